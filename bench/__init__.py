@@ -1,0 +1,1 @@
+"""Scoring recordings and comparing methods."""

@@ -1,0 +1,1 @@
+"""Learning force maps from displacement."""

@@ -1,0 +1,1 @@
+"""Synthesis of surgical-microscope sequences with exact physical ground truth."""

@@ -1,0 +1,180 @@
+"""The job: everything one dataset depends on, as one validated object (schema only; reading is in `config`)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    FiniteFloat,
+    model_validator,
+)
+
+
+def _pair(value: Any) -> Any:
+    """A single number stands for the range that holds only it."""
+    return (value, value) if isinstance(value, (int, float)) and not isinstance(value, bool) else value
+
+
+def _ordered(value: tuple[float, float]) -> tuple[float, float]:
+    if value[0] > value[1]:
+        raise ValueError(f"the lower end {value[0]:g} is above the upper end {value[1]:g}")
+    return value
+
+
+Positive = Annotated[FiniteFloat, Field(gt=0)]
+NonNegative = Annotated[FiniteFloat, Field(ge=0)]
+Range = Annotated[tuple[FiniteFloat, FiniteFloat], BeforeValidator(_pair), AfterValidator(_ordered)]
+PositiveRange = Annotated[tuple[Positive, Positive], BeforeValidator(_pair), AfterValidator(_ordered)]
+NonNegativeRange = Annotated[
+    tuple[NonNegative, NonNegative], BeforeValidator(_pair), AfterValidator(_ordered)
+]
+Vector = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
+
+
+class Section(BaseModel):
+    """One block of the job file. Unknown keys are errors; text under a field is its documentation."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True, allow_inf_nan=False)
+
+
+class Craniotomy(Section):
+    """Where the skull is open."""
+
+    point: Vector | None = None
+    """A point on (or near) the brain surface, in the mesh's own axes [mm]. Needed with `anatomy.mesh`."""
+    direction: Vector | None = None
+    """Outward direction of the opening, in the mesh's own axes; normalised. Needed with `anatomy.mesh`."""
+    radius_mm: Positive = 12.0
+    """Radius of the opening [mm]."""
+    rim_mm: Positive = 3.0
+    """Width over which the rim's hold on the brain grows from none to firm [mm]."""
+
+    @model_validator(mode="after")
+    def _direction_has_length(self) -> Craniotomy:
+        if self.direction is not None and not any(self.direction):
+            raise ValueError("direction has no length")
+        return self
+
+
+class Anatomy(Section):
+    """The brain: a procedural block, or a user's surface."""
+
+    mesh: Path | None = None
+    """Surface of a brain (OBJ, STL, PLY or VTK, mm); relative to the job file. Empty: procedural block."""
+    variety: Annotated[int, Field(ge=1)] | None = None
+    """Number of distinct anatomies in the dataset. Empty: every sequence has its own."""
+    block_mm: tuple[Positive, Positive, Positive] = (100.0, 100.0, 60.0)
+    """Procedural block: width, height, depth [mm]. Below 70 mm the fixed walls take 10-16% of the peak."""
+    dome_mm: Positive = 70.0
+    """Procedural block: radius of curvature of the brain surface [mm]."""
+    gyrus_mm: PositiveRange = (10.0, 15.0)
+    """Procedural relief: spacing of the gyri [mm]."""
+    sulcus_mm: NonNegativeRange = (0.6, 1.4)
+    """Procedural relief: depth of the sulci as seen from outside [mm]."""
+    vertices: Annotated[int, Field(ge=400, le=400_000)] = 40_000
+    """Vertices of the fine surface that is loaded, moved and rendered."""
+    craniotomy: Craniotomy = Craniotomy()
+    """Where the skull is open."""
+
+    @model_validator(mode="after")
+    def _mesh_is_placed(self) -> Anatomy:
+        if self.mesh is not None and (self.craniotomy.point is None or self.craniotomy.direction is None):
+            raise ValueError("a mesh needs craniotomy.point and craniotomy.direction")
+        return self
+
+
+Family = Literal["healthy", "hyperaemic", "pale", "oedematous", "calf"]
+
+
+class Appearance(Section):
+    """How the surface looks."""
+
+    families: tuple[Family, ...] = ("healthy",)
+    """Appearance families that sequences are drawn from, in equal shares."""
+    photo: Path | None = None
+    """A photograph used as albedo, relative to the job file. Empty: procedural vessels and parenchyma."""
+
+
+class Fem(Section):
+    """The physics of the tissue and of the load."""
+
+    law: Literal["linear", "corotational"] = "linear"
+    """Material law."""
+    order: Literal[1, 2] = 1
+    """Polynomial order of the tetrahedra."""
+    tets: Annotated[int, Field(ge=100, le=200_000)] = 4000
+    """Number of tetrahedra to aim for; graded towards the craniotomy."""
+    young_kpa: PositiveRange = (0.5, 3.0)
+    """Young's modulus E [kPa], drawn log-uniformly."""
+    poisson: Annotated[FiniteFloat, Field(ge=0, lt=0.5)] = 0.4
+    """Poisson's ratio."""
+    load: PositiveRange = (0.02, 0.12)
+    """Peak load as P = F/(E a^2), dimensionless, so that one range suits every stiffness."""
+    footprint_mm: PositiveRange = (3.0, 5.0)
+    """Radius a of the contact [mm]."""
+    gestures: tuple[Literal["pull", "push"], ...] = ("pull", "push")
+    """Kinds of gesture that sequences are drawn from, in equal shares."""
+    cone_deg: Annotated[FiniteFloat, Field(ge=0, le=80)] = 45.0
+    """The load's direction is drawn uniformly within this angle of the surface normal."""
+
+
+class Render(Section):
+    """The microscope and its picture."""
+
+    size: tuple[Annotated[int, Field(ge=16, le=4096)], Annotated[int, Field(ge=16, le=4096)]] = (640, 480)
+    """Width, height of the picture [px]."""
+    spp: Annotated[int, Field(ge=1, le=4096)] = 4
+    """Light paths a pixel. Flow stops improving at 4-8."""
+    variant: Literal["auto", "llvm_ad_rgb", "scalar_rgb", "cuda_ad_rgb"] = "auto"
+    """Mitsuba variant; auto takes the fastest that works here."""
+    field_mm: PositiveRange = (32.0, 38.0)
+    """Width of the field of view at the craniotomy [mm]."""
+    working_distance_mm: PositiveRange = (280.0, 320.0)
+    """Distance from the front lens to the craniotomy [mm]."""
+    tilt_deg: NonNegativeRange = (0.0, 20.0)
+    """Angle between the optical axis and the craniotomy's normal."""
+    aperture_mm: NonNegative = 4.0
+    """Radius of the lens aperture [mm]; 0 is a pinhole."""
+    distortion: tuple[FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat] = (
+        -0.05,
+        0.01,
+        0.0,
+        0.0,
+        0.0,
+    )
+    """Brown-Conrady k1, k2, p1, p2, k3."""
+    exr: bool = False
+    """Also write the linear radiance of every frame as EXR."""
+    tool: bool = True
+    """Show the instrument."""
+
+
+class Flow(Section):
+    """Recovering displacement from the video."""
+
+    backend: Literal["opencv-tvl1", "dis", "ideal"] = "opencv-tvl1"
+    """Estimator; `ideal` computes no recovered flow."""
+
+
+class Job(Section):
+    """One dataset."""
+
+    seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
+    """Root of every random draw. Same job, same bytes."""
+    sequences: Annotated[int, Field(ge=1, le=1_000_000)] = 24
+    """Number of sequences."""
+    frames: Annotated[int, Field(ge=2, le=10_000)] = 24
+    """Frames a sequence; frame 0 is the rest frame."""
+    fps: Positive = 25.0
+    """Frames a second of the recorded video."""
+    anatomy: Anatomy = Anatomy()
+    appearance: Appearance = Appearance()
+    fem: Fem = Fem()
+    render: Render = Render()
+    flow: Flow = Flow()
