@@ -1,4 +1,4 @@
-"""The job: everything one dataset depends on, as one validated object (schema only; reading is in `config`)."""
+"""The job: everything one dataset depends on, as one validated object (reading it is in `config`)."""
 
 from __future__ import annotations
 
@@ -35,6 +35,7 @@ NonNegativeRange = Annotated[
     tuple[NonNegative, NonNegative], BeforeValidator(_pair), AfterValidator(_ordered)
 ]
 Vector = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
+Distortion = tuple[FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat]
 
 
 class Section(BaseModel):

@@ -1,0 +1,75 @@
+"""What one sequence is: every number drawn for it, a function of (job, index) only."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from synth.fem.material import Tissue
+from synth.fem.tool import Gesture
+from synth.job import Job
+from synth.render.anatomy import Relief
+from synth.render.camera import View
+from synth.render.scene import Look
+
+# First element of the spawn key: anatomies are shared between sequences, everything else is not.
+_ANATOMY, _SEQUENCE = 0, 1
+_TISSUE, _GESTURE, _LOOK, _VIEW, _NOISE = range(5)
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """One sequence before anything is computed. JSON-ready through `as_dict`."""
+
+    index: int
+    """Position in the dataset."""
+    anatomy: int
+    """Which anatomy; sequences that share it must never be split between training and test."""
+    anatomy_seed: int
+    """Seed of everything grown on that anatomy (relief, vessels)."""
+    family: str
+    """Appearance family."""
+    relief: Relief
+    tissue: Tissue
+    gesture: Gesture
+    look: Look
+    view: View
+
+    def as_dict(self) -> dict[str, Any]:
+        return asdict(self)
+
+
+def draw(job: Job, index: int) -> Scenario:
+    """Draws sequence `index` of `job`; independent of how many others there are and of their order."""
+    anatomy = index % (job.anatomy.variety or job.sequences)
+    family = job.appearance.families[index % len(job.appearance.families)]
+    tissue = Tissue.draw(job.fem, _generator(job, _SEQUENCE, index, _TISSUE))
+    return Scenario(
+        index=index,
+        anatomy=anatomy,
+        anatomy_seed=int(_sequence(job, _ANATOMY, anatomy).generate_state(1)[0]),
+        family=family,
+        relief=Relief.draw(job.anatomy, _generator(job, _ANATOMY, anatomy, 0)),
+        tissue=tissue,
+        gesture=Gesture.draw(
+            job.fem, job.anatomy.craniotomy, tissue, _generator(job, _SEQUENCE, index, _GESTURE)
+        ),
+        look=Look.draw(family, _generator(job, _SEQUENCE, index, _LOOK)),
+        view=View.draw(job.render, _generator(job, _SEQUENCE, index, _VIEW)),
+    )
+
+
+def frame_seeds(job: Job, index: int) -> list[int]:
+    """One seed a frame, for light paths and sensor noise: a fixed one would leave screen-fixed noise."""
+    state = _sequence(job, _SEQUENCE, index, _NOISE).generate_state(job.frames)
+    return [int(seed) for seed in state]
+
+
+def _sequence(job: Job, *key: int) -> np.random.SeedSequence:
+    return np.random.SeedSequence(job.seed, spawn_key=key)
+
+
+def _generator(job: Job, *key: int) -> np.random.Generator:
+    return np.random.default_rng(_sequence(job, *key))

@@ -1,0 +1,37 @@
+"""CPU-seconds and peak memory by stage. The only place in `synth` that reads a clock besides progress display."""
+
+from __future__ import annotations
+
+import resource
+import time
+from collections import defaultdict
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+
+class Stopwatch:
+    """Adds up CPU time (all threads of this process) and wall time under the name of a stage."""
+
+    def __init__(self) -> None:
+        self._cpu: dict[str, float] = defaultdict(float)
+        self._wall: dict[str, float] = defaultdict(float)
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Times the block under `name`; blocks of one name add up."""
+        cpu, wall = time.process_time(), time.perf_counter()
+        try:
+            yield
+        finally:
+            self._cpu[name] += time.process_time() - cpu
+            self._wall[name] += time.perf_counter() - wall
+
+    def report(self) -> dict[str, dict[str, float] | float]:
+        """`{stage: {"cpu_s", "wall_s"}, ..., "peak_rss_mb"}`, seconds and MB (1e6 bytes)."""
+        peak_kib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        stages: dict[str, dict[str, float] | float] = {
+            name: {"cpu_s": round(self._cpu[name], 3), "wall_s": round(self._wall[name], 3)}
+            for name in self._cpu
+        }
+        stages["peak_rss_mb"] = round(peak_kib * 1024 / 1e6, 1)
+        return stages
