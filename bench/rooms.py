@@ -1,0 +1,59 @@
+"""Where each room hangs its measuring commands: `bench pareto X`, `bench stability X` and so on.
+
+A room adds one file, `bench/X_pareto.py`, with one plain function whose arguments are typer's, and one
+line to `COMMANDS`. The module is imported only when its command (or its group's help) is asked for, so that
+`bench --help` doesn't load Mitsuba and torch.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from importlib import import_module
+from typing import Any
+
+import typer
+from typer.core import TyperGroup
+
+
+@dataclass(frozen=True)
+class Command:
+    """One room's measuring command."""
+
+    group: str
+    """`pareto` (speed against accuracy), `stability` (where it breaks) or `experiment` (a question)."""
+    name: str
+    """The word after the group."""
+    module: str
+    """Module that holds it."""
+    function: str
+    """Function in that module; its docstring's first line is the help."""
+
+
+COMMANDS: tuple[Command, ...] = ()
+
+
+class Rooms(TyperGroup):
+    """A group whose commands are those of `COMMANDS` with the group's name.
+
+    Typed `Any` where click's classes would stand: newer typer releases carry their own copy of click.
+    """
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        return [entry.name for entry in COMMANDS if entry.group == self.name]
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        for entry in COMMANDS:
+            if entry.group == self.name and entry.name == cmd_name:
+                return load(entry)
+        return None
+
+
+def load(entry: Command) -> Any:
+    """The command behind an entry, its module imported.
+
+    Raises:
+        ImportError, AttributeError: the entry names what isn't there (a test loads every entry).
+    """
+    single = typer.Typer(add_completion=False)
+    single.command(entry.name)(getattr(import_module(entry.module), entry.function))
+    return typer.main.get_command(single)
