@@ -1,0 +1,15 @@
+"""Errors that a person caused and can mend: one clear line, exit code 2, no traceback."""
+
+from __future__ import annotations
+
+
+class UserError(Exception):
+    """Something in the job, the input or the machine that the user can put right.
+
+    The message is complete without a traceback; several problems are several lines. Command lines print it
+    to stderr and exit with code 2.
+    """
+
+
+class NotFinite(UserError):
+    """A computed value is NaN or infinite: the sequence is stopped and marked failed."""

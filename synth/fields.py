@@ -1,0 +1,113 @@
+"""The field table: every array of a sequence, declared once for writer, reader, verify, card and docs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+TIME, ROW, COLUMN = "frame", "row", "column"
+
+
+@dataclass(frozen=True)
+class Field:
+    """One array of a sequence.
+
+    `dims` names the axes; an axis that is neither frame, row nor column is named after what it lists and
+    has the length given in `length`.
+    """
+
+    name: str
+    dims: tuple[str, ...]
+    dtype: str
+    unit: str
+    meaning: str
+    length: int = 0
+    optional: bool = False
+    low: float | None = None
+    """Smallest value that can be right; checked by verify."""
+    high: float | None = None
+    """Largest value that can be right; checked by verify."""
+
+    @property
+    def framed(self) -> bool:
+        """Whether it has one slice a frame that is as large as a picture."""
+        return self.dims[:3] == (TIME, ROW, COLUMN)
+
+    def shape(self, frames: int, size: tuple[int, int]) -> tuple[int, ...]:
+        """Shape for `frames` frames of `size` = (height, width) [px]."""
+        lengths = {TIME: frames, ROW: size[0], COLUMN: size[1]}
+        return tuple(lengths.get(dim, self.length) for dim in self.dims)
+
+
+_STILL = (ROW, COLUMN)
+_VIDEO = (TIME, ROW, COLUMN)
+
+FIELDS: dict[str, Field] = {
+    field.name: field
+    for field in (
+        Field("time", (TIME,), "float64", "s", "time of the frame; frame 0 is the rest frame", low=0.0),
+        Field("rgb", (*_VIDEO, "rgb"), "uint8", "sRGB", "recorded picture", length=3),
+        Field(
+            "flow",
+            (*_VIDEO, "xy"),
+            "float32",
+            "px",
+            "true motion of the material points from the rest frame to this one, on the rest frame's pixels; "
+            "0 outside tissue",
+            length=2,
+            low=-1e4,
+            high=1e4,
+        ),
+        Field(
+            "visible",
+            _VIDEO,
+            "bool",
+            "-",
+            "the rest pixel's material point is seen in this frame (not hidden by tool, tissue or edge)",
+        ),
+        Field("tissue", _STILL, "bool", "-", "brain surface, in the rest frame"),
+        Field("tool", _VIDEO, "bool", "-", "instrument, in this frame's own pixels"),
+        Field("glare", _VIDEO, "bool", "-", "specular highlight, in this frame's own pixels"),
+        Field(
+            "depth",
+            _VIDEO,
+            "float32",
+            "mm",
+            "distance along the optical axis; 0 where nothing is hit",
+            low=0.0,
+        ),
+        Field(
+            "traction",
+            (*_VIDEO, "xyz"),
+            "float32",
+            "kPa",
+            "load on the tissue per rest area, camera axes, on the rest frame's pixels",
+            length=3,
+            low=-1e4,
+            high=1e4,
+        ),
+        Field("area", _STILL, "float32", "mm^2", "rest surface area that each rest pixel sees", low=0.0),
+        Field("force", (TIME, "xyz"), "float64", "mN", "total load on the tissue, camera axes", length=3),
+        Field(
+            "flow_tvl1",
+            (*_VIDEO, "xy"),
+            "float32",
+            "px",
+            "flow recovered from the video by the estimator in the attribute flow_backend",
+            length=2,
+            optional=True,
+            low=-1e4,
+            high=1e4,
+        ),
+        Field(
+            "flow_confidence",
+            _VIDEO,
+            "float32",
+            "-",
+            "the estimator's confidence in the recovered flow, 0..1",
+            optional=True,
+            low=0.0,
+            high=1.0,
+        ),
+    )
+}
+"""Every field by name, in the order in which they are hashed and listed."""

@@ -1,0 +1,337 @@
+"""The sequence store: one Zarr v3 group a sequence, written as `.part`, sealed, renamed; and the way back."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import zarr
+from numpy.typing import NDArray
+from zarr.codecs import BloscCodec, Crc32cCodec
+
+from synth import identity, versions
+from synth.errors import NotFinite, UserError
+from synth.fields import FIELDS, Field
+from synth.job import Job
+
+FORMAT = "sulcus-sequence"
+FORMAT_VERSION = 1
+
+# Raw bytes of one field that are held back and then written as one file (a Zarr shard; its chunks are frames).
+_SHARD_BYTES = 16 << 20
+
+# What may differ between two runs that gave the same sequence.
+_NOT_CONTENT = {"timings", "versions", "content_hash", "seal_hash"}
+
+
+class Writer:
+    """Writes one sequence. Frames are put in order; nothing is visible under the final name before `seal`."""
+
+    def __init__(self, folder: Path, index: int, *, frames: int, size: tuple[int, int], job: Job) -> None:
+        """
+        Args:
+            folder: the dataset.
+            index: which sequence; names the store.
+            frames: number of frames.
+            size: (height, width) of the picture [px].
+            job: the dataset's job.
+        """
+        self.path = folder / f"{index:06d}.zarr"
+        self._part = folder / f"{index:06d}.zarr.part"
+        self._exr = folder / "radiance" / f"{index:06d}"
+        self._frames, self._size = frames, size
+        for stale in (self._part, self._exr):
+            if stale.exists():
+                shutil.rmtree(stale)
+        self._group = zarr.create_group(str(self._part), zarr_format=3)
+        self._columns: dict[str, _Column] = {}
+        self._exr_hash = hashlib.blake2b(digest_size=16)
+        self._exr_frames = 0
+        self._own = {
+            "format": FORMAT,
+            "format_version": FORMAT_VERSION,
+            "index": index,
+            "frames": frames,
+            "size": [size[1], size[0]],
+            "fps": job.fps,
+            "seed": job.seed,
+            "flow_backend": job.flow.backend,
+            "job": identity.of(job),
+        }
+
+    def put(self, name: str, array: NDArray[Any]) -> None:
+        """Writes a whole field. UserError when shape, type or finiteness is not what the table says."""
+        field = _field(name)
+        column = self._column(field)
+        if field.framed:
+            for t, frame in enumerate(array):
+                column.append(t, frame)
+        else:
+            column.whole(array)
+
+    def put_frame(self, name: str, t: int, array: NDArray[Any]) -> None:
+        """Writes frame `t` of a field; frames come in order."""
+        self._column(_field(name)).append(t, array)
+
+    def put_exr(self, t: int, radiance: NDArray[np.floating]) -> None:
+        """Writes the linear picture of frame `t`, (H, W, 3), as `radiance/NNNNNN/TTTT.exr` in half floats."""
+        import OpenEXR
+
+        if not np.isfinite(radiance).all():
+            raise NotFinite(f"radiance, frame {t}: not finite")
+        self._exr.mkdir(parents=True, exist_ok=True)
+        header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+        file = self._exr / f"{t:04d}.exr"
+        with OpenEXR.File(header, {"RGB": np.ascontiguousarray(radiance, np.float16)}) as exr:
+            exr.write(str(file))
+        self._exr_hash.update(file.read_bytes())
+        self._exr_frames += 1
+
+    def seal(self, **attributes: Any) -> Path:
+        """Finishes the store: checks that every field is whole, adds attributes and hashes, renames.
+
+        Args:
+            attributes: JSON-ready; `timings` may differ between equal sequences, nothing else may.
+
+        Returns:
+            The store's final path.
+        """
+        for field in FIELDS.values():
+            column = self._columns.get(field.name)
+            if column is None:
+                if not field.optional:
+                    raise ValueError(f"{field.name}: was never written")
+            elif column.filled != column.shape[0]:
+                raise ValueError(f"{field.name}: {column.filled} of {column.shape[0]} frames were written")
+        hashes = {name: self._columns[name].digest() for name in FIELDS if name in self._columns}
+        if self._exr_frames:
+            hashes["radiance"] = self._exr_hash.hexdigest()
+        attrs = {**self._own, **attributes, "field_hashes": hashes, "versions": versions.of_everything()}
+        attrs = json.loads(identity.canonical(attrs))
+        attrs["content_hash"] = content_hash(attrs)
+        attrs["seal_hash"] = seal_hash(attrs)
+        self._group.attrs.update(attrs)
+        self._part.rename(self.path)
+        return self.path
+
+    def _column(self, field: Field) -> _Column:
+        if field.name not in self._columns:
+            self._columns[field.name] = _Column(self._group, field, field.shape(self._frames, self._size))
+        return self._columns[field.name]
+
+
+class _Column:
+    """One field being written: checked, hashed, and gathered into shards."""
+
+    def __init__(self, group: zarr.Group, field: Field, shape: tuple[int, ...]) -> None:
+        self._field, self.shape, self.filled = field, shape, 0
+        self._hash = field_hasher(field, shape)
+        self._held: list[NDArray[Any]] = []
+        dtype = np.dtype(field.dtype)
+        chunk, shard = shape, None
+        if field.framed:
+            chunk = (1, *shape[1:])
+            frame_bytes = int(np.prod(chunk)) * dtype.itemsize
+            self._together = int(np.clip(_SHARD_BYTES // frame_bytes, 1, shape[0]))
+            shard = (self._together, *shape[1:])
+        self._array = group.create_array(
+            field.name,
+            shape=shape,
+            dtype=dtype,
+            chunks=chunk,
+            shards=shard,
+            filters=None,
+            compressors=[
+                BloscCodec(cname="zstd", clevel=3, shuffle="shuffle", typesize=dtype.itemsize),
+                Crc32cCodec(),
+            ],
+            dimension_names=field.dims,
+            attributes={"unit": field.unit, "meaning": field.meaning},
+            # With every chunk on disk a missing file is damage, never a silent zero.
+            config={"write_empty_chunks": True},
+        )
+
+    def append(self, t: int, frame: NDArray[Any]) -> None:
+        if not self._field.framed:
+            raise ValueError(f"{self._field.name}: is not stored by frame")
+        if t != self.filled:
+            raise ValueError(f"{self._field.name}: frame {t} after {self.filled} frames")
+        checked = self._checked(frame, self.shape[1:], f", frame {t}")
+        self._hash.update(checked.data)
+        self._held.append(checked)
+        self.filled += 1
+        if len(self._held) == self._together or self.filled == self.shape[0]:
+            self._array[self.filled - len(self._held) : self.filled] = np.stack(self._held)
+            self._held.clear()
+
+    def whole(self, array: NDArray[Any]) -> None:
+        checked = self._checked(array, self.shape, "")
+        self._hash.update(checked.data)
+        self._array[...] = checked
+        self.filled = self.shape[0]
+
+    def digest(self) -> str:
+        return self._hash.hexdigest()
+
+    def _checked(self, array: NDArray[Any], shape: tuple[int, ...], where: str) -> NDArray[Any]:
+        name, dtype = self._field.name, np.dtype(self._field.dtype)
+        array = np.asarray(array)
+        if array.shape != shape:
+            raise ValueError(f"{name}{where}: shape {array.shape}, the field table says {shape}")
+        if not np.can_cast(array.dtype, dtype, "same_kind"):
+            raise ValueError(f"{name}{where}: {array.dtype}, the field table says {dtype}")
+        # A copy, since the caller may reuse its buffer before the shard is full.
+        copy = np.array(array, dtype, order="C")
+        if dtype.kind == "f" and not np.isfinite(copy).all():
+            at = tuple(int(k) for k in np.argwhere(~np.isfinite(copy))[0])
+            raise NotFinite(f"{name}{where}: not finite, first at {at}")
+        return copy
+
+
+class Column:
+    """A field of a sealed sequence, read when indexed; damage is a UserError that names store and field."""
+
+    def __init__(self, array: zarr.Array[Any], where: str) -> None:
+        self._array, self._where = array, where
+        self.shape: tuple[int, ...] = array.shape
+        self.dtype: np.dtype[Any] = array.dtype
+        self.ndim = len(self.shape)
+
+    def __len__(self) -> int:
+        return self.shape[0]
+
+    def __getitem__(self, selection: Any) -> NDArray[Any]:
+        try:
+            return np.asarray(self._array[selection])
+        except IndexError:
+            raise
+        except Exception as error:  # zarr, its codecs and the file system have no common error for damage
+            raise UserError(f"{self._where}: cannot be read, the store is damaged ({error})") from error
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
+        return np.asarray(self[...], dtype)
+
+
+class Sequence:
+    """One sealed sequence: `sequence["rgb"][t]`, `sequence.attrs["young_kpa"]`."""
+
+    def __init__(self, path: Path, group: zarr.Group, attrs: dict[str, Any]) -> None:
+        self.path, self._group, self.attrs = path, group, attrs
+
+    @property
+    def index(self) -> int:
+        return int(self.attrs["index"])
+
+    @property
+    def frames(self) -> int:
+        return int(self.attrs["frames"])
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Height, width [px]."""
+        width, height = self.attrs["size"]
+        return int(height), int(width)
+
+    @property
+    def fields(self) -> list[str]:
+        """Names of the fields it holds, in the table's order."""
+        return [name for name in FIELDS if name in self.attrs["field_hashes"]]
+
+    def __contains__(self, name: str) -> bool:
+        return name in self.attrs["field_hashes"]
+
+    def __getitem__(self, name: str) -> Column:
+        field, where = _field(name), f"{self.path}: {name}"
+        if name not in self:
+            raise UserError(f"{where}: the sequence has no such field")
+        try:
+            array = self._group[name]
+        except Exception as error:  # as in Column
+            raise UserError(f"{where}: cannot be opened, the store is damaged ({error})") from error
+        expected = field.shape(self.frames, self.size)
+        if (
+            not isinstance(array, zarr.Array)
+            or array.shape != expected
+            or array.dtype != np.dtype(field.dtype)
+        ):
+            raise UserError(f"{where}: is not {field.dtype} {expected}, the store is damaged")
+        shard = array.shards or array.chunks
+        files = -(-expected[0] // shard[0])
+        rest = "/0" * (len(expected) - 1)
+        for k in range(files):
+            if not (self.path / name / f"c/{k}{rest}").is_file():
+                raise UserError(f"{where}: file c/{k}{rest} is missing, the store is damaged")
+        return Column(array, where)
+
+
+class Dataset:
+    """A folder of sealed sequences: `len`, iteration and indexing by position, in order of their names."""
+
+    def __init__(self, root: Path | str) -> None:
+        self.root = Path(root)
+        if not self.root.is_dir():
+            raise UserError(f"{self.root}: no such folder")
+        self.paths = sorted(path for path in self.root.glob("[0-9]*.zarr") if path.is_dir())
+        if not self.paths:
+            raise UserError(f"{self.root}: holds no finished sequence")
+
+    def __len__(self) -> int:
+        return len(self.paths)
+
+    def __getitem__(self, position: int) -> Sequence:
+        return open_sequence(self.paths[position])
+
+    def __iter__(self) -> Iterator[Sequence]:
+        return (open_sequence(path) for path in self.paths)
+
+
+def open_sequence(path: Path | str) -> Sequence:
+    """Opens a sealed sequence. UserError for one that is missing, unfinished, foreign or truncated."""
+    path = Path(path)
+    if path.name.endswith(".part"):
+        raise UserError(f"{path}: is an unfinished sequence")
+    if not path.is_dir():
+        raise UserError(f"{path}: no such sequence")
+    try:
+        group = zarr.open_group(str(path), mode="r", zarr_format=3, use_consolidated=False)
+        attrs = dict(group.attrs)
+    except Exception as error:  # as in Column
+        raise UserError(f"{path}: is not a Zarr v3 group, or its metadata is damaged") from error
+    if attrs.get("format") != FORMAT:
+        raise UserError(f"{path}: is a Zarr store, but not a sequence of ours")
+    if attrs.get("format_version") != FORMAT_VERSION:
+        found = attrs.get("format_version")
+        raise UserError(f"{path}: has format version {found}; this program reads version {FORMAT_VERSION}")
+    missing = {"content_hash", "field_hashes", "frames", "size", "index"} - attrs.keys()
+    if missing:
+        raise UserError(f"{path}: lacks the attributes {', '.join(sorted(missing))}")
+    return Sequence(path, group, attrs)
+
+
+def field_hasher(field: Field, shape: tuple[int, ...]) -> hashlib.blake2b:
+    """A hasher that has seen the field's name, type and shape; then give it the values in C order."""
+    described = identity.canonical([field.name, field.dtype, list(shape)])
+    return hashlib.blake2b(described, digest_size=16)
+
+
+def content_hash(attrs: Mapping[str, Any]) -> str:
+    """Hash of everything a sequence says: its fields (by their hashes) and attributes, timings and versions aside."""
+    content = {key: value for key, value in attrs.items() if key not in _NOT_CONTENT}
+    return hashlib.blake2b(identity.canonical(content), digest_size=16).hexdigest()
+
+
+def seal_hash(attrs: Mapping[str, Any]) -> str:
+    """Hash of all root attributes besides itself: what tells an edited attribute, timings included."""
+    sealed = {key: value for key, value in attrs.items() if key != "seal_hash"}
+    return hashlib.blake2b(identity.canonical(sealed), digest_size=16).hexdigest()
+
+
+def _field(name: str) -> Field:
+    if name not in FIELDS:
+        raise ValueError(f"{name}: is not in the field table")
+    return FIELDS[name]
