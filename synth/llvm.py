@@ -1,0 +1,78 @@
+"""Finding an LLVM that Mitsuba's fast variant survives: a wrong one aborts the process, uncatchably."""
+
+from __future__ import annotations
+
+import functools
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+_OLDEST = 17  # drjit 1.5 aborts with 15 and 16 and refuses 14
+_FOLDERS = (
+    "/usr/lib/x86_64-linux-gnu",
+    "/usr/lib/aarch64-linux-gnu",
+    "/usr/lib64",
+    "/usr/lib",
+    "/usr/local/lib",
+    "/opt/homebrew/opt/llvm/lib",
+)
+_PROBE = (
+    "import mitsuba as mi; mi.set_variant('llvm_ad_rgb'); import drjit as dr; "
+    "x = dr.arange(mi.Float, 16); x += 1; dr.eval(x); assert dr.sum(x)[0] == 136"
+)
+
+
+@functools.cache
+def find() -> str | None:
+    """Path of a libLLVM that the fast renderer works with here, or None.
+
+    `DRJIT_LIBLLVM_PATH` is tried first and alone if it is set; then what the linker knows and the usual
+    folders, newest version first. Each is probed in a subprocess, and the answer kept for the process.
+    """
+    named = os.environ.get("DRJIT_LIBLLVM_PATH")
+    tried = [named] if named else candidates()
+    return next((path for path in tried if probe(path)), None)
+
+
+def candidates() -> list[str]:
+    """LLVM libraries of a usable version on this machine, newest first."""
+    found: dict[Path, int] = {}
+    for path in [*_linker(), *_installed()]:
+        version = _version(path.name)
+        if version is not None and version >= _OLDEST and path.exists():
+            found.setdefault(path.resolve(), version)
+    return [str(path) for path, _ in sorted(found.items(), key=lambda item: (-item[1], str(item[0])))]
+
+
+def probe(path: str) -> bool:
+    """Whether a small kernel runs through the LLVM at `path`, found out in a process that may die of it."""
+    if not Path(path).exists():
+        return False
+    environment = {**os.environ, "DRJIT_LIBLLVM_PATH": path}
+    try:
+        done = subprocess.run(
+            [sys.executable, "-c", _PROBE], env=environment, capture_output=True, timeout=120, check=False
+        )
+    except subprocess.TimeoutExpired:
+        return False
+    return done.returncode == 0
+
+
+def _version(name: str) -> int | None:
+    match = re.search(r"libLLVM(?:-(\d+)\.so|\.so\.(\d+)|-(\d+)\.dylib)", name)
+    return int(next(group for group in match.groups() if group)) if match else None
+
+
+def _linker() -> list[Path]:
+    try:
+        cache = subprocess.run(["ldconfig", "-p"], capture_output=True, text=True, check=False).stdout
+    except FileNotFoundError:  # not a glibc system
+        return []
+    return [Path(path) for path in re.findall(r"=> (\S*libLLVM\S*)", cache)]
+
+
+def _installed() -> list[Path]:
+    folders = [Path(folder) for folder in _FOLDERS] + list(Path("/usr/lib").glob("llvm-*/lib"))
+    return [path for folder in folders if folder.is_dir() for path in folder.glob("libLLVM*")]
