@@ -19,10 +19,12 @@ from synth.errors import NotFinite, UserError
 from synth.fields import FIELDS, Field
 from synth.job import Job
 
+__all__ = ["FIELDS", "Column", "Dataset", "Field", "Sequence", "Writer", "open_sequence"]
+
 FORMAT = "sulcus-sequence"
 FORMAT_VERSION = 1
 
-# Raw bytes of one field that are held back and then written as one file (a Zarr shard; its chunks are frames).
+# Raw bytes of one field that are held back and then written as one file: a shard, its chunks being frames.
 _SHARD_BYTES = 16 << 20
 
 # What may differ between two runs that gave the same sequence.
@@ -253,12 +255,8 @@ class Sequence:
             array = self._group[name]
         except Exception as error:  # as in Column
             raise UserError(f"{where}: cannot be opened, the store is damaged ({error})") from error
-        expected = field.shape(self.frames, self.size)
-        if (
-            not isinstance(array, zarr.Array)
-            or array.shape != expected
-            or array.dtype != np.dtype(field.dtype)
-        ):
+        expected, dtype = field.shape(self.frames, self.size), np.dtype(field.dtype)
+        if not isinstance(array, zarr.Array) or (array.shape, array.dtype) != (expected, dtype):
             raise UserError(f"{where}: is not {field.dtype} {expected}, the store is damaged")
         shard = array.shards or array.chunks
         files = -(-expected[0] // shard[0])
@@ -320,7 +318,7 @@ def field_hasher(field: Field, shape: tuple[int, ...]) -> hashlib.blake2b:
 
 
 def content_hash(attrs: Mapping[str, Any]) -> str:
-    """Hash of everything a sequence says: its fields (by their hashes) and attributes, timings and versions aside."""
+    """Hash of all that a sequence says: field hashes and attributes, without timings and versions."""
     content = {key: value for key, value in attrs.items() if key not in _NOT_CONTENT}
     return hashlib.blake2b(identity.canonical(content), digest_size=16).hexdigest()
 
