@@ -1,0 +1,294 @@
+"""Pairs and sequences with known flow: cortex-like texture, warped, lit, covered by a tool, sensed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float32]
+Flags = NDArray[np.bool_]
+Rgb = NDArray[np.uint8]
+
+_FINE = 2  # texture samples a pixel, so that sampling it anywhere loses nothing the sensor could see
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """What happens between the rest frame and the frame looked at. Lengths in px of the picture."""
+
+    size: int = 224
+    """Width and height [px]."""
+    pull: float = 10.0
+    """Largest displacement [px]."""
+    reach: float = 0.14
+    """Radius of the contact's dimple, as a share of the width."""
+    direction: float = 0.6
+    """Direction of the pull in the picture [rad]; x right, y down."""
+    tool: float = 22.0
+    """Width of one branch of the forceps [px]; 0 is no tool."""
+    highlights: float = 0.06
+    """Share of the picture in glare."""
+    illumination: float = 0.10
+    """Largest relative change of brightness, with an equal gradient over the picture."""
+    contrast: float = 1.0
+    """Factor on the texture's contrast."""
+    noise: float = 1.5
+    """Standard deviation of the sensor's noise [grey levels]."""
+    blur: float = 0.0
+    """Gaussian defocus of the frame looked at, standard deviation [px]."""
+
+
+CLEAN = Recipe(tool=0.0, highlights=0.0, illumination=0.0, noise=0.0)
+"""Nothing but motion."""
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Two pictures and everything true about them, on the rest frame's pixels unless said otherwise."""
+
+    rest: Rgb
+    """(H, W, 3) uint8, without tool."""
+    now: Rgb
+    """(H, W, 3) uint8."""
+    flow: Floats
+    """(H, W, 2) px, rest to now."""
+    rest_usable: Flags
+    """(H, W): no glare in the rest frame."""
+    now_usable: Flags
+    """(H, W), on the *now* frame's pixels: neither tool nor glare."""
+    tool: Flags
+    """(H, W), on the *now* frame's pixels."""
+    glare: Flags
+    """(H, W), on the *now* frame's pixels."""
+    hidden: Flags
+    """(H, W): material points that the tool covers in the now frame, inside the picture."""
+    contact: Flags
+    """(H, W): within the dimple's radius of the contact."""
+    inside: Flags
+    """(H, W): material points that the now frame's picture still holds."""
+
+
+def noise_field(shape: tuple[int, int], period: float, rng: np.random.Generator) -> Floats:
+    """Smooth noise of zero mean and unit deviation with features about `period` samples apart, (H, W)."""
+    white = rng.standard_normal(shape)
+    fy = np.fft.fftfreq(shape[0])[:, None]
+    fx = np.fft.rfftfreq(shape[1])[None]
+    radius = np.hypot(fy, fx) * period
+    smooth = np.fft.irfft2(np.fft.rfft2(white) * radius * np.exp(-(radius**2)), shape)
+    return np.asarray((smooth - smooth.mean()) / smooth.std(), np.float32)
+
+
+def cortex(size: int, rng: np.random.Generator) -> Floats:
+    """Albedo like an exposed cortex: parenchyma, arteries, fine vessels and a vein.
+
+    Vessels are the zero lines of smooth noise, which wander as pial vessels do; that isn't anatomy, but the
+    picture has the gradients, the empty patches and the aperture problems that matter to flow.
+
+    Args:
+        size: samples a side.
+        rng: where the picture comes from.
+
+    Returns:
+        (size, size, 3) float32 in 0..1, RGB.
+    """
+    shape = (size, size)
+    unit = size / 448.0
+
+    def line(period: float, width: float) -> Floats:
+        wave = noise_field(shape, period * unit, rng)
+        slope = np.hypot(*np.gradient(wave)) + 1e-3
+        return np.asarray(np.exp(-((wave / slope / (width * unit)) ** 2)), np.float32)
+
+    shade = 1.0 + 0.06 * noise_field(shape, 160 * unit, rng) + 0.025 * noise_field(shape, 40 * unit, rng)
+    shade = shade + 0.012 * noise_field(shape, 8 * unit, rng)
+    colour = np.array([0.80, 0.58, 0.46], np.float32) * shade[..., None]
+    patchy = 1 / (1 + np.exp(-3 * noise_field(shape, 120 * unit, rng)))
+    for alpha, tint in (
+        (0.55 * patchy * line(60, 1.6), (0.72, 0.26, 0.20)),
+        (0.75 * line(130, 3.2), (0.66, 0.17, 0.14)),
+        (0.85 * line(330, 9.0), (0.36, 0.27, 0.40)),
+    ):
+        colour = colour + alpha[..., None] * (np.array(tint, np.float32) - colour)
+    return np.asarray(cv2.GaussianBlur(np.clip(colour, 0, 1), (0, 0), 0.9), np.float32)
+
+
+def pull_field(recipe: Recipe) -> Floats:
+    """Displacement of a surface pulled at its middle, (H, W, 2) px at the rest frame's pixels.
+
+    Falls off as a point load's does on an elastic half space (1/r, Boussinesq) outside the contact, levels
+    off inside, is drawn together towards the contact, and is held at the rim.
+    """
+    y, x = np.mgrid[: recipe.size, : recipe.size].astype(np.float64)
+    centre = 0.5 * (recipe.size - 1) + 0.06 * recipe.size * np.array([-1.0, 0.5])
+    dx, dy = x - centre[0], y - centre[1]
+    radius = np.hypot(dx, dy)
+    dimple = recipe.reach * recipe.size
+    rim = np.clip((0.5 * recipe.size - np.hypot(x - x.mean(), y - y.mean())) / (0.2 * recipe.size), 0, 1)
+    hold = rim**2 * (3 - 2 * rim)
+    along = hold / np.sqrt(1 + (radius / dimple) ** 2)
+    pinch = -0.25 * hold * np.exp(-((radius / (1.3 * dimple)) ** 2)) / dimple
+    u = along * np.cos(recipe.direction) + pinch * dx
+    v = along * np.sin(recipe.direction) + pinch * dy
+    field = np.stack([u, v], -1)
+    largest = np.hypot(u, v).max()
+    return np.asarray(field * (recipe.pull / largest), np.float32)
+
+
+def inverse(flow: Floats) -> Floats:
+    """Where each now pixel came from: x with x + u(x) = y, by damped fixed-point steps. (H, W, 2) px."""
+    height, width = flow.shape[:2]
+    y, x = np.mgrid[:height, :width].astype(np.float32)
+    grid = np.stack([x, y], -1)
+    source = grid.copy()
+    for _ in range(60):
+        moved = cv2.remap(
+            flow, source[..., 0], source[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE
+        )
+        source += 0.8 * (grid - moved - source)
+    return source
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One surface under one light, from which any frame of a pull can be taken."""
+
+    recipe: Recipe
+    albedo: Floats
+    """(2H, 2W, 3) or finer, in 0..1."""
+    wet: Floats
+    """(H, W) field whose high values glare."""
+    drift: Floats
+    """(H, W) field the wet highlights change by as the surface tilts."""
+    field: Floats = field(repr=False)
+    """(H, W, 2) px: displacement at full pull."""
+
+    @classmethod
+    def set(cls, recipe: Recipe, rng: np.random.Generator, photo: Rgb | None = None) -> Stage:
+        """Builds the stage; `photo` (RGB uint8, any size) takes the place of the procedural cortex."""
+        fine = _FINE * recipe.size
+        if photo is None:
+            albedo = cortex(fine, rng)
+        else:
+            albedo = cv2.resize(photo, (fine, fine), interpolation=cv2.INTER_AREA).astype(np.float32) / 255
+        mean = albedo.mean(axis=(0, 1))
+        albedo = mean + recipe.contrast * (albedo - mean)
+        size = (recipe.size, recipe.size)
+        wet = noise_field(size, 14 * recipe.size / 224, rng) + 1.2 * noise_field(
+            size, 70 * recipe.size / 224, rng
+        )
+        return cls(recipe, albedo, wet, noise_field(size, 40 * recipe.size / 224, rng), pull_field(recipe))
+
+    def pair(self, share: float, rng: np.random.Generator) -> Pair:
+        """The rest frame and the frame at `share` of the full pull."""
+        return self.against(self.rest(rng), share, rng)
+
+    def rest(self, rng: np.random.Generator) -> tuple[Rgb, Flags]:
+        """The rest frame and its glare: (H, W, 3) uint8, (H, W) bool."""
+        size = self.recipe.size
+        y, x = np.mgrid[:size, :size].astype(np.float32)
+        picture, glare = self._light(self._sample(np.stack([x, y], -1)), self.wet, 0.0)
+        return self._sense(picture, rng), glare
+
+    def against(self, rest: tuple[Rgb, Flags], share: float, rng: np.random.Generator) -> Pair:
+        """As `pair`, with a rest frame already taken (a sequence has one)."""
+        recipe = self.recipe
+        flow = np.asarray(share * self.field, np.float32)
+        source = inverse(flow)
+        # Highlights belong to the light and the slope: they stay about where they were as the surface moves.
+        picture, glare = self._light(self._sample(source), self.wet + 0.5 * share * self.drift, share)
+        if recipe.blur > 0:
+            picture = cv2.GaussianBlur(picture, (0, 0), recipe.blur)
+        tool = self._tool(share)
+        picture = np.where(tool[..., None], _metal(picture.shape[:2]), picture)
+        soft = cv2.GaussianBlur(tool.astype(np.float32), (0, 0), 0.6)[..., None]
+        picture = picture + np.where(tool[..., None], 0, soft * (0.1 - picture))
+        tool = cv2.dilate(tool.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool)
+        size = recipe.size
+        y, x = np.mgrid[:size, :size].astype(np.float32)
+        at = np.stack([x, y], -1) + flow
+        inside = np.all((at >= 0) & (at <= size - 1), axis=-1)
+        covered = cv2.remap(tool.astype(np.float32), at[..., 0], at[..., 1], cv2.INTER_LINEAR) > 0.5
+        length = np.hypot(self.field[..., 0], self.field[..., 1])
+        return Pair(
+            rest=rest[0],
+            now=self._sense(picture, rng),
+            flow=flow,
+            rest_usable=~rest[1],
+            now_usable=~(tool | glare),
+            tool=tool,
+            glare=glare & ~tool,
+            hidden=covered & inside,
+            contact=(length > 0.7 * length.max()) & inside,
+            inside=inside,
+        )
+
+    def _sample(self, at: Floats) -> Floats:
+        fine = self.albedo.shape[0] / self.recipe.size
+        where = ((at + 0.5) * fine - 0.5).astype(np.float32)
+        return np.asarray(
+            cv2.remap(
+                self.albedo, where[..., 0], where[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT_101
+            ),
+            np.float32,
+        )
+
+    def _light(self, albedo: Floats, wet: Floats, share: float) -> tuple[Floats, Flags]:
+        recipe = self.recipe
+        ramp = np.linspace(-1, 1, recipe.size, dtype=np.float32)
+        change = recipe.illumination * share
+        picture = albedo * (1 + change * ramp[None, :, None] + 0.5 * change * ramp[:, None, None])
+        if recipe.highlights <= 0:
+            return picture, np.zeros(wet.shape, bool)
+        level = np.quantile(self.wet, 1 - recipe.highlights)
+        strength = np.clip((wet - level) / 0.25 + 0.5, 0, 1)[..., None]
+        return np.asarray(picture + strength * (1.05 - picture), np.float32), strength[..., 0] > 0.12
+
+    def _tool(self, share: float) -> Flags:
+        """Two branches from the lower right to the contact, which they follow."""
+        recipe = self.recipe
+        mask = np.zeros((recipe.size, recipe.size), np.uint8)
+        if recipe.tool <= 0:
+            return mask.astype(bool)
+        middle = np.unravel_index(np.argmax(np.hypot(*np.moveaxis(self.field, -1, 0))), mask.shape)
+        tip = np.array([middle[1], middle[0]], float) + share * self.field[middle]
+        for angle, side in ((0.35, -1), (0.75, 1)):
+            normal = np.array([-np.sin(angle), np.cos(angle)])
+            along = np.array([np.cos(angle), np.sin(angle)])
+            start = tip + 0.35 * side * recipe.tool * normal
+            end = start + 2 * recipe.size * along
+            sharp = 0.5 * recipe.tool * normal
+            outline = np.array([start - 0.5 * sharp, start + 0.5 * sharp, end + sharp, end - sharp])
+            cv2.fillConvexPoly(mask, np.round(outline * 16).astype(np.int32), 1, shift=4)
+        return mask.astype(bool)
+
+    def _sense(self, picture: Floats, rng: np.random.Generator) -> Rgb:
+        noisy = 255 * picture + rng.normal(0, max(self.recipe.noise, 0), picture.shape)
+        return np.clip(np.round(noisy), 0, 255).astype(np.uint8)
+
+
+def pairs(recipe: Recipe, count: int, seed: int, photo: Rgb | None = None) -> Iterator[Pair]:
+    """`count` independent pairs: other surfaces, other directions of pull, `photo` cropped elsewhere."""
+    for rng in (np.random.default_rng(child) for child in np.random.SeedSequence(seed).spawn(count)):
+        turned = replace(recipe, direction=float(rng.uniform(0, 2 * np.pi)))
+        crop = None if photo is None else _crop(photo, rng)
+        yield Stage.set(turned, rng, crop).pair(1.0, rng)
+
+
+def _crop(photo: Rgb, rng: np.random.Generator) -> Rgb:
+    """A square of the photograph's middle, where the cortex is."""
+    height, width = photo.shape[:2]
+    side = int(0.36 * height)
+    top = int(rng.uniform(0.30, 0.84 - side / height) * height)
+    left = int(rng.uniform(0.30, 0.66 - side / width) * width)
+    return photo[top : top + side, left : left + side]
+
+
+def _metal(shape: tuple[int, int]) -> Floats:
+    """Brushed steel, (H, W, 3) in 0..1: bright lines along the branches would be easy; this is dull grey."""
+    y, x = np.mgrid[: shape[0], : shape[1]].astype(np.float32)
+    sheen = 0.32 + 0.12 * np.sin(0.35 * (y - 0.6 * x)) + 0.05 * np.sin(0.11 * (x + y))
+    return np.asarray(sheen[..., None] * np.array([0.95, 1.0, 1.05]), np.float32)

@@ -1,0 +1,95 @@
+"""OpenCV's estimators behind our protocol: contrast-normalised pictures, masked pixels filled from around."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+
+from synth.flow import image
+from synth.flow.estimator import Flags, Flow, Map, Rgb
+
+_GREY_PER_DEVIATION = 32.0  # normalised contrast of +-4 deviations spans 8 bits
+_RESIDUAL = 0.6  # in local deviations: where two aligned pictures differ by more they don't match
+_SMALLEST = 16  # OpenCV's estimators want some pixels to build a pyramid from
+_cv2: Any = cv2  # its type stubs leave out the contributed modules
+
+
+class OpenCvTvl1:
+    """TV-L1 of Zach, Pock and Bischof (2007) as OpenCV ships it, with the settings that suit cortex.
+
+    OpenCV's default pyramid (step 0.8, 5 levels) is too shallow for a 10 px pull, and it silently ignores an
+    initial flow unless `useInitialFlow` is set.
+    """
+
+    def __init__(self, weight: float = 0.1, warps: int = 3, levels: int = 5) -> None:
+        self.weight, self.warps, self.levels = weight, warps, levels
+
+    def flow(
+        self, rest: Rgb, now: Rgb, rest_usable: Flags, now_usable: Flags, initial: Flow | None = None
+    ) -> tuple[Flow, Map]:
+        """See `Estimator.flow`."""
+        solver = _cv2.optflow.DualTVL1OpticalFlow_create(
+            tau=0.25,
+            lambda_=self.weight,
+            theta=0.3,
+            nscales=self.levels,
+            warps=self.warps,
+            epsilon=0.01,
+            innnerIterations=10,
+            outerIterations=1,
+            scaleStep=0.5,
+            gamma=0.0,
+            medianFiltering=5,
+            useInitialFlow=initial is not None,
+        )
+        return _solve(solver, rest, now, rest_usable, now_usable, initial)
+
+
+class Dis:
+    """Dense inverse search, Kroeger et al. (2016), OpenCV's medium preset: fast, less sharp."""
+
+    def flow(
+        self, rest: Rgb, now: Rgb, rest_usable: Flags, now_usable: Flags, initial: Flow | None = None
+    ) -> tuple[Flow, Map]:
+        """See `Estimator.flow`."""
+        solver = _cv2.DISOpticalFlow_create(_cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+        return _solve(solver, rest, now, rest_usable, now_usable, initial)
+
+
+def _solve(
+    solver: Any, rest: Rgb, now: Rgb, rest_usable: Flags, now_usable: Flags, initial: Flow | None
+) -> tuple[Flow, Map]:
+    height, width = rest_usable.shape
+    before, after = _prepare(rest, rest_usable), _prepare(now, now_usable)
+    start = np.zeros((height, width, 2), np.float32) if initial is None else initial.astype(np.float32)
+    if min(height, width) < _SMALLEST:
+        # Mirrored up to a size that has a pyramid; the answer is cut out again.
+        spare = ((0, max(0, _SMALLEST - height)), (0, max(0, _SMALLEST - width)))
+        before, after = np.pad(before, spare, "symmetric"), np.pad(after, spare, "symmetric")
+        start = np.pad(start, (*spare, (0, 0)), "edge")
+    found = solver.calc(before, after, start)[:height, :width]
+    flow = np.where(np.isfinite(found), found, 0).astype(np.float32)
+    return flow, _confidence(flow, before[:height, :width], after[:height, :width], rest_usable, now_usable)
+
+
+def _prepare(picture: Rgb, usable: Flags) -> Rgb:
+    """Contrast-normalised, filled, (H, W) uint8 about 128."""
+    known = image.flags(usable)
+    contrast = image.normalise(image.tensor(picture), known)
+    filled = image.fill(contrast, known)[0, 0].numpy()
+    return np.clip(np.round(128 + _GREY_PER_DEVIATION * filled), 0, 255).astype(np.uint8)
+
+
+def _confidence(flow: Flow, before: Rgb, after: Rgb, rest_usable: Flags, now_usable: Flags) -> Map:
+    """Whether the point is seen in both pictures, times how well they agree once aligned; (H, W) in 0..1."""
+    height, width = rest_usable.shape
+    x = np.arange(width, dtype=np.float32) + flow[..., 0]
+    y = np.arange(height, dtype=np.float32)[:, None] + flow[..., 1]
+    seen = cv2.remap(now_usable.astype(np.float32), x, y, cv2.INTER_LINEAR, borderValue=0) * rest_usable
+    aligned = cv2.remap(after.astype(np.float32), x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    difference = cv2.GaussianBlur(((aligned - before) * seen / _GREY_PER_DEVIATION) ** 2, (0, 0), 2.0)
+    share = cv2.GaussianBlur(seen, (0, 0), 2.0)
+    residual = difference / np.maximum(share, 1e-3)
+    return np.asarray(seen * np.exp(-residual / _RESIDUAL**2), np.float32)

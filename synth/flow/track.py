@@ -1,0 +1,86 @@
+"""Displacement through a whole video: always from the rest frame, each frame starting from the one before."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from synth.errors import UserError
+from synth.flow.estimator import Estimator, Flags, Flow, Map, Rgb, create
+
+
+@dataclass(frozen=True)
+class Track:
+    """Recovered displacement of a sequence."""
+
+    flow: NDArray[np.float32]
+    """(T, H, W, 2) px, rest frame to frame t, on the rest frame's pixels; 0 outside the tissue."""
+    confidence: NDArray[np.float32]
+    """(T, H, W) in 0..1; 0 outside the tissue."""
+
+
+class Tracker:
+    """Frames in, displacement from the rest frame out, one at a time, for streams as for recordings.
+
+    Rest to now, never frame to frame: errors of small steps add up (0.8 px after 60 frames), those of one
+    long step don't.
+    """
+
+    def __init__(self, backend: str | Estimator, rest: Rgb, rest_blocked: Flags, tissue: Flags) -> None:
+        """Starts at rest.
+
+        Args:
+            backend: an estimator or its name.
+            rest: the rest frame, (H, W, 3) uint8.
+            rest_blocked: (H, W), tool and glare in it.
+            tissue: (H, W), where there is tissue to follow.
+
+        Raises:
+            UserError: no such estimator, or shapes that don't fit.
+        """
+        if rest.shape[:2] != tissue.shape or rest_blocked.shape != tissue.shape:
+            raise UserError(
+                f"flow: rest frame {rest.shape[:2]}, masks {rest_blocked.shape}, {tissue.shape} differ"
+            )
+        self.estimator = create(backend) if isinstance(backend, str) else backend
+        self.rest, self.tissue = rest, tissue
+        self.usable = tissue & ~rest_blocked
+        self._last: Flow | None = None
+
+    def step(self, frame: Rgb, blocked: Flags) -> tuple[Flow, Map]:
+        """Flow (H, W, 2) px and confidence (H, W) of the next frame.
+
+        Args:
+            frame: (H, W, 3) uint8.
+            blocked: (H, W), tool and glare in it.
+        """
+        if frame.shape != self.rest.shape or blocked.shape != self.tissue.shape:
+            raise UserError(f"flow: frame {frame.shape} does not fit the rest frame {self.rest.shape}")
+        flow, confidence = self.estimator.flow(self.rest, frame, self.usable, ~blocked, self._last)
+        self._last = flow
+        return flow * self.tissue[..., None], confidence * self.tissue
+
+
+def track(backend: str, frames: NDArray[np.uint8], blocked: NDArray[np.bool_], tissue: Flags) -> Track:
+    """Displacement of a recorded sequence; frame 0 is the rest frame.
+
+    Args:
+        backend: name of an estimator; `ideal` computes nothing and is no estimator.
+        frames: (T, H, W, 3) uint8.
+        blocked: (T, H, W), tool and glare.
+        tissue: (H, W).
+
+    Raises:
+        UserError: no such estimator, no frames, or shapes that don't fit.
+    """
+    if len(frames) == 0 or len(frames) != len(blocked):
+        raise UserError(f"flow: {len(frames)} frames with {len(blocked)} masks")
+    tracker = Tracker(backend, frames[0], blocked[0], tissue)
+    flow = np.zeros((*frames.shape[:3], 2), np.float32)
+    confidence = np.zeros(frames.shape[:3], np.float32)
+    confidence[0] = tracker.usable
+    for t in range(1, len(frames)):
+        flow[t], confidence[t] = tracker.step(frames[t], blocked[t])
+    return Track(flow, confidence)
