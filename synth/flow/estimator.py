@@ -46,7 +46,6 @@ class Estimator(Protocol):
 
 
 _OWN = {
-    "tvl1": ("synth.flow.tvl1", "Tvl1"),
     "opencv-tvl1": ("synth.flow.opencv", "OpenCvTvl1"),
     "dis": ("synth.flow.opencv", "Dis"),
 }
