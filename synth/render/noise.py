@@ -1,0 +1,78 @@
+"""Band-limited noise on square maps, and reading maps between their pixels.
+
+A map covers the square [-extent/2, extent/2]^2 of the world's x, y: rows go with y, columns with x, and the
+centre of the first pixel lies half a pixel inside the corner.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+Map = npt.NDArray[np.float32]
+Floats = npt.NDArray[np.float64]
+
+
+def band(rng: np.random.Generator, pixels: int, extent_mm: float, wavelength_mm: float, width: float) -> Map:
+    """Isotropic noise about one wavelength; zero mean, unit variance.
+
+    Args:
+        rng: where the noise comes from.
+        pixels: side of the map.
+        extent_mm: side of the square.
+        wavelength_mm: centre of the band.
+        width: half width of the band as a share of its centre frequency.
+
+    Returns:
+        (pixels, pixels) float32.
+    """
+    rows = np.fft.fftfreq(pixels, extent_mm / pixels)
+    columns = np.fft.rfftfreq(pixels, extent_mm / pixels)
+    frequency = np.hypot(rows[:, None], columns[None])
+    gain = np.exp(-0.5 * ((frequency * wavelength_mm - 1) / width) ** 2)
+    gain[0, 0] = 0.0
+    return _filtered(rng, pixels, gain)
+
+
+def fractal(rng: np.random.Generator, pixels: int, extent_mm: float, longest_mm: float, slope: float) -> Map:
+    """Noise of amplitude spectrum ~ 1/f^slope below `longest_mm`; zero mean, unit variance, float32."""
+    rows = np.fft.fftfreq(pixels, extent_mm / pixels)
+    columns = np.fft.rfftfreq(pixels, extent_mm / pixels)
+    frequency = np.hypot(rows[:, None], columns[None])
+    gain = (frequency**2 + longest_mm**-2) ** (-0.5 * slope)
+    gain[0, 0] = 0.0
+    return _filtered(rng, pixels, gain)
+
+
+def blur(image: Map, sigma_mm: float, extent_mm: float) -> Map:
+    """Gaussian blur of a map (n, n) or (n, n, c) by a width in mm."""
+    sigma = sigma_mm * image.shape[0] / extent_mm
+    # Wide kernels are dear; the blurred picture carries no detail that a smaller one would lose.
+    if sigma > 12:
+        side = max(32, int(image.shape[0] * 6 / sigma))
+        small = cv2.resize(image, (side, side), interpolation=cv2.INTER_AREA)
+        small = cv2.GaussianBlur(small, (0, 0), sigma * side / image.shape[0], borderType=cv2.BORDER_REFLECT)
+        return np.asarray(cv2.resize(small, image.shape[1::-1], interpolation=cv2.INTER_CUBIC), np.float32)
+    return np.asarray(cv2.GaussianBlur(image, (0, 0), sigma, borderType=cv2.BORDER_REFLECT), np.float32)
+
+
+def sample(image: Map, xy: Floats, extent_mm: float) -> npt.NDArray[np.float32]:
+    """Map (n, n) or (n, n, c) at world x, y (N, 2) mm, bilinear, held at the border: (N,) or (N, c)."""
+    pixel = ((xy / extent_mm + 0.5) * image.shape[0] - 0.5).astype(np.float32)
+    width = 32_000  # cv2.remap takes pictures no longer than a short integer
+    padding = -len(pixel) % width
+    grid = np.pad(pixel, ((0, padding), (0, 0))).reshape(-1, width, 2)
+    read = cv2.remap(image, grid, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(read, np.float32).reshape(-1, *image.shape[2:])[: len(pixel)]
+
+
+def centres(pixels: int, extent_mm: float) -> npt.NDArray[np.float32]:
+    """World coordinate of the centres of a map's columns (or rows), (pixels,) mm."""
+    return (((np.arange(pixels) + 0.5) / pixels - 0.5) * extent_mm).astype(np.float32)
+
+
+def _filtered(rng: np.random.Generator, pixels: int, gain: Floats) -> Map:
+    white = rng.standard_normal((pixels, pixels), dtype=np.float32)
+    noise = np.fft.irfft2(np.fft.rfft2(white) * gain, s=(pixels, pixels))
+    return ((noise - noise.mean()) / noise.std()).astype(np.float32)
