@@ -1,4 +1,4 @@
-"""Reading a job: a YAML file or a named job plus `a.b=c` overrides; every mistake is reported at its place."""
+"""Reading a job: a YAML file or a named job plus `a.b=c` overrides; each mistake is reported at its place."""
 
 from __future__ import annotations
 

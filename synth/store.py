@@ -27,6 +27,9 @@ FORMAT_VERSION = 1
 # Raw bytes of one field that are held back and then written as one file: a shard, its chunks being frames.
 _SHARD_BYTES = 16 << 20
 
+# Vector fields whose greatest length is kept as an attribute, in `summary`.
+_PEAKS = {"flow": "peak_flow_px", "traction": "peak_traction_kpa", "force": "peak_force_mn"}
+
 # What may differ between two runs that gave the same sequence.
 _NOT_CONTENT = {"timings", "versions", "content_hash", "seal_hash"}
 
@@ -113,7 +116,14 @@ class Writer:
         hashes = {name: self._columns[name].digest() for name in FIELDS if name in self._columns}
         if self._exr_frames:
             hashes["radiance"] = self._exr_hash.hexdigest()
-        attrs = {**self._own, **attributes, "field_hashes": hashes, "versions": versions.of_everything()}
+        summary = {key: self._columns[name].largest for name, key in _PEAKS.items()}
+        attrs = {
+            **self._own,
+            **attributes,
+            "summary": summary,
+            "field_hashes": hashes,
+            "versions": versions.of_everything(),
+        }
         attrs = json.loads(identity.canonical(attrs))
         attrs["content_hash"] = content_hash(attrs)
         attrs["seal_hash"] = seal_hash(attrs)
@@ -134,6 +144,7 @@ class _Column:
         self._field, self.shape, self.filled = field, shape, 0
         self._hash = field_hasher(field, shape)
         self._held: list[NDArray[Any]] = []
+        self.largest = 0.0
         dtype = np.dtype(field.dtype)
         chunk, shard = shape, None
         if field.framed:
@@ -164,7 +175,7 @@ class _Column:
         if t != self.filled:
             raise ValueError(f"{self._field.name}: frame {t} after {self.filled} frames")
         checked = self._checked(frame, self.shape[1:], f", frame {t}")
-        self._hash.update(checked.data)
+        self._see(checked)
         self._held.append(checked)
         self.filled += 1
         if len(self._held) == self._together or self.filled == self.shape[0]:
@@ -173,12 +184,18 @@ class _Column:
 
     def whole(self, array: NDArray[Any]) -> None:
         checked = self._checked(array, self.shape, "")
-        self._hash.update(checked.data)
+        self._see(checked)
         self._array[...] = checked
         self.filled = self.shape[0]
 
     def digest(self) -> str:
         return self._hash.hexdigest()
+
+    def _see(self, values: NDArray[Any]) -> None:
+        self._hash.update(values.data)
+        if self._field.name in _PEAKS:
+            squared = np.einsum("...k,...k->...", values, values)
+            self.largest = max(self.largest, float(np.sqrt(squared.max())))
 
     def _checked(self, array: NDArray[Any], shape: tuple[int, ...], where: str) -> NDArray[Any]:
         name, dtype = self._field.name, np.dtype(self._field.dtype)

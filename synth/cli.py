@@ -1,0 +1,101 @@
+"""The `synth` command. Heavy imports are inside the commands, so that `synth --help` answers at once."""
+
+from __future__ import annotations
+
+import json as json_
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from synth.commands import Commands
+
+app = typer.Typer(
+    name="synth",
+    cls=Commands,
+    help="Surgical-microscope sequences of a brain surface under load, with exact force and motion.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+
+Out = Annotated[Path, typer.Argument(help="A dataset's folder.")]
+Json = Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")]
+
+
+@app.command()
+def new(path: Annotated[Path, typer.Argument(help="The job file to write.")] = Path("job.yaml")) -> None:
+    """Writes a job file in which every key is explained."""
+    from synth import jobfile
+    from synth.errors import UserError
+
+    if path.exists():
+        raise UserError(f"{path}: exists already")
+    try:
+        path.write_text(jobfile.commented(), "utf-8")
+    except OSError as error:
+        raise UserError(f"{path}: cannot be written ({error.strerror})") from error
+    print(f"wrote {path}; render it with: synth render {path} -o out")
+
+
+@app.command()
+def schema() -> None:
+    """Prints the JSON schema of job files, for editors."""
+    from synth import jobfile
+
+    print(json_.dumps(jobfile.schema(), indent=2))
+
+
+@app.command()
+def render(
+    job: Annotated[str, typer.Argument(help="A job file, or a named job: tiny, demo, paper.")],
+    overrides: Annotated[
+        list[str] | None, typer.Argument(help="Changes to the job, as section.key=value.")
+    ] = None,
+    out: Annotated[
+        Path, typer.Option("--out", "-o", help="The dataset's folder; an unfinished one is continued.")
+    ] = Path("out"),
+    workers: Annotated[
+        int | None, typer.Option(min=1, help="Processes at a time; one a core if not given.")
+    ] = None,
+    memory: Annotated[
+        float | None, typer.Option(help="Memory that a process may take [GB]; a share of what is free.")
+    ] = None,
+    json: Json = False,
+) -> None:
+    """Renders the dataset of a job. Exit code 1 when some of its sequences failed."""
+    from synth import config, engine
+    from synth.progress import Bars
+
+    read = config.load(job, overrides or [])
+    with Bars() as bars:
+        summary = engine.run(read, out, engine.Options(workers=workers, memory_gb=memory), bars)
+    if json:
+        print(json_.dumps({**vars(summary), "out": str(out)}))
+    else:
+        print(f"{summary.already + summary.done} of {summary.total} sequences in {out}")
+        for index, reason in summary.failed.items():
+            print(f"  {index:06d} failed: {reason}", file=sys.stderr)
+    if summary.failed:
+        raise typer.Exit(1)
+
+
+@app.command()
+def retry(out: Out, workers: Annotated[int | None, typer.Option(min=1)] = None, json: Json = False) -> None:
+    """Takes up the sequences that failed, and all that are missing."""
+    from synth import engine
+    from synth.folder import Folder
+    from synth.progress import Bars
+
+    folder = Folder(out)
+    job = folder.job()
+    forgiven = folder.forgive()
+    with Bars() as bars:
+        summary = engine.run(job, out, engine.Options(workers=workers), bars)
+    if json:
+        print(json_.dumps({**vars(summary), "retried": forgiven, "out": str(out)}))
+    else:
+        print(f"{len(forgiven)} retried; {summary.already + summary.done} of {summary.total} are there")
+    if summary.failed:
+        raise typer.Exit(1)

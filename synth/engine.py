@@ -1,0 +1,230 @@
+"""Running a job on this machine: sequences handed to worker processes, none lost, order without effect."""
+
+from __future__ import annotations
+
+import os
+import queue
+import threading
+from collections import deque
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Protocol
+
+from synth import index, preview
+from synth.child import Attempt, Child, Setup
+from synth.errors import UserError
+from synth.folder import Folder, claim
+from synth.job import Job
+
+_TRIES = 3
+# A process that has computed so many is replaced: libraries leak a little with every sequence.
+_RECYCLE = 16
+# So many first sequences failing on the job's own account, and none succeeding, condemn the job.
+_VERDICT = 5
+
+
+@dataclass(frozen=True)
+class Options:
+    """How to run; none of it changes a byte of the dataset."""
+
+    workers: int | None = None
+    """Processes at a time; default one a core."""
+    memory_gb: float | None = None
+    """Memory that one process may take; default what is available now, shared out."""
+    stall_s: float = 1800.0
+    """Patience with a process that reports nothing."""
+    work: str = "synth.pipeline:render_sequence"
+    """`module:function` that computes one sequence."""
+    environment: Mapping[str, str] = field(default_factory=dict)
+    """Added to the environment of the workers."""
+
+
+@dataclass(frozen=True)
+class Summary:
+    """The end of a run."""
+
+    total: int
+    already: int
+    """Sequences that were finished before."""
+    done: int
+    """Sequences finished by this run."""
+    failed: dict[int, str]
+    """Reason of every failed sequence, of this run and of earlier ones."""
+    content_hash: str
+    """Hash of the content hashes of all finished sequences in order."""
+
+
+class Watcher(Protocol):
+    """Told what happens, from the main thread only."""
+
+    def begin(self, total: int, already: int, failed: int) -> None: ...
+    def stage(self, index: int, stage: str, done: int, of: int) -> None: ...
+    def end(self, attempt: Attempt, again: bool) -> None: ...
+
+
+def run(job: Job, root: Path, options: Options, watcher: Watcher) -> Summary:
+    """Computes the sequences of `job` that `root` lacks.
+
+    Raises:
+        UserError: the folder is not for this job, the disk is full, or the job cannot be carried out at all
+            (then nothing is left behind).
+        KeyboardInterrupt: after the workers are ended; what is sealed stays, the next run goes on.
+    """
+    workers = options.workers or len(os.sched_getaffinity(0))
+    with claim(root, job) as folder:
+        finished, failures = set(folder.sealed()), folder.failures()
+        todo = [k for k in range(job.sequences) if k not in finished and k not in failures]
+        watcher.begin(job.sequences, len(finished), len(failures))
+        setup = Setup(
+            job=job.model_dump(mode="json"),
+            folder=root,
+            logs=folder.logs,
+            work=options.work,
+            memory_bytes=_share_of_memory(options, workers),
+            stall_s=options.stall_s,
+            keep_open=(folder.lock_fd,),
+            environment={"SULCUS_THREADS": str(_share_of_cores(workers)), **options.environment},
+        )
+        try:
+            done = _Pool(folder, setup, todo, min(workers, max(len(todo), 1))).work(watcher)
+        except BaseException:
+            index.write(folder)
+            raise
+        rows = index.write(folder)
+        if done or not preview.path(root).exists():
+            preview.write(root)
+        return Summary(
+            total=job.sequences,
+            already=len(finished),
+            done=done,
+            failed={key: failure["reason"] for key, failure in folder.failures().items()},
+            content_hash=index.dataset_hash(rows),
+        )
+
+
+class _Pool:
+    """Worker threads, each with a process of its own, and the queue that they take sequences from."""
+
+    def __init__(self, folder: Folder, setup: Setup, todo: list[int], workers: int) -> None:
+        self._folder, self._setup, self._workers = folder, setup, workers
+        self._todo = deque((k, 1) for k in todo)
+        self._busy = 0
+        self._change = threading.Condition()
+        self._stop = threading.Event()
+        self._events: queue.SimpleQueue[Callable[[Watcher], None] | BaseException | None] = (
+            queue.SimpleQueue()
+        )
+        self._done = 0
+        self._refused: list[Attempt] = []
+
+    def work(self, watcher: Watcher) -> int:
+        """Runs until nothing is left to do; returns how many were finished."""
+        threads = [threading.Thread(target=self._thread, daemon=True) for _ in range(self._workers)]
+        for thread in threads:
+            thread.start()
+        try:
+            alive = len(threads)
+            while alive:
+                event = self._events.get()
+                if event is None:
+                    alive -= 1
+                elif isinstance(event, BaseException):
+                    raise event
+                else:
+                    event(watcher)
+        finally:
+            self._stop.set()
+            with self._change:
+                self._change.notify_all()
+            for thread in threads:
+                thread.join()
+            self._folder.sweep_all()
+        return self._done
+
+    def _thread(self) -> None:
+        child: Child | None = None
+        try:
+            while (task := self._take()) is not None:
+                child = child or Child(self._setup)
+                attempt = child.run(task[0], self._reporter(task[0]), self._stop)
+                worn = child.finished >= _RECYCLE
+                if attempt.kind not in ("done", "input") or worn:
+                    child.close()
+                    child = None
+                self._settle(attempt, task[1])
+        except BaseException as error:
+            self._events.put(error)
+        finally:
+            if child is not None:
+                child.close()
+            self._events.put(None)
+
+    def _take(self) -> tuple[int, int] | None:
+        """The next (sequence, try); waits while others may still give one back; None at the end."""
+        with self._change:
+            while not self._stop.is_set():
+                if self._todo:
+                    self._busy += 1
+                    return self._todo.popleft()
+                if not self._busy:
+                    return None
+                self._change.wait()
+            return None
+
+    def _settle(self, attempt: Attempt, tries: int) -> None:
+        again = False
+        if attempt.kind == "done":
+            self._done += 1
+        elif attempt.kind == "disk":
+            raise UserError(f"{self._folder.root}: cannot be written ({attempt.reason})")
+        elif attempt.kind != "stopped":
+            again = attempt.kind != "input" and tries < _TRIES
+            if again:
+                self._folder.sweep(attempt.index)
+            else:
+                self._fail(attempt, tries)
+        with self._change:
+            if again:
+                self._todo.append((attempt.index, tries + 1))
+            self._busy -= 1
+            self._change.notify_all()
+        self._events.put(lambda watcher: watcher.end(attempt, again))
+
+    def _fail(self, attempt: Attempt, tries: int) -> None:
+        self._folder.mark_failed(
+            attempt.index, kind=attempt.kind, reason=attempt.reason, tries=tries, log=attempt.log
+        )
+        if attempt.kind != "input":
+            return
+        with self._change:
+            self._refused.append(attempt)
+            left = self._done + len(self._todo) + self._busy - 1
+            hopeless = not self._done and (len(self._refused) >= _VERDICT or not left)
+        if hopeless and not self._folder.sealed():
+            # The job itself is at fault: nothing of it is kept.
+            for refused in self._refused:
+                (self._folder.state / "failed" / f"{refused.index:06d}.json").unlink(missing_ok=True)
+            reasons = sorted({refused.reason for refused in self._refused})
+            raise UserError("\n".join(reasons))
+
+    def _reporter(self, key: int) -> Callable[[str, int, int], None]:
+        def report(stage: str, done: int, of: int) -> None:
+            self._events.put(lambda watcher: watcher.stage(key, stage, done, of))
+
+        return report
+
+
+def _share_of_cores(workers: int) -> int:
+    return max(1, len(os.sched_getaffinity(0)) // workers)
+
+
+def _share_of_memory(options: Options, workers: int) -> int | None:
+    if options.memory_gb is not None:
+        return int(options.memory_gb * 1e9)
+    try:
+        lines = Path("/proc/meminfo").read_text().splitlines()
+    except OSError:  # a system without /proc: its own limits must do
+        return None
+    fields = dict(line.split(":") for line in lines)
+    return int(0.9 * int(fields["MemAvailable"].split()[0]) * 1024 / workers)

@@ -1,0 +1,107 @@
+"""Progress of a run on the terminal: what is being done, how far it is, how long it will take."""
+
+from __future__ import annotations
+
+import sys
+import time
+from types import TracebackType
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TaskID, TextColumn
+from rich.text import Text
+
+from synth.child import Attempt
+
+# Without a terminal a line is printed at most so often.
+_QUIET_S = 10.0
+
+
+class _Eta(ProgressColumn):
+    """Time spent, and for the whole run the time left, at the rate of this run."""
+
+    def render(self, task: Task) -> Text:
+        spent = clock(task.elapsed or 0.0)
+        left = task.fields.get("left_s")
+        return Text(f"{spent}" + (f", {clock(left)} left" if left is not None else ""), style="cyan")
+
+
+class Bars:
+    """A bar for the dataset and one for every sequence in work; plain lines where there is no terminal."""
+
+    def __init__(self) -> None:
+        console = Console(stderr=True)
+        self._live = console.is_terminal
+        self._bars = Progress(
+            TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), _Eta(), console=console
+        )
+        self._tasks: dict[int, TaskID] = {}
+        self._whole = self._bars.add_task("sequences", total=None, start=True)
+        self._started = self._said = time.monotonic()
+        self._total = self._already = self._finished = 0
+
+    def __enter__(self) -> Bars:
+        if self._live:
+            self._bars.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._live:
+            self._bars.stop()
+
+    def begin(self, total: int, already: int, failed: int) -> None:
+        self._total, self._already = total, already + failed
+        self._bars.update(self._whole, total=total, completed=self._already)
+        if already or failed:
+            self._say(f"{already} of {total} sequences are there already" + _failed(failed))
+
+    def stage(self, index: int, stage: str, done: int, of: int) -> None:
+        if index not in self._tasks:
+            self._tasks[index] = self._bars.add_task("", total=of)
+        self._bars.update(
+            self._tasks[index], description=f"  {index:06d} {stage}", completed=done, total=max(of, 1)
+        )
+
+    def end(self, attempt: Attempt, again: bool) -> None:
+        task = self._tasks.pop(attempt.index, None)
+        if task is not None:
+            self._bars.remove_task(task)
+        if attempt.kind == "stopped":
+            return
+        if attempt.kind != "done":
+            what = "is tried again" if again else "failed"
+            self._say(f"sequence {attempt.index:06d} {what}: {attempt.reason}")
+        if again:
+            return
+        self._finished += 1
+        spent = time.monotonic() - self._started
+        done = self._already + self._finished
+        left = spent / self._finished * (self._total - done)
+        self._bars.update(self._whole, completed=done, left_s=left)
+        quiet = time.monotonic() - self._said < _QUIET_S and done < self._total
+        if not self._live and not quiet:
+            self._said = time.monotonic()
+            self._say(f"{done} of {self._total} sequences, {clock(spent)} spent, {clock(left)} left")
+
+    def _say(self, text: str) -> None:
+        if self._live:
+            self._bars.console.print(text, highlight=False, markup=False)
+        else:
+            print(text, file=sys.stderr, flush=True)
+
+
+def clock(seconds: float) -> str:
+    """9 s, 2:05 min, 3:20 h, 4.2 days."""
+    whole = round(seconds)
+    if whole < 60:
+        return f"{whole} s"
+    if whole < 3600:
+        return f"{whole // 60}:{whole % 60:02d} min"
+    if whole < 86400:
+        return f"{whole // 3600}:{whole % 3600 // 60:02d} h"
+    return f"{seconds / 86400:.1f} days"
+
+
+def _failed(count: int) -> str:
+    return f", {count} failed (`synth retry` takes them up again)" if count else ""
