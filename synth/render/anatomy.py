@@ -79,7 +79,9 @@ def procedural(relief: Relief, anatomy: job.Anatomy) -> Surface:
     )
 
 
-def from_brain(vertices: Floats, faces: npt.NDArray[np.int32], relief: Relief, anatomy: job.Anatomy) -> Surface:
+def from_brain(
+    vertices: Floats, faces: npt.NDArray[np.int32], relief: Relief, anatomy: job.Anatomy
+) -> Surface:
     """The part of a user's brain under the opening, seen from outside.
 
     Args:

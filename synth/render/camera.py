@@ -145,8 +145,10 @@ def undistort(flat: Floats, distortion: Floats) -> Floats:
             return guess
         a, b, c, d = _slope(guess, distortion)
         determinant = a * d - b * c
-        guess = guess - np.stack([d * error[:, 0] - b * error[:, 1], a * error[:, 1] - c * error[:, 0]], 1) / (
-            determinant[:, None]
+        guess = (
+            guess
+            - np.stack([d * error[:, 0] - b * error[:, 1], a * error[:, 1] - c * error[:, 0]], 1)
+            / (determinant[:, None])
         )
     if not np.abs(_distort(guess, distortion) - flat).max() < 1e-9:
         raise UserError("render.distortion: this distortion folds the picture over itself")

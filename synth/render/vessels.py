@@ -52,7 +52,9 @@ def grow_all(sulci: Map, extent_mm: float, rng: np.random.Generator) -> Vessels:
         extent_mm: side of the square that the map covers.
         rng: where the anatomy comes from.
     """
-    vein_roots, vein_radius = _trunks(sulci, extent_mm, rng, count=int(rng.integers(2, 4)), radius=(0.32, 0.62))
+    vein_roots, vein_radius = _trunks(
+        sulci, extent_mm, rng, count=int(rng.integers(2, 4)), radius=(0.32, 0.62)
+    )
     veins = _tree(sulci, extent_mm, rng, vein_roots, spacing=3.2, leaf=0.13, wander=0.5)
     veins = _widen(veins, vein_radius)
     roots, radius = _trunks(sulci, extent_mm, rng, count=int(rng.integers(3, 6)), radius=(0.13, 0.22))
@@ -258,7 +260,9 @@ def _web(arteries: Tree, extent_mm: float, rng: np.random.Generator) -> Tree:
     # Only the twigs: their roots sit on arteries, which are drawn on their own.
     local = np.full(len(nodes), -1, np.int64)
     local[new] = np.arange(len(new))
-    return Tree(nodes[new], np.where(parent[new] >= fixed, local[parent[new]], -1), np.minimum(own[new], 0.05))
+    return Tree(
+        nodes[new], np.where(parent[new] >= fixed, local[parent[new]], -1), np.minimum(own[new], 0.05)
+    )
 
 
 def _widen(tree: Tree, trunk: Floats) -> Tree:

@@ -1,0 +1,191 @@
+"""The studio: one surface under the microscope, moved frame by frame; pictures and their truth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from synth.job import Job
+from synth.render import instrument, light, noise, rim, sensor, texture, truth
+from synth.render.anatomy import Surface
+from synth.render.camera import Camera
+from synth.render.look import Look
+from synth.render.mitsuba_adapter import Body, Metal, Stage, Wet, pick
+from synth.render.truth import Still
+
+__all__ = ["Look", "Shot", "Still", "Studio"]
+
+Floats = npt.NDArray[np.float64]
+Map = npt.NDArray[np.float32]
+Mask = npt.NDArray[np.bool_]
+
+_STEEL = Metal(reflectance=(0.86, 0.85, 0.83), along=0.34, across=0.16)
+_RIM_ROUGHNESS = 0.11
+_GLARE = 0.35  # specular radiance, as a share of full scale, that hides what is under it
+
+
+@dataclass(frozen=True)
+class Shot:
+    """One frame and its truth."""
+
+    rgb: npt.NDArray[np.uint8]
+    """(H, W, 3) sRGB."""
+    radiance: Map
+    """(H, W, 3) linear, before the sensor."""
+    flow: Map
+    """(H, W, 2) px from the rest frame to this one, at rest pixels; 0 off the tissue."""
+    visible: Mask
+    """(H, W) the rest pixel's material point is seen in this frame."""
+    depth: Map
+    """(H, W) mm along the optical axis; 0 where there is nothing."""
+    tool: Mask
+    """(H, W) this frame's pixels."""
+    glare: Mask
+    """(H, W) this frame's pixels: a highlight outshines the tissue."""
+
+
+class Studio:
+    """One scene. Every frame is a function of its arguments alone.
+
+    Args:
+        surface: the cortex at rest.
+        look: its appearance.
+        camera: the microscope.
+        job: render settings, opening and photograph.
+
+    Raises:
+        UserError: the variant cannot run here, or the photograph cannot be read.
+    """
+
+    def __init__(self, surface: Surface, look: Look, camera: Camera, job: Job) -> None:
+        self.variant = pick(job.render.variant)
+        self._surface, self._look, self._camera, self._render = surface, look, camera, job.render
+        self._rim = rim.build(surface, job.anatomy.craniotomy.radius_mm, look)
+        self._coat = texture.cortex(
+            surface,
+            look,
+            texture.resolution(surface.extent_mm, camera.mm_per_px),
+            job.appearance.photo,
+        )
+        self.still = truth.still(camera, surface.vertices, surface.faces, self._rim.triangles)
+        self._lamps = light.lamps(camera, look)
+        self._sensor = sensor.Sensor(
+            exposure=look.exposure,
+            white=_balance(look.balance_kelvin),
+            full_well=look.full_well,
+            contrast=look.contrast,
+        )
+        self._tool: instrument.Instrument | None = None
+        self._stage: Stage | None = None
+
+    def frame(self, vertices: Floats, tips: Floats, shafts: Floats, seed: int) -> Shot:
+        """Picture and truth of one frame.
+
+        Args:
+            vertices: (V, 3) mm, the surface in this frame.
+            tips: (K, 3) mm, where the instrument's tines end; K is the same in all frames.
+            shafts: (K, 3) unit vectors from tip to hand.
+            seed: of light paths and sensor noise.
+        """
+        camera, surface = self._camera, self._surface
+        if self._render.tool and self._tool is None:
+            self._tool = instrument.build(len(tips))
+        tool = instrument.pose(self._tool, tips, shafts) if self._tool else np.zeros((0, 3))
+        radiance = self._expose(vertices, tool, seed)
+        triangles = tool[self._tool.faces] if self._tool else np.zeros((0, 3, 3))
+        now = truth.now(camera, self.still, camera, vertices, surface.faces, self._rim.triangles, triangles)
+        rng = np.random.default_rng([seed, 1])
+        return Shot(
+            rgb=sensor.record(radiance, self._sensor, rng),
+            radiance=radiance,
+            flow=now.flow,
+            visible=now.visible,
+            depth=now.depth,
+            tool=now.tool,
+            glare=self._glare(radiance, now, vertices),
+        )
+
+    def traction(self, nodal: Floats) -> Map:
+        """Traction (V, 3) kPa in world axes at rest pixels: (H, W, 3) kPa in camera axes; 0 off the tissue."""
+        return truth.at_rest_pixels(self.still, self._surface.faces, nodal @ self._camera.rotation.T)
+
+    def _expose(self, vertices: Floats, tool: Floats, seed: int) -> Map:
+        if self._stage is None:
+            self._stage = Stage(
+                self.variant,
+                self._camera,
+                self._bodies(vertices, tool),
+                self._lamps,
+                (self._look.ambient,) * 3,
+                self._render.spp,
+            )
+        else:
+            self._stage.move("cortex", vertices)
+            if self._tool:
+                self._stage.move("tool", tool)
+        return self._stage.render(seed)
+
+    def _bodies(self, vertices: Floats, tool: Floats) -> dict[str, Body]:
+        surface, look = self._surface, self._look
+        frame = rim.paint(
+            self._rim, look, texture.resolution(self._rim.extent_mm, 2.2 * self._camera.mm_per_px)
+        )
+        bodies = {
+            "cortex": Body(
+                vertices, surface.faces, surface.uv, Wet(self._coat.albedo, self._coat.normal, look.roughness)
+            ),
+            "rim": Body(
+                self._rim.vertices,
+                self._rim.faces,
+                self._rim.uv,
+                Wet(frame.albedo, frame.normal, _RIM_ROUGHNESS),
+            ),
+        }
+        if self._tool:
+            bodies["tool"] = Body(tool, self._tool.faces, self._tool.uv, _STEEL)
+        return bodies
+
+    def _glare(self, radiance: Map, now: truth.Now, vertices: Floats) -> Mask:
+        """Tissue whose radiance exceeds what its diffuse part could send."""
+        height, width = radiance.shape[:2]
+        faces = self._surface.faces
+        on = (now.hits.face >= 0) & (now.hits.face < len(faces))
+        corners = faces[now.hits.face[on]]
+        bary = now.hits.bary[on]
+        uv = np.einsum("nk,nkc->nc", bary, self._surface.uv[corners].astype(np.float64))
+        albedo = noise.sample(self._coat.albedo, uv - 0.5, 1.0)
+        light_in = np.einsum("nk,nkc->nc", bary, self._irradiance(vertices)[corners])
+        diffuse = (albedo * (light_in + self._look.ambient)).mean(axis=1)
+        excess = radiance.reshape(-1, 3)[on].mean(axis=1) - 1.05 * diffuse
+        glare = np.zeros(height * width, bool)
+        glare[on] = excess * self._look.exposure > _GLARE
+        return glare.reshape(height, width)
+
+    def _irradiance(self, vertices: Floats) -> Floats:
+        """Radiance (V, 3) of a white diffuser at each vertex, unshadowed."""
+        normal = _normals(vertices, self._surface.faces)
+        total = np.zeros((len(vertices), 3))
+        for lamp in self._lamps:
+            towards = lamp.position - vertices
+            distance = np.linalg.norm(towards, axis=1)
+            facing = np.maximum(np.einsum("nc,nc->n", normal, towards) / distance, 0)
+            total += (facing / (np.pi * distance**2))[:, None] * np.asarray(lamp.intensity)
+        return total
+
+
+def _balance(kelvin: float) -> tuple[float, float, float]:
+    gains = 1 / light.blackbody(kelvin)
+    r, g, b = (gains / gains[1]).tolist()
+    return r, g, b
+
+
+def _normals(vertices: Floats, faces: npt.NDArray[np.int32]) -> Floats:
+    corners = vertices[faces]
+    face = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normal = np.stack(
+        [sum(np.bincount(faces[:, k], face[:, axis], len(vertices)) for k in range(3)) for axis in range(3)],
+        1,
+    )
+    return np.asarray(normal / np.linalg.norm(normal, axis=1, keepdims=True))
