@@ -1,0 +1,249 @@
+"""`learn train | eval`: from a rendered dataset to a model, and from a model to honest numbers."""
+
+from __future__ import annotations
+
+import json as json_
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+from synth.errors import UserError
+
+app = typer.Typer(help="Learn force from displacement.", no_args_is_help=True, pretty_exceptions_enable=False)
+_console = Console(stderr=True)
+
+Root = Annotated[Path, typer.Argument(help="Dataset: a folder of NNNNNN.zarr stores.")]
+Cache = Annotated[Path | None, typer.Option(help="Folder for packed arrays; made once, shared by runs.")]
+Threads = Annotated[int | None, typer.Option(help="CPU threads; half the cores if not given.")]
+Json = Annotated[bool, typer.Option("--json", help="Print JSON on stdout instead of a table.")]
+
+
+def main() -> None:
+    """The command: bad input is one line and exit code 2."""
+    with _one_line():
+        app()
+
+
+@contextmanager
+def _one_line() -> Iterator[None]:
+    try:
+        yield
+    except UserError as error:
+        print(f"error: {error}", file=sys.stderr)
+        raise typer.Exit(2) from None
+
+
+@app.command("train")
+def train_command(
+    dataset: Root,
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the model.")] = Path("model"),
+    preset: Annotated[str, typer.Option(help="tiny, cpu, live or paper.")] = "cpu",
+    input: Annotated[str | None, typer.Option(help="ideal, recovered or mixed.")] = None,
+    epochs: Annotated[int | None, typer.Option(help="Passes over the training frames.")] = None,
+    batch: Annotated[int | None, typer.Option(help="Frames a step.")] = None,
+    learning_rate: Annotated[float | None, typer.Option(help="AdamW's learning rate.")] = None,
+    loss: Annotated[str | None, typer.Option(help="antighost, mse, mae, huber or published.")] = None,
+    output: Annotated[str | None, typer.Option(help="magnitude or vector.")] = None,
+    target: Annotated[str | None, typer.Option(help="density or intensity (the paper's map).")] = None,
+    size: Annotated[int | None, typer.Option(help="Grid cells along an edge.")] = None,
+    width: Annotated[int | None, typer.Option(help="Channels of the first level.")] = None,
+    stem: Annotated[int | None, typer.Option(help="Stride of the first convolution: 1, 2 or 4.")] = None,
+    folds: Annotated[
+        int | None, typer.Option(help="Groups of sequences: one is test, one select. 5, or what there is.")
+    ] = None,
+    fold: Annotated[int, typer.Option(help="Which of them is the test.")] = 0,
+    hold_out: Annotated[str | None, typer.Option(help="Appearance family kept for the test.")] = None,
+    stop: Annotated[int | None, typer.Option(help="End after this many epochs without a better one.")] = None,
+    frames: Annotated[int | None, typer.Option(help="Frames a sequence gives an epoch; 0 all.")] = None,
+    precision: Annotated[str | None, typer.Option(help="32-true or bf16-mixed.")] = None,
+    seed: Annotated[int, typer.Option(help="Root of all random draws.")] = 0,
+    accelerator: Annotated[str, typer.Option(help="cpu, cuda or auto.")] = "auto",
+    devices: Annotated[int, typer.Option(help="GPUs; under torchrun the number of processes.")] = 1,
+    threads: Threads = None,
+    cache: Cache = None,
+    json: Json = False,
+) -> None:
+    """Train D2FNet on a dataset. An interrupted run is continued by the same command."""
+    with _one_line():
+        from lightning_fabric import Fabric
+
+        from learn.data import load, sources
+        from learn.settings import preset as of
+        from learn.split import groups, nested
+        from learn.threads import set_threads
+        from learn.train import train
+
+        set_threads(threads)
+        changes: dict[str, Any] = {
+            "input": input,
+            "epochs": epochs,
+            "batch": batch,
+            "learning_rate": learning_rate,
+            "target": target,
+            "size": size,
+            "stop": stop,
+            "frames": frames,
+            "precision": precision,
+        }
+        changes = {k: v for k, v in changes.items() if v is not None}
+        changes |= _nested_changes(of(preset), loss, output, width, stem)
+        settings = of(preset, **changes, fold=fold, seed=seed, held_out_family=hold_out)
+        with _bar("Reading sequences") as tell:
+            clips = load(dataset, settings.grid, sources(settings.input), cache=cache, report=tell)
+        count = folds if folds is not None else min(5, len(set(groups(clips))))
+        settings = of(preset, **changes, fold=fold, seed=seed, held_out_family=hold_out, folds=count)
+        split = nested(clips, count, fold, seed, hold_out)
+        fabric = Fabric(accelerator=accelerator, devices=devices, precision=settings.precision)
+        with _bar("Training") as tell:
+            card = train(
+                clips,
+                split,
+                settings,
+                out,
+                fabric=fabric,
+                report=lambda done, of_, numbers: tell(done, of_),
+                log=(lambda numbers: None) if json else _log,
+            )
+        result = {"model": str(out), "epoch": card.epoch, "select_r2": card.score}
+        result |= {k: len(v) for k, v in card.split.items()}
+        if json:
+            print(json_.dumps(result))
+        else:
+            _console.print(
+                f"Model in {out}: epoch {card.epoch} of {settings.epochs}, R² {card.score:.3f} on "
+                f"{result['select']} select sequences; fitted on {result['fit']}, "
+                f"{result['test']} kept for `learn eval`."
+            )
+
+
+def _nested_changes(
+    base: Any, loss: str | None, output: str | None, width: int | None, stem: int | None
+) -> dict[str, Any]:
+    from dataclasses import replace
+
+    arch = {k: v for k, v in {"output": output, "width": width, "stem": stem}.items() if v is not None}
+    out: dict[str, Any] = {}
+    if arch:
+        out["arch"] = replace(base.arch, **arch)
+    if loss is not None:
+        out["objective"] = replace(base.objective, kind=loss)
+    return out
+
+
+def _log(numbers: dict[str, float]) -> None:
+    _console.print(
+        f"epoch {numbers['epoch']:.0f}: loss {numbers['loss']:.4f}, select R² {numbers['select_r2']:.3f}, "
+        f"gradient {numbers['share_error']:.0%} squared error, {numbers['share_r2']:.0%} R²"
+    )
+
+
+@app.command("eval")
+def eval_command(
+    model: Annotated[Path, typer.Argument(help="Model folder.")],
+    dataset: Root,
+    input: Annotated[str | None, typer.Option(help="ideal or recovered; as trained if not given.")] = None,
+    all: Annotated[bool, typer.Option("--all", help="Also sequences the model was fitted on.")] = False,
+    threads: Threads = None,
+    cache: Cache = None,
+    json: Json = False,
+) -> None:
+    """Score a model on the sequences it has not seen; forces in mN."""
+    with _one_line():
+        from learn.data import load
+        from learn.evaluate import evaluate, unseen
+        from learn.predict import load as load_model
+        from learn.threads import set_threads
+
+        set_threads(threads)
+        predictor = load_model(model)
+        trained = predictor.card.settings.input
+        source = input or ("recovered" if trained == "mixed" else trained)
+        if source not in ("ideal", "recovered"):
+            raise UserError(f"unknown input {source!r}: ideal or recovered")
+        with _bar("Reading sequences") as tell:
+            clips = load(dataset, predictor.grid, (source,), cache=cache, report=tell)
+        chosen = clips if all else unseen(clips, predictor.card)
+        if not chosen:
+            raise UserError(
+                f"{dataset}: the model was fitted or chosen on every sequence here; --all scores them anyway"
+            )
+        with _bar("Evaluating") as tell:
+            report = evaluate(predictor, chosen, source, tell)
+        if json:
+            print(json_.dumps({"model": str(model), "input": source, **report.as_dict()}))
+            return
+        Console().print(_table(report, source, all))
+
+
+_ROWS = (
+    ("force_r2_pooled", "total force: R², all frames", ""),
+    ("force_mae", "total force: MAE", "mN"),
+    ("force_rmse", "total force: RMSE", "mN"),
+    ("force_bias", "total force: bias", "mN"),
+    ("force_r", "total force: correlation", ""),
+    ("force_ccc", "total force: concordance", ""),
+    ("vector_error_mn", "total force: error of the vector", "mN"),
+    ("peak_error_share", "peak force: relative error", ""),
+    ("map_r2_pooled", "force map: R², all cells", ""),
+    ("map_mae", "force map: MAE", "map"),
+    ("map_rmse", "force map: RMSE", "map"),
+    ("map_r", "force map: correlation", ""),
+    ("vector_r2", "force map: R² of components", ""),
+    ("ghost", "ghosts: contact-free area above 5 mN", ""),
+    ("ghost_relative", "ghosts: contact-free area above 5% of scale", ""),
+    ("stray_mn", "ghosts: force on contact-free area", "mN"),
+    ("low_over_mn", "over-prediction in low-force frames", "mN"),
+    ("localisation_mm", "contact centre: median error", "mm"),
+    ("calibration_slope", "calibration: slope of truth on answer", ""),
+)
+
+
+def _table(report: Any, source: str, seen: bool) -> Table:
+    from learn.evaluate import YOUNG
+
+    which = "sequences, seen ones too" if seen else "unseen sequences"
+    table = Table(
+        title=f"{len(report.clips)} {which}, {source} flow; mean over sequences", title_justify="left"
+    )
+    table.add_column("")
+    heads = ("E known", "E taken ×½", "E taken ×2", "E unknown")
+    for head in heads:
+        table.add_column(head, justify="right")
+    columns = [report.summary(y) for y in YOUNG]
+    unit = "mN" if report.card.settings.target == "intensity" else "mN/mm²"
+    for key, name, u in _ROWS:
+        if key not in columns[0]:
+            continue
+        label = f"{name} [{unit if u == 'map' else u}]" if u else name
+        table.add_row(label, *(_cell(c.get(key)) for c in columns))
+    return table
+
+
+def _cell(value: float | None) -> str:
+    return "-" if value is None or value != value else f"{value:.3g}"
+
+
+@contextmanager
+def _bar(what: str) -> Iterator[Callable[[int, int], None]]:
+    """A progress bar with what is left of the time, on stderr."""
+    with Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+        console=_console,
+        transient=True,
+    ) as progress:
+        task = progress.add_task(what, total=None)
+        yield lambda done, of: progress.update(task, completed=done, total=of)
+
+
+if __name__ == "__main__":
+    main()

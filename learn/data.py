@@ -1,0 +1,205 @@
+"""Sequences as the network meets them: displacement and force density on the grid, read from stores."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from learn.grid import Grid, Resampler, centre
+from synth.errors import UserError
+from synth.store import Dataset, Sequence
+
+Input = Literal["ideal", "recovered", "mixed"]
+INPUTS = ("ideal", "recovered", "mixed")
+Target = Literal["density", "intensity"]
+_FIELDS = {"ideal": "flow", "recovered": "flow_tvl1"}
+_VERSION = 1
+
+
+@dataclass(frozen=True)
+class Clip:
+    """One sequence on the grid."""
+
+    name: str
+    content_hash: str
+    group: str
+    """Sequences of equal group may never be on both sides of a split."""
+    family: str
+    gesture: str
+    young_kpa: float
+    mask: NDArray[np.float32]
+    """(N, N) 0/1, tissue."""
+    displacement: dict[str, NDArray[np.float32]]
+    """`ideal` and/or `recovered`: (T, 2, N, N) mm in picture axes."""
+    confidence: NDArray[np.float32]
+    """(T, N, N) 0..1 of the recovered flow; 1 where there is none."""
+    density: NDArray[np.float32]
+    """(T, 3, N, N) force density per unit stiffness, camera axes [mN/mm² at E = 1 kPa]. Its sum times the
+    cell's area times E is the total force."""
+    force: NDArray[np.float64]
+    """(T, 3) total force on the tissue, camera axes [mN]."""
+
+    @property
+    def frames(self) -> int:
+        return len(self.density)
+
+
+def sources(wanted: Input) -> tuple[str, ...]:
+    """Which displacements an input kind needs."""
+    if wanted not in INPUTS:
+        raise UserError(f"unknown input {wanted!r}: one of {', '.join(INPUTS)}")
+    return ("ideal", "recovered") if wanted == "mixed" else (wanted,)
+
+
+def read(sequence: Sequence, grid: Grid, wanted: Iterable[str]) -> Clip:
+    """One store on the grid.
+
+    `wanted`: any of `ideal`, `recovered`. Raises UserError if the store lacks the flow or has no tissue.
+    """
+    attrs = sequence.attrs
+    where = sequence.path.name
+    wanted = tuple(wanted)
+    for source in wanted:
+        if _FIELDS[source] not in sequence:
+            raise UserError(
+                f"{where}: holds no {source} flow (field {_FIELDS[source]}); "
+                "render with flow.backend other than 'ideal', or train with --input ideal"
+            )
+    scenario: dict[str, Any] = attrs.get("scenario") or {}
+    try:
+        young, scale = float(attrs["young_kpa"]), float(attrs["scale_mm_per_px"])
+    except KeyError as missing:
+        raise UserError(f"{where}: lacks the attribute {missing.args[0]}") from None
+    tissue = sequence["tissue"][:].astype(bool)
+    resample = Resampler((tissue.shape[0], tissue.shape[1]), scale, centre(tissue), grid)
+    mask = (resample.cover(tissue) > 0.5).astype(np.float32)
+    area = sequence["area"][:]
+    n, frames = grid.size, sequence.frames
+    displacement = {s: np.empty((frames, 2, n, n), np.float32) for s in wanted}
+    confidence = np.ones((frames, n, n), np.float32)
+    density = np.empty((frames, 3, n, n), np.float32)
+    surest = "recovered" in wanted and "flow_confidence" in sequence
+    for t in range(frames):
+        for source in wanted:
+            moved = sequence[_FIELDS[source]][t].transpose(2, 0, 1) * scale
+            displacement[source][t] = resample.mean(moved, tissue) * mask
+        if surest:
+            confidence[t] = resample.mean(sequence["flow_confidence"][t], tissue) * mask
+        load = sequence["traction"][t].transpose(2, 0, 1) * area
+        density[t] = resample.sum(load) * mask / (grid.pitch_mm**2 * young)
+    return Clip(
+        name=where,
+        content_hash=str(attrs["content_hash"]),
+        group=str(scenario.get("anatomy_seed", attrs["content_hash"])),
+        family=str(_find(scenario, "family")),
+        gesture=str(_find(scenario, "kind")),
+        young_kpa=young,
+        mask=mask,
+        displacement=displacement,
+        confidence=confidence,
+        density=density,
+        force=sequence["force"][:],
+    )
+
+
+def _find(tree: dict[str, Any], key: str) -> Any:
+    """The first value under `key` in nested dicts; empty if there is none."""
+    if key in tree:
+        return tree[key]
+    for branch in tree.values():
+        if isinstance(branch, dict) and (found := _find(branch, key)) != "":
+            return found
+    return ""
+
+
+def load(
+    root: Path,
+    grid: Grid,
+    wanted: Iterable[str],
+    *,
+    keep: Callable[[Sequence], bool] = lambda _: True,
+    cache: Path | None = None,
+    report: Callable[[int, int], None] = lambda done, of: None,
+) -> list[Clip]:
+    """All sealed sequences of a dataset that `keep` keeps, in order.
+
+    `cache`: folder of packed arrays, made on first use and memory-mapped after; keyed by content hash and
+    grid, so it can be shared and can't be stale. Raises UserError for an empty dataset.
+    """
+    wanted = tuple(wanted)
+    chosen = [s for s in Dataset(root) if keep(s)]
+    clips = []
+    for i, sequence in enumerate(chosen):
+        report(i, len(chosen))
+        clips.append(
+            read(sequence, grid, wanted) if cache is None else _packed(sequence, grid, wanted, cache)
+        )
+    report(len(chosen), len(chosen))
+    if not clips:
+        raise UserError(f"{root}: holds no sealed sequence to use")
+    return clips
+
+
+def _packed(sequence: Sequence, grid: Grid, wanted: tuple[str, ...], cache: Path) -> Clip:
+    key = f"{sequence.attrs['content_hash']}-{grid.size}-{grid.extent_mm:g}-{'+'.join(wanted)}-v{_VERSION}"
+    folder = cache / key
+    if not folder.is_dir():
+        clip = read(sequence, grid, wanted)
+        part = cache / f"{key}.part{os.getpid()}"
+        part.mkdir(parents=True, exist_ok=True)
+        arrays = {"mask": clip.mask, "confidence": clip.confidence, "density": clip.density}
+        arrays |= {f"displacement-{k}": v for k, v in clip.displacement.items()}
+        for name, array in arrays.items():
+            np.save(part / f"{name}.npy", array)
+        np.save(part / "force.npy", clip.force)
+        plain = ("name", "content_hash", "group", "family", "gesture", "young_kpa")
+        (part / "clip.json").write_text(json.dumps({k: getattr(clip, k) for k in plain}))
+        if folder.is_dir():
+            shutil.rmtree(part)
+        else:
+            part.rename(folder)
+
+    def mapped(name: str) -> NDArray[Any]:
+        array: NDArray[Any] = np.load(folder / f"{name}.npy", mmap_mode="r")
+        return array
+
+    return Clip(
+        **json.loads((folder / "clip.json").read_text()),
+        mask=mapped("mask"),
+        displacement={s: mapped(f"displacement-{s}") for s in wanted},
+        confidence=mapped("confidence"),
+        density=mapped("density"),
+        force=mapped("force"),
+    )
+
+
+def target(clip: Clip, frame: int, kind: Target, components: int) -> NDArray[np.float32]:
+    """(C, N, N) what the network should say about a frame [mN/mm² or, for intensity, mN; at E = 1 kPa].
+
+    `density` is the truth; one component gives its length. `intensity` is the paper's map: the density's
+    shape with its peak raised to the total force. It does not integrate to anything.
+    """
+    density = clip.density[frame]
+    if kind == "density" and components == 3:
+        return np.asarray(density)
+    length: NDArray[np.float32] = np.sqrt(np.square(density).sum(0, keepdims=True))
+    if kind == "intensity":
+        if components != 1:
+            raise UserError("the paper's intensity map has no direction: use output 'magnitude' with it")
+        peak = float(length.max())
+        total = float(np.linalg.norm(clip.force[frame])) / clip.young_kpa
+        length = length * np.float32(total / peak) if peak > 0 else length
+    return length
+
+
+def typical_young(clips: Iterable[Clip]) -> float:
+    """Geometric mean of E over sequences [kPa]: the best guess when a recording's E is unknown."""
+    return float(np.exp(np.mean([np.log(c.young_kpa) for c in clips])))

@@ -1,0 +1,243 @@
+"""How right a model is on sequences it has never seen: in mN, sequence by sequence, for three states of E."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from learn.checkpoint import Card
+from learn.data import Clip, target
+from learn.grid import Grid
+from learn.metrics import Moments, agreement, contact_mm, ghost_share, line
+from learn.predict import Predictor, length, total_force
+from synth.errors import UserError
+
+GHOST_MN = 5.0
+"""A ghost is where a contact-sized patch would seem to carry more than this [mN]."""
+PATCH_MM2 = math.pi * 4.0**2
+"""Area of that patch: a contact of the jobs' mean radius, 4 mm."""
+FREE = 0.01
+"""Contact-free is where the true density is under this share of the training data's 99.9th percentile."""
+LOW = 0.05
+"""A frame is of low force, and an answer above this is a ghost by the relative rule, at this share."""
+YOUNG = ("known", "half", "double", "unknown")
+"""Columns: E as it is, taken ×½, taken ×2, and not known at all (the training data's typical value)."""
+
+Answer = Callable[[Clip], NDArray[np.float32]]
+"""Gives (T, C, N, N) force density [mN/mm²] (or intensity [mN]) of a clip, with its true E."""
+
+
+@dataclass(frozen=True)
+class ClipScore:
+    """One sequence's numbers. Forces in mN, densities in mN/mm² (intensity in mN), lengths in mm."""
+
+    name: str
+    young_kpa: float
+    map: Moments
+    """Over tissue cells of all frames, of the density's length."""
+    vector: Moments | None
+    """Over tissue cells and components, for a model that gives direction."""
+    true_mn: NDArray[np.float64]
+    """(T,) size of the total force."""
+    said_mn: NDArray[np.float64]
+    vector_error_mn: NDArray[np.float64] | None
+    """(T,) length of the total force's error."""
+    ghost: float
+    """Share of the contact-free area where a contact-sized patch would carry over 5 mN."""
+    ghost_relative: float
+    """Share of the contact-free area above 5% of the training data's 99.9th percentile."""
+    stray_mn: float
+    """Force the answer puts on the contact-free area, mean over frames [mN]."""
+    localisation_mm: float
+    """Median distance between true and said centre of the contact, over frames that aren't low [mm]."""
+    low_over_mn: float
+    """Mean over-prediction of the total force in low-force frames [mN]."""
+
+
+def score(clip: Clip, said: NDArray[np.float32], card: Card) -> ClipScore:
+    """Scores the answer to one sequence. `said`: (T, C, N, N), physical, at the clip's true E."""
+    grid, kind, parts = card.settings.grid, card.settings.target, said.shape[1]
+    young = clip.young_kpa
+    true = np.stack([target(clip, t, kind, parts) for t in range(clip.frames)]) * np.float32(young)
+    inside = np.broadcast_to(np.asarray(clip.mask) > 0, (clip.frames, *clip.mask.shape))
+    said_len, true_len = length(said), length(true)
+    unit = card.scales.target * young
+    free = inside & (true_len < FREE * unit)
+    said_mn = total_force(said, kind, grid)
+    true_mn: NDArray[np.float64] = np.linalg.norm(clip.force, axis=1)
+    low = true_mn < LOW * card.scales.force * young
+    as_force = 1.0 if kind == "intensity" else PATCH_MM2
+    vector, vector_error = None, None
+    if parts == 3:
+        components = np.broadcast_to(inside[:, None], said.shape)
+        vector = Moments.of(true[components], said[components])
+        total = said.astype(np.float64).sum((2, 3)) * grid.pitch_mm**2
+        vector_error = np.linalg.norm(total - clip.force, axis=1)
+    distance = [
+        float(np.linalg.norm(contact_mm(said_len[t], grid.pitch_mm) - contact_mm(true_len[t], grid.pitch_mm)))
+        for t in np.flatnonzero(~low)
+    ]
+    distance = [d for d in distance if math.isfinite(d)]
+    return ClipScore(
+        name=clip.name,
+        young_kpa=young,
+        map=Moments.of(true_len[inside], said_len[inside]),
+        vector=vector,
+        true_mn=true_mn,
+        said_mn=said_mn,
+        vector_error_mn=vector_error,
+        ghost=ghost_share(said_len * as_force, free, GHOST_MN),
+        ghost_relative=ghost_share(said_len, free, LOW * unit),
+        stray_mn=float((said_len * free).sum((1, 2)).mean() * _cell(kind, grid)),
+        localisation_mm=float(np.median(distance)) if distance else math.nan,
+        low_over_mn=float(np.maximum(said_mn - true_mn, 0)[low].mean()) if low.any() else math.nan,
+    )
+
+
+def _cell(kind: str, grid: Grid) -> float:
+    return grid.pitch_mm**2 if kind == "density" else 1.0 / grid.size**2
+
+
+@dataclass(frozen=True)
+class Report:
+    """A model's scores over sequences."""
+
+    clips: list[ClipScore]
+    card: Card
+
+    def per_clip(self) -> list[dict[str, float]]:
+        """One row a sequence, plain numbers."""
+        return [_row(c, 1.0) for c in self.clips]
+
+    def summary(self, young: str = "known") -> dict[str, float]:
+        """Mean over sequences of every per-sequence number, and pooled R² (`*_pooled`), in one E column."""
+        rows = [_row(c, self.factor(c, young)) for c in self.clips]
+        out = {k: _mean([r[k] for r in rows]) for k in rows[0]}
+        maps, forces = Moments(), Moments()
+        for c in self.clips:
+            f = self.factor(c, young)
+            maps = maps + _scaled(c.map, f)
+            forces = forces + Moments.of(c.true_mn, c.said_mn * f)
+        out["map_r2_pooled"] = agreement(maps).r2
+        out["force_r2_pooled"] = agreement(forces).r2
+        true = np.concatenate([c.true_mn for c in self.clips])
+        said = np.concatenate([c.said_mn * self.factor(c, young) for c in self.clips])
+        out["calibration_slope"], out["calibration_offset_mn"] = line(said, true)
+        return out
+
+    def factor(self, clip: ClipScore, young: str) -> float:
+        """What a wrong E multiplies the answer by: the answer is proportional to the E it is given."""
+        known = {"known": 1.0, "half": 0.5, "double": 2.0}
+        if young == "unknown":
+            return self.card.typical_young_kpa / clip.young_kpa
+        if young not in known:
+            raise UserError(f"unknown E column {young!r}: one of {', '.join(YOUNG)}")
+        return known[young]
+
+    def bands(self) -> list[dict[str, float]]:
+        """Errors of the total force in four bands of true force, as shares of the training data's largest."""
+        edges = [0.0, LOW, 1 / 3, 2 / 3, math.inf]
+        share = np.concatenate([c.true_mn / (self.card.scales.force * c.young_kpa) for c in self.clips])
+        true = np.concatenate([c.true_mn for c in self.clips])
+        said = np.concatenate([c.said_mn for c in self.clips])
+        out = []
+        for a, b in itertools.pairwise(edges):
+            here = (share >= a) & (share < b)
+            gap = said[here] - true[here]
+            out.append(
+                {
+                    "from": a,
+                    "to": b if math.isfinite(b) else float(share.max(initial=a)),
+                    "frames": float(here.sum()),
+                    "mae_mn": float(np.abs(gap).mean()) if here.any() else math.nan,
+                    "bias_mn": float(gap.mean()) if here.any() else math.nan,
+                }
+            )
+        return out
+
+    def as_dict(self) -> dict[str, object]:
+        """JSON-ready; NaN as null."""
+        return {
+            "sequences": [
+                {"name": c.name, "young_kpa": c.young_kpa, **_plain(_row(c, 1.0))} for c in self.clips
+            ],
+            "columns": {young: _plain(self.summary(young)) for young in YOUNG},
+            "bands": [_plain(b) for b in self.bands()],
+            "scales": asdict(self.card.scales),
+            "definitions": {
+                "ghost_mn": GHOST_MN,
+                "patch_mm2": PATCH_MM2,
+                "free_share": FREE,
+                "low_share": LOW,
+                "target": self.card.settings.target,
+            },
+        }
+
+
+def _row(c: ClipScore, factor: float) -> dict[str, float]:
+    map_, force = agreement(_scaled(c.map, factor)), agreement(Moments.of(c.true_mn, c.said_mn * factor))
+    row = {f"map_{k}": v for k, v in asdict(map_).items()}
+    row |= {f"force_{k}": v for k, v in asdict(force).items()}
+    if c.vector is not None:
+        row["vector_r2"] = agreement(_scaled(c.vector, factor)).r2
+    if factor == 1.0:
+        if c.vector_error_mn is not None:
+            row["vector_error_mn"] = float(c.vector_error_mn.mean())
+        peak = float(c.true_mn.max())
+        row["peak_error_share"] = abs(float(c.said_mn.max()) - peak) / peak if peak > 0 else math.nan
+        for name in ("ghost", "ghost_relative", "stray_mn", "localisation_mm", "low_over_mn"):
+            row[name] = getattr(c, name)
+    return row
+
+
+def _scaled(m: Moments, factor: float) -> Moments:
+    """Moments of (true, factor × said). Absolute errors don't scale: their sum is NaN unless factor is 1."""
+    if factor == 1.0:
+        return m
+    return Moments(m.n, m.t, m.p * factor, m.tt, m.pp * factor**2, m.tp * factor, math.nan)
+
+
+def _mean(values: Sequence[float]) -> float:
+    good = [v for v in values if math.isfinite(v)]
+    return float(np.mean(good)) if good else math.nan
+
+
+def _plain(row: dict[str, float]) -> dict[str, float | None]:
+    return {k: v if math.isfinite(v) else None for k, v in row.items()}
+
+
+def evaluate(
+    predictor: Predictor,
+    clips: Sequence[Clip],
+    source: str,
+    report: Callable[[int, int], None] = lambda done, of: None,
+) -> Report:
+    """Scores a model on clips, with displacement from `source` (`ideal` or `recovered`)."""
+    if not clips:
+        raise UserError("no sequence to evaluate on")
+    scores = []
+    for i, clip in enumerate(clips):
+        report(i, len(clips))
+        if source not in clip.displacement:
+            raise UserError(f"{clip.name}: holds no {source} flow")
+        said = predictor.density(
+            np.asarray(clip.displacement[source]),
+            clip.mask,
+            clip.young_kpa,
+            np.asarray(clip.confidence) if source == "recovered" else None,
+        )
+        scores.append(score(clip, said, predictor.card))
+    report(len(clips), len(clips))
+    return Report(scores, predictor.card)
+
+
+def unseen(clips: Sequence[Clip], card: Card) -> list[Clip]:
+    """Clips of no sequence and no anatomy that the model was fitted or chosen on."""
+    hashes = {h for part in ("fit", "select") for h in card.split.get(part, [])}
+    seen = {g for part in ("fit", "select") for g in card.groups.get(part, [])}
+    return [c for c in clips if c.content_hash not in hashes and c.group not in seen]

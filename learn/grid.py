@@ -1,0 +1,221 @@
+"""The network's view of a picture: an isotropic grid in millimetres, and the input channels on it.
+
+Training, evaluation, prediction and export all come through here, so a channel can't mean two things.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from numpy.typing import NDArray
+from scipy import sparse
+from torch import Tensor
+
+from synth.errors import UserError
+
+CHANNELS = ("dx", "dy", "magnitude", "mask", "divergence")
+CONFIDENCE = "confidence"
+SMOOTHING_MM = 0.5
+"""Standard deviation of the Gaussian under the derivative [mm]; physical, so that resolutions agree."""
+
+
+@dataclass(frozen=True)
+class Grid:
+    """N×N cells over a square of the picture, `extent_mm` wide, whatever the picture's own scale."""
+
+    size: int
+    extent_mm: float = 36.0
+
+    def __post_init__(self) -> None:
+        if self.size < 16 or self.size % 16:
+            raise UserError(f"grid size {self.size}: must be a multiple of 16, at least 16")
+        if not self.extent_mm > 0:
+            raise UserError(f"grid extent {self.extent_mm:g} mm: must be positive")
+
+    @property
+    def pitch_mm(self) -> float:
+        return self.extent_mm / self.size
+
+
+@dataclass(frozen=True)
+class Scales:
+    """99.9th percentiles of the training data, by which input and target are divided; and one spread.
+
+    One scale serves dx and dy: two would make the answer depend on how the camera is turned.
+    """
+
+    displacement_mm: float
+    divergence: float
+    target: float
+    """Force density per unit stiffness [mN/mm² at E = 1 kPa] (or intensity [mN at E = 1 kPa])."""
+    force: float
+    """Total force per unit stiffness [mN at E = 1 kPa]."""
+    spread: float
+    """Root mean square of the target over tissue cells and components, unit of `target`."""
+
+
+def centre(tissue: NDArray[np.bool_]) -> tuple[float, float]:
+    """Centroid of the tissue mask as (x, y) px. `tissue`: (H, W) bool. Raises UserError if it is empty."""
+    rows, cols = np.nonzero(tissue)
+    if rows.size == 0:
+        raise UserError("the tissue mask is empty: nothing to put on the grid")
+    return float(cols.mean()), float(rows.mean())
+
+
+class Resampler:
+    """Carries pixel arrays of one picture to the grid, with hat functions as wide as the coarser of both.
+
+    `mean` is a weighted average (for displacement), `sum` keeps the total (for force). Both are the same
+    two small sparse matrices, rows then columns, so a frame costs two sparse products a channel.
+    """
+
+    def __init__(
+        self, shape: tuple[int, int], scale_mm_per_px: float, centre_px: tuple[float, float], grid: Grid
+    ) -> None:
+        """`shape`: (H, W) of the picture; `centre_px`: the (x, y) px that lands on the grid's centre."""
+        if not (np.isfinite(scale_mm_per_px) and scale_mm_per_px > 0):
+            raise UserError(f"scale {scale_mm_per_px} mm/px: must be positive")
+        self.grid = grid
+        self.shape = shape
+        self.scale_mm_per_px = float(scale_mm_per_px)
+        self.centre_px = centre_px
+        self._rows = _hats(shape[0], centre_px[1], self.scale_mm_per_px, grid)
+        self._cols = _hats(shape[1], centre_px[0], self.scale_mm_per_px, grid)
+
+    def mean(
+        self, values: NDArray[np.floating], weight: NDArray[np.floating | np.bool_]
+    ) -> NDArray[np.float32]:
+        """Weighted mean over each cell; 0 where no weight falls.
+
+        `values`: (..., H, W); `weight`: (H, W), ≥ 0. Returns (..., N, N) float32 in the unit of `values`.
+        """
+        share = weight.astype(np.float32)
+        under = self._apply(share, self._rows, self._cols)
+        over = self._each(values * share, self._rows, self._cols)
+        good = under > 1e-6
+        return np.where(good, over / np.where(good, under, 1.0), 0.0).astype(np.float32)
+
+    def cover(self, mask: NDArray[np.bool_]) -> NDArray[np.float32]:
+        """Share of each cell that `mask` (H, W) covers, 0 outside the picture. Returns (N, N) float32."""
+        inside = self._apply(np.ones(self.shape, np.float32), self._rows, self._cols)
+        full = float(inside.max(initial=0.0)) or 1.0
+        return (self._apply(mask.astype(np.float32), self._rows, self._cols) / full).astype(np.float32)
+
+    def sum(self, values: NDArray[np.floating]) -> NDArray[np.float32]:
+        """Totals over each cell: what lies inside the grid is kept to rounding.
+
+        `values`: (..., H, W), amount a pixel. Returns (..., N, N) float32, amount a cell.
+        """
+        return self._each(values, _partition(self._rows), _partition(self._cols)).astype(np.float32)
+
+    def _each(
+        self, values: NDArray[np.floating], rows: sparse.csr_array, cols: sparse.csr_array
+    ) -> NDArray[np.floating]:
+        flat = values.reshape(-1, *self.shape)
+        n = self.grid.size
+        return np.stack([self._apply(v, rows, cols) for v in flat]).reshape(*values.shape[:-2], n, n)
+
+    @staticmethod
+    def _apply(
+        values: NDArray[np.floating], rows: sparse.csr_array, cols: sparse.csr_array
+    ) -> NDArray[np.floating]:
+        half: NDArray[np.floating] = rows @ np.ascontiguousarray(values, np.float32)
+        out: NDArray[np.floating] = (cols @ np.ascontiguousarray(half.T)).T
+        return out
+
+    def to_image(self, values: NDArray[np.floating], fill: float = 0.0) -> NDArray[np.float32]:
+        """Grid values back on the picture's pixels, bilinearly. (..., N, N) → (..., H, W) float32."""
+        n, ratio = self.grid.size, self.scale_mm_per_px / self.grid.pitch_mm
+        x = (np.arange(self.shape[1]) - self.centre_px[0]) * ratio + (n - 1) / 2
+        y = (np.arange(self.shape[0]) - self.centre_px[1]) * ratio + (n - 1) / 2
+        inside = ((y >= -0.5) & (y <= n - 0.5))[:, None] & ((x >= -0.5) & (x <= n - 0.5))[None, :]
+        x, y = np.clip(x, 0, n - 1), np.clip(y, 0, n - 1)
+        x0, y0 = np.minimum(x.astype(int), n - 2), np.minimum(y.astype(int), n - 2)
+        fx, fy = (x - x0), (y - y0)[:, None]
+        top = values[..., y0, :][..., x0] * (1 - fx) + values[..., y0, :][..., x0 + 1] * fx
+        low = values[..., y0 + 1, :][..., x0] * (1 - fx) + values[..., y0 + 1, :][..., x0 + 1] * fx
+        return np.where(inside, top * (1 - fy) + low * fy, fill).astype(np.float32)
+
+
+def _hats(length: int, centre_px: float, scale: float, grid: Grid) -> sparse.csr_array:
+    """(N, length) hat weights between grid nodes and pixel centres, both placed in mm from the centre."""
+    pixels = (np.arange(length) - centre_px) * scale
+    nodes = (np.arange(grid.size) - (grid.size - 1) / 2) * grid.pitch_mm
+    width = max(grid.pitch_mm, scale)
+    reach = int(np.ceil(width / grid.pitch_mm)) + 1
+    nearest = np.rint((pixels - nodes[0]) / grid.pitch_mm).astype(int)
+    node = nearest[None, :] + np.arange(-reach, reach + 1)[:, None]
+    pixel = np.broadcast_to(np.arange(length), node.shape)
+    weight = 1 - np.abs((nodes[0] + node * grid.pitch_mm) - pixels[pixel]) / width
+    keep = (weight > 0) & (node >= 0) & (node < grid.size)
+    return sparse.csr_array(
+        (weight[keep].astype(np.float32), (node[keep], pixel[keep])), shape=(grid.size, length)
+    )
+
+
+def _partition(hats: sparse.csr_array) -> sparse.csr_array:
+    """The same weights with every pixel's summing to one, so that totals are kept."""
+    total = np.asarray(hats.sum(axis=0)).ravel()
+    scale = np.divide(1.0, total, out=np.zeros_like(total), where=total > 0)
+    return (hats @ sparse.diags_array(scale.astype(np.float32))).tocsr()
+
+
+def divergence(displacement: Tensor, mask: Tensor, pitch_mm: float) -> Tensor:
+    """∂dx/∂x + ∂dy/∂y of the smoothed displacement, dimensionless, 0 outside the mask.
+
+    Smoothing and differences use only masked cells (normalised convolution; at the mask's edge the
+    difference is one-sided), so that the step from tissue to nothing isn't read as strain.
+    `displacement`: (B, 2, N, N) mm, `mask`: (B, 1, N, N) 0/1. Returns (B, 1, N, N).
+    """
+    kernel = _gaussian(SMOOTHING_MM / pitch_mm).to(displacement)
+    weight = _blur(mask, kernel).clamp_min(1e-6)
+    smooth = _blur(displacement * mask, kernel) / weight
+    return (_difference(smooth[:, :1], mask, 3) + _difference(smooth[:, 1:2], mask, 2)) * mask / pitch_mm
+
+
+def _difference(values: Tensor, mask: Tensor, dim: int) -> Tensor:
+    """Mean of the forward and backward differences whose both ends lie in the mask, a cell."""
+    step = torch.diff(values, dim=dim)
+    n = values.shape[dim]
+    both = mask.narrow(dim, 1, n - 1) * mask.narrow(dim, 0, n - 1)
+    ahead = (0, 1, 0, 0) if dim == 3 else (0, 0, 0, 1)
+    behind = (1, 0, 0, 0) if dim == 3 else (0, 0, 1, 0)
+    step = step * both
+    count = F.pad(both, ahead) + F.pad(both, behind)
+    return (F.pad(step, ahead) + F.pad(step, behind)) / count.clamp_min(1)
+
+
+def _gaussian(sigma_px: float) -> Tensor:
+    radius = max(1, int(np.ceil(3 * sigma_px)))
+    x = torch.arange(-radius, radius + 1, dtype=torch.float32)
+    kernel = torch.exp(-0.5 * (x / max(sigma_px, 1e-3)) ** 2)
+    return kernel / kernel.sum()
+
+
+def _blur(values: Tensor, kernel: Tensor) -> Tensor:
+    """Separable convolution of every channel, zero outside."""
+    c, radius = values.shape[1], kernel.numel() // 2
+    rows = kernel.view(1, 1, -1, 1).expand(c, 1, -1, 1)
+    cols = kernel.view(1, 1, 1, -1).expand(c, 1, 1, -1)
+    out = F.conv2d(values, rows, padding=(radius, 0), groups=c)
+    return F.conv2d(out, cols, padding=(0, radius), groups=c)
+
+
+def channels(
+    displacement: Tensor, mask: Tensor, pitch_mm: float, scales: Scales, confidence: Tensor | None = None
+) -> Tensor:
+    """The network's input, in the order of CHANNELS, with `confidence` last if given.
+
+    `displacement`: (B, 2, N, N) mm in picture axes; `mask`: (B, 1, N, N) 0/1;
+    `confidence`: (B, 1, N, N) in 0..1. Returns (B, 5 or 6, N, N), dimensionless.
+    Source: Heraoui et al., the five channels of D2FNet; here in mm and with one displacement scale.
+    """
+    moved = displacement * mask / scales.displacement_mm
+    length = torch.linalg.vector_norm(moved, dim=1, keepdim=True)
+    parts = [moved, length, mask, divergence(displacement, mask, pitch_mm) / scales.divergence]
+    if confidence is not None:
+        parts.append(confidence * mask)
+    return torch.cat(parts, dim=1)

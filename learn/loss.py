@@ -1,0 +1,161 @@
+"""What training minimises: squared error, R², and a heavier price for force where there is none.
+
+Everything here is in physical units. Prediction and target are force density at a reference stiffness of
+1 kPa [mN/mm²], and so are the two numbers of the training data that come along: `unit`, the target's 99.9th
+percentile, says what a low force is; `spread`, its root mean square over tissue cells, is what errors are
+divided by. The squared-error and the R² term then are of one size and their weights mean what they say. (In
+the published code the squared error is in (3 N)², about 1e-4, and R² takes nearly all of the gradient.)
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from synth.errors import UserError
+
+Kind = Literal["antighost", "mse", "mae", "huber", "published"]
+KINDS = ("antighost", "mse", "mae", "huber", "published")
+
+
+@dataclass(frozen=True)
+class Objective:
+    """Which loss, and its weights."""
+
+    kind: Kind = "antighost"
+    r2_weight: float = 0.3
+    """Share of the R² term; the rest is the squared error. (Heraoui et al.: 0.3.)"""
+    ghost_weight: float = 3.0
+    """Price of a squared over-prediction where the true force is low. (Heraoui et al.: 3.)"""
+    low: float = 0.05
+    """A force is low under this share of `unit`."""
+    rule: Literal["pixel", "frame"] = "pixel"
+    """`pixel`: low where the pixel's own force is; `frame`: in frames whose mean over the tissue is, as
+    the published code has it (true for nearly every frame: a contact covers little of the picture)."""
+    total_weight: float = 0.0
+    """Weight of the squared error of the frame's total force, in units of the training data's largest."""
+
+    def __post_init__(self) -> None:
+        if self.kind not in KINDS:
+            raise UserError(f"unknown loss {self.kind!r}: one of {', '.join(KINDS)}")
+        if not (0 <= self.r2_weight <= 1 and self.ghost_weight >= 0 and self.low >= 0):
+            raise UserError("loss weights: r2_weight in 0..1, ghost_weight and low not negative")
+
+
+@dataclass(frozen=True)
+class Terms:
+    """The parts of the loss, dimensionless, already weighted; they add up to it."""
+
+    error: Tensor
+    r2: Tensor
+    total: Tensor
+
+    @property
+    def sum(self) -> Tensor:
+        return self.error + self.r2 + self.total
+
+
+def loss(
+    prediction: Tensor,
+    target: Tensor,
+    mask: Tensor,
+    objective: Objective,
+    unit: float,
+    spread: float,
+    cell_mm2: float = 1.0,
+    force_unit: float = 1.0,
+) -> Terms:
+    """The objective over all masked cells of a batch.
+
+    `prediction`, `target`: (B, C, N, N) mN/mm² at 1 kPa; `mask`: (B, 1, N, N) 0/1; `unit`, `spread`: the same
+    unit; `cell_mm2`: area of a cell; `force_unit`: mN at 1 kPa. Raises UserError if the mask is empty.
+    """
+    cells = mask.sum()
+    if cells == 0:
+        raise UserError("a batch without a single tissue cell has no loss")
+    error = (prediction - target) / spread * mask
+    squared = error.square().sum(1, keepdim=True)
+    zero = squared.new_zeros(())
+    count = cells * prediction.shape[1]
+    if objective.kind == "mse":
+        fit, share = squared.sum() / count, 0.0
+    elif objective.kind == "mae":
+        fit, share = error.abs().sum() / count, 0.0
+    elif objective.kind == "huber":
+        fit, share = (
+            torch.nn.functional.huber_loss(error, zero.expand_as(error), reduction="sum") / count,
+            0.0,
+        )
+    else:
+        weight = ghost_weights(prediction, target, mask, objective, unit)
+        fit, share = (squared * weight).sum() / count, objective.r2_weight
+    r2 = zero
+    if share > 0:
+        r2 = unexplained(prediction, target, mask, spread, bias_blind=objective.kind == "published")
+        if objective.kind == "published":
+            r2 = r2.clamp(max=1.0)
+    total = zero
+    if objective.total_weight > 0:
+        gap = ((prediction - target) * mask).sum((2, 3)) * cell_mm2 / force_unit
+        total = objective.total_weight * gap.square().sum(1).mean()
+    return Terms((1 - share) * fit, share * r2, total)
+
+
+def ghost_weights(
+    prediction: Tensor, target: Tensor, mask: Tensor, objective: Objective, unit: float
+) -> Tensor:
+    """(B, 1, N, N): `ghost_weight` where force is over-predicted and low, 1 elsewhere.
+
+    A vector is over-predicted where it is longer than the true one.
+    """
+    said, true = _length(prediction.detach()), _length(target)
+    if objective.rule == "pixel":
+        low = true < objective.low * unit
+    else:
+        mean = (true * mask).sum((1, 2, 3)) / mask.sum((1, 2, 3)).clamp_min(1)
+        low = (mean < objective.low * unit).view(-1, 1, 1, 1)
+    ghost = low & (said > true)
+    return torch.where(ghost, objective.ghost_weight, 1.0)
+
+
+def unexplained(
+    prediction: Tensor, target: Tensor, mask: Tensor, spread: float, *, bias_blind: bool = False
+) -> Tensor:
+    """1 − R² = SSE/SST over the batch's masked cells, each component about its own mean.
+
+    `bias_blind` takes the variance of the residual instead of SSE, as the published code does: an offset
+    everywhere then costs nothing. A batch with hardly any force is measured against a tenth of the training
+    data's mean square, so that rest frames don't divide by zero.
+    """
+    cells = mask.sum()
+    t = target / spread * mask
+    e = (prediction - target) / spread * mask
+    sst = t.square().sum((0, 2, 3)) - t.sum((0, 2, 3)).square() / cells
+    sse = e.square().sum((0, 2, 3))
+    if bias_blind:
+        sse = sse - e.sum((0, 2, 3)).square() / cells
+    return sse.sum() / sst.sum().clamp_min(0.1 * float(cells) * prediction.shape[1])
+
+
+def gradient_shares(terms: Terms, prediction: Tensor) -> dict[str, float]:
+    """How much of the gradient on the prediction each term gives: norms over their sum.
+
+    Must be called before `backward` frees the graph.
+    """
+    norms: dict[str, float] = {}
+    for name, term in (("error", terms.error), ("r2", terms.r2), ("total", terms.total)):
+        if term.requires_grad:
+            (g,) = torch.autograd.grad(term, prediction, retain_graph=True, allow_unused=True)
+            norms[name] = 0.0 if g is None else float(g.norm())
+        else:
+            norms[name] = 0.0
+    whole = sum(norms.values()) or 1.0
+    return {k: v / whole for k, v in norms.items()}
+
+
+def _length(values: Tensor) -> Tensor:
+    """(B, C, …) → (B, 1, …): the value itself for one component, else the vector's length."""
+    return values if values.shape[1] == 1 else torch.linalg.vector_norm(values, dim=1, keepdim=True)

@@ -1,0 +1,254 @@
+"""D2FNet, from displacement to force map, as Heraoui et al. draw it, in any width, depth and input size.
+
+Encoder-decoder of double convolutions; the features of every block pass an attention gate (where × which
+channel), so each skip is gated before it is concatenated; pyramid pooling 1/2/4/8 at the bottom; three
+bounded heads (low, middle, high force) fused by soft weights. Width 32 on 256² is the paper's network:
+13.1 M parameters, 27.6 GFLOP.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from synth.errors import UserError
+
+Output = Literal["magnitude", "vector"]
+COMPONENTS: dict[str, int] = {"magnitude": 1, "vector": 3}
+
+
+@dataclass(frozen=True)
+class Architecture:
+    """Everything that decides the network's shape; stored in the checkpoint."""
+
+    name: Literal["d2fnet", "unet"] = "d2fnet"
+    width: int = 32
+    """Channels of the first level; each level doubles them."""
+    levels: int = 4
+    """Times the picture is halved after the stem."""
+    stem: int = 1
+    """Stride of the first convolution; 4 makes the network live (`d2fnet-s`)."""
+    output: Output = "vector"
+    """`magnitude`: force density ≥ 0; `vector`: its x, y, z in camera axes."""
+    bounds: tuple[float, float, float] = (0.25, 0.75, 1.5)
+    """Largest value each head can give, in units of the training data's 99.9th percentile. The paper's
+    heads stop at 1/6, 1/2 and 1 of the largest force it has; half as much again is kept in hand here."""
+    dropout: float = 0.1
+    confidence: bool = False
+    """Whether a sixth channel holds the flow's confidence."""
+    condition: Literal["none", "film"] = "none"
+    """`film`: Young's modulus modulates the bottleneck (feature-wise affine; Perez et al. 2018)."""
+
+    def __post_init__(self) -> None:
+        if self.name not in ("d2fnet", "unet"):
+            raise UserError(f"unknown model {self.name!r}: d2fnet or unet")
+        if self.output not in COMPONENTS:
+            raise UserError(f"unknown output {self.output!r}: magnitude or vector")
+        if self.stem not in (1, 2, 4) or not 1 <= self.levels <= 5 or self.width < 4 or self.width % 4:
+            raise UserError(
+                f"architecture: stem {self.stem} (1, 2 or 4), levels {self.levels} (1-5), "
+                f"width {self.width} (a multiple of 4)"
+            )
+
+    @property
+    def inputs(self) -> int:
+        return 6 if self.confidence else 5
+
+    @property
+    def components(self) -> int:
+        return COMPONENTS[self.output]
+
+    def check(self, size: int) -> None:
+        """Raises UserError if an N×N input can't be halved as often as this network does."""
+        if size % (self.stem * 2**self.levels):
+            raise UserError(
+                f"input size {size} does not divide by {self.stem * 2**self.levels} "
+                f"(stem {self.stem}, {self.levels} levels)"
+            )
+
+
+class Gate(nn.Module):
+    """Attention over place times attention over channels."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        inner = max(channels // 4, 1)
+        self.place = nn.Sequential(nn.Conv2d(channels, inner, 1), nn.ReLU(), nn.Conv2d(inner, 1, 1))
+        self.channel = nn.Sequential(nn.Conv2d(channels, inner, 1), nn.ReLU(), nn.Conv2d(inner, channels, 1))
+
+    def forward(self, x: Tensor) -> Tensor:
+        mean = x.mean(dim=(2, 3), keepdim=True)
+        return x * torch.sigmoid(self.place(x)) * torch.sigmoid(self.channel(mean))
+
+
+class Block(nn.Module):
+    """Two 3×3 convolutions with batch norm, the gate (if wanted) and dropout of whole channels."""
+
+    def __init__(self, inputs: int, outputs: int, dropout: float, gated: bool) -> None:
+        super().__init__()
+        self.body = nn.Sequential(
+            nn.Conv2d(inputs, outputs, 3, padding=1),
+            nn.BatchNorm2d(outputs),
+            nn.ReLU(inplace=True),
+            nn.Conv2d(outputs, outputs, 3, padding=1),
+            nn.BatchNorm2d(outputs),
+            nn.ReLU(inplace=True),
+            Gate(outputs) if gated else nn.Identity(),
+            nn.Dropout2d(dropout),
+        )
+
+    def forward(self, x: Tensor) -> Tensor:
+        y: Tensor = self.body(x)
+        return y
+
+
+class Pyramid(nn.Module):
+    """Context of the whole picture, its quarters, sixteenths and sixty-fourths (Zhao et al. 2017)."""
+
+    BINS = (1, 2, 4, 8)
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.squeeze = nn.ModuleList(nn.Conv2d(channels, channels // 4, 1) for _ in self.BINS)
+        self.join = nn.Conv2d(2 * channels, channels, 3, padding=1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        size = x.shape[2]
+        parts = [x]
+        for bins, conv in zip(self.BINS, self.squeeze, strict=True):
+            small = F.avg_pool2d(x, size // bins) if size >= bins else x
+            parts.append(F.interpolate(conv(small), size=(size, size), mode="bilinear", align_corners=False))
+        y: Tensor = self.join(torch.cat(parts, dim=1))
+        return y
+
+
+class Heads(nn.Module):
+    """Three bounded readings of the same features, mixed a pixel at a time by soft weights.
+
+    A magnitude is a sigmoid times its bound; a component has a sign and is a tanh times its bound.
+    """
+
+    def __init__(self, inputs: int, components: int, bounds: tuple[float, float, float]) -> None:
+        super().__init__()
+        self.signed = components > 1
+        self.components = components
+        inner = max(inputs // 2, 4)
+        self.features = nn.Conv2d(inputs, inner, 3, padding=1)
+        self.ranges = nn.ModuleList(nn.Conv2d(inner, components, 1) for _ in bounds)
+        self.mix = nn.Sequential(
+            nn.Conv2d(3 * components, 8, 3, padding=1), nn.ReLU(), nn.Conv2d(8, 3, 3, padding=1)
+        )
+        self.bounds = bounds
+
+    def forward(self, x: Tensor) -> Tensor:
+        x = self.features(x)
+        squash = torch.tanh if self.signed else torch.sigmoid
+        readings = [squash(head(x)) * bound for head, bound in zip(self.ranges, self.bounds, strict=True)]
+        weights = torch.softmax(self.mix(torch.cat(readings, dim=1)), dim=1)
+        return sum((r * weights[:, i : i + 1] for i, r in enumerate(readings)), torch.zeros_like(readings[0]))
+
+
+class D2FNet(nn.Module):
+    """(B, 5|6, N, N) channels → (B, 1|3, N, N) force map in units of `Scales.target`, 0 outside the mask."""
+
+    def __init__(self, arch: Architecture) -> None:
+        super().__init__()
+        self.arch = arch
+        full = arch.name == "d2fnet"
+        widths = [arch.width * 2**i for i in range(arch.levels + 1)]
+        first = arch.inputs
+        self.stem: nn.Module = nn.Identity()
+        if arch.stem > 1:
+            s = arch.stem
+            self.stem = nn.Conv2d(arch.inputs, arch.width, 2 * s, stride=s, padding=s // 2)
+            first = arch.width
+        self.down = nn.ModuleList(
+            Block(a, b, arch.dropout, full) for a, b in zip([first, *widths[:-2]], widths[:-1], strict=True)
+        )
+        self.bottom = Block(widths[-2], widths[-1], arch.dropout, full)
+        self.pyramid = Pyramid(widths[-1]) if full else nn.Identity()
+        self.film = nn.Linear(1, 2 * widths[-1]) if arch.condition == "film" else None
+        self.up = nn.ModuleList(
+            nn.ConvTranspose2d(a, b, 2, stride=2) for a, b in zip(widths[:0:-1], widths[-2::-1], strict=True)
+        )
+        self.merge = nn.ModuleList(Block(2 * b, b, arch.dropout, full) for b in widths[-2::-1])
+        self.heads: nn.Module = (
+            Heads(arch.width, arch.components, arch.bounds)
+            if full
+            else nn.Conv2d(arch.width, arch.components, 1)
+        )
+        self.apply(_start)
+        _start_small(self.heads)
+        if self.film is not None:
+            nn.init.zeros_(self.film.weight)
+            nn.init.zeros_(self.film.bias)
+
+    def forward(self, x: Tensor, log_young: Tensor | None = None) -> Tensor:
+        """`log_young`: (B, 1) ln(E / 1 kPa), used only by a `film` network."""
+        mask = x[:, 3:4]
+        h = self.stem(x)
+        skips = []
+        for block in self.down:
+            h = block(h)
+            skips.append(h)
+            h = F.max_pool2d(h, 2)
+        h = self.pyramid(self.bottom(h))
+        if self.film is not None:
+            if log_young is None:
+                raise UserError("this model is conditioned on Young's modulus: give young_kpa")
+            gain, shift = self.film(log_young)[..., None, None].chunk(2, dim=1)
+            h = h * (1 + gain) + shift
+        for rise, block, skip in zip(self.up, self.merge, reversed(skips), strict=True):
+            h = block(torch.cat([rise(h), skip], dim=1))
+        y: Tensor = self.heads(h)
+        if self.arch.stem > 1:
+            y = F.interpolate(y, scale_factor=float(self.arch.stem), mode="bilinear", align_corners=False)
+        return y * mask
+
+
+def _start(module: nn.Module) -> None:
+    """He initialisation (fan out), as deep ReLU networks need it."""
+    if isinstance(module, nn.Conv2d | nn.ConvTranspose2d):
+        nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
+        if module.bias is not None:
+            nn.init.zeros_(module.bias)
+
+
+def _start_small(heads: nn.Module) -> None:
+    """Begin near no force at all: half a bound everywhere would be one large ghost to unlearn."""
+    last = list(heads.ranges) if isinstance(heads, Heads) else [heads]
+    unsigned = isinstance(heads, Heads) and not heads.signed
+    for conv in last:
+        if isinstance(conv, nn.Conv2d) and conv.bias is not None:
+            nn.init.normal_(conv.weight, std=0.02)
+            nn.init.constant_(conv.bias, -4.0 if unsigned else 0.0)
+
+
+def parameters(model: nn.Module) -> int:
+    """Number of trained parameters."""
+    return sum(p.numel() for p in model.parameters() if p.requires_grad)
+
+
+def flops(arch: Architecture, size: int) -> float:
+    """Floating-point operations (2 a multiply-add) of the convolutions for one N×N frame."""
+    total = 0
+
+    def count(module: nn.Module, _: tuple[Tensor, ...], out: Tensor) -> None:
+        nonlocal total
+        if isinstance(module, nn.ConvTranspose2d):
+            taps = module.in_channels * math.prod(module.kernel_size) / math.prod(module.stride)
+            total += int(2 * taps * out.numel())
+        elif isinstance(module, nn.Conv2d):
+            total += 2 * module.in_channels * math.prod(module.kernel_size) * out.numel()
+
+    with torch.device("meta"):
+        model = D2FNet(arch).eval()
+        for m in model.modules():
+            m.register_forward_hook(count)
+        model(torch.zeros(1, arch.inputs, size, size), torch.zeros(1, 1))
+    return float(total)

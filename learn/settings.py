@@ -1,0 +1,110 @@
+"""Everything that decides a training run, and the presets."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from learn.data import INPUTS, Input, Target
+from learn.grid import Grid
+from learn.loss import Objective
+from learn.model import Architecture
+from synth.errors import UserError
+
+
+@dataclass(frozen=True)
+class Settings:
+    """One training run: same settings, same data, same weights (bit for bit, on one CPU)."""
+
+    size: int = 256
+    """Cells along the grid's edge."""
+    extent_mm: float = 36.0
+    """Width of the grid [mm]."""
+    arch: Architecture = field(default_factory=Architecture)
+    objective: Objective = field(default_factory=Objective)
+    input: Input = "ideal"
+    """Displacement to train on. `mixed`: each frame is ideal or recovered by a draw whose odds move from
+    all ideal to all recovered over the first half of the run."""
+    target: Target = "density"
+    epochs: int = 50
+    batch: int = 8
+    learning_rate: float = 5e-4
+    weight_decay: float = 1e-5
+    patience: int = 5
+    """Epochs without a better score after which the learning rate is halved."""
+    stop: int = 0
+    """Epochs without a better score after which training ends; 0 never."""
+    clip: float = 1.0
+    """Largest norm of the gradient."""
+    augment: bool = True
+    """Quarter turns and mirrors of the grid, vectors turned with it."""
+    frames: int = 0
+    """Frames a sequence gives an epoch, drawn anew each epoch; 0 takes all."""
+    precision: Literal["32-true", "bf16-mixed"] = "32-true"
+    channels_last: bool = False
+    folds: int = 5
+    fold: int = 0
+    held_out_family: str | None = None
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.input not in INPUTS:
+            raise UserError(f"unknown input {self.input!r}: one of {', '.join(INPUTS)}")
+        if self.target not in ("density", "intensity"):
+            raise UserError(f"unknown target {self.target!r}: density or intensity")
+        if self.target == "intensity" and self.arch.output != "magnitude":
+            raise UserError("target 'intensity' has no direction: it needs output 'magnitude'")
+        for name in ("epochs", "batch", "learning_rate", "clip"):
+            if not getattr(self, name) > 0:
+                raise UserError(f"{name} {getattr(self, name)}: must be positive")
+        self.arch.check(self.size)
+
+    @property
+    def grid(self) -> Grid:
+        return Grid(self.size, self.extent_mm)
+
+    def as_dict(self) -> dict[str, Any]:
+        return dataclasses.asdict(self)
+
+
+def from_dict(tree: dict[str, Any]) -> Settings:
+    """The inverse of `as_dict`. Raises TypeError or UserError for anything else."""
+    tree = dict(tree)
+    arch = dict(tree.pop("arch"))
+    arch["bounds"] = tuple(arch["bounds"])
+    return Settings(arch=Architecture(**arch), objective=Objective(**tree.pop("objective")), **tree)
+
+
+PRESETS: dict[str, Settings] = {
+    # Seconds to minutes: shows that everything joins up, not how good it can be.
+    "tiny": Settings(
+        size=64,
+        arch=Architecture(width=8, stem=1, levels=3, dropout=0.0),
+        epochs=12,
+        learning_rate=2e-3,
+        patience=3,
+        batch=8,
+    ),
+    # At most 20 minutes on one core with a few dozen sequences: tells good choices from bad.
+    "cpu": Settings(
+        size=128,
+        arch=Architecture(width=16, stem=2, levels=4, dropout=0.05),
+        epochs=24,
+        learning_rate=1e-3,
+        patience=4,
+        batch=8,
+        frames=12,
+    ),
+    # d2fnet-s: 256², 11 ms a frame on one core.
+    "live": Settings(size=256, arch=Architecture(width=16, stem=4, dropout=0.05), learning_rate=1e-3),
+    # The network, loss weights and schedule of Heraoui et al., on our targets.
+    "paper": Settings(arch=Architecture(width=32, stem=1, dropout=0.1)),
+}
+
+
+def preset(name: str, **changes: Any) -> Settings:
+    """A preset with some settings replaced. Raises UserError for an unknown name."""
+    if name not in PRESETS:
+        raise UserError(f"unknown preset {name!r}: one of {', '.join(PRESETS)}")
+    return dataclasses.replace(PRESETS[name], **changes)

@@ -1,0 +1,221 @@
+"""Training: AdamW on a plateau schedule, clipped, checkpointed every epoch, resumed to the bit."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from lightning_fabric import Fabric
+from torch.optim.lr_scheduler import ReduceLROnPlateau
+from torchmetrics.aggregation import MeanMetric
+
+from learn import checkpoint
+from learn.batch import Batch, Frames, inputs, measure_scales
+from learn.checkpoint import Card
+from learn.data import Clip, typical_young
+from learn.grid import Scales
+from learn.loss import gradient_shares, loss
+from learn.metrics import Moments, agreement
+from learn.model import D2FNet
+from learn.settings import Settings
+from learn.split import Split, groups
+from synth.errors import UserError
+
+Report = Callable[[int, int, dict[str, float]], None]
+"""Told after every batch: batches done, batches there will be, latest numbers."""
+
+
+def train(
+    clips: Sequence[Clip],
+    split: Split,
+    settings: Settings,
+    out: Path,
+    *,
+    report: Report = lambda done, of, numbers: None,
+    fabric: Fabric | None = None,
+    log: Callable[[dict[str, float]], None] = lambda numbers: None,
+) -> Card:
+    """Trains on `split.fit`, chooses the epoch on `split.select`, never looks at `split.test`.
+
+    A folder that holds an unfinished run of the same settings and data is continued; the result is the same,
+    bit for bit on one CPU, as that of an uninterrupted run. `log` gets each epoch's numbers.
+
+    Returns the card of the best epoch. Raises UserError if `out` holds another run, or on divergence.
+    """
+    fabric = fabric or Fabric(accelerator="cpu", devices=1, precision=settings.precision)
+    fabric.launch()
+    fit, select = [clips[i] for i in split.fit], [clips[i] for i in split.select]
+    scales = measure_scales(fit, settings)
+    card = Card(settings, scales, typical_young(fit), *_provenance(clips, split))
+    state = _open(out, card)
+
+    torch.manual_seed(settings.seed)
+    model = D2FNet(settings.arch)
+    if settings.channels_last:
+        model = model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    optimizer = torch.optim.AdamW(
+        model.parameters(), lr=settings.learning_rate, weight_decay=settings.weight_decay
+    )
+    plateau = ReduceLROnPlateau(optimizer, mode="max", factor=0.5, patience=settings.patience)
+    start, best, waited = 0, -math.inf, 0
+    if state is not None:
+        model.load_state_dict(state["model"])
+        optimizer.load_state_dict(state["optimizer"])
+        plateau.load_state_dict(state["plateau"])
+        start, best, waited = state["epoch"], state["best"], state["waited"]
+    net, optimizer = fabric.setup(model, optimizer)
+    frames, chooser = Frames(fit, settings), Frames(select, settings)
+
+    for epoch in range(start, settings.epochs):
+        if settings.stop and waited >= settings.stop:
+            break
+        numbers = _epoch(fabric, net, optimizer, frames, scales, epoch, report)
+        numbers |= select_score(net, chooser, scales, fabric.device)
+        score = numbers["select_r2"]
+        plateau.step(score)
+        improved = score > best
+        best, waited = (score, 0) if improved else (best, waited + 1)
+        numbers |= {"epoch": epoch + 1.0, "lr": optimizer.param_groups[0]["lr"]}
+        if fabric.is_global_zero:
+            if improved:
+                checkpoint.save_tensors(out / "weights.pt", _cpu(model.state_dict()))
+                checkpoint.write_card(out, dataclasses.replace(card, epoch=epoch + 1, score=score))
+            _remember(out, epoch, numbers)
+            checkpoint.save_tensors(
+                out / "last.pt",
+                {
+                    "model": _cpu(model.state_dict()),
+                    "optimizer": optimizer.state_dict(),
+                    "plateau": plateau.state_dict(),
+                    "epoch": epoch + 1,
+                    "best": best,
+                    "waited": waited,
+                },
+            )
+        fabric.barrier()
+        log(numbers)
+    return checkpoint.read_card(out)
+
+
+def _epoch(
+    fabric: Fabric,
+    net: Any,
+    optimizer: Any,
+    frames: Frames,
+    scales: Scales,
+    epoch: int,
+    report: Report,
+) -> dict[str, float]:
+    settings = frames.settings
+    # Seeds from (seed, epoch) alone: nothing to store, so a resumed run draws what the first would have.
+    seed = np.random.SeedSequence([settings.seed, epoch])
+    torch.manual_seed(int(seed.generate_state(1)[0]) + fabric.global_rank)
+    share = min(1.0, epoch / max(settings.epochs // 2, 1))
+    order = frames.order(np.random.default_rng(seed), share)
+    whole = settings.batch * fabric.world_size
+    batches = max(len(order) // whole, 1)
+    net.train()
+    means = {k: MeanMetric().to(fabric.device) for k in ("loss", "share_error", "share_r2", "share_total")}
+    for i in range(batches):
+        batch = frames.batch(order[i * whole : (i + 1) * whole][fabric.global_rank :: fabric.world_size])
+        batch = batch.to(fabric.device)
+        said = forward(net, batch, settings, scales)
+        terms = loss(
+            said,
+            batch.target,
+            batch.mask,
+            settings.objective,
+            scales.target,
+            scales.spread,
+            settings.grid.pitch_mm**2,
+            scales.force,
+        )
+        if not torch.isfinite(terms.sum):
+            raise UserError(f"training diverged in epoch {epoch + 1}: lower --learning-rate")
+        if i % 16 == 0:
+            for k, v in gradient_shares(terms, said).items():
+                means[f"share_{k}"].update(v)
+        optimizer.zero_grad()
+        fabric.backward(terms.sum)
+        fabric.clip_gradients(net, optimizer, max_norm=settings.clip)
+        optimizer.step()
+        means["loss"].update(terms.sum.detach())
+        report(epoch * batches + i + 1, settings.epochs * batches, {"loss": float(terms.sum.detach())})
+    return {k: float(m.compute()) for k, m in means.items()}
+
+
+def forward(net: Any, batch: Batch, settings: Settings, scales: Scales) -> torch.Tensor:
+    """The network's answer in physical units per unit stiffness, (B, C, N, N), unit of `Scales.target`."""
+    x = inputs(batch, settings, scales)
+    if settings.channels_last:
+        x = x.contiguous(memory_format=torch.channels_last)
+    young = batch.log_young if settings.arch.condition == "film" else None
+    said: torch.Tensor = net(x, young)
+    return said.float() * scales.target
+
+
+@torch.no_grad()
+def select_score(net: Any, frames: Frames, scales: Scales, device: torch.device) -> dict[str, float]:
+    """R² and RMSE over all tissue cells and components, on the last (most real) source of the input kind."""
+    net.eval()
+    sums = Moments()
+    for c in range(len(frames.clips)):
+        for batch in frames.sequential(c, frames.sources[-1]):
+            here = batch.to(device)
+            inside = here.mask.bool().expand_as(here.target)
+            said = forward(net, here, frames.settings, scales)
+            sums = sums + Moments.of(here.target[inside].cpu().numpy(), said[inside].cpu().numpy())
+    result = agreement(sums)
+    return {"select_r2": result.r2 if math.isfinite(result.r2) else -math.inf, "select_rmse": result.rmse}
+
+
+def _provenance(clips: Sequence[Clip], split: Split) -> tuple[dict[str, list[str]], dict[str, list[str]]]:
+    parts = {"fit": split.fit, "select": split.select, "test": split.test}
+    number = groups(clips)
+    seen = {number[i] for i in (*split.fit, *split.select)}
+    if seen & {number[i] for i in split.test} or {number[i] for i in split.fit} & {
+        number[i] for i in split.select
+    }:
+        raise UserError("the split shares an anatomy between fit, select and test")
+    return (
+        {k: [clips[i].content_hash for i in v] for k, v in parts.items()},
+        {k: sorted({clips[i].group for i in v}) for k, v in parts.items()},
+    )
+
+
+def _open(out: Path, card: Card) -> dict[str, Any] | None:
+    """The state to go on from, or None for a fresh start in a fresh folder."""
+    if not out.exists() or (out.is_dir() and not any(out.iterdir())):
+        checkpoint.write_card(out, card)
+        return None
+    there = checkpoint.read_card(out)
+    if there.settings != dataclasses.replace(card.settings, epochs=there.settings.epochs):
+        raise UserError(f"{out}: holds a model trained with other settings; choose another folder")
+    if there.split != card.split or there.scales != card.scales:
+        raise UserError(f"{out}: holds a model trained on other data; choose another folder")
+    if there.settings.epochs != card.settings.epochs and there.settings.input == "mixed":
+        raise UserError(f"{out}: the schedule of mixed input depends on --epochs; choose another folder")
+    if not (out / "last.pt").exists():
+        return None
+    state = checkpoint.load_tensors(out / "last.pt")
+    missing = {"model", "optimizer", "plateau", "epoch", "best", "waited"} - state.keys()
+    if missing:
+        raise UserError(f"{out / 'last.pt'}: corrupt checkpoint (lacks {', '.join(sorted(missing))})")
+    return state
+
+
+def _remember(out: Path, epoch: int, numbers: dict[str, float]) -> None:
+    """Writes the epoch's line; lines of epochs that a kill cut off before their checkpoint go."""
+    file = out / "history.jsonl"
+    lines = file.read_text().splitlines()[:epoch] if file.exists() else []
+    file.write_text("\n".join([*lines, json.dumps(numbers)]) + "\n")
+
+
+def _cpu(state: dict[str, Any]) -> dict[str, Any]:
+    return {k: v.detach().cpu().clone() for k, v in state.items()}

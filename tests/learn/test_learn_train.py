@@ -1,0 +1,241 @@
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from typer.testing import CliRunner
+
+from learn import checkpoint
+from learn.cli import app
+from learn.data import Clip
+from learn.evaluate import evaluate, unseen
+from learn.predict import load as load_model
+from learn.settings import Settings, preset
+from learn.split import Split, nested
+from learn.train import train
+from synth.errors import UserError
+from synth.store import Dataset
+
+run = CliRunner().invoke
+
+
+def small(**changes: object) -> Settings:
+    base = preset("tiny", size=32, epochs=4)
+    return dataclasses.replace(base, arch=dataclasses.replace(base.arch, levels=2, dropout=0.1), **changes)  # type: ignore[arg-type]
+
+
+@pytest.fixture(scope="module")
+def split(clips: list[Clip]) -> Split:
+    return nested(clips, 3, 0, seed=0)
+
+
+@pytest.fixture(scope="module")
+def model(clips: list[Clip], split: Split, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("trained") / "model"
+    train(clips, split, small(input="mixed"), out)
+    return out
+
+
+def weights(folder: Path) -> dict[str, torch.Tensor]:
+    state: dict[str, torch.Tensor] = checkpoint.load_tensors(folder / "last.pt")["model"]
+    return state
+
+
+class Killed(Exception):
+    pass
+
+
+def test_killed_and_resumed_equals_uninterrupted(
+    clips: list[Clip], split: Split, model: Path, tmp_path: Path
+) -> None:
+    def kill(numbers: dict[str, float]) -> None:
+        if numbers["epoch"] == 2:
+            raise Killed
+
+    out = tmp_path / "model"
+    with pytest.raises(Killed):
+        train(clips, split, small(input="mixed"), out, log=kill)
+    card = train(clips, split, small(input="mixed"), out)
+    whole = weights(model)
+    for name, value in weights(out).items():
+        assert torch.equal(value, whole[name]), name
+    assert (out / "history.jsonl").read_text() == (model / "history.jsonl").read_text()
+    assert card == checkpoint.read_card(model)
+
+
+def test_another_seed_is_another_model(clips: list[Clip], split: Split, model: Path, tmp_path: Path) -> None:
+    train(clips, split, small(input="mixed", seed=1), tmp_path / "m")
+    assert any(not torch.equal(v, weights(model)[k]) for k, v in weights(tmp_path / "m").items())
+
+
+def test_training_learns(clips: list[Clip], tmp_path: Path) -> None:
+    """Fitted and judged on the same clips: a network that can't even remember is broken."""
+    both = Split((0, 1, 3, 4, 5, 6), (2,), ())
+    settings = dataclasses.replace(small(epochs=60), batch=4, augment=False)
+    settings = dataclasses.replace(settings, arch=dataclasses.replace(settings.arch, dropout=0.0))
+    train(clips, both, settings, tmp_path / "m")
+    report = evaluate(load_model(tmp_path / "m"), [clips[i] for i in both.fit], "ideal")
+    assert report.summary()["map_r2_pooled"] > 0.5
+
+
+def test_history_reports_loss_and_gradient_shares(model: Path) -> None:
+    lines = [json.loads(line) for line in (model / "history.jsonl").read_text().splitlines()]
+    assert [line["epoch"] for line in lines] == [1, 2, 3, 4]
+    for line in lines:
+        assert line["share_error"] + line["share_r2"] == pytest.approx(1)
+        assert 0.05 < line["share_r2"] < 0.95
+
+
+def test_only_unseen_sequences_are_scored(clips: list[Clip], split: Split, model: Path) -> None:
+    card = checkpoint.read_card(model)
+    assert [c.name for c in unseen(clips, card)] == [clips[i].name for i in split.test]
+    copied = dataclasses.replace(clips[split.fit[0]], content_hash="x")
+    assert unseen([copied], card) == []
+
+
+def test_prediction_on_a_picture_is_that_on_the_grid(model: Path, dataset: Path, clips: list[Clip]) -> None:
+    predictor = load_model(model)
+    sequence = Dataset(dataset)[4]
+    map_ = predictor(
+        sequence["flow"][3],
+        sequence["tissue"][:],
+        sequence.attrs["scale_mm_per_px"],
+        sequence.attrs["young_kpa"],
+    )
+    on_grid = predictor.density(clips[4].displacement["ideal"][3:4], clips[4].mask, clips[4].young_kpa)[0]
+    np.testing.assert_allclose(map_.density, on_grid, rtol=1e-4, atol=1e-7)
+    assert map_.force_mn is not None
+    assert map_.total_force_mn == pytest.approx(float(np.linalg.norm(map_.force_mn)))
+    assert map_.to_image().shape == sequence.size
+    assert map_.young_known
+    guessed = predictor(sequence["flow"][3], sequence["tissue"][:], sequence.attrs["scale_mm_per_px"])
+    assert guessed.young_kpa == predictor.card.typical_young_kpa
+    assert guessed.total_force_mn == pytest.approx(
+        map_.total_force_mn * guessed.young_kpa / map_.young_kpa, rel=1e-4
+    )
+
+
+def test_the_same_motion_filmed_at_another_resolution_is_the_same_force(model: Path) -> None:
+    predictor = load_model(model)
+
+    def force(size: int, scale: float) -> float:
+        node = (np.arange(size) - (size - 1) / 2) * scale
+        x, y = np.meshgrid(node, node)
+        tissue = x**2 + y**2 < 11**2
+        moved = np.stack([np.exp(-(x**2 + y**2) / 30), 0 * x], axis=-1) * 0.5 / scale
+        return predictor((moved * tissue[..., None]).astype(np.float32), tissue, scale, 1.0).total_force_mn
+
+    assert force(240, 0.15) == pytest.approx(force(120, 0.3), rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("shape", "message"), [((2, 2, 64, 64), r"shape \(T, 2, 32, 32\)"), ((2, 3, 32, 32), "got")]
+)
+def test_another_grid(model: Path, shape: tuple[int, ...], message: str) -> None:
+    with pytest.raises(UserError, match=message):
+        load_model(model).density(np.zeros(shape, np.float32), np.ones((32, 32), np.float32), 1.0)
+
+
+def test_bad_numbers(model: Path) -> None:
+    predictor = load_model(model)
+    flow, tissue = np.zeros((8, 8, 2), np.float32), np.ones((8, 8), bool)
+    with pytest.raises(UserError, match="young_kpa -1"):
+        predictor(flow, tissue, 0.1, -1.0)
+    with pytest.raises(UserError, match="flow: expected"):
+        predictor(flow[:4], tissue, 0.1)
+    with pytest.raises(UserError, match="NaN"):
+        predictor(flow * np.nan, tissue, 0.1)
+
+
+def broken(model: Path, to: Path, file: str, data: bytes) -> Path:
+    to.mkdir()
+    for item in model.iterdir():
+        (to / item.name).write_bytes(item.read_bytes())
+    (to / file).write_bytes(data)
+    return to
+
+
+def test_corrupt_checkpoints(model: Path, tmp_path: Path) -> None:
+    whole = (model / "weights.pt").read_bytes()
+    with pytest.raises(UserError, match="corrupt checkpoint"):
+        load_model(broken(model, tmp_path / "a", "weights.pt", whole[: len(whole) // 2]))
+    with pytest.raises(UserError, match="corrupt checkpoint"):
+        load_model(broken(model, tmp_path / "b", "weights.pt", b"not a model"))
+    with pytest.raises(UserError, match="corrupt model configuration"):
+        load_model(broken(model, tmp_path / "c", "config.json", b"{}"))
+    config = json.loads((model / "config.json").read_text())
+    config["settings"]["arch"]["width"] = 16
+    with pytest.raises(UserError, match=r"not those of the network in config\.json"):
+        load_model(broken(model, tmp_path / "d", "config.json", json.dumps(config).encode()))
+    with pytest.raises(UserError, match="no model here"):
+        load_model(tmp_path / "nothing")
+
+
+def test_a_folder_with_another_run_is_not_overwritten(clips: list[Clip], split: Split, model: Path) -> None:
+    before = (model / "weights.pt").read_bytes()
+    with pytest.raises(UserError, match="other settings"):
+        train(clips, split, small(input="mixed", learning_rate=0.1), model)
+    with pytest.raises(UserError, match="other data"):
+        train(clips[:-1], nested(clips[:-1], 3, 0, 0), small(input="mixed"), model)
+    assert (model / "weights.pt").read_bytes() == before
+
+
+def test_a_split_that_leaks_is_refused(clips: list[Clip], tmp_path: Path) -> None:
+    # Clips 0 and 1 share an anatomy.
+    with pytest.raises(UserError, match="shares an anatomy"):
+        train(clips, Split((0, 2), (3,), (1,)), small(), tmp_path / "m")
+
+
+ARGS = ["--preset", "tiny", "--size", "32", "--epochs", "1", "--json"]
+
+
+def test_command_line(dataset: Path, tmp_path: Path) -> None:
+    out = tmp_path / "m"
+    done = run(app, ["train", str(dataset), "-o", str(out), "--input", "recovered", *ARGS])
+    assert done.exit_code == 0, done.output
+    assert json.loads(done.stdout)["epoch"] == 1
+    done = run(app, ["eval", str(out), str(dataset), "--json"])
+    assert done.exit_code == 0, done.output
+    result = json.loads(done.stdout)
+    assert result["input"] == "recovered"
+    assert set(result["columns"]) == {"known", "half", "double", "unknown"}
+    assert len(result["sequences"]) == len(checkpoint.read_card(out).split["test"])
+    table = run(app, ["eval", str(out), str(dataset)])
+    assert "unseen sequences" in table.output
+
+
+@pytest.mark.parametrize(
+    ("extra", "message"),
+    [
+        (["--folds", "9"], "9 folds"),
+        (["--input", "guessed"], "unknown input 'guessed'"),
+        (["--preset", "huge"], "unknown preset 'huge'"),
+        (["--size", "40"], "grid size 40"),
+        (["--target", "intensity"], "needs output 'magnitude'"),
+        (["--hold-out", "calf"], "no sequence of family 'calf'"),
+    ],
+)
+def test_bad_input_is_one_line_and_exit_2(
+    dataset: Path, tmp_path: Path, extra: list[str], message: str
+) -> None:
+    out = tmp_path / "m"
+    done = run(app, ["train", str(dataset), "-o", str(out), *ARGS, *extra])
+    assert done.exit_code == 2
+    assert message in done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1
+    assert not out.exists()
+
+
+def test_nothing_unseen_is_said_so(dataset: Path, tmp_path: Path) -> None:
+    out = tmp_path / "m"
+    run(app, ["train", str(dataset), "-o", str(out), *ARGS])
+    config = json.loads((out / "config.json").read_text())
+    config["groups"]["fit"] += config["groups"].pop("test")
+    (out / "config.json").write_text(json.dumps(config))
+    done = run(app, ["eval", str(out), str(dataset)])
+    assert done.exit_code == 2
+    assert "--all scores them anyway" in done.stderr
