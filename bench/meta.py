@@ -1,0 +1,167 @@
+"""`meta.yaml`: what a lab must say about its recording that the video and the sensor file don't."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    FiniteFloat,
+    ValidationError,
+    model_validator,
+)
+from ruamel.yaml import YAML
+from ruamel.yaml.error import MarkedYAMLError, YAMLError
+
+from synth.errors import UserError
+
+Positive = Annotated[FiniteFloat, Field(gt=0)]
+Share = Annotated[FiniteFloat, Field(ge=0, lt=1)]
+Point = tuple[FiniteFloat, FiniteFloat]
+Row = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
+Span = tuple[FiniteFloat, FiniteFloat]
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True, allow_inf_nan=False)
+
+
+class Calibration(_Section):
+    """How to find the scale when it isn't stated. Give one of the ways."""
+
+    focal_px: Positive | None = None
+    """Focal length [px]; with `distance_mm`."""
+    distance_mm: Positive | None = None
+    """Distance from the lens to the tissue [mm]; with `focal_px`."""
+    bar_px: tuple[Point, Point] | None = None
+    """Ends of a scale bar, or the two sides of an instrument of known width, as (x, y) [px]."""
+    bar_mm: Positive | None = None
+    """Its length [mm]."""
+    checkerboard: Path | None = None
+    """Picture of a checkerboard lying on the tissue plane, in the recording's folder."""
+    corners: tuple[int, int] | None = None
+    """Inner corners of the board: columns, rows."""
+    square_mm: Positive | None = None
+    """Side of one of its squares [mm]."""
+    travel_px: tuple[Point, Point] | None = None
+    """Where the tool tip was before and after a known move parallel to the tissue plane, as (x, y) [px]."""
+    travel_mm: Positive | None = None
+    """Length of that move [mm]."""
+
+    @model_validator(mode="after")
+    def _exactly_one_way(self) -> Calibration:
+        ways = (
+            (self.focal_px, self.distance_mm),
+            (self.bar_px, self.bar_mm),
+            (self.checkerboard, self.corners, self.square_mm),
+            (self.travel_px, self.travel_mm),
+        )
+        begun = [way for way in ways if any(part is not None for part in way)]
+        if len(begun) != 1 or any(part is None for part in begun[0]):
+            raise ValueError(
+                "give one whole way: focal_px + distance_mm, bar_px + bar_mm, "
+                "checkerboard + corners + square_mm, or travel_px + travel_mm"
+            )
+        return self
+
+
+class Sensor(_Section):
+    """The force sensor and how its file is to be read."""
+
+    axes: Literal["camera", "sensor"] = "sensor"
+    """`camera`: fx, fy, fz are along the camera's x (right), y (down), z (forward), so that components are
+    scored too. `sensor`: only the magnitude is."""
+    acts_on: Literal["tissue", "tool"] = "tissue"
+    """On what the written force acts; a force on the tool is turned round."""
+    low_pass_hz: Positive | None = 10.0
+    """The one low-pass applied to the sensor (zero-phase, 4th-order Butterworth) [Hz]; null: none."""
+    free_s: tuple[Span, ...] = ()
+    """Spans without contact, (from, to) on the sensor's clock [s]: for tare, drift and noise floor."""
+    mass_g: Annotated[FiniteFloat, Field(ge=0)] = 0.0
+    """Mass beyond a tool-mounted sensor [g], for gravity; needs columns gx, gy, gz in force.csv."""
+
+
+class Sync(_Section):
+    """How the sensor's clock lies on the video's."""
+
+    method: Literal["clock", "offset", "correlate"] = "clock"
+    """`clock`: both files share one. `offset`: `offset_s` (a trigger) is stated. `correlate`: found on
+    `calibration_s`, then frozen."""
+    offset_s: FiniteFloat = 0.0
+    """Added to the sensor's times to give the video's [s]."""
+    calibration_s: Span | None = None
+    """Span of video time on which `correlate` may look [s]; it is left out of the scores."""
+    search_s: Positive = 0.5
+    """Largest offset looked for, either way [s]."""
+
+
+class Meta(_Section):
+    """One recording."""
+
+    scale_mm_per_px: Positive | None = None
+    """Millimetres a pixel at the tissue. This or `calibration`."""
+    calibration: Calibration | None = None
+    """How to find the scale."""
+    scale_uncertainty: Share | None = None
+    """Relative standard uncertainty of the scale, e.g. 0.05. Default: 0.02, or the calibration's."""
+    young_kpa: Annotated[
+        Positive | None, BeforeValidator(lambda value: None if value == "unknown" else value)
+    ] = None
+    """Young's modulus of the tissue [kPa], or `unknown`: then only relative force is known."""
+    young_uncertainty: Share = 0.0
+    """Relative standard uncertainty of `young_kpa`."""
+    fps: Positive | None = None
+    """Frames a second, for frames/*.png without frames.csv."""
+    rest_frame: Annotated[int, Field(ge=0)] = 0
+    """Frame with the tissue unloaded; displacement is measured from it."""
+    press_s: Span | None = None
+    """Span of video time holding a separate press for calibrating one gain [s]; left out of the scores."""
+    specimen: str = ""
+    """Name of the specimen; recordings of one specimen are never treated as independent."""
+    sensor: Sensor = Sensor()
+    sync: Sync = Sync()
+
+    @model_validator(mode="after")
+    def _scale_is_known(self) -> Meta:
+        if (self.scale_mm_per_px is None) == (self.calibration is None):
+            raise ValueError("give either scale_mm_per_px or calibration")
+        if self.sync.method == "correlate" and self.sync.calibration_s is None:
+            raise ValueError("sync.method correlate needs sync.calibration_s")
+        return self
+
+
+def read(path: Path) -> Meta:
+    """The recording's `meta.yaml`.
+
+    Raises:
+        UserError: no such file, not YAML, or (all at once) every field that is wrong.
+    """
+    try:
+        content = YAML(typ="safe").load(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise UserError(f"{path}: missing; a recording needs at least scale_mm_per_px there") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise UserError(f"{path}: unreadable ({error})") from None
+    except MarkedYAMLError as error:
+        mark = error.problem_mark
+        where = f":{mark.line + 1}:{mark.column + 1}" if mark else ""
+        raise UserError(f"{path}{where}: not YAML: {error.problem}") from None
+    except YAMLError as error:
+        raise UserError(f"{path}: not YAML: {error}".splitlines()[0]) from None
+    if not isinstance(content, dict):
+        raise UserError(f"{path}: expected keys and values such as 'scale_mm_per_px: 0.05'")
+    try:
+        return Meta.model_validate(content)
+    except ValidationError as error:
+        raise UserError("; ".join(_line(path, detail) for detail in error.errors())) from None
+
+
+def _line(path: Path, detail: object) -> str:
+    assert isinstance(detail, dict)
+    key = ".".join(str(part) for part in detail["loc"]) or "recording"
+    message = str(detail["msg"]).removeprefix("Value error, ")
+    return f"{path}: {key}: {message[0].lower()}{message[1:]}"

@@ -1,0 +1,49 @@
+"""Trained models behind the bench's protocol of methods."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bench.follow import Answer, Scene
+
+if TYPE_CHECKING:
+    from learn.predict import Predictor
+
+
+class Model:
+    """A model folder of `learn train`. Without a known E it answers for tissue of 1 kPa."""
+
+    def __init__(self, folder: Path) -> None:
+        """Raises UserError if the folder holds no readable model."""
+        from learn.predict import load
+
+        self.predictor: Predictor = load(folder)
+
+    def described(self) -> dict[str, object]:
+        """What the model is, for the report."""
+        settings = self.predictor.card.settings
+        return {
+            "preset_size": settings.size,
+            "extent_mm": settings.extent_mm,
+            "width": settings.arch.width,
+            "stem": settings.arch.stem,
+            "input": settings.input,
+            "target": settings.target,
+        }
+
+    def __call__(
+        self, flow: NDArray[np.float32], confidence: NDArray[np.float32], scene: Scene, picture: bool
+    ) -> Answer:
+        """See `Method`."""
+        said = self.predictor(flow, scene.tissue, scene.scale_mm_per_px, scene.young_kpa, confidence)
+        # The model's own typical E would make the number depend on its training data.
+        per_kpa = 1.0 if scene.young_kpa is not None else 1.0 / said.young_kpa
+        force = said.force_mn
+        if force is None:
+            force = np.array([said.total_force_mn, np.nan, np.nan])
+        density = (per_kpa * said.to_image()).astype(np.float32) if picture else None
+        return Answer(per_kpa * force, density)

@@ -1,0 +1,206 @@
+"""How well one force curve follows another. Pure functions on arrays; undefined is NaN, never 0."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Curve = NDArray[np.float64]
+"""(T,) float64."""
+
+SURGICAL_FORCE_MN = 300.0
+"""The 0.3 N below which 70% of tool-tissue forces in neurosurgery lie."""
+
+
+@dataclass(frozen=True)
+class Event:
+    """One contact: a span of samples, end exclusive."""
+
+    start: int
+    stop: int
+
+
+def agreement(sensor: Curve, predicted: Curve) -> dict[str, float]:
+    """Scores over all samples where both are finite.
+
+    `r2` is 1 − SSE/SST about the sensor's mean, so bias and gain errors count; `ccc` is Lin's concordance
+    ("A concordance correlation coefficient to evaluate reproducibility", Biometrics 1989).
+
+    Args:
+        sensor: (T,) mN.
+        predicted: (T,) mN.
+
+    Returns:
+        n, mae_mn, rmse_mn, bias_mn, r, ccc, r2, gain (least-squares slope of predicted on sensor).
+    """
+    both = np.isfinite(sensor) & np.isfinite(predicted)
+    x, y = sensor[both], predicted[both]
+    n = len(x)
+    if n == 0:
+        keys = ("mae_mn", "rmse_mn", "bias_mn", "r", "ccc", "r2", "gain")
+        return {"n": 0.0, **dict.fromkeys(keys, float("nan"))}
+    error = y - x
+    xc, yc = x - x.mean(), y - y.mean()
+    sxx, syy, sxy = float(xc @ xc), float(yc @ yc), float(xc @ yc)
+    shift = n * float(x.mean() - y.mean()) ** 2
+    return {
+        "n": float(n),
+        "mae_mn": float(np.abs(error).mean()),
+        "rmse_mn": float(np.sqrt((error**2).mean())),
+        "bias_mn": float(error.mean()),
+        "r": _ratio(sxy, float(np.sqrt(sxx * syy))),
+        "ccc": _ratio(2 * sxy, sxx + syy + shift),
+        "r2": 1 - _ratio(float(error @ error), sxx),
+        "gain": _ratio(sxy, sxx),
+    }
+
+
+def lag(time_s: Curve, sensor: Curve, predicted: Curve, search_s: float = 0.5) -> dict[str, float]:
+    """By how much `predicted` runs behind `sensor`, and the correlation with that taken out.
+
+    Only reported: scores are at lag 0. Found on a uniform grid of a quarter of the median frame time.
+
+    Args:
+        time_s: (T,) rising [s].
+        sensor: (T,) mN.
+        predicted: (T,) mN.
+        search_s: largest lag looked for, either way [s].
+
+    Returns:
+        lag_s (positive: predicted is late), r_at_lag.
+    """
+    both = np.isfinite(sensor) & np.isfinite(predicted) & np.isfinite(time_s)
+    t, x, y = time_s[both], sensor[both], predicted[both]
+    if len(t) < 8 or np.ptp(x) == 0 or np.ptp(y) == 0:
+        return {"lag_s": float("nan"), "r_at_lag": float("nan")}
+    step = float(np.median(np.diff(t))) / 4
+    search = min(search_s, 0.25 * float(t[-1] - t[0]))
+    lags = np.arange(-round(search / step), round(search / step) + 1) * step
+    inner = (t >= t[0] + search) & (t <= t[-1] - search)
+    if inner.sum() < 8:
+        return {"lag_s": float("nan"), "r_at_lag": float("nan")}
+    shifted = [np.interp(t[inner] + shift, t, y) for shift in lags]
+    r = np.array([_correlation(x[inner], later) for later in shifted])
+    if not np.isfinite(r).any():
+        return {"lag_s": float("nan"), "r_at_lag": float("nan")}
+    best = int(np.nanargmax(r))
+    return {"lag_s": float(lags[best]), "r_at_lag": float(r[best])}
+
+
+def contact_threshold(sensor: Curve, noise_floor_mn: float) -> float:
+    """Force above which the sensor says contact [mN]: 3 times its noise floor, at least 5% of its peak."""
+    peak = float(np.nanmax(sensor, initial=0.0))
+    return max(3 * noise_floor_mn, 0.05 * peak)
+
+
+def in_contact(curve: Curve, threshold_mn: float) -> NDArray[np.bool_]:
+    """(T,) whether the curve is in contact: entered at the threshold, left at half of it (hysteresis)."""
+    state, out = False, np.zeros(len(curve), bool)
+    for k, value in enumerate(curve):
+        if np.isfinite(value):
+            state = value >= (0.5 * threshold_mn if state else threshold_mn)
+        out[k] = state
+    return out
+
+
+def events(time_s: Curve, contact: NDArray[np.bool_], shortest_s: float = 0.15) -> list[Event]:
+    """Contacts of at least `shortest_s`; gaps shorter than that are closed first."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], contact, [False]]).astype(int)))
+    spans = [Event(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+    joined: list[Event] = []
+    for span in spans:
+        if joined and time_s[span.start] - time_s[joined[-1].stop - 1] < shortest_s:
+            joined[-1] = Event(joined[-1].start, span.stop)
+        else:
+            joined.append(span)
+    return [span for span in joined if time_s[span.stop - 1] - time_s[span.start] >= shortest_s]
+
+
+def per_event(time_s: Curve, sensor: Curve, predicted: Curve, spans: list[Event]) -> list[dict[str, float]]:
+    """One row a contact: peaks [mN], impulses [mN s] (trapezoidal) and their errors."""
+    rows = []
+    for span in spans:
+        part = slice(span.start, span.stop)
+        good = np.isfinite(sensor[part]) & np.isfinite(predicted[part])
+        if good.sum() < 2:
+            continue
+        t, x, y = time_s[part][good], sensor[part][good], predicted[part][good]
+        peak, impulse = float(x.max()), float(np.trapezoid(x, t))
+        rows.append(
+            {
+                "from_s": float(t[0]),
+                "to_s": float(t[-1]),
+                "peak_mn": peak,
+                "predicted_peak_mn": float(y.max()),
+                "peak_error": _ratio(float(y.max()) - peak, peak),
+                "impulse_mns": impulse,
+                "impulse_error": _ratio(float(np.trapezoid(y, t)) - impulse, impulse),
+                "mae_mn": float(np.abs(y - x).mean()),
+            }
+        )
+    return rows
+
+
+def contact_scores(sensor: Curve, predicted: Curve, threshold_mn: float) -> dict[str, float]:
+    """How well contact is told from none.
+
+    Returns:
+        contact_f1; ghost_rate: share of contact-free samples where contact is predicted; ghost_mn: mean
+        predicted force there.
+    """
+    both = np.isfinite(sensor) & np.isfinite(predicted)
+    truth = in_contact(sensor, threshold_mn)[both]
+    said = in_contact(predicted, threshold_mn)[both]
+    free = ~truth
+    hits = float(np.sum(truth & said))
+    return {
+        "contact_f1": _ratio(2 * hits, float(truth.sum() + said.sum())),
+        "ghost_rate": _ratio(float(np.sum(said & free)), float(free.sum())),
+        "ghost_mn": float(np.abs(predicted[both][free]).mean()) if free.any() else float("nan"),
+    }
+
+
+def everything(
+    time_s: Curve, sensor: Curve, predicted: Curve, noise_floor_mn: float = 0.0
+) -> tuple[dict[str, float], list[dict[str, float]]]:
+    """All scores of one predicted curve against one sensor's, and the table of its contacts.
+
+    Args:
+        time_s: (T,) rising [s].
+        sensor: (T,) mN, NaN where there is none.
+        predicted: (T,) mN, NaN where there is none.
+        noise_floor_mn: standard deviation of the sensor without contact [mN].
+    """
+    threshold = contact_threshold(sensor, noise_floor_mn)
+    rows = per_event(time_s, sensor, predicted, events(time_s, in_contact(sensor, threshold)))
+    scores = agreement(sensor, predicted)
+    peaks = np.array([row["peak_mn"] for row in rows])
+    peak = float(peaks.mean()) if len(peaks) else float("nan")
+    scores |= lag(time_s, sensor, predicted)
+    scores |= contact_scores(sensor, predicted, threshold)
+    scores |= {
+        "threshold_mn": threshold,
+        "events": float(len(rows)),
+        "event_peak_mn": peak,
+        "mae_of_peak": _ratio(scores["mae_mn"], peak),
+        "mae_of_surgical": scores["mae_mn"] / SURGICAL_FORCE_MN,
+        "peak_mae": _mean_size(rows, "peak_error"),
+        "impulse_mae": _mean_size(rows, "impulse_error"),
+        "dropout": float(np.mean(~np.isfinite(predicted))) if len(predicted) else float("nan"),
+    }
+    return scores, rows
+
+
+def _mean_size(rows: list[dict[str, float]], key: str) -> float:
+    return float(np.mean([abs(row[key]) for row in rows])) if rows else float("nan")
+
+
+def _correlation(x: Curve, y: Curve) -> float:
+    x, y = x - x.mean(), y - y.mean()
+    return _ratio(float(x @ y), float(np.sqrt((x @ x) * (y @ y))))
+
+
+def _ratio(above: float, below: float) -> float:
+    return above / below if below > 0 else float("nan")

@@ -1,0 +1,136 @@
+"""Pictures with exact times, one at a time, from a video file or a folder of PNGs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from synth.errors import UserError
+
+Rgb = NDArray[np.uint8]
+
+_LARGEST_PIXELS = 40_000_000
+
+
+@dataclass(frozen=True)
+class Picture:
+    """One frame as it is to be looked at: upright, sRGB."""
+
+    index: int
+    """Position among the decoded frames."""
+    time_s: float | None
+    """Presentation time on the video's clock [s]; None if the file states none."""
+    rgb: Rgb
+    """(H, W, 3) uint8."""
+
+
+def from_video(path: Path) -> Iterator[Picture]:
+    """Decodes frame by frame; times are the container's presentation times, first frame as stored.
+
+    A rotation stated in the file is applied. A file cut off in the middle gives the frames before the cut.
+
+    Raises:
+        UserError: not a video, no video stream, or pictures beyond 40 megapixels.
+    """
+    try:
+        container = av.open(str(path))
+    except (av.error.FFmpegError, OSError) as error:
+        raise UserError(f"{path}: not a readable video ({_reason(error)})") from None
+    with container:
+        if not container.streams.video:
+            raise UserError(f"{path}: holds no video stream")
+        stream = container.streams.video[0]
+        if stream.width * stream.height > _LARGEST_PIXELS:
+            raise UserError(f"{path}: {stream.width} x {stream.height} pixels a frame is too large")
+        # Two cores at most: a bench machine scores several recordings at a time.
+        stream.thread_type = "AUTO"
+        stream.codec_context.thread_count = 2
+        index = 0
+        try:
+            for frame in container.decode(stream):
+                rgb = np.rot90(frame.to_ndarray(format="rgb24"), frame.rotation // 90)
+                yield Picture(
+                    index, None if frame.pts is None else float(frame.time), np.ascontiguousarray(rgb)
+                )
+                index += 1
+        except av.error.FFmpegError as error:
+            if index == 0:
+                raise UserError(f"{path}: not a readable video ({_reason(error)})") from None
+        if index == 0:
+            raise UserError(f"{path}: holds no frames")
+
+
+def stated_frames(path: Path) -> int | None:
+    """Number of frames that the container states; None if it doesn't. UserError if it is no video."""
+    try:
+        with av.open(str(path)) as container:
+            return int(container.streams.video[0].frames) or None if container.streams.video else None
+    except (av.error.FFmpegError, OSError) as error:
+        raise UserError(f"{path}: not a readable video ({_reason(error)})") from None
+
+
+def from_pictures(paths: tuple[Path, ...]) -> Iterator[Picture]:
+    """PNG (or any still OpenCV reads) files in the given order, without times.
+
+    Raises:
+        UserError: one can't be read, or its size differs from the first's.
+    """
+    size: tuple[int, ...] | None = None
+    for index, path in enumerate(paths):
+        rgb = read_picture(path)
+        if size is not None and rgb.shape != size:
+            raise UserError(
+                f"{path}: {rgb.shape[1]} x {rgb.shape[0]}, the frames before it {size[1]} x {size[0]}"
+            )
+        size = rgb.shape
+        yield Picture(index, None, rgb)
+
+
+def read_picture(path: Path) -> Rgb:
+    """A still as (H, W, 3) uint8 sRGB; 16-bit ones are brought to 8.
+
+    Raises:
+        UserError: unreadable.
+    """
+    bgr = cv2.imread(str(path), cv2.IMREAD_COLOR)
+    if bgr is None:
+        raise UserError(f"{path}: not a readable picture")
+    return np.ascontiguousarray(bgr[..., ::-1]).astype(np.uint8)
+
+
+def write_video(path: Path, pictures: Iterator[Rgb], times_s: NDArray[np.float64], crf: int = 12) -> None:
+    """H.264 MP4 with each frame at its own time, in milliseconds; odd sizes lose their last row or column.
+
+    Args:
+        pictures: (H, W, 3) uint8 each, as many as `times_s`.
+        times_s: (T,) rising [s].
+        crf: x264's quality, 0 is lossless (4:4:4 colour).
+    """
+    with av.open(str(path), "w") as container:
+        rate = (
+            max(1, round((len(times_s) - 1) / max(times_s[-1] - times_s[0], 1e-3))) if len(times_s) > 1 else 1
+        )
+        stream = container.add_stream("libx264", rate=rate, options={"crf": str(crf), "threads": "1"})
+        stream.codec_context.time_base = stream.time_base = Fraction(1, 90_000)
+        stream.pix_fmt = "yuv444p" if crf == 0 else "yuv420p"
+        for k, (rgb, time) in enumerate(zip(pictures, times_s, strict=True)):
+            even = rgb[: rgb.shape[0] // 2 * 2, : rgb.shape[1] // 2 * 2]
+            if k == 0:
+                stream.height, stream.width = even.shape[:2]
+            frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(even), format="rgb24")
+            frame.pts = round(float(time - times_s[0]) * 90_000)
+            frame.time_base = Fraction(1, 90_000)
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+
+
+def _reason(error: Exception) -> str:
+    text = str(error).splitlines()[0] if str(error) else type(error).__name__
+    return text.split("]")[-1].split(":")[0].strip() or type(error).__name__
