@@ -1,7 +1,7 @@
 """The exposed cortex: relief, vessels and the fine surface that is loaded, moved and rendered.
 
-The surface is a height field over the opening and a margin under its rim. In the window of a craniotomy the pia is
-one, arachnoid bridging the sulci; what lies deeper is never seen.
+The surface is a height field over the opening and a margin under its rim: arachnoid bridges the sulci, and what
+lies deeper is never seen.
 """
 
 from __future__ import annotations
@@ -120,7 +120,7 @@ def _extent(anatomy: job.Anatomy) -> float:
 
 
 def _dome(xy: Floats, radius: float) -> Floats:
-    return np.sqrt(np.maximum(radius**2 - (xy**2).sum(axis=1), 0)) - radius
+    return np.asarray(np.sqrt(np.maximum(radius**2 - (xy**2).sum(axis=1), 0)) - radius)
 
 
 def _folds(relief: Relief, extent_mm: float) -> Map:

@@ -1,6 +1,6 @@
 """The one file that knows Mitsuba. A stage of meshes, lamps and a camera; vertices are moved in place.
 
-Mitsuba's variant is chosen on first use and its LLVM found by `synth.llvm`, since a wrong one ends the process.
+Mitsuba's variant is chosen on first use and its LLVM found by `synth.llvm`: a wrong one ends the process.
 """
 
 from __future__ import annotations
@@ -43,6 +43,8 @@ class Metal:
     along: float
     """GGX alpha along the brushing (the first texture axis)."""
     across: float
+    satin: float
+    """Share of light that the finish scatters evenly."""
 
 
 @dataclass(frozen=True)
@@ -124,6 +126,7 @@ class Stage:
 
         mi.set_variant(variant)
         _register(variant)
+        _limit_threads()
         self.variant = variant
         self._mi = mi
         self._spp = spp
@@ -155,6 +158,15 @@ class Stage:
         self._parameters.update()
         image = self._mi.render(self._scene, sensor=self._sensor, spp=self._spp, seed=seed)
         return np.array(image, dtype=np.float32)[..., :3]
+
+
+def _limit_threads() -> None:
+    """Workers that share a machine say how many threads each may take."""
+    threads = os.environ.get("SULCUS_THREADS")
+    if threads:
+        import drjit as dr
+
+        dr.set_thread_count(int(threads))
 
 
 def _integrator(kind: str) -> dict[str, Any]:
@@ -192,9 +204,7 @@ def _mesh(mi: Any, name: str, body: Body) -> Any:
     parameters = mi.traverse(mesh)
     parameters["vertex_positions"] = body.vertices.astype(np.float32).ravel()
     parameters["faces"] = body.faces.astype(np.uint32).ravel()
-    # Bitmaps have their first row at v = 1; ours have it at y's lower end.
-    uv = np.stack([body.uv[:, 0], 1 - body.uv[:, 1]], axis=1)
-    parameters["vertex_texcoords"] = uv.astype(np.float32).ravel()
+    parameters["vertex_texcoords"] = body.uv.astype(np.float32).ravel()
     parameters.update()
     return mesh
 
@@ -203,17 +213,24 @@ def _material(mi: Any, material: Wet | Metal) -> dict[str, Any]:
     if isinstance(material, Metal):
         return {
             "type": "twosided",
-            "metal": {
-                "type": "roughconductor",
-                "material": "none",
-                "distribution": "ggx",
-                "alpha_u": material.along,
-                "alpha_v": material.across,
-                "specular_reflectance": {"type": "rgb", "value": list(material.reflectance)},
+            "satin": {
+                "type": "blendbsdf",
+                "weight": material.satin,
+                "brushed": {
+                    "type": "roughconductor",
+                    "material": "none",
+                    "distribution": "ggx",
+                    "alpha_u": material.along,
+                    "alpha_v": material.across,
+                    "specular_reflectance": {"type": "rgb", "value": list(material.reflectance)},
+                },
+                "scattered": {
+                    "type": "diffuse",
+                    "reflectance": {"type": "rgb", "value": list(material.reflectance)},
+                },
             },
         }
-    # v runs against the rows in the mesh's own frame, so the second tangent does too.
-    encoded = material.normal * np.array([0.5, -0.5, 0.5], np.float32) + 0.5
+    encoded = material.normal * np.float32(0.5) + np.float32(0.5)
     return {
         "type": "twosided",
         "bent": {
@@ -274,7 +291,7 @@ def _register(variant: str) -> None:
     import drjit as dr
     import mitsuba as mi
 
-    class Lens(mi.Sensor):  # type: ignore[misc]
+    class Lens(mi.Sensor):
         """`camera.rays` for film samples, with a lens of some width."""
 
         def __init__(self, props: Any) -> None:

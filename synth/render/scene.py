@@ -21,7 +21,7 @@ Floats = npt.NDArray[np.float64]
 Map = npt.NDArray[np.float32]
 Mask = npt.NDArray[np.bool_]
 
-_STEEL = Metal(reflectance=(0.86, 0.85, 0.83), along=0.34, across=0.16)
+_STEEL = Metal(reflectance=(0.80, 0.80, 0.79), along=0.30, across=0.14, satin=0.45)
 _RIM_ROUGHNESS = 0.11
 _GLARE = 0.35  # specular radiance, as a share of full scale, that hides what is under it
 
@@ -108,7 +108,7 @@ class Studio:
         )
 
     def traction(self, nodal: Floats) -> Map:
-        """Traction (V, 3) kPa in world axes at rest pixels: (H, W, 3) kPa in camera axes; 0 off the tissue."""
+        """Traction (V, 3) kPa, world axes, at rest pixels: (H, W, 3) kPa, camera axes; 0 off tissue."""
         return truth.at_rest_pixels(self.still, self._surface.faces, nodal @ self._camera.rotation.T)
 
     def _expose(self, vertices: Floats, tool: Floats, seed: int) -> Map:

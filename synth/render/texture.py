@@ -17,7 +17,7 @@ from synth.render.look import Look
 Map = npt.NDArray[np.float32]
 Floats = npt.NDArray[np.float64]
 
-# Light lost in a millimetre of vessel, red, green, blue: whole blood seen through its wall, by eye on photographs.
+# Light lost in a millimetre of vessel, red, green, blue: blood seen through its wall, by eye on photographs.
 _ARTERIAL = np.array([0.35, 5.6, 6.6], np.float32)
 _TEXELS_A_PIXEL = 2.2
 
@@ -116,7 +116,7 @@ def _veined(albedo: Map, tube: tuple[Map, Map], look: Look, extent: float) -> Ma
 def _film(
     rng: np.random.Generator, look: Look, tubes: dict[str, tuple[Map, Map]], pixels: int, extent: float
 ) -> Map:
-    """Height of the wet surface above the mesh: vessels under a film that evens out what is finer than itself."""
+    """Height of the wet surface above the mesh: vessels under a film that evens out finer things."""
     relief = 0.42 * thickness(tubes["arteries"]) + 0.25 * thickness(tubes["capillaries"])
     relief = noise.blur(relief, look.film_mm, extent)
     coarse = 512

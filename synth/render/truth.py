@@ -1,7 +1,7 @@
 """Ground truth by centre rays of our own, in double precision: what each pixel sees, and where that goes.
 
-The renderer has no part in this: triangles are cast here against the very rays of `camera`, so every label is the
-same on every variant, exact at folds and edges, and in the pixels of the recorded (distorted) picture.
+The renderer has no part in this: triangles are cast here against the very rays of `camera`, so every label is
+the same on every variant, exact at folds and edges, and in the pixels of the recorded (distorted) picture.
 Intersection: T. Moeller, B. Trumbore, "Fast, minimum storage ray/triangle intersection", 1997.
 """
 
@@ -54,7 +54,7 @@ class Still:
 
 @dataclass(frozen=True)
 class Now:
-    """Truth of one frame, for the material points of the rest frame's pixels or for the frame's own pixels."""
+    """Truth of one frame, at the rest frame's pixels (material points) or at the frame's own."""
 
     flow: npt.NDArray[np.float32]
     """(H, W, 2) px, rest pixels; 0 off the tissue."""
@@ -167,7 +167,7 @@ def now(
 
 
 def at_rest_pixels(rest: Still, faces: Indices, nodal: Floats) -> npt.NDArray[np.float32]:
-    """A quantity of the fine surface's vertices (V, C) at the rest frame's pixels (H, W, C); 0 off the tissue."""
+    """A quantity of the fine surface's vertices (V, C) at rest pixels (H, W, C); 0 off the tissue."""
     values = np.einsum("hwk,hwkc->hwc", rest.bary, nodal[faces[rest.face]])
     return np.where(rest.tissue[..., None], values, 0.0).astype(np.float32)
 

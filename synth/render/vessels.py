@@ -1,7 +1,7 @@
 """Vessels of the pia: trunks along the sulci, trees by space colonisation, radii by Murray's law.
 
 A. Runions, B. Lane, P. Prusinkiewicz, "Modeling trees with a space colonization algorithm", 2007.
-C. D. Murray, "The physiological principle of minimum work", 1926: r^3 of a parent is the sum over its children.
+C. D. Murray, "The physiological principle of minimum work", 1926: r^3 of a parent is its children's sum.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ def raster(tree: Tree, pixels: int, extent_mm: float) -> tuple[Map, Map]:
     pixel, radii = pixel[inside], radii[inside].astype(np.float32)
     distance = np.full((pixels, pixels), np.float32(extent_mm))
     radius = np.zeros((pixels, pixels), np.float32)
-    # The nearest line is not the one a pixel lies in where a twig leaves a trunk: one class of width at a time.
+    # Where a twig leaves a trunk the nearest line may be the twig's: one class of width at a time.
     edges = np.geomspace(radii.min() * 0.999, radii.max() * 1.001, 4) if len(radii) else np.zeros(1)
     for low, high in itertools.pairwise(edges):
         own = (radii >= low) & (radii < high)
@@ -281,7 +281,7 @@ def _scattered(extent_mm: float, spacing: float, rng: np.random.Generator) -> Fl
 
 
 def _relaxed(nodes: Floats, parent: Ints, fixed: int, rounds: int) -> Floats:
-    """Nodes after the first `fixed` drawn towards the middle of their neighbours, which rounds off the steps."""
+    """Nodes after the first `fixed`, drawn towards their neighbours, which rounds off the steps."""
     has = np.flatnonzero(parent >= 0)
     for _ in range(rounds):
         total, count = np.zeros_like(nodes), np.zeros(len(nodes))
@@ -310,7 +310,7 @@ def _border(angle: float, side: int) -> tuple[int, int]:
     """Pixel (x, y) on the square's border in a direction from its centre."""
     direction = np.array([np.cos(angle), np.sin(angle)])
     point = direction / np.abs(direction).max() * (side - 1) / 2 + (side - 1) / 2
-    return int(round(point[0])), int(round(point[1]))
+    return round(float(point[0])), round(float(point[1]))
 
 
 def _cheapest(cost: Floats, start: tuple[int, int], end: tuple[int, int]) -> Floats:
