@@ -27,11 +27,10 @@ class Scenario:
     """Position in the dataset."""
     anatomy: int
     """Which anatomy; sequences that share it must never be split between training and test."""
-    anatomy_seed: int
-    """Seed of everything grown on that anatomy (relief, vessels)."""
     family: str
     """Appearance family."""
     relief: Relief
+    """Shape and vessels of the anatomy, with its own seed."""
     tissue: Tissue
     gesture: Gesture
     look: Look
@@ -49,7 +48,6 @@ def draw(job: Job, index: int) -> Scenario:
     return Scenario(
         index=index,
         anatomy=anatomy,
-        anatomy_seed=int(_sequence(job, _ANATOMY, anatomy).generate_state(1)[0]),
         family=family,
         relief=Relief.draw(job.anatomy, _generator(job, _ANATOMY, anatomy, 0)),
         tissue=tissue,

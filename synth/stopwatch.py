@@ -1,4 +1,4 @@
-"""CPU-seconds and peak memory by stage. The only place in `synth` that reads a clock besides progress display."""
+"""CPU-seconds and peak memory by stage: with progress and patience, all in `synth` that reads a clock."""
 
 from __future__ import annotations
 
@@ -25,6 +25,10 @@ class Stopwatch:
         finally:
             self._cpu[name] += time.process_time() - cpu
             self._wall[name] += time.perf_counter() - wall
+
+    def cpu_s(self, name: str) -> float:
+        """CPU time of one stage so far [s]; 0 for one that never ran."""
+        return self._cpu.get(name, 0.0)
 
     def report(self) -> dict[str, dict[str, float] | float]:
         """`{stage: {"cpu_s", "wall_s"}, ..., "peak_rss_mb"}`, seconds and MB (1e6 bytes)."""

@@ -1,0 +1,114 @@
+"""One sequence from job to sealed store: where fem, render and flow meet, through plain arrays."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from synth import brain, scenario
+from synth.fem import mesh, solver
+from synth.flow import mask, track
+from synth.job import Job
+from synth.render import anatomy, camera
+from synth.render.scene import Studio
+from synth.stopwatch import Stopwatch
+from synth.store import Writer
+
+Report = Callable[[str, int, int], None]
+"""Progress: what is being done, how many of it are done, how many there are."""
+
+
+def render_sequence(job: Job, index: int, folder: Path, report: Report) -> Path:
+    """Computes sequence `index` and writes `folder/NNNNNN.zarr`.
+
+    Args:
+        job: the dataset's job, paths resolved.
+        index: which sequence, 0 <= index < job.sequences.
+        folder: the dataset; the store is `NNNNNN.zarr.part` until it is sealed.
+        report: told of progress, stage by stage.
+
+    Returns:
+        The sealed store's path.
+
+    Raises:
+        UserError: the job cannot be carried out (surface, load, inverted element), in one line.
+    """
+    watch = Stopwatch()
+    case = scenario.draw(job, index)
+    view = camera.place(case.view, job.render)
+
+    report("mesh", 0, 1)
+    with watch.stage("mesh"):
+        if job.anatomy.mesh is None:
+            surface = anatomy.procedural(case.relief, job.anatomy)
+            tets = mesh.block(job.anatomy, job.fem.tets, job.fem.order)
+        else:
+            whole = brain.load(job.anatomy.mesh, job.anatomy.craniotomy)
+            surface = anatomy.from_brain(whole.vertices, whole.faces, case.relief, job.anatomy)
+            tets = mesh.from_brain(whole, job.anatomy, job.fem.tets, job.fem.order)
+
+    report("fem", 0, 1)
+    with watch.stage("fem"):
+        motion = solver.deform(
+            job.fem,
+            job.anatomy.craniotomy,
+            case.tissue,
+            case.gesture,
+            tets,
+            surface.vertices,
+            surface.faces,
+            job.frames,
+            job.fps,
+        )
+
+    with watch.stage("scene"):
+        studio = Studio(surface, case.look, view, job)
+        still = studio.still
+
+    width, height = job.render.size
+    rotation = view.rotation  # world to camera: labels are in camera axes
+    writer = Writer(folder, index, frames=job.frames, size=(height, width), job=job)
+    writer.put("time", motion.time)
+    writer.put("force", motion.force @ rotation.T)
+    writer.put("tissue", still.tissue)
+    writer.put("area", still.area)
+    rgb = np.empty((job.frames, height, width, 3), np.uint8)
+    blocked = np.empty((job.frames, height, width), bool)
+    for t, seed in enumerate(scenario.frame_seeds(job, index)):
+        report("render", t, job.frames)
+        with watch.stage("render"):
+            shot = studio.frame(motion.rest + motion.displacement[t], motion.tip[t], motion.shaft[t], seed)
+            traction = studio.traction(motion.traction[t])
+        with watch.stage("store"):
+            for name in ("rgb", "flow", "visible", "tool", "glare", "depth"):
+                writer.put_frame(name, t, getattr(shot, name))
+            writer.put_frame("traction", t, traction)
+            if job.render.exr:
+                writer.put_exr(t, shot.radiance)
+        rgb[t] = shot.rgb
+        # What a real pipeline has: the tool's outline, and glare as the picture shows it.
+        blocked[t] = shot.tool | mask.glare(shot.rgb)
+
+    if job.flow.backend != "ideal":
+        report("flow", 0, job.frames)
+        with watch.stage("flow"):
+            recovered = track.track(job.flow.backend, rgb, blocked, still.tissue)
+        with watch.stage("store"):
+            for t in range(job.frames):
+                writer.put_frame("flow_tvl1", t, recovered.flow[t])
+                writer.put_frame("flow_confidence", t, recovered.confidence[t])
+
+    return writer.seal(
+        scenario=case.as_dict(),
+        K=view.K.tolist(),
+        distortion=view.distortion.tolist(),
+        rotation=view.rotation.tolist(),
+        translation=view.translation.tolist(),
+        scale_mm_per_px=float(still.scale_mm_per_px),
+        young_kpa=case.tissue.young_kpa,
+        poisson=case.tissue.poisson,
+        variant=studio.variant,
+        timings=watch.report(),
+    )
