@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json as json_
+import signal
 import sys
 from pathlib import Path
 from typing import Annotated
@@ -68,6 +69,7 @@ def render(
     from synth import config, engine
     from synth.progress import Bars
 
+    _end_on_terminate()
     read = config.load(job, overrides or [])
     with Bars() as bars:
         summary = engine.run(read, out, engine.Options(workers=workers, memory_gb=memory), bars)
@@ -81,6 +83,11 @@ def render(
         raise typer.Exit(1)
 
 
+def _end_on_terminate() -> None:
+    """SIGTERM, which clusters send, ends a run as Ctrl-C does: workers first, then in order."""
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+
+
 @app.command()
 def retry(out: Out, workers: Annotated[int | None, typer.Option(min=1)] = None, json: Json = False) -> None:
     """Takes up the sequences that failed, and all that are missing."""
@@ -88,6 +95,7 @@ def retry(out: Out, workers: Annotated[int | None, typer.Option(min=1)] = None, 
     from synth.folder import Folder
     from synth.progress import Bars
 
+    _end_on_terminate()
     folder = Folder(out)
     job = folder.job()
     forgiven = folder.forgive()
@@ -99,3 +107,61 @@ def retry(out: Out, workers: Annotated[int | None, typer.Option(min=1)] = None, 
         print(f"{len(forgiven)} retried; {summary.already + summary.done} of {summary.total} are there")
     if summary.failed:
         raise typer.Exit(1)
+
+
+@app.command()
+def verify(
+    out: Out,
+    fast: Annotated[
+        bool, typer.Option("--fast", help="Some frames of some sequences, no checksums.")
+    ] = False,
+    json: Json = False,
+) -> None:
+    """Checks a dataset against its own invariants. Exit code 1 when one fails."""
+    from rich.console import Console
+    from rich.table import Table
+
+    from synth import verify as verifying
+
+    report = verifying.run(out, fast=fast)
+    if json:
+        print(json_.dumps(report.as_dict()))
+    else:
+        table = Table("check", "measures", "bad", "worst", "limit", "where", "CPU s", title=f"{out}")
+        for check in report.checks:
+            mark = "[red]" if check.bad else ""
+            table.add_row(
+                f"{mark}{check.name}",
+                str(check.count),
+                f"{mark}{check.bad}",
+                f"{check.worst:.3g}",
+                f"{check.limit:.3g}",
+                check.offender,
+                f"{check.cpu_s:.2f}",
+            )
+        Console().print(table)
+        for check in report.checks:
+            for failure in check.failures[:20]:
+                print(f"{check.name}: {failure}")
+        print("good" if report.good else "not good")
+    if not report.good:
+        raise typer.Exit(1)
+
+
+@app.command()
+def doctor(
+    folder: Annotated[Path, typer.Argument(help="Where datasets are to go.")] = Path(),
+    json: Json = False,
+) -> None:
+    """Says what this machine offers, and what to do about what it lacks."""
+    from synth import doctor as examining
+
+    found = examining.findings(folder)
+    if json:
+        print(json_.dumps([vars(finding) for finding in found]))
+        return
+    width = max(len(finding.what) for finding in found)
+    for finding in found:
+        print(f"{'ok  ' if finding.good else 'LACK'} {finding.what:<{width}}  {finding.found}")
+        if not finding.good:
+            print(f"     {'':<{width}}  -> {finding.advice}")

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
 
-from synth import index, preview
+from synth import index, llvm, preview
 from synth.child import Attempt, Child, Setup
 from synth.errors import UserError
 from synth.folder import Folder, claim
@@ -84,7 +84,7 @@ def run(job: Job, root: Path, options: Options, watcher: Watcher) -> Summary:
             memory_bytes=_share_of_memory(options, workers),
             stall_s=options.stall_s,
             keep_open=(folder.lock_fd,),
-            environment={"SULCUS_THREADS": str(_share_of_cores(workers)), **options.environment},
+            environment={**_machine(job, workers), **options.environment},
         )
         try:
             done = _Pool(folder, setup, todo, min(workers, max(len(todo), 1))).work(watcher)
@@ -215,8 +215,11 @@ class _Pool:
         return report
 
 
-def _share_of_cores(workers: int) -> int:
-    return max(1, len(os.sched_getaffinity(0)) // workers)
+def _machine(job: Job, workers: int) -> dict[str, str]:
+    """What is found out once for all workers: threads for each, and the LLVM that the renderer may use."""
+    threads = max(1, len(os.sched_getaffinity(0)) // workers)
+    library = llvm.find() if job.render.variant in ("auto", "llvm_ad_rgb") else None
+    return {"SULCUS_THREADS": str(threads), "SULCUS_LLVM": library or ""}
 
 
 def _share_of_memory(options: Options, workers: int) -> int | None:

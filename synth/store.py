@@ -220,6 +220,8 @@ class Column:
         self.shape: tuple[int, ...] = array.shape
         self.dtype: np.dtype[Any] = array.dtype
         self.ndim = len(self.shape)
+        self.attrs: dict[str, Any] = dict(array.attrs)
+        self.dims: tuple[str, ...] = tuple(array.metadata.dimension_names or ())
 
     def __len__(self) -> int:
         return self.shape[0]
@@ -279,8 +281,10 @@ class Sequence:
         files = -(-expected[0] // shard[0])
         rest = "/0" * (len(expected) - 1)
         for k in range(files):
-            if not (self.path / name / f"c/{k}{rest}").is_file():
-                raise UserError(f"{where}: file c/{k}{rest} is missing, the store is damaged")
+            file = self.path / name / f"c/{k}{rest}"
+            # Zarr reads a missing or empty file as zeros.
+            if not file.is_file() or not file.stat().st_size:
+                raise UserError(f"{where}: file c/{k}{rest} is missing or empty, the store is damaged")
         return Column(array, where)
 
 

@@ -61,6 +61,7 @@ def troubled(job: Job, index: int, folder: Path, report: Report) -> None:
         held = []
         while True:
             held.append(np.ones(1 << 22))
+            report("fem", len(held), 1 << 20)
     if index == 3:
         writer = Writer(folder, index, frames=job.frames, size=(8, 8), job=job)
         writer.put("force", np.full((job.frames, 3), np.nan))

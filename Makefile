@@ -1,0 +1,56 @@
+# `make demo` and `make test` are all the set-up there is: both make the virtual environment first.
+#
+#   make demo    dataset -> training -> scores -> runs/demo/report.html
+#   make test    lint, types, tests
+#   make clean   removes what these made
+#
+# PYTHON=python3.12 chooses the interpreter (3.11 or newer).
+
+PYTHON ?= $(shell for p in python3.13 python3.12 python3.11 python3; do \
+	  $$p -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo $$p && break; done)
+BIN := .venv/bin
+DEMO := runs/demo
+
+.PHONY: demo test setup lint types clean
+.DELETE_ON_ERROR:
+
+setup: .venv/installed .venv/llvm
+
+.venv/installed: pyproject.toml constraints.txt
+	@test -n "$(PYTHON)" || { echo "Python 3.11 or newer is needed: install it, or say make PYTHON=/path/to/python" >&2; exit 2; }
+	@test -x $(BIN)/python || $(PYTHON) -m venv .venv || \
+	  { echo "$(PYTHON) cannot make a virtual environment; on Debian: apt-get install python3-venv" >&2; exit 2; }
+	@echo "installing into .venv (once; some minutes) ..."
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]' || \
+	  { echo "the packages could not be installed: is an index of Python packages within reach?" >&2; exit 2; }
+	@touch $@
+
+# The fast renderer needs an LLVM; without one the slow variant does the same work.
+.venv/llvm: .venv/installed
+	@$(BIN)/python -m synth.llvm_setup
+	@touch $@
+
+demo: setup
+	@mkdir -p $(DEMO)
+	$(BIN)/synth render demo -o $(DEMO)/data
+	$(BIN)/synth verify $(DEMO)/data
+	$(BIN)/learn train $(DEMO)/data -o $(DEMO)/model --preset tiny
+	$(BIN)/learn eval $(DEMO)/model $(DEMO)/data
+	@echo "a sequence of a brain that the model never saw, as a recording:"
+	$(BIN)/synth render demo -o $(DEMO)/unseen seed=1 sequences=1
+	$(BIN)/bench from-dataset $(DEMO)/unseen -o $(DEMO)/recording
+	$(BIN)/bench score $(DEMO)/recording --model $(DEMO)/model -o $(DEMO)
+	@echo "done: open $(DEMO)/report.html"
+
+test: setup lint types
+	$(BIN)/python -m pytest -n 2
+
+lint: setup
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+types: setup
+	$(BIN)/mypy
+
+clean:
+	rm -rf .venv runs build *.egg-info .mypy_cache .ruff_cache .pytest_cache

@@ -1,0 +1,165 @@
+"""Checking a dataset against its own invariants: each named, counted, timed, with its worst offender."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from synth import identity, index
+from synth.errors import UserError
+from synth.folder import Folder
+from synth.invariants import INVARIANTS, Measure
+from synth.stopwatch import Stopwatch
+from synth.store import Sequence, open_sequence
+
+_FAST_FRAMES = 2
+_FAST_SEQUENCES = 20
+
+
+@dataclass
+class Check:
+    """All measures of one name."""
+
+    name: str
+    meaning: str
+    count: int = 0
+    bad: int = 0
+    worst: float = 0.0
+    limit: float = 0.0
+    offender: str = ""
+    cpu_s: float = 0.0
+    failures: list[str] = field(default_factory=list)
+    """Every sequence with a bad measure, and its worst one."""
+
+    @property
+    def good(self) -> bool:
+        return not self.bad
+
+    def add(self, measure: Measure, who: str) -> None:
+        self.count += 1
+        where = f"{who}: {measure.where}"
+        if not measure.good:
+            self.bad += 1
+            self.failures.append(where)
+        if not self.offender or measure.severity > Measure(self.worst, self.limit, "").severity:
+            self.worst, self.limit, self.offender = measure.value, measure.limit, where
+
+
+@dataclass(frozen=True)
+class Report:
+    """The outcome for one dataset."""
+
+    root: str
+    sequences: int
+    fast: bool
+    checks: list[Check]
+
+    @property
+    def good(self) -> bool:
+        return all(check.good for check in self.checks)
+
+    def as_dict(self) -> dict[str, Any]:
+        return {**asdict(self), "good": self.good}
+
+
+def run(root: Path, *, fast: bool = False, report: Callable[[int, int], None] | None = None) -> Report:
+    """Checks every sequence and the dataset around them.
+
+    Fast: some frames of some sequences, and no checksums.
+
+    Raises:
+        UserError: the folder holds no dataset.
+    """
+    folder = Folder(root)
+    described, sealed = folder.described(), folder.sealed()
+    checks = {
+        "dataset": Check("dataset", "the job, the index and the sequences agree"),
+        "readable": Check("readable", "every store opens and every chunk decodes"),
+    }
+    for name, invariant in INVARIANTS.items():
+        checks[name] = Check(name, (invariant.__doc__ or "").split("\n")[0])
+    for measure, who in _dataset(folder, described, sealed):
+        checks["dataset"].add(measure, who)
+    chosen = sealed
+    if fast and len(sealed) > _FAST_SEQUENCES:
+        chosen = [sealed[k] for k in np.linspace(0, len(sealed) - 1, _FAST_SEQUENCES).astype(int)]
+    for position, key in enumerate(chosen):
+        if report is not None:
+            report(position, len(chosen))
+        _sequence(folder.root / f"{key:06d}.zarr", described["identity"], checks, fast)
+    return Report(str(root), len(chosen), fast, list(checks.values()))
+
+
+def _sequence(path: Path, name: str, checks: dict[str, Check], fast: bool) -> None:
+    try:
+        sequence = open_sequence(path)
+        frames = _frames(sequence, fast)
+    except UserError as error:
+        checks["readable"].add(Measure(1.0, 0.0, _without(path, str(error))), path.name)
+        return
+    own = Measure(0.0 if sequence.attrs.get("job") == name else 1.0, 0.0, "belongs to another job")
+    checks["dataset"].add(own, path.name)
+    broken = ""
+    for key, invariant in INVARIANTS.items():
+        if fast and key == "checksum":
+            continue
+        watch = Stopwatch()
+        try:
+            with watch.stage(key):
+                measures = list(invariant(sequence, frames))
+        except UserError as error:
+            broken = broken or _without(path, str(error))
+            continue
+        finally:
+            checks[key].cpu_s += watch.cpu_s(key)
+        for measure in measures:
+            checks[key].add(measure, path.name)
+    checks["readable"].add(Measure(1.0 if broken else 0.0, 0.0, broken or "reads"), path.name)
+
+
+def _frames(sequence: Sequence, fast: bool) -> list[int]:
+    """The frames to look at closely: where the load is greatest, and some between."""
+    force = np.linalg.norm(sequence["force"][:], axis=1)
+    count = _FAST_FRAMES if fast else 8
+    spread = np.linspace(0, sequence.frames - 1, count).round().astype(int)
+    return sorted({int(np.argmax(force)), *(int(t) for t in spread)})
+
+
+def _dataset(folder: Folder, described: dict[str, Any], sealed: list[int]) -> Iterator[tuple[Measure, str]]:
+    def truth(good: bool, where: str, who: str) -> tuple[Measure, str]:
+        return Measure(0.0 if good else 1.0, 0.0, where), who
+
+    job = folder.job()
+    try:
+        same = identity.of(job) == described["identity"]
+    except UserError:
+        same = True  # the mesh or the photograph need not travel with the dataset
+    yield truth(same, "the job is not the one that was rendered", "dataset.json")
+    failed = set(folder.failures())
+    missing = sorted(set(range(job.sequences)) - set(sealed) - failed)
+    yield truth(not missing, f"{len(missing)} sequences are missing, first {missing[:1]}", "dataset")
+    strangers = [key for key in sealed if key >= job.sequences]
+    yield truth(not strangers, f"sequences that the job does not have: {strangers[:3]}", "dataset")
+    try:
+        rows = {row["index"]: row for row in index.read(folder.root).to_pylist()}
+    except UserError as error:
+        yield truth(False, str(error), index.NAME)
+        return
+    for key in sealed:
+        try:
+            now: dict[str, Any] = index.row_of(open_sequence(folder.root / f"{key:06d}.zarr"))
+        except UserError:
+            continue  # found and named by the check of that sequence
+        row = rows.get(key, {})
+        differing = [name for name, value in now.items() if row.get(name) != value]
+        yield truth(not differing, f"row {key} differs in {', '.join(differing)}", index.NAME)
+    surplus = sorted(key for key, row in rows.items() if row["status"] == "done" and key not in sealed)
+    yield truth(not surplus, f"rows without a sequence: {surplus[:3]}", index.NAME)
+
+
+def _without(path: Path, text: str) -> str:
+    return text.removeprefix(f"{path}: ").removeprefix(f"{path}")

@@ -1,0 +1,184 @@
+"""The engine: order and interruption change nothing, trouble costs the sequence that makes it."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from synth import engine, index
+from synth.child import Attempt
+from synth.engine import Options, Summary
+from synth.errors import UserError
+from synth.folder import Folder
+from synth.job import Job
+
+HERE = Path(__file__).resolve().parent
+JOB = Job(seed=2, sequences=6, frames=3, render={"size": (32, 24)}, flow={"backend": "ideal"})
+
+
+class Silent:
+    """A watcher that remembers the attempts."""
+
+    def __init__(self) -> None:
+        self.attempts: list[tuple[Attempt, bool]] = []
+
+    def begin(self, total: int, already: int, failed: int) -> None:
+        self.begun = (total, already, failed)
+
+    def stage(self, index: int, stage: str, done: int, of: int) -> None:
+        assert 0 <= done <= of
+
+    def end(self, attempt: Attempt, again: bool) -> None:
+        self.attempts.append((attempt, again))
+
+
+def options(work: str, **more: object) -> Options:
+    path = os.pathsep.join([str(HERE), str(HERE.parents[1])])
+    return Options(work=f"fake_work:{work}", environment={"PYTHONPATH": path}, **{"workers": 2, **more})  # type: ignore[arg-type]
+
+
+def run(root: Path, work: str = "sequence", job: Job = JOB, **more: object) -> Summary:
+    return engine.run(job, root, options(work, **more), Silent())
+
+
+def test_number_of_workers_and_order_do_not_matter(tmp_path: Path) -> None:
+    one = run(tmp_path / "one", workers=1)
+    many = run(tmp_path / "many", workers=4)
+    assert one.content_hash == many.content_hash
+    assert (one.done, one.failed) == (6, {})
+    assert run(tmp_path / "other", job=JOB.model_copy(update={"seed": 3})).content_hash != one.content_hash
+
+
+def test_a_finished_dataset_has_its_index_film_and_job_and_is_left_alone(tmp_path: Path) -> None:
+    first = run(tmp_path / "out")
+    for name in ("index.parquet", "preview.mp4", "job.yaml", "dataset.json"):
+        assert (tmp_path / "out" / name).is_file()
+    rows = index.read(tmp_path / "out").to_pylist()
+    assert [row["index"] for row in rows] == list(range(6))
+    before = {path: path.stat().st_mtime_ns for path in (tmp_path / "out").rglob("*/c/*")}
+    again = run(tmp_path / "out")
+    assert (again.already, again.done, again.content_hash) == (6, 0, first.content_hash)
+    assert before == {path: path.stat().st_mtime_ns for path in (tmp_path / "out").rglob("*/c/*")}
+
+
+def test_more_sequences_extend_and_fewer_are_refused(tmp_path: Path) -> None:
+    run(tmp_path / "out", job=JOB.model_copy(update={"sequences": 3}))
+    whole = run(tmp_path / "out")
+    assert (whole.already, whole.done) == (3, 3)
+    assert whole.content_hash == run(tmp_path / "other").content_hash
+    with pytest.raises(UserError, match="holds 6 sequences"):
+        run(tmp_path / "out", job=JOB.model_copy(update={"sequences": 3}))
+
+
+def test_trouble_costs_the_sequence_that_makes_it(tmp_path: Path) -> None:
+    job = JOB.model_copy(update={"sequences": 9})
+    watcher = Silent()
+    summary = engine.run(job, tmp_path / "out", options("troubled", memory_gb=0.7, stall_s=2), watcher)
+    assert summary.done == 3
+    reasons = summary.failed
+    assert "SIGABRT" in reasons[1]
+    assert "0.7 GB" in reasons[2]
+    assert "force: not finite" in reasons[3]
+    assert reasons[4] == "ZeroDivisionError: by nought"
+    assert "nothing for 2 s" in reasons[5]
+    assert reasons[6] == "the load is past the material's range"
+    tries = {key: sum(attempt.index == key for attempt, _ in watcher.attempts) for key in range(9)}
+    assert tries == {0: 1, 1: 3, 2: 3, 3: 1, 4: 3, 5: 3, 6: 1, 7: 2, 8: 1}
+    rows = {row["index"]: row for row in index.read(tmp_path / "out").to_pylist()}
+    assert rows[4]["status"] == "failed"
+    assert rows[4]["reason"] == reasons[4]
+    assert "by nought" in Folder(tmp_path / "out").failures()[4]["log"]
+    assert not list((tmp_path / "out").glob("*.part"))
+    # Given up is given up until it is asked for; then it is done, and nothing tells it from the others.
+    assert run(tmp_path / "out", job=job).done == 0
+    assert Folder(tmp_path / "out").forgive() == [1, 2, 3, 4, 5, 6]
+    healed = run(tmp_path / "out", job=job)
+    assert (healed.done, healed.failed) == (6, {})
+    assert healed.content_hash == run(tmp_path / "clean", job=job).content_hash
+
+
+def test_a_job_that_cannot_be_carried_out_leaves_nothing(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match=r"^no surface at the craniotomy$"):
+        run(tmp_path / "out", "refused")
+    assert not (tmp_path / "out").exists()
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(UserError, match="no surface"):
+        run(tmp_path / "empty", "refused")
+    assert list((tmp_path / "empty").iterdir()) == []
+
+
+def test_a_full_disk_stops_the_run_and_keeps_what_is_sealed(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="No space left"):
+        run(tmp_path / "out", "full")
+    assert Folder(tmp_path / "out").sealed() == [0, 1]
+    assert Folder(tmp_path / "out").failures() == {}
+    assert run(tmp_path / "out").content_hash == run(tmp_path / "other").content_hash
+
+
+def test_another_jobs_dataset_and_other_files_are_never_touched(tmp_path: Path) -> None:
+    run(tmp_path / "out")
+    before = sorted(path for path in tmp_path.rglob("*"))
+    with pytest.raises(UserError, match="seed is 2 there and 8 here"):
+        run(tmp_path / "out", job=JOB.model_copy(update={"seed": 8}))
+    foreign = tmp_path / "foreign"
+    foreign.mkdir()
+    (foreign / "thesis.txt").write_text("precious")
+    with pytest.raises(UserError, match="holds other files"):
+        run(foreign)
+    with pytest.raises(UserError, match="is a file"):
+        run(foreign / "thesis.txt")
+    assert sorted(tmp_path.rglob("*")) == sorted([*before, foreign, foreign / "thesis.txt"])
+
+
+def test_two_runs_on_one_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("synth.folder._LOCK_WAIT_S", 0.3)
+    first = start(tmp_path / "out")
+    try:
+        wait_for(lambda: (tmp_path / "out/.run/lock").exists())
+        with pytest.raises(UserError, match="another run is writing"):
+            run(tmp_path / "out")
+    finally:
+        first.wait(timeout=60)
+    assert first.returncode == 0
+
+
+def test_folder_names_with_spaces_and_other_letters(tmp_path: Path) -> None:
+    strange = tmp_path / "größe μm 脳 out"
+    assert run(strange).content_hash == run(tmp_path / "plain").content_hash
+
+
+@pytest.mark.parametrize("kill", [signal.SIGKILL, signal.SIGINT, signal.SIGTERM])
+def test_killed_and_resumed_equals_undisturbed(tmp_path: Path, kill: signal.Signals) -> None:
+    victim = start(tmp_path / "out")
+    wait_for(lambda: len(list((tmp_path / "out").glob("*.zarr"))) >= 2)
+    victim.send_signal(kill)
+    victim.wait(timeout=30)
+    assert victim.returncode != 0
+    left = len(list((tmp_path / "out").glob("*.zarr")))
+    assert 2 <= left < 6
+    resumed = run(tmp_path / "out")
+    assert (resumed.already, resumed.done) == (left, 6 - left)
+    assert resumed.content_hash == run(tmp_path / "undisturbed").content_hash
+    assert not list((tmp_path / "out").glob("*.part"))
+
+
+def start(root: Path) -> subprocess.Popen[bytes]:
+    """A run of its own, slow enough to be met half-way."""
+    program = (
+        "import sys; sys.path[:0] = sys.argv[2:]; from pathlib import Path; import test_engine as here; "
+        "here.run(Path(sys.argv[1]), 'slow')"
+    )
+    return subprocess.Popen([sys.executable, "-c", program, str(root), str(HERE), str(HERE.parents[1])])
+
+
+def wait_for(condition: object, seconds: float = 30.0) -> None:
+    until = time.monotonic() + seconds
+    while not condition():  # type: ignore[operator]
+        assert time.monotonic() < until, "nothing happened"
+        time.sleep(0.02)
