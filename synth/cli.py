@@ -149,6 +149,30 @@ def verify(
 
 
 @app.command()
+def picture(
+    out: Out,
+    sequence: Annotated[int, typer.Option("--sequence", "-s", help="Which sequence, by its index.")] = 0,
+    frame: Annotated[
+        list[int] | None, typer.Option("--frame", "-f", help="Which frame; repeat for more. [the strongest]")
+    ] = None,
+    to: Annotated[Path, typer.Option("--to", help="The PNG to write.")] = Path("picture.png"),
+) -> None:
+    """Draws frames with their flow and force map side by side, as in the README."""
+    import cv2
+
+    from synth import picture as drawing
+    from synth.errors import UserError
+    from synth.store import open_sequence
+
+    chosen = open_sequence(out / f"{sequence:06d}.zarr")
+    rows = drawing.of_sequence(chosen, frame or [drawing.strongest(chosen)])
+    to.parent.mkdir(parents=True, exist_ok=True)
+    if to.suffix.lower() != ".png" or not cv2.imwrite(str(to), rows[..., ::-1]):
+        raise UserError(f"{to}: cannot be written as PNG")
+    print(f"wrote {to}")
+
+
+@app.command()
 def doctor(
     folder: Annotated[Path, typer.Argument(help="Where datasets are to go.")] = Path(),
     json: Json = False,

@@ -8,6 +8,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from synth.errors import UserError
+from synth.store import Sequence as Sequence_
+
 Rgb = NDArray[np.uint8]
 """(H, W, 3) uint8, sRGB."""
 
@@ -121,6 +124,46 @@ def frame_flow_force(
     pushed = overlay((0.6 * grey).astype(np.uint8), heat(size, largest_kpa), weight)
     pushed = colour_bar(pushed, heat(ramp, 1.0), f"0 - {largest_kpa:.2g} kPa")
     return side_by_side([rgb, moved, pushed], captions)
+
+
+def of_sequence(sequence: Sequence_, frames: Sequence[int]) -> Rgb:
+    """Frame, flow and force map of some frames of a stored sequence, one row a frame, on common scales.
+
+    Raises:
+        UserError: a frame is not in the sequence.
+    """
+    for t in frames:
+        if not 0 <= t < sequence.frames:
+            raise UserError(f"frame {t}: the sequence has frames 0 to {sequence.frames - 1}")
+    flow = {t: sequence["flow"][t] for t in frames}
+    traction = {t: sequence["traction"][t] for t in frames}
+    largest_px = max(float(np.linalg.norm(f, axis=-1).max()) for f in flow.values())
+    largest_kpa = max(float(np.linalg.norm(s, axis=-1).max()) for s in traction.values())
+    force, time = sequence["force"][...], sequence["time"][...]
+    return stack(
+        [
+            frame_flow_force(
+                sequence["rgb"][t],
+                sequence["rgb"][0],
+                flow[t],
+                traction[t],
+                sequence["tissue"][...],
+                largest_px=largest_px,
+                largest_kpa=largest_kpa,
+                captions=[
+                    f"frame {t}, {time[t]:.2f} s",
+                    f"flow from rest, {np.linalg.norm(flow[t], axis=-1).max():.1f} px at most",
+                    f"traction, {np.linalg.norm(force[t]):.1f} mN in all",
+                ],
+            )
+            for t in frames
+        ]
+    )
+
+
+def strongest(sequence: Sequence_) -> int:
+    """The frame with the largest force."""
+    return int(np.linalg.norm(sequence["force"][...], axis=-1).argmax())
 
 
 def _text(picture: Rgb, text: str, at: tuple[int, int], colour: tuple[int, int, int]) -> Rgb:
