@@ -1,7 +1,7 @@
 """The exposed cortex: relief, vessels and the fine surface that is loaded, moved and rendered.
 
-The surface is a height field over the opening and a margin under its rim: arachnoid bridges the sulci, and what
-lies deeper is never seen.
+The surface is a height field over the opening and a margin under its rim: arachnoid bridges the sulci, and
+what lies deeper is never seen.
 """
 
 from __future__ import annotations

@@ -64,7 +64,7 @@ def pose(instrument: Instrument, tips: Floats, shafts: Floats) -> Floats:
 def _tine(side: float) -> Floats:
     """One tine (V, 3): a blunt tip that widens into a flat blade, bowed outwards (to -x for side 1)."""
     s = (np.linspace(0, 1, _ALONG) ** 1.6) * _LENGTH_MM
-    round_off = np.sqrt(np.clip(1 - (1 - np.minimum(s / 0.45, 1)) ** 2, 0, 1))
+    round_off = np.sqrt(np.clip(1 - (1 - np.minimum(s / 0.45 + 0.01, 1)) ** 2, 0, 1))
     wide = (0.42 + 0.9 * (1 - np.exp(-s / 9.0)) + 1.3 * (1 - np.exp(-s / 45.0))) * round_off
     thick = (0.34 + 0.42 * (1 - np.exp(-s / 8.0)) + 0.3 * (1 - np.exp(-s / 40.0))) * round_off
     bow = -side * 5.5 * (1 - np.exp(-((s / 38.0) ** 1.5)))

@@ -1,6 +1,7 @@
-"""The one file that knows Mitsuba. A stage of meshes, lamps and a camera; vertices are moved in place.
+"""A stage of meshes, lamps and a camera in Mitsuba; vertices are moved in place.
 
-Mitsuba's variant is chosen on first use and its LLVM found by `synth.llvm`: a wrong one ends the process.
+With its lens (`mitsuba_lens`) the only file that knows Mitsuba. The variant is chosen on first use and its LLVM
+found by `synth.llvm`: a wrong one ends the process.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import numpy.typing as npt
 from synth import llvm
 from synth.errors import UserError
 from synth.render.camera import Camera
+from synth.render.mitsuba_lens import Compiled, Scalar
 
 Floats = npt.NDArray[np.float64]
 Map = npt.NDArray[np.float32]
@@ -125,11 +127,9 @@ class Stage:
         import mitsuba as mi
 
         mi.set_variant(variant)
-        _register(variant)
         _limit_threads()
         self.variant = variant
         self._mi = mi
-        self._spp = spp
         self._jit = "scalar" not in variant
         scene: dict[str, Any] = {
             "type": "scene",
@@ -140,7 +140,7 @@ class Stage:
             scene[f"lamp{index}"] = _lamp(mi, lamp)
         for name, body in bodies.items():
             scene[name] = _mesh(mi, name, body)
-        self._sensor = mi.load_dict(_lens(camera, spp, sampler))
+        self._lens = (Compiled if self._jit else Scalar)(camera, spp, sampler)
         self._scene = mi.load_dict(scene)
         self._parameters = mi.traverse(self._scene)
 
@@ -156,8 +156,9 @@ class Stage:
     def render(self, seed: int) -> Map:
         """Linear radiance (H, W, 3) float32 of the stage as it stands."""
         self._parameters.update()
-        image = self._mi.render(self._scene, sensor=self._sensor, spp=self._spp, seed=seed)
-        return np.array(image, dtype=np.float32)[..., :3]
+        lens = self._lens
+        image = self._mi.render(self._scene, sensor=lens.sensor, spp=lens.spp, seed=seed)
+        return lens.develop(np.array(image, dtype=np.float32)[..., :3])
 
 
 def _limit_threads() -> None:
@@ -256,85 +257,3 @@ def _bitmap(mi: Any, image: Map) -> dict[str, Any]:
         "filter_type": "bilinear",
         "wrap_mode": "clamp",
     }
-
-
-def _lens(camera: Camera, spp: int, sampler: str) -> dict[str, Any]:
-    width, height = camera.size
-    lens: dict[str, Any] = {
-        "type": "sulcus_lens",
-        "film": {
-            "type": "hdrfilm",
-            "width": width,
-            "height": height,
-            "rfilter": {"type": "box"},
-            "pixel_format": "rgb",
-            "component_format": "float32",
-        },
-        "sampler": {"type": sampler, "sample_count": spp},
-        "aperture": camera.aperture_mm,
-        "focus": camera.focus_mm,
-    }
-    for row in range(3):
-        for column in range(3):
-            lens[f"r{row}{column}"] = float(camera.rotation[row, column])
-        lens[f"c{row}"] = float(camera.centre[row])
-    for name, value in zip(("k1", "k2", "p1", "p2", "k3"), camera.distortion, strict=True):
-        lens[name] = float(value)
-    lens |= {"fx": float(camera.K[0, 0]), "fy": float(camera.K[1, 1])}
-    lens |= {"cx": float(camera.K[0, 2]), "cy": float(camera.K[1, 2])}
-    return lens
-
-
-@functools.cache
-def _register(variant: str) -> None:
-    """Makes the thin lens with Brown-Conrady distortion known to one variant."""
-    import drjit as dr
-    import mitsuba as mi
-
-    class Lens(mi.Sensor):
-        """`camera.rays` for film samples, with a lens of some width."""
-
-        def __init__(self, props: Any) -> None:
-            super().__init__(props)
-            self.v = {name: props[name] for name in ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")}
-            self.aperture, self.focus = props["aperture"], props["focus"]
-            self.rows = [mi.ScalarVector3f(*(props[f"r{row}{c}"] for c in range(3))) for row in range(3)]
-            self.centre = mi.ScalarPoint3f(*(props[f"c{row}"] for row in range(3)))
-            size = self.film().size()
-            self.width, self.height = int(size[0]), int(size[1])
-
-        def sample_ray(
-            self, time: Any, wavelength: Any, position: Any, aperture: Any, active: Any = True
-        ) -> tuple[Any, Any]:
-            v = self.v
-            goal_x = (position.x * self.width - 0.5 - v["cx"]) / v["fx"]
-            goal_y = (position.y * self.height - 0.5 - v["cy"]) / v["fy"]
-            x, y = goal_x, goal_y
-            for _ in range(6):  # each round gains a factor of the distortion itself
-                r2 = x * x + y * y
-                radial = 1 + r2 * (v["k1"] + r2 * (v["k2"] + r2 * v["k3"]))
-                dx = 2 * v["p1"] * x * y + v["p2"] * (r2 + 2 * x * x)
-                dy = 2 * v["p2"] * x * y + v["p1"] * (r2 + 2 * y * y)
-                x, y = (goal_x - dx) / radial, (goal_y - dy) / radial
-            lens = mi.warp.square_to_uniform_disk_concentric(aperture) * self.aperture
-            right, down, forward = self.rows
-            origin = self.centre + right * lens.x + down * lens.y
-            sharp = self.centre + (right * x + down * y + forward) * self.focus
-            ray = mi.Ray3f(mi.Point3f(origin), dr.normalize(mi.Vector3f(sharp - origin)), time)
-            return ray, mi.Color3f(1.0)
-
-        def sample_ray_differential(
-            self, time: Any, wavelength: Any, position: Any, aperture: Any, active: Any = True
-        ) -> tuple[Any, Any]:
-            ray, weight = self.sample_ray(time, wavelength, position, aperture, active)
-            return mi.RayDifferential3f(ray), weight
-
-        def bbox(self) -> Any:
-            box = mi.ScalarBoundingBox3f()
-            box.expand(self.centre)
-            return box
-
-        def to_string(self) -> str:
-            return "SulcusLens[]"
-
-    mi.register_sensor("sulcus_lens", Lens)
