@@ -5,12 +5,15 @@ from __future__ import annotations
 import json as json_
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from bench.rooms import Rooms
 from synth.commands import Commands
+
+if TYPE_CHECKING:
+    from bench.assess import Result
 
 app = typer.Typer(
     name="bench",
@@ -53,36 +56,26 @@ def score(
     json: Json = False,
 ) -> None:
     """Force from a recording's video, scored against its sensor: score.json and report.html."""
-    from rich.console import Console
+    from bench import run
+    from bench.assess import Settings
 
-    from bench import assess, report, scale
-    from bench.bar import counting
-    from bench.methods import Model
-    from bench.recording import open_recording
-    from learn.threads import set_threads
+    result = run.score(recording, model, out, Settings(backend=flow, shrink=shrink), title)
+    _say(result, out or Path(f"{result.recording}-score"), json)
 
-    set_threads(None)
-    opened = open_recording(recording)
-    main = "D2FNet"
-    methods = {main: Model(model)}
-    settings = assess.Settings(backend=flow, shrink=shrink)
-    found = scale.find(opened.meta, recording)
-    with counting(f"scoring {opened.name}", opened.expected_frames()) as progress:
-        result = assess.assess(
-            opened, methods, main, found, settings, {"model": methods[main].described()}, progress
-        )
-    folder = out or Path(f"{opened.name}-score")
-    folder.mkdir(parents=True, exist_ok=True)
-    assess.write_json(result, folder / "score.json")
-    report.write(result, folder / "report.html", title)
-    if json:
-        print(json_.dumps(assess.as_json(result), allow_nan=False))
-        return
-    console = Console()
-    console.print(report.terminal_table(result))
-    for note in result.notes:
-        console.print(f"note: {note}", style="yellow", markup=False, highlight=False)
-    console.print(f"{folder / 'report.html'}", markup=False, highlight=False)
+
+@app.command()
+def demo(
+    dataset: Annotated[Path, typer.Argument(help="A rendered dataset.")],
+    model: Annotated[Path, typer.Option("--model", "-m", help="Model trained on it.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for recording, score and report.")],
+    flow: Annotated[str, typer.Option(help="Flow estimator.")] = "opencv-tvl1",
+    json: Json = False,
+) -> None:
+    """Scores a model on a sequence of its dataset that it has not seen, by way of a recording."""
+    from bench import run
+    from bench.assess import Settings
+
+    _say(run.demo(dataset, model, out, Settings(backend=flow)), out, json)
 
 
 @app.command("from-dataset")
@@ -107,3 +100,18 @@ def from_dataset(
     else:
         for path in written:
             print(path)
+
+
+def _say(result: Result, folder: Path, json: bool) -> None:
+    from rich.console import Console
+
+    from bench import assess, report
+
+    if json:
+        print(json_.dumps(assess.as_json(result), allow_nan=False))
+        return
+    console = Console()
+    console.print(report.terminal_table(result))
+    for note in result.notes:
+        console.print(f"note: {note}", style="yellow", markup=False, highlight=False)
+    console.print(f"report: {folder / 'report.html'}", markup=False, highlight=False)

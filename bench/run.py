@@ -1,0 +1,82 @@
+"""What `bench score` and `bench demo` run: a folder in, score.json and report.html out."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+from bench import assess, report, scale
+from bench.assess import Result, Settings
+from bench.bar import counting
+from bench.export import export
+from bench.methods import Model
+from bench.recording import open_recording
+from synth.errors import UserError
+from synth.store import Dataset, Sequence
+
+MAIN = "D2FNet"
+"""Name under which the given model stands in every table."""
+
+
+def score(recording: Path, model: Path, out: Path | None, settings: Settings, title: str = "") -> Result:
+    """Scores one recording and writes score.json and report.html, both whole or not at all.
+
+    Args:
+        recording: its folder.
+        model: folder of `learn train`.
+        out: folder for the results; `NAME-score` here if None.
+        settings: of this run.
+        title: heading of the report.
+
+    Raises:
+        UserError: recording, model or settings that can't be used; nothing is written then.
+    """
+    from learn.threads import set_threads
+
+    set_threads(None)
+    opened = open_recording(recording)
+    total = opened.expected_frames()
+    network = Model(model)
+    found = scale.find(opened.meta, recording)
+    with counting(f"scoring {opened.name}", total) as progress:
+        result = assess.assess(
+            opened, {MAIN: network}, MAIN, found, settings, {"model": network.described()}, progress
+        )
+    folder = out or Path(f"{opened.name}-score")
+    folder.mkdir(parents=True, exist_ok=True)
+    assess.write_json(result, folder / "score.json")
+    report.write(result, folder / "report.html", title)
+    return result
+
+
+def demo(dataset: Path, model: Path, out: Path, settings: Settings) -> Result:
+    """Exports a sequence that the model has not seen as a recording, and scores it.
+
+    Args:
+        dataset: where the model's training data came from.
+        model: folder of `learn train`.
+        out: gets recording/, score.json and report.html; what an earlier demo left there is replaced.
+
+    Raises:
+        UserError: the model has seen every sequence, or as `score`.
+    """
+    chosen = unseen(dataset, model)
+    folder = out / "recording"
+    if folder.exists():
+        shutil.rmtree(folder)
+    export(chosen, folder)
+    return score(
+        folder, model, out, settings, f"Force from video: sequence {chosen.index}, unseen in training"
+    )
+
+
+def unseen(dataset: Path, model: Path) -> Sequence:
+    """The first sequence that the model was neither fitted nor chosen on. UserError if there is none."""
+    from learn.checkpoint import read_card
+
+    split = read_card(model).split
+    seen = {name for part in ("fit", "select") for name in split.get(part, [])}
+    for sequence in Dataset(dataset):
+        if sequence.attrs["content_hash"] not in seen:
+            return sequence
+    raise UserError(f"{dataset}: the model was fitted or chosen on every sequence here")
