@@ -36,10 +36,7 @@ demo: setup
 	$(BIN)/synth verify $(DEMO)/data
 	$(BIN)/learn train $(DEMO)/data -o $(DEMO)/model --preset tiny
 	$(BIN)/learn eval $(DEMO)/model $(DEMO)/data
-	@echo "a sequence of a brain that the model never saw, as a recording:"
-	$(BIN)/synth render demo -o $(DEMO)/unseen seed=1 sequences=1
-	$(BIN)/bench from-dataset $(DEMO)/unseen -o $(DEMO)/recording
-	$(BIN)/bench score $(DEMO)/recording --model $(DEMO)/model -o $(DEMO)
+	$(BIN)/bench demo $(DEMO)/data --model $(DEMO)/model -o $(DEMO)
 	@echo "done: open $(DEMO)/report.html"
 
 test: setup lint types
