@@ -45,7 +45,9 @@ class Check:
         if not measure.good:
             self.bad += 1
             self.failures.append(where)
-        if not self.offender or measure.severity > Measure(self.worst, self.limit, "").severity:
+        if measure.severity > 0 and (
+            not self.offender or measure.severity > Measure(self.worst, self.limit, "").severity
+        ):
             self.worst, self.limit, self.offender = measure.value, measure.limit, where
 
 

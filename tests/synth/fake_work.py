@@ -97,3 +97,86 @@ def slow(job: Job, index: int, folder: Path, report: Report) -> None:
         report("fem", t, 5)
         time.sleep(0.05)
     sequence(job, index, folder, report)
+
+
+def consistent(job: Job, index: int, folder: Path, report: Report, fault: str = "") -> None:
+    """A flat tissue seen squarely that slides to the right while a load rests on it: every invariant holds.
+
+    `fault` names the field that is made wrong, for tests that must find it.
+    """
+    rng = np.random.default_rng((job.seed, index))
+    width, height = job.render.size
+    frames, focal, distance = job.frames, 1000.0, 300.0
+    rows, columns = np.mgrid[:height, :width].astype(np.float64)
+    texture = _texture(rng)
+    tissue = np.hypot(rows - height / 2, columns - width / 2) < 0.45 * height
+    area = np.where(tissue, (distance / focal) ** 2, 0.0)
+    spot = np.exp(-((rows - height / 2) ** 2 + (columns - width / 2) ** 2) / (2 * (height / 20) ** 2))
+    spot *= spot > 1e-3
+    load = np.array([1.0, 0.5, 2.0])
+    spot /= (spot * area).sum()
+    share = np.arange(frames) / (frames - 1)
+    force = share[:, None] * load * (2.0 if fault == "force" else 1.0)
+
+    writer = Writer(folder, index, frames=frames, size=(height, width), job=job)
+    writer.put("time", np.arange(frames) / job.fps)
+    writer.put("force", force)
+    writer.put("tissue", tissue)
+    writer.put("area", area)
+    for t in range(frames):
+        moved = 6.0 * share[t]
+        tool = columns < 6
+        flow = np.zeros((height, width, 2))
+        flow[tissue, 0] = -moved if fault == "flow" else moved
+        flow[tissue, 1] = 1.0 if fault == "rest" and t == 0 else 0.0
+        picture = texture(rows, columns - moved)
+        gone = (columns + flow[..., 0] < 8) | (columns + flow[..., 0] > width - 1)
+        writer.put_frame("rgb", t, np.repeat(picture[..., None], 3, axis=-1).astype(np.uint8))
+        writer.put_frame("flow", t, flow)
+        covered = _block(tool, rows, height) if fault == "visibility" else tool
+        writer.put_frame("visible", t, ~gone)
+        writer.put_frame("tool", t, covered)
+        writer.put_frame("glare", t, np.zeros_like(tissue))
+        writer.put_frame("depth", t, np.full((height, width), -1.0 if fault == "depth" and t else distance))
+        writer.put_frame("traction", t, share[t] * spot[..., None] * load)
+    focal *= 0.5 if fault == "camera" else 1.0
+    writer.seal(**attributes(index, rng), K=[[focal, 0, 0], [0, focal, 0], [0, 0, 1]])
+
+
+def _texture(rng: np.random.Generator) -> Callable[..., Any]:
+    waves = rng.normal(scale=0.6, size=(20, 2))
+    phases = rng.uniform(0, 6.28, 20)
+
+    def brightness(rows: Any, columns: Any) -> Any:
+        total = sum(np.sin(a * rows + b * columns + c) for (a, b), c in zip(waves, phases, strict=True))
+        return np.clip(128 + 15 * total, 0, 255)
+
+    return brightness
+
+
+def _block(tool: Any, rows: Any, height: int) -> Any:
+    return tool | (np.abs(rows - height / 2) < 8)
+
+
+def wrong_force(job: Job, index: int, folder: Path, report: Report) -> None:
+    consistent(job, index, folder, report, "force")
+
+
+def wrong_flow(job: Job, index: int, folder: Path, report: Report) -> None:
+    consistent(job, index, folder, report, "flow")
+
+
+def wrong_visibility(job: Job, index: int, folder: Path, report: Report) -> None:
+    consistent(job, index, folder, report, "visibility")
+
+
+def wrong_rest(job: Job, index: int, folder: Path, report: Report) -> None:
+    consistent(job, index, folder, report, "rest")
+
+
+def wrong_camera(job: Job, index: int, folder: Path, report: Report) -> None:
+    consistent(job, index, folder, report, "camera")
+
+
+def wrong_depth(job: Job, index: int, folder: Path, report: Report) -> None:
+    consistent(job, index, folder, report, "depth")

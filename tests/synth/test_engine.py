@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import subprocess
 import sys
@@ -10,37 +9,16 @@ import time
 from pathlib import Path
 
 import pytest
+from fake_run import Silent, options
 
 from synth import engine, index
-from synth.child import Attempt
-from synth.engine import Options, Summary
+from synth.engine import Summary
 from synth.errors import UserError
 from synth.folder import Folder
 from synth.job import Job
 
 HERE = Path(__file__).resolve().parent
 JOB = Job(seed=2, sequences=6, frames=3, render={"size": (32, 24)}, flow={"backend": "ideal"})
-
-
-class Silent:
-    """A watcher that remembers the attempts."""
-
-    def __init__(self) -> None:
-        self.attempts: list[tuple[Attempt, bool]] = []
-
-    def begin(self, total: int, already: int, failed: int) -> None:
-        self.begun = (total, already, failed)
-
-    def stage(self, index: int, stage: str, done: int, of: int) -> None:
-        assert 0 <= done <= of
-
-    def end(self, attempt: Attempt, again: bool) -> None:
-        self.attempts.append((attempt, again))
-
-
-def options(work: str, **more: object) -> Options:
-    path = os.pathsep.join([str(HERE), str(HERE.parents[1])])
-    return Options(work=f"fake_work:{work}", environment={"PYTHONPATH": path}, **{"workers": 2, **more})  # type: ignore[arg-type]
 
 
 def run(root: Path, work: str = "sequence", job: Job = JOB, **more: object) -> Summary:
