@@ -107,9 +107,9 @@ class Fem(Section):
 
     law: Literal["linear", "corotational"] = "linear"
     """Material law."""
-    order: Literal[1, 2] = 1
+    order: Literal[1, 2] = 2
     """Polynomial order of the tetrahedra."""
-    tets: Annotated[int, Field(ge=100, le=200_000)] = 4000
+    tets: Annotated[int, Field(ge=100, le=200_000)] = 1600
     """Number of tetrahedra to aim for; graded towards the craniotomy."""
     young_kpa: PositiveRange = (0.5, 3.0)
     """Young's modulus E [kPa], drawn log-uniformly."""

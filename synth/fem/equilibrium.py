@@ -1,0 +1,166 @@
+"""Quasi-static equilibrium along a load's course: one solve, or L-BFGS on the stiffness at rest."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from synth.errors import UserError
+from synth.fem.system import State, System
+
+Floats = NDArray[np.float64]
+
+TOLERANCE = 2e-4
+"""Force out of balance, as a part of the load, at which a step ends."""
+_MEMORY, _STEPS = 8, 200
+
+
+class NoEquilibrium(UserError):
+    """The iteration found no balance of forces."""
+
+
+@dataclass(frozen=True)
+class Path:
+    """States of the volume over T steps, for E = 1 kPa."""
+
+    displacement: Floats
+    """(T, N, 3) mm."""
+    jacobian: Floats
+    """(T,) smallest det F."""
+    energy: Floats
+    """(T,) mN mm."""
+    residual: Floats
+    """(T,) force out of balance over the load, in the norm of the inverse stiffness; 0 without load."""
+
+
+def follow(system: System, load: Floats, part: Floats) -> Path:
+    """Equilibrium at each part of a load.
+
+    Args:
+        system: the equations.
+        load: (N, 3) mN for E = 1 kPa.
+        part: (T,) what part of it is on.
+
+    Raises:
+        NoEquilibrium: the iteration stalled; names the step and its load.
+    """
+    path: list[tuple[Floats, State]] = []
+    residual = np.zeros(len(part))
+    first = system.solve(load)
+    size = float(np.sqrt(np.vdot(load, first)))
+    known: list[tuple[float, Floats]] = [(0.0, np.zeros_like(load))]
+    for step, p in enumerate(part):
+        if system.law == "linear":
+            u = p * first
+            state = system.state(u)
+            out = _free(system, p * load - state.force)
+            residual[step] = np.linalg.norm(out) / np.linalg.norm(load)
+        else:
+            start = _guess(known, float(p), first)
+            u, state, rest = balance(system, p * load, start, TOLERANCE * size)
+            residual[step] = rest / size
+            if rest > TOLERANCE * size:
+                raise NoEquilibrium(
+                    f"frame {step}: no equilibrium at {p:.3g} of the peak load "
+                    f"(out of balance by {rest / size:.1e}); lower fem.load"
+                )
+            if all(abs(p - k) > 1e-3 for k, _ in known):
+                known.append((float(p), u))
+        path.append((u, state))
+    return Path(
+        np.stack([u for u, _ in path]),
+        np.array([s.jacobian for _, s in path]),
+        np.array([s.energy for _, s in path]),
+        residual,
+    )
+
+
+def balance(system: System, load: Floats, start: Floats, tolerance: float) -> tuple[Floats, State, float]:
+    """Minimises stored energy less the load's work by L-BFGS on the factored rest stiffness.
+
+    Nocedal & Wright, Numerical Optimization, 7.4; Liu, Bouaziz & Kavan, "Quasi-Newton methods for real-time
+    simulation of hyperelastic materials" (ACM Trans. Graph. 36, 2017).
+
+    Args:
+        system: the equations.
+        load: (N, 3) mN.
+        start: (N, 3) mm.
+        tolerance: on the norm sqrt(r' K^-1 r) of what is out of balance, in sqrt(mN mm).
+
+    Returns:
+        Displacement, its state and the norm reached; the caller judges it.
+    """
+    u = start
+    state = system.state(u)
+    slope = _free(system, state.force - load)
+    memory: list[tuple[Floats, Floats, float]] = []
+    rest = np.inf
+    for _ in range(_STEPS):
+        direct = system.solve(slope)
+        rest = max(float(np.vdot(slope, direct)), 0.0) ** 0.5
+        if rest <= tolerance:
+            break
+        step = -_descent(slope, direct, memory, system)
+        fall = float(np.vdot(slope, step))
+        if fall >= 0:
+            memory.clear()
+            step, fall = -direct, -(rest**2)
+        length, level = 1.0, state.energy - float(np.vdot(load, u))
+        for _ in range(30):
+            trial = u + length * step
+            new = system.state(trial)
+            value = new.energy - float(np.vdot(load, trial))
+            if np.isfinite(value) and value <= level + 1e-4 * length * fall + 1e-14 * abs(level):
+                break
+            length *= 0.5
+        else:
+            break
+        after = _free(system, new.force - load)
+        s, y = length * step, after - slope
+        bend = float(np.vdot(s, y))
+        if bend > 1e-12 * float(np.sqrt(np.vdot(s, s) * np.vdot(y, y))):
+            memory.append((s, y, bend))
+            del memory[:-_MEMORY]
+        u, state, slope = trial, new, after
+    return u, state, rest
+
+
+def _descent(
+    slope: Floats, direct: Floats, memory: list[tuple[Floats, Floats, float]], system: System
+) -> Floats:
+    """The inverse Hessian on the slope, by two loops round the rest stiffness."""
+    if not memory:
+        return direct
+    q, rates = slope.copy(), []
+    for s, y, bend in reversed(memory):
+        rate = float(np.vdot(s, q)) / bend
+        q -= rate * y
+        rates.append(rate)
+    r = system.solve(q)
+    for (s, y, bend), rate in zip(memory, reversed(rates), strict=True):
+        r += s * (rate - float(np.vdot(y, r)) / bend)
+    return r
+
+
+def _guess(known: list[tuple[float, Floats]], part: float, first: Floats) -> Floats:
+    """The next state, through the known ones nearest in load: elastic states depend on nothing else."""
+    nearest = sorted(known, key=lambda k: abs(k[0] - part))[:3]
+    if len(nearest) == 1:
+        return part * first
+    value = np.zeros_like(first)
+    for i, (at, u) in enumerate(nearest):
+        share = 1.0
+        for j, (other, _) in enumerate(nearest):
+            if j != i:
+                share *= (part - other) / (at - other)
+        value += share * u
+    return value
+
+
+def _free(system: System, force: Floats) -> Floats:
+    """The force without what the walls take."""
+    out = np.zeros(force.size)
+    out[system.free] = force.ravel()[system.free]
+    return out.reshape(-1, 3)

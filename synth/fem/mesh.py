@@ -1,0 +1,199 @@
+"""The volume mesh: graded tetrahedra of a block or of a user's brain, and where the skull holds them."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sp
+from numpy.typing import NDArray
+
+from synth import job
+from synth.brain import Brain
+from synth.errors import UserError
+from synth.fem.element import TRI_POINTS, TRI_WEIGHTS, bary_slope, face_shape
+from synth.fem.refine import edges_of, refine
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+_FIRM_PER_MM = (
+    2.0  # skull and dura as springs of this times E a mm: 10 times stiffer than the tissue under a contact
+)
+_FLAT = 0.8  # the dome is round up to this part of its radius, level beyond (under the skull)
+_KUHN = np.array([[0, 1, 3, 7], [0, 5, 1, 7], [0, 3, 2, 7], [0, 2, 6, 7], [0, 4, 5, 7], [0, 6, 4, 7]])
+"""Six tetrahedra of a cube with corners numbered x + 2y + 4z, round its diagonal."""
+
+
+@dataclass(frozen=True)
+class Tets:
+    """A meshed brain, in world axes."""
+
+    points: Floats
+    """(N, 3) mm: corners first, then (order 2) edge midpoints."""
+    cells: Ints
+    """(M, 4) or (M, 10), positively oriented; midsides in the order of `refine.EDGES`."""
+    order: int
+    fixed: NDArray[np.bool_]
+    """(N,) nodes that cannot move: the walls a block is cut out at."""
+    hold: sp.csr_array
+    """(N, N) mm: springs of the skull on the surface round the opening, for E = 1 kPa."""
+
+
+def block(anatomy: job.Anatomy, tets: int, order: int) -> Tets:
+    """A domed block, fixed at its sides and bottom, held by the skull round the opening.
+
+    Args:
+        anatomy: block_mm, dome_mm and craniotomy are used.
+        tets: number of tetrahedra to aim for.
+        order: 1 or 2.
+
+    Raises:
+        UserError: the block is too shallow for its dome.
+    """
+    size = np.asarray(anatomy.block_mm)
+    fall = -dome(np.array([size[:2] / 2]), anatomy.dome_mm)[0]
+    if fall > 0.8 * size[2]:
+        raise UserError(
+            f"anatomy.block_mm: depth {size[2]:g} mm is too little under a dome that falls {fall:.0f} mm"
+        )
+    points, cells = _bricks(size, tets)
+    opening = anatomy.craniotomy.radius_mm
+    points, cells = refine(points, cells, _grading(opening), tets)
+    wall = (np.abs(np.abs(points[:, :2]) - size[:2] / 2) < 1e-9).any(axis=1) | (points[:, 2] < 1e-9 - size[2])
+    points[:, 2] += dome(points[:, :2], anatomy.dome_mm) * (1 + points[:, 2] / size[2])
+    # A face is on a wall if its three corners are; the upper edge of the walls belongs to both.
+    return _finished(points, cells, order, wall, anatomy.craniotomy)
+
+
+def from_brain(brain: Brain, anatomy: job.Anatomy, tets: int, order: int) -> Tets:
+    """A user's whole brain, held by the skull everywhere but in the opening.
+
+    Raises:
+        UserError: the surface encloses no volume that can be meshed, or none under the opening.
+    """
+    points, cells = _filled(brain, tets)
+    points, cells = refine(points, cells, _grading(anatomy.craniotomy.radius_mm), tets)
+    return _finished(points, cells, order, np.zeros(len(points), bool), anatomy.craniotomy)
+
+
+def dome(xy: Floats, radius_mm: float) -> Floats:
+    """Height of the procedural brain's surface, (n,) mm, at (n, 2) mm; 0 at the craniotomy's centre."""
+    reach = np.minimum((xy**2).sum(axis=1), (_FLAT * radius_mm) ** 2)
+    return np.asarray(np.sqrt(radius_mm**2 - reach) - radius_mm)
+
+
+def lengthened(points: Floats, cells: Ints, order: int) -> tuple[Floats, Ints]:
+    """Adds the midside nodes of order 2; order 1 comes back unchanged."""
+    if order == 1:
+        return points, cells
+    pairs, of = edges_of(cells)
+    return np.vstack([points, points[pairs].mean(axis=1)]), np.hstack([cells, len(points) + of])
+
+
+def boundary(cells: Ints, order: int) -> Ints:
+    """Faces with one tetrahedron, (F, 3 or 6), counter-clockwise seen from outside; midsides 01, 02, 12."""
+    corners = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])
+    sides = np.array([[7, 8, 9], [6, 5, 9], [4, 6, 8], [5, 4, 7]])
+    faces = cells[:, corners].reshape(-1, 3)
+    key = np.sort(faces, axis=1)
+    _, first, count = np.unique(key, axis=0, return_index=True, return_counts=True)
+    alone = np.sort(first[count == 1])
+    if order == 1:
+        return np.asarray(faces[alone])
+    return np.asarray(np.hstack([faces, cells[:, sides].reshape(-1, 3)])[alone])
+
+
+def _grading(opening_mm: float) -> Callable[[Floats], Floats]:
+    """Wanted size: even under the opening, growing with the distance from it."""
+
+    def size(at: Floats) -> Floats:
+        aside = np.maximum(np.hypot(at[:, 0], at[:, 1]) - opening_mm, 0)
+        return np.asarray(1 + np.hypot(aside, at[:, 2]) / (0.5 * opening_mm))
+
+    return size
+
+
+def _bricks(size: Floats, tets: int) -> tuple[Floats, Ints]:
+    """The block cut into near-cubes of six tetrahedra each, z from -depth to 0, at most a tenth of `tets`."""
+    edge = float((size.prod() / max(tets / 60, 2)) ** (1 / 3))
+    n = np.maximum(np.round(size / edge).astype(int), 1)
+    n[:2] += n[:2] % 2  # the opening's centre on a corner, not in the middle of a brick
+    axes = [np.linspace(-size[i] / 2, size[i] / 2, n[i] + 1) for i in (0, 1)]
+    axes.append(np.linspace(-size[2], 0, n[2] + 1))
+    grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    at = np.arange(len(grid)).reshape(n + 1)
+    cube = [
+        at[x : x + n[0], y : y + n[1], z : z + n[2]].ravel() for z in (0, 1) for y in (0, 1) for x in (0, 1)
+    ]
+    cells = np.stack(cube, axis=1)[:, _KUHN].reshape(-1, 4)
+    volume = bary_slope(grid[cells])[1]
+    cells[volume < 0] = cells[volume < 0][:, [0, 2, 1, 3]]
+    return grid, cells
+
+
+def _filled(brain: Brain, tets: int) -> tuple[Floats, Ints]:
+    """Coarse tetrahedra of the volume inside a surface with holes, duplicates and crossings (fTetWild)."""
+    import wildmeshing  # slow to load, and needed for a user's surface only
+
+    mesher = wildmeshing.Tetrahedralizer(
+        stop_quality=10, max_its=10, max_threads=1, epsilon=0.01, edge_length_r=0.1, coarsen=True
+    )
+    with _silence():
+        mesher.set_log_level(6)
+        mesher.set_mesh(brain.vertices, brain.faces)
+        mesher.tetrahedralize()
+        points, cells, _ = mesher.get_tet_mesh()
+    points, cells = np.asarray(points, np.float64), np.asarray(cells, np.int64)
+    if len(cells) == 0:
+        raise UserError("anatomy.mesh: the surface encloses no volume")
+    used, cells = np.unique(cells, return_inverse=True)
+    points, cells = points[used], cells.reshape(-1, 4)
+    volume = bary_slope(points[cells])[1]
+    cells[volume < 0] = cells[volume < 0][:, [0, 2, 1, 3]]
+    return points, cells
+
+
+@contextmanager
+def _silence() -> Iterator[None]:
+    """fTetWild writes its progress past Python to the process's own output; there it would spoil --json."""
+    sys.stdout.flush()
+    kept, nowhere = os.dup(1), os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(nowhere, 1)
+        yield
+    finally:
+        os.dup2(kept, 1)
+        os.close(kept)
+        os.close(nowhere)
+
+
+def _finished(points: Floats, cells: Ints, order: int, wall: NDArray[np.bool_], at: job.Craniotomy) -> Tets:
+    faces = boundary(cells, 1)
+    on_wall = wall[faces].all(axis=1)
+    points, cells = lengthened(points, cells, order)
+    faces = boundary(cells, order)
+    fixed = np.zeros(len(points), bool)
+    fixed[faces[on_wall]] = True
+    return Tets(points, cells, order, fixed, _springs(points, faces[~on_wall], order, at))
+
+
+def _springs(points: Floats, faces: Ints, order: int, at: job.Craniotomy) -> sp.csr_array:
+    """The skull: springs on the surface that grow, over the rim's width, from none in the opening to firm."""
+    corner = points[faces[:, :3]]
+    area = 0.5 * np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1)
+    place = np.einsum("qc,fcd->fqd", TRI_POINTS, corner)
+    out = np.hypot(place[..., 0], place[..., 1]) - at.radius_mm
+    firm = np.clip(out / at.rim_mm, 0, 1)
+    # Deep below, it is the far side of the brain, which no opening bares.
+    firm[place[..., 2] < -2 * at.radius_mm] = 1
+    value = face_shape(TRI_POINTS, order)
+    pressed = _FIRM_PER_MM * firm * firm * (3 - 2 * firm) * area[:, None] * TRI_WEIGHTS
+    local = np.einsum("fq,qi,qj->fij", pressed, value, value)
+    n = faces.shape[1]
+    rows, cols = np.repeat(faces, n, axis=1).ravel(), np.tile(faces, (1, n)).ravel()
+    return sp.coo_array((local.ravel(), (rows, cols)), shape=(len(points),) * 2).tocsr()

@@ -1,0 +1,130 @@
+"""From a gesture to the motion of the surface: load, equilibrium frame by frame, labels."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from synth import job
+from synth.errors import NotFinite, UserError
+from synth.fem import equilibrium, skin, tool
+from synth.fem.material import Tissue, check_load
+from synth.fem.mesh import Tets
+from synth.fem.system import System, assemble
+from synth.fem.tool import Gesture
+from synth.fem.validity import LEAST_JACOBIAN
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int32]
+
+
+class InvertedElement(UserError):
+    """The load is past what the mesh can follow: an element is flat or inside out."""
+
+
+@dataclass(frozen=True)
+class Deformation:
+    """The surface, its loads and the instrument over T frames, in world axes. Frame 0 is at rest."""
+
+    rest: Floats
+    """(V, 3) mm."""
+    faces: Ints
+    """(F, 3)."""
+    displacement: Floats
+    """(T, V, 3) mm."""
+    traction: Floats
+    """(T, V, 3) kPa on the surface at rest, linear on its faces."""
+    area: Floats
+    """(V,) mm^2 at rest: sum(area * traction) is the force."""
+    force: Floats
+    """(T, 3) mN on the tissue."""
+    time: Floats
+    """(T,) s."""
+    tip: Floats
+    """(T, K, 3) mm, the instrument's tips."""
+    shaft: Floats
+    """(T, K, 3) unit vectors from tip to hand."""
+    min_jacobian: Floats
+    """(T,) smallest det F in the volume."""
+    energy: Floats
+    """(T,) mN mm stored."""
+    residual: Floats
+    """(T,) force out of balance as a part of the load, both in the norm of the inverse stiffness."""
+
+
+def deform(
+    fem: job.Fem,
+    craniotomy: job.Craniotomy,
+    tissue: Tissue,
+    gesture: Gesture,
+    tets: Tets,
+    skin_vertices: Floats,
+    skin_faces: Ints,
+    frames: int,
+    fps: float,
+) -> Deformation:
+    """Moves a brain as a gesture asks, quasi-statically.
+
+    Args:
+        fem: the job's section.
+        craniotomy: the opening.
+        tissue: stiffness and law.
+        gesture: the load.
+        tets: the volume.
+        skin_vertices: (V, 3) mm, the fine surface.
+        skin_faces: (F, 3), counter-clockwise seen from outside.
+        frames: T >= 2.
+        fps: 1/s.
+
+    Raises:
+        UserError: the load is past the law's range, or the contact is not on the surface.
+        InvertedElement: names frame, load and element.
+        NotFinite: a number is none.
+    """
+    check_load(tissue.law, gesture.load)
+    system = assemble(tets, tissue.law, tissue.poisson)
+    carry = skin.embedding(tets, skin_vertices)
+    area = skin.vertex_area(skin_vertices, skin_faces)
+    kernel = tool.footprint(gesture, skin_vertices, area)
+    part, away = tool.course(gesture, frames)
+    force = part[:, None] * gesture.force_mn * np.asarray(gesture.direction)
+
+    # One load per kPa of E; displacement depends on no more than that.
+    unit = carry.T @ (area * kernel)
+    peak = np.outer(unit, gesture.force_mn / tissue.young_kpa * np.asarray(gesture.direction))
+    path = equilibrium.follow(system, peak, part)
+    for t in range(frames):
+        _check(path, t, gesture.load * part[t], system)
+
+    # The volume moves by few shapes times numbers where the law is linear; in general frame by frame.
+    displacement = np.stack([carry @ u for u in path.displacement])
+    corners, weights = tool.anchors(gesture, skin_vertices, skin_faces)
+    touched = np.einsum("kc,tkcd->tkd", weights, (skin_vertices + displacement)[:, corners])
+    hand = tool.shaft(gesture)
+    return Deformation(
+        rest=skin_vertices,
+        faces=skin_faces,
+        displacement=displacement,
+        traction=kernel[None, :, None] * force[:, None, :],
+        area=area,
+        force=force,
+        time=np.arange(frames) / fps,
+        tip=touched + gesture.hover_mm * away[:, None, None] * hand,
+        shaft=np.broadcast_to(hand, touched.shape).copy(),
+        min_jacobian=path.jacobian,
+        energy=path.energy * tissue.young_kpa,
+        residual=path.residual,
+    )
+
+
+def _check(path: equilibrium.Path, t: int, load: float, system: System) -> None:
+    if not np.isfinite(path.displacement[t]).all() or not np.isfinite(path.energy[t]):
+        raise NotFinite(f"frame {t}: the deformation at load {load:.3g} is not finite")
+    if path.jacobian[t] <= LEAST_JACOBIAN:
+        element = system.worst(path.displacement[t])
+        raise InvertedElement(
+            f"frame {t}: load {load:.3g} turns element {element} inside out or nearly so "
+            f"(det F {path.jacobian[t]:.2f}, at least {LEAST_JACOBIAN:g} is needed); lower fem.load"
+        )

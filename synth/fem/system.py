@@ -1,0 +1,91 @@
+"""The equations of one brain for E = 1 kPa: stiffness at rest, factored once, and the forces of a law."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sp
+from numpy.typing import NDArray
+from scipy.sparse.linalg import SuperLU, splu
+
+from synth.fem.assembly import divergence, gradient, stiffness
+from synth.fem.element import Quadrature, quadrature
+from synth.fem.laws import NUMBER, lame, stress
+from synth.fem.mesh import Tets
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class State:
+    """What a displacement does to the tissue, for E = 1 kPa."""
+
+    energy: float
+    """mN mm, stored in tissue and springs."""
+    force: Floats
+    """(N, 3) mN that the tissue and its springs put up."""
+    jacobian: float
+    """Smallest det F at the quadrature points."""
+
+
+@dataclass(frozen=True)
+class System:
+    """A meshed brain of one law. All forces and energies are for E = 1 kPa; displacement needs no scaling."""
+
+    mesh: Quadrature
+    law: str
+    poisson: float
+    free: NDArray[np.int64]
+    """(D,) degrees of freedom that can move."""
+    hold: sp.csr_array
+    """(N, N) mN/mm."""
+    stiffness: sp.csr_array
+    """(3N, 3N) mN/mm at rest, springs included."""
+    factor: SuperLU
+    """Of the free part of it."""
+
+    def solve(self, force: Floats) -> Floats:
+        """Displacement of the linear law, (N, 3) mm, under (N, 3) mN."""
+        u = np.zeros(force.size)
+        u[self.free] = self.factor.solve(force.ravel()[self.free])
+        return u.reshape(-1, 3)
+
+    def state(self, u: Floats) -> State:
+        """Energy, forces and smallest Jacobian at (N, 3) mm."""
+        count = self.mesh.weight.size
+        strain, answer, density = np.empty((count, 3, 3)), np.empty((count, 3, 3)), np.empty(count)
+        gradient(self.mesh.cells, self.mesh.slope, u, strain)
+        least = stress(NUMBER[self.law], strain, *lame(1.0, self.poisson), answer, density)
+        force = np.empty_like(u)
+        divergence(self.mesh.cells, self.mesh.slope, self.mesh.weight, answer, force)
+        spring = self.hold @ u
+        energy = float(density @ self.mesh.weight.ravel()) + 0.5 * float(np.vdot(u, spring))
+        return State(energy, force + spring, float(least))
+
+    def worst(self, u: Floats) -> int:
+        """The element with the smallest det F."""
+        strain = np.empty((self.mesh.weight.size, 3, 3))
+        gradient(self.mesh.cells, self.mesh.slope, u, strain)
+        return int(np.linalg.det(strain + np.eye(3)).argmin() // self.mesh.weight.shape[1])
+
+
+def assemble(tets: Tets, law: str, poisson: float) -> System:
+    """Builds and factors the equations.
+
+    Args:
+        tets: the mesh, its walls and springs.
+        law: a key of `laws.NUMBER`.
+        poisson: below 0.5.
+    """
+    mesh = quadrature(tets.points, tets.cells, tets.order)
+    whole = (stiffness(mesh, 1.0, poisson) + sp.kron(tets.hold, sp.eye_array(3), format="csr")).tocsr()
+    free = np.flatnonzero(np.repeat(~tets.fixed, 3))
+    # Symmetric and positive definite: no pivoting, an ordering of A + A'.
+    factor = splu(
+        whole[free][:, free].tocsc(),
+        permc_spec="MMD_AT_PLUS_A",
+        diag_pivot_thresh=0.0,
+        options={"SymmetricMode": True},
+    )
+    return System(mesh, law, poisson, free, tets.hold, whole, factor)
