@@ -21,7 +21,7 @@ setup: .venv/installed .venv/llvm
 	@test -x $(BIN)/python || $(PYTHON) -m venv .venv || \
 	  { echo "$(PYTHON) cannot make a virtual environment; on Debian: apt-get install python3-venv" >&2; exit 2; }
 	@echo "installing into .venv (once; some minutes) ..."
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]' || \
+	@$(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e '.[dev]' || \
 	  { echo "the packages could not be installed: is an index of Python packages within reach?" >&2; exit 2; }
 	@touch $@
 

@@ -44,6 +44,8 @@ class Setup:
     """The job, JSON-ready, paths resolved."""
     folder: Path
     logs: Path
+    scratch: Path
+    """Where a process may leave what it likes."""
     work: str = "synth.pipeline:render_sequence"
     """`module:function` that computes a sequence: `(job, index, folder, report)`."""
     memory_bytes: int | None = None
@@ -80,8 +82,9 @@ class Child:
             json.dumps(
                 {
                     "job": setup.job,
-                    "folder": str(setup.folder),
-                    "logs": str(setup.logs),
+                    "folder": str(setup.folder.resolve()),
+                    "logs": str(setup.logs.resolve()),
+                    "scratch": str(setup.scratch.resolve()),
                     "work": setup.work,
                 }
             )

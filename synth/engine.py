@@ -80,6 +80,7 @@ def run(job: Job, root: Path, options: Options, watcher: Watcher) -> Summary:
             job=job.model_dump(mode="json"),
             folder=root,
             logs=folder.logs,
+            scratch=folder.scratch,
             work=options.work,
             memory_bytes=_share_of_memory(options, workers),
             stall_s=options.stall_s,

@@ -30,6 +30,7 @@ class Folder:
         self.root = root
         self.state = root / _STATE
         self.logs = self.state / "logs"
+        self.scratch = self.state / "scratch"
         self.lock_fd = -1
 
     def described(self) -> dict[str, Any]:
@@ -90,6 +91,8 @@ class Folder:
             shutil.rmtree(part)
         for log in self.logs.glob("worker-*.log"):
             log.unlink()
+        for abandoned in self.scratch.glob("*"):
+            shutil.rmtree(abandoned)
         for radiance in self.root.glob("radiance/[0-9]*"):
             if radiance.name.isdigit():
                 self.sweep(int(radiance.name))
@@ -121,6 +124,7 @@ def claim(root: Path, job: Job) -> Iterator[Folder]:
             _refuse_foreign(folder, job, name)
             (folder.state / "failed").mkdir(exist_ok=True)
             folder.logs.mkdir(exist_ok=True)
+            folder.scratch.mkdir(exist_ok=True)
             described = {"identity": name, "job": job.model_dump(mode="json")}
             write_whole(root / _NAME, json.dumps(described, indent=1) + "\n")
             write_whole(

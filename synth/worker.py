@@ -14,6 +14,7 @@ import json
 import os
 import signal
 import sys
+import tempfile
 import traceback
 from collections.abc import Callable
 from pathlib import Path
@@ -30,7 +31,14 @@ def main(pipe: int) -> None:
     _die_with_parent()
     setup = json.loads(sys.stdin.readline())
     logs = Path(setup["logs"])
-    _log_to(logs / f"worker-{os.getpid()}.log")
+    # Libraries that drop files where they stand must not meet one another's, nor litter the user's folder.
+    with tempfile.TemporaryDirectory(dir=setup["scratch"]) as scratch:
+        os.chdir(scratch)
+        _log_to(logs / f"worker-{os.getpid()}.log")
+        _serve(pipe, setup, logs)
+
+
+def _serve(pipe: int, setup: dict[str, Any], logs: Path) -> None:
     work = job = None
     for line in sys.stdin:
         index = int(line)

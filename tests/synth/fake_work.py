@@ -53,7 +53,7 @@ def attributes(index: int, rng: np.random.Generator) -> dict[str, Any]:
 
 
 def troubled(job: Job, index: int, folder: Path, report: Report) -> None:
-    """1 aborts, 2 fills memory, 3 is NaN, 4 raises, 5 hangs, 6 refuses, 7 works at the second try."""
+    """1 aborts, 2 fills memory, 3 is NaN, 4 raises, 6 refuses, 7 works at the second try."""
     if index == 1:
         report("render", 0, 1)
         os.abort()
@@ -67,8 +67,6 @@ def troubled(job: Job, index: int, folder: Path, report: Report) -> None:
         writer.put("force", np.full((job.frames, 3), np.nan))
     if index == 4:
         raise ZeroDivisionError("by nought")
-    if index == 5:
-        time.sleep(600)
     if index == 6:
         raise UserError("the load is past the material's range")
     if index == 7:
@@ -77,6 +75,11 @@ def troubled(job: Job, index: int, folder: Path, report: Report) -> None:
             tried.touch()
             os.kill(os.getpid(), 9)
     sequence(job, index, folder, report)
+
+
+def hanging(job: Job, index: int, folder: Path, report: Report) -> None:
+    """It never comes back."""
+    time.sleep(600)
 
 
 def refused(job: Job, index: int, folder: Path, report: Report) -> None:
