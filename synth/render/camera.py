@@ -108,7 +108,11 @@ def to_camera(camera: Camera, points: Floats) -> Floats:
 
 def project(camera: Camera, points: Floats) -> Floats:
     """Pixels (N, 2) of world points (N, 3) mm, in the recorded (distorted) picture."""
-    local = to_camera(camera, points)
+    return to_pixels(camera, to_camera(camera, points))
+
+
+def to_pixels(camera: Camera, local: Floats) -> Floats:
+    """Pixels (N, 2) of points (N, 3) mm in camera axes."""
     flat = _distort(local[:, :2] / local[:, 2:], camera.distortion)
     return flat * np.diag(camera.K)[:2] + camera.K[:2, 2]
 

@@ -62,4 +62,4 @@ def blackbody(kelvin: float) -> Floats:
             [0.0556434, -0.2040259, 1.0572252],
         ]
     )
-    return np.maximum(matrix @ xyz, 0.0)
+    return np.asarray(np.maximum(matrix @ xyz, 0.0), np.float64)

@@ -1,7 +1,7 @@
 """A stage of meshes, lamps and a camera in Mitsuba; vertices are moved in place.
 
-With its lens (`mitsuba_lens`) the only file that knows Mitsuba. The variant is chosen on first use and its LLVM
-found by `synth.llvm`: a wrong one ends the process.
+With its lens (`mitsuba_lens`) the only file that knows Mitsuba. The variant is chosen on first use and its
+LLVM found by `synth.llvm`: a wrong one ends the process.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """The microscope's lens for Mitsuba: `camera.rays` with an aperture of some width.
 
-Compiled variants take a sensor plugin that distorts exactly. Written in Python it would cost the scalar one
-twenty times its own work, so there Mitsuba's own thin lens renders the undistorted picture, twice as fine, and
-that is warped.
+Compiled variants take a sensor plugin that distorts exactly. Written in Python it would cost the scalar
+one twenty times its own work, so there Mitsuba's own thin lens renders the undistorted picture, twice as
+fine, and that is warped.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ class Scalar:
                 "fov_axis": "x",
                 "near_clip": 1.0,
                 "far_clip": 1e4,
-                "to_world": mi.ScalarTransform4f(to_world),
+                "to_world": mi.ScalarTransform4f(to_world.tolist()),
                 "film": _film(film_width, film_height),
                 "sampler": {"type": sampler, "sample_count": self.spp},
                 **(

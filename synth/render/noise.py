@@ -75,4 +75,4 @@ def centres(pixels: int, extent_mm: float) -> npt.NDArray[np.float32]:
 def _filtered(rng: np.random.Generator, pixels: int, gain: Floats) -> Map:
     white = rng.standard_normal((pixels, pixels), dtype=np.float32)
     noise = np.fft.irfft2(np.fft.rfft2(white) * gain, s=(pixels, pixels))
-    return ((noise - noise.mean()) / noise.std()).astype(np.float32)
+    return np.asarray((noise - noise.mean()) / noise.std(), np.float32)

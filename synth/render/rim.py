@@ -12,6 +12,7 @@ from synth.render import noise
 from synth.render.anatomy import Surface
 from synth.render.look import Look
 from synth.render.texture import Coat, normals
+from synth.render.truth import Shape
 
 Floats = npt.NDArray[np.float64]
 Map = npt.NDArray[np.float32]
@@ -34,9 +35,9 @@ class Rim:
     """(A,) mm: radius of the opening's edge at even angles."""
 
     @property
-    def triangles(self) -> Floats:
-        """(F, 3, 3) mm."""
-        return self.vertices[self.faces]
+    def shape(self) -> Shape:
+        """For casting rays at it."""
+        return Shape(self.vertices, self.faces)
 
 
 def build(surface: Surface, radius_mm: float, look: Look) -> Rim:

@@ -13,7 +13,7 @@ from synth.render.anatomy import Surface
 from synth.render.camera import Camera
 from synth.render.look import Look
 from synth.render.mitsuba_adapter import Body, Metal, Stage, Wet, pick
-from synth.render.truth import Still
+from synth.render.truth import Shape, Still
 
 __all__ = ["Look", "Shot", "Still", "Studio"]
 
@@ -69,7 +69,7 @@ class Studio:
             texture.resolution(surface.extent_mm, camera.mm_per_px),
             job.appearance.photo,
         )
-        self.still = truth.still(camera, surface.vertices, surface.faces, self._rim.triangles)
+        self.still = truth.still(camera, Shape(surface.vertices, surface.faces), self._rim.shape)
         self._lamps = light.lamps(camera, look)
         self._sensor = sensor.Sensor(
             exposure=look.exposure,
@@ -94,8 +94,13 @@ class Studio:
             self._tool = instrument.build(len(tips))
         tool = instrument.pose(self._tool, tips, shafts) if self._tool else np.zeros((0, 3))
         radiance = self._expose(vertices, tool, seed)
-        triangles = tool[self._tool.faces] if self._tool else np.zeros((0, 3, 3))
-        now = truth.now(camera, self.still, camera, vertices, surface.faces, self._rim.triangles, triangles)
+        now = truth.now(
+            camera,
+            self.still,
+            Shape(vertices, surface.faces),
+            self._rim.shape,
+            Shape(tool, self._tool.faces) if self._tool else None,
+        )
         rng = np.random.default_rng([seed, 1])
         return Shot(
             rgb=sensor.record(radiance, self._sensor, rng),

@@ -84,7 +84,7 @@ def _tone(linear: Map, contrast: float) -> Map:
     curve = (encoded + contrast * (encoded * encoded * (3 - 2 * encoded) - encoded)).astype(np.float32)
     at = linear * 4096
     low = np.minimum(at.astype(np.int32), 4095)
-    return curve[low] + (at - low) * (curve[low + 1] - curve[low])
+    return np.asarray(curve[low] + (at - low) * (curve[low + 1] - curve[low]), np.float32)
 
 
 def _sharpen(video: Map, amount: float) -> Map:

@@ -63,7 +63,7 @@ def normals(height: Map, extent_mm: float) -> Map:
 def thickness(tube: tuple[Map, Map]) -> Map:
     """Length of the chord through a round vessel, seen from above [mm]."""
     distance, radius = tube
-    return (2 * np.sqrt(np.maximum(radius**2 - distance**2, 0))).astype(np.float32)
+    return np.asarray(2 * np.sqrt(np.maximum(radius**2 - distance**2, 0)), np.float32)
 
 
 def _painted(
@@ -95,7 +95,7 @@ def _painted(
     # Light that enters tissue leaves it nearby, red farthest: a blur stands in for the volume.
     for channel, width in enumerate((0.055, 0.032, 0.024)):
         albedo[..., channel] = noise.blur(np.ascontiguousarray(albedo[..., channel]), width, extent)
-    return np.clip(albedo, 0.01, 0.95).astype(np.float32)
+    return np.asarray(np.clip(albedo, 0.01, 0.95), np.float32)
 
 
 def _veined(albedo: Map, tube: tuple[Map, Map], look: Look, extent: float) -> Map:
@@ -127,7 +127,7 @@ def _film(
     )
     fine = noise.band(rng, pixels, extent, 0.24, 0.45) * 0.0012
     pits = cv2.resize(swell, (pixels, pixels), interpolation=cv2.INTER_CUBIC) + fine
-    return (relief + look.bump * dry * pits).astype(np.float32)
+    return np.asarray(relief + look.bump * dry * pits, np.float32)
 
 
 def _photograph(path: Path, pixels: int) -> Map:
@@ -143,4 +143,4 @@ def _photograph(path: Path, pixels: int) -> Map:
     encoded = square[..., ::-1].astype(np.float32) / 255
     linear = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
     # First row of a map is the lower y.
-    return np.clip(linear[::-1], 0.01, 0.95).astype(np.float32)
+    return np.asarray(np.clip(linear[::-1], 0.01, 0.95), np.float32)

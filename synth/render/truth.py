@@ -7,7 +7,9 @@ Intersection: T. Moeller, B. Trumbore, "Fast, minimum storage ray/triangle inter
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numba
 import numpy as np
@@ -21,7 +23,17 @@ Indices = npt.NDArray[np.int32]
 Mask = npt.NDArray[np.bool_]
 
 _HIDDEN_MM = 1e-3  # nearer to the lens than a point by more than this hides it
+_NEAR_MM = 1.0
 _PAD_PX = 1.5  # triangles bow a little under distortion
+
+
+class Shape(NamedTuple):
+    """A triangle mesh, world axes."""
+
+    vertices: Floats
+    """(V, 3) mm."""
+    faces: Indices
+    """(F, 3)."""
 
 
 @dataclass(frozen=True)
@@ -50,6 +62,8 @@ class Still:
     """(H, W) triangle of the fine surface; -1 off the tissue."""
     bary: Floats
     """(H, W, 3)."""
+    directions: Floats
+    """(H*W, 3) of the pixels' centre rays, camera axes, unit z: the lens's own, wherever the camera goes."""
 
 
 @dataclass(frozen=True)
@@ -68,89 +82,73 @@ class Now:
     """This frame's pixels, over tissue, rim and tool, in this order."""
 
 
-def cast(camera: Camera, triangles: Floats, pixels: Floats, directions: Floats) -> Hits:
-    """First triangle that each ray from the lens meets.
+def cast(camera: Camera, shapes: Sequence[Shape], pixels: Floats, directions: Floats) -> Hits:
+    """First triangle that each ray from the lens meets; faces are numbered through all shapes.
 
     Args:
         camera: the camera.
-        triangles: (F, 3, 3) mm, camera axes.
+        shapes: what is there, world axes.
         pixels: (N, 2) px where the rays pierce the picture; those outside it meet nothing.
         directions: (N, 3) in camera axes, of any length, each through its pixel.
     """
     width, height = camera.size
     order, start = _bins(pixels, width, height)
-    flat = np.zeros((len(triangles), 3, 2))
-    front = triangles[:, :, 2].min(axis=1) > 1.0
-    identity = Camera(
-        camera.K, camera.distortion, np.eye(3), np.zeros(3), camera.size, 0.0, 0.0, camera.mm_per_px
-    )
-    flat[front] = cameras.project(identity, triangles[front].reshape(-1, 3)).reshape(-1, 3, 2)
-    low = np.ceil(flat.min(axis=1) - _PAD_PX).astype(np.int64)
-    high = np.floor(flat.max(axis=1) + _PAD_PX).astype(np.int64)
-    face, u, v, along = _cast(
-        triangles, low, high, front, np.ascontiguousarray(directions), order, start, width, height
-    )
+    world = np.concatenate([shape.vertices for shape in shapes])
+    first = np.cumsum([0] + [len(shape.vertices) for shape in shapes])
+    faces = np.concatenate([shape.faces + at for shape, at in zip(shapes, first, strict=False)])
+    points = cameras.to_camera(camera, world)
+    # Behind the lens or at it nothing is seen; kept in the list so that faces keep their numbers.
+    points[points[:, 2] < _NEAR_MM] = np.nan
+    flat = cameras.to_pixels(camera, points)
+    face, u, v, along = _cast(points, flat, faces, directions, order, start, width, height)
     hit = face >= 0
     bary = np.where(hit[:, None], np.stack([1 - u - v, u, v], axis=1), 0.0)
     return Hits(face, bary, along)
 
 
-def still(camera: Camera, vertices: Floats, faces: Indices, rim: Floats) -> Still:
-    """Truth of the rest frame.
-
-    Args:
-        camera: the camera.
-        vertices: (V, 3) mm, fine surface at rest, world axes.
-        faces: (F, 3).
-        rim: (R, 3, 3) mm, triangles of what frames the opening, world axes.
-    """
+def still(camera: Camera, surface: Shape, rim: Shape) -> Still:
+    """Truth of the rest frame: the fine surface at rest, and what frames the opening."""
     width, height = camera.size
-    tissue = cameras.to_camera(camera, vertices)[faces]
-    scene = np.concatenate([tissue, _local(camera, rim)])
     pixels = cameras.pixel_grid(camera.size)
     directions = _forward(camera, pixels)
-    hits = cast(camera, scene, pixels, directions)
-    on_tissue = (hits.face >= 0) & (hits.face < len(faces))
+    hits = cast(camera, [surface, rim], pixels, directions)
+    on_tissue = (hits.face >= 0) & (hits.face < len(surface.faces))
     face = np.where(on_tissue, hits.face, -1).astype(np.int32)
+    corners = cameras.to_camera(camera, surface.vertices)[surface.faces[face[on_tissue]]]
     area = np.zeros(len(pixels), np.float32)
-    area[on_tissue] = _footprint(camera, tissue[face[on_tissue]], directions, on_tissue, hits.along)
+    area[on_tissue] = _footprint(camera, corners, directions, on_tissue, hits.along)
     return Still(
         tissue=on_tissue.reshape(height, width),
         area=area.reshape(height, width),
         scale_mm_per_px=camera.mm_per_px,
         face=face.reshape(height, width),
         bary=np.where(on_tissue[:, None], hits.bary, 0.0).reshape(height, width, 3),
+        directions=directions,
     )
 
 
-def now(
-    camera: Camera, rest: Still, before: Camera, vertices: Floats, faces: Indices, rim: Floats, tool: Floats
-) -> Now:
+def now(camera: Camera, rest: Still, surface: Shape, rim: Shape, tool: Shape | None) -> Now:
     """Truth of one frame.
 
     Args:
-        camera: the camera of this frame.
+        camera: the camera of this frame, with the lens of the rest frame.
         rest: truth of the rest frame.
-        before: the camera of the rest frame.
-        vertices: (V, 3) mm, fine surface in this frame, world axes.
-        faces: (F, 3).
-        rim: (R, 3, 3) mm, world axes.
-        tool: (K, 3, 3) mm, world axes; may be empty.
+        surface: the fine surface in this frame.
+        rim: what frames the opening.
+        tool: the instrument in this frame.
     """
     width, height = camera.size
-    scene = np.concatenate(
-        [cameras.to_camera(camera, vertices)[faces], _local(camera, rim), _local(camera, tool)]
-    )
+    shapes = [surface, rim] if tool is None else [surface, rim, tool]
     pixels = cameras.pixel_grid(camera.size)
-    hits = cast(camera, scene, pixels, _forward(camera, pixels))
+    hits = cast(camera, shapes, pixels, rest.directions)
     seen = hits.face >= 0
     depth = np.where(seen, hits.along, 0.0)  # directions have unit z
 
     on = rest.tissue.ravel()
-    points = np.einsum("nk,nkc->nc", rest.bary.reshape(-1, 3)[on], vertices[faces[rest.face.ravel()[on]]])
-    local = cameras.to_camera(camera, points)
-    pierced = cameras.project(camera, points)
-    blocked = cast(camera, scene, pierced, local)
+    corners = surface.vertices[surface.faces[rest.face.ravel()[on]]]
+    local = cameras.to_camera(camera, np.einsum("nk,nkc->nc", rest.bary.reshape(-1, 3)[on], corners))
+    pierced = cameras.to_pixels(camera, local)
+    blocked = cast(camera, shapes, pierced, local)
     clear = (1 - blocked.along) * np.linalg.norm(local, axis=1) < _HIDDEN_MM
     inside = ((pierced >= -0.5) & (pierced < np.array([width, height]) - 0.5)).all(axis=1)
     flow = np.zeros((len(pixels), 2), np.float32)
@@ -161,7 +159,7 @@ def now(
         flow=flow.reshape(height, width, 2),
         visible=visible.reshape(height, width),
         depth=depth.reshape(height, width).astype(np.float32),
-        tool=(hits.face >= len(faces) + len(rim)).reshape(height, width),
+        tool=(hits.face >= len(surface.faces) + len(rim.faces)).reshape(height, width),
         hits=hits,
     )
 
@@ -176,10 +174,6 @@ def _forward(camera: Camera, pixels: Floats) -> Floats:
     """Directions (N, 3) of centre rays in camera axes with unit z, so that distance along them is depth."""
     flat = cameras.undistort((pixels - camera.K[:2, 2]) / np.diag(camera.K)[:2], camera.distortion)
     return np.concatenate([flat, np.ones((len(flat), 1))], axis=1)
-
-
-def _local(camera: Camera, triangles: Floats) -> Floats:
-    return cameras.to_camera(camera, triangles.reshape(-1, 3)).reshape(-1, 3, 3)
 
 
 def _footprint(camera: Camera, corners: Floats, directions: Floats, on: Mask, along: Floats) -> Floats:
@@ -209,21 +203,25 @@ def _bins(pixels: Floats, width: int, height: int) -> tuple[npt.NDArray[np.int64
     return order, start
 
 
-def _cast_loop(triangles, low, high, front, directions, order, start, width, height):  # type: ignore[no-untyped-def]
+def _cast_loop(points, flat, faces, directions, order, start, width, height):  # type: ignore[no-untyped-def]
     count = len(directions)
     face = np.full(count, -1, np.int32)
     best_u, best_v = np.zeros(count), np.zeros(count)
     best = np.full(count, np.inf)
-    for f in range(len(triangles)):
-        if not front[f]:
+    for f in range(len(faces)):
+        a, b, c = faces[f]
+        left = min(flat[a, 0], flat[b, 0], flat[c, 0]) - _PAD_PX
+        right = max(flat[a, 0], flat[b, 0], flat[c, 0]) + _PAD_PX
+        top = min(flat[a, 1], flat[b, 1], flat[c, 1]) - _PAD_PX
+        bottom = max(flat[a, 1], flat[b, 1], flat[c, 1]) + _PAD_PX
+        # Written so that a corner behind the lens (NaN) drops the face.
+        if not (right >= 0 and bottom >= 0 and left <= width - 1 and top <= height - 1):
             continue
-        x0, x1 = max(low[f, 0], 0), min(high[f, 0], width - 1)
-        y0, y1 = max(low[f, 1], 0), min(high[f, 1], height - 1)
-        if x1 < x0 or y1 < y0:
-            continue
-        a0, a1, a2 = triangles[f, 0]
-        e0, e1, e2 = triangles[f, 1, 0] - a0, triangles[f, 1, 1] - a1, triangles[f, 1, 2] - a2
-        g0, g1, g2 = triangles[f, 2, 0] - a0, triangles[f, 2, 1] - a1, triangles[f, 2, 2] - a2
+        x0, x1 = int(max(np.ceil(left), 0)), int(min(np.floor(right), width - 1))
+        y0, y1 = int(max(np.ceil(top), 0)), int(min(np.floor(bottom), height - 1))
+        a0, a1, a2 = points[a]
+        e0, e1, e2 = points[b, 0] - a0, points[b, 1] - a1, points[b, 2] - a2
+        g0, g1, g2 = points[c, 0] - a0, points[c, 1] - a1, points[c, 2] - a2
         # With the ray's origin at the lens, everything but the direction is the triangle's own.
         n0, n1, n2 = e1 * g2 - e2 * g1, e2 * g0 - e0 * g2, e0 * g1 - e1 * g0
         offset = n0 * a0 + n1 * a1 + n2 * a2
@@ -232,17 +230,20 @@ def _cast_loop(triangles, low, high, front, directions, order, start, width, hei
         for y in range(y0, y1 + 1):
             for k in range(start[y * width + x0], start[y * width + x1 + 1]):
                 i = order[k]
-                d0, d1, d2 = directions[i]
+                d0, d1, d2 = directions[i, 0], directions[i, 1], directions[i, 2]
                 facing = n0 * d0 + n1 * d1 + n2 * d2
                 if facing == 0.0:
                     continue
-                t = offset / facing
-                if t <= 0.0 or t >= best[i]:
-                    continue
-                u = (q0 * d0 + q1 * d1 + q2 * d2) / facing
-                v = (r0 * d0 + r1 * d1 + r2 * d2) / facing
+                inverse = 1.0 / facing
                 # A hair over the edge still counts: rays through shared edges must not slip between faces.
-                if u < -1e-10 or v < -1e-10 or u + v > 1.0 + 1e-10:
+                u = (q0 * d0 + q1 * d1 + q2 * d2) * inverse
+                if u < -1e-10 or u > 1.0 + 1e-10:
+                    continue
+                v = (r0 * d0 + r1 * d1 + r2 * d2) * inverse
+                if v < -1e-10 or u + v > 1.0 + 1e-10:
+                    continue
+                t = offset * inverse
+                if t <= 0.0 or t >= best[i]:
                     continue
                 best[i] = t
                 best_u[i] = u

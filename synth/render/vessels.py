@@ -144,10 +144,12 @@ def grow(
         if not pulls.any():
             break
         positions = np.concatenate(all_nodes)
-        toward = attractors[pulls] - positions[nearest[pulls]]
+        toward: Floats = attractors[pulls] - positions[nearest[pulls]]
         toward /= np.linalg.norm(toward, axis=1, keepdims=True)
         pulled, index = np.unique(nearest[pulls], return_inverse=True)
-        direction = np.stack([np.bincount(index, toward[:, axis]) for axis in (0, 1)], axis=1)
+        direction: Floats = np.stack(
+            [np.bincount(index, toward[:, axis]).astype(np.float64) for axis in (0, 1)], axis=1
+        )
         direction /= np.maximum(np.linalg.norm(direction, axis=1, keepdims=True), 1e-9)
         direction += wander * rng.standard_normal(direction.shape)
         direction /= np.linalg.norm(direction, axis=1, keepdims=True)
@@ -182,7 +184,7 @@ def murray(parent: Ints, leaf: float) -> Floats:
             values[node] = smallest
         if order[node] >= 0:
             values[order[node]] += values[node]
-    return np.cbrt(np.asarray(values))
+    return np.asarray(np.cbrt(np.asarray(values)), np.float64)
 
 
 def _trunks(
