@@ -98,9 +98,9 @@ def read(sequence: Sequence, grid: Grid, wanted: Iterable[str]) -> Clip:
     return Clip(
         name=where,
         content_hash=str(attrs["content_hash"]),
-        group=str(scenario.get("anatomy_seed", attrs["content_hash"])),
-        family=str(_find(scenario, "family")),
-        gesture=str(_find(scenario, "kind")),
+        group=_anatomy(scenario, str(attrs["content_hash"])),
+        family=str(scenario.get("family", "")),
+        gesture=str((scenario.get("gesture") or {}).get("kind", "")),
         young_kpa=young,
         mask=mask,
         displacement=displacement,
@@ -110,14 +110,10 @@ def read(sequence: Sequence, grid: Grid, wanted: Iterable[str]) -> Clip:
     )
 
 
-def _find(tree: dict[str, Any], key: str) -> Any:
-    """The first value under `key` in nested dicts; empty if there is none."""
-    if key in tree:
-        return tree[key]
-    for branch in tree.values():
-        if isinstance(branch, dict) and (found := _find(branch, key)) != "":
-            return found
-    return ""
+def _anatomy(scenario: dict[str, Any], content_hash: str) -> str:
+    """What names the anatomy across datasets: the seed of its relief; a sequence without one is alone."""
+    seed = (scenario.get("relief") or {}).get("seed")
+    return content_hash if seed is None else str(seed)
 
 
 def load(

@@ -85,7 +85,7 @@ def write(
             writer.put_frame("flow_tvl1", t, noisy.astype(np.float32))
             writer.put_frame("flow_confidence", t, np.full(SIZE, 0.8, np.float32))
     return writer.seal(
-        scenario={"anatomy_seed": anatomy_seed, "look": {"family": family}, "gesture": {"kind": "pull"}},
+        scenario={"relief": {"seed": anatomy_seed}, "family": family, "gesture": {"kind": "pull"}},
         scale_mm_per_px=SCALE_MM_PER_PX,
         young_kpa=young,
         poisson=POISSON,

@@ -6,7 +6,7 @@ import numpy as np
 import phantom
 import pytest
 
-from learn.data import Clip, load, target
+from learn.data import Clip, _anatomy, load, target
 from learn.grid import Grid
 from learn.split import folds, groups, nested
 from synth.errors import UserError
@@ -103,3 +103,13 @@ def test_impossible_folds(clips: list[Clip]) -> None:
         nested(clips, 2, 0, 0)
     with pytest.raises(UserError, match="there are folds 0 to 2"):
         nested(clips, 3, 3, 0)
+
+
+def test_anatomies_are_told_apart_by_what_a_real_sequence_says() -> None:
+    from synth import scenario
+    from synth.job import Job
+
+    job = Job.model_validate({"sequences": 6, "anatomy": {"variety": 3}})
+    names = [_anatomy(scenario.draw(job, i).as_dict(), f"hash{i}") for i in range(6)]
+    assert names[:3] == names[3:]
+    assert len(set(names)) == 3
