@@ -140,10 +140,10 @@ def _filled(brain: Brain, tets: int) -> tuple[Floats, Ints]:
     """Coarse tetrahedra of the volume inside a surface with holes, duplicates and crossings (fTetWild)."""
     import wildmeshing  # slow to load, and needed for a user's surface only
 
-    mesher = wildmeshing.Tetrahedralizer(
-        stop_quality=10, max_its=10, max_threads=1, epsilon=0.01, edge_length_r=0.1, coarsen=True
-    )
     with _silence():
+        mesher = wildmeshing.Tetrahedralizer(
+            stop_quality=10, max_its=10, max_threads=1, epsilon=0.01, edge_length_r=0.1, coarsen=True
+        )
         mesher.set_log_level(6)
         mesher.set_mesh(brain.vertices, brain.faces)
         mesher.tetrahedralize()

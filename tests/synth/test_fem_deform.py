@@ -1,0 +1,148 @@
+"""A gesture's motion, loads and labels on the fine surface; what is refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from synth import job
+from synth.errors import UserError
+from synth.fem import mesh, skin, solver, tool
+from synth.fem.material import Tissue
+from synth.fem.solver import Deformation, InvertedElement, deform
+from synth.fem.tool import Gesture
+
+ANATOMY = job.Anatomy()
+
+
+def patch(n: int = 61, extent: float = 46.0) -> tuple[np.ndarray, np.ndarray]:
+    """The dome over the opening as a fine surface."""
+    x = np.linspace(-extent / 2, extent / 2, n)
+    xy = np.stack(np.meshgrid(x, x, indexing="ij"), axis=-1).reshape(-1, 2)
+    i = np.arange(n * n).reshape(n, n)
+    a, b, c, d = i[:-1, :-1].ravel(), i[1:, :-1].ravel(), i[1:, 1:].ravel(), i[:-1, 1:].ravel()
+    faces = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
+    return np.column_stack([xy, mesh.dome(xy, ANATOMY.dome_mm)]), faces.astype(np.int32)
+
+
+def run(fem: job.Fem, gesture: Gesture | None = None, seed: int = 5, frames: int = 12) -> Deformation:
+    rng = np.random.default_rng(seed)
+    tissue = Tissue.draw(fem, rng)
+    drawn = gesture or Gesture.draw(fem, ANATOMY.craniotomy, tissue, rng)
+    tets = mesh.block(ANATOMY, fem.tets, fem.order)
+    return deform(fem, ANATOMY.craniotomy, tissue, drawn, tets, *patch(), frames, 25.0)
+
+
+@pytest.mark.parametrize("law", ["linear", "corotational"])
+def test_traction_sums_to_the_force(law: str) -> None:
+    motion = run(job.Fem(law=law, tets=400))
+    total = np.einsum("v,tvd->td", motion.area, motion.traction)
+    assert np.abs(total - motion.force).max() <= 1e-9 * np.abs(motion.force).max()
+    assert np.abs(motion.force).max() > 0.05
+
+
+def test_transfer_keeps_force_and_moment() -> None:
+    tets = mesh.block(ANATOMY, 400, 2)
+    vertices, _ = patch()
+    vertices = vertices + np.random.default_rng(0).uniform(
+        -0.7, 0.7, vertices.shape
+    )  # off the mesh's surface
+    carry = skin.embedding(tets, vertices)
+    load = np.random.default_rng(1).normal(size=(len(vertices), 3))
+    volume = carry.T @ load
+    assert np.abs(carry.sum(axis=1) - 1).max() <= 1e-12
+    assert np.abs(volume.sum(axis=0) - load.sum(axis=0)).max() <= 1e-12 * np.abs(load).sum()
+    moment = np.cross(vertices, load).sum(axis=0)
+    assert np.abs(np.cross(tets.points, volume).sum(axis=0) - moment).max() <= 1e-9 * np.abs(moment).max()
+
+
+@pytest.mark.parametrize("order", [1, 2])
+def test_embedding_reproduces_what_the_elements_can_hold(order: int) -> None:
+    tets = mesh.block(ANATOMY, 400, order)
+    rng = np.random.default_rng(0)
+    cells = rng.integers(len(tets.cells), size=300)
+    inside = np.einsum("vc,vcd->vd", rng.dirichlet(np.ones(4), 300), tets.points[tets.cells[cells, :4]])
+    for power in range(1, order + 1):
+        carried = skin.embedding(tets, inside) @ tets.points**power
+        assert np.abs(carried - inside**power).max() <= 1e-9 * np.abs(inside).max() ** power
+
+
+def test_rest_frame_is_at_rest_and_the_tool_comes_touches_and_leaves() -> None:
+    fem = job.Fem(tets=400)
+    rng = np.random.default_rng(5)
+    gesture = Gesture.draw(fem, ANATOMY.craniotomy, Tissue.draw(fem, rng), rng)
+    motion = run(fem, gesture, frames=40)
+    assert not motion.displacement[0].any()
+    assert not motion.force[0].any()
+    apart = np.linalg.norm(motion.tip[:, :, None] - (motion.rest + motion.displacement)[:, None], axis=3).min(
+        axis=2
+    )
+    loaded = np.linalg.norm(motion.force, axis=1) > 0
+    assert apart[loaded].max() < 0.6  # half a vertex spacing: the tips touch while they load
+    assert apart[0].min() > 3
+    assert apart[-1].min() > 3
+    assert np.linalg.norm(motion.shaft, axis=2) == pytest.approx(1.0)
+
+
+def test_the_tissue_moves_where_and_whither_it_is_pulled() -> None:
+    fem = job.Fem(tets=1600, gestures=("pull",))
+    motion = run(fem)
+    peak = np.linalg.norm(motion.displacement, axis=2).max(axis=1).argmax()
+    at = np.linalg.norm(motion.displacement[peak], axis=1).argmax()
+    assert np.linalg.norm(motion.traction[peak, at]) > 0
+    assert motion.displacement[peak, at] @ motion.force[peak] > 0
+    assert motion.energy[peak] == pytest.approx(motion.energy.max())
+
+
+def test_motion_depends_on_force_over_stiffness_alone() -> None:
+    fem = job.Fem(tets=400)
+    rng = np.random.default_rng(5)
+    tissue = Tissue(young_kpa=1.0, poisson=0.4, law="linear")
+    gesture = Gesture.draw(fem, ANATOMY.craniotomy, tissue, rng)
+    tets = mesh.block(ANATOMY, 400, 2)
+    one = deform(fem, ANATOMY.craniotomy, tissue, gesture, tets, *patch(), 6, 25.0)
+    stiff = replace(tissue, young_kpa=2.5), replace(gesture, force_mn=2.5 * gesture.force_mn)
+    other = deform(fem, ANATOMY.craniotomy, *stiff, tets, *patch(), 6, 25.0)
+    np.testing.assert_allclose(one.displacement, other.displacement, rtol=1e-12, atol=1e-14)
+    np.testing.assert_allclose(2.5 * one.traction, other.traction, rtol=1e-12)
+
+
+def test_balance_of_forces_is_reached() -> None:
+    motion = run(job.Fem(law="corotational", tets=400))
+    assert motion.residual.max() <= 2e-4
+    assert motion.residual.max() > 0
+
+
+def test_load_past_the_laws_range_is_refused_with_the_largest_valid_value() -> None:
+    fem = job.Fem(load=(3.0, 3.0))
+    with pytest.raises(UserError, match=r"largest valid value is 0\.\d+"):
+        run(fem)
+
+
+def test_inverted_element_names_frame_load_and_element(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(solver, "check_load", lambda law, load: None)
+    fem = job.Fem(load=(8.0, 8.0), gestures=("push",))
+    with pytest.raises(InvertedElement, match=r"frame \d+: load [\d.]+ turns element \d+ inside out"):
+        run(fem)
+
+
+def test_contact_beyond_the_surface_is_refused() -> None:
+    fem = job.Fem(tets=400)
+    rng = np.random.default_rng(5)
+    gesture = Gesture.draw(fem, ANATOMY.craniotomy, Tissue.draw(fem, rng), rng)
+    with pytest.raises(UserError):
+        run(fem, replace(gesture, point_mm=(200.0, 0.0)))
+
+
+def test_footprint_is_the_kernel() -> None:
+    vertices, faces = patch(201, 20.0)
+    flat = vertices * [1, 1, 0]
+    area = skin.vertex_area(flat, faces)
+    fem = job.Fem()
+    gesture = Gesture.draw(fem, ANATOMY.craniotomy, Tissue(1, 0.4, "linear"), np.random.default_rng(0))
+    kernel = tool.footprint(replace(gesture, point_mm=(0.0, 0.0), footprint_mm=4.0), flat, area)
+    peak = 3 / (np.pi * 4.0**2)  # of (1 - (r/a)^2)^2 with unit integral
+    assert kernel.max() == pytest.approx(peak, rel=1e-3)
+    assert kernel @ area == pytest.approx(1.0, abs=1e-14)
