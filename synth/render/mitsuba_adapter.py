@@ -18,6 +18,7 @@ from synth import llvm
 from synth.errors import UserError
 from synth.render.camera import Camera
 from synth.render.mitsuba_lens import Compiled, Scalar
+from synth.render.shape import Shape, normals
 
 Floats = npt.NDArray[np.float64]
 Map = npt.NDArray[np.float32]
@@ -130,6 +131,7 @@ class Stage:
         _limit_threads()
         self.variant = variant
         self._mi = mi
+        self._bodies = bodies
         self._jit = "scalar" not in variant
         scene: dict[str, Any] = {
             "type": "scene",
@@ -146,12 +148,10 @@ class Stage:
 
     def move(self, name: str, vertices: Floats) -> None:
         """New positions (V, 3) mm of a body's vertices."""
-        key = f"{name}.vertex_positions"
-        self._parameters[key] = (
-            self._mi.Float(vertices.astype(np.float32).ravel())
-            if self._jit
-            else (vertices.astype(np.float32).ravel())
-        )
+        bent = normals(Shape(vertices, self._bodies[name].faces))
+        for key, values in (("vertex_positions", vertices), ("vertex_normals", bent)):
+            flat = values.astype(np.float32).ravel()
+            self._parameters[f"{name}.{key}"] = self._mi.Float(flat) if self._jit else flat
 
     def render(self, seed: int) -> Map:
         """Linear radiance (H, W, 3) float32 of the stage as it stands."""
@@ -204,6 +204,8 @@ def _mesh(mi: Any, name: str, body: Body) -> Any:
     )
     parameters = mi.traverse(mesh)
     parameters["vertex_positions"] = body.vertices.astype(np.float32).ravel()
+    bent = normals(Shape(body.vertices, body.faces))
+    parameters["vertex_normals"] = bent.astype(np.float32).ravel()
     parameters["faces"] = body.faces.astype(np.uint32).ravel()
     parameters["vertex_texcoords"] = body.uv.astype(np.float32).ravel()
     parameters.update()

@@ -11,8 +11,8 @@ from scipy.spatial import cKDTree
 from synth.render import noise
 from synth.render.anatomy import Surface
 from synth.render.look import Look
+from synth.render.shape import Shape
 from synth.render.texture import Coat, normals
-from synth.render.truth import Shape
 
 Floats = npt.NDArray[np.float64]
 Map = npt.NDArray[np.float32]

@@ -13,7 +13,8 @@ from synth.render.anatomy import Surface
 from synth.render.camera import Camera
 from synth.render.look import Look
 from synth.render.mitsuba_adapter import Body, Metal, Stage, Wet, pick
-from synth.render.truth import Shape, Still
+from synth.render.shape import Shape, normals
+from synth.render.truth import Still
 
 __all__ = ["Look", "Shot", "Still", "Studio"]
 
@@ -170,7 +171,7 @@ class Studio:
 
     def _irradiance(self, vertices: Floats) -> Floats:
         """Radiance (V, 3) of a white diffuser at each vertex, unshadowed."""
-        normal = _normals(vertices, self._surface.faces)
+        normal = normals(Shape(vertices, self._surface.faces))
         total = np.zeros((len(vertices), 3))
         for lamp in self._lamps:
             towards = lamp.position - vertices
@@ -184,13 +185,3 @@ def _balance(kelvin: float) -> tuple[float, float, float]:
     gains = 1 / light.blackbody(kelvin)
     r, g, b = (gains / gains[1]).tolist()
     return r, g, b
-
-
-def _normals(vertices: Floats, faces: npt.NDArray[np.int32]) -> Floats:
-    corners = vertices[faces]
-    face = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normal = np.stack(
-        [sum(np.bincount(faces[:, k], face[:, axis], len(vertices)) for k in range(3)) for axis in range(3)],
-        1,
-    )
-    return np.asarray(normal / np.linalg.norm(normal, axis=1, keepdims=True))

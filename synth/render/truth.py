@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numba
 import numpy as np
@@ -17,6 +16,7 @@ import numpy.typing as npt
 
 from synth.render import camera as cameras
 from synth.render.camera import Camera
+from synth.render.shape import Shape
 
 Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int32]
@@ -25,15 +25,6 @@ Mask = npt.NDArray[np.bool_]
 _HIDDEN_MM = 1e-3  # nearer to the lens than a point by more than this hides it
 _NEAR_MM = 1.0
 _PAD_PX = 1.5  # triangles bow a little under distortion
-
-
-class Shape(NamedTuple):
-    """A triangle mesh, world axes."""
-
-    vertices: Floats
-    """(V, 3) mm."""
-    faces: Indices
-    """(F, 3)."""
 
 
 @dataclass(frozen=True)

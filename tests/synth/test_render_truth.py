@@ -10,7 +10,7 @@ from synth.job import Anatomy, Render
 from synth.render import anatomy, camera, truth
 from synth.render.anatomy import Relief, Surface
 from synth.render.camera import Camera, View
-from synth.render.truth import Shape
+from synth.render.shape import Shape
 
 NOTHING = Shape(np.array([[0.0, 0.0, -900.0]] * 3), np.array([[0, 1, 2]], np.int32))
 
