@@ -29,7 +29,7 @@ class Command:
     """Function in that module; its docstring's first line is the help."""
 
 
-COMMANDS: tuple[Command, ...] = ()
+COMMANDS: tuple[Command, ...] = (Command("experiment", "stages", "bench.stages", "stages"),)
 
 
 class Rooms(TyperGroup):
