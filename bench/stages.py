@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json as json_
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import typer
@@ -36,7 +36,7 @@ def stages(
     Console().print(table)
 
 
-def measure(dataset: Dataset) -> dict[str, object]:
+def measure(dataset: Dataset) -> dict[str, Any]:
     """Median and largest over sequences of each stage's CPU time a frame [s], and the peak memory [MB].
 
     Raises:
