@@ -110,6 +110,19 @@ def retry(out: Out, workers: Annotated[int | None, typer.Option(min=1)] = None, 
 
 
 @app.command()
+def card(out: Out) -> None:
+    """Writes the dataset's card anew: README.md, its charts and pictures."""
+    from synth import card as carding
+    from synth import index
+    from synth.folder import Folder
+
+    folder = Folder(out)
+    folder.described()
+    index.write(folder)
+    print(carding.write(folder))
+
+
+@app.command()
 def verify(
     out: Out,
     fast: Annotated[

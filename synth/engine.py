@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
 
-from synth import index, llvm, preview
+from synth import card, index, llvm, preview
 from synth.child import Attempt, Child, Setup
 from synth.errors import UserError
 from synth.folder import Folder, claim
@@ -95,6 +95,7 @@ def run(job: Job, root: Path, options: Options, watcher: Watcher) -> Summary:
         rows = index.write(folder)
         if done or not preview.path(root).exists():
             preview.write(root)
+            card.write(folder)
         return Summary(
             total=job.sequences,
             already=len(finished),

@@ -180,7 +180,7 @@ def _refuse_foreign(folder: Folder, job: Job, name: str) -> None:
 
 def _changes(before: dict[str, Any], now: dict[str, Any], at: str = "") -> list[str]:
     found = []
-    for key in {**before, **now}:
+    for key in sorted({**before, **now}.keys() - {"card"}):
         old, new = before.get(key), now.get(key)
         if isinstance(old, dict) and isinstance(new, dict):
             found += _changes(old, new, f"{at}{key}.")

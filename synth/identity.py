@@ -19,10 +19,10 @@ def canonical(value: Any) -> bytes:
 def of(job: Job) -> str:
     """Hash of everything that a sequence of `job` depends on besides its index.
 
-    Files count by content and not by path. The number of sequences does not count: sequence 3 is the same
-    in a dataset of 24 and of 48, so a dataset can be extended.
+    Files count by content and not by path, and what the card says does not count. Nor does the number of
+    sequences: sequence 3 is the same in a dataset of 24 and of 48, so a dataset can be extended.
     """
-    described = job.model_dump(mode="json", exclude={"sequences"})
+    described = job.model_dump(mode="json", exclude={"sequences", "card"})
     described["anatomy"]["mesh"] = _digest(job.anatomy.mesh)
     described["appearance"]["photo"] = _digest(job.appearance.photo)
     return hashlib.blake2b(canonical(described), digest_size=16).hexdigest()

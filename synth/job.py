@@ -163,6 +163,21 @@ class Flow(Section):
     """Estimator; `ideal` computes no recovered flow."""
 
 
+class Card(Section):
+    """What a person says of the dataset, for its card. Changes no sequence."""
+
+    title: str = "Synthetic neurosurgical sequences with ground-truth force"
+    """Name of the dataset."""
+    summary: str | None = None
+    """What it was made for, in your words."""
+    licence: str | None = None
+    """Licence under which you share it, as an SPDX name (cc-by-4.0). Empty: none is given."""
+    authors: tuple[str, ...] = ()
+    """Who made it."""
+    contact: str | None = None
+    """Where questions go."""
+
+
 class Job(Section):
     """One dataset."""
 
@@ -179,3 +194,4 @@ class Job(Section):
     fem: Fem = Fem()
     render: Render = Render()
     flow: Flow = Flow()
+    card: Card = Card()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import textwrap
 import typing
 from pathlib import Path
@@ -107,8 +108,8 @@ def _metadata(annotation: Any, metadata: list[Any]) -> list[Any]:
 def _scalar(value: Any) -> str:
     if value is None:
         return ""
-    if isinstance(value, Path):
-        return f'"{value}"'
+    if isinstance(value, Path) or (isinstance(value, str) and not value.replace("-", "_").isidentifier()):
+        return json.dumps(str(value), ensure_ascii=False)
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, tuple):
