@@ -46,6 +46,7 @@ class Estimator(Protocol):
 
 
 _OWN = {
+    "tvl1": ("synth.flow.tvl1", "Tvl1"),
     "opencv-tvl1": ("synth.flow.opencv", "OpenCvTvl1"),
     "dis": ("synth.flow.opencv", "Dis"),
 }

@@ -47,21 +47,40 @@ def gaussian(field: Tensor, sigma: float) -> Tensor:
     return flat.reshape(field.shape)
 
 
-def normalise(grey: Tensor, usable: Tensor, radius: int = 8) -> Tensor:
+def window(field: Tensor, sigma: float) -> Tensor:
+    """About a Gaussian blur at half the size, (B, C, H/2, W/2): for windows, whose shape matters little."""
+    small = F.avg_pool2d(field, 2, ceil_mode=True, count_include_pad=False)
+    radius = max(1, round(sigma / 2 * 1.5**0.5 - 0.5))  # two boxes of variance ((2r+1)^2 - 1)/12 each
+    return box(box(small, radius), radius)
+
+
+def doubled(field: Tensor, like: Tensor) -> Tensor:
+    """`field` at twice its size, cut to the height and width of `like`. Bilinear."""
+    wide = F.interpolate(field, scale_factor=2, mode="bilinear", align_corners=False)
+    return wide[..., : like.shape[-2], : like.shape[-1]]
+
+
+def normalise(grey: Tensor, usable: Tensor, sigma: float = 6.5) -> Tensor:
     """Local contrast normalisation: (I - mean) / (deviation + floor) over the usable neighbours only.
 
-    Takes out every gain and offset that varies slower than the window, hence illumination drift. Two box
-    filters stand for a Gaussian window. Masked pixels get 0, the local mean.
+    Takes out every gain and offset that varies slower than the window, hence illumination drift. Masked
+    pixels get 0, the local mean.
+
+    Args:
+        grey: (B, 1, H, W), grey levels.
+        usable: (B, 1, H, W) in 0..1.
+        sigma: standard deviation of the window [px].
+
+    Returns:
+        (B, 1, H, W), in local standard deviations.
     """
     # Statistics of I - 128: the difference of two squares loses fewer digits.
     centred = (grey - 128.0) * usable
-    sums = torch.cat([usable, centred, centred * centred], dim=1)
-    for _ in range(2):
-        sums = box(sums, radius)
+    sums = window(torch.cat([usable, centred, centred * centred], dim=1), sigma)
     mean = sums[:, 1:] / sums[:, :1].clamp_min(1e-4)
-    deviation = (mean[:, 1:] - mean[:, :1] ** 2).clamp_min(0).sqrt()
-    normalised: Tensor = usable * (grey - 128.0 - mean[:, :1]) / (deviation + _FLOOR)
-    return normalised
+    deviation = (mean[:, 1:] - mean[:, :1] ** 2).clamp_min(0).sqrt() + _FLOOR
+    smooth = doubled(torch.cat([mean[:, :1] + 128.0, 1 / deviation], 1), grey)
+    return usable * (grey - smooth[:, :1]) * smooth[:, 1:]
 
 
 def fill(field: Tensor, usable: Tensor) -> Tensor:
@@ -83,3 +102,44 @@ def fill(field: Tensor, usable: Tensor) -> Tensor:
     coarse = fill(total[:, :-1] / weight.clamp_min(1e-6), (weight > 0).to(field.dtype))
     back = F.interpolate(coarse, size=field.shape[-2:], mode="bilinear", align_corners=False)
     return known + (1 - usable) * back
+
+
+def warp(now: Tensor, usable: Tensor, flow: Tensor) -> tuple[Tensor, Tensor]:
+    """`now` at x + w by bicubic sampling, and 1 where all it is read from is usable and inside, else 0."""
+    height, width = now.shape[-2:]
+    x = torch.arange(width, device=now.device, dtype=now.dtype)
+    y = torch.arange(height, device=now.device, dtype=now.dtype)[:, None]
+    at = torch.stack([(2 * (x + flow[:, 0]) + 1) / width - 1, (2 * (y + flow[:, 1]) + 1) / height - 1], -1)
+    picture = F.grid_sample(now, at, mode="bicubic", padding_mode="border", align_corners=False)
+    seen = F.grid_sample(usable, at, mode="bilinear", padding_mode="zeros", align_corners=False)
+    return picture, (seen > 0.9).to(now.dtype)
+
+
+def derivative(field: Tensor) -> Tensor:
+    """d/dx of every channel, then d/dy of every channel: (B, 2C, H, W); fourth-order central differences."""
+    wide = F.pad(field, (2, 2, 2, 2), "replicate")
+    x, y = wide[..., 2:-2, :], wide[..., 2:-2]
+    dx = (8 * (x[..., 3:-1] - x[..., 1:-3]) - (x[..., 4:] - x[..., :-4])) / 12
+    dy = (8 * (y[..., 3:-1, :] - y[..., 1:-3, :]) - (y[..., 4:, :] - y[..., :-4, :])) / 12
+    return torch.cat([dx, dy], 1)
+
+
+def median3(field: Tensor) -> Tensor:
+    """3x3 median of every channel, (B, C, H, W).
+
+    Sorts the columns; the median is that of the largest low, the middle mid and the smallest high.
+    """
+    wide = F.pad(field, (1, 1, 1, 1), "replicate")
+    a, b, c = wide[..., :-2, :], wide[..., 1:-1, :], wide[..., 2:, :]
+    low, high = torch.minimum(a, b), torch.maximum(a, b)
+    middle, high = torch.minimum(high, c), torch.maximum(high, c)
+    low, middle = torch.minimum(low, middle), torch.maximum(low, middle)
+
+    def sides(f: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        return f[..., :-2], f[..., 1:-1], f[..., 2:]
+
+    lows, (m0, m1, m2), highs = sides(low), sides(middle), sides(high)
+    top = torch.maximum(torch.maximum(lows[0], lows[1]), lows[2])
+    bottom = torch.minimum(torch.minimum(highs[0], highs[1]), highs[2])
+    mid = torch.maximum(torch.minimum(m0, m1), torch.minimum(torch.maximum(m0, m1), m2))
+    return torch.maximum(torch.minimum(top, mid), torch.minimum(torch.maximum(top, mid), bottom))

@@ -1,4 +1,4 @@
-"""Displacement through a whole video: always from the rest frame, each frame starting from the one before."""
+"""Displacement through a video: always from the rest frame, each frame starting from the one before."""
 
 from __future__ import annotations
 
@@ -10,6 +10,9 @@ from numpy.typing import NDArray
 from synth.errors import UserError
 from synth.flow.estimator import Estimator, Flags, Flow, Map, Rgb, create
 
+_TRUSTED = 0.5  # mean confidence of what is seen; frames below it are flagged
+_DROP = 0.85  # a fall below this share of the last good frame's confidence is looked into
+
 
 @dataclass(frozen=True)
 class Track:
@@ -18,14 +21,17 @@ class Track:
     flow: NDArray[np.float32]
     """(T, H, W, 2) px, rest frame to frame t, on the rest frame's pixels; 0 outside the tissue."""
     confidence: NDArray[np.float32]
-    """(T, H, W) in 0..1; 0 outside the tissue."""
+    """(T, H, W) in 0..1; 0 outside the tissue, under the tool and in glare."""
+    trusted: NDArray[np.bool_]
+    """(T,), False where the frame could not be followed."""
 
 
 class Tracker:
     """Frames in, displacement from the rest frame out, one at a time, for streams as for recordings.
 
     Rest to now, never frame to frame: errors of small steps add up (0.8 px after 60 frames), those of one
-    long step don't.
+    long step don't. Each frame starts from the last one that could be trusted; when confidence falls, the
+    frame is solved again from nothing and the better answer kept: one lost frame doesn't lose the rest.
     """
 
     def __init__(self, backend: str | Estimator, rest: Rgb, rest_blocked: Flags, tissue: Flags) -> None:
@@ -47,10 +53,15 @@ class Tracker:
         self.estimator = create(backend) if isinstance(backend, str) else backend
         self.rest, self.tissue = rest, tissue
         self.usable = tissue & ~rest_blocked
-        self._last: Flow | None = None
+        self.trusted = True
+        """Whether the last frame could be followed."""
+        self.resets = 0
+        """How often a frame was solved again from nothing, and better."""
+        self._good: Flow | None = None
+        self._level = 1.0
 
     def step(self, frame: Rgb, blocked: Flags) -> tuple[Flow, Map]:
-        """Flow (H, W, 2) px and confidence (H, W) of the next frame.
+        """Flow (H, W, 2) px and confidence (H, W) of the next frame; `trusted` says whether it was followed.
 
         Args:
             frame: (H, W, 3) uint8.
@@ -58,16 +69,33 @@ class Tracker:
         """
         if frame.shape != self.rest.shape or blocked.shape != self.tissue.shape:
             raise UserError(f"flow: frame {frame.shape} does not fit the rest frame {self.rest.shape}")
-        flow, confidence = self.estimator.flow(self.rest, frame, self.usable, ~blocked, self._last)
-        self._last = flow
-        return flow * self.tissue[..., None], confidence * self.tissue
+        seen = max(1, int(np.count_nonzero(self.usable & ~blocked)))
+
+        def solve(initial: Flow | None) -> tuple[Flow, Map, float]:
+            flow, confidence = self.estimator.flow(self.rest, frame, self.usable, ~blocked, initial)
+            confidence = confidence * self.tissue
+            return flow, confidence, float(confidence.sum(dtype=np.float64)) / seen
+
+        flow, confidence, level = solve(self._good)
+        if self._good is not None and level < max(_TRUSTED, _DROP * self._level):
+            again = solve(None)
+            if again[2] > level:
+                (flow, confidence, level), self.resets = again, self.resets + 1
+        self.trusted = level >= _TRUSTED
+        if self.trusted:
+            self._good, self._level = flow, level
+        else:
+            confidence = np.minimum(confidence, 0.5 * _TRUSTED)
+        return flow * self.tissue[..., None], confidence
 
 
-def track(backend: str, frames: NDArray[np.uint8], blocked: NDArray[np.bool_], tissue: Flags) -> Track:
+def track(
+    backend: str | Estimator, frames: NDArray[np.uint8], blocked: NDArray[np.bool_], tissue: Flags
+) -> Track:
     """Displacement of a recorded sequence; frame 0 is the rest frame.
 
     Args:
-        backend: name of an estimator; `ideal` computes nothing and is no estimator.
+        backend: an estimator or its name; `ideal` computes nothing and is no estimator.
         frames: (T, H, W, 3) uint8.
         blocked: (T, H, W), tool and glare.
         tissue: (H, W).
@@ -80,7 +108,9 @@ def track(backend: str, frames: NDArray[np.uint8], blocked: NDArray[np.bool_], t
     tracker = Tracker(backend, frames[0], blocked[0], tissue)
     flow = np.zeros((*frames.shape[:3], 2), np.float32)
     confidence = np.zeros(frames.shape[:3], np.float32)
+    trusted = np.ones(len(frames), bool)
     confidence[0] = tracker.usable
     for t in range(1, len(frames)):
         flow[t], confidence[t] = tracker.step(frames[t], blocked[t])
-    return Track(flow, confidence)
+        trusted[t] = tracker.trusted
+    return Track(flow, confidence, trusted)

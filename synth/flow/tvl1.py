@@ -1,0 +1,291 @@
+"""Masked TV-L1 optical flow: one batched solver for CPU and CUDA.
+
+Minimises over the flow w = (u, v), with I_0 the rest frame and I_1 the frame now, both contrast-normalised,
+
+    E(w) = sum_x  lambda m(x) psi(|r(x, w)|^2)  +  |grad u|_h + |grad v|_h ,
+    r(x, w) = (W, gamma d_x W, gamma d_y W) - (I_0, gamma d_x I_0, gamma d_y I_0),   W(x) = I_1(x + w(x)),
+
+psi(s^2) = sqrt(s^2 + epsilon^2) being the robust data term on brightness and gradient (Brox et al., High
+accuracy optical flow estimation based on a theory for warping, ECCV 2004, eq. 5), |.|_h the Huber norm
+(Werlberger et al., Anisotropic Huber-L1 optical flow, BMVC 2009, eq. 6), and m the mask: seen in the rest
+frame, and seen now at x + w. Where m is 0 the regulariser alone carries the flow on. Coarse to fine, re-
+warped (Brox), each warp solved by the primal-dual steps of Chambolle and Pock (J. Math. Imaging Vis. 40,
+2011, algorithm 1) on lagged weights.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from numpy.typing import NDArray
+from torch import Tensor
+
+from synth.flow import confidence, image
+from synth.flow.estimator import Flags, Flow, Map, Rgb
+
+
+@dataclass(frozen=True)
+class Settings:
+    """The energy, and how far it is minimised."""
+
+    weight: float = 0.5
+    """lambda: data against smoothness."""
+    growth: float = 1.0
+    """lambda grows by this factor a level: total variation wears a peak of few pixels down fastest."""
+    gradient: float = 1.0
+    """gamma: weight of gradient constancy."""
+    huber: float = 0.15
+    """h: flow gradients below it [px/px] are smoothed quadratically, above it linearly."""
+    epsilon: float = 0.01
+    """Residuals below it [local deviations] count quadratically."""
+    coarsest_px: int = 12
+    """The pyramid goes down to about this many pixels on the short side."""
+    warps: int = 4
+    """Linearisations a level."""
+    reweights: int = 2
+    """Updates of the robust weights a warp."""
+    steps: int = 8
+    """Primal-dual steps a reweighting."""
+    presmooth: float = 0.0
+    """Gaussian before everything [px]: linearisation wants pictures without corners."""
+    erode: int = 0
+    """Growth of what is masked [px]: derivatives reach into it."""
+    tau: float = 3.5
+    """Primal step; the dual step is 1/(8 tau)."""
+    median: bool = True
+    """3x3 median of the flow after each warp (Wedel et al., An improved algorithm for TV-L1, 2009)."""
+    warm_warps: int = 3
+    """Linearisations a level with an initial flow."""
+    bold_weight: float = 2.0
+    """lambda of the first stage of a cold start: far pulls are steep, and smoothness would hold them back."""
+    bold_warps: int = 6
+    """Linearisations a level of that stage, which leaves out the finest level."""
+
+    def bold(self) -> Settings:
+        """The first stage of a cold start."""
+        return replace(self, weight=self.bold_weight, warps=self.bold_warps)
+
+
+class Tvl1:
+    """The estimator `tvl1`: masked TV-L1, cold in two stages, warm on the fine levels only."""
+
+    def __init__(
+        self,
+        settings: Settings | None = None,
+        device: str | None = None,
+        *,
+        checked: bool = True,
+    ) -> None:
+        """Sets up.
+
+        Args:
+            settings: the energy and the effort; None: the default, a measured point.
+            device: torch device; None: CUDA where there is one.
+            checked: also compute the backward flow for the confidence (about a fifth of the time).
+        """
+        self.settings = settings or Settings()
+        self.device = device or ("cuda" if torch.cuda.is_available() else "cpu")
+        self.checked = checked
+
+    def flow(
+        self, rest: Rgb, now: Rgb, rest_usable: Flags, now_usable: Flags, initial: Flow | None = None
+    ) -> tuple[Flow, Map]:
+        """See `Estimator.flow`."""
+        start = None if initial is None else initial[None]
+        flow, trust = self.flows(rest[None], now[None], rest_usable[None], now_usable[None], start)
+        return flow[0], trust[0]
+
+    def flows(
+        self,
+        rest: NDArray[np.uint8],
+        now: NDArray[np.uint8],
+        rest_usable: NDArray[np.bool_],
+        now_usable: NDArray[np.bool_],
+        initial: NDArray[np.float32] | None = None,
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """As `flow`, for B pairs at once; each comes out as it would alone.
+
+        Args:
+            rest: (B, H, W, 3) uint8.
+            now: (B, H, W, 3) uint8.
+            rest_usable: (B, H, W).
+            now_usable: (B, H, W).
+            initial: (B, H, W, 2) px.
+
+        Returns:
+            Flow (B, H, W, 2) float32 px and confidence (B, H, W) float32.
+        """
+        with torch.inference_mode(), one_thread():
+            start = None
+            if initial is not None:
+                start = torch.from_numpy(np.ascontiguousarray(initial)).to(self.device).movedim(-1, 1)
+            found, trust = self.tensors(
+                image.tensor(rest, self.device),
+                image.tensor(now, self.device),
+                image.flags(rest_usable, self.device),
+                image.flags(now_usable, self.device),
+                start,
+            )
+            return found.movedim(1, -1).cpu().numpy(), trust[:, 0].cpu().numpy()
+
+    def tensors(
+        self,
+        rest: Tensor,
+        now: Tensor,
+        rest_usable: Tensor,
+        now_usable: Tensor,
+        initial: Tensor | None = None,
+    ) -> tuple[Tensor, Tensor]:
+        """As `flows`, on the device: greys, masks and confidence (B, 1, H, W), flows (B, 2, H, W)."""
+        s = self.settings
+        levels = pyramid(rest, now, rest_usable, now_usable, s)
+        if initial is None:
+            coarse = solve(levels[1:], None, s.bold()) if len(levels) > 1 else None
+            found = solve(levels[:2], None if coarse is None else finer(coarse, levels[0]), s)
+        else:
+            found = solve(levels[:2], initial, replace(s, warps=s.warm_warps))
+        back = None
+        if self.checked and len(levels) > 1:
+            back = solve(
+                [level.swapped() for level in levels[1:]], None, replace(s.bold(), warps=s.warm_warps)
+            )
+        return found, confidence.judge(levels[0], found, back)
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """One thread for the block: these tensors are so small that threads only wait for one another."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+@dataclass(frozen=True)
+class Level:
+    """One level of the pyramid: contrast-normalised pictures and their masks, each (B, 1, H, W)."""
+
+    rest: Tensor
+    now: Tensor
+    rest_usable: Tensor
+    now_usable: Tensor
+
+    def swapped(self) -> Level:
+        """For the flow back from now to rest."""
+        return Level(self.now, self.rest, self.now_usable, self.rest_usable)
+
+
+def pyramid(rest: Tensor, now: Tensor, rest_usable: Tensor, now_usable: Tensor, s: Settings) -> list[Level]:
+    """Levels from fine to coarse, each half the one before; pixel x of a level is (x - 1/2)/2 of the next."""
+    levels = []
+    batch = now.shape[0]
+    grey = torch.cat([rest, now])
+    known = torch.cat([rest_usable, now_usable])
+    while True:
+        contrast = image.normalise(grey, known)
+        if s.presmooth > 0:
+            contrast = image.gaussian(contrast, s.presmooth)
+        seen = (known > 0.5).to(grey.dtype)
+        if s.erode:
+            seen = 1 - F.max_pool2d(1 - seen, 2 * s.erode + 1, 1, s.erode)
+        split = [rest.shape[0], batch]
+        (first, second), (seen_first, seen_second) = torch.split(contrast, split), torch.split(seen, split)
+        levels.append(Level(first, second, seen_first, seen_second))
+        if min(grey.shape[-2:]) < 2 * s.coarsest_px:
+            return levels
+        pooled = F.avg_pool2d(torch.cat([grey * known, known], 1), 2, ceil_mode=True, count_include_pad=False)
+        known = pooled[:, 1:]
+        grey = pooled[:, :1] / known.clamp_min(1e-6)
+
+
+def solve(levels: list[Level], initial: Tensor | None, s: Settings) -> Tensor:
+    """Flow (B, 2, H, W) px of the finest level.
+
+    Args:
+        levels: fine to coarse.
+        initial: (B, 2, H, W) px at the finest level, or None.
+        s: settings.
+    """
+    coarsest = levels[-1].now
+    flow = coarsest.new_zeros(coarsest.shape[0], 2, *coarsest.shape[-2:])
+    if initial is not None:
+        flow = initial
+        for _ in levels[1:]:
+            flow = 0.5 * F.avg_pool2d(flow, 2, ceil_mode=True, count_include_pad=False)
+    for depth, level in reversed(list(enumerate(levels))):
+        if flow.shape[-2:] != level.now.shape[-2:]:
+            flow = finer(flow, level)
+        dual = flow.new_zeros(2, *flow.shape)
+        for _ in range(s.warps):
+            flow, dual = step(level, flow, dual, s.weight * s.growth**depth, s)
+    return flow
+
+
+def finer(flow: Tensor, level: Level) -> Tensor:
+    """The flow of the next coarser level on the grid of `level`, in its pixels."""
+    return 2 * image.doubled(flow, level.now)
+
+
+def step(level: Level, flow: Tensor, dual: Tensor, weight: float, s: Settings) -> tuple[Tensor, Tensor]:
+    """One warp: linearise r about `flow`, reweight, minimise. dual: (2, B, 2, H, W), its x and y parts."""
+    warped, seen = image.warp(level.now, level.now_usable, flow)
+    mask = level.rest_usable * seen
+    # The gradient of the *warped* picture is what the rest frame's must equal: it turns and stretches with w.
+    before = torch.cat([level.rest, s.gradient * image.derivative(level.rest)], 1)
+    after = torch.cat([warped, s.gradient * image.derivative(warped)], 1)
+    residual = after - before  # (B, 3, H, W)
+    slope = image.derivative(0.5 * (after + before))  # (B, 6, H, W): x of the 3, then y of the 3
+    rows, columns = slope[:, :3], slope[:, 3:]
+    start = flow
+    for _ in range(s.reweights):
+        moved = flow - start
+        now = residual + rows * moved[:, :1] + columns * moved[:, 1:]
+        c = s.tau * weight * mask / torch.sqrt((now * now).sum(1, keepdim=True) + s.epsilon**2)
+        # (1 + c J^T J) w = v - c J^T (r - J w_0), 2x2 by Cramer.
+        xx = 1 + c * (rows * rows).sum(1, keepdim=True)
+        xy = c * (rows * columns).sum(1, keepdim=True)
+        yy = 1 + c * (columns * columns).sum(1, keepdim=True)
+        offset = residual - rows * start[:, :1] - columns * start[:, 1:]
+        gx, gy = c * (rows * offset).sum(1, keepdim=True), c * (columns * offset).sum(1, keepdim=True)
+        scale = 1 / (xx * yy - xy * xy)
+        straight = torch.cat([yy, xx], 1) * scale
+        cross = -xy * scale
+        shift = straight * torch.cat([gx, gy], 1) + cross * torch.cat([gy, gx], 1)
+        flow, dual = primal_dual(flow, dual, straight, cross, shift, s)
+    if s.median:
+        flow = image.median3(flow)
+    return flow, dual
+
+
+def primal_dual(
+    flow: Tensor, dual: Tensor, straight: Tensor, cross: Tensor, shift: Tensor, s: Settings
+) -> tuple[Tensor, Tensor]:
+    """`steps` of: dual ascent on grad w with the Huber prox, primal descent with the data term's 2x2 prox."""
+    sigma = 1 / (8 * s.tau)
+    dual, flow, ahead = dual.clone(), flow.clone(), flow.clone()
+    px, py = dual[0], dual[1]
+    # Scratch is kept: on the CPU, fresh memory for each product costs more than the product.
+    v, new, norm = torch.empty_like(flow), torch.empty_like(flow), torch.empty_like(flow)
+    dx, dy = torch.empty_like(flow[..., 1:]), torch.empty_like(flow[..., 1:, :])
+    for _ in range(s.steps):
+        px[..., :-1].add_(torch.sub(ahead[..., 1:], ahead[..., :-1], out=dx), alpha=sigma)
+        py[..., :-1, :].add_(torch.sub(ahead[..., 1:, :], ahead[..., :-1, :], out=dy), alpha=sigma)
+        dual.mul_(1 / (1 + sigma * s.huber))
+        torch.mul(px, px, out=norm).addcmul_(py, py).clamp_min_(1).rsqrt_()
+        dual.mul_(norm)  # p / max(1, |p|)
+        torch.add(flow, px, alpha=s.tau, out=v).add_(py, alpha=s.tau)  # v = w + tau div p
+        v[..., 1:].sub_(px[..., :-1], alpha=s.tau)
+        v[..., 1:, :].sub_(py[..., :-1, :], alpha=s.tau)
+        torch.mul(straight, v, out=new).sub_(shift)
+        new[:, :1].addcmul_(cross, v[:, 1:])
+        new[:, 1:].addcmul_(cross, v[:, :1])
+        torch.lerp(flow, new, 2.0, out=ahead)  # 2 new - old
+        flow, new = new, flow
+    return flow, dual
