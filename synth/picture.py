@@ -63,6 +63,11 @@ def arrows(base: Rgb, flow: NDArray[np.floating], where: NDArray[np.bool_], step
     return picture
 
 
+def arrow_gain(width_px: int, largest_px: float) -> int:
+    """Whole number by which arrows are lengthened so that the longest about spans the grid."""
+    return max(1, int(width_px / 24 / max(largest_px, 1e-9))) if largest_px > 0.05 else 1
+
+
 def colour_bar(panel: Rgb, colours: Rgb, label: str) -> Rgb:
     """The panel with a bar (a (1, N, 3) row of colours) and its label in the lower right corner."""
     picture = panel.copy()
@@ -117,7 +122,8 @@ def frame_flow_force(
     inside = tissue.astype(np.float32)
     grey = np.repeat(rest.mean(axis=2, keepdims=True), 3, axis=2).astype(np.uint8)
     moved = overlay(grey, flow_colours(flow, largest_px), 0.65 * inside)
-    moved = arrows(moved, flow, tissue, step_px=max(rgb.shape[1] // 24, 8), gain=1.0)
+    step_px = max(rgb.shape[1] // 24, 8)
+    moved = arrows(moved, flow, tissue, step_px, arrow_gain(rgb.shape[1], largest_px))
     ramp = np.linspace(0, 1, 256, dtype=np.float32)[None]
     size = np.linalg.norm(traction, axis=-1)
     weight = inside * np.clip(0.15 + size / max(largest_kpa, 1e-12), 0, 0.9)
@@ -140,6 +146,7 @@ def of_sequence(sequence: Sequence_, frames: Sequence[int]) -> Rgb:
     largest_px = max(float(np.linalg.norm(f, axis=-1).max()) for f in flow.values())
     largest_kpa = max(float(np.linalg.norm(s, axis=-1).max()) for s in traction.values())
     force, time = sequence["force"][...], sequence["time"][...]
+    gain = arrow_gain(sequence.size[1], largest_px)
     return stack(
         [
             frame_flow_force(
@@ -152,7 +159,7 @@ def of_sequence(sequence: Sequence_, frames: Sequence[int]) -> Rgb:
                 largest_kpa=largest_kpa,
                 captions=[
                     f"frame {t}, {time[t]:.2f} s",
-                    f"flow from rest, {np.linalg.norm(flow[t], axis=-1).max():.1f} px at most",
+                    f"flow from rest, {np.linalg.norm(flow[t], axis=-1).max():.1f} px at most (arrows x{gain})",
                     f"traction, {np.linalg.norm(force[t]):.1f} mN in all",
                 ],
             )
