@@ -159,7 +159,7 @@ def of_sequence(sequence: Sequence_, frames: Sequence[int]) -> Rgb:
                 largest_kpa=largest_kpa,
                 captions=[
                     f"frame {t}, {time[t]:.2f} s",
-                    f"flow from rest, {np.linalg.norm(flow[t], axis=-1).max():.1f} px at most (arrows x{gain})",
+                    f"flow, {np.linalg.norm(flow[t], axis=-1).max():.1f} px at most (arrows x{gain})",
                     f"traction, {np.linalg.norm(force[t]):.1f} mN in all",
                 ],
             )
