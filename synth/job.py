@@ -105,7 +105,7 @@ class Appearance(Section):
 class Fem(Section):
     """The physics of the tissue and of the load."""
 
-    law: Literal["linear", "corotational"] = "linear"
+    law: Literal["linear", "corotational", "stable", "neo-hookean"] = "neo-hookean"
     """Material law."""
     order: Literal[1, 2] = 2
     """Polynomial order of the tetrahedra."""
@@ -115,13 +115,13 @@ class Fem(Section):
     """Young's modulus E [kPa], drawn log-uniformly."""
     poisson: Annotated[FiniteFloat, Field(ge=0, lt=0.5)] = 0.4
     """Poisson's ratio."""
-    load: PositiveRange = (0.02, 0.12)
+    load: PositiveRange = (0.05, 0.4)
     """Peak load as P = F/(E a^2), dimensionless, so that one range suits every stiffness."""
-    footprint_mm: PositiveRange = (3.0, 5.0)
+    footprint_mm: PositiveRange = (3.0, 6.0)
     """Radius a of the contact [mm]."""
     gestures: tuple[Literal["pull", "push"], ...] = ("pull", "push")
     """Kinds of gesture that sequences are drawn from, in equal shares."""
-    cone_deg: Annotated[FiniteFloat, Field(ge=0, le=80)] = 45.0
+    cone_deg: Annotated[FiniteFloat, Field(ge=0, le=80)] = 65.0
     """The load's direction is drawn uniformly within this angle of the surface normal."""
 
 

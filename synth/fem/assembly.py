@@ -1,4 +1,4 @@
-"""Volume integrals: nodal displacement to strain, stress to nodal force, and the stiffness at rest."""
+"""Volume integrals: nodal displacement to strain, stress to nodal force, and the stiffness."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 
 from synth.fem.element import Quadrature
 from synth.fem.jit import compiled
-from synth.fem.laws import lame
 
 Floats = NDArray[np.float64]
 Cells = NDArray[np.int32]
@@ -61,25 +60,43 @@ def divergence(cells: Cells, slope: Floats, weight: Floats, stress: Floats, out:
                     out[at, i] += p[i, 0] * a + p[i, 1] * b + p[i, 2] * c
 
 
-def stiffness(mesh: Quadrature, young: float, poisson: float) -> sp.csr_array:
-    """Stiffness of Hooke's law, the tangent of every law at rest.
+@compiled
+def _local(slope: Floats, weight: Floats, moduli: Floats, out: Floats) -> None:
+    """Stiffness of every element, (M, n, 3, n, 3), from dP/dF at every point (or one for all)."""
+    elements, points, nodes, _ = slope.shape
+    half = np.empty((3, 3, 3))
+    out[:] = 0.0
+    for e in range(elements):
+        for q in range(points):
+            d, a = slope[e, q], moduli[(e * points + q) % len(moduli)]
+            for n in range(nodes):
+                for i in range(3):
+                    for k in range(3):
+                        for m in range(3):
+                            half[i, k, m] = weight[e, q] * (
+                                d[n, 0] * a[i, 0, k, m] + d[n, 1] * a[i, 1, k, m] + d[n, 2] * a[i, 2, k, m]
+                            )
+                for o in range(nodes):
+                    for i in range(3):
+                        for k in range(3):
+                            out[e, n, i, o, k] += (
+                                half[i, k, 0] * d[o, 0] + half[i, k, 1] * d[o, 1] + half[i, k, 2] * d[o, 2]
+                            )
+
+
+def stiffness(mesh: Quadrature, moduli: Floats) -> sp.csr_array:
+    """Tangent stiffness.
 
     Args:
         mesh: the elements.
-        young: kPa.
-        poisson: below 0.5.
+        moduli: (M * Q, 3, 3, 3, 3) kPa, dP/dF at every point; or (1, 3, 3, 3, 3), one for all.
 
     Returns:
         (3N, 3N) mN/mm, degrees of freedom node by node.
     """
-    mu, lam = lame(young, poisson)
-    d, w = mesh.slope, mesh.weight
-    outer = np.einsum("mq,mqai,mqbj->maibj", w, d, d, optimize=True)
-    local = lam * outer + mu * outer.transpose(0, 1, 4, 3, 2)
-    dot = np.einsum("maibi->mab", outer)
-    for i in range(3):
-        local[:, :, i, :, i] += mu * dot
-    n = mesh.cells.shape[1]
-    dof = (3 * mesh.cells[:, :, None] + np.arange(3)).reshape(len(mesh.cells), 3 * n)
+    elements, n = mesh.cells.shape
+    local = np.empty((elements, n, 3, n, 3))
+    _local(mesh.slope, mesh.weight, moduli, local)
+    dof = (3 * mesh.cells[:, :, None] + np.arange(3, dtype=np.int32)).reshape(elements, 3 * n)
     rows, cols = np.repeat(dof, 3 * n, axis=1).ravel(), np.tile(dof, (1, 3 * n)).ravel()
     return sp.coo_array((local.ravel(), (rows, cols)), shape=(3 * mesh.nodes,) * 2).tocsr()

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from synth.errors import UserError
+from synth.errors import NotFinite, UserError
 from synth.fem.system import State, System
+from synth.fem.validity import LEAST_JACOBIAN
 
 Floats = NDArray[np.float64]
 
@@ -19,6 +20,10 @@ _MEMORY, _STEPS = 8, 200
 
 class NoEquilibrium(UserError):
     """The iteration found no balance of forces."""
+
+
+class InvertedElement(UserError):
+    """The load is past what the mesh can follow: an element is flat or inside out."""
 
 
 @dataclass(frozen=True)
@@ -35,16 +40,19 @@ class Path:
     """(T,) force out of balance over the load, in the norm of the inverse stiffness; 0 without load."""
 
 
-def follow(system: System, load: Floats, part: Floats) -> Path:
+def follow(system: System, load: Floats, part: Floats, peak: float) -> Path:
     """Equilibrium at each part of a load.
 
     Args:
         system: the equations.
         load: (N, 3) mN for E = 1 kPa.
         part: (T,) what part of it is on.
+        peak: P = F/(E a^2) of the whole load, for messages.
 
     Raises:
-        NoEquilibrium: the iteration stalled; names the step and its load.
+        InvertedElement: names frame, load and element.
+        NoEquilibrium: the iteration stalled; names frame and load.
+        NotFinite: a number is none.
     """
     path: list[tuple[Floats, State]] = []
     residual = np.zeros(len(part))
@@ -61,13 +69,14 @@ def follow(system: System, load: Floats, part: Floats) -> Path:
             start = _guess(known, float(p), first)
             u, state, rest = balance(system, p * load, start, TOLERANCE * size)
             residual[step] = rest / size
-            if rest > TOLERANCE * size:
-                raise NoEquilibrium(
-                    f"frame {step}: no equilibrium at {p:.3g} of the peak load "
-                    f"(out of balance by {rest / size:.1e}); lower fem.load"
-                )
             if all(abs(p - k) > 1e-3 for k, _ in known):
                 known.append((float(p), u))
+        check(system, u, state, step, peak * float(p))
+        if residual[step] > TOLERANCE:
+            raise NoEquilibrium(
+                f"frame {step}: no equilibrium at load {p * peak:.3g} "
+                f"(out of balance by {residual[step]:.1e}); lower fem.load"
+            )
         path.append((u, state))
     return Path(
         np.stack([u for u, _ in path]),
@@ -75,6 +84,17 @@ def follow(system: System, load: Floats, part: Floats) -> Path:
         np.array([s.energy for _, s in path]),
         residual,
     )
+
+
+def check(system: System, u: Floats, state: State, frame: int, load: float) -> None:
+    """Refuses a state that is no deformation: raises `NotFinite` or `InvertedElement`."""
+    if not np.isfinite(u).all() or not np.isfinite(state.energy):
+        raise NotFinite(f"frame {frame}: the deformation at load {load:.3g} is not finite")
+    if state.jacobian <= LEAST_JACOBIAN:
+        raise InvertedElement(
+            f"frame {frame}: load {load:.3g} turns element {system.worst(u)} inside out or nearly so "
+            f"(det F {state.jacobian:.2f}, more than {LEAST_JACOBIAN:g} is needed); lower fem.load"
+        )
 
 
 def balance(system: System, load: Floats, start: Floats, tolerance: float) -> tuple[Floats, State, float]:

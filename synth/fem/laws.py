@@ -1,8 +1,15 @@
-"""Material laws: energy and first Piola-Kirchhoff stress at every quadrature point.
+"""Material laws: energy, first Piola-Kirchhoff stress and its exact tangent at quadrature points.
 
-All agree with Hooke's law of mu and lambda at rest. Sources, by name:
-linear: Hooke, small strain. corotational: Muller & Gross, "Interactive virtual materials" (GI 2004), with the
-energy mu |F - R|^2 + lambda/2 tr(R'F - I)^2, the law of Heraoui et al.
+All agree with Hooke's law of mu and lambda at rest. With F = I + grad u, J = det F, C = F'F:
+
+linear          Hooke, small strain: mu e:e + lambda/2 (tr e)^2.
+corotational    mu |F - R|^2 + lambda/2 tr(R'F - I)^2, R the rotation of F (Muller & Gross, GI 2004); the law
+                of Heraoui et al.
+stable          mu'/2 (tr C - 3) + lambda'/2 (J - a)^2 - mu'/2 log(tr C + 1) with mu' = 4/3 mu,
+                lambda' = lambda + 5/6 mu, a = 1 + 3/4 mu'/lambda' (Smith, de Goes & Kim, "Stable neo-Hookean
+                flesh simulation", ACM Trans. Graph. 37, 2018): finite even where tissue is crushed flat.
+neo-hookean     mu/2 (tr C - 3) - mu log J + lambda/2 (log J)^2 (Bonet & Wood, Nonlinear Continuum Mechanics,
+                6.4.3): infinite energy at J = 0, so nothing turns inside out.
 """
 
 from __future__ import annotations
@@ -14,8 +21,8 @@ from synth.fem.jit import compiled
 
 Floats = NDArray[np.float64]
 
-LINEAR, COROTATIONAL = 0, 1
-NUMBER = {"linear": LINEAR, "corotational": COROTATIONAL}
+NUMBER = {"linear": 0, "corotational": 1, "stable": 2, "neo-hookean": 3}
+"""What the compiled loops call each law."""
 
 
 def lame(young: float, poisson: float) -> tuple[float, float]:
@@ -32,44 +39,198 @@ def stress(law: int, strain: Floats, mu: float, lam: float, out: Floats, energy:
         strain: (n, 3, 3) displacement gradient F - I.
         mu, lam: kPa.
         out: (n, 3, 3) kPa, overwritten by P = d(energy)/dF.
-        energy: (n,) kPa, overwritten.
+        energy: (n,) kPa, overwritten; infinite where the law has no value.
 
     Returns:
-        The smallest det F.
+        The smallest J.
     """
     least = np.inf
     f, r = np.empty((3, 3)), np.empty((3, 3))
-    for p in range(len(strain)):
+    for n in range(len(strain)):
         for i in range(3):
             for j in range(3):
-                f[i, j] = strain[p, i, j]
+                f[i, j] = strain[n, i, j]
             f[i, i] += 1
         det = _det(f)
         least = min(least, det)
         if law == 0:
-            for i in range(3):
-                for j in range(3):
-                    r[i, j] = 0.5 * (strain[p, i, j] + strain[p, j, i])
-            trace = r[0, 0] + r[1, 1] + r[2, 2]
-            squares = 0.0
-            for i in range(3):
-                for j in range(3):
-                    squares += r[i, j] * r[i, j]
-                    out[p, i, j] = 2 * mu * r[i, j]
-                out[p, i, i] += lam * trace
-            energy[p] = mu * squares + 0.5 * lam * trace * trace
+            energy[n] = _linear(strain[n], mu, lam, out[n])
+        elif law == 1:
+            energy[n] = _corotational(f, r, mu, lam, out[n])
+        elif law == 2:
+            energy[n] = _stable(f, det, r, mu, lam, out[n])
         else:
-            _rotation(f, r)
-            trace, squares = -3.0, 0.0
-            for i in range(3):
-                for j in range(3):
-                    trace += r[i, j] * f[i, j]
-                    squares += (f[i, j] - r[i, j]) ** 2
-            for i in range(3):
-                for j in range(3):
-                    out[p, i, j] = 2 * mu * (f[i, j] - r[i, j]) + lam * trace * r[i, j]
-            energy[p] = mu * squares + 0.5 * lam * trace * trace
+            energy[n] = _neo_hookean(f, det, r, mu, lam, out[n])
     return least
+
+
+@compiled
+def tangent(law: int, strain: Floats, mu: float, lam: float, out: Floats) -> None:
+    """Derivative of the stress, in place.
+
+    Args:
+        law, strain, mu, lam: as in `stress`.
+        out: (n, 3, 3, 3, 3) kPa, overwritten by dP_ij/dF_kl.
+    """
+    f, r = np.empty((3, 3)), np.empty((3, 3))
+    for n in range(len(strain)):
+        for i in range(3):
+            for j in range(3):
+                f[i, j] = strain[n, i, j]
+            f[i, i] += 1
+        det = _det(f)
+        a = out[n]
+        if law == 0:
+            for i in range(3):
+                for j in range(3):
+                    for k in range(3):
+                        for m in range(3):
+                            a[i, j, k, m] = mu * ((i == k) * (j == m) + (i == m) * (j == k)) + lam * (
+                                i == j
+                            ) * (k == m)
+        elif law == 1:
+            _corotational_tangent(f, r, mu, lam, a)
+        elif law == 2:
+            _stable_tangent(f, det, r, mu, lam, a)
+        else:
+            _neo_hookean_tangent(f, det, r, mu, lam, a)
+
+
+@compiled
+def _linear(h: Floats, mu: float, lam: float, p: Floats) -> float:
+    trace, squares = h[0, 0] + h[1, 1] + h[2, 2], 0.0
+    for i in range(3):
+        for j in range(3):
+            e = 0.5 * (h[i, j] + h[j, i])
+            squares += e * e
+            p[i, j] = 2 * mu * e
+        p[i, i] += lam * trace
+    return mu * squares + 0.5 * lam * trace * trace  # type: ignore[no-any-return]
+
+
+@compiled
+def _corotational(f: Floats, r: Floats, mu: float, lam: float, p: Floats) -> float:
+    _rotation(f, r)
+    trace, squares = -3.0, 0.0
+    for i in range(3):
+        for j in range(3):
+            trace += r[i, j] * f[i, j]
+            squares += (f[i, j] - r[i, j]) ** 2
+    for i in range(3):
+        for j in range(3):
+            p[i, j] = 2 * mu * (f[i, j] - r[i, j]) + lam * trace * r[i, j]
+    return mu * squares + 0.5 * lam * trace * trace
+
+
+@compiled
+def _stable(f: Floats, det: float, c: Floats, mu: float, lam: float, p: Floats) -> float:
+    mu, lam = 4 / 3 * mu, lam + 5 / 6 * mu
+    over = det - 1 - 0.75 * mu / lam
+    squares = _squares(f)
+    _cofactor(f, c)
+    soft, hard = mu * (1 - 1 / (squares + 1)), lam * over
+    for i in range(3):
+        for j in range(3):
+            p[i, j] = soft * f[i, j] + hard * c[i, j]
+    rest = 0.5 * lam * (0.75 * mu / lam) ** 2 - 0.5 * mu * np.log(4.0)  # so that the energy is 0 at rest
+    return 0.5 * mu * (squares - 3 - np.log(squares + 1)) + 0.5 * lam * over * over - rest  # type: ignore[no-any-return]
+
+
+@compiled
+def _neo_hookean(f: Floats, det: float, c: Floats, mu: float, lam: float, p: Floats) -> float:
+    if not det > 0:
+        p[:] = 0.0
+        return np.inf
+    _cofactor(f, c)
+    log = np.log(det)
+    out = (lam * log - mu) / det
+    for i in range(3):
+        for j in range(3):
+            p[i, j] = mu * f[i, j] + out * c[i, j]
+    return 0.5 * mu * (_squares(f) - 3) - mu * log + 0.5 * lam * log * log  # type: ignore[no-any-return]
+
+
+@compiled
+def _corotational_tangent(f: Floats, r: Floats, mu: float, lam: float, a: Floats) -> None:
+    """With R'F = S and R'dF = G: dR = R W, where W is skew and its axis w = (tr S - S)^-1 axis(G - G')."""
+    _rotation(f, r)
+    s, b, inverse = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    for i in range(3):
+        for j in range(3):
+            s[i, j] = r[0, i] * f[0, j] + r[1, i] * f[1, j] + r[2, i] * f[2, j]
+    trace = s[0, 0] + s[1, 1] + s[2, 2]
+    for i in range(3):
+        for j in range(3):
+            b[i, j] = trace * (i == j) - s[i, j]
+    _cofactor(b, inverse)
+    inverse /= _det(b)
+    axis, w, turned = np.empty(3), np.empty(3), np.empty((3, 3))
+    for k in range(3):
+        for m in range(3):
+            # dF is one at (k, m): G = R' dF has the row R[k, :]' in column m.
+            for i in range(3):
+                x, y = (i + 1) % 3, (i + 2) % 3
+                axis[i] = r[k, y] * (m == x) - r[k, x] * (m == y)
+            for i in range(3):
+                w[i] = inverse[0, i] * axis[0] + inverse[1, i] * axis[1] + inverse[2, i] * axis[2]
+            for i in range(3):
+                turned[i, 0] = r[i, 1] * w[2] - r[i, 2] * w[1]
+                turned[i, 1] = r[i, 2] * w[0] - r[i, 0] * w[2]
+                turned[i, 2] = r[i, 0] * w[1] - r[i, 1] * w[0]
+            for i in range(3):
+                for j in range(3):
+                    a[i, j, k, m] = (
+                        2 * mu * ((i == k) * (j == m))
+                        + (lam * (trace - 3) - 2 * mu) * turned[i, j]
+                        + lam * r[k, m] * r[i, j]
+                    )
+
+
+@compiled
+def _stable_tangent(f: Floats, det: float, c: Floats, mu: float, lam: float, a: Floats) -> None:
+    mu, lam = 4 / 3 * mu, lam + 5 / 6 * mu
+    squares = _squares(f)
+    _cofactor(f, c)
+    soft, more = mu * (1 - 1 / (squares + 1)), 2 * mu / (squares + 1) ** 2
+    over = lam * (det - 1 - 0.75 * mu / lam)
+    for i in range(3):
+        for j in range(3):
+            for k in range(3):
+                for m in range(3):
+                    a[i, j, k, m] = (
+                        soft * ((i == k) * (j == m)) + more * f[i, j] * f[k, m] + lam * c[i, j] * c[k, m]
+                    )
+                    if i != k and j != m:
+                        a[i, j, k, m] += over * _turn(i, k) * _turn(j, m) * f[3 - i - k, 3 - j - m]
+
+
+@compiled
+def _neo_hookean_tangent(f: Floats, det: float, g: Floats, mu: float, lam: float, a: Floats) -> None:
+    _cofactor(f, g)
+    g /= det
+    twist = mu - lam * np.log(det)
+    for i in range(3):
+        for j in range(3):
+            for k in range(3):
+                for m in range(3):
+                    a[i, j, k, m] = (
+                        mu * ((i == k) * (j == m)) + twist * g[i, m] * g[k, j] + lam * g[i, j] * g[k, m]
+                    )
+
+
+@compiled
+def _turn(i: int, k: int) -> float:
+    """Sign of (i, k, the third) as a permutation, for i != k."""
+    return 1.0 if (k - i) % 3 == 1 else -1.0
+
+
+@compiled
+def _squares(f: Floats) -> float:
+    total = 0.0
+    for i in range(3):
+        for j in range(3):
+            total += f[i, j] * f[i, j]
+    return total
 
 
 @compiled
@@ -109,5 +270,5 @@ def _rotation(f: Floats, r: Floats) -> None:
                 new = 0.5 * (r[i, j] + c[i, j] / det)
                 change = max(change, abs(new - r[i, j]))
                 r[i, j] = new
-        if change < 1e-15:
+        if change < 1e-9:  # squares itself: the next step would be 1e-18
             break

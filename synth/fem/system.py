@@ -11,7 +11,7 @@ from scipy.sparse.linalg import SuperLU, splu
 
 from synth.fem.assembly import divergence, gradient, stiffness
 from synth.fem.element import Quadrature, quadrature
-from synth.fem.laws import NUMBER, lame, stress
+from synth.fem.laws import NUMBER, lame, stress, tangent
 from synth.fem.mesh import Tets
 
 Floats = NDArray[np.float64]
@@ -63,6 +63,14 @@ class System:
         energy = float(density @ self.mesh.weight.ravel()) + 0.5 * float(np.vdot(u, spring))
         return State(energy, force + spring, float(least))
 
+    def tangent(self, u: Floats) -> sp.csr_array:
+        """Stiffness at (N, 3) mm, (3N, 3N) mN/mm, springs included."""
+        strain = np.empty((self.mesh.weight.size, 3, 3))
+        gradient(self.mesh.cells, self.mesh.slope, u, strain)
+        moduli = np.empty((len(strain), 3, 3, 3, 3))
+        tangent(NUMBER[self.law], strain, *lame(1.0, self.poisson), moduli)
+        return (stiffness(self.mesh, moduli) + _springs(self.hold)).tocsr()
+
     def worst(self, u: Floats) -> int:
         """The element with the smallest det F."""
         strain = np.empty((self.mesh.weight.size, 3, 3))
@@ -79,7 +87,7 @@ def assemble(tets: Tets, law: str, poisson: float) -> System:
         poisson: below 0.5.
     """
     mesh = quadrature(tets.points, tets.cells, tets.order)
-    whole = (stiffness(mesh, 1.0, poisson) + sp.kron(tets.hold, sp.eye_array(3), format="csr")).tocsr()
+    whole = (stiffness(mesh, hooke(1.0, poisson)) + _springs(tets.hold)).tocsr()
     free = np.flatnonzero(np.repeat(~tets.fixed, 3))
     # Symmetric and positive definite: no pivoting, an ordering of A + A'.
     factor = splu(
@@ -89,3 +97,15 @@ def assemble(tets: Tets, law: str, poisson: float) -> System:
         options={"SymmetricMode": True},
     )
     return System(mesh, law, poisson, free, tets.hold, whole, factor)
+
+
+def hooke(young: float, poisson: float) -> Floats:
+    """Moduli of Hooke's law, (1, 3, 3, 3, 3) in the unit of `young`: the tangent of every law at rest."""
+    moduli = np.empty((1, 3, 3, 3, 3))
+    tangent(NUMBER["linear"], np.zeros((1, 3, 3)), *lame(young, poisson), moduli)
+    return moduli
+
+
+def _springs(hold: sp.csr_array) -> sp.csr_array:
+    """The same springs in all three directions."""
+    return sp.kron(hold, sp.eye_array(3), format="csr")

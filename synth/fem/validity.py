@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-LARGEST_LOAD = {"linear": 0.15, "corotational": 0.15}
+LARGEST_LOAD = {"linear": 0.15, "corotational": 0.15, "stable": 0.4, "neo-hookean": 0.4}
 """Largest P = F/(E a^2) at which a law is accepted."""
 
 LEAST_JACOBIAN = 0.2

@@ -35,9 +35,9 @@ def run(fem: job.Fem, gesture: Gesture | None = None, seed: int = 5, frames: int
     return deform(fem, ANATOMY.craniotomy, tissue, drawn, tets, *patch(), frames, 25.0)
 
 
-@pytest.mark.parametrize("law", ["linear", "corotational"])
+@pytest.mark.parametrize("law", ["linear", "corotational", "stable", "neo-hookean"])
 def test_traction_sums_to_the_force(law: str) -> None:
-    motion = run(job.Fem(law=law, tets=400))
+    motion = run(job.Fem(law=law, tets=400, load=(0.02, 0.12)))
     total = np.einsum("v,tvd->td", motion.area, motion.traction)
     assert np.abs(total - motion.force).max() <= 1e-9 * np.abs(motion.force).max()
     assert np.abs(motion.force).max() > 0.05
@@ -99,18 +99,18 @@ def test_the_tissue_moves_where_and_whither_it_is_pulled() -> None:
 def test_motion_depends_on_force_over_stiffness_alone() -> None:
     fem = job.Fem(tets=400)
     rng = np.random.default_rng(5)
-    tissue = Tissue(young_kpa=1.0, poisson=0.4, law="linear")
+    tissue = Tissue(young_kpa=1.0, poisson=0.4, law="neo-hookean")
     gesture = Gesture.draw(fem, ANATOMY.craniotomy, tissue, rng)
     tets = mesh.block(ANATOMY, 400, 2)
     one = deform(fem, ANATOMY.craniotomy, tissue, gesture, tets, *patch(), 6, 25.0)
     stiff = replace(tissue, young_kpa=2.5), replace(gesture, force_mn=2.5 * gesture.force_mn)
     other = deform(fem, ANATOMY.craniotomy, *stiff, tets, *patch(), 6, 25.0)
-    np.testing.assert_allclose(one.displacement, other.displacement, rtol=1e-12, atol=1e-14)
+    np.testing.assert_allclose(one.displacement, other.displacement, rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(2.5 * one.traction, other.traction, rtol=1e-12)
 
 
 def test_balance_of_forces_is_reached() -> None:
-    motion = run(job.Fem(law="corotational", tets=400))
+    motion = run(job.Fem(law="corotational", load=(0.1, 0.1), tets=400))
     assert motion.residual.max() <= 2e-4
     assert motion.residual.max() > 0
 
@@ -123,7 +123,7 @@ def test_load_past_the_laws_range_is_refused_with_the_largest_valid_value() -> N
 
 def test_inverted_element_names_frame_load_and_element(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(solver, "check_load", lambda law, load: None)
-    fem = job.Fem(load=(8.0, 8.0), gestures=("push",))
+    fem = job.Fem(law="corotational", load=(8.0, 8.0), gestures=("push",))
     with pytest.raises(InvertedElement, match=r"frame \d+: load [\d.]+ turns element \d+ inside out"):
         run(fem)
 

@@ -12,10 +12,10 @@ from synth import job
 from synth.fem import mesh
 from synth.fem.assembly import stiffness
 from synth.fem.element import quadrature
-from synth.fem.laws import NUMBER
+from synth.fem.laws import NUMBER, stress, tangent
 from synth.fem.mesh import Tets
 from synth.fem.refine import bisect, refine
-from synth.fem.system import System, assemble
+from synth.fem.system import System, assemble, hooke
 
 LAWS = sorted(NUMBER)
 
@@ -37,7 +37,7 @@ def cube(order: int, n: int = 3) -> Tets:
 @pytest.mark.parametrize("order", [1, 2])
 def test_stiffness_is_scikit_fems(order: int) -> None:
     tets = cube(order)
-    ours = stiffness(quadrature(tets.points, tets.cells, order), 2.0, 0.4)
+    ours = stiffness(quadrature(tets.points, tets.cells, order), hooke(2.0, 0.4))
     grid = skfem.MeshTet(tets.points[: tets.cells[:, :4].max() + 1].T, tets.cells[:, :4].T)
     element = skfem.ElementVector(skfem.ElementTetP1() if order == 1 else skfem.ElementTetP2())
     basis = skfem.Basis(grid, element, intorder=2 * order)
@@ -88,10 +88,28 @@ def test_rigid_rotation_gives_no_force(law: str) -> None:
 @pytest.mark.parametrize("law", LAWS)
 def test_force_is_the_slope_of_the_energy(law: str) -> None:
     system, rng = assemble(cube(2), law, 0.4), np.random.default_rng(3)
-    u, step = 0.03 * rng.normal(size=(system.mesh.nodes, 3)), rng.normal(size=(system.mesh.nodes, 3))
-    h = 1e-5
+    u, step = 0.004 * rng.normal(size=(system.mesh.nodes, 3)), rng.normal(size=(system.mesh.nodes, 3))
+    h = 2e-6
     slope = (system.state(u + h * step).energy - system.state(u - h * step).energy) / (2 * h)
     assert slope == pytest.approx(float(np.vdot(system.state(u).force, step)), rel=1e-7)
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_tangent_is_the_slope_of_the_stress(law: str) -> None:
+    rng, h = np.random.default_rng(5), 1e-5
+    strain = 0.25 * rng.normal(size=(40, 3, 3))
+    strain = strain[np.linalg.det(strain + np.eye(3)) > 0.3]
+    moduli = np.empty((len(strain), 3, 3, 3, 3))
+    tangent(NUMBER[law], strain, 0.7, 1.9, moduli)
+    up, down, energy = np.empty_like(strain), np.empty_like(strain), np.empty(len(strain))
+    for k in range(3):
+        for m in range(3):
+            step = np.zeros((3, 3))
+            step[k, m] = h
+            stress(NUMBER[law], strain + step, 0.7, 1.9, up, energy)
+            stress(NUMBER[law], strain - step, 0.7, 1.9, down, energy)
+            error = np.abs((up - down) / (2 * h) - moduli[:, :, :, k, m]).max(axis=(1, 2))
+            assert (error <= 1e-7 * np.abs(moduli).max(axis=(1, 2, 3, 4))).all()
 
 
 @pytest.mark.parametrize("law", LAWS)
