@@ -107,13 +107,13 @@ def render(result: Result, title: str) -> str:
 def terminal_table(result: Result) -> Table:
     """The methods' scores for a terminal."""
     table = Table(title=result.recording, title_justify="left")
-    table.add_column("method")
+    table.add_column("method", no_wrap=True)
     if not result.methods[result.main].scores:
         table.add_column("largest force [mN]", justify="right")
         for name, method in result.methods.items():
             table.add_row(name, shown(float(np.nanmax(method.size_mn))))
         return table
-    keys = [row for row in METRICS if row[0] in {*_TILES, "rmse_mn", "bias_mn", "lag_s", "contact_f1"}]
+    keys = [row for row in METRICS if row[0] in {*_TILES, "bias_mn"}]
     for _, name, unit in keys:
         table.add_column(f"{name} [mN]" if unit == "mN" else name, justify="right")
     for name, method in result.methods.items():

@@ -106,16 +106,17 @@ def in_contact(curve: Curve, threshold_mn: float) -> NDArray[np.bool_]:
 
 
 def events(time_s: Curve, contact: NDArray[np.bool_], shortest_s: float = 0.15) -> list[Event]:
-    """Contacts of at least `shortest_s`; gaps shorter than that are closed first."""
+    """Contacts of at least `shortest_s` (a sample lasts a median step); shorter gaps are closed first."""
+    step = float(np.median(np.diff(time_s))) if len(time_s) > 1 else 0.0
     edges = np.flatnonzero(np.diff(np.concatenate([[False], contact, [False]]).astype(int)))
     spans = [Event(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
     joined: list[Event] = []
     for span in spans:
-        if joined and time_s[span.start] - time_s[joined[-1].stop - 1] < shortest_s:
+        if joined and time_s[span.start] - time_s[joined[-1].stop - 1] - step < shortest_s:
             joined[-1] = Event(joined[-1].start, span.stop)
         else:
             joined.append(span)
-    return [span for span in joined if time_s[span.stop - 1] - time_s[span.start] >= shortest_s]
+    return [span for span in joined if time_s[span.stop - 1] - time_s[span.start] + step >= shortest_s]
 
 
 def per_event(time_s: Curve, sensor: Curve, predicted: Curve, spans: list[Event]) -> list[dict[str, float]]:
