@@ -75,6 +75,8 @@ class Lamp:
     """Half angle where its light ends."""
     beam_deg: float
     """Half angle inside which it is even."""
+    weight: float
+    """How often a light path looks towards it, against the other lamps."""
 
 
 def pick(asked: str) -> str:
@@ -136,7 +138,12 @@ class Stage:
         scene: dict[str, Any] = {
             "type": "scene",
             "integrator": _integrator(integrator),
-            "ambient": {"type": "constant", "radiance": {"type": "rgb", "value": list(ambient)}},
+            # Found by the surface's own sampling: choosing it as a lamp would only add noise.
+            "ambient": {
+                "type": "constant",
+                "radiance": {"type": "rgb", "value": list(ambient)},
+                "sampling_weight": 0.0,
+            },
         }
         for index, lamp in enumerate(lamps):
             scene[f"lamp{index}"] = _lamp(mi, lamp)
@@ -187,7 +194,7 @@ def _lamp(mi: Any, lamp: Lamp) -> dict[str, Any]:
         "intensity": {"type": "rgb", "value": list(lamp.intensity)},
         "cutoff_angle": lamp.cutoff_deg,
         "beam_width": lamp.beam_deg,
-        "sampling_weight": float(sum(lamp.intensity)),
+        "sampling_weight": lamp.weight,
     }
 
 

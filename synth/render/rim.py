@@ -71,9 +71,9 @@ def paint(rim: Rim, look: Look, pixels: int) -> Coat:
     away = np.hypot(x, y) - np.interp(angle, np.linspace(0, 2 * np.pi, len(closed)), closed).astype(
         np.float32
     )
-    wide = noise.fractal(rng, pixels, extent, 6.0, 1.4)
-    mid = noise.fractal(rng, pixels, extent, 1.8, 1.3)
-    fine = noise.fractal(rng, pixels, extent, 0.5, 1.0)
+    wide = noise.fractal(rng, pixels, extent, 7.0, 2.2)
+    mid = noise.fractal(rng, pixels, extent, 2.2, 1.9)
+    fine = noise.fractal(rng, pixels, extent, 0.7, 1.5)
     dura = np.array([0.80, 0.52, 0.44], np.float32) * (1 + 0.06 * fine + 0.08 * mid)[..., None]
     flesh = np.array([0.50, 0.075, 0.045], np.float32) * (1 + 0.30 * mid + 0.15 * fine)[..., None]
     fat = np.array([0.70, 0.42, 0.20], np.float32) * (1 + 0.12 * fine)[..., None]
@@ -100,8 +100,8 @@ def _outline(rng: np.random.Generator, angle: Floats) -> Floats:
     shape = np.ones_like(angle)
     for order in range(2, 9):
         shape += rng.normal(0, 0.055 / order) * np.cos(order * angle + rng.uniform(0, 2 * np.pi))
-    for order in range(12, 40):
-        shape += rng.normal(0, 0.0016) * np.cos(order * angle + rng.uniform(0, 2 * np.pi))
+    for order in range(12, 30):
+        shape += rng.normal(0, 0.0007) * np.cos(order * angle + rng.uniform(0, 2 * np.pi))
     return shape
 
 

@@ -18,7 +18,7 @@ Map = npt.NDArray[np.float32]
 Floats = npt.NDArray[np.float64]
 
 # Light lost in a millimetre of vessel, red, green, blue: blood seen through its wall, by eye on photographs.
-_ARTERIAL = np.array([0.35, 5.6, 6.6], np.float32)
+_ARTERIAL = np.array([1.25, 8.0, 8.6], np.float32)
 _TEXELS_A_PIXEL = 2.2
 
 
@@ -75,7 +75,7 @@ def _painted(
     extent: float,
 ) -> Map:
     coarse = 256
-    wide = noise.fractal(rng, coarse, extent, 12.0, 1.6)
+    wide = noise.fractal(rng, coarse, extent, 12.0, 2.0)
     mottle = noise.fractal(rng, coarse, extent, 3.0, 1.3)
     share = np.clip(0.5 + 0.42 * wide + 0.12 * mottle, 0, 1)
     share = cv2.resize(share, (pixels, pixels), interpolation=cv2.INTER_CUBIC)[..., None]
@@ -88,6 +88,8 @@ def _painted(
     blush = blush * np.clip(1 + 0.5 * cv2.resize(mottle, (pixels, pixels)), 0.2, 2)
     albedo = albedo * np.exp(-blush[..., None] * np.array([0.25, 1.0, 0.95], np.float32))
     albedo = albedo * (1 - look.shade * sulci[..., None] * np.array([0.35, 0.5, 0.42], np.float32))
+    # Deep in a thick vessel no light comes back that could still be lost.
+    arterial = arterial / (1 + arterial / 0.45)
     blood = look.arterial * arterial + look.capillary * thickness(tubes["capillaries"])
     fade = np.clip(0.75 + 0.35 * cv2.resize(wide, (pixels, pixels)), 0.25, 1.2)
     albedo = albedo * np.exp(-(blood * fade)[..., None] * _ARTERIAL)
@@ -106,11 +108,11 @@ def _veined(albedo: Map, tube: tuple[Map, Map], look: Look, extent: float) -> Ma
     colour = np.asarray(look.vein, np.float32) * thick + np.array([0.34, 0.10, 0.13], np.float32) * (
         1 - thick
     )
-    wall = (0.75 + 0.35 * depth)[..., None] * colour
-    cover = noise.blur(np.clip(depth * 3.0, 0, 1).astype(np.float32), 0.03, extent)[..., None]
-    shadow = noise.blur((depth > 0).astype(np.float32), 0.22, extent)[..., None]
-    soft = albedo * (1 - 0.25 * shadow * np.array([0.5, 0.8, 0.6], np.float32))
-    return np.asarray(soft * (1 - 0.94 * cover) + wall * 0.94 * cover, np.float32)
+    wall = (1.25 - 0.45 * depth)[..., None] * colour
+    cover = noise.blur(np.clip(depth * 2.2, 0, 1).astype(np.float32), 0.045, extent)[..., None]
+    halo = noise.blur((depth > 0).astype(np.float32), 0.28, extent)[..., None]
+    soft = albedo * np.exp(-0.9 * halo * np.array([0.35, 1.0, 0.75], np.float32))
+    return np.asarray(soft * (1 - 0.95 * cover) + wall * 0.95 * cover, np.float32)
 
 
 def _film(
@@ -120,14 +122,15 @@ def _film(
     relief = 0.42 * thickness(tubes["arteries"]) + 0.25 * thickness(tubes["capillaries"])
     relief = noise.blur(relief, look.film_mm, extent)
     coarse = 512
-    pools = cv2.resize(noise.fractal(rng, coarse, extent, 6.0, 1.5), (pixels, pixels))
-    dry = np.clip(0.5 + 0.45 * pools, 0.12, 1.0)
-    swell = (
-        noise.band(rng, coarse, extent, 1.5, 0.5) * 0.010 + noise.band(rng, coarse, extent, 0.6, 0.5) * 0.0042
-    )
-    fine = noise.band(rng, pixels, extent, 0.24, 0.45) * 0.0012
-    pits = cv2.resize(swell, (pixels, pixels), interpolation=cv2.INTER_CUBIC) + fine
-    return np.asarray(relief + look.bump * dry * pits, np.float32)
+    pools = cv2.resize(noise.fractal(rng, coarse, extent, 5.0, 1.5), (pixels, pixels))
+    # Mostly a smooth pool; where the film is thin the pia's own grain breaks the highlights up.
+    dry = np.clip(0.6 * pools - 0.25, 0.05, 1.0)
+    swell = noise.band(rng, coarse, extent, 2.4, 0.5) * 0.016
+    rough = noise.band(rng, coarse, extent, 0.55, 0.5) * 0.0060
+    fine = noise.band(rng, pixels, extent, 0.22, 0.45) * 0.0016
+    swell = cv2.resize(swell, (pixels, pixels), interpolation=cv2.INTER_CUBIC)
+    rough = cv2.resize(rough, (pixels, pixels), interpolation=cv2.INTER_CUBIC) + fine
+    return np.asarray(relief + look.bump * (swell + dry * rough), np.float32)
 
 
 def _photograph(path: Path, pixels: int) -> Map:

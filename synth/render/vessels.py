@@ -57,8 +57,8 @@ def grow_all(sulci: Map, extent_mm: float, rng: np.random.Generator) -> Vessels:
     )
     veins = _tree(sulci, extent_mm, rng, vein_roots, spacing=3.2, leaf=0.13, wander=0.5)
     veins = _widen(veins, vein_radius)
-    roots, radius = _trunks(sulci, extent_mm, rng, count=int(rng.integers(3, 6)), radius=(0.13, 0.22))
-    arteries = _tree(sulci, extent_mm, rng, roots, spacing=1.0, leaf=0.034, wander=0.3)
+    roots, radius = _trunks(sulci, extent_mm, rng, count=int(rng.integers(4, 7)), radius=(0.13, 0.22))
+    arteries = _tree(sulci, extent_mm, rng, roots, spacing=1.05, leaf=0.042, wander=0.45)
     arteries = _widen(arteries, radius)
     capillaries = _web(arteries, extent_mm, rng)
     return Vessels(veins=veins, arteries=arteries, capillaries=capillaries)
@@ -247,17 +247,17 @@ def _web(arteries: Tree, extent_mm: float, rng: np.random.Generator) -> Tree:
     nodes, parent = grow(
         arteries.nodes,
         arteries.parent,
-        _scattered(extent_mm, 0.5, rng),
+        _scattered(extent_mm, 0.42, rng),
         buds=rng.random(len(arteries.nodes)) < 0.2,
         step=0.11,
         reach=1.6,
-        kill=0.24,
+        kill=0.2,
         wander=0.45,
         rng=rng,
     )
     fixed = len(arteries.nodes)
     nodes = _relaxed(nodes, parent, fixed, rounds=3)
-    own = murray(parent, 0.016)
+    own = murray(parent, 0.019)
     new = np.flatnonzero(np.arange(len(nodes)) >= fixed)
     # Only the twigs: their roots sit on arteries, which are drawn on their own.
     local = np.full(len(nodes), -1, np.int64)
