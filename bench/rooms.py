@@ -29,7 +29,11 @@ class Command:
     """Function in that module; its docstring's first line is the help."""
 
 
-COMMANDS: tuple[Command, ...] = (Command("experiment", "stages", "bench.stages", "stages"),)
+COMMANDS: tuple[Command, ...] = (
+    Command("experiment", "stages", "bench.stages", "stages"),
+    Command("stability", "damage", "bench.engine_damage", "damage"),
+    Command("stability", "kills", "bench.engine_kills", "kills"),
+)
 
 
 class Rooms(TyperGroup):

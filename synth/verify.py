@@ -78,12 +78,7 @@ def run(root: Path, *, fast: bool = False, report: Callable[[int, int], None] | 
     """
     folder = Folder(root)
     described, sealed = folder.described(), folder.sealed()
-    checks = {
-        "dataset": Check("dataset", "the job, the index and the sequences agree"),
-        "readable": Check("readable", "every store opens and every chunk decodes"),
-    }
-    for name, invariant in INVARIANTS.items():
-        checks[name] = Check(name, (invariant.__doc__ or "").split("\n")[0])
+    checks = _checks()
     for measure, who in _dataset(folder, described, sealed):
         checks["dataset"].add(measure, who)
     chosen = sealed
@@ -94,6 +89,23 @@ def run(root: Path, *, fast: bool = False, report: Callable[[int, int], None] | 
             report(position, len(chosen))
         _sequence(folder.root / f"{key:06d}.zarr", described["identity"], checks, fast)
     return Report(str(root), len(chosen), fast, list(checks.values()))
+
+
+def sequence(path: Path, job: str) -> list[Check]:
+    """Checks one store, which belongs to the job of that identity."""
+    checks = _checks()
+    _sequence(path, job, checks, fast=False)
+    return list(checks.values())
+
+
+def _checks() -> dict[str, Check]:
+    checks = {
+        "dataset": Check("dataset", "the job, the index and the sequences agree"),
+        "readable": Check("readable", "every store opens and every chunk decodes"),
+    }
+    for name, invariant in INVARIANTS.items():
+        checks[name] = Check(name, (invariant.__doc__ or "").split("\n")[0])
+    return checks
 
 
 def _sequence(path: Path, name: str, checks: dict[str, Check], fast: bool) -> None:
@@ -116,6 +128,8 @@ def _sequence(path: Path, name: str, checks: dict[str, Check], fast: bool) -> No
         except UserError as error:
             broken = broken or _without(path, str(error))
             continue
+        except (KeyError, IndexError, TypeError, ValueError) as error:
+            measures = [Measure(1.0, 0.0, f"attributes are missing or odd ({error!r})")]
         finally:
             checks[key].cpu_s += watch.cpu_s(key)
         for measure in measures:
