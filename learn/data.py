@@ -22,6 +22,8 @@ INPUTS = ("ideal", "recovered", "mixed")
 Target = Literal["density", "intensity"]
 _FIELDS = {"ideal": "flow", "recovered": "flow_tvl1"}
 _VERSION = 1
+_ARRAYS = ("mask", "confidence", "density", "force")
+_PLAIN = ("name", "content_hash", "group", "family", "gesture", "young_kpa")
 
 
 @dataclass(frozen=True)
@@ -146,35 +148,41 @@ def load(
 
 def _packed(sequence: Sequence, grid: Grid, wanted: tuple[str, ...], cache: Path) -> Clip:
     key = f"{sequence.attrs['content_hash']}-{grid.size}-{grid.extent_mm:g}-{'+'.join(wanted)}-v{_VERSION}"
-    folder = cache / key
-    if not folder.is_dir():
-        clip = read(sequence, grid, wanted)
-        part = cache / f"{key}.part{os.getpid()}"
-        part.mkdir(parents=True, exist_ok=True)
-        arrays = {"mask": clip.mask, "confidence": clip.confidence, "density": clip.density}
-        arrays |= {f"displacement-{k}": v for k, v in clip.displacement.items()}
-        for name, array in arrays.items():
-            np.save(part / f"{name}.npy", array)
-        np.save(part / "force.npy", clip.force)
-        plain = ("name", "content_hash", "group", "family", "gesture", "young_kpa")
-        (part / "clip.json").write_text(json.dumps({k: getattr(clip, k) for k in plain}))
-        if folder.is_dir():
-            shutil.rmtree(part)
-        else:
-            part.rename(folder)
+    if not (cache / key).is_dir():
+        pack(read(sequence, grid, wanted), cache / key)
+    return unpack(cache / key)
+
+
+def pack(clip: Clip, folder: Path) -> None:
+    """Writes a clip as plain arrays, beside and renamed; a folder that is there already stays."""
+    part = folder.with_name(f"{folder.name}.part{os.getpid()}")
+    part.mkdir(parents=True, exist_ok=True)
+    for name in _ARRAYS:
+        np.save(part / f"{name}.npy", getattr(clip, name))
+    for source, values in clip.displacement.items():
+        np.save(part / f"displacement-{source}.npy", values)
+    plain = {name: getattr(clip, name) for name in _PLAIN}
+    (part / "clip.json").write_text(json.dumps(plain | {"sources": list(clip.displacement)}))
+    if folder.is_dir():
+        shutil.rmtree(part)
+    else:
+        part.rename(folder)
+
+
+def unpack(folder: Path) -> Clip:
+    """A packed clip, memory-mapped. Raises UserError if the folder is not one."""
 
     def mapped(name: str) -> NDArray[Any]:
         array: NDArray[Any] = np.load(folder / f"{name}.npy", mmap_mode="r")
         return array
 
-    return Clip(
-        **json.loads((folder / "clip.json").read_text()),
-        mask=mapped("mask"),
-        displacement={s: mapped(f"displacement-{s}") for s in wanted},
-        confidence=mapped("confidence"),
-        density=mapped("density"),
-        force=mapped("force"),
-    )
+    try:
+        plain = json.loads((folder / "clip.json").read_text())
+        displacement = {source: mapped(f"displacement-{source}") for source in plain.pop("sources")}
+        arrays: dict[str, Any] = {name: mapped(name) for name in _ARRAYS}
+        return Clip(**plain, displacement=displacement, **arrays)
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise UserError(f"{folder}: damaged packed sequence ({error}); remove it") from None
 
 
 def target(clip: Clip, frame: int, kind: Target, components: int) -> NDArray[np.float32]:

@@ -80,8 +80,8 @@ PRESETS: dict[str, Settings] = {
     # Seconds to minutes: shows that everything joins up, not how good it can be.
     "tiny": Settings(
         size=64,
-        arch=Architecture(width=8, stem=1, levels=3, dropout=0.0),
-        epochs=12,
+        arch=Architecture(width=16, stem=2, levels=3, dropout=0.0),
+        epochs=20,
         learning_rate=2e-3,
         patience=3,
         batch=8,

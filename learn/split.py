@@ -66,30 +66,31 @@ def folds(clips: Sequence[Clip], count: int, seed: int) -> list[tuple[int, ...]]
 def nested(
     clips: Sequence[Clip], count: int, fold: int, seed: int, held_out_family: str | None = None
 ) -> Split:
-    """Fold `fold` is the test, the next one chooses the epoch, the others are fitted.
+    """Fold `fold` of `count` is the test; of the rest a fifth chooses the epoch and the others are fitted.
 
-    With `held_out_family` the sequences of that appearance are the test and only the others are split.
-    Raises UserError for fewer than three folds, a fold that doesn't exist, or an unknown family.
+    With `held_out_family` the sequences of that appearance are the test instead, and `fold` only says which
+    of the others choose. Raises UserError if a part would be empty, or for an unknown fold or family.
     """
-    if held_out_family is not None:
+    number = groups(clips)
+    if held_out_family is None:
+        if not 0 <= fold < count:
+            raise UserError(f"fold {fold}: there are folds 0 to {count - 1}")
+        test = folds(clips, count, seed)[fold]
+    else:
         test = tuple(i for i, c in enumerate(clips) if c.family == held_out_family)
         if not test:
             known = ", ".join(sorted({c.family for c in clips}))
             raise UserError(f"no sequence of family {held_out_family!r} to hold out; there are: {known}")
-        seen = set(np.array(groups(clips))[list(test)].tolist())
-        rest = [i for i, g in enumerate(groups(clips)) if g not in seen]
-        if count < 2:
-            raise UserError(f"{count} folds: fitting and selecting need at least 2")
-        parts = folds([clips[i] for i in rest], count, seed)
-        picked = fold % count
-        chosen = tuple(rest[i] for i in parts[picked])
-        fit = tuple(rest[i] for k, p in enumerate(parts) if k != picked for i in p)
-        return Split(fit, chosen, test)
-    if count < 3:
-        raise UserError(f"{count} folds: fit, select and test need at least 3")
-    if not 0 <= fold < count:
-        raise UserError(f"fold {fold}: there are folds 0 to {count - 1}")
-    parts = folds(clips, count, seed)
-    choose = (fold + 1) % count
-    fit = tuple(i for k, p in enumerate(parts) if k not in (fold, choose) for i in p)
-    return Split(tuple(sorted(fit)), parts[choose], parts[fold])
+    seen = {number[i] for i in test}
+    rest = [i for i, g in enumerate(number) if g not in seen]
+    left = len({number[i] for i in rest})
+    if left < 2:
+        raise UserError(
+            f"fit, select and test need an anatomy each: {len(set(number))} are there, {left} are left of "
+            "them beside the test"
+        )
+    parts = folds([clips[i] for i in rest], min(5, left), seed)
+    chosen = fold % len(parts) if held_out_family is not None else 0
+    select = tuple(rest[i] for i in parts[chosen])
+    fit = tuple(sorted(rest[i] for k, part in enumerate(parts) if k != chosen for i in part))
+    return Split(fit, select, test)

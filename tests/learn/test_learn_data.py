@@ -99,8 +99,8 @@ def test_a_held_out_family_is_the_test(clips: list[Clip]) -> None:
 def test_impossible_folds(clips: list[Clip]) -> None:
     with pytest.raises(UserError, match="7 folds: between 2 and 6 are possible, for 8 sequences"):
         folds(clips, 7, 0)
-    with pytest.raises(UserError, match="need at least 3"):
-        nested(clips, 2, 0, 0)
+    with pytest.raises(UserError, match="fit, select and test need an anatomy each: 2 are there"):
+        nested(clips[:3], 2, 0, 0)
     with pytest.raises(UserError, match="there are folds 0 to 2"):
         nested(clips, 3, 3, 0)
 

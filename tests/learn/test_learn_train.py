@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 from learn import checkpoint
 from learn.cli import app
 from learn.data import Clip
-from learn.evaluate import evaluate, unseen
+from learn.evaluate import unseen
 from learn.predict import load as load_model
 from learn.settings import Settings, preset
 from learn.split import Split, nested
@@ -73,13 +73,12 @@ def test_another_seed_is_another_model(clips: list[Clip], split: Split, model: P
 
 
 def test_training_learns(clips: list[Clip], tmp_path: Path) -> None:
-    """Fitted and judged on the same clips: a network that can't even remember is broken."""
-    both = Split((0, 1, 3, 4, 5, 6), (2,), ())
-    settings = dataclasses.replace(small(epochs=60), batch=4, augment=False)
+    """A network that can't even come to remember what it is shown is broken; one that is stuck loses 0.9."""
+    settings = dataclasses.replace(small(epochs=8), batch=4, augment=False, learning_rate=5e-3)
     settings = dataclasses.replace(settings, arch=dataclasses.replace(settings.arch, dropout=0.0))
-    train(clips, both, settings, tmp_path / "m")
-    report = evaluate(load_model(tmp_path / "m"), [clips[i] for i in both.fit], "ideal")
-    assert report.summary()["map_r2_pooled"] > 0.5
+    train(clips, Split((0, 1, 3, 4, 5, 6), (2,), ()), settings, tmp_path / "m")
+    losses = [json.loads(line)["loss"] for line in (tmp_path / "m/history.jsonl").read_text().splitlines()]
+    assert losses[-1] < 0.6 < 0.8 < losses[0]
 
 
 def test_history_reports_loss_and_gradient_shares(model: Path) -> None:
@@ -168,7 +167,7 @@ def test_corrupt_checkpoints(model: Path, tmp_path: Path) -> None:
     with pytest.raises(UserError, match="corrupt model configuration"):
         load_model(broken(model, tmp_path / "c", "config.json", b"{}"))
     config = json.loads((model / "config.json").read_text())
-    config["settings"]["arch"]["width"] = 16
+    config["settings"]["arch"]["width"] = 8
     with pytest.raises(UserError, match=r"not those of the network in config\.json"):
         load_model(broken(model, tmp_path / "d", "config.json", json.dumps(config).encode()))
     with pytest.raises(UserError, match="no model here"):

@@ -1,0 +1,89 @@
+"""Sequences for learning without a picture: physics and projection only, straight onto the network's grid.
+
+Whatever asks only for ideal flow needs no light. The motion, camera and label are those of the pipeline
+(same functions, same draws), a core-second a sequence; nothing here can stand in for recovered flow.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from learn.data import Clip, pack, unpack
+from learn.grid import Grid, Resampler, centre
+from synth import identity, scenario
+from synth.fem import mesh, solver
+from synth.fem.mesh import Tets
+from synth.job import Job
+from synth.render import anatomy, camera, rim, truth
+from synth.render.shape import Shape
+
+
+def clips(
+    job: Job, grid: Grid, cache: Path, report: Callable[[int, int], None] = lambda done, of: None
+) -> list[Clip]:
+    """All sequences of a job with ideal flow, from the cache where it has them."""
+    tets = mesh.block(job.anatomy, job.fem.tets, job.fem.order)
+    out = []
+    for index in range(job.sequences):
+        report(index, job.sequences)
+        name = hashlib.blake2b(
+            identity.canonical([identity.of(job), index, grid.size, grid.extent_mm]), digest_size=16
+        ).hexdigest()
+        if not (cache / name).is_dir():
+            pack(clip(job, index, grid, tets, name), cache / name)
+        out.append(unpack(cache / name))
+    report(job.sequences, job.sequences)
+    return out
+
+
+def clip(job: Job, index: int, grid: Grid, tets: Tets, name: str) -> Clip:
+    """One sequence of a procedural job: deformed, projected, put on the grid."""
+    case = scenario.draw(job, index)
+    view = camera.place(case.view, job.render)
+    surface = anatomy.procedural(case.relief, job.anatomy)
+    motion = solver.deform(
+        job.fem,
+        job.anatomy.craniotomy,
+        case.tissue,
+        case.gesture,
+        tets,
+        surface.vertices,
+        surface.faces,
+        job.frames,
+        job.fps,
+    )
+    frame = rim.build(surface, job.anatomy.craniotomy.radius_mm, case.look).shape
+    still = truth.still(view, Shape(surface.vertices, surface.faces), frame)
+    resample = Resampler(
+        (still.tissue.shape[0], still.tissue.shape[1]), still.scale_mm_per_px, centre(still.tissue), grid
+    )
+    mask = (resample.cover(still.tissue) > 0.5).astype(np.float32)
+    moved = np.empty((job.frames, 2, grid.size, grid.size), np.float32)
+    density = np.empty((job.frames, 3, grid.size, grid.size), np.float32)
+    rest = None
+    for t in range(job.frames):
+        place = truth.at_rest_pixels(still, surface.faces, motion.rest + motion.displacement[t])
+        seen = camera.project(view, place.reshape(-1, 3).astype(np.float64)).reshape(*place.shape[:2], 2)
+        rest = seen if rest is None else rest
+        flow = np.where(still.tissue[..., None], seen - rest, 0.0).transpose(2, 0, 1)
+        moved[t] = resample.mean(flow * still.scale_mm_per_px, still.tissue) * mask
+        load = truth.at_rest_pixels(still, surface.faces, motion.traction[t] @ view.rotation.T)
+        amount = load.transpose(2, 0, 1) * still.area
+        density[t] = resample.sum(amount) * mask / (grid.pitch_mm**2 * case.tissue.young_kpa)
+    return Clip(
+        name=f"{index:06d}",
+        content_hash=name,
+        group=str(case.relief.seed),
+        family=case.family,
+        gesture=case.gesture.kind,
+        young_kpa=case.tissue.young_kpa,
+        mask=mask,
+        displacement={"ideal": moved},
+        confidence=np.ones((job.frames, grid.size, grid.size), np.float32),
+        density=density,
+        force=motion.force @ view.rotation.T,
+    )
