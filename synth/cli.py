@@ -110,6 +110,15 @@ def retry(out: Out, workers: Annotated[int | None, typer.Option(min=1)] = None, 
 
 
 @app.command()
+def status(out: Out, json: Json = False) -> None:
+    """Says what is done, running and failed, and what is still to come in time and disk."""
+    from synth import status as standing
+
+    found = standing.of(out)
+    print(json_.dumps(found.as_dict()) if json else "\n".join(standing.lines(found)))
+
+
+@app.command()
 def card(out: Out) -> None:
     """Writes the dataset's card anew: README.md, its charts and pictures."""
     from synth import card as carding

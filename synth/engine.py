@@ -11,11 +11,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
 
-from synth import card, index, llvm, preview
+from synth import card, forecast, index, llvm, preview
 from synth.child import Attempt, Child, Setup
 from synth.errors import UserError
 from synth.folder import Folder, claim
 from synth.job import Job
+from synth.journal import Journal
 
 _TRIES = 3
 # A process that has computed so many is replaced: libraries leak a little with every sequence.
@@ -75,7 +76,10 @@ def run(job: Job, root: Path, options: Options, watcher: Watcher) -> Summary:
     with claim(root, job) as folder:
         finished, failures = set(folder.sealed()), folder.failures()
         todo = [k for k in range(job.sequences) if k not in finished and k not in failures]
-        watcher.begin(job.sequences, len(finished), len(failures))
+        forecast.refuse_if_too_large(forecast.of(job, root, len(todo), sorted(finished), []), root)
+        watchers = (watcher, Journal(folder, workers))
+        for each in watchers:
+            each.begin(job.sequences, len(finished), len(failures))
         setup = Setup(
             job=job.model_dump(mode="json"),
             folder=root,
@@ -88,7 +92,7 @@ def run(job: Job, root: Path, options: Options, watcher: Watcher) -> Summary:
             environment={**_machine(job, workers), **options.environment},
         )
         try:
-            done = _Pool(folder, setup, todo, min(workers, max(len(todo), 1))).work(watcher)
+            done = _Pool(folder, setup, todo, min(workers, max(len(todo), 1))).work(watchers)
         except BaseException:
             index.write(folder)
             raise
@@ -120,7 +124,7 @@ class _Pool:
         self._done = 0
         self._refused: list[Attempt] = []
 
-    def work(self, watcher: Watcher) -> int:
+    def work(self, watchers: tuple[Watcher, ...]) -> int:
         """Runs until nothing is left to do; returns how many were finished."""
         threads = [threading.Thread(target=self._thread, daemon=True) for _ in range(self._workers)]
         for thread in threads:
@@ -134,7 +138,8 @@ class _Pool:
                 elif isinstance(event, BaseException):
                     raise event
                 else:
-                    event(watcher)
+                    for watcher in watchers:
+                        event(watcher)
         finally:
             self._stop.set()
             with self._change:

@@ -144,14 +144,15 @@ def claim(root: Path, job: Job) -> Iterator[Folder]:
         raise
 
 
-def write_whole(path: Path, text: str | bytes) -> None:
-    """Writes a small file so that it is there in full or not at all."""
+def write_whole(path: Path, text: str | bytes, *, durable: bool = True) -> None:
+    """Writes a small file so that it is there in full or not at all; `durable`: after a power failure too."""
     data = text.encode() if isinstance(text, str) else text
     part = path.with_name(f".{path.name}.part")
     with part.open("wb") as file:
         file.write(data)
-        file.flush()
-        os.fsync(file.fileno())
+        if durable:
+            file.flush()
+            os.fsync(file.fileno())
     part.rename(path)
 
 

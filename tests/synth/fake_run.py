@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable
 from pathlib import Path
 
 from synth.child import Attempt
-from synth.engine import Options
+from synth.engine import Options, run
+from synth.job import Job
 
 HERE = Path(__file__).resolve().parent
 
@@ -30,3 +35,26 @@ class Silent:
 def options(work: str, **more: object) -> Options:
     path = os.pathsep.join([str(HERE), str(HERE.parents[1])])
     return Options(work=f"fake_work:{work}", environment={"PYTHONPATH": path}, **{"workers": 2, **more})  # type: ignore[arg-type]
+
+
+def start(root: Path, job: Job, work: str) -> subprocess.Popen[bytes]:
+    """A run in a process of its own, which can be killed."""
+    program = (
+        "import sys; sys.path[:0] = sys.argv[4:]; from pathlib import Path; import fake_run; "
+        "fake_run.run_job(Path(sys.argv[1]), sys.argv[2], sys.argv[3])"
+    )
+    words = [str(root), job.model_dump_json(), work, str(HERE), str(HERE.parents[1])]
+    return subprocess.Popen([sys.executable, "-c", program, *words])
+
+
+def run_job(root: Path, job: str, work: str) -> None:
+    """What the process of `start` does."""
+    run(Job.model_validate_json(job), root, options(work), Silent())
+
+
+def wait_for(condition: Callable[[], bool], seconds: float = 60.0) -> None:
+    """Returns as soon as the condition holds; AssertionError when it never does."""
+    until = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < until, "nothing happened"
+        time.sleep(0.02)

@@ -87,6 +87,13 @@ def refused(job: Job, index: int, folder: Path, report: Report) -> None:
     raise UserError("no surface at the craniotomy")
 
 
+def trying(job: Job, index: int, folder: Path, report: Report) -> None:
+    """Sequences 2 and 6 cannot be carried out."""
+    if index in (2, 6):
+        raise UserError("the load is past the material's range")
+    sequence(job, index, folder, report)
+
+
 def full(job: Job, index: int, folder: Path, report: Report) -> None:
     """The disk is full at the third sequence."""
     if index >= 2:

@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import signal
-import subprocess
-import sys
-import time
 from pathlib import Path
 
 import pytest
-from fake_run import Silent, options
+from fake_run import Silent, options, start, wait_for
 
 from synth import engine, index
 from synth.engine import Summary
@@ -17,7 +14,6 @@ from synth.errors import UserError
 from synth.folder import Folder
 from synth.job import Job
 
-HERE = Path(__file__).resolve().parent
 JOB = Job(seed=2, sequences=6, frames=3, render={"size": (32, 24)}, flow={"backend": "ideal"})
 
 
@@ -120,7 +116,7 @@ def test_another_jobs_dataset_and_other_files_are_never_touched(tmp_path: Path) 
 
 def test_two_runs_on_one_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("synth.folder._LOCK_WAIT_S", 0.3)
-    first = start(tmp_path / "out")
+    first = start(tmp_path / "out", JOB, "slow")
     try:
         wait_for(lambda: (tmp_path / "out/.run/lock").exists())
         with pytest.raises(UserError, match="another run is writing"):
@@ -137,7 +133,7 @@ def test_folder_names_with_spaces_and_other_letters(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("kill", [signal.SIGKILL, signal.SIGINT, signal.SIGTERM])
 def test_killed_and_resumed_equals_undisturbed(tmp_path: Path, kill: signal.Signals) -> None:
-    victim = start(tmp_path / "out")
+    victim = start(tmp_path / "out", JOB, "slow")
     wait_for(lambda: len(list((tmp_path / "out").glob("*.zarr"))) >= 2)
     victim.send_signal(kill)
     victim.wait(timeout=30)
@@ -148,19 +144,3 @@ def test_killed_and_resumed_equals_undisturbed(tmp_path: Path, kill: signal.Sign
     assert (resumed.already, resumed.done) == (left, 6 - left)
     assert resumed.content_hash == run(tmp_path / "undisturbed").content_hash
     assert not list((tmp_path / "out").glob("*.part"))
-
-
-def start(root: Path) -> subprocess.Popen[bytes]:
-    """A run of its own, slow enough to be met half-way."""
-    program = (
-        "import sys; sys.path[:0] = sys.argv[2:]; from pathlib import Path; import test_engine as here; "
-        "here.run(Path(sys.argv[1]), 'slow')"
-    )
-    return subprocess.Popen([sys.executable, "-c", program, str(root), str(HERE), str(HERE.parents[1])])
-
-
-def wait_for(condition: object, seconds: float = 30.0) -> None:
-    until = time.monotonic() + seconds
-    while not condition():  # type: ignore[operator]
-        assert time.monotonic() < until, "nothing happened"
-        time.sleep(0.02)

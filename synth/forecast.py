@@ -1,0 +1,87 @@
+"""What a run will take: time and disk, from the sequences that are finished, or from the field table."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from synth.errors import UserError
+from synth.fields import FIELDS
+from synth.job import Job
+
+# Stored size over raw size, measured on rendered sequences; used only until one is finished.
+_PACKED = {"rgb": 1.0, "flow": 0.4, "flow_tvl1": 0.5, "flow_confidence": 0.3, "depth": 0.6, "traction": 0.05}
+_OTHERS_PACKED = 0.1
+# Kept free, so that index, card and the system's own files find room.
+_RESERVE_BYTES = 200e6
+
+
+@dataclass(frozen=True)
+class Forecast:
+    """Disk and processor time of what is still to be done."""
+
+    sequences: int
+    """Sequences to do."""
+    bytes: float
+    cpu_s: float | None
+    """None until a sequence is finished."""
+    pilot: int
+    """Finished sequences that the forecast rests on; 0: on the field table."""
+
+
+def of(job: Job, root: Path, todo: int, done: Sequence[int], rows: Sequence[Mapping[str, Any]]) -> Forecast:
+    """Forecast for `todo` sequences; up to ten finished ones, spread over the dataset, serve as pilot."""
+    pilot = [done[int(k)] for k in np.unique(np.linspace(0, len(done) - 1, 10).astype(int))] if done else []
+    each = np.mean([size(root / f"{key:06d}.zarr") for key in pilot]) if pilot else estimate(job)
+    spent = [float(row["cpu_s"]) for row in rows if isinstance(row.get("cpu_s"), float)]
+    cpu = float(np.mean(spent)) * todo if spent else None
+    return Forecast(todo, float(each) * todo, cpu, len(pilot))
+
+
+def estimate(job: Job) -> float:
+    """Bytes of one sequence of `job`, before any is made."""
+    width, height = job.render.size
+    total = 0.0
+    for field in FIELDS.values():
+        if field.optional and job.flow.backend == "ideal":
+            continue
+        shape = field.shape(job.frames, (height, width))
+        total += (
+            float(np.prod(shape)) * np.dtype(field.dtype).itemsize * _PACKED.get(field.name, _OTHERS_PACKED)
+        )
+    radiance = 6.0 * width * height * job.frames if job.render.exr else 0.0
+    return total + radiance
+
+
+def size(path: Path) -> int:
+    """Bytes of all files under `path`."""
+    total = 0
+    with os.scandir(path) as entries:
+        for entry in entries:
+            total += size(Path(entry.path)) if entry.is_dir() else entry.stat().st_size
+    return total
+
+
+def refuse_if_too_large(forecast: Forecast, root: Path) -> None:
+    """UserError when the disk has no room for what is to be done."""
+    free = shutil.disk_usage(root).free
+    if forecast.bytes + _RESERVE_BYTES > free:
+        basis = f"from {forecast.pilot} finished sequences" if forecast.pilot else "estimated"
+        raise UserError(
+            f"{root}: {forecast.sequences} sequences need {amount(forecast.bytes)} ({basis}), "
+            f"the disk has {amount(free)} free"
+        )
+
+
+def amount(size_bytes: float) -> str:
+    """1.2 kB, 34 MB, 5.6 GB, 7.8 TB."""
+    for unit, scale in (("TB", 1e12), ("GB", 1e9), ("MB", 1e6)):
+        if size_bytes >= scale:
+            return f"{size_bytes / scale:.3g} {unit}"
+    return f"{size_bytes / 1e3:.3g} kB"

@@ -1,0 +1,133 @@
+"""How a dataset stands: done, running, failed and why, how long and how much is still to come."""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import shutil
+from collections import Counter
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from synth import forecast
+from synth.errors import UserError
+from synth.folder import Folder
+from synth.forecast import Forecast
+from synth.progress import clock
+from synth.store import open_sequence
+
+_PILOT = 10
+
+
+@dataclass(frozen=True)
+class Status:
+    """A dataset at one moment."""
+
+    total: int
+    done: int
+    failed: dict[str, int]
+    """How many failed for each reason."""
+    running: bool
+    """Whether a run is writing to it now."""
+    in_flight: dict[str, list[Any]]
+    """Stage, steps done and steps in all of the sequences being computed."""
+    left_s: float | None
+    """Time to the end, at the rate of the run at work."""
+    ahead: Forecast
+    disk_free: int
+    stages_cpu_s: dict[str, float]
+    """CPU-seconds a sequence by stage, mean of up to ten finished ones."""
+
+    def as_dict(self) -> dict[str, Any]:
+        return asdict(self)
+
+
+def of(root: Path) -> Status:
+    """The status of the dataset in `root`. UserError if there is none."""
+    folder = Folder(root)
+    job, done = folder.job(), folder.sealed()
+    failures = folder.failures()
+    todo = max(0, job.sequences - len(done) - len(set(failures) - set(done)))
+    journal = _journal(folder)
+    pilot = [done[k * len(done) // _PILOT] for k in range(_PILOT)] if len(done) > _PILOT else done
+    stages = _stages(root, pilot)
+    return Status(
+        total=job.sequences,
+        done=len(done),
+        failed=dict(Counter(failure["reason"] for failure in failures.values()).most_common()),
+        running=journal is not None,
+        in_flight=journal["in_flight"] if journal else {},
+        left_s=journal["left_s"] if journal else None,
+        ahead=forecast.of(job, root, todo, done, [{"cpu_s": sum(stages.values())}] if stages else []),
+        disk_free=shutil.disk_usage(root).free,
+        stages_cpu_s=stages,
+    )
+
+
+def lines(status: Status) -> list[str]:
+    """The same for a person."""
+    count = sum(status.failed.values())
+    found = [f"{status.done} of {status.total} sequences done, {count} failed"]
+    found += [f"  {number} x {reason}" for reason, number in list(status.failed.items())[:10]]
+    if count:
+        found.append("  `synth retry` takes the failed ones up again")
+    if status.running:
+        left = f", {clock(status.left_s)} left" if status.left_s is not None else ""
+        found.append(f"a run is at work{left}")
+        found += [
+            f"  {int(key):06d} {stage} {step} of {of}" for key, (stage, step, of) in status.in_flight.items()
+        ]
+    elif status.ahead.sequences:
+        found.append("no run is at work; `synth render` with the same job and folder goes on")
+    if status.stages_cpu_s:
+        each = ", ".join(f"{name} {seconds:.1f}" for name, seconds in status.stages_cpu_s.items())
+        found.append(f"CPU-seconds a sequence: {each}")
+    if status.ahead.sequences:
+        ahead, basis = (
+            status.ahead,
+            f"from {status.ahead.pilot} finished" if status.ahead.pilot else "estimated",
+        )
+        time = f", {clock(ahead.cpu_s)} of one core" if ahead.cpu_s is not None else ""
+        found.append(
+            f"still to come: {ahead.sequences} sequences, {forecast.amount(ahead.bytes)}{time} ({basis}); "
+            f"the disk has {forecast.amount(status.disk_free)} free"
+        )
+    return found
+
+
+def _journal(folder: Folder) -> dict[str, Any] | None:
+    """What the run at work says of itself; None when none is at work."""
+    try:
+        descriptor = os.open(folder.state / "lock", os.O_RDONLY)
+    except FileNotFoundError:
+        return None
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return _account(folder)
+    finally:
+        os.close(descriptor)
+    return None
+
+
+def _account(folder: Folder) -> dict[str, Any]:
+    try:
+        found: dict[str, Any] = json.loads((folder.state / "progress.json").read_text("utf-8"))
+    except (FileNotFoundError, ValueError):  # it has only just begun
+        return {"in_flight": {}, "left_s": None}
+    return found
+
+
+def _stages(root: Path, pilot: list[int]) -> dict[str, float]:
+    total: Counter[str] = Counter()
+    read = 0
+    for key in pilot:
+        try:
+            timings = open_sequence(root / f"{key:06d}.zarr").attrs.get("timings", {})
+        except UserError:
+            continue  # `synth verify` is for damage
+        read += 1
+        total.update({name: stage["cpu_s"] for name, stage in timings.items() if isinstance(stage, dict)})
+    return {name: seconds / read for name, seconds in total.items()} if read else {}
