@@ -84,10 +84,9 @@ def paint(rim: Rim, look: Look, pixels: int) -> Coat:
     colour = dura * (1 - beyond) + flesh * beyond
     colour = colour * (1 - 0.7 * yellow) + fat * 0.7 * yellow
     # Blood runs and gathers: thick where the noise says so and in the fold behind the flap.
-    gathered = (
-        look.blood * (1.0 + 0.9 * wide + 0.6 * mid) - 0.75 + 0.5 * np.exp(-(((away - reach) / 0.7) ** 2))
-    )
-    blood = np.clip(gathered, 0, 1.2)
+    fold = np.exp(-(((away - reach) / 0.8) ** 2))
+    gathered = 2.2 * look.blood - 1.5 + 0.7 * wide + 0.45 * mid + 0.04 * fine + 0.7 * fold
+    blood = 0.06 + 0.3 * np.log1p(np.exp(3 * gathered))
     colour = colour * np.exp(-blood[..., None] * np.array([0.45, 3.4, 3.6], np.float32))
     colour = colour * (1 + 0.25 * np.exp(-((away / 0.3) ** 2)))[..., None]
     colour = np.clip(colour, 0.006, 0.92).astype(np.float32)

@@ -52,16 +52,14 @@ def grow_all(sulci: Map, extent_mm: float, rng: np.random.Generator) -> Vessels:
         extent_mm: side of the square that the map covers.
         rng: where the anatomy comes from.
     """
-    vein_roots, vein_radius = _trunks(
-        sulci, extent_mm, rng, count=int(rng.integers(2, 4)), radius=(0.32, 0.62)
-    )
-    veins = _tree(sulci, extent_mm, rng, vein_roots, spacing=3.2, leaf=0.13, wander=0.5)
-    veins = _widen(veins, vein_radius)
-    roots, radius = _trunks(sulci, extent_mm, rng, count=int(rng.integers(4, 7)), radius=(0.13, 0.22))
-    arteries = _tree(sulci, extent_mm, rng, roots, spacing=1.05, leaf=0.042, wander=0.45)
+    many = extent_mm / 34.0
+    trunks, radius = _trunks(sulci, extent_mm, rng, round(many * rng.integers(1, 4)), (0.50, 0.95))
+    veins = _tree(extent_mm, rng, trunks, spacings=(4.2,), leaf=0.13, wander=0.5)
+    veins = _widen(veins, radius)
+    trunks, radius = _trunks(sulci, extent_mm, rng, round(many * rng.integers(3, 6)), (0.20, 0.36))
+    arteries = _tree(extent_mm, rng, trunks, spacings=(3.6, 1.7), leaf=0.062, wander=0.45)
     arteries = _widen(arteries, radius)
-    capillaries = _web(arteries, extent_mm, rng)
-    return Vessels(veins=veins, arteries=arteries, capillaries=capillaries)
+    return Vessels(veins, arteries, _web(arteries, extent_mm, rng))
 
 
 def raster(tree: Tree, pixels: int, extent_mm: float) -> tuple[Map, Map]:
@@ -196,7 +194,7 @@ def _trunks(
     nodes, parents, radii = [], [], []
     total = 0
     taken = np.zeros((side, side), np.float32)
-    for trunk in range(count):
+    for trunk in range(max(1, count)):
         cost = 0.12 + (1 - np.clip(depth, 0, 1)) ** 2 + 0.35 * rng.random((side, side)) + 2.5 * taken
         angle = rng.uniform(0, 2 * np.pi) + trunk * 2 * np.pi / count
         turn = rng.uniform(0.6, 1.0) * np.pi
@@ -216,55 +214,71 @@ def _trunks(
 
 
 def _tree(
-    sulci: Map,
     extent_mm: float,
     rng: np.random.Generator,
-    roots: tuple[Floats, Ints],
+    trunks: tuple[Floats, Ints],
     *,
-    spacing: float,
+    spacings: tuple[float, ...],
     leaf: float,
     wander: float,
 ) -> Tree:
-    attractors = _scattered(extent_mm, spacing, rng)
-    fixed = len(roots[0])
-    nodes, parent = grow(
-        *roots,
-        attractors,
-        buds=rng.random(fixed) < 0.18 / (1.6 * spacing),
-        step=0.18 * min(spacing, 1.5),
-        reach=9.0,
-        kill=0.55 * spacing,
-        wander=wander,
-        rng=rng,
-    )
+    """Branches from the trunks, then finer ones from those, one round for each spacing [mm]."""
+    nodes, parent = trunks
+    fixed = len(nodes)
+    for spacing in spacings:
+        step = 0.15 * min(spacing, 1.6)
+        between = np.linalg.norm(nodes[1] - nodes[0])
+        grown = len(nodes)
+        nodes, parent = grow(
+            nodes,
+            parent,
+            _scattered(extent_mm, spacing, rng),
+            buds=rng.random(grown) < between / (1.3 * spacing),
+            step=step,
+            reach=9.0,
+            kill=0.5 * spacing,
+            wander=wander,
+            rng=rng,
+        )
+        nodes, parent = _pruned(nodes, parent, grown, shortest=int(0.7 * spacing / step))
     nodes = _relaxed(nodes, parent, fixed, rounds=4)
     nodes = nodes + _meander(rng, nodes, extent_mm, 0.3)
-    return Tree(nodes, parent, murray(parent, leaf))
+    return Tree(nodes, parent, murray(parent, leaf) * _taper(nodes, parent, 1.6))
 
 
 def _web(arteries: Tree, extent_mm: float, rng: np.random.Generator) -> Tree:
     """Twigs finer than the arteries' own, grown from them into what they left empty."""
+    fixed = len(arteries.nodes)
     nodes, parent = grow(
         arteries.nodes,
         arteries.parent,
-        _scattered(extent_mm, 0.42, rng),
-        buds=rng.random(len(arteries.nodes)) < 0.2,
-        step=0.11,
-        reach=1.6,
-        kill=0.2,
+        _scattered(extent_mm, 0.7, rng),
+        buds=rng.random(fixed) < 0.25,
+        step=0.13,
+        reach=2.4,
+        kill=0.33,
         wander=0.45,
         rng=rng,
     )
-    fixed = len(arteries.nodes)
     nodes = _relaxed(nodes, parent, fixed, rounds=3)
-    own = murray(parent, 0.019)
-    new = np.flatnonzero(np.arange(len(nodes)) >= fixed)
-    # Only the twigs: their roots sit on arteries, which are drawn on their own.
-    local = np.full(len(nodes), -1, np.int64)
-    local[new] = np.arange(len(new))
-    return Tree(
-        nodes[new], np.where(parent[new] >= fixed, local[parent[new]], -1), np.minimum(own[new], 0.05)
-    )
+    radius = np.minimum(murray(parent, 0.028), 0.06) * _taper(nodes, parent, 0.8)
+    # Only the twigs and what they spring from: the arteries are drawn on their own.
+    drawn = np.arange(len(nodes)) >= fixed
+    drawn[parent[fixed:]] = True
+    number = np.cumsum(drawn) - 1
+    up = np.where(np.arange(len(nodes)) >= fixed, number[parent], -1)
+    return Tree(nodes[drawn], up[drawn], radius[drawn])
+
+
+def _taper(nodes: Floats, parent: Ints, length: float) -> Floats:
+    """Factor (N,) by which vessels thin over the last `length` mm before their ends."""
+    up = parent.tolist()
+    segment = np.linalg.norm(nodes - nodes[np.maximum(parent, 0)], axis=1).tolist()
+    left = [0.0] * len(up)
+    for node in range(len(up) - 1, -1, -1):
+        if up[node] >= 0:
+            left[up[node]] = max(left[up[node]], left[node] + segment[node])
+    return np.asarray(0.4 + 0.6 * np.clip(np.asarray(left) / length, 0, 1))
 
 
 def _widen(tree: Tree, trunk: Floats) -> Tree:
@@ -273,6 +287,23 @@ def _widen(tree: Tree, trunk: Floats) -> Tree:
     widest = trunk.max()
     radius[len(trunk) :] = np.minimum(radius[len(trunk) :], 0.8 * widest)
     return Tree(tree.nodes, tree.parent, radius)
+
+
+def _pruned(nodes: Floats, parent: Ints, fixed: int, shortest: int) -> tuple[Floats, Ints]:
+    """Without side twigs of fewer than `shortest` nodes, which look cut off."""
+    links = parent.tolist()
+    reach = [1] * len(links)
+    for node in range(len(links) - 1, -1, -1):
+        if links[node] >= 0:
+            reach[links[node]] = max(reach[links[node]], reach[node] + 1)
+    keep = [True] * len(links)
+    for node in range(fixed, len(links)):
+        up = links[node]
+        side_twig = up < fixed or reach[node] + 1 < reach[up]
+        keep[node] = keep[up] and not (side_twig and reach[node] < shortest)
+    kept = np.flatnonzero(keep)
+    number = np.cumsum(keep) - 1
+    return nodes[kept], np.where(parent[kept] >= 0, number[parent[kept]], -1)
 
 
 def _scattered(extent_mm: float, spacing: float, rng: np.random.Generator) -> Floats:
