@@ -112,7 +112,7 @@ def bulge(tree: vessels.Tree, extent_mm: float) -> Map:
     """Height of vessels above the pia, (n, n) mm: half sunk round tubes with soft shoulders."""
     distance, radius = vessels.raster(tree, _BULGE_PX, extent_mm)
     inside = np.sqrt(np.maximum(radius**2 - distance**2, 0)) * 0.75
-    return noise.blur(inside.astype(np.float32), 0.07, extent_mm)
+    return noise.blur(inside.astype(np.float32), 0.14, extent_mm)
 
 
 def _extent(anatomy: job.Anatomy) -> float:
@@ -132,7 +132,7 @@ def _folds(relief: Relief, extent_mm: float) -> Map:
     pixel = extent_mm / _RELIEF_PX
     slope = np.hypot(*np.gradient(waves, pixel))
     away = np.abs(waves) / np.maximum(noise.blur(slope.astype(np.float32), 1.0, extent_mm), 1e-3)
-    valley = np.exp(-0.5 * (away / 0.9) ** 2) * 0.65 + np.exp(-0.5 * (away / 2.8) ** 2) * 0.35
+    valley = np.exp(-0.5 * (away / 0.9) ** 2) * 0.4 + np.exp(-0.5 * (away / 3.6) ** 2) * 0.6
     fade = np.clip(0.5 + 0.45 * noise.band(rng, _RELIEF_PX, extent_mm, 1.6 * relief.gyrus_mm, 0.3), 0.25, 1.0)
     return noise.blur((valley * fade).astype(np.float32), 0.25, extent_mm)
 

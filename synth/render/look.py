@@ -30,7 +30,7 @@ _FAMILIES: dict[str, _Ranges] = {
     "healthy": _Ranges(
         crown=(0.93, 0.7, 0.38),
         flush=(0.9, 0.55, 0.36),
-        vein=(0.155, 0.135, 0.2),
+        vein=(0.135, 0.125, 0.19),
         arterial=(1.1, 1.5),
         capillary=(1.4, 2.2),
         blush=(0.3, 0.9),

@@ -72,10 +72,10 @@ def paint(rim: Rim, look: Look, pixels: int) -> Coat:
         np.float32
     )
     wide = noise.fractal(rng, pixels, extent, 7.0, 2.2)
-    mid = noise.fractal(rng, pixels, extent, 2.2, 1.9)
-    fine = noise.fractal(rng, pixels, extent, 0.7, 1.5)
+    mid = noise.fractal(rng, pixels, extent, 2.2, 2.5)
+    fine = noise.fractal(rng, pixels, extent, 0.8, 2.0)
     dura = np.array([0.80, 0.52, 0.44], np.float32) * (1 + 0.06 * fine + 0.08 * mid)[..., None]
-    flesh = np.array([0.50, 0.075, 0.045], np.float32) * (1 + 0.30 * mid + 0.15 * fine)[..., None]
+    flesh = np.array([0.52, 0.085, 0.05], np.float32) * (1 + 0.12 * mid + 0.03 * fine)[..., None]
     fat = np.array([0.70, 0.42, 0.20], np.float32) * (1 + 0.12 * fine)[..., None]
     reach = 2.6 + 1.1 * wide
     beyond = _step((away - reach) / 0.5 + 0.5 * mid)
@@ -90,8 +90,8 @@ def paint(rim: Rim, look: Look, pixels: int) -> Coat:
     colour = colour * np.exp(-blood[..., None] * np.array([0.45, 3.4, 3.6], np.float32))
     colour = colour * (1 + 0.25 * np.exp(-((away / 0.3) ** 2)))[..., None]
     colour = np.clip(colour, 0.006, 0.92).astype(np.float32)
-    bumps = 0.020 * mid + 0.006 * fine + 0.012 * noise.band(rng, pixels, extent, 1.0, 0.5)
-    return Coat(colour, normals(noise.blur(bumps.astype(np.float32), 0.06, extent), extent))
+    bumps = 0.05 * mid + 0.008 * fine + 0.02 * noise.band(rng, pixels, extent, 1.2, 0.5)
+    return Coat(colour, normals(noise.blur(bumps.astype(np.float32), 0.1, extent), extent))
 
 
 def _outline(rng: np.random.Generator, angle: Floats) -> Floats:

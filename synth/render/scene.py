@@ -22,8 +22,8 @@ Floats = npt.NDArray[np.float64]
 Map = npt.NDArray[np.float32]
 Mask = npt.NDArray[np.bool_]
 
-_STEEL = Metal(reflectance=(0.80, 0.80, 0.79), along=0.24, across=0.11, satin=0.28)
-_RIM_ROUGHNESS = 0.11
+_STEEL = Metal(reflectance=(0.88, 0.88, 0.87), along=0.14, across=0.5, satin=0.4)
+_RIM_ROUGHNESS = 0.06
 _GLARE = 0.35  # specular radiance, as a share of full scale, that hides what is under it
 
 

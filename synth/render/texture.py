@@ -108,8 +108,8 @@ def _veined(albedo: Map, tube: tuple[Map, Map], look: Look, extent: float) -> Ma
     colour = np.asarray(look.vein, np.float32) * thick + np.array([0.34, 0.10, 0.13], np.float32) * (
         1 - thick
     )
-    wall = (1.25 - 0.45 * depth)[..., None] * colour
-    cover = noise.blur(np.clip(depth * 2.2, 0, 1).astype(np.float32), 0.045, extent)[..., None]
+    wall = (1.15 - 0.4 * depth)[..., None] * colour
+    cover = noise.blur(np.clip(depth * 2.5, 0, 1).astype(np.float32), 0.03, extent)[..., None]
     halo = noise.blur((depth > 0).astype(np.float32), 0.28, extent)[..., None]
     soft = albedo * np.exp(-0.9 * halo * np.array([0.35, 1.0, 0.75], np.float32))
     return np.asarray(soft * (1 - 0.95 * cover) + wall * 0.95 * cover, np.float32)
@@ -125,7 +125,7 @@ def _film(
     pools = cv2.resize(noise.fractal(rng, coarse, extent, 5.0, 1.5), (pixels, pixels))
     # Mostly a smooth pool; where the film is thin the pia's own grain breaks the highlights up.
     dry = np.clip(0.6 * pools - 0.25, 0.05, 1.0)
-    swell = noise.band(rng, coarse, extent, 2.4, 0.5) * 0.016
+    swell = noise.band(rng, coarse, extent, 2.4, 0.5) * 0.009
     rough = noise.band(rng, coarse, extent, 0.55, 0.5) * 0.0060
     fine = noise.band(rng, pixels, extent, 0.22, 0.45) * 0.0016
     swell = cv2.resize(swell, (pixels, pixels), interpolation=cv2.INTER_CUBIC)

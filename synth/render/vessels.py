@@ -57,7 +57,7 @@ def grow_all(sulci: Map, extent_mm: float, rng: np.random.Generator) -> Vessels:
     veins = _tree(extent_mm, rng, trunks, spacings=(4.2,), leaf=0.13, wander=0.5)
     veins = _widen(veins, radius)
     trunks, radius = _trunks(sulci, extent_mm, rng, round(many * rng.integers(3, 6)), (0.20, 0.36))
-    arteries = _tree(extent_mm, rng, trunks, spacings=(3.6, 1.7), leaf=0.062, wander=0.45)
+    arteries = _tree(extent_mm, rng, trunks, spacings=(3.4, 1.4), leaf=0.058, wander=0.45)
     arteries = _widen(arteries, radius)
     return Vessels(veins, arteries, _web(arteries, extent_mm, rng))
 
@@ -203,7 +203,7 @@ def _trunks(
         taken[path[:, 1].astype(int), path[:, 0].astype(int)] = 1.0
         taken = np.maximum(taken, cv2.GaussianBlur(taken, (0, 0), 1.5))
         line = ((path + 0.5) / side - 0.5) * extent_mm
-        line = _resampled(_smoothed(line, 6), 0.18)
+        line = _resampled(_smoothed(line, 14), 0.18)
         line = line + _meander(rng, line, extent_mm, 0.55)
         nodes.append(line)
         parents.append(np.concatenate([[-1], np.arange(len(line) - 1) + total]))
@@ -252,11 +252,11 @@ def _web(arteries: Tree, extent_mm: float, rng: np.random.Generator) -> Tree:
     nodes, parent = grow(
         arteries.nodes,
         arteries.parent,
-        _scattered(extent_mm, 0.7, rng),
+        _scattered(extent_mm, 0.55, rng),
         buds=rng.random(fixed) < 0.25,
         step=0.13,
         reach=2.4,
-        kill=0.33,
+        kill=0.27,
         wander=0.45,
         rng=rng,
     )
@@ -333,9 +333,9 @@ def _meander(rng: np.random.Generator, points: Floats, extent_mm: float, amplitu
     shifts = []
     for _ in range(2):
         long = noise.band(rng, 128, extent_mm, 7.0, 0.3)
-        short = noise.band(rng, 128, extent_mm, 2.6, 0.3)
+        short = noise.band(rng, 128, extent_mm, 3.0, 0.3)
         shifts.append(amplitude * (0.6 * noise.sample(long, points, extent_mm)))
-        shifts[-1] = shifts[-1] + amplitude * 0.28 * noise.sample(short, points, extent_mm)
+        shifts[-1] = shifts[-1] + amplitude * 0.22 * noise.sample(short, points, extent_mm)
     return np.stack(shifts, axis=1).astype(np.float64)
 
 
