@@ -31,7 +31,9 @@ class Command:
 
 COMMANDS: tuple[Command, ...] = (
     Command("experiment", "stages", "bench.stages", "stages"),
+    Command("experiment", "learn", "bench.learn_experiment", "experiment"),
     Command("stability", "damage", "bench.engine_damage", "damage"),
+    Command("experiment", "scale", "bench.engine_scale", "scale"),
     Command("stability", "kills", "bench.engine_kills", "kills"),
 )
 

@@ -78,7 +78,8 @@ def train(
         numbers = _epoch(fabric, net, optimizer, frames, scales, epoch, report)
         numbers |= select_score(net, chooser, scales, fabric.device)
         score = numbers["select_r2"]
-        plateau.step(score)
+        if settings.schedule == "plateau":
+            plateau.step(score)
         improved = score > best
         best, waited = (score, 0) if improved else (best, waited + 1)
         numbers |= {"epoch": epoch + 1.0, "lr": optimizer.param_groups[0]["lr"]}
@@ -141,6 +142,9 @@ def _epoch(
         if i % 16 == 0:
             for k, v in gradient_shares(terms, said).items():
                 means[f"share_{k}"].update(v)
+        if settings.schedule == "cosine":
+            for group in optimizer.param_groups:
+                group["lr"] = settings.learning_rate * cosine((epoch + i / batches) / settings.epochs)
         optimizer.zero_grad()
         fabric.backward(terms.sum)
         fabric.clip_gradients(net, optimizer, max_norm=settings.clip)
@@ -148,6 +152,13 @@ def _epoch(
         means["loss"].update(terms.sum.detach())
         report(epoch * batches + i + 1, settings.epochs * batches, {"loss": float(terms.sum.detach())})
     return {k: float(m.compute()) for k, m in means.items()}
+
+
+def cosine(progress: float, warm: float = 0.05) -> float:
+    """Share of the learning rate at a point 0..1 of the run: a linear warm-up, then half a cosine to zero."""
+    if progress < warm:
+        return (progress + 1e-3) / (warm + 1e-3)
+    return 0.5 * (1 + math.cos(math.pi * (progress - warm) / (1 - warm)))
 
 
 def forward(net: Any, batch: Batch, settings: Settings, scales: Scales) -> torch.Tensor:
@@ -199,8 +210,9 @@ def _open(out: Path, card: Card) -> dict[str, Any] | None:
         raise UserError(f"{out}: holds a model trained with other settings; choose another folder")
     if there.split != card.split or there.scales != card.scales:
         raise UserError(f"{out}: holds a model trained on other data; choose another folder")
-    if there.settings.epochs != card.settings.epochs and there.settings.input == "mixed":
-        raise UserError(f"{out}: the schedule of mixed input depends on --epochs; choose another folder")
+    bound = there.settings.input == "mixed" or there.settings.schedule == "cosine"
+    if there.settings.epochs != card.settings.epochs and bound:
+        raise UserError(f"{out}: its schedule was made for {there.settings.epochs} epochs; keep --epochs")
     if not (out / "last.pt").exists():
         return None
     state = checkpoint.load_tensors(out / "last.pt")

@@ -1,0 +1,94 @@
+"""Training runs as data: (clips, split, settings) → one JSON of per-sequence scores, kept and reused."""
+
+from __future__ import annotations
+
+import json
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from learn.data import Clip
+from learn.evaluate import evaluate
+from learn.predict import load
+from learn.settings import Settings
+from learn.split import nested
+from learn.train import train
+
+
+@dataclass(frozen=True)
+class Run:
+    """One training run and the question it is asked."""
+
+    name: str
+    settings: Settings
+    source: str = "ideal"
+    """Displacement it is tested on."""
+    control: str = ""
+    """`shuffled`: the targets of the fitted sequences are dealt to other sequences; `zero`: the test sees
+    no motion; empty: neither."""
+
+
+def carry_out(run: Run, clips: Sequence[Clip], folder: Path, say: Callable[[str], None]) -> dict[str, Any]:
+    """The run's scores on its test fold, from `folder` if it was done before."""
+    file = folder / f"{run.name}.json"
+    if file.is_file():
+        done: dict[str, Any] = json.loads(file.read_text())
+        return done
+    split = nested(clips, run.settings.folds, run.settings.fold, 0, run.settings.held_out_family)
+    used = list(clips)
+    if run.control == "shuffled":
+        used = _dealt_out(used, split.fit)
+    began = time.process_time()
+    with tempfile.TemporaryDirectory() as scratch:
+        card = train(used, split, run.settings, Path(scratch) / "model")
+        spent = time.process_time() - began
+        asked = [clips[i] for i in split.test]
+        if run.control == "zero":
+            asked = [replace(c, displacement={k: 0 * v for k, v in c.displacement.items()}) for c in asked]
+        report = evaluate(load(Path(scratch) / "model"), asked, run.source)
+        history = [json.loads(s) for s in (Path(scratch) / "model/history.jsonl").read_text().splitlines()]
+    result = {
+        "name": run.name,
+        "source": run.source,
+        "control": run.control,
+        "settings": run.settings.as_dict(),
+        "sequences_fit": len(split.fit),
+        "sequences_select": len(split.select),
+        "epoch": card.epoch,
+        "select_r2": card.score,
+        "train_cpu_s": round(spent, 1),
+        "history": history,
+        **report.as_dict(),
+    }
+    folder.mkdir(parents=True, exist_ok=True)
+    file.write_text(json.dumps(result, indent=1) + "\n")
+    known = report.summary()
+    say(
+        f"{run.name}: {spent:.0f} CPU-s, map R² {known['map_r2_pooled']:.3f}, "
+        f"force R² {known['force_r2_pooled']:.3f}, ghosts {known['ghost_relative']:.4f}"
+    )
+    return result
+
+
+def _dealt_out(clips: list[Clip], fit: Sequence[int]) -> list[Clip]:
+    """Each fitted sequence gets the force of the next: what is learnt then is nothing about motion."""
+    order = list(fit)
+    out = list(clips)
+    for here, other in zip(order, np.roll(order, 1), strict=True):
+        frames = np.linspace(0, clips[other].frames - 1, clips[here].frames).round().astype(int)
+        out[here] = replace(
+            clips[here], density=np.asarray(clips[other].density)[frames], force=clips[other].force[frames]
+        )
+    return out
+
+
+def column(results: Sequence[dict[str, Any]], key: str) -> np.ndarray[Any, np.dtype[np.float64]]:
+    """One metric of every tested sequence of some runs, in order; NaN where it has none."""
+    return np.array(
+        [np.nan if s.get(key) is None else s[key] for r in results for s in r["sequences"]], np.float64
+    )
