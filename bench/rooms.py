@@ -30,6 +30,7 @@ class Command:
 
 
 COMMANDS: tuple[Command, ...] = (
+    Command("experiment", "realism", "bench.render_realism", "realism_figures"),
     Command("experiment", "stages", "bench.stages", "stages"),
     Command("experiment", "learn", "bench.learn_experiment", "experiment"),
     Command("stability", "damage", "bench.engine_damage", "damage"),

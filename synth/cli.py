@@ -118,6 +118,44 @@ def status(out: Out, json: Json = False) -> None:
     print(json_.dumps(found.as_dict()) if json else "\n".join(standing.lines(found)))
 
 
+@app.command("split")
+def split_command(
+    out: Out,
+    by: Annotated[str, typer.Option(help="anatomy, family, gesture or stiffness.")] = "anatomy",
+    shares: Annotated[str, typer.Option(help="For train, validation and test.")] = "0.7,0.15,0.15",
+    hold_out: Annotated[
+        list[str] | None, typer.Option(help="An appearance family that is only for testing.")
+    ] = None,
+    json: Json = False,
+) -> None:
+    """Says who may be trained on, in the index: no anatomy and no held-out family on both sides."""
+    from synth import index, split
+    from synth.errors import UserError
+    from synth.folder import Folder
+
+    folder = Folder(out)
+    folder.described()
+    chosen = split.parse(by, shares, hold_out or [])
+    rows = index.write(folder)
+    split.assign(rows, chosen)
+    split.keep(out, chosen)
+    counts = split.count(index.write(folder))
+    if not counts:
+        raise UserError(f"{out}: holds no finished sequence")
+    print(json_.dumps(counts) if json else ", ".join(f"{side} {n}" for side, n in counts.items()))
+
+
+@app.command()
+def report(
+    out: Out,
+    to: Annotated[Path | None, typer.Option("--to", help="The page; report.html in the dataset.")] = None,
+) -> None:
+    """Writes a page with thumbnails, distributions and failures that opens in any browser."""
+    from synth import report as reporting
+
+    print(reporting.write(out, to or out / "report.html"))
+
+
 @app.command()
 def card(out: Out) -> None:
     """Writes the dataset's card anew: README.md, its charts and pictures."""

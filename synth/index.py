@@ -11,6 +11,7 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from synth import split
 from synth.errors import UserError
 from synth.folder import Folder, write_whole
 from synth.store import Sequence, open_sequence
@@ -47,6 +48,9 @@ SCHEMA = pa.schema(
             "scale_mm_per_px", pa.float64(), metadata={"meaning": "scale at the craniotomy", "unit": "mm/px"}
         ),
         pa.field("flow_backend", pa.string(), metadata={"meaning": "estimator of the recovered flow"}),
+        pa.field(
+            "split", pa.string(), metadata={"meaning": "train, validation or test; by the rule in split.json"}
+        ),
         pa.field("cpu_s", pa.float64(), metadata={"meaning": "processor time it took", "unit": "s"}),
     ]
 )
@@ -73,6 +77,12 @@ def write(folder: Folder) -> list[dict[str, Any]]:
         if key not in rows:
             rows[key] = {"index": key, "status": "failed", "reason": failure["reason"]}
     ordered = [rows[key] for key in sorted(rows)]
+    try:
+        sides = split.assign(ordered, split.rule(folder.root))
+    except UserError:  # too few groups to have some on every side
+        sides = [None] * len(ordered)
+    for row, side in zip(ordered, sides, strict=True):
+        row["split"] = side
     save(folder.root, ordered)
     return ordered
 

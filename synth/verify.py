@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from synth import identity, index
+from synth import identity, index, split
 from synth.errors import UserError
 from synth.folder import Folder
 from synth.invariants import INVARIANTS, Measure
@@ -173,6 +173,8 @@ def _dataset(folder: Folder, described: dict[str, Any], sealed: list[int]) -> It
         row = rows.get(key, {})
         differing = [name for name, value in now.items() if row.get(name) != value]
         yield truth(not differing, f"row {key} differs in {', '.join(differing)}", index.NAME)
+    leaking = split.leaks(list(rows.values()))
+    yield truth(not leaking, f"the split leaks: {'; '.join(leaking[:3])}", index.NAME)
     surplus = sorted(key for key, row in rows.items() if row["status"] == "done" and key not in sealed)
     yield truth(not surplus, f"rows without a sequence: {surplus[:3]}", index.NAME)
 
