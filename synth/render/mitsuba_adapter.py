@@ -34,7 +34,7 @@ class Wet:
     """(n, n, 3) unit normals in the surface's own frame."""
     roughness: float
     """GGX alpha of the coat."""
-    index: float = 1.34
+    index: float = 1.33
     """Refractive index of the coat."""
 
 

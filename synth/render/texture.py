@@ -125,7 +125,7 @@ def _film(
     pools = cv2.resize(noise.fractal(rng, coarse, extent, 5.0, 1.5), (pixels, pixels))
     # Mostly a smooth pool; where the film is thin the pia's own grain breaks the highlights up.
     dry = np.clip(0.6 * pools - 0.25, 0.05, 1.0)
-    swell = noise.band(rng, coarse, extent, 2.4, 0.5) * 0.009
+    swell = noise.band(rng, coarse, extent, 2.4, 0.5) * 0.0065
     rough = noise.band(rng, coarse, extent, 0.55, 0.5) * 0.0060
     fine = noise.band(rng, pixels, extent, 0.22, 0.45) * 0.0016
     swell = cv2.resize(swell, (pixels, pixels), interpolation=cv2.INTER_CUBIC)
