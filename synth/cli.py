@@ -157,6 +157,18 @@ def report(
 
 
 @app.command()
+def export(
+    out: Out,
+    target: Annotated[Path, typer.Argument(help="The new folder.")],
+    to: Annotated[str, typer.Option("--to", help="folder, webdataset, hdf5 or d2fnet-npz.")] = "folder",
+) -> None:
+    """Writes the dataset in a format of others."""
+    from synth import export as exporting
+
+    print(f"{exporting.export(out, target, to)} sequences in {target}")
+
+
+@app.command()
 def card(out: Out) -> None:
     """Writes the dataset's card anew: README.md, its charts and pictures."""
     from synth import card as carding

@@ -34,7 +34,7 @@ class Silent:
 
 def options(work: str, **more: object) -> Options:
     path = os.pathsep.join([str(HERE), str(HERE.parents[1])])
-    return Options(work=f"fake_work:{work}", environment={"PYTHONPATH": path}, **{"workers": 2, **more})  # type: ignore[arg-type]
+    return Options(work=f"fake_work:{work}", environment={"PYTHONPATH": path}, **{"workers": 1, **more})  # type: ignore[arg-type]
 
 
 def start(root: Path, job: Job, work: str) -> subprocess.Popen[bytes]:
