@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from synth import brain, scenario
-from synth.fem import mesh, solver
+from synth.fem import mesh, solver, tool
 from synth.flow import mask, track
 from synth.job import Job
 from synth.render import anatomy, camera
@@ -43,11 +43,11 @@ def render_sequence(job: Job, index: int, folder: Path, report: Report) -> Path:
     with watch.stage("mesh"):
         if job.anatomy.mesh is None:
             surface = anatomy.procedural(case.relief, job.anatomy)
-            tets = mesh.block(job.anatomy, job.fem.tets, job.fem.order)
+            tets = mesh.block(job.anatomy, job.fem.tets, job.fem.order, tool.focus(case.gesture))
         else:
             whole = brain.load(job.anatomy.mesh, job.anatomy.craniotomy)
             surface = anatomy.from_brain(whole.vertices, whole.faces, case.relief, job.anatomy)
-            tets = mesh.from_brain(whole, job.anatomy, job.fem.tets, job.fem.order)
+            tets = mesh.from_brain(whole, job.anatomy, job.fem.tets, job.fem.order, tool.focus(case.gesture))
 
     report("fem", 0, 1)
     with watch.stage("fem"):

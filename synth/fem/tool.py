@@ -92,6 +92,11 @@ def course(gesture: Gesture, frames: int) -> tuple[Floats, Floats]:
     return load, away
 
 
+def focus(gesture: Gesture) -> tuple[tuple[float, float, float], ...]:
+    """Where the mesh should be finest: x, y and radius of what is loaded, mm."""
+    return ((*gesture.point_mm, gesture.footprint_mm),)
+
+
 def footprint(gesture: Gesture, vertices: Floats, area: Floats) -> Floats:
     """Pressure of a unit force: the kernel (1 - (r/a)^2)^2 on the surface at rest.
 

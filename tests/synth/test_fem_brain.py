@@ -49,7 +49,11 @@ def test_open_surface_is_meshed_whole(egg: Path) -> None:
     tets = mesh.from_brain(brain.load(egg, OPENING), anatomy, 800, 2)
     volume = bary_slope(tets.points[tets.cells[:, :4]])[1]
     assert volume.min() > 0
-    assert volume.sum() == pytest.approx(4 / 3 * np.pi * 32 * 26 * 22, rel=0.05)
+    # Corners lie on the surface, faces are chords of it: some volume is lost, none is gained.
+    assert 0.9 < volume.sum() / (4 / 3 * np.pi * 32 * 26 * 22) < 1.0
+    again = mesh.from_brain(brain.load(egg, OPENING), anatomy, 800, 2)
+    assert np.array_equal(tets.points, again.points)
+    assert np.array_equal(tets.cells, again.cells)
     assert not tets.fixed.any()
     assert tets.hold.sum() > 0
 
