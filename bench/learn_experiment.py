@@ -67,7 +67,6 @@ def experiment(
         Path | None, typer.Option(help="Dataset rendered from docs/results/learn/data/rendered.yaml.")
     ] = None,
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for results.")] = RESULTS,
-    sequences: Annotated[int, typer.Option(help="Labels-only sequences.")] = 240,
     only: Annotated[str, typer.Option(help="Only runs whose name holds this.")] = "",
 ) -> None:
     """Train and score learn's choices; done runs are kept, the summary is made anew."""
@@ -83,7 +82,7 @@ def experiment(
             only,
         )
     else:
-        job = config.load(str(RESULTS / "data/labels.yaml"), [f"sequences={sequences}"])
+        job = config.load(str(RESULTS / "data/labels.yaml"))
         _study("ideal", ideal_runs(), labels(job, grid, cache), out, only)
     write(out)
     say(f"{out}/README.md")

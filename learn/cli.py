@@ -1,11 +1,11 @@
-"""`learn train | eval`: from a rendered dataset to a model, and from a model to honest numbers."""
+"""`learn train | eval | predict | export`: from a dataset to a model, honest numbers, forces and a file."""
 
 from __future__ import annotations
 
 import json as json_
-import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -14,9 +14,16 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
+from synth.commands import Commands
 from synth.errors import UserError
 
-app = typer.Typer(help="Learn force from displacement.", no_args_is_help=True, pretty_exceptions_enable=False)
+app = typer.Typer(
+    cls=Commands,
+    help="Learn force from displacement.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
 _console = Console(stderr=True)
 
 Root = Annotated[Path, typer.Argument(help="Dataset: a folder of NNNNNN.zarr stores.")]
@@ -25,24 +32,13 @@ Threads = Annotated[int | None, typer.Option(help="CPU threads; half the cores i
 Json = Annotated[bool, typer.Option("--json", help="Print JSON on stdout instead of a table.")]
 
 
-def main() -> None:
-    """The command: bad input is one line and exit code 2."""
-    with _one_line():
-        app()
-
-
-@contextmanager
-def _one_line() -> Iterator[None]:
-    try:
-        yield
-    except UserError as error:
-        print(f"error: {error}", file=sys.stderr)
-        raise typer.Exit(2) from None
-
-
 @app.command("train")
 def train_command(
     dataset: Root,
+    changes: Annotated[
+        list[str] | None,
+        typer.Argument(help="Any setting, as in a model's config.json: arch.confidence=true batch=16."),
+    ] = None,
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the model.")] = Path("model"),
     preset: Annotated[str, typer.Option(help="tiny, cpu, live or paper.")] = "cpu",
     input: Annotated[str | None, typer.Option(help="ideal, recovered or mixed.")] = None,
@@ -58,12 +54,9 @@ def train_command(
     folds: Annotated[
         int | None, typer.Option(help="Groups of sequences: one is test, one select. 5, or what there is.")
     ] = None,
-    fold: Annotated[int, typer.Option(help="Which of them is the test.")] = 0,
+    fold: Annotated[int | None, typer.Option(help="Which of them is the test.")] = None,
     hold_out: Annotated[str | None, typer.Option(help="Appearance family kept for the test.")] = None,
-    stop: Annotated[int | None, typer.Option(help="End after this many epochs without a better one.")] = None,
-    frames: Annotated[int | None, typer.Option(help="Frames a sequence gives an epoch; 0 all.")] = None,
-    precision: Annotated[str | None, typer.Option(help="32-true or bf16-mixed.")] = None,
-    seed: Annotated[int, typer.Option(help="Root of all random draws.")] = 0,
+    seed: Annotated[int | None, typer.Option(help="Root of all random draws.")] = None,
     accelerator: Annotated[str, typer.Option(help="cpu, cuda or auto.")] = "auto",
     devices: Annotated[int, typer.Option(help="GPUs; under torchrun the number of processes.")] = 1,
     threads: Threads = None,
@@ -71,70 +64,60 @@ def train_command(
     json: Json = False,
 ) -> None:
     """Train D2FNet on a dataset. An interrupted run is continued by the same command."""
-    with _one_line():
-        from lightning_fabric import Fabric
+    from lightning_fabric import Fabric
 
-        from learn.data import load, sources
-        from learn.settings import preset as of
-        from learn.split import groups, nested
-        from learn.threads import set_threads
-        from learn.train import train
+    from learn.data import load, sources
+    from learn.settings import override
+    from learn.settings import preset as of
+    from learn.split import groups, nested
+    from learn.threads import set_threads
+    from learn.train import train
 
-        set_threads(threads)
-        changes: dict[str, Any] = {
-            "input": input,
-            "epochs": epochs,
-            "batch": batch,
-            "learning_rate": learning_rate,
-            "target": target,
-            "size": size,
-            "stop": stop,
-            "frames": frames,
-            "precision": precision,
-        }
-        changes = {k: v for k, v in changes.items() if v is not None}
-        changes |= _nested_changes(of(preset), loss, output, width, stem)
-        settings = of(preset, **changes, fold=fold, seed=seed, held_out_family=hold_out)
-        with _bar("Reading sequences") as tell:
-            clips = load(dataset, settings.grid, sources(settings.input), cache=cache, report=tell)
-        count = folds if folds is not None else min(5, len(set(groups(clips))))
-        settings = of(preset, **changes, fold=fold, seed=seed, held_out_family=hold_out, folds=count)
-        split = nested(clips, count, fold, seed, hold_out)
-        fabric = Fabric(accelerator=accelerator, devices=devices, precision=settings.precision)
-        with _bar("Training") as tell:
-            card = train(
-                clips,
-                split,
-                settings,
-                out,
-                fabric=fabric,
-                report=lambda done, of_, numbers: tell(done, of_),
-                log=(lambda numbers: None) if json else _log,
-            )
-        result = {"model": str(out), "epoch": card.epoch, "select_r2": card.score}
-        result |= {k: len(v) for k, v in card.split.items()}
-        if json:
-            print(json_.dumps(result))
-        else:
-            _console.print(
-                f"Model in {out}: epoch {card.epoch} of {settings.epochs}, R² {card.score:.3f} on "
-                f"{result['select']} select sequences; fitted on {result['fit']}, "
-                f"{result['test']} kept for `learn eval`."
-            )
-
-
-def _nested_changes(
-    base: Any, loss: str | None, output: str | None, width: int | None, stem: int | None
-) -> dict[str, Any]:
-    from dataclasses import replace
-
-    arch = {k: v for k, v in {"output": output, "width": width, "stem": stem}.items() if v is not None}
-    out: dict[str, Any] = {}
-    if arch:
-        out["arch"] = replace(base.arch, **arch)
-    if loss is not None:
-        out["objective"] = replace(base.objective, kind=loss)
-    return out
+    set_threads(threads)
+    options = {
+        "input": input,
+        "epochs": epochs,
+        "batch": batch,
+        "learning_rate": learning_rate,
+        "target": target,
+        "size": size,
+        "objective.kind": loss,
+        "arch.output": output,
+        "arch.width": width,
+        "arch.stem": stem,
+        "held_out_family": hold_out,
+        "folds": folds,
+        "fold": fold,
+        "seed": seed,
+    }
+    given = [f"{k}={v}" for k, v in options.items() if v is not None]
+    settings = override(of(preset), [*given, *(changes or [])])
+    with _bar("Reading sequences") as tell:
+        clips = load(dataset, settings.grid, sources(settings.input), cache=cache, report=tell)
+    if folds is None:
+        settings = replace(settings, folds=min(settings.folds, len(set(groups(clips)))))
+    split = nested(clips, settings.folds, settings.fold, settings.seed, settings.held_out_family)
+    fabric = Fabric(accelerator=accelerator, devices=devices, precision=settings.precision)
+    with _bar("Training") as tell:
+        card = train(
+            clips,
+            split,
+            settings,
+            out,
+            fabric=fabric,
+            report=lambda done, of_, numbers: tell(done, of_),
+            log=(lambda numbers: None) if json else _log,
+        )
+    result = {"model": str(out), "epoch": card.epoch, "select_r2": card.score}
+    result |= {k: len(v) for k, v in card.split.items()}
+    if json:
+        print(json_.dumps(result))
+    else:
+        _console.print(
+            f"Model in {out}: epoch {card.epoch} of {settings.epochs}, R² {card.score:.3f} on "
+            f"{result['select']} select sequences; fitted on {result['fit']}, "
+            f"{result['test']} kept for `learn eval`."
+        )
 
 
 def _log(numbers: dict[str, float]) -> None:
@@ -155,31 +138,75 @@ def eval_command(
     json: Json = False,
 ) -> None:
     """Score a model on the sequences it has not seen; forces in mN."""
-    with _one_line():
-        from learn.data import load
-        from learn.evaluate import evaluate, unseen
-        from learn.predict import load as load_model
-        from learn.threads import set_threads
+    from learn.data import load
+    from learn.evaluate import evaluate, unseen
+    from learn.predict import load as load_model
+    from learn.threads import set_threads
 
-        set_threads(threads)
-        predictor = load_model(model)
-        trained = predictor.card.settings.input
-        source = input or ("recovered" if trained == "mixed" else trained)
-        if source not in ("ideal", "recovered"):
-            raise UserError(f"unknown input {source!r}: ideal or recovered")
-        with _bar("Reading sequences") as tell:
-            clips = load(dataset, predictor.grid, (source,), cache=cache, report=tell)
-        chosen = clips if all else unseen(clips, predictor.card)
-        if not chosen:
-            raise UserError(
-                f"{dataset}: the model was fitted or chosen on every sequence here; --all scores them anyway"
-            )
-        with _bar("Evaluating") as tell:
-            report = evaluate(predictor, chosen, source, tell)
-        if json:
-            print(json_.dumps({"model": str(model), "input": source, **report.as_dict()}))
-            return
-        Console().print(_table(report, source, all))
+    set_threads(threads)
+    predictor = load_model(model)
+    trained = predictor.card.settings.input
+    source = input or ("recovered" if trained == "mixed" else trained)
+    if source not in ("ideal", "recovered"):
+        raise UserError(f"unknown input {source!r}: ideal or recovered")
+    with _bar("Reading sequences") as tell:
+        clips = load(dataset, predictor.grid, (source,), cache=cache, report=tell)
+    chosen = clips if all else unseen(clips, predictor.card)
+    if not chosen:
+        raise UserError(
+            f"{dataset}: the model was fitted or chosen on every sequence here; --all scores them anyway"
+        )
+    with _bar("Evaluating") as tell:
+        report = evaluate(predictor, chosen, source, tell)
+    if json:
+        print(json_.dumps({"model": str(model), "input": source, **report.as_dict()}))
+        return
+    Console().print(_table(report, source, all))
+
+
+@app.command("predict")
+def predict_command(
+    model: Annotated[Path, typer.Argument(help="Model folder.")],
+    source: Annotated[Path, typer.Argument(help="Dataset, NNNNNN.zarr store, or .npz of flow.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for NAME.npz files.")] = Path("forces"),
+    input: Annotated[str, typer.Option(help="ideal or recovered flow of a store.")] = "recovered",
+    young: Annotated[float | None, typer.Option(help="Young's modulus [kPa], instead of the data's.")] = None,
+    threads: Threads = None,
+    json: Json = False,
+) -> None:
+    """Write the force maps and force curves that a model sees in stores or arrays of flow."""
+    import numpy as np
+
+    from learn.apply import apply, motions
+    from learn.predict import load as load_model
+    from learn.threads import set_threads
+
+    set_threads(threads)
+    predictor = load_model(model)
+    peaks = {}
+    for motion in motions(source, input):
+        found = apply(predictor, motion, young)
+        out.mkdir(parents=True, exist_ok=True)
+        np.savez_compressed(out / f"{motion.name}.npz", **found)
+        peaks[motion.name] = float(found["total_force_mn"].max())
+        if not json:
+            _console.print(f"{motion.name}: {motion.frames} frames, peak force {peaks[motion.name]:.3g} mN")
+    if json:
+        print(json_.dumps({"out": str(out), "peak_force_mn": peaks}))
+
+
+@app.command("export")
+def export_command(
+    model: Annotated[Path, typer.Argument(help="Model folder.")],
+    file: Annotated[Path, typer.Argument(help="File to write; NAME.json beside it says how to use it.")],
+    format: Annotated[str, typer.Option(help="torchscript or onnx.")] = "torchscript",
+) -> None:
+    """Write a model for other programs, checked against PyTorch to 1e-4."""
+    from learn.export import export
+    from learn.predict import load as load_model
+
+    worst = export(load_model(model), file, format)
+    _console.print(f"{file}: differs from PyTorch by at most {worst:.1e} of full scale")
 
 
 _ROWS = (
@@ -246,4 +273,4 @@ def _bar(what: str) -> Iterator[Callable[[int, int], None]]:
 
 
 if __name__ == "__main__":
-    main()
+    app()

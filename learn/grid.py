@@ -179,8 +179,8 @@ def divergence(displacement: Tensor, mask: Tensor, pitch_mm: float) -> Tensor:
 
 def _difference(values: Tensor, mask: Tensor, dim: int) -> Tensor:
     """Mean of the forward and backward differences whose both ends lie in the mask, a cell."""
-    step = torch.diff(values, dim=dim)
     n = values.shape[dim]
+    step = values.narrow(dim, 1, n - 1) - values.narrow(dim, 0, n - 1)
     both = mask.narrow(dim, 1, n - 1) * mask.narrow(dim, 0, n - 1)
     ahead = (0, 1, 0, 0) if dim == 3 else (0, 0, 0, 1)
     behind = (1, 0, 0, 0) if dim == 3 else (0, 0, 1, 0)

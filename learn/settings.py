@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import difflib
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -108,6 +110,43 @@ PRESETS: dict[str, Settings] = {
     # The network, loss weights and schedule of Heraoui et al., on our targets.
     "paper": Settings(arch=Architecture(width=32, stem=1, dropout=0.1)),
 }
+
+
+def override(settings: Settings, changes: Iterable[str]) -> Settings:
+    """Settings with `key=value` or `arch.key=value` replaced, values read as the field's own type.
+
+    Raises UserError for an unknown key (with the nearest one) or a value of another type.
+    """
+    top: dict[str, Any] = {}
+    inner: dict[str, dict[str, Any]] = {"arch": {}, "objective": {}}
+    for change in changes:
+        key, _, text = change.partition("=")
+        section, dot, name = key.rpartition(".")
+        owner = getattr(settings, section, None) if dot and section in inner else settings
+        if (dot and section not in inner) or not hasattr(owner, name) or name in inner or not text:
+            known = [f.name for f in dataclasses.fields(settings) if f.name not in inner]
+            known += [f"{s}.{f.name}" for s in inner for f in dataclasses.fields(getattr(settings, s))]
+            near = difflib.get_close_matches(key, known, 1)
+            hint = f", did you mean {near[0]!r}?" if near else ": expected key=value"
+            raise UserError(f"{change}: unknown setting{hint}")
+        (inner[section] if dot else top)[name] = _value(getattr(owner, name), text, change)
+    nested = {k: dataclasses.replace(getattr(settings, k), **v) for k, v in inner.items() if v}
+    return dataclasses.replace(settings, **top, **nested)
+
+
+def _value(old: Any, text: str, change: str) -> Any:
+    """`text` as a value of the type of `old`."""
+    try:
+        if isinstance(old, bool):
+            return {"true": True, "false": False}[text.lower()]
+        if isinstance(old, tuple):
+            values = tuple(float(v) for v in text.strip("[]()").split(","))
+            if len(values) != len(old):
+                raise ValueError
+            return values
+        return type(old)(text) if old is not None else text
+    except (ValueError, KeyError):
+        raise UserError(f"{change}: not a value of type {type(old).__name__}") from None
 
 
 def preset(name: str, **changes: Any) -> Settings:

@@ -213,7 +213,7 @@ def test_command_line(dataset: Path, tmp_path: Path) -> None:
         (["--folds", "9"], "9 folds"),
         (["--input", "guessed"], "unknown input 'guessed'"),
         (["--preset", "huge"], "unknown preset 'huge'"),
-        (["--size", "40"], "grid size 40"),
+        (["--size", "40"], "input size 40 does not divide by 16"),
         (["--target", "intensity"], "needs output 'magnitude'"),
         (["--hold-out", "calf"], "no sequence of family 'calf'"),
     ],
