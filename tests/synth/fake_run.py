@@ -9,8 +9,11 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+from synth import card
 from synth.child import Attempt
 from synth.engine import Options, run
+from synth.folder import claim
+from synth.index import write
 from synth.job import Job
 
 HERE = Path(__file__).resolve().parent
@@ -35,6 +38,15 @@ class Silent:
 def options(work: str, **more: object) -> Options:
     path = os.pathsep.join([str(HERE), str(HERE.parents[1])])
     return Options(work=f"fake_work:{work}", environment={"PYTHONPATH": path}, **{"workers": 1, **more})  # type: ignore[arg-type]
+
+
+def in_process(job: Job, root: Path, work: Callable[..., None]) -> None:
+    """What a run leaves, made without worker processes."""
+    with claim(root, job) as folder:
+        for index in range(job.sequences):
+            work(job, index, root, lambda *_: None)
+        write(folder)
+        card.write(folder)
 
 
 def start(root: Path, job: Job, work: str) -> subprocess.Popen[bytes]:

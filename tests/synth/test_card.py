@@ -8,11 +8,12 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from fake_run import Silent, options
+from fake_run import in_process
+from fake_work import consistent
 from ruamel.yaml import YAML
 from typer.testing import CliRunner
 
-from synth import chart, engine, index
+from synth import chart, index, preview
 from synth.cli import app
 from synth.fields import FIELDS
 from synth.job import Job
@@ -28,7 +29,8 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
         flow={"backend": "ideal"},
         card={"title": "Pulls: a test", "licence": "cc-by-4.0", "summary": "Made to be read."},
     )
-    engine.run(job, out, options("consistent"), Silent())
+    in_process(job, out, consistent)
+    preview.write(out)
     return out
 
 

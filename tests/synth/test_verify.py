@@ -6,12 +6,13 @@ import json
 import shutil
 from pathlib import Path
 
+import fake_work
 import numpy as np
 import pytest
-from fake_run import Silent, options
+from fake_run import in_process
 from typer.testing import CliRunner
 
-from synth import engine, verify
+from synth import verify
 from synth.cli import app
 from synth.errors import UserError
 from synth.job import Job
@@ -22,7 +23,7 @@ JOB = Job(seed=1, sequences=2, frames=5, render={"size": (96, 72)}, flow={"backe
 @pytest.fixture(scope="module")
 def pristine(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("pristine") / "out"
-    engine.run(JOB, root, options("consistent"), Silent())
+    in_process(JOB, root, fake_work.consistent)
     return root
 
 
@@ -47,7 +48,7 @@ def test_a_good_dataset_passes_and_every_invariant_was_measured(dataset: Path) -
 def rewrite(root: Path, work: str) -> None:
     """Replaces the dataset by one that a faulty pipeline would have made: sealed, and wrong."""
     shutil.rmtree(root)
-    engine.run(JOB, root, options(work), Silent())
+    in_process(JOB, root, getattr(fake_work, work))
 
 
 @pytest.mark.parametrize(
