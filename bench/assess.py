@@ -13,13 +13,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bench import score, sensor
+from bench import bootstrap, score, sensor, sync
+from bench.bootstrap import Interval
 from bench.follow import Followed, Method, Progress, follow
-from bench.recording import Recording
+from bench.recording import Force, Recording
 from bench.scale import Scale
+from bench.sync import Offset
 from synth import versions
 
 Curve = NDArray[np.float64]
+_SEED = 0  # of the bootstrap: the same recording gives the same intervals
 
 
 @dataclass(frozen=True)
@@ -45,6 +48,12 @@ class Scored:
     components: dict[str, dict[str, float]]
     """Agreement by camera axis, when the sensor's axes are the camera's."""
     events: list[dict[str, float]]
+    intervals: dict[str, Interval]
+    """95% intervals of some scores, frames being resampled in blocks."""
+    calibrated: dict[str, float]
+    """Scores after one gain found on the separate press, and that gain; empty without a press."""
+    worse_by_mn: Interval | None
+    """Interval of the main method's MAE minus this one's, paired; None for the main method."""
 
 
 @dataclass(frozen=True)
@@ -64,6 +73,10 @@ class Result:
     relative_uncertainty: float
     """Of every force, from scale and stiffness."""
     noise_floor_mn: float
+    scored: NDArray[np.bool_]
+    """(T,) whether the frame counts: calibration spans don't."""
+    sync: Offset | None
+    """What the search for the clocks' offset found; None if they weren't searched."""
     notes: tuple[str, ...]
     steps: tuple[str, ...]
     settings: dict[str, Any]
@@ -106,60 +119,123 @@ def assess(
     )
     time = np.array(done.time_s)
     notes = [*recording.notes, *done.notes]
-    axes = floor = None
-    steps: tuple[str, ...] = ()
-    if recording.force is None:
-        notes.append("no force.csv: predictions only, nothing is scored")
-    else:
-        processed = sensor.process(recording.force, meta.sensor, meta.sync.offset_s)
-        axes, floor, steps = sensor.at(processed, time), processed.noise_floor_mn, processed.steps
-        covered = int(np.isfinite(axes).all(axis=1).sum())
-        if covered == 0:
-            notes.append(
-                "force.csv and the video share no time: predictions only; are both clocks in seconds?"
-            )
-            axes = None
-        elif covered < len(time):
-            notes.append(f"the sensor covers {covered} of {len(time)} frames; only those are scored")
+    truth = _truth(recording, done, time, notes)
     if meta.young_kpa is None:
         notes.append("Young's modulus unknown: forces are those of tissue of 1 kPa and only relative")
-    size = None if axes is None else np.linalg.norm(axes, axis=1)
-    scored = {
-        name: _scored(
-            time, np.array(done.force_mn[name]), size, axes, meta.sensor.axes == "camera", floor or 0.0
-        )
-        for name in methods
-    }
+    kept = np.ones(len(time), bool)
+    for what, span in (("calibration of the clocks", meta.sync.calibration_s), ("press", meta.press_s)):
+        if span is not None:
+            inside = (time >= span[0]) & (time <= span[1])
+            kept &= ~inside
+            notes.append(f"{inside.sum()} frames of the {what} ({span[0]:g} to {span[1]:g} s) are not scored")
+    forces = {name: np.array(done.force_mn[name]) for name in methods}
     return Result(
         recording=recording.name,
         main=main,
         time_s=time,
-        sensor_mn=size,
-        sensor_axes_mn=axes,
-        methods=scored,
+        sensor_mn=truth.size_mn,
+        sensor_axes_mn=truth.axes_mn,
+        methods={
+            name: _scored(time, forces[name], forces[main], truth, kept, recording, name == main)
+            for name in methods
+        },
         scale=scale,
         relative_uncertainty=math.hypot(scale.uncertainty, meta.young_uncertainty),
-        noise_floor_mn=floor or 0.0,
+        noise_floor_mn=truth.floor_mn,
+        scored=kept,
+        sync=truth.sync,
         notes=tuple(notes),
-        steps=steps,
+        steps=truth.steps,
         settings={**asdict(settings), **described, "meta": meta.model_dump(mode="json", exclude_none=True)},
         environment=environment(),
         followed=done,
     )
 
 
+@dataclass(frozen=True)
+class _Truth:
+    """The sensor at the frames' times."""
+
+    axes_mn: Curve | None = None
+    floor_mn: float = 0.0
+    steps: tuple[str, ...] = ()
+    sync: Offset | None = None
+
+    @property
+    def size_mn(self) -> Curve | None:
+        return None if self.axes_mn is None else np.linalg.norm(self.axes_mn, axis=1)
+
+
+def _truth(recording: Recording, done: Followed, time: Curve, notes: list[str]) -> _Truth:
+    """Finds the clocks' offset, freezes it, processes the sensor and reads it at the frames."""
+    force, meta = recording.force, recording.meta
+    if force is None:
+        notes.append("no force.csv: predictions only, nothing is scored")
+        return _Truth()
+    offset, found = meta.sync.offset_s, None
+    if meta.sync.method == "clock":
+        offset = 0.0
+    elif meta.sync.method == "correlate":
+        found = _offset(force, recording, done, time)
+        if found.refused:
+            notes.append(f"clocks could not be aligned ({found.refused}): predictions only")
+            return _Truth(sync=found)
+        offset = found.offset_s
+    processed = sensor.process(force, meta.sensor, offset)
+    axes = sensor.at(processed, time)
+    covered = int(np.isfinite(axes).all(axis=1).sum())
+    if covered == 0:
+        notes.append("force.csv and the video share no time: predictions only; are both clocks in seconds?")
+        return _Truth(steps=processed.steps, sync=found)
+    if covered < len(time):
+        notes.append(f"the sensor covers {covered} of {len(time)} frames; only those are scored")
+    return _Truth(axes, processed.noise_floor_mn, processed.steps, found)
+
+
+def _offset(force: Force, recording: Recording, done: Followed, time: Curve) -> Offset:
+    about = recording.meta.sync
+    assert about.calibration_s is not None
+    inside = (time >= about.calibration_s[0]) & (time <= about.calibration_s[1])
+    smooth = sensor.process(force, recording.meta.sensor, 0.0)
+    return sync.find(
+        time[inside], np.array(done.speed)[inside], smooth.time_s, smooth.force_mn, about.search_s
+    )
+
+
 def _scored(
-    time_s: Curve, force: Curve, size: Curve | None, axes: Curve | None, camera_axes: bool, floor_mn: float
+    time_s: Curve,
+    force: Curve,
+    main: Curve,
+    truth: _Truth,
+    kept: NDArray[np.bool_],
+    recording: Recording,
+    is_main: bool,
 ) -> Scored:
+    length, size, axes = _length(force), truth.size_mn, truth.axes_mn
+    if size is None or axes is None:
+        return Scored(force, length, {}, {}, [], {}, {}, None)
+    t, x, y = time_s[kept], size[kept], length[kept]
+    scores, events = score.everything(t, x, y, truth.floor_mn)
+    components = {}
+    if recording.meta.sensor.axes == "camera" and np.isfinite(force).any(axis=0).all():
+        components = {axis: score.agreement(axes[kept, k], force[kept, k]) for k, axis in enumerate("xyz")}
+    rng = np.random.default_rng(_SEED)
+    intervals = bootstrap.agreement(x, y, rng)
+    worse = None if is_main else bootstrap.difference(x, _length(main)[kept], y, rng)
+    calibrated: dict[str, float] = {}
+    if recording.meta.press_s is not None:
+        low, high = recording.meta.press_s
+        gain = score.gain(size, length, (time_s >= low) & (time_s <= high))
+        calibrated = {"gain": gain, **score.agreement(x, gain * y)}
+        calibrated["mae_of_peak"] = calibrated["mae_mn"] / scores["event_peak_mn"]
+    return Scored(force, length, scores, components, events, intervals, calibrated, worse)
+
+
+def _length(force: Curve) -> Curve:
+    """Size of each force, from the components that there are, (T,) mN."""
     length = np.sqrt(np.nansum(force**2, axis=1))
     length[~np.isfinite(force).any(axis=1)] = np.nan
-    if size is None or axes is None:
-        return Scored(force, length, {}, {}, [])
-    scores, events = score.everything(time_s, size, length, floor_mn)
-    components = {}
-    if camera_axes and np.isfinite(force).any(axis=0).all():
-        components = {axis: score.agreement(axes[:, k], force[:, k]) for k, axis in enumerate("xyz")}
-    return Scored(force, length, scores, components, events)
+    return np.asarray(length, np.float64)
 
 
 def as_json(result: Result) -> dict[str, Any]:
@@ -173,12 +249,20 @@ def as_json(result: Result) -> dict[str, Any]:
         "frames": len(result.time_s),
         "scores": result.methods[result.main].scores,
         "methods": {
-            name: {"scores": m.scores, "components": m.components, "events": m.events}
+            name: {
+                "scores": m.scores,
+                "intervals": m.intervals,
+                "calibrated": m.calibrated,
+                "worse_by_mn": m.worse_by_mn,
+                "components": m.components,
+                "events": m.events,
+            }
             for name, m in result.methods.items()
         },
         "scale": asdict(result.scale),
         "relative_uncertainty": result.relative_uncertainty,
         "noise_floor_mn": result.noise_floor_mn,
+        "sync": None if result.sync is None else asdict(result.sync),
         "notes": list(result.notes),
         "sensor_steps": list(result.steps),
         "settings": result.settings,
@@ -187,6 +271,7 @@ def as_json(result: Result) -> dict[str, Any]:
         "curve": {
             "frame": done.frame,
             "t_s": result.time_s,
+            "scored": result.scored,
             "sensor_mn": result.sensor_mn,
             "sensor_axes_mn": result.sensor_axes_mn,
             "confidence": done.confidence,

@@ -97,7 +97,7 @@ def bland_altman(result: Result, limits: dict[str, float]) -> Figure:
 def _both(result: Result) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     assert result.sensor_mn is not None
     predicted = result.methods[result.main].size_mn
-    good = np.isfinite(result.sensor_mn) & np.isfinite(predicted)
+    good = result.scored & np.isfinite(result.sensor_mn) & np.isfinite(predicted)
     return result.sensor_mn[good], predicted[good]
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json as json_
+from collections.abc import Callable
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -11,6 +12,7 @@ import typer
 
 from bench.rooms import Rooms
 from synth.commands import Commands
+from synth.errors import UserError
 
 if TYPE_CHECKING:
     from bench.assess import Result
@@ -53,13 +55,24 @@ def score(
     flow: Annotated[str, typer.Option(help="Flow estimator, as in a job's flow.backend.")] = "opencv-tvl1",
     shrink: Annotated[int, typer.Option(min=1, max=8, help="Flow on pictures this many times smaller.")] = 1,
     title: Annotated[str, typer.Option(help="Heading of the report.")] = "",
+    train: Annotated[
+        Path | None, typer.Option(help="The model's training data: simpler methods are fitted on it too.")
+    ] = None,
+    also: Annotated[list[str] | None, typer.Option(help="A further model, as NAME=FOLDER.")] = None,
     json: Json = False,
 ) -> None:
     """Force from a recording's video, scored against its sensor: score.json and report.html."""
     from bench import run
     from bench.assess import Settings
 
-    result = run.score(recording, model, out, Settings(backend=flow, shrink=shrink), title)
+    others = {}
+    for word in also or ():
+        name, sign, folder = word.partition("=")
+        if not (name and sign and folder):
+            raise UserError(f"--also {word}: expected NAME=FOLDER")
+        others[name] = Path(folder)
+    settings = Settings(backend=flow, shrink=shrink)
+    result = run.score(recording, model, out, settings, title, train, others)
     _say(result, out or Path(f"{result.recording}-score"), json)
 
 
@@ -88,7 +101,6 @@ def from_dataset(
 ) -> None:
     """Writes sealed sequences as recording folders, to be scored as real ones are."""
     from bench.export import export
-    from synth.errors import UserError
     from synth.store import Dataset
 
     chosen = [s for s in Dataset(dataset) if sequence is None or s.index == sequence]
@@ -100,6 +112,37 @@ def from_dataset(
     else:
         for path in written:
             print(path)
+
+
+@app.command("make-exvivo")
+def make_exvivo(
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder that gets the recordings.")],
+    count: Annotated[int, typer.Option(min=1, help="How many recordings.")] = 6,
+    first: Annotated[
+        int, typer.Option(min=0, help="Number of the first; they don't depend on each other.")
+    ] = 0,
+    seconds: Annotated[float, typer.Option(help="Length of each.")] = 30.0,
+    fps: Annotated[float, typer.Option(min=1.0, help="Mean frames a second.")] = 10.0,
+    width: Annotated[int, typer.Option(min=64, help="Width of the picture; the height is 3/4 of it.")] = 320,
+    photo: Annotated[Path | None, typer.Option(help="A photograph as texture of the surface.")] = None,
+    seed: Annotated[int, typer.Option(help="Root of all draws.")] = 100,
+    json: Json = False,
+) -> None:
+    """Renders pseudo ex vivo recordings, unlike any training data in every respect at once."""
+    from bench import exvivo
+    from bench.bar import counting
+
+    plan = exvivo.Plan(seed, seconds, fps, (width, width * 3 // 4), photo.resolve() if photo else None)
+    written = []
+    for index in range(first, first + count):
+        with counting(f"recording {index}", int(seconds * fps)) as progress:
+            done = exvivo.make(plan, index, out / f"{index:03d}", _first_of_two(progress))
+        written.append(str(done))
+    print(json_.dumps({"recordings": written}) if json else "\n".join(written))
+
+
+def _first_of_two(tell: Callable[[int], None]) -> Callable[[int, int], None]:
+    return lambda done, of: tell(done)
 
 
 def _say(result: Result, folder: Path, json: bool) -> None:

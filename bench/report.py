@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from plotly.offline import get_plotlyjs
 from rich.table import Table
 
-from bench import charts
+from bench import charts, score
 from bench.assess import Result
 from bench.follow import Snapshot
 from synth import picture
@@ -93,6 +93,7 @@ def render(result: Result, title: str) -> str:
         tiles=[(key, name, unit) for key, name, unit in METRICS if key in _TILES],
         best=_best(result),
         beaten_by=beaten_by(result),
+        surely=[n for n in beaten_by(result) if (w := result.methods[n].worse_by_mn) and w[0] > 0],
         panels=panels,
         flow_px=flow_px,
         force_kpa=force_kpa,
@@ -124,15 +125,13 @@ def terminal_table(result: Result) -> Table:
 
 
 def limits_of_agreement(result: Result) -> dict[str, float]:
-    """Bland and Altman's limits of agreement over frames, bias ± 1.96 standard deviations."""
+    """Bias and limits of agreement over the scored frames, contacts being the repeats."""
     assert result.sensor_mn is not None
-    difference = result.methods[result.main].size_mn - result.sensor_mn
-    difference = difference[np.isfinite(difference)]
-    bias, spread = (
-        float(difference.mean()),
-        float(difference.std(ddof=1)) if len(difference) > 1 else math.nan,
-    )
-    return {"bias_mn": bias, "low_mn": bias - 1.96 * spread, "high_mn": bias + 1.96 * spread}
+    kept, predicted = result.scored, result.methods[result.main].size_mn
+    threshold = score.contact_threshold(result.sensor_mn[kept], result.noise_floor_mn)
+    contact = score.in_contact(result.sensor_mn[kept], threshold)
+    run = np.cumsum(np.diff(contact.astype(int), prepend=0) != 0)
+    return score.limits_of_agreement(predicted[kept] - result.sensor_mn[kept], run)
 
 
 def beaten_by(result: Result) -> list[str]:

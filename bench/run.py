@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Mapping
 from pathlib import Path
 
 from bench import assess, report, scale
 from bench.assess import Result, Settings
 from bench.bar import counting
 from bench.export import export
+from bench.follow import Method
 from bench.methods import Model
 from bench.recording import open_recording
 from synth.errors import UserError
@@ -18,12 +20,22 @@ MAIN = "D2FNet"
 """Name under which the given model stands in every table."""
 
 
-def score(recording: Path, model: Path, out: Path | None, settings: Settings, title: str = "") -> Result:
+def score(
+    recording: Path,
+    model: Path,
+    out: Path | None,
+    settings: Settings,
+    title: str = "",
+    train: Path | None = None,
+    also: Mapping[str, Path] | None = None,
+) -> Result:
     """Scores one recording and writes score.json and report.html, both whole or not at all.
 
     Args:
         recording: its folder.
         model: folder of `learn train`.
+        train: the dataset the model was trained on; simpler methods are fitted on the same sequences.
+        also: further models by name.
         out: folder for the results; `NAME-score` here if None.
         settings: of this run.
         title: heading of the report.
@@ -37,16 +49,41 @@ def score(recording: Path, model: Path, out: Path | None, settings: Settings, ti
     opened = open_recording(recording)
     total = opened.expected_frames()
     network = Model(model)
+    methods: dict[str, Method] = {MAIN: network}
+    methods |= {name: Model(folder) for name, folder in (also or {}).items()}
+    methods |= baselines(train, model)
     found = scale.find(opened.meta, recording)
     with counting(f"scoring {opened.name}", total) as progress:
         result = assess.assess(
-            opened, {MAIN: network}, MAIN, found, settings, {"model": network.described()}, progress
+            opened, methods, MAIN, found, settings, {"model": network.described()}, progress
         )
     folder = out or Path(f"{opened.name}-score")
     folder.mkdir(parents=True, exist_ok=True)
     assess.write_json(result, folder / "score.json")
     report.write(result, folder / "report.html", title)
     return result
+
+
+def baselines(train: Path | None, model: Path) -> dict[str, Method]:
+    """Those that need no data, and, given the training data, those fitted on the model's own fit sequences.
+
+    Raises:
+        UserError: none of the model's sequences is in `train`.
+    """
+    from bench import baseline
+
+    methods = baseline.physical()
+    if train is None:
+        return methods
+    from learn.checkpoint import read_card
+    from learn.data import read
+
+    hashes = set(read_card(model).split.get("fit", []))
+    chosen = [s for s in Dataset(train) if s.attrs["content_hash"] in hashes]
+    if not chosen:
+        raise UserError(f"{train}: holds none of the sequences that {model} was fitted on")
+    source = "recovered" if all("flow_tvl1" in s for s in chosen) else "ideal"
+    return methods | baseline.fitted([read(s, baseline.GRID, (source,)) for s in chosen], source)
 
 
 def demo(dataset: Path, model: Path, out: Path, settings: Settings) -> Result:

@@ -57,6 +57,12 @@ def agreement(sensor: Curve, predicted: Curve) -> dict[str, float]:
     }
 
 
+def gain(sensor: Curve, predicted: Curve, where: NDArray[np.bool_]) -> float:
+    """The factor that best brings `predicted` to `sensor` over the samples of a calibrating press."""
+    good = where & np.isfinite(sensor) & np.isfinite(predicted)
+    return _ratio(float(sensor[good] @ predicted[good]), float(predicted[good] @ predicted[good]))
+
+
 def lag(time_s: Curve, sensor: Curve, predicted: Curve, search_s: float = 0.5) -> dict[str, float]:
     """By how much `predicted` runs behind `sensor`, and the correlation with that taken out.
 
@@ -192,6 +198,38 @@ def everything(
         "dropout": float(np.mean(~np.isfinite(predicted))) if len(predicted) else float("nan"),
     }
     return scores, rows
+
+
+def limits_of_agreement(difference: Curve, group: NDArray[np.integer]) -> dict[str, float]:
+    """Bias and 95% limits of agreement when samples come in groups that share their error.
+
+    Bland and Altman, "Agreement between methods of measurement with multiple observations per individual"
+    (J. Biopharmaceutical Statistics 2007), true value varying: variance between groups plus within.
+
+    Args:
+        difference: (T,) predicted minus sensor [mN]; NaN are left out.
+        group: (T,) which contact, or span between contacts, a sample belongs to.
+
+    Returns:
+        bias_mn, low_mn, high_mn.
+    """
+    good = np.isfinite(difference)
+    d, names = difference[good], np.unique(group[good], return_inverse=True)[1]
+    n, size = len(d), np.bincount(names).astype(float) if good.any() else np.zeros(0)
+    k = len(size)
+    nan = float("nan")
+    if n < 2:
+        return {"bias_mn": float(d.mean()) if n else nan, "low_mn": nan, "high_mn": nan}
+    bias = float(d.mean())
+    means = np.bincount(names, d) / size
+    variance = float(d.var(ddof=1))
+    if 1 < k < n:
+        within = float(np.square(d - means[names]).sum()) / (n - k)
+        between = float((size * np.square(means - bias)).sum()) / (k - 1)
+        repeats = (n - float(np.square(size).sum()) / n) / (k - 1)
+        variance = within + max(between - within, 0.0) / repeats
+    spread = 1.96 * float(np.sqrt(variance))
+    return {"bias_mn": bias, "low_mn": bias - spread, "high_mn": bias + spread}
 
 
 def _mean_size(rows: list[dict[str, float]], key: str) -> float:

@@ -37,7 +37,7 @@ def test_shrunken_flow_keeps_its_unit(make: Maker) -> None:
     folder = make(frames=8, size=(192, 256))
     whole, half = run(folder).methods["bump"].size_mn, run(folder, shrink=2).methods["bump"].size_mn
     # Bump reads pixels, which shrink with the picture: half the displacement in px, hence half the force.
-    assert half[3:] == pytest.approx(0.5 * whole[3:], rel=0.1, abs=3)
+    assert half[3:] == pytest.approx(0.5 * whole[3:], rel=0.2, abs=3)
 
 
 def test_frames_before_rest_are_left_out_and_said(make: Maker) -> None:

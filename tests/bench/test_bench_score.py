@@ -88,3 +88,15 @@ def test_ghosts_are_counted_only_without_contact() -> None:
     assert scores["ghost_rate"] == pytest.approx(np.mean(t[x == 0] < 2))
     assert scores["ghost_mn"] == pytest.approx(30 * np.mean(t[x == 0] < 2))
     assert score.everything(t, x, x)[0]["contact_f1"] == 1
+
+
+def test_limits_of_agreement_see_groups_that_share_their_error() -> None:
+    rng = np.random.default_rng(0)
+    group = np.repeat(np.arange(200), 20)
+    difference = rng.normal(0, 3, 200)[group] + rng.normal(0, 4, len(group)) + 1
+    got = score.limits_of_agreement(difference, group)
+    assert got["bias_mn"] == pytest.approx(1, abs=0.6)
+    assert got["high_mn"] - got["low_mn"] == pytest.approx(2 * 1.96 * 5, rel=0.05)
+    # Two groups only, in which plain pooling would see almost no spread between: theirs counts once each.
+    pair = score.limits_of_agreement(np.repeat([0.0, 10.0], 50), np.repeat([0, 1], 50))
+    assert pair["high_mn"] - pair["low_mn"] == pytest.approx(2 * 1.96 * np.sqrt(50), rel=0.02)

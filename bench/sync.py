@@ -1,0 +1,125 @@
+"""The sensor's clock on the video's: where force changes, tissue moves.
+
+Within a frame interval the sensor's force changes by some amount; the tissue moves by some amount. Over the
+calibration span the two series are correlated for every candidate offset. The offset is frozen before
+anything is scored, and refused when the recording doesn't determine it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bench import bootstrap
+
+Curve = NDArray[np.float64]
+
+_STEPS_PER_FRAME = 8
+_LEAST_INTERVALS = 20
+_LEAST_R = 0.4
+_RESAMPLES = 300
+_SAME_PEAK = 0.95
+
+
+@dataclass(frozen=True)
+class Offset:
+    """What was found."""
+
+    offset_s: float
+    """To be added to the sensor's times [s]."""
+    r: float
+    """Correlation there."""
+    r_at_zero: float
+    """Correlation without any offset."""
+    deviation_s: float
+    """Standard deviation of the offset over bootstrap resamples [s]."""
+    refused: str
+    """Why the offset must not be used; empty when it may be."""
+
+
+def find(
+    frame_s: Curve, speed: Curve, sensor_s: Curve, force_mn: NDArray[np.float64], search_s: float
+) -> Offset:
+    """The offset at which the sensor's changes best follow the tissue's motion.
+
+    Args:
+        frame_s: (T,) times of the frames in the calibration span [s].
+        speed: (T,) mean speed of the tissue over the interval that ends at each frame [mm/s].
+        sensor_s: (N,) the sensor's own times [s].
+        force_mn: (N, 3) [mN]; NaN rows are left out.
+        search_s: largest offset looked for, either way [s].
+
+    Returns:
+        The offset, refused if there are too few intervals, the correlation is weak, its peak lies at the
+        search's end, or fewer than 95% of block-bootstrap resamples put it within a frame of the same place.
+    """
+    good = np.isfinite(force_mn).all(axis=1)
+    t, force = sensor_s[good], force_mn[good]
+    widths = np.diff(frame_s)
+    if len(widths) < _LEAST_INTERVALS:
+        return _none(f"only {len(widths)} frame intervals in the calibration span, {_LEAST_INTERVALS} needed")
+    frame = float(np.median(widths))
+    step = frame / _STEPS_PER_FRAME
+    offsets = np.arange(-round(search_s / step), round(search_s / step) + 1) * step
+    change = np.stack([_change(frame_s - offset, t, force) / widths for offset in offsets])
+    moved = speed[1:]
+    usable = np.isfinite(change).all(axis=0) & np.isfinite(moved)
+    if usable.sum() < _LEAST_INTERVALS:
+        return _none("the sensor doesn't cover the calibration span with the search's margin on both sides")
+    change, moved = change[:, usable], moved[usable]
+    r = _correlations(np.ones((1, len(moved))), change, moved)[0]
+    if not np.isfinite(r).any():
+        return _none("nothing moves, or the force doesn't change, in the calibration span")
+    best = int(np.nanargmax(r))
+    rng = np.random.default_rng(0)  # the same recording gives the same offset
+    weights = bootstrap.counts(len(moved), bootstrap.block_length(moved), _RESAMPLES, rng)
+    again = offsets[np.nanargmax(np.nan_to_num(_correlations(weights, change, moved), nan=-1.0), axis=1)]
+    there = np.abs(again - offsets[best]) <= frame
+    zero = float(r[len(offsets) // 2])
+    deviation = float(again[there].std()) if there.any() else float("nan")
+    refused = ""
+    if best in (0, len(offsets) - 1):
+        refused = f"correlation still rises at the end of the search, {search_s:g} s"
+    elif r[best] < _LEAST_R:
+        refused = f"force and motion correlate by only {r[best]:.2f}"
+    elif there.mean() < _SAME_PEAK:
+        refused = f"ambiguous: {100 * (1 - there.mean()):.0f}% of resamples put the peak elsewhere"
+    return Offset(_refined(offsets, r, best), float(r[best]), zero, deviation, refused)
+
+
+def _change(frame_s: Curve, sensor_s: Curve, force_mn: NDArray[np.float64]) -> Curve:
+    """Length of the change of force over each frame interval [mN]; NaN outside the sensor's record."""
+    at = np.stack([np.interp(frame_s, sensor_s, f, left=np.nan, right=np.nan) for f in force_mn.T], axis=1)
+    return np.asarray(np.linalg.norm(np.diff(at, axis=0), axis=1), np.float64)
+
+
+def _correlations(
+    weights: NDArray[np.float64], change: NDArray[np.float64], moved: Curve
+) -> NDArray[np.float64]:
+    """Weighted correlations, (B, L), for weights (B, K) and changes (L, K)."""
+    n = weights.sum(axis=1, keepdims=True)
+    mean_y = weights @ moved[:, None] / n
+    mean_x = weights @ change.T / n
+    cov = weights @ (change * moved).T / n - mean_x * mean_y
+    var_x = weights @ (change**2).T / n - mean_x**2
+    var_y = weights @ (moved**2)[:, None] / n - mean_y**2
+    with np.errstate(divide="ignore", invalid="ignore"):
+        r = cov / np.sqrt(var_x * var_y)
+    return np.where((var_x > 1e-12) & (var_y > 1e-18), r, np.nan)
+
+
+def _refined(offsets: NDArray[np.floating], r: Curve, best: int) -> float:
+    """Top of the parabola through the best three."""
+    if best in (0, len(r) - 1):
+        return float(offsets[best])
+    left, middle, right = r[best - 1 : best + 2]
+    bend = left - 2 * middle + right
+    shift = 0.5 * (left - right) / bend if np.isfinite(bend) and bend < 0 else 0.0
+    return float(offsets[best] + shift * (offsets[1] - offsets[0]))
+
+
+def _none(reason: str) -> Offset:
+    nan = float("nan")
+    return Offset(0.0, nan, nan, nan, reason)
