@@ -18,10 +18,10 @@ _WHITE_L = 88.0
 def statistics(rgb: Picture) -> dict[str, float]:
     """Figures of one crop (N, N, 3) sRGB.
 
-    Lab means and standard deviations (CIE 1976, D65), the slope of the radial power spectrum of L over
-    frequencies from 1/64 to 1/4 cycles a pixel (natural scenes: about -2; D. J. Field 1987), the kurtosis of
-    its horizontal and vertical gradients, the share of highlight pixels and the median and 90th percentile of the
-    areas of connected highlights [px].
+    Lab means and standard deviations (CIE 1976, D65), the slope of the radial power spectrum of L from 1/64
+    to 1/4 cycles a pixel (natural scenes: about -2; D. J. Field 1987), the kurtosis of its horizontal and
+    vertical gradients, the share of highlight pixels, and the median and 90th percentile of the areas of
+    connected highlights [px].
     """
     lab = cv2.cvtColor(rgb.astype(np.float32) / 255, cv2.COLOR_RGB2LAB)
     found: dict[str, float] = {}

@@ -31,10 +31,14 @@ class Command:
 
 COMMANDS: tuple[Command, ...] = (
     Command("experiment", "realism", "bench.render_realism", "realism_figures"),
+    Command("experiment", "render", "bench.render_cost", "experiment"),
+    Command("stability", "render", "bench.render_stability", "stability"),
+    Command("pareto", "render", "bench.render_pareto", "pareto"),
     Command("experiment", "stages", "bench.stages", "stages"),
     Command("experiment", "learn", "bench.learn_experiment", "experiment"),
     Command("stability", "damage", "bench.engine_damage", "damage"),
     Command("experiment", "scale", "bench.engine_scale", "scale"),
+    Command("stability", "dask", "bench.engine_dask", "dask"),
     Command("stability", "kills", "bench.engine_kills", "kills"),
 )
 

@@ -34,8 +34,8 @@ def lamps(camera: Camera, look: Look) -> list[Lamp]:
         r, g, b = (share * total * colour).tolist()
         return Lamp(position, target, (r, g, b), float(cutoff), float(beam), weight)
 
-    # Two points stand for the ring. With weights 2:1:1 the four strata of a multijittered pixel look at the same
-    # lamps in every pixel, and the choice of a lamp makes no noise.
+    # Two points stand for the ring. With weights 2:1:1 the four strata of a multijittered pixel look at the
+    # same lamps in every pixel, and the choice of a lamp makes no noise.
     made = [lamp(main, look.coaxial, 2.0)]
     for around in (angle + 0.6 * np.pi, angle + 1.4 * np.pi):
         offset = _RING_MM * (np.cos(around) * right + np.sin(around) * down)

@@ -119,8 +119,6 @@ class Look:
     """Colour temperature of the lamps."""
     balance_kelvin: float
     """What the camera's white balance takes it for."""
-    ambient: float
-    """Light of the room as a share of the lamps'."""
     exposure: float
     full_well: float
     contrast: float
@@ -150,7 +148,6 @@ class Look:
             lamp_azimuth_deg=float(rng.uniform(0, 360)),
             kelvin=kelvin,
             balance_kelvin=kelvin + float(rng.uniform(-250, 350)),
-            ambient=float(rng.uniform(0.02, 0.05)),
             exposure=float(rng.uniform(1.0, 1.2)),
             full_well=float(rng.uniform(8_000, 20_000)),
             contrast=float(rng.uniform(0.25, 0.55)),

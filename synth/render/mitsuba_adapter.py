@@ -7,6 +7,7 @@ LLVM found by `synth.llvm`: a wrong one ends the process.
 from __future__ import annotations
 
 import functools
+import gc
 import os
 from dataclasses import dataclass
 from typing import Any
@@ -122,7 +123,6 @@ class Stage:
         camera: Camera,
         bodies: dict[str, Body],
         lamps: list[Lamp],
-        ambient: tuple[float, float, float],
         spp: int,
         integrator: str = "direct",
         sampler: str = "multijitter",
@@ -130,20 +130,15 @@ class Stage:
         import mitsuba as mi
 
         mi.set_variant(variant)
+        self._jit = "scalar" not in variant
         _limit_threads()
+        _forget(self._jit)
         self.variant = variant
         self._mi = mi
-        self._bodies = bodies
-        self._jit = "scalar" not in variant
+        self._faces = {name: body.faces for name, body in bodies.items()}
         scene: dict[str, Any] = {
             "type": "scene",
             "integrator": _integrator(integrator),
-            # Found by the surface's own sampling: choosing it as a lamp would only add noise.
-            "ambient": {
-                "type": "constant",
-                "radiance": {"type": "rgb", "value": list(ambient)},
-                "sampling_weight": 0.0,
-            },
         }
         for index, lamp in enumerate(lamps):
             scene[f"lamp{index}"] = _lamp(mi, lamp)
@@ -155,7 +150,7 @@ class Stage:
 
     def move(self, name: str, vertices: Floats) -> None:
         """New positions (V, 3) mm of a body's vertices."""
-        bent = normals(Shape(vertices, self._bodies[name].faces))
+        bent = normals(Shape(vertices, self._faces[name]))
         for key, values in (("vertex_positions", vertices), ("vertex_normals", bent)):
             flat = values.astype(np.float32).ravel()
             self._parameters[f"{name}.{key}"] = self._mi.Float(flat) if self._jit else flat
@@ -166,6 +161,15 @@ class Stage:
         lens = self._lens
         image = self._mi.render(self._scene, sensor=lens.sensor, spp=lens.spp, seed=seed)
         return lens.develop(np.array(image, dtype=np.float32)[..., :3])
+
+
+def _forget(jit: bool) -> None:
+    """Frees what stages before this one held: Python's plugins and their scenes refer to each other."""
+    gc.collect()
+    if jit:
+        import drjit as dr
+
+        dr.flush_malloc_cache()
 
 
 def _limit_threads() -> None:
@@ -179,7 +183,8 @@ def _limit_threads() -> None:
 
 def _integrator(kind: str) -> dict[str, Any]:
     if kind == "direct":
-        return {"type": "direct", "emitter_samples": 1, "bsdf_samples": 1}
+        # Lamps are points: what a surface scatters towards by itself never meets one.
+        return {"type": "direct", "emitter_samples": 1, "bsdf_samples": 0}
     return {"type": "path", "max_depth": int(kind.removeprefix("path"))}
 
 

@@ -62,7 +62,8 @@ class Studio:
 
     def __init__(self, surface: Surface, look: Look, camera: Camera, job: Job) -> None:
         self.variant = pick(job.render.variant)
-        self._surface, self._look, self._camera, self._render = surface, look, camera, job.render
+        self.surface, self.camera = surface, camera
+        self._look, self._render = look, job.render
         self._rim = rim.build(surface, job.anatomy.craniotomy.radius_mm, look)
         self._coat = texture.cortex(
             surface,
@@ -90,7 +91,7 @@ class Studio:
             shafts: (K, 3) unit vectors from tip to hand.
             seed: of light paths and sensor noise.
         """
-        camera, surface = self._camera, self._surface
+        camera, surface = self.camera, self.surface
         if self._render.tool and self._tool is None:
             self._tool = instrument.build(len(tips))
         tool = instrument.pose(self._tool, tips, shafts) if self._tool else np.zeros((0, 3))
@@ -102,9 +103,8 @@ class Studio:
             self._rim.shape,
             Shape(tool, self._tool.faces) if self._tool else None,
         )
-        rng = np.random.default_rng([seed, 1])
         return Shot(
-            rgb=sensor.record(radiance, self._sensor, rng),
+            rgb=self.develop(radiance, seed),
             radiance=radiance,
             flow=now.flow,
             visible=now.visible,
@@ -115,18 +115,34 @@ class Studio:
 
     def traction(self, nodal: Floats) -> Map:
         """Traction (V, 3) kPa, world axes, at rest pixels: (H, W, 3) kPa, camera axes; 0 off tissue."""
-        return truth.at_rest_pixels(self.still, self._surface.faces, nodal @ self._camera.rotation.T)
+        return truth.at_rest_pixels(self.still, self.surface.faces, nodal @ self.camera.rotation.T)
+
+    def stage(
+        self,
+        vertices: Floats,
+        tool: Floats,
+        spp: int,
+        integrator: str = "direct",
+        sampler: str = "multijitter",
+    ) -> Stage:
+        """A Mitsuba stage of this scene with bodies `cortex`, `rim` and `tool`, placed as given."""
+        return Stage(
+            self.variant,
+            self.camera,
+            self._bodies(vertices, tool),
+            self._lamps,
+            spp,
+            integrator,
+            sampler,
+        )
+
+    def develop(self, radiance: Map, seed: int) -> npt.NDArray[np.uint8]:
+        """The recorded picture (H, W, 3) of a radiance (H, W, 3)."""
+        return sensor.record(radiance, self._sensor, np.random.default_rng([seed, 1]))
 
     def _expose(self, vertices: Floats, tool: Floats, seed: int) -> Map:
         if self._stage is None:
-            self._stage = Stage(
-                self.variant,
-                self._camera,
-                self._bodies(vertices, tool),
-                self._lamps,
-                (self._look.ambient,) * 3,
-                self._render.spp,
-            )
+            self._stage = self.stage(vertices, tool, self._render.spp)
         else:
             self._stage.move("cortex", vertices)
             if self._tool:
@@ -134,9 +150,9 @@ class Studio:
         return self._stage.render(seed)
 
     def _bodies(self, vertices: Floats, tool: Floats) -> dict[str, Body]:
-        surface, look = self._surface, self._look
+        surface, look = self.surface, self._look
         frame = rim.paint(
-            self._rim, look, texture.resolution(self._rim.extent_mm, 2.2 * self._camera.mm_per_px)
+            self._rim, look, texture.resolution(self._rim.extent_mm, 2.2 * self.camera.mm_per_px)
         )
         bodies = {
             "cortex": Body(
@@ -156,14 +172,14 @@ class Studio:
     def _glare(self, radiance: Map, now: truth.Now, vertices: Floats) -> Mask:
         """Tissue whose radiance exceeds what its diffuse part could send."""
         height, width = radiance.shape[:2]
-        faces = self._surface.faces
+        faces = self.surface.faces
         on = (now.hits.face >= 0) & (now.hits.face < len(faces))
         corners = faces[now.hits.face[on]]
         bary = now.hits.bary[on]
-        uv = np.einsum("nk,nkc->nc", bary, self._surface.uv[corners].astype(np.float64))
+        uv = np.einsum("nk,nkc->nc", bary, self.surface.uv[corners].astype(np.float64))
         albedo = noise.sample(self._coat.albedo, uv - 0.5, 1.0)
         light_in = np.einsum("nk,nkc->nc", bary, self._irradiance(vertices)[corners])
-        diffuse = (albedo * (light_in + self._look.ambient)).mean(axis=1)
+        diffuse = (albedo * light_in).mean(axis=1)
         excess = radiance.reshape(-1, 3)[on].mean(axis=1) - 1.05 * diffuse
         glare = np.zeros(height * width, bool)
         glare[on] = excess * self._look.exposure > _GLARE
@@ -171,7 +187,7 @@ class Studio:
 
     def _irradiance(self, vertices: Floats) -> Floats:
         """Radiance (V, 3) of a white diffuser at each vertex, unshadowed."""
-        normal = normals(Shape(vertices, self._surface.faces))
+        normal = normals(Shape(vertices, self.surface.faces))
         total = np.zeros((len(vertices), 3))
         for lamp in self._lamps:
             towards = lamp.position - vertices

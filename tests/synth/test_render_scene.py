@@ -48,7 +48,7 @@ def test_the_picture_moves_with_the_truth(variant: str) -> None:
     ours, vertices = studio(variant, spp=64, tool=False)
     rest = ours.frame(vertices, TIPS, SHAFTS, 1)
     pixel = ours.still.scale_mm_per_px
-    moved = ours.frame(vertices + ours._camera.rotation[0] * 3 * pixel, TIPS, SHAFTS, 2)
+    moved = ours.frame(vertices + ours.camera.rotation[0] * 3 * pixel, TIPS, SHAFTS, 2)
     inside = np.zeros_like(ours.still.tissue)
     inside[20:-20, 30:-30] = True
     inside &= ours.still.tissue & ~rest.glare & ~np.roll(moved.glare, -3, axis=1)
