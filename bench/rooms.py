@@ -39,6 +39,8 @@ COMMANDS: tuple[Command, ...] = (
     Command("stability", "damage", "bench.engine_damage", "damage"),
     Command("experiment", "scale", "bench.engine_scale", "scale"),
     Command("stability", "dask", "bench.engine_dask", "dask"),
+    Command("stability", "trouble", "bench.engine_trouble", "trouble"),
+    Command("pareto", "engine", "bench.engine_speed", "speed"),
     Command("stability", "kills", "bench.engine_kills", "kills"),
 )
 

@@ -55,6 +55,9 @@ class Setup:
     keep_open: tuple[int, ...] = ()
     """File descriptors that live as long as any worker does: the lock of the dataset."""
     environment: Mapping[str, str] | None = None
+    turn: int = 0
+    """Which run of the dataset this is; another number in `turn_file` says that it is over."""
+    turn_file: Path = Path()
 
 
 class Child:

@@ -60,19 +60,24 @@ def render(
     workers: Annotated[
         int | None, typer.Option(min=1, help="Processes at a time; one a core if not given.")
     ] = None,
+    engine: Annotated[
+        str, typer.Option(help="local, dask://host:port, or a YAML file that describes a SLURM cluster.")
+    ] = "local",
     memory: Annotated[
         float | None, typer.Option(help="Memory that a process may take [GB]; a share of what is free.")
     ] = None,
     json: Json = False,
 ) -> None:
     """Renders the dataset of a job. Exit code 1 when some of its sequences failed."""
-    from synth import config, engine
+    from synth import config
+    from synth import engine as running
     from synth.progress import Bars
 
     _end_on_terminate()
     read = config.load(job, overrides or [])
     with Bars() as bars:
-        summary = engine.run(read, out, engine.Options(workers=workers, memory_gb=memory), bars)
+        options = running.Options(engine=engine, workers=workers, memory_gb=memory)
+        summary = running.run(read, out, options, bars)
     if json:
         print(json_.dumps({**vars(summary), "out": str(out)}))
     else:

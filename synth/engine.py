@@ -1,4 +1,4 @@
-"""Running a job on this machine: sequences handed to worker processes, none lost, order without effect."""
+"""Running a job: sequences handed to worker processes, none lost, order without effect."""
 
 from __future__ import annotations
 
@@ -7,20 +7,20 @@ import queue
 import threading
 from collections import deque
 from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
 
-from synth import card, forecast, index, llvm, preview
-from synth.child import Attempt, Child, Setup
+from synth import card, forecast, index, preview, slots
+from synth.child import Attempt, Setup
 from synth.errors import UserError
 from synth.folder import Folder, claim
 from synth.job import Job
 from synth.journal import Journal
+from synth.slots import Slots
 
 _TRIES = 3
-# A process that has computed so many is replaced: libraries leak a little with every sequence.
-_RECYCLE = 16
 # So many first sequences failing on the job's own account, and none succeeding, condemn the job.
 _VERDICT = 5
 
@@ -29,6 +29,8 @@ _VERDICT = 5
 class Options:
     """How to run; none of it changes a byte of the dataset."""
 
+    engine: str = "local"
+    """`local`, `dask://host:port`, or a YAML file that describes a SLURM cluster."""
     workers: int | None = None
     """Processes at a time; default one a core."""
     memory_gb: float | None = None
@@ -72,7 +74,7 @@ def run(job: Job, root: Path, options: Options, watcher: Watcher) -> Summary:
             (then nothing is left behind).
         KeyboardInterrupt: after the workers are ended; what is sealed stays, the next run goes on.
     """
-    workers = options.workers or len(os.sched_getaffinity(0))
+    workers, memory = options.workers or len(os.sched_getaffinity(0)), options.memory_gb
     with claim(root, job) as folder:
         finished, failures = set(folder.sealed()), folder.failures()
         todo = [k for k in range(job.sequences) if k not in finished and k not in failures]
@@ -82,17 +84,20 @@ def run(job: Job, root: Path, options: Options, watcher: Watcher) -> Summary:
             each.begin(job.sequences, len(finished), len(failures))
         setup = Setup(
             job=job.model_dump(mode="json"),
-            folder=root,
-            logs=folder.logs,
-            scratch=folder.scratch,
+            folder=root.resolve(),
+            logs=folder.logs.resolve(),
+            scratch=folder.scratch.resolve(),
             work=options.work,
-            memory_bytes=_share_of_memory(options, workers),
+            memory_bytes=slots.share_of_memory(workers) if memory is None else int(memory * 1e9),
             stall_s=options.stall_s,
             keep_open=(folder.lock_fd,),
-            environment={**_machine(job, workers), **options.environment},
+            environment={**slots.machine(job, workers), **options.environment},
+            turn=folder.turn,
+            turn_file=folder.turn_file.resolve(),
         )
         try:
-            done = _Pool(folder, setup, todo, min(workers, max(len(todo), 1))).work(watchers)
+            with _slots(options.engine, setup, workers) as made:
+                done = _Pool(folder, made, todo).work(watchers)
         except BaseException:
             index.write(folder)
             raise
@@ -110,10 +115,11 @@ def run(job: Job, root: Path, options: Options, watcher: Watcher) -> Summary:
 
 
 class _Pool:
-    """Worker threads, each with a process of its own, and the queue that they take sequences from."""
+    """Threads, each with a slot of its own, and the queue that they take sequences from."""
 
-    def __init__(self, folder: Folder, setup: Setup, todo: list[int], workers: int) -> None:
-        self._folder, self._setup, self._workers = folder, setup, workers
+    def __init__(self, folder: Folder, slots: Slots, todo: list[int]) -> None:
+        self._folder, self._slots = folder, slots
+        self._workers = max(1, min(slots.count(), len(todo)))
         self._todo = deque((k, 1) for k in todo)
         self._busy = 0
         self._change = threading.Condition()
@@ -150,21 +156,14 @@ class _Pool:
         return self._done
 
     def _thread(self) -> None:
-        child: Child | None = None
+        slot = self._slots.slot()
         try:
             while (task := self._take()) is not None:
-                child = child or Child(self._setup)
-                attempt = child.run(task[0], self._reporter(task[0]), self._stop)
-                worn = child.finished >= _RECYCLE
-                if attempt.kind not in ("done", "input") or worn:
-                    child.close()
-                    child = None
-                self._settle(attempt, task[1])
+                self._settle(slot.run(task[0], self._reporter(task[0]), self._stop), task[1])
         except BaseException as error:
             self._events.put(error)
         finally:
-            if child is not None:
-                child.close()
+            slot.close()
             self._events.put(None)
 
     def _take(self) -> tuple[int, int] | None:
@@ -222,19 +221,9 @@ class _Pool:
         return report
 
 
-def _machine(job: Job, workers: int) -> dict[str, str]:
-    """What is found out once for all workers: threads for each, and the LLVM that the renderer may use."""
-    threads = max(1, len(os.sched_getaffinity(0)) // workers)
-    library = llvm.find() if job.render.variant in ("auto", "llvm_ad_rgb") else None
-    return {"SULCUS_THREADS": str(threads), "SULCUS_LLVM": library or ""}
+def _slots(engine: str, setup: Setup, workers: int) -> AbstractContextManager[Slots]:
+    if engine == "local":
+        return slots.local(setup, workers)
+    from synth import cluster
 
-
-def _share_of_memory(options: Options, workers: int) -> int | None:
-    if options.memory_gb is not None:
-        return int(options.memory_gb * 1e9)
-    try:
-        lines = Path("/proc/meminfo").read_text().splitlines()
-    except OSError:  # a system without /proc: its own limits must do
-        return None
-    fields = dict(line.split(":") for line in lines)
-    return int(0.9 * int(fields["MemAvailable"].split()[0]) * 1024 / workers)
+    return cluster.slots_of(engine, setup)

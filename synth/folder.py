@@ -32,6 +32,8 @@ class Folder:
         self.logs = self.state / "logs"
         self.scratch = self.state / "scratch"
         self.lock_fd = -1
+        self.turn_file = self.state / "turn"
+        self.turn = 0
 
     def described(self) -> dict[str, Any]:
         """`{"identity", "job"}` as first written. UserError if this is no dataset of ours."""
@@ -97,6 +99,15 @@ class Folder:
             if radiance.name.isdigit():
                 self.sweep(int(radiance.name))
 
+    def pass_turn(self) -> None:
+        """Ends what other machines still do for an earlier run: they look at the turn."""
+        try:
+            before = int(self.turn_file.read_text())
+        except (FileNotFoundError, ValueError):
+            before = 0
+        self.turn = before + 1
+        write_whole(self.turn_file, str(self.turn), durable=False)
+
     def vacate(self) -> None:
         """Removes the traces of a run that finished nothing."""
         for name in (_NAME, "job.yaml", "index.parquet"):
@@ -130,10 +141,12 @@ def claim(root: Path, job: Job) -> Iterator[Folder]:
             write_whole(
                 root / "job.yaml", "# The job of this dataset, every value said.\n" + jobfile.dump(job)
             )
+            folder.pass_turn()
             folder.sweep_all()
             try:
                 yield folder
             finally:
+                folder.pass_turn()
                 if fresh and not folder.sealed() and not folder.failures():
                     folder.vacate()
                     if created:

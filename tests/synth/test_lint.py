@@ -16,6 +16,7 @@ MAY_READ_CLOCKS = {
     "synth/stopwatch.py",
     "synth/progress.py",
     "synth/child.py",
+    "synth/cluster.py",
     "synth/journal.py",
     "synth/folder.py",
 }

@@ -1,0 +1,77 @@
+"""What the engine costs, and what a second worker brings."""
+
+from __future__ import annotations
+
+import json as json_
+import os
+import resource
+import tempfile
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from bench import machine
+from bench.engine_trouble import timed
+from synth import config, engine
+from synth.progress import Bars
+from synth.store import Dataset
+
+
+def speed(
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder of the results.")] = Path(
+        "docs/results/engine/speed"
+    ),
+    job: Annotated[str, typer.Option(help="A job whose rendering is timed for the overhead.")] = "demo",
+    rendered: Annotated[int, typer.Option(help="Sequences of it.")] = 4,
+    sequences: Annotated[int, typer.Option(help="Stand-in sequences for one worker against two.")] = 24,
+    cpu_s: Annotated[float, typer.Option(help="Processor time of each [s].")] = 4.0,
+    json: Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")] = False,
+) -> None:
+    """Overhead of engine and store over the bare stages, and two workers against one."""
+    result: dict[str, Any] = {"overhead": overhead(job, rendered)}
+    if sequences:
+        stand_in = config.load("tiny", [f"sequences={sequences}", "flow.backend=ideal"])
+        load = os.getloadavg()[0]
+        seconds = {n: timed(stand_in, "busy", n, cpu_s, 4.0)[1] for n in (1, 2)}
+        result["workers"] = {
+            "sequences": sequences,
+            "scene_cpu_s": cpu_s,
+            "seconds_1": round(seconds[1], 2),
+            "seconds_2": round(seconds[2], 2),
+            "ratio": round(seconds[1] / seconds[2], 3),
+            "load_before": round(load, 2),
+        }
+    result["machine"] = machine.describe()
+    out.mkdir(parents=True, exist_ok=True)
+    (out / "speed.json").write_text(json_.dumps(result, indent=1) + "\n")
+    print(json_.dumps(result, indent=None if json else 1))
+
+
+def overhead(name: str, count: int) -> dict[str, float | int]:
+    """CPU time of a whole run (engine, workers, store, index, film, card) over that of its stages alone."""
+    job = config.load(name, [f"sequences={count}"])
+    with tempfile.TemporaryDirectory() as scratch, Bars() as bars:
+        before = _cpu()
+        engine.run(job, Path(scratch) / "out", engine.Options(workers=1), bars)
+        whole = _cpu() - before
+        stages: dict[str, float] = {}
+        for sequence in Dataset(Path(scratch) / "out"):
+            for stage, spent in sequence.attrs["timings"].items():
+                if isinstance(spent, dict):
+                    stages[stage] = stages.get(stage, 0.0) + spent["cpu_s"]
+    store = stages.pop("store", 0.0)
+    bare = sum(stages.values())
+    return {
+        "sequences": count,
+        "whole_cpu_s": round(whole, 2),
+        "stages_cpu_s": round(bare, 2),
+        "store_cpu_s": round(store, 2),
+        "overhead": round(whole / bare - 1, 4),
+        "store_share": round(store / bare, 4),
+    }
+
+
+def _cpu() -> float:
+    mine, theirs = (resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+    return mine.ru_utime + mine.ru_stime + theirs.ru_utime + theirs.ru_stime
