@@ -49,6 +49,41 @@ def schema() -> None:
 
 
 @app.command()
+def preview(
+    job: Annotated[str, typer.Argument(help="A job file, or a named job: tiny, demo, paper.")],
+    overrides: Annotated[
+        list[str] | None, typer.Argument(help="Changes to the job, as section.key=value.")
+    ] = None,
+    out: Annotated[Path, typer.Option("--out", "-o", help="The PNG to write.")] = Path("sheet.png"),
+    count: Annotated[int, typer.Option("--count", "-n", min=1, max=100, help="Scenarios to show.")] = 9,
+    json: Json = False,
+) -> None:
+    """Draws a contact sheet of a job's scenarios and says what the whole job will take."""
+    import cv2
+
+    from synth import config, sheet
+    from synth.errors import UserError
+    from synth.forecast import amount
+
+    if out.suffix.lower() != ".png" or not out.parent.is_dir():
+        raise UserError(f"{out}: cannot be written as PNG")
+    read = config.load(job, overrides or [])
+    made = sheet.make(read, count)
+    if not cv2.imwrite(str(out), made.picture[..., ::-1]):
+        raise UserError(f"{out}: cannot be written as PNG")
+    if json:
+        found = {"sheet": str(out), "render_cpu_s": made.render_cpu_s, "disk_bytes": made.disk_bytes}
+        print(json_.dumps(found))
+        return
+    print(f"wrote {out}")
+    print(
+        f"the whole job: {read.sequences} sequences of {read.frames} frames, "
+        f"{made.render_cpu_s / 60:.1f} CPU-minutes of rendering (physics and flow come on top), "
+        f"{amount(made.disk_bytes)} of disk"
+    )
+
+
+@app.command()
 def render(
     job: Annotated[str, typer.Argument(help="A job file, or a named job: tiny, demo, paper.")],
     overrides: Annotated[

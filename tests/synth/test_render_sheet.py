@@ -1,0 +1,28 @@
+"""The contact sheet of a job, through the command that makes it."""
+
+import json
+from pathlib import Path
+
+import cv2
+import pytest
+from typer.testing import CliRunner
+
+from synth.cli import app
+
+
+def test_preview_draws_scenarios_and_says_what_they_cost(tmp_path: Path) -> None:
+    sheet = tmp_path / "sheet.png"
+    small = ["render.size=[80, 64]", "sequences=40", "frames=10", "render.spp=4", "anatomy.vertices=900"]
+    done = CliRunner().invoke(app, ["preview", "tiny", *small, "-n", "3", "-o", str(sheet), "--json"])
+    assert done.exit_code == 0, done.output
+    found = json.loads(done.stdout)
+    assert cv2.imread(str(sheet)).shape == (128, 160, 3)  # three tiles in a square of four
+    assert found["render_cpu_s"] > 0.1
+    assert found["disk_bytes"] > 40 * 10 * 80 * 64 * 3 / 2
+
+
+@pytest.mark.parametrize("target", ["sheet.txt", "missing/sheet.png"])
+def test_preview_refuses_what_it_cannot_write(tmp_path: Path, target: str) -> None:
+    done = CliRunner().invoke(app, ["preview", "tiny", "-o", str(tmp_path / target)])
+    assert done.exit_code != 0
+    assert not list(tmp_path.iterdir())
