@@ -119,8 +119,12 @@ class Fem(Section):
     """Peak load as P = F/(E a^2), dimensionless, so that one range suits every stiffness."""
     footprint_mm: PositiveRange = (3.0, 6.0)
     """Radius a of the contact [mm]."""
-    gestures: tuple[Literal["pull", "push"], ...] = ("pull", "push")
+    gestures: Annotated[
+        tuple[Literal["pull", "push", "slide", "grasp", "retract", "tap"], ...], Field(min_length=1)
+    ] = ("pull", "push", "slide", "grasp", "retract", "tap")
     """Kinds of gesture that sequences are drawn from, in equal shares."""
+    ramp: PositiveRange = (0.25, 0.35)
+    """Time in which the load grows to its peak, as a part of the sequence."""
     cone_deg: Annotated[FiniteFloat, Field(ge=0, le=80)] = 65.0
     """The load's direction is drawn uniformly within this angle of the surface normal."""
 

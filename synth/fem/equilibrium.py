@@ -40,14 +40,13 @@ class Path:
     """(T,) force out of balance over the load, in the norm of the inverse stiffness; 0 without load."""
 
 
-def follow(system: System, load: Floats, part: Floats, peak: float) -> Path:
-    """Equilibrium at each part of a load.
+def follow(system: System, loads: Floats, named: Floats) -> Path:
+    """Equilibrium under each load in turn.
 
     Args:
         system: the equations.
-        load: (N, 3) mN for E = 1 kPa.
-        part: (T,) what part of it is on.
-        peak: P = F/(E a^2) of the whole load, for messages.
+        loads: (T, N, 3) mN for E = 1 kPa.
+        named: (T,) P = F/(E a^2) of each, for messages.
 
     Raises:
         InvertedElement: names frame, load and element.
@@ -55,26 +54,32 @@ def follow(system: System, load: Floats, part: Floats, peak: float) -> Path:
         NotFinite: a number is none.
     """
     path: list[tuple[Floats, State]] = []
-    residual = np.zeros(len(part))
-    first = system.solve(load)
-    size = float(np.sqrt(np.vdot(load, first)))
-    known: list[tuple[float, Floats]] = [(0.0, np.zeros_like(load))]
-    for step, p in enumerate(part):
+    residual = np.zeros(len(loads))
+    peak = loads[np.abs(loads).max(axis=(1, 2)).argmax()]
+    first = system.solve(peak)
+    square = float(np.vdot(peak, peak)) or 1.0
+    size = float(np.sqrt(np.vdot(peak, first))) or 1.0
+    known: list[tuple[float, Floats]] = [(0.0, np.zeros_like(peak))]
+    for step, load in enumerate(loads):
+        part = float(np.vdot(load, peak)) / square
+        alike = float(np.abs(load - part * peak).max()) <= 1e-9 * float(np.abs(peak).max())
         if system.law == "linear":
-            u = p * first
+            u = part * first if alike else system.solve(load)
             state = system.state(u)
-            out = _free(system, p * load - state.force)
-            residual[step] = np.linalg.norm(out) / np.linalg.norm(load)
+            residual[step] = np.linalg.norm(_free(system, load - state.force)) / np.sqrt(square)
         else:
-            start = _guess(known, float(p), first)
-            u, state, rest = balance(system, p * load, start, TOLERANCE * size)
+            if alike:
+                start = _guess(known, part, first)
+            else:
+                start = path[-1][0] + system.solve(load - loads[step - 1])
+            u, state, rest = balance(system, load, start, TOLERANCE * size)
             residual[step] = rest / size
-            if all(abs(p - k) > 1e-3 for k, _ in known):
-                known.append((float(p), u))
-        check(system, u, state, step, peak * float(p))
+            if alike and all(abs(part - k) > 1e-3 for k, _ in known):
+                known.append((part, u))
+        check(system, u, state, step, float(named[step]))
         if residual[step] > TOLERANCE:
             raise NoEquilibrium(
-                f"frame {step}: no equilibrium at load {p * peak:.3g} "
+                f"frame {step}: no equilibrium at load {named[step]:.3g} "
                 f"(out of balance by {residual[step]:.1e}); lower fem.load"
             )
         path.append((u, state))

@@ -84,27 +84,28 @@ def deform(
     system = assemble(tets, tissue.law, tissue.poisson)
     carry = skin.embedding(tets, skin_vertices)
     area = skin.vertex_area(skin_vertices, skin_faces)
-    kernel = tool.footprint(gesture, skin_vertices, area)
-    part, away = tool.course(gesture, frames)
-    force = part[:, None] * gesture.force_mn * np.asarray(gesture.direction)
+    over = tool.course(gesture, frames)
+    traction = tool.tractions(gesture, over, skin_vertices, area)
 
     # One load per kPa of E; displacement depends on no more than that.
-    unit = carry.T @ (area * kernel)
-    peak = np.outer(unit, gesture.force_mn / tissue.young_kpa * np.asarray(gesture.direction))
-    path = equilibrium.follow(system, peak, part, gesture.load)
+    loads = np.stack([carry.T @ (area[:, None] * t) for t in traction / tissue.young_kpa])
+    path = equilibrium.follow(system, loads, gesture.load * over.load)
     displacement = np.stack([carry @ u for u in path.displacement])
-    corners, weights = tool.anchors(gesture, skin_vertices, skin_faces)
-    touched = np.einsum("kc,tkcd->tkd", weights, (skin_vertices + displacement)[:, corners])
+    corners, weights = tool.anchors(gesture, over, skin_vertices, skin_faces)
+    surface = skin_vertices + displacement
+    touched = np.stack(
+        [np.einsum("kc,kcd->kd", w, at[c]) for w, c, at in zip(weights, corners, surface, strict=True)]
+    )
     hand = tool.shaft(gesture)
     return Deformation(
         rest=skin_vertices,
         faces=skin_faces,
         displacement=displacement,
-        traction=kernel[None, :, None] * force[:, None, :],
+        traction=traction,
         area=area,
-        force=force,
+        force=over.load[:, None] * np.sum([c.force_mn for c in gesture.contacts], axis=0),
         time=np.arange(frames) / fps,
-        tip=touched + gesture.hover_mm * away[:, None, None] * hand,
+        tip=touched + gesture.hover_mm * over.away[:, None, None] * hand,
         shaft=np.broadcast_to(hand, touched.shape).copy(),
         min_jacobian=path.jacobian,
         energy=path.energy * tissue.young_kpa,

@@ -15,6 +15,18 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 _INSIDE_MM = 1.0  # clear of the rim
+_PINCH = 0.5  # a grasp's tips press towards each other with this part of their pull
+_FRICTION = 0.4  # a sliding tip drags with this part of its push
+
+
+@dataclass(frozen=True)
+class Contact:
+    """One place where a tip loads the tissue."""
+
+    point_mm: tuple[float, float]
+    """World x, y of its centre at rest."""
+    force_mn: tuple[float, float, float]
+    """Force on the tissue at full load, world axes."""
 
 
 @dataclass(frozen=True)
@@ -22,17 +34,21 @@ class Gesture:
     """What is drawn for the gesture of one sequence."""
 
     kind: str
-    """`pull` or `push`."""
-    point_mm: tuple[float, float]
-    """World x, y of the contact's centre at rest."""
-    direction: tuple[float, float, float]
-    """Unit vector in world axes: which way the tissue is loaded."""
-    load: float
-    """Peak P = F/(E a^2)."""
+    """`pull`, `push`, `slide`, `grasp`, `retract` or `tap`."""
+    contacts: tuple[Contact, ...]
+    """A grasp has two, the others one."""
     footprint_mm: float
-    """Radius a of the contact."""
+    """Radius a of every contact."""
+    load: float
+    """Peak P = F/(E a^2) of a contact."""
+    point_mm: tuple[float, float]
+    """World x, y of the middle of the contacts at rest."""
+    direction: tuple[float, float, float]
+    """Unit vector in world axes: which way the tissue is loaded as a whole."""
     force_mn: float
-    """Peak force F."""
+    """Peak of the whole force."""
+    path_mm: tuple[float, float]
+    """World x, y that a slide covers; else 0."""
     azimuth_deg: float
     """Which side the hand is on, counter-clockwise from world x."""
     elevation_deg: float
@@ -41,6 +57,8 @@ class Gesture:
     """Distance between the two tips."""
     hover_mm: float
     """How far the tips are from the tissue in the rest frame."""
+    taps: int
+    """How often the load comes and goes."""
     timing: tuple[float, float, float, float]
     """Parts of the sequence: touch, full load, load begins to fall, release."""
 
@@ -50,58 +68,133 @@ class Gesture:
     ) -> Gesture:
         """Draws one gesture: contact uniformly in the opening, direction uniformly in its cone."""
         kind = str(rng.choice(fem.gestures))
-        footprint = float(rng.uniform(*fem.footprint_mm))
-        load = float(rng.uniform(*fem.load))
-        room = max(craniotomy.radius_mm - footprint - _INSIDE_MM, 0.0)
+        footprint, load = float(rng.uniform(*fem.footprint_mm)), float(rng.uniform(*fem.load))
+        spread = footprint * float(rng.uniform(1.2, 1.8) if kind == "grasp" else rng.uniform(0.1, 0.9))
+        path = float(rng.uniform(3, 8)) if kind == "slide" else 0.0
+        azimuth = float(rng.uniform(0, 360))
+        reach = footprint + 0.5 * (path if kind == "slide" else spread if kind == "grasp" else 0.0)
+        room = max(craniotomy.radius_mm - reach - _INSIDE_MM, 0.0)
         radius, angle = room * np.sqrt(rng.uniform()), rng.uniform(0, 2 * np.pi)
-        rise = rng.uniform(np.cos(np.radians(fem.cone_deg)), 1.0)
-        turn, flat = rng.uniform(0, 2 * np.pi), np.sqrt(1 - rise**2)
-        touch = rng.uniform(0.08, 0.15)
-        full = touch + rng.uniform(0.3, 0.4)
-        fall = full + rng.uniform(0.1, 0.2)
+        point = radius * np.array([np.cos(angle), np.sin(angle)])
+        turn = rng.uniform(0, 2 * np.pi)
+        along = np.array([np.cos(turn), np.sin(turn)])
+        cone = np.cos(np.radians(fem.cone_deg))
+        rise = rng.uniform(cone, 1.0)
+        if kind == "retract":  # sideways, as a spatula holds tissue away
+            rise = rng.uniform(0.1, max(cone, 0.3))
+        elif kind == "slide":
+            rise = 1 / np.hypot(1, _FRICTION)
+        up = rise if kind in ("pull", "grasp") else -rise
+        way = np.append(np.sqrt(1 - rise**2) * along, up)
+        across = np.radians(azimuth + 90)
+        aside = 0.5 * spread * np.array([np.cos(across), np.sin(across)])
+        places, ways = [point - 0.5 * path * along], [way]
+        if kind == "grasp":
+            places, ways = [point - aside, point + aside], []
+            for inward in (aside, -aside):
+                pinched = way + _PINCH * np.append(inward, 0) / np.linalg.norm(inward)
+                ways.append(pinched / np.linalg.norm(pinched))
+        force = load * tissue.young_kpa * footprint**2
+        whole = force * np.sum(ways, axis=0)
+        touch = float(rng.uniform(0.08, 0.15))
+        ramp = fem.ramp if kind != "tap" else (0.1, 0.2)
+        full = touch + float(rng.uniform(*ramp))
+        release = float(rng.uniform(0.85, 0.92))
+        hold = float(rng.uniform(0.5, 0.7) if kind in ("retract", "slide") else rng.uniform(0.15, 0.5))
         return cls(
             kind=kind,
-            point_mm=(float(radius * np.cos(angle)), float(radius * np.sin(angle))),
-            direction=(
-                float(flat * np.cos(turn)),
-                float(flat * np.sin(turn)),
-                float(rise if kind == "pull" else -rise),
+            contacts=tuple(
+                Contact((float(p[0]), float(p[1])), _vector(f))
+                for p, f in zip(places, force * np.array(ways), strict=True)
             ),
-            load=load,
             footprint_mm=footprint,
-            force_mn=load * tissue.young_kpa * footprint**2,
-            azimuth_deg=float(rng.uniform(0, 360)),
+            load=load,
+            point_mm=(float(point[0]), float(point[1])),
+            direction=_vector(whole / np.linalg.norm(whole)),
+            force_mn=float(np.linalg.norm(whole)),
+            path_mm=(float(path * along[0]), float(path * along[1])),
+            azimuth_deg=azimuth,
             elevation_deg=float(rng.uniform(35, 65)),
-            spread_mm=float(footprint * (rng.uniform(0.5, 0.9) if kind == "pull" else rng.uniform(0.1, 0.2))),
+            spread_mm=spread,
             hover_mm=float(rng.uniform(6, 12)),
-            timing=(float(touch), float(full), float(fall), float(fall + rng.uniform(0.15, 0.25))),
+            taps=int(rng.integers(2, 4)) if kind == "tap" else 1,
+            timing=(touch, full, full + hold * (release - full), release),
         )
 
 
-def course(gesture: Gesture, frames: int) -> tuple[Floats, Floats]:
-    """The gesture over time.
+@dataclass(frozen=True)
+class Course:
+    """The gesture over T frames. In frame 0 there is no load and the tips are whole `hover_mm` away."""
 
-    Returns:
-        (T,) load over its peak, and (T,) distance of the tips from the tissue over `hover_mm`.
-        In frame 0 the load is none and the distance whole.
-    """
+    load: Floats
+    """(T,) as a part of the peak."""
+    away: Floats
+    """(T,) distance of the tips from the tissue, as a part of `hover_mm`."""
+    shift: Floats
+    """(T, 2) mm that the contacts have slid over the surface at rest."""
+
+
+def course(gesture: Gesture, frames: int) -> Course:
+    """When the load comes and goes, and where to."""
     t = np.linspace(0, 1, frames)
     touch, full, fall, leave = gesture.timing
-    load = _smooth((t - touch) / (full - touch)) * (1 - _smooth((t - fall) / (leave - fall)))
-    away = 1 - _smooth(t / touch) + _smooth((t - leave) / max(1 - leave, 1e-9))
-    return load, away
+    if gesture.taps > 1:
+        phase = np.clip((t - touch) / (leave - touch), 0, 1) * gesture.taps
+        load = np.sin(np.pi * (phase % 1)) ** 2 * ((t > touch) & (t < leave))
+        lifted = 0.15 * np.cos(np.pi * (phase % 1)) ** 2
+    else:
+        load = _smooth((t - touch) / (full - touch)) * (1 - _smooth((t - fall) / (leave - fall)))
+        lifted = np.zeros(frames)
+    away = 1 - _smooth(t / touch) + _smooth((t - leave) / (1 - leave))
+    slid = _smooth((t - full) / max(fall - full, 1e-9))
+    # The rest frame is the first one, whatever the timing.
+    load[0] = 0.0
+    return Course(load, np.maximum(away, lifted * (load < 1e-3)), slid[:, None] * np.asarray(gesture.path_mm))
 
 
 def focus(gesture: Gesture) -> tuple[tuple[float, float, float], ...]:
     """Where the mesh should be finest: x, y and radius of what is loaded, mm."""
-    return ((*gesture.point_mm, gesture.footprint_mm),)
+    stops = (0.0, 0.5, 1.0) if any(gesture.path_mm) else (0.0,)
+    return tuple(
+        (c.point_mm[0] + s * gesture.path_mm[0], c.point_mm[1] + s * gesture.path_mm[1], gesture.footprint_mm)
+        for c in gesture.contacts
+        for s in stops
+    )
 
 
-def footprint(gesture: Gesture, vertices: Floats, area: Floats) -> Floats:
+def tractions(gesture: Gesture, over: Course, vertices: Floats, area: Floats) -> Floats:
+    """Load on the surface at rest.
+
+    Args:
+        gesture: contacts and forces.
+        over: its course.
+        vertices: (V, 3) mm at rest.
+        area: (V,) mm^2.
+
+    Returns:
+        (T, V, 3) kPa, with sum(area * result) = the force.
+
+    Raises:
+        UserError: fewer than 3 vertices lie under a contact.
+    """
+    out = np.zeros((len(over.load), len(vertices), 3))
+    for contact in gesture.contacts:
+        start = np.asarray(contact.point_mm)
+        kernel = footprint(start, gesture.footprint_mm, vertices, area)
+        for t, part in enumerate(over.load):
+            if part > 0:
+                if over.shift[t].any():
+                    kernel = footprint(start + over.shift[t], gesture.footprint_mm, vertices, area)
+                out[t] += np.outer(part * kernel, contact.force_mn)
+    return out
+
+
+def footprint(centre: Floats, radius_mm: float, vertices: Floats, area: Floats) -> Floats:
     """Pressure of a unit force: the kernel (1 - (r/a)^2)^2 on the surface at rest.
 
     Args:
-        gesture: point and radius are used.
+        centre: (2,) world x, y, mm.
+        radius_mm: a.
         vertices: (V, 3) mm at rest.
         area: (V,) mm^2.
 
@@ -109,28 +202,40 @@ def footprint(gesture: Gesture, vertices: Floats, area: Floats) -> Floats:
         (V,) 1/mm^2, with sum(area * result) = 1.
 
     Raises:
-        UserError: no vertex lies under the contact.
+        UserError: fewer than 3 vertices lie under the contact.
     """
-    top = np.asarray(gesture.point_mm)
-    flat = np.hypot(*(vertices[:, :2] - top).T)
-    centre = np.append(top, vertices[flat.argmin(), 2])
-    reach = np.minimum(np.linalg.norm(vertices - centre, axis=1) / gesture.footprint_mm, 1)
+    flat = np.hypot(*(vertices[:, :2] - centre).T)
+    middle = np.append(centre, vertices[flat.argmin(), 2])
+    reach = np.minimum(np.linalg.norm(vertices - middle, axis=1) / radius_mm, 1)
     kernel = (1 - reach**2) ** 2
     total = float(kernel @ area)
     if np.count_nonzero(kernel) < 3 or total <= 0:
         raise UserError(
-            f"fem.footprint_mm: {gesture.footprint_mm:g} mm covers fewer than 3 vertices of the surface; "
+            f"fem.footprint_mm: {radius_mm:g} mm covers fewer than 3 vertices of the surface; "
             "raise it, or anatomy.vertices"
         )
     return np.asarray(kernel / total)
 
 
-def anchors(gesture: Gesture, vertices: Floats, faces: NDArray[np.integer]) -> tuple[Ints, Floats]:
-    """Where the tips touch: (K, 3) vertices of the surface and their weights (K, 3)."""
+def anchors(
+    gesture: Gesture, over: Course, vertices: Floats, faces: NDArray[np.integer]
+) -> tuple[Ints, Floats]:
+    """Where the tips touch: (T, K, 3) vertices of the surface and their weights (T, K, 3)."""
     turn = np.radians(gesture.azimuth_deg + 90)
     aside = 0.5 * gesture.spread_mm * np.array([np.cos(turn), np.sin(turn)])
-    places = [_under(np.asarray(gesture.point_mm) + side * aside, vertices, faces) for side in (-1, 1)]
-    return np.stack([p[0] for p in places]), np.stack([p[1] for p in places])
+    start = np.asarray(gesture.point_mm) - 0.5 * np.asarray(gesture.path_mm)
+    reach = np.abs(aside).max() + np.abs(gesture.path_mm).max() + 3 * gesture.footprint_mm
+    near = faces[(np.abs(vertices[faces, :2] - start).max(axis=2) <= reach).any(axis=1)]
+    found: dict[tuple[float, ...], tuple[Ints, Floats]] = {}
+    for shift in over.shift:
+        for side in (-1, 1):
+            place = tuple(start + shift + side * aside)
+            if place not in found:
+                found[place] = _under(np.asarray(place), vertices, near)
+    touched = [[found[tuple(start + s + side * aside)] for side in (-1, 1)] for s in over.shift]
+    return np.array([[p[0] for p in pair] for pair in touched]), np.array(
+        [[p[1] for p in pair] for pair in touched]
+    )
 
 
 def shaft(gesture: Gesture) -> Floats:
@@ -156,6 +261,10 @@ def _under(xy: Floats, vertices: Floats, faces: NDArray[np.integer]) -> tuple[In
 
 def _cross(a: Floats, b: Floats) -> Floats:
     return np.asarray(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
+
+
+def _vector(value: Floats) -> tuple[float, float, float]:
+    return float(value[0]), float(value[1]), float(value[2])
 
 
 def _smooth(s: Floats) -> Floats:

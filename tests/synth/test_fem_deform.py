@@ -27,12 +27,18 @@ def patch(n: int = 61, extent: float = 46.0) -> tuple[np.ndarray, np.ndarray]:
     return np.column_stack([xy, mesh.dome(xy, ANATOMY.dome_mm)]), faces.astype(np.int32)
 
 
+def drawn(fem: job.Fem, tissue: Tissue, seed: int = 5) -> Gesture:
+    return Gesture.draw(fem, ANATOMY.craniotomy, tissue, np.random.default_rng(seed))
+
+
+def block(fem: job.Fem) -> mesh.Tets:
+    return mesh.block(ANATOMY, fem.tets, fem.order)
+
+
 def run(fem: job.Fem, gesture: Gesture | None = None, seed: int = 5, frames: int = 12) -> Deformation:
-    rng = np.random.default_rng(seed)
-    tissue = Tissue.draw(fem, rng)
-    drawn = gesture or Gesture.draw(fem, ANATOMY.craniotomy, tissue, rng)
-    tets = mesh.block(ANATOMY, fem.tets, fem.order)
-    return deform(fem, ANATOMY.craniotomy, tissue, drawn, tets, *patch(), frames, 25.0)
+    tissue = Tissue.draw(fem, np.random.default_rng(seed))
+    gesture = gesture or drawn(fem, tissue, seed)
+    return deform(fem, ANATOMY.craniotomy, tissue, gesture, block(fem), *patch(), frames, 25.0)
 
 
 @pytest.mark.parametrize("law", ["linear", "corotational", "stable", "neo-hookean"])
@@ -69,21 +75,48 @@ def test_embedding_reproduces_what_the_elements_can_hold(order: int) -> None:
         assert np.abs(carried - inside**power).max() <= 1e-9 * np.abs(inside).max() ** power
 
 
-def test_rest_frame_is_at_rest_and_the_tool_comes_touches_and_leaves() -> None:
-    fem = job.Fem(tets=400)
-    rng = np.random.default_rng(5)
-    gesture = Gesture.draw(fem, ANATOMY.craniotomy, Tissue.draw(fem, rng), rng)
-    motion = run(fem, gesture, frames=40)
+@pytest.mark.parametrize("kind", ["pull", "push", "slide", "grasp", "retract", "tap"])
+def test_rest_frame_is_at_rest_and_the_tool_comes_touches_and_leaves(kind: str) -> None:
+    fem = job.Fem(tets=400, gestures=(kind,), load=(0.1, 0.1))
+    motion = run(fem, frames=25)
     assert not motion.displacement[0].any()
     assert not motion.force[0].any()
-    apart = np.linalg.norm(motion.tip[:, :, None] - (motion.rest + motion.displacement)[:, None], axis=3).min(
-        axis=2
-    )
-    loaded = np.linalg.norm(motion.force, axis=1) > 0
-    assert apart[loaded].max() < 0.6  # half a vertex spacing: the tips touch while they load
+    surface = motion.rest + motion.displacement
+    apart = np.linalg.norm(motion.tip[:, :, None] - surface[:, None], axis=3).min(axis=2)
+    pressed = np.linalg.norm(motion.force, axis=1)
+    assert (
+        apart[pressed > 0.05 * pressed.max()].max() < 0.6
+    )  # half a vertex spacing: they touch while they load
     assert apart[0].min() > 3
     assert apart[-1].min() > 3
     assert np.linalg.norm(motion.shaft, axis=2) == pytest.approx(1.0)
+    total = np.einsum("v,tvd->td", motion.area, motion.traction)
+    assert np.abs(total - motion.force).max() <= 1e-9 * pressed.max()
+    # The loaded tissue is where the instrument is.
+    t = int(pressed.argmax())
+    load = np.linalg.norm(motion.traction[t], axis=1) * motion.area
+    centre = (load[:, None] * surface[t]).sum(axis=0) / load.sum()
+    assert np.linalg.norm(motion.tip[t].mean(axis=0) - centre) < 1.0
+
+
+def test_a_slide_moves_its_load_and_a_tap_comes_twice() -> None:
+    slide = run(job.Fem(tets=400, gestures=("slide",), load=(0.1, 0.1)), frames=25)
+    load = np.linalg.norm(slide.traction, axis=2) * slide.area
+    on = np.flatnonzero(load.sum(axis=1) > 0)
+    centre = (load[on] @ slide.rest) / load[on].sum(axis=1, keepdims=True)
+    assert 2.5 < np.linalg.norm(centre[-1] - centre[0]) < 8.5
+    tap = np.linalg.norm(run(job.Fem(tets=400, gestures=("tap",)), frames=60).force, axis=1)
+    peaks = (tap[1:-1] > tap[:-2]) & (tap[1:-1] >= tap[2:]) & (tap[1:-1] > 0.5 * tap.max())
+    assert peaks.sum() >= 2
+
+
+def test_a_grasp_holds_at_two_places() -> None:
+    gesture = drawn(job.Fem(gestures=("grasp",)), Tissue(1.0, 0.4, "neo-hookean"))
+    first, second = (np.array(c.force_mn) for c in gesture.contacts)
+    aside = np.array(gesture.contacts[1].point_mm) - gesture.contacts[0].point_mm
+    assert np.linalg.norm(aside) == pytest.approx(gesture.spread_mm)
+    assert first[:2] @ aside > second[:2] @ aside  # the tips press towards each other
+    assert np.linalg.norm(first + second) == pytest.approx(gesture.force_mn)
 
 
 def test_the_tissue_moves_where_and_whither_it_is_pulled() -> None:
@@ -98,15 +131,13 @@ def test_the_tissue_moves_where_and_whither_it_is_pulled() -> None:
 
 def test_motion_depends_on_force_over_stiffness_alone() -> None:
     fem = job.Fem(tets=400)
-    rng = np.random.default_rng(5)
-    tissue = Tissue(young_kpa=1.0, poisson=0.4, law="neo-hookean")
-    gesture = Gesture.draw(fem, ANATOMY.craniotomy, tissue, rng)
-    tets = mesh.block(ANATOMY, 400, 2)
-    one = deform(fem, ANATOMY.craniotomy, tissue, gesture, tets, *patch(), 6, 25.0)
-    stiff = replace(tissue, young_kpa=2.5), replace(gesture, force_mn=2.5 * gesture.force_mn)
-    other = deform(fem, ANATOMY.craniotomy, *stiff, tets, *patch(), 6, 25.0)
+    soft, stiff = (Tissue(young_kpa=e, poisson=0.4, law="neo-hookean") for e in (1.0, 2.5))
+    one, other = (
+        deform(fem, ANATOMY.craniotomy, tissue, drawn(fem, tissue), block(fem), *patch(), 6, 25.0)
+        for tissue in (soft, stiff)
+    )
     np.testing.assert_allclose(one.displacement, other.displacement, rtol=1e-9, atol=1e-12)
-    np.testing.assert_allclose(2.5 * one.traction, other.traction, rtol=1e-12)
+    np.testing.assert_allclose(2.5 * one.traction, other.traction, rtol=1e-12, atol=1e-15)
 
 
 def test_balance_of_forces_is_reached() -> None:
@@ -130,19 +161,17 @@ def test_inverted_element_names_frame_load_and_element(monkeypatch: pytest.Monke
 
 def test_contact_beyond_the_surface_is_refused() -> None:
     fem = job.Fem(tets=400)
-    rng = np.random.default_rng(5)
-    gesture = Gesture.draw(fem, ANATOMY.craniotomy, Tissue.draw(fem, rng), rng)
+    gesture = drawn(fem, Tissue(1.0, 0.4, "neo-hookean"))
+    away = replace(gesture.contacts[0], point_mm=(200.0, 0.0))
     with pytest.raises(UserError):
-        run(fem, replace(gesture, point_mm=(200.0, 0.0)))
+        run(fem, replace(gesture, contacts=(away,)))
 
 
 def test_footprint_is_the_kernel() -> None:
     vertices, faces = patch(201, 20.0)
     flat = vertices * [1, 1, 0]
     area = skin.vertex_area(flat, faces)
-    fem = job.Fem()
-    gesture = Gesture.draw(fem, ANATOMY.craniotomy, Tissue(1, 0.4, "linear"), np.random.default_rng(0))
-    kernel = tool.footprint(replace(gesture, point_mm=(0.0, 0.0), footprint_mm=4.0), flat, area)
+    kernel = tool.footprint(np.zeros(2), 4.0, flat, area)
     peak = 3 / (np.pi * 4.0**2)  # of (1 - (r/a)^2)^2 with unit integral
     assert kernel.max() == pytest.approx(peak, rel=1e-3)
     assert kernel @ area == pytest.approx(1.0, abs=1e-14)
