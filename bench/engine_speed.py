@@ -5,6 +5,8 @@ from __future__ import annotations
 import json as json_
 import os
 import resource
+import subprocess
+import sys
 import tempfile
 from pathlib import Path
 from typing import Annotated, Any
@@ -13,7 +15,7 @@ import typer
 
 from bench import machine
 from bench.engine_trouble import timed
-from synth import config, engine
+from synth import config, engine, slots
 from synth.progress import Bars
 from synth.store import Dataset
 
@@ -23,7 +25,7 @@ def speed(
         "docs/results/engine/speed"
     ),
     job: Annotated[str, typer.Option(help="A job whose rendering is timed for the overhead.")] = "demo",
-    rendered: Annotated[int, typer.Option(help="Sequences of it.")] = 4,
+    rendered: Annotated[int, typer.Option(help="Sequences of it.")] = 8,
     sequences: Annotated[int, typer.Option(help="Stand-in sequences for one worker against two.")] = 24,
     cpu_s: Annotated[float, typer.Option(help="Processor time of each [s].")] = 4.0,
     json: Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")] = False,
@@ -48,24 +50,41 @@ def speed(
     print(json_.dumps(result, indent=None if json else 1))
 
 
+# The stages in one process and nothing else: no engine, no store, no index, no card.
+_BARE = """
+import sys
+from pathlib import Path
+from synth import pipeline
+from synth.job import Job
+class Nowhere:
+    def __init__(self, *_, **__): pass
+    def __getattr__(self, name): return lambda *_, **__: None
+pipeline.Writer = Nowhere
+job = Job.model_validate_json(sys.argv[1])
+for index in range(job.sequences):
+    pipeline.render_sequence(job, index, Path("."), lambda *_: None)
+"""
+
+
 def overhead(name: str, count: int) -> dict[str, float | int]:
     """CPU time of a whole run (engine, workers, store, index, film, card) over that of its stages alone."""
     job = config.load(name, [f"sequences={count}"])
+    machine_words = {**os.environ, **slots.machine(job, 1), "OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
     with tempfile.TemporaryDirectory() as scratch, Bars() as bars:
+        before = _cpu()
+        words = [sys.executable, "-c", _BARE, job.model_dump_json()]
+        subprocess.run(words, env=machine_words, cwd=scratch, check=True, stdout=subprocess.DEVNULL)
+        bare = _cpu() - before
         before = _cpu()
         engine.run(job, Path(scratch) / "out", engine.Options(workers=1), bars)
         whole = _cpu() - before
-        stages: dict[str, float] = {}
-        for sequence in Dataset(Path(scratch) / "out"):
-            for stage, spent in sequence.attrs["timings"].items():
-                if isinstance(spent, dict):
-                    stages[stage] = stages.get(stage, 0.0) + spent["cpu_s"]
-    store = stages.pop("store", 0.0)
-    bare = sum(stages.values())
+        store = sum(
+            sequence.attrs["timings"]["store"]["cpu_s"] for sequence in Dataset(Path(scratch) / "out")
+        )
     return {
         "sequences": count,
         "whole_cpu_s": round(whole, 2),
-        "stages_cpu_s": round(bare, 2),
+        "stages_alone_cpu_s": round(bare, 2),
         "store_cpu_s": round(store, 2),
         "overhead": round(whole / bare - 1, 4),
         "store_share": round(store / bare, 4),

@@ -210,15 +210,19 @@ def export(
 
 @app.command()
 def card(out: Out) -> None:
-    """Writes the dataset's card anew: README.md, its charts and pictures."""
+    """Writes the dataset's card anew: README.md with its pictures, and croissant.json for machines."""
     from synth import card as carding
-    from synth import index
+    from synth import croissant, index
     from synth.folder import Folder
 
     folder = Folder(out)
     folder.described()
     index.write(folder)
     print(carding.write(folder))
+    print(croissant.write(folder))
+    unsaid = croissant.missing(croissant.describe(folder))
+    if unsaid:
+        print(f"not said in the job's card, so not in the description: {', '.join(unsaid)}", file=sys.stderr)
 
 
 @app.command()

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
 
-from synth import card, forecast, index, preview, slots
+from synth import card, croissant, forecast, index, preview, slots
 from synth.child import Attempt, Setup
 from synth.errors import UserError
 from synth.folder import Folder, claim
@@ -105,6 +105,7 @@ def run(job: Job, root: Path, options: Options, watcher: Watcher) -> Summary:
         if done or not preview.path(root).exists():
             preview.write(root)
             card.write(folder)
+            croissant.write(folder)
         return Summary(
             total=job.sequences,
             already=len(finished),

@@ -15,6 +15,8 @@ from pydantic import (
     model_validator,
 )
 
+from synth.flow.estimator import names
+
 
 def _pair(value: Any) -> Any:
     """A single number stands for the range that holds only it."""
@@ -160,11 +162,18 @@ class Render(Section):
     """Show the instrument."""
 
 
+def _estimator(name: str) -> str:
+    known = ("ideal", *names())
+    if name not in known:
+        raise ValueError(f"there is no estimator {name!r}; there are {', '.join(known)}")
+    return name
+
+
 class Flow(Section):
     """Recovering displacement from the video."""
 
-    backend: Literal["opencv-tvl1", "dis", "ideal"] = "opencv-tvl1"
-    """Estimator; `ideal` computes no recovered flow."""
+    backend: Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]+$"), AfterValidator(_estimator)] = "tvl1"
+    """Estimator: tvl1, opencv-tvl1, dis or an installed plug-in's; `ideal` computes no recovered flow."""
 
 
 class Card(Section):
@@ -180,6 +189,10 @@ class Card(Section):
     """Who made it."""
     contact: str | None = None
     """Where questions go."""
+    url: str | None = None
+    """Where the dataset is to be found."""
+    published: Annotated[str, Field(pattern=r"^\d{4}-\d{2}-\d{2}$")] | None = None
+    """Date of publication, in quotes: "2027-01-31"."""
 
 
 class Job(Section):
