@@ -206,7 +206,8 @@ def _pose(
     width = max(levels[above] - levels[above - 1], 1e-9)
     part = float(np.clip((strain - levels[above - 1]) / width, 0, 1))
     moved = (1 - part) * motion.displacement[above - 1] + part * motion.displacement[above]
-    corners, weights = tool.anchors(gesture, motion.rest, motion.faces)
+    places = tool.anchors(gesture, tool.course(gesture, 2), motion.rest, motion.faces)
+    corners, weights = (of[0] for of in places)
     touched = np.einsum("kc,kcd->kd", weights, (motion.rest + moved)[corners])
     shafts = motion.shaft[-1]
     tips = touched + gesture.hover_mm * course.away[at] * shafts + 0.1 * rng.normal(size=(1, 3))

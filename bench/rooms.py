@@ -30,17 +30,23 @@ class Command:
 
 
 COMMANDS: tuple[Command, ...] = (
+    Command("experiment", "flow", "bench.flow_experiment", "experiment"),
+    Command("stability", "flow", "bench.flow_stability", "stability"),
+    Command("pareto", "flow", "bench.flow_pareto", "pareto"),
     Command("experiment", "realism", "bench.render_realism", "realism_figures"),
     Command("experiment", "render", "bench.render_cost", "experiment"),
     Command("stability", "render", "bench.render_stability", "stability"),
     Command("pareto", "render", "bench.render_pareto", "pareto"),
+    Command("experiment", "cycles", "bench.render_cycles", "cycles"),
     Command("experiment", "stages", "bench.stages", "stages"),
     Command("experiment", "learn", "bench.learn_experiment", "experiment"),
+    Command("pareto", "fem", "bench.fem_pareto", "pareto"),
     Command("stability", "damage", "bench.engine_damage", "damage"),
     Command("experiment", "scale", "bench.engine_scale", "scale"),
     Command("stability", "dask", "bench.engine_dask", "dask"),
     Command("stability", "trouble", "bench.engine_trouble", "trouble"),
     Command("pareto", "engine", "bench.engine_speed", "speed"),
+    Command("stability", "faults", "bench.engine_faults", "faults"),
     Command("stability", "kills", "bench.engine_kills", "kills"),
 )
 

@@ -15,6 +15,7 @@ from pydantic import (
     model_validator,
 )
 
+from synth.fem.validity import LARGEST_LOAD, choose
 from synth.flow.estimator import names
 
 
@@ -107,8 +108,10 @@ class Appearance(Section):
 class Fem(Section):
     """The physics of the tissue and of the load."""
 
-    law: Literal["linear", "corotational", "stable", "neo-hookean"] = "neo-hookean"
-    """Material law."""
+    law: Literal["auto", "linear", "corotational", "stable", "neo-hookean"] = "auto"
+    """Material law; auto takes the cheapest whose error at the largest load is within `tolerance`."""
+    tolerance: Annotated[FiniteFloat, Field(gt=0, le=1)] = 0.05
+    """Error against neo-Hookean that `law: auto` accepts, as a part of the displacement."""
     order: Literal[1, 2] = 2
     """Polynomial order of the tetrahedra."""
     tets: Annotated[int, Field(ge=100, le=200_000)] = 1600
@@ -129,6 +132,16 @@ class Fem(Section):
     """Time in which the load grows to its peak, as a part of the sequence."""
     cone_deg: Annotated[FiniteFloat, Field(ge=0, le=80)] = 65.0
     """The load's direction is drawn uniformly within this angle of the surface normal."""
+
+    @model_validator(mode="after")
+    def _load_is_in_the_laws_range(self) -> Fem:
+        law, _ = choose(self.law, self.load[1], self.tolerance)
+        if self.load[1] > LARGEST_LOAD[law]:
+            raise ValueError(
+                f"load {self.load[1]:g} is past the range of the {law} law; "
+                f"the largest valid value is {LARGEST_LOAD[law]:g}"
+            )
+        return self
 
 
 class Render(Section):

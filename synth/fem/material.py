@@ -8,7 +8,7 @@ import numpy as np
 
 from synth import job
 from synth.errors import UserError
-from synth.fem.validity import LARGEST_LOAD
+from synth.fem.validity import LARGEST_LOAD, choose
 
 
 @dataclass(frozen=True)
@@ -21,12 +21,15 @@ class Tissue:
     """Poisson's ratio."""
     law: str
     """Material law, a key of `laws.NUMBER`."""
+    why: str = "asked for"
+    """Why this law."""
 
     @classmethod
     def draw(cls, fem: job.Fem, rng: np.random.Generator) -> Tissue:
         """E log-uniformly: half as stiff and twice as stiff are as likely."""
         low, high = np.log(fem.young_kpa)
-        return cls(young_kpa=float(np.exp(rng.uniform(low, high))), poisson=fem.poisson, law=fem.law)
+        law, why = choose(fem.law, fem.load[1], fem.tolerance)
+        return cls(float(np.exp(rng.uniform(low, high))), fem.poisson, law, why)
 
 
 def check_load(law: str, load: float) -> None:

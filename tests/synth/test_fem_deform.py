@@ -6,10 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 
 from synth import job
 from synth.errors import UserError
-from synth.fem import mesh, skin, solver, tool
+from synth.fem import mesh, skin, tool, validity
 from synth.fem.material import Tissue
 from synth.fem.solver import Deformation, InvertedElement, deform
 from synth.fem.tool import Gesture
@@ -147,13 +148,25 @@ def test_balance_of_forces_is_reached() -> None:
 
 
 def test_load_past_the_laws_range_is_refused_with_the_largest_valid_value() -> None:
-    fem = job.Fem(load=(3.0, 3.0))
-    with pytest.raises(UserError, match=r"largest valid value is 0\.\d+"):
-        run(fem)
+    for law, largest in (("linear", "0.2"), ("auto", "0.4")):
+        with pytest.raises(ValidationError, match=rf"largest valid value is {largest}"):
+            job.Fem(law=law, load=(3.0, 3.0))
+    gesture = replace(drawn(job.Fem(), Tissue(1.0, 0.4, "neo-hookean")), load=3.0)
+    with pytest.raises(UserError, match=r"largest valid value is 0\.4"):
+        run(job.Fem(), gesture)
+
+
+def test_auto_takes_the_cheapest_law_within_the_tolerance_and_says_why() -> None:
+    rng = np.random.default_rng(0)
+    assert Tissue.draw(job.Fem(load=0.05), rng).law == "linear"
+    assert Tissue.draw(job.Fem(load=0.4), rng).law == "neo-hookean"
+    assert Tissue.draw(job.Fem(load=0.05, tolerance=0.001), rng).law == "neo-hookean"
+    assert "5.0%" in Tissue.draw(job.Fem(load=0.4), rng).why
+    assert Tissue.draw(job.Fem(law="stable", load=0.05), rng).law == "stable"
 
 
 def test_inverted_element_names_frame_load_and_element(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(solver, "check_load", lambda law, load: None)
+    monkeypatch.setitem(validity.LARGEST_LOAD, "corotational", 10.0)
     fem = job.Fem(law="corotational", load=(8.0, 8.0), gestures=("push",))
     with pytest.raises(InvertedElement, match=r"frame \d+: load [\d.]+ turns element \d+ inside out"):
         run(fem)
