@@ -72,7 +72,7 @@ class Studio:
             job.appearance.photo,
         )
         self.still = truth.still(camera, Shape(surface.vertices, surface.faces), self._rim.shape)
-        self._lamps = light.lamps(camera, look)
+        self.lamps = light.lamps(camera, look)
         self._sensor = sensor.Sensor(
             exposure=look.exposure,
             white=_balance(look.balance_kelvin),
@@ -129,8 +129,8 @@ class Studio:
         return Stage(
             self.variant,
             self.camera,
-            self._bodies(vertices, tool),
-            self._lamps,
+            self.bodies(vertices, tool),
+            self.lamps,
             spp,
             integrator,
             sampler,
@@ -149,7 +149,8 @@ class Studio:
                 self._stage.move("tool", tool)
         return self._stage.render(seed)
 
-    def _bodies(self, vertices: Floats, tool: Floats) -> dict[str, Body]:
+    def bodies(self, vertices: Floats, tool: Floats) -> dict[str, Body]:
+        """Everything in the scene with its material; vertices (V, 3) and (T, 3) mm as given."""
         surface, look = self.surface, self._look
         frame = rim.paint(
             self._rim, look, texture.resolution(self._rim.extent_mm, 2.2 * self.camera.mm_per_px)
@@ -189,7 +190,7 @@ class Studio:
         """Radiance (V, 3) of a white diffuser at each vertex, unshadowed."""
         normal = normals(Shape(vertices, self.surface.faces))
         total = np.zeros((len(vertices), 3))
-        for lamp in self._lamps:
+        for lamp in self.lamps:
             towards = lamp.position - vertices
             distance = np.linalg.norm(towards, axis=1)
             facing = np.maximum(np.einsum("nc,nc->n", normal, towards) / distance, 0)
