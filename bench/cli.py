@@ -77,6 +77,26 @@ def score(
 
 
 @app.command()
+def check(
+    recording: Annotated[Path, typer.Argument(help="Recording folder.")],
+    json: Json = False,
+) -> None:
+    """Says what of a recording is usable and what is missing. Exit code 2 if nothing is."""
+    from dataclasses import asdict
+
+    from bench import check as checking
+
+    found = checking.check(recording)
+    if json:
+        print(json_.dumps({"usable": checking.usable(found), "findings": [asdict(f) for f in found]}))
+    else:
+        for finding in found:
+            print(f"{finding.state:<5}{finding.what:<11}{finding.said}")
+    if not checking.usable(found):
+        raise typer.Exit(2)
+
+
+@app.command()
 def demo(
     dataset: Annotated[Path, typer.Argument(help="A rendered dataset.")],
     model: Annotated[Path, typer.Option("--model", "-m", help="Model trained on it.")],
@@ -158,3 +178,73 @@ def _say(result: Result, folder: Path, json: bool) -> None:
     for note in result.notes:
         console.print(f"note: {note}", style="yellow", markup=False, highlight=False)
     console.print(f"report: {folder / 'report.html'}", markup=False, highlight=False)
+
+
+@app.command()
+def flow(
+    first: Annotated[Path, typer.Argument(help="Picture at rest.")],
+    second: Annotated[Path, typer.Argument(help="Picture after the motion.")],
+    truth: Annotated[
+        Path | None, typer.Argument(help="True flow: .flo (Middlebury) or .png (KITTI). Empty: not scored.")
+    ] = None,
+    backend: Annotated[str, typer.Option(help="Flow estimator, as in a job's flow.backend.")] = "tvl1",
+    glare: Annotated[bool, typer.Option("--glare/--no-glare", help="Mask highlights first.")] = False,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Write the flow: .flo or .png.")] = None,
+    json: Json = False,
+) -> None:
+    """Flow between any two pictures, scored against a flow file."""
+    from bench import flow_pair
+
+    found = flow_pair.score(first, second, truth, backend, glare, out)
+    if found is None:
+        typer.echo(f"written to {out}" if out else "nothing asked for: give a truth or --out")
+    elif json:
+        typer.echo(json_.dumps(flow_pair.as_dict(found)))
+    else:
+        typer.echo(
+            f"EPE {found.epe:.3f} px, 95% within {found.p95:.3f} px, outliers {found.outliers:.1%}; "
+            f"{found.trusted:.0%} trusted, EPE {found.trusted_epe:.3f} px there"
+        )
+
+
+@app.command()
+def live(
+    video: Annotated[Path, typer.Argument(help="Video; its first frame is the rest frame.")],
+    model: Annotated[Path | None, typer.Option("--model", "-m", help="Model folder: forces too.")] = None,
+    scale: Annotated[float | None, typer.Option(help="mm a pixel of the video; needed with a model.")] = None,
+    young: Annotated[
+        float | None, typer.Option(help="Young's modulus of the tissue [kPa], if known.")
+    ] = None,
+    backend: Annotated[str, typer.Option(help="Flow estimator.")] = "tvl1",
+    shrink: Annotated[int, typer.Option(min=1, max=8, help="Pictures this many times smaller.")] = 1,
+    every: Annotated[bool, typer.Option("--every", help="Work on every frame, however late.")] = False,
+    json: Json = False,
+) -> None:
+    """Masks, flow and force of a video as it runs: latency percentiles and dropped frames."""
+    from bench import live as stream
+    from bench.methods import Model
+
+    method = None if model is None else Model(model)
+
+    def tell(frame: stream.Frame) -> None:
+        force = "" if frame.force_mn is None else f"  {frame.force_mn:8.2f} mN"
+        mark = "" if frame.trusted else "  not trusted"
+        typer.echo(
+            f"frame {frame.index:5}  {1e3 * frame.latency_s:7.1f} ms  {frame.largest_px:6.2f} px{force}{mark}"
+        )
+
+    account = stream.watch(
+        video,
+        backend=backend,
+        method=method,
+        scale_mm_per_px=scale,
+        young_kpa=young,
+        shrink=shrink,
+        paced=not every,
+        told=(lambda frame: None) if json else tell,
+    )
+    summary = account.summary()
+    if json:
+        typer.echo(json_.dumps(summary))
+    else:
+        typer.echo(", ".join(f"{name} {value:.4g}" for name, value in summary.items()))

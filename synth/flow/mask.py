@@ -6,12 +6,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from synth.flow import toolnet
+
 _CLIPPED = 240.0  # grey levels: at least two channels this high have no texture left
 _ABOVE = 45.0  # grey levels above the local median
 _SHRINK = 4  # the median is taken on a picture this much smaller: it is smooth
 
 
-def glare(rgb: NDArray[np.uint8], dilate_px: int = 3) -> NDArray[np.bool_]:
+def glare(rgb: NDArray[np.uint8], dilate_px: int = 1) -> NDArray[np.bool_]:
     """Specular highlights: clearly brighter than the local median, grown by their soft rim.
 
     Brightness is the smallest channel: a highlight has the colour of the lamp, tissue lacks blue.
@@ -33,6 +35,46 @@ def glare(rgb: NDArray[np.uint8], dilate_px: int = 3) -> NDArray[np.bool_]:
     bright = (whiteness.astype(np.float32) > median + _ABOVE) | (
         np.partition(rgb, 1, axis=2)[..., 1] > _CLIPPED
     )
-    grown = 2 * dilate_px + 1
-    element = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (grown, grown))
-    return np.asarray(cv2.dilate(bright.astype(np.uint8), element), bool)
+    return _grow(bright, dilate_px)
+
+
+def tool(rgb: NDArray[np.uint8], dilate_px: int = 2) -> NDArray[np.bool_]:
+    """The instrument: by the U-Net of `toolnet`; without its weights, grey bodies that enter from the border.
+
+    Args:
+        rgb: (H, W, 3) uint8, sRGB.
+        dilate_px: growth [px].
+
+    Returns:
+        (H, W) bool, True on the instrument.
+    """
+    net = toolnet.load()
+    found = _grey_bodies(rgb) if net is None else toolnet.probability(net, rgb) > 0.5
+    return _grow(found, dilate_px)
+
+
+def blocked(rgb: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    """Everything that is no tissue to follow: glare and tool, both found in the picture. (H, W) bool."""
+    return np.asarray(glare(rgb) | tool(rgb), bool)
+
+
+def _grey_bodies(rgb: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    """Connected pixels of little colour that touch the border and are more than specks."""
+    values = rgb.astype(np.float32)
+    top = values.max(axis=2)
+    grey = ((top - values.min(axis=2)) < 0.22 * top + 4).astype(np.uint8)
+    grey = cv2.morphologyEx(grey, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+    _, label, stats, _ = cv2.connectedComponentsWithStats(grey)
+    height, width = grey.shape
+    left, upper = stats[:, cv2.CC_STAT_LEFT], stats[:, cv2.CC_STAT_TOP]
+    right, lower = left + stats[:, cv2.CC_STAT_WIDTH], upper + stats[:, cv2.CC_STAT_HEIGHT]
+    keep = (left == 0) | (upper == 0) | (right == width) | (lower == height)
+    keep &= stats[:, cv2.CC_STAT_AREA] > 0.003 * height * width
+    keep[0] = False
+    return np.asarray(keep[label], bool)
+
+
+def _grow(found: NDArray[np.bool_], by_px: int) -> NDArray[np.bool_]:
+    wide = 2 * by_px + 1
+    element = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (wide, wide))
+    return np.asarray(cv2.dilate(found.astype(np.uint8), element), bool)

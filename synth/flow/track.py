@@ -60,6 +60,10 @@ class Tracker:
         self._good: Flow | None = None
         self._level = 1.0
 
+    def start(self, initial: Flow | None) -> None:
+        """Sets what the next frame starts from, (H, W, 2) px; None: from nothing."""
+        self._good = initial
+
     def step(self, frame: Rgb, blocked: Flags) -> tuple[Flow, Map]:
         """Flow (H, W, 2) px and confidence (H, W) of the next frame; `trusted` says whether it was followed.
 

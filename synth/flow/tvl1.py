@@ -35,8 +35,6 @@ class Settings:
 
     weight: float = 0.5
     """lambda: data against smoothness."""
-    growth: float = 1.0
-    """lambda grows by this factor a level: total variation wears a peak of few pixels down fastest."""
     gradient: float = 1.0
     """gamma: weight of gradient constancy."""
     huber: float = 0.15
@@ -61,14 +59,16 @@ class Settings:
     """3x3 median of the flow after each warp (Wedel et al., An improved algorithm for TV-L1, 2009)."""
     warm_warps: int = 3
     """Linearisations a level with an initial flow."""
-    bold_weight: float = 2.0
+    bold_weight: float = 1.0
     """lambda of the first stage of a cold start: far pulls are steep, and smoothness would hold them back."""
+    bold_tau: float = 1.0
+    """Primal step of that stage: small, for the coarsest levels have few pixels and must not run away."""
     bold_warps: int = 6
     """Linearisations a level of that stage, which leaves out the finest level."""
 
     def bold(self) -> Settings:
         """The first stage of a cold start."""
-        return replace(self, weight=self.bold_weight, warps=self.bold_warps)
+        return replace(self, weight=self.bold_weight, tau=self.bold_tau, warps=self.bold_warps)
 
 
 class Tvl1:
@@ -219,12 +219,12 @@ def solve(levels: list[Level], initial: Tensor | None, s: Settings) -> Tensor:
         flow = initial
         for _ in levels[1:]:
             flow = 0.5 * F.avg_pool2d(flow, 2, ceil_mode=True, count_include_pad=False)
-    for depth, level in reversed(list(enumerate(levels))):
+    for level in reversed(levels):
         if flow.shape[-2:] != level.now.shape[-2:]:
             flow = finer(flow, level)
         dual = flow.new_zeros(2, *flow.shape)
         for _ in range(s.warps):
-            flow, dual = step(level, flow, dual, s.weight * s.growth**depth, s)
+            flow, dual = step(level, flow, dual, s)
     return flow
 
 
@@ -233,7 +233,7 @@ def finer(flow: Tensor, level: Level) -> Tensor:
     return 2 * image.doubled(flow, level.now)
 
 
-def step(level: Level, flow: Tensor, dual: Tensor, weight: float, s: Settings) -> tuple[Tensor, Tensor]:
+def step(level: Level, flow: Tensor, dual: Tensor, s: Settings) -> tuple[Tensor, Tensor]:
     """One warp: linearise r about `flow`, reweight, minimise. dual: (2, B, 2, H, W), its x and y parts."""
     warped, seen = image.warp(level.now, level.now_usable, flow)
     mask = level.rest_usable * seen
@@ -247,7 +247,7 @@ def step(level: Level, flow: Tensor, dual: Tensor, weight: float, s: Settings) -
     for _ in range(s.reweights):
         moved = flow - start
         now = residual + rows * moved[:, :1] + columns * moved[:, 1:]
-        c = s.tau * weight * mask / torch.sqrt((now * now).sum(1, keepdim=True) + s.epsilon**2)
+        c = s.tau * s.weight * mask / torch.sqrt((now * now).sum(1, keepdim=True) + s.epsilon**2)
         # (1 + c J^T J) w = v - c J^T (r - J w_0), 2x2 by Cramer.
         xx = 1 + c * (rows * rows).sum(1, keepdim=True)
         xy = c * (rows * columns).sum(1, keepdim=True)

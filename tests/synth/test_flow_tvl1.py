@@ -61,7 +61,7 @@ def test_normalisation_takes_out_gain_and_offset() -> None:
 
 def test_proximal_step_solves_its_normal_equations() -> None:
     """Without regulariser (dual step 0 by one step), the data prox is the least-squares solution."""
-    s = Settings(tau=1e6, steps=1, reweights=1, median=False, huber=0.0)
+    s = Settings(weight=1.0, tau=1e6, steps=1, reweights=1, median=False, huber=0.0)
     y, x = torch.meshgrid(torch.arange(40.0), torch.arange(40.0), indexing="ij")
 
     def surface(x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
@@ -73,7 +73,7 @@ def test_proximal_step_solves_its_normal_equations() -> None:
     rest, now = surface(x, y), surface(x - 0.2, y + 0.1)
     every = torch.ones_like(rest)
     flow, _ = tvl1.step(
-        tvl1.Level(rest, now, every, every), torch.zeros(1, 2, 40, 40), torch.zeros(2, 1, 2, 40, 40), 1.0, s
+        tvl1.Level(rest, now, every, every), torch.zeros(1, 2, 40, 40), torch.zeros(2, 1, 2, 40, 40), s
     )
     off = (flow - shifted)[..., 6:-6, 6:-6].norm(dim=1)
     assert float(off.median()) < 0.02
@@ -177,7 +177,7 @@ def test_tracker_leaves_a_wrong_start() -> None:
     stage = Stage.set(Recipe(size=128, pull=8.0, tool=0.0), rng)
     rest = stage.rest(rng)
     tracker = track.Tracker("tvl1", rest[0], rest[1], np.ones((128, 128), bool))
-    tracker._good = np.full((128, 128, 2), 25.0, np.float32)
+    tracker.start(np.full((128, 128, 2), 25.0, np.float32))
     shot = stage.against(rest, 1.0, rng)
     flow, _ = tracker.step(shot.now, ~shot.now_usable)
     assert tracker.resets == 1

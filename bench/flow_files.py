@@ -1,0 +1,77 @@
+"""Flow on disk: Middlebury `.flo` and KITTI 16-bit PNG."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from synth.errors import UserError
+
+_MAGIC = 202021.25
+_UNKNOWN = 1e9  # px: Middlebury marks what isn't known by larger values
+_LARGEST = 1 << 15
+
+Floats = NDArray[np.float32]
+Flags = NDArray[np.bool_]
+
+
+def read(path: Path) -> tuple[Floats, Flags]:
+    """Flow (H, W, 2) float32 px and where it is known (H, W); by suffix, `.flo` or `.png`.
+
+    Raises:
+        UserError: no such format, or a file that isn't what its name says.
+    """
+    readers = {".flo": _read_flo, ".png": _read_kitti}
+    if path.suffix.lower() not in readers:
+        raise UserError(f"{path}: flow files are .flo (Middlebury) or .png (KITTI)")
+    if not path.is_file():
+        raise UserError(f"{path}: no such file")
+    return readers[path.suffix.lower()](path)
+
+
+def write(path: Path, flow: Floats, known: Flags | None = None) -> None:
+    """Writes flow (H, W, 2) px; known: (H, W), everything by default. KITTI keeps 1/64 px and +-512 px.
+
+    Raises:
+        UserError: no such format, or displacements that KITTI's PNG can't hold.
+    """
+    known = np.ones(flow.shape[:2], bool) if known is None else known
+    if path.suffix.lower() == ".flo":
+        height, width = known.shape
+        body = np.where(known[..., None], flow, 10 * _UNKNOWN).astype("<f4")
+        header = np.array([_MAGIC], "<f4").tobytes() + np.array([width, height], "<i4").tobytes()
+        path.write_bytes(header + body.tobytes())
+    elif path.suffix.lower() == ".png":
+        if known.any() and np.abs(flow[known]).max() >= 511.9:
+            raise UserError(f"{path}: a displacement beyond 511 px does not fit KITTI's PNG; write .flo")
+        coded = np.round(np.where(known[..., None], flow, 0) * 64 + 2**15).astype(np.uint16)
+        # OpenCV's order is B, G, R: known, v, u.
+        cv2.imwrite(str(path), np.dstack([known.astype(np.uint16), coded[..., 1], coded[..., 0]]))
+    else:
+        raise UserError(f"{path}: flow files are .flo (Middlebury) or .png (KITTI)")
+
+
+def _read_flo(path: Path) -> tuple[Floats, Flags]:
+    """Baker et al., IJCV 2011: magic 202021.25, width, height, then rows of u, v; little-endian."""
+    data = path.read_bytes()
+    if len(data) < 12 or np.frombuffer(data, "<f4", 1)[0] != _MAGIC:
+        raise UserError(f"{path}: not a Middlebury .flo file")
+    width, height = (int(n) for n in np.frombuffer(data, "<i4", 2, 4))
+    if not (0 < width <= _LARGEST and 0 < height <= _LARGEST) or len(data) != 12 + 8 * width * height:
+        raise UserError(f"{path}: {len(data)} bytes don't hold a flow of {width} x {height} px")
+    flow = np.frombuffer(data, "<f4", 2 * width * height, 12).reshape(height, width, 2).astype(np.float32)
+    known = np.all(np.abs(flow) < _UNKNOWN, axis=-1)
+    return np.where(known[..., None], flow, 0).astype(np.float32), known
+
+
+def _read_kitti(path: Path) -> tuple[Floats, Flags]:
+    """Geiger et al., CVPR 2012: 16-bit RGB PNG, u and v as (value - 2^15)/64, B 1 where known."""
+    coded = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    if coded is None or coded.dtype != np.uint16 or coded.ndim != 3 or coded.shape[2] != 3:
+        raise UserError(f"{path}: not a KITTI flow PNG (16 bits, three channels)")
+    known = coded[..., 0] > 0
+    flow = (coded[..., 2:0:-1].astype(np.float32) - 2**15) / 64
+    return np.where(known[..., None], flow, 0).astype(np.float32), known

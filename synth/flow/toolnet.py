@@ -1,0 +1,91 @@
+"""Where the instrument is: a small U-Net (Ronneberger et al., MICCAI 2015) on a shrunken frame.
+
+Its weights lie beside this file; `toolnet_train` made them, and the file `toolnet.json` says from what.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+import torch.nn.functional as F
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+WEIGHTS = Path(__file__).with_name("toolnet.pt")
+SIDE = 128  # px of the longer side that the net looks at
+_STEP = 16  # both sides are padded to multiples of it
+_WIDTHS = (12, 24, 48, 64)
+
+
+class ToolNet(nn.Module):
+    """Three colours in, one logit a pixel out at half the size: (B, 3, H, W) → (B, 1, H/2, W/2)."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        a, b, c, d = _WIDTHS
+        self.stem = _block(3, a, stride=2)
+        self.down = nn.ModuleList([_block(a, b, 2), _block(b, c, 2), _block(c, d, 2)])
+        self.up = nn.ModuleList([_block(d + c, c), _block(c + b, b), _block(b + a, a)])
+        self.head = nn.Conv2d(a, 1, 1)
+
+    def forward(self, picture: Tensor) -> Tensor:
+        kept = [self.stem(picture)]
+        for layer in self.down:
+            kept.append(layer(kept[-1]))
+        field = kept.pop()
+        for layer in self.up:
+            beside = kept.pop()
+            field = F.interpolate(field, size=beside.shape[-2:], mode="bilinear", align_corners=False)
+            field = layer(torch.cat([field, beside], 1))
+        logits: Tensor = self.head(field)
+        return logits
+
+
+def prepare(rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """(H, W, 3) uint8 as the net sees it: longer side 128 px, mean 0, deviation 1; (3, h, w) float32."""
+    height, width = rgb.shape[:2]
+    share = SIDE / max(height, width)
+    size = (max(1, round(width * share)), max(1, round(height * share)))
+    small = cv2.resize(rgb, size, interpolation=cv2.INTER_AREA).astype(np.float32)
+    small = (small - small.mean()) / (small.std() + 8.0)
+    spare = ((0, -small.shape[0] % _STEP), (0, -small.shape[1] % _STEP), (0, 0))
+    return np.ascontiguousarray(np.pad(small, spare, "edge").transpose(2, 0, 1), np.float32)
+
+
+@cache
+def load(path: Path = WEIGHTS) -> ToolNet | None:
+    """The net with its weights; None if they aren't there."""
+    if not path.is_file():
+        return None
+    net = ToolNet()
+    state = torch.load(path, map_location="cpu", weights_only=True)
+    net.load_state_dict({name: value.float() if value.is_floating_point() else value
+                         for name, value in state.items()})  # fmt: skip
+    net.eval()
+    return net
+
+
+def probability(net: ToolNet, rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """Of being tool, (H, W) float32. rgb: (H, W, 3) uint8."""
+    height, width = rgb.shape[:2]
+    share = SIDE / max(height, width)
+    with torch.inference_mode():
+        logits = net(torch.from_numpy(prepare(rgb))[None])
+        wide = F.interpolate(logits, scale_factor=2, mode="bilinear", align_corners=False)
+        found = torch.sigmoid(wide)[0, 0, : max(1, round(height * share)), : max(1, round(width * share))]
+    return np.asarray(cv2.resize(found.numpy(), (width, height), interpolation=cv2.INTER_LINEAR), np.float32)
+
+
+def _block(inside: int, outside: int, stride: int = 1) -> nn.Sequential:
+    return nn.Sequential(
+        nn.Conv2d(inside, outside, 3, stride, 1, bias=False),
+        nn.BatchNorm2d(outside),
+        nn.ReLU(inplace=True),
+        nn.Conv2d(outside, outside, 3, 1, 1, bias=False),
+        nn.BatchNorm2d(outside),
+        nn.ReLU(inplace=True),
+    )
