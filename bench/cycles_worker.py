@@ -13,7 +13,7 @@ import numpy as np
 
 
 def main(folder: Path) -> None:
-    """Reads `scene.npz` and `scene.json`; writes a picture for each (spp, seed) and `times.json`."""
+    """Reads `scene.npz` and `scene.json`; writes an array for each (spp, seed) and `times.json`."""
     scene = np.load(folder / "scene.npz")
     told = json.loads((folder / "scene.json").read_text("utf-8"))
     bpy.ops.wm.read_factory_settings(use_empty=True)
@@ -35,6 +35,9 @@ def main(folder: Path) -> None:
             bpy.context.scene.render.filepath = str(folder / f"cycles-{spp}-{seed}.exr")
             bpy.ops.render.render(write_still=True)
             times.setdefault(str(spp), []).append(time.process_time() - start)
+            image = bpy.data.images.load(bpy.context.scene.render.filepath)
+            texels = np.array(image.pixels[:], np.float32).reshape(*image.size[::-1], 4)
+            np.save(folder / f"cycles-{spp}-{seed}.npy", texels[::-1, :, :3])
     (folder / "times.json").write_text(json.dumps({"cpu_s": times, "version": bpy.app.version_string}))
 
 

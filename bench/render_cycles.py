@@ -10,9 +10,6 @@ import time
 from pathlib import Path
 from typing import Annotated, Any
 
-os.environ.setdefault("OPENCV_IO_ENABLE_OPENEXR", "1")
-
-import cv2
 import numpy as np
 import numpy.typing as npt
 import typer
@@ -90,7 +87,7 @@ def _cycles(
     told = json_.loads((folder / "times.json").read_text("utf-8"))
     rows = []
     for n in spp:
-        pictures = [_read(folder / f"cycles-{n}-{k}.exr") for k in (1, 2)]
+        pictures = [np.load(folder / f"cycles-{n}-{k}.npy") for k in (1, 2)]
         rows.append(
             {
                 "renderer": "cycles",
@@ -101,13 +98,6 @@ def _cycles(
             }
         )
     return rows
-
-
-def _read(path: Path) -> Map:
-    picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-    if picture is None:
-        raise UserError(f"{path.name}: Cycles left no picture that can be read")
-    return np.asarray(picture[..., :3], np.float32)
 
 
 def _export(ours: Case, folder: Path, spp: list[int]) -> None:

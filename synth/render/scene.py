@@ -24,6 +24,7 @@ Mask = npt.NDArray[np.bool_]
 
 _STEEL = Metal(reflectance=(0.88, 0.88, 0.87), along=0.14, across=0.5, satin=0.4)
 _RIM_ROUGHNESS = 0.06
+_TINES = 2
 _GLARE = 0.35  # specular radiance, as a share of full scale, that hides what is under it
 
 
@@ -64,14 +65,14 @@ class Studio:
         self.variant = pick(job.render.variant)
         self.surface, self.camera = surface, camera
         self._look, self._render = look, job.render
-        self._rim = rim.build(surface, job.anatomy.craniotomy.radius_mm, look)
+        self.rim = rim.build(surface, job.anatomy.craniotomy.radius_mm, look)
         self._coat = texture.cortex(
             surface,
             look,
             texture.resolution(surface.extent_mm, camera.mm_per_px),
             job.appearance.photo,
         )
-        self.still = truth.still(camera, Shape(surface.vertices, surface.faces), self._rim.shape)
+        self.still = truth.still(camera, Shape(surface.vertices, surface.faces), self.rim.shape)
         self.lamps = light.lamps(camera, look)
         self._sensor = sensor.Sensor(
             exposure=look.exposure,
@@ -79,7 +80,7 @@ class Studio:
             full_well=look.full_well,
             contrast=look.contrast,
         )
-        self._tool: instrument.Instrument | None = None
+        self._tool = instrument.build(_TINES) if job.render.tool else None
         self._stage: Stage | None = None
 
     def frame(self, vertices: Floats, tips: Floats, shafts: Floats, seed: int) -> Shot:
@@ -87,20 +88,20 @@ class Studio:
 
         Args:
             vertices: (V, 3) mm, the surface in this frame.
-            tips: (K, 3) mm, where the instrument's tines end; K is the same in all frames.
+            tips: (K, 3) mm, where the instrument's tines end; another K than before sets the scene up anew.
             shafts: (K, 3) unit vectors from tip to hand.
             seed: of light paths and sensor noise.
         """
         camera, surface = self.camera, self.surface
-        if self._render.tool and self._tool is None:
-            self._tool = instrument.build(len(tips))
+        if self._tool and self._tool.tines != len(tips):
+            self._tool, self._stage = instrument.build(len(tips)), None
         tool = instrument.pose(self._tool, tips, shafts) if self._tool else np.zeros((0, 3))
         radiance = self._expose(vertices, tool, seed)
         now = truth.now(
             camera,
             self.still,
             Shape(vertices, surface.faces),
-            self._rim.shape,
+            self.rim.shape,
             Shape(tool, self._tool.faces) if self._tool else None,
         )
         return Shot(
@@ -152,17 +153,15 @@ class Studio:
     def bodies(self, vertices: Floats, tool: Floats) -> dict[str, Body]:
         """Everything in the scene with its material; vertices (V, 3) and (T, 3) mm as given."""
         surface, look = self.surface, self._look
-        frame = rim.paint(
-            self._rim, look, texture.resolution(self._rim.extent_mm, 2.2 * self.camera.mm_per_px)
-        )
+        frame = rim.paint(self.rim, look, texture.resolution(self.rim.extent_mm, 2.2 * self.camera.mm_per_px))
         bodies = {
             "cortex": Body(
                 vertices, surface.faces, surface.uv, Wet(self._coat.albedo, self._coat.normal, look.roughness)
             ),
             "rim": Body(
-                self._rim.vertices,
-                self._rim.faces,
-                self._rim.uv,
+                self.rim.vertices,
+                self.rim.faces,
+                self.rim.uv,
                 Wet(frame.albedo, frame.normal, _RIM_ROUGHNESS),
             ),
         }

@@ -1,0 +1,80 @@
+"""Frames a second on a compiled variant, and what limits them: meant for `cuda_ad_rgb`, runs on any."""
+
+from __future__ import annotations
+
+import json as json_
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+
+from bench import machine
+from bench.render_case import case
+from synth.job import Job
+from synth.render import instrument, truth
+from synth.render.shape import Shape
+
+
+def throughput(
+    variant: Annotated[str, typer.Option(help="As in a job's render.variant.")] = "cuda_ad_rgb",
+    spp: Annotated[list[int], typer.Option(help="Light paths a pixel.")] = [4, 16],  # noqa: B006
+    frames: Annotated[int, typer.Option(min=2, help="Frames to time, after three of warm-up.")] = 60,
+    seed: Annotated[int, typer.Option(help="Of the job.")] = 11,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder for throughput.json.")] = None,
+    json: Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")] = False,
+) -> None:
+    """Frames a second at 640x480 and each step's share of a frame, by the wall clock."""
+    from rich.console import Console
+
+    rows = [measure(variant, paths, frames, seed) for paths in spp]
+    found = {"variant": variant, "seed": seed, "rows": rows, "machine": machine.describe()}
+    if out is not None:
+        out.mkdir(parents=True, exist_ok=True)
+        (out / "throughput.json").write_text(json_.dumps(found, indent=1) + "\n", "utf-8")
+    if json:
+        print(json_.dumps(found))
+    else:
+        Console().print_json(json_.dumps(found))
+
+
+def measure(variant: str, spp: int, frames: int, seed: int) -> dict[str, Any]:
+    """Median seconds of each step, and frames a second if they follow one another.
+
+    The picture comes back to the host within `render`, so its end is the device's end.
+    """
+    job = Job.model_validate({"seed": seed, "render": {"variant": variant, "spp": spp}})
+    ours = case(job, 0)
+    studio = ours.studio
+    forceps = instrument.build(2)
+    stage = studio.stage(ours.vertices, instrument.pose(forceps, ours.tips, ours.shafts), spp)
+    spent: dict[str, list[float]] = {"move": [], "render": [], "sensor": [], "truth": []}
+
+    def timed(name: str, step: Callable[[], Any]) -> Any:
+        start = time.perf_counter()
+        value = step()
+        spent[name].append(time.perf_counter() - start)
+        return value
+
+    for k in range(frames + 3):
+        lift = 0.1 * (k % 20)
+        vertices, tool = ours.moved(lift), instrument.pose(forceps, ours.held(lift), ours.shafts)
+        timed("move", lambda v=vertices, t=tool: (stage.move("cortex", v), stage.move("tool", t)))
+        radiance = timed("render", lambda seed=k: stage.render(seed))
+        timed("sensor", lambda picture=radiance, seed=k: studio.develop(picture, seed))
+        shapes = Shape(vertices, studio.surface.faces), Shape(tool, forceps.faces)
+        timed(
+            "truth",
+            lambda s=shapes: truth.now(studio.camera, studio.still, s[0], studio.rim.shape, s[1]),
+        )
+    median = {name: float(np.median(values[3:])) for name, values in spent.items()}
+    whole = sum(median.values())
+    return {
+        "spp": spp,
+        "frames_a_second": round(1 / whole, 2),
+        "pictures_a_second": round(1 / (median["move"] + median["render"]), 2),
+        "seconds": {name: round(value, 4) for name, value in median.items()},
+        "limited_by": max(median, key=lambda name: median[name]),
+    }
