@@ -36,7 +36,7 @@ def main(folder: Path) -> None:
             bpy.ops.render.render(write_still=True)
             times.setdefault(str(spp), []).append(time.process_time() - start)
             image = bpy.data.images.load(bpy.context.scene.render.filepath)
-            texels = np.array(image.pixels[:], np.float32).reshape(*image.size[::-1], 4)
+            texels = np.array(image.pixels[:], np.float32).reshape(image.size[1], image.size[0], 4)
             np.save(folder / f"cycles-{spp}-{seed}.npy", texels[::-1, :, :3])
     (folder / "times.json").write_text(json.dumps({"cpu_s": times, "version": bpy.app.version_string}))
 

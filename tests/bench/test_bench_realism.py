@@ -1,0 +1,45 @@
+"""Statistics of pictures against pictures whose statistics are known."""
+
+import numpy as np
+import pytest
+
+from bench.realism import spread, statistics, tiles
+
+
+def grey(light: np.ndarray) -> np.ndarray:
+    return np.repeat(np.clip(light, 0, 255).astype(np.uint8)[..., None], 3, axis=2)
+
+
+def test_white_noise_has_a_flat_spectrum_and_gaussian_gradients() -> None:
+    found = statistics(grey(128 + 12 * np.random.default_rng(0).standard_normal((256, 256))))
+    assert found["spectrum slope"] == pytest.approx(0, abs=0.3)
+    assert found["gradient kurtosis"] == pytest.approx(3, abs=0.15)
+    assert found["a mean"] == pytest.approx(0, abs=0.1)
+
+
+def test_a_spectrum_of_known_slope_is_found() -> None:
+    rng = np.random.default_rng(1)
+    frequency = np.hypot(np.fft.fftfreq(256)[:, None], np.fft.fftfreq(256)[None])
+    frequency[0, 0] = 1
+    field = np.fft.ifft2(np.fft.fft2(rng.standard_normal((256, 256))) / frequency).real
+    assert statistics(grey(128 + 30 * field / field.std()))["spectrum slope"] == pytest.approx(-2, abs=0.25)
+
+
+def test_highlights_are_counted_and_sized() -> None:
+    light = np.full((200, 200), 150.0)
+    light[20:24, 20:24] = 255
+    light[100:108, 60:68] = 255
+    found = statistics(grey(light))
+    assert found["highlight share"] == pytest.approx((16 + 64) / 40_000)
+    assert found["highlight area median"] == pytest.approx(40)
+
+
+def test_tiles_lie_inside_the_mask() -> None:
+    inside = np.zeros((40, 60), bool)
+    inside[4:36, 10:44] = True
+    picture = np.repeat(np.repeat(inside[..., None], 3, axis=2) * np.uint8(9), 1, axis=0)
+    crops = tiles(picture, inside, side=16, step=1)
+    assert len(crops) == 17 * 19
+    assert min(crop.min() for crop in crops) == 9
+    low, middle, high = spread(crops[:3])["L mean"]
+    assert low == middle == high
