@@ -30,14 +30,19 @@ def clips(
     out = []
     for index in range(job.sequences):
         report(index, job.sequences)
-        name = hashlib.blake2b(
-            identity.canonical([identity.of(job), index, grid.size, grid.extent_mm]), digest_size=16
-        ).hexdigest()
+        name = _key(job, index, grid)
         if not (cache / name).is_dir():
             pack(clip(job, index, grid, tets, name), cache / name)
         out.append(unpack(cache / name))
     report(job.sequences, job.sequences)
     return out
+
+
+def _key(job: Job, index: int, grid: Grid) -> str:
+    """Hash of all that labels depend on: pictures and flow estimators change none of them."""
+    parts = job.model_dump(mode="json", include={"seed", "frames", "fps", "anatomy", "fem", "render"})
+    described = identity.canonical([parts, index, grid.size, grid.extent_mm])
+    return hashlib.blake2b(described, digest_size=16).hexdigest()
 
 
 def clip(job: Job, index: int, grid: Grid, tets: Tets, name: str) -> Clip:

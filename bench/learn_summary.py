@@ -91,9 +91,9 @@ def _tests(found: list[dict[str, Any]]) -> list[str]:
 _AGAINST = (
     ("mse", "antighost"),
     ("mse", "published"),
-    ("antighost", "stem4"),
-    ("mse", "unet-mse"),
-    ("antighost", "vector"),
+    ("mse", "stem4"),
+    ("mse", "unet"),
+    ("mse", "vector"),
     ("ideal-on-recovered", "recovered"),
     ("ideal-on-recovered", "mixed"),
 )

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from learn import checkpoint
 from learn.checkpoint import Card
 from learn.grid import Grid, Resampler, centre, channels
-from learn.model import D2FNet
+from learn.model import D2FNet, fused
 from synth.errors import UserError
 
 
@@ -94,7 +94,7 @@ class Predictor:
     def __init__(self, model: D2FNet, card: Card, device: torch.device | str = "cpu") -> None:
         self.card, self.grid = card, card.settings.grid
         self.device = torch.device(device)
-        self.model = model.to(self.device).eval()
+        self.model = fused(model).to(self.device)
         self._view: View | None = None
 
     def view(self, tissue: NDArray[np.bool_], scale_mm_per_px: float) -> View:
@@ -158,14 +158,13 @@ class Predictor:
             raise UserError("displacement holds NaN or infinity")
         out = []
         for start in range(0, len(displacement), settings.batch):
-            u = torch.from_numpy(np.ascontiguousarray(displacement[start : start + settings.batch]))
-            u = u.to(self.device)
+            u = torch.from_numpy(np.array(displacement[start : start + settings.batch])).to(self.device)
             m = torch.from_numpy(np.array(mask)).to(self.device).expand(len(u), 1, n, n)
             sure = None
             if settings.arch.confidence:
                 sure = torch.ones_like(m)
                 if confidence is not None:
-                    part = np.ascontiguousarray(confidence[start : start + settings.batch])
+                    part = np.array(confidence[start : start + settings.batch])
                     sure = torch.from_numpy(part)[:, None].to(self.device)
             log_young = torch.full((len(u), 1), float(np.log(young_kpa)), device=self.device)
             said = self.model(channels(u, m, self.grid.pitch_mm, scales, sure), log_young)

@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from learn.model import Architecture, D2FNet, flops, parameters
+from learn.model import Architecture, D2FNet, flops, fused, parameters
 from learn.settings import PRESETS
 from synth.errors import UserError
 
@@ -74,3 +74,20 @@ def test_impossible_shapes(change: dict[str, object], message: str) -> None:
 def test_an_input_that_cannot_be_halved_often_enough() -> None:
     with pytest.raises(UserError, match="input size 80 does not divide by 64"):
         Architecture(stem=4).check(80)
+
+
+def test_folding_batch_norms_changes_nothing_but_the_time() -> None:
+    torch.manual_seed(0)
+    model = D2FNet(Architecture(width=8, levels=2)).eval()
+    for module in model.modules():
+        if isinstance(module, torch.nn.BatchNorm2d):
+            module.running_mean.normal_()  # type: ignore[union-attr,operator]
+            module.running_var.uniform_(0.5, 2)  # type: ignore[union-attr,operator]
+    quick = fused(model)
+    x = torch.randn(1, 5, 32, 32)
+    x[:, 3] = 1
+    with torch.no_grad():
+        assert model(x).abs().max() > 0
+        torch.testing.assert_close(quick(x), model(x), rtol=1e-3, atol=1e-6)
+    assert not any(isinstance(m, torch.nn.BatchNorm2d) for m in quick.modules())
+    assert any(isinstance(m, torch.nn.BatchNorm2d) for m in model.modules())

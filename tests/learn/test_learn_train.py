@@ -13,6 +13,7 @@ from learn import checkpoint
 from learn.cli import app
 from learn.data import Clip
 from learn.evaluate import unseen
+from learn.loss import Objective
 from learn.predict import load as load_model
 from learn.settings import Settings, preset
 from learn.split import Split, nested
@@ -24,7 +25,7 @@ run = CliRunner().invoke
 
 
 def small(**changes: object) -> Settings:
-    base = preset("tiny", size=32, epochs=4)
+    base = preset("tiny", size=32, epochs=4, objective=Objective())
     return dataclasses.replace(base, arch=dataclasses.replace(base.arch, levels=2, dropout=0.1), **changes)  # type: ignore[arg-type]
 
 
