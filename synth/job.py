@@ -132,6 +132,24 @@ class Fem(Section):
     """Time in which the load grows to its peak, as a part of the sequence."""
     cone_deg: Annotated[FiniteFloat, Field(ge=0, le=80)] = 65.0
     """The load's direction is drawn uniformly within this angle of the surface normal."""
+    time: Literal["quasi-static", "dynamic"] = "quasi-static"
+    """Equilibrium in every frame, or motion with inertia (backward Euler)."""
+    dt_s: Annotated[FiniteFloat, Field(gt=0, le=1)] = 0.03
+    """Dynamic: longest time step [s]; a frame holds a whole number of steps."""
+    mass_kg: Positive = 1.0
+    """Dynamic: mass of the whole brain [kg]."""
+    damping: NonNegative = 2.0
+    """Dynamic: damping by mass [1/s]."""
+    relaxation: Annotated[
+        tuple[tuple[Annotated[FiniteFloat, Field(gt=0, lt=1)], Positive], ...], Field(max_length=2)
+    ] = ()
+    """Prony terms [part of the stiffness lost, time in s], one or two: E is then that of a sudden load."""
+
+    @model_validator(mode="after")
+    def _some_stiffness_stays(self) -> Fem:
+        if sum(part for part, _ in self.relaxation) >= 1:
+            raise ValueError("relaxation: the parts lost add up to the whole stiffness or more")
+        return self
 
     @model_validator(mode="after")
     def _load_is_in_the_laws_range(self) -> Fem:

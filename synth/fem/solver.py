@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from synth import job
-from synth.fem import equilibrium, skin, tool
+from synth.fem import equilibrium, motion, skin, tool
 from synth.fem.equilibrium import InvertedElement
 from synth.fem.material import Tissue, check_load
 from synth.fem.mesh import Tets
@@ -62,7 +62,7 @@ def deform(
     frames: int,
     fps: float,
 ) -> Deformation:
-    """Moves a brain as a gesture asks, quasi-statically.
+    """Moves a brain as a gesture asks.
 
     Args:
         fem: the job's section.
@@ -81,7 +81,6 @@ def deform(
         NotFinite: a number is none.
     """
     check_load(tissue.law, gesture.load)
-    system = assemble(tets, tissue.law, tissue.poisson)
     carry = skin.embedding(tets, skin_vertices)
     area = skin.vertex_area(skin_vertices, skin_faces)
     over = tool.course(gesture, frames)
@@ -89,7 +88,11 @@ def deform(
 
     # One load per kPa of E; displacement depends on no more than that.
     loads = np.stack([carry.T @ (area[:, None] * t) for t in traction / tissue.young_kpa])
-    path = equilibrium.follow(system, loads, gesture.load * over.load)
+    named = gesture.load * over.load
+    if fem.time == "quasi-static" and not fem.relaxation:
+        path = equilibrium.follow(assemble(tets, tissue.law, tissue.poisson), loads, named)
+    else:
+        path = motion.march(tets, tissue.law, tissue.poisson, tissue.young_kpa, loads, named, clock(fem, fps))
     displacement = np.stack([carry @ u for u in path.displacement])
     corners, weights = tool.anchors(gesture, over, skin_vertices, skin_faces)
     surface = skin_vertices + displacement
@@ -110,4 +113,13 @@ def deform(
         min_jacobian=path.jacobian,
         energy=path.energy * tissue.young_kpa,
         residual=path.residual,
+    )
+
+
+def clock(fem: job.Fem, fps: float) -> motion.Clock:
+    """Steps no longer than `fem.dt_s`, a whole number of them a frame."""
+    dynamic = fem.time == "dynamic"
+    substeps = int(np.ceil(1 / fps / fem.dt_s - 1e-9)) if dynamic else 1
+    return motion.Clock(
+        1 / fps, substeps, fem.mass_kg if dynamic else 0.0, fem.damping if dynamic else 0.0, fem.relaxation
     )

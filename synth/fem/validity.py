@@ -8,13 +8,13 @@ others are measured against, is taken to hold while its stable relative agrees a
 
 LAW_ERROR = {
     "linear": ((0.02, 0.0048), (0.05, 0.0123), (0.1, 0.0254), (0.15, 0.0392), (0.2, 0.0541)),
-    "stable": ((0.02, 0.0013), (0.05, 0.0032), (0.1, 0.0068), (0.15, 0.0111), (0.2, 0.0159), (0.4, 0.0510)),
+    "stable": ((0.05, 0.0032), (0.1, 0.0068), (0.15, 0.0111), (0.2, 0.0159), (0.3, 0.0288), (0.4, 0.0510)),
     "corotational": ((0.02, 0.0048), (0.05, 0.0118), (0.1, 0.0234), (0.15, 0.0346), (0.2, 0.0508)),
 }
 """Load and error against neo-Hookean, the worst of pushing, pulling and dragging aside, nu 0.4; from
 `bench pareto fem` (docs/results/fem/pareto)."""
 
-CHEAPEST_FIRST = ("linear", "neo-hookean", "stable", "corotational")
+CHEAPEST_FIRST = ("linear", "stable", "neo-hookean", "corotational")
 """Laws by CPU time a frame, from the same measurement."""
 
 LEAST_JACOBIAN = 0.2

@@ -1,0 +1,107 @@
+"""Time: inertia with damping, and tissue that relaxes, step by step.
+
+Both turn a step into equilibrium with other springs under another load, so that the quasi-static solver and
+one factorisation serve here too. Inertia: backward Euler, M a + d M v + f(u) = load, as in Heraoui et al.
+Relaxation: quasi-linear viscoelasticity (Fung), its stress a Prony series over the elastic one, stepped by
+the recurrence of Taylor, Pister & Goudreau (Int. J. Numer. Meth. Eng. 2, 1970), exact for stress that changes
+evenly in a step. Since nodal forces are linear in stress, the history is kept as nodal forces.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy.sparse as sp
+from numpy.typing import NDArray
+
+from synth.fem.element import bary_slope
+from synth.fem.equilibrium import TOLERANCE, NoEquilibrium, Path, balance, check
+from synth.fem.mesh import Tets
+from synth.fem.system import State, assemble
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Clock:
+    """What time does to the tissue."""
+
+    step_s: float
+    """Between two loads."""
+    substeps: int = 1
+    """Steps of the solver between two loads."""
+    mass_kg: float = 0.0
+    """Of the whole brain; 0 leaves inertia out."""
+    damping: float = 0.0
+    """1/s, by mass."""
+    relaxation: tuple[tuple[float, float], ...] = ()
+    """Prony terms: the part of the stiffness that is lost, and its time [s]."""
+
+
+def march(
+    tets: Tets, law: str, poisson: float, young_kpa: float, loads: Floats, named: Floats, clock: Clock
+) -> Path:
+    """Motion from rest under loads at even times; between them they change evenly.
+
+    Args:
+        tets: the mesh.
+        law: a key of `laws.NUMBER`; its stiffness is that of a sudden load.
+        poisson: below 0.5.
+        young_kpa: E, which sets how much inertia counts.
+        loads: (T, N, 3) mN for E = 1 kPa.
+        named: (T,) P = F/(E a^2) of each, for messages.
+        clock: time.
+
+    Raises:
+        As `equilibrium.follow`.
+    """
+    dt = clock.step_s / clock.substeps
+    fade = [(g, tau, np.exp(-dt / tau), tau / dt * -np.expm1(-dt / tau)) for g, tau in clock.relaxation]
+    firm = 1 - sum(g for g, _, _, _ in fade) + sum(g * even for g, _, _, even in fade)
+    pull = (1 / dt**2 + clock.damping / dt) if clock.mass_kg else 0.0
+    mass = nodal_mass(tets, clock.mass_kg) / young_kpa
+    springs = (tets.hold + sp.diags_array(pull * mass)) / firm
+    system = assemble(replace(tets, hold=sp.csr_array(springs)), law, poisson)
+    tissue = replace(system, hold=sp.csr_array(tets.hold.shape))
+
+    peak = loads[np.abs(loads).max(axis=(1, 2)).argmax()]
+    size = float(np.sqrt(np.vdot(peak, system.solve(peak)))) / firm
+    u = before = np.zeros_like(loads[0])
+    elastic, history = np.zeros_like(u), [np.zeros_like(u) for _ in fade]
+    states: list[tuple[Floats, State, float]] = []
+    for t in range(len(loads)):
+        for sub in range(1, clock.substeps + 1 if t else 2):
+            share = sub / clock.substeps
+            load = loads[t] if t == 0 else (1 - share) * loads[t - 1] + share * loads[t]
+            for (g, _, decay, even), h in zip(fade, history, strict=True):
+                load = load - decay * h + g * even * elastic
+            if pull:
+                ahead = ((2 * u - before) / dt**2 + clock.damping / dt * u) / pull
+                load = load + pull * mass[:, None] * ahead
+            new, state, rest = balance(system, load / firm, u + (u - before), TOLERANCE * size)
+            check(system, new, state, t, float(named[t]))
+            now = tissue.state(new).force
+            for k, (g, _, decay, even) in enumerate(fade):
+                history[k] = decay * history[k] + g * even * (now - elastic)
+            before, u, elastic = u, new, now
+            if rest > 2 * TOLERANCE * size:
+                raise NoEquilibrium(f"frame {t}: no equilibrium at load {named[t]:.3g}; lower fem.load")
+        states.append((u, tissue.state(u), rest / size))
+    return Path(
+        np.stack([u for u, _, _ in states]),
+        np.array([s.jacobian for _, s, _ in states]),
+        np.array([s.energy + 0.5 * float(np.vdot(u, tets.hold @ u)) for u, s, _ in states]),
+        np.array([r for _, _, r in states]),
+    )
+
+
+def nodal_mass(tets: Tets, mass_kg: float) -> Floats:
+    """(N,) kg, spread evenly over the volume; within an element as the diagonal of its consistent mass.
+
+    Hinton, Rock & Zienkiewicz, Earthq. Eng. Struct. Dyn. 4, 1976.
+    """
+    volume = bary_slope(tets.points[tets.cells[:, :4]])[1]
+    shares = np.full(4, 0.25) if tets.order == 1 else np.repeat([1 / 36, 4 / 27], [4, 6])
+    spread = np.bincount(tets.cells.ravel(), np.outer(volume, shares).ravel(), len(tets.points))
+    return np.asarray(mass_kg * spread / volume.sum())
