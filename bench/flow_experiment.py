@@ -226,7 +226,8 @@ def _exact(one: flow_rendered.WetPair) -> Error:
     begin = time.process_time()
     flow, _ = create("tvl1").flow(pair.rest, pair.now, rest, now)
     spent = time.process_time() - begin
-    return against(flow, pair.flow, one.tissue & one.visible, pair.contact, pair.hidden, spent)
+    seen = one.tissue & one.visible
+    return against(flow, pair.flow, seen, pair.contact & seen, pair.hidden, spent)
 
 
 def _time(source: Source) -> Iterator[Row]:

@@ -24,7 +24,7 @@ class Error:
     """Endpoint error over what is seen."""
     p95: float
     contact: float
-    """Endpoint error within the contact."""
+    """Endpoint error within the contact, where it is seen."""
     hidden: float
     """Endpoint error under the tool; NaN where nothing is hidden."""
     magnitude: float

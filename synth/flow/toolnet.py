@@ -1,6 +1,6 @@
 """Where the instrument is: a small U-Net (Ronneberger et al., MICCAI 2015) on a shrunken frame.
 
-Its weights lie beside this file; `toolnet_train` made them, and the file `toolnet.json` says from what.
+Its weights lie beside this file; `bench.flow_toolnet` makes them, and `toolnet.json` says from what.
 """
 
 from __future__ import annotations

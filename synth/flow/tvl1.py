@@ -33,7 +33,7 @@ from synth.flow.estimator import Flags, Flow, Map, Rgb
 class Settings:
     """The energy, and how far it is minimised."""
 
-    weight: float = 0.5
+    weight: float = 0.3
     """lambda: data against smoothness."""
     gradient: float = 1.0
     """gamma: weight of gradient constancy."""
@@ -43,7 +43,7 @@ class Settings:
     """Residuals below it [local deviations] count quadratically."""
     coarsest_px: int = 12
     """The pyramid goes down to about this many pixels on the short side."""
-    warps: int = 4
+    warps: int = 6
     """Linearisations a level."""
     reweights: int = 2
     """Updates of the robust weights a warp."""
@@ -59,7 +59,11 @@ class Settings:
     """3x3 median of the flow after each warp (Wedel et al., An improved algorithm for TV-L1, 2009)."""
     warm_warps: int = 3
     """Linearisations a level with an initial flow."""
-    bold_weight: float = 1.0
+    steep_px: float = 15.0
+    """A pull this far doubles lambda: flow gets steeper with the pull, noise doesn't."""
+    fine_levels: int = 2
+    """Levels that the second stage of a cold start, or a warm start, works on."""
+    bold_weight: float = 2.0
     """lambda of the first stage of a cold start: far pulls are steep, and smoothness would hold them back."""
     bold_tau: float = 1.0
     """Primal step of that stage: small, for the coarsest levels have few pixels and must not run away."""
@@ -146,9 +150,10 @@ class Tvl1:
         levels = pyramid(rest, now, rest_usable, now_usable, s)
         if initial is None:
             coarse = solve(levels[1:], None, s.bold()) if len(levels) > 1 else None
-            found = solve(levels[:2], None if coarse is None else finer(coarse, levels[0]), s)
+            initial, settings = None if coarse is None else finer(coarse, levels[0]), s
         else:
-            found = solve(levels[:2], initial, replace(s, warps=s.warm_warps))
+            settings = replace(s, warps=s.warm_warps)
+        found = solve(levels[: s.fine_levels], initial, settings)
         back = None
         if self.checked and len(levels) > 1:
             back = solve(
@@ -215,8 +220,11 @@ def solve(levels: list[Level], initial: Tensor | None, s: Settings) -> Tensor:
     """
     coarsest = levels[-1].now
     flow = coarsest.new_zeros(coarsest.shape[0], 2, *coarsest.shape[-2:])
+    weight = torch.full_like(flow[:, :1, :1, :1], s.weight)
     if initial is not None:
         flow = initial
+        far = torch.quantile(flow.norm(dim=1).flatten(1), 0.99, dim=1).view(-1, 1, 1, 1)
+        weight = s.weight * (1 + (far / s.steep_px) ** 2)
         for _ in levels[1:]:
             flow = 0.5 * F.avg_pool2d(flow, 2, ceil_mode=True, count_include_pad=False)
     for level in reversed(levels):
@@ -224,7 +232,7 @@ def solve(levels: list[Level], initial: Tensor | None, s: Settings) -> Tensor:
             flow = finer(flow, level)
         dual = flow.new_zeros(2, *flow.shape)
         for _ in range(s.warps):
-            flow, dual = step(level, flow, dual, s)
+            flow, dual = step(level, flow, dual, weight, s)
     return flow
 
 
@@ -233,7 +241,7 @@ def finer(flow: Tensor, level: Level) -> Tensor:
     return 2 * image.doubled(flow, level.now)
 
 
-def step(level: Level, flow: Tensor, dual: Tensor, s: Settings) -> tuple[Tensor, Tensor]:
+def step(level: Level, flow: Tensor, dual: Tensor, weight: Tensor, s: Settings) -> tuple[Tensor, Tensor]:
     """One warp: linearise r about `flow`, reweight, minimise. dual: (2, B, 2, H, W), its x and y parts."""
     warped, seen = image.warp(level.now, level.now_usable, flow)
     mask = level.rest_usable * seen
@@ -247,7 +255,7 @@ def step(level: Level, flow: Tensor, dual: Tensor, s: Settings) -> tuple[Tensor,
     for _ in range(s.reweights):
         moved = flow - start
         now = residual + rows * moved[:, :1] + columns * moved[:, 1:]
-        c = s.tau * s.weight * mask / torch.sqrt((now * now).sum(1, keepdim=True) + s.epsilon**2)
+        c = s.tau * weight * mask / torch.sqrt((now * now).sum(1, keepdim=True) + s.epsilon**2)
         # (1 + c J^T J) w = v - c J^T (r - J w_0), 2x2 by Cramer.
         xx = 1 + c * (rows * rows).sum(1, keepdim=True)
         xy = c * (rows * columns).sum(1, keepdim=True)

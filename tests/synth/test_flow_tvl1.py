@@ -73,7 +73,11 @@ def test_proximal_step_solves_its_normal_equations() -> None:
     rest, now = surface(x, y), surface(x - 0.2, y + 0.1)
     every = torch.ones_like(rest)
     flow, _ = tvl1.step(
-        tvl1.Level(rest, now, every, every), torch.zeros(1, 2, 40, 40), torch.zeros(2, 1, 2, 40, 40), s
+        tvl1.Level(rest, now, every, every),
+        torch.zeros(1, 2, 40, 40),
+        torch.zeros(2, 1, 2, 40, 40),
+        torch.ones(1, 1, 1, 1),
+        s,
     )
     off = (flow - shifted)[..., 6:-6, 6:-6].norm(dim=1)
     assert float(off.median()) < 0.02
@@ -97,11 +101,11 @@ def test_pull_with_tool_highlights_and_light() -> None:
         flow, trust = Tvl1().flow(pair.rest, pair.now, pair.rest_usable, pair.now_usable)
         error = _error(flow, pair.flow)
         mean.append(error[pair.inside & ~pair.hidden].mean())
-        contact.append(error[pair.contact].mean())
+        contact.append(error[pair.contact & ~pair.hidden].mean())
         hidden.append(error[pair.hidden].mean())
         assert trust[pair.hidden].mean() < 0.02  # what can't be seen isn't vouched for
     assert np.mean(mean) < 0.15
-    assert np.mean(contact) < 0.5
+    assert np.mean(contact) < 0.4
     assert np.mean(hidden) < 0.5
 
 

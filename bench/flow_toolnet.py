@@ -1,7 +1,7 @@
 """Trains the tool mask's U-Net on the masks of a rendered dataset.
 
     synth render docs/results/learn/data/rendered.yaml -o DATA
-    python -m synth.flow.toolnet_train DATA --steps 260 --seed 0 -o synth/flow
+    python -m bench.flow_toolnet DATA --steps 150 --seed 0 -o synth/flow
 
 Writes `toolnet.pt` (half precision) and `toolnet.json` (data, seed, steps, overlap on held-out sequences).
 """
@@ -67,7 +67,7 @@ def train(data: Path, out: Path, steps: int, seed: int) -> dict[str, float | int
     torch.save({k: v.half() if v.is_floating_point() else v for k, v in net.state_dict().items()},
                out / "toolnet.pt")  # fmt: skip
     card: dict[str, float | int | str] = {
-        "command": f"python -m synth.flow.toolnet_train DATA --steps {steps} --seed {seed}",
+        "command": f"python -m bench.flow_toolnet DATA --steps {steps} --seed {seed}",
         "frames": len(training),
         "held_out_frames": len(overlap),
         "held_out_iou": round(float(np.mean(overlap)), 4) if overlap else float("nan"),
@@ -145,7 +145,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("data", type=Path, help="rendered dataset with tools in view")
     parser.add_argument("-o", "--out", type=Path, default=toolnet.WEIGHTS.parent)
-    parser.add_argument("--steps", type=int, default=260)
+    parser.add_argument("--steps", type=int, default=150)
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args()
     print(json.dumps(train(given.data, given.out, given.steps, given.seed)))
