@@ -35,11 +35,12 @@ def test_highlights_are_counted_and_sized() -> None:
 
 
 def test_tiles_lie_inside_the_mask() -> None:
-    inside = np.zeros((40, 60), bool)
-    inside[4:36, 10:44] = True
-    picture = np.repeat(np.repeat(inside[..., None], 3, axis=2) * np.uint8(9), 1, axis=0)
-    crops = tiles(picture, inside, side=16, step=1)
-    assert len(crops) == 17 * 19
+    inside = np.zeros((160, 180), bool)
+    inside[4:136, 10:143] = True
+    picture = np.repeat(inside[..., None], 3, axis=2) * np.uint8(9)
+    crops = tiles(picture, inside, side=128, step=1)
+    assert len(crops) == 5 * 6
     assert min(crop.min() for crop in crops) == 9
-    low, middle, high = spread(crops[:3])["L mean"]
-    assert low == middle == high
+    noise = np.random.default_rng(2).integers(80, 160, (3, 128, 128)).astype(float)
+    low, middle, high = spread([grey(light + 10 * k) for k, light in enumerate(noise)])["L mean"]
+    assert low < middle < high
