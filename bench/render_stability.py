@@ -29,6 +29,7 @@ _SMALL = {"size": (160, 120)}
 def stability(
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder for stability.json.")] = None,
     seed: Annotated[int, typer.Option(help="Of the jobs.")] = 11,
+    only: Annotated[list[str] | None, typer.Option(help="Cases to try, by name; all if not given.")] = None,
     json: Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")] = False,
 ) -> None:
     """Steep folds, grazing views, extreme sizes, missing parts: a correct frame or a clear error."""
@@ -36,7 +37,11 @@ def stability(
     from rich.table import Table
 
     rows: list[dict[str, Any]] = []
-    for name, trial in _TRIALS.items():
+    unknown = set(only or []) - set(_TRIALS)
+    if unknown:
+        raise UserError(f"no case {sorted(unknown)[0]!r}; there are: {', '.join(_TRIALS)}")
+    for name in only or _TRIALS:
+        trial = _TRIALS[name]
         try:
             figures, outcome = trial(seed), "frame"
         except UserError as error:
