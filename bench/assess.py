@@ -29,7 +29,7 @@ _SEED = 0  # of the bootstrap: the same recording gives the same intervals
 class Settings:
     """What decides a run of `bench score` besides the recording and the model."""
 
-    backend: str = "opencv-tvl1"
+    backend: str = "tvl1"
     """Flow estimator."""
     shrink: int = 1
     """Flow is computed on pictures this many times smaller."""

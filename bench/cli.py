@@ -52,7 +52,7 @@ def score(
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="Folder for score.json and report.html; NAME-score.")
     ] = None,
-    flow: Annotated[str, typer.Option(help="Flow estimator, as in a job's flow.backend.")] = "opencv-tvl1",
+    flow: Annotated[str, typer.Option(help="Flow estimator, as in a job's flow.backend.")] = "tvl1",
     shrink: Annotated[int, typer.Option(min=1, max=8, help="Flow on pictures this many times smaller.")] = 1,
     title: Annotated[str, typer.Option(help="Heading of the report.")] = "",
     train: Annotated[
@@ -101,7 +101,7 @@ def demo(
     dataset: Annotated[Path, typer.Argument(help="A rendered dataset.")],
     model: Annotated[Path, typer.Option("--model", "-m", help="Model trained on it.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for recording, score and report.")],
-    flow: Annotated[str, typer.Option(help="Flow estimator.")] = "opencv-tvl1",
+    flow: Annotated[str, typer.Option(help="Flow estimator.")] = "tvl1",
     json: Json = False,
 ) -> None:
     """Scores a model on a sequence of its dataset that it has not seen, by way of a recording."""

@@ -193,11 +193,9 @@ def _rendered(count: int, seed: int) -> Iterator[Row]:
             yield Row(
                 f"{what}, automatic glare mask: {name}", on, asked[k], float(np.mean([f[k] for f in found]))
             )
-    tooled = list(
-        flow_rendered.pairs(flow_rendered.Wet(peak_px=10, tool=True, size=(320, 240)), count, seed + 1)
-    )
+    tooled = list(flow_rendered.pairs(flow_rendered.Wet(peak_px=10, tool=True), count, seed + 1))
     ours = average([_exact(one) for one in tooled])
-    on = "rendered, 10 px, tool"
+    on = "rendered, 10 px, tool, 224²"
     yield Row("EPE mean, given masks", on, 0.20, ours.mean)
     yield Row("EPE contact, given masks", on, 0.40, ours.contact)
     yield Row("EPE hidden under the tool, given masks", on, 0.45, ours.hidden)
@@ -220,14 +218,19 @@ def _wet(one: flow_rendered.WetPair, name: str) -> tuple[float, float, float]:
 
 
 def _exact(one: flow_rendered.WetPair) -> Error:
-    pair = one.pair
+    pair, half = one.pair, 112
+    row, column = (int(np.median(at)) for at in np.nonzero(pair.contact))
+    height, width = one.tissue.shape
+    top, left = np.clip(row - half, 0, height - 2 * half), np.clip(column - half, 0, width - 2 * half)
+    crop = (slice(top, top + 2 * half), slice(left, left + 2 * half))
     # The renderer's own glare is only where the tissue is outshone; a picture's mask is wider, and is used.
     rest, now = one.tissue & ~one.rest_glare, ~(one.now_glare | pair.tool)
     begin = time.process_time()
-    flow, _ = create("tvl1").flow(pair.rest, pair.now, rest, now)
+    flow, _ = create("tvl1").flow(pair.rest[crop], pair.now[crop], rest[crop], now[crop])
     spent = time.process_time() - begin
-    seen = one.tissue & one.visible
-    return against(flow, pair.flow, seen, pair.contact & seen, pair.hidden, spent)
+    seen = (one.tissue & one.visible)[crop]
+    contact, hidden = pair.contact[crop] & seen, pair.hidden[crop]
+    return against(flow, pair.flow[crop], seen, contact, hidden, spent)
 
 
 def _time(source: Source) -> Iterator[Row]:

@@ -93,7 +93,8 @@ def measure(
         begin = time.process_time()
         flow, _ = estimator.flow(pair.rest, pair.now, rest, now, initial)
         spent = time.process_time() - begin
-        errors.append(against(flow, pair.flow, pair.inside & ~pair.hidden, pair.contact, pair.hidden, spent))
+        seen = pair.inside & ~pair.hidden
+        errors.append(against(flow, pair.flow, seen, pair.contact & seen, pair.hidden, spent))
     return average(errors)
 
 

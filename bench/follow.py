@@ -106,7 +106,7 @@ def follow(
     methods: Mapping[str, Method],
     scale_mm_per_px: float,
     *,
-    backend: str = "opencv-tvl1",
+    backend: str = "tvl1",
     shrink: int = 1,
     pictured: str | None = None,
     progress: Progress = lambda done: None,

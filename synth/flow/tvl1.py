@@ -223,7 +223,8 @@ def solve(levels: list[Level], initial: Tensor | None, s: Settings) -> Tensor:
     weight = torch.full_like(flow[:, :1, :1, :1], s.weight)
     if initial is not None:
         flow = initial
-        far = torch.quantile(flow.norm(dim=1).flatten(1), 0.99, dim=1).view(-1, 1, 1, 1)
+        length = flow.norm(dim=1).flatten(1)
+        far = length.kthvalue(1 + 99 * (length.shape[1] - 1) // 100, dim=1).values.view(-1, 1, 1, 1)
         weight = s.weight * (1 + (far / s.steep_px) ** 2)
         for _ in levels[1:]:
             flow = 0.5 * F.avg_pool2d(flow, 2, ceil_mode=True, count_include_pad=False)
