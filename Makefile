@@ -34,7 +34,7 @@ demo: setup
 	@mkdir -p $(DEMO)
 	$(BIN)/synth render demo -o $(DEMO)/data
 	$(BIN)/synth verify $(DEMO)/data
-	$(BIN)/learn train $(DEMO)/data -o $(DEMO)/model --preset tiny
+	$(BIN)/learn train $(DEMO)/data -o $(DEMO)/model --preset tiny --input mixed --epochs 30
 	$(BIN)/learn eval $(DEMO)/model $(DEMO)/data
 	$(BIN)/bench demo $(DEMO)/data --model $(DEMO)/model -o $(DEMO)
 	@echo "done: open $(DEMO)/report.html"

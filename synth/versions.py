@@ -13,7 +13,6 @@ _PACKAGES = (
     "scipy",
     "opencv-contrib-python-headless",
     "torch",
-    "wildmeshing",
     "zarr",
 )
 
