@@ -14,7 +14,7 @@ import zarr
 from numpy.typing import NDArray
 from zarr.codecs import BloscCodec, Crc32cCodec
 
-from synth import identity, versions
+from synth import identity, place, versions
 from synth.errors import NotFinite, UserError
 from synth.fields import FIELDS, Field
 from synth.job import Job
@@ -241,8 +241,8 @@ class Column:
 class Sequence:
     """One sealed sequence: `sequence["rgb"][t]`, `sequence.attrs["young_kpa"]`."""
 
-    def __init__(self, path: Path, group: zarr.Group, attrs: dict[str, Any]) -> None:
-        self.path, self._group, self.attrs = path, group, attrs
+    def __init__(self, path: Path, group: zarr.Group, attrs: dict[str, Any], at: place.Place) -> None:
+        self.path, self._group, self.attrs, self._place = path, group, attrs, at
 
     @property
     def index(self) -> int:
@@ -267,7 +267,7 @@ class Sequence:
         return name in self.attrs["field_hashes"]
 
     def __getitem__(self, name: str) -> Column:
-        field, where = _field(name), f"{self.path}: {name}"
+        field, where = _field(name), f"{self._place.name}: {name}"
         if name not in self:
             raise UserError(f"{where}: the sequence has no such field")
         try:
@@ -281,21 +281,25 @@ class Sequence:
         files = -(-expected[0] // shard[0])
         rest = "/0" * (len(expected) - 1)
         for k in range(files):
-            file = self.path / name / f"c/{k}{rest}"
             # Zarr reads a missing or empty file as zeros.
-            if not file.is_file() or not file.stat().st_size:
+            if not self._place.size(f"{name}/c/{k}{rest}"):
                 raise UserError(f"{where}: file c/{k}{rest} is missing or empty, the store is damaged")
         return Column(array, where)
 
 
 class Dataset:
-    """A folder of sealed sequences: `len`, iteration and indexing by position, in order of their names."""
+    """A folder of sealed sequences, or an address of one: `len`, iteration, indexing, in order of names."""
 
     def __init__(self, root: Path | str) -> None:
         self.root = Path(root)
-        if not self.root.is_dir():
+        self._addresses: list[str] | None = None
+        if isinstance(root, str) and "://" in root:
+            self._addresses = place.stores(root)
+            self.paths = [Path(address.partition("::")[0]) for address in self._addresses]
+        elif not self.root.is_dir():
             raise UserError(f"{self.root}: no such folder")
-        self.paths = sorted(path for path in self.root.glob("[0-9]*.zarr") if path.is_dir())
+        else:
+            self.paths = sorted(path for path in self.root.glob("[0-9]*.zarr") if path.is_dir())
         if not self.paths:
             raise UserError(f"{self.root}: holds no finished sequence")
 
@@ -303,21 +307,20 @@ class Dataset:
         return len(self.paths)
 
     def __getitem__(self, position: int) -> Sequence:
-        return open_sequence(self.paths[position])
+        return open_sequence((self._addresses or self.paths)[position])
 
     def __iter__(self) -> Iterator[Sequence]:
-        return (open_sequence(path) for path in self.paths)
+        return (self[position] for position in range(len(self)))
 
 
 def open_sequence(path: Path | str) -> Sequence:
-    """Opens a sealed sequence. UserError for one that is missing, unfinished, foreign or truncated."""
-    path = Path(path)
-    if path.name.endswith(".part"):
+    """Opens a sealed sequence, by path or address. UserError if missing, unfinished, foreign or truncated."""
+    if str(path).partition("::")[0].endswith(".part"):
         raise UserError(f"{path}: is an unfinished sequence")
-    if not path.is_dir():
-        raise UserError(f"{path}: no such sequence")
+    at = place.of(path)
+    path = Path(str(path).partition("::")[0])
     try:
-        group = zarr.open_group(str(path), mode="r", zarr_format=3, use_consolidated=False)
+        group = zarr.open_group(at.store, mode="r", zarr_format=3, use_consolidated=False)
         attrs = dict(group.attrs)
     except Exception as error:  # as in Column
         raise UserError(f"{path}: is not a Zarr v3 group, or its metadata is damaged") from error
@@ -329,7 +332,7 @@ def open_sequence(path: Path | str) -> Sequence:
     missing = {"content_hash", "field_hashes", "frames", "size", "index"} - attrs.keys()
     if missing:
         raise UserError(f"{path}: lacks the attributes {', '.join(sorted(missing))}")
-    return Sequence(path, group, attrs)
+    return Sequence(path, group, attrs, at)
 
 
 def field_hasher(field: Field, shape: tuple[int, ...]) -> hashlib.blake2b:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -158,3 +159,19 @@ def test_exr_beside_the_store_is_hashed(tmp_path: Path) -> None:
 
     assert store_with(1.0, tmp_path / "a") == store_with(1.0, tmp_path / "b")
     assert store_with(2.0, tmp_path / "c") != store_with(1.0, tmp_path / "d")
+
+
+def test_a_zip_reads_as_the_folder_does_and_names_what_it_lacks(root: Path, tmp_path: Path) -> None:
+    archive = tmp_path / "out of it.zip"
+    with zipfile.ZipFile(archive, "w") as target:
+        for file in sorted(root.rglob("*.zarr/**/*")):
+            if file.is_file() and file != root / "000001.zarr/depth/c/0/0/0":
+                target.write(file, file.relative_to(root))
+    dataset = Dataset(f"zip://::{archive}")
+    assert [one.index for one in dataset] == [0, 1]
+    assert np.array_equal(dataset[0]["flow"][3], Dataset(root)[0]["flow"][3])
+    assert dataset[1].path.name == "000001.zarr"
+    with pytest.raises(UserError, match="depth: file c/0/0/0 is missing"):
+        dataset[1]["depth"]
+    with pytest.raises(UserError, match="no such sequence"):
+        open_sequence(f"zip://000009.zarr::{archive}")

@@ -1,0 +1,83 @@
+"""Where a store lies: a folder, or anything that fsspec opens (zip, S3, HTTP, ...)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from synth.errors import UserError
+
+
+@dataclass(frozen=True)
+class Place:
+    """A folder somewhere."""
+
+    name: str
+    """Its path or address, for messages."""
+    store: Any
+    """What Zarr opens."""
+    size: Callable[[str], int]
+    """Bytes of a file in it, by its path from here; 0 when it is missing."""
+
+
+def of(where: Path | str) -> Place:
+    """The place of a path or an address such as `s3://bucket/out/000000.zarr` or `zip://000000.zarr::out.zip`.
+
+    Raises:
+        UserError: nothing is there, or the address cannot be opened.
+    """
+    if isinstance(where, Path) or "://" not in where:
+        folder = Path(where)
+        if not folder.is_dir():
+            raise UserError(f"{folder}: no such sequence")
+        return Place(str(folder), str(folder), lambda key: _size(folder / key))
+    fs, base = _open(where)
+    if not fs.isdir(base):
+        raise UserError(f"{where}: no such sequence")
+
+    def size(key: str) -> int:
+        try:
+            return int(fs.size(f"{base}/{key}" if base else key) or 0)
+        except FileNotFoundError:
+            return 0
+
+    from zarr.storage import FsspecStore
+
+    return Place(where, FsspecStore.from_url(_absolute(where), read_only=True), size)
+
+
+def stores(where: str) -> list[str]:
+    """Addresses of the sealed stores in the dataset at an address, in order of their names."""
+    fs, base = _open(where)
+    found = []
+    for entry in fs.ls(base, detail=False):
+        name = str(entry).rstrip("/").rsplit("/", 1)[-1]
+        if name.endswith(".zarr") and name[:-5].isdigit():
+            first, chained, rest = where.partition("::")
+            slash = "" if first.endswith("/") else "/"
+            found.append(f"{first}{slash}{name}{chained}{rest}")
+    return sorted(found)
+
+
+def _open(where: str) -> tuple[Any, str]:
+    import fsspec
+
+    try:
+        fs, base = fsspec.core.url_to_fs(_absolute(where))
+    except (ImportError, ValueError, OSError) as error:
+        raise UserError(f"{where}: cannot be opened ({error})") from error
+    return fs, str(base).rstrip("/")
+
+
+def _absolute(where: str) -> str:
+    """A local file that ends a chain (`zip://x::out.zip`) as an address of its own, as Zarr asks."""
+    *chain, last = where.split("::")
+    if chain and "://" not in last:
+        last = f"file://{Path(last).resolve()}"
+    return "::".join([*chain, last])
+
+
+def _size(path: Path) -> int:
+    return path.stat().st_size if path.is_file() else 0
