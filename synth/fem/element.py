@@ -81,6 +81,16 @@ def bary_slope(corners: Floats) -> tuple[Floats, Floats]:
     return slope, np.linalg.det(sides) / 6
 
 
+def quality(corners: Floats) -> Floats:
+    """Mean ratio of tetrahedra (M, 4, 3): 1 is regular, 0 flat, below 0 inside out.
+
+    Liu & Joe, BIT 34, 1994.
+    """
+    volume = np.linalg.det(corners[:, 1:] - corners[:, :1]) / 6
+    squares = ((corners[:, EDGES[:, 0]] - corners[:, EDGES[:, 1]]) ** 2).sum(axis=(1, 2))
+    return np.asarray(12 * np.sign(volume) * (3 * np.abs(volume)) ** (2 / 3) / squares)
+
+
 @dataclass(frozen=True)
 class Quadrature:
     """The mesh as volume integrals see it: M elements, Q points each, n nodes each."""

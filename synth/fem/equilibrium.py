@@ -72,7 +72,8 @@ def follow(system: System, loads: Floats, named: Floats) -> Path:
                 start = _guess(known, part, first)
             else:
                 start = path[-1][0] + system.solve(load - loads[step - 1])
-            u, state, rest = balance(system, load, start, TOLERANCE * size)
+            last = path[-1][0] if path else np.zeros_like(load)
+            u, state, rest = balance(system, load, start, TOLERANCE * size, last)
             residual[step] = rest / size
             if alike and all(abs(part - k) > 1e-3 for k, _ in known):
                 known.append((part, u))
@@ -102,7 +103,9 @@ def check(system: System, u: Floats, state: State, frame: int, load: float) -> N
         )
 
 
-def balance(system: System, load: Floats, start: Floats, tolerance: float) -> tuple[Floats, State, float]:
+def balance(
+    system: System, load: Floats, start: Floats, tolerance: float, safe: Floats
+) -> tuple[Floats, State, float]:
     """Minimises stored energy less the load's work by L-BFGS on the factored rest stiffness.
 
     Nocedal & Wright, Numerical Optimization, 7.4; Liu, Bouaziz & Kavan, "Quasi-Newton methods for real-time
@@ -112,13 +115,15 @@ def balance(system: System, load: Floats, start: Floats, tolerance: float) -> tu
         system: the equations.
         load: (N, 3) mN.
         start: (N, 3) mm.
+        safe: (N, 3) mm, a state of finite energy, for when the guess `start` has none.
         tolerance: on the norm sqrt(r' K^-1 r) of what is out of balance, in sqrt(mN mm).
 
     Returns:
         Displacement, its state and the norm reached; the caller judges it.
     """
-    u = start
-    state = system.state(u)
+    u, state = start, system.state(start)
+    if not np.isfinite(state.energy):
+        u, state = safe, system.state(safe)
     slope = _free(system, state.force - load)
     memory: list[tuple[Floats, Floats, float]] = []
     rest = np.inf

@@ -79,7 +79,7 @@ def march(
             if pull:
                 ahead = ((2 * u - before) / dt**2 + clock.damping / dt * u) / pull
                 load = load + pull * mass[:, None] * ahead
-            new, state, rest = balance(system, load / firm, u + (u - before), TOLERANCE * size)
+            new, state, rest = balance(system, load / firm, u + (u - before), TOLERANCE * size, u)
             check(system, new, state, t, float(named[t]))
             now = tissue.state(new).force
             for k, (g, _, decay, even) in enumerate(fade):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import scipy.sparse as sp
@@ -9,9 +11,10 @@ import skfem
 from skfem.models.elasticity import lame_parameters, linear_elasticity
 
 from synth import job
+from synth.errors import UserError
 from synth.fem import mesh
 from synth.fem.assembly import stiffness
-from synth.fem.element import quadrature
+from synth.fem.element import quadrature, quality
 from synth.fem.laws import NUMBER, stress, tangent
 from synth.fem.mesh import Tets
 from synth.fem.refine import bisect, refine
@@ -143,10 +146,24 @@ def test_bisection_conforms_and_keeps_volume_and_orientation() -> None:
 def test_block_has_the_wanted_size_and_sound_tetrahedra(tets: int) -> None:
     block = mesh.block(job.Anatomy(), tets, 1)
     assert tets <= len(block.cells) <= 1.3 * tets + 150
-    corner = block.points[block.cells]
-    sides = [np.linalg.norm(corner[:, i] - corner[:, j], axis=1) ** 2 for i in range(4) for j in range(i)]
-    quality = 12 * (3 * _volumes(block.points, block.cells)) ** (2 / 3) / np.sum(sides, axis=0)
-    assert quality.min() > 0.2  # mean ratio: 1 is regular, 0 flat
+    assert quality(block.points[block.cells]).min() > 0.2
+
+
+def test_quality_is_1_for_a_regular_and_0_for_a_flat_tetrahedron() -> None:
+    regular = np.array([[1.0, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
+    assert abs(quality(regular[None])[0]) == pytest.approx(1.0)
+    flat = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0.3, 0.3, 1e-9]])
+    assert quality(flat[None])[0] == pytest.approx(0.0, abs=1e-5)
+
+
+def test_a_flat_element_is_refused() -> None:
+    tets = cube(1)
+    points = tets.points.copy()
+    inner, cell = next((v, c) for c in tets.cells for v in c if not tets.fixed[v])
+    base = points[cell[cell != inner]].mean(axis=0)
+    points[inner] = base + 1e-6 * (points[inner] - base)
+    with pytest.raises(UserError, match=r"element \d+ is flat"):
+        assemble(replace(tets, points=points), "linear", 0.4)
 
 
 def test_refining_is_finest_where_size_is_smallest() -> None:
