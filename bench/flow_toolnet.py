@@ -1,7 +1,7 @@
 """Trains the tool mask's U-Net on the masks of a rendered dataset.
 
     synth render docs/results/learn/data/rendered.yaml -o DATA
-    python -m bench.flow_toolnet DATA --steps 150 --seed 0 -o synth/flow
+    python -m bench.flow_toolnet DATA --steps 450 --seed 0 -o synth/flow
 
 Writes `toolnet.pt` (half precision) and `toolnet.json` (data, seed, steps, overlap on held-out sequences).
 """
@@ -145,7 +145,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("data", type=Path, help="rendered dataset with tools in view")
     parser.add_argument("-o", "--out", type=Path, default=toolnet.WEIGHTS.parent)
-    parser.add_argument("--steps", type=int, default=150)
+    parser.add_argument("--steps", type=int, default=450)
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args()
     print(json.dumps(train(given.data, given.out, given.steps, given.seed)))
