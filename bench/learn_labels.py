@@ -14,11 +14,9 @@ import numpy as np
 
 from learn.data import Clip, pack, unpack
 from learn.grid import Grid, Resampler, centre
-from synth import identity, scenario
-from synth.fem import mesh, solver
-from synth.fem.mesh import Tets
+from synth import identity, pipeline, scenario
 from synth.job import Job
-from synth.render import anatomy, camera, rim, truth
+from synth.render import camera, rim, truth
 from synth.render.shape import Shape
 
 
@@ -26,13 +24,12 @@ def clips(
     job: Job, grid: Grid, cache: Path, report: Callable[[int, int], None] = lambda done, of: None
 ) -> list[Clip]:
     """All sequences of a job with ideal flow, from the cache where it has them."""
-    tets = mesh.block(job.anatomy, job.fem.tets, job.fem.order)
     out = []
     for index in range(job.sequences):
         report(index, job.sequences)
         name = _key(job, index, grid)
         if not (cache / name).is_dir():
-            pack(clip(job, index, grid, tets, name), cache / name)
+            pack(clip(job, index, grid, name), cache / name)
         out.append(unpack(cache / name))
     report(job.sequences, job.sequences)
     return out
@@ -45,22 +42,12 @@ def _key(job: Job, index: int, grid: Grid) -> str:
     return hashlib.blake2b(described, digest_size=16).hexdigest()
 
 
-def clip(job: Job, index: int, grid: Grid, tets: Tets, name: str) -> Clip:
-    """One sequence of a procedural job: deformed, projected, put on the grid."""
+def clip(job: Job, index: int, grid: Grid, name: str) -> Clip:
+    """One sequence of a job: deformed, projected, put on the grid."""
     case = scenario.draw(job, index)
     view = camera.place(case.view, job.render)
-    surface = anatomy.procedural(case.relief, job.anatomy)
-    motion = solver.deform(
-        job.fem,
-        job.anatomy.craniotomy,
-        case.tissue,
-        case.gesture,
-        tets,
-        surface.vertices,
-        surface.faces,
-        job.frames,
-        job.fps,
-    )
+    surface, tets = pipeline.build(job, case)
+    motion = pipeline.move(job, case, surface, tets)
     frame = rim.build(surface, job.anatomy.craniotomy.radius_mm, case.look).shape
     still = truth.still(view, Shape(surface.vertices, surface.faces), frame)
     resample = Resampler(

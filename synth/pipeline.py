@@ -9,10 +9,14 @@ import numpy as np
 
 from synth import brain, scenario
 from synth.fem import mesh, solver, tool
+from synth.fem.mesh import Tets
+from synth.fem.solver import Deformation
 from synth.flow import mask, track
 from synth.job import Job
 from synth.render import anatomy, camera
+from synth.render.anatomy import Surface
 from synth.render.scene import Studio
+from synth.scenario import Scenario
 from synth.stopwatch import Stopwatch
 from synth.store import Writer
 
@@ -41,27 +45,10 @@ def render_sequence(job: Job, index: int, folder: Path, report: Report) -> Path:
 
     report("mesh", 0, 1)
     with watch.stage("mesh"):
-        if job.anatomy.mesh is None:
-            surface = anatomy.procedural(case.relief, job.anatomy)
-            tets = mesh.block(job.anatomy, job.fem.tets, job.fem.order, tool.focus(case.gesture))
-        else:
-            whole = brain.load(job.anatomy.mesh, job.anatomy.craniotomy)
-            surface = anatomy.from_brain(whole.vertices, whole.faces, case.relief, job.anatomy)
-            tets = mesh.from_brain(whole, job.anatomy, job.fem.tets, job.fem.order, tool.focus(case.gesture))
-
+        surface, tets = build(job, case)
     report("fem", 0, 1)
     with watch.stage("fem"):
-        motion = solver.deform(
-            job.fem,
-            job.anatomy.craniotomy,
-            case.tissue,
-            case.gesture,
-            tets,
-            surface.vertices,
-            surface.faces,
-            job.frames,
-            job.fps,
-        )
+        motion = move(job, case, surface, tets)
 
     with watch.stage("scene"):
         studio = Studio(surface, case.look, view, job)
@@ -109,6 +96,40 @@ def render_sequence(job: Job, index: int, folder: Path, report: Report) -> Path:
         scale_mm_per_px=float(still.scale_mm_per_px),
         young_kpa=case.tissue.young_kpa,
         poisson=case.tissue.poisson,
+        mechanics={
+            "law": case.tissue.law,
+            "min_jacobian": motion.min_jacobian.tolist(),
+            "energy_mn_mm": motion.energy.tolist(),
+            "residual": motion.residual.tolist(),
+            "tip_mm": motion.tip.tolist(),
+            "shaft": motion.shaft.tolist(),
+        },
         variant=studio.variant,
         timings=watch.report(),
+    )
+
+
+def build(job: Job, case: Scenario) -> tuple[Surface, Tets]:
+    """The fine surface of a scenario and the volume under it, finest where its contact is."""
+    focus = tool.focus(case.gesture)
+    if job.anatomy.mesh is None:
+        surface = anatomy.procedural(case.relief, job.anatomy)
+        return surface, mesh.block(job.anatomy, job.fem.tets, job.fem.order, focus)
+    whole = brain.load(job.anatomy.mesh, job.anatomy.craniotomy)
+    surface = anatomy.from_brain(whole.vertices, whole.faces, case.relief, job.anatomy)
+    return surface, mesh.from_brain(whole, job.anatomy, job.fem.tets, job.fem.order, focus)
+
+
+def move(job: Job, case: Scenario, surface: Surface, tets: Tets) -> Deformation:
+    """The scenario's gesture, carried out on that surface and volume."""
+    return solver.deform(
+        job.fem,
+        job.anatomy.craniotomy,
+        case.tissue,
+        case.gesture,
+        tets,
+        surface.vertices,
+        surface.faces,
+        job.frames,
+        job.fps,
     )
