@@ -1,6 +1,7 @@
 """Where the instrument is: a small U-Net (Ronneberger et al., MICCAI 2015) on a shrunken frame.
 
-Its weights lie beside this file; `bench.flow_toolnet` makes them, and `toolnet.json` says from what.
+`bench.flow_toolnet` makes its weights from a rendered dataset, with a card that says from what; they belong
+beside this file. None are shipped yet: at the effort tried so far `mask.tool` does better without them.
 """
 
 from __future__ import annotations

@@ -129,3 +129,13 @@ def test_glare_of_the_benchmark() -> None:
     bright = cv2.erode(pair.glare.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool)
     assert found[bright].mean() > 0.97
     assert found[~pair.glare].mean() < 0.08
+
+
+def test_tool_is_found_without_weights() -> None:
+    (pair,) = pairs(Recipe(highlights=0.0), 1, 2)
+    found = mask._grey_bodies(pair.now)
+    assert np.count_nonzero(found & pair.tool) / np.count_nonzero(found | pair.tool) > 0.6
+    assert not mask._grey_bodies(pair.rest).any()
+    blocked = mask.blocked(pair.now)
+    assert blocked[pair.tool].mean() > 0.8
+    assert blocked.mean() < 0.2
