@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json as json_
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -52,23 +51,22 @@ def measure(variant: str, spp: int, frames: int, seed: int) -> dict[str, Any]:
     stage = studio.stage(ours.vertices, instrument.pose(forceps, ours.tips, ours.shafts), spp)
     spent: dict[str, list[float]] = {"move": [], "render": [], "sensor": [], "truth": []}
 
-    def timed(name: str, step: Callable[[], Any]) -> Any:
-        start = time.perf_counter()
-        value = step()
-        spent[name].append(time.perf_counter() - start)
-        return value
-
     for k in range(frames + 3):
         lift = 0.1 * (k % 20)
         vertices, tool = ours.moved(lift), instrument.pose(forceps, ours.held(lift), ours.shafts)
-        timed("move", lambda v=vertices, t=tool: (stage.move("cortex", v), stage.move("tool", t)))
-        radiance = timed("render", lambda seed=k: stage.render(seed))
-        timed("sensor", lambda picture=radiance, seed=k: studio.develop(picture, seed))
-        shapes = Shape(vertices, studio.surface.faces), Shape(tool, forceps.faces)
-        timed(
-            "truth",
-            lambda s=shapes: truth.now(studio.camera, studio.still, s[0], studio.rim.shape, s[1]),
-        )
+        clock = [time.perf_counter()]
+        stage.move("cortex", vertices)
+        stage.move("tool", tool)
+        clock.append(time.perf_counter())
+        radiance = stage.render(k)
+        clock.append(time.perf_counter())
+        studio.develop(radiance, k)
+        clock.append(time.perf_counter())
+        surface, held = Shape(vertices, studio.surface.faces), Shape(tool, forceps.faces)
+        truth.now(studio.camera, studio.still, surface, studio.rim.shape, held)
+        clock.append(time.perf_counter())
+        for name, seconds in zip(spent, np.diff(clock).tolist(), strict=True):
+            spent[name].append(seconds)
     median = {name: float(np.median(values[3:])) for name, values in spent.items()}
     whole = sum(median.values())
     return {
