@@ -51,6 +51,10 @@ def measure(variant: str, spp: int, frames: int, seed: int) -> dict[str, Any]:
     stage = studio.stage(ours.vertices, instrument.pose(forceps, ours.tips, ours.shafts), spp)
     spent: dict[str, list[float]] = {"move": [], "render": [], "sensor": [], "truth": []}
 
+    def move(vertices: Any, tool: Any) -> None:
+        stage.move("cortex", vertices)
+        stage.move("tool", tool)
+
     for k in range(frames + 3):
         lift = 0.1 * (k % 20)
         vertices, tool = ours.moved(lift), instrument.pose(forceps, ours.held(lift), ours.shafts)
