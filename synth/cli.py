@@ -271,7 +271,7 @@ def picture(
     frame: Annotated[
         list[int] | None, typer.Option("--frame", "-f", help="Which frame; repeat for more. [the strongest]")
     ] = None,
-    to: Annotated[Path, typer.Option("--to", help="The PNG to write.")] = Path("picture.png"),
+    to: Annotated[Path, typer.Option("--to", help="The PNG or JPEG to write.")] = Path("picture.png"),
 ) -> None:
     """Draws frames with their flow and force map side by side, as in the README."""
     import cv2
@@ -283,8 +283,8 @@ def picture(
     chosen = open_sequence(out / f"{sequence:06d}.zarr")
     rows = drawing.of_sequence(chosen, frame or [drawing.strongest(chosen)])
     to.parent.mkdir(parents=True, exist_ok=True)
-    if to.suffix.lower() != ".png" or not cv2.imwrite(str(to), rows[..., ::-1]):
-        raise UserError(f"{to}: cannot be written as PNG")
+    if to.suffix.lower() not in (".png", ".jpg") or not cv2.imwrite(str(to), rows[..., ::-1]):
+        raise UserError(f"{to}: cannot be written as a picture (.png or .jpg)")
     print(f"wrote {to}")
 
 

@@ -54,7 +54,7 @@ def _findings(folder: Path) -> Iterator[Finding]:
     )
     for name, version in versions.of_everything().items():
         yield Finding(name, version)
-    for name in ("mitsuba", "cv2", "torch", "skfem", "av"):
+    for name in ("mitsuba", "cv2", "torch", "trimesh", "av"):
         if importlib.util.find_spec(name) is None:
             yield Finding(name, "missing", False, "pip install -c constraints.txt . in the project's folder")
 
