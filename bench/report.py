@@ -15,6 +15,7 @@ import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 from numpy.typing import NDArray
 from plotly.offline import get_plotlyjs
+from rich import box
 from rich.table import Table
 
 from bench import charts, score
@@ -107,8 +108,9 @@ def render(result: Result, title: str) -> str:
 
 def terminal_table(result: Result) -> Table:
     """The methods' scores for a terminal."""
-    table = Table(title=result.recording, title_justify="left")
-    table.add_column("method", no_wrap=True)
+    # Eighty columns: a name may take two lines, a number never.
+    table = Table(title=result.recording, title_justify="left", box=box.SIMPLE)
+    table.add_column("method")
     if not result.methods[result.main].scores:
         table.add_column("largest force [mN]", justify="right")
         for name, method in result.methods.items():
@@ -116,7 +118,7 @@ def terminal_table(result: Result) -> Table:
         return table
     keys = [row for row in METRICS if row[0] in {*_TILES, "bias_mn"}]
     for _, name, unit in keys:
-        table.add_column(f"{name} [mN]" if unit == "mN" else name, justify="right")
+        table.add_column(f"{name} [mN]" if unit == "mN" else name, justify="right", no_wrap=True)
     for name, method in result.methods.items():
         table.add_row(
             name, *(shown(method.scores[key], unit if unit != "mN" else "") for key, _, unit in keys)
