@@ -39,6 +39,7 @@ COMMANDS: tuple[Command, ...] = (
     Command("pareto", "render", "bench.render_pareto", "pareto"),
     Command("experiment", "cycles", "bench.render_cycles", "cycles"),
     Command("experiment", "throughput", "bench.render_gpu", "throughput"),
+    Command("experiment", "gpu", "bench.gpu", "gpu"),
     Command("experiment", "stages", "bench.stages", "stages"),
     Command("experiment", "learn", "bench.learn_experiment", "experiment"),
     Command("pareto", "learn", "bench.learn_pareto", "pareto"),

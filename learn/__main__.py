@@ -1,0 +1,5 @@
+"""`python -m learn`: the command without its script."""
+
+from learn.cli import main
+
+main()
