@@ -38,7 +38,7 @@ def gpu(
     limit: Annotated[float, typer.Option(help="Longest that one step may take [s].")] = 300.0,
     json: Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")] = False,
 ) -> None:
-    """Checks and times renderer, flow, networks and the whole way on an NVIDIA GPU. Exit code 1 if a step fails."""
+    """Checks and times everything that an NVIDIA GPU changes. Exit code 1 if a step fails."""
     from synth.render.mitsuba_adapter import cuda
 
     if not cuda():

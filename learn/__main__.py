@@ -1,5 +1,5 @@
 """`python -m learn`: the command without its script."""
 
-from learn.cli import main
+from learn.cli import app
 
-main()
+app()
