@@ -227,7 +227,8 @@ def _scored(
         low, high = recording.meta.press_s
         gain = score.gain(size, length, (time_s >= low) & (time_s <= high))
         calibrated = {"gain": gain, **score.agreement(x, gain * y)}
-        calibrated["mae_of_peak"] = calibrated["mae_mn"] / scores["event_peak_mn"]
+        peak = scores["event_peak_mn"]
+        calibrated["mae_of_peak"] = calibrated["mae_mn"] / peak if peak else float("nan")
     return Scored(force, length, scores, components, events, intervals, calibrated, worse)
 
 

@@ -95,10 +95,16 @@ def lag(time_s: Curve, sensor: Curve, predicted: Curve, search_s: float = 0.5) -
     return {"lag_s": float(lags[best]), "r_at_lag": float(r[best])}
 
 
+_LEAST_CONTACT_MN = 1e-3
+
+
 def contact_threshold(sensor: Curve, noise_floor_mn: float) -> float:
-    """Force above which the sensor says contact [mN]: 3 times its noise floor, at least 5% of its peak."""
+    """Force above which the sensor says contact [mN]: 3 times its noise floor, at least 5% of its peak.
+
+    Never zero: a sensor that reads nothing says that there is no contact.
+    """
     peak = float(np.nanmax(sensor, initial=0.0))
-    return max(3 * noise_floor_mn, 0.05 * peak)
+    return max(3 * noise_floor_mn, 0.05 * peak, _LEAST_CONTACT_MN)
 
 
 def in_contact(curve: Curve, threshold_mn: float) -> NDArray[np.bool_]:

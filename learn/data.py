@@ -45,7 +45,8 @@ class Clip:
     """(T, N, N) 0..1 of the recovered flow; 1 where there is none."""
     density: NDArray[np.float32]
     """(T, 3, N, N) force density per unit stiffness, camera axes [mN/mm² at E = 1 kPa]. Its sum times the
-    cell's area times E is the total force."""
+    cell's area times E is the force on the grid's tissue: what lies in cells that are mostly not tissue, or
+    off the grid, is in `force` alone."""
     force: NDArray[np.float64]
     """(T, 3) total force on the tissue, camera axes [mN]."""
 

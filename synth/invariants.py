@@ -62,14 +62,16 @@ def checksum(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
         field, column = FIELDS[name], sequence[name]
         hasher = store.field_hasher(field, column.shape)
         parts = range(column.shape[0]) if field.framed else [...]
-        low, high = np.inf, -np.inf
+        low, high, finite = np.inf, -np.inf, True
         for part in parts:
             values = np.ascontiguousarray(column[part])
             hasher.update(values.data)
             if values.dtype.kind == "f":
                 low, high = min(low, float(values.min())), max(high, float(values.max()))
+                finite = finite and bool(np.isfinite(values).all())
         good = hasher.hexdigest() == sequence.attrs["field_hashes"][name]
         yield _truth(good, f"{name}: values are not those that were written")
+        yield _truth(finite, f"{name}: holds values that are no numbers")
         if field.low is not None:
             yield Measure(field.low - low, 0.0, f"{name}: smallest value {low:g} {field.unit}")
         if field.high is not None:
