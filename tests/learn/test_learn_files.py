@@ -88,10 +88,10 @@ def test_predict_on_stores_and_on_arrays_agree(model: Path, dataset: Path, tmp_p
     for source in (store, arrays):
         done = run(app, ["predict", str(model), str(source), "-o", str(tmp_path / "out"), "--json"])
         assert done.exit_code == 0, done.output
-    a, b = (np.load(tmp_path / "out" / f"{name}.npz") for name in ("000002", "mine"))
-    np.testing.assert_array_equal(a["density"], b["density"])
-    assert a["force_mn"].shape == (6, 3)
-    np.testing.assert_allclose(np.linalg.norm(a["force_mn"], axis=1), a["total_force_mn"], rtol=1e-6)
+    with np.load(tmp_path / "out/000002.npz") as a, np.load(tmp_path / "out/mine.npz") as b:
+        np.testing.assert_array_equal(a["density"], b["density"])
+        assert a["force_mn"].shape == (6, 3)
+        np.testing.assert_allclose(np.linalg.norm(a["force_mn"], axis=1), a["total_force_mn"], rtol=1e-6)
 
 
 def test_bad_files(tmp_path: Path, dataset: Path) -> None:
