@@ -13,11 +13,14 @@ from pathlib import Path
 import numpy as np
 
 from learn.data import Clip, pack, unpack
-from learn.grid import Grid, Resampler, centre
+from learn.grid import Grid, Resampler, centre, settled
 from synth import identity, pipeline, scenario
 from synth.job import Job
 from synth.render import camera, rim, truth
 from synth.render.shape import Shape
+
+_VERSION = 2
+"""Of what is packed: a change of the labels makes another cache."""
 
 
 def clips(
@@ -38,7 +41,7 @@ def clips(
 def _key(job: Job, index: int, grid: Grid) -> str:
     """Hash of all that labels depend on: pictures and flow estimators change none of them."""
     parts = job.model_dump(mode="json", include={"seed", "frames", "fps", "anatomy", "fem", "render"})
-    described = identity.canonical([parts, index, grid.size, grid.extent_mm])
+    described = identity.canonical([_VERSION, parts, index, grid.size, grid.extent_mm])
     return hashlib.blake2b(described, digest_size=16).hexdigest()
 
 
@@ -65,7 +68,8 @@ def clip(job: Job, index: int, grid: Grid, name: str) -> Clip:
         moved[t] = resample.mean(flow * still.scale_mm_per_px, still.tissue) * mask
         load = truth.at_rest_pixels(still, surface.faces, motion.traction[t] @ view.rotation.T)
         amount = load.transpose(2, 0, 1) * still.area
-        density[t] = resample.sum(amount) * mask / (grid.pitch_mm**2 * case.tissue.young_kpa)
+        per_cell = settled(resample.sum(amount), mask)
+        density[t] = per_cell / np.float32(grid.pitch_mm**2 * case.tissue.young_kpa)
     return Clip(
         name=f"{index:06d}",
         content_hash=name,

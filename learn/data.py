@@ -13,7 +13,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from learn.grid import Grid, Resampler, centre
+from learn.grid import Grid, Resampler, centre, settled
 from synth.errors import UserError
 from synth.store import Dataset, Sequence
 
@@ -21,7 +21,7 @@ Input = Literal["ideal", "recovered", "mixed"]
 INPUTS = ("ideal", "recovered", "mixed")
 Target = Literal["density", "intensity"]
 _FIELDS = {"ideal": "flow", "recovered": "flow_tvl1"}
-_VERSION = 1
+_VERSION = 2
 _ARRAYS = ("mask", "confidence", "density", "force")
 _PLAIN = ("name", "content_hash", "group", "family", "gesture", "young_kpa")
 
@@ -45,8 +45,8 @@ class Clip:
     """(T, N, N) 0..1 of the recovered flow; 1 where there is none."""
     density: NDArray[np.float32]
     """(T, 3, N, N) force density per unit stiffness, camera axes [mN/mm² at E = 1 kPa]. Its sum times the
-    cell's area times E is the force on the grid's tissue: what lies in cells that are mostly not tissue, or
-    off the grid, is in `force` alone."""
+    cell's area times E is the force on the tissue in view: what falls into cells that are mostly not tissue
+    is carried by the nearest cell that is; only what lies off the grid is in `force` alone."""
     force: NDArray[np.float64]
     """(T, 3) total force on the tissue, camera axes [mN]."""
 
@@ -97,7 +97,7 @@ def read(sequence: Sequence, grid: Grid, wanted: Iterable[str]) -> Clip:
         if surest:
             confidence[t] = resample.mean(sequence["flow_confidence"][t], tissue) * mask
         load = sequence["traction"][t].transpose(2, 0, 1) * area
-        density[t] = resample.sum(load) * mask / (grid.pitch_mm**2 * young)
+        density[t] = settled(resample.sum(load), mask) / np.float32(grid.pitch_mm**2 * young)
     return Clip(
         name=where,
         content_hash=str(attrs["content_hash"]),

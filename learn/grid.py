@@ -12,7 +12,7 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from numpy.typing import NDArray
-from scipy import sparse
+from scipy import ndimage, sparse
 from torch import Tensor
 
 from synth.errors import UserError
@@ -139,6 +139,22 @@ class Resampler:
         top = values[..., y0, :][..., x0] * (1 - fx) + values[..., y0, :][..., x0 + 1] * fx
         low = values[..., y0 + 1, :][..., x0] * (1 - fx) + values[..., y0 + 1, :][..., x0 + 1] * fx
         return np.where(inside, top * (1 - fy) + low * fy, fill).astype(np.float32)
+
+
+def settled(amount: NDArray[np.float32], mask: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Amounts outside the mask carried to the nearest cell inside, so that the total is kept.
+
+    A cell at the tissue's edge may hold force and yet be mostly not tissue: dropping it would lose that.
+    `amount`: (C, N, N) a cell; `mask`: (N, N) 0/1, not empty. Returns (C, N, N), 0 outside the mask.
+    """
+    inside = mask > 0
+    out = np.where(inside, amount, np.float32(0))
+    rows, cols = np.nonzero(~inside & (amount != 0).any(0))
+    if rows.size:
+        near = ndimage.distance_transform_edt(~inside, return_distances=False, return_indices=True)
+        to = (slice(None), near[0][rows, cols], near[1][rows, cols])
+        np.add.at(out, to, amount[:, rows, cols])
+    return out
 
 
 def _hats(length: int, centre_px: float, scale: float, grid: Grid) -> sparse.csr_array:

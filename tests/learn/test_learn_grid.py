@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from learn.batch import turned
-from learn.grid import CHANNELS, Grid, Resampler, Scales, centre, channels, divergence
+from learn.grid import CHANNELS, Grid, Resampler, Scales, centre, channels, divergence, settled
 from synth.errors import UserError
 
 GRID = Grid(64, 36.0)
@@ -125,3 +125,15 @@ def test_a_turn_is_counter_clockwise_as_seen() -> None:
     right[:, 1, 3] = (1.0, 0.0, 9.0)
     up = turned(right, 1, False)
     assert up[:, 0, 1].tolist() == [0.0, -1.0, 9.0]
+
+
+def test_force_in_border_cells_is_carried_inside_not_lost() -> None:
+    mask = np.zeros((6, 6), np.float32)
+    mask[1:5, 1:4] = 1
+    amount = np.random.default_rng(0).normal(size=(3, 6, 6)).astype(np.float32)
+    kept = settled(amount, mask)
+    np.testing.assert_allclose(kept.sum((1, 2)), amount.sum((1, 2)), rtol=1e-5)
+    assert (kept[:, mask == 0] == 0).all()
+    # The centre has no neighbour outside; the right edge gets all of its row's.
+    np.testing.assert_array_equal(kept[:, 2, 2], amount[:, 2, 2])
+    np.testing.assert_allclose(kept[:, 2, 3], amount[:, 2, 3:].sum(-1), rtol=1e-6)
