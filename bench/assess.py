@@ -121,7 +121,10 @@ def assess(
     notes = [*recording.notes, *done.notes]
     truth = _truth(recording, done, time, notes)
     if meta.young_kpa is None:
-        notes.append("Young's modulus unknown: forces are those of tissue of 1 kPa and only relative")
+        notes.append(
+            "Young's modulus unknown: forces are those of tissue of 1 kPa, so only scores that no factor "
+            "changes are given, and those after the gain of a separate press if there is one"
+        )
     kept = np.ones(len(time), bool)
     for what, span in (("calibration of the clocks", meta.sync.calibration_s), ("press", meta.press_s)):
         if span is not None:
@@ -214,21 +217,25 @@ def _scored(
     length, size, axes = _length(force), truth.size_mn, truth.axes_mn
     if size is None or axes is None:
         return Scored(force, length, {}, {}, [], {}, {}, None)
-    t, x, y = time_s[kept], size[kept], length[kept]
-    scores, events = score.everything(t, x, y, truth.floor_mn)
-    components = {}
+    x, y = size[kept], length[kept]
+    scores, events = score.everything(time_s, size, length, truth.floor_mn, kept)
+    components: dict[str, dict[str, float]] = {}
     if recording.meta.sensor.axes == "camera" and np.isfinite(force).any(axis=0).all():
         components = {axis: score.agreement(axes[kept, k], force[kept, k]) for k, axis in enumerate("xyz")}
     rng = np.random.default_rng(_SEED)
     intervals = bootstrap.agreement(x, y, rng)
     worse = None if is_main else bootstrap.difference(x, _length(main)[kept], y, rng)
+    absolute = recording.meta.young_kpa is not None
+    if not absolute:
+        scores, events = score.without_newtons(scores), []
+        components = {axis: score.without_newtons(values) for axis, values in components.items()}
+        intervals, worse = {key: intervals[key] for key in intervals if key in score.RELATIVE}, None
     calibrated: dict[str, float] = {}
     if recording.meta.press_s is not None:
         low, high = recording.meta.press_s
         gain = score.gain(size, length, (time_s >= low) & (time_s <= high))
         calibrated = {"gain": gain, **score.agreement(x, gain * y)}
-        peak = scores["event_peak_mn"]
-        calibrated["mae_of_peak"] = calibrated["mae_mn"] / peak if peak else float("nan")
+        calibrated["mae_of_peak"] = score.ratio(calibrated["mae_mn"], scores["event_peak_mn"])
     return Scored(force, length, scores, components, events, intervals, calibrated, worse)
 
 

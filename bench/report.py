@@ -82,7 +82,7 @@ def render(result: Result, title: str) -> str:
     environment.filters["shown"] = shown
     main = result.methods[result.main]
     figures = {"force": charts.force(result)}
-    if main.scores:
+    if math.isfinite(main.scores.get("mae_mn", math.nan)):
         figures["scatter"] = charts.scatter(result)
         figures["bland"] = charts.bland_altman(result, limits_of_agreement(result))
     panels, flow_px, force_kpa = pictures(result)
@@ -95,6 +95,7 @@ def render(result: Result, title: str) -> str:
         best=_best(result),
         beaten_by=beaten_by(result),
         surely=[n for n in beaten_by(result) if (w := result.methods[n].worse_by_mn) and w[0] > 0],
+        agreement="scatter" in figures,
         panels=panels,
         flow_px=flow_px,
         force_kpa=force_kpa,
@@ -131,9 +132,11 @@ def limits_of_agreement(result: Result) -> dict[str, float]:
     assert result.sensor_mn is not None
     kept, predicted = result.scored, result.methods[result.main].size_mn
     threshold = score.contact_threshold(result.sensor_mn[kept], result.noise_floor_mn)
-    contact = score.in_contact(result.sensor_mn[kept], threshold)
-    run = np.cumsum(np.diff(contact.astype(int), prepend=0) != 0)
-    return score.limits_of_agreement(predicted[kept] - result.sensor_mn[kept], run)
+    contact = score.in_contact(result.sensor_mn, threshold)
+    # What is left out also ends a repeat: contact before a calibrating press is not contact after it.
+    state = np.where(kept, contact, -1)
+    run = np.cumsum(np.diff(state, prepend=state[:1]) != 0)
+    return score.limits_of_agreement((predicted - result.sensor_mn)[kept], run[kept])
 
 
 def beaten_by(result: Result) -> list[str]:

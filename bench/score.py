@@ -50,17 +50,17 @@ def agreement(sensor: Curve, predicted: Curve) -> dict[str, float]:
         "mae_mn": float(np.abs(error).mean()),
         "rmse_mn": float(np.sqrt((error**2).mean())),
         "bias_mn": float(error.mean()),
-        "r": _ratio(sxy, float(np.sqrt(sxx * syy))),
-        "ccc": _ratio(2 * sxy, sxx + syy + shift),
-        "r2": 1 - _ratio(float(error @ error), sxx),
-        "gain": _ratio(sxy, sxx),
+        "r": ratio(sxy, float(np.sqrt(sxx * syy))),
+        "ccc": ratio(2 * sxy, sxx + syy + shift),
+        "r2": 1 - ratio(float(error @ error), sxx),
+        "gain": ratio(sxy, sxx),
     }
 
 
 def gain(sensor: Curve, predicted: Curve, where: NDArray[np.bool_]) -> float:
     """The factor that best brings `predicted` to `sensor` over the samples of a calibrating press."""
     good = where & np.isfinite(sensor) & np.isfinite(predicted)
-    return _ratio(float(sensor[good] @ predicted[good]), float(predicted[good] @ predicted[good]))
+    return ratio(float(sensor[good] @ predicted[good]), float(predicted[good] @ predicted[good]))
 
 
 def lag(time_s: Curve, sensor: Curve, predicted: Curve, search_s: float = 0.5) -> dict[str, float]:
@@ -147,9 +147,9 @@ def per_event(time_s: Curve, sensor: Curve, predicted: Curve, spans: list[Event]
                 "to_s": float(t[-1]),
                 "peak_mn": peak,
                 "predicted_peak_mn": float(y.max()),
-                "peak_error": _ratio(float(y.max()) - peak, peak),
+                "peak_error": ratio(float(y.max()) - peak, peak),
                 "impulse_mns": impulse,
-                "impulse_error": _ratio(float(np.trapezoid(y, t)) - impulse, impulse),
+                "impulse_error": ratio(float(np.trapezoid(y, t)) - impulse, impulse),
                 "mae_mn": float(np.abs(y - x).mean()),
             }
         )
@@ -169,14 +169,18 @@ def contact_scores(sensor: Curve, predicted: Curve, threshold_mn: float) -> dict
     free = ~truth
     hits = float(np.sum(truth & said))
     return {
-        "contact_f1": _ratio(2 * hits, float(truth.sum() + said.sum())),
-        "ghost_rate": _ratio(float(np.sum(said & free)), float(free.sum())),
+        "contact_f1": ratio(2 * hits, float(truth.sum() + said.sum())),
+        "ghost_rate": ratio(float(np.sum(said & free)), float(free.sum())),
         "ghost_mn": float(np.abs(predicted[both][free]).mean()) if free.any() else float("nan"),
     }
 
 
 def everything(
-    time_s: Curve, sensor: Curve, predicted: Curve, noise_floor_mn: float = 0.0
+    time_s: Curve,
+    sensor: Curve,
+    predicted: Curve,
+    noise_floor_mn: float = 0.0,
+    kept: NDArray[np.bool_] | None = None,
 ) -> tuple[dict[str, float], list[dict[str, float]]]:
     """All scores of one predicted curve against one sensor's, and the table of its contacts.
 
@@ -185,9 +189,12 @@ def everything(
         sensor: (T,) mN, NaN where there is none.
         predicted: (T,) mN, NaN where there is none.
         noise_floor_mn: standard deviation of the sensor without contact [mN].
+        kept: (T,) which samples count; None: all. A contact ends where samples are left out.
     """
+    kept = np.ones(len(time_s), bool) if kept is None else kept
+    sensor, predicted = np.where(kept, sensor, np.nan), np.where(kept, predicted, np.nan)
     threshold = contact_threshold(sensor, noise_floor_mn)
-    rows = per_event(time_s, sensor, predicted, events(time_s, in_contact(sensor, threshold)))
+    rows = per_event(time_s, sensor, predicted, events(time_s, in_contact(sensor, threshold) & kept))
     scores = agreement(sensor, predicted)
     peaks = np.array([row["peak_mn"] for row in rows])
     peak = float(peaks.mean()) if len(peaks) else float("nan")
@@ -197,13 +204,22 @@ def everything(
         "threshold_mn": threshold,
         "events": float(len(rows)),
         "event_peak_mn": peak,
-        "mae_of_peak": _ratio(scores["mae_mn"], peak),
+        "mae_of_peak": ratio(scores["mae_mn"], peak),
         "mae_of_surgical": scores["mae_mn"] / SURGICAL_FORCE_MN,
         "peak_mae": _mean_size(rows, "peak_error"),
         "impulse_mae": _mean_size(rows, "impulse_error"),
-        "dropout": float(np.mean(~np.isfinite(predicted))) if len(predicted) else float("nan"),
+        "dropout": float(np.mean(~np.isfinite(predicted[kept]))) if kept.any() else float("nan"),
     }
     return scores, rows
+
+
+RELATIVE = ("n", "r", "lag_s", "r_at_lag", "events", "event_peak_mn", "threshold_mn", "dropout")
+"""Scores that a constant factor on the prediction doesn't change, or that speak of the sensor alone."""
+
+
+def without_newtons(scores: dict[str, float]) -> dict[str, float]:
+    """The scores with those that need forces in newtons made NaN: for predictions of unknown stiffness."""
+    return {key: value if key in RELATIVE else float("nan") for key, value in scores.items()}
 
 
 def limits_of_agreement(difference: Curve, group: NDArray[np.integer]) -> dict[str, float]:
@@ -244,8 +260,9 @@ def _mean_size(rows: list[dict[str, float]], key: str) -> float:
 
 def _correlation(x: Curve, y: Curve) -> float:
     x, y = x - x.mean(), y - y.mean()
-    return _ratio(float(x @ y), float(np.sqrt((x @ x) * (y @ y))))
+    return ratio(float(x @ y), float(np.sqrt((x @ x) * (y @ y))))
 
 
-def _ratio(above: float, below: float) -> float:
+def ratio(above: float, below: float) -> float:
+    """above / below; NaN unless `below` is positive."""
     return above / below if below > 0 else float("nan")

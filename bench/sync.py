@@ -34,7 +34,7 @@ class Offset:
     r_at_zero: float
     """Correlation without any offset."""
     deviation_s: float
-    """Standard deviation of the offset over bootstrap resamples [s]."""
+    """Standard deviation of the offset over all bootstrap resamples, other peaks included [s]."""
     refused: str
     """Why the offset must not be used; empty when it may be."""
 
@@ -78,7 +78,7 @@ def find(
     again = offsets[np.nanargmax(np.nan_to_num(_correlations(weights, change, moved), nan=-1.0), axis=1)]
     there = np.abs(again - offsets[best]) <= frame
     zero = float(r[len(offsets) // 2])
-    deviation = float(again[there].std()) if there.any() else float("nan")
+    deviation = float(again.std())
     refused = ""
     if best in (0, len(offsets) - 1):
         refused = f"correlation still rises at the end of the search, {search_s:g} s"

@@ -10,7 +10,7 @@ import pytest
 from fake_recording import Bump, Maker
 from typer.testing import CliRunner
 
-from bench import assess, report, scale
+from bench import assess, report, scale, score
 from bench.assess import Result, Settings
 from bench.cli import app
 from bench.follow import Answer
@@ -119,3 +119,24 @@ def test_bad_recording_is_one_line_and_exit_2(make: Maker, tmp_path: Path, spoil
     assert result.exit_code == 2
     assert said in " ".join(result.output.split())
     assert not out.exists()
+
+
+def test_without_stiffness_only_what_no_factor_changes_is_scored(make: Maker) -> None:
+    folder = make(frames=30, meta={"young_kpa": "unknown", "press_s": [0.2, 1.2]})
+    result = run(folder)
+    scores, calibrated = result.methods["bump"].scores, result.methods["bump"].calibrated
+    assert scores["r"] > 0.99
+    assert all(np.isnan(scores[key]) for key in ("mae_mn", "rmse_mn", "ccc", "r2", "gain", "contact_f1"))
+    assert set(result.methods["bump"].intervals) == {"r"}
+    assert calibrated["mae_mn"] < 10  # the press's gain gives newtons back
+    assert 'id="bland"' not in report.render(result, "t")
+
+
+def test_a_contact_ends_where_samples_are_left_out() -> None:
+    time = np.arange(100) / 10.0
+    force = np.full(100, 50.0)
+    force[:5] = 0
+    kept = np.ones(100, bool)
+    kept[40:60] = False
+    _, events = score.everything(time, force, force, 0.0, kept)
+    assert [(event["from_s"], event["to_s"]) for event in events] == [(0.5, 3.9), (6.0, 9.9)]
