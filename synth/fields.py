@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Literal
 
 TIME, ROW, COLUMN = "frame", "row", "column"
 
@@ -21,7 +23,13 @@ class Field:
     unit: str
     meaning: str
     length: int = 0
-    optional: bool = False
+    kept: Literal["always", "usually", "recovered", "asked"] = "always"
+    """`usually`: unless the job's `store.without` names it; `recovered`: with an estimator of flow (and as
+    before); `asked`: when `store.extra` names it."""
+    half: bool = False
+    """Whether `store.flow: float16` stores it in half the space."""
+    packed: float = 0.1
+    """Stored size over raw size, measured on rendered sequences: for forecasts before there is one."""
     low: float | None = None
     """Smallest value that can be right; checked by verify."""
     high: float | None = None
@@ -31,6 +39,11 @@ class Field:
     def framed(self) -> bool:
         """Whether it has one slice a frame that is as large as a picture."""
         return self.dims[:3] == (TIME, ROW, COLUMN)
+
+    @property
+    def optional(self) -> bool:
+        """Whether a sequence of the default job may lack it."""
+        return self.kept in ("recovered", "asked")
 
     def shape(self, frames: int, size: tuple[int, int]) -> tuple[int, ...]:
         """Shape for `frames` frames of `size` = (height, width) [px]."""
@@ -45,7 +58,7 @@ FIELDS: dict[str, Field] = {
     field.name: field
     for field in (
         Field("time", (TIME,), "float64", "s", "time of the frame; frame 0 is the rest frame", low=0.0),
-        Field("rgb", (*_VIDEO, "rgb"), "uint8", "sRGB", "recorded picture", length=3),
+        Field("rgb", (*_VIDEO, "rgb"), "uint8", "sRGB", "recorded picture", length=3, packed=1.0),
         Field(
             "flow",
             (*_VIDEO, "xy"),
@@ -54,6 +67,8 @@ FIELDS: dict[str, Field] = {
             "true motion of the material points from the rest frame to this one, on the rest frame's pixels; "
             "0 outside tissue",
             length=2,
+            half=True,
+            packed=0.4,
             low=-1e4,
             high=1e4,
         ),
@@ -73,6 +88,8 @@ FIELDS: dict[str, Field] = {
             "float32",
             "mm",
             "distance along the optical axis; 0 where nothing is hit",
+            kept="usually",
+            packed=0.6,
             low=0.0,
         ),
         Field(
@@ -82,6 +99,7 @@ FIELDS: dict[str, Field] = {
             "kPa",
             "load on the tissue per rest area, camera axes, on the rest frame's pixels",
             length=3,
+            packed=0.05,
             low=-1e4,
             high=1e4,
         ),
@@ -94,7 +112,9 @@ FIELDS: dict[str, Field] = {
             "px",
             "flow recovered from the video by the estimator in the attribute flow_backend",
             length=2,
-            optional=True,
+            kept="recovered",
+            half=True,
+            packed=0.5,
             low=-1e4,
             high=1e4,
         ),
@@ -104,10 +124,30 @@ FIELDS: dict[str, Field] = {
             "float32",
             "-",
             "the estimator's confidence in the recovered flow, 0..1",
-            optional=True,
+            kept="recovered",
+            packed=0.3,
             low=0.0,
             high=1.0,
         ),
     )
 }
 """Every field by name, in the order in which they are hashed and listed."""
+
+EXTRA = tuple(name for name, field in FIELDS.items() if field.kept == "asked")
+"""What a job's `store.extra` may name."""
+
+SPARED = ("depth", "flow_confidence")
+"""What a job's `store.without` may name: nothing else can be computed without the rest."""
+
+
+def kept(extra: Iterable[str], without: Iterable[str], *, recovered: bool) -> tuple[str, ...]:
+    """Names of the fields that a sequence holds, in the table's order.
+
+    Args:
+        extra: as the job's `store.extra`.
+        without: as the job's `store.without`.
+        recovered: whether an estimator of flow runs.
+    """
+    kinds = {"always", "usually", *(("recovered",) if recovered else ())}
+    chosen = {name for name, field in FIELDS.items() if field.kept in kinds} | set(extra)
+    return tuple(name for name in FIELDS if name in chosen - set(without))

@@ -15,9 +15,6 @@ from synth.errors import UserError
 from synth.fields import FIELDS
 from synth.job import Job
 
-# Stored size over raw size, measured on rendered sequences; used only until one is finished.
-_PACKED = {"rgb": 1.0, "flow": 0.4, "flow_tvl1": 0.5, "flow_confidence": 0.3, "depth": 0.6, "traction": 0.05}
-_OTHERS_PACKED = 0.1
 # Kept free, so that index, card and the system's own files find room.
 _RESERVE_BYTES = 200e6
 
@@ -48,13 +45,10 @@ def estimate(job: Job) -> float:
     """Bytes of one sequence of `job`, before any is made."""
     width, height = job.render.size
     total = 0.0
-    for field in FIELDS.values():
-        if field.optional and job.flow.backend == "ideal":
-            continue
-        shape = field.shape(job.frames, (height, width))
-        total += (
-            float(np.prod(shape)) * np.dtype(field.dtype).itemsize * _PACKED.get(field.name, _OTHERS_PACKED)
-        )
+    for name in job.kept_fields:
+        field = FIELDS[name]
+        each = 2 if field.half and job.store.flow == "float16" else np.dtype(field.dtype).itemsize
+        total += float(np.prod(field.shape(job.frames, (height, width)))) * each * field.packed
     radiance = 6.0 * width * height * job.frames if job.render.exr else 0.0
     return total + radiance
 

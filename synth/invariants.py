@@ -60,12 +60,12 @@ def checksum(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
     """Every value is the one that was written; NaN and values out of their range are found on the way."""
     for name in sequence.fields:
         field, column = FIELDS[name], sequence[name]
-        hasher = store.field_hasher(field, column.shape)
+        hasher = store.field_hasher(field, column.stored, column.shape)
         parts = range(column.shape[0]) if field.framed else [...]
         low, high, finite = np.inf, -np.inf, True
         for part in parts:
             values = np.ascontiguousarray(column[part])
-            hasher.update(values.data)
+            hasher.update(values.astype(column.stored, copy=False).data)
             if values.dtype.kind == "f":
                 low, high = min(low, float(values.min())), max(high, float(values.max()))
                 finite = finite and bool(np.isfinite(values).all())

@@ -15,6 +15,7 @@ from pydantic import (
     model_validator,
 )
 
+from synth import fields
 from synth.fem.validity import LARGEST_LOAD, choose
 from synth.flow.estimator import names
 
@@ -230,6 +231,26 @@ class Job(Section):
     """One dataset."""
 
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
+def _known(names: tuple[str, ...], known: tuple[str, ...]) -> tuple[str, ...]:
+    strangers = [name for name in names if name not in known]
+    if strangers:
+        raise ValueError(
+            f"{', '.join(strangers)}: not among {', '.join(known) or 'any (there are none yet)'}"
+        )
+    return names
+
+
+class Store(Section):
+    """What is kept of every sequence. `synth fields` lists the fields and what they take."""
+
+    extra: Annotated[tuple[str, ...], AfterValidator(lambda names: _known(names, fields.EXTRA))] = ()
+    """Fields to keep besides the usual ones."""
+    without: Annotated[tuple[str, ...], AfterValidator(lambda names: _known(names, fields.SPARED))] = ()
+    """Fields to leave out, of those that can be spared: depth, flow_confidence."""
+    flow: Literal["float32", "float16"] = "float32"
+    """Type of both flows on disk; float16 rounds motion up to 16 px by at most 0.004 px (twice that up to 32)."""
+
+
     """Root of every random draw. Same job, same bytes."""
     sequences: Annotated[int, Field(ge=1, le=1_000_000)] = 24
     """Number of sequences."""
@@ -243,3 +264,10 @@ class Job(Section):
     render: Render = Render()
     flow: Flow = Flow()
     card: Card = Card()
+    store: Store = Store()
+
+    @property
+    def kept_fields(self) -> tuple[str, ...]:
+        """Names of the fields that its sequences hold."""
+        recovered = self.flow.backend != "ideal"
+        return fields.kept(self.store.extra, self.store.without, recovered=recovered)

@@ -20,6 +20,9 @@ from synth.scenario import Scenario
 from synth.stopwatch import Stopwatch
 from synth.store import Writer
 
+# Fields that the renderer gives by frame; those of `store.extra` are attributes of its `Shot` as well.
+_SHOT = ("rgb", "flow", "visible", "tool", "glare", "depth")
+
 Report = Callable[[str, int, int], None]
 """Progress: what is being done, how many of it are done, how many there are."""
 
@@ -69,7 +72,7 @@ def render_sequence(job: Job, index: int, folder: Path, report: Report) -> Path:
             shot = studio.frame(motion.rest + motion.displacement[t], motion.tip[t], motion.shaft[t], seed)
             traction = studio.traction(motion.traction[t])
         with watch.stage("store"):
-            for name in ("rgb", "flow", "visible", "tool", "glare", "depth"):
+            for name in (*_SHOT, *job.store.extra):
                 writer.put_frame(name, t, getattr(shot, name))
             writer.put_frame("traction", t, traction)
             if job.render.exr:

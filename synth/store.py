@@ -55,6 +55,8 @@ class Writer:
                 shutil.rmtree(stale)
         self._group = zarr.create_group(str(self._part), zarr_format=3)
         self._columns: dict[str, _Column] = {}
+        self._wanted = job.kept_fields
+        self._half = job.store.flow == "float16"
         self._exr_hash = hashlib.blake2b(digest_size=16)
         self._exr_frames = 0
         self._own = {
@@ -69,9 +71,15 @@ class Writer:
             "job": identity.of(job),
         }
 
+    def wants(self, name: str) -> bool:
+        """Whether the job keeps that field; one that it does not is not computed, and `put` passes it over."""
+        return _field(name).name in self._wanted
+
     def put(self, name: str, array: NDArray[Any]) -> None:
         """Writes a whole field. UserError when shape, type or finiteness is not what the table says."""
         field = _field(name)
+        if not self.wants(name):
+            return
         column = self._column(field)
         if field.framed:
             for t, frame in enumerate(array):
@@ -81,7 +89,8 @@ class Writer:
 
     def put_frame(self, name: str, t: int, array: NDArray[Any]) -> None:
         """Writes frame `t` of a field; frames come in order."""
-        self._column(_field(name)).append(t, array)
+        if self.wants(name):
+            self._column(_field(name)).append(t, array)
 
     def put_exr(self, t: int, radiance: NDArray[np.floating]) -> None:
         """Writes the linear picture of frame `t`, (H, W, 3), as `radiance/NNNNNN/TTTT.exr` in half floats."""
@@ -106,17 +115,19 @@ class Writer:
         Returns:
             The store's final path.
         """
-        for field in FIELDS.values():
-            column = self._columns.get(field.name)
+        for name in self._wanted:
+            column = self._columns.get(name)
             if column is None:
-                if not field.optional:
-                    raise ValueError(f"{field.name}: was never written")
-            elif column.filled != column.shape[0]:
-                raise ValueError(f"{field.name}: {column.filled} of {column.shape[0]} frames were written")
+                raise ValueError(f"{name}: was never written")
+            if column.filled != column.shape[0]:
+                raise ValueError(f"{name}: {column.filled} of {column.shape[0]} frames were written")
         hashes = {name: self._columns[name].digest() for name in FIELDS if name in self._columns}
         if self._exr_frames:
             hashes["radiance"] = self._exr_hash.hexdigest()
-        summary = {key: self._columns[name].largest for name, key in _PEAKS.items()}
+        summary: dict[str, Any] = {key: self._columns[name].largest for name, key in _PEAKS.items()}
+        if self._half:
+            rounded = {name: one.rounding for name, one in self._columns.items() if FIELDS[name].half}
+            summary["rounding_px"] = rounded
         attrs = {
             **self._own,
             **attributes,
@@ -133,19 +144,20 @@ class Writer:
 
     def _column(self, field: Field) -> _Column:
         if field.name not in self._columns:
-            self._columns[field.name] = _Column(self._group, field, field.shape(self._frames, self._size))
+            shape = field.shape(self._frames, self._size)
+            self._columns[field.name] = _Column(self._group, field, shape, self._half and field.half)
         return self._columns[field.name]
 
 
 class _Column:
     """One field being written: checked, hashed, and gathered into shards."""
 
-    def __init__(self, group: zarr.Group, field: Field, shape: tuple[int, ...]) -> None:
+    def __init__(self, group: zarr.Group, field: Field, shape: tuple[int, ...], half: bool) -> None:
         self._field, self.shape, self.filled = field, shape, 0
-        self._hash = field_hasher(field, shape)
+        self._dtype = dtype = np.dtype("float16" if half else field.dtype)
+        self._hash = field_hasher(field, dtype, shape)
         self._held: list[NDArray[Any]] = []
-        self.largest = 0.0
-        dtype = np.dtype(field.dtype)
+        self.largest = self.rounding = 0.0
         chunk, shard = shape, None
         if field.framed:
             chunk = (1, *shape[1:])
@@ -194,11 +206,11 @@ class _Column:
     def _see(self, values: NDArray[Any]) -> None:
         self._hash.update(values.data)
         if self._field.name in _PEAKS:
-            squared = np.einsum("...k,...k->...", values, values)
+            squared = np.einsum("...k,...k->...", values, values, dtype=np.result_type(values, np.float32))
             self.largest = max(self.largest, float(np.sqrt(squared.max())))
 
     def _checked(self, array: NDArray[Any], shape: tuple[int, ...], where: str) -> NDArray[Any]:
-        name, dtype = self._field.name, np.dtype(self._field.dtype)
+        name, dtype = self._field.name, self._dtype
         array = np.asarray(array)
         if array.shape != shape:
             raise ValueError(f"{name}{where}: shape {array.shape}, the field table says {shape}")
@@ -209,16 +221,20 @@ class _Column:
         if dtype.kind == "f" and not np.isfinite(copy).all():
             at = tuple(int(k) for k in np.argwhere(~np.isfinite(copy))[0])
             raise NotFinite(f"{name}{where}: not finite, first at {at}")
+        if self._field.half and copy.dtype != array.dtype:
+            self.rounding = max(self.rounding, float(np.abs(copy - array).max()))
         return copy
 
 
 class Column:
     """A field of a sealed sequence, read when indexed; damage is a UserError that names store and field."""
 
-    def __init__(self, array: zarr.Array[Any], where: str) -> None:
+    def __init__(self, array: zarr.Array[Any], dtype: np.dtype[Any], where: str) -> None:
         self._array, self._where = array, where
         self.shape: tuple[int, ...] = array.shape
-        self.dtype: np.dtype[Any] = array.dtype
+        self.stored: np.dtype[Any] = array.dtype
+        """Type on disk; values are given in the table's."""
+        self.dtype: np.dtype[Any] = dtype
         self.ndim = len(self.shape)
         self.attrs: dict[str, Any] = dict(array.attrs)
         self.dims: tuple[str, ...] = tuple(array.metadata.dimension_names or ())
@@ -228,7 +244,7 @@ class Column:
 
     def __getitem__(self, selection: Any) -> NDArray[Any]:
         try:
-            return np.asarray(self._array[selection])
+            return np.asarray(self._array[selection], self.dtype)
         except IndexError:
             raise
         except Exception as error:  # zarr, its codecs and the file system have no common error for damage
@@ -275,7 +291,8 @@ class Sequence:
         except Exception as error:  # as in Column
             raise UserError(f"{where}: cannot be opened, the store is damaged ({error})") from error
         expected, dtype = field.shape(self.frames, self.size), np.dtype(field.dtype)
-        if not isinstance(array, zarr.Array) or (array.shape, array.dtype) != (expected, dtype):
+        types = (dtype, np.dtype("float16")) if field.half else (dtype,)
+        if not isinstance(array, zarr.Array) or array.shape != expected or array.dtype not in types:
             raise UserError(f"{where}: is not {field.dtype} {expected}, the store is damaged")
         shard = array.shards or array.chunks
         files = -(-expected[0] // shard[0])
@@ -284,7 +301,7 @@ class Sequence:
             # Zarr reads a missing or empty file as zeros.
             if not self._place.size(f"{name}/c/{k}{rest}"):
                 raise UserError(f"{where}: file c/{k}{rest} is missing or empty, the store is damaged")
-        return Column(array, where)
+        return Column(array, dtype, where)
 
 
 class Dataset:
@@ -335,9 +352,9 @@ def open_sequence(path: Path | str) -> Sequence:
     return Sequence(path, group, attrs, at)
 
 
-def field_hasher(field: Field, shape: tuple[int, ...]) -> hashlib.blake2b:
-    """A hasher that has seen the field's name, type and shape; then give it the values in C order."""
-    described = identity.canonical([field.name, field.dtype, list(shape)])
+def field_hasher(field: Field, stored: np.dtype[Any], shape: tuple[int, ...]) -> hashlib.blake2b:
+    """A hasher that has seen the field's name, type and shape; then give it the stored values in C order."""
+    described = identity.canonical([field.name, str(stored), list(shape)])
     return hashlib.blake2b(described, digest_size=16)
 
 

@@ -20,7 +20,8 @@ SIZE = (33, 48)
 
 def sealed(folder: Path, index: int = 0, frames: int = 4) -> Sequence:
     rng = np.random.default_rng(index)
-    writer = Writer(folder, index, frames=frames, size=SIZE, job=Job(frames=frames))
+    job = Job(frames=frames, flow={"backend": "ideal"})
+    writer = Writer(folder, index, frames=frames, size=SIZE, job=job)
     writer.put("time", np.arange(frames) / 25.0)
     writer.put("force", rng.normal(size=(frames, 3)))
     tissue = np.zeros(SIZE, bool)

@@ -15,6 +15,7 @@ from fake_work import attributes, sequence
 from synth import store
 from synth.errors import NotFinite, UserError
 from synth.fields import FIELDS
+from synth.invariants import checksum
 from synth.job import Job
 from synth.store import Dataset, Writer, open_sequence
 
@@ -94,6 +95,41 @@ def test_wrong_shape_type_order_and_name_are_refused(tmp_path: Path) -> None:
         sink.put_frame("depth", 1, np.ones((4, 5)))
     with pytest.raises(ValueError, match="not in the field table"):
         sink.put("colour", np.ones(3))
+
+
+def test_half_floats_are_read_as_floats_within_the_stated_error(root: Path, tmp_path: Path) -> None:
+    job = JOB.model_copy(update={"store": JOB.store.model_copy(update={"flow": "float16"})})
+    (tmp_path / "half").mkdir()
+    sequence(job, 0, tmp_path / "half", quiet)
+    exact, half = open_sequence(root / "000000.zarr"), open_sequence(tmp_path / "half/000000.zarr")
+    assert (half["flow"].dtype, half["flow"].stored, half["depth"].stored) == (
+        "float32",
+        "float16",
+        "float32",
+    )
+    assert half["flow"][2].dtype == np.float32
+    worst = float(np.abs(half["flow"][:] - exact["flow"][:]).max())
+    stated = half.attrs["summary"]["rounding_px"]["flow"]
+    assert 0 < worst <= stated * (1 + 1e-3)
+    assert stated < 0.004, "motion here is below 16 px"
+    assert "rounding_px" not in exact.attrs["summary"]
+    assert all(not failing for failing in damaged(half))
+
+
+def damaged(found: store.Sequence) -> list[bool]:
+    return [not measure.good for measure in checksum(found, [0])]
+
+
+def test_a_job_says_which_fields_are_kept(tmp_path: Path) -> None:
+    job = Job.model_validate({**JOB.model_dump(), "store": {"without": ["depth"]}})
+    sequence(job, 0, tmp_path, quiet)
+    found = open_sequence(tmp_path / "000000.zarr")
+    assert "depth" not in found
+    assert not (tmp_path / "000000.zarr/depth").exists()
+    with pytest.raises(ValueError, match="rgb: not among depth, flow_confidence"):
+        Job.model_validate({"store": {"without": ["rgb"]}})
+    with pytest.raises(ValueError, match="wings: not among"):
+        Job.model_validate({"store": {"extra": ["wings"]}})
 
 
 def test_nothing_is_visible_before_the_seal(tmp_path: Path) -> None:
