@@ -38,6 +38,10 @@ PositiveRange = Annotated[tuple[Positive, Positive], BeforeValidator(_pair), Aft
 NonNegativeRange = Annotated[
     tuple[NonNegative, NonNegative], BeforeValidator(_pair), AfterValidator(_ordered)
 ]
+_Instruments = Annotated[int, Field(ge=1, le=3)]
+InstrumentRange = Annotated[
+    tuple[_Instruments, _Instruments], BeforeValidator(_pair), AfterValidator(_ordered)
+]
 Vector = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
 Distortion = tuple[FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat]
 
@@ -123,12 +127,16 @@ class Fem(Section):
     """Poisson's ratio."""
     load: PositiveRange = (0.05, 0.4)
     """Peak load as P = F/(E a^2), dimensionless, so that one range suits every stiffness."""
+    force_mn: PositiveRange | None = None
+    """Peak force of a contact [mN]; given, it takes the place of `load`."""
     footprint_mm: PositiveRange = (3.0, 6.0)
     """Radius a of the contact [mm]."""
     gestures: Annotated[
         tuple[Literal["pull", "push", "slide", "grasp", "retract", "tap"], ...], Field(min_length=1)
     ] = ("pull", "push", "slide", "grasp", "retract", "tap")
     """Kinds of gesture that sequences are drawn from, in equal shares."""
+    instruments: InstrumentRange = (1, 1)
+    """How many instruments act at once, each with a gesture, load, direction and timing of its own."""
     ramp: PositiveRange = (0.25, 0.35)
     """Time in which the load grows to its peak, as a part of the sequence."""
     cone_deg: Annotated[FiniteFloat, Field(ge=0, le=80)] = 65.0
@@ -154,13 +162,28 @@ class Fem(Section):
 
     @model_validator(mode="after")
     def _load_is_in_the_laws_range(self) -> Fem:
-        law, _ = choose(self.law, self.load[1], self.tolerance)
-        if self.load[1] > LARGEST_LOAD[law]:
+        load = self.largest_load
+        law, _ = choose(self.law, load, self.tolerance)
+        largest = LARGEST_LOAD[law]
+        if self.force_mn is None and load > largest:
             raise ValueError(
-                f"load {self.load[1]:g} is past the range of the {law} law; "
-                f"the largest valid value is {LARGEST_LOAD[law]:g}"
+                f"load {load:g} is past the range of the {law} law; the largest valid value is {largest:g}"
+            )
+        if self.force_mn is not None and load > largest * (1 + 1e-9):
+            young, radius = self.young_kpa[0], self.footprint_mm[0]
+            raise ValueError(
+                f"force_mn {self.force_mn[1]:g} on the softest tissue ({young:g} kPa) under the smallest contact "
+                f"({radius:g} mm) is a load of {load:.3g}, past the range of the {law} law; "
+                f"the largest valid value is {largest * young * radius**2:.4g}"
             )
         return self
+
+    @property
+    def largest_load(self) -> float:
+        """Largest P = F/(E a^2) that can be drawn."""
+        if self.force_mn is None:
+            return self.load[1]
+        return self.force_mn[1] / (self.young_kpa[0] * self.footprint_mm[0] ** 2)
 
 
 class Render(Section):

@@ -104,8 +104,15 @@ def render_sequence(job: Job, index: int, folder: Path, report: Report) -> Path:
             "min_jacobian": motion.min_jacobian.tolist(),
             "energy_mn_mm": motion.energy.tolist(),
             "residual": motion.residual.tolist(),
-            "tip_mm": motion.tip.tolist(),
-            "shaft": motion.shaft.tolist(),
+            "instruments": [
+                {
+                    "kind": gesture.kind,
+                    "force_mn": (motion.by_instrument[:, k] @ rotation.T).tolist(),
+                    "tip_mm": motion.tip[:, 2 * k : 2 * k + 2].tolist(),
+                    "shaft": motion.shaft[:, 2 * k].tolist(),
+                }
+                for k, gesture in enumerate(case.gestures)
+            ],
         },
         variant=studio.variant,
         timings=watch.report(),
@@ -113,8 +120,8 @@ def render_sequence(job: Job, index: int, folder: Path, report: Report) -> Path:
 
 
 def build(job: Job, case: Scenario) -> tuple[Surface, Tets]:
-    """The fine surface of a scenario and the volume under it, finest where its contact is."""
-    focus = tool.focus(case.gesture)
+    """The fine surface of a scenario and the volume under it, finest where its contacts are."""
+    focus = [place for gesture in case.gestures for place in tool.focus(gesture)]
     if job.anatomy.mesh is None:
         surface = anatomy.procedural(case.relief, job.anatomy)
         return surface, mesh.block(job.anatomy, job.fem.tets, job.fem.order, focus)
@@ -124,7 +131,7 @@ def build(job: Job, case: Scenario) -> tuple[Surface, Tets]:
 
 
 def move(job: Job, case: Scenario, surface: Surface, tets: Tets) -> Deformation:
-    """The scenario's gesture, carried out on that surface and volume."""
+    """The scenario's gestures, carried out on that surface and volume."""
     return solver.deform(
         job.fem,
         job.anatomy.craniotomy,
@@ -135,4 +142,5 @@ def move(job: Job, case: Scenario, surface: Surface, tets: Tets) -> Deformation:
         surface.faces,
         job.frames,
         job.fps,
+        case.further,
     )

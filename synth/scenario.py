@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from synth.fem import crew
 from synth.fem.material import Tissue
 from synth.fem.tool import Gesture
 from synth.job import Job
@@ -16,7 +17,7 @@ from synth.render.scene import Look
 
 # First element of the spawn key: anatomies are shared between sequences, everything else is not.
 _ANATOMY, _SEQUENCE = 0, 1
-_TISSUE, _GESTURE, _LOOK, _VIEW, _NOISE = range(5)
+_TISSUE, _GESTURE, _LOOK, _VIEW, _NOISE, _FURTHER, _LABELS = range(7)
 
 
 @dataclass(frozen=True)
@@ -33,8 +34,16 @@ class Scenario:
     """Shape and vessels of the anatomy, with its own seed."""
     tissue: Tissue
     gesture: Gesture
+    """What the first instrument does."""
+    further: tuple[Gesture, ...]
+    """What the other instruments do at the same time."""
     look: Look
     view: View
+
+    @property
+    def gestures(self) -> tuple[Gesture, ...]:
+        """One an instrument."""
+        return (self.gesture, *self.further)
 
     def as_dict(self) -> dict[str, Any]:
         return asdict(self)
@@ -44,15 +53,18 @@ def draw(job: Job, index: int) -> Scenario:
     """Draws sequence `index` of `job`; independent of how many others there are and of their order."""
     anatomy = index % (job.anatomy.variety or job.sequences)
     family = job.appearance.families[index % len(job.appearance.families)]
+    opening = job.anatomy.craniotomy
     tissue = Tissue.draw(job.fem, _generator(job, _SEQUENCE, index, _TISSUE))
+    gesture = Gesture.draw(job.fem, opening, tissue, _generator(job, _SEQUENCE, index, _GESTURE))
     return Scenario(
         index=index,
         anatomy=anatomy,
         family=family,
         relief=Relief.draw(job.anatomy, _generator(job, _ANATOMY, anatomy, 0)),
         tissue=tissue,
-        gesture=Gesture.draw(
-            job.fem, job.anatomy.craniotomy, tissue, _generator(job, _SEQUENCE, index, _GESTURE)
+        gesture=gesture,
+        further=crew.further(
+            gesture, job.fem, opening, tissue, _generator(job, _SEQUENCE, index, _FURTHER)
         ),
         look=Look.draw(family, _generator(job, _SEQUENCE, index, _LOOK)),
         view=View.draw(job.render, _generator(job, _SEQUENCE, index, _VIEW)),

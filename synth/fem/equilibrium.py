@@ -56,23 +56,21 @@ def follow(system: System, loads: Floats, named: Floats) -> Path:
     path: list[tuple[Floats, State]] = []
     residual = np.zeros(len(loads))
     peak = loads[np.abs(loads).max(axis=(1, 2)).argmax()]
-    first = system.solve(peak)
+    answers = _Answers(system)
+    first = answers(peak)
     square = float(np.vdot(peak, peak)) or 1.0
     size = float(np.sqrt(np.vdot(peak, first))) or 1.0
     known: list[tuple[float, Floats]] = [(0.0, np.zeros_like(peak))]
     for step, load in enumerate(loads):
-        part = float(np.vdot(load, peak)) / square
-        alike = float(np.abs(load - part * peak).max()) <= 1e-9 * float(np.abs(peak).max())
         if system.law == "linear":
-            u = part * first if alike else system.solve(load)
+            u = answers(load)
             state = system.state(u)
             residual[step] = np.linalg.norm(_free(system, load - state.force)) / np.sqrt(square)
         else:
-            if alike:
-                start = _guess(known, part, first)
-            else:
-                start = path[-1][0] + system.solve(load - loads[step - 1])
+            part = float(np.vdot(load, peak)) / square
+            alike = float(np.abs(load - part * peak).max()) <= 1e-9 * float(np.abs(peak).max())
             last = path[-1][0] if path else np.zeros_like(load)
+            start = _guess(known, part, first) if alike else last + answers(load - loads[step - 1])
             u, state, rest = balance(system, load, start, TOLERANCE * size, last)
             residual[step] = rest / size
             if alike and all(abs(part - k) > 1e-3 for k, _ in known):
@@ -81,7 +79,7 @@ def follow(system: System, loads: Floats, named: Floats) -> Path:
         if residual[step] > TOLERANCE:
             raise NoEquilibrium(
                 f"frame {step}: no equilibrium at load {named[step]:.3g} "
-                f"(out of balance by {residual[step]:.1e}); lower fem.load"
+                f"(out of balance by {residual[step]:.1e}); lower the load"
             )
         path.append((u, state))
     return Path(
@@ -92,6 +90,31 @@ def follow(system: System, loads: Floats, named: Floats) -> Path:
     )
 
 
+class _Answers:
+    """Linear displacement under loads that are mostly mixtures of few: one solve for each new direction."""
+
+    def __init__(self, system: System) -> None:
+        self._system = system
+        self._loads: list[Floats] = []
+        self._moved: list[Floats] = []
+
+    def __call__(self, load: Floats) -> Floats:
+        size = float(np.linalg.norm(load))
+        u, rest = np.zeros_like(load), load
+        for direction, moved in zip(self._loads, self._moved, strict=True):
+            share = float(np.vdot(direction, rest))
+            u = u + share * moved
+            rest = rest - share * direction
+        left = float(np.linalg.norm(rest))
+        if left <= 1e-10 * size:
+            return u
+        direction = rest / left
+        moved = self._system.solve(direction)
+        self._loads.append(direction)
+        self._moved.append(moved)
+        return u + left * moved
+
+
 def check(system: System, u: Floats, state: State, frame: int, load: float) -> None:
     """Refuses a state that is no deformation: raises `NotFinite` or `InvertedElement`."""
     if not np.isfinite(u).all() or not np.isfinite(state.energy):
@@ -99,7 +122,7 @@ def check(system: System, u: Floats, state: State, frame: int, load: float) -> N
     if state.jacobian <= LEAST_JACOBIAN:
         raise InvertedElement(
             f"frame {frame}: load {load:.3g} turns element {system.worst(u)} inside out or nearly so "
-            f"(det F {state.jacobian:.2f}, more than {LEAST_JACOBIAN:g} is needed); lower fem.load"
+            f"(det F {state.jacobian:.2f}, more than {LEAST_JACOBIAN:g} is needed); lower the load"
         )
 
 

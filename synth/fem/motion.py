@@ -86,7 +86,7 @@ def march(
                 history[k] = decay * history[k] + g * even * (now - elastic)
             before, u, elastic = u, new, now
             if rest > 2 * TOLERANCE * size:
-                raise NoEquilibrium(f"frame {t}: no equilibrium at load {named[t]:.3g}; lower fem.load")
+                raise NoEquilibrium(f"frame {t}: no equilibrium at load {named[t]:.3g}; lower the load")
         states.append((u, tissue.state(u), rest / size))
     return Path(
         np.stack([u for u, _, _ in states]),

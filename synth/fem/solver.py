@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,7 +24,7 @@ Ints = NDArray[np.int32]
 
 @dataclass(frozen=True)
 class Deformation:
-    """The surface, its loads and the instrument over T frames, in world axes. Frame 0 is at rest."""
+    """The surface, its loads and the instruments over T frames, in world axes. Frame 0 is at rest."""
 
     rest: Floats
     """(V, 3) mm."""
@@ -39,10 +40,12 @@ class Deformation:
     """(T, 3) mN on the tissue."""
     time: Floats
     """(T,) s."""
+    by_instrument: Floats
+    """(T, I, 3) mN, the part of each of the I instruments in it."""
     tip: Floats
-    """(T, K, 3) mm, the instrument's tips."""
+    """(T, 2 I, 3) mm, the instruments' tips, two each."""
     shaft: Floats
-    """(T, K, 3) unit vectors from tip to hand."""
+    """(T, 2 I, 3) unit vectors from tip to hand."""
     min_jacobian: Floats
     """(T,) smallest det F in the volume."""
     energy: Floats
@@ -61,55 +64,65 @@ def deform(
     skin_faces: Ints,
     frames: int,
     fps: float,
+    further: Sequence[Gesture] = (),
 ) -> Deformation:
-    """Moves a brain as a gesture asks.
+    """Moves a brain as gestures ask.
 
     Args:
         fem: the job's section.
         craniotomy: the opening.
         tissue: stiffness and law.
-        gesture: the load.
+        gesture: the first instrument's.
         tets: the volume.
         skin_vertices: (V, 3) mm, the fine surface.
         skin_faces: (F, 3), counter-clockwise seen from outside.
         frames: T >= 2.
         fps: 1/s.
+        further: gestures of more instruments at the same time.
 
     Raises:
         UserError: the load is past the law's range, or the contact is not on the surface.
         InvertedElement: names frame, load and element.
         NotFinite: a number is none.
     """
-    check_load(tissue.law, gesture.load)
+    crew = (gesture, *further)
+    for one in crew:
+        check_load(tissue.law, one.load)
     carry = skin.embedding(tets, skin_vertices)
     area = skin.vertex_area(skin_vertices, skin_faces)
-    over = tool.course(gesture, frames)
-    traction = tool.tractions(gesture, over, skin_vertices, area)
+    courses = [tool.course(one, frames) for one in crew]
+    traction = np.zeros((frames, len(skin_vertices), 3))
+    for one, over in zip(crew, courses, strict=True):
+        traction += tool.tractions(one, over, skin_vertices, area)
 
     # One load per kPa of E; displacement depends on no more than that.
     loads = np.stack([carry.T @ (area[:, None] * t) for t in traction / tissue.young_kpa])
-    named = gesture.load * over.load
+    named = np.max([one.load * over.load for one, over in zip(crew, courses, strict=True)], axis=0)
     if fem.time == "quasi-static" and not fem.relaxation:
         path = equilibrium.follow(assemble(tets, tissue.law, tissue.poisson), loads, named)
     else:
         path = motion.march(tets, tissue.law, tissue.poisson, tissue.young_kpa, loads, named, clock(fem, fps))
     displacement = np.stack([carry @ u for u in path.displacement])
-    corners, weights = tool.anchors(gesture, over, skin_vertices, skin_faces)
     surface = skin_vertices + displacement
-    touched = np.stack(
-        [np.einsum("kc,kcd->kd", w, at[c]) for w, c, at in zip(weights, corners, surface, strict=True)]
-    )
-    hand = tool.shaft(gesture)
+    poses = [
+        tool.pose(one, over, skin_vertices, skin_faces, surface)
+        for one, over in zip(crew, courses, strict=True)
+    ]
+    forces = [
+        np.outer(over.load, np.sum([c.force_mn for c in one.contacts], axis=0))
+        for one, over in zip(crew, courses, strict=True)
+    ]
     return Deformation(
         rest=skin_vertices,
         faces=skin_faces,
         displacement=displacement,
         traction=traction,
         area=area,
-        force=over.load[:, None] * np.sum([c.force_mn for c in gesture.contacts], axis=0),
+        force=np.sum(forces, axis=0),
+        by_instrument=np.stack(forces, axis=1),
         time=np.arange(frames) / fps,
-        tip=touched + gesture.hover_mm * over.away[:, None, None] * hand,
-        shaft=np.broadcast_to(hand, touched.shape).copy(),
+        tip=np.concatenate([tip for tip, _ in poses], axis=1),
+        shaft=np.concatenate([shaft for _, shaft in poses], axis=1),
         min_jacobian=path.jacobian,
         energy=path.energy * tissue.young_kpa,
         residual=path.residual,

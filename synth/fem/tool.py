@@ -68,7 +68,9 @@ class Gesture:
     ) -> Gesture:
         """Draws one gesture: contact uniformly in the opening, direction uniformly in its cone."""
         kind = str(rng.choice(fem.gestures))
-        footprint, load = float(rng.uniform(*fem.footprint_mm)), float(rng.uniform(*fem.load))
+        footprint = float(rng.uniform(*fem.footprint_mm))
+        size = tissue.young_kpa * footprint**2
+        load = float(rng.uniform(*fem.load) if fem.force_mn is None else rng.uniform(*fem.force_mn) / size)
         spread = footprint * float(rng.uniform(1.2, 1.8) if kind == "grasp" else rng.uniform(0.1, 0.9))
         path = float(rng.uniform(3, 8)) if kind == "slide" else 0.0
         azimuth = float(rng.uniform(0, 360))
@@ -94,7 +96,7 @@ class Gesture:
             for inward in (aside, -aside):
                 pinched = way + _PINCH * np.append(inward, 0) / np.linalg.norm(inward)
                 ways.append(pinched / np.linalg.norm(pinched))
-        force = load * tissue.young_kpa * footprint**2
+        force = load * size
         whole = force * np.sum(ways, axis=0)
         touch = float(rng.uniform(0.08, 0.15))
         ramp = fem.ramp if kind != "tap" else (0.1, 0.2)
@@ -236,6 +238,33 @@ def anchors(
     return np.array([[p[0] for p in pair] for pair in touched]), np.array(
         [[p[1] for p in pair] for pair in touched]
     )
+
+
+def pose(
+    gesture: Gesture, over: Course, vertices: Floats, faces: NDArray[np.integer], surface: Floats
+) -> tuple[Floats, Floats]:
+    """Where the instrument is: its tips rest on the tissue while they load it.
+
+    Args:
+        gesture, over: what it does.
+        vertices: (V, 3) mm at rest.
+        faces: (F, 3).
+        surface: (T, V, 3) mm, the moved vertices.
+
+    Returns:
+        Tips (T, 2, 3) mm and unit vectors from tip to hand (T, 2, 3).
+
+    Raises:
+        UserError: it touches beyond the edge of the surface.
+    """
+    corners, weights = anchors(gesture, over, vertices, faces)
+    touched = np.stack(
+        [np.einsum("kc,kcd->kd", w, at[c]) for w, c, at in zip(weights, corners, surface, strict=True)]
+    )
+    hand = shaft(gesture)
+    return touched + gesture.hover_mm * over.away[:, None, None] * hand, np.broadcast_to(
+        hand, touched.shape
+    ).copy()
 
 
 def shaft(gesture: Gesture) -> Floats:
