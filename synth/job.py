@@ -42,6 +42,12 @@ _Instruments = Annotated[int, Field(ge=1, le=3)]
 InstrumentRange = Annotated[
     tuple[_Instruments, _Instruments], BeforeValidator(_pair), AfterValidator(_ordered)
 ]
+Share = Annotated[FiniteFloat, Field(ge=0, le=1)]
+ShareRange = Annotated[tuple[Share, Share], BeforeValidator(_pair), AfterValidator(_ordered)]
+_Tilt = Annotated[FiniteFloat, Field(ge=0, le=40)]
+LightTilt = Annotated[tuple[_Tilt, _Tilt], BeforeValidator(_pair), AfterValidator(_ordered)]
+_Kelvin = Annotated[FiniteFloat, Field(ge=2000, le=12_000)]
+LightKelvin = Annotated[tuple[_Kelvin, _Kelvin], BeforeValidator(_pair), AfterValidator(_ordered)]
 Vector = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
 Distortion = tuple[FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat]
 
@@ -108,6 +114,29 @@ class Appearance(Section):
     """Appearance families that sequences are drawn from, in equal shares."""
     photo: Path | None = None
     """A photograph used as albedo, relative to the job file. Empty: procedural vessels and parenchyma."""
+    cottonoid: Share = 0.2
+    """Share of sequences with a cotton patty on the rim."""
+    blood: ShareRange | None = None
+    """Blood on the rim, from none (0) to soaked (1). Empty: as the family has it."""
+
+
+class Light(Section):
+    """The microscope's lamps."""
+
+    glare: ShareRange = (0.0, 0.3)
+    """Wet highlights: 0 the few sparks of a well placed lamp, 1 up to a third of the tissue outshone."""
+    tilt_deg: LightTilt | None = None
+    """Angle between the main lamp and the optical axis, 0-40, any side. Empty: the lamp is where `glare` asks."""
+    coaxial: ShareRange = (0.8, 0.92)
+    """Share of light from the main lamp; the rest comes from the ring round the objective."""
+    power: PositiveRange = (0.95, 1.1)
+    """Illumination, against one that just fills the sensor with white."""
+    kelvin: LightKelvin = (4200.0, 5600.0)
+    """Colour temperature [K], 2000-12000."""
+    even: PositiveRange = (0.35, 0.5)
+    """Radius of the evenly lit spot, in widths of the field; beyond it the light falls off."""
+    drift: ShareRange = (0.0, 0.03)
+    """Largest change of power over the sequence, as a share of it."""
 
 
 class Fem(Section):
@@ -172,8 +201,8 @@ class Fem(Section):
         if self.force_mn is not None and load > largest * (1 + 1e-9):
             young, radius = self.young_kpa[0], self.footprint_mm[0]
             raise ValueError(
-                f"force_mn {self.force_mn[1]:g} on the softest tissue ({young:g} kPa) under the smallest contact "
-                f"({radius:g} mm) is a load of {load:.3g}, past the range of the {law} law; "
+                f"force_mn {self.force_mn[1]:g} on the softest tissue ({young:g} kPa) under the smallest "
+                f"contact ({radius:g} mm) is a load of {load:.3g}, past the range of the {law} law; "
                 f"the largest valid value is {largest * young * radius**2:.4g}"
             )
         return self
@@ -231,6 +260,26 @@ class Flow(Section):
     """Estimator: tvl1, opencv-tvl1, dis or an installed plug-in's; `ideal` computes no recovered flow."""
 
 
+def _known(names: tuple[str, ...], known: tuple[str, ...]) -> tuple[str, ...]:
+    strangers = [name for name in names if name not in known]
+    if strangers:
+        raise ValueError(
+            f"{', '.join(strangers)}: not among {', '.join(known) or 'any (there are none yet)'}"
+        )
+    return names
+
+
+class Store(Section):
+    """What is kept of every sequence. `synth fields` lists the fields and what they take."""
+
+    extra: Annotated[tuple[str, ...], AfterValidator(lambda names: _known(names, fields.EXTRA))] = ()
+    """Fields to keep besides the usual ones."""
+    without: Annotated[tuple[str, ...], AfterValidator(lambda names: _known(names, fields.SPARED))] = ()
+    """Fields to leave out, of those that can be spared: depth, flow_confidence."""
+    flow: Literal["float32", "float16"] = "float32"
+    """Type of both flows stored; float16 rounds motion below 16 px by at most 0.004 px, below 32 by 0.008."""
+
+
 class Card(Section):
     """What a person says of the dataset, for its card. Changes no sequence."""
 
@@ -254,26 +303,6 @@ class Job(Section):
     """One dataset."""
 
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
-def _known(names: tuple[str, ...], known: tuple[str, ...]) -> tuple[str, ...]:
-    strangers = [name for name in names if name not in known]
-    if strangers:
-        raise ValueError(
-            f"{', '.join(strangers)}: not among {', '.join(known) or 'any (there are none yet)'}"
-        )
-    return names
-
-
-class Store(Section):
-    """What is kept of every sequence. `synth fields` lists the fields and what they take."""
-
-    extra: Annotated[tuple[str, ...], AfterValidator(lambda names: _known(names, fields.EXTRA))] = ()
-    """Fields to keep besides the usual ones."""
-    without: Annotated[tuple[str, ...], AfterValidator(lambda names: _known(names, fields.SPARED))] = ()
-    """Fields to leave out, of those that can be spared: depth, flow_confidence."""
-    flow: Literal["float32", "float16"] = "float32"
-    """Type of both flows on disk; float16 rounds motion up to 16 px by at most 0.004 px (twice that up to 32)."""
-
-
     """Root of every random draw. Same job, same bytes."""
     sequences: Annotated[int, Field(ge=1, le=1_000_000)] = 24
     """Number of sequences."""
@@ -283,11 +312,12 @@ class Store(Section):
     """Frames a second of the recorded video."""
     anatomy: Anatomy = Anatomy()
     appearance: Appearance = Appearance()
+    light: Light = Light()
     fem: Fem = Fem()
     render: Render = Render()
     flow: Flow = Flow()
-    card: Card = Card()
     store: Store = Store()
+    card: Card = Card()
 
     @property
     def kept_fields(self) -> tuple[str, ...]:

@@ -72,7 +72,7 @@ class Writer:
         }
 
     def wants(self, name: str) -> bool:
-        """Whether the job keeps that field; one that it does not is not computed, and `put` passes it over."""
+        """Whether the job keeps that field; `put` passes over one that it does not keep."""
         return _field(name).name in self._wanted
 
     def put(self, name: str, array: NDArray[Any]) -> None:
