@@ -181,6 +181,52 @@ def _say(result: Result, folder: Path, json: bool) -> None:
 
 
 @app.command()
+def gap(
+    dataset: Annotated[Path, typer.Argument(help="Dataset rendered in several appearance families.")],
+    cache: Annotated[Path, typer.Option(help="Folder for packed sequences and trained networks.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the results.")] = Path(
+        "docs/results/gap"
+    ),
+    held_out: Annotated[str, typer.Option(help="Appearance family that no training sees.")] = "calf",
+    flow: Annotated[
+        list[str] | None,
+        typer.Option(help="Back end of the recovered flow; each is a whole experiment. [default: both]"),
+    ] = None,
+    preset: Annotated[str, typer.Option(help="Preset of `learn train`.")] = "tiny",
+    epochs: Annotated[int | None, typer.Option(min=1, help="Epochs; the preset's if not given.")] = None,
+    seeds: Annotated[int, typer.Option(min=1, help="Networks a training.")] = 2,
+    json: Json = False,
+) -> None:
+    """How much of the sim-to-real gap training on recovered flow closes, and fitted noise alone."""
+    import shlex
+    import sys
+
+    from rich.console import Console
+
+    from bench import gap_experiment
+    from learn.threads import set_threads
+
+    set_threads(1)
+    tree = gap_experiment.run(
+        dataset,
+        out,
+        cache,
+        gap_experiment.settings_of(preset, epochs),
+        held_out,
+        flow or ["tvl1", "opencv-tvl1"],
+        seeds,
+        shlex.join(["bench", *sys.argv[1:]]),
+        lambda line: Console(stderr=True).print(line, markup=False),
+    )
+    if json:
+        print(json_.dumps({name: found["verdict"] for name, found in tree["flows"].items()}))
+    else:
+        for name, found in tree["flows"].items():
+            print(f"{name}: {found['verdict']['force_mae']}")
+        print(out / "README.md")
+
+
+@app.command()
 def flow(
     first: Annotated[Path, typer.Argument(help="Picture at rest.")],
     second: Annotated[Path, typer.Argument(help="Picture after the motion.")],

@@ -11,16 +11,16 @@ from bench import gap
 def test_share_closed_by_hand() -> None:
     rng = np.random.default_rng(0)
     base = rng.uniform(0.9, 1.1, 30)
-    got = gap.closed(10 * base, 6 * base, 2 * base[:12], rng)
-    assert got.share == pytest.approx(4 / 8, rel=0.05)
-    assert got.interval[0] < got.share < got.interval[1]
+    got = gap.closed(10 * base, 6 * base, 2 * base, rng)
+    assert got.share == pytest.approx(4 / 8, rel=1e-9)
+    assert got.interval == pytest.approx((0.5, 0.5), abs=1e-6)  # all in proportion: pairs leave no doubt
     assert got.undefined == ""
 
 
 def test_no_gap_is_undefined_and_says_so() -> None:
     rng = np.random.default_rng(0)
     errors = rng.normal(5, 2, 20)
-    got = gap.closed(errors, errors - 1, rng.normal(5, 2, 20), rng)
+    got = gap.closed(errors, errors - 1, errors + 0.3 * rng.normal(size=20), rng)
     assert np.isnan(got.share)
     assert "touches zero" in got.undefined
 
@@ -42,5 +42,7 @@ def test_verdict_names_the_cheaper_way_when_it_is_as_good() -> None:
     def closing(share: float) -> gap.Gap:
         return gap.Gap(share, (share - 0.1, share + 0.1), 1.0, (0.8, 1.2), "")
 
-    assert "not needed" in gap.verdict({"R": closing(0.5), "N": closing(0.45), "mixed": closing(0.5)})
-    assert "more" in gap.verdict({"R": closing(0.5), "N": closing(0.2), "mixed": closing(0.5)})
+    shares = {"R": closing(0.5), "N": closing(0.45)}
+    assert "not needed" in gap.verdict(shares, (-0.2, -0.1))
+    assert "not shown" in gap.verdict(shares, (-0.1, 0.2))
+    assert "closes more than" in gap.verdict({"R": closing(0.5), "N": closing(0.2)}, (0.1, 0.2))
