@@ -78,7 +78,7 @@ def _row(k: int, rng: np.random.Generator) -> dict[str, Any]:
         "status": "done",
         "path": f"{k:06d}.zarr",
         "content_hash": f"{int(rng.integers(1 << 62)):032x}",
-        "anatomy": k % 5000,
+        "anatomy": f"seed-{k % 5000}",
         "family": ("healthy", "pale")[k % 2],
         "gesture": ("pull", "push")[k % 2],
         "young_kpa": float(rng.uniform(0.5, 3)),

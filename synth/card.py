@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from synth import chart, index
+from synth import chart, index, split
 from synth.fields import FIELDS
 from synth.folder import Folder, write_whole
 from synth.job import Job
@@ -51,7 +51,7 @@ def write(folder: Folder) -> Path:
         versions="" if sequence is None else _versions(sequence.attrs.get("versions", {})),
         fields=_fields(sequence),
         columns=_columns(),
-        limits=limits(job),
+        limits=limits(folder),
         command="synth render job.yaml -o FOLDER",
     )
     path = folder.root / "README.md"
@@ -59,9 +59,21 @@ def write(folder: Folder) -> Path:
     return path
 
 
-def limits(job: Job) -> list[str]:
+def limits(folder: Folder) -> list[str]:
     """What a reader must know before trusting the data, given how it was made."""
-    found = [
+    job, described = folder.job(), folder.described()
+    found = []
+    if len(described.get("generators", [])) > 1:
+        found.append(
+            "Several versions of the program made it: a sequence made again need not have the same bytes."
+        )
+    if split.rule(folder.root).share_anatomy:
+        found.append("The split's sides share a brain: scores on it say nothing of other brains.")
+    if job.store.flow == "float16":
+        found.append(
+            "Flow is stored in half floats: see `summary.rounding_px` of a sequence for the largest error."
+        )
+    found += [
         "The motion is quasi-static: within 3% of damped dynamics after a hold of 0.3 s, not before.",
         "Tissue is homogeneous and isotropic: no membranes, no stiffness of vessels, no bleeding, "
         "breathing or heart beat.",

@@ -55,6 +55,8 @@ class Setup:
     keep_open: tuple[int, ...] = ()
     """File descriptors that live as long as any worker does: the lock of the dataset."""
     environment: Mapping[str, str] | None = None
+    generator: str = ""
+    """Version of the program that the engine has; a machine of a cluster with another one refuses."""
     turn: int = 0
     """Which run of the dataset this is; another number in `turn_file` says that it is over."""
     turn_file: Path = Path()
@@ -89,6 +91,7 @@ class Child:
                     "logs": str(setup.logs.resolve()),
                     "scratch": str(setup.scratch.resolve()),
                     "work": setup.work,
+                    "generator": setup.generator,
                 }
             )
         )

@@ -22,6 +22,10 @@ app = typer.Typer(
 )
 
 Out = Annotated[Path, typer.Argument(help="A dataset's folder.")]
+Mix = Annotated[
+    bool,
+    typer.Option("--mix-versions", help="Continue a dataset that another version of this program began."),
+]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")]
 
 
@@ -101,6 +105,7 @@ def render(
     memory: Annotated[
         float | None, typer.Option(help="Memory that a process may take [GB]; a share of what is free.")
     ] = None,
+    mix_versions: Mix = False,
     json: Json = False,
 ) -> None:
     """Renders the dataset of a job. Exit code 1 when some of its sequences failed."""
@@ -111,7 +116,7 @@ def render(
     _end_on_terminate()
     read = config.load(job, overrides or [])
     with Bars() as bars:
-        options = running.Options(engine=engine, workers=workers, memory_gb=memory)
+        options = running.Options(engine=engine, workers=workers, memory_gb=memory, mix_versions=mix_versions)
         summary = running.run(read, out, options, bars)
     if json:
         print(json_.dumps({**vars(summary), "out": str(out)}))
@@ -129,7 +134,12 @@ def _end_on_terminate() -> None:
 
 
 @app.command()
-def retry(out: Out, workers: Annotated[int | None, typer.Option(min=1)] = None, json: Json = False) -> None:
+def retry(
+    out: Out,
+    workers: Annotated[int | None, typer.Option(min=1, help="Processes at a time; one a core.")] = None,
+    mix_versions: Mix = False,
+    json: Json = False,
+) -> None:
     """Takes up the sequences that failed, and all that are missing."""
     from synth import engine
     from synth.folder import Folder
@@ -140,7 +150,7 @@ def retry(out: Out, workers: Annotated[int | None, typer.Option(min=1)] = None, 
     job = folder.job()
     forgiven = folder.forgive()
     with Bars() as bars:
-        summary = engine.run(job, out, engine.Options(workers=workers), bars)
+        summary = engine.run(job, out, engine.Options(workers=workers, mix_versions=mix_versions), bars)
     if json:
         print(json_.dumps({**vars(summary), "retried": forgiven, "out": str(out)}))
     else:
@@ -161,11 +171,15 @@ def status(out: Out, json: Json = False) -> None:
 @app.command("split")
 def split_command(
     out: Out,
-    by: Annotated[str, typer.Option(help="anatomy, family, gesture or stiffness.")] = "anatomy",
+    by: Annotated[str, typer.Option(help="anatomy, family, gesture, stiffness or sequence.")] = "anatomy",
     shares: Annotated[str, typer.Option(help="For train, validation and test.")] = "0.7,0.15,0.15",
     hold_out: Annotated[
         list[str] | None, typer.Option(help="An appearance family that is only for testing.")
     ] = None,
+    share_anatomy: Annotated[
+        bool,
+        typer.Option("--share-anatomy", help="One brain may be on all sides: for a dataset of one brain."),
+    ] = False,
     json: Json = False,
 ) -> None:
     """Says who may be trained on, in the index: no anatomy and no held-out family on both sides."""
@@ -175,7 +189,7 @@ def split_command(
 
     folder = Folder(out)
     folder.described()
-    chosen = split.parse(by, shares, hold_out or [])
+    chosen = split.parse(by, shares, hold_out or [], share_anatomy)
     rows = index.write(folder)
     split.assign(rows, chosen)
     split.keep(out, chosen)

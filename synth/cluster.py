@@ -16,7 +16,7 @@ from typing import Any
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
-from synth import slots
+from synth import slots, versions
 from synth.child import Attempt, Setup
 from synth.errors import UserError
 from synth.job import Job
@@ -45,7 +45,9 @@ def slots_of(engine: str, setup: Setup) -> Iterator[Slots]:
         raise UserError("a Dask engine needs the extra `cluster`: pip install 'sulcus[cluster]'") from None
     # The lock cannot travel; a worker sees by the turn that its run is over.
     own = {key: value for key, value in (setup.environment or {}).items() if not key.startswith("SULCUS_")}
-    travelling = replace(setup, keep_open=(), environment=own, memory_bytes=None)
+    travelling = replace(
+        setup, keep_open=(), environment=own, memory_bytes=None, generator=versions.fingerprint()
+    )
     with _cluster(engine) as (address, expected):
         try:
             client = distributed.Client(address, timeout=_CONNECT)

@@ -82,7 +82,7 @@ def describe(folder: Folder) -> dict[str, Any]:
         "rai:dataCollectionType": ["Software Collection"],
         "rai:dataAnnotationProtocol": "Labels are the simulation's own state. Fields: " + _fields(),
         "rai:dataPreprocessingProtocol": ["None: sensor noise and 8-bit sRGB are part of the rendering."],
-        "rai:dataLimitations": card.limits(job),
+        "rai:dataLimitations": card.limits(folder),
         "rai:dataBiases": [
             f"Appearance: {card.share(done, 'family')}. Gestures: {card.share(done, 'gesture')}. "
             f"Anatomies: {len({row['anatomy'] for row in done})}."

@@ -41,6 +41,8 @@ class Options:
     """`module:function` that computes one sequence."""
     environment: Mapping[str, str] = field(default_factory=dict)
     """Added to the environment of the workers."""
+    mix_versions: bool = False
+    """Continue a dataset that another version of the program began."""
 
 
 @dataclass(frozen=True)
@@ -75,7 +77,7 @@ def run(job: Job, root: Path, options: Options, watcher: Watcher) -> Summary:
         KeyboardInterrupt: after the workers are ended; what is sealed stays, the next run goes on.
     """
     workers, memory = options.workers or len(os.sched_getaffinity(0)), options.memory_gb
-    with claim(root, job) as folder:
+    with claim(root, job, mix_versions=options.mix_versions) as folder:
         finished, failures = set(folder.sealed()), folder.failures()
         todo = [k for k in range(job.sequences) if k not in finished and k not in failures]
         forecast.refuse_if_too_large(forecast.of(job, root, len(todo), sorted(finished), []), root)

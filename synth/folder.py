@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from synth import identity, jobfile
+from synth import identity, jobfile, versions
 from synth.errors import UserError
 from synth.job import Job
 
@@ -36,7 +36,7 @@ class Folder:
         self.turn = 0
 
     def described(self) -> dict[str, Any]:
-        """`{"identity", "job"}` as first written. UserError if this is no dataset of ours."""
+        """`{"identity", "generators", "job"}` as first written. UserError if this is no dataset of ours."""
         try:
             found = json.loads((self.root / _NAME).read_text("utf-8"))
             if not {"identity", "job"} <= found.keys():
@@ -118,25 +118,32 @@ class Folder:
 
 
 @contextmanager
-def claim(root: Path, job: Job) -> Iterator[Folder]:
+def claim(root: Path, job: Job, *, mix_versions: bool = False) -> Iterator[Folder]:
     """The folder for `job`, created or continued, and this process alone writes to it meanwhile.
 
     A folder that holds something else is left as it was. More sequences than before extend the dataset.
 
+    Args:
+        root: the folder.
+        job: the job.
+        mix_versions: continue what another version of the program began; `dataset.json` names them all.
+
     Raises:
-        UserError: another job's dataset, other files, another run at work, or no permission.
+        UserError: another job's dataset, another version's, other files, another run at work, or no
+            permission.
     """
     folder, created, fresh = Folder(root), not root.exists(), not (root / _NAME).exists()
     name = identity.of(job)
     try:
         _refuse_foreign(folder, job, name)
+        makers = _makers(folder, mix_versions)
         folder.state.mkdir(parents=True, exist_ok=True)
         with _locked(folder.state / "lock") as folder.lock_fd:
             _refuse_foreign(folder, job, name)
             (folder.state / "failed").mkdir(exist_ok=True)
             folder.logs.mkdir(exist_ok=True)
             folder.scratch.mkdir(exist_ok=True)
-            described = {"identity": name, "job": job.model_dump(mode="json")}
+            described = {"identity": name, "generators": makers, "job": job.model_dump(mode="json")}
             write_whole(root / _NAME, json.dumps(described, indent=1) + "\n")
             write_whole(
                 root / "job.yaml", "# The job of this dataset, every value said.\n" + jobfile.dump(job)
@@ -190,6 +197,27 @@ def _refuse_foreign(folder: Folder, job: Job, name: str) -> None:
     before = int(described["job"]["sequences"])
     if before > job.sequences:
         raise UserError(f"{root}: holds {before} sequences of this job, {job.sequences} are asked for")
+
+
+def _makers(folder: Folder, mix: bool) -> list[dict[str, str]]:
+    """The versions that made the dataset, this one included. UserError when they may not mix."""
+    now, count = versions.generator(), len(folder.sealed()) if folder.root.is_dir() else 0
+    if not count:
+        return [now]
+    before: list[dict[str, str]] = folder.described().get("generators", [])
+    if now in before and (mix or len(before) == 1):
+        return before
+    if not mix:
+        last = before[-1] if before else {}
+        changes = [
+            f"{key} {last.get(key, 'unknown')}, now {now[key]}" for key in now if last.get(key) != now[key]
+        ]
+        what = "; ".join(changes) or "several versions"
+        raise UserError(
+            f"{folder.root}: its {count} sequences were made by another version of this program ({what}): "
+            "choose another folder, or --mix-versions to continue it all the same"
+        )
+    return [*before, now]
 
 
 def _changes(before: dict[str, Any], now: dict[str, Any], at: str = "") -> list[str]:

@@ -28,6 +28,15 @@ def of(job: Job) -> str:
     return hashlib.blake2b(canonical(described), digest_size=16).hexdigest()
 
 
+def anatomy(job: Job, seed: int) -> str:
+    """Which geometry a sequence shows, across datasets: a user's brain, or the seed of a procedural one.
+
+    A brain is one anatomy wherever it is opened and whatever vessels are drawn on it.
+    """
+    mesh = _digest(job.anatomy.mesh)
+    return f"seed-{seed}" if mesh is None else f"mesh-{mesh[:16]}"
+
+
 def _digest(path: Path | None) -> str | None:
     if path is None:
         return None

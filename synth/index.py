@@ -27,8 +27,11 @@ SCHEMA = pa.schema(
         pa.field("content_hash", pa.string(), metadata={"meaning": "hash of fields and attributes"}),
         pa.field(
             "anatomy",
-            pa.int64(),
-            metadata={"meaning": "sequences that share it belong on one side of a split"},
+            pa.string(),
+            metadata={
+                "meaning": "the geometry: a user's brain or a procedural one's seed, the same in every "
+                "dataset; sequences that share it belong on one side of a split"
+            },
         ),
         pa.field("family", pa.string(), metadata={"meaning": "appearance family"}),
         pa.field("gesture", pa.string(), metadata={"meaning": "kind of gesture"}),
@@ -71,7 +74,9 @@ def write(folder: Folder) -> list[dict[str, Any]]:
     """Brings the index up to date with the folder; rows that it has already are kept. Returns all rows."""
     known: dict[int, dict[str, Any]] = {}
     if (folder.root / NAME).exists():
-        known = {row["index"]: row for row in read(folder.root).to_pylist() if row["status"] == "done"}
+        table = read(folder.root)
+        rows_before = table.to_pylist() if table.schema.equals(SCHEMA) else []
+        known = {row["index"]: row for row in rows_before if row["status"] == "done"}
     rows = {key: known.get(key) or row_of(_open(folder, key)) for key in folder.sealed()}
     for key, failure in folder.failures().items():
         if key not in rows:
@@ -107,7 +112,7 @@ def row_of(sequence: Sequence) -> dict[str, Any]:
         "status": "done",
         "path": sequence.path.name,
         "content_hash": attrs["content_hash"],
-        "anatomy": scenario.get("anatomy"),
+        "anatomy": attrs.get("anatomy_id", str(scenario.get("anatomy"))),
         "family": scenario.get("family"),
         "gesture": gesture.get("kind"),
         "young_kpa": attrs.get("young_kpa"),

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from synth import brain, scenario
+from synth import brain, identity, scenario
 from synth.fem import mesh, solver, tool
 from synth.fem.mesh import Tets
 from synth.fem.solver import Deformation
@@ -92,6 +92,7 @@ def render_sequence(job: Job, index: int, folder: Path, report: Report) -> Path:
 
     return writer.seal(
         scenario=case.as_dict(),
+        anatomy_id=identity.anatomy(job, case.relief.seed),
         K=view.K.tolist(),
         distortion=view.distortion.tolist(),
         rotation=view.rotation.tolist(),

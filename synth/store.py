@@ -16,13 +16,12 @@ from zarr.codecs import BloscCodec, Crc32cCodec
 
 from synth import identity, place, versions
 from synth.errors import NotFinite, UserError
-from synth.fields import FIELDS, Field
+from synth.fields import FIELDS, FORMAT_VERSION, Field
 from synth.job import Job
 
 __all__ = ["FIELDS", "Column", "Dataset", "Field", "Sequence", "Writer", "open_sequence"]
 
 FORMAT = "sulcus-sequence"
-FORMAT_VERSION = 1
 
 # Raw bytes of one field that are held back and then written as one file: a shard, its chunks being frames.
 _SHARD_BYTES = 16 << 20
@@ -133,7 +132,7 @@ class Writer:
             **attributes,
             "summary": summary,
             "field_hashes": hashes,
-            "versions": versions.of_everything(),
+            "versions": {**versions.of_everything(), "generator": versions.fingerprint()},
         }
         attrs = json.loads(identity.canonical(attrs))
         attrs["content_hash"] = content_hash(attrs)

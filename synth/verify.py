@@ -173,7 +173,7 @@ def _dataset(folder: Folder, described: dict[str, Any], sealed: list[int]) -> It
         row = rows.get(key, {})
         differing = [name for name, value in now.items() if row.get(name) != value]
         yield truth(not differing, f"row {key} differs in {', '.join(differing)}", index.NAME)
-    leaking = split.leaks(list(rows.values()))
+    leaking = split.leaks(list(rows.values()), split.rule(folder.root))
     yield truth(not leaking, f"the split leaks: {'; '.join(leaking[:3])}", index.NAME)
     surplus = sorted(key for key, row in rows.items() if row["status"] == "done" and key not in sealed)
     yield truth(not surplus, f"rows without a sequence: {surplus[:3]}", index.NAME)

@@ -1,9 +1,14 @@
-"""Versions of what took part in making a sequence."""
+"""Versions of what took part in making a sequence, and one name for all that shapes its values."""
 
 from __future__ import annotations
 
+import ast
+import hashlib
+import json
 import platform
+from functools import cache
 from importlib import metadata
+from pathlib import Path
 
 _PACKAGES = (
     "sulcus",
@@ -15,6 +20,53 @@ _PACKAGES = (
     "torch",
     "zarr",
 )
+
+
+# What decides the values of a sequence, given its job and index; the rest runs, keeps and describes them.
+_CODE = ("pipeline.py", "scenario.py", "brain.py", "fem", "render", "flow")
+_COMPUTING = ("mitsuba", "drjit", "numpy", "scipy", "opencv-contrib-python-headless", "torch")
+
+
+@cache
+def generator() -> dict[str, str]:
+    """`{"format", "code", package: version}`: two sequences of a job are comparable when it is equal.
+
+    `code` is a hash of the program's own statements that make a sequence; comments, docstrings and layout
+    do not count.
+    """
+    from synth.fields import FORMAT_VERSION
+
+    here = Path(__file__).parent
+    total = hashlib.blake2b(digest_size=8)
+    for name in _CODE:
+        for path in sorted((here / name).rglob("*")) if (here / name).is_dir() else [here / name]:
+            if path.suffix == ".py":
+                total.update(f"{path.relative_to(here)}\n{_statements(path)}\n".encode())
+            elif path.suffix in (".pt", ".json", ".yaml", ".npz"):
+                total.update(path.read_bytes())
+    packages = {name: found for name, found in of_everything().items() if name in _COMPUTING}
+    return {"format": str(FORMAT_VERSION), "code": total.hexdigest(), **packages}
+
+
+def fingerprint() -> str:
+    """`generator()` in one word."""
+    described = json.dumps(generator(), sort_keys=True).encode()
+    return hashlib.blake2b(described, digest_size=8).hexdigest()
+
+
+def _statements(path: Path) -> str:
+    tree = ast.parse(path.read_text("utf-8"))
+    for node in ast.walk(tree):
+        body = getattr(node, "body", None)
+        if isinstance(body, list):
+            # Docstrings, under fields too.
+            node.body = [one for one in body if not _is_text(one)]  # type: ignore[attr-defined]
+    return ast.dump(tree)
+
+
+def _is_text(node: ast.AST) -> bool:
+    held = node.value if isinstance(node, ast.Expr) else None
+    return isinstance(held, ast.Constant) and isinstance(held.value, str)
 
 
 def of_everything() -> dict[str, str]:

@@ -45,8 +45,14 @@ def _serve(pipe: int, setup: dict[str, Any], logs: Path) -> None:
         log = logs / f"{index:06d}.log"
         _log_to(log)
         try:
+            if (Path(setup["folder"]) / f"{index:06d}.zarr").exists():
+                # An attempt that a cluster lost sight of had just sealed it.
+                log.unlink(missing_ok=True)
+                _send(pipe, sealed=index)
+                continue
             if work is None or job is None:
                 _send(pipe, stage="start", done=0, of=1)
+                _refuse_other_version(setup["generator"])
                 work, job = _work(setup["work"]), _job(setup["job"])
             work(job, index, Path(setup["folder"]), _reporter(pipe))
         except UserError as error:
@@ -66,6 +72,13 @@ def _serve(pipe: int, setup: dict[str, Any], logs: Path) -> None:
             log.unlink(missing_ok=True)
             _send(pipe, sealed=index)
         gc.collect()
+
+
+def _refuse_other_version(expected: str) -> None:
+    from synth import versions
+
+    if expected and versions.fingerprint() != expected:
+        raise UserError("the worker has another version of this program or its libraries than the engine")
 
 
 def _job(described: dict[str, Any]) -> Any:

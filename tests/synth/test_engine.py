@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import signal
+import threading
 from pathlib import Path
 
 import pytest
 from fake_run import Silent, options, start, wait_for
 
-from synth import engine, index
+from synth import engine, index, versions
+from synth.child import Child, Setup
 from synth.engine import Summary
 from synth.errors import UserError
 from synth.folder import Folder
@@ -53,6 +55,46 @@ def test_more_sequences_extend_and_fewer_are_refused(tmp_path: Path, undisturbed
     assert whole.content_hash == undisturbed
     with pytest.raises(UserError, match="holds 6 sequences"):
         run(tmp_path / "out", job=JOB.model_copy(update={"sequences": 3}))
+
+
+def test_another_versions_dataset_is_continued_only_when_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root = tmp_path / "out"
+    run(root, job=JOB.model_copy(update={"sequences": 2}))
+    newer = {**versions.generator(), "numpy": "99.0"}
+    monkeypatch.setattr(versions, "generator", lambda: newer)
+    with pytest.raises(UserError, match=r"2 sequences were made by another version .*numpy .*, now 99\.0"):
+        run(root)
+    assert run(root, mix_versions=True).done == 4
+    assert len(Folder(root).described()["generators"]) == 2
+    assert "Several versions" in (root / "README.md").read_text("utf-8")
+    monkeypatch.undo()
+    with pytest.raises(UserError, match="made by another version"):
+        run(root, job=JOB.model_copy(update={"sequences": 7}))
+
+
+def test_a_sequence_sealed_by_an_attempt_that_was_lost_is_not_made_again(tmp_path: Path) -> None:
+    run(tmp_path / "made", job=JOB.model_copy(update={"sequences": 1}))
+    setup = Setup(
+        job=JOB.model_dump(mode="json"),
+        folder=tmp_path / "made",
+        logs=tmp_path,
+        scratch=tmp_path,
+        work="no:such",
+    )
+    child = Child(setup)
+    try:
+        assert child.run(0, lambda *_: None, threading.Event()).kind == "done"
+    finally:
+        child.close()
+
+
+def test_comments_are_no_other_version_and_statements_are(tmp_path: Path) -> None:
+    file = tmp_path / "a.py"
+    texts = ['"""One."""\nx = 1\n', '"""Two."""\n\n# said\nx = 1\n"""Of x."""\n', '"""One."""\nx = 2\n']
+    first, remarked, changed = (versions._statements(file) for text in texts if file.write_text(text))
+    assert first == remarked != changed
 
 
 def test_trouble_costs_the_sequence_that_makes_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

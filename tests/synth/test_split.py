@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import pytest
 
-from synth import split
+from synth import identity, split
 from synth.errors import UserError
+from synth.job import Job
 from synth.split import Rule
 
 
@@ -93,3 +95,32 @@ def test_words_of_a_command_line() -> None:
     for by, shares in (("colour", "1,0,0"), ("family", "1,0"), ("family", "a,b,c")):
         with pytest.raises(UserError):
             split.parse(by, shares, [])
+
+
+def test_a_dataset_of_one_brain_is_split_within_it_only_when_told() -> None:
+    found = [{**row, "anatomy": "mesh-1"} for row in rows()]
+    with pytest.raises(UserError, match=r"1 groups by sequence: too few .*--share-anatomy"):
+        split.assign(found, Rule("sequence"))
+    rule = Rule("sequence", share_anatomy=True)
+    given = [{**row, "split": side} for row, side in zip(found, split.assign(found, rule), strict=True)]
+    assert set(split.count(given)) == set(split.SIDES)
+    assert not split.leaks(given, rule)
+    assert split.leaks(given)[0].startswith("anatomy mesh-1 is in")
+
+
+def test_a_held_out_family_in_training_is_a_leak() -> None:
+    found = [{**row, "split": "train"} for row in rows(anatomies=60)]
+    assert "family pale is held out and in train" in split.leaks(found, Rule(held_out=("pale",)))
+
+
+def test_sequences_on_one_users_brain_are_one_anatomy_in_every_dataset(tmp_path: Path) -> None:
+    brain, copy, other = (tmp_path / name for name in ("brain.obj", "copy.obj", "other.obj"))
+    for path, text in ((brain, "v 0 0 0"), (copy, "v 0 0 0"), (other, "v 0 0 1")):
+        path.write_text(text)
+
+    def name(mesh: Path, point: float, seed: int) -> str:
+        opening = {"point": (point, 0, 0), "direction": (0, 0, 1)}
+        return identity.anatomy(Job(anatomy={"mesh": mesh, "craniotomy": opening}), seed)  # type: ignore[arg-type]
+
+    assert name(brain, 0, 1) == name(copy, 5, 2) != name(other, 0, 1)
+    assert identity.anatomy(Job(), 1) != identity.anatomy(Job(), 2)
