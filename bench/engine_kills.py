@@ -46,6 +46,7 @@ def kills(
     job: Annotated[str, typer.Option(help="A job file or name, for all but its sequences.")] = "tiny",
     work: Annotated[str, typer.Option(help="What computes a sequence.")] = "bench.engine_work:sequence",
     frame_s: Annotated[float, typer.Option(help="Sleep a frame of the stand-in [s].")] = 0.25,
+    pause_s: Annotated[float, typer.Option(help="Longest wait between two kills [s].")] = 2.0,
     seed: Annotated[int, typer.Option(help="Of the kills.")] = 0,
     json: Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")] = False,
 ) -> None:
@@ -69,7 +70,7 @@ def kills(
                         shutil.rmtree(path)
                 run = _start(root, work, workers, described, again, frame_s)
                 starts += 1
-            time.sleep(float(rng.uniform(0.05, 2.0)))
+            time.sleep(float(rng.uniform(0.05, pause_s)))
             kind = list(victims)[int(rng.integers(3))]
             victims[kind] += _kill(run, kind, rng)
         if run is not None:
@@ -80,6 +81,8 @@ def kills(
         _start(calm, work, workers, described, "go on", 0.0).wait()
         checks = {check.name: check.good for check in verify.run(root).checks}
         result = {
+            "job": job,
+            "work": work,
             "sigkills": victims,
             "sequences": sequences,
             "starts": starts,
