@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from bench import fem_case, flow_plot, machine
+from bench import fem_case, fem_page, flow_plot, machine
 from synth.fem.equilibrium import InvertedElement, NoEquilibrium
 from synth.fem.laws import NUMBER
 from synth.job import Fem
@@ -49,7 +49,7 @@ def pareto(
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
         (out / "pareto.json").write_text(json_.dumps(found, indent=1) + "\n", "utf-8")
-        flow_plot.write(_panels(rows, laws), out, "Physics: error against cost")
+        fem_page.write(_panels(rows, laws), rows, found, "Physics: error against cost", out)
     if json:
         print(json_.dumps(found))
         return

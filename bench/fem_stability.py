@@ -14,7 +14,7 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
-from bench import fem_case, flow_plot, machine
+from bench import fem_case, fem_page, flow_plot, machine
 from synth import job
 from synth.errors import UserError
 from synth.fem import equilibrium, mesh, motion, skin, solver, tool
@@ -62,7 +62,7 @@ def stability(
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
         (out / "stability.json").write_text(json_.dumps(found, indent=1) + "\n", "utf-8")
-        flow_plot.write(_panels(rows), out, "Physics: where it breaks")
+        fem_page.write(_panels(rows), rows, found, "Physics: where it breaks", out)
     if json:
         print(json_.dumps(found))
         return
@@ -283,6 +283,8 @@ def _panels(rows: list[Row]) -> list[flow_plot.Panel]:
         "poisson": "Poisson's ratio",
         "size": "tetrahedra",
         "sliver": "height left",
+        "ramp": "steps to the peak",
+        "dt": "time step [s]",
     }
     panels = []
     for sweep, axis in axes.items():
