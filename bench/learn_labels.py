@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from learn.data import Clip, pack, unpack
 from learn.grid import Grid, Resampler, centre, settled
@@ -19,6 +21,8 @@ from synth.job import Job
 from synth.render import camera, rim, truth
 from synth.render.shape import Shape
 
+FINE = 128
+"""Cells along the edge of the grid that labels are made on, at least."""
 _VERSION = 2
 """Of what is packed: a change of the labels makes another cache."""
 
@@ -26,16 +30,46 @@ _VERSION = 2
 def clips(
     job: Job, grid: Grid, cache: Path, report: Callable[[int, int], None] = lambda done, of: None
 ) -> list[Clip]:
-    """All sequences of a job with ideal flow, from the cache where it has them."""
+    """All sequences of a job with ideal flow on a grid of 64², 128² or 256² cells, cached.
+
+    Labels are made on 128² or finer; 64² is four cells of that in one.
+    """
+    fine = grid if grid.size >= FINE else Grid(FINE, grid.extent_mm)
     out = []
     for index in range(job.sequences):
         report(index, job.sequences)
-        name = _key(job, index, grid)
-        if not (cache / name).is_dir():
-            pack(clip(job, index, grid, name), cache / name)
-        out.append(unpack(cache / name))
+        name = _key(job, index, fine)
+        folder = cache / name
+        if not folder.is_dir():
+            pack(clip(job, index, fine, name), folder)
+        if grid.size < fine.size:
+            folder = cache / f"{name}-{grid.size}"
+            if not folder.is_dir():
+                pack(coarser(unpack(cache / name), fine, fine.size // grid.size), folder)
+        out.append(unpack(folder))
     report(job.sequences, job.sequences)
     return out
+
+
+def coarser(clip: Clip, grid: Grid, times: int) -> Clip:
+    """The clip on a grid of `times` wider cells: mean displacement of a cell's tissue, all of its force."""
+
+    def blocks(values: NDArray[np.float32]) -> NDArray[np.float32]:
+        n = grid.size // times
+        pooled: NDArray[np.float32] = values.reshape(*values.shape[:-2], n, times, n, times).mean((-3, -1))
+        return pooled
+
+    cover = blocks(np.asarray(clip.mask))
+    mask = (cover > 0.5).astype(np.float32)
+    share = np.where(mask > 0, cover, 1)
+    density = blocks(np.asarray(clip.density))
+    return replace(
+        clip,
+        mask=mask,
+        displacement={k: blocks(np.asarray(v)) / share * mask for k, v in clip.displacement.items()},
+        confidence=blocks(np.asarray(clip.confidence)),
+        density=np.stack([settled(d, mask) for d in density]),
+    )
 
 
 def _key(job: Job, index: int, grid: Grid) -> str:

@@ -99,7 +99,8 @@ def apply(predictor: Predictor, motion: Motion, young_kpa: float | None = None) 
     """Force of every frame of a film, ready for np.savez.
 
     `young_kpa` overrides the film's own. Returns `density` (T, C, N, N) mN/mm², `total_force_mn` (T,),
-    `force_mn` (T, 3) for a model that gives direction, `mask` (N, N), `pitch_mm`, `centre_px` (x, y),
+    `force_mn` (T, 3) for a model that gives direction, `head_mn` (T, C) for one with a total-force head,
+    `mask` (N, N), `pitch_mm`, `centre_px` (x, y),
     `young_kpa`, `young_known`.
     """
     young = young_kpa if young_kpa is not None else motion.young_kpa
@@ -127,4 +128,6 @@ def apply(predictor: Predictor, motion: Motion, young_kpa: float | None = None) 
     }
     if density.shape[1] == 3:
         out["force_mn"] = density.astype(np.float64).sum((2, 3)) * predictor.grid.pitch_mm**2
+    if maps[0].head_mn is not None:
+        out["head_mn"] = np.stack([m.head_mn for m in maps])
     return out

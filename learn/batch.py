@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from learn.data import Clip, sources, target
+from learn.data import Clip, amount, sources, target
 from learn.grid import Scales, channels, divergence
 from learn.settings import Settings
 from synth.errors import UserError
@@ -28,6 +28,8 @@ class Batch:
     """(B, 1, N, N) 0..1."""
     target: Tensor
     """(B, C, N, N) in the unit of `Scales.target`."""
+    force: Tensor
+    """(B, C) total force [mN at E = 1 kPa]."""
     log_young: Tensor
     """(B, 1) ln(E / 1 kPa)."""
 
@@ -64,6 +66,8 @@ class Frames:
 
     def __init__(self, clips: Sequence[Clip], settings: Settings) -> None:
         self.clips, self.settings = list(clips), settings
+        parts, pitch = settings.arch.components, settings.grid.pitch_mm
+        self.force = [amount(c, settings.target, parts, pitch).astype(np.float32) for c in self.clips]
         self.sources = sources(settings.input)
         if not self.clips:
             raise UserError("no sequence to take frames from")
@@ -101,6 +105,7 @@ class Frames:
             "mask": [],
             "confidence": [],
             "target": [],
+            "force": [],
         }
         for c, t, source, turn in items:
             clip, how = self.clips[c], (turn % 4, turn >= 4)
@@ -110,6 +115,7 @@ class Frames:
             columns["mask"].append(turned(clip.mask[None], *how))
             columns["confidence"].append(turned(np.asarray(confidence)[None], *how))
             columns["target"].append(turned(truth, *how))
+            columns["force"].append(turned(self.force[c][t][:, None, None], *how)[:, 0, 0])
         young = [[np.log(self.clips[c].young_kpa)] for c, *_ in items]
         return Batch(
             **{k: torch.from_numpy(np.stack(v)) for k, v in columns.items()},
@@ -136,7 +142,8 @@ def measure_scales(clips: Sequence[Clip], settings: Settings, frames: int = 16) 
             wanted.append(np.linalg.norm(truth, axis=0)[inside])
             squares += float(np.square(truth[:, inside], dtype=np.float64).sum())
             cells += float(inside.sum() * len(truth))
-        force.append(np.linalg.norm(clip.force, axis=1) / clip.young_kpa)
+        total = amount(clip, settings.target, settings.arch.components, settings.grid.pitch_mm)
+        force.append(np.linalg.norm(total, axis=1))
     found = tuple(float(np.percentile(np.concatenate(v), 99.9)) for v in (moved, strain, wanted, force))
     if min(found) <= 0:
         raise UserError("the training sequences hold no motion or no force: there is nothing to learn")

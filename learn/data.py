@@ -205,6 +205,24 @@ def target(clip: Clip, frame: int, kind: Target, components: int) -> NDArray[np.
     return length
 
 
+def amount(clip: Clip, kind: Target, components: int, pitch_mm: float) -> NDArray[np.float64]:
+    """(T, C) total force that a map of this kind can be held to [mN at E = 1 kPa].
+
+    A vector map adds up to the force on the tissue, and an intensity map peaks at its size. A map of lengths
+    knows no direction: two jaws that pull against each other add up in it, so it is held to the sum of
+    lengths
+    (C = 1), which is the force's size where all of it points one way.
+    """
+    if components == 3:
+        return clip.force / clip.young_kpa
+    if kind == "intensity":
+        size: NDArray[np.float64] = np.linalg.norm(clip.force, axis=1, keepdims=True) / clip.young_kpa
+        return size
+    length = np.sqrt(np.square(np.asarray(clip.density), dtype=np.float64).sum(1))
+    total: NDArray[np.float64] = length.sum((1, 2))[:, None] * pitch_mm**2
+    return total
+
+
 def typical_young(clips: Iterable[Clip]) -> float:
     """Geometric mean of E over sequences [kPa]: the best guess when a recording's E is unknown."""
     return float(np.exp(np.mean([np.log(c.young_kpa) for c in clips])))

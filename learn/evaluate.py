@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from learn.checkpoint import Card
-from learn.data import Clip, target
+from learn.data import Clip, amount, target
 from learn.grid import Grid
 from learn.metrics import Moments, agreement, contact_mm, ghost_share, line
 from learn.predict import Predictor, length, total_force
+from learn.statistics import Interval, interval
 from synth.errors import UserError
 
 GHOST_MN = 5.0
@@ -26,10 +27,9 @@ FREE = 0.01
 LOW = 0.05
 """A frame is of low force, and an answer above this is a ghost by the relative rule, at this share."""
 YOUNG = ("known", "half", "double", "unknown")
-"""Columns: E as it is, taken ×½, taken ×2, and not known at all (the training data's typical value)."""
-
-Answer = Callable[[Clip], NDArray[np.float32]]
-"""Gives (T, C, N, N) force density [mN/mm²] (or intensity [mN]) of a clip, with its true E."""
+"""Columns: E as it is, taken ×½, taken ×2, and not known at all (the training data's typical value). A
+further
+column, `press`, is there where E was estimated from a calibration press (`learn.calibrate`)."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class ClipScore:
     vector: Moments | None
     """Over tissue cells and components, for a model that gives direction."""
     true_mn: NDArray[np.float64]
-    """(T,) size of the total force."""
+    """(T,) size of the total force; for a map of lengths the sum of lengths (`learn.data.amount`)."""
     said_mn: NDArray[np.float64]
     vector_error_mn: NDArray[np.float64] | None
     """(T,) length of the total force's error."""
@@ -57,10 +57,14 @@ class ClipScore:
     """Median distance between true and said centre of the contact, over frames that aren't low [mm]."""
     low_over_mn: float
     """Mean over-prediction of the total force in low-force frames [mN]."""
+    head_error_mn: NDArray[np.float64] | None = None
+    """(T,) length of the error of the total-force head."""
 
 
-def score(clip: Clip, said: NDArray[np.float32], card: Card) -> ClipScore:
-    """Scores the answer to one sequence. `said`: (T, C, N, N), physical, at the clip's true E."""
+def score(
+    clip: Clip, said: NDArray[np.float32], card: Card, head: NDArray[np.float64] | None = None
+) -> ClipScore:
+    """Scores the answer to one sequence. `said`: (T, C, N, N), physical; `head`: (T, C) mN of such a head."""
     grid, kind, parts = card.settings.grid, card.settings.target, said.shape[1]
     young = clip.young_kpa
     true = np.stack([target(clip, t, kind, parts) for t in range(clip.frames)]) * np.float32(young)
@@ -69,7 +73,8 @@ def score(clip: Clip, said: NDArray[np.float32], card: Card) -> ClipScore:
     unit = card.scales.target * young
     free = inside & (true_len < FREE * unit)
     said_mn = total_force(said, kind, grid)
-    true_mn: NDArray[np.float64] = np.linalg.norm(clip.force, axis=1)
+    whole = amount(clip, kind, parts, grid.pitch_mm) * young
+    true_mn: NDArray[np.float64] = np.linalg.norm(whole, axis=1)
     low = true_mn < LOW * card.scales.force * young
     as_force = 1.0 if kind == "intensity" else PATCH_MM2
     vector, vector_error = None, None
@@ -96,6 +101,7 @@ def score(clip: Clip, said: NDArray[np.float32], card: Card) -> ClipScore:
         stray_mn=float((said_len * free).sum((1, 2)).mean() * _cell(kind, grid)),
         localisation_mm=float(np.median(distance)) if distance else math.nan,
         low_over_mn=float(np.maximum(said_mn - true_mn, 0)[low].mean()) if low.any() else math.nan,
+        head_error_mn=None if head is None else np.linalg.norm(head - whole, axis=1),
     )
 
 
@@ -105,39 +111,39 @@ def _cell(kind: str, grid: Grid) -> float:
 
 @dataclass(frozen=True)
 class Report:
-    """A model's scores over sequences."""
+    """A model's scores over sequences, once for every state of knowledge of E."""
 
-    clips: list[ClipScore]
+    columns: dict[str, list[ClipScore]]
     card: Card
 
-    def per_clip(self) -> list[dict[str, float]]:
+    @property
+    def clips(self) -> list[ClipScore]:
+        """With E known."""
+        return self.columns["known"]
+
+    def per_clip(self, young: str = "known") -> list[dict[str, float]]:
         """One row a sequence, plain numbers."""
-        return [_row(c, 1.0) for c in self.clips]
+        if young not in self.columns:
+            raise UserError(f"unknown E column {young!r}: one of {', '.join(self.columns)}")
+        return [_row(c) for c in self.columns[young]]
 
     def summary(self, young: str = "known") -> dict[str, float]:
         """Mean over sequences of every per-sequence number, and pooled R² (`*_pooled`), in one E column."""
-        rows = [_row(c, self.factor(c, young)) for c in self.clips]
+        rows, clips = self.per_clip(young), self.columns[young]
         out = {k: _mean([r[k] for r in rows]) for k in rows[0]}
-        maps, forces = Moments(), Moments()
-        for c in self.clips:
-            f = self.factor(c, young)
-            maps = maps + _scaled(c.map, f)
-            forces = forces + Moments.of(c.true_mn, c.said_mn * f)
-        out["map_r2_pooled"] = agreement(maps).r2
-        out["force_r2_pooled"] = agreement(forces).r2
-        true = np.concatenate([c.true_mn for c in self.clips])
-        said = np.concatenate([c.said_mn * self.factor(c, young) for c in self.clips])
+        out["map_r2_pooled"] = agreement(sum((c.map for c in clips), Moments())).r2
+        out["unit_map_r2_pooled"] = agreement(sum((c.map.over(c.young_kpa) for c in clips), Moments())).r2
+        true = np.concatenate([c.true_mn for c in clips])
+        said = np.concatenate([c.said_mn for c in clips])
+        out["force_r2_pooled"] = agreement(Moments.of(true, said)).r2
         out["calibration_slope"], out["calibration_offset_mn"] = line(said, true)
         return out
 
-    def factor(self, clip: ClipScore, young: str) -> float:
-        """What a wrong E multiplies the answer by: the answer is proportional to the E it is given."""
-        known = {"known": 1.0, "half": 0.5, "double": 2.0}
-        if young == "unknown":
-            return self.card.typical_young_kpa / clip.young_kpa
-        if young not in known:
-            raise UserError(f"unknown E column {young!r}: one of {', '.join(YOUNG)}")
-        return known[young]
+    def intervals(self, young: str = "known", seed: int = 0) -> dict[str, Interval]:
+        """Mean and BCa bootstrap interval over sequences of every per-sequence number."""
+        rows = self.per_clip(young)
+        rng = np.random.default_rng(seed)
+        return {k: interval(np.array([r[k] for r in rows]), rng) for k in rows[0]}
 
     def bands(self) -> list[dict[str, float]]:
         """Errors of the total force in four bands of true force, as shares of the training data's largest."""
@@ -163,10 +169,9 @@ class Report:
     def as_dict(self) -> dict[str, object]:
         """JSON-ready; NaN as null."""
         return {
-            "sequences": [
-                {"name": c.name, "young_kpa": c.young_kpa, **_plain(_row(c, 1.0))} for c in self.clips
-            ],
-            "columns": {young: _plain(self.summary(young)) for young in YOUNG},
+            "sequences": [{"name": c.name, "young_kpa": c.young_kpa, **_plain(_row(c))} for c in self.clips],
+            "columns": {young: _plain(self.summary(young)) for young in self.columns},
+            "intervals": {k: _plain({"low": i.low, "high": i.high}) for k, i in self.intervals().items()},
             "bands": [_plain(b) for b in self.bands()],
             "scales": asdict(self.card.scales),
             "definitions": {
@@ -179,27 +184,20 @@ class Report:
         }
 
 
-def _row(c: ClipScore, factor: float) -> dict[str, float]:
-    map_, force = agreement(_scaled(c.map, factor)), agreement(Moments.of(c.true_mn, c.said_mn * factor))
-    row = {f"map_{k}": v for k, v in asdict(map_).items()}
-    row |= {f"force_{k}": v for k, v in asdict(force).items()}
+def _row(c: ClipScore) -> dict[str, float]:
+    row = {f"map_{k}": v for k, v in asdict(agreement(c.map)).items()}
+    row |= {f"force_{k}": v for k, v in asdict(agreement(Moments.of(c.true_mn, c.said_mn))).items()}
     if c.vector is not None:
-        row["vector_r2"] = agreement(_scaled(c.vector, factor)).r2
-    if factor == 1.0:
-        if c.vector_error_mn is not None:
-            row["vector_error_mn"] = float(c.vector_error_mn.mean())
-        peak = float(c.true_mn.max())
-        row["peak_error_share"] = abs(float(c.said_mn.max()) - peak) / peak if peak > 0 else math.nan
-        for name in ("ghost", "ghost_relative", "stray_mn", "localisation_mm", "low_over_mn"):
-            row[name] = getattr(c, name)
+        row["vector_r2"] = agreement(c.vector).r2
+    if c.vector_error_mn is not None:
+        row["vector_error_mn"] = float(c.vector_error_mn.mean())
+    if c.head_error_mn is not None:
+        row["head_error_mn"] = float(c.head_error_mn.mean())
+    peak = float(c.true_mn.max())
+    row["peak_error_share"] = abs(float(c.said_mn.max()) - peak) / peak if peak > 0 else math.nan
+    for name in ("ghost", "ghost_relative", "stray_mn", "localisation_mm", "low_over_mn"):
+        row[name] = getattr(c, name)
     return row
-
-
-def _scaled(m: Moments, factor: float) -> Moments:
-    """Moments of (true, factor × said). Absolute errors don't scale: their sum is NaN unless factor is 1."""
-    if factor == 1.0:
-        return m
-    return Moments(m.n, m.t, m.p * factor, m.tt, m.pp * factor**2, m.tp * factor, math.nan)
 
 
 def _mean(values: Sequence[float]) -> float:
@@ -216,24 +214,51 @@ def evaluate(
     clips: Sequence[Clip],
     source: str,
     report: Callable[[int, int], None] = lambda done, of: None,
+    pressed: Mapping[str, float] | None = None,
 ) -> Report:
-    """Scores a model on clips, with displacement from `source` (`ideal` or `recovered`)."""
+    """Scores a model on clips, with displacement from `source` (`ideal` or `recovered`).
+
+    `pressed`: E [kPa] of each clip by its content hash, as a calibration press found it; gives the column
+    `press`.
+    """
     if not clips:
         raise UserError("no sequence to evaluate on")
-    scores = []
+    columns: dict[str, list[ClipScore]] = {}
     for i, clip in enumerate(clips):
         report(i, len(clips))
         if source not in clip.displacement:
             raise UserError(f"{clip.name}: holds no {source} flow")
-        said = predictor.density(
-            np.asarray(clip.displacement[source]),
-            clip.mask,
-            clip.young_kpa,
-            np.asarray(clip.confidence) if source == "recovered" else None,
-        )
-        scores.append(score(clip, said, predictor.card))
+        taken = {"known": 1.0, "half": 0.5, "double": 2.0}
+        young = {name: clip.young_kpa * factor for name, factor in taken.items()}
+        young["unknown"] = predictor.card.typical_young_kpa
+        if pressed is not None:
+            young["press"] = pressed[clip.content_hash]
+        for name, (said, head) in _answers(predictor, clip, source, young).items():
+            columns.setdefault(name, []).append(score(clip, said, predictor.card, head))
     report(len(clips), len(clips))
-    return Report(scores, predictor.card)
+    return Report(columns, predictor.card)
+
+
+Answer = tuple[NDArray[np.float32], NDArray[np.float64] | None]
+
+
+def _answers(predictor: Predictor, clip: Clip, source: str, young: Mapping[str, float]) -> dict[str, Answer]:
+    """What the model says for each E it may be given.
+
+    The answer is proportional to E, so one pass does for all, unless E also conditions the network.
+    """
+
+    def ask(given: float) -> Answer:
+        sure = np.asarray(clip.confidence) if source == "recovered" else None
+        return predictor.answer(np.asarray(clip.displacement[source]), clip.mask, given, sure)
+
+    if predictor.card.settings.arch.condition == "film":
+        return {name: ask(given) for name, given in young.items()}
+    said, head = ask(1.0)
+    return {
+        name: (said * np.float32(given), None if head is None else head * given)
+        for name, given in young.items()
+    }
 
 
 def unseen(clips: Sequence[Clip], card: Card) -> list[Clip]:

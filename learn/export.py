@@ -36,13 +36,16 @@ class Portable(nn.Module):
         super().__init__()
         self.model, self.card = model, card
 
-    def forward(self, displacement: Tensor, mask: Tensor, *extra: Tensor) -> Tensor:
+    def forward(self, displacement: Tensor, mask: Tensor, *extra: Tensor) -> Tensor | tuple[Tensor, Tensor]:
         arch, more = self.card.settings.arch, list(extra)
         confidence = more.pop(0) if arch.confidence else None
         log_young = more.pop(0) if arch.condition == "film" else None
         x = channels(displacement, mask, self.card.settings.grid.pitch_mm, self.card.scales, confidence)
-        y: Tensor = self.model(x, log_young)
-        return y * self.card.scales.target
+        said = self.model(x, log_young)
+        if arch.total:
+            return said[0] * self.card.scales.target, said[1] * self.card.scales.force
+        y: Tensor = said * self.card.scales.target
+        return y
 
 
 def names(card: Card) -> list[str]:

@@ -5,6 +5,13 @@ Everything here is in physical units. Prediction and target are force density at
 percentile, says what a low force is; `spread`, its root mean square over tissue cells, is what errors are
 divided by. The squared-error and the R² term then are of one size and their weights mean what they say. (In
 the published code the squared error is in (3 N)², about 1e-4, and R² takes nearly all of the gradient.)
+
+Why another loss against ghosts (`hinge`): a squared price, times three or not, fades with the ghost itself,
+so
+it moves large ghosts a little and small ones not at all. The hinge's price is linear: where the best guess in
+the mean would be q (in `spread`s) on tissue that is free with probability p, it says q − p·weight/2, or
+nothing.
+Cells that are surely in contact (p = 0) aren't touched, which is why R² need not pay for it.
 """
 
 from __future__ import annotations
@@ -17,13 +24,20 @@ from torch import Tensor
 
 from synth.errors import UserError
 
-Kind = Literal["antighost", "mse", "mae", "huber", "published"]
-KINDS = ("antighost", "mse", "mae", "huber", "published")
+Kind = Literal["antighost", "hinge", "mse", "mae", "huber", "published"]
+KINDS = ("antighost", "hinge", "mse", "mae", "huber", "published")
 
 
 @dataclass(frozen=True)
 class Objective:
-    """Which loss, and its weights."""
+    """Which loss, and its weights.
+
+    `antighost` (squared error, dearer where a low force is over-predicted, and R²), `hinge` (squared error,
+    R²
+    and a linear price of force on contact-free tissue), `published` (as `antighost`, with the published
+    code's R²
+    that is blind to bias), `mse`, `mae`, `huber`.
+    """
 
     kind: Kind = "antighost"
     r2_weight: float = 0.3
@@ -35,14 +49,27 @@ class Objective:
     rule: Literal["pixel", "frame"] = "pixel"
     """`pixel`: low where the pixel's own force is; `frame`: in frames whose mean over the tissue is, as
     the published code has it (true for nearly every frame: a contact covers little of the picture)."""
+    stray_weight: float = 1.0
+    """`hinge`: price of the mean force density on contact-free tissue [mN/mm²], in units of `spread`."""
+    free: float = 0.01
+    """`hinge`: tissue is contact-free where its true density is under this share of `unit`."""
     total_weight: float = 0.0
-    """Weight of the squared error of the frame's total force, in units of the training data's largest."""
+    """Weight of the squared error of the map's total force, in units of the training data's largest."""
+    head_weight: float = 0.3
+    """The same of the total-force head, for a network that has one."""
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
             raise UserError(f"unknown loss {self.kind!r}: one of {', '.join(KINDS)}")
-        if not (0 <= self.r2_weight <= 1 and self.ghost_weight >= 0 and self.low >= 0):
-            raise UserError("loss weights: r2_weight in 0..1, ghost_weight and low not negative")
+        weights = ("ghost_weight", "low", "stray_weight", "free", "total_weight", "head_weight")
+        if not (0 <= self.r2_weight <= 1 and all(getattr(self, w) >= 0 for w in weights)):
+            raise UserError("loss weights: r2_weight in 0..1, the others not negative")
+        if self.rule not in ("pixel", "frame"):
+            raise UserError(f"unknown low-force rule {self.rule!r}: pixel or frame")
+
+
+SHARES = ("error", "r2", "ghost", "total")
+"""The terms that act on the map."""
 
 
 @dataclass(frozen=True)
@@ -51,11 +78,13 @@ class Terms:
 
     error: Tensor
     r2: Tensor
+    ghost: Tensor
     total: Tensor
+    head: Tensor
 
     @property
     def sum(self) -> Tensor:
-        return self.error + self.r2 + self.total
+        return self.error + self.r2 + self.ghost + self.total + self.head
 
 
 def loss(
@@ -67,11 +96,14 @@ def loss(
     spread: float,
     cell_mm2: float = 1.0,
     force_unit: float = 1.0,
+    totals: tuple[Tensor, Tensor] | None = None,
 ) -> Terms:
     """The objective over all masked cells of a batch.
 
     `prediction`, `target`: (B, C, N, N) mN/mm² at 1 kPa; `mask`: (B, 1, N, N) 0/1; `unit`, `spread`: the same
-    unit; `cell_mm2`: area of a cell; `force_unit`: mN at 1 kPa. Raises UserError if the mask is empty.
+    unit; `cell_mm2`: area of a cell; `force_unit`: mN at 1 kPa; `totals`: (B, C) of the total-force head
+    and its
+    truth, mN at 1 kPa. Raises UserError if the mask is empty.
     """
     cells = mask.sum()
     if cells == 0:
@@ -90,18 +122,36 @@ def loss(
             0.0,
         )
     else:
-        weight = ghost_weights(prediction, target, mask, objective, unit)
+        dear = objective.kind != "hinge"
+        weight = ghost_weights(prediction, target, mask, objective, unit) if dear else 1.0
         fit, share = (squared * weight).sum() / count, objective.r2_weight
     r2 = zero
     if share > 0:
         r2 = unexplained(prediction, target, mask, spread, bias_blind=objective.kind == "published")
         if objective.kind == "published":
             r2 = r2.clamp(max=1.0)
-    total = zero
+    ghost = zero
+    if objective.kind == "hinge":
+        ghost = objective.stray_weight * stray(prediction, target, mask, objective.free * unit) / spread
+    total, head = zero, zero
     if objective.total_weight > 0:
         gap = ((prediction - target) * mask).sum((2, 3)) * cell_mm2 / force_unit
         total = objective.total_weight * gap.square().sum(1).mean()
-    return Terms((1 - share) * fit, share * r2, total)
+    if totals is not None:
+        said, true = totals
+        head = objective.head_weight * ((said - true) / force_unit).square().sum(1).mean()
+    return Terms((1 - share) * fit, share * r2, ghost, total, head)
+
+
+def stray(prediction: Tensor, target: Tensor, mask: Tensor, free: float) -> Tensor:
+    """Mean over tissue of the force density said where the true one is under `free`; unit of `prediction`.
+
+    `prediction`, `target`: (B, C, N, N); `mask`: (B, 1, N, N) 0/1. Times the tissue's area it is the force
+    [mN at
+    1 kPa] that the answer puts where nothing touches.
+    """
+    loose = mask * (_length(target) < free)
+    return (_length(prediction).abs() * loose).sum() / mask.sum()
 
 
 def ghost_weights(
@@ -141,12 +191,13 @@ def unexplained(
 
 
 def gradient_shares(terms: Terms, prediction: Tensor) -> dict[str, float]:
-    """How much of the gradient on the prediction each term gives: norms over their sum.
+    """How much of the gradient on the map each of its terms gives: norms over their sum.
 
     Must be called before `backward` frees the graph.
     """
     norms: dict[str, float] = {}
-    for name, term in (("error", terms.error), ("r2", terms.r2), ("total", terms.total)):
+    for name in SHARES:
+        term = getattr(terms, name)
         if term.requires_grad:
             (g,) = torch.autograd.grad(term, prediction, retain_graph=True, allow_unused=True)
             norms[name] = 0.0 if g is None else float(g.norm())
@@ -158,4 +209,7 @@ def gradient_shares(terms: Terms, prediction: Tensor) -> dict[str, float]:
 
 def _length(values: Tensor) -> Tensor:
     """(B, C, …) → (B, 1, …): the value itself for one component, else the vector's length."""
-    return values if values.shape[1] == 1 else torch.linalg.vector_norm(values, dim=1, keepdim=True)
+    if values.shape[1] == 1:
+        return values
+    # A little inside the root: the gradient of a length at zero is not a number.
+    return (values.square().sum(1, keepdim=True) + 1e-20).sqrt()

@@ -38,6 +38,13 @@ class Moments:
     def __add__(self, other: Moments) -> Moments:
         return Moments(*(getattr(self, f.name) + getattr(other, f.name) for f in fields(self)))
 
+    def over(self, unit: float) -> Moments:
+        """Of the same pairs, both divided by `unit`."""
+        u, u2 = 1 / unit, 1 / unit**2
+        return Moments(
+            self.n, self.t * u, self.p * u, self.tt * u2, self.pp * u2, self.tp * u2, self.absolute * u
+        )
+
 
 @dataclass(frozen=True)
 class Agreement:

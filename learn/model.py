@@ -43,6 +43,8 @@ class Architecture:
     dropout: float = 0.1
     confidence: bool = False
     """Whether a sixth channel holds the flow's confidence."""
+    total: bool = False
+    """Whether a further head reads the total force from the bottleneck, also what lies beyond the grid."""
     condition: Literal["none", "film"] = "none"
     """`film`: Young's modulus modulates the bottleneck (feature-wise affine; Perez et al. 2018)."""
 
@@ -155,8 +157,26 @@ class Heads(nn.Module):
         return sum((r * weights[:, i : i + 1] for i, r in enumerate(readings)), torch.zeros_like(readings[0]))
 
 
+class Total(nn.Module):
+    """Total force from the bottleneck's mean features: its components, or its size if there is one."""
+
+    def __init__(self, channels: int, components: int) -> None:
+        super().__init__()
+        self.body = nn.Sequential(
+            nn.Linear(channels, channels // 4), nn.ReLU(), nn.Linear(channels // 4, components)
+        )
+        self.signed = components > 1
+
+    def forward(self, x: Tensor) -> Tensor:
+        y: Tensor = self.body(x.mean(dim=(2, 3)))
+        return y if self.signed else F.softplus(y)
+
+
 class D2FNet(nn.Module):
-    """(B, 5|6, N, N) channels → (B, 1|3, N, N) force map in units of `Scales.target`, 0 outside the mask."""
+    """(B, 5|6, N, N) channels → (B, 1|3, N, N) force map in units of `Scales.target`, 0 outside the mask.
+
+    With `arch.total` a pair: the map and (B, 1|3) total force in units of `Scales.force`.
+    """
 
     def __init__(self, arch: Architecture) -> None:
         super().__init__()
@@ -174,6 +194,7 @@ class D2FNet(nn.Module):
         )
         self.bottom = Block(widths[-2], widths[-1], arch.dropout, full)
         self.pyramid = Pyramid(widths[-1]) if full else nn.Identity()
+        self.total = Total(widths[-1], arch.components) if arch.total else None
         self.film = nn.Linear(1, 2 * widths[-1]) if arch.condition == "film" else None
         self.up = nn.ModuleList(
             nn.ConvTranspose2d(a, b, 2, stride=2) for a, b in zip(widths[:0:-1], widths[-2::-1], strict=True)
@@ -190,7 +211,7 @@ class D2FNet(nn.Module):
             nn.init.zeros_(self.film.weight)
             nn.init.zeros_(self.film.bias)
 
-    def forward(self, x: Tensor, log_young: Tensor | None = None) -> Tensor:
+    def forward(self, x: Tensor, log_young: Tensor | None = None) -> Tensor | tuple[Tensor, Tensor]:
         """`log_young`: (B, 1) ln(E / 1 kPa), used only by a `film` network."""
         mask = x[:, 3:4]
         h = self.stem(x)
@@ -205,12 +226,13 @@ class D2FNet(nn.Module):
                 raise UserError("this model is conditioned on Young's modulus: give young_kpa")
             gain, shift = self.film(log_young)[..., None, None].chunk(2, dim=1)
             h = h * (1 + gain) + shift
+        total = None if self.total is None else self.total(h)
         for rise, block, skip in zip(self.up, self.merge, reversed(skips), strict=True):
             h = block(torch.cat([rise(h), skip], dim=1))
         y: Tensor = self.heads(h)
         if self.arch.stem > 1:
             y = F.interpolate(y, scale_factor=float(self.arch.stem), mode="bilinear", align_corners=False)
-        return y * mask
+        return y * mask if total is None else (y * mask, total)
 
 
 def _start(module: nn.Module) -> None:

@@ -30,6 +30,8 @@ class ForceMap:
     """Young's modulus the numbers rest on: the one given, else the training data's typical one."""
     young_known: bool
     view: View
+    head_mn: NDArray[np.float64] | None = None
+    """(C,) total force [mN] of a network with a total-force head, forces beyond the grid included."""
 
     @property
     def magnitude(self) -> NDArray[np.float32]:
@@ -132,10 +134,12 @@ class Predictor:
         moved = view.resample.mean(flow.transpose(2, 0, 1) * view.resample.scale_mm_per_px, view.tissue)
         sure = None if confidence is None else view.resample.mean(confidence, view.tissue)[None]
         young = young_kpa or self.card.typical_young_kpa
-        density = self.density(moved[None], view.mask, young, sure)[0]
-        return ForceMap(density, self.grid, self.card.settings.target, young, young_kpa is not None, view)
+        density, total = self.answer(moved[None], view.mask, young, sure)
+        head = None if total is None else total[0]
+        return ForceMap(
+            density[0], self.grid, self.card.settings.target, young, young_kpa is not None, view, head
+        )
 
-    @torch.inference_mode()
     def density(
         self,
         displacement: NDArray[np.float32],
@@ -143,10 +147,22 @@ class Predictor:
         young_kpa: float,
         confidence: NDArray[np.float32] | None = None,
     ) -> NDArray[np.float32]:
-        """Force density of frames already on the grid.
+        """The maps of `answer` alone."""
+        return self.answer(displacement, mask, young_kpa, confidence)[0]
+
+    @torch.inference_mode()
+    def answer(
+        self,
+        displacement: NDArray[np.float32],
+        mask: NDArray[np.float32],
+        young_kpa: float,
+        confidence: NDArray[np.float32] | None = None,
+    ) -> tuple[NDArray[np.float32], NDArray[np.float64] | None]:
+        """Force density of frames already on the grid, and their total force if the network has that head.
 
         `displacement`: (T, 2, N, N) mm; `mask`: (N, N) 0/1; `confidence`: (T, N, N). Returns (T, C, N, N)
-        mN/mm² at `young_kpa`. Raises UserError for another grid, or displacement that isn't finite.
+        mN/mm² at `young_kpa` and (T, C) mN or None. Raises UserError for another grid, or displacement that
+        isn't finite.
         """
         n, settings, scales = self.grid.size, self.card.settings, self.card.scales
         if displacement.ndim != 4 or displacement.shape[1:] != (2, n, n):
@@ -156,7 +172,7 @@ class Predictor:
             )
         if not np.isfinite(displacement).all():
             raise UserError("displacement holds NaN or infinity")
-        out = []
+        maps, totals = [], []
         for start in range(0, len(displacement), settings.batch):
             u = torch.from_numpy(np.array(displacement[start : start + settings.batch])).to(self.device)
             m = torch.from_numpy(np.array(mask)).to(self.device).expand(len(u), 1, n, n)
@@ -168,9 +184,12 @@ class Predictor:
                     sure = torch.from_numpy(part)[:, None].to(self.device)
             log_young = torch.full((len(u), 1), float(np.log(young_kpa)), device=self.device)
             said = self.model(channels(u, m, self.grid.pitch_mm, scales, sure), log_young)
-            out.append(said.float().cpu().numpy())
-        factor = np.float32(scales.target * young_kpa)
-        return np.concatenate(out) * factor
+            if settings.arch.total:
+                said, total = said
+                totals.append(total.double().cpu().numpy())
+            maps.append(said.float().cpu().numpy())
+        density = np.concatenate(maps) * np.float32(scales.target * young_kpa)
+        return density, np.concatenate(totals) * (scales.force * young_kpa) if totals else None
 
 
 def load(model_dir: Path | str, device: torch.device | str = "cpu") -> Predictor:

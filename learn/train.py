@@ -20,7 +20,7 @@ from learn.batch import Batch, Frames, inputs, measure_scales
 from learn.checkpoint import Card
 from learn.data import Clip, typical_young
 from learn.grid import Scales
-from learn.loss import gradient_shares, loss
+from learn.loss import SHARES, gradient_shares, loss
 from learn.metrics import Moments, agreement
 from learn.model import D2FNet
 from learn.settings import Settings
@@ -122,11 +122,11 @@ def _epoch(
     whole = settings.batch * fabric.world_size
     batches = max(len(order) // whole, 1)
     net.train()
-    means = {k: MeanMetric().to(fabric.device) for k in ("loss", "share_error", "share_r2", "share_total")}
+    means = {k: MeanMetric().to(fabric.device) for k in ("loss", *(f"share_{k}" for k in SHARES))}
     for i in range(batches):
         batch = frames.batch(order[i * whole : (i + 1) * whole][fabric.global_rank :: fabric.world_size])
         batch = batch.to(fabric.device)
-        said = forward(net, batch, settings, scales)
+        said, total = forward(net, batch, settings, scales)
         terms = loss(
             said,
             batch.target,
@@ -136,6 +136,7 @@ def _epoch(
             scales.spread,
             settings.grid.pitch_mm**2,
             scales.force,
+            None if total is None else (total, batch.force),
         )
         if not torch.isfinite(terms.sum):
             raise UserError(f"training diverged in epoch {epoch + 1}: lower --learning-rate")
@@ -161,14 +162,20 @@ def cosine(progress: float, warm: float = 0.05) -> float:
     return 0.5 * (1 + math.cos(math.pi * (progress - warm) / (1 - warm)))
 
 
-def forward(net: Any, batch: Batch, settings: Settings, scales: Scales) -> torch.Tensor:
-    """The network's answer in physical units per unit stiffness, (B, C, N, N), unit of `Scales.target`."""
+def forward(
+    net: Any, batch: Batch, settings: Settings, scales: Scales
+) -> tuple[torch.Tensor, torch.Tensor | None]:
+    """The network's answer in physical units per unit stiffness: the map (B, C, N, N), unit of
+    `Scales.target`,
+    and the total force (B, C) [mN at 1 kPa] of a network with that head."""
     x = inputs(batch, settings, scales)
     if settings.channels_last:
         x = x.contiguous(memory_format=torch.channels_last)
     young = batch.log_young if settings.arch.condition == "film" else None
-    said: torch.Tensor = net(x, young)
-    return said.float() * scales.target
+    said = net(x, young)
+    if settings.arch.total:
+        return said[0].float() * scales.target, said[1].float() * scales.force
+    return said.float() * scales.target, None
 
 
 @torch.no_grad()
@@ -180,7 +187,7 @@ def select_score(net: Any, frames: Frames, scales: Scales, device: torch.device)
         for batch in frames.sequential(c, frames.sources[-1]):
             here = batch.to(device)
             inside = here.mask.bool().expand_as(here.target)
-            said = forward(net, here, frames.settings, scales)
+            said, _ = forward(net, here, frames.settings, scales)
             sums = sums + Moments.of(here.target[inside].cpu().numpy(), said[inside].cpu().numpy())
     result = agreement(sums)
     return {"select_r2": result.r2 if math.isfinite(result.r2) else -math.inf, "select_rmse": result.rmse}

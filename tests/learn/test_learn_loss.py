@@ -90,6 +90,40 @@ def test_gradient_shares_add_up_and_follow_the_weights() -> None:
     assert gradient_shares(loss(said, TRUE, MASK, Objective(r2_weight=1.0), 4.0, 2.0), said)["r2"] == 1
 
 
+def test_the_hinge_prices_force_on_contact_free_tissue_alone_and_linearly() -> None:
+    """0.4 mN/mm² on the first cell (truth 0; free is under 0.04), none on the second; the third is contact."""
+    objective = Objective(kind="hinge", r2_weight=0.0, stray_weight=1.5)
+    terms = loss(SAID, TRUE, MASK, objective, unit=4.0, spread=2.0)
+    assert float(terms.ghost) == pytest.approx(1.5 * 0.4 / 3 / 2.0, rel=1e-5)
+    assert float(terms.error) == pytest.approx(0.2925 / 3, rel=1e-5)
+    small = torch.tensor([1e-4, 0.1, 2.0, 0.0]).view_as(TRUE).requires_grad_()
+    pull = {
+        kind: torch.autograd.grad(
+            loss(small, TRUE, MASK, Objective(kind=kind, r2_weight=0.0), 4.0, 2.0).sum,  # type: ignore[arg-type]
+            small,
+        )[0][0, 0, 0, 0]
+        for kind in ("hinge", "antighost", "mse")
+    }
+    # The last tenth of a thousandth: three times next to nothing is next to nothing.
+    assert pull["antighost"] == pytest.approx(3 * float(pull["mse"]), rel=1e-3)
+    assert pull["hinge"] > 1000 * pull["antighost"]
+
+
+def test_the_length_of_a_zero_vector_has_a_gradient() -> None:
+    said = torch.zeros(1, 3, 1, 2, requires_grad=True)
+    true, ones = torch.zeros(1, 3, 1, 2), torch.ones(1, 1, 1, 2)
+    loss(said, true, ones, Objective(kind="hinge"), 4.0, 1.0).sum.backward()
+    assert said.grad is not None
+    assert torch.isfinite(said.grad).all()
+
+
+def test_the_head_is_held_to_the_total() -> None:
+    objective = Objective(kind="mse", head_weight=0.5)
+    totals = (torch.tensor([[1.0, 0.0, 2.0]]), torch.tensor([[0.0, 0.0, 0.0]]))
+    terms = loss(SAID, TRUE, MASK, objective, 4.0, 2.0, force_unit=10.0, totals=totals)
+    assert float(terms.head) == pytest.approx(0.5 * 0.05)
+
+
 def test_bad_weights_and_an_empty_mask() -> None:
     with pytest.raises(UserError, match="r2_weight"):
         Objective(r2_weight=1.5)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import numpy as np
@@ -12,10 +13,11 @@ import torchmetrics
 from learn.batch import measure_scales
 from learn.checkpoint import Card
 from learn.data import Clip
-from learn.evaluate import Report, score
+from learn.evaluate import Report, evaluate, score
 from learn.metrics import Moments, agreement, contact_mm, ghost_share, line
 from learn.model import Architecture
 from learn.settings import Settings
+from synth.errors import UserError
 
 
 @pytest.fixture
@@ -78,10 +80,14 @@ def truth(clip: Clip, output: str) -> np.ndarray:
     return density if output == "vector" else np.linalg.norm(density, axis=1, keepdims=True)
 
 
+def report(clips: list[Clip], said: list[np.ndarray], c: Card) -> Report:
+    return Report({"known": [score(clip, s, c) for clip, s in zip(clips, said, strict=True)]}, c)
+
+
 @pytest.mark.parametrize("output", ["vector", "magnitude"])
 def test_the_truth_scores_one_and_no_ghosts(clips: list[Clip], output: str) -> None:
     c = card(clips, output)
-    got = Report([score(clip, truth(clip, output), c) for clip in clips], c).summary()
+    got = report(clips, [truth(clip, output) for clip in clips], c).summary()
     assert got["map_r2"] == pytest.approx(1, abs=1e-6)
     assert got["force_r2_pooled"] == pytest.approx(1, abs=1e-4)
     for name in ("map_mae", "ghost", "ghost_relative", "localisation_mm", "force_bias"):
@@ -91,7 +97,7 @@ def test_the_truth_scores_one_and_no_ghosts(clips: list[Clip], output: str) -> N
 @pytest.mark.parametrize("output", ["vector", "magnitude"])
 def test_saying_nothing_scores_at_most_zero(clips: list[Clip], output: str) -> None:
     c = card(clips, output)
-    got = Report([score(clip, 0 * truth(clip, output), c) for clip in clips], c).summary()
+    got = report(clips, [0 * truth(clip, output) for clip in clips], c).summary()
     assert got["map_r2"] <= 0
     assert got["force_r2_pooled"] <= 0
     assert got["ghost"] == 0
@@ -101,19 +107,57 @@ def test_a_mirrored_answer_is_not_forgiven(clips: list[Clip]) -> None:
     """An answer that is right up to direction: the length's R² can't see it, the components' does."""
     c = card(clips, "vector")
     said = [truth(clip, "vector") * np.array([-1, 1, 1], np.float32)[:, None, None] for clip in clips]
-    got = Report([score(clip, s, c) for clip, s in zip(clips, said, strict=True)], c).summary()
+    got = report(clips, said, c).summary()
     assert got["map_r2"] == pytest.approx(1, abs=1e-6)
     assert got["vector_r2"] < 0.7
     assert got["vector_error_mn"] > 0
 
 
-def test_columns_of_stiffness(clips: list[Clip]) -> None:
+class Knowing:
+    """Answers a sequence with its truth per unit stiffness times the E it is given."""
+
+    def __init__(self, clip: Clip, c: Card) -> None:
+        self.clip, self.card, self.asked = clip, c, 0
+
+    def answer(self, moved: object, mask: object, young: float, sure: object) -> tuple[np.ndarray, None]:
+        self.asked += 1
+        return self.clip.density * np.float32(young), None
+
+
+@pytest.mark.parametrize(("condition", "passes"), [("none", 1), ("film", 5)])
+def test_columns_of_stiffness(clips: list[Clip], condition: str, passes: int) -> None:
     c = card(clips, "vector")
-    report = Report([score(clip, truth(clip, "vector"), c) for clip in clips], c)
-    assert report.summary("double")["force_bias"] > 0 > report.summary("half")["force_bias"]
-    assert report.summary("half")["force_r2_pooled"] < 1
-    for clip, row in zip(report.clips, clips, strict=True):
-        assert report.factor(clip, "unknown") == pytest.approx(1.2 / row.young_kpa)
+    arch = dataclasses.replace(c.settings.arch, condition=condition)  # type: ignore[arg-type]
+    c = dataclasses.replace(c, settings=dataclasses.replace(c.settings, arch=arch))
+    clip = clips[2]
+    knowing = Knowing(clip, c)
+    pressed = {clip.content_hash: 1.1 * clip.young_kpa}
+    found = evaluate(knowing, [clip], "ideal", pressed=pressed)  # type: ignore[arg-type]
+    assert knowing.asked == passes, "only a network conditioned on E must be asked again"
+    peak = np.linalg.norm(clip.force, axis=1).max()
+    for column, factor in {
+        "known": 1.0,
+        "half": 0.5,
+        "double": 2.0,
+        "press": 1.1,
+        "unknown": 1.2 / clip.young_kpa,
+    }.items():
+        assert found.columns[column][0].said_mn.max() == pytest.approx(factor * peak, rel=0.01), column
+    assert found.summary("known")["unit_map_r2_pooled"] == pytest.approx(1)
+    with pytest.raises(UserError, match="unknown E column 'guess'"):
+        found.summary("guess")
+
+
+def test_two_jaws_that_cancel_are_held_to_what_each_output_can_say(clips: list[Clip]) -> None:
+    """A grasp's jaws pull against each other: no net force, yet a map of lengths rightly adds them up."""
+    density = np.zeros_like(clips[0].density)
+    density[3, 0, 10:14, 8:12], density[3, 0, 10:14, 20:24] = 0.01, -0.01
+    clip = dataclasses.replace(clips[0], density=density, force=np.zeros_like(clips[0].force))
+    for output in ("magnitude", "vector"):
+        c = card(clips, output)
+        got = score(clip, truth(clip, output), c)
+        np.testing.assert_allclose(got.said_mn, got.true_mn, atol=1e-6)
+        assert (got.true_mn[3] > 0.1) == (output == "magnitude")
 
 
 def test_ghosts_are_counted_in_mn_over_a_contact_sized_patch(clips: list[Clip]) -> None:
@@ -127,5 +171,5 @@ def test_ghosts_are_counted_in_mn_over_a_contact_sized_patch(clips: list[Clip]) 
 
 def test_bands_hold_every_frame_once(clips: list[Clip]) -> None:
     c = card(clips, "vector")
-    report = Report([score(clip, truth(clip, "vector"), c) for clip in clips], c)
-    assert sum(b["frames"] for b in report.bands()) == sum(clip.frames for clip in clips)
+    whole = report(clips, [truth(clip, "vector") for clip in clips], c)
+    assert sum(b["frames"] for b in whole.bands()) == sum(clip.frames for clip in clips)
