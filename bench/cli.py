@@ -96,6 +96,54 @@ def check(
         raise typer.Exit(2)
 
 
+@app.command("import")
+def import_(
+    source: Annotated[
+        Path, typer.Argument(help="A .mha or .igs.mha sequence, .bag, .mcap, .db3, ROS 2 bag folder or .h5.")
+    ],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Recording folder to write.")],
+    scale: Annotated[float | None, typer.Option(help="mm a pixel; else fill in meta.yaml.")] = None,
+    young: Annotated[
+        float | None, typer.Option(help="Young's modulus of the tissue [kPa], if known.")
+    ] = None,
+    use: Annotated[
+        list[str] | None,
+        typer.Option(help="ROLE=NAME where there is a choice: frames, frame_time, force, force_time, tip."),
+    ] = None,
+    newtons: Annotated[
+        float, typer.Option(min=1e-6, help="Newtons in the source's unit of force: 0.001 if it is in mN.")
+    ] = 1.0,
+    json: Json = False,
+) -> None:
+    """Turns another system's recording into a recording folder: `bench import a.mcap -o rec --scale 0.05`."""
+    from bench import intake
+    from bench.bar import counting
+
+    named = {}
+    for word in use or ():
+        role, sign, name = word.partition("=")
+        if not (role and sign and name):
+            raise UserError(f"--use {word}: expected ROLE=NAME")
+        named[role] = name
+    found = intake.read(source, named)
+    about: dict[str, object] = {"young_kpa": young if young is not None else "unknown"}
+    if scale is not None:
+        about["scale_mm_per_px"] = scale
+    with counting(f"importing {source.name}", len(found.times_s)) as progress:
+        intake.write(found, out, newtons, about, progress)
+    notes = list(found.notes)
+    if scale is None:
+        notes.append("meta.yaml still needs scale_mm_per_px or calibration")
+    if not len(found.force):
+        notes.append("no force: predictions only")
+    if json:
+        print(json_.dumps({"recording": str(out), "frames": len(found.times_s), "notes": notes}))
+    else:
+        for note in notes:
+            typer.echo(f"note: {note}", err=True)
+        print(out)
+
+
 @app.command()
 def demo(
     dataset: Annotated[Path, typer.Argument(help="A rendered dataset.")],

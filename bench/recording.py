@@ -94,6 +94,8 @@ def open_recording(folder: Path) -> Recording:
     Raises:
         UserError: no folder, bad meta.yaml, neither or both of video and frames, a CSV that can't be used.
     """
+    if folder.is_file():
+        raise UserError(f"{folder}: a file, not a recording folder; `bench import` makes one of it")
     if not folder.is_dir():
         raise UserError(f"{folder}: no such recording folder")
     about = meta.read(folder / "meta.yaml")
