@@ -2,87 +2,53 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from synth import store
+from synth import optics, store
 from synth.fields import FIELDS
+from synth.measure import Invariant, Measure, truth
 from synth.store import Sequence
 
 Floats = NDArray[np.floating]
 
-
-@dataclass(frozen=True)
-class Measure:
-    """One number that must not exceed its limit, and where it was found."""
-
-    value: float
-    limit: float
-    where: str
-
-    @property
-    def good(self) -> bool:
-        return bool(self.value <= self.limit)
-
-    @property
-    def severity(self) -> float:
-        """Above 1 is bad; compares measures whose limits differ."""
-        if self.limit > 0:
-            return self.value / self.limit
-        return 0.0 if self.good else np.inf
-
-
-Invariant = Callable[[Sequence, list[int]], Iterator[Measure]]
-"""Measures of a sequence in the frames given."""
+# A point may come back so far off: tissue that is pressed together or seen at a slant lands in few pixels.
+_RETURN_PX = 4.0
 
 
 def seal(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
-    """The attributes are those that were sealed, and the fields are those that the table declares."""
+    """The attributes are those that were sealed, under the name that was given."""
     attrs = sequence.attrs
-    yield _truth(attrs.get("seal_hash") == store.seal_hash(attrs), "attributes were edited")
-    yield _truth(attrs["content_hash"] == store.content_hash(attrs), "attributes were edited")
-    yield _truth(sequence.path.stem == f"{sequence.index:06d}", "is another sequence than its name says")
+    yield truth(attrs.get("seal_hash") == store.seal_hash(attrs), "attributes were edited")
+    yield truth(attrs["content_hash"] == store.content_hash(attrs), "attributes were edited")
+    yield truth(sequence.path.stem == f"{sequence.index:06d}", "is another sequence than its name says")
+
+
+def schema(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
+    """The fields are those that the table declares: shape, type, unit, meaning, axes."""
     for field in FIELDS.values():
         if field.name in sequence:
             column = sequence[field.name]
             known = {"unit": field.unit, "meaning": field.meaning}
-            yield _truth(column.attrs == known, f"{field.name}: unit or meaning was edited")
-            yield _truth(column.dims == field.dims, f"{field.name}: axes were edited")
+            yield truth(column.attrs == known, f"{field.name}: unit or meaning was edited")
+            yield truth(column.dims == field.dims, f"{field.name}: axes were edited")
         else:
-            yield _truth(field.optional, f"{field.name} is missing")
-
-
-def checksum(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
-    """Every value is the one that was written; NaN and values out of their range are found on the way."""
-    for name in sequence.fields:
-        field, column = FIELDS[name], sequence[name]
-        hasher = store.field_hasher(field, column.stored, column.shape)
-        parts = range(column.shape[0]) if field.framed else [...]
-        low, high, finite = np.inf, -np.inf, True
-        for part in parts:
-            values = np.ascontiguousarray(column[part])
-            hasher.update(values.astype(column.stored, copy=False).data)
-            if values.dtype.kind == "f":
-                low, high = min(low, float(values.min())), max(high, float(values.max()))
-                finite = finite and bool(np.isfinite(values).all())
-        good = hasher.hexdigest() == sequence.attrs["field_hashes"][name]
-        yield _truth(good, f"{name}: values are not those that were written")
-        yield _truth(finite, f"{name}: holds values that are no numbers")
-        if field.low is not None:
-            yield Measure(field.low - low, 0.0, f"{name}: smallest value {low:g} {field.unit}")
-        if field.high is not None:
-            yield Measure(high - field.high, 0.0, f"{name}: largest value {high:g} {field.unit}")
+            yield truth(field.kept != "always", f"{field.name} is missing")
 
 
 def rest(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
-    """Frame 0 is at rest: no motion [px] and no force [mN]."""
+    """Frame 0 is at rest: no true or recovered motion [px], no force [mN], no load [kPa]."""
     yield Measure(float(np.abs(sequence["flow"][0]).max()), 0.02, "flow in frame 0")
+    if "flow_tvl1" in sequence:
+        yield Measure(float(np.abs(sequence["flow_tvl1"][0]).max()), 0.02, "recovered flow in frame 0")
     force = np.linalg.norm(sequence["force"][:], axis=1)
     yield Measure(float(force[0]), 1e-6 * max(float(force.max()), 1e-9), "force in frame 0")
+    most = float(np.abs(sequence["traction"][int(np.argmax(force))]).max())
+    least = float(np.abs(sequence["traction"][0]).max())
+    yield Measure(least, 1e-6 * max(most, 1e-9), "traction in frame 0")
 
 
 def force(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
@@ -138,28 +104,43 @@ def warp(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
         yield Measure(after / max(before, 1e-9), 1.0, f"frame {t}")
 
 
-def camera(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
-    """No pixel sees less tissue than one that looks at it squarely: K and depth against area (relative)."""
-    focal = float(sequence.attrs["K"][0][0]) * float(sequence.attrs["K"][1][1])
-    tissue, depth, area = sequence["tissue"][:], sequence["depth"][0], sequence["area"][:]
-    where = tissue & ~sequence["tool"][0] & (area > 0)
-    yield _truth(bool(where.any()), "no tissue in view")
-    if where.any():
-        square = depth[where].astype(np.float64) ** 2 / focal
-        # Distortion stretches pixels by some percent towards the corners.
-        short = float(np.quantile(1 - area[where] / square, 0.99))
-        yield Measure(short, 0.15, "1st percentile of area")
-        yield Measure(float(np.median(area[where] / square)), 4.0, "median of area")
+def forward_backward(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
+    """Forward by the flow and back, a visible point is where it was; none is seen from behind (share)."""
+    tissue = sequence["tissue"][:]
+    for t in frames:
+        x, y = _targets(sequence["flow"][t])
+        seen = sequence["visible"][t] & tissue
+        count = max(int(seen.sum()), 1)
+        rows, columns = np.nonzero(seen)
+        cell = np.stack([y[seen].round(), x[seen].round()], axis=1)
+        _, landed, times = np.unique(cell, axis=0, return_inverse=True, return_counts=True)
+        lost = np.zeros(len(rows))
+        for rest in (rows, columns):
+            # Back from a pixel of this frame: the mean of all rest pixels that came to it.
+            back = np.bincount(landed.ravel(), rest) / times
+            lost += (rest - back[landed.ravel()]) ** 2
+        yield Measure(float((lost > _RETURN_PX**2).sum()) / count, 0.005, f"frame {t}: not where it was")
+        whole = seen[:-1, :-1] & seen[1:, :-1] & seen[:-1, 1:]
+        turned = (x[:-1, 1:] - x[:-1, :-1]) * (y[1:, :-1] - y[:-1, :-1])
+        turned -= (y[:-1, 1:] - y[:-1, :-1]) * (x[1:, :-1] - x[:-1, :-1])
+        yield Measure(float((whole & (turned < 0)).sum()) / count, 0.005, f"frame {t}: seen from behind")
 
 
 INVARIANTS: dict[str, Invariant] = {
-    function.__name__: function for function in (seal, checksum, rest, force, visibility, warp, camera)
+    function.__name__: function
+    for function in (
+        seal,
+        schema,
+        rest,
+        force,
+        visibility,
+        warp,
+        forward_backward,
+        optics.camera,
+        optics.contact,
+    )
 }
 """Every invariant by name, in the order in which they are checked."""
-
-
-def _truth(good: bool, where: str) -> Measure:
-    return Measure(0.0 if good else 1.0, 0.0, where)
 
 
 def _targets(flow: Floats) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

@@ -9,10 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from synth import identity, index, split
+from synth import contents, identity, index, split, versions
 from synth.errors import UserError
 from synth.folder import Folder
-from synth.invariants import INVARIANTS, Measure
+from synth.invariants import INVARIANTS
+from synth.measure import Measure, truth
 from synth.stopwatch import Stopwatch
 from synth.store import Sequence, open_sequence
 
@@ -79,8 +80,11 @@ def run(root: Path, *, fast: bool = False, report: Callable[[int, int], None] | 
     folder = Folder(root)
     described, sealed = folder.described(), folder.sealed()
     checks = _checks()
-    for measure, who in _dataset(folder, described, sealed):
-        checks["dataset"].add(measure, who)
+    watch = Stopwatch()
+    with watch.stage("dataset"):
+        for name, measure, who in _dataset(folder, described, sealed):
+            checks[name].add(measure, who)
+    checks["dataset"].cpu_s += watch.cpu_s("dataset")
     chosen = sealed
     if fast and len(sealed) > _FAST_SEQUENCES:
         chosen = [sealed[k] for k in np.linspace(0, len(sealed) - 1, _FAST_SEQUENCES).astype(int)]
@@ -101,8 +105,10 @@ def sequence(path: Path, job: str) -> list[Check]:
 def _checks() -> dict[str, Check]:
     checks = {
         "dataset": Check("dataset", "the job, the index and the sequences agree"),
+        "splits": Check("splits", "no anatomy, copy or held-out family is on a side where it may not be"),
         "readable": Check("readable", "every store opens and every chunk decodes"),
     }
+    checks.update({name: Check(name, meaning) for name, meaning in contents.CHECKS.items()})
     for name, invariant in INVARIANTS.items():
         checks[name] = Check(name, (invariant.__doc__ or "").split("\n")[0])
     return checks
@@ -115,13 +121,15 @@ def _sequence(path: Path, name: str, checks: dict[str, Check], fast: bool) -> No
     except UserError as error:
         checks["readable"].add(Measure(1.0, 0.0, _without(path, str(error))), path.name)
         return
-    own = Measure(0.0 if sequence.attrs.get("job") == name else 1.0, 0.0, "belongs to another job")
-    checks["dataset"].add(own, path.name)
-    broken = ""
+    own = sequence.attrs.get("job") == name
+    checks["dataset"].add(truth(own, "belongs to another job"), path.name)
+    broken, watch = "", Stopwatch()
+    try:
+        for key, measure in contents.check(sequence, frames, fast, watch):
+            checks[key].add(measure, path.name)
+    except UserError as error:
+        broken = _without(path, str(error))
     for key, invariant in INVARIANTS.items():
-        if fast and key == "checksum":
-            continue
-        watch = Stopwatch()
         try:
             with watch.stage(key):
                 measures = list(invariant(sequence, frames))
@@ -130,11 +138,11 @@ def _sequence(path: Path, name: str, checks: dict[str, Check], fast: bool) -> No
             continue
         except (KeyError, IndexError, TypeError, ValueError) as error:
             measures = [Measure(1.0, 0.0, f"attributes are missing or odd ({error!r})")]
-        finally:
-            checks[key].cpu_s += watch.cpu_s(key)
         for measure in measures:
             checks[key].add(measure, path.name)
-    checks["readable"].add(Measure(1.0 if broken else 0.0, 0.0, broken or "reads"), path.name)
+    for key, check in checks.items():
+        check.cpu_s += watch.cpu_s(key)
+    checks["readable"].add(truth(not broken, broken or "reads"), path.name)
 
 
 def _frames(sequence: Sequence, fast: bool) -> list[int]:
@@ -145,38 +153,46 @@ def _frames(sequence: Sequence, fast: bool) -> list[int]:
     return sorted({int(np.argmax(force)), *(int(t) for t in spread)})
 
 
-def _dataset(folder: Folder, described: dict[str, Any], sealed: list[int]) -> Iterator[tuple[Measure, str]]:
-    def truth(good: bool, where: str, who: str) -> tuple[Measure, str]:
-        return Measure(0.0 if good else 1.0, 0.0, where), who
-
+def _dataset(
+    folder: Folder, described: dict[str, Any], sealed: list[int]
+) -> Iterator[tuple[str, Measure, str]]:
+    """(check, measure, whose)."""
     job = folder.job()
+    makers = {versions.word(one) for one in described.get("generators", [])}
     try:
-        same = identity.of(job) == described["identity"]
+        same = identity.of(job) == described["identity"] or versions.fingerprint() not in makers
     except UserError:
         same = True  # the mesh or the photograph need not travel with the dataset
-    yield truth(same, "the job is not the one that was rendered", "dataset.json")
+    yield "dataset", truth(same, "the job is not the one that was rendered"), "dataset.json"
     failed = set(folder.failures())
     missing = sorted(set(range(job.sequences)) - set(sealed) - failed)
-    yield truth(not missing, f"{len(missing)} sequences are missing, first {missing[:1]}", "dataset")
+    yield (
+        "dataset",
+        truth(not missing, f"{len(missing)} sequences are missing, first {missing[:1]}"),
+        "dataset",
+    )
     strangers = [key for key in sealed if key >= job.sequences]
-    yield truth(not strangers, f"sequences that the job does not have: {strangers[:3]}", "dataset")
+    yield "dataset", truth(not strangers, f"sequences that the job does not have: {strangers[:3]}"), "dataset"
     try:
         rows = {row["index"]: row for row in index.read(folder.root).to_pylist()}
     except UserError as error:
-        yield truth(False, str(error), index.NAME)
+        yield "dataset", truth(False, str(error)), index.NAME
         return
     for key in sealed:
         try:
-            now: dict[str, Any] = index.row_of(open_sequence(folder.root / f"{key:06d}.zarr"))
+            found = open_sequence(folder.root / f"{key:06d}.zarr")
         except UserError:
             continue  # found and named by the check of that sequence
-        row = rows.get(key, {})
+        now, row = index.row_of(found), rows.get(key, {})
         differing = [name for name, value in now.items() if row.get(name) != value]
-        yield truth(not differing, f"row {key} differs in {', '.join(differing)}", index.NAME)
-    leaking = split.leaks(list(rows.values()), split.rule(folder.root))
-    yield truth(not leaking, f"the split leaks: {'; '.join(leaking[:3])}", index.NAME)
+        yield "dataset", truth(not differing, f"row {key} differs in {', '.join(differing)}"), index.NAME
+        maker = found.attrs.get("versions", {}).get("generator")
+        known = maker in makers
+        yield "dataset", truth(known, "made by a version that dataset.json does not name"), found.path.name
     surplus = sorted(key for key, row in rows.items() if row["status"] == "done" and key not in sealed)
-    yield truth(not surplus, f"rows without a sequence: {surplus[:3]}", index.NAME)
+    yield "dataset", truth(not surplus, f"rows without a sequence: {surplus[:3]}"), index.NAME
+    leaking = split.leaks(list(rows.values()), split.rule(folder.root))
+    yield "splits", truth(not leaking, "; ".join(leaking[:3]) or "none"), index.NAME
 
 
 def _without(path: Path, text: str) -> str:

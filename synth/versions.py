@@ -23,7 +23,7 @@ _PACKAGES = (
 
 
 # What decides the values of a sequence, given its job and index; the rest runs, keeps and describes them.
-_CODE = ("pipeline.py", "scenario.py", "brain.py", "fem", "render", "flow")
+_CODE = ("job.py", "pipeline.py", "scenario.py", "brain.py", "fem", "render", "flow")
 _COMPUTING = ("mitsuba", "drjit", "numpy", "scipy", "opencv-contrib-python-headless", "torch")
 
 
@@ -50,7 +50,12 @@ def generator() -> dict[str, str]:
 
 def fingerprint() -> str:
     """`generator()` in one word."""
-    described = json.dumps(generator(), sort_keys=True).encode()
+    return word(generator())
+
+
+def word(made_by: dict[str, str]) -> str:
+    """What `generator()` gave, here or elsewhere, in one word."""
+    described = json.dumps(made_by, sort_keys=True).encode()
     return hashlib.blake2b(described, digest_size=8).hexdigest()
 
 

@@ -139,6 +139,9 @@ def consistent(job: Job, index: int, folder: Path, report: Report, fault: str = 
         flow = np.zeros((height, width, 2))
         flow[tissue, 0] = -moved if fault == "flow" else moved
         flow[tissue, 1] = 1.0 if fault == "rest" and t == 0 else 0.0
+        if fault == "fold" and t:
+            flow[tissue, 0] -= 2 * (columns - width / 2)[tissue] * (np.abs(columns - width / 2) < 10)[tissue]
+        recovered = flow + (0.1 if fault == "recovered_rest" else 0.0)
         picture = texture(rows, columns - moved)
         gone = (columns + flow[..., 0] < 8) | (columns + flow[..., 0] > width - 1)
         writer.put_frame("rgb", t, np.repeat(picture[..., None], 3, axis=-1).astype(np.uint8))
@@ -148,9 +151,24 @@ def consistent(job: Job, index: int, folder: Path, report: Report, fault: str = 
         writer.put_frame("tool", t, covered)
         writer.put_frame("glare", t, np.zeros_like(tissue))
         writer.put_frame("depth", t, np.full((height, width), -1.0 if fault == "depth" and t else distance))
-        writer.put_frame("traction", t, share[t] * spot[..., None] * load)
+        pressed = 1e-3 if fault == "load_rest" and t == 0 else share[t]
+        writer.put_frame("traction", t, pressed * spot[..., None] * load)
+        writer.put_frame("flow_tvl1", t, recovered)
+        writer.put_frame("flow_confidence", t, np.ones((height, width)))
     focal *= 0.5 if fault == "camera" else 1.0
-    writer.seal(**attributes(index, rng), K=[[focal, 0, 0], [0, focal, 0], [0, 0, 1]])
+    tip = np.zeros((frames, 2, 3))
+    tip[:, :, 0] = (6.0 * share * distance / 1000.0 + (3.0 if fault == "contact" else 0.0))[:, None]
+    described = attributes(index, rng)
+    described["scenario"]["gesture"]["footprint_mm"] = 3.0
+    described["scale_mm_per_px"] = distance / 1000.0 * (1.5 if fault == "scale" else 1.0)
+    writer.seal(
+        **described,
+        K=[[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]],
+        distortion=[0.0] * 5,
+        rotation=np.eye(3).tolist(),
+        translation=[0.0, 0.0, distance],
+        mechanics={"instruments": [{"tip_mm": tip.tolist()}]},
+    )
 
 
 def _texture(rng: np.random.Generator) -> Callable[..., Any]:
@@ -168,25 +186,6 @@ def _block(tool: Any, rows: Any, height: int) -> Any:
     return tool | (np.abs(rows - height / 2) < 8)
 
 
-def wrong_force(job: Job, index: int, folder: Path, report: Report) -> None:
-    consistent(job, index, folder, report, "force")
-
-
-def wrong_flow(job: Job, index: int, folder: Path, report: Report) -> None:
-    consistent(job, index, folder, report, "flow")
-
-
-def wrong_visibility(job: Job, index: int, folder: Path, report: Report) -> None:
-    consistent(job, index, folder, report, "visibility")
-
-
-def wrong_rest(job: Job, index: int, folder: Path, report: Report) -> None:
-    consistent(job, index, folder, report, "rest")
-
-
-def wrong_camera(job: Job, index: int, folder: Path, report: Report) -> None:
-    consistent(job, index, folder, report, "camera")
-
-
-def wrong_depth(job: Job, index: int, folder: Path, report: Report) -> None:
-    consistent(job, index, folder, report, "depth")
+def wrong(fault: str) -> Callable[[Job, int, Path, Report], None]:
+    """`consistent` with one fault, sealed as if nothing were wrong."""
+    return lambda job, index, folder, report: consistent(job, index, folder, report, fault)
