@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,7 +11,7 @@ import trimesh
 from numpy.typing import NDArray
 
 from synth.errors import UserError
-from synth.job import Craniotomy
+from synth.job import Attachment, Craniotomy
 
 Floats = NDArray[np.float64]
 
@@ -23,6 +24,22 @@ class Brain:
     """(V, 3) mm."""
     faces: NDArray[np.int32]
     """(F, 3)."""
+    origin: Floats
+    """(3,) mm, the craniotomy's centre in the file's axes."""
+    turn: Floats
+    """(3, 3) rows: world axes in the file's."""
+
+    def placed(self, attachments: Sequence[Attachment]) -> tuple[Attachment, ...]:
+        """Attachments given in the file's axes, in world axes."""
+        return tuple(
+            a.model_copy(
+                update={
+                    "point": tuple(self.turn @ (np.asarray(a.point) - self.origin)),
+                    "normal": None if a.normal is None else tuple(self.turn @ np.asarray(a.normal)),
+                }
+            )
+            for a in attachments
+        )
 
 
 def load(path: Path, craniotomy: Craniotomy) -> Brain:
@@ -44,7 +61,8 @@ def load(path: Path, craniotomy: Craniotomy) -> Brain:
     if len(faces) < 4 or span.min() < 1e-3 * span.max() or _volume(vertices, faces) < 1e-3 * span.prod():
         raise UserError(f"anatomy.mesh: {path.name} encloses no volume")
     out = np.asarray(craniotomy.direction) / np.linalg.norm(craniotomy.direction)
-    placed = (vertices - np.asarray(craniotomy.point)) @ axes(out).T
+    turn, origin = axes(out), np.asarray(craniotomy.point)
+    placed = (vertices - origin) @ turn.T
     heights = _heights(placed, faces)
     heights = heights[np.abs(heights) <= craniotomy.radius_mm]
     if len(heights) == 0:
@@ -53,7 +71,8 @@ def load(path: Path, craniotomy: Craniotomy) -> Brain:
             "point, looking along the direction"
         )
     placed[:, 2] -= heights.max()
-    return Brain(np.ascontiguousarray(placed), faces.astype(np.int32))
+    origin = origin + heights.max() * turn[2]
+    return Brain(np.ascontiguousarray(placed), faces.astype(np.int32), origin, turn)
 
 
 def axes(out: Floats) -> Floats:

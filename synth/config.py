@@ -207,6 +207,8 @@ def _message(error: Any, at: Loc) -> str:
     if kind in limits:
         limit = context[{">": "gt", ">=": "ge", "<": "lt", "<=": "le"}[limits[kind]]]
         return f"{error['input']!r} is out of range, it must be {limits[kind]} {limit:g}"
+    if kind == "missing" and isinstance(at[-1], str):
+        return "is missing"
     if kind in ("missing", "too_short", "too_long"):
         return f"the list has the wrong length ({error['msg'].lower()})"
     return f"{_KINDS.get(kind, error['msg'])}, not {error['input']!r}"
@@ -226,6 +228,8 @@ def _did_you_mean(at: Loc) -> str:
 def _model_at(at: Loc) -> type[BaseModel]:
     model: type[BaseModel] = Job
     for step in at:
+        if isinstance(step, int):  # an item of a list of sections
+            continue
         inner = section(model.model_fields[step].annotation) if step in model.model_fields else None
         if inner is None:
             return model
@@ -242,11 +246,11 @@ def section(annotation: Any) -> type[BaseModel] | None:
 
 
 def places(model: type[BaseModel] = Job, at: Loc = ()) -> list[Loc]:
-    """Every key of a job, from the top: ("seed",), ("render",), ("render", "spp"), ..."""
+    """Every key of a job, from the top: ("seed",), ("render",), ("render", "spp"), ... but not in lists."""
     found: list[Loc] = []
     for name, field in model.model_fields.items():
         found.append((*at, name))
         inner = section(field.annotation)
-        if inner is not None:
+        if inner is not None and typing.get_origin(field.annotation) is not tuple:
             found += places(inner, (*at, name))
     return found

@@ -77,6 +77,27 @@ class Craniotomy(Section):
         return self
 
 
+class Attachment(Section):
+    """A region in which tissue is held: falx, tentorium, an adhesion. The skull holds it in any case."""
+
+    point: Vector
+    """Its middle [mm], in the mesh's own axes; for the block, from the opening's centre with z outwards."""
+    radius_mm: Positive
+    """How far it reaches from its middle [mm]."""
+    normal: Vector | None = None
+    """Of a sheet (falx, tentorium) through the middle, in the same axes. Empty: a ball."""
+    thickness_mm: Positive = 3.0
+    """Thickness of a sheet [mm]."""
+    firm_per_mm: Positive = 2.0
+    """Traction per displacement as a multiple of E, per mm; the skull's is 2."""
+
+    @model_validator(mode="after")
+    def _normal_has_length(self) -> Attachment:
+        if self.normal is not None and not any(self.normal):
+            raise ValueError("normal has no length")
+        return self
+
+
 class Anatomy(Section):
     """The brain: a procedural block, or a user's surface."""
 
@@ -96,6 +117,9 @@ class Anatomy(Section):
     """Vertices of the fine surface that is loaded, moved and rendered."""
     craniotomy: Craniotomy = Craniotomy()
     """Where the skull is open."""
+    attachments: tuple[Attachment, ...] = ()
+    """Regions in which the tissue is held inside, such as the falx: a list of {point, radius_mm, normal,
+    thickness_mm, firm_per_mm}, normal for a sheet. Empty: the skull alone holds it."""
 
     @model_validator(mode="after")
     def _mesh_is_placed(self) -> Anatomy:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from synth import job
 from synth.brain import Brain
 from synth.errors import UserError
-from synth.fem import winding
+from synth.fem import attach, winding
 from synth.fem.element import TRI_POINTS, TRI_WEIGHTS, bary_slope, face_shape
 from synth.fem.refine import edges_of, refine
 from synth.fem.stuffing import stuff
@@ -45,20 +45,20 @@ class Tets:
     fixed: NDArray[np.bool_]
     """(N,) nodes that cannot move: the walls a block is cut out at."""
     hold: sp.csr_array
-    """(N, N) mm: springs of the skull on the surface round the opening, for E = 1 kPa."""
+    """(N, N) mm, for E = 1 kPa: springs of the skull on the surface round the opening, and of attachments."""
 
 
 def block(anatomy: job.Anatomy, tets: int, order: int, focus: Sequence[Contact] = ()) -> Tets:
     """A domed block, fixed at its sides and bottom, held by the skull round the opening.
 
     Args:
-        anatomy: block_mm, dome_mm and craniotomy are used.
+        anatomy: block_mm, dome_mm, craniotomy and attachments are used.
         tets: number of tetrahedra to aim for.
         order: 1 or 2.
         focus: where the load will be; finest there. Empty: finest in the whole opening.
 
     Raises:
-        UserError: the block is too shallow for its dome.
+        UserError: the block is too shallow for its dome, or an attachment holds nothing.
     """
     size = np.asarray(anatomy.block_mm)
     fall = -dome(np.array([size[:2] / 2]), anatomy.dome_mm)[0]
@@ -72,7 +72,7 @@ def block(anatomy: job.Anatomy, tets: int, order: int, focus: Sequence[Contact] 
     wall = (np.abs(np.abs(points[:, :2]) - size[:2] / 2) < 1e-9).any(axis=1) | (points[:, 2] < 1e-9 - size[2])
     points[:, 2] += dome(points[:, :2], anatomy.dome_mm) * (1 + points[:, 2] / size[2])
     # A face is on a wall if its three corners are; the upper edge of the walls belongs to both.
-    return _finished(points, cells, order, wall, anatomy.craniotomy)
+    return _finished(points, cells, order, wall, anatomy.craniotomy, anatomy.attachments)
 
 
 def from_brain(
@@ -83,7 +83,8 @@ def from_brain(
     Arguments as in `block`.
 
     Raises:
-        UserError: the surface encloses no volume that can be meshed, or none under the opening.
+        UserError: the surface encloses no volume that can be meshed, or none under the opening; an attachment
+            holds nothing.
     """
     points, cells = _filled(brain, _grading(anatomy.craniotomy.radius_mm, focus), tets)
     if len(cells) < 0.2 * tets:
@@ -91,7 +92,8 @@ def from_brain(
     top = points[np.hypot(points[:, 0], points[:, 1]) < anatomy.craniotomy.radius_mm, 2].max(initial=-np.inf)
     if top < -anatomy.craniotomy.radius_mm:
         raise UserError("anatomy.craniotomy: there is no volume under the opening")
-    return _finished(points, cells, order, np.zeros(len(points), bool), anatomy.craniotomy)
+    held = brain.placed(anatomy.attachments)
+    return _finished(points, cells, order, np.zeros(len(points), bool), anatomy.craniotomy, held)
 
 
 def dome(xy: Floats, radius_mm: float) -> Floats:
@@ -185,14 +187,22 @@ def _filled(brain: Brain, grading: Callable[[Floats], Floats], tets: int) -> tup
     return points, cells
 
 
-def _finished(points: Floats, cells: Ints, order: int, wall: NDArray[np.bool_], at: job.Craniotomy) -> Tets:
+def _finished(
+    points: Floats,
+    cells: Ints,
+    order: int,
+    wall: NDArray[np.bool_],
+    at: job.Craniotomy,
+    held: Sequence[job.Attachment],
+) -> Tets:
     faces = boundary(cells, 1)
     on_wall = wall[faces].all(axis=1)
     points, cells = lengthened(points, cells, order)
     faces = boundary(cells, order)
     fixed = np.zeros(len(points), bool)
     fixed[faces[on_wall]] = True
-    return Tets(points, cells, order, fixed, _springs(points, faces[~on_wall], order, at))
+    hold = _springs(points, faces[~on_wall], order, at) + attach.springs(points, cells, order, held)
+    return Tets(points, cells, order, fixed, sp.csr_array(hold))
 
 
 def _springs(points: Floats, faces: Ints, order: int, at: job.Craniotomy) -> sp.csr_array:
