@@ -41,6 +41,7 @@ COMMANDS: tuple[Command, ...] = (
     Command("experiment", "throughput", "bench.render_gpu", "throughput"),
     Command("experiment", "gpu", "bench.gpu", "gpu"),
     Command("experiment", "stages", "bench.stages", "stages"),
+    Command("experiment", "leakage", "bench.leakage", "leakage"),
     Command("experiment", "learn", "bench.learn_experiment", "experiment"),
     Command("pareto", "learn", "bench.learn_pareto", "pareto"),
     Command("pareto", "fem", "bench.fem_pareto", "pareto"),
@@ -50,6 +51,7 @@ COMMANDS: tuple[Command, ...] = (
     Command("stability", "dask", "bench.engine_dask", "dask"),
     Command("stability", "trouble", "bench.engine_trouble", "trouble"),
     Command("pareto", "engine", "bench.engine_speed", "speed"),
+    Command("pareto", "reading", "bench.engine_reading", "reading"),
     Command("stability", "faults", "bench.engine_faults", "faults"),
     Command("stability", "kills", "bench.engine_kills", "kills"),
 )

@@ -20,6 +20,8 @@ class Place:
     """What Zarr opens."""
     size: Callable[[str], int]
     """Bytes of a file in it, by its path from here; 0 when it is missing."""
+    folder: Path | None = None
+    """Where it is on this machine's file system."""
 
 
 def of(where: Path | str) -> Place:
@@ -32,7 +34,7 @@ def of(where: Path | str) -> Place:
         folder = Path(where)
         if not folder.is_dir():
             raise UserError(f"{folder}: no such sequence")
-        return Place(str(folder), str(folder), lambda key: _size(folder / key))
+        return Place(str(folder), str(folder), lambda key: _size(folder / key), folder)
     fs, base = _open(where)
     if not fs.isdir(base):
         raise UserError(f"{where}: no such sequence")

@@ -14,7 +14,7 @@ import zarr
 from numpy.typing import NDArray
 from zarr.codecs import BloscCodec, Crc32cCodec
 
-from synth import identity, place, versions
+from synth import identity, place, shard, versions
 from synth.errors import NotFinite, UserError
 from synth.fields import FIELDS, FORMAT_VERSION, Field
 from synth.job import Job
@@ -228,8 +228,11 @@ class _Column:
 class Column:
     """A field of a sealed sequence, read when indexed; damage is a UserError that names store and field."""
 
-    def __init__(self, array: zarr.Array[Any], dtype: np.dtype[Any], where: str) -> None:
+    def __init__(
+        self, array: zarr.Array[Any], dtype: np.dtype[Any], where: str, folder: Path | None = None
+    ) -> None:
         self._array, self._where = array, where
+        self._frames = shard.of(array, folder)
         self.shape: tuple[int, ...] = array.shape
         self.stored: np.dtype[Any] = array.dtype
         """Type on disk; values are given in the table's."""
@@ -242,8 +245,10 @@ class Column:
         return self.shape[0]
 
     def __getitem__(self, selection: Any) -> NDArray[Any]:
+        single = self._frames is not None and isinstance(selection, (int, np.integer))
         try:
-            return np.asarray(self._array[selection], self.dtype)
+            values = self._frames[int(selection)] if single and self._frames else self._array[selection]
+            return np.asarray(values, self.dtype)
         except IndexError:
             raise
         except Exception as error:  # zarr, its codecs and the file system have no common error for damage
@@ -300,7 +305,7 @@ class Sequence:
             # Zarr reads a missing or empty file as zeros.
             if not self._place.size(f"{name}/c/{k}{rest}"):
                 raise UserError(f"{where}: file c/{k}{rest} is missing or empty, the store is damaged")
-        return Column(array, dtype, where)
+        return Column(array, dtype, where, self._place.folder and self._place.folder / name)
 
 
 class Dataset:

@@ -12,7 +12,7 @@ import pytest
 import zarr
 from fake_work import attributes, sequence
 
-from synth import contents, store
+from synth import contents, shard, store
 from synth.errors import NotFinite, UserError
 from synth.fields import FIELDS
 from synth.job import Job
@@ -66,6 +66,27 @@ def test_plain_zarr_reads_it(root: Path) -> None:
     assert group["flow"].attrs["unit"] == "px"
     assert group["rgb"].metadata.dimension_names == ("frame", "row", "column", "rgb")
     assert np.array_equal(group["rgb"][3], open_sequence(root / "000000.zarr")["rgb"][3])
+
+
+def test_single_frames_are_those_that_zarr_reads(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(store, "_SHARD_BYTES", 3 * 40 * 30 * 8)
+    sequence(JOB, 2, root, quiet)
+    found, plain = open_sequence(root / "000002.zarr"), zarr.open_group(str(root / "000002.zarr"), mode="r")
+    for name in found.fields:
+        column, array = found[name], plain[name]
+        fast = shard.of(array, root / "000002.zarr" / name)
+        assert (fast is not None) == FIELDS[name].framed
+        for t in (0, 6, 2, -1, -7):
+            assert np.array_equal(column[t], array[t])
+            assert fast is None or np.array_equal(fast[t], array[t])
+    for t in (7, -8):
+        with pytest.raises(IndexError):
+            found["flow"][t]
+    column = found["flow"]
+    column[0]
+    (root / "000002.zarr/flow/c/0/0/0/0").write_bytes(b"short")
+    with pytest.raises(UserError, match="flow: cannot be read, the store is damaged"):
+        column[1]
 
 
 def test_peaks_are_kept(root: Path) -> None:
@@ -163,6 +184,8 @@ def test_a_cut_or_flipped_shard_is_an_error_and_never_zeros(root: Path, cut: int
         shard.write_bytes(data)
     with pytest.raises(UserError, match=r"000000.zarr: flow: .*damaged"):
         open_sequence(root / "000000.zarr")["flow"][:]
+    with pytest.raises(UserError, match=r"000000.zarr: flow: .*damaged"):
+        [open_sequence(root / "000000.zarr")["flow"][t] for t in range(7)]
 
 
 def test_dataset_lists_sequences_in_order(root: Path) -> None:
