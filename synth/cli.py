@@ -303,6 +303,32 @@ def picture(
 
 
 @app.command()
+def view(
+    out: Out,
+    sequence: Annotated[
+        list[int] | None,
+        typer.Option("--sequence", "-s", help="Which sequence, by its index; repeat for more."),
+    ] = None,
+    save: Annotated[
+        Path | None, typer.Option("--save", help="Write a recording (.rrd) instead of opening the viewer.")
+    ] = None,
+    web: Annotated[
+        bool, typer.Option("--web", help="In a browser: for a machine without a window system.")
+    ] = False,
+) -> None:
+    """Opens sequences in rerun, on this machine only: surface, frame, flow, traction and force by time."""
+    from synth import view as viewing
+    from synth.store import Dataset, open_sequence
+
+    chosen = [open_sequence(out / f"{k:06d}.zarr") for k in sequence] if sequence else [Dataset(out)[0]]
+    if save is None:
+        viewing.show(chosen, web=web)
+    else:
+        viewing.save(chosen, save)
+        print(f"wrote {save}; open it with: rerun {save}")
+
+
+@app.command()
 def doctor(
     folder: Annotated[Path, typer.Argument(help="Where datasets are to go.")] = Path(),
     json: Json = False,

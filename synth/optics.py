@@ -19,7 +19,7 @@ def camera(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
     """K, distortion and depth span the area that each pixel says it sees, at the scale stated (relative)."""
     if "depth" not in sequence:
         return
-    view, (height, width) = _camera(sequence), sequence.size
+    view, (height, width) = camera_of(sequence), sequence.size
     depth = sequence["depth"][0].astype(np.float64)
     on = sequence["tissue"][:] & ~sequence["tool"][0] & (depth > 0)
     inner = cv2.erode(on.astype(np.uint8), np.ones((9, 9), np.uint8), borderValue=0).astype(bool)
@@ -46,7 +46,7 @@ def contact(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
     instruments = (sequence.attrs.get("mechanics") or {}).get("instruments", [])
     if len(instruments) != 1:
         return
-    view, tips = _camera(sequence), np.asarray(instruments[0]["tip_mm"], np.float64)
+    view, tips = camera_of(sequence), np.asarray(instruments[0]["tip_mm"], np.float64)
     footprint = float(sequence.attrs["scenario"]["gesture"]["footprint_mm"])
     area, tissue = sequence["area"][:], sequence["tissue"][:]
     inside = cv2.erode(tissue.astype(np.uint8), np.ones((5, 5), np.uint8), borderValue=0).astype(bool)
@@ -66,7 +66,8 @@ def contact(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
         yield Measure(off, 0.1 * footprint + view.mm_per_px, f"frame {t}")
 
 
-def _camera(sequence: Sequence) -> cameras.Camera:
+def camera_of(sequence: Sequence) -> cameras.Camera:
+    """The camera that took a sequence; aperture and focus are not kept."""
     attrs, (height, width) = sequence.attrs, sequence.size
     return cameras.Camera(
         K=np.asarray(attrs["K"], np.float64),
