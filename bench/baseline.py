@@ -69,6 +69,11 @@ def physical() -> dict[str, Method]:
 
 
 def fitted(clips: Sequence[Clip], source: str, seed: int = 0) -> dict[str, Method]:
+    """Those fitted on sequences, behind the bench's protocol. Arguments as `fitted_rules`."""
+    return {name: Baseline(rule) for name, rule in fitted_rules(clips, source, seed).items()}
+
+
+def fitted_rules(clips: Sequence[Clip], source: str, seed: int = 0) -> dict[str, Rule]:
     """Those fitted on sequences: the network's own fit sequences, for a fair table.
 
     Args:
@@ -90,7 +95,7 @@ def fitted(clips: Sequence[Clip], source: str, seed: int = 0) -> dict[str, Metho
     rules["ridge on PCA of flow"] = _ridge(basis, basis(moved, mask), force, _groups(clips))
     rules["k-NN on PCA of flow"] = _neighbours(basis, basis(moved, mask), force)
     rules["boosting per pixel"] = _boosting(clips, source, np.random.default_rng(seed))
-    return {name: Baseline(rule) for name, rule in rules.items()}
+    return rules
 
 
 def _peak(moved: NDArray[np.float32], mask: NDArray[np.float32]) -> float:

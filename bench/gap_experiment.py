@@ -178,7 +178,6 @@ def write(tree: dict[str, Any], out: Path) -> None:
 
 def readme(tree: dict[str, Any]) -> str:
     """The results in words and tables."""
-    where = tree["machine"]
     lines = [
         "# The sim-to-real gap",
         "",
@@ -190,7 +189,7 @@ def readme(tree: dict[str, Any]) -> str:
         "",
         f"Data: data.yaml here. {_counts(tree['sequences'])}; family held out: {tree['held_out']};",
         f"{tree['seeds']} network(s) a training, errors averaged over them; 95% BCa intervals.",
-        f"Machine: {where['processor']}, {where['cores']} cores, no GPU.",
+        f"Machine: {machine.line(tree['machine'])}.",
         "",
     ]
     for flow, found in tree["flows"].items():

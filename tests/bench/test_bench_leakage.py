@@ -1,0 +1,46 @@
+"""A method that only remembers looks good when frames are dealt at random, and not when recordings are."""
+
+from __future__ import annotations
+
+import numpy as np
+from rich.console import Console
+
+from bench import baseline, leakage
+from learn.data import Clip
+
+
+def clips(count: int = 6, frames: int = 8) -> list[Clip]:
+    """Each with a field of its own that grows with the force, whose gain is drawn: nothing carries over."""
+    rng = np.random.default_rng(0)
+    n = baseline.GRID.size
+    out = []
+    for k in range(count):
+        field = rng.normal(size=(2, n, n)).astype(np.float32)
+        level = np.linspace(0.1, 1, frames)
+        force = np.zeros((frames, 3))
+        force[:, 0] = level * rng.uniform(1, 20)
+        moved = (level[:, None, None, None] * field).astype(np.float32)
+        density = np.zeros((frames, 3, n, n), np.float32)
+        out.append(
+            Clip(
+                name=str(k), content_hash=str(k), group=str(k), family="", gesture="", young_kpa=1.0,
+                mask=np.ones((n, n), np.float32), displacement={"recovered": moved},
+                confidence=np.ones((frames, n, n), np.float32), density=density, force=force,
+            )
+        )  # fmt: skip
+    return out
+
+
+def test_remembering_is_only_rewarded_by_random_frames() -> None:
+    data = clips()
+    found = {
+        name: leakage.answers(data, fold, Console(quiet=True))
+        for name, fold in (
+            ("random frames", leakage._by_frame(data, 0)),
+            ("whole recordings", leakage._by_recording(data, 0)),
+        )
+    }
+    values = leakage.summary(data, found)["methods"]["k-NN on PCA of flow"]
+    assert values["random frames"]["r2"] > 0.8
+    assert values["whole recordings"]["r2"] < 0.2
+    assert "k-NN" in leakage.readme(leakage.summary(data, found))
