@@ -7,7 +7,7 @@ frames whose neighbours it was fitted on, and even one that only remembers does 
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -58,7 +58,10 @@ def leakage(
 
 
 def answers(
-    clips: Sequence[Clip], fold: Sequence[NDArray[np.intp]], console: Console
+    clips: Sequence[Clip],
+    fold: Sequence[NDArray[np.intp]],
+    console: Console,
+    fit: Callable[[Sequence[Clip], str], dict[str, baseline.Rule]] = baseline.fitted_rules,
 ) -> dict[str, list[Curve]]:
     """Every method's force [mN] of every frame, each asked only in the fold it wasn't fitted on.
 
@@ -66,11 +69,12 @@ def answers(
         clips: on the baselines' grid, with recovered flow.
         fold: for each clip (T,) the fold of its frames.
         console: told which fold is under way.
+        fit: makes the methods from clips and the name of their displacement.
     """
     said: dict[str, list[Curve]] = {}
     for k in range(_FOLDS):
         console.print(f"fold {k + 1} of {_FOLDS}")
-        rules = baseline.fitted_rules(
+        rules = fit(
             [_frames(c, f != k) for c, f in zip(clips, fold, strict=True) if (f != k).any()], "recovered"
         )
         for name, rule in rules.items():
