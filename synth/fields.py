@@ -132,6 +132,29 @@ FIELDS: dict[str, Field] = {
             low=0.0,
             high=1.0,
         ),
+        Field(
+            "flow_noisy",
+            (*_VIDEO, "xy"),
+            "float32",
+            "px",
+            "the true motion with the published method's noise, as the job's labels ask",
+            length=2,
+            kept="asked",
+            packed=0.45,
+            low=-1e4,
+            high=1e4,
+        ),
+        Field(
+            "intensity",
+            _VIDEO,
+            "float32",
+            "mN",
+            "the published method's label: size of the load, scaled to peak at the total force, with noise as "
+            "the job's labels ask; on the rest frame's pixels",
+            kept="asked",
+            packed=0.1,
+            low=0.0,
+        ),
     )
 }
 """Every field by name, in the order in which they are hashed and listed."""

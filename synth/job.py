@@ -319,6 +319,27 @@ class Card(Section):
     """Where questions go."""
     url: str | None = None
     """Where the dataset is to be found."""
+class Labels(Section):
+    """Noise of the published method, in the fields `intensity` and `flow_noisy` alone; see `store.extra`."""
+
+    force_std_mn: NonNegative = 0.0
+    """First stage, on every label: standard deviation [mN] of its normal noise."""
+    force_share: NonNegative = 0.0
+    """The same as a part of the label's size, added to it."""
+    force_bias_mn: FiniteFloat = 0.0
+    """Added to every component of every label [mN]."""
+    outliers: Share = 0.0
+    """Part of the labels whose noise is `outlier_scale` times larger."""
+    outlier_scale: Positive = 10.0
+    """How much larger."""
+    noisy_frames: Share = 0.3
+    """Second stage: part of the frames that it disturbs."""
+    noisy_points: Share = 0.05
+    """Part of the tissue's pixels, away from the contact, that get a displacement of their own and label 0."""
+    noisy_range: Share = 0.05
+    """That displacement's largest size, as a part of the frame's range of displacement."""
+
+
     published: Annotated[str, Field(pattern=r"^\d{4}-\d{2}-\d{2}$")] | None = None
     """Date of publication, in quotes: "2027-01-31"."""
 
@@ -348,3 +369,4 @@ class Job(Section):
         """Names of the fields that its sequences hold."""
         recovered = self.flow.backend != "ideal"
         return fields.kept(self.store.extra, self.store.without, recovered=recovered)
+    labels: Labels = Labels()

@@ -13,6 +13,7 @@ from synth.fem.mesh import Tets
 from synth.fem.solver import Deformation
 from synth.flow import mask, track
 from synth.job import Job
+from synth.published import Published
 from synth.render import anatomy, camera
 from synth.render.anatomy import Surface
 from synth.render.scene import Studio
@@ -20,8 +21,10 @@ from synth.scenario import Scenario
 from synth.stopwatch import Stopwatch
 from synth.store import Writer
 
-# Fields that the renderer gives by frame; those of `store.extra` are attributes of its `Shot` as well.
+# Fields that the renderer gives by frame; those of `store.extra` are attributes of its `Shot` as well, but
+# for the published method's.
 _SHOT = ("rgb", "flow", "visible", "tool", "glare", "depth")
+_PUBLISHED = ("flow_noisy", "intensity")
 
 Report = Callable[[str, int, int], None]
 """Progress: what is being done, how many of it are done, how many there are."""
@@ -64,6 +67,9 @@ def render_sequence(job: Job, index: int, folder: Path, report: Report) -> Path:
     writer.put("force", motion.force @ rotation.T)
     writer.put("tissue", still.tissue)
     writer.put("area", still.area)
+    labels = None
+    if set(_PUBLISHED) & set(job.store.extra):
+        labels = Published.begin(job.labels, still.tissue, job.frames, scenario.label_rng(job, index))
     rgb = np.empty((job.frames, height, width, 3), np.uint8)
     blocked = np.empty((job.frames, height, width), bool)
     for t, seed in enumerate(scenario.frame_seeds(job, index)):
@@ -72,8 +78,9 @@ def render_sequence(job: Job, index: int, folder: Path, report: Report) -> Path:
             shot = studio.frame(motion.rest + motion.displacement[t], motion.tip[t], motion.shaft[t], seed)
             traction = studio.traction(motion.traction[t])
         with watch.stage("store"):
+            made = labels.frame(t, shot.flow, traction, motion.force[t]) if labels else {}
             for name in (*_SHOT, *job.store.extra):
-                writer.put_frame(name, t, getattr(shot, name))
+                writer.put_frame(name, t, made[name] if name in made else getattr(shot, name))
             writer.put_frame("traction", t, traction)
             if job.render.exr:
                 writer.put_exr(t, shot.radiance)
