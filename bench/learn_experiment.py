@@ -11,9 +11,10 @@ import typer
 from rich.console import Console
 
 from bench.learn_labels import clips as labels
+from bench.learn_labels import press
 from bench.learn_runs import Run, carry_out
 from bench.learn_summary import write
-from learn.data import Clip, load
+from learn.data import load
 from learn.grid import Grid
 from learn.loss import Objective
 from learn.settings import Settings, preset
@@ -24,29 +25,54 @@ RESULTS = Path("docs/results/learn")
 
 
 def small() -> Settings:
-    """The study's base run: some 40 core-seconds, the same for every choice that is compared."""
-    base = preset("tiny", epochs=10, frames=4, folds=3, objective=Objective(kind="mse"))
+    """The study's base run: about a core-minute, the same for every choice that is compared."""
+    base = preset("tiny", epochs=8, folds=3, objective=Objective(kind="mse"))
     return replace(base, arch=replace(base.arch, output="magnitude"))
+
+
+PRESSED = ("mse-fold0-seed0", "film-fold0-seed0")
+"""Runs that are also scored with E from a calibration press."""
+LOSSES = {
+    "mse": Objective(kind="mse"),
+    "hinge": Objective(kind="hinge"),
+    "published": Objective(kind="published", rule="frame"),
+    "antighost": Objective(),
+    "antighost-frame": Objective(rule="frame"),
+}
+"""Compared on three seeds. `antighost` and `antighost-frame` differ in the low-force rule alone."""
 
 
 def ideal_runs() -> Iterator[Run]:
     """On labels-only sequences, in the order of their worth; an interrupted study goes on where it was."""
-    base, antighost = small(), Objective()
-    published = Objective(kind="published", rule="frame")
-    yield Run("mse-fold0-seed0", base)
-    yield Run("antighost-fold0-seed0", replace(base, objective=antighost))
-    yield Run("mse-fold1-seed0", replace(base, fold=1))
-    yield Run("mse-fold2-seed0", replace(base, fold=2))
+    base = small()
+    first = ("mse", "hinge", "published")
+    for seed in range(3):
+        for name in first:
+            yield Run(f"{name}-fold0-seed{seed}", replace(base, objective=LOSSES[name], seed=seed))
+    # The network as it is drawn, without a stem, on three folds.
+    whole = replace(base, arch=replace(base.arch, stem=1))
+    for fold in range(3):
+        yield Run(f"d2fnet-fold{fold}-seed0", replace(whole, fold=fold))
     yield Run("shuffled-fold0-seed0", base, control="shuffled")
-    yield Run("published-fold0-seed0", replace(base, objective=published))
     yield Run("stem4-fold0-seed0", replace(base, arch=replace(base.arch, stem=4, levels=2)))
-    yield Run("zero-fold0-seed0", base, control="zero")
-    for seed in (1, 2):
-        yield Run(f"mse-fold0-seed{seed}", replace(base, seed=seed))
-        yield Run(f"antighost-fold0-seed{seed}", replace(base, objective=antighost, seed=seed))
-        yield Run(f"published-fold0-seed{seed}", replace(base, objective=published, seed=seed))
-    yield Run("vector-fold0-seed0", replace(base, arch=replace(base.arch, output="vector")))
     yield Run("unet-fold0-seed0", replace(base, arch=replace(base.arch, name="unet")))
+    yield Run("monai-unet-fold0-seed0", replace(base, arch=replace(base.arch, name="monai-unet", stem=1)))
+    for fold in (1, 2):
+        for name in ("mse", "hinge"):
+            yield Run(f"{name}-fold{fold}-seed0", replace(base, objective=LOSSES[name], fold=fold))
+    yield Run("vector-fold0-seed0", replace(base, arch=replace(base.arch, output="vector", total=True)))
+    yield Run("film-fold0-seed0", replace(base, arch=replace(base.arch, condition="film")))
+    for seed in range(3):
+        for name in LOSSES.keys() - set(first):
+            yield Run(f"{name}-fold0-seed{seed}", replace(base, objective=LOSSES[name], seed=seed))
+
+
+def fine_runs() -> Iterator[Run]:
+    """On 128²: what the stem of the live network costs in error, at equal steps."""
+    base = replace(small(), size=128, epochs=4)
+    for stem, levels in ((4, 3), (2, 4), (1, 4)):
+        arch = replace(base.arch, stem=stem, levels=levels)
+        yield Run(f"stem{stem}-fold0-seed0", replace(base, arch=arch))
 
 
 def recovered_runs() -> Iterator[Run]:
@@ -66,28 +92,24 @@ def experiment(
     ] = None,
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for results.")] = RESULTS,
     only: Annotated[str, typer.Option(help="Only runs whose name holds this.")] = "",
+    fine: Annotated[bool, typer.Option("--fine", help="The runs on 128² instead of those on 64².")] = False,
 ) -> None:
     """Train and score learn's choices; done runs are kept, the summary is made anew."""
     set_threads(1)
     say = Console(stderr=True).print
     grid = Grid(small().size)
     if rendered is not None:
-        _study(
-            "recovered",
-            recovered_runs(),
-            load(rendered, grid, ("ideal", "recovered"), cache=cache),
-            out,
-            only,
-        )
+        clips = load(rendered, grid, ("ideal", "recovered"), cache=cache)
+        name, runs, presses = "recovered", recovered_runs(), None
     else:
         job = config.load(str(RESULTS / "data/labels.yaml"))
-        _study("ideal", ideal_runs(), labels(job, grid, cache), out, only)
-    write(out)
-    say(f"{out}/README.md")
-
-
-def _study(name: str, runs: Iterator[Run], clips: list[Clip], out: Path, only: str) -> None:
-    say = Console(stderr=True).print
+        grid = Grid(128) if fine else grid
+        clips, presses = labels(job, grid, cache), lambda index: press(job, index, grid, cache)
+        name, runs = ("fine", fine_runs()) if fine else ("ideal", ideal_runs())
     for run in runs:
         if only in run.name:
-            carry_out(run, clips, out / name / "runs", say)
+            # A press costs a sequence: once is enough to say what calibration gives.
+            asked = presses if run.name in PRESSED else None
+            carry_out(run, clips, out / name / "runs", cache / "models" / name, say, asked)
+    write(out)
+    say(f"{out}/README.md")

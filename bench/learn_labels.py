@@ -17,14 +17,18 @@ from numpy.typing import NDArray
 from learn.data import Clip, pack, unpack
 from learn.grid import Grid, Resampler, centre, settled
 from synth import identity, pipeline, scenario
+from synth.fem.tool import Gesture
 from synth.job import Job
 from synth.render import camera, rim, truth
 from synth.render.shape import Shape
+from synth.scenario import Scenario
 
 FINE = 128
 """Cells along the edge of the grid that labels are made on, at least."""
 _VERSION = 2
 """Of what is packed: a change of the labels makes another cache."""
+_PRESS = 0x9E55
+"""Told apart from every other draw of a sequence."""
 
 
 def clips(
@@ -72,6 +76,21 @@ def coarser(clip: Clip, grid: Grid, times: int) -> Clip:
     )
 
 
+def press(job: Job, index: int, grid: Grid, cache: Path) -> Clip:
+    """A push somewhere else on the tissue of a sequence: what calibrates E (`learn.calibrate`)."""
+    fine = Grid(max(grid.size, FINE), grid.extent_mm)
+    name = f"{_key(job, index, grid)}-press"
+    if not (cache / name).is_dir():
+        case = scenario.draw(job, index)
+        rng = np.random.default_rng([job.seed, index, _PRESS])
+        only = job.fem.model_copy(update={"gestures": ("push",)})
+        gesture = Gesture.draw(only, job.anatomy.craniotomy, case.tissue, rng)
+        made = clip(job, index, fine, name, replace(case, gesture=gesture))
+        times = fine.size // grid.size
+        pack(coarser(made, fine, times) if times > 1 else made, cache / name)
+    return unpack(cache / name)
+
+
 def _key(job: Job, index: int, grid: Grid) -> str:
     """Hash of all that labels depend on: pictures and flow estimators change none of them."""
     parts = job.model_dump(mode="json", include={"seed", "frames", "fps", "anatomy", "fem", "render"})
@@ -79,9 +98,9 @@ def _key(job: Job, index: int, grid: Grid) -> str:
     return hashlib.blake2b(described, digest_size=16).hexdigest()
 
 
-def clip(job: Job, index: int, grid: Grid, name: str) -> Clip:
-    """One sequence of a job: deformed, projected, put on the grid."""
-    case = scenario.draw(job, index)
+def clip(job: Job, index: int, grid: Grid, name: str, case: Scenario | None = None) -> Clip:
+    """One sequence of a job (or the one that `case` says): deformed, projected, put on the grid."""
+    case = case or scenario.draw(job, index)
     view = camera.place(case.view, job.render)
     surface, tets = pipeline.build(job, case)
     motion = pipeline.move(job, case, surface, tets)

@@ -17,7 +17,8 @@ from rich.table import Table
 
 from bench.machine import describe
 from learn.grid import Grid, Scales, channels
-from learn.model import Architecture, D2FNet, flops, fused, parameters
+from learn.model import Architecture, flops, fused, parameters
+from learn.reference import build
 from learn.settings import PRESETS
 from learn.threads import set_threads
 
@@ -64,7 +65,7 @@ def measure(
     timed at least five times, light ones `repeats` times.
     """
     torch.manual_seed(0)
-    model = fused(D2FNet(arch)).to(device)
+    model = fused(build(arch)).to(device)
     if layout == "channels_last":
         model = model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     grid, scales = Grid(size), Scales(0.2, 0.03, 0.07, 2.0, 0.003)
@@ -85,7 +86,7 @@ def measure(
         "name": f"{arch.name} w{arch.width} stem{arch.stem} {size} {layout} {precision}",
         "preset": names.get(arch, ""),
         "size": size,
-        "parameters": parameters(D2FNet(arch)),
+        "parameters": parameters(build(arch)),
         "gflop": round(flops(arch, size) / 1e9, 3),
         "cpu_ms_p50": round(float(np.quantile(times, 0.5)), 3),
         "cpu_ms_p95": round(float(np.quantile(times, 0.95)), 3),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import tempfile
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -12,9 +11,11 @@ from typing import Any
 
 import numpy as np
 
+from bench.learn_controls import controls
+from learn.calibrate import stiffness
 from learn.data import Clip
 from learn.evaluate import evaluate
-from learn.predict import load
+from learn.predict import Predictor, load
 from learn.settings import Settings
 from learn.split import nested
 from learn.train import train
@@ -29,12 +30,23 @@ class Run:
     source: str = "ideal"
     """Displacement it is tested on."""
     control: str = ""
-    """`shuffled`: the targets of the fitted sequences are dealt to other sequences; `zero`: the test sees
-    no motion; empty: neither."""
+    """`shuffled`: the targets of the fitted sequences are dealt to other sequences; empty: they are not."""
 
 
-def carry_out(run: Run, clips: Sequence[Clip], folder: Path, say: Callable[[str], None]) -> dict[str, Any]:
-    """The run's scores on its test fold, from `folder` if it was done before."""
+def carry_out(
+    run: Run,
+    clips: Sequence[Clip],
+    folder: Path,
+    models: Path,
+    say: Callable[[str], None],
+    presses: Callable[[int], Clip] | None = None,
+) -> dict[str, Any]:
+    """The run's scores on its test fold, from `folder` if it was done before.
+
+    `models`: where the trained model stays, for whoever asks it more; a run that was stopped goes on from
+    there.
+    `presses`: gives a calibration press on the tissue of a sequence, by its index.
+    """
     file = folder / f"{run.name}.json"
     if file.is_file():
         done: dict[str, Any] = json.loads(file.read_text())
@@ -44,14 +56,14 @@ def carry_out(run: Run, clips: Sequence[Clip], folder: Path, say: Callable[[str]
     if run.control == "shuffled":
         used = _dealt_out(used, split.fit)
     began = time.process_time()
-    with tempfile.TemporaryDirectory() as scratch:
-        card = train(used, split, run.settings, Path(scratch) / "model")
-        spent = time.process_time() - began
-        asked = [clips[i] for i in split.test]
-        if run.control == "zero":
-            asked = [replace(c, displacement={k: 0 * v for k, v in c.displacement.items()}) for c in asked]
-        report = evaluate(load(Path(scratch) / "model"), asked, run.source)
-        history = [json.loads(s) for s in (Path(scratch) / "model/history.jsonl").read_text().splitlines()]
+    card = train(used, split, run.settings, models / run.name)
+    spent = time.process_time() - began
+    predictor = load(models / run.name)
+    pressed = None
+    if presses is not None:
+        pressed = {clips[i].content_hash: _pressed(predictor, presses(i)) for i in split.test}
+    report = evaluate(predictor, [clips[i] for i in split.test], run.source, pressed=pressed)
+    history = [json.loads(s) for s in (models / run.name / "history.jsonl").read_text().splitlines()]
     result = {
         "name": run.name,
         "source": run.source,
@@ -63,8 +75,12 @@ def carry_out(run: Run, clips: Sequence[Clip], folder: Path, say: Callable[[str]
         "select_r2": card.score,
         "train_cpu_s": round(spent, 1),
         "history": history,
+        "controls": controls(predictor, [clips[i] for i in split.test], run.source),
         **report.as_dict(),
     }
+    if pressed is not None:
+        off = [abs(np.log(pressed[clips[i].content_hash] / clips[i].young_kpa)) for i in split.test]
+        result["press_young_off"] = float(np.exp(np.median(off)) - 1)
     folder.mkdir(parents=True, exist_ok=True)
     file.write_text(json.dumps(result, indent=1) + "\n")
     known = report.summary()
@@ -73,6 +89,11 @@ def carry_out(run: Run, clips: Sequence[Clip], folder: Path, say: Callable[[str]
         f"force R² {known['force_r2_pooled']:.3f}, ghosts {known['ghost_relative']:.4f}"
     )
     return result
+
+
+def _pressed(predictor: Predictor, press: Clip) -> float:
+    force = np.linalg.norm(press.force, axis=1)
+    return stiffness(predictor, np.asarray(press.displacement["ideal"]), press.mask, force)
 
 
 def _dealt_out(clips: list[Clip], fit: Sequence[int]) -> list[Clip]:

@@ -11,9 +11,10 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch import nn
 
 from learn.grid import Scales
-from learn.model import D2FNet
+from learn.reference import build
 from learn.settings import Settings, from_dict
 from synth.errors import UserError
 
@@ -77,10 +78,10 @@ def load_tensors(file: Path) -> dict[str, Any]:
     return tree
 
 
-def load_model(folder: Path) -> tuple[D2FNet, Card]:
+def load_model(folder: Path) -> tuple[nn.Module, Card]:
     """The trained network, in evaluation mode on the CPU, and its card."""
     card = read_card(folder)
-    model = D2FNet(card.settings.arch)
+    model = build(card.settings.arch)
     state = load_tensors(folder / "weights.pt")
     try:
         model.load_state_dict(state)

@@ -69,7 +69,7 @@ def train_command(
     from learn.data import load, sources
     from learn.settings import override
     from learn.settings import preset as of
-    from learn.split import groups, nested
+    from learn.split import groups, nested, ungrouped
     from learn.threads import set_threads
     from learn.train import train
 
@@ -94,6 +94,9 @@ def train_command(
     settings = override(of(preset), [*given, *(changes or [])])
     with _bar("Reading sequences") as tell:
         clips = load(dataset, settings.grid, sources(settings.input), cache=cache, report=tell)
+    if settings.share_anatomy:
+        clips = ungrouped(clips)
+        _console.print("One brain may be on several sides of the split: scores say nothing of other brains.")
     if folds is None:
         settings = replace(settings, folds=min(settings.folds, len(set(groups(clips)))))
     split = nested(clips, settings.folds, settings.fold, settings.seed, settings.held_out_family)
@@ -141,6 +144,7 @@ def eval_command(
     from learn.data import load
     from learn.evaluate import evaluate, unseen
     from learn.predict import load as load_model
+    from learn.split import ungrouped
     from learn.threads import set_threads
 
     set_threads(threads)
@@ -151,6 +155,9 @@ def eval_command(
         raise UserError(f"unknown input {source!r}: ideal or recovered")
     with _bar("Reading sequences") as tell:
         clips = load(dataset, predictor.grid, (source,), cache=cache, report=tell)
+    if predictor.card.settings.share_anatomy:
+        clips = ungrouped(clips)
+        _console.print("The model was chosen on brains it is scored on: this says nothing of other brains.")
     chosen = clips if all else unseen(clips, predictor.card)
     if not chosen:
         raise UserError(

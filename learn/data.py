@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -21,7 +21,7 @@ Input = Literal["ideal", "recovered", "mixed"]
 INPUTS = ("ideal", "recovered", "mixed")
 Target = Literal["density", "intensity"]
 _FIELDS = {"ideal": "flow", "recovered": "flow_tvl1"}
-_VERSION = 2
+_VERSION = 3
 _ARRAYS = ("mask", "confidence", "density", "force")
 _PLAIN = ("name", "content_hash", "group", "family", "gesture", "young_kpa")
 
@@ -101,7 +101,7 @@ def read(sequence: Sequence, grid: Grid, wanted: Iterable[str]) -> Clip:
     return Clip(
         name=where,
         content_hash=str(attrs["content_hash"]),
-        group=_anatomy(scenario, str(attrs["content_hash"])),
+        group=_anatomy(attrs),
         family=str(scenario.get("family", "")),
         gesture=str((scenario.get("gesture") or {}).get("kind", "")),
         young_kpa=young,
@@ -113,10 +113,15 @@ def read(sequence: Sequence, grid: Grid, wanted: Iterable[str]) -> Clip:
     )
 
 
-def _anatomy(scenario: dict[str, Any], content_hash: str) -> str:
-    """What names the anatomy across datasets: the seed of its relief; a sequence without one is alone."""
-    seed = (scenario.get("relief") or {}).get("seed")
-    return content_hash if seed is None else str(seed)
+def _anatomy(attrs: Mapping[str, Any]) -> str:
+    """What names the anatomy across datasets: `anatomy_id`; in older stores the seed of the relief; a
+    sequence
+    with neither is alone. All sequences of one user's brain are one anatomy."""
+    named = attrs.get("anatomy_id")
+    if named is not None:
+        return str(named)
+    seed = ((attrs.get("scenario") or {}).get("relief") or {}).get("seed")
+    return str(attrs["content_hash"]) if seed is None else f"seed-{seed}"
 
 
 def load(

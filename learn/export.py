@@ -21,7 +21,6 @@ from torch import Tensor, nn
 
 from learn.checkpoint import Card
 from learn.grid import SMOOTHING_MM, channels
-from learn.model import D2FNet
 from learn.predict import Predictor
 from synth.errors import UserError
 
@@ -32,7 +31,7 @@ TOLERANCE = 1e-4
 class Portable(nn.Module):
     """From displacement to force density per unit stiffness, in one module."""
 
-    def __init__(self, model: D2FNet, card: Card) -> None:
+    def __init__(self, model: nn.Module, card: Card) -> None:
         super().__init__()
         self.model, self.card = model, card
 

@@ -16,7 +16,7 @@ Cells that are surely in contact (p = 0) aren't touched, which is why R² need n
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import torch
@@ -51,6 +51,9 @@ class Objective:
     the published code has it (true for nearly every frame: a contact covers little of the picture)."""
     stray_weight: float = 1.0
     """`hinge`: price of the mean force density on contact-free tissue [mN/mm²], in units of `spread`."""
+    ramp: tuple[float, float] = (0.25, 0.75)
+    """`hinge`: shares of the run between which the price grows from none to full. Paid from the start it is
+    cheapest to say nothing, and a network learns that first."""
     free: float = 0.01
     """`hinge`: tissue is contact-free where its true density is under this share of `unit`."""
     total_weight: float = 0.0
@@ -66,6 +69,18 @@ class Objective:
             raise UserError("loss weights: r2_weight in 0..1, the others not negative")
         if self.rule not in ("pixel", "frame"):
             raise UserError(f"unknown low-force rule {self.rule!r}: pixel or frame")
+
+
+def at(objective: Objective, progress: float) -> Objective:
+    """The objective at a point 0..1 of the run."""
+    start, full = objective.ramp
+    share = min(max((progress - start) / max(full - start, 1e-9), 0.0), 1.0)
+    return replace(objective, stray_weight=objective.stray_weight * share)
+
+
+def full(objective: Objective, progress: float) -> bool:
+    """Whether nothing of the objective is still to come at a point 0..1 of the run."""
+    return objective.kind != "hinge" or progress >= objective.ramp[1]
 
 
 SHARES = ("error", "r2", "ghost", "total")

@@ -28,7 +28,7 @@ COMPONENTS: dict[str, int] = {"magnitude": 1, "vector": 3}
 class Architecture:
     """Everything that decides the network's shape; stored in the checkpoint."""
 
-    name: Literal["d2fnet", "unet"] = "d2fnet"
+    name: Literal["d2fnet", "unet", "monai-unet"] = "d2fnet"
     width: int = 32
     """Channels of the first level; each level doubles them."""
     levels: int = 4
@@ -49,8 +49,8 @@ class Architecture:
     """`film`: Young's modulus modulates the bottleneck (feature-wise affine; Perez et al. 2018)."""
 
     def __post_init__(self) -> None:
-        if self.name not in ("d2fnet", "unet"):
-            raise UserError(f"unknown model {self.name!r}: d2fnet or unet")
+        if self.name not in ("d2fnet", "unet", "monai-unet"):
+            raise UserError(f"unknown model {self.name!r}: d2fnet, unet or monai-unet")
         if self.output not in COMPONENTS:
             raise UserError(f"unknown output {self.output!r}: magnitude or vector")
         if self.stem not in (1, 2, 4) or not 1 <= self.levels <= 5 or self.width < 4 or self.width % 4:
@@ -244,16 +244,20 @@ def _start(module: nn.Module) -> None:
 
 
 def _start_small(heads: nn.Module) -> None:
-    """Begin near no force at all: half a bound everywhere would be one large ghost to unlearn."""
+    """Begin near no force at all: half a bound everywhere would be one large ghost to unlearn.
+
+    A bias of -2 is a tenth of a bound; at -4 the sigmoids are so flat that little force left at the start is
+    also slow to go.
+    """
     last = list(heads.ranges) if isinstance(heads, Heads) else [heads]
     unsigned = isinstance(heads, Heads) and not heads.signed
     for conv in last:
         if isinstance(conv, nn.Conv2d) and conv.bias is not None:
             nn.init.normal_(conv.weight, std=0.02)
-            nn.init.constant_(conv.bias, -4.0 if unsigned else 0.0)
+            nn.init.constant_(conv.bias, -2.0 if unsigned else 0.0)
 
 
-def fused(model: D2FNet) -> D2FNet:
+def fused(model: nn.Module) -> nn.Module:
     """A copy for evaluation in which every batch norm is folded into the convolution before it."""
     quick = copy.deepcopy(model).eval()
     for block in quick.modules():

@@ -8,11 +8,12 @@ from pathlib import Path
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import nn
 
 from learn import checkpoint
 from learn.checkpoint import Card
 from learn.grid import Grid, Resampler, centre, channels
-from learn.model import D2FNet, fused
+from learn.model import fused
 from synth.errors import UserError
 
 
@@ -93,7 +94,7 @@ class View:
 class Predictor:
     """A trained model, ready for pictures of any size and scale."""
 
-    def __init__(self, model: D2FNet, card: Card, device: torch.device | str = "cpu") -> None:
+    def __init__(self, model: nn.Module, card: Card, device: torch.device | str = "cpu") -> None:
         self.card, self.grid = card, card.settings.grid
         self.device = torch.device(device)
         self.model = fused(model).to(self.device)

@@ -48,9 +48,16 @@ class Settings:
     """Frames a sequence gives an epoch, drawn anew each epoch; 0 takes all."""
     precision: Literal["32-true", "bf16-mixed"] = "32-true"
     channels_last: bool = False
+    compile: bool = False
+    """Whether torch.compile takes the network: worth its minute on a GPU; needs a C++ compiler on a CPU."""
+    deterministic: bool = False
+    """Whether operations without a deterministic form are refused. On one CPU the others give equal bits too;
+    on a GPU set CUBLAS_WORKSPACE_CONFIG=:4096:8 beside it."""
     folds: int = 5
     fold: int = 0
     held_out_family: str | None = None
+    share_anatomy: bool = False
+    """Whether one brain's sequences may be on several sides of the split, for a dataset of a single brain."""
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -80,7 +87,10 @@ def from_dict(tree: dict[str, Any]) -> Settings:
     tree = dict(tree)
     arch = dict(tree.pop("arch"))
     arch["bounds"] = tuple(arch["bounds"])
-    return Settings(arch=Architecture(**arch), objective=Objective(**tree.pop("objective")), **tree)
+    objective = dict(tree.pop("objective"))
+    if "ramp" in objective:
+        objective["ramp"] = tuple(objective["ramp"])
+    return Settings(arch=Architecture(**arch), objective=Objective(**objective), **tree)
 
 
 PRESETS: dict[str, Settings] = {

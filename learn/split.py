@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from learn.data import Clip
 from synth.errors import UserError
+
+_HINT = "; share_anatomy=true splits one brain's sequences, and says nothing of other brains"
 
 
 @dataclass(frozen=True)
@@ -18,6 +20,13 @@ class Split:
     fit: tuple[int, ...]
     select: tuple[int, ...]
     test: tuple[int, ...]
+
+
+def ungrouped(clips: Sequence[Clip]) -> list[Clip]:
+    """The clips with every sequence a group of its own: for a dataset of a single brain, whose sequences
+    can't be
+    kept apart by anatomy. Scores then say nothing of other brains."""
+    return [replace(c, group=f"{c.group}/{c.content_hash}") for c in clips]
 
 
 def groups(clips: Sequence[Clip]) -> list[int]:
@@ -53,7 +62,7 @@ def folds(clips: Sequence[Clip], count: int, seed: int) -> list[tuple[int, ...]]
     if not 2 <= count <= len(names):
         raise UserError(
             f"{count} folds: between 2 and {len(names)} are possible, for {len(clips)} sequences hold "
-            f"{len(names)} different anatomies"
+            f"{len(names)} different anatomies" + _HINT * (len(names) < 3)
         )
     size = {int(g): int((group == g).sum()) for g in names}
     bins: list[list[int]] = [[] for _ in range(count)]
@@ -87,7 +96,7 @@ def nested(
     if left < 2:
         raise UserError(
             f"fit, select and test need an anatomy each: {len(set(number))} are there, {left} are left of "
-            "them beside the test"
+            "them beside the test" + _HINT
         )
     parts = folds([clips[i] for i in rest], min(5, left), seed)
     chosen = fold % len(parts) if held_out_family is not None else 0

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import math
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -20,9 +20,10 @@ from learn.batch import Batch, Frames, inputs, measure_scales
 from learn.checkpoint import Card
 from learn.data import Clip, typical_young
 from learn.grid import Scales
-from learn.loss import SHARES, gradient_shares, loss
+from learn.log import Log
+from learn.loss import SHARES, at, full, gradient_shares, loss
 from learn.metrics import Moments, agreement
-from learn.model import D2FNet
+from learn.reference import build
 from learn.settings import Settings
 from learn.split import Split, groups
 from synth.errors import UserError
@@ -50,13 +51,14 @@ def train(
     """
     fabric = fabric or Fabric(accelerator="cpu", devices=1, precision=settings.precision)
     fabric.launch()
+    torch.use_deterministic_algorithms(settings.deterministic)
     fit, select = [clips[i] for i in split.fit], [clips[i] for i in split.select]
     scales = measure_scales(fit, settings)
     card = Card(settings, scales, typical_young(fit), *_provenance(clips, split))
     state = _open(out, card)
 
     torch.manual_seed(settings.seed)
-    model = D2FNet(settings.arch)
+    model = build(settings.arch)
     if settings.channels_last:
         model = model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     optimizer = torch.optim.AdamW(
@@ -69,38 +71,38 @@ def train(
         optimizer.load_state_dict(state["optimizer"])
         plateau.load_state_dict(state["plateau"])
         start, best, waited = state["epoch"], state["best"], state["waited"]
-    net, optimizer = fabric.setup(model, optimizer)
+    net, optimizer = fabric.setup(torch.compile(model) if settings.compile else model, optimizer)
     frames, chooser = Frames(fit, settings), Frames(select, settings)
 
-    for epoch in range(start, settings.epochs):
-        if settings.stop and waited >= settings.stop:
-            break
-        numbers = _epoch(fabric, net, optimizer, frames, scales, epoch, report)
-        numbers |= select_score(net, chooser, scales, fabric.device)
-        score = numbers["select_r2"]
-        if settings.schedule == "plateau":
-            plateau.step(score)
-        improved = score > best
-        best, waited = (score, 0) if improved else (best, waited + 1)
-        numbers |= {"epoch": epoch + 1.0, "lr": optimizer.param_groups[0]["lr"]}
-        if fabric.is_global_zero:
-            if improved:
-                checkpoint.save_tensors(out / "weights.pt", _cpu(model.state_dict()))
-                checkpoint.write_card(out, dataclasses.replace(card, epoch=epoch + 1, score=score))
-            _remember(out, epoch, numbers)
-            checkpoint.save_tensors(
-                out / "last.pt",
-                {
-                    "model": _cpu(model.state_dict()),
-                    "optimizer": optimizer.state_dict(),
-                    "plateau": plateau.state_dict(),
+    with Log(out, start) if fabric.is_global_zero else nullcontext() as write:
+        for epoch in range(start, settings.epochs):
+            if settings.stop and waited >= settings.stop:
+                break
+            numbers = _epoch(fabric, net, optimizer, frames, scales, epoch, report)
+            numbers |= select_score(net, chooser, scales, fabric.device)
+            score = numbers["select_r2"]
+            if settings.schedule == "plateau":
+                plateau.step(score)
+            # Before its price is whole no epoch has been asked to have no ghosts: none of those is chosen.
+            asked = full(settings.objective, (epoch + 1) / settings.epochs)
+            improved = asked and score > best
+            best, waited = (score, 0) if improved else (best, waited + asked)
+            numbers |= {"epoch": epoch + 1.0, "lr": optimizer.param_groups[0]["lr"]}
+            if write is not None:
+                write(epoch, numbers)
+                if improved:
+                    checkpoint.save_tensors(out / "weights.pt", _cpu(model.state_dict()))
+                    checkpoint.write_card(out, dataclasses.replace(card, epoch=epoch + 1, score=score))
+                state = {
                     "epoch": epoch + 1,
                     "best": best,
                     "waited": waited,
-                },
-            )
-        fabric.barrier()
-        log(numbers)
+                    "model": _cpu(model.state_dict()),
+                }
+                state |= {"optimizer": optimizer.state_dict(), "plateau": plateau.state_dict()}
+                checkpoint.save_tensors(out / "last.pt", state)
+            fabric.barrier()
+            log(numbers)
     return checkpoint.read_card(out)
 
 
@@ -131,7 +133,7 @@ def _epoch(
             said,
             batch.target,
             batch.mask,
-            settings.objective,
+            at(settings.objective, (epoch + i / batches) / settings.epochs),
             scales.target,
             scales.spread,
             settings.grid.pitch_mm**2,
@@ -217,7 +219,8 @@ def _open(out: Path, card: Card) -> dict[str, Any] | None:
         raise UserError(f"{out}: holds a model trained with other settings; choose another folder")
     if there.split != card.split or there.scales != card.scales:
         raise UserError(f"{out}: holds a model trained on other data; choose another folder")
-    bound = there.settings.input == "mixed" or there.settings.schedule == "cosine"
+    planned = there.settings.input == "mixed" or there.settings.objective.kind == "hinge"
+    bound = planned or there.settings.schedule == "cosine"
     if there.settings.epochs != card.settings.epochs and bound:
         raise UserError(f"{out}: its schedule was made for {there.settings.epochs} epochs; keep --epochs")
     if not (out / "last.pt").exists():
@@ -227,13 +230,6 @@ def _open(out: Path, card: Card) -> dict[str, Any] | None:
     if missing:
         raise UserError(f"{out / 'last.pt'}: corrupt checkpoint (lacks {', '.join(sorted(missing))})")
     return state
-
-
-def _remember(out: Path, epoch: int, numbers: dict[str, float]) -> None:
-    """Writes the epoch's line; lines of epochs that a kill cut off before their checkpoint go."""
-    file = out / "history.jsonl"
-    lines = file.read_text().splitlines()[:epoch] if file.exists() else []
-    file.write_text("\n".join([*lines, json.dumps(numbers)]) + "\n")
 
 
 def _cpu(state: dict[str, Any]) -> dict[str, Any]:

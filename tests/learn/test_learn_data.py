@@ -8,7 +8,7 @@ import pytest
 
 from learn.data import Clip, _anatomy, load, target
 from learn.grid import Grid
-from learn.split import folds, groups, nested
+from learn.split import folds, groups, nested, ungrouped
 from synth.errors import UserError
 
 GRID = Grid(32)
@@ -105,11 +105,26 @@ def test_impossible_folds(clips: list[Clip]) -> None:
         nested(clips, 3, 3, 0)
 
 
-def test_anatomies_are_told_apart_by_what_a_real_sequence_says() -> None:
+def test_anatomies_are_told_apart_by_what_a_sequence_says() -> None:
     from synth import scenario
     from synth.job import Job
 
     job = Job.model_validate({"sequences": 6, "anatomy": {"variety": 3}})
-    names = [_anatomy(scenario.draw(job, i).as_dict(), f"hash{i}") for i in range(6)]
+    cases = [{"scenario": scenario.draw(job, i).as_dict(), "content_hash": f"hash{i}"} for i in range(6)]
+    names = [_anatomy(case) for case in cases]
     assert names[:3] == names[3:]
     assert len(set(names)) == 3
+    # A user's brain is one anatomy, whatever relief was drawn on it.
+    assert {_anatomy({**case, "anatomy_id": "mesh-5f"}) for case in cases} == {"mesh-5f"}
+    assert _anatomy({"content_hash": "h", "scenario": {}}) == "h"
+
+
+def test_one_brain_is_split_only_when_asked_to(clips: list[Clip]) -> None:
+    from dataclasses import replace
+
+    one = [replace(c, group="mesh-5f") for c in clips]
+    with pytest.raises(UserError, match="share_anatomy=true"):
+        nested(one, 3, 0, 0)
+    alone = ungrouped(one)
+    split = nested(alone, 3, 0, 0)
+    assert len(split.fit) + len(split.select) + len(split.test) == len(clips)

@@ -91,7 +91,7 @@ def test_gradient_shares_add_up_and_follow_the_weights() -> None:
 
 
 def test_the_hinge_prices_force_on_contact_free_tissue_alone_and_linearly() -> None:
-    """0.4 mN/mm² on the first cell (truth 0; free is under 0.04), none on the second; the third is contact."""
+    """0.4 mN/mm² on the first cell (truth 0; free is under 0.04), none on the second."""
     objective = Objective(kind="hinge", r2_weight=0.0, stray_weight=1.5)
     terms = loss(SAID, TRUE, MASK, objective, unit=4.0, spread=2.0)
     assert float(terms.ghost) == pytest.approx(1.5 * 0.4 / 3 / 2.0, rel=1e-5)

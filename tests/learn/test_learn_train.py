@@ -153,7 +153,7 @@ def test_bad_numbers(model: Path) -> None:
 
 def broken(model: Path, to: Path, file: str, data: bytes) -> Path:
     to.mkdir()
-    for item in model.iterdir():
+    for item in (f for f in model.iterdir() if f.is_file()):
         (to / item.name).write_bytes(item.read_bytes())
     (to / file).write_bytes(data)
     return to
