@@ -149,8 +149,8 @@ FIELDS: dict[str, Field] = {
             _VIDEO,
             "float32",
             "mN",
-            "the published method's label: size of the load, scaled to peak at the total force, with noise as "
-            "the job's labels ask; on the rest frame's pixels",
+            "the published method's label: size of the load, scaled to peak at the total force, with noise "
+            "as the job's labels ask; on the rest frame's pixels",
             kept="asked",
             packed=0.1,
             low=0.0,

@@ -304,21 +304,6 @@ class Store(Section):
     """Type of both flows stored; float16 rounds motion below 16 px by at most 0.004 px, below 32 by 0.008."""
 
 
-class Card(Section):
-    """What a person says of the dataset, for its card. Changes no sequence."""
-
-    title: str = "Synthetic neurosurgical sequences with ground-truth force"
-    """Name of the dataset."""
-    summary: str | None = None
-    """What it was made for, in your words."""
-    licence: str | None = None
-    """Licence under which you share it, as an SPDX name (cc-by-4.0). Empty: none is given."""
-    authors: tuple[str, ...] = ()
-    """Who made it."""
-    contact: str | None = None
-    """Where questions go."""
-    url: str | None = None
-    """Where the dataset is to be found."""
 class Labels(Section):
     """Noise of the published method, in the fields `intensity` and `flow_noisy` alone; see `store.extra`."""
 
@@ -335,11 +320,26 @@ class Labels(Section):
     noisy_frames: Share = 0.3
     """Second stage: part of the frames that it disturbs."""
     noisy_points: Share = 0.05
-    """Part of the tissue's pixels, away from the contact, that get a displacement of their own and label 0."""
+    """Part of the tissue's pixels, away from the contact, that get displacement of their own and label 0."""
     noisy_range: Share = 0.05
     """That displacement's largest size, as a part of the frame's range of displacement."""
 
 
+class Card(Section):
+    """What a person says of the dataset, for its card. Changes no sequence."""
+
+    title: str = "Synthetic neurosurgical sequences with ground-truth force"
+    """Name of the dataset."""
+    summary: str | None = None
+    """What it was made for, in your words."""
+    licence: str | None = None
+    """Licence under which you share it, as an SPDX name (cc-by-4.0). Empty: none is given."""
+    authors: tuple[str, ...] = ()
+    """Who made it."""
+    contact: str | None = None
+    """Where questions go."""
+    url: str | None = None
+    """Where the dataset is to be found."""
     published: Annotated[str, Field(pattern=r"^\d{4}-\d{2}-\d{2}$")] | None = None
     """Date of publication, in quotes: "2027-01-31"."""
 
@@ -362,6 +362,7 @@ class Job(Section):
     render: Render = Render()
     flow: Flow = Flow()
     store: Store = Store()
+    labels: Labels = Labels()
     card: Card = Card()
 
     @property
@@ -369,4 +370,3 @@ class Job(Section):
         """Names of the fields that its sequences hold."""
         recovered = self.flow.backend != "ideal"
         return fields.kept(self.store.extra, self.store.without, recovered=recovered)
-    labels: Labels = Labels()
