@@ -75,11 +75,11 @@ def frame_seeds(job: Job, index: int) -> list[int]:
     """One seed a frame, for light paths and sensor noise: a fixed one would leave screen-fixed noise."""
     state = _sequence(job, _SEQUENCE, index, _NOISE).generate_state(job.frames)
     return [int(seed) for seed in state]
+
+
 def label_rng(job: Job, index: int) -> np.random.Generator:
     """Random numbers for the noise of the published labels."""
     return _generator(job, _SEQUENCE, index, _LABELS)
-
-
 
 
 def _sequence(job: Job, *key: int) -> np.random.SeedSequence:
