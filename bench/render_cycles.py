@@ -61,7 +61,7 @@ def ratio(rows: list[dict[str, Any]]) -> float:
 
 
 def _mitsuba(ours: Case, spp: int, inside: npt.NDArray[np.bool_]) -> dict[str, float]:
-    tool = instrument.pose(instrument.build(2), ours.tips, ours.shafts)
+    tool = instrument.pose(instrument.build(("forceps",)), ours.tips, ours.shafts)
     stage = ours.studio.stage(ours.vertices, tool, spp)
     spent, pictures = [], []
     for k in range(3):
@@ -102,7 +102,7 @@ def _cycles(
 
 def _export(ours: Case, folder: Path, spp: list[int]) -> None:
     studio = ours.studio
-    tool = instrument.pose(instrument.build(2), ours.tips, ours.shafts)
+    tool = instrument.pose(instrument.build(("forceps",)), ours.tips, ours.shafts)
     arrays: dict[str, Any] = {"rotation": studio.camera.rotation, "centre": studio.camera.centre}
     bodies: dict[str, Any] = {}
     for name, body in studio.bodies(ours.vertices, tool).items():

@@ -47,7 +47,7 @@ def measure(variant: str, spp: int, frames: int, seed: int) -> dict[str, Any]:
     job = Job.model_validate({"seed": seed, "render": {"variant": variant, "spp": spp}})
     ours = case(job, 0)
     studio = ours.studio
-    forceps = instrument.build(2)
+    forceps = instrument.build(("forceps",))
     stage = studio.stage(ours.vertices, instrument.pose(forceps, ours.tips, ours.shafts), spp)
     spent: dict[str, list[float]] = {"move": [], "render": [], "sensor": [], "truth": []}
 

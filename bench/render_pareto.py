@@ -70,7 +70,7 @@ def measure(ours: Case, spp: int, sampler: str, kind: str) -> dict[str, float]:
     their mean. Flow error is against the truth, over visible tissue away from the instrument.
     """
     studio = ours.studio
-    forceps = instrument.build(2)
+    forceps = instrument.build(("forceps",))
     tool = instrument.pose(forceps, ours.tips, ours.shafts)
     stage = studio.stage(ours.vertices, tool, spp=spp, integrator=kind, sampler=sampler)
     stage.render(0)

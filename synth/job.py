@@ -150,9 +150,9 @@ class Light(Section):
     glare: ShareRange = (0.0, 0.3)
     """Wet highlights: 0 the few sparks of a well placed lamp, 1 up to a third of the tissue outshone."""
     tilt_deg: LightTilt | None = None
-    """Angle between the main lamp and the optical axis, 0-40, any side. Empty: the lamp is where `glare` asks."""
-    coaxial: ShareRange = (0.8, 0.92)
-    """Share of light from the main lamp; the rest comes from the ring round the objective."""
+    """Angle between main lamp and optical axis, 0-40, to any side. Empty: the lamp is where `glare` asks."""
+    main: ShareRange = (0.5, 0.68)
+    """Share of light from the main lamp; the rest comes from two beside it, which stand for a ring."""
     power: PositiveRange = (0.95, 1.1)
     """Illumination, against one that just fills the sensor with white."""
     kelvin: LightKelvin = (4200.0, 5600.0)
@@ -161,6 +161,21 @@ class Light(Section):
     """Radius of the evenly lit spot, in widths of the field; beyond it the light falls off."""
     drift: ShareRange = (0.0, 0.03)
     """Largest change of power over the sequence, as a share of it."""
+
+
+class Sensor(Section):
+    """The camera's chip and what its video processor makes of it."""
+
+    exposure: PositiveRange = (0.98, 1.12)
+    """Share of full scale that a white surface at the craniotomy fills."""
+    full_well: PositiveRange = (8_000.0, 20_000.0)
+    """Photoelectrons at full scale: photon noise is the root of what is counted."""
+    read_noise: NonNegativeRange = (8.0, 14.0)
+    """Noise of the readout, standard deviation [electrons]."""
+    contrast: ShareRange = (0.25, 0.55)
+    """Tone curve: weight of an S over plain sRGB."""
+    sharpening: NonNegativeRange = (0.15, 0.4)
+    """Unsharp mask, as a share of the detail."""
 
 
 class Fem(Section):
@@ -358,6 +373,7 @@ class Job(Section):
     anatomy: Anatomy = Anatomy()
     appearance: Appearance = Appearance()
     light: Light = Light()
+    sensor: Sensor = Sensor()
     fem: Fem = Fem()
     render: Render = Render()
     flow: Flow = Flow()

@@ -57,7 +57,7 @@ def render_sequence(job: Job, index: int, folder: Path, report: Report) -> Path:
         motion = move(job, case, surface, tets)
 
     with watch.stage("scene"):
-        studio = Studio(surface, case.look, view, job)
+        studio = Studio(surface, case.look, view, job, [gesture.kind for gesture in case.gestures])
         still = studio.still
 
     width, height = job.render.size

@@ -63,10 +63,8 @@ def draw(job: Job, index: int) -> Scenario:
         relief=Relief.draw(job.anatomy, _generator(job, _ANATOMY, anatomy, 0)),
         tissue=tissue,
         gesture=gesture,
-        further=crew.further(
-            gesture, job.fem, opening, tissue, _generator(job, _SEQUENCE, index, _FURTHER)
-        ),
-        look=Look.draw(family, _generator(job, _SEQUENCE, index, _LOOK)),
+        further=crew.further(gesture, job.fem, opening, tissue, _generator(job, _SEQUENCE, index, _FURTHER)),
+        look=Look.draw(job, family, _generator(job, _SEQUENCE, index, _LOOK)),
         view=View.draw(job.render, _generator(job, _SEQUENCE, index, _VIEW)),
     )
 

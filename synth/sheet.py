@@ -72,8 +72,10 @@ def _frame(job: Job, index: int, repeats: int) -> tuple[NDArray[np.uint8], float
     else:
         whole = brain.load(job.anatomy.mesh, job.anatomy.craniotomy)
         surface = anatomy.from_brain(whole.vertices, whole.faces, case.relief, job.anatomy)
-    studio = Studio(surface, case.look, camera.place(case.view, job.render), job)
-    tips, shafts = _poised(case.gesture, surface)
+    view, gestures = camera.place(case.view, job.render), case.gestures
+    studio = Studio(surface, case.look, view, job, [gesture.kind for gesture in gestures])
+    poised = [_poised(gesture, surface) for gesture in gestures]
+    tips, shafts = (np.concatenate(part) for part in zip(*poised, strict=True))
     seed = scenario.frame_seeds(job, index)[0]
     for _ in range(repeats):
         watch = Stopwatch()

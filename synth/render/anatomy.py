@@ -16,7 +16,8 @@ from scipy.ndimage import distance_transform_edt
 
 from synth import job
 from synth.errors import UserError
-from synth.render import noise, vessels
+from synth.render import noise, tube, vessels
+from synth.render.tree import Tree
 from synth.render.vessels import Vessels
 
 Floats = npt.NDArray[np.float64]
@@ -108,9 +109,9 @@ def from_brain(
     return _surface(lambda xy: noise.sample(outer, xy, extent), sulci, relief, anatomy, extent)
 
 
-def bulge(tree: vessels.Tree, extent_mm: float) -> Map:
+def bulge(tree: Tree, extent_mm: float) -> Map:
     """Height of vessels above the pia, (n, n) mm: half sunk round tubes with soft shoulders."""
-    distance, radius = vessels.raster(tree, _BULGE_PX, extent_mm)
+    distance, radius = tube.raster(tree, _BULGE_PX, extent_mm)
     inside = np.sqrt(np.maximum(radius**2 - distance**2, 0)) * 0.75
     return noise.blur(inside.astype(np.float32), 0.14, extent_mm)
 

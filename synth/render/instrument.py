@@ -1,89 +1,189 @@
-"""Instruments as meshes that follow tips and shafts."""
+"""Instruments as meshes that follow tips and shafts: forceps, dissector, suction tube, spatula."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
 
-Floats = npt.NDArray[np.float64]
+from synth.errors import UserError
 
-_AROUND = 20
-_ALONG = 96
+Floats = npt.NDArray[np.float64]
+Kind = Literal["forceps", "dissector", "suction", "spatula"]
+
+_AROUND = 36
 _LENGTH_MM = 110.0
+
+# What a hand would take for each gesture, and how often.
+_HABITS: dict[str, tuple[tuple[Kind, ...], tuple[float, ...]]] = {
+    "pull": (("forceps",), (1.0,)),
+    "grasp": (("forceps",), (1.0,)),
+    "push": (("dissector", "suction"), (0.6, 0.4)),
+    "slide": (("dissector", "suction"), (0.5, 0.5)),
+    "tap": (("dissector", "suction"), (0.7, 0.3)),
+    "retract": (("spatula", "dissector"), (0.7, 0.3)),
+}
+
+
+@dataclass(frozen=True)
+class Part:
+    """A swept bar in its own axes: the tip at the origin, z towards the hand, flat across x."""
+
+    profile: Floats
+    """(V, 3) mm."""
+    side: int
+    """Which of its instrument's two tips it follows, 1 and -1; 0: their middle."""
 
 
 @dataclass(frozen=True)
 class Instrument:
-    """Tines in their own axes: the tip at the origin, z towards the hand; all tines one mesh."""
+    """All instruments of a scene as one mesh."""
 
-    tines: int
-    profile: Floats
-    """(T, V, 3) mm, one block a tine."""
+    kinds: tuple[Kind, ...]
+    parts: tuple[tuple[Part, ...], ...]
+    """The parts of each."""
     faces: npt.NDArray[np.int32]
-    """(F, 3) over all tines."""
+    """(F, 3) over all parts."""
     uv: npt.NDArray[np.float32]
+    """(V, 2): round the bar, along it."""
 
 
-def build(tines: int) -> Instrument:
-    """Bipolar forceps for two tips, a dissector for one."""
-    blocks = [_tine(side) for side in (np.linspace(1, -1, tines) if tines > 1 else [0.0])]
-    faces, uv = _skin()
-    count = blocks[0].shape[0]
+def choose(gestures: Sequence[str], rng: np.random.Generator) -> tuple[Kind, ...]:
+    """An instrument that suits each gesture."""
+    chosen: list[Kind] = []
+    for gesture in gestures:
+        kinds, shares = _HABITS[gesture]
+        chosen.append(kinds[int(rng.choice(len(kinds), p=shares))])
+    return tuple(chosen)
+
+
+def build(kinds: Sequence[Kind]) -> Instrument:
+    """The mesh of some instruments, to be placed by `pose`."""
+    parts = tuple(_PARTS[kind]() for kind in kinds)
+    faces, uv, total = [], [], 0
+    for part in (part for own in parts for part in own):
+        skin, flat = _skin(len(part.profile) // (_AROUND + 1))
+        faces.append(skin + total)
+        uv.append(flat)
+        total += len(part.profile)
     return Instrument(
-        tines=tines,
-        profile=np.stack(blocks),
-        faces=np.concatenate([faces + count * t for t in range(tines)]).astype(np.int32),
-        uv=np.concatenate([uv] * tines).astype(np.float32),
+        kinds=tuple(kinds),
+        parts=parts,
+        faces=np.concatenate(faces).astype(np.int32),
+        uv=np.concatenate(uv).astype(np.float32),
     )
 
 
 def pose(instrument: Instrument, tips: Floats, shafts: Floats) -> Floats:
-    """World vertices (T*V, 3) mm of an instrument.
+    """World vertices (V, 3) mm of the instruments.
 
     Args:
-        instrument: the instrument.
-        tips: (T, 3) mm, where each tine ends.
-        shafts: (T, 3) unit, from tip to hand.
+        instrument: n instruments.
+        tips: (2n, 3) mm, two an instrument; one with a single tip is in the middle of its two.
+        shafts: (2n, 3), from tip to hand.
+
+    Raises:
+        UserError: another number of tips than two an instrument.
     """
+    if len(tips) != 2 * len(instrument.parts):
+        raise UserError(f"{len(tips)} tips for {len(instrument.parts)} instruments; two each are needed")
     placed = []
-    spread = tips[-1] - tips[0]
-    for profile, tip, shaft in zip(instrument.profile, tips, shafts, strict=True):
-        z = shaft / np.linalg.norm(shaft)
-        # Flat sides of the tines face each other; a single one turns its flat side up.
-        side = spread if np.linalg.norm(spread) > 1e-9 else np.cross(z, [0.0, 0.0, 1.0])
-        x = side - (side @ z) * z
-        if np.linalg.norm(x) < 1e-9:
-            x = np.cross(z, [1.0, 0.0, 0.0])
-        x /= np.linalg.norm(x)
-        placed.append(tip + profile @ np.stack([x, np.cross(z, x), z]))
+    for k, parts in enumerate(instrument.parts):
+        ends, ways = tips[2 * k : 2 * k + 2], shafts[2 * k : 2 * k + 2]
+        for part in parts:
+            follows = {1: 0, -1: 1}.get(part.side)
+            tip = ends.mean(axis=0) if follows is None else ends[follows]
+            shaft = ways.mean(axis=0) if follows is None else ways[follows]
+            # The flat sides of two tines face each other; a single blade's faces the tissue.
+            across = np.array([0.0, 0.0, 1.0]) if follows is None else ends[1] - ends[0]
+            placed.append(tip + part.profile @ _axes(shaft, across))
     return np.concatenate(placed)
 
 
-def _tine(side: float) -> Floats:
-    """One tine (V, 3): a blunt tip that widens into a flat blade, bowed outwards (to -x for side 1)."""
-    s = (np.linspace(0, 1, _ALONG) ** 1.6) * _LENGTH_MM
-    round_off = np.sqrt(np.clip(1 - (1 - np.minimum(s / 0.45 + 0.01, 1)) ** 2, 0, 1))
-    wide = (0.42 + 0.9 * (1 - np.exp(-s / 9.0)) + 1.3 * (1 - np.exp(-s / 45.0))) * round_off
-    thick = (0.34 + 0.42 * (1 - np.exp(-s / 8.0)) + 0.3 * (1 - np.exp(-s / 40.0))) * round_off
-    bow = -side * 5.5 * (1 - np.exp(-((s / 38.0) ** 1.5)))
+def _axes(shaft: Floats, across: Floats) -> Floats:
+    """Rows x, y, z of an orthonormal frame: z along the shaft, x as near to `across` as it can be."""
+    z = shaft / np.linalg.norm(shaft)
+    for side in (across, np.cross(z, [0.0, 0.0, 1.0]), np.cross(z, [1.0, 0.0, 0.0])):
+        x = side - (side @ z) * z
+        if np.linalg.norm(x) > 1e-9:
+            x = x / np.linalg.norm(x)
+            return np.stack([x, np.cross(z, x), z])
+    raise ValueError("a shaft without direction")
+
+
+def _sweep(s: Floats, thick: Floats, wide: Floats, bow: Floats, power: float) -> Floats:
+    """Rings (V, 3): half axes `thick` and `wide`, shifted by `bow` along x; power 1 round, less squarer."""
     angle = np.linspace(0, 2 * np.pi, _AROUND + 1)
-    # A superellipse: flats with rounded edges.
     c, w = np.cos(angle), np.sin(angle)
-    x = np.sign(c) * np.abs(c) ** 0.7
-    y = np.sign(w) * np.abs(w) ** 0.7
-    ring = np.stack(
-        [thick[:, None] * x + bow[:, None], wide[:, None] * y, np.repeat(s[:, None], len(x), 1)], -1
-    )
-    return ring.reshape(-1, 3)
+    x = np.sign(c) * np.abs(c) ** power
+    y = np.sign(w) * np.abs(w) ** power
+    columns = [thick[:, None] * x + bow[:, None], wide[:, None] * y, np.repeat(s[:, None], len(x), 1)]
+    return np.stack(columns, -1).reshape(-1, 3)
 
 
-def _skin() -> tuple[npt.NDArray[np.int64], Floats]:
+def _along(rings: int, power: float = 1.6) -> Floats:
+    return np.asarray((np.linspace(0, 1, rings) ** power) * _LENGTH_MM)
+
+
+def _round_off(s: Floats, over: float) -> Floats:
+    """Factor that closes a bar's end as an ellipse does, over the first `over` mm."""
+    return np.asarray(np.sqrt(np.clip(1 - (1 - np.minimum(s / over + 0.01, 1)) ** 2, 0, 1)))
+
+
+def _forceps() -> tuple[Part, ...]:
+    """Two tines: a blunt tip that widens into a flat blade, bowed outwards (to -x for side 1)."""
+    s = _along(96)
+    close = _round_off(s, 0.45)
+    wide = (0.42 + 0.9 * (1 - np.exp(-s / 9.0)) + 1.3 * (1 - np.exp(-s / 45.0))) * close
+    thick = (0.34 + 0.42 * (1 - np.exp(-s / 8.0)) + 0.3 * (1 - np.exp(-s / 40.0))) * close
+    bow = 5.5 * (1 - np.exp(-((s / 38.0) ** 1.5)))
+    return tuple(Part(_sweep(s, thick, wide, -side * bow, 0.7), side) for side in (1, -1))
+
+
+def _dissector() -> tuple[Part, ...]:
+    """A small rounded blade on a thin round shaft, slightly bent, that ends in a thicker handle."""
+    s = _along(96)
+    close = _round_off(s, 1.4)
+    neck = np.exp(-((s / 5.0) ** 2))
+    handle = 1.1 / (1 + np.exp(-(s - 42.0) / 2.0))
+    thick = (0.28 + 0.55 * (1 - neck) + handle) * np.minimum(close * 1.4, 1)
+    wide = (0.83 + 0.75 * neck + handle) * close
+    bow = 1.6 * np.exp(-s / 6.0) - 1.6
+    return (Part(_sweep(s, thick, wide, bow, 0.9), 0),)
+
+
+def _suction() -> tuple[Part, ...]:
+    """A tube, open at its end; beyond a bend it widens."""
+    outside = 0.12 + _along(84)
+    inside = np.array([8.0, 3.0, 1.0, 0.3, 0.05])
+    s = np.concatenate([inside, outside])
+    radius = np.concatenate([np.full(5, 1.05), 1.25 + 0.9 / (1 + np.exp(-(outside - 55.0) / 4.0))])
+    radius[5] = 1.15  # a blunted edge
+    bow = 2.5 * (1 - np.exp(-((s / 45.0) ** 2)))
+    return (Part(_sweep(s, radius, radius, bow, 1.0), 0),)
+
+
+def _spatula() -> tuple[Part, ...]:
+    """A flat ribbon with a round end, bent where it leaves the wound."""
+    s = _along(96)
+    wide = (3.4 + 0.8 * (1 - np.exp(-s / 30.0))) * _round_off(s, 3.4)
+    thick = np.full_like(s, 0.32) * _round_off(s, 0.3)
+    bow = 4.0 * (1 - np.exp(-((s / 30.0) ** 2)))
+    return (Part(_sweep(s, thick, wide, bow, 0.35), 0),)
+
+
+_PARTS = {"forceps": _forceps, "dissector": _dissector, "suction": _suction, "spatula": _spatula}
+
+
+def _skin(rings: int) -> tuple[npt.NDArray[np.int64], Floats]:
+    """Faces and uv of a swept bar."""
     around = _AROUND + 1
-    row, column = np.meshgrid(np.arange(_ALONG - 1), np.arange(_AROUND), indexing="ij")
+    row, column = np.meshgrid(np.arange(rings - 1), np.arange(_AROUND), indexing="ij")
     a = (row * around + column).ravel()
     b, c, d = a + 1, a + around, a + around + 1
     faces = np.concatenate([np.stack([a, b, d], 1), np.stack([a, d, c], 1)])
-    v, u = np.meshgrid(np.linspace(0, 1, _ALONG), np.linspace(0, 1, around), indexing="ij")
+    v, u = np.meshgrid(np.linspace(0, 1, rings), np.linspace(0, 1, around), indexing="ij")
     return faces, np.stack([u.ravel(), v.ravel()], axis=1)

@@ -33,8 +33,12 @@ class Wet:
     """(n, n, 3) linear reflectance."""
     normal: Map
     """(n, n, 3) unit normals in the surface's own frame."""
+    dry: Map
+    """(m, m) share of the surface whose film is too thin to be smooth."""
     roughness: float
-    """GGX alpha of the coat."""
+    """GGX alpha of the coat under film."""
+    dry_roughness: float
+    """GGX alpha where there is none."""
     index: float = 1.33
     """Refractive index of the coat."""
 
@@ -49,6 +53,8 @@ class Metal:
     across: float
     satin: float
     """Share of light that the finish scatters evenly."""
+    glow: Floats
+    """(V, 3) radiance that vertices mirror of what lights nothing; `Stage.mirror` renews it."""
 
 
 @dataclass(frozen=True)
@@ -155,6 +161,11 @@ class Stage:
             flat = values.astype(np.float32).ravel()
             self._parameters[f"{name}.{key}"] = self._mi.Float(flat) if self._jit else flat
 
+    def mirror(self, name: str, glow: Floats) -> None:
+        """New mirrored radiance (V, 3) of a metal body's vertices."""
+        flat = glow.astype(np.float32).ravel()
+        self._parameters[f"{name}.vertex_glow"] = self._mi.Float(flat) if self._jit else flat
+
     def render(self, seed: int) -> Map:
         """Linear radiance (H, W, 3) float32 of the stage as it stands."""
         self._parameters.update()
@@ -206,6 +217,11 @@ def _lamp(mi: Any, lamp: Lamp) -> dict[str, Any]:
 def _mesh(mi: Any, name: str, body: Body) -> Any:
     properties = mi.Properties()
     properties["bsdf"] = mi.load_dict(_material(mi, body.material))
+    metal = body.material if isinstance(body.material, Metal) else None
+    if metal:
+        # Seen, but never chosen as a lamp: its weight is nothing.
+        texture = {"type": "mesh_attribute", "name": "vertex_glow"}
+        properties["glow"] = mi.load_dict({"type": "area", "radiance": texture, "sampling_weight": 0.0})
     mesh = mi.Mesh(
         name,
         vertex_count=len(body.vertices),
@@ -214,6 +230,8 @@ def _mesh(mi: Any, name: str, body: Body) -> Any:
         has_vertex_texcoords=True,
         props=properties,
     )
+    if metal:
+        mesh.add_attribute("vertex_glow", 3, metal.glow.astype(np.float32).ravel())
     parameters = mi.traverse(mesh)
     parameters["vertex_positions"] = body.vertices.astype(np.float32).ravel()
     bent = normals(Shape(body.vertices, body.faces))
@@ -246,18 +264,28 @@ def _material(mi: Any, material: Wet | Metal) -> dict[str, Any]:
             },
         }
     encoded = material.normal * np.float32(0.5) + np.float32(0.5)
+    albedo = _bitmap(mi, material.albedo)
+
+    def coat(roughness: float) -> dict[str, Any]:
+        return {
+            "type": "roughplastic",
+            "distribution": "ggx",
+            "diffuse_reflectance": albedo,
+            "alpha": roughness,
+            "int_ior": material.index,
+            "nonlinear": True,
+        }
+
     return {
         "type": "twosided",
         "bent": {
             "type": "normalmap",
             "normalmap": _bitmap(mi, encoded),
-            "coat": {
-                "type": "roughplastic",
-                "distribution": "ggx",
-                "diffuse_reflectance": _bitmap(mi, material.albedo),
-                "alpha": material.roughness,
-                "int_ior": material.index,
-                "nonlinear": True,
+            "film": {
+                "type": "blendbsdf",
+                "weight": _bitmap(mi, material.dry),
+                "smooth": coat(material.roughness),
+                "rough": coat(material.dry_roughness),
             },
         },
     }
@@ -266,7 +294,7 @@ def _material(mi: Any, material: Wet | Metal) -> dict[str, Any]:
 def _bitmap(mi: Any, image: Map) -> dict[str, Any]:
     return {
         "type": "bitmap",
-        "bitmap": mi.Bitmap(np.ascontiguousarray(image, np.float32)),
+        "bitmap": mi.Bitmap(np.ascontiguousarray(image.reshape(*image.shape[:2], -1), np.float32)),
         "raw": True,
         "filter_type": "bilinear",
         "wrap_mode": "clamp",

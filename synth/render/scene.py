@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
 from synth.job import Job
-from synth.render import instrument, light, noise, rim, sensor, texture, truth
+from synth.render import instrument, light, noise, reflection, rim, sensor, texture, truth
 from synth.render.anatomy import Surface
 from synth.render.camera import Camera
 from synth.render.look import Look
-from synth.render.mitsuba_adapter import Body, Metal, Stage, Wet, pick
+from synth.render.mitsuba_adapter import Body, Metal, Stage, pick
 from synth.render.shape import Shape, normals
 from synth.render.truth import Still
 
@@ -22,9 +23,7 @@ Floats = npt.NDArray[np.float64]
 Map = npt.NDArray[np.float32]
 Mask = npt.NDArray[np.bool_]
 
-_STEEL = Metal(reflectance=(0.88, 0.88, 0.87), along=0.14, across=0.5, satin=0.4)
-_RIM_ROUGHNESS = 0.06
-_TINES = 2
+_RIM_ROUGHNESS, _RIM_DRY = 0.05, 0.25
 _GLARE = 0.35  # specular radiance, as a share of full scale, that hides what is under it
 
 
@@ -56,12 +55,15 @@ class Studio:
         look: its appearance.
         camera: the microscope.
         job: render settings, opening and photograph.
+        gestures: kind of each instrument's gesture; an instrument that suits it is shown.
 
     Raises:
         UserError: the variant cannot run here, or the photograph cannot be read.
     """
 
-    def __init__(self, surface: Surface, look: Look, camera: Camera, job: Job) -> None:
+    def __init__(
+        self, surface: Surface, look: Look, camera: Camera, job: Job, gestures: Sequence[str] = ("pull",)
+    ) -> None:
         self.variant = pick(job.render.variant)
         self.surface, self.camera = surface, camera
         self._look, self._render = look, job.render
@@ -71,16 +73,12 @@ class Studio:
             look,
             texture.resolution(surface.extent_mm, camera.mm_per_px),
             job.appearance.photo,
+            rim.shade(self.rim, surface.extent_mm),
         )
         self.still = truth.still(camera, Shape(surface.vertices, surface.faces), self.rim.shape)
-        self.lamps = light.lamps(camera, look)
-        self._sensor = sensor.Sensor(
-            exposure=look.exposure,
-            white=_balance(look.balance_kelvin),
-            full_well=look.full_well,
-            contrast=look.contrast,
-        )
-        self._tool = instrument.build(_TINES) if job.render.tool else None
+        self.lamps = light.lamps(camera, look.light)
+        kinds = instrument.choose(gestures, np.random.default_rng([look.rim_seed, 2]))
+        self._tool = instrument.build(kinds) if job.render.tool else None
         self._stage: Stage | None = None
 
     def frame(self, vertices: Floats, tips: Floats, shafts: Floats, seed: int) -> Shot:
@@ -88,13 +86,11 @@ class Studio:
 
         Args:
             vertices: (V, 3) mm, the surface in this frame.
-            tips: (K, 3) mm, where the instrument's tines end; another K than before sets the scene up anew.
-            shafts: (K, 3) unit vectors from tip to hand.
+            tips: (2n, 3) mm, two for each of n instruments: where its tines end.
+            shafts: (2n, 3) unit vectors from tip to hand.
             seed: of light paths and sensor noise.
         """
         camera, surface = self.camera, self.surface
-        if self._tool and self._tool.tines != len(tips):
-            self._tool, self._stage = instrument.build(len(tips)), None
         tool = instrument.pose(self._tool, tips, shafts) if self._tool else np.zeros((0, 3))
         radiance = self._expose(vertices, tool, seed)
         now = truth.now(
@@ -139,7 +135,7 @@ class Studio:
 
     def develop(self, radiance: Map, seed: int) -> npt.NDArray[np.uint8]:
         """The recorded picture (H, W, 3) of a radiance (H, W, 3)."""
-        return sensor.record(radiance, self._sensor, np.random.default_rng([seed, 1]))
+        return sensor.record(radiance, self._look.sensor, np.random.default_rng([seed, 1]))
 
     def _expose(self, vertices: Floats, tool: Floats, seed: int) -> Map:
         if self._stage is None:
@@ -148,6 +144,7 @@ class Studio:
             self._stage.move("cortex", vertices)
             if self._tool:
                 self._stage.move("tool", tool)
+                self._stage.mirror("tool", self._mirrored(tool))
         return self._stage.render(seed)
 
     def bodies(self, vertices: Floats, tool: Floats) -> dict[str, Body]:
@@ -156,18 +153,26 @@ class Studio:
         frame = rim.paint(self.rim, look, texture.resolution(self.rim.extent_mm, 2.2 * self.camera.mm_per_px))
         bodies = {
             "cortex": Body(
-                vertices, surface.faces, surface.uv, Wet(self._coat.albedo, self._coat.normal, look.roughness)
+                vertices,
+                surface.faces,
+                surface.uv,
+                self._coat.wet(look.roughness, look.dry_roughness, look.film_index),
             ),
             "rim": Body(
                 self.rim.vertices,
                 self.rim.faces,
                 self.rim.uv,
-                Wet(frame.albedo, frame.normal, _RIM_ROUGHNESS),
+                frame.wet(_RIM_ROUGHNESS, _RIM_DRY),
             ),
         }
         if self._tool:
-            bodies["tool"] = Body(tool, self._tool.faces, self._tool.uv, _STEEL)
+            steel = Metal((0.66, 0.66, 0.66), along=0.16, across=0.42, satin=0.22, glow=self._mirrored(tool))
+            bodies["tool"] = Body(tool, self._tool.faces, self._tool.uv, steel)
         return bodies
+
+    def _mirrored(self, tool: Floats) -> Floats:
+        assert self._tool is not None
+        return reflection.glow(Shape(tool, self._tool.faces), self.camera.centre, self._look.rim_seed)
 
     def _glare(self, radiance: Map, now: truth.Now, vertices: Floats) -> Mask:
         """Tissue whose radiance exceeds what its diffuse part could send."""
@@ -182,7 +187,7 @@ class Studio:
         diffuse = (albedo * light_in).mean(axis=1)
         excess = radiance.reshape(-1, 3)[on].mean(axis=1) - 1.05 * diffuse
         glare = np.zeros(height * width, bool)
-        glare[on] = excess * self._look.exposure > _GLARE
+        glare[on] = excess * self._look.sensor.exposure > _GLARE
         return glare.reshape(height, width)
 
     def _irradiance(self, vertices: Floats) -> Floats:
@@ -195,9 +200,3 @@ class Studio:
             facing = np.maximum(np.einsum("nc,nc->n", normal, towards) / distance, 0)
             total += (facing / (np.pi * distance**2))[:, None] * np.asarray(lamp.intensity)
         return total
-
-
-def _balance(kelvin: float) -> tuple[float, float, float]:
-    gains = 1 / light.blackbody(kelvin)
-    r, g, b = (gains / gains[1]).tolist()
-    return r, g, b

@@ -8,6 +8,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from synth import job
+
 Map = npt.NDArray[np.float32]
 
 
@@ -33,6 +35,18 @@ class Sensor:
     """Weight of the tone curve's S over a straight line."""
     sharpening: float = 0.3
     """Unsharp mask of the video processor, as a share of the detail."""
+
+    @classmethod
+    def draw(cls, section: job.Sensor, white: tuple[float, float, float], rng: np.random.Generator) -> Sensor:
+        """A sensor within the job's ranges, with that white balance."""
+        return cls(
+            exposure=float(rng.uniform(*section.exposure)),
+            white=white,
+            full_well=float(rng.uniform(*section.full_well)),
+            read_noise=float(rng.uniform(*section.read_noise)),
+            contrast=float(rng.uniform(*section.contrast)),
+            sharpening=float(rng.uniform(*section.sharpening)),
+        )
 
 
 def record(radiance: Map, sensor: Sensor, rng: np.random.Generator) -> npt.NDArray[np.uint8]:

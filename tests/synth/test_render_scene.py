@@ -26,7 +26,7 @@ def studio(variant: str, spp: int = 4, **render: object) -> tuple[Studio, np.nda
     job = Job(anatomy=Anatomy(vertices=2500), render=Render.model_validate(settings))
     surface = anatomy.procedural(Relief.draw(job.anatomy, np.random.default_rng(4)), job.anatomy)
     view = View.draw(job.render, np.random.default_rng(4))
-    look = Look.draw("healthy", np.random.default_rng(4))
+    look = Look.draw(job, "healthy", np.random.default_rng(4))
     return Studio(surface, look, camera.place(view, job.render), job), surface.vertices
 
 

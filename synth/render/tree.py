@@ -1,0 +1,163 @@
+"""Trees of vessels grown by space colonisation, with radii by Murray's law.
+
+A. Runions, B. Lane, P. Prusinkiewicz, "Modeling trees with a space colonization algorithm", 2007.
+C. D. Murray, "The physiological principle of minimum work", 1926: r^3 of a parent is its children's sum.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial import cKDTree
+
+Floats = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Tree:
+    """One kind of vessel as segments: each node is joined to its parent, which comes before it."""
+
+    nodes: Floats
+    """(N, 2) mm."""
+    parent: Ints
+    """(N,) index of the parent; -1 at a root."""
+    radius: Floats
+    """(N,) mm."""
+
+
+def grow(
+    nodes: Floats,
+    parent: Ints,
+    attractors: Floats,
+    *,
+    buds: npt.NDArray[np.bool_],
+    step: float,
+    reach: float,
+    kill: float,
+    wander: float,
+    rng: np.random.Generator,
+) -> tuple[Floats, Ints]:
+    """Space colonisation: nodes step towards the attractors nearest to them until none is left in reach.
+
+    Args:
+        nodes: (N, 2) mm, where growth starts.
+        parent: (N,).
+        attractors: (A, 2) mm.
+        buds: (N,) which of the given nodes may sprout; everything grown may.
+        step: length of a segment [mm].
+        reach: farthest attractor that pulls [mm].
+        kill: an attractor this near is used up [mm].
+        wander: random part of a step's direction, as a share.
+        rng: where the wandering comes from.
+
+    Returns:
+        All nodes (M, 2) and parents (M,), the given ones first.
+    """
+    all_nodes, all_parent = [nodes], [parent]
+    distance, nearest = cKDTree(nodes[buds]).query(attractors)
+    nearest = np.flatnonzero(buds)[nearest]
+    # What lies beside a trunk is already supplied, bud or no bud.
+    distance = np.where(cKDTree(nodes).query(attractors)[0] < kill, 0.0, distance)
+    total = len(nodes)
+    children = np.bincount(parent[parent >= 0], minlength=total)
+    for _ in range(int(4 * reach / step) + 400):
+        keep = distance > kill
+        attractors, distance, nearest = attractors[keep], distance[keep], nearest[keep]
+        pulls = distance < reach
+        if not pulls.any():
+            break
+        positions = np.concatenate(all_nodes)
+        toward: Floats = attractors[pulls] - positions[nearest[pulls]]
+        toward /= np.linalg.norm(toward, axis=1, keepdims=True)
+        pulled, index = np.unique(nearest[pulls], return_inverse=True)
+        direction: Floats = np.stack(
+            [np.bincount(index, toward[:, axis]).astype(np.float64) for axis in (0, 1)], axis=1
+        )
+        direction /= np.maximum(np.linalg.norm(direction, axis=1, keepdims=True), 1e-9)
+        direction += wander * rng.standard_normal(direction.shape)
+        direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+        # A node pulled evenly from two sides would sprout the same twig for ever.
+        free = children[pulled] < 3
+        stuck = np.isin(nearest, pulled[~free])
+        if stuck.any():
+            distance = np.where(stuck, 0.0, distance)
+        if not free.any():
+            continue
+        sprouts = positions[pulled[free]] + step * direction[free]
+        children[pulled[free]] += 1
+        children = np.concatenate([children, np.zeros(len(sprouts), children.dtype)])
+        all_nodes.append(sprouts)
+        all_parent.append(pulled[free])
+        near, which = cKDTree(sprouts).query(attractors)
+        closer = (near < distance) & (distance > 0)
+        distance = np.where(closer, near, distance)
+        nearest = np.where(closer, which + total, nearest)
+        total += len(sprouts)
+    return np.concatenate(all_nodes), np.concatenate(all_parent)
+
+
+def murray(parent: Ints, leaf: float) -> Floats:
+    """Radii (N,) mm by Murray's law from leaves of radius `leaf`; parents come before children."""
+    cubes = np.zeros(len(parent))
+    order = parent.tolist()
+    values = cubes.tolist()
+    smallest = leaf**3
+    for node in range(len(order) - 1, -1, -1):
+        if values[node] == 0.0:
+            values[node] = smallest
+        if order[node] >= 0:
+            values[order[node]] += values[node]
+    return np.asarray(np.cbrt(np.asarray(values)), np.float64)
+
+
+def taper(nodes: Floats, parent: Ints, length: float) -> Floats:
+    """Factor (N,) by which vessels thin over the last `length` mm before their ends."""
+    up = parent.tolist()
+    segment = np.linalg.norm(nodes - nodes[np.maximum(parent, 0)], axis=1).tolist()
+    left = [0.0] * len(up)
+    for node in range(len(up) - 1, -1, -1):
+        if up[node] >= 0:
+            left[up[node]] = max(left[up[node]], left[node] + segment[node])
+    return np.asarray(0.4 + 0.6 * np.clip(np.asarray(left) / length, 0, 1))
+
+
+def pruned(nodes: Floats, parent: Ints, fixed: int, shortest: int) -> tuple[Floats, Ints]:
+    """Without side twigs of fewer than `shortest` nodes, which look cut off."""
+    links = parent.tolist()
+    reach = [1] * len(links)
+    for node in range(len(links) - 1, -1, -1):
+        if links[node] >= 0:
+            reach[links[node]] = max(reach[links[node]], reach[node] + 1)
+    keep = [True] * len(links)
+    for node in range(fixed, len(links)):
+        up = links[node]
+        side_twig = up < fixed or reach[node] + 1 < reach[up]
+        keep[node] = keep[up] and not (side_twig and reach[node] < shortest)
+    kept = np.flatnonzero(keep)
+    number = np.cumsum(keep) - 1
+    return nodes[kept], np.where(parent[kept] >= 0, number[parent[kept]], -1)
+
+
+def scattered(extent_mm: float, spacing: float, rng: np.random.Generator) -> Floats:
+    """Points about `spacing` apart: a jittered grid, which neither clumps nor lines up."""
+    side = int(extent_mm / spacing)
+    cell = np.stack(np.meshgrid(np.arange(side), np.arange(side)), axis=-1).reshape(-1, 2)
+    return ((cell + rng.random(cell.shape)) / side - 0.5) * extent_mm
+
+
+def relaxed(nodes: Floats, parent: Ints, fixed: int, rounds: int) -> Floats:
+    """Nodes after the first `fixed`, drawn towards their neighbours, which rounds off the steps."""
+    has = np.flatnonzero(parent >= 0)
+    for _ in range(rounds):
+        total, count = np.zeros_like(nodes), np.zeros(len(nodes))
+        np.add.at(total, has, nodes[parent[has]])
+        np.add.at(count, has, 1)
+        np.add.at(total, parent[has], nodes[has])
+        np.add.at(count, parent[has], 1)
+        moved = 0.5 * nodes + 0.5 * total / np.maximum(count, 1)[:, None]
+        inner = (np.arange(len(nodes)) >= fixed) & (count > 1)
+        nodes = np.where(inner[:, None], moved, nodes)
+    return nodes
