@@ -12,7 +12,15 @@ from learn.data import Clip, target
 from learn.evaluate import Report, evaluate, score
 from learn.predict import Predictor
 
-KEYS = ("map_r2_pooled", "force_r2_pooled", "map_rmse", "force_mae", "ghost_relative", "stray_mn")
+KEYS = (
+    "map_r2_pooled",
+    "force_r2_pooled",
+    "map_rmse",
+    "force_mae",
+    "ghost_relative",
+    "ghost_far",
+    "stray_mn",
+)
 
 
 def controls(predictor: Predictor, clips: Sequence[Clip], source: str) -> dict[str, dict[str, float]]:

@@ -17,6 +17,7 @@ _COLUMNS = (
     ("force_mae", "total force MAE [mN]"),
     ("peak_error_share", "peak force error"),
     ("ghost_relative", "ghost area"),
+    ("ghost_far", "ghost area beyond 2 mm"),
     ("stray_mn", "force off contact [mN]"),
     ("low_over_mn", "over in low frames [mN]"),
     ("localisation_mm", "contact centre [mm]"),

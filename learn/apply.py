@@ -1,4 +1,4 @@
-"""A trained model on files: sequence stores, datasets, and arrays of flow from anywhere."""
+"""A trained model on files: sequence stores, datasets, videos, and arrays of flow from anywhere."""
 
 from __future__ import annotations
 
@@ -10,12 +10,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from learn import film
+from learn.calibrate import stiffness
+from learn.film import Step
 from learn.predict import Predictor, View, total_force
 from synth.errors import UserError
 from synth.store import Dataset, Sequence, open_sequence
 
 _FLOW = {"ideal": "flow", "recovered": "flow_tvl1"}
-_VIDEO = {".mp4", ".avi", ".mov", ".mkv", ".webm"}
 
 
 @dataclass(frozen=True)
@@ -23,24 +25,37 @@ class Motion:
     """Flow of one film, still in pixels, wherever it came from."""
 
     name: str
-    frames: int
-    flow: Callable[[int], NDArray[np.float32]]
-    """Frame t → (H, W, 2) px from the rest frame, on its pixels."""
-    confidence: Callable[[int], NDArray[np.float32]] | None
+    steps: Callable[[], Iterator[Step]]
+    """Flow (H, W, 2) px from the rest frame, on its pixels, and confidence if there is one, frame by
+    frame."""
     tissue: NDArray[np.bool_]
     scale_mm_per_px: float
     young_kpa: float | None
+    force_mn: NDArray[np.float64] | None = None
+    """(T,) size of the true force, where it is known."""
 
 
-def motions(path: Path, source: str) -> Iterator[Motion]:
-    """What `path` holds: a dataset folder, one NNNNNN.zarr store, or an .npz of arrays.
+@dataclass(frozen=True)
+class Filmed:
+    """What a video doesn't say of itself."""
 
-    An .npz holds `flow` (T, H, W, 2) px, `tissue` (H, W), `scale_mm_per_px`, and if known `young_kpa` and
-    `confidence` (T, H, W). Raises UserError for anything else; for a video it says who reads those.
+    scale_mm_per_px: float | None = None
+    tissue: Path | None = None
+    """A picture, white where there is tissue; everywhere if not given."""
+    backend: str = "tvl1"
+    """Flow estimator, as in a job's flow.backend."""
+
+
+def motions(path: Path, source: str, filmed: Filmed | None = None) -> Iterator[Motion]:
+    """What `path` holds: a dataset folder, one NNNNNN.zarr store, an .npz of arrays, or a video.
+
+    An .npz holds `flow` (T, H, W, 2) px, `tissue` (H, W), `scale_mm_per_px`, and if known `young_kpa`,
+    `confidence` (T, H, W) and `force_mn` (T,). A video's first frame is its rest frame. Raises UserError for
+    anything else, and for a video without a scale.
     """
-    if path.suffix.lower() in _VIDEO:
-        raise UserError(f"{path}: a video has no flow yet; `bench score` recovers it and then predicts")
-    if path.suffix == ".npz":
+    if path.suffix.lower() in film.SUFFIXES:
+        yield _video(path, filmed or Filmed())
+    elif path.suffix == ".npz":
         yield _arrays(path)
     elif path.name.endswith((".zarr", ".zarr.part")):
         yield _stored(open_sequence(path), source)
@@ -59,12 +74,26 @@ def _stored(sequence: Sequence, source: str) -> Motion:
     confidence = sequence["flow_confidence"] if sure else None
     return Motion(
         name=sequence.path.stem,
-        frames=sequence.frames,
-        flow=lambda t: flow[t],
-        confidence=None if confidence is None else lambda t: confidence[t],
+        steps=lambda: (
+            (flow[t], None if confidence is None else confidence[t]) for t in range(sequence.frames)
+        ),
         tissue=sequence["tissue"][:].astype(bool),
         scale_mm_per_px=float(sequence.attrs["scale_mm_per_px"]),
         young_kpa=float(sequence.attrs["young_kpa"]),
+        force_mn=np.linalg.norm(sequence["force"][:], axis=1),
+    )
+
+
+def _video(path: Path, filmed: Filmed) -> Motion:
+    if filmed.scale_mm_per_px is None:
+        raise UserError(f"{path}: a video doesn't say how large it shows things; give --scale in mm a pixel")
+    where = film.tissue(path, filmed.tissue)
+    return Motion(
+        name=path.stem,
+        steps=lambda: film.steps(path, where, filmed.backend),
+        tissue=where,
+        scale_mm_per_px=filmed.scale_mm_per_px,
+        young_kpa=None,
     )
 
 
@@ -83,15 +112,18 @@ def _arrays(path: Path) -> Motion:
     confidence = found.get("confidence")
     if confidence is not None and confidence.shape != flow.shape[:3]:
         raise UserError(f"{path}: confidence is {confidence.shape}, expected {flow.shape[:3]}")
-    young = found.get("young_kpa")
+    young, force = found.get("young_kpa"), found.get("force_mn")
+    if force is not None and force.shape != (len(flow),):
+        raise UserError(f"{path}: force_mn is {force.shape}, expected ({len(flow)},)")
     return Motion(
         name=path.stem,
-        frames=len(flow),
-        flow=lambda t: flow[t],
-        confidence=None if confidence is None else lambda t: confidence[t].astype(np.float32),
+        steps=lambda: (
+            (f, None if confidence is None else confidence[t].astype(np.float32)) for t, f in enumerate(flow)
+        ),
         tissue=tissue,
         scale_mm_per_px=float(found["scale_mm_per_px"]),
         young_kpa=None if young is None else float(young),
+        force_mn=None if force is None else force.astype(np.float64),
     )
 
 
@@ -106,14 +138,8 @@ def apply(predictor: Predictor, motion: Motion, young_kpa: float | None = None) 
     young = young_kpa if young_kpa is not None else motion.young_kpa
     view = View(motion.tissue, motion.scale_mm_per_px, predictor.grid)
     maps = [
-        predictor(
-            motion.flow(t),
-            motion.tissue,
-            motion.scale_mm_per_px,
-            young,
-            None if motion.confidence is None else motion.confidence(t),
-        )
-        for t in range(motion.frames)
+        predictor(flow, motion.tissue, motion.scale_mm_per_px, young, confidence)
+        for flow, confidence in motion.steps()
     ]
     density = np.stack([m.density for m in maps])
     kind = predictor.card.settings.target
@@ -131,3 +157,17 @@ def apply(predictor: Predictor, motion: Motion, young_kpa: float | None = None) 
     if maps[0].head_mn is not None:
         out["head_mn"] = np.stack([m.head_mn for m in maps])
     return out
+
+
+def calibrate(predictor: Predictor, press: Motion) -> float:
+    """Young's modulus [kPa] from a film of one press whose force is known. Raises UserError if it isn't."""
+    if press.force_mn is None:
+        raise UserError(f"{press.name}: holds no force to calibrate on (force_mn in an .npz)")
+    view = View(press.tissue, press.scale_mm_per_px, predictor.grid)
+    moved, sure = [], []
+    for flow, confidence in press.steps():
+        moved.append(view.resample.mean(flow.transpose(2, 0, 1) * press.scale_mm_per_px, press.tissue))
+        if confidence is not None:
+            sure.append(view.resample.mean(confidence, press.tissue))
+    given = np.stack(sure) if sure else None
+    return stiffness(predictor, np.stack(moved), view.mask, press.force_mn, given)

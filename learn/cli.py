@@ -1,4 +1,5 @@
-"""`learn train | eval | predict | export`: from a dataset to a model, honest numbers, forces and a file."""
+"""`learn train | eval | predict | calibrate | export`: from a dataset to a model, honest numbers, forces
+and a file."""
 
 from __future__ import annotations
 
@@ -174,32 +175,64 @@ def eval_command(
 @app.command("predict")
 def predict_command(
     model: Annotated[Path, typer.Argument(help="Model folder.")],
-    source: Annotated[Path, typer.Argument(help="Dataset, NNNNNN.zarr store, or .npz of flow.")],
+    source: Annotated[Path, typer.Argument(help="Dataset, NNNNNN.zarr store, video, or .npz of flow.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for NAME.npz files.")] = Path("forces"),
     input: Annotated[str, typer.Option(help="ideal or recovered flow of a store.")] = "recovered",
     young: Annotated[float | None, typer.Option(help="Young's modulus [kPa], instead of the data's.")] = None,
+    scale: Annotated[float | None, typer.Option(help="A video's scale [mm a pixel].")] = None,
+    tissue: Annotated[
+        Path | None,
+        typer.Option(help="A picture, white where the video shows tissue; everywhere if not given."),
+    ] = None,
+    backend: Annotated[str, typer.Option(help="Flow estimator for a video, as in a job.")] = "tvl1",
     threads: Threads = None,
     json: Json = False,
 ) -> None:
-    """Write the force maps and force curves that a model sees in stores or arrays of flow."""
+    """Write the force maps and force curves that a model sees in stores, videos or arrays of flow."""
     import numpy as np
 
-    from learn.apply import apply, motions
+    from learn.apply import Filmed, apply, motions
     from learn.predict import load as load_model
     from learn.threads import set_threads
 
     set_threads(threads)
     predictor = load_model(model)
     peaks = {}
-    for motion in motions(source, input):
+    for motion in motions(source, input, Filmed(scale, tissue, backend)):
         found = apply(predictor, motion, young)
         out.mkdir(parents=True, exist_ok=True)
         np.savez_compressed(out / f"{motion.name}.npz", **found)
         peaks[motion.name] = float(found["total_force_mn"].max())
         if not json:
-            _console.print(f"{motion.name}: {motion.frames} frames, peak force {peaks[motion.name]:.3g} mN")
+            count = len(found["total_force_mn"])
+            _console.print(f"{motion.name}: {count} frames, peak force {peaks[motion.name]:.3g} mN")
     if json:
         print(json_.dumps({"out": str(out), "peak_force_mn": peaks}))
+
+
+@app.command("calibrate")
+def calibrate_command(
+    model: Annotated[Path, typer.Argument(help="Model folder.")],
+    press: Annotated[
+        Path, typer.Argument(help="One press with known force: NNNNNN.zarr store, or .npz with force_mn.")
+    ],
+    input: Annotated[str, typer.Option(help="ideal or recovered flow of a store.")] = "recovered",
+    threads: Threads = None,
+    json: Json = False,
+) -> None:
+    """Estimate the tissue's stiffness from one press whose force is known."""
+    from learn.apply import calibrate, motions
+    from learn.predict import load as load_model
+    from learn.threads import set_threads
+
+    set_threads(threads)
+    predictor = load_model(model)
+    found = {motion.name: calibrate(predictor, motion) for motion in motions(press, input)}
+    if json:
+        print(json_.dumps({"young_kpa": found}))
+    else:
+        for name, young in found.items():
+            Console().print(f"{name}: E = {young:.3g} kPa; give it to `learn predict` as --young {young:.3g}")
 
 
 @app.command("export")
@@ -232,6 +265,7 @@ _ROWS = (
     ("vector_r2", "force map: R² of components", ""),
     ("ghost", "ghosts: contact-free area above 5 mN", ""),
     ("ghost_relative", "ghosts: contact-free area above 5% of scale", ""),
+    ("ghost_far", "ghosts: the same beyond 2 mm of a contact", ""),
     ("stray_mn", "ghosts: force on contact-free area", "mN"),
     ("low_over_mn", "over-prediction in low-force frames", "mN"),
     ("localisation_mm", "contact centre: median error", "mm"),

@@ -9,6 +9,7 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from learn.checkpoint import Card
 from learn.data import Clip, amount, target
@@ -24,6 +25,8 @@ PATCH_MM2 = math.pi * 4.0**2
 """Area of that patch: a contact of the jobs' mean radius, 4 mm."""
 FREE = 0.01
 """Contact-free is where the true density is under this share of the training data's 99.9th percentile."""
+RIM_MM = 2.0
+"""Width of the rim around a contact that `ghost_far` leaves out."""
 LOW = 0.05
 """A frame is of low force, and an answer above this is a ghost by the relative rule, at this share."""
 YOUNG = ("known", "half", "double", "unknown")
@@ -51,6 +54,9 @@ class ClipScore:
     """Share of the contact-free area where a contact-sized patch would carry over 5 mN."""
     ghost_relative: float
     """Share of the contact-free area above 5% of the training data's 99.9th percentile."""
+    ghost_far: float
+    """The same beyond 2 mm of any contact: without the rim, where a contact found a cell aside shows up
+    too."""
     stray_mn: float
     """Force the answer puts on the contact-free area, mean over frames [mN]."""
     localisation_mm: float
@@ -98,11 +104,20 @@ def score(
         vector_error_mn=vector_error,
         ghost=ghost_share(said_len * as_force, free, GHOST_MN),
         ghost_relative=ghost_share(said_len, free, LOW * unit),
+        ghost_far=ghost_share(said_len, inside & _away(true_len >= FREE * unit, grid), LOW * unit),
         stray_mn=float((said_len * free).sum((1, 2)).mean() * _cell(kind, grid)),
         localisation_mm=float(np.median(distance)) if distance else math.nan,
         low_over_mn=float(np.maximum(said_mn - true_mn, 0)[low].mean()) if low.any() else math.nan,
         head_error_mn=None if head is None else np.linalg.norm(head - whole, axis=1),
     )
+
+
+def _away(contact: NDArray[np.bool_], grid: Grid) -> NDArray[np.bool_]:
+    """(T, N, N) beyond `RIM_MM` of any contact in the same frame."""
+    out = np.ones_like(contact)
+    for t in np.flatnonzero(contact.any((1, 2))):
+        out[t] = ndimage.distance_transform_edt(~contact[t]) * grid.pitch_mm > RIM_MM
+    return out
 
 
 def _cell(kind: str, grid: Grid) -> float:
@@ -178,6 +193,7 @@ class Report:
                 "ghost_mn": GHOST_MN,
                 "patch_mm2": PATCH_MM2,
                 "free_share": FREE,
+                "rim_mm": RIM_MM,
                 "low_share": LOW,
                 "target": self.card.settings.target,
             },
@@ -195,7 +211,7 @@ def _row(c: ClipScore) -> dict[str, float]:
         row["head_error_mn"] = float(c.head_error_mn.mean())
     peak = float(c.true_mn.max())
     row["peak_error_share"] = abs(float(c.said_mn.max()) - peak) / peak if peak > 0 else math.nan
-    for name in ("ghost", "ghost_relative", "stray_mn", "localisation_mm", "low_over_mn"):
+    for name in ("ghost", "ghost_relative", "ghost_far", "stray_mn", "localisation_mm", "low_over_mn"):
         row[name] = getattr(c, name)
     return row
 

@@ -3,7 +3,9 @@
 The file's input is displacement in mm on the grid, not the channels, so that nobody has to rebuild them:
 `displacement` (B, 2, N, N) mm and `mask` (B, 1, N, N) 0/1 (for some models `confidence` (B, 1, N, N) 0..1 and
 `log_young` (B, 1) ln(E/kPa)); its output is force density per unit stiffness (B, C, N, N) [mN/mm² at 1 kPa].
-Times E in kPa it is mN/mm², times the cell's area and summed, mN. How a picture's flow comes onto the grid
+Times E in kPa it is mN/mm², times the cell's area and summed, mN. A network with a total-force head gives
+that
+too, (B, C) [mN at 1 kPa]. How a picture's flow comes onto the grid
 is written into the .json beside it.
 """
 
@@ -89,13 +91,29 @@ def export(predictor: Predictor, file: Path, kind: str) -> float:
     worst = 0.0
     for batch in (1, 3):
         inputs = examples(card, batch, seed=batch)
-        gap = float((run(inputs) - module(*inputs)).abs().max()) / card.scales.target
-        worst = max(worst, gap)
+        worst = max(worst, _gap(_pair(run(inputs)), _pair(module(*inputs)), card))
     if not worst <= TOLERANCE:
         file.unlink()
         raise UserError(f"{file}: differs from PyTorch by {worst:.1e} of full scale, at most {TOLERANCE:g}")
     file.with_suffix(file.suffix + ".json").write_text(json.dumps(describe(card, kind, worst), indent=1))
     return worst
+
+
+def _pair(said: Tensor | tuple[Tensor, ...]) -> tuple[Tensor, ...]:
+    return (said,) if isinstance(said, Tensor) else said
+
+
+def _gap(said: tuple[Tensor, ...], expected: tuple[Tensor, ...], card: Card) -> float:
+    units = (card.scales.target, card.scales.force)
+    return max(
+        float((a - b).abs().max()) / unit
+        for a, b, unit in zip(said, expected, units[: len(said)], strict=True)
+    )
+
+
+def outputs(card: Card) -> list[str]:
+    """The file's outputs, in order."""
+    return ["density", "total_force"] if card.settings.arch.total else ["density"]
 
 
 def describe(card: Card, kind: str, difference: float) -> dict[str, Any]:
@@ -104,6 +122,7 @@ def describe(card: Card, kind: str, difference: float) -> dict[str, Any]:
     return {
         "format": kind,
         "inputs": names(card),
+        "outputs": outputs(card),
         "output": "force density per unit stiffness [mN/mm2 at E = 1 kPa]; components x, y, z in camera axes"
         if card.settings.arch.components == 3
         else f"{card.settings.target} per unit stiffness, one component",
@@ -145,16 +164,16 @@ def _onnx(module: Portable, card: Card, file: Path) -> Any:
             tuple(examples(card, 2)),
             str(file),
             input_names=names(card),
-            output_names=["density"],
-            dynamic_axes={name: {0: "batch"} for name in [*names(card), "density"]},
+            output_names=outputs(card),
+            dynamic_axes={name: {0: "batch"} for name in [*names(card), *outputs(card)]},
             dynamo=False,
             opset_version=17,
         )
     session = runtime.InferenceSession(str(file), providers=["CPUExecutionProvider"])
     order = names(card)
 
-    def run(inputs: list[Tensor]) -> Tensor:
+    def run(inputs: list[Tensor]) -> tuple[Tensor, ...]:
         named = {name: value.numpy() for name, value in zip(order, inputs, strict=True)}
-        return torch.from_numpy(session.run(None, named)[0])
+        return tuple(torch.from_numpy(value) for value in session.run(None, named))
 
     return run

@@ -169,6 +169,16 @@ def test_ghosts_are_counted_in_mn_over_a_contact_sized_patch(clips: list[Clip]) 
     assert score(clips[0], ghosts, c).stray_mn > 1
 
 
+def test_a_contact_found_a_cell_aside_is_no_ghost_far_away(clips: list[Clip]) -> None:
+    c, clip = card(clips, "magnitude"), clips[2]
+    aside = np.roll(truth(clip, "magnitude"), 1, axis=3)
+    got = score(clip, aside, c)
+    assert got.ghost_relative > 0
+    assert got.ghost_far == 0
+    everywhere = aside + np.float32(0.06 * c.scales.target * clip.young_kpa) * (clip.mask > 0)
+    assert score(clip, everywhere, c).ghost_far == 1
+
+
 def test_bands_hold_every_frame_once(clips: list[Clip]) -> None:
     c = card(clips, "vector")
     whole = report(clips, [truth(clip, "vector") for clip in clips], c)
