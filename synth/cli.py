@@ -102,6 +102,9 @@ def render(
     engine: Annotated[
         str, typer.Option(help="local, dask://host:port, or a YAML file that describes a SLURM cluster.")
     ] = "local",
+    gpus: Annotated[
+        str, typer.Option(help="GPUs that workers take in turn: auto, none, or numbers as 0,1.")
+    ] = "auto",
     memory: Annotated[
         float | None, typer.Option(help="Memory that a process may take [GB]; a share of what is free.")
     ] = None,
@@ -116,7 +119,9 @@ def render(
     _end_on_terminate()
     read = config.load(job, overrides or [])
     with Bars() as bars:
-        options = running.Options(engine=engine, workers=workers, memory_gb=memory, mix_versions=mix_versions)
+        options = running.Options(
+            engine=engine, workers=workers, gpus=gpus, memory_gb=memory, mix_versions=mix_versions
+        )
         summary = running.run(read, out, options, bars)
     if json:
         print(json_.dumps({**vars(summary), "out": str(out)}))

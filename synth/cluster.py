@@ -166,11 +166,25 @@ def _cluster(engine: str) -> Iterator[tuple[str, int]]:
         return
     described = read_slurm(Path(engine))
     jobs = int(described.pop("jobs"))
-    from dask_jobqueue import SLURMCluster
-
-    with SLURMCluster(**described) as cluster:
+    with slurm(described) as cluster:
         cluster.scale(jobs=jobs)
-        yield cluster.scheduler_address, jobs * int(described.get("processes", 1))
+        yield cluster.scheduler_address, jobs * int(described["cores"])
+
+
+def slurm(described: dict[str, Any]) -> Any:
+    """The cluster of a file as `read_slurm` gives it, less `jobs`, with no job submitted yet.
+
+    Raises:
+        UserError: the extra is not installed, or dask-jobqueue does not take an argument.
+    """
+    try:
+        from dask_jobqueue import SLURMCluster
+    except ImportError:
+        raise UserError("a SLURM engine needs the extra `cluster`: pip install 'sulcus[cluster]'") from None
+    try:
+        return SLURMCluster(**described)
+    except (TypeError, ValueError) as error:
+        raise UserError(f"the SLURM file is not what dask-jobqueue takes ({error})") from error
 
 
 def read_slurm(path: Path) -> dict[str, Any]:

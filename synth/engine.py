@@ -17,7 +17,7 @@ from synth.child import Attempt, Setup
 from synth.errors import UserError
 from synth.folder import Folder, claim
 from synth.job import Job
-from synth.journal import Journal
+from synth.journal import Account, Journal
 from synth.slots import Slots
 
 _TRIES = 3
@@ -33,6 +33,8 @@ class Options:
     """`local`, `dask://host:port`, or a YAML file that describes a SLURM cluster."""
     workers: int | None = None
     """Processes at a time; default one a core."""
+    gpus: str = "auto"
+    """GPUs of this machine that the workers share: `auto`, `none`, or their numbers, `0,1`."""
     memory_gb: float | None = None
     """Memory that one process may take; default what is available now, shared out."""
     stall_s: float = 1800.0
@@ -60,12 +62,18 @@ class Summary:
     """Hash of the content hashes of all finished sequences in order."""
 
 
-class Watcher(Protocol):
+class Listener(Protocol):
     """Told what happens, from the main thread only."""
 
     def begin(self, total: int, already: int, failed: int) -> None: ...
     def stage(self, index: int, stage: str, done: int, of: int) -> None: ...
     def end(self, attempt: Attempt, again: bool) -> None: ...
+
+
+class Watcher(Listener, Protocol):
+    """Told besides how the run as a whole goes."""
+
+    def account(self, account: Account) -> None: ...
 
 
 def run(job: Job, root: Path, options: Options, watcher: Watcher) -> Summary:
@@ -77,11 +85,12 @@ def run(job: Job, root: Path, options: Options, watcher: Watcher) -> Summary:
         KeyboardInterrupt: after the workers are ended; what is sealed stays, the next run goes on.
     """
     workers, memory = options.workers or len(os.sched_getaffinity(0)), options.memory_gb
+    gpus = slots.gpus(options.gpus, job.render.variant == "cuda_ad_rgb")
     with claim(root, job, mix_versions=options.mix_versions) as folder:
         finished, failures = set(folder.sealed()), folder.failures()
         todo = [k for k in range(job.sequences) if k not in finished and k not in failures]
         forecast.refuse_if_too_large(forecast.of(job, root, len(todo), sorted(finished), []), root)
-        watchers = (watcher, Journal(folder, workers))
+        watchers = (watcher, Journal(folder, workers, job.frames, watcher))
         for each in watchers:
             each.begin(job.sequences, len(finished), len(failures))
         setup = Setup(
@@ -98,7 +107,7 @@ def run(job: Job, root: Path, options: Options, watcher: Watcher) -> Summary:
             turn_file=folder.turn_file.resolve(),
         )
         try:
-            with _slots(options.engine, setup, workers) as made:
+            with _slots(options.engine, setup, workers, gpus) as made:
                 done = _Pool(folder, made, todo).work(watchers)
         except BaseException:
             index.write(folder)
@@ -127,13 +136,13 @@ class _Pool:
         self._busy = 0
         self._change = threading.Condition()
         self._stop = threading.Event()
-        self._events: queue.SimpleQueue[Callable[[Watcher], None] | BaseException | None] = (
+        self._events: queue.SimpleQueue[Callable[[Listener], None] | BaseException | None] = (
             queue.SimpleQueue()
         )
         self._done = 0
         self._refused: list[Attempt] = []
 
-    def work(self, watchers: tuple[Watcher, ...]) -> int:
+    def work(self, watchers: tuple[Listener, ...]) -> int:
         """Runs until nothing is left to do; returns how many were finished."""
         threads = [threading.Thread(target=self._thread, daemon=True) for _ in range(self._workers)]
         for thread in threads:
@@ -224,9 +233,11 @@ class _Pool:
         return report
 
 
-def _slots(engine: str, setup: Setup, workers: int) -> AbstractContextManager[Slots]:
+def _slots(
+    engine: str, setup: Setup, workers: int, gpus: tuple[str, ...] | None
+) -> AbstractContextManager[Slots]:
     if engine == "local":
-        return slots.local(setup, workers)
+        return slots.local(setup, workers, gpus)
     from synth import cluster
 
     return cluster.slots_of(engine, setup)

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import sys
 import time
+from collections.abc import Iterable
 from types import TracebackType
 
-from rich.console import Console
+from rich.console import Console, RenderableType
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TaskID, TextColumn
 from rich.text import Text
 
+from synth import forecast
 from synth.child import Attempt
+from synth.journal import Account
 
 # Without a terminal a line is printed at most so often.
 _QUIET_S = 10.0
@@ -25,19 +28,31 @@ class _Eta(ProgressColumn):
         return Text(f"{spent}" + (f", {clock(left)} left" if left is not None else ""), style="cyan")
 
 
+class _Progress(Progress):
+    """Bars with a line under them."""
+
+    below = ""
+
+    def get_renderables(self) -> Iterable[RenderableType]:
+        yield from super().get_renderables()
+        if self.below:
+            yield Text(self.below, style="dim")
+
+
 class Bars:
     """A bar for the dataset and one for every sequence in work; plain lines where there is no terminal."""
 
     def __init__(self) -> None:
         console = Console(stderr=True)
         self._live = console.is_terminal
-        self._bars = Progress(
+        self._bars = _Progress(
             TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), _Eta(), console=console
         )
         self._tasks: dict[int, TaskID] = {}
         self._whole = self._bars.add_task("sequences", total=None, start=True)
         self._started = self._said = time.monotonic()
         self._total = self._already = self._finished = 0
+        self._rates = ""
 
     def __enter__(self) -> Bars:
         if self._live:
@@ -82,13 +97,33 @@ class Bars:
         quiet = time.monotonic() - self._said < _QUIET_S and done < self._total
         if not self._live and not quiet:
             self._said = time.monotonic()
-            self._say(f"{done} of {self._total} sequences, {clock(spent)} spent, {clock(left)} left")
+            rest = f"; {self._rates}" if self._rates else ""
+            self._say(f"{done} of {self._total} sequences, {clock(spent)} spent, {clock(left)} left{rest}")
+
+    def account(self, account: Account) -> None:
+        self._rates = rates(account)
+        self._bars.below = self._rates
 
     def _say(self, text: str) -> None:
         if self._live:
             self._bars.console.print(text, highlight=False, markup=False)
         else:
             print(text, file=sys.stderr, flush=True)
+
+
+def rates(account: Account) -> str:
+    """How fast a run goes, what it will take: "render 0.62 s a step; 1.2 frames/s in all; 3 GB to come"."""
+    parts = []
+    if account.step_s:
+        each = ", ".join(f"{name} {seconds:.2g} s" for name, seconds in account.step_s.items())
+        parts.append(f"{each} a step")
+    if account.frames_per_s is not None:
+        parts.append(f"{account.frames_per_s:.2g} frames/s in all")
+    if account.disk_left is not None and account.disk_left > 0:
+        parts.append(
+            f"{forecast.amount(account.disk_left)} to come, {forecast.amount(account.disk_free)} free"
+        )
+    return "; ".join(parts)
 
 
 def clock(seconds: float) -> str:

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import itertools
 import os
+import subprocess
 import threading
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
+from dataclasses import replace
 from pathlib import Path
 from typing import Protocol
 
 from synth import llvm
 from synth.child import Attempt, Child, Setup
+from synth.errors import UserError
 from synth.job import Job
 
 Report = Callable[[str, int, int], None]
@@ -54,21 +58,60 @@ class LocalSlot:
 
 
 class LocalSlots:
-    """As many slots on this machine as asked for."""
+    """As many slots on this machine as asked for; each sees one GPU, in turn, or those that it finds."""
 
-    def __init__(self, setup: Setup, workers: int) -> None:
-        self._setup, self._workers = setup, workers
+    def __init__(self, setup: Setup, workers: int, gpus: tuple[str, ...] | None) -> None:
+        self._setup, self._workers, self._gpus = setup, workers, gpus
+        self._made = itertools.count()
 
     def count(self) -> int:
         return self._workers
 
     def slot(self) -> Slot:
-        return LocalSlot(self._setup)
+        if self._gpus is None:
+            return LocalSlot(self._setup)
+        mine = self._gpus[next(self._made) % len(self._gpus)] if self._gpus else ""
+        seen = {**(self._setup.environment or {}), "CUDA_VISIBLE_DEVICES": mine}
+        return LocalSlot(replace(self._setup, environment=seen))
 
 
-def local(setup: Setup, workers: int) -> AbstractContextManager[Slots]:
-    """Slots on this machine, for as long as the context lasts."""
-    return nullcontext(LocalSlots(setup, workers))
+def local(setup: Setup, workers: int, gpus: tuple[str, ...] | None = None) -> AbstractContextManager[Slots]:
+    """Slots on this machine, for as long as the context lasts; `gpus` as from the function of that name."""
+    return nullcontext(LocalSlots(setup, workers, gpus))
+
+
+def gpus(asked: str, wanted: bool) -> tuple[str, ...] | None:
+    """Names of the GPUs that workers share, as CUDA_VISIBLE_DEVICES takes them; None: nothing is set.
+
+    Args:
+        asked: `auto`, `none` or names with commas between.
+        wanted: whether the job renders on a GPU; else `auto` sets nothing.
+
+    Raises:
+        UserError: a GPU that is not there.
+    """
+    if asked == "none":
+        return ()
+    if asked == "auto":
+        return (_gpus_here() or None) if wanted else None
+    named, here = tuple(word.strip() for word in asked.split(",")), _gpus_here()
+    strangers = [name for name in named if name not in here]
+    if strangers:
+        raise UserError(f"--gpus {', '.join(strangers)}: this machine has {', '.join(here) or 'none'}")
+    return named
+
+
+def _gpus_here() -> tuple[str, ...]:
+    """What a scheduler left visible, or all."""
+    visible = os.environ.get("CUDA_VISIBLE_DEVICES")
+    if visible is not None:
+        return tuple(name.strip() for name in visible.split(",") if name.strip())
+    try:
+        listed = subprocess.run(["nvidia-smi", "-L"], capture_output=True, text=True, timeout=30)
+    except (OSError, subprocess.TimeoutExpired):  # no driver, or one that does not answer
+        return ()
+    count = sum(line.startswith("GPU ") for line in listed.stdout.splitlines())
+    return tuple(str(k) for k in range(count)) if listed.returncode == 0 else ()
 
 
 def machine(job: Job, workers: int) -> dict[str, str]:

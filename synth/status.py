@@ -15,7 +15,8 @@ from synth import forecast
 from synth.errors import UserError
 from synth.folder import Folder
 from synth.forecast import Forecast
-from synth.progress import clock
+from synth.journal import Account
+from synth.progress import clock, rates
 from synth.store import open_sequence
 
 _PILOT = 10
@@ -35,6 +36,8 @@ class Status:
     """Stage, steps done and steps in all of the sequences being computed."""
     left_s: float | None
     """Time to the end, at the rate of the run at work."""
+    rates: str
+    """How fast the run at work goes, by stage, and the disk that it will take."""
     ahead: Forecast
     disk_free: int
     stages_cpu_s: dict[str, float]
@@ -58,8 +61,9 @@ def of(root: Path) -> Status:
         done=len(done),
         failed=dict(Counter(failure["reason"] for failure in failures.values()).most_common()),
         running=journal is not None,
-        in_flight=journal["in_flight"] if journal else {},
-        left_s=journal["left_s"] if journal else None,
+        in_flight=journal.in_flight if journal else {},
+        left_s=journal.left_s if journal else None,
+        rates=rates(journal) if journal else "",
         ahead=forecast.of(job, root, todo, done, [{"cpu_s": sum(stages.values())}] if stages else []),
         disk_free=shutil.disk_usage(root).free,
         stages_cpu_s=stages,
@@ -76,6 +80,8 @@ def lines(status: Status) -> list[str]:
     if status.running:
         left = f", {clock(status.left_s)} left" if status.left_s is not None else ""
         found.append(f"a run is at work{left}")
+        if status.rates:
+            found.append(f"  {status.rates}")
         found += [
             f"  {int(key):06d} {stage} {step} of {of}" for key, (stage, step, of) in status.in_flight.items()
         ]
@@ -97,7 +103,7 @@ def lines(status: Status) -> list[str]:
     return found
 
 
-def _journal(folder: Folder) -> dict[str, Any] | None:
+def _journal(folder: Folder) -> Account | None:
     """What the run at work says of itself; None when none is at work."""
     try:
         descriptor = os.open(folder.state / "lock", os.O_RDONLY)
@@ -112,12 +118,11 @@ def _journal(folder: Folder) -> dict[str, Any] | None:
     return None
 
 
-def _account(folder: Folder) -> dict[str, Any]:
+def _account(folder: Folder) -> Account:
     try:
-        found: dict[str, Any] = json.loads((folder.state / "progress.json").read_text("utf-8"))
-    except (FileNotFoundError, ValueError):  # it has only just begun
-        return {"in_flight": {}, "left_s": None}
-    return found
+        return Account(**json.loads((folder.state / "progress.json").read_text("utf-8")))
+    except (FileNotFoundError, ValueError, TypeError):  # it has only just begun, or is of another version
+        return Account(0, 0.0, 0, None, {}, None, None, 0, {})
 
 
 def _stages(root: Path, pilot: list[int]) -> dict[str, float]:

@@ -15,6 +15,7 @@ from synth.engine import Options, run
 from synth.folder import claim
 from synth.index import write
 from synth.job import Job
+from synth.journal import Account
 
 HERE = Path(__file__).resolve().parent
 
@@ -34,10 +35,17 @@ class Silent:
     def end(self, attempt: Attempt, again: bool) -> None:
         self.attempts.append((attempt, again))
 
+    def account(self, account: Account) -> None:
+        self.last = account
+
 
 def options(work: str, **more: object) -> Options:
     path = os.pathsep.join([str(HERE), str(HERE.parents[1])])
-    return Options(work=f"fake_work:{work}", environment={"PYTHONPATH": path}, **{"workers": 1, **more})  # type: ignore[arg-type]
+    return Options(
+        work=f"fake_work:{work}",
+        environment={"PYTHONPATH": path},
+        **{"workers": 1, "mix_versions": True, **more},
+    )  # type: ignore[arg-type]
 
 
 def in_process(job: Job, root: Path, work: Callable[..., None]) -> None:

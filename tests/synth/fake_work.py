@@ -77,6 +77,12 @@ def troubled(job: Job, index: int, folder: Path, report: Report) -> None:
     sequence(job, index, folder, report)
 
 
+def seeing(job: Job, index: int, folder: Path, report: Report) -> None:
+    """Leaves word of the GPU that it sees, and takes long enough that every worker gets one."""
+    (folder / ".run" / f"saw-{index}").write_text(os.environ.get("CUDA_VISIBLE_DEVICES", "whatever is there"))
+    slow(job, index, folder, report)
+
+
 def hanging(job: Job, index: int, folder: Path, report: Report) -> None:
     """It never comes back."""
     time.sleep(600)

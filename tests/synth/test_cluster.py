@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 from pathlib import Path
 
 import pytest
@@ -11,7 +12,7 @@ from fake_run import Silent, options, run_job, wait_for
 
 from bench.engine_dask import local_cluster
 from synth import engine
-from synth.cluster import read_slurm
+from synth.cluster import read_slurm, slurm
 from synth.errors import UserError
 from synth.folder import Folder
 from synth.index import dataset_hash, read
@@ -42,6 +43,23 @@ def test_a_lost_worker_costs_nothing_but_time(tmp_path: Path) -> None:
     run_job(tmp_path / "local", JOB.model_dump_json(), "sequence")
     assert made.content_hash == dataset_hash(read(tmp_path / "local").to_pylist())
     assert not list(root.glob("*.part"))
+
+
+def test_the_jobs_script_holds_what_was_asked(tmp_path: Path) -> None:
+    pytest.importorskip("dask_jobqueue", reason="the extra `cluster` is not installed")
+    lines = ["jobs: 8", "cores: 1", "processes: 1", "memory: 8 GB", 'walltime: "12:00:00"']
+    (tmp_path / "slurm.yaml").write_text(
+        "\n".join([*lines, 'job_extra_directives: ["--gres=gpu:1"]', "queue: long"])
+    )
+    described = read_slurm(tmp_path / "slurm.yaml")
+    assert described.pop("jobs") == 8
+    with slurm({**described, "interface": "lo"}) as cluster:
+        script = cluster.job_script()
+    for asked in ("-p long", "--cpus-per-task=1", "--mem=8G", "-t 12:00:00", "--gres=gpu:1"):
+        assert f"#SBATCH {asked}\n" in script
+    started = script.splitlines()[-1]
+    assert started.startswith(sys.executable)
+    assert "--nthreads 1 " in started
 
 
 def test_an_earlier_runs_workers_see_that_its_turn_is_over(tmp_path: Path) -> None:

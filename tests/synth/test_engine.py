@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import signal
 import threading
 from pathlib import Path
@@ -9,12 +10,13 @@ from pathlib import Path
 import pytest
 from fake_run import Silent, options, start, wait_for
 
-from synth import engine, index, versions
+from synth import engine, index, slots, versions
 from synth.child import Child, Setup
 from synth.engine import Summary
 from synth.errors import UserError
 from synth.folder import Folder
 from synth.job import Job
+from synth.progress import rates
 
 JOB = Job(seed=2, sequences=6, frames=3, render={"size": (32, 24)}, flow={"backend": "ideal"})
 
@@ -65,13 +67,13 @@ def test_another_versions_dataset_is_continued_only_when_told(
     newer = {**versions.generator(), "numpy": "99.0"}
     monkeypatch.setattr(versions, "generator", lambda: newer)
     with pytest.raises(UserError, match=r"2 sequences were made by another version .*numpy .*, now 99\.0"):
-        run(root)
-    assert run(root, mix_versions=True).done == 4
+        run(root, mix_versions=False)
+    assert run(root).done == 4
     assert len(Folder(root).described()["generators"]) == 2
     assert "Several versions" in (root / "README.md").read_text("utf-8")
     monkeypatch.undo()
     with pytest.raises(UserError, match="made by another version"):
-        run(root, job=JOB.model_copy(update={"sequences": 7}))
+        run(root, job=JOB.model_copy(update={"sequences": 7}), mix_versions=False)
 
 
 def test_a_sequence_sealed_by_an_attempt_that_was_lost_is_not_made_again(tmp_path: Path) -> None:
@@ -95,6 +97,44 @@ def test_comments_are_no_other_version_and_statements_are(tmp_path: Path) -> Non
     texts = ['"""One."""\nx = 1\n', '"""Two."""\n\n# said\nx = 1\n"""Of x."""\n', '"""One."""\nx = 2\n']
     first, remarked, changed = (versions._statements(file) for text in texts if file.write_text(text))
     assert first == remarked != changed
+
+
+@pytest.mark.parametrize(
+    ("visible", "asked", "seen"),
+    [("0,1", "0,1", {"0", "1"}), ("4,7", "7", {"7"}), ("0", "none", {""}), ("5", "auto", {"5"})],
+)
+def test_workers_take_gpus_in_turn(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, visible: str, asked: str, seen: set[str]
+) -> None:
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", visible)
+    job = JOB.model_copy(update={"sequences": 2})
+    run(tmp_path, "seeing", job, workers=2, gpus=asked)
+    assert {path.read_text() for path in (tmp_path / ".run").glob("saw-*")} == seen
+
+
+def test_which_gpus_there_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "0,1")
+    assert slots.gpus("auto", True) == ("0", "1")
+    assert slots.gpus("auto", False) is None
+    with pytest.raises(UserError, match="--gpus 2: this machine has 0, 1"):
+        slots.gpus("0,2", True)
+    monkeypatch.delenv("CUDA_VISIBLE_DEVICES")
+    monkeypatch.setenv("PATH", "")
+    assert slots.gpus("auto", True) is None, "no driver"
+
+
+def test_an_account_says_rates_time_and_disk(tmp_path: Path) -> None:
+    watcher = Silent()
+    engine.run(JOB, tmp_path, options("slow"), watcher)
+    last = watcher.last
+    assert (last.finished, last.left_s, last.in_flight) == (6, 0.0, {})
+    assert last.step_s["fem"] >= 0.05
+    assert last.frames_per_s is not None
+    assert last.frames_per_s < JOB.frames / 0.25, "the stand-in sleeps a quarter of a second a sequence"
+    assert last.disk_left == 0
+    said = rates(dataclasses.replace(last, disk_left=2.5e9, disk_free=int(1e12)))
+    assert "fem 0.05" in said
+    assert said.endswith("frames/s in all; 2.5 GB to come, 1 TB free")
 
 
 def test_trouble_costs_the_sequence_that_makes_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,4 +1,4 @@
-"""Viewing: a recording that rerun itself finds whole, a surface where the depth says, on this machine only."""
+"""Viewing: a recording that rerun finds whole, a surface where the depth says, on this machine only."""
 
 from __future__ import annotations
 
