@@ -80,15 +80,29 @@ def _left(root: Path) -> dict[str, Any]:
     return {"left": len(sealed), "corrupt": corrupt}
 
 
+# Found by every Python process, workers too: each look at the clock is in another year than the one before.
+_JUMPING = """
+import itertools, time
+real, jumps = time.time, itertools.cycle((-40, 0, 40, 7))
+time.time = lambda: real() + next(jumps) * 365 * 86400.0
+time.time_ns = lambda: int(time.time() * 1e9)
+"""
+
+
 def _with_another_clock(root: Path) -> str:
-    """A run whose processes believe in another year, by way of every clock call that Python code makes."""
-    program = (
-        "import time, datetime; real = time.time; time.time = lambda: real() - 40 * 365 * 86400\n"
-        "import sys; from pathlib import Path; from bench.engine_faults import run\n"
-        "print(run(Path(sys.argv[1])).content_hash)"
-    )
-    words = [sys.executable, "-c", program, str(root)]
-    done = subprocess.run(words, env=os.environ, capture_output=True, text=True, check=True)
+    """The hash of a run, workers included, whose clock jumps over decades while it goes on."""
+    program = "import sys; from pathlib import Path; from bench.engine_faults import run\n"
+    program += "print(run(Path(sys.argv[1])).content_hash)"
+    with tempfile.TemporaryDirectory() as early:
+        (Path(early) / "sitecustomize.py").write_text(_JUMPING)
+        path = os.pathsep.join(filter(None, [early, os.environ.get("PYTHONPATH", "")]))
+        done = subprocess.run(
+            [sys.executable, "-c", program, str(root)],
+            env={**os.environ, "PYTHONPATH": path},
+            capture_output=True,
+            text=True,
+            check=True,
+        )
     return done.stdout.strip()
 
 

@@ -252,7 +252,10 @@ class Column:
         except IndexError:
             raise
         except Exception as error:  # zarr, its codecs and the file system have no common error for damage
-            raise UserError(f"{self._where}: cannot be read, the store is damaged ({error})") from error
+            why = "the store is damaged"
+            if self._where.startswith("http"):
+                why += " or its server does not answer range requests"
+            raise UserError(f"{self._where}: cannot be read, {why} ({error})") from error
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
         return np.asarray(self[...], dtype)

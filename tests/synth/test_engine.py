@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 import signal
 import threading
 from pathlib import Path
@@ -10,6 +11,7 @@ from pathlib import Path
 import pytest
 from fake_run import Silent, options, start, wait_for
 
+from bench.engine_faults import _JUMPING
 from synth import engine, index, slots, versions
 from synth.child import Child, Setup
 from synth.engine import Summary
@@ -133,8 +135,20 @@ def test_an_account_says_rates_time_and_disk(tmp_path: Path) -> None:
     assert last.frames_per_s < JOB.frames / 0.25, "the stand-in sleeps a quarter of a second a sequence"
     assert last.disk_left == 0
     said = rates(dataclasses.replace(last, disk_left=2.5e9, disk_free=int(1e12)))
-    assert "fem 0.05" in said
+    assert f"fem {last.step_s['fem']:.2g} s" in said
     assert said.endswith("frames/s in all; 2.5 GB to come, 1 TB free")
+
+
+def test_a_clock_that_jumps_changes_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, undisturbed: str
+) -> None:
+    jumping = options("sequence")
+    (tmp_path / "sitecustomize.py").write_text(_JUMPING)
+    path = os.pathsep.join([str(tmp_path), jumping.environment["PYTHONPATH"]])
+    made = engine.run(
+        JOB, tmp_path / "out", dataclasses.replace(jumping, environment={"PYTHONPATH": path}), Silent()
+    )
+    assert made.content_hash == undisturbed
 
 
 def test_trouble_costs_the_sequence_that_makes_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
