@@ -79,6 +79,8 @@ def _tests(found: list[dict[str, Any]]) -> list[str]:
         groups = [[r for r in found if r["name"] in {n + t for t in both}] for n in (a, b)]
         for key, label in _COLUMNS:
             a_values, b_values = (_per_sequence(g, key) for g in groups)
+            if not np.isfinite(b_values - a_values).any():
+                continue
             test = paired(a_values, b_values, np.random.default_rng(0))
             base = float(np.nanmean(a_values))
             change = f"{test.difference.mean / base:+.0%}" if base > 0 else "-"

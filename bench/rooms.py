@@ -43,6 +43,8 @@ COMMANDS: tuple[Command, ...] = (
     Command("experiment", "stages", "bench.stages", "stages"),
     Command("experiment", "leakage", "bench.leakage", "leakage"),
     Command("experiment", "learn", "bench.learn_experiment", "experiment"),
+    Command("stability", "learn", "bench.learn_stability", "stability"),
+    Command("experiment", "loading", "bench.learn_loading", "loading"),
     Command("pareto", "learn", "bench.learn_pareto", "pareto"),
     Command("pareto", "fem", "bench.fem_pareto", "pareto"),
     Command("stability", "fem", "bench.fem_stability", "stability"),

@@ -12,12 +12,11 @@ from numpy.typing import NDArray
 
 from learn import film
 from learn.calibrate import stiffness
+from learn.data import FIELDS
 from learn.film import Step
 from learn.predict import Predictor, View, total_force
 from synth.errors import UserError
 from synth.store import Dataset, Sequence, open_sequence
-
-_FLOW = {"ideal": "flow", "recovered": "flow_tvl1"}
 
 
 @dataclass(frozen=True)
@@ -65,11 +64,11 @@ def motions(path: Path, source: str, filmed: Filmed | None = None) -> Iterator[M
 
 
 def _stored(sequence: Sequence, source: str) -> Motion:
-    if source not in _FLOW:
-        raise UserError(f"unknown input {source!r}: ideal or recovered")
-    if _FLOW[source] not in sequence:
+    if source not in FIELDS:
+        raise UserError(f"unknown input {source!r}: {', '.join(FIELDS)}")
+    if FIELDS[source] not in sequence:
         raise UserError(f"{sequence.path}: holds no {source} flow")
-    flow = sequence[_FLOW[source]]
+    flow = sequence[FIELDS[source]]
     sure = source == "recovered" and "flow_confidence" in sequence
     confidence = sequence["flow_confidence"] if sure else None
     return Motion(

@@ -42,11 +42,13 @@ def train_command(
     ] = None,
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the model.")] = Path("model"),
     preset: Annotated[str, typer.Option(help="tiny, cpu, live or paper.")] = "cpu",
-    input: Annotated[str | None, typer.Option(help="ideal, recovered or mixed.")] = None,
+    input: Annotated[
+        str | None, typer.Option(help="ideal, recovered, noisy (the published noise) or mixed.")
+    ] = None,
     epochs: Annotated[int | None, typer.Option(help="Passes over the training frames.")] = None,
     batch: Annotated[int | None, typer.Option(help="Frames a step.")] = None,
     learning_rate: Annotated[float | None, typer.Option(help="AdamW's learning rate.")] = None,
-    loss: Annotated[str | None, typer.Option(help="antighost, mse, mae, huber or published.")] = None,
+    loss: Annotated[str | None, typer.Option(help="mse, hinge, antighost, published, mae or huber.")] = None,
     output: Annotated[str | None, typer.Option(help="magnitude or vector.")] = None,
     target: Annotated[str | None, typer.Option(help="density or intensity (the paper's map).")] = None,
     size: Annotated[int | None, typer.Option(help="Grid cells along an edge.")] = None,
@@ -135,14 +137,16 @@ def _log(numbers: dict[str, float]) -> None:
 def eval_command(
     model: Annotated[Path, typer.Argument(help="Model folder.")],
     dataset: Root,
-    input: Annotated[str | None, typer.Option(help="ideal or recovered; as trained if not given.")] = None,
+    input: Annotated[
+        str | None, typer.Option(help="ideal, recovered or noisy; as trained if not given.")
+    ] = None,
     all: Annotated[bool, typer.Option("--all", help="Also sequences the model was fitted on.")] = False,
     threads: Threads = None,
     cache: Cache = None,
     json: Json = False,
 ) -> None:
     """Score a model on the sequences it has not seen; forces in mN."""
-    from learn.data import load
+    from learn.data import FIELDS, load
     from learn.evaluate import evaluate, unseen
     from learn.predict import load as load_model
     from learn.split import ungrouped
@@ -152,8 +156,8 @@ def eval_command(
     predictor = load_model(model)
     trained = predictor.card.settings.input
     source = input or ("recovered" if trained == "mixed" else trained)
-    if source not in ("ideal", "recovered"):
-        raise UserError(f"unknown input {source!r}: ideal or recovered")
+    if source not in FIELDS:
+        raise UserError(f"unknown input {source!r}: one of {', '.join(FIELDS)}")
     with _bar("Reading sequences") as tell:
         clips = load(dataset, predictor.grid, (source,), cache=cache, report=tell)
     if predictor.card.settings.share_anatomy:
@@ -177,7 +181,7 @@ def predict_command(
     model: Annotated[Path, typer.Argument(help="Model folder.")],
     source: Annotated[Path, typer.Argument(help="Dataset, NNNNNN.zarr store, video, or .npz of flow.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for NAME.npz files.")] = Path("forces"),
-    input: Annotated[str, typer.Option(help="ideal or recovered flow of a store.")] = "recovered",
+    input: Annotated[str, typer.Option(help="A store's flow: ideal, recovered or noisy.")] = "recovered",
     young: Annotated[float | None, typer.Option(help="Young's modulus [kPa], instead of the data's.")] = None,
     scale: Annotated[float | None, typer.Option(help="A video's scale [mm a pixel].")] = None,
     tissue: Annotated[
@@ -216,7 +220,7 @@ def calibrate_command(
     press: Annotated[
         Path, typer.Argument(help="One press with known force: NNNNNN.zarr store, or .npz with force_mn.")
     ],
-    input: Annotated[str, typer.Option(help="ideal or recovered flow of a store.")] = "recovered",
+    input: Annotated[str, typer.Option(help="A store's flow: ideal, recovered or noisy.")] = "recovered",
     threads: Threads = None,
     json: Json = False,
 ) -> None:

@@ -17,10 +17,17 @@ from learn.grid import Grid, Resampler, centre, settled
 from synth.errors import UserError
 from synth.store import Dataset, Sequence
 
-Input = Literal["ideal", "recovered", "mixed"]
-INPUTS = ("ideal", "recovered", "mixed")
+Input = Literal["ideal", "recovered", "noisy", "mixed"]
+INPUTS = ("ideal", "recovered", "noisy", "mixed")
 Target = Literal["density", "intensity"]
-_FIELDS = {"ideal": "flow", "recovered": "flow_tvl1"}
+FIELDS = {"ideal": "flow", "recovered": "flow_tvl1", "noisy": "flow_noisy"}
+"""Field of a store that holds each displacement. `noisy` is the published regime: true flow with its
+noise."""
+_CURE = {
+    "ideal": "render it anew",
+    "recovered": "render with flow.backend other than 'ideal'",
+    "noisy": "render with store.extra: [flow_noisy]",
+}
 _VERSION = 3
 _ARRAYS = ("mask", "confidence", "density", "force")
 _PLAIN = ("name", "content_hash", "group", "family", "gesture", "young_kpa")
@@ -40,7 +47,7 @@ class Clip:
     mask: NDArray[np.float32]
     """(N, N) 0/1, tissue."""
     displacement: dict[str, NDArray[np.float32]]
-    """`ideal` and/or `recovered`: (T, 2, N, N) mm in picture axes."""
+    """`ideal`, `recovered` and/or `noisy`: (T, 2, N, N) mm in picture axes."""
     confidence: NDArray[np.float32]
     """(T, N, N) 0..1 of the recovered flow; 1 where there is none."""
     density: NDArray[np.float32]
@@ -65,16 +72,17 @@ def sources(wanted: Input) -> tuple[str, ...]:
 def read(sequence: Sequence, grid: Grid, wanted: Iterable[str]) -> Clip:
     """One store on the grid.
 
-    `wanted`: any of `ideal`, `recovered`. Raises UserError if the store lacks the flow or has no tissue.
+    `wanted`: any of `ideal`, `recovered`, `noisy`. Raises UserError if the store lacks the flow or has no
+    tissue.
     """
     attrs = sequence.attrs
     where = sequence.path.name
     wanted = tuple(wanted)
     for source in wanted:
-        if _FIELDS[source] not in sequence:
+        if FIELDS[source] not in sequence:
             raise UserError(
-                f"{where}: holds no {source} flow (field {_FIELDS[source]}); "
-                "render with flow.backend other than 'ideal', or train with --input ideal"
+                f"{where}: holds no {source} flow (field {FIELDS[source]}); {_CURE[source]}, "
+                "or use --input ideal"
             )
     scenario: dict[str, Any] = attrs.get("scenario") or {}
     try:
@@ -92,7 +100,7 @@ def read(sequence: Sequence, grid: Grid, wanted: Iterable[str]) -> Clip:
     surest = "recovered" in wanted and "flow_confidence" in sequence
     for t in range(frames):
         for source in wanted:
-            moved = sequence[_FIELDS[source]][t].transpose(2, 0, 1) * scale
+            moved = sequence[FIELDS[source]][t].transpose(2, 0, 1) * scale
             displacement[source][t] = resample.mean(moved, tissue) * mask
         if surest:
             confidence[t] = resample.mean(sequence["flow_confidence"][t], tissue) * mask

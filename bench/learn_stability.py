@@ -1,0 +1,231 @@
+"""`bench stability learn`: where training diverges, what bad data costs, and that bad input says so."""
+
+from __future__ import annotations
+
+import json as json_
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+from rich.console import Console
+
+from bench import learn_disturb as disturb
+from bench.learn_badinput import bad_inputs
+from bench.learn_experiment import LOSSES, RESULTS, small
+from bench.learn_labels import clips as labels
+from bench.learn_table import markdown
+from bench.machine import describe
+from learn.data import Clip
+from learn.evaluate import Report, evaluate
+from learn.grid import Grid
+from learn.predict import Predictor, load
+from learn.settings import Settings
+from learn.split import Split, nested
+from learn.threads import set_threads
+from learn.train import train
+from synth import config
+from synth.errors import UserError
+
+RATES = (5e-4, 2e-3, 1e-2, 5e-2)
+STRAY = (0.0, 8.0, 32.0)
+LABEL_NOISE = (0.0, 0.1, 0.3)
+FLOW_NOISE = ((0.005, 0.0), (0.02, 0.0), (0.005, 1.0), (0.02, 1.0), (0.05, 1.0))
+"""Size [mm] and blob scale [mm]."""
+UNSEEN = ("grasp", "retract")
+
+Say = Callable[[str], None]
+Row = dict[str, Any]
+
+
+def stability(
+    cache: Annotated[Path, typer.Option(help="Folder for packed sequences and trained models; made once.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for results.")] = RESULTS / "stability",
+    seeds: Annotated[int, typer.Option(min=1, help="Seeds of each learning rate and loss weight.")] = 5,
+    only: Annotated[str, typer.Option(help="Only the part of this name.")] = "",
+    json: Annotated[bool, typer.Option("--json", help="Print JSON on stdout.")] = False,
+) -> None:
+    """Learning rates × loss weights × seeds, noise, wrong E and scale, unseen gestures, bad input."""
+    set_threads(1)
+    say = Console(stderr=True).print
+    out.mkdir(parents=True, exist_ok=True)
+    clips = labels(config.load(str(RESULTS / "data/labels.yaml")), Grid(small().size), cache)
+    split = nested(clips, 3, 0, 0)
+    folder = cache / "models/stability"
+    parts: dict[str, Callable[[], list[Row]]] = {
+        "rates": lambda: _rates(clips, split, folder, seeds, say),
+        "labels": lambda: _label_noise(clips, split, folder, say),
+        "gestures": lambda: _gestures(clips, split, folder, cache / "models/ideal/mse-fold0-seed0"),
+        "confidence": lambda: _confidence(clips, split, folder),
+        "shown": lambda: _shown(clips, split, cache / "models/ideal/mse-fold0-seed0"),
+        "bad-input": lambda: bad_inputs(cache / "models/ideal/mse-fold0-seed0", folder / "bad"),
+    }
+    if only and only not in parts:
+        raise UserError(f"unknown part {only!r}: one of {', '.join(parts)}")
+    for name, part in parts.items():
+        file = out / f"{name}.json"
+        if (not only or name == only) and not file.is_file():
+            file.write_text(json_.dumps({"machine": describe(), "rows": part()}, indent=1) + "\n")
+            say(f"{name}: done")
+    found = {n: json_.loads((out / f"{n}.json").read_text()) for n in parts if (out / f"{n}.json").is_file()}
+    text = "\n\n".join(f"## {_TITLES[n]}\n\n{markdown(f['rows'])}" for n, f in found.items())
+    (out / "README.md").write_text(f"{_HEAD}\n{text}\n")
+    if json:
+        print(json_.dumps({n: f["rows"] for n, f in found.items()}))
+    else:
+        Console().print(f"{out / 'README.md'}")
+
+
+_HEAD = """# Learn: where it breaks
+
+`bench stability learn --cache CACHE`, on the sequences of `../data/labels.yaml`, fold 0 of 3 on a 64² grid;
+training
+parts with a network of width 8 and stem 4 (two epochs a run), the others with the study's
+`mse-fold0-seed0`. R² is
+pooled over frames (force) or cells (map) of the tested sequences. Machine: 2 cores, no GPU, one thread.
+"""
+_TITLES = {
+    "rates": "Learning rate × price of force off contact (`hinge`), over seeds",
+    "labels": "Labels off by a factor exp(N(0, s)), one draw a fitted sequence",
+    "gestures": "Gestures never seen in training, and frames with two contacts",
+    "confidence": "Flow that fails over a fifth of the picture, with and without its confidence",
+    "shown": "What a trained network is shown at test time",
+    "bad-input": "Bad input, and the one line it gets",
+}
+
+
+def _tiny(**changes: Any) -> Settings:
+    base = replace(small(), epochs=2, **changes)
+    return replace(base, arch=replace(base.arch, width=8, stem=4, levels=2))
+
+
+def _fit(clips: Sequence[Clip], split: Split, settings: Settings, folder: Path) -> Predictor:
+    train(clips, split, settings, folder)
+    return load(folder)
+
+
+def _numbers(report: Report, young: str = "known") -> Row:
+    s = report.summary(young)
+    return {
+        "map R²": round(s["map_r2_pooled"], 3),
+        "force R²": round(s["force_r2_pooled"], 3),
+        "force bias [mN]": round(s["force_bias"], 3),
+        "force MAE [mN]": round(s["force_mae"], 3),
+        "off contact [mN]": round(s["stray_mn"], 4),
+    }
+
+
+def _rates(clips: list[Clip], split: Split, folder: Path, seeds: int, say: Say) -> list[Row]:
+    """A run diverges where training stops itself, or ends no better than saying the mean."""
+    rows = []
+    for rate in RATES:
+        for stray in STRAY:
+            scores, lost = [], 0
+            for seed in range(seeds):
+                objective = replace(LOSSES["hinge"], stray_weight=stray)
+                settings = _tiny(learning_rate=rate, objective=objective, seed=seed)
+                try:
+                    card = train(clips, split, settings, folder / f"rate{rate:g}-stray{stray:g}-{seed}")
+                    scores.append(card.score)
+                    lost += not card.score > 0
+                except UserError as stopped:
+                    say(str(stopped))
+                    lost += 1
+            rows.append(
+                {
+                    "learning rate": rate,
+                    "price": stray,
+                    "seeds": seeds,
+                    "diverged": lost,
+                    "select R², mean": round(float(np.mean(scores)), 3) if scores else None,
+                    "spread (sd)": round(float(np.std(scores, ddof=1)), 3) if len(scores) > 1 else None,
+                }
+            )
+            say(str(rows[-1]))
+    return rows
+
+
+def _label_noise(clips: list[Clip], split: Split, folder: Path, say: Say) -> list[Row]:
+    rows = []
+    for sigma in LABEL_NOISE:
+        rng, used = np.random.default_rng(1), list(clips)
+        for i in split.fit:
+            used[i] = disturb.mislabelled(clips[i], sigma, rng)
+        model = _fit(used, split, replace(_tiny(), epochs=4), folder / f"labels{sigma:g}")
+        rows.append({"s": sigma} | _numbers(evaluate(model, [clips[i] for i in split.test], "ideal")))
+        say(str(rows[-1]))
+    return rows
+
+
+def _gestures(clips: list[Clip], split: Split, folder: Path, usual: Path) -> list[Row]:
+    seen = {
+        side: tuple(i for i in getattr(split, side) if clips[i].gesture not in UNSEEN)
+        for side in ("fit", "select")
+    }
+    without = Split(seen["fit"], seen["select"], split.test)
+    models = {
+        "seen": load(usual),
+        f"without {', '.join(UNSEEN)}": _fit(clips, without, small(), folder / "unseen"),
+    }
+    rows = []
+    for gesture in sorted({c.gesture for c in clips}):
+        asked = [clips[i] for i in split.test if clips[i].gesture == gesture]
+        for name, model in models.items():
+            rows.append(
+                {"gesture": gesture, "sequences": len(asked), "trained": name}
+                | _numbers(evaluate(model, asked, "ideal"))
+            )
+    test = [clips[i] for i in split.test if clips[i].gesture in ("pull", "push", "tap")]
+    pairs = [disturb.both(a, b) for a, b in zip(test[0::2], test[1::2], strict=False)]
+    rows.append(
+        {"gesture": "two contacts, superposed", "sequences": len(pairs), "trained": "seen"}
+        | _numbers(evaluate(models["seen"], pairs, "ideal"))
+    )
+    return rows
+
+
+def _confidence(clips: list[Clip], split: Split, folder: Path) -> list[Row]:
+    rng, grid = np.random.default_rng(2), Grid(small().size)
+    torn = [disturb.hidden(c, 0.05, 0.2, grid, rng) for c in clips]
+    rows = []
+    for channel in (False, True):
+        base = replace(small(), epochs=4, input="recovered")
+        settings = replace(base, arch=replace(base.arch, confidence=channel))
+        model = _fit(torn, split, settings, folder / f"confidence-{channel}")
+        test = [torn[i] for i in split.test]
+        cases = (
+            {"given": test, "missing": [disturb.unsure(c) for c in test]} if channel else {"no channel": test}
+        )
+        for name, asked in cases.items():
+            rows.append({"confidence": name} | _numbers(evaluate(model, asked, "recovered")))
+    return rows
+
+
+def _shown(clips: list[Clip], split: Split, model: Path) -> list[Row]:
+    predictor, grid, rng = load(model), Grid(small().size), np.random.default_rng(3)
+    test = [clips[i] for i in split.test]
+    plain = evaluate(predictor, test, "ideal")
+    rows: list[Row] = [{"shown": "as it is"} | _numbers(plain)]
+    for young, name in (("half", "E taken ×½"), ("double", "E taken ×2"), ("unknown", "E unknown")):
+        rows.append({"shown": name} | _numbers(plain, young))
+    for sigma, patch in FLOW_NOISE:
+        asked = [disturb.noisy(c, sigma, patch, grid, rng) for c in test]
+        what = f"noise {sigma:g} mm, {f'{patch:g} mm blobs' if patch else 'cell by cell'}"
+        rows.append({"shown": what} | _numbers(evaluate(predictor, asked, "ideal")))
+    for factor in (0.8, 1.2):
+        found = _numbers(evaluate(predictor, [disturb.scaled(c, factor) for c in test], "ideal"))
+        # The map has moved against its truth: only the total can be compared.
+        rows.append(
+            {"shown": f"mm/px taken ×{factor:g}"} | found | {"map R²": None, "off contact [mN]": None}
+        )
+    rows.append({"shown": "nothing moves"} | _still(predictor, [disturb.still(c) for c in test]))
+    jitter = [disturb.noisy(disturb.still(c), 0.005, 1.0, grid, rng) for c in test]
+    rows.append({"shown": "nothing moves, noise 0.005 mm, 1 mm blobs"} | _still(predictor, jitter))
+    return rows
+
+
+def _still(predictor: Predictor, clips: Sequence[Clip]) -> Row:
+    """R² has no meaning where the truth is nothing."""
+    return _numbers(evaluate(predictor, clips, "ideal")) | {"map R²": None, "force R²": None}
