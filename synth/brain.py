@@ -10,6 +10,7 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
+from synth import vtk
 from synth.errors import UserError
 from synth.job import Attachment, Craniotomy
 
@@ -43,7 +44,7 @@ class Brain:
 
 
 def load(path: Path, craniotomy: Craniotomy) -> Brain:
-    """Reads a surface (OBJ, STL, PLY, OFF or VTK), merges what belongs together, and places it.
+    """Reads a surface (OBJ, STL, PLY, OFF or legacy VTK), merges what belongs together, and places it.
 
     Args:
         path: the file, coordinates in mm.
@@ -97,6 +98,8 @@ def _read(path: Path) -> tuple[Floats, NDArray[np.int64]]:
     if not path.is_file():
         raise UserError(f"anatomy.mesh: there is no file {path}")
     try:
+        if path.suffix.lower() == ".vtk":
+            return _merged(*vtk.read(path))
         mesh = trimesh.load(path, force="mesh", process=False)
     except (ValueError, IndexError, KeyError, NotImplementedError, UnicodeDecodeError) as error:
         raise UserError(f"anatomy.mesh: {path.name} is no surface that can be read ({error})") from error

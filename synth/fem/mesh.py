@@ -14,6 +14,7 @@ from synth.brain import Brain
 from synth.errors import UserError
 from synth.fem import attach, winding
 from synth.fem.element import TRI_POINTS, TRI_WEIGHTS, bary_slope, face_shape
+from synth.fem.fit import fit
 from synth.fem.refine import edges_of, refine
 from synth.fem.stuffing import stuff
 
@@ -184,6 +185,8 @@ def _filled(brain: Brain, grading: Callable[[Floats], Floats], tets: int) -> tup
         if 0.9 * tets <= len(cells) <= 1.1 * tets or len(cells) == 0:
             break
         lattice = int(lattice * tets / len(cells))
+    if len(cells):
+        points = fit(points, cells, boundary(cells, 1), lambda at: turns(at) - 0.5)
     return points, cells
 
 
