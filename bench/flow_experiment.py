@@ -70,7 +70,7 @@ def experiment(
     ] = "warped,far,drift,rendered,time",
     count: Annotated[int, typer.Option(min=1, help="Pairs a source.")] = 6,
     frames: Annotated[int, typer.Option(min=60, help="Frames of the drift sequence.")] = 200,
-    seed: Annotated[int, typer.Option(min=0, help="Root of every draw.")] = 4,
+    seed: Annotated[int, typer.Option(min=0, help="Root of every draw; 4 and 5 were tuned on.")] = 2611,
     json: Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")] = False,
 ) -> None:
     """Flow: endpoint error, divergence, masks, drift and time against what was asked."""
@@ -125,6 +125,7 @@ def _warped(source: Source) -> Iterator[Row]:
     ours = measure(create("tvl1"), dirty)
     yield Row("EPE mean, given masks", on, 0.20, ours.mean)
     yield Row("EPE contact, given masks", on, 0.40, ours.contact)
+    yield Row("EPE contact where it is seen, given masks", on, 0.40, ours.contact_seen)
     yield Row("EPE hidden under the tool, given masks", on, 0.45, ours.hidden)
     yield Row("magnitude error", on, 0.06, ours.magnitude, "share")
     yield Row("divergence, relative RMS", on, 0.45, ours.divergence, "share")
@@ -150,6 +151,9 @@ def _far(source: Source) -> Iterator[Row]:
         yield Row(f"EPE mean, {pull:g} px pull, cold", source.name, asked, found.mean)
         theirs = measure(create("opencv-tvl1"), far)
         yield Row(f"EPE mean, {pull:g} px pull, cold: opencv-tvl1", source.name, None, theirs.mean)
+
+
+_WET = 0.75  # of a job's light.glare: the automatic mask then takes about 30% of the tissue
 
 
 def _drift(source: Source, frames: int) -> Iterator[Row]:
@@ -181,23 +185,22 @@ def _drift(source: Source, frames: int) -> Iterator[Row]:
 
 
 def _rendered(count: int, seed: int) -> Iterator[Row]:
-    wet = list(flow_rendered.pairs(flow_rendered.Wet(), count, seed))
-    on = "rendered, 7 px, glare"
-    yield Row(
-        "share of tissue masked as glare", on, None, float(np.mean([one.share for one in wet])), "share"
-    )
-    for name in ("tvl1", "opencv-tvl1", "dis"):
-        found = [_wet(one, name) for one in wet]
-        asked = (0.14, 0.33, 0.16) if name == "tvl1" else (None, None, None)
-        for k, what in enumerate(("EPE mean", "EPE 95th percentile", "EPE in glare")):
-            yield Row(
-                f"{what}, automatic glare mask: {name}", on, asked[k], float(np.mean([f[k] for f in found]))
-            )
+    for on, glare in (("rendered, 7 px, default glare", None), ("rendered, 7 px, 30% glare", _WET)):
+        wet = list(flow_rendered.pairs(flow_rendered.Wet(glare=glare), count, seed))
+        share = float(np.mean([one.share for one in wet]))
+        yield Row("share of tissue masked as glare", on, None, share, "share")
+        for name in ("tvl1", "opencv-tvl1", "dis"):
+            found = [_wet(one, name) for one in wet]
+            asked = (0.14, 0.33, 0.16) if name == "tvl1" else (None, None, None)
+            for k, what in enumerate(("EPE mean", "EPE 95th percentile", "EPE in glare")):
+                figure = float(np.nanmean([f[k] for f in found]))
+                yield Row(f"{what}, automatic glare mask: {name}", on, asked[k], figure)
     tooled = list(flow_rendered.pairs(flow_rendered.Wet(peak_px=10, tool=True), count, seed + 1))
     ours = average([_exact(one) for one in tooled])
     on = "rendered, 10 px, tool, 224²"
     yield Row("EPE mean, given masks", on, 0.20, ours.mean)
     yield Row("EPE contact, given masks", on, 0.40, ours.contact)
+    yield Row("EPE contact where it is seen, given masks", on, 0.40, ours.contact_seen)
     yield Row("EPE hidden under the tool, given masks", on, 0.45, ours.hidden)
     yield Row("magnitude error", on, 0.06, ours.magnitude, "share")
     yield Row("divergence, relative RMS", on, 0.45, ours.divergence, "share")
@@ -213,7 +216,7 @@ def _wet(one: flow_rendered.WetPair, name: str) -> tuple[float, float, float]:
     return (
         float(error[seen].mean()),
         float(np.percentile(error[seen], 95)),
-        float(error[seen & one.rest_glare].mean()),
+        float(error[seen & one.rest_glare].mean()) if (seen & one.rest_glare).any() else float("nan"),
     )
 
 
@@ -229,7 +232,7 @@ def _exact(one: flow_rendered.WetPair) -> Error:
     flow, _ = create("tvl1").flow(pair.rest[crop], pair.now[crop], rest[crop], now[crop])
     spent = time.process_time() - begin
     seen = (one.tissue & one.visible)[crop]
-    contact, hidden = pair.contact[crop] & seen, pair.hidden[crop]
+    contact, hidden = pair.contact[crop], pair.hidden[crop]
     return against(flow, pair.flow[crop], seen, contact, hidden, spent)
 
 

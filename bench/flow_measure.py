@@ -24,7 +24,9 @@ class Error:
     """Endpoint error over what is seen."""
     p95: float
     contact: float
-    """Endpoint error within the contact, where it is seen."""
+    """Endpoint error within the contact, hidden points included."""
+    contact_seen: float
+    """The same where it is seen."""
     hidden: float
     """Endpoint error under the tool; NaN where nothing is hidden."""
     magnitude: float
@@ -57,13 +59,18 @@ def against(flow: Floats, truth: Floats, seen: Flags, contact: Flags, hidden: Fl
     return Error(
         mean=float(error[seen].mean()),
         p95=float(np.percentile(error[seen], 95)),
-        contact=float(error[contact].mean()) if contact.any() else float("nan"),
-        hidden=float(error[hidden].mean()) if hidden.any() else float("nan"),
+        contact=_within(error, contact),
+        contact_seen=_within(error, contact & seen),
+        hidden=_within(error, hidden),
         magnitude=float(np.abs(size - real).mean() / max(float(real.mean()), 1e-9)),
         divergence=float(np.sqrt(np.mean((found - true) ** 2)) / max(spread, 1e-9)),
         divergence_r=float(np.corrcoef(found, true)[0, 1]) if spread > 0 and found.std() > 0 else 0.0,
         cpu_s=cpu_s,
     )
+
+
+def _within(error: Floats, where: Flags) -> float:
+    return float(error[where].mean()) if where.any() else float("nan")
 
 
 Masks = Callable[[Rgb, Flags], Flags]
@@ -94,7 +101,7 @@ def measure(
         flow, _ = estimator.flow(pair.rest, pair.now, rest, now, initial)
         spent = time.process_time() - begin
         seen = pair.inside & ~pair.hidden
-        errors.append(against(flow, pair.flow, seen, pair.contact & seen, pair.hidden, spent))
+        errors.append(against(flow, pair.flow, seen, pair.contact, pair.hidden, spent))
     return average(errors)
 
 

@@ -30,6 +30,8 @@ class Wet:
     """Largest displacement in the picture [px]."""
     tool: bool = False
     """Show the forceps at the contact."""
+    glare: float | None = None
+    """The job's `light.glare`, 0 to 1; None: as the default job has it."""
 
 
 @dataclass(frozen=True)
@@ -58,6 +60,7 @@ def pairs(wet: Wet, count: int, seed: int) -> Iterator[WetPair]:
             "sequences": count,
             "frames": 2,
             "render": {"size": wet.size, "spp": wet.spp, "tool": wet.tool},
+            "light": {} if wet.glare is None else {"glare": wet.glare},
         }
     )
     for index in range(count):

@@ -10,6 +10,9 @@ from torch import Tensor
 
 from synth.flow import image
 
+DOUBTFUL = 0.3
+"""A visible pixel of less confidence counts as lost: the best F1 for errors over 1 px, on the tuning set."""
+
 _WINDOW = 4.0  # px: the neighbours that vouch for a pixel
 _NOISE = 0.02  # local deviations squared: agreement of less contrast than this says nothing
 _LOOP = 1.0  # px: there and back again misses by this much in a doubtful flow ...

@@ -49,7 +49,7 @@ def tool(rgb: NDArray[np.uint8], dilate_px: int = 2) -> NDArray[np.bool_]:
         (H, W) bool, True on the instrument.
     """
     net = toolnet.load()
-    found = _grey_bodies(rgb) if net is None else toolnet.probability(net, rgb) > 0.5
+    found = grey_bodies(rgb) if net is None else toolnet.probability(net, rgb) > 0.5
     return _grow(found, dilate_px)
 
 
@@ -58,7 +58,7 @@ def blocked(rgb: NDArray[np.uint8]) -> NDArray[np.bool_]:
     return np.asarray(glare(rgb) | tool(rgb), bool)
 
 
-def _grey_bodies(rgb: NDArray[np.uint8]) -> NDArray[np.bool_]:
+def grey_bodies(rgb: NDArray[np.uint8]) -> NDArray[np.bool_]:
     """Connected pixels of little colour that touch the border and are more than specks."""
     values = rgb.astype(np.float32)
     top = values.max(axis=2)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 WEIGHTS = Path(__file__).with_name("toolnet.pt")
-SIDE = 128  # px of the longer side that the net looks at
+SIDE = 160  # px of the longer side that the net looks at
 _STEP = 16  # both sides are padded to multiples of it
 _WIDTHS = (12, 24, 48, 64)
 
@@ -47,7 +47,7 @@ class ToolNet(nn.Module):
 
 
 def prepare(rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """(H, W, 3) uint8 as the net sees it: longer side 128 px, mean 0, deviation 1; (3, h, w) float32."""
+    """(H, W, 3) uint8 as the net sees it: longer side 160 px, mean 0, deviation 1; (3, h, w) float32."""
     height, width = rgb.shape[:2]
     share = SIDE / max(height, width)
     size = (max(1, round(width * share)), max(1, round(height * share)))
@@ -82,8 +82,9 @@ def probability(net: ToolNet, rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
 
 
 def _block(inside: int, outside: int, stride: int = 1) -> nn.Sequential:
+    # A kernel of 4 halves about the pixels' corners, as upsampling doubles; one of 3 would shift the picture.
     return nn.Sequential(
-        nn.Conv2d(inside, outside, 3, stride, 1, bias=False),
+        nn.Conv2d(inside, outside, 2 + stride, stride, 1, bias=False),
         nn.BatchNorm2d(outside),
         nn.ReLU(inplace=True),
         nn.Conv2d(outside, outside, 3, 1, 1, bias=False),

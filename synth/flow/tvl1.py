@@ -8,7 +8,9 @@ Minimises over the flow w = (u, v), with I_0 the rest frame and I_1 the frame no
 psi(s^2) = sqrt(s^2 + epsilon^2) being the robust data term on brightness and gradient (Brox et al., High
 accuracy optical flow estimation based on a theory for warping, ECCV 2004, eq. 5), |.|_h the Huber norm
 (Werlberger et al., Anisotropic Huber-L1 optical flow, BMVC 2009, eq. 6), and m the mask: seen in the rest
-frame, and seen now at x + w. Where m is 0 the regulariser alone carries the flow on. Coarse to fine, re-
+frame, and seen now at x + w. Where m is 0 the regulariser alone carries the flow on, there as a membrane (a
+larger h). lambda is that of a picture of little noise; it falls with the square of the residual's median, as a
+measurement's weight does with its noise, and rises where the first guess is steep. Coarse to fine, re-
 warped (Brox), each warp solved by the primal-dual steps of Chambolle and Pock (J. Math. Imaging Vis. 40,
 2011, algorithm 1) on lagged weights.
 """
@@ -28,26 +30,33 @@ from torch import Tensor
 from synth.flow import confidence, image
 from synth.flow.estimator import Flags, Flow, Map, Rgb
 
+_CALMEST = 1.5  # pictures without noise (tests) would ask for no smoothness at all
+
 
 @dataclass(frozen=True)
 class Settings:
     """The energy, and how far it is minimised."""
 
-    weight: float = 0.3
+    weight: float = 0.36
     """lambda: data against smoothness."""
+    noise: float = 0.115
+    """Median residual [local deviations] that lambda is for. It falls with the square of what is found: that
+    is the weight of a measurement with so much noise. 0: lambda stays."""
     gradient: float = 1.0
     """gamma: weight of gradient constancy."""
     huber: float = 0.15
     """h: flow gradients below it [px/px] are smoothed quadratically, above it linearly."""
+    hidden_huber: float = 0.3
+    """Added to h where nothing is seen: flow carries on there as a membrane would, without steps."""
     epsilon: float = 0.01
     """Residuals below it [local deviations] count quadratically."""
     coarsest_px: int = 12
     """The pyramid goes down to about this many pixels on the short side."""
     warps: int = 6
     """Linearisations a level."""
-    reweights: int = 2
+    reweights: int = 1
     """Updates of the robust weights a warp."""
-    steps: int = 8
+    steps: int = 16
     """Primal-dual steps a reweighting."""
     presmooth: float = 0.0
     """Gaussian before everything [px]: linearisation wants pictures without corners."""
@@ -59,8 +68,8 @@ class Settings:
     """3x3 median of the flow after each warp (Wedel et al., An improved algorithm for TV-L1, 2009)."""
     warm_warps: int = 3
     """Linearisations a level with an initial flow."""
-    steep_px: float = 15.0
-    """A pull this far doubles lambda: flow gets steeper with the pull, noise doesn't."""
+    steep: float = 0.1
+    """Where the first guess's gradient [px/px] is this large, lambda is doubled: smoothness costs most there."""
     fine_levels: int = 2
     """Levels that the second stage of a cold start, or a warm start, works on."""
     bold_weight: float = 2.0
@@ -72,7 +81,7 @@ class Settings:
 
     def bold(self) -> Settings:
         """The first stage of a cold start."""
-        return replace(self, weight=self.bold_weight, tau=self.bold_tau, warps=self.bold_warps)
+        return replace(self, weight=self.bold_weight, tau=self.bold_tau, warps=self.bold_warps, noise=0.0)
 
 
 class Tvl1:
@@ -223,17 +232,19 @@ def solve(levels: list[Level], initial: Tensor | None, s: Settings) -> Tensor:
     weight = torch.full_like(flow[:, :1, :1, :1], s.weight)
     if initial is not None:
         flow = initial
-        length = flow.norm(dim=1).flatten(1)
-        far = length.kthvalue(1 + 99 * (length.shape[1] - 1) // 100, dim=1).values.view(-1, 1, 1, 1)
-        weight = s.weight * (1 + (far / s.steep_px) ** 2)
+        if s.steep > 0:
+            weight = weight * (1 + steepness(flow) / s.steep**2)
         for _ in levels[1:]:
             flow = 0.5 * F.avg_pool2d(flow, 2, ceil_mode=True, count_include_pad=False)
     for level in reversed(levels):
         if flow.shape[-2:] != level.now.shape[-2:]:
             flow = finer(flow, level)
         dual = flow.new_zeros(2, *flow.shape)
+        here = weight
+        if weight.shape[-1] > 1:
+            here = F.interpolate(weight, size=flow.shape[-2:], mode="bilinear", align_corners=False)
         for _ in range(s.warps):
-            flow, dual = step(level, flow, dual, weight, s)
+            flow, dual = step(level, flow, dual, here, s)
     return flow
 
 
@@ -252,6 +263,8 @@ def step(level: Level, flow: Tensor, dual: Tensor, weight: Tensor, s: Settings) 
     residual = after - before  # (B, 3, H, W)
     slope = image.derivative(0.5 * (after + before))  # (B, 6, H, W): x of the 3, then y of the 3
     rows, columns = slope[:, :3], slope[:, 3:]
+    if s.noise > 0:
+        weight = weight * calm(residual, mask, s.noise)
     start = flow
     for _ in range(s.reweights):
         moved = flow - start
@@ -267,26 +280,43 @@ def step(level: Level, flow: Tensor, dual: Tensor, weight: Tensor, s: Settings) 
         straight = torch.cat([yy, xx], 1) * scale
         cross = -xy * scale
         shift = straight * torch.cat([gx, gy], 1) + cross * torch.cat([gy, gx], 1)
-        flow, dual = primal_dual(flow, dual, straight, cross, shift, s)
+        flow, dual = primal_dual(flow, dual, straight, cross, shift, s.huber + s.hidden_huber * (1 - mask), s)
     if s.median:
         flow = image.median3(flow)
     return flow, dual
 
 
+def calm(residual: Tensor, mask: Tensor, noise: float) -> Tensor:
+    """(noise / median of |r| over the mask) squared, at most `_CALMEST`, (B, 1, 1, 1); 1 if nothing is seen."""
+    size = torch.where(mask > 0, residual.norm(dim=1, keepdim=True), torch.nan)[..., ::2, ::2]
+    found = torch.nan_to_num(size.flatten(1).nanmedian(dim=1).values, nan=noise)
+    return (noise / found.clamp_min(1e-6)).square().clamp_max(_CALMEST).view(-1, 1, 1, 1)
+
+
+def steepness(flow: Tensor) -> Tensor:
+    """|grad w|^2 of w averaged over 16 x 16 px, (B, 1, H, W): what of the slope isn't noise."""
+    coarse = F.avg_pool2d(flow, 16, ceil_mode=True, count_include_pad=False)
+    wide = F.pad(coarse, (1, 1, 1, 1), "replicate")
+    dx, dy = wide[..., 1:-1, 2:] - wide[..., 1:-1, :-2], wide[..., 2:, 1:-1] - wide[..., :-2, 1:-1]
+    slope = (dx * dx + dy * dy).sum(1, keepdim=True) / 32**2
+    return F.interpolate(slope, size=flow.shape[-2:], mode="bilinear", align_corners=False)
+
+
 def primal_dual(
-    flow: Tensor, dual: Tensor, straight: Tensor, cross: Tensor, shift: Tensor, s: Settings
+    flow: Tensor, dual: Tensor, straight: Tensor, cross: Tensor, shift: Tensor, huber: Tensor, s: Settings
 ) -> tuple[Tensor, Tensor]:
     """`steps` of: dual ascent on grad w with the Huber prox, primal descent with the data term's 2x2 prox."""
     sigma = 1 / (8 * s.tau)
     dual, flow, ahead = dual.clone(), flow.clone(), flow.clone()
     px, py = dual[0], dual[1]
+    shrink = 1 / (1 + sigma * huber)
     # Scratch is kept: on the CPU, fresh memory for each product costs more than the product.
     v, new, norm = torch.empty_like(flow), torch.empty_like(flow), torch.empty_like(flow)
     dx, dy = torch.empty_like(flow[..., 1:]), torch.empty_like(flow[..., 1:, :])
     for _ in range(s.steps):
         px[..., :-1].add_(torch.sub(ahead[..., 1:], ahead[..., :-1], out=dx), alpha=sigma)
         py[..., :-1, :].add_(torch.sub(ahead[..., 1:, :], ahead[..., :-1, :], out=dy), alpha=sigma)
-        dual.mul_(1 / (1 + sigma * s.huber))
+        dual.mul_(shrink)
         torch.mul(px, px, out=norm).addcmul_(py, py).clamp_min_(1).rsqrt_()
         dual.mul_(norm)  # p / max(1, |p|)
         torch.add(flow, px, alpha=s.tau, out=v).add_(py, alpha=s.tau)  # v = w + tau div p

@@ -72,6 +72,16 @@ def test_error_of_a_known_offset() -> None:
     assert np.isnan(error.hidden)
 
 
+def test_contact_counts_hidden_points_and_contact_seen_does_not() -> None:
+    truth = np.zeros((4, 4, 2), np.float32)
+    flow = truth.copy()
+    flow[0, :, 0] = 8.0  # wrong under the tool only
+    contact, hidden = np.zeros((4, 4), bool), np.zeros((4, 4), bool)
+    contact[:2], hidden[0] = True, True
+    error = against(flow, truth, ~hidden, contact, hidden, 0.0)
+    assert (error.contact, error.contact_seen, error.hidden) == (4.0, 0.0, 8.0)
+
+
 def test_divergence_of_a_linear_field() -> None:
     y, x = np.mgrid[:30, :30].astype(np.float32)
     found = divergence(np.stack([0.3 * x, -0.1 * y], -1))

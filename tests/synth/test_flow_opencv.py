@@ -133,9 +133,9 @@ def test_glare_of_the_benchmark() -> None:
 
 def test_tool_is_found_without_weights() -> None:
     (pair,) = pairs(Recipe(highlights=0.0), 1, 2)
-    found = mask._grey_bodies(pair.now)
+    found = mask.grey_bodies(pair.now)
     assert np.count_nonzero(found & pair.tool) / np.count_nonzero(found | pair.tool) > 0.6
-    assert not mask._grey_bodies(pair.rest).any()
+    assert not mask.grey_bodies(pair.rest).any()
     blocked = mask.blocked(pair.now)
     assert blocked[pair.tool].mean() > 0.8
     assert blocked.mean() < 0.2

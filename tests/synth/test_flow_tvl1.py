@@ -205,3 +205,20 @@ def test_chain_of_steps_drifts_and_rest_to_now_does_not() -> None:
         here, _ = ours.step(shot.now, ~shot.now_usable)
         there, _ = chain.step(shot.now, ~shot.now_usable)
     assert _error(there, shot.flow).mean() > 1.5 * _error(here, shot.flow).mean()
+
+
+def test_more_noise_asks_for_more_smoothness() -> None:
+    """lambda falls with the square of the median residual, and stays where nothing is seen."""
+    generator = torch.Generator().manual_seed(3)
+    residual = torch.randn(2, 3, 40, 40, generator=generator) * torch.tensor([0.2, 0.4]).view(2, 1, 1, 1)
+    every = torch.ones(2, 1, 40, 40)
+    factor = tvl1.calm(residual, every, 0.115).flatten()
+    assert float(factor[0] / factor[1]) == pytest.approx(4.0, rel=0.1)
+    assert tvl1.calm(residual, 0 * every, 0.115).flatten().tolist() == [1.0, 1.0]
+
+
+def test_steepness_of_a_ramp() -> None:
+    x = torch.arange(96.0).expand(1, 1, 96, 96)
+    flow = torch.cat([0.3 * x, -0.4 * x], 1)
+    inner = tvl1.steepness(flow)[..., 32:-32, 32:-32]
+    torch.testing.assert_close(inner, torch.full_like(inner, 0.25))
