@@ -308,6 +308,34 @@ def picture(
 
 
 @app.command()
+def fields(
+    out: Annotated[
+        Path | None, typer.Argument(help="A dataset, for what its first sequence takes in fact.")
+    ] = None,
+    size: Annotated[str, typer.Option(help="Picture, WIDTHxHEIGHT in pixels.")] = "640x480",
+    page: Annotated[bool, typer.Option("--page", help="As the page docs/fields.md.")] = False,
+    json: Json = False,
+) -> None:
+    """Lists the fields of a sequence: axes, type, unit, when they are kept, and what they take."""
+    from synth import budget
+    from synth.errors import UserError
+    from synth.store import Dataset
+
+    if page:
+        print(budget.page(), end="")
+        return
+    first = Dataset(out)[0] if out else None
+    width, cross, height = size.partition("x")
+    if not (cross and width.isdigit() and height.isdigit() and int(width) and int(height)):
+        raise UserError(f"--size {size}: is not WIDTHxHEIGHT in pixels")
+    shape = first.size if first else (int(height), int(width))
+    if json:
+        print(json_.dumps([vars(row) for row in budget.rows(shape, first)]))
+    else:
+        print("\n".join(budget.lines(shape, first)))
+
+
+@app.command()
 def view(
     out: Out,
     sequence: Annotated[

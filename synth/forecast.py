@@ -15,6 +15,8 @@ from synth.errors import UserError
 from synth.fields import FIELDS
 from synth.job import Job
 
+# An estimate from the field table is this much too high, lest a run be started that cannot end.
+_MARGIN = 1.25
 # Kept free, so that index, card and the system's own files find room.
 _RESERVE_BYTES = 200e6
 
@@ -50,7 +52,7 @@ def estimate(job: Job) -> float:
         each = 2 if field.half and job.store.flow == "float16" else np.dtype(field.dtype).itemsize
         total += float(np.prod(field.shape(job.frames, (height, width)))) * each * field.packed
     radiance = 6.0 * width * height * job.frames if job.render.exr else 0.0
-    return total + radiance
+    return _MARGIN * (total + radiance)
 
 
 def size(path: Path) -> int:
