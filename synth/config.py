@@ -21,7 +21,7 @@ Loc = tuple[str | int, ...]
 """Where in the job: keys and positions from the top."""
 
 # Paths that are resolved and must exist, as places in the job.
-_FILES: tuple[Loc, ...] = (("anatomy", "mesh"), ("appearance", "photo"))
+_FILES: tuple[Loc, ...] = (("anatomy", "mesh"), ("appearance", "photo"), ("render", "calibration"))
 
 _KINDS = {
     "int_parsing": "a whole number is needed",

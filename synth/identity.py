@@ -25,6 +25,7 @@ def of(job: Job) -> str:
     described = job.model_dump(mode="json", exclude={"sequences", "card"})
     described["anatomy"]["mesh"] = _digest(job.anatomy.mesh)
     described["appearance"]["photo"] = _digest(job.appearance.photo)
+    described["render"]["calibration"] = _digest(job.render.calibration)
     return hashlib.blake2b(canonical(described), digest_size=16).hexdigest()
 
 

@@ -3,59 +3,27 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
-from pydantic import (
-    AfterValidator,
-    BaseModel,
-    BeforeValidator,
-    ConfigDict,
-    Field,
-    FiniteFloat,
-    model_validator,
-)
+from pydantic import AfterValidator, Field, FiniteFloat, model_validator
 
 from synth import fields
 from synth.fem.validity import LARGEST_LOAD, choose
 from synth.flow.estimator import names
-
-
-def _pair(value: Any) -> Any:
-    """A single number stands for the range that holds only it."""
-    return (value, value) if isinstance(value, (int, float)) and not isinstance(value, bool) else value
-
-
-def _ordered(value: tuple[float, float]) -> tuple[float, float]:
-    if value[0] > value[1]:
-        raise ValueError(f"the lower end {value[0]:g} is above the upper end {value[1]:g}")
-    return value
-
-
-Positive = Annotated[FiniteFloat, Field(gt=0)]
-NonNegative = Annotated[FiniteFloat, Field(ge=0)]
-Range = Annotated[tuple[FiniteFloat, FiniteFloat], BeforeValidator(_pair), AfterValidator(_ordered)]
-PositiveRange = Annotated[tuple[Positive, Positive], BeforeValidator(_pair), AfterValidator(_ordered)]
-NonNegativeRange = Annotated[
-    tuple[NonNegative, NonNegative], BeforeValidator(_pair), AfterValidator(_ordered)
-]
-_Instruments = Annotated[int, Field(ge=1, le=3)]
-InstrumentRange = Annotated[
-    tuple[_Instruments, _Instruments], BeforeValidator(_pair), AfterValidator(_ordered)
-]
-Share = Annotated[FiniteFloat, Field(ge=0, le=1)]
-ShareRange = Annotated[tuple[Share, Share], BeforeValidator(_pair), AfterValidator(_ordered)]
-_Tilt = Annotated[FiniteFloat, Field(ge=0, le=40)]
-LightTilt = Annotated[tuple[_Tilt, _Tilt], BeforeValidator(_pair), AfterValidator(_ordered)]
-_Kelvin = Annotated[FiniteFloat, Field(ge=2000, le=12_000)]
-LightKelvin = Annotated[tuple[_Kelvin, _Kelvin], BeforeValidator(_pair), AfterValidator(_ordered)]
-Vector = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
-Distortion = tuple[FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat]
-
-
-class Section(BaseModel):
-    """One block of the job file. Unknown keys are errors; text under a field is its documentation."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True, allow_inf_nan=False)
+from synth.microscope import Light as Light
+from synth.microscope import Render as Render
+from synth.microscope import Sensor as Sensor
+from synth.section import (
+    InstrumentRange,
+    NonNegative,
+    NonNegativeRange,
+    Positive,
+    PositiveRange,
+    Section,
+    Share,
+    ShareRange,
+    Vector,
+)
 
 
 class Craniotomy(Section):
@@ -144,40 +112,6 @@ class Appearance(Section):
     """Blood on the rim, from none (0) to soaked (1). Empty: as the family has it."""
 
 
-class Light(Section):
-    """The microscope's lamps."""
-
-    glare: ShareRange = (0.0, 0.3)
-    """Wet highlights: 0 the few sparks of a well placed lamp, 1 up to a third of the tissue outshone."""
-    tilt_deg: LightTilt | None = None
-    """Angle between main lamp and optical axis, 0-40, to any side. Empty: the lamp is where `glare` asks."""
-    main: ShareRange = (0.5, 0.68)
-    """Share of light from the main lamp; the rest comes from two beside it, which stand for a ring."""
-    power: PositiveRange = (0.95, 1.1)
-    """Illumination, against one that just fills the sensor with white."""
-    kelvin: LightKelvin = (4200.0, 5600.0)
-    """Colour temperature [K], 2000-12000."""
-    even: PositiveRange = (0.35, 0.5)
-    """Radius of the evenly lit spot, in widths of the field; beyond it the light falls off."""
-    drift: ShareRange = (0.0, 0.03)
-    """Largest change of power over the sequence, as a share of it."""
-
-
-class Sensor(Section):
-    """The camera's chip and what its video processor makes of it."""
-
-    exposure: PositiveRange = (0.98, 1.12)
-    """Share of full scale that a white surface at the craniotomy fills."""
-    full_well: PositiveRange = (8_000.0, 20_000.0)
-    """Photoelectrons at full scale: photon noise is the root of what is counted."""
-    read_noise: NonNegativeRange = (8.0, 14.0)
-    """Noise of the readout, standard deviation [electrons]."""
-    contrast: ShareRange = (0.25, 0.55)
-    """Tone curve: weight of an S over plain sRGB."""
-    sharpening: NonNegativeRange = (0.15, 0.4)
-    """Unsharp mask, as a share of the detail."""
-
-
 class Fem(Section):
     """The physics of the tissue and of the load."""
 
@@ -252,37 +186,6 @@ class Fem(Section):
         if self.force_mn is None:
             return self.load[1]
         return self.force_mn[1] / (self.young_kpa[0] * self.footprint_mm[0] ** 2)
-
-
-class Render(Section):
-    """The microscope and its picture."""
-
-    size: tuple[Annotated[int, Field(ge=16, le=4096)], Annotated[int, Field(ge=16, le=4096)]] = (640, 480)
-    """Width, height of the picture [px]."""
-    spp: Annotated[int, Field(ge=1, le=4096)] = 4
-    """Light paths a pixel. Flow stops improving at 4-8."""
-    variant: Literal["auto", "llvm_ad_rgb", "scalar_rgb", "cuda_ad_rgb"] = "auto"
-    """Mitsuba variant; auto takes the fastest that works here."""
-    field_mm: PositiveRange = (32.0, 38.0)
-    """Width of the field of view at the craniotomy [mm]."""
-    working_distance_mm: PositiveRange = (280.0, 320.0)
-    """Distance from the front lens to the craniotomy [mm]."""
-    tilt_deg: NonNegativeRange = (0.0, 20.0)
-    """Angle between the optical axis and the craniotomy's normal."""
-    aperture_mm: NonNegative = 4.0
-    """Radius of the lens aperture [mm]; 0 is a pinhole."""
-    distortion: tuple[FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat] = (
-        -0.05,
-        0.01,
-        0.0,
-        0.0,
-        0.0,
-    )
-    """Brown-Conrady k1, k2, p1, p2, k3."""
-    exr: bool = False
-    """Also write the linear radiance of every frame as EXR."""
-    tool: bool = True
-    """Show the instrument."""
 
 
 def _estimator(name: str) -> str:
@@ -380,6 +283,13 @@ class Job(Section):
     store: Store = Store()
     labels: Labels = Labels()
     card: Card = Card()
+
+    @model_validator(mode="after")
+    def _second_lens_exists(self) -> Job:
+        asked = [name for name in self.store.extra if name.endswith("_right")]
+        if asked and self.render.stereo_mm == 0:
+            raise ValueError(f"store.extra: {asked[0]} needs a second lens; set render.stereo_mm")
+        return self
 
     @property
     def kept_fields(self) -> tuple[str, ...]:

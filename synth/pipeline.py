@@ -11,15 +11,17 @@ from synth import brain, identity, scenario
 from synth.fem import mesh, solver, tool
 from synth.fem.mesh import Tets
 from synth.fem.solver import Deformation
+from synth.fields import FIELDS
 from synth.flow import mask, track
 from synth.job import Job
 from synth.published import Published
-from synth.render import anatomy, camera
+from synth.render import anatomy, camera, video
 from synth.render.anatomy import Surface
 from synth.render.scene import Studio
 from synth.scenario import Scenario
 from synth.stopwatch import Stopwatch
 from synth.store import Writer
+from synth.timeline import Timeline
 
 # Fields that the renderer gives by frame; those of `store.extra` are attributes of its `Shot` as well, but
 # for the published method's.
@@ -70,27 +72,46 @@ def render_sequence(job: Job, index: int, folder: Path, report: Report) -> Path:
     labels = None
     if set(_PUBLISHED) & set(job.store.extra):
         labels = Published.begin(job.labels, still.tissue, job.frames, scenario.label_rng(job, index))
+    coded = job.sensor.bitrate_mbps is not None  # a codec sees the whole film at once
+    film = Timeline(motion, view, case.sway, case.look.light, job.fps)
     rgb = np.empty((job.frames, height, width, 3), np.uint8)
-    blocked = np.empty((job.frames, height, width), bool)
+    rgb_right = np.empty_like(rgb) if writer.wants("rgb_right") else None
+    tools = np.empty((job.frames, height, width), bool)
+    poses = np.tile(np.eye(4), (job.frames, 1, 1))
     for t, seed in enumerate(scenario.frame_seeds(job, index)):
         report("render", t, job.frames)
         with watch.stage("render"):
-            shot = studio.frame(motion.rest + motion.displacement[t], motion.tip[t], motion.shaft[t], seed)
+            now = film.at(t)
+            lit = film.open(t, job.sensor.shutter, job.sensor.subframes)
+            shot = studio.shoot(now, seed, lit, film.at(t + 1))
             traction = studio.traction(motion.traction[t])
         with watch.stage("store"):
             made = labels.frame(t, shot.flow, traction, motion.force[t]) if labels else {}
             for name in (*_SHOT, *job.store.extra):
-                writer.put_frame(name, t, made[name] if name in made else getattr(shot, name))
+                if FIELDS[name].framed and not (coded and name.startswith("rgb")):
+                    writer.put_frame(name, t, made[name] if name in made else getattr(shot, name))
             writer.put_frame("traction", t, traction)
             if job.render.exr:
                 writer.put_exr(t, shot.radiance)
-        rgb[t] = shot.rgb
-        # What a real pipeline has: the tool's outline, and glare as the picture shows it.
-        blocked[t] = shot.tool | mask.glare(shot.rgb)
+        rgb[t], tools[t] = shot.rgb, shot.tool
+        if rgb_right is not None and shot.rgb_right is not None:
+            rgb_right[t] = shot.rgb_right
+        lens = now.camera or view
+        poses[t, :3, :3], poses[t, :3, 3] = lens.rotation, lens.translation
+
+    with watch.stage("store"):
+        writer.put("camera", poses)
+        if coded:
+            rgb = video.recorded(rgb, job.sensor, job.fps)
+            writer.put("rgb", rgb)
+            if rgb_right is not None:
+                writer.put("rgb_right", video.recorded(rgb_right, job.sensor, job.fps))
 
     if job.flow.backend != "ideal":
         report("flow", 0, job.frames)
         with watch.stage("flow"):
+            # What a real pipeline has: the tool's outline, and glare as the picture shows it.
+            blocked = tools | np.stack([mask.glare(picture) for picture in rgb])
             recovered = track.track(job.flow.backend, rgb, blocked, still.tissue)
         with watch.stage("store"):
             for t in range(job.frames):

@@ -14,10 +14,11 @@ from synth.job import Job
 from synth.render.anatomy import Relief
 from synth.render.camera import View
 from synth.render.scene import Look
+from synth.render.sway import Sway
 
 # First element of the spawn key: anatomies are shared between sequences, everything else is not.
 _ANATOMY, _SEQUENCE = 0, 1
-_TISSUE, _GESTURE, _LOOK, _VIEW, _NOISE, _FURTHER, _LABELS = range(7)
+_TISSUE, _GESTURE, _LOOK, _VIEW, _NOISE, _FURTHER, _LABELS, _SWAY = range(8)
 
 
 @dataclass(frozen=True)
@@ -39,6 +40,7 @@ class Scenario:
     """What the other instruments do at the same time."""
     look: Look
     view: View
+    sway: Sway
 
     @property
     def gestures(self) -> tuple[Gesture, ...]:
@@ -66,6 +68,7 @@ def draw(job: Job, index: int) -> Scenario:
         further=crew.further(gesture, job.fem, opening, tissue, _generator(job, _SEQUENCE, index, _FURTHER)),
         look=Look.draw(job, family, _generator(job, _SEQUENCE, index, _LOOK)),
         view=View.draw(job.render, _generator(job, _SEQUENCE, index, _VIEW)),
+        sway=Sway.draw(job.render, _generator(job, _SEQUENCE, index, _SWAY)),
     )
 
 

@@ -6,13 +6,14 @@ of the top-left pixel at (0, 0). D. C. Brown, "Close-range camera calibration", 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
 from synth.errors import UserError
 from synth.job import Render
+from synth.render import calibration
 
 Floats = npt.NDArray[np.float64]
 
@@ -34,6 +35,8 @@ class View:
     """Turn of the picture about the optical axis."""
     focus_mm: float
     """Distance of the plane in focus beyond the craniotomy's centre."""
+    off_centre: tuple[float, float]
+    """Principal point from the middle of the picture, in its widths; x, y."""
 
     @classmethod
     def draw(cls, render: Render, rng: np.random.Generator) -> View:
@@ -44,6 +47,7 @@ class View:
             azimuth_deg=float(rng.uniform(0.0, 360.0)),
             roll_deg=float(rng.uniform(0.0, 360.0)),
             focus_mm=float(rng.uniform(-0.5, 0.5)),
+            off_centre=_aside(render, rng),
         )
 
 
@@ -88,17 +92,38 @@ def place(view: View, render: Render) -> Camera:
     frame = np.stack([right, -up, -backward])
     c, s = np.cos(roll), np.sin(roll)
     rotation = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ frame
-    focal = width * view.working_distance_mm / view.field_mm
+    if render.calibration is None:
+        focal = width * view.working_distance_mm / view.field_mm
+        x, y = (np.array([width, height]) - 1) / 2 + width * np.asarray(view.off_centre)
+        K = np.array([[focal, 0.0, x], [0.0, focal, y], [0.0, 0.0, 1.0]])
+        distortion = np.asarray(render.distortion, np.float64)
+    else:
+        known = calibration.read(render.calibration)
+        K, distortion = known.fitted(render.size), known.distortion
     return Camera(
-        K=np.array([[focal, 0.0, (width - 1) / 2], [0.0, focal, (height - 1) / 2], [0.0, 0.0, 1.0]]),
-        distortion=np.asarray(render.distortion, np.float64),
+        K=K,
+        distortion=distortion,
         rotation=rotation,
         translation=np.array([0.0, 0.0, view.working_distance_mm]),
         size=(width, height),
         aperture_mm=render.aperture_mm,
         focus_mm=view.working_distance_mm + view.focus_mm,
-        mm_per_px=view.working_distance_mm / focal,
+        mm_per_px=float(view.working_distance_mm / K[0, 0]),
     )
+
+
+def beside(camera: Camera, baseline_mm: float) -> Camera:
+    """The second lens of a stereo pair, to the right; its picture is shifted to show the same field."""
+    K = camera.K.copy()
+    K[0, 2] += K[0, 0] * baseline_mm / camera.translation[2]
+    return replace(camera, K=K, translation=camera.translation - np.array([baseline_mm, 0.0, 0.0]))
+
+
+def blur_radius(camera: Camera, depth: npt.NDArray[np.floating]) -> npt.NDArray[np.float32]:
+    """Radius of the circle of confusion [px] of points at depths (...) mm; 0 where depth is 0."""
+    away = np.maximum(depth, 1e-9)
+    radius = camera.K[0, 0] * camera.aperture_mm * np.abs(1 / away - 1 / camera.focus_mm)
+    return np.where(depth > 0, radius, 0.0).astype(np.float32)
 
 
 def to_camera(camera: Camera, points: Floats) -> Floats:
@@ -157,6 +182,11 @@ def undistort(flat: Floats, distortion: Floats) -> Floats:
     if not np.abs(_distort(guess, distortion) - flat).max() < 1e-9:
         raise UserError("render.distortion: this distortion folds the picture over itself")
     return guess
+
+
+def _aside(render: Render, rng: np.random.Generator) -> tuple[float, float]:
+    length, angle = rng.uniform(*render.off_centre), rng.uniform(0, 2 * np.pi)
+    return float(length * np.cos(angle)), float(length * np.sin(angle))
 
 
 def _distort(flat: Floats, distortion: Floats) -> Floats:

@@ -166,9 +166,11 @@ class Stage:
         flat = glow.astype(np.float32).ravel()
         self._parameters[f"{name}.vertex_glow"] = self._mi.Float(flat) if self._jit else flat
 
-    def render(self, seed: int) -> Map:
-        """Linear radiance (H, W, 3) float32 of the stage as it stands."""
+    def render(self, seed: int, camera: Camera | None = None) -> Map:
+        """Linear radiance (H, W, 3) float32 of the stage as it stands, from a camera with the same lens."""
         self._parameters.update()
+        if camera is not None:
+            self._lens.place(camera)
         lens = self._lens
         image = self._mi.render(self._scene, sensor=lens.sensor, spp=lens.spp, seed=seed)
         return lens.develop(np.array(image, dtype=np.float32)[..., :3])

@@ -29,6 +29,11 @@ class Compiled:
         _register(mi.variant())
         self.spp = spp
         self.sensor = mi.load_dict(_plugin(camera, spp, sampler))
+        self.place(camera)
+
+    def place(self, camera: Camera) -> None:
+        """Puts the lens where the camera is."""
+        self.sensor.place(camera)
 
     def develop(self, image: Map) -> Map:
         """The film is the picture."""
@@ -39,10 +44,15 @@ class Scalar:
     """Mitsuba's thin lens on a larger, finer film, and the warp to the recorded picture."""
 
     def __init__(self, camera: Camera, spp: int, sampler: str) -> None:
-        import mitsuba as mi
-
         self._fine = 2 if spp >= 4 else 1
         self.spp = max(1, spp // self._fine**2)
+        self._sampler = sampler
+        self._fit(camera)
+        self.place(camera)
+
+    def _fit(self, camera: Camera) -> None:
+        """The larger film, and where the picture's pixels lie on it."""
+        self._K = camera.K
         width, height = camera.size
         fx, fy = camera.K[0, 0], camera.K[1, 1]
         # The middle of each fine pixel, and where it lies on a film whose principal point is its middle.
@@ -55,6 +65,15 @@ class Scalar:
         half = np.ceil(np.abs(at).max(axis=(0, 1))).astype(int) + 1
         self._at = (at + half - 0.5).astype(np.float32)
         film_width, film_height = (2 * half).tolist()
+        self._width, self._height = film_width, film_height
+        self._fov = float(np.rad2deg(2 * np.arctan(film_width / (2 * fx * self._fine))))
+
+    def place(self, camera: Camera) -> None:
+        """Puts the lens where the camera is."""
+        import mitsuba as mi
+
+        if not np.array_equal(camera.K, self._K):
+            self._fit(camera)
         to_world = np.eye(4)
         # Mitsuba's cameras have x to the left and y up.
         to_world[:3, :3] = (camera.rotation * np.array([[-1.0], [-1.0], [1.0]])).T
@@ -62,13 +81,13 @@ class Scalar:
         self.sensor = mi.load_dict(
             {
                 "type": "thinlens" if camera.aperture_mm > 0 else "perspective",
-                "fov": float(np.rad2deg(2 * np.arctan(film_width / (2 * fx * self._fine)))),
+                "fov": self._fov,
                 "fov_axis": "x",
                 "near_clip": 1.0,
                 "far_clip": 1e4,
                 "to_world": mi.ScalarTransform4f(to_world.tolist()),
-                "film": _film(film_width, film_height),
-                "sampler": {"type": sampler, "sample_count": self.spp},
+                "film": _film(self._width, self._height),
+                "sampler": {"type": self._sampler, "sample_count": self.spp},
                 **(
                     {"aperture_radius": camera.aperture_mm, "focus_distance": camera.focus_mm}
                     if camera.aperture_mm > 0
@@ -93,14 +112,9 @@ def _plugin(camera: Camera, spp: int, sampler: str) -> dict[str, Any]:
         "aperture": camera.aperture_mm,
         "focus": camera.focus_mm,
     }
-    for row in range(3):
-        for column in range(3):
-            lens[f"r{row}{column}"] = float(camera.rotation[row, column])
-        lens[f"c{row}"] = float(camera.centre[row])
     for name, value in zip(("k1", "k2", "p1", "p2", "k3"), camera.distortion, strict=True):
         lens[name] = float(value)
     lens |= {"fx": float(camera.K[0, 0]), "fy": float(camera.K[1, 1])}
-    lens |= {"cx": float(camera.K[0, 2]), "cy": float(camera.K[1, 2])}
     return lens
 
 
@@ -127,19 +141,28 @@ def _register(variant: str) -> None:
 
         def __init__(self, props: Any) -> None:
             super().__init__(props)
-            self.v = {name: props[name] for name in ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")}
+            self.v = {name: props[name] for name in ("fx", "fy", "k1", "k2", "p1", "p2", "k3")}
             self.aperture, self.focus = props["aperture"], props["focus"]
-            self.rows = [mi.ScalarVector3f(*(props[f"r{row}{c}"] for c in range(3))) for row in range(3)]
-            self.centre = mi.ScalarPoint3f(*(props[f"c{row}"] for row in range(3)))
             size = self.film().size()
             self.width, self.height = int(size[0]), int(size[1])
+
+        def place(self, camera: Camera) -> None:
+            """Pose and principal point, as data: a number written into the code would compile it anew."""
+
+            def data(values: Any) -> list[Any]:
+                return [dr.opaque(mi.Float, float(value)) for value in values]
+
+            self.rows = [mi.Vector3f(*data(row)) for row in camera.rotation]
+            self.centre = mi.Point3f(*data(camera.centre))
+            self.middle = data(camera.K[:2, 2])
+            self.around = mi.ScalarPoint3f(*camera.centre.tolist())
 
         def sample_ray(
             self, time: Any, wavelength: Any, position: Any, aperture: Any, active: Any = True
         ) -> tuple[Any, Any]:
             v = self.v
-            goal_x = (position.x * self.width - 0.5 - v["cx"]) / v["fx"]
-            goal_y = (position.y * self.height - 0.5 - v["cy"]) / v["fy"]
+            goal_x = (position.x * self.width - 0.5 - self.middle[0]) / v["fx"]
+            goal_y = (position.y * self.height - 0.5 - self.middle[1]) / v["fy"]
             x, y = goal_x, goal_y
             for _ in range(6):  # each round gains a factor of the distortion itself
                 r2 = x * x + y * y
@@ -162,7 +185,7 @@ def _register(variant: str) -> None:
 
         def bbox(self) -> Any:
             box = mi.ScalarBoundingBox3f()
-            box.expand(self.centre)
+            box.expand(self.around)
             return box
 
         def to_string(self) -> str:

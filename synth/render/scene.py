@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -11,13 +12,13 @@ import numpy.typing as npt
 from synth.job import Job
 from synth.render import instrument, light, noise, reflection, rim, sensor, texture, truth
 from synth.render.anatomy import Surface
-from synth.render.camera import Camera
+from synth.render.camera import Camera, beside, blur_radius
 from synth.render.look import Look
 from synth.render.mitsuba_adapter import Body, Metal, Stage, pick
 from synth.render.shape import Shape, normals
 from synth.render.truth import Still
 
-__all__ = ["Look", "Shot", "Still", "Studio"]
+__all__ = ["Look", "Moment", "Shot", "Still", "Studio"]
 
 Floats = npt.NDArray[np.float64]
 Map = npt.NDArray[np.float32]
@@ -28,8 +29,24 @@ _GLARE = 0.35  # specular radiance, as a share of full scale, that hides what is
 
 
 @dataclass(frozen=True)
+class Moment:
+    """Where everything is at one time."""
+
+    vertices: Floats
+    """(V, 3) mm, the surface."""
+    tips: Floats
+    """(2n, 3) mm, two for each of n instruments: where its tines end."""
+    shafts: Floats
+    """(2n, 3) unit vectors from tip to hand."""
+    camera: Camera | None = None
+    """The microscope, if it is not where it was at rest; with the same lens."""
+    power: float = 1.0
+    """Of the lamps, against the rest frame's."""
+
+
+@dataclass(frozen=True)
 class Shot:
-    """One frame and its truth."""
+    """One frame and its truth. What the job does not ask for (`store.extra`) is None."""
 
     rgb: npt.NDArray[np.uint8]
     """(H, W, 3) sRGB."""
@@ -45,6 +62,16 @@ class Shot:
     """(H, W) this frame's pixels."""
     glare: Mask
     """(H, W) this frame's pixels: a highlight outshines the tissue."""
+    flow_next: Map | None = None
+    """(H, W, 2) px from this frame to the next, at this frame's pixels; 0 off the tissue."""
+    normals: Map | None = None
+    """(H, W, 3) camera axes, this frame's pixels; 0 where there is nothing."""
+    blur: Map | None = None
+    """(H, W) px: radius of the circle of confusion, this frame's pixels."""
+    rgb_right: npt.NDArray[np.uint8] | None = None
+    flow_right: Map | None = None
+    visible_right: Mask | None = None
+    depth_right: Map | None = None
 
 
 class Studio:
@@ -53,7 +80,7 @@ class Studio:
     Args:
         surface: the cortex at rest.
         look: its appearance.
-        camera: the microscope.
+        camera: the microscope at rest.
         job: render settings, opening and photograph.
         gestures: kind of each instrument's gesture; an instrument that suits it is shown.
 
@@ -66,7 +93,7 @@ class Studio:
     ) -> None:
         self.variant = pick(job.render.variant)
         self.surface, self.camera = surface, camera
-        self._look, self._render = look, job.render
+        self._look, self._render, self._extra = look, job.render, job.store.extra
         self.rim = rim.build(surface, job.anatomy.craniotomy.radius_mm, look)
         self._coat = texture.cortex(
             surface,
@@ -75,39 +102,62 @@ class Studio:
             job.appearance.photo,
             rim.shade(self.rim, surface.extent_mm),
         )
-        self.still = truth.still(camera, Shape(surface.vertices, surface.faces), self.rim.shape)
+        rest = Shape(surface.vertices, surface.faces)
+        self.still = truth.still(camera, rest, self.rim.shape)
+        self._right: Still | None = None
+        if any(name.endswith("_right") for name in self._extra):
+            self._right = truth.still(beside(camera, job.render.stereo_mm), rest, self.rim.shape)
         self.lamps = light.lamps(camera, look.light)
         kinds = instrument.choose(gestures, np.random.default_rng([look.rim_seed, 2]))
         self._tool = instrument.build(kinds) if job.render.tool else None
         self._stage: Stage | None = None
 
     def frame(self, vertices: Floats, tips: Floats, shafts: Floats, seed: int) -> Shot:
+        """Picture and truth of one frame with the microscope at rest; arguments as in `Moment`."""
+        return self.shoot(Moment(vertices, tips, shafts), seed)
+
+    def shoot(
+        self, now: Moment, seed: int, shutter: Sequence[Moment] = (), after: Moment | None = None
+    ) -> Shot:
         """Picture and truth of one frame.
 
         Args:
-            vertices: (V, 3) mm, the surface in this frame.
-            tips: (2n, 3) mm, two for each of n instruments: where its tines end.
-            shafts: (2n, 3) unit vectors from tip to hand.
+            now: the frame's time, which its truth is of.
             seed: of light paths and sensor noise.
+            shutter: times while the shutter is open, whose light adds up in the picture; `now` if none.
+            after: the next frame's time, for the flow to it.
         """
-        camera, surface = self.camera, self.surface
-        tool = instrument.pose(self._tool, tips, shafts) if self._tool else np.zeros((0, 3))
-        radiance = self._expose(vertices, tool, seed)
-        now = truth.now(
-            camera,
-            self.still,
-            Shape(vertices, surface.faces),
-            self.rim.shape,
-            Shape(tool, self._tool.faces) if self._tool else None,
-        )
+        camera = now.camera or self.camera
+        tool = self._posed(now)
+        moments = shutter or (now,)
+        radiance = self._gathered(moments, seed, 0.0)
+        shapes = (Shape(now.vertices, self.surface.faces), self.rim.shape, tool)
+        seen = truth.now(camera, self.still, *shapes)
+        extra: dict[str, Any] = {}
+        if "flow_next" in self._extra:
+            there = after or now
+            extra["flow_next"] = truth.onwards(
+                seen.hits, self.surface.faces, there.vertices, there.camera or self.camera
+            )
+        if "normals" in self._extra:
+            extra["normals"] = truth.facing(camera, seen.hits, shapes)
+        if "blur" in self._extra:
+            extra["blur"] = blur_radius(camera, seen.depth)
+        if self._right is not None:
+            baseline = self._render.stereo_mm
+            other = truth.now(beside(camera, baseline), self._right, *shapes)
+            picture = self.develop(self._gathered(moments, seed + 1, baseline), seed + 1)
+            extra |= {"rgb_right": picture, "flow_right": other.flow}
+            extra |= {"visible_right": other.visible, "depth_right": other.depth}
         return Shot(
             rgb=self.develop(radiance, seed),
             radiance=radiance,
-            flow=now.flow,
-            visible=now.visible,
-            depth=now.depth,
-            tool=now.tool,
-            glare=self._glare(radiance, now, vertices),
+            flow=seen.flow,
+            visible=seen.visible,
+            depth=seen.depth,
+            tool=seen.tool,
+            glare=self._glare(radiance, seen, now),
+            **extra,
         )
 
     def traction(self, nodal: Floats) -> Map:
@@ -137,15 +187,32 @@ class Studio:
         """The recorded picture (H, W, 3) of a radiance (H, W, 3)."""
         return sensor.record(radiance, self._look.sensor, np.random.default_rng([seed, 1]))
 
-    def _expose(self, vertices: Floats, tool: Floats, seed: int) -> Map:
+    def _posed(self, now: Moment) -> Shape | None:
+        if self._tool is None:
+            return None
+        return Shape(instrument.pose(self._tool, now.tips, now.shafts), self._tool.faces)
+
+    def _gathered(self, moments: Sequence[Moment], seed: int, baseline: float) -> Map:
+        """Mean light of some moments in the lens, or in one `baseline` mm to its right."""
+        pictures = []
+        for k, moment in enumerate(moments):
+            camera = moment.camera or self.camera
+            if baseline:
+                camera = beside(camera, baseline)
+            pictures.append(np.float32(moment.power) * self._expose(moment, camera, seed + 7919 * k))
+        return np.asarray(np.mean(pictures, axis=0), np.float32)
+
+    def _expose(self, moment: Moment, camera: Camera, seed: int) -> Map:
+        tool = self._posed(moment)
         if self._stage is None:
-            self._stage = self.stage(vertices, tool, self._render.spp)
+            points = np.zeros((0, 3)) if tool is None else tool.vertices
+            self._stage = self.stage(moment.vertices, points, self._render.spp)
         else:
-            self._stage.move("cortex", vertices)
-            if self._tool:
-                self._stage.move("tool", tool)
-                self._stage.mirror("tool", self._mirrored(tool))
-        return self._stage.render(seed)
+            self._stage.move("cortex", moment.vertices)
+            if tool:
+                self._stage.move("tool", tool.vertices)
+                self._stage.mirror("tool", self._mirrored(tool.vertices))
+        return self._stage.render(seed % 2**32, camera)
 
     def bodies(self, vertices: Floats, tool: Floats) -> dict[str, Body]:
         """Everything in the scene with its material; vertices (V, 3) and (T, 3) mm as given."""
@@ -174,7 +241,7 @@ class Studio:
         assert self._tool is not None
         return reflection.glow(Shape(tool, self._tool.faces), self.camera.centre, self._look.rim_seed)
 
-    def _glare(self, radiance: Map, now: truth.Now, vertices: Floats) -> Mask:
+    def _glare(self, radiance: Map, now: truth.Now, moment: Moment) -> Mask:
         """Tissue whose radiance exceeds what its diffuse part could send."""
         height, width = radiance.shape[:2]
         faces = self.surface.faces
@@ -183,7 +250,7 @@ class Studio:
         bary = now.hits.bary[on]
         uv = np.einsum("nk,nkc->nc", bary, self.surface.uv[corners].astype(np.float64))
         albedo = noise.sample(self._coat.albedo, uv - 0.5, 1.0)
-        light_in = np.einsum("nk,nkc->nc", bary, self._irradiance(vertices)[corners])
+        light_in = np.einsum("nk,nkc->nc", bary, moment.power * self._irradiance(moment.vertices)[corners])
         diffuse = (albedo * light_in).mean(axis=1)
         excess = radiance.reshape(-1, 3)[on].mean(axis=1) - 1.05 * diffuse
         glare = np.zeros(height * width, bool)

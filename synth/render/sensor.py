@@ -35,6 +35,10 @@ class Sensor:
     """Weight of the tone curve's S over a straight line."""
     sharpening: float = 0.3
     """Unsharp mask of the video processor, as a share of the detail."""
+    bayer: bool = False
+    """One colour a pixel (RGGB)."""
+    chroma: str = "4:4:4"
+    """Colour resolution of the video: 4:4:4, 4:2:2 or 4:2:0."""
 
     @classmethod
     def draw(cls, section: job.Sensor, white: tuple[float, float, float], rng: np.random.Generator) -> Sensor:
@@ -46,6 +50,9 @@ class Sensor:
             read_noise=float(rng.uniform(*section.read_noise)),
             contrast=float(rng.uniform(*section.contrast)),
             sharpening=float(rng.uniform(*section.sharpening)),
+            bayer=section.bayer,
+            # A codec thins the colours out itself.
+            chroma=section.chroma if section.bitrate_mbps is None else "4:4:4",
         )
 
 
@@ -69,9 +76,35 @@ def record(radiance: Map, sensor: Sensor, rng: np.random.Generator) -> npt.NDArr
     steps = np.float32(2**sensor.bits - 1)
     digital = np.rint(np.clip(electrons / np.float32(sensor.full_well), 0, 1) * steps) / steps
     balanced = np.clip(digital * np.asarray(sensor.white, np.float32), 0, 1)
+    if sensor.bayer:
+        balanced = _demosaiced(balanced)
     video = _tone(balanced, sensor.contrast)
     video = _sharpen(video, sensor.sharpening)
+    video = _thinned(np.clip(video, 0, 1), sensor.chroma)
     return np.rint(np.clip(video, 0, 1) * 255).astype(np.uint8)
+
+
+def _demosaiced(balanced: Map) -> Map:
+    """What is left of a picture when each pixel measures one colour, and the others are interpolated."""
+    mosaic = balanced[..., 1].copy()
+    mosaic[::2, ::2] = balanced[::2, ::2, 0]
+    mosaic[1::2, 1::2] = balanced[1::2, 1::2, 2]
+    raw = np.rint(mosaic * 65535).astype(np.uint16)
+    # OpenCV names a pattern by its second row's second and third pixel: this one is red first.
+    return np.asarray(cv2.cvtColor(raw, cv2.COLOR_BayerBG2RGB_EA), np.float32) / np.float32(65535)
+
+
+def _thinned(video: Map, chroma: str) -> Map:
+    """Colour at half the resolution across, or across and down."""
+    if chroma == "4:4:4":
+        return video
+    height, width = video.shape[:2]
+    small = ((width + 1) // 2, height if chroma == "4:2:2" else (height + 1) // 2)
+    parts = cv2.cvtColor(np.ascontiguousarray(video, np.float32), cv2.COLOR_RGB2YCrCb)
+    for channel in (1, 2):
+        coarse = cv2.resize(parts[..., channel], small, interpolation=cv2.INTER_AREA)
+        parts[..., channel] = cv2.resize(coarse, (width, height), interpolation=cv2.INTER_LINEAR)
+    return np.asarray(cv2.cvtColor(parts, cv2.COLOR_YCrCb2RGB), np.float32)
 
 
 def _falloff(shape: tuple[int, int], vignette: float) -> Map:

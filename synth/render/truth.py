@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from synth.render import camera as cameras
 from synth.render.camera import Camera
-from synth.render.shape import Shape
+from synth.render.shape import Shape, normals
 
 Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int32]
@@ -153,6 +153,37 @@ def now(camera: Camera, rest: Still, surface: Shape, rim: Shape, tool: Shape | N
         tool=(hits.face >= len(surface.faces) + len(rim.faces)).reshape(height, width),
         hits=hits,
     )
+
+
+def onwards(hits: Hits, faces: Indices, vertices: Floats, camera: Camera) -> npt.NDArray[np.float32]:
+    """Flow (H, W, 2) px of what each pixel of one frame sees to another frame; 0 off the tissue.
+
+    Args:
+        hits: of the first frame's pixels, the surface's faces first.
+        faces: of the surface.
+        vertices: (V, 3) mm, the surface in the other frame.
+        camera: of the other frame.
+    """
+    width, height = camera.size
+    on = (hits.face >= 0) & (hits.face < len(faces))
+    points = np.einsum("nk,nkc->nc", hits.bary[on], vertices[faces[hits.face[on]]])
+    flow = np.zeros((len(on), 2), np.float32)
+    flow[on] = cameras.project(camera, points) - cameras.pixel_grid(camera.size)[on]
+    return flow.reshape(height, width, 2)
+
+
+def facing(camera: Camera, hits: Hits, shapes: Sequence[Shape | None]) -> npt.NDArray[np.float32]:
+    """Smoothed unit normals (H, W, 3), camera axes, of what each pixel sees; 0 where there is nothing."""
+    width, height = camera.size
+    there = [shape for shape in shapes if shape is not None]
+    first = np.cumsum([0] + [len(shape.vertices) for shape in there])
+    faces = np.concatenate([shape.faces + at for shape, at in zip(there, first, strict=False)])
+    vertex = np.concatenate([normals(shape) for shape in there]) @ camera.rotation.T
+    on = hits.face >= 0
+    smooth = np.einsum("nk,nkc->nc", hits.bary[on], vertex[faces[hits.face[on]]])
+    found = np.zeros((len(on), 3), np.float32)
+    found[on] = smooth / np.maximum(np.linalg.norm(smooth, axis=1, keepdims=True), 1e-12)
+    return found.reshape(height, width, 3)
 
 
 def at_rest_pixels(rest: Still, faces: Indices, nodal: Floats) -> npt.NDArray[np.float32]:

@@ -2,28 +2,33 @@
 
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from synth import llvm
 from synth.errors import UserError
-from synth.job import Anatomy, Job, Render
+from synth.job import Anatomy, Job, Render, Store
 from synth.render import anatomy, camera
 from synth.render.anatomy import Relief
 from synth.render.camera import View
 from synth.render.look import Look
 from synth.render.mitsuba_adapter import cuda, pick
-from synth.render.scene import Studio
+from synth.render.scene import Moment, Studio
 
 VARIANTS = ["scalar_rgb", *(["llvm_ad_rgb"] if llvm.find() else []), *(["cuda_ad_rgb"] if cuda() else [])]
 TIPS = np.array([[-1.0, 1.0, 0.2], [1.2, 1.4, 0.2]])
 SHAFTS = np.array([[0.6, 0.3, 0.74], [0.6, 0.3, 0.74]])
 
 
-def studio(variant: str, spp: int = 4, **render: object) -> tuple[Studio, np.ndarray]:
+def studio(
+    variant: str, spp: int = 4, extra: tuple[str, ...] = (), **render: object
+) -> tuple[Studio, np.ndarray]:
     settings = {"size": (96, 72), "spp": spp, "variant": variant, **render}
-    job = Job(anatomy=Anatomy(vertices=2500), render=Render.model_validate(settings))
+    job = Job(
+        anatomy=Anatomy(vertices=2500), render=Render.model_validate(settings), store=Store(extra=extra)
+    )
     surface = anatomy.procedural(Relief.draw(job.anatomy, np.random.default_rng(4)), job.anatomy)
     view = View.draw(job.render, np.random.default_rng(4))
     look = Look.draw(job, "healthy", np.random.default_rng(4))
@@ -113,3 +118,66 @@ def test_without_llvm_the_scalar_variant_is_taken() -> None:
     environment = {"PATH": "/usr/bin:/bin", "SULCUS_LLVM": ""}
     done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
     assert done.stdout.strip() == "scalar_rgb"
+
+
+def test_a_moved_camera_and_weaker_light_are_in_picture_and_truth() -> None:
+    ours, vertices = studio("scalar_rgb" if len(VARIANTS) == 1 else VARIANTS[1], spp=16, tool=False)
+    pixel = ours.still.scale_mm_per_px
+    aside = replace(ours.camera, translation=ours.camera.translation + np.array([2 * pixel, 0, 0]))
+    rest = ours.shoot(Moment(vertices, TIPS, SHAFTS), 1)
+    moved = ours.shoot(Moment(vertices, TIPS, SHAFTS, aside, 0.5), 2)
+    inside = ours.still.tissue.copy()
+    inside[:, :8] = inside[:, -8:] = False
+    np.testing.assert_allclose(np.median(moved.flow[inside], axis=0), [2, 0], atol=0.05)
+    one, two = rest.radiance.mean(axis=2), np.roll(moved.radiance.mean(axis=2), -2, axis=1)
+    assert np.median(two[inside] / one[inside]) == pytest.approx(0.5, abs=0.03)
+    back = ours.shoot(Moment(vertices, TIPS, SHAFTS), 1)
+    assert (back.radiance == rest.radiance).all()
+
+
+def test_an_open_shutter_adds_up_light() -> None:
+    ours, vertices = studio(VARIANTS[-1], spp=4, tool=False)
+    moments = [Moment(vertices, TIPS, SHAFTS, None, power) for power in (0.5, 1.5)]
+    sharp = ours.shoot(Moment(vertices, TIPS, SHAFTS), 1)
+    both = ours.shoot(Moment(vertices, TIPS, SHAFTS), 1, moments)
+    assert both.radiance.mean() == pytest.approx(sharp.radiance.mean(), rel=0.01)
+    assert (both.flow == sharp.flow).all()
+
+
+def test_truth_on_request() -> None:
+    """Flow to the next frame chains with flow from rest; normals face the lens; a second lens has its own."""
+    extra = ("flow_next", "normals", "blur", "rgb_right", "flow_right", "visible_right", "depth_right")
+    ours, vertices = studio(VARIANTS[-1], spp=1, tool=False, extra=extra, stereo_mm=20.0)
+    push = np.exp(-(vertices[:, :2] ** 2).sum(axis=1) / 30)[:, None] * np.array([0.6, 0.2, 0.5])
+    moments = [Moment(vertices + k * push, TIPS, SHAFTS) for k in range(3)]
+    shots = [ours.shoot(moments[k], k, (), moments[min(k + 1, 2)]) for k in range(3)]
+    first, second = shots[0], shots[1]
+    assert first.flow_next is not None
+    assert second.flow_next is not None
+    assert first.normals is not None
+    # In the rest frame a pixel's point is the same for both.
+    np.testing.assert_allclose(first.flow_next, second.flow, atol=1e-4)
+    rows, columns = np.nonzero(ours.still.tissue & second.visible & shots[2].visible)
+    goal = np.stack([columns, rows], 1) + second.flow[rows, columns]
+    near = np.rint(goal).astype(int)
+    kept = np.abs(goal - near).max(axis=1) < 0.1
+    there = second.flow_next[near[kept, 1], near[kept, 0]]
+    both = second.flow[rows, columns][kept] + there
+    assert np.median(np.abs(both - shots[2].flow[rows, columns][kept])) < 0.02
+    assert first.normals[ours.still.tissue][:, 2].max() < 0
+    np.testing.assert_allclose(np.linalg.norm(first.normals[ours.still.tissue], axis=1), 1, atol=1e-5)
+    assert (shots[2].flow_next == 0).sum() > 0
+    assert first.depth_right is not None
+    assert first.rgb_right is not None
+    assert np.median(first.depth_right[ours.still.tissue]) == pytest.approx(
+        np.median(first.depth[ours.still.tissue]), rel=0.01
+    )
+    assert (first.rgb_right != first.rgb).any()
+
+
+def test_what_is_not_asked_for_is_not_made() -> None:
+    ours, vertices = studio(VARIANTS[-1], spp=1)
+    shot = ours.frame(vertices, TIPS, SHAFTS, 1)
+    assert shot.normals is None
+    assert shot.flow_next is None
+    assert shot.rgb_right is None

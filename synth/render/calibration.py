@@ -1,0 +1,138 @@
+"""Reading a camera calibration that OpenCV wrote: FileStorage YAML or XML, or JSON of either kind."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from synth.errors import UserError
+
+Floats = npt.NDArray[np.float64]
+
+_MATRIX = ("camera_matrix", "cameraMatrix", "Camera_Matrix", "K", "M1", "intrinsic_matrix", "mtx")
+_LENS = (
+    "distortion_coefficients",
+    "distCoeffs",
+    "Distortion_Coefficients",
+    "dist_coeffs",
+    "distortion",
+    "D",
+    "D1",
+    "dist",
+)
+_SIZE = (("image_width", "image_height"), ("image_Width", "image_Height"), ("width", "height"))
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """What a calibrated camera is, for pictures of one size."""
+
+    K: Floats
+    """(3, 3) px, centre of the top-left pixel at (0, 0)."""
+    distortion: Floats
+    """(5,) k1, k2, p1, p2, k3."""
+    size: tuple[int, int] | None
+    """Width, height of the pictures it was made from, if the file says so."""
+
+    def fitted(self, size: tuple[int, int]) -> Floats:
+        """K (3, 3) for pictures of another size with the same field of view.
+
+        Raises:
+            UserError: the shapes of the pictures differ.
+        """
+        if self.size is None or self.size == size:
+            return self.K
+        across, down = size[0] / self.size[0], size[1] / self.size[1]
+        if abs(across / down - 1) > 0.01:
+            raise UserError(
+                f"render.calibration: made from pictures of {self.size[0]} x {self.size[1]}, "
+                f"render.size {size[0]} x {size[1]} has another shape"
+            )
+        K = self.K.copy()
+        # Pixel centres, not corners, are whole numbers.
+        K[0, 0], K[0, 2] = K[0, 0] * across, (K[0, 2] + 0.5) * across - 0.5
+        K[1, 1], K[1, 2] = K[1, 1] * down, (K[1, 2] + 0.5) * down - 0.5
+        return K
+
+
+def read(path: Path) -> Calibration:
+    """The calibration in a file.
+
+    Raises:
+        UserError: it cannot be read, or what it holds is no pinhole with Brown-Conrady distortion.
+    """
+    found = _json(path) if path.suffix.lower() == ".json" else _storage(path)
+    K = _array(path, found, _MATRIX, "camera matrix")
+    if K.shape != (3, 3):
+        raise UserError(f"render.calibration: {path.name}: the camera matrix is {K.shape}, not 3 x 3")
+    if not (np.isfinite(K).all() and K[0, 0] > 0 and K[1, 1] > 0) or abs(K[0, 1]) > 1e-6 * K[0, 0]:
+        raise UserError(
+            f"render.calibration: {path.name}: the camera matrix is not that of a camera without skew"
+        )
+    lens = _array(path, found, _LENS, "distortion coefficients").ravel()
+    if not np.isfinite(lens).all() or len(lens) < 4 or np.abs(lens[5:]).max(initial=0) > 0:
+        raise UserError(
+            f"render.calibration: {path.name}: {len(lens)} distortion coefficients; "
+            "needed are k1 k2 p1 p2 and perhaps k3 (no rational, thin-prism or fisheye model)"
+        )
+    size = None
+    for wide, tall in _SIZE:
+        if wide in found and tall in found:
+            size = (int(float(found[wide])), int(float(found[tall])))
+    return Calibration(K, np.resize(np.append(lens, np.zeros(5)), 5), size)
+
+
+def _json(path: Path) -> dict[str, Any]:
+    try:
+        found = json.loads(path.read_text("utf-8"))
+    except OSError as error:
+        raise UserError(f"render.calibration: {path}: {error.strerror}") from error
+    except ValueError as error:
+        raise UserError(f"render.calibration: {path.name}: is no JSON ({error})") from error
+    if not isinstance(found, dict):
+        raise UserError(f"render.calibration: {path.name}: holds no named values")
+    return found
+
+
+def _storage(path: Path) -> dict[str, Any]:
+    if not path.is_file():
+        raise UserError(f"render.calibration: there is no file {path}")
+    try:
+        storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
+        root = storage.root()
+        if not storage.isOpened() or not root.isMap():
+            raise UserError(f"render.calibration: {path.name}: is no OpenCV calibration (YAML, XML or JSON)")
+        found: dict[str, Any] = {}
+        for name in root.keys():  # noqa: SIM118 - a FileNode is no dictionary
+            node = root.getNode(name)
+            if node.isMap():
+                found[name] = node.mat()
+            elif node.isInt() or node.isReal():
+                found[name] = node.real()
+        return found
+    except (cv2.error, SystemError) as error:
+        why = str(error).strip().splitlines()[-1]
+        raise UserError(f"render.calibration: {path.name}: is no OpenCV calibration ({why})") from error
+
+
+def _array(path: Path, found: dict[str, Any], names: tuple[str, ...], what: str) -> Floats:
+    for name in names:
+        value = found.get(name)
+        if isinstance(value, dict):  # OpenCV's own JSON: {"rows": 3, "cols": 3, "data": [...]}
+            value = (
+                np.reshape(value.get("data", []), (int(value.get("rows", -1)), -1))
+                if value.get("data")
+                else None
+            )
+        if value is not None:
+            try:
+                return np.asarray(value, np.float64)
+            except (TypeError, ValueError) as error:
+                raise UserError(f"render.calibration: {path.name}: {name} holds no numbers") from error
+    raise UserError(f"render.calibration: {path.name}: holds no {what} (looked for {', '.join(names)})")
