@@ -112,8 +112,10 @@ def train_command(
             out,
             fabric=fabric,
             report=lambda done, of_, numbers: tell(done, of_),
-            log=(lambda numbers: None) if json else _log,
+            log=(lambda numbers: None) if json or not fabric.is_global_zero else _log,
         )
+    if not fabric.is_global_zero:
+        return
     result = {"model": str(out), "epoch": card.epoch, "select_r2": card.score}
     result |= {k: len(v) for k, v in card.split.items()}
     if json:
