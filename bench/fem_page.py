@@ -130,7 +130,10 @@ def _share(value: float, ends: tuple[float, float], log: bool) -> float:
 def _ticks(ends: tuple[float, float], log: bool) -> list[float]:
     low, high = ends
     if not log:
-        return [low + k * (high - low) / 5 for k in range(6)]
+        rough = (high - low) / 5
+        size = 10.0 ** math.floor(math.log10(rough))
+        step = next(m * size for m in (1, 2, 5, 10) if m * size >= rough)
+        return [k * step for k in range(math.ceil(low / step), math.floor(high / step) + 1)]
     decades = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
     several = (1, 2, 5) if len(decades) <= 4 else (1,)
     return [m * 10.0**d for d in decades for m in several if low <= m * 10.0**d <= high]

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import json as json_
-import resource
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 import typer
 
-from bench import fem_case, fem_page, flow_plot, machine
+from bench import fem_case, fem_cost, fem_page, flow_plot, machine
 from synth.fem.equilibrium import InvertedElement, NoEquilibrium
 from synth.fem.laws import NUMBER
 from synth.job import Fem
@@ -33,10 +32,12 @@ def pareto(
     ] = None,
     json: Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")] = False,
 ) -> None:
-    """Error of the deformation against CPU time a frame, for law, order and size."""
+    """Error against CPU time a frame, for law, order and size; what gestures and a whole sequence cost."""
     on = fem_case.patch()
     rows = discretisation(on, refined, contacts, load)
     laws = law_table(on)
+    gestures = fem_cost.gestures(on, 0.15)
+    whole = [fem_cost.sequence("linear", 0.15), fem_cost.sequence("neo-hookean", 0.4)]
     found = {
         "command": f"bench pareto fem --load {load:g} --refined {refined} --contacts {contacts}",
         "machine": machine.describe(),
@@ -44,12 +45,15 @@ def pareto(
         "core, 60 frames, 40,000 vertices moved",
         "rows": rows,
         "laws": laws,
-        "peak_rss_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6, 1),
+        "gestures": gestures,
+        "sequence": whole,
     }
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
         (out / "pareto.json").write_text(json_.dumps(found, indent=1) + "\n", "utf-8")
-        fem_page.write(_panels(rows, laws), rows, found, "Physics: error against cost", out)
+        fem_page.write(
+            _panels(rows, laws), [*rows, *gestures, *whole], found, "Physics: error against cost", out
+        )
     if json:
         print(json_.dumps(found))
         return
@@ -61,6 +65,13 @@ def pareto(
         )
     for row in laws:
         print(f"{row['law']:13s} P {row['load']:4.2f} {row['way']:5s} {row['outcome']}")
+    for row in gestures:
+        print(
+            f"{row['law']:13s} P {row['load']:4.2f} {row['gesture']:15s} {row['ms_a_frame']:6.1f} ms a frame"
+        )
+    for row in whole:
+        spent = ", ".join(f"{k[:-2]} {v:.2f}" for k, v in row.items() if k.endswith("_s"))
+        print(f"{row['law']:13s} whole sequence: {row['peak_rss_mb']:.0f} MB at most; CPU s: {spent}")
 
 
 def discretisation(on: fem_case.Patch, refined: int, contacts: int, load: float) -> list[dict[str, Any]]:

@@ -78,9 +78,9 @@ class _Reader:
         if words and words[0].upper() == "OFFSETS":  # since 5.1: `count` offsets, then `size` point numbers
             offsets = self._numbers(count, words[1])
             words = self._line().split()
-            return np.split(self._numbers(size, words[1]), offsets[1:-1])
+            return np.split(self._numbers(size, words[1]).astype(np.int64), offsets[1:-1])
         self._at = start
-        numbers, cells, at = self._numbers(size, "int"), [], 0
+        numbers, cells, at = self._numbers(size, "int").astype(np.int64), [], 0
         for _ in range(count):
             cells.append(numbers[at + 1 : at + 1 + int(numbers[at])])
             at += 1 + int(numbers[at])
