@@ -238,6 +238,8 @@ class Column:
         """Type on disk; values are given in the table's."""
         self.dtype: np.dtype[Any] = dtype
         self.ndim = len(self.shape)
+        self.together: int = (array.shards or array.chunks)[0] if self.shape else 1
+        """Frames in one file, where it has frames."""
         self.attrs: dict[str, Any] = dict(array.attrs)
         self.dims: tuple[str, ...] = tuple(array.metadata.dimension_names or ())
 
