@@ -142,6 +142,8 @@ def follow(
             raise UserError(f"{recording.folder}: rest_frame {recording.meta.rest_frame}, but {seen} frames")
         raise UserError(f"{recording.folder}: no frame has a time; give frames.csv, or fps in meta.yaml")
     out.timings = watch.report()
+    if not recording.masks:
+        out.notes.append("no masks/: the tool is found in each picture")
     for kind, count in walker.left_out.items():
         if count:
             out.notes.append(f"{count} of {seen} frames {kind} left out")
@@ -209,6 +211,8 @@ class _Walker:
             blocked = mask.glare(rgb)
             if tool is not None:
                 blocked |= _smaller(tool.astype(np.uint8) * 255, self.shrink) > 0
+            elif not self.recording.masks:
+                blocked |= mask.tool(rgb)
         return rgb, blocked
 
     def _start(

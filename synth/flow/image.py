@@ -35,18 +35,6 @@ def box(field: Tensor, radius: int) -> Tensor:
     return F.avg_pool2d(rows, (wide, 1), 1, (radius, 0), count_include_pad=False)
 
 
-def gaussian(field: Tensor, sigma: float) -> Tensor:
-    """Gaussian blur with replicated border, separable. Each channel by itself."""
-    radius = max(1, int(3 * sigma + 0.5))
-    at = torch.arange(-radius, radius + 1, device=field.device, dtype=field.dtype)
-    kernel = torch.exp(-0.5 * (at / sigma) ** 2)
-    kernel = kernel / kernel.sum()
-    flat = field.reshape(-1, 1, *field.shape[-2:])
-    flat = F.conv2d(F.pad(flat, (radius, radius, 0, 0), "replicate"), kernel.view(1, 1, 1, -1))
-    flat = F.conv2d(F.pad(flat, (0, 0, radius, radius), "replicate"), kernel.view(1, 1, -1, 1))
-    return flat.reshape(field.shape)
-
-
 def window(field: Tensor, sigma: float) -> Tensor:
     """About a Gaussian blur at half the size, (B, C, H/2, W/2): for windows, whose shape matters little."""
     small = F.avg_pool2d(field, 2, ceil_mode=True, count_include_pad=False)

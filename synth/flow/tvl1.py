@@ -9,8 +9,8 @@ psi(s^2) = sqrt(s^2 + epsilon^2) being the robust data term on brightness and gr
 accuracy optical flow estimation based on a theory for warping, ECCV 2004, eq. 5), |.|_h the Huber norm
 (Werlberger et al., Anisotropic Huber-L1 optical flow, BMVC 2009, eq. 6), and m the mask: seen in the rest
 frame, and seen now at x + w. Where m is 0 the regulariser alone carries the flow on, there as a membrane (a
-larger h). lambda is that of a picture of little noise; it falls with the square of the residual's median, as a
-measurement's weight does with its noise, and rises where the first guess is steep. Coarse to fine, re-
+larger h). lambda is that of a picture of little noise: it falls with the square of the residual's median, as
+a measurement's weight does with its noise, and rises where the first guess is steep. Coarse to fine, re-
 warped (Brox), each warp solved by the primal-dual steps of Chambolle and Pock (J. Math. Imaging Vis. 40,
 2011, algorithm 1) on lagged weights.
 """
@@ -58,8 +58,6 @@ class Settings:
     """Updates of the robust weights a warp."""
     steps: int = 16
     """Primal-dual steps a reweighting."""
-    presmooth: float = 0.0
-    """Gaussian before everything [px]: linearisation wants pictures without corners."""
     erode: int = 0
     """Growth of what is masked [px]: derivatives reach into it."""
     tau: float = 3.5
@@ -69,7 +67,7 @@ class Settings:
     warm_warps: int = 3
     """Linearisations a level with an initial flow."""
     steep: float = 0.1
-    """Where the first guess's gradient [px/px] is this large, lambda is doubled: smoothness costs most there."""
+    """Where the first guess's gradient [px/px] is this large, lambda doubles: smoothness costs most there."""
     fine_levels: int = 2
     """Levels that the second stage of a cold start, or a warm start, works on."""
     bold_weight: float = 2.0
@@ -204,8 +202,6 @@ def pyramid(rest: Tensor, now: Tensor, rest_usable: Tensor, now_usable: Tensor, 
     known = torch.cat([rest_usable, now_usable])
     while True:
         contrast = image.normalise(grey, known)
-        if s.presmooth > 0:
-            contrast = image.gaussian(contrast, s.presmooth)
         seen = (known > 0.5).to(grey.dtype)
         if s.erode:
             seen = 1 - F.max_pool2d(1 - seen, 2 * s.erode + 1, 1, s.erode)
@@ -287,7 +283,7 @@ def step(level: Level, flow: Tensor, dual: Tensor, weight: Tensor, s: Settings) 
 
 
 def calm(residual: Tensor, mask: Tensor, noise: float) -> Tensor:
-    """(noise / median of |r| over the mask) squared, at most `_CALMEST`, (B, 1, 1, 1); 1 if nothing is seen."""
+    """(noise / median of |r| in the mask) squared, at most `_CALMEST`; 1 if nothing is seen. (B, 1, 1, 1)."""
     size = torch.where(mask > 0, residual.norm(dim=1, keepdim=True), torch.nan)[..., ::2, ::2]
     found = torch.nan_to_num(size.flatten(1).nanmedian(dim=1).values, nan=noise)
     return (noise / found.clamp_min(1e-6)).square().clamp_max(_CALMEST).view(-1, 1, 1, 1)

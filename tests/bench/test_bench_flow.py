@@ -9,14 +9,23 @@ import av
 import cv2
 import numpy as np
 import pytest
+import torch
 from scipy.ndimage import map_coordinates
 from typer.testing import CliRunner
 
 from bench import flow_files, flow_plot, live
 from bench.cli import app
 from bench.flow_measure import MeanInpainting, against, divergence, measure
-from bench.flow_scenes import CLEAN, Recipe, inverse, pairs, pull_field
-from bench.video import Picture
+from bench.flow_scenes import CLEAN, Recipe, Stage, inverse, pairs, pull_field
+from bench.follow import Answer, Scene, follow
+from bench.methods import Model
+from bench.recording import open_recording
+from bench.video import Picture, write_video
+from learn.checkpoint import Card, save_tensors, write_card
+from learn.grid import Scales
+from learn.model import D2FNet
+from learn.reference import build
+from learn.settings import override, preset
 from synth.errors import UserError
 from synth.flow.opencv import Dis
 
@@ -181,3 +190,64 @@ def test_live_runs_on_a_video_and_refuses_what_is_none(tmp_path: Path) -> None:
         live.watch(tmp_path / "no.mp4")
     with pytest.raises(UserError, match="scale"):
         live.watch(path, method=lambda *given: None)  # type: ignore[arg-type, return-value]
+
+
+@pytest.fixture
+def model(tmp_path: Path) -> Path:
+    """A model folder as training leaves it, of an untrained network with weights that say something."""
+    settings = override(preset("tiny"), ["size=32", "arch.levels=2"])
+    torch.manual_seed(0)
+    net = build(settings.arch).eval()
+    assert isinstance(net, D2FNet)
+    with torch.no_grad():
+        for conv in net.heads.ranges:  # type: ignore[union-attr]
+            conv.weight.normal_(0, 200.0)  # type: ignore[union-attr,operator]
+    write_card(tmp_path / "model", Card(settings, Scales(1.0, 0.2, 1.0, 100.0, 0.3), 1.0, {}, {}))
+    save_tensors(tmp_path / "model" / "weights.pt", net.state_dict())
+    return tmp_path / "model"
+
+
+def test_live_answers_with_the_forces_that_scoring_finds(tmp_path: Path, model: Path) -> None:
+    """One video, once as a stream and once as a recording without masks: same masks, flow and model."""
+    rng = np.random.default_rng(5)
+    stage = Stage.set(Recipe(size=96, pull=4.0, tool=10.0), rng)
+    rest = stage.rest(rng)
+    shots = [stage.against(rest, share, rng).now for share in (0.3, 0.6, 1.0)]
+    folder = tmp_path / "recording"
+    folder.mkdir()
+    write_video(folder / "video.mp4", iter([rest[0], *shots]), np.arange(4) / 25)
+    (folder / "meta.yaml").write_text("scale_mm_per_px: 0.3\nyoung_kpa: 1.0\nrest_frame: 0\n")
+    arguments = ["live", str(folder / "video.mp4"), "-m", str(model), "--scale", "0.3", "--young", "1"]
+    ran = CliRunner().invoke(app, [*arguments, "--every", "--json"])
+    assert ran.exit_code == 0, ran.output
+    summary = json.loads(ran.output)
+    assert (summary["frames"], summary["dropped"]) == (3, 0)
+    assert 0 < summary["p50_ms"] <= summary["p95_ms"] <= summary["p99_ms"]
+    assert summary["force_ms"] > 0
+    streamed: list[live.Frame] = []
+    live.watch(folder / "video.mp4", method=Model(model), scale_mm_per_px=0.3, young_kpa=1.0, paced=False,
+               told=streamed.append)  # fmt: skip
+    followed = follow(open_recording(folder), {"model": Model(model)}, 0.3)
+    scored = [float(np.linalg.norm(force)) for force in followed.force_mn["model"][1:]]
+    assert min(scored) > 0
+    # The stream has looked at the rest frame twice and so starts its first flow warm.
+    assert [frame.force_mn for frame in streamed] == pytest.approx(scored, rel=0.15)
+    assert any("tool is found" in note for note in followed.notes)
+
+
+def test_scoring_without_masks_leaves_the_instrument_out(tmp_path: Path) -> None:
+    (pair,) = pairs(Recipe(size=96, pull=4.0, tool=16.0, highlights=0.0), 1, 2)
+    folder = tmp_path / "recording"
+    (folder / "frames").mkdir(parents=True)
+    for k, picture in enumerate((pair.rest, pair.now)):
+        cv2.imwrite(str(folder / "frames" / f"{k}.png"), picture[..., ::-1])
+    (folder / "meta.yaml").write_text("scale_mm_per_px: 0.3\nyoung_kpa: 1.0\nrest_frame: 0\nfps: 25\n")
+    trust: list[np.ndarray] = []
+
+    def method(flow: np.ndarray, confidence: np.ndarray, scene: Scene, picture: bool) -> Answer:
+        trust.append(confidence)
+        return Answer(np.zeros(3))
+
+    follow(open_recording(folder), {"none": method}, 0.3, backend="dis")
+    assert trust[1][pair.hidden].mean() < 0.3
+    assert trust[1][~pair.hidden & pair.inside].mean() > 0.6

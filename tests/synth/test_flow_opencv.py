@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
@@ -9,6 +11,7 @@ import pytest
 from bench.flow_scenes import CLEAN, Recipe, Stage, cortex, pairs
 from synth.errors import UserError
 from synth.flow import estimator, mask, opencv, track
+from synth.job import Job
 
 
 def _error(flow: np.ndarray, truth: np.ndarray) -> np.ndarray:
@@ -139,3 +142,49 @@ def test_tool_is_found_without_weights() -> None:
     blocked = mask.blocked(pair.now)
     assert blocked[pair.tool].mean() > 0.8
     assert blocked.mean() < 0.2
+
+
+_PLUGIN = """
+import numpy as np
+import torch
+
+class Learned:
+    def __init__(self):
+        self.net = torch.nn.Linear(1, 2)
+        with torch.no_grad():
+            self.net.weight.zero_()
+            self.net.bias.copy_(torch.tensor([1.0, -2.0]))
+
+    def flow(self, rest, now, rest_usable, now_usable, initial=None):
+        with torch.inference_mode():
+            moved = self.net(torch.ones(*rest.shape[:2], 1)).numpy()
+        return moved, (rest_usable & now_usable).astype(np.float32)
+"""
+
+
+def test_another_packages_estimator_is_found_by_its_entry_point(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "learned_flow.py").write_text(_PLUGIN)
+    about = tmp_path / "learned_flow-1.0.dist-info"
+    about.mkdir()
+    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: learned-flow\nVersion: 1.0\n")
+    (about / "entry_points.txt").write_text("[sulcus.flow]\nmy-net = learned_flow:Learned\n")
+    with pytest.raises(UserError, match="no estimator"):
+        estimator.create("my-net")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    assert "my-net" in estimator.names()
+    assert Job.model_validate({"flow": {"backend": "my-net"}}).flow.backend == "my-net"
+    frames = np.zeros((2, 24, 32, 3), np.uint8)
+    found = track.track("my-net", frames, np.zeros((2, 24, 32), bool), np.ones((24, 32), bool))
+    np.testing.assert_array_equal(found.flow[1], np.broadcast_to([1.0, -2.0], (24, 32, 2)))
+    assert found.trusted.all()
+
+
+def test_opencv_gives_one_answer_to_one_input() -> None:
+    (pair,) = pairs(Recipe(size=128), 1, 13)
+    for name in ("opencv-tvl1", "dis"):
+        flows = [estimator.create(name).flow(pair.rest, pair.now, pair.rest_usable, pair.now_usable)[0]
+                 for _ in range(5)]  # fmt: skip
+        for flow in flows[1:]:
+            np.testing.assert_array_equal(flow, flows[0], err_msg=name)
