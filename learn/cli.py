@@ -202,7 +202,7 @@ def predict_command(
     from learn.threads import set_threads
 
     set_threads(threads)
-    predictor = load_model(model)
+    predictor = load_model(model, quick=True)
     peaks = {}
     for motion in motions(source, input, Filmed(scale, tissue, backend)):
         found = apply(predictor, motion, young)

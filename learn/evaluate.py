@@ -234,8 +234,8 @@ def evaluate(
 ) -> Report:
     """Scores a model on clips, with displacement from `source` (`ideal` or `recovered`).
 
-    `pressed`: E [kPa] of each clip by its content hash, as a calibration press found it; gives the column
-    `press`.
+    `pressed`: E [kPa] of clips by their content hash, as a calibration press found it: the column `press`
+    holds those that have one.
     """
     if not clips:
         raise UserError("no sequence to evaluate on")
@@ -247,7 +247,7 @@ def evaluate(
         taken = {"known": 1.0, "half": 0.5, "double": 2.0}
         young = {name: clip.young_kpa * factor for name, factor in taken.items()}
         young["unknown"] = predictor.card.typical_young_kpa
-        if pressed is not None:
+        if pressed is not None and clip.content_hash in pressed:
             young["press"] = pressed[clip.content_hash]
         for name, (said, head) in _answers(predictor, clip, source, young).items():
             columns.setdefault(name, []).append(score(clip, said, predictor.card, head))

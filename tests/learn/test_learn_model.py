@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from learn.model import Architecture, D2FNet, flops, fused, parameters
+from learn.quick import Quick
 from learn.settings import PRESETS
 from synth.errors import UserError
 
@@ -91,3 +92,19 @@ def test_folding_batch_norms_changes_nothing_but_the_time() -> None:
         torch.testing.assert_close(quick(x), model(x), rtol=1e-3, atol=1e-6)
     assert not any(isinstance(m, torch.nn.BatchNorm2d) for m in quick.modules())
     assert any(isinstance(m, torch.nn.BatchNorm2d) for m in model.modules())
+
+
+@pytest.mark.parametrize(("condition", "total"), [("none", False), ("film", True)])
+def test_the_quick_network_says_the_same_in_any_batch(condition: str, total: bool) -> None:
+    torch.manual_seed(0)
+    arch = Architecture(width=8, stem=4, levels=2, condition=condition, total=total)  # type: ignore[arg-type]
+    model = D2FNet(arch).eval()
+    quick = Quick(model, arch, 64)
+    for batch in (1, 2, 3):
+        x, young = torch.randn(batch, 5, 64, 64), torch.randn(batch, 1)
+        x[:, 3] = 1
+        with torch.no_grad():
+            expected, got = model(x, young), quick(x, young)
+        for a, b in zip(expected, got, strict=True) if total else [(expected, got)]:
+            assert a.abs().max() > 0
+            torch.testing.assert_close(b, a, rtol=1e-3, atol=1e-5)
