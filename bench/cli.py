@@ -312,6 +312,9 @@ def live(
     backend: Annotated[str, typer.Option(help="Flow estimator.")] = "tvl1",
     shrink: Annotated[int, typer.Option(min=1, max=8, help="Pictures this many times smaller.")] = 1,
     every: Annotated[bool, typer.Option("--every", help="Work on every frame, however late.")] = False,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Folder for live.json: latencies and the machine.")
+    ] = None,
     json: Json = False,
 ) -> None:
     """Masks, flow and force of a video as it runs: latency percentiles and dropped frames."""
@@ -338,6 +341,8 @@ def live(
         told=(lambda frame: None) if json else tell,
     )
     summary = account.summary()
+    if out is not None:
+        stream.write(out, summary, backend=backend, shrink=shrink, paced=not every, model=model is not None)
     if json:
         typer.echo(json_.dumps(summary))
     else:

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, dataclass, replace
 from itertools import chain
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import cv2
 import numpy as np
@@ -61,7 +61,7 @@ class Source:
 
 
 def experiment(
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for results.json.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for results.json and results.md.")],
     photo: Annotated[
         Path | None, typer.Option(help="Photograph of a cortex to warp as well; nothing of it is written.")
     ] = None,
@@ -101,6 +101,7 @@ def experiment(
         command = f"bench experiment flow --only {part} --count {count} --frames {frames} --seed {seed}"
         record[part] = {"command": command, "rows": rows}
         path.write_text(json_.dumps(record, indent=1) + "\n")
+        (out / "results.md").write_text(_table(record))
         if not json:
             for row in rows:
                 typer.echo(_line(row))
@@ -112,6 +113,25 @@ def _line(row: dict[str, object]) -> str:
     asked = "" if row["asked"] is None else f"{'>=' if row['at_least'] else '<='} {row['asked']:g}"
     verdict = {None: "", True: "reached", False: "NOT REACHED"}[row["reached"]]  # type: ignore[index]
     return f"{row['what']:<52} {row['on']:<26} {row['measured']:>8.3f} {row['unit']:<6} {asked:<9} {verdict}"
+
+
+def _table(record: dict[str, Any]) -> str:
+    """Every row measured so far, as Markdown."""
+    lines = ["# Flow: asked against measured", ""]
+    for part in (part for part in record if part != "machine"):
+        lines += [
+            f"`{record[part]['command']}`",
+            "",
+            "| what | on | asked | measured | |",
+            "| --- " * 5 + "|",
+        ]
+        for row in record[part]["rows"]:
+            asked = "" if row["asked"] is None else f"{'≥' if row['at_least'] else '≤'} {row['asked']:g}"
+            verdict = {None: "", True: "reached", False: "**not reached**"}[row["reached"]]
+            figure = f"{row['measured']:.3f} {row['unit']}"
+            lines.append(f"| {row['what']} | {row['on']} | {asked} | {figure} | {verdict} |")
+        lines.append("")
+    return "\n".join(lines)
 
 
 def automatic(picture: Rgb, _: Flags) -> Flags:

@@ -1,6 +1,6 @@
 """Trains the tool mask's U-Net on masks rendered for it (`flow_toolscenes`).
 
-    python -m bench.flow_toolnet --scenes 52 --steps 900 --seed 0 -o synth/flow
+    python -m bench.flow_toolnet --scenes 39 --steps 700 --seed 0 -o synth/flow
 
 Writes `toolnet.pt` (half precision) and `toolnet.json` (command, seed, steps, overlap on scenes held
 out, beside that of the rule without weights).
@@ -141,8 +141,8 @@ def main() -> None:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("-o", "--out", type=Path, default=toolnet.WEIGHTS.parent, help="folder")
-    parser.add_argument("--scenes", type=int, default=52, help="scenes to render and train on")
-    parser.add_argument("--steps", type=int, default=900, help="of AdamW, batches of 8")
+    parser.add_argument("--scenes", type=int, default=39, help="scenes to render and train on")
+    parser.add_argument("--steps", type=int, default=700, help="of AdamW, batches of 8")
     parser.add_argument("--seed", type=int, default=0, help="of everything drawn")
     given = parser.parse_args()
     print(json.dumps(train(given.scenes, given.out, given.steps, given.seed)))

@@ -6,6 +6,7 @@ dropped, as it would be beside the table. Mask, tracker and model are those that
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
@@ -15,6 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from bench import machine
 from bench.follow import Method, Scene
 from bench.video import Picture, from_video
 from synth.errors import UserError
@@ -47,11 +49,14 @@ class Watched:
 
     frames: list[Frame] = field(default_factory=list)
     dropped: int = 0
+    size: tuple[int, int] = (0, 0)
+    """Height, width of what is worked on [px]."""
 
     def summary(self) -> dict[str, float | int]:
         """Latency percentiles [ms], mean time of each stage [ms], dropped and flagged frames."""
         latency = 1e3 * np.array([frame.latency_s for frame in self.frames])
         result: dict[str, float | int] = {"frames": len(self.frames), "dropped": self.dropped}
+        result |= {"height": self.size[0], "width": self.size[1]}
         result |= {f"p{q}_ms": float(np.percentile(latency, q)) for q in (50, 95, 99)}
         for stage in self.frames[0].stages_s:
             result[f"{stage}_ms"] = 1e3 * float(np.mean([frame.stages_s[stage] for frame in self.frames]))
@@ -118,6 +123,7 @@ def run(
         stamp = picture.index / _FPS if picture.time_s is None else picture.time_s
         if tracker is None:
             tissue = np.ones(picture.rgb.shape[:2], bool)
+            account.size = picture.rgb.shape[:2]
             tracker = Tracker(backend, picture.rgb, mask.blocked(picture.rgb), tissue)
             scene = Scene(tissue, scale_mm_per_px, young_kpa)
             # The clock starts when the first flow is warm: loading isn't latency.
@@ -136,6 +142,13 @@ def run(
     if not account.frames:
         raise UserError(f"{name}: fewer than two frames")
     return account
+
+
+def write(out: Path, summary: dict[str, float | int], **how: str | int | bool) -> None:
+    """`live.json`: the summary, how the stream was run, and the machine."""
+    out.mkdir(parents=True, exist_ok=True)
+    record = {"command": "bench live", **how, "machine": machine.describe(), **summary}
+    (out / "live.json").write_text(json.dumps(record, indent=1) + "\n", "utf-8")
 
 
 def _interval(stamp: float, first_s: float, index: int) -> float:

@@ -218,9 +218,10 @@ def test_live_answers_with_the_forces_that_scoring_finds(tmp_path: Path, model: 
     write_video(folder / "video.mp4", iter([rest[0], *shots]), np.arange(4) / 25)
     (folder / "meta.yaml").write_text("scale_mm_per_px: 0.3\nyoung_kpa: 1.0\nrest_frame: 0\n")
     arguments = ["live", str(folder / "video.mp4"), "-m", str(model), "--scale", "0.3", "--young", "1"]
-    ran = CliRunner().invoke(app, [*arguments, "--every", "--json"])
+    ran = CliRunner().invoke(app, [*arguments, "--every", "--json", "-o", str(tmp_path / "out")])
     assert ran.exit_code == 0, ran.output
     summary = json.loads(ran.output)
+    assert json.loads((tmp_path / "out" / "live.json").read_text()).items() >= summary.items()
     assert (summary["frames"], summary["dropped"]) == (3, 0)
     assert 0 < summary["p50_ms"] <= summary["p95_ms"] <= summary["p99_ms"]
     assert summary["force_ms"] > 0
