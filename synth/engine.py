@@ -90,7 +90,8 @@ def run(job: Job, root: Path, options: Options, watcher: Watcher) -> Summary:
         finished, failures = set(folder.sealed()), folder.failures()
         todo = [k for k in range(job.sequences) if k not in finished and k not in failures]
         forecast.refuse_if_too_large(forecast.of(job, root, len(todo), sorted(finished), []), root)
-        watchers = (watcher, Journal(folder, workers, job.frames, watcher))
+        # The journal first: what is said of the run is then said with what has just ended.
+        watchers = (Journal(folder, workers, job.frames, watcher), watcher)
         for each in watchers:
             each.begin(job.sequences, len(finished), len(failures))
         setup = Setup(

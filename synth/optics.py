@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from synth.measure import Measure, truth
 from synth.render import camera as cameras
+from synth.render.sway import Sway
 from synth.store import Sequence
 
 Floats = NDArray[np.float64]
@@ -46,8 +47,10 @@ def contact(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
     instruments = (sequence.attrs.get("mechanics") or {}).get("instruments", [])
     if len(instruments) != 1:
         return
-    view, tips = camera_of(sequence), np.asarray(instruments[0]["tip_mm"], np.float64)
-    footprint = float(sequence.attrs["scenario"]["gesture"]["footprint_mm"])
+    still, tips = camera_of(sequence), np.asarray(instruments[0]["tip_mm"], np.float64)
+    scenario, time = sequence.attrs["scenario"], sequence["time"][:]
+    footprint = float(scenario["gesture"]["footprint_mm"])
+    sway = Sway(**scenario["sway"]) if "sway" in scenario else None
     area, tissue = sequence["area"][:], sequence["tissue"][:]
     inside = cv2.erode(tissue.astype(np.uint8), np.ones((5, 5), np.uint8), borderValue=0).astype(bool)
     rows, columns = np.indices(tissue.shape)
@@ -61,6 +64,7 @@ def contact(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
         share = share / share.sum()
         flow = sequence["flow"][t]
         x, y = ((share * (base + flow[..., k])).sum() for k, base in enumerate((columns, rows)))
+        view = sway.at(still, float(time[t])) if sway else still
         seen = cameras.to_pixels(view, cameras.to_camera(view, tips[t].reshape(-1, 3))).mean(axis=0)
         off = float(np.hypot(x - seen[0], y - seen[1])) * view.mm_per_px
         yield Measure(off, 0.1 * footprint + view.mm_per_px, f"frame {t}")

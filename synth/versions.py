@@ -22,8 +22,9 @@ _PACKAGES = (
 )
 
 
-# What decides the values of a sequence, given its job and index; the rest runs, keeps and describes them.
-_CODE = ("job.py", "pipeline.py", "scenario.py", "brain.py", "fem", "render", "flow")
+# Where the making of a sequence begins, and what it uses that decides no value.
+_MAKER = "synth.pipeline"
+_NO_PART = {f"synth.{name}" for name in ("errors", "fields", "identity", "stopwatch", "store", "versions")}
 _COMPUTING = ("mitsuba", "drjit", "numpy", "scipy", "opencv-contrib-python-headless", "torch")
 
 
@@ -36,14 +37,10 @@ def generator() -> dict[str, str]:
     """
     from synth.fields import FORMAT_VERSION
 
-    here = Path(__file__).parent
-    total = hashlib.blake2b(digest_size=8)
-    for name in _CODE:
-        for path in sorted((here / name).rglob("*")) if (here / name).is_dir() else [here / name]:
-            if path.suffix == ".py":
-                total.update(f"{path.relative_to(here)}\n{_statements(path)}\n".encode())
-            elif path.suffix in (".pt", ".json", ".yaml", ".npz"):
-                total.update(path.read_bytes())
+    home, total = Path(__file__).parents[1], hashlib.blake2b(digest_size=8)
+    for path in sorted(_makers(home)):
+        total.update(f"{path.relative_to(home)}\n".encode())
+        total.update(_statements(path).encode() if path.suffix == ".py" else path.read_bytes())
     packages = {name: found for name, found in of_everything().items() if name in _COMPUTING}
     return {"format": str(FORMAT_VERSION), "code": total.hexdigest(), **packages}
 
@@ -57,6 +54,25 @@ def word(made_by: dict[str, str]) -> str:
     """What `generator()` gave, here or elsewhere, in one word."""
     described = json.dumps(made_by, sort_keys=True).encode()
     return hashlib.blake2b(described, digest_size=8).hexdigest()
+
+
+def _makers(home: Path) -> set[Path]:
+    """Files that the maker of sequences is made of: its modules, theirs, and the networks beside them."""
+    found: set[Path] = set()
+    # Estimators of flow are found by name, so all of them count.
+    waiting = [_MAKER, *(f"synth.flow.{path.stem}" for path in (home / "synth/flow").glob("*.py"))]
+    while waiting:
+        name = waiting.pop()
+        file = home / Path(*name.split(".")).with_suffix(".py")
+        if name in _NO_PART or not file.is_file() or file in found:
+            continue
+        found |= {file, *file.parent.glob("*.pt")}
+        for node in ast.walk(ast.parse(file.read_text("utf-8"))):
+            if isinstance(node, ast.Import):
+                waiting += [alias.name for alias in node.names]
+            elif isinstance(node, ast.ImportFrom) and node.module:
+                waiting += [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
+    return found
 
 
 def _statements(path: Path) -> str:

@@ -58,6 +58,19 @@ def test_every_required_key_is_there_and_its_loss_is_seen(root: Path) -> None:
         assert croissant.missing({name: value for name, value in described.items() if name != key}) == [key]
 
 
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of rdflib's own
+def test_a_reader_of_linked_data_sees_the_same(root: Path) -> None:
+    rdflib = pytest.importorskip("rdflib", reason="rdflib comes with mlcroissant")
+    document = json.loads((root / croissant.NAME).read_text("utf-8"))
+    graph = rdflib.Graph().parse(data=json.dumps(document), format="json-ld")
+    schema, cr = rdflib.Namespace("https://schema.org/"), rdflib.Namespace("http://mlcommons.org/croissant/")
+    (dataset,) = graph.subjects(rdflib.RDF.type, schema.Dataset)
+    assert str(graph.value(dataset, schema.name)) == document["name"]
+    assert len(list(graph.subjects(rdflib.RDF.type, cr.Field))) == len(index.SCHEMA)
+    rai = rdflib.Namespace("http://mlcommons.org/croissant/RAI/")
+    assert len(list(graph.objects(dataset, rai.dataLimitations))) == len(document["rai:dataLimitations"])
+
+
 def test_what_nobody_said_is_not_made_up(root: Path) -> None:
     path = root / "dataset.json"
     before = path.read_text()

@@ -78,6 +78,18 @@ def test_another_versions_dataset_is_continued_only_when_told(
         run(root, job=JOB.model_copy(update={"sequences": 7}), mix_versions=False)
 
 
+def test_what_makes_a_sequence_counts_and_what_keeps_it_does_not() -> None:
+    home = Path(versions.__file__).parents[1]
+    counted = {str(path.relative_to(home)) for path in versions._makers(home)}
+    assert {
+        "synth/scenario.py",
+        "synth/fem/solver.py",
+        "synth/render/truth.py",
+        "synth/flow/tvl1.py",
+    } <= counted
+    assert not counted & {"synth/store.py", "synth/engine.py", "synth/verify.py", "synth/cli.py"}
+
+
 def test_a_sequence_sealed_by_an_attempt_that_was_lost_is_not_made_again(tmp_path: Path) -> None:
     run(tmp_path / "made", job=JOB.model_copy(update={"sequences": 1}))
     setup = Setup(
