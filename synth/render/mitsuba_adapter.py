@@ -6,9 +6,11 @@ LLVM found by `synth.llvm`: a wrong one ends the process.
 
 from __future__ import annotations
 
+import ctypes
 import functools
 import gc
 import os
+import sys
 from dataclasses import dataclass
 from typing import Any
 
@@ -110,8 +112,6 @@ def pick(asked: str) -> str:
 @functools.cache
 def cuda() -> bool:
     """Whether an NVIDIA driver with a device is there."""
-    import ctypes
-
     try:
         driver = ctypes.CDLL("libcuda.so.1")
     except OSError:
@@ -138,7 +138,7 @@ class Stage:
         mi.set_variant(variant)
         self._jit = "scalar" not in variant
         _limit_threads()
-        _forget(self._jit)
+        forget()
         self.variant = variant
         self._mi = mi
         self._faces = {name: body.faces for name, body in bodies.items()}
@@ -173,16 +173,35 @@ class Stage:
             self._lens.place(camera)
         lens = self._lens
         image = self._mi.render(self._scene, sensor=lens.sensor, spp=lens.spp, seed=seed)
-        return lens.develop(np.array(image, dtype=np.float32)[..., :3])
+        radiance = lens.develop(np.array(image, dtype=np.float32)[..., :3])
+        if self._jit:
+            # What one frame needs is not kept for the next: it costs nothing to ask for it again.
+            import drjit as dr
+
+            dr.flush_malloc_cache()
+        return radiance
 
 
-def _forget(jit: bool) -> None:
-    """Frees what stages before this one held: Python's plugins and their scenes refer to each other."""
+def forget() -> None:
+    """Frees what stages that are gone held: Python's plugins and their scenes refer to each other."""
     gc.collect()
-    if jit:
+    if "drjit" in sys.modules:
         import drjit as dr
 
         dr.flush_malloc_cache()
+    _trim()
+
+
+def _trim() -> None:
+    """Gives free pages back to the system: glibc would keep what maps needed while they were made."""
+    trim = getattr(_libc(), "malloc_trim", None)
+    if trim is not None:
+        trim(0)
+
+
+@functools.cache
+def _libc() -> ctypes.CDLL:
+    return ctypes.CDLL(None)
 
 
 def _limit_threads() -> None:
@@ -266,7 +285,7 @@ def _material(mi: Any, material: Wet | Metal) -> dict[str, Any]:
             },
         }
     encoded = material.normal * np.float32(0.5) + np.float32(0.5)
-    albedo = _bitmap(mi, material.albedo)
+    albedo = mi.load_dict(_bitmap(mi, material.albedo))  # once, for both
 
     def coat(roughness: float) -> dict[str, Any]:
         return {

@@ -74,5 +74,5 @@ def centres(pixels: int, extent_mm: float) -> npt.NDArray[np.float32]:
 
 def _filtered(rng: np.random.Generator, pixels: int, gain: Floats) -> Map:
     white = rng.standard_normal((pixels, pixels), dtype=np.float32)
-    noise = np.fft.irfft2(np.fft.rfft2(white) * gain, s=(pixels, pixels))
+    noise = np.fft.irfft2(np.fft.rfft2(white) * gain.astype(np.float32), s=(pixels, pixels))
     return np.asarray((noise - noise.mean()) / noise.std(), np.float32)

@@ -14,7 +14,7 @@ from synth.render import instrument, light, noise, reflection, rim, sensor, text
 from synth.render.anatomy import Surface
 from synth.render.camera import Camera, beside, blur_radius
 from synth.render.look import Look
-from synth.render.mitsuba_adapter import Body, Metal, Stage, pick
+from synth.render.mitsuba_adapter import Body, Metal, Stage, forget, pick
 from synth.render.shape import Shape, normals
 from synth.render.truth import Still
 
@@ -91,6 +91,7 @@ class Studio:
     def __init__(
         self, surface: Surface, look: Look, camera: Camera, job: Job, gestures: Sequence[str] = ("pull",)
     ) -> None:
+        forget()  # of a studio before this one
         self.variant = pick(job.render.variant)
         self.surface, self.camera = surface, camera
         self._look, self._render, self._extra = look, job.render, job.store.extra
