@@ -6,6 +6,7 @@ import itertools
 import json as json_
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -13,14 +14,42 @@ import numpy as np
 import torch
 import typer
 from rich.console import Console
-from rich.table import Table
 
+from bench import flow_plot
+from bench.learn_runs import column
+from bench.learn_table import markdown
 from bench.machine import describe
+from learn.cost import flops, parameters
 from learn.grid import Grid, Scales, channels
-from learn.model import Architecture, flops, fused, parameters
+from learn.model import Architecture, fused
+from learn.quick import Quick
 from learn.reference import build
 from learn.settings import PRESETS
+from learn.statistics import Interval, interval
 from learn.threads import set_threads
+
+LIGHT = 5e9
+"""FLOP a frame up to which a network is timed in every layout and precision, and `repeats` times."""
+
+
+@dataclass(frozen=True)
+class Choice:
+    """One way to run one network."""
+
+    arch: Architecture
+    size: int
+    layout: str = "quick"
+    """`contiguous`, `channels_last`, or `quick` (`learn.quick`, as `learn predict` and live use run it)."""
+    precision: str = "fp32"
+
+    @property
+    def name(self) -> str:
+        return f"{self.arch.name} w{self.arch.width} stem{self.arch.stem} {self.size}"
+
+    @property
+    def preset(self) -> str:
+        found = [k for k, v in PRESETS.items() if v.size == self.size and _shape(v.arch) == _shape(self.arch)]
+        return ", ".join(found)
 
 
 def pareto(
@@ -30,19 +59,24 @@ def pareto(
     runs: Annotated[Path, typer.Option(help="Runs whose errors are shown.")] = Path("docs/results/learn"),
     repeats: Annotated[int, typer.Option(help="Frames timed, at least.")] = 30,
     device: Annotated[str, typer.Option(help="cpu or cuda.")] = "cpu",
+    only: Annotated[str, typer.Option(help="Only networks whose name, with layout, holds this.")] = "",
     json: Annotated[bool, typer.Option("--json", help="Print JSON on stdout.")] = False,
 ) -> None:
     """Time every network a frame, channels included, on one core (or a GPU), beside its error."""
     set_threads(1)
     errors = _errors(runs)
     rows = []
-    for arch, size, layout, precision in _choices(device):
-        row = measure(arch, size, layout, precision, repeats, device)
-        row["map_rmse"] = errors.get(_shape(arch, size))
+    for choice in _choices(device, errors):
+        if only not in f"{choice.name} {choice.layout} {choice.precision}":
+            continue
+        row = measure(choice, repeats, device)
+        error = errors.get((choice.arch, choice.size))
+        row["map_rmse"] = None if error is None else [error.mean, error.low, error.high]
         rows.append(row)
         if not json:
             Console(stderr=True).print(
-                f"{row['name']}: p50 {row['cpu_ms_p50']:.1f} ms, p95 {row['cpu_ms_p95']:.1f} ms"
+                f"{row['name']} {choice.layout} {choice.precision}: p50 {row['ms_p50']:.1f} ms, "
+                f"p95 {row['ms_p95']:.1f} ms"
             )
     result = {
         "machine": describe() | {"device": device, "threads": 1, "torch": torch.__version__},
@@ -50,47 +84,52 @@ def pareto(
     }
     out.mkdir(parents=True, exist_ok=True)
     (out / f"data-{device}.json").write_text(json_.dumps(result, indent=1) + "\n")
+    _write(out)
     if json:
         print(json_.dumps(result))
     else:
-        Console().print(_table(rows))
+        print(markdown(_lines(rows)))
 
 
-def measure(
-    arch: Architecture, size: int, layout: str, precision: str, repeats: int, device: str = "cpu"
-) -> dict[str, Any]:
+def measure(choice: Choice, repeats: int, device: str = "cpu") -> dict[str, Any]:
     """Latency of one frame from displacement on the grid to the force map on it, batch norms folded.
 
     CPU time on the CPU (other processes take turns, they don't count), wall time on a GPU. Heavy networks are
     timed at least five times, light ones `repeats` times.
     """
     torch.manual_seed(0)
-    model = fused(build(arch)).to(device)
-    if layout == "channels_last":
-        model = model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    arch, size = choice.arch, choice.size
+    model = build(arch).eval()
+    net: Callable[..., Any] = (
+        Quick(model, arch, size) if choice.layout == "quick" else fused(model).to(device)
+    )
+    if choice.layout == "channels_last":
+        net = net.to(memory_format=torch.channels_last)  # type: ignore[attr-defined]
     grid, scales = Grid(size), Scales(0.2, 0.03, 0.07, 2.0, 0.003)
     displacement = torch.randn(1, 2, size, size, device=device) * 0.1
     mask = torch.ones(1, 1, size, size, device=device)
 
     @torch.inference_mode()
     def frame() -> None:
-        with torch.autocast(torch.device(device).type, torch.bfloat16, enabled=precision == "bf16"):
+        with torch.autocast(torch.device(device).type, torch.bfloat16, enabled=choice.precision == "bf16"):
             x = channels(displacement, mask, grid.pitch_mm, scales)
-            if layout == "channels_last":
+            if choice.layout == "channels_last":
                 x = x.contiguous(memory_format=torch.channels_last)
-            model(x)
+            net(x)
 
-    times = np.array(list(_timed(frame, repeats if flops(arch, size) < 5e9 else 5, device)))
-    names = {v.arch: k for k, v in PRESETS.items() if v.size == size}
+    cost = flops(arch, size)
+    times = np.array(list(_timed(frame, repeats if cost < LIGHT else 5, device)))
     return {
-        "name": f"{arch.name} w{arch.width} stem{arch.stem} {size} {layout} {precision}",
-        "preset": names.get(arch, ""),
+        "name": choice.name,
+        "preset": choice.preset,
+        "layout": choice.layout,
+        "precision": choice.precision,
         "size": size,
-        "parameters": parameters(build(arch)),
-        "gflop": round(flops(arch, size) / 1e9, 3),
-        "cpu_ms_p50": round(float(np.quantile(times, 0.5)), 3),
-        "cpu_ms_p95": round(float(np.quantile(times, 0.95)), 3),
-        "cpu_ms_least": round(float(times.min()), 3),
+        "parameters": parameters(model),
+        "gflop": round(cost / 1e9, 3),
+        "ms_p50": round(float(np.quantile(times, 0.5)), 3),
+        "ms_p95": round(float(np.quantile(times, 0.95)), 3),
+        "ms_least": round(float(times.min()), 3),
         "frames": len(times),
     }
 
@@ -111,51 +150,99 @@ def _timed(frame: Callable[[], None], repeats: int, device: str) -> Iterator[flo
             yield 1e3 * (time.perf_counter() - start)
 
 
-def _choices(device: str) -> Iterator[tuple[Architecture, int, str, str]]:
-    base = PRESETS["paper"].arch
-    precisions = ("fp32",) if device == "cpu" else ("fp32", "bf16")
-    layouts = ("contiguous", "channels_last")
-    shapes = [(16, 4), (8, 4), (32, 4), (16, 2), (16, 1), (32, 1)]
+def _choices(device: str, trained: dict[tuple[Architecture, int], Interval]) -> Iterator[Choice]:
+    shapes = [(8, 4), (16, 4), (32, 4), (16, 2), (16, 1), (32, 1)]
+    ways = [("contiguous", "fp32"), ("channels_last", "fp32"), ("channels_last", "bf16")]
+    ways = [("quick", "fp32"), *ways] if device == "cpu" else ways
     for (width, stem), size in itertools.product(shapes, (256, 192, 128)):
-        if size % (stem * 16):
+        levels = PRESETS["live"].arch.levels
+        if size % (stem * 2**levels):
             continue
-        arch = Architecture(width=width, stem=stem, levels=base.levels, dropout=0.05)
-        light = flops(arch, size) < 5e9
-        for layout, precision in itertools.product(layouts if light else layouts[:1], precisions):
-            yield arch, size, layout, precision
-    yield Architecture(name="unet"), 256, "contiguous", "fp32"
+        arch = Architecture(width=width, stem=stem, levels=levels, dropout=0.05)
+        for layout, precision in ways if flops(arch, size) < LIGHT else ways[:1]:
+            yield Choice(arch, size, layout, precision)
+    yield Choice(Architecture(name="unet"), 256, ways[0][0])
+    for arch, size in trained:
+        yield Choice(arch, size, ways[0][0])
 
 
-def _shape(arch: Architecture, size: int) -> tuple[Any, ...]:
-    return arch.name, arch.width, arch.stem, arch.levels, size
+def _shape(arch: Architecture) -> tuple[Any, ...]:
+    return arch.name, arch.width, arch.stem, arch.levels
 
 
-def _errors(root: Path) -> dict[tuple[Any, ...], float]:
-    """Mean map RMSE over tested sequences of every network that has runs on ideal flow."""
-    found: dict[tuple[Any, ...], list[float]] = {}
-    for file in sorted(root.glob("ideal/runs/*.json")):
+def _errors(root: Path) -> dict[tuple[Architecture, int], Interval]:
+    """Map RMSE over tested sequences [mN/mm²], with interval, of networks trained alike (MSE, fold and seed
+    0)."""
+    found: dict[tuple[Architecture, int], Interval] = {}
+    for file in sorted([*root.glob("ideal/runs/*.json"), *root.glob("fine/runs/*.json")]):
         run = json_.loads(file.read_text())
-        arch, kind = run["settings"]["arch"], run["settings"]["objective"]["kind"]
-        if run["control"] or kind != "mse":
+        tree = run["settings"]["arch"]
+        if run["control"] or run["settings"]["objective"]["kind"] != "mse" or tree["output"] != "magnitude":
             continue
-        key = (arch["name"], arch["width"], arch["stem"], arch["levels"], run["settings"]["size"])
-        found.setdefault(key, []).append(run["columns"]["known"]["map_rmse"])
-    return {k: float(np.mean(v)) for k, v in found.items()}
+        if not file.stem.endswith("fold0-seed0") or file.stem.startswith(("long", "film")):
+            continue
+        arch = Architecture(**tree | {"bounds": tuple(tree["bounds"])})
+        found[arch, run["settings"]["size"]] = interval(column([run], "map_rmse"), np.random.default_rng(0))
+    return found
 
 
-def _table(rows: list[dict[str, Any]]) -> Table:
-    table = Table(title="A frame, channels included", title_justify="left")
-    for head in ("network", "preset", "parameters [M]", "GFLOP", "p50 [ms]", "p95 [ms]", "map RMSE [mN/mm²]"):
-        table.add_column(head, justify="left" if head in ("network", "preset") else "right")
-    for r in sorted(rows, key=lambda r: float(r["cpu_ms_p50"])):
-        error = "-" if r["map_rmse"] is None else f"{r['map_rmse']:.4f}"
-        table.add_row(
-            r["name"],
-            r["preset"],
-            f"{r['parameters'] / 1e6:.2f}",
-            f"{r['gflop']:.2f}",
-            f"{r['cpu_ms_p50']:.1f}",
-            f"{r['cpu_ms_p95']:.1f}",
-            error,
-        )
-    return table
+def _lines(rows: list[dict[str, Any]]) -> list[dict[str, object]]:
+    return [
+        {
+            "network": r["name"],
+            "preset": r["preset"] or None,
+            "way": f"{r['layout']}, {r['precision']}",
+            "parameters [M]": round(r["parameters"] / 1e6, 2),
+            "GFLOP": r["gflop"],
+            "p50 [ms]": r["ms_p50"],
+            "p95 [ms]": r["ms_p95"],
+            "map RMSE [mN/mm²]": _text(r["map_rmse"]),
+        }
+        for r in sorted(rows, key=lambda r: float(r["ms_p50"]))
+    ]
+
+
+def _text(error: list[float] | None) -> str | None:
+    return None if error is None else f"{error[0]:.4f} [{error[1]:.4f}, {error[2]:.4f}]"
+
+
+def _write(out: Path) -> None:
+    """README.md, chart.png and index.html from every data file there."""
+    parts, panels = [_HEAD], []
+    for file in sorted(out.glob("data-*.json")):
+        result = json_.loads(file.read_text())
+        device, rows = result["machine"]["device"], result["rows"]
+        parts.append(f"## {device}\n\n{markdown(_lines(rows))}\n")
+        scored = [r for r in rows if r["map_rmse"] is not None]
+        if scored:
+            curves = [
+                flow_plot.Curve(
+                    f"{size}² grid",
+                    tuple(r["ms_p50"] for r in own),
+                    tuple(r["map_rmse"][0] for r in own),
+                    tuple(r["name"] for r in own),
+                )
+                for size, own in ((n, [r for r in scored if r["size"] == n]) for n in (64, 128, 256))
+                if own
+            ]
+            title = f"error of the map against time, {device}"
+            panels.append(
+                flow_plot.Panel(
+                    title, "p50 [ms]", "map RMSE [mN/mm²]", tuple(curves), log_x=True, log_y=False
+                )
+            )
+    (out / "README.md").write_text("\n".join(parts))
+    if panels:
+        flow_plot.write(panels, out, "Learn: error against time")
+
+
+_HEAD = """# Learn: time a frame, and error where it was trained
+
+`bench pareto learn`. From displacement on the grid to the force map, channels included, batch norms folded,
+one frame
+at a time; CPU time of one thread on a CPU, wall time on a GPU. `cpu` is the preset that `learn train` takes
+if none is
+named, `live` is `d2fnet-s`. Errors are of the study's runs on fold 0 with MSE (mean over tested sequences,
+BCa
+interval); only those networks have one: the others are too large to train here. Machine: 2 cores, no GPU.
+"""

@@ -9,7 +9,6 @@ bounded heads (low, middle, high force) fused by soft weights. Width 32 on 256²
 from __future__ import annotations
 
 import copy
-import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -267,28 +266,3 @@ def fused(model: nn.Module) -> nn.Module:
                 if isinstance(one, nn.Conv2d) and isinstance(two, nn.BatchNorm2d):
                     block.body[conv], block.body[norm] = fuse_conv_bn_eval(one, two), nn.Identity()
     return quick
-
-
-def parameters(model: nn.Module) -> int:
-    """Number of trained parameters."""
-    return sum(p.numel() for p in model.parameters() if p.requires_grad)
-
-
-def flops(arch: Architecture, size: int) -> float:
-    """Floating-point operations (2 a multiply-add) of the convolutions for one N×N frame."""
-    total = 0
-
-    def count(module: nn.Module, _: tuple[Tensor, ...], out: Tensor) -> None:
-        nonlocal total
-        if isinstance(module, nn.ConvTranspose2d):
-            taps = module.in_channels * math.prod(module.kernel_size) / math.prod(module.stride)
-            total += int(2 * taps * out.numel())
-        elif isinstance(module, nn.Conv2d):
-            total += 2 * module.in_channels * math.prod(module.kernel_size) * out.numel()
-
-    with torch.device("meta"):
-        model = D2FNet(arch).eval()
-        for m in model.modules():
-            m.register_forward_hook(count)
-        model(torch.zeros(1, arch.inputs, size, size), torch.zeros(1, 1))
-    return float(total)

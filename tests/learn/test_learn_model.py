@@ -3,7 +3,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from learn.model import Architecture, D2FNet, flops, fused, parameters
+from learn.cost import flops, parameters
+from learn.model import Architecture, D2FNet, fused
 from learn.quick import Quick
 from learn.settings import PRESETS
 from synth.errors import UserError
