@@ -66,7 +66,7 @@ def _tree(
             nodes,
             parent,
             scattered(extent_mm, spacing, rng),
-            buds=rng.random(grown) < between / (1.3 * spacing),
+            buds=_sprouting(grown, between / (1.3 * spacing), rng),
             step=step,
             reach=9.0,
             kill=0.5 * spacing,
@@ -86,7 +86,7 @@ def _web(arteries: Tree, extent_mm: float, rng: np.random.Generator) -> Tree:
         arteries.nodes,
         arteries.parent,
         scattered(extent_mm, 0.55, rng),
-        buds=rng.random(fixed) < 0.25,
+        buds=_sprouting(fixed, 0.25, rng),
         step=0.13,
         reach=2.4,
         kill=0.27,
@@ -101,6 +101,13 @@ def _web(arteries: Tree, extent_mm: float, rng: np.random.Generator) -> Tree:
     number = np.cumsum(drawn) - 1
     up = np.where(np.arange(len(nodes)) >= fixed, number[parent], -1)
     return Tree(nodes[drawn], up[drawn], radius[drawn])
+
+
+def _sprouting(count: int, share: float, rng: np.random.Generator) -> npt.NDArray[np.bool_]:
+    """A random share of nodes, and one at least: short trunks have few."""
+    buds = rng.random(count) < share
+    buds[count // 2] |= not buds.any()
+    return np.asarray(buds)
 
 
 def _widen(tree: Tree, trunk: Floats) -> Tree:
