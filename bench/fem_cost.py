@@ -34,9 +34,12 @@ def gestures(on: fem_case.Patch, load: float) -> list[Row]:
             volume = mesh.block(fem_case.ANATOMY, fem.tets, fem.order, places)
             carry, system = skin.embedding(volume, on.vertices), assemble(volume, law, tissue.poisson)
             courses = [tool.course(one, _FRAMES) for one in crew_]
-            traction = sum(
-                tool.tractions(one, over, on.vertices, on.area)
-                for one, over in zip(crew_, courses, strict=True)
+            traction = np.sum(
+                [
+                    tool.tractions(one, over, on.vertices, on.area)
+                    for one, over in zip(crew_, courses, strict=True)
+                ],
+                axis=0,
             )
             loads = np.stack([carry.T @ (on.area[:, None] * t) for t in traction])
             start = time.process_time()
@@ -82,9 +85,9 @@ def _sequence(law: str, load: float) -> Row:
 
 
 def _fem(kind: str, load: float) -> job.Fem:
-    if kind == "two instruments":
-        return job.Fem(gestures=("pull", "push"), load=load, instruments=2)
-    return job.Fem.model_validate({"gestures": (kind,), "load": load})
+    several = {"gestures": ("pull", "push"), "instruments": 2}
+    chosen = several if kind == "two instruments" else {"gestures": (kind,)}
+    return job.Fem.model_validate({"load": load} | chosen)
 
 
 def _drawn(fem: job.Fem, law: str) -> tuple[Tissue, tuple[tool.Gesture, ...]]:
