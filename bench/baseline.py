@@ -64,6 +64,7 @@ def physical() -> dict[str, Method]:
     return {
         "zero": Baseline(lambda moved, mask, sure: np.array([0.0, np.nan, np.nan])),
         "Tikhonov, FEM compliance": Baseline(_inverse(inverse.tikhonov)),
+        "Tikhonov near the contact": Baseline(_inverse(inverse.tikhonov_near)),
         "one contact, FEM compliance": Baseline(_inverse(inverse.one_contact)),
     }
 

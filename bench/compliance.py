@@ -40,7 +40,7 @@ class Compliance:
 @lru_cache(maxsize=4)
 def build(
     point_mm: float = 1.0,
-    node_mm: float = 1.6,
+    node_mm: float = 1.2,
     tets: int = 3000,
     poisson: float = 0.4,
     radius_mm: float = 12.0,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from bench import baseline, compliance, inverse
+from bench import baseline, compliance, inverse, inverse_experiment
 from bench.follow import Method, Scene
 from learn.data import Clip
 from synth import job
@@ -86,13 +86,11 @@ def known() -> compliance.Compliance:
     return compliance.build(point_mm=1.5, node_mm=2.0, tets=1500)
 
 
-@pytest.mark.parametrize("solve", [inverse.tikhonov, inverse.one_contact])
-def test_force_across_the_view_with_another_mesh_and_noise(
-    known: compliance.Compliance, solve: object
-) -> None:
-    assert callable(solve)
+@pytest.fixture(scope="module")
+def across(known: compliance.Compliance) -> NDArray[np.float64]:
+    """Displacement at the compliance's points for (30, -40, 0) mN on another mesh, with 0.1 mm of noise."""
     rng = np.random.default_rng(0)
-    volume = mesh.block(job.Anatomy(), 3500, 2)
+    volume = mesh.block(job.Anatomy(), 2500, 2)
     system = assemble(volume, "linear", 0.4)
     xy = np.array([[2.0, -3.0], [2.5, -3.0], [2.0, -2.5], [1.5, -3.0]])
 
@@ -102,12 +100,28 @@ def test_force_across_the_view_with_another_mesh_and_noise(
 
     held = skin.embedding(volume, on(xy)).toarray().mean(axis=0)
     u = skin.embedding(volume, on(known.points)) @ system.solve(np.outer(held, [30.0, 40.0, 0]))
-    seen = (u * [1, -1, -1])[:, :2] + 0.1 * rng.normal(size=(len(known.points), 2))
-    total = solve(known, seen, np.ones(len(known.points)))
+    return np.asarray((u * [1, -1, -1])[:, :2] + 0.1 * rng.normal(size=(len(known.points), 2)))
+
+
+@pytest.mark.parametrize("solve", [inverse.tikhonov, inverse.tikhonov_near, inverse.one_contact])
+def test_force_across_the_view_with_another_mesh_and_noise(
+    known: compliance.Compliance, across: NDArray[np.float64], solve: object
+) -> None:
+    assert callable(solve)
+    total = solve(known, across, np.ones(len(known.points)))
     assert total[:2] == pytest.approx([30, -40], abs=6)
+
+
+def test_one_contact_finds_the_force_along_the_view(known: compliance.Compliance) -> None:
+    forces, fields = inverse_experiment.contacts(known, 3, 3.0, 2500, np.random.default_rng(3))
+    rng = np.random.default_rng(4)
+    for force, field in zip(forces, fields, strict=True):
+        noisy = field + 0.1 * rng.normal(size=field.shape)
+        said = 3.0 * inverse.one_contact(known, noisy, np.ones(len(field)))
+        assert said == pytest.approx(force, abs=0.12 * np.linalg.norm(force) + 4)
 
 
 def test_inverse_of_nothing_is_nothing(known: compliance.Compliance) -> None:
     none = np.zeros((len(known.points), 2))
-    for solve in (inverse.tikhonov, inverse.one_contact):
+    for solve in (inverse.tikhonov, inverse.tikhonov_near, inverse.one_contact):
         assert np.abs(solve(known, none, np.ones(len(none)))).max() < 1e-9
