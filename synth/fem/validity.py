@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 LARGEST_LOAD = {"linear": 0.2, "corotational": 0.2, "stable": 0.4, "neo-hookean": 0.4}
-"""Largest P = F/(E a^2) at which a law is accepted: its worst error there is 5.4%. Neo-Hookean, which the
+"""Largest P = F/(E a^2) at which a law is accepted: its worst error there is 6.2%. Neo-Hookean, which the
 others are measured against, is taken to hold while its stable relative agrees as well with it."""
 
 LAW_ERROR = {
-    "linear": ((0.02, 0.0048), (0.05, 0.0123), (0.1, 0.0254), (0.15, 0.0392), (0.2, 0.0541)),
-    "stable": ((0.05, 0.0032), (0.1, 0.0068), (0.15, 0.0111), (0.2, 0.0159), (0.3, 0.0288), (0.4, 0.0510)),
-    "corotational": ((0.02, 0.0048), (0.05, 0.0118), (0.1, 0.0234), (0.15, 0.0346), (0.2, 0.0508)),
+    "linear": ((0.02, 0.0049), (0.05, 0.0126), (0.1, 0.0260), (0.15, 0.0403), (0.2, 0.0557)),
+    "stable": ((0.05, 0.0033), (0.1, 0.0070), (0.15, 0.0113), (0.2, 0.0163), (0.3, 0.0306), (0.4, 0.0616)),
+    "corotational": ((0.02, 0.0049), (0.05, 0.0119), (0.1, 0.0236), (0.15, 0.0357), (0.2, 0.0532)),
 }
 """Load and error against neo-Hookean, the worst of pushing, pulling and dragging aside, nu 0.4; from
 `bench pareto fem` (docs/results/fem/pareto)."""
