@@ -9,11 +9,13 @@ import pytest
 from pydantic import ValidationError
 from test_fem_deform import ANATOMY, block, patch
 
-from synth import config, job
+from synth import config, job, pipeline, scenario
 from synth.errors import UserError
 from synth.fem import crew, solver
 from synth.fem.material import Tissue
 from synth.fem.tool import Gesture
+from synth.render import camera
+from synth.render.scene import Studio
 
 TISSUE = Tissue(1.0, 0.4, "neo-hookean")
 
@@ -87,6 +89,29 @@ def test_labels_of_two_instruments_add_up_and_both_touch(law: str) -> None:
             for g in gestures
         ]
         np.testing.assert_allclose(motion.displacement, sum(alone), atol=1e-8)
+
+
+def test_the_picture_shows_every_instrument_where_its_load_is() -> None:
+    whole = job.Job(
+        seed=2,
+        frames=5,
+        anatomy=job.Anatomy(vertices=2500),
+        fem=job.Fem(tets=400, load=(0.1, 0.1), instruments=2, gestures=("pull", "push")),
+        render=job.Render(size=(160, 120), spp=1, tilt_deg=0.0),
+    )
+    case = scenario.draw(whole, 0)
+    surface, tets = pipeline.build(whole, case)
+    motion = pipeline.move(whole, case, surface, tets)
+    view = camera.place(case.view, whole.render)
+    studio = Studio(surface, case.look, view, whole, [gesture.kind for gesture in case.gestures])
+    t = int(np.linalg.norm(motion.by_instrument, axis=2).min(axis=1).argmax())
+    moved = motion.rest + motion.displacement[t]
+    shown = np.argwhere(studio.frame(moved, motion.tip[t], motion.shaft[t], 0).tool)[:, ::-1]
+    for gesture in case.gestures:
+        mine = np.linalg.norm(motion.rest[:, :2] - gesture.contacts[0].point_mm, axis=1).argmin()
+        place = camera.project(view, moved[[mine]])[0]
+        reach = 0.5 * gesture.spread_mm + 1.0  # two tips stand on either side of the contact's centre
+        assert np.linalg.norm(shown - place, axis=1).min() * view.mm_per_px < reach
 
 
 def test_a_force_takes_the_place_of_the_load() -> None:
