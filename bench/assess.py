@@ -31,8 +31,10 @@ class Settings:
 
     backend: str = "tvl1"
     """Flow estimator."""
-    shrink: int = 1
-    """Flow is computed on pictures this many times smaller."""
+    shrink: int = 0
+    """Flow is computed on pictures this many times smaller; 0: so that they keep 320 columns."""
+    rate_hz: float | None = 10.0
+    """At most so many frames a second are looked at; None: all."""
 
 
 @dataclass(frozen=True)
@@ -114,6 +116,7 @@ def assess(
         scale.mm_per_px,
         backend=settings.backend,
         shrink=settings.shrink,
+        rate_hz=settings.rate_hz,
         pictured=main,
         progress=progress,
     )

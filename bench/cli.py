@@ -53,7 +53,12 @@ def score(
         Path | None, typer.Option("--out", "-o", help="Folder for score.json and report.html; NAME-score.")
     ] = None,
     flow: Annotated[str, typer.Option(help="Flow estimator, as in a job's flow.backend.")] = "tvl1",
-    shrink: Annotated[int, typer.Option(min=1, max=8, help="Flow on pictures this many times smaller.")] = 1,
+    shrink: Annotated[
+        int, typer.Option(min=0, max=8, help="Flow on pictures this many times smaller; 0: to 320 columns.")
+    ] = 0,
+    rate: Annotated[
+        float, typer.Option(min=0.0, help="At most so many frames a second are looked at; 0: all.")
+    ] = 10.0,
     title: Annotated[str, typer.Option(help="Heading of the report.")] = "",
     train: Annotated[
         Path | None, typer.Option(help="The model's training data: simpler methods are fitted on it too.")
@@ -71,7 +76,7 @@ def score(
         if not (name and sign and folder):
             raise UserError(f"--also {word}: expected NAME=FOLDER")
         others[name] = Path(folder)
-    settings = Settings(backend=flow, shrink=shrink)
+    settings = Settings(backend=flow, shrink=shrink, rate_hz=rate or None)
     result = run.score(recording, model, out, settings, title, train, others)
     _say(result, out or Path(f"{result.recording}-score"), json)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Protocol
@@ -20,6 +21,8 @@ from synth.stopwatch import Stopwatch
 Progress = Callable[[int], None]
 """Told how many frames are done."""
 
+WIDTH_KEPT = 320
+"""Columns that `shrink` 0 leaves a picture at least: the networks' grids are no finer."""
 _MOST_SNAPSHOTS = 64
 _SNAPSHOT_WIDTH = 480
 
@@ -108,6 +111,7 @@ def follow(
     *,
     backend: str = "tvl1",
     shrink: int = 1,
+    rate_hz: float | None = None,
     pictured: str | None = None,
     progress: Progress = lambda done: None,
 ) -> Followed:
@@ -118,7 +122,9 @@ def follow(
         methods: by name.
         scale_mm_per_px: of the recording's own pixels.
         backend: flow estimator.
-        shrink: flow is computed on pictures this many times smaller.
+        shrink: flow is computed on pictures this many times smaller; 0: the most that leaves them
+            `WIDTH_KEPT` columns.
+        rate_hz: at most so many frames a second are looked at; None: all.
         pictured: the method whose force map goes into the snapshots.
         progress: told after every frame.
 
@@ -126,7 +132,7 @@ def follow(
         UserError: unreadable video, no frame with a time, rest frame beyond the end, masks of another size.
     """
     watch, out = Stopwatch(), Followed(force_mn={name: [] for name in methods})
-    walker = _Walker(recording, methods, scale_mm_per_px, backend, shrink, pictured, out, watch)
+    walker = _Walker(recording, methods, scale_mm_per_px, backend, shrink, rate_hz, pictured, out, watch)
     frames = recording.frames()
     seen = 0
     while True:
@@ -158,18 +164,24 @@ class _Walker:
         scale: float,
         backend: str,
         shrink: int,
+        rate_hz: float | None,
         pictured: str | None,
         out: Followed,
         watch: Stopwatch,
     ) -> None:
         self.recording, self.methods, self.out, self.watch = recording, methods, out, watch
-        self.backend, self.shrink, self.pictured = backend, shrink, pictured
-        self.scale = scale * shrink
+        self.backend, self.shrink, self.pictured = backend, 0, pictured
+        self.scale = scale
+        if shrink:
+            self._shrink_by(shrink)
         self.left_out = {
             "before the rest frame": 0,
             "without a time": 0,
             "whose time stands still or runs back": 0,
+            f"beyond {rate_hz or 0:g} a second": 0,
         }
+        self.period = 0.0 if rate_hz is None else 1 / rate_hz
+        self.due = -math.inf
         self.tracker: Tracker | None = None
         self.scene: Scene | None = None
         self.last: NDArray[np.float32] | None = None
@@ -190,7 +202,12 @@ class _Walker:
         elif self.out.time_s and time <= self.out.time_s[-1]:
             self.left_out["whose time stands still or runs back"] += 1
             return
+        if time is not None and not self._is_due(time):
+            self.left_out[f"beyond {1 / self.period:g} a second"] += 1
+            return
         size = picture.rgb.shape[:2]
+        if self.shrink == 0:
+            self._shrink_by(max(1, size[1] // WIDTH_KEPT))
         tool = self.recording.tool(picture.index, size)
         rgb, blocked = self._prepare(picture.rgb, tool)
         if self.tracker is None:
@@ -202,6 +219,18 @@ class _Walker:
                 flow, confidence = self.tracker.step(rgb, blocked)
         if time is not None:
             self._record(picture.index, time, rgb, flow, confidence)
+
+    def _shrink_by(self, shrink: int) -> None:
+        self.shrink, self.scale = shrink, self.scale * shrink
+        if shrink > 1:
+            self.out.notes.append(f"flow is computed on pictures {shrink} times smaller")
+
+    def _is_due(self, time: float) -> bool:
+        """Whether a frame is to be looked at; a tenth of the period early is in time."""
+        if time < self.due - 0.1 * self.period:
+            return False
+        self.due = (time if self.due == -math.inf else max(self.due, time - 0.1 * self.period)) + self.period
+        return True
 
     def _prepare(
         self, rgb: NDArray[np.uint8], tool: NDArray[np.bool_] | None

@@ -20,7 +20,9 @@ from bench.recording import open_recording
 def run(folder: Path, shrink: int = 1) -> Result:
     recording = open_recording(folder)
     found = scale.find(recording.meta, folder)
-    return assess.assess(recording, {"bump": Bump()}, "bump", found, Settings(shrink=shrink), {})
+    return assess.assess(
+        recording, {"bump": Bump()}, "bump", found, Settings(shrink=shrink, rate_hz=None), {}
+    )
 
 
 @pytest.mark.parametrize("footage", ["png", "mp4"])
@@ -38,6 +40,17 @@ def test_shrunken_flow_keeps_its_unit(make: Maker) -> None:
     whole, half = run(folder).methods["bump"].size_mn, run(folder, shrink=2).methods["bump"].size_mn
     # Bump reads pixels, which shrink with the picture: half the displacement in px, hence half the force.
     assert half[3:] == pytest.approx(0.5 * whole[3:], rel=0.2, abs=3)
+
+
+def test_fast_footage_is_thinned_and_large_pictures_shrunk(make: Maker) -> None:
+    folder = make(frames=13, fps=40.0, size=(96, 640))
+    recording = open_recording(folder)
+    found = scale.find(recording.meta, folder)
+    result = assess.assess(recording, {"bump": Bump()}, "bump", found, Settings(), {})
+    assert result.followed.frame == [0, 4, 8, 12]
+    assert result.followed.tissue is not None
+    assert result.followed.tissue.shape == (48, 320)
+    assert "9 of 13 frames beyond 10 a second left out" in result.notes
 
 
 def test_frames_before_rest_are_left_out_and_said(make: Maker) -> None:
