@@ -48,6 +48,8 @@ class Settings:
     """Frames a sequence gives an epoch, drawn anew each epoch; 0 takes all."""
     precision: Literal["32-true", "bf16-mixed"] = "32-true"
     channels_last: bool = False
+    resident: Literal["auto", "yes", "no"] = "auto"
+    """Whether all frames are held by the device and turned there: `auto` on a GPU whose memory is enough."""
     compile: bool = False
     """Whether torch.compile takes the network: worth its minute on a GPU; needs a C++ compiler on a CPU."""
     deterministic: bool = False
@@ -69,6 +71,8 @@ class Settings:
             raise UserError("target 'intensity' has no direction: it needs output 'magnitude'")
         if self.schedule not in ("plateau", "cosine"):
             raise UserError(f"unknown schedule {self.schedule!r}: plateau or cosine")
+        if self.resident not in ("auto", "yes", "no"):
+            raise UserError(f"unknown resident {self.resident!r}: auto, yes or no")
         for name in ("epochs", "batch", "learning_rate", "clip"):
             if not getattr(self, name) > 0:
                 raise UserError(f"{name} {getattr(self, name)}: must be positive")

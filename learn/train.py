@@ -24,9 +24,13 @@ from learn.log import Log
 from learn.loss import SHARES, at, full, gradient_shares, loss
 from learn.metrics import Moments, agreement
 from learn.reference import build
+from learn.resident import held
 from learn.settings import Settings
 from learn.split import Split, groups
 from synth.errors import UserError
+
+LOOK = 16
+"""Steps between two looks at the loss and its gradient: each makes a GPU wait."""
 
 Report = Callable[[int, int, dict[str, float]], None]
 """Told after every batch: batches done, batches there will be, latest numbers."""
@@ -72,7 +76,7 @@ def train(
         plateau.load_state_dict(state["plateau"])
         start, best, waited = state["epoch"], state["best"], state["waited"]
     net, optimizer = fabric.setup(torch.compile(model) if settings.compile else model, optimizer)
-    frames, chooser = Frames(fit, settings), Frames(select, settings)
+    frames, chooser = held(fit, settings, fabric.device), held(select, settings, fabric.device)
 
     with Log(out, start) if fabric.is_global_zero else nullcontext() as write:
         for epoch in range(start, settings.epochs):
@@ -124,6 +128,7 @@ def _epoch(
     whole = settings.batch * fabric.world_size
     batches = max(len(order) // whole, 1)
     net.train()
+    last = 0.0
     means = {k: MeanMetric().to(fabric.device) for k in ("loss", *(f"share_{k}" for k in SHARES))}
     for i in range(batches):
         batch = frames.batch(order[i * whole : (i + 1) * whole][fabric.global_rank :: fabric.world_size])
@@ -140,9 +145,9 @@ def _epoch(
             scales.force,
             None if total is None else (total, batch.force),
         )
-        if not torch.isfinite(terms.sum):
-            raise UserError(f"training diverged in epoch {epoch + 1}: lower --learning-rate")
-        if i % 16 == 0:
+        if i % LOOK == 0:
+            last = float(terms.sum.detach())
+            _finite(last, epoch)
             for k, v in gradient_shares(terms, said).items():
                 means[f"share_{k}"].update(v)
         if settings.schedule == "cosine":
@@ -153,8 +158,15 @@ def _epoch(
         fabric.clip_gradients(net, optimizer, max_norm=settings.clip)
         optimizer.step()
         means["loss"].update(terms.sum.detach())
-        report(epoch * batches + i + 1, settings.epochs * batches, {"loss": float(terms.sum.detach())})
-    return {k: float(m.compute()) for k, m in means.items()}
+        report(epoch * batches + i + 1, settings.epochs * batches, {"loss": last})
+    numbers = {k: float(m.compute()) for k, m in means.items()}
+    _finite(numbers["loss"], epoch)
+    return numbers
+
+
+def _finite(value: float, epoch: int) -> None:
+    if not math.isfinite(value):
+        raise UserError(f"training diverged in epoch {epoch + 1}: lower --learning-rate")
 
 
 def cosine(progress: float, warm: float = 0.05) -> float:
@@ -190,9 +202,16 @@ def select_score(net: Any, frames: Frames, scales: Scales, device: torch.device)
             here = batch.to(device)
             inside = here.mask.bool().expand_as(here.target)
             said, _ = forward(net, here, frames.settings, scales)
-            sums = sums + Moments.of(here.target[inside].cpu().numpy(), said[inside].cpu().numpy())
+            sums = sums + moments(here.target[inside], said[inside])
     result = agreement(sums)
     return {"select_r2": result.r2 if math.isfinite(result.r2) else -math.inf, "select_rmse": result.rmse}
+
+
+def moments(true: torch.Tensor, said: torch.Tensor) -> Moments:
+    """`Moments.of`, summed on the tensors' own device: six numbers come back."""
+    t, p = true.double(), said.double()
+    sums = torch.stack([t.sum(), p.sum(), t @ t, p @ p, t @ p, (p - t).abs().sum()])
+    return Moments(float(t.numel()), *sums.tolist())
 
 
 def _provenance(clips: Sequence[Clip], split: Split) -> tuple[dict[str, list[str]], dict[str, list[str]]]:

@@ -10,14 +10,17 @@ import torch
 from typer.testing import CliRunner
 
 from learn import checkpoint
+from learn.batch import Frames
 from learn.cli import app
 from learn.data import Clip
 from learn.evaluate import unseen
 from learn.loss import SHARES, Objective
+from learn.metrics import Moments
 from learn.predict import load as load_model
+from learn.resident import Resident, held
 from learn.settings import Settings, preset
 from learn.split import Split, nested
-from learn.train import train
+from learn.train import moments, train
 from synth.errors import UserError
 from synth.store import Dataset
 
@@ -239,3 +242,31 @@ def test_nothing_unseen_is_said_so(dataset: Path, tmp_path: Path) -> None:
     done = run(app, ["eval", str(out), str(dataset)])
     assert done.exit_code == 2
     assert "--all scores them anyway" in done.stderr
+
+
+@pytest.mark.parametrize(("output", "confidence"), [("vector", True), ("magnitude", False)])
+def test_frames_held_by_the_device_are_the_same_frames(
+    clips: list[Clip], output: str, confidence: bool
+) -> None:
+    settings = small(input="mixed", resident="yes")
+    arch = dataclasses.replace(settings.arch, output=output, confidence=confidence)
+    settings = dataclasses.replace(settings, arch=arch)
+    streamed, there = Frames(clips, settings), held(clips, settings, torch.device("cpu"))
+    assert isinstance(there, Resident)
+    items = streamed.order(np.random.default_rng(0), 0.5)
+    assert items == there.order(np.random.default_rng(0), 0.5)
+    turns = {item[3] for item in items[:16]}
+    assert len(turns) > 4
+    # Alike turned frames stand together, sources in the order of the settings.
+    order = sorted(items[:16], key=lambda item: (item[3], streamed.sources.index(item[2])))
+    a, b = streamed.batch(order), there.batch(items[:16])
+    for name, value in vars(a).items():
+        if name == "confidence" and not confidence:
+            continue
+        torch.testing.assert_close(getattr(b, name), value, rtol=0, atol=0, msg=name)
+
+
+def test_moments_of_tensors_are_those_of_arrays() -> None:
+    true, said = np.random.default_rng(0).normal(size=(2, 500)).astype(np.float32)
+    got, expected = moments(torch.from_numpy(true), torch.from_numpy(said)), Moments.of(true, said)
+    assert dataclasses.astuple(got) == pytest.approx(dataclasses.astuple(expected))
