@@ -152,7 +152,7 @@ def _moved(
     rising = tool.Gesture(**{**vars(gesture), "timing": (0.02, 1.0, 2.0, 3.0)})
     tets = mesh.block(job.anatomy, job.fem.tets, job.fem.order, tool.focus(gesture))
     return solver.deform(
-        job.fem, job.anatomy.craniotomy, case.tissue, rising, tets, surface.vertices, surface.faces,
+        job.fem, case.tissue, rising, tets, surface.vertices, surface.faces,
         job.frames, job.fps,
     )  # fmt: skip
 

@@ -64,10 +64,10 @@ def sequence(law: str, load: float) -> Row:
 def _sequence(law: str, load: float) -> Row:
     on, fem = fem_case.patch(), _fem("pull", load)
     tissue, (gesture,) = _drawn(fem, law)
-    opening, times = fem_case.ANATOMY.craniotomy, [time.process_time()]
+    times = [time.process_time()]
     volume = mesh.block(fem_case.ANATOMY, fem.tets, fem.order, tool.focus(gesture))
     times.append(time.process_time())
-    solver.deform(fem, opening, tissue, gesture, volume, on.vertices, on.faces, _FRAMES, 25.0)
+    solver.deform(fem, tissue, gesture, volume, on.vertices, on.faces, _FRAMES, 25.0)
     times.append(time.process_time())
     memory = _peak_mb()
     carry = skin.embedding(volume, on.vertices)

@@ -249,9 +249,7 @@ def random_scenes(count: int, tets: int, seed: int, first: int = 0, frames: int 
         gesture = tool.Gesture.draw(fem, fem_case.ANATOMY.craniotomy, tissue, rng)
         try:
             volume = mesh.block(fem_case.ANATOMY, tets, fem.order, tool.focus(gesture))
-            motion = solver.deform(
-                fem, fem_case.ANATOMY.craniotomy, tissue, gesture, volume, on.vertices, on.faces, frames, 25.0
-            )
+            motion = solver.deform(fem, tissue, gesture, volume, on.vertices, on.faces, frames, 25.0)
         except UserError as refusal:
             outcome[type(refusal).__name__] += 1
             refusals.append({"index": index, "kind": gesture.kind, "load": gesture.load, "why": str(refusal)})

@@ -163,7 +163,6 @@ def move(job: Job, case: Scenario, surface: Surface, tets: Tets) -> Deformation:
     """The scenario's gestures, carried out on that surface and volume."""
     return solver.deform(
         job.fem,
-        job.anatomy.craniotomy,
         case.tissue,
         case.gesture,
         tets,

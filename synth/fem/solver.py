@@ -56,7 +56,6 @@ class Deformation:
 
 def deform(
     fem: job.Fem,
-    craniotomy: job.Craniotomy,
     tissue: Tissue,
     gesture: Gesture,
     tets: Tets,
@@ -70,7 +69,6 @@ def deform(
 
     Args:
         fem: the job's section.
-        craniotomy: the opening.
         tissue: stiffness and law.
         gesture: the first instrument's.
         tets: the volume.

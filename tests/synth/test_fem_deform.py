@@ -39,7 +39,7 @@ def block(fem: job.Fem) -> mesh.Tets:
 def run(fem: job.Fem, gesture: Gesture | None = None, seed: int = 5, frames: int = 12) -> Deformation:
     tissue = Tissue.draw(fem, np.random.default_rng(seed))
     gesture = gesture or drawn(fem, tissue, seed)
-    return deform(fem, ANATOMY.craniotomy, tissue, gesture, block(fem), *patch(), frames, 25.0)
+    return deform(fem, tissue, gesture, block(fem), *patch(), frames, 25.0)
 
 
 @pytest.mark.parametrize("law", ["linear", "corotational", "stable", "neo-hookean"])
@@ -134,8 +134,7 @@ def test_motion_depends_on_force_over_stiffness_alone() -> None:
     fem = job.Fem(tets=400)
     soft, stiff = (Tissue(young_kpa=e, poisson=0.4, law="neo-hookean") for e in (1.0, 2.5))
     one, other = (
-        deform(fem, ANATOMY.craniotomy, tissue, drawn(fem, tissue), block(fem), *patch(), 6, 25.0)
-        for tissue in (soft, stiff)
+        deform(fem, tissue, drawn(fem, tissue), block(fem), *patch(), 6, 25.0) for tissue in (soft, stiff)
     )
     np.testing.assert_allclose(one.displacement, other.displacement, rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(2.5 * one.traction, other.traction, rtol=1e-12, atol=1e-15)
