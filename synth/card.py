@@ -73,17 +73,19 @@ def limits(folder: Folder) -> list[str]:
         found.append(
             "Flow is stored in half floats: see `summary.rounding_px` of a sequence for the largest error."
         )
+    if job.fem.time == "quasi-static":
+        found.append(
+            "The motion is quasi-static: within 3% of damped dynamics after a hold of 0.3 s, not before."
+        )
     found += [
-        "The motion is quasi-static: within 3% of damped dynamics after a hold of 0.3 s, not before.",
         "Tissue is homogeneous and isotropic: no membranes, no stiffness of vessels, no bleeding, "
         "breathing or heart beat.",
         "What video alone can tell is traction divided by stiffness: give a method `young_kpa`, or score it "
         "without scale.",
     ]
-    if job.fem.law == "linear" and job.fem.load[1] > 0.05:
-        found.append(
-            f"Linear elasticity is exact to some percent up to P = 0.05; loads go to {job.fem.load[1]:g}."
-        )
+    load = job.fem.largest_load
+    if job.fem.law == "linear" and load > 0.05:
+        found.append(f"Linear elasticity is exact to some percent up to P = 0.05; loads go to {load:.2g}.")
     if job.fem.law == "corotational":
         found.append(
             "The co-rotational law is the paper's; above P = 0.05 it is no better than the linear one."
@@ -96,6 +98,12 @@ def limits(folder: Folder) -> list[str]:
         found.append(f"Linear tetrahedra lock at a Poisson's ratio of {job.fem.poisson:g}.")
     if job.anatomy.mesh is None:
         found.append("The brain is a procedural block: its gyri look right and belong to nobody.")
+    noisy = sorted({"flow_noisy", "intensity"} & set(job.store.extra))
+    if noisy:
+        found.append(
+            f"{' and '.join(noisy)}: the published method's labels with its noise, to compare with; the truth is "
+            "`flow` and `traction`."
+        )
     if job.flow.backend == "ideal":
         found.append(
             "There is no recovered flow: a network trained on this has never seen a tracker's errors."
