@@ -101,8 +101,8 @@ def limits(folder: Folder) -> list[str]:
     noisy = sorted({"flow_noisy", "intensity"} & set(job.store.extra))
     if noisy:
         found.append(
-            f"{' and '.join(noisy)}: the published method's labels with its noise, to compare with; the truth is "
-            "`flow` and `traction`."
+            f"{' and '.join(noisy)}: the published method's labels with its noise, to compare with; truth "
+            "is in `flow` and `traction`."
         )
     if job.flow.backend == "ideal":
         found.append(
