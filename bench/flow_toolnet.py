@@ -51,6 +51,7 @@ def train(scenes: int, out: Path, steps: int, seed: int) -> dict[str, float | in
         "frames": len(training),
         "held_out_frames": len(held),
         "held_out_iou": round(overlap(held, lambda rgb: toolnet.probability(net, rgb) > 0.5), 4),
+        "held_out_iou_with_the_rule": round(overlap(held, lambda rgb: mask.both(rgb, net)), 4),
         "held_out_iou_of_the_rule": round(overlap(held, mask.grey_bodies), 4),
         "parameters": sum(p.numel() for p in net.parameters()),
         "torch": torch.__version__,

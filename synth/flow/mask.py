@@ -10,6 +10,7 @@ from synth.flow import toolnet
 
 _CLIPPED = 240.0  # grey levels: at least two channels this high have no texture left
 _ABOVE = 45.0  # grey levels above the local median
+_SOME = 0.1  # mean probability of a grey body that counts as an instrument
 _SHRINK = 4  # the median is taken on a picture this much smaller: it is smooth
 
 
@@ -39,7 +40,10 @@ def glare(rgb: NDArray[np.uint8], dilate_px: int = 1) -> NDArray[np.bool_]:
 
 
 def tool(rgb: NDArray[np.uint8], dilate_px: int = 2) -> NDArray[np.bool_]:
-    """The instrument: by the U-Net of `toolnet`; without its weights, grey bodies that enter from the border.
+    """The instrument: what the U-Net of `toolnet` finds, and grey bodies that it doesn't rule out.
+
+    The net knows the renderer's instruments; the rule knows only that steel is grey, on any picture.
+    Without weights the rule stands alone.
 
     Args:
         rgb: (H, W, 3) uint8, sRGB.
@@ -49,8 +53,18 @@ def tool(rgb: NDArray[np.uint8], dilate_px: int = 2) -> NDArray[np.bool_]:
         (H, W) bool, True on the instrument.
     """
     net = toolnet.load()
-    found = grey_bodies(rgb) if net is None else toolnet.probability(net, rgb) > 0.5
-    return _grow(found, dilate_px)
+    return _grow(grey_bodies(rgb) if net is None else both(rgb, net), dilate_px)
+
+
+def both(rgb: NDArray[np.uint8], net: toolnet.ToolNet) -> NDArray[np.bool_]:
+    """(H, W): where the net is sure, and whole grey bodies in which it sees some instrument."""
+    probable = toolnet.probability(net, rgb)
+    count, label = cv2.connectedComponents(grey_bodies(rgb).astype(np.uint8))
+    size = np.bincount(label.ravel(), minlength=count)
+    inside = np.bincount(label.ravel(), weights=probable.ravel(), minlength=count)
+    keep = inside > _SOME * size
+    keep[0] = False
+    return np.asarray((probable > 0.5) | keep[label], bool)
 
 
 def blocked(rgb: NDArray[np.uint8]) -> NDArray[np.bool_]:

@@ -70,7 +70,7 @@ class Settings:
     """Where the first guess's gradient [px/px] is this large, lambda doubles: smoothness costs most there."""
     fine_levels: int = 2
     """Levels that the second stage of a cold start, or a warm start, works on."""
-    bold_weight: float = 2.0
+    bold_weight: float = 1.4
     """lambda of the first stage of a cold start: far pulls are steep, and smoothness would hold them back."""
     bold_tau: float = 1.0
     """Primal step of that stage: small, for the coarsest levels have few pixels and must not run away."""
@@ -79,7 +79,14 @@ class Settings:
 
     def bold(self) -> Settings:
         """The first stage of a cold start."""
-        return replace(self, weight=self.bold_weight, tau=self.bold_tau, warps=self.bold_warps, noise=0.0)
+        return replace(
+            self,
+            weight=self.bold_weight,
+            noise=0.0,
+            hidden_huber=0.0,
+            tau=self.bold_tau,
+            warps=self.bold_warps,
+        )
 
 
 class Tvl1:

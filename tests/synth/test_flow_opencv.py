@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import cv2
@@ -10,7 +11,7 @@ import pytest
 
 from bench.flow_scenes import CLEAN, Recipe, Stage, cortex, pairs
 from synth.errors import UserError
-from synth.flow import estimator, mask, opencv, track
+from synth.flow import estimator, mask, opencv, toolnet, track
 from synth.job import Job
 
 
@@ -142,6 +143,22 @@ def test_tool_is_found_without_weights() -> None:
     blocked = mask.blocked(pair.now)
     assert blocked[pair.tool].mean() > 0.8
     assert blocked.mean() < 0.2
+
+
+def test_shipped_weights_are_small_say_what_made_them_and_beat_the_rule() -> None:
+    card = json.loads(toolnet.WEIGHTS.with_suffix(".json").read_text())
+    assert toolnet.WEIGHTS.stat().st_size <= 2_000_000
+    assert "--seed" in card["command"]
+    assert card["held_out_iou"] > card["held_out_iou_of_the_rule"]
+    net = toolnet.load()
+    assert net is not None
+    assert sum(p.numel() for p in net.parameters()) == card["parameters"]
+
+
+def test_without_weights_the_rule_answers(monkeypatch: pytest.MonkeyPatch) -> None:
+    (pair,) = pairs(Recipe(highlights=0.0), 1, 2)
+    monkeypatch.setattr(toolnet, "load", lambda: None)
+    assert mask.tool(pair.now)[pair.tool].mean() > 0.8
 
 
 _PLUGIN = """
