@@ -35,7 +35,7 @@ def gpu(
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for logs and gpu.json.")] = Path(
         "docs/results/gpu"
     ),
-    limit: Annotated[float, typer.Option(help="Longest that one step may take [s].")] = 300.0,
+    limit: Annotated[float, typer.Option(help="Longest that one step may take [s].")] = 900.0,
     json: Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")] = False,
 ) -> None:
     """Checks and times everything that an NVIDIA GPU changes. Exit code 1 if a step fails."""
@@ -53,6 +53,7 @@ def gpu(
 def steps(out: Path) -> Steps:
     """What is run, in order: first whether it is right, then how fast it is."""
     data, model = str(out / "data"), str(out / "model")
+    full = ("--cache", str(out / "labels"), "-o", str(out / "full"), "--accelerator", "cuda")
     return (
         ("doctor", ("-m", "synth", "doctor")),
         ("variants agree", ("-m", "pytest", "-q", "tests/synth/test_render_scene.py")),
@@ -65,6 +66,11 @@ def steps(out: Path) -> Steps:
             "training",
             ("-m", "learn", "train", data, "-o", model, "--accelerator", "cuda", "--input", "mixed"),
         ),
+        (
+            "loading",
+            ("-m", "bench", "experiment", "loading", "--device", "cuda", "-o", str(out / "loading")),
+        ),
+        ("full size", ("-m", "bench", "experiment", "full-size", *full)),
     )
 
 

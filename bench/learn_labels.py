@@ -42,7 +42,7 @@ def clips(
     out = []
     for index in range(job.sequences):
         report(index, job.sequences)
-        name = _key(job, index, fine)
+        name = key(job, index, fine)
         folder = cache / name
         if not folder.is_dir():
             pack(clip(job, index, fine, name), folder)
@@ -79,7 +79,7 @@ def coarser(clip: Clip, grid: Grid, times: int) -> Clip:
 def press(job: Job, index: int, grid: Grid, cache: Path) -> Clip:
     """A push somewhere else on the tissue of a sequence: what calibrates E (`learn.calibrate`)."""
     fine = Grid(max(grid.size, FINE), grid.extent_mm)
-    name = f"{_key(job, index, grid)}-press"
+    name = f"{key(job, index, grid)}-press"
     if not (cache / name).is_dir():
         case = scenario.draw(job, index)
         rng = np.random.default_rng([job.seed, index, _PRESS])
@@ -91,7 +91,7 @@ def press(job: Job, index: int, grid: Grid, cache: Path) -> Clip:
     return unpack(cache / name)
 
 
-def _key(job: Job, index: int, grid: Grid) -> str:
+def key(job: Job, index: int, grid: Grid) -> str:
     """Hash of all that labels depend on: pictures and flow estimators change none of them."""
     parts = job.model_dump(mode="json", include={"seed", "frames", "fps", "anatomy", "fem", "render"})
     described = identity.canonical([_VERSION, parts, index, grid.size, grid.extent_mm])

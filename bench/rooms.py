@@ -46,6 +46,7 @@ COMMANDS: tuple[Command, ...] = (
     Command("experiment", "learn", "bench.learn_experiment", "experiment"),
     Command("stability", "learn", "bench.learn_stability", "stability"),
     Command("experiment", "loading", "bench.learn_loading", "loading"),
+    Command("experiment", "full-size", "bench.learn_full", "full_size"),
     Command("pareto", "learn", "bench.learn_pareto", "pareto"),
     Command("pareto", "fem", "bench.fem_pareto", "pareto"),
     Command("stability", "fem", "bench.fem_stability", "stability"),

@@ -4,11 +4,11 @@ and a file."""
 from __future__ import annotations
 
 import json as json_
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
@@ -17,6 +17,9 @@ from rich.table import Table
 
 from synth.commands import Commands
 from synth.errors import UserError
+
+if TYPE_CHECKING:
+    from learn.statistics import Paired
 
 app = typer.Typer(
     cls=Commands,
@@ -142,6 +145,9 @@ def eval_command(
     input: Annotated[
         str | None, typer.Option(help="ideal, recovered or noisy; as trained if not given.")
     ] = None,
+    against: Annotated[
+        Path | None, typer.Option(help="A second model: paired tests on the sequences neither has seen.")
+    ] = None,
     all: Annotated[bool, typer.Option("--all", help="Also sequences the model was fitted on.")] = False,
     threads: Threads = None,
     cache: Cache = None,
@@ -149,7 +155,7 @@ def eval_command(
 ) -> None:
     """Score a model on the sequences it has not seen; forces in mN."""
     from learn.data import FIELDS, load
-    from learn.evaluate import evaluate, unseen
+    from learn.evaluate import compare, evaluate, unseen
     from learn.predict import load as load_model
     from learn.split import ungrouped
     from learn.threads import set_threads
@@ -165,17 +171,31 @@ def eval_command(
     if predictor.card.settings.share_anatomy:
         clips = ungrouped(clips)
         _console.print("The model was chosen on brains it is scored on: this says nothing of other brains.")
+    other = None if against is None else load_model(against)
     chosen = clips if all else unseen(clips, predictor.card)
+    if other is not None:
+        if other.grid != predictor.grid or other.card.settings.target != predictor.card.settings.target:
+            raise UserError(
+                f"{against}: is of another grid or target than {model}; their maps can't be paired"
+            )
+        chosen = chosen if all else unseen(chosen, other.card)
     if not chosen:
         raise UserError(
             f"{dataset}: the model was fitted or chosen on every sequence here; --all scores them anyway"
         )
     with _bar("Evaluating") as tell:
         report = evaluate(predictor, chosen, source, tell)
+        second = None if other is None else evaluate(other, chosen, source, tell)
+    pairs = {} if second is None else compare(second, report)
     if json:
-        print(json_.dumps({"model": str(model), "input": source, **report.as_dict()}))
+        found = {"model": str(model), "input": source, **report.as_dict()}
+        if second is not None:
+            found["against"] = {"model": str(against), "paired": {k: asdict(v) for k, v in pairs.items()}}
+        print(json_.dumps(found))
         return
     Console().print(_table(report, source, all))
+    if second is not None:
+        Console().print(_pairs(pairs, str(against)))
 
 
 @app.command("predict")
@@ -287,16 +307,34 @@ def _table(report: Any, source: str, seen: bool) -> Table:
         title=f"{len(report.clips)} {which}, {source} flow; mean over sequences", title_justify="left"
     )
     table.add_column("")
-    heads = ("E known", "E taken ×½", "E taken ×2", "E unknown")
+    heads = ("E known [95%]", "E taken ×½", "E taken ×2", "E unknown")
     for head in heads:
         table.add_column(head, justify="right")
-    columns = [report.summary(y) for y in YOUNG]
+    columns, sure = [report.summary(y) for y in YOUNG], report.intervals()
     unit = "mN" if report.card.settings.target == "intensity" else "mN/mm²"
     for key, name, u in _ROWS:
         if key not in columns[0]:
             continue
         label = f"{name} [{unit if u == 'map' else u}]" if u else name
-        table.add_row(label, *(_cell(c.get(key)) for c in columns))
+        cells = [_cell(c.get(key)) for c in columns]
+        if key in sure and sure[key].low == sure[key].low:
+            cells[0] += f" [{_cell(sure[key].low)}, {_cell(sure[key].high)}]"
+        table.add_row(label, *cells)
+    return table
+
+
+def _pairs(pairs: Mapping[str, Paired], against: str) -> Table:
+    """Differences, this model minus the other, sequence by sequence."""
+    table = Table(title=f"against {against}, paired by sequence", title_justify="left")
+    for head in ("", "difference [95%]", "p", "larger on"):
+        table.add_column(head, justify="left" if not head else "right")
+    for key, name, unit in _ROWS:
+        if key in pairs:
+            d, pair = pairs[key].difference, pairs[key]
+            label = f"{name} [{unit}]" if unit else name
+            table.add_row(
+                label, f"{d.mean:+.3g} [{d.low:+.3g}, {d.high:+.3g}]", f"{pair.p:.2g}", f"{pair.wins:.0%}"
+            )
     return table
 
 

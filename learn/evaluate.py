@@ -16,7 +16,7 @@ from learn.data import Clip, amount, target
 from learn.grid import Grid
 from learn.metrics import Moments, agreement, contact_mm, ghost_share, line
 from learn.predict import Predictor, length, total_force
-from learn.statistics import Interval, interval
+from learn.statistics import Interval, Paired, interval, paired
 from synth.errors import UserError
 
 GHOST_MN = 5.0
@@ -275,6 +275,20 @@ def _answers(predictor: Predictor, clip: Clip, source: str, young: Mapping[str, 
         name: (said * np.float32(given), None if head is None else head * given)
         for name, given in young.items()
     }
+
+
+def compare(a: Report, b: Report, young: str = "known", seed: int = 0) -> dict[str, Paired]:
+    """B against A on the same sequences, number by number; numbers that no sequence has from both are left
+    out."""
+    rows, rng = (a.per_clip(young), b.per_clip(young)), np.random.default_rng(seed)
+    if [c.name for c in a.columns[young]] != [c.name for c in b.columns[young]]:
+        raise UserError("paired test: the two models were not scored on the same sequences")
+    out = {}
+    for key in rows[0][0]:
+        one, two = (np.array([row.get(key, math.nan) for row in side]) for side in rows)
+        if np.isfinite(two - one).any():
+            out[key] = paired(one, two, rng)
+    return out
 
 
 def unseen(clips: Sequence[Clip], card: Card) -> list[Clip]:

@@ -2,11 +2,13 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import struct
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from tensorboardX.proto.event_pb2 import Event
 from typer.testing import CliRunner
 
 from learn import checkpoint
@@ -207,8 +209,14 @@ def test_command_line(dataset: Path, tmp_path: Path) -> None:
     assert result["input"] == "recovered"
     assert set(result["columns"]) == {"known", "half", "double", "unknown"}
     assert len(result["sequences"]) == len(checkpoint.read_card(out).split["test"])
-    table = run(app, ["eval", str(out), str(dataset)])
+    table = run(app, ["eval", str(out), str(dataset), "--against", str(out)])
     assert "unseen sequences" in table.output
+    assert "paired by sequence" in table.output
+    done = run(app, ["eval", str(out), str(dataset), "--against", str(out), "--json"])
+    pairs = json.loads(done.stdout)["against"]["paired"]
+    assert pairs["map_rmse"]["difference"]["mean"] == 0
+    assert pairs["map_rmse"]["p"] == 1
+    assert (out / "tensorboard").is_dir()
 
 
 @pytest.mark.parametrize(
@@ -270,3 +278,44 @@ def test_moments_of_tensors_are_those_of_arrays() -> None:
     true, said = np.random.default_rng(0).normal(size=(2, 500)).astype(np.float32)
     got, expected = moments(torch.from_numpy(true), torch.from_numpy(said)), Moments.of(true, said)
     assert dataclasses.astuple(got) == pytest.approx(dataclasses.astuple(expected))
+
+
+def scalars(folder: Path) -> dict[str, list[int]]:
+    """Steps of every scalar in the event files: length, its checksum, the record, its checksum, again and
+    again."""
+    found: dict[str, list[int]] = {}
+    for file in sorted(folder.glob("events*")):
+        data = file.read_bytes()
+        at = 0
+        while at < len(data):
+            (size,) = struct.unpack_from("<Q", data, at)
+            event = Event.FromString(data[at + 12 : at + 12 + size])
+            at += 16 + size
+            for value in event.summary.value:
+                found.setdefault(value.tag, []).append(event.step)
+    return found
+
+
+def test_tensorboard_gets_every_epoch(model: Path) -> None:
+    found = scalars(model / "tensorboard")
+    assert found["select/r2"] == [0, 1, 2, 3]
+    assert {"loss", "lr", "share/error", "share/ghost"} <= set(found)
+
+
+def test_training_stops_early(
+    clips: list[Clip], split: Split, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scores = iter([0.1, 0.5, 0.4, 0.3, 0.2])
+    monkeypatch.setattr("learn.train.select_score", lambda *_: {"select_r2": next(scores)})
+    card = train(clips, split, small(epochs=9, stop=2), tmp_path / "m")
+    assert (card.epoch, card.score) == (2, 0.5)
+    assert len((tmp_path / "m/history.jsonl").read_text().splitlines()) == 4
+
+
+def test_no_epoch_is_chosen_before_the_price_of_ghosts_is_whole(
+    clips: list[Clip], split: Split, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scores = iter([0.9, 0.8, 0.1, 0.2])
+    monkeypatch.setattr("learn.train.select_score", lambda *_: {"select_r2": next(scores)})
+    objective = Objective(kind="hinge", ramp=(0.25, 0.75))
+    assert train(clips, split, small(objective=objective), tmp_path / "m").epoch == 4
