@@ -11,8 +11,9 @@ from test_fem_deform import ANATOMY, block, patch
 
 from synth import config, job, pipeline, scenario
 from synth.errors import UserError
-from synth.fem import crew, solver
+from synth.fem import crew, equilibrium, mesh, solver
 from synth.fem.material import Tissue
+from synth.fem.system import System, assemble
 from synth.fem.tool import Gesture
 from synth.render import camera
 from synth.render.scene import Studio
@@ -84,6 +85,21 @@ def test_labels_of_two_instruments_add_up_and_both_touch(law: str) -> None:
     if law == "linear":
         alone = [solver.deform(fem, tissue, g, tets, *surface, frames, 25.0).displacement for g in gestures]
         np.testing.assert_allclose(motion.displacement, sum(alone), atol=1e-8)
+
+
+def test_a_linear_scene_is_solved_once_for_each_direction_of_load(monkeypatch: pytest.MonkeyPatch) -> None:
+    solved = []
+    solve = System.solve
+    monkeypatch.setattr(System, "solve", lambda self, force: solved.append(1) or solve(self, force))
+    tets = mesh.block(ANATOMY, 400, 2)
+    system = assemble(tets, "linear", 0.4)
+    one, other = np.random.default_rng(0).normal(size=(2, *tets.points.shape))
+    share = np.array([[0.0, 0.0], [0.5, 0.0], [1.0, 0.3], [0.2, 1.0], [0.0, 0.1]])
+    loads = 1e-3 * np.einsum("tk,knd->tnd", share, np.stack([one, other]))
+    moved = equilibrium.follow(system, loads, np.full(5, 0.1)).displacement
+    assert len(solved) == 2
+    for u, load in zip(moved, loads, strict=True):
+        np.testing.assert_allclose(u, solve(system, load), atol=1e-10)
 
 
 def test_the_picture_shows_every_instrument_where_its_load_is() -> None:
