@@ -14,11 +14,13 @@ import sys
 from dataclasses import dataclass
 from typing import Any
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 
 from synth import llvm
 from synth.errors import UserError
+from synth.render import mitsuba_volume
 from synth.render.camera import Camera
 from synth.render.mitsuba_lens import Compiled, Scalar
 from synth.render.shape import Shape, normals
@@ -43,6 +45,10 @@ class Wet:
     """GGX alpha where there is none."""
     index: float = 1.33
     """Refractive index of the coat."""
+    ambient: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Light from all around, as a white diffuser's radiance: what a wound throws into its own shadows."""
+    volume: bool = False
+    """Whether light is followed through the tissue under the coat."""
 
 
 @dataclass(frozen=True)
@@ -217,6 +223,8 @@ def _integrator(kind: str) -> dict[str, Any]:
     if kind == "direct":
         # Lamps are points: what a surface scatters towards by itself never meets one.
         return {"type": "direct", "emitter_samples": 1, "bsdf_samples": 0}
+    if kind.startswith("volume"):
+        return {"type": "volpath", "max_depth": int(kind.removeprefix("volume")), "rr_depth": 40}
     return {"type": "path", "max_depth": int(kind.removeprefix("path"))}
 
 
@@ -238,11 +246,13 @@ def _lamp(mi: Any, lamp: Lamp) -> dict[str, Any]:
 def _mesh(mi: Any, name: str, body: Body) -> Any:
     properties = mi.Properties()
     properties["bsdf"] = mi.load_dict(_material(mi, body.material))
-    metal = body.material if isinstance(body.material, Metal) else None
-    if metal:
+    if isinstance(body.material, Wet) and body.material.volume:
+        under = mitsuba_volume.medium(mi, body.material.albedo, body.vertices)
+        properties["interior"] = mi.load_dict(under)
+    else:
         # Seen, but never chosen as a lamp: its weight is nothing.
-        texture = {"type": "mesh_attribute", "name": "vertex_glow"}
-        properties["glow"] = mi.load_dict({"type": "area", "radiance": texture, "sampling_weight": 0.0})
+        glow = {"type": "area", "radiance": _glow(mi, body.material), "sampling_weight": 0.0}
+        properties["glow"] = mi.load_dict(glow)
     mesh = mi.Mesh(
         name,
         vertex_count=len(body.vertices),
@@ -251,8 +261,8 @@ def _mesh(mi: Any, name: str, body: Body) -> Any:
         has_vertex_texcoords=True,
         props=properties,
     )
-    if metal:
-        mesh.add_attribute("vertex_glow", 3, metal.glow.astype(np.float32).ravel())
+    if isinstance(body.material, Metal):
+        mesh.add_attribute("vertex_glow", 3, body.material.glow.astype(np.float32).ravel())
     parameters = mi.traverse(mesh)
     parameters["vertex_positions"] = body.vertices.astype(np.float32).ravel()
     bent = normals(Shape(body.vertices, body.faces))
@@ -261,6 +271,14 @@ def _mesh(mi: Any, name: str, body: Body) -> Any:
     parameters["vertex_texcoords"] = body.uv.astype(np.float32).ravel()
     parameters.update()
     return mesh
+
+
+def _glow(mi: Any, material: Wet | Metal) -> dict[str, Any]:
+    """Radiance that a body shows of light which no lamp stands for."""
+    if isinstance(material, Metal):
+        return {"type": "mesh_attribute", "name": "vertex_glow"}
+    half = cv2.resize(material.albedo, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+    return _bitmap(mi, half * np.asarray(material.ambient, np.float32))
 
 
 def _material(mi: Any, material: Wet | Metal) -> dict[str, Any]:
@@ -284,6 +302,9 @@ def _material(mi: Any, material: Wet | Metal) -> dict[str, Any]:
                 },
             },
         }
+    if material.volume:
+        bent = material.normal * np.float32(0.5) + np.float32(0.5)
+        return mitsuba_volume.boundary(_bitmap(mi, bent), material.roughness)
     encoded = material.normal * np.float32(0.5) + np.float32(0.5)
     albedo = mi.load_dict(_bitmap(mi, material.albedo))  # once, for both
 

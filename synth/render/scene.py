@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -25,6 +25,8 @@ Map = npt.NDArray[np.float32]
 Mask = npt.NDArray[np.bool_]
 
 _RIM_ROUGHNESS, _RIM_DRY = 0.05, 0.25
+_VOLUME = "volume128"
+_AMBIENT = 0.05  # of the lamps' light comes from everywhere
 _GLARE = 0.35  # specular radiance, as a share of full scale, that hides what is under it
 
 
@@ -174,6 +176,8 @@ class Studio:
         sampler: str = "multijitter",
     ) -> Stage:
         """A Mitsuba stage of this scene with bodies `cortex`, `rim` and `tool`, placed as given."""
+        if self._render.subsurface == "volume":
+            integrator = _VOLUME
         return Stage(
             self.variant,
             self.camera,
@@ -219,18 +223,23 @@ class Studio:
         """Everything in the scene with its material; vertices (V, 3) and (T, 3) mm as given."""
         surface, look = self.surface, self._look
         frame = rim.paint(self.rim, look, texture.resolution(self.rim.extent_mm, 2.2 * self.camera.mm_per_px))
+        r, g, b = (_AMBIENT * look.light.power * light.blackbody(look.light.kelvin)).tolist()
+        ambient = (r, g, b)
+        coat = self._coat.wet(look.roughness, look.dry_roughness, ambient, look.film_index)
+        if self._render.subsurface == "volume":
+            coat = replace(coat, volume=True)
         bodies = {
             "cortex": Body(
                 vertices,
                 surface.faces,
                 surface.uv,
-                self._coat.wet(look.roughness, look.dry_roughness, look.film_index),
+                coat,
             ),
             "rim": Body(
                 self.rim.vertices,
                 self.rim.faces,
                 self.rim.uv,
-                frame.wet(_RIM_ROUGHNESS, _RIM_DRY),
+                frame.wet(_RIM_ROUGHNESS, _RIM_DRY, ambient),
             ),
         }
         if self._tool:

@@ -12,6 +12,7 @@ import numpy.typing as npt
 from synth.errors import UserError
 from synth.render import noise, tube
 from synth.render.anatomy import Surface
+from synth.render.family import Colour
 from synth.render.look import Look
 from synth.render.mitsuba_adapter import Wet
 
@@ -34,9 +35,9 @@ class Coat:
     dry: Map
     """(m, m) share of the surface that has no film."""
 
-    def wet(self, roughness: float, dry_roughness: float, index: float = 1.33) -> Wet:
+    def wet(self, roughness: float, dry_roughness: float, ambient: Colour, index: float = 1.33) -> Wet:
         """As a material."""
-        return Wet(self.albedo, self.normal, self.dry, roughness, dry_roughness, index)
+        return Wet(self.albedo, self.normal, self.dry, roughness, dry_roughness, index, ambient)
 
 
 def resolution(extent_mm: float, mm_per_px: float) -> int:

@@ -66,7 +66,7 @@ def _tree(
             nodes,
             parent,
             scattered(extent_mm, spacing, rng),
-            buds=_sprouting(grown, between / (1.3 * spacing), rng),
+            buds=_sprouting(grown, float(between) / (1.3 * spacing), rng),
             step=step,
             reach=9.0,
             kill=0.5 * spacing,
