@@ -82,6 +82,25 @@ def score(
 
 
 @app.command()
+def pool(
+    scores: Annotated[
+        list[Path], typer.Argument(help="Folders that `bench score` wrote, or their score.json.")
+    ],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the pooled result.")],
+    json: Json = False,
+) -> None:
+    """Scores of several recordings as one: means, intervals over specimens, one table and chart."""
+    import shlex
+    import sys
+
+    from bench import pool as pooling
+
+    tree = pooling.pool(pooling.read(scores))
+    pooling.write(tree, out, shlex.join(["bench", *sys.argv[1:]]))
+    print(json_.dumps(tree) if json else out / "README.md")
+
+
+@app.command()
 def check(
     recording: Annotated[Path, typer.Argument(help="Recording folder.")],
     json: Json = False,
