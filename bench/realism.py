@@ -7,6 +7,7 @@ from typing import Any
 import cv2
 import numpy as np
 import numpy.typing as npt
+from scipy.stats import wasserstein_distance
 
 Picture = npt.NDArray[np.uint8]
 
@@ -23,7 +24,7 @@ def statistics(rgb: Picture) -> dict[str, float]:
     vertical gradients, the share of highlight pixels, and the median and 90th percentile of the areas of
     connected highlights [px].
     """
-    lab = cv2.cvtColor(rgb.astype(np.float32) / 255, cv2.COLOR_RGB2LAB)
+    lab = _lab(rgb)
     found: dict[str, float] = {}
     for k, name in enumerate("Lab"):
         found[f"{name} mean"] = float(lab[..., k].mean())
@@ -34,9 +35,24 @@ def statistics(rgb: Picture) -> dict[str, float]:
     return found
 
 
-def spread(crops: list[Picture]) -> dict[str, tuple[float, float, float]]:
-    """Smallest, median and largest of each statistic over crops."""
-    rows = [statistics(crop) for crop in crops]
+def distances(rgb: Picture, pooled: Picture) -> dict[str, float]:
+    """How far a crop's Lab histograms are from those of pixels (M, 3): earth mover's distance, in Lab."""
+    found = {}
+    for k, name in enumerate("Lab"):
+        ours, theirs = (_lab(picture)[..., k].ravel() for picture in (rgb[::2, ::2], pooled[None]))
+        found[f"{name} histogram"] = float(wasserstein_distance(ours, theirs))
+    return found
+
+
+def pool(crops: list[Picture], count: int = 4000) -> Picture:
+    """Pixels (count, 3) spread evenly over crops."""
+    pixels = np.concatenate([crop.reshape(-1, 3) for crop in crops])
+    return pixels[np.linspace(0, len(pixels) - 1, count).astype(np.int64)]
+
+
+def spread(crops: list[Picture], pooled: Picture) -> dict[str, tuple[float, float, float]]:
+    """Smallest, median and largest of each statistic over crops; histograms against those of `pooled`."""
+    rows = [statistics(crop) | distances(crop, pooled) for crop in crops]
     return {
         name: tuple(float(f([row[name] for row in rows])) for f in (np.min, np.median, np.max))  # type: ignore[misc]
         for name in rows[0]
@@ -53,6 +69,10 @@ def tiles(rgb: Picture, inside: npt.NDArray[np.bool_], side: int, step: int) -> 
             if covered == side * side:
                 crops.append(rgb[y : y + side, x : x + side])
     return crops
+
+
+def _lab(rgb: Picture) -> npt.NDArray[np.float32]:
+    return np.asarray(cv2.cvtColor(rgb.astype(np.float32) / 255, cv2.COLOR_RGB2LAB), np.float32)
 
 
 def _slope(light: npt.NDArray[np.float32]) -> float:

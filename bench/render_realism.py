@@ -29,6 +29,10 @@ def realism_figures(
     family: Annotated[str, typer.Option(help="Appearance family.")] = "healthy",
     seed: Annotated[int, typer.Option(help="Of the rendered job.")] = 11,
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder for figures and sheet.")] = None,
+    beside: Annotated[
+        Path | None,
+        typer.Option(help="Also write the frames and the photograph, at equal scale, as this picture."),
+    ] = None,
     json: Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")] = False,
 ) -> None:
     """Colour, spectrum, gradients and highlights of rendered frames against crops of a photograph."""
@@ -37,7 +41,8 @@ def realism_figures(
 
     pictures, crops, pixel = _rendered(frames, family, seed)
     reference = _photographed(photo, outline, width_mm / pixel)
-    theirs, ours = realism.spread(reference), realism.spread(crops)
+    pooled = realism.pool(reference)
+    theirs, ours = realism.spread(reference, pooled), realism.spread(crops, pooled)
     rows = [
         {
             "statistic": name,
@@ -60,6 +65,8 @@ def realism_figures(
         out.mkdir(parents=True, exist_ok=True)
         (out / "realism.json").write_text(json_.dumps(found, indent=1) + "\n", "utf-8")
         cv2.imwrite(str(out / "sheet.jpg"), _sheet(pictures)[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 88])
+    if beside is not None:
+        cv2.imwrite(str(beside), _beside(pictures, _scaled(photo, width_mm / pixel))[..., ::-1])
     if json:
         print(json_.dumps(found))
         return
@@ -97,18 +104,33 @@ def _rendered(
 
 def _photographed(photo: Path, outline: str, width_px: float) -> list[realism.Picture]:
     """Crops of the photograph inside the outline, at the rendered frames' scale."""
+    image = _scaled(photo, width_px)
+    corners = np.array([[float(v) for v in pair.split(",")] for pair in outline.split()])
+    inside = np.zeros(image.shape[:2], np.uint8)
+    cv2.fillPoly(inside, [np.rint(corners * np.array(image.shape[1::-1])).astype(np.int32)], 1)
+    crops = realism.tiles(image, inside > 0, _SIDE, _STEP)
+    if not crops:
+        raise UserError(f"{photo}: no crop of {_SIDE} px fits inside the outline")
+    return crops
+
+
+def _scaled(photo: Path, width_px: float) -> realism.Picture:
+    """The photograph (H, W, 3) sRGB, `width_px` wide."""
     image = cv2.imread(str(photo), cv2.IMREAD_COLOR)
     if image is None:
         raise UserError(f"{photo}: not a picture that can be read")
     scale = width_px / image.shape[1]
-    image = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)[..., ::-1]
-    corners = np.array([[float(v) for v in pair.split(",")] for pair in outline.split()])
-    inside = np.zeros(image.shape[:2], np.uint8)
-    cv2.fillPoly(inside, [np.rint(corners * np.array(image.shape[1::-1])).astype(np.int32)], 1)
-    crops = realism.tiles(np.ascontiguousarray(image), inside > 0, _SIDE, _STEP)
-    if not crops:
-        raise UserError(f"{photo}: no crop of {_SIDE} px fits inside the outline")
-    return crops
+    small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    return np.ascontiguousarray(small[..., ::-1])
+
+
+def _beside(pictures: list[realism.Picture], photo: realism.Picture) -> realism.Picture:
+    """Frames in a column of two beside the photograph, all at their own size."""
+    pictures = pictures + [np.zeros_like(pictures[0])] * (len(pictures) % 2)
+    left = np.vstack([np.hstack(pictures[k : k + 2]) for k in range(0, len(pictures), 2)])
+    tall = max(len(left), len(photo))
+    parts = [np.pad(part, ((0, tall - len(part)), (0, 0), (0, 0))) for part in (left, photo)]
+    return np.hstack(parts)
 
 
 def _sheet(pictures: list[realism.Picture]) -> realism.Picture:

@@ -7,6 +7,7 @@ import json as json_
 import os
 import subprocess
 import sys
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
@@ -18,9 +19,11 @@ import typer
 from bench import machine
 from bench.render_case import Case, case
 from synth.errors import UserError
-from synth.job import Job
-from synth.render import anatomy
+from synth.job import Job, Render, Sensor
+from synth.render import anatomy, video
+from synth.render.scene import Moment
 from synth.render.shape import Shape
+from synth.render.sway import Sway
 from synth.render.truth import still
 
 _SMALL = {"size": (160, 120)}
@@ -72,8 +75,8 @@ def checked(ours: Case, lift: float = 2.0, **changes: Any) -> dict[str, Any]:
     """
     moved = changes.get("vertices", ours.moved(lift))
     tips, shafts = changes.get("tips", ours.held(lift)), changes.get("shafts", ours.shafts)
-    shot = ours.studio.frame(moved, tips, shafts, 3)
-    rest, lens = ours.studio.still, ours.studio.camera
+    rest, lens = ours.studio.still, changes.get("camera", ours.studio.camera)
+    shot = ours.studio.shoot(Moment(moved, tips, shafts, lens), 3)
     for array in (shot.radiance, shot.flow, shot.depth, rest.area):
         assert np.isfinite(array).all()
     assert not (shot.visible & ~rest.tissue).any()
@@ -126,6 +129,43 @@ def _behind(seed: int) -> dict[str, Any]:
     ours = case(_job(seed), 0)
     towards = ours.studio.camera.centre / np.linalg.norm(ours.studio.camera.centre)
     return checked(ours, tips=np.stack([250 * towards] * 2), shafts=np.stack([towards] * 2))
+
+
+def _overexposed(seed: int) -> dict[str, Any]:
+    """Thirty times too much light: a white picture, and labels as ever."""
+    found = checked(case(_job(seed, sensor={"exposure": 30.0}), 0))
+    assert found["mean_level"] > 200
+    return found
+
+
+def _flat_maps(seed: int) -> dict[str, Any]:
+    """Every vertex at the same place of the maps."""
+    ours = case(_job(seed), 0)
+    ours.studio.surface.uv[:] = 0.5
+    return checked(ours)
+
+
+def _swaying(seed: int) -> dict[str, Any]:
+    """A microscope that drifts 3 mm and vibrates."""
+    ours = case(_job(seed, render={**_SMALL, "drift_mm": 3.0, "vibration_mm": 0.1}), 0)
+    sway = Sway.draw(Render(drift_mm=(3.0, 3.0), vibration_mm=(0.1, 0.1)), np.random.default_rng(seed))
+    return checked(ours, camera=sway.at(ours.studio.camera, 3.7))
+
+
+def _starved(seed: int) -> dict[str, Any]:
+    """A bitrate that leaves nothing: still a film of the right size."""
+    ours = case(_job(seed), 0)
+    film = np.stack([ours.studio.frame(ours.moved(k), ours.held(k), ours.shafts, k).rgb for k in range(3)])
+    back = video.recorded(film, Sensor(bitrate_mbps=0.02, chroma="4:2:0"), 25.0)
+    assert back.shape == film.shape
+    return {"worst_px": 0.0, "mean_level": round(float(back.mean()), 1)}
+
+
+def _no_calibration(seed: int) -> dict[str, Any]:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "lens.yaml"
+        path.write_text("%YAML:1.0\n---\nlens: a good one\n")
+        return _render(seed, calibration=path)
 
 
 def _degenerate(seed: int) -> dict[str, Any]:
@@ -195,6 +235,7 @@ _TRIALS: dict[str, Callable[[int], dict[str, Any]]] = {
     "tool fills the view": _filled_view,
     "tool past the lens": _behind,
     "aperture 30 mm (defocus)": lambda seed: _render(seed, aperture_mm=30.0),
+    "over-exposure": _overexposed,
     "pinhole": lambda seed: _render(seed, aperture_mm=0.0),
     "strong distortion": lambda seed: _render(seed, distortion=(-8.0, 30.0, 0.02, -0.02, 0.0)),
     "folding distortion": lambda seed: _render(seed, distortion=(-200.0, 0.0, 0.0, 0.0, 0.0)),
@@ -204,6 +245,11 @@ _TRIALS: dict[str, Callable[[int], dict[str, Any]]] = {
     "200k vertices": lambda seed: checked(case(_job(seed, anatomy={"vertices": 200_000}), 0)),
     "400 vertices": lambda seed: checked(case(_job(seed, anatomy={"vertices": 400}), 0)),
     "degenerate faces": _degenerate,
+    "degenerate uv": _flat_maps,
+    "drifting, vibrating microscope": _swaying,
+    "calibration that is none": _no_calibration,
+    "glare over everything": lambda seed: checked(case(_job(seed, light={"glare": 1.0}), 0)),
+    "codec at 20 kbit/s": _starved,
     "surface outside the picture": _empty,
     "no surface under the opening": _holes,
     "no LLVM, auto": _no_llvm,

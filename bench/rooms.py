@@ -37,6 +37,7 @@ COMMANDS: tuple[Command, ...] = (
     Command("experiment", "render", "bench.render_cost", "experiment"),
     Command("stability", "render", "bench.render_stability", "stability"),
     Command("pareto", "render", "bench.render_pareto", "pareto"),
+    Command("experiment", "camera-noise", "bench.render_noise", "camera_noise"),
     Command("experiment", "cycles", "bench.render_cycles", "cycles"),
     Command("experiment", "throughput", "bench.render_gpu", "throughput"),
     Command("experiment", "gpu", "bench.gpu", "gpu"),

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from bench.realism import spread, statistics, tiles
+from bench.realism import distances, pool, spread, statistics, tiles
 
 
 def grey(light: np.ndarray) -> np.ndarray:
@@ -42,5 +42,18 @@ def test_tiles_lie_inside_the_mask() -> None:
     assert len(crops) == 5 * 6
     assert min(crop.min() for crop in crops) == 9
     noise = np.random.default_rng(2).integers(80, 160, (3, 128, 128)).astype(float)
-    low, middle, high = spread([grey(light + 10 * k) for k, light in enumerate(noise)])["L mean"]
+    pictures = [grey(light + 10 * k) for k, light in enumerate(noise)]
+    low, middle, high = spread(pictures, pool(pictures))["L mean"]
     assert low < middle < high
+
+
+def test_a_histogram_is_as_far_as_its_brightness() -> None:
+    noise = np.random.default_rng(3).integers(80, 120, (64, 64)).astype(float)
+    same, lighter = (
+        distances(grey(noise), pool([grey(noise)])),
+        distances(grey(noise + 60), pool([grey(noise)])),
+    )
+    assert same["L histogram"] < 0.5
+    lift = statistics(grey(noise + 60))["L mean"] - statistics(grey(noise))["L mean"]
+    assert lighter["L histogram"] == pytest.approx(lift, rel=0.05)
+    assert lighter["a histogram"] < 0.5
