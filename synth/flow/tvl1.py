@@ -30,7 +30,7 @@ from torch import Tensor
 from synth.flow import confidence, image
 from synth.flow.estimator import Flags, Flow, Map, Rgb
 
-_CALMEST = 1.5  # pictures without noise (tests) would ask for no smoothness at all
+_NOISIEST, _CALMEST = 0.45, 1.5  # pictures of much noise, or none, would be smoothed to nothing or not at all
 
 
 @dataclass(frozen=True)
@@ -290,10 +290,10 @@ def step(level: Level, flow: Tensor, dual: Tensor, weight: Tensor, s: Settings) 
 
 
 def calm(residual: Tensor, mask: Tensor, noise: float) -> Tensor:
-    """(noise / median of |r| in the mask) squared, at most `_CALMEST`; 1 if nothing is seen. (B, 1, 1, 1)."""
+    """(noise / median of |r| in the mask) squared, within limits; 1 if nothing is seen. (B, 1, 1, 1)."""
     size = torch.where(mask > 0, residual.norm(dim=1, keepdim=True), torch.nan)[..., ::2, ::2]
     found = torch.nan_to_num(size.flatten(1).nanmedian(dim=1).values, nan=noise)
-    return (noise / found.clamp_min(1e-6)).square().clamp_max(_CALMEST).view(-1, 1, 1, 1)
+    return (noise / found.clamp_min(1e-6)).square().clamp(_NOISIEST, _CALMEST).view(-1, 1, 1, 1)
 
 
 def steepness(flow: Tensor) -> Tensor:
