@@ -118,13 +118,15 @@ def contact(compliance: Compliance, displacement: Floats, weight: Floats) -> tup
     if best <= 0:
         return np.zeros(3), np.zeros(3)
     by_node = compliance.matrix.reshape(len(root), -1, 3)
+    farthest = float(np.linalg.norm(compliance.nodes, axis=1).max())
 
     def fit(place: Floats) -> tuple[float, Floats]:
         """Square of what a contact at x, y of radius exp(third) leaves unexplained, and its force."""
         apart = np.square(compliance.nodes - place[:2]).sum(axis=1) / np.exp(2 * place[2])
         share = np.clip(1 - apart, 0, None) ** 2 * compliance.node_area
         under = np.flatnonzero(share)
-        if len(under) < 3 or not _LOG_RADII[0] < place[2] < _LOG_RADII[1]:
+        inside = np.hypot(*place[:2]) <= farthest and _LOG_RADII[0] < place[2] < _LOG_RADII[1]
+        if len(under) < 3 or not inside:
             return np.inf, np.zeros(3)
         a = np.tensordot(by_node[:, under], share[under] / share.sum(), axes=(1, 0)) * root[:, None]
         gram = a.T @ a

@@ -121,6 +121,16 @@ def test_one_contact_finds_the_force_along_the_view(known: compliance.Compliance
         assert said == pytest.approx(force, abs=0.12 * np.linalg.norm(force) + 4)
 
 
+def test_noise_at_the_edge_leads_nowhere_outside(known: compliance.Compliance) -> None:
+    rng = np.random.default_rng(1)
+    for seen in (np.ones(len(known.points)), (known.points[:, 0] > 9).astype(float)):
+        noise = 0.05 * rng.normal(size=(len(known.points), 2))
+        place, force = inverse.contact(known, noise, seen)
+        assert np.hypot(*place[:2]) <= 12
+        assert np.isfinite(force).all()
+        assert np.isfinite(inverse.tikhonov_near(known, noise, seen)).all()
+
+
 def test_inverse_of_nothing_is_nothing(known: compliance.Compliance) -> None:
     none = np.zeros((len(known.points), 2))
     for solve in (inverse.tikhonov, inverse.tikhonov_near, inverse.one_contact):
