@@ -67,14 +67,14 @@ def full_size(
         list(pool.map(_make, [(job, i, grid, cache) for i in range(sequences)]))
     clips = [unpack(cache / key(job, i, grid)) for i in range(sequences)]
     made = time.perf_counter() - began
-    fabric_kind = "bf16-mixed" if accelerator != "cpu" and torch.cuda.is_available() else "32-true"
+    gpu = accelerator != "cpu" and torch.cuda.is_available()
     base = preset("paper", size=size, epochs=epochs, batch=batch, folds=10, objective=LOSSES[loss])
     settings = replace(
         base,
         arch=replace(base.arch, width=width, stem=stem, output="magnitude"),
         learning_rate=2e-3,
         schedule="cosine",
-        precision=fabric_kind,
+        precision="bf16-mixed" if gpu else "32-true",
         channels_last=True,
         compile=compile,
     )

@@ -65,12 +65,14 @@ def coarser(clip: Clip, grid: Grid, times: int) -> Clip:
 
     cover = blocks(np.asarray(clip.mask))
     mask = (cover > 0.5).astype(np.float32)
-    share = np.where(mask > 0, cover, 1)
+    share = np.where(mask > 0, cover, np.float32(1))
     density = blocks(np.asarray(clip.density))
     return replace(
         clip,
         mask=mask,
-        displacement={k: blocks(np.asarray(v)) / share * mask for k, v in clip.displacement.items()},
+        displacement={
+            k: (blocks(np.asarray(v)) / share * mask).astype(np.float32) for k, v in clip.displacement.items()
+        },
         confidence=blocks(np.asarray(clip.confidence)),
         density=np.stack([settled(d, mask) for d in density]),
     )

@@ -30,7 +30,7 @@ from synth import config
 from synth.errors import UserError
 
 RATES = (5e-4, 2e-3, 1e-2, 5e-2)
-STRAY = (0.0, 8.0, 32.0)
+STRAY = (0.0, 8.0)
 LABEL_NOISE = (0.0, 0.1, 0.3)
 FLOW_NOISE = ((0.005, 0.0), (0.02, 0.0), (0.005, 1.0), (0.02, 1.0), (0.05, 1.0))
 """Size [mm] and blob scale [mm]."""
@@ -57,7 +57,7 @@ def stability(
     parts: dict[str, Callable[[], list[Row]]] = {
         "rates": lambda: _rates(clips, split, folder, seeds, say),
         "labels": lambda: _label_noise(clips, split, folder, say),
-        "gestures": lambda: _gestures(clips, split, folder, cache / "models/ideal/mse-fold0-seed0"),
+        "gestures": lambda: _gestures(clips, split, folder),
         "confidence": lambda: _confidence(clips, split, folder),
         "shown": lambda: _shown(clips, split, cache / "models/ideal/mse-fold0-seed0"),
         "bad-input": lambda: bad_inputs(cache / "models/ideal/mse-fold0-seed0", folder / "bad"),
@@ -159,15 +159,15 @@ def _label_noise(clips: list[Clip], split: Split, folder: Path, say: Say) -> lis
     return rows
 
 
-def _gestures(clips: list[Clip], split: Split, folder: Path, usual: Path) -> list[Row]:
+def _gestures(clips: list[Clip], split: Split, folder: Path) -> list[Row]:
     seen = {
         side: tuple(i for i in getattr(split, side) if clips[i].gesture not in UNSEEN)
         for side in ("fit", "select")
     }
     without = Split(seen["fit"], seen["select"], split.test)
     models = {
-        "seen": load(usual),
-        f"without {', '.join(UNSEEN)}": _fit(clips, without, small(), folder / "unseen"),
+        "seen": _fit(clips, split, replace(small(), epochs=4), folder / "seen"),
+        f"without {', '.join(UNSEEN)}": _fit(clips, without, replace(small(), epochs=4), folder / "unseen"),
     }
     rows = []
     for gesture in sorted({c.gesture for c in clips}):

@@ -107,7 +107,8 @@ def _arrays(path: Path) -> Motion:
         raise UserError(f"{path}: lacks {', '.join(sorted(missing))}")
     flow, tissue = found["flow"].astype(np.float32), found["tissue"].astype(bool)
     if flow.ndim != 4 or flow.shape[1:] != (*tissue.shape, 2):
-        raise UserError(f"{path}: flow is {flow.shape}, expected (T, {tissue.shape}, 2) like the tissue")
+        h, w = tissue.shape
+        raise UserError(f"{path}: flow is {flow.shape}, expected (T, {h}, {w}, 2) like the tissue")
     confidence = found.get("confidence")
     if confidence is not None and confidence.shape != flow.shape[:3]:
         raise UserError(f"{path}: confidence is {confidence.shape}, expected {flow.shape[:3]}")
@@ -153,8 +154,9 @@ def apply(predictor: Predictor, motion: Motion, young_kpa: float | None = None) 
     }
     if density.shape[1] == 3:
         out["force_mn"] = density.astype(np.float64).sum((2, 3)) * predictor.grid.pitch_mm**2
-    if maps[0].head_mn is not None:
-        out["head_mn"] = np.stack([m.head_mn for m in maps])
+    heads = [m.head_mn for m in maps if m.head_mn is not None]
+    if heads:
+        out["head_mn"] = np.stack(heads)
     return out
 
 

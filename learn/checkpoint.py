@@ -72,7 +72,8 @@ def load_tensors(file: Path) -> dict[str, Any]:
     try:
         tree = torch.load(file, map_location="cpu", weights_only=True)
     except (RuntimeError, EOFError, ValueError, KeyError, pickle.UnpicklingError, OSError) as error:
-        raise UserError(f"{file}: corrupt checkpoint ({str(error).splitlines()[0]})") from None
+        why = str(error).splitlines()[0].split(". ")[0]
+        raise UserError(f"{file}: corrupt checkpoint ({why})") from None
     if not isinstance(tree, dict):
         raise UserError(f"{file}: corrupt checkpoint (holds no state)")
     return tree

@@ -152,8 +152,9 @@ def settled(amount: NDArray[np.float32], mask: NDArray[np.float32]) -> NDArray[n
     rows, cols = np.nonzero(~inside & (amount != 0).any(0))
     if rows.size:
         near = ndimage.distance_transform_edt(~inside, return_distances=False, return_indices=True)
-        to = (slice(None), near[0][rows, cols], near[1][rows, cols])
-        np.add.at(out, to, amount[:, rows, cols])
+        to = near[0][rows, cols], near[1][rows, cols]
+        for plane, lost in zip(out, amount[:, rows, cols], strict=True):
+            np.add.at(plane, to, lost)
     return out
 
 
