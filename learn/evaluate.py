@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, astuple, dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +17,7 @@ from learn.data import Clip, amount, target
 from learn.grid import Grid
 from learn.metrics import Moments, agreement, contact_mm, ghost_share, line
 from learn.predict import Predictor, length, total_force
-from learn.statistics import Interval, Paired, interval, paired
+from learn.statistics import Interval, Paired, interval, paired, pooled_r2
 from synth.errors import UserError
 
 GHOST_MN = 5.0
@@ -155,10 +156,13 @@ class Report:
         return out
 
     def intervals(self, young: str = "known", seed: int = 0) -> dict[str, Interval]:
-        """Mean and BCa bootstrap interval over sequences of every per-sequence number."""
+        """Mean and BCa interval over sequences of every per-sequence number, and of the pooled R²."""
         rows = self.per_clip(young)
         rng = np.random.default_rng(seed)
-        return {k: interval(np.array([r[k] for r in rows]), rng) for k in rows[0]}
+        out = {k: interval(np.array([r[k] for r in rows]), rng) for k in rows[0]}
+        out["map_r2_pooled"] = pooled_r2(_sums(c.map for c in self.columns[young]), rng)
+        forces = (Moments.of(c.true_mn, c.said_mn) for c in self.columns[young])
+        return out | {"force_r2_pooled": pooled_r2(_sums(forces), rng)}
 
     def bands(self) -> list[dict[str, float]]:
         """Errors of the total force in four bands of true force, as shares of the training data's largest."""
@@ -184,7 +188,15 @@ class Report:
     def as_dict(self) -> dict[str, object]:
         """JSON-ready; NaN as null."""
         return {
-            "sequences": [{"name": c.name, "young_kpa": c.young_kpa, **_plain(_row(c))} for c in self.clips],
+            "sequences": [
+                {
+                    "name": c.name,
+                    "young_kpa": c.young_kpa,
+                    **_plain(_row(c)),
+                    "map_moments": list(astuple(c.map)),
+                }
+                for c in self.clips
+            ],
             "columns": {young: _plain(self.summary(young)) for young in self.columns},
             "intervals": {k: _plain({"low": i.low, "high": i.high}) for k, i in self.intervals().items()},
             "bands": [_plain(b) for b in self.bands()],
@@ -216,12 +228,16 @@ def _row(c: ClipScore) -> dict[str, float]:
     return row
 
 
+def _sums(moments: Iterable[Moments]) -> NDArray[np.float64]:
+    return np.array([astuple(m)[:6] for m in moments])
+
+
 def _mean(values: Sequence[float]) -> float:
     good = [v for v in values if math.isfinite(v)]
     return float(np.mean(good)) if good else math.nan
 
 
-def _plain(row: dict[str, float]) -> dict[str, float | None]:
+def _plain(row: dict[str, float]) -> dict[str, Any]:
     return {k: v if math.isfinite(v) else None for k, v in row.items()}
 
 

@@ -39,18 +39,42 @@ def interval(values: Floats, rng: np.random.Generator, level: float = 0.95, draw
         return Interval(nan, nan, nan, 0)
     if v.size < 3 or np.ptp(v) == 0:
         return Interval(float(v.mean()), nan, nan, int(v.size))
-    mean = float(v.mean())
     boot = v[rng.integers(0, v.size, (draws, v.size))].mean(axis=1)
+    return _bca(float(v.mean()), boot, (v.sum() - v) / (v.size - 1), level)
+
+
+def pooled_r2(moments: Floats, rng: np.random.Generator, level: float = 0.95, draws: int = 4000) -> Interval:
+    """R² over everything that the sequences hold together, and its BCa interval over sequences.
+
+    `moments`: (n, 6), the first six of each sequence's `learn.metrics.Moments`: count, sums of t, p, tt, pp
+    and tp. With fewer than three sequences there is no interval (NaN).
+    """
+
+    def r2(m: Floats) -> Floats:
+        n, t, _, tt, pp, tp = np.moveaxis(m, -1, 0)
+        return np.asarray(1 - (pp - 2 * tp + tt) / (tt - t**2 / n), np.float64)
+
+    m = np.asarray(moments, np.float64)
+    whole = m.sum(axis=0)
+    if len(m) < 3:
+        return Interval(float(r2(whole)), float("nan"), float("nan"), len(m))
+    times = rng.multinomial(len(m), np.full(len(m), 1 / len(m)), draws)
+    out = _bca(float(r2(whole)), r2(times @ m), r2(whole - m), level)
+    return Interval(out.mean, out.low, out.high, len(m))
+
+
+def _bca(value: float, boot: Floats, left_out: Floats, level: float) -> Interval:
+    """The interval of a statistic from its bootstrap draws and its leave-one-out values."""
+    draws = len(boot)
     # Ties count half, else few sequences or a spike of equal values tilt the bias correction.
-    below = (boot < mean).mean() + 0.5 * (boot == mean).mean()
+    below = (boot < value).mean() + 0.5 * (boot == value).mean()
     z0 = stats.norm.ppf(np.clip(below, 1 / draws, 1 - 1 / draws))
-    left_out = (v.sum() - v) / (v.size - 1)
     d = left_out.mean() - left_out
     spread = float((d**2).sum())
     acceleration = float((d**3).sum() / (6 * spread**1.5)) if spread > 0 else 0.0
     z = z0 + stats.norm.ppf([(1 - level) / 2, (1 + level) / 2])
     low, high = np.quantile(boot, stats.norm.cdf(z0 + z / (1 - acceleration * z)))
-    return Interval(mean, float(low), float(high), int(v.size))
+    return Interval(value, float(low), float(high), len(left_out))
 
 
 @dataclass(frozen=True)

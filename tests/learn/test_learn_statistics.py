@@ -1,10 +1,13 @@
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 from scipy import stats
 
-from learn.statistics import interval, paired
+from learn.metrics import Moments
+from learn.statistics import interval, paired, pooled_r2
 from learn.train import cosine
 from synth.errors import UserError
 
@@ -52,6 +55,27 @@ def test_paired_finds_a_shift_and_does_not_invent_one(n: int) -> None:
 def test_exact_p_by_hand() -> None:
     # Three positive differences: only +++ and --- are as extreme, of eight.
     assert paired(np.zeros(3), np.array([1.0, 2.0, 3.0]), rng()).p == pytest.approx(0.25)
+
+
+def test_pooled_r2_is_that_of_everything_together_and_its_interval_that_of_scipy() -> None:
+    draw = np.random.default_rng(5)
+    true = [draw.normal(size=50) * scale for scale in draw.gamma(2, 1, 20)]
+    said = [t + draw.normal(size=50) * 0.5 for t in true]
+    sums = np.array([dataclasses.astuple(Moments.of(t, p))[:6] for t, p in zip(true, said, strict=True)])
+    got = pooled_r2(sums, rng(), draws=8000)
+    t, p = np.concatenate(true), np.concatenate(said)
+    assert got.mean == pytest.approx(1 - ((t - p) ** 2).sum() / ((t - t.mean()) ** 2).sum())
+
+    def r2(i: np.ndarray) -> float:
+        t, p = np.concatenate([true[k] for k in i]), np.concatenate([said[k] for k in i])
+        return float(1 - ((t - p) ** 2).sum() / ((t - t.mean()) ** 2).sum())
+
+    theirs = stats.bootstrap(
+        (np.arange(20),), r2, n_resamples=2000, method="BCa", vectorized=False, rng=rng()
+    )
+    assert got.low == pytest.approx(theirs.confidence_interval.low, abs=0.02)
+    assert got.high == pytest.approx(theirs.confidence_interval.high, abs=0.02)
+    assert np.isnan(pooled_r2(sums[:2], rng()).low)
 
 
 def test_unequal_lengths() -> None:
