@@ -9,7 +9,9 @@ from typing import Any
 import numpy as np
 
 from bench.learn_runs import column
-from learn.statistics import Interval, interval, paired
+from bench.learn_table import markdown
+from learn.loss import SHARES
+from learn.statistics import Interval, interval, paired, pooled_r2
 
 _COLUMNS = (
     ("map_r2", "map R²"),
@@ -40,6 +42,13 @@ def write(out: Path) -> None:
         found = runs(folder)
         if found:
             parts += [f"## {folder.name}", "", *_table(found), "", *_tests(found), ""]
+            for title, rows in (
+                ("What is known of E", _stiffness(found)),
+                ("Controls, of the trained models", _controls(found)),
+                ("Each term's share of the gradient on the map, first and last epoch", _gradient(found)),
+                ("Total force by band of true force (shares of the largest in training)", _bands(found)),
+            ):
+                parts += [f"### {title}", "", markdown(rows), ""] if rows else []
     head = (out / "HEAD.md").read_text() if (out / "HEAD.md").is_file() else "# Learn: results\n"
     (out / "README.md").write_text(head + "\n" + "\n".join(parts))
 
@@ -52,9 +61,82 @@ def _table(found: list[dict[str, Any]]) -> list[str]:
         group = [r for r in found if family(r["name"]) == name]
         pooled = [[r["columns"]["known"][k] for r in group] for k in ("map_r2_pooled", "force_r2_pooled")]
         cells = [_text(interval(_per_sequence(group, k), np.random.default_rng(0))) for k, _ in _COLUMNS]
-        means = " | ".join(f"{np.mean(p):.3f}" for p in pooled)
+        sure = _pooled(group)
+        means = f"{sure if sure else f'{np.mean(pooled[0]):.3f}'} | {np.mean(pooled[1]):.3f}"
         lines.append(f"| {name} ({len(group)}) | {means} | " + " | ".join(cells) + " |")
     return lines
+
+
+def _pooled(group: list[dict[str, Any]]) -> str:
+    """R² over all cells of all tested sequences, each tested once: folds together, the mean over seeds."""
+    seeds: dict[str, list[list[float]]] = {}
+    for r in group:
+        if any("map_moments" not in s for s in r["sequences"]):
+            return ""
+        seeds.setdefault(r["name"].split("-seed")[-1], []).extend(
+            s["map_moments"][:6] for s in r["sequences"]
+        )
+    found = [pooled_r2(np.array(m), np.random.default_rng(0)) for m in seeds.values()]
+    return _text(Interval(*np.mean([(i.mean, i.low, i.high) for i in found], axis=0), n=found[0].n))
+
+
+def _stiffness(found: list[dict[str, Any]]) -> list[dict[str, object]]:
+    """Every E column of the runs that were also scored with a calibration press."""
+    rows: list[dict[str, object]] = []
+    for r in (r for r in found if "press" in r["columns"]):
+        for young, c in r["columns"].items():
+            row: dict[str, object] = {"run": r["name"], "E": young}
+            row |= {"force R²": c["force_r2_pooled"], "force MAE [mN]": c["force_mae"]}
+            rows.append(row | {"map R²": c["map_r2_pooled"], "E off, median": None})
+        rows[-1]["E off, median"] = f"{r['press_young_off']:.0%}"
+    return rows
+
+
+def _controls(found: list[dict[str, Any]]) -> list[dict[str, object]]:
+    heads = {"map_r2_pooled": "map R²", "force_r2_pooled": "force R²", "map_rmse": "map RMSE [mN/mm²]"}
+    heads |= {"ghost_relative": "ghost area"}
+    rows: list[dict[str, object]] = []
+    for r in found:
+        if r["name"] in _SHOWN:
+            rows += [
+                {"run": r["name"], "control": k} | {heads[h]: v[h] for h in heads}
+                for k, v in r["controls"].items()
+            ]
+        if r["control"]:
+            known = r["columns"]["known"]
+            rows.append({"run": r["name"], "control": r["control"]} | {heads[h]: known[h] for h in heads})
+    return rows
+
+
+def _gradient(found: list[dict[str, Any]]) -> list[dict[str, object]]:
+    rows: list[dict[str, object]] = []
+    for r in (
+        r for r in found if r["name"].endswith("fold0-seed0") and r["settings"]["objective"]["kind"] != "mse"
+    ):
+        ends = r["history"][0], r["history"][-1]
+        rows.append(
+            {"run": r["name"]} | {k: " → ".join(f"{e[f'share_{k}']:.0%}" for e in ends) for k in SHARES}
+        )
+    return rows
+
+
+def _bands(found: list[dict[str, Any]]) -> list[dict[str, object]]:
+    return [
+        {
+            "run": r["name"],
+            "band": f"{b['from']:.2f} to {b['to']:.2f}",
+            "frames": int(b["frames"]),
+            "MAE [mN]": b["mae_mn"],
+            "bias [mN]": b["bias_mn"],
+        }
+        for r in found
+        if r["name"] in _SHOWN
+        for b in r["bands"]
+    ]
+
+
+_SHOWN = ("mse-fold0-seed0", "hinge-fold0-seed0", "long-fold0-seed0")
+"""Runs that the detailed tables are of."""
 
 
 def _per_sequence(group: list[dict[str, Any]], key: str) -> np.ndarray[Any, np.dtype[np.float64]]:
@@ -92,10 +174,14 @@ def _tests(found: list[dict[str, Any]]) -> list[str]:
 
 
 _AGAINST = (
-    ("mse", "antighost"),
+    ("mse", "hinge"),
     ("mse", "published"),
+    ("mse", "hinge-mse"),
+    ("mse", "antighost"),
+    ("antighost", "antighost-frame"),
     ("mse", "stem4"),
     ("mse", "unet"),
+    ("mse", "monai-unet"),
     ("mse", "vector"),
     ("ideal-on-recovered", "recovered"),
     ("ideal-on-recovered", "mixed"),
