@@ -7,6 +7,7 @@ loads across the view can imitate it, so the smooth prior answers badly along th
 from __future__ import annotations
 
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +23,9 @@ _ALONG_VIEW = 5.0
 """Loads along the view are let be this much larger a priori, as in depth-weighted minimum-norm imaging."""
 _RADII_MM = (3.0, 4.0, 5.0, 6.0)
 _LOG_RADII = (np.log(2.0), np.log(9.0))
+_CORRELATED = 3.0
+"""Degrees of freedom count so much more in cross-validation, for errors of flow that go together (Cummins,
+Filloon and Nychka, J. Amer. Stat. Assoc. 2001, with 1.4)."""
 _SMOOTH_MM = 4.0
 _NEAR_MM, _NEAR_SMOOTH_MM = 3.0, 3.0
 
@@ -40,9 +44,9 @@ def tikhonov(compliance: Compliance, displacement: Floats, weight: Floats) -> Fl
     Returns:
         (3,) mN for E = 1 kPa, camera axes.
     """
-    # Loads 4 mm wide overlap so much that every other node carries them as well.
-    every_other = np.round(compliance.nodes / _spacing(compliance)).sum(axis=1) % 2 == 0
-    return _smallest(compliance, displacement, weight, _SMOOTH_MM, every_other.astype(np.float64))
+    # Loads 4 mm wide overlap so much that every other row and column of nodes carries them as well.
+    sparse = (np.round(compliance.nodes / _spacing(compliance)) % 2 == 0).all(axis=1)
+    return _smallest(compliance, displacement, weight, _SMOOTH_MM, sparse.astype(np.float64))
 
 
 def tikhonov_near(compliance: Compliance, displacement: Floats, weight: Floats) -> Floats:
@@ -61,7 +65,7 @@ def _smallest(
     compliance: Compliance, displacement: Floats, weight: Floats, smooth_mm: float, prior: Floats
 ) -> Floats:
     """Tikhonov's answer with loads `smooth_mm` wide at the nodes, `prior` their standard deviations."""
-    used = prior > 1e-3
+    used = prior > 0.05
     root = np.sqrt(np.tile(weight, 2))
     size = np.array([1.0, 1.0, _ALONG_VIEW]) * prior[used, None]
     a = (atoms(compliance, smooth_mm)[:, used] * size).reshape(len(root), -1) * root[:, None]
@@ -74,7 +78,8 @@ def _smallest(
     n = 2 * float((weight > 0).sum())
     levels = np.maximum(_RATIOS * values[-1], 1e-30)
     damp = levels[:, None] / (values + levels[:, None])
-    score = (outside + (inside * damp**2).sum(axis=1)) / np.maximum(n - (1 - damp).sum(axis=1), 1e-9) ** 2
+    free = np.maximum(n - _CORRELATED * (1 - damp).sum(axis=1), 1e-9)
+    score = (outside + (inside * damp**2).sum(axis=1)) / free**2
     x = vectors @ (projected / (values + levels[int(np.argmin(score))]))
     return np.asarray((x.reshape(-1, 3) * size).sum(axis=0), np.float64)
 
@@ -101,8 +106,20 @@ def one_contact(compliance: Compliance, displacement: Floats, weight: Floats) ->
 def contact(compliance: Compliance, displacement: Floats, weight: Floats) -> tuple[Floats, Floats]:
     """The contact of `one_contact`: (3,) x, y [mm] and the logarithm of its radius, and (3,) its force.
 
-    Without any motion it stands in the middle and carries nothing.
+    Without any motion it stands in the middle and carries nothing. The last answer is remembered: two of the
+    baselines ask for the same one.
     """
+    key = (id(compliance), displacement.tobytes(), weight.tobytes())
+    if _LAST.get("key") != key:
+        _LAST.update(key=key, found=_contact(compliance, displacement, weight))
+    place, force = _LAST["found"]
+    return place, force
+
+
+_LAST: dict[str, Any] = {}
+
+
+def _contact(compliance: Compliance, displacement: Floats, weight: Floats) -> tuple[Floats, Floats]:
     root = np.tile(np.sqrt(weight), 2)
     u = displacement.T.ravel() * root
     best, start = 0.0, np.zeros(3)

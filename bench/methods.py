@@ -22,6 +22,7 @@ class Model:
         from learn.predict import load
 
         self.predictor: Predictor = load(folder)
+        self._rest: tuple[int, NDArray[np.float64]] | None = None
 
     def described(self) -> dict[str, object]:
         """What the model is, for the report."""
@@ -38,7 +39,19 @@ class Model:
     def __call__(
         self, flow: NDArray[np.float32], confidence: NDArray[np.float32], scene: Scene, picture: bool
     ) -> Answer:
-        """See `Method`."""
+        """See `Method`. What it says of the rest frame, where nothing has moved, is taken off: a tare."""
+        said, density = self._say(flow, confidence, scene, picture)
+        if self._rest is None or self._rest[0] != id(scene):
+            still = np.zeros_like(flow), scene.tissue.astype(np.float32)
+            self._rest = id(scene), self._say(*still, scene, False)[0]
+        force = said - self._rest[1]
+        if np.isnan(force[1:]).all():
+            force[0] = max(force[0], 0.0)
+        return Answer(force, density)
+
+    def _say(
+        self, flow: NDArray[np.float32], confidence: NDArray[np.float32], scene: Scene, picture: bool
+    ) -> tuple[NDArray[np.float64], NDArray[np.float32] | None]:
         said = self.predictor(flow, scene.tissue, scene.scale_mm_per_px, scene.young_kpa, confidence)
         # The model's own typical E would make the number depend on its training data.
         per_kpa = 1.0 if scene.young_kpa is not None else 1.0 / said.young_kpa
@@ -46,4 +59,4 @@ class Model:
         if force is None:
             force = np.array([said.total_force_mn, np.nan, np.nan])
         density = (per_kpa * said.to_image()).astype(np.float32) if picture else None
-        return Answer(per_kpa * force, density)
+        return np.asarray(per_kpa * force, np.float64), density
