@@ -61,12 +61,13 @@ class Baseline:
 
 def physical() -> dict[str, Method]:
     """Those that need no training data."""
-    return {
-        "zero": Baseline(lambda moved, mask, sure: np.array([0.0, np.nan, np.nan])),
-        "Tikhonov, FEM compliance": Baseline(_inverse(inverse.tikhonov)),
-        "Tikhonov near the contact": Baseline(_inverse(inverse.tikhonov_near)),
-        "one contact, FEM compliance": Baseline(_inverse(inverse.one_contact)),
+    rules = {
+        "Tikhonov, FEM compliance": inverse.tikhonov,
+        "Tikhonov near the contact": inverse.tikhonov_near,
+        "one contact, FEM compliance": inverse.one_contact,
     }
+    zero: Method = Baseline(lambda moved, mask, sure: np.array([0.0, np.nan, np.nan]))
+    return {"zero": zero} | {name: Baseline(_inverse(rule)) for name, rule in rules.items()}
 
 
 def fitted(clips: Sequence[Clip], source: str, seed: int = 0) -> dict[str, Method]:

@@ -20,7 +20,7 @@ from synth.fem.system import assemble
 Floats = NDArray[np.float64]
 
 # World (z out of the brain) to camera (x right, y down, z forward) for a camera straight above.
-_TO_CAMERA = np.diag([1.0, -1.0, -1.0])
+TO_CAMERA = np.diag([1.0, -1.0, -1.0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,14 +58,14 @@ def build(
     volume = mesh.block(anatomy, tets, 2)
     system = assemble(volume, "linear", poisson)
     points, nodes = _disc(point_mm, radius_mm), _disc(node_mm, radius_mm - node_mm)
-    seen = skin.embedding(volume, _on_dome(points, anatomy.dome_mm))
-    held = skin.embedding(volume, _on_dome(nodes, anatomy.dome_mm))
+    seen = skin.embedding(volume, on_dome(points, anatomy.dome_mm))
+    held = skin.embedding(volume, on_dome(nodes, anatomy.dome_mm))
     columns = np.empty((len(nodes), 3, 2, len(points)))
     for k in range(len(nodes)):
         carry = held[[k]].toarray()[0]
         for axis in range(3):
-            u = seen @ system.solve(np.outer(carry, _TO_CAMERA[axis]))
-            columns[k, axis] = (u @ _TO_CAMERA.T).T[:2]
+            u = seen @ system.solve(np.outer(carry, TO_CAMERA[axis]))
+            columns[k, axis] = (u @ TO_CAMERA.T).T[:2]
     matrix = columns.transpose(2, 3, 0, 1).reshape(2 * len(points), 3 * len(nodes))
     return Compliance(matrix, points, nodes, _areas(nodes))
 
@@ -77,7 +77,7 @@ def _disc(spacing_mm: float, radius_mm: float) -> Floats:
     return np.stack([x, y], axis=-1)[np.hypot(x, y) <= radius_mm]
 
 
-def _on_dome(xy: Floats, dome_mm: float) -> Floats:
+def on_dome(xy: Floats, dome_mm: float) -> Floats:
     """Camera x, y to the world's surface, (N, 3) mm."""
     world = xy * np.array([1.0, -1.0])
     return np.column_stack([world, mesh.dome(world, dome_mm)])

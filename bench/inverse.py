@@ -44,8 +44,9 @@ def tikhonov(compliance: Compliance, displacement: Floats, weight: Floats) -> Fl
     Returns:
         (3,) mN for E = 1 kPa, camera axes.
     """
-    # Loads 4 mm wide overlap so much that every other row and column of nodes carries them as well.
-    sparse = (np.round(compliance.nodes / _spacing(compliance)) % 2 == 0).all(axis=1)
+    # Loads 4 mm wide overlap so much that rows and columns 2.4 mm apart carry them as well as closer ones.
+    spacing = _spacing(compliance)
+    sparse = (np.round(compliance.nodes / spacing) % max(1, round(2.4 / spacing)) == 0).all(axis=1)
     return _smallest(compliance, displacement, weight, _SMOOTH_MM, sparse.astype(np.float64))
 
 
@@ -139,8 +140,7 @@ def _contact(compliance: Compliance, displacement: Floats, weight: Floats) -> tu
 
     def fit(place: Floats) -> tuple[float, Floats]:
         """Square of what a contact at x, y of radius exp(third) leaves unexplained, and its force."""
-        apart = np.square(compliance.nodes - place[:2]).sum(axis=1) / np.exp(2 * place[2])
-        share = np.clip(1 - apart, 0, None) ** 2 * compliance.node_area
+        share = _kernel(compliance, place)
         under = np.flatnonzero(share)
         inside = np.hypot(*place[:2]) <= farthest and _LOG_RADII[0] < place[2] < _LOG_RADII[1]
         if len(under) < 3 or not inside:
@@ -163,6 +163,11 @@ def _contact(compliance: Compliance, displacement: Floats, weight: Floats) -> tu
         },
     )
     return found.x, fit(found.x)[1]
+
+
+def _kernel(compliance: Compliance, place: Floats) -> Floats:
+    apart = np.square(compliance.nodes - place[:2]).sum(axis=1) / np.exp(2 * place[2])
+    return np.asarray(np.clip(1 - apart, 0, None) ** 2 * compliance.node_area, np.float64)
 
 
 @lru_cache(maxsize=8)
