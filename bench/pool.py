@@ -82,9 +82,22 @@ def pool(found: Sequence[dict[str, Any]]) -> dict[str, Any]:
         "version": 1,
         "main": main,
         "recordings": [tree["recording"] for tree in found],
+        "each": [_each(tree) for tree in found],
         "specimens": len(set(specimens)),
         "frames": sum(tree["frames"] for tree in found),
         "methods": out,
+    }
+
+
+def _each(tree: dict[str, Any]) -> dict[str, Any]:
+    """What is said of one recording: its main method's scores and how its clocks were aligned."""
+    found = tree.get("sync") or {}
+    return {
+        "recording": tree["recording"],
+        "frames": tree["frames"],
+        **{key: tree["scores"].get(key) for key in ("event_peak_mn", "mae_of_peak", "r")},
+        "offset_s": found.get("offset_s"),
+        "offset_deviation_s": found.get("deviation_s"),
     }
 
 
@@ -126,6 +139,19 @@ def readme(tree: dict[str, Any], command: str) -> str:
         cells = [_text(method["scores"][key], "[mN]" in head) for key, head in shown]
         cells += [_text(method["calibrated"][key], False) for key, _ in _CALIBRATED]
         lines.append(f"| {'**' + name + '** (better)' if beats else name} | " + " | ".join(cells) + " |")
+    lines += ["", f"By recording, {tree['main']}:", ""]
+    lines += [
+        "| recording | frames | event peak [mN] | MAE of it | r | clocks' offset [ms] |",
+        "|" + " --- |" * 6,
+    ]
+    for row in tree["each"]:
+        peak, mae, r = (_number(row[key]) for key in ("event_peak_mn", "mae_of_peak", "r"))
+        offset = "–"
+        if row["offset_s"] is not None:
+            offset = f"{1e3 * row['offset_s']:.0f} ± {1e3 * _number(row['offset_deviation_s']):.0f}"
+        lines.append(
+            f"| {row['recording']} | {row['frames']} | {peak:.2f} | {mae:.1%} | {r:.3f} | {offset} |"
+        )
     return "\n".join([*lines, "", "![Errors](chart.png)", ""])
 
 
