@@ -30,6 +30,7 @@ from torch import Tensor
 from synth.flow import confidence, image
 from synth.flow.estimator import Flags, Flow, Map, Rgb
 
+_BETTER = 1.025  # the bold first guess must fit this much better than the calm one
 _NOISIEST, _CALMEST = 0.45, 1.5  # pictures of much noise, or none, would be smoothed to nothing or not at all
 
 
@@ -70,23 +71,23 @@ class Settings:
     """Where the first guess's gradient [px/px] is this large, lambda doubles: smoothness costs most there."""
     fine_levels: int = 2
     """Levels that the second stage of a cold start, or a warm start, works on."""
-    bold_weight: float = 1.4
+    bold_weight: float = 2.5
     """lambda of the first stage of a cold start: far pulls are steep, and smoothness would hold them back."""
+    calm_weight: float = 1.0
+    """lambda of its other try, which has the say unless the bold one fits clearly better."""
     bold_tau: float = 1.0
     """Primal step of that stage: small, for the coarsest levels have few pixels and must not run away."""
     bold_warps: int = 6
     """Linearisations a level of that stage, which leaves out the finest level."""
 
+    def calm(self) -> Settings:
+        """A first stage of a cold start, for what moves little."""
+        weight, tau, warps = self.calm_weight, self.bold_tau, self.bold_warps
+        return replace(self, weight=weight, noise=0.0, hidden_huber=0.0, tau=tau, warps=warps)
+
     def bold(self) -> Settings:
-        """The first stage of a cold start."""
-        return replace(
-            self,
-            weight=self.bold_weight,
-            noise=0.0,
-            hidden_huber=0.0,
-            tau=self.bold_tau,
-            warps=self.bold_warps,
-        )
+        """A first stage of a cold start, for what moves far."""
+        return replace(self.calm(), weight=self.bold_weight)
 
 
 class Tvl1:
@@ -163,7 +164,7 @@ class Tvl1:
         s = self.settings
         levels = pyramid(rest, now, rest_usable, now_usable, s)
         if initial is None:
-            coarse = solve(levels[1:], None, s.bold()) if len(levels) > 1 else None
+            coarse = guess(levels[1:], s) if len(levels) > 1 else None
             initial, settings = None if coarse is None else finer(coarse, levels[0]), s
         else:
             settings = replace(s, warps=s.warm_warps)
@@ -171,7 +172,7 @@ class Tvl1:
         back = None
         if self.checked and len(levels) > 1:
             back = solve(
-                [level.swapped() for level in levels[1:]], None, replace(s.bold(), warps=s.warm_warps)
+                [level.swapped() for level in levels[1:]], None, replace(s.calm(), warps=s.warm_warps)
             )
         return found, confidence.judge(levels[0], found, back)
 
@@ -220,6 +221,16 @@ def pyramid(rest: Tensor, now: Tensor, rest_usable: Tensor, now_usable: Tensor, 
         pooled = F.avg_pool2d(torch.cat([grey * known, known], 1), 2, ceil_mode=True, count_include_pad=False)
         known = pooled[:, 1:]
         grey = pooled[:, :1] / known.clamp_min(1e-6)
+
+
+def guess(levels: list[Level], s: Settings) -> Tensor:
+    """The first stage of a cold start, twice: the picture's better answer, (B, 2, H, W) px.
+
+    Little smoothness follows far pulls but loses islands between the tines, much smoothness the reverse.
+    """
+    calm, bold = solve(levels, None, s.calm()), solve(levels, None, s.bold())
+    trust = [confidence.judge(levels[0], flow, None).mean((1, 2, 3), keepdim=True) for flow in (calm, bold)]
+    return torch.where(trust[1] > _BETTER * trust[0], bold, calm)
 
 
 def solve(levels: list[Level], initial: Tensor | None, s: Settings) -> Tensor:
