@@ -6,7 +6,7 @@ import itertools
 import json as json_
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -59,7 +59,9 @@ def pareto(
     runs: Annotated[Path, typer.Option(help="Runs whose errors are shown.")] = Path("docs/results/learn"),
     repeats: Annotated[int, typer.Option(help="Frames timed, at least.")] = 30,
     device: Annotated[str, typer.Option(help="cpu or cuda.")] = "cpu",
-    only: Annotated[str, typer.Option(help="Only networks whose name, with layout, holds this.")] = "",
+    only: Annotated[
+        str, typer.Option(help="Only networks whose name and way hold this; none: errors and charts anew.")
+    ] = "",
     json: Annotated[bool, typer.Option("--json", help="Print JSON on stdout.")] = False,
 ) -> None:
     """Time every network a frame, channels included, on one core (or a GPU), beside its error."""
@@ -69,9 +71,7 @@ def pareto(
     for choice in _choices(device, errors):
         if only not in f"{choice.name} {choice.layout} {choice.precision}":
             continue
-        row = measure(choice, repeats, device)
-        error = errors.get((choice.arch, choice.size))
-        row["map_rmse"] = None if error is None else [error.mean, error.low, error.high]
+        row = measure(choice, repeats, device) | {"arch": asdict(choice.arch)}
         rows.append(row)
         if not json:
             Console(stderr=True).print(
@@ -83,12 +83,11 @@ def pareto(
         "rows": rows,
     }
     out.mkdir(parents=True, exist_ok=True)
-    (out / f"data-{device}.json").write_text(json_.dumps(result, indent=1) + "\n")
-    _write(out)
+    if rows:
+        (out / f"data-{device}.json").write_text(json_.dumps(result, indent=1) + "\n")
+    _write(out, errors)
     if json:
         print(json_.dumps(result))
-    else:
-        print(markdown(_lines(rows)))
 
 
 def measure(choice: Choice, repeats: int, device: str = "cpu") -> dict[str, Any]:
@@ -181,9 +180,14 @@ def _errors(root: Path) -> dict[tuple[Architecture, int], Interval]:
             continue
         if not file.stem.endswith("fold0-seed0") or file.stem.startswith(("long", "film")):
             continue
-        arch = Architecture(**tree | {"bounds": tuple(tree["bounds"])})
-        found[arch, run["settings"]["size"]] = interval(column([run], "map_rmse"), np.random.default_rng(0))
+        found[_arch(tree), run["settings"]["size"]] = interval(
+            column([run], "map_rmse"), np.random.default_rng(0)
+        )
     return found
+
+
+def _arch(tree: dict[str, Any]) -> Architecture:
+    return Architecture(**tree | {"bounds": tuple(tree["bounds"])})
 
 
 def _lines(rows: list[dict[str, Any]]) -> list[dict[str, object]]:
@@ -206,12 +210,15 @@ def _text(error: list[float] | None) -> str | None:
     return None if error is None else f"{error[0]:.4f} [{error[1]:.4f}, {error[2]:.4f}]"
 
 
-def _write(out: Path) -> None:
+def _write(out: Path, errors: dict[tuple[Architecture, int], Interval]) -> None:
     """README.md, chart.png and index.html from every data file there."""
     parts, panels = [_HEAD], []
     for file in sorted(out.glob("data-*.json")):
         result = json_.loads(file.read_text())
         device, rows = result["machine"]["device"], result["rows"]
+        for row in rows:
+            error = errors.get((_arch(row["arch"]), row["size"]))
+            row["map_rmse"] = None if error is None else [error.mean, error.low, error.high]
         parts.append(f"## {device}\n\n{markdown(_lines(rows))}\n")
         scored = [r for r in rows if r["map_rmse"] is not None]
         if scored:
