@@ -231,8 +231,8 @@ def test_live_answers_with_the_forces_that_scoring_finds(tmp_path: Path, model: 
     followed = follow(open_recording(folder), {"model": Model(model)}, 0.3)
     scored = [float(np.linalg.norm(force)) for force in followed.force_mn["model"][1:]]
     assert min(scored) > 0
-    # The stream has looked at the rest frame twice and so starts its first flow warm; what differs is a share of
-    # the motion's part alone, the network's answer to none being taken off.
+    # The stream has looked at the rest frame twice and so starts its first flow warm; what differs is a share
+    # of the motion's part alone, the network's answer to none being taken off.
     assert [frame.force_mn for frame in streamed] == pytest.approx(scored, rel=0.25)
     assert any("tool is found" in note for note in followed.notes)
 
