@@ -1,0 +1,109 @@
+"""What `bench ... learn` is made of: disturbances that do what they say, controls, tables, bad input."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bench import learn_disturb as disturb
+from bench.learn_badinput import bad_inputs
+from bench.learn_controls import controls
+from bench.learn_labels import coarser
+from bench.learn_table import markdown
+from learn.data import Clip
+from learn.grid import Grid
+from learn.loss import Objective
+from learn.predict import load
+from learn.settings import preset
+from learn.split import nested
+from learn.train import train
+
+GRID = Grid(32)
+
+
+@pytest.fixture(scope="module")
+def model(clips: list[Clip], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("bench") / "model"
+    settings = preset("tiny", size=32, epochs=1, objective=Objective(kind="mse"))
+    arch = dataclasses.replace(settings.arch, levels=2, width=8, output="magnitude")
+    train(clips, nested(clips, 3, 0, 0), dataclasses.replace(settings, arch=arch), out)
+    return out
+
+
+def rng() -> np.random.Generator:
+    return np.random.default_rng(0)
+
+
+@pytest.mark.parametrize("patch", [0.0, 3.0])
+def test_noise_has_its_size_and_leaves_the_rest_frame(clips: list[Clip], patch: float) -> None:
+    added = disturb.noisy(clips[0], 0.02, patch, GRID, rng()).displacement["ideal"]
+    added = added - clips[0].displacement["ideal"]
+    assert not added[0].any()
+    inside = added[1:, :, clips[0].mask > 0]
+    assert inside.std() == pytest.approx(0.02, rel=0.1 if patch == 0 else 0.4)
+
+
+def test_a_wrong_scale_makes_lengths_longer_and_keeps_the_centre(clips: list[Clip]) -> None:
+    seen = disturb.scaled(clips[2], 1.25)
+    assert seen.mask.sum() == pytest.approx(clips[2].mask.sum() * 1.25**2, rel=0.1)
+    largest = [np.abs(c.displacement["ideal"]).max() for c in (clips[2], seen)]
+    assert largest[1] == pytest.approx(1.25 * largest[0], rel=0.1)
+    same = disturb.scaled(clips[2], 1.0)
+    np.testing.assert_allclose(same.displacement["ideal"], clips[2].displacement["ideal"], atol=1e-6)
+
+
+def test_two_sequences_at_once_add_up(clips: list[Clip]) -> None:
+    pair = disturb.both(clips[0], clips[2])
+    total = pair.density.sum((2, 3)) * GRID.pitch_mm**2 * pair.young_kpa
+    np.testing.assert_allclose(total, pair.force, atol=0.02 * np.abs(pair.force).max())
+
+
+def test_stillness_and_mislabelling(clips: list[Clip]) -> None:
+    still = disturb.still(clips[0])
+    assert not still.displacement["ideal"].any()
+    assert not still.force.any()
+    off = disturb.mislabelled(clips[0], 0.3, rng())
+    gain = off.force[3] / clips[0].force[3]
+    assert np.allclose(gain, gain[0])
+    assert gain[0] != 1
+    np.testing.assert_allclose(off.density[3], clips[0].density[3] * gain[0], rtol=1e-5)
+
+
+def test_failing_flow_says_where(clips: list[Clip]) -> None:
+    torn = disturb.hidden(clips[0], 0.5, 0.2, GRID, rng())
+    gap = np.abs(torn.displacement["recovered"][3] - clips[0].displacement["ideal"][3]).max(0)
+    assert (torn.confidence[3][gap > 0] < 0.2).all()
+    assert (disturb.unsure(torn).confidence[3][clips[0].mask > 0] == 1).all()
+
+
+def test_a_coarser_grid_keeps_force_and_motion(clips: list[Clip]) -> None:
+    wide = coarser(clips[2], GRID, 2)
+    fine = clips[2].density.sum((2, 3)) * GRID.pitch_mm**2
+    np.testing.assert_allclose(wide.density.sum((2, 3)) * Grid(16).pitch_mm ** 2, fine, rtol=1e-4, atol=1e-6)
+    largest = [np.abs(c.displacement["ideal"]).max() for c in (clips[2], wide)]
+    assert largest[1] == pytest.approx(largest[0], rel=0.1)
+
+
+def test_controls_score_what_they_must(clips: list[Clip], model: Path) -> None:
+    found = controls(load(model), clips[:3], "ideal")
+    assert found["zero"]["map_r2_pooled"] <= 0
+    assert found["identity"]["map_rmse"] == 0
+    assert found["identity"]["map_r2_pooled"] == 1
+    assert 0 < found["input"]["map_r2_pooled"] < 0.95
+
+
+def test_every_bad_input_gets_one_line(model: Path, tmp_path: Path) -> None:
+    rows = bad_inputs(model, tmp_path / "bad")
+    assert len(rows) > 12
+    assert [row for row in rows if not row["one line"]] == []
+    assert not any(str(tmp_path) in row["said"] for row in rows)
+
+
+def test_a_table() -> None:
+    assert markdown([{"a": 1.23456, "b": None}, {"a": True, "b": "x"}]).splitlines()[2:] == [
+        "| 1.235 | – |",
+        "| yes | x |",
+    ]
