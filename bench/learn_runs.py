@@ -91,8 +91,9 @@ def carry_out(
     folder.mkdir(parents=True, exist_ok=True)
     file.write_text(json.dumps(result, indent=1) + "\n")
     known = report.summary()
+    took = "continued" if spent is None else f"{spent:.0f} CPU-s"
     say(
-        f"{run.name}: {'continued' if spent is None else f'{spent:.0f} CPU-s'}, map R² {known['map_r2_pooled']:.3f}, "
+        f"{run.name}: {took}, map R² {known['map_r2_pooled']:.3f}, "
         f"force R² {known['force_r2_pooled']:.3f}, ghosts {known['ghost_relative']:.4f}"
     )
     return result
