@@ -226,10 +226,10 @@ class _Walker:
             self.out.notes.append(f"flow is computed on pictures {shrink} times smaller")
 
     def _is_due(self, time: float) -> bool:
-        """Whether a frame is to be looked at; a tenth of the period early is in time."""
-        if time < self.due - 0.1 * self.period:
+        """Whether a frame is to be looked at; a fifth of the period early is in time."""
+        if time < self.due - 0.2 * self.period:
             return False
-        self.due = (time if self.due == -math.inf else max(self.due, time - 0.1 * self.period)) + self.period
+        self.due = (time if self.due == -math.inf else max(self.due, time - 0.2 * self.period)) + self.period
         return True
 
     def _prepare(
