@@ -60,7 +60,10 @@ def pareto(
     repeats: Annotated[int, typer.Option(help="Frames timed, at least.")] = 30,
     device: Annotated[str, typer.Option(help="cpu or cuda.")] = "cpu",
     only: Annotated[
-        str, typer.Option(help="Only networks whose name and way hold this; none: errors and charts anew.")
+        str,
+        typer.Option(
+            help="Only networks whose name and way hold one of these, by commas; none: errors anew."
+        ),
     ] = "",
     json: Annotated[bool, typer.Option("--json", help="Print JSON on stdout.")] = False,
 ) -> None:
@@ -69,7 +72,8 @@ def pareto(
     errors = _errors(runs)
     rows = []
     for choice in _choices(device, errors):
-        if only not in f"{choice.name} {choice.layout} {choice.precision}":
+        named = f"{choice.name} {choice.layout} {choice.precision}"
+        if not any(word in named for word in only.split(",")):
             continue
         row = measure(choice, repeats, device) | {"arch": asdict(choice.arch)}
         rows.append(row)
