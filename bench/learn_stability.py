@@ -80,27 +80,11 @@ def stability(
 
 _HEAD = """# Learn: where it breaks
 
-`bench stability learn --cache CACHE`, on the sequences of `../data/labels.yaml`, fold 0 of 3 on a 64² grid. Learning
-rates and labels: a network of width 8 and stem 4, two and four epochs a run. Gestures and confidence: the study's base
-network, four epochs. What is shown: the study's `mse-fold0-seed0`, trained on ideal flow. R² is pooled over frames
-(force) or cells (map) of the tested sequences. Parts without a table here have not been run. Machine: 2 cores, no GPU,
-one thread.
-"""
-_TITLES[n]}\n\n{markdown(f['rows'])}" for n, f in found.items())
-    (out / "README.md").write_text(f"{_HEAD}\n{text}\n")
-    if json:
-        print(json_.dumps({n: f["rows"] for n, f in found.items()}))
-    else:
-        Console().print(f"{out / 'README.md'}")
-
-
-_HEAD = """# Learn: where it breaks
-
-`bench stability learn --cache CACHE`, on the sequences of `../data/labels.yaml`, fold 0 of 3 on a 64² grid;
-training
-parts with a network of width 8 and stem 4 (two epochs a run), the others with the study's
-`mse-fold0-seed0`. R² is
-pooled over frames (force) or cells (map) of the tested sequences. Machine: 2 cores, no GPU, one thread.
+`bench stability learn --cache CACHE`, on the sequences of `../data/labels.yaml`, fold 0 of 3 on a 64² grid.
+Learning rates and labels: a network of width 8 and stem 4, two and four epochs a run. Gestures and confidence:
+the study's base network, four epochs. What is shown: the study's `mse-fold0-seed0`, trained on ideal flow. R²
+is pooled over frames (force) or cells (map) of the tested sequences. Parts without a table here have not been
+run. Machine: 2 cores, no GPU, one thread.
 """
 _TITLES = {
     "rates": "Learning rate × price of force off contact (`hinge`), over seeds",
