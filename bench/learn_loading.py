@@ -85,7 +85,7 @@ def loading(
 _HEAD = """# Learn: what a training step spends where
 
 `bench experiment loading`. The published loop is our reading of its description, not its code: one .npz a
-sample opened in `__getitem__`, 8000 vertices scattered onto the picture, channels by NumPy, a plain DataLoader,
+sample opened in `__getitem__`, 8000 vertices scattered onto the picture, channels by NumPy, plain DataLoader,
 contiguous float32. Network, batch, optimizer and loss are the same for all rows; ours also turns and mirrors
 every frame.
 

@@ -81,7 +81,7 @@ def stability(
 _HEAD = """# Learn: where it breaks
 
 `bench stability learn --cache CACHE`, on the sequences of `../data/labels.yaml`, fold 0 of 3 on a 64² grid.
-Learning rates and labels: a network of width 8 and stem 4, two and four epochs a run. Gestures and confidence:
+Learning rates and labels: a network of width 8 and stem 4, two and four epochs a run. Gestures, confidence:
 the study's base network, four epochs. What is shown: the study's `mse-fold0-seed0`, trained on ideal flow. R²
 is pooled over frames (force) or cells (map) of the tested sequences. Parts without a table here have not been
 run. Machine: 2 cores, no GPU, one thread.
