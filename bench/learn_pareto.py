@@ -250,8 +250,8 @@ def _write(out: Path, errors: dict[tuple[Architecture, int], Interval]) -> None:
 _HEAD = """# Learn: time a frame, and error where it was trained
 
 `bench pareto learn`. From displacement on the grid to the force map, channels included, batch norms folded,
-one frame at a time; CPU time of one thread on a CPU, wall time on a GPU. `cpu` is the preset that `learn train`
-takes if none is named, `live` is `d2fnet-s`. Errors are of the study's runs on fold 0 with MSE (mean over
+one frame at a time; CPU time of one thread on a CPU, wall time on a GPU. `cpu` is the preset of `learn train`
+where none is named, `live` is `d2fnet-s`. Errors are of the study's runs on fold 0 with MSE (mean over
 tested sequences, BCa interval); only those networks have one: the others are too large to train here.
 Machine: 2 cores, no GPU.
 """
