@@ -70,25 +70,25 @@ def pareto(
     """Time every network a frame, channels included, on one core (or a GPU), beside its error."""
     set_threads(1)
     errors = _errors(runs)
-    rows = []
+    rows: list[dict[str, Any]] = []
+    result = {
+        "machine": describe() | {"device": device, "threads": 1, "torch": torch.__version__},
+        "rows": rows,
+    }
+    out.mkdir(parents=True, exist_ok=True)
     for choice in _choices(device, errors):
         named = f"{choice.name} {choice.layout} {choice.precision}"
         if not any(word in named for word in only.split(",")):
             continue
         row = measure(choice, repeats, device) | {"arch": asdict(choice.arch)}
         rows.append(row)
+        # After every one: a run that is stopped has what it timed.
+        (out / f"data-{device}.json").write_text(json_.dumps(result, indent=1) + "\n")
         if not json:
             Console(stderr=True).print(
                 f"{row['name']} {choice.layout} {choice.precision}: p50 {row['ms_p50']:.1f} ms, "
                 f"p95 {row['ms_p95']:.1f} ms"
             )
-    result = {
-        "machine": describe() | {"device": device, "threads": 1, "torch": torch.__version__},
-        "rows": rows,
-    }
-    out.mkdir(parents=True, exist_ok=True)
-    if rows:
-        (out / f"data-{device}.json").write_text(json_.dumps(result, indent=1) + "\n")
     _write(out, errors)
     if json:
         print(json_.dumps(result))
