@@ -77,7 +77,8 @@ def _pooled(group: list[dict[str, Any]]) -> str:
             s["map_moments"][:6] for s in r["sequences"]
         )
     found = [pooled_r2(np.array(m), np.random.default_rng(0)) for m in seeds.values()]
-    return _text(Interval(*np.mean([(i.mean, i.low, i.high) for i in found], axis=0), n=found[0].n))
+    mean, low, high = (float(np.mean([getattr(i, k) for i in found])) for k in ("mean", "low", "high"))
+    return _text(Interval(mean, low, high, found[0].n))
 
 
 def _stiffness(found: list[dict[str, Any]]) -> list[dict[str, object]]:
