@@ -45,8 +45,6 @@ def read(paths: Sequence[Path]) -> list[dict[str, Any]]:
             raise UserError(f"{path}: holds no readable score.json") from None
         if tree.get("format") != "sulcus-score":
             raise UserError(f"{path}: not written by `bench score`")
-        if not tree["scores"]:
-            raise UserError(f"{path}: was not scored (no sensor), so it can't be pooled")
         found.append(tree)
     if not found:
         raise UserError("no scores to pool")
@@ -54,13 +52,19 @@ def read(paths: Sequence[Path]) -> list[dict[str, Any]]:
     twice = {name for name in names if names.count(name) > 1}
     if twice:
         raise UserError(f"recording {min(twice)} is given twice")
+    if not any(tree["scores"] for tree in found):
+        raise UserError("none of the recordings was scored against a sensor")
     if len({tree["main"] for tree in found}) > 1:
         raise UserError("the scores are of different main methods")
     return found
 
 
 def pool(found: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Means over recordings with 95% intervals, specimens resampled; methods that all have."""
+    """Means over recordings with 95% intervals, specimens resampled; methods that all have.
+
+    Recordings that were not scored (no sensor, clocks not aligned) are left out and named.
+    """
+    every, found = found, [tree for tree in found if tree["scores"]]
     methods = [m for m in found[0]["methods"] if all(m in tree["methods"] for tree in found)]
     specimens = [tree["settings"]["meta"].get("specimen") or tree["recording"] for tree in found]
     main = found[0]["main"]
@@ -82,11 +86,18 @@ def pool(found: Sequence[dict[str, Any]]) -> dict[str, Any]:
         "version": 1,
         "main": main,
         "recordings": [tree["recording"] for tree in found],
+        "left_out": {tree["recording"]: _reason(tree) for tree in every if not tree["scores"]},
         "each": [_each(tree) for tree in found],
         "specimens": len(set(specimens)),
         "frames": sum(tree["frames"] for tree in found),
         "methods": out,
     }
+
+
+def _reason(tree: dict[str, Any]) -> str:
+    """Why a recording has no scores."""
+    refused = (tree.get("sync") or {}).get("refused")
+    return f"clocks not aligned: {refused}" if refused else "no sensor"
 
 
 def _each(tree: dict[str, Any]) -> dict[str, Any]:
@@ -139,6 +150,8 @@ def readme(tree: dict[str, Any], command: str) -> str:
         cells = [_text(method["scores"][key], "[mN]" in head) for key, head in shown]
         cells += [_text(method["calibrated"][key], False) for key, _ in _CALIBRATED]
         lines.append(f"| {'**' + name + '** (better)' if beats else name} | " + " | ".join(cells) + " |")
+    for name, reason in tree["left_out"].items():
+        lines += ["", f"Recording {name} is left out: {reason}."]
     lines += ["", f"By recording, {tree['main']}:", ""]
     lines += [
         "| recording | frames | event peak [mN] | MAE of it | r | clocks' offset [ms] |",

@@ -43,6 +43,14 @@ def test_a_better_method_is_marked() -> None:
     assert "**zero** (better)" in pool.readme(pool.pool([score("a", 5.0), score("b", 6.0)]), "")
 
 
+def test_a_recording_without_scores_is_named() -> None:
+    lost = score("b", 2.0) | {"scores": {}, "sync": {"refused": "ambiguous"}}
+    tree = pool.pool([score("a", 5.0), lost])
+    assert tree["recordings"] == ["a"]
+    assert tree["left_out"] == {"b": "clocks not aligned: ambiguous"}
+    assert "Recording b is left out" in pool.readme(tree, "")
+
+
 def test_command_reads_folders_and_refuses_the_same_twice(tmp_path: Path) -> None:
     for name in "ab":
         (tmp_path / name).mkdir()
