@@ -1,20 +1,17 @@
-"""Means with their intervals, row by row: a page and a picture."""
+"""Means with their intervals, row by row: a picture and a page, both small."""
 
 from __future__ import annotations
 
+import html
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
-import numpy as np
-from numpy.typing import NDArray
-
 from bench.bootstrap import Interval
 
-_ROW, _LEFT, _WIDTH, _TOP, _BELOW = 24, 250, 760, 40, 46
-_INK, _FAINT, _COLOURS = (34, 38, 43), (228, 231, 235), ((31, 111, 235), (194, 53, 43), (43, 122, 75))
+_ROW, _LEFT, _WIDTH, _TOP, _BELOW = 24, 270, 780, 40, 46
+_COLOURS = ("#1f6feb", "#c2352b", "#2b7a4b")
 
 
 @dataclass(frozen=True)
@@ -30,55 +27,53 @@ class Row:
 
 
 def write(rows: Sequence[Row], out: Path, title: str, unit: str) -> None:
-    """`chart.png` and `index.html`, which stands alone, in the folder `out`."""
-    import plotly.graph_objects as go
-
+    """`chart.svg` and `index.html`, which stands alone and shows numbers on pointing, in the folder `out`."""
     out.mkdir(parents=True, exist_ok=True)
-    cv2.imwrite(str(out / "chart.png"), draw(rows, title, unit)[..., ::-1])
-    up = [row.interval[1] - row.value for row in rows]
-    down = [row.value - row.interval[0] for row in rows]
-    figure = go.Figure(
-        go.Scatter(
-            x=[row.value for row in rows],
-            y=[row.name for row in rows],
-            mode="markers",
-            marker={"size": 9, "color": [f"rgb{_COLOURS[row.group % len(_COLOURS)]}" for row in rows]},
-            error_x={"type": "data", "array": up, "arrayminus": down, "symmetric": False},
-        )
+    picture = draw(rows, title, unit)
+    (out / "chart.svg").write_text(picture + "\n", encoding="utf-8")
+    page = (
+        f'<!DOCTYPE html><html lang="en"><meta charset="utf-8"><title>{html.escape(title)}</title>'
+        '<meta name="viewport" content="width=device-width"><body style="margin:1rem">'
+        f"{picture}</body></html>\n"
     )
-    figure.update_layout(title=title, template="plotly_white", height=26 * len(rows) + 160)
-    figure.update_yaxes(autorange="reversed", automargin=True)
-    figure.update_xaxes(title=unit, rangemode="tozero")
-    figure.write_html(out / "index.html", include_plotlyjs=True, full_html=True)
+    (out / "index.html").write_text(page, encoding="utf-8")
 
 
-def draw(rows: Sequence[Row], title: str, unit: str) -> NDArray[np.uint8]:
-    """The picture, (H, W, 3) uint8 sRGB."""
+def draw(rows: Sequence[Row], title: str, unit: str) -> str:
+    """The picture as SVG."""
     height = _TOP + _ROW * len(rows) + _BELOW
-    canvas = np.full((height, _WIDTH, 3), 255, np.uint8)
     ends = [v for row in rows for v in (row.value, *row.interval) if math.isfinite(v)] or [1.0]
     low, high = min(0.0, *ends), max(ends)
     step = _step((high - low) or 1.0)
-    high = step * math.ceil(high / step + 1e-9)
-    low = step * math.floor(low / step)
+    low, high = step * math.floor(low / step), step * math.ceil(high / step + 1e-9)
 
-    def at(value: float) -> int:
-        return round(_LEFT + (_WIDTH - _LEFT - 24) * (value - low) / (high - low))
+    def at(value: float) -> float:
+        return round(_LEFT + (_WIDTH - _LEFT - 24) * (value - low) / (high - low), 1)
 
+    parts = [
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {_WIDTH} {height}" '
+        f'style="max-width:{_WIDTH}px;width:100%" font-family="sans-serif" font-size="12" fill="#22262b">',
+        f'<rect width="{_WIDTH}" height="{height}" fill="#fff"/>',
+        _text(10, 22, title, 'font-size="15"'),
+        _text(_LEFT, height - 10, unit),
+    ]
     for k in range(round((high - low) / step) + 1):
-        tick = low + k * step
-        cv2.line(canvas, (at(tick), _TOP), (at(tick), height - _BELOW), _FAINT, 1, cv2.LINE_AA)
-        _text(canvas, f"{tick:.4g}", (at(tick) - 10, height - _BELOW + 16), 0.36)
+        x = at(low + k * step)
+        parts.append(f'<path d="M{x} {_TOP}V{height - _BELOW}" stroke="#e4e7eb"/>')
+        parts.append(_text(x, height - _BELOW + 16, f"{low + k * step:.4g}", 'text-anchor="middle"'))
     for k, row in enumerate(rows):
         y, colour = _TOP + _ROW * k + _ROW // 2, _COLOURS[row.group % len(_COLOURS)]
-        _text(canvas, row.name, (10, y + 4), 0.4)
+        parts.append(_text(10, y + 4, row.name))
+        said = f"{row.name}: {row.value:.4g}"
+        bar = ""
         if all(math.isfinite(end) for end in row.interval):
-            cv2.line(canvas, (at(row.interval[0]), y), (at(row.interval[1]), y), colour, 2, cv2.LINE_AA)
+            said += f" [{row.interval[0]:.4g}, {row.interval[1]:.4g}]"
+            low_x, high_x = (at(end) for end in row.interval)
+            bar = f'<path d="M{low_x} {y}H{high_x}" stroke="{colour}" stroke-width="2"/>'
         if math.isfinite(row.value):
-            cv2.circle(canvas, (at(row.value), y), 5, colour, -1, cv2.LINE_AA)
-    _text(canvas, title, (10, 22), 0.5)
-    _text(canvas, unit, (_LEFT, height - 10), 0.4)
-    return canvas
+            bar += f'<circle cx="{at(row.value)}" cy="{y}" r="5" fill="{colour}"/>'
+        parts.append(f"<g><title>{html.escape(said)}</title>{bar}</g>")
+    return "\n".join([*parts, "</svg>"])
 
 
 def _step(span: float) -> float:
@@ -87,5 +82,5 @@ def _step(span: float) -> float:
     return next(m * base for m in (1, 2, 5, 10) if span / (m * base) <= 9)
 
 
-def _text(canvas: NDArray[np.uint8], text: str, at: tuple[int, int], size: float) -> None:
-    cv2.putText(canvas, text, at, cv2.FONT_HERSHEY_SIMPLEX, size, _INK, 1, cv2.LINE_AA)
+def _text(x: float, y: float, text: str, how: str = "") -> str:
+    return f'<text x="{x}" y="{y}" {how}>{html.escape(text)}</text>'

@@ -133,7 +133,7 @@ def readme(tree: dict[str, Any]) -> str:
         r = [f"{v['r']:.3f}" if v["r"] is not None else "–" for v in (a, b)]
         mae = [f"{v['mae_mn']:.2f} [{v['mae_interval'][0]:.2f}, {v['mae_interval'][1]:.2f}]" for v in (a, b)]
         lines.append(f"| {name} | {r[0]} | {r[1]} | {a['r2']:.3f} | {b['r2']:.3f} | {mae[0]} | {mae[1]} |")
-    return "\n".join([*lines, "", "![Errors by split](chart.png)", ""])
+    return "\n".join([*lines, "", "![Errors by split](chart.svg)", ""])
 
 
 def _by_frame(clips: Sequence[Clip], seed: int) -> list[NDArray[np.intp]]:

@@ -113,7 +113,7 @@ def _each(tree: dict[str, Any]) -> dict[str, Any]:
 
 
 def write(tree: dict[str, Any], out: Path, command: str) -> None:
-    """pool.json, README.md, chart.png and index.html in the folder `out`."""
+    """pool.json, README.md, chart.svg and index.html in the folder `out`."""
     out.mkdir(parents=True, exist_ok=True)
     (out / "pool.json").write_text(json.dumps(tree, indent=1, allow_nan=False) + "\n", encoding="utf-8")
     (out / "README.md").write_text(readme(tree, command), encoding="utf-8")
@@ -165,7 +165,7 @@ def readme(tree: dict[str, Any], command: str) -> str:
         lines.append(
             f"| {row['recording']} | {row['frames']} | {peak:.2f} | {mae:.1%} | {r:.3f} | {offset} |"
         )
-    return "\n".join([*lines, "", "![Errors](chart.png)", ""])
+    return "\n".join([*lines, "", "![Errors](chart.svg)", ""])
 
 
 def _mean(values: Sequence[float | None], specimens: Sequence[str]) -> dict[str, float | None]:

@@ -58,7 +58,7 @@ def test_command_reads_folders_and_refuses_the_same_twice(tmp_path: Path) -> Non
     out = tmp_path / "out"
     done = CliRunner().invoke(app, ["pool", str(tmp_path / "a"), str(tmp_path / "b"), "-o", str(out)])
     assert done.exit_code == 0, done.output
-    assert {path.name for path in out.iterdir()} == {"pool.json", "README.md", "chart.png", "index.html"}
+    assert {path.name for path in out.iterdir()} == {"pool.json", "README.md", "chart.svg", "index.html"}
     with pytest.raises(UserError, match="given twice"):
         pool.read([tmp_path / "a", tmp_path / "a"])
     with pytest.raises(UserError, match="no readable score"):
