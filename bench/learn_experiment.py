@@ -35,6 +35,7 @@ PRESSED = ("long-fold0-seed0", "film-fold0-seed0")
 LOSSES = {
     "mse": Objective(kind="mse"),
     "hinge": Objective(kind="hinge", stray_weight=8.0),
+    "hinge4": Objective(kind="hinge", stray_weight=4.0),
     "hinge-mse": Objective(kind="hinge", r2_weight=0.0, stray_weight=8.0),
     "published": Objective(kind="published", rule="frame"),
     "antighost": Objective(),
@@ -46,7 +47,7 @@ LOSSES = {
 def ideal_runs() -> Iterator[Run]:
     """On labels-only sequences, in the order of their worth; an interrupted study goes on where it was."""
     base = small()
-    for name in ("mse", "hinge", "published"):
+    for name in ("mse", "hinge", "hinge4", "published"):
         for seed in range(3):
             yield Run(f"{name}-fold0-seed{seed}", replace(base, objective=LOSSES[name], seed=seed))
     # The study's best effort, on every fold: twice the steps.

@@ -176,6 +176,7 @@ def _tests(found: list[dict[str, Any]]) -> list[str]:
 
 _AGAINST = (
     ("mse", "hinge"),
+    ("mse", "hinge4"),
     ("mse", "published"),
     ("mse", "hinge-mse"),
     ("mse", "antighost"),
