@@ -132,7 +132,7 @@ def test_a_video_is_followed_and_predicted(model: Path, tmp_path: Path) -> None:
     assert done.exit_code == 0, done.output
     with np.load(tmp_path / "film.npz") as found:
         assert found["total_force_mn"].shape == (3,)
-        assert not found["young_known"]
+        assert found["young_known"]
     seen = list(film.steps(tmp_path / "film.mp4", marked > 0, "dis"))
     assert np.abs(seen[0][0]).max() == 0
     np.testing.assert_allclose(seen[2][0][16:32, 16:48].mean((0, 1)), [2, 0], atol=0.3)
