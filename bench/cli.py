@@ -180,7 +180,7 @@ def demo(
     from bench import run
     from bench.assess import Settings
 
-    _say(run.demo(dataset, model, out, Settings(backend=flow)), out, json)
+    _say(run.demo(dataset, model, out, Settings(backend=flow, rate_hz=None)), out, json)
 
 
 @app.command("from-dataset")

@@ -250,12 +250,12 @@ def test_killed_and_resumed_equals_undisturbed(
     tmp_path: Path, kill: signal.Signals, undisturbed: str
 ) -> None:
     victim = start(tmp_path / "out", JOB, "slow")
-    wait_for(lambda: len(list((tmp_path / "out").glob("*.zarr"))) >= 2)
+    wait_for(lambda: len(list((tmp_path / "out").glob("*.zarr"))) >= 1)
     victim.send_signal(kill)
     victim.wait(timeout=30)
     assert victim.returncode != 0
     left = len(list((tmp_path / "out").glob("*.zarr")))
-    assert 2 <= left < 6
+    assert 1 <= left < 6
     resumed = run(tmp_path / "out")
     assert (resumed.already, resumed.done) == (left, 6 - left)
     assert resumed.content_hash == undisturbed
