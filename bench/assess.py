@@ -20,6 +20,7 @@ from bench.recording import Force, Recording
 from bench.scale import Scale
 from bench.sync import Offset
 from synth import versions
+from synth.folder import write_whole
 
 Curve = NDArray[np.float64]
 _SEED = 0  # of the bootstrap: the same recording gives the same intervals
@@ -297,9 +298,8 @@ def as_json(result: Result) -> dict[str, Any]:
 
 def write_json(result: Result, path: Path) -> None:
     """Writes `score.json` whole or not at all."""
-    part = path.with_name(path.name + ".part")
-    part.write_text(json.dumps(as_json(result), indent=1, allow_nan=False) + "\n", encoding="utf-8")
-    part.replace(path)
+    text = json.dumps(as_json(result), indent=1, allow_nan=False)
+    write_whole(path, text + "\n", durable=False)
 
 
 def environment() -> dict[str, str]:

@@ -36,8 +36,8 @@ _SURE = 0.3
 class Baseline:
     """A rule behind the bench's protocol. The last frame put on the grid is shared between baselines."""
 
-    _last: tuple[int, int, NDArray[np.float32], NDArray[np.float32]] | None = None
-    _view: tuple[int, View] | None = None
+    _last: tuple[NDArray[np.float32], Scene, NDArray[np.float32], NDArray[np.float32]] | None = None
+    _view: tuple[Scene, View] | None = None
 
     def __init__(self, rule: Rule) -> None:
         self._rule = rule
@@ -47,13 +47,13 @@ class Baseline:
     ) -> Answer:
         """See `Method`."""
         view = Baseline._view
-        if view is None or view[0] != id(scene):
-            Baseline._view = view = (id(scene), View(scene.tissue, scene.scale_mm_per_px, GRID))
+        if view is None or view[0] is not scene:
+            Baseline._view = view = (scene, View(scene.tissue, scene.scale_mm_per_px, GRID))
         last = Baseline._last
-        if last is None or last[:2] != (id(flow), id(scene)):
+        if last is None or last[0] is not flow or last[1] is not scene:
             resample = view[1].resample
             moved = resample.mean(flow.transpose(2, 0, 1) * scene.scale_mm_per_px, scene.tissue)
-            last = (id(flow), id(scene), moved, resample.mean(confidence, scene.tissue))
+            last = (flow, scene, moved, resample.mean(confidence, scene.tissue))
             Baseline._last = last
         young = 1.0 if scene.young_kpa is None else scene.young_kpa
         return Answer(young * self._rule(last[2], view[1].mask, last[3]))

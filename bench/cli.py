@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json as json_
+import shlex
+import sys
 from collections.abc import Callable
 from enum import StrEnum
 from pathlib import Path
@@ -70,12 +72,7 @@ def score(
     from bench import run
     from bench.assess import Settings
 
-    others = {}
-    for word in also or ():
-        name, sign, folder = word.partition("=")
-        if not (name and sign and folder):
-            raise UserError(f"--also {word}: expected NAME=FOLDER")
-        others[name] = Path(folder)
+    others = {name: Path(folder) for name, folder in _pairs("--also", also, "NAME=FOLDER").items()}
     settings = Settings(backend=flow, shrink=shrink, rate_hz=rate or None)
     result = run.score(recording, model, out, settings, title, train, others)
     _say(result, out or Path(f"{result.recording}-score"), json)
@@ -90,13 +87,10 @@ def pool(
     json: Json = False,
 ) -> None:
     """Scores of several recordings as one: means, intervals over specimens, one table and chart."""
-    import shlex
-    import sys
-
     from bench import pool as pooling
 
     tree = pooling.pool(pooling.read(scores))
-    pooling.write(tree, out, shlex.join(["bench", *sys.argv[1:]]))
+    pooling.write(tree, out, _typed())
     print(json_.dumps(tree) if json else out / "README.md")
 
 
@@ -143,13 +137,7 @@ def import_(
     from bench import intake
     from bench.bar import counting
 
-    named = {}
-    for word in use or ():
-        role, sign, name = word.partition("=")
-        if not (role and sign and name):
-            raise UserError(f"--use {word}: expected ROLE=NAME")
-        named[role] = name
-    found = intake.read(source, named)
+    found = intake.read(source, _pairs("--use", use, "ROLE=NAME"))
     about: dict[str, object] = {"young_kpa": young if young is not None else "unknown"}
     if scale is not None:
         about["scale_mm_per_px"] = scale
@@ -233,6 +221,22 @@ def make_exvivo(
     print(json_.dumps({"recordings": written}) if json else "\n".join(written))
 
 
+def _pairs(option: str, words: list[str] | None, form: str) -> dict[str, str]:
+    """The words A=B of a repeated option as a dictionary; UserError for one of another form."""
+    named = {}
+    for word in words or ():
+        name, sign, value = word.partition("=")
+        if not (name and sign and value):
+            raise UserError(f"{option} {word}: expected {form}")
+        named[name] = value
+    return named
+
+
+def _typed() -> str:
+    """The command as it was typed, for a README."""
+    return shlex.join(["bench", *sys.argv[1:]])
+
+
 def _first_of_two(tell: Callable[[int], None]) -> Callable[[int, int], None]:
     return lambda done, of: tell(done)
 
@@ -270,9 +274,6 @@ def gap(
     json: Json = False,
 ) -> None:
     """How much of the sim-to-real gap training on recovered flow closes, and fitted noise alone."""
-    import shlex
-    import sys
-
     from rich.console import Console
 
     from bench import gap_experiment
@@ -287,7 +288,7 @@ def gap(
         held_out,
         flow or ["tvl1", "opencv-tvl1"],
         seeds,
-        shlex.join(["bench", *sys.argv[1:]]),
+        _typed(),
         lambda line: Console(stderr=True).print(line, markup=False),
     )
     if json:

@@ -236,10 +236,10 @@ class _Walker:
         self, rgb: NDArray[np.uint8], tool: NDArray[np.bool_] | None
     ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
         with self.watch.stage("mask"):
-            rgb = _smaller(rgb, self.shrink)
+            rgb = smaller(rgb, self.shrink)
             blocked = mask.glare(rgb)
             if tool is not None:
-                blocked |= _smaller(tool.astype(np.uint8) * 255, self.shrink) > 0
+                blocked |= smaller(tool.astype(np.uint8) * 255, self.shrink) > 0
             elif not self.recording.masks:
                 blocked |= mask.tool(rgb)
         return rgb, blocked
@@ -248,7 +248,7 @@ class _Walker:
         self, rgb: NDArray[np.uint8], blocked: NDArray[np.bool_], size: tuple[int, int]
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         whole = self.recording.tissue_mask(size)
-        tissue = _smaller(whole.astype(np.uint8) * 255, self.shrink) > 127
+        tissue = smaller(whole.astype(np.uint8) * 255, self.shrink) > 127
         if not tissue.any():
             raise UserError(f"{self.recording.tissue}: marks no tissue")
         self.tracker = Tracker(self.backend, rgb, blocked, tissue)
@@ -296,7 +296,8 @@ class _Walker:
             self.stride *= 2
 
 
-def _smaller(picture: NDArray[np.uint8], shrink: int) -> NDArray[np.uint8]:
+def smaller(picture: NDArray[np.uint8], shrink: int) -> NDArray[np.uint8]:
+    """A picture or mask `shrink` times smaller, (H, W[, C]) uint8; what doesn't fill a pixel is cut off."""
     if shrink == 1:
         return picture
     size = (max(1, picture.shape[1] // shrink), max(1, picture.shape[0] // shrink))

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from bench import forest, gap, machine
 from bench.bootstrap import Interval
 from bench.gap_runs import KEYS, Tests, Training, carry_out, followed
-from learn.data import Clip, read
+from learn.data import Clip, load
 from learn.settings import Settings
 from learn.split import Split, folds, nested
 from learn.statistics import interval
@@ -61,7 +61,7 @@ def run(
         UserError: no such family, or data that lacks a flow.
     """
     stored = list(Dataset(dataset))
-    clips = [read(s, settings.grid, ("ideal", "recovered")) for s in stored]
+    clips = load(dataset, settings.grid, ("ideal", "recovered"), cache=cache)
     split, seen_test = parts(clips, held_out, settings)
     results: dict[str, Any] = {}
     untrained: dict[str, list[dict[str, Any]]] = {}

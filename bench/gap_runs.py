@@ -21,6 +21,7 @@ from learn.settings import Settings
 from learn.split import Split
 from learn.train import train
 from synth.flow.track import Tracker
+from synth.folder import write_whole
 from synth.store import Sequence as Stored
 
 KEYS = ("force_mae", "map_rmse")
@@ -145,9 +146,7 @@ def carry_out(
         "errors": errors,
     }
     folder.mkdir(parents=True, exist_ok=True)
-    part_file = file.with_suffix(".part")
-    part_file.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
-    part_file.replace(file)
+    write_whole(file, json.dumps(result, indent=1) + "\n", durable=False)
     return result
 
 

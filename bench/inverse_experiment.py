@@ -12,7 +12,7 @@ import typer
 from numpy.typing import NDArray
 
 from bench import compliance, inverse, machine
-from bench.compliance import Compliance
+from bench.compliance import TO_CAMERA, Compliance, on_dome
 from synth import job
 from synth.fem import mesh, skin
 from synth.fem.system import assemble
@@ -78,13 +78,7 @@ def contacts(
     anatomy = job.Anatomy()
     volume = mesh.block(anatomy, tets, 2)
     system = assemble(volume, "linear", 0.4)
-    flip = np.array([1.0, -1.0, -1.0])
-
-    def on(xy: Floats) -> Floats:
-        flat = xy * [1, -1]
-        return np.column_stack([flat, mesh.dome(flat, anatomy.dome_mm)])
-
-    seen = skin.embedding(volume, on(known.points))
+    seen = skin.embedding(volume, on_dome(known.points, anatomy.dome_mm))
     steps = np.stack(np.meshgrid(np.linspace(-1, 1, 13), np.linspace(-1, 1, 13)), axis=-1).reshape(-1, 2)
     disc = steps[np.hypot(*steps.T) < 1]
     share = (1 - np.square(disc).sum(axis=1)) ** 2
@@ -95,10 +89,14 @@ def contacts(
         around = rng.uniform(0, 2 * np.pi)
         flat = np.sqrt(1 - up**2)
         way = np.array([flat * np.cos(around), flat * np.sin(around), up * rng.choice([-1, 1])])
-        held = share / share.sum() @ skin.embedding(volume, on(at + radius * disc)).toarray()
+        held = (
+            share
+            / share.sum()
+            @ skin.embedding(volume, on_dome(at + radius * disc, anatomy.dome_mm)).toarray()
+        )
         u = seen @ system.solve(np.outer(held, size * way)) / young_kpa
-        forces[k] = size * way * flip
-        fields.append((u * flip)[:, :2])
+        forces[k] = TO_CAMERA @ (size * way)
+        fields.append((u @ TO_CAMERA.T)[:, :2])
     return forces, fields
 
 

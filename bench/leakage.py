@@ -19,9 +19,9 @@ from rich.console import Console
 
 from bench import baseline, forest, machine, score
 from bench.bootstrap import over_groups
-from learn.data import Clip, read
+from bench.follow import Answer
+from learn.data import Clip, load
 from learn.split import groups
-from synth.store import Dataset
 
 Curve = NDArray[np.float64]
 _FOLDS = 5
@@ -36,7 +36,7 @@ def leakage(
     seed: Annotated[int, typer.Option(help="Of the folds.")] = 0,
 ) -> None:
     """Random-frame against whole-recording split on one dataset: what leakage does to every simple method."""
-    clips = [read(s, baseline.GRID, ("recovered",)) for s in Dataset(dataset)]
+    clips = load(dataset, baseline.GRID, ("recovered",))
     found = {
         name: answers(clips, fold, Console(stderr=True))
         for name, fold in (
@@ -82,7 +82,7 @@ def answers(
             for curve, clip, f in zip(curves, clips, fold, strict=True):
                 for t in np.flatnonzero(f == k):
                     force = rule(clip.displacement["recovered"][t], clip.mask, clip.confidence[t])
-                    curve[t] = clip.young_kpa * np.sqrt(np.nansum(force**2))
+                    curve[t] = clip.young_kpa * Answer(force).size_mn
     return said
 
 

@@ -12,12 +12,11 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from bench import machine
-from bench.follow import Method, Scene
+from bench.follow import Method, Scene, smaller
 from bench.video import Picture, from_video
 from synth.errors import UserError
 from synth.flow import mask
@@ -179,12 +178,4 @@ def _work(picture: Picture, tracker: Tracker, scene: Scene, method: Method | Non
 
 
 def _smaller(picture: Picture, shrink: int) -> Picture:
-    if shrink == 1:
-        return picture
-    height, width = picture.rgb.shape[:2]
-    size = (max(1, width // shrink), max(1, height // shrink))
-    return Picture(
-        picture.index,
-        picture.time_s,
-        np.asarray(cv2.resize(picture.rgb, size, interpolation=cv2.INTER_AREA), np.uint8),
-    )
+    return Picture(picture.index, picture.time_s, smaller(picture.rgb, shrink))

@@ -22,7 +22,7 @@ class Model:
         from learn.predict import load
 
         self.predictor: Predictor = load(folder)
-        self._rest: tuple[int, NDArray[np.float64]] | None = None
+        self._rest: tuple[Scene, NDArray[np.float64]] | None = None
 
     def described(self) -> dict[str, object]:
         """What the model is, for the report."""
@@ -41,9 +41,9 @@ class Model:
     ) -> Answer:
         """See `Method`. What it says of the rest frame, where nothing has moved, is taken off: a tare."""
         said, density = self._say(flow, confidence, scene, picture)
-        if self._rest is None or self._rest[0] != id(scene):
+        if self._rest is None or self._rest[0] is not scene:
             still = np.zeros_like(flow), scene.tissue.astype(np.float32)
-            self._rest = id(scene), self._say(*still, scene, False)[0]
+            self._rest = scene, self._say(*still, scene, False)[0]
         force = said - self._rest[1]
         if np.isnan(force[1:]).all():
             force[0] = max(force[0], 0.0)

@@ -22,6 +22,7 @@ from bench import charts, score
 from bench.assess import Result
 from bench.follow import Snapshot
 from synth import picture
+from synth.folder import write_whole
 
 _PEAKS, _WORST = 4, 2
 
@@ -65,9 +66,7 @@ def write(result: Result, path: Path, title: str = "") -> None:
         title: heading; the recording's name if empty.
     """
     page = render(result, title or f"Force from video: {result.recording}")
-    part = path.with_name(path.name + ".part")
-    part.write_text(page, encoding="utf-8")
-    part.replace(path)
+    write_whole(path, page, durable=False)
 
 
 def render(result: Result, title: str) -> str:

@@ -93,13 +93,10 @@ def across(known: compliance.Compliance) -> NDArray[np.float64]:
     volume = mesh.block(job.Anatomy(), 2500, 2)
     system = assemble(volume, "linear", 0.4)
     xy = np.array([[2.0, -3.0], [2.5, -3.0], [2.0, -2.5], [1.5, -3.0]])
-
-    def on(points: NDArray[np.float64]) -> NDArray[np.float64]:
-        flat = points * [1, -1]
-        return np.column_stack([flat, mesh.dome(flat, 70.0)])
-
-    held = skin.embedding(volume, on(xy)).toarray().mean(axis=0)
-    u = skin.embedding(volume, on(known.points)) @ system.solve(np.outer(held, [30.0, 40.0, 0]))
+    held = skin.embedding(volume, compliance.on_dome(xy, 70.0)).toarray().mean(axis=0)
+    u = skin.embedding(volume, compliance.on_dome(known.points, 70.0)) @ system.solve(
+        np.outer(held, [30.0, 40.0, 0])
+    )
     return np.asarray((u * [1, -1, -1])[:, :2] + 0.1 * rng.normal(size=(len(known.points), 2)))
 
 
