@@ -45,7 +45,7 @@ class Footage(StrEnum):
     mp4 = "mp4"
 
 
-@app.command()
+@app.command(epilog="Example: bench score recording --model model --also other=other-model")
 def score(
     recording: Annotated[
         Path, typer.Argument(help="Recording folder: meta.yaml, video or frames, force.csv.")
@@ -78,7 +78,7 @@ def score(
     _say(result, out or Path(f"{result.recording}-score"), json)
 
 
-@app.command()
+@app.command(epilog="Example: bench pool a-score b-score --out pooled")
 def pool(
     scores: Annotated[
         list[Path], typer.Argument(help="Folders that `bench score` wrote, or their score.json.")
@@ -94,7 +94,7 @@ def pool(
     print(json_.dumps(tree) if json else out / "README.md")
 
 
-@app.command()
+@app.command(epilog="Example: bench check recording")
 def check(
     recording: Annotated[Path, typer.Argument(help="Recording folder.")],
     json: Json = False,
@@ -114,7 +114,9 @@ def check(
         raise typer.Exit(2)
 
 
-@app.command("import")
+@app.command(
+    "import", epilog="Example: bench import a.mcap --out recording --scale 0.05 --use force=/ft/wrench"
+)
 def import_(
     source: Annotated[
         Path, typer.Argument(help="A .mha or .igs.mha sequence, .bag, .mcap, .db3, ROS 2 bag folder or .h5.")
@@ -133,7 +135,7 @@ def import_(
     ] = 1.0,
     json: Json = False,
 ) -> None:
-    """Turns another system's recording into a recording folder: `bench import a.mcap -o rec --scale 0.05`."""
+    """Turns another system's recording into a recording folder."""
     from bench import intake
     from bench.bar import counting
 
@@ -156,7 +158,7 @@ def import_(
         print(out)
 
 
-@app.command()
+@app.command(epilog="Example: bench demo out --model model --out runs/demo")
 def demo(
     dataset: Annotated[Path, typer.Argument(help="A rendered dataset.")],
     model: Annotated[Path, typer.Option("--model", "-m", help="Model trained on it.")],
@@ -171,7 +173,9 @@ def demo(
     _say(run.demo(dataset, model, out, Settings(backend=flow, rate_hz=None)), out, json)
 
 
-@app.command("from-dataset")
+@app.command(
+    "from-dataset", epilog="Example: bench from-dataset out --out recordings --sequence 3 --footage mp4"
+)
 def from_dataset(
     dataset: Annotated[Path, typer.Argument(help="A rendered dataset.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder that gets one recording a sequence.")],
@@ -194,7 +198,7 @@ def from_dataset(
             print(path)
 
 
-@app.command("make-exvivo")
+@app.command("make-exvivo", epilog="Example: bench make-exvivo --out recordings --count 2 --seconds 10")
 def make_exvivo(
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder that gets the recordings.")],
     count: Annotated[int, typer.Option(min=1, help="How many recordings.")] = 6,
@@ -256,7 +260,7 @@ def _say(result: Result, folder: Path, json: bool) -> None:
     console.print(f"report: {folder / 'report.html'}", markup=False, highlight=False)
 
 
-@app.command()
+@app.command(epilog="Example: bench gap out --cache cache --out runs/gap --held-out calf")
 def gap(
     dataset: Annotated[Path, typer.Argument(help="Dataset rendered in several appearance families.")],
     cache: Annotated[Path, typer.Option(help="Folder for packed sequences and trained networks.")],
@@ -299,7 +303,7 @@ def gap(
         print(out / "README.md")
 
 
-@app.command()
+@app.command(epilog="Example: bench flow rest.png moved.png truth.flo --backend tvl1")
 def flow(
     first: Annotated[Path, typer.Argument(help="Picture at rest.")],
     second: Annotated[Path, typer.Argument(help="Picture after the motion.")],
@@ -326,7 +330,7 @@ def flow(
         )
 
 
-@app.command()
+@app.command(epilog="Example: bench live video.mp4 --model model --scale 0.05 --young 1.5")
 def live(
     video: Annotated[Path, typer.Argument(help="Video; its first frame is the rest frame.")],
     model: Annotated[Path | None, typer.Option("--model", "-m", help="Model folder: forces too.")] = None,

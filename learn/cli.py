@@ -36,7 +36,7 @@ Threads = Annotated[int | None, typer.Option(help="CPU threads; half the cores i
 Json = Annotated[bool, typer.Option("--json", help="Print JSON on stdout instead of a table.")]
 
 
-@app.command("train")
+@app.command("train", epilog="Example: learn train out --out model --preset cpu --input mixed")
 def train_command(
     dataset: Root,
     changes: Annotated[
@@ -138,7 +138,7 @@ def _log(numbers: dict[str, float]) -> None:
     )
 
 
-@app.command("eval")
+@app.command("eval", epilog="Example: learn eval model out --against other-model")
 def eval_command(
     model: Annotated[Path, typer.Argument(help="Model folder.")],
     dataset: Root,
@@ -198,7 +198,7 @@ def eval_command(
         Console().print(_pairs(pairs, str(against)))
 
 
-@app.command("predict")
+@app.command("predict", epilog="Example: learn predict model video.mp4 --scale 0.05 --young 1.5")
 def predict_command(
     model: Annotated[Path, typer.Argument(help="Model folder.")],
     source: Annotated[Path, typer.Argument(help="Dataset, NNNNNN.zarr store, video, or .npz of flow.")],
@@ -236,7 +236,7 @@ def predict_command(
         print(json_.dumps({"out": str(out), "peak_force_mn": peaks}))
 
 
-@app.command("calibrate")
+@app.command("calibrate", epilog="Example: learn calibrate model press.npz")
 def calibrate_command(
     model: Annotated[Path, typer.Argument(help="Model folder.")],
     press: Annotated[
@@ -261,7 +261,7 @@ def calibrate_command(
             Console().print(f"{name}: E = {young:.3g} kPa; give it to `learn predict` as --young {young:.3g}")
 
 
-@app.command("export")
+@app.command("export", epilog="Example: learn export model d2fnet.onnx --format onnx")
 def export_command(
     model: Annotated[Path, typer.Argument(help="Model folder.")],
     file: Annotated[Path, typer.Argument(help="File to write; NAME.json beside it says how to use it.")],

@@ -29,7 +29,7 @@ Mix = Annotated[
 Json = Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")]
 
 
-@app.command()
+@app.command(epilog="Example: synth new job.yaml")
 def new(path: Annotated[Path, typer.Argument(help="The job file to write.")] = Path("job.yaml")) -> None:
     """Writes a job file in which every key is explained."""
     from synth import jobfile
@@ -44,7 +44,7 @@ def new(path: Annotated[Path, typer.Argument(help="The job file to write.")] = P
     print(f"wrote {path}; render it with: synth render {path} -o out")
 
 
-@app.command()
+@app.command(epilog="Example: synth schema > job.schema.json")
 def schema() -> None:
     """Prints the JSON schema of job files, for editors."""
     from synth import jobfile
@@ -52,7 +52,7 @@ def schema() -> None:
     print(json_.dumps(jobfile.schema(), indent=2))
 
 
-@app.command()
+@app.command(epilog="Example: synth preview demo --count 9 --out sheet.png")
 def preview(
     job: Annotated[str, typer.Argument(help="A job file, or a named job: tiny, demo, paper.")],
     overrides: Annotated[
@@ -87,7 +87,7 @@ def preview(
     )
 
 
-@app.command()
+@app.command(epilog="Example: synth render demo --out out render.spp=8 sequences=100")
 def render(
     job: Annotated[str, typer.Argument(help="A job file, or a named job: tiny, demo, paper.")],
     overrides: Annotated[
@@ -138,7 +138,7 @@ def _end_on_terminate() -> None:
     signal.signal(signal.SIGTERM, signal.default_int_handler)
 
 
-@app.command()
+@app.command(epilog="Example: synth retry out")
 def retry(
     out: Out,
     workers: Annotated[int | None, typer.Option(min=1, help="Processes at a time; one a core.")] = None,
@@ -164,7 +164,7 @@ def retry(
         raise typer.Exit(1)
 
 
-@app.command()
+@app.command(epilog="Example: synth status out")
 def status(out: Out, json: Json = False) -> None:
     """Says what is done, running and failed, and what is still to come in time and disk."""
     from synth import status as standing
@@ -173,7 +173,7 @@ def status(out: Out, json: Json = False) -> None:
     print(json_.dumps(found.as_dict()) if json else "\n".join(standing.lines(found)))
 
 
-@app.command("split")
+@app.command("split", epilog="Example: synth split out --by anatomy --hold-out calf")
 def split_command(
     out: Out,
     by: Annotated[str, typer.Option(help="anatomy, family, gesture, stiffness or sequence.")] = "anatomy",
@@ -204,7 +204,7 @@ def split_command(
     print(json_.dumps(counts) if json else ", ".join(f"{side} {n}" for side, n in counts.items()))
 
 
-@app.command()
+@app.command(epilog="Example: synth report out --to report.html")
 def report(
     out: Out,
     to: Annotated[Path | None, typer.Option("--to", help="The page; report.html in the dataset.")] = None,
@@ -215,7 +215,7 @@ def report(
     print(reporting.write(out, to or out / "report.html"))
 
 
-@app.command()
+@app.command(epilog="Example: synth export out out-hdf5 --to hdf5")
 def export(
     out: Out,
     target: Annotated[Path, typer.Argument(help="The new folder.")],
@@ -227,7 +227,7 @@ def export(
     print(f"{exporting.export(out, target, to)} sequences in {target}")
 
 
-@app.command()
+@app.command(epilog="Example: synth card out")
 def card(out: Out) -> None:
     """Writes the dataset's card anew: README.md with its pictures, and croissant.json for machines."""
     from synth import card as carding
@@ -244,7 +244,7 @@ def card(out: Out) -> None:
         print(f"not said in the job's card, so not in the description: {', '.join(unsaid)}", file=sys.stderr)
 
 
-@app.command()
+@app.command(epilog="Example: synth verify out --fast")
 def verify(
     out: Out,
     fast: Annotated[
@@ -283,7 +283,7 @@ def verify(
         raise typer.Exit(1)
 
 
-@app.command()
+@app.command(epilog="Example: synth picture out --sequence 1 -f 0 -f 5 --to picture.jpg")
 def picture(
     out: Out,
     sequence: Annotated[int, typer.Option("--sequence", "-s", help="Which sequence, by its index.")] = 0,
@@ -307,7 +307,7 @@ def picture(
     print(f"wrote {to}")
 
 
-@app.command()
+@app.command(epilog="Example: synth fields --size 1280x960")
 def fields(
     out: Annotated[
         Path | None, typer.Argument(help="A dataset, for what its first sequence takes in fact.")
@@ -335,7 +335,7 @@ def fields(
         print("\n".join(budget.lines(shape, first)))
 
 
-@app.command()
+@app.command(epilog="Example: synth view out --sequence 0 --save scene.rrd")
 def view(
     out: Out,
     sequence: Annotated[
@@ -361,7 +361,7 @@ def view(
         print(f"wrote {save}; open it with: rerun {save}")
 
 
-@app.command()
+@app.command(epilog="Example: synth doctor .")
 def doctor(
     folder: Annotated[Path, typer.Argument(help="Where datasets are to go.")] = Path(),
     json: Json = False,

@@ -17,7 +17,7 @@ def test_entry_loads_and_has_help(entry: rooms.Command) -> None:
 
 
 def test_group_runs_the_function_of_its_entry(monkeypatch: pytest.MonkeyPatch) -> None:
-    entry = rooms.Command("pareto", "sum", "tests_bench_sum", "total")
+    entry = rooms.Command("pareto", "sum", "tests_bench_sum", "total", "2 5")
 
     class Module:
         @staticmethod
