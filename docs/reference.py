@@ -5,8 +5,6 @@ Job keys come from the schema, fields from the field table, commands from the co
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib import import_module

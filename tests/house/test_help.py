@@ -1,4 +1,4 @@
-"""Every command says what it does, every parameter what it means, and its examples can be typed as they are."""
+"""Every command says what it does, every parameter what it means, and its examples can be typed."""
 
 from __future__ import annotations
 
