@@ -59,19 +59,20 @@ def _section(section: BaseModel, indent: str) -> list[str]:
         value = getattr(section, name)
         inner = config.section(field.annotation)
         text = field.description or (inner.__doc__ if inner else "") or ""
-        limits = "" if inner else _limits(field.annotation, field.metadata)
-        comment = " ".join([*text.split(), limits]).strip()
+        allowed = "" if inner else limits(field.annotation, field.metadata)
+        comment = " ".join([*text.split(), allowed]).strip()
         if inner is not None and lines and lines[-1]:
             lines.append("")
         lines += textwrap.wrap(comment, _WIDTH, initial_indent=f"{indent}# ", subsequent_indent=f"{indent}# ")
         if isinstance(value, BaseModel):
             lines += [f"{indent}{name}:", *_section(value, indent + "  ")]
         else:
-            lines.append(f"{indent}{name}: {_scalar(value)}".rstrip())
+            lines.append(f"{indent}{name}: {scalar(value)}".rstrip())
     return lines
 
 
-def _limits(annotation: Any, metadata: list[Any]) -> str:
+def limits(annotation: Any, metadata: list[Any]) -> str:
+    """What a key may hold, in words: "(> 0)", "(linear | stable)"; empty where anything goes."""
     choices = _choices(annotation)
     if choices:
         return f"({' | '.join(choices)})"
@@ -105,7 +106,8 @@ def _metadata(annotation: Any, metadata: list[Any]) -> list[Any]:
     return found
 
 
-def _scalar(value: Any) -> str:
+def scalar(value: Any) -> str:
+    """A value as YAML in one line; empty for none."""
     if value is None:
         return ""
     if isinstance(value, Path) or (isinstance(value, str) and not value.replace("-", "_").isidentifier()):
@@ -113,5 +115,5 @@ def _scalar(value: Any) -> str:
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, tuple):
-        return f"[{', '.join(_scalar(item) for item in value)}]"
+        return f"[{', '.join(scalar(item) for item in value)}]"
     return str(value)

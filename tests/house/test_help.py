@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 
 import pytest
-from reference import Spoken, commands
+from generate import Spoken, commands
 
 SPOKEN = list(commands())
 DOING = [spoken for spoken in SPOKEN if not hasattr(spoken.command, "list_commands")]

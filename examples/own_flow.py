@@ -1,0 +1,54 @@
+"""A flow back end of one's own: Farneback's, behind the protocol that the tracker and the bench ask for.
+
+    python examples/own_flow.py out
+
+Installed in a package, an entry point makes it a job's `flow.backend` and a `--flow` of the bench:
+
+    [project.entry-points."sulcus.flow"]
+    farneback = "own_flow:Farneback"
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from synth.flow import mask
+from synth.flow.estimator import Flags, Flow, Map, Rgb
+from synth.flow.track import track
+from synth.store import Dataset, Sequence
+
+
+class Farneback:
+    """G. Farneback, "Two-frame motion estimation based on polynomial expansion", SCIA 2003."""
+
+    def flow(
+        self, rest: Rgb, now: Rgb, rest_usable: Flags, now_usable: Flags, initial: Flow | None = None
+    ) -> tuple[Flow, Map]:
+        """Flow (H, W, 2) px at the pixels of `rest`, and how far it is to be trusted, (H, W) in 0..1."""
+        first, second = (cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY) for picture in (rest, now))
+        start = np.zeros((*first.shape, 2), np.float32) if initial is None else initial.copy()
+        flags = 0 if initial is None else cv2.OPTFLOW_USE_INITIAL_FLOW
+        found = cv2.calcOpticalFlowFarneback(first, second, start, 0.5, 4, 15, 5, 7, 1.5, flags)
+        y, x = np.mgrid[: first.shape[0], : first.shape[1]].astype(np.float32)
+        seen = cv2.remap(
+            now_usable.astype(np.float32), x + found[..., 0], y + found[..., 1], cv2.INTER_LINEAR
+        )
+        return np.asarray(found, np.float32), (rest_usable * (seen > 0.9)).astype(np.float32)
+
+
+def error_px(sequence: Sequence) -> float:
+    """Mean endpoint error over visible tissue of all frames but the first."""
+    frames = sequence["rgb"][:]
+    blocked = sequence["tool"][:] | np.stack([mask.glare(frame) for frame in frames])
+    recovered = track(Farneback(), frames, blocked, sequence["tissue"][:])
+    error = np.linalg.norm(recovered.flow - sequence["flow"][:], axis=3)
+    return float(error[1:][sequence["visible"][1:]].mean())
+
+
+if __name__ == "__main__":
+    for sequence in Dataset(Path(sys.argv[1])):
+        print(sequence.index, f"{error_px(sequence):.3f} px")

@@ -1,0 +1,45 @@
+"""Scores a method of one's own as the bench scores networks: against a recording's force sensor.
+
+bench from-dataset out --out recordings
+python examples/own_method.py recordings/000000
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from bench import assess, scale
+from bench.follow import Answer, Scene
+from bench.recording import open_recording
+
+
+class Spring:
+    """Force as stiffness times the mean displacement of the tissue: blind to direction, and to depth."""
+
+    def __init__(self, mm: float) -> None:
+        self.mm = mm
+        """Mean displacement of 1 mm is what E times this much squared, in mN, would do."""
+
+    def __call__(self, flow: np.ndarray, confidence: np.ndarray, scene: Scene, picture: bool) -> Answer:
+        """Force from flow (H, W, 2) px and its confidence (H, W), the bench's `Method`."""
+        moved_mm = np.linalg.norm(flow, axis=2) * scene.scale_mm_per_px
+        young = scene.young_kpa or 1.0  # unknown: the bench then scores shapes only
+        size = young * self.mm * np.average(moved_mm, weights=confidence * scene.tissue + 1e-9)
+        return Answer(np.array([size, np.nan, np.nan]))  # a magnitude: no direction
+
+
+def score(recording: Path) -> assess.Result:
+    """The recording's scores under two springs."""
+    opened = open_recording(recording)
+    methods = {"spring": Spring(60.0), "stiffer": Spring(120.0)}
+    found = scale.find(opened.meta, recording)
+    return assess.assess(opened, methods, "spring", found, assess.Settings(rate_hz=None), {})
+
+
+if __name__ == "__main__":
+    for name, method in score(Path(sys.argv[1])).methods.items():
+        scores = method.scores
+        print(f"{name}: r {scores['r']:.2f}, mean error {scores['mae_mn']:.2f} mN")

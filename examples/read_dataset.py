@@ -1,0 +1,38 @@
+"""Reads a dataset: what was applied, how far the tissue moved, and how well the flow was recovered.
+
+python examples/read_dataset.py out
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from synth.store import Dataset, Sequence
+
+
+def describe(sequence: Sequence) -> dict[str, float]:
+    """A sequence in five numbers."""
+    force = np.linalg.norm(sequence["force"][:], axis=1)  # (T,) mN
+    t = int(force.argmax())
+    # Traction is the label: over the area that each pixel sees it adds up to the force.
+    traction, area = sequence["traction"][t], sequence["area"][:]  # (H, W, 3) kPa, (H, W) mm2
+    labelled = np.linalg.norm(np.einsum("hwk,hw->k", traction, area))  # 1 kPa mm2 = 1 mN
+    flow, seen = sequence["flow"][t], sequence["visible"][t]  # (H, W, 2) px, (H, W)
+    found = {
+        "young_kpa": float(sequence.attrs["young_kpa"]),
+        "peak_force_mn": float(force[t]),
+        "labelled_force_mn": float(labelled),
+        "largest_motion_px": float(np.linalg.norm(flow, axis=2).max()),
+    }
+    if "flow_tvl1" in sequence:
+        error = np.linalg.norm(sequence["flow_tvl1"][t] - flow, axis=2)
+        found["median_flow_error_px"] = float(np.median(error[seen]))
+    return found
+
+
+if __name__ == "__main__":
+    for sequence in Dataset(Path(sys.argv[1])):
+        print(sequence.index, {name: round(value, 3) for name, value in describe(sequence).items()})
