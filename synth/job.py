@@ -200,6 +200,8 @@ class Flow(Section):
 
     backend: Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]+$"), AfterValidator(_estimator)] = "tvl1"
     """Estimator: tvl1, opencv-tvl1, dis or an installed plug-in's; `ideal` computes no recovered flow."""
+    warps: Annotated[int, Field(ge=1, le=12)] = 3
+    """tvl1: linearisations a level of a frame that starts from the one before; twice as many from nothing."""
 
 
 def _known(names: tuple[str, ...], known: tuple[str, ...]) -> tuple[str, ...]:

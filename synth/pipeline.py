@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,8 +13,9 @@ from synth.fem import mesh, solver, tool
 from synth.fem.mesh import Tets
 from synth.fem.solver import Deformation
 from synth.fields import FIELDS
-from synth.flow import mask, track
-from synth.job import Job
+from synth.flow import mask, track, tvl1
+from synth.flow.estimator import Estimator, create
+from synth.job import Flow, Job
 from synth.published import Published
 from synth.render import anatomy, camera, video
 from synth.render.anatomy import Surface
@@ -112,7 +114,7 @@ def render_sequence(job: Job, index: int, folder: Path, report: Report) -> Path:
         with watch.stage("flow"):
             # What a real pipeline has: the tool's outline, and glare as the picture shows it.
             blocked = tools | np.stack([mask.glare(picture) for picture in rgb])
-            recovered = track.track(job.flow.backend, rgb, blocked, still.tissue)
+            recovered = track.track(estimator(job.flow), rgb, blocked, still.tissue)
         with watch.stage("store"):
             for t in range(job.frames):
                 writer.put_frame("flow_tvl1", t, recovered.flow[t])
@@ -172,3 +174,10 @@ def move(job: Job, case: Scenario, surface: Surface, tets: Tets) -> Deformation:
         job.fps,
         case.further,
     )
+
+
+def estimator(flow: Flow) -> Estimator:
+    """The estimator that a job asks for."""
+    if flow.backend != "tvl1":
+        return create(flow.backend)
+    return tvl1.Tvl1(replace(tvl1.Settings(), warps=2 * flow.warps, warm_warps=flow.warps))
