@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from bench.learn_controls import controls
+from bench.learn_controls import beyond_mean_map, controls, mean_map
 from learn.calibrate import stiffness
 from learn.data import Clip
 from learn.evaluate import evaluate
@@ -69,7 +69,8 @@ def carry_out(
     pressed = None
     if presses is not None:
         pressed = {clips[i].content_hash: _pressed(predictor, presses(i)) for i in split.test[:PRESSES]}
-    report = evaluate(predictor, [clips[i] for i in split.test], run.source, pressed=pressed)
+    fitted, tested = [clips[i] for i in split.fit], [clips[i] for i in split.test]
+    report = evaluate(predictor, tested, run.source, pressed=pressed)
     history = [json.loads(s) for s in (models / run.name / "history.jsonl").read_text().splitlines()]
     result = {
         "name": run.name,
@@ -82,9 +83,12 @@ def carry_out(
         "select_r2": card.score,
         "train_cpu_s": spent,
         "history": history,
-        "controls": controls(predictor, [clips[i] for i in split.test], run.source),
+        "controls": controls(predictor, tested, run.source, fitted),
         **report.as_dict(),
     }
+    if run.control:
+        base = mean_map(tested, predictor.card, fitted)
+        result["beyond_mean_map"] = beyond_mean_map(report, base)
     if pressed is not None:
         off = [abs(np.log(pressed[clips[i].content_hash] / clips[i].young_kpa)) for i in split.test[:PRESSES]]
         result["press_young_off"] = float(np.exp(np.median(off)) - 1)

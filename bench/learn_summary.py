@@ -106,6 +106,13 @@ def _controls(found: list[dict[str, Any]]) -> list[dict[str, object]]:
         if r["control"]:
             known = r["columns"]["known"]
             rows.append({"run": r["name"], "control": r["control"]} | {heads[h]: known[h] for h in heads})
+            base = r["controls"]["mean map"]
+            rows.append({"run": r["name"], "control": "mean map"} | {heads[h]: base[h] for h in heads})
+            beyond = {k: Interval(**v, n=0) for k, v in r["beyond_mean_map"].items()}
+            rows.append(
+                {"run": r["name"], "control": f"{r['control']}, beyond the mean map"}
+                | {heads[f"{k}_r2_pooled"]: _text(i) for k, i in beyond.items()}
+            )
     return rows
 
 

@@ -7,11 +7,11 @@ divided by. The squared-error and the R² term then are of one size and their we
 the published code the squared error is in (3 N)², about 1e-4, and R² takes nearly all of the gradient.)
 
 Why another loss against ghosts (`hinge`): a squared price, times three or not, fades with the ghost itself,
-so
-it moves large ghosts a little and small ones not at all. The hinge's price is linear: where the best guess in
-the mean would be q (in `spread`s) on tissue that is free with probability p, it says q − p·weight/2, or
-nothing.
-Cells that are surely in contact (p = 0) aren't touched, which is why R² need not pay for it.
+so it moves large ghosts a little and small ones not at all. The hinge's price is linear: where the best guess
+in the mean would be q (in `spread`s) on tissue that is free with probability p, it says q − p·weight/2, or
+nothing. Cells that are surely in contact (p = 0) aren't touched. What it costs in R² falls on weak presses,
+whose whole map is of the size of that price; `r2_scope` `frame` gives it back: each frame's error is then
+measured against the frame's own force, so a weak press weighs as much as a strong one.
 """
 
 from __future__ import annotations
@@ -42,6 +42,8 @@ class Objective:
     kind: Kind = "antighost"
     r2_weight: float = 0.3
     """Share of the R² term; the rest is the squared error. (Heraoui et al.: 0.3.)"""
+    r2_scope: Literal["batch", "frame"] = "batch"
+    """Over what SSE/SST is taken: the whole batch, as published, or each frame, then their mean."""
     ghost_weight: float = 3.0
     """Price of a squared over-prediction where the true force is low. (Heraoui et al.: 3.)"""
     low: float = 0.05
@@ -51,6 +53,8 @@ class Objective:
     the published code has it (true for nearly every frame: a contact covers little of the picture)."""
     stray_weight: float = 1.0
     """`hinge`: price of the mean force density on contact-free tissue [mN/mm²], in units of `spread`."""
+    stray_above: float = 0.0
+    """`hinge`: share of `unit` up to which force on contact-free tissue has no price."""
     ramp: tuple[float, float] = (0.25, 0.75)
     """`hinge`: shares of the run between which the price grows from none to full. Paid from the start it is
     cheapest to say nothing, and a network learns that first."""
@@ -64,9 +68,12 @@ class Objective:
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
             raise UserError(f"unknown loss {self.kind!r}: one of {', '.join(KINDS)}")
-        weights = ("ghost_weight", "low", "stray_weight", "free", "total_weight", "head_weight")
+        weights = ("ghost_weight", "low", "stray_weight", "stray_above", "free")
+        weights = (*weights, "total_weight", "head_weight")
         if not (0 <= self.r2_weight <= 1 and all(getattr(self, w) >= 0 for w in weights)):
             raise UserError("loss weights: r2_weight in 0..1, the others not negative")
+        if self.r2_scope not in ("batch", "frame"):
+            raise UserError(f"unknown r2_scope {self.r2_scope!r}: batch or frame")
         if self.rule not in ("pixel", "frame"):
             raise UserError(f"unknown low-force rule {self.rule!r}: pixel or frame")
 
@@ -142,12 +149,14 @@ def loss(
         fit, share = (squared * weight).sum() / count, objective.r2_weight
     r2 = zero
     if share > 0:
-        r2 = unexplained(prediction, target, mask, spread, bias_blind=objective.kind == "published")
+        blind, whole = objective.kind == "published", objective.r2_scope == "batch"
+        r2 = unexplained(prediction, target, mask, spread, bias_blind=blind, by_frame=not whole)
         if objective.kind == "published":
             r2 = r2.clamp(max=1.0)
     ghost = zero
     if objective.kind == "hinge":
-        ghost = objective.stray_weight * stray(prediction, target, mask, objective.free * unit) / spread
+        free, above = objective.free * unit, objective.stray_above * unit
+        ghost = objective.stray_weight * stray(prediction, target, mask, free, above) / spread
     total, head = zero, zero
     if objective.total_weight > 0:
         gap = ((prediction - target) * mask).sum((2, 3)) * cell_mm2 / force_unit
@@ -158,15 +167,15 @@ def loss(
     return Terms((1 - share) * fit, share * r2, ghost, total, head)
 
 
-def stray(prediction: Tensor, target: Tensor, mask: Tensor, free: float) -> Tensor:
-    """Mean over tissue of the force density said where the true one is under `free`; unit of `prediction`.
+def stray(prediction: Tensor, target: Tensor, mask: Tensor, free: float, above: float = 0.0) -> Tensor:
+    """Mean over tissue of the force density beyond `above` said where the true one is under `free`.
 
-    `prediction`, `target`: (B, C, N, N); `mask`: (B, 1, N, N) 0/1. Times the tissue's area it is the force
-    [mN at
-    1 kPa] that the answer puts where nothing touches.
+    `prediction`, `target`: (B, C, N, N), `free` and `above` in their unit, as is what is returned; `mask`:
+    (B, 1, N, N) 0/1. With `above` 0, times the tissue's area, it is the force [mN at 1 kPa] that the answer
+    puts where nothing touches.
     """
     loose = mask * (_length(target) < free)
-    return (_length(prediction).abs() * loose).sum() / mask.sum()
+    return ((_length(prediction).abs() - above).clamp_min(0) * loose).sum() / mask.sum()
 
 
 def ghost_weights(
@@ -187,22 +196,32 @@ def ghost_weights(
 
 
 def unexplained(
-    prediction: Tensor, target: Tensor, mask: Tensor, spread: float, *, bias_blind: bool = False
+    prediction: Tensor,
+    target: Tensor,
+    mask: Tensor,
+    spread: float,
+    *,
+    bias_blind: bool = False,
+    by_frame: bool = False,
 ) -> Tensor:
     """1 − R² = SSE/SST over the batch's masked cells, each component about its own mean.
 
-    `bias_blind` takes the variance of the residual instead of SSE, as the published code does: an offset
-    everywhere then costs nothing. A batch with hardly any force is measured against a tenth of the training
-    data's mean square, so that rest frames don't divide by zero.
+    `by_frame` takes the ratio frame by frame and then their mean. `bias_blind` takes the variance of the
+    residual instead of SSE, as the published code does: an offset everywhere then costs nothing. What holds
+    hardly any force is measured against a tenth of the training data's mean square, so that rest frames don't
+    divide by zero.
     """
-    cells = mask.sum()
+    over = (2, 3) if by_frame else (0, 2, 3)
+    cells = mask.sum(over)
     t = target / spread * mask
     e = (prediction - target) / spread * mask
-    sst = t.square().sum((0, 2, 3)) - t.sum((0, 2, 3)).square() / cells
-    sse = e.square().sum((0, 2, 3))
+    count = cells.clamp_min(1)
+    sst = t.square().sum(over) - t.sum(over).square() / count
+    sse = e.square().sum(over)
     if bias_blind:
-        sse = sse - e.sum((0, 2, 3)).square() / cells
-    return sse.sum() / sst.sum().clamp_min(0.1 * float(cells) * prediction.shape[1])
+        sse = sse - e.sum(over).square() / count
+    least = 0.1 * cells.sum(-1).clamp_min(1) * prediction.shape[1]
+    return (sse.sum(-1) / sst.sum(-1).clamp_min(least)).mean()
 
 
 def gradient_shares(terms: Terms, prediction: Tensor) -> dict[str, float]:

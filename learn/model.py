@@ -34,6 +34,9 @@ class Architecture:
     """Times the picture is halved after the stem."""
     stem: int = 1
     """Stride of the first convolution; 4 makes the network live (`d2fnet-s`)."""
+    detail: bool = False
+    """With a stem of 4: strides two and two, and what the first sees also reaches the answer by a skip of
+    its own, so that a contact's rim is drawn at half the input's resolution, not a quarter."""
     output: Output = "vector"
     """`magnitude`: force density ≥ 0; `vector`: its x, y, z in camera axes."""
     bounds: tuple[float, float, float] = (0.25, 0.75, 1.5)
@@ -57,6 +60,9 @@ class Architecture:
                 f"architecture: stem {self.stem} (1, 2 or 4), levels {self.levels} (1-5), "
                 f"width {self.width} (a multiple of 4)"
             )
+
+        if self.detail and (self.stem != 4 or self.name == "monai-unet"):
+            raise UserError("architecture: detail goes with a stem of 4")
 
     @property
     def inputs(self) -> int:
@@ -184,10 +190,16 @@ class D2FNet(nn.Module):
         widths = [arch.width * 2**i for i in range(arch.levels + 1)]
         first = arch.inputs
         self.stem: nn.Module = nn.Identity()
+        fine = arch.width // 2 if arch.detail else 0
+        self.fine: nn.Module | None = None
         if arch.stem > 1:
-            s = arch.stem
-            self.stem = nn.Conv2d(arch.inputs, arch.width, 2 * s, stride=s, padding=s // 2)
+            s = 2 if arch.detail else arch.stem
+            self.stem = nn.Conv2d(fine or arch.inputs, arch.width, 2 * s, stride=s, padding=s // 2)
             first = arch.width
+        if fine:
+            self.fine = nn.Sequential(nn.Conv2d(arch.inputs, fine, 4, stride=2, padding=1), nn.ReLU())
+            self.rise = nn.ConvTranspose2d(arch.width, fine, 2, stride=2)
+            self.draw = Block(2 * fine, fine, 0.0, False)
         self.down = nn.ModuleList(
             Block(a, b, arch.dropout, full) for a, b in zip([first, *widths[:-2]], widths[:-1], strict=True)
         )
@@ -200,9 +212,9 @@ class D2FNet(nn.Module):
         )
         self.merge = nn.ModuleList(Block(2 * b, b, arch.dropout, full) for b in widths[-2::-1])
         self.heads: nn.Module = (
-            Heads(arch.width, arch.components, arch.bounds)
+            Heads(fine or arch.width, arch.components, arch.bounds)
             if full
-            else nn.Conv2d(arch.width, arch.components, 1)
+            else nn.Conv2d(fine or arch.width, arch.components, 1)
         )
         self.apply(_start)
         _start_small(self.heads)
@@ -213,7 +225,8 @@ class D2FNet(nn.Module):
     def forward(self, x: Tensor, log_young: Tensor | None = None) -> Tensor | tuple[Tensor, Tensor]:
         """`log_young`: (B, 1) ln(E / 1 kPa), used only by a `film` network."""
         mask = x[:, 3:4]
-        h = self.stem(x)
+        seen = x if self.fine is None else self.fine(x)
+        h = self.stem(seen)
         skips = []
         for block in self.down:
             h = block(h)
@@ -228,9 +241,12 @@ class D2FNet(nn.Module):
         total = None if self.total is None else self.total(h)
         for rise, block, skip in zip(self.up, self.merge, reversed(skips), strict=True):
             h = block(torch.cat([rise(h), skip], dim=1))
+        if self.fine is not None:
+            h = self.draw(torch.cat([self.rise(h), seen], dim=1))
         y: Tensor = self.heads(h)
         if self.arch.stem > 1:
-            y = F.interpolate(y, scale_factor=float(self.arch.stem), mode="bilinear", align_corners=False)
+            times = 2.0 if self.fine is not None else float(self.arch.stem)
+            y = F.interpolate(y, scale_factor=times, mode="bilinear", align_corners=False)
         return y * mask if total is None else (y * mask, total)
 
 

@@ -6,6 +6,7 @@ ten times too narrow.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -54,12 +55,30 @@ def pooled_r2(moments: Floats, rng: np.random.Generator, level: float = 0.95, dr
         n, t, _, tt, pp, tp = np.moveaxis(m, -1, 0)
         return np.asarray(1 - (pp - 2 * tp + tt) / (tt - t**2 / n), np.float64)
 
-    m = np.asarray(moments, np.float64)
+    return _pooled(moments, r2, rng, level, draws)
+
+
+def skill(
+    error: Floats, base: Floats, rng: np.random.Generator, level: float = 0.95, draws: int = 4000
+) -> Interval:
+    """1 − Σ error / Σ base over sequences: how much of the base's squared error an answer takes away.
+
+    `error`, `base`: (n,) sums of squares of each sequence, same unit. BCa interval over sequences.
+    """
+    sums = np.stack([error, base], axis=-1)
+    return _pooled(sums, lambda m: np.asarray(1 - m[..., 0] / m[..., 1]), rng, level, draws)
+
+
+def _pooled(
+    sums: Floats, statistic: Callable[[Floats], Floats], rng: np.random.Generator, level: float, draws: int
+) -> Interval:
+    """A statistic of sums over sequences; with fewer than three sequences there is no interval (NaN)."""
+    m = np.asarray(sums, np.float64)
     whole = m.sum(axis=0)
     if len(m) < 3:
-        return Interval(float(r2(whole)), float("nan"), float("nan"), len(m))
+        return Interval(float(statistic(whole)), float("nan"), float("nan"), len(m))
     times = rng.multinomial(len(m), np.full(len(m), 1 / len(m)), draws)
-    out = _bca(float(r2(whole)), r2(times @ m), r2(whole - m), level)
+    out = _bca(float(statistic(whole)), statistic(times @ m), statistic(whole - m), level)
     return Interval(out.mean, out.low, out.high, len(m))
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from bench import learn_disturb as disturb
 from bench.learn_badinput import bad_inputs
-from bench.learn_controls import controls
+from bench.learn_controls import beyond_mean_map, controls, mean_map
 from bench.learn_labels import coarser
 from bench.learn_table import markdown
 from learn.data import Clip
@@ -88,11 +88,26 @@ def test_a_coarser_grid_keeps_force_and_motion(clips: list[Clip]) -> None:
 
 
 def test_controls_score_what_they_must(clips: list[Clip], model: Path) -> None:
-    found = controls(load(model), clips[:3], "ideal")
+    found = controls(load(model), clips[:3], "ideal", clips[3:])
     assert found["zero"]["map_r2_pooled"] <= 0
     assert found["identity"]["map_rmse"] == 0
     assert found["identity"]["map_r2_pooled"] == 1
     assert 0 < found["input"]["map_r2_pooled"] < 0.95
+
+
+def test_the_mean_map_is_a_mean_that_knows_no_turn_and_its_skill_beyond_itself_is_none(
+    clips: list[Clip], model: Path
+) -> None:
+    card = load(model).card
+    base = mean_map(clips[:3], card, clips[3:])
+    assert beyond_mean_map(base, base)["map"]["mean"] == 0
+    truth = controls(load(model), clips[:3], "ideal", clips[3:])
+    assert truth["mean map"]["map_r2_pooled"] < truth["input"]["map_r2_pooled"]
+    # On a full mask the mean map holds the fitted frames' mean force, whichever way they are turned.
+    full = [dataclasses.replace(c, mask=np.ones_like(c.mask)) for c in clips]
+    said = mean_map(full[:1], card, full[3:]).clips[0].said_mn / full[0].young_kpa
+    lengths = [np.linalg.norm(c.density, axis=1).sum((1, 2)) for c in full[3:]]
+    assert said[0] == pytest.approx(np.concatenate(lengths).mean() * GRID.pitch_mm**2, rel=1e-5)
 
 
 def test_every_bad_input_gets_one_line(model: Path, tmp_path: Path) -> None:

@@ -109,6 +109,29 @@ def test_the_hinge_prices_force_on_contact_free_tissue_alone_and_linearly() -> N
     assert pull["hinge"] > 1000 * pull["antighost"]
 
 
+def test_a_margin_is_free_of_charge() -> None:
+    objective = Objective(kind="hinge", r2_weight=0.0, stray_weight=1.5, stray_above=0.025)
+    terms = loss(SAID, TRUE, MASK, objective, unit=4.0, spread=2.0)
+    assert float(terms.ghost) == pytest.approx(1.5 * (0.4 - 0.1) / 3 / 2.0, rel=1e-5)
+
+
+def test_r2_frame_by_frame_gives_a_weak_frame_the_weight_of_a_strong_one() -> None:
+    torch.manual_seed(1)
+    true = torch.rand(1, 1, 8, 8)
+    pair = torch.cat([4 * true, 2 * true])
+    ones = torch.ones(2, 1, 8, 8)
+    weak = pair * torch.tensor([1.0, 0.5]).view(2, 1, 1, 1)
+    strong = pair * torch.tensor([0.5, 1.0]).view(2, 1, 1, 1)
+    both = [float(unexplained(said, pair, ones, 1.0, by_frame=True)) for said in (weak, strong)]
+    assert both[0] == pytest.approx(both[1], rel=1e-4)
+    whole = [float(unexplained(said, pair, ones, 1.0)) for said in (weak, strong)]
+    assert whole[1] == pytest.approx(4 * whole[0], rel=1e-4)
+    alone = [float(unexplained(s[None], p[None], ones[:1], 1.0)) for s, p in zip(weak, pair, strict=True)]
+    assert both[0] == pytest.approx(sum(alone) / 2, rel=1e-4)
+    # A rest frame among them divides by no zero.
+    assert torch.isfinite(unexplained(weak, 0 * pair, ones, 1.0, by_frame=True))
+
+
 def test_the_length_of_a_zero_vector_has_a_gradient() -> None:
     said = torch.zeros(1, 3, 1, 2, requires_grad=True)
     true, ones = torch.zeros(1, 3, 1, 2), torch.ones(1, 1, 1, 2)
@@ -127,6 +150,8 @@ def test_the_head_is_held_to_the_total() -> None:
 def test_bad_weights_and_an_empty_mask() -> None:
     with pytest.raises(UserError, match="r2_weight"):
         Objective(r2_weight=1.5)
+    with pytest.raises(UserError, match="unknown r2_scope 'cell'"):
+        Objective(r2_scope="cell")  # type: ignore[arg-type]
     with pytest.raises(UserError, match="unknown loss 'l3'"):
         Objective(kind="l3")  # type: ignore[arg-type]
     with pytest.raises(UserError, match="without a single tissue cell"):

@@ -43,9 +43,37 @@ def test_shapes_mask_and_bounds(output: str, stem: int, levels: int, name: str) 
         assert output == "vector" or y.min() >= 0
 
 
+@pytest.mark.parametrize("name", ["d2fnet", "unet"])
+def test_a_stem_with_detail_draws_at_half_the_inputs_resolution(name: str) -> None:
+    torch.manual_seed(0)
+    arch = Architecture(name=name, width=8, stem=4, levels=2, output="magnitude", detail=True)  # type: ignore[arg-type]
+    x = torch.randn(1, 5, 64, 64)
+    x[:, 3] = 1
+    model = D2FNet(arch).eval()
+    with torch.no_grad():
+        y = model(x)
+        other = x.clone()
+        other[:, :2, 30:32, 30:32] += 1
+        moved = (model(other) - y).abs()[0, 0]
+    assert y.shape == (1, 1, 64, 64)
+    assert moved[30:32, 30:32].max() > 0
+    for wrong in ({"stem": 2}, {"name": "monai-unet"}):
+        with pytest.raises(UserError, match="detail goes with a stem of 4"):
+            Architecture(**{"stem": 4, "detail": True} | wrong)  # type: ignore[arg-type]
+
+
 def test_every_parameter_is_reached_by_the_gradient() -> None:
-    for output in ("magnitude", "vector"):
-        model = D2FNet(Architecture(width=8, levels=2, output=output, condition="film"))  # type: ignore[arg-type]
+    for output, stem in (("magnitude", 1), ("vector", 1), ("magnitude", 4)):
+        model = D2FNet(
+            Architecture(
+                width=8,
+                levels=2,
+                stem=stem,
+                detail=stem == 4,
+                output=output,
+                condition="film",  # type: ignore[arg-type]
+            )
+        )
         x = torch.randn(2, 5, 32, 32)
         x[:, 3] = 1
         model(x, torch.ones(2, 1)).square().sum().backward()
