@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Callable, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import Protocol
 
 import cv2
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from bench.recording import Recording
@@ -25,6 +28,8 @@ WIDTH_KEPT = 320
 """Columns that `shrink` 0 leaves a picture at least: the networks' grids are no finer."""
 _MOST_SNAPSHOTS = 64
 _SNAPSHOT_WIDTH = 480
+_AHEAD = 2
+"""Frames that may wait for the methods, which work in a thread beside the flow."""
 
 
 @dataclass(frozen=True)
@@ -115,7 +120,9 @@ def follow(
     pictured: str | None = None,
     progress: Progress = lambda done: None,
 ) -> Followed:
-    """Decodes, tracks and asks every method, holding one frame at a time.
+    """Decodes, tracks and asks every method, holding a few frames at a time.
+
+    The methods answer in a thread of their own, in order, while the next frame's flow is computed.
 
     Args:
         recording: the opened recording.
@@ -131,18 +138,23 @@ def follow(
     Raises:
         UserError: unreadable video, no frame with a time, rest frame beyond the end, masks of another size.
     """
-    watch, out = Stopwatch(), Followed(force_mn={name: [] for name in methods})
-    walker = _Walker(recording, methods, scale_mm_per_px, backend, shrink, rate_hz, pictured, out, watch)
+    watch, out = Stopwatch(own_thread=True), Followed(force_mn={name: [] for name in methods})
     frames = recording.frames()
     seen = 0
-    while True:
-        with watch.stage("decode"):
-            picture = next(frames, None)
-        if picture is None:
-            break
-        seen += 1
-        walker.take(picture)
-        progress(seen)
+    threads = torch.get_num_threads()
+    with ThreadPoolExecutor(1, initializer=lambda: torch.set_num_threads(threads)) as beside:
+        walker = _Walker(
+            recording, methods, scale_mm_per_px, backend, shrink, rate_hz, pictured, out, watch, beside
+        )
+        while True:
+            with watch.stage("decode"):
+                picture = next(frames, None)
+            if picture is None:
+                break
+            seen += 1
+            walker.take(picture)
+            progress(seen)
+        walker.wait(0)
     if not out.time_s:
         if seen <= recording.meta.rest_frame:
             raise UserError(f"{recording.folder}: rest_frame {recording.meta.rest_frame}, but {seen} frames")
@@ -168,6 +180,7 @@ class _Walker:
         pictured: str | None,
         out: Followed,
         watch: Stopwatch,
+        beside: ThreadPoolExecutor,
     ) -> None:
         self.recording, self.methods, self.out, self.watch = recording, methods, out, watch
         self.backend, self.shrink, self.pictured = backend, 0, pictured
@@ -182,6 +195,9 @@ class _Walker:
         }
         self.period = 0.0 if rate_hz is None else 1 / rate_hz
         self.due = -math.inf
+        self.beside = beside
+        self.asked: deque[Future[None]] = deque()
+        self.time_s: float | None = None
         self.tracker: Tracker | None = None
         self.scene: Scene | None = None
         self.last: NDArray[np.float32] | None = None
@@ -199,7 +215,7 @@ class _Walker:
             self.left_out["without a time"] += 1
             if picture.index != rest_at:
                 return
-        elif self.out.time_s and time <= self.out.time_s[-1]:
+        elif self.time_s is not None and time <= self.time_s:
             self.left_out["whose time stands still or runs back"] += 1
             return
         if time is not None and not self._is_due(time):
@@ -218,7 +234,14 @@ class _Walker:
             with self.watch.stage("flow"):
                 flow, confidence = self.tracker.step(rgb, blocked)
         if time is not None:
-            self._record(picture.index, time, rgb, flow, confidence)
+            self.time_s = time
+            self.wait(_AHEAD - 1)
+            self.asked.append(self.beside.submit(self._record, picture.index, time, rgb, flow, confidence))
+
+    def wait(self, most: int) -> None:
+        """Until at most so many frames wait for the methods. Raises what a method raised."""
+        while len(self.asked) > most:
+            self.asked.popleft().result()
 
     def _shrink_by(self, shrink: int) -> None:
         self.shrink, self.scale = shrink, self.scale * shrink

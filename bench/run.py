@@ -6,6 +6,8 @@ import shutil
 from collections.abc import Mapping
 from pathlib import Path
 
+from threadpoolctl import threadpool_limits
+
 from bench import assess, report, scale
 from bench.assess import Result, Settings
 from bench.bar import counting
@@ -45,7 +47,8 @@ def score(
     """
     from learn.threads import set_threads
 
-    set_threads(None)
+    # NumPy's BLAS too: a second thread of its own waits for a core that the flow has.
+    threadpool_limits(set_threads(None))
     opened = open_recording(recording)
     total = opened.expected_frames()
     network = Model(model)

@@ -142,7 +142,9 @@ class Tvl1:
         with torch.inference_mode(), one_thread():
             start = None
             if initial is not None:
-                start = torch.from_numpy(np.ascontiguousarray(initial)).to(self.device).movedim(-1, 1)
+                # Planes, not interleaved: sums over neighbours took five times as long on the latter.
+                start = torch.from_numpy(np.ascontiguousarray(initial)).to(self.device)
+                start = start.movedim(-1, 1).contiguous()
             found, trust = self.tensors(
                 image.tensor(rest, self.device),
                 image.tensor(now, self.device),
@@ -302,9 +304,10 @@ def step(level: Level, flow: Tensor, dual: Tensor, weight: Tensor, s: Settings) 
 
 def calm(residual: Tensor, mask: Tensor, noise: float) -> Tensor:
     """(noise / median of |r| in the mask) squared, within limits; 1 if nothing is seen. (B, 1, 1, 1)."""
-    size = torch.where(mask > 0, residual.norm(dim=1, keepdim=True), torch.nan)[..., ::2, ::2]
-    found = torch.nan_to_num(size.flatten(1).nanmedian(dim=1).values, nan=noise)
-    return (noise / found.clamp_min(1e-6)).square().clamp(_NOISIEST, _CALMEST).view(-1, 1, 1, 1)
+    some = residual[..., ::2, ::2]
+    square = torch.where(mask[..., ::2, ::2] > 0, (some * some).sum(1, keepdim=True), torch.nan)
+    found = torch.nan_to_num(square.flatten(1).nanmedian(dim=1).values, nan=noise**2)
+    return (noise**2 / found.clamp_min(1e-12)).clamp(_NOISIEST, _CALMEST).view(-1, 1, 1, 1)
 
 
 def steepness(flow: Tensor) -> Tensor:
