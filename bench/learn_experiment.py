@@ -16,7 +16,8 @@ from bench.learn_runs import Run, carry_out
 from bench.learn_summary import write
 from learn.data import load
 from learn.grid import Grid
-from learn.loss import Objective
+from learn.loss import GHOSTLESS, Objective
+from learn.model import Architecture
 from learn.settings import Settings, preset
 from learn.threads import set_threads
 from synth import config
@@ -34,43 +35,56 @@ PRESSED = ("long-fold0-seed0", "film-fold0-seed0")
 """Runs that are also scored with E from a calibration press."""
 LOSSES = {
     "mse": Objective(kind="mse"),
-    "hinge": Objective(kind="hinge", stray_weight=8.0),
-    "hinge4": Objective(kind="hinge", stray_weight=4.0),
-    "hinge-mse": Objective(kind="hinge", r2_weight=0.0, stray_weight=8.0),
+    "ghostless": GHOSTLESS,
     "published": Objective(kind="published", rule="frame"),
     "antighost": Objective(),
     "antighost-frame": Objective(rule="frame"),
+    "hinge": Objective(kind="hinge"),
+    "r2-frame": replace(GHOSTLESS, stray_weight=0.0),
 }
-"""`antighost` and `antighost-frame` differ in the low-force rule alone, `hinge-mse` is `hinge` without R²."""
+"""`antighost` and `antighost-frame` differ in the low-force rule alone. `hinge` is `ghostless` with R² over the
+batch, as published, and `r2-frame` is it without its price: which part does what."""
 
 
 def ideal_runs() -> Iterator[Run]:
     """On labels-only sequences, in the order of their worth; an interrupted study goes on where it was."""
     base = small()
-    for name in ("mse", "hinge", "hinge4", "published"):
-        for seed in range(3):
+    for seed in range(3):
+        for name in ("mse", "ghostless", "published"):
             yield Run(f"{name}-fold0-seed{seed}", replace(base, objective=LOSSES[name], seed=seed))
+    yield Run("shuffled-fold0-seed0", replace(base, epochs=4), control="shuffled")
+    for name, arch in shapes(base.arch).items():
+        yield Run(f"{name}-fold0-seed0", replace(base, arch=arch))
     # The study's best effort, on every fold: twice the steps.
     for fold in range(3):
-        yield Run(f"long-fold{fold}-seed0", replace(base, epochs=16, fold=fold))
-    yield Run("shuffled-fold0-seed0", replace(base, epochs=4), control="shuffled")
-    yield Run("stem4-fold0-seed0", replace(base, arch=replace(base.arch, stem=4, levels=2)))
-    yield Run("unet-fold0-seed0", replace(base, arch=replace(base.arch, name="unet")))
-    yield Run("monai-unet-fold0-seed0", replace(base, arch=replace(base.arch, name="monai-unet", stem=1)))
-    yield Run("vector-fold0-seed0", replace(base, arch=replace(base.arch, output="vector", total=True)))
+        yield Run(f"long-fold{fold}-seed0", replace(base, epochs=16, fold=fold, objective=GHOSTLESS))
     for seed in range(3):
         for name in ("antighost", "antighost-frame"):
             yield Run(f"{name}-fold0-seed{seed}", replace(base, objective=LOSSES[name], seed=seed))
-    yield Run("hinge-mse-fold0-seed0", replace(base, objective=LOSSES["hinge-mse"]))
-    yield Run("film-fold0-seed0", replace(base, arch=replace(base.arch, condition="film")))
+    for name in ("hinge", "r2-frame"):
+        yield Run(f"{name}-fold0-seed0", replace(base, objective=LOSSES[name]))
+
+
+def shapes(arch: Architecture) -> dict[str, Architecture]:
+    """Networks beside the base one, all trained with MSE on the same batches."""
+    return {
+        "unet": replace(arch, name="unet"),
+        "monai-unet": replace(arch, name="monai-unet", stem=1),
+        "film": replace(arch, condition="film"),
+        "total": replace(arch, total=True),
+        "vector": replace(arch, output="vector", total=True),
+        "stem4": replace(arch, stem=4, levels=2),
+        "stem4-detail": replace(arch, stem=4, levels=2, detail=True),
+    }
 
 
 def fine_runs() -> Iterator[Run]:
     """On 128²: what the stem of the live network costs in error, at equal steps."""
     base = replace(small(), size=128, epochs=4)
-    for stem, levels in ((4, 3), (2, 4), (1, 4)):
-        arch = replace(base.arch, stem=stem, levels=levels)
-        yield Run(f"stem{stem}-fold0-seed0", replace(base, arch=arch))
+    for name, stem, detail in (("stem2", 2, False), ("stem4", 4, False), ("stem4-detail", 4, True)):
+        arch = replace(base.arch, stem=stem, levels=3, detail=detail)
+        yield Run(f"{name}-fold0-seed0", replace(base, arch=arch))
+    yield Run("stem1-fold0-seed0", replace(base, arch=replace(base.arch, stem=1, levels=4)))
 
 
 def recovered_runs() -> Iterator[Run]:

@@ -14,13 +14,14 @@ from rich.console import Console
 
 from bench import learn_disturb as disturb
 from bench.learn_badinput import bad_inputs
-from bench.learn_experiment import LOSSES, RESULTS, small
+from bench.learn_experiment import RESULTS, small
 from bench.learn_labels import clips as labels
 from bench.learn_table import markdown
 from bench.machine import describe
 from learn.data import Clip
 from learn.evaluate import Report, evaluate
 from learn.grid import Grid
+from learn.loss import GHOSTLESS
 from learn.predict import Predictor, load
 from learn.settings import Settings
 from learn.split import Split, nested
@@ -87,7 +88,7 @@ is pooled over frames (force) or cells (map) of the tested sequences. Parts with
 run. Machine: 2 cores, no GPU, one thread.
 """
 _TITLES = {
-    "rates": "Learning rate × price of force off contact (`hinge`), over seeds",
+    "rates": "Learning rate × price of force off contact (`ghostless`), over seeds",
     "labels": "Labels off by a factor exp(N(0, s)), one draw a fitted sequence",
     "gestures": "Gestures never seen in training, and frames with two contacts",
     "confidence": "Flow that fails over a fifth of the picture, with and without its confidence",
@@ -124,7 +125,7 @@ def _rates(clips: list[Clip], split: Split, folder: Path, seeds: int, say: Say) 
         for stray in STRAY:
             scores, lost = [], 0
             for seed in range(seeds):
-                objective = replace(LOSSES["hinge"], stray_weight=stray)
+                objective = replace(GHOSTLESS, stray_weight=stray)
                 settings = _tiny(learning_rate=rate, objective=objective, seed=seed)
                 try:
                     card = train(clips, split, settings, folder / f"rate{rate:g}-stray{stray:g}-{seed}")

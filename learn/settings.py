@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 from learn.data import INPUTS, Input, Target
 from learn.grid import Grid
-from learn.loss import Objective
+from learn.loss import GHOSTLESS, Objective
 from learn.model import Architecture
 from synth.errors import UserError
 
@@ -115,6 +115,7 @@ PRESETS: dict[str, Settings] = {
         size=128,
         arch=Architecture(width=16, stem=2, levels=4, dropout=0.05),
         epochs=24,
+        objective=GHOSTLESS,
         learning_rate=1e-3,
         schedule="cosine",
         channels_last=True,
