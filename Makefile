@@ -2,6 +2,7 @@
 #
 #   make demo    dataset -> training -> scores -> runs/demo/report.html
 #   make test    lint, types, tests
+#   make docs    the pages in site/; open site/index.html
 #   make clean   removes what these made
 #
 # PYTHON=python3.12 chooses the interpreter (3.11 or newer).
@@ -11,7 +12,7 @@ PYTHON ?= $(shell for p in python3.13 python3.12 python3.11 python3; do \
 BIN := .venv/bin
 DEMO := runs/demo
 
-.PHONY: demo test setup lint types clean
+.PHONY: demo test docs setup lint types clean
 .DELETE_ON_ERROR:
 
 setup: .venv/installed .venv/llvm
@@ -42,6 +43,10 @@ demo: setup
 test: setup lint types
 	$(BIN)/python -m pytest -n 2
 
+docs: setup
+	$(BIN)/python docs/generate.py
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+
 lint: setup
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
@@ -50,4 +55,4 @@ types: setup
 	$(BIN)/mypy
 
 clean:
-	rm -rf .venv runs build *.egg-info .mypy_cache .ruff_cache .pytest_cache
+	rm -rf .venv runs build site *.egg-info .mypy_cache .ruff_cache .pytest_cache
