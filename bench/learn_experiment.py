@@ -42,8 +42,8 @@ LOSSES = {
     "hinge": Objective(kind="hinge"),
     "r2-frame": replace(GHOSTLESS, stray_weight=0.0),
 }
-"""`antighost` and `antighost-frame` differ in the low-force rule alone. `hinge` is `ghostless` with R² over the
-batch, as published, and `r2-frame` is it without its price: which part does what."""
+"""`antighost` and `antighost-frame` differ in the low-force rule alone. Which part of `ghostless` does what:
+`hinge` has R² over the batch, as published, at its weight there, and `r2-frame` is without the price."""
 
 
 def ideal_runs() -> Iterator[Run]:
