@@ -15,7 +15,7 @@ import torch
 import typer
 from rich.console import Console
 
-from bench import flow_plot
+from bench import plot
 from bench.learn_runs import column
 from bench.learn_table import markdown
 from bench.machine import describe
@@ -44,7 +44,8 @@ class Choice:
 
     @property
     def name(self) -> str:
-        return f"{self.arch.name} w{self.arch.width} stem{self.arch.stem} {self.size}"
+        stem = f"stem{self.arch.stem}{'+detail' if self.arch.detail else ''}"
+        return f"{self.arch.name} w{self.arch.width} {stem} {self.size}"
 
     @property
     def preset(self) -> str:
@@ -154,14 +155,15 @@ def _timed(frame: Callable[[], None], repeats: int, device: str) -> Iterator[flo
 
 
 def _choices(device: str, trained: dict[tuple[Architecture, int], Interval]) -> Iterator[Choice]:
-    shapes = [(8, 4), (16, 4), (32, 4), (16, 2), (16, 1), (32, 1)]
+    stems = [(8, 4), (16, 4), (32, 4), (16, 2), (16, 1), (32, 1)]
+    shapes = [(*s, False) for s in stems] + [(16, 4, True), (24, 4, True)]
     ways = [("contiguous", "fp32"), ("channels_last", "fp32"), ("channels_last", "bf16")]
     ways = [("quick", "fp32"), *ways] if device == "cpu" else ways
-    for (width, stem), size in itertools.product(shapes, (256, 192, 128)):
+    for (width, stem, detail), size in itertools.product(shapes, (256, 192, 128)):
         levels = PRESETS["live"].arch.levels
         if size % (stem * 2**levels):
             continue
-        arch = Architecture(width=width, stem=stem, levels=levels, dropout=0.05)
+        arch = Architecture(width=width, stem=stem, levels=levels, dropout=0.05, detail=detail)
         for layout, precision in ways if flops(arch, size) < LIGHT else ways[:1]:
             yield Choice(arch, size, layout, precision)
     yield Choice(Architecture(name="unet"), 256, ways[0][0])
@@ -170,7 +172,7 @@ def _choices(device: str, trained: dict[tuple[Architecture, int], Interval]) -> 
 
 
 def _shape(arch: Architecture) -> tuple[Any, ...]:
-    return arch.name, arch.width, arch.stem, arch.levels
+    return arch.name, arch.width, arch.stem, arch.levels, arch.detail
 
 
 def _errors(root: Path) -> dict[tuple[Architecture, int], Interval]:
@@ -227,24 +229,22 @@ def _write(out: Path, errors: dict[tuple[Architecture, int], Interval]) -> None:
         scored = [r for r in rows if r["map_rmse"] is not None]
         if scored:
             curves = [
-                flow_plot.Curve(
+                plot.Curve(
                     f"{size}² grid",
                     tuple(r["ms_p50"] for r in own),
                     tuple(r["map_rmse"][0] for r in own),
-                    tuple(r["name"] for r in own),
+                    tuple(f"{r['name']} ({r['preset']})" if r["preset"] else r["name"] for r in own),
                 )
                 for size, own in ((n, [r for r in scored if r["size"] == n]) for n in (64, 128, 256))
                 if own
             ]
             title = f"error of the map against time, {device}"
             panels.append(
-                flow_plot.Panel(
-                    title, "p50 [ms]", "map RMSE [mN/mm²]", tuple(curves), log_x=True, log_y=False
-                )
+                plot.Panel(title, "p50 [ms]", "map RMSE [mN/mm²]", tuple(curves), log_x=True, log_y=False)
             )
     (out / "README.md").write_text("\n".join(parts))
     if panels:
-        flow_plot.write(panels, out, "Learn: error against time")
+        plot.write(panels, out, "Learn: error against time")
 
 
 _HEAD = """# Learn: time a frame, and error where it was trained
