@@ -131,10 +131,12 @@ def _any(store: Path, rng: np.random.Generator) -> Path:
 
 
 def flipped_bit(store: Path, rng: np.random.Generator) -> str:
+    """One bit of any file."""
     return _flip(_any(store, rng), 1, rng)
 
 
 def flipped_bytes(store: Path, rng: np.random.Generator) -> str:
+    """A bit in each of sixteen bytes of a chunk."""
     return _flip(_chunk(store, rng), 16, rng)
 
 
@@ -148,6 +150,7 @@ def _flip(path: Path, count: int, rng: np.random.Generator) -> str:
 
 
 def truncated(store: Path, rng: np.random.Generator) -> str:
+    """A chunk cut short."""
     path = _chunk(store, rng)
     data = path.read_bytes()
     left = int(rng.integers(len(data)))
@@ -156,18 +159,21 @@ def truncated(store: Path, rng: np.random.Generator) -> str:
 
 
 def emptied(store: Path, rng: np.random.Generator) -> str:
+    """Any file, empty."""
     path = _any(store, rng)
     path.write_bytes(b"")
     return str(path)
 
 
 def removed(store: Path, rng: np.random.Generator) -> str:
+    """Any file, gone."""
     path = _any(store, rng)
     path.unlink()
     return str(path)
 
 
 def zeroed_block(store: Path, rng: np.random.Generator) -> str:
+    """512 bytes of a chunk, zero."""
     path = _chunk(store, rng)
     data = bytearray(path.read_bytes())
     start = int(rng.integers(len(data)))
@@ -210,6 +216,7 @@ def edited_metadata(store: Path, rng: np.random.Generator) -> str:
 
 
 def removed_key(store: Path, rng: np.random.Generator) -> str:
+    """A key of the metadata, gone."""
     path = _metadata(store, rng)
     document = json_.loads(path.read_text())
     leaves = [(holder, key) for holder, key in _leaves(document) if isinstance(holder, dict)]

@@ -27,6 +27,7 @@ _COLUMNS = (
 
 
 def runs(folder: Path) -> list[dict[str, Any]]:
+    """What the runs of an experiment left, by name."""
     return [json.loads(file.read_text()) for file in sorted(folder.glob("runs/*.json"))]
 
 

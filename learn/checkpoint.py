@@ -39,6 +39,7 @@ class Card:
 
 
 def write_card(folder: Path, card: Card) -> None:
+    """Writes config.json into a model's folder, whole or not at all."""
     folder.mkdir(parents=True, exist_ok=True)
     tree = {"format": _FORMAT, "version": _VERSION, **asdict(card)}
     _replace(folder / "config.json", (json.dumps(tree, indent=1) + "\n").encode())

@@ -112,7 +112,7 @@ def limits(folder: Folder) -> list[str]:
 
 
 def column(rows: Iterable[Mapping[str, Any]], name: str) -> NDArray[np.float64]:
-    """The numbers of one column that are there."""
+    """The numbers of one column that are there, (n,)."""
     return np.array([row[name] for row in rows if row.get(name) is not None], np.float64)
 
 

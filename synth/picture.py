@@ -79,7 +79,7 @@ def colour_bar(panel: Rgb, colours: Rgb, label: str) -> Rgb:
 
 
 def side_by_side(panels: Sequence[Rgb], captions: Sequence[str]) -> Rgb:
-    """Panels of one size in a row, each under its caption, on white."""
+    """Panels (H, W, 3) of one size in a row, each under its caption, on white."""
     height, width = panels[0].shape[:2]
     row = np.full((height + _CAPTION_PX, len(panels) * (width + _GAP_PX) - _GAP_PX, 3), 255, np.uint8)
     for k, (panel, caption) in enumerate(zip(panels, captions, strict=True)):
@@ -90,7 +90,7 @@ def side_by_side(panels: Sequence[Rgb], captions: Sequence[str]) -> Rgb:
 
 
 def stack(rows: Sequence[Rgb]) -> Rgb:
-    """Rows of one width under one another."""
+    """Rows (h, W, 3) of one width under one another."""
     gap = np.full((_GAP_PX, rows[0].shape[1], 3), 255, np.uint8)
     parts = [part for row in rows for part in (row, gap)]
     return np.concatenate(parts[:-1])
@@ -133,7 +133,7 @@ def frame_flow_force(
 
 
 def of_sequence(sequence: Sequence_, frames: Sequence[int]) -> Rgb:
-    """Frame, flow and force map of some frames of a stored sequence, one row a frame, on common scales.
+    """Frame, flow and force map of some frames of a sequence, a row each, on common scales: (h, w, 3).
 
     Raises:
         UserError: a frame is not in the sequence.

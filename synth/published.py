@@ -105,7 +105,7 @@ class Published:
 
     @classmethod
     def begin(cls, noise: Labels, tissue: Mask, frames: int, rng: np.random.Generator) -> Published:
-        """Draws which frames will be disturbed."""
+        """Draws which frames will be disturbed; `tissue` is (H, W)."""
         return cls(noise, tissue, noisy_frames(frames, noise, rng), rng)
 
     def frame(

@@ -75,7 +75,12 @@ class Writer:
         return _field(name).name in self._wanted
 
     def put(self, name: str, array: NDArray[Any]) -> None:
-        """Writes a whole field. UserError when shape, type or finiteness is not what the table says."""
+        """Writes a whole field, of the shape that the table says for this sequence.
+
+        Raises:
+            ValueError: another shape or type.
+            NotFinite: a number is none.
+        """
         field = _field(name)
         if not self.wants(name):
             return
@@ -87,7 +92,7 @@ class Writer:
             column.whole(array)
 
     def put_frame(self, name: str, t: int, array: NDArray[Any]) -> None:
-        """Writes frame `t` of a field; frames come in order."""
+        """Writes frame `t` of a field, without its first axis; frames come in order. Raises as `put`."""
         if self.wants(name):
             self._column(_field(name)).append(t, array)
 

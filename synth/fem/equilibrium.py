@@ -116,7 +116,7 @@ class _Answers:
 
 
 def check(system: System, u: Floats, state: State, frame: int, load: float) -> None:
-    """Refuses a state that is no deformation: raises `NotFinite` or `InvertedElement`."""
+    """Refuses displacements u (N, 3) mm that are no deformation: `NotFinite` or `InvertedElement`."""
     if not np.isfinite(u).all() or not np.isfinite(state.energy):
         raise NotFinite(f"frame {frame}: the deformation at load {load:.3g} is not finite")
     if state.jacobian <= LEAST_JACOBIAN:

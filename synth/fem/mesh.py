@@ -104,7 +104,7 @@ def dome(xy: Floats, radius_mm: float) -> Floats:
 
 
 def lengthened(points: Floats, cells: Ints, order: int) -> tuple[Floats, Ints]:
-    """Adds the midside nodes of order 2; order 1 comes back unchanged."""
+    """Adds the midside nodes of order 2: cells (M, 4) become (M, 10); those of order 1 stay as they are."""
     if order == 1:
         return points, cells
     pairs, of = edges_of(cells)

@@ -59,7 +59,13 @@ def edges_of(cells: Ints) -> tuple[Ints, Ints]:
 
 
 def bisect(points: Floats, cells: Ints, chosen: Ints) -> tuple[Floats, Ints]:
-    """Halves the chosen tetrahedra at their longest edges, and as many others as conformity asks for."""
+    """Halves chosen tetrahedra at their longest edges, and as many others as conformity asks for.
+
+    Args:
+        points: (N, 3) mm.
+        cells: (M, 4).
+        chosen: (K,) indices of cells.
+    """
     pairs, of = edges_of(cells)
     length = np.linalg.norm(points[pairs[:, 0]] - points[pairs[:, 1]], axis=1)
     # One order of all edges: ties must fall alike in neighbours, or their face would be cut in two ways.

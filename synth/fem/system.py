@@ -77,7 +77,7 @@ class System:
         return (stiffness(self.mesh, moduli) + _springs(self.hold)).tocsr()
 
     def worst(self, u: Floats) -> int:
-        """The element with the smallest det F."""
+        """The element with the smallest det F at (N, 3) mm."""
         strain = np.empty((self.mesh.weight.size, 3, 3))
         gradient(self.mesh.cells, self.mesh.slope, u, strain)
         return int(np.linalg.det(strain + np.eye(3)).argmin() // self.mesh.weight.shape[1])

@@ -43,7 +43,7 @@ def window(field: Tensor, sigma: float) -> Tensor:
 
 
 def doubled(field: Tensor, like: Tensor) -> Tensor:
-    """`field` at twice its size, cut to the height and width of `like`. Bilinear."""
+    """`field` (B, C, h, w) at twice its size, cut to the height and width of `like`. Bilinear."""
     wide = F.interpolate(field, scale_factor=2, mode="bilinear", align_corners=False)
     return wide[..., : like.shape[-2], : like.shape[-1]]
 
@@ -93,7 +93,13 @@ def fill(field: Tensor, usable: Tensor) -> Tensor:
 
 
 def warp(now: Tensor, usable: Tensor, flow: Tensor) -> tuple[Tensor, Tensor]:
-    """`now` at x + w by bicubic sampling, and 1 where all it is read from is usable and inside, else 0."""
+    """`now` at x + w by bicubic sampling, and 1 where all it is read from is usable and inside, else 0.
+
+    Args:
+        now: (B, C, H, W).
+        usable: (B, 1, H, W) in 0..1.
+        flow: w, (B, 2, H, W) px.
+    """
     height, width = now.shape[-2:]
     x = torch.arange(width, device=now.device, dtype=now.dtype)
     y = torch.arange(height, device=now.device, dtype=now.dtype)[:, None]

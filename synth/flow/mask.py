@@ -73,7 +73,7 @@ def blocked(rgb: NDArray[np.uint8]) -> NDArray[np.bool_]:
 
 
 def grey_bodies(rgb: NDArray[np.uint8]) -> NDArray[np.bool_]:
-    """Connected pixels of little colour that touch the border and are more than specks."""
+    """(H, W): connected pixels of little colour that touch the border and are more than specks."""
     values = rgb.astype(np.float32)
     top = values.max(axis=2)
     grey = ((top - values.min(axis=2)) < 0.22 * top + 4).astype(np.uint8)

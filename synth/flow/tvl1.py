@@ -265,7 +265,7 @@ def solve(levels: list[Level], initial: Tensor | None, s: Settings) -> Tensor:
 
 
 def finer(flow: Tensor, level: Level) -> Tensor:
-    """The flow of the next coarser level on the grid of `level`, in its pixels."""
+    """The next coarser level's flow (B, 2, h, w) on the grid of `level`, (B, 2, H, W) in its pixels."""
     return 2 * image.doubled(flow, level.now)
 
 
@@ -322,7 +322,15 @@ def steepness(flow: Tensor) -> Tensor:
 def primal_dual(
     flow: Tensor, dual: Tensor, straight: Tensor, cross: Tensor, shift: Tensor, huber: Tensor, s: Settings
 ) -> tuple[Tensor, Tensor]:
-    """`steps` of: dual ascent on grad w with the Huber prox, primal descent with the data term's 2x2 prox."""
+    """`steps` of: dual ascent on grad w with the Huber prox, primal descent with the data term's 2x2 prox.
+
+    Args:
+        flow: (B, 2, H, W) px.
+        dual: (2, B, 2, H, W), its x and y parts.
+        straight, cross, shift: (B, 2, H, W), (B, 1, H, W), (B, 2, H, W): the prox as an affine map.
+        huber: (B, 1, H, W) or a number, h [px/px].
+        s: settings.
+    """
     sigma = 1 / (8 * s.tau)
     dual, flow, ahead = dual.clone(), flow.clone(), flow.clone()
     px, py = dual[0], dual[1]

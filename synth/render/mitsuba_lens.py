@@ -36,7 +36,7 @@ class Compiled:
         self.sensor.place(camera)
 
     def develop(self, image: Map) -> Map:
-        """The film is the picture."""
+        """The film (H, W, 3) is the picture."""
         return image
 
 
@@ -97,7 +97,7 @@ class Scalar:
         )
 
     def develop(self, image: Map) -> Map:
-        """The recorded picture of a film."""
+        """The recorded picture (H, W, 3) of a larger, finer film."""
         fine = cv2.remap(image, self._at, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         size = (fine.shape[1] // self._fine, fine.shape[0] // self._fine)
         return np.asarray(cv2.resize(fine, size, interpolation=cv2.INTER_AREA), np.float32)

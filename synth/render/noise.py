@@ -36,7 +36,7 @@ def band(rng: np.random.Generator, pixels: int, extent_mm: float, wavelength_mm:
 
 
 def fractal(rng: np.random.Generator, pixels: int, extent_mm: float, longest_mm: float, slope: float) -> Map:
-    """Noise of amplitude spectrum ~ 1/f^slope below `longest_mm`; zero mean, unit variance, float32."""
+    """Noise (n, n) of amplitude ~ 1/f^slope for waves below `longest_mm`; zero mean, unit variance."""
     rows = np.fft.fftfreq(pixels, extent_mm / pixels)
     columns = np.fft.rfftfreq(pixels, extent_mm / pixels)
     frequency = np.hypot(rows[:, None], columns[None])

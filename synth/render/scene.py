@@ -116,7 +116,7 @@ class Studio:
         self._stage: Stage | None = None
 
     def frame(self, vertices: Floats, tips: Floats, shafts: Floats, seed: int) -> Shot:
-        """Picture and truth of one frame with the microscope at rest; arguments as in `Moment`."""
+        """Picture and truth of one frame with the microscope at rest; arrays as in `Moment`."""
         return self.shoot(Moment(vertices, tips, shafts), seed)
 
     def shoot(
@@ -175,7 +175,7 @@ class Studio:
         integrator: str = "direct",
         sampler: str = "multijitter",
     ) -> Stage:
-        """A Mitsuba stage of this scene with bodies `cortex`, `rim` and `tool`, placed as given."""
+        """A Mitsuba stage with bodies `cortex`, `rim` and `tool`; vertices (V, 3), (T, 3) mm as given."""
         if self._render.subsurface == "volume":
             integrator = _VOLUME
         return Stage(

@@ -84,7 +84,7 @@ def normals(height: Map, extent_mm: float) -> Map:
 
 
 def thickness(tube: tuple[Map, Map]) -> Map:
-    """Length of the chord through a round vessel, seen from above [mm]."""
+    """Chord through a round vessel, seen from above, (n, n) mm, of its distance and radius maps."""
     distance, radius = tube
     return np.asarray(2 * np.sqrt(np.maximum(radius**2 - distance**2, 0)), np.float32)
 

@@ -125,7 +125,7 @@ def taper(nodes: Floats, parent: Ints, length: float) -> Floats:
 
 
 def pruned(nodes: Floats, parent: Ints, fixed: int, shortest: int) -> tuple[Floats, Ints]:
-    """Without side twigs of fewer than `shortest` nodes, which look cut off."""
+    """Nodes (N, 2) mm and parents (N,), without side twigs of fewer than `shortest` nodes: they look cut."""
     links = parent.tolist()
     reach = [1] * len(links)
     for node in range(len(links) - 1, -1, -1):
@@ -142,14 +142,14 @@ def pruned(nodes: Floats, parent: Ints, fixed: int, shortest: int) -> tuple[Floa
 
 
 def scattered(extent_mm: float, spacing: float, rng: np.random.Generator) -> Floats:
-    """Points about `spacing` apart: a jittered grid, which neither clumps nor lines up."""
+    """Points (n, 2) mm about `spacing` apart: a jittered grid, which neither clumps nor lines up."""
     side = int(extent_mm / spacing)
     cell = np.stack(np.meshgrid(np.arange(side), np.arange(side)), axis=-1).reshape(-1, 2)
     return ((cell + rng.random(cell.shape)) / side - 0.5) * extent_mm
 
 
 def relaxed(nodes: Floats, parent: Ints, fixed: int, rounds: int) -> Floats:
-    """Nodes after the first `fixed`, drawn towards their neighbours, which rounds off the steps."""
+    """Nodes (N, 2) mm, those after the first `fixed` drawn to their neighbours: that rounds off the steps."""
     has = np.flatnonzero(parent >= 0)
     for _ in range(rounds):
         total, count = np.zeros_like(nodes), np.zeros(len(nodes))

@@ -65,7 +65,7 @@ def trunks(
 def meander(
     rng: np.random.Generator, points: Floats, extent_mm: float, amplitude: float, wiggle: float
 ) -> Floats:
-    """A smooth random shift of points [mm], so that no vessel runs straight; `wiggle` is its short part."""
+    """A smooth random shift of points (n, 2) mm: no vessel runs straight; `wiggle` is its short part."""
     shifts = []
     for _ in range(2):
         long = noise.band(rng, 128, extent_mm, 9.0, 0.3)
