@@ -29,7 +29,7 @@ def flags(mask: NDArray[np.bool_], device: str = "cpu") -> Tensor:
 
 
 def box(field: Tensor, radius: int) -> Tensor:
-    """Mean over (2 radius + 1)², smaller at the border. Separable."""
+    """Mean of (B, C, H, W) over squares of 2 radius + 1 pixels, smaller at the border. Separable."""
     wide = 2 * radius + 1
     rows = F.avg_pool2d(field, (1, wide), 1, (0, radius), count_include_pad=False)
     return F.avg_pool2d(rows, (wide, 1), 1, (radius, 0), count_include_pad=False)

@@ -205,7 +205,7 @@ class Level:
 
 
 def pyramid(rest: Tensor, now: Tensor, rest_usable: Tensor, now_usable: Tensor, s: Settings) -> list[Level]:
-    """Levels from fine to coarse, each half the one before; pixel x of a level is (x - 1/2)/2 of the next."""
+    """Levels, fine to coarse, of tensors as in `Level`; pixel x of a level is (x - 1/2)/2 of the next."""
     levels = []
     batch = now.shape[0]
     grey = torch.cat([rest, now])
