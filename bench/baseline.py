@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
-from bench import compliance, inverse
+from bench import compliance, corotational, inverse
 from bench.follow import Answer, Method, Scene
 from learn.grid import Grid
 from learn.predict import View
@@ -65,6 +65,7 @@ def physical() -> dict[str, Method]:
         "Tikhonov, FEM compliance": inverse.tikhonov,
         "Tikhonov near the contact": inverse.tikhonov_near,
         "one contact, FEM compliance": inverse.one_contact,
+        "one contact, co-rotational": corotational.one_contact,
     }
     zero: Method = Baseline(lambda moved, mask, sure: np.array([0.0, np.nan, np.nan]))
     return {"zero": zero} | {name: Baseline(_inverse(rule)) for name, rule in rules.items()}

@@ -6,6 +6,7 @@ loads across the view can imitate it, so the smooth prior answers badly along th
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -56,7 +57,7 @@ def tikhonov_near(compliance: Compliance, displacement: Floats, weight: Floats) 
 
     Args, returns: as `tikhonov`.
     """
-    place = contact(compliance, displacement, weight)[0]
+    place = contact(compliance, displacement, weight).place
     away = np.square(compliance.nodes - place[:2]).sum(axis=1) / _NEAR_MM**2
     return _smallest(compliance, displacement, weight, _NEAR_SMOOTH_MM, np.exp(-away))
 
@@ -100,11 +101,21 @@ def one_contact(compliance: Compliance, displacement: Floats, weight: Floats) ->
 
     Args, returns: as `tikhonov`.
     """
-    return contact(compliance, displacement, weight)[1]
+    return contact(compliance, displacement, weight).force
 
 
-def contact(compliance: Compliance, displacement: Floats, weight: Floats) -> tuple[Floats, Floats]:
-    """The contact of `one_contact`: (3,) x, y [mm] and the logarithm of its radius, and (3,) its force.
+@dataclass(frozen=True, eq=False)
+class Contact:
+    """A contact that explains a displacement."""
+
+    place: Floats
+    """(3,) x, y [mm] and the logarithm of its radius [mm]."""
+    force: Floats
+    """(3,) mN for E = 1 kPa, camera axes."""
+
+
+def contact(compliance: Compliance, displacement: Floats, weight: Floats) -> Contact:
+    """The contact of `one_contact`.
 
     Without any motion it stands in the middle and carries nothing. The last answer is remembered: two of the
     baselines ask for the same one.
@@ -112,8 +123,13 @@ def contact(compliance: Compliance, displacement: Floats, weight: Floats) -> tup
     return _contact(compliance, displacement.tobytes(), weight.tobytes())
 
 
+def forget() -> None:
+    """Forgets the last contact, so that the next method asked for it pays for it: for timings."""
+    _contact.cache_clear()
+
+
 @lru_cache(maxsize=1)
-def _contact(compliance: Compliance, moved: bytes, sure: bytes) -> tuple[Floats, Floats]:
+def _contact(compliance: Compliance, moved: bytes, sure: bytes) -> Contact:
     displacement, weight = np.frombuffer(moved).reshape(-1, 2), np.frombuffer(sure)
     root = np.tile(np.sqrt(weight), 2)
     u = displacement.T.ravel() * root
@@ -128,23 +144,40 @@ def _contact(compliance: Compliance, moved: bytes, sure: bytes) -> tuple[Floats,
         if explained[k] > best:
             best, start = float(explained[k]), np.array([*compliance.nodes[k], np.log(radius)])
     if best <= 0:
-        return np.zeros(3), np.zeros(3)
+        return Contact(np.zeros(3), np.zeros(3))
+    return settle(compliance, displacement, weight, start)
+
+
+def settle(
+    compliance: Compliance, displacement: Floats, weight: Floats, start: Floats, step: float = 1.0
+) -> Contact:
+    """Moves place and radius of a contact to where it explains the displacement best, the force solved for.
+
+    Args:
+        compliance: for the points seen.
+        displacement: (P, 2) mm.
+        weight: (P,) >= 0.
+        start: (3,) x, y [mm] and the logarithm of the radius.
+        step: of the search's first simplex [mm].
+    """
+    root = np.tile(np.sqrt(weight), 2)
+    u = displacement.T.ravel() * root
     by_node = compliance.matrix.reshape(len(root), -1, 3)
     farthest = float(np.linalg.norm(compliance.nodes, axis=1).max())
 
     def fit(place: Floats) -> tuple[float, Floats]:
         """Square of what a contact at x, y of radius exp(third) leaves unexplained, and its force."""
-        share = _kernel(compliance, place)
-        under = np.flatnonzero(share)
         inside = np.hypot(*place[:2]) <= farthest and _LOG_RADII[0] < place[2] < _LOG_RADII[1]
+        share = kernel(compliance, place)
+        under = np.flatnonzero(share)
         if len(under) < 3 or not inside:
             return np.inf, np.zeros(3)
-        a = np.tensordot(by_node[:, under], share[under] / share.sum(), axes=(1, 0)) * root[:, None]
+        a = np.tensordot(by_node[:, under], share[under], axes=(1, 0)) * root[:, None]
         gram = a.T @ a
         force = np.linalg.solve(gram + 1e-12 * np.trace(gram) * np.eye(3), a.T @ u)
         return float(np.square(u - a @ force).sum()), force
 
-    corners = start + np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 0.25]])
+    corners = start + step * np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 0.25]])
     found = minimize(
         lambda place: fit(place)[0],
         start,
@@ -156,12 +189,14 @@ def _contact(compliance: Compliance, moved: bytes, sure: bytes) -> tuple[Floats,
             "maxiter": 120,
         },
     )
-    return found.x, fit(found.x)[1]
+    return Contact(found.x, fit(found.x)[1])
 
 
-def _kernel(compliance: Compliance, place: Floats) -> Floats:
+def kernel(compliance: Compliance, place: Floats) -> Floats:
+    """Share (K,) of a contact's force that each node carries; they add up to 1, or all are 0 far outside."""
     apart = np.square(compliance.nodes - place[:2]).sum(axis=1) / np.exp(2 * place[2])
-    return np.asarray(np.clip(1 - apart, 0, None) ** 2 * compliance.node_area, np.float64)
+    share = np.clip(1 - apart, 0, None) ** 2 * compliance.node_area
+    return np.asarray(share / max(float(share.sum()), 1e-30), np.float64)
 
 
 @lru_cache(maxsize=8)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from bench import baseline, compliance, inverse, inverse_experiment
+from bench import baseline, compliance, corotational, inverse, inverse_experiment
 from bench.follow import Method, Scene
 from learn.data import Clip
 from synth import job
@@ -118,17 +118,41 @@ def test_one_contact_finds_the_force_along_the_view(known: compliance.Compliance
         assert said == pytest.approx(force, abs=0.12 * np.linalg.norm(force) + 4)
 
 
+def test_corotational_contact_undoes_what_the_tissues_turn_looks_like(known: compliance.Compliance) -> None:
+    forces, fields = inverse_experiment.contacts(
+        known, 3, 3.0, 2000, np.random.default_rng(5), "corotational"
+    )
+    everywhere = np.ones(len(known.points))
+    linear, turned = (
+        np.mean(
+            [
+                np.linalg.norm(3.0 * solve(known, u, everywhere) - f)
+                for f, u in zip(forces, fields, strict=True)
+            ]
+        )
+        for solve in (inverse.one_contact, corotational.one_contact)
+    )
+    assert turned < 0.6 * linear
+
+
+def test_loads_past_the_laws_range_stay_with_the_linear_answer(known: compliance.Compliance) -> None:
+    _, fields = inverse_experiment.contacts(known, 1, 3.0, 2000, np.random.default_rng(6))
+    said = corotational.one_contact(known, fields[0], np.ones(len(known.points)))
+    assert said == pytest.approx(inverse.one_contact(known, fields[0], np.ones(len(known.points))))
+
+
 def test_noise_at_the_edge_leads_nowhere_outside(known: compliance.Compliance) -> None:
     rng = np.random.default_rng(1)
     for seen in (np.ones(len(known.points)), (known.points[:, 0] > 9).astype(float)):
         noise = 0.05 * rng.normal(size=(len(known.points), 2))
-        place, force = inverse.contact(known, noise, seen)
-        assert np.hypot(*place[:2]) <= 12
-        assert np.isfinite(force).all()
+        found = inverse.contact(known, noise, seen)
+        assert np.hypot(*found.place[:2]) <= 12
+        assert np.isfinite(found.force).all()
+        assert np.isfinite(corotational.one_contact(known, noise, seen)).all()
         assert np.isfinite(inverse.tikhonov_near(known, noise, seen)).all()
 
 
 def test_inverse_of_nothing_is_nothing(known: compliance.Compliance) -> None:
     none = np.zeros((len(known.points), 2))
-    for solve in (inverse.tikhonov, inverse.tikhonov_near, inverse.one_contact):
+    for solve in (inverse.tikhonov, inverse.tikhonov_near, inverse.one_contact, corotational.one_contact):
         assert np.abs(solve(known, none, np.ones(len(none)))).max() < 1e-9
