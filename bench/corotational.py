@@ -109,7 +109,7 @@ def added(
     # The load that moves the stiffer mesh as far as this one moves the map's.
     give = float(stiff @ wanted) / max(float(stiff @ stiff), 1e-30)
     load, linear = give * load, give * linear
-    size = float(np.sqrt(max(np.vdot(load, linear), 0.0)))
+    size = max(float(np.vdot(load, linear)), 0.0) ** 0.5
     safe = np.zeros_like(linear)
     begin = linear if start is None else start
     moved, state, rest = equilibrium.balance(tissue.system, load, begin, _TOLERANCE * size, safe)
