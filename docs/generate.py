@@ -107,7 +107,7 @@ def _keys(section: BaseModel, at: str) -> list[str]:
             meaning += f" {limits}"
         value = "" if field.is_required() else jobfile.scalar(default)
         shown = "needed" if field.is_required() else f"`{value}`" if value else "–"
-        rows.append(f"| `{at}{name}` | {shown} | {_cell(meaning)} |")
+        rows.append(f"| `{name}` | {shown} | {_cell(meaning)} |")
         if below is not None:
             many = "tuple" in str(field.annotation)
             inner += ["", f"## {at}{name}{', each of them' if many else ''}", "", _sentence(below.__doc__)]

@@ -296,10 +296,11 @@ def picture(
     import cv2
 
     from synth import picture as drawing
+    from synth import place
     from synth.errors import UserError
     from synth.store import open_sequence
 
-    chosen = open_sequence(out / f"{sequence:06d}.zarr")
+    chosen = open_sequence(place.store(out, sequence))
     rows = drawing.of_sequence(chosen, frame or [drawing.strongest(chosen)])
     to.parent.mkdir(parents=True, exist_ok=True)
     if to.suffix.lower() not in (".png", ".jpg") or not cv2.imwrite(str(to), rows[..., ::-1]):
@@ -350,10 +351,11 @@ def view(
     ] = False,
 ) -> None:
     """Opens sequences in rerun, on this machine only: surface, frame, flow, traction and force by time."""
+    from synth import place
     from synth import view as viewing
     from synth.store import Dataset, open_sequence
 
-    chosen = [open_sequence(out / f"{k:06d}.zarr") for k in sequence] if sequence else [Dataset(out)[0]]
+    chosen = [open_sequence(place.store(out, k)) for k in sequence] if sequence else [Dataset(out)[0]]
     if save is None:
         viewing.show(chosen, web=web)
     else:

@@ -47,8 +47,8 @@ def _findings(folder: Path) -> Iterator[Finding]:
         library is not None,
         "install LLVM 17 or newer (Debian: apt-get install libllvm19), or set DRJIT_LIBLLVM_PATH",
     )
-    yield Finding("CUDA", gpu or "no GPU (not needed)")
-    variant = "cuda_ad_rgb" if gpu else "llvm_ad_rgb" if library else "scalar_rgb"
+    yield Finding("CUDA", f"{gpu}; render.variant=cuda_ad_rgb uses it" if gpu else "no GPU (not needed)")
+    variant = "llvm_ad_rgb" if library else "scalar_rgb"
     yield Finding(
         "renderer", variant, variant != "scalar_rgb", "the slow variant works; LLVM halves the time"
     )

@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from synth import identity, jobfile, versions
+from synth import identity, jobfile, place, versions
 from synth.errors import UserError
 from synth.job import Job
 
@@ -83,8 +83,9 @@ class Folder:
 
     def sweep(self, index: int) -> None:
         """Removes what an attempt at `index` left behind."""
-        for leftover in (self.root / f"{index:06d}.zarr.part", self.root / "radiance" / f"{index:06d}"):
-            if leftover.exists() and not (self.root / f"{index:06d}.zarr").exists():
+        sealed = place.store(self.root, index)
+        for leftover in (sealed.with_name(f"{sealed.name}.part"), self.root / "radiance" / f"{index:06d}"):
+            if leftover.exists() and not sealed.exists():
                 shutil.rmtree(leftover)
 
     def sweep_all(self) -> None:

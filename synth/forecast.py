@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from synth import place
 from synth.errors import UserError
 from synth.fields import FIELDS
 from synth.job import Job
@@ -37,7 +38,7 @@ class Forecast:
 def of(job: Job, root: Path, todo: int, done: Sequence[int], rows: Sequence[Mapping[str, Any]]) -> Forecast:
     """Forecast for `todo` sequences; up to ten finished ones, spread over the dataset, serve as pilot."""
     pilot = [done[int(k)] for k in np.unique(np.linspace(0, len(done) - 1, 10).astype(int))] if done else []
-    each = np.mean([size(root / f"{key:06d}.zarr") for key in pilot]) if pilot else estimate(job)
+    each = np.mean([size(place.store(root, key)) for key in pilot]) if pilot else estimate(job)
     spent = [float(row["cpu_s"]) for row in rows if isinstance(row.get("cpu_s"), float)]
     cpu = float(np.mean(spent)) * todo if spent else None
     return Forecast(todo, float(each) * todo, cpu, len(pilot))

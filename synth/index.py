@@ -11,7 +11,7 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from synth import split
+from synth import place, split
 from synth.errors import UserError
 from synth.folder import Folder, write_whole
 from synth.store import Sequence, open_sequence
@@ -141,4 +141,4 @@ def dataset_hash(rows: Iterable[Mapping[str, Any]]) -> str:
 
 
 def _open(folder: Folder, key: int) -> Sequence:
-    return open_sequence(folder.root / f"{key:06d}.zarr")
+    return open_sequence(place.store(folder.root, key))

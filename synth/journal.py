@@ -8,7 +8,7 @@ import time
 from dataclasses import asdict, dataclass
 from typing import Any, Protocol
 
-from synth import forecast
+from synth import forecast, place
 from synth.child import Attempt
 from synth.folder import Folder, write_whole
 
@@ -74,7 +74,7 @@ class Journal:
     def end(self, attempt: Attempt, again: bool) -> None:
         if attempt.kind == "done":
             self._leave(attempt.index, time.monotonic())
-            self._stored += forecast.size(self._folder.root / f"{attempt.index:06d}.zarr")
+            self._stored += forecast.size(place.store(self._folder.root, attempt.index))
         self._in_flight.pop(attempt.index, None)
         self._since.pop(attempt.index, None)
         if not again:

@@ -74,7 +74,7 @@ class Render(Section):
     spp: Annotated[int, Field(ge=1, le=4096)] = 4
     """Light paths a pixel. Flow stops improving at 4-8."""
     variant: Literal["auto", "llvm_ad_rgb", "scalar_rgb", "cuda_ad_rgb"] = "auto"
-    """Mitsuba variant; auto takes the fastest that works here."""
+    """Mitsuba variant; auto takes llvm_ad_rgb where an LLVM works, else scalar_rgb."""
     field_mm: PositiveRange = (32.0, 38.0)
     """Width of the field of view at the craniotomy [mm]."""
     working_distance_mm: PositiveRange = (280.0, 320.0)

@@ -24,6 +24,11 @@ class Place:
     """Where it is on this machine's file system."""
 
 
+def store(root: Path, index: int) -> Path:
+    """Where sequence `index` of the dataset in `root` lies once it is sealed."""
+    return root / f"{index:06d}.zarr"
+
+
 def of(where: Path | str) -> Place:
     """The place of a path or an address such as `s3://bucket/out/000000.zarr` or `zip://000000.zarr::out.zip`.
 

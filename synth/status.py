@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from synth import forecast
+from synth import forecast, place
 from synth.errors import UserError
 from synth.folder import Folder
 from synth.forecast import Forecast
@@ -130,7 +130,7 @@ def _stages(root: Path, pilot: list[int]) -> dict[str, float]:
     read = 0
     for key in pilot:
         try:
-            timings = open_sequence(root / f"{key:06d}.zarr").attrs.get("timings", {})
+            timings = open_sequence(place.store(root, key)).attrs.get("timings", {})
         except UserError:
             continue  # `synth verify` is for damage
         read += 1

@@ -45,8 +45,8 @@ class Writer:
             size: (height, width) of the picture [px].
             job: the dataset's job.
         """
-        self.path = folder / f"{index:06d}.zarr"
-        self._part = folder / f"{index:06d}.zarr.part"
+        self.path = place.store(folder, index)
+        self._part = self.path.with_name(f"{self.path.name}.part")
         self._exr = folder / "radiance" / f"{index:06d}"
         self._frames, self._size = frames, size
         for stale in (self._part, self._exr):

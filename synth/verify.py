@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from synth import contents, identity, index, split, versions
+from synth import contents, identity, index, place, split, versions
 from synth.errors import UserError
 from synth.folder import Folder
 from synth.invariants import INVARIANTS
@@ -91,7 +91,7 @@ def run(root: Path, *, fast: bool = False, report: Callable[[int, int], None] | 
     for position, key in enumerate(chosen):
         if report is not None:
             report(position, len(chosen))
-        _sequence(folder.root / f"{key:06d}.zarr", described["identity"], checks, fast)
+        _sequence(place.store(folder.root, key), described["identity"], checks, fast)
     return Report(str(root), len(chosen), fast, list(checks.values()))
 
 
@@ -180,7 +180,7 @@ def _dataset(
         return
     for key in sealed:
         try:
-            found = open_sequence(folder.root / f"{key:06d}.zarr")
+            found = open_sequence(place.store(folder.root, key))
         except UserError:
             continue  # found and named by the check of that sequence
         now, row = index.row_of(found), rows.get(key, {})

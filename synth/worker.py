@@ -20,6 +20,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from synth import place
 from synth.errors import UserError
 
 # From <linux/prctl.h>: the signal this process gets when the engine dies, however it dies.
@@ -45,7 +46,7 @@ def _serve(pipe: int, setup: dict[str, Any], logs: Path) -> None:
         log = logs / f"{index:06d}.log"
         _log_to(log)
         try:
-            if (Path(setup["folder"]) / f"{index:06d}.zarr").exists():
+            if place.store(Path(setup["folder"]), index).exists():
                 # An attempt that a cluster lost sight of had just sealed it.
                 log.unlink(missing_ok=True)
                 _send(pipe, sealed=index)

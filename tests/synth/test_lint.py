@@ -31,7 +31,11 @@ def sources(*packages: str) -> list[Path]:
 
 
 def imports(path: Path) -> Iterator[str]:
-    for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+    yield from imported(ast.parse(path.read_text("utf-8")))
+
+
+def imported(tree: ast.Module) -> Iterator[str]:
+    for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom) and node.module:
@@ -100,6 +104,30 @@ def test_rooms_do_not_reach_into_one_another(room: str, barred: tuple[str, ...])
             assert not crossed, f"{path} imports {name}"
 
 
+def reached(*rooms: str) -> set[str]:
+    """Names of all modules that importing a room's modules imports, one through another."""
+    modules = {}
+    for path in sources(*PACKAGES):
+        name = ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
+        tree = ast.parse(path.read_text("utf-8"))
+        tree.body = [node for node in tree.body if isinstance(node, ast.Import | ast.ImportFrom)]
+        modules[name] = set(imported(tree))
+    found: set[str] = set()
+    todo = [name for name in modules if name.split(".")[0] in rooms]
+    while todo:
+        for name in modules.get(todo.pop(), set()) - found:
+            found.add(name)
+            todo.append(name)
+    return found
+
+
+def test_learn_loads_no_renderer_by_way_of_another_module() -> None:
+    found = reached("learn")
+    assert {"torch", "synth.store", "synth.job"} <= found
+    assert not [name for name in found if name.startswith(("mitsuba", "drjit", "bench", "synth.render"))]
+    assert "synth.pipeline" in reached("bench") | reached("synth"), "the walk sees nothing"
+
+
 def test_only_the_adapter_imports_mitsuba_at_the_top() -> None:
     """Mitsuba is loaded after its variant and LLVM are chosen, never on the way of another import."""
     for path in sources("synth", "learn", "bench"):
@@ -109,7 +137,11 @@ def test_only_the_adapter_imports_mitsuba_at_the_top() -> None:
 
 
 def test_no_path_of_a_machine_anywhere() -> None:
-    for path in [*sources(*PACKAGES, "tests"), *ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md")]:
+    for path in [
+        *sources(*PACKAGES, "tests", "examples", "docs"),
+        *ROOT.glob("*.md"),
+        *ROOT.glob("docs/**/*.md"),
+    ]:
         text = path.read_text("utf-8")
         for marker in ("/home" + "/", "/root" + "/", "/work" + "/", "/Users" + "/"):
             assert marker not in text, f"{path} names {marker}"
