@@ -21,6 +21,9 @@ import synth
 Kind = Literal["done", "input", "error", "crash", "memory", "stalled", "disk", "stopped"]
 """How an attempt ended: only `done` is good; `input` would end the same way again."""
 
+Report = Callable[[str, int, int], None]
+"""Told what is being done, how many of it are done, how many there are."""
+
 _TICK_S = 0.2
 _LOG_TAIL = 4000
 
@@ -96,7 +99,7 @@ class Child:
             )
         )
 
-    def run(self, index: int, report: Callable[[str, int, int], None], stop: threading.Event) -> Attempt:
+    def run(self, index: int, report: Report, stop: threading.Event) -> Attempt:
         """Computes one sequence; returns when it is sealed, has failed, or `stop` is set.
 
         After anything but "done" and "input" the process is gone.

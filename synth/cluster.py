@@ -17,10 +17,10 @@ from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
 from synth import slots, versions
-from synth.child import Attempt, Setup
+from synth.child import Attempt, Report, Setup
 from synth.errors import UserError
 from synth.job import Job
-from synth.slots import LocalSlot, Report, Slot, Slots
+from synth.slots import LocalSlot, Slot, Slots
 
 _TOPIC = "sulcus-progress"
 _TICK_S = 0.5

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Protocol
 
 from synth import card, croissant, forecast, index, preview, slots
-from synth.child import Attempt, Setup
+from synth.child import Attempt, Report, Setup
 from synth.errors import UserError
 from synth.folder import Folder, claim
 from synth.job import Job
@@ -227,7 +227,7 @@ class _Pool:
             reasons = sorted({refused.reason for refused in self._refused})
             raise UserError("\n".join(reasons))
 
-    def _reporter(self, key: int) -> Callable[[str, int, int], None]:
+    def _reporter(self, key: int) -> Report:
         def report(stage: str, done: int, of: int) -> None:
             self._events.put(lambda watcher: watcher.stage(key, stage, done, of))
 

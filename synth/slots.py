@@ -6,18 +6,15 @@ import itertools
 import os
 import subprocess
 import threading
-from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Protocol
 
 from synth import llvm
-from synth.child import Attempt, Child, Setup
+from synth.child import Attempt, Child, Report, Setup
 from synth.errors import UserError
 from synth.job import Job
-
-Report = Callable[[str, int, int], None]
 
 # A process that has computed so many is replaced: libraries leak a little with every sequence.
 _RECYCLE = 16
