@@ -175,6 +175,10 @@ def _place(
         elif isinstance(block, CommentedSeq) and isinstance(step, int) and step < len(block):
             line, column = block.lc.item(step)
         else:
+            # Not in the file, but perhaps a part of what was given: `rendr` of `rendr.spp=3`.
+            inside = [text for place, text in given.items() if place[: len(at)] == at]
+            if inside:
+                return (1 << 30, f"'{inside[0]}'")
             break
         block = block[step]
     return (line, f"{label}:{line + 1}:{column + 1}")
