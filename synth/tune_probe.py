@@ -168,7 +168,7 @@ class Probe:
                 opened = line.open(f, job.sensor.shutter, job.sensor.subframes)
                 shots.append(studio.shoot(line.at(f), seeds[f], opened, line.at(f + 1)))
             each.append(cpu[0])
-            frame = min(each[1:])  # what else the machine does only adds
+        frame = min(each[1:])  # what else the machine does only adds
         rgb = np.stack([shot.rgb for shot in shots])
         blocked = np.stack([shot.tool | mask.glare(shot.rgb) for shot in shots])
         return _Film(rgb, blocked, shots, studio, {"scene": scene[0] + each[0] - frame, "render": frame})
