@@ -11,6 +11,7 @@ from typing import Annotated
 import typer
 
 from synth.commands import Commands
+from synth.tune_command import tune
 
 app = typer.Typer(
     name="synth",
@@ -27,6 +28,8 @@ Mix = Annotated[
     typer.Option("--mix-versions", help="Continue a dataset that another version of this program began."),
 ]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")]
+
+app.command(epilog='Example: synth tune demo --budget "force 3%" --out tuned.yaml')(tune)
 
 
 @app.command(epilog="Example: synth new job.yaml")

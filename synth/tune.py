@@ -1,9 +1,9 @@
 """Goal-oriented fidelity: the cheapest job whose forces stay within a budget of those at full fidelity.
 
-A few probe sequences are computed at full fidelity and with one knob turned at a time. What a knob does to the
-force read from them (`tune_reading`) adds up to first order, with its sign, sequence by sequence; costs multiply
-stage by stage. That only orders the candidates: the cheapest one that promises to keep the budget is then
-measured as a whole, on further sequences too, and given up for the next if it does not keep it.
+A few probe sequences are computed at full fidelity and with one knob turned at a time. What a knob does to
+the force read from them (`tune_reading`) adds up to first order, with its sign, sequence by sequence; costs
+multiply stage by stage. That only orders the candidates: the cheapest one that promises to keep the budget is
+then measured as a whole, on further sequences too, and given up for the next if it does not keep it.
 """
 
 from __future__ import annotations
@@ -169,7 +169,8 @@ def run(job: Job, budget: Budget, journal_file: Path, probes: int, checks: int, 
     own_levels = [own(knob, job) for knob in knobs]
     mine = joint(bench, whole, "the job as it is", own_levels, sweep.error(own_levels))
     tried: list[Joint] = []
-    trust, seen = 1.0, set()
+    trust = 1.0
+    seen: set[tuple[str, ...]] = set()
     while True:
         picked = sweep.cheapest(budget.share / trust, own_levels, seen)
         if picked is None or len(tried) == _TRIES - 1:
@@ -274,7 +275,10 @@ class _Sweep:
                 self._moves[i].append(None if broken else [move for move, _ in good])
                 stages = {stage for _, ratio in good for stage in ratio}
                 self._ratios[i].append(
-                    {stage: float(np.median([ratio.get(stage, 1.0) for _, ratio in good])) for stage in stages}
+                    {
+                        stage: float(np.median([ratio.get(stage, 1.0) for _, ratio in good]))
+                        for stage in stages
+                    }
                 )
                 if broken:
                     self._why[i, j] = broken
@@ -318,7 +322,7 @@ class _Sweep:
     def _one(
         self, bench: _Bench, index: int, knob: Knob, finest: dict[str, Any]
     ) -> list[tuple[Floats, dict[str, float]] | str]:
-        """Each level's move of the force on one sequence, and its cost by stage against the finest level's."""
+        """Each level's move of the force on one sequence, and its cost by stage over the finest level's."""
         base = dict(finest)
         if knob.name in ("law", "time"):
             base |= {"fem.tets": min(_SIDE_TETS, finest["fem.tets"])}

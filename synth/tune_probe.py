@@ -1,4 +1,4 @@
-"""One sequence of a job, computed at full fidelity and then with knobs turned: error of the force, and cost."""
+"""One sequence of a job, computed at full fidelity then with knobs turned: error of the force, and cost."""
 
 from __future__ import annotations
 
