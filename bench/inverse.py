@@ -28,6 +28,7 @@ _CORRELATED = 3.0
 Filloon and Nychka, J. Amer. Stat. Assoc. 2001, with 1.4)."""
 _SMOOTH_MM = 4.0
 _NEAR_MM, _NEAR_SMOOTH_MM = 3.0, 3.0
+_ROAM_MM = 2.0
 
 
 def tikhonov(compliance: Compliance, displacement: Floats, weight: Floats) -> Floats:
@@ -131,13 +132,14 @@ def forget() -> None:
 @lru_cache(maxsize=1)
 def _contact(compliance: Compliance, moved: bytes, sure: bytes) -> Contact:
     displacement, weight = np.frombuffer(moved).reshape(-1, 2), np.frombuffer(sure)
-    root = np.tile(np.sqrt(weight), 2)
-    u = displacement.T.ravel() * root
+    # A start needs no more than every other point.
+    square = np.tile(weight, 2)[::2]
+    u = displacement.T.ravel()[::2]
     best, start = 0.0, np.zeros(3)
     for radius in _RADII_MM:
-        a = atoms(compliance, radius)
-        gram = np.einsum("mna,mnb->nab", a * (root**2)[:, None, None], a, optimize=True)
-        right = np.einsum("mna,m->na", a, u * root, optimize=True)
+        a = atoms(compliance, radius)[::2]
+        gram = np.einsum("mna,mnb->nab", a * square[:, None, None], a, optimize=True)
+        right = np.einsum("mna,m->na", a, u * square, optimize=True)
         gram += 1e-9 * np.trace(gram, axis1=1, axis2=2)[:, None, None] * np.eye(3) + 1e-30 * np.eye(3)
         explained = (np.linalg.solve(gram, right[..., None])[..., 0] * right).sum(axis=1)
         k = int(explained.argmax())
@@ -164,18 +166,27 @@ def settle(
     u = displacement.T.ravel() * root
     by_node = compliance.matrix.reshape(len(root), -1, 3)
     farthest = float(np.linalg.norm(compliance.nodes, axis=1).max())
+    # The normal equations of the nodes nearby, once: most of the search stays among them.
+    near = np.linalg.norm(compliance.nodes - start[:2], axis=1) < np.exp(start[2]) + _ROAM_MM
+    columns = by_node[:, near].transpose(0, 2, 1).reshape(len(root), -1) * root[:, None]
+    normal = (columns.T @ columns).reshape(3, near.sum(), 3, near.sum()).transpose(0, 2, 1, 3).copy()
+    right = (columns.T @ u).reshape(3, -1)
 
     def fit(place: Floats) -> tuple[float, Floats]:
         """Square of what a contact at x, y of radius exp(third) leaves unexplained, and its force."""
         inside = np.hypot(*place[:2]) <= farthest and _LOG_RADII[0] < place[2] < _LOG_RADII[1]
         share = kernel(compliance, place)
-        under = np.flatnonzero(share)
-        if len(under) < 3 or not inside:
+        under = share > 0
+        if under.sum() < 3 or not inside:
             return np.inf, np.zeros(3)
-        a = np.tensordot(by_node[:, under], share[under], axes=(1, 0)) * root[:, None]
-        gram = a.T @ a
-        force = np.linalg.solve(gram + 1e-12 * np.trace(gram) * np.eye(3), a.T @ u)
-        return float(np.square(u - a @ force).sum()), force
+        if not (under & ~near).any():
+            held = share[near]
+            gram, seen = normal @ held @ held, right @ held
+        else:
+            a = np.tensordot(by_node[:, under], share[under], axes=(1, 0)) * root[:, None]
+            gram, seen = a.T @ a, a.T @ u
+        force = np.linalg.solve(gram + 1e-12 * np.trace(gram) * np.eye(3), seen)
+        return float(u @ u - force @ (2 * seen - gram @ force)), force
 
     corners = start + step * np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 0.25]])
     found = minimize(
