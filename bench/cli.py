@@ -303,14 +303,16 @@ def gap(
         print(out / "README.md")
 
 
-@app.command(epilog="Example: bench flow rest.png moved.png truth.flo --backend tvl1")
+@app.command(epilog="Example: bench flow rest.png moved.png truth.flo --flow tvl1")
 def flow(
     first: Annotated[Path, typer.Argument(help="Picture at rest.")],
     second: Annotated[Path, typer.Argument(help="Picture after the motion.")],
     truth: Annotated[
         Path | None, typer.Argument(help="True flow: .flo (Middlebury) or .png (KITTI). Empty: not scored.")
     ] = None,
-    backend: Annotated[str, typer.Option(help="Flow estimator, as in a job's flow.backend.")] = "tvl1",
+    backend: Annotated[
+        str, typer.Option("--flow", "--backend", help="Flow estimator, as in a job's flow.backend.")
+    ] = "tvl1",
     glare: Annotated[bool, typer.Option("--glare/--no-glare", help="Mask highlights first.")] = False,
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Write the flow: .flo or .png.")] = None,
     json: Json = False,
@@ -338,7 +340,7 @@ def live(
     young: Annotated[
         float | None, typer.Option(help="Young's modulus of the tissue [kPa], if known.")
     ] = None,
-    backend: Annotated[str, typer.Option(help="Flow estimator.")] = "tvl1",
+    backend: Annotated[str, typer.Option("--flow", "--backend", help="Flow estimator.")] = "tvl1",
     shrink: Annotated[int, typer.Option(min=1, max=8, help="Pictures this many times smaller.")] = 1,
     every: Annotated[bool, typer.Option("--every", help="Work on every frame, however late.")] = False,
     out: Annotated[
