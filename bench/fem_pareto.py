@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from bench import fem_case, fem_cost, fem_page, flow_plot, machine
+from bench import fem_case, fem_cost, machine, plot
 from synth.fem.equilibrium import InvertedElement, NoEquilibrium
 from synth.fem.laws import NUMBER
 from synth.job import Fem
@@ -51,9 +51,8 @@ def pareto(
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
         (out / "pareto.json").write_text(json_.dumps(found, indent=1) + "\n", "utf-8")
-        fem_page.write(
-            _panels(rows, laws), [*rows, *gestures, *whole], found, "Physics: error against cost", out
-        )
+        everything = [*rows, *gestures, *whole]
+        plot.write(panels(found), out, "Physics: error against cost", everything, found)
     if json:
         print(json_.dumps(found))
         return
@@ -139,20 +138,23 @@ def law_table(on: fem_case.Patch) -> list[dict[str, Any]]:
     return rows
 
 
-def _panels(rows: list[dict[str, Any]], laws: list[dict[str, Any]]) -> list[flow_plot.Panel]:
+def panels(found: dict[str, Any]) -> list[plot.Panel]:
+    """Charts of `pareto.json`: the mesh and law's error against cost, and each law's over the load."""
+    rows, laws = found["rows"], found["laws"]
     groups = sorted({(r["law"], r["order"]) for r in rows})
     cost = tuple(
-        flow_plot.Curve(
+        plot.Curve(
             f"{law} P{order}",
             tuple(r["ms_a_frame"] for r in mine),
             tuple(100 * r["error"] for r in mine),
-            tuple(f"{r['tets']}{' (default)' if r['default'] else ''}" for r in mine),
+            tuple(f"{law} P{order}, {r['tets']}" for r in mine),
+            ringed=tuple(k for k, r in enumerate(mine) if r["default"]),
         )
         for law, order in groups
         if (mine := [r for r in rows if (r["law"], r["order"]) == (law, order)])
     )
     worth = tuple(
-        flow_plot.Curve(
+        plot.Curve(
             law,
             tuple(load for load, _ in worst),
             tuple(100 * error for _, error in worst),
@@ -161,8 +163,8 @@ def _panels(rows: list[dict[str, Any]], laws: list[dict[str, Any]]) -> list[flow
         if (worst := _worst(laws, law))
     )
     return [
-        flow_plot.Panel("Error against cost", "CPU ms a frame", "error [%]", cost, log_x=True, log_y=True),
-        flow_plot.Panel("Laws against neo-Hookean", "P = F/(E a2)", "error [%]", worth, True, True),
+        plot.Panel("Error against cost", "CPU ms a frame", "error [%]", cost, True, True, front=True),
+        plot.Panel("Laws against neo-Hookean", "P = F/(E a2)", "error [%]", worth, True, True),
     ]
 
 

@@ -15,7 +15,7 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
-from bench import fem_case, fem_page, flow_plot, machine
+from bench import fem_case, machine, plot
 from synth import job
 from synth.errors import UserError
 from synth.fem import equilibrium, mesh, motion, skin, solver, tool
@@ -64,7 +64,7 @@ def stability(
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
         (out / "stability.json").write_text(json_.dumps(found, indent=1) + "\n", "utf-8")
-        fem_page.write(_panels(rows), rows, found, "Physics: where it breaks", out)
+        plot.write(panels(found), out, "Physics: where it breaks", rows, found)
     if json:
         print(json_.dumps(found))
         return
@@ -290,7 +290,9 @@ def _added(parts: list[Row]) -> Row:
     return whole
 
 
-def _panels(rows: list[Row]) -> list[flow_plot.Panel]:
+def panels(found: dict[str, Any]) -> list[plot.Panel]:
+    """Charts of `stability.json`: error over each thing that is made worse."""
+    rows: list[Row] = found["rows"]
     axes = {
         "load": "P = F/(E a2)",
         "poisson": "Poisson's ratio",
@@ -299,17 +301,17 @@ def _panels(rows: list[Row]) -> list[flow_plot.Panel]:
         "ramp": "steps to the peak",
         "dt": "time step [s]",
     }
-    panels = []
+    made = []
     for sweep, axis in axes.items():
         ours = [r for r in rows if r["sweep"] == sweep and r["error"] is not None and np.isfinite(r["error"])]
         ours = [r for r in ours if r["way"] != "aside" and (sweep != "load" or r["way"] == "push")]
         curves = tuple(
-            flow_plot.Curve(
+            plot.Curve(
                 law,
                 tuple(r["value"] for r in ours if r["law"] == law),
                 tuple(max(100 * r["error"], 1e-3) for r in ours if r["law"] == law),
             )
             for law in dict.fromkeys(r["law"] for r in ours)
         )
-        panels.append(flow_plot.Panel(sweep, axis, "error [%]", curves, sweep != "poisson", True))
-    return panels
+        made.append(plot.Panel(sweep, axis, "error [%]", curves, sweep != "poisson", True))
+    return made

@@ -11,7 +11,7 @@ import cv2
 import torch
 import typer
 
-from bench import flow_plot, machine
+from bench import machine, plot
 from bench.flow_measure import measure
 from bench.flow_scenes import Recipe, pairs
 from synth.flow.estimator import Estimator
@@ -20,7 +20,7 @@ from synth.flow.tvl1 import Settings, Tvl1
 
 
 def pareto(
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for pareto.json, chart.png, index.html.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for pareto.json, chart.svg, index.html.")],
     count: Annotated[int, typer.Option(min=1, help="Pairs a point.")] = 4,
     seed: Annotated[int, typer.Option(min=0, help="Root of every draw.")] = 2613,
     json: Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")] = False,
@@ -45,24 +45,32 @@ def pareto(
         "rows": rows,
     }
     (out / "pareto.json").write_text(json_.dumps(record, indent=1) + "\n")
-    panels = []
+    plot.write(panels(record), out, "Flow: error against time", rows, record)
+    if json:
+        typer.echo(json_.dumps(record))
+
+
+def panels(found: dict[str, Any]) -> list[plot.Panel]:
+    """Charts of `pareto.json`: endpoint and divergence error against time."""
+    rows, made = found["rows"], []
     for title, key in (("endpoint error", "mean"), ("divergence error (relative RMS)", "divergence")):
         curves = []
         for family in dict.fromkeys(str(row["family"]) for row in rows):
             own = [row for row in rows if row["family"] == family]
             curves.append(
-                flow_plot.Curve(
+                plot.Curve(
                     family,
                     tuple(1e3 * float(row["cpu_s"]) for row in own),
                     tuple(float(row[key]) for row in own),
                     tuple(str(row["setting"]) for row in own),
+                    ringed=tuple(k for k, row in enumerate(own) if row["default"]),
                 )
             )
         unit = "EPE mean [px]" if key == "mean" else "relative RMS"
-        panels.append(flow_plot.Panel(title, "CPU time [ms]", unit, tuple(curves), log_x=True, log_y=True))
-    flow_plot.write(panels, out, "Flow: error against time")
-    if json:
-        typer.echo(json_.dumps(record))
+        made.append(
+            plot.Panel(f"Flow: {title}", "CPU time [ms]", unit, tuple(curves), True, True, front=True)
+        )
+    return made
 
 
 def _candidates() -> list[tuple[str, str, Estimator, float | None]]:

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 import typer
 
-from bench import flow_plot, machine
+from bench import machine, plot
 from bench.flow_measure import epe
 from bench.flow_scenes import CLEAN, Flags, Floats, Pair, Recipe, pairs
 from synth.flow import confidence
@@ -56,7 +56,7 @@ class Point:
 
 def stability(
     out: Annotated[
-        Path, typer.Option("--out", "-o", help="Folder for stability.json, chart.png, index.html.")
+        Path, typer.Option("--out", "-o", help="Folder for stability.json, chart.svg, index.html.")
     ],
     count: Annotated[int, typer.Option(min=1, help="Pairs a point.")] = 2,
     size: Annotated[int, typer.Option(min=64, help="Width and height of the pictures [px].")] = 224,
@@ -85,7 +85,7 @@ def stability(
         "points": [asdict(point) for point in points],
     }
     (out / "stability.json").write_text(json_.dumps(record, indent=1) + "\n")
-    flow_plot.write(_panels(points), out, "Flow: where it breaks")
+    plot.write(panels(record), out, "Flow: where it breaks", found=record)
     typer.echo(json_.dumps(record if json else {k: record[k] for k in list(record)[2:5]}))
 
 
@@ -219,15 +219,16 @@ def _extremes(estimator: Estimator) -> dict[str, bool]:
     return result
 
 
-def _panels(points: Sequence[Point]) -> list[flow_plot.Panel]:
-    panels = []
+def panels(found: dict[str, Any]) -> list[plot.Panel]:
+    """Charts of `stability.json`: error over each trouble."""
+    points, made = [Point(**point) for point in found["points"]], []
     for trouble in dict.fromkeys(point.trouble for point in points):
         curves = []
         for name in dict.fromkeys(point.estimator for point in points):
             own = [p for p in points if p.trouble == trouble and p.estimator == name]
             if len(own) > 1:
                 y = tuple(max(p.epe, 1e-3) for p in own)
-                curves.append(flow_plot.Curve(name, tuple(p.value for p in own), y))
+                curves.append(plot.Curve(name, tuple(p.value for p in own), y))
         if curves:
-            panels.append(flow_plot.Panel(trouble, trouble, "EPE mean [px]", tuple(curves), log_y=True))
-    return panels
+            made.append(plot.Panel(trouble, trouble, "EPE mean [px]", tuple(curves), log_y=True))
+    return made

@@ -71,7 +71,9 @@ def pareto(
     """Time every network a frame, channels included, on one core (or a GPU), beside its error."""
     set_threads(1)
     errors = _errors(runs)
-    rows: list[dict[str, Any]] = []
+    file = out / f"data-{device}.json"
+    # A part that is timed anew takes the place of what was there; the rest stays.
+    rows: list[dict[str, Any]] = json_.loads(file.read_text())["rows"] if only and file.is_file() else []
     result = {
         "machine": describe() | {"device": device, "threads": 1, "torch": torch.__version__},
         "rows": rows,
@@ -82,9 +84,9 @@ def pareto(
         if not any(word in named for word in only.split(",")):
             continue
         row = measure(choice, repeats, device) | {"arch": asdict(choice.arch)}
-        rows.append(row)
+        rows[:] = [r for r in rows if _way(r) != _way(row)] + [row]
         # After every one: a run that is stopped has what it timed.
-        (out / f"data-{device}.json").write_text(json_.dumps(result, indent=1) + "\n")
+        file.write_text(json_.dumps(result, indent=1) + "\n")
         if not json:
             Console(stderr=True).print(
                 f"{row['name']} {choice.layout} {choice.precision}: p50 {row['ms_p50']:.1f} ms, "
@@ -171,6 +173,10 @@ def _choices(device: str, trained: dict[tuple[Architecture, int], Interval]) -> 
         yield Choice(arch, size, ways[0][0])
 
 
+def _way(row: dict[str, Any]) -> tuple[Any, ...]:
+    return _arch(row["arch"]), row["size"], row["layout"], row["precision"]
+
+
 def _shape(arch: Architecture) -> tuple[Any, ...]:
     return arch.name, arch.width, arch.stem, arch.levels, arch.detail
 
@@ -217,7 +223,7 @@ def _text(error: list[float] | None) -> str | None:
 
 
 def _write(out: Path, errors: dict[tuple[Architecture, int], Interval]) -> None:
-    """README.md, chart.png and index.html from every data file there."""
+    """README.md, chart.svg and index.html from every data file there."""
     parts, panels = [_HEAD], []
     for file in sorted(out.glob("data-*.json")):
         result = json_.loads(file.read_text())
@@ -226,25 +232,31 @@ def _write(out: Path, errors: dict[tuple[Architecture, int], Interval]) -> None:
             error = errors.get((_arch(row["arch"]), row["size"]))
             row["map_rmse"] = None if error is None else [error.mean, error.low, error.high]
         parts.append(f"## {device}\n\n{markdown(_lines(rows))}\n")
-        scored = [r for r in rows if r["map_rmse"] is not None]
-        if scored:
-            curves = [
-                plot.Curve(
-                    f"{size}² grid",
-                    tuple(r["ms_p50"] for r in own),
-                    tuple(r["map_rmse"][0] for r in own),
-                    tuple(f"{r['name']} ({r['preset']})" if r["preset"] else r["name"] for r in own),
-                )
-                for size, own in ((n, [r for r in scored if r["size"] == n]) for n in (64, 128, 256))
-                if own
-            ]
-            title = f"error of the map against time, {device}"
-            panels.append(
-                plot.Panel(title, "p50 [ms]", "map RMSE [mN/mm²]", tuple(curves), log_x=True, log_y=False)
-            )
+        panels += chart(rows, device)
     (out / "README.md").write_text("\n".join(parts))
     if panels:
         plot.write(panels, out, "Learn: error against time")
+
+
+def chart(rows: list[dict[str, Any]], device: str) -> list[plot.Panel]:
+    """The chart of one device's rows that have an error, if any."""
+    scored = [r for r in rows if r["map_rmse"] is not None]
+    curves = [
+        plot.Curve(
+            f"{size}² grid",
+            tuple(r["ms_p50"] for r in own),
+            tuple(r["map_rmse"][0] for r in own),
+            tuple(f"{r['name']} ({r['preset']})" if r["preset"] else r["name"] for r in own),
+            ringed=tuple(k for k, r in enumerate(own) if r["preset"] and r["layout"] == "quick"),
+            ends=tuple((r["map_rmse"][1], r["map_rmse"][2]) for r in own),
+        )
+        for size, own in ((n, [r for r in scored if r["size"] == n]) for n in (64, 128, 256))
+        if own
+    ]
+    if not curves:
+        return []
+    title = f"Learn: error of the map against time, {device}"
+    return [plot.Panel(title, "p50 [ms]", "map RMSE [mN/mm²]", tuple(curves), log_x=True, front=True)]
 
 
 _HEAD = """# Learn: time a frame, and error where it was trained

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json as json_
 import time
+from inspect import signature
 from itertools import product
 from pathlib import Path
 from typing import Annotated, Any
@@ -12,13 +13,15 @@ import cv2
 import numpy as np
 import typer
 
-from bench import machine
+from bench import machine, plot
 from bench.render_case import Case, case
-from synth.job import Job
+from synth.job import Job, Render
 from synth.render import instrument
+from synth.render.scene import Studio
 
 _LIFT = 1.5
-_DEFAULT = (4, "multijitter", "direct", 640)
+_STAGE = signature(Studio.stage).parameters
+_DEFAULT = (Render().spp, _STAGE["sampler"].default, _STAGE["integrator"].default, Render().size[0])
 
 
 def pareto(
@@ -48,11 +51,19 @@ def pareto(
             row = {"spp": paths, "sampler": pattern, "integrator": kind, "width": wide}
             row["default"] = (paths, pattern, kind, wide) == _DEFAULT
             rows.append(row | measure(ours, paths, pattern, kind))
-    found = {"seed": seed, "lift_mm": _LIFT, "machine": machine.describe(), "rows": rows}
+    asked = {"width": width, "spp": spp, "sampler": sampler, "integrator": integrator}
+    words = [f"--{name} {one}" for name, many in asked.items() for one in many]
+    found = {
+        "command": " ".join(["bench pareto render", *words, f"--seed {seed}"]),
+        "seed": seed,
+        "lift_mm": _LIFT,
+        "machine": machine.describe(),
+        "rows": rows,
+    }
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
         (out / "pareto.json").write_text(json_.dumps(found, indent=1) + "\n", "utf-8")
-        (out / "pareto.svg").write_text(chart(rows), "utf-8")
+        plot.write(panels(found), out, "Rendering: flow error and noise against time", rows, found)
     if json:
         print(json_.dumps(found))
         return
@@ -99,22 +110,23 @@ def measure(ours: Case, spp: int, sampler: str, kind: str) -> dict[str, float]:
     }
 
 
-def chart(rows: list[dict[str, Any]]) -> str:
-    """Noise against CPU time as an SVG, one dot a setting, the default ringed."""
-    x = np.log10([row["cpu_s"] for row in rows])
-    y = np.log10([max(row["noise"], 1e-5) for row in rows])
-    left, right, low, high = x.min() - 0.1, x.max() + 0.1, y.min() - 0.1, y.max() + 0.1
-    parts = [
-        '<svg xmlns="http://www.w3.org/2000/svg" width="640" height="420" font-family="sans-serif" '
-        'font-size="11"><rect width="640" height="420" fill="white"/>'
-        '<text x="320" y="412" text-anchor="middle">CPU s a picture (log)</text>'
-        '<text x="14" y="210" transform="rotate(-90 14 210)" text-anchor="middle">noise / mean (log)</text>'
-    ]
-    for row, a, b in zip(rows, x, y, strict=True):
-        px, py = 50 + 560 * (a - left) / (right - left), 380 - 360 * (b - low) / (high - low)
-        ring = ' stroke="#c2352b" stroke-width="3"' if row["default"] else ""
-        colour = "#1f6feb" if row["width"] == rows[0]["width"] else "#2b7a4b"
-        parts.append(f'<circle cx="{px:.1f}" cy="{py:.1f}" r="5" fill="{colour}"{ring}/>')
-        label = f"{row['spp']} {row['sampler']} {row['integrator']} {row['width']}"
-        parts.append(f'<text x="{px + 8:.1f}" y="{py + 4:.1f}">{label}</text>')
-    return "".join(parts) + "</svg>\n"
+def panels(found: dict[str, Any]) -> list[plot.Panel]:
+    """Charts of `pareto.json`: what flow makes of the pictures, and their noise, against time."""
+    made = []
+    for key, unit in (("flow_median_px", "flow error, median [px]"), ("noise", "noise / mean")):
+        curves = []
+        for kind in dict.fromkeys((r["width"], r["sampler"], r["integrator"]) for r in found["rows"]):
+            own = [r for r in found["rows"] if (r["width"], r["sampler"], r["integrator"]) == kind]
+            curves.append(
+                plot.Curve(
+                    f"{kind[1]}, {kind[2]}, {kind[0]} px",
+                    tuple(float(r["cpu_s"]) for r in own),
+                    tuple(float(r[key]) for r in own),
+                    tuple(f"{r['spp']} spp" for r in own),
+                    ringed=tuple(k for k, r in enumerate(own) if r["default"]),
+                )
+            )
+        made.append(
+            plot.Panel(f"Render: {unit}", "CPU s a picture", unit, tuple(curves), True, True, front=True)
+        )
+    return made

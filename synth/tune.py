@@ -34,6 +34,7 @@ Report = Callable[[int, int, str], None]
 _SIDE_TETS = 1600  # laws and time steps are compared on this mesh, where they cost little
 _SIDE_SIZE = 0.5  # all of the picture but its size is compared at about this part of it
 _TRIES = 6
+_DRAWS = 5
 _SPARE = 1.05  # a promise that was broken is trusted this much less than what it missed by
 _NOTHING = 0.01  # saving less than this part of a frame's cost is no reason to change a job
 
@@ -117,30 +118,39 @@ class _Bench:
     report: Report
     total: int
     done: int = 0
-    _probes: dict[int, Probe] = field(default_factory=dict, repr=False)
+    _probes: dict[int, tuple[Job, Probe]] = field(default_factory=dict, repr=False)
 
     def measure(self, index: int, words: str, changes: Mapping[str, Any], pictures: bool) -> Measured | str:
         """One setting on one sequence; a text where that cannot be carried out."""
         key = f"{index} {sorted(changes.items())} {pictures}"
         found = self.journal.get(key)
         if found is None:
-            job = probing(self.job, index)
+            job, probe = self._probe(index)
             try:
-                if index not in self._probes:
-                    for other in self._probes.values():
-                        other.rest()
-                    finest = tune_knobs.finest(tune_knobs.of(self.job))
-                    self._probes[index] = Probe(tune_knobs.changed(job, finest), 0)
-                found = self._probes[index].measure(tune_knobs.changed(job, changes), pictures)
+                found = probe.measure(tune_knobs.changed(job, changes), pictures)
             except UserError as error:
-                if index not in self._probes:
-                    raise
                 found = str(error)
             self.journal.put(key, found)
         self.done += 1
         self.total = max(self.total, self.done)
         self.report(self.done, self.total, f"sequence {index}: {words}")
         return found
+
+    def _probe(self, index: int) -> tuple[Job, Probe]:
+        """A probe sequence; draws that the job itself could not carry out are passed over."""
+        if index not in self._probes:
+            for _, other in self._probes.values():
+                other.rest()
+            finest = tune_knobs.finest(tune_knobs.of(self.job))
+            for attempt in range(_DRAWS):
+                job = probing(self.job, index, attempt)
+                try:
+                    self._probes[index] = (job, Probe(tune_knobs.changed(job, finest), 0))
+                    break
+                except UserError:
+                    if attempt == _DRAWS - 1:
+                        raise
+        return self._probes[index]
 
 
 def run(job: Job, budget: Budget, journal_file: Path, probes: int, checks: int, report: Report) -> Tuned:
@@ -186,9 +196,9 @@ def run(job: Job, budget: Budget, journal_file: Path, probes: int, checks: int, 
     return Tuned(job, budget, tuple(knobs), tuple(picked), tuple(sweep.rows), full, mine, tuple(tried), kinds)
 
 
-def probing(job: Job, index: int) -> Job:
+def probing(job: Job, index: int, attempt: int = 0) -> Job:
     """A job of one sequence like those of `job`, but none of them; gestures and families in turn."""
-    digest = hashlib.blake2b(f"tune {job.seed} {index}".encode(), digest_size=7).digest()
+    digest = hashlib.blake2b(f"tune {job.seed} {index} {attempt}".encode(), digest_size=7).digest()
     gestures, families = job.fem.gestures, job.appearance.families
     return tune_knobs.changed(
         job,

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from bench import fem_case, fem_page, fem_surface
-from bench.flow_plot import Curve, Panel
+from bench import fem_case, fem_surface, plot
+from bench.plot import Curve, Panel
 
 
 def test_the_page_holds_its_charts_and_rows_and_asks_for_nothing_else(tmp_path: Path) -> None:
@@ -26,15 +26,15 @@ def test_the_page_holds_its_charts_and_rows_and_asks_for_nothing_else(tmp_path: 
     ]
     rows = [{"law": "linear", "error": 0.0123456}, {"law": "stable", "error": None, "why": "a & b"}]
     found = {"command": "bench pareto fem", "machine": {"cores": 2}}
-    fem_page.write(panels, rows, found, "Physics", tmp_path)
+    plot.write(panels, tmp_path, "Physics", rows, found)
     page = (tmp_path / "index.html").read_text("utf-8")
     assert not re.findall(r"(?:src|href)=", page)
     assert page.count("<polyline") == 1
-    assert page.count("<circle") == 1 + 3
+    assert page.count("<circle") == 1 + 3 + 2  # points, and one a name
     assert "P2 &lt;fast&gt;" in page
     assert "<td>0.01235</td>" in page
     assert "a &amp; b" in page
-    assert (tmp_path / "chart.svg").read_text("utf-8") in page
+    assert (tmp_path / "chart.svg").read_text("utf-8").count("<circle") == 6
 
 
 def test_a_users_surface_is_measured_against_a_finer_mesh(tmp_path: Path) -> None:
