@@ -53,8 +53,9 @@ class Objective:
     the published code has it (true for nearly every frame: a contact covers little of the picture)."""
     stray_weight: float = 8.0
     """`hinge`: price of the mean force density on contact-free tissue [mN/mm²], in units of `spread`."""
-    stray_above: float = 0.0
-    """`hinge`: share of `unit` up to which force on contact-free tissue has no price."""
+    stray_cap: float = 0.0
+    """`hinge`: share of `unit` from which on more force on contact-free tissue costs no more; 0 is none. The
+    rim of a strong contact, where the best guess is well above it, then isn't pulled down."""
     ramp: tuple[float, float] = (0.25, 0.75)
     """`hinge`: shares of the run between which the price grows from none to full. Paid from the start it is
     cheapest to say nothing, and a network learns that first."""
@@ -68,7 +69,7 @@ class Objective:
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
             raise UserError(f"unknown loss {self.kind!r}: one of {', '.join(KINDS)}")
-        weights = ["ghost_weight", "low", "stray_weight", "stray_above", "free"]
+        weights = ["ghost_weight", "low", "stray_weight", "stray_cap", "free"]
         weights += ["total_weight", "head_weight"]
         if not (0 <= self.r2_weight <= 1 and all(getattr(self, w) >= 0 for w in weights)):
             raise UserError("loss weights: r2_weight in 0..1, the others not negative")
@@ -78,7 +79,7 @@ class Objective:
             raise UserError(f"unknown low-force rule {self.rule!r}: pixel or frame")
 
 
-GHOSTLESS = Objective(kind="hinge", r2_weight=0.5, r2_scope="frame")
+GHOSTLESS = Objective(kind="hinge", r2_scope="frame", stray_weight=10.0, stray_cap=0.1)
 """What took the ghosts away at no cost in R² (docs/results/learn): its weights were chosen there."""
 
 
@@ -159,8 +160,8 @@ def loss(
             r2 = r2.clamp(max=1.0)
     ghost = zero
     if objective.kind == "hinge":
-        free, above = objective.free * unit, objective.stray_above * unit
-        ghost = objective.stray_weight * stray(prediction, target, mask, free, above) / spread
+        free, cap = objective.free * unit, objective.stray_cap * unit
+        ghost = objective.stray_weight * stray(prediction, target, mask, free, cap) / spread
     total, head = zero, zero
     if objective.total_weight > 0:
         gap = ((prediction - target) * mask).sum((2, 3)) * cell_mm2 / force_unit
@@ -171,15 +172,16 @@ def loss(
     return Terms((1 - share) * fit, share * r2, ghost, total, head)
 
 
-def stray(prediction: Tensor, target: Tensor, mask: Tensor, free: float, above: float = 0.0) -> Tensor:
-    """Mean over tissue of the force density beyond `above` said where the true one is under `free`.
+def stray(prediction: Tensor, target: Tensor, mask: Tensor, free: float, cap: float = 0.0) -> Tensor:
+    """Mean over tissue of the force density, at most `cap` (0: any), said where the true one is under `free`.
 
-    `prediction`, `target`: (B, C, N, N), `free` and `above` in their unit, as is what is returned; `mask`:
-    (B, 1, N, N) 0/1. With `above` 0, times the tissue's area, it is the force [mN at 1 kPa] that the answer
+    `prediction`, `target`: (B, C, N, N), `free` and `cap` in their unit, as is what is returned; `mask`:
+    (B, 1, N, N) 0/1. Without a cap, times the tissue's area, it is the force [mN at 1 kPa] that the answer
     puts where nothing touches.
     """
     loose = mask * (_length(target) < free)
-    return ((_length(prediction).abs() - above).clamp_min(0) * loose).sum() / mask.sum()
+    said = _length(prediction).abs()
+    return ((said.clamp_max(cap) if cap > 0 else said) * loose).sum() / mask.sum()
 
 
 def ghost_weights(

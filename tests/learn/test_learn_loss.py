@@ -109,10 +109,12 @@ def test_the_hinge_prices_force_on_contact_free_tissue_alone_and_linearly() -> N
     assert pull["hinge"] > 1000 * pull["antighost"]
 
 
-def test_a_margin_is_free_of_charge() -> None:
-    objective = Objective(kind="hinge", r2_weight=0.0, stray_weight=1.5, stray_above=0.025)
-    terms = loss(SAID, TRUE, MASK, objective, unit=4.0, spread=2.0)
-    assert float(terms.ghost) == pytest.approx(1.5 * (0.4 - 0.1) / 3 / 2.0, rel=1e-5)
+def test_beyond_the_cap_more_force_costs_no_more() -> None:
+    objective = Objective(kind="hinge", r2_weight=0.0, stray_weight=1.5, stray_cap=0.025)
+    said = SAID.clone().requires_grad_()
+    ghost = loss(said, TRUE, MASK, objective, unit=4.0, spread=2.0).ghost
+    assert float(ghost.detach()) == pytest.approx(1.5 * 0.1 / 3 / 2.0, rel=1e-5)
+    assert not torch.autograd.grad(ghost, said)[0].any()
 
 
 def test_r2_frame_by_frame_gives_a_weak_frame_the_weight_of_a_strong_one() -> None:
