@@ -61,14 +61,19 @@ class Baseline:
 
 def physical() -> dict[str, Method]:
     """Those that need no training data."""
-    rules = {
+    zero: Method = Baseline(lambda moved, mask, sure: np.array([0.0, np.nan, np.nan]))
+    return {"zero": zero} | {name: Baseline(rule) for name, rule in physical_rules().items()}
+
+
+def physical_rules() -> dict[str, Rule]:
+    """The inverses of the physics."""
+    solvers = {
         "Tikhonov, FEM compliance": inverse.tikhonov,
         "Tikhonov near the contact": inverse.tikhonov_near,
         "one contact, FEM compliance": inverse.one_contact,
         "one contact, co-rotational": corotational.one_contact,
     }
-    zero: Method = Baseline(lambda moved, mask, sure: np.array([0.0, np.nan, np.nan]))
-    return {"zero": zero} | {name: Baseline(_inverse(rule)) for name, rule in rules.items()}
+    return {name: _inverse(solve) for name, solve in solvers.items()}
 
 
 def fitted(clips: Sequence[Clip], source: str, seed: int = 0) -> dict[str, Method]:
