@@ -1,4 +1,4 @@
-"""What building the pages needs beside MkDocs: equations as MathML, one front page a results folder."""
+"""What building the pages needs beside MkDocs: equations as MathML, and the results as they are found."""
 
 from __future__ import annotations
 
@@ -18,6 +18,9 @@ def on_config(config: Any) -> Any:
     docs = Path(config.docs_dir)
     twice = [f"/{page.parent.relative_to(docs).as_posix()}/index.html" for page in docs.rglob("README.md")]
     config.exclude_docs = GitIgnoreSpec.from_lines(["*.py", *twice])
+    rooms = sorted((docs / "results").glob("*/README.md"))
+    listed = [{page.parent.name: page.relative_to(docs).as_posix()} for page in rooms]
+    config.nav.append({"Results": ["results/README.md", *listed]})
     return config
 
 
