@@ -115,6 +115,14 @@ def slow(job: Job, index: int, folder: Path, report: Report) -> None:
     sequence(job, index, folder, report)
 
 
+def stuck(job: Job, index: int, folder: Path, report: Report) -> None:
+    """From the fourth sequence on without end: whoever interrupts it comes in time."""
+    while index >= 3:
+        report("fem", 0, 5)
+        time.sleep(0.05)
+    sequence(job, index, folder, report)
+
+
 def consistent(job: Job, index: int, folder: Path, report: Report, fault: str = "") -> None:
     """A flat tissue seen squarely that slides to the right while a load rests on it: every invariant holds.
 

@@ -249,7 +249,7 @@ def test_folder_names_with_spaces_and_other_letters(tmp_path: Path, undisturbed:
 def test_killed_and_resumed_equals_undisturbed(
     tmp_path: Path, kill: signal.Signals, undisturbed: str
 ) -> None:
-    victim = start(tmp_path / "out", JOB, "slow")
+    victim = start(tmp_path / "out", JOB, "stuck")
     wait_for(lambda: len(list((tmp_path / "out").glob("*.zarr"))) >= 1)
     victim.send_signal(kill)
     victim.wait(timeout=30)
