@@ -36,6 +36,8 @@ class Settings:
     """Flow is computed on pictures this many times smaller; 0: so that they keep 320 columns."""
     rate_hz: float | None = 10.0
     """At most so many frames a second are looked at; None: all."""
+    two_processes: bool = False
+    """Flow in a process of its own, beside the methods: the same answers sooner, for two cores."""
 
 
 @dataclass(frozen=True)
@@ -119,6 +121,7 @@ def assess(
         shrink=settings.shrink,
         rate_hz=settings.rate_hz,
         pictured=main,
+        two_processes=settings.two_processes,
         progress=progress,
     )
     time = np.array(done.time_s)

@@ -3,22 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections import deque
 from collections.abc import Callable, Mapping
-from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import Protocol
 
 import cv2
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
+from bench.beside import Beside, Flow, Here
 from bench.recording import Recording
 from bench.video import Picture
 from synth.errors import UserError
 from synth.flow import mask
-from synth.flow.track import Tracker
 from synth.stopwatch import Stopwatch
 
 Progress = Callable[[int], None]
@@ -28,8 +25,6 @@ WIDTH_KEPT = 320
 """Columns that `shrink` 0 leaves a picture at least: the networks' grids are no finer."""
 _MOST_SNAPSHOTS = 64
 _SNAPSHOT_WIDTH = 480
-_AHEAD = 2
-"""Frames that may wait for the methods, which work in a thread beside the flow."""
 
 
 @dataclass(frozen=True)
@@ -118,11 +113,10 @@ def follow(
     shrink: int = 1,
     rate_hz: float | None = None,
     pictured: str | None = None,
+    two_processes: bool = False,
     progress: Progress = lambda done: None,
 ) -> Followed:
     """Decodes, tracks and asks every method, holding a few frames at a time.
-
-    The methods answer in a thread of their own, in order, while the next frame's flow is computed.
 
     Args:
         recording: the opened recording.
@@ -133,19 +127,20 @@ def follow(
             `WIDTH_KEPT` columns.
         rate_hz: at most so many frames a second are looked at; None: all.
         pictured: the method whose force map goes into the snapshots.
+        two_processes: flow in a process of its own, while the methods answer for the frame before.
         progress: told after every frame.
 
     Raises:
         UserError: unreadable video, no frame with a time, rest frame beyond the end, masks of another size.
     """
-    watch, out = Stopwatch(own_thread=True), Followed(force_mn={name: [] for name in methods})
+    watch, out = Stopwatch(), Followed(force_mn={name: [] for name in methods})
+    flow: Flow = Beside() if two_processes else Here()
+    walker = _Walker(
+        recording, methods, scale_mm_per_px, backend, shrink, rate_hz, pictured, out, watch, flow
+    )
     frames = recording.frames()
     seen = 0
-    threads = torch.get_num_threads()
-    with ThreadPoolExecutor(1, initializer=lambda: torch.set_num_threads(threads)) as beside:
-        walker = _Walker(
-            recording, methods, scale_mm_per_px, backend, shrink, rate_hz, pictured, out, watch, beside
-        )
+    try:
         while True:
             with watch.stage("decode"):
                 picture = next(frames, None)
@@ -154,12 +149,16 @@ def follow(
             seen += 1
             walker.take(picture)
             progress(seen)
-        walker.wait(0)
+        walker.finish()
+    finally:
+        flow.close()
     if not out.time_s:
         if seen <= recording.meta.rest_frame:
             raise UserError(f"{recording.folder}: rest_frame {recording.meta.rest_frame}, but {seen} frames")
         raise UserError(f"{recording.folder}: no frame has a time; give frames.csv, or fps in meta.yaml")
     out.timings = watch.report()
+    if walker.peak_bytes:
+        out.timings["flow_peak_rss_mb"] = round(walker.peak_bytes / 1e6, 1)
     if not recording.masks:
         out.notes.append("no masks/: the tool is found in each picture")
     for kind, count in walker.left_out.items():
@@ -180,7 +179,7 @@ class _Walker:
         pictured: str | None,
         out: Followed,
         watch: Stopwatch,
-        beside: ThreadPoolExecutor,
+        flow: Flow,
     ) -> None:
         self.recording, self.methods, self.out, self.watch = recording, methods, out, watch
         self.backend, self.shrink, self.pictured = backend, 0, pictured
@@ -195,10 +194,10 @@ class _Walker:
         }
         self.period = 0.0 if rate_hz is None else 1 / rate_hz
         self.due = -math.inf
-        self.beside = beside
-        self.asked: deque[Future[None]] = deque()
+        self.flow = flow
+        self.asked: tuple[int, float, NDArray[np.uint8]] | None = None
         self.time_s: float | None = None
-        self.tracker: Tracker | None = None
+        self.peak_bytes = 0
         self.scene: Scene | None = None
         self.last: NDArray[np.float32] | None = None
         self.stride = 1
@@ -226,22 +225,36 @@ class _Walker:
             self._shrink_by(max(1, size[1] // WIDTH_KEPT))
         tool = self.recording.tool(picture.index, size)
         rgb, blocked = self._prepare(picture.rgb, tool)
-        if self.tracker is None:
-            flow, confidence = self._start(rgb, blocked, size)
+        if self.scene is None:
+            still = self._start(rgb, blocked, size)
+            if time is not None:
+                self._record(picture.index, time, rgb, *still)
         elif size != self.out.size:
             raise UserError(f"frame {picture.index}: {size[1]} x {size[0]}, the rest frame is another size")
         else:
-            with self.watch.stage("flow"):
-                flow, confidence = self.tracker.step(rgb, blocked)
-        if time is not None:
-            self.time_s = time
-            self.wait(_AHEAD - 1)
-            self.asked.append(self.beside.submit(self._record, picture.index, time, rgb, flow, confidence))
+            assert time is not None  # only the rest frame may be without
+            before, found = self.asked, self._answer()
+            self.flow.ask(rgb, blocked)
+            self.asked = (picture.index, time, rgb)
+            # The methods' turn, while the flow of this frame is on its way.
+            if before is not None and found is not None:
+                self._record(*before, *found)
+        self.time_s = time if time is not None else self.time_s
 
-    def wait(self, most: int) -> None:
-        """Until at most so many frames wait for the methods. Raises what a method raised."""
-        while len(self.asked) > most:
-            self.asked.popleft().result()
+    def finish(self) -> None:
+        """What the last frame is still owed."""
+        found = self._answer()
+        if self.asked is not None and found is not None:
+            self._record(*self.asked, *found)
+
+    def _answer(self) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
+        """Flow and confidence of the frame under way; None if none is."""
+        if self.asked is None:
+            return None
+        found = self.flow.answer()
+        self.watch.add("flow", found.cpu_s, found.wall_s)
+        self.peak_bytes = max(self.peak_bytes, found.peak_bytes)
+        return found.flow, found.confidence
 
     def _shrink_by(self, shrink: int) -> None:
         self.shrink, self.scale = shrink, self.scale * shrink
@@ -274,7 +287,7 @@ class _Walker:
         tissue = smaller(whole.astype(np.uint8) * 255, self.shrink) > 127
         if not tissue.any():
             raise UserError(f"{self.recording.tissue}: marks no tissue")
-        self.tracker = Tracker(self.backend, rgb, blocked, tissue)
+        self.flow.begin(self.backend, rgb, blocked, tissue)
         self.scene = Scene(tissue, self.scale, self.recording.meta.young_kpa)
         self.out.size = size
         self.out.rest, self.out.tissue = _shown(rgb), _shown(tissue.astype(np.uint8) * 255) > 127

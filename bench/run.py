@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import shutil
-import sys
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 from threadpoolctl import threadpool_limits
@@ -21,6 +22,8 @@ from synth.store import Dataset, Sequence
 
 MAIN = "D2FNet"
 """Name under which the given model stands in every table."""
+_LONG = 100
+"""Frames from which a second process is worth the seconds that it takes to start."""
 
 
 def score(
@@ -50,8 +53,6 @@ def score(
 
     # NumPy's BLAS too: a second thread of its own waits for a core that the flow has.
     threadpool_limits(set_threads(None))
-    # The flow makes thousands of short calls a frame, and after each would wait 5 ms for the methods' thread.
-    sys.setswitchinterval(2e-4)
     opened = open_recording(recording)
     total = opened.expected_frames()
     network = Model(model)
@@ -59,6 +60,8 @@ def score(
     methods |= {name: Model(folder) for name, folder in (also or {}).items()}
     methods |= baselines(train, model)
     found = scale.find(opened.meta, recording)
+    if len(os.sched_getaffinity(0)) > 1 and (total or _LONG) >= _LONG:
+        settings = replace(settings, two_processes=True)
     with counting(f"scoring {opened.name}", total) as progress:
         result = assess.assess(
             opened, methods, MAIN, found, settings, {"model": network.described()}, progress

@@ -10,28 +10,26 @@ from contextlib import contextmanager
 
 
 class Stopwatch:
-    """Adds up CPU time and wall time under the name of a stage."""
+    """Adds up CPU time (all threads of this process) and wall time under the name of a stage."""
 
-    def __init__(self, *, own_thread: bool = False) -> None:
-        """Starts at nothing.
-
-        Args:
-            own_thread: CPU time of the thread that runs the stage, for stages that run side by side; else of
-                all threads of this process.
-        """
-        self._clock = time.thread_time if own_thread else time.process_time
+    def __init__(self) -> None:
         self._cpu: dict[str, float] = defaultdict(float)
         self._wall: dict[str, float] = defaultdict(float)
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
         """Times the block under `name`; blocks of one name add up."""
-        cpu, wall = self._clock(), time.perf_counter()
+        cpu, wall = time.process_time(), time.perf_counter()
         try:
             yield
         finally:
-            self._cpu[name] += self._clock() - cpu
+            self._cpu[name] += time.process_time() - cpu
             self._wall[name] += time.perf_counter() - wall
+
+    def add(self, name: str, cpu_s: float, wall_s: float) -> None:
+        """What another process spent on a stage [s]."""
+        self._cpu[name] += cpu_s
+        self._wall[name] += wall_s
 
     def cpu_s(self, name: str) -> float:
         """CPU time of one stage so far [s]; 0 for one that never ran."""
