@@ -11,7 +11,7 @@ import numpy as np
 from bench.learn_runs import column
 from bench.learn_table import markdown
 from learn.loss import SHARES
-from learn.statistics import Interval, interval, paired, pooled_r2
+from learn.statistics import Interval, interval, paired, pooled_r2, pooled_r2_difference
 
 _COLUMNS = (
     ("map_r2", "map R²"),
@@ -168,6 +168,7 @@ def _tests(found: list[dict[str, Any]]) -> list[str]:
         tags = [{r["name"].split(n, 1)[1] for r in found if family(r["name"]) == n} for n in (a, b)]
         both = tags[0] & tags[1]
         groups = [[r for r in found if r["name"] in {n + t for t in both}] for n in (a, b)]
+        lines += _pooled_difference(a, b, groups)
         for key, label in _COLUMNS:
             a_values, b_values = (_per_sequence(g, key) for g in groups)
             if not np.isfinite(b_values - a_values).any():
@@ -180,6 +181,21 @@ def _tests(found: list[dict[str, Any]]) -> list[str]:
                 f"{test.difference.n} sequences, {len(both)} runs each"
             )
     return lines
+
+
+def _pooled_difference(a: str, b: str, groups: list[list[dict[str, Any]]]) -> list[str]:
+    """B's pooled R² less A's, where both tested every sequence in each of their runs."""
+    rows = [{s["name"]: s.get("map_moments") for s in r["sequences"]} for g in groups for r in g]
+    names = sorted(rows[0])
+    if any(sorted(row) != names or None in row.values() for row in rows):
+        return []
+    both = [
+        np.array([[row[n][:6] for row in part] for n in names])
+        for part in (rows[: len(groups[0])], rows[len(groups[0]) :])
+    ]
+    found = pooled_r2_difference(both[0], both[1], np.random.default_rng(0))
+    many = f"{len(names)} sequences, {len(groups[1])} runs each"
+    return [f"- {b} against {a}, pooled map R²: {_text(found)}, {many}"]
 
 
 _AGAINST = (

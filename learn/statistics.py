@@ -51,11 +51,29 @@ def pooled_r2(moments: Floats, rng: np.random.Generator, level: float = 0.95, dr
     and tp. With fewer than three sequences there is no interval (NaN).
     """
 
-    def r2(m: Floats) -> Floats:
-        n, t, _, tt, pp, tp = np.moveaxis(m, -1, 0)
-        return np.asarray(1 - (pp - 2 * tp + tt) / (tt - t**2 / n), np.float64)
+    return _pooled(moments, _r2, rng, level, draws)
 
-    return _pooled(moments, r2, rng, level, draws)
+
+def pooled_r2_difference(
+    a: Floats, b: Floats, rng: np.random.Generator, level: float = 0.95, draws: int = 4000
+) -> Interval:
+    """Pooled R² of B less that of A, each the mean over its runs, and its BCa interval over sequences.
+
+    `a`, `b`: (n, runs, 6) moments as for `pooled_r2`, of the same n sequences in the same order.
+    """
+    split = a.shape[1]
+
+    def difference(flat: Floats) -> Floats:
+        found = _r2(flat.reshape(*flat.shape[:-1], -1, 6))
+        return np.asarray(found[..., split:].mean(-1) - found[..., :split].mean(-1))
+
+    both = np.concatenate([a, b], axis=1).reshape(len(a), -1)
+    return _pooled(both, difference, rng, level, draws)
+
+
+def _r2(moments: Floats) -> Floats:
+    n, t, _, tt, pp, tp = np.moveaxis(moments, -1, 0)
+    return np.asarray(1 - (pp - 2 * tp + tt) / (tt - t**2 / n), np.float64)
 
 
 def skill(

@@ -7,13 +7,36 @@ import pytest
 from scipy import stats
 
 from learn.metrics import Moments
-from learn.statistics import interval, paired, pooled_r2
+from learn.statistics import interval, paired, pooled_r2, pooled_r2_difference, skill
 from learn.train import cosine
 from synth.errors import UserError
 
 
 def rng() -> np.random.Generator:
     return np.random.default_rng(0)
+
+
+def test_a_difference_of_pooled_r2_is_that_of_its_parts() -> None:
+    draw = np.random.default_rng(3)
+    true = draw.normal(size=(20, 30))
+
+    def moments(noise: float) -> np.ndarray:
+        said = true + noise * draw.normal(size=true.shape)
+        return np.array([dataclasses.astuple(Moments.of(t, s))[:6] for t, s in zip(true, said, strict=True)])
+
+    a, b = (np.stack([moments(noise), moments(noise)], axis=1) for noise in (0.5, 0.2))
+    found = pooled_r2_difference(a, b, np.random.default_rng(0))
+    single = [[pooled_r2(m[:, k], np.random.default_rng(0)).mean for k in (0, 1)] for m in (a, b)]
+    assert found.mean == pytest.approx(np.mean(single[1]) - np.mean(single[0]))
+    assert 0 < found.low < found.mean < found.high
+    assert pooled_r2_difference(a, a, np.random.default_rng(0)).mean == pytest.approx(0)
+
+
+def test_skill_is_the_share_of_the_base_error_that_is_gone() -> None:
+    base = np.array([1.0, 2.0, 3.0, 4.0])
+    found = skill(base / 4, base, np.random.default_rng(0))
+    assert found.mean == pytest.approx(0.75)
+    assert skill(base, base, np.random.default_rng(0)).mean == 0
 
 
 def test_bca_is_scipys() -> None:
