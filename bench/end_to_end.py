@@ -95,9 +95,9 @@ def chosen() -> list[Pipeline]:
     usual, flow = default_world(), Flow().backend
     worlds = [
         usual,
-        *(replace(usual, law=law) for law in ("linear", "neo-hookean")),
-        *(replace(usual, tets=tets) for tets in (400, 3000)),
-        *(replace(usual, spp=spp) for spp in (1, 16)),
+        replace(usual, law="linear"),
+        replace(usual, tets=400),
+        replace(usual, spp=1),
         World("linear", 400, 1),
     ]
     cheapest = worlds[-1]

@@ -34,7 +34,16 @@ def pareto(
     for family, label, estimator, warm in _candidates():
         error = measure(estimator, made, warm=warm)
         default = label in ("cold (default)", "warm (default)")
-        rows.append({"family": family, "setting": label, "default": default} | asdict(error))
+        what = {
+            "family": family,
+            "setting": label,
+            "estimator": "tvl1" if isinstance(estimator, Tvl1) else family,
+            "settings": asdict(estimator.settings) if isinstance(estimator, Tvl1) else None,
+            "checked": not isinstance(estimator, Tvl1) or estimator.checked,
+            "warm": warm is not None,
+            "default": default,
+        }
+        rows.append(what | asdict(error))
         if not json:
             typer.echo(f"{family:12} {label:22} {1e3 * error.cpu_s:6.0f} ms  EPE {error.mean:.3f} px  "
                        f"divergence {error.divergence:.2f}")  # fmt: skip

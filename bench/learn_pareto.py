@@ -49,7 +49,7 @@ class Choice:
 
     @property
     def preset(self) -> str:
-        found = [k for k, v in PRESETS.items() if v.size == self.size and _shape(v.arch) == _shape(self.arch)]
+        found = [k for k, v in PRESETS.items() if v.size == self.size and shape(v.arch) == shape(self.arch)]
         return ", ".join(found)
 
 
@@ -70,7 +70,7 @@ def pareto(
 ) -> None:
     """Time every network a frame, channels included, on one core (or a GPU), beside its error."""
     set_threads(1)
-    errors = _errors(runs)
+    known = errors(runs)
     file = out / f"data-{device}.json"
     # A part that is timed anew takes the place of what was there; the rest stays.
     rows: list[dict[str, Any]] = json_.loads(file.read_text())["rows"] if only and file.is_file() else []
@@ -79,7 +79,7 @@ def pareto(
         "rows": rows,
     }
     out.mkdir(parents=True, exist_ok=True)
-    for choice in _choices(device, errors):
+    for choice in _choices(device, known):
         named = f"{choice.name} {choice.layout} {choice.precision}"
         if not any(word in named for word in only.split(",")):
             continue
@@ -92,7 +92,7 @@ def pareto(
                 f"{row['name']} {choice.layout} {choice.precision}: p50 {row['ms_p50']:.1f} ms, "
                 f"p95 {row['ms_p95']:.1f} ms"
             )
-    _write(out, errors)
+    _write(out, known)
     if json:
         print(json_.dumps(result))
 
@@ -174,14 +174,14 @@ def _choices(device: str, trained: dict[tuple[Architecture, int], Interval]) -> 
 
 
 def _way(row: dict[str, Any]) -> tuple[Any, ...]:
-    return _arch(row["arch"]), row["size"], row["layout"], row["precision"]
+    return architecture(row["arch"]), row["size"], row["layout"], row["precision"]
 
 
-def _shape(arch: Architecture) -> tuple[Any, ...]:
+def shape(arch: Architecture) -> tuple[Any, ...]:
     return arch.name, arch.width, arch.stem, arch.levels, arch.detail
 
 
-def _errors(root: Path) -> dict[tuple[Architecture, int], Interval]:
+def errors(root: Path) -> dict[tuple[Architecture, int], Interval]:
     """Map RMSE over tested sequences [mN/mm²], with interval, of networks trained alike (MSE, fold and seed
     0)."""
     found: dict[tuple[Architecture, int], Interval] = {}
@@ -192,13 +192,13 @@ def _errors(root: Path) -> dict[tuple[Architecture, int], Interval]:
             continue
         if not file.stem.endswith("fold0-seed0") or file.stem.startswith(("long", "film")):
             continue
-        found[_arch(tree), run["settings"]["size"]] = interval(
+        found[architecture(tree), run["settings"]["size"]] = interval(
             column([run], "map_rmse"), np.random.default_rng(0)
         )
     return found
 
 
-def _arch(tree: dict[str, Any]) -> Architecture:
+def architecture(tree: dict[str, Any]) -> Architecture:
     return Architecture(**tree | {"bounds": tuple(tree["bounds"])})
 
 
@@ -228,14 +228,22 @@ def _write(out: Path, errors: dict[tuple[Architecture, int], Interval]) -> None:
     for file in sorted(out.glob("data-*.json")):
         result = json_.loads(file.read_text())
         device, rows = result["machine"]["device"], result["rows"]
-        for row in rows:
-            error = errors.get((_arch(row["arch"]), row["size"]))
-            row["map_rmse"] = None if error is None else [error.mean, error.low, error.high]
+        with_errors(rows, errors)
         parts.append(f"## {device}\n\n{markdown(_lines(rows))}\n")
         panels += chart(rows, device)
     (out / "README.md").write_text("\n".join(parts))
     if panels:
         plot.write(panels, out, "Learn: error against time")
+
+
+def with_errors(
+    rows: list[dict[str, Any]], known: dict[tuple[Architecture, int], Interval]
+) -> list[dict[str, Any]]:
+    """The rows, each with `map_rmse`: the error of its network and the interval's ends, or None."""
+    for row in rows:
+        error = known.get((architecture(row["arch"]), row["size"]))
+        row["map_rmse"] = None if error is None else [error.mean, error.low, error.high]
+    return rows
 
 
 def chart(rows: list[dict[str, Any]], device: str) -> list[plot.Panel]:

@@ -35,7 +35,7 @@ _SIDE_TETS = 1600  # laws and time steps are compared on this mesh, where they c
 _SIDE_SIZE = 0.5  # all of the picture but its size is compared at about this part of it
 _TRIES = 6
 _DRAWS = 5
-_SPARE = 1.05  # a promise that was broken is trusted this much less than what it missed by
+_STEP = (0.6, 0.95)  # after a broken promise, the next may be this part of it
 _NOTHING = 0.01  # saving less than this part of a frame's cost is no reason to change a job
 
 
@@ -179,10 +179,10 @@ def run(job: Job, budget: Budget, journal_file: Path, probes: int, checks: int, 
     own_levels = [own(knob, job) for knob in knobs]
     mine = joint(bench, whole, "the job as it is", own_levels, sweep.error(own_levels))
     tried: list[Joint] = []
-    trust = 1.0
+    allowed = budget.share
     seen: set[tuple[str, ...]] = set()
     while True:
-        picked = sweep.cheapest(budget.share / trust, own_levels, seen)
+        picked = sweep.cheapest(allowed, own_levels, seen)
         if picked is None or len(tried) == _TRIES - 1:
             picked = [knob.levels[0] for knob in knobs]  # full fidelity is what the budget is counted from
         promised = sweep.error(picked)
@@ -190,10 +190,31 @@ def run(job: Job, budget: Budget, journal_file: Path, probes: int, checks: int, 
         tried.append(joint(bench, whole, f"try {len(tried) + 1}", picked, promised))
         if tried[-1].error <= budget.share or picked == [knob.levels[0] for knob in knobs]:
             break
-        trust = max(trust, _SPARE * tried[-1].error / max(promised, 0.1 * budget.share))
+        # Promises are held to less, by what this one missed, but a single surprise is not taken for the rule.
+        allowed *= float(np.clip(budget.share / tried[-1].error, *_STEP))
     journal.remove()
     kinds = tuple(scenario_kind(job, index) for index in whole)
     return Tuned(job, budget, tuple(knobs), tuple(picked), tuple(sweep.rows), full, mine, tuple(tried), kinds)
+
+
+def again(found: Tuned, journal_file: Path, first: int, count: int, report: Report) -> tuple[Joint, Joint]:
+    """The job as it was and the tuned one, measured on sequences that had no part in the choice.
+
+    Args:
+        found: the answer.
+        journal_file: as in `run`.
+        first: number of the first such sequence; the choice used those below.
+        count: how many.
+        report: progress.
+    """
+    state = hashlib.blake2b(found.job.model_dump_json().encode(), digest_size=8).hexdigest()
+    bench = _Bench(found.job, Journal(journal_file, f"{state} again {first}"), report, 3 * count)
+    whole = range(first, first + count)
+    mine = [own(knob, found.job) for knob in found.knobs]
+    before = joint(bench, whole, "the job as it is", mine, float("nan"))
+    after = joint(bench, whole, "the tuned job", found.chosen, float("nan"))
+    bench.journal.remove()
+    return before, after
 
 
 def probing(job: Job, index: int, attempt: int = 0) -> Job:

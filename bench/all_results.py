@@ -1,0 +1,143 @@
+"""`bench pareto all`, `bench stability all`: every room's results on one page each."""
+
+from __future__ import annotations
+
+import html
+import json as json_
+import shlex
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from bench import fronts, plot
+from synth.errors import UserError
+
+Out = Annotated[Path | None, typer.Option("--out", "-o", help="Folder for the page; all/ in the results.")]
+Results = Annotated[Path, typer.Option(help="Folder that holds the rooms' results.")]
+Again = Annotated[
+    bool, typer.Option("--run", help="Measure every room anew first, by the commands its data name.")
+]
+Json = Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")]
+
+_PARETO = ("fem", "render", "flow", "end-to-end")
+_STABILITY = ("fem", "flow")
+
+
+def pareto(
+    out: Out = None, results: Results = fronts.RESULTS, run: Again = False, json: Json = False
+) -> None:
+    """Error against cost in every room, and where defaults stand; ends with 1 if one left it."""
+    if run:
+        for room in _PARETO:
+            _again(results / room if room == "end-to-end" else results / room / "pareto", "pareto.json")
+    gathered = fronts.gather(results)
+    rows = fronts.table(gathered)
+    parts = [
+        "<p>Each default of the code among the points measured for it, none dearer than it needs to be: off "
+        "the front is by how much it costs more than the cheapest point that errs no more, or errs more than "
+        f"the best that costs no more, whichever is less; {100 * fronts.ALLOWED:.0f}% are allowed. Rings mark "
+        "defaults.</p>",
+        plot.table(rows),
+        plot.charts(list(_pareto_panels(results))),
+        *_credits([results / room / "pareto/pareto.json" for room in ("fem", "render", "flow")]),
+        *_credits([results / "end-to-end/pareto.json"]),
+    ]
+    folder = out or results / "all" / "pareto"
+    _write(folder, "Error against cost, every room", parts)
+    (folder / "fronts.json").write_text(json_.dumps(rows, indent=1) + "\n", "utf-8")
+    if json:
+        print(json_.dumps(rows))
+    else:
+        for row in rows:
+            print(f"{row['room']:34s} {row['default']:44s} {row['off the front']} off the front")
+        print(folder / "index.html")
+    if any(front.excess() > fronts.ALLOWED for front in gathered):
+        raise typer.Exit(1)
+
+
+def stability(
+    out: Out = None, results: Results = fronts.RESULTS, run: Again = False, json: Json = False
+) -> None:
+    """Where everything breaks, room by room, on one page."""
+    if run:
+        for room in _STABILITY:
+            _again(results / room / "stability", "stability.json")
+    from bench import fem_stability, flow_stability
+
+    fem = fronts.read(results / "fem/stability/stability.json")
+    flow = fronts.read(results / "flow/stability/stability.json")
+    render = [
+        case
+        for file in sorted(results.glob("render/stability/*/stability.json"))
+        for case in fronts.read(file)["cases"]
+    ]
+    parts = [
+        "<h2>Physics</h2>",
+        plot.charts(fem_stability.panels(fem)),
+        "<h2>Flow</h2>",
+        plot.charts(flow_stability.panels(flow)),
+        "<h2>Rendering: a correct frame or a clear error</h2>",
+        plot.table(render),
+    ]
+    for file in sorted(results.glob("learn/stability/*.json")):
+        found = fronts.read(file)
+        if found.get("rows"):
+            parts += [f"<h2>Learning: {html.escape(file.stem)}</h2>", plot.table(found["rows"])]
+    engine = [
+        {"trial": file.parent.name} | {key: value for key, value in _flat(fronts.read(file))}
+        for file in sorted(results.glob("engine/*/*.json"))
+        if file.parent.name in ("damage", "dask", "faults", "kills", "kills-real", "trouble")
+    ]
+    parts.append("<h2>Engine</h2>")
+    parts += [plot.table([row]) for row in engine]
+    parts += _credits([results / room / "stability/stability.json" for room in _STABILITY])
+    folder = out or results / "all" / "stability"
+    _write(folder, "Where it breaks, every room", parts)
+    held = {
+        "render cases": len(render),
+        "render cases that held": sum(bool(case["passed"]) for case in render),
+        "engine trials": len(engine),
+    }
+    print(json_.dumps(held) if json else folder / "index.html")
+
+
+def _pareto_panels(results: Path) -> Iterator[plot.Panel]:
+    from bench import end_to_end_page, fem_pareto, flow_pareto, learn_pareto, render_pareto
+
+    yield from end_to_end_page.panels(fronts.read(results / "end-to-end/pareto.json"))
+    yield from fem_pareto.panels(fronts.read(results / "fem/pareto/pareto.json"))
+    yield from render_pareto.panels(fronts.read(results / "render/pareto/pareto.json"))
+    yield from flow_pareto.panels(fronts.read(results / "flow/pareto/pareto.json"))
+    rows = learn_pareto.with_errors(
+        fronts.read(results / "learn/pareto/data-cpu.json")["rows"], learn_pareto.errors(results / "learn")
+    )
+    yield from learn_pareto.chart(rows, "cpu")
+
+
+def _credits(files: list[Path]) -> list[str]:
+    """Command and machine of each file."""
+    return [plot.credit(fronts.read(file)) for file in files]
+
+
+def _flat(found: dict[str, Any]) -> Iterator[tuple[str, Any]]:
+    """What fits into a cell; lists and machine left out."""
+    for key, value in found.items():
+        if key != "machine" and not isinstance(value, list):
+            yield key, json_.dumps(value) if isinstance(value, dict) else value
+
+
+def _again(folder: Path, file: str) -> None:
+    """Runs the command that a result names, into its folder. UserError if it fails."""
+    command = shlex.split(str(fronts.read(folder / file)["command"]))[1:]
+    done = subprocess.run([sys.executable, "-m", "bench", *command, "--out", str(folder)], check=False)
+    if done.returncode:
+        raise UserError(f"bench {shlex.join(command)}: ended with {done.returncode}")
+
+
+def _write(folder: Path, title: str, parts: list[str]) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "index.html").write_text(plot.page(title, "\n".join(parts)), "utf-8")
