@@ -39,8 +39,8 @@ def pareto(
     parts = [
         "<p>Each default of the code among the points measured for it, none dearer than it needs to be: off "
         "the front is by how much it costs more than the cheapest point that errs no more, or errs more than "
-        f"the best that costs no more, whichever is less; {100 * fronts.ALLOWED:.0f}% are allowed. Rings mark "
-        "defaults.</p>",
+        f"the best that costs no more, whichever is less; {100 * fronts.ALLOWED:.0f}% are allowed. Rings "
+        "mark defaults.</p>",
         plot.table(rows),
         plot.charts(list(_pareto_panels(results))),
         *_credits([results / room / "pareto/pareto.json" for room in ("fem", "render", "flow")]),

@@ -163,8 +163,10 @@ def panels(found: dict[str, Any]) -> list[plot.Panel]:
         if (worst := _worst(laws, law))
     )
     return [
-        plot.Panel("Error against cost", "CPU ms a frame", "error [%]", cost, True, True, front=True),
-        plot.Panel("Laws against neo-Hookean", "P = F/(E a2)", "error [%]", worth, True, True),
+        plot.Panel(
+            "Physics: error against cost", "CPU ms a frame", "error [%]", cost, True, True, front=True
+        ),
+        plot.Panel("Physics: laws against neo-Hookean", "P = F/(E a2)", "error [%]", worth, True, True),
     ]
 
 
