@@ -171,8 +171,8 @@ def _learn(results: Path) -> list[Front]:
     for name, preset in PRESETS.items():
         key = (*learn_pareto.shape(preset.arch), preset.size)
         if any(point.key == key for point in points):
-            cost, error = "CPU ms a frame", "map RMSE [mN/mm²]"
-            fronts.append(Front(f"learn, {name}", cost, error, tuple(points), key))
+            unit = "map RMSE [mN/mm²]"
+            fronts.append(Front(f"learn, {name}", "CPU ms a frame", unit, tuple(points), key))
     return fronts
 
 

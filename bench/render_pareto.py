@@ -51,7 +51,7 @@ def pareto(
             row = {"spp": paths, "sampler": pattern, "integrator": kind, "width": wide}
             row["default"] = (paths, pattern, kind, wide) == _DEFAULT
             rows.append(row | measure(ours, paths, pattern, kind))
-    asked = {"width": width, "spp": spp, "sampler": sampler, "integrator": integrator}
+    asked: dict[str, list[Any]] = {"width": width, "spp": spp, "sampler": sampler, "integrator": integrator}
     words = [f"--{name} {one}" for name, many in asked.items() for one in many]
     found = {
         "command": " ".join(["bench pareto render", *words, f"--seed {seed}"]),
