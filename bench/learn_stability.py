@@ -32,7 +32,7 @@ from synth.errors import UserError
 from synth.job import Job
 
 RATES = (5e-4, 2e-3, 1e-2, 5e-2)
-WEIGHTS = ((0.0, 0.0), (0.3, 0.0), (0.3, 10.0))
+WEIGHTS = ((0.0, 0.0), (0.5, 0.0), (0.5, 8.0))
 """Share of the R² term and price of force off contact: the first is MSE, the last `ghostless`."""
 LABEL_NOISE = (0.0, 0.1, 0.3)
 FLOW_NOISE = ((0.005, 0.0), (0.02, 0.0), (0.005, 1.0), (0.02, 1.0), (0.05, 1.0))

@@ -107,6 +107,7 @@ def _controls(found: list[dict[str, Any]]) -> list[dict[str, object]]:
         if r["control"]:
             known = r["columns"]["known"]
             rows.append({"run": r["name"], "control": r["control"]} | {heads[h]: known[h] for h in heads})
+        if "beyond_mean_map" in r:
             base = r["controls"]["mean map"]
             rows.append({"run": r["name"], "control": "mean map"} | {heads[h]: base[h] for h in heads})
             beyond = {k: Interval(**v, n=0) for k, v in r["beyond_mean_map"].items()}
@@ -202,6 +203,10 @@ _AGAINST = (
     ("mse", "ghostless"),
     ("mse", "published"),
     ("published", "ghostless"),
+    ("mse", "capped"),
+    ("mse", "hinge"),
+    ("mse", "hinge4"),
+    ("mse", "hinge-mse"),
     ("hinge", "ghostless"),
     ("r2-frame", "ghostless"),
     ("mse", "antighost"),

@@ -79,7 +79,7 @@ class Objective:
             raise UserError(f"unknown low-force rule {self.rule!r}: pixel or frame")
 
 
-GHOSTLESS = Objective(kind="hinge", r2_scope="frame", stray_weight=10.0, stray_cap=0.1)
+GHOSTLESS = Objective(kind="hinge", r2_weight=0.5, r2_scope="frame", stray_weight=8.0)
 """What took the ghosts away at no cost in R² (docs/results/learn): its weights were chosen there."""
 
 
