@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench import bootstrap, score, sensor, sync
+from bench.beside import Flow
 from bench.bootstrap import Interval
 from bench.follow import Followed, Method, Progress, follow
 from bench.recording import Force, Recording
@@ -36,8 +37,6 @@ class Settings:
     """Flow is computed on pictures this many times smaller; 0: so that they keep 320 columns."""
     rate_hz: float | None = 10.0
     """At most so many frames a second are looked at; None: all."""
-    two_processes: bool = False
-    """Flow in a process of its own, beside the methods: the same answers sooner, for two cores."""
 
 
 @dataclass(frozen=True)
@@ -97,6 +96,7 @@ def assess(
     settings: Settings,
     described: Mapping[str, Any],
     progress: Progress = lambda done: None,
+    flow: Flow | None = None,
 ) -> Result:
     """Follows the recording and scores every method against its sensor.
 
@@ -108,6 +108,7 @@ def assess(
         settings: of this run.
         described: what the methods are, for the report.
         progress: told after every frame.
+        flow: where it is computed; None: here.
 
     Raises:
         UserError: as `follow` and `sensor.process`.
@@ -121,7 +122,7 @@ def assess(
         shrink=settings.shrink,
         rate_hz=settings.rate_hz,
         pictured=main,
-        two_processes=settings.two_processes,
+        flow=flow,
         progress=progress,
     )
     time = np.array(done.time_s)

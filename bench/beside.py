@@ -142,7 +142,7 @@ def serve(line: Connection) -> None:
     while True:
         try:
             said = line.recv()
-        except EOFError:
+        except (EOFError, OSError):  # the other side is gone, perhaps in the middle of a word
             return
         try:
             if beginning:

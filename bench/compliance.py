@@ -22,6 +22,8 @@ Floats = NDArray[np.float64]
 # World (z out of the brain) to camera (x right, y down, z forward) for a camera straight above.
 TO_CAMERA = np.diag([1.0, -1.0, -1.0])
 
+_AT_ONCE = 32
+
 
 @dataclass(frozen=True, eq=False)
 class Compliance:
@@ -61,11 +63,12 @@ def build(
     seen = skin.embedding(volume, on_dome(points, anatomy.dome_mm))
     held = skin.embedding(volume, on_dome(nodes, anatomy.dome_mm))
     columns = np.empty((len(nodes), 3, 2, len(points)))
-    for k in range(len(nodes)):
-        carry = held[[k]].toarray()[0]
+    for some in np.array_split(np.arange(len(nodes)), max(1, len(nodes) // _AT_ONCE)):
+        carry = held[some].toarray()
         for axis in range(3):
-            u = seen @ system.solve(np.outer(carry, TO_CAMERA[axis]))
-            columns[k, axis] = (u @ TO_CAMERA.T).T[:2]
+            u = system.solve(np.einsum("kn,a->nak", carry, TO_CAMERA[axis]))
+            at_points = np.stack([seen @ part for part in u.transpose(1, 0, 2)])
+            columns[some, axis] = np.einsum("ba,apk->kbp", TO_CAMERA, at_points)[:, :2]
     matrix = columns.transpose(2, 3, 0, 1).reshape(2 * len(points), 3 * len(nodes))
     return Compliance(matrix, points, nodes, _areas(nodes))
 

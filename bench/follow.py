@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.beside import Beside, Flow, Here
+from bench.beside import Flow, Here
 from bench.recording import Recording
 from bench.video import Picture
 from synth.errors import UserError
@@ -113,7 +113,7 @@ def follow(
     shrink: int = 1,
     rate_hz: float | None = None,
     pictured: str | None = None,
-    two_processes: bool = False,
+    flow: Flow | None = None,
     progress: Progress = lambda done: None,
 ) -> Followed:
     """Decodes, tracks and asks every method, holding a few frames at a time.
@@ -127,31 +127,28 @@ def follow(
             `WIDTH_KEPT` columns.
         rate_hz: at most so many frames a second are looked at; None: all.
         pictured: the method whose force map goes into the snapshots.
-        two_processes: flow in a process of its own, while the methods answer for the frame before.
+        flow: where it is computed, closed by the caller; None: here. Elsewhere, it is on its way while the
+            methods answer for the frame before.
         progress: told after every frame.
 
     Raises:
         UserError: unreadable video, no frame with a time, rest frame beyond the end, masks of another size.
     """
     watch, out = Stopwatch(), Followed(force_mn={name: [] for name in methods})
-    flow: Flow = Beside() if two_processes else Here()
     walker = _Walker(
-        recording, methods, scale_mm_per_px, backend, shrink, rate_hz, pictured, out, watch, flow
+        recording, methods, scale_mm_per_px, backend, shrink, rate_hz, pictured, out, watch, flow or Here()
     )
     frames = recording.frames()
     seen = 0
-    try:
-        while True:
-            with watch.stage("decode"):
-                picture = next(frames, None)
-            if picture is None:
-                break
-            seen += 1
-            walker.take(picture)
-            progress(seen)
-        walker.finish()
-    finally:
-        flow.close()
+    while True:
+        with watch.stage("decode"):
+            picture = next(frames, None)
+        if picture is None:
+            break
+        seen += 1
+        walker.take(picture)
+        progress(seen)
+    walker.finish()
     if not out.time_s:
         if seen <= recording.meta.rest_frame:
             raise UserError(f"{recording.folder}: rest_frame {recording.meta.rest_frame}, but {seen} frames")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 from collections.abc import Mapping
-from dataclasses import replace
+from contextlib import closing
 from pathlib import Path
 
 from threadpoolctl import threadpool_limits
@@ -13,6 +13,7 @@ from threadpoolctl import threadpool_limits
 from bench import assess, report, scale
 from bench.assess import Result, Settings
 from bench.bar import counting
+from bench.beside import Beside, Here
 from bench.export import export
 from bench.follow import Method
 from bench.methods import Model
@@ -55,22 +56,25 @@ def score(
     threadpool_limits(set_threads(None))
     opened = open_recording(recording)
     total = opened.expected_frames()
-    network = Model(model)
-    methods: dict[str, Method] = {MAIN: network}
-    methods |= {name: Model(folder) for name, folder in (also or {}).items()}
-    methods |= baselines(train, model)
-    found = scale.find(opened.meta, recording)
-    if len(os.sched_getaffinity(0)) > 1 and (total or _LONG) >= _LONG:
-        settings = replace(settings, two_processes=True)
-    with counting(f"scoring {opened.name}", total) as progress:
-        result = assess.assess(
-            opened, methods, MAIN, found, settings, {"model": network.described()}, progress
-        )
+    # Started first, for it takes seconds to begin; the methods are fitted meanwhile.
+    with closing(Beside() if _worth_a_process(total) else Here()) as flow:
+        network = Model(model)
+        methods: dict[str, Method] = {MAIN: network}
+        methods |= {name: Model(folder) for name, folder in (also or {}).items()}
+        methods |= baselines(train, model)
+        found = scale.find(opened.meta, recording)
+        with counting(f"scoring {opened.name}", total) as progress:
+            about = {"model": network.described()}
+            result = assess.assess(opened, methods, MAIN, found, settings, about, progress, flow)
     folder = out or Path(f"{opened.name}-score")
     folder.mkdir(parents=True, exist_ok=True)
     assess.write_json(result, folder / "score.json")
     report.write(result, folder / "report.html", title)
     return result
+
+
+def _worth_a_process(frames: int | None) -> bool:
+    return len(os.sched_getaffinity(0)) > 1 and (frames or _LONG) >= _LONG
 
 
 def baselines(train: Path | None, model: Path) -> dict[str, Method]:

@@ -51,10 +51,11 @@ class System:
     """Of the free part of it."""
 
     def solve(self, force: Floats) -> Floats:
-        """Displacement of the linear law, (N, 3) mm, under (N, 3) mN."""
-        u = np.zeros(force.size)
-        u[self.free] = self.factor.solve(force.ravel()[self.free])
-        return u.reshape(-1, 3)
+        """Displacement of the linear law, (N, 3) mm, under (N, 3) mN; of K loads at once, (N, 3, K) each."""
+        rows = force.reshape(3 * len(force), *force.shape[2:])
+        u = np.zeros_like(rows, np.float64)
+        u[self.free] = self.factor.solve(np.asfortranarray(rows[self.free]))
+        return u.reshape(force.shape)
 
     def state(self, u: Floats) -> State:
         """Energy, forces and smallest Jacobian at (N, 3) mm."""
