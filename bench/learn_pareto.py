@@ -45,7 +45,7 @@ class Choice:
     @property
     def name(self) -> str:
         stem = f"stem{self.arch.stem}{'+detail' if self.arch.detail else ''}"
-        return f"{self.arch.name} w{self.arch.width} {stem} {self.size}"
+        return f"{self.arch.name} w{self.arch.width} {stem} depth{self.arch.levels} {self.size}"
 
     @property
     def preset(self) -> str:
@@ -158,11 +158,10 @@ def _timed(frame: Callable[[], None], repeats: int, device: str) -> Iterator[flo
 
 def _choices(device: str, trained: dict[tuple[Architecture, int], Interval]) -> Iterator[Choice]:
     stems = [(8, 4), (16, 4), (32, 4), (16, 2), (16, 1), (32, 1)]
-    shapes = [(*s, False) for s in stems] + [(16, 4, True), (24, 4, True)]
+    shapes = [(*s, 4, False) for s in stems] + [(16, 4, 3, False), (16, 4, 3, True)]
     ways = [("contiguous", "fp32"), ("channels_last", "fp32"), ("channels_last", "bf16")]
     ways = [("quick", "fp32"), *ways] if device == "cpu" else ways
-    for (width, stem, detail), size in itertools.product(shapes, (256, 192, 128)):
-        levels = PRESETS["live"].arch.levels
+    for (width, stem, levels, detail), size in itertools.product(shapes, (256, 192, 128)):
         if size % (stem * 2**levels):
             continue
         arch = Architecture(width=width, stem=stem, levels=levels, dropout=0.05, detail=detail)
