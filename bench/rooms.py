@@ -45,6 +45,7 @@ COMMANDS: tuple[Command, ...] = (
     Command("experiment", "gpu", "bench.gpu", "gpu", "--out runs/gpu"),
     Command("experiment", "stages", "bench.stages", "stages", "out --out runs/stages"),
     Command("experiment", "leakage", "bench.leakage", "leakage", "out --out runs/leakage"),
+    Command("experiment", "scoring", "bench.score_cost", "cost", "model --train out"),
     Command("experiment", "inverse", "bench.inverse_experiment", "experiment", "--count 10"),
     Command("experiment", "learn", "bench.learn_experiment", "experiment", "--cache cache --out runs/learn"),
     Command("stability", "learn", "bench.learn_stability", "stability", "--cache cache --seeds 2"),
