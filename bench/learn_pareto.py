@@ -238,9 +238,14 @@ def _write(out: Path, errors: dict[tuple[Architecture, int], Interval]) -> None:
 def with_errors(
     rows: list[dict[str, Any]], known: dict[tuple[Architecture, int], Interval]
 ) -> list[dict[str, Any]]:
-    """The rows, each with `map_rmse`: the error of its network and the interval's ends, or None."""
+    """The rows, each with `map_rmse`: the error of its network and the interval's ends, or None.
+
+    Presets may have moved since the rows were timed: they are named anew.
+    """
     for row in rows:
-        error = known.get((architecture(row["arch"]), row["size"]))
+        arch = architecture(row["arch"])
+        row["preset"] = Choice(arch, row["size"]).preset
+        error = known.get((arch, row["size"]))
         row["map_rmse"] = None if error is None else [error.mean, error.low, error.high]
     return rows
 
