@@ -54,7 +54,8 @@ def pareto(
         "rows": rows,
     }
     (out / "pareto.json").write_text(json_.dumps(record, indent=1) + "\n")
-    plot.write(panels(record), out, "Flow: error against time", rows, record)
+    shown = [{key: value for key, value in row.items() if key != "settings"} for row in rows]
+    plot.write(panels(record), out, "Flow: error against time", shown, record)
     if json:
         typer.echo(json_.dumps(record))
 

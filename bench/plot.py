@@ -16,7 +16,7 @@ _STYLE = (
     "body{font:15px/1.45 system-ui,sans-serif;color:#22262b;margin:1rem auto;max-width:1200px;padding:0 1rem}"
     "h1{font-size:1.4rem}h2{font-size:1.1rem;margin:1.6rem 0 .4rem}"
     ".charts{display:grid;grid-template-columns:repeat(auto-fit,minmax(min(100%,420px),1fr));gap:.5rem}"
-    "svg{width:100%;height:auto;display:block}.wide{overflow-x:auto}"
+    "svg{width:100%;max-width:640px;height:auto;display:block}.wide{overflow-x:auto}"
     "table{border-collapse:collapse;font-size:12px;margin:.6rem 0}td,th{padding:2px 8px;text-align:left;"
     "border-bottom:1px solid #e6e8eb;vertical-align:top}code{background:#f3f4f6;padding:1px 4px;"
     "overflow-wrap:anywhere}"
@@ -33,7 +33,7 @@ class Curve:
     labels: tuple[str, ...] = ()
     """Said of the points on pointing; empty: a line goes through them."""
     ringed: tuple[int, ...] = ()
-    """Points that a default stands on: ringed, and labelled in the picture."""
+    """Points to be looked at, as defaults: ringed, and labelled in the picture."""
     ends: tuple[tuple[float, float], ...] = ()
     """Interval of every y; empty: none."""
 
@@ -217,8 +217,7 @@ def _curve(
         if k in curve.ringed:
             yield f'<circle cx="{x:.1f}" cy="{y:.1f}" r="7" fill="none" stroke="#22262b" stroke-width="1.8"/>'
             side = "start" if x < 0.7 * _WIDE else "end"
-            words = label if "default" in label else f"{label} (default)".strip()
-            yield _text(words, x + (10 if side == "start" else -10), y - 8, side, size=10)
+            yield _text(label, x + (10 if side == "start" else -10), y - 8, side, size=10)
         yield f"<title>{html.escape(about)}</title></g>"
 
 
