@@ -177,6 +177,7 @@ def _way(row: dict[str, Any]) -> tuple[Any, ...]:
 
 
 def shape(arch: Architecture) -> tuple[Any, ...]:
+    """What sets the time a frame takes, of an architecture."""
     return arch.name, arch.width, arch.stem, arch.levels, arch.detail
 
 
@@ -198,6 +199,7 @@ def errors(root: Path) -> dict[tuple[Architecture, int], Interval]:
 
 
 def architecture(tree: dict[str, Any]) -> Architecture:
+    """An architecture as a run's settings hold it."""
     return Architecture(**tree | {"bounds": tuple(tree["bounds"])})
 
 

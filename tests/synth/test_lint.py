@@ -19,6 +19,7 @@ MAY_READ_CLOCKS = {
     "synth/cluster.py",
     "synth/journal.py",
     "synth/folder.py",
+    "synth/tune_command.py",
 }
 CLOCKS = {"time", "datetime", "uuid", "secrets"}
 RANDOM_CLASSES = {"Generator", "SeedSequence", "default_rng", "PCG64", "BitGenerator"}
