@@ -127,19 +127,21 @@ def pareto(
     asked = Made(FINE, FINE.job(seed + 1, test), work)
     kept: dict[str, Made] = {}
     rows: list[dict[str, Any]] = []
-    found = {
+    found: dict[str, Any] = {
         "command": f"bench pareto end-to-end --fit {fit} --test {test} --seed {seed} --epochs {epochs}",
         "machine": machine.describe(),
         "meaning": f"{SIZE[0]} x {SIZE[1]} px, {FRAMES} frames; cpu_s: of a frame of data (physics, scene, "
         "rendering, flow) and of one answer; rmse: of the force's three components together, as a part of "
         "its root mean square in the sequence, mean over sequences with its BCa interval",
         "asked": asdict(FINE),
+        "missing": [f"{p.world.name}, {p.flow}, {p.model}" for p in chosen()],
         "rows": rows,
     }
     for one in chosen():
         made = kept.setdefault(one.world.name, Made(one.world, one.world.job(seed, fit), work))
         row = measure(one, made, asked, work, epochs, seed)
         rows.append(asdict(one.world) | {"flow": one.flow, "model": one.model, "default": one.default} | row)
+        found["missing"] = found["missing"][1:]
         if not json:
             typer.echo(
                 f"{one.world.name:22s} {one.flow:12s} {one.model:26s} {row['cpu_s']:.3f} CPU-s a frame  "

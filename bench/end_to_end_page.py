@@ -63,6 +63,8 @@ def readme(found: dict[str, Any]) -> str:
         cells = [row["law"], row["tets"], row["spp"], row["flow"], row["model"], f"{row['cpu_s']:.3f}", error]
         words = [f"**{cell}**" if row["default"] else str(cell) for cell in cells]
         lines.append(f"| {' | '.join(words)} |")
+    if found["missing"]:
+        lines += ["", f"Not measured, the run was stopped before: {'; '.join(found['missing'])}."]
     return "\n".join(lines) + "\n"
 
 

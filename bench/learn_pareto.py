@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import itertools
 import json as json_
 import time
@@ -235,6 +236,9 @@ def _write(out: Path, errors: dict[tuple[Architecture, int], Interval]) -> None:
     (out / "README.md").write_text("\n".join(parts))
     if panels:
         plot.write(panels, out, "Learn: error against time")
+    else:
+        text = html.escape("\n".join(parts))
+        (out / "index.html").write_text(plot.page("Learn: time a frame", f"<pre>{text}</pre>"), "utf-8")
 
 
 def with_errors(
