@@ -64,6 +64,12 @@ class Front:
         error = min(p.error for p in self.points if p.cost <= mine.cost)
         return min(mine.cost / cost, mine.error / error if error else math.inf) - 1
 
+    def holds(self) -> bool:
+        """Near enough to the front; where errors have intervals, unless a point is better beyond doubt."""
+        if self.find().ends is not None:
+            return self.beaten_by() is None
+        return self.excess() <= ALLOWED
+
     def beaten_by(self) -> Point | None:
         """A point that is no dearer and beyond doubt better: its interval ends below the default's begins.
 
