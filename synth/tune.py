@@ -271,7 +271,11 @@ class _Sweep:
         Where costs are as good as equal, the fewest changes to the job win.
         """
         found: list[tuple[float, int, list[Level]]] = []
-        for at in itertools.product(*(range(len(knob.levels)) for knob in self._knobs)):
+        choices = [
+            range(len(knob.levels)) if knob.turned else [knob.levels.index(level)]
+            for knob, level in zip(self._knobs, mine, strict=True)
+        ]
+        for at in itertools.product(*choices):
             levels = [knob.levels[j] for knob, j in zip(self._knobs, at, strict=True)]
             if tuple(level.words for level in levels) in seen or not self._error(at) <= budget:
                 continue

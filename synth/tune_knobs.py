@@ -36,6 +36,9 @@ class Knob:
     """`physics` moves the truth, `picture` what is seen, `surface` both, `flow` what is made of it."""
     levels: tuple[Level, ...]
     """Full fidelity first."""
+    turned: bool = True
+    """False: measured and told, but left as the job has it. Pictures without highlights or without blur are
+    other pictures, not cheaper ones, and what is trained on them is another network."""
 
 
 def of(job: Job) -> list[Knob]:
@@ -92,6 +95,7 @@ def of(job: Job) -> list[Knob]:
                     Level("lens", {"render.aperture_mm": render.aperture_mm}),
                     Level("pinhole", {"render.aperture_mm": 0.0}),
                 ),
+                turned=False,
             )
         )
     if job.light.glare[1] > 0:
@@ -103,6 +107,7 @@ def of(job: Job) -> list[Knob]:
                     Level("wet highlights", {"light.glare": list(job.light.glare)}),
                     Level("few highlights", {"light.glare": [0.0, 0.0]}),
                 ),
+                turned=False,
             )
         )
     if job.flow.backend == "tvl1":

@@ -80,6 +80,22 @@ def test_a_promise_that_does_not_hold_is_given_up(found: tune.Tuned) -> None:
     assert levels["light"] == "wet highlights"  # what saves nothing stays
 
 
+def test_other_pictures_are_no_cheaper_ones(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    class Matte(Fake):
+        def measure(self, job: Job, pictures: bool) -> Measured:
+            found = super().measure(job, pictures)
+            if job.light.glare[1] == 0 or job.render.aperture_mm == 0:
+                found.cost["render"] = 0.1 * found.cost["render"]
+            return found
+
+    monkeypatch.setattr(tune, "Probe", Matte)
+    job = Job.model_validate({"seed": 1, "fem": {"gestures": ["pull"]}})
+    done = tune.run(job, tune.Budget(0.03), tmp_path / "part", 2, 1, lambda done, total, words: None)
+    assert max(row.saved for row in done.rows if row.knob == "light") > 0.2
+    levels = dict(zip((knob.name for knob in done.knobs), done.best.levels, strict=True))
+    assert (levels["light"], levels["depth of field"]) == ("wet highlights", "lens")
+
+
 def test_nothing_but_full_fidelity_keeps_a_tiny_budget(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
