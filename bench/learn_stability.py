@@ -233,8 +233,8 @@ def _shown(clips: list[Clip], split: Split, name: str, model: Path) -> list[Row]
     test = [clips[i] for i in split.test]
     plain = evaluate(predictor, test, "ideal")
     rows: list[Row] = [{"shown": "as it is"} | _numbers(plain)]
-    for young, name in (("half", "E taken ×½"), ("double", "E taken ×2"), ("unknown", "E unknown")):
-        rows.append({"shown": name} | _numbers(plain, young))
+    for young, text in (("half", "E taken ×½"), ("double", "E taken ×2"), ("unknown", "E unknown")):
+        rows.append({"shown": text} | _numbers(plain, young))
     for sigma, patch in FLOW_NOISE:
         asked = [disturb.noisy(c, sigma, patch, grid, rng) for c in test]
         what = f"noise {sigma:g} mm, {f'{patch:g} mm blobs' if patch else 'cell by cell'}"
