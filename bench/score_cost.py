@@ -118,6 +118,7 @@ def readme(tree: dict[str, Any]) -> str:
     stages = {k: v for k, v in tree["timings"].items() if isinstance(v, dict)}
     memory = sum(v for k, v in tree["timings"].items() if k.endswith("peak_rss_mb"))
     width, height = tree["size"]
+    bar = r"\|"
     lines = [
         "# What scoring costs",
         "",
@@ -133,7 +134,10 @@ def readme(tree: dict[str, Any]) -> str:
         "",
         "| stage | CPU [s] | wall [s] |",
         "| --- | --- | --- |",
-        *(f"| {name} | {v['cpu_s']:.1f} | {v['wall_s']:.1f} |" for name, v in stages.items()),
+        *(
+            f"| {name.replace('|', bar)} | {v['cpu_s']:.1f} | {v['wall_s']:.1f} |"
+            for name, v in stages.items()
+        ),
         "",
     ]
     return "\n".join(lines)
