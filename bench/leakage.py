@@ -132,7 +132,8 @@ def readme(tree: dict[str, Any]) -> str:
         a, b = by["random frames"], by["whole recordings"]
         r = [f"{v['r']:.3f}" if v["r"] is not None else "–" for v in (a, b)]
         mae = [f"{v['mae_mn']:.2f} [{v['mae_interval'][0]:.2f}, {v['mae_interval'][1]:.2f}]" for v in (a, b)]
-        lines.append(f"| {name} | {r[0]} | {r[1]} | {a['r2']:.3f} | {b['r2']:.3f} | {mae[0]} | {mae[1]} |")
+        word = name.replace("|", r"\|")
+        lines.append(f"| {word} | {r[0]} | {r[1]} | {a['r2']:.3f} | {b['r2']:.3f} | {mae[0]} | {mae[1]} |")
     return "\n".join([*lines, "", "![Errors by split](chart.svg)", ""])
 
 

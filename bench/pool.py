@@ -149,8 +149,8 @@ def readme(tree: dict[str, Any], command: str) -> str:
         beats = name != tree["main"] and _number(method["scores"]["mae_mn"]["mean"]) < own
         cells = [_text(method["scores"][key], "[mN]" in head) for key, head in shown]
         cells += [_text(method["calibrated"][key], False) for key, _ in _CALIBRATED]
-        shown = name.replace("|", r"\|")
-        lines.append(f"| {'**' + shown + '** (better)' if beats else shown} | " + " | ".join(cells) + " |")
+        word = name.replace("|", r"\|")
+        lines.append(f"| {'**' + word + '** (better)' if beats else word} | " + " | ".join(cells) + " |")
     for name, reason in tree["left_out"].items():
         lines += ["", f"Recording {name} is left out: {reason}."]
     lines += ["", f"By recording, {tree['main']}:", ""]
