@@ -65,8 +65,8 @@ def experiment(
                 "after_cpu_s": after.cost,
             },
             "machine": machine.describe(),
-            "command": f"bench experiment tune --budget '{budget}' --probes {probes} --checks {checks} "
-            f"--fresh {fresh}",
+            "command": f"bench experiment tune --only {name} --budget '{budget}' --probes {probes} "
+            f"--checks {checks} --fresh {fresh}",
         }
         (out / f"{name}.json").write_text(json_.dumps(row, indent=1) + "\n", "utf-8")
     rows = [
@@ -140,7 +140,7 @@ def readme(rows: list[dict[str, Any]]) -> str:
     lines = [
         "# Tuning: no more than a scene needs",
         "",
-        f"    {rows[0]['command']}",
+        *(f"    {row['command']}" for row in rows),
         "",
         *textwrap.wrap(f"Machine: {machine.line(rows[0]['machine'])}. {_HOW}", 110),
         "",
