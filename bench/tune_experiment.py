@@ -74,9 +74,9 @@ def experiment(
         for name in _SCENES
         if (out / f"{name}.json").is_file()
     ]
-    plot.write(
-        panels(rows), out, "Tuning: what each knob does to the force, and what it costs", table(rows), rows[0]
-    )
+    commands = "; ".join(row["command"] for row in rows)
+    title = "Tuning: what each knob does to the force, and what it costs"
+    plot.write(panels(rows), out, title, table(rows), rows[0] | {"command": commands})
     (out / "README.md").write_text(readme(rows), "utf-8")
     if json:
         print(json_.dumps(rows))
