@@ -21,14 +21,13 @@ from numpy.typing import NDArray
 
 from bench import baseline, end_to_end_page, machine
 from bench.baseline import GRID
+from bench.refollow import refollow
 from learn import data
 from learn.data import Clip
-from learn.grid import Resampler, centre
 from learn.statistics import interval
-from synth import pipeline
+from synth import pipeline, place
 from synth.fem.validity import choose
 from synth.flow import mask
-from synth.flow.track import Tracker
 from synth.job import Fem, Flow, Job, Render
 from synth.store import Sequence, open_sequence
 
@@ -163,11 +162,11 @@ class Made:
         folder = work / f"{world.name}-{job.seed}"
         folder.mkdir(parents=True, exist_ok=True)
         for index in range(job.sequences):
-            target = folder / f"{index:06d}.zarr"
+            target = place.store(folder, index)
             if not target.exists():
                 shutil.rmtree(target.with_suffix(".zarr.part"), ignore_errors=True)
                 pipeline.render_sequence(job, index, folder, lambda stage, done, of: None)
-        self.sequences = [open_sequence(folder / f"{index:06d}.zarr") for index in range(job.sequences)]
+        self.sequences = [open_sequence(place.store(folder, index)) for index in range(job.sequences)]
         # The first one of a process compiles: medians leave it out.
         costs = [
             sum(t["cpu_s"] for name, t in s.attrs["timings"].items() if name not in ("peak_rss_mb", "store"))
@@ -192,21 +191,13 @@ class Made:
         return self._flows[flow]
 
     def _followed(self, sequence: Sequence, clip: Clip, flow: str) -> tuple[Clip, float]:
-        tissue = sequence["tissue"][:].astype(bool)
-        scale = float(sequence.attrs["scale_mm_per_px"])
-        resample = Resampler((tissue.shape[0], tissue.shape[1]), scale, centre(tissue), GRID)
-        moved, sure = np.zeros_like(clip.displacement["ideal"]), np.ones_like(clip.confidence)
         rgb, tools = sequence["rgb"][...], sequence["tool"][...].astype(bool)
         began = time.process_time()
         blocked = tools | np.stack([mask.glare(picture) for picture in rgb])
+        masks_s = time.process_time() - began
         job = self._job.flow.model_copy(update={"backend": flow})
-        tracker = Tracker(pipeline.estimator(job), rgb[0], blocked[0], tissue)
-        answers = [tracker.step(rgb[t], blocked[t]) for t in range(1, clip.frames)]
-        spent = (time.process_time() - began) / (clip.frames - 1)
-        for t, (found, trust) in enumerate(answers, start=1):
-            moved[t] = resample.mean(found.transpose(2, 0, 1) * scale, tissue) * clip.mask
-            sure[t] = resample.mean(trust, tissue) * clip.mask
-        return replace(clip, displacement={**clip.displacement, "recovered": moved}, confidence=sure), spent
+        found, flow_s = refollow(sequence, clip, pipeline.estimator(job), blocked, GRID)
+        return found, (masks_s + flow_s) / (clip.frames - 1)
 
 
 def measure(one: Pipeline, made: Made, asked: Made, work: Path, epochs: int, seed: int) -> dict[str, Any]:

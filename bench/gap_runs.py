@@ -13,14 +13,14 @@ from typing import Any
 import numpy as np
 
 from bench import gap
+from bench.refollow import refollow
 from learn.data import Clip, pack, unpack
 from learn.evaluate import evaluate
-from learn.grid import Grid, Resampler, centre
+from learn.grid import Grid
 from learn.predict import load
 from learn.settings import Settings
 from learn.split import Split
 from learn.train import train
-from synth.flow.track import Tracker
 from synth.folder import write_whole
 from synth.store import Sequence as Stored
 
@@ -63,17 +63,7 @@ def followed(sequence: Stored, clip: Clip, backend: str, grid: Grid, cache: Path
     folder = cache / f"{clip.content_hash}-{grid.size}-{grid.extent_mm:g}-{backend}"
     if folder.is_dir():
         return unpack(folder)
-    tissue = sequence["tissue"][:].astype(bool)
-    scale = float(sequence.attrs["scale_mm_per_px"])
-    resample = Resampler((tissue.shape[0], tissue.shape[1]), scale, centre(tissue), grid)
-    moved = np.zeros_like(clip.displacement["recovered"])
-    confidence = np.ones_like(clip.confidence)
-    tracker = Tracker(backend, sequence["rgb"][0], sequence["tool"][0].astype(bool), tissue)
-    for t in range(1, clip.frames):
-        flow, sure = tracker.step(sequence["rgb"][t], sequence["tool"][t].astype(bool))
-        moved[t] = resample.mean(flow.transpose(2, 0, 1) * scale, tissue) * clip.mask
-        confidence[t] = resample.mean(sure, tissue) * clip.mask
-    out = replace(clip, displacement={**clip.displacement, "recovered": moved}, confidence=confidence)
+    out, _ = refollow(sequence, clip, backend, sequence["tool"][...].astype(bool), grid)
     pack(out, folder)
     return out
 
