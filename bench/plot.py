@@ -9,6 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from bench import results
+
 _COLOURS = ("#1f6feb", "#c2352b", "#2b7a4b", "#8a6d00", "#a04f9c", "#00798c", "#3b3f46", "#b8562b", "#6b8e23")
 _WIDE, _TALL, _LEFT, _RIGHT, _TOP, _LINE = 480, 350, 56, 16, 34, 15
 _PER_LINE = 3
@@ -63,14 +65,18 @@ def write(
 
     Args:
         panels: the charts.
-        out: exists.
+        out: made if need be.
         title: of the page.
         rows: what was measured, as the page's table; columns are the keys of all rows.
         found: its `command` and `machine`, if any, stand under the title.
     """
-    (out / "chart.svg").write_text(drawing(panels), "utf-8")
-    parts = [credit(found or {}), charts(panels), table(rows) if rows else ""]
-    (out / "index.html").write_text(page(title, "\n".join(parts)), "utf-8")
+    results.keep(out, "chart.svg", drawing(panels))
+    write_page(out, title, [credit(found or {}), charts(panels), table(rows) if rows else ""])
+
+
+def write_page(out: Path, title: str, parts: Sequence[str]) -> None:
+    """Writes `index.html`, which needs nothing from elsewhere, of parts (HTML) into the folder `out`."""
+    results.keep(out, "index.html", page(title, "\n".join(parts)))
 
 
 def page(title: str, body: str) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json as json_
 import os
+import shlex
 import subprocess
 import sys
 import tempfile
@@ -16,7 +17,7 @@ import cv2
 import numpy as np
 import typer
 
-from bench import machine
+from bench import machine, plot, results
 from bench.render_case import Case, case
 from synth.errors import UserError
 from synth.job import Job, Render, Sensor
@@ -30,7 +31,7 @@ _SMALL = {"size": (160, 120)}
 
 
 def stability(
-    out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder for stability.json.")] = None,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder for data and page.")] = None,
     seed: Annotated[int, typer.Option(help="Of the jobs.")] = 11,
     only: Annotated[list[str] | None, typer.Option(help="Cases to try, by name; all if not given.")] = None,
     json: Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")] = False,
@@ -51,10 +52,13 @@ def stability(
             figures, outcome = {"error": str(error)}, "clear error"
         passed = outcome == "clear error" or float(figures.get("worst_px", 0.0)) < 1e-2
         rows.append({"case": name, "outcome": outcome, "passed": passed, **figures})
-    found = {"seed": seed, "machine": machine.describe(), "cases": rows}
+    words = ["bench", "stability", "render", "--seed", str(seed)]
+    words += [word for name in only or () for word in ("--only", name)]
+    found = {"command": shlex.join(words), "seed": seed, "machine": machine.describe(), "cases": rows}
     if out is not None:
-        out.mkdir(parents=True, exist_ok=True)
-        (out / "stability.json").write_text(json_.dumps(found, indent=1) + "\n", "utf-8")
+        results.keep(out, "stability.json", found)
+        title = "Rendering: a correct frame or a clear error"
+        plot.write_page(out, title, [plot.credit(found), plot.table(rows)])
     if json:
         print(json_.dumps(found))
     else:
