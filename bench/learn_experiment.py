@@ -14,13 +14,14 @@ from bench.learn_labels import clips as labels
 from bench.learn_labels import press
 from bench.learn_runs import Run, carry_out
 from bench.learn_summary import write
-from learn.data import load
+from learn.data import Clip, load
 from learn.grid import Grid
 from learn.loss import GHOSTLESS, Objective
 from learn.model import Architecture
 from learn.settings import Settings, preset
 from learn.threads import set_threads
 from synth import config
+from synth.job import Job
 
 RESULTS = Path("docs/results/learn")
 
@@ -88,6 +89,43 @@ def fine_runs() -> Iterator[Run]:
     yield Run("stem1-fold0-seed0", replace(base, arch=replace(base.arch, stem=1, levels=4)))
 
 
+BESIDE: dict[str, tuple[tuple[int, int, int], ...]] = {
+    "live": ((16, 4, 3), (16, 4, 4), (8, 4, 4), (8, 4, 3), (16, 4, 2)),
+    "cpu": ((16, 2, 4), (16, 2, 3), (16, 4, 4), (16, 4, 3), (8, 2, 4), (8, 4, 4)),
+    "tiny": ((16, 2, 3), (16, 4, 2), (8, 2, 3), (16, 2, 2)),
+}
+"""Width, stem and levels of each preset's network, first, and of those beside it that cost about as much or
+less. `paper` has none: its network is the published one, and too large to be trained on a CPU."""
+
+
+def preset_runs() -> Iterator[Run]:
+    """Each preset's network beside its neighbours, trained as the preset has it (loss, output, dropout) on
+    the preset's grid: for the fronts of `bench pareto`. Steps, batches and learning rate are the study's."""
+    study = small()
+    for seed in range(2):
+        for name, shapes in BESIDE.items():
+            base = replace(
+                preset(name, epochs=study.epochs, folds=study.folds, frames=0, seed=seed),
+                learning_rate=study.learning_rate,
+                schedule=study.schedule,
+                channels_last=True,
+            )
+            for width, stem, levels in shapes:
+                arch = replace(base.arch, width=width, stem=stem, levels=levels)
+                called = f"{base.size}-w{width}-stem{stem}-depth{levels}-fold0-seed{seed}"
+                yield Run(called, replace(base, arch=arch), controlled=False)
+
+
+def pictured(job: Job, grid: Grid) -> Job:
+    """The job with pictures of at least a pixel a cell: on coarser ones a fine grid would learn of nothing
+    that a coarser grid doesn't have."""
+    wide, tall = job.render.size
+    times = -(-grid.size // wide)
+    return job.model_copy(
+        update={"render": job.render.model_copy(update={"size": (times * wide, times * tall)})}
+    )
+
+
 def recovered_runs() -> Iterator[Run]:
     """On rendered sequences: what training on recovered flow changes when the test is recovered flow."""
     base = replace(small(), frames=0, epochs=16)
@@ -106,23 +144,37 @@ def experiment(
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for results.")] = RESULTS,
     only: Annotated[str, typer.Option(help="Only runs whose name holds this.")] = "",
     fine: Annotated[bool, typer.Option("--fine", help="The runs on 128² instead of those on 64².")] = False,
+    presets: Annotated[
+        bool, typer.Option("--presets", help="The presets' networks and those beside them, each on its grid.")
+    ] = False,
 ) -> None:
     """Train and score learn's choices; done runs are kept, the summary is made anew."""
     set_threads(1)
     say = Console(stderr=True).print
-    grid = Grid(small().size)
+    packed: dict[int, list[Clip]] = {}
+    job = config.load(str(RESULTS / "data/labels.yaml"))
+
+    def sequences(grid: Grid) -> list[Clip]:
+        if grid.size not in packed:
+            packed[grid.size] = (
+                labels(pictured(job, grid), grid, cache)
+                if rendered is None
+                else load(rendered, grid, ("ideal", "recovered"), cache=cache)
+            )
+        return packed[grid.size]
+
     if rendered is not None:
-        clips = load(rendered, grid, ("ideal", "recovered"), cache=cache)
-        name, runs, presses = "recovered", recovered_runs(), None
+        name, runs = "recovered", recovered_runs()
+    elif presets:
+        name, runs = "presets", preset_runs()
     else:
-        job = config.load(str(RESULTS / "data/labels.yaml"))
-        grid = Grid(128) if fine else grid
-        clips, presses = labels(job, grid, cache), lambda index: press(job, index, grid, cache)
         name, runs = ("fine", fine_runs()) if fine else ("ideal", ideal_runs())
     for run in runs:
         if only in run.name:
+            grid = run.settings.grid
             # A press costs a sequence: once is enough to say what calibration gives.
-            asked = presses if run.name in PRESSED else None
-            carry_out(run, clips, out / name / "runs", cache / "models" / name, say, asked)
+            asked = name == "ideal" and run.name in PRESSED
+            presses = (lambda index: press(job, index, small().grid, cache)) if asked else None
+            carry_out(run, sequences(grid), out / name / "runs", cache / "models" / name, say, presses)
     write(out)
     say(f"{out}/README.md")

@@ -34,6 +34,8 @@ class Run:
     """Displacement it is tested on."""
     control: str = ""
     """`shuffled`: the fitted frames' targets are dealt out anew among them; empty: they are not."""
+    controlled: bool = True
+    """Whether controls are scored too: of a further network on the same sequences they say nothing new."""
 
 
 def carry_out(
@@ -83,7 +85,7 @@ def carry_out(
         "select_r2": card.score,
         "train_cpu_s": spent,
         "history": history,
-        "controls": controls(predictor, tested, run.source, fitted),
+        "controls": controls(predictor, tested, run.source, fitted) if run.controlled else {},
         **report.as_dict(),
     }
     if run.control:
