@@ -8,13 +8,16 @@ import textwrap
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
 import typer
 
 from bench import machine, plot
+from learn.statistics import interval
 from synth import config, tune, tune_file
 from synth.errors import UserError
 
 _SCENES = ("easy", "middle", "hard")
+_KNOBS = "| knob | level | error of the force | takes of the budget | saves of a full frame |"
 _HOW = (
     "Seeds are in the jobs here; probe sequences are drawn from them, and the fresh ones had no part in the "
     "choice. Costs are of physics, scene, rendering and flow, in the same run."
@@ -22,10 +25,13 @@ _HOW = (
 _WHAT = (
     "The force is read from the displacement of a frame by a fixed linear rule "
     "(`synth/tune_reading.py`): the tangent of the physics at full fidelity, place, footprint and "
-    "direction of each contact being known. *Error* is how far a job's reading, by its true and by its "
-    "recovered displacement (the larger counts), is from that at full fidelity: root mean square over "
-    "frames, mean over sequences. It holds what physics, surface, picture and flow do together; that "
-    "the flow of the finest picture is itself not perfect is no part of it."
+    "direction of each contact being known. *Error* is how far the force read from recovered displacement "
+    "is off the truth of full fidelity: root mean square over frames as a part of the force, mean over "
+    "sequences. A setting *takes* of the budget by how much that is more than at full fidelity, or by how "
+    "much the label itself moves, whichever is more; a sequence that reads better than at full fidelity "
+    "takes nothing and pays for no other. *Apart* is how far the two readings are from each other, frame by "
+    "frame: grain that differs counts there, though neither picture is the better one. The intervals are "
+    "over the fresh sequences."
 )
 
 
@@ -36,7 +42,7 @@ def experiment(
     budget: Annotated[str, typer.Option(help="As in `synth tune`.")] = "force 3%",
     probes: Annotated[int, typer.Option(min=1, help="Sequences that every knob is measured on.")] = 3,
     checks: Annotated[int, typer.Option(min=0, help="Further ones for whole settings.")] = 3,
-    fresh: Annotated[int, typer.Option(min=1, help="Sequences that had no part in the choice.")] = 4,
+    fresh: Annotated[int, typer.Option(min=2, help="Sequences that had no part in the choice.")] = 6,
     only: Annotated[
         list[str] | None, typer.Option(help="Scenes; easy, middle and hard if not given.")
     ] = None,
@@ -51,7 +57,7 @@ def experiment(
         job = config.load(str(source))
         say = _said(name)
         found = tune.run(job, asked, out / f"{name}.part", probes, checks, say)
-        before, after = tune.again(found, out / f"{name}.fresh.part", probes + checks, fresh, say)
+        full, before, after = tune.again(found, out / f"{name}.fresh.part", probes + checks, fresh, say)
         tuned = out / f"{name}.tuned.yaml"
         tuned.unlink(missing_ok=True)
         tune_file.write(found, str(source), (), tuned)
@@ -59,10 +65,13 @@ def experiment(
             "scene": name,
             "frames": job.frames,
             "fresh": {
-                "before": list(before.errors),
-                "after": list(after.errors),
-                "before_cpu_s": before.cost,
-                "after_cpu_s": after.cost,
+                name: {
+                    "errors": list(one.errors),
+                    "totals": list(one.totals),
+                    "apart": list(one.apart),
+                    "cpu_s_a_frame": one.cost,
+                }
+                for name, one in (("full", full), ("before", before), ("after", after))
             },
             "machine": machine.describe(),
             "command": f"bench experiment tune --only {name} --budget '{budget}' --probes {probes} "
@@ -88,29 +97,29 @@ def panels(rows: list[dict[str, Any]]) -> list[plot.Panel]:
     """A chart a scene: error of the force over cost, each knob alone and whole settings."""
     made = []
     for row in rows:
-        curves = []
+        curves, base = [], _mean(row["full"]["totals"])
         for knob in dict.fromkeys(one["knob"] for one in row["knobs"]):
             own = [one for one in row["knobs"] if one["knob"] == knob and one["error"] is not None]
             curves.append(
                 plot.Curve(
                     knob,
                     tuple(row["full"]["cpu_s_a_frame"] * (1 - one["saved"]) for one in own),
-                    tuple(100 * one["error"] for one in own),
+                    tuple(100 * (base + one["change"]) for one in own),
                     tuple(f"{one['level']}" for one in own),
                 )
             )
-        whole = [("the job as it was", row["own"]), ("tuned", row["tried"][-1])]
+        whole = [("full", row["full"]), ("the job as it was", row["own"]), ("tuned", row["tried"][-1])]
         curves.append(
             plot.Curve(
                 "whole job",
                 tuple(one["cpu_s_a_frame"] for _, one in whole),
-                tuple(100 * one["error"] for _, one in whole),
+                tuple(100 * _mean(one["totals"]) for _, one in whole),
                 tuple(words for words, _ in whole),
-                ringed=(1,),
+                ringed=(2,),
             )
         )
         title = f"{row['scene']}: error of the force over cost"
-        made.append(plot.Panel(title, "CPU s a frame", "force moves by [%]", tuple(curves)))
+        made.append(plot.Panel(title, "CPU s a frame", "error of the force [%]", tuple(curves)))
     return made
 
 
@@ -123,12 +132,18 @@ def table(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
             {
                 "scene": row["scene"],
                 "budget [%]": 100 * row["budget"],
-                "probes: tuned [%]": 100 * best["error"],
-                "fresh: tuned [%]": 100 * _mean(fresh["after"]),
-                "fresh: as it was [%]": 100 * _mean(fresh["before"]),
-                "CPU s a frame, as it was": fresh["before_cpu_s"],
-                "CPU s a frame, tuned": fresh["after_cpu_s"],
-                "cost ratio": fresh["after_cpu_s"] / fresh["before_cpu_s"],
+                "taken, probes [%]": f"{100 * best['error']:.1f}",
+                "taken, fresh [%]": _over(fresh["after"]["errors"]),
+                "as it was, fresh [%]": _over(fresh["before"]["errors"]),
+                "error, fresh: full, as it was, tuned [%]": ", ".join(
+                    f"{100 * _mean(fresh[name]['totals']):.1f}" for name in ("full", "before", "after")
+                ),
+                "apart, fresh: as it was, tuned [%]": ", ".join(
+                    f"{100 * _mean(fresh[name]['apart']):.1f}" for name in ("before", "after")
+                ),
+                "CPU s a frame, as it was": fresh["before"]["cpu_s_a_frame"],
+                "CPU s a frame, tuned": fresh["after"]["cpu_s_a_frame"],
+                "cost ratio": fresh["after"]["cpu_s_a_frame"] / fresh["before"]["cpu_s_a_frame"],
                 "changes": ", ".join(f"{key} {value}" for key, value in row["changes"].items()),
             }
         )
@@ -156,11 +171,11 @@ def readme(rows: list[dict[str, Any]]) -> str:
     lines += [f"| {' | '.join(cells[0])} |", "|" + " --- |" * len(cells[0])]
     lines += [f"| {' | '.join(one.values())} |" for one in cells]
     for row in rows:
-        lines += ["", f"## {row['scene']}", "", "| knob | level | force moves by | saves of a full frame |"]
-        lines.append("|" + " --- |" * 4)
+        lines += ["", f"## {row['scene']}", "", _KNOBS, "|" + " --- |" * 5]
         for one in row["knobs"]:
-            error = "out of range" if one["error"] is None else f"{100 * one['error']:.2g}%"
-            lines.append(f"| {one['knob']} | {one['level']} | {error} | {100 * one['saved']:.0f}% |")
+            took, change = _percent(one["error"]), _percent(one["change"], "+")
+            saved = f"{100 * one['saved']:.0f}%"
+            lines.append(f"| {one['knob']} | {one['level']} | {change} | {took} | {saved} |")
         lines += ["", "Measured as a whole:", ""]
         for name, one in [
             ("as it was", row["own"]),
@@ -168,13 +183,23 @@ def readme(rows: list[dict[str, Any]]) -> str:
         ]:
             said = ", ".join(f"{key} {value}" for key, value in one["setting"].items())
             promised = "" if one["promised"] is None else f", {100 * one['promised']:.2g}% promised"
-            error = "out of range" if one["error"] is None else f"{100 * one['error']:.2g}%"
-            lines.append(f"- {name}: {error}{promised}, {one['cpu_s_a_frame']:.2f} CPU-s a frame ({said})")
+            took = f"takes {_percent(one['error'])}{promised}"
+            lines.append(f"- {name}: {took}, {one['cpu_s_a_frame']:.2f} CPU-s a frame ({said})")
     return "\n".join(lines) + "\n"
 
 
 def _mean(values: list[float]) -> float:
     return sum(values) / len(values)
+
+
+def _over(values: list[float]) -> str:
+    """Mean over sequences with its interval, in percent."""
+    found = interval(100 * np.asarray(values), np.random.default_rng(0))
+    return f"{found.mean:.1f} [{found.low:.1f}, {found.high:.1f}]"
+
+
+def _percent(share: float | None, sign: str = "") -> str:
+    return "out of range" if share is None else f"{100 * share:{sign}.2g}%"
 
 
 def _said(scene: str) -> tune.Report:

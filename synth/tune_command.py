@@ -21,7 +21,8 @@ def tune(
         list[str] | None, typer.Argument(help="Changes to the job, as section.key=value.")
     ] = None,
     budget: Annotated[
-        str, typer.Option(help="How far the force may be from that of full fidelity: 'force 3%'.")
+        str,
+        typer.Option(help="By how much the error of the force may grow over full fidelity's: 'force 3%'."),
     ] = "force 3%",
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="The job to write; JOB.tuned.yaml if not given.")
@@ -30,7 +31,7 @@ def tune(
     checks: Annotated[int, typer.Option(min=0, max=50, help="Further sequences for whole settings.")] = 3,
     json: Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")] = False,
 ) -> None:
-    """Writes the cheapest job whose forces stay within a budget of those at full fidelity.
+    """Writes the cheapest job whose error of the force is within a budget of full fidelity's.
 
     A few probe sequences are computed at full fidelity and with each knob turned (law, mesh, time step,
     surface, size of picture, paths, lens, highlights, flow's warps); the setting chosen is measured as a

@@ -83,7 +83,8 @@ def changes(found: Tuned) -> list[tuple[str, Any, str]]:
             continue
         row, was = _row(found, knob.name, level.words), _row(found, knob.name, before.words)
         why = (
-            f"was {before.words}: the force moves by {_percent(row.error)} instead of {_percent(was.error)}, "
+            f"was {before.words}: the error of the force grows by {_grown(row.change)} over full fidelity's "
+            f"instead of {_grown(was.change)}, "
             f"a frame saves {100 * (row.saved - was.saved):.0f}% of full cost"
         )
         out += [(key, value, why) for key, value in level.changes.items() if _value(found.job, key) != value]
@@ -94,10 +95,12 @@ def summary(found: Tuned) -> list[str]:
     """What was asked, what came out, on what."""
     own_cost, best = found.own.cost, found.best
     words = (
-        f"Written by synth tune for a budget of {_percent(found.budget.share)} of the force. Against full "
-        f"fidelity ({_setting(found, found.full.levels)}) the force read from this job's sequences moves by "
-        f"{_percent(best.error)} ({', '.join(_percent(e) for e in best.errors)} in {len(best.errors)} probe "
-        f"sequences), from the job's before by {_percent(found.own.error)}. A frame costs {best.cost:.2f} "
+        f"Written by synth tune for a budget of {_percent(found.budget.share)} of the force, by which its "
+        f"error may grow over full fidelity's ({_setting(found, found.full.levels)}). This job takes "
+        f"{_percent(best.error)} of it ({', '.join(_percent(e) for e in best.errors)} in {len(best.errors)} "
+        f"probe sequences), the job as it was took {_percent(found.own.error)}. The force read from "
+        f"recovered displacement is off by {_percent(best.total)}, as it was {_percent(found.own.total)}, "
+        f"at full fidelity {_percent(found.full.total)}. A frame costs {best.cost:.2f} "
         f"CPU-s (physics, scene, rendering, flow) instead of {own_cost:.2f}, at full fidelity "
         f"{found.full.cost:.2f}. {len(found.tried)} settings were measured as a whole, the last one is this."
     )
@@ -111,15 +114,15 @@ def lines(found: Tuned) -> list[str]:
     """Each level of each knob by itself, as a table."""
     mine = {knob.name: own(knob, found.job).words for knob in found.knobs}
     picked = {knob.name: level.words for knob, level in zip(found.knobs, found.chosen, strict=True)}
-    out = ["knob            level               force moves by   saves of a full frame"]
+    out = ["knob            level              error of force   of the budget   saves of a full frame"]
     for row in found.rows:
         marks = [
             word
             for word, levels in (("chosen", picked), ("as it was", mine))
             if levels[row.knob] == row.level
         ]
-        moved = row.why[:60] if row.why else f"{_percent(row.error):>14}   {100 * row.saved:20.0f}%"
-        out.append(f"{row.knob:15s} {row.level:18s} {moved}  {', '.join(marks)}".rstrip())
+        moves = f"{_grown(row.change):>14}   {_percent(row.error):>13}   {100 * row.saved:20.0f}%"
+        out.append(f"{row.knob:15s} {row.level:18s} {row.why[:60] or moves}  {', '.join(marks)}".rstrip())
     return out
 
 
@@ -133,15 +136,20 @@ def as_dict(found: Tuned) -> dict[str, Any]:
             "promised": _finite(one.promised),
             "error": _finite(one.error),
             "errors": [_finite(e) for e in one.errors],
+            "totals": [_finite(e) for e in one.totals],
+            "apart": [_finite(e) for e in one.apart],
             "cpu_s_a_frame": one.cost,
         }
 
     return {
         "budget": found.budget.share,
-        "knobs": [vars(row) | {"error": _finite(row.error)} for row in found.rows],
+        "knobs": [
+            vars(row) | {"error": _finite(row.error), "change": _finite(row.change)} for row in found.rows
+        ],
         "full": whole(found.full),
         "own": whole(found.own),
         "tried": [whole(one) for one in found.tried],
+        "sequences": list(found.kinds),
         "changes": {key: value for key, value, _ in changes(found)},
     }
 
@@ -160,6 +168,10 @@ def _row(found: Tuned, knob: str, level: str) -> Row:
 
 def _percent(share: float) -> str:
     return f"{100 * share:.2g}%" if np.isfinite(share) else "out of range"
+
+
+def _grown(share: float) -> str:
+    return f"{100 * share:+.2g}%" if np.isfinite(share) else "out of range"
 
 
 def _value(job: Job, key: str) -> Any:

@@ -14,10 +14,11 @@ from synth.tune_knobs import Knob, Level
 
 @dataclass(frozen=True)
 class Budget:
-    """How much the force may move."""
+    """How much worse the force may be read."""
 
     share: float
-    """Mean over sequences of each one's root mean square over frames, as a part of its force."""
+    """By how much the error of the force may grow over that at full fidelity, as a part of the force: root
+    mean square over frames, mean over sequences, none of which pays for another by reading better."""
 
     @classmethod
     def parse(cls, text: str) -> Budget:
@@ -35,7 +36,9 @@ class Row:
     knob: str
     level: str
     error: float
-    """Of the force, against the finest level; inf where a sequence cannot be carried out."""
+    """What it takes of the budget; inf where a sequence cannot be carried out."""
+    change: float
+    """Of the error of the force over the finest level's, mean over sequences; below 0 it reads better."""
     saved: float
     """Part of a frame's cost at full fidelity that it saves."""
     why: str = ""
@@ -51,13 +54,23 @@ class Joint:
     promised: float
     """Error by adding up; NaN where nothing was promised."""
     errors: tuple[float, ...]
-    """Of the force by sequence: the larger of what the label and the recovered displacement say."""
+    """By sequence, what counts: the larger of how far the label moves and of how much more than at full
+    fidelity the force read from the recovered displacement is off."""
+    totals: tuple[float, ...]
+    """By sequence, how far the force read from the recovered displacement is off."""
+    apart: tuple[float, ...]
+    """By sequence, how far it is from what is read at full fidelity, frame by frame: grain that differs
+    counts here, though neither picture is the better one."""
     cost: float
     """CPU-s a frame: physics, scene, rendering, flow; not the writing of the store."""
 
     @property
     def error(self) -> float:
         return float(np.mean(self.errors))
+
+    @property
+    def total(self) -> float:
+        return float(np.mean(self.totals))
 
 
 @dataclass(frozen=True)

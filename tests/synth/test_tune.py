@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from synth import config, tune, tune_file, tune_knobs, tune_probe
+from synth import config, tune, tune_file, tune_knobs, tune_probe, tune_sweep
 from synth.cli import app
 from synth.errors import UserError
 from synth.job import Job
@@ -80,6 +81,35 @@ def test_a_promise_that_does_not_hold_is_given_up(found: tune.Tuned) -> None:
     assert levels["light"] == "wet highlights"  # what saves nothing stays
 
 
+def test_what_a_setting_takes_of_the_budget() -> None:
+    still, exact = np.zeros((2, 1)), np.array([[0.03], [-0.03]])
+    assert tune_sweep.taken(still, -2 * exact, exact) == pytest.approx(0.03)  # its size counts, not its sign
+    assert tune_sweep.taken(still, 0.1 * exact, exact) == 0  # reading better pays for nothing
+    assert tune_sweep.taken(0.5 * exact, 0.1 * exact, exact) == pytest.approx(0.015)  # but the label moved
+    two = np.array([[0.03, 0.04]])
+    assert tune_sweep.size(two) == pytest.approx(0.05)  # instruments add up by their squares
+
+
+def test_a_job_within_the_budget_is_better_than_full_fidelity(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Where nothing cheaper holds what it promised, the job stays as it was."""
+
+    measured = tune.joint
+
+    def joint(*arguments: Any) -> tune.Joint:
+        found = measured(*arguments)
+        return replace(found, errors=(1.0,)) if found.name.startswith("try") else found
+
+    monkeypatch.setattr(tune, "Probe", Fake)
+    monkeypatch.setattr(tune, "joint", joint)
+    job = Job.model_validate({"seed": 1, "fem": {"gestures": ["pull"], "law": "neo-hookean"}})
+    done = tune.run(job, tune.Budget(0.03), tmp_path / "part", 1, 0, lambda done, total, words: None)
+    assert len(done.tried) > 1
+    assert done.best.levels == done.own.levels
+    assert tune_file.changes(done) == []
+
+
 def test_other_pictures_are_no_cheaper_ones(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     class Matte(Fake):
         def measure(self, job: Job, pictures: bool) -> Measured:
@@ -117,7 +147,7 @@ def test_the_written_job_is_the_persons_own(found: tune.Tuned, tmp_path: Path) -
     text = out.read_text()
     assert "# mine" in text
     assert "# only these" in text
-    assert "the force moves by" in text
+    assert "the error of the force grows by" in text
     changed = {key for key, _, _ in tune_file.changes(found)}
     assert changed
     before, after = found.job.model_dump(mode="json"), job.model_dump(mode="json")

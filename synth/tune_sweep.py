@@ -1,0 +1,214 @@
+"""What each knob does to the force by itself, and what that promises of settings that turn several."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from synth import tune_knobs
+from synth.errors import UserError
+from synth.tune_found import Row
+from synth.tune_knobs import Knob, Level
+from synth.tune_probe import Measured
+
+Floats = NDArray[np.float64]
+Measure = Callable[[int, str, Mapping[str, Any], bool], Measured | str]
+"""One setting (words, changes) on one sequence, with pictures or without."""
+
+_SIDE_TETS = 1600  # laws and time steps are compared on this mesh, where they cost little
+_SIDE_SIZE = 0.5  # all of the picture but its size is compared at about this part of it
+_NOTHING = 0.01  # saving less than this part of a frame's cost is no reason to change a job
+
+
+class Sweep:
+    """Every knob turned by itself, and what that promises of all of them."""
+
+    def __init__(self, knobs: list[Knob], measure: Measure, frames: int, probes: int) -> None:
+        self._knobs, self._frames = knobs, frames
+        self._moves: list[list[list[tuple[Floats, Floats]] | None]] = [[] for _ in knobs]
+        self._ratios: list[list[dict[str, float]]] = [[] for _ in knobs]
+        self._why: dict[tuple[int, int], str] = {}
+        finest = tune_knobs.finest(knobs)
+        exact = [_whole(measure(k, "full fidelity", finest, True)) for k in range(probes)]
+        self._exact = [seen_error(one) for one in exact]
+        self._cost = {
+            stage: float(np.median([e.cost.get(stage, 0.0) for e in exact]))
+            for stage in ("physics", "scene", "render", "flow")
+        }
+        # One sequence after the other: its full fidelity is computed once.
+        tables = [[self._one(measure, k, knob, finest) for knob in knobs] for k in range(probes)]
+        for i, knob in enumerate(knobs):
+            for j in range(len(knob.levels)):
+                cells = [tables[k][i][j] for k in range(probes)]
+                broken = next((cell for cell in cells if isinstance(cell, str)), None)
+                good = [cell for cell in cells if not isinstance(cell, str)]
+                self._moves[i].append(None if broken else [move for move, _ in good])
+                stages = {stage for _, ratio in good for stage in ratio}
+                self._ratios[i].append(
+                    {
+                        stage: float(np.median([ratio.get(stage, 1.0) for _, ratio in good]))
+                        for stage in stages
+                    }
+                )
+                if broken:
+                    self._why[i, j] = broken
+        self.rows = [
+            Row(
+                knob.name,
+                level.words,
+                self._error(self._alone(i, j)),
+                self._change(self._alone(i, j)),
+                1 - self._price([(i, j)]) / self._price([]),
+                self._why.get((i, j), ""),
+            )
+            for i, knob in enumerate(knobs)
+            for j, level in enumerate(knob.levels)
+        ]
+
+    def error(self, levels: Sequence[Level]) -> float:
+        """Of the force, by adding up; inf where a knob broke."""
+        at = [knob.levels.index(level) for knob, level in zip(self._knobs, levels, strict=True)]
+        return self._error(at)
+
+    def price(self, levels: Sequence[Level]) -> float:
+        """Expected CPU-s a frame."""
+        at = [knob.levels.index(level) for knob, level in zip(self._knobs, levels, strict=True)]
+        return self._price(list(enumerate(at)))
+
+    def cheapest(
+        self, budget: float, mine: Sequence[Level], seen: set[tuple[str, ...]]
+    ) -> list[Level] | None:
+        """Levels that promise to keep the budget at the least cost, not among those `seen`.
+
+        Where costs are as good as equal, the fewest changes to the job win.
+        """
+        found: list[tuple[float, int, list[Level]]] = []
+        choices = [
+            range(len(knob.levels)) if knob.turned else [knob.levels.index(level)]
+            for knob, level in zip(self._knobs, mine, strict=True)
+        ]
+        for at in itertools.product(*choices):
+            levels = [knob.levels[j] for knob, j in zip(self._knobs, at, strict=True)]
+            if tuple(level.words for level in levels) in seen or not self._error(at) <= budget:
+                continue
+            price = self._price(list(enumerate(at)))
+            found.append((price, sum(a != b for a, b in zip(levels, mine, strict=True)), levels))
+        if not found:
+            return None
+        least = min(price for price, _, _ in found)
+        near = [one for one in found if one[0] <= (1 + _NOTHING) * least]
+        return min(near, key=lambda one: (one[1], one[0]))[2]
+
+    def _one(
+        self, measure: Measure, index: int, knob: Knob, finest: dict[str, Any]
+    ) -> list[tuple[tuple[Floats, Floats], dict[str, float]] | str]:
+        """What each level does on one sequence to the force that the label stands for and to the one that is
+        read, and its cost by stage over the finest level's."""
+        base = dict(finest)
+        if knob.name in ("law", "time"):
+            base |= {"fem.tets": min(_SIDE_TETS, finest["fem.tets"])}
+        elif knob.kind != "physics" and knob.name != "size":
+            base |= self._side()
+        pictures = knob.kind != "physics"
+        zero = _whole(measure(index, f"{knob.name}, finest", base, pictures))
+        still = np.zeros_like(zero.label)
+        out: list[tuple[tuple[Floats, Floats], dict[str, float]] | str] = [((still, still), {})]
+        for level in knob.levels[1:]:
+            found = measure(index, f"{knob.name} {level.words}", base | dict(level.changes), pictures)
+            if isinstance(found, str):
+                out.append(found)
+                continue
+            label = found.label - zero.label
+            ratio = {s: found.cost[s] / zero.cost[s] for s in found.cost if zero.cost.get(s, 0.0) > 0}
+            # Without pictures, what is read moves as the truth does.
+            out.append(((label, seen_error(found) - seen_error(zero) if pictures else label), ratio))
+        return out
+
+    def _side(self) -> dict[str, Any]:
+        size = next(knob for knob in self._knobs if knob.name == "size")
+        wide = _SIDE_SIZE * size.levels[0].changes["render.size"][0]
+        nearest = min(size.levels, key=lambda level: abs(level.changes["render.size"][0] - wide))
+        return dict(nearest.changes)
+
+    def _alone(self, i: int, j: int) -> list[int]:
+        at = [0] * len(self._knobs)
+        at[i] = j
+        return at
+
+    def _sums(self, at: Sequence[int]) -> list[tuple[Floats, Floats]] | None:
+        """Move of the label and error of the force read, a probe sequence each; None where a knob broke."""
+        parts = [self._moves[i][j] for i, j in enumerate(at) if j]
+        known = [part for part in parts if part is not None]
+        if len(known) < len(parts):
+            return None
+        return [
+            (
+                np.sum([np.zeros_like(exact), *(part[k][0] for part in known)], axis=0),
+                np.sum([exact, *(part[k][1] for part in known)], axis=0),
+            )
+            for k, exact in enumerate(self._exact)
+        ]
+
+    def _error(self, at: Sequence[int]) -> float:
+        sums = self._sums(at)
+        if sums is None:
+            return float("inf")
+        pairs = zip(sums, self._exact, strict=True)
+        return float(np.mean([taken(label, seen, exact) for (label, seen), exact in pairs]))
+
+    def _change(self, at: Sequence[int]) -> float:
+        sums = self._sums(at)
+        if sums is None:
+            return float("inf")
+        pairs = zip(sums, self._exact, strict=True)
+        return float(np.mean([size(seen) - size(exact) for (_, seen), exact in pairs]))
+
+    def _price(self, at: Sequence[tuple[int, int]]) -> float:
+        stages = dict(self._cost)
+        for i, j in at:
+            for stage, ratio in self._ratios[i][j].items():
+                stages[stage] *= ratio
+        return (stages["physics"] + stages["scene"]) / self._frames + stages["render"] + stages["flow"]
+
+
+def seen_error(found: Measured) -> Floats:
+    """(K, I) error of the force read; of a job whose flow is the truth, that of the label."""
+    return found.label if found.seen is None else found.seen
+
+
+def _whole(found: Measured | str) -> Measured:
+    if isinstance(found, str):
+        raise UserError(f"a probe sequence cannot be carried out at full fidelity: {found}")
+    return found
+
+
+def taken(label: Floats, seen: Floats, exact: Floats) -> float:
+    """What a setting takes of the budget in one sequence.
+
+    Args:
+        label: (K, I) by how much its true displacement moves the force, as a part of the force.
+        seen: (K, I) by how much the force read from its recovered displacement is off.
+        exact: (K, I) the same at full fidelity.
+    """
+    return max(size(label), size(seen) - size(exact), 0.0)
+
+
+def size(errors: Floats) -> float:
+    """Root mean square over frames of (K, I) errors, instruments together."""
+    return float(np.sqrt(np.square(errors).sum(axis=1).mean()))
+
+
+def merged(levels: Sequence[Level]) -> dict[str, Any]:
+    """The changes of one level of every knob."""
+    return {key: value for level in levels for key, value in level.changes.items()}
+
+
+def cost(found: Measured, frames: int) -> float:
+    """CPU-s a frame in a sequence of so many."""
+    stages = found.cost
+    once = stages.get("physics", 0.0) + stages.get("scene", 0.0)
+    return once / frames + stages.get("render", 0.0) + stages.get("flow", 0.0)
