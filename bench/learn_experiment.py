@@ -90,28 +90,26 @@ def fine_runs() -> Iterator[Run]:
 
 
 BESIDE: dict[str, tuple[tuple[int, int, int], ...]] = {
-    "live": ((16, 4, 3), (16, 4, 4), (8, 4, 4), (8, 4, 3), (16, 4, 2)),
-    "cpu": ((16, 2, 4), (16, 2, 3), (16, 4, 4), (16, 4, 3), (8, 2, 4), (8, 4, 4)),
-    "tiny": ((16, 2, 3), (16, 4, 2), (8, 2, 3), (16, 2, 2)),
+    "live": ((16, 4, 3), (8, 4, 4), (16, 4, 4), (8, 4, 3), (16, 4, 2)),
+    "cpu": ((16, 2, 4), (16, 4, 4), (16, 2, 3), (16, 4, 3), (8, 2, 4), (8, 4, 4)),
+    "tiny": ((8, 2, 3), (16, 2, 2)),
 }
-"""Width, stem and levels of each preset's network, first, and of those beside it that cost about as much or
-less. `paper` has none: its network is the published one, and too large to be trained on a CPU."""
+"""Width, stem and levels of each preset's network and of those beside it that cost about as much or less;
+for `tiny` those that `ideal_runs` lack. `paper` has none: its network is the published one, and too large to be
+trained on a CPU."""
 
 
 def preset_runs() -> Iterator[Run]:
-    """Each preset's network beside its neighbours, trained as the preset has it (loss, output, dropout) on
-    the preset's grid: for the fronts of `bench pareto`. Steps, batches and learning rate are the study's."""
+    """Each preset's network beside its neighbours, on the preset's grid, with its loss and dropout: for the
+    fronts of `bench pareto`. All else is the study's: steps, batches, learning rate, and magnitude output (a
+    vector map, three times as much to learn, stays on a plateau for as long as these runs are)."""
     study = small()
     for seed in range(2):
         for name, shapes in BESIDE.items():
-            base = replace(
-                preset(name, epochs=study.epochs, folds=study.folds, frames=0, seed=seed),
-                learning_rate=study.learning_rate,
-                schedule=study.schedule,
-                channels_last=True,
-            )
+            base = replace(study, **{k: getattr(preset(name), k) for k in ("size", "objective")}, seed=seed)
             for width, stem, levels in shapes:
-                arch = replace(base.arch, width=width, stem=stem, levels=levels)
+                dropout = preset(name).arch.dropout
+                arch = replace(study.arch, width=width, stem=stem, levels=levels, dropout=dropout)
                 called = f"{base.size}-w{width}-stem{stem}-depth{levels}-fold0-seed{seed}"
                 yield Run(called, replace(base, arch=arch), controlled=False)
 
