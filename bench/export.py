@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Literal
@@ -10,14 +9,13 @@ from typing import Literal
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from ruamel.yaml import YAML
 
-from bench import video
+from bench import recorded, video
 from synth.errors import UserError
 from synth.store import Sequence
 
 
-def export(sequence: Sequence, folder: Path, frames: Literal["png", "mp4"] = "png", crf: int = 12) -> Path:
+def export(sequence: Sequence, folder: Path, frames: Literal["png", "mp4"] = "png") -> Path:
     """Writes one recording: frames or video, times, force in camera axes, tool masks, tissue, meta.yaml.
 
     Nothing that the recorded scene wouldn't have given is written: no true flow, no traction, no glare mask.
@@ -26,19 +24,19 @@ def export(sequence: Sequence, folder: Path, frames: Literal["png", "mp4"] = "pn
         sequence: a sealed sequence.
         folder: where to; must not exist.
         frames: `png` is lossless, `mp4` is H.264.
-        crf: quality of the latter.
 
     Raises:
         UserError: the folder exists.
     """
-    if folder.exists():
-        raise UserError(f"{folder}: exists already")
-    part = folder.with_name(folder.name + ".part")
-    if part.exists():
-        shutil.rmtree(part)
-    (part / "masks").mkdir(parents=True)
+    with recorded.whole(folder) as part:
+        _fill(sequence, part, frames)
+    return folder
+
+
+def _fill(sequence: Sequence, part: Path, frames: Literal["png", "mp4"]) -> None:
+    (part / "masks").mkdir()
     time = np.asarray(sequence["time"][:], np.float64)
-    _footage(sequence, part, frames, crf, time)
+    _footage(sequence, part, frames, time)
     even = (slice(None), slice(None))
     if frames == "mp4":  # the codec wants even sizes; masks must fit the video
         even = tuple(slice(0, side // 2 * 2) for side in sequence.size)  # type: ignore[assignment]
@@ -47,11 +45,8 @@ def export(sequence: Sequence, folder: Path, frames: Literal["png", "mp4"] = "pn
         if tool.any():
             _write(part / "masks" / f"{t:06d}.png", tool.astype(np.uint8) * 255)
     _write(part / "tissue.png", np.asarray(sequence["tissue"][:], bool)[even].astype(np.uint8) * 255)
-    newtons = np.asarray(sequence["force"][:], np.float64) / 1000
-    rows = [f"{t:.6f},{f[0]:.9f},{f[1]:.9f},{f[2]:.9f}" for t, f in zip(time, newtons, strict=True)]
-    (part / "force.csv").write_text("\n".join(["t_s,fx_n,fy_n,fz_n", *rows]) + "\n", encoding="utf-8")
-    listed = [f"{k},{t:.6f}" for k, t in enumerate(time)]
-    (part / "frames.csv").write_text("\n".join(["frame,t_s", *listed]) + "\n", encoding="utf-8")
+    recorded.force(part, time, np.asarray(sequence["force"][:], np.float64) / 1000)
+    recorded.frames(part, time)
     about = {
         "scale_mm_per_px": float(sequence.attrs["scale_mm_per_px"]),
         "scale_uncertainty": 0.0,
@@ -60,20 +55,15 @@ def export(sequence: Sequence, folder: Path, frames: Literal["png", "mp4"] = "pn
         "specimen": f"anatomy {_anatomy(sequence)}",
         "sensor": {"axes": "camera", "acts_on": "tissue", "low_pass_hz": None},
     }
-    with (part / "meta.yaml").open("w", encoding="utf-8") as file:
-        YAML().dump(about, file)
-    part.rename(folder)
-    return folder
+    recorded.about(part, about)
 
 
-def _footage(
-    sequence: Sequence, part: Path, kind: Literal["png", "mp4"], crf: int, time: NDArray[np.float64]
-) -> None:
+def _footage(sequence: Sequence, part: Path, kind: Literal["png", "mp4"], time: NDArray[np.float64]) -> None:
     pictures: Iterator[NDArray[np.uint8]] = (
         np.asarray(sequence["rgb"][t], np.uint8) for t in range(sequence.frames)
     )
     if kind == "mp4":
-        video.write_video(part / "video.mp4", pictures, time, crf)
+        video.write_video(part / "video.mp4", pictures, time)
         return
     (part / "frames").mkdir()
     for t, rgb in enumerate(pictures):

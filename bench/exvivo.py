@@ -7,7 +7,6 @@ drift and noise. Written in the layout of a real recording, so that the same cod
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,10 +14,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from ruamel.yaml import YAML
 from scipy.spatial.transform import Rotation
 
-from bench import video
+from bench import recorded, video
 from synth import job as jobs
 from synth import scenario
 from synth.errors import UserError
@@ -36,6 +34,8 @@ _SENSOR_HZ = 200.0
 _STILL_S = 1.5
 _SYNC_S = 9.0
 _PRESS_S = 13.0
+# Creep: the part of the response that comes late, and how late [s].
+_LATE, _LATE_S = 0.2, 0.8
 
 
 @dataclass(frozen=True)
@@ -98,13 +98,15 @@ def make(plan: Plan, index: int, folder: Path, progress: Progress = lambda done,
     Raises:
         UserError: the folder exists, the recording is shorter than its calibration, or as the rendering.
     """
-    if folder.exists():
-        raise UserError(f"{folder}: exists already")
     if plan.seconds < _PRESS_S + 5:
         raise UserError(f"seconds: {plan.seconds:g}; calibration alone takes {_PRESS_S:g}, at least 5 more")
-    part = folder.with_name(folder.name + ".part")
-    shutil.rmtree(part, ignore_errors=True)
-    (part / "masks").mkdir(parents=True)
+    with recorded.whole(folder) as part:
+        _fill(plan, index, part, progress)
+    return folder
+
+
+def _fill(plan: Plan, index: int, part: Path, progress: Progress) -> None:
+    (part / "masks").mkdir()
     job = job_of(plan)
     case = scenario.draw(job, index)
     view = camera.place(case.view, job.render)
@@ -129,7 +131,7 @@ def make(plan: Plan, index: int, folder: Path, progress: Progress = lambda done,
     video.write_video(part / "video.mp4", iter(pictures), times, crf=int(rng.integers(18, 25)))
     cv2.imwrite(str(part / "tissue.png"), studio.still.tissue.astype(np.uint8) * 255)
     force = np.stack([g.force_mn * np.asarray(g.direction) for g in gestures])[course.gesture]
-    lag = _write_sensor(part, course, force * course.level[:, None], plan, rng)
+    lag = _write_sensor(part, course, force * course.level[:, None], rng)
     about = {
         "scale_mm_per_px": float(studio.still.scale_mm_per_px * (1 + 0.02 * rng.normal())),
         "scale_uncertainty": 0.02,
@@ -139,10 +141,7 @@ def make(plan: Plan, index: int, folder: Path, progress: Progress = lambda done,
         "sync": {"method": "correlate", "calibration_s": [0.0, _SYNC_S], "search_s": 0.7},
         "sensor": {"axes": "sensor", "low_pass_hz": 10.0, "free_s": _free_spans(plan, lag)},
     }
-    with (part / "meta.yaml").open("w", encoding="utf-8") as file:
-        YAML().dump(about, file)
-    part.rename(folder)
-    return folder
+    recorded.about(part, about)
 
 
 def _moved(
@@ -182,12 +181,12 @@ def _course(plan: Plan, rng: np.random.Generator) -> _Course:
     return _Course(time, level, _crept(time, level), gesture, away)
 
 
-def _crept(time_s: Floats, level: Floats, share: float = 0.2, after_s: float = 0.8) -> Floats:
+def _crept(time_s: Floats, level: Floats) -> Floats:
     """Quasi-linear creep with one time (Fung): part of the response comes late, by a first-order lag."""
     late, step = np.zeros_like(level), time_s[1] - time_s[0]
     for k in range(1, len(level)):
-        late[k] = late[k - 1] + step / after_s * (level[k] - late[k - 1])
-    return np.asarray(np.clip((1 - share) * level + share * late, 0, 1), np.float64)
+        late[k] = late[k - 1] + step / _LATE_S * (level[k] - late[k - 1])
+    return np.asarray(np.clip((1 - _LATE) * level + _LATE * late, 0, 1), np.float64)
 
 
 def _frame_times(plan: Plan, rng: np.random.Generator) -> Floats:
@@ -214,7 +213,7 @@ def _pose(
     return motion.rest + moved, tips, shafts
 
 
-def _write_sensor(part: Path, course: _Course, force: Floats, plan: Plan, rng: np.random.Generator) -> float:
+def _write_sensor(part: Path, course: _Course, force: Floats, rng: np.random.Generator) -> float:
     """Writes force.csv as a sensor of its own would; returns by how much its clock is behind [s]."""
     lag = float(rng.uniform(-0.5, 0.5))
     size = float(np.linalg.norm(force, axis=1).max())
@@ -222,11 +221,7 @@ def _write_sensor(part: Path, course: _Course, force: Floats, plan: Plan, rng: n
     drift = size * rng.normal(size=3) * 0.002 * course.time_s[:, None]
     seen = force @ turn.T + size * rng.normal(0, 0.3, 3) + drift + 0.005 * size * rng.normal(size=force.shape)
     clock = course.time_s - lag
-    rows = [
-        f"{t:.6f},{f[0] / 1000:.9f},{f[1] / 1000:.9f},{f[2] / 1000:.9f}"
-        for t, f in zip(clock, seen, strict=True)
-    ]
-    (part / "force.csv").write_text("\n".join(["t_s,fx_n,fy_n,fz_n", *rows]) + "\n", encoding="utf-8")
+    recorded.force(part, clock, seen / 1000)
     return lag
 
 

@@ -6,7 +6,6 @@ the libraries kept for them; what comes out is the layout that everything else h
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from importlib import import_module
@@ -15,9 +14,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from ruamel.yaml import YAML
 
-from bench import video
+from bench import recorded, video
 from synth.errors import UserError
 
 Floats = NDArray[np.float64]
@@ -96,32 +94,16 @@ def write(
     Raises:
         UserError: the folder exists, or a picture can't be decoded.
     """
-    if out.exists():
-        raise UserError(f"{out}: exists already")
-    part = out.with_name(out.name + ".part")
-    shutil.rmtree(part, ignore_errors=True)
-    part.mkdir(parents=True)
-    try:
+    with recorded.whole(out) as part:
         video.write_video(
             part / "video.mp4", _told(found.pictures(), progress), _rising(found.times_s), crf=_CRF_LOSSLESS
         )
-        _csv(
-            part / "frames.csv", "frame,t_s", np.column_stack([np.arange(len(found.times_s)), found.times_s])
-        )
+        recorded.frames(part, found.times_s)
         if len(found.force):
-            _csv(
-                part / "force.csv",
-                "t_s,fx_n,fy_n,fz_n",
-                np.column_stack([found.force_s, newtons * found.force]),
-            )
+            recorded.force(part, found.force_s, newtons * found.force)
         if len(found.tip):
-            _csv(part / "tip.csv", "t_s,x_mm,y_mm,z_mm", found.tip)
-        with (part / "meta.yaml").open("w", encoding="utf-8") as file:
-            YAML().dump(dict(about), file)
-    except BaseException:
-        shutil.rmtree(part, ignore_errors=True)
-        raise
-    part.rename(out)
+            recorded.tip(part, found.tip)
+        recorded.about(part, about)
     return out
 
 
@@ -173,7 +155,3 @@ def _rising(times_s: Floats) -> Floats:
     steps = np.maximum(np.diff(times_s, prepend=times_s[:1]), 0)
     steps[1:] = np.maximum(steps[1:], 1e-3)
     return np.asarray(times_s[0] + np.cumsum(steps), np.float64)
-
-
-def _csv(path: Path, head: str, rows: Floats) -> None:
-    np.savetxt(path, rows, fmt="%.9g", delimiter=",", header=head, comments="")

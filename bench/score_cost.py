@@ -12,13 +12,11 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any
 
-import cv2
 import numpy as np
 import typer
 from numpy.typing import NDArray
-from ruamel.yaml import YAML
 
-from bench import machine, video
+from bench import machine, phantom, recorded, results, video
 from synth.errors import UserError
 
 _PERIOD_S, _PEAK_PX, _PX_A_MN = 4.0, 9.0, 0.3
@@ -61,9 +59,8 @@ def cost(
         "machine": machine.describe(),
         "command": shlex.join(["bench", "experiment", "scoring", "MODEL", "--train", "DATA"]),
     }
-    out.mkdir(parents=True, exist_ok=True)
-    (out / "results.json").write_text(json.dumps(tree, indent=1) + "\n", encoding="utf-8")
-    (out / "README.md").write_text(readme(tree), encoding="utf-8")
+    results.keep(out, "results.json", tree)
+    results.keep(out, "README.md", readme(tree))
     print(out / "README.md")
 
 
@@ -81,15 +78,17 @@ def record(folder: Path, seconds: float, fps: float, size: tuple[int, int], rng:
     times = np.arange(round(seconds * fps)) / fps
     video.write_video(folder / "video.mp4", _pictures(times, size, rng), times, crf=12)
     clock = np.arange(0, seconds, 1 / _SENSOR_HZ)
-    rows = [f"{t:.4f},{m / _PX_A_MN / 1000:.7f},0,0" for t, m in zip(clock, _motion(clock), strict=True)]
-    (folder / "force.csv").write_text("\n".join(["t_s,fx_n,fy_n,fz_n", *rows]) + "\n", encoding="utf-8")
-    about = {
-        "scale_mm_per_px": 35.0 / size[0],
-        "young_kpa": 2.0,
-        "sensor": {"axes": "camera", "low_pass_hz": None},
-    }
-    with (folder / "meta.yaml").open("w", encoding="utf-8") as file:
-        YAML().dump(about, file)
+    newtons = np.zeros((len(clock), 3))
+    newtons[:, 0] = _motion(clock) / _PX_A_MN / 1000
+    recorded.force(folder, clock, newtons)
+    recorded.about(
+        folder,
+        {
+            "scale_mm_per_px": 35.0 / size[0],
+            "young_kpa": 2.0,
+            "sensor": {"axes": "camera", "low_pass_hz": None},
+        },
+    )
 
 
 def _motion(time_s: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -100,17 +99,8 @@ def _motion(time_s: NDArray[np.float64]) -> NDArray[np.float64]:
 def _pictures(
     times: NDArray[np.float64], size: tuple[int, int], rng: np.random.Generator
 ) -> Iterator[NDArray[np.uint8]]:
-    width, height = size
-    noise = rng.normal(size=(height, width)).astype(np.float32)
-    fine = cv2.GaussianBlur(noise, (0, 0), 1.5) - cv2.GaussianBlur(noise, (0, 0), 6)
-    grey = 110 + 45 * fine / fine.std()
-    rest = np.clip(np.stack([1.1 * grey, 0.7 * grey, 0.6 * grey], axis=-1), 0, 210).astype(np.uint8)
-    y, x = np.mgrid[:height, :width].astype(np.float32)
-    bump = np.exp(-((x - width / 2) ** 2 + (y - height / 2) ** 2) / (2 * (0.18 * height) ** 2))
-    for move in _motion(times):
-        source = (x - move * bump).astype(np.float32)
-        moved = cv2.remap(rest, source, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
-        yield np.asarray(moved, np.uint8)
+    rest = phantom.texture(size[1], size[0], rng)
+    return (phantom.pushed(rest, move) for move in _motion(times))
 
 
 def readme(tree: dict[str, Any]) -> str:

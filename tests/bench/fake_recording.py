@@ -10,30 +10,16 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from ruamel.yaml import YAML
 
-from bench import video
+from bench import phantom, recorded, video
 from bench.follow import Answer, Scene
 
 GAIN_MN_PER_PX = 40.0
 
 
 def texture(height: int, width: int, seed: int = 0) -> NDArray[np.uint8]:
-    """Band-passed noise in tissue colours, (H, W, 3) uint8."""
-    rng = np.random.default_rng(seed)
-    noise = rng.normal(size=(height, width)).astype(np.float32)
-    fine = cv2.GaussianBlur(noise, (0, 0), 1.5) - cv2.GaussianBlur(noise, (0, 0), 6)
-    grey = 110 + 45 * fine / fine.std()
-    return np.clip(np.stack([grey * 1.1, grey * 0.7, grey * 0.6], axis=-1), 0, 210).astype(np.uint8)
-
-
-def pushed(rest: NDArray[np.uint8], peak_px: float) -> NDArray[np.uint8]:
-    """The texture moved right by a bump of `peak_px` in the middle."""
-    height, width = rest.shape[:2]
-    y, x = np.mgrid[:height, :width].astype(np.float32)
-    bump = np.exp(-((x - width / 2) ** 2 + (y - height / 2) ** 2) / (2 * (0.18 * height) ** 2))
-    source = (x - peak_px * bump).astype(np.float32)
-    return np.asarray(cv2.remap(rest, source, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT), np.uint8)
+    """`phantom.texture` of a seed."""
+    return phantom.texture(height, width, np.random.default_rng(seed))
 
 
 def force_curve(time_s: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -63,27 +49,24 @@ class Maker:
         (folder / "frames").mkdir(parents=True)
         time = np.arange(frames) / fps
         rest = texture(*size)
-        pictures = [pushed(rest, f / GAIN_MN_PER_PX) for f in force_curve(time)]
+        pictures = [phantom.pushed(rest, f / GAIN_MN_PER_PX) for f in force_curve(time)]
         if footage == "png":
             for k, rgb in enumerate(pictures):
                 cv2.imwrite(str(folder / "frames" / f"{k:04d}.png"), rgb[..., ::-1])
-            rows = [f"{k},{t:.6f}" for k, t in enumerate(time)]
-            (folder / "frames.csv").write_text("\n".join(["frame,t_s", *rows]) + "\n")
+            recorded.frames(folder, time)
         else:
             (folder / "frames").rmdir()
             video.write_video(folder / "video.mp4", iter(pictures), time, crf=6)
         if force:
             t = np.arange(0, time[-1] + 1e-9, 1 / sensor_hz)
-            rows = [f"{a:.6f},{b / 1000:.9f},0,0" for a, b in zip(t, force_curve(t), strict=True)]
-            (folder / "force.csv").write_text("\n".join(["t_s,fx_n,fy_n,fz_n", *rows]) + "\n")
+            recorded.force(folder, t, np.outer(force_curve(t) / 1000, [1.0, 0.0, 0.0]))
         about = {"scale_mm_per_px": 0.2, "young_kpa": 1.0, "sensor": {"axes": "camera", "low_pass_hz": None}}
-        with (folder / "meta.yaml").open("w") as file:
-            YAML().dump({**about, **(meta or {})}, file)
+        recorded.about(folder, {**about, **(meta or {})})
         return folder
 
 
 class Bump:
-    """The inverse of `pushed`: force from the largest displacement. What a perfect method would be."""
+    """The inverse of `phantom.pushed`: force from the largest displacement, as a perfect method would."""
 
     def __call__(
         self, flow: NDArray[np.float32], confidence: NDArray[np.float32], scene: Scene, picture: bool

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from fake_recording import Maker, texture
 
-from bench import table, video
+from bench import recorded, table, video
 from bench.recording import open_recording
 from synth.errors import UserError
 
@@ -20,6 +20,17 @@ def test_variable_frame_rate_keeps_its_times(tmp_path: Path) -> None:
     video.write_video(tmp_path / "v.mp4", iter([texture(32, 48, k) for k in range(6)]), times)
     got = [picture.time_s for picture in video.from_video(tmp_path / "v.mp4")]
     assert got == pytest.approx(times, abs=1e-4)
+
+
+def test_times_of_day_keep_their_microseconds(tmp_path: Path) -> None:
+    """Seconds since 1970, as a ROS bag stamps them, need sixteen figures."""
+    times = 1.7e9 + np.array([0.0, 0.04, 0.080001])
+    recorded.frames(tmp_path, times)
+    recorded.force(tmp_path, times, np.eye(3))
+    assert table.read(tmp_path / "frames.csv", ("t_s",))["t_s"] == pytest.approx(times, abs=1e-6, rel=0)
+    read = table.read(tmp_path / "force.csv", ("t_s", "fy_n"))
+    assert read["t_s"] == pytest.approx(times, abs=1e-6, rel=0)
+    assert read["fy_n"].tolist() == [0, 1, 0]
 
 
 def test_lossless_video_gives_the_pixels_back(tmp_path: Path) -> None:
