@@ -95,8 +95,8 @@ BESIDE: dict[str, tuple[tuple[int, int, int], ...]] = {
     "tiny": ((8, 2, 3), (16, 2, 2)),
 }
 """Width, stem and levels of each preset's network and of those beside it that cost about as much or less;
-for `tiny` those that `ideal_runs` lack. `paper` has none: its network is the published one, and too large to be
-trained on a CPU."""
+for `tiny` those that `ideal_runs` lack. `paper` has none: its network is the published one, and too large to
+be trained on a CPU."""
 
 
 def preset_runs() -> Iterator[Run]:
