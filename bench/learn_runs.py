@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from bench.learn_controls import beyond_mean_map, controls, mean_map
+from bench.learn_wide import CELLS, wide_rmse
 from learn.calibrate import stiffness
 from learn.data import Clip
 from learn.evaluate import evaluate
@@ -74,7 +75,7 @@ def carry_out(
     fitted, tested = [clips[i] for i in split.fit], [clips[i] for i in split.test]
     report = evaluate(predictor, tested, run.source, pressed=pressed)
     history = [json.loads(s) for s in (models / run.name / "history.jsonl").read_text().splitlines()]
-    result = {
+    result: dict[str, Any] = {
         "name": run.name,
         "source": run.source,
         "control": run.control,
@@ -88,6 +89,10 @@ def carry_out(
         "controls": controls(predictor, tested, run.source, fitted) if run.controlled else {},
         **report.as_dict(),
     }
+    if run.settings.size > CELLS:
+        wide = wide_rmse(predictor, tested, run.source)
+        for row, value in zip(result["sequences"], wide, strict=True):
+            row["map_rmse_wide"] = value
     if run.control:
         base = mean_map(tested, predictor.card, fitted)
         result["beyond_mean_map"] = beyond_mean_map(report, base)
