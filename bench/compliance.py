@@ -10,18 +10,22 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
+import scipy.sparse as sp
 from numpy.typing import NDArray
 from scipy.spatial import Delaunay
 
 from synth import job
 from synth.fem import mesh, skin
-from synth.fem.system import assemble
+from synth.fem.mesh import Tets
+from synth.fem.system import System, assemble
 
 Floats = NDArray[np.float64]
 
 # World (z out of the brain) to camera (x right, y down, z forward) for a camera straight above.
 TO_CAMERA = np.diag([1.0, -1.0, -1.0])
 
+# A recording doesn't tell the brain's shape: the default job's.
+_ANATOMY = job.Anatomy()
 _AT_ONCE = 32
 
 
@@ -39,36 +43,55 @@ class Compliance:
     """(K,) mm^2."""
 
 
+@dataclass(frozen=True, eq=False)
+class Block:
+    """A procedural block seen from straight above, E = 1 kPa."""
+
+    volume: Tets
+    system: System
+
+    @classmethod
+    def build(cls, law: str, tets: int, order: int) -> Block:
+        """A block of about that many tetrahedra, with Poisson's ratio 0.4."""
+        volume = mesh.block(_ANATOMY, tets, order)
+        return cls(volume, assemble(volume, law, 0.4))
+
+    def carry(self, xy: Floats) -> sp.csr_array:
+        """(P, N) what gives the motion of surface points (P, 2), camera x, y [mm], from the volume's.
+
+        Its transpose carries loads on them to the volume.
+        """
+        world = xy * np.array([1.0, -1.0])
+        on_dome = np.column_stack([world, mesh.dome(world, _ANATOMY.dome_mm)])
+        return skin.embedding(self.volume, on_dome)
+
+
+def picture(carry: sp.csr_array, moved: Floats) -> Floats:
+    """What the camera sees, (P, 2, ...) mm at points, of a volume's motion (N, 3, ...) mm in world axes."""
+    flat = moved.reshape(len(moved), -1)
+    world = (carry @ flat).reshape(-1, *moved.shape[1:])
+    return np.asarray(np.einsum("ab,pb...->pa...", TO_CAMERA[:2], world), np.float64)
+
+
 @lru_cache(maxsize=4)
-def build(
-    point_mm: float = 1.0,
-    node_mm: float = 1.2,
-    tets: int = 3000,
-    poisson: float = 0.4,
-    radius_mm: float = 12.0,
-) -> Compliance:
+def build(point_mm: float = 1.0, node_mm: float = 1.2, tets: int = 3000) -> Compliance:
     """Solves one linear problem a node and axis, on one factorisation.
 
     Args:
-        point_mm: spacing of the points.
-        node_mm: spacing of the nodes.
+        point_mm: spacing of the points, which reach to the opening's edge.
+        node_mm: spacing of the nodes, which stay as far inside it.
         tets: of the map's own mesh, second order.
-        poisson: of the tissue.
-        radius_mm: of the opening; points reach to it, nodes stay a spacing inside.
     """
-    anatomy = job.Anatomy(craniotomy=job.Craniotomy(radius_mm=radius_mm))
-    volume = mesh.block(anatomy, tets, 2)
-    system = assemble(volume, "linear", poisson)
+    block = Block.build("linear", tets, 2)
+    radius_mm = _ANATOMY.craniotomy.radius_mm
     points, nodes = _disc(point_mm, radius_mm), _disc(node_mm, radius_mm - node_mm)
-    seen = skin.embedding(volume, on_dome(points, anatomy.dome_mm))
-    held = skin.embedding(volume, on_dome(nodes, anatomy.dome_mm))
+    seen, held = block.carry(points), block.carry(nodes)
     columns = np.empty((len(nodes), 3, 2, len(points)))
     for some in np.array_split(np.arange(len(nodes)), max(1, len(nodes) // _AT_ONCE)):
-        carry = held[some].toarray()
+        shares = held[some].toarray()
         for axis in range(3):
-            u = system.solve(np.einsum("kn,a->nak", carry, TO_CAMERA[axis]))
-            at_points = np.stack([seen @ part for part in u.transpose(1, 0, 2)])
-            columns[some, axis] = np.einsum("ba,apk->kbp", TO_CAMERA, at_points)[:, :2]
+            u = block.system.solve(np.einsum("kn,a->nak", shares, TO_CAMERA[axis]))
+            columns[some, axis] = picture(seen, u).transpose(2, 1, 0)
     matrix = columns.transpose(2, 3, 0, 1).reshape(2 * len(points), 3 * len(nodes))
     return Compliance(matrix, points, nodes, _areas(nodes))
 
@@ -78,12 +101,6 @@ def _disc(spacing_mm: float, radius_mm: float) -> Floats:
     steps = np.arange(-np.floor(radius_mm / spacing_mm), np.floor(radius_mm / spacing_mm) + 1) * spacing_mm
     x, y = np.meshgrid(steps, steps)
     return np.stack([x, y], axis=-1)[np.hypot(x, y) <= radius_mm]
-
-
-def on_dome(xy: Floats, dome_mm: float) -> Floats:
-    """Camera x, y to the world's surface, (N, 3) mm."""
-    world = xy * np.array([1.0, -1.0])
-    return np.column_stack([world, mesh.dome(world, dome_mm)])
 
 
 def _areas(nodes: Floats) -> Floats:

@@ -17,13 +17,11 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
-from bench import compliance as compliances
 from bench import inverse
-from bench.compliance import TO_CAMERA, Compliance
+from bench.compliance import TO_CAMERA, Block, Compliance, picture
 from bench.inverse import Contact
-from synth import job
-from synth.fem import equilibrium, mesh, skin
-from synth.fem.system import System, assemble
+from synth.fem import equilibrium
+from synth.fem.system import System
 
 Floats = NDArray[np.float64]
 
@@ -39,7 +37,7 @@ _FAILED = 0.05
 
 @dataclass(frozen=True, eq=False)
 class Tissue:
-    """A co-rotational block seen from above, E = 1 kPa."""
+    """A co-rotational block under a compliance's points and nodes, E = 1 kPa."""
 
     system: System
     seen: sp.csr_array
@@ -49,18 +47,13 @@ class Tissue:
 
 
 @lru_cache(maxsize=2)
-def build(known: Compliance, tets: int = _TETS) -> Tissue:
+def build(known: Compliance) -> Tissue:
     """First-order elements: their turns are right, and what they lack in give is scaled for.
 
     On second-order ones the steps swing about the answer, and each costs six times as much.
     """
-    anatomy = job.Anatomy()
-    volume = mesh.block(anatomy, tets, 1)
-    return Tissue(
-        assemble(volume, "corotational", 0.4),
-        skin.embedding(volume, compliances.on_dome(known.points, anatomy.dome_mm)),
-        skin.embedding(volume, compliances.on_dome(known.nodes, anatomy.dome_mm)),
-    )
+    block = Block.build("corotational", _TETS, 1)
+    return Tissue(block.system, block.carry(known.points), block.carry(known.nodes))
 
 
 def one_contact(known: Compliance, displacement: Floats, weight: Floats) -> Floats:
@@ -104,7 +97,7 @@ def added(
     share = inverse.kernel(known, contact.place)
     load = np.outer(np.asarray(tissue.held.T @ share), TO_CAMERA.T @ contact.force)
     linear = tissue.system.solve(load)
-    stiff = _picture(tissue, linear).T.ravel()
+    stiff = picture(tissue.seen, linear).T.ravel()
     wanted = np.einsum("mka,k,a->m", known.matrix.reshape(len(stiff), -1, 3), share, contact.force)
     # The load that moves the stiffer mesh as far as this one moves the map's.
     give = float(stiff @ wanted) / max(float(stiff @ stiff), 1e-30)
@@ -115,8 +108,4 @@ def added(
     moved, state, rest = equilibrium.balance(tissue.system, load, begin, _TOLERANCE * size, safe)
     if not np.isfinite(state.energy) or rest > _FAILED * size:
         return None
-    return _picture(tissue, moved - linear), moved
-
-
-def _picture(tissue: Tissue, moved: Floats) -> Floats:
-    return np.asarray(((tissue.seen @ moved) @ TO_CAMERA.T)[:, :2], np.float64)
+    return picture(tissue.seen, moved - linear), moved

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
+from synth.child import Report
 from synth.job import Job
 from synth.store import Writer
-
-Report = Callable[[str, int, int], None]
 
 
 def sequence(job: Job, index: int, folder: Path, report: Report) -> None:

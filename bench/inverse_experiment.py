@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -12,11 +11,9 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
-from bench import compliance, corotational, inverse, machine
-from bench.compliance import TO_CAMERA, Compliance, on_dome
-from synth import job
-from synth.fem import equilibrium, mesh, skin
-from synth.fem.system import assemble
+from bench import compliance, corotational, inverse, machine, results
+from bench.compliance import TO_CAMERA, Block, Compliance, picture
+from synth.fem import equilibrium
 
 Floats = NDArray[np.float64]
 Solve = Callable[[Compliance, Floats, Floats], Floats]
@@ -71,9 +68,8 @@ def experiment(
             "mean_peak_mm": float(np.mean([np.linalg.norm(field, axis=1).max() for field in fields])),
             "methods": {name: tried(solve, known, spoilt, forces, young) for name, solve in _METHODS.items()},
         }
-    out.mkdir(parents=True, exist_ok=True)
-    (out / "results.json").write_text(json.dumps(tree, indent=1) + "\n", encoding="utf-8")
-    (out / "README.md").write_text(readme(tree), encoding="utf-8")
+    results.keep(out, "results.json", tree)
+    results.keep(out, "README.md", readme(tree))
     print(out / "README.md")
 
 
@@ -100,10 +96,8 @@ def contacts(
     Returns:
         (count, 3) forces [mN], camera axes, and count fields (P, 2) of displacement [mm].
     """
-    anatomy = job.Anatomy()
-    volume = mesh.block(anatomy, tets, 2)
-    system = assemble(volume, law, 0.4)
-    seen = skin.embedding(volume, on_dome(known.points, anatomy.dome_mm))
+    block = Block.build(law, tets, 2)
+    seen = block.carry(known.points)
     steps = np.stack(np.meshgrid(np.linspace(-1, 1, 13), np.linspace(-1, 1, 13)), axis=-1).reshape(-1, 2)
     disc = steps[np.hypot(*steps.T) < 1]
     share = (1 - np.square(disc).sum(axis=1)) ** 2
@@ -117,14 +111,16 @@ def contacts(
         way = np.array([flat * np.cos(around), flat * np.sin(around), up * rng.choice([-1, 1])])
         if law != "linear":
             size = rng.uniform(*_LOAD) * young_kpa * radius**2
-        held = share @ skin.embedding(volume, on_dome(at + radius * disc, anatomy.dome_mm)).toarray()
+        held = share @ block.carry(at + radius * disc).toarray()
         load = np.outer(held, size * way) / young_kpa
         if law == "linear":  # by itself: `follow` refuses elements that such loads turn inside out
-            moved = system.solve(load)
+            moved = block.system.solve(load)
         else:
-            moved = equilibrium.follow(system, np.stack([0.5 * load, load]), np.zeros(2)).displacement[-1]
+            moved = equilibrium.follow(block.system, np.stack([0.5 * load, load]), np.zeros(2)).displacement[
+                -1
+            ]
         forces[k] = TO_CAMERA @ (size * way)
-        fields.append((seen @ moved @ TO_CAMERA.T)[:, :2])
+        fields.append(picture(seen, moved))
     return forces, fields
 
 

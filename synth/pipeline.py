@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from synth import brain, identity, scenario
+from synth.child import Report
 from synth.fem import mesh, solver, tool
 from synth.fem.mesh import Tets
 from synth.fem.solver import Deformation
@@ -29,9 +29,6 @@ from synth.timeline import Timeline
 # for the published method's.
 _SHOT = ("rgb", "flow", "visible", "tool", "glare", "depth")
 _PUBLISHED = ("flow_noisy", "intensity")
-
-Report = Callable[[str, int, int], None]
-"""Progress: what is being done, how many of it are done, how many there are."""
 
 
 def render_sequence(job: Job, index: int, folder: Path, report: Report) -> Path:
@@ -113,8 +110,7 @@ def render_sequence(job: Job, index: int, folder: Path, report: Report) -> Path:
         report("flow", 0, job.frames)
         with watch.stage("flow"):
             # What a real pipeline has: the tool's outline, and glare as the picture shows it.
-            blocked = tools | np.stack([mask.glare(picture) for picture in rgb])
-            recovered = track.track(estimator(job.flow), rgb, blocked, still.tissue)
+            recovered = track.track(estimator(job.flow), rgb, mask.hidden(rgb, tools), still.tissue)
         with watch.stage("store"):
             for t in range(job.frames):
                 writer.put_frame("flow_tvl1", t, recovered.flow[t])

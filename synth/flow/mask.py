@@ -72,6 +72,11 @@ def blocked(rgb: NDArray[np.uint8]) -> NDArray[np.bool_]:
     return np.asarray(glare(rgb) | tool(rgb), bool)
 
 
+def hidden(film: NDArray[np.uint8], tools: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """The same of a film (T, H, W, 3) whose instrument's outline is known, (T, H, W): glare is found."""
+    return np.asarray(tools | np.stack([glare(picture) for picture in film]), bool)
+
+
 def grey_bodies(rgb: NDArray[np.uint8]) -> NDArray[np.bool_]:
     """(H, W): connected pixels of little colour that touch the border and are more than specks."""
     values = rgb.astype(np.float32)

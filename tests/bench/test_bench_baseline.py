@@ -9,9 +9,6 @@ from numpy.typing import NDArray
 from bench import baseline, compliance, corotational, inverse, inverse_experiment
 from bench.follow import Method, Scene
 from learn.data import Clip
-from synth import job
-from synth.fem import mesh, skin
-from synth.fem.system import assemble
 
 N = baseline.GRID.size
 
@@ -90,13 +87,9 @@ def known() -> compliance.Compliance:
 def across(known: compliance.Compliance) -> NDArray[np.float64]:
     """Displacement at the compliance's points for (30, -40, 0) mN on another mesh, with 0.1 mm of noise."""
     rng = np.random.default_rng(0)
-    volume = mesh.block(job.Anatomy(), 2500, 2)
-    system = assemble(volume, "linear", 0.4)
-    xy = np.array([[2.0, -3.0], [2.5, -3.0], [2.0, -2.5], [1.5, -3.0]])
-    held = skin.embedding(volume, compliance.on_dome(xy, 70.0)).toarray().mean(axis=0)
-    u = skin.embedding(volume, compliance.on_dome(known.points, 70.0)) @ system.solve(
-        np.outer(held, [30.0, 40.0, 0])
-    )
+    block = compliance.Block.build("linear", 2500, 2)
+    held = block.carry(np.array([[2.0, -3.0], [2.5, -3.0], [2.0, -2.5], [1.5, -3.0]])).toarray().mean(axis=0)
+    u = block.carry(known.points) @ block.system.solve(np.outer(held, [30.0, 40.0, 0]))
     return np.asarray((u * [1, -1, -1])[:, :2] + 0.1 * rng.normal(size=(len(known.points), 2)))
 
 
