@@ -170,7 +170,7 @@ class Probe:
             each.append(cpu[0])
         frame = min(each[1:])  # what else the machine does only adds
         rgb = np.stack([shot.rgb for shot in shots])
-        blocked = np.stack([shot.tool | mask.glare(shot.rgb) for shot in shots])
+        blocked = mask.hidden(rgb, np.stack([shot.tool for shot in shots]))
         return _Film(rgb, blocked, shots, studio, {"scene": scene[0] + each[0] - frame, "render": frame})
 
 
