@@ -84,13 +84,14 @@ def pool(
         list[Path], typer.Argument(help="Folders that `bench score` wrote, or their score.json.")
     ],
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the pooled result.")],
+    by: Annotated[str, typer.Option(help="What made the scores, for the page; else this command.")] = "",
     json: Json = False,
 ) -> None:
     """Scores of several recordings as one: means, intervals over specimens, one table and chart."""
     from bench import pool as pooling
 
     tree = pooling.pool(pooling.read(scores))
-    pooling.write(tree, out, _typed())
+    pooling.write(tree, out, by or _typed())
     print(json_.dumps(tree) if json else out / "README.md")
 
 
@@ -156,6 +157,29 @@ def import_(
         for note in notes:
             typer.echo(f"note: {note}", err=True)
         print(out)
+
+
+@app.command(epilog="Example: bench pages docs/results --check")
+def pages(
+    results: Annotated[Path, typer.Argument(help="Folder of results.")] = Path("docs/results"),
+    check: Annotated[
+        bool, typer.Option("--check", help="Write nothing; end with 1 if any is stale.")
+    ] = False,
+    json: Json = False,
+) -> None:
+    """Draws picture and page of every experiment anew from its data, where its own command doesn't."""
+    from bench import pages as drawn
+
+    if not results.is_dir():
+        raise UserError(f"{results}: no such folder")
+    found = drawn.stale(results) if check else drawn.write(results)
+    print(
+        json_.dumps([str(file) for file in found])
+        if json
+        else "\n".join(map(str, found)) or "all as they should be"
+    )
+    if check and found:
+        raise typer.Exit(1)
 
 
 @app.command(epilog="Example: bench demo out --model model --out runs/demo")

@@ -1,4 +1,4 @@
-"""Means with their intervals, row by row: a picture and a page, both small."""
+"""Means with their intervals, row by row, as a small picture."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import html
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 from bench.bootstrap import Interval
 
@@ -26,36 +25,24 @@ class Row:
     """Which colour."""
 
 
-def write(rows: Sequence[Row], out: Path, title: str, unit: str) -> None:
-    """`chart.svg` and `index.html`, which stands alone and shows numbers on pointing, in the folder `out`."""
-    out.mkdir(parents=True, exist_ok=True)
-    picture = draw(rows, title, unit)
-    (out / "chart.svg").write_text(picture + "\n", encoding="utf-8")
-    page = (
-        f'<!DOCTYPE html><html lang="en"><meta charset="utf-8"><title>{html.escape(title)}</title>'
-        '<meta name="viewport" content="width=device-width"><body style="margin:1rem">'
-        f"{picture}</body></html>\n"
-    )
-    (out / "index.html").write_text(page, encoding="utf-8")
-
-
 def draw(rows: Sequence[Row], title: str, unit: str) -> str:
     """The picture as SVG."""
     height = _TOP + _ROW * len(rows) + _BELOW
+    left = max(_LEFT, 20 + round(6.4 * max((len(row.name) for row in rows), default=0)))
     ends = [v for row in rows for v in (row.value, *row.interval) if math.isfinite(v)] or [1.0]
     low, high = min(0.0, *ends), max(ends)
     step = _step((high - low) or 1.0)
     low, high = step * math.floor(low / step), step * math.ceil(high / step + 1e-9)
 
     def at(value: float) -> float:
-        return round(_LEFT + (_WIDTH - _LEFT - 24) * (value - low) / (high - low), 1)
+        return round(left + (_WIDTH - left - 24) * (value - low) / (high - low), 1)
 
     parts = [
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {_WIDTH} {height}" '
         f'style="max-width:{_WIDTH}px;width:100%" font-family="sans-serif" font-size="12" fill="#22262b">',
         f'<rect width="{_WIDTH}" height="{height}" fill="#fff"/>',
         _text(10, 22, title, 'font-size="15"'),
-        _text(_LEFT, height - 10, unit),
+        _text(left, height - 10, unit),
     ]
     for k in range(round((high - low) / step) + 1):
         x = at(low + k * step)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bench import forest, gap, machine
+from bench import forest, gap, machine, results, sheet
 from bench.bootstrap import Interval
 from bench.gap_runs import KEYS, Tests, Training, carry_out, followed
 from learn.data import Clip, load
@@ -179,10 +179,13 @@ def _errors(runs: Sequence[dict[str, Any]], test: str, key: str) -> Curve:
 
 def write(tree: dict[str, Any], out: Path) -> None:
     """results.json, README.md, chart.svg and index.html."""
-    out.mkdir(parents=True, exist_ok=True)
-    text = json.dumps(_plain(tree), indent=1, allow_nan=False)
-    (out / "results.json").write_text(text + "\n", encoding="utf-8")
-    (out / "README.md").write_text(readme(tree), encoding="utf-8")
+    results.keep(out, "results.json", json.dumps(_plain(tree), indent=1, allow_nan=False) + "\n")
+    results.keep(out, "README.md", readme(tree))
+    sheet.write(drawn(_plain(tree)), out)
+
+
+def drawn(tree: Mapping[str, Any]) -> sheet.Sheet:
+    """Page and picture of `results.json`."""
     rows = []
     for group, (flow, found) in enumerate(tree["flows"].items()):
         errors = found["errors"][KEYS[0]]
@@ -196,9 +199,9 @@ def write(tree: dict[str, Any], out: Path) -> None:
                     group,
                 )
             )
-    forest.write(
-        rows, out, f"Unseen family ({tree['held_out']}): trained on ... tested on ...", _UNITS[KEYS[0]]
-    )
+    title = f"Unseen family ({tree['held_out']}): trained on ... tested on ..."
+    chart = sheet.Chart(title, _UNITS[KEYS[0]], tuple(rows))
+    return sheet.Sheet("The sim-to-real gap", tree["command"], tree, (chart,))
 
 
 def readme(tree: dict[str, Any]) -> str:

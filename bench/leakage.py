@@ -6,8 +6,7 @@ frames whose neighbours it was fitted on, and even one that only remembers does 
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -17,7 +16,7 @@ import typer
 from numpy.typing import NDArray
 from rich.console import Console
 
-from bench import baseline, forest, machine, score
+from bench import baseline, forest, machine, results, score, sheet
 from bench.bootstrap import over_groups
 from bench.follow import Answer
 from learn.data import Clip, load
@@ -45,16 +44,21 @@ def leakage(
         )
     }
     tree = summary(clips, found)
-    out.mkdir(parents=True, exist_ok=True)
-    (out / "results.json").write_text(json.dumps(tree, indent=1) + "\n", encoding="utf-8")
-    (out / "README.md").write_text(readme(tree), encoding="utf-8")
-    rows = [
+    results.keep(out, "results.json", tree)
+    results.keep(out, "README.md", readme(tree))
+    sheet.write(drawn(tree), out)
+    print(out / "README.md")
+
+
+def drawn(tree: Mapping[str, Any]) -> sheet.Sheet:
+    """Page and picture of `results.json`."""
+    rows = tuple(
         forest.Row(f"{method}: {split}", value["mae_mn"], tuple(value["mae_interval"]), _SPLITS[split])
         for method, by_split in tree["methods"].items()
         for split, value in by_split.items()
-    ]
-    forest.write(rows, out, "The same methods, two ways to split", "mean error of the total force [mN]")
-    print(out / "README.md")
+    )
+    chart = sheet.Chart("The same methods, two ways to split", "mean error of the total force [mN]", rows)
+    return sheet.Sheet("What leakage does to a score", "bench experiment leakage DATASET", tree, (chart,))
 
 
 def answers(

@@ -13,7 +13,7 @@ from bench.learn_table import markdown
 from learn.loss import SHARES
 from learn.statistics import Interval, interval, paired, pooled_r2, pooled_r2_difference
 
-_COLUMNS = (
+COLUMNS = (
     ("map_r2", "map R²"),
     ("map_rmse", "map RMSE [mN/mm²]"),
     ("force_mae", "total force MAE [mN]"),
@@ -56,16 +56,25 @@ def write(out: Path) -> None:
 
 def _table(found: list[dict[str, Any]]) -> list[str]:
     names = sorted({family(r["name"]) for r in found})
-    lines = ["| runs | pooled map R² | pooled force R² | " + " | ".join(c for _, c in _COLUMNS) + " |"]
-    lines.append("|" + " --- |" * (len(_COLUMNS) + 3))
+    lines = ["| runs | pooled map R² | pooled force R² | " + " | ".join(c for _, c in COLUMNS) + " |"]
+    lines.append("|" + " --- |" * (len(COLUMNS) + 3))
     for name in names:
         group = [r for r in found if family(r["name"]) == name]
         pooled = [[r["columns"]["known"][k] for r in group] for k in ("map_r2_pooled", "force_r2_pooled")]
-        cells = [_text(interval(_per_sequence(group, k), np.random.default_rng(0))) for k, _ in _COLUMNS]
+        cells = [_text(interval(_per_sequence(group, k), np.random.default_rng(0))) for k, _ in COLUMNS]
         sure = _pooled(group)
         means = f"{sure if sure else f'{np.mean(pooled[0]):.3f}'} | {np.mean(pooled[1]):.3f}"
         lines.append(f"| {name} ({len(group)}) | {means} | " + " | ".join(cells) + " |")
     return lines
+
+
+def families(found: list[dict[str, Any]], key: str) -> list[tuple[str, int, Interval]]:
+    """Name, number of runs, and the mean of a metric over tested sequences, of each family of runs."""
+    out = []
+    for name in sorted({family(r["name"]) for r in found}):
+        group = [r for r in found if family(r["name"]) == name]
+        out.append((name, len(group), interval(_per_sequence(group, key), np.random.default_rng(0))))
+    return out
 
 
 def _pooled(group: list[dict[str, Any]]) -> str:
@@ -170,7 +179,7 @@ def _tests(found: list[dict[str, Any]]) -> list[str]:
         both = tags[0] & tags[1]
         groups = [[r for r in found if r["name"] in {n + t for t in both}] for n in (a, b)]
         lines += _pooled_difference(a, b, groups)
-        for key, label in _COLUMNS:
+        for key, label in COLUMNS:
             a_values, b_values = (_per_sequence(g, key) for g in groups)
             if not np.isfinite(b_values - a_values).any():
                 continue

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from bench import forest
+from bench import forest, machine, results, sheet
 from bench.bootstrap import Interval, over_groups
 from synth.errors import UserError
 
@@ -114,10 +114,15 @@ def _each(tree: dict[str, Any]) -> dict[str, Any]:
 
 def write(tree: dict[str, Any], out: Path, command: str) -> None:
     """pool.json, README.md, chart.svg and index.html in the folder `out`."""
-    out.mkdir(parents=True, exist_ok=True)
-    (out / "pool.json").write_text(json.dumps(tree, indent=1, allow_nan=False) + "\n", encoding="utf-8")
-    (out / "README.md").write_text(readme(tree, command), encoding="utf-8")
-    rows = [
+    tree = tree | {"command": command, "machine": machine.describe()}
+    results.keep(out, "pool.json", json.dumps(tree, indent=1, allow_nan=False) + "\n")
+    results.keep(out, "README.md", readme(tree))
+    sheet.write(drawn(tree), out)
+
+
+def drawn(tree: Mapping[str, Any]) -> sheet.Sheet:
+    """Page and picture of `pool.json`."""
+    rows = tuple(
         forest.Row(
             name,
             _number(m["scores"]["mae_of_peak"]["mean"]),
@@ -125,13 +130,13 @@ def write(tree: dict[str, Any], out: Path, command: str) -> None:
             name == tree["main"],
         )
         for name, m in tree["methods"].items()
-    ]
-    forest.write(
-        rows, out, f"{len(tree['recordings'])} recordings", "mean error as a share of the event peak"
     )
+    title = f"{len(tree['recordings'])} recordings"
+    chart = sheet.Chart(title, "mean error as a share of the event peak", rows)
+    return sheet.Sheet(title, tree["command"], tree, (chart,))
 
 
-def readme(tree: dict[str, Any], command: str) -> str:
+def readme(tree: dict[str, Any]) -> str:
     """The pooled scores as a table; methods that beat the main one are marked."""
     shown = [(key, name) for key, name in SCORES if key not in ("bias_mn", "impulse_mae", "dropout")]
     lines = [
@@ -139,7 +144,9 @@ def readme(tree: dict[str, Any], command: str) -> str:
         "",
         "Means over recordings; in brackets 95% intervals, specimens resampled.",
         "",
-        f"    {command}",
+        f"    {tree['command']}",
+        "",
+        f"Machine: {machine.line(tree['machine'])}.",
         "",
         "| method | " + " | ".join(name for _, name in (*shown, *_CALIBRATED)) + " |",
         "|" + " --- |" * (1 + len(shown) + len(_CALIBRATED)),

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
-from bench import pool
+from bench import machine, pool
 from bench.cli import app
 from synth.errors import UserError
 
@@ -28,6 +28,9 @@ def score(name: str, mae: float, specimen: str = "") -> dict[str, Any]:
     }  # fmt: skip
 
 
+MADE = {"command": "bench pool", "machine": machine.describe()}
+
+
 def test_means_and_intervals_over_specimens() -> None:
     tree = pool.pool([score("a", 1.0, "x"), score("b", 3.0, "x"), score("c", 5.0, "y")])
     net = tree["methods"]["net"]["scores"]["mae_mn"]
@@ -36,11 +39,11 @@ def test_means_and_intervals_over_specimens() -> None:
     assert tree["methods"]["zero"]["main_worse_by_mn"]["mean"] == pytest.approx(-1.0)
     assert tree["methods"]["net"]["scores"]["ccc"]["mean"] is None
     assert tree["specimens"] == 2
-    assert "better" not in pool.readme(tree, "")
+    assert "better" not in pool.readme(tree | MADE)
 
 
 def test_a_better_method_is_marked() -> None:
-    assert "**zero** (better)" in pool.readme(pool.pool([score("a", 5.0), score("b", 6.0)]), "")
+    assert "**zero** (better)" in pool.readme(pool.pool([score("a", 5.0), score("b", 6.0)]) | MADE)
 
 
 def test_a_recording_without_scores_is_named() -> None:
@@ -48,7 +51,7 @@ def test_a_recording_without_scores_is_named() -> None:
     tree = pool.pool([score("a", 5.0), lost])
     assert tree["recordings"] == ["a"]
     assert tree["left_out"] == {"b": "clocks not aligned: ambiguous"}
-    assert "Recording b is left out" in pool.readme(tree, "")
+    assert "Recording b is left out" in pool.readme(tree | MADE)
 
 
 def test_command_reads_folders_and_refuses_the_same_twice(tmp_path: Path) -> None:

@@ -18,4 +18,4 @@ for recording in "$work"/recordings/*; do
     --also "D2FNet, ideal flow=$(net I)" --also "D2FNet, recovered flow=$(net R-tvl1)" \
     --also "U-Net, MSE=$work/unet" --also "d2fnet-s=$work/small" -o "$work/scores/$(basename "$recording")"
 done
-bench pool "$work"/scores/* -o docs/results/exvivo
+bench pool "$work"/scores/* -o docs/results/exvivo --by "docs/results/exvivo/run.sh PHOTO WORK"
