@@ -7,13 +7,14 @@ import json as json_
 import shlex
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
 from bench import fronts, plot
+from bench import results as kept
 from synth.errors import UserError
 
 Out = Annotated[Path | None, typer.Option("--out", "-o", help="Folder for the page; all/ in the results.")]
@@ -23,8 +24,23 @@ Again = Annotated[
 ]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")]
 
-_PARETO = ("fem", "render", "flow", "end-to-end")
-_STABILITY = ("fem", "flow")
+PARETO = (
+    "fem/pareto/pareto.json",
+    "render/pareto/pareto.json",
+    "flow/pareto/pareto.json",
+    "learn/pareto/data-cpu.json",
+    "end-to-end/pareto.json",
+)
+STABILITY = (
+    "fem/stability/stability.json",
+    "flow/stability/stability.json",
+    "render/stability/stability.json",
+)
+"""Of these, `--run` measures anew. Learning and engine need data of their own: by their own commands."""
+
+
+def _bench(words: list[str]) -> int:
+    return subprocess.run([sys.executable, "-m", "bench", *words], check=False).returncode
 
 
 def pareto(
@@ -32,8 +48,7 @@ def pareto(
 ) -> None:
     """Error against cost in every room, and where defaults stand; ends with 1 if one left it."""
     if run:
-        for room in _PARETO:
-            _again(results / room if room == "end-to-end" else results / room / "pareto", "pareto.json")
+        again([results / name for name in PARETO])
     gathered = fronts.gather(results)
     rows = fronts.table(gathered)
     parts = [
@@ -43,12 +58,11 @@ def pareto(
         "mark defaults.</p>",
         plot.table(rows),
         plot.charts(list(_pareto_panels(results))),
-        *_credits([results / room / "pareto/pareto.json" for room in ("fem", "render", "flow")]),
-        *_credits([results / "end-to-end/pareto.json"]),
+        *_credits([results / name for name in PARETO]),
     ]
     folder = out or results / "all" / "pareto"
-    _write(folder, "Error against cost, every room", parts)
-    (folder / "fronts.json").write_text(json_.dumps(rows, indent=1) + "\n", "utf-8")
+    plot.write_page(folder, "Error against cost, every room", parts)
+    kept.keep(folder, "fronts.json", rows)
     if json:
         print(json_.dumps(rows))
     else:
@@ -64,24 +78,17 @@ def stability(
 ) -> None:
     """Where everything breaks, room by room, on one page."""
     if run:
-        for room in _STABILITY:
-            _again(results / room / "stability", "stability.json")
+        again([results / name for name in STABILITY])
     from bench import fem_stability, flow_stability
 
-    fem = fronts.read(results / "fem/stability/stability.json")
-    flow = fronts.read(results / "flow/stability/stability.json")
-    render = [
-        case
-        for file in sorted(results.glob("render/stability/*/stability.json"))
-        for case in fronts.read(file)["cases"]
-    ]
+    fem, flow, render = (fronts.read(results / name) for name in STABILITY)
     parts = [
         "<h2>Physics</h2>",
         plot.charts(fem_stability.panels(fem)),
         "<h2>Flow</h2>",
         plot.charts(flow_stability.panels(flow)),
         "<h2>Rendering: a correct frame or a clear error</h2>",
-        plot.table(render),
+        plot.table(render["cases"]),
     ]
     for file in sorted(results.glob("learn/stability/*.json")):
         found = fronts.read(file)
@@ -94,12 +101,12 @@ def stability(
     ]
     parts.append("<h2>Engine</h2>")
     parts += [plot.table([row]) for row in engine]
-    parts += _credits([results / room / "stability/stability.json" for room in _STABILITY])
+    parts += _credits([results / name for name in STABILITY])
     folder = out or results / "all" / "stability"
-    _write(folder, "Where it breaks, every room", parts)
+    plot.write_page(folder, "Where it breaks, every room", parts)
     held = {
-        "render cases": len(render),
-        "render cases that held": sum(bool(case["passed"]) for case in render),
+        "render cases": len(render["cases"]),
+        "render cases that held": sum(bool(case["passed"]) for case in render["cases"]),
         "engine trials": len(engine),
     }
     print(json_.dumps(held) if json else folder / "index.html")
@@ -130,14 +137,23 @@ def _flat(found: dict[str, Any]) -> Iterator[tuple[str, Any]]:
             yield key, json_.dumps(value) if isinstance(value, dict) else value
 
 
-def _again(folder: Path, file: str) -> None:
-    """Runs the command that a result names, into its folder. UserError if it fails."""
-    command = shlex.split(str(fronts.read(folder / file)["command"]))[1:]
-    done = subprocess.run([sys.executable, "-m", "bench", *command, "--out", str(folder)], check=False)
-    if done.returncode:
-        raise UserError(f"bench {shlex.join(command)}: ended with {done.returncode}")
+def again(files: Sequence[Path], bench: Callable[[list[str]], int] = _bench) -> None:
+    """Measures anew what files hold, by the command that each names, into its folder.
 
+    Args:
+        files: of results.
+        bench: runs `bench` with these words; gives its exit status.
 
-def _write(folder: Path, title: str, parts: list[str]) -> None:
-    folder.mkdir(parents=True, exist_ok=True)
-    (folder / "index.html").write_text(plot.page(title, "\n".join(parts)), "utf-8")
+    Raises:
+        UserError: a file names no command (before anything is measured), or a command failed.
+    """
+    commands = []
+    for file in files:
+        said = fronts.read(file).get("command")
+        if said is None:
+            raise UserError(f"{file}: names no command that measures it")
+        commands.append(shlex.split(str(said))[1:])
+    for file, words in zip(files, commands, strict=True):
+        status = bench([*words, "--out", str(file.parent)])
+        if status:
+            raise UserError(f"bench {shlex.join(words)}: ended with {status}")

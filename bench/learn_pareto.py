@@ -76,6 +76,7 @@ def pareto(
     # A part that is timed anew takes the place of what was there; the rest stays.
     rows: list[dict[str, Any]] = json_.loads(file.read_text())["rows"] if only and file.is_file() else []
     result = {
+        "command": f"bench pareto learn --repeats {repeats} --device {device}",
         "machine": describe() | {"device": device, "threads": 1, "torch": torch.__version__},
         "rows": rows,
     }
