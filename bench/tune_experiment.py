@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from bench import machine, plot
+from bench import machine, plot, results
 from learn.statistics import interval
 from synth import config, tune, tune_file
 from synth.errors import UserError
@@ -77,20 +77,20 @@ def experiment(
             "command": f"bench experiment tune --only {name} --budget '{budget}' --probes {probes} "
             f"--checks {checks} --fresh {fresh}",
         }
-        (out / f"{name}.json").write_text(json_.dumps(row, indent=1) + "\n", "utf-8")
-    rows = [
-        json_.loads((out / f"{name}.json").read_text("utf-8"))
-        for name in _SCENES
-        if (out / f"{name}.json").is_file()
-    ]
+        results.keep(out, f"{name}.json", row)
+    rows = write(out)
+    print(json_.dumps(rows) if json else out / "README.md")
+
+
+def write(out: Path) -> list[dict[str, Any]]:
+    """Picture, page and README of the scenes whose data are in `out`; gives those back."""
+    files = [out / f"{name}.json" for name in _SCENES]
+    rows = [json_.loads(file.read_text("utf-8")) for file in files if file.is_file()]
     commands = "; ".join(row["command"] for row in rows)
     title = "Tuning: what each knob does to the force, and what it costs"
     plot.write(panels(rows), out, title, table(rows), rows[0] | {"command": commands})
-    (out / "README.md").write_text(readme(rows), "utf-8")
-    if json:
-        print(json_.dumps(rows))
-    else:
-        print(out / "README.md")
+    results.keep(out, "README.md", readme(rows))
+    return rows
 
 
 def panels(rows: list[dict[str, Any]]) -> list[plot.Panel]:
