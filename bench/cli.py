@@ -334,9 +334,7 @@ def flow(
     truth: Annotated[
         Path | None, typer.Argument(help="True flow: .flo (Middlebury) or .png (KITTI). Empty: not scored.")
     ] = None,
-    backend: Annotated[
-        str, typer.Option("--flow", "--backend", help="Flow estimator, as in a job's flow.backend.")
-    ] = "tvl1",
+    flow: Annotated[str, typer.Option(help="Flow estimator, as in a job's flow.backend.")] = "tvl1",
     glare: Annotated[bool, typer.Option("--glare/--no-glare", help="Mask highlights first.")] = False,
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Write the flow: .flo or .png.")] = None,
     json: Json = False,
@@ -344,7 +342,7 @@ def flow(
     """Flow between any two pictures, scored against a flow file."""
     from bench import flow_pair
 
-    found = flow_pair.score(first, second, truth, backend, glare, out)
+    found = flow_pair.score(first, second, truth, flow, glare, out)
     if found is None:
         typer.echo(f"written to {out}" if out else "nothing asked for: give a truth or --out")
     elif json:
@@ -364,7 +362,7 @@ def live(
     young: Annotated[
         float | None, typer.Option(help="Young's modulus of the tissue [kPa], if known.")
     ] = None,
-    backend: Annotated[str, typer.Option("--flow", "--backend", help="Flow estimator.")] = "tvl1",
+    flow: Annotated[str, typer.Option(help="Flow estimator, as in a job's flow.backend.")] = "tvl1",
     shrink: Annotated[int, typer.Option(min=1, max=8, help="Pictures this many times smaller.")] = 1,
     every: Annotated[bool, typer.Option("--every", help="Work on every frame, however late.")] = False,
     out: Annotated[
@@ -387,7 +385,7 @@ def live(
 
     account = stream.watch(
         video,
-        backend=backend,
+        backend=flow,
         method=method,
         scale_mm_per_px=scale,
         young_kpa=young,
@@ -397,7 +395,7 @@ def live(
     )
     summary = account.summary()
     if out is not None:
-        stream.write(out, summary, backend=backend, shrink=shrink, paced=not every, model=model is not None)
+        stream.write(out, summary, backend=flow, shrink=shrink, paced=not every, model=model is not None)
     if json:
         typer.echo(json_.dumps(summary))
     else:

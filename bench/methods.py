@@ -17,11 +17,16 @@ if TYPE_CHECKING:
 class Model:
     """A model folder of `learn train`. Without a known E it answers for tissue of 1 kPa."""
 
-    def __init__(self, folder: Path) -> None:
-        """Raises UserError if the folder holds no readable model."""
+    def __init__(self, folder: Path, quick: bool = False) -> None:
+        """Loads the network; UserError if it can't be read.
+
+        Args:
+            folder: of the model.
+            quick: spend half a second on a graph that takes a third less a frame.
+        """
         from learn.predict import load
 
-        self.predictor: Predictor = load(folder)
+        self.predictor: Predictor = load(folder, quick=quick)
         self._rest: tuple[Scene, NDArray[np.float64]] | None = None
 
     def described(self) -> dict[str, object]:

@@ -46,7 +46,7 @@ def write_card(folder: Path, card: Card) -> None:
 
 
 def read_card(folder: Path) -> Card:
-    """Raises UserError if there is no model or its config is not ours."""
+    """Raises UserError if there is no model, or its config is damaged or of another version."""
     file = folder / "config.json"
     if not file.is_file():
         raise UserError(f"{folder}: no model here (config.json is missing)")
@@ -56,6 +56,9 @@ def read_card(folder: Path) -> Card:
             raise UserError(f"{file}: not a model of this version")
         return Card(settings=from_dict(tree.pop("settings")), scales=Scales(**tree.pop("scales")), **tree)
     except (ValueError, KeyError, TypeError, AttributeError) as error:
+        _, unknown, key = str(error).partition("got an unexpected keyword argument ")
+        if unknown:  # as dataclasses say it
+            raise UserError(f"{file}: made by another version of this program (no {key} here)") from None
         raise UserError(f"{file}: corrupt model configuration ({error})") from None
 
 

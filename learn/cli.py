@@ -210,7 +210,9 @@ def predict_command(
         Path | None,
         typer.Option(help="A picture, white where the video shows tissue; everywhere if not given."),
     ] = None,
-    backend: Annotated[str, typer.Option(help="Flow estimator for a video, as in a job.")] = "tvl1",
+    flow: Annotated[
+        str, typer.Option(help="Flow estimator for a video, as in a job's flow.backend.")
+    ] = "tvl1",
     threads: Threads = None,
     json: Json = False,
 ) -> None:
@@ -224,7 +226,7 @@ def predict_command(
     set_threads(threads)
     predictor = load_model(model, quick=True)
     peaks = {}
-    for motion in motions(source, input, Filmed(scale, tissue, backend)):
+    for motion in motions(source, input, Filmed(scale, tissue, flow)):
         found = apply(predictor, motion, young)
         out.mkdir(parents=True, exist_ok=True)
         np.savez_compressed(out / f"{motion.name}.npz", **found)

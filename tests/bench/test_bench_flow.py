@@ -183,7 +183,7 @@ def test_live_runs_on_a_video_and_refuses_what_is_none(tmp_path: Path) -> None:
         for picture in (pair.rest, pair.now, pair.rest):
             container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
         container.mux(stream.encode())
-    ran = CliRunner().invoke(app, ["live", str(path), "--backend", "dis", "--every", "--json"])
+    ran = CliRunner().invoke(app, ["live", str(path), "--flow", "dis", "--every", "--json"])
     assert ran.exit_code == 0, ran.output
     assert json.loads(ran.output)["frames"] == 2
     (tmp_path / "no.mp4").write_text("no video")

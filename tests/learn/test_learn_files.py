@@ -127,7 +127,7 @@ def test_a_video_is_followed_and_predicted(model: Path, tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "tissue.png"), marked)
     args = ["predict", str(model), str(tmp_path / "film.mp4"), "-o", str(tmp_path), "--scale", "0.4"]
     done = run(
-        app, [*args, "--tissue", str(tmp_path / "tissue.png"), "--backend", "dis", "--young", "1", "--json"]
+        app, [*args, "--tissue", str(tmp_path / "tissue.png"), "--flow", "dis", "--young", "1", "--json"]
     )
     assert done.exit_code == 0, done.output
     with np.load(tmp_path / "film.npz") as found:

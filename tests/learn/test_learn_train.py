@@ -173,6 +173,9 @@ def test_corrupt_checkpoints(model: Path, tmp_path: Path) -> None:
     with pytest.raises(UserError, match="corrupt model configuration"):
         load_model(broken(model, tmp_path / "c", "config.json", b"{}"))
     config = json.loads((model / "config.json").read_text())
+    newer = {**config, "settings": {**config["settings"], "arch": {**config["settings"]["arch"], "heads": 3}}}
+    with pytest.raises(UserError, match="made by another version of this program"):
+        load_model(broken(model, tmp_path / "e", "config.json", json.dumps(newer).encode()))
     config["settings"]["arch"]["width"] = 8
     with pytest.raises(UserError, match=r"not those of the network in config\.json"):
         load_model(broken(model, tmp_path / "d", "config.json", json.dumps(config).encode()))
