@@ -11,6 +11,7 @@ from typing import Any, Protocol
 from synth import forecast, place
 from synth.child import Attempt
 from synth.folder import Folder, write_whole
+from synth.pace import Pace
 
 _EVERY_S = 2.0
 
@@ -25,7 +26,9 @@ class Account:
     finished: int
     """Sequences that it finished or gave up."""
     left_s: float | None
-    """To the end, at the rate so far; None until a sequence is finished."""
+    """To the end, at the latest sequences' rate; None until a sequence is finished."""
+    cold: bool
+    """Whether only first sequences are finished, which also compile: `left_s` is then too long."""
     step_s: dict[str, float]
     """Seconds that a worker takes for one step (a frame, where a stage has frames) of each stage."""
     frames_per_s: float | None
@@ -50,7 +53,8 @@ class Journal:
         self._folder, self._workers, self._frames, self._told = folder, workers, frames, told
         self._path = folder.state / "progress.json"
         self._started = self._written = time.monotonic()
-        self._total = self._done = self._failed = self._before = 0
+        self._pace = Pace(workers)
+        self._total = self._done = self._before = 0
         self._stored = 0
         self._in_flight: dict[int, list[Any]] = {}
         self._since: dict[int, float] = {}
@@ -77,11 +81,12 @@ class Journal:
             self._stored += forecast.size(place.store(self._folder.root, attempt.index))
         self._in_flight.pop(attempt.index, None)
         self._since.pop(attempt.index, None)
-        if not again:
+        now = time.monotonic()
+        if not again and attempt.kind != "stopped":
             self._done += attempt.kind == "done"
-            self._failed += attempt.kind not in ("done", "stopped")
-        last = self._before + self._done + self._failed == self._total
-        if last or time.monotonic() - self._written > _EVERY_S:
+            self._pace.end(now - self._started)
+        notable = self._pace.ended in (1, self._total - self._before)
+        if notable or now - self._written > _EVERY_S:
             self._tell()
 
     def _leave(self, index: int, now: float) -> None:
@@ -93,13 +98,15 @@ class Journal:
 
     def _tell(self) -> None:
         self._written = time.monotonic()
-        spent, finished = self._written - self._started, self._done + self._failed
-        left = self._total - self._before - finished
+        spent = self._written - self._started
+        left = self._total - self._before - self._pace.ended
+        left_s = self._pace.left_s(left)
         made = Account(
             workers=self._workers,
             seconds=round(spent, 1),
-            finished=finished,
-            left_s=round(spent / finished * left, 1) if finished else None,
+            finished=self._pace.ended,
+            left_s=None if left_s is None else round(left_s, 1),
+            cold=self._pace.cold,
             step_s={name: round(self._spent[name] / self._steps[name], 3) for name in self._spent},
             frames_per_s=round(self._done * self._frames / spent, 3) if self._done else None,
             disk_left=self._stored / self._done * left if self._done else None,

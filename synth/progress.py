@@ -20,12 +20,12 @@ _QUIET_S = 10.0
 
 
 class _Eta(ProgressColumn):
-    """Time spent, and for the whole run the time left, at the rate of this run."""
+    """Time spent, and for the whole run the time left."""
 
     def render(self, task: Task) -> Text:
         spent = clock(task.elapsed or 0.0)
-        left = task.fields.get("left_s")
-        return Text(f"{spent}" + (f", {clock(left)} left" if left is not None else ""), style="cyan")
+        left = task.fields.get("left")
+        return Text(f"{spent}, {left}" if left else spent, style="cyan")
 
 
 class _Progress(Progress):
@@ -52,7 +52,7 @@ class Bars:
         self._whole = self._bars.add_task("sequences", total=None, start=True)
         self._started = self._said = time.monotonic()
         self._total = self._already = self._finished = 0
-        self._rates = ""
+        self._rates = self._left = ""
 
     def __enter__(self) -> Bars:
         if self._live:
@@ -92,23 +92,31 @@ class Bars:
         self._finished += 1
         spent = time.monotonic() - self._started
         done = self._already + self._finished
-        left = spent / self._finished * (self._total - done)
-        self._bars.update(self._whole, completed=done, left_s=left)
+        self._bars.update(self._whole, completed=done)
         quiet = time.monotonic() - self._said < _QUIET_S and done < self._total
         if not self._live and not quiet:
             self._said = time.monotonic()
+            said = ", ".join(filter(None, (f"{clock(spent)} spent", self._left)))
             rest = f"; {self._rates}" if self._rates else ""
-            self._say(f"{done} of {self._total} sequences, {clock(spent)} spent, {clock(left)} left{rest}")
+            self._say(f"{done} of {self._total} sequences, {said}{rest}")
 
     def account(self, account: Account) -> None:
-        self._rates = rates(account)
+        self._rates, self._left = rates(account), remaining(account)
         self._bars.below = self._rates
+        self._bars.update(self._whole, left=self._left)
 
     def _say(self, text: str) -> None:
         if self._live:
             self._bars.console.print(text, highlight=False, markup=False)
         else:
             print(text, file=sys.stderr, flush=True)
+
+
+def remaining(account: Account) -> str:
+    """How long a run will take still: "2:05 min left", "at most 9 s left" while all is cold, or nothing."""
+    if account.left_s is None:
+        return ""
+    return f"{'at most ' if account.cold and account.left_s else ''}{clock(account.left_s)} left"
 
 
 def rates(account: Account) -> str:

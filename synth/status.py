@@ -16,7 +16,7 @@ from synth.errors import UserError
 from synth.folder import Folder
 from synth.forecast import Forecast
 from synth.journal import Account
-from synth.progress import clock, rates
+from synth.progress import clock, rates, remaining
 from synth.store import open_sequence
 
 _PILOT = 10
@@ -36,6 +36,8 @@ class Status:
     """Stage, steps done and steps in all of the sequences being computed."""
     left_s: float | None
     """Time to the end, at the rate of the run at work."""
+    left: str
+    """The same for a person."""
     rates: str
     """How fast the run at work goes, by stage, and the disk that it will take."""
     ahead: Forecast
@@ -63,6 +65,7 @@ def of(root: Path) -> Status:
         running=journal is not None,
         in_flight=journal.in_flight if journal else {},
         left_s=journal.left_s if journal else None,
+        left=remaining(journal) if journal else "",
         rates=rates(journal) if journal else "",
         ahead=forecast.of(job, root, todo, done, [{"cpu_s": sum(stages.values())}] if stages else []),
         disk_free=shutil.disk_usage(root).free,
@@ -78,8 +81,7 @@ def lines(status: Status) -> list[str]:
     if count:
         found.append("  `synth retry` takes the failed ones up again")
     if status.running:
-        left = f", {clock(status.left_s)} left" if status.left_s is not None else ""
-        found.append(f"a run is at work{left}")
+        found.append(f"a run is at work{status.left and ', '}{status.left}")
         if status.rates:
             found.append(f"  {status.rates}")
         found += [
@@ -122,7 +124,7 @@ def _account(folder: Folder) -> Account:
     try:
         return Account(**json.loads((folder.state / "progress.json").read_text("utf-8")))
     except (FileNotFoundError, ValueError, TypeError):  # it has only just begun, or is of another version
-        return Account(0, 0.0, 0, None, {}, None, None, 0, {})
+        return Account(0, 0.0, 0, None, True, {}, None, None, 0, {})
 
 
 def _stages(root: Path, pilot: list[int]) -> dict[str, float]:
