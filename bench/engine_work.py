@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from synth.child import Report
 from synth.job import Job
+from synth.stopwatch import Report
 from synth.store import Writer
 
 

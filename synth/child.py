@@ -11,18 +11,16 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 import synth
+from synth.stopwatch import Report
 
 Kind = Literal["done", "input", "error", "crash", "memory", "stalled", "disk", "stopped"]
 """How an attempt ended: only `done` is good; `input` would end the same way again."""
-
-Report = Callable[[str, int, int], None]
-"""Told what is being done, how many of it are done, how many there are."""
 
 _TICK_S = 0.2
 _LOG_TAIL = 4000
@@ -46,10 +44,11 @@ class Setup:
     job: Mapping[str, Any]
     """The job, JSON-ready, paths resolved."""
     folder: Path
+    """The dataset; like all paths here absolute, for a worker stands elsewhere."""
     logs: Path
     scratch: Path
     """Where a process may leave what it likes."""
-    work: str = "synth.pipeline:render_sequence"
+    work: str
     """`module:function` that computes a sequence: `(job, index, folder, report)`."""
     memory_bytes: int | None = None
     """A process that takes more is ended."""
@@ -90,9 +89,9 @@ class Child:
             json.dumps(
                 {
                     "job": setup.job,
-                    "folder": str(setup.folder.resolve()),
-                    "logs": str(setup.logs.resolve()),
-                    "scratch": str(setup.scratch.resolve()),
+                    "folder": str(setup.folder),
+                    "logs": str(setup.logs),
+                    "scratch": str(setup.scratch),
                     "work": setup.work,
                     "generator": setup.generator,
                 }

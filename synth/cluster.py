@@ -17,10 +17,11 @@ from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
 from synth import slots, versions
-from synth.child import Attempt, Report, Setup
+from synth.child import Attempt, Setup
 from synth.errors import UserError
 from synth.job import Job
 from synth.slots import LocalSlot, Slot, Slots
+from synth.stopwatch import Report
 
 _TOPIC = "sulcus-progress"
 _TICK_S = 0.5

@@ -13,12 +13,13 @@ from pathlib import Path
 from typing import Protocol
 
 from synth import card, croissant, forecast, index, preview, slots
-from synth.child import Attempt, Report, Setup
+from synth.child import Attempt, Setup
 from synth.errors import UserError
 from synth.folder import Folder, claim
 from synth.job import Job
 from synth.journal import Account, Journal
 from synth.slots import Slots
+from synth.stopwatch import Report
 
 _TRIES = 3
 # So many first sequences failing on the job's own account, and none succeeding, condemn the job.
@@ -89,7 +90,7 @@ def run(job: Job, root: Path, options: Options, watcher: Watcher) -> Summary:
     with claim(root, job, mix_versions=options.mix_versions) as folder:
         finished, failures = set(folder.sealed()), folder.failures()
         todo = [k for k in range(job.sequences) if k not in finished and k not in failures]
-        forecast.refuse_if_too_large(forecast.of(job, root, len(todo), sorted(finished), []), root)
+        forecast.refuse_if_too_large(forecast.of(job, root, len(todo), sorted(finished)), root)
         # The journal first: what is said of the run is then said with what has just ended.
         watchers = (Journal(folder, workers, job.frames, watcher), watcher)
         for each in watchers:

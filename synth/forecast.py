@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -35,13 +34,24 @@ class Forecast:
     """Finished sequences that the forecast rests on; 0: on the field table."""
 
 
-def of(job: Job, root: Path, todo: int, done: Sequence[int], rows: Sequence[Mapping[str, Any]]) -> Forecast:
-    """Forecast for `todo` sequences; up to ten finished ones, spread over the dataset, serve as pilot."""
-    pilot = [done[int(k)] for k in np.unique(np.linspace(0, len(done) - 1, 10).astype(int))] if done else []
-    each = np.mean([size(place.store(root, key)) for key in pilot]) if pilot else estimate(job)
-    spent = [float(row["cpu_s"]) for row in rows if isinstance(row.get("cpu_s"), float)]
-    cpu = float(np.mean(spent)) * todo if spent else None
-    return Forecast(todo, float(each) * todo, cpu, len(pilot))
+def of(job: Job, root: Path, todo: int, done: Sequence[int], cpu_s: float | None = None) -> Forecast:
+    """Forecast of what is still to do.
+
+    Args:
+        job: of the dataset.
+        root: its folder.
+        todo: how many sequences.
+        done: indices of the finished ones.
+        cpu_s: processor time of one [s], if it is known.
+    """
+    some = pilot(done)
+    each = np.mean([size(place.store(root, key)) for key in some]) if some else estimate(job)
+    return Forecast(todo, float(each) * todo, None if cpu_s is None else cpu_s * todo, len(some))
+
+
+def pilot(done: Sequence[int]) -> list[int]:
+    """Up to ten of the finished sequences, spread over the dataset, to judge the others by."""
+    return [done[int(k)] for k in np.unique(np.linspace(0, len(done) - 1, 10).astype(int))] if done else []
 
 
 def estimate(job: Job) -> float:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from synth import brain, identity, scenario
-from synth.child import Report
+from synth.brain import Brain
 from synth.fem import mesh, solver, tool
 from synth.fem.mesh import Tets
 from synth.fem.solver import Deformation
@@ -21,7 +23,7 @@ from synth.render import anatomy, camera, video
 from synth.render.anatomy import Surface
 from synth.render.scene import Studio
 from synth.scenario import Scenario
-from synth.stopwatch import Stopwatch
+from synth.stopwatch import Report, Stopwatch
 from synth.store import Writer
 from synth.timeline import Timeline
 
@@ -126,35 +128,45 @@ def render_sequence(job: Job, index: int, folder: Path, report: Report) -> Path:
         scale_mm_per_px=float(still.scale_mm_per_px),
         young_kpa=case.tissue.young_kpa,
         poisson=case.tissue.poisson,
-        mechanics={
-            "law": case.tissue.law,
-            "min_jacobian": motion.min_jacobian.tolist(),
-            "energy_mn_mm": motion.energy.tolist(),
-            "residual": motion.residual.tolist(),
-            "instruments": [
-                {
-                    "kind": gesture.kind,
-                    "force_mn": (motion.by_instrument[:, k] @ rotation.T).tolist(),
-                    "tip_mm": motion.tip[:, 2 * k : 2 * k + 2].tolist(),
-                    "shaft": motion.shaft[:, 2 * k].tolist(),
-                }
-                for k, gesture in enumerate(case.gestures)
-            ],
-        },
+        mechanics=_mechanics(case, motion, rotation),
         variant=studio.variant,
         timings=watch.report(),
     )
 
 
+def _mechanics(case: Scenario, motion: Deformation, rotation: NDArray[np.float64]) -> dict[str, Any]:
+    return {
+        "law": case.tissue.law,
+        "min_jacobian": motion.min_jacobian.tolist(),
+        "energy_mn_mm": motion.energy.tolist(),
+        "residual": motion.residual.tolist(),
+        "instruments": [
+            {
+                "kind": gesture.kind,
+                "force_mn": (motion.by_instrument[:, k] @ rotation.T).tolist(),
+                "tip_mm": motion.tip[:, 2 * k : 2 * k + 2].tolist(),
+                "shaft": motion.shaft[:, 2 * k].tolist(),
+            }
+            for k, gesture in enumerate(case.gestures)
+        ],
+    }
+
+
 def build(job: Job, case: Scenario) -> tuple[Surface, Tets]:
     """The fine surface of a scenario and the volume under it, finest where its contacts are."""
     focus = [place for gesture in case.gestures for place in tool.focus(gesture)]
-    if job.anatomy.mesh is None:
-        surface = anatomy.procedural(case.relief, job.anatomy)
+    surface, whole = cortex(job, case)
+    if whole is None:
         return surface, mesh.block(job.anatomy, job.fem.tets, job.fem.order, focus)
-    whole = brain.load(job.anatomy.mesh, job.anatomy.craniotomy)
-    surface = anatomy.from_brain(whole.vertices, whole.faces, case.relief, job.anatomy)
     return surface, mesh.from_brain(whole, job.anatomy, job.fem.tets, job.fem.order, focus)
+
+
+def cortex(job: Job, case: Scenario) -> tuple[Surface, Brain | None]:
+    """The fine surface of a scenario, and the user's brain that it is a part of, if it is."""
+    if job.anatomy.mesh is None:
+        return anatomy.procedural(case.relief, job.anatomy), None
+    whole = brain.load(job.anatomy.mesh, job.anatomy.craniotomy)
+    return anatomy.from_brain(whole.vertices, whole.faces, case.relief, job.anatomy), whole
 
 
 def move(job: Job, case: Scenario, surface: Surface, tets: Tets) -> Deformation:

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from synth import brain, forecast, scenario
+from synth import forecast, pipeline, scenario
 from synth.fem.tool import Gesture
 from synth.job import Job
-from synth.render import anatomy, camera
+from synth.render import camera
 from synth.render.anatomy import Surface
 from synth.render.scene import Studio
 from synth.stopwatch import Stopwatch
@@ -67,11 +67,7 @@ def make(job: Job, count: int) -> Sheet:
 def _frame(job: Job, index: int, repeats: int) -> tuple[NDArray[np.uint8], float]:
     """A scenario's picture and the CPU time [s] of the last of `repeats`."""
     case = scenario.draw(job, index)
-    if job.anatomy.mesh is None:
-        surface = anatomy.procedural(case.relief, job.anatomy)
-    else:
-        whole = brain.load(job.anatomy.mesh, job.anatomy.craniotomy)
-        surface = anatomy.from_brain(whole.vertices, whole.faces, case.relief, job.anatomy)
+    surface, _ = pipeline.cortex(job, case)
     view, gestures = camera.place(case.view, job.render), case.gestures
     studio = Studio(surface, case.look, view, job, [gesture.kind for gesture in gestures])
     poised = [_poised(gesture, surface) for gesture in gestures]

@@ -12,9 +12,10 @@ from pathlib import Path
 from typing import Protocol
 
 from synth import llvm
-from synth.child import Attempt, Child, Report, Setup
+from synth.child import Attempt, Child, Setup
 from synth.errors import UserError
 from synth.job import Job
+from synth.stopwatch import Report
 
 # A process that has computed so many is replaced: libraries leak a little with every sequence.
 _RECYCLE = 16

@@ -19,8 +19,6 @@ from synth.journal import Account
 from synth.progress import clock, rates, remaining
 from synth.store import open_sequence
 
-_PILOT = 10
-
 
 @dataclass(frozen=True)
 class Status:
@@ -56,8 +54,7 @@ def of(root: Path) -> Status:
     failures = folder.failures()
     todo = max(0, job.sequences - len(done) - len(set(failures) - set(done)))
     journal = _journal(folder)
-    pilot = [done[k * len(done) // _PILOT] for k in range(_PILOT)] if len(done) > _PILOT else done
-    stages = _stages(root, pilot)
+    stages = _stages(root, forecast.pilot(done))
     return Status(
         total=job.sequences,
         done=len(done),
@@ -67,7 +64,7 @@ def of(root: Path) -> Status:
         left_s=journal.left_s if journal else None,
         left=remaining(journal) if journal else "",
         rates=rates(journal) if journal else "",
-        ahead=forecast.of(job, root, todo, done, [{"cpu_s": sum(stages.values())}] if stages else []),
+        ahead=forecast.of(job, root, todo, done, sum(stages.values()) if stages else None),
         disk_free=shutil.disk_usage(root).free,
         stages_cpu_s=stages,
     )

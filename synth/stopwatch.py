@@ -5,8 +5,11 @@ from __future__ import annotations
 import resource
 import time
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+
+Report = Callable[[str, int, int], None]
+"""Told which stage a sequence is in, how many of its steps are done, and how many there are."""
 
 
 class Stopwatch:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -69,7 +69,7 @@ class Report:
         return {**asdict(self), "good": self.good}
 
 
-def run(root: Path, *, fast: bool = False, report: Callable[[int, int], None] | None = None) -> Report:
+def run(root: Path, *, fast: bool = False) -> Report:
     """Checks every sequence and the dataset around them.
 
     Fast: some frames of some sequences, and no checksums.
@@ -88,9 +88,7 @@ def run(root: Path, *, fast: bool = False, report: Callable[[int, int], None] | 
     chosen = sealed
     if fast and len(sealed) > _FAST_SEQUENCES:
         chosen = [sealed[k] for k in np.linspace(0, len(sealed) - 1, _FAST_SEQUENCES).astype(int)]
-    for position, key in enumerate(chosen):
-        if report is not None:
-            report(position, len(chosen))
+    for key in chosen:
         _sequence(place.store(folder.root, key), described["identity"], checks, fast)
     return Report(str(root), len(chosen), fast, list(checks.values()))
 

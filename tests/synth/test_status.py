@@ -50,7 +50,7 @@ def test_forecast_rests_on_finished_sequences(tmp_path: Path) -> None:
     root = tmp_path / "out"
     engine.run(JOB, root, options("sequence"), Silent())
     whole = sum(forecast.size(path) for path in root.glob("*.zarr"))
-    ahead = forecast.of(JOB, root, 600, list(range(6)), [{"cpu_s": 2.0}])
+    ahead = forecast.of(JOB, root, 600, list(range(6)), 2.0)
     assert ahead.bytes == pytest.approx(100 * whole, rel=1e-6)
     assert (ahead.cpu_s, ahead.pilot) == (1200.0, 6)
 
