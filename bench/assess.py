@@ -17,6 +17,7 @@ from bench import bootstrap, score, sensor, sync
 from bench.beside import Flow
 from bench.bootstrap import Interval
 from bench.follow import Followed, Method, Progress, follow
+from bench.follow import Settings as Settings
 from bench.recording import Force, Recording
 from bench.scale import Scale
 from bench.sync import Offset
@@ -25,18 +26,6 @@ from synth.folder import write_whole
 
 Curve = NDArray[np.float64]
 _SEED = 0  # of the bootstrap: the same recording gives the same intervals
-
-
-@dataclass(frozen=True)
-class Settings:
-    """What decides a run of `bench score` besides the recording and the model."""
-
-    backend: str = "tvl1"
-    """Flow estimator."""
-    shrink: int = 0
-    """Flow is computed on pictures this many times smaller; 0: so that they keep 320 columns."""
-    rate_hz: float | None = 10.0
-    """At most so many frames a second are looked at; None: all."""
 
 
 @dataclass(frozen=True)
@@ -118,9 +107,7 @@ def assess(
         recording,
         methods,
         scale.mm_per_px,
-        backend=settings.backend,
-        shrink=settings.shrink,
-        rate_hz=settings.rate_hz,
+        settings,
         pictured=main,
         flow=flow,
         progress=progress,

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json as json_
 import shlex
 import sys
-from collections.abc import Callable
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -244,7 +243,7 @@ def make_exvivo(
     written = []
     for index in range(first, first + count):
         with counting(f"recording {index}", int(seconds * fps)) as progress:
-            done = exvivo.make(plan, index, out / f"{index:03d}", _first_of_two(progress))
+            done = exvivo.make(plan, index, out / f"{index:03d}", progress)
         written.append(str(done))
     print(json_.dumps({"recordings": written}) if json else "\n".join(written))
 
@@ -263,10 +262,6 @@ def _pairs(option: str, words: list[str] | None, form: str) -> dict[str, str]:
 def _typed() -> str:
     """The command as it was typed, for a README."""
     return shlex.join(["bench", *sys.argv[1:]])
-
-
-def _first_of_two(tell: Callable[[int], None]) -> Callable[[int, int], None]:
-    return lambda done, of: tell(done)
 
 
 def _say(result: Result, folder: Path, json: bool) -> None:

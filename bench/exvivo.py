@@ -7,7 +7,6 @@ drift and noise. Written in the layout of a real recording, so that the same cod
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,6 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from bench import recorded, video
+from bench.follow import Progress
 from synth import job as jobs
 from synth import scenario
 from synth.errors import UserError
@@ -26,7 +26,6 @@ from synth.render import anatomy, camera
 from synth.render.scene import Studio
 
 Floats = NDArray[np.float64]
-Progress = Callable[[int, int], None]
 
 _GESTURES = 3
 _LEVELS = 9
@@ -92,7 +91,7 @@ def job_of(plan: Plan) -> jobs.Job:
     )  # fmt: skip
 
 
-def make(plan: Plan, index: int, folder: Path, progress: Progress = lambda done, of: None) -> Path:
+def make(plan: Plan, index: int, folder: Path, progress: Progress = lambda done: None) -> Path:
     """Renders recording `index` of a plan into `folder`.
 
     Raises:
@@ -121,13 +120,13 @@ def _fill(plan: Plan, index: int, part: Path, progress: Progress) -> None:
     studio = Studio(surface, case.look, view, job)
     pictures: list[NDArray[np.uint8]] = []
     for k, time in enumerate(times):
-        progress(k, len(times))
         at = int(np.searchsorted(course.time_s, time).clip(0, len(course.time_s) - 1))
         motion, gesture = motions[course.gesture[at]], gestures[course.gesture[at]]
         vertices, tips, shafts = _pose(motion, gesture, course, at, rng)
         shot = studio.frame(vertices, tips, shafts, int(rng.integers(2**31)))
         pictures.append(shot.rgb)
         cv2.imwrite(str(part / "masks" / f"{k:06d}.png"), shot.tool.astype(np.uint8) * 255)
+        progress(k + 1)
     video.write_video(part / "video.mp4", iter(pictures), times, crf=int(rng.integers(18, 25)))
     cv2.imwrite(str(part / "tissue.png"), studio.still.tissue.astype(np.uint8) * 255)
     force = np.stack([g.force_mn * np.asarray(g.direction) for g in gestures])[course.gesture]

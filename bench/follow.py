@@ -104,14 +104,24 @@ class Followed:
     timings: dict[str, dict[str, float] | float] = field(default_factory=dict)
 
 
+@dataclass(frozen=True)
+class Settings:
+    """What decides a run of `bench score` besides the recording and the model."""
+
+    backend: str = "tvl1"
+    """Flow estimator."""
+    shrink: int = 0
+    """Flow is computed on pictures this many times smaller; 0: the most that leaves `WIDTH_KEPT` columns."""
+    rate_hz: float | None = 10.0
+    """At most so many frames a second are looked at; None: all."""
+
+
 def follow(
     recording: Recording,
     methods: Mapping[str, Method],
     scale_mm_per_px: float,
+    settings: Settings,
     *,
-    backend: str = "tvl1",
-    shrink: int = 1,
-    rate_hz: float | None = None,
     pictured: str | None = None,
     flow: Flow | None = None,
     progress: Progress = lambda done: None,
@@ -122,10 +132,7 @@ def follow(
         recording: the opened recording.
         methods: by name.
         scale_mm_per_px: of the recording's own pixels.
-        backend: flow estimator.
-        shrink: flow is computed on pictures this many times smaller; 0: the most that leaves them
-            `WIDTH_KEPT` columns.
-        rate_hz: at most so many frames a second are looked at; None: all.
+        settings: of this run.
         pictured: the method whose force map goes into the snapshots.
         flow: where it is computed, closed by the caller; None: here. Elsewhere, it is on its way while the
             methods answer for the frame before.
@@ -134,10 +141,8 @@ def follow(
     Raises:
         UserError: unreadable video, no frame with a time, rest frame beyond the end, masks of another size.
     """
-    watch, out = Stopwatch(), Followed(force_mn={name: [] for name in methods})
-    walker = _Walker(
-        recording, methods, scale_mm_per_px, backend, shrink, rate_hz, pictured, out, watch, flow or Here()
-    )
+    walker = _Walker(recording, methods, scale_mm_per_px, settings, pictured, flow or Here())
+    watch, out = walker.watch, walker.out
     frames = recording.frames()
     seen = 0
     while True:
@@ -170,19 +175,16 @@ class _Walker:
         recording: Recording,
         methods: Mapping[str, Method],
         scale: float,
-        backend: str,
-        shrink: int,
-        rate_hz: float | None,
+        settings: Settings,
         pictured: str | None,
-        out: Followed,
-        watch: Stopwatch,
         flow: Flow,
     ) -> None:
-        self.recording, self.methods, self.out, self.watch = recording, methods, out, watch
-        self.backend, self.shrink, self.pictured = backend, 0, pictured
-        self.scale = scale
-        if shrink:
-            self._shrink_by(shrink)
+        self.recording, self.methods, self.pictured = recording, methods, pictured
+        self.out, self.watch = Followed(force_mn={name: [] for name in methods}), Stopwatch()
+        self.backend, self.shrink, self.scale = settings.backend, 0, scale
+        rate_hz = settings.rate_hz
+        if settings.shrink:
+            self._shrink_by(settings.shrink)
         self.left_out = {
             "before the rest frame": 0,
             "without a time": 0,

@@ -18,7 +18,7 @@ from bench import flow_files, live, plot
 from bench.cli import app
 from bench.flow_measure import MeanInpainting, against, divergence, measure
 from bench.flow_scenes import CLEAN, Recipe, Stage, inverse, pairs, pull_field
-from bench.follow import Answer, Scene, follow
+from bench.follow import Answer, Scene, Settings, follow
 from bench.methods import Model
 from bench.recording import open_recording
 from bench.video import Picture, write_video
@@ -229,7 +229,7 @@ def test_live_answers_with_the_forces_that_scoring_finds(tmp_path: Path, model: 
     streamed: list[live.Frame] = []
     live.watch(folder / "video.mp4", method=Model(model), scale_mm_per_px=0.3, young_kpa=1.0, paced=False,
                told=streamed.append)  # fmt: skip
-    followed = follow(open_recording(folder), {"model": Model(model)}, 0.3)
+    followed = follow(open_recording(folder), {"model": Model(model)}, 0.3, Settings(shrink=1, rate_hz=None))
     scored = [float(np.linalg.norm(force)) for force in followed.force_mn["model"][1:]]
     assert min(scored) > 0
     # The stream has looked at the rest frame twice and so starts its first flow warm; what differs is a share
@@ -251,6 +251,6 @@ def test_scoring_without_masks_leaves_the_instrument_out(tmp_path: Path) -> None
         trust.append(confidence)
         return Answer(np.zeros(3))
 
-    follow(open_recording(folder), {"none": method}, 0.3, backend="dis")
+    follow(open_recording(folder), {"none": method}, 0.3, Settings("dis", shrink=1, rate_hz=None))
     assert trust[1][pair.hidden].mean() < 0.3
     assert trust[1][~pair.hidden & pair.inside].mean() > 0.6

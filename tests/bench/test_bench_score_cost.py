@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from bench import score_cost
-from bench.follow import follow
+from bench.follow import Settings, follow
 from bench.recording import open_recording
 
 
@@ -16,7 +16,7 @@ def test_the_bump_moves_as_the_sensor_says(tmp_path: Path) -> None:
     score_cost.record(tmp_path / "rec", 3.0, 10.0, (128, 96), np.random.default_rng(0))
     recording = open_recording(tmp_path / "rec")
     assert recording.expected_frames() == 30
-    done = follow(recording, {}, 35 / 128, backend="dis")
+    done = follow(recording, {}, 35 / 128, Settings("dis", shrink=1, rate_hz=None))
     # Still for half a second, then away, at the peak after a quarter of the period, then back.
     speed = np.array(done.speed)
     assert speed[:5].max() < 0.1 * speed[5:].max()
