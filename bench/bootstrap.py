@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -93,28 +93,24 @@ def difference(sensor: Curve, first: Curve, second: Curve, rng: np.random.Genera
     return _interval(weights @ gap / len(gap))
 
 
-def over_groups(
-    values: Sequence[float], groups: Sequence[str], rng: np.random.Generator, resamples: int = RESAMPLES
-) -> Interval:
+def over_groups(values: Sequence[float], groups: Sequence[str], rng: np.random.Generator) -> Interval:
     """Interval of the mean over recordings, whole groups (specimens) being resampled.
 
     Args:
         values: one a recording; NaN are left out.
         groups: the specimen of each.
+        rng: source of the resamples.
     """
     by: dict[str, list[float]] = {}
     for value, group in zip(values, groups, strict=True):
         if np.isfinite(value):
             by.setdefault(group, []).append(value)
-    return _interval(group_means(by, rng, resamples)) if len(by) > 1 else (float("nan"), float("nan"))
-
-
-def group_means(by: Mapping[str, Sequence[float]], rng: np.random.Generator, resamples: int) -> Curve:
-    """Means over all values of resampled groups, (resamples,)."""
+    if len(by) < 2:
+        return (float("nan"), float("nan"))
     sums = np.array([float(np.sum(v)) for v in by.values()])
     sizes = np.array([float(len(v)) for v in by.values()])
-    picks = rng.integers(0, len(sums), (resamples, len(sums)))
-    return np.asarray(sums[picks].sum(axis=1) / sizes[picks].sum(axis=1), np.float64)
+    picks = rng.integers(0, len(sums), (RESAMPLES, len(sums)))
+    return _interval(sums[picks].sum(axis=1) / sizes[picks].sum(axis=1))
 
 
 def _weights(x: Curve, y: Curve, rng: np.random.Generator) -> NDArray[np.float64]:

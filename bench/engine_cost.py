@@ -12,7 +12,7 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from bench import machine
+from bench import machine, results
 from synth import forecast
 from synth.errors import UserError
 from synth.store import Dataset
@@ -36,8 +36,7 @@ def cost(
     """Says what so many frames take in CPU-hours, disk and memory, at the rates of a rendered dataset."""
     found = {**rates(dataset, length), "machine": machine.describe()}
     found["planned"] = plan(found, frames, length)
-    out.mkdir(parents=True, exist_ok=True)
-    (out / "cost.json").write_text(json_.dumps(found, indent=1) + "\n")
+    results.keep(out, "cost.json", found)
     text = tables(found)
     if page is not None:
         whole = page.read_text("utf-8")

@@ -15,7 +15,7 @@ import numpy as np
 import typer
 import zarr
 
-from bench import machine
+from bench import machine, results
 from synth import verify
 from synth.folder import Folder
 from synth.store import Dataset
@@ -59,8 +59,7 @@ def damage(
             cases.append(Case(kind, what, changed, found))
             shutil.rmtree(copy)
     result = summary(cases, seed)
-    out.mkdir(parents=True, exist_ok=True)
-    (out / "damage.json").write_text(json_.dumps(result, indent=1) + "\n")
+    results.keep(out, "damage.json", result)
     if json:
         print(json_.dumps(result))
     else:

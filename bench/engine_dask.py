@@ -18,7 +18,7 @@ from typing import Annotated
 
 import typer
 
-from bench import machine
+from bench import machine, results
 from synth import engine
 from synth.job import Job
 from synth.progress import Bars
@@ -60,8 +60,7 @@ def dask(
         "hash_on_one_machine": here.content_hash,
         "machine": machine.describe(),
     }
-    out.mkdir(parents=True, exist_ok=True)
-    (out / "dask.json").write_text(json_.dumps(result, indent=1) + "\n")
+    results.keep(out, "dask.json", result)
     equal = on_cluster.content_hash == here.content_hash
     text = f"{on_cluster.done} of {sequences} done, one worker killed: {killed}; equal = {equal}"
     print(json_.dumps(result) if json else text)

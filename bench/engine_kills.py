@@ -16,7 +16,7 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from bench import machine
+from bench import machine, results
 from synth import index, verify
 from synth.folder import Folder
 
@@ -95,8 +95,7 @@ def kills(
             "machine": machine.describe(),
         }
     result["equal"] = result["hash_after_kills"] == result["hash_undisturbed"]
-    out.mkdir(parents=True, exist_ok=True)
-    (out / "kills.json").write_text(json_.dumps(result, indent=1) + "\n")
+    results.keep(out, "kills.json", result)
     print(json_.dumps(result) if json else f"{sum(victims.values())} SIGKILLs: equal = {result['equal']}")
     if not (result["equal"] and result["checksums_good"] and not result["leftovers"]):
         raise typer.Exit(1)

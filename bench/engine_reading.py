@@ -11,7 +11,7 @@ import numpy as np
 import typer
 import zarr
 
-from bench import machine
+from bench import machine, results
 from synth.frames import Frames
 from synth.store import Dataset
 
@@ -54,8 +54,7 @@ def reading(
         "seed": seed,
         "machine": machine.describe(),
     }
-    out.mkdir(parents=True, exist_ok=True)
-    (out / "reading.json").write_text(json_.dumps(result, indent=1) + "\n")
+    results.keep(out, "reading.json", result)
     if json:
         print(json_.dumps(result))
         return

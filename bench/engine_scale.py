@@ -12,7 +12,7 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from bench import machine
+from bench import machine, results
 from synth import index
 from synth.folder import write_whole
 from synth.job import Job
@@ -44,8 +44,7 @@ def scale(
         simulate(root, sequences, np.random.default_rng(seed))
         found = {name: _timed(name, root) for name in ("status", "report")}
     result = {"sequences": sequences, **found, "seed": seed, "machine": machine.describe()}
-    out.mkdir(parents=True, exist_ok=True)
-    (out / "scale.json").write_text(json_.dumps(result, indent=1) + "\n")
+    results.keep(out, "scale.json", result)
     if json:
         print(json_.dumps(result))
     else:

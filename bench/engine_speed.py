@@ -13,7 +13,7 @@ from typing import Annotated, Any
 
 import typer
 
-from bench import machine
+from bench import machine, results
 from bench.engine_trouble import timed
 from synth import config, engine, slots
 from synth.progress import Bars
@@ -45,8 +45,7 @@ def speed(
             "load_before": round(load, 2),
         }
     result["machine"] = machine.describe()
-    out.mkdir(parents=True, exist_ok=True)
-    (out / "speed.json").write_text(json_.dumps(result, indent=1) + "\n")
+    results.keep(out, "speed.json", result)
     print(json_.dumps(result, indent=None if json else 1))
 
 

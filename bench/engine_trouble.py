@@ -10,7 +10,7 @@ from typing import Annotated
 
 import typer
 
-from bench import machine
+from bench import machine, results
 from synth import engine
 from synth.engine import Options, Summary
 from synth.job import Job
@@ -43,8 +43,7 @@ def trouble(
         "ratio": round(bad_s / good_s, 3),
         "machine": machine.describe(),
     }
-    out.mkdir(parents=True, exist_ok=True)
-    (out / "trouble.json").write_text(json_.dumps(result, indent=1) + "\n")
+    results.keep(out, "trouble.json", result)
     text = f"{bad.done} done, {len(bad.failed)} failed, {result['ratio']} times the time"
     print(json_.dumps(result) if json else text)
     if good.done != sequences or bad.done != sequences - 2:

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from bench import fem_case, fem_cost, machine, plot
+from bench import fem_case, fem_cost, machine, plot, results
 from synth.fem.equilibrium import InvertedElement, NoEquilibrium
 from synth.fem.laws import NUMBER
 from synth.job import Fem
@@ -49,8 +49,7 @@ def pareto(
         "sequence": whole,
     }
     if out is not None:
-        out.mkdir(parents=True, exist_ok=True)
-        (out / "pareto.json").write_text(json_.dumps(found, indent=1) + "\n", "utf-8")
+        results.keep(out, "pareto.json", found)
         everything = [*rows, *gestures, *whole]
         plot.write(panels(found), out, "Physics: error against cost", everything, found)
     if json:

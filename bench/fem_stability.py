@@ -15,7 +15,7 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
-from bench import fem_case, machine, plot
+from bench import fem_case, machine, plot, results
 from synth import job
 from synth.errors import UserError
 from synth.fem import equilibrium, mesh, motion, skin, solver, tool
@@ -62,8 +62,7 @@ def stability(
         "random_scenes": random,
     }
     if out is not None:
-        out.mkdir(parents=True, exist_ok=True)
-        (out / "stability.json").write_text(json_.dumps(found, indent=1) + "\n", "utf-8")
+        results.keep(out, "stability.json", found)
         plot.write(panels(found), out, "Physics: where it breaks", rows, found)
     if json:
         print(json_.dumps(found))

@@ -12,7 +12,7 @@ import trimesh
 import typer
 from numpy.typing import NDArray
 
-from bench import machine
+from bench import machine, results
 from synth import brain, job
 from synth.fem import mesh, skin, tool, winding
 from synth.fem.element import bary_slope, quality
@@ -43,8 +43,7 @@ def surface(
         "machine": machine.describe(),
     } | measure(file, outwards, [int(n) for n in tets.split(",")], refined)
     if out is not None:
-        out.mkdir(parents=True, exist_ok=True)
-        (out / f"{file.stem}.json").write_text(json_.dumps(found, indent=1) + "\n", "utf-8")
+        results.keep(out, f"{file.stem}.json", found)
     if json:
         print(json_.dumps(found))
         return

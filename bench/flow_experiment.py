@@ -17,7 +17,7 @@ import numpy as np
 import torch
 import typer
 
-from bench import flow_rendered, machine
+from bench import flow_rendered, machine, results
 from bench.flow_measure import Error, MeanInpainting, against, average, epe, measure
 from bench.flow_scenes import CLEAN, Flags, Pair, Recipe, Rgb, Stage, pairs
 from synth.errors import UserError
@@ -100,8 +100,8 @@ def experiment(
         rows = [asdict(row) | {"reached": row.reached} for row in parts[part]()]
         command = f"bench experiment flow --only {part} --count {count} --frames {frames} --seed {seed}"
         record[part] = {"command": command, "rows": rows}
-        path.write_text(json_.dumps(record, indent=1) + "\n")
-        (out / "results.md").write_text(_table(record))
+        results.keep(out, "results.json", record)
+        results.keep(out, "results.md", _table(record))
         if not json:
             for row in rows:
                 typer.echo(_line(row))

@@ -11,7 +11,7 @@ import cv2
 import torch
 import typer
 
-from bench import machine, plot
+from bench import machine, plot, results
 from bench.flow_measure import measure
 from bench.flow_scenes import Recipe, pairs
 from synth.flow.estimator import Estimator
@@ -53,7 +53,7 @@ def pareto(
         "machine": machine.describe() | {"torch": torch.__version__, "opencv": cv2.__version__},
         "rows": rows,
     }
-    (out / "pareto.json").write_text(json_.dumps(record, indent=1) + "\n")
+    results.keep(out, "pareto.json", record)
     shown = [{key: value for key, value in row.items() if key != "settings"} for row in rows]
     plot.write(panels(record), out, "Flow: error against time", shown, record)
     if json:

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 import typer
 
-from bench import machine, plot
+from bench import machine, plot, results
 from bench.flow_measure import epe
 from bench.flow_scenes import CLEAN, Flags, Floats, Pair, Recipe, pairs
 from synth.flow import confidence
@@ -84,7 +84,7 @@ def stability(
         "flag": {name: _flag([p for p in points if p.estimator == name]) for name in estimators},
         "points": [asdict(point) for point in points],
     }
-    (out / "stability.json").write_text(json_.dumps(record, indent=1) + "\n")
+    results.keep(out, "stability.json", record)
     plot.write(panels(record), out, "Flow: where it breaks", found=record)
     typer.echo(json_.dumps(record if json else {k: record[k] for k in list(record)[2:5]}))
 

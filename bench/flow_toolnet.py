@@ -20,7 +20,7 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor
 
-from bench import flow_toolscenes
+from bench import flow_toolscenes, results
 from bench.flow_toolscenes import Frame
 from synth.flow import mask, toolnet
 
@@ -56,7 +56,7 @@ def train(scenes: int, out: Path, steps: int, seed: int) -> dict[str, float | in
         "parameters": sum(p.numel() for p in net.parameters()),
         "torch": torch.__version__,
     }
-    (out / "toolnet.json").write_text(json.dumps(card, indent=1) + "\n")
+    results.keep(out, "toolnet.json", card)
     return card
 
 

@@ -13,7 +13,7 @@ from typing import Annotated
 
 import typer
 
-from bench import machine
+from bench import machine, results
 from synth.errors import UserError
 
 Steps = Sequence[tuple[str, Sequence[str]]]
@@ -96,5 +96,5 @@ def run(steps: Steps, out: Path, limit_s: float) -> list[Outcome]:
         found.append(Outcome(name, "python " + " ".join(arguments), code, spent))
         print(f"{name}: {'good' if code == 0 else f'exit code {code}'}, {spent:.1f} s", file=sys.stderr)
         kept = {"machine": machine.describe(), "steps": [asdict(outcome) for outcome in found]}
-        (out / "gpu.json").write_text(json_.dumps(kept, indent=1) + "\n", "utf-8")
+        results.keep(out, "gpu.json", kept)
     return found

@@ -6,7 +6,6 @@ dropped, as it would be beside the table. Mask, tracker and model are those that
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
@@ -15,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from bench import machine
+from bench import machine, results
 from bench.follow import Method, Scene, smaller
 from bench.video import Picture, from_video
 from synth.errors import UserError
@@ -147,7 +146,7 @@ def write(out: Path, summary: dict[str, float | int], **how: str | int | bool) -
     """`live.json`: the summary, how the stream was run, and the machine."""
     out.mkdir(parents=True, exist_ok=True)
     record = {"command": "bench live", **how, "machine": machine.describe(), **summary}
-    (out / "live.json").write_text(json.dumps(record, indent=1) + "\n", "utf-8")
+    results.keep(out, "live.json", record)
 
 
 def _interval(stamp: float, first_s: float, index: int) -> float:

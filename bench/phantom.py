@@ -14,7 +14,8 @@ def texture(height: int, width: int, rng: np.random.Generator) -> Rgb:
     noise = rng.normal(size=(height, width)).astype(np.float32)
     fine = cv2.GaussianBlur(noise, (0, 0), 1.5) - cv2.GaussianBlur(noise, (0, 0), 6)
     grey = 110 + 45 * fine / fine.std()
-    return np.clip(np.stack([grey * 1.1, grey * 0.7, grey * 0.6], axis=-1), 0, 210).astype(np.uint8)
+    rgb = np.stack([grey * 1.1, grey * 0.7, grey * 0.6], axis=-1)
+    return np.asarray(np.clip(rgb, 0, 210), np.uint8)
 
 
 def pushed(rest: Rgb, peak_px: float) -> Rgb:

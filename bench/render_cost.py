@@ -16,7 +16,7 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from bench import machine
+from bench import machine, results
 from bench.render_case import Case, case
 from synth.job import Job
 
@@ -51,9 +51,8 @@ def experiment(
         found |= {"variant": variant, "spp": spp, "seed": seed, "machine": machine.describe()}
         measured[asked.value] = found
         if out is not None:
-            out.mkdir(parents=True, exist_ok=True)
             name = f"{asked.value}.json" if variant == "auto" else f"{asked.value}-{variant}.json"
-            (out / name).write_text(json_.dumps(found, indent=1) + "\n", "utf-8")
+            results.keep(out, name, found)
     if json:
         print(json_.dumps(measured))
     else:

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 import typer
 
-from bench import machine
+from bench import machine, results
 from bench.render_case import Case, case
 from synth.errors import UserError
 from synth.job import Job
@@ -44,8 +44,7 @@ def cycles(
         rows += _cycles(ours, Path(folder), python, spp, inside)
     found = {"seed": seed, "rows": rows, "ratio_at_equal_noise": ratio(rows), "machine": machine.describe()}
     if out is not None:
-        out.mkdir(parents=True, exist_ok=True)
-        (out / "cycles.json").write_text(json_.dumps(found, indent=1) + "\n", "utf-8")
+        results.keep(out, "cycles.json", found)
     if json:
         print(json_.dumps(found))
     else:

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from bench import machine
+from bench import machine, results
 from bench.render_case import case
 from synth.job import Job
 from synth.render import instrument, truth
@@ -31,8 +31,7 @@ def throughput(
     rows = [measure(variant, paths, frames, seed) for paths in spp]
     found = {"variant": variant, "seed": seed, "rows": rows, "machine": machine.describe()}
     if out is not None:
-        out.mkdir(parents=True, exist_ok=True)
-        (out / "throughput.json").write_text(json_.dumps(found, indent=1) + "\n", "utf-8")
+        results.keep(out, "throughput.json", found)
     if json:
         print(json_.dumps(found))
     else:

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import typer
 
-from bench import machine, plot
+from bench import machine, plot, results
 from bench.render_case import Case, case
 from synth.job import Job, Render
 from synth.render import instrument
@@ -61,8 +61,7 @@ def pareto(
         "rows": rows,
     }
     if out is not None:
-        out.mkdir(parents=True, exist_ok=True)
-        (out / "pareto.json").write_text(json_.dumps(found, indent=1) + "\n", "utf-8")
+        results.keep(out, "pareto.json", found)
         plot.write(panels(found), out, "Rendering: flow error and noise against time", rows, found)
     if json:
         print(json_.dumps(found))

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import typer
 
-from bench import machine, realism
+from bench import machine, realism, results
 from bench.render_case import case
 from synth.errors import UserError
 from synth.job import Family, Job
@@ -62,8 +62,7 @@ def realism_figures(
         "machine": machine.describe(),
     }
     if out is not None:
-        out.mkdir(parents=True, exist_ok=True)
-        (out / "realism.json").write_text(json_.dumps(found, indent=1) + "\n", "utf-8")
+        results.keep(out, "realism.json", found)
         cv2.imwrite(str(out / "sheet.jpg"), _sheet(pictures)[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 88])
     if beside is not None:
         cv2.imwrite(str(beside), _beside(pictures, _scaled(photo, width_mm / pixel))[..., ::-1])

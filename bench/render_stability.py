@@ -28,6 +28,7 @@ from synth.render.sway import Sway
 from synth.render.truth import still
 
 _SMALL = {"size": (160, 120)}
+_LIFT_MM = 2.0
 
 
 def stability(
@@ -71,14 +72,14 @@ def stability(
         raise typer.Exit(1)
 
 
-def checked(ours: Case, lift: float = 2.0, **changes: Any) -> dict[str, Any]:
+def checked(ours: Case, **changes: Any) -> dict[str, Any]:
     """Renders one frame and holds its labels against OpenCV's projection of the same material points.
 
     Raises:
         AssertionError: an array has a value that is not finite, or a mask contradicts another.
     """
-    moved = changes.get("vertices", ours.moved(lift))
-    tips, shafts = changes.get("tips", ours.held(lift)), changes.get("shafts", ours.shafts)
+    moved = changes.get("vertices", ours.moved(_LIFT_MM))
+    tips, shafts = changes.get("tips", ours.held(_LIFT_MM)), changes.get("shafts", ours.shafts)
     rest, lens = ours.studio.still, changes.get("camera", ours.studio.camera)
     shot = ours.studio.shoot(Moment(moved, tips, shafts, lens), 3)
     for array in (shot.radiance, shot.flow, shot.depth, rest.area):

@@ -13,6 +13,8 @@ Curve = NDArray[np.float64]
 SURGICAL_FORCE_MN = 300.0
 """The 0.3 N below which 70% of tool-tissue forces in neurosurgery lie."""
 
+_LARGEST_LAG_S = 0.5
+
 
 @dataclass(frozen=True)
 class Event:
@@ -63,16 +65,16 @@ def gain(sensor: Curve, predicted: Curve, where: NDArray[np.bool_]) -> float:
     return ratio(float(sensor[good] @ predicted[good]), float(predicted[good] @ predicted[good]))
 
 
-def lag(time_s: Curve, sensor: Curve, predicted: Curve, search_s: float = 0.5) -> dict[str, float]:
+def lag(time_s: Curve, sensor: Curve, predicted: Curve) -> dict[str, float]:
     """By how much `predicted` runs behind `sensor`, and the correlation with that taken out.
 
-    Only reported: scores are at lag 0. Found on a uniform grid of a quarter of the median frame time.
+    Only reported: scores are at lag 0. Found on a uniform grid of a quarter of the median frame time, within
+    half a second either way.
 
     Args:
         time_s: (T,) rising [s].
         sensor: (T,) mN.
         predicted: (T,) mN.
-        search_s: largest lag looked for, either way [s].
 
     Returns:
         lag_s (positive: predicted is late), r_at_lag.
@@ -82,7 +84,7 @@ def lag(time_s: Curve, sensor: Curve, predicted: Curve, search_s: float = 0.5) -
     if len(t) < 8 or np.ptp(x) == 0 or np.ptp(y) == 0:
         return {"lag_s": float("nan"), "r_at_lag": float("nan")}
     step = float(np.median(np.diff(t))) / 4
-    search = min(search_s, 0.25 * float(t[-1] - t[0]))
+    search = min(_LARGEST_LAG_S, 0.25 * float(t[-1] - t[0]))
     lags = np.arange(-round(search / step), round(search / step) + 1) * step
     inner = (t >= t[0] + search) & (t <= t[-1] - search)
     if inner.sum() < 8:

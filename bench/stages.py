@@ -9,6 +9,7 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
+from bench import results
 from synth.errors import UserError
 from synth.store import Dataset
 
@@ -24,8 +25,7 @@ def stages(
 
     found = measure(Dataset(data))
     if out is not None:
-        out.mkdir(parents=True, exist_ok=True)
-        (out / "stages.json").write_text(json_.dumps(found, indent=2) + "\n", "utf-8")
+        results.keep(out, "stages.json", found)
     if json:
         print(json_.dumps(found))
         return

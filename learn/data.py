@@ -137,26 +137,23 @@ def load(
     grid: Grid,
     wanted: Iterable[str],
     *,
-    keep: Callable[[Sequence], bool] = lambda _: True,
     cache: Path | None = None,
     report: Callable[[int, int], None] = lambda done, of: None,
 ) -> list[Clip]:
-    """All sealed sequences of a dataset that `keep` keeps, in order.
+    """All sealed sequences of a dataset, in order.
 
     `cache`: folder of packed arrays, made on first use and memory-mapped after; keyed by content hash and
     grid, so it can be shared and can't be stale. Raises UserError for an empty dataset.
     """
     wanted = tuple(wanted)
-    chosen = [s for s in Dataset(root) if keep(s)]
+    dataset = Dataset(root)
     clips = []
-    for i, sequence in enumerate(chosen):
-        report(i, len(chosen))
+    for i, sequence in enumerate(dataset):
+        report(i, len(dataset))
         clips.append(
             read(sequence, grid, wanted) if cache is None else _packed(sequence, grid, wanted, cache)
         )
-    report(len(chosen), len(chosen))
-    if not clips:
-        raise UserError(f"{root}: holds no sealed sequence to use")
+    report(len(dataset), len(dataset))
     return clips
 
 

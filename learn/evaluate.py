@@ -155,13 +155,12 @@ class Report:
         out["calibration_slope"], out["calibration_offset_mn"] = line(said, true)
         return out
 
-    def intervals(self, young: str = "known", seed: int = 0) -> dict[str, Interval]:
+    def intervals(self) -> dict[str, Interval]:
         """Mean and BCa interval over sequences of every per-sequence number, and of the pooled R²."""
-        rows = self.per_clip(young)
-        rng = np.random.default_rng(seed)
+        rows, rng = self.per_clip(), np.random.default_rng(0)
         out = {k: interval(np.array([r[k] for r in rows]), rng) for k in rows[0]}
-        out["map_r2_pooled"] = pooled_r2(_sums(c.map for c in self.columns[young]), rng)
-        forces = (Moments.of(c.true_mn, c.said_mn) for c in self.columns[young])
+        out["map_r2_pooled"] = pooled_r2(_sums(c.map for c in self.clips), rng)
+        forces = (Moments.of(c.true_mn, c.said_mn) for c in self.clips)
         return out | {"force_r2_pooled": pooled_r2(_sums(forces), rng)}
 
     def bands(self) -> list[dict[str, float]]:
@@ -293,11 +292,11 @@ def _answers(predictor: Predictor, clip: Clip, source: str, young: Mapping[str, 
     }
 
 
-def compare(a: Report, b: Report, young: str = "known", seed: int = 0) -> dict[str, Paired]:
+def compare(a: Report, b: Report) -> dict[str, Paired]:
     """B against A on the same sequences, number by number; numbers that no sequence has from both are left
     out."""
-    rows, rng = (a.per_clip(young), b.per_clip(young)), np.random.default_rng(seed)
-    if [c.name for c in a.columns[young]] != [c.name for c in b.columns[young]]:
+    rows, rng = (a.per_clip(), b.per_clip()), np.random.default_rng(0)
+    if [c.name for c in a.clips] != [c.name for c in b.clips]:
         raise UserError("paired test: the two models were not scored on the same sequences")
     out = {}
     for key in rows[0][0]:

@@ -127,8 +127,8 @@ class Resampler:
         out: NDArray[np.floating] = (cols @ np.ascontiguousarray(half.T)).T
         return out
 
-    def to_image(self, values: NDArray[np.floating], fill: float = 0.0) -> NDArray[np.float32]:
-        """Grid values back on the picture's pixels, bilinearly. (..., N, N) → (..., H, W) float32."""
+    def to_image(self, values: NDArray[np.floating]) -> NDArray[np.float32]:
+        """Grid values on the picture's pixels, bilinearly; 0 outside. (..., N, N) → (..., H, W) float32."""
         n, ratio = self.grid.size, self.scale_mm_per_px / self.grid.pitch_mm
         x = (np.arange(self.shape[1]) - self.centre_px[0]) * ratio + (n - 1) / 2
         y = (np.arange(self.shape[0]) - self.centre_px[1]) * ratio + (n - 1) / 2
@@ -138,7 +138,7 @@ class Resampler:
         fx, fy = (x - x0), (y - y0)[:, None]
         top = values[..., y0, :][..., x0] * (1 - fx) + values[..., y0, :][..., x0 + 1] * fx
         low = values[..., y0 + 1, :][..., x0] * (1 - fx) + values[..., y0 + 1, :][..., x0 + 1] * fx
-        return np.where(inside, top * (1 - fy) + low * fy, fill).astype(np.float32)
+        return np.where(inside, top * (1 - fy) + low * fy, 0).astype(np.float32)
 
 
 def settled(amount: NDArray[np.float32], mask: NDArray[np.float32]) -> NDArray[np.float32]:

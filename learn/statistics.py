@@ -17,6 +17,10 @@ from synth.errors import UserError
 
 Floats = NDArray[np.float64]
 
+_LEVEL = 0.95
+_DRAWS = 4000
+_SIGNS = 10_000
+
 
 @dataclass(frozen=True)
 class Interval:
@@ -28,7 +32,7 @@ class Interval:
     n: int
 
 
-def interval(values: Floats, rng: np.random.Generator, level: float = 0.95, draws: int = 4000) -> Interval:
+def interval(values: Floats, rng: np.random.Generator, draws: int = _DRAWS) -> Interval:
     """Mean and BCa bootstrap interval over sequences (Efron 1987). NaNs are sequences without a value.
 
     `values`: (n,), any unit. With fewer than three values, or none that differ, there is no interval (NaN).
@@ -41,22 +45,19 @@ def interval(values: Floats, rng: np.random.Generator, level: float = 0.95, draw
     if v.size < 3 or np.ptp(v) == 0:
         return Interval(float(v.mean()), nan, nan, int(v.size))
     boot = v[rng.integers(0, v.size, (draws, v.size))].mean(axis=1)
-    return _bca(float(v.mean()), boot, (v.sum() - v) / (v.size - 1), level)
+    return _bca(float(v.mean()), boot, (v.sum() - v) / (v.size - 1))
 
 
-def pooled_r2(moments: Floats, rng: np.random.Generator, level: float = 0.95, draws: int = 4000) -> Interval:
+def pooled_r2(moments: Floats, rng: np.random.Generator, draws: int = _DRAWS) -> Interval:
     """R² over everything that the sequences hold together, and its BCa interval over sequences.
 
     `moments`: (n, 6), the first six of each sequence's `learn.metrics.Moments`: count, sums of t, p, tt, pp
     and tp. With fewer than three sequences there is no interval (NaN).
     """
+    return _pooled(moments, _r2, rng, draws)
 
-    return _pooled(moments, _r2, rng, level, draws)
 
-
-def pooled_r2_difference(
-    a: Floats, b: Floats, rng: np.random.Generator, level: float = 0.95, draws: int = 4000
-) -> Interval:
+def pooled_r2_difference(a: Floats, b: Floats, rng: np.random.Generator) -> Interval:
     """Pooled R² of B less that of A, each the mean over its runs, and its BCa interval over sequences.
 
     `a`, `b`: (n, runs, 6) moments as for `pooled_r2`, of the same n sequences in the same order.
@@ -68,7 +69,7 @@ def pooled_r2_difference(
         return np.asarray(found[..., split:].mean(-1) - found[..., :split].mean(-1))
 
     both = np.concatenate([a, b], axis=1).reshape(len(a), -1)
-    return _pooled(both, difference, rng, level, draws)
+    return _pooled(both, difference, rng)
 
 
 def _r2(moments: Floats) -> Floats:
@@ -76,19 +77,17 @@ def _r2(moments: Floats) -> Floats:
     return np.asarray(1 - (pp - 2 * tp + tt) / (tt - t**2 / n), np.float64)
 
 
-def skill(
-    error: Floats, base: Floats, rng: np.random.Generator, level: float = 0.95, draws: int = 4000
-) -> Interval:
+def skill(error: Floats, base: Floats, rng: np.random.Generator) -> Interval:
     """1 − Σ error / Σ base over sequences: how much of the base's squared error an answer takes away.
 
     `error`, `base`: (n,) sums of squares of each sequence, same unit. BCa interval over sequences.
     """
     sums = np.stack([error, base], axis=-1)
-    return _pooled(sums, lambda m: np.asarray(1 - m[..., 0] / m[..., 1]), rng, level, draws)
+    return _pooled(sums, lambda m: np.asarray(1 - m[..., 0] / m[..., 1]), rng)
 
 
 def _pooled(
-    sums: Floats, statistic: Callable[[Floats], Floats], rng: np.random.Generator, level: float, draws: int
+    sums: Floats, statistic: Callable[[Floats], Floats], rng: np.random.Generator, draws: int = _DRAWS
 ) -> Interval:
     """A statistic of sums over sequences; with fewer than three sequences there is no interval (NaN)."""
     m = np.asarray(sums, np.float64)
@@ -96,11 +95,11 @@ def _pooled(
     if len(m) < 3:
         return Interval(float(statistic(whole)), float("nan"), float("nan"), len(m))
     times = rng.multinomial(len(m), np.full(len(m), 1 / len(m)), draws)
-    out = _bca(float(statistic(whole)), statistic(times @ m), statistic(whole - m), level)
+    out = _bca(float(statistic(whole)), statistic(times @ m), statistic(whole - m))
     return Interval(out.mean, out.low, out.high, len(m))
 
 
-def _bca(value: float, boot: Floats, left_out: Floats, level: float) -> Interval:
+def _bca(value: float, boot: Floats, left_out: Floats) -> Interval:
     """The interval of a statistic from its bootstrap draws and its leave-one-out values."""
     draws = len(boot)
     # Ties count half, else few sequences or a spike of equal values tilt the bias correction.
@@ -109,7 +108,7 @@ def _bca(value: float, boot: Floats, left_out: Floats, level: float) -> Interval
     d = left_out.mean() - left_out
     spread = float((d**2).sum())
     acceleration = float((d**3).sum() / (6 * spread**1.5)) if spread > 0 else 0.0
-    z = z0 + stats.norm.ppf([(1 - level) / 2, (1 + level) / 2])
+    z = z0 + stats.norm.ppf([(1 - _LEVEL) / 2, (1 + _LEVEL) / 2])
     low, high = np.quantile(boot, stats.norm.cdf(z0 + z / (1 - acceleration * z)))
     return Interval(value, float(low), float(high), len(left_out))
 
@@ -126,7 +125,7 @@ class Paired:
     """Share of sequences on which B's value is the larger; ties count half."""
 
 
-def paired(a: Floats, b: Floats, rng: np.random.Generator, draws: int = 10000) -> Paired:
+def paired(a: Floats, b: Floats, rng: np.random.Generator) -> Paired:
     """Compares two models, sequence by sequence. `a`, `b`: (n,) in the same order.
 
     Exact (all sign patterns) up to 13 sequences, by random patterns above. Raises UserError for lengths that
@@ -142,6 +141,6 @@ def paired(a: Floats, b: Floats, rng: np.random.Generator, draws: int = 10000) -
         signs = 1 - 2 * ((np.arange(2**d.size)[:, None] >> np.arange(d.size)) & 1)
         p = float((np.abs(signs @ d) >= abs(d.sum()) * (1 - 1e-12)).mean())
     else:
-        signs = rng.choice([-1.0, 1.0], (draws, d.size))
-        p = float((1 + (np.abs(signs @ d) >= abs(d.sum()) * (1 - 1e-12)).sum()) / (1 + draws))
+        signs = rng.choice([-1.0, 1.0], (_SIGNS, d.size))
+        p = float((1 + (np.abs(signs @ d) >= abs(d.sum()) * (1 - 1e-12)).sum()) / (1 + _SIGNS))
     return Paired(interval(d, rng), p, float((d > 0).mean() + 0.5 * (d == 0).mean()))

@@ -22,6 +22,8 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 
+Source = Annotated[str, typer.Argument(help="A job file, or a named job: tiny, demo, paper.")]
+Overrides = Annotated[list[str] | None, typer.Argument(help="Changes to the job, as section.key=value.")]
 Out = Annotated[Path, typer.Argument(help="A dataset's folder.")]
 Mix = Annotated[
     bool,
@@ -57,10 +59,8 @@ def schema() -> None:
 
 @app.command(epilog="Example: synth preview demo --count 9 --out sheet.png")
 def preview(
-    job: Annotated[str, typer.Argument(help="A job file, or a named job: tiny, demo, paper.")],
-    overrides: Annotated[
-        list[str] | None, typer.Argument(help="Changes to the job, as section.key=value.")
-    ] = None,
+    job: Source,
+    overrides: Overrides = None,
     out: Annotated[Path, typer.Option("--out", "-o", help="The PNG to write.")] = Path("sheet.png"),
     count: Annotated[int, typer.Option("--count", "-n", min=1, max=100, help="Scenarios to show.")] = 9,
     json: Json = False,
@@ -92,10 +92,8 @@ def preview(
 
 @app.command(epilog="Example: synth render demo --out out render.spp=8 sequences=100")
 def render(
-    job: Annotated[str, typer.Argument(help="A job file, or a named job: tiny, demo, paper.")],
-    overrides: Annotated[
-        list[str] | None, typer.Argument(help="Changes to the job, as section.key=value.")
-    ] = None,
+    job: Source,
+    overrides: Overrides = None,
     out: Annotated[
         Path, typer.Option("--out", "-o", help="The dataset's folder; an unfinished one is continued.")
     ] = Path("out"),

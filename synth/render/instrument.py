@@ -124,8 +124,9 @@ def _sweep(s: Floats, thick: Floats, wide: Floats, bow: Floats, power: float) ->
     return np.stack(columns, -1).reshape(-1, 3)
 
 
-def _along(rings: int, power: float = 1.6) -> Floats:
-    return np.asarray((np.linspace(0, 1, rings) ** power) * _LENGTH_MM)
+def _along(rings: int) -> Floats:
+    """Where rings stand along an instrument (rings,) mm: closer together at its tip."""
+    return np.asarray((np.linspace(0, 1, rings) ** 1.6) * _LENGTH_MM)
 
 
 def _round_off(s: Floats, over: float) -> Floats:
