@@ -3,7 +3,8 @@
 A few probe sequences are computed at full fidelity and with one knob turned at a time. What a knob does to
 the force read from them (`tune_reading`) adds up to first order, with its sign, frame by frame; costs
 multiply stage by stage. That only orders the candidates: the cheapest one that promises to keep the budget is
-then measured as a whole, on further sequences too, and given up for the next if it does not keep it.
+then measured as a whole, on further sequences too, and given up for the next if it does not keep it. The
+sequence that broke the promise is then measured knob by knob as well.
 """
 
 from __future__ import annotations
@@ -91,7 +92,8 @@ def run(job: Job, budget: Budget, journal_file: Path, probes: int, checks: int, 
         budget: how far its forces may move.
         journal_file: keeps what is measured, so that a run that was stopped goes on; removed at the end.
         probes: sequences that every knob is measured on.
-        checks: further ones that whole settings are measured on.
+        checks: further ones that whole settings are measured on; every knob too, on one that breaks a
+            promise.
         report: progress.
 
     Raises:
@@ -122,11 +124,17 @@ def run(job: Job, budget: Budget, journal_file: Path, probes: int, checks: int, 
         tried.append(joint(bench, whole, f"try {len(tried) + 1}", picked, promised))
         if tried[-1].error <= budget.share or picked == last:
             break
-        # Promises are held to less, by what this one missed, but a single surprise is not taken for the rule.
-        allowed *= float(np.clip(budget.share / tried[-1].error, *_STEP))
+        surprise = whole[int(np.argmax(tried[-1].errors))]
+        if sweep.knows(surprise):
+            # Promises are held to less, by what this one missed, but not to little for a single surprise.
+            allowed *= float(np.clip(budget.share / tried[-1].error, *_STEP))
+        else:
+            sweep.learn(surprise)  # which knob did it?
     journal.remove()
     kinds = tuple(scenario_kind(job, index) for index in whole)
-    return Tuned(job, budget, tuple(knobs), tuple(picked), tuple(sweep.rows), full, mine, tuple(tried), kinds)
+    return Tuned(
+        job, budget, tuple(knobs), tuple(picked), tuple(sweep.rows()), full, mine, tuple(tried), kinds
+    )
 
 
 def again(

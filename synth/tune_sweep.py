@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -24,48 +25,51 @@ _SIDE_SIZE = 0.5  # all of the picture but its size is compared at about this pa
 _NOTHING = 0.01  # saving less than this part of a frame's cost is no reason to change a job
 
 
+@dataclass(frozen=True)
+class _Cell:
+    """One level of one knob on one sequence, against the knob's finest level."""
+
+    label: Floats
+    """(K, I) by how much the force that the label stands for moves, as a part of the force."""
+    seen: Floats
+    """(K, I) by how much the force that is read moves."""
+    ratio: dict[str, float]
+    """Cost by stage over the finest level's."""
+
+
 class Sweep:
     """Every knob turned by itself, and what that promises of all of them."""
 
     def __init__(self, knobs: list[Knob], measure: Measure, frames: int, probes: int) -> None:
-        self._knobs, self._frames = knobs, frames
-        self._moves: list[list[list[tuple[Floats, Floats]] | None]] = [[] for _ in knobs]
-        self._ratios: list[list[dict[str, float]]] = [[] for _ in knobs]
-        self._why: dict[tuple[int, int], str] = {}
-        finest = tune_knobs.finest(knobs)
-        exact = [_whole(measure(k, "full fidelity", finest, True)) for k in range(probes)]
-        self._exact = [seen_error(one) for one in exact]
-        self._cost = {
-            stage: float(np.median([e.cost.get(stage, 0.0) for e in exact]))
-            for stage in ("physics", "scene", "render", "flow")
-        }
+        self._knobs, self._measure, self._frames = knobs, measure, frames
+        self._finest = tune_knobs.finest(knobs)
+        self._exact: dict[int, Measured] = {}
+        self._cells: dict[int, list[list[_Cell | str]]] = {}
+        for index in range(probes):
+            self.learn(index)
+
+    def learn(self, index: int) -> None:
+        """Measures every knob on one more sequence."""
         # One sequence after the other: its full fidelity is computed once.
-        tables = [[self._one(measure, k, knob, finest) for knob in knobs] for k in range(probes)]
-        for i, knob in enumerate(knobs):
-            for j in range(len(knob.levels)):
-                cells = [tables[k][i][j] for k in range(probes)]
-                broken = next((cell for cell in cells if isinstance(cell, str)), None)
-                good = [cell for cell in cells if not isinstance(cell, str)]
-                self._moves[i].append(None if broken else [move for move, _ in good])
-                stages = {stage for _, ratio in good for stage in ratio}
-                self._ratios[i].append(
-                    {
-                        stage: float(np.median([ratio.get(stage, 1.0) for _, ratio in good]))
-                        for stage in stages
-                    }
-                )
-                if broken:
-                    self._why[i, j] = broken
-        self.rows = [
+        self._exact[index] = _whole(self._measure(index, "full fidelity", self._finest, True))
+        self._cells[index] = [self._one(index, knob) for knob in self._knobs]
+
+    def knows(self, index: int) -> bool:
+        """Whether every knob was measured on a sequence."""
+        return index in self._cells
+
+    def rows(self) -> list[Row]:
+        """What each level of each knob does by itself."""
+        return [
             Row(
                 knob.name,
                 level.words,
                 self._error(self._alone(i, j)),
                 self._change(self._alone(i, j)),
                 1 - self._price([(i, j)]) / self._price([]),
-                self._why.get((i, j), ""),
+                next((cell for cell in self._column(i, j) if isinstance(cell, str)), ""),
             )
-            for i, knob in enumerate(knobs)
+            for i, knob in enumerate(self._knobs)
             for j, level in enumerate(knob.levels)
         ]
 
@@ -103,29 +107,26 @@ class Sweep:
         near = [one for one in found if one[0] <= (1 + _NOTHING) * least]
         return min(near, key=lambda one: (one[1], one[0]))[2]
 
-    def _one(
-        self, measure: Measure, index: int, knob: Knob, finest: dict[str, Any]
-    ) -> list[tuple[tuple[Floats, Floats], dict[str, float]] | str]:
-        """What each level does on one sequence to the force that the label stands for and to the one that is
-        read, and its cost by stage over the finest level's."""
-        base = dict(finest)
+    def _one(self, index: int, knob: Knob) -> list[_Cell | str]:
+        """What each level of a knob does on one sequence; a text where it cannot be carried out."""
+        base = dict(self._finest)
         if knob.name in ("law", "time"):
-            base |= {"fem.tets": min(_SIDE_TETS, finest["fem.tets"])}
+            base |= {"fem.tets": min(_SIDE_TETS, self._finest["fem.tets"])}
         elif knob.kind != "physics" and knob.name != "size":
             base |= self._side()
         pictures = knob.kind != "physics"
-        zero = _whole(measure(index, f"{knob.name}, finest", base, pictures))
+        zero = _whole(self._measure(index, f"{knob.name}, finest", base, pictures))
         still = np.zeros_like(zero.label)
-        out: list[tuple[tuple[Floats, Floats], dict[str, float]] | str] = [((still, still), {})]
+        out: list[_Cell | str] = [_Cell(still, still, {})]
         for level in knob.levels[1:]:
-            found = measure(index, f"{knob.name} {level.words}", base | dict(level.changes), pictures)
+            found = self._measure(index, f"{knob.name} {level.words}", base | dict(level.changes), pictures)
             if isinstance(found, str):
                 out.append(found)
                 continue
             label = found.label - zero.label
             ratio = {s: found.cost[s] / zero.cost[s] for s in found.cost if zero.cost.get(s, 0.0) > 0}
             # Without pictures, what is read moves as the truth does.
-            out.append(((label, seen_error(found) - seen_error(zero) if pictures else label), ratio))
+            out.append(_Cell(label, seen_error(found) - seen_error(zero) if pictures else label, ratio))
         return out
 
     def _side(self) -> dict[str, Any]:
@@ -139,39 +140,42 @@ class Sweep:
         at[i] = j
         return at
 
-    def _sums(self, at: Sequence[int]) -> list[tuple[Floats, Floats]] | None:
-        """Move of the label and error of the force read, a probe sequence each; None where a knob broke."""
-        parts = [self._moves[i][j] for i, j in enumerate(at) if j]
-        known = [part for part in parts if part is not None]
-        if len(known) < len(parts):
-            return None
-        return [
-            (
-                np.sum([np.zeros_like(exact), *(part[k][0] for part in known)], axis=0),
-                np.sum([exact, *(part[k][1] for part in known)], axis=0),
-            )
-            for k, exact in enumerate(self._exact)
-        ]
+    def _column(self, i: int, j: int) -> list[_Cell | str]:
+        return [cells[i][j] for cells in self._cells.values()]
+
+    def _sums(self, at: Sequence[int]) -> list[tuple[Floats, Floats, Floats]] | None:
+        """By sequence, move of the label, error of the force read, the same at full fidelity; None where a
+        knob broke."""
+        out = []
+        for index, cells in self._cells.items():
+            parts = [cells[i][j] for i, j in enumerate(at) if j]
+            known = [part for part in parts if isinstance(part, _Cell)]
+            if len(known) < len(parts):
+                return None
+            exact = seen_error(self._exact[index])
+            label = np.sum([np.zeros_like(exact), *(part.label for part in known)], axis=0)
+            out.append((label, np.sum([exact, *(part.seen for part in known)], axis=0), exact))
+        return out
 
     def _error(self, at: Sequence[int]) -> float:
         sums = self._sums(at)
-        if sums is None:
-            return float("inf")
-        pairs = zip(sums, self._exact, strict=True)
-        return float(np.mean([taken(label, seen, exact) for (label, seen), exact in pairs]))
+        return float("inf") if sums is None else float(np.mean([taken(*one) for one in sums]))
 
     def _change(self, at: Sequence[int]) -> float:
         sums = self._sums(at)
         if sums is None:
             return float("inf")
-        pairs = zip(sums, self._exact, strict=True)
-        return float(np.mean([size(seen) - size(exact) for (_, seen), exact in pairs]))
+        return float(np.mean([size(seen) - size(exact) for _, seen, exact in sums]))
 
     def _price(self, at: Sequence[tuple[int, int]]) -> float:
-        stages = dict(self._cost)
+        stages = {
+            stage: float(np.median([one.cost.get(stage, 0.0) for one in self._exact.values()]))
+            for stage in ("physics", "scene", "render", "flow")
+        }
         for i, j in at:
-            for stage, ratio in self._ratios[i][j].items():
-                stages[stage] *= ratio
+            good = [cell.ratio for cell in self._column(i, j) if isinstance(cell, _Cell)]
+            for stage in {stage for ratio in good for stage in ratio}:
+                stages[stage] *= float(np.median([ratio.get(stage, 1.0) for ratio in good]))
         return (stages["physics"] + stages["scene"]) / self._frames + stages["render"] + stages["flow"]
 
 

@@ -27,6 +27,9 @@ SMALL: dict[str, Any] = {
 }
 
 
+JOB = Job.model_validate({"seed": 1, "fem": {"gestures": ["pull"]}})
+
+
 def test_a_tenth_more_load_reads_as_a_tenth_more_force() -> None:
     job = Job.model_validate(SMALL)
     probe = Probe(job, 0)
@@ -110,9 +113,33 @@ def test_a_job_within_the_budget_is_better_than_full_fidelity(
     assert tune_file.changes(done) == []
 
 
+def test_a_sequence_that_breaks_a_promise_is_asked_which_knob_did_it(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """The check moves fast, what the probe doesn't show: there few warps lose force."""
+
+    class Fast(Fake):
+        def __init__(self, job: Job, index: int) -> None:
+            self.fast = job.seed == tune.probing(JOB, 1).seed
+
+        def measure(self, job: Job, pictures: bool = True) -> Measured:
+            found = super().measure(job, pictures)
+            if self.fast and job.flow.warps < 6 and found.seen is not None:
+                return Measured(found.label, found.seen + 0.2, found.cost)
+            return found
+
+    monkeypatch.setattr(tune, "Probe", Fast)
+    done = tune.run(JOB, tune.Budget(0.03), tmp_path / "part", 1, 1, lambda done, total, words: None)
+    assert done.tried[0].errors[1] > 0.2
+    assert done.best.error <= 0.03
+    levels = dict(zip((knob.name for knob in done.knobs), done.best.levels, strict=True))
+    assert levels["warps"] == "6"
+    assert next(row.change for row in done.rows if row.level == "3") > 0.09
+
+
 def test_other_pictures_are_no_cheaper_ones(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     class Matte(Fake):
-        def measure(self, job: Job, pictures: bool) -> Measured:
+        def measure(self, job: Job, pictures: bool = True) -> Measured:
             found = super().measure(job, pictures)
             if job.light.glare[1] == 0 or job.render.aperture_mm == 0:
                 found.cost["render"] = 0.1 * found.cost["render"]
