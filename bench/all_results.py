@@ -113,14 +113,14 @@ def stability(
 
 
 def _pareto_panels(results: Path) -> Iterator[plot.Panel]:
-    from bench import end_to_end_page, fem_pareto, flow_pareto, learn_pareto, render_pareto
+    from bench import end_to_end_page, fem_pareto, flow_pareto, learn_pareto, learn_trained, render_pareto
 
     yield from end_to_end_page.panels(fronts.read(results / "end-to-end/pareto.json"))
     yield from fem_pareto.panels(fronts.read(results / "fem/pareto/pareto.json"))
     yield from render_pareto.panels(fronts.read(results / "render/pareto/pareto.json"))
     yield from flow_pareto.panels(fronts.read(results / "flow/pareto/pareto.json"))
     rows = learn_pareto.with_errors(
-        fronts.read(results / "learn/pareto/data-cpu.json")["rows"], learn_pareto.errors(results / "learn")
+        fronts.read(results / "learn/pareto/data-cpu.json")["rows"], learn_trained.errors(results / "learn")
     )
     yield from learn_pareto.chart(rows, "cpu")
 

@@ -161,24 +161,24 @@ def _flow(found: Mapping[str, Any]) -> list[Front]:
 
 
 def _learn(results: Path) -> list[Front]:
-    from bench import learn_pareto
+    from bench import learn_trained
     from learn.settings import PRESETS
 
+    # A front a grid, as rendering has one a picture's width: errors on two grids aren't comparable. Without
+    # intervals: they are over sequences, which all networks share, and would call any two networks equal.
     data = read(results / "learn/pareto/data-cpu.json")
-    errors = learn_pareto.errors(results / "learn")
-    points = []
-    for row in data["rows"]:
-        arch = learn_pareto.architecture(row["arch"])
-        error = errors.get((arch, row["size"]))
-        if error is not None and (row["layout"], row["precision"]) == ("quick", "fp32"):
-            key = (*learn_pareto.shape(arch), row["size"])
-            points.append(Point(key, row["name"], row["ms_p50"], error.mean, (error.low, error.high)))
+    known = learn_trained.errors(results / "learn")
     fronts = []
-    for name, preset in PRESETS.items():
-        key = (*learn_pareto.shape(preset.arch), preset.size)
-        if any(point.key == key for point in points):
-            unit = "map RMSE [mN/mm²]"
-            fronts.append(Front(f"learn, {name}", "CPU ms a frame", unit, tuple(points), key))
+    for size, name in sorted(learn_trained.GRIDS.items()):
+        points = []
+        for row in data["rows"]:
+            if (row["size"], row["layout"], row["precision"]) == (size, "quick", "fp32"):
+                key = learn_trained.shape(learn_trained.architecture(row["arch"])), size
+                if key in known:
+                    points.append(Point(key, row["name"], row["ms_p50"], known[key].error.mean))
+        default = learn_trained.shape(PRESETS[name].arch), size
+        unit = "map RMSE [mN/mm²]"
+        fronts.append(Front(f"learn, {name}", "CPU ms a frame", unit, tuple(points), default))
     return fronts
 
 

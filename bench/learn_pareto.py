@@ -1,12 +1,11 @@
-"""`bench pareto learn`: what a network costs a frame, and what it gets wrong where it has been trained."""
+"""`bench pareto learn`: what a network costs a frame, beside what it gets wrong where it has been trained."""
 
 from __future__ import annotations
 
-import html
 import itertools
 import json as json_
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -16,9 +15,10 @@ import torch
 import typer
 from rich.console import Console
 
-from bench import plot
-from bench.learn_runs import column
+from bench import plot, results
+from bench.learn_experiment import BESIDE
 from bench.learn_table import markdown
+from bench.learn_trained import GRIDS, Known, Shape, architecture, errors, shape
 from bench.machine import describe
 from learn.cost import flops, parameters
 from learn.grid import Grid, Scales, channels
@@ -26,9 +26,11 @@ from learn.model import Architecture, fused
 from learn.quick import Quick
 from learn.reference import build
 from learn.settings import PRESETS
-from learn.statistics import Interval, interval
+from learn.statistics import Interval
 from learn.threads import set_threads
 
+TURNS = 4
+"""Times that all networks are gone through."""
 LIGHT = 5e9
 """FLOP a frame up to which a network is timed in every layout and precision, and `repeats` times."""
 
@@ -80,31 +82,58 @@ def pareto(
         "machine": describe() | {"device": device, "threads": 1, "torch": torch.__version__},
         "rows": rows,
     }
-    out.mkdir(parents=True, exist_ok=True)
-    for choice in _choices(device, known):
-        named = f"{choice.name} {choice.layout} {choice.precision}"
-        if not any(word in named for word in only.split(",")):
-            continue
-        row = measure(choice, repeats, device) | {"arch": asdict(choice.arch)}
-        rows[:] = [r for r in rows if _way(r) != _way(row)] + [row]
-        # After every one: a run that is stopped has what it timed.
-        file.write_text(json_.dumps(result, indent=1) + "\n")
-        if not json:
-            Console(stderr=True).print(
-                f"{row['name']} {choice.layout} {choice.precision}: p50 {row['ms_p50']:.1f} ms, "
-                f"p95 {row['ms_p95']:.1f} ms"
-            )
+    choices = list(dict.fromkeys(_choices(device, known)))
+    asked = {(shape(c.arch), c.size, c.layout, c.precision) for c in choices}
+    chosen = [c for c in choices if any(word in _named(c) for word in only.split(","))]
+    new = measure(chosen, repeats, device)
+    again = {_way(row) for row in new}
+    rows[:] = [r for r in rows if _way(r) in asked - again] + new
+    if new:
+        results.keep(out, file.name, result)
+    for row in () if json else new:
+        Console(stderr=True).print(
+            f"{row['name']} {row['layout']} {row['precision']}: p50 {row['ms_p50']:.1f} ms, "
+            f"p95 {row['ms_p95']:.1f} ms"
+        )
     _write(out, known)
     if json:
         print(json_.dumps(result))
 
 
-def measure(choice: Choice, repeats: int, device: str = "cpu") -> dict[str, Any]:
+def measure(choices: Sequence[Choice], repeats: int, device: str = "cpu") -> list[dict[str, Any]]:
     """Latency of one frame from displacement on the grid to the force map on it, batch norms folded.
 
     CPU time on the CPU (other processes take turns, they don't count), wall time on a GPU. Heavy networks are
-    timed at least five times, light ones `repeats` times.
+    timed at least five times, light ones `repeats` times, all of them in turns: a machine that is faster at
+    one time than at another then is so to all.
     """
+    frames = [_frame(choice, device) for choice in choices]
+    costs = [flops(choice.arch, choice.size) for choice in choices]
+    times: list[list[float]] = [[] for _ in choices]
+    for _ in range(TURNS):
+        for frame, cost, own in zip(frames, costs, times, strict=True):
+            own += _timed(frame, -(-(repeats if cost < LIGHT else 5) // TURNS), device)
+    return [
+        {
+            "name": choice.name,
+            "preset": choice.preset,
+            "layout": choice.layout,
+            "precision": choice.precision,
+            "size": choice.size,
+            "parameters": parameters(build(choice.arch)),
+            "gflop": round(cost / 1e9, 3),
+            "ms_p50": round(float(np.quantile(own, 0.5)), 3),
+            "ms_p95": round(float(np.quantile(own, 0.95)), 3),
+            "ms_least": round(min(own), 3),
+            "frames": len(own),
+            "arch": asdict(choice.arch),
+        }
+        for choice, cost, own in zip(choices, costs, times, strict=True)
+    ]
+
+
+def _frame(choice: Choice, device: str) -> Callable[[], None]:
+    """What answers one frame, made ready."""
     torch.manual_seed(0)
     arch, size = choice.arch, choice.size
     model = build(arch).eval()
@@ -125,21 +154,7 @@ def measure(choice: Choice, repeats: int, device: str = "cpu") -> dict[str, Any]
                 x = x.contiguous(memory_format=torch.channels_last)
             net(x)
 
-    cost = flops(arch, size)
-    times = np.array(list(_timed(frame, repeats if cost < LIGHT else 5, device)))
-    return {
-        "name": choice.name,
-        "preset": choice.preset,
-        "layout": choice.layout,
-        "precision": choice.precision,
-        "size": size,
-        "parameters": parameters(model),
-        "gflop": round(cost / 1e9, 3),
-        "ms_p50": round(float(np.quantile(times, 0.5)), 3),
-        "ms_p95": round(float(np.quantile(times, 0.95)), 3),
-        "ms_least": round(float(times.min()), 3),
-        "frames": len(times),
-    }
+    return frame
 
 
 def _timed(frame: Callable[[], None], repeats: int, device: str) -> Iterator[float]:
@@ -158,7 +173,7 @@ def _timed(frame: Callable[[], None], repeats: int, device: str) -> Iterator[flo
             yield 1e3 * (time.perf_counter() - start)
 
 
-def _choices(device: str, trained: dict[tuple[Architecture, int], Interval]) -> Iterator[Choice]:
+def _choices(device: str, trained: Known) -> Iterator[Choice]:
     stems = [(8, 4), (16, 4), (32, 4), (16, 2), (16, 1), (32, 1)]
     shapes = [(*s, 4, False) for s in stems] + [(16, 4, 3, False), (16, 4, 3, True)]
     ways = [("contiguous", "fp32"), ("channels_last", "fp32"), ("channels_last", "bf16")]
@@ -166,43 +181,24 @@ def _choices(device: str, trained: dict[tuple[Architecture, int], Interval]) -> 
     for (width, stem, levels, detail), size in itertools.product(shapes, (256, 192, 128)):
         if size % (stem * 2**levels):
             continue
-        arch = Architecture(width=width, stem=stem, levels=levels, dropout=0.05, detail=detail)
+        arch = Architecture(width=width, stem=stem, levels=levels, detail=detail)
         for layout, precision in ways if flops(arch, size) < LIGHT else ways[:1]:
             yield Choice(arch, size, layout, precision)
     yield Choice(Architecture(name="unet"), 256, ways[0][0])
-    for arch, size in trained:
+    beside: list[tuple[Shape, int]] = [
+        (("d2fnet", *sizes, False), PRESETS[name].size) for name, group in BESIDE.items() for sizes in group
+    ]
+    for (name, width, stem, levels, detail), size in [*trained, *beside]:
+        arch = Architecture(name=name, width=width, stem=stem, levels=levels, detail=detail)
         yield Choice(arch, size, ways[0][0])
 
 
+def _named(choice: Choice) -> str:
+    return f"{choice.name} {choice.layout} {choice.precision}"
+
+
 def _way(row: dict[str, Any]) -> tuple[Any, ...]:
-    return architecture(row["arch"]), row["size"], row["layout"], row["precision"]
-
-
-def shape(arch: Architecture) -> tuple[Any, ...]:
-    """What sets the time a frame takes, of an architecture."""
-    return arch.name, arch.width, arch.stem, arch.levels, arch.detail
-
-
-def errors(root: Path) -> dict[tuple[Architecture, int], Interval]:
-    """Map RMSE over tested sequences [mN/mm²], with interval, of networks trained alike (MSE, fold and seed
-    0)."""
-    found: dict[tuple[Architecture, int], Interval] = {}
-    for file in sorted([*root.glob("ideal/runs/*.json"), *root.glob("fine/runs/*.json")]):
-        run = json_.loads(file.read_text())
-        tree = run["settings"]["arch"]
-        if run["control"] or run["settings"]["objective"]["kind"] != "mse" or tree["output"] != "magnitude":
-            continue
-        if not file.stem.endswith("fold0-seed0") or file.stem.startswith(("long", "film")):
-            continue
-        found[architecture(tree), run["settings"]["size"]] = interval(
-            column([run], "map_rmse"), np.random.default_rng(0)
-        )
-    return found
-
-
-def architecture(tree: dict[str, Any]) -> Architecture:
-    """An architecture as a run's settings hold it."""
-    return Architecture(**tree | {"bounds": tuple(tree["bounds"])})
+    return shape(architecture(row["arch"])), row["size"], row["layout"], row["precision"]
 
 
 def _lines(rows: list[dict[str, Any]]) -> list[dict[str, object]]:
@@ -216,73 +212,112 @@ def _lines(rows: list[dict[str, Any]]) -> list[dict[str, object]]:
             "p50 [ms]": r["ms_p50"],
             "p95 [ms]": r["ms_p95"],
             "map RMSE [mN/mm²]": _text(r["map_rmse"]),
+            "against its grid's preset": _share(r["against"]),
+            "map RMSE over 0.56 mm": _text(r["wide_rmse"]),
+            "total force MAE [mN]": _text(r["force_mae"], 3),
+            "seeds": r["seeds"],
         }
         for r in sorted(rows, key=lambda r: float(r["ms_p50"]))
     ]
 
 
-def _text(error: list[float] | None) -> str | None:
-    return None if error is None else f"{error[0]:.4f} [{error[1]:.4f}, {error[2]:.4f}]"
+def _text(error: list[float] | None, digits: int = 4) -> str | None:
+    return None if error is None else "{:.{n}f} [{:.{n}f}, {:.{n}f}]".format(*error, n=digits)
 
 
-def _write(out: Path, errors: dict[tuple[Architecture, int], Interval]) -> None:
+def _ends(i: Interval) -> list[float]:
+    return [i.mean, i.low, i.high]
+
+
+def _share(against: list[float] | None) -> str | None:
+    return None if against is None else "{:+.0%} [{:+.0%}, {:+.0%}]".format(*against)
+
+
+def _write(out: Path, known: Known) -> None:
     """README.md, chart.svg and index.html from every data file there."""
-    parts, panels = [_HEAD], []
+    parts, panels, lines = [_HEAD], [], []
+    how: dict[str, Any] = {}
     for file in sorted(out.glob("data-*.json")):
-        result = json_.loads(file.read_text())
-        device, rows = result["machine"]["device"], result["rows"]
-        with_errors(rows, errors)
-        parts.append(f"## {device}\n\n{markdown(_lines(rows))}\n")
+        found = json_.loads(file.read_text())
+        device, rows = found["machine"]["device"], found["rows"]
+        with_errors(rows, known)
+        own = _lines(rows)
+        parts.append(f"## {device}\n\n{markdown(own)}\n")
+        lines += [{"device": device} | line for line in own]
         panels += chart(rows, device)
-    (out / "README.md").write_text("\n".join(parts))
-    if panels:
-        plot.write(panels, out, "Learn: error against time")
-    else:
-        text = html.escape("\n".join(parts))
-        (out / "index.html").write_text(plot.page("Learn: time a frame", f"<pre>{text}</pre>"), "utf-8")
+        how = how or found
+    results.keep(out, "README.md", "\n".join(parts))
+    plot.write(panels, out, "Learn: error against time", lines, how)
 
 
-def with_errors(
-    rows: list[dict[str, Any]], known: dict[tuple[Architecture, int], Interval]
-) -> list[dict[str, Any]]:
-    """The rows, each with `map_rmse`: the error of its network and the interval's ends, or None.
+def with_errors(rows: list[dict[str, Any]], known: Known) -> list[dict[str, Any]]:
+    """The rows, each with what is known of its network (`learn_trained.Trained`), as lists of a mean and its
+    interval's ends; None where it was not trained.
 
     Presets may have moved since the rows were timed: they are named anew.
     """
     for row in rows:
-        arch = architecture(row["arch"])
-        row["preset"] = Choice(arch, row["size"]).preset
-        error = known.get((arch, row["size"]))
-        row["map_rmse"] = None if error is None else [error.mean, error.low, error.high]
+        arch, size = architecture(row["arch"]), row["size"]
+        row["preset"] = Choice(arch, size).preset
+        found = known.get((shape(arch), size))
+        row["map_rmse"] = None if found is None else _ends(found.error)
+        row["wide_rmse"] = None if found is None else _ends(found.wide)
+        row["force_mae"] = None if found is None else _ends(found.force)
+        row["against"] = None if found is None or found.against is None else _ends(found.against)
+        row["seeds"] = None if found is None else found.seeds
     return rows
 
 
 def chart(rows: list[dict[str, Any]], device: str) -> list[plot.Panel]:
-    """The chart of one device's rows that have an error, if any."""
-    scored = [r for r in rows if r["map_rmse"] is not None]
-    curves = [
-        plot.Curve(
-            f"{size}² grid",
-            tuple(r["ms_p50"] for r in own),
-            tuple(r["map_rmse"][0] for r in own),
-            tuple(f"{r['name']} ({r['preset']})" if r["preset"] else r["name"] for r in own),
-            ringed=tuple(k for k, r in enumerate(own) if r["preset"] and r["layout"] == "quick"),
-            ends=tuple((r["map_rmse"][1], r["map_rmse"][2]) for r in own),
-        )
-        for size, own in ((n, [r for r in scored if r["size"] == n]) for n in (64, 128, 256))
-        if own
-    ]
-    if not curves:
-        return []
-    title = f"Learn: error of the map against time, {device}"
-    return [plot.Panel(title, "p50 [ms]", "map RMSE [mN/mm²]", tuple(curves), log_x=True, front=True)]
+    """A chart for each preset's grid: one device's rows that have an error, as they are run live.
+
+    Errors are differences from the preset, paired: what sequences have in common would hide them.
+    """
+    panels, way = [], "quick" if device == "cpu" else "contiguous"
+    for size, name in sorted(GRIDS.items()):
+        scored = [
+            r
+            for r in rows
+            if r["size"] == size and r["layout"] == way and (r["against"] or r["preset"] == name)
+        ]
+        gaps = {id(r): [100 * v for v in r["against"] or (0.0, 0.0, 0.0)] for r in scored}
+        curves = [
+            plot.Curve(
+                f"stem of {stem}",
+                tuple(r["ms_p50"] for r in own),
+                tuple(gaps[id(r)][0] for r in own),
+                tuple(f"{_short(r)} ({r['preset']})" if r["preset"] else _short(r) for r in own),
+                ringed=tuple(k for k, r in enumerate(own) if r["preset"]),
+                ends=tuple((gaps[id(r)][1], gaps[id(r)][2]) for r in own),
+            )
+            for stem in (1, 2, 4)
+            if (own := [r for r in scored if r["arch"]["stem"] == stem])
+        ]
+        if curves:
+            title = f"Learn: networks on {size}² beside the preset {name}, {device}"
+            panels.append(
+                plot.Panel(
+                    title, "p50 [ms]", "map RMSE, more than the preset's [%]", tuple(curves), front=True
+                )
+            )
+    return panels
+
+
+def _short(row: dict[str, Any]) -> str:
+    return f"w{row['arch']['width']} stem{row['arch']['stem']} depth{row['arch']['levels']}"
 
 
 _HEAD = """# Learn: time a frame, and error where it was trained
 
 `bench pareto learn`. From displacement on the grid to the force map, channels included, batch norms folded,
 one frame at a time; CPU time of one thread on a CPU, wall time on a GPU. `cpu` is the preset of `learn train`
-where none is named, `live` is `d2fnet-s`. Errors are of the study's runs on fold 0 with MSE (mean over
-tested sequences, BCa interval); only those networks have one: the others are too large to train here.
-Machine: 2 cores, no GPU.
+where none is named, `live` is `d2fnet-s`. Machine: 2 cores, no GPU.
+
+Errors are of `bench experiment learn --presets` and, on 64², of the study's own runs: fold 0, with the loss
+and dropout of the grid's preset, in equal steps on the same batches, all saying magnitudes; mean over tested
+sequences (and seeds) with BCa interval, and beside it the difference from the preset, paired by sequences, as
+a share of the preset's error. A front is of one grid, as rendering has one a picture's width. Between grids
+compare the errors over cells of 0.56 mm (64²), onto which answer and truth are averaged, and those of the
+total force. `paper`, the published network (27.7 GFLOP), and what is as large can't be trained on this
+machine and have no error.
 """

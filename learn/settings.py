@@ -113,7 +113,8 @@ PRESETS: dict[str, Settings] = {
     # At most 20 minutes on one core with a few dozen sequences: tells good choices from bad.
     "cpu": Settings(
         size=128,
-        arch=Architecture(width=16, stem=2, levels=4, dropout=0.05),
+        # A stem of 2 errs no less and takes twice the time, in training too (docs/results/learn/pareto).
+        arch=Architecture(width=16, stem=4, levels=4, dropout=0.05),
         epochs=24,
         objective=GHOSTLESS,
         learning_rate=1e-3,

@@ -3,23 +3,33 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from bench import learn_disturb as disturb
 from bench.learn_badinput import bad_inputs
 from bench.learn_controls import beyond_mean_map, controls, mean_map
+from bench.learn_experiment import pictured, preset_runs
 from bench.learn_labels import coarser
+from bench.learn_runs import Run
 from bench.learn_table import markdown
+from bench.learn_trained import errors, shape
+from bench.learn_wide import wide_rmse
 from learn.data import Clip
 from learn.grid import Grid
 from learn.loss import Objective
-from learn.predict import load
-from learn.settings import preset
+from learn.predict import Predictor, load
+from learn.settings import PRESETS, preset
 from learn.split import nested
 from learn.train import train
+from synth import config
+from synth.errors import UserError
+from synth.job import Render
 
 GRID = Grid(32)
 
@@ -85,6 +95,68 @@ def test_a_coarser_grid_keeps_force_and_motion(clips: list[Clip]) -> None:
     np.testing.assert_allclose(wide.density.sum((2, 3)) * Grid(16).pitch_mm ** 2, fine, rtol=1e-4, atol=1e-6)
     largest = [np.abs(c.displacement["ideal"]).max() for c in (clips[2], wide)]
     assert largest[1] == pytest.approx(largest[0], rel=0.1)
+
+
+def test_an_error_over_wider_cells_is_without_what_averages_out(clips: list[Clip], model: Path) -> None:
+    rough = np.where(np.indices((32, 32)).sum(0) % 2, 0.1, -0.1).astype(np.float32)
+    clip = dataclasses.replace(clips[2], mask=np.ones((32, 32), np.float32))
+
+    class Rough:
+        card = load(model).card
+
+        @staticmethod
+        def density(moved: object, mask: object, young_kpa: float) -> NDArray[np.float32]:
+            said: NDArray[np.float32] = clip.density * np.float32(young_kpa) + rough
+            return said
+
+    predictor = cast(Predictor, Rough())
+    assert wide_rmse(predictor, [clip], "ideal", 16) == pytest.approx([0.0], abs=1e-6)
+    assert wide_rmse(predictor, [clip], "ideal", 32) > [0.05]
+
+
+def test_a_fine_grid_gets_pictures_of_a_pixel_a_cell() -> None:
+    job = config.load("tiny").model_copy(update={"render": Render(size=(192, 144))})
+    assert pictured(job, Grid(128)) == job
+    assert pictured(job, Grid(256)).render.size == (384, 288)
+
+
+def kept(root: Path, run: Run, rmse: list[float]) -> None:
+    """A run's file, as far as errors are read from it."""
+    names = ("map_rmse", "map_rmse_wide", "force_mae")
+    rows = [{"name": f"{k}"} | dict.fromkeys(names, v) for k, v in enumerate(rmse)]
+    tree = {"name": run.name, "control": run.control, "settings": run.settings.as_dict(), "sequences": rows}
+    file = root / "presets/runs" / f"{run.name}.json"
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_text(json.dumps(tree))
+
+
+def test_errors_are_of_runs_that_were_trained_as_the_preset_is(tmp_path: Path) -> None:
+    runs = [run for run in preset_runs() if run.settings.size == PRESETS["cpu"].size]
+    own = [shape(run.settings.arch) == shape(PRESETS["cpu"].arch) for run in runs]
+    cpu, other = runs[own.index(True)], runs[own.index(False)]
+    again = Run("again", dataclasses.replace(other.settings, seed=1))
+    kept(tmp_path, cpu, [1.0, 2.0, 3.0, 4.0])
+    kept(tmp_path, other, [1.5, 2.5, 3.0, 4.5])
+    kept(tmp_path, again, [2.5, 2.5, 3.0, 4.5])
+    mse = dataclasses.replace(cpu.settings, objective=Objective(kind="mse"), seed=7)
+    kept(tmp_path, Run("another-loss", mse), [9.0] * 4)
+    kept(tmp_path, Run("longer", dataclasses.replace(cpu.settings, epochs=99, seed=8)), [9.0] * 4)
+    found = errors(tmp_path)
+    assert set(found) == {(shape(r.settings.arch), 128) for r in (cpu, other)}
+    mine, beside = (found[shape(r.settings.arch), 128] for r in (cpu, other))
+    assert (mine.error.mean, mine.seeds, mine.against) == (2.5, 1, None)
+    assert (beside.error.mean, beside.seeds) == (3.0, 2)
+    # Paired over the seed that both have: (0.5 + 0.5 + 0 + 0.5) / 10.
+    assert beside.against is not None
+    assert beside.against.mean == pytest.approx(0.15)
+
+
+def test_runs_that_were_tested_on_other_sequences_are_not_averaged(tmp_path: Path) -> None:
+    first = next(preset_runs())
+    kept(tmp_path, first, [1.0, 2.0, 3.0])
+    kept(tmp_path, Run("again", dataclasses.replace(first.settings, seed=1)), [1.0, 2.0])
+    with pytest.raises(UserError, match="different sequences"):
+        errors(tmp_path)
 
 
 def test_controls_score_what_they_must(clips: list[Clip], model: Path) -> None:
