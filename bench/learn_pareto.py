@@ -294,7 +294,7 @@ def chart(rows: list[dict[str, Any]], device: str) -> list[plot.Panel]:
             if (own := [r for r in scored if r["arch"]["stem"] == stem])
         ]
         if curves:
-            title = f"Learn: networks on {size}² beside the preset {name}, {device}"
+            title = f"Learn: networks on {size}² beside the preset {name} (on {device})"
             panels.append(
                 plot.Panel(
                     title, "p50 [ms]", "map RMSE, more than the preset's [%]", tuple(curves), front=True
