@@ -3,14 +3,18 @@
 A pipeline makes sequences (law, mesh, paths), recovers their flow and fits a model on them; it is asked for
 the force of sequences that a finer pipeline made of scenes it has not seen, from the flow that its own
 estimator recovers there. Its cost is the CPU time of one frame of its data and of one answer.
+
+What is asked is restricted to one instrument that pulls or pushes. Flow shows the force along the line of
+sight only through the little that tissue spreads under a push, and a grasp's two jaws gather it as well: with
+grasps among the scenes that part was lost on true flow already. On recovered flow it is lost without them
+too, half of the squared force: so the part across the line of sight is judged by itself besides.
 """
 
 from __future__ import annotations
 
 import json as json_
 import shutil
-import time
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -19,24 +23,29 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
-from bench import baseline, end_to_end_page, machine
+from bench import end_to_end_costs, end_to_end_page, machine, results
+from bench import end_to_end_models as models
 from bench.baseline import GRID
+from bench.end_to_end_models import Answer
 from bench.refollow import refollow
 from learn import data
 from learn.data import Clip
-from learn.statistics import interval
+from learn.statistics import interval, paired
 from synth import pipeline, place
 from synth.fem.validity import choose
 from synth.flow import mask
 from synth.job import Fem, Flow, Job, Render
-from synth.store import Sequence, open_sequence
+from synth.store import open_sequence
 
 Floats = NDArray[np.float64]
 
-FRAMES, SIZE, VERTICES, LOAD = 8, (256, 192), 8000, (0.05, 0.2)
-NETWORK = "D2FNet tiny"
-_MODELS = ("ridge on PCA of flow", "k-NN on PCA of flow", "Tikhonov near the contact")
-_UNLEARNT = ("Tikhonov near the contact",)
+FRAMES, SIZE, VERTICES, LOAD, GESTURES = 8, (256, 192), 8000, (0.05, 0.2), ("pull", "push")
+_MODELS = (models.RIDGE, models.NEAREST, models.PHYSICS)
+
+
+PARTS = {"": "errors", "across_": "across"}
+"""What defaults are judged by: the whole force, and its part across the line of sight. Prefix of the names in
+a row, and the errors by sequence."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +63,7 @@ class World:
                 "sequences": count,
                 "frames": FRAMES,
                 "anatomy": {"vertices": VERTICES},
-                "fem": {"law": self.law, "tets": self.tets, "load": LOAD},
+                "fem": {"law": self.law, "tets": self.tets, "load": LOAD, "gestures": GESTURES},
                 "render": {"size": SIZE, "spp": self.spp},
                 "flow": {"backend": "ideal"},
             }
@@ -84,29 +93,43 @@ class Pipeline:
     model: str
 
     @property
+    def name(self) -> str:
+        return f"{self.world.name}, {self.flow}, {self.model}"
+
+    @property
+    def slug(self) -> str:
+        """Its name in a file's."""
+        return self.name.replace(", ", "-").replace(" ", "-")
+
+    def words(self) -> dict[str, Any]:
+        """What names it in a row of results."""
+        return asdict(self.world) | {"flow": self.flow, "model": self.model, "default": self.default}
+
+    @property
     def default(self) -> bool:
         """Whether it is made of defaults alone; the model is none of a job's."""
         return self.world == default_world() and self.flow == Flow().backend
 
 
 def chosen() -> list[Pipeline]:
-    """One thing changed at a time from the defaults, and all of them at their cheapest."""
+    """One thing changed at a time from the defaults, all at their cheapest, and as dear as what is asked."""
     usual, flow = default_world(), Flow().backend
+    cheapest = World("linear", 400, 1)
     worlds = [
         usual,
         replace(usual, law="linear"),
         replace(usual, tets=400),
         replace(usual, spp=1),
-        World("linear", 400, 1),
+        cheapest,
+        FINE,
     ]
-    cheapest = worlds[-1]
     made = [Pipeline(world, flow, model) for world in dict.fromkeys(worlds) for model in _MODELS]
     made += [Pipeline(usual, other, m) for other in ("dis", "opencv-tvl1", "ideal") for m in _MODELS]
     made += [Pipeline(cheapest, "dis", model) for model in _MODELS]
-    made += [Pipeline(world, flow, NETWORK) for world in (usual, cheapest)]
-    made += [Pipeline(usual, other, NETWORK) for other in ("dis", "ideal")]
-    # Physics alone learns nothing from the sequences: it is one dot for every flow.
-    return [p for p in made if p.model not in _UNLEARNT or p.world == usual]
+    made += [Pipeline(world, flow, models.NETWORK) for world in (usual, cheapest)]
+    made.append(Pipeline(usual, "ideal", models.NETWORK))
+    # Physics alone learns nothing from the sequences: it is one dot for every flow that it is asked with.
+    return [p for p in made if p.model not in models.UNLEARNT or (p.world == usual and p.flow != "ideal")]
 
 
 def pareto(
@@ -114,43 +137,90 @@ def pareto(
         "docs/results/end-to-end"
     ),
     work: Annotated[
-        Path, typer.Option(help="Folder for the sequences; what is there already is used.")
+        Path, typer.Option(help="Folder for sequences, flow and answers; what is there already is used.")
     ] = Path("end-to-end-work"),
-    fit: Annotated[int, typer.Option(min=4, help="Sequences that each pipeline makes to fit on.")] = 14,
-    test: Annotated[int, typer.Option(min=3, help="Sequences that all are asked about.")] = 12,
+    fit: Annotated[int, typer.Option(min=4, help="Sequences that each pipeline makes to fit on.")] = 40,
+    test: Annotated[int, typer.Option(min=3, help="Sequences that all are asked about.")] = 24,
     seed: Annotated[int, typer.Option(min=0, help="Root of every draw.")] = 31,
-    epochs: Annotated[int, typer.Option(min=1, help="Of the network.")] = 30,
+    epochs: Annotated[int, typer.Option(min=1, help="Of the network.")] = 60,
+    rounds: Annotated[
+        int, typer.Option(min=1, help="How often everything is timed, in turn, once the answers are there.")
+    ] = 4,
     json: Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")] = False,
 ) -> None:
     """Error of the force against CPU time a frame, for whole pipelines: law, mesh, paths, flow and model."""
-    asked = Made(FINE, FINE.job(seed + 1, test), work)
-    kept: dict[str, Made] = {}
-    rows: list[dict[str, Any]] = []
-    found: dict[str, Any] = {
-        "command": f"bench pareto end-to-end --fit {fit} --test {test} --seed {seed} --epochs {epochs}",
-        "machine": machine.describe(),
-        "meaning": f"{SIZE[0]} x {SIZE[1]} px, {FRAMES} frames; cpu_s: of a frame of data (physics, scene, "
-        "rendering, flow) and of one answer; rmse: of the force's three components together, as a part of "
-        "its root mean square in the sequence, mean over sequences with its BCa interval",
-        "asked": asdict(FINE),
-        "missing": [f"{p.world.name}, {p.flow}, {p.model}" for p in chosen()],
-        "rows": rows,
-    }
-    for one in chosen():
-        made = kept.setdefault(one.world.name, Made(one.world, one.world.job(seed, fit), work))
-        row = measure(one, made, asked, work, epochs, seed)
-        rows.append(asdict(one.world) | {"flow": one.flow, "model": one.model, "default": one.default} | row)
-        found["missing"] = found["missing"][1:]
+
+    def say(line: str) -> None:
         if not json:
-            typer.echo(
-                f"{one.world.name:22s} {one.flow:12s} {one.model:26s} {row['cpu_s']:.3f} CPU-s a frame  "
-                f"{100 * row['rmse']:.0f}% [{100 * row['low']:.0f}, {100 * row['high']:.0f}]"
-            )
-        out.mkdir(parents=True, exist_ok=True)
-        (out / "pareto.json").write_text(json_.dumps(found, indent=1) + "\n", "utf-8")
+            typer.echo(line)
+
+    asked = Made(FINE, FINE.job(seed + 1, test), work)
+    made = {one.world: Made(one.world, one.world.job(seed, fit), work) for one in chosen()}
+    run = work / f"answers-{fit}-{test}-{seed}-{epochs}"
+    rows: list[dict[str, Any]] = []
+    for one in chosen():
+        rows.append(one.words() | answered(one, made[one.world], asked, run, epochs, seed))
+        say(f"{len(rows)} of {len(chosen())}: {one.name}, {100 * np.mean(rows[-1]['errors']):.0f}%")
+    usual = [one for one in chosen() if one.default]
+    ready = {one.model: _answer(one, made[one.world], run, epochs, seed) for one in usual}
+    costs = end_to_end_costs.measure(
+        {world.name: world.job(seed, fit) for world in made},
+        [flow for flow in dict.fromkeys(one.flow for one in chosen()) if flow != "ideal"],
+        ready,
+        asked.clips(Flow().backend),
+        work,
+        rounds,
+        say,
+    )
+    for one, row in zip(chosen(), rows, strict=True):
+        row |= {"data_s": costs.data[one.world.name], "flow_s": costs.flow[one.flow]}
+        row |= {"answer_s": costs.answer[one.model]}
+        row["cpu_s"] = row["data_s"] + row["flow_s"] + row["answer_s"]
+    still = [clip.force for clip in asked.clips("ideal")]
+    nothing = {key: float(np.mean(v)) for key, v in errors([0 * f for f in still], still).items()}
+    found = {
+        "command": f"bench pareto end-to-end --fit {fit} --test {test} --seed {seed} --epochs {epochs} "
+        f"--rounds {rounds}",
+        "machine": machine.describe(),
+        "meaning": f"{SIZE[0]} x {SIZE[1]} px, {FRAMES} frames, one instrument that pulls or pushes; "
+        "cpu_s: of a frame of data (physics, scene, rendering, flow) and of one answer, the least of "
+        f"{rounds} rounds in which everything was timed in turn; errors: of the force's three components "
+        "together, root mean square over frames as a part of the force's own, by sequence; across, along: "
+        "the parts of it across and along the line of sight, whose squares add up in every sequence",
+        "asked": asdict(FINE),
+        "zero": 1.0,
+        "across_zero": nothing["across"],
+        "rows": summarised(rows, seed),
+        "rounds": costs.rounds,
+    }
+    results.keep(out, "pareto.json", found)
     end_to_end_page.write(found, out)
-    if json:
-        typer.echo(json_.dumps(found))
+    typer.echo(json_.dumps(found) if json else str(out / "index.html"))
+
+
+def summarised(rows: list[dict[str, Any]], seed: int) -> list[dict[str, Any]]:
+    """Rows with means over sequences and what they err more than the default pipeline with the same model.
+
+    `rmse`, `low`, `high` of the whole force, and of its part across as `across_rmse` and so on, BCa;
+    `difference` and `across_difference`: mean, low, high; None for a default.
+    """
+    defaults = {row["model"]: row for row in rows if row["default"]}
+    done = []
+    for row in rows:
+        usual = None if row["default"] else defaults[row["model"]]
+        more: dict[str, Any] = {"along_rmse": float(np.mean(row["along"]))}
+        for name, part in PARTS.items():
+            found = interval(np.asarray(row[part]), np.random.default_rng(seed))
+            more |= {f"{name}rmse": found.mean, f"{name}low": found.low, f"{name}high": found.high}
+            more[f"{name}difference"] = None if usual is None else difference(usual[part], row[part], seed)
+        done.append(row | more)
+    return done
+
+
+def difference(usual: list[float], other: list[float], seed: int) -> list[float]:
+    """Mean, low and high of what `other` errs more than `usual` on the same sequences (BCa)."""
+    found = paired(np.asarray(usual), np.asarray(other), np.random.default_rng(seed)).difference
+    return [found.mean, found.low, found.high]
 
 
 class Made:
@@ -159,102 +229,63 @@ class Made:
     def __init__(self, world: World, job: Job, work: Path) -> None:
         """Renders what is not there yet."""
         self.world, self._job = world, job
-        folder = work / f"{world.name}-{job.seed}"
-        folder.mkdir(parents=True, exist_ok=True)
+        self._folder = work / f"{world.name}-{job.seed}"
+        self._folder.mkdir(parents=True, exist_ok=True)
         for index in range(job.sequences):
-            target = place.store(folder, index)
+            target = place.store(self._folder, index)
             if not target.exists():
                 shutil.rmtree(target.with_suffix(".zarr.part"), ignore_errors=True)
-                pipeline.render_sequence(job, index, folder, lambda stage, done, of: None)
-        self.sequences = [open_sequence(place.store(folder, index)) for index in range(job.sequences)]
-        # The first one of a process compiles: medians leave it out.
-        costs = [
-            sum(t["cpu_s"] for name, t in s.attrs["timings"].items() if name not in ("peak_rss_mb", "store"))
-            for s in self.sequences
-        ]
-        self.cpu_s = float(np.median(costs)) / FRAMES
-        self._clips = [data.read(s, GRID, ("ideal",)) for s in self.sequences]
-        self._flows: dict[str, tuple[list[Clip], float]] = {}
+                pipeline.render_sequence(job, index, self._folder, lambda stage, done, of: None)
 
-    def clips(self, flow: str) -> tuple[list[Clip], float]:
-        """The clips with `recovered` displacement of an estimator, and its CPU-s a frame."""
-        if flow not in self._flows:
-            if flow == "ideal":
-                same = [
-                    replace(c, displacement={**c.displacement, "recovered": c.displacement["ideal"]})
-                    for c in self._clips
-                ]
-                self._flows[flow] = (same, 0.0)
-            else:
-                pairs = [self._followed(s, c, flow) for s, c in zip(self.sequences, self._clips, strict=True)]
-                self._flows[flow] = ([c for c, _ in pairs], float(np.median([t for _, t in pairs])))
-        return self._flows[flow]
+    def clips(self, flow: str) -> list[Clip]:
+        """The clips with `recovered` displacement of an estimator; kept beside the sequences."""
+        return [self._clip(index, flow) for index in range(self._job.sequences)]
 
-    def _followed(self, sequence: Sequence, clip: Clip, flow: str) -> tuple[Clip, float]:
-        rgb, tools = sequence["rgb"][...], sequence["tool"][...].astype(bool)
-        began = time.process_time()
-        blocked = tools | np.stack([mask.glare(picture) for picture in rgb])
-        masks_s = time.process_time() - began
-        job = self._job.flow.model_copy(update={"backend": flow})
-        found, flow_s = refollow(sequence, clip, pipeline.estimator(job), blocked, GRID)
-        return found, (masks_s + flow_s) / (clip.frames - 1)
+    def _clip(self, index: int, flow: str) -> Clip:
+        kept = self._folder / f"clips-{GRID.size}" / flow / f"{index:06d}"
+        if not kept.is_dir():
+            data.pack(self._followed(index, flow), kept)
+        return data.unpack(kept)
+
+    def _followed(self, index: int, flow: str) -> Clip:
+        sequence = open_sequence(place.store(self._folder, index))
+        clip = data.read(sequence, GRID, ("ideal",))
+        if flow == "ideal":
+            return replace(clip, displacement=clip.displacement | {"recovered": clip.displacement["ideal"]})
+        estimator = pipeline.estimator(self._job.flow.model_copy(update={"backend": flow}))
+        hidden = mask.hidden(sequence["rgb"][...], sequence["tool"][...].astype(bool))
+        return refollow(sequence, clip, estimator, hidden, GRID)[0]
 
 
-def measure(one: Pipeline, made: Made, asked: Made, work: Path, epochs: int, seed: int) -> dict[str, Any]:
-    """Error and cost of one pipeline; trained on ideal flow, it is asked with the default estimator's."""
-    fit, flow_s = made.clips(one.flow)
-    tests, _ = asked.clips(Flow().backend if one.flow == "ideal" else one.flow)
-    began = time.process_time()
-    answer = _network(one, fit, work, epochs, seed) if one.model == NETWORK else _rule(one, fit)
-    train_s = time.process_time() - began
-    began, errors = time.process_time(), []
-    for clip in tests:
-        said = answer(clip)
-        off = np.square(said - clip.force).sum(axis=1).mean()
-        errors.append(float(np.sqrt(off / np.square(clip.force).sum(axis=1).mean())))
-    answer_s = (time.process_time() - began) / sum(clip.frames for clip in tests)
-    found = interval(np.asarray(errors), np.random.default_rng(seed))
-    return {
-        "cpu_s": made.cpu_s + flow_s + answer_s,
-        "data_s": made.cpu_s,
-        "flow_s": flow_s,
-        "answer_s": answer_s,
-        "train_s": train_s,
-        "rmse": found.mean,
-        "low": found.low,
-        "high": found.high,
-        "errors": errors,
-    }
+def answered(
+    one: Pipeline, made: Made, asked: Made, folder: Path, epochs: int, seed: int
+) -> dict[str, list[float]]:
+    """Errors of one pipeline, kept in `folder`; one fitted on ideal flow is asked with the default's."""
+    kept = folder / f"{one.slug}.json"
+    if kept.exists():
+        known: dict[str, list[float]] = json_.loads(kept.read_text("utf-8"))
+        return known
+    answer = _answer(one, made, folder, epochs, seed)
+    tests = asked.clips(Flow().backend if one.flow == "ideal" else one.flow)
+    found = errors([answer(clip) for clip in tests], [clip.force for clip in tests])
+    results.keep(folder, kept.name, found)
+    return found
 
 
-def _rule(one: Pipeline, fit: list[Clip]) -> Callable[[Clip], Floats]:
-    known = baseline.physical_rules() if one.model in _UNLEARNT else baseline.fitted_rules(fit, "recovered")
-    rule = known[one.model]
+def errors(said: Sequence[Floats], true: Sequence[Floats]) -> dict[str, list[float]]:
+    """Root mean square error of the force as a part of the force's own, by sequence: (T, 3) mN, camera axes.
 
-    def answer(clip: Clip) -> Floats:
-        moved, sure = clip.displacement["recovered"], clip.confidence
-        return clip.young_kpa * np.stack([rule(moved[t], clip.mask, sure[t]) for t in range(clip.frames)])
+    Whole, and its parts across and along the line of sight.
+    """
+    found: dict[str, list[float]] = {"errors": [], "across": [], "along": []}
+    for answer, force in zip(said, true, strict=True):
+        own = np.square(force).sum(axis=1).mean()
+        off = np.square(answer - force).mean(axis=0) / own
+        for name, parts in (("errors", off), ("across", off[:2]), ("along", off[2:])):
+            found[name].append(float(np.sqrt(parts.sum())))
+    return found
 
-    return answer
 
-
-def _network(one: Pipeline, fit: list[Clip], work: Path, epochs: int, seed: int) -> Callable[[Clip], Floats]:
-    from learn.predict import load
-    from learn.settings import preset
-    from learn.split import Split
-    from learn.train import train
-
-    select = max(2, len(fit) // 5)
-    settings = preset("tiny", size=GRID.size, epochs=epochs, input="recovered", seed=seed)
-    split = Split(tuple(range(select, len(fit))), tuple(range(select)), ())
-    folder = work / f"network-{one.world.name}-{one.flow}-{epochs}"
-    train(fit, split, settings, folder)
-    predictor = load(folder)
-
-    def answer(clip: Clip) -> Floats:
-        said, _ = predictor.answer(
-            np.asarray(clip.displacement["recovered"]), clip.mask, clip.young_kpa, np.asarray(clip.confidence)
-        )
-        return np.asarray(said.sum(axis=(2, 3)) * GRID.pitch_mm**2, np.float64)
-
-    return answer
+def _answer(one: Pipeline, made: Made, folder: Path, epochs: int, seed: int) -> Answer:
+    fit = [] if one.model in models.UNLEARNT else made.clips(one.flow)
+    return models.build(one.model, fit, folder / f"network-{one.slug}", epochs, seed)

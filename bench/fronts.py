@@ -34,6 +34,8 @@ class Point:
     error: float
     ends: tuple[float, float] | None = None
     """Interval of the error."""
+    beyond: tuple[float, float] | None = None
+    """Interval of the error less the default's, from the same sequences; a front has it or none of it."""
 
 
 @dataclass(frozen=True)
@@ -73,15 +75,22 @@ class Front:
     def beaten_by(self) -> Point | None:
         """A point that is no dearer and beyond doubt better: its interval ends below the default's begins.
 
-        None where there are no intervals.
+        Where both were asked about the same sequences the interval of the difference says so, and only a
+        difference that is more than allowed counts. None where there are no intervals.
         """
         mine = self.find()
         if mine.ends is None:
             return None
         for point in self.points:
-            if point.cost <= mine.cost and point.ends is not None and point.ends[1] < mine.ends[0]:
+            if point.cost <= mine.cost and _better(point, mine):
                 return point
         return None
+
+
+def _better(point: Point, mine: Point) -> bool:
+    if point.beyond is not None:
+        return point.beyond[1] < 0 and point.error < (1 - ALLOWED) * mine.error
+    return point.ends is not None and mine.ends is not None and point.ends[1] < mine.ends[0]
 
 
 def gather(results: Path = RESULTS) -> list[Front]:
@@ -183,26 +192,33 @@ def _learn(results: Path) -> list[Front]:
 
 
 def _end_to_end(found: Mapping[str, Any]) -> list[Front]:
-    from bench.end_to_end import default_world
+    """Two of every model: of the whole force, and of its part across the line of sight."""
+    from bench.end_to_end import PARTS, default_world, difference
     from synth.job import Flow
 
     world = default_world()
+    default = (world.law, world.tets, world.spp, Flow().backend)
     fronts = []
     for model in dict.fromkeys(row["model"] for row in found["rows"]):
-        points = [
-            Point(
-                (row["law"], row["tets"], row["spp"], row["flow"]),
-                f"{row['law']} {row['tets']}, {row['spp']} spp, {row['flow']}",
-                float(row["cpu_s"]),
-                100 * float(row["rmse"]),
-                (100 * float(row["low"]), 100 * float(row["high"])),
-            )
+        own = {
+            (row["law"], row["tets"], row["spp"], row["flow"]): row
             for row in found["rows"]
             if row["model"] == model
-        ]
-        default = (world.law, world.tets, world.spp, Flow().backend)
-        room = f"end to end, {model}"
-        fronts.append(Front(room, "CPU s a frame", "RMSE of the force [%]", tuple(points), default))
+        }
+        usual = own.get(default)
+        for part, errors in PARTS.items():
+            points = []
+            for key, row in own.items():
+                beyond = None
+                if usual is not None and row is not usual:
+                    _, low, high = difference(usual[errors], row[errors], 0)
+                    beyond = (100 * low, 100 * high)
+                name = f"{row['law']} {row['tets']}, {row['spp']} spp, {row['flow']}"
+                mean, *ends = (100 * float(row[f"{part}{end}"]) for end in ("rmse", "low", "high"))
+                points.append(Point(key, name, float(row["cpu_s"]), mean, (ends[0], ends[1]), beyond))
+            room = f"end to end{', across' if part else ''}, {model}"
+            unit = "RMSE of the force [%]"
+            fronts.append(Front(room, "CPU s a frame", unit, tuple(points), default))
     return fronts
 
 

@@ -38,6 +38,8 @@ class Curve:
     """Points to be looked at, as defaults: ringed, and labelled in the picture."""
     ends: tuple[tuple[float, float], ...] = ()
     """Interval of every y; empty: none."""
+    named: bool = True
+    """Whether ringed points are labelled in the picture; not where many of them lie together."""
 
 
 @dataclass(frozen=True)
@@ -222,8 +224,9 @@ def _curve(
         yield f'<circle cx="{x:.1f}" cy="{y:.1f}" r="3.5" fill="{colour}"/>'
         if k in curve.ringed:
             yield f'<circle cx="{x:.1f}" cy="{y:.1f}" r="7" fill="none" stroke="#22262b" stroke-width="1.8"/>'
-            side = "start" if x < 0.7 * _WIDE else "end"
-            yield _text(label, x + (10 if side == "start" else -10), y - 8, side, size=10)
+            if curve.named:
+                side = "start" if x < 0.7 * _WIDE else "end"
+                yield _text(label, x + (10 if side == "start" else -10), y - 8, side, size=10)
         yield f"<title>{html.escape(about)}</title></g>"
 
 
