@@ -39,7 +39,9 @@ def experiment(
     out: Annotated[
         Path, typer.Option("--out", "-o", help="Folder that holds the scenes' jobs and gets the results.")
     ] = Path("docs/results/tune"),
-    budget: Annotated[str, typer.Option(help="As in `synth tune`.")] = "force 3%",
+    budget: Annotated[
+        list[str] | None, typer.Option(help="As in `synth tune`; 'force 5%' and 'force 3%' if not given.")
+    ] = None,
     probes: Annotated[int, typer.Option(min=1, help="Sequences that every knob is measured on.")] = 3,
     checks: Annotated[int, typer.Option(min=0, help="Further ones for whole settings.")] = 3,
     fresh: Annotated[int, typer.Option(min=2, help="Sequences that had no part in the choice.")] = 6,
@@ -49,44 +51,51 @@ def experiment(
     json: Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")] = False,
 ) -> None:
     """Tunes three scenes of different difficulty and checks budget and cost on fresh sequences."""
-    asked = tune.Budget.parse(budget)
+    budgets = budget or ["force 5%", "force 3%"]
+    asked = [tune.Budget.parse(one) for one in budgets]
+    words = " ".join(f"--budget {one!r}" for one in budgets)
     for name in only or _SCENES:
         source = out / f"{name}.yaml"
         if not source.is_file():
             raise UserError(f"{source}: no such scene")
-        job = config.load(str(source))
-        say = _said(name)
-        found = tune.run(job, asked, out / f"{name}.part", probes, checks, say)
-        full, before, after = tune.again(found, out / f"{name}.fresh.part", probes + checks, fresh, say)
-        tuned = out / f"{name}.tuned.yaml"
-        tuned.unlink(missing_ok=True)
-        tune_file.write(found, str(source), (), tuned)
-        row = tune_file.as_dict(found) | {
-            "scene": name,
-            "frames": job.frames,
-            "fresh": {
-                name: {
-                    "errors": list(one.errors),
-                    "totals": list(one.totals),
-                    "apart": list(one.apart),
-                    "cpu_s_a_frame": one.cost,
-                }
-                for name, one in (("full", full), ("before", before), ("after", after))
-            },
-            "machine": machine.describe(),
-            "command": f"bench experiment tune --only {name} --budget '{budget}' --probes {probes} "
-            f"--checks {checks} --fresh {fresh}",
-        }
-        results.keep(out, f"{name}.json", row)
+        job, say = config.load(str(source)), _said(name)
+        # One budget after the other finds what was measured for the one before.
+        journals = out / f"{name}.part", out / f"{name}.fresh.part"
+        for one in asked:
+            found = tune.run(job, one, journals[0], probes, checks, say)
+            fresh_ones = tune.again(found, journals[1], probes + checks, fresh, say)
+            stem = f"{name}-{100 * one.share:g}"
+            (out / f"{stem}.tuned.yaml").unlink(missing_ok=True)
+            tune_file.write(found, str(source), (), out / f"{stem}.tuned.yaml")
+            row = tune_file.as_dict(found) | {
+                "scene": name,
+                "frames": job.frames,
+                "fresh": {
+                    kind: {
+                        "errors": list(whole.errors),
+                        "totals": list(whole.totals),
+                        "apart": list(whole.apart),
+                        "cpu_s_a_frame": whole.cost,
+                    }
+                    for kind, whole in zip(("full", "before", "after"), fresh_ones, strict=True)
+                },
+                "machine": machine.describe(),
+                "command": f"bench experiment tune --only {name} {words} --probes {probes} "
+                f"--checks {checks} --fresh {fresh}",
+            }
+            results.keep(out, f"{stem}.json", row)
+        for journal in journals:
+            journal.unlink(missing_ok=True)
     rows = write(out)
     print(json_.dumps(rows) if json else out / "README.md")
 
 
 def write(out: Path) -> list[dict[str, Any]]:
     """Picture, page and README of the scenes whose data are in `out`; gives those back."""
-    files = [out / f"{name}.json" for name in _SCENES]
-    rows = [json_.loads(file.read_text("utf-8")) for file in files if file.is_file()]
-    commands = "; ".join(row["command"] for row in rows)
+    files = [file for name in _SCENES for file in out.glob(f"{name}-*.json")]
+    rows = [json_.loads(file.read_text("utf-8")) for file in files]
+    rows.sort(key=lambda row: (_SCENES.index(row["scene"]), -row["budget"]))
+    commands = "; ".join(dict.fromkeys(row["command"] for row in rows))
     title = "Tuning: what each knob does to the force, and what it costs"
     plot.write(panels(rows), out, title, table(rows), rows[0] | {"command": commands})
     results.keep(out, "README.md", readme(rows))
@@ -118,7 +127,7 @@ def panels(rows: list[dict[str, Any]]) -> list[plot.Panel]:
                 ringed=(2,),
             )
         )
-        title = f"{row['scene']}: error of the force over cost"
+        title = f"{row['scene']}, {100 * row['budget']:g}%: error of the force over cost"
         made.append(plot.Panel(title, "CPU s a frame", "error of the force [%]", tuple(curves)))
     return made
 
@@ -155,7 +164,7 @@ def readme(rows: list[dict[str, Any]]) -> str:
     lines = [
         "# Tuning: no more than a scene needs",
         "",
-        *(f"    {row['command']}" for row in rows),
+        *(f"    {command}" for command in dict.fromkeys(row["command"] for row in rows)),
         "",
         *textwrap.wrap(f"Machine: {machine.line(rows[0]['machine'])}. {_HOW}", 110),
         "",
@@ -171,7 +180,7 @@ def readme(rows: list[dict[str, Any]]) -> str:
     lines += [f"| {' | '.join(cells[0])} |", "|" + " --- |" * len(cells[0])]
     lines += [f"| {' | '.join(one.values())} |" for one in cells]
     for row in rows:
-        lines += ["", f"## {row['scene']}", "", _KNOBS, "|" + " --- |" * 5]
+        lines += ["", f"## {row['scene']}, {100 * row['budget']:g}%", "", _KNOBS, "|" + " --- |" * 5]
         for one in row["knobs"]:
             took, change = _percent(one["error"]), _percent(one["change"], "+")
             saved = f"{100 * one['saved']:.0f}%"

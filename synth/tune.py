@@ -90,7 +90,8 @@ def run(job: Job, budget: Budget, journal_file: Path, probes: int, checks: int, 
     Args:
         job: what is to be made cheaper.
         budget: how far its forces may move.
-        journal_file: keeps what is measured, so that a run that was stopped goes on; removed at the end.
+        journal_file: keeps what is measured, so that a run that was stopped, or one with another budget, goes
+            on from there; the caller's to remove.
         probes: sequences that every knob is measured on.
         checks: further ones that whole settings are measured on; every knob too, on one that breaks a
             promise.
@@ -130,7 +131,6 @@ def run(job: Job, budget: Budget, journal_file: Path, probes: int, checks: int, 
             allowed *= float(np.clip(budget.share / tried[-1].error, *_STEP))
         else:
             sweep.learn(surprise)  # which knob did it?
-    journal.remove()
     kinds = tuple(scenario_kind(job, index) for index in whole)
     return Tuned(
         job, budget, tuple(knobs), tuple(picked), tuple(sweep.rows()), full, mine, tuple(tried), kinds
@@ -156,7 +156,6 @@ def again(
     mine = [own(knob, found.job) for knob in found.knobs]
     before = joint(bench, whole, "the job as it is", mine, float("nan"))
     after = joint(bench, whole, "the tuned job", found.chosen, float("nan"))
-    bench.journal.remove()
     return full, before, after
 
 

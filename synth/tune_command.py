@@ -59,8 +59,10 @@ def tune(
         f"{probes + checks}: about {minutes:.0f} CPU-minutes; a run that is stopped goes on",
         file=sys.stderr,
     )
-    found = tuning.run(read, asked, target.with_name(target.name + ".part"), probes, checks, _said())
+    journal = target.with_name(target.name + ".part")
+    found = tuning.run(read, asked, journal, probes, checks, _said())
     tune_file.write(found, job, overrides or [], target)
+    journal.unlink(missing_ok=True)
     if json:
         print(json_.dumps(tune_file.as_dict(found) | {"out": str(target)}))
         return

@@ -49,9 +49,6 @@ class Journal:
         with self._path.open("a", encoding="utf-8") as file:
             file.write(json.dumps([key, _plain(found)]) + "\n")
 
-    def remove(self) -> None:
-        self._path.unlink(missing_ok=True)
-
 
 def _plain(found: Measured | str) -> Any:
     if isinstance(found, str):
