@@ -63,6 +63,9 @@ def ideal_runs() -> Iterator[Run]:
     for seed in range(3):
         for name in ("antighost", "antighost-frame"):
             yield Run(f"{name}-fold0-seed{seed}", replace(base, objective=LOSSES[name], seed=seed))
+    for name in ("mse", "ghostless"):
+        arch = replace(base.arch, output="vector")
+        yield Run(f"vec-{name}-fold0-seed0", replace(base, arch=arch, objective=LOSSES[name]))
     for name in ("hinge", "r2-frame", "capped"):
         yield Run(f"{name}-fold0-seed0", replace(base, objective=LOSSES[name]))
 

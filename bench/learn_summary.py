@@ -225,6 +225,7 @@ _AGAINST = (
     ("mse", "film"),
     ("mse", "total"),
     ("mse", "vector"),
+    ("vec-mse", "vec-ghostless"),
     ("mse", "stem4"),
     ("mse", "stem4-detail"),
     ("stem2", "stem4"),

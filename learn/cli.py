@@ -52,7 +52,7 @@ def train_command(
     batch: Annotated[int | None, typer.Option(help="Frames a step.")] = None,
     learning_rate: Annotated[float | None, typer.Option(help="AdamW's learning rate.")] = None,
     loss: Annotated[str | None, typer.Option(help="mse, hinge, antighost, published, mae or huber.")] = None,
-    output: Annotated[str | None, typer.Option(help="magnitude or vector.")] = None,
+    output: Annotated[str | None, typer.Option(help="magnitude, or vector (with --loss mse).")] = None,
     target: Annotated[str | None, typer.Option(help="density or intensity (the paper's map).")] = None,
     size: Annotated[int | None, typer.Option(help="Grid cells along an edge.")] = None,
     width: Annotated[int | None, typer.Option(help="Channels of the first level.")] = None,

@@ -114,7 +114,8 @@ PRESETS: dict[str, Settings] = {
     "cpu": Settings(
         size=128,
         # A stem of 2 errs no less and takes twice the time, in training too (docs/results/learn/pareto).
-        arch=Architecture(width=16, stem=4, levels=4, dropout=0.05),
+        # Magnitudes: on vectors this loss leaves 0.10 less of R² than squared error (docs/results/learn).
+        arch=Architecture(width=16, stem=4, levels=4, output="magnitude", dropout=0.05),
         epochs=24,
         objective=GHOSTLESS,
         learning_rate=1e-3,
@@ -126,7 +127,7 @@ PRESETS: dict[str, Settings] = {
     # d2fnet-s: 256², 10 ms a frame on one core (12 with a fourth halving).
     "live": Settings(
         size=256,
-        arch=Architecture(width=16, stem=4, levels=3, dropout=0.05),
+        arch=Architecture(width=16, stem=4, levels=3, output="magnitude", dropout=0.05),
         objective=GHOSTLESS,
         learning_rate=1e-3,
     ),
