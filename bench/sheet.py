@@ -56,7 +56,7 @@ def together(drawings: Sequence[str]) -> str:
     top, parts = 0.0, []
     for one, (w, h) in zip(drawings, sizes, strict=True):
         # The inner picture's own width, height and style would fight with the place it is given.
-        inner = one.strip().removeprefix(_OPENING.match(one.strip()).group(0))  # type: ignore[union-attr]
+        inner = _OPENING.sub("", one.strip(), count=1)
         parts.append(
             f'<svg x="0" y="{top:g}" width="{w:g}" height="{h:g}" viewBox="0 0 {w:g} {h:g}" {_FONT}>'
         )

@@ -124,7 +124,7 @@ def cycles(found: Tree) -> Sheet:
         for name in dict.fromkeys(row["renderer"] for row in found["rows"])
     )
     panel = plot.Panel("The same scene in both", "CPU s a picture", "noise / mean", curves, True, True)
-    command = "bench experiment cycles --python PY --spp 2 --spp 4"
+    command = "bench experiment cycles --python PY --spp 2 --spp 4 --spp 16"
     return Sheet("Against Cycles", command, found, (panel,), (("Pictures", found["rows"]),))
 
 
@@ -159,18 +159,13 @@ def loading(found: Tree) -> Sheet:
 def render_cost(folder: Path) -> Sheet:
     """Memory over time, and every other figure in a table."""
     found = {file.stem: read(file) for file in sorted(folder.glob("*.json"))}
-    curves = tuple(
-        plot.Curve(
-            words,
-            tuple(
-                float(k + 1) * found[name]["count"] / len(found[name]["every_tenth_mb"]) for k in range(10)
-            ),
-            tuple(found[name]["every_tenth_mb"]),
-        )
-        for name, words in (("frames", "frames of one scene"), ("scenes", "scenes"))
-        if name in found
-    )
-    panel = plot.Panel("Memory of one process", "frames or scenes so far", "MB", curves, log_x=True)
+    curves = []
+    for name, words in (("frames", "frames of one scene"), ("scenes", "scenes")):
+        if name in found:
+            memory, count = found[name]["every_tenth_mb"], found[name]["count"]
+            so_far = tuple(float(k + 1) * count / len(memory) for k in range(len(memory)))
+            curves.append(plot.Curve(words, so_far, tuple(memory)))
+    panel = plot.Panel("Memory of one process", "frames or scenes so far", "MB", tuple(curves), log_x=True)
     tables = tuple((name, flat(one)) for name, one in found.items())
     command = "bench experiment render cost first truth bytes frames scenes"
     return Sheet("Rendering: cost, truth, memory", command, {"machine": _machine(found)}, (panel,), tables)
@@ -197,8 +192,8 @@ def learning(folder: Path) -> Sheet:
         charts.append(
             Chart(words, "mean over tested sequences, BCa interval; in brackets: runs", tuple(rows))
         )
-    command = "bench experiment learn --cache CACHE"
-    return Sheet(f"Learning: {folder.name}", command, {}, tuple(charts))
+    words = ["bench experiment learn --cache CACHE", *_LEARNING.get(folder.name, ())]
+    return Sheet(f"Learning: {folder.name}", " ".join(words), {}, tuple(charts))
 
 
 def learn_stability(folder: Path) -> Sheet:
@@ -207,13 +202,8 @@ def learn_stability(folder: Path) -> Sheet:
     charts = []
     for name, one in found.items():
         rows = [row for row in one["rows"] if row.get("map R²") is not None]
-        said = [
-            k
-            for k in ("trained with", "contacts", "gesture", "shown", "trained", "confidence", "s")
-            if rows and k in rows[0]
-        ]
         if rows:
-            values = {", ".join(str(row[k]) for k in said): row["map R²"] for row in rows}
+            values = {", ".join(str(row[k]) for k in _SAID if k in row): row["map R²"] for row in rows}
             charts.append(
                 Chart(f"{name}: R² of the map", "pooled over tested sequences", tuple(bars(values)))
             )
@@ -256,6 +246,15 @@ def _machine(found: Mapping[str, Tree]) -> dict[str, str]:
     return {n: " / ".join(dict.fromkeys(str(one[n]) for one in all_ if n in one)) for n in names}
 
 
+_LEARNING = {
+    "presets": ("--presets",),
+    "fine": ("--fine",),
+    "recovered": ("--rendered", "DATASET"),
+    "ideal-first": ("(at commit 2f82ab3)",),
+}
+"""Folder of learn's results -> what else its command says."""
+_SAID = ("trained with", "contacts", "gesture", "shown", "trained", "confidence", "s")
+"""What names a row of learn's stability."""
 _ENGINE_COMMANDS = (
     "bench pareto engine",
     "bench pareto reading DATASET",

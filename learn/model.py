@@ -3,7 +3,7 @@
 Encoder-decoder of double convolutions; the features of every block pass an attention gate (where × which
 channel), so each skip is gated before it is concatenated; pyramid pooling 1/2/4/8 at the bottom; three
 bounded heads (low, middle, high force) fused by soft weights. Width 32 on 256² is the paper's network:
-13.1 M parameters, 27.6 GFLOP.
+13.1 M parameters, 27.7 GFLOP.
 """
 
 from __future__ import annotations
