@@ -52,7 +52,7 @@ COMMANDS: tuple[Command, ...] = (
     Command("experiment", "loading", "bench.learn_loading", "loading", "--steps 3 --out runs/loading"),
     Command("experiment", "full-size", "bench.learn_full", "full_size", "--cache cache --out full"),
     Command("pareto", "learn", "bench.learn_pareto", "pareto", "--out runs/learn --repeats 10"),
-    Command("experiment", "tune", "bench.tune_experiment", "experiment", "--only easy --fresh 2"),
+    Command("experiment", "tune", "bench.tune_experiment", "experiment", "--only easy --fresh 3"),
     Command("pareto", "end-to-end", "bench.end_to_end", "pareto", "--fit 8 --test 6 --out runs/end-to-end"),
     Command("pareto", "all", "bench.all_results", "pareto", "--out runs/all"),
     Command("stability", "all", "bench.all_results", "stability", "--out runs/all"),

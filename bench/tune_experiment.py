@@ -20,7 +20,8 @@ _SCENES = ("easy", "middle", "hard")
 _KNOBS = "| knob | level | error of the force | takes of the budget | saves of a full frame |"
 _HOW = (
     "Seeds are in the jobs here; probe sequences are drawn from them, and the fresh ones had no part in the "
-    "choice. Costs are of physics, scene, rendering and flow, in the same run."
+    "choice. Costs are of physics, scene, rendering and flow, in CPU time; what two "
+    "budgets share is measured once."
 )
 _WHAT = (
     "The force is read from the displacement of a frame by a fixed linear rule "
@@ -44,7 +45,7 @@ def experiment(
     ] = None,
     probes: Annotated[int, typer.Option(min=1, help="Sequences that every knob is measured on.")] = 3,
     checks: Annotated[int, typer.Option(min=0, help="Further ones for whole settings.")] = 3,
-    fresh: Annotated[int, typer.Option(min=2, help="Sequences that had no part in the choice.")] = 6,
+    fresh: Annotated[int, typer.Option(min=3, help="Sequences that had no part in the choice.")] = 6,
     only: Annotated[
         list[str] | None, typer.Option(help="Scenes; easy, middle and hard if not given.")
     ] = None,
@@ -54,11 +55,12 @@ def experiment(
     budgets = budget or ["force 5%", "force 3%"]
     asked = [tune.Budget.parse(one) for one in budgets]
     words = " ".join(f"--budget {one!r}" for one in budgets)
-    for name in only or _SCENES:
-        source = out / f"{name}.yaml"
-        if not source.is_file():
-            raise UserError(f"{source}: no such scene")
-        job, say = config.load(str(source)), _said(name)
+    scenes = list(only or _SCENES)
+    if unknown := [name for name in scenes if name not in _SCENES]:
+        raise UserError(f"--only {unknown[0]}: no such scene; there are {', '.join(_SCENES)}")
+    jobs = {name: config.load(str(out / f"{name}.yaml")) for name in scenes}
+    for name, job in jobs.items():
+        source, say = out / f"{name}.yaml", _said(name)
         # One budget after the other finds what was measured for the one before.
         journals = out / f"{name}.part", out / f"{name}.fresh.part"
         for one in asked:
@@ -71,12 +73,7 @@ def experiment(
                 "scene": name,
                 "frames": job.frames,
                 "fresh": {
-                    kind: {
-                        "errors": list(whole.errors),
-                        "totals": list(whole.totals),
-                        "apart": list(whole.apart),
-                        "cpu_s_a_frame": whole.cost,
-                    }
+                    kind: tune_file.whole(found, whole)
                     for kind, whole in zip(("full", "before", "after"), fresh_ones, strict=True)
                 },
                 "machine": machine.describe(),
@@ -197,13 +194,17 @@ def readme(rows: list[dict[str, Any]]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _mean(values: list[float]) -> float:
-    return sum(values) / len(values)
+def _mean(values: list[float | None]) -> float:
+    """NaN where a sequence could not be carried out."""
+    known = [value for value in values if value is not None]
+    return sum(known) / len(values) if len(known) == len(values) else float("nan")
 
 
-def _over(values: list[float]) -> str:
+def _over(values: list[float | None]) -> str:
     """Mean over sequences with its interval, in percent."""
-    found = interval(100 * np.asarray(values), np.random.default_rng(0))
+    if None in values:
+        return "out of range"
+    found = interval(100 * np.asarray(values, np.float64), np.random.default_rng(0))
     return f"{found.mean:.1f} [{found.low:.1f}, {found.high:.1f}]"
 
 

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from synth import tune_knobs
+from synth import tune_knobs, versions
 from synth.errors import UserError
 from synth.fem.validity import choose
 from synth.job import Job
@@ -62,16 +62,19 @@ class _Bench:
             except UserError as error:
                 found = str(error)
             self.journal.put(key, found)
-        self.done += 1
-        self.total = max(self.total, self.done)
-        self.report(self.done, self.total, f"sequence {index}: {words}")
+            self.done += 1
+            self.total = max(self.total, self.done)
+            self.report(self.done, self.total, f"sequence {index}: {words}")
+        else:
+            self.total -= 1
         return found
 
     def _probe(self, index: int) -> tuple[Job, Probe]:
-        """A probe sequence; draws that the job itself could not carry out are passed over."""
-        if index not in self._probes:
-            for _, other in self._probes.values():
+        """A probe sequence; draws that cannot be carried out at full fidelity are passed over."""
+        for number, (_, other) in self._probes.items():
+            if number != index:
                 other.rest()
+        if index not in self._probes:
             finest = tune_knobs.finest(tune_knobs.of(self.job))
             for attempt in range(_DRAWS):
                 job = probing(self.job, index, attempt)
@@ -89,7 +92,7 @@ def run(job: Job, budget: Budget, journal_file: Path, probes: int, checks: int, 
 
     Args:
         job: what is to be made cheaper.
-        budget: how far its forces may move.
+        budget: by how much its error of the force may grow over full fidelity's.
         journal_file: keeps what is measured, so that a run that was stopped, or one with another budget, goes
             on from there; the caller's to remove.
         probes: sequences that every knob is measured on.
@@ -101,8 +104,7 @@ def run(job: Job, budget: Budget, journal_file: Path, probes: int, checks: int, 
         UserError: a probe sequence cannot be carried out at full fidelity.
     """
     knobs = tune_knobs.of(job)
-    state = hashlib.blake2b(job.model_dump_json().encode(), digest_size=8).hexdigest()
-    journal = Journal(journal_file, f"{state} {probes}")
+    journal = Journal(journal_file, _state(job))
     levels = sum(len(knob.levels) for knob in knobs)
     total = probes * (levels + 2) + 2 * probes + 3 * checks
     bench = _Bench(job, journal, report, total)
@@ -123,7 +125,8 @@ def run(job: Job, budget: Budget, journal_file: Path, probes: int, checks: int, 
         promised = sweep.error(picked)
         seen.add(tuple(level.words for level in picked))
         tried.append(joint(bench, whole, f"try {len(tried) + 1}", picked, promised))
-        if tried[-1].error <= budget.share or picked == last:
+        dearer = mine.error <= budget.share and tried[-1].cost >= mine.cost
+        if (tried[-1].error <= budget.share and not dearer) or picked == last:
             break
         surprise = whole[int(np.argmax(tried[-1].errors))]
         if sweep.knows(surprise):
@@ -149,14 +152,19 @@ def again(
         count: how many.
         report: progress.
     """
-    state = hashlib.blake2b(found.job.model_dump_json().encode(), digest_size=8).hexdigest()
-    bench = _Bench(found.job, Journal(journal_file, f"{state} again {first}"), report, 3 * count)
+    bench = _Bench(found.job, Journal(journal_file, _state(found.job)), report, 3 * count)
     whole = range(first, first + count)
     full = joint(bench, whole, "full fidelity", [knob.levels[0] for knob in found.knobs], float("nan"))
     mine = [own(knob, found.job) for knob in found.knobs]
     before = joint(bench, whole, "the job as it is", mine, float("nan"))
     after = joint(bench, whole, "the tuned job", found.chosen, float("nan"))
     return full, before, after
+
+
+def _state(job: Job) -> str:
+    """What a journal's measurements are of: the job and the code that makes sequences."""
+    job_hash = hashlib.blake2b(job.model_dump_json().encode(), digest_size=8).hexdigest()
+    return f"{job_hash} {versions.fingerprint()}"
 
 
 def probing(job: Job, index: int, attempt: int = 0) -> Job:

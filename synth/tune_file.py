@@ -107,6 +107,8 @@ def summary(found: Tuned) -> list[str]:
     lines = textwrap.wrap(words, _WIDTH)
     if best.levels == found.full.levels:
         lines.append("Nothing cheaper kept the budget: this is full fidelity itself.")
+    elif best.levels == found.own.levels:
+        lines.append("Nothing cheaper kept the budget: this is the job as it was.")
     return lines
 
 
@@ -129,28 +131,29 @@ def lines(found: Tuned) -> list[str]:
 def as_dict(found: Tuned) -> dict[str, Any]:
     """All that was measured, ready for JSON; errors are parts of the force, infinite ones None."""
 
-    def whole(one: Joint) -> dict[str, Any]:
-        setting = {knob.name: words for knob, words in zip(found.knobs, one.levels, strict=True)}
-        return {
-            "setting": setting,
-            "promised": _finite(one.promised),
-            "error": _finite(one.error),
-            "errors": [_finite(e) for e in one.errors],
-            "totals": [_finite(e) for e in one.totals],
-            "apart": [_finite(e) for e in one.apart],
-            "cpu_s_a_frame": one.cost,
-        }
-
     return {
         "budget": found.budget.share,
         "knobs": [
             vars(row) | {"error": _finite(row.error), "change": _finite(row.change)} for row in found.rows
         ],
-        "full": whole(found.full),
-        "own": whole(found.own),
-        "tried": [whole(one) for one in found.tried],
+        "full": whole(found, found.full),
+        "own": whole(found, found.own),
+        "tried": [whole(found, one) for one in found.tried],
         "sequences": list(found.kinds),
         "changes": {key: value for key, value, _ in changes(found)},
+    }
+
+
+def whole(found: Tuned, one: Joint) -> dict[str, Any]:
+    """A setting measured as a whole, ready for JSON."""
+    return {
+        "setting": {knob.name: words for knob, words in zip(found.knobs, one.levels, strict=True)},
+        "promised": _finite(one.promised),
+        "error": _finite(one.error),
+        "errors": [_finite(e) for e in one.errors],
+        "totals": [_finite(e) for e in one.totals],
+        "apart": [_finite(e) for e in one.apart],
+        "cpu_s_a_frame": _finite(one.cost),
     }
 
 

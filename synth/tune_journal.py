@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from synth.errors import UserError
+from synth.folder import write_whole
 from synth.tune_probe import Measured
 
 
@@ -16,20 +17,23 @@ class Journal:
     """One JSON line a measurement; the first line says of which job."""
 
     def __init__(self, path: Path, of: str) -> None:
-        """Takes up the file if it is of the same job; starts it anew otherwise.
+        """Takes up the file if there is one, starts it otherwise.
 
         Raises:
-            UserError: the file cannot be written.
+            UserError: the file cannot be written, or is of something else.
         """
         self._path = path
         self._known: dict[str, Measured | str] = {}
         try:
             lines = path.read_text("utf-8").splitlines() if path.exists() else []
-            if not lines or json.loads(lines[0]) != of:
+            if not lines:
                 path.write_text(json.dumps(of) + "\n", "utf-8")
                 return
+            before = json.loads(lines[0])
         except (OSError, ValueError) as error:
             raise UserError(f"{path}: cannot be read or written ({error})") from error
+        if before != of:
+            raise UserError(f"{path}: is of another job or version; remove it to start anew")
         for line in lines[1:]:
             try:
                 key, value = json.loads(line)
@@ -37,9 +41,8 @@ class Journal:
                 break  # cut off while it was written
             self._known[key] = _read(value)
         # Without a line that was cut off.
-        path.write_text(
-            "\n".join([json.dumps(of), *(json.dumps([k, _plain(v)]) for k, v in self._known.items())]) + "\n"
-        )
+        kept = [json.dumps(of), *(json.dumps([k, _plain(v)]) for k, v in self._known.items())]
+        write_whole(path, "\n".join(kept) + "\n")
 
     def get(self, key: str) -> Measured | str | None:
         return self._known.get(key)

@@ -111,7 +111,7 @@ class Sweep:
         """What each level of a knob does on one sequence; a text where it cannot be carried out."""
         base = dict(self._finest)
         if knob.name in ("law", "time"):
-            base |= {"fem.tets": min(_SIDE_TETS, self._finest["fem.tets"])}
+            base |= {"fem.tets": _SIDE_TETS}
         elif knob.kind != "physics" and knob.name != "size":
             base |= self._side()
         pictures = knob.kind != "physics"
