@@ -54,8 +54,10 @@ def pareto(
     parts = [
         "<p>Each default of the code among the points measured for it, none dearer than it needs to be: off "
         "the front is by how much it costs more than the cheapest point that errs no more, or errs more than "
-        f"the best that costs no more, whichever is less; {100 * fronts.ALLOWED:.0f}% are allowed. Rings "
-        "mark defaults.</p>",
+        f"the best that costs no more, whichever is less; {100 * fronts.ALLOWED:.0f}% are allowed. "
+        "Where errors have intervals (end to end) another rule decides: a default is off the front when a "
+        "point that costs no more errs less beyond the interval of their paired difference, and by more than "
+        f"{100 * fronts.ALLOWED:.0f}%. Rings mark defaults.</p>",
         plot.table(rows),
         plot.charts(list(_pareto_panels(results))),
         *_credits([results / name for name in PARETO]),

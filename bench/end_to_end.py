@@ -4,10 +4,10 @@ A pipeline makes sequences (law, mesh, paths), recovers their flow and fits a mo
 the force of sequences that a finer pipeline made of scenes it has not seen, from the flow that its own
 estimator recovers there. Its cost is the CPU time of one frame of its data and of one answer.
 
-What is asked is restricted to one instrument that pulls or pushes. Flow shows the force along the line of
-sight only through the little that tissue spreads under a push, and a grasp's two jaws gather it as well: with
-grasps among the scenes that part was lost on true flow already. On recovered flow it is lost without them
-too, half of the squared force: so the part across the line of sight is judged by itself besides.
+What is asked is restricted to one instrument that pulls or pushes: flow shows the force along the line of
+sight only through the little that tissue spreads under a push, and a grasp's two jaws gather it as well. On
+recovered flow hardly anything of that part is learnt (`along` in the results): so the part across the line of
+sight is judged by itself besides.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """What answers with a force in `bench pareto end-to-end`: rules fitted on flow, physics alone, a network.
 
 The force on the tissue turns with the picture, so the fitted rules see every sequence in its eight turns and
-mirrors, as the network does by drawing them: on true flow that halves the ridge's error across the line of
-sight.
+mirrors, as the network does by drawing them.
 """
 
 from __future__ import annotations

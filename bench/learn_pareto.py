@@ -28,6 +28,7 @@ from learn.reference import build
 from learn.settings import PRESETS
 from learn.statistics import Interval
 from learn.threads import set_threads
+from synth.errors import UserError
 
 TURNS = 4
 """Times that all networks are gone through."""
@@ -66,7 +67,8 @@ def pareto(
     only: Annotated[
         str,
         typer.Option(
-            help="Only networks whose name and way hold one of these, by commas; none: errors anew."
+            help="Time only networks whose name and way hold one of these words, by commas (empty: all) "
+            "and keep the others' times. A word that none holds times nothing: pages and errors anew."
         ),
     ] = "",
     json: Annotated[bool, typer.Option("--json", help="Print JSON on stdout.")] = False,
@@ -85,6 +87,8 @@ def pareto(
     choices = list(dict.fromkeys(_choices(device, known)))
     asked = {(shape(c.arch), c.size, c.layout, c.precision) for c in choices}
     chosen = [c for c in choices if any(word in _named(c) for word in only.split(","))]
+    if not chosen and not any(out.glob("data-*.json")):
+        raise UserError(f"--only {only}: no network's name or way holds that, and {out} has no times to show")
     new = measure(chosen, repeats, device)
     again = {_way(row) for row in new}
     rows[:] = [r for r in rows if _way(r) in asked - again] + new
@@ -211,6 +215,7 @@ def _lines(rows: list[dict[str, Any]]) -> list[dict[str, object]]:
             "GFLOP": r["gflop"],
             "p50 [ms]": r["ms_p50"],
             "p95 [ms]": r["ms_p95"],
+            "frames": r["frames"],
             "map RMSE [mN/mm²]": _text(r["map_rmse"]),
             "against its grid's preset": _share(r["against"]),
             "map RMSE over 0.56 mm": _text(r["wide_rmse"]),
@@ -304,14 +309,17 @@ def chart(rows: list[dict[str, Any]], device: str) -> list[plot.Panel]:
 
 
 def _short(row: dict[str, Any]) -> str:
-    return f"w{row['arch']['width']} stem{row['arch']['stem']} depth{row['arch']['levels']}"
+    arch = architecture(row["arch"])
+    name = "" if arch.name == "d2fnet" else f"{arch.name} "
+    return f"{name}w{arch.width} stem{arch.stem}{'+detail' if arch.detail else ''} depth{arch.levels}"
 
 
 _HEAD = """# Learn: time a frame, and error where it was trained
 
 `bench pareto learn`. From displacement on the grid to the force map, channels included, batch norms folded,
 one frame at a time; CPU time of one thread on a CPU, wall time on a GPU. `cpu` is the preset of `learn train`
-where none is named, `live` is `d2fnet-s`. Machine: 2 cores, no GPU.
+where none is named, `live` is `d2fnet-s`. Networks beyond 5 GFLOP are timed a few times only; of the others,
+rows with fewer frames than `--repeats` were timed in an earlier run. Machine: 2 cores, no GPU.
 
 Errors are of `bench experiment learn --presets` and, on 64², of the study's own runs: fold 0, with the loss
 and dropout of the grid's preset, in equal steps on the same batches, all saying magnitudes; mean over tested

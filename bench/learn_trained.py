@@ -60,13 +60,13 @@ Known = Mapping[tuple[Shape, int], Trained]
 def errors(root: Path) -> Known:
     """Networks by shape and grid, trained as their grid's preset is: its loss, its dropout.
 
-    `root`: learn's results. A run with another loss says nothing of the preset and is left out; so are those
-    of other folds, lengths and outputs than the study's.
+    `root`: learn's results. A run with another loss says nothing of the preset and is left out; so is one
+    that differs from the study's in any other setting, or was tested on recovered flow.
     """
     found: dict[tuple[Shape, int], dict[int, dict[str, Any]]] = {}
     for file in sorted([*root.glob("ideal/runs/*.json"), *root.glob("presets/runs/*.json")]):
         run = json.loads(file.read_text())
-        if not run["control"] and _alike(run["settings"]):
+        if not run["control"] and run["source"] == "ideal" and _alike(run["settings"]):
             tree = run["settings"]
             found.setdefault((shape(architecture(tree["arch"])), tree["size"]), {})[tree["seed"]] = run
     out = {}
@@ -102,8 +102,14 @@ def _alike(tree: dict[str, Any]) -> bool:
     loss = asdict(preset.objective) | {"ramp": list(preset.objective.ramp)}
     # Squared error has no weights: what else stood in its tree, in other versions, decided nothing.
     same = tree["objective"] == loss or tree["objective"]["kind"] == loss["kind"] == "mse"
-    plain = ("epochs", "batch", "learning_rate", "schedule", "fold", "folds", "frames", "target", "input")
-    return arch == own and same and all(tree[name] == getattr(study, name) for name in plain)
+    asked = replace(study, seed=tree["seed"], size=tree["size"], arch=own).as_dict()
+    return same and _plain(asked) == _plain(tree)
+
+
+def _plain(tree: dict[str, Any]) -> dict[str, Any]:
+    """Settings as JSON holds them, but for the loss."""
+    found: dict[str, Any] = json.loads(json.dumps(tree | {"objective": None}))
+    return found
 
 
 def _mean(runs: list[dict[str, Any]], name: str) -> NDArray[np.float64]:

@@ -192,8 +192,8 @@ def learning(folder: Path) -> Sheet:
         charts.append(
             Chart(words, "mean over tested sequences, BCa interval; in brackets: runs", tuple(rows))
         )
-    words = ["bench experiment learn --cache CACHE", *_LEARNING.get(folder.name, ())]
-    return Sheet(f"Learning: {folder.name}", " ".join(words), {}, tuple(charts))
+    command = " ".join(["bench experiment learn --cache CACHE", *_LEARNING.get(folder.name, ())])
+    return Sheet(f"Learning: {folder.name}", command, {}, tuple(charts))
 
 
 def learn_stability(folder: Path) -> Sheet:

@@ -125,6 +125,7 @@ def kept(root: Path, run: Run, rmse: list[float]) -> None:
     names = ("map_rmse", "map_rmse_wide", "force_mae")
     rows = [{"name": f"{k}"} | dict.fromkeys(names, v) for k, v in enumerate(rmse)]
     tree = {"name": run.name, "control": run.control, "settings": run.settings.as_dict(), "sequences": rows}
+    tree["source"] = run.source
     file = root / "presets/runs" / f"{run.name}.json"
     file.parent.mkdir(parents=True, exist_ok=True)
     file.write_text(json.dumps(tree))
@@ -141,6 +142,10 @@ def test_errors_are_of_runs_that_were_trained_as_the_preset_is(tmp_path: Path) -
     mse = dataclasses.replace(cpu.settings, objective=Objective(kind="mse"), seed=7)
     kept(tmp_path, Run("another-loss", mse), [9.0] * 4)
     kept(tmp_path, Run("longer", dataclasses.replace(cpu.settings, epochs=99, seed=8)), [9.0] * 4)
+    decayed = dataclasses.replace(cpu.settings, weight_decay=0.1, seed=9)
+    kept(tmp_path, Run("other-decay", decayed), [9.0] * 4)
+    elsewhere = dataclasses.replace(cpu.settings, seed=10)
+    kept(tmp_path, Run("on-recovered", elsewhere, source="recovered"), [9.0] * 4)
     found = errors(tmp_path)
     assert set(found) == {(shape(r.settings.arch), 128) for r in (cpu, other)}
     mine, beside = (found[shape(r.settings.arch), 128] for r in (cpu, other))
