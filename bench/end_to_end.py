@@ -12,6 +12,7 @@ sight is judged by itself besides.
 
 from __future__ import annotations
 
+import hashlib
 import json as json_
 import shutil
 from collections.abc import Sequence
@@ -31,7 +32,7 @@ from bench.refollow import refollow
 from learn import data
 from learn.data import Clip
 from learn.statistics import interval, paired
-from synth import pipeline, place
+from synth import identity, pipeline, place, versions
 from synth.fem.validity import choose
 from synth.flow import mask
 from synth.job import Fem, Flow, Job, Render
@@ -137,14 +138,18 @@ def pareto(
         "docs/results/end-to-end"
     ),
     work: Annotated[
-        Path, typer.Option(help="Folder for sequences, flow and answers; what is there already is used.")
-    ] = Path("end-to-end-work"),
+        Path,
+        typer.Option(
+            help="Folder for sequences, flow and answers; what is there already is used, if the same job, "
+            "generator and estimator made it."
+        ),
+    ] = Path("runs/end-to-end-work"),
     fit: Annotated[int, typer.Option(min=4, help="Sequences that each pipeline makes to fit on.")] = 40,
     test: Annotated[int, typer.Option(min=3, help="Sequences that all are asked about.")] = 24,
     seed: Annotated[int, typer.Option(min=0, help="Root of every draw.")] = 31,
     epochs: Annotated[int, typer.Option(min=1, help="Of the network.")] = 60,
     rounds: Annotated[
-        int, typer.Option(min=1, help="How often everything is timed, in turn, once the answers are there.")
+        int, typer.Option(min=2, help="How often everything is timed, in turn, once the answers are there.")
     ] = 4,
     json: Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")] = False,
 ) -> None:
@@ -156,7 +161,8 @@ def pareto(
 
     asked = Made(FINE, FINE.job(seed + 1, test), work)
     made = {one.world: Made(one.world, one.world.job(seed, fit), work) for one in chosen()}
-    run = work / f"answers-{fit}-{test}-{seed}-{epochs}"
+    sources = _word([asked.name, *(one.name for one in made.values())])
+    run = work / f"answers-{fit}-{test}-{seed}-{epochs}-{sources}"
     rows: list[dict[str, Any]] = []
     for one in chosen():
         rows.append(one.words() | answered(one, made[one.world], asked, run, epochs, seed))
@@ -188,7 +194,7 @@ def pareto(
         "together, root mean square over frames as a part of the force's own, by sequence; across, along: "
         "the parts of it across and along the line of sight, whose squares add up in every sequence",
         "asked": asdict(FINE),
-        "zero": 1.0,
+        "zero": nothing["errors"],
         "across_zero": nothing["across"],
         "rows": summarised(rows, seed),
         "rounds": costs.rounds,
@@ -223,13 +229,23 @@ def difference(usual: list[float], other: list[float], seed: int) -> list[float]
     return [found.mean, found.low, found.high]
 
 
+def called(world: World, job: Job) -> str:
+    """Folder of a world's sequences: another one when the job's constants or the generator's code change."""
+    return f"{world.name}-{job.seed}-{_word([identity.of(job), versions.fingerprint()])}"
+
+
+def _word(value: Any) -> str:
+    return hashlib.blake2b(identity.canonical(value), digest_size=5).hexdigest()
+
+
 class Made:
     """Sequences of one world on the baselines' grid, with the flow that any estimator recovers from them."""
 
     def __init__(self, world: World, job: Job, work: Path) -> None:
         """Renders what is not there yet."""
         self.world, self._job = world, job
-        self._folder = work / f"{world.name}-{job.seed}"
+        self.name = called(world, job)
+        self._folder = work / self.name
         self._folder.mkdir(parents=True, exist_ok=True)
         for index in range(job.sequences):
             target = place.store(self._folder, index)
@@ -242,17 +258,24 @@ class Made:
         return [self._clip(index, flow) for index in range(self._job.sequences)]
 
     def _clip(self, index: int, flow: str) -> Clip:
-        kept = self._folder / f"clips-{GRID.size}" / flow / f"{index:06d}"
+        kept = self._folder / f"clips-{GRID.size}" / self._estimator(flow) / f"{index:06d}"
         if not kept.is_dir():
             data.pack(self._followed(index, flow), kept)
         return data.unpack(kept)
+
+    def _flow(self, backend: str) -> Flow:
+        return self._job.flow.model_copy(update={"backend": backend})
+
+    def _estimator(self, flow: str) -> str:
+        """An estimator and its settings in a folder's name; its code is in the generator's fingerprint."""
+        return f"{flow}-{_word(self._flow(flow).model_dump(mode='json'))}"
 
     def _followed(self, index: int, flow: str) -> Clip:
         sequence = open_sequence(place.store(self._folder, index))
         clip = data.read(sequence, GRID, ("ideal",))
         if flow == "ideal":
             return replace(clip, displacement=clip.displacement | {"recovered": clip.displacement["ideal"]})
-        estimator = pipeline.estimator(self._job.flow.model_copy(update={"backend": flow}))
+        estimator = pipeline.estimator(self._flow(flow))
         hidden = mask.hidden(sequence["rgb"][...], sequence["tool"][...].astype(bool))
         return refollow(sequence, clip, estimator, hidden, GRID)[0]
 

@@ -58,11 +58,12 @@ def measure(
         answers: models, fitted.
         clips: what they are asked about; one a round, and once more if there are fewer.
         work: existing folder for the sequences, which are removed.
-        rounds: one sequence of every world each.
+        rounds: one sequence of every world each; at least two, for estimators and models are cold in the
+            first.
         report: told of every round.
     """
     found: defaultdict[str, list[float]] = defaultdict(list)
-    for job in jobs.values():  # compiles
+    for job in jobs.values():  # compiles; flow and models are warm after the first of the rounds
         _rendered(job.model_copy(update={"frames": 2}), 0, work / "warm")
     for k in range(rounds):
         followed: Stored | None = None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -21,6 +22,7 @@ from learn.model import Architecture
 from learn.settings import Settings, preset
 from learn.threads import set_threads
 from synth import config
+from synth.errors import UserError
 from synth.job import Job
 
 RESULTS = Path("docs/results/learn")
@@ -150,15 +152,20 @@ def experiment(
     ] = False,
 ) -> None:
     """Train and score learn's choices; done runs are kept, the summary is made anew."""
+    if (rendered is not None) + fine + presets > 1:
+        raise UserError("--rendered, --fine and --presets each have their own runs: give one of them")
     set_threads(1)
     say = Console(stderr=True).print
     packed: dict[int, list[Clip]] = {}
-    job = config.load(str(RESULTS / "data/labels.yaml"))
+
+    @functools.cache
+    def job() -> Job:
+        return config.load(str(RESULTS / "data/labels.yaml"))
 
     def sequences(grid: Grid) -> list[Clip]:
         if grid.size not in packed:
             packed[grid.size] = (
-                labels(pictured(job, grid), grid, cache)
+                labels(pictured(job(), grid), grid, cache)
                 if rendered is None
                 else load(rendered, grid, ("ideal", "recovered"), cache=cache)
             )
@@ -175,7 +182,7 @@ def experiment(
             grid = run.settings.grid
             # A press costs a sequence: once is enough to say what calibration gives.
             asked = name == "ideal" and run.name in PRESSED
-            presses = (lambda index: press(job, index, small().grid, cache)) if asked else None
+            presses = (lambda index: press(job(), index, small().grid, cache)) if asked else None
             carry_out(run, sequences(grid), out / name / "runs", cache / "models" / name, say, presses)
     write(out)
     say(f"{out}/README.md")

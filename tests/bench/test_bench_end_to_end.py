@@ -131,6 +131,16 @@ def row(cpu_s: float, errors: list[float], *, default: bool = False, tets: int =
     }  # fmt: skip
 
 
+def test_kept_sequences_are_found_only_by_what_made_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    world = end_to_end.FINE
+    job = world.job(1, 4)
+    here = end_to_end.called(world, job)
+    assert end_to_end.called(world, world.job(1, 9)) == here  # more of the same
+    longer = end_to_end.called(world, job.model_copy(update={"frames": job.frames + 1}))
+    monkeypatch.setattr("synth.versions.fingerprint", lambda: "another")
+    assert len({here, longer, end_to_end.called(world, job)}) == 3
+
+
 def test_differences_are_paired() -> None:
     """Sequences that differ widely among themselves, and all by a tenth from one pipeline to the other."""
     usual = list(np.linspace(0.2, 1.2, 12))

@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 from bench import learn_disturb as disturb
 from bench.learn_badinput import bad_inputs
 from bench.learn_controls import beyond_mean_map, controls, mean_map
-from bench.learn_experiment import pictured, preset_runs
+from bench.learn_experiment import experiment, pictured, preset_runs
 from bench.learn_labels import coarser
+from bench.learn_pareto import pareto
 from bench.learn_runs import Run
 from bench.learn_table import markdown
 from bench.learn_trained import errors, shape
@@ -162,6 +163,17 @@ def test_runs_that_were_tested_on_other_sequences_are_not_averaged(tmp_path: Pat
     kept(tmp_path, Run("again", dataclasses.replace(first.settings, seed=1)), [1.0, 2.0])
     with pytest.raises(UserError, match="different sequences"):
         errors(tmp_path)
+
+
+def test_runs_of_two_kinds_are_not_asked_for_at_once(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="one of them"):
+        experiment(tmp_path, fine=True, presets=True)
+
+
+def test_a_word_that_no_network_holds_needs_times_to_show(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="nothing"):
+        pareto(tmp_path / "new", tmp_path, only="nothing")
+    assert not (tmp_path / "new").exists()
 
 
 def test_controls_score_what_they_must(clips: list[Clip], model: Path) -> None:
