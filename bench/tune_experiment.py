@@ -114,7 +114,7 @@ def panels(rows: list[dict[str, Any]]) -> list[plot.Panel]:
                     tuple(f"{one['level']}" for one in own),
                 )
             )
-        whole = [("full", row["full"]), ("the job as it was", row["own"]), ("tuned", row["tried"][-1])]
+        whole = [("full", row["full"]), ("the job as it was", row["own"]), ("tuned", row["best"])]
         curves.append(
             plot.Curve(
                 "whole job",
@@ -133,7 +133,7 @@ def table(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """One line a scene."""
     lines = []
     for row in rows:
-        fresh, best = row["fresh"], row["tried"][-1]
+        fresh, best = row["fresh"], row["best"]
         lines.append(
             {
                 "scene": row["scene"],

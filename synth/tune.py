@@ -38,6 +38,7 @@ Report = Callable[[int, int, str], None]
 _TRIES = 6
 _DRAWS = 5
 _STEP = (0.6, 0.95)  # after a broken promise, the next may be this part of it
+_MORE = (1.05, 1.6)  # after a kept one
 
 
 @dataclass
@@ -118,25 +119,35 @@ def run(job: Job, budget: Budget, journal_file: Path, probes: int, checks: int, 
     seen: set[tuple[str, ...]] = set()
     # The budget is counted from full fidelity, which keeps it by itself.
     last = own_levels if mine.error <= budget.share else [knob.levels[0] for knob in knobs]
-    while True:
+    best: tuple[list[Level], Joint] | None = None
+    while len(tried) < _TRIES:
         picked = sweep.cheapest(allowed, own_levels, seen)
-        if picked is None or len(tried) == _TRIES - 1 or sweep.price(picked) >= sweep.price(last):
-            picked = last
-        promised = sweep.error(picked)
-        seen.add(tuple(level.words for level in picked))
-        tried.append(joint(bench, whole, f"try {len(tried) + 1}", picked, promised))
-        dearer = mine.error <= budget.share and tried[-1].cost >= mine.cost
-        if (tried[-1].error <= budget.share and not dearer) or picked == last:
+        if picked is None or sweep.price(picked) >= sweep.price(best[0] if best else last):
             break
-        surprise = whole[int(np.argmax(tried[-1].errors))]
+        seen.add(tuple(level.words for level in picked))
+        found = joint(bench, whole, f"try {len(tried) + 1}", picked, sweep.error(picked))
+        tried.append(found)
+        limit = best[1].cost if best else mine.cost if last is own_levels else np.inf
+        if found.error <= budget.share and found.cost < limit:
+            # It kept more than it promised: something cheaper may keep the budget too.
+            best = picked, found
+            allowed *= float(np.clip(budget.share / max(found.error, 1e-9), *_MORE))
+            continue
+        if best:
+            break
+        surprise = whole[int(np.argmax(found.errors))]
         if sweep.knows(surprise):
             # Promises are held to less, by what this one missed, but not to little for a single surprise.
-            allowed *= float(np.clip(budget.share / tried[-1].error, *_STEP))
+            allowed *= float(np.clip(budget.share / found.error, *_STEP))
         else:
             sweep.learn(surprise)  # which knob did it?
+    if best is None:
+        best = last, joint(bench, whole, f"try {len(tried) + 1}", last, sweep.error(last))
+        tried.append(best[1])
+    picked, answer = best
     kinds = tuple(scenario_kind(job, index) for index in whole)
     return Tuned(
-        job, budget, tuple(knobs), tuple(picked), tuple(sweep.rows()), full, mine, tuple(tried), kinds
+        job, budget, tuple(knobs), tuple(picked), tuple(sweep.rows()), full, mine, tuple(tried), answer, kinds
     )
 
 

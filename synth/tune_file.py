@@ -102,7 +102,7 @@ def summary(found: Tuned) -> list[str]:
         f"recovered displacement is off by {_percent(best.total)}, as it was {_percent(found.own.total)}, "
         f"at full fidelity {_percent(found.full.total)}. A frame costs {best.cost:.2f} "
         f"CPU-s (physics, scene, rendering, flow) instead of {own_cost:.2f}, at full fidelity "
-        f"{found.full.cost:.2f}. {len(found.tried)} settings were measured as a whole, the last one is this."
+        f"{found.full.cost:.2f}. {len(found.tried)} settings were measured as a whole."
     )
     lines = textwrap.wrap(words, _WIDTH)
     if best.levels == found.full.levels:
@@ -139,6 +139,7 @@ def as_dict(found: Tuned) -> dict[str, Any]:
         "full": whole(found, found.full),
         "own": whole(found, found.own),
         "tried": [whole(found, one) for one in found.tried],
+        "best": whole(found, found.best),
         "sequences": list(found.kinds),
         "changes": {key: value for key, value, _ in changes(found)},
     }

@@ -86,10 +86,7 @@ class Tuned:
     own: Joint
     """The job as it was."""
     tried: tuple[Joint, ...]
-    """The last one is the answer."""
+    best: Joint
+    """Of those the answer."""
     kinds: tuple[str, ...]
     """Gestures of the probe sequences."""
-
-    @property
-    def best(self) -> Joint:
-        return self.tried[-1]

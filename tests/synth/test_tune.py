@@ -126,6 +126,22 @@ def test_what_turns_out_dearer_is_not_taken(monkeypatch: pytest.MonkeyPatch, tmp
     assert done.best.cost <= done.own.cost
 
 
+def test_a_promise_that_is_more_than_kept_leads_to_a_cheaper_one(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    measured = tune.joint
+
+    def joint(*arguments: Any) -> tune.Joint:
+        found = measured(*arguments)
+        return replace(found, errors=tuple(0.5 * error for error in found.errors))
+
+    monkeypatch.setattr(tune, "Probe", Fake)
+    monkeypatch.setattr(tune, "joint", joint)
+    done = tune.run(JOB, tune.Budget(0.03), tmp_path / "part", 1, 0, lambda done, total, words: None)
+    assert done.best.promised > 0.03 >= done.best.error
+    assert done.best.cost == min(one.cost for one in done.tried if one.error <= 0.03)
+
+
 def test_a_sequence_that_breaks_a_promise_is_asked_which_knob_did_it(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
