@@ -133,7 +133,7 @@ def test_a_promise_that_is_more_than_kept_leads_to_a_cheaper_one(
 
     def joint(*arguments: Any) -> tune.Joint:
         found = measured(*arguments)
-        return replace(found, errors=tuple(0.5 * error for error in found.errors))
+        return replace(found, errors=tuple(0.2 * error for error in found.errors))
 
     monkeypatch.setattr(tune, "Probe", Fake)
     monkeypatch.setattr(tune, "joint", joint)
