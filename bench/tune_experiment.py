@@ -89,14 +89,19 @@ def experiment(
 
 def write(out: Path) -> list[dict[str, Any]]:
     """Picture, page and README of the scenes whose data are in `out`; gives those back."""
-    files = [file for name in _SCENES for file in out.glob(f"{name}-*.json")]
-    rows = [json_.loads(file.read_text("utf-8")) for file in files]
-    rows.sort(key=lambda row: (_SCENES.index(row["scene"]), -row["budget"]))
+    rows = read(out)
     commands = "; ".join(dict.fromkeys(row["command"] for row in rows))
     title = "Tuning: what each knob does to the force, and what it costs"
     plot.write(panels(rows), out, title, table(rows), rows[0] | {"command": commands})
     results.keep(out, "README.md", readme(rows))
     return rows
+
+
+def read(out: Path) -> list[dict[str, Any]]:
+    """The data in `out`, scene by scene, the loosest budget first."""
+    files = [file for name in _SCENES for file in out.glob(f"{name}-*.json")]
+    rows = [json_.loads(file.read_text("utf-8")) for file in files]
+    return sorted(rows, key=lambda row: (_SCENES.index(row["scene"]), -row["budget"]))
 
 
 def panels(rows: list[dict[str, Any]]) -> list[plot.Panel]:

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from bench import pages, sheet
+from bench import pages, sheet, tune_experiment
 from bench.cli import app
 from bench.sheet import Chart, Sheet
 
@@ -31,6 +31,19 @@ def test_data_have_a_page_and_a_picture(file: Path) -> None:
     pages = [p.read_text("utf-8") for folder in above for p in folder.glob("index.html")]
     assert pages, file
     assert TABLES & {str(folder) for folder in file.parents} or any("<svg" in page for page in pages), file
+
+
+@pytest.mark.parametrize(
+    "page", sorted(RESULTS.rglob("index.html")), ids=lambda p: str(p.relative_to(RESULTS))
+)
+def test_a_page_has_its_data(page: Path) -> None:
+    # `all` gathers what the other rooms have.
+    assert "all" in page.relative_to(RESULTS).parts or any(page.parent.rglob("*.json"))
+
+
+def test_tuning_says_what_its_data_say() -> None:
+    folder = RESULTS / "tune"
+    assert (folder / "README.md").read_text("utf-8") == tune_experiment.readme(tune_experiment.read(folder))
 
 
 @pytest.mark.parametrize("folder", sorted({Path(file.parts[0]) for file in DATA}), ids=str)
