@@ -160,25 +160,27 @@ def pareto(
             typer.echo(line)
 
     asked = Made(FINE, FINE.job(seed + 1, test), work)
-    made = {one.world: Made(one.world, one.world.job(seed, fit), work) for one in chosen()}
+    pipelines = chosen()
+    worlds = dict.fromkeys(one.world for one in pipelines)
+    made = {world: Made(world, world.job(seed, fit), work) for world in worlds}
     sources = _word([asked.name, *(one.name for one in made.values())])
     run = work / f"answers-{fit}-{test}-{seed}-{epochs}-{sources}"
     rows: list[dict[str, Any]] = []
-    for one in chosen():
+    for one in pipelines:
         rows.append(one.words() | answered(one, made[one.world], asked, run, epochs, seed))
-        say(f"{len(rows)} of {len(chosen())}: {one.name}, {100 * np.mean(rows[-1]['errors']):.0f}%")
-    usual = [one for one in chosen() if one.default]
+        say(f"{len(rows)} of {len(pipelines)}: {one.name}, {100 * np.mean(rows[-1]['errors']):.0f}%")
+    usual = [one for one in pipelines if one.default]
     ready = {one.model: _answer(one, made[one.world], run, epochs, seed) for one in usual}
     costs = end_to_end_costs.measure(
         {world.name: world.job(seed, fit) for world in made},
-        [flow for flow in dict.fromkeys(one.flow for one in chosen()) if flow != "ideal"],
+        [flow for flow in dict.fromkeys(one.flow for one in pipelines) if flow != "ideal"],
         ready,
         asked.clips(Flow().backend),
         work,
         rounds,
         say,
     )
-    for one, row in zip(chosen(), rows, strict=True):
+    for one, row in zip(pipelines, rows, strict=True):
         row |= {"data_s": costs.data[one.world.name], "flow_s": costs.flow[one.flow]}
         row |= {"answer_s": costs.answer[one.model]}
         row["cpu_s"] = row["data_s"] + row["flow_s"] + row["answer_s"]

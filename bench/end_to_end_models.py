@@ -9,12 +9,14 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bench import baseline
 from bench.baseline import GRID
+from learn import batch
 from learn.data import Clip
 
 Floats = NDArray[np.float64]
@@ -58,49 +60,21 @@ def build(model: str, fit: Sequence[Clip], folder: Path, epochs: int, seed: int)
 
 def turned(clip: Clip) -> list[Clip]:
     """The clip in its four quarter turns and their mirrors, all arrays and the force turned with it."""
-    found = []
-    for mirrored in (False, True):
-        one = _mirrored(clip) if mirrored else clip
-        for _ in range(4):
-            found.append(one)
-            one = _quarter(one)
-    return found
+    return [_turned(clip, quarter, mirror) for mirror in (False, True) for quarter in range(4)]
 
 
-def _mirrored(clip: Clip) -> Clip:
-    """Left and right exchanged."""
-    flip = np.array([-1.0, 1.0, 1.0])
-    moved = {
-        name: np.ascontiguousarray(d[..., ::-1]) * flip[:2, None, None].astype(np.float32)
-        for name, d in clip.displacement.items()
-    }
+def _turned(clip: Clip, quarter: int, mirror: bool) -> Clip:
+    def each(fields: NDArray[Any]) -> NDArray[Any]:
+        return np.stack([batch.turned(field, quarter, mirror) for field in fields])
+
     return replace(
         clip,
-        displacement=moved,
-        mask=clip.mask[:, ::-1],
-        confidence=clip.confidence[..., ::-1],
-        density=clip.density[..., ::-1] * flip[:, None, None].astype(np.float32),
-        force=clip.force * flip,
+        displacement={name: each(moved) for name, moved in clip.displacement.items()},
+        mask=each(clip.mask[None, None])[0, 0],
+        confidence=each(clip.confidence[:, None])[:, 0],
+        density=each(clip.density),
+        force=each(clip.force[..., None, None])[..., 0, 0],
     )
-
-
-def _quarter(clip: Clip) -> Clip:
-    """A quarter turn: what pointed along x points against y."""
-    moved = {name: _turned_vectors(np.rot90(d, axes=(-2, -1)), 1) for name, d in clip.displacement.items()}
-    return replace(
-        clip,
-        displacement=moved,
-        mask=np.rot90(clip.mask),
-        confidence=np.rot90(clip.confidence, axes=(-2, -1)),
-        density=_turned_vectors(np.rot90(clip.density, axes=(-2, -1)), 1),
-        force=np.asarray(_turned_vectors(clip.force, 1), np.float64),
-    )
-
-
-def _turned_vectors(values: NDArray[np.floating], axis: int) -> NDArray[np.floating]:
-    """(x, y, ...) → (y, -x, ...) along an axis."""
-    x, y, *rest = np.moveaxis(values, axis, 0)
-    return np.stack([y, -x, *rest], axis=axis)
 
 
 def _rows(clip: Clip) -> Floats:

@@ -70,11 +70,11 @@ def together(drawings: Sequence[str]) -> str:
 
 def bars(
     values: Mapping[str, float], ends: Mapping[str, tuple[float, float]] | None = None
-) -> list[forest.Row]:
+) -> tuple[forest.Row, ...]:
     """A line a value, with its interval where there is one."""
     known = ends or {}
     nan = (float("nan"), float("nan"))
-    return [forest.Row(name, float(value), known.get(name, nan)) for name, value in values.items()]
+    return tuple(forest.Row(name, float(value), known.get(name, nan)) for name, value in values.items())
 
 
 def flat(tree: Mapping[str, Any]) -> list[dict[str, Any]]:
@@ -94,11 +94,10 @@ def flat(tree: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 def write(sheet: Sheet, folder: Path) -> list[str]:
     """Writes its files into `folder`; gives back the names of those that changed."""
-    changed = stale(sheet, folder)
-    for name, text in sheet.files().items():
-        if name in changed:
-            results.keep(folder, name, text)
-    return changed
+    changed = {name: text for name, text in sheet.files().items() if not _same(folder / name, text)}
+    for name, text in changed.items():
+        results.keep(folder, name, text)
+    return list(changed)
 
 
 def stale(sheet: Sheet, folder: Path) -> list[str]:

@@ -63,7 +63,7 @@ def scoring(found: Tree) -> Sheet:
         "What scoring costs",
         found["command"],
         found,
-        (Chart(title, "wall s by stage, two processes side by side", tuple(bars(stages))),),
+        (Chart(title, "wall s by stage, two processes side by side", bars(stages)),),
         (("Stages", timed),),
     )
 
@@ -77,7 +77,7 @@ def stages(found: Tree) -> Sheet:
         "The whole way, by stage",
         "bench experiment stages runs/demo/data -o docs/results/pipeline/stages",
         found,
-        (Chart("Median over sequences; the bar ends at the largest", "CPU s a frame", tuple(rows)),),
+        (Chart("Median over sequences; the bar ends at the largest", "CPU s a frame", rows),),
         (("In all", flat(found)),),
     )
 
@@ -94,7 +94,7 @@ def flow(found: Tree) -> Sheet:
             for row in rows
             if row["on"] == on and row["asked"]
         }
-        charts.append(Chart(f"{on}: reached where at most 1", "measured / asked", tuple(bars(shares))))
+        charts.append(Chart(f"{on}: reached where at most 1", "measured / asked", bars(shares)))
     commands = "; ".join(part["command"] for part in found.values() if "command" in part)
     return Sheet("Flow: asked against measured", commands, found, tuple(charts), (("Figures", rows),))
 
@@ -102,7 +102,7 @@ def flow(found: Tree) -> Sheet:
 def live(found: Tree) -> Sheet:
     """Latency of a live stream."""
     kept = {k: found[k] for k in ("p50_ms", "p95_ms", "p99_ms", "mask_ms") if k in found}
-    rows = tuple(bars(kept))
+    rows = bars(kept)
     return Sheet(
         "Flow on a live stream",
         found["command"],
@@ -150,7 +150,7 @@ def realism(found: Tree) -> Sheet:
 def loading(found: Tree) -> Sheet:
     """Time of a training step."""
     rows = bars({row["way"]: row["frames/s"] for row in found["rows"]})
-    chart = Chart("Training on one thread", "frames a second", tuple(rows))
+    chart = Chart("Training on one thread", "frames a second", rows)
     return Sheet(
         "Training throughput", "bench experiment loading", found, (chart,), (("Ways", found["rows"]),)
     )
@@ -175,7 +175,7 @@ def engine(folder: Path) -> Sheet:
     """Every trial's figures as a part of what was allowed, and all of them in tables."""
     found = {file.parent.name: read(file) for file in sorted(folder.glob("*/*.json"))}
     shares = {words: share(found[name]) for name, words, share in _ENGINE if name in found}
-    chart = Chart("Reached where at most 1", "found / allowed", tuple(bars(shares)))
+    chart = Chart("Reached where at most 1", "found / allowed", bars(shares))
     tables = tuple((name, flat(one)) for name, one in found.items())
     return Sheet("Engine", "; ".join(_ENGINE_COMMANDS), {"machine": _machine(found)}, (chart,), tables)
 
@@ -204,9 +204,7 @@ def learn_stability(folder: Path) -> Sheet:
         rows = [row for row in one["rows"] if row.get("map R²") is not None]
         if rows:
             values = {", ".join(str(row[k]) for k in _SAID if k in row): row["map R²"] for row in rows}
-            charts.append(
-                Chart(f"{name}: R² of the map", "pooled over tested sequences", tuple(bars(values)))
-            )
+            charts.append(Chart(f"{name}: R² of the map", "pooled over tested sequences", bars(values)))
     tables = tuple((name, one["rows"]) for name, one in found.items())
     machine = {"machine": _machine(found)}
     return Sheet(

@@ -130,7 +130,6 @@ def lines(found: Tuned) -> list[str]:
 
 def as_dict(found: Tuned) -> dict[str, Any]:
     """All that was measured, ready for JSON; errors are parts of the force, infinite ones None."""
-
     return {
         "budget": found.budget.share,
         "knobs": [

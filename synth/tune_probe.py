@@ -65,7 +65,6 @@ class Probe:
         """
         self._job, self._index = job, index
         case = scenario.draw(job, index)
-        self.kind = ", ".join(gesture.kind for gesture in case.gestures)
         self._frames = loaded(job, index)
         self._motions: dict[str, tuple[Surface, Deformation, float]] = {}
         self._film: tuple[str, _Film] | None = None
@@ -73,7 +72,6 @@ class Probe:
         film = self._filmed(job)
         still, lens = film.studio.still, film.studio.camera
         self._still, self._lens = still, lens
-        self._surface = surface
         true = np.stack([tune_reading.cells(shot.flow, still.tissue) for shot in film.shots[1:]])
         self._reading = tune_reading.fit(
             job,

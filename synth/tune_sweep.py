@@ -60,13 +60,14 @@ class Sweep:
 
     def rows(self) -> list[Row]:
         """What each level of each knob does by itself."""
+        full = self._price([0] * len(self._knobs))
         return [
             Row(
                 knob.name,
                 level.words,
                 self._error(self._alone(i, j)),
                 self._change(self._alone(i, j)),
-                1 - self._price([(i, j)]) / self._price([]),
+                1 - self._price(self._alone(i, j)) / full,
                 next((cell for cell in self._column(i, j) if isinstance(cell, str)), ""),
             )
             for i, knob in enumerate(self._knobs)
@@ -75,13 +76,11 @@ class Sweep:
 
     def error(self, levels: Sequence[Level]) -> float:
         """Of the force, by adding up; inf where a knob broke."""
-        at = [knob.levels.index(level) for knob, level in zip(self._knobs, levels, strict=True)]
-        return self._error(at)
+        return self._error(self._at(levels))
 
     def price(self, levels: Sequence[Level]) -> float:
         """Expected CPU-s a frame."""
-        at = [knob.levels.index(level) for knob, level in zip(self._knobs, levels, strict=True)]
-        return self._price(list(enumerate(at)))
+        return self._price(self._at(levels))
 
     def cheapest(
         self, budget: float, mine: Sequence[Level], seen: set[tuple[str, ...]]
@@ -99,7 +98,7 @@ class Sweep:
             levels = [knob.levels[j] for knob, j in zip(self._knobs, at, strict=True)]
             if tuple(level.words for level in levels) in seen or not self._error(at) <= budget:
                 continue
-            price = self._price(list(enumerate(at)))
+            price = self._price(at)
             found.append((price, sum(a != b for a, b in zip(levels, mine, strict=True)), levels))
         if not found:
             return None
@@ -135,6 +134,9 @@ class Sweep:
         nearest = min(size.levels, key=lambda level: abs(level.changes["render.size"][0] - wide))
         return dict(nearest.changes)
 
+    def _at(self, levels: Sequence[Level]) -> list[int]:
+        return [knob.levels.index(level) for knob, level in zip(self._knobs, levels, strict=True)]
+
     def _alone(self, i: int, j: int) -> list[int]:
         at = [0] * len(self._knobs)
         at[i] = j
@@ -167,12 +169,12 @@ class Sweep:
             return float("inf")
         return float(np.mean([size(seen) - size(exact) for _, seen, exact in sums]))
 
-    def _price(self, at: Sequence[tuple[int, int]]) -> float:
+    def _price(self, at: Sequence[int]) -> float:
         stages = {
             stage: float(np.median([one.cost.get(stage, 0.0) for one in self._exact.values()]))
             for stage in ("physics", "scene", "render", "flow")
         }
-        for i, j in at:
+        for i, j in enumerate(at):
             good = [cell.ratio for cell in self._column(i, j) if isinstance(cell, _Cell)]
             for stage in {stage for ratio in good for stage in ratio}:
                 stages[stage] *= float(np.median([ratio.get(stage, 1.0) for ratio in good]))

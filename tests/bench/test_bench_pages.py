@@ -71,7 +71,7 @@ def test_a_page_that_is_not_of_its_data_is_found(tmp_path: Path) -> None:
 
 
 def test_drawings_one_below_the_other() -> None:
-    chart = Chart("error", "mN", tuple(sheet.bars({"ours": 1.0, "theirs": 2.0})))
+    chart = Chart("error", "mN", sheet.bars({"ours": 1.0, "theirs": 2.0}))
     both = sheet.together([chart.drawing(), chart.drawing()])
     tall = float(both.split('viewBox="0 0 ')[1].split()[1].strip('"'))
     alone = float(chart.drawing().split('viewBox="0 0 ')[1].split()[1].rstrip('">').split('"')[0])

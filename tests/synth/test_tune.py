@@ -48,7 +48,7 @@ class Fake:
     """A probe whose errors are known: what knobs do adds up, but for a surprise in the cheapest picture."""
 
     def __init__(self, job: Job, index: int) -> None:
-        self.made = 0
+        pass
 
     def rest(self) -> None:
         pass
