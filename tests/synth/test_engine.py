@@ -90,6 +90,38 @@ def test_what_makes_a_sequence_counts_and_what_keeps_it_does_not() -> None:
     assert not counted & {f"synth/{name}.py" for name in ("store", "engine", "child", "verify", "cli")}
 
 
+def _tree(home: Path, **files: str) -> Path:
+    """A program whose maker imports the job's schema, with further files (`a__b` is a/b.py)."""
+    outside = {name.replace(".", "/"): "" for name in versions._NO_PART}
+    inside = {"synth/pipeline": "from synth.job import Job\n", "synth/flow/own": "", "synth/__init__": ""}
+    for name, text in {**outside, **inside, **{k.replace("__", "/"): v for k, v in files.items()}}.items():
+        path = home / f"{name.replace('/init', '/__init__')}.py"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+    return home
+
+
+def test_what_moves_into_a_package_still_counts(tmp_path: Path) -> None:
+    home = _tree(
+        tmp_path,
+        synth__job__init="from synth.job.schema import Job\n",
+        synth__job__schema="class Job:\n    spp = 4\n",
+    )
+    counted = {str(path.relative_to(home)) for path in versions._makers(home)}
+    assert {"synth/__init__.py", "synth/job/__init__.py", "synth/job/schema.py"} <= counted
+
+
+def test_an_import_that_leads_nowhere_is_an_error(tmp_path: Path) -> None:
+    with pytest.raises(LookupError, match=r"synth\.job: there is no such module"):
+        versions._makers(_tree(tmp_path / "a"))
+    with pytest.raises(LookupError, match="doesn't say what 'Job' is"):
+        versions._makers(_tree(tmp_path / "b", synth__job__init="def __getattr__(name): ...\n"))
+    home = _tree(tmp_path / "c", synth__job="class Job: ...\n")
+    (home / "synth/store.py").unlink()
+    with pytest.raises(LookupError, match=r"synth\.store: there is no such module"):
+        versions._makers(home)
+
+
 def test_a_sequence_sealed_by_an_attempt_that_was_lost_is_not_made_again(tmp_path: Path) -> None:
     run(tmp_path / "made", job=JOB.model_copy(update={"sequences": 1}))
     setup = Setup(
