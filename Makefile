@@ -28,7 +28,7 @@ setup: .venv/installed .venv/llvm
 
 # The fast renderer needs an LLVM; without one the slow variant does the same work.
 .venv/llvm: .venv/installed
-	@$(BIN)/python -m synth.llvm_setup
+	@$(BIN)/python -m synth.system.llvm_setup
 	@touch $@
 
 demo: setup

@@ -6,17 +6,17 @@ import json as json_
 import shlex
 import sys
 from enum import StrEnum
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from bench.rooms import Rooms
-from synth.commands import Commands
 from synth.errors import UserError
+from synth.system.cli_errors import Commands
 
 if TYPE_CHECKING:
-    from bench.assess import Result
+    from bench.scoring.evaluate_recording import Result
 
 app = typer.Typer(
     name="bench",
@@ -26,13 +26,6 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-
-for _name, _help in (
-    ("pareto", "Speed against accuracy of one room's choices."),
-    ("stability", "Where one room's methods break, and that they say so."),
-    ("experiment", "One stated question about one room, answered with numbers."),
-):
-    app.add_typer(typer.Typer(name=_name, cls=Rooms, help=_help, no_args_is_help=True))
 
 Json = Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")]
 
@@ -68,12 +61,12 @@ def score(
     json: Json = False,
 ) -> None:
     """Force from a recording's video, scored against its sensor: score.json and report.html."""
-    from bench import run
-    from bench.assess import Settings
+    from bench.scoring import commands
+    from bench.scoring.evaluate_recording import Settings
 
     others = {name: Path(folder) for name, folder in _pairs("--also", also, "NAME=FOLDER").items()}
     settings = Settings(backend=flow, shrink=shrink, rate_hz=rate or None)
-    result = run.score(recording, model, out, settings, title, train, others)
+    result = commands.score(recording, model, out, settings, title, train, others)
     _say(result, out or Path(f"{result.recording}-score"), json)
 
 
@@ -87,7 +80,7 @@ def pool(
     json: Json = False,
 ) -> None:
     """Scores of several recordings as one: means, intervals over specimens, one table and chart."""
-    from bench import pool as pooling
+    from bench.scoring import pool as pooling
 
     tree = pooling.pool(pooling.read(scores))
     pooling.write(tree, out, by or _typed())
@@ -102,7 +95,7 @@ def check(
     """Says what of a recording is usable and what is missing. Exit code 2 if nothing is."""
     from dataclasses import asdict
 
-    from bench import check as checking
+    from bench.recording import check as checking
 
     found = checking.check(recording)
     if json:
@@ -136,15 +129,15 @@ def import_(
     json: Json = False,
 ) -> None:
     """Turns another system's recording into a recording folder."""
-    from bench import intake
-    from bench.bar import counting
+    from bench.importers import registry
+    from bench.output.progress_bar import counting
 
-    found = intake.read(source, _pairs("--use", use, "ROLE=NAME"))
+    found = registry.read(source, _pairs("--use", use, "ROLE=NAME"))
     about: dict[str, object] = {"young_kpa": young if young is not None else "unknown"}
     if scale is not None:
         about["scale_mm_per_px"] = scale
     with counting(f"importing {source.name}", len(found.times_s)) as progress:
-        intake.write(found, out, newtons, about, progress)
+        registry.write(found, out, newtons, about, progress)
     notes = list(found.notes)
     if scale is None:
         notes.append("meta.yaml still needs scale_mm_per_px or calibration")
@@ -158,29 +151,6 @@ def import_(
         print(out)
 
 
-@app.command(epilog="Example: bench pages docs/results --check")
-def pages(
-    results: Annotated[Path, typer.Argument(help="Folder of results.")] = Path("docs/results"),
-    check: Annotated[
-        bool, typer.Option("--check", help="Write nothing; end with 1 if any is stale.")
-    ] = False,
-    json: Json = False,
-) -> None:
-    """Draws picture and page of every experiment anew from its data, where its own command doesn't."""
-    from bench import pages as drawn
-
-    if not results.is_dir():
-        raise UserError(f"{results}: no such folder")
-    found = drawn.stale(results) if check else drawn.write(results)
-    print(
-        json_.dumps([str(file) for file in found])
-        if json
-        else "\n".join(map(str, found)) or "all as they should be"
-    )
-    if check and found:
-        raise typer.Exit(1)
-
-
 @app.command(epilog="Example: bench demo out --model model --out runs/demo")
 def demo(
     dataset: Annotated[Path, typer.Argument(help="A rendered dataset.")],
@@ -190,10 +160,10 @@ def demo(
     json: Json = False,
 ) -> None:
     """Scores a model on a sequence of its dataset that it has not seen, by way of a recording."""
-    from bench import run
-    from bench.assess import Settings
+    from bench.scoring import commands
+    from bench.scoring.evaluate_recording import Settings
 
-    _say(run.demo(dataset, model, out, Settings(backend=flow, rate_hz=None)), out, json)
+    _say(commands.demo(dataset, model, out, Settings(backend=flow, rate_hz=None)), out, json)
 
 
 @app.command(
@@ -207,8 +177,8 @@ def from_dataset(
     json: Json = False,
 ) -> None:
     """Writes sealed sequences as recording folders, to be scored as real ones are."""
-    from bench.export import export
-    from synth.store import Dataset
+    from bench.recording.from_sequence import export
+    from synth.dataset.store import Dataset
 
     chosen = [s for s in Dataset(dataset) if sequence is None or s.index == sequence]
     if not chosen:
@@ -219,33 +189,6 @@ def from_dataset(
     else:
         for path in written:
             print(path)
-
-
-@app.command("make-exvivo", epilog="Example: bench make-exvivo --out recordings --count 2 --seconds 10")
-def make_exvivo(
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder that gets the recordings.")],
-    count: Annotated[int, typer.Option(min=1, help="How many recordings.")] = 6,
-    first: Annotated[
-        int, typer.Option(min=0, help="Number of the first; they don't depend on each other.")
-    ] = 0,
-    seconds: Annotated[float, typer.Option(help="Length of each.")] = 30.0,
-    fps: Annotated[float, typer.Option(min=1.0, help="Mean frames a second.")] = 10.0,
-    width: Annotated[int, typer.Option(min=64, help="Width of the picture; the height is 3/4 of it.")] = 320,
-    photo: Annotated[Path | None, typer.Option(help="A photograph as texture of the surface.")] = None,
-    seed: Annotated[int, typer.Option(help="Root of all draws.")] = 100,
-    json: Json = False,
-) -> None:
-    """Renders pseudo ex vivo recordings, unlike any training data in every respect at once."""
-    from bench import exvivo
-    from bench.bar import counting
-
-    plan = exvivo.Plan(seed, seconds, fps, (width, width * 3 // 4), photo.resolve() if photo else None)
-    written = []
-    for index in range(first, first + count):
-        with counting(f"recording {index}", int(seconds * fps)) as progress:
-            done = exvivo.make(plan, index, out / f"{index:03d}", progress)
-        written.append(str(done))
-    print(json_.dumps({"recordings": written}) if json else "\n".join(written))
 
 
 def _pairs(option: str, words: list[str] | None, form: str) -> dict[str, str]:
@@ -267,59 +210,16 @@ def _typed() -> str:
 def _say(result: Result, folder: Path, json: bool) -> None:
     from rich.console import Console
 
-    from bench import assess, report
+    from bench.scoring import evaluate_recording, report
 
     if json:
-        print(json_.dumps(assess.as_json(result), allow_nan=False))
+        print(json_.dumps(evaluate_recording.as_json(result), allow_nan=False))
         return
     console = Console()
     console.print(report.terminal_table(result))
     for note in result.notes:
         console.print(f"note: {note}", style="yellow", markup=False, highlight=False)
     console.print(f"report: {folder / 'report.html'}", markup=False, highlight=False)
-
-
-@app.command(epilog="Example: bench gap out --cache cache --out runs/gap --held-out calf")
-def gap(
-    dataset: Annotated[Path, typer.Argument(help="Dataset rendered in several appearance families.")],
-    cache: Annotated[Path, typer.Option(help="Folder for packed sequences and trained networks.")],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the results.")] = Path(
-        "docs/results/gap"
-    ),
-    held_out: Annotated[str, typer.Option(help="Appearance family that no training sees.")] = "calf",
-    flow: Annotated[
-        list[str] | None,
-        typer.Option(help="Back end of the recovered flow; each is a whole experiment. [default: both]"),
-    ] = None,
-    preset: Annotated[str, typer.Option(help="Preset of `learn train`.")] = "tiny",
-    epochs: Annotated[int | None, typer.Option(min=1, help="Epochs; the preset's if not given.")] = None,
-    seeds: Annotated[int, typer.Option(min=1, help="Networks a training.")] = 2,
-    json: Json = False,
-) -> None:
-    """How much of the sim-to-real gap training on recovered flow closes, and fitted noise alone."""
-    from rich.console import Console
-
-    from bench import gap_experiment
-    from learn.threads import set_threads
-
-    set_threads(1)
-    tree = gap_experiment.run(
-        dataset,
-        out,
-        cache,
-        gap_experiment.settings_of(preset, epochs),
-        held_out,
-        flow or ["tvl1", "opencv-tvl1"],
-        seeds,
-        _typed(),
-        lambda line: Console(stderr=True).print(line, markup=False),
-    )
-    if json:
-        print(json_.dumps({name: found["verdict"] for name, found in tree["flows"].items()}))
-    else:
-        for name, found in tree["flows"].items():
-            print(f"{name}: {found['verdict']['force_mae']}")
-        print(out / "README.md")
 
 
 @app.command(epilog="Example: bench flow rest.png moved.png truth.flo --flow tvl1")
@@ -335,13 +235,13 @@ def flow(
     json: Json = False,
 ) -> None:
     """Flow between any two pictures, scored against a flow file."""
-    from bench import flow_pair
+    from bench.flow import pair
 
-    found = flow_pair.score(first, second, truth, flow, glare, out)
+    found = pair.score(first, second, truth, flow, glare, out)
     if found is None:
         typer.echo(f"written to {out}" if out else "nothing asked for: give a truth or --out")
     elif json:
-        typer.echo(json_.dumps(flow_pair.as_dict(found)))
+        typer.echo(json_.dumps(pair.as_dict(found)))
     else:
         typer.echo(
             f"EPE {found.epe:.3f} px, 95% within {found.p95:.3f} px, outliers {found.outliers:.1%}; "
@@ -366,8 +266,8 @@ def live(
     json: Json = False,
 ) -> None:
     """Masks, flow and force of a video as it runs: latency percentiles and dropped frames."""
-    from bench import live as stream
-    from bench.methods import Model
+    from bench.methods.network import Model
+    from bench.tracking import live as stream
 
     method = None if model is None else Model(model)
 
@@ -395,3 +295,15 @@ def live(
         typer.echo(json_.dumps(summary))
     else:
         typer.echo(", ".join(f"{name} {value:.4g}" for name, value in summary.items()))
+
+
+def _with_evidence() -> None:
+    """Adds the commands that measure this project itself, where their code is: in a checkout."""
+    checkout = Path(__file__).resolve().parents[1]
+    if (checkout / "evidence" / "commands.py").is_file():
+        if str(checkout) not in sys.path:
+            sys.path.append(str(checkout))
+        import_module("evidence.commands").add_to(app)
+
+
+_with_evidence()

@@ -15,9 +15,10 @@ from typing import Any
 import typer
 from pydantic import BaseModel
 
-from bench.meta import Meta
-from synth import budget, config, jobfile
-from synth.job import Job
+from bench.recording.meta import Meta
+from synth.dataset import field_sizes
+from synth.job import reader, writer
+from synth.job.schema import Job
 
 DOCS = Path(__file__).resolve().parent
 PROGRAMS = ("synth", "learn", "bench")
@@ -54,7 +55,7 @@ def commands() -> Iterator[Spoken]:
 def pages() -> dict[Path, str]:
     """The generated pages and what they must hold."""
     return {
-        DOCS / "fields.md": budget.page(),
+        DOCS / "fields.md": field_sizes.page(),
         DOCS / "reference" / "job.md": _job(),
         DOCS / "reference" / "recording.md": _recording(),
         DOCS / "reference" / "commands.md": _commands(),
@@ -96,16 +97,16 @@ def _keys(section: BaseModel, at: str) -> list[str]:
     inner: list[str] = []
     for name, field in type(section).model_fields.items():
         default = field.get_default(call_default_factory=True)
-        below = config.section(field.annotation)
+        below = reader.section(field.annotation)
         if isinstance(default, BaseModel):
             inner += ["", f"## {at}{name}", "", _sentence(type(default).__doc__)]
             inner += _keys(default, f"{at}{name}.")
             continue
         meaning = _sentence(field.description or (below.__doc__ if below else ""))
-        limits = jobfile.limits(field.annotation, field.metadata)
+        limits = writer.limits(field.annotation, field.metadata)
         if limits:
             meaning += f" {limits}"
-        value = "" if field.is_required() else jobfile.scalar(default)
+        value = "" if field.is_required() else writer.scalar(default)
         shown = "needed" if field.is_required() else f"`{value}`" if value else "–"
         rows.append(f"| `{name}` | {shown} | {_cell(meaning)} |")
         if below is not None:

@@ -16,10 +16,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from synth.dataset.store import Dataset, Sequence
 from synth.flow import mask
 from synth.flow.estimator import Flags, Flow, Map, Rgb
 from synth.flow.track import track
-from synth.store import Dataset, Sequence
 
 
 class Farneback:

@@ -13,11 +13,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from synth.fem import equilibrium, mesh, skin, tool
+from synth.fem import equilibrium, surface_embedding, tool
 from synth.fem.assembly import divergence, gradient
 from synth.fem.laws import lame
+from synth.fem.mesh import tetrahedra
 from synth.fem.system import State, System, assemble
-from synth.job import Anatomy
+from synth.job.schema import Anatomy
 
 Floats = NDArray[np.float64]
 
@@ -53,16 +54,16 @@ class Stiffening(System):
 
 def peak_mm(b: float | None, load: float = 0.3, radius_mm: float = 5.0) -> float:
     """Largest displacement under a pull of P = F/(E a^2) = `load`; `b` None is neo-Hookean."""
-    tets = mesh.block(Anatomy(), 400, 2, [(0.0, 0.0, radius_mm)])
+    tets = tetrahedra.block(Anatomy(), 400, 2, [(0.0, 0.0, radius_mm)])
     system = assemble(tets, "neo-hookean", 0.4)
     if b is not None:
         system = Stiffening(**vars(system), b=b)
     # The surface that is loaded: a dense patch, which the volume carries by B and answers to by B'.
     xy = np.stack(np.meshgrid(*2 * [np.linspace(-15, 15, 61)]), axis=-1).reshape(-1, 2)
-    vertices = np.column_stack([xy, mesh.dome(xy, Anatomy().dome_mm)])
+    vertices = np.column_stack([xy, tetrahedra.dome(xy, Anatomy().dome_mm)])
     area = np.full(len(vertices), 0.25)
     pressure = tool.footprint(np.zeros(2), radius_mm, vertices, area) * load * radius_mm**2  # E = 1 kPa
-    carry = skin.embedding(tets, vertices)
+    carry = surface_embedding.embedding(tets, vertices)
     pull = carry.T @ (np.outer(area * pressure, [0.0, 0.0, 1.0]))
     course = np.linspace(0, 1, 5)
     path = equilibrium.follow(system, course[:, None, None] * pull, course * load)

@@ -11,9 +11,10 @@ from pathlib import Path
 
 import numpy as np
 
-from bench import assess, scale
-from bench.follow import Answer, Scene
-from bench.recording import open_recording
+from bench.recording import pixel_scale
+from bench.recording.folder import open_recording
+from bench.scoring import evaluate_recording
+from bench.tracking.tracking import Answer, Scene
 
 
 class Spring:
@@ -31,12 +32,14 @@ class Spring:
         return Answer(np.array([size, np.nan, np.nan]))  # a magnitude: no direction
 
 
-def score(recording: Path) -> assess.Result:
+def score(recording: Path) -> evaluate_recording.Result:
     """The recording's scores under two springs."""
     opened = open_recording(recording)
     methods = {"spring": Spring(60.0), "stiffer": Spring(120.0)}
-    found = scale.find(opened.meta, recording)
-    return assess.assess(opened, methods, "spring", found, assess.Settings(rate_hz=None), {})
+    found = pixel_scale.find(opened.meta, recording)
+    return evaluate_recording.assess(
+        opened, methods, "spring", found, evaluate_recording.Settings(rate_hz=None), {}
+    )
 
 
 if __name__ == "__main__":

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from synth.store import Dataset, Sequence
+from synth.dataset.store import Dataset, Sequence
 
 
 def describe(sequence: Sequence) -> dict[str, float]:

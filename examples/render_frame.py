@@ -11,9 +11,10 @@ from dataclasses import replace
 import numpy as np
 from PIL import Image
 
-from synth.job import Job
-from synth.render import anatomy, camera
-from synth.render.look import Look
+from synth.job.schema import Job
+from synth.render.anatomy import surface as anatomy
+from synth.render.appearance.look import Look
+from synth.render.camera import camera
 from synth.render.scene import Shot, Studio
 
 

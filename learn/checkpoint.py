@@ -13,8 +13,8 @@ from typing import Any
 import torch
 from torch import nn
 
-from learn.grid import Scales
-from learn.reference import build
+from learn.data.grid import Scales
+from learn.network.monai_unet import build
 from learn.settings import Settings, from_dict
 from synth.errors import UserError
 

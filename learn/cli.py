@@ -15,11 +15,11 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from synth.commands import Commands
 from synth.errors import UserError
+from synth.system.cli_errors import Commands
 
 if TYPE_CHECKING:
-    from learn.statistics import Paired
+    from learn.evaluation.statistics import Paired
 
 app = typer.Typer(
     cls=Commands,
@@ -72,12 +72,12 @@ def train_command(
     """Train D2FNet on a dataset. An interrupted run is continued by the same command."""
     from lightning_fabric import Fabric
 
-    from learn.data import load, sources
+    from learn.data.clips import load, sources
+    from learn.data.split import groups, nested, ungrouped
     from learn.settings import override
     from learn.settings import preset as of
-    from learn.split import groups, nested, ungrouped
-    from learn.threads import set_threads
-    from learn.train import train
+    from learn.training.threads import set_threads
+    from learn.training.train import train
 
     set_threads(threads)
     options = {
@@ -154,11 +154,11 @@ def eval_command(
     json: Json = False,
 ) -> None:
     """Score a model on the sequences it has not seen; forces in mN."""
-    from learn.data import FIELDS, load
-    from learn.evaluate import compare, evaluate, unseen
-    from learn.predict import load as load_model
-    from learn.split import ungrouped
-    from learn.threads import set_threads
+    from learn.data.clips import FIELDS, load
+    from learn.data.split import ungrouped
+    from learn.evaluation.evaluate import compare, evaluate, unseen
+    from learn.inference.predict import load as load_model
+    from learn.training.threads import set_threads
 
     set_threads(threads)
     predictor = load_model(model)
@@ -219,9 +219,9 @@ def predict_command(
     """Write the force maps and force curves that a model sees in stores, videos or arrays of flow."""
     import numpy as np
 
-    from learn.apply import Filmed, apply, motions
-    from learn.predict import load as load_model
-    from learn.threads import set_threads
+    from learn.inference.apply import Filmed, apply, motions
+    from learn.inference.predict import load as load_model
+    from learn.training.threads import set_threads
 
     set_threads(threads)
     predictor = load_model(model, quick=True)
@@ -249,9 +249,9 @@ def calibrate_command(
     json: Json = False,
 ) -> None:
     """Estimate the tissue's stiffness from one press whose force is known."""
-    from learn.apply import calibrate, motions
-    from learn.predict import load as load_model
-    from learn.threads import set_threads
+    from learn.inference.apply import calibrate, motions
+    from learn.inference.predict import load as load_model
+    from learn.training.threads import set_threads
 
     set_threads(threads)
     predictor = load_model(model)
@@ -270,8 +270,8 @@ def export_command(
     format: Annotated[str, typer.Option(help="torchscript or onnx.")] = "torchscript",
 ) -> None:
     """Write a model for other programs, checked against PyTorch to 1e-4."""
-    from learn.export import export
-    from learn.predict import load as load_model
+    from learn.inference.export import export
+    from learn.inference.predict import load as load_model
 
     worst = export(load_model(model), file, format)
     _console.print(f"{file}: differs from PyTorch by at most {worst:.1e} of full scale")
@@ -302,7 +302,7 @@ _ROWS = (
 
 
 def _table(report: Any, source: str, seen: bool) -> Table:
-    from learn.evaluate import YOUNG
+    from learn.evaluation.evaluate import YOUNG
 
     which = "sequences, seen ones too" if seen else "unseen sequences"
     table = Table(

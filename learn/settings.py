@@ -8,10 +8,10 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from learn.data import INPUTS, Input, Target
-from learn.grid import Grid
+from learn.data.clips import INPUTS, Input, Target
+from learn.data.grid import Grid
 from learn.loss import GHOSTLESS, Objective
-from learn.model import Architecture
+from learn.network.d2fnet import Architecture
 from synth.errors import UserError
 
 

@@ -10,8 +10,8 @@ from typing import Annotated
 
 import typer
 
-from synth.commands import Commands
-from synth.tune_command import tune
+from synth.system.cli_errors import Commands
+from synth.tune.command import tune
 
 app = typer.Typer(
     name="synth",
@@ -37,13 +37,13 @@ app.command(epilog='Example: synth tune demo --budget "force 3%" --out tuned.yam
 @app.command(epilog="Example: synth new job.yaml")
 def new(path: Annotated[Path, typer.Argument(help="The job file to write.")] = Path("job.yaml")) -> None:
     """Writes a job file in which every key is explained."""
-    from synth import jobfile
     from synth.errors import UserError
+    from synth.job import writer
 
     if path.exists():
         raise UserError(f"{path}: exists already")
     try:
-        path.write_text(jobfile.commented(), "utf-8")
+        path.write_text(writer.commented(), "utf-8")
     except OSError as error:
         raise UserError(f"{path}: cannot be written ({error.strerror})") from error
     print(f"wrote {path}; render it with: synth render {path} -o out")
@@ -52,9 +52,9 @@ def new(path: Annotated[Path, typer.Argument(help="The job file to write.")] = P
 @app.command(epilog="Example: synth schema > job.schema.json")
 def schema() -> None:
     """Prints the JSON schema of job files, for editors."""
-    from synth import jobfile
+    from synth.job import writer
 
-    print(json_.dumps(jobfile.schema(), indent=2))
+    print(json_.dumps(writer.schema(), indent=2))
 
 
 @app.command(epilog="Example: synth preview demo --count 9 --out sheet.png")
@@ -68,14 +68,15 @@ def preview(
     """Draws a contact sheet of a job's scenarios and says what the whole job will take."""
     import cv2
 
-    from synth import config, sheet
+    from synth.dataset.size_forecast import amount
     from synth.errors import UserError
-    from synth.forecast import amount
+    from synth.job import reader
+    from synth.publish import contact_sheet
 
     if out.suffix.lower() != ".png" or not out.parent.is_dir():
         raise UserError(f"{out}: cannot be written as PNG")
-    read = config.load(job, overrides or [])
-    made = sheet.make(read, count)
+    read = reader.load(job, overrides or [])
+    made = contact_sheet.make(read, count)
     if not cv2.imwrite(str(out), made.picture[..., ::-1]):
         raise UserError(f"{out}: cannot be written as PNG")
     if json:
@@ -113,12 +114,12 @@ def render(
     json: Json = False,
 ) -> None:
     """Renders the dataset of a job. Exit code 1 when some of its sequences failed."""
-    from synth import config
-    from synth import engine as running
-    from synth.progress import Bars
+    from synth.engine import run as running
+    from synth.engine.progress import Bars
+    from synth.job import reader
 
     _end_on_terminate()
-    read = config.load(job, overrides or [])
+    read = reader.load(job, overrides or [])
     with Bars() as bars:
         options = running.Options(
             engine=engine, workers=workers, gpus=gpus, memory_gb=memory, mix_versions=mix_versions
@@ -147,9 +148,9 @@ def retry(
     json: Json = False,
 ) -> None:
     """Takes up the sequences that failed, and all that are missing."""
-    from synth import engine
-    from synth.folder import Folder
-    from synth.progress import Bars
+    from synth.dataset.folder import Folder
+    from synth.engine import run as engine
+    from synth.engine.progress import Bars
 
     _end_on_terminate()
     folder = Folder(out)
@@ -168,7 +169,7 @@ def retry(
 @app.command(epilog="Example: synth status out")
 def status(out: Out, json: Json = False) -> None:
     """Says what is done, running and failed, and what is still to come in time and disk."""
-    from synth import status as standing
+    from synth.engine import status as standing
 
     found = standing.of(out)
     print(json_.dumps(found.as_dict()) if json else "\n".join(standing.lines(found)))
@@ -189,9 +190,9 @@ def split_command(
     json: Json = False,
 ) -> None:
     """Says who may be trained on, in the index: no anatomy and no held-out family on both sides."""
-    from synth import index, split
+    from synth.dataset import index, split
+    from synth.dataset.folder import Folder
     from synth.errors import UserError
-    from synth.folder import Folder
 
     folder = Folder(out)
     folder.described()
@@ -211,7 +212,7 @@ def report(
     to: Annotated[Path | None, typer.Option("--to", help="The page; report.html in the dataset.")] = None,
 ) -> None:
     """Writes a page with thumbnails, distributions and failures that opens in any browser."""
-    from synth import report as reporting
+    from synth.publish import report as reporting
 
     print(reporting.write(out, to or out / "report.html"))
 
@@ -223,7 +224,7 @@ def export(
     to: Annotated[str, typer.Option("--to", help="folder, webdataset, hdf5 or d2fnet-npz.")] = "folder",
 ) -> None:
     """Writes the dataset in a format of others."""
-    from synth import export as exporting
+    from synth.publish import export as exporting
 
     print(f"{exporting.export(out, target, to)} sequences in {target}")
 
@@ -231,9 +232,10 @@ def export(
 @app.command(epilog="Example: synth card out")
 def card(out: Out) -> None:
     """Writes the dataset's card anew: README.md with its pictures, and croissant.json for machines."""
-    from synth import card as carding
-    from synth import croissant, index
-    from synth.folder import Folder
+    from synth.dataset import index
+    from synth.dataset.folder import Folder
+    from synth.publish import card as carding
+    from synth.publish import croissant
 
     folder = Folder(out)
     folder.described()
@@ -257,7 +259,7 @@ def verify(
     from rich.console import Console
     from rich.table import Table
 
-    from synth import verify as verifying
+    from synth.checks import verify as verifying
 
     report = verifying.run(out, fast=fast)
     if json:
@@ -296,12 +298,12 @@ def picture(
     """Draws frames with their flow and force map side by side, as in the README."""
     import cv2
 
-    from synth import picture as drawing
-    from synth import place
+    from synth.dataset import location
+    from synth.dataset.store import open_sequence
     from synth.errors import UserError
-    from synth.store import open_sequence
+    from synth.publish import picture as drawing
 
-    chosen = open_sequence(place.store(out, sequence))
+    chosen = open_sequence(location.store(out, sequence))
     rows = drawing.of_sequence(chosen, frame or [drawing.strongest(chosen)])
     to.parent.mkdir(parents=True, exist_ok=True)
     if to.suffix.lower() not in (".png", ".jpg") or not cv2.imwrite(str(to), rows[..., ::-1]):
@@ -319,12 +321,12 @@ def fields(
     json: Json = False,
 ) -> None:
     """Lists the fields of a sequence: axes, type, unit, when they are kept, and what they take."""
-    from synth import budget
+    from synth.dataset import field_sizes
+    from synth.dataset.store import Dataset
     from synth.errors import UserError
-    from synth.store import Dataset
 
     if page:
-        print(budget.page(), end="")
+        print(field_sizes.page(), end="")
         return
     first = Dataset(out)[0] if out else None
     width, cross, height = size.partition("x")
@@ -332,9 +334,9 @@ def fields(
         raise UserError(f"--size {size}: is not WIDTHxHEIGHT in pixels")
     shape = first.size if first else (int(height), int(width))
     if json:
-        print(json_.dumps([vars(row) for row in budget.rows(shape, first)]))
+        print(json_.dumps([vars(row) for row in field_sizes.rows(shape, first)]))
     else:
-        print("\n".join(budget.lines(shape, first)))
+        print("\n".join(field_sizes.lines(shape, first)))
 
 
 @app.command(epilog="Example: synth view out --sequence 0 --save scene.rrd")
@@ -352,11 +354,11 @@ def view(
     ] = False,
 ) -> None:
     """Opens sequences in rerun, on this machine only: surface, frame, flow, traction and force by time."""
-    from synth import place
-    from synth import view as viewing
-    from synth.store import Dataset, open_sequence
+    from synth.dataset import location
+    from synth.dataset.store import Dataset, open_sequence
+    from synth.publish import rerun_view as viewing
 
-    chosen = [open_sequence(place.store(out, k)) for k in sequence] if sequence else [Dataset(out)[0]]
+    chosen = [open_sequence(location.store(out, k)) for k in sequence] if sequence else [Dataset(out)[0]]
     if save is None:
         viewing.show(chosen, web=web)
     else:
@@ -370,7 +372,7 @@ def doctor(
     json: Json = False,
 ) -> None:
     """Says what this machine offers, and what to do about what it lacks."""
-    from synth import doctor as examining
+    from synth.system import doctor as examining
 
     found = examining.findings(folder)
     if json:

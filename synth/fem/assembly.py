@@ -6,8 +6,8 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
-from synth.fem.element import Quadrature
-from synth.fem.jit import compiled
+from synth.fem.mesh.element import Quadrature
+from synth.system.jit import compiled
 
 Floats = NDArray[np.float64]
 Cells = NDArray[np.int32]

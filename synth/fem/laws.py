@@ -17,7 +17,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from synth.fem.jit import compiled
+from synth.system.jit import compiled
 
 Floats = NDArray[np.float64]
 

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from synth import job
 from synth.errors import UserError
-from synth.fem.validity import LARGEST_LOAD, choose
+from synth.job import schema
+from synth.job.law_limits import LARGEST_LOAD, choose
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class Tissue:
     """Why this law."""
 
     @classmethod
-    def draw(cls, fem: job.Fem, rng: np.random.Generator) -> Tissue:
+    def draw(cls, fem: schema.Fem, rng: np.random.Generator) -> Tissue:
         """E log-uniformly: half as stiff and twice as stiff are as likely."""
         low, high = np.log(fem.young_kpa)
         law, why = choose(fem.law, fem.largest_load, fem.tolerance)

@@ -15,9 +15,9 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
-from synth.fem.element import bary_slope
 from synth.fem.equilibrium import TOLERANCE, NoEquilibrium, Path, balance, check
-from synth.fem.mesh import Tets
+from synth.fem.mesh.element import bary_slope
+from synth.fem.mesh.tetrahedra import Tets
 from synth.fem.system import State, assemble
 
 Floats = NDArray[np.float64]

@@ -8,13 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from synth import job
-from synth.fem import equilibrium, motion, skin, tool
+from synth.fem import equilibrium, motion, surface_embedding, tool
 from synth.fem.equilibrium import InvertedElement
 from synth.fem.material import Tissue, check_load
-from synth.fem.mesh import Tets
+from synth.fem.mesh.tetrahedra import Tets
 from synth.fem.system import assemble
 from synth.fem.tool import Gesture
+from synth.job import schema
 
 __all__ = ["Deformation", "InvertedElement", "deform"]
 
@@ -55,7 +55,7 @@ class Deformation:
 
 
 def deform(
-    fem: job.Fem,
+    fem: schema.Fem,
     tissue: Tissue,
     gesture: Gesture,
     tets: Tets,
@@ -86,8 +86,8 @@ def deform(
     crew = (gesture, *further)
     for one in crew:
         check_load(tissue.law, one.load)
-    carry = skin.embedding(tets, skin_vertices)
-    area = skin.vertex_area(skin_vertices, skin_faces)
+    carry = surface_embedding.embedding(tets, skin_vertices)
+    area = surface_embedding.vertex_area(skin_vertices, skin_faces)
     courses = [tool.course(one, frames) for one in crew]
     traction = np.zeros((frames, len(skin_vertices), 3))
     for one, over in zip(crew, courses, strict=True):
@@ -127,7 +127,7 @@ def deform(
     )
 
 
-def clock(fem: job.Fem, fps: float) -> motion.Clock:
+def clock(fem: schema.Fem, fps: float) -> motion.Clock:
     """Steps no longer than `fem.dt_s`, a whole number of them a frame."""
     dynamic = fem.time == "dynamic"
     substeps = int(np.ceil(1 / fps / fem.dt_s - 1e-9)) if dynamic else 1

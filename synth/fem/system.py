@@ -11,9 +11,9 @@ from scipy.sparse.linalg import SuperLU, splu
 
 from synth.errors import UserError
 from synth.fem.assembly import divergence, gradient, stiffness
-from synth.fem.element import Quadrature, quadrature, quality
 from synth.fem.laws import NUMBER, lame, stress, tangent
-from synth.fem.mesh import Tets
+from synth.fem.mesh.element import Quadrature, quadrature, quality
+from synth.fem.mesh.tetrahedra import Tets
 
 Floats = NDArray[np.float64]
 

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from synth import job
 from synth.errors import UserError
 from synth.fem.material import Tissue
+from synth.job import schema
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -64,7 +64,7 @@ class Gesture:
 
     @classmethod
     def draw(
-        cls, fem: job.Fem, craniotomy: job.Craniotomy, tissue: Tissue, rng: np.random.Generator
+        cls, fem: schema.Fem, craniotomy: schema.Craniotomy, tissue: Tissue, rng: np.random.Generator
     ) -> Gesture:
         """Draws one gesture: contact uniformly in the opening, direction uniformly in its cone."""
         kind = str(rng.choice(fem.gestures))

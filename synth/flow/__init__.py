@@ -1,1 +1,1 @@
-
+"""Optical flow: estimators of displacement, masks, tracking from the rest frame."""

@@ -1,7 +1,7 @@
 """Where the instrument is: a small U-Net (Ronneberger et al., MICCAI 2015) on a shrunken frame.
 
-`bench.flow_toolnet` makes its weights from scenes rendered for it; they lie beside this file, with a card
-that says by what command and how well they do on scenes held out.
+`evidence.flow.toolnet_training` makes its weights from scenes rendered for it; they lie beside this
+file, with a card that says by what command and how well they do on scenes held out.
 """
 
 from __future__ import annotations

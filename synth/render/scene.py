@@ -9,13 +9,16 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from synth.job import Job
-from synth.render import instrument, light, noise, reflection, rim, sensor, texture, truth
-from synth.render.anatomy import Surface
-from synth.render.camera import Camera, beside, blur_radius
-from synth.render.look import Look
-from synth.render.mitsuba_adapter import Body, Metal, Stage, forget, pick
-from synth.render.shape import Shape, normals
+from synth.geometry.triangles import Shape, normals
+from synth.job.schema import Job
+from synth.render import instrument, truth
+from synth.render.anatomy import noise, rim, texture
+from synth.render.anatomy.surface import Surface
+from synth.render.appearance import light, reflection
+from synth.render.appearance.look import Look
+from synth.render.camera import camera_sensor
+from synth.render.camera.camera import Camera, beside, blur_radius
+from synth.render.mitsuba.adapter import Body, Metal, Stage, forget, pick
 from synth.render.truth import Still
 
 __all__ = ["Look", "Moment", "Shot", "Still", "Studio"]
@@ -190,7 +193,7 @@ class Studio:
 
     def develop(self, radiance: Map, seed: int) -> npt.NDArray[np.uint8]:
         """The recorded picture (H, W, 3) of a radiance (H, W, 3)."""
-        return sensor.record(radiance, self._look.sensor, np.random.default_rng([seed, 1]))
+        return camera_sensor.record(radiance, self._look.sensor, np.random.default_rng([seed, 1]))
 
     def _posed(self, now: Moment) -> Shape | None:
         if self._tool is None:

@@ -14,9 +14,9 @@ import numba
 import numpy as np
 import numpy.typing as npt
 
-from synth.render import camera as cameras
-from synth.render.camera import Camera
-from synth.render.shape import Shape, normals
+from synth.geometry.triangles import Shape, normals
+from synth.render.camera import camera as cameras
+from synth.render.camera.camera import Camera
 
 Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int32]

@@ -1,0 +1,1 @@
+"""Flow between any two pictures, and flow files."""

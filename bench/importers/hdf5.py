@@ -1,0 +1,93 @@
+"""HDF5 files: arrays under names that every lab chooses for itself."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bench.importers.registry import ROLES, Intake, as_rgb
+from synth.errors import UserError
+
+_USUAL = {
+    "frames": ("frames", "images", "image", "rgb", "video", "color"),
+    "frame_time": ("frame_time", "frame_times", "frame_timestamps", "timestamps", "timestamp", "time", "t"),
+    "force": ("force", "forces", "wrench", "ft"),
+    "force_time": ("force_time", "force_times", "force_timestamps", "ft_time", "wrench_time"),
+    "tip": ("tip", "tip_position", "tool_tip"),
+}
+
+
+def read(source: Path, use: dict[str, str]) -> Intake:
+    """Opens a file: frames (T, H, W[, C]), their times (T,), force (N, 3 or 6), its times (N,), tip (T, 3).
+
+    Arrays are found by their usual names anywhere in the file, or named by `use`. Without times of its own,
+    force as long as the frames takes theirs.
+
+    Raises:
+        UserError: h5py missing, not HDF5, arrays missing, ambiguous or of the wrong shape.
+    """
+    try:
+        import h5py
+    except ImportError:
+        raise UserError("reading HDF5 needs h5py: pip install 'sulcus[readers]'") from None
+    try:
+        file = h5py.File(source, "r")
+    except OSError:
+        raise UserError(f"{source}: not a readable HDF5 file") from None
+    arrays: dict[str, Any] = {}
+    file.visititems(
+        lambda name, item: arrays.update({name: item}) if isinstance(item, h5py.Dataset) else None
+    )
+    chosen = {role: _chosen(source, role, use, arrays) for role in ROLES}
+    frames, times = chosen["frames"], chosen["frame_time"]
+    if frames is None or times is None:
+        raise UserError(
+            f"{source}: no {'frames' if frames is None else 'frame_time'} found; say --use; "
+            f"there are {', '.join(sorted(arrays)) or 'no arrays'}"
+        )
+    seconds = np.asarray(times[:], np.float64).ravel()
+    if len(seconds) != len(frames):
+        raise UserError(f"{source}: {len(frames)} frames, {len(seconds)} frame times")
+    force, force_s = np.zeros((0, 3)), np.zeros(0)
+    if chosen["force"] is not None:
+        force = np.asarray(chosen["force"][:], np.float64)
+        if force.ndim != 2 or force.shape[1] not in (3, 6):
+            raise UserError(f"{source}: force of shape {force.shape}, expected (N, 3) or (N, 6)")
+        force = force[:, :3]
+        clock = chosen["force_time"]
+        force_s = seconds if clock is None else np.asarray(clock[:], np.float64).ravel()
+        if len(force_s) != len(force):
+            raise UserError(
+                f"{source}: {len(force)} forces, {len(force_s)} times for them; say --use force_time="
+            )
+    tip = np.zeros((0, 4))
+    if chosen["tip"] is not None:
+        place = np.asarray(chosen["tip"][:], np.float64)
+        if place.shape != (len(seconds), 3):
+            raise UserError(f"{source}: tip of shape {place.shape}, expected ({len(seconds)}, 3)")
+        tip = np.column_stack([seconds, place])
+
+    def pictures() -> Iterator[NDArray[np.uint8]]:
+        for k in range(len(frames)):
+            yield as_rgb(np.asarray(frames[k]))
+
+    return Intake(seconds, pictures, force_s, force, tip)
+
+
+def _chosen(source: Path, role: str, use: dict[str, str], arrays: dict[str, Any]) -> Any:
+    if role in use:
+        name = use[role].strip("/")
+        if name not in arrays:
+            raise UserError(f"{source}: --use {role}={use[role]}: there are {', '.join(sorted(arrays))}")
+        return arrays[name]
+    for usual in _USUAL[role]:
+        named = [name for name in arrays if name.rsplit("/", 1)[-1].lower() == usual]
+        if len(named) > 1:
+            raise UserError(f"{source}: {' and '.join(named)} could be the {role}: say --use {role}=NAME")
+        if named:
+            return arrays[named[0]]
+    return None

@@ -1,0 +1,100 @@
+"""PLUS/IGSIO sequences: a MetaImage whose header carries fields a frame, read by SimpleITK."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bench.importers.registry import Floats, Intake, as_rgb, one_of
+from synth.errors import UserError
+
+_FIELD = re.compile(r"Seq_Frame(\d+)_(.+)")
+
+
+def read(source: Path, use: dict[str, str]) -> Intake:
+    """Opens a sequence.
+
+    `Timestamp` is the frame's time, `Force` (one or three numbers) its force, and the translation of a
+    `*TipToWorldTransform` the tip. Frames whose tracker says INVALID have no tip.
+
+    Raises:
+        UserError: SimpleITK missing, not a MetaImage, or no times.
+    """
+    try:
+        import SimpleITK
+    except ImportError:
+        raise UserError("reading .mha needs SimpleITK: pip install 'sulcus[readers]'") from None
+    reader = SimpleITK.ImageFileReader()
+    reader.SetFileName(str(source))
+    try:
+        reader.ReadImageInformation()
+    except RuntimeError:
+        raise UserError(f"{source}: not a readable MetaImage") from None
+    fields: dict[str, dict[int, str]] = {}
+    for key in reader.GetMetaDataKeys():
+        if match := _FIELD.fullmatch(key):
+            fields.setdefault(match[2], {})[int(match[1])] = reader.GetMetaData(key)
+    size = reader.GetSize()
+    if len(size) != 3:
+        raise UserError(f"{source}: a picture, not a sequence of pictures")
+    count = size[2]
+    stamp = use.get("frame_time", "Timestamp")
+    if stamp not in fields:
+        raise UserError(
+            f"{source}: frames have no field {stamp}; there are {', '.join(sorted(fields)) or 'none'}"
+        )
+    times = _column(source, stamp, fields[stamp], count, (1,))[:, 0]
+    notes = []
+    force_name = (
+        one_of("force", use.get("force"), [n for n in fields if n.lower() == "force"], "field")
+        if "force" not in use
+        else one_of("force", use["force"], sorted(fields), "field")
+    )
+    force = np.zeros((0, 3))
+    if force_name is not None:
+        force = _column(source, force_name, fields[force_name], count, (1, 3))
+        if force.shape[1] == 1:
+            force = np.column_stack([force, np.zeros((count, 2))])
+            notes.append(f"{force_name} is one number a frame: taken as a size, in fx_n")
+    tips = [n for n in fields if n.endswith("TipToWorldTransform")]
+    tip_name = one_of("tip", use.get("tip"), tips if "tip" not in use else sorted(fields), "field")
+    tip = np.zeros((0, 4))
+    if tip_name is not None:
+        poses = _column(source, tip_name, fields[tip_name], count, (16,))
+        tracked = [fields.get(f"{tip_name}Status", {}).get(k, "OK").strip() == "OK" for k in range(count)]
+        tip = np.column_stack([times, poses[:, [3, 7, 11]]])[np.array(tracked)]
+    if "UltrasoundImageOrientation" in reader.GetMetaDataKeys():
+        notes.append(
+            f"orientation {reader.GetMetaData('UltrasoundImageOrientation')}: pictures are as stored"
+        )
+
+    def pictures() -> Iterator[NDArray[np.uint8]]:
+        for k in range(count):
+            reader.SetExtractIndex([0, 0, k])
+            reader.SetExtractSize([size[0], size[1], 0])
+            try:
+                yield as_rgb(SimpleITK.GetArrayFromImage(reader.Execute()))
+            except RuntimeError:
+                raise UserError(f"{source}: frame {k} can't be read; is the file whole?") from None
+
+    good = np.isfinite(force).all(axis=1) if len(force) else np.zeros(0, bool)
+    return Intake(times, pictures, times[: len(force)][good], force[good], tip, tuple(notes))
+
+
+def _column(source: Path, name: str, values: dict[int, str], count: int, widths: tuple[int, ...]) -> Floats:
+    """(T, width) numbers of a field; NaN where a frame lacks it."""
+    rows = {k: text.split() for k, text in values.items() if k < count}
+    width = max((len(row) for row in rows.values()), default=0)
+    if width not in widths:
+        raise UserError(f"{source}: field {name} holds {width} numbers a frame, expected {widths[-1]}")
+    out = np.full((count, width), np.nan)
+    for k, row in rows.items():
+        try:
+            out[k] = [float(word) for word in row]
+        except ValueError:
+            raise UserError(f"{source}: field {name} of frame {k} is not {width} numbers") from None
+    return out

@@ -1,0 +1,157 @@
+"""`bench import`: recordings that other systems wrote, turned into recording folders.
+
+PLUS/IGSIO sequences (.mha, .igs.mha), ROS bags (.bag, .mcap, .db3, ROS 2 folders) and HDF5 files are read by
+the libraries kept for them; what comes out is the layout that everything else here reads.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bench.recording import video, writer
+from synth.errors import UserError
+
+Floats = NDArray[np.float64]
+ROLES = ("frames", "frame_time", "force", "force_time", "tip")
+"""What a source may hold; `--use ROLE=NAME` says under which name."""
+_MAKERS = {
+    ".mha": "bench.importers.igsio",
+    ".h5": "bench.importers.hdf5",
+    ".hdf5": "bench.importers.hdf5",
+    ".bag": "bench.importers.rosbag",
+    ".mcap": "bench.importers.rosbag",
+    ".db3": "bench.importers.rosbag",
+}
+_CRF_LOSSLESS = 0
+
+
+@dataclass(frozen=True)
+class Intake:
+    """What a source holds, its pictures not yet decoded."""
+
+    times_s: Floats
+    """(T,) of the frames [s]."""
+    pictures: Callable[[], Iterator[NDArray[np.uint8]]]
+    """Gives the T frames in order, (H, W, 3) uint8 each."""
+    force_s: Floats = field(default_factory=lambda: np.zeros(0))
+    """(N,) [s]; empty if the source holds no force."""
+    force: Floats = field(default_factory=lambda: np.zeros((0, 3)))
+    """(N, 3) in the source's unit."""
+    tip: Floats = field(default_factory=lambda: np.zeros((0, 4)))
+    """(M, 4) time [s] and the tool's tip [mm]."""
+    notes: tuple[str, ...] = ()
+
+
+def supported(path: Path) -> bool:
+    """Whether the name is that of a source to import, and not of a recording folder."""
+    return path.suffix.lower() in _MAKERS or (path / "metadata.yaml").is_file()
+
+
+def read(source: Path, use: Mapping[str, str] | None = None) -> Intake:
+    """Opens a source.
+
+    Args:
+        source: the file, or the folder of a ROS 2 bag.
+        use: role → name in the source, where there is a choice.
+
+    Raises:
+        UserError: another format, a library that is not installed, nothing usable, or an ambiguous choice.
+    """
+    if not source.exists():
+        raise UserError(f"{source}: no such file")
+    known = ", ".join(sorted(_MAKERS))
+    if not supported(source):
+        raise UserError(f"{source}: not a format that can be imported ({known}, or a folder of a ROS 2 bag)")
+    unknown = sorted(set(use or {}) - set(ROLES))
+    if unknown:
+        raise UserError(f"--use {unknown[0]}=...: one of {', '.join(ROLES)}")
+    module = import_module("bench.importers.rosbag" if source.is_dir() else _MAKERS[source.suffix.lower()])
+    found: Intake = module.read(source, dict(use or {}))
+    if len(found.times_s) == 0:
+        raise UserError(f"{source}: holds no frames")
+    return found
+
+
+def write(
+    found: Intake, out: Path, newtons: float, about: Mapping[str, object], progress: Callable[[int], None]
+) -> Path:
+    """Writes a recording folder, whole or not at all: lossless video.mp4, frames.csv, force.csv, meta.yaml.
+
+    Args:
+        found: of `read`.
+        out: must not exist.
+        newtons: newtons in the source's unit of force.
+        about: contents of meta.yaml.
+        progress: told how many frames are written.
+
+    Raises:
+        UserError: the folder exists, or a picture can't be decoded.
+    """
+    with writer.whole(out) as part:
+        video.write_video(
+            part / "video.mp4", _told(found.pictures(), progress), _rising(found.times_s), crf=_CRF_LOSSLESS
+        )
+        writer.frames(part, found.times_s)
+        if len(found.force):
+            writer.force(part, found.force_s, newtons * found.force)
+        if len(found.tip):
+            writer.tip(part, found.tip)
+        writer.about(part, about)
+    return out
+
+
+def one_of(role: str, wanted: str | None, names: list[str], what: str) -> str | None:
+    """The name for a role: the wanted one, the only one, or none.
+
+    Raises:
+        UserError: the wanted one isn't there, or there are several and none is wanted.
+    """
+    if wanted is not None:
+        if wanted not in names:
+            raise UserError(f"--use {role}={wanted}: no such {what}; there are {', '.join(names) or 'none'}")
+        return wanted
+    if len(names) > 1:
+        raise UserError(f"several {what}s could be the {role}: say --use {role}=NAME; {', '.join(names)}")
+    return names[0] if names else None
+
+
+def as_rgb(picture: NDArray[Any], order: str = "rgb") -> NDArray[np.uint8]:
+    """A grey or colour picture as (H, W, 3) uint8 sRGB; 16-bit grey levels are cut to 8.
+
+    Raises:
+        UserError: neither grey nor three or four channels, or of another type.
+    """
+    if picture.dtype == np.uint16:
+        picture = (picture >> 8).astype(np.uint8)
+    if picture.dtype != np.uint8:
+        raise UserError(f"pictures of type {picture.dtype}: 8 or 16 bits a channel are read")
+    if picture.ndim == 3 and picture.shape[2] == 1:
+        picture = picture[..., 0]
+    if picture.ndim == 2:
+        picture = np.repeat(picture[..., None], 3, axis=2)
+    if picture.ndim != 3 or picture.shape[2] not in (3, 4):
+        raise UserError(f"pictures of shape {picture.shape}: grey, or 3 or 4 channels are read")
+    colours = picture[..., :3]
+    return np.ascontiguousarray(colours[..., ::-1] if order == "bgr" else colours, np.uint8)
+
+
+def _told(
+    pictures: Iterator[NDArray[np.uint8]], progress: Callable[[int], None]
+) -> Iterator[NDArray[np.uint8]]:
+    for k, picture in enumerate(pictures):
+        yield picture
+        progress(k + 1)
+
+
+def _rising(times_s: Floats) -> Floats:
+    """The container needs times that rise; frames.csv keeps the true ones."""
+    steps = np.maximum(np.diff(times_s, prepend=times_s[:1]), 0)
+    steps[1:] = np.maximum(steps[1:], 1e-3)
+    return np.asarray(times_s[0] + np.cumsum(steps), np.float64)

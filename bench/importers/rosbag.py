@@ -1,0 +1,105 @@
+"""ROS 1 and ROS 2 bags (also a lone .mcap or .db3), read by rosbags without any ROS installed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from bench.importers.registry import Intake, as_rgb, one_of
+from synth.errors import UserError
+
+_PICTURES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+_FORCES = ("geometry_msgs/msg/WrenchStamped", "geometry_msgs/msg/Vector3Stamped")
+_TIPS = (
+    "geometry_msgs/msg/PoseStamped",
+    "geometry_msgs/msg/PointStamped",
+    "geometry_msgs/msg/TransformStamped",
+)
+_CHANNELS = {"mono8": 1, "8UC1": 1, "rgb8": 3, "bgr8": 3, "8UC3": 3, "rgba8": 4, "bgra8": 4}
+
+
+def read(source: Path, use: dict[str, str]) -> Intake:
+    """Opens a bag: the only topic of pictures, of forces and of poses, or those named by `use`.
+
+    Times are the messages' own stamps; a topic whose stamps are all zero falls back on the bag's. Positions,
+    in metres by the ROS convention, become mm.
+
+    Raises:
+        UserError: rosbags missing, not a bag, no pictures, several topics of a kind, an unknown encoding.
+    """
+    try:
+        from rosbags.highlevel import AnyReader, AnyReaderError
+        from rosbags.typesys import Stores, get_typestore
+    except ImportError:
+        raise UserError("reading bags needs rosbags: pip install 'sulcus[readers]'") from None
+
+    def opened() -> Any:
+        return AnyReader([source], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
+
+    try:
+        with opened() as bag:
+            topics = {role: _topic(bag, role, kinds, use) for role, kinds in
+                      (("frames", _PICTURES), ("force", _FORCES), ("tip", _TIPS))}  # fmt: skip
+            if topics["frames"] is None:
+                raise UserError(f"{source}: holds no topic of pictures")
+            stamps = np.array([time for time, _ in _messages(bag, topics["frames"])])
+            force = [(t, *_vector(m)) for t, m in _messages(bag, topics["force"])]
+            tip = [(t, *(1000.0 * v for v in _place(m))) for t, m in _messages(bag, topics["tip"])]
+    except (AnyReaderError, OSError, ValueError, KeyError) as error:
+        raise UserError(f"{source}: not a readable bag ({str(error).splitlines()[0]})") from None
+
+    def pictures() -> Iterator[NDArray[np.uint8]]:
+        with opened() as bag:
+            for _, message in _messages(bag, topics["frames"]):
+                yield _picture(source, message)
+
+    forces = np.array(force, np.float64).reshape(-1, 4)
+    return Intake(stamps, pictures, forces[:, 0], forces[:, 1:], np.array(tip, np.float64).reshape(-1, 4))
+
+
+def _topic(bag: Any, role: str, kinds: tuple[str, ...], use: dict[str, str]) -> str | None:
+    names = sorted({c.topic for c in bag.connections if c.msgtype in kinds})
+    return one_of(role, use.get(role), names, "topic")
+
+
+def _messages(bag: Any, topic: str | None) -> Iterator[tuple[float, Any]]:
+    """Stamp [s] and message, in the bag's order."""
+    for connection, logged, raw in bag.messages([c for c in bag.connections if c.topic == topic]):
+        message = bag.deserialize(raw, connection.msgtype)
+        stamp = message.header.stamp
+        seconds = stamp.sec + 1e-9 * stamp.nanosec
+        yield (seconds if seconds > 0 else 1e-9 * logged), message
+
+
+def _vector(message: Any) -> tuple[float, float, float]:
+    vector = message.wrench.force if hasattr(message, "wrench") else message.vector
+    return vector.x, vector.y, vector.z
+
+
+def _place(message: Any) -> tuple[float, float, float]:
+    if hasattr(message, "pose"):
+        place = message.pose.position
+    elif hasattr(message, "point"):
+        place = message.point
+    else:
+        place = message.transform.translation
+    return place.x, place.y, place.z
+
+
+def _picture(source: Path, message: Any) -> NDArray[np.uint8]:
+    if hasattr(message, "format"):
+        bgr = cv2.imdecode(np.asarray(message.data, np.uint8), cv2.IMREAD_COLOR)
+        if bgr is None:
+            raise UserError(f"{source}: a compressed picture can't be decoded")
+        return as_rgb(bgr.astype(np.uint8), "bgr")
+    channels = _CHANNELS.get(message.encoding)
+    if channels is None:
+        raise UserError(f"{source}: pictures in encoding {message.encoding}; {', '.join(_CHANNELS)} are read")
+    rows = np.asarray(message.data, np.uint8).reshape(message.height, message.step)
+    picture = rows[:, : message.width * channels].reshape(message.height, message.width, channels)
+    return as_rgb(picture, "bgr" if message.encoding.startswith(("bgr", "8UC3")) else "rgb")

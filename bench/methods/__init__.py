@@ -1,0 +1,1 @@
+"""What answers with a force: networks, baselines, physics."""

@@ -1,0 +1,231 @@
+"""What simpler methods say: fitted on the same sequences as the network, or on physics alone.
+
+All look at the same grid of displacement in millimetres, divided by nothing and normalised by nothing but E:
+for a linear solid, force over E is a function of displacement.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
+
+from bench.methods import compliance, corotational, inverse
+from bench.tracking.tracking import Answer, Method, Scene
+from learn.data.grid import Grid
+from learn.inference.predict import View
+
+if TYPE_CHECKING:
+    from learn.data.clips import Clip
+
+Floats = NDArray[np.float64]
+Rule = Callable[[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]], Floats]
+"""Displacement (2, N, N) mm, mask (N, N) 0/1, confidence (N, N) → force over E, (3,) mN/kPa; NaN: magnitude
+only, in x."""
+
+GRID = Grid(48)
+_COMPONENTS = 20
+_NEIGHBOURS = 5
+_PIXELS = 60_000
+_SURE = 0.3
+
+
+class Baseline:
+    """A rule behind the bench's protocol. The last frame put on the grid is shared between baselines."""
+
+    _last: tuple[NDArray[np.float32], Scene, NDArray[np.float32], NDArray[np.float32]] | None = None
+    _view: tuple[Scene, View] | None = None
+
+    def __init__(self, rule: Rule) -> None:
+        self._rule = rule
+
+    def __call__(
+        self, flow: NDArray[np.float32], confidence: NDArray[np.float32], scene: Scene, picture: bool
+    ) -> Answer:
+        """See `Method`."""
+        view = Baseline._view
+        if view is None or view[0] is not scene:
+            Baseline._view = view = (scene, View(scene.tissue, scene.scale_mm_per_px, GRID))
+        last = Baseline._last
+        if last is None or last[0] is not flow or last[1] is not scene:
+            resample = view[1].resample
+            moved = resample.mean(flow.transpose(2, 0, 1) * scene.scale_mm_per_px, scene.tissue)
+            last = (flow, scene, moved, resample.mean(confidence, scene.tissue))
+            Baseline._last = last
+        young = 1.0 if scene.young_kpa is None else scene.young_kpa
+        return Answer(young * self._rule(last[2], view[1].mask, last[3]))
+
+
+def physical() -> dict[str, Method]:
+    """Those that need no training data."""
+    zero: Method = Baseline(lambda moved, mask, sure: np.array([0.0, np.nan, np.nan]))
+    return {"zero": zero} | {name: Baseline(rule) for name, rule in physical_rules().items()}
+
+
+def physical_rules() -> dict[str, Rule]:
+    """The inverses of the physics."""
+    solvers = {
+        "Tikhonov, FEM compliance": inverse.tikhonov,
+        "Tikhonov near the contact": inverse.tikhonov_near,
+        "one contact, FEM compliance": inverse.one_contact,
+        "one contact, co-rotational": corotational.one_contact,
+    }
+    return {name: _inverse(solve) for name, solve in solvers.items()}
+
+
+def fitted(clips: Sequence[Clip], source: str, seed: int = 0) -> dict[str, Method]:
+    """Those fitted on sequences, behind the bench's protocol. Arguments as `fitted_rules`."""
+    return {name: Baseline(rule) for name, rule in fitted_rules(clips, source, seed).items()}
+
+
+def fitted_rules(clips: Sequence[Clip], source: str, seed: int = 0) -> dict[str, Rule]:
+    """Those fitted on sequences: the network's own fit sequences, for a fair table.
+
+    Args:
+        clips: on `GRID`.
+        source: which displacement, `recovered` or `ideal`.
+        seed: of what is drawn (pixels for boosting).
+    """
+    moved = np.concatenate([clip.displacement[source] for clip in clips])
+    mask = np.concatenate([np.broadcast_to(clip.mask, (clip.frames, *clip.mask.shape)) for clip in clips])
+    force = np.concatenate([clip.force / clip.young_kpa for clip in clips])
+    size = np.linalg.norm(force, axis=1)
+    peak = np.array([_peak(m, k) for m, k in zip(moved, mask, strict=True)])
+    rules: dict[str, Rule] = {
+        "mean": _constant(float(size.mean())),
+        "linear in |d|": _linear(peak, size),
+        "power law in |d|": _power(peak, size),
+    }
+    basis = _Basis(moved, mask)
+    rules["ridge on PCA of flow"] = _ridge(basis, basis(moved, mask), force, _groups(clips))
+    rules["k-NN on PCA of flow"] = _neighbours(basis, basis(moved, mask), force)
+    rules["boosting per pixel"] = _boosting(clips, source, np.random.default_rng(seed))
+    return rules
+
+
+def _peak(moved: NDArray[np.float32], mask: NDArray[np.float32]) -> float:
+    """Displacement that 2% of the tissue exceeds [mm]: the largest, but for outliers."""
+    return float(np.percentile(np.hypot(*moved)[mask > 0], 98)) if (mask > 0).any() else 0.0
+
+
+def _size_only(value: float) -> Floats:
+    return np.array([value, np.nan, np.nan])
+
+
+def _constant(value: float) -> Rule:
+    return lambda moved, mask, sure: _size_only(value)
+
+
+def _linear(peak: Floats, size: Floats) -> Rule:
+    slope = float(peak @ size) / max(float(peak @ peak), 1e-12)
+    return lambda moved, mask, sure: _size_only(slope * _peak(moved, mask))
+
+
+def _power(peak: Floats, size: Floats) -> Rule:
+    """a d^b, least squares on logarithms over the frames with some load and some motion."""
+    used = (size > 0.05 * size.max()) & (peak > 0.05 * peak.max())
+    b, log_a = np.polyfit(np.log(peak[used]), np.log(size[used]), 1) if used.sum() > 2 else (1.0, 0.0)
+    a, b = float(np.exp(log_a)), float(np.clip(b, 0.2, 4))
+    return lambda moved, mask, sure: _size_only(a * _peak(moved, mask) ** b)
+
+
+class _Basis:
+    """Principal components of masked displacement fields, not centred: no motion stays zero."""
+
+    def __init__(self, moved: NDArray[np.float32], mask: NDArray[np.float32]) -> None:
+        rows = self._rows(moved, mask)
+        _, _, axes = np.linalg.svd(rows, full_matrices=False)
+        self._axes = axes[:_COMPONENTS]
+
+    def __call__(self, moved: NDArray[np.float32], mask: NDArray[np.float32]) -> Floats:
+        """(T, 2, N, N), (T, N, N) → (T, components) mm."""
+        return np.asarray(self._rows(moved, mask) @ self._axes.T, np.float64)
+
+    @staticmethod
+    def _rows(moved: NDArray[np.float32], mask: NDArray[np.float32]) -> Floats:
+        return (moved * mask[:, None]).reshape(len(moved), -1).astype(np.float64)
+
+
+def _ridge(basis: _Basis, features: Floats, force: Floats, groups: NDArray[np.intp]) -> Rule:
+    """Ridge without intercept; its strength by cross-validation that leaves anatomies out."""
+
+    def solve(x: Floats, y: Floats, strength: float) -> Floats:
+        return np.asarray(np.linalg.solve(x.T @ x + strength * np.eye(x.shape[1]), x.T @ y), np.float64)
+
+    strengths = np.geomspace(1e-4, 1e2, 13) * np.trace(features.T @ features) / features.shape[1]
+    fold = groups % 4
+
+    def left_out(strength: float) -> float:
+        error = 0.0
+        for k in np.unique(fold):
+            out = fold == k
+            if out.all():
+                continue
+            error += float(
+                np.square(features[out] @ solve(features[~out], force[~out], strength) - force[out]).sum()
+            )
+        return error
+
+    best = solve(features, force, min(strengths, key=left_out))
+    return lambda moved, mask, sure: np.asarray((basis(moved[None], mask[None]) @ best)[0], np.float64)
+
+
+def _neighbours(basis: _Basis, features: Floats, force: Floats) -> Rule:
+    def rule(moved: NDArray[np.float32], mask: NDArray[np.float32], sure: NDArray[np.float32]) -> Floats:
+        away = np.square(features - basis(moved[None], mask[None])).sum(axis=1)
+        nearest = np.argsort(away, kind="stable")[:_NEIGHBOURS]
+        return np.asarray(force[nearest].mean(axis=0), np.float64)
+
+    return rule
+
+
+def _boosting(clips: Sequence[Clip], source: str, rng: np.random.Generator) -> Rule:
+    """Gradient-boosted trees from a pixel's own channels to the length of its force density."""
+    from sklearn.ensemble import HistGradientBoostingRegressor
+
+    features, target = [], []
+    for clip in clips:
+        inside = clip.mask > 0
+        for t in range(clip.frames):
+            features.append(_pixels(clip.displacement[source][t])[inside])
+            target.append(np.linalg.norm(clip.density[t], axis=0)[inside])
+    x, y = np.concatenate(features), np.concatenate(target)
+    chosen = rng.permutation(len(x))[:_PIXELS]
+    trees = HistGradientBoostingRegressor(max_iter=120, learning_rate=0.1, max_leaf_nodes=31, random_state=0)
+    trees.fit(x[chosen], y[chosen])
+    cell = GRID.pitch_mm**2
+
+    def rule(moved: NDArray[np.float32], mask: NDArray[np.float32], sure: NDArray[np.float32]) -> Floats:
+        said = np.clip(trees.predict(_pixels(moved)[mask > 0]), 0, None)
+        return _size_only(cell * float(said.sum()))
+
+    return rule
+
+
+def _pixels(moved: NDArray[np.float32]) -> Floats:
+    """Displacement, its length and its four derivatives at every cell, (N, N, 7)."""
+    slopes = [d / GRID.pitch_mm for part in moved for d in np.gradient(part)]
+    return np.stack([*moved, np.hypot(*moved), *slopes], axis=-1).astype(np.float64)
+
+
+def _groups(clips: Sequence[Clip]) -> NDArray[np.intp]:
+    names = sorted({clip.group for clip in clips})
+    return np.concatenate([np.full(clip.frames, names.index(clip.group)) for clip in clips])
+
+
+def _inverse(solve: Callable[[compliance.Compliance, Floats, Floats], Floats]) -> Rule:
+    """Displacement at the compliance's points, from the grid, weighted by confidence."""
+
+    def rule(moved: NDArray[np.float32], mask: NDArray[np.float32], sure: NDArray[np.float32]) -> Floats:
+        known = compliance.build()
+        at = known.points.T[::-1] / GRID.pitch_mm + (GRID.size - 1) / 2
+        seen = np.stack([map_coordinates(part, at, order=1, mode="nearest") for part in moved], axis=1)
+        weight = map_coordinates(mask * np.where(sure > _SURE, sure, 0), at, order=1, mode="constant")
+        if (weight > 0).sum() < 20 or not np.abs(seen).max() > 0:
+            return np.zeros(3)
+        return solve(known, seen.astype(np.float64), weight.astype(np.float64))
+
+    return rule

@@ -1,0 +1,110 @@
+"""What unit loads on the surface do to what a camera sees: the linear map that the inverse baselines invert.
+
+Built from `synth.fem` on a procedural block seen straight from above, with a mesh of its own. A recording
+doesn't tell the pose of the camera or the shape of the brain, so neither does the map know them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+import scipy.sparse as sp
+from numpy.typing import NDArray
+from scipy.spatial import Delaunay
+
+from synth.fem import surface_embedding
+from synth.fem.mesh import tetrahedra
+from synth.fem.mesh.tetrahedra import Tets
+from synth.fem.system import System, assemble
+from synth.job import schema
+
+Floats = NDArray[np.float64]
+
+# World (z out of the brain) to camera (x right, y down, z forward) for a camera straight above.
+TO_CAMERA = np.diag([1.0, -1.0, -1.0])
+
+# A recording doesn't tell the brain's shape: the default job's.
+_ANATOMY = schema.Anatomy()
+_AT_ONCE = 32
+
+
+@dataclass(frozen=True, eq=False)
+class Compliance:
+    """Displacement seen at points of the opening for loads at nodes of it, E = 1 kPa."""
+
+    matrix: Floats
+    """(2 P, 3 K): in-plane displacement [mm], x of every point, then y, for x, y, z loads of 1 mN a node."""
+    points: Floats
+    """(P, 2) where displacement is seen, camera x, y from the opening's centre [mm]."""
+    nodes: Floats
+    """(K, 2) where loads stand, same axes [mm]."""
+    node_area: Floats
+    """(K,) mm^2."""
+
+
+@dataclass(frozen=True, eq=False)
+class Block:
+    """A procedural block seen from straight above, E = 1 kPa."""
+
+    volume: Tets
+    system: System
+
+    @classmethod
+    def build(cls, law: str, tets: int, order: int) -> Block:
+        """A block of about that many tetrahedra, with Poisson's ratio 0.4."""
+        volume = tetrahedra.block(_ANATOMY, tets, order)
+        return cls(volume, assemble(volume, law, 0.4))
+
+    def carry(self, xy: Floats) -> sp.csr_array:
+        """(P, N) what gives the motion of surface points (P, 2), camera x, y [mm], from the volume's.
+
+        Its transpose carries loads on them to the volume.
+        """
+        world = xy * np.array([1.0, -1.0])
+        on_dome = np.column_stack([world, tetrahedra.dome(world, _ANATOMY.dome_mm)])
+        return surface_embedding.embedding(self.volume, on_dome)
+
+
+def picture(carry: sp.csr_array, moved: Floats) -> Floats:
+    """What the camera sees, (P, 2, ...) mm at points, of a volume's motion (N, 3, ...) mm in world axes."""
+    flat = moved.reshape(len(moved), -1)
+    world = (carry @ flat).reshape(-1, *moved.shape[1:])
+    return np.asarray(np.einsum("ab,pb...->pa...", TO_CAMERA[:2], world), np.float64)
+
+
+@lru_cache(maxsize=4)
+def build(point_mm: float = 1.0, node_mm: float = 1.2, tets: int = 3000) -> Compliance:
+    """Solves one linear problem a node and axis, on one factorisation.
+
+    Args:
+        point_mm: spacing of the points, which reach to the opening's edge.
+        node_mm: spacing of the nodes, which stay as far inside it.
+        tets: of the map's own mesh, second order.
+    """
+    block = Block.build("linear", tets, 2)
+    radius_mm = _ANATOMY.craniotomy.radius_mm
+    points, nodes = _disc(point_mm, radius_mm), _disc(node_mm, radius_mm - node_mm)
+    seen, held = block.carry(points), block.carry(nodes)
+    columns = np.empty((len(nodes), 3, 2, len(points)))
+    for some in np.array_split(np.arange(len(nodes)), max(1, len(nodes) // _AT_ONCE)):
+        shares = held[some].toarray()
+        for axis in range(3):
+            u = block.system.solve(np.einsum("kn,a->nak", shares, TO_CAMERA[axis]))
+            columns[some, axis] = picture(seen, u).transpose(2, 1, 0)
+    matrix = columns.transpose(2, 3, 0, 1).reshape(2 * len(points), 3 * len(nodes))
+    return Compliance(matrix, points, nodes, _areas(nodes))
+
+
+def _disc(spacing_mm: float, radius_mm: float) -> Floats:
+    """Square lattice inside a circle, (N, 2) mm."""
+    steps = np.arange(-np.floor(radius_mm / spacing_mm), np.floor(radius_mm / spacing_mm) + 1) * spacing_mm
+    x, y = np.meshgrid(steps, steps)
+    return np.stack([x, y], axis=-1)[np.hypot(x, y) <= radius_mm]
+
+
+def _areas(nodes: Floats) -> Floats:
+    """A third of the triangles round each node, mm^2."""
+    flat = np.column_stack([nodes, np.zeros(len(nodes))])
+    return surface_embedding.vertex_area(flat, Delaunay(nodes).simplices)

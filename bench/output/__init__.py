@@ -1,0 +1,1 @@
+"""What a command leaves: files, bars, intervals as pictures."""

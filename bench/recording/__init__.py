@@ -1,0 +1,1 @@
+"""A recording: video, force sensor, description; read, written, checked."""

@@ -1,0 +1,194 @@
+"""A recording: a folder with a video, perhaps the force sensor's file, and `meta.yaml`.
+
+meta.yaml              scale, stiffness, rest frame, ... (`bench.recording.meta`)
+video.mp4 or frames/*.png
+frames.csv             optional: frame,t_s      (else the video's own presentation times)
+force.csv              optional: t_s,fx_n,fy_n,fz_n
+masks/NNNNNN.png       optional: white where the tool is, in the frame of that number
+tissue.png             optional: white where tissue may be tracked, in the rest frame
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bench.recording import csv_table, meta, video
+from bench.recording.meta import Meta
+from bench.recording.video import Picture
+from synth.errors import UserError
+
+_VIDEOS = (".mp4", ".mov", ".mkv", ".avi", ".webm", ".m4v")
+_LARGEST_FORCE_N = 50.0
+
+
+@dataclass(frozen=True)
+class Force:
+    """What the sensor's file says, in its own time, unprocessed but for units and sign."""
+
+    time_s: NDArray[np.float64]
+    """(N,) strictly rising [s]."""
+    force_mn: NDArray[np.float64]
+    """(N, 3) force on the tissue [mN]; NaN where the file has none."""
+    gravity: NDArray[np.float64] | None = None
+    """(N, 3) unit vector of gravity in the sensor's axes, when the file has gx, gy, gz."""
+
+
+@dataclass(frozen=True)
+class Recording:
+    """An opened recording. Nothing is decoded yet."""
+
+    folder: Path
+    meta: Meta
+    video: Path | None
+    pictures: tuple[Path, ...]
+    times_s: NDArray[np.float64] | None
+    """(N,) from frames.csv [s]; NaN for frames it doesn't list. None without the file."""
+    force: Force | None
+    masks: dict[int, Path]
+    tissue: Path | None
+    notes: tuple[str, ...]
+    """What was found odd and how it was taken; every one goes into the report."""
+
+    @property
+    def name(self) -> str:
+        return self.folder.resolve().name
+
+    def expected_frames(self) -> int | None:
+        """Frames as stated, undecoded; None if the video doesn't say. UserError if unreadable."""
+        return video.stated_frames(self.video) if self.video else len(self.pictures)
+
+    def frames(self) -> Iterator[Picture]:
+        """Upright frames in order, with times: frames.csv's, else the video's; None if neither says.
+
+        Raises:
+            UserError: unreadable video or picture.
+        """
+        source = video.from_video(self.video) if self.video else video.from_pictures(self.pictures)
+        for picture in source:
+            yield self._timed(picture)
+
+    def tool(self, index: int, size: tuple[int, int]) -> NDArray[np.bool_] | None:
+        """(H, W) tool mask of a frame, or None if there is none for it. UserError for one of another size."""
+        return _mask(self.masks[index], size) if index in self.masks else None
+
+    def tissue_mask(self, size: tuple[int, int]) -> NDArray[np.bool_]:
+        """(H, W) where tissue may be tracked in the rest frame; everywhere without `tissue.png`."""
+        return np.ones(size, bool) if self.tissue is None else _mask(self.tissue, size)
+
+    def _timed(self, picture: Picture) -> Picture:
+        if self.times_s is None:
+            return picture
+        known = picture.index < len(self.times_s) and np.isfinite(self.times_s[picture.index])
+        return Picture(picture.index, float(self.times_s[picture.index]) if known else None, picture.rgb)
+
+
+def open_recording(folder: Path) -> Recording:
+    """Reads everything but the pictures.
+
+    Raises:
+        UserError: no folder, bad meta.yaml, neither or both of video and frames, a CSV that can't be used.
+    """
+    if folder.is_file():
+        raise UserError(f"{folder}: a file, not a recording folder; `bench import` makes one of it")
+    if not folder.is_dir():
+        raise UserError(f"{folder}: no such recording folder")
+    about = meta.read(folder / "meta.yaml")
+    movie, pictures = _footage(folder)
+    notes: list[str] = []
+    times = _frame_times(folder / "frames.csv", notes)
+    force = _force(folder / "force.csv", about, notes)
+    masks = {int(path.stem): path for path in sorted(folder.glob("masks/*.png")) if path.stem.isdigit()}
+    still = folder / "tissue.png"
+    return Recording(
+        folder, about, movie, pictures, times, force, masks, still if still.is_file() else None, tuple(notes)
+    )
+
+
+def _footage(folder: Path) -> tuple[Path | None, tuple[Path, ...]]:
+    movies = sorted(path for path in folder.glob("video.*") if path.suffix.lower() in _VIDEOS)
+    pictures = tuple(sorted(folder.glob("frames/*.png"), key=_natural))
+    if len(movies) + bool(pictures) > 1:
+        found = [path.name for path in movies] + ["frames/"] * bool(pictures)
+        raise UserError(f"{folder}: holds {' and '.join(found)}; keep one of them")
+    if not movies and not pictures:
+        raise UserError(f"{folder}: holds neither video.mp4 nor frames/*.png")
+    return (movies[0] if movies else None), pictures
+
+
+def _natural(path: Path) -> list[tuple[int, str]]:
+    return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", path.stem)]
+
+
+def _frame_times(path: Path, notes: list[str]) -> NDArray[np.float64] | None:
+    if not path.is_file():
+        return None
+    columns = csv_table.read(path, ("frame", "t_s"))
+    frame, time = columns["frame"], columns["t_s"]
+    if (
+        not np.isfinite(frame).all()
+        or (frame < 0).any()
+        or (frame != np.round(frame)).any()
+        or (frame > 1e8).any()
+    ):
+        raise UserError(f"{path}: column frame must hold whole numbers from 0")
+    number = frame.astype(np.int64)
+    if len(np.unique(number)) < len(number):
+        raise UserError(
+            f"{path}: frame {number[np.flatnonzero(np.diff(np.sort(number)) == 0)[0]]} is listed twice"
+        )
+    if number.max() > 10 * len(number) + 1000:
+        raise UserError(f"{path}: lists frame {number.max()} but has {len(number)} rows")
+    times = np.full(number.max() + 1, np.nan)
+    times[number] = time
+    known = times[np.isfinite(times)]
+    if len(known) and (np.diff(known) <= 0).any():
+        notes.append(f"{path.name}: times stand still or run back; those frames are left out")
+    return times
+
+
+def _force(path: Path, about: Meta, notes: list[str]) -> Force | None:
+    if not path.is_file():
+        return None
+    columns = csv_table.read(path, ("t_s", "fx_n", "fy_n", "fz_n"), ("gx", "gy", "gz"))
+    time = columns["t_s"]
+    newtons = np.stack([columns[name] for name in ("fx_n", "fy_n", "fz_n")], axis=1)
+    kept = np.isfinite(time)
+    if not kept.all():
+        notes.append(f"{path.name}: {np.sum(~kept)} rows without a time left out")
+    time, newtons = time[kept], newtons[kept]
+    # A clock that runs back: rows are kept only while time reaches new ground.
+    new = np.concatenate([[True], time[1:] > np.maximum.accumulate(time)[:-1]]) if len(time) else kept[:0]
+    if not new.all():
+        notes.append(f"{path.name}: {np.sum(~new)} rows whose time stands still or runs back left out")
+    time, newtons = time[new], newtons[new]
+    usable = np.isfinite(newtons).all(axis=1)
+    if usable.sum() < 2:
+        raise UserError(f"{path}: fewer than two rows with a time and three forces")
+    if not usable.all():
+        notes.append(
+            f"{path.name}: {np.sum(~usable)} rows with a missing force; scores leave those times out"
+        )
+        newtons[~usable] = np.nan
+    largest = float(np.nanmax(np.abs(newtons)))
+    if largest > _LARGEST_FORCE_N:
+        raise UserError(
+            f"{path}: force reaches {largest:.4g} N, more than any brain bears; are the columns in mN?"
+        )
+    gravity = None
+    if all(name in columns for name in ("gx", "gy", "gz")):
+        gravity = np.stack([columns[name][kept][new] for name in ("gx", "gy", "gz")], axis=1)
+    sign = 1.0 if about.sensor.acts_on == "tissue" else -1.0
+    return Force(time, sign * 1000.0 * newtons, gravity)
+
+
+def _mask(path: Path, size: tuple[int, int]) -> NDArray[np.bool_]:
+    mask = video.read_picture(path)[..., 0] > 127
+    if mask.shape != size:
+        raise UserError(f"{path}: {mask.shape[1]} x {mask.shape[0]}, the video is {size[1]} x {size[0]}")
+    return np.asarray(mask, bool)

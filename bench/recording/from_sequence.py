@@ -1,0 +1,80 @@
+"""A sealed sequence written as a recording folder, so that the code that scores real ones scores it too."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from bench.recording import video, writer
+from synth.dataset.store import Sequence
+from synth.errors import UserError
+
+
+def export(sequence: Sequence, folder: Path, frames: Literal["png", "mp4"] = "png") -> Path:
+    """Writes one recording: frames or video, times, force in camera axes, tool masks, tissue, meta.yaml.
+
+    Nothing that the recorded scene wouldn't have given is written: no true flow, no traction, no glare mask.
+
+    Args:
+        sequence: a sealed sequence.
+        folder: where to; must not exist.
+        frames: `png` is lossless, `mp4` is H.264.
+
+    Raises:
+        UserError: the folder exists.
+    """
+    with writer.whole(folder) as part:
+        _fill(sequence, part, frames)
+    return folder
+
+
+def _fill(sequence: Sequence, part: Path, frames: Literal["png", "mp4"]) -> None:
+    (part / "masks").mkdir()
+    time = np.asarray(sequence["time"][:], np.float64)
+    _footage(sequence, part, frames, time)
+    even = (slice(None), slice(None))
+    if frames == "mp4":  # the codec wants even sizes; masks must fit the video
+        even = tuple(slice(0, side // 2 * 2) for side in sequence.size)  # type: ignore[assignment]
+    for t in range(sequence.frames):
+        tool = np.asarray(sequence["tool"][t], bool)[even]
+        if tool.any():
+            _write(part / "masks" / f"{t:06d}.png", tool.astype(np.uint8) * 255)
+    _write(part / "tissue.png", np.asarray(sequence["tissue"][:], bool)[even].astype(np.uint8) * 255)
+    writer.force(part, time, np.asarray(sequence["force"][:], np.float64) / 1000)
+    writer.frames(part, time)
+    about = {
+        "scale_mm_per_px": float(sequence.attrs["scale_mm_per_px"]),
+        "scale_uncertainty": 0.0,
+        "young_kpa": float(sequence.attrs["young_kpa"]),
+        "rest_frame": 0,
+        "specimen": f"anatomy {_anatomy(sequence)}",
+        "sensor": {"axes": "camera", "acts_on": "tissue", "low_pass_hz": None},
+    }
+    writer.about(part, about)
+
+
+def _footage(sequence: Sequence, part: Path, kind: Literal["png", "mp4"], time: NDArray[np.float64]) -> None:
+    pictures: Iterator[NDArray[np.uint8]] = (
+        np.asarray(sequence["rgb"][t], np.uint8) for t in range(sequence.frames)
+    )
+    if kind == "mp4":
+        video.write_video(part / "video.mp4", pictures, time)
+        return
+    (part / "frames").mkdir()
+    for t, rgb in enumerate(pictures):
+        _write(part / "frames" / f"{t:06d}.png", rgb[..., ::-1])
+
+
+def _anatomy(sequence: Sequence) -> str:
+    scenario = sequence.attrs.get("scenario") or {}
+    return str(scenario.get("anatomy", sequence.index))
+
+
+def _write(path: Path, picture: NDArray[np.uint8]) -> None:
+    if not cv2.imwrite(str(path), np.ascontiguousarray(picture)):
+        raise UserError(f"{path}: could not be written")

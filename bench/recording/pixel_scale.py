@@ -1,0 +1,86 @@
+"""Millimetres a pixel, and how sure they are. Force goes with the scale, so 5% of scale is 5% of force."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from bench.recording import video
+from bench.recording.meta import Calibration, Meta
+from synth.errors import UserError
+
+_STATED = 0.02  # what a stated scale is trusted to without more
+_POINT_PX = 1.0  # standard error of a point set by hand
+_DISTANCE = 0.01  # relative standard error of a stated working distance
+
+
+@dataclass(frozen=True)
+class Scale:
+    """Scale at the tissue."""
+
+    mm_per_px: float
+    uncertainty: float
+    """Relative, one standard deviation."""
+    source: str
+
+
+def find(meta: Meta, folder: Path) -> Scale:
+    """The recording's scale, from what `meta.yaml` offers.
+
+    Raises:
+        UserError: a checkerboard that isn't found, points that coincide.
+    """
+    if meta.scale_mm_per_px is not None:
+        return Scale(meta.scale_mm_per_px, _first(meta.scale_uncertainty, _STATED), "stated")
+    assert meta.calibration is not None
+    found = _calibrated(meta.calibration, folder)
+    return Scale(found.mm_per_px, _first(meta.scale_uncertainty, found.uncertainty), found.source)
+
+
+def _calibrated(way: Calibration, folder: Path) -> Scale:
+    if way.focal_px is not None and way.distance_mm is not None:
+        return Scale(way.distance_mm / way.focal_px, _DISTANCE, "focal length and working distance")
+    if way.bar_px is not None and way.bar_mm is not None:
+        return _bar(way.bar_px, way.bar_mm, "scale bar")
+    if way.travel_px is not None and way.travel_mm is not None:
+        return _bar(way.travel_px, way.travel_mm, "known move of the tool")
+    assert way.checkerboard is not None
+    assert way.corners is not None
+    assert way.square_mm is not None
+    return _checkerboard(folder / way.checkerboard, way.corners, way.square_mm)
+
+
+def _bar(ends: tuple[tuple[float, float], tuple[float, float]], length_mm: float, source: str) -> Scale:
+    length = float(np.hypot(ends[1][0] - ends[0][0], ends[1][1] - ends[0][1]))
+    if length < 2:
+        raise UserError(f"calibration: the ends of the {source} are {length:.1f} px apart")
+    return Scale(length_mm / length, float(np.sqrt(2)) * _POINT_PX / length, source)
+
+
+def _checkerboard(path: Path, corners: tuple[int, int], square_mm: float) -> Scale:
+    """Mean length of the squares' sides around the picture's middle; its spread over the board is the error.
+
+    On a board that lies flat and square to the view all sides are equal; tilt and distortion show as spread.
+    """
+    columns, rows = corners
+    if columns < 2 or rows < 2:
+        raise UserError("calibration.corners: at least 2 by 2 inner corners")
+    grey = np.ascontiguousarray(video.read_picture(path).mean(axis=2).astype(np.uint8))
+    found, points = cv2.findChessboardCornersSB(grey, (columns, rows))
+    if not found:
+        raise UserError(f"{path}: no checkerboard of {columns} x {rows} inner corners found")
+    grid = np.asarray(points, np.float64).reshape(rows, columns, 2)
+    sides = [np.linalg.norm(np.diff(grid, axis=k), axis=-1).ravel() for k in (0, 1)]
+    lengths = np.concatenate(sides)
+    middle = float(lengths.mean())
+    # Sides along rows and columns differ under tilt: half that difference can't be averaged away.
+    tilt = abs(float(sides[0].mean() - sides[1].mean())) / 2
+    error = float(np.hypot(lengths.std() / np.sqrt(len(lengths)), tilt)) / middle
+    return Scale(square_mm / middle, max(error, 1e-4), "checkerboard")
+
+
+def _first(*values: float | None) -> float:
+    return next(value for value in values if value is not None)

@@ -1,0 +1,1 @@
+"""From a recording and methods to scores and a report."""

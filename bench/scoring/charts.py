@@ -1,0 +1,142 @@
+"""The report's charts as plotly figures in plain JSON-ready dicts."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bench.scoring.evaluate_recording import Result
+
+Figure = dict[str, Any]
+
+SENSOR, MAIN, BAND, RED = "#3b3f46", "#1f6feb", "rgba(31,111,235,0.15)", "#c2352b"
+OTHERS = ("#8a6d00", "#2b7a4b", "#a04f9c", "#b8562b", "#5b6b7a", "#00798c", "#7a5195", "#6b8e23", "#a61c3c")
+
+
+def force(result: Result) -> Figure:
+    """Force over time: the sensor, the main method with its band of uncertainty, the rest on demand."""
+    time, main = _list(result.time_s), result.methods[result.main].size_mn
+    data: list[Figure] = []
+    spread = 1.96 * result.relative_uncertainty
+    if spread > 0:
+        low, high = main * (1 - min(spread, 1.0)), main * (1 + spread)
+        data += [
+            _line(time, low, "", "rgba(0,0,0,0)", showlegend=False, hoverinfo="skip"),
+            _line(
+                time, high, f"±{100 * spread:.0f}% scale, stiffness", "rgba(0,0,0,0)",
+                fill="tonexty", fillcolor=BAND, hoverinfo="skip",
+            ),
+        ]  # fmt: skip
+    if result.sensor_mn is not None:
+        data.append(_line(time, result.sensor_mn, "sensor", SENSOR, width=2.5))
+    data.append(_line(time, main, result.main, MAIN, width=2.5))
+    rest = [name for name in result.methods if name != result.main]
+    for k, name in enumerate(rest):
+        data.append(
+            _line(
+                time,
+                result.methods[name].size_mn,
+                name,
+                OTHERS[k % len(OTHERS)],
+                width=1.5,
+                visible="legendonly",
+            )
+        )
+    return _figure(data, "time [s]", "force [mN]", legend=True)
+
+
+def scatter(result: Result) -> Figure:
+    """Predicted against sensor, with the line of agreement."""
+    assert result.sensor_mn is not None
+    x, y = _both(result)
+    top = float(max(x.max(initial=0.0), y.max(initial=0.0))) * 1.05 or 1.0
+    data = [
+        _line([0, top], np.array([0, top]), "equal", SENSOR, width=1, dash="dot", hoverinfo="skip"),
+        _dots(x, y, result.main),
+    ]
+    figure = _figure(data, "sensor [mN]", "predicted [mN]")
+    for axis in ("xaxis", "yaxis"):
+        figure["layout"][axis]["range"] = [-0.02 * top, top]
+    return figure
+
+
+def bland_altman(result: Result, limits: dict[str, float]) -> Figure:
+    """Difference against mean, with bias and limits of agreement.
+
+    Args:
+        limits: bias_mn, low_mn, high_mn.
+    """
+    x, y = _both(result)
+    middle, difference = (x + y) / 2, y - x
+    left, right = float(middle.min(initial=0.0)), float(middle.max(initial=1.0))
+    data = [_dots(middle, difference, result.main)]
+    for name, key, colour in (
+        ("bias", "bias_mn", MAIN),
+        ("95% low", "low_mn", RED),
+        ("95% high", "high_mn", RED),
+    ):
+        level = limits[key]
+        if math.isfinite(level):
+            data.append(
+                _line(
+                    [left, right],
+                    np.array([level, level]),
+                    f"{name} {level:+.3g}",
+                    colour,
+                    width=1.5,
+                    dash="dash",
+                )
+            )
+    return _figure(data, "mean of both [mN]", "predicted − sensor [mN]")
+
+
+def _both(result: Result) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    assert result.sensor_mn is not None
+    predicted = result.methods[result.main].size_mn
+    good = result.scored & np.isfinite(result.sensor_mn) & np.isfinite(predicted)
+    return result.sensor_mn[good], predicted[good]
+
+
+def _line(
+    x: Sequence[float | None],
+    y: NDArray[np.float64],
+    name: str,
+    colour: str,
+    width: float = 0,
+    dash: str = "solid",
+    **more: Any,
+) -> Figure:
+    line = {"color": colour, "width": width, "dash": dash}
+    return {"type": "scatter", "mode": "lines", "x": x, "y": _list(y), "name": name, "line": line, **more}
+
+
+def _dots(x: NDArray[np.float64], y: NDArray[np.float64], name: str) -> Figure:
+    marker = {"color": MAIN, "size": 5, "opacity": 0.45 if len(x) > 100 else 0.8}
+    kind = "scattergl" if len(x) > 4000 else "scatter"
+    return {"type": kind, "mode": "markers", "x": _list(x), "y": _list(y), "name": name, "marker": marker}
+
+
+def _figure(data: list[Figure], x: str, y: str, legend: bool = False) -> Figure:
+    axis = {"gridcolor": "#e6e8eb", "zerolinecolor": "#c9ced6", "linecolor": "#c9ced6", "ticks": "outside",
+            "tickcolor": "#c9ced6", "automargin": True}  # fmt: skip
+    layout = {
+        "xaxis": {**axis, "title": {"text": x, "standoff": 6}},
+        "yaxis": {**axis, "title": {"text": y, "standoff": 4}, "rangemode": "normal"},
+        "margin": {"l": 8, "r": 8, "t": 8, "b": 8},
+        "showlegend": legend,
+        "legend": {"orientation": "h", "y": 1.02, "yanchor": "bottom", "x": 0, "font": {"size": 12}},
+        "font": {"family": "system-ui, sans-serif", "size": 13, "color": "#22262b"},
+        "paper_bgcolor": "white",
+        "plot_bgcolor": "white",
+        "hovermode": "x unified" if legend else "closest",
+    }
+    return {"data": data, "layout": layout}
+
+
+def _list(values: Any) -> list[float | None]:
+    """Five figures are more than a chart shows; NaN becomes a gap."""
+    return [float(f"{value:.5g}") if math.isfinite(value) else None for value in values]

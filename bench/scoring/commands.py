@@ -1,0 +1,136 @@
+"""What `bench score` and `bench demo` run: a folder in, score.json and report.html out."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Mapping
+from contextlib import closing
+from pathlib import Path
+
+from threadpoolctl import threadpool_limits
+
+from bench.methods.network import Model
+from bench.output.progress_bar import counting
+from bench.recording import pixel_scale
+from bench.recording.folder import open_recording
+from bench.recording.from_sequence import export
+from bench.scoring import evaluate_recording, report
+from bench.scoring.evaluate_recording import Result, Settings
+from bench.tracking.flow_process import Beside, Here
+from bench.tracking.tracking import Method
+from synth.dataset.store import Dataset, Sequence
+from synth.errors import UserError
+
+MAIN = "D2FNet"
+"""Name under which the given model stands in every table."""
+_LONG = 100
+"""Frames from which a second process is worth the seconds that it takes to start."""
+_MANY = 300
+"""Frames from which a quick network is: it gains what it takes on 65 to 130 frames looked at."""
+
+
+def score(
+    recording: Path,
+    model: Path,
+    out: Path | None,
+    settings: Settings,
+    title: str = "",
+    train: Path | None = None,
+    also: Mapping[str, Path] | None = None,
+) -> Result:
+    """Scores one recording and writes score.json and report.html, both whole or not at all.
+
+    Args:
+        recording: its folder.
+        model: folder of `learn train`.
+        train: the dataset the model was trained on; simpler methods are fitted on the same sequences.
+        also: further models by name.
+        out: folder for the results; `NAME-score` here if None.
+        settings: of this run.
+        title: heading of the report.
+
+    Raises:
+        UserError: recording, model or settings that can't be used; nothing is written then.
+    """
+    from learn.training.threads import set_threads
+
+    # NumPy's BLAS too: a second thread of its own waits for a core that the flow has.
+    threadpool_limits(set_threads(None))
+    opened = open_recording(recording)
+    total = opened.expected_frames()
+    # Started first, for it takes seconds to begin; the methods are fitted meanwhile.
+    with closing(Beside() if _worth_a_process(total) else Here()) as flow:
+        quick = (total or 0) >= _MANY
+        network = Model(model, quick)
+        methods: dict[str, Method] = {MAIN: network}
+        methods |= {name: Model(folder, quick) for name, folder in (also or {}).items()}
+        methods |= baselines(train, model)
+        found = pixel_scale.find(opened.meta, recording)
+        with counting(f"scoring {opened.name}", total) as progress:
+            about = {"model": network.described()}
+            result = evaluate_recording.assess(opened, methods, MAIN, found, settings, about, progress, flow)
+    folder = out or Path(f"{opened.name}-score")
+    folder.mkdir(parents=True, exist_ok=True)
+    evaluate_recording.write_json(result, folder / "score.json")
+    report.write(result, folder / "report.html", title)
+    return result
+
+
+def _worth_a_process(frames: int | None) -> bool:
+    return len(os.sched_getaffinity(0)) > 1 and (frames or _LONG) >= _LONG
+
+
+def baselines(train: Path | None, model: Path) -> dict[str, Method]:
+    """Those that need no data, and, given the training data, those fitted on the model's own fit sequences.
+
+    Raises:
+        UserError: none of the model's sequences is in `train`.
+    """
+    from bench.methods import baselines as baseline
+
+    methods = baseline.physical()
+    if train is None:
+        return methods
+    from learn.checkpoint import read_card
+    from learn.data.clips import read
+
+    hashes = set(read_card(model).split.get("fit", []))
+    chosen = [s for s in Dataset(train) if s.attrs["content_hash"] in hashes]
+    if not chosen:
+        raise UserError(f"{train}: holds none of the sequences that {model} was fitted on")
+    source = "recovered" if all("flow_tvl1" in s for s in chosen) else "ideal"
+    return methods | baseline.fitted([read(s, baseline.GRID, (source,)) for s in chosen], source)
+
+
+def demo(dataset: Path, model: Path, out: Path, settings: Settings) -> Result:
+    """Exports a sequence that the model has not seen as a recording, and scores it.
+
+    Args:
+        dataset: where the model's training data came from.
+        model: folder of `learn train`.
+        out: gets recording/, score.json and report.html; what an earlier demo left there is replaced.
+
+    Raises:
+        UserError: the model has seen every sequence, or as `score`.
+    """
+    chosen = unseen(dataset, model)
+    folder = out / "recording"
+    if folder.exists():
+        shutil.rmtree(folder)
+    export(chosen, folder)
+    return score(
+        folder, model, out, settings, f"Force from video: sequence {chosen.index}, unseen in training"
+    )
+
+
+def unseen(dataset: Path, model: Path) -> Sequence:
+    """The first sequence that the model was neither fitted nor chosen on. UserError if there is none."""
+    from learn.checkpoint import read_card
+
+    split = read_card(model).split
+    seen = {name for part in ("fit", "select") for name in split.get(part, [])}
+    for sequence in Dataset(dataset):
+        if sequence.attrs["content_hash"] not in seen:
+            return sequence
+    raise UserError(f"{dataset}: the model was fitted or chosen on every sequence here")

@@ -1,0 +1,207 @@
+"""Several scored recordings as one answer: means over recordings, intervals over specimens."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bench.bootstrap import Interval, over_groups
+from bench.output import forest_plot, machine, result_page
+from bench.output import write as results
+from synth.errors import UserError
+
+SCORES = (
+    ("mae_mn", "MAE [mN]"),
+    ("mae_of_peak", "MAE of event peak"),
+    ("r", "r"),
+    ("ccc", "CCC"),
+    ("r2", "R²"),
+    ("bias_mn", "bias [mN]"),
+    ("contact_f1", "contact F1"),
+    ("ghost_rate", "ghosts"),
+    ("peak_mae", "peak error"),
+    ("impulse_mae", "impulse error"),
+    ("dropout", "dropout"),
+)
+_CALIBRATED = (("mae_of_peak", "MAE of event peak, gain set"), ("r2", "R², gain set"), ("gain", "gain"))
+
+
+def read(paths: Sequence[Path]) -> list[dict[str, Any]]:
+    """The score.json of each path (a file, or a folder of `bench score`), in the order given.
+
+    Raises:
+        UserError: none given, one that is no score, recordings twice, or different main methods.
+    """
+    found = []
+    for path in paths:
+        file = path / "score.json" if path.is_dir() else path
+        try:
+            tree = json.loads(file.read_text(encoding="utf-8"))
+        except (OSError, ValueError):
+            raise UserError(f"{path}: holds no readable score.json") from None
+        if tree.get("format") != "sulcus-score":
+            raise UserError(f"{path}: not written by `bench score`")
+        found.append(tree)
+    if not found:
+        raise UserError("no scores to pool")
+    names = [tree["recording"] for tree in found]
+    twice = {name for name in names if names.count(name) > 1}
+    if twice:
+        raise UserError(f"recording {min(twice)} is given twice")
+    if not any(tree["scores"] for tree in found):
+        raise UserError("none of the recordings was scored against a sensor")
+    if len({tree["main"] for tree in found}) > 1:
+        raise UserError("the scores are of different main methods")
+    return found
+
+
+def pool(found: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Means over recordings with 95% intervals, specimens resampled; methods that all have.
+
+    Recordings that were not scored (no sensor, clocks not aligned) are left out and named.
+    """
+    every, found = found, [tree for tree in found if tree["scores"]]
+    methods = [m for m in found[0]["methods"] if all(m in tree["methods"] for tree in found)]
+    specimens = [tree["settings"]["meta"].get("specimen") or tree["recording"] for tree in found]
+    main = found[0]["main"]
+    out: dict[str, Any] = {}
+    for method in methods:
+        rows = [tree["methods"][method] for tree in found]
+        out[method] = {
+            "scores": {key: _mean([row["scores"][key] for row in rows], specimens) for key, _ in SCORES},
+            "calibrated": {
+                key: _mean([row["calibrated"].get(key) for row in rows], specimens) for key, _ in _CALIBRATED
+            },
+        }
+        own = [tree["methods"][main]["scores"]["mae_mn"] for tree in found]
+        other = [row["scores"]["mae_mn"] for row in rows]
+        apart = [a - b for a, b in zip(_numbers(own), _numbers(other), strict=True)]
+        out[method]["main_worse_by_mn"] = None if method == main else _mean(apart, specimens)
+    return {
+        "format": "sulcus-pool",
+        "version": 1,
+        "main": main,
+        "recordings": [tree["recording"] for tree in found],
+        "left_out": {tree["recording"]: _reason(tree) for tree in every if not tree["scores"]},
+        "each": [_each(tree) for tree in found],
+        "specimens": len(set(specimens)),
+        "frames": sum(tree["frames"] for tree in found),
+        "methods": out,
+    }
+
+
+def _reason(tree: dict[str, Any]) -> str:
+    """Why a recording has no scores."""
+    refused = (tree.get("sync") or {}).get("refused")
+    return f"clocks not aligned: {refused}" if refused else "no sensor"
+
+
+def _each(tree: dict[str, Any]) -> dict[str, Any]:
+    """What is said of one recording: its main method's scores and how its clocks were aligned."""
+    found = tree.get("sync") or {}
+    return {
+        "recording": tree["recording"],
+        "frames": tree["frames"],
+        **{key: tree["scores"].get(key) for key in ("event_peak_mn", "mae_of_peak", "r")},
+        "offset_s": found.get("offset_s"),
+        "offset_deviation_s": found.get("deviation_s"),
+    }
+
+
+def write(tree: dict[str, Any], out: Path, command: str) -> None:
+    """pool.json, README.md, chart.svg and index.html in the folder `out`."""
+    tree = tree | {"command": command, "machine": machine.describe()}
+    results.keep(out, "pool.json", json.dumps(tree, indent=1, allow_nan=False) + "\n")
+    results.keep(out, "README.md", readme(tree))
+    result_page.write(drawn(tree), out)
+
+
+def drawn(tree: Mapping[str, Any]) -> result_page.Sheet:
+    """Page and picture of `pool.json`."""
+    rows = tuple(
+        forest_plot.Row(
+            name,
+            _number(m["scores"]["mae_of_peak"]["mean"]),
+            _ends(m["scores"]["mae_of_peak"]),
+            name == tree["main"],
+        )
+        for name, m in tree["methods"].items()
+    )
+    title = f"{len(tree['recordings'])} recordings"
+    chart = result_page.Chart(title, "mean error as a share of the event peak", rows)
+    return result_page.Sheet(title, tree["command"], tree, (chart,))
+
+
+def readme(tree: dict[str, Any]) -> str:
+    """The pooled scores as a table; methods that beat the main one are marked."""
+    shown = [(key, name) for key, name in SCORES if key not in ("bias_mn", "impulse_mae", "dropout")]
+    lines = [
+        f"# {len(tree['recordings'])} recordings, {tree['specimens']} specimens, {tree['frames']} frames",
+        "",
+        "Means over recordings; in brackets 95% intervals, specimens resampled.",
+        "",
+        f"    {tree['command']}",
+        "",
+        f"Machine: {machine.line(tree['machine'])}.",
+        "",
+        "| method | " + " | ".join(name for _, name in (*shown, *_CALIBRATED)) + " |",
+        "|" + " --- |" * (1 + len(shown) + len(_CALIBRATED)),
+    ]
+    own = _number(tree["methods"][tree["main"]]["scores"]["mae_mn"]["mean"])
+    for name, method in tree["methods"].items():
+        beats = name != tree["main"] and _number(method["scores"]["mae_mn"]["mean"]) < own
+        cells = [_text(method["scores"][key], "[mN]" in head) for key, head in shown]
+        cells += [_text(method["calibrated"][key], False) for key, _ in _CALIBRATED]
+        word = name.replace("|", r"\|")
+        lines.append(f"| {'**' + word + '** (better)' if beats else word} | " + " | ".join(cells) + " |")
+    for name, reason in tree["left_out"].items():
+        lines += ["", f"Recording {name} is left out: {reason}."]
+    lines += ["", f"By recording, {tree['main']}:", ""]
+    lines += [
+        "| recording | frames | event peak [mN] | MAE of it | r | clocks' offset [ms] |",
+        "|" + " --- |" * 6,
+    ]
+    for row in tree["each"]:
+        peak, mae, r = (_number(row[key]) for key in ("event_peak_mn", "mae_of_peak", "r"))
+        offset = "–"
+        if row["offset_s"] is not None:
+            offset = f"{1e3 * row['offset_s']:.0f} ± {1e3 * _number(row['offset_deviation_s']):.0f}"
+        lines.append(
+            f"| {row['recording']} | {row['frames']} | {peak:.2f} | {mae:.1%} | {r:.3f} | {offset} |"
+        )
+    return "\n".join([*lines, "", "![Errors](chart.svg)", ""])
+
+
+def _mean(values: Sequence[float | None], specimens: Sequence[str]) -> dict[str, float | None]:
+    numbers = _numbers(values)
+    good = [v for v in numbers if math.isfinite(v)]
+    low, high = over_groups(numbers, list(specimens), np.random.default_rng(0))
+    plain = [v if math.isfinite(v) else None for v in (low, high)]
+    return {"mean": float(np.mean(good)) if good else None, "low": plain[0], "high": plain[1], "n": len(good)}
+
+
+def _numbers(values: Sequence[float | None]) -> list[float]:
+    return [_number(value) for value in values]
+
+
+def _number(value: float | None) -> float:
+    return math.nan if value is None else value
+
+
+def _ends(value: dict[str, float | None]) -> Interval:
+    return (_number(value["low"]), _number(value["high"]))
+
+
+def _text(value: dict[str, float | None], newtons: bool) -> str:
+    if value["mean"] is None:
+        return "–"
+    digits = 2 if newtons else 3
+    text = f"{value['mean']:.{digits}f}"
+    if value["low"] is None or value["high"] is None:
+        return text
+    return f"{text} [{value['low']:.{digits}f}, {value['high']:.{digits}f}]"

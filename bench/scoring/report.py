@@ -1,0 +1,268 @@
+"""`report.html`: one page that stands alone, from a result."""
+
+from __future__ import annotations
+
+import base64
+import html
+import json
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
+from numpy.typing import NDArray
+from plotly.offline import get_plotlyjs
+from rich import box
+from rich.table import Table
+
+from bench.scoring import charts, metrics
+from bench.scoring.evaluate_recording import Result
+from bench.tracking.tracking import Snapshot
+from synth.dataset.folder import write_whole
+from synth.publish import picture
+
+_PEAKS, _WORST = 4, 2
+
+METRICS: tuple[tuple[str, str, str], ...] = (
+    ("mae_mn", "MAE", "mN"),
+    ("mae_of_peak", "of peak", "%"),
+    ("rmse_mn", "RMSE", "mN"),
+    ("bias_mn", "bias", "mN"),
+    ("r", "r", ""),
+    ("ccc", "CCC", ""),
+    ("r2", "R²", ""),
+    ("gain", "gain", ""),
+    ("lag_s", "lag", "ms"),
+    ("contact_f1", "contact F1", ""),
+    ("ghost_rate", "ghosts", "%"),
+    ("peak_mae", "peak err.", "%"),
+    ("impulse_mae", "impulse err.", "%"),
+    ("dropout", "dropout", "%"),
+)
+"""Score, heading, unit shown."""
+
+_TILES = ("mae_mn", "mae_of_peak", "r", "ccc", "r2", "ghost_rate")
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One moment: frame, flow, force map, as data URIs."""
+
+    caption: str
+    frame: str
+    flow: str
+    force: str | None
+
+
+def write(result: Result, path: Path, title: str = "") -> None:
+    """Writes the report whole or not at all.
+
+    Args:
+        result: of `assess`.
+        path: the HTML file.
+        title: heading; the recording's name if empty.
+    """
+    page = render(result, title or f"Force from video: {result.recording}")
+    write_whole(path, page, durable=False)
+
+
+def render(result: Result, title: str) -> str:
+    """The page as text."""
+    environment = Environment(
+        loader=PackageLoader("bench.scoring", "."),
+        autoescape=select_autoescape(default_for_string=True, default=True),
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters["shown"] = shown
+    main = result.methods[result.main]
+    figures = {"force": charts.force(result)}
+    if math.isfinite(main.scores.get("mae_mn", math.nan)):
+        figures["scatter"] = charts.scatter(result)
+        figures["bland"] = charts.bland_altman(result, limits_of_agreement(result))
+    panels, flow_px, force_kpa = pictures(result)
+    return environment.get_template("report.html.jinja").render(
+        title=title,
+        result=result,
+        main=main,
+        metrics=METRICS,
+        tiles=[(key, name, unit) for key, name, unit in METRICS if key in _TILES],
+        best=_best(result),
+        beaten_by=beaten_by(result),
+        surely=[n for n in beaten_by(result) if (w := result.methods[n].worse_by_mn) and w[0] > 0],
+        agreement="scatter" in figures,
+        panels=panels,
+        flow_px=flow_px,
+        force_kpa=force_kpa,
+        # "</" would end the script element early.
+        figures=json.dumps(figures, allow_nan=False).replace("</", "<\\/"),
+        plotly=get_plotlyjs(),
+        settings=_flat(result.settings),
+        cost=_cost(result),
+    )
+
+
+def terminal_table(result: Result) -> Table:
+    """The methods' scores for a terminal."""
+    # Eighty columns: a name may take two lines, a number never.
+    table = Table(title=result.recording, title_justify="left", box=box.SIMPLE)
+    table.add_column("method")
+    if not result.methods[result.main].scores:
+        table.add_column("largest force [mN]", justify="right")
+        for name, method in result.methods.items():
+            table.add_row(name, shown(float(np.nanmax(method.size_mn))))
+        return table
+    keys = [row for row in METRICS if row[0] in {*_TILES, "bias_mn"}]
+    for _, name, unit in keys:
+        table.add_column(f"{name} [mN]" if unit == "mN" else name, justify="right", no_wrap=True)
+    for name, method in result.methods.items():
+        table.add_row(
+            name, *(shown(method.scores[key], unit if unit != "mN" else "") for key, _, unit in keys)
+        )
+    return table
+
+
+def limits_of_agreement(result: Result) -> dict[str, float]:
+    """Bias and limits of agreement over the scored frames, contacts being the repeats."""
+    assert result.sensor_mn is not None
+    kept, predicted = result.scored, result.methods[result.main].size_mn
+    threshold = metrics.contact_threshold(result.sensor_mn[kept], result.noise_floor_mn)
+    contact = metrics.in_contact(result.sensor_mn, threshold)
+    # What is left out also ends a repeat: contact before a calibrating press is not contact after it.
+    state = np.where(kept, contact, -1)
+    run = np.cumsum(np.diff(state, prepend=state[:1]) != 0)
+    return metrics.limits_of_agreement((predicted - result.sensor_mn)[kept], run[kept])
+
+
+def beaten_by(result: Result) -> list[str]:
+    """Names of the other methods whose MAE is lower than the main one's."""
+    own = result.methods[result.main].scores.get("mae_mn", math.nan)
+    return [
+        name
+        for name, method in result.methods.items()
+        if name != result.main and method.scores.get("mae_mn", math.inf) < own
+    ]
+
+
+def shown(value: float | None, unit: str = "") -> str:
+    """A number for a person: three figures, percent and milliseconds converted, a dash for none."""
+    if value is None or not math.isfinite(value):
+        return "–"
+    if unit == "%":
+        return f"{100 * value:.1f}%"
+    if unit == "ms":
+        return f"{1000 * value:+.0f} ms"
+    digits = max(0, 2 - math.floor(math.log10(abs(value)))) if value else 0
+    text = f"{value:.{min(digits, 3)}f}"
+    return f"{text} {unit}" if unit else text
+
+
+def pictures(result: Result) -> tuple[list[Panel], float, float]:
+    """The moments shown, and the flow [px of the picture shown] and density [kPa] at full colour."""
+    chosen = moments(result)
+    done = result.followed
+    if not chosen or done.rest is None or done.tissue is None:
+        return [], 0.0, 0.0
+    lengths = [np.linalg.norm(snap.flow, axis=-1)[done.tissue] for _, snap in chosen]
+    flow_px = max(float(np.percentile(np.concatenate(lengths), 99.5)), 0.5)
+    maps = [snap.density for _, snap in chosen if snap.density is not None]
+    force_kpa = max([float(np.percentile(m[done.tissue], 99.8)) for m in maps], default=0.0)
+    tissue = done.tissue.astype(np.float32)
+    grey = np.repeat(done.rest.mean(axis=2, keepdims=True), 3, axis=2).astype(np.uint8)
+    panels = []
+    for caption, snap in chosen:
+        moved = picture.overlay(grey, picture.flow_colours(snap.flow, flow_px), 0.65 * tissue)
+        moved = picture.arrows(moved, snap.flow, done.tissue, max(grey.shape[1] // 22, 8), 1.0)
+        pushed = None
+        if snap.density is not None:
+            weight = tissue * np.clip(0.15 + snap.density / max(force_kpa, 1e-12), 0, 0.9)
+            dark = (0.6 * grey).astype(np.uint8)
+            pushed = _jpeg(picture.overlay(dark, picture.heat(snap.density, force_kpa), weight))
+        panels.append(Panel(caption, _jpeg(snap.rgb), _jpeg(moved), pushed))
+    return panels, flow_px, force_kpa
+
+
+def moments(result: Result) -> list[tuple[str, Snapshot]]:
+    """The snapshots nearest the largest forces of separate contacts, and the ones with the largest errors."""
+    snaps = result.followed.snapshots
+    if not snaps:
+        return []
+    at = np.array([snap.position for snap in snaps])
+    predicted = result.methods[result.main].size_mn[at]
+    truth = predicted if result.sensor_mn is None else result.sensor_mn[at]
+    height = np.where(np.isfinite(truth), truth, 0.0)
+    taken: list[int] = []
+    apart = max(2, len(snaps) // (2 * _PEAKS))
+    for k in np.argsort(-height, kind="stable"):
+        if len(taken) == _PEAKS or height[k] < 0.1 * height.max():
+            break
+        if all(abs(int(k) - other) >= apart for other in taken):
+            taken.append(int(k))
+    out = [(_caption(result, snaps[k]), snaps[k]) for k in sorted(taken)]
+    if result.sensor_mn is not None:
+        error = np.nan_to_num(np.abs(predicted - truth), nan=-1.0)
+        for k in np.argsort(-error, kind="stable")[:_WORST]:
+            if int(k) not in taken and error[k] >= 0:
+                out.append(("Large error: " + _caption(result, snaps[k]), snaps[k]))
+    return out
+
+
+def _caption(result: Result, snap: Snapshot) -> str:
+    k = snap.position
+    words = f"{result.time_s[k]:.2f} s, predicted {shown(float(result.methods[result.main].size_mn[k]))} mN"
+    if result.sensor_mn is not None and math.isfinite(result.sensor_mn[k]):
+        words += f", sensor {shown(float(result.sensor_mn[k]))} mN"
+    return words
+
+
+def _best(result: Result) -> dict[str, float]:
+    """The best value in each column of the table, to be set in bold."""
+    down = {"mae_mn", "mae_of_peak", "rmse_mn", "ghost_rate", "peak_mae", "impulse_mae", "dropout"}
+    best = {}
+    for key, _, _ in METRICS:
+        values = [
+            m.scores[key] for m in result.methods.values() if math.isfinite(m.scores.get(key, math.nan))
+        ]
+        if len(set(values)) < 2:
+            continue
+        if key in down:
+            best[key] = min(values)
+        elif key in {"r", "ccc", "r2", "contact_f1"}:
+            best[key] = max(values)
+        elif key in {"bias_mn", "lag_s"}:
+            best[key] = min(values, key=abs)
+        elif key == "gain":
+            best[key] = min(values, key=lambda value: abs(value - 1))
+    return best
+
+
+def _cost(result: Result) -> list[tuple[str, str, str]]:
+    """Stage, CPU milliseconds a frame, share of real time."""
+    frames = max(len(result.time_s), 1)
+    duration = float(result.time_s[-1] - result.time_s[0]) if len(result.time_s) > 1 else math.nan
+    rows = []
+    for stage, spent in result.followed.timings.items():
+        if isinstance(spent, dict):
+            rows.append((stage, f"{1000 * spent['cpu_s'] / frames:.1f}", f"{spent['wall_s'] / duration:.2f}"))
+    return rows
+
+
+def _flat(tree: dict[str, Any], before: str = "") -> list[tuple[str, str]]:
+    rows: list[tuple[str, str]] = []
+    for key, value in tree.items():
+        name = f"{before}{key}"
+        if isinstance(value, dict):
+            rows += _flat(value, f"{name}.")
+        else:
+            rows.append((name, html.unescape(str(value))))
+    return rows
+
+
+def _jpeg(rgb: NDArray[np.uint8]) -> str:
+    done, data = cv2.imencode(".jpg", np.ascontiguousarray(rgb[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, 85])
+    assert done
+    return "data:image/jpeg;base64," + base64.b64encode(data.tobytes()).decode("ascii")

@@ -1,0 +1,1 @@
+"""The force sensor: its samples and its clock."""

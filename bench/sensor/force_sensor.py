@@ -1,0 +1,155 @@
+"""From the sensor's raw samples to the force on the tissue at the times of the frames."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import signal
+
+from bench.recording.folder import Force
+from bench.recording.meta import Sensor
+from synth.errors import UserError
+
+STANDARD_GRAVITY = 9.80665
+"""m/s² = mN/g."""
+
+_GAP = 5.0  # median sample times after which samples are apart
+_ORDER = 4
+
+
+@dataclass(frozen=True)
+class Processed:
+    """Force on the tissue, on the video's clock."""
+
+    time_s: NDArray[np.float64]
+    """(N,) rising [s]."""
+    force_mn: NDArray[np.float64]
+    """(N, 3) [mN]; NaN in gaps."""
+    noise_floor_mn: float
+    """Standard deviation without contact, all components together, after filtering [mN]; 0 if unknown."""
+    drift_mn: float
+    """Largest drift taken out [mN]."""
+    steps: tuple[str, ...]
+    """What was done, in order, in words."""
+
+
+def process(force: Force, sensor: Sensor, offset_s: float, causal: bool = False) -> Processed:
+    """Gravity, tare and drift, low-pass, clock; in this order.
+
+    Args:
+        force: raw samples.
+        sensor: how to read them.
+        offset_s: added to the sensor's times [s].
+        causal: the low-pass runs forward only, as a live system's must (its delay is then in the curve).
+
+    Raises:
+        UserError: a contact-free span without samples, a mass without gravity columns.
+    """
+    steps: list[str] = []
+    values = _weightless(force, sensor, steps)
+    values, drift = _tared(force.time_s, values, sensor, steps)
+    values = _smooth(force.time_s, values, sensor.low_pass_hz, causal, steps)
+    floor = _floor(force.time_s, values, sensor)
+    if offset_s:
+        steps.append(f"clock moved by {offset_s * 1000:+.1f} ms")
+    return Processed(force.time_s + offset_s, values, floor, drift, tuple(steps))
+
+
+def at(processed: Processed, time_s: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Force at the given times by linear interpolation, (T, 3) mN; NaN in gaps and outside the samples."""
+    t, values = processed.time_s, processed.force_mn
+    out = np.stack([np.interp(time_s, t, column, left=np.nan, right=np.nan) for column in values.T], axis=1)
+    step = float(np.median(np.diff(t)))
+    after = np.clip(np.searchsorted(t, time_s), 1, len(t) - 1)
+    # Frame times that fall in a hole of the sensor's record have no truth.
+    hole = (t[after] - t[after - 1] > _GAP * step) & (time_s != t[after]) & (time_s != t[after - 1])
+    out[hole] = np.nan
+    return out
+
+
+def _weightless(force: Force, sensor: Sensor, steps: list[str]) -> NDArray[np.float64]:
+    if sensor.mass_g == 0:
+        return force.force_mn.copy()
+    if force.gravity is None:
+        raise UserError(
+            "sensor.mass_g is given, but force.csv has no columns gx, gy, gz for the direction of gravity"
+        )
+    sign = -1.0 if sensor.acts_on == "tool" else 1.0  # the file's sign was turned on reading
+    steps.append(f"weight of {sensor.mass_g:g} g beyond the sensor taken off")
+    return np.asarray(force.force_mn - sign * sensor.mass_g * STANDARD_GRAVITY * force.gravity, np.float64)
+
+
+def _tared(
+    time_s: NDArray[np.float64], values: NDArray[np.float64], sensor: Sensor, steps: list[str]
+) -> tuple[NDArray[np.float64], float]:
+    """Subtracts the zero: a line through the medians of the contact-free spans, constant beyond them."""
+    if not sensor.free_s:
+        return values, 0.0
+    middles, zeros = [], []
+    for start, stop in sorted(sensor.free_s):
+        inside = (time_s >= start) & (time_s <= stop) & np.isfinite(values).all(axis=1)
+        if not inside.any():
+            raise UserError(f"sensor.free_s: no samples between {start:g} and {stop:g} s")
+        middles.append(float(time_s[inside].mean()))
+        zeros.append(np.median(values[inside], axis=0))
+    zero = np.stack([np.interp(time_s, middles, column) for column in np.array(zeros).T], axis=1)
+    drift = float(np.linalg.norm(zero - zero[0], axis=1).max())
+    word = "tare" if len(middles) == 1 else f"tare and drift ({drift:.1f} mN)"
+    steps.append(f"{word} from {len(middles)} contact-free span{'s' * (len(middles) > 1)}")
+    return values - zero, drift
+
+
+def _smooth(
+    time_s: NDArray[np.float64],
+    values: NDArray[np.float64],
+    cut_hz: float | None,
+    causal: bool,
+    steps: list[str],
+) -> NDArray[np.float64]:
+    """Butterworth on each unbroken run of samples, brought to a uniform clock and back."""
+    if cut_hz is None:
+        return values
+    step = float(np.median(np.diff(time_s)))
+    if cut_hz >= 0.4 / step:
+        steps.append(f"no low-pass: {cut_hz:g} Hz is too near half the sensor's {1 / step:.4g} Hz")
+        return values
+    sos = signal.butter(_ORDER, cut_hz, fs=1 / step, output="sos")
+    out = np.full_like(values, np.nan)
+    good = np.asarray(np.isfinite(values).all(axis=1), bool)
+    for run in runs(time_s, good, _GAP * step):
+        t = time_s[run]
+        even = np.arange(t[0], t[-1] + step / 2, step)
+        if len(even) <= 3 * (2 * len(sos) + 1):
+            out[run] = values[run]
+            continue
+        for k in range(values.shape[1]):
+            x = np.interp(even, t, values[run, k])
+            if causal:
+                state = signal.sosfilt_zi(sos) * x[0]
+                y = signal.sosfilt(sos, x, zi=state)[0]
+            else:
+                y = signal.sosfiltfilt(sos, x)
+            out[run, k] = np.interp(t, even, y)
+    way = "causal" if causal else "zero-phase"
+    steps.append(f"{way} Butterworth low-pass, order {_ORDER}, {cut_hz:g} Hz")
+    return out
+
+
+def runs(time_s: NDArray[np.float64], good: NDArray[np.bool_], gap_s: float) -> list[NDArray[np.intp]]:
+    """Indices of good samples, split where more than `gap_s` lies between neighbours."""
+    where = np.flatnonzero(good)
+    if len(where) == 0:
+        return []
+    return list(np.split(where, np.flatnonzero(np.diff(time_s[where]) > gap_s) + 1))
+
+
+def _floor(time_s: NDArray[np.float64], values: NDArray[np.float64], sensor: Sensor) -> float:
+    spreads = []
+    for start, stop in sensor.free_s:
+        inside = values[(time_s >= start) & (time_s <= stop)]
+        inside = inside[np.isfinite(inside).all(axis=1)]
+        if len(inside) > 2:
+            spreads.append(float(inside.var(axis=0).sum()))
+    return float(np.sqrt(np.mean(spreads))) if spreads else 0.0

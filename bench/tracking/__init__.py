@@ -1,0 +1,1 @@
+"""One pass over a video: displacement from the rest frame."""

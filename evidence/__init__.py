@@ -1,0 +1,1 @@
+"""This project's own evidence: what its defaults and claims are measured by. In the checkout only."""

@@ -1,0 +1,1 @@
+"""Whole pipelines: error of the force against cost."""

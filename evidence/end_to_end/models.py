@@ -1,0 +1,148 @@
+"""What answers with a force in `bench pareto end-to-end`: rules fitted on flow, physics alone, a network.
+
+The force on the tissue turns with the picture, so the fitted rules see every sequence in its eight turns and
+mirrors, as the network does by drawing them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bench.methods import baselines
+from bench.methods.baselines import GRID
+from learn.data.clips import Clip
+from learn.training import batches
+
+Floats = NDArray[np.float64]
+Answer = Callable[[Clip], Floats]
+"""A clip with `recovered` displacement → force (T, 3) mN, camera axes."""
+
+RIDGE, NEAREST, PHYSICS, NETWORK = "ridge on flow", "k-NN on flow", "Tikhonov near the contact", "D2FNet tiny"
+UNLEARNT = (PHYSICS,)
+
+_TURNS = 8
+_FOLDS = 4
+_NEIGHBOURS = 5
+_STRENGTHS = np.geomspace(1e-8, 1e2, 21)
+
+
+def build(model: str, fit: Sequence[Clip], folder: Path, epochs: int, seed: int) -> Answer:
+    """A model fitted on sequences; a network's training is kept in `folder`."""
+    if model == NETWORK:
+        return _network(fit, folder, epochs, seed)
+    if model in UNLEARNT:
+        rule = baselines.physical_rules()[model]
+        return lambda clip: (
+            clip.young_kpa
+            * np.stack(
+                [
+                    rule(moved, clip.mask, sure)
+                    for moved, sure in zip(clip.displacement["recovered"], clip.confidence, strict=True)
+                ]
+            )
+        )
+    x, force, group = _samples([t for clip in fit for t in turned(clip)])
+    live = np.abs(x).max(axis=0) > 0
+    x = x[:, live]
+    if model == RIDGE:
+        # Every sequence weighs alike, as it does in the score: what is linear may be scaled.
+        size = np.array([np.sqrt(np.square(force[group == k]).sum(axis=1).mean()) for k in np.unique(group)])
+        x, force = x / size[group, None], force / size[group, None]
+    rule_of = {RIDGE: _ridge, NEAREST: _nearest}[model](x, force, group)
+    return lambda clip: clip.young_kpa * rule_of(_rows(clip)[:, live])
+
+
+def turned(clip: Clip) -> list[Clip]:
+    """The clip in its four quarter turns and their mirrors, all arrays and the force turned with it."""
+    return [_turned(clip, quarter, mirror) for mirror in (False, True) for quarter in range(4)]
+
+
+def _turned(clip: Clip, quarter: int, mirror: bool) -> Clip:
+    def each(fields: NDArray[Any]) -> NDArray[Any]:
+        return np.stack([batches.turned(field, quarter, mirror) for field in fields])
+
+    return replace(
+        clip,
+        displacement={name: each(moved) for name, moved in clip.displacement.items()},
+        mask=each(clip.mask[None, None])[0, 0],
+        confidence=each(clip.confidence[:, None])[:, 0],
+        density=each(clip.density),
+        force=each(clip.force[..., None, None])[..., 0, 0],
+    )
+
+
+def _rows(clip: Clip) -> Floats:
+    """Displacement of a clip, (T, 2 N N) mm."""
+    return (clip.displacement["recovered"] * clip.mask).reshape(clip.frames, -1).astype(np.float64)
+
+
+def _samples(clips: Sequence[Clip]) -> tuple[Floats, Floats, NDArray[np.intp]]:
+    """All frames: displacement, force over E (n, 3), and which sequence; a sequence's turns are together."""
+    x = np.concatenate([_rows(clip) for clip in clips])
+    force = np.concatenate([clip.force / clip.young_kpa for clip in clips])
+    group = np.concatenate([np.full(clip.frames, k // _TURNS) for k, clip in enumerate(clips)])
+    return x, force, group
+
+
+def _ridge(x: Floats, force: Floats, group: NDArray[np.intp]) -> Callable[[Floats], Floats]:
+    """Linear in all cells, without intercept: no motion is no force.
+
+    The strength is chosen by cross-validation that leaves whole sequences out; that along the line of sight
+    by itself, for flow shows it far less well than the force across it.
+    """
+    folds = [group % _FOLDS == k for k in range(_FOLDS)]
+    grams, targets = [x[f].T @ x[f] for f in folds], [x[f].T @ force[f] for f in folds]
+    gram, target = np.sum(grams, axis=0), np.sum(targets, axis=0)
+    strengths = _STRENGTHS * np.trace(gram) / len(gram)
+    errors = np.zeros((len(strengths), 3))
+    for f, own, aim in zip(folds, grams, targets, strict=True):
+        values, axes = np.linalg.eigh(gram - own)
+        seen, aimed = x[f] @ axes, axes.T @ (target - aim)
+        for k, strength in enumerate(strengths):
+            said = seen @ (aimed / (np.maximum(values, 0) + strength)[:, None])
+            errors[k] += np.square(said - force[f]).sum(axis=0)
+    across, along = int(errors[:, :2].sum(axis=1).argmin()), int(errors[:, 2].argmin())
+    weights = [
+        np.linalg.solve(gram + strengths[k] * np.eye(len(gram)), target[:, axes])
+        for k, axes in ((across, slice(0, 2)), (along, slice(2, 3)))
+    ]
+    best = np.concatenate(weights, axis=1)
+    return lambda seen: np.asarray(seen @ best)
+
+
+def _nearest(x: Floats, force: Floats, group: NDArray[np.intp]) -> Callable[[Floats], Floats]:
+    """Mean force of the most alike frames."""
+    known = np.square(x).sum(axis=1)
+
+    def rule(seen: Floats) -> Floats:
+        away = known - 2 * seen @ x.T  # but for what all candidates share
+        nearest = np.argsort(away, axis=1, kind="stable")[:, :_NEIGHBOURS]
+        return np.asarray(force[nearest].mean(axis=1))
+
+    return rule
+
+
+def _network(fit: Sequence[Clip], folder: Path, epochs: int, seed: int) -> Answer:
+    from learn.data.split import Split
+    from learn.inference.predict import load
+    from learn.settings import preset
+    from learn.training.train import train
+
+    select = max(2, len(fit) // 5)
+    settings = preset("tiny", size=GRID.size, epochs=epochs, input="recovered", seed=seed)
+    train(fit, Split(tuple(range(select, len(fit))), tuple(range(select)), ()), settings, folder)
+    predictor = load(folder)
+
+    def answer(clip: Clip) -> Floats:
+        said, _ = predictor.answer(
+            np.asarray(clip.displacement["recovered"]), clip.mask, clip.young_kpa, np.asarray(clip.confidence)
+        )
+        return np.asarray(said.sum(axis=(2, 3)) * GRID.pitch_mm**2, np.float64)
+
+    return answer

@@ -1,0 +1,1 @@
+"""The engine measured: cost, kills, damage, faults, size."""

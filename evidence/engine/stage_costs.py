@@ -1,0 +1,67 @@
+"""What each stage of a dataset cost: CPU-seconds a frame and peak memory, from what the stores recorded."""
+
+from __future__ import annotations
+
+import json as json_
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+
+from bench.output import write
+from synth.dataset.store import Dataset
+from synth.errors import UserError
+
+
+def stages(
+    data: Annotated[Path, typer.Argument(help="A dataset made by `synth render`.")],
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder for stages.json.")] = None,
+    json: Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")] = False,
+) -> None:
+    """CPU-seconds a frame and peak memory, stage by stage, of a rendered dataset."""
+    from rich.console import Console
+    from rich.table import Table
+
+    found = measure(Dataset(data))
+    if out is not None:
+        write.keep(out, "stages.json", found)
+    if json:
+        print(json_.dumps(found))
+        return
+    table = Table("stage", "CPU s a frame", "largest", title=f"{found['sequences']} sequences, {data}")
+    for name, cost in found["cpu_s_a_frame"].items():
+        table.add_row(name, f"{cost['median']:.3f}", f"{cost['largest']:.3f}")
+    table.add_row("peak memory", f"{found['peak_rss_mb']:.0f} MB", "")
+    Console().print(table)
+
+
+def measure(dataset: Dataset) -> dict[str, Any]:
+    """Median and largest over sequences of each stage's CPU time a frame [s], and the peak memory [MB].
+
+    Raises:
+        UserError: a store has no timings.
+    """
+    costs: dict[str, list[float]] = {}
+    peak, size, frames = 0.0, (0, 0), 0
+    for sequence in dataset:
+        timings = sequence.attrs.get("timings")
+        if not timings:
+            raise UserError(f"{sequence.path}: records no timings")
+        peak = max(peak, float(timings["peak_rss_mb"]))
+        size, frames = sequence.size, sequence.frames
+        for name, spent in timings.items():
+            if isinstance(spent, dict):
+                costs.setdefault(name, []).append(float(spent["cpu_s"]) / sequence.frames)
+    summary = {
+        name: {"median": round(float(np.median(c)), 4), "largest": round(max(c), 4)}
+        for name, c in costs.items()
+    }
+    return {
+        "sequences": len(dataset),
+        "frames": frames,
+        "size": [size[1], size[0]],
+        "cpu_s_a_frame": summary,
+        "cpu_s_a_frame_all_stages": round(sum(stage["median"] for stage in summary.values()), 4),
+        "peak_rss_mb": peak,
+    }

@@ -1,0 +1,1 @@
+"""The physics measured: error against cost, and where it breaks."""

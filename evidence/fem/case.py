@@ -1,0 +1,100 @@
+"""One contact on the procedural brain, as the measurements of the physics need it."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sp
+from numpy.typing import NDArray
+
+from synth.fem import equilibrium, surface_embedding, tool
+from synth.fem.material import Tissue
+from synth.fem.mesh import tetrahedra
+from synth.fem.system import System, assemble
+from synth.job import schema
+
+Floats = NDArray[np.float64]
+
+ANATOMY = schema.Anatomy()
+WAYS = {"push": (0.0, 0.0, -1.0), "pull": (0.0, 0.0, 1.0), "aside": (0.87, 0.0, 0.5)}
+CONTACTS = ((0.0, 0.0, 4.5), (5.0, 2.0, 3.0), (-3.0, -5.0, 6.0), (-2.0, 6.0, 3.5))
+"""World x, y and radius, mm: the default range of radii, near the centre and near the rim."""
+
+
+@dataclass(frozen=True)
+class Patch:
+    """The dome over the opening as a fine surface."""
+
+    vertices: Floats
+    faces: NDArray[np.int32]
+    area: Floats
+    opening: NDArray[np.bool_]
+    """(V,) in the opening, where errors are measured."""
+
+
+def patch(vertices: int = 40_000, extent: float = 46.0) -> Patch:
+    """A square grid on the dome."""
+    n = round(vertices**0.5)
+    x = np.linspace(-extent / 2, extent / 2, n)
+    xy = np.stack(np.meshgrid(x, x, indexing="ij"), axis=-1).reshape(-1, 2)
+    i = np.arange(n * n).reshape(n, n)
+    a, b, c, d = i[:-1, :-1].ravel(), i[1:, :-1].ravel(), i[1:, 1:].ravel(), i[:-1, 1:].ravel()
+    faces = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)]).astype(np.int32)
+    at = np.column_stack([xy, tetrahedra.dome(xy, ANATOMY.dome_mm)])
+    inside = np.hypot(*xy.T) < ANATOMY.craniotomy.radius_mm
+    return Patch(at, faces, surface_embedding.vertex_area(at, faces), inside)
+
+
+@dataclass(frozen=True)
+class Brain:
+    """A mesh finest under one contact, its equations and the surface on it."""
+
+    system: System
+    carry: sp.csr_array
+    kernel: Floats
+    """(N,) nodal share of a unit force."""
+    radius_mm: float
+
+    def load(self, load: float, way: str) -> Floats:
+        """(N, 3) mN for E = 1 kPa at P = `load`."""
+        return np.outer(self.kernel, load * self.radius_mm**2 * np.array(WAYS[way]))
+
+
+def brain(
+    on: Patch, law: str, order: int, tets: int, contact: tuple[float, float, float], poisson: float = 0.4
+) -> Brain:
+    """Meshes, assembles and embeds."""
+    volume = tetrahedra.block(ANATOMY, tets, order, (contact,))
+    carry = surface_embedding.embedding(volume, on.vertices)
+    pressure = tool.footprint(np.array(contact[:2]), contact[2], on.vertices, on.area)
+    return Brain(assemble(volume, law, poisson), carry, carry.T @ (on.area * pressure), contact[2])
+
+
+def moved(case: Brain, load: float, way: str, steps: int = 3) -> Floats:
+    """(V, 3) mm under a load that was raised in a few steps."""
+    part = np.linspace(0, 1, steps + 1)
+    path = equilibrium.follow(case.system, part[:, None, None] * case.load(load, way), load * part)
+    return np.asarray(case.carry @ path.displacement[-1])
+
+
+def error(u: Floats, exact: Floats, on: Patch) -> float:
+    """Relative root mean square over the opening."""
+    return float(np.linalg.norm((u - exact)[on.opening]) / np.linalg.norm(exact[on.opening]))
+
+
+def speed(case: Brain, load: float, way: str, frames: int = 60) -> float:
+    """CPU milliseconds a frame of a pull with ramp, hold and release, moving the surface included."""
+    part = tool.course(_gesture(), frames).load
+    loads = part[:, None, None] * case.load(load, way)
+    start = time.process_time()
+    path = equilibrium.follow(case.system, loads, load * part)
+    for u in path.displacement:
+        case.carry @ u
+    return 1e3 * (time.process_time() - start) / frames
+
+
+def _gesture() -> tool.Gesture:
+    fem = schema.Fem(gestures=("pull",))
+    return tool.Gesture.draw(fem, ANATOMY.craniotomy, Tissue(1.0, 0.4, "linear"), np.random.default_rng(0))

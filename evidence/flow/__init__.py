@@ -1,0 +1,1 @@
+"""Flow measured: error against time, and where it breaks."""

@@ -1,0 +1,103 @@
+"""`bench pareto flow`: error against time for estimators and their settings."""
+
+from __future__ import annotations
+
+import json as json_
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import cv2
+import torch
+import typer
+
+from bench.output import machine, plot, write
+from evidence.flow.measure import measure
+from evidence.flow.scenes import Recipe, pairs
+from synth.flow.estimator import Estimator
+from synth.flow.opencv import Dis, OpenCvTvl1
+from synth.flow.tvl1 import Settings, Tvl1
+
+
+def pareto(
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for pareto.json, chart.svg, index.html.")],
+    count: Annotated[int, typer.Option(min=1, help="Pairs a point.")] = 4,
+    seed: Annotated[int, typer.Option(min=0, help="Root of every draw.")] = 2613,
+    json: Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")] = False,
+) -> None:
+    """Flow: endpoint and divergence error against milliseconds, the default marked."""
+    torch.set_num_threads(1)
+    cv2.setNumThreads(1)
+    out.mkdir(parents=True, exist_ok=True)
+    made = list(pairs(Recipe(), count, seed))
+    rows: list[dict[str, Any]] = []
+    for family, label, estimator, warm in _candidates():
+        error = measure(estimator, made, warm=warm)
+        default = label in ("cold (default)", "warm (default)")
+        what = {
+            "family": family,
+            "setting": label,
+            "estimator": "tvl1" if isinstance(estimator, Tvl1) else family,
+            "settings": asdict(estimator.settings) if isinstance(estimator, Tvl1) else None,
+            "checked": not isinstance(estimator, Tvl1) or estimator.checked,
+            "warm": warm is not None,
+            "default": default,
+        }
+        rows.append(what | asdict(error))
+        if not json:
+            typer.echo(f"{family:12} {label:22} {1e3 * error.cpu_s:6.0f} ms  EPE {error.mean:.3f} px  "
+                       f"divergence {error.divergence:.2f}")  # fmt: skip
+    record = {
+        "command": f"bench pareto flow --count {count} --seed {seed}",
+        "on": "warped procedural cortex, 224², 10 px pull, tool, highlights; CPU time of one thread",
+        "machine": machine.describe() | {"torch": torch.__version__, "opencv": cv2.__version__},
+        "rows": rows,
+    }
+    write.keep(out, "pareto.json", record)
+    shown = [{key: value for key, value in row.items() if key != "settings"} for row in rows]
+    plot.write(panels(record), out, "Flow: error against time", shown, record)
+    if json:
+        typer.echo(json_.dumps(record))
+
+
+def panels(found: dict[str, Any]) -> list[plot.Panel]:
+    """Charts of `pareto.json`: endpoint and divergence error against time."""
+    rows, made = found["rows"], []
+    for title, key in (("endpoint error", "mean"), ("divergence error (relative RMS)", "divergence")):
+        curves = []
+        for family in dict.fromkeys(str(row["family"]) for row in rows):
+            own = [row for row in rows if row["family"] == family]
+            curves.append(
+                plot.Curve(
+                    family,
+                    tuple(1e3 * float(row["cpu_s"]) for row in own),
+                    tuple(float(row[key]) for row in own),
+                    tuple(str(row["setting"]) for row in own),
+                    ringed=tuple(k for k, row in enumerate(own) if row["default"]),
+                )
+            )
+        unit = "EPE mean [px]" if key == "mean" else "relative RMS"
+        made.append(
+            plot.Panel(f"Flow: {title}", "CPU time [ms]", unit, tuple(curves), True, True, front=True)
+        )
+    return made
+
+
+def _candidates() -> list[tuple[str, str, Estimator, float | None]]:
+    """(family, setting, estimator, share of the true flow to start from)."""
+    s = Settings()
+    ours = [("warps 2", replace(s, warps=2)), ("cold (default)", s), ("warps 8", replace(s, warps=8)),
+            ("no gradient", replace(s, gradient=0.0)), ("no median", replace(s, median=False)),
+            ("Huber 0.03", replace(s, huber=0.03)), ("lambda / 3", replace(s, weight=s.weight / 3)),
+            ("lambda x 3", replace(s, weight=3 * s.weight)), ("one lambda", replace(s, noise=0.0, steep=0.0)),
+            ("no membrane", replace(s, hidden_huber=0.0))]  # fmt: skip
+    warm = [("warm 1 warp", replace(s, warm_warps=1)), ("warm 2 warps", replace(s, warm_warps=2)),
+            ("warm (default)", s)]  # fmt: skip
+    cv = [(f"lambda {w:g}, {n} warps", OpenCvTvl1(w, n)) for w in (0.06, 0.1, 0.2) for n in (2, 3, 6)]
+    return [
+        *(("tvl1", label, Tvl1(setting), None) for label, setting in ours),
+        ("tvl1", "unchecked", Tvl1(s, checked=False), None),
+        *(("tvl1 warm", label, Tvl1(setting), 0.9) for label, setting in warm),
+        *(("opencv-tvl1", label, estimator, None) for label, estimator in cv),
+        ("dis", "medium", Dis(), None),
+    ]

@@ -1,0 +1,155 @@
+"""Trains the tool mask's U-Net on masks rendered for it (`flow_toolscenes`).
+
+    python -m evidence.flow.toolnet_training --scenes 39 --steps 700 --seed 0 -o synth/flow
+
+Writes `toolnet.pt` (half precision) and `toolnet.json` (command, seed, steps, overlap on scenes held
+out, beside that of the rule without weights).
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+import torch.nn.functional as F
+from numpy.typing import NDArray
+from torch import Tensor
+
+from bench.output import write
+from evidence.flow import toolnet_scenes
+from evidence.flow.toolnet_scenes import Frame
+from synth.flow import mask, toolnet
+
+_HELD_OUT, _FIRST = range(13), 26  # scenes to test on, and the first to train on
+_BATCH = 8
+_RATE = 3e-3
+
+Picture = NDArray[np.uint8]
+Flags = NDArray[np.bool_]
+
+
+def train(scenes: int, out: Path, steps: int, seed: int) -> dict[str, float | int | str]:
+    """Renders, trains, writes weights and card into `out`, and gives the card back.
+
+    Args:
+        scenes: to train on.
+        out: folder.
+        steps: of AdamW, batches of 8.
+        seed: of everything drawn.
+    """
+    training = list(toolnet_scenes.frames(range(_FIRST, _FIRST + scenes), seed))
+    net = fit(training, steps, seed)
+    out.mkdir(parents=True, exist_ok=True)
+    save(net, out / "toolnet.pt")
+    held = list(toolnet_scenes.frames(_HELD_OUT, seed))
+    card: dict[str, float | int | str] = {
+        "command": "python -m evidence.flow.toolnet_training "
+        f"--scenes {scenes} --steps {steps} --seed {seed}",
+        "frames": len(training),
+        "held_out_frames": len(held),
+        "held_out_iou": round(overlap(held, lambda rgb: toolnet.probability(net, rgb) > 0.5), 4),
+        "held_out_iou_with_the_rule": round(overlap(held, lambda rgb: mask.both(rgb, net)), 4),
+        "held_out_iou_of_the_rule": round(overlap(held, mask.grey_bodies), 4),
+        "parameters": sum(p.numel() for p in net.parameters()),
+        "torch": torch.__version__,
+    }
+    write.keep(out, "toolnet.json", card)
+    return card
+
+
+def fit(training: Sequence[Frame], steps: int, seed: int) -> toolnet.ToolNet:
+    """A net trained from nothing; one-cycle rate, one thread."""
+    torch.manual_seed(seed)
+    torch.set_num_threads(1)
+    rng = np.random.default_rng(seed)
+    net = toolnet.ToolNet()
+    optimiser = torch.optim.AdamW(net.parameters(), _RATE, weight_decay=1e-3)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, _RATE, total_steps=steps)
+    net.train()
+    for step, (pictures, masks) in zip(range(steps), _batches(training, rng), strict=False):
+        loss = _loss(net(pictures), masks)
+        optimiser.zero_grad()
+        loss.backward()  # type: ignore[no-untyped-call]
+        optimiser.step()
+        schedule.step()
+        if step % 50 == 0:
+            print(f"step {step} loss {float(loss.detach()):.4f}", flush=True)
+    net.eval()
+    return net
+
+
+def save(net: toolnet.ToolNet, path: Path) -> None:
+    """Half-precision weights."""
+    state = {k: v.half() if v.is_floating_point() else v for k, v in net.state_dict().items()}
+    torch.save(state, path)
+
+
+def overlap(frames: Sequence[Frame], find: Callable[[Picture], Flags]) -> float:
+    """Intersection over union of all that is found and all that is tool, over all frames together."""
+    both = either = 0
+    for frame in frames:
+        found = find(frame.rgb)
+        both += int(np.count_nonzero(found & frame.tool))
+        either += int(np.count_nonzero(found | frame.tool))
+    return both / max(either, 1)
+
+
+def _batches(frames: Sequence[Frame], rng: np.random.Generator) -> Iterator[tuple[Tensor, Tensor]]:
+    while True:
+        drawn = [frames[int(k)] for k in rng.integers(len(frames), size=_BATCH)]
+        chosen = [_vary(frame.rgb, frame.tool, rng) for frame in drawn]
+        pictures = torch.from_numpy(np.stack([toolnet.prepare(picture) for picture, _ in chosen]))
+        masks = torch.from_numpy(np.stack([mask for _, mask in chosen]))[:, None].float()
+        small = F.interpolate(masks, size=(toolnet.SIDE, toolnet.SIDE), mode="area")
+        yield pictures, F.avg_pool2d(small, 2)
+
+
+def _vary(picture: Picture, mask: Flags, rng: np.random.Generator) -> tuple[Picture, Flags]:
+    """Turned, mirrored, zoomed and cropped square; other light, other steel, other colour of the field."""
+    side = min(mask.shape)
+    turn, zoom = rng.uniform(0, 360), rng.uniform(0.55, 1.3)
+    matrix = cv2.getRotationMatrix2D((mask.shape[1] / 2, mask.shape[0] / 2), turn, zoom)
+    matrix[:, 2] += np.array([side, side]) / 2 - np.array([mask.shape[1], mask.shape[0]]) / 2
+    matrix[:, 2] += rng.uniform(-0.2, 0.2, 2) * side
+    border = cv2.BORDER_REFLECT_101
+    turned = cv2.warpAffine(picture, matrix, (side, side), flags=cv2.INTER_LINEAR, borderMode=border)
+    inside = cv2.warpAffine(
+        mask.astype(np.uint8), matrix, (side, side), flags=cv2.INTER_NEAREST, borderMode=border
+    ).astype(bool)
+    field = turned.astype(np.float32)
+    if rng.random() < 0.5:  # another steel
+        steel = field.mean(axis=2, keepdims=True) * rng.uniform(0.3, 1.5) + rng.uniform(-25, 60)
+        field = np.where(inside[..., None], steel * rng.uniform(0.92, 1.08, 3), field)
+    field = field * rng.uniform(0.8, 1.2, 3) + rng.uniform(-15, 15)
+    field = 255 * np.clip(field / 255, 0, 1) ** rng.uniform(0.75, 1.35)
+    if rng.random() < 0.3:
+        field = cv2.GaussianBlur(field, (0, 0), rng.uniform(0.5, 1.5))
+    field = field + rng.normal(0, rng.uniform(0, 6), field.shape)
+    return np.clip(field, 0, 255).astype(np.uint8), inside
+
+
+def _loss(logits: Tensor, masks: Tensor) -> Tensor:
+    """Cross-entropy plus one minus the soft Dice overlap."""
+    share = torch.sigmoid(logits)
+    overlap = 2 * (share * masks).sum() / ((share + masks).sum() + 1)
+    return F.binary_cross_entropy_with_logits(logits, masks) + 1 - overlap
+
+
+def main() -> None:
+    """The command line."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("-o", "--out", type=Path, default=toolnet.WEIGHTS.parent, help="folder")
+    parser.add_argument("--scenes", type=int, default=39, help="scenes to render and train on")
+    parser.add_argument("--steps", type=int, default=700, help="of AdamW, batches of 8")
+    parser.add_argument("--seed", type=int, default=0, help="of everything drawn")
+    given = parser.parse_args()
+    print(json.dumps(train(given.scenes, given.out, given.steps, given.seed)))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,284 @@
+"""`bench gap`: the experiment's trainings, its table, its verdict."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bench.bootstrap import Interval
+from bench.output import forest_plot, machine, result_page
+from bench.output import write as results
+from evidence.gap import gap
+from evidence.gap.runs import KEYS, Tests, Training, carry_out, followed
+from learn.data.clips import Clip, load
+from learn.data.split import Split, folds, nested
+from learn.evaluation.statistics import interval
+from learn.settings import Settings
+from synth.dataset.store import Dataset
+from synth.errors import UserError
+
+Curve = NDArray[np.float64]
+KINDS = ("R", "N", "mixed")
+_TESTS = {
+    "I": "ideal flow",
+    "R": "recovered flow",
+    "I'": "ideal flow, unseen family",
+    "R'": "recovered flow, unseen family",
+}
+_UNITS = {"force_mae": "mean error of the total force [mN]", "map_rmse": "RMSE of the force map [mN/mm²]"}
+
+
+def run(
+    dataset: Path,
+    out: Path,
+    cache: Path,
+    settings: Settings,
+    held_out: str,
+    flows: Sequence[str],
+    seeds: int,
+    command: str,
+    say: Callable[[str], None],
+) -> dict[str, Any]:
+    """Trains, asks and writes results.json, README.md, chart.svg and index.html.
+
+    Args:
+        dataset: rendered, with recovered flow of the back end `tvl1`, of several appearance families.
+        out: folder for the results; trainings done there are kept.
+        cache: folder for packed sequences.
+        settings: of every training.
+        held_out: family that no training sees.
+        flows: back ends of the recovered flow, each a whole experiment.
+        seeds: networks a training; a sequence's error is the mean over them.
+        command: as typed, for the README.
+        say: told what is under way.
+
+    Raises:
+        UserError: no such family, or data that lacks a flow.
+    """
+    stored = list(Dataset(dataset))
+    clips = load(dataset, settings.grid, ("ideal", "recovered"), cache=cache)
+    split, seen_test = parts(clips, held_out, settings)
+    results: dict[str, Any] = {}
+    untrained: dict[str, list[dict[str, Any]]] = {}
+    for flow in flows:
+        used = clips
+        if flow != "tvl1":
+            say(f"recovering flow with {flow}")
+            used = [followed(s, c, flow, settings.grid, cache) for s, c in zip(stored, clips, strict=True)]
+        seen = [used[i] for i in seen_test]
+        unseen = [used[i] for i in split.test]
+        tests: Tests = {
+            "I": (seen, "ideal"),
+            "R": (seen, "recovered"),
+            "I'": (unseen, "ideal"),
+            "R'": (unseen, "recovered"),
+        }
+        trained = {
+            kind: [
+                carry_out(
+                    Training(kind, flow, seed),
+                    used,
+                    split,
+                    settings,
+                    tests,
+                    out / "runs",
+                    cache / "models",
+                    say,
+                )
+                for seed in range(seeds)
+            ]
+            for kind in ("I", *KINDS)
+        }
+        results[flow] = summary(trained)
+        untrained[flow] = trained["I"]
+    tree = {
+        "command": command,
+        "machine": machine.describe(),
+        "settings": settings.as_dict(),
+        "held_out": held_out,
+        "sequences": {
+            "fit": len(split.fit),
+            "select": len(split.select),
+            "test": len(seen_test),
+            "unseen family": len(split.test),
+        },
+        "seeds": seeds,
+        "flows": results,
+        "better_flow": better_flow(untrained),
+    }
+    write(tree, out)
+    return tree
+
+
+def parts(clips: Sequence[Clip], held_out: str, settings: Settings) -> tuple[Split, tuple[int, ...]]:
+    """Fit and select, with the held-out family as test; and a test of the seen families, an eighth of them.
+
+    No two of the four share a sequence or an anatomy.
+    """
+    split = nested(clips, settings.folds, settings.fold, 0, held_out)
+    rest = (*split.fit, *split.select)
+    aside = {rest[i] for i in folds([clips[i] for i in rest], 5, 1)[0]}
+    fit = tuple(i for i in split.fit if i not in aside)
+    select = tuple(i for i in split.select if i not in aside)
+    if not fit or not select:
+        raise UserError("too few anatomies for fit, select and two tests: render more sequences")
+    return Split(fit, select, split.test), tuple(sorted(aside))
+
+
+def summary(trained: dict[str, list[dict[str, Any]]]) -> dict[str, Any]:
+    """Errors with intervals, and the share of the gap each training closes, for every measure."""
+    out: dict[str, Any] = {"noise": trained["N"][0]["noise"], "errors": {}, "closed": {}, "verdict": {}}
+    for key in KEYS:
+        of = {kind: {test: _errors(runs, test, key) for test in _TESTS} for kind, runs in trained.items()}
+        out["errors"][key] = {
+            kind: {test: asdict(interval(values, np.random.default_rng(0))) for test, values in tests.items()}
+            for kind, tests in of.items()
+        }
+        closed = {
+            kind: gap.closed(of["I"]["R'"], of[kind]["R'"], of["I"]["I'"], np.random.default_rng(0))
+            for kind in KINDS
+        }
+        out["closed"][key] = {kind: asdict(value) for kind, value in closed.items()}
+        apart = gap.paired(of["N"]["R'"], of["R"]["R'"], np.random.default_rng(0))
+        out["verdict"][key] = gap.verdict(closed, apart)
+    return out
+
+
+def better_flow(untrained: dict[str, list[dict[str, Any]]]) -> dict[str, Any]:
+    """The share of OpenCV's gap that our flow closes before any retraining; empty unless both were run.
+
+    Args:
+        untrained: by flow, the results of the network trained on ideal flow.
+    """
+    if not {"tvl1", "opencv-tvl1"} <= set(untrained):
+        return {}
+    ours, plain = untrained["tvl1"], untrained["opencv-tvl1"]
+    return {
+        key: asdict(
+            gap.closed(
+                _errors(plain, "R'", key),
+                _errors(ours, "R'", key),
+                _errors(plain, "I'", key),
+                np.random.default_rng(0),
+            )
+        )
+        for key in KEYS
+    }
+
+
+def _errors(runs: Sequence[dict[str, Any]], test: str, key: str) -> Curve:
+    """(S,) errors by sequence, the mean over seeds."""
+    rows = [[math.nan if v is None else v for v in run["errors"][test][key]] for run in runs]
+    return np.asarray(np.mean(rows, axis=0), np.float64)
+
+
+def write(tree: dict[str, Any], out: Path) -> None:
+    """results.json, README.md, chart.svg and index.html."""
+    results.keep(out, "results.json", json.dumps(_plain(tree), indent=1, allow_nan=False) + "\n")
+    results.keep(out, "README.md", readme(tree))
+    result_page.write(drawn(_plain(tree)), out)
+
+
+def drawn(tree: Mapping[str, Any]) -> result_page.Sheet:
+    """Page and picture of `results.json`."""
+    rows = []
+    for group, (flow, found) in enumerate(tree["flows"].items()):
+        errors = found["errors"][KEYS[0]]
+        for kind, test in (("I", "I'"), *((kind, "R'") for kind in ("I", *KINDS))):
+            value = errors[kind][test]
+            rows.append(
+                forest_plot.Row(
+                    f"{flow}: {kind} on {_TESTS[test].split(',')[0]}",
+                    value["mean"],
+                    (value["low"], value["high"]),
+                    group,
+                )
+            )
+    title = f"Unseen family ({tree['held_out']}): trained on ... tested on ..."
+    chart = result_page.Chart(title, _UNITS[KEYS[0]], tuple(rows))
+    return result_page.Sheet("The sim-to-real gap", tree["command"], tree, (chart,))
+
+
+def readme(tree: dict[str, Any]) -> str:
+    """The results in words and tables."""
+    lines = [
+        "# The sim-to-real gap",
+        "",
+        "Does training on the flow recovered from rendered frames close the gap that training on ideal",
+        "displacement leaves? I: trained on ideal flow, R: on recovered, N: on ideal with noise fitted to",
+        "the recovered flow's error, mixed: ideal first, recovered later.",
+        "",
+        "    synth render docs/results/gap/data.yaml -o DATA",
+        f"    {tree['command']}",
+        "",
+        f"{_counts(tree['sequences'])}; family held out: {tree['held_out']};",
+        f"{tree['seeds']} network(s) a training, errors averaged over them; 95% BCa intervals.",
+        f"Machine: {machine.line(tree['machine'])}.",
+        "",
+    ]
+    for flow, found in tree["flows"].items():
+        lines += [f"## Flow by {flow}", ""]
+        noise = found["noise"]
+        lines += [
+            f"Fitted noise: gain {noise['gain']:.3f}, {noise['sigma_mm']:.3f} mm a component, "
+            f"correlated over {noise['reach_cells']:.1f} cells.",
+            "",
+        ]
+        for key in KEYS:
+            lines += [f"### {_UNITS[key][0].upper()}{_UNITS[key][1:]}", ""]
+            lines += ["| trained on | " + " | ".join(_TESTS.values()) + " | share of the gap closed |"]
+            lines += ["|" + " --- |" * (len(_TESTS) + 2)]
+            for kind, tests in found["errors"][key].items():
+                cells = [_text((v["low"], v["high"]), v["mean"]) for v in tests.values()]
+                share = "–"
+                if kind in found["closed"][key]:
+                    closed = found["closed"][key][kind]
+                    share = "undefined" if closed["undefined"] else _text(closed["interval"], closed["share"])
+                lines.append(f"| {kind} | " + " | ".join(cells) + f" | {share} |")
+            lines += ["", found["verdict"][key], ""]
+    if tree["better_flow"]:
+        lines += ["## A better flow, before any retraining", ""]
+        for key in KEYS:
+            found = tree["better_flow"][key]
+            share = found["undefined"] or _text(found["interval"], found["share"])
+            lines += [
+                f"Ours instead of plain OpenCV TV-L1 under the network trained on ideal flow, {_UNITS[key]}:",
+                f"{share} of OpenCV's gap closed.",
+                "",
+            ]
+    lines += ["![Errors in the unseen family](chart.svg)", ""]
+    return "\n".join(lines)
+
+
+def _counts(sequences: dict[str, int]) -> str:
+    return ", ".join(f"{count} sequences {name}" for name, count in sequences.items())
+
+
+def _text(ends: Interval, mean: float) -> str:
+    return f"{mean:.3g} [{ends[0]:.3g}, {ends[1]:.3g}]"
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _plain(part) for key, part in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(part) for part in value]
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    return value
+
+
+def settings_of(preset: str, epochs: int | None) -> Settings:
+    """A preset of `learn train` for this experiment: magnitude output, all scored alike."""
+    from learn.settings import preset as named
+
+    base = named(preset)
+    base = replace(base, arch=replace(base.arch, output="magnitude"))
+    return base if epochs is None else replace(base, epochs=epochs)

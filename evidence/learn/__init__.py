@@ -1,0 +1,1 @@
+"""Learning measured: losses, networks, controls, and where it breaks."""

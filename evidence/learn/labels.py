@@ -1,0 +1,143 @@
+"""Sequences for learning without a picture: physics and projection only, straight onto the network's grid.
+
+Whatever asks only for ideal flow needs no light. The motion, camera and label are those of the pipeline
+(same functions, same draws), a core-second a sequence; nothing here can stand in for recovered flow.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from learn.data.clips import Clip, pack, unpack
+from learn.data.grid import Grid, Resampler, centre, settled
+from synth.fem.tool import Gesture
+from synth.geometry.triangles import Shape
+from synth.job import identity
+from synth.job.schema import Job
+from synth.render import truth
+from synth.render.anatomy import rim
+from synth.render.camera import camera
+from synth.sequence import pipeline, scenario
+from synth.sequence.scenario import Scenario
+
+FINE = 128
+"""Cells along the edge of the grid that labels are made on, at least."""
+_VERSION = 2
+"""Of what is packed: a change of the labels makes another cache."""
+_PRESS = 0x9E55
+"""Told apart from every other draw of a sequence."""
+
+
+def clips(
+    job: Job, grid: Grid, cache: Path, report: Callable[[int, int], None] = lambda done, of: None
+) -> list[Clip]:
+    """All sequences of a job with ideal flow on a grid of 64², 128² or 256² cells, cached.
+
+    Labels are made on 128² or finer; 64² is four cells of that in one.
+    """
+    fine = grid if grid.size >= FINE else Grid(FINE, grid.extent_mm)
+    out = []
+    for index in range(job.sequences):
+        report(index, job.sequences)
+        name = key(job, index, fine)
+        folder = cache / name
+        if not folder.is_dir():
+            pack(clip(job, index, fine, name), folder)
+        if grid.size < fine.size:
+            folder = cache / f"{name}-{grid.size}"
+            if not folder.is_dir():
+                pack(coarser(unpack(cache / name), fine, fine.size // grid.size), folder)
+        out.append(unpack(folder))
+    report(job.sequences, job.sequences)
+    return out
+
+
+def coarser(clip: Clip, grid: Grid, times: int) -> Clip:
+    """The clip on a grid of `times` wider cells: mean displacement of a cell's tissue, all of its force."""
+
+    def blocks(values: NDArray[np.float32]) -> NDArray[np.float32]:
+        n = grid.size // times
+        pooled: NDArray[np.float32] = values.reshape(*values.shape[:-2], n, times, n, times).mean((-3, -1))
+        return pooled
+
+    cover = blocks(np.asarray(clip.mask))
+    mask = (cover > 0.5).astype(np.float32)
+    share = np.where(mask > 0, cover, np.float32(1))
+    density = blocks(np.asarray(clip.density))
+    return replace(
+        clip,
+        mask=mask,
+        displacement={
+            k: (blocks(np.asarray(v)) / share * mask).astype(np.float32) for k, v in clip.displacement.items()
+        },
+        confidence=blocks(np.asarray(clip.confidence)),
+        density=np.stack([settled(d, mask) for d in density]),
+    )
+
+
+def press(job: Job, index: int, grid: Grid, cache: Path) -> Clip:
+    """A push somewhere else on the tissue of a sequence: what calibrates E (`learn.inference.stiffness`)."""
+    fine = Grid(max(grid.size, FINE), grid.extent_mm)
+    name = f"{key(job, index, grid)}-press"
+    if not (cache / name).is_dir():
+        case = scenario.draw(job, index)
+        rng = np.random.default_rng([job.seed, index, _PRESS])
+        only = job.fem.model_copy(update={"gestures": ("push",)})
+        gesture = Gesture.draw(only, job.anatomy.craniotomy, case.tissue, rng)
+        made = clip(job, index, fine, name, replace(case, gesture=gesture))
+        times = fine.size // grid.size
+        pack(coarser(made, fine, times) if times > 1 else made, cache / name)
+    return unpack(cache / name)
+
+
+def key(job: Job, index: int, grid: Grid) -> str:
+    """Hash of all that labels depend on: pictures and flow estimators change none of them."""
+    parts = job.model_dump(mode="json", include={"seed", "frames", "fps", "anatomy", "fem", "render"})
+    described = identity.canonical([_VERSION, parts, index, grid.size, grid.extent_mm])
+    return hashlib.blake2b(described, digest_size=16).hexdigest()
+
+
+def clip(job: Job, index: int, grid: Grid, name: str, case: Scenario | None = None) -> Clip:
+    """One sequence of a job (or the one that `case` says): deformed, projected, put on the grid."""
+    case = case or scenario.draw(job, index)
+    view = camera.place(case.view, job.render)
+    surface, tets = pipeline.build(job, case)
+    motion = pipeline.move(job, case, surface, tets)
+    frame = rim.build(surface, job.anatomy.craniotomy.radius_mm, case.look).shape
+    still = truth.still(view, Shape(surface.vertices, surface.faces), frame)
+    resample = Resampler(
+        (still.tissue.shape[0], still.tissue.shape[1]), still.scale_mm_per_px, centre(still.tissue), grid
+    )
+    mask = (resample.cover(still.tissue) > 0.5).astype(np.float32)
+    moved = np.empty((job.frames, 2, grid.size, grid.size), np.float32)
+    density = np.empty((job.frames, 3, grid.size, grid.size), np.float32)
+    rest = None
+    for t in range(job.frames):
+        place = truth.at_rest_pixels(still, surface.faces, motion.rest + motion.displacement[t])
+        seen = camera.project(view, place.reshape(-1, 3).astype(np.float64)).reshape(*place.shape[:2], 2)
+        rest = seen if rest is None else rest
+        flow = np.where(still.tissue[..., None], seen - rest, 0.0).transpose(2, 0, 1)
+        moved[t] = resample.mean(flow * still.scale_mm_per_px, still.tissue) * mask
+        load = truth.at_rest_pixels(still, surface.faces, motion.traction[t] @ view.rotation.T)
+        amount = load.transpose(2, 0, 1) * still.area
+        per_cell = settled(resample.sum(amount), mask)
+        density[t] = per_cell / np.float32(grid.pitch_mm**2 * case.tissue.young_kpa)
+    return Clip(
+        name=f"{index:06d}",
+        content_hash=name,
+        group=str(case.relief.seed),
+        family=case.family,
+        gesture=case.gesture.kind,
+        young_kpa=case.tissue.young_kpa,
+        mask=mask,
+        displacement={"ideal": moved},
+        confidence=np.ones((job.frames, grid.size, grid.size), np.float32),
+        density=density,
+        force=motion.force @ view.rotation.T,
+    )

@@ -1,0 +1,1 @@
+"""The renderer measured: cost, truth, noise, likeness, and where it breaks."""

@@ -1,0 +1,59 @@
+"""One drawn sequence for measuring the renderer alone: its studio and a plain pull, without the physics."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial import cKDTree
+
+from synth.job.schema import Job
+from synth.render.anatomy import surface as anatomy
+from synth.render.camera import camera
+from synth.render.scene import Studio
+from synth.sequence import scenario
+
+Floats = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Case:
+    """A studio and how its surface and instrument move."""
+
+    studio: Studio
+    vertices: Floats
+    """(V, 3) mm at rest."""
+    tips: Floats
+    """(2, 3) mm."""
+    shafts: Floats
+    """(2, 3)."""
+    centre: Floats
+    """(2,) mm: where the tissue is held."""
+
+    def moved(self, lift_mm: float) -> Floats:
+        """The surface pulled up by a Gaussian of 3 mm width, with a third of that sideways."""
+        r2 = ((self.vertices[:, :2] - self.centre) ** 2).sum(axis=1)
+        pull = lift_mm * np.exp(-r2 / 18.0)
+        return np.asarray(self.vertices + pull[:, None] * np.array([0.3, 0.15, 1.0]))
+
+    def held(self, lift_mm: float) -> Floats:
+        """The tips, moving with the tissue they hold."""
+        return self.tips + lift_mm * np.array([0.3, 0.15, 1.0])
+
+
+def case(job: Job, index: int) -> Case:
+    """Sequence `index` of a job, its load replaced by a plain pull at the gesture's own point."""
+    drawn = scenario.draw(job, index)
+    surface = anatomy.procedural(drawn.relief, job.anatomy)
+    lens = camera.place(drawn.view, job.render)
+    studio = Studio(surface, drawn.look, lens, job)
+    rng = np.random.default_rng([job.seed, index])
+    centre = rng.uniform(-4, 4, 2)
+    azimuth, lift = rng.uniform(0, 2 * np.pi), np.deg2rad(rng.uniform(35, 55))
+    shaft = np.array([np.cos(azimuth) * np.cos(lift), np.sin(azimuth) * np.cos(lift), np.sin(lift)])
+    side = 1.1 * np.array([-np.sin(azimuth), np.cos(azimuth)])
+    flat = np.stack([centre + side, centre - side])
+    height = surface.vertices[cKDTree(surface.vertices[:, :2]).query(flat)[1], 2]
+    tips = np.concatenate([flat, height[:, None]], axis=1)
+    return Case(studio, surface.vertices, tips, np.stack([shaft, shaft]), centre)

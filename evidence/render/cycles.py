@@ -1,0 +1,145 @@
+"""Our pictures against Blender's Cycles at equal noise: same meshes, maps, lamps, lens; direct light only."""
+
+from __future__ import annotations
+
+import json as json_
+import os
+import subprocess
+import tempfile
+import time
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import numpy.typing as npt
+import typer
+
+from bench.output import machine, write
+from evidence.render.case import Case, case
+from synth.errors import UserError
+from synth.job.schema import Job
+from synth.render import instrument
+from synth.render.mitsuba.adapter import Wet
+
+Map = npt.NDArray[np.float32]
+
+
+def cycles(
+    python: Annotated[Path, typer.Option(help="A Python that has bpy (pip install bpy).")],
+    spp: Annotated[list[int], typer.Option(help="Samples a pixel to try.")] = [1, 2, 4, 8],  # noqa: B006
+    seed: Annotated[int, typer.Option(help="Of the job.")] = 11,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder for cycles.json.")] = None,
+    json: Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")] = False,
+) -> None:
+    """CPU-seconds and noise of a 640x480 frame, Mitsuba's and Cycles', and their ratio at equal noise."""
+    from rich.console import Console
+
+    job = Job.model_validate(
+        {"seed": seed, "render": {"distortion": [0.0] * 5, "aperture_mm": 0.0, "variant": "llvm_ad_rgb"}}
+    )
+    ours = case(job, 0)
+    inside = ours.studio.still.tissue & ~ours.studio.frame(ours.vertices, ours.tips, ours.shafts, 0).tool
+    rows = [{"renderer": "mitsuba", "spp": n, **_mitsuba(ours, n, inside)} for n in spp]
+    with tempfile.TemporaryDirectory() as folder:
+        rows += _cycles(ours, Path(folder), python, spp, inside)
+    found = {"seed": seed, "rows": rows, "ratio_at_equal_noise": ratio(rows), "machine": machine.describe()}
+    if out is not None:
+        write.keep(out, "cycles.json", found)
+    if json:
+        print(json_.dumps(found))
+    else:
+        Console().print_json(json_.dumps(found))
+
+
+def ratio(rows: list[dict[str, Any]]) -> float:
+    """Cycles' CPU time over Mitsuba's at the noise of Mitsuba's 4 paths, log-log between its points."""
+    mine = next(row for row in rows if row["renderer"] == "mitsuba" and row["spp"] == 4)
+    theirs = sorted((row["noise"], row["cpu_s"]) for row in rows if row["renderer"] == "cycles")
+    noise, spent = np.log(np.array(theirs)).T
+    return float(np.exp(np.interp(np.log(mine["noise"]), noise, spent)) / mine["cpu_s"])
+
+
+def _mitsuba(ours: Case, spp: int, inside: npt.NDArray[np.bool_]) -> dict[str, float]:
+    tool = instrument.pose(instrument.build(("forceps",)), ours.tips, ours.shafts)
+    stage = ours.studio.stage(ours.vertices, tool, spp)
+    spent, pictures = [], []
+    for k in range(3):
+        start = time.process_time()
+        stage.move("cortex", ours.vertices)
+        pictures.append(stage.render(k))
+        spent.append(time.process_time() - start)
+    return {"cpu_s": round(min(spent[1:]), 3), "noise": _noise(pictures[1], pictures[2], inside)}
+
+
+def _cycles(
+    ours: Case, folder: Path, python: Path, spp: list[int], inside: npt.NDArray[np.bool_]
+) -> list[dict[str, Any]]:
+    _export(ours, folder, spp)
+    worker = Path(__file__).with_name("cycles_worker.py")
+    # Its own packages and nothing of ours.
+    clean = {k: v for k, v in os.environ.items() if not k.startswith(("PYTHON", "VIRTUAL_ENV"))}
+    done = subprocess.run([str(python), str(worker), str(folder)], capture_output=True, text=True, env=clean)
+    if done.returncode or not (folder / "times.json").exists():
+        raise UserError(
+            f"{python}: Cycles did not run ({(done.stderr.strip() or 'no message').splitlines()[-1]})"
+        )
+    told = json_.loads((folder / "times.json").read_text("utf-8"))
+    rows = []
+    for n in spp:
+        pictures = [np.load(folder / f"cycles-{n}-{k}.npy") for k in (1, 2)]
+        rows.append(
+            {
+                "renderer": "cycles",
+                "version": told["version"],
+                "spp": n,
+                "cpu_s": round(min(told["cpu_s"][str(n)][1:]), 3),
+                "noise": _noise(pictures[0], pictures[1], inside),
+            }
+        )
+    return rows
+
+
+def _export(ours: Case, folder: Path, spp: list[int]) -> None:
+    studio = ours.studio
+    tool = instrument.pose(instrument.build(("forceps",)), ours.tips, ours.shafts)
+    arrays: dict[str, Any] = {"rotation": studio.camera.rotation, "centre": studio.camera.centre}
+    bodies: dict[str, Any] = {}
+    for name, body in studio.bodies(ours.vertices, tool).items():
+        arrays |= {f"{name}_vertices": body.vertices, f"{name}_faces": body.faces, f"{name}_uv": body.uv}
+        if isinstance(body.material, Wet):
+            arrays |= {
+                f"{name}_albedo": body.material.albedo,
+                f"{name}_normal": body.material.normal / 2 + 0.5,
+            }
+            bodies[name] = {
+                "albedo": True,
+                "roughness": body.material.roughness,
+                "index": body.material.index,
+            }
+        else:
+            bodies[name] = {"roughness": 0.25, "metallic": 1 - body.material.satin}
+    lamps = [
+        {
+            "position": lamp.position.tolist(),
+            "target": lamp.target.tolist(),
+            "intensity": list(lamp.intensity),
+            "cutoff_deg": lamp.cutoff_deg,
+            "beam_deg": lamp.beam_deg,
+        }
+        for lamp in studio.lamps
+    ]
+    told = {
+        "bodies": bodies,
+        "lamps": lamps,
+        "focal_px": float(studio.camera.K[0, 0]),
+        "size": list(studio.camera.size),
+        "spp": spp,
+        "threads": int(os.environ.get("SULCUS_THREADS", os.cpu_count() or 1)),
+    }
+    np.savez(folder / "scene.npz", **arrays)
+    (folder / "scene.json").write_text(json_.dumps(told), "utf-8")
+
+
+def _noise(one: Map, two: Map, inside: npt.NDArray[np.bool_]) -> float:
+    """Root mean square of a picture's noise over a mask, as a share of the mean."""
+    return round(float(np.sqrt(((one - two)[inside] ** 2).mean() / 2) / one[inside].mean()), 5)

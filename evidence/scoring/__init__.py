@@ -1,0 +1,1 @@
+"""Scoring measured: pseudo ex vivo recordings, cost, physics alone."""

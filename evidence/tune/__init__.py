@@ -1,0 +1,1 @@
+"""Tuning measured: is a budget kept on fresh sequences?"""

@@ -1,0 +1,179 @@
+"""A trained model as one file for other programs: TorchScript or ONNX, channels and scales inside.
+
+The file's input is displacement in mm on the grid, not the channels, so that nobody has to rebuild them:
+`displacement` (B, 2, N, N) mm and `mask` (B, 1, N, N) 0/1 (for some models `confidence` (B, 1, N, N) 0..1 and
+`log_young` (B, 1) ln(E/kPa)); its output is force density per unit stiffness (B, C, N, N) [mN/mm² at 1 kPa].
+Times E in kPa it is mN/mm², times the cell's area and summed, mN. A network with a total-force head gives
+that
+too, (B, C) [mN at 1 kPa]. How a picture's flow comes onto the grid
+is written into the .json beside it.
+"""
+
+from __future__ import annotations
+
+import importlib
+import json
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from learn.checkpoint import Card
+from learn.data.grid import SMOOTHING_MM, channels
+from learn.inference.predict import Predictor
+from synth.errors import UserError
+
+TOLERANCE = 1e-4
+"""Largest difference from PyTorch allowed, in units of the training data's 99.9th percentile."""
+
+
+class Portable(nn.Module):
+    """From displacement to force density per unit stiffness, in one module."""
+
+    def __init__(self, model: nn.Module, card: Card) -> None:
+        super().__init__()
+        self.model, self.card = model, card
+
+    def forward(self, displacement: Tensor, mask: Tensor, *extra: Tensor) -> Tensor | tuple[Tensor, Tensor]:
+        arch, more = self.card.settings.arch, list(extra)
+        confidence = more.pop(0) if arch.confidence else None
+        log_young = more.pop(0) if arch.condition == "film" else None
+        x = channels(displacement, mask, self.card.settings.grid.pitch_mm, self.card.scales, confidence)
+        said = self.model(x, log_young)
+        if arch.total:
+            return said[0] * self.card.scales.target, said[1] * self.card.scales.force
+        y: Tensor = said * self.card.scales.target
+        return y
+
+
+def names(card: Card) -> list[str]:
+    """The file's inputs, in order."""
+    arch = card.settings.arch
+    extra = ["confidence"] * arch.confidence + ["log_young"] * (arch.condition == "film")
+    return ["displacement", "mask", *extra]
+
+
+def examples(card: Card, batch: int, seed: int = 0) -> list[Tensor]:
+    """Inputs of the right shapes and sizes, drawn from a seed: smooth motion over a round mask."""
+    n = card.settings.size
+    rng = np.random.default_rng(seed)
+    y, x = np.meshgrid(np.linspace(-1, 1, n), np.linspace(-1, 1, n), indexing="ij")
+    a = rng.normal(size=(batch, 2, 6))
+    basis = np.stack([np.ones_like(x), x, y, x * y, np.cos(3 * x), np.sin(3 * y)])
+    moved = np.einsum("bck,kyx->bcyx", a, basis) * card.scales.displacement_mm / 3
+    mask = np.broadcast_to(x**2 + y**2 < 0.7, (batch, 1, n, n))
+    found = {
+        "displacement": moved,
+        "mask": mask,
+        "confidence": rng.uniform(size=(batch, 1, n, n)),
+        "log_young": rng.normal(size=(batch, 1)),
+    }
+    return [torch.from_numpy(np.array(found[name], np.float32)) for name in names(card)]
+
+
+@torch.no_grad()
+def export(predictor: Predictor, file: Path, kind: str) -> float:
+    """Writes `file` and a description `file`.json, reads it back, and compares it with PyTorch.
+
+    Returns the largest difference in units of the 99.9th percentile. Raises UserError if it is above 1e-4
+    (the file is removed), or if ONNX is asked for and its packages are not installed.
+    """
+    card = predictor.card
+    module = Portable(predictor.model.cpu(), card).eval()
+    file.parent.mkdir(parents=True, exist_ok=True)
+    write = {"torchscript": _torchscript, "onnx": _onnx}.get(kind)
+    if write is None:
+        raise UserError(f"unknown format {kind!r}: torchscript or onnx")
+    run = write(module, card, file)
+    worst = 0.0
+    for batch in (1, 3):
+        inputs = examples(card, batch, seed=batch)
+        worst = max(worst, _gap(_pair(run(inputs)), _pair(module(*inputs)), card))
+    if not worst <= TOLERANCE:
+        file.unlink()
+        raise UserError(f"{file}: differs from PyTorch by {worst:.1e} of full scale, at most {TOLERANCE:g}")
+    file.with_suffix(file.suffix + ".json").write_text(json.dumps(describe(card, kind, worst), indent=1))
+    return worst
+
+
+def _pair(said: Tensor | tuple[Tensor, ...]) -> tuple[Tensor, ...]:
+    return (said,) if isinstance(said, Tensor) else said
+
+
+def _gap(said: tuple[Tensor, ...], expected: tuple[Tensor, ...], card: Card) -> float:
+    units = (card.scales.target, card.scales.force)
+    return max(
+        float((a - b).abs().max()) / unit
+        for a, b, unit in zip(said, expected, units[: len(said)], strict=True)
+    )
+
+
+def outputs(card: Card) -> list[str]:
+    """The file's outputs, in order."""
+    return ["density", "total_force"] if card.settings.arch.total else ["density"]
+
+
+def describe(card: Card, kind: str, difference: float) -> dict[str, Any]:
+    """What a program must know to use the file."""
+    grid = card.settings.grid
+    return {
+        "format": kind,
+        "inputs": names(card),
+        "outputs": outputs(card),
+        "output": "force density per unit stiffness [mN/mm2 at E = 1 kPa]; components x, y, z in camera axes"
+        if card.settings.arch.components == 3
+        else f"{card.settings.target} per unit stiffness, one component",
+        "grid": {"size": grid.size, "pitch_mm": grid.pitch_mm, "extent_mm": grid.extent_mm},
+        "preprocessing": [
+            "flow [px] times the picture's scale [mm/px] is displacement [mm]; x right, y down",
+            "the grid's centre lies on the centroid of the tissue mask in the rest picture",
+            "displacement: mean over tissue pixels under hat functions as wide as the coarser of cell and "
+            "pixel",
+            "mask: 1 where more than half of a cell is tissue; displacement is 0 where it is 0",
+            f"divergence is computed inside, from displacement smoothed with sigma {SMOOTHING_MM} mm",
+        ],
+        "force": "sum of the output over cells times pitch_mm^2 times E [kPa] is the total force [mN]",
+        "typical_young_kpa": card.typical_young_kpa,
+        "largest_difference_from_pytorch": difference,
+    }
+
+
+def _torchscript(module: Portable, card: Card, file: Path) -> Any:
+    with warnings.catch_warnings():
+        # Tracing warns that shapes are taken as constants: the grid's size is one.
+        warnings.simplefilter("ignore")
+        jit: Any = torch.jit
+        jit.trace(module, tuple(examples(card, 2)), check_trace=False).save(str(file))
+        loaded = jit.load(str(file))
+    return lambda inputs: loaded(*inputs)
+
+
+def _onnx(module: Portable, card: Card, file: Path) -> Any:
+    try:
+        importlib.import_module("onnx")
+        runtime: Any = importlib.import_module("onnxruntime")
+    except ImportError as missing:
+        raise UserError(f"ONNX export needs {missing.name}: pip install 'sulcus[export]'") from None
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        torch.onnx.export(
+            module,
+            tuple(examples(card, 2)),
+            str(file),
+            input_names=names(card),
+            output_names=outputs(card),
+            dynamic_axes={name: {0: "batch"} for name in [*names(card), *outputs(card)]},
+            dynamo=False,
+            opset_version=17,
+        )
+    session = runtime.InferenceSession(str(file), providers=["CPUExecutionProvider"])
+    order = names(card)
+
+    def run(inputs: list[Tensor]) -> tuple[Tensor, ...]:
+        named = {name: value.numpy() for name, value in zip(order, inputs, strict=True)}
+        return tuple(torch.from_numpy(value) for value in session.run(None, named))
+
+    return run

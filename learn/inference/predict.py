@@ -1,0 +1,208 @@
+"""From displacement to force with a trained model: what bench, scripts and `learn predict` call."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import nn
+
+from learn import checkpoint
+from learn.checkpoint import Card
+from learn.data.grid import Grid, Resampler, centre, channels
+from learn.network.d2fnet import fused
+from learn.network.traced import Quick
+from synth.errors import UserError
+
+
+@dataclass(frozen=True)
+class ForceMap:
+    """What the model says of one frame."""
+
+    density: NDArray[np.float32]
+    """(C, N, N): force density [mN per mm² of the picture plane], C = 1 its length or 3 its x, y, z in
+    camera axes; for a model of the paper's target the intensity [mN], C = 1."""
+    grid: Grid
+    kind: str
+    """`density` or `intensity`."""
+    young_kpa: float
+    """Young's modulus the numbers rest on: the one given, else the training data's typical one."""
+    young_known: bool
+    view: View
+    head_mn: NDArray[np.float64] | None = None
+    """(C,) total force [mN] of a network with a total-force head, forces beyond the grid included."""
+
+    @property
+    def magnitude(self) -> NDArray[np.float32]:
+        """(N, N), ≥ 0, in the unit of `density`."""
+        return length(self.density)
+
+    @property
+    def force_mn(self) -> NDArray[np.float64] | None:
+        """(3,) total force on the tissue in camera axes [mN]; None if the model gives no direction."""
+        if self.density.shape[0] != 3:
+            return None
+        total: NDArray[np.float64] = self.density.astype(np.float64).sum((1, 2)) * self.grid.pitch_mm**2
+        return total
+
+    @property
+    def total_force_mn(self) -> float:
+        """Size of the total force [mN]."""
+        return float(total_force(self.density[None], self.kind, self.grid)[0])
+
+    def to_image(self) -> NDArray[np.float32]:
+        """Magnitude on the picture's pixels, (H, W), 0 outside the grid."""
+        return self.view.resample.to_image(self.magnitude)
+
+
+def length(density: NDArray[np.float32], axis: int = -3) -> NDArray[np.float32]:
+    """Length over the component axis; the value itself if there is one component."""
+    if density.shape[axis] == 1:
+        return density.squeeze(axis)
+    out: NDArray[np.float32] = np.sqrt(np.square(density).sum(axis))
+    return out
+
+
+def total_force(density: NDArray[np.float32], kind: str, grid: Grid) -> NDArray[np.float64]:
+    """Size of the total force of each frame [mN]: the integral of a density, the peak of an intensity.
+
+    `density`: (T, C, N, N). Returns (T,) float64.
+    """
+    if kind == "intensity":
+        peak: NDArray[np.float64] = density[:, 0].max((1, 2)).astype(np.float64)
+        return peak
+    whole = density.astype(np.float64).sum((2, 3)) * grid.pitch_mm**2
+    size: NDArray[np.float64] = np.linalg.norm(whole, axis=1)
+    return size
+
+
+class View:
+    """A still picture's geometry (tissue and scale), prepared once and used for each of its frames."""
+
+    def __init__(self, tissue: NDArray[np.bool_], scale_mm_per_px: float, grid: Grid) -> None:
+        if tissue.ndim != 2:
+            raise UserError(f"tissue mask: expected (H, W), got {tissue.shape}")
+        self.tissue = tissue.astype(bool)
+        self.resample = Resampler(
+            (tissue.shape[0], tissue.shape[1]), scale_mm_per_px, centre(self.tissue), grid
+        )
+        self.mask = (self.resample.cover(self.tissue) > 0.5).astype(np.float32)
+
+
+class Predictor:
+    """A trained model, ready for pictures of any size and scale."""
+
+    def __init__(
+        self, model: nn.Module, card: Card, device: torch.device | str = "cpu", quick: bool = False
+    ) -> None:
+        """`quick`: spend a second on a graph that runs a fifth faster on a CPU, for live use and films."""
+        self.card, self.grid = card, card.settings.grid
+        self.device = torch.device(device)
+        self.model = fused(model).to(self.device)
+        self._say: Callable[..., Any] = self.model
+        if quick and self.device.type == "cpu":
+            self._say = Quick(model, card.settings.arch, card.settings.size)
+        self._view: View | None = None
+
+    def view(self, tissue: NDArray[np.bool_], scale_mm_per_px: float) -> View:
+        """Prepares a picture's geometry; the last one is kept."""
+        last = self._view
+        if (
+            last is None
+            or last.resample.scale_mm_per_px != float(scale_mm_per_px)
+            or last.tissue.shape != tissue.shape
+            or not np.array_equal(last.tissue, tissue)
+        ):
+            self._view = last = View(tissue, scale_mm_per_px, self.grid)
+        return last
+
+    def __call__(
+        self,
+        flow: NDArray[np.float32],
+        tissue: NDArray[np.bool_],
+        scale_mm_per_px: float,
+        young_kpa: float | None = None,
+        confidence: NDArray[np.float32] | None = None,
+    ) -> ForceMap:
+        """Force map of one frame.
+
+        `flow`: (H, W, 2) px, motion from the rest frame on the rest frame's pixels; `tissue`: (H, W) bool;
+        `young_kpa`: None stands for the training data's typical value; `confidence`: (H, W) 0..1, used only
+        by a model with that channel (1 if not given). Raises UserError for other shapes or values that aren't
+        finite.
+        """
+        if flow.ndim != 3 or flow.shape[2] != 2 or flow.shape[:2] != tissue.shape:
+            raise UserError(f"flow: expected ({tissue.shape[0]}, {tissue.shape[1]}, 2), got {flow.shape}")
+        if young_kpa is not None and not (np.isfinite(young_kpa) and young_kpa > 0):
+            raise UserError(f"young_kpa {young_kpa}: must be positive")
+        view = self.view(tissue, scale_mm_per_px)
+        moved = view.resample.mean(flow.transpose(2, 0, 1) * view.resample.scale_mm_per_px, view.tissue)
+        sure = None if confidence is None else view.resample.mean(confidence, view.tissue)[None]
+        young = young_kpa or self.card.typical_young_kpa
+        density, total = self.answer(moved[None], view.mask, young, sure)
+        head = None if total is None else total[0]
+        return ForceMap(
+            density[0], self.grid, self.card.settings.target, young, young_kpa is not None, view, head
+        )
+
+    def density(
+        self,
+        displacement: NDArray[np.float32],
+        mask: NDArray[np.float32],
+        young_kpa: float,
+        confidence: NDArray[np.float32] | None = None,
+    ) -> NDArray[np.float32]:
+        """The maps of `answer` alone."""
+        return self.answer(displacement, mask, young_kpa, confidence)[0]
+
+    @torch.inference_mode()
+    def answer(
+        self,
+        displacement: NDArray[np.float32],
+        mask: NDArray[np.float32],
+        young_kpa: float,
+        confidence: NDArray[np.float32] | None = None,
+    ) -> tuple[NDArray[np.float32], NDArray[np.float64] | None]:
+        """Force density of frames already on the grid, and their total force if the network has that head.
+
+        `displacement`: (T, 2, N, N) mm; `mask`: (N, N) 0/1; `confidence`: (T, N, N). Returns (T, C, N, N)
+        mN/mm² at `young_kpa` and (T, C) mN or None. Raises UserError for another grid, or displacement that
+        isn't finite.
+        """
+        n, settings, scales = self.grid.size, self.card.settings, self.card.scales
+        if displacement.ndim != 4 or displacement.shape[1:] != (2, n, n):
+            raise UserError(
+                f"this model takes displacement of shape (T, 2, {n}, {n}) [dx, dy in mm], "
+                f"got {displacement.shape}"
+            )
+        if not np.isfinite(displacement).all():
+            raise UserError("displacement holds NaN or infinity")
+        maps, totals = [], []
+        for start in range(0, len(displacement), settings.batch):
+            u = torch.from_numpy(np.array(displacement[start : start + settings.batch])).to(self.device)
+            m = torch.from_numpy(np.array(mask)).to(self.device).expand(len(u), 1, n, n)
+            sure = None
+            if settings.arch.confidence:
+                sure = torch.ones_like(m)
+                if confidence is not None:
+                    part = np.array(confidence[start : start + settings.batch])
+                    sure = torch.from_numpy(part)[:, None].to(self.device)
+            log_young = torch.full((len(u), 1), float(np.log(young_kpa)), device=self.device)
+            said = self._say(channels(u, m, self.grid.pitch_mm, scales, sure), log_young)
+            if settings.arch.total:
+                said, total = said
+                totals.append(total.double().cpu().numpy())
+            maps.append(said.float().cpu().numpy())
+        density = np.concatenate(maps) * np.float32(scales.target * young_kpa)
+        return density, np.concatenate(totals) * (scales.force * young_kpa) if totals else None
+
+
+def load(model_dir: Path | str, device: torch.device | str = "cpu", quick: bool = False) -> Predictor:
+    """A model folder as `learn train` writes it. Raises UserError if it is missing or corrupt."""
+    model, card = checkpoint.load_model(Path(model_dir))
+    return Predictor(model, card, device, quick)

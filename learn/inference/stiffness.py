@@ -1,0 +1,46 @@
+"""Stiffness from one press: what video can't know, from a moment in which the force is known.
+
+The network's answer per unit stiffness times E is the force, so one press with a known force (a weight, a
+sensor
+on the tool) gives E for the rest of the recording.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from learn.inference.predict import Predictor, total_force
+from synth.errors import UserError
+
+_ROUNDS, _CLOSE = 12, 1e-3
+
+
+def stiffness(
+    predictor: Predictor,
+    displacement: NDArray[np.float32],
+    mask: NDArray[np.float32],
+    force_mn: NDArray[np.float64],
+    confidence: NDArray[np.float32] | None = None,
+) -> float:
+    """Young's modulus [kPa] that makes the answer to a press fit its force best, in the least squares.
+
+    `displacement`: (T, 2, N, N) mm on the model's grid; `mask`: (N, N); `force_mn`: (T,) size of the known
+    force;
+    `confidence`: (T, N, N). A network conditioned on E is asked again with each estimate until it stays
+    within a
+    thousandth. Raises UserError if the lengths differ, or if there is no force or no answer to fit.
+    """
+    if len(force_mn) != len(displacement):
+        raise UserError(f"calibration press: {len(force_mn)} forces for {len(displacement)} frames")
+    kind, grid = predictor.card.settings.target, predictor.grid
+    young = predictor.card.typical_young_kpa
+    for _ in range(_ROUNDS if predictor.card.settings.arch.condition == "film" else 1):
+        said = total_force(predictor.density(displacement, mask, young, confidence), kind, grid)
+        fit = float(said @ force_mn), float(said @ said)
+        if not (np.isfinite(fit).all() and min(fit) > 0):
+            raise UserError("calibration press: no force was given, or the model sees none in the motion")
+        before, young = young, young * fit[0] / fit[1]
+        if abs(young / before - 1) < _CLOSE:
+            break
+    return young

@@ -1,0 +1,150 @@
+"""Batches of frames: which, turned how, and as tensors."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from learn.data.clips import Clip, amount, sources, target
+from learn.data.grid import Scales, channels, divergence
+from learn.settings import Settings
+from synth.errors import UserError
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Frames on one device, in physical units."""
+
+    displacement: Tensor
+    """(B, 2, N, N) mm."""
+    mask: Tensor
+    """(B, 1, N, N) 0/1."""
+    confidence: Tensor
+    """(B, 1, N, N) 0..1."""
+    target: Tensor
+    """(B, C, N, N) in the unit of `Scales.target`."""
+    force: Tensor
+    """(B, C) total force [mN at E = 1 kPa]."""
+    log_young: Tensor
+    """(B, 1) ln(E / 1 kPa)."""
+
+    def to(self, device: torch.device) -> Batch:
+        return Batch(**{k: v.to(device, non_blocking=True) for k, v in vars(self).items()})
+
+
+def inputs(batch: Batch, settings: Settings, scales: Scales) -> Tensor:
+    """The network's channels for a batch."""
+    extra = batch.confidence if settings.arch.confidence else None
+    return channels(batch.displacement, batch.mask, settings.grid.pitch_mm, scales, extra)
+
+
+def turned(values: NDArray[np.float32], quarter: int, mirror: bool) -> NDArray[np.float32]:
+    """A field turned by `quarter` × 90° (counter-clockwise as seen) after an optional left-right mirror.
+
+    `values`: (C, N, N). With two or three channels the first two are x, y components and turn with the
+    field; a single channel is a scalar. Divergence is computed after this, so it needs no rule of its own.
+    """
+    vector = values.shape[0] > 1
+    if mirror:
+        values = values[:, :, ::-1]
+        if vector:
+            values = np.concatenate([-values[:1], values[1:]])
+    for _ in range(quarter % 4):
+        values = np.rot90(values, axes=(1, 2))
+        if vector:
+            values = np.concatenate([values[1:2], -values[:1], values[2:]])
+    return np.ascontiguousarray(values)
+
+
+class Frames:
+    """All frames of some clips, given out in batches."""
+
+    def __init__(self, clips: Sequence[Clip], settings: Settings) -> None:
+        self.clips, self.settings = list(clips), settings
+        parts, pitch = settings.arch.components, settings.grid.pitch_mm
+        self.force = [amount(c, settings.target, parts, pitch).astype(np.float32) for c in self.clips]
+        self.sources = sources(settings.input)
+        if not self.clips:
+            raise UserError("no sequence to take frames from")
+        for clip in self.clips:
+            if clip.mask.shape != (settings.size, settings.size):
+                raise UserError(
+                    f"{clip.name}: on a {clip.mask.shape[0]}² grid, the model takes {settings.size}²"
+                )
+
+    def order(self, rng: np.random.Generator, share_recovered: float) -> list[tuple[int, int, str, int]]:
+        """One epoch: (clip, frame, source, turn 0-7) in random order."""
+        items = []
+        for c, clip in enumerate(self.clips):
+            frames = np.arange(clip.frames)
+            if 0 < self.settings.frames < clip.frames:
+                frames = rng.choice(clip.frames, self.settings.frames, replace=False)
+            items += [(c, int(t)) for t in frames]
+        source = [self.sources[0]] * len(items)
+        if len(self.sources) == 2:
+            source = [self.sources[int(u < share_recovered)] for u in rng.random(len(items))]
+        turn = rng.integers(0, 8, len(items)) if self.settings.augment else np.zeros(len(items), int)
+        return [(*items[i], source[i], int(turn[i])) for i in rng.permutation(len(items))]
+
+    def sequential(self, clip: int, source: str) -> Iterator[Batch]:
+        """All frames of one clip, in order, as they are."""
+        step = self.settings.batch
+        for start in range(0, self.clips[clip].frames, step):
+            stop = min(start + step, self.clips[clip].frames)
+            yield self.batch([(clip, t, source, 0) for t in range(start, stop)])
+
+    def batch(self, items: Sequence[tuple[int, int, str, int]]) -> Batch:
+        """The frames named by `items`, as tensors."""
+        columns: dict[str, list[NDArray[np.float32]]] = {
+            "displacement": [],
+            "mask": [],
+            "confidence": [],
+            "target": [],
+            "force": [],
+        }
+        for c, t, source, turn in items:
+            clip, how = self.clips[c], (turn % 4, turn >= 4)
+            confidence = clip.confidence[t] if source == "recovered" else np.ones_like(clip.mask)
+            truth = target(clip, t, self.settings.target, self.settings.arch.components)
+            columns["displacement"].append(turned(clip.displacement[source][t], *how))
+            columns["mask"].append(turned(clip.mask[None], *how))
+            columns["confidence"].append(turned(np.asarray(confidence)[None], *how))
+            columns["target"].append(turned(truth, *how))
+            columns["force"].append(turned(self.force[c][t][:, None, None], *how)[:, 0, 0])
+        young = [[np.log(self.clips[c].young_kpa)] for c, *_ in items]
+        return Batch(
+            **{k: torch.from_numpy(np.stack(v)) for k, v in columns.items()},
+            log_young=torch.tensor(young, dtype=torch.float32),
+        )
+
+
+def measure_scales(clips: Sequence[Clip], settings: Settings, frames: int = 16) -> Scales:
+    """99.9th percentiles over tissue cells of up to `frames` evenly spaced frames of every clip.
+
+    Raises UserError if nothing moves or nothing is loaded.
+    """
+    moved, strain, wanted, force = [], [], [], []
+    squares, cells = 0.0, 0.0
+    for clip in clips:
+        mask = torch.from_numpy(np.array(clip.mask))[None, None]
+        inside = clip.mask > 0
+        for t in np.unique(np.linspace(0, clip.frames - 1, frames).astype(int)):
+            for source in sources(settings.input):
+                u = torch.from_numpy(np.array(clip.displacement[source][t]))[None]
+                moved.append(np.linalg.norm(clip.displacement[source][t], axis=0)[inside])
+                strain.append(np.abs(divergence(u, mask, settings.grid.pitch_mm)[0, 0].numpy()[inside]))
+            truth = target(clip, int(t), settings.target, settings.arch.components)
+            wanted.append(np.linalg.norm(truth, axis=0)[inside])
+            squares += float(np.square(truth[:, inside], dtype=np.float64).sum())
+            cells += float(inside.sum() * len(truth))
+        total = amount(clip, settings.target, settings.arch.components, settings.grid.pitch_mm)
+        force.append(np.linalg.norm(total, axis=1))
+    found = tuple(float(np.percentile(np.concatenate(v), 99.9)) for v in (moved, strain, wanted, force))
+    if min(found) <= 0:
+        raise UserError("the training sequences hold no motion or no force: there is nothing to learn")
+    return Scales(found[0], found[1], found[2], found[3], (squares / cells) ** 0.5)

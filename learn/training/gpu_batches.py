@@ -1,0 +1,103 @@
+"""All frames on the device at once, batches cut and turned there: nothing but indices crosses the bus."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from learn.data.clips import Clip, sources, target
+from learn.settings import Settings
+from learn.training.batches import Batch, Frames
+
+SHARE = 0.6
+"""Part of the device's free memory that frames may take; the rest is the network's."""
+
+
+def turned(values: Tensor, turn: int) -> Tensor:
+    """`learn.training.batches.turned` for a batch (B, C, N, N) on a device: `turn` 0-7, from 4 on
+    with a mirror first."""
+    vector = values.shape[1] > 1
+    sign = values.new_tensor([-1.0, 1.0, 1.0][: values.shape[1]]).view(1, -1, 1, 1)
+    if turn >= 4:
+        values = values.flip(-1)
+        values = values * sign if vector else values
+    for _ in range(turn % 4):
+        values = values.rot90(dims=(2, 3))
+        if vector:
+            values = torch.cat([values[:, 1:2], -values[:, :1], values[:, 2:]], dim=1)
+    return values
+
+
+class Resident(Frames):
+    """The same frames as `Frames`, in the same order, held by the device."""
+
+    def __init__(self, clips: Sequence[Clip], settings: Settings, device: torch.device) -> None:
+        super().__init__(clips, settings)
+        parts = settings.arch.components
+        self._first = np.cumsum([0, *(c.frames for c in self.clips)])
+
+        def whole(arrays: list[np.ndarray[tuple[int, ...], np.dtype[np.float32]]]) -> Tensor:
+            shape = (sum(len(a) for a in arrays), *arrays[0].shape[1:])
+            out = torch.empty(shape, dtype=torch.float32, device=device)
+            at = 0
+            for a in arrays:
+                out[at : at + len(a)] = torch.from_numpy(np.array(a))
+                at += len(a)
+            return out
+
+        self._moved = {s: whole([c.displacement[s] for c in self.clips]) for s in self.sources}
+        self._mask = whole([np.asarray(c.mask)[None, None] for c in self.clips])
+        self._sure = None
+        if settings.arch.confidence:
+            self._sure = whole([np.asarray(c.confidence)[:, None] for c in self.clips])
+        self._true = whole(
+            [np.stack([target(c, t, settings.target, parts) for t in range(c.frames)]) for c in self.clips]
+        )
+        self._force = whole(self.force)
+        young = torch.tensor([np.log(c.young_kpa) for c in self.clips], dtype=torch.float32)
+        self._young, self._device = young[:, None].to(device), device
+
+    def batch(self, items: Sequence[tuple[int, int, str, int]]) -> Batch:
+        """As `Frames.batch`; within it frames of one turn stand together."""
+        items = sorted(items, key=lambda item: item[3])
+        parts: list[dict[str, Tensor]] = []
+        for turn in sorted({item[3] for item in items}):
+            for source in self.sources:
+                some = [item for item in items if item[3] == turn and item[2] == source]
+                if some:
+                    parts.append(self._cut(some, source, turn))
+        return Batch(**{k: torch.cat([p[k] for p in parts]) for k in parts[0]})
+
+    def _cut(self, items: list[tuple[int, int, str, int]], source: str, turn: int) -> dict[str, Tensor]:
+        at = torch.tensor([int(self._first[c]) + t for c, t, _, _ in items], device=self._device)
+        clip = torch.tensor([c for c, *_ in items], device=self._device)
+        mask = turned(self._mask[clip], turn)
+        sure = torch.ones_like(mask)
+        if self._sure is not None and source == "recovered":
+            sure = turned(self._sure[at], turn)
+        return {
+            "displacement": turned(self._moved[source][at], turn),
+            "mask": mask,
+            "confidence": sure,
+            "target": turned(self._true[at], turn),
+            "force": turned(self._force[at][..., None, None], turn)[..., 0, 0],
+            "log_young": self._young[clip],
+        }
+
+
+def held(clips: Sequence[Clip], settings: Settings, device: torch.device) -> Frames:
+    """Frames on the device where the settings and its memory allow, else read as they are asked for."""
+    mode: Literal["auto", "yes", "no"] = settings.resident
+    if mode == "no" or (mode == "auto" and device.type != "cuda"):
+        return Frames(clips, settings)
+    if mode == "auto":
+        arch = settings.arch
+        planes = 2 * len(sources(settings.input)) + arch.components + arch.confidence
+        needed = sum(c.frames for c in clips) * planes * 4 * settings.size**2
+        if needed > SHARE * torch.cuda.mem_get_info(device)[0]:
+            return Frames(clips, settings)
+    return Resident(clips, settings, device)

@@ -1,0 +1,255 @@
+"""Training: AdamW on a plateau schedule, clipped, checkpointed every epoch, resumed to the bit."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Sequence
+from contextlib import nullcontext
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from lightning_fabric import Fabric
+from torch.optim.lr_scheduler import ReduceLROnPlateau
+from torchmetrics.aggregation import MeanMetric
+
+from learn import checkpoint
+from learn.checkpoint import Card
+from learn.data.clips import Clip, typical_young
+from learn.data.grid import Scales
+from learn.data.split import Split, groups
+from learn.evaluation.metrics import Moments, agreement
+from learn.loss import SHARES, at, full, gradient_shares, loss
+from learn.network.monai_unet import build
+from learn.settings import Settings
+from learn.training.batches import Batch, Frames, inputs, measure_scales
+from learn.training.gpu_batches import held
+from learn.training.log import Log
+from synth.errors import UserError
+
+LOOK = 16
+"""Steps between two looks at the loss and its gradient: each makes a GPU wait."""
+
+Report = Callable[[int, int, dict[str, float]], None]
+"""Told after every batch: batches done, batches there will be, latest numbers."""
+
+
+def train(
+    clips: Sequence[Clip],
+    split: Split,
+    settings: Settings,
+    out: Path,
+    *,
+    report: Report = lambda done, of, numbers: None,
+    fabric: Fabric | None = None,
+    log: Callable[[dict[str, float]], None] = lambda numbers: None,
+) -> Card:
+    """Trains on `split.fit`, chooses the epoch on `split.select`, never looks at `split.test`.
+
+    A folder that holds an unfinished run of the same settings and data is continued; the result is the same,
+    bit for bit on one CPU, as that of an uninterrupted run. `log` gets each epoch's numbers.
+
+    Returns the card of the best epoch. Raises UserError if `out` holds another run, or on divergence.
+    """
+    fabric = fabric or Fabric(accelerator="cpu", devices=1, precision=settings.precision)
+    fabric.launch()
+    torch.use_deterministic_algorithms(settings.deterministic)
+    fit, select = [clips[i] for i in split.fit], [clips[i] for i in split.select]
+    scales = measure_scales(fit, settings)
+    card = Card(settings, scales, typical_young(fit), *_provenance(clips, split))
+    state = _open(out, card)
+
+    torch.manual_seed(settings.seed)
+    model = build(settings.arch)
+    if settings.channels_last:
+        model = model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    optimizer = torch.optim.AdamW(
+        model.parameters(), lr=settings.learning_rate, weight_decay=settings.weight_decay
+    )
+    plateau = ReduceLROnPlateau(optimizer, mode="max", factor=0.5, patience=settings.patience)
+    start, best, waited = 0, -math.inf, 0
+    if state is not None:
+        model.load_state_dict(state["model"])
+        optimizer.load_state_dict(state["optimizer"])
+        plateau.load_state_dict(state["plateau"])
+        start, best, waited = state["epoch"], state["best"], state["waited"]
+    net, optimizer = fabric.setup(torch.compile(model) if settings.compile else model, optimizer)
+    frames, chooser = held(fit, settings, fabric.device), held(select, settings, fabric.device)
+
+    with Log(out, start) if fabric.is_global_zero else nullcontext() as write:
+        for epoch in range(start, settings.epochs):
+            if settings.stop and waited >= settings.stop:
+                break
+            numbers = _epoch(fabric, net, optimizer, frames, scales, epoch, report)
+            numbers |= select_score(net, chooser, scales, fabric.device)
+            score = numbers["select_r2"]
+            if settings.schedule == "plateau":
+                plateau.step(score)
+            # Before its price is whole no epoch has been asked to have no ghosts: none of those is chosen.
+            asked = full(settings.objective, (epoch + 1) / settings.epochs)
+            improved = asked and score > best
+            best, waited = (score, 0) if improved else (best, waited + asked)
+            numbers |= {"epoch": epoch + 1.0, "lr": optimizer.param_groups[0]["lr"]}
+            if write is not None:
+                write(epoch, numbers)
+                if improved:
+                    checkpoint.save_tensors(out / "weights.pt", _cpu(model.state_dict()))
+                    checkpoint.write_card(out, dataclasses.replace(card, epoch=epoch + 1, score=score))
+                state = {
+                    "epoch": epoch + 1,
+                    "best": best,
+                    "waited": waited,
+                    "model": _cpu(model.state_dict()),
+                }
+                state |= {"optimizer": optimizer.state_dict(), "plateau": plateau.state_dict()}
+                checkpoint.save_tensors(out / "last.pt", state)
+            fabric.barrier()
+            log(numbers)
+    return checkpoint.read_card(out)
+
+
+def _epoch(
+    fabric: Fabric,
+    net: Any,
+    optimizer: Any,
+    frames: Frames,
+    scales: Scales,
+    epoch: int,
+    report: Report,
+) -> dict[str, float]:
+    settings = frames.settings
+    # Seeds from (seed, epoch) alone: nothing to store, so a resumed run draws what the first would have.
+    seed = np.random.SeedSequence([settings.seed, epoch])
+    torch.manual_seed(int(seed.generate_state(1)[0]) + fabric.global_rank)
+    share = min(1.0, epoch / max(settings.epochs // 2, 1))
+    order = frames.order(np.random.default_rng(seed), share)
+    whole = settings.batch * fabric.world_size
+    batches = max(len(order) // whole, 1)
+    net.train()
+    last = 0.0
+    means = {k: MeanMetric().to(fabric.device) for k in ("loss", *(f"share_{k}" for k in SHARES))}
+    for i in range(batches):
+        batch = frames.batch(order[i * whole : (i + 1) * whole][fabric.global_rank :: fabric.world_size])
+        batch = batch.to(fabric.device)
+        said, total = forward(net, batch, settings, scales)
+        terms = loss(
+            said,
+            batch.target,
+            batch.mask,
+            at(settings.objective, (epoch + i / batches) / settings.epochs),
+            scales.target,
+            scales.spread,
+            settings.grid.pitch_mm**2,
+            scales.force,
+            None if total is None else (total, batch.force),
+        )
+        if i % LOOK == 0:
+            last = float(terms.sum.detach())
+            _finite(last, epoch)
+            for k, v in gradient_shares(terms, said).items():
+                means[f"share_{k}"].update(v)
+        if settings.schedule == "cosine":
+            for group in optimizer.param_groups:
+                group["lr"] = settings.learning_rate * cosine((epoch + i / batches) / settings.epochs)
+        optimizer.zero_grad()
+        fabric.backward(terms.sum)
+        fabric.clip_gradients(net, optimizer, max_norm=settings.clip)
+        optimizer.step()
+        means["loss"].update(terms.sum.detach())
+        report(epoch * batches + i + 1, settings.epochs * batches, {"loss": last})
+    numbers = {k: float(m.compute()) for k, m in means.items()}
+    _finite(numbers["loss"], epoch)
+    return numbers
+
+
+def _finite(value: float, epoch: int) -> None:
+    if not math.isfinite(value):
+        raise UserError(f"training diverged in epoch {epoch + 1}: lower --learning-rate")
+
+
+def cosine(progress: float, warm: float = 0.05) -> float:
+    """Share of the learning rate at a point 0..1 of the run: a linear warm-up, then half a cosine to zero."""
+    if progress < warm:
+        return (progress + 1e-3) / (warm + 1e-3)
+    return 0.5 * (1 + math.cos(math.pi * (progress - warm) / (1 - warm)))
+
+
+def forward(
+    net: Any, batch: Batch, settings: Settings, scales: Scales
+) -> tuple[torch.Tensor, torch.Tensor | None]:
+    """The network's answer in physical units per unit stiffness: the map (B, C, N, N), unit of
+    `Scales.target`,
+    and the total force (B, C) [mN at 1 kPa] of a network with that head."""
+    x = inputs(batch, settings, scales)
+    if settings.channels_last:
+        x = x.contiguous(memory_format=torch.channels_last)
+    young = batch.log_young if settings.arch.condition == "film" else None
+    said = net(x, young)
+    if settings.arch.total:
+        return said[0].float() * scales.target, said[1].float() * scales.force
+    return said.float() * scales.target, None
+
+
+@torch.no_grad()
+def select_score(net: Any, frames: Frames, scales: Scales, device: torch.device) -> dict[str, float]:
+    """R² and RMSE over all tissue cells and components, on the last (most real) source of the input kind."""
+    net.eval()
+    sums = Moments()
+    for c in range(len(frames.clips)):
+        for batch in frames.sequential(c, frames.sources[-1]):
+            here = batch.to(device)
+            inside = here.mask.bool().expand_as(here.target)
+            said, _ = forward(net, here, frames.settings, scales)
+            sums = sums + moments(here.target[inside], said[inside])
+    result = agreement(sums)
+    return {"select_r2": result.r2 if math.isfinite(result.r2) else -math.inf, "select_rmse": result.rmse}
+
+
+def moments(true: torch.Tensor, said: torch.Tensor) -> Moments:
+    """`Moments.of`, summed on the tensors' own device: six numbers come back."""
+    t, p = true.double(), said.double()
+    sums = torch.stack([t.sum(), p.sum(), t @ t, p @ p, t @ p, (p - t).abs().sum()])
+    return Moments(float(t.numel()), *sums.tolist())
+
+
+def _provenance(clips: Sequence[Clip], split: Split) -> tuple[dict[str, list[str]], dict[str, list[str]]]:
+    parts = {"fit": split.fit, "select": split.select, "test": split.test}
+    number = groups(clips)
+    seen = {number[i] for i in (*split.fit, *split.select)}
+    if seen & {number[i] for i in split.test} or {number[i] for i in split.fit} & {
+        number[i] for i in split.select
+    }:
+        raise UserError("the split shares an anatomy between fit, select and test")
+    return (
+        {k: [clips[i].content_hash for i in v] for k, v in parts.items()},
+        {k: sorted({clips[i].group for i in v}) for k, v in parts.items()},
+    )
+
+
+def _open(out: Path, card: Card) -> dict[str, Any] | None:
+    """The state to go on from, or None for a fresh start in a fresh folder."""
+    if not out.exists() or (out.is_dir() and not any(out.iterdir())):
+        checkpoint.write_card(out, card)
+        return None
+    there = checkpoint.read_card(out)
+    if there.settings != dataclasses.replace(card.settings, epochs=there.settings.epochs):
+        raise UserError(f"{out}: holds a model trained with other settings; choose another folder")
+    if there.split != card.split or there.scales != card.scales:
+        raise UserError(f"{out}: holds a model trained on other data; choose another folder")
+    planned = there.settings.input == "mixed" or there.settings.objective.kind == "hinge"
+    bound = planned or there.settings.schedule == "cosine"
+    if there.settings.epochs != card.settings.epochs and bound:
+        raise UserError(f"{out}: its schedule was made for {there.settings.epochs} epochs; keep --epochs")
+    if not (out / "last.pt").exists():
+        return None
+    state = checkpoint.load_tensors(out / "last.pt")
+    missing = {"model", "optimizer", "plateau", "epoch", "best", "waited"} - state.keys()
+    if missing:
+        raise UserError(f"{out / 'last.pt'}: corrupt checkpoint (lacks {', '.join(sorted(missing))})")
+    return state
+
+
+def _cpu(state: dict[str, Any]) -> dict[str, Any]:
+    return {k: v.detach().cpu().clone() for k, v in state.items()}

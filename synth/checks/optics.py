@@ -1,0 +1,85 @@
+"""What must hold between camera, depth, flow and load in every sequence: they are computed apart."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from synth.checks.measure import Measure, truth
+from synth.dataset.store import Sequence
+from synth.render.camera import camera as cameras
+from synth.render.camera.sway import Sway
+
+Floats = NDArray[np.float64]
+
+
+def camera(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
+    """K, distortion and depth span the area that each pixel says it sees, at the scale stated (relative)."""
+    if "depth" not in sequence:
+        return
+    view, (height, width) = camera_of(sequence), sequence.size
+    depth = sequence["depth"][0].astype(np.float64)
+    on = sequence["tissue"][:] & ~sequence["tool"][0] & (depth > 0)
+    inner = cv2.erode(on.astype(np.uint8), np.ones((9, 9), np.uint8), borderValue=0).astype(bool)
+    yield truth(bool(inner.any()), "no tissue in view")
+    if not inner.any():
+        return
+    pixels = cameras.pixel_grid(view.size)
+    flat = cameras.undistort((pixels - view.K[:2, 2]) / np.diag(view.K)[:2], view.distortion)
+    rays = np.concatenate([flat, np.ones((len(flat), 1))], axis=1).reshape(height, width, 3)
+    points = rays * depth[..., None]
+    across, down = 0.5 * (points[1:-1, 2:] - points[1:-1, :-2]), 0.5 * (points[2:, 1:-1] - points[:-2, 1:-1])
+    spanned = np.linalg.norm(np.cross(across, down), axis=-1)
+    inside = inner[1:-1, 1:-1]
+    area = np.maximum(sequence["area"][:][1:-1, 1:-1][inside], 1e-12)
+    off = np.abs(spanned[inside] / area - 1)
+    yield Measure(float(np.median(off)), 0.02, "area of the middle pixel")
+    yield Measure(float(np.quantile(off, 0.9)), 0.3, "area of all but a tenth of the pixels")
+    scale = float(np.median(depth[inner])) / float(np.sqrt(view.K[0, 0] * view.K[1, 1]))
+    yield Measure(abs(scale / view.mm_per_px - 1), 0.08, "scale")
+
+
+def contact(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
+    """The middle of the load, moved by the flow, is where the camera sees the instrument's tips [mm]."""
+    instruments = (sequence.attrs.get("mechanics") or {}).get("instruments", [])
+    if len(instruments) != 1:
+        return
+    still, tips = camera_of(sequence), np.asarray(instruments[0]["tip_mm"], np.float64)
+    scenario, time = sequence.attrs["scenario"], sequence["time"][:]
+    footprint = float(scenario["gesture"]["footprint_mm"])
+    sway = Sway(**scenario["sway"]) if "sway" in scenario else None
+    area, tissue = sequence["area"][:], sequence["tissue"][:]
+    inside = cv2.erode(tissue.astype(np.uint8), np.ones((5, 5), np.uint8), borderValue=0).astype(bool)
+    rows, columns = np.indices(tissue.shape)
+    peak = float(np.linalg.norm(sequence["force"][:], axis=1).max())
+    for t in frames:
+        size = np.linalg.norm(sequence["traction"][t], axis=-1)
+        share = size * area
+        # Written so that a peak that is no number passes the frame over.
+        if (size[~inside] > 0.02 * size.max()).any() or not share.sum() > 0.05 * peak:
+            continue
+        share = share / share.sum()
+        flow = sequence["flow"][t]
+        x, y = ((share * (base + flow[..., k])).sum() for k, base in enumerate((columns, rows)))
+        view = sway.at(still, float(time[t])) if sway else still
+        seen = cameras.to_pixels(view, cameras.to_camera(view, tips[t].reshape(-1, 3))).mean(axis=0)
+        off = float(np.hypot(x - seen[0], y - seen[1])) * view.mm_per_px
+        yield Measure(off, 0.1 * footprint + view.mm_per_px, f"frame {t}")
+
+
+def camera_of(sequence: Sequence) -> cameras.Camera:
+    """The camera that took a sequence; aperture and focus are not kept."""
+    attrs, (height, width) = sequence.attrs, sequence.size
+    return cameras.Camera(
+        K=np.asarray(attrs["K"], np.float64),
+        distortion=np.asarray(attrs["distortion"], np.float64),
+        rotation=np.asarray(attrs["rotation"], np.float64),
+        translation=np.asarray(attrs["translation"], np.float64),
+        size=(width, height),
+        aperture_mm=0.0,
+        focus_mm=0.0,
+        mm_per_px=float(attrs["scale_mm_per_px"]),
+    )

@@ -1,0 +1,103 @@
+"""What a sequence holds and takes on disk, field by field: for planning and for the docs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from synth.dataset import size_forecast
+from synth.dataset.store import Sequence
+from synth.fields import FIELDS, TIME, Field
+
+_KEPT = {
+    "always": "always",
+    "usually": "unless in `store.without`",
+    "recovered": "with an estimator of flow",
+    "asked": "if in `store.extra`",
+}
+
+
+@dataclass(frozen=True)
+class Row:
+    """One field at one size of picture."""
+
+    name: str
+    axes: str
+    dtype: str
+    unit: str
+    kept: str
+    raw: float
+    """Bytes a frame in memory; of a field without frames, bytes a sequence."""
+    stored: float
+    """The same on disk, by the ratio measured on rendered sequences."""
+    measured: float | None
+    """The same in a dataset at hand."""
+    meaning: str
+
+
+def rows(size: tuple[int, int], sequence: Sequence | None = None) -> Iterator[Row]:
+    """Every field in the table's order; size: (height, width) [px]; `sequence` gives what is measured."""
+    for field in FIELDS.values():
+        raw = float(np.prod(field.shape(1, size))) * np.dtype(field.dtype).itemsize
+        yield Row(
+            name=field.name,
+            axes=", ".join(field.dims),
+            dtype=field.dtype,
+            unit=field.unit,
+            kept=_KEPT[field.kept],
+            raw=raw,
+            stored=raw * field.packed,
+            measured=None if sequence is None else _measured(field, sequence),
+            meaning=field.meaning,
+        )
+
+
+def lines(size: tuple[int, int], sequence: Sequence | None = None) -> Iterator[str]:
+    """The table in Markdown, and the sum of what a default job keeps of a frame."""
+    height, width = size
+    found = list(rows(size, sequence))
+    yield "| field | axes | type | unit | kept | in memory | on disk | meaning |"
+    yield "| --- | --- | --- | --- | --- | ---: | ---: | --- |"
+    for row in found:
+        stored = row.stored if row.measured is None else row.measured
+        per = "" if TIME in row.axes else " a sequence"
+        sizes = f"{size_forecast.amount(row.raw)}{per} | {size_forecast.amount(stored)}{per}"
+        words = (f"`{row.name}`", row.axes, row.dtype, row.unit, row.kept, sizes, row.meaning)
+        yield f"| {' | '.join(words)} |"
+    usual = [row for row in found if FIELDS[row.name].kept != "asked" and TIME in row.axes]
+    stored = sum(row.stored if row.measured is None else row.measured for row in usual)
+    raw = sum(row.raw for row in usual)
+    yield ""
+    yield (
+        f"A frame of {width} x {height} px, without what is only kept if asked for: "
+        f"{size_forecast.amount(raw)} in memory, {size_forecast.amount(stored)} on disk."
+    )
+
+
+def page() -> str:
+    """docs/fields.md."""
+    return _HEAD + "\n".join(lines((480, 640))) + "\n"
+
+
+_HEAD = """\
+# What a sequence holds
+
+Written by `synth fields --page > docs/fields.md`; do not edit. Sizes: a frame of 640 x 480 px; on disk by
+the ratio measured on rendered sequences. `synth fields --size 1280x960` gives them for another picture,
+`synth fields OUT` as they are in a dataset.
+
+`store.flow: float16` halves the flows. A value is then rounded to 11 bits: by 0.004 px at most below 16 px of
+motion, 0.008 px below 32. The largest error of a sequence is measured as it is written, in its attribute
+`summary.rounding_px`. Readers give float32 either way.
+
+"""
+
+
+def _measured(field: Field, sequence: Sequence) -> float:
+    folder: Path = sequence.path / field.name
+    if not folder.is_dir():
+        return 0.0
+    return size_forecast.size(folder) / (sequence.frames if TIME in field.dims else 1)

@@ -1,0 +1,252 @@
+"""The dataset's folder: whose it is, who writes to it now, what is done, what failed."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import fcntl
+import json
+import os
+import shutil
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from synth.dataset import location, provenance
+from synth.errors import UserError
+from synth.job import identity, writer
+from synth.job.schema import Job
+
+_LOCK_WAIT_S = 5.0
+_NAME = "dataset.json"
+_STATE = ".run"
+
+
+class Folder:
+    """A dataset's folder. Everything here is told by what is on disk, so it survives any death."""
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+        self.state = root / _STATE
+        self.logs = self.state / "logs"
+        self.scratch = self.state / "scratch"
+        self.lock_fd = -1
+        self.turn_file = self.state / "turn"
+        self.turn = 0
+
+    def described(self) -> dict[str, Any]:
+        """`{"identity", "generators", "job"}` as first written. UserError if this is no dataset of ours."""
+        try:
+            found = json.loads((self.root / _NAME).read_text("utf-8"))
+            if not {"identity", "job"} <= found.keys():
+                raise ValueError("keys are missing")
+        except FileNotFoundError:
+            raise UserError(f"{self.root}: holds no dataset ({_NAME} is missing)") from None
+        except (OSError, ValueError, AttributeError) as error:
+            raise UserError(f"{self.root / _NAME}: is damaged ({error})") from error
+        return dict(found)
+
+    def job(self) -> Job:
+        """The dataset's job."""
+        try:
+            return Job.model_validate(self.described()["job"])
+        except ValueError as error:
+            raise UserError(f"{self.root / _NAME}: is damaged or of another version ({error})") from error
+
+    def sealed(self) -> list[int]:
+        """Indices of the finished sequences, in order."""
+        with os.scandir(self.root) as entries:
+            names = [entry.name for entry in entries if entry.name.endswith(".zarr")]
+        return sorted(int(name[:-5]) for name in names if name[:-5].isdigit())
+
+    def failures(self) -> dict[int, dict[str, Any]]:
+        """`{index: {"reason", "kind", "tries", "log"}}` of the sequences given up."""
+        found = {}
+        for path in sorted((self.state / "failed").glob("*.json")):
+            with contextlib.suppress(ValueError):  # cut short by a power failure: it is tried again
+                found[int(path.stem)] = json.loads(path.read_text("utf-8"))
+        return found
+
+    def mark_failed(self, index: int, *, kind: str, reason: str, tries: int, log: str) -> None:
+        """Gives a sequence up; `synth retry` takes it back."""
+        record = {"index": index, "kind": kind, "reason": reason, "tries": tries, "log": log}
+        write_whole(self.state / "failed" / f"{index:06d}.json", json.dumps(record, indent=1))
+        self.sweep(index)
+
+    def forgive(self) -> list[int]:
+        """Forgets every failure; returns which."""
+        indices = sorted(self.failures())
+        for index in indices:
+            (self.state / "failed" / f"{index:06d}.json").unlink(missing_ok=True)
+        return indices
+
+    def sweep(self, index: int) -> None:
+        """Removes what an attempt at `index` left behind."""
+        sealed = location.store(self.root, index)
+        for leftover in (sealed.with_name(f"{sealed.name}.part"), self.root / "radiance" / f"{index:06d}"):
+            if leftover.exists() and not sealed.exists():
+                shutil.rmtree(leftover)
+
+    def sweep_all(self) -> None:
+        """Removes every leftover of interrupted attempts."""
+        for part in self.root.glob("*.zarr.part"):
+            shutil.rmtree(part)
+        for log in self.logs.glob("worker-*.log"):
+            log.unlink()
+        for abandoned in self.scratch.glob("*"):
+            shutil.rmtree(abandoned)
+        for radiance in self.root.glob("radiance/[0-9]*"):
+            if radiance.name.isdigit():
+                self.sweep(int(radiance.name))
+
+    def pass_turn(self) -> None:
+        """Ends what other machines still do for an earlier run: they look at the turn."""
+        try:
+            before = int(self.turn_file.read_text())
+        except (FileNotFoundError, ValueError):
+            before = 0
+        self.turn = before + 1
+        write_whole(self.turn_file, str(self.turn), durable=False)
+
+    def vacate(self) -> None:
+        """Removes the traces of a run that finished nothing."""
+        for name in (_NAME, "job.yaml", "index.parquet"):
+            (self.root / name).unlink(missing_ok=True)
+        for own in (self.state, self.root / "radiance"):
+            if own.exists():
+                shutil.rmtree(own)
+
+
+@contextmanager
+def claim(root: Path, job: Job, *, mix_versions: bool = False) -> Iterator[Folder]:
+    """The folder for `job`, created or continued, and this process alone writes to it meanwhile.
+
+    A folder that holds something else is left as it was. More sequences than before extend the dataset.
+
+    Args:
+        root: the folder.
+        job: the job.
+        mix_versions: continue what another version of the program began; `dataset.json` names them all.
+
+    Raises:
+        UserError: another job's dataset, another version's, other files, another run at work, or no
+            permission.
+    """
+    folder, created, fresh = Folder(root), not root.exists(), not (root / _NAME).exists()
+    name = identity.of(job)
+    try:
+        _refuse_foreign(folder, job, name)
+        makers = _makers(folder, mix_versions)
+        folder.state.mkdir(parents=True, exist_ok=True)
+        with _locked(folder.state / "lock") as folder.lock_fd:
+            _refuse_foreign(folder, job, name)
+            (folder.state / "failed").mkdir(exist_ok=True)
+            folder.logs.mkdir(exist_ok=True)
+            folder.scratch.mkdir(exist_ok=True)
+            described = {"identity": name, "generators": makers, "job": job.model_dump(mode="json")}
+            write_whole(root / _NAME, json.dumps(described, indent=1) + "\n")
+            write_whole(
+                root / "job.yaml", "# The job of this dataset, every value said.\n" + writer.dump(job)
+            )
+            folder.pass_turn()
+            folder.sweep_all()
+            try:
+                yield folder
+            finally:
+                folder.pass_turn()
+                if fresh and not folder.sealed() and not folder.failures():
+                    folder.vacate()
+                    if created:
+                        root.rmdir()
+    except OSError as error:
+        if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOSPC, errno.EDQUOT, errno.ENOTDIR):
+            raise UserError(f"{root}: cannot be written ({os.strerror(error.errno)})") from error
+        raise
+
+
+def write_whole(path: Path, text: str | bytes, *, durable: bool = True) -> None:
+    """Writes a small file so that it is there in full or not at all; `durable`: after a power failure too."""
+    data = text.encode() if isinstance(text, str) else text
+    part = path.with_name(f".{path.name}.part")
+    with part.open("wb") as file:
+        file.write(data)
+        if durable:
+            file.flush()
+            os.fsync(file.fileno())
+    part.rename(path)
+
+
+def _refuse_foreign(folder: Folder, job: Job, name: str) -> None:
+    root = folder.root
+    if not root.exists():
+        return
+    if not root.is_dir():
+        raise UserError(f"{root}: is a file, a folder is needed")
+    if not (root / _NAME).exists():
+        others = sorted(
+            entry.name for entry in root.iterdir() if entry.name not in (_STATE, f".{_NAME}.part")
+        )
+        if others:
+            raise UserError(f"{root}: holds other files ({others[0]}), choose an empty or new folder")
+        return
+    described = folder.described()
+    if described["identity"] != name:
+        changes = _changes(described["job"], job.model_dump(mode="json"))
+        what = ", ".join(changes[:4]) or "another mesh or photograph"
+        raise UserError(f"{root}: holds the dataset of another job ({what}), choose another folder")
+    before = int(described["job"]["sequences"])
+    if before > job.sequences:
+        raise UserError(f"{root}: holds {before} sequences of this job, {job.sequences} are asked for")
+
+
+def _makers(folder: Folder, mix: bool) -> list[dict[str, str]]:
+    """The versions that made the dataset, this one included. UserError when they may not mix."""
+    now, count = provenance.generator(), len(folder.sealed()) if folder.root.is_dir() else 0
+    if not count:
+        return [now]
+    before: list[dict[str, str]] = folder.described().get("generators", [])
+    if now in before and (mix or len(before) == 1):
+        return before
+    if not mix:
+        last = before[-1] if before else {}
+        changes = [
+            f"{key} {last.get(key, 'unknown')}, now {now[key]}" for key in now if last.get(key) != now[key]
+        ]
+        what = "; ".join(changes) or "several versions"
+        raise UserError(
+            f"{folder.root}: its {count} sequences were made by another version of this program ({what}): "
+            "choose another folder, or --mix-versions to continue it all the same"
+        )
+    return [*before, now]
+
+
+def _changes(before: dict[str, Any], now: dict[str, Any], at: str = "") -> list[str]:
+    found = []
+    for key in sorted({**before, **now}.keys() - {"card"}):
+        old, new = before.get(key), now.get(key)
+        if isinstance(old, dict) and isinstance(new, dict):
+            found += _changes(old, new, f"{at}{key}.")
+        elif old != new and f"{at}{key}" != "sequences":
+            found.append(f"{at}{key} is {json.dumps(old)} there and {json.dumps(new)} here")
+    return found
+
+
+@contextmanager
+def _locked(path: Path) -> Iterator[int]:
+    """Holds the lock file; its descriptor goes to the workers, so it is held until the last one is gone."""
+    descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+    try:
+        until = time.monotonic() + _LOCK_WAIT_S
+        while True:
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                break
+            except BlockingIOError:
+                if time.monotonic() > until:
+                    raise UserError(f"{path.parents[1]}: another run is writing to it") from None
+                time.sleep(0.1)
+        yield descriptor
+    finally:
+        os.close(descriptor)

@@ -1,0 +1,145 @@
+"""What made a sequence: one name for all the code and packages that shape its values."""
+
+from __future__ import annotations
+
+import ast
+import hashlib
+import json
+from functools import cache
+from pathlib import Path
+
+from synth.system import packages
+
+# Where the making of a sequence begins, and what it uses that decides no value.
+_MAKER = "synth.sequence.pipeline"
+_NO_PART = {
+    f"synth.{name}"
+    for name in (
+        "errors",
+        "fields",
+        "job.identity",
+        "system.stopwatch",
+        "dataset.store",
+        "dataset.provenance",
+    )
+}
+_COMPUTING = ("mitsuba", "drjit", "numpy", "scipy", "opencv-contrib-python-headless", "torch")
+
+
+@cache
+def generator() -> dict[str, str]:
+    """`{"format", "code", package: version}`: two sequences of a job are comparable when it is equal.
+
+    `code` is a hash of the program's own statements that make a sequence; comments, docstrings and layout
+    do not count.
+    """
+    from synth.fields import FORMAT_VERSION
+
+    home, total = Path(__file__).parents[2], hashlib.blake2b(digest_size=8)
+    for path in sorted(_makers(home)):
+        total.update(f"{path.relative_to(home)}\n".encode())
+        total.update(_statements(path).encode() if path.suffix == ".py" else path.read_bytes())
+    computing = {name: found for name, found in packages.versions().items() if name in _COMPUTING}
+    return {"format": str(FORMAT_VERSION), "code": total.hexdigest(), **computing}
+
+
+def fingerprint() -> str:
+    """`generator()` in one word."""
+    return word(generator())
+
+
+def word(made_by: dict[str, str]) -> str:
+    """What `generator()` gave, here or elsewhere, in one word."""
+    described = json.dumps(made_by, sort_keys=True).encode()
+    return hashlib.blake2b(described, digest_size=8).hexdigest()
+
+
+def _makers(home: Path) -> set[Path]:
+    """Files that the maker of sequences is made of: its modules, theirs, and the networks beside them.
+
+    Packages are followed like modules, so that what an `__init__.py` re-exports counts.
+
+    Raises:
+        LookupError: an import that leads to no file of ours, or to a name that its file doesn't hold.
+    """
+    for name in _NO_PART:
+        _file(home, name)
+    found: set[Path] = set()
+    # Estimators of flow are found by name, so all of them count.
+    waiting = [_MAKER, *(f"synth.flow.{path.stem}" for path in (home / "synth/flow").glob("[a-z]*.py"))]
+    while waiting:
+        name = waiting.pop()
+        file = _file(home, name)
+        if name in _NO_PART or file in found:
+            continue
+        found |= {file, *file.parent.glob("*.pt")}
+        for node in ast.walk(ast.parse(file.read_text("utf-8"))):
+            if isinstance(node, ast.Import):
+                waiting += [alias.name for alias in node.names if _is_ours(alias.name)]
+            elif isinstance(node, ast.ImportFrom) and _is_ours(node.module or ""):
+                waiting += _imported(home, str(node.module), [alias.name for alias in node.names])
+            elif isinstance(node, ast.ImportFrom) and node.level:
+                raise LookupError(f"{file}: relative imports can't be followed")
+    return found
+
+
+def _is_ours(name: str) -> bool:
+    return name.split(".")[0] == "synth"
+
+
+def _file(home: Path, name: str) -> Path:
+    """The file of a module or of a package. LookupError if there is none."""
+    at = home.joinpath(*name.split("."))
+    for file in (at.with_suffix(".py"), at / "__init__.py"):
+        if file.is_file():
+            return file
+    raise LookupError(f"{name}: there is no such module below {home}, so what it does can't be counted")
+
+
+def _imported(home: Path, module: str, names: list[str]) -> list[str]:
+    """The modules that `from module import names` runs, packages above them included."""
+    parts = module.split(".")
+    ran = [".".join(parts[: k + 1]) for k in range(len(parts))]
+    file = _file(home, module)
+    for name in names:
+        below = file.parent / name
+        if file.name == "__init__.py" and (below.with_suffix(".py").is_file() or below.is_dir()):
+            ran.append(f"{module}.{name}")
+        elif name not in _bound(ast.parse(file.read_text("utf-8")).body):
+            raise LookupError(f"{file}: doesn't say what {name!r} is, so what it does can't be counted")
+    return ran
+
+
+def _bound(body: list[ast.stmt]) -> set[str]:
+    """Names that the statements at the top of a file bind, inside `if` and `try` too."""
+    names: set[str] = set()
+    for node in body:
+        if isinstance(node, ast.FunctionDef | ast.ClassDef):
+            names.add(node.name)
+        elif isinstance(node, ast.Import | ast.ImportFrom):
+            names |= {alias.asname or alias.name.split(".")[0] for alias in node.names}
+        elif isinstance(node, ast.If | ast.Try):
+            handlers = [one for handler in getattr(node, "handlers", []) for one in handler.body]
+            names |= _bound([*node.body, *node.orelse, *handlers])
+        else:
+            names |= {
+                one.id
+                for one in ast.walk(node)
+                if isinstance(one, ast.Name) and isinstance(one.ctx, ast.Store)
+            }
+    return names
+
+
+def _statements(path: Path) -> str:
+    tree = ast.parse(path.read_text("utf-8"))
+    for node in ast.walk(tree):
+        body = getattr(node, "body", None)
+        if isinstance(body, list):
+            # Docstrings, under fields too.
+            node.body = [one for one in body if not _is_text(one)]  # type: ignore[attr-defined]
+    return ast.dump(tree)
+
+
+def _is_text(node: ast.AST) -> bool:
+    held = node.value if isinstance(node, ast.Expr) else None
+    return isinstance(held, ast.Constant) and isinstance(held.value, str)

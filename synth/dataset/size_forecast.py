@@ -1,0 +1,94 @@
+"""What a run will take: time and disk, from the sequences that are finished, or from the field table."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from synth.dataset import location
+from synth.errors import UserError
+from synth.fields import FIELDS
+from synth.job.schema import Job
+
+# An estimate from the field table is this much too high, lest a run be started that cannot end.
+_MARGIN = 1.25
+# Kept free, so that index, card and the system's own files find room.
+_RESERVE_BYTES = 200e6
+
+
+@dataclass(frozen=True)
+class Forecast:
+    """Disk and processor time of what is still to be done."""
+
+    sequences: int
+    """Sequences to do."""
+    bytes: float
+    cpu_s: float | None
+    """None until a sequence is finished."""
+    pilot: int
+    """Finished sequences that the forecast rests on; 0: on the field table."""
+
+
+def of(job: Job, root: Path, todo: int, done: Sequence[int], cpu_s: float | None = None) -> Forecast:
+    """Forecast of what is still to do.
+
+    Args:
+        job: of the dataset.
+        root: its folder.
+        todo: how many sequences.
+        done: indices of the finished ones.
+        cpu_s: processor time of one [s], if it is known.
+    """
+    some = pilot(done)
+    each = np.mean([size(location.store(root, key)) for key in some]) if some else estimate(job)
+    return Forecast(todo, float(each) * todo, None if cpu_s is None else cpu_s * todo, len(some))
+
+
+def pilot(done: Sequence[int]) -> list[int]:
+    """Up to ten of the finished sequences, spread over the dataset, to judge the others by."""
+    return [done[int(k)] for k in np.unique(np.linspace(0, len(done) - 1, 10).astype(int))] if done else []
+
+
+def estimate(job: Job) -> float:
+    """Bytes of one sequence of `job`, before any is made."""
+    width, height = job.render.size
+    total = 0.0
+    for name in job.kept_fields:
+        field = FIELDS[name]
+        each = 2 if field.half and job.store.flow == "float16" else np.dtype(field.dtype).itemsize
+        total += float(np.prod(field.shape(job.frames, (height, width)))) * each * field.packed
+    radiance = 6.0 * width * height * job.frames if job.render.exr else 0.0
+    return _MARGIN * (total + radiance)
+
+
+def size(path: Path) -> int:
+    """Bytes of all files under `path`."""
+    total = 0
+    with os.scandir(path) as entries:
+        for entry in entries:
+            total += size(Path(entry.path)) if entry.is_dir() else entry.stat().st_size
+    return total
+
+
+def refuse_if_too_large(forecast: Forecast, root: Path) -> None:
+    """UserError when the disk has no room for what is to be done."""
+    free = shutil.disk_usage(root).free
+    if forecast.bytes + _RESERVE_BYTES > free:
+        basis = f"from {forecast.pilot} finished sequences" if forecast.pilot else "estimated"
+        raise UserError(
+            f"{root}: {forecast.sequences} sequences need {amount(forecast.bytes)} ({basis}), "
+            f"the disk has {amount(free)} free"
+        )
+
+
+def amount(size_bytes: float) -> str:
+    """1.2 kB, 34 MB, 5.6 GB, 7.8 TB."""
+    for unit, scale in (("TB", 1e12), ("GB", 1e9), ("MB", 1e6)):
+        if size_bytes >= scale:
+            return f"{size_bytes / scale:.3g} {unit}"
+    return f"{size_bytes / 1e3:.3g} kB"

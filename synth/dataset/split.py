@@ -1,0 +1,159 @@
+"""Who may be trained on: a split of the sequences in which no group is on both sides."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal, cast, get_args
+
+from synth.dataset.folder import write_whole
+from synth.errors import UserError
+
+By = Literal["anatomy", "family", "gesture", "stiffness", "sequence"]
+"""What must not be shared between the sides; `stiffness` splits at quantiles of Young's modulus."""
+
+SIDES = ("train", "validation", "test")
+_CLASSES = 10
+_NAME = "split.json"
+
+
+@dataclass(frozen=True)
+class Rule:
+    """How a dataset is split; kept beside it, so that one that grows is split as before."""
+
+    by: By = "anatomy"
+    shares: tuple[float, float, float] = (0.7, 0.15, 0.15)
+    held_out: tuple[str, ...] = ()
+    share_anatomy: bool = False
+    """Whether one brain may be on several sides: scores then say nothing of other brains."""
+
+
+def rule(root: Path) -> Rule:
+    """The rule of the dataset in `root`; the default if none was given."""
+    try:
+        found = json.loads((root / _NAME).read_text("utf-8"))
+        return Rule(
+            found["by"],
+            tuple(found["shares"]),
+            tuple(found["held_out"]),
+            bool(found.get("share_anatomy", False)),
+        )
+    except FileNotFoundError:
+        return Rule()
+    except (ValueError, KeyError, TypeError) as error:
+        raise UserError(f"{root / _NAME}: is damaged ({error})") from error
+
+
+def keep(root: Path, chosen: Rule) -> None:
+    """Makes `chosen` the rule of the dataset in `root`."""
+    write_whole(root / _NAME, json.dumps(asdict(chosen), indent=1) + "\n")
+
+
+def parse(by: str, shares: str, held_out: Sequence[str], share_anatomy: bool = False) -> Rule:
+    """A rule from the words of a command line. UserError for what is none."""
+    if by not in get_args(By):
+        raise UserError(f"by {by}: is not one of {', '.join(get_args(By))}")
+    try:
+        train, validation, test = (float(word) for word in shares.split(","))
+    except ValueError:
+        raise UserError(f"shares {shares}: three numbers are needed, as 0.7,0.15,0.15") from None
+    return Rule(cast(By, by), (train, validation, test), tuple(held_out), share_anatomy)
+
+
+def count(rows: Sequence[Mapping[str, Any]]) -> dict[str, int]:
+    """Sequences on each side."""
+    sides = [row.get("split") for row in rows]
+    return {side: sides.count(side) for side in SIDES if side in sides}
+
+
+def assign(rows: Sequence[Mapping[str, Any]], chosen: Rule) -> list[str | None]:
+    """The side of every row of the index; None for a sequence that failed.
+
+    A group's side depends on the group's name and on which groups there are, not on the order of rows.
+    Sequences of a family that is held out are always for testing; any group that they share goes with them.
+
+    Raises:
+        UserError: a family that is not there, shares that do not sum to 1, or fewer groups than sides.
+    """
+    by, shares, held_out, share_anatomy = chosen.by, chosen.shares, chosen.held_out, chosen.share_anatomy
+    if len(shares) != 3 or abs(sum(shares) - 1) > 1e-6 or min(shares) < 0:
+        raise UserError(f"shares {shares}: must not be negative and must sum to 1")
+    done = [row for row in rows if row["status"] == "done"]
+    strangers = set(held_out) - {str(row["family"]) for row in done}
+    if strangers:
+        raise UserError(f"family {', '.join(sorted(strangers))}: no sequence has it")
+    group = _groups(done, by, chosen.share_anatomy)
+    sealed = {group[row["index"]] for row in done if row["family"] in held_out}
+    sizes: dict[str, int] = {}
+    for row in done:
+        name = group[row["index"]]
+        sizes[name] = sizes.get(name, 0) + 1
+    side = dict.fromkeys(sealed, "test")
+    wanted = [share * len(done) for share in shares]
+    wanted[2] -= sum(sizes[name] for name in sealed)
+    free = sorted(sizes.keys() - sealed, key=lambda name: (-sizes[name], _shuffled(name)))
+    sides = [k for k in range(3) if shares[k] > 0]
+    if len(free) + bool(sealed) < len(sides):
+        hint = (
+            ""
+            if share_anatomy
+            else "; --share-anatomy splits within a brain, for a model of that brain alone"
+        )
+        needing = ", ".join(SIDES[k] for k in sides)
+        raise UserError(f"{len(sizes)} groups by {by}: too few for {needing} to have one each{hint}")
+    for name in free:
+        # The side that lacks most, in proportion, gets the next group.
+        best = max(sides, key=lambda k: (wanted[k] / max(shares[k], 1e-9), -k))
+        side[name] = SIDES[best]
+        wanted[best] -= sizes[name]
+    return [side[group[row["index"]]] if row["status"] == "done" else None for row in rows]
+
+
+def leaks(rows: Sequence[Mapping[str, Any]], chosen: Rule | None = None) -> list[str]:
+    """Anatomies and contents that are on more than one side, and held-out families that are trained on."""
+    chosen, found = chosen or Rule(), []
+    for row in rows:
+        if row["status"] == "done" and row.get("split") in SIDES[:2] and row["family"] in chosen.held_out:
+            found.append(f"family {row['family']} is held out and in {row['split']}")
+    for name in ("content_hash",) if chosen.share_anatomy else ("anatomy", "content_hash"):
+        seen: dict[Any, set[str]] = {}
+        for row in rows:
+            if row["status"] == "done" and row.get("split"):
+                seen.setdefault(row[name], set()).add(row["split"])
+        found += [f"{name} {key} is in {', '.join(sorted(on))}" for key, on in seen.items() if len(on) > 1]
+    return found
+
+
+def _groups(rows: Sequence[Mapping[str, Any]], by: By, share_anatomy: bool) -> dict[int, str]:
+    """A group's name for every index; groups that share an anatomy are one unless the rule allows it."""
+    if by == "stiffness":
+        ordered = sorted(float(row["young_kpa"]) for row in rows)
+        edges = [ordered[k * len(ordered) // _CLASSES] for k in range(1, _CLASSES)]
+        named = {row["index"]: f"E{sum(row['young_kpa'] >= edge for edge in edges)}" for row in rows}
+    elif by == "sequence":
+        named = {row["index"]: str(row["content_hash"]) for row in rows}
+    else:
+        named = {row["index"]: str(row[by]) for row in rows}
+    if share_anatomy:
+        return named
+    parent = {name: name for name in named.values()}
+
+    def root(name: str) -> str:
+        while parent[name] != name:
+            parent[name] = parent[parent[name]]
+            name = parent[name]
+        return name
+
+    first: dict[Any, str] = {}
+    for row in rows:
+        name = root(named[row["index"]])
+        other = root(first.setdefault(row["anatomy"], name))
+        parent[max(name, other)] = min(name, other)
+    return {key: root(name) for key, name in named.items()}
+
+
+def _shuffled(name: str) -> str:
+    return hashlib.blake2b(name.encode(), digest_size=8).hexdigest()

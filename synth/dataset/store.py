@@ -1,0 +1,393 @@
+"""The sequence store: one Zarr v3 group a sequence, written as `.part`, sealed, renamed; and the way back."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import zarr
+from numpy.typing import NDArray
+from zarr.codecs import BloscCodec, Crc32cCodec
+
+from synth.dataset import fast_read as shard
+from synth.dataset import location, provenance
+from synth.errors import NotFinite, UserError
+from synth.fields import FIELDS, FORMAT_VERSION, Field
+from synth.job import identity
+from synth.job.schema import Job
+from synth.system import packages
+
+__all__ = ["FIELDS", "Column", "Dataset", "Field", "Sequence", "Writer", "open_sequence"]
+
+FORMAT = "sulcus-sequence"
+
+# Raw bytes of one field that are held back and then written as one file: a shard, its chunks being frames.
+_SHARD_BYTES = 16 << 20
+
+# Vector fields whose greatest length is kept as an attribute, in `summary`.
+_PEAKS = {"flow": "peak_flow_px", "traction": "peak_traction_kpa", "force": "peak_force_mn"}
+
+# What may differ between two runs that gave the same sequence.
+_NOT_CONTENT = {"timings", "versions", "content_hash", "seal_hash"}
+
+
+class Writer:
+    """Writes one sequence. Frames are put in order; nothing is visible under the final name before `seal`."""
+
+    def __init__(self, folder: Path, index: int, *, frames: int, size: tuple[int, int], job: Job) -> None:
+        """
+        Args:
+            folder: the dataset.
+            index: which sequence; names the store.
+            frames: number of frames.
+            size: (height, width) of the picture [px].
+            job: the dataset's job.
+        """
+        self.path = location.store(folder, index)
+        self._part = self.path.with_name(f"{self.path.name}.part")
+        self._exr = folder / "radiance" / f"{index:06d}"
+        self._frames, self._size = frames, size
+        for stale in (self._part, self._exr):
+            if stale.exists():
+                shutil.rmtree(stale)
+        self._group = zarr.create_group(str(self._part), zarr_format=3)
+        self._columns: dict[str, _Column] = {}
+        self._wanted = job.kept_fields
+        self._half = job.store.flow == "float16"
+        self._exr_hash = hashlib.blake2b(digest_size=16)
+        self._exr_frames = 0
+        self._own = {
+            "format": FORMAT,
+            "format_version": FORMAT_VERSION,
+            "index": index,
+            "frames": frames,
+            "size": [size[1], size[0]],
+            "fps": job.fps,
+            "seed": job.seed,
+            "flow_backend": job.flow.backend,
+            "job": identity.of(job),
+        }
+
+    def wants(self, name: str) -> bool:
+        """Whether the job keeps that field; `put` passes over one that it does not keep."""
+        return _field(name).name in self._wanted
+
+    def put(self, name: str, array: NDArray[Any]) -> None:
+        """Writes a whole field, of the shape that the table says for this sequence.
+
+        Raises:
+            ValueError: another shape or type.
+            NotFinite: a number is none.
+        """
+        field = _field(name)
+        if not self.wants(name):
+            return
+        column = self._column(field)
+        if field.framed:
+            for t, frame in enumerate(array):
+                column.append(t, frame)
+        else:
+            column.whole(array)
+
+    def put_frame(self, name: str, t: int, array: NDArray[Any]) -> None:
+        """Writes frame `t` of a field, without its first axis; frames come in order. Raises as `put`."""
+        if self.wants(name):
+            self._column(_field(name)).append(t, array)
+
+    def put_exr(self, t: int, radiance: NDArray[np.floating]) -> None:
+        """Writes the linear picture of frame `t`, (H, W, 3), as `radiance/NNNNNN/TTTT.exr` in half floats."""
+        import OpenEXR
+
+        if not np.isfinite(radiance).all():
+            raise NotFinite(f"radiance, frame {t}: not finite")
+        self._exr.mkdir(parents=True, exist_ok=True)
+        header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+        file = self._exr / f"{t:04d}.exr"
+        with OpenEXR.File(header, {"RGB": np.ascontiguousarray(radiance, np.float16)}) as exr:
+            exr.write(str(file))
+        self._exr_hash.update(file.read_bytes())
+        self._exr_frames += 1
+
+    def seal(self, **attributes: Any) -> Path:
+        """Finishes the store: checks that every field is whole, adds attributes and hashes, renames.
+
+        Args:
+            attributes: JSON-ready; `timings` may differ between equal sequences, nothing else may.
+
+        Returns:
+            The store's final path.
+        """
+        for name in self._wanted:
+            column = self._columns.get(name)
+            if column is None:
+                raise ValueError(f"{name}: was never written")
+            if column.filled != column.shape[0]:
+                raise ValueError(f"{name}: {column.filled} of {column.shape[0]} frames were written")
+        hashes = {name: self._columns[name].digest() for name in FIELDS if name in self._columns}
+        if self._exr_frames:
+            hashes["radiance"] = self._exr_hash.hexdigest()
+        summary: dict[str, Any] = {key: self._columns[name].largest for name, key in _PEAKS.items()}
+        if self._half:
+            rounded = {name: one.rounding for name, one in self._columns.items() if FIELDS[name].half}
+            summary["rounding_px"] = rounded
+        attrs = {
+            **self._own,
+            **attributes,
+            "summary": summary,
+            "field_hashes": hashes,
+            "versions": {**packages.versions(), "generator": provenance.fingerprint()},
+        }
+        attrs = json.loads(identity.canonical(attrs))
+        attrs["content_hash"] = content_hash(attrs)
+        attrs["seal_hash"] = seal_hash(attrs)
+        self._group.attrs.update(attrs)
+        self._part.rename(self.path)
+        return self.path
+
+    def _column(self, field: Field) -> _Column:
+        if field.name not in self._columns:
+            shape = field.shape(self._frames, self._size)
+            self._columns[field.name] = _Column(self._group, field, shape, self._half and field.half)
+        return self._columns[field.name]
+
+
+class _Column:
+    """One field being written: checked, hashed, and gathered into shards."""
+
+    def __init__(self, group: zarr.Group, field: Field, shape: tuple[int, ...], half: bool) -> None:
+        self._field, self.shape, self.filled = field, shape, 0
+        self._dtype = dtype = np.dtype("float16" if half else field.dtype)
+        self._hash = field_hasher(field, dtype, shape)
+        self._held: list[NDArray[Any]] = []
+        self.largest = self.rounding = 0.0
+        chunk, shard = shape, None
+        if field.framed:
+            chunk = (1, *shape[1:])
+            frame_bytes = int(np.prod(chunk)) * dtype.itemsize
+            self._together = int(np.clip(_SHARD_BYTES // frame_bytes, 1, shape[0]))
+            shard = (self._together, *shape[1:])
+        self._array = group.create_array(
+            field.name,
+            shape=shape,
+            dtype=dtype,
+            chunks=chunk,
+            shards=shard,
+            filters=None,
+            compressors=[
+                BloscCodec(cname="zstd", clevel=3, shuffle="shuffle", typesize=dtype.itemsize),
+                Crc32cCodec(),
+            ],
+            dimension_names=field.dims,
+            attributes={"unit": field.unit, "meaning": field.meaning},
+            # With every chunk on disk a missing file is damage, never a silent zero.
+            config={"write_empty_chunks": True},
+        )
+
+    def append(self, t: int, frame: NDArray[Any]) -> None:
+        if not self._field.framed:
+            raise ValueError(f"{self._field.name}: is not stored by frame")
+        if t != self.filled:
+            raise ValueError(f"{self._field.name}: frame {t} after {self.filled} frames")
+        checked = self._checked(frame, self.shape[1:], f", frame {t}")
+        self._see(checked)
+        self._held.append(checked)
+        self.filled += 1
+        if len(self._held) == self._together or self.filled == self.shape[0]:
+            self._array[self.filled - len(self._held) : self.filled] = np.stack(self._held)
+            self._held.clear()
+
+    def whole(self, array: NDArray[Any]) -> None:
+        checked = self._checked(array, self.shape, "")
+        self._see(checked)
+        self._array[...] = checked
+        self.filled = self.shape[0]
+
+    def digest(self) -> str:
+        return self._hash.hexdigest()
+
+    def _see(self, values: NDArray[Any]) -> None:
+        self._hash.update(values.data)
+        if self._field.name in _PEAKS:
+            squared = np.einsum("...k,...k->...", values, values, dtype=np.result_type(values, np.float32))
+            self.largest = max(self.largest, float(np.sqrt(squared.max())))
+
+    def _checked(self, array: NDArray[Any], shape: tuple[int, ...], where: str) -> NDArray[Any]:
+        name, dtype = self._field.name, self._dtype
+        array = np.asarray(array)
+        if array.shape != shape:
+            raise ValueError(f"{name}{where}: shape {array.shape}, the field table says {shape}")
+        if not np.can_cast(array.dtype, dtype, "same_kind"):
+            raise ValueError(f"{name}{where}: {array.dtype}, the field table says {dtype}")
+        # A copy, since the caller may reuse its buffer before the shard is full.
+        copy = np.array(array, dtype, order="C")
+        if dtype.kind == "f" and not np.isfinite(copy).all():
+            at = tuple(int(k) for k in np.argwhere(~np.isfinite(copy))[0])
+            raise NotFinite(f"{name}{where}: not finite, first at {at}")
+        if self._field.half and copy.dtype != array.dtype:
+            self.rounding = max(self.rounding, float(np.abs(copy - array).max()))
+        return copy
+
+
+class Column:
+    """A field of a sealed sequence, read when indexed; damage is a UserError that names store and field."""
+
+    def __init__(
+        self, array: zarr.Array[Any], dtype: np.dtype[Any], where: str, folder: Path | None = None
+    ) -> None:
+        self._array, self._where = array, where
+        self._frames = shard.of(array, folder)
+        self.shape: tuple[int, ...] = array.shape
+        self.stored: np.dtype[Any] = array.dtype
+        """Type on disk; values are given in the table's."""
+        self.dtype: np.dtype[Any] = dtype
+        self.ndim = len(self.shape)
+        self.together: int = (array.shards or array.chunks)[0] if self.shape else 1
+        """Frames in one file, where it has frames."""
+        self.attrs: dict[str, Any] = dict(array.attrs)
+        self.dims: tuple[str, ...] = tuple(array.metadata.dimension_names or ())
+
+    def __len__(self) -> int:
+        return self.shape[0]
+
+    def __getitem__(self, selection: Any) -> NDArray[Any]:
+        single = self._frames is not None and isinstance(selection, (int, np.integer))
+        try:
+            values = self._frames[int(selection)] if single and self._frames else self._array[selection]
+            return np.asarray(values, self.dtype)
+        except IndexError:
+            raise
+        except Exception as error:  # zarr, its codecs and the file system have no common error for damage
+            why = "the store is damaged"
+            if self._where.startswith("http"):
+                why += " or its server does not answer range requests"
+            raise UserError(f"{self._where}: cannot be read, {why} ({error})") from error
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
+        return np.asarray(self[...], dtype)
+
+
+class Sequence:
+    """One sealed sequence: `sequence["rgb"][t]`, `sequence.attrs["young_kpa"]`."""
+
+    def __init__(self, path: Path, group: zarr.Group, attrs: dict[str, Any], at: location.Place) -> None:
+        self.path, self._group, self.attrs, self._place = path, group, attrs, at
+
+    @property
+    def index(self) -> int:
+        return int(self.attrs["index"])
+
+    @property
+    def frames(self) -> int:
+        return int(self.attrs["frames"])
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Height, width [px]."""
+        width, height = self.attrs["size"]
+        return int(height), int(width)
+
+    @property
+    def fields(self) -> list[str]:
+        """Names of the fields it holds, in the table's order."""
+        return [name for name in FIELDS if name in self.attrs["field_hashes"]]
+
+    def __contains__(self, name: str) -> bool:
+        return name in self.attrs["field_hashes"]
+
+    def __getitem__(self, name: str) -> Column:
+        field, where = _field(name), f"{self._place.name}: {name}"
+        if name not in self:
+            raise UserError(f"{where}: the sequence has no such field")
+        try:
+            array = self._group[name]
+        except Exception as error:  # as in Column
+            raise UserError(f"{where}: cannot be opened, the store is damaged ({error})") from error
+        expected, dtype = field.shape(self.frames, self.size), np.dtype(field.dtype)
+        types = (dtype, np.dtype("float16")) if field.half else (dtype,)
+        if not isinstance(array, zarr.Array) or array.shape != expected or array.dtype not in types:
+            raise UserError(f"{where}: is not {field.dtype} {expected}, the store is damaged")
+        shard = array.shards or array.chunks
+        files = -(-expected[0] // shard[0])
+        rest = "/0" * (len(expected) - 1)
+        for k in range(files):
+            # Zarr reads a missing or empty file as zeros.
+            if not self._place.size(f"{name}/c/{k}{rest}"):
+                raise UserError(f"{where}: file c/{k}{rest} is missing or empty, the store is damaged")
+        return Column(array, dtype, where, self._place.folder and self._place.folder / name)
+
+
+class Dataset:
+    """A folder of sealed sequences, or an address of one: `len`, iteration, indexing, in order of names."""
+
+    def __init__(self, root: Path | str) -> None:
+        self.root = Path(root)
+        self._addresses: list[str] | None = None
+        if isinstance(root, str) and "://" in root:
+            self._addresses = location.stores(root)
+            self.paths = [Path(address.partition("::")[0]) for address in self._addresses]
+        elif not self.root.is_dir():
+            raise UserError(f"{self.root}: no such folder")
+        else:
+            self.paths = sorted(path for path in self.root.glob("[0-9]*.zarr") if path.is_dir())
+        if not self.paths:
+            raise UserError(f"{self.root}: holds no finished sequence")
+
+    def __len__(self) -> int:
+        return len(self.paths)
+
+    def __getitem__(self, position: int) -> Sequence:
+        return open_sequence((self._addresses or self.paths)[position])
+
+    def __iter__(self) -> Iterator[Sequence]:
+        return (self[position] for position in range(len(self)))
+
+
+def open_sequence(path: Path | str) -> Sequence:
+    """Opens a sealed sequence, by path or address. UserError if missing, unfinished, foreign or truncated."""
+    if str(path).partition("::")[0].endswith(".part"):
+        raise UserError(f"{path}: is an unfinished sequence")
+    at = location.of(path)
+    path = Path(str(path).partition("::")[0])
+    try:
+        group = zarr.open_group(at.store, mode="r", zarr_format=3, use_consolidated=False)
+        attrs = dict(group.attrs)
+    except Exception as error:  # as in Column
+        raise UserError(f"{path}: is not a Zarr v3 group, or its metadata is damaged") from error
+    if attrs.get("format") != FORMAT:
+        raise UserError(f"{path}: is a Zarr store, but not a sequence of ours")
+    if attrs.get("format_version") != FORMAT_VERSION:
+        found = attrs.get("format_version")
+        raise UserError(f"{path}: has format version {found}; this program reads version {FORMAT_VERSION}")
+    missing = {"content_hash", "field_hashes", "frames", "size", "index"} - attrs.keys()
+    if missing:
+        raise UserError(f"{path}: lacks the attributes {', '.join(sorted(missing))}")
+    return Sequence(path, group, attrs, at)
+
+
+def field_hasher(field: Field, stored: np.dtype[Any], shape: tuple[int, ...]) -> hashlib.blake2b:
+    """A hasher that has seen the field's name, type and shape; then give it the stored values in C order."""
+    described = identity.canonical([field.name, str(stored), list(shape)])
+    return hashlib.blake2b(described, digest_size=16)
+
+
+def content_hash(attrs: Mapping[str, Any]) -> str:
+    """Hash of all that a sequence says: field hashes and attributes, without timings and versions."""
+    content = {key: value for key, value in attrs.items() if key not in _NOT_CONTENT}
+    return hashlib.blake2b(identity.canonical(content), digest_size=16).hexdigest()
+
+
+def seal_hash(attrs: Mapping[str, Any]) -> str:
+    """Hash of all root attributes besides itself: what tells an edited attribute, timings included."""
+    sealed = {key: value for key, value in attrs.items() if key != "seal_hash"}
+    return hashlib.blake2b(identity.canonical(sealed), digest_size=16).hexdigest()
+
+
+def _field(name: str) -> Field:
+    if name not in FIELDS:
+        raise ValueError(f"{name}: is not in the field table")
+    return FIELDS[name]

@@ -1,0 +1,1 @@
+"""Running a job: workers, slots, clusters, progress."""

@@ -1,0 +1,205 @@
+"""Slots on a Dask cluster: each of its workers keeps a worker process of its own, as the local engine does.
+
+Needs the extra `cluster`. The dataset's folder must be on a file system that all machines share.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from ruamel.yaml import YAML
+from ruamel.yaml.error import YAMLError
+
+from synth.dataset import provenance
+from synth.engine import slots
+from synth.engine.slots import LocalSlot, Slot, Slots
+from synth.engine.worker_process import Attempt, Setup
+from synth.errors import UserError
+from synth.job.schema import Job
+from synth.system.stopwatch import Report
+
+_TOPIC = "sulcus-progress"
+_TICK_S = 0.5
+_REPORT_S = 1.0
+_WAIT_FOR_WORKERS_S = 600
+_CONNECT = "20s"
+
+# On a Dask worker: the slot of each of its threads, kept from sequence to sequence.
+_kept = threading.local()
+
+
+@contextmanager
+def slots_of(engine: str, setup: Setup) -> Iterator[Slots]:
+    """The slots of `dask://host:port`, or of a SLURM cluster described in a YAML file.
+
+    Raises:
+        UserError: the extra is not installed, no scheduler answers, the file is wrong.
+    """
+    try:
+        import distributed
+    except ImportError:
+        raise UserError("a Dask engine needs the extra `cluster`: pip install 'sulcus[cluster]'") from None
+    # The lock cannot travel; a worker sees by the turn that its run is over.
+    own = {key: value for key, value in (setup.environment or {}).items() if not key.startswith("SULCUS_")}
+    travelling = replace(
+        setup, keep_open=(), environment=own, memory_bytes=None, generator=provenance.fingerprint()
+    )
+    with _cluster(engine) as (address, expected):
+        try:
+            client = distributed.Client(address, timeout=_CONNECT)
+        except (OSError, TimeoutError, ValueError) as error:
+            raise UserError(f"{engine}: no Dask scheduler answers ({error})") from error
+        with client:
+            try:
+                client.wait_for_workers(1, timeout=_WAIT_FOR_WORKERS_S)
+            except TimeoutError:
+                raise UserError(f"{engine}: no worker has joined") from None
+            yield DaskSlots(client, travelling, max(sum(client.nthreads().values()), expected))
+
+
+class DaskSlots:
+    """A slot for every thread of the cluster's workers."""
+
+    def __init__(self, client: Any, setup: Setup, count: int) -> None:
+        self._client, self._setup, self._count = client, setup, count
+        self._reports: dict[int, Report] = {}
+        client.subscribe_topic(_TOPIC, self._hear)
+
+    def count(self) -> int:
+        return self._count
+
+    def slot(self) -> Slot:
+        return _DaskSlot(self._client, self._setup, self._reports)
+
+    def _hear(self, event: Any) -> None:
+        index, stage, done, of = event[1]
+        report = self._reports.get(index)
+        if report is not None:
+            report(stage, done, of)
+
+
+class _DaskSlot:
+    def __init__(self, client: Any, setup: Setup, reports: dict[int, Report]) -> None:
+        self._client, self._setup, self._reports = client, setup, reports
+
+    def run(self, index: int, report: Report, stop: threading.Event) -> Attempt:
+        self._reports[index] = report
+        report("waiting", 0, 1)
+        future = self._client.submit(attempt, self._setup, index, pure=False)
+        try:
+            while not future.done():
+                if stop.wait(_TICK_S):
+                    future.cancel()
+                    return Attempt(index, "stopped")
+            if future.status != "finished":
+                return Attempt(index, "crash", f"the cluster lost it ({future.status}: {_why(future)})")
+            return Attempt(**future.result())
+        finally:
+            del self._reports[index]
+            future.release()
+
+    def close(self) -> None:
+        """What is kept on the cluster ends by itself, when the turn has passed on."""
+
+
+def attempt(setup: Setup, index: int) -> dict[str, Any]:
+    """One attempt, on a Dask worker. Returns the Attempt's fields, which need no class of ours to be read."""
+    from distributed import get_worker
+
+    worker, last = get_worker(), 0.0
+
+    def report(stage: str, done: int, of: int) -> None:
+        nonlocal last
+        if time.monotonic() - last > _REPORT_S:
+            last = time.monotonic()
+            worker.log_event(_TOPIC, (index, stage, done, of))
+
+    stop, ended = threading.Event(), threading.Event()
+    watch = threading.Thread(target=_stop_when_passed, args=(setup, stop, ended), daemon=True)
+    watch.start()
+    try:
+        return vars(_slot(setup, worker.state.nthreads).run(index, report, stop))
+    finally:
+        ended.set()
+        watch.join()
+
+
+def _slot(setup: Setup, threads: int) -> LocalSlot:
+    if getattr(_kept, "setup", None) != setup:
+        if getattr(_kept, "slot", None) is not None:
+            _kept.slot.close()
+        here = slots.machine(Job.model_validate(setup.job), threads)
+        memory = slots.share_of_memory(threads)
+        _kept.setup = setup
+        environment = {**here, **(setup.environment or {})}
+        _kept.slot = LocalSlot(replace(setup, environment=environment, memory_bytes=memory))
+    slot: LocalSlot = _kept.slot
+    return slot
+
+
+def _stop_when_passed(setup: Setup, stop: threading.Event, ended: threading.Event) -> None:
+    """Sets `stop` when another run has its turn at the dataset: this one's engine is gone."""
+    while not ended.wait(_TICK_S):
+        try:
+            passed = int(setup.turn_file.read_text()) != setup.turn
+        except (OSError, ValueError):  # being rewritten, or the file system is away for a moment
+            continue
+        if passed:
+            stop.set()
+            return
+
+
+def _why(future: Any) -> str:
+    error = future.exception() if future.status == "error" else None
+    return str(error).splitlines()[0] if error else "no reason given"
+
+
+@contextmanager
+def _cluster(engine: str) -> Iterator[tuple[str, int]]:
+    """(address of the scheduler, slots that will come)."""
+    if engine.startswith("dask://"):
+        yield f"tcp://{engine.removeprefix('dask://')}", 0
+        return
+    described = read_slurm(Path(engine))
+    jobs = int(described.pop("jobs"))
+    with slurm(described) as cluster:
+        cluster.scale(jobs=jobs)
+        yield cluster.scheduler_address, jobs * int(described["cores"])
+
+
+def slurm(described: dict[str, Any]) -> Any:
+    """The cluster of a file as `read_slurm` gives it, less `jobs`, with no job submitted yet.
+
+    Raises:
+        UserError: the extra is not installed, or dask-jobqueue does not take an argument.
+    """
+    try:
+        from dask_jobqueue import SLURMCluster
+    except ImportError:
+        raise UserError("a SLURM engine needs the extra `cluster`: pip install 'sulcus[cluster]'") from None
+    try:
+        return SLURMCluster(**described)
+    except (TypeError, ValueError) as error:
+        raise UserError(f"the SLURM file is not what dask-jobqueue takes ({error})") from error
+
+
+def read_slurm(path: Path) -> dict[str, Any]:
+    """`jobs` and the arguments of dask_jobqueue.SLURMCluster. UserError for a file that does not say so."""
+    try:
+        found = YAML(typ="safe").load(path.read_text("utf-8"))
+    except FileNotFoundError:
+        raise UserError(f"{path}: is neither local, dask://host:port nor a file") from None
+    except (OSError, YAMLError) as error:
+        raise UserError(f"{path}: cannot be read ({error})") from error
+    if not isinstance(found, dict) or not isinstance(found.get("jobs"), int) or found["jobs"] < 1:
+        raise UserError(f"{path}: must say how many `jobs` to ask for")
+    missing = {"cores", "memory"} - found.keys()
+    if missing:
+        raise UserError(f"{path}: must say {' and '.join(sorted(missing))} of a job")
+    return dict(found)

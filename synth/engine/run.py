@@ -1,0 +1,247 @@
+"""Running a job: sequences handed to worker processes, none lost, order without effect."""
+
+from __future__ import annotations
+
+import os
+import queue
+import threading
+from collections import deque
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Protocol
+
+from synth.dataset import index, size_forecast
+from synth.dataset.folder import Folder, claim
+from synth.engine import slots
+from synth.engine.journal import Account, Journal
+from synth.engine.slots import Slots
+from synth.engine.worker_process import Attempt, Setup
+from synth.errors import UserError
+from synth.job.schema import Job
+from synth.publish import card, croissant, preview_video
+from synth.system.stopwatch import Report
+
+_TRIES = 3
+# So many first sequences failing on the job's own account, and none succeeding, condemn the job.
+_VERDICT = 5
+
+
+@dataclass(frozen=True)
+class Options:
+    """How to run; none of it changes a byte of the dataset."""
+
+    engine: str = "local"
+    """`local`, `dask://host:port`, or a YAML file that describes a SLURM cluster."""
+    workers: int | None = None
+    """Processes at a time; default one a core."""
+    gpus: str = "auto"
+    """GPUs of this machine that the workers share: `auto`, `none`, or their numbers, `0,1`."""
+    memory_gb: float | None = None
+    """Memory that one process may take; default what is available now, shared out."""
+    stall_s: float = 1800.0
+    """Patience with a process that reports nothing."""
+    work: str = "synth.sequence.pipeline:render_sequence"
+    """`module:function` that computes one sequence."""
+    environment: Mapping[str, str] = field(default_factory=dict)
+    """Added to the environment of the workers."""
+    mix_versions: bool = False
+    """Continue a dataset that another version of the program began."""
+
+
+@dataclass(frozen=True)
+class Summary:
+    """The end of a run."""
+
+    total: int
+    already: int
+    """Sequences that were finished before."""
+    done: int
+    """Sequences finished by this run."""
+    failed: dict[int, str]
+    """Reason of every failed sequence, of this run and of earlier ones."""
+    content_hash: str
+    """Hash of the content hashes of all finished sequences in order."""
+
+
+class Listener(Protocol):
+    """Told what happens, from the main thread only."""
+
+    def begin(self, total: int, already: int, failed: int) -> None: ...
+    def stage(self, index: int, stage: str, done: int, of: int) -> None: ...
+    def end(self, attempt: Attempt, again: bool) -> None: ...
+
+
+class Watcher(Listener, Protocol):
+    """Told besides how the run as a whole goes."""
+
+    def account(self, account: Account) -> None: ...
+
+
+def run(job: Job, root: Path, options: Options, watcher: Watcher) -> Summary:
+    """Computes the sequences of `job` that `root` lacks.
+
+    Raises:
+        UserError: the folder is not for this job, the disk is full, or the job cannot be carried out at all
+            (then nothing is left behind).
+        KeyboardInterrupt: after the workers are ended; what is sealed stays, the next run goes on.
+    """
+    workers, memory = options.workers or len(os.sched_getaffinity(0)), options.memory_gb
+    gpus = slots.gpus(options.gpus, job.render.variant == "cuda_ad_rgb")
+    with claim(root, job, mix_versions=options.mix_versions) as folder:
+        finished, failures = set(folder.sealed()), folder.failures()
+        todo = [k for k in range(job.sequences) if k not in finished and k not in failures]
+        size_forecast.refuse_if_too_large(size_forecast.of(job, root, len(todo), sorted(finished)), root)
+        # The journal first: what is said of the run is then said with what has just ended.
+        watchers = (Journal(folder, workers, job.frames, watcher), watcher)
+        for each in watchers:
+            each.begin(job.sequences, len(finished), len(failures))
+        setup = Setup(
+            job=job.model_dump(mode="json"),
+            folder=root.resolve(),
+            logs=folder.logs.resolve(),
+            scratch=folder.scratch.resolve(),
+            work=options.work,
+            memory_bytes=slots.share_of_memory(workers) if memory is None else int(memory * 1e9),
+            stall_s=options.stall_s,
+            keep_open=(folder.lock_fd,),
+            environment={**slots.machine(job, workers), **options.environment},
+            turn=folder.turn,
+            turn_file=folder.turn_file.resolve(),
+        )
+        try:
+            with _slots(options.engine, setup, workers, gpus) as made:
+                done = _Pool(folder, made, todo).work(watchers)
+        except BaseException:
+            index.write(folder)
+            raise
+        rows = index.write(folder)
+        if done or not preview_video.path(root).exists():
+            preview_video.write(root)
+            card.write(folder)
+            croissant.write(folder)
+        return Summary(
+            total=job.sequences,
+            already=len(finished),
+            done=done,
+            failed={key: failure["reason"] for key, failure in folder.failures().items()},
+            content_hash=index.dataset_hash(rows),
+        )
+
+
+class _Pool:
+    """Threads, each with a slot of its own, and the queue that they take sequences from."""
+
+    def __init__(self, folder: Folder, slots: Slots, todo: list[int]) -> None:
+        self._folder, self._slots = folder, slots
+        self._workers = max(1, min(slots.count(), len(todo)))
+        self._todo = deque((k, 1) for k in todo)
+        self._busy = 0
+        self._change = threading.Condition()
+        self._stop = threading.Event()
+        self._events: queue.SimpleQueue[Callable[[Listener], None] | BaseException | None] = (
+            queue.SimpleQueue()
+        )
+        self._done = 0
+        self._refused: list[Attempt] = []
+
+    def work(self, watchers: tuple[Listener, ...]) -> int:
+        """Runs until nothing is left to do; returns how many were finished."""
+        threads = [threading.Thread(target=self._thread, daemon=True) for _ in range(self._workers)]
+        for thread in threads:
+            thread.start()
+        try:
+            alive = len(threads)
+            while alive:
+                event = self._events.get()
+                if event is None:
+                    alive -= 1
+                elif isinstance(event, BaseException):
+                    raise event
+                else:
+                    for watcher in watchers:
+                        event(watcher)
+        finally:
+            self._stop.set()
+            with self._change:
+                self._change.notify_all()
+            for thread in threads:
+                thread.join()
+            self._folder.sweep_all()
+        return self._done
+
+    def _thread(self) -> None:
+        slot = self._slots.slot()
+        try:
+            while (task := self._take()) is not None:
+                self._settle(slot.run(task[0], self._reporter(task[0]), self._stop), task[1])
+        except BaseException as error:
+            self._events.put(error)
+        finally:
+            slot.close()
+            self._events.put(None)
+
+    def _take(self) -> tuple[int, int] | None:
+        """The next (sequence, try); waits while others may still give one back; None at the end."""
+        with self._change:
+            while not self._stop.is_set():
+                if self._todo:
+                    self._busy += 1
+                    return self._todo.popleft()
+                if not self._busy:
+                    return None
+                self._change.wait()
+            return None
+
+    def _settle(self, attempt: Attempt, tries: int) -> None:
+        again = False
+        if attempt.kind == "done":
+            self._done += 1
+        elif attempt.kind == "disk":
+            raise UserError(f"{self._folder.root}: cannot be written ({attempt.reason})")
+        elif attempt.kind != "stopped":
+            again = attempt.kind != "input" and tries < _TRIES
+            if again:
+                self._folder.sweep(attempt.index)
+            else:
+                self._fail(attempt, tries)
+        with self._change:
+            if again:
+                self._todo.append((attempt.index, tries + 1))
+            self._busy -= 1
+            self._change.notify_all()
+        self._events.put(lambda watcher: watcher.end(attempt, again))
+
+    def _fail(self, attempt: Attempt, tries: int) -> None:
+        self._folder.mark_failed(
+            attempt.index, kind=attempt.kind, reason=attempt.reason, tries=tries, log=attempt.log
+        )
+        if attempt.kind != "input":
+            return
+        with self._change:
+            self._refused.append(attempt)
+            left = self._done + len(self._todo) + self._busy - 1
+            hopeless = not self._done and (len(self._refused) >= _VERDICT or not left)
+        if hopeless and not self._folder.sealed():
+            # The job itself is at fault: nothing of it is kept.
+            for refused in self._refused:
+                (self._folder.state / "failed" / f"{refused.index:06d}.json").unlink(missing_ok=True)
+            reasons = sorted({refused.reason for refused in self._refused})
+            raise UserError("\n".join(reasons))
+
+    def _reporter(self, key: int) -> Report:
+        def report(stage: str, done: int, of: int) -> None:
+            self._events.put(lambda watcher: watcher.stage(key, stage, done, of))
+
+        return report
+
+
+def _slots(
+    engine: str, setup: Setup, workers: int, gpus: tuple[str, ...] | None
+) -> AbstractContextManager[Slots]:
+    if engine == "local":
+        return slots.local(setup, workers, gpus)
+    from synth.engine import dask
+
+    return dask.slots_of(engine, setup)

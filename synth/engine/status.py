@@ -1,0 +1,138 @@
+"""How a dataset stands: done, running, failed and why, how long and how much is still to come."""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import shutil
+from collections import Counter
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from synth.dataset import location, size_forecast
+from synth.dataset.folder import Folder
+from synth.dataset.size_forecast import Forecast
+from synth.dataset.store import open_sequence
+from synth.engine.journal import Account
+from synth.engine.progress import clock, rates, remaining
+from synth.errors import UserError
+
+
+@dataclass(frozen=True)
+class Status:
+    """A dataset at one moment."""
+
+    total: int
+    done: int
+    failed: dict[str, int]
+    """How many failed for each reason."""
+    running: bool
+    """Whether a run is writing to it now."""
+    in_flight: dict[str, list[Any]]
+    """Stage, steps done and steps in all of the sequences being computed."""
+    left_s: float | None
+    """Time to the end, at the rate of the run at work."""
+    left: str
+    """The same for a person."""
+    rates: str
+    """How fast the run at work goes, by stage, and the disk that it will take."""
+    ahead: Forecast
+    disk_free: int
+    stages_cpu_s: dict[str, float]
+    """CPU-seconds a sequence by stage, mean of up to ten finished ones."""
+
+    def as_dict(self) -> dict[str, Any]:
+        return asdict(self)
+
+
+def of(root: Path) -> Status:
+    """The status of the dataset in `root`. UserError if there is none."""
+    folder = Folder(root)
+    job, done = folder.job(), folder.sealed()
+    failures = folder.failures()
+    todo = max(0, job.sequences - len(done) - len(set(failures) - set(done)))
+    journal = _journal(folder)
+    stages = _stages(root, size_forecast.pilot(done))
+    return Status(
+        total=job.sequences,
+        done=len(done),
+        failed=dict(Counter(failure["reason"] for failure in failures.values()).most_common()),
+        running=journal is not None,
+        in_flight=journal.in_flight if journal else {},
+        left_s=journal.left_s if journal else None,
+        left=remaining(journal) if journal else "",
+        rates=rates(journal) if journal else "",
+        ahead=size_forecast.of(job, root, todo, done, sum(stages.values()) if stages else None),
+        disk_free=shutil.disk_usage(root).free,
+        stages_cpu_s=stages,
+    )
+
+
+def lines(status: Status) -> list[str]:
+    """The same for a person."""
+    count = sum(status.failed.values())
+    found = [f"{status.done} of {status.total} sequences done, {count} failed"]
+    found += [f"  {number} x {reason}" for reason, number in list(status.failed.items())[:10]]
+    if count:
+        found.append("  `synth retry` takes the failed ones up again")
+    if status.running:
+        found.append(f"a run is at work{status.left and ', '}{status.left}")
+        if status.rates:
+            found.append(f"  {status.rates}")
+        found += [
+            f"  {int(key):06d} {stage} {step} of {of}" for key, (stage, step, of) in status.in_flight.items()
+        ]
+    elif status.ahead.sequences:
+        found.append("no run is at work; `synth render` with the same job and folder goes on")
+    if status.stages_cpu_s:
+        each = ", ".join(f"{name} {seconds:.1f}" for name, seconds in status.stages_cpu_s.items())
+        found.append(f"CPU-seconds a sequence: {each}")
+    if status.ahead.sequences:
+        ahead, basis = (
+            status.ahead,
+            f"from {status.ahead.pilot} finished" if status.ahead.pilot else "estimated",
+        )
+        time = f", {clock(ahead.cpu_s)} of one core" if ahead.cpu_s is not None else ""
+        found.append(
+            f"still to come: {ahead.sequences} sequences, "
+            f"{size_forecast.amount(ahead.bytes)}{time} ({basis}); "
+            f"the disk has {size_forecast.amount(status.disk_free)} free"
+        )
+    return found
+
+
+def _journal(folder: Folder) -> Account | None:
+    """What the run at work says of itself; None when none is at work."""
+    try:
+        descriptor = os.open(folder.state / "lock", os.O_RDONLY)
+    except FileNotFoundError:
+        return None
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return _account(folder)
+    finally:
+        os.close(descriptor)
+    return None
+
+
+def _account(folder: Folder) -> Account:
+    try:
+        return Account(**json.loads((folder.state / "progress.json").read_text("utf-8")))
+    except (FileNotFoundError, ValueError, TypeError):  # it has only just begun, or is of another version
+        return Account(0, 0.0, 0, None, True, {}, None, None, 0, {})
+
+
+def _stages(root: Path, pilot: list[int]) -> dict[str, float]:
+    total: Counter[str] = Counter()
+    read = 0
+    for key in pilot:
+        try:
+            timings = open_sequence(location.store(root, key)).attrs.get("timings", {})
+        except UserError:
+            continue  # `synth verify` is for damage
+        read += 1
+        total.update({name: stage["cpu_s"] for name, stage in timings.items() if isinstance(stage, dict)})
+    return {name: seconds / read for name, seconds in total.items()} if read else {}

@@ -1,0 +1,72 @@
+"""Where tissue is held inside: the falx, the tentorium, an adhesion, as springs in a ball or a sheet."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import product
+
+import numpy as np
+import scipy.sparse as sp
+from numpy.typing import NDArray
+
+from synth.errors import UserError
+from synth.fem.mesh.element import bary_slope, shape
+from synth.job import schema
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+_FINE = 9
+_GRID = np.array([i for i in product(range(_FINE), repeat=4) if sum(i) == _FINE - 1], np.float64)
+_SAMPLES = (_GRID + 0.25) / _FINE
+"""(165, 4) even barycentric places: a sheet may be much thinner than the elements that it passes."""
+
+
+def springs(
+    points: Floats, cells: Ints, order: int, attachments: Sequence[schema.Attachment]
+) -> sp.csr_array:
+    """Springs of all attachments.
+
+    Args:
+        points: (N, 3) mm, all nodes.
+        cells: (M, 4 or 10).
+        order: 1 or 2.
+        attachments: in the axes of `points`.
+
+    Returns:
+        (N, N) mm: mN/mm for E = 1 kPa.
+
+    Raises:
+        UserError: an attachment holds no tissue.
+    """
+    total = sp.csr_array((len(points), len(points)))
+    if not attachments:
+        return total
+    corner = points[cells[:, :4]]
+    value, share = shape(_SAMPLES, order), bary_slope(corner)[1] / len(_SAMPLES)
+    for k, attachment in enumerate(attachments):
+        near = np.linalg.norm(corner - attachment.point, axis=2).min(axis=1)
+        reach = np.ptp(corner, axis=1).max(axis=1) * np.sqrt(3) + attachment.radius_mm
+        chosen = np.flatnonzero(near <= reach)
+        held = within(attachment, np.einsum("qc,mcd->mqd", _SAMPLES, corner[chosen]))
+        touched = held.any(axis=1)
+        if not touched.any():
+            raise UserError(f"anatomy.attachments: number {k} holds no tissue; check its point and radius_mm")
+        held, mine = held[touched], cells[chosen[touched]]
+        across = attachment.radius_mm if attachment.normal is None else attachment.thickness_mm
+        weight = held * (attachment.firm_per_mm / across * share[chosen[touched]])[:, None]
+        local = np.einsum("mq,qi,qj->mij", weight, value, value, optimize=True)
+        n = mine.shape[1]
+        rows, columns = np.repeat(mine, n, axis=1).ravel(), np.tile(mine, (1, n)).ravel()
+        total = total + sp.coo_array((local.ravel(), (rows, columns)), shape=total.shape).tocsr()
+    return sp.csr_array(total)
+
+
+def within(attachment: schema.Attachment, at: Floats) -> NDArray[np.bool_]:
+    """Which of the places (..., 3) mm an attachment holds, (...)."""
+    away = at - np.asarray(attachment.point)
+    inside = np.linalg.norm(away, axis=-1) <= attachment.radius_mm
+    if attachment.normal is not None:
+        normal = np.asarray(attachment.normal) / np.linalg.norm(attachment.normal)
+        inside &= np.abs(away @ normal) <= 0.5 * attachment.thickness_mm
+    return np.asarray(inside)

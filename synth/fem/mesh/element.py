@@ -1,0 +1,120 @@
+"""Tetrahedra of order 1 and 2: shape functions, quadrature, and what the volume integrals need of a mesh."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from synth.fem.mesh.refine import EDGES
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+_A, _B = (5 + 3 * np.sqrt(5)) / 20, (5 - np.sqrt(5)) / 20
+TET_POINTS = {
+    1: np.full((1, 4), 0.25),
+    2: np.full((4, 4), _B) + (_A - _B) * np.eye(4),
+}
+"""Barycentric quadrature points by element order, all of weight 1/Q: exact for the rest stiffness of straight
+tetrahedra (degree 0 and 2; Keast, Comput. Meth. Appl. Mech. Eng. 55, 1986)."""
+
+_C, _D = 0.445948490915965, 0.091576213509771
+TRI_POINTS = np.array(
+    [[1 - 2 * c if i == j else c for i in range(3)] for c in (_C, _D) for j in range(3)], np.float64
+)
+"""(6, 3) barycentric points of degree 4 on a triangle (Dunavant, Int. J. Numer. Meth. Eng. 21, 1985)."""
+TRI_WEIGHTS = np.repeat([0.223381589678011, 0.109951743655322], 3)
+"""(6,) their weights, summing to 1."""
+
+
+def shape(bary: Floats, order: int) -> Floats:
+    """Values of the shape functions.
+
+    Args:
+        bary: (..., 4) barycentric coordinates.
+        order: 1 or 2.
+
+    Returns:
+        (..., 4 or 10): corners, then midsides in the order of `EDGES`.
+    """
+    if order == 1:
+        return bary.copy()
+    corners = bary * (2 * bary - 1)
+    return np.concatenate([corners, 4 * bary[..., EDGES[:, 0]] * bary[..., EDGES[:, 1]]], axis=-1)
+
+
+def shape_slope(bary: Floats, order: int) -> Floats:
+    """Derivatives of the shape functions by the barycentric coordinates, (..., 4 or 10, 4)."""
+    eye = np.broadcast_to(np.eye(4), (*bary.shape[:-1], 4, 4))
+    if order == 1:
+        return eye.copy()
+    corners = eye * (4 * bary - 1)[..., None, :]
+    left, right = EDGES[:, 0], EDGES[:, 1]
+    sides = 4 * (bary[..., left, None] * np.eye(4)[right] + bary[..., right, None] * np.eye(4)[left])
+    return np.concatenate([corners, sides], axis=-2)
+
+
+def face_shape(bary: Floats, order: int) -> Floats:
+    """Shape functions on a face, (..., 3 or 6): corners, then midsides 01, 02, 12."""
+    if order == 1:
+        return bary.copy()
+    sides = np.stack([4 * bary[..., i] * bary[..., j] for i, j in ((0, 1), (0, 2), (1, 2))], axis=-1)
+    return np.concatenate([bary * (2 * bary - 1), sides], axis=-1)
+
+
+def bary_slope(corners: Floats) -> tuple[Floats, Floats]:
+    """Gradients of the barycentric coordinates and volumes of straight tetrahedra.
+
+    Args:
+        corners: (M, 4, 3) mm.
+
+    Returns:
+        (M, 4, 3) 1/mm, and (M,) mm^3, negative where a tetrahedron is inside out.
+    """
+    sides = corners[:, 1:] - corners[:, :1]
+    inverse = np.linalg.inv(sides)  # rows: directions in space; columns: barycentrics 1..3
+    slope = np.empty_like(corners)
+    slope[:, 1:] = inverse.transpose(0, 2, 1)
+    slope[:, 0] = -slope[:, 1:].sum(axis=1)
+    return slope, np.linalg.det(sides) / 6
+
+
+def quality(corners: Floats) -> Floats:
+    """Mean ratio of tetrahedra (M, 4, 3): 1 is regular, 0 flat, below 0 inside out.
+
+    Liu & Joe, BIT 34, 1994.
+    """
+    volume = np.linalg.det(corners[:, 1:] - corners[:, :1]) / 6
+    squares = ((corners[:, EDGES[:, 0]] - corners[:, EDGES[:, 1]]) ** 2).sum(axis=(1, 2))
+    return np.asarray(12 * np.sign(volume) * (3 * np.abs(volume)) ** (2 / 3) / squares)
+
+
+@dataclass(frozen=True)
+class Quadrature:
+    """The mesh as volume integrals see it: M elements, Q points each, n nodes each."""
+
+    cells: NDArray[np.int32]
+    """(M, n) nodes."""
+    slope: Floats
+    """(M, Q, n, 3) gradients of the shape functions at the points, 1/mm."""
+    weight: Floats
+    """(M, Q) mm^3."""
+    nodes: int
+    """N, number of nodes."""
+
+
+def quadrature(points: Floats, cells: Ints, order: int) -> Quadrature:
+    """Prepares a mesh of straight tetrahedra.
+
+    Args:
+        points: (N, 3) mm, all nodes.
+        cells: (M, 4 or 10).
+        order: 1 or 2.
+    """
+    slope, volume = bary_slope(points[cells[:, :4]])
+    at = TET_POINTS[order]
+    gradient = np.einsum("qnb,mbd->mqnd", shape_slope(at, order), slope)
+    weight = np.repeat(volume[:, None] / len(at), len(at), axis=1)
+    return Quadrature(cells.astype(np.int32), np.ascontiguousarray(gradient), weight, len(points))

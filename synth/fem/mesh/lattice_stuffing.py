@@ -1,0 +1,143 @@
+"""Tetrahedra inside a surface, by stuffing a graded lattice: deterministic, whatever the surface is like.
+
+After Labelle & Shewchuk, "Isosurface stuffing" (ACM Trans. Graph. 26, 2007): lattice corners close to the
+surface move onto it, tetrahedra that still cross it are cut. Their lattice is an octree's, ours Kuhn's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import scipy.sparse as sp
+from numpy.typing import NDArray
+from scipy.sparse.csgraph import connected_components
+
+from synth.fem.mesh.element import bary_slope
+from synth.fem.mesh.refine import edges_of
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+_SNAP = 0.3  # of an edge: how far a corner may move; less leaves flat pieces, more flattens neighbours
+_HALVINGS = 14
+
+
+def stuff(points: Floats, cells: Ints, inside: Callable[[Floats], Floats]) -> tuple[Floats, Ints]:
+    """Keeps what of a lattice is inside.
+
+    Args:
+        points: (N, 3) mm, lattice corners.
+        cells: (M, 4), positively oriented.
+        inside: positive inside and negative outside, at (n, 3) mm.
+
+    Returns:
+        Points and cells of the largest connected part, positively oriented; none if nothing is inside.
+    """
+    points, value = points.copy(), np.where(inside(points) > 0, 1, -1)
+    kept = (value[cells] > 0).any(axis=1)
+    cells = cells[kept]
+    pairs, _ = edges_of(cells)
+    pairs = pairs[value[pairs[:, 0]] != value[pairs[:, 1]]]
+    where = _crossing(points, pairs, value, inside)
+    _snap(points, value, pairs, where)
+
+    # The edges that are still cut get a corner each.
+    cut = value[pairs[:, 0]] * value[pairs[:, 1]] < 0
+    pairs = pairs[cut]
+    where = _crossing(points, pairs, value, inside)
+    new = points[pairs[:, 0]] + where[:, None] * (points[pairs[:, 1]] - points[pairs[:, 0]])
+    corner = {(int(a), int(b)): len(points) + i for i, (a, b) in enumerate(pairs)}
+    points = np.vstack([points, new])
+
+    sign = value[cells]
+    whole = (sign >= 0).all(axis=1) & (sign > 0).any(axis=1)
+    mixed = (sign < 0).any(axis=1) & (sign > 0).any(axis=1)
+    pieces = [piece for cell in cells[mixed] for piece in _pieces(cell, value, corner)]
+    cells = np.vstack([cells[whole], np.array(pieces, np.int64).reshape(-1, 4)])
+    return _sound(points, cells)
+
+
+def _crossing(points: Floats, pairs: Ints, value: Ints, inside: Callable[[Floats], Floats]) -> Floats:
+    """Where each edge passes the surface, (E,) from 0 at its first corner to 1, by halving."""
+    low, high = np.zeros(len(pairs)), np.ones(len(pairs))
+    first, side = points[pairs[:, 0]], points[pairs[:, 1]] - points[pairs[:, 0]]
+    begins_inside = value[pairs[:, 0]] > 0
+    for _ in range(_HALVINGS):
+        middle = 0.5 * (low + high)
+        before = (inside(first + middle[:, None] * side) > 0) == begins_inside
+        low, high = np.where(before, middle, low), np.where(before, high, middle)
+    return 0.5 * (low + high)
+
+
+def _snap(points: Floats, value: Ints, pairs: Ints, where: Floats) -> None:
+    """Moves corners close to the surface onto it, in place, the closest first; their value becomes 0."""
+    ends = np.concatenate([pairs[:, 0], pairs[:, 1]])
+    share = np.concatenate([where, 1 - where])
+    length = np.linalg.norm(points[pairs[:, 1]] - points[pairs[:, 0]], axis=1)
+    target = points[pairs[:, 0]] + where[:, None] * (points[pairs[:, 1]] - points[pairs[:, 0]])
+    near = np.flatnonzero(share < _SNAP)
+    order = near[np.lexsort((near, share[near] * np.tile(length, 2)[near]))]
+    _, first = np.unique(ends[order], return_index=True)
+    chosen = order[np.sort(first)]
+    points[ends[chosen]] = target[chosen % len(pairs)]
+    value[ends[chosen]] = 0
+
+
+def _pieces(cell: Ints, value: Ints, corner: dict[tuple[int, int], int]) -> list[list[int]]:
+    """The inner part of a cut tetrahedron, as tetrahedra of any orientation."""
+
+    def on(a: int, b: int) -> int:
+        return corner[(a, b) if a < b else (b, a)]
+
+    ins = [int(v) for v in cell if value[v] > 0]
+    zero = [int(v) for v in cell if value[v] == 0]
+    outs = [int(v) for v in cell if value[v] < 0]
+    if len(ins) == 1:
+        return [[ins[0], *zero, *(on(ins[0], o) for o in outs)]]
+    if len(ins) == 3:  # a corner is off: what is left is a prism
+        return _prism([ins, [on(i, outs[0]) for i in ins]])
+    a, b = ins
+    if len(outs) == 2:
+        return _prism([[a, on(a, outs[0]), on(a, outs[1])], [b, on(b, outs[0]), on(b, outs[1])]])
+    # Two inside, one on the surface, one outside: a pyramid over a quadrilateral, its top on the surface.
+    return _pyramid([a, b, on(b, outs[0]), on(a, outs[0])], zero[0])
+
+
+def _pyramid(base: list[int], top: int) -> list[list[int]]:
+    """Two tetrahedra; the base is halved from its lowest corner, as its other side's will be."""
+    k = base.index(min(base))
+    a, b, c, d = base[k:] + base[:k]
+    return [[a, b, c, top], [a, c, d, top]]
+
+
+def _prism(ends: list[list[int]]) -> list[list[int]]:
+    """Three tetrahedra; every quadrilateral is halved from its lowest corner, as its neighbour's will be."""
+    if min(ends[1]) < min(ends[0]):
+        ends = ends[::-1]
+    k = ends[0].index(min(ends[0]))
+    (a, b, c), (d, e, f) = (end[k:] + end[:k] for end in ends)
+    # a is the lowest of all: both quadrilaterals at it are halved from it; the third is left.
+    return [[a, d, e, f], *_pyramid([b, c, f, e], a)]
+
+
+def _sound(points: Floats, cells: Ints) -> tuple[Floats, Ints]:
+    """Turned the right way, without flat ones, the largest connected part, only the corners in use."""
+    if len(cells) == 0:
+        return np.zeros((0, 3)), np.zeros((0, 4), np.int64)
+    corner = points[cells]
+    volume = np.linalg.det(corner[:, 1:] - corner[:, :1]) / 6
+    cells[volume < 0] = cells[volume < 0][:, [0, 2, 1, 3]]
+    span = np.ptp(corner, axis=1).max(axis=1)
+    cells = cells[np.abs(volume) > 1e-6 * span**3]
+    faces = np.sort(cells[:, [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]]].reshape(-1, 3), axis=1)
+    _, face = np.unique(faces, axis=0, return_inverse=True)
+    links = sp.csr_array(
+        (np.ones(len(face)), (np.repeat(np.arange(len(cells)), 4), face.ravel())),
+        shape=(len(cells), int(face.max()) + 1),
+    )
+    _, part = connected_components(links @ links.T, directed=False)
+    size = np.bincount(part, np.abs(bary_slope(points[cells])[1]))
+    cells = cells[part == size.argmax()]
+    used, cells = np.unique(cells, return_inverse=True)
+    return points[used], cells.reshape(-1, 4)

@@ -1,0 +1,62 @@
+"""Several instruments at once: gestures that leave each other room."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from synth.errors import UserError
+from synth.fem.material import Tissue
+from synth.fem.tool import Gesture, focus, shaft
+from synth.job import schema
+
+Floats = NDArray[np.float64]
+
+_TRIES = 400
+_OVERLAP = 0.6  # centres at least this part of both radii apart: the pressures' sum peaks 10% above one's
+_BLADE_MM, _SPREADING, _BODY_MM = 3.0, 0.3, 14.0  # room an instrument needs at its tip, growing up the shaft
+_LENGTH_MM, _STEPS = 110.0, 23
+
+
+def further(
+    first: Gesture, fem: schema.Fem, craniotomy: schema.Craniotomy, tissue: Tissue, rng: np.random.Generator
+) -> tuple[Gesture, ...]:
+    """Draws the gestures beside the first; each is redrawn until it has room.
+
+    Args:
+        first: the gesture of the first instrument.
+        fem, craniotomy, tissue: as in `Gesture.draw`.
+        rng: random numbers of this sequence's further gestures alone.
+
+    Returns:
+        One gesture less than there are instruments, a number drawn from `fem.instruments`.
+
+    Raises:
+        UserError: the opening has no room for so many.
+    """
+    count = int(rng.integers(fem.instruments[0], fem.instruments[1] + 1))
+    crew = [first]
+    while len(crew) < count:
+        for _ in range(_TRIES):
+            trial = Gesture.draw(fem, craniotomy, tissue, rng)
+            if all(room(trial, other) >= 0 for other in crew):
+                crew.append(trial)
+                break
+        else:
+            raise UserError(
+                f"fem.instruments: {count} have no room in an opening of {craniotomy.radius_mm:g} mm radius; "
+                "lower it or fem.footprint_mm, or widen anatomy.craniotomy.radius_mm"
+            )
+    return tuple(crew[1:])
+
+
+def room(one: Gesture, other: Gesture) -> float:
+    """How far apart two gestures are beyond what they need, mm: their contacts and their shafts."""
+    here, there = np.array(focus(one)), np.array(focus(other))
+    apart = np.linalg.norm(here[:, None, :2] - there[None, :, :2], axis=2)
+    contacts = (apart - _OVERLAP * (here[:, None, 2] + there[None, :, 2])).min()
+    s = np.linspace(0, _LENGTH_MM, _STEPS)
+    lines = [np.append(g.point_mm, 0.0) + s[:, None] * shaft(g) for g in (one, other)]
+    gap = np.linalg.norm(lines[0][:, None] - lines[1][None], axis=2)
+    wide = np.minimum(_BLADE_MM + _SPREADING * np.maximum(s[:, None], s[None, :]), _BODY_MM)
+    return float(min(contacts, (gap - wide).min()))

@@ -1,0 +1,128 @@
+"""A user's brain surface, as it comes, placed in world axes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+
+from synth.errors import UserError
+from synth.geometry import vtk
+from synth.job.schema import Attachment, Craniotomy
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Brain:
+    """A surface in world axes: z out of the brain, origin at the craniotomy's centre. It may have holes."""
+
+    vertices: Floats
+    """(V, 3) mm."""
+    faces: NDArray[np.int32]
+    """(F, 3)."""
+    origin: Floats
+    """(3,) mm, the craniotomy's centre in the file's axes."""
+    turn: Floats
+    """(3, 3) rows: world axes in the file's."""
+
+    def placed(self, attachments: Sequence[Attachment]) -> tuple[Attachment, ...]:
+        """Attachments given in the file's axes, in world axes."""
+        return tuple(
+            a.model_copy(
+                update={
+                    "point": tuple(self.turn @ (np.asarray(a.point) - self.origin)),
+                    "normal": None if a.normal is None else tuple(self.turn @ np.asarray(a.normal)),
+                }
+            )
+            for a in attachments
+        )
+
+
+def load(path: Path, craniotomy: Craniotomy) -> Brain:
+    """Reads a surface (OBJ, STL, PLY, OFF or legacy VTK), merges what belongs together, and places it.
+
+    Args:
+        path: the file, coordinates in mm.
+        craniotomy: point and direction in the file's axes.
+
+    Raises:
+        UserError: the file cannot be read, encloses no volume, or has no surface at the craniotomy.
+    """
+    vertices, faces = _read(path)
+    if craniotomy.point is None or craniotomy.direction is None:
+        raise UserError("anatomy.mesh needs craniotomy.point and craniotomy.direction")
+    if not np.isfinite(vertices).all():
+        raise UserError(f"anatomy.mesh: {path.name} holds coordinates that are no numbers")
+    span = np.ptp(vertices, axis=0) if len(vertices) else np.zeros(3)
+    if len(faces) < 4 or span.min() < 1e-3 * span.max() or _volume(vertices, faces) < 1e-3 * span.prod():
+        raise UserError(f"anatomy.mesh: {path.name} encloses no volume")
+    out = np.asarray(craniotomy.direction) / np.linalg.norm(craniotomy.direction)
+    turn, origin = axes(out), np.asarray(craniotomy.point)
+    placed = (vertices - origin) @ turn.T
+    heights = _heights(placed, faces)
+    heights = heights[np.abs(heights) <= craniotomy.radius_mm]
+    if len(heights) == 0:
+        raise UserError(
+            f"anatomy.craniotomy: {path.name} has no surface within {craniotomy.radius_mm:g} mm of the "
+            "point, looking along the direction"
+        )
+    placed[:, 2] -= heights.max()
+    origin = origin + heights.max() * turn[2]
+    return Brain(np.ascontiguousarray(placed), faces.astype(np.int32), origin, turn)
+
+
+def axes(out: Floats) -> Floats:
+    """World axes in a mesh's own, (3, 3) rows x, y, z with z = `out`; x as near to the mesh's x as can be."""
+    z = out / np.linalg.norm(out)
+    helper = np.eye(3)[0] if abs(z[0]) < 0.9 else np.eye(3)[1]
+    x = helper - z * (helper @ z)
+    x /= np.linalg.norm(x)
+    return np.stack([x, np.cross(z, x), z])
+
+
+def _heights(vertices: Floats, faces: NDArray[np.int64]) -> Floats:
+    """Where the z axis passes the faces, mm."""
+    a, b, c = (vertices[faces[:, i]] for i in range(3))
+    parts = np.stack([p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0] for p, q in ((b, c), (c, a), (a, b))], axis=1)
+    whole = parts.sum(axis=1)
+    hit = (np.abs(whole) > 1e-12) & ((parts >= 0).all(axis=1) | (parts <= 0).all(axis=1))
+    return np.asarray((parts[hit] * vertices[faces[hit], 2]).sum(axis=1) / whole[hit])
+
+
+def _read(path: Path) -> tuple[Floats, NDArray[np.int64]]:
+    if not path.is_file():
+        raise UserError(f"anatomy.mesh: there is no file {path}")
+    try:
+        if path.suffix.lower() == ".vtk":
+            return _merged(*vtk.read(path))
+        mesh = trimesh.load(path, force="mesh", process=False)
+    except (ValueError, IndexError, KeyError, NotImplementedError, UnicodeDecodeError) as error:
+        raise UserError(f"anatomy.mesh: {path.name} is no surface that can be read ({error})") from error
+    if not isinstance(mesh, trimesh.Trimesh):
+        raise UserError(f"anatomy.mesh: {path.name} holds no surface")
+    return _merged(np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64))
+
+
+def _merged(vertices: Floats, faces: NDArray[np.int64]) -> tuple[Floats, NDArray[np.int64]]:
+    """One vertex a place, one face three vertices; faces without area and vertices without face left out."""
+    if len(vertices) == 0 or len(faces) == 0:
+        return np.zeros((0, 3)), np.zeros((0, 3), np.int64)
+    step = 1e-6 * max(float(np.ptp(vertices, axis=0).max()), 1e-12)
+    _, first, place = np.unique(np.round(vertices / step), axis=0, return_index=True, return_inverse=True)
+    faces = place.ravel()[faces]
+    faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
+    _, once = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
+    faces = faces[np.sort(once)]
+    used, faces = np.unique(faces, return_inverse=True)
+    return vertices[first][used], faces.reshape(-1, 3)
+
+
+def _volume(vertices: Floats, faces: NDArray[np.int64]) -> float:
+    """Volume by the divergence theorem about the centroid; a hole makes it inexact, not meaningless."""
+    corner = (vertices - vertices.mean(axis=0))[faces]
+    return float(abs(np.einsum("ij,ij->", corner[:, 0], np.cross(corner[:, 1], corner[:, 2])) / 6))

@@ -1,0 +1,48 @@
+"""Which dataset a job is: a hash that is equal exactly when the sequences are."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+from synth.errors import UserError
+from synth.job.schema import Job
+
+
+def canonical(value: Any) -> bytes:
+    """JSON with sorted keys and no spaces; the same value gives the same bytes. ValueError for NaN."""
+    return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False).encode()
+
+
+def of(job: Job) -> str:
+    """Hash of everything that a sequence of `job` depends on besides its index.
+
+    Files count by content and not by path, and what the card says does not count. Nor does the number of
+    sequences: sequence 3 is the same in a dataset of 24 and of 48, so a dataset can be extended.
+    """
+    described = job.model_dump(mode="json", exclude={"sequences", "card"})
+    described["anatomy"]["mesh"] = _digest(job.anatomy.mesh)
+    described["appearance"]["photo"] = _digest(job.appearance.photo)
+    described["render"]["calibration"] = _digest(job.render.calibration)
+    return hashlib.blake2b(canonical(described), digest_size=16).hexdigest()
+
+
+def anatomy(job: Job, seed: int) -> str:
+    """Which geometry a sequence shows, across datasets: a user's brain, or the seed of a procedural one.
+
+    A brain is one anatomy wherever it is opened and whatever vessels are drawn on it.
+    """
+    mesh = _digest(job.anatomy.mesh)
+    return f"seed-{seed}" if mesh is None else f"mesh-{mesh[:16]}"
+
+
+def _digest(path: Path | None) -> str | None:
+    if path is None:
+        return None
+    try:
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, lambda: hashlib.blake2b(digest_size=16)).hexdigest()
+    except OSError as error:
+        raise UserError(f"{path}: cannot be read ({error.strerror})") from error

@@ -1,0 +1,110 @@
+"""The job's sections on light, camera and chip: how the surface is seen and recorded."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import Field, FiniteFloat
+
+from synth.job.types import (
+    LightKelvin,
+    LightTilt,
+    NonNegative,
+    NonNegativeRange,
+    Positive,
+    PositiveRange,
+    Section,
+    Share,
+    ShareRange,
+)
+
+
+class Light(Section):
+    """The microscope's lamps."""
+
+    glare: ShareRange = (0.0, 0.3)
+    """Wet highlights: 0 the few sparks of a well placed lamp, 1 up to a third of the tissue outshone."""
+    tilt_deg: LightTilt | None = None
+    """Angle between main lamp and optical axis, 0-40, to any side. Empty: the lamp is where `glare` asks."""
+    main: ShareRange = (0.5, 0.68)
+    """Share of light from the main lamp; the rest comes from two beside it, which stand for a ring."""
+    power: PositiveRange = (0.95, 1.1)
+    """Illumination, against one that just fills the sensor with white."""
+    kelvin: LightKelvin = (4200.0, 5600.0)
+    """Colour temperature [K], 2000-12000."""
+    even: PositiveRange = (0.35, 0.5)
+    """Radius of the evenly lit spot, in widths of the field; beyond it the light falls off."""
+    drift: ShareRange = (0.0, 0.03)
+    """Largest change of power over the sequence, as a share of it."""
+
+
+class Sensor(Section):
+    """The camera's chip and what its video processor makes of it."""
+
+    exposure: PositiveRange = (0.98, 1.12)
+    """Share of full scale that a white surface at the craniotomy fills."""
+    full_well: PositiveRange = (8_000.0, 20_000.0)
+    """Photoelectrons at full scale: photon noise is the root of what is counted."""
+    read_noise: NonNegativeRange = (8.0, 14.0)
+    """Noise of the readout, standard deviation [electrons]."""
+    contrast: ShareRange = (0.25, 0.55)
+    """Tone curve: weight of an S over plain sRGB."""
+    sharpening: NonNegativeRange = (0.15, 0.4)
+    """Unsharp mask, as a share of the detail."""
+    bayer: bool = False
+    """One colour a pixel (RGGB), the others interpolated; else three chips."""
+    depth: Literal[8, 10] = 8
+    """Bits of a channel in the H.264 stream; the stored picture has 8."""
+    chroma: Literal["4:4:4", "4:2:2", "4:2:0"] = "4:4:4"
+    """Colour resolution on that way: full, half across, half across and down."""
+    bitrate_mbps: Positive | None = None
+    """H.264 on that way at so many megabits a second. Empty: not compressed."""
+    shutter: Share = 0.0
+    """Part of the time between frames in which light is gathered: motion blur."""
+    subframes: Annotated[int, Field(ge=2, le=32)] = 4
+    """Pictures that make up a blurred one; the cost of a frame grows with them."""
+
+
+class Render(Section):
+    """The microscope and its picture."""
+
+    size: tuple[Annotated[int, Field(ge=16, le=4096)], Annotated[int, Field(ge=16, le=4096)]] = (640, 480)
+    """Width, height of the picture [px]."""
+    spp: Annotated[int, Field(ge=1, le=4096)] = 4
+    """Light paths a pixel. Flow stops improving at 4-8."""
+    variant: Literal["auto", "llvm_ad_rgb", "scalar_rgb", "cuda_ad_rgb"] = "auto"
+    """Mitsuba variant; auto takes llvm_ad_rgb where an LLVM works, else scalar_rgb."""
+    field_mm: PositiveRange = (32.0, 38.0)
+    """Width of the field of view at the craniotomy [mm]."""
+    working_distance_mm: PositiveRange = (280.0, 320.0)
+    """Distance from the front lens to the craniotomy [mm]."""
+    tilt_deg: NonNegativeRange = (0.0, 20.0)
+    """Angle between the optical axis and the craniotomy's normal."""
+    aperture_mm: NonNegative = 4.0
+    """Radius of the lens aperture [mm]; 0 is a pinhole."""
+    distortion: tuple[FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat] = (
+        -0.05,
+        0.01,
+        0.0,
+        0.0,
+        0.0,
+    )
+    """Brown-Conrady k1, k2, p1, p2, k3."""
+    off_centre: ShareRange = (0.0, 0.0)
+    """How far the principal point is from the middle, in widths of the picture, to any side."""
+    calibration: Path | None = None
+    """Calibration of a camera as OpenCV writes it (YAML, XML, JSON), relative to the job file; it takes the
+    place of field_mm, distortion and off_centre."""
+    drift_mm: NonNegativeRange = (0.0, 0.0)
+    """Slow drift of the microscope over some seconds [mm]; it is part of the flow."""
+    vibration_mm: NonNegativeRange = (0.0, 0.0)
+    """Vibration of the microscope at 4-14 Hz, standard deviation [mm]; it is part of the flow."""
+    stereo_mm: NonNegative = 0.0
+    """Distance of a second lens to the right, for the fields `*_right` [mm]; 0: there is none."""
+    subsurface: Literal["blur", "volume"] = "blur"
+    """How light spreads in tissue: by a blurred albedo, or followed through a volume (a reference: slow)."""
+    exr: bool = False
+    """Also write the linear radiance of every frame as EXR."""
+    tool: bool = True
+    """Show the instrument."""

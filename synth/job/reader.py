@@ -1,0 +1,260 @@
+"""Reading a job: a YAML file or a named job plus `a.b=c` overrides; each mistake is reported at its place."""
+
+from __future__ import annotations
+
+import difflib
+import typing
+from collections.abc import Iterable, Sequence
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel, ValidationError
+from ruamel.yaml import YAML
+from ruamel.yaml.comments import CommentedMap, CommentedSeq
+from ruamel.yaml.error import MarkedYAMLError
+
+from synth.errors import UserError
+from synth.job.schema import Job
+
+Loc = tuple[str | int, ...]
+"""Where in the job: keys and positions from the top."""
+
+# Paths that are resolved and must exist, as places in the job.
+_FILES: tuple[Loc, ...] = (("anatomy", "mesh"), ("appearance", "photo"), ("render", "calibration"))
+
+_KINDS = {
+    "int_parsing": "a whole number is needed",
+    "int_type": "a whole number is needed",
+    "int_from_float": "a whole number is needed",
+    "float_parsing": "a number is needed",
+    "float_type": "a number is needed",
+    "finite_number": "a finite number is needed",
+    "bool_parsing": "true or false is needed",
+    "bool_type": "true or false is needed",
+    "string_type": "a text is needed",
+    "path_type": "a file name is needed",
+    "tuple_type": "a list is needed",
+    "model_type": "a block of keys is needed",
+}
+
+
+def names() -> list[str]:
+    """Jobs that come with the program."""
+    jobs = resources.files("synth.job") / "named"
+    return sorted(
+        entry.name.removesuffix(".yaml") for entry in jobs.iterdir() if entry.name.endswith(".yaml")
+    )
+
+
+def load(source: str, overrides: Sequence[str] = ()) -> Job:
+    """The job in `source`, with overrides applied.
+
+    Args:
+        source: path of a job file, or one of `names()`. A path wins when it exists.
+        overrides: `section.key=value`, the value in YAML. Relative paths in them start at the working
+            directory, those in a file at the file.
+
+    Raises:
+        UserError: one line for every mistake, `job.yaml:12:3: render.sppp: unknown key, did you mean 'spp'?`
+    """
+    path = Path(source)
+    if path.exists() or source not in names():
+        text, label, folder = _text(path), source, path.resolve().parent
+    else:
+        text = (resources.files("synth.job") / "named" / f"{source}.yaml").read_text("utf-8")
+        label, folder = f"{source} (a named job)", Path.cwd()
+    return parse(text, label, folder, overrides)
+
+
+def parse(text: str, label: str, folder: Path, overrides: Sequence[str] = ()) -> Job:
+    """The job in `text`; `label` names it in messages and its relative paths start at `folder`."""
+    written = _yaml(text, label)
+    if not isinstance(written, CommentedMap):
+        raise UserError(f"{label}:1:1: a job is a block of `key: value` lines")
+    values = _plain(written)
+    given = _apply(values, overrides)
+    problems = []
+    for at in _FILES:
+        base = Path.cwd() if at in given else folder
+        problems += _resolve(values, at, base, _place(written, at, label, given))
+    job = None
+    try:
+        job = Job.model_validate(values)
+    except ValidationError as error:
+        for one in error.errors(include_url=False):
+            at = _trim(one["loc"])
+            unknown = one["type"] == "extra_forbidden"
+            place = _place(written, at, label, given, key=unknown)
+            problems.append((*place, f"{_dotted(at)}{_message(one, at)}"))
+    if problems or job is None:
+        raise UserError("\n".join(f"{where}: {what}" for _, where, what in sorted(set(problems))))
+    return job
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text("utf-8")
+    except FileNotFoundError:
+        close = difflib.get_close_matches(str(path), names(), 1)
+        hint = f"did you mean '{close[0]}'?" if close else f"nor a job called so ({', '.join(names())})"
+        raise UserError(f"{path}: no such file; {hint}") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise UserError(f"{path}: cannot be read ({error})") from error
+
+
+def _yaml(text: str, label: str) -> Any:
+    reader = YAML(typ="rt")
+    try:
+        return reader.load(text)
+    except MarkedYAMLError as error:
+        mark = error.problem_mark or error.context_mark
+        where = f"{label}:{mark.line + 1}:{mark.column + 1}" if mark else label
+        problem = str(error.problem or error.context).splitlines()[0]
+        raise UserError(f"{where}: {problem}") from None
+    except Exception as error:  # the reader raises bare ValueErrors for odd scalars and control characters
+        raise UserError(f"{label}: is not YAML ({str(error).splitlines()[0]})") from error
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_plain(item) for item in value]
+    return value
+
+
+def _apply(values: dict[Any, Any], overrides: Iterable[str]) -> dict[Loc, str]:
+    """Puts overrides into `values`; returns the text that gave each place."""
+    given: dict[Loc, str] = {}
+    for text in overrides:
+        dotted, equals, value = text.partition("=")
+        at: Loc = tuple(dotted.strip().split("."))
+        if not equals or not all(at):
+            raise UserError(f"{text}: an override is written section.key=value")
+        block: Any = values
+        for key in at[:-1]:
+            if not isinstance(block.get(key), dict):
+                block[key] = {}
+            block = block[key]
+        block[at[-1]] = _plain(_yaml(value, text)) if value.strip() else None
+        given[at] = text
+    return given
+
+
+def _resolve(
+    values: dict[Any, Any], at: Loc, base: Path, place: tuple[int, str]
+) -> list[tuple[int, str, str]]:
+    block: Any = values
+    for key in at[:-1]:
+        block = block.get(key) if isinstance(block, dict) else None
+    if not isinstance(block, dict) or not isinstance(block.get(at[-1]), str):
+        return []
+    path = (base / Path(block[at[-1]]).expanduser()).resolve()
+    if not path.is_file():
+        return [(*place, f"{_dotted(at)}no such file ({path})")]
+    block[at[-1]] = str(path)
+    return []
+
+
+def _place(
+    written: CommentedMap, at: Loc, label: str, given: dict[Loc, str], *, key: bool = False
+) -> tuple[int, str]:
+    """(order, text) of the place in the file or on the command line that gave `at`."""
+    for length in range(len(at), 0, -1):
+        if at[:length] in given:
+            return (1 << 30, f"'{given[at[:length]]}'")
+    block: Any = written
+    line, column = 0, 0
+    for depth, step in enumerate(at):
+        if isinstance(block, CommentedMap) and step in block:
+            last = depth == len(at) - 1
+            line, column = block.lc.key(step) if (key and last) else block.lc.value(step)
+            if not last and isinstance(block[step], (CommentedMap, CommentedSeq)):
+                line, column = block.lc.key(step)
+        elif isinstance(block, CommentedSeq) and isinstance(step, int) and step < len(block):
+            line, column = block.lc.item(step)
+        else:
+            # Not in the file, but perhaps a part of what was given: `rendr` of `rendr.spp=3`.
+            inside = [text for place, text in given.items() if place[: len(at)] == at]
+            if inside:
+                return (1 << 30, f"'{inside[0]}'")
+            break
+        block = block[step]
+    return (line, f"{label}:{line + 1}:{column + 1}")
+
+
+def _trim(loc: Loc) -> Loc:
+    """The place without the names that pydantic adds for validators and unions."""
+    return tuple(step for step in loc if isinstance(step, int) or "[" not in step)
+
+
+def _dotted(at: Loc) -> str:
+    text = ""
+    for step in at:
+        text += f"[{step}]" if isinstance(step, int) else f".{step}" if text else str(step)
+    return f"{text}: " if text else ""
+
+
+def _message(error: Any, at: Loc) -> str:
+    kind, context = str(error["type"]), error.get("ctx", {})
+    if kind == "extra_forbidden":
+        return f"unknown key{_did_you_mean(at)}"
+    if kind == "literal_error":
+        close = difflib.get_close_matches(str(error["input"]), str(context["expected"]).split("'")[1::2], 1)
+        return f"{error['input']!r} is not one of {context['expected']}" + (
+            f"; did you mean '{close[0]}'?" if close else ""
+        )
+    if kind == "value_error":
+        return str(context["error"])
+    limits = {"greater_than": ">", "greater_than_equal": ">=", "less_than": "<", "less_than_equal": "<="}
+    if kind in limits:
+        limit = context[{">": "gt", ">=": "ge", "<": "lt", "<=": "le"}[limits[kind]]]
+        return f"{error['input']!r} is out of range, it must be {limits[kind]} {limit:g}"
+    if kind == "missing" and isinstance(at[-1], str):
+        return "is missing"
+    if kind in ("missing", "too_short", "too_long"):
+        return f"the list has the wrong length ({error['msg'].lower()})"
+    return f"{_KINDS.get(kind, error['msg'])}, not {error['input']!r}"
+
+
+def _did_you_mean(at: Loc) -> str:
+    model = _model_at(at[:-1])
+    close = difflib.get_close_matches(str(at[-1]), list(model.model_fields), 1, 0.6)
+    if close:
+        return f", did you mean '{close[0]}'?"
+    elsewhere = [place for place in places() if place[-1] == at[-1]]
+    if elsewhere:
+        return f", did you mean '{'.'.join(map(str, elsewhere[0]))}'?"
+    return f"; known are {', '.join(model.model_fields)}"
+
+
+def _model_at(at: Loc) -> type[BaseModel]:
+    model: type[BaseModel] = Job
+    for step in at:
+        if isinstance(step, int):  # an item of a list of sections
+            continue
+        inner = section(model.model_fields[step].annotation) if step in model.model_fields else None
+        if inner is None:
+            return model
+        model = inner
+    return model
+
+
+def section(annotation: Any) -> type[BaseModel] | None:
+    """The section that a field's type is (or may be), if any."""
+    for option in (annotation, *typing.get_args(annotation)):
+        if isinstance(option, type) and issubclass(option, BaseModel):
+            return option
+    return None
+
+
+def places(model: type[BaseModel] = Job, at: Loc = ()) -> list[Loc]:
+    """Every key of a job, from the top: ("seed",), ("render",), ("render", "spp"), ... but not in lists."""
+    found: list[Loc] = []
+    for name, field in model.model_fields.items():
+        found.append((*at, name))
+        inner = section(field.annotation)
+        if inner is not None and typing.get_origin(field.annotation) is not tuple:
+            found += places(inner, (*at, name))
+    return found

@@ -1,0 +1,300 @@
+"""The job: everything one dataset depends on, as one validated object (reading it is in `config`)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import AfterValidator, Field, FiniteFloat, model_validator
+
+from synth import fields
+from synth.flow.estimator import names
+from synth.job.law_limits import LARGEST_LOAD, choose
+from synth.job.microscope import Light as Light
+from synth.job.microscope import Render as Render
+from synth.job.microscope import Sensor as Sensor
+from synth.job.types import (
+    InstrumentRange,
+    NonNegative,
+    NonNegativeRange,
+    Positive,
+    PositiveRange,
+    Section,
+    Share,
+    ShareRange,
+    Vector,
+)
+
+
+class Craniotomy(Section):
+    """Where the skull is open."""
+
+    point: Vector | None = None
+    """A point on (or near) the brain surface, in the mesh's own axes [mm]. Needed with `anatomy.mesh`."""
+    direction: Vector | None = None
+    """Outward direction of the opening, in the mesh's own axes; normalised. Needed with `anatomy.mesh`."""
+    radius_mm: Positive = 12.0
+    """Radius of the opening [mm]."""
+    rim_mm: Positive = 3.0
+    """Width over which the rim's hold on the brain grows from none to firm [mm]."""
+
+    @model_validator(mode="after")
+    def _direction_has_length(self) -> Craniotomy:
+        if self.direction is not None and not any(self.direction):
+            raise ValueError("direction has no length")
+        return self
+
+
+class Attachment(Section):
+    """A region in which tissue is held: falx, tentorium, an adhesion. The skull holds it in any case."""
+
+    point: Vector
+    """Its middle [mm], in the mesh's own axes; for the block, from the opening's centre with z outwards."""
+    radius_mm: Positive
+    """How far it reaches from its middle [mm]."""
+    normal: Vector | None = None
+    """Of a sheet (falx, tentorium) through the middle, in the same axes. Empty: a ball."""
+    thickness_mm: Positive = 3.0
+    """Thickness of a sheet [mm]."""
+    firm_per_mm: Positive = 2.0
+    """Traction per displacement as a multiple of E, per mm; the skull's is 2."""
+
+    @model_validator(mode="after")
+    def _normal_has_length(self) -> Attachment:
+        if self.normal is not None and not any(self.normal):
+            raise ValueError("normal has no length")
+        return self
+
+
+class Anatomy(Section):
+    """The brain: a procedural block, or a user's surface."""
+
+    mesh: Path | None = None
+    """Surface of a brain (OBJ, STL, PLY or VTK, mm); relative to the job file. Empty: procedural block."""
+    variety: Annotated[int, Field(ge=1)] | None = None
+    """Number of distinct anatomies in the dataset. Empty: every sequence has its own."""
+    block_mm: tuple[Positive, Positive, Positive] = (100.0, 100.0, 60.0)
+    """Procedural block: width, height, depth [mm]. Below 70 mm the fixed walls take 10-16% of the peak."""
+    dome_mm: Positive = 70.0
+    """Procedural block: radius of curvature of the brain surface [mm]."""
+    gyrus_mm: PositiveRange = (10.0, 15.0)
+    """Procedural relief: spacing of the gyri [mm]."""
+    sulcus_mm: NonNegativeRange = (0.6, 1.4)
+    """Procedural relief: depth of the sulci as seen from outside [mm]."""
+    vertices: Annotated[int, Field(ge=400, le=400_000)] = 40_000
+    """Vertices of the fine surface that is loaded, moved and rendered."""
+    craniotomy: Craniotomy = Craniotomy()
+    """Where the skull is open."""
+    attachments: tuple[Attachment, ...] = ()
+    """Regions in which the tissue is held inside, such as the falx: a list of {point, radius_mm, normal,
+    thickness_mm, firm_per_mm}, normal for a sheet. Empty: the skull alone holds it."""
+
+    @model_validator(mode="after")
+    def _mesh_is_placed(self) -> Anatomy:
+        if self.mesh is not None and (self.craniotomy.point is None or self.craniotomy.direction is None):
+            raise ValueError("a mesh needs craniotomy.point and craniotomy.direction")
+        return self
+
+
+Family = Literal["healthy", "hyperaemic", "pale", "oedematous", "calf"]
+
+
+class Appearance(Section):
+    """How the surface looks."""
+
+    families: tuple[Family, ...] = ("healthy",)
+    """Appearance families that sequences are drawn from, in equal shares."""
+    photo: Path | None = None
+    """A photograph used as albedo, relative to the job file. Empty: procedural vessels and parenchyma."""
+    cottonoid: Share = 0.2
+    """Share of sequences with a cotton patty on the rim."""
+    blood: ShareRange | None = None
+    """Blood on the rim, from none (0) to soaked (1). Empty: as the family has it."""
+
+
+class Fem(Section):
+    """The physics of the tissue and of the load."""
+
+    law: Literal["auto", "linear", "corotational", "stable", "neo-hookean"] = "auto"
+    """Material law; auto takes the cheapest whose error at the largest load is within `tolerance`."""
+    tolerance: Annotated[FiniteFloat, Field(gt=0, le=1)] = 0.05
+    """Error against neo-Hookean that `law: auto` accepts, as a part of the displacement."""
+    order: Literal[1, 2] = 2
+    """Polynomial order of the tetrahedra."""
+    tets: Annotated[int, Field(ge=100, le=200_000)] = 1600
+    """Number of tetrahedra to aim for; graded towards the craniotomy."""
+    young_kpa: PositiveRange = (0.5, 3.0)
+    """Young's modulus E [kPa], drawn log-uniformly."""
+    poisson: Annotated[FiniteFloat, Field(ge=0, lt=0.5)] = 0.4
+    """Poisson's ratio."""
+    load: PositiveRange = (0.05, 0.4)
+    """Peak load as P = F/(E a^2), dimensionless, so that one range suits every stiffness."""
+    force_mn: PositiveRange | None = None
+    """Peak force of a contact [mN]; given, it takes the place of `load`."""
+    footprint_mm: PositiveRange = (3.0, 6.0)
+    """Radius a of the contact [mm]."""
+    gestures: Annotated[
+        tuple[Literal["pull", "push", "slide", "grasp", "retract", "tap"], ...], Field(min_length=1)
+    ] = ("pull", "push", "slide", "grasp", "retract", "tap")
+    """Kinds of gesture that sequences are drawn from, in equal shares."""
+    instruments: InstrumentRange = (1, 1)
+    """How many instruments act at once, each with a gesture, load, direction and timing of its own."""
+    ramp: PositiveRange = (0.25, 0.35)
+    """Time in which the load grows to its peak, as a part of the sequence."""
+    cone_deg: Annotated[FiniteFloat, Field(ge=0, le=80)] = 65.0
+    """The load's direction is drawn uniformly within this angle of the surface normal."""
+    time: Literal["quasi-static", "dynamic"] = "quasi-static"
+    """Equilibrium in every frame, or motion with inertia (backward Euler)."""
+    dt_s: Annotated[FiniteFloat, Field(gt=0, le=1)] = 0.03
+    """Dynamic: longest time step [s]; a frame holds a whole number of steps."""
+    mass_kg: Positive = 1.0
+    """Dynamic: mass of the whole brain [kg]."""
+    damping: NonNegative = 2.0
+    """Dynamic: damping by mass [1/s]."""
+    relaxation: Annotated[
+        tuple[tuple[Annotated[FiniteFloat, Field(gt=0, lt=1)], Positive], ...], Field(max_length=2)
+    ] = ()
+    """Prony terms [part of the stiffness lost, time in s], one or two: E is then that of a sudden load."""
+
+    @model_validator(mode="after")
+    def _some_stiffness_stays(self) -> Fem:
+        if sum(part for part, _ in self.relaxation) >= 1:
+            raise ValueError("relaxation: the parts lost add up to the whole stiffness or more")
+        return self
+
+    @model_validator(mode="after")
+    def _load_is_in_the_laws_range(self) -> Fem:
+        load = self.largest_load
+        law, _ = choose(self.law, load, self.tolerance)
+        largest = LARGEST_LOAD[law]
+        if self.force_mn is None and load > largest:
+            raise ValueError(
+                f"load {load:g} is past the range of the {law} law; the largest valid value is {largest:g}"
+            )
+        if self.force_mn is not None and load > largest * (1 + 1e-9):
+            young, radius = self.young_kpa[0], self.footprint_mm[0]
+            raise ValueError(
+                f"force_mn {self.force_mn[1]:g} on the softest tissue ({young:g} kPa) under the smallest "
+                f"contact ({radius:g} mm) is a load of {load:.3g}, past the range of the {law} law; "
+                f"the largest valid value is {largest * young * radius**2:.4g}"
+            )
+        return self
+
+    @property
+    def largest_load(self) -> float:
+        """Largest P = F/(E a^2) that can be drawn."""
+        if self.force_mn is None:
+            return self.load[1]
+        return self.force_mn[1] / (self.young_kpa[0] * self.footprint_mm[0] ** 2)
+
+
+def _estimator(name: str) -> str:
+    known = ("ideal", *names())
+    if name not in known:
+        raise ValueError(f"there is no estimator {name!r}; there are {', '.join(known)}")
+    return name
+
+
+class Flow(Section):
+    """Recovering displacement from the video."""
+
+    backend: Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]+$"), AfterValidator(_estimator)] = "tvl1"
+    """Estimator: tvl1, opencv-tvl1, dis or an installed plug-in's; `ideal` computes no recovered flow."""
+    warps: Annotated[int, Field(ge=1, le=12)] = 3
+    """tvl1: linearisations a level of a frame that starts from the one before; twice as many from nothing."""
+
+
+def _known(names: tuple[str, ...], known: tuple[str, ...]) -> tuple[str, ...]:
+    strangers = [name for name in names if name not in known]
+    if strangers:
+        raise ValueError(
+            f"{', '.join(strangers)}: not among {', '.join(known) or 'any (there are none yet)'}"
+        )
+    return names
+
+
+class Store(Section):
+    """What is kept of every sequence. `synth fields` lists the fields and what they take."""
+
+    extra: Annotated[tuple[str, ...], AfterValidator(lambda names: _known(names, fields.EXTRA))] = ()
+    """Fields to keep besides the usual ones."""
+    without: Annotated[tuple[str, ...], AfterValidator(lambda names: _known(names, fields.SPARED))] = ()
+    """Fields to leave out, of those that can be spared: depth, flow_confidence."""
+    flow: Literal["float32", "float16"] = "float32"
+    """Type of both flows stored; float16 rounds motion below 16 px by at most 0.004 px, below 32 by 0.008."""
+
+
+class Labels(Section):
+    """Noise of the published method, in the fields `intensity` and `flow_noisy` alone; see `store.extra`."""
+
+    force_std_mn: NonNegative = 0.0
+    """First stage, on every label: standard deviation [mN] of its normal noise."""
+    force_share: NonNegative = 0.0
+    """The same as a part of the label's size, added to it."""
+    force_bias_mn: FiniteFloat = 0.0
+    """Added to every component of every label [mN]."""
+    outliers: Share = 0.0
+    """Part of the labels whose noise is `outlier_scale` times larger."""
+    outlier_scale: Positive = 10.0
+    """How much larger."""
+    noisy_frames: Share = 0.3
+    """Second stage: part of the frames that it disturbs."""
+    noisy_points: Share = 0.05
+    """Part of the tissue's pixels, away from the contact, that get displacement of their own and label 0."""
+    noisy_range: Share = 0.05
+    """That displacement's largest size, as a part of the frame's range of displacement."""
+
+
+class Card(Section):
+    """What a person says of the dataset, for its card. Changes no sequence."""
+
+    title: str = "Synthetic neurosurgical sequences with ground-truth force"
+    """Name of the dataset."""
+    summary: str | None = None
+    """What it was made for, in your words."""
+    licence: str | None = None
+    """Licence under which you share it, as an SPDX name (cc-by-4.0). Empty: none is given."""
+    authors: tuple[str, ...] = ()
+    """Who made it."""
+    contact: str | None = None
+    """Where questions go."""
+    url: str | None = None
+    """Where the dataset is to be found."""
+    published: Annotated[str, Field(pattern=r"^\d{4}-\d{2}-\d{2}$")] | None = None
+    """Date of publication, in quotes: "2027-01-31"."""
+
+
+class Job(Section):
+    """One dataset."""
+
+    seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
+    """Root of every random draw. Same job, same bytes."""
+    sequences: Annotated[int, Field(ge=1, le=1_000_000)] = 24
+    """Number of sequences."""
+    frames: Annotated[int, Field(ge=2, le=10_000)] = 24
+    """Frames a sequence; frame 0 is the rest frame."""
+    fps: Positive = 25.0
+    """Frames a second of the recorded video."""
+    anatomy: Anatomy = Anatomy()
+    appearance: Appearance = Appearance()
+    light: Light = Light()
+    sensor: Sensor = Sensor()
+    fem: Fem = Fem()
+    render: Render = Render()
+    flow: Flow = Flow()
+    store: Store = Store()
+    labels: Labels = Labels()
+    card: Card = Card()
+
+    @model_validator(mode="after")
+    def _second_lens_exists(self) -> Job:
+        asked = [name for name in self.store.extra if name.endswith("_right")]
+        if asked and self.render.stereo_mm == 0:
+            raise ValueError(f"store.extra: {asked[0]} needs a second lens; set render.stereo_mm")
+        return self
+
+    @property
+    def kept_fields(self) -> tuple[str, ...]:
+        """Names of the fields that its sequences hold."""
+        recovered = self.flow.backend != "ideal"
+        return fields.kept(self.store.extra, self.store.without, recovered=recovered)

@@ -1,0 +1,119 @@
+"""Writing a job: a fully commented file from the schema, its JSON schema, and the job of a dataset."""
+
+from __future__ import annotations
+
+import io
+import json
+import textwrap
+import typing
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import BaseModel
+from ruamel.yaml import YAML
+
+from synth.job import reader
+from synth.job.schema import Job
+
+_WIDTH = 100
+
+
+def commented(job: Job | None = None) -> str:
+    """A job file with every key, its meaning and its range, and the values of `job` (default: the defaults).
+
+    Reading it back gives the same job.
+    """
+    job = job or Job()
+    lines = [
+        "# A job: everything a dataset depends on. Every key may be left out; these are the defaults.",
+        "# Render it:            synth render THIS_FILE -o OUT",
+        "# Change it in passing: synth render THIS_FILE -o OUT render.spp=8 sequences=100",
+        "# Help in editors:      synth schema > job.schema.json",
+        "# yaml-language-server: $schema=job.schema.json",
+        "",
+    ]
+    lines += _section(job, "")
+    return "\n".join(lines).rstrip() + "\n"
+
+
+def schema() -> dict[str, Any]:
+    """JSON schema of a job file, for editors."""
+    described = Job.model_json_schema()
+    described["$schema"] = "https://json-schema.org/draft/2020-12/schema"
+    return described
+
+
+def dump(job: Job) -> str:
+    """The job as a plain YAML file: what a dataset keeps of it."""
+    out = io.StringIO()
+    writer = YAML(typ="safe")
+    writer.default_flow_style = None
+    writer.sort_base_mapping_type_on_output = False  # type: ignore[assignment]
+    writer.dump(job.model_dump(mode="json"), out)
+    return out.getvalue()
+
+
+def _section(section: BaseModel, indent: str) -> list[str]:
+    lines: list[str] = []
+    for name, field in type(section).model_fields.items():
+        value = getattr(section, name)
+        inner = reader.section(field.annotation)
+        text = field.description or (inner.__doc__ if inner else "") or ""
+        allowed = "" if inner else limits(field.annotation, field.metadata)
+        comment = " ".join([*text.split(), allowed]).strip()
+        if inner is not None and lines and lines[-1]:
+            lines.append("")
+        lines += textwrap.wrap(comment, _WIDTH, initial_indent=f"{indent}# ", subsequent_indent=f"{indent}# ")
+        if isinstance(value, BaseModel):
+            lines += [f"{indent}{name}:", *_section(value, indent + "  ")]
+        else:
+            lines.append(f"{indent}{name}: {scalar(value)}".rstrip())
+    return lines
+
+
+def limits(annotation: Any, metadata: list[Any]) -> str:
+    """What a key may hold, in words: "(> 0)", "(linear | stable)"; empty where anything goes."""
+    choices = _choices(annotation)
+    if choices:
+        return f"({' | '.join(choices)})"
+    bounds = {}
+    for one in _metadata(annotation, metadata):
+        for name, sign in (("gt", ">"), ("ge", ">="), ("lt", "<"), ("le", "<=")):
+            limit = getattr(one, name, None)
+            if limit is not None and abs(limit) < 1e9:
+                bounds[name] = f"{sign} {limit:.12g}"
+    return f"({', '.join(bounds.values())})" if bounds else ""
+
+
+def _choices(annotation: Any) -> list[str]:
+    if typing.get_origin(annotation) is Literal:
+        return [str(choice) for choice in typing.get_args(annotation)]
+    return [choice for inner in typing.get_args(annotation)[:1] for choice in _choices(inner)]
+
+
+def _metadata(annotation: Any, metadata: list[Any]) -> list[Any]:
+    found = list(metadata)
+    for one in metadata:
+        found += list(getattr(one, "metadata", []))
+    if typing.get_origin(annotation) is tuple:
+        inner = typing.get_args(annotation)[0]
+        found += list(getattr(inner, "__metadata__", ()))
+        for one in getattr(inner, "__metadata__", ()):
+            found += list(getattr(one, "metadata", []))
+    elif annotation is not None:
+        for inner in typing.get_args(annotation):
+            found += list(getattr(inner, "__metadata__", ()))
+    return found
+
+
+def scalar(value: Any) -> str:
+    """A value as YAML in one line; empty for none."""
+    if value is None:
+        return ""
+    if isinstance(value, Path) or (isinstance(value, str) and not value.replace("-", "_").isidentifier()):
+        return json.dumps(str(value), ensure_ascii=False)
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, tuple):
+        return f"[{', '.join(scalar(item) for item in value)}]"
+    return str(value)

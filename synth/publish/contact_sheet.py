@@ -1,0 +1,96 @@
+"""A contact sheet of a job: one small frame of some of its scenarios, to judge it before paying for it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from synth.dataset import size_forecast
+from synth.fem.tool import Gesture
+from synth.job.schema import Job
+from synth.render.anatomy.surface import Surface
+from synth.render.camera import camera
+from synth.render.scene import Studio
+from synth.sequence import pipeline, scenario
+from synth.system.stopwatch import Stopwatch
+
+_TILE_PX = 320
+_OPENING_MM = 1.0  # two tips closer than this would be one
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """What a job looks like and what it will take."""
+
+    picture: NDArray[np.uint8]
+    """(H, W, 3)."""
+    render_cpu_s: float
+    """Rendering the whole job; physics and recovered flow come on top."""
+    disk_bytes: float
+    """The whole dataset."""
+
+
+def make(job: Job, count: int) -> Sheet:
+    """Draws `count` scenarios spread over the job, each in the moment before its load.
+
+    Nothing is deformed: the sheet shows anatomy, appearance, light, view and instrument.
+
+    Raises:
+        UserError: the job cannot be carried out.
+    """
+    chosen = np.unique(np.linspace(0, job.sequences - 1, count).round().astype(int))
+    width, height = job.render.size
+    scale = min(1.0, _TILE_PX / width)
+    small = (max(16, round(width * scale)), max(16, round(height * scale)))
+    quick = job.model_copy(
+        update={
+            "render": job.render.model_copy(update={"size": small}),
+            "anatomy": job.anatomy.model_copy(update={"vertices": min(job.anatomy.vertices, 20_000)}),
+        }
+    )
+    tiles = [_frame(quick, int(index), 1)[0] for index in chosen]
+    columns = int(np.ceil(np.sqrt(len(tiles))))
+    tiles += [np.zeros_like(tiles[0])] * (-len(tiles) % columns)
+    rows = [np.hstack(tiles[k : k + columns]) for k in range(0, len(tiles), columns)]
+    # The second frame of a scene costs what all later ones will.
+    each = _frame(job, int(chosen[0]), 2)[1]
+    return Sheet(
+        picture=np.vstack(rows),
+        render_cpu_s=each * job.frames * job.sequences,
+        disk_bytes=size_forecast.estimate(job) * job.sequences,
+    )
+
+
+def _frame(job: Job, index: int, repeats: int) -> tuple[NDArray[np.uint8], float]:
+    """A scenario's picture and the CPU time [s] of the last of `repeats`."""
+    case = scenario.draw(job, index)
+    surface, _ = pipeline.cortex(job, case)
+    view, gestures = camera.place(case.view, job.render), case.gestures
+    studio = Studio(surface, case.look, view, job, [gesture.kind for gesture in gestures])
+    poised = [_poised(gesture, surface) for gesture in gestures]
+    tips, shafts = (np.concatenate(part) for part in zip(*poised, strict=True))
+    seed = scenario.frame_seeds(job, index)[0]
+    for _ in range(repeats):
+        watch = Stopwatch()
+        with watch.stage("frame"):
+            shot = studio.frame(surface.vertices, tips, shafts, seed)
+        spent = watch.cpu_s("frame")
+    label = f"{index}  {case.family}  {case.gesture.kind}"
+    place, font = (6, job.render.size[1] - 8), cv2.FONT_HERSHEY_SIMPLEX
+    for colour, thick in (((0, 0, 0), 3), ((255, 255, 255), 1)):
+        cv2.putText(shot.rgb, label, place, font, 0.4, colour, thick, cv2.LINE_AA)
+    return shot.rgb, spent
+
+
+def _poised(gesture: Gesture, surface: Surface) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Tips (2, 3) mm on the surface where the gesture begins, and shafts (2, 3)."""
+    azimuth, rise = np.deg2rad([gesture.azimuth_deg, gesture.elevation_deg])
+    shaft = np.array([np.cos(azimuth) * np.cos(rise), np.sin(azimuth) * np.cos(rise), np.sin(rise)])
+    side = 0.5 * max(gesture.spread_mm, _OPENING_MM) * np.array([-np.sin(azimuth), np.cos(azimuth)])
+    flat = np.asarray(gesture.point_mm) + np.stack([side, -side])
+    height = surface.vertices[cKDTree(surface.vertices[:, :2]).query(flat)[1], 2]
+    return np.concatenate([flat, height[:, None]], axis=1), np.stack([shaft, shaft])

@@ -1,0 +1,1 @@
+"""The exposed cortex: relief, vessels, texture and the rim around the opening."""

@@ -1,0 +1,207 @@
+"""The exposed cortex: relief, vessels and the fine surface that is loaded, moved and rendered.
+
+The surface is a height field over the opening and a margin under its rim: arachnoid bridges the sulci, and
+what lies deeper is never seen.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+from scipy.ndimage import distance_transform_edt
+
+from synth.errors import UserError
+from synth.job import schema
+from synth.render.anatomy import noise, tube, vessels
+from synth.render.anatomy.tree import Tree
+from synth.render.anatomy.vessels import Vessels
+
+Floats = npt.NDArray[np.float64]
+Map = npt.NDArray[np.float32]
+
+_MARGIN_MM = 5.0  # reach under the rim: no drawn tilt or pull shows the patch's edge
+_RELIEF_PX = 512
+_BULGE_PX = 1024
+
+
+@dataclass(frozen=True)
+class Relief:
+    """What is drawn for one anatomy."""
+
+    seed: int
+    """Seed of the folds, vessels and stains."""
+    gyrus_mm: float
+    """Spacing of the gyri."""
+    sulcus_mm: float
+    """Depth of the sulci as seen from outside."""
+
+    @classmethod
+    def draw(cls, anatomy: schema.Anatomy, rng: np.random.Generator) -> Relief:
+        return cls(
+            seed=int(rng.integers(2**31)),
+            gyrus_mm=float(rng.uniform(*anatomy.gyrus_mm)),
+            sulcus_mm=float(rng.uniform(*anatomy.sulcus_mm)),
+        )
+
+
+@dataclass(frozen=True)
+class Surface:
+    """The fine surface at rest, in world axes, and what is on it."""
+
+    vertices: Floats
+    """(V, 3) mm."""
+    faces: npt.NDArray[np.int32]
+    """(F, 3), counter-clockwise seen from outside."""
+    uv: npt.NDArray[np.float32]
+    """(V, 2): world x, y over `extent_mm`, from 0 to 1."""
+    extent_mm: float
+    """Side of the square patch."""
+    sulci: Map
+    """(n, n) 0 on the crown of a gyrus to 1 in a sulcus."""
+    vessels: Vessels
+    seed: int
+    """Seed of everything else that belongs to this anatomy."""
+
+
+def procedural(relief: Relief, anatomy: schema.Anatomy) -> Surface:
+    """A cortex of winding gyri on a dome, with veins that stand out of it."""
+    extent = _extent(anatomy)
+    sulci = _folds(relief, extent)
+    return _surface(
+        lambda xy: _dome(xy, anatomy.dome_mm) - relief.sulcus_mm * noise.sample(sulci, xy, extent),
+        sulci,
+        relief,
+        anatomy,
+        extent,
+    )
+
+
+def from_brain(
+    vertices: Floats, faces: npt.NDArray[np.int32], relief: Relief, anatomy: schema.Anatomy
+) -> Surface:
+    """The part of a user's brain under the opening, seen from outside.
+
+    Args:
+        vertices: (V, 3) mm, world axes (z out of the brain, origin at the craniotomy's centre).
+        faces: (F, 3); any winding, holes and duplicates allowed.
+        relief: what the job drew; the user's own folds stand in for its relief.
+        anatomy: the job's section.
+
+    Raises:
+        UserError: there is no surface under the opening.
+    """
+    extent = _extent(anatomy)
+    height = _height_map(vertices, faces, extent, _RELIEF_PX // 2)
+    if np.isnan(height).mean() > 0.35:
+        raise UserError("anatomy.craniotomy: the brain's surface does not fill the opening there")
+    height = _filled(height)
+    # The arachnoid bridges what is narrower than itself: a closing, then a smoothing.
+    pixel = extent / len(height)
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * int(2.0 / pixel) + 1,) * 2)
+    bridged = cv2.morphologyEx(height, cv2.MORPH_CLOSE, disc)
+    outer = noise.blur(np.maximum(height, bridged - relief.sulcus_mm), 0.7, extent)
+    depth = noise.blur(outer, 4.0, extent) - outer
+    sulci = np.clip(depth / max(float(np.quantile(depth, 0.98)), 1e-6), 0, 1).astype(np.float32)
+    return _surface(lambda xy: noise.sample(outer, xy, extent), sulci, relief, anatomy, extent)
+
+
+def bulge(tree: Tree, extent_mm: float) -> Map:
+    """Height of vessels above the pia, (n, n) mm: half sunk round tubes with soft shoulders."""
+    distance, radius = tube.raster(tree, _BULGE_PX, extent_mm)
+    inside = np.sqrt(np.maximum(radius**2 - distance**2, 0)) * 0.75
+    return noise.blur(inside.astype(np.float32), 0.14, extent_mm)
+
+
+def _extent(anatomy: schema.Anatomy) -> float:
+    return 2 * (anatomy.craniotomy.radius_mm + _MARGIN_MM)
+
+
+def _dome(xy: Floats, radius: float) -> Floats:
+    return np.asarray(np.sqrt(np.maximum(radius**2 - (xy**2).sum(axis=1), 0)) - radius)
+
+
+def _folds(relief: Relief, extent_mm: float) -> Map:
+    """Sulci (n, n) from 0 to 1: the zero lines of band-passed noise, each about a gyrus from the next."""
+    rng = np.random.default_rng([relief.seed, 0])
+    # Zero lines of noise lie half a wavelength apart.
+    waves = noise.band(rng, _RELIEF_PX, extent_mm, 2 * relief.gyrus_mm, 0.22)
+    waves = waves + 0.12 * noise.band(rng, _RELIEF_PX, extent_mm, 0.7 * relief.gyrus_mm, 0.3)
+    pixel = extent_mm / _RELIEF_PX
+    slope = np.hypot(*np.gradient(waves, pixel))
+    away = np.abs(waves) / np.maximum(noise.blur(slope.astype(np.float32), 1.0, extent_mm), 1e-3)
+    valley = np.exp(-0.5 * (away / 0.9) ** 2) * 0.4 + np.exp(-0.5 * (away / 3.6) ** 2) * 0.6
+    fade = np.clip(0.5 + 0.45 * noise.band(rng, _RELIEF_PX, extent_mm, 1.6 * relief.gyrus_mm, 0.3), 0.25, 1.0)
+    return noise.blur((valley * fade).astype(np.float32), 0.25, extent_mm)
+
+
+def _surface(
+    height: Callable[[Floats], npt.NDArray[np.floating]],
+    sulci: Map,
+    relief: Relief,
+    anatomy: schema.Anatomy,
+    extent: float,
+) -> Surface:
+    rng = np.random.default_rng([relief.seed, 1])
+    tree = vessels.grow_all(sulci, extent, rng)
+    side = max(20, round(anatomy.vertices**0.5))
+    axis = np.linspace(-extent / 2, extent / 2, side)
+    x, y = np.meshgrid(axis, axis)
+    xy = np.stack([x.ravel(), y.ravel()], axis=1)
+    z = height(xy).astype(np.float64) + noise.sample(bulge(tree.veins, extent), xy, extent)
+    return Surface(
+        vertices=np.concatenate([xy, z[:, None]], axis=1),
+        faces=_grid_faces(side),
+        uv=(xy / extent + 0.5).astype(np.float32),
+        extent_mm=extent,
+        sulci=sulci,
+        vessels=tree,
+        seed=relief.seed,
+    )
+
+
+def _grid_faces(side: int) -> npt.NDArray[np.int32]:
+    corner = (np.arange(side - 1)[:, None] * side + np.arange(side - 1)[None]).ravel()
+    right, below, across = corner + 1, corner + side, corner + side + 1
+    faces = np.concatenate([np.stack([corner, right, across], 1), np.stack([corner, across, below], 1)])
+    return faces.astype(np.int32)
+
+
+def _height_map(vertices: Floats, faces: npt.NDArray[np.int32], extent: float, pixels: int) -> Map:
+    """Highest point of the surface over each pixel, (n, n) mm; NaN where there is none."""
+    scale = pixels / extent
+    flat = (vertices[:, :2] / extent + 0.5) * pixels - 0.5
+    corners = flat[faces]
+    low = np.ceil(corners.min(axis=1)).astype(np.int64)
+    high = np.floor(corners.max(axis=1)).astype(np.int64)
+    near = ((high >= 0) & (low < pixels) & (high >= low)).all(axis=1)
+    # Only what faces the opening: the far side of the brain and its base lie deeper than any sulcus.
+    near &= vertices[faces][:, :, 2].max(axis=1) > -0.75 * extent
+    height = np.full((pixels, pixels), np.nan, np.float32)
+    for face in np.flatnonzero(near):
+        (x0, y0), (x1, y1) = np.clip(low[face], 0, None), np.clip(high[face], None, pixels - 1)
+        a, b, c = corners[face]
+        area = (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
+        if abs(area) < 1e-9 * scale:
+            continue
+        x, y = np.meshgrid(np.arange(x0, x1 + 1), np.arange(y0, y1 + 1))
+        u = ((x - a[0]) * (c[1] - a[1]) - (y - a[1]) * (c[0] - a[0])) / area
+        v = ((b[0] - a[0]) * (y - a[1]) - (b[1] - a[1]) * (x - a[0])) / area
+        inside = (u >= -1e-9) & (v >= -1e-9) & (u + v <= 1 + 1e-9)
+        za, zb, zc = vertices[faces[face], 2]
+        z = np.where(inside, za + u * (zb - za) + v * (zc - za), np.nan)
+        window = height[y0 : y1 + 1, x0 : x1 + 1]
+        height[y0 : y1 + 1, x0 : x1 + 1] = np.fmax(window, z)
+    return height
+
+
+def _filled(height: Map) -> Map:
+    """Holes take the height of the nearest pixel that has one."""
+    hole = np.isnan(height)
+    if not hole.any():
+        return height
+    row, column = distance_transform_edt(hole, return_distances=False, return_indices=True)
+    return np.asarray(height[row, column], np.float32)

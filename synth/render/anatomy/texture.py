@@ -1,0 +1,204 @@
+"""Colour and microstructure of the cortex as maps over its patch."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from synth.errors import UserError
+from synth.render.anatomy import noise, tube
+from synth.render.anatomy.surface import Surface
+from synth.render.appearance.family import Colour
+from synth.render.appearance.look import Look
+from synth.render.mitsuba.adapter import Wet
+
+Map = npt.NDArray[np.float32]
+Floats = npt.NDArray[np.float64]
+
+# Light lost in a millimetre of vessel, red, green, blue: blood seen through its wall, by eye on photographs.
+_ARTERIAL = np.array([0.38, 8.0, 9.6], np.float32)
+_TEXELS_A_PIXEL = 2.2
+
+
+@dataclass(frozen=True)
+class Coat:
+    """What one body of wet tissue looks like."""
+
+    albedo: Map
+    """(n, n, 3) linear."""
+    normal: Map
+    """(n, n, 3)."""
+    dry: Map
+    """(m, m) share of the surface that has no film."""
+
+    def wet(self, roughness: float, dry_roughness: float, ambient: Colour, index: float = 1.33) -> Wet:
+        """As a material."""
+        return Wet(self.albedo, self.normal, self.dry, roughness, dry_roughness, index, ambient)
+
+
+def resolution(extent_mm: float, mm_per_px: float) -> int:
+    """Side of a map fine enough for the picture, and no finer."""
+    return int(np.clip(64 * round(extent_mm / mm_per_px * _TEXELS_A_PIXEL / 64), 128, 4096))
+
+
+def cortex(surface: Surface, look: Look, pixels: int, photo: Path | None, shade: Map | None = None) -> Coat:
+    """Parenchyma, vessels and wet film over the surface's patch.
+
+    Args:
+        surface: the cortex.
+        look: its appearance.
+        pixels: side of the maps.
+        photo: a picture that takes the place of the painted albedo.
+        shade: (m, m) share of light that reaches the surface past what frames it; all of it if not given.
+
+    Raises:
+        UserError: the photograph cannot be read.
+    """
+    extent = surface.extent_mm
+    rng = np.random.default_rng([surface.seed, 2])
+    tubes = {
+        name: tube.raster(getattr(surface.vessels, name), pixels, extent)
+        for name in ("veins", "arteries", "capillaries")
+    }
+    sulci = cv2.resize(surface.sulci, (pixels, pixels), interpolation=cv2.INTER_LINEAR)
+    albedo = _photograph(photo, pixels) if photo else _painted(rng, look, sulci, tubes, pixels, extent)
+    if shade is not None:
+        albedo = albedo * cv2.resize(shade, (pixels, pixels))[..., None] ** np.array(
+            [0.7, 1.0, 1.0], np.float32
+        )
+    height, dry = _film(rng, look, tubes, sulci, pixels, extent)
+    return Coat(albedo, normals(height, extent), dry)
+
+
+def normals(height: Map, extent_mm: float) -> Map:
+    """Unit normals (n, n, 3) of a height map (n, n) mm."""
+    pixel = extent_mm / height.shape[0]
+    dx = cv2.Sobel(height, cv2.CV_32F, 1, 0, ksize=3, scale=1 / (8 * pixel))
+    dy = cv2.Sobel(height, cv2.CV_32F, 0, 1, ksize=3, scale=1 / (8 * pixel))
+    length = np.sqrt(1 + dx * dx + dy * dy)
+    return np.stack([-dx / length, -dy / length, 1 / length], axis=-1).astype(np.float32)
+
+
+def thickness(tube: tuple[Map, Map]) -> Map:
+    """Chord through a round vessel, seen from above, (n, n) mm, of its distance and radius maps."""
+    distance, radius = tube
+    return np.asarray(2 * np.sqrt(np.maximum(radius**2 - distance**2, 0)), np.float32)
+
+
+def _painted(
+    rng: np.random.Generator,
+    look: Look,
+    sulci: Map,
+    tubes: dict[str, tuple[Map, Map]],
+    pixels: int,
+    extent: float,
+) -> Map:
+    coarse = 256
+    wide = noise.fractal(rng, coarse, extent, 12.0, 2.4)
+    mottle = noise.fractal(rng, coarse, extent, 3.0, 1.3)
+    share = np.clip(0.62 + 0.42 * wide + 0.04 * mottle, 0, 1)
+    share = cv2.resize(share, (pixels, pixels), interpolation=cv2.INTER_CUBIC)[..., None]
+    albedo = np.asarray(look.crown, np.float32) * share + np.asarray(look.flush, np.float32) * (1 - share)
+    grain = noise.fractal(rng, pixels, extent, 0.35, 1.2)
+    albedo = albedo * (1 + look.grain * grain[..., None] * np.array([0.5, 1.0, 1.2], np.float32))
+    # Blood in the pia: more of it in the sulci and beside arteries.
+    arterial = thickness(tubes["arteries"])
+    beside = noise.blur(arterial, 0.7, extent) + noise.blur(thickness(tubes["veins"]), 1.1, extent)
+    blush = look.blush * (0.04 + 0.3 * sulci) + (0.25 + 0.9 * sulci) * beside
+    blush = blush * np.clip(1 + 0.3 * cv2.resize(mottle, (pixels, pixels)), 0.2, 2)
+    albedo = albedo * np.exp(-blush[..., None] * np.array([0.16, 1.0, 1.0], np.float32))
+    albedo = albedo * (1 - look.shade * sulci[..., None] * np.array([0.35, 0.5, 0.42], np.float32))
+    albedo = _arterial(albedo, tubes, look, cv2.resize(wide, (pixels, pixels)))
+    albedo = _veined(rng, albedo, tubes["veins"], look, extent)
+    # Light that enters tissue leaves it nearby, red farthest: a blur stands in for the volume.
+    for channel, width in enumerate((0.055, 0.032, 0.026)):
+        albedo[..., channel] = noise.blur(np.ascontiguousarray(albedo[..., channel]), width, extent)
+    return np.asarray(np.clip(albedo, 0.01, 0.95), np.float32)
+
+
+def _arterial(albedo: Map, tubes: dict[str, tuple[Map, Map]], look: Look, wide: Map) -> Map:
+    arterial = thickness(tubes["arteries"])
+    # Even the finest stop much of the green: blood is nearly opaque to it within a tenth of a millimetre.
+    reach = 0.30 * (1 - np.exp(-arterial / 0.16)) + 0.08 * arterial
+    blood = look.arterial * reach + look.capillary * 0.9 * thickness(tubes["capillaries"])
+    fade = np.clip(0.95 + 0.25 * wide, 0.4, 1.2)
+    red = albedo * np.exp(-(blood * fade)[..., None] * _ARTERIAL)
+    # The wall of a wide one scatters a little light of its own along its crest.
+    distance, radius = tubes["arteries"]
+    crest = np.exp(-((distance / np.maximum(0.55 * radius, 1e-3)) ** 2)) * np.clip((radius - 0.2) / 0.2, 0, 1)
+    wall = np.array([0.62, 0.16, 0.14], np.float32)
+    return np.asarray(red + (0.4 * crest)[..., None] * (wall - red), np.float32)
+
+
+def _veined(rng: np.random.Generator, albedo: Map, tube: tuple[Map, Map], look: Look, extent: float) -> Map:
+    """Veins: wine red where thin or seen at their sides, slate along the crest, here more and there less."""
+    distance, radius = tube
+    pixels = len(albedo)
+    across = np.clip(distance / np.maximum(radius, 1e-3), 0, 1)
+    thick = np.clip((radius - 0.12) / 0.3, 0, 1)
+    along = cv2.resize(noise.band(rng, 256, extent, 9.0, 0.6), (pixels, pixels))
+    slate = np.clip(0.55 + 0.4 * along, 0.08, 1) * thick * np.exp(-((across / 0.55) ** 2))
+    streak = cv2.resize(noise.fractal(rng, 1024, extent, 1.5, 1.0), (pixels, pixels))
+    slate = np.clip(slate * (1 + 0.12 * streak), 0, 1)[..., None]
+    thin = np.array([0.50, 0.13, 0.15], np.float32) + 0.06 * along[..., None]
+    wine = np.asarray(look.wine, np.float32) * thick[..., None] + thin * (1 - thick[..., None])
+    wall = np.asarray(look.vein, np.float32) * slate + wine * (1 - slate)
+    cover = noise.blur(np.clip((1 - across**2) * 2.2, 0, 1).astype(np.float32), 0.05, extent)[..., None]
+    halo = noise.blur(((across < 1) * thick).astype(np.float32), 0.45, extent)[..., None]
+    soft = albedo * np.exp(-0.8 * halo * np.array([0.45, 1.0, 0.75], np.float32))
+    # Not every stretch lies on the surface: some shimmer through the arachnoid.
+    depth = cv2.resize(noise.band(rng, 256, extent, 7.0, 0.6), (pixels, pixels))
+    cover = cover * np.clip(0.9 + 0.15 * depth, 0.5, 0.97)[..., None]
+    return np.asarray(soft * (1 - cover) + wall * cover, np.float32)
+
+
+def _film(
+    rng: np.random.Generator,
+    look: Look,
+    tubes: dict[str, tuple[Map, Map]],
+    sulci: Map,
+    pixels: int,
+    extent: float,
+) -> tuple[Map, Map]:
+    """Height of the wet surface above the mesh, and where its film is thin, 0 to 1.
+
+    The film evens out what is finer than itself; it gathers in sulci and leaves crowns and veins bare.
+    """
+    coarse = 512
+
+    def fine(image: Map) -> Map:
+        return np.asarray(cv2.resize(image, (pixels, pixels), interpolation=cv2.INTER_CUBIC), np.float32)
+
+    relief = 0.2 * thickness(tubes["arteries"]) + 0.15 * thickness(tubes["capillaries"])
+    relief = noise.blur(relief, look.film_mm, extent)
+    pools = noise.fractal(rng, coarse, extent, 5.0, 1.5)
+    dry = np.clip(0.35 + 0.45 * pools - 0.5 * cv2.resize(sulci, (coarse, coarse)), 0.05, 1.0)
+    swell = fine(noise.band(rng, coarse, extent, 2.4, 0.5) * 0.0065)
+    rough = fine(noise.band(rng, coarse, extent, 0.6, 0.5) * 0.0050)
+    # The mesh of fibres round a vein makes a string of sparks of its crest's highlight.
+    distance, radius = tubes["veins"]
+    on_vein = noise.blur((distance < radius).astype(np.float32), 0.1, extent)
+    strings = noise.band(rng, pixels, extent, 0.34, 0.4) * 0.0042
+    height = relief + look.bump * (swell + fine(dry) * rough * (1 - on_vein) + strings * on_vein)
+    bare = np.maximum(dry, 0.5 * cv2.resize(on_vein, (coarse, coarse), interpolation=cv2.INTER_AREA))
+    return np.asarray(height, np.float32), np.asarray(np.clip(bare, 0, 1), np.float32)
+
+
+def _photograph(path: Path, pixels: int) -> Map:
+    """The middle square of a photograph as linear albedo."""
+    image = cv2.imread(str(path), cv2.IMREAD_COLOR)
+    if image is None:
+        raise UserError(f"appearance.photo: {path} is not a picture that can be read")
+    side = min(image.shape[:2])
+    top, left = (image.shape[0] - side) // 2, (image.shape[1] - side) // 2
+    square = cv2.resize(
+        image[top : top + side, left : left + side], (pixels, pixels), interpolation=cv2.INTER_AREA
+    )
+    encoded = square[..., ::-1].astype(np.float32) / 255
+    linear = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
+    # First row of a map is the lower y.
+    return np.asarray(np.clip(linear[::-1], 0.01, 0.95), np.float32)

@@ -1,0 +1,116 @@
+"""Trunks of vessels: smooth paths across the patch that keep to the sulci."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import dijkstra
+
+from synth.render.anatomy import noise
+
+Floats = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
+Map = npt.NDArray[np.float32]
+
+
+def trunks(
+    sulci: Map,
+    extent_mm: float,
+    rng: np.random.Generator,
+    count: int,
+    radius: tuple[float, float],
+    *,
+    smooth: int,
+    wiggle: float,
+) -> tuple[tuple[Floats, Ints], Floats]:
+    """Paths across the square along the sulci, as nodes with parents, and the trunk radius of each node.
+
+    Args:
+        sulci: (n, n) 0 on a crown to 1 in a sulcus.
+        extent_mm: side of the square.
+        rng: where the anatomy comes from.
+        count: number of trunks.
+        radius: between which a trunk's own radius is drawn [mm].
+        smooth: rounds of smoothing; thick vessels bend in wider curves.
+        wiggle: share of short bends in the path.
+    """
+    side = 72
+    depth = cv2.resize(sulci, (side, side), interpolation=cv2.INTER_AREA)
+    nodes, parents, radii = [], [], []
+    total = 0
+    taken = np.zeros((side, side), np.float32)
+    for trunk in range(max(1, count)):
+        cost = 0.12 + (1 - np.clip(depth, 0, 1)) ** 2 + 0.35 * rng.random((side, side)) + 2.5 * taken
+        angle = rng.uniform(0, 2 * np.pi) + trunk * 2 * np.pi / count
+        turn = rng.uniform(0.6, 1.0) * np.pi
+        ends = [_border(angle, side), _border(angle + turn, side)]
+        path = _cheapest(cost, ends[0], ends[1])
+        taken[path[:, 1].astype(int), path[:, 0].astype(int)] = 1.0
+        taken = np.maximum(taken, cv2.GaussianBlur(taken, (0, 0), 1.5))
+        line = ((path + 0.5) / side - 0.5) * extent_mm
+        line = _resampled(_smoothed(line, smooth), 0.18)
+        line = line + meander(rng, line, extent_mm, 0.55, wiggle)
+        nodes.append(line)
+        parents.append(np.concatenate([[-1], np.arange(len(line) - 1) + total]))
+        taper = np.linspace(1.0, rng.uniform(0.55, 0.85), len(line))
+        # No vessel is as wide as itself a few millimetres on.
+        swell = 1 + 0.1 * noise.sample(noise.band(rng, 128, extent_mm, 6.0, 0.5), line, extent_mm)
+        radii.append(rng.uniform(*radius) * taper * np.clip(swell, 0.75, 1.3))
+        total += len(line)
+    return (np.concatenate(nodes), np.concatenate(parents).astype(np.int64)), np.concatenate(radii)
+
+
+def meander(
+    rng: np.random.Generator, points: Floats, extent_mm: float, amplitude: float, wiggle: float
+) -> Floats:
+    """A smooth random shift of points (n, 2) mm: no vessel runs straight; `wiggle` is its short part."""
+    shifts = []
+    for _ in range(2):
+        long = noise.band(rng, 128, extent_mm, 9.0, 0.3)
+        short = noise.band(rng, 128, extent_mm, 3.0, 0.3)
+        shifts.append(amplitude * (0.6 * noise.sample(long, points, extent_mm)))
+        shifts[-1] = shifts[-1] + amplitude * wiggle * noise.sample(short, points, extent_mm)
+    return np.stack(shifts, axis=1).astype(np.float64)
+
+
+def _border(angle: float, side: int) -> tuple[int, int]:
+    """Pixel (x, y) on the square's border in a direction from its centre."""
+    direction = np.array([np.cos(angle), np.sin(angle)])
+    point = direction / np.abs(direction).max() * (side - 1) / 2 + (side - 1) / 2
+    return round(float(point[0])), round(float(point[1]))
+
+
+def _cheapest(cost: Floats, start: tuple[int, int], end: tuple[int, int]) -> Floats:
+    """Cheapest path (L, 2) of pixels x, y over a square cost map, diagonals allowed."""
+    side = len(cost)
+    index = np.arange(side * side).reshape(side, side)
+    rows, columns, weights = [], [], []
+    for dy, dx in ((0, 1), (1, 0), (1, 1), (1, -1)):
+        a = index[: side - dy, max(0, -dx) : side - max(0, dx)]
+        b = index[dy:, max(0, dx) : side + min(0, dx)]
+        rows.append(a.ravel())
+        columns.append(b.ravel())
+        weights.append((0.5 * (cost.ravel()[a] + cost.ravel()[b]) * np.hypot(dx, dy)).ravel())
+    graph = coo_array(
+        (np.concatenate(weights), (np.concatenate(rows), np.concatenate(columns))), shape=(side**2, side**2)
+    ).tocsr()
+    source, goal = start[1] * side + start[0], end[1] * side + end[0]
+    before = dijkstra(graph, directed=False, indices=source, return_predecessors=True)[1]
+    path = [goal]
+    while path[-1] != source:
+        path.append(int(before[path[-1]]))
+    return np.array([(p % side, p // side) for p in reversed(path)], dtype=np.float64)
+
+
+def _smoothed(line: Floats, rounds: int) -> Floats:
+    for _ in range(rounds):
+        line = np.concatenate([line[:1], 0.25 * line[:-2] + 0.5 * line[1:-1] + 0.25 * line[2:], line[-1:]])
+    return line
+
+
+def _resampled(line: Floats, spacing: float) -> Floats:
+    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
+    at = np.linspace(0, along[-1], max(2, int(along[-1] / spacing)))
+    return np.stack([np.interp(at, along, line[:, axis]) for axis in (0, 1)], axis=1)

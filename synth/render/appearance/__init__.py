@@ -1,0 +1,1 @@
+"""How it looks: families of colour and wetness, lamps, reflections."""

@@ -1,0 +1,140 @@
+"""The microscope's lamps: a main beam, and two beside it that stand for the ring."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from synth.job import schema
+from synth.render.camera.camera import Camera
+from synth.render.mitsuba.adapter import Lamp
+
+Floats = npt.NDArray[np.float64]
+
+_APART = 1.35  # between the main lamp and each of the others, round the optical axis [rad]
+# A dome of 70 mm under an opening of 12 mm faces at most 10 degrees aside: a lamp that only a slope of 17
+# mirrors lights sparks on vessels and sulci, and none of the crowns.
+_SPARSE_DEG = 17.0
+_STEEPEST_DEG = 40.0
+
+
+@dataclass(frozen=True)
+class Lighting:
+    """Light of one sequence."""
+
+    glare: float
+    """0 few highlights to 1 a third of the tissue."""
+    mirror_deg: float
+    """Slope of the surface that mirrors the main lamp into the lens; used without `tilt_deg`."""
+    tilt_deg: float | None
+    """Angle between main lamp and optical axis, if the job sets one."""
+    azimuth_deg: float
+    """Which side the lamp is on: of the optical axis's own tilt, or of the picture with `tilt_deg`."""
+    main: float
+    """Share of the light that comes from the main lamp."""
+    power: float
+    kelvin: float
+    """Colour temperature."""
+    even: float
+    """Radius of the even spot, in widths of the field."""
+    drift: float
+    """Largest change of power over the sequence."""
+    phase: float
+    """Where in its slow wave the drift begins [rad]."""
+
+    @classmethod
+    def draw(cls, light: schema.Light, rng: np.random.Generator) -> Lighting:
+        glare = float(rng.uniform(*light.glare))
+        azimuth = float(rng.uniform(-1, 1))
+        return cls(
+            glare=glare,
+            mirror_deg=_SPARSE_DEG * (1 - glare),
+            tilt_deg=None if light.tilt_deg is None else float(rng.uniform(*light.tilt_deg)),
+            azimuth_deg=azimuth * (180.0 if light.tilt_deg is not None else 50.0),
+            main=float(rng.uniform(*light.main)),
+            power=float(rng.uniform(*light.power)),
+            kelvin=float(rng.uniform(*light.kelvin)),
+            even=float(rng.uniform(*light.even)),
+            drift=float(rng.uniform(*light.drift)),
+            phase=float(rng.uniform(0, 2 * np.pi)),
+        )
+
+    def gain(self, part: float) -> float:
+        """Power at a part (0 to 1) of the sequence, against that of the rest frame."""
+        return 1 + self.drift * 0.5 * float(np.sin(self.phase + np.pi * part) - np.sin(self.phase))
+
+
+def lamps(camera: Camera, lighting: Lighting) -> list[Lamp]:
+    """Lamps that together give a white surface in the opening a radiance of about 1."""
+    colour = blackbody(lighting.kelvin)
+    distance = float(np.linalg.norm(camera.centre))
+    target = np.zeros(3)
+    field = camera.size[0] * camera.mm_per_px
+    beam = np.rad2deg(np.arctan(lighting.even * field / distance))
+    cutoff = np.rad2deg(np.arctan((lighting.even + 0.6) * field / distance))
+    # Radiance of a white diffuser square to the light is I / (pi d^2); the opening is not square to it.
+    total = lighting.power * np.pi * distance**2
+
+    def lamp(position: Floats, share: float, weight: float) -> Lamp:
+        r, g, b = (share * total * colour).tolist()
+        return Lamp(position, target, (r, g, b), float(cutoff), float(beam), weight)
+
+    # With weights 2:1:1 the four strata of a multijittered pixel look at the same lamps in every pixel, and
+    # the choice of a lamp makes no noise.
+    made = []
+    for side, share, weight in ((0.0, lighting.main, 2.0), (1.0, 0.0, 1.0), (-1.0, 0.0, 1.0)):
+        towards = _towards(camera, lighting, side)
+        share = share or (1 - lighting.main) / 2
+        made.append(lamp(distance * towards, share / max(float(towards[2]), 0.3), weight))
+    return made
+
+
+def _towards(camera: Camera, lighting: Lighting, side: float) -> Floats:
+    """Unit direction (3,) from the craniotomy to the main lamp (side 0) or to one beside it (1, -1)."""
+    axis = camera.centre / np.linalg.norm(camera.centre)
+    turn = np.deg2rad(lighting.azimuth_deg) + side * _APART
+    if lighting.tilt_deg is not None:
+        lean = np.deg2rad(lighting.tilt_deg)
+        right, down, _ = camera.rotation
+        return np.asarray(np.cos(lean) * axis + np.sin(lean) * (np.cos(turn) * right + np.sin(turn) * down))
+    turn = turn + np.arctan2(axis[1], axis[0])
+    slope = np.deg2rad(lighting.mirror_deg)
+    facing = np.array([np.sin(slope) * np.cos(turn), np.sin(slope) * np.sin(turn), np.cos(slope)])
+    mirrored = 2 * (axis @ facing) * facing - axis
+    lean, most = np.arccos(np.clip(mirrored @ axis, -1, 1)), np.deg2rad(_STEEPEST_DEG)
+    if lean > most:
+        across = mirrored - (mirrored @ axis) * axis
+        mirrored = np.cos(most) * axis + np.sin(most) * across / np.linalg.norm(across)
+    return np.asarray(mirrored)
+
+
+def balance(kelvin: float) -> tuple[float, float, float]:
+    """Gains of red, green, blue that make the light of a black body white."""
+    gains = 1 / blackbody(kelvin)
+    r, g, b = (gains / gains[1]).tolist()
+    return r, g, b
+
+
+def blackbody(kelvin: float) -> Floats:
+    """Linear sRGB colour (3,) of a black body, luminance 1.
+
+    Planckian locus of Y.-S. Kim et al. (US 7,024,034, 2006), 4000-25000 K; below 4000 K its other branch.
+    """
+    t = 1e3 / kelvin
+    if kelvin < 4000:
+        x = -0.2661239 * t**3 - 0.2343589 * t**2 + 0.8776956 * t + 0.179910
+        y = -0.9549476 * x**3 - 1.37418593 * x**2 + 2.09137015 * x - 0.16748867
+    else:
+        x = -3.0258469 * t**3 + 2.1070379 * t**2 + 0.2226347 * t + 0.240390
+        y = 3.0817580 * x**3 - 5.87338670 * x**2 + 3.75112997 * x - 0.37001483
+    xyz = np.array([x / y, 1.0, (1 - x - y) / y])
+    matrix = np.array(
+        [
+            [3.2404542, -1.5371385, -0.4985314],
+            [-0.9692660, 1.8760108, 0.0415560],
+            [0.0556434, -0.2040259, 1.0572252],
+        ]
+    )
+    return np.asarray(np.maximum(matrix @ xyz, 0.0), np.float64)

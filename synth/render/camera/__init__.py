@@ -1,0 +1,1 @@
+"""The microscope camera: geometry, calibration, movement, chip and video link."""

@@ -1,0 +1,219 @@
+"""The microscope camera: one model for rays, truth, flow and bench.
+
+OpenCV axes (x right, y down, z forward), `K` 3x3, Brown-Conrady distortion (k1, k2, p1, p2, k3), the centre
+of the top-left pixel at (0, 0). D. C. Brown, "Close-range camera calibration", 1971.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from synth.errors import UserError
+from synth.job.schema import Render
+from synth.render.camera import calibration
+
+Floats = npt.NDArray[np.float64]
+
+_NEWTON = 20
+
+
+@dataclass(frozen=True)
+class View:
+    """How the microscope looks at the craniotomy in one sequence."""
+
+    field_mm: float
+    """Width of the field of view at the craniotomy."""
+    working_distance_mm: float
+    tilt_deg: float
+    """Angle between the optical axis and the craniotomy's normal."""
+    azimuth_deg: float
+    """Towards which side the axis tilts."""
+    roll_deg: float
+    """Turn of the picture about the optical axis."""
+    focus_mm: float
+    """Distance of the plane in focus beyond the craniotomy's centre."""
+    off_centre: tuple[float, float]
+    """Principal point from the middle of the picture, in its widths; x, y."""
+
+    @classmethod
+    def draw(cls, render: Render, rng: np.random.Generator) -> View:
+        return cls(
+            field_mm=float(rng.uniform(*render.field_mm)),
+            working_distance_mm=float(rng.uniform(*render.working_distance_mm)),
+            tilt_deg=float(rng.uniform(*render.tilt_deg)),
+            azimuth_deg=float(rng.uniform(0.0, 360.0)),
+            roll_deg=float(rng.uniform(0.0, 360.0)),
+            focus_mm=float(rng.uniform(-0.5, 0.5)),
+            off_centre=_aside(render, rng),
+        )
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A thin lens with distortion; its centre rays are those of the pinhole."""
+
+    K: Floats
+    """(3, 3) px."""
+    distortion: Floats
+    """(5,) k1, k2, p1, p2, k3."""
+    rotation: Floats
+    """(3, 3) world to camera."""
+    translation: Floats
+    """(3,) mm: x_camera = rotation @ x_world + translation."""
+    size: tuple[int, int]
+    """Width, height [px]."""
+    aperture_mm: float
+    """Radius of the lens aperture; 0 is a pinhole."""
+    focus_mm: float
+    """Depth of the plane in focus."""
+    mm_per_px: float
+    """Size of a pixel at the craniotomy's centre, across the optical axis."""
+
+    @property
+    def centre(self) -> Floats:
+        """(3,) mm: the lens, in world axes."""
+        return -self.rotation.T @ self.translation
+
+
+def place(view: View, render: Render) -> Camera:
+    """The camera of `view`, looking at the world's origin from its working distance."""
+    width, height = render.size
+    tilt, azimuth, roll = np.deg2rad([view.tilt_deg, view.azimuth_deg, view.roll_deg])
+    backward = np.array(
+        [np.sin(tilt) * np.cos(azimuth), np.sin(tilt) * np.sin(azimuth), np.cos(tilt)], dtype=np.float64
+    )
+    # Any axis across the view serves to start from; roll makes it uniform.
+    right = np.cross([0.0, 1.0, 0.0], backward)
+    right /= np.linalg.norm(right)
+    up = np.cross(backward, right)
+    frame = np.stack([right, -up, -backward])
+    c, s = np.cos(roll), np.sin(roll)
+    rotation = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ frame
+    if render.calibration is None:
+        focal = width * view.working_distance_mm / view.field_mm
+        x, y = (np.array([width, height]) - 1) / 2 + width * np.asarray(view.off_centre)
+        K = np.array([[focal, 0.0, x], [0.0, focal, y], [0.0, 0.0, 1.0]])
+        distortion = np.asarray(render.distortion, np.float64)
+    else:
+        known = calibration.read(render.calibration)
+        K, distortion = known.fitted(render.size), known.distortion
+    return Camera(
+        K=K,
+        distortion=distortion,
+        rotation=rotation,
+        translation=np.array([0.0, 0.0, view.working_distance_mm]),
+        size=(width, height),
+        aperture_mm=render.aperture_mm,
+        focus_mm=view.working_distance_mm + view.focus_mm,
+        mm_per_px=float(view.working_distance_mm / K[0, 0]),
+    )
+
+
+def beside(camera: Camera, baseline_mm: float) -> Camera:
+    """The second lens of a stereo pair, to the right; its picture is shifted to show the same field."""
+    K = camera.K.copy()
+    K[0, 2] += K[0, 0] * baseline_mm / camera.translation[2]
+    return replace(camera, K=K, translation=camera.translation - np.array([baseline_mm, 0.0, 0.0]))
+
+
+def blur_radius(camera: Camera, depth: npt.NDArray[np.floating]) -> npt.NDArray[np.float32]:
+    """Radius of the circle of confusion [px] of points at depths (...) mm; 0 where depth is 0."""
+    away = np.maximum(depth, 1e-9)
+    radius = camera.K[0, 0] * camera.aperture_mm * np.abs(1 / away - 1 / camera.focus_mm)
+    return np.where(depth > 0, radius, 0.0).astype(np.float32)
+
+
+def to_camera(camera: Camera, points: Floats) -> Floats:
+    """World points (N, 3) mm in camera axes (N, 3) mm."""
+    return points @ camera.rotation.T + camera.translation
+
+
+def project(camera: Camera, points: Floats) -> Floats:
+    """Pixels (N, 2) of world points (N, 3) mm, in the recorded (distorted) picture."""
+    return to_pixels(camera, to_camera(camera, points))
+
+
+def to_pixels(camera: Camera, local: Floats) -> Floats:
+    """Pixels (N, 2) of points (N, 3) mm in camera axes."""
+    flat = _distort(local[:, :2] / local[:, 2:], camera.distortion)
+    return flat * np.diag(camera.K)[:2] + camera.K[:2, 2]
+
+
+def rays(camera: Camera, pixels: Floats) -> tuple[Floats, Floats]:
+    """Centre rays of pixels (N, 2).
+
+    Returns:
+        Origins (N, 3) mm and unit directions (N, 3), world axes.
+
+    Raises:
+        UserError: the distortion folds the picture over itself, so that a pixel has no ray.
+    """
+    flat = undistort((pixels - camera.K[:2, 2]) / np.diag(camera.K)[:2], camera.distortion)
+    local = np.concatenate([flat, np.ones((len(flat), 1))], axis=1)
+    directions = local @ camera.rotation
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    return np.broadcast_to(camera.centre, directions.shape).copy(), directions
+
+
+def pixel_grid(size: tuple[int, int]) -> Floats:
+    """Pixel centres (H*W, 2), row by row."""
+    width, height = size
+    columns, rows = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64))
+    return np.stack([columns.ravel(), rows.ravel()], axis=1)
+
+
+def undistort(flat: Floats, distortion: Floats) -> Floats:
+    """Inverse of Brown-Conrady on normalised coordinates (N, 2), by Newton's method to rounding."""
+    guess = flat.copy()
+    for _ in range(_NEWTON):
+        error = _distort(guess, distortion) - flat
+        if not error.size or np.abs(error).max() < 1e-14:
+            return guess
+        a, b, c, d = _slope(guess, distortion)
+        determinant = a * d - b * c
+        guess = (
+            guess
+            - np.stack([d * error[:, 0] - b * error[:, 1], a * error[:, 1] - c * error[:, 0]], 1)
+            / (determinant[:, None])
+        )
+    if not np.abs(_distort(guess, distortion) - flat).max() < 1e-9:
+        raise UserError("render.distortion: this distortion folds the picture over itself")
+    return guess
+
+
+def _aside(render: Render, rng: np.random.Generator) -> tuple[float, float]:
+    length, angle = rng.uniform(*render.off_centre), rng.uniform(0, 2 * np.pi)
+    return float(length * np.cos(angle)), float(length * np.sin(angle))
+
+
+def _distort(flat: Floats, distortion: Floats) -> Floats:
+    k1, k2, p1, p2, k3 = distortion
+    x, y = flat[:, 0], flat[:, 1]
+    r2 = x * x + y * y
+    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    return np.stack(
+        [
+            x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+            y * radial + 2 * p2 * x * y + p1 * (r2 + 2 * y * y),
+        ],
+        axis=1,
+    )
+
+
+def _slope(flat: Floats, distortion: Floats) -> tuple[Floats, Floats, Floats, Floats]:
+    """Jacobian of the distortion, row by row."""
+    k1, k2, p1, p2, k3 = distortion
+    x, y = flat[:, 0], flat[:, 1]
+    r2 = x * x + y * y
+    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    growth = 2 * (k1 + r2 * (2 * k2 + 3 * k3 * r2))
+    cross = growth * x * y + 2 * p1 * x + 2 * p2 * y
+    return (
+        radial + growth * x * x + 2 * p1 * y + 6 * p2 * x,
+        cross,
+        cross,
+        radial + growth * y * y + 2 * p2 * x + 6 * p1 * y,
+    )

@@ -1,0 +1,142 @@
+"""From radiance to the recorded picture: one pure function, in the order light goes through a camera."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from synth.job import schema
+
+Map = npt.NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """A colour camera on the microscope."""
+
+    exposure: float = 1.0
+    """Share of full scale that radiance 1 fills."""
+    white: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    """White balance: gain of red, green, blue."""
+    full_well: float = 12_000.0
+    """Photoelectrons at full scale."""
+    read_noise: float = 12.0
+    """Standard deviation of the readout [electrons]."""
+    bits: int = 12
+    """Of the converter."""
+    vignette: float = 0.15
+    """Share of light lost in the picture's corners."""
+    bloom: float = 0.03
+    """Share of light that the optics scatter around."""
+    contrast: float = 0.35
+    """Weight of the tone curve's S over a straight line."""
+    sharpening: float = 0.3
+    """Unsharp mask of the video processor, as a share of the detail."""
+    bayer: bool = False
+    """One colour a pixel (RGGB)."""
+    chroma: str = "4:4:4"
+    """Colour resolution of the video: 4:4:4, 4:2:2 or 4:2:0."""
+
+    @classmethod
+    def draw(
+        cls, section: schema.Sensor, white: tuple[float, float, float], rng: np.random.Generator
+    ) -> Sensor:
+        """A sensor within the job's ranges, with that white balance."""
+        return cls(
+            exposure=float(rng.uniform(*section.exposure)),
+            white=white,
+            full_well=float(rng.uniform(*section.full_well)),
+            read_noise=float(rng.uniform(*section.read_noise)),
+            contrast=float(rng.uniform(*section.contrast)),
+            sharpening=float(rng.uniform(*section.sharpening)),
+            bayer=section.bayer,
+            # A codec thins the colours out itself.
+            chroma=section.chroma if section.bitrate_mbps is None else "4:4:4",
+        )
+
+
+def record(radiance: Map, sensor: Sensor, rng: np.random.Generator) -> npt.NDArray[np.uint8]:
+    """The 8-bit sRGB picture of a linear one.
+
+    Args:
+        radiance: (H, W, 3) float32, linear.
+        sensor: the camera.
+        rng: photon and readout noise.
+
+    Returns:
+        (H, W, 3) uint8.
+    """
+    light = radiance * (sensor.exposure * _falloff(radiance.shape[:2], sensor.vignette))[..., None]
+    light = _scatter(light, sensor.bloom)
+    electrons = np.maximum(light, 0) * np.float32(sensor.full_well)
+    # A Poisson count this large is a Gaussian to within the readout noise.
+    noise = rng.standard_normal(electrons.shape, dtype=np.float32)
+    electrons = electrons + noise * np.sqrt(electrons + np.float32(sensor.read_noise**2))
+    steps = np.float32(2**sensor.bits - 1)
+    digital = np.rint(np.clip(electrons / np.float32(sensor.full_well), 0, 1) * steps) / steps
+    balanced = np.clip(digital * np.asarray(sensor.white, np.float32), 0, 1)
+    if sensor.bayer:
+        balanced = _demosaiced(balanced)
+    video = _tone(balanced, sensor.contrast)
+    video = _sharpen(video, sensor.sharpening)
+    video = _thinned(np.clip(video, 0, 1), sensor.chroma)
+    return np.rint(np.clip(video, 0, 1) * 255).astype(np.uint8)
+
+
+def _demosaiced(balanced: Map) -> Map:
+    """What is left of a picture when each pixel measures one colour, and the others are interpolated."""
+    mosaic = balanced[..., 1].copy()
+    mosaic[::2, ::2] = balanced[::2, ::2, 0]
+    mosaic[1::2, 1::2] = balanced[1::2, 1::2, 2]
+    raw = np.rint(mosaic * 65535).astype(np.uint16)
+    # OpenCV names a pattern by its second row's second and third pixel: this one is red first.
+    return np.asarray(cv2.cvtColor(raw, cv2.COLOR_BayerBG2RGB_EA), np.float32) / np.float32(65535)
+
+
+def _thinned(video: Map, chroma: str) -> Map:
+    """Colour at half the resolution across, or across and down."""
+    if chroma == "4:4:4":
+        return video
+    height, width = video.shape[:2]
+    small = ((width + 1) // 2, height if chroma == "4:2:2" else (height + 1) // 2)
+    parts = cv2.cvtColor(np.ascontiguousarray(video, np.float32), cv2.COLOR_RGB2YCrCb)
+    for channel in (1, 2):
+        coarse = cv2.resize(parts[..., channel], small, interpolation=cv2.INTER_AREA)
+        parts[..., channel] = cv2.resize(coarse, (width, height), interpolation=cv2.INTER_LINEAR)
+    return np.asarray(cv2.cvtColor(parts, cv2.COLOR_YCrCb2RGB), np.float32)
+
+
+def _falloff(shape: tuple[int, int], vignette: float) -> Map:
+    rows = (np.arange(shape[0], dtype=np.float32) - (shape[0] - 1) / 2)[:, None]
+    columns = (np.arange(shape[1], dtype=np.float32) - (shape[1] - 1) / 2)[None]
+    r2 = (rows**2 + columns**2) / ((shape[0] - 1) ** 2 + (shape[1] - 1) ** 2) * 4
+    return (1 - vignette * r2).astype(np.float32)
+
+
+def _scatter(light: Map, share: float) -> Map:
+    """A narrow halo around bright spots; the light it takes is taken from them."""
+    if share == 0:
+        return light
+    sigma = light.shape[1] / 200
+    small = cv2.resize(light, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+    halo = cv2.resize(cv2.GaussianBlur(small, (0, 0), max(sigma / 2, 0.5)), light.shape[1::-1])
+    return np.asarray((1 - share) * light + share * halo, np.float32)
+
+
+def _tone(linear: Map, contrast: float) -> Map:
+    """sRGB transfer (IEC 61966-2-1), then an S-curve that keeps black, middle and white."""
+    levels = np.linspace(0, 1, 4097, dtype=np.float32)
+    encoded = np.where(levels <= 0.0031308, 12.92 * levels, 1.055 * levels ** (1 / 2.4) - 0.055)
+    curve = (encoded + contrast * (encoded * encoded * (3 - 2 * encoded) - encoded)).astype(np.float32)
+    at = linear * 4096
+    low = np.minimum(at.astype(np.int32), 4095)
+    return np.asarray(curve[low] + (at - low) * (curve[low + 1] - curve[low]), np.float32)
+
+
+def _sharpen(video: Map, amount: float) -> Map:
+    if amount == 0:
+        return video
+    return np.asarray(video + amount * (video - cv2.GaussianBlur(video, (0, 0), 1.0)), np.float32)

@@ -1,0 +1,65 @@
+"""Slow drift and vibration of the microscope on its stand: a camera for every moment."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from synth.job.schema import Render
+from synth.render.camera.camera import Camera
+
+Floats = npt.NDArray[np.float64]
+
+_SLOW_HZ = (0.05, 0.25)
+_FAST_HZ = (4.0, 14.0)  # stands ring in this range
+_WAVES = 3
+_TURN = 0.002  # rad of turn about each axis that go with a shift of 1 mm
+
+
+@dataclass(frozen=True)
+class Sway:
+    """How the microscope moves in one sequence; it is in its place in the rest frame."""
+
+    drift_mm: float
+    """Largest slow shift from there, about."""
+    vibration_mm: float
+    """Standard deviation of the fast shift."""
+    seed: int
+
+    @classmethod
+    def draw(cls, render: Render, rng: np.random.Generator) -> Sway:
+        return cls(
+            drift_mm=float(rng.uniform(*render.drift_mm)),
+            vibration_mm=float(rng.uniform(*render.vibration_mm)),
+            seed=int(rng.integers(2**31)),
+        )
+
+    def at(self, camera: Camera, seconds: float) -> Camera:
+        """The camera at a time, `camera` being that of time 0."""
+        if self.drift_mm == 0 and self.vibration_mm == 0:
+            return camera
+        shift = self._wave(_SLOW_HZ, 0, seconds) * self.drift_mm / np.sqrt(_WAVES)
+        shift = shift + self._wave(_FAST_HZ, 1, seconds) * self.vibration_mm * np.sqrt(2 / _WAVES)
+        turn = _rotation(shift[3:] * _TURN)
+        # The turn is about the craniotomy, so that it stays in view.
+        return replace(camera, rotation=turn @ camera.rotation, translation=camera.translation + shift[:3])
+
+    def _wave(self, band: tuple[float, float], kind: int, seconds: float) -> Floats:
+        """Six random waves (x, y, z and three turns), 0 at time 0."""
+        rng = np.random.default_rng([self.seed, kind])
+        hertz = rng.uniform(*band, (_WAVES, 6))
+        phase = rng.uniform(0, 2 * np.pi, (_WAVES, 6))
+        total = np.sin(2 * np.pi * hertz * seconds + phase) - np.sin(phase)
+        return np.asarray(total.sum(axis=0))
+
+
+def _rotation(turn: Floats) -> Floats:
+    """Rodrigues' formula for a small turn (3,) rad."""
+    angle = float(np.linalg.norm(turn))
+    if angle < 1e-15:
+        return np.eye(3)
+    x, y, z = turn / angle
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.asarray(np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross)

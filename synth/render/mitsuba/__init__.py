@@ -1,0 +1,1 @@
+"""All that knows Mitsuba: stage, lens and volume."""

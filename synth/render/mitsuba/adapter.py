@@ -1,0 +1,343 @@
+"""A stage of meshes, lamps and a camera in Mitsuba; vertices are moved in place.
+
+With its lens (`mitsuba_lens`) the only file that knows Mitsuba. The variant is chosen on first use and its
+LLVM found by `synth.system.llvm`: a wrong one ends the process.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import gc
+import os
+import sys
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from synth.errors import UserError
+from synth.geometry.triangles import Shape, normals
+from synth.render.camera.camera import Camera
+from synth.render.mitsuba import volume as mitsuba_volume
+from synth.render.mitsuba.lens import Compiled, Scalar
+from synth.system import llvm
+
+Floats = npt.NDArray[np.float64]
+Map = npt.NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Wet:
+    """A diffuse body under a wet coat."""
+
+    albedo: Map
+    """(n, n, 3) linear reflectance."""
+    normal: Map
+    """(n, n, 3) unit normals in the surface's own frame."""
+    dry: Map
+    """(m, m) share of the surface whose film is too thin to be smooth."""
+    roughness: float
+    """GGX alpha of the coat under film."""
+    dry_roughness: float
+    """GGX alpha where there is none."""
+    index: float = 1.33
+    """Refractive index of the coat."""
+    ambient: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Light from all around, as a white diffuser's radiance: what a wound throws into its own shadows."""
+    volume: bool = False
+    """Whether light is followed through the tissue under the coat."""
+
+
+@dataclass(frozen=True)
+class Metal:
+    """A brushed conductor."""
+
+    reflectance: tuple[float, float, float]
+    along: float
+    """GGX alpha along the brushing (the first texture axis)."""
+    across: float
+    satin: float
+    """Share of light that the finish scatters evenly."""
+    glow: Floats
+    """(V, 3) radiance that vertices mirror of what lights nothing; `Stage.mirror` renews it."""
+
+
+@dataclass(frozen=True)
+class Body:
+    """A mesh and what it is made of."""
+
+    vertices: Floats
+    """(V, 3) mm."""
+    faces: npt.NDArray[np.int32]
+    uv: npt.NDArray[np.float32]
+    material: Wet | Metal
+
+
+@dataclass(frozen=True)
+class Lamp:
+    """A spot light."""
+
+    position: Floats
+    """(3,) mm."""
+    target: Floats
+    """(3,) mm."""
+    intensity: tuple[float, float, float]
+    """Radiant intensity, linear RGB."""
+    cutoff_deg: float
+    """Half angle where its light ends."""
+    beam_deg: float
+    """Half angle inside which it is even."""
+    weight: float
+    """How often a light path looks towards it, against the other lamps."""
+
+
+def pick(asked: str) -> str:
+    """The variant that `asked` stands for on this machine.
+
+    Raises:
+        UserError: the machine cannot run the one asked for.
+    """
+    if asked == "scalar_rgb":
+        return asked
+    if asked == "cuda_ad_rgb":
+        if not cuda():
+            raise UserError("render.variant: cuda_ad_rgb needs an NVIDIA GPU and its driver; none was found")
+        return asked
+    found = llvm.find()
+    if found is None:
+        if asked == "llvm_ad_rgb":
+            raise UserError("render.variant: llvm_ad_rgb needs libLLVM 17 or newer (Debian: libllvm19)")
+        return "scalar_rgb"
+    os.environ["DRJIT_LIBLLVM_PATH"] = found
+    return "llvm_ad_rgb"
+
+
+@functools.cache
+def cuda() -> bool:
+    """Whether an NVIDIA driver with a device is there."""
+    try:
+        driver = ctypes.CDLL("libcuda.so.1")
+    except OSError:
+        return False
+    count = ctypes.c_int(0)
+    return driver.cuInit(0) == 0 and driver.cuDeviceGetCount(ctypes.byref(count)) == 0 and count.value > 0
+
+
+class Stage:
+    """One Mitsuba scene."""
+
+    def __init__(
+        self,
+        variant: str,
+        camera: Camera,
+        bodies: dict[str, Body],
+        lamps: list[Lamp],
+        spp: int,
+        integrator: str = "direct",
+        sampler: str = "multijitter",
+    ) -> None:
+        import mitsuba as mi
+
+        mi.set_variant(variant)
+        self._jit = "scalar" not in variant
+        _limit_threads()
+        forget()
+        self.variant = variant
+        self._mi = mi
+        self._faces = {name: body.faces for name, body in bodies.items()}
+        scene: dict[str, Any] = {
+            "type": "scene",
+            "integrator": _integrator(integrator),
+        }
+        for index, lamp in enumerate(lamps):
+            scene[f"lamp{index}"] = _lamp(mi, lamp)
+        for name, body in bodies.items():
+            scene[name] = _mesh(mi, name, body)
+        self._lens = (Compiled if self._jit else Scalar)(camera, spp, sampler)
+        self._scene = mi.load_dict(scene)
+        self._parameters = mi.traverse(self._scene)
+
+    def move(self, name: str, vertices: Floats) -> None:
+        """New positions (V, 3) mm of a body's vertices."""
+        bent = normals(Shape(vertices, self._faces[name]))
+        for key, values in (("vertex_positions", vertices), ("vertex_normals", bent)):
+            flat = values.astype(np.float32).ravel()
+            self._parameters[f"{name}.{key}"] = self._mi.Float(flat) if self._jit else flat
+
+    def mirror(self, name: str, glow: Floats) -> None:
+        """New mirrored radiance (V, 3) of a metal body's vertices."""
+        flat = glow.astype(np.float32).ravel()
+        self._parameters[f"{name}.vertex_glow"] = self._mi.Float(flat) if self._jit else flat
+
+    def render(self, seed: int, camera: Camera | None = None) -> Map:
+        """Linear radiance (H, W, 3) float32 of the stage as it stands, from a camera with the same lens."""
+        self._parameters.update()
+        if camera is not None:
+            self._lens.place(camera)
+        lens = self._lens
+        image = self._mi.render(self._scene, sensor=lens.sensor, spp=lens.spp, seed=seed)
+        radiance = lens.develop(np.array(image, dtype=np.float32)[..., :3])
+        if self._jit:
+            # What one frame needs is not kept for the next: it costs nothing to ask for it again.
+            import drjit as dr
+
+            dr.flush_malloc_cache()
+        return radiance
+
+
+def forget() -> None:
+    """Frees what stages that are gone held: Python's plugins and their scenes refer to each other."""
+    gc.collect()
+    if "drjit" in sys.modules:
+        import drjit as dr
+
+        dr.flush_malloc_cache()
+    _trim()
+
+
+def _trim() -> None:
+    """Gives free pages back to the system: glibc would keep what maps needed while they were made."""
+    trim = getattr(_libc(), "malloc_trim", None)
+    if trim is not None:
+        trim(0)
+
+
+@functools.cache
+def _libc() -> ctypes.CDLL:
+    return ctypes.CDLL(None)
+
+
+def _limit_threads() -> None:
+    """Workers that share a machine say how many threads each may take."""
+    threads = os.environ.get("SULCUS_THREADS")
+    if threads:
+        import drjit as dr
+
+        dr.set_thread_count(int(threads))
+
+
+def _integrator(kind: str) -> dict[str, Any]:
+    if kind == "direct":
+        # Lamps are points: what a surface scatters towards by itself never meets one.
+        return {"type": "direct", "emitter_samples": 1, "bsdf_samples": 0}
+    if kind.startswith("volume"):
+        return {"type": "volpath", "max_depth": int(kind.removeprefix("volume")), "rr_depth": 40}
+    return {"type": "path", "max_depth": int(kind.removeprefix("path"))}
+
+
+def _lamp(mi: Any, lamp: Lamp) -> dict[str, Any]:
+    towards = lamp.target - lamp.position
+    up = [0.0, 1.0, 0.0] if abs(towards[1]) < 0.9 * np.linalg.norm(towards) else [1.0, 0.0, 0.0]
+    return {
+        "type": "spot",
+        "to_world": mi.ScalarTransform4f().look_at(
+            origin=lamp.position.tolist(), target=lamp.target.tolist(), up=up
+        ),
+        "intensity": {"type": "rgb", "value": list(lamp.intensity)},
+        "cutoff_angle": lamp.cutoff_deg,
+        "beam_width": lamp.beam_deg,
+        "sampling_weight": lamp.weight,
+    }
+
+
+def _mesh(mi: Any, name: str, body: Body) -> Any:
+    properties = mi.Properties()
+    properties["bsdf"] = mi.load_dict(_material(mi, body.material))
+    if isinstance(body.material, Wet) and body.material.volume:
+        under = mitsuba_volume.medium(mi, body.material.albedo, body.vertices)
+        properties["interior"] = mi.load_dict(under)
+    else:
+        # Seen, but never chosen as a lamp: its weight is nothing.
+        glow = {"type": "area", "radiance": _glow(mi, body.material), "sampling_weight": 0.0}
+        properties["glow"] = mi.load_dict(glow)
+    mesh = mi.Mesh(
+        name,
+        vertex_count=len(body.vertices),
+        face_count=len(body.faces),
+        has_vertex_normals=True,
+        has_vertex_texcoords=True,
+        props=properties,
+    )
+    if isinstance(body.material, Metal):
+        mesh.add_attribute("vertex_glow", 3, body.material.glow.astype(np.float32).ravel())
+    parameters = mi.traverse(mesh)
+    parameters["vertex_positions"] = body.vertices.astype(np.float32).ravel()
+    bent = normals(Shape(body.vertices, body.faces))
+    parameters["vertex_normals"] = bent.astype(np.float32).ravel()
+    parameters["faces"] = body.faces.astype(np.uint32).ravel()
+    parameters["vertex_texcoords"] = body.uv.astype(np.float32).ravel()
+    parameters.update()
+    return mesh
+
+
+def _glow(mi: Any, material: Wet | Metal) -> dict[str, Any]:
+    """Radiance that a body shows of light which no lamp stands for."""
+    if isinstance(material, Metal):
+        return {"type": "mesh_attribute", "name": "vertex_glow"}
+    half = cv2.resize(material.albedo, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+    return _bitmap(mi, half * np.asarray(material.ambient, np.float32))
+
+
+def _material(mi: Any, material: Wet | Metal) -> dict[str, Any]:
+    if isinstance(material, Metal):
+        return {
+            "type": "twosided",
+            "satin": {
+                "type": "blendbsdf",
+                "weight": material.satin,
+                "brushed": {
+                    "type": "roughconductor",
+                    "material": "none",
+                    "distribution": "ggx",
+                    "alpha_u": material.along,
+                    "alpha_v": material.across,
+                    "specular_reflectance": {"type": "rgb", "value": list(material.reflectance)},
+                },
+                "scattered": {
+                    "type": "diffuse",
+                    "reflectance": {"type": "rgb", "value": list(material.reflectance)},
+                },
+            },
+        }
+    if material.volume:
+        bent = material.normal * np.float32(0.5) + np.float32(0.5)
+        return mitsuba_volume.boundary(_bitmap(mi, bent), material.roughness)
+    encoded = material.normal * np.float32(0.5) + np.float32(0.5)
+    albedo = mi.load_dict(_bitmap(mi, material.albedo))  # once, for both
+
+    def coat(roughness: float) -> dict[str, Any]:
+        return {
+            "type": "roughplastic",
+            "distribution": "ggx",
+            "diffuse_reflectance": albedo,
+            "alpha": roughness,
+            "int_ior": material.index,
+            "nonlinear": True,
+        }
+
+    return {
+        "type": "twosided",
+        "bent": {
+            "type": "normalmap",
+            "normalmap": _bitmap(mi, encoded),
+            "film": {
+                "type": "blendbsdf",
+                "weight": _bitmap(mi, material.dry),
+                "smooth": coat(material.roughness),
+                "rough": coat(material.dry_roughness),
+            },
+        },
+    }
+
+
+def _bitmap(mi: Any, image: Map) -> dict[str, Any]:
+    return {
+        "type": "bitmap",
+        "bitmap": mi.Bitmap(np.ascontiguousarray(image.reshape(*image.shape[:2], -1), np.float32)),
+        "raw": True,
+        "filter_type": "bilinear",
+        "wrap_mode": "clamp",
+    }

@@ -1,0 +1,194 @@
+"""The microscope's lens for Mitsuba: `camera.rays` with an aperture of some width.
+
+Compiled variants take a sensor plugin that distorts exactly. Written in Python it would cost the scalar
+one twenty times its own work, so there Mitsuba's own thin lens renders the undistorted picture, twice as
+fine, and that is warped.
+"""
+
+from __future__ import annotations
+
+import functools
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from synth.render.camera import camera as cameras
+from synth.render.camera.camera import Camera
+
+Map = npt.NDArray[np.float32]
+
+
+class Compiled:
+    """The exact lens, for variants that compile it."""
+
+    def __init__(self, camera: Camera, spp: int, sampler: str) -> None:
+        import mitsuba as mi
+
+        _register(mi.variant())
+        self.spp = spp
+        self.sensor = mi.load_dict(_plugin(camera, spp, sampler))
+        self.place(camera)
+
+    def place(self, camera: Camera) -> None:
+        """Puts the lens where the camera is."""
+        self.sensor.place(camera)
+
+    def develop(self, image: Map) -> Map:
+        """The film (H, W, 3) is the picture."""
+        return image
+
+
+class Scalar:
+    """Mitsuba's thin lens on a larger, finer film, and the warp to the recorded picture."""
+
+    def __init__(self, camera: Camera, spp: int, sampler: str) -> None:
+        self._fine = 2 if spp >= 4 else 1
+        self.spp = max(1, spp // self._fine**2)
+        self._sampler = sampler
+        self._fit(camera)
+        self.place(camera)
+
+    def _fit(self, camera: Camera) -> None:
+        """The larger film, and where the picture's pixels lie on it."""
+        self._K = camera.K
+        width, height = camera.size
+        fx, fy = camera.K[0, 0], camera.K[1, 1]
+        # The middle of each fine pixel, and where it lies on a film whose principal point is its middle.
+        step = 1 / self._fine
+        columns = (np.arange(width * self._fine) + 0.5) * step - 0.5
+        rows = (np.arange(height * self._fine) + 0.5) * step - 0.5
+        x, y = np.meshgrid((columns - camera.K[0, 2]) / fx, (rows - camera.K[1, 2]) / fy)
+        flat = cameras.undistort(np.stack([x.ravel(), y.ravel()], axis=1), camera.distortion)
+        at = (flat * fx * self._fine).reshape(*x.shape, 2)
+        half = np.ceil(np.abs(at).max(axis=(0, 1))).astype(int) + 1
+        self._at = (at + half - 0.5).astype(np.float32)
+        film_width, film_height = (2 * half).tolist()
+        self._width, self._height = film_width, film_height
+        self._fov = float(np.rad2deg(2 * np.arctan(film_width / (2 * fx * self._fine))))
+
+    def place(self, camera: Camera) -> None:
+        """Puts the lens where the camera is."""
+        import mitsuba as mi
+
+        if not np.array_equal(camera.K, self._K):
+            self._fit(camera)
+        to_world = np.eye(4)
+        # Mitsuba's cameras have x to the left and y up.
+        to_world[:3, :3] = (camera.rotation * np.array([[-1.0], [-1.0], [1.0]])).T
+        to_world[:3, 3] = camera.centre
+        self.sensor = mi.load_dict(
+            {
+                "type": "thinlens" if camera.aperture_mm > 0 else "perspective",
+                "fov": self._fov,
+                "fov_axis": "x",
+                "near_clip": 1.0,
+                "far_clip": 1e4,
+                "to_world": mi.ScalarTransform4f(to_world.tolist()),
+                "film": _film(self._width, self._height),
+                "sampler": {"type": self._sampler, "sample_count": self.spp},
+                **(
+                    {"aperture_radius": camera.aperture_mm, "focus_distance": camera.focus_mm}
+                    if camera.aperture_mm > 0
+                    else {}
+                ),
+            }
+        )
+
+    def develop(self, image: Map) -> Map:
+        """The recorded picture (H, W, 3) of a larger, finer film."""
+        fine = cv2.remap(image, self._at, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        size = (fine.shape[1] // self._fine, fine.shape[0] // self._fine)
+        return np.asarray(cv2.resize(fine, size, interpolation=cv2.INTER_AREA), np.float32)
+
+
+def _plugin(camera: Camera, spp: int, sampler: str) -> dict[str, Any]:
+    width, height = camera.size
+    lens: dict[str, Any] = {
+        "type": "sulcus_lens",
+        "film": _film(width, height),
+        "sampler": {"type": sampler, "sample_count": spp},
+        "aperture": camera.aperture_mm,
+        "focus": camera.focus_mm,
+    }
+    for name, value in zip(("k1", "k2", "p1", "p2", "k3"), camera.distortion, strict=True):
+        lens[name] = float(value)
+    lens |= {"fx": float(camera.K[0, 0]), "fy": float(camera.K[1, 1])}
+    return lens
+
+
+def _film(width: int, height: int) -> dict[str, Any]:
+    # A box keeps pixels apart: no order of summing, so the same bytes on any number of threads.
+    return {
+        "type": "hdrfilm",
+        "width": width,
+        "height": height,
+        "rfilter": {"type": "box"},
+        "pixel_format": "rgb",
+        "component_format": "float32",
+    }
+
+
+@functools.cache
+def _register(variant: str) -> None:
+    """Makes the thin lens with Brown-Conrady distortion known to one variant."""
+    import drjit as dr
+    import mitsuba as mi
+
+    class Lens(mi.Sensor):
+        """`camera.rays` for film samples, with a lens of some width."""
+
+        def __init__(self, props: Any) -> None:
+            super().__init__(props)
+            self.v = {name: props[name] for name in ("fx", "fy", "k1", "k2", "p1", "p2", "k3")}
+            self.aperture, self.focus = props["aperture"], props["focus"]
+            size = self.film().size()
+            self.width, self.height = int(size[0]), int(size[1])
+
+        def place(self, camera: Camera) -> None:
+            """Pose and principal point, as data: a number written into the code would compile it anew."""
+
+            def data(values: Any) -> list[Any]:
+                return [dr.opaque(mi.Float, float(value)) for value in values]
+
+            self.rows = [mi.Vector3f(*data(row)) for row in camera.rotation]
+            self.centre = mi.Point3f(*data(camera.centre))
+            self.middle = data(camera.K[:2, 2])
+            self.around = mi.ScalarPoint3f(*camera.centre.tolist())
+
+        def sample_ray(
+            self, time: Any, wavelength: Any, position: Any, aperture: Any, active: Any = True
+        ) -> tuple[Any, Any]:
+            v = self.v
+            goal_x = (position.x * self.width - 0.5 - self.middle[0]) / v["fx"]
+            goal_y = (position.y * self.height - 0.5 - self.middle[1]) / v["fy"]
+            x, y = goal_x, goal_y
+            for _ in range(6):  # each round gains a factor of the distortion itself
+                r2 = x * x + y * y
+                radial = 1 + r2 * (v["k1"] + r2 * (v["k2"] + r2 * v["k3"]))
+                dx = 2 * v["p1"] * x * y + v["p2"] * (r2 + 2 * x * x)
+                dy = 2 * v["p2"] * x * y + v["p1"] * (r2 + 2 * y * y)
+                x, y = (goal_x - dx) / radial, (goal_y - dy) / radial
+            lens = mi.warp.square_to_uniform_disk_concentric(aperture) * self.aperture
+            right, down, forward = self.rows
+            origin = self.centre + right * lens.x + down * lens.y
+            sharp = self.centre + (right * x + down * y + forward) * self.focus
+            ray = mi.Ray3f(mi.Point3f(origin), dr.normalize(mi.Vector3f(sharp - origin)), time)
+            return ray, mi.Color3f(1.0)
+
+        def sample_ray_differential(
+            self, time: Any, wavelength: Any, position: Any, aperture: Any, active: Any = True
+        ) -> tuple[Any, Any]:
+            ray, weight = self.sample_ray(time, wavelength, position, aperture, active)
+            return mi.RayDifferential3f(ray), weight
+
+        def bbox(self) -> Any:
+            box = mi.ScalarBoundingBox3f()
+            box.expand(self.around)
+            return box
+
+        def to_string(self) -> str:
+            return "SulcusLens[]"
+
+    mi.register_sensor("sulcus_lens", Lens)

@@ -1,0 +1,1 @@
+"""One sequence, from (job, index) to a sealed store."""

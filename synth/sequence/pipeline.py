@@ -1,0 +1,195 @@
+"""One sequence from job to sealed store: where fem, render and flow meet, through plain arrays."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from synth.dataset.store import Writer
+from synth.fem import solver, tool
+from synth.fem.mesh import tetrahedra
+from synth.fem.mesh.tetrahedra import Tets
+from synth.fem.solver import Deformation
+from synth.fields import FIELDS
+from synth.flow import mask, track, tvl1
+from synth.flow.estimator import Estimator, create
+from synth.geometry import brain_surface
+from synth.geometry.brain_surface import Brain
+from synth.job import identity
+from synth.job.schema import Flow, Job
+from synth.render.anatomy import surface as anatomy
+from synth.render.anatomy.surface import Surface
+from synth.render.camera import camera, video
+from synth.render.scene import Studio
+from synth.sequence import scenario
+from synth.sequence.published_labels import Published
+from synth.sequence.scenario import Scenario
+from synth.sequence.timeline import Timeline
+from synth.system.stopwatch import Report, Stopwatch
+
+# Fields that the renderer gives by frame; those of `store.extra` are attributes of its `Shot` as well, but
+# for the published method's.
+_SHOT = ("rgb", "flow", "visible", "tool", "glare", "depth")
+_PUBLISHED = ("flow_noisy", "intensity")
+
+
+def render_sequence(job: Job, index: int, folder: Path, report: Report) -> Path:
+    """Computes sequence `index` and writes `folder/NNNNNN.zarr`.
+
+    Args:
+        job: the dataset's job, paths resolved.
+        index: which sequence, 0 <= index < job.sequences.
+        folder: the dataset; the store is `NNNNNN.zarr.part` until it is sealed.
+        report: told of progress, stage by stage.
+
+    Returns:
+        The sealed store's path.
+
+    Raises:
+        UserError: the job cannot be carried out (surface, load, inverted element), in one line.
+    """
+    watch = Stopwatch()
+    case = scenario.draw(job, index)
+    view = camera.place(case.view, job.render)
+
+    report("mesh", 0, 1)
+    with watch.stage("mesh"):
+        surface, tets = build(job, case)
+    report("fem", 0, 1)
+    with watch.stage("fem"):
+        motion = move(job, case, surface, tets)
+
+    with watch.stage("scene"):
+        studio = Studio(surface, case.look, view, job, [gesture.kind for gesture in case.gestures])
+        still = studio.still
+
+    width, height = job.render.size
+    rotation = view.rotation  # world to camera: labels are in camera axes
+    writer = Writer(folder, index, frames=job.frames, size=(height, width), job=job)
+    writer.put("time", motion.time)
+    writer.put("force", motion.force @ rotation.T)
+    writer.put("tissue", still.tissue)
+    writer.put("area", still.area)
+    labels = None
+    if set(_PUBLISHED) & set(job.store.extra):
+        labels = Published.begin(job.labels, still.tissue, job.frames, scenario.label_rng(job, index))
+    coded = job.sensor.bitrate_mbps is not None  # a codec sees the whole film at once
+    film = Timeline(motion, view, case.sway, case.look.light, job.fps)
+    rgb = np.empty((job.frames, height, width, 3), np.uint8)
+    rgb_right = np.empty_like(rgb) if writer.wants("rgb_right") else None
+    tools = np.empty((job.frames, height, width), bool)
+    poses = np.tile(np.eye(4), (job.frames, 1, 1))
+    for t, seed in enumerate(scenario.frame_seeds(job, index)):
+        report("render", t, job.frames)
+        with watch.stage("render"):
+            now = film.at(t)
+            lit = film.open(t, job.sensor.shutter, job.sensor.subframes)
+            shot = studio.shoot(now, seed, lit, film.at(t + 1))
+            traction = studio.traction(motion.traction[t])
+        with watch.stage("store"):
+            made = labels.frame(t, shot.flow, traction, motion.force[t]) if labels else {}
+            for name in (*_SHOT, *job.store.extra):
+                if FIELDS[name].framed and not (coded and name.startswith("rgb")):
+                    writer.put_frame(name, t, made[name] if name in made else getattr(shot, name))
+            writer.put_frame("traction", t, traction)
+            if job.render.exr:
+                writer.put_exr(t, shot.radiance)
+        rgb[t], tools[t] = shot.rgb, shot.tool
+        if rgb_right is not None and shot.rgb_right is not None:
+            rgb_right[t] = shot.rgb_right
+        lens = now.camera or view
+        poses[t, :3, :3], poses[t, :3, 3] = lens.rotation, lens.translation
+
+    with watch.stage("store"):
+        writer.put("camera", poses)
+        if coded:
+            rgb = video.recorded(rgb, job.sensor, job.fps)
+            writer.put("rgb", rgb)
+            if rgb_right is not None:
+                writer.put("rgb_right", video.recorded(rgb_right, job.sensor, job.fps))
+
+    if job.flow.backend != "ideal":
+        report("flow", 0, job.frames)
+        with watch.stage("flow"):
+            # What a real pipeline has: the tool's outline, and glare as the picture shows it.
+            recovered = track.track(estimator(job.flow), rgb, mask.hidden(rgb, tools), still.tissue)
+        with watch.stage("store"):
+            for t in range(job.frames):
+                writer.put_frame("flow_tvl1", t, recovered.flow[t])
+                writer.put_frame("flow_confidence", t, recovered.confidence[t])
+
+    return writer.seal(
+        scenario=case.as_dict(),
+        anatomy_id=identity.anatomy(job, case.relief.seed),
+        K=view.K.tolist(),
+        distortion=view.distortion.tolist(),
+        rotation=view.rotation.tolist(),
+        translation=view.translation.tolist(),
+        scale_mm_per_px=float(still.scale_mm_per_px),
+        young_kpa=case.tissue.young_kpa,
+        poisson=case.tissue.poisson,
+        mechanics=_mechanics(case, motion, rotation),
+        variant=studio.variant,
+        timings=watch.report(),
+    )
+
+
+def _mechanics(case: Scenario, motion: Deformation, rotation: NDArray[np.float64]) -> dict[str, Any]:
+    return {
+        "law": case.tissue.law,
+        "min_jacobian": motion.min_jacobian.tolist(),
+        "energy_mn_mm": motion.energy.tolist(),
+        "residual": motion.residual.tolist(),
+        "instruments": [
+            {
+                "kind": gesture.kind,
+                "force_mn": (motion.by_instrument[:, k] @ rotation.T).tolist(),
+                "tip_mm": motion.tip[:, 2 * k : 2 * k + 2].tolist(),
+                "shaft": motion.shaft[:, 2 * k].tolist(),
+            }
+            for k, gesture in enumerate(case.gestures)
+        ],
+    }
+
+
+def build(job: Job, case: Scenario) -> tuple[Surface, Tets]:
+    """The fine surface of a scenario and the volume under it, finest where its contacts are."""
+    focus = [place for gesture in case.gestures for place in tool.focus(gesture)]
+    surface, whole = cortex(job, case)
+    if whole is None:
+        return surface, tetrahedra.block(job.anatomy, job.fem.tets, job.fem.order, focus)
+    return surface, tetrahedra.from_brain(whole, job.anatomy, job.fem.tets, job.fem.order, focus)
+
+
+def cortex(job: Job, case: Scenario) -> tuple[Surface, Brain | None]:
+    """The fine surface of a scenario, and the user's brain that it is a part of, if it is."""
+    if job.anatomy.mesh is None:
+        return anatomy.procedural(case.relief, job.anatomy), None
+    whole = brain_surface.load(job.anatomy.mesh, job.anatomy.craniotomy)
+    return anatomy.from_brain(whole.vertices, whole.faces, case.relief, job.anatomy), whole
+
+
+def move(job: Job, case: Scenario, surface: Surface, tets: Tets) -> Deformation:
+    """The scenario's gestures, carried out on that surface and volume."""
+    return solver.deform(
+        job.fem,
+        case.tissue,
+        case.gesture,
+        tets,
+        surface.vertices,
+        surface.faces,
+        job.frames,
+        job.fps,
+        case.further,
+    )
+
+
+def estimator(flow: Flow) -> Estimator:
+    """The estimator that a job asks for."""
+    if flow.backend != "tvl1":
+        return create(flow.backend)
+    return tvl1.Tvl1(replace(tvl1.Settings(), warps=2 * flow.warps, warm_warps=flow.warps))

@@ -1,0 +1,1 @@
+"""The machine underneath: LLVM, compiled code, clocks, how commands end."""

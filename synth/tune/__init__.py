@@ -1,0 +1,1 @@
+"""Goal-oriented fidelity: no more than a scene needs."""

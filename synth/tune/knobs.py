@@ -1,0 +1,135 @@
+"""The knobs of a job that cost time and move the force: their levels, finest first."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from synth.errors import UserError
+from synth.job.law_limits import CHEAPEST_FIRST, LARGEST_LOAD
+from synth.job.schema import Job
+
+FINE_TETS, FINE_SPP, FINE_WARPS = 4000, 8, 6
+_TETS, _SPP, _WARPS, _SIZES = (2500, 1600, 800), (4, 2), (3, 2, 1), (0.75, 0.6, 0.5, 0.4)
+_VERTICES = 10_000
+_FEWEST_PX = 96  # of the picture's short side: below, flow has no pyramid to speak of
+
+Changes = Mapping[str, Any]
+"""Keys of a job, dotted, and their values."""
+
+
+@dataclass(frozen=True)
+class Level:
+    """One setting of one knob."""
+
+    words: str
+    changes: Changes
+
+
+@dataclass(frozen=True)
+class Knob:
+    """What may be turned."""
+
+    name: str
+    kind: str
+    """`physics` moves the truth, `picture` what is seen, `surface` both, `flow` what is made of it."""
+    levels: tuple[Level, ...]
+    """Full fidelity first."""
+    turned: bool = True
+    """False: measured and told, but left as the job has it. Pictures without highlights or without blur are
+    other pictures, not cheaper ones, and what is trained on them is another network."""
+
+
+def of(job: Job) -> list[Knob]:
+    """The knobs that a job has, with its own value among the levels.
+
+    Raises:
+        UserError: the job asks for what no cheaper picture can be measured against.
+    """
+    if job.render.subsurface == "volume":
+        raise UserError("render.subsurface: volume is a reference itself; tune the job with blur")
+    fem, render = job.fem, job.render
+    own_law = fem.law if fem.law in CHEAPEST_FIRST else "neo-hookean"
+    laws = ["neo-hookean", *(law for law in ("stable", "linear") if fem.largest_load <= LARGEST_LOAD[law])]
+    if own_law not in laws:
+        laws.append(own_law)
+    knobs = [
+        Knob("law", "physics", tuple(Level(law, {"fem.law": law}) for law in laws)),
+        Knob(
+            "tets",
+            "physics",
+            tuple(
+                Level(f"{n} P2", {"fem.order": 2, "fem.tets": n})
+                for n in _down([max(FINE_TETS, fem.tets), fem.tets, *_TETS])
+            ),
+        ),
+    ]
+    if fem.time == "dynamic":
+        frame = 1 / job.fps
+        steps = _down([fem.dt_s / 2, fem.dt_s, *([frame] if frame > fem.dt_s else [])])
+        levels = [Level(f"steps of {dt:.3g} s", {"fem.dt_s": dt}) for dt in steps[::-1]]
+        knobs.append(Knob("time", "physics", (*levels, Level("at rest", {"fem.time": "quasi-static"}))))
+    if job.flow.backend == "ideal":
+        return knobs  # no force is read from its pictures, so nothing here can say how good they must be
+    vertices = _down([job.anatomy.vertices, min(_VERTICES, job.anatomy.vertices)])
+    knobs.append(Knob("vertices", "surface", tuple(Level(f"{n}", {"anatomy.vertices": n}) for n in vertices)))
+    sizes = [render.size]
+    for part in _SIZES:
+        # Multiples of 8, in the shape that was asked for.
+        wide = max(8, round(part * render.size[0] / 8) * 8)
+        size = (wide, max(8, round(wide * render.size[1] / render.size[0] / 8) * 8))
+        if min(size) >= _FEWEST_PX and size not in sizes:
+            sizes.append(size)
+    knobs.append(
+        Knob("size", "picture", tuple(Level(f"{w} x {h}", {"render.size": [w, h]}) for w, h in sizes))
+    )
+    paths = _down([max(FINE_SPP, render.spp), render.spp, *_SPP])
+    knobs.append(Knob("spp", "picture", tuple(Level(f"{n}", {"render.spp": n}) for n in paths)))
+    if render.aperture_mm > 0:
+        knobs.append(
+            Knob(
+                "depth of field",
+                "picture",
+                (
+                    Level("lens", {"render.aperture_mm": render.aperture_mm}),
+                    Level("pinhole", {"render.aperture_mm": 0.0}),
+                ),
+                turned=False,
+            )
+        )
+    if job.light.glare[1] > 0:
+        knobs.append(
+            Knob(
+                "light",
+                "picture",
+                (
+                    Level("wet highlights", {"light.glare": list(job.light.glare)}),
+                    Level("few highlights", {"light.glare": [0.0, 0.0]}),
+                ),
+                turned=False,
+            )
+        )
+    if job.flow.backend == "tvl1":
+        warps = _down([max(FINE_WARPS, job.flow.warps), job.flow.warps, *_WARPS])
+        knobs.append(Knob("warps", "flow", tuple(Level(f"{n}", {"flow.warps": n}) for n in warps)))
+    return knobs
+
+
+def finest(knobs: Iterable[Knob]) -> dict[str, Any]:
+    """Changes that set every knob to full fidelity."""
+    return {key: value for knob in knobs for key, value in knob.levels[0].changes.items()}
+
+
+def changed(job: Job, changes: Changes) -> Job:
+    """The job with some keys set."""
+    values = job.model_dump(mode="json")
+    for key, value in changes.items():
+        block, _, name = key.rpartition(".")
+        (values[block] if block else values)[name] = value
+    return Job.model_validate(values)
+
+
+def _down(values: Iterable[Any]) -> list[Any]:
+    """Different values, the largest first."""
+    return sorted(set(values), reverse=True)

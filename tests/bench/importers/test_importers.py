@@ -1,0 +1,161 @@
+"""Foreign recordings made by their own libraries come back as the frames, times and forces put in."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from typer.testing import CliRunner
+
+from bench.cli import app
+from bench.importers import registry
+from bench.recording.folder import open_recording
+from synth.errors import UserError
+
+TIMES = np.array([0.0, 0.11, 0.19, 0.3])
+FORCE = np.array([[0.0, 0, 0], [0.1, 0, -0.2], [0.2, 0.1, 0], [0.0, 0, 0.05]])
+TIP = np.array([[1.0, 2, 3], [1, 2, 4], [1, 3, 4], [2, 3, 4]])
+
+
+def footage() -> NDArray[np.uint8]:
+    """(4, 12, 16, 3), smooth enough to survive a change of colour space within two levels."""
+    y, x = np.mgrid[:12, :16]
+    return np.stack(
+        [np.stack([60 + 8 * x, 90 + 6 * y, 120 + 20 * k + 0 * x], axis=-1) for k in range(4)]
+    ).astype(np.uint8)
+
+
+def igs(path: Path) -> Path:
+    lines = ["ObjectType = Image", "NDims = 3", "DimSize = 16 12 4", "ElementType = MET_UCHAR",
+             "ElementNumberOfChannels = 3", "UltrasoundImageOrientation = MF"]  # fmt: skip
+    for k in range(4):
+        matrix = np.eye(4)
+        matrix[:3, 3] = TIP[k]
+        lines += [
+            f"Seq_Frame{k:04d}_Timestamp = {TIMES[k]}",
+            f"Seq_Frame{k:04d}_Force = {' '.join(map(str, FORCE[k]))}",
+            f"Seq_Frame{k:04d}_StylusTipToWorldTransform = {' '.join(map(str, matrix.ravel()))}",
+            f"Seq_Frame{k:04d}_StylusTipToWorldTransformStatus = {'INVALID' if k == 2 else 'OK'}",
+        ]
+    head = "\n".join([*lines, "ElementDataFile = LOCAL", ""])
+    path.write_bytes(head.encode() + footage().tobytes())
+    return path
+
+
+def hdf5(path: Path) -> Path:
+    h5py = pytest.importorskip("h5py", reason="h5py is not installed")
+    with h5py.File(path, "w") as file:
+        file["camera/rgb"] = footage()
+        file["camera/timestamps"] = TIMES
+        file["sensor/force"] = FORCE
+        file["sensor/force_time"] = TIMES
+        file["tip"] = TIP
+    return path
+
+
+def mcap(path: Path) -> Path:
+    """A ROS 2 bag folder; the .mcap in it can be read alone as well."""
+    pytest.importorskip("rosbags", reason="rosbags is not installed")
+    from rosbags.rosbag2 import StoragePlugin, Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    kind = store.types
+    with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as bag:
+        topics = {
+            name: bag.add_connection(name, message, typestore=store)
+            for name, message in (
+                ("/camera", "sensor_msgs/msg/Image"),
+                ("/ft", "geometry_msgs/msg/WrenchStamped"),
+                ("/tip", "geometry_msgs/msg/PoseStamped"),
+            )
+        }
+        for k, picture in enumerate(footage()):
+            whole = int(TIMES[k])
+            stamp = kind["builtin_interfaces/msg/Time"](whole, round(1e9 * (TIMES[k] - whole)) + 1)
+            head = kind["std_msgs/msg/Header"](stamp, "")
+            vector = kind["geometry_msgs/msg/Vector3"]
+            bgr = np.ascontiguousarray(picture[..., ::-1]).ravel()
+            messages = {
+                "/camera": kind["sensor_msgs/msg/Image"](head, 12, 16, "bgr8", 0, 48, bgr),
+                "/ft": kind["geometry_msgs/msg/WrenchStamped"](
+                    head, kind["geometry_msgs/msg/Wrench"](vector(*FORCE[k]), vector(0.0, 0.0, 0.0))
+                ),
+                "/tip": kind["geometry_msgs/msg/PoseStamped"](
+                    head,
+                    kind["geometry_msgs/msg/Pose"](
+                        kind["geometry_msgs/msg/Point"](*(TIP[k] / 1000)),
+                        kind["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0),
+                    ),
+                ),
+            }
+            for name, message in messages.items():
+                raw = store.serialize_cdr(message, message.__msgtype__)
+                bag.write(topics[name], round(1e9 * TIMES[k]) + 1, raw)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("make", "name", "use"),
+    [(igs, "run.igs.mha", []), (hdf5, "run.h5", ["--use", "frames=camera/rgb"]), (mcap, "run", [])],
+)
+def test_what_went_in_comes_out(
+    make: Callable[[Path], Path], name: str, use: list[str], tmp_path: Path
+) -> None:
+    source, out = make(tmp_path / name), tmp_path / "rec"
+    result = CliRunner().invoke(app, ["import", str(source), "-o", str(out), "--scale", "0.1", *use])
+    assert result.exit_code == 0, result.output
+    recording = open_recording(out)
+    pictures = list(recording.frames())
+    assert np.array([p.time_s for p in pictures]) == pytest.approx(TIMES, abs=1e-6)
+    got = np.stack([p.rgb for p in pictures]).astype(int)
+    assert np.abs(got - footage()).max() <= 3  # RGB to YUV and back
+    assert recording.force is not None
+    assert recording.force.force_mn == pytest.approx(1000 * FORCE, abs=1e-6)
+    tip = np.loadtxt(out / "tip.csv", delimiter=",", skiprows=1)
+    assert tip[-1, 1:] == pytest.approx(TIP[-1])
+    assert len(tip) == (3 if "mha" in name else 4)  # an INVALID pose is none
+
+
+def test_a_lone_mcap_is_read(tmp_path: Path) -> None:
+    folder = mcap(tmp_path / "bag")
+    found = registry.read(next(folder.glob("*.mcap")))
+    assert len(found.times_s) == 4
+    assert next(found.pictures()).shape == (12, 16, 3)
+
+
+def spoil_text(path: Path) -> Path:
+    path.write_text("nothing of the kind")
+    return path
+
+
+@pytest.mark.parametrize(
+    ("make", "name", "use", "said"),
+    [
+        (spoil_text, "a.h5", {}, "not a readable HDF5 file"),
+        (spoil_text, "a.mha", {}, "not a readable MetaImage"),
+        (spoil_text, "a.mcap", {}, "not a readable bag"),
+        (spoil_text, "a.xyz", {}, "not a format that can be imported"),
+        (hdf5, "a.h5", {"force": "camera/timestamps"}, "force of shape"),
+        (hdf5, "a.h5", {"frames": "nowhere"}, "there are camera/rgb"),
+        (igs, "a.mha", {"force": "Wrench"}, "no such field"),
+        (mcap, "a", {"frames": "/other"}, "no such topic"),
+        (igs, "a.mha", {"nonsense": "x"}, "one of frames"),
+    ],
+)
+def test_what_cannot_be_read_is_one_line(
+    make: Callable[[Path], Path], name: str, use: dict[str, str], said: str, tmp_path: Path
+) -> None:
+    with pytest.raises(UserError, match=said):
+        registry.read(make(tmp_path / name), use)
+
+
+def test_truncated_sequence_leaves_nothing_behind(tmp_path: Path) -> None:
+    source = igs(tmp_path / "a.mha")
+    source.write_bytes(source.read_bytes()[:-700])
+    with pytest.raises(UserError, match="is the file whole"):
+        registry.write(registry.read(source), tmp_path / "rec", 1.0, {}, lambda done: None)
+    assert not any(path.name.startswith("rec") for path in tmp_path.iterdir())

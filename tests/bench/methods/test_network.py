@@ -1,0 +1,57 @@
+"""A network's answer to no motion is taken off its answers, as a sensor's zero is."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from bench.methods.network import Model
+from bench.tracking.tracking import Scene
+from learn import checkpoint
+from learn.checkpoint import Card
+from learn.data.grid import Scales
+from learn.network.d2fnet import Architecture
+from learn.network.monai_unet import build
+from learn.settings import preset
+
+
+@pytest.mark.parametrize("vector", [True, False])
+def test_answer_to_the_rest_frame_is_the_zero(vector: bool) -> None:
+    def predictor(flow: np.ndarray, tissue: object, scale: float, young: object, sure: object) -> object:
+        total = 2.0 + float(flow.sum())
+        return SimpleNamespace(
+            young_kpa=1.0, force_mn=np.array([total, 1.0, 0.0]) if vector else None, total_force_mn=total
+        )
+
+    model = Model.__new__(Model)
+    model.predictor, model._rest = predictor, None  # type: ignore[assignment]
+    scene = Scene(np.ones((4, 4), bool), 0.1, 1.0)
+    moved, sure = np.zeros((4, 4, 2), np.float32), np.ones((4, 4), np.float32)
+    assert model(moved, sure, scene, False).size_mn == 0
+    moved[0, 0, 0] = 3
+    assert model(moved, sure, scene, False).size_mn == pytest.approx(3)
+    moved[0, 0, 0] = -1
+    assert model(moved, sure, scene, False).force_mn[0] == (-1 if vector else 0)
+
+
+@pytest.mark.parametrize("output", ["magnitude", "vector"])
+def test_a_quick_network_answers_the_same(tmp_path: Path, output: str) -> None:
+    arch = Architecture(width=8, stem=2, levels=2, dropout=0.0, output=output)
+    settings = preset("tiny", arch=arch, size=32)
+    torch.manual_seed(0)
+    checkpoint.write_card(tmp_path, Card(settings, Scales(0.2, 0.03, 0.07, 2.0, 0.003), 1.0, {}, {}))
+    checkpoint.save_tensors(tmp_path / "weights.pt", build(arch).state_dict())
+    rng = np.random.default_rng(0)
+    scene = Scene(np.ones((40, 48), bool), 0.5, 2.0)
+    plain, quick = Model(tmp_path), Model(tmp_path, quick=True)
+    for _ in range(2):
+        flow = rng.normal(size=(40, 48, 2)).astype(np.float32)
+        sure = np.ones((40, 48), np.float32)
+        one, two = plain(flow, sure, scene, True), quick(flow, sure, scene, True)
+        assert two.force_mn == pytest.approx(one.force_mn, rel=1e-4, nan_ok=True)
+        assert one.density is not None
+        assert two.density == pytest.approx(one.density, rel=1e-3, abs=1e-6)

@@ -1,0 +1,104 @@
+"""Reading recordings: times, gaps, rotation, and what is said of broken ones."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+from fake_recording import Maker, texture
+
+from bench.recording import csv_table, video, writer
+from bench.recording.folder import open_recording
+from synth.errors import UserError
+
+
+def test_variable_frame_rate_keeps_its_times(tmp_path: Path) -> None:
+    times = np.array([0, 0.04, 0.08, 0.21, 0.233, 1.0])
+    video.write_video(tmp_path / "v.mp4", iter([texture(32, 48, k) for k in range(6)]), times)
+    got = [picture.time_s for picture in video.from_video(tmp_path / "v.mp4")]
+    assert got == pytest.approx(times, abs=1e-4)
+
+
+def test_times_of_day_keep_their_microseconds(tmp_path: Path) -> None:
+    """Seconds since 1970, as a ROS bag stamps them, need sixteen figures."""
+    times = 1.7e9 + np.array([0.0, 0.04, 0.080001])
+    writer.frames(tmp_path, times)
+    writer.force(tmp_path, times, np.eye(3))
+    assert csv_table.read(tmp_path / "frames.csv", ("t_s",))["t_s"] == pytest.approx(times, abs=1e-6, rel=0)
+    read = csv_table.read(tmp_path / "force.csv", ("t_s", "fy_n"))
+    assert read["t_s"] == pytest.approx(times, abs=1e-6, rel=0)
+    assert read["fy_n"].tolist() == [0, 1, 0]
+
+
+def test_lossless_video_gives_the_pixels_back(tmp_path: Path) -> None:
+    rgb = texture(32, 48)
+    video.write_video(tmp_path / "v.mp4", iter([rgb]), np.zeros(1), crf=0)
+    picture = next(iter(video.from_video(tmp_path / "v.mp4")))
+    # 8-bit YCbCr itself rounds by two levels or so.
+    assert np.abs(picture.rgb.astype(int) - rgb).max() <= 4
+
+
+def test_stated_rotation_is_applied(tmp_path: Path) -> None:
+    rgb = np.zeros((32, 64, 3), np.uint8)
+    rgb[:8, :8] = 255  # top left as recorded
+    with av.open(str(tmp_path / "v.mp4"), "w") as out:
+        stream = out.add_stream("libx264", rate=10)
+        stream.width, stream.height, stream.pix_fmt, stream.time_base = 64, 32, "yuv420p", Fraction(1, 10)
+        for packet in [*stream.encode(av.VideoFrame.from_ndarray(rgb, format="rgb24")), *stream.encode()]:
+            out.mux(packet)
+    data = bytearray((tmp_path / "v.mp4").read_bytes())
+    # The track header's display matrix [ISO 14496-12, 8.3.2]: 90 degrees clockwise.
+    at = data.find(b"tkhd") + 4 + 40
+    matrix = [0, 0x10000, 0, -0x10000, 0, 0, 32 << 16, 0, 0x40000000]
+    data[at : at + 36] = b"".join((v & 0xFFFFFFFF).to_bytes(4, "big") for v in matrix)
+    (tmp_path / "r.mp4").write_bytes(data)
+    upright = next(iter(video.from_video(tmp_path / "r.mp4"))).rgb
+    assert upright.shape == (64, 32, 3)
+    assert upright[:8, -8:].mean() > 200  # what was top left is now top right
+    assert upright[:8, :8].mean() < 50
+
+
+def test_force_in_mn_sign_and_gaps(make: Maker) -> None:
+    folder = make(frames=3, meta={"sensor": {"acts_on": "tool"}})
+    (folder / "force.csv").write_text(
+        "t_s,fx_n,fy_n,fz_n,extra\n0,0.1,0,0,x\n0.1,,0,0,x\n0.2,0.3,0,0,x\n0.2,9,9,9,x\n"
+    )
+    recording = open_recording(folder)
+    assert recording.force is not None
+    assert recording.force.force_mn[[0, 2], 0].tolist() == [-100.0, -300.0]
+    assert np.isnan(recording.force.force_mn[1]).all()
+    assert len(recording.force.time_s) == 3
+    assert any("missing force" in note for note in recording.notes)
+    assert any("stands still" in note for note in recording.notes)
+
+
+def test_table_names_the_line(tmp_path: Path) -> None:
+    file = tmp_path / "t.csv"
+    file.write_text("a,b\n1,2\n3,x\n")
+    with pytest.raises(UserError, match=r"t\.csv:3: 'x' is not a number"):
+        csv_table.read(file, ("a", "b"))
+    file.write_text("a,b\n1,2\n3\n")
+    with pytest.raises(UserError, match=r"t\.csv:3: 1 cells, 2 expected"):
+        csv_table.read(file, ("a", "b"))
+    file.write_text("\ufeffA; b\n1;2\n;4\n", encoding="utf-8")
+    got = csv_table.read(file, ("a", "b"))
+    assert got["b"].tolist() == [2, 4]
+    assert np.isnan(got["a"][1])
+
+
+def test_meta_tells_all_errors_at_once(make: Maker) -> None:
+    folder = make(frames=2, force=False)
+    (folder / "meta.yaml").write_text("scale_mm_per_px: -1\nyoung: 3\nrest_frame: 0\n")
+    with pytest.raises(UserError) as caught:
+        open_recording(folder)
+    assert "scale_mm_per_px" in str(caught.value)
+    assert "young" in str(caught.value)
+
+
+def test_ffmpeg_agrees_on_frames(make: Maker) -> None:
+    folder = make(frames=7, footage="mp4")
+    assert sum(1 for _ in open_recording(folder).frames()) == 7
+    assert open_recording(folder).expected_frames() == 7

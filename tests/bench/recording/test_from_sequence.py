@@ -1,0 +1,102 @@
+"""A sealed sequence exported as a recording gives back what it was, and nothing a lab wouldn't have."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from bench.cli import app
+from bench.recording.folder import open_recording
+from bench.recording.from_sequence import export
+from synth.dataset.store import Sequence, Writer, open_sequence
+from synth.errors import UserError
+from synth.job.schema import Job
+
+SIZE = (33, 48)
+
+
+def sealed(folder: Path, index: int = 0, frames: int = 4) -> Sequence:
+    rng = np.random.default_rng(index)
+    job = Job(frames=frames, flow={"backend": "ideal"})
+    writer = Writer(folder, index, frames=frames, size=SIZE, job=job)
+    writer.put("time", np.arange(frames) / 25.0)
+    writer.put("force", rng.normal(size=(frames, 3)))
+    tissue = np.zeros(SIZE, bool)
+    tissue[4:-4, 4:-4] = True
+    writer.put("tissue", tissue)
+    writer.put("area", np.ones(SIZE, np.float32))
+    for t in range(frames):
+        tool = np.zeros(SIZE, bool)
+        tool[: 2 * t] = True
+        writer.put_frame("rgb", t, rng.integers(0, 255, (*SIZE, 3)).astype(np.uint8))
+        for name, value in (("tool", tool), ("glare", ~tissue), ("visible", tissue)):
+            writer.put_frame(name, t, value)
+        writer.put_frame("flow", t, np.zeros((*SIZE, 2), np.float32))
+        writer.put_frame("depth", t, np.full(SIZE, 300, np.float32))
+        writer.put_frame("traction", t, np.zeros((*SIZE, 3), np.float32))
+    return open_sequence(
+        writer.seal(scenario={"anatomy": 7}, scale_mm_per_px=0.07, young_kpa=1.4, poisson=0.4)
+    )
+
+
+def test_pictures_forces_and_masks_come_back(tmp_path: Path) -> None:
+    sequence = sealed(tmp_path)
+    recording = open_recording(export(sequence, tmp_path / "rec"))
+    frames = list(recording.frames())
+    assert np.array_equal(np.stack([f.rgb for f in frames]), sequence["rgb"][:])
+    assert [f.time_s for f in frames] == pytest.approx(sequence["time"][:])
+    assert recording.force is not None
+    assert recording.force.force_mn == pytest.approx(sequence["force"][:], abs=1e-5)
+    assert recording.meta.scale_mm_per_px == pytest.approx(0.07)
+    assert recording.meta.young_kpa == pytest.approx(1.4)
+    assert recording.meta.specimen == "anatomy 7"
+    assert np.array_equal(recording.tissue_mask(SIZE), sequence["tissue"][:])
+    assert recording.tool(0, SIZE) is None
+    mask = recording.tool(2, SIZE)
+    assert mask is not None
+    assert np.array_equal(mask, sequence["tool"][2])
+
+
+def test_nothing_of_the_truth_leaks(tmp_path: Path) -> None:
+    folder = export(sealed(tmp_path), tmp_path / "rec")
+    names = {path.relative_to(folder).parts[0] for path in folder.rglob("*")}
+    assert names == {"frames", "masks", "force.csv", "frames.csv", "meta.yaml", "tissue.png"}
+
+
+def test_mp4_has_the_size_its_masks_have(tmp_path: Path) -> None:
+    recording = open_recording(export(sealed(tmp_path), tmp_path / "rec", "mp4"))
+    first = next(recording.frames()).rgb
+    assert first.shape == (32, 48, 3)
+    assert recording.tissue_mask((32, 48)).any()
+    assert recording.tool(2, (32, 48)) is not None
+
+
+def test_never_overwrites(tmp_path: Path) -> None:
+    sequence = sealed(tmp_path)
+    export(sequence, tmp_path / "rec")
+    with pytest.raises(UserError, match="exists already"):
+        export(sequence, tmp_path / "rec")
+
+
+def test_from_dataset_takes_one_or_all(tmp_path: Path) -> None:
+    for index in range(2):
+        sealed(tmp_path / "data", index)
+    run = CliRunner().invoke
+    assert (
+        run(
+            app, ["from-dataset", str(tmp_path / "data"), "-o", str(tmp_path / "one"), "--sequence", "1"]
+        ).exit_code
+        == 0
+    )
+    assert [path.name for path in (tmp_path / "one").iterdir()] == ["000001"]
+    assert run(app, ["from-dataset", str(tmp_path / "data"), "-o", str(tmp_path / "all")]).exit_code == 0
+    assert len(list((tmp_path / "all").iterdir())) == 2
+    assert (
+        run(
+            app, ["from-dataset", str(tmp_path / "data"), "-o", str(tmp_path / "x"), "--sequence", "9"]
+        ).exit_code
+        == 2
+    )

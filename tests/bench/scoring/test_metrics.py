@@ -1,0 +1,102 @@
+"""Scores against hand-computed numbers, and what they must notice."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from bench.scoring import metrics
+
+
+def test_agreement_by_hand() -> None:
+    got = metrics.agreement(np.array([0.0, 10, 20, np.nan]), np.array([2.0, 10, 24, 5]))
+    assert got["n"] == 3
+    assert got["mae_mn"] == pytest.approx(2.0)
+    assert got["bias_mn"] == pytest.approx(2.0)
+    assert got["rmse_mn"] == pytest.approx(np.sqrt(20 / 3))
+    assert got["r2"] == pytest.approx(1 - 20 / 200)
+    assert got["gain"] == pytest.approx(220 / 200)
+    # Lin 1989 with population moments: 2 s_xy / (s_x² + s_y² + (mean difference)²).
+    y = np.array([2.0, 10, 24])
+    assert got["ccc"] == pytest.approx(2 * (220 / 3) / (200 / 3 + y.var() + 4))
+
+
+def test_correlation_is_scipys() -> None:
+    rng = np.random.default_rng(0)
+    x = rng.normal(size=50)
+    y = x + rng.normal(size=50)
+    assert metrics.agreement(x, y)["r"] == pytest.approx(stats.pearsonr(x, y).statistic)
+
+
+def test_gain_error_shows_in_r2_and_ccc_but_not_in_r() -> None:
+    x = np.linspace(0, 100, 40)
+    got = metrics.agreement(x, 0.5 * x)
+    assert got["r"] == pytest.approx(1)
+    assert got["r2"] < 0.3
+    assert got["ccc"] < 0.8
+
+
+def test_undefined_is_nan() -> None:
+    flat = metrics.agreement(np.full(5, 3.0), np.arange(5.0))
+    assert np.isnan(flat["r"])
+    assert np.isnan(flat["r2"])
+    assert np.isnan(metrics.agreement(np.array([]), np.array([]))["mae_mn"])
+
+
+@pytest.mark.parametrize("late_s", [-0.2, 0.0, 0.13])
+def test_lag_is_found_on_uneven_times(late_s: float) -> None:
+    rng = np.random.default_rng(1)
+    t = np.sort(rng.uniform(0, 10, 300))
+
+    def signal(at: np.ndarray) -> np.ndarray:
+        return np.sin(1.7 * at) + 0.5 * np.sin(4.1 * at + 1)
+
+    got = metrics.lag(t, signal(t), signal(t - late_s))
+    assert got["lag_s"] == pytest.approx(late_s, abs=0.02)
+    assert got["r_at_lag"] > 0.99
+
+
+def test_contact_has_hysteresis() -> None:
+    curve = np.array([0, 9, 11, 6, 4, 6, 11, 0.0])
+    assert metrics.in_contact(curve, 10).tolist() == [False, False, True, True, False, False, True, False]
+
+
+def test_events_close_short_gaps_and_drop_short_contacts() -> None:
+    t = np.arange(100) / 10
+    contact = np.zeros(100, bool)
+    contact[10:20] = contact[21:30] = True  # one contact with a gap of one sample
+    contact[50] = True  # too short
+    assert metrics.events(t, contact, 0.25) == [metrics.Event(10, 30)]
+
+
+def test_peak_and_impulse_errors() -> None:
+    t = np.arange(0, 5, 0.01)
+    x = 100 * np.exp(-((t - 2) ** 2) / 0.1)
+    _, rows = metrics.everything(t, x, 1.2 * x)
+    assert len(rows) == 1
+    assert rows[0]["peak_error"] == pytest.approx(0.2, abs=1e-9)
+    assert rows[0]["impulse_error"] == pytest.approx(0.2, abs=1e-9)
+    assert rows[0]["impulse_mns"] == pytest.approx(100 * np.sqrt(0.1 * np.pi), rel=0.02)
+
+
+def test_ghosts_are_counted_only_without_contact() -> None:
+    t = np.arange(200) / 20
+    x = np.where((t > 4) & (t < 6), 100.0, 0.0)
+    ghost = x + np.where(t < 2, 30.0, 0.0)
+    scores, _ = metrics.everything(t, x, ghost)
+    assert scores["ghost_rate"] == pytest.approx(np.mean(t[x == 0] < 2))
+    assert scores["ghost_mn"] == pytest.approx(30 * np.mean(t[x == 0] < 2))
+    assert metrics.everything(t, x, x)[0]["contact_f1"] == 1
+
+
+def test_limits_of_agreement_see_groups_that_share_their_error() -> None:
+    rng = np.random.default_rng(0)
+    group = np.repeat(np.arange(200), 20)
+    difference = rng.normal(0, 3, 200)[group] + rng.normal(0, 4, len(group)) + 1
+    got = metrics.limits_of_agreement(difference, group)
+    assert got["bias_mn"] == pytest.approx(1, abs=0.6)
+    assert got["high_mn"] - got["low_mn"] == pytest.approx(2 * 1.96 * 5, rel=0.05)
+    # Two groups only, in which plain pooling would see almost no spread between: theirs counts once each.
+    pair = metrics.limits_of_agreement(np.repeat([0.0, 10.0], 50), np.repeat([0, 1], 50))
+    assert pair["high_mn"] - pair["low_mn"] == pytest.approx(2 * 1.96 * np.sqrt(50), rel=0.02)

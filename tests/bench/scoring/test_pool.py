@@ -1,0 +1,69 @@
+"""Pooled scores by hand, and what can't be pooled."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner
+
+from bench.cli import app
+from bench.output import machine
+from bench.scoring import pool
+from synth.errors import UserError
+
+
+def score(name: str, mae: float, specimen: str = "") -> dict[str, Any]:
+    def method(value: float) -> dict[str, Any]:
+        return {
+            "scores": dict.fromkeys([key for key, _ in pool.SCORES], None) | {"mae_mn": value, "r": 0.9},
+            "calibrated": {},
+        }
+
+    return {
+        "format": "sulcus-score", "recording": name, "main": "net", "frames": 10,
+        "scores": {"mae_mn": mae}, "methods": {"net": method(mae), "zero": method(4.0)},
+        "settings": {"meta": {"specimen": specimen}},
+    }  # fmt: skip
+
+
+MADE = {"command": "bench pool", "machine": machine.describe()}
+
+
+def test_means_and_intervals_over_specimens() -> None:
+    tree = pool.pool([score("a", 1.0, "x"), score("b", 3.0, "x"), score("c", 5.0, "y")])
+    net = tree["methods"]["net"]["scores"]["mae_mn"]
+    assert net["mean"] == pytest.approx(3.0)
+    assert (net["low"], net["high"]) == (2.0, 5.0)  # two specimens: either alone, or both
+    assert tree["methods"]["zero"]["main_worse_by_mn"]["mean"] == pytest.approx(-1.0)
+    assert tree["methods"]["net"]["scores"]["ccc"]["mean"] is None
+    assert tree["specimens"] == 2
+    assert "better" not in pool.readme(tree | MADE)
+
+
+def test_a_better_method_is_marked() -> None:
+    assert "**zero** (better)" in pool.readme(pool.pool([score("a", 5.0), score("b", 6.0)]) | MADE)
+
+
+def test_a_recording_without_scores_is_named() -> None:
+    lost = score("b", 2.0) | {"scores": {}, "sync": {"refused": "ambiguous"}}
+    tree = pool.pool([score("a", 5.0), lost])
+    assert tree["recordings"] == ["a"]
+    assert tree["left_out"] == {"b": "clocks not aligned: ambiguous"}
+    assert "Recording b is left out" in pool.readme(tree | MADE)
+
+
+def test_command_reads_folders_and_refuses_the_same_twice(tmp_path: Path) -> None:
+    for name in "ab":
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "score.json").write_text(json.dumps(score(name, 2.0, name)))
+    out = tmp_path / "out"
+    done = CliRunner().invoke(app, ["pool", str(tmp_path / "a"), str(tmp_path / "b"), "-o", str(out)])
+    assert done.exit_code == 0, done.output
+    assert {path.name for path in out.iterdir()} == {"pool.json", "README.md", "chart.svg", "index.html"}
+    with pytest.raises(UserError, match="given twice"):
+        pool.read([tmp_path / "a", tmp_path / "a"])
+    with pytest.raises(UserError, match="no readable score"):
+        pool.read([tmp_path])

@@ -1,0 +1,67 @@
+"""Offsets between clocks: found within a frame, refused when the recording doesn't determine them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from bench.sensor import clock_sync
+
+
+def presses(t: np.ndarray, seed: int) -> np.ndarray:
+    """Irregular presses, as a hand makes them, mN."""
+    rng = np.random.default_rng(seed)
+    out = np.zeros_like(t)
+    for centre in np.cumsum(rng.uniform(0.6, 1.8, 20)):
+        out += rng.uniform(40, 150) * np.exp(-((t - centre) ** 2) / (2 * rng.uniform(0.08, 0.2) ** 2))
+    return out
+
+
+def recording(
+    lag_s: float, seed: int = 0, noise: float = 0.15, fps: float = 25.0, span_s: float = 8.0
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Frames and a sensor whose clock reads `lag_s` too little."""
+    rng = np.random.default_rng([seed, 1])
+    frames = 1 + np.cumsum(rng.uniform(0.8, 1.2, round(span_s * fps)) / fps)  # variable frame rate
+    speed = np.abs(np.diff(presses(frames, seed), prepend=0)) / np.diff(frames, prepend=frames[0] - 1 / fps)
+    speed[0] = 0
+    speed = 0.01 * (speed + noise * speed.max() * np.abs(rng.normal(size=len(speed))))
+    t = np.arange(0, 12, 0.002)
+    force = presses(t, seed) + rng.normal(0, 0.3, len(t))
+    return frames, speed, t - lag_s, np.stack([force, 0 * t, 0 * t], axis=1)
+
+
+@pytest.mark.parametrize("lag_s", [-0.5, -0.313, -0.1, 0.0, 0.04, 0.2, 0.5])
+@pytest.mark.parametrize("seed", range(3))
+def test_known_lags_within_one_frame(lag_s: float, seed: int) -> None:
+    found = clock_sync.find(*recording(lag_s, seed), search_s=0.7)
+    assert found.refused == ""
+    assert found.offset_s == pytest.approx(lag_s, abs=1 / 25)
+    assert abs(found.offset_s - lag_s) < 5 * max(found.deviation_s, 0.004)
+
+
+def test_periodic_presses_are_ambiguous() -> None:
+    frames = np.arange(0, 8, 0.04)
+    t = np.arange(-1, 9, 0.002)
+    rng = np.random.default_rng(0)
+    force = 100 * np.clip(np.sin(2 * np.pi * 2 * t), 0, None)
+    speed = np.abs(np.gradient(100 * np.clip(np.sin(2 * np.pi * 2 * frames), 0, None), 0.04))
+    found = clock_sync.find(frames, speed + rng.normal(0, 40, len(speed)), t, np.stack([force] * 3, 1), 0.6)
+    assert found.refused
+
+
+def test_noise_is_refused() -> None:
+    frames, _, t, force = recording(0.0)
+    speed = np.abs(np.random.default_rng(5).normal(size=len(frames)))
+    assert "correlate by only" in clock_sync.find(frames, speed, t, force, 0.5).refused
+
+
+def test_lag_beyond_the_search_is_refused() -> None:
+    assert clock_sync.find(*recording(0.5), search_s=0.3).refused
+
+
+def test_too_short_a_span_and_a_still_one_are_refused() -> None:
+    frames, speed, t, force = recording(0.0)
+    assert "frame intervals" in clock_sync.find(frames[:10], speed[:10], t, force, 0.5).refused
+    assert "nothing moves" in clock_sync.find(frames, 0 * speed, t, force, 0.5).refused
+    assert "cover" in clock_sync.find(frames + 100, speed, t, force, 0.5).refused

@@ -1,0 +1,104 @@
+"""Sensor processing against signals whose answer is known, and scales against drawn boards."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from bench.recording import pixel_scale
+from bench.recording.folder import Force
+from bench.recording.meta import Meta, Sensor
+from bench.sensor import force_sensor
+from synth.errors import UserError
+
+
+def three(x: np.ndarray) -> np.ndarray:
+    return np.stack([x, np.zeros_like(x), np.zeros_like(x)], axis=1)
+
+
+def test_tare_and_drift_come_off() -> None:
+    t = np.arange(0, 10, 0.01)
+    press = 100 * np.exp(-((t - 5) ** 2))
+    raw = Force(t, three(press + 30 + 2 * t))
+    about = Sensor(low_pass_hz=None, free_s=((0, 1), (9, 10)))
+    got = force_sensor.process(raw, about, 0.0)
+    assert got.force_mn[:, 0] == pytest.approx(press, abs=1.1)  # constant beyond the spans' middles
+    assert got.drift_mn == pytest.approx(18, abs=0.1)
+
+
+def test_noise_floor_is_the_standard_deviation() -> None:
+    rng = np.random.default_rng(0)
+    t = np.arange(0, 20, 0.01)
+    raw = Force(t, rng.normal(0, 3, (len(t), 3)))
+    got = force_sensor.process(raw, Sensor(low_pass_hz=None, free_s=((0, 20),)), 0.0)
+    assert got.noise_floor_mn == pytest.approx(3 * np.sqrt(3), rel=0.03)
+
+
+def test_gravity_of_what_hangs_on_a_turning_tool() -> None:
+    t = np.arange(0, 5, 0.01)
+    down = np.stack([np.sin(t), np.zeros_like(t), np.cos(t)], axis=1)
+    on_tool = -three(50 * np.exp(-((t - 2) ** 2))) + 20 * force_sensor.STANDARD_GRAVITY * down
+    raw = Force(t, -on_tool, down)  # the reader has turned the sign: force on the tissue
+    got = force_sensor.process(raw, Sensor(acts_on="tool", mass_g=20, low_pass_hz=None), 0.0)
+    assert got.force_mn == pytest.approx(three(50 * np.exp(-((t - 2) ** 2))), abs=1e-9)
+    with pytest.raises(UserError, match="gx, gy, gz"):
+        force_sensor.process(Force(t, -on_tool), Sensor(mass_g=20), 0.0)
+
+
+@pytest.mark.parametrize("causal", [False, True])
+def test_low_pass_delays_only_when_causal(causal: bool) -> None:
+    t = np.arange(0, 20, 0.005)
+    raw = Force(t, three(np.sin(2 * np.pi * t) + np.sin(2 * np.pi * 40 * t)))
+    got = force_sensor.process(raw, Sensor(low_pass_hz=8), 0.0, causal=causal).force_mn[:, 0]
+    inner = slice(800, -800)
+    shifts = np.arange(-40, 100)
+    fit = [np.mean((got[inner] - np.sin(2 * np.pi * (t[inner] - s * 0.001))) ** 2) for s in shifts]
+    delay_s = 0.001 * shifts[int(np.argmin(fit))]
+    assert min(fit) < 1e-3  # the 40 Hz are gone
+    if causal:
+        # Group delay of a 4th-order Butterworth at low frequency: 2.613 / (2 pi f_c).
+        assert delay_s == pytest.approx(2.613 / (2 * np.pi * 8), abs=0.002)
+    else:
+        assert delay_s == pytest.approx(0, abs=0.001)
+
+
+def test_frames_in_a_hole_have_no_truth() -> None:
+    t = np.concatenate([np.arange(0, 1, 0.01), np.arange(2, 3, 0.01)])
+    got = force_sensor.process(Force(t, three(t)), Sensor(low_pass_hz=None), 0.5)
+    at = force_sensor.at(got, np.array([0.2, 0.75, 2.0, 2.75]))
+    assert np.isnan(at[0]).all()  # before the sensor began: its clock is moved by 0.5 s
+    assert at[1, 0] == pytest.approx(0.25)
+    assert np.isnan(at[2]).all()
+    assert at[3, 0] == pytest.approx(2.25)
+
+
+def test_checkerboard_scale(tmp_path: Path) -> None:
+    square, (columns, rows) = 23.4, (7, 5)
+    y, x = np.mgrid[: 8 * 24 + 60, : 10 * 24 + 60]
+    inside = (x >= 30) & (y >= 30) & (x < 30 + 8 * square) & (y < 30 + 6 * square)
+    dark = (((x - 30) // square + (y - 30) // square) % 2 == 0) & inside
+    cv2.imwrite(str(tmp_path / "board.png"), np.where(dark, 20, 235).astype(np.uint8))
+    about = Meta.model_validate(
+        {"calibration": {"checkerboard": "board.png", "corners": [columns, rows], "square_mm": 2.0}}
+    )
+    found = pixel_scale.find(about, tmp_path)
+    assert found.mm_per_px == pytest.approx(2.0 / square, rel=0.005)
+    assert found.uncertainty < 0.01
+    worse = Meta.model_validate(
+        {
+            "calibration": {"checkerboard": "board.png", "corners": [4, 4], "square_mm": 2.0},
+            "young_kpa": "unknown",
+        }
+    )
+    with pytest.raises(UserError, match="no checkerboard"):
+        pixel_scale.find(worse, tmp_path)
+
+
+def test_scale_of_a_bar_knows_its_error() -> None:
+    about = Meta.model_validate({"calibration": {"bar_px": [[10, 10], [110, 10]], "bar_mm": 5}})
+    found = pixel_scale.find(about, Path())
+    assert found.mm_per_px == pytest.approx(0.05)
+    assert found.uncertainty == pytest.approx(np.sqrt(2) / 100)

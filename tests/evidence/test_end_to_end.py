@@ -1,0 +1,175 @@
+"""Whole pipelines: errors of known answers, turns that keep the physics, rules that find what is linear."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from evidence import defaults_on_front
+from evidence.end_to_end import costs, models, page, pareto
+from learn.data.clips import Clip
+
+N, T = 16, 6
+RESULTS = Path(__file__).parents[2] / "docs" / "results"
+
+
+def clip(rng: np.random.Generator, name: int = 0) -> Clip:
+    """A force across the line of sight that is E times the sum of displacement over the left half; a mask
+    with a corner missing."""
+    moved = rng.standard_normal((T, 2, N, N)).astype(np.float32)
+    mask = np.ones((N, N), np.float32)
+    mask[:3, :5] = 0
+    moved *= mask
+    force = np.zeros((T, 3))
+    force[:, :2] = 2.0 * moved.sum(axis=(2, 3))
+    return Clip(
+        name=str(name),
+        content_hash=str(name),
+        group=str(name),
+        family="",
+        gesture="pull",
+        young_kpa=2.0,
+        mask=mask,
+        displacement={"recovered": moved},
+        confidence=np.ones((T, N, N), np.float32),
+        density=np.zeros((T, 3, N, N), np.float32),
+        force=force,
+    )
+
+
+def test_errors_of_known_answers() -> None:
+    force = np.tile([3.0, 0.0, 4.0], (2, 1))
+    zero = pareto.errors([np.zeros((2, 3))], [force])
+    assert zero == {
+        "errors": [pytest.approx(1)],
+        "across": [pytest.approx(0.6)],
+        "along": [pytest.approx(0.8)],
+    }
+    half = pareto.errors([force / 2, force], [force, force])
+    assert half["errors"] == [pytest.approx(0.5), 0]
+
+
+def test_a_small_press_weighs_as_much_as_a_large_one() -> None:
+    force = np.tile([3.0, 0.0, 4.0], (2, 1))
+    found = pareto.errors([force * 0, force * 0.5], [force, 100 * force])
+    assert found["errors"] == [pytest.approx(1), pytest.approx(0.995)]
+
+
+def arrow(clip: Clip) -> NDArray[np.float64]:
+    """Where the one moved cell is from the middle, and how it moves, (4,)."""
+    moved = np.asarray(clip.displacement["recovered"][0])
+    row, col = np.argwhere(np.abs(moved).sum(axis=0) > 0)[0]
+    return np.array([col - (N - 1) / 2, row - (N - 1) / 2, *moved[:, row, col]])
+
+
+def test_turns_turn_places_and_vectors_alike() -> None:
+    """Displacement that points away from the middle does so in every turn; and so does the force."""
+    one = clip(np.random.default_rng(0))
+    moved = np.zeros((T, 2, N, N), np.float32)
+    moved[:, :, 2, 11] = (11 - 7.5, 2 - 7.5)  # outwards: x right, y down
+    force = np.tile([3.5, -5.5, 9.0], (T, 1))
+    turns = models.turned(replace(one, displacement={"recovered": moved}, force=force))
+    for turn in turns:
+        x, y, dx, dy = arrow(turn)
+        assert (dx, dy) == (x, y)
+        assert turn.force[0] == pytest.approx([x, y, 9.0])
+    assert len({tuple(arrow(turn)) for turn in turns}) == 8
+    mask = turns[1].mask
+    assert all(turn.mask.sum() == mask.sum() for turn in turns)
+
+
+def test_turns_keep_the_sense_of_rotation_unless_mirrored() -> None:
+    one = clip(np.random.default_rng(0))
+    moved = np.zeros((T, 2, N, N), np.float32)
+    moved[:, :, 2, 11] = (5.5, 3.5)  # a quarter turn from outwards
+    senses = [
+        x * dy - y * dx > 0
+        for x, y, dx, dy in map(arrow, models.turned(replace(one, displacement={"recovered": moved})))
+    ]
+    assert senses == [senses[0]] * 4 + [not senses[0]] * 4
+
+
+def test_ridge_says_nothing_of_no_motion(tmp_path: Path) -> None:
+    rng = np.random.default_rng(1)
+    fit = [clip(rng, k) for k in range(4)]
+    still = replace(fit[0], displacement={"recovered": np.zeros((T, 2, N, N), np.float32)})
+    said = models.build(models.RIDGE, fit, tmp_path, 1, 0)(still)
+    assert said.shape == (T, 3)
+    assert said == pytest.approx(0)
+
+
+def test_ridge_finds_what_is_linear_and_nearest_finds_what_it_knows(tmp_path: Path) -> None:
+    rng = np.random.default_rng(2)
+    fit, fresh = [clip(rng, k) for k in range(12)], clip(rng, 12)
+    ridge = models.build(models.RIDGE, fit, tmp_path, 1, 0)
+    found = pareto.errors([ridge(fresh)], [fresh.force])
+    assert found["errors"][0] < 0.05
+    twice = [replace(one, force=one.force * 0 + [0, 0, 4.0]) for one in fit]
+    near = models.build(models.NEAREST, twice, tmp_path, 1, 0)
+    assert near(fresh) == pytest.approx(np.tile([0, 0, 4.0], (T, 1)))
+
+
+def test_the_least_of_the_rounds_counts() -> None:
+    found = costs.least({"data stable-4": [3.0, 1.0], "flow tvl1": [0.2, 0.3], "answer a b": [1.0]})
+    assert found.data == {"stable-4": 1.0}
+    assert found.flow == {"ideal": 0.0, "tvl1": 0.2}
+    assert found.answer == {"a b": 1.0}
+
+
+def row(cpu_s: float, errors: list[float], *, default: bool = False, tets: int = 1600) -> dict[str, object]:
+    world = pareto.default_world()
+    return {
+        "law": world.law, "tets": tets, "spp": world.spp, "flow": "tvl1", "model": "m", "default": default,
+        "cpu_s": cpu_s, "errors": errors, "across": errors, "along": errors,
+    }  # fmt: skip
+
+
+def test_kept_sequences_are_found_only_by_what_made_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    world = pareto.FINE
+    job = world.job(1, 4)
+    here = pareto.called(world, job)
+    assert pareto.called(world, world.job(1, 9)) == here  # more of the same
+    longer = pareto.called(world, job.model_copy(update={"frames": job.frames + 1}))
+    monkeypatch.setattr("synth.dataset.provenance.fingerprint", lambda: "another")
+    assert len({here, longer, pareto.called(world, job)}) == 3
+
+
+def test_differences_are_paired() -> None:
+    """Sequences that differ widely among themselves, and all by a tenth from one pipeline to the other."""
+    usual = list(np.linspace(0.2, 1.2, 12))
+    better = [e - 0.1 - 0.01 * (k % 2) for k, e in enumerate(usual)]
+    rows = pareto.summarised([row(1.0, usual, default=True), row(0.9, better, tets=400)], 0)
+    assert rows[0]["difference"] is None
+    mean, low, high = rows[1]["difference"]
+    assert mean == pytest.approx(-0.105)
+    assert -0.11 <= low < mean < high <= -0.1
+    assert rows[1]["high"] > rows[0]["low"]  # intervals apart would not tell
+
+
+@pytest.mark.parametrize(
+    ("cost", "off", "holds"),
+    [
+        (0.9, -0.10, False),
+        (1.1, -0.10, True),  # dearer
+        (0.9, -0.02, True),  # beyond doubt, but within what is allowed
+        (0.9, +0.10, True),
+    ],
+)
+def test_a_front_is_left_beyond_the_paired_interval(cost: float, off: float, holds: bool) -> None:
+    usual = list(np.linspace(0.2, 1.2, 12))
+    other = [e + off * (1 + 0.1 * (k % 2)) for k, e in enumerate(usual)]
+    rows = pareto.summarised([row(1.0, usual, default=True), row(cost, other, tets=400)], 0)
+    found = defaults_on_front._end_to_end({"rows": rows})
+    assert [front.holds() for front in found] == [holds] * len(found)
+
+
+def test_the_page_is_that_of_its_data(tmp_path: Path) -> None:
+    found = json.loads((RESULTS / "end-to-end" / "pareto.json").read_text("utf-8"))
+    page.write(found, tmp_path)
+    for name in ("chart.svg", "index.html", "README.md"):
+        assert (tmp_path / name).read_text("utf-8") == (RESULTS / "end-to-end" / name).read_text("utf-8")

@@ -1,0 +1,64 @@
+"""The physics' measurements, small: the page, a user's surface, order and size of the mesh."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from bench.output import plot
+from bench.output.plot import Curve, Panel
+from evidence.fem import case, surface
+
+
+def test_the_page_holds_its_charts_and_rows_and_asks_for_nothing_else(tmp_path: Path) -> None:
+    panels = [
+        Panel(
+            "cost",
+            "ms",
+            "error",
+            (Curve("P2 <fast>", (1.0, 10.0), (4.0, float("nan")), ("700", "1600")),),
+            True,
+        ),
+        Panel("loads", "P", "error", (Curve("linear", (0.0, 0.1, 0.2), (0.0, 1.0, 3.0)),)),
+    ]
+    rows = [{"law": "linear", "error": 0.0123456}, {"law": "stable", "error": None, "why": "a & b"}]
+    found = {"command": "bench pareto fem", "machine": {"cores": 2}}
+    plot.write(panels, tmp_path, "Physics", rows, found)
+    page = (tmp_path / "index.html").read_text("utf-8")
+    assert not re.findall(r"(?:src|href)=", page)
+    assert page.count("<polyline") == 1
+    assert page.count("<circle") == 1 + 3 + 2  # points, and one a name
+    assert "P2 &lt;fast&gt;" in page
+    assert "<td>0.01235</td>" in page
+    assert "a &amp; b" in page
+    assert (tmp_path / "chart.svg").read_text("utf-8").count("<circle") == 6
+
+
+def test_a_users_surface_is_measured_against_a_finer_mesh(tmp_path: Path) -> None:
+    ball = trimesh.creation.icosphere(subdivisions=3)
+    ball.vertices *= (30.0, 28.0, 26.0)
+    path = tmp_path / "ball.ply"
+    ball.export(path)
+    found = surface.measure(path, np.array([0.0, 0.0, 1.0]), [300], 700)
+    assert found["volume_mm3"] == pytest.approx(ball.volume, rel=0.02)
+    (row,) = found["rows"]
+    assert row["volume_kept"] == pytest.approx(1.0, abs=0.03)
+    assert 0.001 < row["error"] < 0.3
+
+
+def test_error_falls_with_the_mesh_and_with_the_order() -> None:
+    on, contact = case.patch(3600), case.CONTACTS[0]
+    exact = case.moved(case.brain(on, "linear", 2, 2000, contact), 0.1, "pull", 1)
+
+    def error(order: int, tets: int) -> float:
+        return case.error(
+            case.moved(case.brain(on, "linear", order, tets, contact), 0.1, "pull", 1), exact, on
+        )
+
+    assert error(2, 1200) < 0.06
+    assert error(2, 1200) < 0.7 * error(2, 500)
+    assert error(1, 1200) > 3 * error(2, 1200)

@@ -1,0 +1,42 @@
+"""The recording that scoring's cost is measured on."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bench.recording.folder import open_recording
+from bench.tracking.tracking import Settings, follow
+from evidence.scoring import scoring_cost
+
+
+def test_the_bump_moves_as_the_sensor_says(tmp_path: Path) -> None:
+    scoring_cost.record(tmp_path / "rec", 3.0, 10.0, (128, 96), np.random.default_rng(0))
+    recording = open_recording(tmp_path / "rec")
+    assert recording.expected_frames() == 30
+    done = follow(recording, {}, 35 / 128, Settings("dis", shrink=1, rate_hz=None))
+    # Still for half a second, then away, at the peak after a quarter of the period, then back.
+    speed = np.array(done.speed)
+    assert speed[:5].max() < 0.1 * speed[5:].max()
+    peak = int(np.argmax(recording.force.force_mn[:, 0])) if recording.force is not None else -1
+    assert peak / 200 == pytest.approx(1.5, abs=0.02)
+
+
+def test_the_result_is_told_with_both_processes_memory() -> None:
+    stage = {"cpu_s": 1.0, "wall_s": 2.0}
+    tree = {
+        "seconds": 60.0,
+        "fps": 30.0,
+        "size": [680, 480],
+        "frames": 600,
+        "wall_s": 90.0,
+        "timings": {"flow": stage, "peak_rss_mb": 800.0, "flow_peak_rss_mb": 400.0},
+        "machine": {"processor": "P", "cores": 2, "memory_gb": 8.0},
+        "command": "bench experiment scoring MODEL --train DATA",
+    }
+    told = scoring_cost.readme(tree)
+    assert "**90 s, 1.5 times the" in told
+    assert "1.2 GB" in told
+    assert "| flow | 1.0 | 2.0 |" in told

@@ -1,0 +1,25 @@
+"""Fixtures of tests that learn: a dataset of phantoms, and its clips."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import phantom
+import pytest
+
+from learn.data.clips import Clip, load
+from learn.data.grid import Grid
+
+
+@pytest.fixture(scope="session")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Eight sequences of six anatomies: two pairs share one."""
+    folder = tmp_path_factory.mktemp("dataset")
+    for index, anatomy in enumerate((1, 1, 2, 3, 3, 4, 5, 6)):
+        phantom.write(folder, index, anatomy_seed=anatomy, family="pale" if anatomy == 6 else "healthy")
+    return folder
+
+
+@pytest.fixture(scope="session")
+def clips(dataset: Path) -> list[Clip]:
+    return load(dataset, Grid(32), ("ideal", "recovered"))

@@ -1,0 +1,44 @@
+"""An egg for a brain: a surface as users have it, in every format that is read."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import trimesh
+
+from synth.job import schema
+
+OPENING = schema.Craniotomy(point=(31.0, 0.0, 0.0), direction=(1.0, 0.0, 0.0))
+
+
+def soup() -> np.ndarray:
+    """An ellipsoid as users have it, (F, 3, 3): every face has its own vertices, some twice, some not."""
+    ball = trimesh.creation.icosphere(subdivisions=3)
+    ball.vertices *= (32.0, 26.0, 22.0)
+    return np.asarray(ball.vertices[np.concatenate([ball.faces[20:], ball.faces[40:60]])])
+
+
+def written(path: Path, corner: np.ndarray) -> Path:
+    """Triangles (F, 3, 3) as a file of the format that its name says, vertices unmerged."""
+    flat = [f"{x:.6f} {y:.6f} {z:.6f}" for x, y, z in corner.reshape(-1, 3)]
+    three = np.arange(len(flat)).reshape(-1, 3)
+    rows = [f"3 {a} {b} {c}" for a, b, c in three]
+    if path.suffix == ".obj":
+        lines = [f"v {v}" for v in flat] + [f"f {a + 1} {b + 1} {c + 1}" for a, b, c in three]
+    elif path.suffix == ".stl":
+        lines = ["solid egg"]
+        for triple in three:
+            corners = [f"vertex {flat[i]}" for i in triple]
+            lines += ["facet normal 0 0 0", "outer loop", *corners, "endloop", "endfacet"]
+        lines.append("endsolid egg")
+    elif path.suffix == ".ply":
+        lines = ["ply", "format ascii 1.0", f"element vertex {len(flat)}"]
+        lines += [f"property float {axis}" for axis in "xyz"]
+        lines += [f"element face {len(rows)}", "property list uchar int vertex_indices", "end_header"]
+        lines += [*flat, *rows]
+    else:
+        lines = ["# vtk DataFile Version 3.0", "egg", "ASCII", "DATASET POLYDATA"]
+        lines += [f"POINTS {len(flat)} float", *flat, f"POLYGONS {len(rows)} {4 * len(rows)}", *rows]
+    path.write_text("\n".join(lines) + "\n")
+    return path

@@ -1,0 +1,79 @@
+"""Recordings with a known answer: a texture moved by a smooth field in proportion to a known force."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from bench.recording import video, writer
+from bench.tracking.tracking import Answer, Scene
+from evidence.scoring import phantom
+
+GAIN_MN_PER_PX = 40.0
+
+
+def texture(height: int, width: int, seed: int = 0) -> NDArray[np.uint8]:
+    """`phantom.texture` of a seed."""
+    return phantom.texture(height, width, np.random.default_rng(seed))
+
+
+def force_curve(time_s: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Two presses a period of 2 s, peak 120 mN; 0 in the first 0.2 s."""
+    return 120 * np.clip(np.sin(2 * np.pi * (time_s - 0.2) / 2), 0, None) * (time_s >= 0.2)
+
+
+@dataclass(frozen=True)
+class Maker:
+    """Writes recordings under one folder."""
+
+    root: Path
+
+    def __call__(
+        self,
+        name: str = "rec",
+        *,
+        frames: int = 30,
+        fps: float = 10.0,
+        size: tuple[int, int] = (96, 128),
+        sensor_hz: float = 100.0,
+        meta: Mapping[str, Any] | None = None,
+        footage: str = "png",
+        force: bool = True,
+    ) -> Path:
+        folder = self.root / name
+        (folder / "frames").mkdir(parents=True)
+        time = np.arange(frames) / fps
+        rest = texture(*size)
+        pictures = [phantom.pushed(rest, f / GAIN_MN_PER_PX) for f in force_curve(time)]
+        if footage == "png":
+            for k, rgb in enumerate(pictures):
+                cv2.imwrite(str(folder / "frames" / f"{k:04d}.png"), rgb[..., ::-1])
+            writer.frames(folder, time)
+        else:
+            (folder / "frames").rmdir()
+            video.write_video(folder / "video.mp4", iter(pictures), time, crf=6)
+        if force:
+            t = np.arange(0, time[-1] + 1e-9, 1 / sensor_hz)
+            writer.force(folder, t, np.outer(force_curve(t) / 1000, [1.0, 0.0, 0.0]))
+        about = {"scale_mm_per_px": 0.2, "young_kpa": 1.0, "sensor": {"axes": "camera", "low_pass_hz": None}}
+        writer.about(folder, {**about, **(meta or {})})
+        return folder
+
+
+class Bump:
+    """The inverse of `phantom.pushed`: force from the largest displacement, as a perfect method would."""
+
+    def __call__(
+        self, flow: NDArray[np.float32], confidence: NDArray[np.float32], scene: Scene, picture: bool
+    ) -> Answer:
+        length = np.linalg.norm(flow, axis=-1)
+        height, width = length.shape
+        middle = flow[height // 2 - 4 : height // 2 + 4, width // 2 - 4 : width // 2 + 4, 0]
+        force = GAIN_MN_PER_PX * float(np.median(middle))
+        return Answer(np.array([force, 0.0, 0.0]), length.astype(np.float32) if picture else None)

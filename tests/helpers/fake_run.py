@@ -1,0 +1,80 @@
+"""Running the engine with a stand-in for the pipeline."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from synth.dataset.folder import claim
+from synth.dataset.index import write
+from synth.engine.journal import Account
+from synth.engine.run import Options, run
+from synth.engine.worker_process import Attempt
+from synth.job.schema import Job
+from synth.publish import card
+
+HERE = Path(__file__).resolve().parent
+
+
+class Silent:
+    """A watcher that remembers the attempts."""
+
+    def __init__(self) -> None:
+        self.attempts: list[tuple[Attempt, bool]] = []
+
+    def begin(self, total: int, already: int, failed: int) -> None:
+        self.begun = (total, already, failed)
+
+    def stage(self, index: int, stage: str, done: int, of: int) -> None:
+        assert 0 <= done <= of
+
+    def end(self, attempt: Attempt, again: bool) -> None:
+        self.attempts.append((attempt, again))
+
+    def account(self, account: Account) -> None:
+        self.last = account
+
+
+def options(work: str, **more: object) -> Options:
+    path = os.pathsep.join([str(HERE), str(HERE.parents[1])])
+    return Options(
+        work=f"fake_work:{work}",
+        environment={"PYTHONPATH": path},
+        **{"workers": 1, "mix_versions": True, **more},
+    )  # type: ignore[arg-type]
+
+
+def in_process(job: Job, root: Path, work: Callable[..., None]) -> None:
+    """What a run leaves, made without worker processes."""
+    with claim(root, job) as folder:
+        for index in range(job.sequences):
+            work(job, index, root, lambda *_: None)
+        write(folder)
+        card.write(folder)
+
+
+def start(root: Path, job: Job, work: str) -> subprocess.Popen[bytes]:
+    """A run in a process of its own, which can be killed."""
+    program = (
+        "import sys; sys.path[:0] = sys.argv[4:]; from pathlib import Path; import fake_run; "
+        "fake_run.run_job(Path(sys.argv[1]), sys.argv[2], sys.argv[3])"
+    )
+    words = [str(root), job.model_dump_json(), work, str(HERE), str(HERE.parents[1])]
+    return subprocess.Popen([sys.executable, "-c", program, *words])
+
+
+def run_job(root: Path, job: str, work: str) -> None:
+    """What the process of `start` does."""
+    run(Job.model_validate_json(job), root, options(work), Silent())
+
+
+def wait_for(condition: Callable[[], bool], seconds: float = 60.0) -> None:
+    """Returns as soon as the condition holds; AssertionError when it never does."""
+    until = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < until, "nothing happened"
+        time.sleep(0.02)

@@ -1,0 +1,205 @@
+"""Stand-ins for the pipeline: sequences that cost nothing, and such that end badly."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from synth.dataset.store import Writer
+from synth.errors import UserError
+from synth.job.schema import Job
+
+Report = Callable[[str, int, int], None]
+
+
+def sequence(job: Job, index: int, folder: Path, report: Report) -> None:
+    """A sequence whose every field is random, from the job's seed and the index only."""
+    rng = np.random.default_rng((job.seed, index))
+    width, height = job.render.size
+    writer = Writer(folder, index, frames=job.frames, size=(height, width), job=job)
+    writer.put("time", np.arange(job.frames) / job.fps)
+    writer.put("force", rng.normal(size=(job.frames, 3)))
+    writer.put("tissue", rng.random((height, width)) > 0.2)
+    writer.put("area", rng.random((height, width)))
+    for t in range(job.frames):
+        report("render", t, job.frames)
+        for name in ("visible", "tool", "glare"):
+            writer.put_frame(name, t, rng.random((height, width)) > 0.5)
+        writer.put_frame("rgb", t, rng.integers(0, 256, (height, width, 3)).astype(np.uint8))
+        writer.put_frame("flow", t, rng.normal(size=(height, width, 2)))
+        writer.put_frame("depth", t, rng.random((height, width)) + 300)
+        writer.put_frame("traction", t, rng.normal(size=(height, width, 3)))
+    writer.seal(**attributes(index, rng))
+
+
+def attributes(index: int, rng: np.random.Generator) -> dict[str, Any]:
+    return {
+        "scenario": {
+            "index": index,
+            "anatomy": index,
+            "family": "healthy",
+            "gesture": {"kind": "pull", "load": 0.1},
+        },
+        "scale_mm_per_px": 0.1,
+        "young_kpa": float(rng.uniform(0.5, 3)),
+        "poisson": 0.4,
+        "timings": {"render": {"cpu_s": time.process_time(), "wall_s": 0.0}},
+    }
+
+
+def troubled(job: Job, index: int, folder: Path, report: Report) -> None:
+    """1 aborts, 2 fills memory, 3 is NaN, 4 raises, 6 refuses, 7 works at the second try."""
+    if index == 1:
+        report("render", 0, 1)
+        os.abort()
+    if index == 2:
+        held = []
+        while True:
+            held.append(np.ones(1 << 22))
+            report("fem", len(held), 1 << 20)
+    if index == 3:
+        writer = Writer(folder, index, frames=job.frames, size=(8, 8), job=job)
+        writer.put("force", np.full((job.frames, 3), np.nan))
+    if index == 4:
+        raise ZeroDivisionError("by nought")
+    if index == 6:
+        raise UserError("the load is past the material's range")
+    if index == 7:
+        tried = folder / ".run" / "tried"
+        if not tried.exists():
+            tried.touch()
+            os.kill(os.getpid(), 9)
+    sequence(job, index, folder, report)
+
+
+def seeing(job: Job, index: int, folder: Path, report: Report) -> None:
+    """Leaves word of the GPU that it sees, and takes long enough that every worker gets one."""
+    (folder / ".run" / f"saw-{index}").write_text(os.environ.get("CUDA_VISIBLE_DEVICES", "whatever is there"))
+    slow(job, index, folder, report)
+
+
+def hanging(job: Job, index: int, folder: Path, report: Report) -> None:
+    """It never comes back."""
+    time.sleep(600)
+
+
+def refused(job: Job, index: int, folder: Path, report: Report) -> None:
+    """No sequence of this job can be carried out."""
+    raise UserError("no surface at the craniotomy")
+
+
+def trying(job: Job, index: int, folder: Path, report: Report) -> None:
+    """Sequences 2 and 6 cannot be carried out."""
+    if index in (2, 6):
+        raise UserError("the load is past the material's range")
+    sequence(job, index, folder, report)
+
+
+def full(job: Job, index: int, folder: Path, report: Report) -> None:
+    """The disk is full at the third sequence."""
+    if index >= 2:
+        raise OSError(28, "No space left on device")
+    sequence(job, index, folder, report)
+
+
+def slow(job: Job, index: int, folder: Path, report: Report) -> None:
+    """A sequence that takes its time, so that it can be interrupted."""
+    for t in range(5):
+        report("fem", t, 5)
+        time.sleep(0.05)
+    sequence(job, index, folder, report)
+
+
+def stuck(job: Job, index: int, folder: Path, report: Report) -> None:
+    """From the fourth sequence on without end: whoever interrupts it comes in time."""
+    while index >= 3:
+        report("fem", 0, 5)
+        time.sleep(0.05)
+    sequence(job, index, folder, report)
+
+
+def consistent(job: Job, index: int, folder: Path, report: Report, fault: str = "") -> None:
+    """A flat tissue seen squarely that slides to the right while a load rests on it: every invariant holds.
+
+    `fault` names the field that is made wrong, for tests that must find it.
+    """
+    rng = np.random.default_rng((job.seed, index))
+    width, height = job.render.size
+    frames, focal, distance = job.frames, 1000.0, 300.0
+    rows, columns = np.mgrid[:height, :width].astype(np.float64)
+    texture = _texture(rng)
+    tissue = np.hypot(rows - height / 2, columns - width / 2) < 0.45 * height
+    area = np.where(tissue, (distance / focal) ** 2, 0.0)
+    spot = np.exp(-((rows - height / 2) ** 2 + (columns - width / 2) ** 2) / (2 * (height / 20) ** 2))
+    spot *= spot > 1e-3
+    load = np.array([1.0, 0.5, 2.0])
+    spot /= (spot * area).sum()
+    share = np.arange(frames) / (frames - 1)
+    force = share[:, None] * load * (2.0 if fault == "force" else 1.0)
+
+    writer = Writer(folder, index, frames=frames, size=(height, width), job=job)
+    writer.put("time", np.arange(frames) / job.fps)
+    writer.put("force", force)
+    writer.put("tissue", tissue)
+    writer.put("area", area)
+    for t in range(frames):
+        moved = 6.0 * share[t]
+        tool = columns < 6
+        flow = np.zeros((height, width, 2))
+        flow[tissue, 0] = -moved if fault == "flow" else moved
+        flow[tissue, 1] = 1.0 if fault == "rest" and t == 0 else 0.0
+        if fault == "fold" and t:
+            flow[tissue, 0] -= 2 * (columns - width / 2)[tissue] * (np.abs(columns - width / 2) < 10)[tissue]
+        recovered = flow + (0.1 if fault == "recovered_rest" else 0.0)
+        picture = texture(rows, columns - moved)
+        gone = (columns + flow[..., 0] < 8) | (columns + flow[..., 0] > width - 1)
+        writer.put_frame("rgb", t, np.repeat(picture[..., None], 3, axis=-1).astype(np.uint8))
+        writer.put_frame("flow", t, flow)
+        covered = _block(tool, rows, height) if fault == "visibility" else tool
+        writer.put_frame("visible", t, ~gone)
+        writer.put_frame("tool", t, covered)
+        writer.put_frame("glare", t, np.zeros_like(tissue))
+        writer.put_frame("depth", t, np.full((height, width), -1.0 if fault == "depth" and t else distance))
+        pressed = 1e-3 if fault == "load_rest" and t == 0 else share[t]
+        writer.put_frame("traction", t, pressed * spot[..., None] * load)
+        writer.put_frame("flow_tvl1", t, recovered)
+        writer.put_frame("flow_confidence", t, np.ones((height, width)))
+    focal *= 0.5 if fault == "camera" else 1.0
+    tip = np.zeros((frames, 2, 3))
+    tip[:, :, 0] = (6.0 * share * distance / 1000.0 + (3.0 if fault == "contact" else 0.0))[:, None]
+    described = attributes(index, rng)
+    described["scenario"]["gesture"]["footprint_mm"] = 3.0
+    described["scale_mm_per_px"] = distance / 1000.0 * (1.5 if fault == "scale" else 1.0)
+    writer.seal(
+        **described,
+        K=[[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]],
+        distortion=[0.0] * 5,
+        rotation=np.eye(3).tolist(),
+        translation=[0.0, 0.0, distance],
+        mechanics={"instruments": [{"tip_mm": tip.tolist()}]},
+    )
+
+
+def _texture(rng: np.random.Generator) -> Callable[..., Any]:
+    waves = rng.normal(scale=0.6, size=(20, 2))
+    phases = rng.uniform(0, 6.28, 20)
+
+    def brightness(rows: Any, columns: Any) -> Any:
+        total = sum(np.sin(a * rows + b * columns + c) for (a, b), c in zip(waves, phases, strict=True))
+        return np.clip(128 + 15 * total, 0, 255)
+
+    return brightness
+
+
+def _block(tool: Any, rows: Any, height: int) -> Any:
+    return tool | (np.abs(rows - height / 2) < 8)
+
+
+def wrong(fault: str) -> Callable[[Job, int, Path, Report], None]:
+    """`consistent` with one fault, sealed as if nothing were wrong."""
+    return lambda job, index, folder, report: consistent(job, index, folder, report, fault)

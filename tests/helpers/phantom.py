@@ -1,0 +1,92 @@
+"""Small sequences from a closed form, written as real stores: what the learn tests train and score on.
+
+Surface displacement of an elastic half-space under a force spread like a hat of radius a (regularised
+Cerruti and Boussinesq solutions; Johnson, Contact Mechanics, 1985, §3.2), seen straight from above.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from synth.dataset.store import Writer
+from synth.job.schema import Job
+
+POISSON = 0.4
+SIZE = (48, 64)
+SCALE_MM_PER_PX = 0.5
+RADIUS_MM = 4.0
+
+
+def density(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Share of the force a mm², (1 − r²/a²)² inside the contact; integrates to 1."""
+    r2 = (x**2 + y**2) / RADIUS_MM**2
+    return np.where(r2 < 1, (1 - np.minimum(r2, 1)) ** 2, 0.0) * 3 / (np.pi * RADIUS_MM**2)
+
+
+def displacement(
+    x: NDArray[np.float64], y: NDArray[np.float64], force: NDArray[np.float64], young_kpa: float
+) -> NDArray[np.float64]:
+    """(H, W, 2) in-plane displacement [mm] under `force` (x, y right and down, z into the tissue) [mN]."""
+    rho = np.sqrt(x**2 + y**2 + RADIUS_MM**2 / 2)
+    shear = (1 + POISSON) / (np.pi * young_kpa)
+    fx, fy, fz = force
+    ux = shear * (fx * ((1 - POISSON) / rho + POISSON * x**2 / rho**3) + fy * POISSON * x * y / rho**3)
+    uy = shear * (fy * ((1 - POISSON) / rho + POISSON * y**2 / rho**3) + fx * POISSON * x * y / rho**3)
+    inward = (1 - 2 * POISSON) * (1 + POISSON) / (2 * np.pi * young_kpa) * fz / rho**2
+    return np.stack([ux - inward * x, uy - inward * y], axis=-1)
+
+
+def write(
+    folder: Path,
+    index: int,
+    *,
+    anatomy_seed: int,
+    frames: int = 6,
+    recovered: bool = True,
+    family: str = "healthy",
+    noise_px: float = 0.05,
+) -> Path:
+    """One sequence: a contact somewhere, a direction, a ramp up to a peak; deterministic in `index`."""
+    rng = np.random.default_rng([7, index])
+    job = Job(frames=frames, flow={"backend": "opencv-tvl1" if recovered else "ideal"})  # type: ignore[arg-type]
+    rows, cols = SIZE
+    young = float(np.exp(rng.uniform(np.log(0.5), np.log(3.0))))
+    at = rng.uniform(-4, 4, 2)
+    direction = rng.normal(size=3)
+    direction /= np.linalg.norm(direction)
+    peak = rng.uniform(0.02, 0.12) * young * RADIUS_MM**2 * direction
+    x = (np.arange(cols) - (cols - 1) / 2) * SCALE_MM_PER_PX - at[0]
+    y = (np.arange(rows) - (rows - 1) / 2) * SCALE_MM_PER_PX - at[1]
+    gx, gy = np.meshgrid(x, y)
+    tissue = (gx + at[0]) ** 2 + (gy + at[1]) ** 2 < 11.0**2
+    area = np.full(SIZE, SCALE_MM_PER_PX**2, np.float32)
+    ramp = np.sin(np.linspace(0, np.pi, frames)).clip(0)
+    writer = Writer(folder, index, frames=frames, size=SIZE, job=job)
+    writer.put("time", np.arange(frames) / 25.0)
+    writer.put("force", ramp[:, None] * peak)
+    writer.put("tissue", tissue)
+    writer.put("area", area)
+    share = density(gx, gy)
+    share /= (share * area).sum()
+    for t, level in enumerate(ramp):
+        flow = displacement(gx, gy, level * peak, young) / SCALE_MM_PER_PX * tissue[..., None]
+        writer.put_frame("rgb", t, np.full((*SIZE, 3), 90, np.uint8))
+        writer.put_frame("flow", t, flow.astype(np.float32))
+        writer.put_frame("visible", t, tissue)
+        writer.put_frame("tool", t, np.zeros(SIZE, bool))
+        writer.put_frame("glare", t, np.zeros(SIZE, bool))
+        writer.put_frame("depth", t, np.full(SIZE, 300.0, np.float32))
+        writer.put_frame("traction", t, (share[..., None] * level * peak).astype(np.float32))
+        if recovered:
+            noisy = flow + noise_px * rng.normal(size=flow.shape) * tissue[..., None]
+            writer.put_frame("flow_tvl1", t, noisy.astype(np.float32))
+            writer.put_frame("flow_confidence", t, np.full(SIZE, 0.8, np.float32))
+    return writer.seal(
+        scenario={"relief": {"seed": anatomy_seed}, "family": family, "gesture": {"kind": "pull"}},
+        scale_mm_per_px=SCALE_MM_PER_PX,
+        young_kpa=young,
+        poisson=POISSON,
+    )

@@ -1,0 +1,34 @@
+"""The project's own source, as tests of the repository read it."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+PACKAGES = ("synth", "learn", "bench", "evidence")
+
+
+def sources(*packages: str) -> list[Path]:
+    found = sorted(path for package in packages for path in (ROOT / package).rglob("*.py"))
+    assert len(found) > len(packages)
+    return found
+
+
+def imports(path: Path) -> Iterator[str]:
+    yield from imported(ast.parse(path.read_text("utf-8")))
+
+
+def imported(tree: ast.Module) -> Iterator[str]:
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            yield node.module
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+
+
+def module(path: Path) -> str:
+    """Its dotted name; of a package, the package's."""
+    return ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")

@@ -1,0 +1,130 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import phantom
+import pytest
+
+from learn.data.clips import Clip, _anatomy, load, target
+from learn.data.grid import Grid
+from learn.data.split import folds, groups, nested, ungrouped
+from synth.errors import UserError
+
+GRID = Grid(32)
+
+
+def test_force_density_times_cell_times_stiffness_is_the_force(clips: list[Clip]) -> None:
+    for clip in clips:
+        total = clip.density.sum((2, 3)) * GRID.pitch_mm**2 * clip.young_kpa
+        np.testing.assert_allclose(total, clip.force, atol=0.01 * np.abs(clip.force).max())
+        assert np.abs(clip.force[3]).max() > 0
+
+
+def test_displacement_is_in_mm(clips: list[Clip], dataset: Path) -> None:
+    from synth.dataset.store import Dataset
+
+    flow = Dataset(dataset)[0]["flow"][3]
+    largest = np.linalg.norm(flow, axis=2).max() * phantom.SCALE_MM_PER_PX
+    got = np.linalg.norm(clips[0].displacement["ideal"][3], axis=0).max()
+    assert got == pytest.approx(largest, rel=0.1)
+    assert not np.array_equal(clips[0].displacement["recovered"][3], clips[0].displacement["ideal"][3])
+
+
+def test_the_papers_intensity_peaks_at_the_total_force(clips: list[Clip]) -> None:
+    clip = clips[2]
+    peak = target(clip, 3, "intensity", 1).max() * clip.young_kpa
+    assert peak == pytest.approx(np.linalg.norm(clip.force[3]), rel=1e-5)
+    assert target(clip, 0, "intensity", 1).max() == 0
+
+
+def test_a_packed_cache_gives_the_same_and_is_used(dataset: Path, clips: list[Clip], tmp_path: Path) -> None:
+    for _ in range(2):
+        packed = load(dataset, GRID, ("ideal", "recovered"), cache=tmp_path)
+    for a, b in zip(clips, packed, strict=True):
+        np.testing.assert_array_equal(a.density, b.density)
+        np.testing.assert_array_equal(a.displacement["recovered"], b.displacement["recovered"])
+        assert isinstance(b.density, np.memmap)
+        assert (a.name, a.group, a.family, a.young_kpa) == (b.name, b.group, b.family, b.young_kpa)
+    assert len(list(tmp_path.iterdir())) == len(clips)
+
+
+def test_a_store_without_recovered_flow(tmp_path: Path) -> None:
+    phantom.write(tmp_path, 0, anatomy_seed=1, recovered=False)
+    with pytest.raises(UserError, match=r"000000.zarr: holds no recovered flow"):
+        load(tmp_path, GRID, ("recovered",))
+    assert len(load(tmp_path, GRID, ("ideal",))) == 1
+
+
+def test_folds_share_no_anatomy_and_leave_nobody_out(clips: list[Clip]) -> None:
+    number = groups(clips)
+    for seed in range(5):
+        parts = folds(clips, 4, seed)
+        assert sorted(i for p in parts for i in p) == list(range(len(clips)))
+        sides = [{number[i] for i in p} for p in parts]
+        assert sum(len(s) for s in sides) == len(set(number))
+
+
+def test_nested_folds(clips: list[Clip]) -> None:
+    number = groups(clips)
+    tested: list[int] = []
+    for fold in range(3):
+        split = nested(clips, 3, fold, seed=1)
+        parts = [{number[i] for i in p} for p in (split.fit, split.select, split.test)]
+        assert not parts[0] & parts[1]
+        assert not parts[0] & parts[2]
+        assert not parts[1] & parts[2]
+        assert all(parts)
+        tested += split.test
+    assert sorted(tested) == list(range(len(clips)))
+
+
+def test_copies_of_a_sequence_are_one_group_whatever_their_anatomy_says(clips: list[Clip]) -> None:
+    from dataclasses import replace
+
+    twin = replace(clips[0], group="another")
+    other = replace(clips[5], group="another")
+    number = groups([*clips, twin, other])
+    assert number[0] == number[1] == number[-1] == number[-2] == number[5]
+
+
+def test_a_held_out_family_is_the_test(clips: list[Clip]) -> None:
+    split = nested(clips, 3, 0, seed=0, held_out_family="pale")
+    assert [clips[i].family for i in split.test] == ["pale"]
+    assert not set(split.test) & (set(split.fit) | set(split.select))
+    with pytest.raises(UserError, match=r"no sequence of family 'oedematous'.*healthy, pale"):
+        nested(clips, 3, 0, seed=0, held_out_family="oedematous")
+
+
+def test_impossible_folds(clips: list[Clip]) -> None:
+    with pytest.raises(UserError, match="7 folds: between 2 and 6 are possible, for 8 sequences"):
+        folds(clips, 7, 0)
+    with pytest.raises(UserError, match="fit, select and test need an anatomy each: 2 are there"):
+        nested(clips[:3], 2, 0, 0)
+    with pytest.raises(UserError, match="there are folds 0 to 2"):
+        nested(clips, 3, 3, 0)
+
+
+def test_anatomies_are_told_apart_by_what_a_sequence_says() -> None:
+    from synth.job.schema import Job
+    from synth.sequence import scenario
+
+    job = Job.model_validate({"sequences": 6, "anatomy": {"variety": 3}})
+    cases = [{"scenario": scenario.draw(job, i).as_dict(), "content_hash": f"hash{i}"} for i in range(6)]
+    names = [_anatomy(case) for case in cases]
+    assert names[:3] == names[3:]
+    assert len(set(names)) == 3
+    # A user's brain is one anatomy, whatever relief was drawn on it.
+    assert {_anatomy({**case, "anatomy_id": "mesh-5f"}) for case in cases} == {"mesh-5f"}
+    assert _anatomy({"content_hash": "h", "scenario": {}}) == "h"
+
+
+def test_one_brain_is_split_only_when_asked_to(clips: list[Clip]) -> None:
+    from dataclasses import replace
+
+    one = [replace(c, group="mesh-5f") for c in clips]
+    with pytest.raises(UserError, match="share_anatomy=true"):
+        nested(one, 3, 0, 0)
+    alone = ungrouped(one)
+    split = nested(alone, 3, 0, 0)
+    assert len(split.fit) + len(split.select) + len(split.test) == len(clips)

@@ -1,0 +1,139 @@
+"""The grid: what is carried to it and the channels on it, against closed forms."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from learn.data.grid import CHANNELS, Grid, Resampler, Scales, centre, channels, divergence, settled
+from learn.training.batches import turned
+from synth.errors import UserError
+
+GRID = Grid(64, 36.0)
+ONE = Scales(1.0, 1.0, 1.0, 1.0, 1.0)
+
+
+def resampler(shape: tuple[int, int], scale: float) -> Resampler:
+    return Resampler(shape, scale, ((shape[1] - 1) / 2, (shape[0] - 1) / 2), GRID)
+
+
+@pytest.mark.parametrize(("shape", "scale"), [((300, 400), 0.06), ((40, 52), 0.5), ((30, 36), 1.1)])
+def test_totals_are_kept_at_any_scale(shape: tuple[int, int], scale: float) -> None:
+    y, x = np.indices(shape)
+    blob = np.exp(-((x - shape[1] / 2 - 3) ** 2 + (y - shape[0] / 2) ** 2) * (scale / 3) ** 2)
+    carried = resampler(shape, scale).sum(blob)
+    assert carried.sum(dtype=np.float64) == pytest.approx(blob.sum(), rel=1e-4)
+
+
+@pytest.mark.parametrize(("shape", "scale"), [((300, 400), 0.06), ((72, 72), 0.5), ((36, 36), 1.0)])
+def test_a_linear_field_stays_the_same_field_in_mm(shape: tuple[int, int], scale: float) -> None:
+    y, x = np.indices(shape)
+    field = 0.02 * (x - (shape[1] - 1) / 2) * scale - 0.01 * (y - (shape[0] - 1) / 2) * scale
+    carried = resampler(shape, scale).mean(field, np.ones(shape, bool))
+    node = (np.arange(64) - 31.5) * GRID.pitch_mm
+    expected = 0.02 * node[None, :] - 0.01 * node[:, None]
+    inner = slice(26, 38)
+    np.testing.assert_allclose(carried[inner, inner], expected[inner, inner], atol=2e-3)
+
+
+def test_pixels_outside_the_mask_have_no_say() -> None:
+    tissue = np.zeros((72, 72), bool)
+    tissue[:, 20:] = True
+    field = np.where(tissue, 1.0, 1e6)
+    carried = resampler((72, 72), 0.5).mean(field, tissue)
+    assert set(np.unique(carried)) <= {0.0, 1.0}
+
+
+def test_an_empty_mask_is_said_so() -> None:
+    with pytest.raises(UserError, match="tissue mask is empty"):
+        centre(np.zeros((4, 4), bool))
+
+
+def test_back_on_the_picture() -> None:
+    field = np.indices((64, 64))[1].astype(np.float32) * GRID.pitch_mm
+    back = resampler((72, 72), 0.5).to_image(field)
+    np.testing.assert_allclose(np.diff(back[36, 5:-5]), 0.5, atol=1e-5)
+
+
+def spread(strain_x: float, strain_y: float) -> torch.Tensor:
+    node = (torch.arange(64) - 31.5) * GRID.pitch_mm
+    return torch.stack([strain_x * node.expand(64, 64), strain_y * node.expand(64, 64).T])[None]
+
+
+def test_divergence_of_a_stretch_is_the_sum_of_its_strains_up_to_the_masks_edge() -> None:
+    mask = torch.zeros(1, 1, 64, 64)
+    mask[..., 10:50, 8:56] = 1
+    got = divergence(spread(0.03, 0.01), mask, GRID.pitch_mm)
+    assert torch.all(got[mask == 0] == 0)
+    inner = got[..., 14:46, 12:52]
+    torch.testing.assert_close(inner, torch.full_like(inner, 0.04), rtol=1e-4, atol=1e-5)
+    # Both signs count: a published channel has one flipped and reads this as 0.02.
+    assert got[mask == 1].min() > 0.02
+
+
+def test_a_rigid_shift_has_no_divergence_even_at_the_edge() -> None:
+    mask = torch.zeros(1, 1, 64, 64)
+    mask[..., 10:50, 8:56] = 1
+    got = divergence(torch.full((1, 2, 64, 64), 0.7), mask, GRID.pitch_mm)
+    assert got.abs().max() < 1e-5
+
+
+def test_divergence_does_not_depend_on_resolution() -> None:
+    def peak(size: int) -> float:
+        grid = Grid(size, 36.0)
+        node = (torch.arange(size) - (size - 1) / 2) * grid.pitch_mm
+        y, x = torch.meshgrid(node, node, indexing="ij")
+        bump = torch.exp(-(x**2 + y**2) / 18)
+        u = torch.stack([-x * bump, -y * bump])[None] * 0.1
+        return float(divergence(u, torch.ones(1, 1, size, size), grid.pitch_mm).min())
+
+    assert peak(64) == pytest.approx(peak(256), rel=0.04)
+    assert peak(256) == pytest.approx(-0.2, rel=0.06)
+
+
+def test_channel_order_and_units() -> None:
+    mask = torch.ones(1, 1, 64, 64)
+    u = torch.tensor([3.0, -4.0]).view(1, 2, 1, 1).expand(1, 2, 64, 64)
+    x = channels(u, mask, GRID.pitch_mm, Scales(2.0, 1.0, 1.0, 1.0, 1.0), torch.full_like(mask, 0.5))
+    assert CHANNELS == ("dx", "dy", "magnitude", "mask", "divergence")
+    assert x[0, :, 32, 32].tolist() == pytest.approx([1.5, -2.0, 2.5, 1.0, 0.0, 0.5], abs=1e-5)
+
+
+@pytest.mark.parametrize("mirror", [False, True])
+@pytest.mark.parametrize("quarter", [1, 2, 3])
+def test_turning_moves_vectors_with_the_field_and_keeps_divergence(quarter: int, mirror: bool) -> None:
+    rng = np.random.default_rng(0)
+    node = (np.arange(32) - 15.5) / 16
+    y, x = np.meshgrid(node, node, indexing="ij")
+    a, b = rng.normal(size=(2, 3))
+    u = np.stack([a[0] * x + a[1] * x * y + a[2] * y**2, b[0] * y + b[1] * x**2 + b[2] * x * y])
+    u = u.astype(np.float32)
+    mask = torch.ones(1, 1, 32, 32)
+
+    def div(v: np.ndarray) -> np.ndarray:
+        return divergence(torch.from_numpy(v)[None], mask, 1.125)[0].numpy()
+
+    np.testing.assert_allclose(div(turned(u, quarter, mirror)), turned(div(u), quarter, mirror), atol=1e-5)
+    # A field that points outwards everywhere still does.
+    out = turned(np.stack([x, y]).astype(np.float32), quarter, mirror)
+    np.testing.assert_allclose(out, np.stack([x, y]), atol=1e-6)
+
+
+def test_a_turn_is_counter_clockwise_as_seen() -> None:
+    right = np.zeros((3, 4, 4), np.float32)
+    right[:, 1, 3] = (1.0, 0.0, 9.0)
+    up = turned(right, 1, False)
+    assert up[:, 0, 1].tolist() == [0.0, -1.0, 9.0]
+
+
+def test_force_in_border_cells_is_carried_inside_not_lost() -> None:
+    mask = np.zeros((6, 6), np.float32)
+    mask[1:5, 1:4] = 1
+    amount = np.random.default_rng(0).normal(size=(3, 6, 6)).astype(np.float32)
+    kept = settled(amount, mask)
+    np.testing.assert_allclose(kept.sum((1, 2)), amount.sum((1, 2)), rtol=1e-5)
+    assert (kept[:, mask == 0] == 0).all()
+    # The centre has no neighbour outside; the right edge gets all of its row's.
+    np.testing.assert_array_equal(kept[:, 2, 2], amount[:, 2, 2])
+    np.testing.assert_allclose(kept[:, 2, 3], amount[:, 2, 3:].sum(-1), rtol=1e-6)

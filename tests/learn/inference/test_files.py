@@ -1,0 +1,238 @@
+"""What leaves the room: exported models, forces of files, settings from the command line."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+
+import av
+import cv2
+import numpy as np
+import phantom
+import pytest
+import torch
+from typer.testing import CliRunner
+
+from learn.checkpoint import Card, save_tensors, write_card
+from learn.cli import app
+from learn.data.clips import Clip
+from learn.data.grid import Grid
+from learn.inference import video_flow
+from learn.inference.apply import motions
+from learn.inference.export import examples, export
+from learn.inference.predict import load as load_model
+from learn.inference.stiffness import stiffness
+from learn.network.d2fnet import D2FNet
+from learn.network.monai_unet import build
+from learn.settings import override, preset
+from learn.training.batches import measure_scales
+from synth.dataset.store import Dataset
+from synth.errors import UserError
+
+run = CliRunner().invoke
+
+
+@pytest.fixture(scope="module", params=["plain", "everything", "monai"])
+def model(
+    clips: list[Clip], tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequest
+) -> Path:
+    """An untrained network with weights large enough to say something."""
+    extra = {
+        "plain": [],
+        "everything": ["arch.confidence=true", "arch.condition=film", "arch.total=true"],
+        "monai": ["arch.name=monai-unet", "arch.stem=1"],
+    }[request.param]
+    settings = override(preset("tiny"), ["size=32", "arch.levels=2", *extra])
+    out = tmp_path_factory.mktemp("model")
+    torch.manual_seed(0)
+    net = build(settings.arch).eval()
+    with torch.no_grad():
+        if isinstance(net, D2FNet):
+            for conv in net.heads.ranges:  # type: ignore[union-attr]
+                conv.weight.normal_(0, 200.0)  # type: ignore[union-attr,operator]
+        if isinstance(net, D2FNet) and net.film is not None:
+            net.film.weight.normal_(0, 0.2)
+    write_card(out, Card(settings, measure_scales(clips, settings), 1.2, {}, {}))
+    save_tensors(out / "weights.pt", net.state_dict())
+    return out
+
+
+@pytest.mark.parametrize("kind", ["torchscript", "onnx"])
+def test_an_exported_model_says_the_same(model: Path, tmp_path: Path, kind: str) -> None:
+    predictor = load_model(model)
+    file = tmp_path / "net"
+    worst = export(predictor, file, kind)
+    said = predictor.density(
+        examples(predictor.card, 1)[0].numpy(), examples(predictor.card, 1)[1][0, 0].numpy(), 1.0
+    )
+    assert np.abs(said).max() > 0.05 * predictor.card.scales.target, "a silent network proves nothing"
+    assert worst <= 1e-4
+    note = json.loads((tmp_path / "net.json").read_text())
+    assert note["inputs"][:2] == ["displacement", "mask"]
+    assert note["grid"]["pitch_mm"] == 36 / 32
+
+
+def test_an_unfaithful_export_is_refused_and_removed(
+    model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("learn.inference.export.TOLERANCE", -1.0)
+    with pytest.raises(UserError, match="differs from PyTorch"):
+        export(load_model(model), tmp_path / "net", "torchscript")
+    assert not list(tmp_path.iterdir())
+    with pytest.raises(UserError, match="unknown format 'tflite'"):
+        export(load_model(model), tmp_path / "net", "tflite")
+
+
+def test_predict_on_stores_and_on_arrays_agree(model: Path, dataset: Path, tmp_path: Path) -> None:
+    store = sorted(dataset.glob("*.zarr"))[2]
+    sequence = Dataset(dataset)[2]
+    arrays = tmp_path / "mine.npz"
+    np.savez(
+        arrays,
+        flow=sequence["flow_tvl1"][:],
+        confidence=sequence["flow_confidence"][:],
+        tissue=sequence["tissue"][:],
+        scale_mm_per_px=sequence.attrs["scale_mm_per_px"],
+        young_kpa=sequence.attrs["young_kpa"],
+    )
+    for source in (store, arrays):
+        done = run(app, ["predict", str(model), str(source), "-o", str(tmp_path / "out"), "--json"])
+        assert done.exit_code == 0, done.output
+    with np.load(tmp_path / "out/000002.npz") as a, np.load(tmp_path / "out/mine.npz") as b:
+        np.testing.assert_array_equal(a["density"], b["density"])
+        assert a["force_mn"].shape == (6, 3)
+        np.testing.assert_allclose(np.linalg.norm(a["force_mn"], axis=1), a["total_force_mn"], rtol=1e-6)
+
+
+def write_film(file: Path, frames: int = 3) -> None:
+    """Texture that slides a pixel a frame to the right, as lossless as H.264 gets."""
+    rng = np.random.default_rng(0)
+    wide = cv2.GaussianBlur(rng.uniform(60, 200, (48, 80)).astype(np.float32), None, 1.5)
+    wide = (255 * (wide - wide.min()) / np.ptp(wide)).clip(40, 220).astype(np.uint8)
+    with av.open(str(file), "w") as container:
+        stream = container.add_stream("libx264", rate=10, options={"crf": "0", "threads": "1"})
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv444p"
+        for t in range(frames):
+            rgb = np.repeat(wide[:, 8 - t : 72 - t, None], 3, axis=2) * np.array([1.0, 0.75, 0.7])
+            frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(rgb.astype(np.uint8)), format="rgb24")
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+
+
+def test_a_video_is_followed_and_predicted(model: Path, tmp_path: Path) -> None:
+    write_film(tmp_path / "film.mp4")
+    marked = np.zeros((48, 64), np.uint8)
+    marked[8:40, 8:56] = 255
+    cv2.imwrite(str(tmp_path / "tissue.png"), marked)
+    args = ["predict", str(model), str(tmp_path / "film.mp4"), "-o", str(tmp_path), "--scale", "0.4"]
+    done = run(
+        app, [*args, "--tissue", str(tmp_path / "tissue.png"), "--flow", "dis", "--young", "1", "--json"]
+    )
+    assert done.exit_code == 0, done.output
+    with np.load(tmp_path / "film.npz") as found:
+        assert found["total_force_mn"].shape == (3,)
+        assert found["young_known"]
+    seen = list(video_flow.steps(tmp_path / "film.mp4", marked > 0, "dis"))
+    assert np.abs(seen[0][0]).max() == 0
+    np.testing.assert_allclose(seen[2][0][16:32, 16:48].mean((0, 1)), [2, 0], atol=0.3)
+
+
+def test_films_that_are_none(tmp_path: Path) -> None:
+    write_film(tmp_path / "film.mp4", 1)
+    (tmp_path / "torn.mp4").write_bytes(b"no film")
+    cv2.imwrite(str(tmp_path / "small.png"), np.full((4, 4), 255, np.uint8))
+    cv2.imwrite(str(tmp_path / "black.png"), np.zeros((48, 64), np.uint8))
+    for name, mask, message in (
+        ("torn.mp4", None, "not a readable video"),
+        ("film.mp4", "small.png", "4 x 4, film.mp4 is 64 x 48"),
+        ("film.mp4", "black.png", "marks no tissue"),
+        ("film.mp4", "missing.png", "not a readable picture"),
+    ):
+        with pytest.raises(UserError, match=message):
+            video_flow.tissue(tmp_path / name, tmp_path / mask if mask else None)
+
+
+def test_stiffness_from_a_press(clips: list[Clip], dataset: Path, tmp_path: Path) -> None:
+    """A model that is right per unit stiffness finds E, whatever E it starts from; film or not."""
+    clip = clips[2]
+
+    class Right:
+        grid = Grid(32)
+
+        def __init__(self, condition: str, exponent: float) -> None:
+            settings = override(preset("tiny"), ["size=32", "arch.levels=2", f"arch.condition={condition}"])
+            self.card, self.exponent = Card(settings, measure_scales(clips, settings), 0.7, {}, {}), exponent
+
+        def density(self, moved: object, mask: object, young: float, sure: object) -> np.ndarray:
+            # A conditioned network may lean on E; it is right where E is.
+            return clip.density * np.float32(young * (young / clip.young_kpa) ** self.exponent)
+
+    force = np.linalg.norm(clip.force, axis=1)
+    for right in (Right("none", 0.0), Right("film", -0.3)):
+        found = stiffness(right, clip.displacement["ideal"], clip.mask, force)  # type: ignore[arg-type]
+        assert found == pytest.approx(clip.young_kpa, rel=0.01)
+    with pytest.raises(UserError, match="no force was given"):
+        stiffness(right, clip.displacement["ideal"], clip.mask, 0 * force)  # type: ignore[arg-type]
+    with pytest.raises(UserError, match="5 forces for 6 frames"):
+        stiffness(right, clip.displacement["ideal"], clip.mask, force[1:])  # type: ignore[arg-type]
+
+
+def test_calibrate_command(model: Path, dataset: Path, tmp_path: Path) -> None:
+    store = sorted(dataset.glob("*.zarr"))[2]
+    done = run(app, ["calibrate", str(model), str(store), "--json"])
+    assert done.exit_code == 0, done.output
+    assert json.loads(done.stdout)["young_kpa"]["000002"] > 0
+    sequence = Dataset(dataset)[2]
+    keep = {k: sequence[k][:] for k in ("flow", "tissue")}
+    np.savez(tmp_path / "a.npz", scale_mm_per_px=0.5, **keep)
+    done = run(app, ["calibrate", str(model), str(tmp_path / "a.npz")])
+    assert done.exit_code == 2
+    assert "a: holds no force to calibrate on" in done.stderr
+
+
+def test_bad_files(tmp_path: Path, dataset: Path) -> None:
+    def first(path: Path) -> None:
+        next(iter(motions(path, "recovered")))
+
+    np.savez(tmp_path / "a.npz", flow=np.zeros((2, 4, 4, 2)))
+    np.savez(tmp_path / "b.npz", flow=np.zeros((2, 4, 4, 2)), tissue=np.ones((4, 5)), scale_mm_per_px=0.1)
+    (tmp_path / "c.npz").write_bytes(b"PK no")
+    for name, message in (
+        ("a.npz", "lacks scale_mm_per_px, tissue"),
+        ("b.npz", r"flow is \(2, 4, 4, 2\)"),
+        ("c.npz", "cannot be read"),
+        ("d.mp4", "give --scale in mm a pixel"),
+        ("e.zarr", "no such sequence"),
+    ):
+        with pytest.raises(UserError, match=message):
+            first(tmp_path / name)
+    phantom.write(tmp_path / "x", 0, anatomy_seed=0, recovered=False)
+    with pytest.raises(UserError, match="holds no recovered flow"):
+        first(tmp_path / "x")
+
+
+def test_settings_from_words() -> None:
+    got = override(
+        preset("tiny"), ["arch.width=8", "batch=3", "augment=false", "arch.bounds=1,2,3", "objective.low=0.1"]
+    )
+    assert (got.arch.width, got.batch, got.augment, got.arch.bounds) == (8, 3, False, (1.0, 2.0, 3.0))
+    assert got.objective.low == 0.1
+    assert dataclasses.replace(got, batch=8).arch.stem == preset("tiny").arch.stem
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ("bacth=3", r"bacth=3: unknown setting, did you mean 'batch'"),
+        ("arch.widht=3", r"did you mean 'arch.width'"),
+        ("batch=many", "not a value of type int"),
+        ("augment=1", "not a value of type bool"),
+        ("arch=3", "unknown setting"),
+        ("batch=0", "batch 0: must be positive"),
+        ("schedule=step", "unknown schedule 'step'"),
+    ],
+)
+def test_settings_that_cannot_be(change: str, message: str) -> None:
+    with pytest.raises(UserError, match=message):
+        override(preset("tiny"), [change])

@@ -1,0 +1,67 @@
+"""Every example runs, and gives the number pinned here."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import own_flow
+import own_law
+import own_method
+import pytest
+import read_dataset
+import render_frame
+
+from synth.dataset.store import Dataset
+
+
+def test_every_example_is_here() -> None:
+    names = {path.stem for path in Path(own_law.__file__).parent.glob("*.py")}
+    assert names == {
+        module.__name__ for module in (own_flow, own_law, own_method, read_dataset, render_frame)
+    }
+
+
+def test_reading_a_dataset(out: Path) -> None:
+    found = read_dataset.describe(Dataset(out)[0])
+    assert found["young_kpa"] == pytest.approx(0.81474, abs=1e-4)
+    assert found["peak_force_mn"] == pytest.approx(4.2385, abs=1e-3)
+    assert found["labelled_force_mn"] == pytest.approx(found["peak_force_mn"], rel=0.02)
+    assert found["largest_motion_px"] == pytest.approx(3.840, abs=0.01)
+    assert found["median_flow_error_px"] < 0.2
+
+
+def test_rendering_a_frame() -> None:
+    shot = render_frame.frame()
+    assert np.linalg.norm(shot.flow, axis=2).max() == pytest.approx(4.82, abs=0.01)
+    assert shot.rgb.shape == (240, 320, 3)
+    assert shot.rgb[100:140, 140:180].mean() == pytest.approx(130.1, abs=3)
+
+
+def test_a_law_of_ones_own_stiffens() -> None:
+    soft, stiff = own_law.peak_mm(None), own_law.peak_mm(4.0)
+    assert soft == pytest.approx(1.20, abs=0.01)
+    assert stiff == pytest.approx(1.11, abs=0.01)
+    assert own_law.peak_mm(1e-4) == pytest.approx(soft, rel=1e-3), "for small b it is neo-Hookean"
+
+
+def test_the_laws_stress_is_the_slope_of_its_energy() -> None:
+    rng = np.random.default_rng(0)
+    f = np.eye(3) + 0.1 * rng.normal(size=(5, 3, 3))
+    way, step = rng.normal(size=f.shape), 1e-5
+    ends = [own_law.stress(f + sign * step * way, 2.0, 0.36, 1.4)[0] for sign in (1, -1)]
+    slope = np.einsum("nij,nij->n", own_law.stress(f, 2.0, 0.36, 1.4)[1], way)
+    np.testing.assert_allclose((ends[0] - ends[1]) / (2 * step), slope, rtol=1e-6)
+
+
+def test_a_flow_back_end_of_ones_own(out: Path) -> None:
+    assert own_flow.error_px(Dataset(out)[0]) == pytest.approx(0.378, rel=0.1)
+
+
+def test_a_method_of_ones_own(out: Path, tmp_path: Path) -> None:
+    from bench.recording.from_sequence import export
+
+    found = own_method.score(export(Dataset(out)[0], tmp_path / "recording")).methods
+    assert found["spring"].scores["r"] == pytest.approx(0.99, abs=0.01)
+    assert found["spring"].scores["mae_mn"] == pytest.approx(0.98, rel=0.1)
+    assert found["stiffer"].scores["r"] == pytest.approx(found["spring"].scores["r"], abs=1e-6)

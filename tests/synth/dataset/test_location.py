@@ -1,0 +1,111 @@
+"""Reading a dataset where it lies: in memory, behind HTTP, in S3; the same values as from the folder."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+
+import fsspec
+import numpy as np
+import pytest
+from fake_work import sequence
+
+from synth.dataset.store import Dataset, open_sequence
+from synth.errors import UserError
+from synth.job.schema import Job
+
+JOB = Job(seed=5, sequences=2, frames=3, render={"size": (40, 30)}, flow={"backend": "ideal"})
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("place") / "out"
+    out.mkdir()
+    for index in range(JOB.sequences):
+        sequence(JOB, index, out, lambda *_: None)
+    return out
+
+
+def assert_same(address: str, root: Path) -> None:
+    here, there = Dataset(root), Dataset(address)
+    assert [one.index for one in there] == [0, 1]
+    for name in here[1].fields:
+        assert np.array_equal(there[1][name][:], here[1][name][:])
+    assert np.array_equal(there[0]["flow"][2], here[0]["flow"][2])
+    assert there[0].attrs == here[0].attrs
+    with pytest.raises(UserError, match="no such sequence"):
+        open_sequence(f"{address}/000009.zarr")
+
+
+def test_memory(root: Path) -> None:
+    fsspec.filesystem("memory").put(str(root), "/datasets/out", recursive=True)
+    assert_same("memory://datasets/out", root)
+
+
+class Handler(SimpleHTTPRequestHandler):
+    """Serves files, and parts of them when `parts`: what any web server does, and Python's own does not."""
+
+    parts = True
+
+    def do_GET(self) -> None:
+        path, asked = Path(self.translate_path(self.path)), self.headers.get("Range", "")
+        if not (self.parts and asked and path.is_file()):
+            return super().do_GET()
+        data = path.read_bytes()
+        first, _, last = asked.removeprefix("bytes=").partition("-")
+        start = int(first) if first else len(data) - int(last)
+        part = data[start : int(last) + 1] if first and last else data[start:]
+        self.send_response(206)
+        self.send_header("Content-Range", f"bytes {start}-{start + len(part) - 1}/{len(data)}")
+        self.send_header("Content-Length", str(len(part)))
+        self.end_headers()
+        self.wfile.write(part)
+        return None
+
+    def log_message(self, *_: Any) -> None:
+        """Nothing on the terminal."""
+
+
+@pytest.fixture
+def server(root: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
+    monkeypatch.chdir(root.parent)  # which the handler serves
+    with ThreadingHTTPServer(("127.0.0.1", 0), Handler) as serving:
+        thread = threading.Thread(target=serving.serve_forever, daemon=True)
+        thread.start()
+        yield f"http://127.0.0.1:{serving.server_port}"
+        serving.shutdown()
+        thread.join()
+
+
+def test_http(root: Path, server: str) -> None:
+    pytest.importorskip("aiohttp", reason="fsspec's HTTP needs aiohttp")
+    assert_same(f"{server}/out", root)
+
+
+def test_a_server_that_gives_no_parts_of_files_is_said(server: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("aiohttp", reason="fsspec's HTTP needs aiohttp")
+    monkeypatch.setattr(Handler, "parts", False)
+    with pytest.raises(UserError, match=r"or its server does not answer range requests"):
+        Dataset(f"{server}/out")[0]["flow"][1]
+
+
+def test_s3(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("s3fs", reason="S3 needs the package s3fs")
+    moto = pytest.importorskip("moto.server", reason="the stand-in for S3 is moto[server]")
+    served = moto.ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
+    served.start()
+    try:
+        _, port = served.get_host_and_port()
+        for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
+            monkeypatch.setenv(name, "test")
+        monkeypatch.setenv("AWS_DEFAULT_REGION", "us-east-1")
+        monkeypatch.setenv("AWS_ENDPOINT_URL", f"http://127.0.0.1:{port}")
+        bucket = fsspec.filesystem("s3")
+        bucket.mkdir("bucket")
+        bucket.put(str(root), "bucket/out", recursive=True)
+        assert_same("s3://bucket/out", root)
+    finally:
+        served.stop()

@@ -1,0 +1,127 @@
+"""Splits: no group on two sides, held-out families never trained on, order without effect."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from synth.dataset import split
+from synth.dataset.split import Rule
+from synth.errors import UserError
+from synth.job import identity
+from synth.job.schema import Job
+
+
+def rows(count: int = 60, anatomies: int = 20) -> list[dict[str, Any]]:
+    return [
+        {
+            "index": k,
+            "status": "done" if k != 7 else "failed",
+            "anatomy": k % anatomies,
+            "family": ("healthy", "pale", "calf")[k % anatomies % 3],
+            "gesture": ("pull", "push")[k % 2],
+            "young_kpa": 0.5 + (k * 37 % count) / count,
+            "content_hash": str(k),
+        }
+        for k in range(count)
+    ]
+
+
+def sides(found: list[dict[str, Any]], rule: Rule) -> dict[int, str | None]:
+    return {row["index"]: side for row, side in zip(found, split.assign(found, rule), strict=True)}
+
+
+def test_no_anatomy_is_on_two_sides_and_shares_are_kept() -> None:
+    found = rows()
+    given = sides(found, Rule())
+    assert given[7] is None
+    for anatomy in range(20):
+        assert len({given[k] for k in range(60) if k % 20 == anatomy and k != 7}) == 1
+    counts = split.count([{"split": side} for side in given.values()])
+    for side, share in zip(split.SIDES, (0.7, 0.15, 0.15), strict=True):
+        assert abs(counts[side] - 59 * share) <= 3, "an anatomy has three sequences"
+
+
+def test_order_does_not_matter() -> None:
+    found = rows()
+    assert sides(found, Rule()) == sides(found[::-1], Rule())
+
+
+def test_a_held_out_family_is_only_for_testing() -> None:
+    found = rows()
+    given = sides(found, Rule(held_out=("pale",)))
+    for row in found:
+        if row["family"] == "pale" and row["status"] == "done":
+            assert given[row["index"]] == "test"
+    assert {"train", "validation", "test"} <= set(given.values())
+
+
+@pytest.mark.parametrize("by", ["family", "stiffness", "gesture"])
+def test_other_groups_still_never_share_an_anatomy(by: str) -> None:
+    found = rows(anatomies=60)
+    rule = Rule(by=by, shares=(0.5, 0.0, 0.5))  # type: ignore[arg-type]
+    given = sides(found, rule)
+    assert set(given.values()) == {"train", "test", None}
+    assert not split.leaks([{**row, "split": given[row["index"]]} for row in found])
+    if by != "stiffness":
+        for value in {row[by] for row in found}:
+            on = {given[row["index"]] for row in found if row[by] == value and row["status"] == "done"}
+            assert len(on) == 1
+
+
+def test_leaks_are_named() -> None:
+    found = rows(6, 3)
+    for row in found:
+        row["split"] = "train" if row["index"] < 3 else "test"
+    assert "anatomy 0 is in test, train" in split.leaks(found)
+
+
+@pytest.mark.parametrize(
+    ("rule", "message"),
+    [
+        (Rule(shares=(0.5, 0.1, 0.1)), "must sum to 1"),
+        (Rule(held_out=("blue",)), "family blue: no sequence has it"),
+        (Rule(by="gesture"), "too few"),
+    ],
+)
+def test_what_cannot_be_split_is_said_so(rule: Rule, message: str) -> None:
+    with pytest.raises(UserError, match=message):
+        split.assign(rows(anatomies=60), rule)
+
+
+def test_words_of_a_command_line() -> None:
+    assert split.parse("family", "0.8, 0, 0.2", ["calf"]) == Rule("family", (0.8, 0.0, 0.2), ("calf",))
+    for by, shares in (("colour", "1,0,0"), ("family", "1,0"), ("family", "a,b,c")):
+        with pytest.raises(UserError):
+            split.parse(by, shares, [])
+
+
+def test_a_dataset_of_one_brain_is_split_within_it_only_when_told() -> None:
+    found = [{**row, "anatomy": "mesh-1"} for row in rows()]
+    with pytest.raises(UserError, match=r"1 groups by sequence: too few .*--share-anatomy"):
+        split.assign(found, Rule("sequence"))
+    rule = Rule("sequence", share_anatomy=True)
+    given = [{**row, "split": side} for row, side in zip(found, split.assign(found, rule), strict=True)]
+    assert set(split.count(given)) == set(split.SIDES)
+    assert not split.leaks(given, rule)
+    assert split.leaks(given)[0].startswith("anatomy mesh-1 is in")
+
+
+def test_a_held_out_family_in_training_is_a_leak() -> None:
+    found = [{**row, "split": "train"} for row in rows(anatomies=60)]
+    assert "family pale is held out and in train" in split.leaks(found, Rule(held_out=("pale",)))
+
+
+def test_sequences_on_one_users_brain_are_one_anatomy_in_every_dataset(tmp_path: Path) -> None:
+    brain, copy, other = (tmp_path / name for name in ("brain.obj", "copy.obj", "other.obj"))
+    for path, text in ((brain, "v 0 0 0"), (copy, "v 0 0 0"), (other, "v 0 0 1")):
+        path.write_text(text)
+
+    def name(mesh: Path, point: float, seed: int) -> str:
+        opening = {"point": (point, 0, 0), "direction": (0, 0, 1)}
+        return identity.anatomy(Job(anatomy={"mesh": mesh, "craniotomy": opening}), seed)  # type: ignore[arg-type]
+
+    assert name(brain, 0, 1) == name(copy, 5, 2) != name(other, 0, 1)
+    assert identity.anatomy(Job(), 1) != identity.anatomy(Job(), 2)

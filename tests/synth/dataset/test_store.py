@@ -1,0 +1,231 @@
+"""The sequence store: what goes in comes out, nothing unfinished is visible, damage is named."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zarr
+from fake_work import attributes, sequence
+
+from synth.checks import contents
+from synth.dataset import fast_read as shard
+from synth.dataset import store
+from synth.dataset.store import Dataset, Writer, open_sequence
+from synth.errors import NotFinite, UserError
+from synth.fields import FIELDS
+from synth.job.schema import Job
+from synth.system.stopwatch import Stopwatch
+
+JOB = Job(seed=5, sequences=2, frames=7, render={"size": (40, 30)}, flow={"backend": "ideal"})
+
+
+def quiet(stage: str, done: int, of: int) -> None:
+    """Progress that nobody looks at."""
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    for index in range(JOB.sequences):
+        sequence(JOB, index, tmp_path, quiet)
+    return tmp_path
+
+
+def test_values_come_back_as_they_were_put(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(store, "_SHARD_BYTES", 3 * 40 * 30 * 8)  # several shards, the last one not full
+    sequence(JOB, 2, root, quiet)
+    found = open_sequence(root / "000002.zarr")
+    rng = np.random.default_rng((5, 2))
+    assert np.array_equal(found["force"][:], rng.normal(size=(7, 3)))
+    assert found["flow"].shape == (7, 30, 40, 2)
+    assert (found.index, found.frames, found.size) == (2, 7, (30, 40))
+    for name in found.fields:
+        assert found[name].dtype == np.dtype(FIELDS[name].dtype)
+        assert found[name].shape == FIELDS[name].shape(7, (30, 40))
+
+
+def test_shards_do_not_change_the_content_hash(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    before = open_sequence(root / "000000.zarr").attrs["content_hash"]
+    monkeypatch.setattr(store, "_SHARD_BYTES", 1)
+    (root / "again").mkdir()
+    sequence(JOB, 0, root / "again", quiet)
+    assert open_sequence(root / "again/000000.zarr").attrs["content_hash"] == before
+
+
+def test_timings_do_not_count_and_everything_else_does(root: Path) -> None:
+    attrs = open_sequence(root / "000000.zarr").attrs
+    assert store.content_hash({**attrs, "timings": {}, "versions": {}}) == attrs["content_hash"]
+    for key in attrs.keys() - {"timings", "versions", "content_hash", "seal_hash"}:
+        assert store.content_hash({**attrs, key: "edited"}) != attrs["content_hash"], key
+
+
+def test_plain_zarr_reads_it(root: Path) -> None:
+    group = zarr.open_group(str(root / "000000.zarr"), mode="r")
+    assert group["flow"].attrs["unit"] == "px"
+    assert group["rgb"].metadata.dimension_names == ("frame", "row", "column", "rgb")
+    assert np.array_equal(group["rgb"][3], open_sequence(root / "000000.zarr")["rgb"][3])
+
+
+def test_single_frames_are_those_that_zarr_reads(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(store, "_SHARD_BYTES", 3 * 40 * 30 * 8)
+    sequence(JOB, 2, root, quiet)
+    found, plain = open_sequence(root / "000002.zarr"), zarr.open_group(str(root / "000002.zarr"), mode="r")
+    for name in found.fields:
+        column, array = found[name], plain[name]
+        fast = shard.of(array, root / "000002.zarr" / name)
+        assert (fast is not None) == FIELDS[name].framed
+        for t in (0, 6, 2, -1, -7):
+            assert np.array_equal(column[t], array[t])
+            assert fast is None or np.array_equal(fast[t], array[t])
+    for t in (7, -8):
+        with pytest.raises(IndexError):
+            found["flow"][t]
+    column = found["flow"]
+    column[0]
+    (root / "000002.zarr/flow/c/0/0/0/0").write_bytes(b"short")
+    with pytest.raises(UserError, match="flow: cannot be read, the store is damaged"):
+        column[1]
+
+
+def test_peaks_are_kept(root: Path) -> None:
+    found = open_sequence(root / "000001.zarr")
+    lengths = np.linalg.norm(found["flow"][:], axis=-1)
+    assert found.attrs["summary"]["peak_flow_px"] == pytest.approx(float(lengths.max()), rel=1e-6)
+
+
+def writer(folder: Path) -> Writer:
+    return Writer(folder, 9, frames=2, size=(4, 5), job=JOB)
+
+
+def test_nan_is_refused_with_field_and_frame(tmp_path: Path) -> None:
+    sink = writer(tmp_path)
+    sink.put_frame("depth", 0, np.ones((4, 5)))
+    with pytest.raises(NotFinite, match="depth, frame 1: not finite, first at \\(2, 3\\)"):
+        sink.put_frame("depth", 1, np.where(np.arange(20).reshape(4, 5) == 13, np.nan, 1.0))
+
+
+def test_wrong_shape_type_order_and_name_are_refused(tmp_path: Path) -> None:
+    sink = writer(tmp_path)
+    with pytest.raises(ValueError, match="shape"):
+        sink.put_frame("depth", 0, np.ones((5, 4)))
+    with pytest.raises(ValueError, match="float64"):
+        sink.put_frame("rgb", 0, np.ones((4, 5, 3)))
+    with pytest.raises(ValueError, match="frame 1 after 0"):
+        sink.put_frame("depth", 1, np.ones((4, 5)))
+    with pytest.raises(ValueError, match="not in the field table"):
+        sink.put("colour", np.ones(3))
+
+
+def test_half_floats_are_read_as_floats_within_the_stated_error(root: Path, tmp_path: Path) -> None:
+    job = JOB.model_copy(update={"store": JOB.store.model_copy(update={"flow": "float16"})})
+    (tmp_path / "half").mkdir()
+    sequence(job, 0, tmp_path / "half", quiet)
+    exact, half = open_sequence(root / "000000.zarr"), open_sequence(tmp_path / "half/000000.zarr")
+    assert (half["flow"].dtype, half["flow"].stored) == ("float32", "float16")
+    assert half["depth"].stored == "float32"
+    assert half["flow"][2].dtype == np.float32
+    worst = float(np.abs(half["flow"][:] - exact["flow"][:]).max())
+    stated = half.attrs["summary"]["rounding_px"]["flow"]
+    assert 0 < worst <= stated * (1 + 1e-3)
+    assert stated < 0.004, "motion here is below 16 px"
+    assert "rounding_px" not in exact.attrs["summary"]
+    assert all(measure.good for _, measure in contents.check(half, [0], False, Stopwatch()))
+
+
+def test_a_job_says_which_fields_are_kept(tmp_path: Path) -> None:
+    job = Job.model_validate({**JOB.model_dump(), "store": {"without": ["depth"]}})
+    sequence(job, 0, tmp_path, quiet)
+    found = open_sequence(tmp_path / "000000.zarr")
+    assert "depth" not in found
+    assert not (tmp_path / "000000.zarr/depth").exists()
+    with pytest.raises(ValueError, match="rgb: not among depth, flow_confidence"):
+        Job.model_validate({"store": {"without": ["rgb"]}})
+    with pytest.raises(ValueError, match="wings: not among"):
+        Job.model_validate({"store": {"extra": ["wings"]}})
+
+
+def test_nothing_is_visible_before_the_seal(tmp_path: Path) -> None:
+    sink = writer(tmp_path)
+    sink.put("time", np.arange(2.0))
+    assert [path.name for path in tmp_path.iterdir()] == ["000009.zarr.part"]
+    with pytest.raises(UserError, match="unfinished"):
+        open_sequence(tmp_path / "000009.zarr.part")
+    with pytest.raises(ValueError, match="was never written"):
+        sink.seal(**attributes(9, np.random.default_rng(0)))
+    with pytest.raises(UserError, match="holds no finished sequence"):
+        Dataset(tmp_path)
+
+
+def test_foreign_and_truncated_stores_are_one_line(root: Path) -> None:
+    foreign = root / "foreign.zarr"
+    zarr.create_group(str(foreign), zarr_format=3)
+    with pytest.raises(UserError, match="not a sequence of ours"):
+        open_sequence(foreign)
+    with pytest.raises(UserError, match="no such sequence"):
+        open_sequence(root / "000007.zarr")
+    (root / "000000.zarr/zarr.json").write_text('{"zarr_form')
+    with pytest.raises(UserError, match="metadata is damaged"):
+        open_sequence(root / "000000.zarr")
+    shutil.rmtree(root / "000001.zarr/flow/c/0")
+    with pytest.raises(UserError, match="flow: file c/0/0/0/0 is missing or empty"):
+        open_sequence(root / "000001.zarr")["flow"]
+
+
+@pytest.mark.parametrize("cut", [0, 1, 100, -1])
+def test_a_cut_or_flipped_shard_is_an_error_and_never_zeros(root: Path, cut: int) -> None:
+    shard = root / "000000.zarr/flow/c/0/0/0/0"
+    data = bytearray(shard.read_bytes())
+    if cut >= 0:
+        shard.write_bytes(data[:cut])
+    else:
+        data[50] ^= 1
+        shard.write_bytes(data)
+    with pytest.raises(UserError, match=r"000000.zarr: flow: .*damaged"):
+        open_sequence(root / "000000.zarr")["flow"][:]
+    with pytest.raises(UserError, match=r"000000.zarr: flow: .*damaged"):
+        [open_sequence(root / "000000.zarr")["flow"][t] for t in range(7)]
+
+
+def test_dataset_lists_sequences_in_order(root: Path) -> None:
+    dataset = Dataset(root)
+    assert len(dataset) == 2
+    assert [one.index for one in dataset] == [0, 1]
+
+
+def test_exr_beside_the_store_is_hashed(tmp_path: Path) -> None:
+    def store_with(value: float, folder: Path) -> str:
+        folder.mkdir()
+        job = Job(frames=2, render={"size": (16, 16), "exr": True}, flow={"backend": "ideal"})
+        sink = Writer(folder, 0, frames=2, size=(16, 16), job=job)
+        for name, field in FIELDS.items():
+            if not field.optional:
+                sink.put(name, np.zeros(field.shape(2, (16, 16)), field.dtype))
+        for t in range(2):
+            sink.put_exr(t, np.full((16, 16, 3), value, np.float32))
+        path = sink.seal(**attributes(0, np.random.default_rng(0)))
+        assert len(list((folder / "radiance/000000").glob("*.exr"))) == 2
+        attrs = json.loads((path / "zarr.json").read_text())["attributes"]
+        return str(attrs["field_hashes"]["radiance"])
+
+    assert store_with(1.0, tmp_path / "a") == store_with(1.0, tmp_path / "b")
+    assert store_with(2.0, tmp_path / "c") != store_with(1.0, tmp_path / "d")
+
+
+def test_a_zip_reads_as_the_folder_does_and_names_what_it_lacks(root: Path, tmp_path: Path) -> None:
+    archive = tmp_path / "out of it.zip"
+    with zipfile.ZipFile(archive, "w") as target:
+        for file in sorted(root.rglob("*.zarr/**/*")):
+            if file.is_file() and file != root / "000001.zarr/depth/c/0/0/0":
+                target.write(file, file.relative_to(root))
+    dataset = Dataset(f"zip://::{archive}")
+    assert [one.index for one in dataset] == [0, 1]
+    assert np.array_equal(dataset[0]["flow"][3], Dataset(root)[0]["flow"][3])
+    assert dataset[1].path.name == "000001.zarr"
+    with pytest.raises(UserError, match="depth: file c/0/0/0 is missing"):
+        dataset[1]["depth"]
+    with pytest.raises(UserError, match="no such sequence"):
+        open_sequence(f"zip://000009.zarr::{archive}")

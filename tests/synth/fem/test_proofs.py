@@ -1,0 +1,179 @@
+"""The solver against closed forms: half-space, uniaxial stretch, manufactured solutions, Newton's method."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+from newton import newton
+from scipy.optimize import brentq
+from scipy.sparse.linalg import splu
+from skfem.quadrature import get_quadrature
+from skfem.refdom import RefTet
+
+from synth.fem import equilibrium, surface_embedding, tool
+from synth.fem.laws import lame
+from synth.fem.mesh import tetrahedra
+from synth.fem.mesh.element import bary_slope, shape
+from synth.fem.mesh.refine import refine
+from synth.fem.mesh.tetrahedra import Tets
+from synth.fem.system import System, assemble
+from synth.job import schema
+
+Floats = np.ndarray
+
+
+def box(size: tuple[float, float, float], cubes: float, order: int) -> Tets:
+    """A box from z = -depth to 0, fixed on all sides but the top, without springs."""
+    points, cells = tetrahedra._bricks(np.array(size), cubes)
+    return _boxed(points, cells, size, order)
+
+
+def _boxed(points: Floats, cells: Floats, size: tuple[float, float, float], order: int) -> Tets:
+    points, cells = tetrahedra.lengthened(points, cells, order)
+    half = np.array(size)[:2] / 2
+    fixed = (np.abs(np.abs(points[:, :2]) - half) < 1e-9).any(axis=1) | (points[:, 2] < 1e-9 - size[2])
+    return Tets(points, cells, order, fixed, sp.csr_array((len(points), len(points))))
+
+
+def boussinesq(at: Floats, young: float, poisson: float) -> Floats:
+    """Displacement of a half-space z <= 0 under a unit force in -z at the origin (Johnson 1985, 3.2)."""
+    shear = young / (2 * (1 + poisson))
+    flat, depth = np.hypot(at[:, 0], at[:, 1]), -at[:, 2]
+    far = np.sqrt(flat**2 + depth**2)
+    down = (2 * (1 - poisson) / far + depth**2 / far**3) / (4 * np.pi * shear)
+    out = (depth / far**3 - (1 - 2 * poisson) / (far * (far + depth))) / (4 * np.pi * shear)
+    return np.column_stack([out * at[:, 0], out * at[:, 1], -down])
+
+
+@pytest.mark.parametrize("poisson", [0.4, 0.49])
+def test_kernel_on_a_half_space(poisson: float) -> None:
+    """w0 = 1.0186 (1 - nu^2) F / (a E) under (1 - (r/a)^2)^2; the far boundary carries the solution."""
+    a, size = 1.0, (4.0, 4.0, 2.0)
+    points, cells = tetrahedra._bricks(np.array(size), 20)
+    points, cells = refine(points, cells, lambda at: 0.25 + np.linalg.norm(at, axis=1), 2000)
+    tets = _boxed(points, cells, size, 2)
+    # The kernel as 24 rings of 24 point forces each.
+    node, weight = np.polynomial.legendre.leggauss(24)
+    r, angle = a * (node + 1) / 2, 2 * np.pi * np.arange(24) / 24
+    ring = weight * a / 2 * r * (1 - (r / a) ** 2) ** 2 * 3 / (np.pi * a**2) * 2 * np.pi / 24
+    edge = np.flatnonzero(tets.fixed)
+    shell = np.zeros_like(tets.points)
+    for radius, share in zip(r, ring, strict=True):
+        for turn in angle:
+            offset = np.array([radius * np.cos(turn), radius * np.sin(turn), 0.0])
+            shell[edge] += share * boussinesq(tets.points[edge] - offset, 1.0, poisson)
+    system = assemble(tets, "linear", poisson)
+    n = 121
+    x = np.linspace(-1.2, 1.2, n)
+    top = np.stack(np.meshgrid(x, x, indexing="ij"), axis=-1).reshape(-1, 2)
+    i = np.arange(n * n).reshape(n, n)
+    p, q, s, t = i[:-1, :-1].ravel(), i[1:, :-1].ravel(), i[1:, 1:].ravel(), i[:-1, 1:].ravel()
+    faces = np.concatenate([np.stack([p, q, s], axis=1), np.stack([p, s, t], axis=1)])
+    vertices = np.column_stack([top, np.zeros(len(top))])
+    area = surface_embedding.vertex_area(vertices, faces)
+    kernel = tool.footprint(np.zeros(2), a, vertices, area)
+    carry = surface_embedding.embedding(tets, vertices)
+    load = np.outer(carry.T @ (area * kernel), [0, 0, -1.0])
+    u = shell + system.solve(load - (system.stiffness @ shell.ravel()).reshape(-1, 3))
+    centre = -(carry @ u)[n * n // 2, 2]
+    assert centre == pytest.approx(1.0186 * (1 - poisson**2) / a, rel=0.005)
+
+
+def test_uniaxial_neo_hookean() -> None:
+    """A cube pulled to stretch 1.5 with free sides: stress and sideways stretch from one scalar equation."""
+    tets, poisson, stretch = box((2.0, 2.0, 2.0), 8, 1), 0.4, 1.5
+    system = assemble(tets, "neo-hookean", poisson)
+    points = tets.points + np.array([1.0, 1.0, 2.0])
+    held = np.stack(
+        [points[:, 0] < 1e-9, points[:, 1] < 1e-9, (points[:, 2] < 1e-9) | (points[:, 2] > 2 - 1e-9)]
+    )
+    free = np.flatnonzero(~held.T.ravel())
+    system = replace(system, free=free, factor=splu(system.stiffness[free][:, free].tocsc()))
+    start = points * [stretch**-0.4 - 1, stretch**-0.4 - 1, stretch - 1]
+    u = newton(system, np.zeros_like(start), start, tolerance=1e-13)
+    mu, lam = lame(1.0, poisson)
+    side = brentq(lambda t: mu * (t - 1 / t) + lam * np.log(stretch * t * t) / t, 0.5, 1.0, xtol=1e-15)
+    pull = mu * (stretch - 1 / stretch) + lam * np.log(stretch * side**2) / stretch
+    assert np.abs(u - points * [side - 1, side - 1, stretch - 1]).max() <= 1e-10
+    force = system.state(u).force[points[:, 2] > 2 - 1e-9, 2].sum()
+    assert force / 4 == pytest.approx(pull, abs=1e-10)
+
+
+@pytest.mark.parametrize(("order", "sizes", "rate"), [(1, (8, 16), 2.0), (2, (4, 8), 3.0)])
+def test_manufactured_solution_converges(order: int, sizes: tuple[int, int], rate: float) -> None:
+    errors = [_manufactured(n, order) for n in sizes]
+    assert np.log2(errors[0] / errors[1]) == pytest.approx(rate, abs=0.1)
+
+
+def _manufactured(n: int, order: int) -> float:
+    """L2 error of u = (1, 1/2, -1) sin x sin y sin z (times pi, on the unit cube) under its body force."""
+    tets = box((1.0, 1.0, 1.0), n**3, order)
+    tets = replace(tets, fixed=tets.fixed | (tets.points[:, 2] > -1e-9))
+    way, shift, k = np.array([1.0, 0.5, -1.0]), np.array([0.5, 0.5, 1.0]), np.pi
+    mu, lam = lame(1.0, 0.0)
+
+    def exact(x: Floats) -> Floats:
+        return np.prod(np.sin(k * (x + shift)), axis=-1)[..., None] * way
+
+    def body(x: Floats) -> Floats:
+        s, c = np.sin(k * (x + shift)), np.cos(k * (x + shift))
+        second = np.empty((*x.shape[:-1], 3, 3))  # of sin sin sin
+        for i in range(3):
+            for j in range(3):
+                rest = [m for m in range(3) if m not in (i, j)]
+                factor = c[..., i] * c[..., j] if i != j else -s[..., i]
+                second[..., i, j] = k * k * factor * np.prod(s[..., rest], axis=-1)
+        return 3 * k * k * mu * exact(x) - (lam + mu) * second @ way
+
+    at, weight = get_quadrature(RefTet, 5)
+    bary = np.column_stack([1 - at.sum(axis=0), at.T])
+    corner = tets.points[tets.cells[:, :4]]
+    volume = bary_slope(corner)[1]
+    place = np.einsum("qc,mcd->mqd", bary, corner)
+    value = shape(bary, order)
+    local = np.einsum("m,q,qn,mqd->mnd", 6 * volume, weight, value, body(place))
+    load = np.zeros_like(tets.points)
+    np.add.at(load, tets.cells, local)
+    system = assemble(tets, "linear", 0.0)
+    u = system.solve(load)
+    gap = np.einsum("qn,mnd->mqd", value, u[tets.cells]) - exact(place)
+    return float(np.sqrt(np.einsum("m,q,mqd->", 6 * volume, weight, gap**2)))
+
+
+def loaded(law: str, load: float, kind: str) -> tuple[System, Floats]:
+    """A block under one contact, and the load for E = 1 kPa."""
+    anatomy = schema.Anatomy()
+    tets = tetrahedra.block(anatomy, 700, 2, ((2.0, 1.0, 4.0),))
+    outer = np.unique(tetrahedra.boundary(tets.cells[:, :4], 1))
+    area = np.zeros(len(tets.points))
+    area[outer] = 1.0
+    area[tets.points[:, 2] < -15] = 0.0
+    kernel = tool.footprint(np.array([2.0, 1.0]), 4.0, tets.points, area) * area
+    way = np.array([0.5, 0.0, 0.87 if kind == "pull" else -0.87])
+    return assemble(tets, law, 0.4), np.outer(kernel, 16.0 * load * way)
+
+
+@pytest.mark.parametrize(
+    ("law", "kind"), [("corotational", "pull"), ("stable", "push"), ("neo-hookean", "push")]
+)
+def test_fast_solver_agrees_with_newtons_method(law: str, kind: str) -> None:
+    system, load = loaded(law, 0.15, kind)
+    part = np.array([0.0, 0.4, 0.8, 1.0])
+    path = equilibrium.follow(system, part[:, None, None] * load, 0.15 * part)
+    exact = newton(system, load, path.displacement[-1], 1e-8)
+    assert np.linalg.norm(path.displacement[-1] - exact) <= 1e-3 * np.linalg.norm(exact)
+
+
+def test_a_guess_past_inversion_does_not_spoil_the_step() -> None:
+    system, load = loaded("neo-hookean", 0.15, "push")
+    still = np.zeros_like(load)
+    wild = np.random.default_rng(0).normal(size=load.shape) * 20
+    assert not np.isfinite(system.state(wild).energy)
+    u, state, rest = equilibrium.balance(system, load, wild, 1e-3, still)
+    usual, _, _ = equilibrium.balance(system, load, still, 1e-3, still)
+    assert np.isfinite(state.energy)
+    assert rest <= 1e-3
+    np.testing.assert_array_equal(u, usual)

@@ -1,0 +1,93 @@
+"""The card: front matter that a hub reads, every field and column, and numbers that are the dataset's own."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from fake_run import in_process
+from fake_work import consistent
+from ruamel.yaml import YAML
+from typer.testing import CliRunner
+
+from synth.cli import app
+from synth.dataset import index
+from synth.fields import FIELDS
+from synth.job.schema import Job
+from synth.publish import histogram, preview_video
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("card") / "out"
+    job = Job(
+        sequences=3,
+        frames=3,
+        render={"size": (64, 48)},
+        flow={"backend": "ideal"},
+        card={"title": "Pulls: a test", "licence": "cc-by-4.0", "summary": "Made to be read."},
+    )
+    in_process(job, out, consistent)
+    preview_video.write(out)
+    return out
+
+
+def text(root: Path) -> str:
+    return (root / "README.md").read_text("utf-8")
+
+
+def test_front_matter_is_yaml_that_names_title_licence_and_index(root: Path) -> None:
+    front = YAML(typ="safe").load(text(root).split("---")[1])
+    assert front["pretty_name"] == "Pulls: a test"
+    assert front["license"] == "cc-by-4.0"
+    assert front["size_categories"] == ["n<1K"]
+    assert (root / front["configs"][0]["data_files"][0]["path"]).is_file()
+
+
+def test_every_field_and_column_is_described_and_absent_ones_are_not(root: Path) -> None:
+    for name, field in FIELDS.items():
+        assert (f"| `{name}` | {', '.join(field.dims)} |" in text(root)) != field.optional
+    for name in index.SCHEMA.names:
+        assert f"| `{name}` |" in text(root)
+
+
+def test_numbers_are_those_of_the_index(root: Path) -> None:
+    stiffness = [row["young_kpa"] for row in index.read(root).to_pylist()]
+    line = next(line for line in text(root).splitlines() if line.startswith("| Young's modulus"))
+    assert [float(cell) for cell in line.split("|")[2:5]] == pytest.approx(
+        [min(stiffness), float(np.median(stiffness)), max(stiffness)], rel=5e-3
+    )
+    assert "3 sequences (9 frames, 64 × 48 px)" in text(root)
+    assert "Made to be read." in text(root)
+
+
+def test_every_picture_that_is_shown_exists_and_markdown_holds_together(root: Path) -> None:
+    shown = re.findall(r"\]\(([^)]+)\)", text(root))
+    assert len(shown) >= 5
+    for path in shown:
+        assert (root / path).is_file(), path
+    lines = text(root).splitlines()
+    for k, line in enumerate(lines):
+        if line.startswith("#") and k:
+            assert lines[k - 1] == "", f"no blank line before {line}"
+        if line.startswith("|") and not lines[k + 1].startswith("|"):
+            assert lines[k + 1] == "", f"the table runs into: {lines[k + 1]}"
+
+
+def test_the_command_writes_it_anew(root: Path) -> None:
+    before = text(root)
+    (root / "README.md").unlink()
+    assert CliRunner().invoke(app, ["card", str(root)]).exit_code == 0
+    assert text(root) == before
+
+
+def test_histogram_counts_what_it_is_given() -> None:
+    picture = histogram.histogram(np.array([1.0, 1.0, 1.0, 3.0, np.nan]), "a < b", "mN", bins=2)
+    tree = ElementTree.fromstring(picture)
+    heights = [float(one.get("height", 0)) for one in tree if one.get("fill") == "#3b6ea5"]
+    assert heights[0] == pytest.approx(3 * heights[1], rel=0.01)
+    assert "a < b (n = 4)" in "".join(tree.itertext())
+    assert ElementTree.fromstring(histogram.histogram(np.array([]), "none", "")) is not None

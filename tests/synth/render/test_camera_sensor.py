@@ -1,0 +1,64 @@
+"""The sensor's noise and transfer against their closed forms."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from synth.render.camera.camera_sensor import Sensor, record
+
+PLAIN = Sensor(vignette=0.0, bloom=0.0, contrast=0.0, sharpening=0.0)
+
+
+def flat(level: float, side: int = 200) -> np.ndarray:
+    return np.full((side, side, 3), level, np.float32)
+
+
+def linear(video: np.ndarray) -> np.ndarray:
+    encoded = video / 255
+    return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
+
+
+@pytest.mark.parametrize("level", [0.1, 0.4, 0.8])
+def test_noise_is_photons_and_readout(level: float) -> None:
+    sensor = replace(PLAIN, full_well=500.0, read_noise=6.0)
+    seen = linear(record(flat(level), sensor, np.random.default_rng(0)).astype(float))
+    expected = np.sqrt(level * 500 + 36) / 500
+    assert seen.std() == pytest.approx(expected, rel=0.05)
+    assert seen.mean() == pytest.approx(level, rel=0.02)
+
+
+def test_more_light_than_the_well_holds_is_white() -> None:
+    assert (record(flat(3.0), PLAIN, np.random.default_rng(0)) == 255).all()
+
+
+def test_darkness_stays_dark() -> None:
+    assert record(flat(0.0), replace(PLAIN, read_noise=1.0), np.random.default_rng(0)).max() < 8
+
+
+def test_white_balance_multiplies_channels() -> None:
+    sensor = replace(PLAIN, white=(1.5, 1.0, 0.5), full_well=1e6, read_noise=0.0)
+    seen = linear(record(flat(0.4), sensor, np.random.default_rng(0)).astype(float)).mean(axis=(0, 1))
+    np.testing.assert_allclose(seen, [0.6, 0.4, 0.2], rtol=0.02)
+
+
+def test_bloom_keeps_the_light() -> None:
+    spot = np.zeros((101, 101, 3), np.float32)
+    spot[50, 50] = 0.5
+    sharp = replace(PLAIN, full_well=1e9, read_noise=0.0, bits=30)
+    without = linear(record(spot, sharp, np.random.default_rng(0)).astype(float))
+    with_bloom = linear(record(spot, replace(sharp, bloom=0.4), np.random.default_rng(0)).astype(float))
+    assert with_bloom[50, 50, 0] < 0.75 * without[50, 50, 0]
+    assert with_bloom[52, 50, 0] > without[52, 50, 0]
+
+
+def test_corners_lose_the_share_asked_for() -> None:
+    sensor = replace(PLAIN, vignette=0.3, full_well=1e6, read_noise=0.0)
+    seen = linear(record(flat(0.5, 201), sensor, np.random.default_rng(0)).astype(float))[..., 0]
+    assert seen[0, 0] / seen[100, 100] == pytest.approx(0.7, rel=0.03)
+
+
+def test_same_seed_same_bytes_other_seed_other_noise() -> None:
+    pictures = [record(flat(0.5), PLAIN, np.random.default_rng(seed)) for seed in (1, 1, 2)]
+    assert (pictures[0] == pictures[1]).all()
+    assert (pictures[0] != pictures[2]).any()

@@ -1,0 +1,184 @@
+"""The studio on every variant that runs here."""
+
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from synth.errors import UserError
+from synth.job.schema import Anatomy, Job, Render, Store
+from synth.render.anatomy import surface as anatomy
+from synth.render.anatomy.surface import Relief
+from synth.render.appearance.look import Look
+from synth.render.camera import camera
+from synth.render.camera.camera import View
+from synth.render.mitsuba.adapter import cuda, pick
+from synth.render.scene import Moment, Studio
+from synth.system import llvm
+
+VARIANTS = ["scalar_rgb", *(["llvm_ad_rgb"] if llvm.find() else []), *(["cuda_ad_rgb"] if cuda() else [])]
+TIPS = np.array([[-1.0, 1.0, 0.2], [1.2, 1.4, 0.2]])
+SHAFTS = np.array([[0.6, 0.3, 0.74], [0.6, 0.3, 0.74]])
+
+
+def studio(
+    variant: str, spp: int = 4, extra: tuple[str, ...] = (), **render: object
+) -> tuple[Studio, np.ndarray]:
+    settings = {"size": (96, 72), "spp": spp, "variant": variant, **render}
+    job = Job(
+        anatomy=Anatomy(vertices=2500), render=Render.model_validate(settings), store=Store(extra=extra)
+    )
+    surface = anatomy.procedural(Relief.draw(job.anatomy, np.random.default_rng(4)), job.anatomy)
+    view = View.draw(job.render, np.random.default_rng(4))
+    look = Look.draw(job, "healthy", np.random.default_rng(4))
+    return Studio(surface, look, camera.place(view, job.render), job), surface.vertices
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_same_seed_same_bytes(variant: str) -> None:
+    ours, vertices = studio(variant)
+    shots = [ours.frame(vertices, TIPS, SHAFTS, seed) for seed in (7, 8, 7)]
+    assert (shots[0].rgb == shots[2].rgb).all()
+    assert (shots[0].radiance == shots[2].radiance).all()
+    assert (shots[0].rgb != shots[1].rgb).any()
+    assert np.isfinite(shots[0].radiance).all()
+    again, _ = studio(variant)
+    assert (again.frame(vertices, TIPS, SHAFTS, 7).rgb == shots[0].rgb).all()
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_the_picture_moves_with_the_truth(variant: str) -> None:
+    """A sideways shift of the cortex shows in the picture where flow says, and nowhere else."""
+    ours, vertices = studio(variant, spp=64, tool=False)
+    rest = ours.frame(vertices, TIPS, SHAFTS, 1)
+    pixel = ours.still.scale_mm_per_px
+    moved = ours.frame(vertices + ours.camera.rotation[0] * 3 * pixel, TIPS, SHAFTS, 2)
+    inside = np.zeros_like(ours.still.tissue)
+    inside[20:-20, 30:-30] = True
+    inside &= ours.still.tissue & ~rest.glare & ~np.roll(moved.glare, -3, axis=1)
+    np.testing.assert_allclose(np.median(moved.flow[inside], axis=0), [3, 0], atol=0.1)
+    green = [shot.rgb[..., 1].astype(float) for shot in (rest, moved)]
+    errors = {d: np.abs(np.roll(green[1], -d, axis=1) - green[0])[inside].mean() for d in range(7)}
+    assert min(errors, key=lambda d: errors[d]) == 3
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_variants_agree_pixel_by_pixel(variant: str) -> None:
+    """Means of independent frames differ by no more than their standard errors say, over the picture.
+
+    Without distortion, where no variant resamples. After Mitsuba's own z-tests of renderings.
+    """
+    frames = 12
+    stacks = []
+    for name, seed in (("scalar_rgb", 50), (variant, 90)):
+        ours, vertices = studio(name, spp=16, size=(64, 48), distortion=(0.0,) * 5)
+        shots = [ours.frame(vertices, TIPS, SHAFTS, seed + k) for k in range(frames)]
+        stacks.append(np.stack([shot.radiance.mean(axis=2) for shot in shots]))
+    one, other = stacks
+    error = np.sqrt((one.var(axis=0, ddof=1) + other.var(axis=0, ddof=1)) / frames)
+    z = (one.mean(axis=0) - other.mean(axis=0)) / np.maximum(error, 1e-4)
+    assert abs(z.mean()) < 0.15
+    assert z.std() < 1.3
+    assert (np.abs(z) > 4.5).mean() < 0.01
+
+
+def test_the_tool_hides_and_is_masked() -> None:
+    ours, vertices = studio(VARIANTS[-1])
+    shot = ours.frame(vertices, TIPS, SHAFTS, 1)
+    assert 0.01 < shot.tool.mean() < 0.5
+    assert not (shot.visible & shot.tool).any()
+    assert not (shot.glare & shot.tool).any()
+    without, _ = studio(VARIANTS[-1], tool=False)
+    bare = without.frame(vertices, TIPS, SHAFTS, 1)
+    assert not bare.tool.any()
+    assert (bare.visible == without.still.tissue).all()
+
+
+def test_traction_is_in_camera_axes() -> None:
+    ours, vertices = studio(VARIANTS[-1])
+    nodal = np.zeros_like(vertices)
+    nodal[:, 2] = 2.0  # pulled out of the brain, towards the lens
+    seen = ours.traction(nodal)[ours.still.tissue]
+    np.testing.assert_allclose(np.linalg.norm(seen, axis=1), 2.0, rtol=1e-5)
+    assert (seen[:, 2] < -1.8).all()
+    assert (ours.traction(nodal)[~ours.still.tissue] == 0).all()
+
+
+def test_the_variant_is_named_or_refused() -> None:
+    assert pick("scalar_rgb") == "scalar_rgb"
+    assert pick("auto") == ("llvm_ad_rgb" if llvm.find() else "scalar_rgb")
+    if not cuda():
+        with pytest.raises(UserError, match="cuda_ad_rgb"):
+            pick("cuda_ad_rgb")
+
+
+def test_without_llvm_the_scalar_variant_is_taken() -> None:
+    code = "from synth.render.mitsuba.adapter import pick; print(pick('auto'))"
+    environment = {"PATH": "/usr/bin:/bin", "SULCUS_LLVM": ""}
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
+    assert done.stdout.strip() == "scalar_rgb"
+
+
+def test_a_moved_camera_and_weaker_light_are_in_picture_and_truth() -> None:
+    ours, vertices = studio("scalar_rgb" if len(VARIANTS) == 1 else VARIANTS[1], spp=16, tool=False)
+    pixel = ours.still.scale_mm_per_px
+    aside = replace(ours.camera, translation=ours.camera.translation + np.array([2 * pixel, 0, 0]))
+    rest = ours.shoot(Moment(vertices, TIPS, SHAFTS), 1)
+    moved = ours.shoot(Moment(vertices, TIPS, SHAFTS, aside, 0.5), 2)
+    inside = ours.still.tissue.copy()
+    inside[:, :8] = inside[:, -8:] = False
+    np.testing.assert_allclose(np.median(moved.flow[inside], axis=0), [2, 0], atol=0.05)
+    one, two = rest.radiance.mean(axis=2), np.roll(moved.radiance.mean(axis=2), -2, axis=1)
+    assert np.median(two[inside] / one[inside]) == pytest.approx(0.5, abs=0.03)
+    back = ours.shoot(Moment(vertices, TIPS, SHAFTS), 1)
+    assert (back.radiance == rest.radiance).all()
+
+
+def test_an_open_shutter_adds_up_light() -> None:
+    ours, vertices = studio(VARIANTS[-1], spp=4, tool=False)
+    moments = [Moment(vertices, TIPS, SHAFTS, None, power) for power in (0.5, 1.5)]
+    sharp = ours.shoot(Moment(vertices, TIPS, SHAFTS), 1)
+    both = ours.shoot(Moment(vertices, TIPS, SHAFTS), 1, moments)
+    assert both.radiance.mean() == pytest.approx(sharp.radiance.mean(), rel=0.01)
+    assert (both.flow == sharp.flow).all()
+
+
+def test_truth_on_request() -> None:
+    """Flow to the next frame chains with flow from rest; normals face the lens; a second lens has its own."""
+    extra = ("flow_next", "normals", "blur", "rgb_right", "flow_right", "visible_right", "depth_right")
+    ours, vertices = studio(VARIANTS[-1], spp=1, tool=False, extra=extra, stereo_mm=20.0)
+    push = np.exp(-(vertices[:, :2] ** 2).sum(axis=1) / 30)[:, None] * np.array([0.6, 0.2, 0.5])
+    moments = [Moment(vertices + k * push, TIPS, SHAFTS) for k in range(3)]
+    shots = [ours.shoot(moments[k], k, (), moments[min(k + 1, 2)]) for k in range(3)]
+    first, second = shots[0], shots[1]
+    assert first.flow_next is not None
+    assert second.flow_next is not None
+    assert first.normals is not None
+    # In the rest frame a pixel's point is the same for both.
+    np.testing.assert_allclose(first.flow_next, second.flow, atol=1e-4)
+    rows, columns = np.nonzero(ours.still.tissue & second.visible & shots[2].visible)
+    goal = np.stack([columns, rows], 1) + second.flow[rows, columns]
+    near = np.rint(goal).astype(int)
+    kept = np.abs(goal - near).max(axis=1) < 0.1
+    there = second.flow_next[near[kept, 1], near[kept, 0]]
+    both = second.flow[rows, columns][kept] + there
+    assert np.median(np.abs(both - shots[2].flow[rows, columns][kept])) < 0.02
+    assert first.normals[ours.still.tissue][:, 2].max() < 0
+    np.testing.assert_allclose(np.linalg.norm(first.normals[ours.still.tissue], axis=1), 1, atol=1e-5)
+    assert (shots[2].flow_next == 0).sum() > 0
+    assert first.depth_right is not None
+    assert first.rgb_right is not None
+    assert np.median(first.depth_right[ours.still.tissue]) == pytest.approx(
+        np.median(first.depth[ours.still.tissue]), rel=0.01
+    )
+    assert (first.rgb_right != first.rgb).any()
+
+
+def test_what_is_not_asked_for_is_not_made() -> None:
+    ours, vertices = studio(VARIANTS[-1], spp=1)
+    shot = ours.frame(vertices, TIPS, SHAFTS, 1)
+    assert shot.normals is None
+    assert shot.flow_next is None
+    assert shot.rgb_right is None

@@ -1,0 +1,61 @@
+"""A microscope that moves, and its second lens."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+
+from synth.job.schema import Render
+from synth.render.camera import camera
+from synth.render.camera.camera import View
+from synth.render.camera.sway import Sway
+
+RENDER = Render(tilt_deg=(15.0, 15.0), drift_mm=(0.4, 0.4), vibration_mm=(0.02, 0.02))
+LENS = camera.place(View.draw(RENDER, np.random.default_rng(1)), RENDER)
+
+
+def test_at_rest_the_microscope_is_in_its_place_and_later_about_as_far_as_asked() -> None:
+    sways = [Sway.draw(RENDER, np.random.default_rng(k)) for k in range(40)]
+    np.testing.assert_array_equal(sways[0].at(LENS, 0.0).translation, LENS.translation)
+    shifts = np.array([sway.at(LENS, 4.0).translation - LENS.translation for sway in sways])
+    assert 0.1 < np.abs(shifts).mean() < 0.8
+    for sway in sways[:5]:
+        turn = sway.at(LENS, 2.0).rotation
+        np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=1e-12)
+
+
+def test_vibration_has_the_deviation_asked_for() -> None:
+    sway = replace(Sway.draw(RENDER, np.random.default_rng(5)), drift_mm=0.0)
+    x = [sway.at(LENS, t).translation for t in np.arange(0, 4, 0.005)]
+    np.testing.assert_allclose(np.std(x, axis=0), 0.02, rtol=0.15)
+
+
+def test_a_still_microscope_is_the_same_object() -> None:
+    still = replace(Sway.draw(RENDER, np.random.default_rng(5)), drift_mm=0.0, vibration_mm=0.0)
+    assert still.at(LENS, 3.0) is LENS
+
+
+def test_the_second_lens_sees_the_disparity_of_a_rectified_pair() -> None:
+    right = camera.beside(LENS, 20.0)
+    points = np.random.default_rng(0).uniform(-8, 8, (30, 3))
+    plain = replace(LENS, distortion=np.zeros(5)), replace(right, distortion=np.zeros(5))
+    left_px, right_px = (camera.project(lens, points) for lens in plain)
+    depth = camera.to_camera(LENS, points)[:, 2]
+    disparity = left_px[:, 0] - right_px[:, 0]
+    distance = LENS.translation[2]
+    np.testing.assert_allclose(disparity, LENS.K[0, 0] * 20.0 * (1 / depth - 1 / distance), atol=1e-8)
+    np.testing.assert_allclose(left_px[:, 1], right_px[:, 1], atol=1e-9)
+    turn, _ = cv2.Rodrigues(right.rotation)
+    expected, _ = cv2.projectPoints(points, turn, right.translation, right.K, right.distortion)
+    np.testing.assert_allclose(camera.project(right, points), expected[:, 0], atol=1e-6)
+
+
+def test_blur_is_the_spread_of_rays_through_the_lens() -> None:
+    depth = np.array([0.0, LENS.focus_mm, LENS.focus_mm + 3.0])
+    radius = camera.blur_radius(LENS, depth)
+    assert radius[0] == 0
+    assert radius[1] < 1e-6
+    # A ray from the lens's edge through the point in focus, met again 3 mm behind it.
+    focus = LENS.focus_mm
+    miss = LENS.aperture_mm * 3.0 / focus
+    assert np.isclose(radius[2], LENS.K[0, 0] * miss / (focus + 3.0))

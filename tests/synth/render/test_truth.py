@@ -1,0 +1,143 @@
+"""Truth against what other code makes of the same geometry."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+
+from synth.geometry.triangles import Shape
+from synth.job.schema import Anatomy, Render
+from synth.render import truth
+from synth.render.anatomy import surface as anatomy
+from synth.render.anatomy.surface import Relief, Surface
+from synth.render.camera import camera
+from synth.render.camera.camera import Camera, View
+
+NOTHING = Shape(np.array([[0.0, 0.0, -900.0]] * 3), np.array([[0, 1, 2]], np.int32))
+
+
+@pytest.fixture(scope="module")
+def surface() -> Surface:
+    section = Anatomy(vertices=2500)
+    return anatomy.procedural(Relief.draw(section, np.random.default_rng(5)), section)
+
+
+@pytest.fixture(scope="module")
+def lens() -> Camera:
+    render = Render(size=(96, 72), tilt_deg=(20.0, 20.0), distortion=(-0.3, 0.1, 0.004, -0.003, 0.0))
+    return camera.place(View.draw(render, np.random.default_rng(2)), render)
+
+
+def bump(surface: Surface) -> np.ndarray:
+    """A smooth pull of 2 mm with some sideways motion."""
+    x, y = surface.vertices[:, 0], surface.vertices[:, 1]
+    pull = 2.0 * np.exp(-((x - 1) ** 2 + (y + 2) ** 2) / 18)
+    return surface.vertices + np.stack([0.5 * pull, -0.3 * pull, pull], axis=1)
+
+
+def test_rays_meet_what_trimesh_meets(surface: Surface, lens: Camera) -> None:
+    rest = truth.still(lens, Shape(surface.vertices, surface.faces), NOTHING)
+    pixels = camera.pixel_grid(lens.size)[::7]
+    origins, directions = camera.rays(lens, pixels)
+    mesh = trimesh.Trimesh(surface.vertices, surface.faces, process=False)
+    where, ray, _ = mesh.ray.intersects_location(origins, directions, multiple_hits=False)
+    expected = np.full((len(pixels), 3), np.nan)
+    expected[ray] = where
+    corners = surface.vertices[surface.faces[rest.face.ravel()[::7]]]
+    ours = np.einsum("nk,nkc->nc", rest.bary.reshape(-1, 3)[::7], corners)
+    ours[~rest.tissue.ravel()[::7]] = np.nan
+    assert np.isfinite(expected).all(axis=1).sum() > 500
+    np.testing.assert_allclose(ours, expected, atol=1e-6)
+
+
+def test_flow_is_the_projections_finite_difference(surface: Surface, lens: Camera) -> None:
+    shape = Shape(surface.vertices, surface.faces)
+    rest = truth.still(lens, shape, NOTHING)
+    direction = bump(surface) - surface.vertices
+    step = 1e-4
+    moved = Shape(surface.vertices + step * direction, surface.faces)
+    flow = truth.now(lens, rest, moved, NOTHING, None).flow.astype(np.float64)
+    pixels = camera.pixel_grid(lens.size)
+    origins, rays = camera.rays(lens, pixels)
+    on = rest.tissue.ravel()
+    faces = surface.faces[rest.face.ravel()[on]]
+    normal = np.cross(
+        surface.vertices[faces[:, 1]] - surface.vertices[faces[:, 0]],
+        surface.vertices[faces[:, 2]] - surface.vertices[faces[:, 0]],
+    )
+    reach = np.einsum("nc,nc->n", normal, surface.vertices[faces[:, 0]] - origins[on])
+    point = origins[on] + rays[on] * (reach / np.einsum("nc,nc->n", normal, rays[on]))[:, None]
+    shift = np.einsum("nk,nkc->nc", rest.bary.reshape(-1, 3)[on], direction[faces])
+    h = 1e-5
+    derivative = (camera.project(lens, point + h * shift) - camera.project(lens, point - h * shift)) / (2 * h)
+    np.testing.assert_allclose(flow.reshape(-1, 2)[on] / step, derivative, atol=2e-3)
+
+
+def test_flow_warps_the_moved_surface_back_to_rest(surface: Surface, lens: Camera) -> None:
+    """What a pixel sees at rest is what is seen at the flow's end in the moved frame."""
+    shape, moved = Shape(surface.vertices, surface.faces), Shape(bump(surface), surface.faces)
+    rest = truth.still(lens, shape, NOTHING)
+    now = truth.now(lens, rest, moved, NOTHING, None)
+    seen = now.visible & rest.tissue
+    assert seen.mean() > 0.5
+    assert np.linalg.norm(now.flow[seen], axis=1).max() > 3
+    pixels = camera.pixel_grid(lens.size).reshape(72, 96, 2)
+    ends = pixels[seen] + now.flow[seen]
+    origins, directions = camera.rays(lens, ends)
+    mesh = trimesh.Trimesh(moved.vertices, moved.faces, process=False)
+    where, ray, triangle = mesh.ray.intersects_location(origins, directions, multiple_hits=False)
+    bary = trimesh.triangles.points_to_barycentric(moved.vertices[moved.faces[triangle]], where)
+    material = np.einsum("nk,nkc->nc", bary, shape.vertices[shape.faces[triangle]])
+    error = np.linalg.norm(camera.project(lens, material) - pixels[seen][ray], axis=1)
+    assert np.median(error) < 1e-4
+    assert np.quantile(error, 0.999) < 1e-3
+
+
+def test_what_hides_a_point_makes_it_invisible(surface: Surface, lens: Camera) -> None:
+    shape = Shape(surface.vertices, surface.faces)
+    rest = truth.still(lens, shape, NOTHING)
+    plate = Shape(
+        np.array([[-4.0, -4.0, 6.0], [4.0, -4.0, 6.0], [4.0, 4.0, 6.0], [-4.0, 4.0, 6.0]]),
+        np.array([[0, 1, 2], [0, 2, 3]], np.int32),
+    )
+    now = truth.now(lens, rest, shape, NOTHING, plate)
+    assert 0.02 < now.tool.mean() < 0.3
+    # Nothing moved, so a rest pixel is seen just where the plate is not.
+    np.testing.assert_array_equal(now.visible, rest.tissue & ~now.tool)
+    assert now.depth[now.tool].max() < now.depth[rest.tissue & ~now.tool].max()
+    np.testing.assert_allclose(now.flow[rest.tissue], 0, atol=1e-5)
+
+
+def test_areas_of_pixels_add_up_to_the_surfaces(surface: Surface) -> None:
+    render = Render(size=(320, 240), field_mm=(60.0, 60.0), tilt_deg=(20.0, 20.0))
+    lens = camera.place(View.draw(render, np.random.default_rng(2)), render)
+    rest = truth.still(lens, Shape(surface.vertices, surface.faces), NOTHING)
+    mesh = trimesh.Trimesh(surface.vertices, surface.faces, process=False)
+    assert rest.area.sum() == pytest.approx(mesh.area, rel=5e-3)
+
+
+def test_a_points_outside_the_picture_is_invisible(surface: Surface, lens: Camera) -> None:
+    rest = truth.still(lens, Shape(surface.vertices, surface.faces), NOTHING)
+    aside = Shape(surface.vertices + np.array([60.0, 0.0, 0.0]), surface.faces)
+    now = truth.now(lens, rest, aside, NOTHING, None)
+    assert not now.visible.any()
+    assert np.isfinite(now.flow).all()
+
+
+def test_a_quantity_of_the_vertices_reaches_the_pixels(surface: Surface, lens: Camera) -> None:
+    rest = truth.still(lens, Shape(surface.vertices, surface.faces), NOTHING)
+    read = truth.at_rest_pixels(rest, surface.faces, surface.vertices)
+    pixels = camera.project(lens, read[rest.tissue].astype(np.float64))
+    expected = camera.pixel_grid(lens.size).reshape(72, 96, 2)[rest.tissue]
+    np.testing.assert_allclose(pixels, expected, atol=1e-4)
+    assert (read[~rest.tissue] == 0).all()
+
+
+def test_a_camera_that_moves_is_part_of_the_flow(surface: Surface, lens: Camera) -> None:
+    shape = Shape(surface.vertices, surface.faces)
+    rest = truth.still(lens, shape, NOTHING)
+    later = replace(lens, translation=lens.translation + np.array([0.5, 0.0, 0.0]))
+    now = truth.now(later, rest, shape, NOTHING, None)
+    expected = 0.5 * lens.K[0, 0] / lens.translation[2]
+    assert np.median(now.flow[rest.tissue][:, 0]) == pytest.approx(expected, rel=0.02)
