@@ -25,6 +25,7 @@ app = typer.Typer(
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
+    rich_markup_mode=None,  # "[kPa]" is a unit, not markup
 )
 
 Json = Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")]
@@ -66,7 +67,7 @@ def score(
 
     others = {name: Path(folder) for name, folder in _pairs("--also", also, "NAME=FOLDER").items()}
     settings = Settings(backend=flow, shrink=shrink, rate_hz=rate or None)
-    result = commands.score(recording, model, out, settings, title, train, others)
+    result = commands.score_recording(recording, model, out, settings, title, train, others)
     _say(result, out or Path(f"{result.recording}-score"), json)
 
 
@@ -97,13 +98,13 @@ def check(
 
     from bench.recording import check as checking
 
-    found = checking.check(recording)
+    found = checking.check_recording(recording)
     if json:
-        print(json_.dumps({"usable": checking.usable(found), "findings": [asdict(f) for f in found]}))
+        print(json_.dumps({"usable": checking.is_usable(found), "findings": [asdict(f) for f in found]}))
     else:
         for finding in found:
             print(f"{finding.state:<5}{finding.what:<11}{finding.said}")
-    if not checking.usable(found):
+    if not checking.is_usable(found):
         raise typer.Exit(2)
 
 
@@ -132,12 +133,12 @@ def import_(
     from bench.importers import registry
     from bench.output.progress_bar import counting
 
-    found = registry.read(source, _pairs("--use", use, "ROLE=NAME"))
+    found = registry.read_source(source, _pairs("--use", use, "ROLE=NAME"))
     about: dict[str, object] = {"young_kpa": young if young is not None else "unknown"}
     if scale is not None:
         about["scale_mm_per_px"] = scale
     with counting(f"importing {source.name}", len(found.times_s)) as progress:
-        registry.write(found, out, newtons, about, progress)
+        registry.write_recording(found, out, newtons, about, progress)
     notes = list(found.notes)
     if scale is None:
         notes.append("meta.yaml still needs scale_mm_per_px or calibration")
@@ -163,7 +164,7 @@ def demo(
     from bench.scoring import commands
     from bench.scoring.evaluate_recording import Settings
 
-    _say(commands.demo(dataset, model, out, Settings(backend=flow, rate_hz=None)), out, json)
+    _say(commands.score_demo(dataset, model, out, Settings(backend=flow, rate_hz=None)), out, json)
 
 
 @app.command(
@@ -177,13 +178,13 @@ def from_dataset(
     json: Json = False,
 ) -> None:
     """Writes sealed sequences as recording folders, to be scored as real ones are."""
-    from bench.recording.from_sequence import export
+    from bench.recording.from_sequence import export_recording
     from synth.dataset.store import Dataset
 
     chosen = [s for s in Dataset(dataset) if sequence is None or s.index == sequence]
     if not chosen:
         raise UserError(f"{dataset}: holds no finished sequence {sequence}")
-    written = [export(s, out / f"{s.index:06d}", footage.value) for s in chosen]
+    written = [export_recording(s, out / f"{s.index:06d}", footage.value) for s in chosen]
     if json:
         print(json_.dumps({"recordings": [str(path) for path in written]}))
     else:
@@ -237,11 +238,11 @@ def flow(
     """Flow between any two pictures, scored against a flow file."""
     from bench.flow import pair
 
-    found = pair.score(first, second, truth, flow, glare, out)
-    if found is None:
+    found = pair.score_pair(first, second, truth, flow, glare, out)
+    if json:
+        typer.echo(json_.dumps(pair.as_dict(found, out)))
+    elif found is None:
         typer.echo(f"written to {out}" if out else "nothing asked for: give a truth or --out")
-    elif json:
-        typer.echo(json_.dumps(pair.as_dict(found)))
     else:
         typer.echo(
             f"EPE {found.epe:.3f} px, 95% within {found.p95:.3f} px, outliers {found.outliers:.1%}; "
@@ -278,7 +279,7 @@ def live(
             f"frame {frame.index:5}  {1e3 * frame.latency_s:7.1f} ms  {frame.largest_px:6.2f} px{force}{mark}"
         )
 
-    account = stream.watch(
+    account = stream.watch_video(
         video,
         backend=flow,
         method=method,
@@ -290,7 +291,7 @@ def live(
     )
     summary = account.summary()
     if out is not None:
-        stream.write(out, summary, backend=flow, shrink=shrink, paced=not every, model=model is not None)
+        stream.write_live(out, summary, backend=flow, shrink=shrink, paced=not every, model=model is not None)
     if json:
         typer.echo(json_.dumps(summary))
     else:

@@ -11,10 +11,10 @@ from pathlib import Path
 
 import numpy as np
 
+from bench.methods.protocol import Answer, Scene
 from bench.recording import pixel_scale
 from bench.recording.folder import open_recording
 from bench.scoring import evaluate_recording
-from bench.tracking.tracking import Answer, Scene
 
 
 class Spring:
@@ -36,8 +36,8 @@ def score(recording: Path) -> evaluate_recording.Result:
     """The recording's scores under two springs."""
     opened = open_recording(recording)
     methods = {"spring": Spring(60.0), "stiffer": Spring(120.0)}
-    found = pixel_scale.find(opened.meta, recording)
-    return evaluate_recording.assess(
+    found = pixel_scale.find_scale(opened.meta, recording)
+    return evaluate_recording.evaluate_recording(
         opened, methods, "spring", found, evaluate_recording.Settings(rate_hz=None), {}
     )
 

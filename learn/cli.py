@@ -27,6 +27,7 @@ app = typer.Typer(
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
+    rich_markup_mode=None,  # "[kPa]" is a unit, not markup
 )
 _console = Console(stderr=True)
 
@@ -213,6 +214,15 @@ def predict_command(
     flow: Annotated[
         str, typer.Option(help="Flow estimator for a video, as in a job's flow.backend.")
     ] = "tvl1",
+    shrink: Annotated[
+        int,
+        typer.Option(
+            min=0, max=8, help="Flow on a video's pictures this many times smaller; 0: to 320 columns."
+        ),
+    ] = 0,
+    rate: Annotated[
+        float, typer.Option(min=0.0, help="At most so many frames a second of a video are looked at; 0: all.")
+    ] = 10.0,
     threads: Threads = None,
     json: Json = False,
 ) -> None:
@@ -221,12 +231,14 @@ def predict_command(
 
     from learn.inference.apply import Filmed, apply, motions
     from learn.inference.predict import load as load_model
+    from learn.inference.video_flow import Settings
     from learn.training.threads import set_threads
 
     set_threads(threads)
     predictor = load_model(model, quick=True)
+    filmed = Filmed(scale, tissue, Settings(flow, shrink, rate or None))
     peaks = {}
-    for motion in motions(source, input, Filmed(scale, tissue, flow)):
+    for motion in motions(source, input, filmed):
         found = apply(predictor, motion, young)
         out.mkdir(parents=True, exist_ok=True)
         np.savez_compressed(out / f"{motion.name}.npz", **found)
@@ -234,6 +246,8 @@ def predict_command(
         if not json:
             count = len(found["total_force_mn"])
             _console.print(f"{motion.name}: {count} frames, peak force {peaks[motion.name]:.3g} mN")
+            for note in motion.notes:
+                _console.print(f"note: {note}", style="yellow", markup=False, highlight=False)
     if json:
         print(json_.dumps({"out": str(out), "peak_force_mn": peaks}))
 

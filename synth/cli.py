@@ -20,6 +20,7 @@ app = typer.Typer(
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
+    rich_markup_mode=None,  # "[kPa]" is a unit, not markup
 )
 
 Source = Annotated[str, typer.Argument(help="A job file, or a named job: tiny, demo, paper.")]

@@ -18,7 +18,7 @@ Floats = NDArray[np.float32]
 Flags = NDArray[np.bool_]
 
 
-def read(path: Path) -> tuple[Floats, Flags]:
+def read_flow(path: Path) -> tuple[Floats, Flags]:
     """Flow (H, W, 2) float32 px and where it is known (H, W); by suffix, `.flo` or `.png`.
 
     Raises:
@@ -32,7 +32,7 @@ def read(path: Path) -> tuple[Floats, Flags]:
     return readers[path.suffix.lower()](path)
 
 
-def write(path: Path, flow: Floats, known: Flags | None = None) -> None:
+def write_flow(path: Path, flow: Floats, known: Flags | None = None) -> None:
     """Writes flow (H, W, 2) px; known: (H, W), everything by default. KITTI keeps 1/64 px and +-512 px.
 
     Raises:

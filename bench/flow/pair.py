@@ -31,7 +31,7 @@ class Score:
     pixels: int
 
 
-def score(
+def score_pair(
     first: Path, second: Path, truth: Path | None, backend: str, masks: bool, out: Path | None
 ) -> Score | None:
     """Computes the flow from `first` to `second`, writes it to `out`, and scores it if there is a truth.
@@ -46,10 +46,10 @@ def score(
     usable = (~mask.glare(one), ~mask.glare(two)) if masks else (every, every)
     flow, trust = create(backend).flow(one, two, *usable)
     if out is not None:
-        files.write(out, flow)
+        files.write_flow(out, flow)
     if truth is None:
         return None
-    real, known = files.read(truth)
+    real, known = files.read_flow(truth)
     if real.shape != flow.shape:
         raise UserError(f"{truth}: {real.shape[1]} x {real.shape[0]} px, the pictures have other size")
     if not known.any():
@@ -57,9 +57,11 @@ def score(
     return _score(flow, real, trust, known)
 
 
-def as_dict(score: Score) -> dict[str, float | int | None]:
-    """For JSON, which has no NaN."""
-    return {name: None if value != value else value for name, value in asdict(score).items()}
+def as_dict(score: Score | None, out: Path | None) -> dict[str, float | int | str | None]:
+    """For JSON, which has no NaN: where the flow was written, and the scores if there was a truth."""
+    found = {} if score is None else asdict(score)
+    plain = {name: None if value != value else value for name, value in found.items()}
+    return {**plain, "out": None if out is None else str(out)}
 
 
 def _score(flow: Flow, real: Flow, trust: Map, known: Flags) -> Score:

@@ -21,7 +21,7 @@ _USUAL = {
 }
 
 
-def read(source: Path, use: dict[str, str]) -> Intake:
+def read_source(source: Path, use: dict[str, str]) -> Intake:
     """Opens a file: frames (T, H, W[, C]), their times (T,), force (N, 3 or 6), its times (N,), tip (T, 3).
 
     Arrays are found by their usual names anywhere in the file, or named by `use`. Without times of its own,

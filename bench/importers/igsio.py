@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,10 +13,13 @@ from numpy.typing import NDArray
 from bench.importers.registry import Floats, Intake, as_rgb, one_of
 from synth.errors import UserError
 
+Fields = dict[str, dict[int, str]]
+"""Text of a field by name and frame."""
+
 _FIELD = re.compile(r"Seq_Frame(\d+)_(.+)")
 
 
-def read(source: Path, use: dict[str, str]) -> Intake:
+def read_source(source: Path, use: dict[str, str]) -> Intake:
     """Opens a sequence.
 
     `Timestamp` is the frame's time, `Force` (one or three numbers) its force, and the translation of a
@@ -34,10 +38,7 @@ def read(source: Path, use: dict[str, str]) -> Intake:
         reader.ReadImageInformation()
     except RuntimeError:
         raise UserError(f"{source}: not a readable MetaImage") from None
-    fields: dict[str, dict[int, str]] = {}
-    for key in reader.GetMetaDataKeys():
-        if match := _FIELD.fullmatch(key):
-            fields.setdefault(match[2], {})[int(match[1])] = reader.GetMetaData(key)
+    fields = _fields(reader)
     size = reader.GetSize()
     if len(size) != 3:
         raise UserError(f"{source}: a picture, not a sequence of pictures")
@@ -48,25 +49,9 @@ def read(source: Path, use: dict[str, str]) -> Intake:
             f"{source}: frames have no field {stamp}; there are {', '.join(sorted(fields)) or 'none'}"
         )
     times = _column(source, stamp, fields[stamp], count, (1,))[:, 0]
-    notes = []
-    force_name = (
-        one_of("force", use.get("force"), [n for n in fields if n.lower() == "force"], "field")
-        if "force" not in use
-        else one_of("force", use["force"], sorted(fields), "field")
-    )
-    force = np.zeros((0, 3))
-    if force_name is not None:
-        force = _column(source, force_name, fields[force_name], count, (1, 3))
-        if force.shape[1] == 1:
-            force = np.column_stack([force, np.zeros((count, 2))])
-            notes.append(f"{force_name} is one number a frame: taken as a size, in fx_n")
-    tips = [n for n in fields if n.endswith("TipToWorldTransform")]
-    tip_name = one_of("tip", use.get("tip"), tips if "tip" not in use else sorted(fields), "field")
-    tip = np.zeros((0, 4))
-    if tip_name is not None:
-        poses = _column(source, tip_name, fields[tip_name], count, (16,))
-        tracked = [fields.get(f"{tip_name}Status", {}).get(k, "OK").strip() == "OK" for k in range(count)]
-        tip = np.column_stack([times, poses[:, [3, 7, 11]]])[np.array(tracked)]
+    notes: list[str] = []
+    force = _force(source, fields, count, use, notes)
+    tip = _tip(source, fields, times, use)
     if "UltrasoundImageOrientation" in reader.GetMetaDataKeys():
         notes.append(
             f"orientation {reader.GetMetaData('UltrasoundImageOrientation')}: pictures are as stored"
@@ -83,6 +68,39 @@ def read(source: Path, use: dict[str, str]) -> Intake:
 
     good = np.isfinite(force).all(axis=1) if len(force) else np.zeros(0, bool)
     return Intake(times, pictures, times[: len(force)][good], force[good], tip, tuple(notes))
+
+
+def _fields(reader: Any) -> Fields:
+    fields: Fields = {}
+    for key in reader.GetMetaDataKeys():
+        if match := _FIELD.fullmatch(key):
+            fields.setdefault(match[2], {})[int(match[1])] = reader.GetMetaData(key)
+    return fields
+
+
+def _force(source: Path, fields: Fields, count: int, use: dict[str, str], notes: list[str]) -> Floats:
+    """(T, 3), NaN where a frame has none; (0, 3) without such a field."""
+    names = sorted(fields) if "force" in use else [name for name in fields if name.lower() == "force"]
+    name = one_of("force", use.get("force"), names, "field")
+    if name is None:
+        return np.zeros((0, 3))
+    force = _column(source, name, fields[name], count, (1, 3))
+    if force.shape[1] == 1:
+        notes.append(f"{name} is one number a frame: taken as a size, in fx_n")
+        force = np.column_stack([force, np.zeros((count, 2))])
+    return force
+
+
+def _tip(source: Path, fields: Fields, times: Floats, use: dict[str, str]) -> Floats:
+    """(M, 4) time and place of the frames whose tracker saw the tip."""
+    names = sorted(fields) if "tip" in use else [n for n in fields if n.endswith("TipToWorldTransform")]
+    name = one_of("tip", use.get("tip"), names, "field")
+    if name is None:
+        return np.zeros((0, 4))
+    poses = _column(source, name, fields[name], len(times), (16,))
+    status = fields.get(f"{name}Status", {})
+    tracked = [status.get(k, "OK").strip() == "OK" for k in range(len(times))]
+    return np.asarray(np.column_stack([times, poses[:, [3, 7, 11]]])[np.array(tracked)], np.float64)
 
 
 def _column(source: Path, name: str, values: dict[int, str], count: int, widths: tuple[int, ...]) -> Floats:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.recording import video, writer
+from bench.recording import writer
 from synth.errors import UserError
 
 Floats = NDArray[np.float64]
@@ -54,7 +54,7 @@ def supported(path: Path) -> bool:
     return path.suffix.lower() in _MAKERS or (path / "metadata.yaml").is_file()
 
 
-def read(source: Path, use: Mapping[str, str] | None = None) -> Intake:
+def read_source(source: Path, use: Mapping[str, str] | None = None) -> Intake:
     """Opens a source.
 
     Args:
@@ -73,19 +73,19 @@ def read(source: Path, use: Mapping[str, str] | None = None) -> Intake:
     if unknown:
         raise UserError(f"--use {unknown[0]}=...: one of {', '.join(ROLES)}")
     module = import_module("bench.importers.rosbag" if source.is_dir() else _MAKERS[source.suffix.lower()])
-    found: Intake = module.read(source, dict(use or {}))
+    found: Intake = module.read_source(source, dict(use or {}))
     if len(found.times_s) == 0:
         raise UserError(f"{source}: holds no frames")
     return found
 
 
-def write(
+def write_recording(
     found: Intake, out: Path, newtons: float, about: Mapping[str, object], progress: Callable[[int], None]
 ) -> Path:
     """Writes a recording folder, whole or not at all: lossless video.mp4, frames.csv, force.csv, meta.yaml.
 
     Args:
-        found: of `read`.
+        found: of `read_source`.
         out: must not exist.
         newtons: newtons in the source's unit of force.
         about: contents of meta.yaml.
@@ -94,16 +94,16 @@ def write(
     Raises:
         UserError: the folder exists, or a picture can't be decoded.
     """
-    with writer.whole(out) as part:
-        video.write_video(
+    with writer.write_whole_folder(out) as part:
+        writer.write_video(
             part / "video.mp4", _told(found.pictures(), progress), _rising(found.times_s), crf=_CRF_LOSSLESS
         )
-        writer.frames(part, found.times_s)
+        writer.write_frames(part, found.times_s)
         if len(found.force):
-            writer.force(part, found.force_s, newtons * found.force)
+            writer.write_force(part, found.force_s, newtons * found.force)
         if len(found.tip):
-            writer.tip(part, found.tip)
-        writer.about(part, about)
+            writer.write_tip(part, found.tip)
+        writer.write_meta(part, about)
     return out
 
 

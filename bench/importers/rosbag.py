@@ -23,7 +23,7 @@ _TIPS = (
 _CHANNELS = {"mono8": 1, "8UC1": 1, "rgb8": 3, "bgr8": 3, "8UC3": 3, "rgba8": 4, "bgra8": 4}
 
 
-def read(source: Path, use: dict[str, str]) -> Intake:
+def read_source(source: Path, use: dict[str, str]) -> Intake:
     """Opens a bag: the only topic of pictures, of forces and of poses, or those named by `use`.
 
     Times are the messages' own stamps; a topic whose stamps are all zero falls back on the bag's. Positions,

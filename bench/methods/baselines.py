@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
 from bench.methods import compliance, corotational, inverse
-from bench.tracking.tracking import Answer, Method, Scene
+from bench.methods.protocol import Answer, Method, Scene
 from learn.data.grid import Grid
 from learn.inference.predict import View
 

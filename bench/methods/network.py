@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.tracking.tracking import Answer, Scene
+from bench.methods.protocol import Answer, Scene
 
 if TYPE_CHECKING:
+    from learn.inference.force_reader import ForceReader
     from learn.inference.predict import Predictor
 
 
@@ -27,7 +28,7 @@ class Model:
         from learn.inference.predict import load
 
         self.predictor: Predictor = load(folder, quick=quick)
-        self._rest: tuple[Scene, NDArray[np.float64]] | None = None
+        self._reader: tuple[Scene, ForceReader] | None = None
 
     def described(self) -> dict[str, object]:
         """What the model is, for the report."""
@@ -44,24 +45,11 @@ class Model:
     def __call__(
         self, flow: NDArray[np.float32], confidence: NDArray[np.float32], scene: Scene, picture: bool
     ) -> Answer:
-        """See `Method`. What it says of the rest frame, where nothing has moved, is taken off: a tare."""
-        said, density = self._say(flow, confidence, scene, picture)
-        if self._rest is None or self._rest[0] is not scene:
-            still = np.zeros_like(flow), scene.tissue.astype(np.float32)
-            self._rest = scene, self._say(*still, scene, False)[0]
-        force = said - self._rest[1]
-        if np.isnan(force[1:]).all():
-            force[0] = max(force[0], 0.0)
-        return Answer(force, density)
+        """See `Method`."""
+        from learn.inference.force_reader import ForceReader
 
-    def _say(
-        self, flow: NDArray[np.float32], confidence: NDArray[np.float32], scene: Scene, picture: bool
-    ) -> tuple[NDArray[np.float64], NDArray[np.float32] | None]:
-        said = self.predictor(flow, scene.tissue, scene.scale_mm_per_px, scene.young_kpa, confidence)
-        # The model's own typical E would make the number depend on its training data.
-        per_kpa = 1.0 if scene.young_kpa is not None else 1.0 / said.young_kpa
-        force = said.force_mn
-        if force is None:
-            force = np.array([said.total_force_mn, np.nan, np.nan])
-        density = (per_kpa * said.to_image()).astype(np.float32) if picture else None
-        return np.asarray(per_kpa * force, np.float64), density
+        if self._reader is None or self._reader[0] is not scene:
+            reader = ForceReader(self.predictor, scene.tissue, scene.scale_mm_per_px, scene.young_kpa)
+            self._reader = scene, reader
+        read = self._reader[1].read(flow, confidence)
+        return Answer(read.force_mn, read.map.to_image() if picture else None)

@@ -30,7 +30,7 @@ class Finding:
     """What was found."""
 
 
-def check(folder: Path) -> list[Finding]:
+def check_recording(folder: Path) -> list[Finding]:
     """Opens a recording, decodes its pictures and compares what its files say. Raises no UserError."""
     try:
         recording = open_recording(folder)
@@ -46,14 +46,14 @@ def check(folder: Path) -> list[Finding]:
     return found + _sensor(recording, times) + _stiffness(recording)
 
 
-def usable(found: list[Finding]) -> bool:
+def is_usable(found: list[Finding]) -> bool:
     """Whether anything can be predicted from it."""
     return all(finding.state != "bad" for finding in found)
 
 
 def _scale(recording: Recording) -> list[Finding]:
     try:
-        known = pixel_scale.find(recording.meta, recording.folder)
+        known = pixel_scale.find_scale(recording.meta, recording.folder)
     except UserError as error:
         return [Finding("bad", "scale", str(error))]
     said = f"{known.mm_per_px:.4g} mm/px ± {100 * known.uncertainty:.2g}% ({known.source})"
@@ -132,7 +132,7 @@ def _masks(recording: Recording, size: tuple[int, int]) -> list[Finding]:
 
 def _width(recording: Recording, size: tuple[int, int]) -> list[Finding]:
     try:
-        width = pixel_scale.find(recording.meta, recording.folder).mm_per_px * size[1]
+        width = pixel_scale.find_scale(recording.meta, recording.folder).mm_per_px * size[1]
     except UserError:
         return []
     if _NARROWEST_MM <= width <= _WIDEST_MM:

@@ -14,7 +14,9 @@ from synth.errors import UserError
 _LARGEST_BYTES = 2 << 30
 
 
-def read(path: Path, required: Sequence[str], optional: Sequence[str] = ()) -> dict[str, NDArray[np.float64]]:
+def read_csv(
+    path: Path, required: Sequence[str], optional: Sequence[str] = ()
+) -> dict[str, NDArray[np.float64]]:
     """Columns by name, float64, in the file's order of rows; empty cells and `nan` are NaN.
 
     Args:

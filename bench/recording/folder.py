@@ -18,12 +18,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.recording import csv_table, meta, video
+from bench.recording import csv_table, meta
 from bench.recording.meta import Meta
-from bench.recording.video import Picture
+from learn.inference import video
+from learn.inference.video import Picture
 from synth.errors import UserError
 
-_VIDEOS = (".mp4", ".mov", ".mkv", ".avi", ".webm", ".m4v")
 _LARGEST_FORCE_N = 50.0
 
 
@@ -61,7 +61,7 @@ class Recording:
 
     def expected_frames(self) -> int | None:
         """Frames as stated, undecoded; None if the video doesn't say. UserError if unreadable."""
-        return video.stated_frames(self.video) if self.video else len(self.pictures)
+        return video.count_frames(self.video) if self.video else len(self.pictures)
 
     def frames(self) -> Iterator[Picture]:
         """Upright frames in order, with times: frames.csv's, else the video's; None if neither says.
@@ -69,17 +69,17 @@ class Recording:
         Raises:
             UserError: unreadable video or picture.
         """
-        source = video.from_video(self.video) if self.video else video.from_pictures(self.pictures)
+        source = video.read_video(self.video) if self.video else video.read_pictures(self.pictures)
         for picture in source:
             yield self._timed(picture)
 
     def tool(self, index: int, size: tuple[int, int]) -> NDArray[np.bool_] | None:
         """(H, W) tool mask of a frame, or None if there is none for it. UserError for one of another size."""
-        return _mask(self.masks[index], size) if index in self.masks else None
+        return video.read_mask(self.masks[index], size) if index in self.masks else None
 
     def tissue_mask(self, size: tuple[int, int]) -> NDArray[np.bool_]:
         """(H, W) where tissue may be tracked in the rest frame; everywhere without `tissue.png`."""
-        return np.ones(size, bool) if self.tissue is None else _mask(self.tissue, size)
+        return np.ones(size, bool) if self.tissue is None else video.read_mask(self.tissue, size)
 
     def _timed(self, picture: Picture) -> Picture:
         if self.times_s is None:
@@ -98,7 +98,7 @@ def open_recording(folder: Path) -> Recording:
         raise UserError(f"{folder}: a file, not a recording folder; `bench import` makes one of it")
     if not folder.is_dir():
         raise UserError(f"{folder}: no such recording folder")
-    about = meta.read(folder / "meta.yaml")
+    about = meta.read_meta(folder / "meta.yaml")
     movie, pictures = _footage(folder)
     notes: list[str] = []
     times = _frame_times(folder / "frames.csv", notes)
@@ -111,7 +111,7 @@ def open_recording(folder: Path) -> Recording:
 
 
 def _footage(folder: Path) -> tuple[Path | None, tuple[Path, ...]]:
-    movies = sorted(path for path in folder.glob("video.*") if path.suffix.lower() in _VIDEOS)
+    movies = sorted(path for path in folder.glob("video.*") if path.suffix.lower() in video.SUFFIXES)
     pictures = tuple(sorted(folder.glob("frames/*.png"), key=_natural))
     if len(movies) + bool(pictures) > 1:
         found = [path.name for path in movies] + ["frames/"] * bool(pictures)
@@ -128,7 +128,7 @@ def _natural(path: Path) -> list[tuple[int, str]]:
 def _frame_times(path: Path, notes: list[str]) -> NDArray[np.float64] | None:
     if not path.is_file():
         return None
-    columns = csv_table.read(path, ("frame", "t_s"))
+    columns = csv_table.read_csv(path, ("frame", "t_s"))
     frame, time = columns["frame"], columns["t_s"]
     if (
         not np.isfinite(frame).all()
@@ -155,7 +155,7 @@ def _frame_times(path: Path, notes: list[str]) -> NDArray[np.float64] | None:
 def _force(path: Path, about: Meta, notes: list[str]) -> Force | None:
     if not path.is_file():
         return None
-    columns = csv_table.read(path, ("t_s", "fx_n", "fy_n", "fz_n"), ("gx", "gy", "gz"))
+    columns = csv_table.read_csv(path, ("t_s", "fx_n", "fy_n", "fz_n"), ("gx", "gy", "gz"))
     time = columns["t_s"]
     newtons = np.stack([columns[name] for name in ("fx_n", "fy_n", "fz_n")], axis=1)
     kept = np.isfinite(time)
@@ -185,10 +185,3 @@ def _force(path: Path, about: Meta, notes: list[str]) -> Force | None:
         gravity = np.stack([columns[name][kept][new] for name in ("gx", "gy", "gz")], axis=1)
     sign = 1.0 if about.sensor.acts_on == "tissue" else -1.0
     return Force(time, sign * 1000.0 * newtons, gravity)
-
-
-def _mask(path: Path, size: tuple[int, int]) -> NDArray[np.bool_]:
-    mask = video.read_picture(path)[..., 0] > 127
-    if mask.shape != size:
-        raise UserError(f"{path}: {mask.shape[1]} x {mask.shape[0]}, the video is {size[1]} x {size[0]}")
-    return np.asarray(mask, bool)

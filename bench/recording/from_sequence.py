@@ -10,12 +10,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.recording import video, writer
+from bench.recording import writer
 from synth.dataset.store import Sequence
 from synth.errors import UserError
 
 
-def export(sequence: Sequence, folder: Path, frames: Literal["png", "mp4"] = "png") -> Path:
+def export_recording(sequence: Sequence, folder: Path, frames: Literal["png", "mp4"] = "png") -> Path:
     """Writes one recording: frames or video, times, force in camera axes, tool masks, tissue, meta.yaml.
 
     Nothing that the recorded scene wouldn't have given is written: no true flow, no traction, no glare mask.
@@ -28,7 +28,7 @@ def export(sequence: Sequence, folder: Path, frames: Literal["png", "mp4"] = "pn
     Raises:
         UserError: the folder exists.
     """
-    with writer.whole(folder) as part:
+    with writer.write_whole_folder(folder) as part:
         _fill(sequence, part, frames)
     return folder
 
@@ -45,8 +45,8 @@ def _fill(sequence: Sequence, part: Path, frames: Literal["png", "mp4"]) -> None
         if tool.any():
             _write(part / "masks" / f"{t:06d}.png", tool.astype(np.uint8) * 255)
     _write(part / "tissue.png", np.asarray(sequence["tissue"][:], bool)[even].astype(np.uint8) * 255)
-    writer.force(part, time, np.asarray(sequence["force"][:], np.float64) / 1000)
-    writer.frames(part, time)
+    writer.write_force(part, time, np.asarray(sequence["force"][:], np.float64) / 1000)
+    writer.write_frames(part, time)
     about = {
         "scale_mm_per_px": float(sequence.attrs["scale_mm_per_px"]),
         "scale_uncertainty": 0.0,
@@ -55,7 +55,7 @@ def _fill(sequence: Sequence, part: Path, frames: Literal["png", "mp4"]) -> None
         "specimen": f"anatomy {_anatomy(sequence)}",
         "sensor": {"axes": "camera", "acts_on": "tissue", "low_pass_hz": None},
     }
-    writer.about(part, about)
+    writer.write_meta(part, about)
 
 
 def _footage(sequence: Sequence, part: Path, kind: Literal["png", "mp4"], time: NDArray[np.float64]) -> None:
@@ -63,7 +63,7 @@ def _footage(sequence: Sequence, part: Path, kind: Literal["png", "mp4"], time: 
         np.asarray(sequence["rgb"][t], np.uint8) for t in range(sequence.frames)
     )
     if kind == "mp4":
-        video.write_video(part / "video.mp4", pictures, time)
+        writer.write_video(part / "video.mp4", pictures, time)
         return
     (part / "frames").mkdir()
     for t, rgb in enumerate(pictures):

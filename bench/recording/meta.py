@@ -134,7 +134,7 @@ class Meta(_Section):
         return self
 
 
-def read(path: Path) -> Meta:
+def read_meta(path: Path) -> Meta:
     """The recording's `meta.yaml`.
 
     Raises:

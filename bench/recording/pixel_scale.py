@@ -8,8 +8,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from bench.recording import video
 from bench.recording.meta import Calibration, Meta
+from learn.inference import video
 from synth.errors import UserError
 
 _STATED = 0.02  # what a stated scale is trusted to without more
@@ -27,7 +27,7 @@ class Scale:
     source: str
 
 
-def find(meta: Meta, folder: Path) -> Scale:
+def find_scale(meta: Meta, folder: Path) -> Scale:
     """The recording's scale, from what `meta.yaml` offers.
 
     Raises:

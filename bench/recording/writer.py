@@ -5,8 +5,10 @@ from __future__ import annotations
 import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from fractions import Fraction
 from pathlib import Path
 
+import av
 import numpy as np
 from numpy.typing import NDArray
 from ruamel.yaml import YAML
@@ -17,7 +19,7 @@ Floats = NDArray[np.float64]
 
 
 @contextmanager
-def whole(folder: Path) -> Iterator[Path]:
+def write_whole_folder(folder: Path) -> Iterator[Path]:
     """A folder to fill, which gets its name when the block ends well and is gone when it doesn't.
 
     Raises:
@@ -36,26 +38,52 @@ def whole(folder: Path) -> Iterator[Path]:
     part.rename(folder)
 
 
-def frames(folder: Path, time_s: Floats) -> None:
+def write_frames(folder: Path, time_s: Floats) -> None:
     """Writes frames.csv: the time of every frame, (T,) s."""
     _csv(folder / "frames.csv", "frame,t_s", "%d,%.6f", np.column_stack([np.arange(len(time_s)), time_s]))
 
 
-def force(folder: Path, time_s: Floats, newtons: Floats) -> None:
+def write_force(folder: Path, time_s: Floats, newtons: Floats) -> None:
     """Writes force.csv: the sensor's times (N,) s and forces (N, 3) N."""
     columns = np.column_stack([time_s, newtons])
     _csv(folder / "force.csv", "t_s,fx_n,fy_n,fz_n", "%.6f,%.9f,%.9f,%.9f", columns)
 
 
-def tip(folder: Path, places: Floats) -> None:
+def write_tip(folder: Path, places: Floats) -> None:
     """Writes tip.csv: times and places of the instrument's tip, (N, 4) s, mm, mm, mm."""
     _csv(folder / "tip.csv", "t_s,x_mm,y_mm,z_mm", "%.6f,%.6f,%.6f,%.6f", places)
 
 
-def about(folder: Path, said: Mapping[str, object]) -> None:
+def write_meta(folder: Path, said: Mapping[str, object]) -> None:
     """Writes meta.yaml."""
     with (folder / "meta.yaml").open("w", encoding="utf-8") as file:
         YAML().dump(dict(said), file)
+
+
+def write_video(path: Path, pictures: Iterator[NDArray[np.uint8]], times_s: Floats, crf: int = 12) -> None:
+    """H.264 MP4 with each frame at its own time, in milliseconds; odd sizes lose their last row or column.
+
+    Args:
+        pictures: (H, W, 3) uint8 each, as many as `times_s`.
+        times_s: (T,) rising [s].
+        crf: x264's quality, 0 is lossless (4:4:4 colour).
+    """
+    with av.open(str(path), "w") as container:
+        rate = (
+            max(1, round((len(times_s) - 1) / max(times_s[-1] - times_s[0], 1e-3))) if len(times_s) > 1 else 1
+        )
+        stream = container.add_stream("libx264", rate=rate, options={"crf": str(crf), "threads": "1"})
+        stream.codec_context.time_base = stream.time_base = Fraction(1, 90_000)
+        stream.pix_fmt = "yuv444p" if crf == 0 else "yuv420p"
+        for k, (rgb, time) in enumerate(zip(pictures, times_s, strict=True)):
+            even = rgb[: rgb.shape[0] // 2 * 2, : rgb.shape[1] // 2 * 2]
+            if k == 0:
+                stream.height, stream.width = even.shape[:2]
+            frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(even), format="rgb24")
+            frame.pts = round(float(time - times_s[0]) * 90_000)
+            frame.time_base = Fraction(1, 90_000)
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
 
 
 def _csv(path: Path, head: str, line: str, rows: Floats) -> None:

@@ -17,7 +17,7 @@ SENSOR, MAIN, BAND, RED = "#3b3f46", "#1f6feb", "rgba(31,111,235,0.15)", "#c2352
 OTHERS = ("#8a6d00", "#2b7a4b", "#a04f9c", "#b8562b", "#5b6b7a", "#00798c", "#7a5195", "#6b8e23", "#a61c3c")
 
 
-def force(result: Result) -> Figure:
+def draw_force(result: Result) -> Figure:
     """Force over time: the sensor, the main method with its band of uncertainty, the rest on demand."""
     time, main = _list(result.time_s), result.methods[result.main].size_mn
     data: list[Figure] = []
@@ -49,7 +49,7 @@ def force(result: Result) -> Figure:
     return _figure(data, "time [s]", "force [mN]", legend=True)
 
 
-def scatter(result: Result) -> Figure:
+def draw_scatter(result: Result) -> Figure:
     """Predicted against sensor, with the line of agreement."""
     assert result.sensor_mn is not None
     x, y = _both(result)
@@ -64,7 +64,7 @@ def scatter(result: Result) -> Figure:
     return figure
 
 
-def bland_altman(result: Result, limits: dict[str, float]) -> Figure:
+def draw_bland_altman(result: Result, limits: dict[str, float]) -> Figure:
     """Difference against mean, with bias and limits of agreement.
 
     Args:

@@ -5,20 +5,20 @@ from __future__ import annotations
 import os
 import shutil
 from collections.abc import Mapping
-from contextlib import closing
+from contextlib import closing, nullcontext
 from pathlib import Path
 
 from threadpoolctl import threadpool_limits
 
 from bench.methods.network import Model
+from bench.methods.protocol import Method
 from bench.output.progress_bar import counting
 from bench.recording import pixel_scale
 from bench.recording.folder import open_recording
-from bench.recording.from_sequence import export
+from bench.recording.from_sequence import export_recording
 from bench.scoring import evaluate_recording, report
 from bench.scoring.evaluate_recording import Result, Settings
-from bench.tracking.flow_process import Beside, Here
-from bench.tracking.tracking import Method
+from bench.tracking.flow_process import FlowProcess
 from synth.dataset.store import Dataset, Sequence
 from synth.errors import UserError
 
@@ -30,7 +30,7 @@ _MANY = 300
 """Frames from which a quick network is: it gains what it takes on 65 to 130 frames looked at."""
 
 
-def score(
+def score_recording(
     recording: Path,
     model: Path,
     out: Path | None,
@@ -60,20 +60,22 @@ def score(
     opened = open_recording(recording)
     total = opened.expected_frames()
     # Started first, for it takes seconds to begin; the methods are fitted meanwhile.
-    with closing(Beside() if _worth_a_process(total) else Here()) as flow:
+    with closing(FlowProcess()) if _worth_a_process(total) else nullcontext() as flow:
         quick = (total or 0) >= _MANY
         network = Model(model, quick)
         methods: dict[str, Method] = {MAIN: network}
         methods |= {name: Model(folder, quick) for name, folder in (also or {}).items()}
-        methods |= baselines(train, model)
-        found = pixel_scale.find(opened.meta, recording)
+        methods |= fit_baselines(train, model)
+        found = pixel_scale.find_scale(opened.meta, recording)
         with counting(f"scoring {opened.name}", total) as progress:
             about = {"model": network.described()}
-            result = evaluate_recording.assess(opened, methods, MAIN, found, settings, about, progress, flow)
+            result = evaluate_recording.evaluate_recording(
+                opened, methods, MAIN, found, settings, about, progress, flow
+            )
     folder = out or Path(f"{opened.name}-score")
     folder.mkdir(parents=True, exist_ok=True)
     evaluate_recording.write_json(result, folder / "score.json")
-    report.write(result, folder / "report.html", title)
+    report.write_report(result, folder / "report.html", title)
     return result
 
 
@@ -81,7 +83,7 @@ def _worth_a_process(frames: int | None) -> bool:
     return len(os.sched_getaffinity(0)) > 1 and (frames or _LONG) >= _LONG
 
 
-def baselines(train: Path | None, model: Path) -> dict[str, Method]:
+def fit_baselines(train: Path | None, model: Path) -> dict[str, Method]:
     """Those that need no data, and, given the training data, those fitted on the model's own fit sequences.
 
     Raises:
@@ -103,7 +105,7 @@ def baselines(train: Path | None, model: Path) -> dict[str, Method]:
     return methods | baseline.fitted([read(s, baseline.GRID, (source,)) for s in chosen], source)
 
 
-def demo(dataset: Path, model: Path, out: Path, settings: Settings) -> Result:
+def score_demo(dataset: Path, model: Path, out: Path, settings: Settings) -> Result:
     """Exports a sequence that the model has not seen as a recording, and scores it.
 
     Args:
@@ -112,19 +114,19 @@ def demo(dataset: Path, model: Path, out: Path, settings: Settings) -> Result:
         out: gets recording/, score.json and report.html; what an earlier demo left there is replaced.
 
     Raises:
-        UserError: the model has seen every sequence, or as `score`.
+        UserError: the model has seen every sequence, or as `score_recording`.
     """
-    chosen = unseen(dataset, model)
+    chosen = find_unseen(dataset, model)
     folder = out / "recording"
     if folder.exists():
         shutil.rmtree(folder)
-    export(chosen, folder)
-    return score(
+    export_recording(chosen, folder)
+    return score_recording(
         folder, model, out, settings, f"Force from video: sequence {chosen.index}, unseen in training"
     )
 
 
-def unseen(dataset: Path, model: Path) -> Sequence:
+def find_unseen(dataset: Path, model: Path) -> Sequence:
     """The first sequence that the model was neither fitted nor chosen on. UserError if there is none."""
     from learn.checkpoint import read_card
 

@@ -15,15 +15,15 @@ from numpy.typing import NDArray
 
 from bench import bootstrap
 from bench.bootstrap import Interval
+from bench.methods.protocol import Method
 from bench.recording.folder import Force, Recording
 from bench.recording.pixel_scale import Scale
 from bench.scoring import metrics
-from bench.sensor import clock_sync as sync
-from bench.sensor import force_sensor
+from bench.sensor import clock_sync, force_sensor
 from bench.sensor.clock_sync import Offset
-from bench.tracking.flow_process import Flow
-from bench.tracking.tracking import Followed, Method, Progress, follow
-from bench.tracking.tracking import Settings as Settings
+from bench.tracking.tracking import Progress, Tracked, track_recording
+from learn.inference.video_flow import Flow
+from learn.inference.video_flow import Settings as Settings
 from synth.dataset.folder import write_whole
 from synth.system import packages
 
@@ -77,10 +77,10 @@ class Result:
     steps: tuple[str, ...]
     settings: dict[str, Any]
     environment: dict[str, str]
-    followed: Followed
+    followed: Tracked
 
 
-def assess(
+def evaluate_recording(
     recording: Recording,
     methods: Mapping[str, Method],
     main: str,
@@ -103,18 +103,19 @@ def assess(
         flow: where it is computed; None: here.
 
     Raises:
-        UserError: as `follow` and `sensor.process`.
+        UserError: as `track_recording` and `force_sensor.process_force`.
     """
-    meta = recording.meta
-    done = follow(
-        recording,
-        methods,
-        scale.mm_per_px,
-        settings,
-        pictured=main,
-        flow=flow,
-        progress=progress,
+    done = track_recording(
+        recording, methods, scale.mm_per_px, settings, pictured=main, flow=flow, progress=progress
     )
+    return score_tracked(recording, done, main, scale, {**asdict(settings), **described})
+
+
+def score_tracked(
+    recording: Recording, done: Tracked, main: str, scale: Scale, settings: Mapping[str, Any]
+) -> Result:
+    """Scores curves that are there already; arguments as `evaluate_recording`."""
+    meta = recording.meta
     time = np.array(done.time_s)
     notes = [*recording.notes, *done.notes]
     truth = _truth(recording, done, time, notes)
@@ -123,13 +124,8 @@ def assess(
             "Young's modulus unknown: forces are those of tissue of 1 kPa, so only scores that no factor "
             "changes are given, and those after the gain of a separate press if there is one"
         )
-    kept = np.ones(len(time), bool)
-    for what, span in (("calibration of the clocks", meta.sync.calibration_s), ("press", meta.press_s)):
-        if span is not None:
-            inside = (time >= span[0]) & (time <= span[1])
-            kept &= ~inside
-            notes.append(f"{inside.sum()} frames of the {what} ({span[0]:g} to {span[1]:g} s) are not scored")
-    forces = {name: np.array(done.force_mn[name]) for name in methods}
+    kept = _kept(recording, time, notes)
+    forces = {name: np.array(curve) for name, curve in done.force_mn.items()}
     return Result(
         recording=recording.name,
         main=main,
@@ -137,8 +133,8 @@ def assess(
         sensor_mn=truth.size_mn,
         sensor_axes_mn=truth.axes_mn,
         methods={
-            name: _scored(time, forces[name], forces[main], truth, kept, recording, name == main)
-            for name in methods
+            name: _scored(time, force, forces[main], truth, kept, recording, name == main)
+            for name, force in forces.items()
         },
         scale=scale,
         relative_uncertainty=math.hypot(scale.uncertainty, meta.young_uncertainty),
@@ -147,10 +143,21 @@ def assess(
         sync=truth.sync,
         notes=tuple(notes),
         steps=truth.steps,
-        settings={**asdict(settings), **described, "meta": meta.model_dump(mode="json", exclude_none=True)},
+        settings={**settings, "meta": meta.model_dump(mode="json", exclude_none=True)},
         environment=environment(),
         followed=done,
     )
+
+
+def _kept(recording: Recording, time: Curve, notes: list[str]) -> NDArray[np.bool_]:
+    """(T,) whether a frame is scored: those that something was calibrated on are not."""
+    meta, kept = recording.meta, np.ones(len(time), bool)
+    for what, span in (("calibration of the clocks", meta.sync.calibration_s), ("press", meta.press_s)):
+        if span is not None:
+            inside = (time >= span[0]) & (time <= span[1])
+            kept &= ~inside
+            notes.append(f"{inside.sum()} frames of the {what} ({span[0]:g} to {span[1]:g} s) are not scored")
+    return kept
 
 
 @dataclass(frozen=True)
@@ -167,7 +174,7 @@ class _Truth:
         return None if self.axes_mn is None else np.linalg.norm(self.axes_mn, axis=1)
 
 
-def _truth(recording: Recording, done: Followed, time: Curve, notes: list[str]) -> _Truth:
+def _truth(recording: Recording, done: Tracked, time: Curve, notes: list[str]) -> _Truth:
     """Finds the clocks' offset, freezes it, processes the sensor and reads it at the frames."""
     force, meta = recording.force, recording.meta
     if force is None:
@@ -182,8 +189,8 @@ def _truth(recording: Recording, done: Followed, time: Curve, notes: list[str]) 
             notes.append(f"clocks could not be aligned ({found.refused}): predictions only")
             return _Truth(sync=found)
         offset = found.offset_s
-    processed = force_sensor.process(force, meta.sensor, offset)
-    axes = force_sensor.at(processed, time)
+    processed = force_sensor.process_force(force, meta.sensor, offset)
+    axes = force_sensor.force_at(processed, time)
     covered = int(np.isfinite(axes).all(axis=1).sum())
     if covered == 0:
         notes.append("force.csv and the video share no time: predictions only; are both clocks in seconds?")
@@ -193,12 +200,12 @@ def _truth(recording: Recording, done: Followed, time: Curve, notes: list[str]) 
     return _Truth(axes, processed.noise_floor_mn, processed.steps, found)
 
 
-def _offset(force: Force, recording: Recording, done: Followed, time: Curve) -> Offset:
+def _offset(force: Force, recording: Recording, done: Tracked, time: Curve) -> Offset:
     about = recording.meta.sync
     assert about.calibration_s is not None
     inside = (time >= about.calibration_s[0]) & (time <= about.calibration_s[1])
-    smooth = force_sensor.process(force, recording.meta.sensor, 0.0)
-    return sync.find(
+    smooth = force_sensor.process_force(force, recording.meta.sensor, 0.0)
+    return clock_sync.find_offset(
         time[inside], np.array(done.speed)[inside], smooth.time_s, smooth.force_mn, about.search_s
     )
 
@@ -216,7 +223,7 @@ def _scored(
     if size is None or axes is None:
         return Scored(force, length, {}, {}, [], {}, {}, None)
     x, y = size[kept], length[kept]
-    scores, events = metrics.everything(time_s, size, length, truth.floor_mn, kept)
+    scores, events = metrics.compute_all(time_s, size, length, truth.floor_mn, kept)
     components: dict[str, dict[str, float]] = {}
     if recording.meta.sensor.axes == "camera" and np.isfinite(force).any(axis=0).all():
         components = {axis: metrics.agreement(axes[kept, k], force[kept, k]) for k, axis in enumerate("xyz")}

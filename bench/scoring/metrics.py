@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import linregress
+from sklearn.metrics import f1_score, mean_absolute_error, r2_score, root_mean_squared_error
 
 Curve = NDArray[np.float64]
 """(T,) float64."""
@@ -14,6 +17,84 @@ SURGICAL_FORCE_MN = 300.0
 """The 0.3 N below which 70% of tool-tissue forces in neurosurgery lie."""
 
 _LARGEST_LAG_S = 0.5
+
+
+@dataclass(frozen=True)
+class Metric:
+    """One score: what it is called and how it is shown, wherever it is shown."""
+
+    key: str
+    """In `score.json`."""
+    name: str
+    unit: str
+    """As shown: mN, ms and % are turned into from mN, s and shares; empty for a number."""
+    about: str
+    best: Literal["low", "high", "zero", "one", ""] = ""
+    """Which value is the best; empty for what is no merit."""
+    digits: int = 3
+    """Behind the point in tables of plain text, in the score's own unit."""
+    short: str = ""
+    """Heading of a narrow column; the name if empty."""
+    relative: bool = False
+    """Whether a constant factor on the prediction leaves it as it is, or it speaks of the sensor alone."""
+    column: bool = True
+    """Whether the report's table has it."""
+
+    @property
+    def heading(self) -> str:
+        """The name, with its unit if its numbers are shown without: those of force."""
+        return f"{self.name} [mN]" if self.unit == "mN" else self.name
+
+    @property
+    def column_heading(self) -> str:
+        """The same for a narrow column."""
+        return self.short or self.heading
+
+    @property
+    def cell_unit(self) -> str:
+        """What is written behind each number under a heading."""
+        return "" if self.unit == "mN" else self.unit
+
+
+METRICS = {
+    metric.key: metric
+    for metric in (
+        Metric("n", "samples", "", "Samples where both are finite.", relative=True, column=False),
+        Metric("mae_mn", "MAE", "mN", "Mean absolute error.", "low", digits=2),
+        Metric("mae_of_peak", "MAE of event peak", "%", "MAE over the contacts' mean peak.", "low",
+               short="of peak"),
+        Metric("rmse_mn", "RMSE", "mN", "Root mean square error.", "low", digits=2),
+        Metric("bias_mn", "bias", "mN", "Mean of predicted minus sensor.", "zero", digits=2),
+        Metric("r", "r", "", "Pearson's correlation.", "high", relative=True),
+        Metric("ccc", "CCC", "", "Lin's concordance correlation.", "high"),
+        Metric("r2", "R²", "", "1 − SSE/SST about the sensor's mean: bias and gain errors count.", "high"),
+        Metric("gain", "gain", "", "Least-squares slope of predicted on sensor.", "one"),
+        Metric("lag_s", "lag", "ms", "By how much predicted is late, at the best correlation.", "zero",
+               relative=True),
+        Metric("r_at_lag", "r at that lag", "", "Correlation with the lag taken out.", "high", relative=True,
+               column=False),
+        Metric("contact_f1", "contact F1", "", "F1 of contact against none, by sample.", "high"),
+        Metric("ghost_rate", "ghosts", "%", "Contact-free samples where contact is predicted.", "low"),
+        Metric("ghost_mn", "ghost force", "mN", "Mean predicted force without contact.", "low", digits=2,
+               column=False),
+        Metric("threshold_mn", "contact threshold", "mN", "Force from which the sensor says contact.",
+               digits=2, relative=True, column=False),
+        Metric("events", "contacts", "", "Contacts that the sensor shows.", relative=True, column=False),
+        Metric("event_peak_mn", "event peak", "mN", "Mean peak of the contacts.", digits=2, relative=True,
+               column=False),
+        Metric("mae_of_surgical", "MAE of 0.3 N", "%", "MAE over a usual surgical force.", "low",
+               column=False),
+        Metric("peak_mae", "peak error", "%", "Mean relative error of the contacts' peaks.", "low",
+               short="peak err."),
+        Metric("impulse_mae", "impulse error", "%", "Mean relative error of the contacts' impulses.", "low",
+               short="impulse err."),
+        Metric("dropout", "dropout", "%", "Samples without a prediction.", "low", relative=True),
+    )
+}  # fmt: skip
+"""Every score, in the order of `score.json`'s reader: the only place that names them."""
+
+RELATIVE = tuple(key for key, metric in METRICS.items() if metric.relative)
+"""Scores that a prediction of unknown stiffness has."""
 
 
 @dataclass(frozen=True)
@@ -39,23 +120,23 @@ def agreement(sensor: Curve, predicted: Curve) -> dict[str, float]:
     """
     both = np.isfinite(sensor) & np.isfinite(predicted)
     x, y = sensor[both], predicted[both]
-    n = len(x)
+    n, nan = len(x), float("nan")
     if n == 0:
         keys = ("mae_mn", "rmse_mn", "bias_mn", "r", "ccc", "r2", "gain")
-        return {"n": 0.0, **dict.fromkeys(keys, float("nan"))}
-    error = y - x
-    xc, yc = x - x.mean(), y - y.mean()
-    sxx, syy, sxy = float(xc @ xc), float(yc @ yc), float(xc @ yc)
-    shift = n * float(x.mean() - y.mean()) ** 2
+        return {"n": 0.0, **dict.fromkeys(keys, nan)}
+    bias = float((y - x).mean())
+    moving, both_moving = bool(np.ptp(x) > 0), bool(np.ptp(x) > 0 and np.ptp(y) > 0)
+    fit = linregress(x, y) if moving else None
+    covariance = float(np.cov(x, y, ddof=0)[0, 1]) if moving else 0.0
     return {
         "n": float(n),
-        "mae_mn": float(np.abs(error).mean()),
-        "rmse_mn": float(np.sqrt((error**2).mean())),
-        "bias_mn": float(error.mean()),
-        "r": ratio(sxy, float(np.sqrt(sxx * syy))),
-        "ccc": ratio(2 * sxy, sxx + syy + shift),
-        "r2": 1 - ratio(float(error @ error), sxx),
-        "gain": ratio(sxy, sxx),
+        "mae_mn": float(mean_absolute_error(x, y)),
+        "rmse_mn": float(root_mean_squared_error(x, y)),
+        "bias_mn": bias,
+        "r": float(fit.rvalue) if fit and both_moving else nan,
+        "ccc": ratio(2 * covariance, float(x.var() + y.var() + bias**2)),
+        "r2": float(r2_score(x, y)) if moving else nan,
+        "gain": float(fit.slope) if fit else nan,
     }
 
 
@@ -90,7 +171,8 @@ def lag(time_s: Curve, sensor: Curve, predicted: Curve) -> dict[str, float]:
     if inner.sum() < 8:
         return {"lag_s": float("nan"), "r_at_lag": float("nan")}
     shifted = [np.interp(t[inner] + shift, t, y) for shift in lags]
-    r = np.array([_correlation(x[inner], later) for later in shifted])
+    with np.errstate(divide="ignore", invalid="ignore"):  # a curve that stands still correlates with nothing
+        r = np.corrcoef([x[inner], *shifted])[0, 1:]
     if not np.isfinite(r).any():
         return {"lag_s": float("nan"), "r_at_lag": float("nan")}
     best = int(np.nanargmax(r))
@@ -169,15 +251,15 @@ def contact_scores(sensor: Curve, predicted: Curve, threshold_mn: float) -> dict
     truth = in_contact(sensor, threshold_mn)[both]
     said = in_contact(predicted, threshold_mn)[both]
     free = ~truth
-    hits = float(np.sum(truth & said))
+    ghosts = predicted[both][free]
     return {
-        "contact_f1": ratio(2 * hits, float(truth.sum() + said.sum())),
-        "ghost_rate": ratio(float(np.sum(said & free)), float(free.sum())),
-        "ghost_mn": float(np.abs(predicted[both][free]).mean()) if free.any() else float("nan"),
+        "contact_f1": float(f1_score(truth, said)) if (truth | said).any() else float("nan"),
+        "ghost_rate": float(said[free].mean()) if free.any() else float("nan"),
+        "ghost_mn": float(np.abs(ghosts).mean()) if free.any() else float("nan"),
     }
 
 
-def everything(
+def compute_all(
     time_s: Curve,
     sensor: Curve,
     predicted: Curve,
@@ -213,10 +295,6 @@ def everything(
         "dropout": float(np.mean(~np.isfinite(predicted[kept]))) if kept.any() else float("nan"),
     }
     return scores, rows
-
-
-RELATIVE = ("n", "r", "lag_s", "r_at_lag", "events", "event_peak_mn", "threshold_mn", "dropout")
-"""Scores that a constant factor on the prediction doesn't change, or that speak of the sensor alone."""
 
 
 def without_newtons(scores: dict[str, float]) -> dict[str, float]:
@@ -258,11 +336,6 @@ def limits_of_agreement(difference: Curve, group: NDArray[np.integer]) -> dict[s
 
 def _mean_size(rows: list[dict[str, float]], key: str) -> float:
     return float(np.mean([abs(row[key]) for row in rows])) if rows else float("nan")
-
-
-def _correlation(x: Curve, y: Curve) -> float:
-    x, y = x - x.mean(), y - y.mean()
-    return ratio(float(x @ y), float(np.sqrt((x @ x) * (y @ y))))
 
 
 def ratio(above: float, below: float) -> float:

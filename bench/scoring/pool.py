@@ -13,22 +13,18 @@ import numpy as np
 from bench.bootstrap import Interval, over_groups
 from bench.output import forest_plot, machine, result_page
 from bench.output import write as results
+from bench.scoring.metrics import METRICS
 from synth.errors import UserError
 
-SCORES = (
-    ("mae_mn", "MAE [mN]"),
-    ("mae_of_peak", "MAE of event peak"),
-    ("r", "r"),
-    ("ccc", "CCC"),
-    ("r2", "R²"),
-    ("bias_mn", "bias [mN]"),
-    ("contact_f1", "contact F1"),
-    ("ghost_rate", "ghosts"),
-    ("peak_mae", "peak error"),
-    ("impulse_mae", "impulse error"),
-    ("dropout", "dropout"),
+SCORES = tuple(
+    (key, METRICS[key].heading)
+    for key in ("mae_mn", "mae_of_peak", "r", "ccc", "r2", "bias_mn", "contact_f1", "ghost_rate", "peak_mae",
+                "impulse_mae", "dropout")
+)  # fmt: skip
+_CALIBRATED = (
+    *((key, f"{METRICS[key].heading}, gain set") for key in ("mae_of_peak", "r2")),
+    ("gain", METRICS["gain"].heading),
 )
-_CALIBRATED = (("mae_of_peak", "MAE of event peak, gain set"), ("r2", "R², gain set"), ("gain", "gain"))
 
 
 def read(paths: Sequence[Path]) -> list[dict[str, Any]]:
@@ -155,8 +151,8 @@ def readme(tree: dict[str, Any]) -> str:
     own = _number(tree["methods"][tree["main"]]["scores"]["mae_mn"]["mean"])
     for name, method in tree["methods"].items():
         beats = name != tree["main"] and _number(method["scores"]["mae_mn"]["mean"]) < own
-        cells = [_text(method["scores"][key], "[mN]" in head) for key, head in shown]
-        cells += [_text(method["calibrated"][key], False) for key, _ in _CALIBRATED]
+        cells = [_text(method["scores"][key], METRICS[key].digits) for key, _ in shown]
+        cells += [_text(method["calibrated"][key], METRICS[key].digits) for key, _ in _CALIBRATED]
         word = name.replace("|", r"\|")
         lines.append(f"| {'**' + word + '** (better)' if beats else word} | " + " | ".join(cells) + " |")
     for name, reason in tree["left_out"].items():
@@ -197,10 +193,9 @@ def _ends(value: dict[str, float | None]) -> Interval:
     return (_number(value["low"]), _number(value["high"]))
 
 
-def _text(value: dict[str, float | None], newtons: bool) -> str:
+def _text(value: dict[str, float | None], digits: int) -> str:
     if value["mean"] is None:
         return "–"
-    digits = 2 if newtons else 3
     text = f"{value['mean']:.{digits}f}"
     if value["low"] is None or value["high"] is None:
         return text

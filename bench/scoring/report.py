@@ -6,6 +6,7 @@ import base64
 import html
 import json
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,30 +21,14 @@ from rich.table import Table
 
 from bench.scoring import charts, metrics
 from bench.scoring.evaluate_recording import Result
+from bench.scoring.metrics import METRICS
 from bench.tracking.tracking import Snapshot
 from synth.dataset.folder import write_whole
 from synth.publish import picture
 
 _PEAKS, _WORST = 4, 2
 
-METRICS: tuple[tuple[str, str, str], ...] = (
-    ("mae_mn", "MAE", "mN"),
-    ("mae_of_peak", "of peak", "%"),
-    ("rmse_mn", "RMSE", "mN"),
-    ("bias_mn", "bias", "mN"),
-    ("r", "r", ""),
-    ("ccc", "CCC", ""),
-    ("r2", "R²", ""),
-    ("gain", "gain", ""),
-    ("lag_s", "lag", "ms"),
-    ("contact_f1", "contact F1", ""),
-    ("ghost_rate", "ghosts", "%"),
-    ("peak_mae", "peak err.", "%"),
-    ("impulse_mae", "impulse err.", "%"),
-    ("dropout", "dropout", "%"),
-)
-"""Score, heading, unit shown."""
-
+_COLUMNS = tuple(metric for metric in METRICS.values() if metric.column)
 _TILES = ("mae_mn", "mae_of_peak", "r", "ccc", "r2", "ghost_rate")
 
 
@@ -57,19 +42,19 @@ class Panel:
     force: str | None
 
 
-def write(result: Result, path: Path, title: str = "") -> None:
+def write_report(result: Result, path: Path, title: str = "") -> None:
     """Writes the report whole or not at all.
 
     Args:
-        result: of `assess`.
+        result: of `evaluate_recording`.
         path: the HTML file.
         title: heading; the recording's name if empty.
     """
-    page = render(result, title or f"Force from video: {result.recording}")
+    page = render_report(result, title or f"Force from video: {result.recording}")
     write_whole(path, page, durable=False)
 
 
-def render(result: Result, title: str) -> str:
+def render_report(result: Result, title: str) -> str:
     """The page as text."""
     environment = Environment(
         loader=PackageLoader("bench.scoring", "."),
@@ -80,17 +65,17 @@ def render(result: Result, title: str) -> str:
     )
     environment.filters["shown"] = shown
     main = result.methods[result.main]
-    figures = {"force": charts.force(result)}
+    figures = {"force": charts.draw_force(result)}
     if math.isfinite(main.scores.get("mae_mn", math.nan)):
-        figures["scatter"] = charts.scatter(result)
-        figures["bland"] = charts.bland_altman(result, limits_of_agreement(result))
+        figures["scatter"] = charts.draw_scatter(result)
+        figures["bland"] = charts.draw_bland_altman(result, limits_of_agreement(result))
     panels, flow_px, force_kpa = pictures(result)
     return environment.get_template("report.html.jinja").render(
         title=title,
         result=result,
         main=main,
-        metrics=METRICS,
-        tiles=[(key, name, unit) for key, name, unit in METRICS if key in _TILES],
+        metrics=_COLUMNS,
+        tiles=[METRICS[key] for key in _TILES],
         best=_best(result),
         beaten_by=beaten_by(result),
         surely=[n for n in beaten_by(result) if (w := result.methods[n].worse_by_mn) and w[0] > 0],
@@ -116,13 +101,11 @@ def terminal_table(result: Result) -> Table:
         for name, method in result.methods.items():
             table.add_row(name, shown(float(np.nanmax(method.size_mn))))
         return table
-    keys = [row for row in METRICS if row[0] in {*_TILES, "bias_mn"}]
-    for _, name, unit in keys:
-        table.add_column(f"{name} [mN]" if unit == "mN" else name, justify="right", no_wrap=True)
+    columns = [metric for metric in _COLUMNS if metric.key in {*_TILES, "bias_mn"}]
+    for metric in columns:
+        table.add_column(metric.column_heading, justify="right", no_wrap=True)
     for name, method in result.methods.items():
-        table.add_row(
-            name, *(shown(method.scores[key], unit if unit != "mN" else "") for key, _, unit in keys)
-        )
+        table.add_row(name, *(shown(method.scores[metric.key], metric.cell_unit) for metric in columns))
     return table
 
 
@@ -219,24 +202,23 @@ def _caption(result: Result, snap: Snapshot) -> str:
     return words
 
 
+_DISTANCE: dict[str, Callable[[float], float]] = {
+    "low": lambda value: value,
+    "high": lambda value: -value,
+    "zero": abs,
+    "one": lambda value: abs(value - 1),
+}
+"""What the best value has least of."""
+
+
 def _best(result: Result) -> dict[str, float]:
     """The best value in each column of the table, to be set in bold."""
-    down = {"mae_mn", "mae_of_peak", "rmse_mn", "ghost_rate", "peak_mae", "impulse_mae", "dropout"}
     best = {}
-    for key, _, _ in METRICS:
-        values = [
-            m.scores[key] for m in result.methods.values() if math.isfinite(m.scores.get(key, math.nan))
-        ]
-        if len(set(values)) < 2:
-            continue
-        if key in down:
-            best[key] = min(values)
-        elif key in {"r", "ccc", "r2", "contact_f1"}:
-            best[key] = max(values)
-        elif key in {"bias_mn", "lag_s"}:
-            best[key] = min(values, key=abs)
-        elif key == "gain":
-            best[key] = min(values, key=lambda value: abs(value - 1))
+    for metric in _COLUMNS:
+        found = [method.scores.get(metric.key, math.nan) for method in result.methods.values()]
+        values = {value for value in found if math.isfinite(value)}
+        if len(values) > 1 and metric.best:
+            best[metric.key] = min(values, key=_DISTANCE[metric.best])
     return best
 
 

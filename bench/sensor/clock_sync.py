@@ -39,7 +39,7 @@ class Offset:
     """Why the offset must not be used; empty when it may be."""
 
 
-def find(
+def find_offset(
     frame_s: Curve, speed: Curve, sensor_s: Curve, force_mn: NDArray[np.float64], search_s: float
 ) -> Offset:
     """The offset at which the sensor's changes best follow the tissue's motion.

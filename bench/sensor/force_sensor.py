@@ -35,7 +35,7 @@ class Processed:
     """What was done, in order, in words."""
 
 
-def process(force: Force, sensor: Sensor, offset_s: float, causal: bool = False) -> Processed:
+def process_force(force: Force, sensor: Sensor, offset_s: float, causal: bool = False) -> Processed:
     """Gravity, tare and drift, low-pass, clock; in this order.
 
     Args:
@@ -57,7 +57,7 @@ def process(force: Force, sensor: Sensor, offset_s: float, causal: bool = False)
     return Processed(force.time_s + offset_s, values, floor, drift, tuple(steps))
 
 
-def at(processed: Processed, time_s: NDArray[np.float64]) -> NDArray[np.float64]:
+def force_at(processed: Processed, time_s: NDArray[np.float64]) -> NDArray[np.float64]:
     """Force at the given times by linear interpolation, (T, 3) mN; NaN in gaps and outside the samples."""
     t, values = processed.time_s, processed.force_mn
     out = np.stack([np.interp(time_s, t, column, left=np.nan, right=np.nan) for column in values.T], axis=1)

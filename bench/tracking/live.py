@@ -7,22 +7,28 @@ dropped, as it would be beside the table. Mask, tracker and model are those that
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from bench.methods.protocol import Method, Scene
 from bench.output import machine
 from bench.output import write as results
-from bench.recording.video import Picture, from_video
-from bench.tracking.tracking import Method, Scene, smaller
+from learn.inference.video import Picture, read_video
+from learn.inference.video_flow import (
+    FPS,
+    Flags,
+    FlowHere,
+    Footage,
+    Rgb,
+    Settings,
+    Step,
+    VideoFlow,
+)
 from synth.errors import UserError
-from synth.flow import mask
-from synth.flow.track import Tracker
-
-_FPS = 25.0  # where the video states no times
 
 
 @dataclass(frozen=True)
@@ -63,7 +69,7 @@ class Watched:
         return result
 
 
-def watch(
+def watch_video(
     video: Path,
     *,
     backend: str = "tvl1",
@@ -91,91 +97,92 @@ def watch(
     """
     if method is not None and scale_mm_per_px is None:
         raise UserError("a model needs --scale (mm a pixel): forces have no meaning without it")
-    return run(
-        (_smaller(picture, shrink) for picture in from_video(video)),
-        backend=backend,
+    return watch_footage(
+        Footage(lambda: read_video(video), str(video), fps=FPS),
+        Settings(backend, shrink, rate_hz=None),
         method=method,
-        scale_mm_per_px=(scale_mm_per_px or 1.0) * shrink,
+        scale_mm_per_px=scale_mm_per_px or 1.0,
         young_kpa=young_kpa,
         paced=paced,
         told=told,
-        name=str(video),
     )
 
 
-def run(
-    pictures: Iterable[Picture],
+def watch_footage(
+    footage: Footage,
+    settings: Settings,
     *,
-    backend: str,
     method: Method | None,
     scale_mm_per_px: float,
     young_kpa: float | None,
     paced: bool,
     told: Callable[[Frame], None],
-    name: str,
 ) -> Watched:
-    """As `watch`, on pictures from anywhere."""
-    account = Watched()
-    tracker: Tracker | None = None
-    begin = first_s = 0.0
-    for picture in pictures:
-        stamp = picture.index / _FPS if picture.time_s is None else picture.time_s
-        if tracker is None:
-            tissue = np.ones(picture.rgb.shape[:2], bool)
-            account.size = picture.rgb.shape[:2]
-            tracker = Tracker(backend, picture.rgb, mask.blocked(picture.rgb), tissue)
-            scene = Scene(tissue, scale_mm_per_px, young_kpa)
-            # The clock starts when the first flow is warm: loading isn't latency.
-            tracker.step(picture.rgb, mask.blocked(picture.rgb))
-            begin, first_s = time.perf_counter(), stamp
+    """As `watch_video`, on pictures from anywhere."""
+    account, pace = Watched(), _Pace(paced)
+    video = VideoFlow(footage, settings, _Warm(), pace.is_due)
+    scene: Scene | None = None
+    for step in video.steps():
+        if scene is None:
+            assert video.tissue is not None
+            account.size = video.tissue.shape
+            scene = Scene(video.tissue, scale_mm_per_px * video.shrink, young_kpa)
+            pace.start(step)
             continue
-        arrival = begin + stamp - first_s
-        if paced and arrival < time.perf_counter() - _interval(stamp, first_s, picture.index):
-            account.dropped += 1
-            continue
-        if paced:
-            time.sleep(max(0.0, arrival - time.perf_counter()))
-        frame = _work(picture, tracker, scene, method, arrival if paced else time.perf_counter())
+        began, found, force = time.perf_counter(), step.found, None
+        if method is not None:
+            force = method(found.flow, found.confidence, scene, False).size_mn
+        end = time.perf_counter()
+        seen: NDArray[np.bool_] = found.confidence > 0
+        frame = Frame(
+            index=step.index,
+            latency_s=end - pace.arrival_s,
+            stages_s={"mask": step.masking_s, "flow": found.wall_s, "force": end - began},
+            confidence=float(found.confidence[seen].mean()) if seen.any() else 0.0,
+            trusted=found.trusted,
+            largest_px=float(np.hypot(*found.flow[seen].T).max()) if seen.any() else 0.0,
+            force_mn=force,
+        )
         account.frames.append(frame)
         told(frame)
+    account.dropped = pace.dropped
     if not account.frames:
-        raise UserError(f"{name}: fewer than two frames")
+        raise UserError(f"{footage.name}: fewer than two frames")
     return account
 
 
-def write(out: Path, summary: dict[str, float | int], **how: str | int | bool) -> None:
+class _Warm(FlowHere):
+    """Flow that has run once before the clock starts: loading isn't latency."""
+
+    def begin(self, backend: str, rest: Rgb, blocked: Flags, tissue: Flags) -> None:
+        """See `Flow`."""
+        super().begin(backend, rest, blocked, tissue)
+        self.tracker.step(rest, blocked)
+
+
+class _Pace:
+    """Lets frames arrive as the video's own clock has them."""
+
+    def __init__(self, paced: bool) -> None:
+        self.paced, self.dropped, self.arrival_s = paced, 0, 0.0
+
+    def start(self, rest: Step) -> None:
+        """The clock starts with the rest frame."""
+        self.first_s, self.began_s = rest.time_s or 0.0, time.perf_counter()
+
+    def is_due(self, picture: Picture, time_s: float) -> bool:
+        """Waits until a frame arrives; False if it has a successor already."""
+        since, now = time_s - self.first_s, time.perf_counter()
+        self.arrival_s = self.began_s + since if self.paced else now
+        if self.arrival_s < now - since / picture.index:
+            self.dropped += 1
+            return False
+        time.sleep(max(0.0, self.arrival_s - now))
+        return True
+
+
+def write_live(out: Path, summary: dict[str, float | int], **how: str | int | bool) -> None:
     """`live.json`: the summary, how the stream was run, and the machine."""
     out.mkdir(parents=True, exist_ok=True)
     record = {"command": "bench live", **how, "machine": machine.describe(), **summary}
     results.keep(out, "live.json", record)
-
-
-def _interval(stamp: float, first_s: float, index: int) -> float:
-    """Time between frames [s]: a frame older than that has a successor already."""
-    return (stamp - first_s) / index if index > 0 and stamp > first_s else 1 / _FPS
-
-
-def _work(picture: Picture, tracker: Tracker, scene: Scene, method: Method | None, arrival: float) -> Frame:
-    start = time.perf_counter()
-    blocked = mask.blocked(picture.rgb)
-    masked = time.perf_counter()
-    flow, confidence = tracker.step(picture.rgb, blocked)
-    flowed = time.perf_counter()
-    force = None
-    if method is not None:
-        force = method(flow, confidence, scene, False).size_mn
-    end = time.perf_counter()
-    seen: NDArray[np.bool_] = confidence > 0
-    return Frame(
-        index=picture.index,
-        latency_s=end - arrival,
-        stages_s={"mask": masked - start, "flow": flowed - masked, "force": end - flowed},
-        confidence=float(confidence[seen].mean()) if seen.any() else 0.0,
-        trusted=tracker.trusted,
-        largest_px=float(np.hypot(flow[..., 0], flow[..., 1])[seen].max()) if seen.any() else 0.0,
-        force_mn=force,
-    )
-
-
-def _smaller(picture: Picture, shrink: int) -> Picture:
-    return Picture(picture.index, picture.time_s, smaller(picture.rgb, shrink))

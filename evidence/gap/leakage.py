@@ -18,9 +18,9 @@ from rich.console import Console
 
 from bench.bootstrap import over_groups
 from bench.methods import baselines
+from bench.methods.protocol import Answer
 from bench.output import forest_plot, machine, result_page, write
 from bench.scoring import metrics
-from bench.tracking.tracking import Answer
 from learn.data.clips import Clip, load
 from learn.data.split import groups
 

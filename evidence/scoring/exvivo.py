@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from bench.recording import video, writer
+from bench.recording import writer
 from bench.tracking.tracking import Progress
 from synth.errors import UserError
 from synth.fem import solver, tool
@@ -101,7 +101,7 @@ def make(plan: Plan, index: int, folder: Path, progress: Progress = lambda done:
     """
     if plan.seconds < _PRESS_S + 5:
         raise UserError(f"seconds: {plan.seconds:g}; calibration alone takes {_PRESS_S:g}, at least 5 more")
-    with writer.whole(folder) as part:
+    with writer.write_whole_folder(folder) as part:
         _fill(plan, index, part, progress)
     return folder
 
@@ -129,7 +129,7 @@ def _fill(plan: Plan, index: int, part: Path, progress: Progress) -> None:
         pictures.append(shot.rgb)
         cv2.imwrite(str(part / "masks" / f"{k:06d}.png"), shot.tool.astype(np.uint8) * 255)
         progress(k + 1)
-    video.write_video(part / "video.mp4", iter(pictures), times, crf=int(rng.integers(18, 25)))
+    writer.write_video(part / "video.mp4", iter(pictures), times, crf=int(rng.integers(18, 25)))
     cv2.imwrite(str(part / "tissue.png"), studio.still.tissue.astype(np.uint8) * 255)
     force = np.stack([g.force_mn * np.asarray(g.direction) for g in gestures])[course.gesture]
     lag = _write_sensor(part, course, force * course.level[:, None], rng)
@@ -142,7 +142,7 @@ def _fill(plan: Plan, index: int, part: Path, progress: Progress) -> None:
         "sync": {"method": "correlate", "calibration_s": [0.0, _SYNC_S], "search_s": 0.7},
         "sensor": {"axes": "sensor", "low_pass_hz": 10.0, "free_s": _free_spans(plan, lag)},
     }
-    writer.about(part, about)
+    writer.write_meta(part, about)
 
 
 def _moved(
@@ -222,7 +222,7 @@ def _write_sensor(part: Path, course: _Course, force: Floats, rng: np.random.Gen
     drift = size * rng.normal(size=3) * 0.002 * course.time_s[:, None]
     seen = force @ turn.T + size * rng.normal(0, 0.3, 3) + drift + 0.005 * size * rng.normal(size=force.shape)
     clock = course.time_s - lag
-    writer.force(part, clock, seen / 1000)
+    writer.write_force(part, clock, seen / 1000)
     return lag
 
 

@@ -17,7 +17,7 @@ import typer
 from numpy.typing import NDArray
 
 from bench.output import machine, write
-from bench.recording import video, writer
+from bench.recording import writer
 from evidence.scoring import phantom
 from synth.errors import UserError
 
@@ -78,12 +78,12 @@ def record(folder: Path, seconds: float, fps: float, size: tuple[int, int], rng:
     """
     folder.mkdir(parents=True)
     times = np.arange(round(seconds * fps)) / fps
-    video.write_video(folder / "video.mp4", _pictures(times, size, rng), times, crf=12)
+    writer.write_video(folder / "video.mp4", _pictures(times, size, rng), times, crf=12)
     clock = np.arange(0, seconds, 1 / _SENSOR_HZ)
     newtons = np.zeros((len(clock), 3))
     newtons[:, 0] = _motion(clock) / _PX_A_MN / 1000
-    writer.force(folder, clock, newtons)
-    writer.about(
+    writer.write_force(folder, clock, newtons)
+    writer.write_meta(
         folder,
         {
             "scale_mm_per_px": 35.0 / size[0],

@@ -2,21 +2,36 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from learn.data.clips import FIELDS
-from learn.inference import video_flow
-from learn.inference.predict import Predictor, View, total_force
+from learn.inference import video
+from learn.inference.force_reader import ForceReader
+from learn.inference.predict import Predictor, View
 from learn.inference.stiffness import stiffness
-from learn.inference.video_flow import Step
+from learn.inference.video_flow import FPS, Footage, Settings, VideoFlow, everywhere
 from synth.dataset.store import Dataset, Sequence, open_sequence
 from synth.errors import UserError
+
+
+class Step(NamedTuple):
+    """One frame's flow."""
+
+    flow: NDArray[np.float32]
+    """(H, W, 2) px from the rest frame, on its pixels."""
+    confidence: NDArray[np.float32] | None
+    """(H, W) in 0..1, if there is one."""
+    frame: int
+    """Number in the film."""
+    time_s: float = math.nan
 
 
 @dataclass(frozen=True)
@@ -25,13 +40,16 @@ class Motion:
 
     name: str
     steps: Callable[[], Iterator[Step]]
-    """Flow (H, W, 2) px from the rest frame, on its pixels, and confidence if there is one, frame by
-    frame."""
+    """Goes through the frames."""
     tissue: NDArray[np.bool_]
     scale_mm_per_px: float
     young_kpa: float | None
     force_mn: NDArray[np.float64] | None = None
     """(T,) size of the true force, where it is known."""
+    shrink: int = 1
+    """How many times smaller than the film's own pictures those are that flow is on."""
+    notes: list[str] = field(default_factory=list)
+    """What was done to the film that its user should know, once its steps are through."""
 
 
 @dataclass(frozen=True)
@@ -41,8 +59,8 @@ class Filmed:
     scale_mm_per_px: float | None = None
     tissue: Path | None = None
     """A picture, white where there is tissue; everywhere if not given."""
-    backend: str = "tvl1"
-    """Flow estimator, as in a job's flow.backend."""
+    settings: Settings = Settings()
+    """How it is followed."""
 
 
 def motions(path: Path, source: str, filmed: Filmed | None = None) -> Iterator[Motion]:
@@ -52,7 +70,7 @@ def motions(path: Path, source: str, filmed: Filmed | None = None) -> Iterator[M
     `confidence` (T, H, W) and `force_mn` (T,). A video's first frame is its rest frame. Raises UserError for
     anything else, and for a video without a scale.
     """
-    if path.suffix.lower() in video_flow.SUFFIXES:
+    if path.suffix.lower() in video.SUFFIXES:
         yield _video(path, filmed or Filmed())
     elif path.suffix == ".npz":
         yield _arrays(path)
@@ -71,10 +89,12 @@ def _stored(sequence: Sequence, source: str) -> Motion:
     flow = sequence[FIELDS[source]]
     sure = source == "recovered" and "flow_confidence" in sequence
     confidence = sequence["flow_confidence"] if sure else None
+    time_s = sequence["time"][:]
     return Motion(
         name=sequence.path.stem,
         steps=lambda: (
-            (flow[t], None if confidence is None else confidence[t]) for t in range(sequence.frames)
+            Step(flow[t], None if confidence is None else confidence[t], t, float(time_s[t]))
+            for t in range(sequence.frames)
         ),
         tissue=sequence["tissue"][:].astype(bool),
         scale_mm_per_px=float(sequence.attrs["scale_mm_per_px"]),
@@ -86,13 +106,28 @@ def _stored(sequence: Sequence, source: str) -> Motion:
 def _video(path: Path, filmed: Filmed) -> Motion:
     if filmed.scale_mm_per_px is None:
         raise UserError(f"{path}: a video doesn't say how large it shows things; give --scale in mm a pixel")
-    where = video_flow.tissue(path, filmed.tissue)
+    drawn = filmed.tissue
+    tissue = everywhere if drawn is None else partial(video.read_mask, drawn)
+    footage = Footage(lambda: video.read_video(path), str(path), tissue, fps=FPS)
+    first = next(video.read_video(path)).rgb
+    shrink = filmed.settings.shrink_of(first.shape[1])
+    notes: list[str] = []
+
+    def steps() -> Iterator[Step]:
+        following = VideoFlow(footage, filmed.settings)
+        for step in following.steps():
+            time_s = math.nan if step.time_s is None else step.time_s
+            yield Step(step.found.flow, step.found.confidence, step.index, time_s)
+        notes[:] = following.notes
+
     return Motion(
         name=path.stem,
-        steps=lambda: video_flow.steps(path, where, filmed.backend),
-        tissue=where,
-        scale_mm_per_px=filmed.scale_mm_per_px,
+        steps=steps,
+        tissue=VideoFlow(footage, filmed.settings).tissue_of(first.shape[:2]),
+        scale_mm_per_px=filmed.scale_mm_per_px * shrink,
         young_kpa=None,
+        shrink=shrink,
+        notes=notes,
     )
 
 
@@ -118,7 +153,8 @@ def _arrays(path: Path) -> Motion:
     return Motion(
         name=path.stem,
         steps=lambda: (
-            (f, None if confidence is None else confidence[t].astype(np.float32)) for t, f in enumerate(flow)
+            Step(f, None if confidence is None else confidence[t].astype(np.float32), t)
+            for t, f in enumerate(flow)
         ),
         tissue=tissue,
         scale_mm_per_px=float(found["scale_mm_per_px"]),
@@ -128,33 +164,37 @@ def _arrays(path: Path) -> Motion:
 
 
 def apply(predictor: Predictor, motion: Motion, young_kpa: float | None = None) -> dict[str, Any]:
-    """Force of every frame of a film, ready for np.savez.
+    """Force of every frame of a film, ready for np.savez; what is done to it is `ForceReader`'s.
 
-    `young_kpa` overrides the film's own. Returns `density` (T, C, N, N) mN/mm², `total_force_mn` (T,),
-    `force_mn` (T, 3) for a model that gives direction, `head_mn` (T, C) for one with a total-force head,
-    `mask` (N, N), `pitch_mm`, `centre_px` (x, y),
-    `young_kpa`, `young_known`.
+    `young_kpa` overrides the film's own. Returns `frame` (T,), `time_s` (T,) where the film has times,
+    `total_force_mn` (T,), `force_mn` (T, 3) for a model that gives direction, and as the network says it
+    `density` (T, C, N, N) mN/mm² and `head_mn` (T, C) of one with a total-force head; `mask` (N, N),
+    `pitch_mm`, `centre_px` (x, y) in the film's own pixels, `young_kpa`, `young_known`.
     """
     young = young_kpa if young_kpa is not None else motion.young_kpa
-    view = View(motion.tissue, motion.scale_mm_per_px, predictor.grid)
-    maps = [
-        predictor(flow, motion.tissue, motion.scale_mm_per_px, young, confidence)
-        for flow, confidence in motion.steps()
-    ]
-    density = np.stack([m.density for m in maps])
-    kind = predictor.card.settings.target
+    reader = ForceReader(predictor, motion.tissue, motion.scale_mm_per_px, young)
+    frames, times, read = [], [], []
+    for step in motion.steps():
+        frames.append(step.frame)
+        times.append(step.time_s)
+        read.append(reader.read(step.flow, step.confidence))
+    view = read[0].map.view
     out: dict[str, Any] = {
-        "density": density,
-        "total_force_mn": total_force(density, kind, predictor.grid),
+        "density": np.stack([r.map.density for r in read]),
+        "total_force_mn": np.array([r.size_mn for r in read]),
         "mask": view.mask,
         "pitch_mm": predictor.grid.pitch_mm,
-        "centre_px": np.array(view.resample.centre_px),
-        "young_kpa": maps[0].young_kpa,
-        "young_known": maps[0].young_known,
+        # A picture begins half a pixel before its first pixel, whatever its pixels' size.
+        "centre_px": motion.shrink * (np.array(view.resample.centre_px) + 0.5) - 0.5,
+        "young_kpa": read[0].map.young_kpa,
+        "young_known": read[0].map.young_known,
+        "frame": np.array(frames),
     }
-    if density.shape[1] == 3:
-        out["force_mn"] = density.astype(np.float64).sum((2, 3)) * predictor.grid.pitch_mm**2
-    heads = [m.head_mn for m in maps if m.head_mn is not None]
+    if np.isfinite(times).any():
+        out["time_s"] = np.array(times)
+    if read[0].map.force_mn is not None:
+        out["force_mn"] = np.stack([r.force_mn for r in read])
+    heads = [r.map.head_mn for r in read if r.map.head_mn is not None]
     if heads:
         out["head_mn"] = np.stack(heads)
     return out
@@ -166,7 +206,7 @@ def calibrate(predictor: Predictor, press: Motion) -> float:
         raise UserError(f"{press.name}: holds no force to calibrate on (force_mn in an .npz)")
     view = View(press.tissue, press.scale_mm_per_px, predictor.grid)
     moved, sure = [], []
-    for flow, confidence in press.steps():
+    for flow, confidence, _, _ in press.steps():
         moved.append(view.resample.mean(flow.transpose(2, 0, 1) * press.scale_mm_per_px, press.tissue))
         if confidence is not None:
             sure.append(view.resample.mean(confidence, press.tissue))

@@ -17,15 +17,18 @@ from typer.testing import CliRunner
 from bench.cli import app
 from bench.flow import files
 from bench.methods.network import Model
+from bench.methods.protocol import Answer, Scene
 from bench.output import plot
 from bench.recording.folder import open_recording
-from bench.recording.video import Picture, write_video
+from bench.recording.writer import write_video
 from bench.tracking import live
-from bench.tracking.tracking import Answer, Scene, Settings, follow
+from bench.tracking.tracking import track_recording
 from evidence.flow.measure import MeanInpainting, against, divergence, measure
 from evidence.flow.scenes import CLEAN, Recipe, Stage, inverse, pairs, pull_field
 from learn.checkpoint import Card, save_tensors, write_card
 from learn.data.grid import Scales
+from learn.inference.video import Picture
+from learn.inference.video_flow import Footage, Settings
 from learn.network.d2fnet import D2FNet
 from learn.network.monai_unet import build
 from learn.settings import override, preset
@@ -39,8 +42,8 @@ def test_flow_files_return_what_was_written(tmp_path: Path, suffix: str, within:
     known = np.ones((7, 5), bool)
     known[2, 3] = False
     path = tmp_path / f"flow{suffix}"
-    files.write(path, flow, known)
-    back, there = files.read(path)
+    files.write_flow(path, flow, known)
+    back, there = files.read_flow(path)
     np.testing.assert_array_equal(there, known)
     assert np.abs(back - flow)[known].max() <= within
     assert not back[2, 3].any()
@@ -48,7 +51,7 @@ def test_flow_files_return_what_was_written(tmp_path: Path, suffix: str, within:
 
 def test_flo_bytes_are_middleburys(tmp_path: Path) -> None:
     path = tmp_path / "a.flo"
-    files.write(path, np.array([[[1.0, -2.0], [3.0, 4.0]]], np.float32))
+    files.write_flow(path, np.array([[[1.0, -2.0], [3.0, 4.0]]], np.float32))
     data = path.read_bytes()
     assert data[:4] == b"PIEH"
     assert np.frombuffer(data, "<i4", 2, 4).tolist() == [2, 1]
@@ -57,7 +60,7 @@ def test_flo_bytes_are_middleburys(tmp_path: Path) -> None:
 
 def test_kitti_png_is_readable_by_its_formula(tmp_path: Path) -> None:
     path = tmp_path / "a.png"
-    files.write(path, np.full((2, 2, 2), (1.5, -2.25), np.float32))
+    files.write_flow(path, np.full((2, 2, 2), (1.5, -2.25), np.float32))
     blue, green, red = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)[0, 0].tolist()
     assert ((red - 2**15) / 64, (green - 2**15) / 64, blue) == (1.5, -2.25, 1)
 
@@ -69,9 +72,9 @@ def test_flow_files_refuse_what_they_cannot_read(tmp_path: Path) -> None:
     cv2.imwrite(str(eight), np.zeros((4, 4, 3), np.uint8))
     for path in (bad, eight, tmp_path / "none.flo", tmp_path / "a.txt"):
         with pytest.raises(UserError):
-            files.read(path)
+            files.read_flow(path)
     with pytest.raises(UserError, match="511"):
-        files.write(tmp_path / "far.png", np.full((2, 2, 2), 600.0, np.float32))
+        files.write_flow(tmp_path / "far.png", np.full((2, 2, 2), 600.0, np.float32))
 
 
 def test_error_of_a_known_offset() -> None:
@@ -136,14 +139,14 @@ def test_bench_flow_scores_a_pair(tmp_path: Path) -> None:
     (pair,) = pairs(Recipe(size=96, pull=4.0, tool=0.0, highlights=0.0), 1, 3)
     for name, picture in (("a.png", pair.rest), ("b.png", pair.now)):
         cv2.imwrite(str(tmp_path / name), picture[..., ::-1])
-    files.write(tmp_path / "truth.flo", pair.flow, pair.inside)
+    files.write_flow(tmp_path / "truth.flo", pair.flow, pair.inside)
     names = [str(tmp_path / name) for name in ("a.png", "b.png", "truth.flo")]
     ran = CliRunner().invoke(app, ["flow", *names, "--json", "-o", str(tmp_path / "out.flo")])
     assert ran.exit_code == 0, ran.output
     score = json.loads(ran.output)
     assert score["epe"] < 0.15
     assert score["pixels"] == np.count_nonzero(pair.inside)
-    back, _ = files.read(tmp_path / "out.flo")
+    back, _ = files.read_flow(tmp_path / "out.flo")
     assert np.linalg.norm(back - pair.flow, axis=-1)[pair.inside].mean() == pytest.approx(
         score["epe"], abs=1e-5
     )
@@ -153,9 +156,9 @@ def test_stream_answers_every_frame_and_says_what_it_cost() -> None:
     (pair,) = pairs(Recipe(size=64, pull=2.0, tool=0.0), 1, 3)
     shown = [Picture(k, k / 25, pair.rest if k % 2 == 0 else pair.now) for k in range(5)]
     told: list[live.Frame] = []
-    account = live.run(
-        iter(shown), backend="dis", method=None, scale_mm_per_px=1.0, young_kpa=None, paced=False,
-        told=told.append, name="test",
+    account = live.watch_footage(
+        Footage(lambda: iter(shown), "test"), Settings("dis", shrink=1, rate_hz=None),
+        method=None, scale_mm_per_px=1.0, young_kpa=None, paced=False, told=told.append,
     )  # fmt: skip
     summary = account.summary()
     assert [frame.index for frame in told] == [1, 2, 3, 4]
@@ -168,9 +171,9 @@ def test_stream_answers_every_frame_and_says_what_it_cost() -> None:
 def test_stream_drops_what_comes_too_fast() -> None:
     (pair,) = pairs(Recipe(size=64, pull=2.0, tool=0.0), 1, 3)
     shown = [Picture(k, k * 1e-4, pair.now) for k in range(30)]
-    account = live.run(
-        iter(shown), backend="dis", method=None, scale_mm_per_px=1.0, young_kpa=None, paced=True,
-        told=lambda frame: None, name="test",
+    account = live.watch_footage(
+        Footage(lambda: iter(shown), "test"), Settings("dis", shrink=1, rate_hz=None),
+        method=None, scale_mm_per_px=1.0, young_kpa=None, paced=True, told=lambda frame: None,
     )  # fmt: skip
     assert account.dropped > 5
     assert account.dropped + len(account.frames) == 29
@@ -190,9 +193,9 @@ def test_live_runs_on_a_video_and_refuses_what_is_none(tmp_path: Path) -> None:
     assert json.loads(ran.output)["frames"] == 2
     (tmp_path / "no.mp4").write_text("no video")
     with pytest.raises(UserError):
-        live.watch(tmp_path / "no.mp4")
+        live.watch_video(tmp_path / "no.mp4")
     with pytest.raises(UserError, match="scale"):
-        live.watch(path, method=lambda *given: None)  # type: ignore[arg-type, return-value]
+        live.watch_video(path, method=lambda *given: None)  # type: ignore[arg-type, return-value]
 
 
 @pytest.fixture
@@ -229,9 +232,12 @@ def test_live_answers_with_the_forces_that_scoring_finds(tmp_path: Path, model: 
     assert 0 < summary["p50_ms"] <= summary["p95_ms"] <= summary["p99_ms"]
     assert summary["force_ms"] > 0
     streamed: list[live.Frame] = []
-    live.watch(folder / "video.mp4", method=Model(model), scale_mm_per_px=0.3, young_kpa=1.0, paced=False,
-               told=streamed.append)  # fmt: skip
-    followed = follow(open_recording(folder), {"model": Model(model)}, 0.3, Settings(shrink=1, rate_hz=None))
+    live.watch_video(
+        folder / "video.mp4", method=Model(model), scale_mm_per_px=0.3, young_kpa=1.0, paced=False,
+        told=streamed.append,
+    )  # fmt: skip
+    settings = Settings(shrink=1, rate_hz=None)
+    followed = track_recording(open_recording(folder), {"model": Model(model)}, 0.3, settings)
     scored = [float(np.linalg.norm(force)) for force in followed.force_mn["model"][1:]]
     assert min(scored) > 0
     # The stream has looked at the rest frame twice and so starts its first flow warm; what differs is a share
@@ -253,6 +259,6 @@ def test_scoring_without_masks_leaves_the_instrument_out(tmp_path: Path) -> None
         trust.append(confidence)
         return Answer(np.zeros(3))
 
-    follow(open_recording(folder), {"none": method}, 0.3, Settings("dis", shrink=1, rate_hz=None))
+    track_recording(open_recording(folder), {"none": method}, 0.3, Settings("dis", shrink=1, rate_hz=None))
     assert trust[1][pair.hidden].mean() < 0.3
     assert trust[1][~pair.hidden & pair.inside].mean() > 0.6

@@ -8,15 +8,16 @@ import numpy as np
 import pytest
 
 from bench.recording.folder import open_recording
-from bench.tracking.tracking import Settings, follow
+from bench.tracking.tracking import track_recording
 from evidence.scoring import scoring_cost
+from learn.inference.video_flow import Settings
 
 
 def test_the_bump_moves_as_the_sensor_says(tmp_path: Path) -> None:
     scoring_cost.record(tmp_path / "rec", 3.0, 10.0, (128, 96), np.random.default_rng(0))
     recording = open_recording(tmp_path / "rec")
     assert recording.expected_frames() == 30
-    done = follow(recording, {}, 35 / 128, Settings("dis", shrink=1, rate_hz=None))
+    done = track_recording(recording, {}, 35 / 128, Settings("dis", shrink=1, rate_hz=None))
     # Still for half a second, then away, at the peak after a quarter of the period, then back.
     speed = np.array(done.speed)
     assert speed[:5].max() < 0.1 * speed[5:].max()

@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.recording import video, writer
-from bench.tracking.tracking import Answer, Scene
+from bench.methods.protocol import Answer, Scene
+from bench.recording import writer
 from evidence.scoring import phantom
 
 GAIN_MN_PER_PX = 40.0
@@ -54,15 +54,15 @@ class Maker:
         if footage == "png":
             for k, rgb in enumerate(pictures):
                 cv2.imwrite(str(folder / "frames" / f"{k:04d}.png"), rgb[..., ::-1])
-            writer.frames(folder, time)
+            writer.write_frames(folder, time)
         else:
             (folder / "frames").rmdir()
-            video.write_video(folder / "video.mp4", iter(pictures), time, crf=6)
+            writer.write_video(folder / "video.mp4", iter(pictures), time, crf=6)
         if force:
             t = np.arange(0, time[-1] + 1e-9, 1 / sensor_hz)
-            writer.force(folder, t, np.outer(force_curve(t) / 1000, [1.0, 0.0, 0.0]))
+            writer.write_force(folder, t, np.outer(force_curve(t) / 1000, [1.0, 0.0, 0.0]))
         about = {"scale_mm_per_px": 0.2, "young_kpa": 1.0, "sensor": {"axes": "camera", "low_pass_hz": None}}
-        writer.about(folder, {**about, **(meta or {})})
+        writer.write_meta(folder, {**about, **(meta or {})})
         return folder
 
 

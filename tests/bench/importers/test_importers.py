@@ -122,7 +122,7 @@ def test_what_went_in_comes_out(
 
 def test_a_lone_mcap_is_read(tmp_path: Path) -> None:
     folder = mcap(tmp_path / "bag")
-    found = registry.read(next(folder.glob("*.mcap")))
+    found = registry.read_source(next(folder.glob("*.mcap")))
     assert len(found.times_s) == 4
     assert next(found.pictures()).shape == (12, 16, 3)
 
@@ -150,12 +150,12 @@ def test_what_cannot_be_read_is_one_line(
     make: Callable[[Path], Path], name: str, use: dict[str, str], said: str, tmp_path: Path
 ) -> None:
     with pytest.raises(UserError, match=said):
-        registry.read(make(tmp_path / name), use)
+        registry.read_source(make(tmp_path / name), use)
 
 
 def test_truncated_sequence_leaves_nothing_behind(tmp_path: Path) -> None:
     source = igs(tmp_path / "a.mha")
     source.write_bytes(source.read_bytes()[:-700])
     with pytest.raises(UserError, match="is the file whole"):
-        registry.write(registry.read(source), tmp_path / "rec", 1.0, {}, lambda done: None)
+        registry.write_recording(registry.read_source(source), tmp_path / "rec", 1.0, {}, lambda done: None)
     assert not any(path.name.startswith("rec") for path in tmp_path.iterdir())

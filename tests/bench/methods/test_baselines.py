@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from bench.methods import baselines, compliance, corotational, inverse
-from bench.tracking.tracking import Method, Scene
+from bench.methods.protocol import Method, Scene
 from evidence.scoring import inverse as inverse_experiment
 from learn.data.clips import Clip
 

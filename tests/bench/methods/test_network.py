@@ -3,39 +3,45 @@
 from __future__ import annotations
 
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 
 from bench.methods.network import Model
-from bench.tracking.tracking import Scene
+from bench.methods.protocol import Scene
 from learn import checkpoint
 from learn.checkpoint import Card
-from learn.data.grid import Scales
+from learn.data.grid import Grid, Scales
+from learn.inference.predict import ForceMap, View
 from learn.network.d2fnet import Architecture
 from learn.network.monai_unet import build
 from learn.settings import preset
 
 
+@pytest.mark.parametrize("young_kpa", [2.0, None])
 @pytest.mark.parametrize("vector", [True, False])
-def test_answer_to_the_rest_frame_is_the_zero(vector: bool) -> None:
-    def predictor(flow: np.ndarray, tissue: object, scale: float, young: object, sure: object) -> object:
-        total = 2.0 + float(flow.sum())
-        return SimpleNamespace(
-            young_kpa=1.0, force_mn=np.array([total, 1.0, 0.0]) if vector else None, total_force_mn=total
-        )
+def test_the_rest_frame_is_the_zero_and_unknown_tissue_has_1_kpa(vector: bool, young_kpa: float | None) -> None:
+    tissue, typical = np.ones((4, 4), bool), 5.0
+    view = View(tissue, 0.1, Grid(16))
+
+    def predictor(flow: np.ndarray, where: object, scale: float, young: float | None, sure: object) -> ForceMap:
+        """Total force of 2 mN and 1 mN a pixel of motion, for each kPa."""
+        per_kpa = np.array([2.0 + float(flow.sum()), 1.0, 0.0])[: 3 if vector else 1]
+        density = np.zeros((len(per_kpa), 16, 16), np.float32)
+        density[:, 8, 8] = (young or typical) * per_kpa / Grid(16).pitch_mm ** 2
+        return ForceMap(density, Grid(16), "density", young or typical, young is not None, view)
 
     model = Model.__new__(Model)
-    model.predictor, model._rest = predictor, None  # type: ignore[assignment]
-    scene = Scene(np.ones((4, 4), bool), 0.1, 1.0)
+    model.predictor, model._reader = predictor, None  # type: ignore[assignment]
+    scene = Scene(tissue, 0.1, young_kpa)
     moved, sure = np.zeros((4, 4, 2), np.float32), np.ones((4, 4), np.float32)
+    young = young_kpa or 1.0
     assert model(moved, sure, scene, False).size_mn == 0
     moved[0, 0, 0] = 3
-    assert model(moved, sure, scene, False).size_mn == pytest.approx(3)
+    assert model(moved, sure, scene, False).size_mn == pytest.approx(3 * young)
     moved[0, 0, 0] = -1
-    assert model(moved, sure, scene, False).force_mn[0] == (-1 if vector else 0)
+    assert model(moved, sure, scene, False).force_mn[0] == pytest.approx(-young if vector else 0)
 
 
 @pytest.mark.parametrize("output", ["magnitude", "vector"])

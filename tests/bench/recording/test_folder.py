@@ -10,33 +10,36 @@ import numpy as np
 import pytest
 from fake_recording import Maker, texture
 
-from bench.recording import csv_table, video, writer
+from bench.recording import csv_table, writer
 from bench.recording.folder import open_recording
+from learn.inference import video
 from synth.errors import UserError
 
 
 def test_variable_frame_rate_keeps_its_times(tmp_path: Path) -> None:
     times = np.array([0, 0.04, 0.08, 0.21, 0.233, 1.0])
-    video.write_video(tmp_path / "v.mp4", iter([texture(32, 48, k) for k in range(6)]), times)
-    got = [picture.time_s for picture in video.from_video(tmp_path / "v.mp4")]
+    writer.write_video(tmp_path / "v.mp4", iter([texture(32, 48, k) for k in range(6)]), times)
+    got = [picture.time_s for picture in video.read_video(tmp_path / "v.mp4")]
     assert got == pytest.approx(times, abs=1e-4)
 
 
 def test_times_of_day_keep_their_microseconds(tmp_path: Path) -> None:
     """Seconds since 1970, as a ROS bag stamps them, need sixteen figures."""
     times = 1.7e9 + np.array([0.0, 0.04, 0.080001])
-    writer.frames(tmp_path, times)
-    writer.force(tmp_path, times, np.eye(3))
-    assert csv_table.read(tmp_path / "frames.csv", ("t_s",))["t_s"] == pytest.approx(times, abs=1e-6, rel=0)
-    read = csv_table.read(tmp_path / "force.csv", ("t_s", "fy_n"))
+    writer.write_frames(tmp_path, times)
+    writer.write_force(tmp_path, times, np.eye(3))
+    assert csv_table.read_csv(tmp_path / "frames.csv", ("t_s",))["t_s"] == pytest.approx(
+        times, abs=1e-6, rel=0
+    )
+    read = csv_table.read_csv(tmp_path / "force.csv", ("t_s", "fy_n"))
     assert read["t_s"] == pytest.approx(times, abs=1e-6, rel=0)
     assert read["fy_n"].tolist() == [0, 1, 0]
 
 
 def test_lossless_video_gives_the_pixels_back(tmp_path: Path) -> None:
     rgb = texture(32, 48)
-    video.write_video(tmp_path / "v.mp4", iter([rgb]), np.zeros(1), crf=0)
-    picture = next(iter(video.from_video(tmp_path / "v.mp4")))
+    writer.write_video(tmp_path / "v.mp4", iter([rgb]), np.zeros(1), crf=0)
+    picture = next(iter(video.read_video(tmp_path / "v.mp4")))
     # 8-bit YCbCr itself rounds by two levels or so.
     assert np.abs(picture.rgb.astype(int) - rgb).max() <= 4
 
@@ -55,7 +58,7 @@ def test_stated_rotation_is_applied(tmp_path: Path) -> None:
     matrix = [0, 0x10000, 0, -0x10000, 0, 0, 32 << 16, 0, 0x40000000]
     data[at : at + 36] = b"".join((v & 0xFFFFFFFF).to_bytes(4, "big") for v in matrix)
     (tmp_path / "r.mp4").write_bytes(data)
-    upright = next(iter(video.from_video(tmp_path / "r.mp4"))).rgb
+    upright = next(iter(video.read_video(tmp_path / "r.mp4"))).rgb
     assert upright.shape == (64, 32, 3)
     assert upright[:8, -8:].mean() > 200  # what was top left is now top right
     assert upright[:8, :8].mean() < 50
@@ -79,12 +82,12 @@ def test_table_names_the_line(tmp_path: Path) -> None:
     file = tmp_path / "t.csv"
     file.write_text("a,b\n1,2\n3,x\n")
     with pytest.raises(UserError, match=r"t\.csv:3: 'x' is not a number"):
-        csv_table.read(file, ("a", "b"))
+        csv_table.read_csv(file, ("a", "b"))
     file.write_text("a,b\n1,2\n3\n")
     with pytest.raises(UserError, match=r"t\.csv:3: 1 cells, 2 expected"):
-        csv_table.read(file, ("a", "b"))
+        csv_table.read_csv(file, ("a", "b"))
     file.write_text("\ufeffA; b\n1;2\n;4\n", encoding="utf-8")
-    got = csv_table.read(file, ("a", "b"))
+    got = csv_table.read_csv(file, ("a", "b"))
     assert got["b"].tolist() == [2, 4]
     assert np.isnan(got["a"][1])
 

@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from bench.cli import app
 from bench.recording.folder import open_recording
-from bench.recording.from_sequence import export
+from bench.recording.from_sequence import export_recording
 from synth.dataset.store import Sequence, Writer, open_sequence
 from synth.errors import UserError
 from synth.job.schema import Job
@@ -44,7 +44,7 @@ def sealed(folder: Path, index: int = 0, frames: int = 4) -> Sequence:
 
 def test_pictures_forces_and_masks_come_back(tmp_path: Path) -> None:
     sequence = sealed(tmp_path)
-    recording = open_recording(export(sequence, tmp_path / "rec"))
+    recording = open_recording(export_recording(sequence, tmp_path / "rec"))
     frames = list(recording.frames())
     assert np.array_equal(np.stack([f.rgb for f in frames]), sequence["rgb"][:])
     assert [f.time_s for f in frames] == pytest.approx(sequence["time"][:])
@@ -61,13 +61,13 @@ def test_pictures_forces_and_masks_come_back(tmp_path: Path) -> None:
 
 
 def test_nothing_of_the_truth_leaks(tmp_path: Path) -> None:
-    folder = export(sealed(tmp_path), tmp_path / "rec")
+    folder = export_recording(sealed(tmp_path), tmp_path / "rec")
     names = {path.relative_to(folder).parts[0] for path in folder.rglob("*")}
     assert names == {"frames", "masks", "force.csv", "frames.csv", "meta.yaml", "tissue.png"}
 
 
 def test_mp4_has_the_size_its_masks_have(tmp_path: Path) -> None:
-    recording = open_recording(export(sealed(tmp_path), tmp_path / "rec", "mp4"))
+    recording = open_recording(export_recording(sealed(tmp_path), tmp_path / "rec", "mp4"))
     first = next(recording.frames()).rgb
     assert first.shape == (32, 48, 3)
     assert recording.tissue_mask((32, 48)).any()
@@ -76,9 +76,9 @@ def test_mp4_has_the_size_its_masks_have(tmp_path: Path) -> None:
 
 def test_never_overwrites(tmp_path: Path) -> None:
     sequence = sealed(tmp_path)
-    export(sequence, tmp_path / "rec")
+    export_recording(sequence, tmp_path / "rec")
     with pytest.raises(UserError, match="exists already"):
-        export(sequence, tmp_path / "rec")
+        export_recording(sequence, tmp_path / "rec")
 
 
 def test_from_dataset_takes_one_or_all(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from fake_recording import Bump, Maker, texture
 
-from bench.recording import check, pixel_scale, video
+from bench.recording import check, pixel_scale, writer
 from bench.recording.folder import open_recording
 from bench.scoring import evaluate_recording
 from synth.errors import UserError
@@ -63,13 +63,13 @@ def picture(name: str, array: np.ndarray) -> Spoil:
 def cut_video(folder: Path) -> None:
     shutil.rmtree(folder / "frames")
     (folder / "frames.csv").unlink()
-    video.write_video(folder / "video.mp4", iter([texture(96, 128)] * 6), np.arange(6) / 10)
+    writer.write_video(folder / "video.mp4", iter([texture(96, 128)] * 6), np.arange(6) / 10)
     whole = (folder / "video.mp4").read_bytes()
     (folder / "video.mp4").write_bytes(whole[: len(whole) // 2])
 
 
 def both(folder: Path) -> None:
-    video.write_video(folder / "video.mp4", iter([texture(96, 128)] * 2), np.arange(2) / 10)
+    writer.write_video(folder / "video.mp4", iter([texture(96, 128)] * 2), np.arange(2) / 10)
 
 
 def no_video(content: bytes) -> Spoil:
@@ -147,9 +147,11 @@ def said(folder: Path) -> str:
     """What scoring says: its error, or the notes of its partial result."""
     try:
         recording = open_recording(folder)
-        found = pixel_scale.find(recording.meta, folder)
+        found = pixel_scale.find_scale(recording.meta, folder)
         settings = evaluate_recording.Settings(backend="dis")
-        result = evaluate_recording.assess(recording, {"bump": Bump()}, "bump", found, settings, {})
+        result = evaluate_recording.evaluate_recording(
+            recording, {"bump": Bump()}, "bump", found, settings, {}
+        )
     except UserError as error:
         return str(error)
     assert len(result.time_s) > 0
@@ -157,7 +159,7 @@ def said(folder: Path) -> str:
 
 
 def test_the_sound_one_has_nothing_bad(sound: Path) -> None:
-    states = {finding.state for finding in check.check(sound)}
+    states = {finding.state for finding in check.check_recording(sound)}
     assert states <= {"ok", "lack"}
 
 
@@ -171,7 +173,7 @@ def test_broken_recording_is_told(sound: Path, tmp_path: Path, name: str) -> Non
     shutil.copytree(sound, folder)
     spoil, words = CASES[name]
     spoil(folder)
-    findings = check.check(folder)
+    findings = check.check_recording(folder)
     heard = said(folder) + " " + " ".join(f"{f.what}: {f.said}" for f in findings)
     assert words in heard, heard
     assert "\n" not in heard

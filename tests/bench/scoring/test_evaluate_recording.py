@@ -11,17 +11,17 @@ from fake_recording import Bump, Maker
 from typer.testing import CliRunner
 
 from bench.cli import app
+from bench.methods.protocol import Answer
 from bench.recording import pixel_scale
 from bench.recording.folder import open_recording
 from bench.scoring import evaluate_recording, metrics, report
 from bench.scoring.evaluate_recording import Result, Settings
-from bench.tracking.tracking import Answer
 
 
 def run(folder: Path, shrink: int = 1) -> Result:
     recording = open_recording(folder)
-    found = pixel_scale.find(recording.meta, folder)
-    return evaluate_recording.assess(
+    found = pixel_scale.find_scale(recording.meta, folder)
+    return evaluate_recording.evaluate_recording(
         recording, {"bump": Bump()}, "bump", found, Settings(shrink=shrink, rate_hz=None), {}
     )
 
@@ -46,8 +46,8 @@ def test_shrunken_flow_keeps_its_unit(make: Maker) -> None:
 def test_fast_footage_is_thinned_and_large_pictures_shrunk(make: Maker) -> None:
     folder = make(frames=13, fps=40.0, size=(96, 640))
     recording = open_recording(folder)
-    found = pixel_scale.find(recording.meta, folder)
-    result = evaluate_recording.assess(recording, {"bump": Bump()}, "bump", found, Settings(), {})
+    found = pixel_scale.find_scale(recording.meta, folder)
+    result = evaluate_recording.evaluate_recording(recording, {"bump": Bump()}, "bump", found, Settings(), {})
     assert result.followed.frame == [0, 4, 8, 12]
     assert result.followed.tissue is not None
     assert result.followed.tissue.shape == (48, 320)
@@ -75,7 +75,7 @@ def test_without_forces_predictions_only(make: Maker, tmp_path: Path) -> None:
     result = run(make(frames=6, force=False))
     assert result.methods["bump"].scores == {}
     assert any("predictions only" in note for note in result.notes)
-    report.write(result, tmp_path / "report.html")
+    report.write_report(result, tmp_path / "report.html")
     page = (tmp_path / "report.html").read_text()
     assert "nothing is scored" in page
     assert 'id="scatter"' not in page
@@ -87,7 +87,7 @@ def test_json_has_no_nan_and_the_page_stands_alone(make: Maker, tmp_path: Path) 
     tree = json.loads((tmp_path / "score.json").read_text(), parse_constant=lambda name: pytest.fail(name))
     assert tree["scores"]["n"] == 12
     assert len(tree["curve"]["predicted_mn"]["bump"]) == 12
-    report.write(result, tmp_path / "report.html")
+    report.write_report(result, tmp_path / "report.html")
     page = (tmp_path / "report.html").read_text()
     assert page.count("plotly.js v") == 1
     for outside in ('src="http', "src='http", 'href="http', "@import"):
@@ -96,7 +96,7 @@ def test_json_has_no_nan_and_the_page_stands_alone(make: Maker, tmp_path: Path) 
 
 def test_page_escapes_what_a_recording_says(make: Maker) -> None:
     result = run(make(frames=5, meta={"specimen": "<script>alert(1)</script>"}))
-    page = report.render(result, "</title><script>alert(2)</script>")
+    page = report.render_report(result, "</title><script>alert(2)</script>")
     assert "<script>alert" not in page
 
 
@@ -108,11 +108,11 @@ def test_a_method_that_loses_says_so(make: Maker) -> None:
     folder = make(frames=15)
     recording = open_recording(folder)
     methods = {"net": Half(), "simple": Bump()}
-    result = evaluate_recording.assess(
-        recording, methods, "net", pixel_scale.find(recording.meta, folder), Settings(), {}
+    result = evaluate_recording.evaluate_recording(
+        recording, methods, "net", pixel_scale.find_scale(recording.meta, folder), Settings(), {}
     )
     assert report.beaten_by(result) == ["simple"]
-    assert "net loses on mean absolute error to: simple" in report.render(result, "t")
+    assert "net loses on mean absolute error to: simple" in report.render_report(result, "t")
 
 
 @pytest.mark.parametrize(
@@ -145,7 +145,7 @@ def test_without_stiffness_only_what_no_factor_changes_is_scored(make: Maker) ->
     assert all(np.isnan(scores[key]) for key in ("mae_mn", "rmse_mn", "ccc", "r2", "gain", "contact_f1"))
     assert set(result.methods["bump"].intervals) == {"r"}
     assert calibrated["mae_mn"] < 10  # the press's gain gives newtons back
-    assert 'id="bland"' not in report.render(result, "t")
+    assert 'id="bland"' not in report.render_report(result, "t")
 
 
 def test_a_contact_ends_where_samples_are_left_out() -> None:
@@ -154,5 +154,5 @@ def test_a_contact_ends_where_samples_are_left_out() -> None:
     force[:5] = 0
     kept = np.ones(100, bool)
     kept[40:60] = False
-    _, events = metrics.everything(time, force, force, 0.0, kept)
+    _, events = metrics.compute_all(time, force, force, 0.0, kept)
     assert [(event["from_s"], event["to_s"]) for event in events] == [(0.5, 3.9), (6.0, 9.9)]

@@ -73,7 +73,7 @@ def test_events_close_short_gaps_and_drop_short_contacts() -> None:
 def test_peak_and_impulse_errors() -> None:
     t = np.arange(0, 5, 0.01)
     x = 100 * np.exp(-((t - 2) ** 2) / 0.1)
-    _, rows = metrics.everything(t, x, 1.2 * x)
+    _, rows = metrics.compute_all(t, x, 1.2 * x)
     assert len(rows) == 1
     assert rows[0]["peak_error"] == pytest.approx(0.2, abs=1e-9)
     assert rows[0]["impulse_error"] == pytest.approx(0.2, abs=1e-9)
@@ -84,10 +84,10 @@ def test_ghosts_are_counted_only_without_contact() -> None:
     t = np.arange(200) / 20
     x = np.where((t > 4) & (t < 6), 100.0, 0.0)
     ghost = x + np.where(t < 2, 30.0, 0.0)
-    scores, _ = metrics.everything(t, x, ghost)
+    scores, _ = metrics.compute_all(t, x, ghost)
     assert scores["ghost_rate"] == pytest.approx(np.mean(t[x == 0] < 2))
     assert scores["ghost_mn"] == pytest.approx(30 * np.mean(t[x == 0] < 2))
-    assert metrics.everything(t, x, x)[0]["contact_f1"] == 1
+    assert metrics.compute_all(t, x, x)[0]["contact_f1"] == 1
 
 
 def test_limits_of_agreement_see_groups_that_share_their_error() -> None:

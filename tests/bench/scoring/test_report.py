@@ -45,10 +45,10 @@ def test_report_in_a_browser(make: Maker, tmp_path: Path) -> None:
     folder = make(frames=8)
     recording = open_recording(folder)
     methods = {"bump": Bump(), "a method with a rather long name": Bump()}
-    result = evaluate_recording.assess(
-        recording, methods, "bump", pixel_scale.find(recording.meta, folder), Settings(), {}
+    result = evaluate_recording.evaluate_recording(
+        recording, methods, "bump", pixel_scale.find_scale(recording.meta, folder), Settings(), {}
     )
-    page = report.render(result, "A title long enough to need two lines on a narrow screen, surely")
+    page = report.render_report(result, "A title long enough to need two lines on a narrow screen, surely")
     probe = tmp_path / "probe.html"
     probe.write_text(_PROBE.format(page=html.escape(page, quote=True)), encoding="utf-8")
     assert BROWSER is not None

@@ -34,7 +34,7 @@ def recording(
 @pytest.mark.parametrize("lag_s", [-0.5, -0.313, -0.1, 0.0, 0.04, 0.2, 0.5])
 @pytest.mark.parametrize("seed", range(3))
 def test_known_lags_within_one_frame(lag_s: float, seed: int) -> None:
-    found = clock_sync.find(*recording(lag_s, seed), search_s=0.7)
+    found = clock_sync.find_offset(*recording(lag_s, seed), search_s=0.7)
     assert found.refused == ""
     assert found.offset_s == pytest.approx(lag_s, abs=1 / 25)
     assert abs(found.offset_s - lag_s) < 5 * max(found.deviation_s, 0.004)
@@ -46,22 +46,24 @@ def test_periodic_presses_are_ambiguous() -> None:
     rng = np.random.default_rng(0)
     force = 100 * np.clip(np.sin(2 * np.pi * 2 * t), 0, None)
     speed = np.abs(np.gradient(100 * np.clip(np.sin(2 * np.pi * 2 * frames), 0, None), 0.04))
-    found = clock_sync.find(frames, speed + rng.normal(0, 40, len(speed)), t, np.stack([force] * 3, 1), 0.6)
+    found = clock_sync.find_offset(
+        frames, speed + rng.normal(0, 40, len(speed)), t, np.stack([force] * 3, 1), 0.6
+    )
     assert found.refused
 
 
 def test_noise_is_refused() -> None:
     frames, _, t, force = recording(0.0)
     speed = np.abs(np.random.default_rng(5).normal(size=len(frames)))
-    assert "correlate by only" in clock_sync.find(frames, speed, t, force, 0.5).refused
+    assert "correlate by only" in clock_sync.find_offset(frames, speed, t, force, 0.5).refused
 
 
 def test_lag_beyond_the_search_is_refused() -> None:
-    assert clock_sync.find(*recording(0.5), search_s=0.3).refused
+    assert clock_sync.find_offset(*recording(0.5), search_s=0.3).refused
 
 
 def test_too_short_a_span_and_a_still_one_are_refused() -> None:
     frames, speed, t, force = recording(0.0)
-    assert "frame intervals" in clock_sync.find(frames[:10], speed[:10], t, force, 0.5).refused
-    assert "nothing moves" in clock_sync.find(frames, 0 * speed, t, force, 0.5).refused
-    assert "cover" in clock_sync.find(frames + 100, speed, t, force, 0.5).refused
+    assert "frame intervals" in clock_sync.find_offset(frames[:10], speed[:10], t, force, 0.5).refused
+    assert "nothing moves" in clock_sync.find_offset(frames, 0 * speed, t, force, 0.5).refused
+    assert "cover" in clock_sync.find_offset(frames + 100, speed, t, force, 0.5).refused

@@ -24,7 +24,7 @@ def test_tare_and_drift_come_off() -> None:
     press = 100 * np.exp(-((t - 5) ** 2))
     raw = Force(t, three(press + 30 + 2 * t))
     about = Sensor(low_pass_hz=None, free_s=((0, 1), (9, 10)))
-    got = force_sensor.process(raw, about, 0.0)
+    got = force_sensor.process_force(raw, about, 0.0)
     assert got.force_mn[:, 0] == pytest.approx(press, abs=1.1)  # constant beyond the spans' middles
     assert got.drift_mn == pytest.approx(18, abs=0.1)
 
@@ -33,7 +33,7 @@ def test_noise_floor_is_the_standard_deviation() -> None:
     rng = np.random.default_rng(0)
     t = np.arange(0, 20, 0.01)
     raw = Force(t, rng.normal(0, 3, (len(t), 3)))
-    got = force_sensor.process(raw, Sensor(low_pass_hz=None, free_s=((0, 20),)), 0.0)
+    got = force_sensor.process_force(raw, Sensor(low_pass_hz=None, free_s=((0, 20),)), 0.0)
     assert got.noise_floor_mn == pytest.approx(3 * np.sqrt(3), rel=0.03)
 
 
@@ -42,17 +42,17 @@ def test_gravity_of_what_hangs_on_a_turning_tool() -> None:
     down = np.stack([np.sin(t), np.zeros_like(t), np.cos(t)], axis=1)
     on_tool = -three(50 * np.exp(-((t - 2) ** 2))) + 20 * force_sensor.STANDARD_GRAVITY * down
     raw = Force(t, -on_tool, down)  # the reader has turned the sign: force on the tissue
-    got = force_sensor.process(raw, Sensor(acts_on="tool", mass_g=20, low_pass_hz=None), 0.0)
+    got = force_sensor.process_force(raw, Sensor(acts_on="tool", mass_g=20, low_pass_hz=None), 0.0)
     assert got.force_mn == pytest.approx(three(50 * np.exp(-((t - 2) ** 2))), abs=1e-9)
     with pytest.raises(UserError, match="gx, gy, gz"):
-        force_sensor.process(Force(t, -on_tool), Sensor(mass_g=20), 0.0)
+        force_sensor.process_force(Force(t, -on_tool), Sensor(mass_g=20), 0.0)
 
 
 @pytest.mark.parametrize("causal", [False, True])
 def test_low_pass_delays_only_when_causal(causal: bool) -> None:
     t = np.arange(0, 20, 0.005)
     raw = Force(t, three(np.sin(2 * np.pi * t) + np.sin(2 * np.pi * 40 * t)))
-    got = force_sensor.process(raw, Sensor(low_pass_hz=8), 0.0, causal=causal).force_mn[:, 0]
+    got = force_sensor.process_force(raw, Sensor(low_pass_hz=8), 0.0, causal=causal).force_mn[:, 0]
     inner = slice(800, -800)
     shifts = np.arange(-40, 100)
     fit = [np.mean((got[inner] - np.sin(2 * np.pi * (t[inner] - s * 0.001))) ** 2) for s in shifts]
@@ -67,8 +67,8 @@ def test_low_pass_delays_only_when_causal(causal: bool) -> None:
 
 def test_frames_in_a_hole_have_no_truth() -> None:
     t = np.concatenate([np.arange(0, 1, 0.01), np.arange(2, 3, 0.01)])
-    got = force_sensor.process(Force(t, three(t)), Sensor(low_pass_hz=None), 0.5)
-    at = force_sensor.at(got, np.array([0.2, 0.75, 2.0, 2.75]))
+    got = force_sensor.process_force(Force(t, three(t)), Sensor(low_pass_hz=None), 0.5)
+    at = force_sensor.force_at(got, np.array([0.2, 0.75, 2.0, 2.75]))
     assert np.isnan(at[0]).all()  # before the sensor began: its clock is moved by 0.5 s
     assert at[1, 0] == pytest.approx(0.25)
     assert np.isnan(at[2]).all()
@@ -84,7 +84,7 @@ def test_checkerboard_scale(tmp_path: Path) -> None:
     about = Meta.model_validate(
         {"calibration": {"checkerboard": "board.png", "corners": [columns, rows], "square_mm": 2.0}}
     )
-    found = pixel_scale.find(about, tmp_path)
+    found = pixel_scale.find_scale(about, tmp_path)
     assert found.mm_per_px == pytest.approx(2.0 / square, rel=0.005)
     assert found.uncertainty < 0.01
     worse = Meta.model_validate(
@@ -94,11 +94,11 @@ def test_checkerboard_scale(tmp_path: Path) -> None:
         }
     )
     with pytest.raises(UserError, match="no checkerboard"):
-        pixel_scale.find(worse, tmp_path)
+        pixel_scale.find_scale(worse, tmp_path)
 
 
 def test_scale_of_a_bar_knows_its_error() -> None:
     about = Meta.model_validate({"calibration": {"bar_px": [[10, 10], [110, 10]], "bar_mm": 5}})
-    found = pixel_scale.find(about, Path())
+    found = pixel_scale.find_scale(about, Path())
     assert found.mm_per_px == pytest.approx(0.05)
     assert found.uncertainty == pytest.approx(np.sqrt(2) / 100)

@@ -1,14 +1,20 @@
-"""Flow in a process of its own: the same answers, and errors that arrive."""
+"""Flow in a process of its own: the same answers, errors that arrive, and an end whatever happens."""
 
 from __future__ import annotations
 
 import os
 import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import closing
 
 import numpy as np
 import pytest
 
-from bench.tracking.flow_process import Beside, Here
+from bench.tracking.flow_process import FlowProcess
+from learn.inference.video_flow import FlowHere
 from synth.errors import UserError
 
 
@@ -19,39 +25,55 @@ def pictures() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return rest, np.roll(rest, 2, axis=1), free
 
 
-def test_the_same_flow_in_both_places() -> None:
+@pytest.fixture
+def elsewhere() -> Iterator[FlowProcess]:
+    with closing(FlowProcess()) as flow:
+        yield flow
+
+
+def test_the_same_flow_in_both_places(elsewhere: FlowProcess) -> None:
     rest, moved, free = pictures()
-    beside = Beside()
     found = []
-    try:
-        for flow in (Here(), beside):
-            flow.begin("dis", rest, free, ~free)
-            flow.ask(moved, free)
-            first = flow.answer()
-            flow.ask(rest, free)
-            found.append((first, flow.answer()))
-    finally:
-        beside.close()
+    for flow in (FlowHere(), elsewhere):
+        flow.begin("dis", rest, free, ~free)
+        asked = [flow.ask(picture, free) for picture in (moved, rest)]
+        found.append([answer() for answer in asked])
     for here, there in zip(*found, strict=True):
         np.testing.assert_array_equal(here.flow, there.flow)
         np.testing.assert_array_equal(here.confidence, there.confidence)
+        assert here.trusted == there.trusted
     assert np.abs(found[0][0].flow).max() > 1
     assert found[1][0].peak_bytes > 1e7
 
 
-def test_errors_of_the_flow_arrive_and_its_end_is_said() -> None:
+def test_errors_of_the_flow_arrive_and_its_end_is_said(elsewhere: FlowProcess) -> None:
     rest, moved, free = pictures()
-    beside = Beside()
-    try:
-        with pytest.raises(UserError, match="no estimator"):
-            beside.begin("nonesuch", rest, free, ~free)
-        beside.begin("dis", rest, free, ~free)
-        beside.ask(moved[:-1], free)
-        with pytest.raises(UserError, match="does not fit"):
-            beside.answer()
-        os.kill(beside._process.pid, signal.SIGKILL)
-        beside._process.wait()
-        with pytest.raises(UserError, match="ended"):
-            beside.ask(moved, free)
-    finally:
-        beside.close()
+    with pytest.raises(UserError, match="no estimator"):
+        elsewhere.begin("nonesuch", rest, free, ~free)
+    elsewhere.begin("dis", rest, free, ~free)
+    with pytest.raises(UserError, match="does not fit"):
+        elsewhere.ask(moved[:-1], free)()
+    worker = elsewhere._pool.submit(os.getpid).result()
+    os.kill(worker, signal.SIGINT)  # a terminal's Ctrl-C reaches every process; this one is closed instead
+    assert np.abs(elsewhere.ask(moved, free)().flow).max() > 1
+    os.kill(worker, signal.SIGKILL)
+    with pytest.raises(UserError, match="ended"):
+        elsewhere.ask(moved, free)()
+
+
+def test_it_does_not_outlive_a_killed_parent() -> None:
+    script = (
+        "import os, time; from bench.tracking.flow_process import FlowProcess; flow = FlowProcess();"
+        "print(flow._pool.submit(os.getpid).result(), flush=True); time.sleep(60)"
+    )
+    parent = subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True)
+    assert parent.stdout is not None
+    worker = int(parent.stdout.readline())
+    os.kill(worker, 0)
+    parent.kill()
+    parent.wait()
+    parent.stdout.close()
+    deadline = time.monotonic() + 20
+    while os.path.exists(f"/proc/{worker}") and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert not os.path.exists(f"/proc/{worker}")

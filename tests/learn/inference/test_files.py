@@ -18,11 +18,12 @@ from learn.checkpoint import Card, save_tensors, write_card
 from learn.cli import app
 from learn.data.clips import Clip
 from learn.data.grid import Grid
-from learn.inference import video_flow
-from learn.inference.apply import motions
+from learn.inference.apply import Filmed, motions
 from learn.inference.export import examples, export
 from learn.inference.predict import load as load_model
 from learn.inference.stiffness import stiffness
+from learn.inference.video import read_video
+from learn.inference.video_flow import Footage, Settings, VideoFlow
 from learn.network.d2fnet import D2FNet
 from learn.network.monai_unet import build
 from learn.settings import override, preset
@@ -133,9 +134,10 @@ def test_a_video_is_followed_and_predicted(model: Path, tmp_path: Path) -> None:
     with np.load(tmp_path / "film.npz") as found:
         assert found["total_force_mn"].shape == (3,)
         assert found["young_known"]
-    seen = list(video_flow.steps(tmp_path / "film.mp4", marked > 0, "dis"))
-    assert np.abs(seen[0][0]).max() == 0
-    np.testing.assert_allclose(seen[2][0][16:32, 16:48].mean((0, 1)), [2, 0], atol=0.3)
+    footage = Footage(lambda: read_video(tmp_path / "film.mp4"), "film", lambda size: marked > 0)
+    seen = [step.found.flow for step in VideoFlow(footage, Settings("dis", rate_hz=None)).steps()]
+    assert np.abs(seen[0]).max() == 0
+    np.testing.assert_allclose(seen[2][16:32, 16:48].mean((0, 1)), [2, 0], atol=0.3)
 
 
 def test_films_that_are_none(tmp_path: Path) -> None:
@@ -145,12 +147,12 @@ def test_films_that_are_none(tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "black.png"), np.zeros((48, 64), np.uint8))
     for name, mask, message in (
         ("torn.mp4", None, "not a readable video"),
-        ("film.mp4", "small.png", "4 x 4, film.mp4 is 64 x 48"),
+        ("film.mp4", "small.png", "4 x 4, the video is 64 x 48"),
         ("film.mp4", "black.png", "marks no tissue"),
         ("film.mp4", "missing.png", "not a readable picture"),
     ):
         with pytest.raises(UserError, match=message):
-            video_flow.tissue(tmp_path / name, tmp_path / mask if mask else None)
+            next(motions(tmp_path / name, "recovered", Filmed(0.1, tmp_path / mask if mask else None)))
 
 
 def test_stiffness_from_a_press(clips: list[Clip], dataset: Path, tmp_path: Path) -> None:

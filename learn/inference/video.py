@@ -1,10 +1,9 @@
-"""Pictures with exact times, one at a time, from a video file or a folder of PNGs."""
+"""Pictures with exact times, one at a time, from a video file or a folder of PNGs: the one reader."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from fractions import Fraction
 from pathlib import Path
 
 import av
@@ -13,6 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from synth.errors import UserError
+
+SUFFIXES = (".mp4", ".mov", ".mkv", ".avi", ".webm", ".m4v")
 
 Rgb = NDArray[np.uint8]
 
@@ -31,7 +32,7 @@ class Picture:
     """(H, W, 3) uint8."""
 
 
-def from_video(path: Path) -> Iterator[Picture]:
+def read_video(path: Path) -> Iterator[Picture]:
     """Decodes frame by frame; times are the container's presentation times, first frame as stored.
 
     A rotation stated in the file is applied. A file cut off in the middle gives the frames before the cut.
@@ -67,7 +68,7 @@ def from_video(path: Path) -> Iterator[Picture]:
             raise UserError(f"{path}: holds no frames")
 
 
-def stated_frames(path: Path) -> int | None:
+def count_frames(path: Path) -> int | None:
     """Number of frames that the container states; None if it doesn't. UserError if it is no video."""
     try:
         with av.open(str(path)) as container:
@@ -76,7 +77,7 @@ def stated_frames(path: Path) -> int | None:
         raise UserError(f"{path}: not a readable video ({_reason(error)})") from None
 
 
-def from_pictures(paths: tuple[Path, ...]) -> Iterator[Picture]:
+def read_pictures(paths: tuple[Path, ...]) -> Iterator[Picture]:
     """PNG (or any still OpenCV reads) files in the given order, without times.
 
     Raises:
@@ -105,30 +106,12 @@ def read_picture(path: Path) -> Rgb:
     return np.ascontiguousarray(bgr[..., ::-1]).astype(np.uint8)
 
 
-def write_video(path: Path, pictures: Iterator[Rgb], times_s: NDArray[np.float64], crf: int = 12) -> None:
-    """H.264 MP4 with each frame at its own time, in milliseconds; odd sizes lose their last row or column.
-
-    Args:
-        pictures: (H, W, 3) uint8 each, as many as `times_s`.
-        times_s: (T,) rising [s].
-        crf: x264's quality, 0 is lossless (4:4:4 colour).
-    """
-    with av.open(str(path), "w") as container:
-        rate = (
-            max(1, round((len(times_s) - 1) / max(times_s[-1] - times_s[0], 1e-3))) if len(times_s) > 1 else 1
-        )
-        stream = container.add_stream("libx264", rate=rate, options={"crf": str(crf), "threads": "1"})
-        stream.codec_context.time_base = stream.time_base = Fraction(1, 90_000)
-        stream.pix_fmt = "yuv444p" if crf == 0 else "yuv420p"
-        for k, (rgb, time) in enumerate(zip(pictures, times_s, strict=True)):
-            even = rgb[: rgb.shape[0] // 2 * 2, : rgb.shape[1] // 2 * 2]
-            if k == 0:
-                stream.height, stream.width = even.shape[:2]
-            frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(even), format="rgb24")
-            frame.pts = round(float(time - times_s[0]) * 90_000)
-            frame.time_base = Fraction(1, 90_000)
-            container.mux(stream.encode(frame))
-        container.mux(stream.encode())
+def read_mask(path: Path, size: tuple[int, int]) -> NDArray[np.bool_]:
+    """(H, W) where the picture is white. UserError if it is unreadable or not of that height and width."""
+    mask = read_picture(path)[..., 0] > 127
+    if mask.shape != size:
+        raise UserError(f"{path}: {mask.shape[1]} x {mask.shape[0]}, the video is {size[1]} x {size[0]}")
+    return np.asarray(mask, bool)
 
 
 def _reason(error: Exception) -> str:

@@ -1,0 +1,50 @@
+"""What a method is: displacement to force, frame by frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What stays the same over a recording, on the pixels flow is computed on."""
+
+    tissue: NDArray[np.bool_]
+    """(H, W)."""
+    scale_mm_per_px: float
+    young_kpa: float | None
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What a method says of one frame."""
+
+    force_mn: NDArray[np.float64]
+    """(3,) force on the tissue in camera axes [mN]; a method of magnitudes only puts it into x, rest NaN."""
+    density: NDArray[np.float32] | None = None
+    """(H, W) size of the force density on the rest frame's pixels [kPa], for the pictures."""
+
+    @property
+    def size_mn(self) -> float:
+        return float(np.sqrt(np.nansum(self.force_mn**2)))
+
+
+class Method(Protocol):
+    """Displacement to force, frame by frame."""
+
+    def __call__(
+        self, flow: NDArray[np.float32], confidence: NDArray[np.float32], scene: Scene, picture: bool
+    ) -> Answer:
+        """Force of one frame.
+
+        Args:
+            flow: (H, W, 2) px from the rest frame.
+            confidence: (H, W) in 0..1.
+            scene: the recording's constants.
+            picture: whether `density` is wanted.
+        """
+        ...
