@@ -117,7 +117,7 @@ def load(entry: Command) -> Any:
     Raises:
         ImportError, AttributeError: the entry names what isn't there (a test loads every entry).
     """
-    single = typer.Typer(add_completion=False)
+    single = typer.Typer(add_completion=False, rich_markup_mode=None)
     single.command(entry.name, epilog=f"Example: bench {entry.group} {entry.name} {entry.example}")(
         getattr(import_module(entry.module), entry.function)
     )

@@ -32,7 +32,7 @@ class Spring:
         return Answer(np.array([size, np.nan, np.nan]))  # a magnitude: no direction
 
 
-def score(recording: Path) -> evaluate_recording.Result:
+def score_springs(recording: Path) -> evaluate_recording.Result:
     """The recording's scores under two springs."""
     opened = open_recording(recording)
     methods = {"spring": Spring(60.0), "stiffer": Spring(120.0)}
@@ -43,6 +43,6 @@ def score(recording: Path) -> evaluate_recording.Result:
 
 
 if __name__ == "__main__":
-    for name, method in score(Path(sys.argv[1])).methods.items():
+    for name, method in score_springs(Path(sys.argv[1])).methods.items():
         scores = method.scores
         print(f"{name}: r {scores['r']:.2f}, mean error {scores['mae_mn']:.2f} mN")

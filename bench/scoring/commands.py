@@ -26,8 +26,6 @@ MAIN = "D2FNet"
 """Name under which the given model stands in every table."""
 _LONG = 100
 """Frames from which a second process is worth the seconds that it takes to start."""
-_MANY = 300
-"""Frames from which a quick network is: it gains what it takes on 65 to 130 frames looked at."""
 
 
 def score_recording(
@@ -61,10 +59,10 @@ def score_recording(
     total = opened.expected_frames()
     # Started first, for it takes seconds to begin; the methods are fitted meanwhile.
     with closing(FlowProcess()) if _worth_a_process(total) else nullcontext() as flow:
-        quick = (total or 0) >= _MANY
-        network = Model(model, quick)
+        # Quick as in `learn predict`: to the last digit the same network.
+        network = Model(model, quick=True)
         methods: dict[str, Method] = {MAIN: network}
-        methods |= {name: Model(folder, quick) for name, folder in (also or {}).items()}
+        methods |= {name: Model(folder, quick=True) for name, folder in (also or {}).items()}
         methods |= fit_baselines(train, model)
         found = pixel_scale.find_scale(opened.meta, recording)
         with counting(f"scoring {opened.name}", total) as progress:

@@ -30,7 +30,7 @@ class FlowProcess:
 
     def __init__(self) -> None:
         self._pool = ProcessPoolExecutor(1, mp_context=get_context("spawn"), initializer=_set_up)
-        # The other process inherits that Ctrl-C is held back: it is for this one, which then closes the other.
+        # The other process inherits that Ctrl-C is held back: it is for this one, which closes the other.
         before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         try:
             self._pool.submit(os.getpid)  # a first task starts it

@@ -12,7 +12,7 @@ from learn.data.clips import Clip
 from learn.data.grid import Grid, Resampler, centre
 from synth.dataset.store import Sequence
 from synth.flow.estimator import Estimator
-from synth.flow.track import Tracker
+from synth.flow.track import track
 
 
 def refollow(
@@ -31,13 +31,11 @@ def refollow(
     scale = float(sequence.attrs["scale_mm_per_px"])
     resample = Resampler((tissue.shape[0], tissue.shape[1]), scale, centre(tissue), grid)
     moved, confidence = np.zeros_like(clip.displacement["ideal"]), np.ones_like(clip.confidence)
-    rgb, spent = sequence["rgb"], 0.0
-    tracker = Tracker(estimator, rgb[0], blocked[0], tissue)
+    rgb, began = sequence["rgb"][: clip.frames], time.process_time()
+    followed = track(estimator, rgb, blocked[: clip.frames], tissue)
+    spent = time.process_time() - began
     for t in range(1, clip.frames):
-        picture, began = rgb[t], time.process_time()
-        flow, sure = tracker.step(picture, blocked[t])
-        spent += time.process_time() - began
-        moved[t] = resample.mean(flow.transpose(2, 0, 1) * scale, tissue) * clip.mask
-        confidence[t] = resample.mean(sure, tissue) * clip.mask
+        moved[t] = resample.mean(followed.flow[t].transpose(2, 0, 1) * scale, tissue) * clip.mask
+        confidence[t] = resample.mean(followed.confidence[t], tissue) * clip.mask
     found = {**clip.displacement, "recovered": moved}
     return replace(clip, displacement=found, confidence=confidence), spent

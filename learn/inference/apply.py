@@ -59,7 +59,7 @@ class Filmed:
     scale_mm_per_px: float | None = None
     tissue: Path | None = None
     """A picture, white where there is tissue; everywhere if not given."""
-    settings: Settings = Settings()
+    settings: Settings = field(default_factory=Settings)
     """How it is followed."""
 
 

@@ -1,5 +1,4 @@
-"""From a network's answer to a force: the zero taken off, and what holds where E is unknown. For `learn predict`
-and the bench alike."""
+"""From a network's answer to a force, for `learn predict` and the bench alike: the zero, and an unknown E."""
 
 from __future__ import annotations
 
@@ -16,7 +15,7 @@ class Reading:
     """One frame's force."""
 
     force_mn: NDArray[np.float64]
-    """(3,) total force on the tissue in camera axes [mN]; of a model without direction its size in x, rest NaN."""
+    """(3,) total force on the tissue in camera axes [mN]; a model without direction: size in x, rest NaN."""
     map: ForceMap
     """As the model says it, nothing taken off."""
 
@@ -28,9 +27,9 @@ class Reading:
 class ForceReader:
     """Reads the frames of one video.
 
-    What the model says of the rest frame, where nothing has moved, is taken off the total force, as a sensor's
-    tare is. Without a known E forces are those of tissue of 1 kPa: the model's own typical E would make the
-    number depend on its training data.
+    What the model says of the rest frame, where nothing has moved, is taken off the total force, as a
+    sensor's tare is. Without a known E forces are those of tissue of 1 kPa: the model's own typical E would
+    make the number depend on its training data.
     """
 
     def __init__(

@@ -1,6 +1,7 @@
 """Video to displacement: decode, shrink, mask, track.
 
-The one loop of `learn predict`, `bench score` and `bench live`. Displacement is that of the tissue from the rest frame, on the rest frame's pixels.
+The one loop of `learn predict`, `bench score` and `bench live`. Displacement is that of the tissue from the
+rest frame, on the rest frame's pixels.
 """
 
 from __future__ import annotations

@@ -10,7 +10,7 @@ import av
 import cv2
 import numpy as np
 import pytest
-import torch
+from fake_model import write_model
 from scipy.ndimage import map_coordinates
 from typer.testing import CliRunner
 
@@ -25,13 +25,8 @@ from bench.tracking import live
 from bench.tracking.tracking import track_recording
 from evidence.flow.measure import MeanInpainting, against, divergence, measure
 from evidence.flow.scenes import CLEAN, Recipe, Stage, inverse, pairs, pull_field
-from learn.checkpoint import Card, save_tensors, write_card
-from learn.data.grid import Scales
 from learn.inference.video import Picture
 from learn.inference.video_flow import Footage, Settings
-from learn.network.d2fnet import D2FNet
-from learn.network.monai_unet import build
-from learn.settings import override, preset
 from synth.errors import UserError
 from synth.flow.opencv import Dis
 
@@ -152,6 +147,15 @@ def test_bench_flow_scores_a_pair(tmp_path: Path) -> None:
     )
 
 
+def test_bench_flow_without_a_truth_answers_in_json_too(tmp_path: Path) -> None:
+    for name in ("a.png", "b.png"):
+        cv2.imwrite(str(tmp_path / name), np.full((32, 32, 3), 90, np.uint8))
+    out = tmp_path / "out.flo"
+    words = ["flow", str(tmp_path / "a.png"), str(tmp_path / "b.png"), "--flow", "dis", "--json"]
+    assert json.loads(CliRunner().invoke(app, [*words, "-o", str(out)]).stdout) == {"out": str(out)}
+    assert json.loads(CliRunner().invoke(app, words).stdout) == {"out": None}
+
+
 def test_stream_answers_every_frame_and_says_what_it_cost() -> None:
     (pair,) = pairs(Recipe(size=64, pull=2.0, tool=0.0), 1, 3)
     shown = [Picture(k, k / 25, pair.rest if k % 2 == 0 else pair.now) for k in range(5)]
@@ -200,17 +204,7 @@ def test_live_runs_on_a_video_and_refuses_what_is_none(tmp_path: Path) -> None:
 
 @pytest.fixture
 def model(tmp_path: Path) -> Path:
-    """A model folder as training leaves it, of an untrained network with weights that say something."""
-    settings = override(preset("tiny"), ["size=32", "arch.levels=2"])
-    torch.manual_seed(0)
-    net = build(settings.arch).eval()
-    assert isinstance(net, D2FNet)
-    with torch.no_grad():
-        for conv in net.heads.ranges:  # type: ignore[union-attr]
-            conv.weight.normal_(0, 200.0)  # type: ignore[union-attr,operator]
-    write_card(tmp_path / "model", Card(settings, Scales(1.0, 0.2, 1.0, 100.0, 0.3), 1.0, {}, {}))
-    save_tensors(tmp_path / "model" / "weights.pt", net.state_dict())
-    return tmp_path / "model"
+    return write_model(tmp_path / "model")
 
 
 def test_live_answers_with_the_forces_that_scoring_finds(tmp_path: Path, model: Path) -> None:

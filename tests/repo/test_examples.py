@@ -61,7 +61,7 @@ def test_a_flow_back_end_of_ones_own(out: Path) -> None:
 def test_a_method_of_ones_own(out: Path, tmp_path: Path) -> None:
     from bench.recording.from_sequence import export_recording
 
-    found = own_method.score(export_recording(Dataset(out)[0], tmp_path / "recording")).methods
+    found = own_method.score_springs(export_recording(Dataset(out)[0], tmp_path / "recording")).methods
     assert found["spring"].scores["r"] == pytest.approx(0.99, abs=0.01)
     assert found["spring"].scores["mae_mn"] == pytest.approx(0.98, rel=0.1)
     assert found["stiffer"].scores["r"] == pytest.approx(found["spring"].scores["r"], abs=1e-6)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shlex
 
 import pytest
@@ -36,6 +37,22 @@ def test_it_says_what_it_does_and_what_its_parameters_mean(spoken: Spoken) -> No
         one.name for one in spoken.command.params if one.name != "help" and not (one.help or "").strip()
     ]
     assert not silent, f"parameters without help: {silent}"
+
+
+@pytest.mark.parametrize("spoken", SPOKEN, ids=_name)
+def test_units_in_brackets_reach_the_reader(spoken: Spoken, capsys: pytest.CaptureFixture[str]) -> None:
+    """Rich reads `[kPa]` as markup, and shows nothing."""
+    context = spoken.command.make_context(spoken.words[-1], [], resilient_parsing=True)
+    print(spoken.command.get_help(context))
+    seen = capsys.readouterr().out
+    texts = [spoken.command.help or "", *(getattr(one, "help", None) or "" for one in spoken.command.params)]
+    for unit in re.findall(r"\[[^\]]+\]", " ".join(texts)):
+        assert "".join(unit.split()) in "".join(seen.split()), unit
+
+
+def test_there_are_units_in_brackets() -> None:
+    young = next(one for spoken in DOING for one in spoken.command.params if one.name == "young")
+    assert "[kPa]" in young.help
 
 
 @pytest.mark.parametrize("spoken", DOING, ids=_name)

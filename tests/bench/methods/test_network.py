@@ -21,11 +21,15 @@ from learn.settings import preset
 
 @pytest.mark.parametrize("young_kpa", [2.0, None])
 @pytest.mark.parametrize("vector", [True, False])
-def test_the_rest_frame_is_the_zero_and_unknown_tissue_has_1_kpa(vector: bool, young_kpa: float | None) -> None:
+def test_the_rest_frame_is_the_zero_and_unknown_tissue_has_1_kpa(
+    vector: bool, young_kpa: float | None
+) -> None:
     tissue, typical = np.ones((4, 4), bool), 5.0
     view = View(tissue, 0.1, Grid(16))
 
-    def predictor(flow: np.ndarray, where: object, scale: float, young: float | None, sure: object) -> ForceMap:
+    def predictor(
+        flow: np.ndarray, where: object, scale: float, young: float | None, sure: object
+    ) -> ForceMap:
         """Total force of 2 mN and 1 mN a pixel of motion, for each kPa."""
         per_kpa = np.array([2.0 + float(flow.sum()), 1.0, 0.0])[: 3 if vector else 1]
         density = np.zeros((len(per_kpa), 16, 16), np.float32)

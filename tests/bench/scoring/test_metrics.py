@@ -100,3 +100,15 @@ def test_limits_of_agreement_see_groups_that_share_their_error() -> None:
     # Two groups only, in which plain pooling would see almost no spread between: theirs counts once each.
     pair = metrics.limits_of_agreement(np.repeat([0.0, 10.0], 50), np.repeat([0, 1], 50))
     assert pair["high_mn"] - pair["low_mn"] == pytest.approx(2 * 1.96 * np.sqrt(50), rel=0.02)
+
+
+def test_every_score_is_declared_and_every_declared_one_is_computed() -> None:
+    t = np.arange(200) / 20
+    x = 100 * np.clip(np.sin(t), 0, None)
+    scores, _ = metrics.compute_all(t, x, 1.1 * x)
+    assert set(scores) == set(metrics.METRICS)
+    assert [key for key, metric in metrics.METRICS.items() if key != metric.key] == []
+    # What is said not to feel a factor does not.
+    twice, _ = metrics.compute_all(t, x, 2.2 * x)
+    for key in metrics.RELATIVE:
+        assert twice[key] == pytest.approx(scores[key]), key

@@ -1,0 +1,62 @@
+"""One video, one number: what `learn predict` says of it is what `bench score` scores."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from fake_model import write_model
+from fake_recording import Maker
+from typer.testing import CliRunner
+
+import bench.cli
+import learn.cli
+from bench.scoring import commands
+
+FPS, SIZE = 25.0, (96, 704)
+
+
+@pytest.mark.parametrize(("output", "young"), [("vector", 2.0), ("magnitude", 2.0), ("vector", None)])
+def test_predict_and_score_agree_at_every_frame(
+    output: str, young: float | None, make: Maker, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    loss = ["objective.kind=mse"] if output == "vector" else []
+    model = write_model(tmp_path / "model", f"arch.output={output}", *loss)
+    known = {"young_kpa": "unknown" if young is None else young}
+    folder = make(frames=13, fps=FPS, size=SIZE, footage="mp4", meta=known)
+    marked = np.zeros(SIZE, np.uint8)
+    marked[8:-8, 40:-90] = 255
+    cv2.imwrite(str(folder / "tissue.png"), marked)
+    # The other methods are slow, and no part of the question.
+    monkeypatch.setattr(commands, "fit_baselines", lambda train, model: {})
+
+    words = [str(model), str(folder / "video.mp4"), "--scale", "0.2", "--tissue", str(folder / "tissue.png")]
+    words += [] if young is None else ["--young", str(young)]
+    words += ["-o", str(tmp_path / "forces"), "--flow", "dis", "--json"]
+    said = CliRunner().invoke(learn.cli.app, ["predict", *words])
+    assert said.exit_code == 0, said.output
+    words = [str(folder), "--model", str(model), "-o", str(tmp_path / "score"), "--flow", "dis", "--json"]
+    scored = CliRunner().invoke(bench.cli.app, ["score", *words])
+    assert scored.exit_code == 0, scored.output
+
+    curve = json.loads((tmp_path / "score" / "score.json").read_text())["curve"]
+    with np.load(tmp_path / "forces" / "video.npz") as found:
+        # Every third of 25 frames a second, as close to ten as whole frames come; half as large as filmed.
+        assert found["frame"].tolist() == curve["frame"]
+        assert 4 <= len(curve["frame"]) < 13
+        assert found["time_s"] == pytest.approx(np.array(curve["t_s"]), abs=1e-6)
+        size = np.array(curve["predicted_mn"]["D2FNet"])
+        largest = size.max()
+        assert size[0] < 1e-6 * largest, "nothing has moved in the rest frame"
+        assert np.ptp(size[1:]) > 0.1 * largest, "a network that says nothing proves nothing"
+        assert found["total_force_mn"] == pytest.approx(size, rel=1e-6, abs=1e-8)
+        if output == "vector":
+            axes = np.array(curve["predicted_axes_mn"]["D2FNet"])
+            assert found["force_mn"] == pytest.approx(axes, rel=1e-6, abs=1e-8)
+        assert found["young_kpa"] == (young or 1.0)
+        assert bool(found["young_known"]) == (young is not None)
+        middle = np.argwhere(marked > 0).mean(axis=0)[::-1]
+        assert found["centre_px"] == pytest.approx(middle, abs=0.5)

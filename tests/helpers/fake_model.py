@@ -1,0 +1,27 @@
+"""A model folder as training leaves it, of an untrained network with weights that say something."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+
+from learn.checkpoint import Card, save_tensors, write_card
+from learn.data.grid import Scales
+from learn.network.d2fnet import D2FNet
+from learn.network.monai_unet import build
+from learn.settings import override, preset
+
+
+def write_model(folder: Path, *changes: str) -> Path:
+    """The folder; `changes` as on the command line, e.g. `arch.output=vector`."""
+    settings = override(preset("tiny"), ["size=32", "arch.levels=2", *changes])
+    torch.manual_seed(0)
+    net = build(settings.arch).eval()
+    assert isinstance(net, D2FNet)
+    with torch.no_grad():
+        for conv in net.heads.ranges:  # type: ignore[union-attr]
+            conv.weight.normal_(0, 200.0)  # type: ignore[union-attr,operator]
+    write_card(folder, Card(settings, Scales(1.0, 0.2, 1.0, 100.0, 0.3), 1.7, {}, {}))
+    save_tensors(folder / "weights.pt", net.state_dict())
+    return folder
