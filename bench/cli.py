@@ -269,6 +269,8 @@ def live(
     """Masks, flow and force of a video as it runs: latency percentiles and dropped frames."""
     from bench.methods.network import Model
     from bench.tracking import live as stream
+    from learn.inference.video import read_video
+    from learn.inference.video_flow import FPS, Footage
 
     method = None if model is None else Model(model)
 
@@ -280,7 +282,7 @@ def live(
         )
 
     account = stream.watch_video(
-        video,
+        Footage(read_video(video), str(video), fps=FPS),
         backend=flow,
         method=method,
         scale_mm_per_px=scale,

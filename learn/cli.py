@@ -246,7 +246,7 @@ def predict_command(
         if not json:
             count = len(found["total_force_mn"])
             _console.print(f"{motion.name}: {count} frames, peak force {peaks[motion.name]:.3g} mN")
-            for note in motion.notes:
+            for note in motion.notes():
                 _console.print(f"note: {note}", style="yellow", markup=False, highlight=False)
     if json:
         print(json_.dumps({"out": str(out), "peak_force_mn": peaks}))

@@ -10,9 +10,7 @@ from numpy.typing import NDArray
 
 from synth.errors import UserError
 
-_MAGIC = 202021.25
 _UNKNOWN = 1e9  # px: Middlebury marks what isn't known by larger values
-_LARGEST = 1 << 15
 
 Floats = NDArray[np.float32]
 Flags = NDArray[np.bool_]
@@ -40,10 +38,8 @@ def write_flow(path: Path, flow: Floats, known: Flags | None = None) -> None:
     """
     known = np.ones(flow.shape[:2], bool) if known is None else known
     if path.suffix.lower() == ".flo":
-        height, width = known.shape
-        body = np.where(known[..., None], flow, 10 * _UNKNOWN).astype("<f4")
-        header = np.array([_MAGIC], "<f4").tobytes() + np.array([width, height], "<i4").tobytes()
-        path.write_bytes(header + body.tobytes())
+        marked = np.where(known[..., None], flow, 10 * _UNKNOWN).astype(np.float32)
+        cv2.writeOpticalFlow(str(path), marked)
     elif path.suffix.lower() == ".png":
         if known.any() and np.abs(flow[known]).max() >= 511.9:
             raise UserError(f"{path}: a displacement beyond 511 px does not fit KITTI's PNG; write .flo")
@@ -55,14 +51,10 @@ def write_flow(path: Path, flow: Floats, known: Flags | None = None) -> None:
 
 
 def _read_flo(path: Path) -> tuple[Floats, Flags]:
-    """Baker et al., IJCV 2011: magic 202021.25, width, height, then rows of u, v; little-endian."""
-    data = path.read_bytes()
-    if len(data) < 12 or np.frombuffer(data, "<f4", 1)[0] != _MAGIC:
-        raise UserError(f"{path}: not a Middlebury .flo file")
-    width, height = (int(n) for n in np.frombuffer(data, "<i4", 2, 4))
-    if not (0 < width <= _LARGEST and 0 < height <= _LARGEST) or len(data) != 12 + 8 * width * height:
-        raise UserError(f"{path}: {len(data)} bytes don't hold a flow of {width} x {height} px")
-    flow = np.frombuffer(data, "<f4", 2 * width * height, 12).reshape(height, width, 2).astype(np.float32)
+    """Baker et al., IJCV 2011: magic number, width, height, then rows of u, v; little-endian floats."""
+    flow = cv2.readOpticalFlow(str(path))
+    if flow is None:
+        raise UserError(f"{path}: not a whole Middlebury .flo file")
     known = np.all(np.abs(flow) < _UNKNOWN, axis=-1)
     return np.where(known[..., None], flow, 0).astype(np.float32), known
 

@@ -51,5 +51,5 @@ class Model:
         if self._reader is None or self._reader[0] is not scene:
             reader = ForceReader(self.predictor, scene.tissue, scene.scale_mm_per_px, scene.young_kpa)
             self._reader = scene, reader
-        read = self._reader[1].read(flow, confidence)
-        return Answer(read.force_mn, read.map.to_image() if picture else None)
+        force, said = self._reader[1].read(flow, confidence)
+        return Answer(force, said.to_image() if picture else None)

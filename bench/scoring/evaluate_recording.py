@@ -22,7 +22,7 @@ from bench.scoring import metrics
 from bench.sensor import clock_sync, force_sensor
 from bench.sensor.clock_sync import Offset
 from bench.tracking.tracking import Progress, Tracked, track_recording
-from learn.inference.video_flow import Flow
+from learn.inference.video_flow import FlowHere
 from learn.inference.video_flow import Settings as Settings
 from synth.dataset.folder import write_whole
 from synth.system import packages
@@ -88,7 +88,7 @@ def evaluate_recording(
     settings: Settings,
     described: Mapping[str, Any],
     progress: Progress = lambda done: None,
-    flow: Flow | None = None,
+    flow: FlowHere | None = None,
 ) -> Result:
     """Follows the recording and scores every method against its sensor.
 
@@ -108,13 +108,6 @@ def evaluate_recording(
     done = track_recording(
         recording, methods, scale.mm_per_px, settings, pictured=main, flow=flow, progress=progress
     )
-    return score_tracked(recording, done, main, scale, {**asdict(settings), **described})
-
-
-def score_tracked(
-    recording: Recording, done: Tracked, main: str, scale: Scale, settings: Mapping[str, Any]
-) -> Result:
-    """Scores curves that are there already; arguments as `evaluate_recording`."""
     meta = recording.meta
     time = np.array(done.time_s)
     notes = [*recording.notes, *done.notes]
@@ -143,7 +136,7 @@ def score_tracked(
         sync=truth.sync,
         notes=tuple(notes),
         steps=truth.steps,
-        settings={**settings, "meta": meta.model_dump(mode="json", exclude_none=True)},
+        settings={**asdict(settings), **described, "meta": meta.model_dump(mode="json", exclude_none=True)},
         environment=environment(),
         followed=done,
     )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,36 +19,26 @@ SURGICAL_FORCE_MN = 300.0
 _LARGEST_LAG_S = 0.5
 
 
-@dataclass(frozen=True)
-class Metric:
+class Metric(NamedTuple):
     """One score: what it is called and how it is shown, wherever it is shown."""
 
-    key: str
-    """In `score.json`."""
     name: str
     unit: str
-    """As shown: mN, ms and % are turned into from mN, s and shares; empty for a number."""
+    """As shown: mN, ms and % are made of mN, s and shares; empty for a number."""
     about: str
     best: Literal["low", "high", "zero", "one", ""] = ""
     """Which value is the best; empty for what is no merit."""
     digits: int = 3
     """Behind the point in tables of plain text, in the score's own unit."""
-    short: str = ""
-    """Heading of a narrow column; the name if empty."""
     relative: bool = False
     """Whether a constant factor on the prediction leaves it as it is, or it speaks of the sensor alone."""
-    column: bool = True
-    """Whether the report's table has it."""
+    column: str = ""
+    """Heading in the report's table; empty: not there."""
 
     @property
     def heading(self) -> str:
         """The name, with its unit if its numbers are shown without: those of force."""
         return f"{self.name} [mN]" if self.unit == "mN" else self.name
-
-    @property
-    def column_heading(self) -> str:
-        """The same for a narrow column."""
-        return self.short or self.heading
 
     @property
     def cell_unit(self) -> str:
@@ -57,41 +47,29 @@ class Metric:
 
 
 METRICS = {
-    metric.key: metric
-    for metric in (
-        Metric("n", "samples", "", "Samples where both are finite.", relative=True, column=False),
-        Metric("mae_mn", "MAE", "mN", "Mean absolute error.", "low", digits=2),
-        Metric("mae_of_peak", "MAE of event peak", "%", "MAE over the contacts' mean peak.", "low",
-               short="of peak"),
-        Metric("rmse_mn", "RMSE", "mN", "Root mean square error.", "low", digits=2),
-        Metric("bias_mn", "bias", "mN", "Mean of predicted minus sensor.", "zero", digits=2),
-        Metric("r", "r", "", "Pearson's correlation.", "high", relative=True),
-        Metric("ccc", "CCC", "", "Lin's concordance correlation.", "high"),
-        Metric("r2", "R²", "", "1 − SSE/SST about the sensor's mean: bias and gain errors count.", "high"),
-        Metric("gain", "gain", "", "Least-squares slope of predicted on sensor.", "one"),
-        Metric("lag_s", "lag", "ms", "By how much predicted is late, at the best correlation.", "zero",
-               relative=True),
-        Metric("r_at_lag", "r at that lag", "", "Correlation with the lag taken out.", "high", relative=True,
-               column=False),
-        Metric("contact_f1", "contact F1", "", "F1 of contact against none, by sample.", "high"),
-        Metric("ghost_rate", "ghosts", "%", "Contact-free samples where contact is predicted.", "low"),
-        Metric("ghost_mn", "ghost force", "mN", "Mean predicted force without contact.", "low", digits=2,
-               column=False),
-        Metric("threshold_mn", "contact threshold", "mN", "Force from which the sensor says contact.",
-               digits=2, relative=True, column=False),
-        Metric("events", "contacts", "", "Contacts that the sensor shows.", relative=True, column=False),
-        Metric("event_peak_mn", "event peak", "mN", "Mean peak of the contacts.", digits=2, relative=True,
-               column=False),
-        Metric("mae_of_surgical", "MAE of 0.3 N", "%", "MAE over a usual surgical force.", "low",
-               column=False),
-        Metric("peak_mae", "peak error", "%", "Mean relative error of the contacts' peaks.", "low",
-               short="peak err."),
-        Metric("impulse_mae", "impulse error", "%", "Mean relative error of the contacts' impulses.", "low",
-               short="impulse err."),
-        Metric("dropout", "dropout", "%", "Samples without a prediction.", "low", relative=True),
-    )
-}  # fmt: skip
-"""Every score, in the order of `score.json`'s reader: the only place that names them."""
+    "n": Metric("samples", "", "Samples where both are finite.", relative=True),
+    "mae_mn": Metric("MAE", "mN", "Mean absolute error.", "low", 2, column="MAE [mN]"),
+    "mae_of_peak": Metric("MAE of event peak", "%", "Over the contacts' mean peak.", "low", column="of peak"),
+    "rmse_mn": Metric("RMSE", "mN", "Root mean square error.", "low", 2, column="RMSE [mN]"),
+    "bias_mn": Metric("bias", "mN", "Mean of predicted minus sensor.", "zero", 2, column="bias [mN]"),
+    "r": Metric("r", "", "Pearson's correlation.", "high", relative=True, column="r"),
+    "ccc": Metric("CCC", "", "Lin's concordance correlation.", "high", column="CCC"),
+    "r2": Metric("R²", "", "1 − SSE/SST about the sensor's mean: bias and gain count.", "high", column="R²"),
+    "gain": Metric("gain", "", "Least-squares slope of predicted on sensor.", "one", column="gain"),
+    "lag_s": Metric("lag", "ms", "How late predicted is, at the best correlation.", "zero", 3, True, "lag"),
+    "r_at_lag": Metric("r at that lag", "", "Correlation with the lag taken out.", "high", relative=True),
+    "contact_f1": Metric("contact F1", "", "F1 of contact, by sample.", "high", column="contact F1"),
+    "ghost_rate": Metric("ghosts", "%", "Free samples with contact predicted.", "low", column="ghosts"),
+    "ghost_mn": Metric("ghost force", "mN", "Mean predicted force without contact.", "low", 2),
+    "threshold_mn": Metric("contact threshold", "mN", "From which the sensor says contact.", "", 2, True),
+    "events": Metric("contacts", "", "Contacts that the sensor shows.", relative=True),
+    "event_peak_mn": Metric("event peak", "mN", "Mean peak of the contacts.", "", 2, True),
+    "mae_of_surgical": Metric("MAE of 0.3 N", "%", "MAE over a usual surgical force.", "low"),
+    "peak_mae": Metric("peak error", "%", "Mean relative error of peaks.", "low", column="peak err."),
+    "impulse_mae": Metric("impulse error", "%", "The same of their impulses.", "low", column="impulse err."),
+    "dropout": Metric("dropout", "%", "Samples without a prediction.", "low", 3, True, "dropout"),
+}
+"""By key of `score.json`: the only place that says what a score is."""
 
 RELATIVE = tuple(key for key, metric in METRICS.items() if metric.relative)
 """Scores that a prediction of unknown stiffness has."""
@@ -124,8 +102,7 @@ def agreement(sensor: Curve, predicted: Curve) -> dict[str, float]:
     if n == 0:
         keys = ("mae_mn", "rmse_mn", "bias_mn", "r", "ccc", "r2", "gain")
         return {"n": 0.0, **dict.fromkeys(keys, nan)}
-    bias = float((y - x).mean())
-    moving, both_moving = bool(np.ptp(x) > 0), bool(np.ptp(x) > 0 and np.ptp(y) > 0)
+    bias, moving = float((y - x).mean()), np.ptp(x) > 0
     fit = linregress(x, y) if moving else None
     covariance = float(np.cov(x, y, ddof=0)[0, 1]) if moving else 0.0
     return {
@@ -133,7 +110,7 @@ def agreement(sensor: Curve, predicted: Curve) -> dict[str, float]:
         "mae_mn": float(mean_absolute_error(x, y)),
         "rmse_mn": float(root_mean_squared_error(x, y)),
         "bias_mn": bias,
-        "r": float(fit.rvalue) if fit and both_moving else nan,
+        "r": float(fit.rvalue) if fit and np.ptp(y) > 0 else nan,
         "ccc": ratio(2 * covariance, float(x.var() + y.var() + bias**2)),
         "r2": float(r2_score(x, y)) if moving else nan,
         "gain": float(fit.slope) if fit else nan,

@@ -28,7 +28,7 @@ from synth.publish import picture
 
 _PEAKS, _WORST = 4, 2
 
-_COLUMNS = tuple(metric for metric in METRICS.values() if metric.column)
+_COLUMNS = {key: metric for key, metric in METRICS.items() if metric.column}
 _TILES = ("mae_mn", "mae_of_peak", "r", "ccc", "r2", "ghost_rate")
 
 
@@ -75,7 +75,7 @@ def render_report(result: Result, title: str) -> str:
         result=result,
         main=main,
         metrics=_COLUMNS,
-        tiles=[METRICS[key] for key in _TILES],
+        tiles={key: METRICS[key] for key in _TILES},
         best=_best(result),
         beaten_by=beaten_by(result),
         surely=[n for n in beaten_by(result) if (w := result.methods[n].worse_by_mn) and w[0] > 0],
@@ -101,11 +101,11 @@ def terminal_table(result: Result) -> Table:
         for name, method in result.methods.items():
             table.add_row(name, shown(float(np.nanmax(method.size_mn))))
         return table
-    columns = [metric for metric in _COLUMNS if metric.key in {*_TILES, "bias_mn"}]
-    for metric in columns:
-        table.add_column(metric.column_heading, justify="right", no_wrap=True)
+    columns = {key: metric for key, metric in _COLUMNS.items() if key in {*_TILES, "bias_mn"}}
+    for metric in columns.values():
+        table.add_column(metric.column, justify="right", no_wrap=True)
     for name, method in result.methods.items():
-        table.add_row(name, *(shown(method.scores[metric.key], metric.cell_unit) for metric in columns))
+        table.add_row(name, *(shown(method.scores[key], m.cell_unit) for key, m in columns.items()))
     return table
 
 
@@ -214,11 +214,11 @@ _DISTANCE: dict[str, Callable[[float], float]] = {
 def _best(result: Result) -> dict[str, float]:
     """The best value in each column of the table, to be set in bold."""
     best = {}
-    for metric in _COLUMNS:
-        found = [method.scores.get(metric.key, math.nan) for method in result.methods.values()]
+    for key, metric in _COLUMNS.items():
+        found = [method.scores.get(key, math.nan) for method in result.methods.values()]
         values = {value for value in found if math.isfinite(value)}
         if len(values) > 1 and metric.best:
-            best[metric.key] = min(values, key=_DISTANCE[metric.best])
+            best[key] = min(values, key=_DISTANCE[metric.best])
     return best
 
 

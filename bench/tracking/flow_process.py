@@ -23,8 +23,8 @@ from synth.errors import UserError
 T = TypeVar("T")
 
 
-class FlowProcess:
-    """A `Flow` in one other process, which starts at once and ends with this one."""
+class FlowProcess(FlowHere):
+    """Flow in one other process, which starts at once and ends with this one."""
 
     ahead = 1
 
@@ -38,11 +38,11 @@ class FlowProcess:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
     def begin(self, backend: str, rest: Rgb, blocked: Flags, tissue: Flags) -> None:
-        """See `Flow`."""
+        """See `FlowHere`."""
         self._submit(_begin, backend, rest, blocked, tissue)()
 
     def ask(self, rgb: Rgb, blocked: Flags) -> Callable[[], Found]:
-        """See `Flow`."""
+        """See `FlowHere`."""
         return self._submit(_step, rgb, blocked)
 
     def close(self) -> None:

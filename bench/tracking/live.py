@@ -17,17 +17,7 @@ from numpy.typing import NDArray
 from bench.methods.protocol import Method, Scene
 from bench.output import machine
 from bench.output import write as results
-from learn.inference.video import Picture, read_video
-from learn.inference.video_flow import (
-    FPS,
-    Flags,
-    FlowHere,
-    Footage,
-    Rgb,
-    Settings,
-    Step,
-    VideoFlow,
-)
+from learn.inference.video_flow import Flags, FlowHere, Footage, Rgb, Settings, Step, VideoFlow
 from synth.errors import UserError
 
 
@@ -70,7 +60,7 @@ class Watched:
 
 
 def watch_video(
-    video: Path,
+    footage: Footage,
     *,
     backend: str = "tvl1",
     method: Method | None = None,
@@ -83,7 +73,7 @@ def watch_video(
     """Follows the video from its first frame on, which is taken as the rest frame.
 
     Args:
-        video: any file that FFmpeg reads.
+        footage: the video.
         backend: flow estimator.
         method: a model that makes force of flow; needs the scale.
         scale_mm_per_px: of the video's own pixels.
@@ -97,36 +87,13 @@ def watch_video(
     """
     if method is not None and scale_mm_per_px is None:
         raise UserError("a model needs --scale (mm a pixel): forces have no meaning without it")
-    return watch_footage(
-        Footage(lambda: read_video(video), str(video), fps=FPS),
-        Settings(backend, shrink, rate_hz=None),
-        method=method,
-        scale_mm_per_px=scale_mm_per_px or 1.0,
-        young_kpa=young_kpa,
-        paced=paced,
-        told=told,
-    )
-
-
-def watch_footage(
-    footage: Footage,
-    settings: Settings,
-    *,
-    method: Method | None,
-    scale_mm_per_px: float,
-    young_kpa: float | None,
-    paced: bool,
-    told: Callable[[Frame], None],
-) -> Watched:
-    """As `watch_video`, on pictures from anywhere."""
     account, pace = Watched(), _Pace(paced)
-    video = VideoFlow(footage, settings, _Warm(), pace.is_due)
+    video = VideoFlow(footage, Settings(backend, shrink, rate_hz=None), _Warm(), pace.is_due)
     scene: Scene | None = None
     for step in video.steps():
         if scene is None:
-            assert video.tissue is not None
             account.size = video.tissue.shape
-            scene = Scene(video.tissue, scale_mm_per_px * video.shrink, young_kpa)
+            scene = Scene(video.tissue, (scale_mm_per_px or 1.0) * video.shrink, young_kpa)
             pace.start(step)
             continue
         began, found, force = time.perf_counter(), step.found, None
@@ -155,7 +122,7 @@ class _Warm(FlowHere):
     """Flow that has run once before the clock starts: loading isn't latency."""
 
     def begin(self, backend: str, rest: Rgb, blocked: Flags, tissue: Flags) -> None:
-        """See `Flow`."""
+        """See `FlowHere`."""
         super().begin(backend, rest, blocked, tissue)
         self.tracker.step(rest, blocked)
 
@@ -170,11 +137,11 @@ class _Pace:
         """The clock starts with the rest frame."""
         self.first_s, self.began_s = rest.time_s or 0.0, time.perf_counter()
 
-    def is_due(self, picture: Picture, time_s: float) -> bool:
+    def is_due(self, index: int, time_s: float) -> bool:
         """Waits until a frame arrives; False if it has a successor already."""
         since, now = time_s - self.first_s, time.perf_counter()
         self.arrival_s = self.began_s + since if self.paced else now
-        if self.arrival_s < now - since / picture.index:
+        if self.arrival_s < now - since / index:
             self.dropped += 1
             return False
         time.sleep(max(0.0, self.arrival_s - now))

@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 from bench.methods.protocol import Method, Scene
 from bench.recording.folder import Recording
-from learn.inference.video_flow import Flow, Footage, Settings, Step, VideoFlow
+from learn.inference.video_flow import FlowHere, Footage, Settings, Step, VideoFlow
 from synth.errors import UserError
+from synth.system.stopwatch import Stopwatch
 
 A = TypeVar("A", bound=np.generic)
 Progress = Callable[[int], None]
@@ -66,7 +67,7 @@ def track_recording(
     settings: Settings,
     *,
     pictured: str | None = None,
-    flow: Flow | None = None,
+    flow: FlowHere | None = None,
     progress: Progress = lambda done: None,
 ) -> Tracked:
     """Follows the video and asks every method, holding a few frames at a time.
@@ -87,16 +88,17 @@ def track_recording(
     meta = recording.meta
     tool = recording.tool if recording.masks else None
     footage = Footage(
-        recording.frames, str(recording.folder), recording.tissue_mask, tool, meta.fps, meta.rest_frame
+        recording.frames(), str(recording.folder), recording.tissue_mask, tool, meta.fps, meta.rest_frame
     )
     video = VideoFlow(footage, settings, flow)
-    asking = _Asking(methods, pictured, video)
+    asking = _Asking(methods, pictured, video.watch)
     for step in video.steps(progress):
         if asking.scene is None:
-            assert video.tissue is not None
-            asking.begin(step, Scene(video.tissue, scale_mm_per_px * video.shrink, meta.young_kpa))
+            asking.scene = Scene(video.tissue, scale_mm_per_px * video.shrink, meta.young_kpa)
+            asking.out.rest = _shrunk(step.rgb)
+            asking.out.tissue = _shrunk(video.tissue.astype(np.uint8) * 255) > 127
         if step.time_s is not None:
-            asking.ask(step, step.time_s)
+            asking.ask(step, step.time_s, asking.scene)
     out = asking.out
     if not out.time_s:
         if video.seen <= meta.rest_frame:
@@ -113,38 +115,31 @@ def track_recording(
 class _Asking:
     """Every method asked of every frame."""
 
-    def __init__(self, methods: Mapping[str, Method], pictured: str | None, video: VideoFlow) -> None:
-        self.methods, self.pictured, self.watch = methods, pictured, video.watch
+    def __init__(self, methods: Mapping[str, Method], pictured: str | None, watch: Stopwatch) -> None:
+        self.methods, self.pictured, self.watch = methods, pictured, watch
         self.out = Tracked(force_mn={name: [] for name in methods})
         self.scene: Scene | None = None
         self.last: NDArray[np.float32] | None = None
         self.stride = 1
 
-    def begin(self, rest: Step, scene: Scene) -> None:
-        """The rest frame and what stays the same."""
-        self.scene = scene
-        self.out.rest = _shrunk(rest.rgb)
-        self.out.tissue = _shrunk(scene.tissue.astype(np.uint8) * 255) > 127
-
-    def ask(self, step: Step, time_s: float) -> None:
+    def ask(self, step: Step, time_s: float, scene: Scene) -> None:
         """Records what the methods say of a frame at its time [s]."""
-        assert self.scene is not None
         flow, confidence, out = step.found.flow, step.found.confidence, self.out
         position = len(out.time_s)
         wanted = position % self.stride == 0
         density = None
         for name, method in self.methods.items():
             with self.watch.stage(name):
-                answer = method(flow, confidence, self.scene, wanted and name == self.pictured)
+                answer = method(flow, confidence, scene, wanted and name == self.pictured)
             out.force_mn[name].append(answer.force_mn)
             if name == self.pictured:
                 density = answer.density
-        inside = self.scene.tissue
+        inside = scene.tissue
         out.confidence.append(float(confidence[inside].mean()))
         speed = 0.0
         if self.last is not None and out.time_s:
             moved = np.linalg.norm(flow - self.last, axis=-1)[inside]
-            speed = float(moved.mean()) * self.scene.scale_mm_per_px / (time_s - out.time_s[-1])
+            speed = float(moved.mean()) * scene.scale_mm_per_px / (time_s - out.time_s[-1])
         out.speed.append(speed)
         self.last = flow
         out.frame.append(step.index)

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -39,8 +40,8 @@ class Motion:
     """Flow of one film, still in pixels, wherever it came from."""
 
     name: str
-    steps: Callable[[], Iterator[Step]]
-    """Goes through the frames."""
+    steps: Iterator[Step]
+    """The frames in order; once."""
     tissue: NDArray[np.bool_]
     scale_mm_per_px: float
     young_kpa: float | None
@@ -48,7 +49,7 @@ class Motion:
     """(T,) size of the true force, where it is known."""
     shrink: int = 1
     """How many times smaller than the film's own pictures those are that flow is on."""
-    notes: list[str] = field(default_factory=list)
+    notes: Callable[[], list[str]] = list
     """What was done to the film that its user should know, once its steps are through."""
 
 
@@ -92,7 +93,7 @@ def _stored(sequence: Sequence, source: str) -> Motion:
     time_s = sequence["time"][:]
     return Motion(
         name=sequence.path.stem,
-        steps=lambda: (
+        steps=(
             Step(flow[t], None if confidence is None else confidence[t], t, float(time_s[t]))
             for t in range(sequence.frames)
         ),
@@ -108,26 +109,20 @@ def _video(path: Path, filmed: Filmed) -> Motion:
         raise UserError(f"{path}: a video doesn't say how large it shows things; give --scale in mm a pixel")
     drawn = filmed.tissue
     tissue = everywhere if drawn is None else partial(video.read_mask, drawn)
-    footage = Footage(lambda: video.read_video(path), str(path), tissue, fps=FPS)
-    first = next(video.read_video(path)).rgb
-    shrink = filmed.settings.shrink_of(first.shape[1])
-    notes: list[str] = []
-
-    def steps() -> Iterator[Step]:
-        following = VideoFlow(footage, filmed.settings)
-        for step in following.steps():
-            time_s = math.nan if step.time_s is None else step.time_s
-            yield Step(step.found.flow, step.found.confidence, step.index, time_s)
-        notes[:] = following.notes
-
+    following = VideoFlow(Footage(video.read_video(path), str(path), tissue, fps=FPS), filmed.settings)
+    steps = (
+        Step(step.found.flow, step.found.confidence, step.index, step.time_s or 0.0)
+        for step in following.steps()
+    )
+    rest = next(steps)
     return Motion(
         name=path.stem,
-        steps=steps,
-        tissue=VideoFlow(footage, filmed.settings).tissue_of(first.shape[:2]),
-        scale_mm_per_px=filmed.scale_mm_per_px * shrink,
+        steps=chain([rest], steps),
+        tissue=following.tissue,
+        scale_mm_per_px=filmed.scale_mm_per_px * following.shrink,
         young_kpa=None,
-        shrink=shrink,
-        notes=notes,
+        shrink=following.shrink,
+        notes=lambda: following.notes,
     )
 
 
@@ -152,7 +147,7 @@ def _arrays(path: Path) -> Motion:
         raise UserError(f"{path}: force_mn is {force.shape}, expected ({len(flow)},)")
     return Motion(
         name=path.stem,
-        steps=lambda: (
+        steps=(
             Step(f, None if confidence is None else confidence[t].astype(np.float32), t)
             for t, f in enumerate(flow)
         ),
@@ -173,28 +168,30 @@ def apply(predictor: Predictor, motion: Motion, young_kpa: float | None = None) 
     """
     young = young_kpa if young_kpa is not None else motion.young_kpa
     reader = ForceReader(predictor, motion.tissue, motion.scale_mm_per_px, young)
-    frames, times, read = [], [], []
-    for step in motion.steps():
+    frames, times, forces, maps = [], [], [], []
+    for step in motion.steps:
+        force, said = reader.read(step.flow, step.confidence)
         frames.append(step.frame)
         times.append(step.time_s)
-        read.append(reader.read(step.flow, step.confidence))
-    view = read[0].map.view
+        forces.append(force)
+        maps.append(said)
+    total, last = np.array(forces), maps[-1]
     out: dict[str, Any] = {
-        "density": np.stack([r.map.density for r in read]),
-        "total_force_mn": np.array([r.size_mn for r in read]),
-        "mask": view.mask,
+        "density": np.stack([m.density for m in maps]),
+        "total_force_mn": np.sqrt(np.nansum(total**2, axis=1)),
+        "mask": last.view.mask,
         "pitch_mm": predictor.grid.pitch_mm,
         # A picture begins half a pixel before its first pixel, whatever its pixels' size.
-        "centre_px": motion.shrink * (np.array(view.resample.centre_px) + 0.5) - 0.5,
-        "young_kpa": read[0].map.young_kpa,
-        "young_known": read[0].map.young_known,
+        "centre_px": motion.shrink * (np.array(last.view.resample.centre_px) + 0.5) - 0.5,
+        "young_kpa": last.young_kpa,
+        "young_known": last.young_known,
         "frame": np.array(frames),
     }
     if np.isfinite(times).any():
         out["time_s"] = np.array(times)
-    if read[0].map.force_mn is not None:
-        out["force_mn"] = np.stack([r.force_mn for r in read])
-    heads = [r.map.head_mn for r in read if r.map.head_mn is not None]
+    if last.force_mn is not None:
+        out["force_mn"] = total
+    heads = [m.head_mn for m in maps if m.head_mn is not None]
     if heads:
         out["head_mn"] = np.stack(heads)
     return out
@@ -206,7 +203,7 @@ def calibrate(predictor: Predictor, press: Motion) -> float:
         raise UserError(f"{press.name}: holds no force to calibrate on (force_mn in an .npz)")
     view = View(press.tissue, press.scale_mm_per_px, predictor.grid)
     moved, sure = [], []
-    for flow, confidence, _, _ in press.steps():
+    for flow, confidence, _, _ in press.steps:
         moved.append(view.resample.mean(flow.transpose(2, 0, 1) * press.scale_mm_per_px, press.tissue))
         if confidence is not None:
             sure.append(view.resample.mean(confidence, press.tissue))

@@ -2,26 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from learn.inference.predict import ForceMap, Predictor
-
-
-@dataclass(frozen=True, eq=False)
-class Reading:
-    """One frame's force."""
-
-    force_mn: NDArray[np.float64]
-    """(3,) total force on the tissue in camera axes [mN]; a model without direction: size in x, rest NaN."""
-    map: ForceMap
-    """As the model says it, nothing taken off."""
-
-    @property
-    def size_mn(self) -> float:
-        return float(np.sqrt(np.nansum(self.force_mn**2)))
 
 
 class ForceReader:
@@ -44,8 +30,14 @@ class ForceReader:
         self._scale, self._young_kpa = scale_mm_per_px, young_kpa
         self._zero: NDArray[np.float64] | None = None
 
-    def read(self, flow: NDArray[np.float32], confidence: NDArray[np.float32] | None) -> Reading:
-        """Force of a frame from its flow (H, W, 2) px and confidence (H, W); errors as `Predictor`."""
+    def read(
+        self, flow: NDArray[np.float32], confidence: NDArray[np.float32] | None
+    ) -> tuple[NDArray[np.float64], ForceMap]:
+        """Total force of a frame, and the map as the model says it, nothing taken off; errors as `Predictor`.
+
+        `flow`: (H, W, 2) px; `confidence`: (H, W). The force: (3,) mN on the tissue in camera axes; of a
+        model without direction the size in x, the rest NaN.
+        """
         said = self._say(flow, confidence)
         if self._zero is None:
             sure = None if confidence is None else self._tissue.astype(np.float32)
@@ -53,7 +45,7 @@ class ForceReader:
         force = _total(said) - self._zero
         if said.force_mn is None:
             force[0] = max(force[0], 0.0)
-        return Reading(force, said)
+        return force, said
 
     def _say(self, flow: NDArray[np.float32], confidence: NDArray[np.float32] | None) -> ForceMap:
         said = self._predictor(flow, self._tissue, self._scale, self._young_kpa, confidence)

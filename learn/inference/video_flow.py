@@ -8,10 +8,9 @@ from __future__ import annotations
 
 import math
 import time
-from collections import deque
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from typing import Protocol
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -45,10 +44,6 @@ class Settings:
     rate_hz: float | None = 10.0
     """At most so many frames a second are looked at; None: all."""
 
-    def shrink_of(self, width: int) -> int:
-        """By how much pictures `width` columns wide are shrunk."""
-        return self.shrink or max(1, width // WIDTH_KEPT)
-
 
 def everywhere(size: Size) -> Flags:
     """(H, W) True: all of the picture is tissue."""
@@ -59,7 +54,7 @@ def everywhere(size: Size) -> Flags:
 class Footage:
     """What is followed."""
 
-    pictures: Callable[[], Iterator[Picture]]
+    pictures: Iterable[Picture]
     """Its frames in order, from the first on."""
     name: str
     """For messages."""
@@ -77,42 +72,29 @@ class Found:
     """The flow of one frame."""
 
     flow: NDArray[np.float32]
-    """(H, W, 2) px from the rest frame."""
+    """(h, w, 2) px from the rest frame."""
     confidence: NDArray[np.float32]
-    """(H, W) in 0..1."""
-    trusted: bool
+    """(h, w) in 0..1."""
+    trusted: bool = True
     """Whether the frame could be followed."""
     cpu_s: float = 0.0
     wall_s: float = 0.0
     peak_bytes: int = 0
-    """Memory of the other process; 0 without one."""
+    """Memory of the process that computed it, if it was another."""
 
 
-class Flow(Protocol):
-    """Where flow is computed: frames in order, each from the rest frame."""
+class FlowHere:
+    """Where flow is computed: in this process, at once."""
 
-    ahead: int
+    ahead = 0
     """How many frames may be asked before the first is waited for."""
 
     def begin(self, backend: str, rest: Rgb, blocked: Flags, tissue: Flags) -> None:
         """The rest frame; arguments and errors as `Tracker`."""
-
-    def ask(self, rgb: Rgb, blocked: Flags) -> Callable[[], Found]:
-        """Gives a frame, (H, W, 3) and (H, W); what comes back waits for its flow, errors as `Tracker`."""
-        ...
-
-
-class FlowHere:
-    """Flow in this process, at once."""
-
-    ahead = 0
-
-    def begin(self, backend: str, rest: Rgb, blocked: Flags, tissue: Flags) -> None:
-        """See `Flow`."""
         self.tracker = Tracker(backend, rest, blocked, tissue)
 
     def ask(self, rgb: Rgb, blocked: Flags) -> Callable[[], Found]:
-        """See `Flow`."""
+        """Gives a frame, (h, w, 3) and (h, w); what comes back waits for its flow, errors as `Tracker`."""
         cpu, wall = time.process_time(), time.perf_counter()
         flow, confidence = self.tracker.step(rgb, blocked)
         spent = time.process_time() - cpu, time.perf_counter() - wall
@@ -142,8 +124,8 @@ class VideoFlow:
         self,
         footage: Footage,
         settings: Settings,
-        flow: Flow | None = None,
-        is_due: Callable[[Picture, float], bool] = lambda picture, time_s: True,
+        flow: FlowHere | None = None,
+        is_due: Callable[[int, float], bool] = lambda index, time_s: True,
     ) -> None:
         """Nothing is decoded yet.
 
@@ -154,29 +136,22 @@ class VideoFlow:
             is_due: whether a frame after the rest frame, at its time [s], is to be worked on.
         """
         self.footage, self.settings, self.watch = footage, settings, Stopwatch()
-        self.tissue: Flags | None = None
-        """(h, w), shrunk as the pictures are; None before the rest frame."""
-        self.shrink = settings.shrink
-        self.size: Size = (0, 0)
-        """Of the video's own pictures."""
-        self.seen = 0
-        """Frames decoded."""
-        self.peak_bytes = 0
+        self.tissue = np.zeros((0, 0), bool)
+        """(h, w), shrunk as the pictures are; empty before the rest frame."""
+        self.shrink, self.size = settings.shrink, (0, 0)
+        """How many times smaller than `size`, height and width of the video's own pictures, these are."""
+        self.seen = self.peak_bytes = 0
+        """Frames decoded, and memory of the flow's own process."""
         self._flow, self._is_due = flow or FlowHere(), is_due
-        self._left_out = {"before the rest frame": 0, "without a time": 0,
-                          "whose time stands still or runs back": 0}  # fmt: skip
-        rate_hz = settings.rate_hz
-        self._period_s = 0.0 if rate_hz is None else 1 / rate_hz
-        self._beyond = f"beyond {rate_hz or 0:g} a second"
-        self._left_out[self._beyond] = 0
-        self._due_s, self._last_s = -math.inf, -math.inf
+        self._left_out: Counter[str] = Counter()
+        self._period_s = 0.0 if settings.rate_hz is None else 1 / settings.rate_hz
+        self._due_s = self._last_s = -math.inf
 
     @property
     def notes(self) -> list[str]:
         """What was done to the video that its user should know; complete when all frames are through."""
         shrunk = [f"flow is computed on pictures {self.shrink} times smaller"] if self.shrink > 1 else []
-        left_out = self._left_out.items()
-        return shrunk + [f"{n} of {self.seen} frames {kind} left out" for kind, n in left_out if n]
+        return shrunk + [f"{n} of {self.seen} frames {why} left out" for why, n in self._left_out.items()]
 
     def steps(self, progress: Callable[[int], None] = lambda done: None) -> Iterator[Step]:
         """The frames that are followed, the rest frame first, holding a few at a time.
@@ -189,8 +164,8 @@ class VideoFlow:
         Raises:
             UserError: unreadable video, no tissue, masks or frames of another size, no such estimator.
         """
-        pictures = self.footage.pictures()
-        under_way: deque[tuple[Picture, float | None, Callable[[], Found], float]] = deque()
+        pictures = iter(self.footage.pictures)
+        under_way: deque[tuple[Picture, float | None, float, Callable[[], Found]]] = deque()
         while True:
             with self.watch.stage("decode"):
                 picture = next(pictures, None)
@@ -200,31 +175,25 @@ class VideoFlow:
             time_s = picture.time_s
             if time_s is None and self.footage.fps is not None:
                 time_s = picture.index / self.footage.fps
-            if not self._is_wanted(picture, time_s):
-                pass
-            elif self.tissue is None:
-                yield self._start(picture, time_s)
-            else:
+            if self._is_wanted(picture.index, time_s):
+                resting = self.tissue.size == 0
+                if resting:
+                    self._see(picture)
                 small, blocked, masking_s = self._prepare(picture)
-                under_way.append((small, time_s, self._flow.ask(small.rgb, blocked), masking_s))
+                if resting:
+                    found = self._rest(small.rgb, blocked)
+                    yield Step(picture.index, time_s, small.rgb, found, masking_s)
+                else:
+                    under_way.append((small, time_s, masking_s, self._flow.ask(small.rgb, blocked)))
                 if len(under_way) > self._flow.ahead:
-                    yield self._answered(*under_way.popleft())
+                    yield self._step(*under_way.popleft())
             progress(self.seen)
         for waiting in under_way:
-            yield self._answered(*waiting)
+            yield self._step(*waiting)
 
-    def tissue_of(self, size: Size) -> Flags:
-        """(h, w) where tissue is followed in a video of that size, shrunk as the pictures are."""
-        shrink = self.settings.shrink_of(size[1])
-        tissue = shrink_picture(self.footage.tissue(size).astype(np.uint8) * 255, shrink) > 127
-        if not tissue.any():
-            raise UserError(f"{self.footage.name}: the picture of the tissue marks no tissue")
-        return np.asarray(tissue)
-
-    def _is_wanted(self, picture: Picture, time_s: float | None) -> bool:
+    def _is_wanted(self, index: int, time_s: float | None) -> bool:
         """Whether a frame is looked at; what isn't is counted."""
-        reason = None
-        if picture.index < self.footage.rest_frame:
+        if index < self.footage.rest_frame:
             reason = "before the rest frame"
         elif time_s is None:
             reason = "without a time"
@@ -232,27 +201,22 @@ class VideoFlow:
             reason = "whose time stands still or runs back"
         # A fifth of the period early is in time.
         elif time_s < self._due_s - 0.2 * self._period_s:
-            reason = self._beyond
-        if reason is not None:
-            self._left_out[reason] += 1
-            return reason == "without a time" and picture.index == self.footage.rest_frame
-        assert time_s is not None
-        first = self._due_s == -math.inf
-        self._due_s = (time_s if first else max(self._due_s, time_s - 0.2 * self._period_s)) + self._period_s
-        self._last_s = time_s
-        return self.tissue is None or self._is_due(picture, time_s)
+            reason = f"beyond {self.settings.rate_hz:g} a second"
+        else:
+            first = self._due_s == -math.inf
+            due_s = time_s if first else max(self._due_s, time_s - 0.2 * self._period_s)
+            self._due_s, self._last_s = due_s + self._period_s, time_s
+            return self.tissue.size == 0 or self._is_due(index, time_s)
+        self._left_out[reason] += 1
+        return time_s is None and index == self.footage.rest_frame
 
-    def _start(self, picture: Picture, time_s: float | None) -> Step:
-        """The rest frame: nothing has moved."""
+    def _see(self, picture: Picture) -> None:
+        """Sizes and tissue, from the rest frame."""
         self.size = (picture.rgb.shape[0], picture.rgb.shape[1])
-        self.shrink = self.settings.shrink_of(self.size[1])
-        tissue = self.tissue_of(self.size)
-        small, blocked, masking_s = self._prepare(picture)
-        self._flow.begin(self.settings.backend, small.rgb, blocked, tissue)
-        self.tissue = tissue
-        still = np.zeros((*tissue.shape, 2), np.float32)
-        found = Found(still, (tissue & ~blocked).astype(np.float32), trusted=True)
-        return Step(small.index, time_s, small.rgb, found, masking_s)
+        self.shrink = self.settings.shrink or max(1, self.size[1] // WIDTH_KEPT)
+        self.tissue = shrink_mask(self.footage.tissue(self.size), self.shrink, 127)
+        if not self.tissue.any():
+            raise UserError(f"{self.footage.name}: the picture of the tissue marks no tissue")
 
     def _prepare(self, picture: Picture) -> tuple[Picture, Flags, float]:
         """A frame shrunk, what of it is no tissue (h, w), and the time that took [s]."""
@@ -266,11 +230,17 @@ class VideoFlow:
             if self.footage.tool is None:
                 blocked |= mask.tool(rgb)
             elif (tool := self.footage.tool(picture.index, self.size)) is not None:
-                blocked |= shrink_picture(tool.astype(np.uint8) * 255, self.shrink) > 0
-        return Picture(picture.index, picture.time_s, rgb), blocked, time.perf_counter() - began
+                blocked |= shrink_mask(tool, self.shrink, 0)
+        return replace(picture, rgb=rgb), blocked, time.perf_counter() - began
 
-    def _answered(
-        self, small: Picture, time_s: float | None, answer: Callable[[], Found], masking_s: float
+    def _rest(self, rgb: Rgb, blocked: Flags) -> Found:
+        """Starts the flow: nothing has moved."""
+        self._flow.begin(self.settings.backend, rgb, blocked, self.tissue)
+        still = np.zeros((*self.tissue.shape, 2), np.float32)
+        return Found(still, (self.tissue & ~blocked).astype(np.float32))
+
+    def _step(
+        self, small: Picture, time_s: float | None, masking_s: float, answer: Callable[[], Found]
     ) -> Step:
         found = answer()
         self.watch.add("flow", found.cpu_s, found.wall_s)
@@ -278,11 +248,16 @@ class VideoFlow:
         return Step(small.index, time_s, small.rgb, found, masking_s)
 
 
-def shrink_picture(picture: NDArray[np.uint8], shrink: int) -> NDArray[np.uint8]:
-    """A picture or mask `shrink` times smaller, (H, W[, C]) uint8; what doesn't fill a pixel is cut off."""
+def shrink_picture(picture: Rgb, shrink: int) -> Rgb:
+    """A picture `shrink` times smaller, (H, W[, C]) uint8; what doesn't fill a pixel is cut off."""
     if shrink == 1:
         return picture
     size = (max(1, picture.shape[1] // shrink), max(1, picture.shape[0] // shrink))
     # Cut to a multiple, so that a pixel of the small picture is exactly shrink x shrink of the large one.
     cut = picture[: size[1] * shrink, : size[0] * shrink]
     return np.asarray(cv2.resize(cut, size, interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def shrink_mask(mask: Flags, shrink: int, above: int) -> Flags:
+    """The same of a mask (H, W): True where more than `above` of 255 parts of a pixel are."""
+    return np.asarray(shrink_picture(mask.astype(np.uint8) * 255, shrink) > above)

@@ -25,7 +25,7 @@ from bench.tracking import live
 from bench.tracking.tracking import track_recording
 from evidence.flow.measure import MeanInpainting, against, divergence, measure
 from evidence.flow.scenes import CLEAN, Recipe, Stage, inverse, pairs, pull_field
-from learn.inference.video import Picture
+from learn.inference.video import Picture, read_video
 from learn.inference.video_flow import Footage, Settings
 from synth.errors import UserError
 from synth.flow.opencv import Dis
@@ -160,10 +160,8 @@ def test_stream_answers_every_frame_and_says_what_it_cost() -> None:
     (pair,) = pairs(Recipe(size=64, pull=2.0, tool=0.0), 1, 3)
     shown = [Picture(k, k / 25, pair.rest if k % 2 == 0 else pair.now) for k in range(5)]
     told: list[live.Frame] = []
-    account = live.watch_footage(
-        Footage(lambda: iter(shown), "test"), Settings("dis", shrink=1, rate_hz=None),
-        method=None, scale_mm_per_px=1.0, young_kpa=None, paced=False, told=told.append,
-    )  # fmt: skip
+    footage = Footage(shown, "test")
+    account = live.watch_video(footage, backend="dis", paced=False, told=told.append)
     summary = account.summary()
     assert [frame.index for frame in told] == [1, 2, 3, 4]
     assert summary["dropped"] == 0
@@ -175,10 +173,8 @@ def test_stream_answers_every_frame_and_says_what_it_cost() -> None:
 def test_stream_drops_what_comes_too_fast() -> None:
     (pair,) = pairs(Recipe(size=64, pull=2.0, tool=0.0), 1, 3)
     shown = [Picture(k, k * 1e-4, pair.now) for k in range(30)]
-    account = live.watch_footage(
-        Footage(lambda: iter(shown), "test"), Settings("dis", shrink=1, rate_hz=None),
-        method=None, scale_mm_per_px=1.0, young_kpa=None, paced=True, told=lambda frame: None,
-    )  # fmt: skip
+    footage = Footage(shown, "test")
+    account = live.watch_video(footage, backend="dis", paced=True, told=lambda frame: None)
     assert account.dropped > 5
     assert account.dropped + len(account.frames) == 29
 
@@ -197,9 +193,9 @@ def test_live_runs_on_a_video_and_refuses_what_is_none(tmp_path: Path) -> None:
     assert json.loads(ran.output)["frames"] == 2
     (tmp_path / "no.mp4").write_text("no video")
     with pytest.raises(UserError):
-        live.watch_video(tmp_path / "no.mp4")
+        live.watch_video(Footage(read_video(tmp_path / "no.mp4"), "no"))
     with pytest.raises(UserError, match="scale"):
-        live.watch_video(path, method=lambda *given: None)  # type: ignore[arg-type, return-value]
+        live.watch_video(Footage(read_video(path), "video"), method=lambda *given: None)  # type: ignore[arg-type, return-value]
 
 
 @pytest.fixture
@@ -227,8 +223,8 @@ def test_live_answers_with_the_forces_that_scoring_finds(tmp_path: Path, model: 
     assert summary["force_ms"] > 0
     streamed: list[live.Frame] = []
     live.watch_video(
-        folder / "video.mp4", method=Model(model), scale_mm_per_px=0.3, young_kpa=1.0, paced=False,
-        told=streamed.append,
+        Footage(read_video(folder / "video.mp4"), "video"), method=Model(model), scale_mm_per_px=0.3,
+        young_kpa=1.0, paced=False, told=streamed.append,
     )  # fmt: skip
     settings = Settings(shrink=1, rate_hz=None)
     followed = track_recording(open_recording(folder), {"model": Model(model)}, 0.3, settings)

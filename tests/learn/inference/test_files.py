@@ -134,7 +134,7 @@ def test_a_video_is_followed_and_predicted(model: Path, tmp_path: Path) -> None:
     with np.load(tmp_path / "film.npz") as found:
         assert found["total_force_mn"].shape == (3,)
         assert found["young_known"]
-    footage = Footage(lambda: read_video(tmp_path / "film.mp4"), "film", lambda size: marked > 0)
+    footage = Footage(read_video(tmp_path / "film.mp4"), "film", lambda size: marked > 0)
     seen = [step.found.flow for step in VideoFlow(footage, Settings("dis", rate_hz=None)).steps()]
     assert np.abs(seen[0]).max() == 0
     np.testing.assert_allclose(seen[2][16:32, 16:48].mean((0, 1)), [2, 0], atol=0.3)
