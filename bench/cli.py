@@ -28,6 +28,8 @@ app = typer.Typer(
     rich_markup_mode=None,  # "[kPa]" is a unit, not markup
 )
 
+Backend = Annotated[str, typer.Option(help="Flow estimator, as in a job's flow.backend.")]
+Young = Annotated[float | None, typer.Option(help="Young's modulus of the tissue [kPa], if known.")]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")]
 
 
@@ -47,7 +49,7 @@ def score(
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="Folder for score.json and report.html; NAME-score.")
     ] = None,
-    flow: Annotated[str, typer.Option(help="Flow estimator, as in a job's flow.backend.")] = "tvl1",
+    flow: Backend = "tvl1",
     shrink: Annotated[
         int, typer.Option(min=0, max=8, help="Flow on pictures this many times smaller; 0: to 320 columns.")
     ] = 0,
@@ -117,9 +119,7 @@ def import_(
     ],
     out: Annotated[Path, typer.Option("--out", "-o", help="Recording folder to write.")],
     scale: Annotated[float | None, typer.Option(help="mm a pixel; else fill in meta.yaml.")] = None,
-    young: Annotated[
-        float | None, typer.Option(help="Young's modulus of the tissue [kPa], if known.")
-    ] = None,
+    young: Young = None,
     use: Annotated[
         list[str] | None,
         typer.Option(help="ROLE=NAME where there is a choice: frames, frame_time, force, force_time, tip."),
@@ -157,7 +157,7 @@ def demo(
     dataset: Annotated[Path, typer.Argument(help="A rendered dataset.")],
     model: Annotated[Path, typer.Option("--model", "-m", help="Model trained on it.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for recording, score and report.")],
-    flow: Annotated[str, typer.Option(help="Flow estimator.")] = "tvl1",
+    flow: Backend = "tvl1",
     json: Json = False,
 ) -> None:
     """Scores a model on a sequence of its dataset that it has not seen, by way of a recording."""
@@ -230,7 +230,7 @@ def flow(
     truth: Annotated[
         Path | None, typer.Argument(help="True flow: .flo (Middlebury) or .png (KITTI). Empty: not scored.")
     ] = None,
-    flow: Annotated[str, typer.Option(help="Flow estimator, as in a job's flow.backend.")] = "tvl1",
+    flow: Backend = "tvl1",
     glare: Annotated[bool, typer.Option("--glare/--no-glare", help="Mask highlights first.")] = False,
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Write the flow: .flo or .png.")] = None,
     json: Json = False,
@@ -255,10 +255,8 @@ def live(
     video: Annotated[Path, typer.Argument(help="Video; its first frame is the rest frame.")],
     model: Annotated[Path | None, typer.Option("--model", "-m", help="Model folder: forces too.")] = None,
     scale: Annotated[float | None, typer.Option(help="mm a pixel of the video; needed with a model.")] = None,
-    young: Annotated[
-        float | None, typer.Option(help="Young's modulus of the tissue [kPa], if known.")
-    ] = None,
-    flow: Annotated[str, typer.Option(help="Flow estimator, as in a job's flow.backend.")] = "tvl1",
+    young: Young = None,
+    flow: Backend = "tvl1",
     shrink: Annotated[int, typer.Option(min=1, max=8, help="Pictures this many times smaller.")] = 1,
     every: Annotated[bool, typer.Option("--every", help="Work on every frame, however late.")] = False,
     out: Annotated[
@@ -269,8 +267,8 @@ def live(
     """Masks, flow and force of a video as it runs: latency percentiles and dropped frames."""
     from bench.methods.network import Model
     from bench.tracking import live as stream
-    from learn.inference.video import read_video
-    from learn.inference.video_flow import FPS, Footage
+    from learn.inference.video import FPS, read_video
+    from learn.inference.video_flow import Footage
 
     method = None if model is None else Model(model)
 
@@ -282,7 +280,7 @@ def live(
         )
 
     account = stream.watch_video(
-        Footage(read_video(video), str(video), fps=FPS),
+        Footage(read_video(video, FPS), str(video)),
         backend=flow,
         method=method,
         scale_mm_per_px=scale,

@@ -30,20 +30,40 @@ class Finding:
     """What was found."""
 
 
+class _Findings(list[Finding]):
+    """What is found, line by line."""
+
+    def add(self, state: str, what: str, said: str) -> None:
+        self.append(Finding(state, what, said))
+
+
 def check_recording(folder: Path) -> list[Finding]:
     """Opens a recording, decodes its pictures and compares what its files say. Raises no UserError."""
+    found = _Findings()
     try:
         recording = open_recording(folder)
     except UserError as error:
-        return [Finding("bad", "recording", str(error))]
-    found = [Finding("odd", "files", note) for note in recording.notes]
-    found += _scale(recording)
-    times, size, pictures = _pictures(recording)
-    found += pictures
+        found.add("bad", "recording", str(error))
+        return found
+    for note in recording.notes:
+        found.add("odd", "files", note)
+    scale = None
+    try:
+        scale = pixel_scale.find_scale(recording.meta, recording.folder)
+        said = f"{scale.mm_per_px:.4g} mm/px ± {100 * scale.uncertainty:.2g}% ({scale.source})"
+        found.add("ok", "scale", said)
+    except UserError as error:
+        found.add("bad", "scale", str(error))
+    times, size = _check_pictures(recording, found)
     if size is not None:
-        found += _masks(recording, size)
-        found += _width(recording, size)
-    return found + _sensor(recording, times) + _stiffness(recording)
+        _check_masks(recording, size, found)
+        width = scale.mm_per_px * size[1] if scale is not None else _NARROWEST_MM
+        if not _NARROWEST_MM <= width <= _WIDEST_MM:
+            said = f"the picture would be {width:.3g} mm wide: is the scale in mm/px?"
+            found.add("odd", "scale", said)
+    _check_sensor(recording, times, found)
+    _check_stiffness(recording, found)
+    return found
 
 
 def is_usable(found: list[Finding]) -> bool:
@@ -51,132 +71,100 @@ def is_usable(found: list[Finding]) -> bool:
     return all(finding.state != "bad" for finding in found)
 
 
-def _scale(recording: Recording) -> list[Finding]:
-    try:
-        known = pixel_scale.find_scale(recording.meta, recording.folder)
-    except UserError as error:
-        return [Finding("bad", "scale", str(error))]
-    said = f"{known.mm_per_px:.4g} mm/px ± {100 * known.uncertainty:.2g}% ({known.source})"
-    return [Finding("ok", "scale", said)]
-
-
-def _pictures(
-    recording: Recording,
-) -> tuple[NDArray[np.float64], tuple[int, int] | None, list[Finding]]:
+def _check_pictures(
+    recording: Recording, found: _Findings
+) -> tuple[NDArray[np.float64], tuple[int, int] | None]:
+    """Times of the usable frames [s], and height and width of the first."""
     times: list[float] = []
     size: tuple[int, int] | None = None
     count = timeless = back = 0
-    fps = recording.meta.fps
     try:
         for picture in recording.frames():
             size = size or (picture.rgb.shape[0], picture.rgb.shape[1])
             count += 1
-            time = picture.time_s
-            if time is None and fps is not None:
-                time = picture.index / fps
-            if time is None:
+            if picture.time_s is None:
                 timeless += 1
-            elif times and time <= times[-1]:
+            elif times and picture.time_s <= times[-1]:
                 back += 1
             else:
-                times.append(time)
+                times.append(picture.time_s)
     except UserError as error:
-        state = "odd" if count else "bad"
-        return np.array(times), size, [Finding(state, "pictures", str(error))]
+        found.add("odd" if count else "bad", "pictures", str(error))
+        return np.array(times), size
     assert size is not None
     t = np.array(times)
-    found = [Finding("ok", "pictures", f"{count} of {size[1]} x {size[0]} px")]
+    found.add("ok", "pictures", f"{count} of {size[1]} x {size[0]} px")
     if len(t) < 2:
-        return t, size, [*found, Finding("bad", "times", "fewer than two frames have a time")]
-    step = float(np.median(np.diff(t)))
-    found.append(Finding("ok", "times", f"{t[-1] - t[0]:.2f} s at {1 / step:.4g} frames a second"))
+        found.add("bad", "times", "fewer than two frames have a time")
+        return t, size
+    steps = np.diff(t)
+    step = float(np.median(steps))
+    found.add("ok", "times", f"{t[-1] - t[0]:.2f} s at {1 / step:.4g} frames a second")
     if timeless or back:
-        found.append(
-            Finding("odd", "times", f"{timeless} frames without a time, {back} whose time runs back")
-        )
-    jumps = np.flatnonzero(np.diff(t) > _JUMP * step)
-    if len(jumps):
-        worst = jumps[int(np.diff(t)[jumps].argmax())]
-        longest = float(np.diff(t)[worst])
-        found.append(
-            Finding("odd", "times", f"{len(jumps)} gaps, the longest {longest:.3g} s at {t[worst]:.3g} s")
-        )
+        found.add("odd", "times", f"{timeless} frames without a time, {back} whose time runs back")
+    if (jumps := steps > _JUMP * step).any():
+        longest = int(steps.argmax())
+        where = f"the longest {steps[longest]:.3g} s at {t[longest]:.3g} s"
+        found.add("odd", "times", f"{jumps.sum()} gaps, {where}")
     if not 0.5 <= 1 / step <= 1000:
-        found.append(Finding("odd", "times", f"{1 / step:.3g} frames a second: are the times in seconds?"))
+        found.add("odd", "times", f"{1 / step:.3g} frames a second: are the times in seconds?")
     if recording.meta.rest_frame >= count:
-        found.append(
-            Finding("bad", "rest frame", f"rest_frame is {recording.meta.rest_frame} of {count} frames")
-        )
-    return t, size, found
+        found.add("bad", "rest frame", f"rest_frame is {recording.meta.rest_frame} of {count} frames")
+    return t, size
 
 
-def _masks(recording: Recording, size: tuple[int, int]) -> list[Finding]:
-    found = []
+def _check_masks(recording: Recording, size: tuple[int, int], found: _Findings) -> None:
     try:
         tissue = recording.tissue_mask(size)
         if recording.tissue is None:
-            found.append(Finding("lack", "tissue", "no tissue.png: the whole picture is taken for tissue"))
+            found.add("lack", "tissue", "no tissue.png: the whole picture is taken for tissue")
         elif not tissue.any():
-            found.append(Finding("bad", "tissue", "tissue.png marks nothing"))
+            found.add("bad", "tissue", "tissue.png marks nothing")
         if not recording.masks:
-            found.append(
-                Finding("lack", "tool", "no masks/: the instrument will be tracked as if it were tissue")
-            )
+            found.add("lack", "tool", "no masks/: the tool is looked for in each picture")
         else:
             recording.tool(next(iter(recording.masks)), size)
-            found.append(Finding("ok", "tool", f"{len(recording.masks)} masks"))
+            found.add("ok", "tool", f"{len(recording.masks)} masks")
     except UserError as error:
-        found.append(Finding("bad", "masks", str(error)))
-    return found
+        found.add("bad", "masks", str(error))
 
 
-def _width(recording: Recording, size: tuple[int, int]) -> list[Finding]:
-    try:
-        width = pixel_scale.find_scale(recording.meta, recording.folder).mm_per_px * size[1]
-    except UserError:
-        return []
-    if _NARROWEST_MM <= width <= _WIDEST_MM:
-        return []
-    return [Finding("odd", "scale", f"the picture would be {width:.3g} mm wide: is the scale in mm/px?")]
-
-
-def _sensor(recording: Recording, times: NDArray[np.float64]) -> list[Finding]:
+def _check_sensor(recording: Recording, times: NDArray[np.float64], found: _Findings) -> None:
     force, meta = recording.force, recording.meta
     if force is None:
-        return [Finding("lack", "sensor", "no force.csv: predictions only")]
+        found.add("lack", "sensor", "no force.csv: predictions only")
+        return
     t = force.time_s
-    good = np.isfinite(force.force_mn).all(axis=1)
+    lacking = 1 - float(np.isfinite(force.force_mn).all(axis=1).mean())
     peak = float(np.nanmax(np.linalg.norm(force.force_mn, axis=1)))
     rate = 1 / float(np.median(np.diff(t)))
-    found = [Finding("ok", "sensor", f"{len(t)} rows at {rate:.4g} a second, up to {peak:.3g} mN")]
+    found.add("ok", "sensor", f"{len(t)} rows at {rate:.4g} a second, up to {peak:.3g} mN")
     if peak > 1000 * _SURGICAL_N:
-        found.append(
-            Finding("odd", "sensor", f"{peak / 1000:.3g} N is much for a brain: is force.csv in newtons?")
-        )
+        said = f"{peak / 1000:.3g} N is much for a brain: is force.csv in newtons?"
+        found.add("odd", "sensor", said)
     if peak == 0:
-        found.append(Finding("odd", "sensor", "force is zero throughout"))
-    if (~good).mean() > 0.05:
-        found.append(Finding("odd", "sensor", f"{100 * (~good).mean():.0f}% of rows lack a force"))
+        found.add("odd", "sensor", "force is zero throughout")
+    if lacking > 0.05:
+        found.add("odd", "sensor", f"{100 * lacking:.0f}% of rows lack a force")
     if not meta.sensor.free_s:
-        found.append(Finding("lack", "sensor", "no sensor.free_s: no tare, no drift, no noise floor"))
+        found.add("lack", "sensor", "no sensor.free_s: no tare, no drift, no noise floor")
     if len(times) > 1:
         offset = meta.sync.offset_s if meta.sync.method == "offset" else 0.0
         common = min(times[-1], t[-1] + offset) - max(times[0], t[0] + offset)
         share = max(common, 0) / (times[-1] - times[0])
-        state = "ok" if share > 0.9 else "odd"
-        found.append(Finding(state, "clocks", f"the sensor covers {100 * share:.0f}% of the video"))
+        said = f"the sensor covers {100 * share:.0f}% of the video"
+        found.add("ok" if share > 0.9 else "odd", "clocks", said)
         ratio = (t[-1] - t[0]) / (times[-1] - times[0])
-        if ratio > 100 or ratio < 0.01:
-            found.append(
-                Finding("odd", "clocks", f"the sensor's record is {ratio:.3g} times as long: seconds?")
-            )
-    return found
+        if not 0.01 <= ratio <= 100:
+            found.add("odd", "clocks", f"the sensor's record is {ratio:.3g} times as long: seconds?")
 
 
-def _stiffness(recording: Recording) -> list[Finding]:
+def _check_stiffness(recording: Recording, found: _Findings) -> None:
     young = recording.meta.young_kpa
     if young is None:
-        return [Finding("lack", "stiffness", "young_kpa unknown: only relative force can be had")]
-    if not _SOFTEST_KPA <= young <= _STIFFEST_KPA:
-        return [Finding("odd", "stiffness", f"E = {young:g} kPa: is it in kPa?")]
-    return [Finding("ok", "stiffness", f"E = {young:g} kPa ± {100 * recording.meta.young_uncertainty:.2g}%")]
+        found.add("lack", "stiffness", "young_kpa unknown: only relative force can be had")
+    elif not _SOFTEST_KPA <= young <= _STIFFEST_KPA:
+        found.add("odd", "stiffness", f"E = {young:g} kPa: is it in kPa?")
+    else:
+        spread = 100 * recording.meta.young_uncertainty
+        found.add("ok", "stiffness", f"E = {young:g} kPa ± {spread:.2g}%")

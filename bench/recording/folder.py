@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -64,7 +64,7 @@ class Recording:
         return video.count_frames(self.video) if self.video else len(self.pictures)
 
     def frames(self) -> Iterator[Picture]:
-        """Upright frames in order, with times: frames.csv's, else the video's; None if neither says.
+        """Upright frames in order, with times: frames.csv's, else the video's, else `fps` in meta.yaml.
 
         Raises:
             UserError: unreadable video or picture.
@@ -82,10 +82,13 @@ class Recording:
         return np.ones(size, bool) if self.tissue is None else video.read_mask(self.tissue, size)
 
     def _timed(self, picture: Picture) -> Picture:
-        if self.times_s is None:
-            return picture
-        known = picture.index < len(self.times_s) and np.isfinite(self.times_s[picture.index])
-        return Picture(picture.index, float(self.times_s[picture.index]) if known else None, picture.rgb)
+        time_s, fps = picture.time_s, self.meta.fps
+        if self.times_s is not None:
+            known = picture.index < len(self.times_s) and np.isfinite(self.times_s[picture.index])
+            time_s = float(self.times_s[picture.index]) if known else None
+        if time_s is None and fps is not None:
+            time_s = picture.index / fps
+        return replace(picture, time_s=time_s)
 
 
 def open_recording(folder: Path) -> Recording:

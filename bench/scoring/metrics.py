@@ -139,19 +139,20 @@ def lag(time_s: Curve, sensor: Curve, predicted: Curve) -> dict[str, float]:
     """
     both = np.isfinite(sensor) & np.isfinite(predicted) & np.isfinite(time_s)
     t, x, y = time_s[both], sensor[both], predicted[both]
+    nothing = {"lag_s": float("nan"), "r_at_lag": float("nan")}
     if len(t) < 8 or np.ptp(x) == 0 or np.ptp(y) == 0:
-        return {"lag_s": float("nan"), "r_at_lag": float("nan")}
+        return nothing
     step = float(np.median(np.diff(t))) / 4
     search = min(_LARGEST_LAG_S, 0.25 * float(t[-1] - t[0]))
     lags = np.arange(-round(search / step), round(search / step) + 1) * step
     inner = (t >= t[0] + search) & (t <= t[-1] - search)
     if inner.sum() < 8:
-        return {"lag_s": float("nan"), "r_at_lag": float("nan")}
+        return nothing
     shifted = [np.interp(t[inner] + shift, t, y) for shift in lags]
     with np.errstate(divide="ignore", invalid="ignore"):  # a curve that stands still correlates with nothing
         r = np.corrcoef([x[inner], *shifted])[0, 1:]
     if not np.isfinite(r).any():
-        return {"lag_s": float("nan"), "r_at_lag": float("nan")}
+        return nothing
     best = int(np.nanargmax(r))
     return {"lag_s": float(lags[best]), "r_at_lag": float(r[best])}
 

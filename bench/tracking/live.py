@@ -102,7 +102,7 @@ def watch_video(
         end = time.perf_counter()
         seen: NDArray[np.bool_] = found.confidence > 0
         frame = Frame(
-            index=step.index,
+            index=step.picture.index,
             latency_s=end - pace.arrival_s,
             stages_s={"mask": step.masking_s, "flow": found.wall_s, "force": end - began},
             confidence=float(found.confidence[seen].mean()) if seen.any() else 0.0,
@@ -135,7 +135,7 @@ class _Pace:
 
     def start(self, rest: Step) -> None:
         """The clock starts with the rest frame."""
-        self.first_s, self.began_s = rest.time_s or 0.0, time.perf_counter()
+        self.first_s, self.began_s = rest.picture.time_s or 0.0, time.perf_counter()
 
     def is_due(self, index: int, time_s: float) -> bool:
         """Waits until a frame arrives; False if it has a successor already."""

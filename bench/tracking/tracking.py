@@ -87,18 +87,16 @@ def track_recording(
     """
     meta = recording.meta
     tool = recording.tool if recording.masks else None
-    footage = Footage(
-        recording.frames(), str(recording.folder), recording.tissue_mask, tool, meta.fps, meta.rest_frame
-    )
+    footage = Footage(recording.frames(), str(recording.folder), recording.tissue_mask, tool, meta.rest_frame)
     video = VideoFlow(footage, settings, flow)
     asking = _Asking(methods, pictured, video.watch)
     for step in video.steps(progress):
         if asking.scene is None:
             asking.scene = Scene(video.tissue, scale_mm_per_px * video.shrink, meta.young_kpa)
-            asking.out.rest = _shrunk(step.rgb)
+            asking.out.rest = _shrunk(step.picture.rgb)
             asking.out.tissue = _shrunk(video.tissue.astype(np.uint8) * 255) > 127
-        if step.time_s is not None:
-            asking.ask(step, step.time_s, asking.scene)
+        if step.picture.time_s is not None:
+            asking.ask(step, step.picture.time_s, asking.scene)
     out = asking.out
     if not out.time_s:
         if video.seen <= meta.rest_frame:
@@ -142,7 +140,7 @@ class _Asking:
             speed = float(moved.mean()) * scene.scale_mm_per_px / (time_s - out.time_s[-1])
         out.speed.append(speed)
         self.last = flow
-        out.frame.append(step.index)
+        out.frame.append(step.picture.index)
         out.time_s.append(time_s)
         if wanted:
             self._keep(position, step, density)
@@ -150,8 +148,8 @@ class _Asking:
     def _keep(self, position: int, step: Step, density: NDArray[np.float32] | None) -> None:
         """Keeps at most so many, evenly: when full, every other one goes and the stride doubles."""
         small = None if density is None else _shrunk(density)
-        flow = _shrunk(step.found.flow) * np.float32(_ratio(step.rgb.shape[1]))
-        self.out.snapshots.append(Snapshot(position, _shrunk(step.rgb), flow, small))
+        flow = _shrunk(step.found.flow) * np.float32(_ratio(step.picture.rgb.shape[1]))
+        self.out.snapshots.append(Snapshot(position, _shrunk(step.picture.rgb), flow, small))
         if len(self.out.snapshots) >= _MOST_SNAPSHOTS:
             self.out.snapshots = self.out.snapshots[::2]
             self.stride *= 2

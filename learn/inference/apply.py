@@ -18,7 +18,7 @@ from learn.inference import video
 from learn.inference.force_reader import ForceReader
 from learn.inference.predict import Predictor, View
 from learn.inference.stiffness import stiffness
-from learn.inference.video_flow import FPS, Footage, Settings, VideoFlow, everywhere
+from learn.inference.video_flow import Footage, Settings, VideoFlow, everywhere
 from synth.dataset.store import Dataset, Sequence, open_sequence
 from synth.errors import UserError
 
@@ -109,9 +109,9 @@ def _video(path: Path, filmed: Filmed) -> Motion:
         raise UserError(f"{path}: a video doesn't say how large it shows things; give --scale in mm a pixel")
     drawn = filmed.tissue
     tissue = everywhere if drawn is None else partial(video.read_mask, drawn)
-    following = VideoFlow(Footage(video.read_video(path), str(path), tissue, fps=FPS), filmed.settings)
+    following = VideoFlow(Footage(video.read_video(path, video.FPS), str(path), tissue), filmed.settings)
     steps = (
-        Step(step.found.flow, step.found.confidence, step.index, step.time_s or 0.0)
+        Step(step.found.flow, step.found.confidence, step.picture.index, step.picture.time_s or 0.0)
         for step in following.steps()
     )
     rest = next(steps)

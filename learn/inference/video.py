@@ -15,6 +15,9 @@ from synth.errors import UserError
 
 SUFFIXES = (".mp4", ".mov", ".mkv", ".avi", ".webm", ".m4v")
 
+FPS = 25.0
+"""Taken where nobody knows a video's times."""
+
 Rgb = NDArray[np.uint8]
 
 _LARGEST_PIXELS = 40_000_000
@@ -32,8 +35,8 @@ class Picture:
     """(H, W, 3) uint8."""
 
 
-def read_video(path: Path) -> Iterator[Picture]:
-    """Decodes frame by frame; times are the container's presentation times, first frame as stored.
+def read_video(path: Path, fps: float | None = None) -> Iterator[Picture]:
+    """Decodes frame by frame; times are the container's presentation times, else frames over `fps`.
 
     A rotation stated in the file is applied. A file cut off in the middle gives the frames before the cut.
 
@@ -57,9 +60,9 @@ def read_video(path: Path) -> Iterator[Picture]:
         try:
             for frame in container.decode(stream):
                 rgb = np.rot90(frame.to_ndarray(format="rgb24"), frame.rotation // 90)
-                yield Picture(
-                    index, None if frame.pts is None else float(frame.time), np.ascontiguousarray(rgb)
-                )
+                unstated = None if fps is None else index / fps
+                time_s = unstated if frame.pts is None else float(frame.time)
+                yield Picture(index, time_s, np.ascontiguousarray(rgb))
                 index += 1
         except av.error.FFmpegError as error:
             if index == 0:

@@ -27,8 +27,6 @@ Flags = NDArray[np.bool_]
 Size = tuple[int, int]
 """Height, width [px]."""
 
-FPS = 25.0
-"""Taken where a video states no times."""
 WIDTH_KEPT = 320
 """Columns that `shrink` 0 leaves a picture at least: the networks' grids are no finer."""
 
@@ -62,8 +60,6 @@ class Footage:
     """(H, W) where there is tissue in the rest frame."""
     tool: Callable[[int, Size], Flags | None] | None = None
     """(H, W) where the tool is in a frame, None for nowhere; if not given it is found in the pictures."""
-    fps: float | None = None
-    """Frames a second where a frame has no time of its own; None: such frames are left out."""
     rest_frame: int = 0
 
 
@@ -106,12 +102,8 @@ class FlowHere:
 class Step:
     """One frame that was followed."""
 
-    index: int
-    """Position among the decoded frames."""
-    time_s: float | None
-    """On the video's clock [s]; None only for a rest frame without a time."""
-    rgb: Rgb
-    """(h, w, 3), as small as the flow was computed."""
+    picture: Picture
+    """(h, w, 3), as small as the flow was computed; only the rest frame may be without a time."""
     found: Found
     masking_s: float
     """Time that shrinking and masking took [s]."""
@@ -165,26 +157,23 @@ class VideoFlow:
             UserError: unreadable video, no tissue, masks or frames of another size, no such estimator.
         """
         pictures = iter(self.footage.pictures)
-        under_way: deque[tuple[Picture, float | None, float, Callable[[], Found]]] = deque()
+        under_way: deque[tuple[Picture, float, Callable[[], Found]]] = deque()
         while True:
             with self.watch.stage("decode"):
                 picture = next(pictures, None)
             if picture is None:
                 break
             self.seen += 1
-            time_s = picture.time_s
-            if time_s is None and self.footage.fps is not None:
-                time_s = picture.index / self.footage.fps
-            if self._is_wanted(picture.index, time_s):
+            if self._is_wanted(picture.index, picture.time_s):
                 resting = self.tissue.size == 0
                 if resting:
                     self._see(picture)
                 small, blocked, masking_s = self._prepare(picture)
                 if resting:
                     found = self._rest(small.rgb, blocked)
-                    yield Step(picture.index, time_s, small.rgb, found, masking_s)
+                    yield Step(small, found, masking_s)
                 else:
-                    under_way.append((small, time_s, masking_s, self._flow.ask(small.rgb, blocked)))
+                    under_way.append((small, masking_s, self._flow.ask(small.rgb, blocked)))
                 if len(under_way) > self._flow.ahead:
                     yield self._step(*under_way.popleft())
             progress(self.seen)
@@ -239,13 +228,11 @@ class VideoFlow:
         still = np.zeros((*self.tissue.shape, 2), np.float32)
         return Found(still, (self.tissue & ~blocked).astype(np.float32))
 
-    def _step(
-        self, small: Picture, time_s: float | None, masking_s: float, answer: Callable[[], Found]
-    ) -> Step:
+    def _step(self, small: Picture, masking_s: float, answer: Callable[[], Found]) -> Step:
         found = answer()
         self.watch.add("flow", found.cpu_s, found.wall_s)
         self.peak_bytes = max(self.peak_bytes, found.peak_bytes)
-        return Step(small.index, time_s, small.rgb, found, masking_s)
+        return Step(small, found, masking_s)
 
 
 def shrink_picture(picture: Rgb, shrink: int) -> Rgb:
