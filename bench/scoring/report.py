@@ -17,6 +17,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescap
 from numpy.typing import NDArray
 from plotly.offline import get_plotlyjs
 from rich import box
+from rich.markup import escape
 from rich.table import Table
 
 from bench.scoring import charts, metrics
@@ -97,13 +98,13 @@ def terminal_table(result: Result) -> Table:
     table = Table(title=result.recording, title_justify="left", box=box.SIMPLE)
     table.add_column("method")
     if not result.methods[result.main].scores:
-        table.add_column("largest force [mN]", justify="right")
+        table.add_column(escape("largest force [mN]"), justify="right")
         for name, method in result.methods.items():
             table.add_row(name, shown(float(np.nanmax(method.size_mn))))
         return table
     columns = {key: metric for key, metric in _COLUMNS.items() if key in {*_TILES, "bias_mn"}}
     for metric in columns.values():
-        table.add_column(metric.column, justify="right", no_wrap=True)
+        table.add_column(escape(metric.column), justify="right", no_wrap=True)
     for name, method in result.methods.items():
         table.add_row(name, *(shown(method.scores[key], m.cell_unit) for key, m in columns.items()))
     return table

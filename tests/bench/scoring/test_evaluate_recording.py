@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from fake_recording import Bump, Maker
+from rich.console import Console
 from typer.testing import CliRunner
 
 from bench.cli import app
@@ -92,6 +93,14 @@ def test_json_has_no_nan_and_the_page_stands_alone(make: Maker, tmp_path: Path) 
     assert page.count("plotly.js v") == 1
     for outside in ('src="http', "src='http", 'href="http', "@import"):
         assert outside not in page.split("<script>")[0]
+
+
+@pytest.mark.parametrize("force", [True, False])
+def test_the_terminals_table_keeps_its_units(
+    make: Maker, force: bool, capsys: pytest.CaptureFixture[str]
+) -> None:
+    Console(width=80).print(report.terminal_table(run(make(frames=6, force=force))))
+    assert "[mN]" in capsys.readouterr().out
 
 
 def test_page_escapes_what_a_recording_says(make: Maker) -> None:
