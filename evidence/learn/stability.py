@@ -15,8 +15,9 @@ from rich.console import Console
 from bench.output.machine import describe
 from evidence.learn import corruptions as disturb
 from evidence.learn.bad_input import bad_inputs
-from evidence.learn.experiment import RESULTS, small
+from evidence.learn.experiment import RESULTS, ideal_runs, small
 from evidence.learn.labels import clips as labels
+from evidence.learn.runs import model_folder
 from evidence.learn.table import markdown
 from learn.data.clips import Clip
 from learn.data.grid import Grid
@@ -58,7 +59,8 @@ def stability(
     out.mkdir(parents=True, exist_ok=True)
     job, grid = reader.load(str(RESULTS / "data/labels.yaml")), Grid(small().size)
     clips = labels(job, grid, cache)
-    trained = {n: cache / f"models/ideal/{n}-fold0-seed0" for n in ("mse", "ghostless")}
+    study = {run.name: run for run in ideal_runs()}
+    trained = {n: model_folder(study[f"{n}-fold0-seed0"], clips, cache) for n in ("mse", "ghostless")}
     split = nested(clips, 3, 0, 0)
     folder = cache / "models/stability"
     parts: dict[str, Callable[[], list[Row]]] = {
