@@ -57,7 +57,7 @@ def test_the_source_of_a_module_is_that_of_all_it_imports_of_ours(
     assert word(learn__train="RATE = 1  # remarked") == here
     assert word(evidence__page="A = 2") == here
     assert word(learn__train="RATE = 2") != here
-    assert word(evidence__runs=f"{runs}\nB = RATE") != here
+    assert word(evidence__runs="from learn.train import RATE\nB = RATE") != here
 
 
 @pytest.mark.parametrize("module", ["learn.runs", "gap.runs", "end_to_end.pipelines"])
