@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
@@ -178,7 +177,7 @@ def _errors(runs: Sequence[Mapping[str, Any]], test: str, key: str) -> Curve:
 
 def write(tree: dict[str, Any], out: Path) -> None:
     """results.json, README.md, chart.svg and index.html."""
-    results.keep(out, "results.json", json.dumps(_plain(tree), indent=1, allow_nan=False) + "\n")
+    results.keep(out, "results.json", _plain(tree))
     results.keep(out, "README.md", readme(tree))
     result_page.write(drawn(_plain(tree)), out)
 

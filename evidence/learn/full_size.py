@@ -21,6 +21,7 @@ from lightning_fabric import Fabric
 from rich.console import Console
 
 from bench.output.machine import describe
+from bench.output.write import keep
 from evidence.learn.experiment import LOSSES, RESULTS
 from evidence.learn.labels import FINE, whole
 from learn.data.clips import Clip
@@ -79,7 +80,7 @@ def full_size(
     )
     result = train_and_score(clips, settings, accelerator, out / "model", say)
     result["labels_s"] = round(made, 1)
-    (out / "full.json").write_text(json_.dumps(result, indent=1) + "\n")
+    keep(out, "full.json", result)
     if json:
         print(json_.dumps(result))
         return

@@ -13,6 +13,7 @@ import typer
 from rich.console import Console
 
 from bench.output.machine import describe
+from bench.output.write import keep
 from evidence.learn import corruptions as disturb
 from evidence.learn.bad_input import bad_inputs
 from evidence.learn.experiment import RESULTS, ideal_runs, small
@@ -77,7 +78,7 @@ def stability(
     for name, part in parts.items():
         file = out / f"{name}.json"
         if (not only or name == only) and not file.is_file():
-            file.write_text(json_.dumps({"machine": describe(), "rows": part()}, indent=1) + "\n")
+            keep(out, file.name, {"machine": describe(), "rows": part()})
             say(f"{name}: done")
     found = {n: json_.loads((out / f"{n}.json").read_text()) for n in parts if (out / f"{n}.json").is_file()}
     text = "\n\n".join(f"## {_TITLES[n]}\n\n{markdown(f['rows'])}" for n, f in found.items())

@@ -14,7 +14,7 @@ import pytest
 from evidence import kept
 from evidence.gap import experiment, gap, runs
 from learn.data.clips import Clip
-from learn.data.split import Split
+from learn.data.split import nested
 from learn.loss import Objective
 from learn.settings import preset
 
@@ -83,7 +83,8 @@ def test_a_training_is_answered_from_what_was_kept_only_if_nothing_that_made_it_
     monkeypatch.setattr(runs, "train", lambda *args: trained.append(args[3]) or train(*args))
 
     def ask(clips: list[Clip] = clips, settings: Any = settings, kind: str = "I", flow: str = "tvl1") -> int:
-        split, tests = Split((0, 1, 2), (3,), (4,)), {"I": (clips[4:5], "ideal")}
+        split = nested(clips, 3, 0, 0)
+        tests = {"I": ([clips[i] for i in split.test], "ideal")}
         training = runs.Training(kind, flow, 0)
         runs.carry_out(training, clips, split, settings, tests, tmp_path, lambda line: None)
         return len(trained)
