@@ -7,7 +7,7 @@ for a linear solid, force over E is a function of displacement.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,13 +30,6 @@ Floats = NDArray[np.float64]
 Rule = Callable[[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]], Floats]
 """Displacement (2, N, N) mm, mask (N, N) 0/1, confidence (N, N) → force over E, (3,) mN/kPa; NaN: magnitude
 only, in x."""
-
-
-class Regressor(Protocol):
-    """What scikit-learn's regressors are, once fitted."""
-
-    def predict(self, x: Floats) -> Floats: ...
-
 
 GRID = Grid(48)
 _COMPONENTS = 20
@@ -153,7 +146,7 @@ def _rows(moved: NDArray[np.float32], mask: NDArray[np.float32]) -> Floats:
     return (moved * mask[:, None]).reshape(len(moved), -1).astype(np.float64)
 
 
-def _by(basis: TruncatedSVD, regressor: Regressor) -> Rule:
+def _by(basis: TruncatedSVD, regressor: Ridge | KNeighborsRegressor) -> Rule:
     return lambda moved, mask, sure: np.asarray(
         regressor.predict(basis.transform(_rows(moved[None], mask[None])))[0], np.float64
     )
@@ -165,7 +158,7 @@ def ridge(
     fold: NDArray[np.intp],
     strengths: Floats,
     parts: Sequence[slice] = (slice(None),),
-) -> Regressor:
+) -> Ridge:
     """Ridge without intercept: no motion is no force. Its strength by cross-validation.
 
     Args:
@@ -178,24 +171,17 @@ def ridge(
     alphas = strengths * np.square(x).sum() / x.shape[1]
     best = np.full(y.shape[1], alphas[0])
     if len(np.unique(fold)) > 1:
-        errors = np.array([_left_out(x, y, fold, alpha) for alpha in alphas])
+        models = [Ridge(alpha, fit_intercept=False, solver="cholesky") for alpha in alphas]
+        said = [cross_val_predict(model, x, y, cv=PredefinedSplit(fold)) for model in models]
+        errors = np.square(np.stack(said) - y).sum(axis=1)
         for part in parts:
             best[part] = alphas[errors[:, part].sum(axis=1).argmin()]
-    model: Regressor = Ridge(best, fit_intercept=False, solver="cholesky").fit(x, y)
-    return model
+    return Ridge(best, fit_intercept=False, solver="cholesky").fit(x, y)
 
 
-def _left_out(x: Floats, y: Floats, fold: NDArray[np.intp], alpha: float) -> Floats:
-    """Sum of squares of each target's error, (targets,), every sample asked of what the other folds say."""
-    model = Ridge(alpha, fit_intercept=False, solver="cholesky")
-    said = cross_val_predict(model, x, y, cv=PredefinedSplit(fold))
-    return np.asarray(np.square(said - y).sum(axis=0), np.float64)
-
-
-def nearest(x: Floats, y: Floats) -> Regressor:
+def nearest(x: Floats, y: Floats) -> KNeighborsRegressor:
     """Mean of the most alike samples."""
-    model: Regressor = KNeighborsRegressor(min(_NEIGHBOURS, len(x)), algorithm="brute").fit(x, y)
-    return model
+    return KNeighborsRegressor(min(_NEIGHBOURS, len(x)), algorithm="brute").fit(x, y)
 
 
 def _boosting(clips: Sequence[Clip], source: str, rng: np.random.Generator) -> Rule:

@@ -167,31 +167,29 @@ class Trial:
 
     def fit(self, one: Pipeline, made: Sequences) -> Answer:
         """The pipeline's model, fitted on its sequences."""
-        clips = [] if one.model in models.UNLEARNT else made.clips(one.flow)
-        return models.build(one.model, clips, self._model_folder(one, clips), self.epochs, self.seed)
+        clips = _fitted_on(one, made)
+        folder = self.work / "networks" / f"{one.slug}-{self._key(one, clips)}"
+        return models.build(one.model, clips, folder, self.epochs, self.seed)
 
     def errors(self, one: Pipeline, made: Sequences, asked: Sequences) -> dict[str, list[float]]:
         """What the pipeline errs by; one fitted on ideal flow is asked with the default's."""
-        clips = [] if one.model in models.UNLEARNT else made.clips(one.flow)
-        flow = Flow().backend if one.flow == "ideal" else one.flow
-        tests = asked.clips(flow)
+        tests = asked.clips(Flow().backend if one.flow == "ideal" else one.flow)
 
         def compute() -> dict[str, list[float]]:
             answer = self.fit(one, made)
             return errors([answer(clip) for clip in tests], [clip.force for clip in tests])
 
-        key = kept.word(__name__, self._key(one, clips), [clip.content_hash for clip in tests])
+        key = self._key(one, [*_fitted_on(one, made), *tests])
         found: dict[str, list[float]] = kept.result(self.work / "answers", one.slug, key, compute)
         return found
 
-    def _key(self, one: Pipeline, clips: Sequence[Clip]) -> list[Any]:
-        network = (
-            models.network_settings(self.epochs, self.seed).as_dict() if one.model == models.NETWORK else None
-        )
-        return [one.model, one.flow, network, [clip.content_hash for clip in clips]]
+    def _key(self, one: Pipeline, clips: Sequence[Clip]) -> str:
+        settings = models.network_settings(self.epochs, self.seed).as_dict()
+        return kept.word(__name__, one.name, settings, [clip.content_hash for clip in clips])
 
-    def _model_folder(self, one: Pipeline, clips: Sequence[Clip]) -> Path:
-        return self.work / "networks" / f"{one.slug}-{kept.word(__name__, self._key(one, clips))}"
+
+def _fitted_on(one: Pipeline, made: Sequences) -> list[Clip]:
+    return [] if one.model in models.UNLEARNT else made.clips(one.flow)
 
 
 def errors(said: Sequence[Floats], true: Sequence[Floats]) -> dict[str, list[float]]:

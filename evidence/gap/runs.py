@@ -56,8 +56,11 @@ def kept_flow(sequence: Stored, clip: Clip, backend: str, grid: Grid, cache: Pat
         cache: folder of packed clips.
     """
     key = kept.word(recover_flow.__module__, clip.content_hash, backend, grid.size, grid.extent_mm)
-    blocked = sequence["tool"][...].astype(bool)
-    return kept.clip(cache / key, lambda: recover_flow(sequence, clip, backend, blocked, grid)[0])
+
+    def make() -> Clip:
+        return recover_flow(sequence, clip, backend, sequence["tool"][...].astype(bool), grid)[0]
+
+    return kept.clip(cache / key, make)
 
 
 def with_fitted_noise(clips: Sequence[Clip], fit: Sequence[int], seed: int) -> tuple[list[Clip], gap.Noise]:
@@ -111,10 +114,7 @@ def carry_out(
         card = train(used, split, chosen, model)
         spent = round(time.process_time() - began, 1)
         found = {"epoch": card.epoch, "select_r2": card.score, "train_cpu_s": spent}
-        return found | {
-            "noise": None if noise is None else vars(noise),
-            "errors": _errors(model, tests),
-        }
+        return found | {"noise": noise and vars(noise), "errors": _errors(model, tests)}
 
     asked = {name: [c.content_hash for c in part] for name, (part, _) in tests.items()}
     key = kept.word(__name__, *trained, training.flow, asked)

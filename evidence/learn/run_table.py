@@ -1,6 +1,6 @@
 """The runs of an experiment as two tables: a line a run (`runs.json`), one a sequence (`sequences.parquet`).
 
-What runs have in common of their settings stands once. Numbers of a run and moments have seven digits.
+What runs have in common of their settings stands once. A run's numbers have six digits, moments seven.
 `pandas.read_parquet` shows the second to whoever wants to check.
 """
 
@@ -36,7 +36,9 @@ MOMENTS = ("n", "t", "p", "tt", "pp", "tp")
 """Of force density true (t) and said (p) over the map's cells: count, sums, sums of products."""
 _OF_YOUNG = ("map_r2_pooled", "force_r2_pooled", "force_mae")
 _LEFT_OUT = ("sequences", "intervals", "scales", "definitions")
-_DIGITS = 7
+_DIGITS = 6
+_TYPES = ((("run", "sequence"), pa.string()), (SCORES, pa.float64()), (MOMENTS, pa.float32()))
+_SCHEMA = pa.schema([(name, kind) for names, kind in _TYPES for name in names])
 
 
 def write(folder: Path, runs: Sequence[Mapping[str, Any]]) -> None:
@@ -55,13 +57,13 @@ def write(folder: Path, runs: Sequence[Mapping[str, Any]]) -> None:
         lines.append(json.dumps(_short(line)))
     text = f'{{"settings": {json.dumps(common)}, "runs": [\n' + ",\n".join(lines) + "\n]}\n"
     keep(folder, "runs.json", text)
-    rows = [(run["name"], s) for run in runs for s in run["sequences"]]
-    table = {"run": pa.array([name for name, _ in rows]), "sequence": pa.array([s["name"] for _, s in rows])}
-    table |= {name: pa.array([s.get(name) for _, s in rows], pa.float64()) for name in SCORES}
-    for k, name in enumerate(MOMENTS):
-        table[name] = pa.array([s["map_moments"][k] for _, s in rows], pa.float32())
+    rows = [
+        {"run": run["name"], "sequence": s["name"]} | s | dict(zip(MOMENTS, s["map_moments"], strict=False))
+        for run in runs
+        for s in run["sequences"]
+    ]
     pq.write_table(
-        pa.table(table),
+        pa.Table.from_pylist(rows, _SCHEMA),
         folder / "sequences.parquet",
         compression="zstd",
         compression_level=19,

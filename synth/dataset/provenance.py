@@ -37,7 +37,7 @@ def generator() -> dict[str, str]:
     from synth.fields import FORMAT_VERSION
 
     home = Path(__file__).parents[2]
-    return {"format": str(FORMAT_VERSION), "code": _digest(home, _makers(home)), **_computing()}
+    return {"format": str(FORMAT_VERSION), **_versions(home, _makers(home))}
 
 
 def source(modules: Iterable[str], ours: Collection[str], home: Path = Path(__file__).parents[2]) -> str:
@@ -45,8 +45,7 @@ def source(modules: Iterable[str], ours: Collection[str], home: Path = Path(__fi
 
     `ours`: packages under `home` that are followed into.
     """
-    code = _digest(home, _imports(home, modules, ours))
-    return word({"code": code, **_computing()})
+    return word(_versions(home, _imports(home, modules, ours)))
 
 
 def fingerprint() -> str:
@@ -60,16 +59,13 @@ def word(made_by: dict[str, str]) -> str:
     return hashlib.blake2b(described, digest_size=8).hexdigest()
 
 
-def _digest(home: Path, files: Iterable[Path]) -> str:
+def _versions(home: Path, files: Iterable[Path]) -> dict[str, str]:
     total = hashlib.blake2b(digest_size=8)
     for path in sorted(files):
         total.update(f"{path.relative_to(home)}\n".encode())
         total.update(_statements(path).encode() if path.suffix == ".py" else path.read_bytes())
-    return total.hexdigest()
-
-
-def _computing() -> dict[str, str]:
-    return {name: found for name, found in packages.versions().items() if name in _COMPUTING}
+    computing = {name: found for name, found in packages.versions().items() if name in _COMPUTING}
+    return {"code": total.hexdigest(), **computing}
 
 
 def _makers(home: Path) -> set[Path]:
