@@ -198,7 +198,8 @@ def _learn(results: Path) -> list[Front]:
 
 def _end_to_end(found: Mapping[str, Any]) -> list[Front]:
     """Two of every model: of the whole force, and of its part across the line of sight."""
-    from evidence.end_to_end.pareto import PARTS, default_world, difference
+    from evidence.end_to_end.pareto import PARTS, difference
+    from evidence.end_to_end.pipelines import default_world
     from synth.job.schema import Flow
 
     world = default_world()

@@ -14,7 +14,7 @@ from bench.output.result_page import Chart, Sheet, bars, flat
 from bench.scoring import pool
 from evidence.defaults_on_front import read
 from evidence.gap import experiment, leakage
-from evidence.learn import summary
+from evidence.learn import run_table, summary
 
 Tree = Mapping[str, Any]
 
@@ -31,7 +31,7 @@ def every(results: Path) -> Iterator[tuple[Path, Sheet]]:
     for name, gather in _FOLDERS.items():
         if any((results / name).rglob("*.json")):
             yield results / name, gather(results / name)
-    for runs in sorted(results.glob("learn/*/runs")):
+    for runs in sorted(results.glob("learn/*/runs.json")):
         yield runs.parent, learning(runs.parent)
 
 
@@ -185,7 +185,7 @@ def engine(folder: Path) -> Sheet:
 
 def learning(folder: Path) -> Sheet:
     """What every loss, network and control comes to, over the tested sequences."""
-    found = [run for run in summary.runs(folder) if not run["control"]]
+    found = [run for run in run_table.read(folder) if not run["control"]]
     charts = []
     for key, words in summary.COLUMNS:
         rows = [
@@ -251,7 +251,6 @@ _LEARNING = {
     "presets": ("--presets",),
     "fine": ("--fine",),
     "recovered": ("--rendered", "DATASET"),
-    "ideal-first": ("(at commit 2f82ab3)",),
 }
 """Folder of learn's results -> what else its command says."""
 _SAID = ("trained with", "contacts", "gesture", "shown", "trained", "confidence", "s")

@@ -12,6 +12,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
+from sklearn.decomposition import TruncatedSVD
+from sklearn.ensemble import HistGradientBoostingRegressor
+from sklearn.linear_model import Ridge
+from sklearn.model_selection import PredefinedSplit, cross_val_predict
+from sklearn.neighbors import KNeighborsRegressor
 
 from bench.methods import compliance, corotational, inverse
 from bench.methods.protocol import Answer, Method, Scene
@@ -99,9 +104,13 @@ def fitted_rules(clips: Sequence[Clip], source: str, seed: int = 0) -> dict[str,
         "linear in |d|": _linear(peak, size),
         "power law in |d|": _power(peak, size),
     }
-    basis = _Basis(moved, mask)
-    rules["ridge on PCA of flow"] = _ridge(basis, basis(moved, mask), force, _groups(clips))
-    rules["k-NN on PCA of flow"] = _neighbours(basis, basis(moved, mask), force)
+    rows = _rows(moved, mask)
+    # Not centred: no motion stays zero.
+    basis = TruncatedSVD(min(_COMPONENTS, min(rows.shape) - 1), algorithm="arpack", random_state=0).fit(rows)
+    features = basis.transform(rows)
+    strengths, fold = np.geomspace(1e-4, 1e2, 13), _groups(clips) % 4
+    rules["ridge on PCA of flow"] = _by(basis, ridge(features, force, fold, strengths))
+    rules["k-NN on PCA of flow"] = _by(basis, nearest(features, force))
     rules["boosting per pixel"] = _boosting(clips, source, np.random.default_rng(seed))
     return rules
 
@@ -132,60 +141,51 @@ def _power(peak: Floats, size: Floats) -> Rule:
     return lambda moved, mask, sure: _size_only(a * _peak(moved, mask) ** b)
 
 
-class _Basis:
-    """Principal components of masked displacement fields, not centred: no motion stays zero."""
-
-    def __init__(self, moved: NDArray[np.float32], mask: NDArray[np.float32]) -> None:
-        rows = self._rows(moved, mask)
-        _, _, axes = np.linalg.svd(rows, full_matrices=False)
-        self._axes = axes[:_COMPONENTS]
-
-    def __call__(self, moved: NDArray[np.float32], mask: NDArray[np.float32]) -> Floats:
-        """(T, 2, N, N), (T, N, N) → (T, components) mm."""
-        return np.asarray(self._rows(moved, mask) @ self._axes.T, np.float64)
-
-    @staticmethod
-    def _rows(moved: NDArray[np.float32], mask: NDArray[np.float32]) -> Floats:
-        return (moved * mask[:, None]).reshape(len(moved), -1).astype(np.float64)
+def _rows(moved: NDArray[np.float32], mask: NDArray[np.float32]) -> Floats:
+    """(T, 2, N, N) mm, (T, N, N) → masked displacement, (T, 2 N N)."""
+    return (moved * mask[:, None]).reshape(len(moved), -1).astype(np.float64)
 
 
-def _ridge(basis: _Basis, features: Floats, force: Floats, groups: NDArray[np.intp]) -> Rule:
-    """Ridge without intercept; its strength by cross-validation that leaves anatomies out."""
-
-    def solve(x: Floats, y: Floats, strength: float) -> Floats:
-        return np.asarray(np.linalg.solve(x.T @ x + strength * np.eye(x.shape[1]), x.T @ y), np.float64)
-
-    strengths = np.geomspace(1e-4, 1e2, 13) * np.trace(features.T @ features) / features.shape[1]
-    fold = groups % 4
-
-    def left_out(strength: float) -> float:
-        error = 0.0
-        for k in np.unique(fold):
-            out = fold == k
-            if out.all():
-                continue
-            error += float(
-                np.square(features[out] @ solve(features[~out], force[~out], strength) - force[out]).sum()
-            )
-        return error
-
-    best = solve(features, force, min(strengths, key=left_out))
-    return lambda moved, mask, sure: np.asarray((basis(moved[None], mask[None]) @ best)[0], np.float64)
+def _by(basis: TruncatedSVD, regressor: Ridge | KNeighborsRegressor) -> Rule:
+    return lambda moved, mask, sure: np.asarray(
+        regressor.predict(basis.transform(_rows(moved[None], mask[None])))[0], np.float64
+    )
 
 
-def _neighbours(basis: _Basis, features: Floats, force: Floats) -> Rule:
-    def rule(moved: NDArray[np.float32], mask: NDArray[np.float32], sure: NDArray[np.float32]) -> Floats:
-        away = np.square(features - basis(moved[None], mask[None])).sum(axis=1)
-        nearest = np.argsort(away, kind="stable")[:_NEIGHBOURS]
-        return np.asarray(force[nearest].mean(axis=0), np.float64)
+def ridge(
+    x: Floats,
+    y: Floats,
+    fold: NDArray[np.intp],
+    strengths: Floats,
+    parts: Sequence[slice] = (slice(None),),
+) -> Ridge:
+    """Ridge without intercept: no motion is no force. Its strength by cross-validation.
 
-    return rule
+    Args:
+        x: (n, features).
+        y: (n, targets).
+        fold: (n,) the fold that leaves each sample out.
+        strengths: to choose from, in units of the features' mean sum of squares.
+        parts: columns of `y` that share a strength.
+    """
+    alphas = strengths * np.square(x).sum() / x.shape[1]
+    best = np.full(y.shape[1], alphas[0])
+    if len(np.unique(fold)) > 1:
+        models = [Ridge(alpha, fit_intercept=False, solver="cholesky") for alpha in alphas]
+        said = [cross_val_predict(model, x, y, cv=PredefinedSplit(fold)) for model in models]
+        errors = np.square(np.stack(said) - y).sum(axis=1)
+        for part in parts:
+            best[part] = alphas[errors[:, part].sum(axis=1).argmin()]
+    return Ridge(best, fit_intercept=False, solver="cholesky").fit(x, y)
+
+
+def nearest(x: Floats, y: Floats) -> KNeighborsRegressor:
+    """Mean of the most alike samples."""
+    return KNeighborsRegressor(min(_NEIGHBOURS, len(x)), algorithm="brute").fit(x, y)
 
 
 def _boosting(clips: Sequence[Clip], source: str, rng: np.random.Generator) -> Rule:
     """Gradient-boosted trees from a pixel's own channels to the length of its force density."""
-    from sklearn.ensemble import HistGradientBoostingRegressor
-
     features, target = [], []
     for clip in clips:
         inside = clip.mask > 0

@@ -17,7 +17,7 @@ from pathlib import Path
 
 from bench.methods.baselines import GRID
 from evidence.end_to_end.models import Answer
-from evidence.gap.recompute_flow import refollow
+from evidence.gap.recompute_flow import recover_flow
 from learn.data import clips as data
 from learn.data.clips import Clip
 from synth.dataset import location
@@ -73,7 +73,7 @@ def measure(
             found[f"data {name}"].append(_cpu_s(made) / job.frames)
             followed = followed or made
         assert followed is not None
-        _follow(followed, next(iter(jobs.values())), flows, found)
+        _time_flows(followed, next(iter(jobs.values())), flows, found)
         clip = clips[k % len(clips)]
         for name, answer in answers.items():
             began = time.process_time()
@@ -107,7 +107,7 @@ def _cpu_s(made: Stored) -> float:
     return float(sum(t["cpu_s"] for name, t in times.items() if name not in ("peak_rss_mb", "store")))
 
 
-def _follow(made: Stored, job: Job, flows: Sequence[str], found: defaultdict[str, list[float]]) -> None:
+def _time_flows(made: Stored, job: Job, flows: Sequence[str], found: defaultdict[str, list[float]]) -> None:
     clip = data.read(made, GRID, ("ideal",))
     rgb, tools = made["rgb"][...], made["tool"][...].astype(bool)
     for flow in flows:
@@ -115,5 +115,5 @@ def _follow(made: Stored, job: Job, flows: Sequence[str], found: defaultdict[str
         hidden = mask.hidden(rgb, tools)
         masks_s = time.process_time() - began
         estimator = pipeline.estimator(job.flow.model_copy(update={"backend": flow}))
-        _, flow_s = refollow(made, clip, estimator, hidden, GRID)
+        _, flow_s = recover_flow(made, clip, estimator, hidden, GRID)
         found[f"flow {flow}"].append((masks_s + flow_s) / (clip.frames - 1))

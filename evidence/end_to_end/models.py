@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from bench.methods import baselines
 from bench.methods.baselines import GRID
 from learn.data.clips import Clip
+from learn.settings import Settings, preset
 from learn.training import batches
 
 Floats = NDArray[np.float64]
@@ -28,7 +29,6 @@ UNLEARNT = (PHYSICS,)
 
 _TURNS = 8
 _FOLDS = 4
-_NEIGHBOURS = 5
 _STRENGTHS = np.geomspace(1e-8, 1e2, 21)
 
 
@@ -50,12 +50,15 @@ def build(model: str, fit: Sequence[Clip], folder: Path, epochs: int, seed: int)
     x, force, group = _samples([t for clip in fit for t in turned(clip)])
     live = np.abs(x).max(axis=0) > 0
     x = x[:, live]
+    regressor: Any = baselines.nearest(x, force)
     if model == RIDGE:
         # Every sequence weighs alike, as it does in the score: what is linear may be scaled.
         size = np.array([np.sqrt(np.square(force[group == k]).sum(axis=1).mean()) for k in np.unique(group)])
         x, force = x / size[group, None], force / size[group, None]
-    rule_of = {RIDGE: _ridge, NEAREST: _nearest}[model](x, force, group)
-    return lambda clip: clip.young_kpa * rule_of(_rows(clip)[:, live])
+        # Flow shows the force along the line of sight far less well than that across it.
+        parts = (slice(0, 2), slice(2, 3))
+        regressor = baselines.ridge(x, force, group % _FOLDS, _STRENGTHS, parts)
+    return lambda clip: clip.young_kpa * np.asarray(regressor.predict(_rows(clip)[:, live]))
 
 
 def turned(clip: Clip) -> list[Clip]:
@@ -90,52 +93,17 @@ def _samples(clips: Sequence[Clip]) -> tuple[Floats, Floats, NDArray[np.intp]]:
     return x, force, group
 
 
-def _ridge(x: Floats, force: Floats, group: NDArray[np.intp]) -> Callable[[Floats], Floats]:
-    """Linear in all cells, without intercept: no motion is no force.
-
-    The strength is chosen by cross-validation that leaves whole sequences out; that along the line of sight
-    by itself, for flow shows it far less well than the force across it.
-    """
-    folds = [group % _FOLDS == k for k in range(_FOLDS)]
-    grams, targets = [x[f].T @ x[f] for f in folds], [x[f].T @ force[f] for f in folds]
-    gram, target = np.sum(grams, axis=0), np.sum(targets, axis=0)
-    strengths = _STRENGTHS * np.trace(gram) / len(gram)
-    errors = np.zeros((len(strengths), 3))
-    for f, own, aim in zip(folds, grams, targets, strict=True):
-        values, axes = np.linalg.eigh(gram - own)
-        seen, aimed = x[f] @ axes, axes.T @ (target - aim)
-        for k, strength in enumerate(strengths):
-            said = seen @ (aimed / (np.maximum(values, 0) + strength)[:, None])
-            errors[k] += np.square(said - force[f]).sum(axis=0)
-    across, along = int(errors[:, :2].sum(axis=1).argmin()), int(errors[:, 2].argmin())
-    weights = [
-        np.linalg.solve(gram + strengths[k] * np.eye(len(gram)), target[:, axes])
-        for k, axes in ((across, slice(0, 2)), (along, slice(2, 3)))
-    ]
-    best = np.concatenate(weights, axis=1)
-    return lambda seen: np.asarray(seen @ best)
-
-
-def _nearest(x: Floats, force: Floats, group: NDArray[np.intp]) -> Callable[[Floats], Floats]:
-    """Mean force of the most alike frames."""
-    known = np.square(x).sum(axis=1)
-
-    def rule(seen: Floats) -> Floats:
-        away = known - 2 * seen @ x.T  # but for what all candidates share
-        nearest = np.argsort(away, axis=1, kind="stable")[:, :_NEIGHBOURS]
-        return np.asarray(force[nearest].mean(axis=1))
-
-    return rule
+def network_settings(epochs: int, seed: int) -> Settings:
+    """Of the network's training."""
+    return preset("tiny", size=GRID.size, epochs=epochs, input="recovered", seed=seed)
 
 
 def _network(fit: Sequence[Clip], folder: Path, epochs: int, seed: int) -> Answer:
     from learn.data.split import Split
     from learn.inference.predict import load
-    from learn.settings import preset
     from learn.training.train import train
 
-    select = max(2, len(fit) // 5)
-    settings = preset("tiny", size=GRID.size, epochs=epochs, input="recovered", seed=seed)
+    select, settings = max(2, len(fit) // 5), network_settings(epochs, seed)
     train(fit, Split(tuple(range(select, len(fit))), tuple(range(select)), ()), settings, folder)
     predictor = load(folder)
 

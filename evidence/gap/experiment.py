@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
@@ -16,7 +15,7 @@ from bench.bootstrap import Interval
 from bench.output import forest_plot, machine, result_page
 from bench.output import write as results
 from evidence.gap import gap
-from evidence.gap.runs import KEYS, Tests, Training, carry_out, followed
+from evidence.gap.runs import KEYS, Tests, Training, carry_out, kept_flow, write_table
 from learn.data.clips import Clip, load
 from learn.data.split import Split, folds, nested
 from learn.evaluation.statistics import interval
@@ -46,12 +45,12 @@ def run(
     command: str,
     say: Callable[[str], None],
 ) -> dict[str, Any]:
-    """Trains, asks and writes results.json, README.md, chart.svg and index.html.
+    """Trains, asks and writes runs.parquet, results.json, README.md, chart.svg and index.html.
 
     Args:
         dataset: rendered, with recovered flow of the back end `tvl1`, of several appearance families.
-        out: folder for the results; trainings done there are kept.
-        cache: folder for packed sequences.
+        out: folder for the results.
+        cache: folder for packed sequences, trained networks and their errors.
         settings: of every training.
         held_out: family that no training sees.
         flows: back ends of the recovered flow, each a whole experiment.
@@ -65,39 +64,17 @@ def run(
     stored = list(Dataset(dataset))
     clips = load(dataset, settings.grid, ("ideal", "recovered"), cache=cache)
     split, seen_test = parts(clips, held_out, settings)
-    results: dict[str, Any] = {}
-    untrained: dict[str, list[dict[str, Any]]] = {}
+    runs: dict[Training, dict[str, Any]] = {}
     for flow in flows:
         used = clips
         if flow != "tvl1":
             say(f"recovering flow with {flow}")
-            used = [followed(s, c, flow, settings.grid, cache) for s, c in zip(stored, clips, strict=True)]
-        seen = [used[i] for i in seen_test]
-        unseen = [used[i] for i in split.test]
-        tests: Tests = {
-            "I": (seen, "ideal"),
-            "R": (seen, "recovered"),
-            "I'": (unseen, "ideal"),
-            "R'": (unseen, "recovered"),
-        }
-        trained = {
-            kind: [
-                carry_out(
-                    Training(kind, flow, seed),
-                    used,
-                    split,
-                    settings,
-                    tests,
-                    out / "runs",
-                    cache / "models",
-                    say,
-                )
-                for seed in range(seeds)
-            ]
-            for kind in ("I", *KINDS)
-        }
-        results[flow] = summary(trained)
-        untrained[flow] = trained["I"]
+            used = [kept_flow(s, c, flow, settings.grid, cache) for s, c in zip(stored, clips, strict=True)]
+        tests = _tests([used[i] for i in seen_test], [used[i] for i in split.test])
+        for kind in ("I", *KINDS):
+            for seed in range(seeds):
+                training = Training(kind, flow, seed)
+                runs[training] = carry_out(training, used, split, settings, tests, cache, say)
     tree = {
         "command": command,
         "machine": machine.describe(),
@@ -110,11 +87,30 @@ def run(
             "unseen family": len(split.test),
         },
         "seeds": seeds,
-        "flows": results,
-        "better_flow": better_flow(untrained),
-    }
+    } | compared(runs)
+    write_table(runs, out / "runs.parquet")
     write(tree, out)
     return tree
+
+
+def _tests(seen: Sequence[Clip], unseen: Sequence[Clip]) -> Tests:
+    return {
+        "I": (seen, "ideal"),
+        "R": (seen, "recovered"),
+        "I'": (unseen, "ideal"),
+        "R'": (unseen, "recovered"),
+    }
+
+
+def compared(runs: Mapping[Training, Mapping[str, Any]]) -> dict[str, Any]:
+    """What the trainings come to, by flow; and flows against each other."""
+    by: dict[str, dict[str, list[Mapping[str, Any]]]] = {}
+    for training, run in runs.items():
+        by.setdefault(training.flow, {}).setdefault(training.kind, []).append(run)
+    return {
+        "flows": {flow: summary(trained) for flow, trained in by.items()},
+        "better_flow": better_flow({flow: trained["I"] for flow, trained in by.items()}),
+    }
 
 
 def parts(clips: Sequence[Clip], held_out: str, settings: Settings) -> tuple[Split, tuple[int, ...]]:
@@ -132,7 +128,7 @@ def parts(clips: Sequence[Clip], held_out: str, settings: Settings) -> tuple[Spl
     return Split(fit, select, split.test), tuple(sorted(aside))
 
 
-def summary(trained: dict[str, list[dict[str, Any]]]) -> dict[str, Any]:
+def summary(trained: Mapping[str, Sequence[Mapping[str, Any]]]) -> dict[str, Any]:
     """Errors with intervals, and the share of the gap each training closes, for every measure."""
     out: dict[str, Any] = {"noise": trained["N"][0]["noise"], "errors": {}, "closed": {}, "verdict": {}}
     for key in KEYS:
@@ -151,7 +147,7 @@ def summary(trained: dict[str, list[dict[str, Any]]]) -> dict[str, Any]:
     return out
 
 
-def better_flow(untrained: dict[str, list[dict[str, Any]]]) -> dict[str, Any]:
+def better_flow(untrained: Mapping[str, Sequence[Mapping[str, Any]]]) -> dict[str, Any]:
     """The share of OpenCV's gap that our flow closes before any retraining; empty unless both were run.
 
     Args:
@@ -173,7 +169,7 @@ def better_flow(untrained: dict[str, list[dict[str, Any]]]) -> dict[str, Any]:
     }
 
 
-def _errors(runs: Sequence[dict[str, Any]], test: str, key: str) -> Curve:
+def _errors(runs: Sequence[Mapping[str, Any]], test: str, key: str) -> Curve:
     """(S,) errors by sequence, the mean over seeds."""
     rows = [[math.nan if v is None else v for v in run["errors"][test][key]] for run in runs]
     return np.asarray(np.mean(rows, axis=0), np.float64)
@@ -181,7 +177,7 @@ def _errors(runs: Sequence[dict[str, Any]], test: str, key: str) -> Curve:
 
 def write(tree: dict[str, Any], out: Path) -> None:
     """results.json, README.md, chart.svg and index.html."""
-    results.keep(out, "results.json", json.dumps(_plain(tree), indent=1, allow_nan=False) + "\n")
+    results.keep(out, "results.json", _plain(tree))
     results.keep(out, "README.md", readme(tree))
     result_page.write(drawn(_plain(tree)), out)
 

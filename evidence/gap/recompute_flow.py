@@ -1,4 +1,4 @@
-"""A stored sequence followed anew by another estimator, on a grid."""
+"""The flow of a stored sequence recovered anew, by another estimator, on a grid."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from synth.flow.estimator import Estimator
 from synth.flow.track import track
 
 
-def refollow(
+def recover_flow(
     sequence: Sequence, clip: Clip, estimator: str | Estimator, blocked: NDArray[np.bool_], grid: Grid
 ) -> tuple[Clip, float]:
     """The clip with the flow that an estimator recovers, and the CPU time of the flow over all frames [s].

@@ -1,9 +1,7 @@
-"""Trainings of the gap experiment and what they are asked: clips in, errors by sequence out, kept as JSON."""
+"""Trainings of the gap experiment and what they are asked: clips in, errors by sequence out."""
 
 from __future__ import annotations
 
-import hashlib
-import json
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -11,17 +9,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 
+from evidence import kept
 from evidence.gap import gap
-from evidence.gap.recompute_flow import refollow
-from learn.data.clips import Clip, pack, unpack
+from evidence.gap.recompute_flow import recover_flow
+from learn.data.clips import Clip
 from learn.data.grid import Grid
 from learn.data.split import Split
 from learn.evaluation.evaluate import evaluate
 from learn.inference.predict import load
 from learn.settings import Settings
 from learn.training.train import train
-from synth.dataset.folder import write_whole
 from synth.dataset.store import Sequence as Stored
 
 KEYS = ("force_mae", "map_rmse")
@@ -44,31 +44,26 @@ class Training:
     def name(self) -> str:
         return f"{self.kind}-{self.flow}-seed{self.seed}"
 
-    @property
-    def model(self) -> str:
-        """Which network: training on ideal flow is the same whatever flow the test recovers."""
-        return f"I-seed{self.seed}" if self.kind == "I" else self.name
 
-
-def followed(sequence: Stored, clip: Clip, backend: str, grid: Grid, cache: Path) -> Clip:
-    """The clip with the flow that another back end recovers, as the paper's pipeline would run it.
+def kept_flow(sequence: Stored, clip: Clip, backend: str, grid: Grid, cache: Path) -> Clip:
+    """The clip with the flow that another back end recovers, as the paper's pipeline would run it; cached.
 
     Only the instrument is masked, not glare: whoever draws masks by hand draws the tool's.
 
     Args:
         sequence: rendered, with `rgb`, `tool` and `tissue`.
         clip: of the sequence on `grid`, with ideal and any recovered flow.
-        cache: folder of packed clips; keyed by content hash, back end and grid.
+        cache: folder of packed clips.
     """
-    folder = cache / f"{clip.content_hash}-{grid.size}-{grid.extent_mm:g}-{backend}"
-    if folder.is_dir():
-        return unpack(folder)
-    out, _ = refollow(sequence, clip, backend, sequence["tool"][...].astype(bool), grid)
-    pack(out, folder)
-    return out
+    key = kept.word(recover_flow.__module__, clip.content_hash, backend, grid.size, grid.extent_mm)
+
+    def make() -> Clip:
+        return recover_flow(sequence, clip, backend, sequence["tool"][...].astype(bool), grid)[0]
+
+    return kept.clip(cache / key, make)
 
 
-def noisy(clips: Sequence[Clip], fit: Sequence[int], seed: int) -> tuple[list[Clip], gap.Noise]:
+def with_fitted_noise(clips: Sequence[Clip], fit: Sequence[int], seed: int) -> tuple[list[Clip], gap.Noise]:
     """The clips with recovered flow replaced by ideal flow plus noise fitted on the `fit` ones."""
     chosen = [clips[i] for i in fit]
     noise = gap.fit_noise(
@@ -90,57 +85,62 @@ def carry_out(
     split: Split,
     settings: Settings,
     tests: Tests,
-    folder: Path,
-    models: Path,
+    cache: Path,
     say: Callable[[str], None],
 ) -> dict[str, Any]:
-    """The training's errors in every test, from `folder` if it was done before with the same settings.
+    """The training's errors in every test, from `cache` if the same was done before on the same data.
 
     Args:
         clips: with ideal and recovered displacement; only fit and select of `split` are looked at.
         settings: `input` and `seed` are set by the training.
         tests: what the network is asked.
-        folder: gets NAME.json.
-        models: gets the trained networks; an unfinished one is continued.
+        cache: gets results and trained networks; an unfinished one is continued.
         say: told what is under way.
     """
     kind = {"I": "ideal", "R": "recovered", "N": "recovered", "mixed": "mixed"}[training.kind]
     chosen = replace(settings, input=kind, seed=training.seed)  # type: ignore[arg-type]
-    file = folder / f"{training.name}.json"
+    # Training on ideal flow is the same whatever flow the test recovers.
+    flow = "" if training.kind == "I" else f"-{training.flow}"
+    seen = [clips[i].content_hash for i in (*split.fit, *split.select)]
+    trained = [training.kind, flow, chosen.as_dict(), len(split.fit), seen]
+    model = cache / "models" / f"{training.kind}{flow}-seed{training.seed}-{kept.word(__name__, *trained)}"
+
+    def compute() -> dict[str, Any]:
+        say(f"training {training.name}")
+        used, noise = list(clips), None
+        if training.kind == "N":
+            used, noise = with_fitted_noise(used, split.fit, training.seed)
+        began = time.process_time()
+        card = train(used, split, chosen, model)
+        spent = round(time.process_time() - began, 1)
+        found = {"epoch": card.epoch, "select_r2": card.score, "train_cpu_s": spent}
+        return found | {"noise": noise and vars(noise), "errors": _errors(model, tests)}
+
     asked = {name: [c.content_hash for c in part] for name, (part, _) in tests.items()}
-    if file.is_file():
-        done: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
-        if done["settings"] == json.loads(json.dumps(chosen.as_dict())) and done["asked"] == asked:
-            return done
-    say(f"training {training.name}")
-    used, noise = list(clips), None
-    if training.kind == "N":
-        used, noise = noisy(used, split.fit, training.seed)
-    began = time.process_time()
-    model = models / f"{training.model}-{_digest(chosen, used, split)}"
-    card = train(used, split, chosen, model)
-    spent = time.process_time() - began
+    key = kept.word(__name__, *trained, training.flow, asked)
+    done: dict[str, Any] = kept.result(cache / "runs", training.name, key, compute)
+    return done | {"asked": asked}
+
+
+def _errors(model: Path, tests: Tests) -> dict[str, dict[str, list[float]]]:
     predictor = load(model)
-    errors = {}
+    found = {}
     for name, (part, source) in tests.items():
         rows = evaluate(predictor, part, source).per_clip()
-        errors[name] = {key: [row[key] for row in rows] for key in KEYS}
-    result = {
-        "name": training.name,
-        "settings": chosen.as_dict(),
-        "epoch": card.epoch,
-        "select_r2": card.score,
-        "train_cpu_s": round(spent, 1),
-        "noise": None if noise is None else vars(noise),
-        "asked": asked,
-        "errors": errors,
-    }
-    folder.mkdir(parents=True, exist_ok=True)
-    write_whole(file, json.dumps(result, indent=1) + "\n", durable=False)
-    return result
+        found[name] = {key: [row[key] for row in rows] for key in KEYS}
+    return found
 
 
-def _digest(settings: Settings, clips: Sequence[Clip], split: Split) -> str:
-    """Eight letters that change when the settings or the sequences do."""
-    seen = [clips[i].content_hash for i in (*split.fit, *split.select)]
-    return hashlib.sha256(json.dumps([settings.as_dict(), seen]).encode()).hexdigest()[:8]
+def write_table(runs: Mapping[Training, Mapping[str, Any]], file: Path) -> None:
+    """Every sequence's errors in every test of every training, a row each; `sequence`: its content's hash."""
+    rows = [
+        vars(training)
+        | {name: run[name] for name in ("epoch", "select_r2", "train_cpu_s")}
+        | {"test": test, "sequence": sequence}
+        | {key: run["errors"][test][key][k] for key in KEYS}
+        for training, run in runs.items()
+        for test, asked in run["asked"].items()
+        for k, sequence in enumerate(asked)
+    ]
+    file.parent.mkdir(parents=True, exist_ok=True)
+    pq.write_table(pa.Table.from_pylist(rows), file, compression="zstd")

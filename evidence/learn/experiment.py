@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import json
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -11,6 +12,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
+from evidence.learn import run_table
 from evidence.learn.labels import clips as labels
 from evidence.learn.labels import press
 from evidence.learn.runs import Run, carry_out
@@ -172,17 +174,20 @@ def experiment(
         return packed[grid.size]
 
     if rendered is not None:
-        name, runs = "recovered", recovered_runs()
+        name, runs = "recovered", list(recovered_runs())
     elif presets:
-        name, runs = "presets", preset_runs()
+        name, runs = "presets", list(preset_runs())
     else:
-        name, runs = ("fine", fine_runs()) if fine else ("ideal", ideal_runs())
+        name, runs = ("fine", list(fine_runs())) if fine else ("ideal", list(ideal_runs()))
+    # What the code no longer asks for, or asks otherwise, leaves the table.
+    asked = {run.name: json.loads(json.dumps(run.settings.as_dict())) for run in runs}
+    table = {r["name"]: r for r in run_table.read(out / name) if r["settings"] == asked.get(r["name"])}
     for run in runs:
         if only in run.name:
-            grid = run.settings.grid
             # A press costs a sequence: once is enough to say what calibration gives.
-            asked = name == "ideal" and run.name in PRESSED
-            presses = (lambda index: press(job(), index, small().grid, cache)) if asked else None
-            carry_out(run, sequences(grid), out / name / "runs", cache / "models" / name, say, presses)
+            pressed = name == "ideal" and run.name in PRESSED
+            presses = (lambda index: press(job(), index, small().grid, cache)) if pressed else None
+            table[run.name] = carry_out(run, sequences(run.settings.grid), cache, say, presses)
+            run_table.write(out / name, list(table.values()))
     write(out)
     say(f"{out}/README.md")

@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import json as json_
 import time
+from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import torch
 import typer
@@ -20,14 +21,15 @@ from lightning_fabric import Fabric
 from rich.console import Console
 
 from bench.output.machine import describe
+from bench.output.write import keep
 from evidence.learn.experiment import LOSSES, RESULTS
-from evidence.learn.labels import FINE, clip, key
-from learn.data.clips import pack, unpack
+from evidence.learn.labels import FINE, whole
+from learn.data.clips import Clip
 from learn.data.grid import Grid
 from learn.data.split import nested
 from learn.evaluation.evaluate import evaluate
 from learn.inference.predict import load
-from learn.settings import preset
+from learn.settings import Settings, preset
 from learn.training.threads import set_threads
 from learn.training.train import train
 from synth.errors import UserError
@@ -56,16 +58,14 @@ def full_size(
     """Make labels in parallel, train at full size, score the fold that was kept; all of it timed."""
     if loss not in LOSSES:
         raise UserError(f"unknown loss {loss!r}: one of {', '.join(LOSSES)}")
+    if size < FINE:
+        raise UserError(f"grid size {size}: labels are made on {FINE}² at least")
     set_threads(1)
     say = Console(stderr=True).print
     job = reader.load(str(RESULTS / "data/labels.yaml"))
     job = job.model_copy(update={"sequences": sequences, "frames": frames})
-    grid, began = Grid(size), time.perf_counter()
-    if size < FINE:
-        raise UserError(f"grid size {size}: labels are made on {FINE}² at least")
-    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-        list(pool.map(_make, [(job, i, grid, cache) for i in range(sequences)]))
-    clips = [unpack(cache / key(job, i, grid)) for i in range(sequences)]
+    began = time.perf_counter()
+    clips = _labels(job, Grid(size), cache, workers)
     made = time.perf_counter() - began
     gpu = accelerator != "cpu" and torch.cuda.is_available()
     base = preset("paper", size=size, epochs=epochs, batch=batch, folds=10, objective=LOSSES[loss])
@@ -78,40 +78,49 @@ def full_size(
         channels_last=True,
         compile=compile,
     )
+    result = train_and_score(clips, settings, accelerator, out / "model", say)
+    result["labels_s"] = round(made, 1)
+    keep(out, "full.json", result)
+    if json:
+        print(json_.dumps(result))
+        return
+    known = result["columns"]["known"]
+    print(
+        f"{result['frames_fit']} frames, {epochs} epochs in {result['training_s']:.0f} s "
+        f"({result['frames_per_s']} frames/s), labels in {made:.0f} s; map R² {known['map_r2_pooled']:.3f}, "
+        f"force R² {known['force_r2_pooled']:.3f}"
+    )
+
+
+def train_and_score(
+    clips: Sequence[Clip], settings: Settings, accelerator: str, model: Path, say: Callable[[str], None]
+) -> dict[str, Any]:
+    """What a training took and what the fold that was kept says of it."""
     split = nested(clips, settings.folds, settings.fold, settings.seed)
     fabric = Fabric(accelerator=accelerator, devices=1, precision=settings.precision)
     began = time.perf_counter()
-    card = train(clips, split, settings, out / "model", fabric=fabric, log=lambda numbers: say(str(numbers)))
+    card = train(clips, split, settings, model, fabric=fabric, log=lambda numbers: say(str(numbers)))
     trained = time.perf_counter() - began
-    predictor = load(out / "model", fabric.device)
-    known = evaluate(predictor, [clips[i] for i in split.test], "ideal")
-    seen = len(split.fit) * frames
-    result = {
+    report = evaluate(load(model, fabric.device), [clips[i] for i in split.test], "ideal")
+    seen = sum(clips[i].frames for i in split.fit)
+    return {
         "machine": describe() | {"device": str(fabric.device), "torch": torch.__version__},
         "settings": settings.as_dict(),
         "sequences": {"fit": len(split.fit), "select": len(split.select), "test": len(split.test)},
         "frames_fit": seen,
-        "labels_s": round(made, 1),
         "training_s": round(trained, 1),
-        "frames_per_s": round(seen * epochs / trained, 1),
+        "frames_per_s": round(seen * settings.epochs / trained, 1),
         "epoch": card.epoch,
-        "columns": known.as_dict()["columns"],
+        "columns": report.as_dict()["columns"],
     }
-    (out / "full.json").write_text(json_.dumps(result, indent=1) + "\n")
-    summary = known.summary()
-    if json:
-        print(json_.dumps(result))
-    else:
-        print(
-            f"{seen} frames, {epochs} epochs in {trained:.0f} s ({result['frames_per_s']} frames/s), "
-            f"labels in {made:.0f} s; map R² {summary['map_r2_pooled']:.3f}, "
-            f"force R² {summary['force_r2_pooled']:.3f}"
-        )
+
+
+def _labels(job: Job, grid: Grid, cache: Path, workers: int) -> list[Clip]:
+    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+        list(pool.map(_make, [(job, i, grid, cache) for i in range(job.sequences)]))
+    return [whole(job, i, grid, cache) for i in range(job.sequences)]
 
 
 def _make(task: tuple[Job, int, Grid, Path]) -> None:
-    job, index, grid, cache = task
     torch.set_num_threads(1)
-    folder = cache / key(job, index, grid)
-    if not folder.is_dir():
-        pack(clip(job, index, grid, folder.name), folder)
+    whole(*task)

@@ -6,7 +6,6 @@ Whatever asks only for ideal flow needs no light. The motion, camera and label a
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -14,11 +13,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from learn.data.clips import Clip, pack, unpack
+from evidence import kept
+from learn.data.clips import Clip
 from learn.data.grid import Grid, Resampler, centre, settled
 from synth.fem.tool import Gesture
 from synth.geometry.triangles import Shape
-from synth.job import identity
 from synth.job.schema import Job
 from synth.render import truth
 from synth.render.anatomy import rim
@@ -28,8 +27,6 @@ from synth.sequence.scenario import Scenario
 
 FINE = 128
 """Cells along the edge of the grid that labels are made on, at least."""
-_VERSION = 2
-"""Of what is packed: a change of the labels makes another cache."""
 _PRESS = 0x9E55
 """Told apart from every other draw of a sequence."""
 
@@ -41,21 +38,29 @@ def clips(
 
     Labels are made on 128² or finer; 64² is four cells of that in one.
     """
-    fine = grid if grid.size >= FINE else Grid(FINE, grid.extent_mm)
     out = []
     for index in range(job.sequences):
         report(index, job.sequences)
-        name = key(job, index, fine)
-        folder = cache / name
-        if not folder.is_dir():
-            pack(clip(job, index, fine, name), folder)
-        if grid.size < fine.size:
-            folder = cache / f"{name}-{grid.size}"
-            if not folder.is_dir():
-                pack(coarser(unpack(cache / name), fine, fine.size // grid.size), folder)
-        out.append(unpack(folder))
+        out.append(_one(job, index, grid, cache))
     report(job.sequences, job.sequences)
     return out
+
+
+def _one(job: Job, index: int, grid: Grid, cache: Path) -> Clip:
+    if grid.size >= FINE:
+        return whole(job, index, grid, cache)
+    fine = Grid(FINE, grid.extent_mm)
+
+    def make() -> Clip:
+        return coarser(whole(job, index, fine, cache), fine, fine.size // grid.size)
+
+    return kept.clip(cache / f"{key(job, index, fine)}-{grid.size}", make)
+
+
+def whole(job: Job, index: int, grid: Grid, cache: Path) -> Clip:
+    """One sequence with ideal flow on a grid, cached."""
+    name = key(job, index, grid)
+    return kept.clip(cache / name, lambda: clip(job, index, grid, name))
 
 
 def coarser(clip: Clip, grid: Grid, times: int) -> Clip:
@@ -85,22 +90,23 @@ def press(job: Job, index: int, grid: Grid, cache: Path) -> Clip:
     """A push somewhere else on the tissue of a sequence: what calibrates E (`learn.inference.stiffness`)."""
     fine = Grid(max(grid.size, FINE), grid.extent_mm)
     name = f"{key(job, index, grid)}-press"
-    if not (cache / name).is_dir():
+
+    def make() -> Clip:
         case = scenario.draw(job, index)
         rng = np.random.default_rng([job.seed, index, _PRESS])
         only = job.fem.model_copy(update={"gestures": ("push",)})
         gesture = Gesture.draw(only, job.anatomy.craniotomy, case.tissue, rng)
         made = clip(job, index, fine, name, replace(case, gesture=gesture))
         times = fine.size // grid.size
-        pack(coarser(made, fine, times) if times > 1 else made, cache / name)
-    return unpack(cache / name)
+        return coarser(made, fine, times) if times > 1 else made
+
+    return kept.clip(cache / name, make)
 
 
 def key(job: Job, index: int, grid: Grid) -> str:
-    """Hash of all that labels depend on: pictures and flow estimators change none of them."""
+    """One word for all that labels depend on, the code that makes them too; flow estimators aren't asked."""
     parts = job.model_dump(mode="json", include={"seed", "frames", "fps", "anatomy", "fem", "render"})
-    described = identity.canonical([_VERSION, parts, index, grid.size, grid.extent_mm])
-    return hashlib.blake2b(described, digest_size=16).hexdigest()
+    return kept.word(__name__, parts, index, grid.size, grid.extent_mm)
 
 
 def clip(job: Job, index: int, grid: Grid, name: str, case: Scenario | None = None) -> Clip:

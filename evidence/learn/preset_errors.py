@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from evidence.learn.coarse_rmse import CELLS
 from evidence.learn.experiment import BESIDE, small
-from evidence.learn.runs import column
+from evidence.learn.run_table import column, read
 from learn.evaluation.statistics import Interval, interval, paired
 from learn.network.d2fnet import Architecture
 from learn.settings import PRESETS
@@ -64,8 +64,7 @@ def errors(root: Path) -> Known:
     that differs from the study's in any other setting, or was tested on recovered flow.
     """
     found: dict[tuple[Shape, int], dict[int, dict[str, Any]]] = {}
-    for file in sorted([*root.glob("ideal/runs/*.json"), *root.glob("presets/runs/*.json")]):
-        run = json.loads(file.read_text())
+    for run in [*read(root / "ideal"), *read(root / "presets")]:
         if not run["control"] and run["source"] == "ideal" and _alike(run["settings"]):
             tree = run["settings"]
             found.setdefault((shape(architecture(tree["arch"])), tree["size"]), {})[tree["seed"]] = run

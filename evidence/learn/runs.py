@@ -1,4 +1,4 @@
-"""Training runs as data: (clips, split, settings) → one JSON of per-sequence scores, kept and reused."""
+"""Training runs as data: (clips, split, settings) → scores a sequence, kept and reused."""
 
 from __future__ import annotations
 
@@ -11,10 +11,11 @@ from typing import Any
 
 import numpy as np
 
+from evidence import kept
 from evidence.learn.coarse_rmse import CELLS, wide_rmse
 from evidence.learn.controls import beyond_mean_map, controls, mean_map
 from learn.data.clips import Clip
-from learn.data.split import nested
+from learn.data.split import Split, nested
 from learn.evaluation.evaluate import evaluate
 from learn.inference.predict import Predictor, load
 from learn.inference.stiffness import stiffness
@@ -42,40 +43,55 @@ class Run:
 def carry_out(
     run: Run,
     clips: Sequence[Clip],
-    folder: Path,
-    models: Path,
+    cache: Path,
     say: Callable[[str], None],
     presses: Callable[[int], Clip] | None = None,
 ) -> dict[str, Any]:
-    """The run's scores on its test fold, from `folder` if it was done before.
+    """The run's scores on its test fold, from `cache` if the same run was done before on the same data.
 
-    `models`: where the trained model stays, for whoever asks it more; a run that was stopped goes on from
-    there.
+    `cache`: where scores and trained models stay; a training that was stopped goes on from there.
     `presses`: gives a calibration press on the tissue of a sequence, by its index.
     """
-    file = folder / f"{run.name}.json"
-    if file.is_file():
-        done: dict[str, Any] = json.loads(file.read_text())
-        return done
-    split = nested(clips, run.settings.folds, run.settings.fold, 0, run.settings.held_out_family)
-    used = list(clips)
-    if run.control == "shuffled":
-        used = _dealt_out(used, split.fit)
-    began, clock = time.process_time(), models / run.name / "cpu_s"
-    whole = not (models / run.name).exists()
-    card = train(used, split, run.settings, models / run.name)
+    split, key = _split(run, clips), _key(run, clips)
+
+    def compute() -> dict[str, Any]:
+        trained = _train(run, clips, split, model_folder(run, clips, cache))
+        found = trained | _score(run, clips, split, model_folder(run, clips, cache), presses)
+        known, spent = found["columns"]["known"], found["train_cpu_s"]
+        took = "continued" if spent is None else f"{spent:.0f} CPU-s"
+        say(
+            f"{run.name}: {took}, map R² {known['map_r2_pooled']:.3f}, "
+            f"force R² {known['force_r2_pooled']:.3f}, ghosts {known['ghost_relative']:.4f}"
+        )
+        return found
+
+    folder, name = cache / "runs", run.name if presses is None else f"{run.name}-pressed"
+    done: dict[str, Any] = kept.result(folder, name, key, compute)
+    return done
+
+
+def model_folder(run: Run, clips: Sequence[Clip], cache: Path) -> Path:
+    """Where the trained model of a run is."""
+    return cache / "models" / f"{run.name}-{_key(run, clips)}"
+
+
+def _key(run: Run, clips: Sequence[Clip]) -> str:
+    settings = run.settings.as_dict()
+    asked = [run.source, run.control, run.controlled, [clip.content_hash for clip in clips]]
+    return kept.word(__name__, settings, *asked)
+
+
+def _split(run: Run, clips: Sequence[Clip]) -> Split:
+    return nested(clips, run.settings.folds, run.settings.fold, 0, run.settings.held_out_family)
+
+
+def _train(run: Run, clips: Sequence[Clip], split: Split, model: Path) -> dict[str, Any]:
+    used = _dealt_out(list(clips), split.fit) if run.control == "shuffled" else clips
+    began, clock, whole = time.process_time(), model / "cpu_s", not model.exists()
+    card = train(used, split, run.settings, model)
     if whole:
         clock.write_text(f"{time.process_time() - began:.1f}")
-    # A run that was stopped and continued has no time to tell.
-    spent = float(clock.read_text()) if clock.is_file() else None
-    predictor = load(models / run.name)
-    pressed = None
-    if presses is not None:
-        pressed = {clips[i].content_hash: _pressed(predictor, presses(i)) for i in split.test[:PRESSES]}
-    fitted, tested = [clips[i] for i in split.fit], [clips[i] for i in split.test]
-    report = evaluate(predictor, tested, run.source, pressed=pressed)
-    history = [json.loads(s) for s in (models / run.name / "history.jsonl").read_text().splitlines()]
-    result: dict[str, Any] = {
+    return {
         "name": run.name,
         "source": run.source,
         "control": run.control,
@@ -84,30 +100,36 @@ def carry_out(
         "sequences_select": len(split.select),
         "epoch": card.epoch,
         "select_r2": card.score,
-        "train_cpu_s": spent,
-        "history": history,
-        "controls": controls(predictor, tested, run.source, fitted) if run.controlled else {},
-        **report.as_dict(),
+        # A run that was stopped and continued has no time to tell.
+        "train_cpu_s": float(clock.read_text()) if clock.is_file() else None,
+        "history": [json.loads(line) for line in (model / "history.jsonl").read_text().splitlines()],
     }
+
+
+def _score(
+    run: Run,
+    clips: Sequence[Clip],
+    split: Split,
+    model: Path,
+    presses: Callable[[int], Clip] | None,
+) -> dict[str, Any]:
+    predictor, pressed = load(model), None
+    if presses is not None:
+        pressed = {clips[i].content_hash: _pressed(predictor, presses(i)) for i in split.test[:PRESSES]}
+    fitted, tested = [clips[i] for i in split.fit], [clips[i] for i in split.test]
+    report = evaluate(predictor, tested, run.source, pressed=pressed)
+    found: dict[str, Any] = report.as_dict()
+    found["controls"] = controls(predictor, tested, run.source, fitted) if run.controlled else {}
     if run.settings.size > CELLS:
         wide = wide_rmse(predictor, tested, run.source)
-        for row, value in zip(result["sequences"], wide, strict=True):
+        for row, value in zip(found["sequences"], wide, strict=True):
             row["map_rmse_wide"] = value
     if run.control:
-        base = mean_map(tested, predictor.card, fitted)
-        result["beyond_mean_map"] = beyond_mean_map(report, base)
+        found["beyond_mean_map"] = beyond_mean_map(report, mean_map(tested, predictor.card, fitted))
     if pressed is not None:
-        off = [abs(np.log(pressed[clips[i].content_hash] / clips[i].young_kpa)) for i in split.test[:PRESSES]]
-        result["press_young_off"] = float(np.exp(np.median(off)) - 1)
-    folder.mkdir(parents=True, exist_ok=True)
-    file.write_text(json.dumps(result, indent=1) + "\n")
-    known = report.summary()
-    took = "continued" if spent is None else f"{spent:.0f} CPU-s"
-    say(
-        f"{run.name}: {took}, map R² {known['map_r2_pooled']:.3f}, "
-        f"force R² {known['force_r2_pooled']:.3f}, ghosts {known['ghost_relative']:.4f}"
-    )
-    return result
+        off = [abs(np.log(pressed[c.content_hash] / c.young_kpa)) for c in tested[:PRESSES]]
+        found["press_young_off"] = float(np.exp(np.median(off)) - 1)
+    return found
 
 
 def _pressed(predictor: Predictor, press: Clip) -> float:
@@ -132,10 +154,3 @@ def _dealt_out(clips: list[Clip], fit: Sequence[int]) -> list[Clip]:
             force=np.stack([clips[j].force[t] / clips[j].young_kpa for j, t in from_]) * clips[i].young_kpa,
         )
     return out
-
-
-def column(results: Sequence[dict[str, Any]], key: str) -> np.ndarray[Any, np.dtype[np.float64]]:
-    """One metric of every tested sequence of some runs, in order; NaN where it has none."""
-    return np.array(
-        [np.nan if s.get(key) is None else s[key] for r in results for s in r["sequences"]], np.float64
-    )

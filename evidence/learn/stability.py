@@ -13,10 +13,12 @@ import typer
 from rich.console import Console
 
 from bench.output.machine import describe
+from bench.output.write import keep
 from evidence.learn import corruptions as disturb
 from evidence.learn.bad_input import bad_inputs
-from evidence.learn.experiment import RESULTS, small
+from evidence.learn.experiment import RESULTS, ideal_runs, small
 from evidence.learn.labels import clips as labels
+from evidence.learn.runs import model_folder
 from evidence.learn.table import markdown
 from learn.data.clips import Clip
 from learn.data.grid import Grid
@@ -58,7 +60,8 @@ def stability(
     out.mkdir(parents=True, exist_ok=True)
     job, grid = reader.load(str(RESULTS / "data/labels.yaml")), Grid(small().size)
     clips = labels(job, grid, cache)
-    trained = {n: cache / f"models/ideal/{n}-fold0-seed0" for n in ("mse", "ghostless")}
+    study = {run.name: run for run in ideal_runs()}
+    trained = {n: model_folder(study[f"{n}-fold0-seed0"], clips, cache) for n in ("mse", "ghostless")}
     split = nested(clips, 3, 0, 0)
     folder = cache / "models/stability"
     parts: dict[str, Callable[[], list[Row]]] = {
@@ -75,7 +78,7 @@ def stability(
     for name, part in parts.items():
         file = out / f"{name}.json"
         if (not only or name == only) and not file.is_file():
-            file.write_text(json_.dumps({"machine": describe(), "rows": part()}, indent=1) + "\n")
+            keep(out, file.name, {"machine": describe(), "rows": part()})
             say(f"{name}: done")
     found = {n: json_.loads((out / f"{n}.json").read_text()) for n in parts if (out / f"{n}.json").is_file()}
     text = "\n\n".join(f"## {_TITLES[n]}\n\n{markdown(f['rows'])}" for n, f in found.items())

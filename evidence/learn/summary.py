@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from evidence.learn.runs import column
+from evidence.learn.run_table import column, read
 from evidence.learn.table import markdown
 from learn.evaluation.statistics import Interval, interval, paired, pooled_r2, pooled_r2_difference
 from learn.loss import SHARES
@@ -26,32 +25,30 @@ COLUMNS = (
 )
 
 
-def runs(folder: Path) -> list[dict[str, Any]]:
-    """What the runs of an experiment left, by name."""
-    return [json.loads(file.read_text()) for file in sorted(folder.glob("runs/*.json"))]
-
-
 def family(name: str) -> str:
     """What a run compares: its name without fold and seed."""
     return name.split("-fold")[0]
 
 
 def write(out: Path) -> None:
-    """`out`/README.md from every run found in `out`/*/runs."""
+    """The tables of `out`/README.md from all runs found in `out`; what stands above them stays."""
     parts = []
-    for folder in sorted(p for p in out.iterdir() if (p / "runs").is_dir()):
-        found = runs(folder)
-        if found:
-            parts += [f"## {folder.name}", "", *_table(found), "", *_tests(found), ""]
-            for title, rows in (
-                ("What is known of E", _stiffness(found)),
-                ("Controls, of the trained models", _controls(found)),
-                ("Each term's share of the gradient on the map, first and last epoch", _gradient(found)),
-                ("Total force by band of true force (shares of the largest in training)", _bands(found)),
-            ):
-                parts += [f"### {title}", "", markdown(rows), ""] if rows else []
-    head = (out / "HEAD.md").read_text() if (out / "HEAD.md").is_file() else "# Learn: results\n"
-    (out / "README.md").write_text(head + "\n" + "\n".join(parts))
+    for folder in sorted(p.parent for p in out.glob("*/runs.json")):
+        found = read(folder)
+        parts += [f"## {folder.name}", "", *_table(found), "", *_tests(found), ""]
+        for title, rows in (
+            ("What is known of E", _stiffness(found)),
+            ("Controls, of the trained models", _controls(found)),
+            ("Each term's share of the gradient on the map, first and last epoch", _gradient(found)),
+            ("Total force by band of true force (shares of the largest in training)", _bands(found)),
+        ):
+            parts += [f"### {title}", "", markdown(rows), ""] if rows else []
+    page = out / "README.md"
+    head = page.read_text("utf-8").split(_TABLES)[0] if page.is_file() else "# Learn: results\n\n"
+    page.write_text(f"{head}{_TABLES}\n\n" + "\n".join(parts), "utf-8")
+
+
+_TABLES = "<!-- From here on: written by `bench experiment learn`. -->"
 
 
 def _table(found: list[dict[str, Any]]) -> list[str]:
@@ -214,8 +211,6 @@ _AGAINST = (
     ("published", "ghostless"),
     ("mse", "capped"),
     ("mse", "hinge"),
-    ("mse", "hinge4"),
-    ("mse", "hinge-mse"),
     ("hinge", "ghostless"),
     ("r2-frame", "ghostless"),
     ("mse", "antighost"),

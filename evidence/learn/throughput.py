@@ -23,6 +23,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
 from bench.output.machine import describe
+from bench.output.write import keep
 from evidence.learn.table import markdown
 from learn.data.clips import Clip, pack, unpack
 from learn.data.grid import Scales
@@ -72,8 +73,7 @@ def loading(
         row["data, against published"] = round(rows[0]["data [ms]"] / row["data [ms]"], 1)
     result = {"machine": describe() | {"device": device, "threads": 1}, "size": size, "width": width}
     result |= {"batch": batch, "steps": steps, "vertices": VERTICES, "rows": rows}
-    out.mkdir(parents=True, exist_ok=True)
-    (out / f"data-{device}.json").write_text(json_.dumps(result, indent=1) + "\n")
+    keep(out, f"data-{device}.json", result)
     files = [json_.loads(file.read_text()) for file in sorted(out.glob("data-*.json"))]
     (out / "README.md").write_text(_HEAD + "\n".join(_section(f) for f in files))
     if json:

@@ -64,7 +64,8 @@ def realism_figures(
     }
     if out is not None:
         write.keep(out, "realism.json", found)
-        cv2.imwrite(str(out / "sheet.jpg"), _sheet(pictures)[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 88])
+        quality = [cv2.IMWRITE_JPEG_QUALITY, 75, cv2.IMWRITE_JPEG_PROGRESSIVE, 1]
+        cv2.imwrite(str(out / "sheet.jpg"), _sheet(pictures)[..., ::-1], quality)
     if beside is not None:
         cv2.imwrite(str(beside), _beside(pictures, _scaled(photo, width_mm / pixel))[..., ::-1])
     if json:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import hashlib
 import json
+from collections.abc import Collection, Iterable
 from functools import cache
 from pathlib import Path
 
@@ -35,12 +36,16 @@ def generator() -> dict[str, str]:
     """
     from synth.fields import FORMAT_VERSION
 
-    home, total = Path(__file__).parents[2], hashlib.blake2b(digest_size=8)
-    for path in sorted(_makers(home)):
-        total.update(f"{path.relative_to(home)}\n".encode())
-        total.update(_statements(path).encode() if path.suffix == ".py" else path.read_bytes())
-    computing = {name: found for name, found in packages.versions().items() if name in _COMPUTING}
-    return {"format": str(FORMAT_VERSION), "code": total.hexdigest(), **computing}
+    home = Path(__file__).parents[2]
+    return {"format": str(FORMAT_VERSION), **_versions(home, _makers(home))}
+
+
+def source(modules: Iterable[str], ours: Collection[str], home: Path = Path(__file__).parents[2]) -> str:
+    """One word for the statements of modules and of all that they import, and for the packages that compute.
+
+    `ours`: packages under `home` that are followed into.
+    """
+    return word(_versions(home, _imports(home, modules, ours)))
 
 
 def fingerprint() -> str:
@@ -54,8 +59,27 @@ def word(made_by: dict[str, str]) -> str:
     return hashlib.blake2b(described, digest_size=8).hexdigest()
 
 
+def _versions(home: Path, files: Iterable[Path]) -> dict[str, str]:
+    total = hashlib.blake2b(digest_size=8)
+    for path in sorted(files):
+        total.update(f"{path.relative_to(home)}\n".encode())
+        total.update(_statements(path).encode() if path.suffix == ".py" else path.read_bytes())
+    computing = {name: found for name, found in packages.versions().items() if name in _COMPUTING}
+    return {"code": total.hexdigest(), **computing}
+
+
 def _makers(home: Path) -> set[Path]:
-    """Files that the maker of sequences is made of: its modules, theirs, and the networks beside them.
+    """Files that the maker of sequences is made of."""
+    return _imports(home, [_MAKER, *estimators(home)], {"synth"})
+
+
+def estimators(home: Path = Path(__file__).parents[2]) -> list[str]:
+    """Modules of flow estimators: found by name, so nothing that uses them imports them."""
+    return [f"synth.flow.{path.stem}" for path in (home / "synth/flow").glob("[a-z]*.py")]
+
+
+def _imports(home: Path, modules: Iterable[str], ours: Collection[str]) -> set[Path]:
+    """Files of modules, of all that they import of the packages `ours`, and the networks beside them.
 
     Packages are followed like modules, so that what an `__init__.py` re-exports counts.
 
@@ -65,8 +89,7 @@ def _makers(home: Path) -> set[Path]:
     for name in _NO_PART:
         _file(home, name)
     found: set[Path] = set()
-    # Estimators of flow are found by name, so all of them count.
-    waiting = [_MAKER, *(f"synth.flow.{path.stem}" for path in (home / "synth/flow").glob("[a-z]*.py"))]
+    waiting = list(modules)
     while waiting:
         name = waiting.pop()
         file = _file(home, name)
@@ -75,16 +98,12 @@ def _makers(home: Path) -> set[Path]:
         found |= {file, *file.parent.glob("*.pt")}
         for node in ast.walk(ast.parse(file.read_text("utf-8"))):
             if isinstance(node, ast.Import):
-                waiting += [alias.name for alias in node.names if _is_ours(alias.name)]
-            elif isinstance(node, ast.ImportFrom) and _is_ours(node.module or ""):
+                waiting += [alias.name for alias in node.names if alias.name.split(".")[0] in ours]
+            elif isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] in ours:
                 waiting += _imported(home, str(node.module), [alias.name for alias in node.names])
             elif isinstance(node, ast.ImportFrom) and node.level:
                 raise LookupError(f"{file}: relative imports can't be followed")
     return found
-
-
-def _is_ours(name: str) -> bool:
-    return name.split(".")[0] == "synth"
 
 
 def _file(home: Path, name: str) -> Path:

@@ -5,13 +5,15 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from evidence import defaults_on_front
-from evidence.end_to_end import costs, models, page, pareto
+from evidence import defaults_on_front, kept
+from evidence.end_to_end import costs, models, page, pareto, pipelines
+from evidence.end_to_end.pipelines import Sequences
 from learn.data.clips import Clip
 
 N, T = 16, 6
@@ -44,19 +46,19 @@ def clip(rng: np.random.Generator, name: int = 0) -> Clip:
 
 def test_errors_of_known_answers() -> None:
     force = np.tile([3.0, 0.0, 4.0], (2, 1))
-    zero = pareto.errors([np.zeros((2, 3))], [force])
+    zero = pipelines.errors([np.zeros((2, 3))], [force])
     assert zero == {
         "errors": [pytest.approx(1)],
         "across": [pytest.approx(0.6)],
         "along": [pytest.approx(0.8)],
     }
-    half = pareto.errors([force / 2, force], [force, force])
+    half = pipelines.errors([force / 2, force], [force, force])
     assert half["errors"] == [pytest.approx(0.5), 0]
 
 
 def test_a_small_press_weighs_as_much_as_a_large_one() -> None:
     force = np.tile([3.0, 0.0, 4.0], (2, 1))
-    found = pareto.errors([force * 0, force * 0.5], [force, 100 * force])
+    found = pipelines.errors([force * 0, force * 0.5], [force, 100 * force])
     assert found["errors"] == [pytest.approx(1), pytest.approx(0.995)]
 
 
@@ -107,7 +109,7 @@ def test_ridge_finds_what_is_linear_and_nearest_finds_what_it_knows(tmp_path: Pa
     rng = np.random.default_rng(2)
     fit, fresh = [clip(rng, k) for k in range(12)], clip(rng, 12)
     ridge = models.build(models.RIDGE, fit, tmp_path, 1, 0)
-    found = pareto.errors([ridge(fresh)], [fresh.force])
+    found = pipelines.errors([ridge(fresh)], [fresh.force])
     assert found["errors"][0] < 0.05
     twice = [replace(one, force=one.force * 0 + [0, 0, 4.0]) for one in fit]
     near = models.build(models.NEAREST, twice, tmp_path, 1, 0)
@@ -122,7 +124,7 @@ def test_the_least_of_the_rounds_counts() -> None:
 
 
 def row(cpu_s: float, errors: list[float], *, default: bool = False, tets: int = 1600) -> dict[str, object]:
-    world = pareto.default_world()
+    world = pipelines.default_world()
     return {
         "law": world.law, "tets": tets, "spp": world.spp, "flow": "tvl1", "model": "m", "default": default,
         "cpu_s": cpu_s, "errors": errors, "across": errors, "along": errors,
@@ -130,13 +132,52 @@ def row(cpu_s: float, errors: list[float], *, default: bool = False, tets: int =
 
 
 def test_kept_sequences_are_found_only_by_what_made_them(monkeypatch: pytest.MonkeyPatch) -> None:
-    world = pareto.FINE
+    world = pipelines.FINE
     job = world.job(1, 4)
-    here = pareto.called(world, job)
-    assert pareto.called(world, world.job(1, 9)) == here  # more of the same
-    longer = pareto.called(world, job.model_copy(update={"frames": job.frames + 1}))
+    here = pipelines.folder_name(world, job)
+    assert pipelines.folder_name(world, world.job(1, 9)) == here  # more of the same
+    longer = pipelines.folder_name(world, job.model_copy(update={"frames": job.frames + 1}))
     monkeypatch.setattr("synth.dataset.provenance.fingerprint", lambda: "another")
-    assert len({here, longer, pareto.called(world, job)}) == 3
+    assert len({here, longer, pipelines.folder_name(world, job)}) == 3
+
+
+class Given:
+    """Stands for sequences of a world: clips that are there."""
+
+    def __init__(self, clips: list[Clip]) -> None:
+        self._clips = clips
+
+    def clips(self, flow: str) -> list[Clip]:
+        return self._clips
+
+
+def test_kept_errors_are_found_only_by_all_that_made_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rng = np.random.default_rng(3)
+    fit, fresh = [clip(rng, k) for k in range(3)], [clip(rng, 9)]
+    built: list[Path] = []
+
+    def build(model: str, fit: list[Clip], folder: Path, epochs: int, seed: int) -> models.Answer:
+        built.append(folder)
+        return lambda clip: 0 * clip.force
+
+    monkeypatch.setattr(models, "build", build)
+    one = pipelines.Pipeline(pipelines.default_world(), "tvl1", models.NETWORK)
+
+    def ask(epochs: int = 2, fit: list[Clip] = fit, asked: list[Clip] = fresh) -> int:
+        trial = pipelines.Trial(epochs, 0, tmp_path)
+        found = trial.errors(one, cast(Sequences, Given(fit)), cast(Sequences, Given(asked)))
+        assert found["errors"] == [pytest.approx(1)] * len(asked)
+        return len(built)
+
+    assert [ask(), ask()] == [1, 1]
+    assert ask(epochs=3) == 2  # another setting of the training
+    assert ask(fit=[replace(fit[0], content_hash="other"), *fit[1:]]) == 3
+    assert ask(asked=[*fresh, fit[0]]) == 4
+    monkeypatch.setattr(kept, "code", lambda module: "other")
+    assert ask() == 5
+    assert len(set(built)) == 4  # what is asked changes nothing of the model
 
 
 def test_differences_are_paired() -> None:

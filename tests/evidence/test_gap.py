@@ -1,11 +1,24 @@
-"""The gap's arithmetic on errors that are known, and the noise model on noise that is."""
+"""The gap's arithmetic on errors that are known, the noise model on noise that is, and what is kept."""
 
 from __future__ import annotations
 
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 
-from evidence.gap import gap
+from evidence import kept
+from evidence.gap import experiment, gap, runs
+from learn.data.clips import Clip
+from learn.data.split import nested
+from learn.loss import Objective
+from learn.settings import preset
+
+RESULTS = Path(__file__).parents[2] / "docs" / "results" / "gap"
 
 
 def test_share_closed_by_hand() -> None:
@@ -46,3 +59,41 @@ def test_verdict_names_the_cheaper_way_when_it_is_as_good() -> None:
     assert "not needed" in gap.verdict(shares, (-0.2, -0.1))
     assert "not shown" in gap.verdict(shares, (-0.1, 0.2))
     assert "closes more than" in gap.verdict({"R": closing(0.5), "N": closing(0.2)}, (0.1, 0.2))
+
+
+def test_results_are_those_of_the_runs_beside_them() -> None:
+    found: dict[runs.Training, dict[str, Any]] = {}
+    tree = json.loads((RESULTS / "results.json").read_text("utf-8"))
+    for row in pq.read_table(RESULTS / "runs.parquet").to_pylist():
+        training = runs.Training(row["kind"], row["flow"], row["seed"])
+        run = found.setdefault(training, {"noise": tree["flows"][row["flow"]]["noise"], "errors": {}})
+        for key in runs.KEYS:
+            run["errors"].setdefault(row["test"], {}).setdefault(key, []).append(row[key])
+    again = json.loads(json.dumps(experiment._plain(experiment.compared(found))))
+    assert {name: tree[name] for name in again} == again
+
+
+def test_a_training_is_answered_from_what_was_kept_only_if_nothing_that_made_it_changed(
+    clips: list[Clip], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settings = preset("tiny", size=32, epochs=1, objective=Objective(kind="mse"))
+    settings = replace(settings, arch=replace(settings.arch, levels=2, width=8, output="magnitude"))
+    trained: list[Path] = []
+    train = runs.train
+    monkeypatch.setattr(runs, "train", lambda *args: trained.append(args[3]) or train(*args))
+
+    def ask(clips: list[Clip] = clips, settings: Any = settings, kind: str = "I", flow: str = "tvl1") -> int:
+        split = nested(clips, 3, 0, 0)
+        tests = {"I": ([clips[i] for i in split.test], "ideal")}
+        training = runs.Training(kind, flow, 0)
+        runs.carry_out(training, clips, split, settings, tests, tmp_path, lambda line: None)
+        return len(trained)
+
+    assert [ask(), ask()] == [1, 1]
+    assert ask(settings=replace(settings, weight_decay=0.1)) == 2
+    assert ask([replace(clips[0], content_hash="other"), *clips[1:]]) == 3
+    assert ask(flow="dis") == 4
+    assert trained[3] == trained[0]  # asked otherwise, but the same network
+    monkeypatch.setattr(kept, "code", lambda module: "other")
+    assert ask() == 5
+    assert len(set(trained)) == 4

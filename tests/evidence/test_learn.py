@@ -5,13 +5,15 @@ from __future__ import annotations
 import dataclasses
 import json
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from evidence import kept
 from evidence.learn import corruptions as disturb
+from evidence.learn import run_table, runs
 from evidence.learn.bad_input import bad_inputs
 from evidence.learn.coarse_rmse import wide_rmse
 from evidence.learn.controls import beyond_mean_map, controls, mean_map
@@ -121,15 +123,13 @@ def test_a_fine_grid_gets_pictures_of_a_pixel_a_cell() -> None:
     assert pictured(job, Grid(256)).render.size == (384, 288)
 
 
-def kept(root: Path, run: Run, rmse: list[float]) -> None:
-    """A run's file, as far as errors are read from it."""
+def done(run: Run, rmse: list[float]) -> dict[str, Any]:
+    """What a run leaves, as far as errors are read from it."""
     names = ("map_rmse", "map_rmse_wide", "force_mae")
-    rows = [{"name": f"{k}"} | dict.fromkeys(names, v) for k, v in enumerate(rmse)]
+    moments = {"map_moments": [1.0] * 7}
+    rows = [{"name": f"{k}"} | moments | dict.fromkeys(names, v) for k, v in enumerate(rmse)]
     tree = {"name": run.name, "control": run.control, "settings": run.settings.as_dict(), "sequences": rows}
-    tree["source"] = run.source
-    file = root / "presets/runs" / f"{run.name}.json"
-    file.parent.mkdir(parents=True, exist_ok=True)
-    file.write_text(json.dumps(tree))
+    return tree | {"source": run.source, "history": [{}], "columns": {"known": {}}}
 
 
 def test_errors_are_of_runs_that_were_trained_as_the_preset_is(tmp_path: Path) -> None:
@@ -137,16 +137,21 @@ def test_errors_are_of_runs_that_were_trained_as_the_preset_is(tmp_path: Path) -
     own = [shape(run.settings.arch) == shape(PRESETS["cpu"].arch) for run in runs]
     cpu, other = runs[own.index(True)], runs[own.index(False)]
     again = Run("again", dataclasses.replace(other.settings, seed=1))
-    kept(tmp_path, cpu, [1.0, 2.0, 3.0, 4.0])
-    kept(tmp_path, other, [1.5, 2.5, 3.0, 4.5])
-    kept(tmp_path, again, [2.5, 2.5, 3.0, 4.5])
     mse = dataclasses.replace(cpu.settings, objective=Objective(kind="mse"), seed=7)
-    kept(tmp_path, Run("another-loss", mse), [9.0] * 4)
-    kept(tmp_path, Run("longer", dataclasses.replace(cpu.settings, epochs=99, seed=8)), [9.0] * 4)
     decayed = dataclasses.replace(cpu.settings, weight_decay=0.1, seed=9)
-    kept(tmp_path, Run("other-decay", decayed), [9.0] * 4)
     elsewhere = dataclasses.replace(cpu.settings, seed=10)
-    kept(tmp_path, Run("on-recovered", elsewhere, source="recovered"), [9.0] * 4)
+    unlike = [
+        Run("another-loss", mse),
+        Run("longer", dataclasses.replace(cpu.settings, epochs=99, seed=8)),
+        Run("other-decay", decayed),
+        Run("on-recovered", elsewhere, source="recovered"),
+    ]
+    like = [
+        done(cpu, [1.0, 2.0, 3.0, 4.0]),
+        done(other, [1.5, 2.5, 3.0, 4.5]),
+        done(again, [2.5, 2.5, 3.0, 4.5]),
+    ]
+    run_table.write(tmp_path / "presets", [*like, *(done(run, [9.0] * 4) for run in unlike)])
     found = errors(tmp_path)
     assert set(found) == {(shape(r.settings.arch), 128) for r in (cpu, other)}
     mine, beside = (found[shape(r.settings.arch), 128] for r in (cpu, other))
@@ -159,8 +164,8 @@ def test_errors_are_of_runs_that_were_trained_as_the_preset_is(tmp_path: Path) -
 
 def test_runs_that_were_tested_on_other_sequences_are_not_averaged(tmp_path: Path) -> None:
     first = next(preset_runs())
-    kept(tmp_path, first, [1.0, 2.0, 3.0])
-    kept(tmp_path, Run("again", dataclasses.replace(first.settings, seed=1)), [1.0, 2.0])
+    again = Run("again", dataclasses.replace(first.settings, seed=1))
+    run_table.write(tmp_path / "presets", [done(first, [1.0, 2.0, 3.0]), done(again, [1.0, 2.0])])
     with pytest.raises(UserError, match="different sequences"):
         errors(tmp_path)
 
@@ -168,6 +173,47 @@ def test_runs_that_were_tested_on_other_sequences_are_not_averaged(tmp_path: Pat
 def test_runs_of_two_kinds_are_not_asked_for_at_once(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="one of them"):
         experiment(tmp_path, fine=True, presets=True)
+
+
+def test_tables_give_back_what_runs_left(tmp_path: Path) -> None:
+    one, two = list(preset_runs())[:2]
+    left = [done(two, [0.1, 1 / 3]), done(one, [0.2, 0.3])]
+    del left[0]["sequences"][1]["map_rmse_wide"]
+    run_table.write(tmp_path, left)
+    found = run_table.read(tmp_path)
+    assert [run["name"] for run in found] == sorted([one.name, two.name])
+    for run, was in zip(found, sorted(left, key=lambda run: run["name"]), strict=True):
+        assert run["settings"] == json.loads(json.dumps(was["settings"]))
+    both = [run for run in found if run["name"] == two.name]
+    assert run_table.column(both, "map_rmse") == pytest.approx([0.1, 1 / 3], abs=0)
+    assert np.isnan(run_table.column(both, "map_rmse_wide")).tolist() == [False, True]
+
+
+def test_a_run_is_answered_from_what_was_kept_only_if_nothing_that_made_it_changed(
+    clips: list[Clip], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settings = preset("tiny", size=32, epochs=1, folds=3, objective=Objective(kind="mse"))
+    run = Run(
+        "run", dataclasses.replace(settings, arch=dataclasses.replace(settings.arch, levels=2, width=8))
+    )
+    trained: list[str] = []
+    train = runs.train
+    monkeypatch.setattr(runs, "train", lambda *args: trained.append(str(args[3])) or train(*args))
+
+    def ask(run: Run = run, clips: list[Clip] = clips) -> dict[str, Any]:
+        return runs.carry_out(run, clips, tmp_path, lambda line: None)
+
+    first = ask()
+    assert len(trained) == 1
+    assert ask() == first
+    assert len(trained) == 1
+    ask(dataclasses.replace(run, settings=dataclasses.replace(run.settings, weight_decay=0.1)))
+    assert len(trained) == 2
+    ask(clips=[dataclasses.replace(clips[0], content_hash="other"), *clips[1:]])
+    assert len(trained) == 3
+    monkeypatch.setattr(kept, "code", lambda module: "other")
+    ask()
+    assert len(set(trained)) == 4
 
 
 def test_a_word_that_no_network_holds_needs_times_to_show(tmp_path: Path) -> None:

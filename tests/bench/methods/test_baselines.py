@@ -74,6 +74,39 @@ def test_neighbours_and_trees_answer_within_the_data(methods: dict[str, Method])
     )
 
 
+def test_ridge_is_its_formula_with_the_strength_that_errs_least_on_folds_left_out() -> None:
+    rng = np.random.default_rng(0)
+    x, fold = rng.normal(size=(60, 8)) * np.geomspace(1, 0.01, 8), np.arange(60) % 4
+    y = x @ rng.normal(size=(8, 3)) + [0.02, 0.02, 0.5] * rng.normal(size=(60, 3))
+    strengths = np.geomspace(1e-6, 1e2, 9)
+
+    def solve(x: NDArray[np.float64], y: NDArray[np.float64], alpha: float) -> NDArray[np.float64]:
+        return np.asarray(np.linalg.solve(x.T @ x + alpha * np.eye(8), x.T @ y))
+
+    alphas = strengths * np.trace(x.T @ x) / 8
+    errors = [
+        sum(
+            np.square(x[fold == k] @ solve(x[fold != k], y[fold != k], a) - y[fold == k]).sum(0)
+            for k in range(4)
+        )
+        for a in alphas
+    ]
+    parts = (slice(0, 2), slice(2, 3))
+    chosen = [int(np.argmin([e[part].sum() for e in errors])) for part in parts]
+    assert chosen[0] != chosen[1]
+    by_hand = [x @ solve(x, y[:, part], alphas[k]) for part, k in zip(parts, chosen, strict=True)]
+    said = baselines.ridge(x, y, fold, strengths, parts).predict(x)
+    np.testing.assert_allclose(said, np.concatenate(by_hand, axis=1), rtol=1e-9, atol=1e-12)
+
+
+def test_nearest_is_the_mean_of_the_five_most_alike() -> None:
+    rng = np.random.default_rng(0)
+    x, y, asked = rng.normal(size=(40, 6)), rng.normal(size=(40, 3)), rng.normal(size=(7, 6))
+    order = np.square(asked[:, None] - x).sum(-1).argsort(axis=1)[:, :5]
+    np.testing.assert_allclose(baselines.nearest(x, y).predict(asked), y[order].mean(axis=1), rtol=1e-12)
+    assert baselines.nearest(x[:2], y[:2]).predict(asked)[0] == pytest.approx(y[:2].mean(axis=0))
+
+
 def test_mean_and_zero_do_not_look(methods: dict[str, Method]) -> None:
     assert ask(methods["mean"], np.zeros(3), 2.0) == pytest.approx(2.0 * 5.0)
     assert ask(baselines.physical()["zero"], np.array([9.0, 0, 0]), 2.0) == 0
