@@ -48,7 +48,7 @@ quick: setup lint types
 	$(BIN)/python -m pytest -n 2 -m "not slow"
 
 docs: setup
-	PYTHONPATH=. $(BIN)/python docs/generate.py
+	$(BIN)/python docs/generate.py
 	PYTHONPATH=docs $(BIN)/python -m zensical build --strict --clean
 
 lint: setup
