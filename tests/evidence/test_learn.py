@@ -170,6 +170,7 @@ def test_runs_of_two_kinds_are_not_asked_for_at_once(tmp_path: Path) -> None:
         experiment(tmp_path, fine=True, presets=True)
 
 
+@pytest.mark.slow
 def test_a_word_that_no_network_holds_needs_times_to_show(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="nothing"):
         pareto(tmp_path / "new", tmp_path, only="nothing")
