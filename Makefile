@@ -12,6 +12,7 @@ PYTHON ?= $(shell for p in python3.13 python3.12 python3.11 python3; do \
 	  $$p -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo $$p && break; done)
 BIN := .venv/bin
 DEMO := runs/demo
+PYTEST := $(BIN)/python -m pytest -n 2
 
 .PHONY: demo test quick docs setup lint types clean
 .DELETE_ON_ERROR:
@@ -42,10 +43,10 @@ demo: setup
 	@echo "done: open $(DEMO)/report.html"
 
 test: setup lint types
-	$(BIN)/python -m pytest -n 2
+	$(PYTEST)
 
 quick: setup lint types
-	$(BIN)/python -m pytest -n 2 -m "not slow"
+	$(PYTEST) -m "not slow"
 
 docs: setup
 	$(BIN)/python docs/generate.py
