@@ -27,6 +27,7 @@ PAGES = [
     for page in [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(DOCS.rglob("*.md"))]
     if page.relative_to(ROOT).parts[:2] not in (("docs", "results"), ("docs", "reference"))
 ]
+GENERATED = generate.pages()
 SPOKEN = {spoken.words: spoken for spoken in generate.commands()}
 
 
@@ -44,9 +45,9 @@ def typed(page: Path) -> Iterator[str]:
             yield line.strip().removeprefix(".venv/bin/")
 
 
-@pytest.mark.parametrize("page", generate.pages(), ids=lambda page: page.stem)
+@pytest.mark.parametrize("page", GENERATED, ids=lambda page: page.stem)
 def test_generated_pages_are_those_of_this_code(page: Path) -> None:
-    assert page.read_text("utf-8") == generate.pages()[page], "out of date: run `make docs`"
+    assert page.read_text("utf-8") == GENERATED[page], "out of date: run `make docs`"
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)

@@ -136,6 +136,7 @@ def test_an_import_that_leads_nowhere_is_an_error(tmp_path: Path) -> None:
         provenance._makers(home)
 
 
+@pytest.mark.slow
 def test_a_sequence_sealed_by_an_attempt_that_was_lost_is_not_made_again(tmp_path: Path) -> None:
     run(tmp_path / "made", job=JOB.model_copy(update={"sequences": 1}))
     setup = Setup(
@@ -199,6 +200,7 @@ def test_an_account_says_rates_time_and_disk(tmp_path: Path) -> None:
     assert said.endswith("frames/s in all; 2.5 GB to come, 1 TB free")
 
 
+@pytest.mark.slow
 def test_a_clock_that_jumps_changes_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, undisturbed: str
 ) -> None:

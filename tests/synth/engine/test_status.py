@@ -50,6 +50,7 @@ def test_failures_are_counted_by_reason_and_retried(tmp_path: Path) -> None:
     assert json.loads(shown)["done"] == 5
 
 
+@pytest.mark.slow
 def test_forecast_rests_on_finished_sequences(tmp_path: Path) -> None:
     root = tmp_path / "out"
     engine.run(JOB, root, options("sequence"), Silent())

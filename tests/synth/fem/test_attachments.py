@@ -46,6 +46,7 @@ def compared(free: Tets, held: Tets, region: schema.Attachment, edge_mm: float) 
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("given", [BALL, {**FALX, "thickness_mm": 6.0}], ids=["ball", "sheet"])
 def test_a_region_of_the_block_is_held_and_the_rest_is_not(given: dict[str, object]) -> None:
     region = schema.Attachment.model_validate(given)

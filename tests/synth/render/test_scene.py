@@ -140,6 +140,7 @@ def test_a_moved_camera_and_weaker_light_are_in_picture_and_truth() -> None:
     assert (back.radiance == rest.radiance).all()
 
 
+@pytest.mark.slow
 def test_an_open_shutter_adds_up_light() -> None:
     ours, vertices = studio(VARIANTS[-1], spp=4, tool=False)
     moments = [Moment(vertices, TIPS, SHAFTS, None, power) for power in (0.5, 1.5)]
