@@ -44,7 +44,7 @@ def commented(found: Tuned, source: str, overrides: Sequence[str], folder: Path)
 
     Args:
         found: what was measured.
-        source, overrides: as given to `synth.job.reader.load`.
+        source, overrides: as given to `config.load`.
         folder: where the file will be, from which relative paths start.
     """
     path = Path(source)
