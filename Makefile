@@ -1,7 +1,8 @@
 # `make demo` and `make test` are all the set-up there is: both make the virtual environment first.
 #
 #   make demo    dataset -> training -> scores -> runs/demo/report.html
-#   make test    lint, types, tests
+#   make test    lint, types, all tests: what has to pass before anything lands
+#   make quick   lint, types, and the tests that take no more than seconds
 #   make docs    the pages in site/; open site/index.html
 #   make clean   removes what these made
 #
@@ -11,8 +12,9 @@ PYTHON ?= $(shell for p in python3.13 python3.12 python3.11 python3; do \
 	  $$p -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo $$p && break; done)
 BIN := .venv/bin
 DEMO := runs/demo
+PYTEST := $(BIN)/python -m pytest -n 2
 
-.PHONY: demo test docs setup lint types clean
+.PHONY: demo test quick docs setup lint types clean
 .DELETE_ON_ERROR:
 
 setup: .venv/installed .venv/llvm
@@ -41,11 +43,14 @@ demo: setup
 	@echo "done: open $(DEMO)/report.html"
 
 test: setup lint types
-	$(BIN)/python -m pytest -n 2
+	$(PYTEST)
+
+quick: setup lint types
+	$(PYTEST) -m "not slow"
 
 docs: setup
 	$(BIN)/python docs/generate.py
-	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+	PYTHONPATH=docs $(BIN)/python -m zensical build --strict --clean
 
 lint: setup
 	$(BIN)/ruff check .
@@ -55,4 +60,4 @@ types: setup
 	$(BIN)/mypy
 
 clean:
-	rm -rf .venv runs build site *.egg-info .mypy_cache .ruff_cache .pytest_cache
+	rm -rf .venv .cache runs build site *.egg-info .mypy_cache .ruff_cache .pytest_cache

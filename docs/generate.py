@@ -1,11 +1,13 @@
 """Writes the pages that say what the code says: `python docs/generate.py`, which `make docs` runs.
 
 Job keys and meta.yaml come from their schemas, fields from the field table, commands from the command lines'
-own help. A test fails when a page says something else.
+own help, the map of rooms from the packages' docstrings, the site's list of results from its folders. A test
+fails when a page says something else.
 """
 
 from __future__ import annotations
 
+import ast
 from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib import import_module
@@ -21,8 +23,13 @@ from synth.job import reader, writer
 from synth.job.schema import Job
 
 DOCS = Path(__file__).resolve().parent
+ROOT = DOCS.parent
 PROGRAMS = ("synth", "learn", "bench")
+PACKAGES = (*PROGRAMS, "evidence")
 _WRITTEN = "Written by `make docs`; do not edit."
+# What stands between these in CONTRIBUTING.md, and after the last in mkdocs.yml, is written here.
+_ROOMS = ("<!-- rooms: written by `make docs` -->", "<!-- end of rooms -->")
+_LISTED = "  # From here on written by `make docs`"
 
 
 @dataclass(frozen=True)
@@ -59,6 +66,8 @@ def pages() -> dict[Path, str]:
         DOCS / "reference" / "job.md": _job(),
         DOCS / "reference" / "recording.md": _recording(),
         DOCS / "reference" / "commands.md": _commands(),
+        ROOT / "CONTRIBUTING.md": _contributing(),
+        ROOT / "mkdocs.yml": _site(),
     }
 
 
@@ -153,6 +162,70 @@ def _parameter(one: Any) -> str:
     else:
         shown = f"`{getattr(default, 'value', default)}`"
     return f"| {', '.join(f'`{name}`' for name in names)} | {shown} | {_cell(one.help)} |"
+
+
+def _contributing() -> str:
+    """CONTRIBUTING.md with the map of rooms as the code has it."""
+    path = ROOT / "CONTRIBUTING.md"
+    head, _, rest = path.read_text("utf-8").partition(_ROOMS[0])
+    rows = [f"| `{name.replace('.', '/')}` | {_cell(what)} | {met} |" for name, what, met in rooms()]
+    table = ["", "| room | what | imports from |", "| --- | --- | --- |", *rows, ""]
+    return f"{head}{_ROOMS[0]}\n" + "\n".join(table) + "\n" + _ROOMS[1] + rest.partition(_ROOMS[1])[2]
+
+
+def rooms() -> Iterator[tuple[str, str, str]]:
+    """Each package: dotted name, what it is for, rooms and packages that its files import from."""
+    paths = [path.parent for name in PACKAGES for path in sorted((ROOT / name).rglob("__init__.py"))]
+    folders = {".".join(path.relative_to(ROOT).parts): path for path in paths}
+    for name, folder in folders.items():
+        trees = {path.stem: ast.parse(path.read_text("utf-8")) for path in folder.glob("*.py")}
+        met = {_room(module, folders) for tree in trees.values() for module in _imported(tree)} - {"", name}
+        home = name.partition(".")[0]
+        inside = sorted(one.partition(".")[2] for one in met if one.startswith(f"{home}."))
+        others = [
+            one for one in PACKAGES if one != home and any(f"{at}.".startswith(f"{one}.") for at in met)
+        ]
+        shown = ", ".join(f"`{one}`" for one in [*others, *inside])
+        yield (
+            name,
+            ast.get_docstring(trees["__init__"]) or "",
+            "its rooms" if name in PROGRAMS else shown or "–",
+        )
+
+
+def _imported(tree: ast.Module) -> Iterator[str]:
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+
+
+def _room(module: str, folders: dict[str, Path]) -> str:
+    """The package that a module lies in; nothing if it isn't ours."""
+    return max((name for name in folders if f"{module}.".startswith(f"{name}.")), key=len, default="")
+
+
+def _site() -> str:
+    """mkdocs.yml with the rooms of docs/results as they are found."""
+    head = (ROOT / "mkdocs.yml").read_text("utf-8").partition(_LISTED)[0]
+    pages = sorted((DOCS / "results").glob("*/README.md"))
+    lines = [
+        f"{_LISTED}: the rooms of docs/results as they are found.",
+        "  - Results:",
+        "      - results/README.md",
+        *(f"      - {page.parent.name}: {page.relative_to(DOCS).as_posix()}" for page in pages),
+        "",
+        "exclude_docs: |",
+        "  *.py",
+        # A chart of that name would be the same file of the site as the README beside it.
+        *(
+            f"  /{page.parent.relative_to(DOCS).as_posix()}/index.html"
+            for page in sorted((DOCS / "results").rglob("README.md"))
+            if page.with_name("index.html").exists()
+        ),
+    ]
+    return head + "\n".join(lines) + "\n"
 
 
 if __name__ == "__main__":

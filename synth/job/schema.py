@@ -1,4 +1,4 @@
-"""The job: everything one dataset depends on, as one validated object (reading it is in `config`)."""
+"""The job: everything one dataset depends on, as one validated object (`synth.job.reader` reads it)."""
 
 from __future__ import annotations
 

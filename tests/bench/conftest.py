@@ -3,10 +3,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-import torch
 from fake_recording import Bump, Maker
-
-torch.set_num_threads(1)
 
 
 @pytest.fixture

@@ -38,6 +38,7 @@ def test_the_page_holds_its_charts_and_rows_and_asks_for_nothing_else(tmp_path: 
     assert (tmp_path / "chart.svg").read_text("utf-8").count("<circle") == 6
 
 
+@pytest.mark.slow
 def test_a_users_surface_is_measured_against_a_finer_mesh(tmp_path: Path) -> None:
     ball = trimesh.creation.icosphere(subdivisions=3)
     ball.vertices *= (30.0, 28.0, 26.0)

@@ -216,6 +216,7 @@ def test_a_run_is_answered_from_what_was_kept_only_if_nothing_that_made_it_chang
     assert len(set(trained)) == 4
 
 
+@pytest.mark.slow
 def test_a_word_that_no_network_holds_needs_times_to_show(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="nothing"):
         pareto(tmp_path / "new", tmp_path, only="nothing")

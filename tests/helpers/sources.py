@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -16,8 +17,15 @@ def sources(*packages: str) -> list[Path]:
     return found
 
 
-def imports(path: Path) -> Iterator[str]:
-    yield from imported(ast.parse(path.read_text("utf-8")))
+@cache
+def parsed(path: Path) -> ast.Module:
+    """A file's syntax tree; to be read, not changed."""
+    return ast.parse(path.read_text("utf-8"))
+
+
+@cache
+def imports(path: Path) -> tuple[str, ...]:
+    return tuple(imported(parsed(path)))
 
 
 def imported(tree: ast.Module) -> Iterator[str]:

@@ -3,9 +3,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-import torch
-
-torch.set_num_threads(1)
 
 
 @pytest.fixture(scope="session")
@@ -15,7 +12,7 @@ def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
     from synth.sequence import pipeline
 
     small = ["sequences=1", "seed=3", "anatomy.vertices=2500", "fem.tets=400", "render.spp=2"]
-    folder = tmp_path_factory.mktemp("house") / "out"
+    folder = tmp_path_factory.mktemp("repo") / "out"
     folder.mkdir()
     pipeline.render_sequence(reader.load("tiny", small), 0, folder, lambda stage, done, of: None)
     return folder

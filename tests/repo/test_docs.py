@@ -5,10 +5,13 @@ from __future__ import annotations
 import os
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
+from html.parser import HTMLParser
 from pathlib import Path
+from urllib.parse import unquote
 
 import generate
 import pytest
@@ -24,6 +27,7 @@ PAGES = [
     for page in [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(DOCS.rglob("*.md"))]
     if page.relative_to(ROOT).parts[:2] not in (("docs", "results"), ("docs", "reference"))
 ]
+GENERATED = generate.pages()
 SPOKEN = {spoken.words: spoken for spoken in generate.commands()}
 
 
@@ -41,9 +45,9 @@ def typed(page: Path) -> Iterator[str]:
             yield line.strip().removeprefix(".venv/bin/")
 
 
-@pytest.mark.parametrize("page", generate.pages(), ids=lambda page: page.stem)
+@pytest.mark.parametrize("page", GENERATED, ids=lambda page: page.stem)
 def test_generated_pages_are_those_of_this_code(page: Path) -> None:
-    assert page.read_text("utf-8") == generate.pages()[page], "out of date: run `make docs`"
+    assert page.read_text("utf-8") == GENERATED[page], "out of date: run `make docs`"
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
@@ -57,9 +61,19 @@ def test_commands_on_the_pages_can_be_typed(page: Path) -> None:
             spoken.command.make_context(words[depth - 1], words[depth:])
 
 
-def test_the_pages_hold_commands() -> None:
-    assert len(list(typed(ROOT / "README.md"))) >= 6
-    assert sum(len(list(typed(page))) for page in PAGES) >= 30
+def test_commands_of_a_page_are_found(tmp_path: Path) -> None:
+    page = tmp_path / "page.md"
+    lines = [
+        "Say synth render.",
+        "    .venv/bin/synth verify out \\",
+        "        --json",
+        "1. So:",
+        "        bench flow a",
+    ]
+    page.write_text("\n".join(lines))
+    assert list(typed(page)) == ["synth verify out --json", "bench flow a"]
+    whole_way = {tuple(line.split()[:2]) for line in typed(ROOT / "README.md")}
+    assert whole_way >= {("synth", "render"), ("synth", "verify"), ("learn", "train"), ("bench", "score")}
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
@@ -91,15 +105,81 @@ def test_python_on_the_pages_runs(
     assert capsys.readouterr().out.startswith("0.81"), "the stiffness that is printed first"
 
 
-def test_the_pages_build_and_load_nothing_from_elsewhere(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "-q", "-d", str(tmp_path / "site")]
-    environment = {**os.environ, "NO_MKDOCS_2_WARNING": "1"}
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, env=environment)
+def build(folder: Path) -> subprocess.CompletedProcess[str]:
+    """Builds the site in a folder that holds mkdocs.yml and docs, as `make docs` does."""
+    command = [sys.executable, "-m", "zensical", "build", "--strict", "--clean"]
+    environment = {**os.environ, "PYTHONPATH": "docs"}
+    return subprocess.run(command, cwd=folder, capture_output=True, text=True, env=environment)
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The built site; from a copy, as a build writes beside its pages."""
+    folder = tmp_path_factory.mktemp("site")
+    shutil.copytree(DOCS, folder / "docs")
+    shutil.copy(ROOT / "mkdocs.yml", folder)
+    done = build(folder)
     assert done.returncode == 0, done.stdout + done.stderr
-    science = (tmp_path / "site" / "science.html").read_text("utf-8")
-    assert science.count("<math") >= 20
+    return folder / "site"
+
+
+class _Links(HTMLParser):
+    """What a page fetches, what it links to, and the places in it that can be linked to."""
+
+    def __init__(self, page: Path) -> None:
+        super().__init__()
+        self.fetched: list[str] = []
+        self.linked: list[str] = []
+        self.places: set[str] = set()
+        self.feed(page.read_text("utf-8"))
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        for name, value in attrs:
+            if name == "id":
+                self.places.add(value or "")
+            elif name in ("src", "href") and value:
+                (self.linked if tag == "a" else self.fetched).append(value)
+
+
+def test_equations_need_no_script(site: Path) -> None:
+    science = (site / "science.html").read_text("utf-8")
+    fences = len(list(blocks(DOCS / "science.md", "math")))
+    assert science.count("<math") == fences >= 20
     assert not re.search(r"<math[^§]*?\\", science.split("</main>")[0]), "LaTeX that was not understood"
-    for page in (tmp_path / "site").rglob("*.html"):
-        if "results" not in page.parts:
-            fetched = re.findall(r"<(?:script|link|img)[^>]*?(?:src|href)=\"(?:https?:)?//", page.read_text())
-            assert not fetched, f"{page.name} loads from elsewhere"
+
+
+def test_pages_load_nothing_from_elsewhere(site: Path) -> None:
+    for page in site.rglob("*.html"):
+        away = [one for one in _Links(page).fetched if re.match(r"(https?:)?//", one)]
+        assert not away, f"{page.relative_to(site)} loads {away}"
+
+
+def test_pages_open_from_disk_and_every_link_leads_somewhere(site: Path) -> None:
+    """More than `--strict` asks, which passes over pictures, data files and the list of pages."""
+    pages = {page: _Links(page) for page in site.rglob("*.html") if page.name != "404.html"}
+    broken = []
+    for page, links in pages.items():
+        for link in {*links.fetched, *links.linked}:
+            path, _, place = link.partition("#")
+            if re.match(r"[a-z]+:", link):
+                continue
+            target = (page.parent / unquote(path)).resolve() if path else page
+            found = target.is_file() and (target not in pages or not place or place in pages[target].places)
+            if not found:
+                broken.append(f"{page.relative_to(site)}: {link}")
+    assert not broken, "\n".join(broken)
+
+
+def test_a_broken_link_stops_the_build(tmp_path: Path) -> None:
+    (tmp_path / "docs").mkdir()
+    shutil.copy(DOCS / "equations.py", tmp_path / "docs")
+    head = (ROOT / "mkdocs.yml").read_text("utf-8").partition("nav:")[0]
+    (tmp_path / "mkdocs.yml").write_text(head)
+    page = tmp_path / "docs" / "index.md"
+    page.write_text("# One {#one}\n\nSee [itself](index.md#one).\n")
+    assert build(tmp_path).returncode == 0
+    for link in ("nowhere.md", "index.md#two"):
+        page.write_text(f"# One {{#one}}\n\nSee [itself]({link}).\n")
+        done = build(tmp_path)
+        assert done.returncode != 0
+        assert "does not exist" in done.stdout + done.stderr

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import ast
+from functools import cache
 from pathlib import Path
 
-from sources import PACKAGES, ROOT, imported, imports, module, sources
+from sources import PACKAGES, ROOT, imported, imports, module, parsed, sources
 
 # From the ground up: a room, or a file that stands by itself, may import what comes before it.
 ORDER = (
@@ -67,10 +68,15 @@ def room(name: str) -> str:
     return max((one for one in ORDER if name == one or name.startswith(f"{one}.")), key=len)
 
 
+@cache
+def modules() -> set[str]:
+    """All modules of ours."""
+    return {module(source) for source in sources(*PACKAGES)}
+
+
 def ours(path: Path) -> set[str]:
     """Modules of ours that a file imports, anywhere in it."""
-    known = {module(source) for source in sources(*PACKAGES)}
-    return {name for name in imports(path) if name in known}
+    return modules().intersection(imports(path))
 
 
 def test_imports_go_down_only() -> None:
@@ -126,16 +132,15 @@ def test_a_room_is_neither_a_drawer_nor_a_hall() -> None:
 
 def reached(*rooms: str) -> set[str]:
     """Names of all modules that importing a room's modules imports, one through another."""
-    modules = {}
+    loaded = {}
     for path in sources(*PACKAGES):
         name = ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
-        tree = ast.parse(path.read_text("utf-8"))
-        tree.body = [node for node in tree.body if isinstance(node, ast.Import | ast.ImportFrom)]
-        modules[name] = set(imported(tree))
+        top = [node for node in parsed(path).body if isinstance(node, ast.Import | ast.ImportFrom)]
+        loaded[name] = set(imported(ast.Module(top, [])))
     found: set[str] = set()
-    todo = [name for name in modules if name.split(".")[0] in rooms]
+    todo = [name for name in loaded if name.split(".")[0] in rooms]
     while todo:
-        for name in modules.get(todo.pop(), set()) - found:
+        for name in loaded.get(todo.pop(), set()) - found:
             found.add(name)
             todo.append(name)
     return found
@@ -151,6 +156,6 @@ def test_learn_loads_no_renderer_by_way_of_another_module() -> None:
 def test_only_the_adapter_imports_mitsuba_at_the_top() -> None:
     """Mitsuba is loaded after its variant and LLVM are chosen, never on the way of another import."""
     for path in sources(*PACKAGES):
-        for node in ast.parse(path.read_text("utf-8")).body:
+        for node in parsed(path).body:
             if isinstance(node, ast.Import) and any(alias.name == "mitsuba" for alias in node.names):
                 assert path.parent.name == "mitsuba", path

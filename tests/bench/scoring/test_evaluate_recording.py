@@ -37,6 +37,7 @@ def test_force_is_recovered_from_the_video(make: Maker, footage: str) -> None:
     assert scores["ghost_rate"] == 0
 
 
+@pytest.mark.slow
 def test_shrunken_flow_keeps_its_unit(make: Maker) -> None:
     folder = make(frames=8, size=(192, 256))
     whole, half = run(folder).methods["bump"].size_mn, run(folder, shrink=2).methods["bump"].size_mn
@@ -146,6 +147,7 @@ def test_bad_recording_is_one_line_and_exit_2(make: Maker, tmp_path: Path, spoil
     assert not out.exists()
 
 
+@pytest.mark.slow
 def test_without_stiffness_only_what_no_factor_changes_is_scored(make: Maker) -> None:
     folder = make(frames=30, meta={"young_kpa": "unknown", "press_s": [0.2, 1.2]})
     result = run(folder)

@@ -40,6 +40,7 @@ addEventListener("load", () => setTimeout(() => {{
 </script>"""
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(BROWSER is None, reason="no Chromium here (Debian: apt-get install chromium)")
 def test_report_in_a_browser(make: Maker, tmp_path: Path) -> None:
     folder = make(frames=8)

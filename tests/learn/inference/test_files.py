@@ -34,7 +34,7 @@ from synth.errors import UserError
 run = CliRunner().invoke
 
 
-@pytest.fixture(scope="module", params=["plain", "everything", "monai"])
+@pytest.fixture(scope="module", params=["plain", pytest.param("everything", marks=pytest.mark.slow), "monai"])
 def model(
     clips: list[Clip], tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequest
 ) -> Path:

@@ -47,6 +47,7 @@ def test_a_good_dataset_passes_and_every_invariant_was_measured(dataset: Path) -
     assert verify.run(dataset, fast=True).good
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("fault", "check"),
     [

@@ -34,6 +34,7 @@ class Killing(Silent):
             os.killpg(self.victim, signal.SIGKILL)
 
 
+@pytest.mark.slow
 def test_a_lost_worker_costs_nothing_but_time(tmp_path: Path) -> None:
     root = tmp_path / "cluster"
     with local_cluster(2) as (address, processes):

@@ -36,6 +36,7 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> str:
     return run(tmp_path_factory.mktemp("undisturbed") / "out").content_hash
 
 
+@pytest.mark.slow
 def test_number_of_workers_and_order_do_not_matter(tmp_path: Path, undisturbed: str) -> None:
     many = run(tmp_path / "many", workers=3)
     assert (many.content_hash, many.done, many.failed) == (undisturbed, 6, {})
@@ -55,6 +56,7 @@ def test_a_finished_dataset_has_its_index_film_and_job_and_is_left_alone(tmp_pat
     assert before == {path: path.stat().st_mtime_ns for path in (tmp_path / "out").rglob("*/c/*")}
 
 
+@pytest.mark.slow
 def test_more_sequences_extend_and_fewer_are_refused(tmp_path: Path, undisturbed: str) -> None:
     run(tmp_path / "out", job=JOB.model_copy(update={"sequences": 3}))
     whole = run(tmp_path / "out")
@@ -64,6 +66,7 @@ def test_more_sequences_extend_and_fewer_are_refused(tmp_path: Path, undisturbed
         run(tmp_path / "out", job=JOB.model_copy(update={"sequences": 3}))
 
 
+@pytest.mark.slow
 def test_another_versions_dataset_is_continued_only_when_told(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -133,6 +136,7 @@ def test_an_import_that_leads_nowhere_is_an_error(tmp_path: Path) -> None:
         provenance._makers(home)
 
 
+@pytest.mark.slow
 def test_a_sequence_sealed_by_an_attempt_that_was_lost_is_not_made_again(tmp_path: Path) -> None:
     run(tmp_path / "made", job=JOB.model_copy(update={"sequences": 1}))
     setup = Setup(
@@ -156,6 +160,7 @@ def test_comments_are_no_other_version_and_statements_are(tmp_path: Path) -> Non
     assert first == remarked != changed
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("visible", "asked", "seen"),
     [("0,1", "0,1", {"0", "1"}), ("4,7", "7", {"7"}), ("0", "none", {""}), ("5", "auto", {"5"})],
@@ -180,6 +185,7 @@ def test_which_gpus_there_are(monkeypatch: pytest.MonkeyPatch) -> None:
     assert slots.gpus("auto", True) is None, "no driver"
 
 
+@pytest.mark.slow
 def test_an_account_says_rates_time_and_disk(tmp_path: Path) -> None:
     watcher = Silent()
     engine.run(JOB, tmp_path, options("slow"), watcher)
@@ -194,6 +200,7 @@ def test_an_account_says_rates_time_and_disk(tmp_path: Path) -> None:
     assert said.endswith("frames/s in all; 2.5 GB to come, 1 TB free")
 
 
+@pytest.mark.slow
 def test_a_clock_that_jumps_changes_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, undisturbed: str
 ) -> None:
@@ -206,6 +213,7 @@ def test_a_clock_that_jumps_changes_nothing(
     assert made.content_hash == undisturbed
 
 
+@pytest.mark.slow
 def test_trouble_costs_the_sequence_that_makes_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert engine._TRIES == 3
     monkeypatch.setattr(engine, "_TRIES", 2)
@@ -233,6 +241,7 @@ def test_trouble_costs_the_sequence_that_makes_it(tmp_path: Path, monkeypatch: p
     assert (healed.done, healed.failed) == (5, {})
 
 
+@pytest.mark.slow
 def test_a_sequence_that_hangs_is_ended(tmp_path: Path) -> None:
     job = JOB.model_copy(update={"sequences": 1})
     assert "reported nothing for 1 s" in run(tmp_path / "out", "hanging", job, stall_s=1.0).failed[0]
@@ -248,6 +257,7 @@ def test_a_job_that_cannot_be_carried_out_leaves_nothing(tmp_path: Path) -> None
     assert list((tmp_path / "empty").iterdir()) == []
 
 
+@pytest.mark.slow
 def test_a_full_disk_stops_the_run_and_keeps_what_is_sealed(tmp_path: Path, undisturbed: str) -> None:
     with pytest.raises(UserError, match="No space left"):
         run(tmp_path / "out", "full")
@@ -256,6 +266,7 @@ def test_a_full_disk_stops_the_run_and_keeps_what_is_sealed(tmp_path: Path, undi
     assert run(tmp_path / "out").content_hash == undisturbed
 
 
+@pytest.mark.slow
 def test_another_jobs_dataset_and_other_files_are_never_touched(tmp_path: Path) -> None:
     run(tmp_path / "out")
     before = sorted(path for path in tmp_path.rglob("*"))
@@ -271,6 +282,7 @@ def test_another_jobs_dataset_and_other_files_are_never_touched(tmp_path: Path) 
     assert sorted(tmp_path.rglob("*")) == sorted([*before, foreign, foreign / "thesis.txt"])
 
 
+@pytest.mark.slow
 def test_two_runs_on_one_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("synth.dataset.folder._LOCK_WAIT_S", 0.3)
     first = start(tmp_path / "out", JOB, "slow")
@@ -283,11 +295,13 @@ def test_two_runs_on_one_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     assert first.returncode == 0
 
 
+@pytest.mark.slow
 def test_folder_names_with_spaces_and_other_letters(tmp_path: Path, undisturbed: str) -> None:
     strange = tmp_path / "größe μm 脳 out"
     assert run(strange).content_hash == undisturbed
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kill", [signal.SIGKILL, signal.SIGINT])
 def test_killed_and_resumed_equals_undisturbed(
     tmp_path: Path, kill: signal.Signals, undisturbed: str

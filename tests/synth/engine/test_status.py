@@ -21,6 +21,7 @@ from synth.job.schema import Job
 JOB = Job(seed=2, sequences=6, frames=3, render={"size": (32, 24)}, flow={"backend": "ideal"})
 
 
+@pytest.mark.slow
 def test_status_during_and_after_a_run(tmp_path: Path) -> None:
     root = tmp_path / "out"
     run = start(root, JOB, "slow")
@@ -36,6 +37,7 @@ def test_status_during_and_after_a_run(tmp_path: Path) -> None:
     assert after.stages_cpu_s["render"] > 0
 
 
+@pytest.mark.slow
 def test_failures_are_counted_by_reason_and_retried(tmp_path: Path) -> None:
     job = JOB.model_copy(update={"sequences": 7})
     engine.run(job, tmp_path / "out", options("trying"), Silent())
@@ -48,6 +50,7 @@ def test_failures_are_counted_by_reason_and_retried(tmp_path: Path) -> None:
     assert json.loads(shown)["done"] == 5
 
 
+@pytest.mark.slow
 def test_forecast_rests_on_finished_sequences(tmp_path: Path) -> None:
     root = tmp_path / "out"
     engine.run(JOB, root, options("sequence"), Silent())

@@ -46,6 +46,7 @@ def compared(free: Tets, held: Tets, region: schema.Attachment, edge_mm: float) 
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("given", [BALL, {**FALX, "thickness_mm": 6.0}], ids=["ball", "sheet"])
 def test_a_region_of_the_block_is_held_and_the_rest_is_not(given: dict[str, object]) -> None:
     region = schema.Attachment.model_validate(given)
@@ -56,6 +57,7 @@ def test_a_region_of_the_block_is_held_and_the_rest_is_not(given: dict[str, obje
     assert beyond > 0.6
 
 
+@pytest.mark.slow
 def test_a_falx_in_a_users_mesh_stands_in_the_meshs_own_axes(egg: Path) -> None:
     # The opening looks along x, its centre is at x = 32: the middle of the sheet lies 20 mm under it.
     region = schema.Attachment(

@@ -98,6 +98,7 @@ def test_axes_are_a_rotation_with_z_outwards() -> None:
         assert turn[2] @ direction == pytest.approx(np.linalg.norm(direction))
 
 
+@pytest.mark.slow
 def test_open_surface_is_meshed_whole(egg: Path) -> None:
     anatomy = schema.Anatomy(mesh=egg, craniotomy=OPENING)
     tets = tetrahedra.from_brain(brain_surface.load(egg, OPENING), anatomy, 800, 2)

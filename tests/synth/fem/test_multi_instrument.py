@@ -104,6 +104,7 @@ def test_a_linear_scene_is_solved_once_for_each_direction_of_load(monkeypatch: p
         np.testing.assert_allclose(u, solve(system, load), atol=1e-10)
 
 
+@pytest.mark.slow
 def test_the_picture_shows_every_instrument_where_its_load_is() -> None:
     whole = schema.Job(
         seed=2,

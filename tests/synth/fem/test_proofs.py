@@ -102,6 +102,7 @@ def test_uniaxial_neo_hookean() -> None:
     assert force / 4 == pytest.approx(pull, abs=1e-10)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("order", "sizes", "rate"), [(1, (8, 16), 2.0), (2, (4, 8), 3.0)])
 def test_manufactured_solution_converges(order: int, sizes: tuple[int, int], rate: float) -> None:
     errors = [_manufactured(n, order) for n in sizes]

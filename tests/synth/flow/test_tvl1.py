@@ -193,6 +193,7 @@ def test_compose_of_translations() -> None:
     np.testing.assert_allclose(compose(one, two), np.full((9, 9, 2), (1.0, 3.5)), atol=1e-6)
 
 
+@pytest.mark.slow
 def test_chain_of_steps_drifts_and_rest_to_now_does_not() -> None:
     rng = np.random.default_rng(12)
     stage = Stage.set(Recipe(size=96, pull=4.0, tool=0.0, noise=3.0), rng)

@@ -10,6 +10,7 @@ from typer.testing import CliRunner
 from synth.cli import app
 
 
+@pytest.mark.slow
 def test_preview_draws_scenarios_and_says_what_they_cost(tmp_path: Path) -> None:
     sheet = tmp_path / "sheet.png"
     small = ["render.size=[80, 64]", "sequences=40", "frames=10", "render.spp=4", "anatomy.vertices=900"]

@@ -118,6 +118,7 @@ def test_frames_are_those_of_the_store(root: Path) -> None:
         Frames(root, ["flow_tvl1"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["fork", "spawn"])
 @pytest.mark.filterwarnings("ignore:This process .* is multi-threaded:DeprecationWarning")
 def test_frames_in_workers_of_a_loader(root: Path, method: str) -> None:

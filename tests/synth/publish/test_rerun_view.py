@@ -45,6 +45,7 @@ def test_the_surface_is_where_flow_and_depth_say(root: Path) -> None:
     assert seen == pytest.approx(seen.round() // 4 * 4, abs=1e-3)
 
 
+@pytest.mark.slow
 def test_a_recording_holds_every_field_on_one_timeline(root: Path, tmp_path: Path) -> None:
     pytest.importorskip("rerun", reason="the extra `view` is not installed")
     path = tmp_path / "two.rrd"

@@ -124,6 +124,7 @@ def test_power_drifts_from_the_rest_frame_by_no_more_than_asked() -> None:
         assert 0.01 < np.abs(np.array(gains) - 1).max() <= 0.2
 
 
+@pytest.mark.slow
 def test_a_volume_looks_about_like_the_blurred_albedo() -> None:
     """The reference for `subsurface: blur`: brightness within a tenth, channel by channel."""
     seen = []

@@ -36,6 +36,7 @@ def studio(
     return Studio(surface, look, camera.place(view, job.render), job), surface.vertices
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_same_seed_same_bytes(variant: str) -> None:
     ours, vertices = studio(variant)
@@ -48,6 +49,7 @@ def test_same_seed_same_bytes(variant: str) -> None:
     assert (again.frame(vertices, TIPS, SHAFTS, 7).rgb == shots[0].rgb).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_the_picture_moves_with_the_truth(variant: str) -> None:
     """A sideways shift of the cortex shows in the picture where flow says, and nowhere else."""
@@ -64,6 +66,7 @@ def test_the_picture_moves_with_the_truth(variant: str) -> None:
     assert min(errors, key=lambda d: errors[d]) == 3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_variants_agree_pixel_by_pixel(variant: str) -> None:
     """Means of independent frames differ by no more than their standard errors say, over the picture.
@@ -84,6 +87,7 @@ def test_variants_agree_pixel_by_pixel(variant: str) -> None:
     assert (np.abs(z) > 4.5).mean() < 0.01
 
 
+@pytest.mark.slow
 def test_the_tool_hides_and_is_masked() -> None:
     ours, vertices = studio(VARIANTS[-1])
     shot = ours.frame(vertices, TIPS, SHAFTS, 1)
@@ -136,6 +140,7 @@ def test_a_moved_camera_and_weaker_light_are_in_picture_and_truth() -> None:
     assert (back.radiance == rest.radiance).all()
 
 
+@pytest.mark.slow
 def test_an_open_shutter_adds_up_light() -> None:
     ours, vertices = studio(VARIANTS[-1], spp=4, tool=False)
     moments = [Moment(vertices, TIPS, SHAFTS, None, power) for power in (0.5, 1.5)]

@@ -36,6 +36,7 @@ def test_a_straight_vessel_is_drawn_as_wide_as_it_is() -> None:
     np.testing.assert_allclose(radius[inside], 0.5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("radius_mm", [4.0, 12.0, 30.0])
 def test_every_anatomy_grows(radius_mm: float) -> None:
     """Small openings have trunks so short that none of their nodes may be drawn to sprout."""

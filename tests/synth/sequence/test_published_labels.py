@@ -99,6 +99,7 @@ def test_the_paper_job_is_the_published_regime() -> None:
     assert {"intensity", "flow_noisy"} <= set(job.kept_fields)
 
 
+@pytest.mark.slow
 def test_its_dataset_holds_noisy_labels_beside_the_truth_and_is_read_as_any_other(regime: Path) -> None:
     report = verify.run(regime)
     assert report.good, [check.failures for check in report.checks]

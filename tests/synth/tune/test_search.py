@@ -32,6 +32,7 @@ SMALL: dict[str, Any] = {
 JOB = Job.model_validate({"seed": 1, "fem": {"gestures": ["pull"]}})
 
 
+@pytest.mark.slow
 def test_a_tenth_more_load_reads_as_a_tenth_more_force() -> None:
     job = Job.model_validate(SMALL)
     probe = Probe(job, 0)

@@ -1,0 +1,5 @@
+from __future__ import annotations
+
+from clip_fixtures import dataset
+
+__all__ = ["dataset"]
