@@ -329,10 +329,8 @@ class Pair:
         if noise > 0:
             weight = weight * np.float32(calm(self._residual, self._mask, noise, *limits))
         weight = np.ascontiguousarray(np.broadcast_to(weight, self._mask.shape), np.float32)
-        sigma = 1 / (8 * tau)
-        shrink = 1 / (
-            1 + np.float32(sigma) * (np.float32(huber) + np.float32(hidden_huber) * (1 - self._mask))
-        )
+        h = huber + hidden_huber * (1 - self._mask)
+        shrink = (1 / (1 + h / (8 * tau))).astype(np.float32)
         start = flow.copy() if reweights > 1 else flow
         for _ in range(reweights):
             linearise(
