@@ -115,7 +115,7 @@ def clip(job: Job, index: int, grid: Grid, name: str, case: Scenario | None = No
     view = camera.place(case.view, job.render)
     surface, tets = pipeline.build(job, case)
     motion = pipeline.move(job, case, surface, tets)
-    frame = rim.build(surface, job.anatomy.craniotomy.radius_mm, case.look).shape
+    frame = rim.build(surface, job.anatomy.craniotomy.radius_mm, case.look, view.mm_per_px).shape
     still = truth.still(view, Shape(surface.vertices, surface.faces), frame)
     resample = Resampler(
         (still.tissue.shape[0], still.tissue.shape[1]), still.scale_mm_per_px, centre(still.tissue), grid

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Protocol
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from synth.flow import image
@@ -58,7 +57,7 @@ def judge(pictures: Pictures, flow: Tensor, back: Tensor | None) -> Tensor:
     agreement = product / torch.sqrt((power + _NOISE) * (power_now + _NOISE))
     vouched = agreement[:, None].clamp(0, 1)
     if back is not None:
-        small = 0.5 * F.avg_pool2d(flow, 2, ceil_mode=True, count_include_pad=False)
+        small = 0.5 * image.halved(flow)
         there, _ = image.warp(back, back[:, :1], small)
         miss = 2 * _length(small + there)
         allowed = _LOOP + _LOOP_SHARE * 2 * _length(small)

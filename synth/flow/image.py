@@ -11,6 +11,8 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor
 
+from synth.flow import fused
+
 _GREY = (0.2, 0.6, 0.2)  # vessels stand out in green, noise falls by averaging
 _FLOOR = 3.0  # grey levels: contrast below this is noise and isn't stretched to full contrast
 
@@ -30,14 +32,30 @@ def flags(mask: NDArray[np.bool_], device: str = "cpu") -> Tensor:
 
 def box(field: Tensor, radius: int) -> Tensor:
     """Mean of (B, C, H, W) over squares of 2 radius + 1 pixels, smaller at the border. Separable."""
+    if field.device.type == "cpu":
+        planes = field.contiguous().numpy().reshape(-1, *field.shape[-2:])
+        between, out = np.empty_like(planes), np.empty_like(planes)
+        fused.box_into(planes, radius, between, out)
+        return torch.from_numpy(out).view_as(field)
     wide = 2 * radius + 1
     rows = F.avg_pool2d(field, (1, wide), 1, (0, radius), count_include_pad=False)
     return F.avg_pool2d(rows, (wide, 1), 1, (radius, 0), count_include_pad=False)
 
 
+def halved(field: Tensor) -> Tensor:
+    """Mean of (B, C, H, W) over 2 x 2 pixels, fewer at an odd border: (B, C, ceil(H/2), ceil(W/2))."""
+    if field.device.type != "cpu":
+        return F.avg_pool2d(field, 2, ceil_mode=True, count_include_pad=False)
+    *batch, height, width = field.shape
+    planes = field.contiguous().numpy().reshape(-1, height, width)
+    out = np.empty((len(planes), (height + 1) // 2, (width + 1) // 2), np.float32)
+    fused.halve_into(planes, out)
+    return torch.from_numpy(out).view(*batch, *out.shape[1:])
+
+
 def window(field: Tensor, sigma: float) -> Tensor:
     """About a Gaussian blur at half the size, (B, C, H/2, W/2): for windows, whose shape matters little."""
-    small = F.avg_pool2d(field, 2, ceil_mode=True, count_include_pad=False)
+    small = halved(field)
     radius = max(1, round(sigma / 2 * 1.5**0.5 - 0.5))  # two boxes of variance ((2r+1)^2 - 1)/12 each
     return box(box(small, radius), radius)
 
@@ -85,7 +103,7 @@ def fill(field: Tensor, usable: Tensor) -> Tensor:
     if min(field.shape[-2:]) <= 2:
         mean = known.mean((-2, -1), keepdim=True) / usable.mean((-2, -1), keepdim=True).clamp_min(1e-6)
         return known + (1 - usable) * mean
-    total = F.avg_pool2d(torch.cat([known, usable], 1), 2, ceil_mode=True, count_include_pad=False)
+    total = halved(torch.cat([known, usable], 1))
     weight = total[:, -1:]
     coarse = fill(total[:, :-1] / weight.clamp_min(1e-6), (weight > 0).to(field.dtype))
     back = F.interpolate(coarse, size=field.shape[-2:], mode="bilinear", align_corners=False)

@@ -27,7 +27,7 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor
 
-from synth.flow import confidence, image
+from synth.flow import confidence, fused, image
 from synth.flow.estimator import Flags, Flow, Map, Rgb
 
 _BETTER = 1.025  # the bold first guess must fit this much better than the calm one
@@ -220,7 +220,7 @@ def pyramid(rest: Tensor, now: Tensor, rest_usable: Tensor, now_usable: Tensor, 
         levels.append(Level(first, second, seen_first, seen_second))
         if min(grey.shape[-2:]) < 2 * s.coarsest_px:
             return levels
-        pooled = F.avg_pool2d(torch.cat([grey * known, known], 1), 2, ceil_mode=True, count_include_pad=False)
+        pooled = image.halved(torch.cat([grey * known, known], 1))
         known = pooled[:, 1:]
         grey = pooled[:, :1] / known.clamp_min(1e-6)
 
@@ -251,17 +251,46 @@ def solve(levels: list[Level], initial: Tensor | None, s: Settings) -> Tensor:
         if s.steep > 0:
             weight = weight * (1 + steepness(flow) / s.steep**2)
         for _ in levels[1:]:
-            flow = 0.5 * F.avg_pool2d(flow, 2, ceil_mode=True, count_include_pad=False)
+            flow = 0.5 * image.halved(flow)
     for level in reversed(levels):
         if flow.shape[-2:] != level.now.shape[-2:]:
             flow = finer(flow, level)
-        dual = flow.new_zeros(2, *flow.shape)
         here = weight
         if weight.shape[-1] > 1:
             here = F.interpolate(weight, size=flow.shape[-2:], mode="bilinear", align_corners=False)
+        if flow.device.type == "cpu":
+            flow = _fused(level, flow, here, s)
+            continue
+        dual = flow.new_zeros(2, *flow.shape)
         for _ in range(s.warps):
             flow, dual = step(level, flow, dual, here, s)
     return flow
+
+
+def _fused(level: Level, flow: Tensor, weight: Tensor, s: Settings) -> Tensor:
+    """All warps of a level on the CPU, in compiled loops; as `step`, pair by pair."""
+    found = flow.contiguous().numpy().copy()
+    for k, one in enumerate(found):
+        pictures = (level.rest, level.now, level.rest_usable, level.now_usable)
+        pair = fused.Pair(*(np.ascontiguousarray(picture[k, 0].numpy()) for picture in pictures))
+        dual = np.zeros((2, *one.shape), np.float32)
+        for _ in range(s.warps):
+            pair.step(
+                one,
+                dual,
+                weight[k, 0].numpy(),
+                gamma=s.gradient,
+                noise=s.noise,
+                limits=(_NOISIEST, _CALMEST),
+                huber=s.huber,
+                hidden_huber=s.hidden_huber,
+                epsilon=s.epsilon,
+                tau=s.tau,
+                reweights=s.reweights,
+                steps=s.steps,
+                median=s.median,
+            )
+    return torch.from_numpy(found)
 
 
 def finer(flow: Tensor, level: Level) -> Tensor:

@@ -100,7 +100,7 @@ class Studio:
         self.variant = pick(job.render.variant)
         self.surface, self.camera = surface, camera
         self._look, self._render, self._extra = look, job.render, job.store.extra
-        self.rim = rim.build(surface, job.anatomy.craniotomy.radius_mm, look)
+        self.rim = rim.build(surface, job.anatomy.craniotomy.radius_mm, look, camera.mm_per_px)
         self._coat = texture.cortex(
             surface,
             look,

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from synth.system import llvm, packages
+from synth.system import cache, llvm, packages
 
 _LEAST_FREE_GB = 5.0
 _LEAST_MEMORY_GB = 4.0
@@ -52,6 +52,9 @@ def _findings(folder: Path) -> Iterator[Finding]:
     yield Finding(
         "renderer", variant, variant != "scalar_rgb", "the slow variant works; LLVM halves the time"
     )
+    kernels = cache.folder("kernels")
+    held = cache.size_bytes(kernels) / 1e6
+    yield Finding("compiled kernels", f"{held:.0f} MB of at most {cache.LIMIT_BYTES / 1e6:.0f} in {kernels}")
     for name, version in packages.versions().items():
         yield Finding(name, version)
     for name in ("mitsuba", "cv2", "torch", "trimesh", "av"):

@@ -20,3 +20,14 @@ def compiled(function: F) -> F:
         return numba.njit(cache=True, nogil=True)(function)  # type: ignore[no-any-return]
     except RuntimeError:  # no folder to write the cache to: read-only installation without a home
         return numba.njit(nogil=True)(function)  # type: ignore[no-any-return]
+
+
+def vectorised(function: F) -> F:
+    """As `compiled`, for loops over pixels: a division by zero gives inf or nan, as NumPy's does.
+
+    Python's own rule, an error, would put a branch into every division, and the loop would go pixel by pixel.
+    """
+    try:
+        return numba.njit(cache=True, nogil=True, error_model="numpy")(function)  # type: ignore[no-any-return]
+    except RuntimeError:
+        return numba.njit(nogil=True, error_model="numpy")(function)  # type: ignore[no-any-return]

@@ -18,7 +18,8 @@ from synth.render.appearance.look import Look
 Floats = npt.NDArray[np.float64]
 Map = npt.NDArray[np.float32]
 
-_AROUND, _OUT = 320, 48
+_AROUND, _OUT, _INNER = 320, 42, 6  # at most: points around, rings outwards, rings of the cut edge
+_SEGMENT_PX = 4.0  # points around are no nearer than this in the picture: the mesh is built anew every frame
 _WIDTH_MM = 26.0  # beyond the opening; the picture ends before
 _LIP_MM = 0.4  # how far the cut edge leans over the brain
 _LAID_MM = (-3.0, -1.5, -1.2, -0.95, -0.7, -0.3)
@@ -57,12 +58,14 @@ class Rim:
         return Shape(self.vertices, self.faces)
 
 
-def build(surface: Surface, radius_mm: float, look: Look) -> Rim:
-    """The rim around an opening of `radius_mm` in the surface."""
+def build(surface: Surface, radius_mm: float, look: Look, mm_per_px: float) -> Rim:
+    """The rim around an opening of `radius_mm` in the surface, as fine as pixels of `mm_per_px` show."""
     rng = np.random.default_rng([look.rim_seed, 0])
-    angle = np.linspace(0, 2 * np.pi, _AROUND, endpoint=False)
+    around = int(np.clip(2 * np.pi * radius_mm / (_SEGMENT_PX * mm_per_px), 96, _AROUND))
+    rings = round(_OUT * around / _AROUND)
+    angle = np.linspace(0, 2 * np.pi, around, endpoint=False)
     edge = radius_mm * _outline(rng, angle)
-    out = _WIDTH_MM * np.linspace(0, 1, _OUT - 6) ** 1.6
+    out = _WIDTH_MM * np.linspace(0, 1, rings) ** 1.6
     # From below the brain's surface up to the lip that leans over it, round that, and away.
     away = np.concatenate([[0.1, 0.0, -0.7 * _LIP_MM, -_LIP_MM, -0.8 * _LIP_MM, -0.3 * _LIP_MM], out + 0.12])
     up = np.concatenate(
@@ -84,7 +87,14 @@ def build(surface: Surface, radius_mm: float, look: Look) -> Rim:
     # The cut edge stands upright: on the maps it is laid flat inside the opening, or it had no width there.
     flat = edge[:, None] + np.concatenate([_LAID_MM, away[len(_LAID_MM) :]])[None]
     laid = np.stack([flat * np.cos(angle)[:, None], flat * np.sin(angle)[:, None]], axis=-1).reshape(-1, 2)
-    return Rim(vertices, _faces(), (laid / extent + 0.5).astype(np.float32), extent, edge, patty)
+    return Rim(
+        vertices,
+        _faces(around, _INNER + rings),
+        (laid / extent + 0.5).astype(np.float32),
+        extent,
+        edge,
+        patty,
+    )
 
 
 def paint(rim: Rim, look: Look, pixels: int) -> Coat:
@@ -231,10 +241,10 @@ def _step(x: Map | Floats) -> Map:
     return np.asarray(t * t * (3 - 2 * t), np.float32)
 
 
-def _faces() -> npt.NDArray[np.int32]:
-    row, column = np.meshgrid(np.arange(_AROUND), np.arange(_OUT - 1), indexing="ij")
-    a = (row * _OUT + column).ravel()
+def _faces(around: int, rings: int) -> npt.NDArray[np.int32]:
+    row, column = np.meshgrid(np.arange(around), np.arange(rings - 1), indexing="ij")
+    a = (row * rings + column).ravel()
     b = a + 1
-    c = (((row + 1) % _AROUND) * _OUT + column).ravel()
+    c = (((row + 1) % around) * rings + column).ravel()
     d = c + 1
     return np.concatenate([np.stack([a, b, d], 1), np.stack([a, d, c], 1)]).astype(np.int32)

@@ -22,11 +22,14 @@ from synth.errors import UserError
 from synth.geometry.triangles import Shape, normals
 from synth.render.camera.camera import Camera
 from synth.render.mitsuba import volume as mitsuba_volume
+from synth.render.mitsuba.glow import register_glow
 from synth.render.mitsuba.lens import Compiled, Scalar
-from synth.system import llvm
+from synth.system import cache, llvm
 
 Floats = npt.NDArray[np.float64]
 Map = npt.NDArray[np.float32]
+
+_REGISTER = 64  # bytes
 
 
 @dataclass(frozen=True)
@@ -102,6 +105,9 @@ def pick(asked: str) -> str:
     """
     if asked == "scalar_rgb":
         return asked
+    # Kernels are the same for all scenes of a job; the renderer would keep them in the user's home, for ever.
+    os.environ.setdefault("DRJIT_CACHE_DIR", str(cache.folder("kernels")))
+    os.environ.setdefault("DRJIT_CACHE_MAXSIZE", str(cache.LIMIT_BYTES))
     if asked == "cuda_ad_rgb":
         if not cuda():
             raise UserError("render.variant: cuda_ad_rgb needs an NVIDIA GPU and its driver; none was found")
@@ -143,6 +149,8 @@ class Stage:
 
         mi.set_variant(variant)
         self._jit = "scalar" not in variant
+        if self._jit:
+            register_glow(variant)
         _limit_threads()
         forget()
         self.variant = variant
@@ -164,12 +172,12 @@ class Stage:
         """New positions (V, 3) mm of a body's vertices."""
         bent = normals(Shape(vertices, self._faces[name]))
         for key, values in (("vertex_positions", vertices), ("vertex_normals", bent)):
-            flat = values.astype(np.float32).ravel()
+            flat = _aligned(values, np.float32)
             self._parameters[f"{name}.{key}"] = self._mi.Float(flat) if self._jit else flat
 
     def mirror(self, name: str, glow: Floats) -> None:
         """New mirrored radiance (V, 3) of a metal body's vertices."""
-        flat = glow.astype(np.float32).ravel()
+        flat = _aligned(glow, np.float32)
         self._parameters[f"{name}.vertex_glow"] = self._mi.Float(flat) if self._jit else flat
 
     def render(self, seed: int, camera: Camera | None = None) -> Map:
@@ -251,7 +259,8 @@ def _mesh(mi: Any, name: str, body: Body) -> Any:
         properties["interior"] = mi.load_dict(under)
     else:
         # Seen, but never chosen as a lamp: its weight is nothing.
-        glow = {"type": "area", "radiance": _glow(mi, body.material), "sampling_weight": 0.0}
+        kind = "area" if "scalar" in mi.variant() else "sulcus_glow"
+        glow = {"type": kind, "radiance": _glow(mi, body.material), "sampling_weight": 0.0}
         properties["glow"] = mi.load_dict(glow)
     mesh = mi.Mesh(
         name,
@@ -262,15 +271,29 @@ def _mesh(mi: Any, name: str, body: Body) -> Any:
         props=properties,
     )
     if isinstance(body.material, Metal):
-        mesh.add_attribute("vertex_glow", 3, body.material.glow.astype(np.float32).ravel())
+        mesh.add_attribute("vertex_glow", 3, _aligned(body.material.glow, np.float32))
     parameters = mi.traverse(mesh)
-    parameters["vertex_positions"] = body.vertices.astype(np.float32).ravel()
+    parameters["vertex_positions"] = _aligned(body.vertices, np.float32)
     bent = normals(Shape(body.vertices, body.faces))
-    parameters["vertex_normals"] = bent.astype(np.float32).ravel()
-    parameters["faces"] = body.faces.astype(np.uint32).ravel()
-    parameters["vertex_texcoords"] = body.uv.astype(np.float32).ravel()
+    parameters["vertex_normals"] = _aligned(bent, np.float32)
+    parameters["faces"] = _aligned(body.faces, np.uint32)
+    parameters["vertex_texcoords"] = _aligned(body.uv, np.float32)
     parameters.update()
     return mesh
+
+
+def _aligned(values: npt.NDArray[Any], kind: type[np.generic]) -> npt.NDArray[Any]:
+    """The values in one row, of a type, where a vector register may read them.
+
+    Dr.Jit takes NumPy's memory as it lies, and compiles one kernel for what is aligned and another for what
+    isn't: which of them a scene got was chance.
+    """
+    count = values.size
+    raw = np.empty(count * np.dtype(kind).itemsize + _REGISTER, np.uint8)
+    start = -raw.ctypes.data % _REGISTER
+    flat = raw[start : start + count * np.dtype(kind).itemsize].view(kind)
+    flat[:] = values.ravel()
+    return flat
 
 
 def _glow(mi: Any, material: Wet | Metal) -> dict[str, Any]:

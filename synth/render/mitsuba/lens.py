@@ -141,8 +141,9 @@ def _register(variant: str) -> None:
 
         def __init__(self, props: Any) -> None:
             super().__init__(props)
-            self.v = {name: props[name] for name in ("fx", "fy", "k1", "k2", "p1", "p2", "k3")}
-            self.aperture, self.focus = props["aperture"], props["focus"]
+            # As data: a number written into the code would compile it anew for every scene.
+            names = ("fx", "fy", "k1", "k2", "p1", "p2", "k3", "aperture", "focus")
+            self.v = {name: dr.opaque(mi.Float, float(props[name])) for name in names}
             size = self.film().size()
             self.width, self.height = int(size[0]), int(size[1])
 
@@ -170,10 +171,10 @@ def _register(variant: str) -> None:
                 dx = 2 * v["p1"] * x * y + v["p2"] * (r2 + 2 * x * x)
                 dy = 2 * v["p2"] * x * y + v["p1"] * (r2 + 2 * y * y)
                 x, y = (goal_x - dx) / radial, (goal_y - dy) / radial
-            lens = mi.warp.square_to_uniform_disk_concentric(aperture) * self.aperture
+            lens = mi.warp.square_to_uniform_disk_concentric(aperture) * v["aperture"]
             right, down, forward = self.rows
             origin = self.centre + right * lens.x + down * lens.y
-            sharp = self.centre + (right * x + down * y + forward) * self.focus
+            sharp = self.centre + (right * x + down * y + forward) * v["focus"]
             ray = mi.Ray3f(mi.Point3f(origin), dr.normalize(mi.Vector3f(sharp - origin)), time)
             return ray, mi.Color3f(1.0)
 

@@ -1,0 +1,111 @@
+"""A SLURM of one node with two slots on this machine, for as long as a test needs it."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import socket
+import subprocess
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+PROGRAMS = ("slurmctld", "slurmd", "sbatch", "scancel", "scontrol", "squeue")
+
+_CONFIGURATION = """
+ClusterName=test
+SlurmctldHost={host}(127.0.0.1)
+SlurmUser=root
+SlurmdUser=root
+AuthType=auth/none
+CredType=cred/none
+SlurmctldPort={controller}
+SlurmdPort={daemon}
+ProctrackType=proctrack/linuxproc
+TaskPlugin=task/none
+SelectType=select/cons_tres
+SelectTypeParameters=CR_CPU
+MpiDefault=none
+ReturnToService=2
+SchedulerParameters=sched_interval=1,batch_sched_delay=0
+StateSaveLocation={home}/state
+SlurmdSpoolDir={home}/spool
+SlurmctldPidFile={home}/slurmctld.pid
+SlurmdPidFile={home}/slurmd.pid
+SlurmctldLogFile={home}/slurmctld.log
+SlurmdLogFile={home}/slurmd.log
+SlurmdParameters=config_overrides
+NodeName={host} NodeAddr=127.0.0.1 CPUs=2 RealMemory=16000 State=UNKNOWN
+PartitionName=all Nodes=ALL Default=YES MaxTime=INFINITE State=UP
+"""
+
+
+def missing() -> str:
+    """Why there can be none here; empty if there can."""
+    gone = [name for name in PROGRAMS if shutil.which(name) is None]
+    if gone:
+        return f"no {', '.join(gone)} here (Debian: apt-get install slurm-wlm)"
+    return "" if os.geteuid() == 0 else "a node's daemon needs root"
+
+
+def call(*words: str) -> str:
+    """Output of one of SLURM's commands."""
+    done = subprocess.run(words, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, f"{' '.join(words)}: {done.stderr}"
+    return done.stdout.strip()
+
+
+@contextmanager
+def slurm_cluster(home: Path) -> Iterator[str]:
+    """The node's name; `SLURM_CONF` says where the cluster is, until the block ends."""
+    host = socket.gethostname().split(".")[0]
+    for name in ("state", "spool"):
+        (home / name).mkdir(parents=True)
+    ports = _free_ports(2)
+    text = _CONFIGURATION.format(home=home, host=host, controller=ports[0], daemon=ports[1])
+    (home / "slurm.conf").write_text(text)
+    before = os.environ.get("SLURM_CONF")
+    os.environ["SLURM_CONF"] = str(home / "slurm.conf")
+    daemons: list[subprocess.Popen[bytes]] = []
+    try:
+        for program in ("slurmctld", "slurmd"):
+            log = (home / f"{program}.out").open("wb")
+            daemons.append(subprocess.Popen([program, "-D"], stdout=log, stderr=log))
+            log.close()
+        _wait_for_node(daemons, home)
+        yield host
+    finally:
+        for daemon in reversed(daemons):
+            daemon.terminate()
+        for daemon in daemons:
+            try:
+                daemon.wait(timeout=20)
+            except subprocess.TimeoutExpired:
+                daemon.kill()
+        if before is None:
+            del os.environ["SLURM_CONF"]
+        else:
+            os.environ["SLURM_CONF"] = before
+
+
+def _free_ports(count: int) -> list[int]:
+    held = [socket.socket() for _ in range(count)]
+    for one in held:
+        one.bind(("127.0.0.1", 0))
+    ports = [one.getsockname()[1] for one in held]
+    for one in held:
+        one.close()
+    return ports
+
+
+def _wait_for_node(daemons: list[subprocess.Popen[bytes]], home: Path) -> None:
+    until = time.monotonic() + 60
+    while time.monotonic() < until:
+        said = "\n".join(path.read_text(errors="replace") for path in home.glob("*.out"))
+        assert all(daemon.poll() is None for daemon in daemons), said
+        done = subprocess.run(["sinfo", "-h", "-o", "%T"], capture_output=True, text=True, timeout=60)
+        if done.stdout.strip() == "idle":
+            return
+        time.sleep(0.5)
+    raise AssertionError(f"the node never came up\n{said}")

@@ -1,0 +1,73 @@
+"""A dataset rendered through SLURM, the real one, on this machine: lost jobs and nodes change no byte."""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+
+import pytest
+import slurm_cluster
+from fake_run import Silent, wait_for
+
+from synth.dataset.folder import Folder
+from synth.engine import run
+from synth.job.schema import Job
+
+pytestmark = pytest.mark.slow
+
+JOB = Job.model_validate(
+    {
+        "seed": 7,
+        "sequences": 5,
+        "frames": 3,
+        "render": {"size": [64, 48], "spp": 2},
+        "anatomy": {"vertices": 2500},
+        "fem": {"tets": 300},
+        "flow": {"backend": "ideal"},
+    }
+)
+DESCRIBED = """
+jobs: 2
+cores: 1
+processes: 1
+memory: 2 GB
+walltime: "00:20:00"
+scheduler_options: {host: 127.0.0.1}
+log_directory: LOGS
+"""
+
+
+class Disturbing(Silent):
+    """When the first sequence has ended, drains the node and kills one of the two jobs."""
+
+    def __init__(self, node: str) -> None:
+        super().__init__()
+        self.node, self.killed, self._once = node, "", threading.Lock()
+
+    def end(self, attempt: object, again: bool) -> None:
+        super().end(attempt, again)  # type: ignore[arg-type]
+        if self._once.acquire(blocking=False):
+            slurm_cluster.call("scontrol", "update", f"nodename={self.node}", "state=drain", "reason=test")
+            running = slurm_cluster.call("squeue", "-h", "-t", "running", "-o", "%i").split()
+            assert len(running) == 2, "both slots should be at work"
+            self.killed = running[0]
+            slurm_cluster.call("scancel", "--signal=KILL", "--full", self.killed)
+            slurm_cluster.call("scancel", self.killed)
+
+
+@pytest.mark.skipif(bool(slurm_cluster.missing()), reason=slurm_cluster.missing())
+def test_a_killed_job_and_a_drained_node_change_no_byte(tmp_path: Path) -> None:
+    pytest.importorskip("dask_jobqueue", reason="the extra `cluster` is not installed")
+    described = tmp_path / "slurm.yaml"
+    described.write_text(DESCRIBED.replace("LOGS", str(tmp_path / "logs")))
+    with slurm_cluster.slurm_cluster(tmp_path / "slurm") as node:
+        watcher = Disturbing(node)
+        made = run.run(JOB, tmp_path / "cluster", run.Options(engine=str(described)), watcher)
+        assert watcher.killed
+        wait_for(lambda: not slurm_cluster.call("squeue", "-h", "-t", "running", "-o", "%i"))
+        assert "drain" in slurm_cluster.call("sinfo", "-h", "-o", "%T")
+    assert (made.done, made.failed) == (JOB.sequences, {})
+    here = run.run(JOB, tmp_path / "local", run.Options(workers=1), Silent())
+    assert made.content_hash == here.content_hash
+    assert not list((tmp_path / "cluster").glob("*.part"))
+    assert not list((Folder(tmp_path / "cluster").state / "failed").glob("*"))

@@ -1,0 +1,76 @@
+"""The compiled loops compute what the tensor code does, which CUDA runs."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from synth.flow import image, tvl1
+from synth.flow.tvl1 import Level, Settings, Tvl1
+
+
+def by_tensors(level: Level, flow: Tensor, weight: Tensor, s: Settings) -> Tensor:
+    """What `solve` does where the device is no CPU."""
+    dual = flow.new_zeros(2, *flow.shape)
+    for _ in range(s.warps):
+        flow, dual = tvl1.step(level, flow, dual, weight, s)
+    return flow
+
+
+def picture(rng: np.random.Generator, shape: tuple[int, int]) -> np.ndarray:
+    """Coarse and fine noise as RGB."""
+    made = np.zeros(shape)
+    for period in (4, 12, 40):
+        small = rng.normal(size=(shape[0] // period + 3, shape[1] // period + 3))
+        wide = F.interpolate(torch.from_numpy(small)[None, None], scale_factor=period, mode="bicubic")
+        made += wide[0, 0, : shape[0], : shape[1]].numpy()
+    grey = np.clip(120 + 30 * made, 0, 255).astype(np.uint8)
+    return np.repeat(grey[..., None], 3, axis=-1)
+
+
+@pytest.mark.parametrize("shape", [(96, 128), (75, 101)])
+@pytest.mark.parametrize("settings", [Settings(), Settings(reweights=2, noise=0.0, median=False, erode=1)])
+def test_flow_is_that_of_the_tensor_code(
+    shape: tuple[int, int], settings: Settings, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rng = np.random.default_rng(3)
+    rest = np.stack([picture(rng, shape) for _ in range(2)])
+    now = np.stack([np.roll(one, (2, -3), (0, 1)) for one in rest])
+    usable = np.ones((2, *shape), bool)
+    usable[0, 20:40, 30:60] = False
+    now_usable = np.ones((2, *shape), bool)
+    now_usable[:, :15, :25] = False
+    initial = rng.normal(0, 0.3, (2, *shape, 2)).astype(np.float32) + np.float32([-3, 2])
+    estimator = Tvl1(settings, device="cpu")
+    for start in (None, initial):
+        fused = estimator.flows(rest, now, usable, now_usable, start)
+        with monkeypatch.context() as patched:
+            patched.setattr(tvl1, "_fused", by_tensors)
+            plain = estimator.flows(rest, now, usable, now_usable, start)
+        assert np.abs(fused[0] - plain[0]).max() < 1e-3
+        assert np.abs(fused[1] - plain[1]).max() < 1e-3
+        assert np.abs(plain[0]).max() > 2, "nothing moved, so nothing was compared"
+
+
+@pytest.mark.parametrize("shape", [(8, 12), (9, 13), (2, 3)])
+def test_means_are_those_of_pytorch(shape: tuple[int, int]) -> None:
+    field = torch.randn(2, 3, *shape, generator=torch.Generator().manual_seed(1))
+    expected = F.avg_pool2d(field, 2, ceil_mode=True, count_include_pad=False)
+    torch.testing.assert_close(image.halved(field), expected, rtol=1e-5, atol=1e-6)
+    for radius in (1, 3):
+        wide = 2 * radius + 1
+        rows = F.avg_pool2d(field, (1, wide), 1, (0, radius), count_include_pad=False)
+        expected = F.avg_pool2d(rows, (wide, 1), 1, (radius, 0), count_include_pad=False)
+        torch.testing.assert_close(image.box(field, radius), expected, rtol=1e-5, atol=1e-6)
+
+
+def test_a_flow_that_ran_away_is_read_at_the_border() -> None:
+    now = torch.arange(20.0).view(1, 1, 4, 5)
+    flow = torch.full((1, 2, 4, 5), 1e9)
+    level = Level(now, now, torch.ones_like(now), torch.ones_like(now))
+    settings = Settings(warps=1, median=False)
+    found = tvl1.solve([level], flow, settings)
+    assert torch.isfinite(found).all()
