@@ -75,8 +75,8 @@ def preview(
 
     if out.suffix.lower() != ".png" or not out.parent.is_dir():
         raise UserError(f"{out}: cannot be written as PNG")
-    read = reader.load(job, overrides or [])
-    made = contact_sheet.make(read, count)
+    read = reader.load_job(job, overrides or [])
+    made = contact_sheet.draw_sheet(read, count)
     if not cv2.imwrite(str(out), made.picture[..., ::-1]):
         raise UserError(f"{out}: cannot be written as PNG")
     if json:
@@ -119,12 +119,12 @@ def render(
     from synth.job import reader
 
     _end_on_terminate()
-    read = reader.load(job, overrides or [])
+    read = reader.load_job(job, overrides or [])
     with Bars() as bars:
         options = running.Options(
             engine=engine, workers=workers, gpus=gpus, memory_gb=memory, mix_versions=mix_versions
         )
-        summary = running.run(read, out, options, bars)
+        summary = running.run_job(read, out, options, bars)
     if json:
         print(json_.dumps({**vars(summary), "out": str(out)}))
     else:
@@ -157,7 +157,7 @@ def retry(
     job = folder.job()
     forgiven = folder.forgive()
     with Bars() as bars:
-        summary = engine.run(job, out, engine.Options(workers=workers, mix_versions=mix_versions), bars)
+        summary = engine.run_job(job, out, engine.Options(workers=workers, mix_versions=mix_versions), bars)
     if json:
         print(json_.dumps({**vars(summary), "retried": forgiven, "out": str(out)}))
     else:
@@ -171,7 +171,7 @@ def status(out: Out, json: Json = False) -> None:
     """Says what is done, running and failed, and what is still to come in time and disk."""
     from synth.engine import status as standing
 
-    found = standing.of(out)
+    found = standing.read_status(out)
     print(json_.dumps(found.as_dict()) if json else "\n".join(standing.lines(found)))
 
 
@@ -196,11 +196,11 @@ def split_command(
 
     folder = Folder(out)
     folder.described()
-    chosen = split.parse(by, shares, hold_out or [], share_anatomy)
-    rows = index.write(folder)
-    split.assign(rows, chosen)
-    split.keep(out, chosen)
-    counts = split.count(index.write(folder))
+    chosen = split.parse_rule(by, shares, hold_out or [], share_anatomy)
+    rows = index.write_index(folder)
+    split.assign_sides(rows, chosen)
+    split.keep_rule(out, chosen)
+    counts = split.count(index.write_index(folder))
     if not counts:
         raise UserError(f"{out}: holds no finished sequence")
     print(json_.dumps(counts) if json else ", ".join(f"{side} {n}" for side, n in counts.items()))
@@ -214,7 +214,7 @@ def report(
     """Writes a page with thumbnails, distributions and failures that opens in any browser."""
     from synth.publish import report as reporting
 
-    print(reporting.write(out, to or out / "report.html"))
+    print(reporting.write_report(out, to or out / "report.html"))
 
 
 @app.command(epilog="Example: synth export out out-hdf5 --to hdf5")
@@ -226,7 +226,7 @@ def export(
     """Writes the dataset in a format of others."""
     from synth.publish import export as exporting
 
-    print(f"{exporting.export(out, target, to)} sequences in {target}")
+    print(f"{exporting.export_dataset(out, target, to)} sequences in {target}")
 
 
 @app.command(epilog="Example: synth card out")
@@ -239,9 +239,9 @@ def card(out: Out) -> None:
 
     folder = Folder(out)
     folder.described()
-    index.write(folder)
-    print(carding.write(folder))
-    print(croissant.write(folder))
+    index.write_index(folder)
+    print(carding.write_card(folder))
+    print(croissant.write_croissant(folder))
     unsaid = croissant.missing(croissant.describe(folder))
     if unsaid:
         print(f"not said in the job's card, so not in the description: {', '.join(unsaid)}", file=sys.stderr)
@@ -261,7 +261,7 @@ def verify(
 
     from synth.checks import verify as verifying
 
-    report = verifying.run(out, fast=fast)
+    report = verifying.verify_dataset(out, fast=fast)
     if json:
         print(json_.dumps(report.as_dict()))
     else:
@@ -304,7 +304,7 @@ def picture(
     from synth.publish import picture as drawing
 
     chosen = open_sequence(location.store(out, sequence))
-    rows = drawing.of_sequence(chosen, frame or [drawing.strongest(chosen)])
+    rows = drawing.draw_sequence(chosen, frame or [drawing.strongest(chosen)])
     to.parent.mkdir(parents=True, exist_ok=True)
     if to.suffix.lower() not in (".png", ".jpg") or not cv2.imwrite(str(to), rows[..., ::-1]):
         raise UserError(f"{to}: cannot be written as a picture (.png or .jpg)")
@@ -360,9 +360,9 @@ def view(
 
     chosen = [open_sequence(location.store(out, k)) for k in sequence] if sequence else [Dataset(out)[0]]
     if save is None:
-        viewing.show(chosen, web=web)
+        viewing.show_sequences(chosen, web=web)
     else:
-        viewing.save(chosen, save)
+        viewing.save_recording(chosen, save)
         print(f"wrote {save}; open it with: rerun {save}")
 
 

@@ -236,7 +236,7 @@ def difference(usual: list[float], other: list[float], seed: int) -> list[float]
 
 def called(world: World, job: Job) -> str:
     """Folder of a world's sequences: another one when the job's constants or the generator's code change."""
-    return f"{world.name}-{job.seed}-{_word([identity.of(job), provenance.fingerprint()])}"
+    return f"{world.name}-{job.seed}-{_word([identity.identify_job(job), provenance.fingerprint()])}"
 
 
 def _word(value: Any) -> str:

@@ -58,7 +58,7 @@ def full_size(
         raise UserError(f"unknown loss {loss!r}: one of {', '.join(LOSSES)}")
     set_threads(1)
     say = Console(stderr=True).print
-    job = reader.load(str(RESULTS / "data/labels.yaml"))
+    job = reader.load_job(str(RESULTS / "data/labels.yaml"))
     job = job.model_copy(update={"sequences": sequences, "frames": frames})
     grid, began = Grid(size), time.perf_counter()
     if size < FINE:

@@ -56,7 +56,7 @@ def stability(
     set_threads(1)
     say = Console(stderr=True).print
     out.mkdir(parents=True, exist_ok=True)
-    job, grid = reader.load(str(RESULTS / "data/labels.yaml")), Grid(small().size)
+    job, grid = reader.load_job(str(RESULTS / "data/labels.yaml")), Grid(small().size)
     clips = labels(job, grid, cache)
     trained = {n: cache / f"models/ideal/{n}-fold0-seed0" for n in ("mse", "ghostless")}
     split = nested(clips, 3, 0, 0)

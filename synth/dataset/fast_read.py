@@ -61,7 +61,7 @@ class Frames:
         )
 
 
-def of(array: zarr.Array[Any], folder: Path | None) -> Frames | None:
+def open_frames(array: zarr.Array[Any], folder: Path | None) -> Frames | None:
     """The fast way to the frames of `array`, stored in `folder`; None where there is none."""
     codecs = [type(codec).__name__ for codec in (*array.filters, array.serializer, *array.compressors)]  # type: ignore[list-item]
     if folder is None or array.shards is None or array.chunks != (1, *array.shape[1:]) or codecs != _CODECS:

@@ -97,7 +97,7 @@ motion, 0.008 px below 32. The largest error of a sequence is measured as it is 
 
 
 def _measured(field: Field, sequence: Sequence) -> float:
-    folder: Path = sequence.path / field.name
+    folder: Path = sequence.path / (sequence.stored_name(field.name) or field.name)
     if not folder.is_dir():
         return 0.0
     return size_forecast.size(folder) / (sequence.frames if TIME in field.dims else 1)

@@ -34,7 +34,9 @@ class Forecast:
     """Finished sequences that the forecast rests on; 0: on the field table."""
 
 
-def of(job: Job, root: Path, todo: int, done: Sequence[int], cpu_s: float | None = None) -> Forecast:
+def forecast_rest(
+    job: Job, root: Path, todo: int, done: Sequence[int], cpu_s: float | None = None
+) -> Forecast:
     """Forecast of what is still to do.
 
     Args:

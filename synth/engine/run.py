@@ -79,7 +79,7 @@ class Watcher(Listener, Protocol):
     def account(self, account: Account) -> None: ...
 
 
-def run(job: Job, root: Path, options: Options, watcher: Watcher) -> Summary:
+def run_job(job: Job, root: Path, options: Options, watcher: Watcher) -> Summary:
     """Computes the sequences of `job` that `root` lacks.
 
     Raises:
@@ -92,7 +92,9 @@ def run(job: Job, root: Path, options: Options, watcher: Watcher) -> Summary:
     with claim(root, job, mix_versions=options.mix_versions) as folder:
         finished, failures = set(folder.sealed()), folder.failures()
         todo = [k for k in range(job.sequences) if k not in finished and k not in failures]
-        size_forecast.refuse_if_too_large(size_forecast.of(job, root, len(todo), sorted(finished)), root)
+        size_forecast.refuse_if_too_large(
+            size_forecast.forecast_rest(job, root, len(todo), sorted(finished)), root
+        )
         # The journal first: what is said of the run is then said with what has just ended.
         watchers = (Journal(folder, workers, job.frames, watcher), watcher)
         for each in watchers:
@@ -114,13 +116,13 @@ def run(job: Job, root: Path, options: Options, watcher: Watcher) -> Summary:
             with _slots(options.engine, setup, workers, gpus) as made:
                 done = _Pool(folder, made, todo).work(watchers)
         except BaseException:
-            index.write(folder)
+            index.write_index(folder)
             raise
-        rows = index.write(folder)
+        rows = index.write_index(folder)
         if done or not preview_video.path(root).exists():
-            preview_video.write(root)
-            card.write(folder)
-            croissant.write(folder)
+            preview_video.write_preview(root)
+            card.write_card(folder)
+            croissant.write_croissant(folder)
         return Summary(
             total=job.sequences,
             already=len(finished),
@@ -244,4 +246,4 @@ def _slots(
         return slots.local(setup, workers, gpus)
     from synth.engine import dask
 
-    return dask.slots_of(engine, setup)
+    return dask.open_slots(engine, setup)

@@ -119,12 +119,12 @@ def render_sequence(job: Job, index: int, folder: Path, report: Report) -> Path:
             recovered = track.track(estimator(job.flow), rgb, mask.hidden(rgb, tools), still.tissue)
         with watch.stage("store"):
             for t in range(job.frames):
-                writer.put_frame("flow_tvl1", t, recovered.flow[t])
+                writer.put_frame("flow_recovered", t, recovered.flow[t])
                 writer.put_frame("flow_confidence", t, recovered.confidence[t])
 
     return writer.seal(
         scenario=case.as_dict(),
-        anatomy_id=identity.anatomy(job, case.relief.seed),
+        anatomy_id=identity.identify_anatomy(job, case.relief.seed),
         K=view.K.tolist(),
         distortion=view.distortion.tolist(),
         rotation=view.rotation.tolist(),
@@ -169,7 +169,7 @@ def cortex(job: Job, case: Scenario) -> tuple[Surface, Brain | None]:
     """The fine surface of a scenario, and the user's brain that it is a part of, if it is."""
     if job.anatomy.mesh is None:
         return anatomy.procedural(case.relief, job.anatomy), None
-    whole = brain_surface.load(job.anatomy.mesh, job.anatomy.craniotomy)
+    whole = brain_surface.load_brain(job.anatomy.mesh, job.anatomy.craniotomy)
     return anatomy.from_brain(whole.vertices, whole.faces, case.relief, job.anatomy), whole
 
 

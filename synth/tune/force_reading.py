@@ -55,7 +55,7 @@ class Reading:
         return np.asarray(np.einsum("kip,kp->ki", self.inverse, away))
 
 
-def fit(
+def fit_reading(
     job: Job,
     case: Scenario,
     surface: Surface,

@@ -41,7 +41,7 @@ class Knob:
     other pictures, not cheaper ones, and what is trained on them is another network."""
 
 
-def of(job: Job) -> list[Knob]:
+def list_knobs(job: Job) -> list[Knob]:
     """The knobs that a job has, with its own value among the levels.
 
     Raises:

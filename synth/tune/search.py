@@ -77,7 +77,7 @@ class _Bench:
             if number != index:
                 other.rest()
         if index not in self._probes:
-            finest = tune_knobs.finest(tune_knobs.of(self.job))
+            finest = tune_knobs.finest(tune_knobs.list_knobs(self.job))
             for attempt in range(_DRAWS):
                 job = probing(self.job, index, attempt)
                 try:
@@ -89,7 +89,7 @@ class _Bench:
         return self._probes[index]
 
 
-def run(job: Job, budget: Budget, journal_file: Path, probes: int, checks: int, report: Report) -> Tuned:
+def tune_job(job: Job, budget: Budget, journal_file: Path, probes: int, checks: int, report: Report) -> Tuned:
     """Finds the cheapest job within the budget.
 
     Args:
@@ -105,7 +105,7 @@ def run(job: Job, budget: Budget, journal_file: Path, probes: int, checks: int, 
     Raises:
         UserError: a probe sequence cannot be carried out at full fidelity.
     """
-    knobs = tune_knobs.of(job)
+    knobs = tune_knobs.list_knobs(job)
     journal = Journal(journal_file, _state(job))
     levels = sum(len(knob.levels) for knob in knobs)
     total = probes * (levels + 2) + 2 * probes + 3 * checks
@@ -152,7 +152,7 @@ def run(job: Job, budget: Budget, journal_file: Path, probes: int, checks: int, 
     )
 
 
-def again(
+def measure_again(
     found: Tuned, journal_file: Path, first: int, count: int, report: Report
 ) -> tuple[Joint, Joint, Joint]:
     """Full fidelity, the job as it was and the tuned one, on sequences that had no part in the choice.
@@ -216,7 +216,7 @@ def joint(
 ) -> Joint:
     """A setting as a whole, against full fidelity, on some sequences."""
     changes = merged(levels)
-    finest = tune_knobs.finest(tune_knobs.of(bench.job))
+    finest = tune_knobs.finest(tune_knobs.list_knobs(bench.job))
     errors: list[float] = []
     totals: list[float] = []
     apart: list[float] = []
