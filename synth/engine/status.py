@@ -90,10 +90,8 @@ def lines(status: Status) -> list[str]:
         each = ", ".join(f"{name} {seconds:.1f}" for name, seconds in status.stages_cpu_s.items())
         found.append(f"CPU-seconds a sequence: {each}")
     if status.ahead.sequences:
-        ahead, basis = (
-            status.ahead,
-            f"from {status.ahead.pilot} finished" if status.ahead.pilot else "estimated",
-        )
+        ahead = status.ahead
+        basis = f"from {ahead.pilot} finished" if ahead.pilot else "estimated"
         time = f", {clock(ahead.cpu_s)} of one core" if ahead.cpu_s is not None else ""
         found.append(
             f"still to come: {ahead.sequences} sequences, "

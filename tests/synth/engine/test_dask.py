@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from fake_run import Silent, options, run_job, wait_for
+from fake_run import Silent, options, run_here, wait_for
 
 from evidence.engine.dask import local_cluster
 from synth.dataset.folder import Folder
@@ -40,7 +40,7 @@ def test_a_lost_worker_costs_nothing_but_time(tmp_path: Path) -> None:
         made = run.run_job(JOB, root, options("slow", engine=f"dask://{address}"), Killing(processes[0].pid))
         wait_for(lambda: processes[0].poll() is not None)
     assert (made.done, made.failed) == (6, {})
-    run_job(tmp_path / "local", JOB.model_dump_json(), "sequence")
+    run_here(tmp_path / "local", JOB.model_dump_json(), "sequence")
     assert made.content_hash == dataset_hash(read_index(tmp_path / "local").to_pylist())
     assert not list(root.glob("*.part"))
 
