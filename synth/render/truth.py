@@ -10,13 +10,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 import numpy.typing as npt
 
 from synth.geometry.triangles import Shape, normals
 from synth.render.camera import camera as cameras
 from synth.render.camera.camera import Camera
+from synth.system.jit import compiled
 
 Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int32]
@@ -274,4 +274,4 @@ def _cast_loop(points, flat, faces, directions, order, start, width, height):  #
     return face, best_u, best_v, best
 
 
-_cast = numba.njit(cache=True)(_cast_loop)
+_cast = compiled(_cast_loop)
