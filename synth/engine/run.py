@@ -125,13 +125,13 @@ class _Pool:
         self._busy = 0
         self._change = threading.Condition()
         self._stop = threading.Event()
-        self._events: queue.SimpleQueue[Callable[[Watcher], None] | BaseException | None] = (
+        self._events: queue.SimpleQueue[Callable[[Journal], None] | BaseException | None] = (
             queue.SimpleQueue()
         )
         self._done = 0
         self._refused: list[Attempt] = []
 
-    def work(self, watcher: Watcher) -> int:
+    def work(self, journal: Journal) -> int:
         """Runs until nothing is left to do; returns how many were finished."""
         threads = [threading.Thread(target=self._thread, daemon=True) for _ in range(self._workers)]
         for thread in threads:
@@ -145,7 +145,7 @@ class _Pool:
                 elif isinstance(event, BaseException):
                     raise event
                 else:
-                    event(watcher)
+                    event(journal)
         finally:
             self._stop.set()
             with self._change:

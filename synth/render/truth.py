@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -274,4 +275,4 @@ def _cast_loop(points, flat, faces, directions, order, start, width, height):  #
     return face, best_u, best_v, best
 
 
-_cast = compiled(_cast_loop)
+_cast: Any = compiled(_cast_loop)
