@@ -2,7 +2,7 @@
 
 Only for fields on this machine's disk in the very layout that the writer gives them (a file of frames, each
 packed by Blosc and followed by its CRC-32C, and an index at the end of the file: zarr-specs.readthedocs.io,
-sharding codec 1.0). For anything else `of` gives None, and Zarr does the reading.
+sharding codec 1.0). For anything else `open_frames` gives None, and Zarr does the reading.
 """
 
 from __future__ import annotations

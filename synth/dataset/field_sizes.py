@@ -93,6 +93,8 @@ the ratio measured on rendered sequences. `synth fields --size 1280x960` gives t
 motion, 0.008 px below 32. The largest error of a sequence is measured as it is written, in its attribute
 `summary.rounding_px`. Readers give float32 either way.
 
+Older stores call `flow_recovered` by its former name, `flow_tvl1`; both names are read.
+
 """
 
 

@@ -14,8 +14,7 @@ import zarr
 from numpy.typing import NDArray
 from zarr.codecs import BloscCodec, Crc32cCodec
 
-from synth.dataset import fast_read as shard
-from synth.dataset import location, provenance
+from synth.dataset import fast_read, location, provenance
 from synth.errors import NotFinite, UserError
 from synth.fields import FIELDS, FORMAT_VERSION, FORMER_NAMES, Field, find_field
 from synth.job import identity
@@ -240,7 +239,7 @@ class Column:
         self, array: zarr.Array[Any], dtype: np.dtype[Any], where: str, folder: Path | None = None
     ) -> None:
         self._array, self._where = array, where
-        self._frames = shard.open_frames(array, folder)
+        self._frames = fast_read.open_frames(array, folder)
         self.shape: tuple[int, ...] = array.shape
         self.stored: np.dtype[Any] = array.dtype
         """Type on disk; values are given in the table's."""

@@ -13,8 +13,7 @@ import zarr
 from fake_work import attributes, sequence
 
 from synth.checks import contents
-from synth.dataset import fast_read as shard
-from synth.dataset import store
+from synth.dataset import fast_read, store
 from synth.dataset.store import Dataset, Writer, open_sequence
 from synth.errors import NotFinite, UserError
 from synth.fields import FIELDS
@@ -76,7 +75,7 @@ def test_single_frames_are_those_that_zarr_reads(root: Path, monkeypatch: pytest
     found, plain = open_sequence(root / "000002.zarr"), zarr.open_group(str(root / "000002.zarr"), mode="r")
     for name in found.fields:
         column, array = found[name], plain[name]
-        fast = shard.open_frames(array, root / "000002.zarr" / name)
+        fast = fast_read.open_frames(array, root / "000002.zarr" / name)
         assert (fast is not None) == FIELDS[name].framed
         for t in (0, 6, 2, -1, -7):
             assert np.array_equal(column[t], array[t])
