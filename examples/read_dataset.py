@@ -27,8 +27,8 @@ def describe(sequence: Sequence) -> dict[str, float]:
         "labelled_force_mn": float(labelled),
         "largest_motion_px": float(np.linalg.norm(flow, axis=2).max()),
     }
-    if "flow_tvl1" in sequence:
-        error = np.linalg.norm(sequence["flow_tvl1"][t] - flow, axis=2)
+    if "flow_recovered" in sequence:
+        error = np.linalg.norm(sequence["flow_recovered"][t] - flow, axis=2)
         found["median_flow_error_px"] = float(np.median(error[seen]))
     return found
 

@@ -76,8 +76,8 @@ def preview(
 
     if out.suffix.lower() != ".png" or not out.parent.is_dir():
         raise UserError(f"{out}: cannot be written as PNG")
-    read = reader.load(job, overrides or [])
-    made = contact_sheet.make(read, count)
+    read = reader.load_job(job, overrides or [])
+    made = contact_sheet.draw_sheet(read, count)
     if not cv2.imwrite(str(out), made.picture[..., ::-1]):
         raise UserError(f"{out}: cannot be written as PNG")
     if json:
@@ -115,17 +115,15 @@ def render(
     json: Json = False,
 ) -> None:
     """Renders the dataset of a job. Exit code 1 when some of its sequences failed."""
-    from synth.engine import run as running
     from synth.engine.progress import Bars
-    from synth.job import reader
+    from synth.engine.run import Options, run_job
+    from synth.job.reader import load_job
 
     _end_on_terminate()
-    read = reader.load(job, overrides or [])
+    read = load_job(job, overrides or [])
+    options = Options(engine=engine, workers=workers, gpus=gpus, memory_gb=memory, mix_versions=mix_versions)
     with Bars() as bars:
-        options = running.Options(
-            engine=engine, workers=workers, gpus=gpus, memory_gb=memory, mix_versions=mix_versions
-        )
-        summary = running.run(read, out, options, bars)
+        summary = run_job(read, out, options, bars)
     if json:
         print(json_.dumps({**vars(summary), "out": str(out)}))
     else:
@@ -150,15 +148,15 @@ def retry(
 ) -> None:
     """Takes up the sequences that failed, and all that are missing."""
     from synth.dataset.folder import Folder
-    from synth.engine import run as engine
     from synth.engine.progress import Bars
+    from synth.engine.run import Options, run_job
 
     _end_on_terminate()
     folder = Folder(out)
     job = folder.job()
     forgiven = folder.forgive()
     with Bars() as bars:
-        summary = engine.run(job, out, engine.Options(workers=workers, mix_versions=mix_versions), bars)
+        summary = run_job(job, out, Options(workers=workers, mix_versions=mix_versions), bars)
     if json:
         print(json_.dumps({**vars(summary), "retried": forgiven, "out": str(out)}))
     else:
@@ -170,10 +168,10 @@ def retry(
 @app.command(epilog="Example: synth status out")
 def status(out: Out, json: Json = False) -> None:
     """Says what is done, running and failed, and what is still to come in time and disk."""
-    from synth.engine import status as standing
+    from synth.engine.status import lines, read_status
 
-    found = standing.of(out)
-    print(json_.dumps(found.as_dict()) if json else "\n".join(standing.lines(found)))
+    found = read_status(out)
+    print(json_.dumps(found.as_dict()) if json else "\n".join(lines(found)))
 
 
 @app.command("split", epilog="Example: synth split out --by anatomy --hold-out calf")
@@ -197,11 +195,11 @@ def split_command(
 
     folder = Folder(out)
     folder.described()
-    chosen = split.parse(by, shares, hold_out or [], share_anatomy)
-    rows = index.write(folder)
-    split.assign(rows, chosen)
-    split.keep(out, chosen)
-    counts = split.count(index.write(folder))
+    chosen = split.parse_rule(by, shares, hold_out or [], share_anatomy)
+    rows = index.write_index(folder)
+    split.assign_sides(rows, chosen)
+    split.keep_rule(out, chosen)
+    counts = split.count(index.write_index(folder))
     if not counts:
         raise UserError(f"{out}: holds no finished sequence")
     print(json_.dumps(counts) if json else ", ".join(f"{side} {n}" for side, n in counts.items()))
@@ -213,9 +211,9 @@ def report(
     to: Annotated[Path | None, typer.Option("--to", help="The page; report.html in the dataset.")] = None,
 ) -> None:
     """Writes a page with thumbnails, distributions and failures that opens in any browser."""
-    from synth.publish import report as reporting
+    from synth.publish.report import write_report
 
-    print(reporting.write(out, to or out / "report.html"))
+    print(write_report(out, to or out / "report.html"))
 
 
 @app.command(epilog="Example: synth export out out-hdf5 --to hdf5")
@@ -225,24 +223,24 @@ def export(
     to: Annotated[str, typer.Option("--to", help="folder, webdataset, hdf5 or d2fnet-npz.")] = "folder",
 ) -> None:
     """Writes the dataset in a format of others."""
-    from synth.publish import export as exporting
+    from synth.publish.export import export_dataset
 
-    print(f"{exporting.export(out, target, to)} sequences in {target}")
+    print(f"{export_dataset(out, target, to)} sequences in {target}")
 
 
 @app.command(epilog="Example: synth card out")
 def card(out: Out) -> None:
     """Writes the dataset's card anew: README.md with its pictures, and croissant.json for machines."""
-    from synth.dataset import index
     from synth.dataset.folder import Folder
-    from synth.publish import card as carding
+    from synth.dataset.index import write_index
     from synth.publish import croissant
+    from synth.publish.card import write_card
 
     folder = Folder(out)
     folder.described()
-    index.write(folder)
-    print(carding.write(folder))
-    print(croissant.write(folder))
+    write_index(folder)
+    print(write_card(folder))
+    print(croissant.write_croissant(folder))
     unsaid = croissant.missing(croissant.describe(folder))
     if unsaid:
         print(f"not said in the job's card, so not in the description: {', '.join(unsaid)}", file=sys.stderr)
@@ -260,9 +258,9 @@ def verify(
     from rich.console import Console
     from rich.table import Table
 
-    from synth.checks import verify as verifying
+    from synth.checks.verify import verify_dataset
 
-    report = verifying.run(out, fast=fast)
+    report = verify_dataset(out, fast=fast)
     if json:
         print(json_.dumps(report.as_dict()))
     else:
@@ -302,10 +300,10 @@ def picture(
     from synth.dataset import location
     from synth.dataset.store import open_sequence
     from synth.errors import UserError
-    from synth.publish import picture as drawing
+    from synth.publish.picture import draw_sequence, strongest
 
     chosen = open_sequence(location.store(out, sequence))
-    rows = drawing.of_sequence(chosen, frame or [drawing.strongest(chosen)])
+    rows = draw_sequence(chosen, frame or [strongest(chosen)])
     to.parent.mkdir(parents=True, exist_ok=True)
     if to.suffix.lower() not in (".png", ".jpg") or not cv2.imwrite(str(to), rows[..., ::-1]):
         raise UserError(f"{to}: cannot be written as a picture (.png or .jpg)")
@@ -357,13 +355,13 @@ def view(
     """Opens sequences in rerun, on this machine only: surface, frame, flow, traction and force by time."""
     from synth.dataset import location
     from synth.dataset.store import Dataset, open_sequence
-    from synth.publish import rerun_view as viewing
+    from synth.publish.rerun_view import save_recording, show_sequences
 
     chosen = [open_sequence(location.store(out, k)) for k in sequence] if sequence else [Dataset(out)[0]]
     if save is None:
-        viewing.show(chosen, web=web)
+        show_sequences(chosen, web=web)
     else:
-        viewing.save(chosen, save)
+        save_recording(chosen, save)
         print(f"wrote {save}; open it with: rerun {save}")
 
 
@@ -373,9 +371,9 @@ def doctor(
     json: Json = False,
 ) -> None:
     """Says what this machine offers, and what to do about what it lacks."""
-    from synth.system import doctor as examining
+    from synth.system.doctor import findings
 
-    found = examining.findings(folder)
+    found = findings(folder)
     if json:
         print(json_.dumps([vars(finding) for finding in found]))
         return

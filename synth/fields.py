@@ -6,8 +6,14 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal
 
+# When `flow_tvl1` became `flow_recovered` the version stayed: the field means what it meant, an older reader
+# finds no field of the name it knows and says so, and a higher number would have every reader refuse stores
+# whose values it reads right.
 FORMAT_VERSION = 1
 """Of the stores; raised when a reader of the older one would misread the newer."""
+
+FORMER_NAMES = {"flow_tvl1": "flow_recovered"}
+"""Names that older stores give to fields, and what those are called now. Both may be asked for."""
 
 TIME, ROW, COLUMN = "frame", "row", "column"
 
@@ -134,7 +140,7 @@ FIELDS: dict[str, Field] = {
             packed=3.5,
         ),
         Field(
-            "flow_tvl1",
+            "flow_recovered",
             (*_VIDEO, "xy"),
             "float32",
             "px",
@@ -267,6 +273,11 @@ EXTRA = tuple(name for name, field in FIELDS.items() if field.kept == "asked")
 
 SPARED = ("depth", "flow_confidence")
 """What a job's `store.without` may name: nothing else can be computed without the rest."""
+
+
+def find_field(name: str) -> Field | None:
+    """The field of that name, present or former; None if there is none."""
+    return FIELDS.get(FORMER_NAMES.get(name, name))
 
 
 def kept(extra: Iterable[str], without: Iterable[str], *, recovered: bool) -> tuple[str, ...]:

@@ -99,7 +99,7 @@ def fit_baselines(train: Path | None, model: Path) -> dict[str, Method]:
     chosen = [s for s in Dataset(train) if s.attrs["content_hash"] in hashes]
     if not chosen:
         raise UserError(f"{train}: holds none of the sequences that {model} was fitted on")
-    source = "recovered" if all("flow_tvl1" in s for s in chosen) else "ideal"
+    source = "recovered" if all("flow_recovered" in s for s in chosen) else "ideal"
     return methods | baseline.fitted([read(s, baseline.GRID, (source,)) for s in chosen], source)
 
 

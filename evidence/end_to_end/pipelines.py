@@ -119,7 +119,7 @@ def chosen() -> list[Pipeline]:
 
 def folder_name(world: World, job: Job) -> str:
     """Folder of a world's sequences: another one when the job's constants or the generator's code change."""
-    return f"{world.name}-{job.seed}-{identity.of(job)[:10]}-{provenance.fingerprint()}"
+    return f"{world.name}-{job.seed}-{identity.identify_job(job)[:10]}-{provenance.fingerprint()}"
 
 
 class Sequences:

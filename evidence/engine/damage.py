@@ -55,7 +55,7 @@ def damage(
             kind = list(KINDS)[k % len(KINDS)]
             what = KINDS[kind](copy, rng)
             changed = not _same(original, copy)
-            found = tuple(check.name for check in verify.sequence(copy, identity) if not check.good)
+            found = tuple(check.name for check in verify.verify_sequence(copy, identity) if not check.good)
             cases.append(Case(kind, what, changed, found))
             shutil.rmtree(copy)
     result = summary(cases, seed)

@@ -45,11 +45,11 @@ def dask(
                 target=_kill_half_way, args=(root, sequences, processes[0]), daemon=True
             )
             killer.start()
-            on_cluster = run.run(job, root, _with(options, f"dask://{address}"), bars)
+            on_cluster = run.run_job(job, root, _with(options, f"dask://{address}"), bars)
             killer.join(timeout=10)
             killed = processes[0].poll() is not None
         with Bars() as bars:
-            here = run.run(job, Path(scratch) / "local", run.Options(work=options.work), bars)
+            here = run.run_job(job, Path(scratch) / "local", run.Options(work=options.work), bars)
     result = {
         "sequences": sequences,
         "dask_workers": workers,

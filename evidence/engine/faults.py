@@ -57,7 +57,7 @@ def run(root: Path, work: str = "sequence") -> engine.Summary:
         {"sequences": 12, "frames": 5, "render": {"size": (160, 120)}, "flow": {"backend": "ideal"}}
     )
     with Bars() as bars:
-        return engine.run(job, root, engine.Options(workers=2, work=f"evidence.engine.work:{work}"), bars)
+        return engine.run_job(job, root, engine.Options(workers=2, work=f"evidence.engine.work:{work}"), bars)
 
 
 def _refusal(attempt: Callable[[], Any], root: Path) -> dict[str, Any]:
@@ -76,7 +76,9 @@ def _left(root: Path) -> dict[str, Any]:
     identity = str(Folder(root).described()["identity"]) if sealed else ""
     corrupt = 0
     for index in sealed:
-        checks = {check.name: check.good for check in verify.sequence(root / f"{index:06d}.zarr", identity)}
+        checks = {
+            check.name: check.good for check in verify.verify_sequence(root / f"{index:06d}.zarr", identity)
+        }
         corrupt += not (checks["readable"] and checks["checksum"] and checks["seal"])
     return {"left": len(sealed), "corrupt": corrupt}
 

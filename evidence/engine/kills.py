@@ -24,7 +24,7 @@ from synth.dataset.folder import Folder
 _PROGRAM = """
 import sys
 from pathlib import Path
-from synth import engine
+from synth.engine import run as engine
 from synth.dataset.folder import Folder
 from synth.job.schema import Job
 from synth.engine.progress import Bars
@@ -33,7 +33,7 @@ if retry == "retry":
     Folder(Path(root)).forgive()
 with Bars() as bars:
     options = engine.Options(workers=int(workers), work=work)
-    engine.run(Job.model_validate_json(job), Path(root), options, bars)
+    engine.run_job(Job.model_validate_json(job), Path(root), options, bars)
 """
 
 
@@ -54,7 +54,7 @@ def kills(
     """Kills runs at random moments, lets them resume, and compares with a run left in peace."""
     from synth.job import reader
 
-    described = reader.load(job, [f"sequences={sequences}"]).model_dump_json()
+    described = reader.load_job(job, [f"sequences={sequences}"]).model_dump_json()
     rng = np.random.default_rng(seed)
     victims = {"worker": 0, "engine": 0, "both": 0}
     with tempfile.TemporaryDirectory() as scratch:
@@ -80,7 +80,7 @@ def kills(
             _start(root, work, workers, described, "retry", frame_s).wait()
         calm = Path(scratch) / "calm"
         _start(calm, work, workers, described, "go on", 0.0).wait()
-        checks = {check.name: check.good for check in verify.run(root).checks}
+        checks = {check.name: check.good for check in verify.verify_dataset(root).checks}
         result = {
             "job": job,
             "work": work,
@@ -88,8 +88,8 @@ def kills(
             "sequences": sequences,
             "starts": starts,
             "starts_that_retried_failed": retries,
-            "hash_after_kills": index.dataset_hash(index.read(root).to_pylist()),
-            "hash_undisturbed": index.dataset_hash(index.read(calm).to_pylist()),
+            "hash_after_kills": index.dataset_hash(index.read_index(root).to_pylist()),
+            "hash_undisturbed": index.dataset_hash(index.read_index(calm).to_pylist()),
             "leftovers": [path.name for path in root.glob("*.part")],
             "checksums_good": checks["checksum"] and checks["readable"] and checks["seal"],
             "seed": seed,

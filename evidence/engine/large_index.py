@@ -21,9 +21,10 @@ _TIMED = """
 import json, resource, sys, time
 from pathlib import Path
 wall = time.perf_counter()
-from synth import report, status
+from synth.engine import status
+from synth.publish import report
 root = Path(sys.argv[2])
-status.of(root) if sys.argv[1] == "status" else report.write(root, root / "report.html")
+status.read_status(root) if sys.argv[1] == "status" else report.write_report(root, root / "report.html")
 used = resource.getrusage(resource.RUSAGE_SELF)
 print(json.dumps({"cpu_s": used.ru_utime + used.ru_stime, "wall_s": time.perf_counter() - wall,
                   "peak_mb": used.ru_maxrss * 1024 / 1e6}))
@@ -68,7 +69,7 @@ def simulate(root: Path, count: int, rng: np.random.Generator) -> None:
             continue
         (root / f"{k:06d}.zarr").mkdir()
         rows.append(_row(k, rng))
-    index.save(root, rows)
+    index.save_rows(root, rows)
 
 
 def _row(k: int, rng: np.random.Generator) -> dict[str, Any]:

@@ -34,7 +34,7 @@ def speed(
     """Overhead of engine and store over the bare stages, and two workers against one."""
     result: dict[str, Any] = {"overhead": overhead(job, rendered)}
     if sequences:
-        stand_in = reader.load("tiny", [f"sequences={sequences}", "flow.backend=ideal"])
+        stand_in = reader.load_job("tiny", [f"sequences={sequences}", "flow.backend=ideal"])
         load = os.getloadavg()[0]
         seconds = {n: timed(stand_in, "busy", n, cpu_s, 4.0)[1] for n in (1, 2)}
         result["workers"] = {
@@ -68,7 +68,7 @@ for index in range(job.sequences):
 
 def overhead(name: str, count: int) -> dict[str, float | int]:
     """CPU time of a whole run (engine, workers, store, index, film, card) over that of its stages alone."""
-    job = reader.load(name, [f"sequences={count}"])
+    job = reader.load_job(name, [f"sequences={count}"])
     machine_words = {**os.environ, **slots.machine(job, 1), "OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
     with tempfile.TemporaryDirectory() as scratch, Bars() as bars:
         before = _cpu()
@@ -76,7 +76,7 @@ def overhead(name: str, count: int) -> dict[str, float | int]:
         subprocess.run(words, env=machine_words, cwd=scratch, check=True, stdout=subprocess.DEVNULL)
         bare = _cpu() - before
         before = _cpu()
-        run.run(job, Path(scratch) / "out", run.Options(workers=1), bars)
+        run.run_job(job, Path(scratch) / "out", run.Options(workers=1), bars)
         whole = _cpu() - before
         store = sum(
             sequence.attrs["timings"]["store"]["cpu_s"] for sequence in Dataset(Path(scratch) / "out")

@@ -60,5 +60,5 @@ def timed(job: Job, work: str, workers: int, cpu_s: float, memory_gb: float) -> 
     )
     with tempfile.TemporaryDirectory() as scratch, Bars() as bars:
         begun = time.perf_counter()
-        summary = run.run(job, Path(scratch) / "out", options, bars)
+        summary = run.run_job(job, Path(scratch) / "out", options, bars)
         return summary, time.perf_counter() - begun

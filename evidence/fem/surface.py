@@ -63,7 +63,7 @@ def measure(file: Path, outwards: Floats, tets: list[int], refined: int) -> dict
     Errors: relative root mean square of the displacement in the opening (12 mm), linear law, quadratic
     tetrahedra, contact of 6 mm radius, mean of pulling and dragging aside.
     """
-    placed = brain_surface.load(file, _opening(file, outwards))
+    placed = brain_surface.load_brain(file, _opening(file, outwards))
     turns = winding.prepare(placed.vertices, placed.faces)
     low, high = placed.vertices.min(axis=0), placed.vertices.max(axis=0)
     at = np.random.default_rng(0).uniform(low, high, (100_000, 3))

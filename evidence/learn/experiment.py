@@ -162,7 +162,7 @@ def experiment(
 
     @functools.cache
     def job() -> Job:
-        return reader.load(str(RESULTS / "data/labels.yaml"))
+        return reader.load_job(str(RESULTS / "data/labels.yaml"))
 
     def sequences(grid: Grid) -> list[Clip]:
         if grid.size not in packed:

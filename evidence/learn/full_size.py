@@ -62,7 +62,7 @@ def full_size(
         raise UserError(f"grid size {size}: labels are made on {FINE}² at least")
     set_threads(1)
     say = Console(stderr=True).print
-    job = reader.load(str(RESULTS / "data/labels.yaml"))
+    job = reader.load_job(str(RESULTS / "data/labels.yaml"))
     job = job.model_copy(update={"sequences": sequences, "frames": frames})
     began = time.perf_counter()
     clips = _labels(job, Grid(size), cache, workers)

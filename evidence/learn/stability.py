@@ -58,7 +58,7 @@ def stability(
     set_threads(1)
     say = Console(stderr=True).print
     out.mkdir(parents=True, exist_ok=True)
-    job, grid = reader.load(str(RESULTS / "data/labels.yaml")), Grid(small().size)
+    job, grid = reader.load_job(str(RESULTS / "data/labels.yaml")), Grid(small().size)
     clips = labels(job, grid, cache)
     study = {run.name: run for run in ideal_runs()}
     trained = {n: model_folder(study[f"{n}-fold0-seed0"], clips, cache) for n in ("mse", "ghostless")}

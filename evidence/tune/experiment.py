@@ -60,17 +60,17 @@ def experiment(
     scenes = list(only or _SCENES)
     if unknown := [name for name in scenes if name not in _SCENES]:
         raise UserError(f"--only {unknown[0]}: no such scene; there are {', '.join(_SCENES)}")
-    jobs = {name: reader.load(str(out / f"{name}.yaml")) for name in scenes}
+    jobs = {name: reader.load_job(str(out / f"{name}.yaml")) for name in scenes}
     for name, job in jobs.items():
         source, say = out / f"{name}.yaml", _said(name)
         # One budget after the other finds what was measured for the one before.
         journals = out / f"{name}.part", out / f"{name}.fresh.part"
         for one in asked:
-            found = search.run(job, one, journals[0], probes, checks, say)
-            fresh_ones = search.again(found, journals[1], probes + checks, fresh, say)
+            found = search.tune_job(job, one, journals[0], probes, checks, say)
+            fresh_ones = search.measure_again(found, journals[1], probes + checks, fresh, say)
             stem = f"{name}-{100 * one.share:g}"
             (out / f"{stem}.tuned.yaml").unlink(missing_ok=True)
-            tuned_job.write(found, str(source), (), out / f"{stem}.tuned.yaml")
+            tuned_job.write_tuned(found, str(source), (), out / f"{stem}.tuned.yaml")
             row = tuned_job.as_dict(found) | {
                 "scene": name,
                 "frames": job.frames,

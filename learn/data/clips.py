@@ -20,7 +20,7 @@ from synth.errors import UserError
 Input = Literal["ideal", "recovered", "noisy", "mixed"]
 INPUTS = ("ideal", "recovered", "noisy", "mixed")
 Target = Literal["density", "intensity"]
-FIELDS = {"ideal": "flow", "recovered": "flow_tvl1", "noisy": "flow_noisy"}
+FIELDS = {"ideal": "flow", "recovered": "flow_recovered", "noisy": "flow_noisy"}
 """Field of a store that holds each displacement. `noisy` is the published regime: true flow with its
 noise."""
 _CURE = {

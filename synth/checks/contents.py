@@ -20,7 +20,7 @@ CHECKS = {
 }
 
 
-def check(
+def check_contents(
     sequence: Sequence, frames: list[int], fast: bool, watch: Stopwatch
 ) -> Iterator[tuple[str, Measure]]:
     """Measures by the name of their check.
@@ -35,8 +35,8 @@ def check(
         UserError: a chunk cannot be read.
     """
     for name in sequence.fields:
-        field, column = FIELDS[name], sequence[name]
-        hasher = None if fast else store.field_hasher(field, column.stored, column.shape)
+        field, column, stored = FIELDS[name], sequence[name], sequence.stored_name(name) or name
+        hasher = None if fast else store.field_hasher(stored, column.stored, column.shape)
         low, high, finite = np.inf, -np.inf, True
         every: Any = (frames if fast else range(column.shape[0])) if field.framed else [...]
         for part in every:
@@ -51,7 +51,7 @@ def check(
                 with watch.stage("range"):
                     low, high = min(low, float(values.min())), max(high, float(values.max()))
         if hasher is not None:
-            good = hasher.hexdigest() == sequence.attrs["field_hashes"][name]
+            good = hasher.hexdigest() == sequence.attrs["field_hashes"][stored]
             yield "checksum", truth(good, f"{name}: values are not those that were written")
         yield "finite", truth(finite, f"{name}: holds values that are no numbers")
         if finite and field.low is not None:

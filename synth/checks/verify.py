@@ -71,7 +71,7 @@ class Report:
         return {**asdict(self), "good": self.good}
 
 
-def run(root: Path, *, fast: bool = False) -> Report:
+def verify_dataset(root: Path, *, fast: bool = False) -> Report:
     """Checks every sequence and the dataset around them.
 
     Fast: some frames of some sequences, and no checksums.
@@ -95,7 +95,7 @@ def run(root: Path, *, fast: bool = False) -> Report:
     return Report(str(root), len(chosen), fast, list(checks.values()))
 
 
-def sequence(path: Path, job: str) -> list[Check]:
+def verify_sequence(path: Path, job: str) -> list[Check]:
     """Checks one store, which belongs to the job of that identity."""
     checks = _checks()
     _sequence(path, job, checks, fast=False)
@@ -125,7 +125,7 @@ def _sequence(path: Path, name: str, checks: dict[str, Check], fast: bool) -> No
     checks["dataset"].add(truth(own, "belongs to another job"), path.name)
     broken, watch = "", Stopwatch()
     try:
-        for key, measure in contents.check(sequence, frames, fast, watch):
+        for key, measure in contents.check_contents(sequence, frames, fast, watch):
             checks[key].add(measure, path.name)
     except UserError as error:
         broken = _without(path, str(error))
@@ -160,7 +160,7 @@ def _dataset(
     job = folder.job()
     makers = {provenance.word(one) for one in described.get("generators", [])}
     try:
-        same = identity.of(job) == described["identity"] or provenance.fingerprint() not in makers
+        same = identity.identify_job(job) == described["identity"] or provenance.fingerprint() not in makers
     except UserError:
         same = True  # the mesh or the photograph need not travel with the dataset
     yield "dataset", truth(same, "the job is not the one that was rendered"), "dataset.json"
@@ -174,7 +174,7 @@ def _dataset(
     strangers = [key for key in sealed if key >= job.sequences]
     yield "dataset", truth(not strangers, f"sequences that the job does not have: {strangers[:3]}"), "dataset"
     try:
-        rows = {row["index"]: row for row in index.read(folder.root).to_pylist()}
+        rows = {row["index"]: row for row in index.read_index(folder.root).to_pylist()}
     except UserError as error:
         yield "dataset", truth(False, str(error)), index.NAME
         return
@@ -191,7 +191,7 @@ def _dataset(
         yield "dataset", truth(known, "made by a version that dataset.json does not name"), found.path.name
     surplus = sorted(key for key, row in rows.items() if row["status"] == "done" and key not in sealed)
     yield "dataset", truth(not surplus, f"rows without a sequence: {surplus[:3]}"), index.NAME
-    leaking = split.leaks(list(rows.values()), split.rule(folder.root))
+    leaking = split.leaks(list(rows.values()), split.read_rule(folder.root))
     yield "splits", truth(not leaking, "; ".join(leaking[:3]) or "none"), index.NAME
 
 

@@ -2,7 +2,7 @@
 
 Only for fields on this machine's disk in the very layout that the writer gives them (a file of frames, each
 packed by Blosc and followed by its CRC-32C, and an index at the end of the file: zarr-specs.readthedocs.io,
-sharding codec 1.0). For anything else `of` gives None, and Zarr does the reading.
+sharding codec 1.0). For anything else `open_frames` gives None, and Zarr does the reading.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ class Frames:
         )
 
 
-def of(array: zarr.Array[Any], folder: Path | None) -> Frames | None:
+def open_frames(array: zarr.Array[Any], folder: Path | None) -> Frames | None:
     """The fast way to the frames of `array`, stored in `folder`; None where there is none."""
     codecs = [type(codec).__name__ for codec in (*array.filters, array.serializer, *array.compressors)]  # type: ignore[list-item]
     if folder is None or array.shards is None or array.chunks != (1, *array.shape[1:]) or codecs != _CODECS:

@@ -93,11 +93,13 @@ the ratio measured on rendered sequences. `synth fields --size 1280x960` gives t
 motion, 0.008 px below 32. The largest error of a sequence is measured as it is written, in its attribute
 `summary.rounding_px`. Readers give float32 either way.
 
+Older stores call `flow_recovered` by its former name, `flow_tvl1`; both names are read.
+
 """
 
 
 def _measured(field: Field, sequence: Sequence) -> float:
-    folder: Path = sequence.path / field.name
+    folder: Path = sequence.path / (sequence.stored_name(field.name) or field.name)
     if not folder.is_dir():
         return 0.0
     return size_forecast.size(folder) / (sequence.frames if TIME in field.dims else 1)

@@ -135,7 +135,7 @@ def claim(root: Path, job: Job, *, mix_versions: bool = False) -> Iterator[Folde
             permission.
     """
     folder, created, fresh = Folder(root), not root.exists(), not (root / _NAME).exists()
-    name = identity.of(job)
+    name = identity.identify_job(job)
     try:
         _refuse_foreign(folder, job, name)
         makers = _makers(folder, mix_versions)
@@ -148,7 +148,7 @@ def claim(root: Path, job: Job, *, mix_versions: bool = False) -> Iterator[Folde
             described = {"identity": name, "generators": makers, "job": job.model_dump(mode="json")}
             write_whole(root / _NAME, json.dumps(described, indent=1) + "\n")
             write_whole(
-                root / "job.yaml", "# The job of this dataset, every value said.\n" + writer.dump(job)
+                root / "job.yaml", "# The job of this dataset, every value said.\n" + writer.dump_job(job)
             )
             folder.pass_turn()
             folder.sweep_all()

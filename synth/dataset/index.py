@@ -59,7 +59,7 @@ SCHEMA = pa.schema(
 )
 
 
-def read(root: Path) -> pa.Table:
+def read_index(root: Path) -> pa.Table:
     """The index as it was last written. UserError when it is missing or damaged."""
     path = root / NAME
     try:
@@ -70,11 +70,11 @@ def read(root: Path) -> pa.Table:
         raise UserError(f"{path}: is damaged ({str(error).splitlines()[0]})") from error
 
 
-def write(folder: Folder) -> list[dict[str, Any]]:
+def write_index(folder: Folder) -> list[dict[str, Any]]:
     """Brings the index up to date with the folder; rows that it has already are kept. Returns all rows."""
     known: dict[int, dict[str, Any]] = {}
     if (folder.root / NAME).exists():
-        table = read(folder.root)
+        table = read_index(folder.root)
         rows_before = table.to_pylist() if table.schema.equals(SCHEMA) else []
         known = {row["index"]: row for row in rows_before if row["status"] == "done"}
     rows = {key: known.get(key) or row_of(_open(folder, key)) for key in folder.sealed()}
@@ -83,16 +83,16 @@ def write(folder: Folder) -> list[dict[str, Any]]:
             rows[key] = {"index": key, "status": "failed", "reason": failure["reason"]}
     ordered = [rows[key] for key in sorted(rows)]
     try:
-        sides = split.assign(ordered, split.rule(folder.root))
+        sides = split.assign_sides(ordered, split.read_rule(folder.root))
     except UserError:  # too few groups to have some on every side
         sides = [None] * len(ordered)
     for row, side in zip(ordered, sides, strict=True):
         row["split"] = side
-    save(folder.root, ordered)
+    save_rows(folder.root, ordered)
     return ordered
 
 
-def save(root: Path, rows: Iterable[Mapping[str, Any]]) -> None:
+def save_rows(root: Path, rows: Iterable[Mapping[str, Any]]) -> None:
     """Writes the rows; columns that a row lacks are null."""
     table = pa.Table.from_pylist([dict(row) for row in rows], schema=SCHEMA)
     buffer = io.BytesIO()

@@ -29,7 +29,7 @@ def store(root: Path, index: int) -> Path:
     return root / f"{index:06d}.zarr"
 
 
-def of(where: Path | str) -> Place:
+def find_place(where: Path | str) -> Place:
     """The place of a path or an address such as `s3://bucket/out/000000.zarr` or `zip://000000.zarr::out.zip`.
 
     Raises:

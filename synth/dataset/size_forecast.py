@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -34,7 +33,9 @@ class Forecast:
     """Finished sequences that the forecast rests on; 0: on the field table."""
 
 
-def of(job: Job, root: Path, todo: int, done: Sequence[int], cpu_s: float | None = None) -> Forecast:
+def forecast_rest(
+    job: Job, root: Path, todo: int, done: Sequence[int], cpu_s: float | None = None
+) -> Forecast:
     """Forecast of what is still to do.
 
     Args:
@@ -68,11 +69,7 @@ def estimate(job: Job) -> float:
 
 def size(path: Path) -> int:
     """Bytes of all files under `path`."""
-    total = 0
-    with os.scandir(path) as entries:
-        for entry in entries:
-            total += size(Path(entry.path)) if entry.is_dir() else entry.stat().st_size
-    return total
+    return sum(file.stat().st_size for file in path.rglob("*") if file.is_file())
 
 
 def refuse_if_too_large(forecast: Forecast, root: Path) -> None:

@@ -31,7 +31,7 @@ class Rule:
     """Whether one brain may be on several sides: scores then say nothing of other brains."""
 
 
-def rule(root: Path) -> Rule:
+def read_rule(root: Path) -> Rule:
     """The rule of the dataset in `root`; the default if none was given."""
     try:
         found = json.loads((root / _NAME).read_text("utf-8"))
@@ -47,12 +47,12 @@ def rule(root: Path) -> Rule:
         raise UserError(f"{root / _NAME}: is damaged ({error})") from error
 
 
-def keep(root: Path, chosen: Rule) -> None:
+def keep_rule(root: Path, chosen: Rule) -> None:
     """Makes `chosen` the rule of the dataset in `root`."""
     write_whole(root / _NAME, json.dumps(asdict(chosen), indent=1) + "\n")
 
 
-def parse(by: str, shares: str, held_out: Sequence[str], share_anatomy: bool = False) -> Rule:
+def parse_rule(by: str, shares: str, held_out: Sequence[str], share_anatomy: bool = False) -> Rule:
     """A rule from the words of a command line. UserError for what is none."""
     if by not in get_args(By):
         raise UserError(f"by {by}: is not one of {', '.join(get_args(By))}")
@@ -69,7 +69,7 @@ def count(rows: Sequence[Mapping[str, Any]]) -> dict[str, int]:
     return {side: sides.count(side) for side in SIDES if side in sides}
 
 
-def assign(rows: Sequence[Mapping[str, Any]], chosen: Rule) -> list[str | None]:
+def assign_sides(rows: Sequence[Mapping[str, Any]], chosen: Rule) -> list[str | None]:
     """The side of every row of the index; None for a sequence that failed.
 
     A group's side depends on the group's name and on which groups there are, not on the order of rows.

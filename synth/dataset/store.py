@@ -14,10 +14,9 @@ import zarr
 from numpy.typing import NDArray
 from zarr.codecs import BloscCodec, Crc32cCodec
 
-from synth.dataset import fast_read as shard
-from synth.dataset import location, provenance
+from synth.dataset import fast_read, location, provenance
 from synth.errors import NotFinite, UserError
-from synth.fields import FIELDS, FORMAT_VERSION, Field
+from synth.fields import FIELDS, FORMAT_VERSION, FORMER_NAMES, Field, find_field
 from synth.job import identity
 from synth.job.schema import Job
 from synth.system import packages
@@ -70,7 +69,7 @@ class Writer:
             "fps": job.fps,
             "seed": job.seed,
             "flow_backend": job.flow.backend,
-            "job": identity.of(job),
+            "job": identity.identify_job(job),
         }
 
     def wants(self, name: str) -> bool:
@@ -162,7 +161,7 @@ class _Column:
     def __init__(self, group: zarr.Group, field: Field, shape: tuple[int, ...], half: bool) -> None:
         self._field, self.shape, self.filled = field, shape, 0
         self._dtype = dtype = np.dtype("float16" if half else field.dtype)
-        self._hash = field_hasher(field, dtype, shape)
+        self._hash = field_hasher(field.name, dtype, shape)
         self._held: list[NDArray[Any]] = []
         self.largest = self.rounding = 0.0
         chunk, shard = shape, None
@@ -240,7 +239,7 @@ class Column:
         self, array: zarr.Array[Any], dtype: np.dtype[Any], where: str, folder: Path | None = None
     ) -> None:
         self._array, self._where = array, where
-        self._frames = shard.of(array, folder)
+        self._frames = fast_read.open_frames(array, folder)
         self.shape: tuple[int, ...] = array.shape
         self.stored: np.dtype[Any] = array.dtype
         """Type on disk; values are given in the table's."""
@@ -294,17 +293,24 @@ class Sequence:
     @property
     def fields(self) -> list[str]:
         """Names of the fields it holds, in the table's order."""
-        return [name for name in FIELDS if name in self.attrs["field_hashes"]]
+        return [name for name in FIELDS if name in self]
+
+    def stored_name(self, name: str) -> str | None:
+        """What the store calls a field: an older one may use a former name. None if it lacks the field."""
+        now = FORMER_NAMES.get(name, name)
+        names = (now, *(former for former, present in FORMER_NAMES.items() if present == now))
+        return next((one for one in names if one in self.attrs["field_hashes"]), None)
 
     def __contains__(self, name: str) -> bool:
-        return name in self.attrs["field_hashes"]
+        return self.stored_name(name) is not None
 
     def __getitem__(self, name: str) -> Column:
         field, where = _field(name), f"{self._place.name}: {name}"
-        if name not in self:
+        stored = self.stored_name(name)
+        if stored is None:
             raise UserError(f"{where}: the sequence has no such field")
         try:
-            array = self._group[name]
+            array = self._group[stored]
         except Exception as error:  # as in Column
             raise UserError(f"{where}: cannot be opened, the store is damaged ({error})") from error
         expected, dtype = field.shape(self.frames, self.size), np.dtype(field.dtype)
@@ -316,9 +322,9 @@ class Sequence:
         rest = "/0" * (len(expected) - 1)
         for k in range(files):
             # Zarr reads a missing or empty file as zeros.
-            if not self._place.size(f"{name}/c/{k}{rest}"):
+            if not self._place.size(f"{stored}/c/{k}{rest}"):
                 raise UserError(f"{where}: file c/{k}{rest} is missing or empty, the store is damaged")
-        return Column(array, dtype, where, self._place.folder and self._place.folder / name)
+        return Column(array, dtype, where, self._place.folder and self._place.folder / stored)
 
 
 class Dataset:
@@ -351,7 +357,7 @@ def open_sequence(path: Path | str) -> Sequence:
     """Opens a sealed sequence, by path or address. UserError if missing, unfinished, foreign or truncated."""
     if str(path).partition("::")[0].endswith(".part"):
         raise UserError(f"{path}: is an unfinished sequence")
-    at = location.of(path)
+    at = location.find_place(path)
     path = Path(str(path).partition("::")[0])
     try:
         group = zarr.open_group(at.store, mode="r", zarr_format=3, use_consolidated=False)
@@ -369,9 +375,9 @@ def open_sequence(path: Path | str) -> Sequence:
     return Sequence(path, group, attrs, at)
 
 
-def field_hasher(field: Field, stored: np.dtype[Any], shape: tuple[int, ...]) -> hashlib.blake2b:
-    """A hasher that has seen the field's name, type and shape; then give it the stored values in C order."""
-    described = identity.canonical([field.name, str(stored), list(shape)])
+def field_hasher(name: str, stored: np.dtype[Any], shape: tuple[int, ...]) -> hashlib.blake2b:
+    """A hasher that has seen the name in the store, type and shape; then give it the values in C order."""
+    described = identity.canonical([name, str(stored), list(shape)])
     return hashlib.blake2b(described, digest_size=16)
 
 
@@ -388,6 +394,7 @@ def seal_hash(attrs: Mapping[str, Any]) -> str:
 
 
 def _field(name: str) -> Field:
-    if name not in FIELDS:
+    field = find_field(name)
+    if field is None:
         raise ValueError(f"{name}: is not in the field table")
-    return FIELDS[name]
+    return field

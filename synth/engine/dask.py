@@ -35,7 +35,7 @@ _kept = threading.local()
 
 
 @contextmanager
-def slots_of(engine: str, setup: Setup) -> Iterator[Slots]:
+def open_slots(engine: str, setup: Setup) -> Iterator[Slots]:
     """The slots of `dask://host:port`, or of a SLURM cluster described in a YAML file.
 
     Raises:

@@ -40,30 +40,36 @@ class Account:
     """Stage, steps done and steps in all of the sequences being computed."""
 
 
-class Told(Protocol):
-    """Who is told an account every two seconds."""
+class Watcher(Protocol):
+    """Told what happens in a run, from the main thread only."""
 
+    def begin(self, total: int, already: int, failed: int) -> None: ...
+    def stage(self, index: int, stage: str, done: int, of: int) -> None: ...
+    def end(self, attempt: Attempt, again: bool) -> None: ...
     def account(self, account: Account) -> None: ...
 
 
 class Journal:
-    """Told what happens in a run, as a watcher; gives an account every two seconds at most."""
+    """Told what happens in a run; passes it on to a watcher, with an account every two seconds at most.
 
-    def __init__(self, folder: Folder, workers: int, frames: int, told: Told) -> None:
-        self._folder, self._workers, self._frames, self._told = folder, workers, frames, told
+    The account comes first: what is said of the run is then said with what has just ended.
+    """
+
+    def __init__(self, folder: Folder, workers: int, frames: int, watcher: Watcher) -> None:
+        self._folder, self._workers, self._frames, self._watcher = folder, workers, frames, watcher
         self._path = folder.state / "progress.json"
         self._started = self._written = time.monotonic()
         self._pace = Pace(workers)
-        self._total = self._done = self._before = 0
-        self._stored = 0
+        self._left = self._done = self._stored = 0
         self._in_flight: dict[int, list[Any]] = {}
         self._since: dict[int, float] = {}
         self._spent: dict[str, float] = {}
         self._steps: dict[str, int] = {}
 
     def begin(self, total: int, already: int, failed: int) -> None:
-        self._total, self._before = total, already + failed
+        self._left = total - already - failed
         self._tell()
+        self._watcher.begin(total, already, failed)
 
     def stage(self, index: int, stage: str, done: int, of: int) -> None:
         now = time.monotonic()
@@ -74,20 +80,22 @@ class Journal:
         self._in_flight[index] = [stage, done, of]
         if now - self._written > _EVERY_S:
             self._tell()
+        self._watcher.stage(index, stage, done, of)
 
     def end(self, attempt: Attempt, again: bool) -> None:
+        now = time.monotonic()
         if attempt.kind == "done":
-            self._leave(attempt.index, time.monotonic())
+            self._leave(attempt.index, now)
             self._stored += size_forecast.size(location.store(self._folder.root, attempt.index))
         self._in_flight.pop(attempt.index, None)
         self._since.pop(attempt.index, None)
-        now = time.monotonic()
         if not again and attempt.kind != "stopped":
             self._done += attempt.kind == "done"
+            self._left -= 1
             self._pace.end(now - self._started)
-        notable = self._pace.ended in (1, self._total - self._before)
-        if notable or now - self._written > _EVERY_S:
+        if self._pace.ended == 1 or not self._left or now - self._written > _EVERY_S:
             self._tell()
+        self._watcher.end(attempt, again)
 
     def _leave(self, index: int, now: float) -> None:
         """Books the time of the stage that a sequence has come to the end of."""
@@ -99,8 +107,7 @@ class Journal:
     def _tell(self) -> None:
         self._written = time.monotonic()
         spent = self._written - self._started
-        left = self._total - self._before - self._pace.ended
-        left_s = self._pace.left_s(left)
+        left_s = self._pace.left_s(self._left)
         made = Account(
             workers=self._workers,
             seconds=round(spent, 1),
@@ -109,9 +116,9 @@ class Journal:
             cold=self._pace.cold,
             step_s={name: round(self._spent[name] / self._steps[name], 3) for name in self._spent},
             frames_per_s=round(self._done * self._frames / spent, 3) if self._done else None,
-            disk_left=self._stored / self._done * left if self._done else None,
+            disk_left=self._stored / self._done * self._left if self._done else None,
             disk_free=shutil.disk_usage(self._folder.root).free,
             in_flight={str(key): value for key, value in sorted(self._in_flight.items())},
         )
         write_whole(self._path, json.dumps(asdict(made)), durable=False)
-        self._told.account(made)
+        self._watcher.account(made)

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Iterable
-from types import TracebackType
 
 from rich.console import Console, RenderableType
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TaskID, TextColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 from rich.text import Text
 
 from synth.dataset import size_forecast
@@ -19,69 +17,41 @@ from synth.engine.worker_process import Attempt
 _QUIET_S = 10.0
 
 
-class _Eta(ProgressColumn):
-    """Time spent, and for the whole run the time left."""
+class Bars(Progress):
+    """A bar for the dataset and one for every sequence in work; plain lines where there is no terminal.
 
-    def render(self, task: Task) -> Text:
-        spent = clock(task.elapsed or 0.0)
-        left = task.fields.get("left")
-        return Text(f"{spent}, {left}" if left else spent, style="cyan")
+    What is left is the run's own estimate: rich knows nothing of workers whose first sequences also compile.
+    """
 
-
-class _Progress(Progress):
-    """Bars with a line under them."""
-
-    below = ""
+    def __init__(self) -> None:
+        self._rates = self._left = ""  # first: the bars are drawn as soon as they are made
+        console = Console(stderr=True)
+        columns = [TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()]
+        left = TextColumn("{task.fields[left]}", style="cyan")
+        super().__init__(*columns, left, console=console, disable=not console.is_terminal)
+        self._bars: dict[int, TaskID] = {}
+        self._dataset = self.add_task("sequences", total=None, left="")
+        self._said = time.monotonic()
 
     def get_renderables(self) -> Iterable[RenderableType]:
         yield from super().get_renderables()
-        if self.below:
-            yield Text(self.below, style="dim")
-
-
-class Bars:
-    """A bar for the dataset and one for every sequence in work; plain lines where there is no terminal."""
-
-    def __init__(self) -> None:
-        console = Console(stderr=True)
-        self._live = console.is_terminal
-        self._bars = _Progress(
-            TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), _Eta(), console=console
-        )
-        self._tasks: dict[int, TaskID] = {}
-        self._whole = self._bars.add_task("sequences", total=None, start=True)
-        self._started = self._said = time.monotonic()
-        self._total = self._already = self._finished = 0
-        self._rates = self._left = ""
-
-    def __enter__(self) -> Bars:
-        if self._live:
-            self._bars.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if self._live:
-            self._bars.stop()
+        if self._rates:
+            yield Text(self._rates, style="dim")
 
     def begin(self, total: int, already: int, failed: int) -> None:
-        self._total, self._already = total, already + failed
-        self._bars.update(self._whole, total=total, completed=self._already)
+        self.reset(self._dataset, total=total, completed=already + failed)
         if already or failed:
-            self._say(f"{already} of {total} sequences are there already" + _failed(failed))
+            hint = f", {failed} failed (`synth retry` takes them up again)" if failed else ""
+            self._say(f"{already} of {total} sequences are there already{hint}")
 
     def stage(self, index: int, stage: str, done: int, of: int) -> None:
-        if index not in self._tasks:
-            self._tasks[index] = self._bars.add_task("", total=of)
-        self._bars.update(
-            self._tasks[index], description=f"  {index:06d} {stage}", completed=done, total=max(of, 1)
-        )
+        if index not in self._bars:
+            self._bars[index] = self.add_task("", left="")
+        self.update(self._bars[index], description=f"  {index:06d} {stage}", completed=done, total=max(of, 1))
 
     def end(self, attempt: Attempt, again: bool) -> None:
-        task = self._tasks.pop(attempt.index, None)
-        if task is not None:
-            self._bars.remove_task(task)
+        if attempt.index in self._bars:
+            self.remove_task(self._bars.pop(attempt.index))
         if attempt.kind == "stopped":
             return
         if attempt.kind != "done":
@@ -89,27 +59,21 @@ class Bars:
             self._say(f"sequence {attempt.index:06d} {what}: {attempt.reason}")
         if again:
             return
-        self._finished += 1
-        spent = time.monotonic() - self._started
-        done = self._already + self._finished
-        self._bars.update(self._whole, completed=done)
-        quiet = time.monotonic() - self._said < _QUIET_S and done < self._total
-        if not self._live and not quiet:
+        self.advance(self._dataset)
+        whole = next(task for task in self.tasks if task.id == self._dataset)
+        quiet = time.monotonic() - self._said < _QUIET_S and not whole.finished
+        if self.disable and not quiet:
             self._said = time.monotonic()
-            said = ", ".join(filter(None, (f"{clock(spent)} spent", self._left)))
+            said = ", ".join(filter(None, (f"{clock(whole.elapsed or 0.0)} spent", self._left)))
             rest = f"; {self._rates}" if self._rates else ""
-            self._say(f"{done} of {self._total} sequences, {said}{rest}")
+            self._say(f"{whole.completed:.0f} of {whole.total:.0f} sequences, {said}{rest}")
 
     def account(self, account: Account) -> None:
         self._rates, self._left = rates(account), remaining(account)
-        self._bars.below = self._rates
-        self._bars.update(self._whole, left=self._left)
+        self.update(self._dataset, left=self._left)
 
     def _say(self, text: str) -> None:
-        if self._live:
-            self._bars.console.print(text, highlight=False, markup=False)
-        else:
-            print(text, file=sys.stderr, flush=True)
+        self.console.print(text, highlight=False, markup=False, soft_wrap=True)
 
 
 def remaining(account: Account) -> str:
@@ -145,7 +109,3 @@ def clock(seconds: float) -> str:
     if whole < 86400:
         return f"{whole // 3600}:{whole % 3600 // 60:02d} h"
     return f"{seconds / 86400:.1f} days"
-
-
-def _failed(count: int) -> str:
-    return f", {count} failed (`synth retry` takes them up again)" if count else ""

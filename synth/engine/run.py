@@ -10,12 +10,11 @@ from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Protocol
 
 from synth.dataset import index, size_forecast
 from synth.dataset.folder import Folder, claim
 from synth.engine import slots
-from synth.engine.journal import Account, Journal
+from synth.engine.journal import Journal, Watcher
 from synth.engine.slots import Slots
 from synth.engine.worker_process import Attempt, Setup
 from synth.errors import UserError
@@ -65,21 +64,7 @@ class Summary:
     """Hash of the content hashes of all finished sequences in order."""
 
 
-class Listener(Protocol):
-    """Told what happens, from the main thread only."""
-
-    def begin(self, total: int, already: int, failed: int) -> None: ...
-    def stage(self, index: int, stage: str, done: int, of: int) -> None: ...
-    def end(self, attempt: Attempt, again: bool) -> None: ...
-
-
-class Watcher(Listener, Protocol):
-    """Told besides how the run as a whole goes."""
-
-    def account(self, account: Account) -> None: ...
-
-
-def run(job: Job, root: Path, options: Options, watcher: Watcher) -> Summary:
+def run_job(job: Job, root: Path, options: Options, watcher: Watcher) -> Summary:
     """Computes the sequences of `job` that `root` lacks.
 
     Raises:
@@ -92,11 +77,11 @@ def run(job: Job, root: Path, options: Options, watcher: Watcher) -> Summary:
     with claim(root, job, mix_versions=options.mix_versions) as folder:
         finished, failures = set(folder.sealed()), folder.failures()
         todo = [k for k in range(job.sequences) if k not in finished and k not in failures]
-        size_forecast.refuse_if_too_large(size_forecast.of(job, root, len(todo), sorted(finished)), root)
-        # The journal first: what is said of the run is then said with what has just ended.
-        watchers = (Journal(folder, workers, job.frames, watcher), watcher)
-        for each in watchers:
-            each.begin(job.sequences, len(finished), len(failures))
+        size_forecast.refuse_if_too_large(
+            size_forecast.forecast_rest(job, root, len(todo), sorted(finished)), root
+        )
+        journal = Journal(folder, workers, job.frames, watcher)
+        journal.begin(job.sequences, len(finished), len(failures))
         setup = Setup(
             job=job.model_dump(mode="json"),
             folder=root.resolve(),
@@ -112,15 +97,15 @@ def run(job: Job, root: Path, options: Options, watcher: Watcher) -> Summary:
         )
         try:
             with _slots(options.engine, setup, workers, gpus) as made:
-                done = _Pool(folder, made, todo).work(watchers)
+                done = _Pool(folder, made, todo).work(journal)
         except BaseException:
-            index.write(folder)
+            index.write_index(folder)
             raise
-        rows = index.write(folder)
+        rows = index.write_index(folder)
         if done or not preview_video.path(root).exists():
-            preview_video.write(root)
-            card.write(folder)
-            croissant.write(folder)
+            preview_video.write_preview(root)
+            card.write_card(folder)
+            croissant.write_croissant(folder)
         return Summary(
             total=job.sequences,
             already=len(finished),
@@ -140,13 +125,13 @@ class _Pool:
         self._busy = 0
         self._change = threading.Condition()
         self._stop = threading.Event()
-        self._events: queue.SimpleQueue[Callable[[Listener], None] | BaseException | None] = (
+        self._events: queue.SimpleQueue[Callable[[Journal], None] | BaseException | None] = (
             queue.SimpleQueue()
         )
         self._done = 0
         self._refused: list[Attempt] = []
 
-    def work(self, watchers: tuple[Listener, ...]) -> int:
+    def work(self, journal: Journal) -> int:
         """Runs until nothing is left to do; returns how many were finished."""
         threads = [threading.Thread(target=self._thread, daemon=True) for _ in range(self._workers)]
         for thread in threads:
@@ -160,8 +145,7 @@ class _Pool:
                 elif isinstance(event, BaseException):
                     raise event
                 else:
-                    for watcher in watchers:
-                        event(watcher)
+                    event(journal)
         finally:
             self._stop.set()
             with self._change:
@@ -244,4 +228,4 @@ def _slots(
         return slots.local(setup, workers, gpus)
     from synth.engine import dask
 
-    return dask.slots_of(engine, setup)
+    return dask.open_slots(engine, setup)

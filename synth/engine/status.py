@@ -47,7 +47,7 @@ class Status:
         return asdict(self)
 
 
-def of(root: Path) -> Status:
+def read_status(root: Path) -> Status:
     """The status of the dataset in `root`. UserError if there is none."""
     folder = Folder(root)
     job, done = folder.job(), folder.sealed()
@@ -64,7 +64,7 @@ def of(root: Path) -> Status:
         left_s=journal.left_s if journal else None,
         left=remaining(journal) if journal else "",
         rates=rates(journal) if journal else "",
-        ahead=size_forecast.of(job, root, todo, done, sum(stages.values()) if stages else None),
+        ahead=size_forecast.forecast_rest(job, root, todo, done, sum(stages.values()) if stages else None),
         disk_free=shutil.disk_usage(root).free,
         stages_cpu_s=stages,
     )
@@ -90,10 +90,8 @@ def lines(status: Status) -> list[str]:
         each = ", ".join(f"{name} {seconds:.1f}" for name, seconds in status.stages_cpu_s.items())
         found.append(f"CPU-seconds a sequence: {each}")
     if status.ahead.sequences:
-        ahead, basis = (
-            status.ahead,
-            f"from {status.ahead.pilot} finished" if status.ahead.pilot else "estimated",
-        )
+        ahead = status.ahead
+        basis = f"from {ahead.pilot} finished" if ahead.pilot else "estimated"
         time = f", {clock(ahead.cpu_s)} of one core" if ahead.cpu_s is not None else ""
         found.append(
             f"still to come: {ahead.sequences} sequences, "

@@ -43,7 +43,7 @@ class Brain:
         )
 
 
-def load(path: Path, craniotomy: Craniotomy) -> Brain:
+def load_brain(path: Path, craniotomy: Craniotomy) -> Brain:
     """Reads a surface (OBJ, STL, PLY, OFF or legacy VTK), merges what belongs together, and places it.
 
     Args:
@@ -99,7 +99,7 @@ def _read(path: Path) -> tuple[Floats, NDArray[np.int64]]:
         raise UserError(f"anatomy.mesh: there is no file {path}")
     try:
         if path.suffix.lower() == ".vtk":
-            return _merged(*vtk.read(path))
+            return _merged(*vtk.read_vtk(path))
         mesh = trimesh.load(path, force="mesh", process=False)
     except (ValueError, IndexError, KeyError, NotImplementedError, UnicodeDecodeError) as error:
         raise UserError(f"anatomy.mesh: {path.name} is no surface that can be read ({error})") from error

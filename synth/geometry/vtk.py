@@ -18,7 +18,7 @@ _TYPES = {"float": ">f4", "double": ">f8", "int": ">i4", "long": ">i8", "vtktype
 _TRIANGLE, _POLYGON, _QUAD = 5, 7, 9
 
 
-def read(path: Path) -> tuple[Floats, Ints]:
+def read_vtk(path: Path) -> tuple[Floats, Ints]:
     """Vertices (V, 3) and triangles (F, 3) of a file; polygons are cut into fans.
 
     Raises:

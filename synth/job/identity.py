@@ -16,7 +16,7 @@ def canonical(value: Any) -> bytes:
     return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False).encode()
 
 
-def of(job: Job) -> str:
+def identify_job(job: Job) -> str:
     """Hash of everything that a sequence of `job` depends on besides its index.
 
     Files count by content and not by path, and what the card says does not count. Nor does the number of
@@ -29,7 +29,7 @@ def of(job: Job) -> str:
     return hashlib.blake2b(canonical(described), digest_size=16).hexdigest()
 
 
-def anatomy(job: Job, seed: int) -> str:
+def identify_anatomy(job: Job, seed: int) -> str:
     """Which geometry a sequence shows, across datasets: a user's brain, or the seed of a procedural one.
 
     A brain is one anatomy wherever it is opened and whatever vessels are drawn on it.

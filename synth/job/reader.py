@@ -47,7 +47,7 @@ def names() -> list[str]:
     )
 
 
-def load(source: str, overrides: Sequence[str] = ()) -> Job:
+def load_job(source: str, overrides: Sequence[str] = ()) -> Job:
     """The job in `source`, with overrides applied.
 
     Args:
@@ -64,10 +64,10 @@ def load(source: str, overrides: Sequence[str] = ()) -> Job:
     else:
         text = (resources.files("synth.job") / "named" / f"{source}.yaml").read_text("utf-8")
         label, folder = f"{source} (a named job)", Path.cwd()
-    return parse(text, label, folder, overrides)
+    return parse_job(text, label, folder, overrides)
 
 
-def parse(text: str, label: str, folder: Path, overrides: Sequence[str] = ()) -> Job:
+def parse_job(text: str, label: str, folder: Path, overrides: Sequence[str] = ()) -> Job:
     """The job in `text`; `label` names it in messages and its relative paths start at `folder`."""
     written = _yaml(text, label)
     if not isinstance(written, CommentedMap):

@@ -43,7 +43,7 @@ def schema() -> dict[str, Any]:
     return described
 
 
-def dump(job: Job) -> str:
+def dump_job(job: Job) -> str:
     """The job as a plain YAML file: what a dataset keeps of it."""
     out = io.StringIO()
     writer = YAML(typ="safe")

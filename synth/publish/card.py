@@ -25,9 +25,9 @@ _CHARTS = {
 }
 
 
-def write(folder: Folder) -> Path:
+def write_card(folder: Folder) -> Path:
     """Writes README.md and the pictures it shows, from the index and the sequences. Returns its path."""
-    rows = index.read(folder.root).to_pylist()
+    rows = index.read_index(folder.root).to_pylist()
     job, done = folder.job(), [row for row in rows if row["status"] == "done"]
     pictures = folder.root / "card"
     pictures.mkdir(exist_ok=True)
@@ -68,7 +68,7 @@ def limits(folder: Folder) -> list[str]:
         found.append(
             "Several versions of the program made it: a sequence made again need not have the same bytes."
         )
-    if split.rule(folder.root).share_anatomy:
+    if split.read_rule(folder.root).share_anatomy:
         found.append("The split's sides share a brain: scores on it say nothing of other brains.")
     if job.store.flow == "float16":
         found.append(

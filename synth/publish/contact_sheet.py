@@ -34,7 +34,7 @@ class Sheet:
     """The whole dataset."""
 
 
-def make(job: Job, count: int) -> Sheet:
+def draw_sheet(job: Job, count: int) -> Sheet:
     """Draws `count` scenarios spread over the job, each in the moment before its load.
 
     Nothing is deformed: the sheet shows anatomy, appearance, light, view and instrument.

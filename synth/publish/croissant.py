@@ -49,7 +49,7 @@ _TYPES = {
 }
 
 
-def write(folder: Folder) -> Path:
+def write_croissant(folder: Folder) -> Path:
     """Writes `croissant.json` beside the index. Returns its path."""
     path = folder.root / NAME
     text = json.dumps(describe(folder), indent=1, ensure_ascii=False) + "\n"
@@ -59,7 +59,7 @@ def write(folder: Folder) -> Path:
 
 def describe(folder: Folder) -> dict[str, Any]:
     """The description, JSON-LD. Everything is taken from the dataset; prose is what its job's card says."""
-    job, rows = folder.job(), index.read(folder.root).to_pylist()
+    job, rows = folder.job(), index.read_index(folder.root).to_pylist()
     done = [row for row in rows if row["status"] == "done"]
     about = job.card
     return {

@@ -23,7 +23,7 @@ _D2FNET_LARGEST_X = 1400.0
 _D2FNET_NODES = 20_000
 
 
-def export(root: Path, target: Path, to: str) -> int:
+def export_dataset(root: Path, target: Path, to: str) -> int:
     """Writes the finished sequences of `root` into the new folder `target`; returns how many.
 
     Args:

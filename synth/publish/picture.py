@@ -132,7 +132,7 @@ def frame_flow_force(
     return side_by_side([rgb, moved, pushed], captions)
 
 
-def of_sequence(sequence: Sequence_, frames: Sequence[int]) -> Rgb:
+def draw_sequence(sequence: Sequence_, frames: Sequence[int]) -> Rgb:
     """Frame, flow and force map of some frames of a sequence, a row each, on common scales: (h, w, 3).
 
     Raises:

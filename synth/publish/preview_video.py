@@ -20,7 +20,7 @@ def path(root: Path) -> Path:
     return root / "preview.mp4"
 
 
-def write(root: Path) -> Path | None:
+def write_preview(root: Path) -> Path | None:
     """Makes the film from up to nine sequences spread over the dataset; None when nothing is finished."""
     if not any(root.glob("[0-9]*.zarr")):
         return None
@@ -39,10 +39,10 @@ def write(root: Path) -> Path | None:
         for t in range(frames):
             picture = video["rgb"][min(t, video.frames - 1)]
             film[t, top : top + tall, left : left + wide] = picture[::step, ::step]
-    return encode(path(root), film, float(videos[0].attrs["fps"]))
+    return encode_video(path(root), film, float(videos[0].attrs["fps"]))
 
 
-def encode(target: Path, film: NDArray[np.uint8], fps: float) -> Path:
+def encode_video(target: Path, film: NDArray[np.uint8], fps: float) -> Path:
     """Writes (T, H, W, 3) uint8 frames as an MP4 that browsers play."""
     import av
 

@@ -30,13 +30,13 @@ _HISTOGRAMS = {
 _BARS = {"family": "Appearance", "gesture": "Gesture", "split": "Split"}
 
 
-def write(root: Path, target: Path) -> Path:
+def write_report(root: Path, target: Path) -> Path:
     """Writes the page about the dataset in `root`; everything it shows is inside it."""
     import jinja2
 
     folder = Folder(root)
     described = folder.described()
-    table = index.read(root)
+    table = index.read_index(root)
     done = table.filter(pc.equal(table["status"], "done"))
     text = (Path(__file__).parent / "report.html.jinja").read_text("utf-8")
     environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined)

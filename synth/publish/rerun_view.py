@@ -26,7 +26,7 @@ _MESH_COLUMNS = 200
 _JPEG_QUALITY = 90
 
 
-def save(sequences: Iterable[Sequence], path: Path) -> None:
+def save_recording(sequences: Iterable[Sequence], path: Path) -> None:
     """Writes sequences as a rerun recording file, one recording each.
 
     Raises:
@@ -53,7 +53,7 @@ def save(sequences: Iterable[Sequence], path: Path) -> None:
         raise UserError(f"{path}: cannot be written ({error.strerror})") from error
 
 
-def show(sequences: Iterable[Sequence], *, web: bool) -> None:
+def show_sequences(sequences: Iterable[Sequence], *, web: bool) -> None:
     """Opens sequences in the viewer and returns when it is closed; it listens on this machine only.
 
     Args:
@@ -67,7 +67,7 @@ def show(sequences: Iterable[Sequence], *, web: bool) -> None:
     print("rerun sends its makers anonymous usage counts until `rerun analytics disable`", file=sys.stderr)
     with tempfile.TemporaryDirectory() as scratch:
         path = Path(scratch) / "sequences.rrd"
-        save(sequences, path)
+        save_recording(sequences, path)
         done = subprocess.run(command(path, web=web))
     if done.returncode:
         hint = "" if web else "; without a window system use --web, or --save and open the file elsewhere"
@@ -112,7 +112,7 @@ def _log(rerun: Any, stream: Any, sequence: Sequence) -> None:
     attrs, (height, width) = sequence.attrs, sequence.size
     view, frames = optics.camera_of(sequence), range(sequence.frames)
     force, time = sequence["force"][:], sequence["time"][:]
-    flows = [name for name in ("flow", "flow_tvl1") if name in sequence]
+    flows = [name for name in ("flow", "flow_recovered") if name in sequence]
     longest = max(float(attrs["summary"]["peak_flow_px"]), 1e-6)
     strongest = max(float(attrs["summary"]["peak_traction_kpa"]), 1e-9)
     tissue, first, step = sequence["tissue"][:], sequence["rgb"][0], max(1, width // _MESH_COLUMNS)

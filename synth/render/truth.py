@@ -9,14 +9,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
-import numba
 import numpy as np
 import numpy.typing as npt
 
 from synth.geometry.triangles import Shape, normals
 from synth.render.camera import camera as cameras
 from synth.render.camera.camera import Camera
+from synth.system.jit import compiled
 
 Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int32]
@@ -274,4 +275,4 @@ def _cast_loop(points, flat, faces, directions, order, start, width, height):  #
     return face, best_u, best_v, best
 
 
-_cast = numba.njit(cache=True)(_cast_loop)
+_cast: Any = compiled(_cast_loop)

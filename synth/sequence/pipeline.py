@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,7 @@ from synth.job.schema import Flow, Job
 from synth.render.anatomy import surface as anatomy
 from synth.render.anatomy.surface import Surface
 from synth.render.camera import camera, video
+from synth.render.camera.camera import Camera
 from synth.render.scene import Studio
 from synth.sequence import scenario
 from synth.sequence.published_labels import Published
@@ -35,6 +36,36 @@ from synth.system.stopwatch import Report, Stopwatch
 # for the published method's.
 _SHOT = ("rgb", "flow", "visible", "tool", "glare", "depth")
 _PUBLISHED = ("flow_noisy", "intensity")
+
+
+@dataclass(frozen=True)
+class _Shooting:
+    """A sequence about to be rendered: what all later stages share."""
+
+    job: Job
+    index: int
+    case: Scenario
+    view: Camera
+    """At rest."""
+    motion: Deformation
+    studio: Studio
+    writer: Writer
+    watch: Stopwatch
+    report: Report
+
+
+@dataclass(frozen=True)
+class _Film:
+    """What the cameras recorded, before a codec."""
+
+    rgb: NDArray[np.uint8]
+    """(T, H, W, 3)."""
+    rgb_right: NDArray[np.uint8] | None
+    """The same of the second lens; None where the job keeps none."""
+    tools: NDArray[np.bool_]
+    """(T, H, W) pixels of the instruments."""
+    poses: NDArray[np.float64]
+    """(T, 4, 4) mm, world to camera axes."""
 
 
 def render_sequence(job: Job, index: int, folder: Path, report: Report) -> Path:
@@ -62,79 +93,115 @@ def render_sequence(job: Job, index: int, folder: Path, report: Report) -> Path:
     report("fem", 0, 1)
     with watch.stage("fem"):
         motion = move(job, case, surface, tets)
-
     with watch.stage("scene"):
         studio = Studio(surface, case.look, view, job, [gesture.kind for gesture in case.gestures])
         still = studio.still
 
     width, height = job.render.size
-    rotation = view.rotation  # world to camera: labels are in camera axes
     writer = Writer(folder, index, frames=job.frames, size=(height, width), job=job)
     writer.put("time", motion.time)
-    writer.put("force", motion.force @ rotation.T)
+    writer.put("force", motion.force @ view.rotation.T)  # labels are in camera axes
     writer.put("tissue", still.tissue)
     writer.put("area", still.area)
+
+    shooting = _Shooting(job, index, case, view, motion, studio, writer, watch, report)
+    film = _render_frames(shooting)
+    rgb = _write_video(shooting, film)
+    if job.flow.backend != "ideal":
+        _recover_flow(shooting, rgb, film.tools)
+    return _seal(shooting)
+
+
+def _render_frames(shooting: _Shooting) -> _Film:
+    """Renders every frame and writes its fields, but for video that a codec must see whole."""
+    job, motion, studio, writer = shooting.job, shooting.motion, shooting.studio, shooting.writer
+    width, height = job.render.size
     labels = None
     if set(_PUBLISHED) & set(job.store.extra):
-        labels = Published.begin(job.labels, still.tissue, job.frames, scenario.label_rng(job, index))
-    coded = job.sensor.bitrate_mbps is not None  # a codec sees the whole film at once
-    film = Timeline(motion, view, case.sway, case.look.light, job.fps)
+        rng = scenario.label_rng(job, shooting.index)
+        labels = Published.begin(job.labels, studio.still.tissue, job.frames, rng)
+    names = [
+        name
+        for name in (*_SHOT, *job.store.extra)
+        if FIELDS[name].framed and not (_coded(job) and name.startswith("rgb"))
+    ]
+    line = Timeline(motion, shooting.view, shooting.case.sway, shooting.case.look.light, job.fps)
     rgb = np.empty((job.frames, height, width, 3), np.uint8)
     rgb_right = np.empty_like(rgb) if writer.wants("rgb_right") else None
     tools = np.empty((job.frames, height, width), bool)
     poses = np.tile(np.eye(4), (job.frames, 1, 1))
-    for t, seed in enumerate(scenario.frame_seeds(job, index)):
-        report("render", t, job.frames)
-        with watch.stage("render"):
-            now = film.at(t)
-            lit = film.open(t, job.sensor.shutter, job.sensor.subframes)
-            shot = studio.shoot(now, seed, lit, film.at(t + 1))
+    for t, seed in enumerate(scenario.frame_seeds(job, shooting.index)):
+        shooting.report("render", t, job.frames)
+        with shooting.watch.stage("render"):
+            now = line.at(t)
+            lit = line.open(t, job.sensor.shutter, job.sensor.subframes)
+            shot = studio.shoot(now, seed, lit, line.at(t + 1))
             traction = studio.traction(motion.traction[t])
-        with watch.stage("store"):
+        with shooting.watch.stage("store"):
             made = labels.frame(t, shot.flow, traction, motion.force[t]) if labels else {}
-            for name in (*_SHOT, *job.store.extra):
-                if FIELDS[name].framed and not (coded and name.startswith("rgb")):
-                    writer.put_frame(name, t, made[name] if name in made else getattr(shot, name))
+            for name in names:
+                writer.put_frame(name, t, made[name] if name in made else getattr(shot, name))
             writer.put_frame("traction", t, traction)
             if job.render.exr:
                 writer.put_exr(t, shot.radiance)
         rgb[t], tools[t] = shot.rgb, shot.tool
         if rgb_right is not None and shot.rgb_right is not None:
             rgb_right[t] = shot.rgb_right
-        lens = now.camera or view
+        lens = now.camera or shooting.view
         poses[t, :3, :3], poses[t, :3, 3] = lens.rotation, lens.translation
+    return _Film(rgb, rgb_right, tools, poses)
 
-    with watch.stage("store"):
-        writer.put("camera", poses)
-        if coded:
+
+def _write_video(shooting: _Shooting, film: _Film) -> NDArray[np.uint8]:
+    """Writes the cameras' poses, and video through its codec if it has one; returns video as kept."""
+    job, writer, rgb = shooting.job, shooting.writer, film.rgb
+    with shooting.watch.stage("store"):
+        writer.put("camera", film.poses)
+        if _coded(job):
             rgb = video.recorded(rgb, job.sensor, job.fps)
             writer.put("rgb", rgb)
-            if rgb_right is not None:
-                writer.put("rgb_right", video.recorded(rgb_right, job.sensor, job.fps))
+            if film.rgb_right is not None:
+                writer.put("rgb_right", video.recorded(film.rgb_right, job.sensor, job.fps))
+    return rgb
 
-    if job.flow.backend != "ideal":
-        report("flow", 0, job.frames)
-        with watch.stage("flow"):
-            # What a real pipeline has: the tool's outline, and glare as the picture shows it.
-            recovered = track.track(estimator(job.flow), rgb, mask.hidden(rgb, tools), still.tissue)
-        with watch.stage("store"):
-            for t in range(job.frames):
-                writer.put_frame("flow_tvl1", t, recovered.flow[t])
-                writer.put_frame("flow_confidence", t, recovered.confidence[t])
 
-    return writer.seal(
+def _coded(job: Job) -> bool:
+    """Whether video goes through a codec, which sees all of it at once."""
+    return job.sensor.bitrate_mbps is not None
+
+
+def _recover_flow(shooting: _Shooting, rgb: NDArray[np.uint8], tools: NDArray[np.bool_]) -> None:
+    """Follows the video (T, H, W, 3) with the job's estimator and writes what it finds.
+
+    It has what a real pipeline has: the tool's outline (T, H, W), and glare as the picture shows it.
+    """
+    job, writer = shooting.job, shooting.writer
+    shooting.report("flow", 0, job.frames)
+    with shooting.watch.stage("flow"):
+        tissue = shooting.studio.still.tissue
+        recovered = track.track(estimator(job.flow), rgb, mask.hidden(rgb, tools), tissue)
+    with shooting.watch.stage("store"):
+        for t in range(job.frames):
+            writer.put_frame("flow_recovered", t, recovered.flow[t])
+            writer.put_frame("flow_confidence", t, recovered.confidence[t])
+
+
+def _seal(shooting: _Shooting) -> Path:
+    """Seals the store with what was drawn and measured as its attributes; returns its path."""
+    case, view = shooting.case, shooting.view
+    return shooting.writer.seal(
         scenario=case.as_dict(),
-        anatomy_id=identity.anatomy(job, case.relief.seed),
+        anatomy_id=identity.identify_anatomy(shooting.job, case.relief.seed),
         K=view.K.tolist(),
         distortion=view.distortion.tolist(),
         rotation=view.rotation.tolist(),
         translation=view.translation.tolist(),
-        scale_mm_per_px=float(still.scale_mm_per_px),
+        scale_mm_per_px=float(shooting.studio.still.scale_mm_per_px),
         young_kpa=case.tissue.young_kpa,
         poisson=case.tissue.poisson,
-        mechanics=_mechanics(case, motion, rotation),
-        variant=studio.variant,
-        timings=watch.report(),
+        mechanics=_mechanics(case, shooting.motion, view.rotation),
+        variant=shooting.studio.variant,
+        timings=shooting.watch.report(),
     )
 
 
@@ -169,7 +236,7 @@ def cortex(job: Job, case: Scenario) -> tuple[Surface, Brain | None]:
     """The fine surface of a scenario, and the user's brain that it is a part of, if it is."""
     if job.anatomy.mesh is None:
         return anatomy.procedural(case.relief, job.anatomy), None
-    whole = brain_surface.load(job.anatomy.mesh, job.anatomy.craniotomy)
+    whole = brain_surface.load_brain(job.anatomy.mesh, job.anatomy.craniotomy)
     return anatomy.from_brain(whole.vertices, whole.faces, case.relief, job.anatomy), whole
 
 

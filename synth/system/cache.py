@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import os
+import stat
 import tempfile
 from pathlib import Path
 
@@ -16,28 +17,29 @@ def folder(name: str) -> Path:
     """A folder for one kind of compiled code, made if it isn't there.
 
     `SULCUS_CACHE` is asked first, then the user's cache (`XDG_CACHE_HOME`, else ~/.cache); where neither can
-    be written (no home, read-only), a folder of this user's in the system's temporary one.
+    be written (no home, read-only), a folder of this user's own in the system's temporary one.
+
+    Raises:
+        OSError: nothing can be written, or the temporary folder is one that others made or may write to: what
+            is kept here is code that will be run.
     """
-    tried = []
-    if "SULCUS_CACHE" in os.environ:
-        tried.append(Path(os.environ["SULCUS_CACHE"]))
-    if "XDG_CACHE_HOME" in os.environ:
-        tried.append(Path(os.environ["XDG_CACHE_HOME"]) / "sulcus")
-    home = os.environ.get("HOME")
-    if home:
-        tried.append(Path(home) / ".cache" / "sulcus")
-    for place in tried:
+    told, home = os.environ.get("XDG_CACHE_HOME"), os.environ.get("HOME")
+    places = [
+        Path(os.environ["SULCUS_CACHE"]) if "SULCUS_CACHE" in os.environ else None,
+        Path(told) / "sulcus" if told else Path(home) / ".cache" / "sulcus" if home else None,
+    ]
+    for place in filter(None, places):
         try:
             (place / name).mkdir(parents=True, exist_ok=True)
         except OSError:
             continue
         if os.access(place / name, os.W_OK):
             return place / name
-    # Of this user alone: what is loaded from here runs.
     mine = Path(tempfile.gettempdir()) / f"sulcus-{os.getuid()}"
     mine.mkdir(mode=0o700, exist_ok=True)
-    if mine.is_symlink() or mine.stat().st_uid != os.getuid():
-        mine = Path(tempfile.mkdtemp(prefix="sulcus-"))
+    about = mine.lstat()
+    if not stat.S_ISDIR(about.st_mode) or about.st_uid != os.getuid() or about.st_mode & 0o077:
+        raise PermissionError(f"{mine}: is not this user's alone")
     (mine / name).mkdir(exist_ok=True)
     return mine / name
 

@@ -52,9 +52,7 @@ def _findings(folder: Path) -> Iterator[Finding]:
     yield Finding(
         "renderer", variant, variant != "scalar_rgb", "the slow variant works; LLVM halves the time"
     )
-    kernels = cache.folder("kernels")
-    held = cache.size_bytes(kernels) / 1e6
-    yield Finding("compiled kernels", f"{held:.0f} MB of at most {cache.LIMIT_BYTES / 1e6:.0f} in {kernels}")
+    yield _kernels()
     for name, version in packages.versions().items():
         yield Finding(name, version)
     for name in ("mitsuba", "cv2", "torch", "trimesh", "av"):
@@ -68,6 +66,15 @@ def _memory() -> Iterator[Finding]:
         yield Finding(
             "memory", f"{size:.1f} GB", size >= _LEAST_MEMORY_GB, "use --workers 1 and a smaller render.size"
         )
+
+
+def _kernels() -> Finding:
+    try:
+        place = cache.folder("kernels")
+    except OSError as error:
+        return Finding("compiled kernels", f"not kept ({error})", False, "set SULCUS_CACHE to a folder")
+    held = cache.size_bytes(place) / 1e6
+    return Finding("compiled kernels", f"{held:.0f} MB of at most {cache.LIMIT_BYTES / 1e6:.0f} in {place}")
 
 
 def _disk(folder: Path) -> Finding:

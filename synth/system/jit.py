@@ -7,19 +7,21 @@ from typing import Any, TypeVar
 
 import numba
 
+from synth.system import cache
+
 F = TypeVar("F", bound=Callable[..., Any])
 
 
 def compiled(function: F) -> F:
     """Compiles with numba, once a machine rather than once a process.
 
+    The cache lies in `NUMBA_CACHE_DIR`, else beside the package, else in the user's cache folder (numba's own
+    order), else in ours (`synth.system.cache`); where none can be written it is done without.
+
     numba notices a change only in the file a function stands in. Hence the rule of this package: a compiled
     function calls compiled functions of its own file only.
     """
-    try:
-        return numba.njit(cache=True, nogil=True)(function)  # type: ignore[no-any-return]
-    except RuntimeError:  # no folder to write the cache to: read-only installation without a home
-        return numba.njit(nogil=True)(function)  # type: ignore[no-any-return]
+    return _compile(function)
 
 
 def vectorised(function: F) -> F:
@@ -27,7 +29,18 @@ def vectorised(function: F) -> F:
 
     Python's own rule, an error, would put a branch into every division, and the loop would go pixel by pixel.
     """
+    return _compile(function, error_model="numpy")
+
+
+def _compile(function: F, **how: str) -> F:
     try:
-        return numba.njit(cache=True, nogil=True, error_model="numpy")(function)  # type: ignore[no-any-return]
-    except RuntimeError:
-        return numba.njit(nogil=True, error_model="numpy")(function)  # type: ignore[no-any-return]
+        return numba.njit(cache=True, nogil=True, **how)(function)  # type: ignore[no-any-return]
+    except RuntimeError:  # no folder to write to: read-only installation without a home
+        told = numba.config.CACHE_DIR
+    try:
+        numba.config.CACHE_DIR = str(cache.folder("loops"))
+        return numba.njit(cache=True, nogil=True, **how)(function)  # type: ignore[no-any-return]
+    except (RuntimeError, OSError):  # nor a temporary one, or a disk that is full
+        return numba.njit(nogil=True, **how)(function)  # type: ignore[no-any-return]
+    finally:
+        numba.config.CACHE_DIR = told

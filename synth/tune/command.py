@@ -44,25 +44,25 @@ def tune(
     from synth.tune.probe import LOADED
 
     asked = tuning.Budget.parse(budget)
-    read = reader.load(job, overrides or [])
+    read = reader.load_job(job, overrides or [])
     target = out or Path(f"{Path(job).stem}.tuned.yaml")
     if target.exists():
         raise UserError(f"{target}: exists already")
     if not target.resolve().parent.is_dir():
         raise UserError(f"{target}: its folder does not exist")
-    levels = sum(len(knob.levels) for knob in knobs.of(read))
+    levels = sum(len(knob.levels) for knob in knobs.list_knobs(read))
     width, height = read.render.size
     each = _SCENE_S + (LOADED + 1) * width * height * _PIXEL_S
     # Most levels are compared at half the picture's width.
     minutes = (probes * levels * 0.4 + 4 * (probes + checks)) * each / 60
     print(
-        f"{levels} levels of {len(knobs.of(read))} knobs on {probes} sequences, whole settings on "
+        f"{levels} levels of {len(knobs.list_knobs(read))} knobs on {probes} sequences, whole settings on "
         f"{probes + checks}: about {minutes:.0f} CPU-minutes; a run that is stopped goes on",
         file=sys.stderr,
     )
     journal = target.with_name(target.name + ".part")
-    found = tuning.run(read, asked, journal, probes, checks, _said())
-    tuned_job.write(found, job, overrides or [], target)
+    found = tuning.tune_job(read, asked, journal, probes, checks, _said())
+    tuned_job.write_tuned(found, job, overrides or [], target)
     journal.unlink(missing_ok=True)
     if json:
         print(json_.dumps(tuned_job.as_dict(found) | {"out": str(target)}))

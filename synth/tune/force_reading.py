@@ -19,7 +19,7 @@ from scipy.sparse.linalg import splu
 
 from synth.fem import equilibrium, surface_embedding, tool
 from synth.fem.solver import Deformation
-from synth.fem.system import assemble
+from synth.fem.system import System, assemble
 from synth.job.schema import Job
 from synth.render import truth
 from synth.render.anatomy.surface import Surface
@@ -55,7 +55,7 @@ class Reading:
         return np.asarray(np.einsum("kip,kp->ki", self.inverse, away))
 
 
-def fit(
+def fit_reading(
     job: Job,
     case: Scenario,
     surface: Surface,
@@ -89,19 +89,13 @@ def fit(
     courses = [tool.course(gesture, job.frames) for gesture in case.gestures]
     rules = []
     for k, frame in enumerate(frames):
-        tangent = system.tangent(path.displacement[k])
-        factor = splu(
-            tangent[system.free][:, system.free].tocsc(),
-            permc_spec="MMD_AT_PLUS_A",
-            diag_pivot_thresh=0.0,
-            options={"SymmetricMode": True},
-        )
+        factor = _factorise(system, path.displacement[k])
         now = surface.vertices + motion.displacement[frame]
         seen = cameras.project(camera, now)
         columns = []
         for gesture, over in zip(case.gestures, courses, strict=True):
             # A load of the sequence's size along the instrument's direction: errors come out as parts of it.
-            pull = np.zeros_like(carry.T @ now)
+            pull = np.zeros_like(tets.points)
             for contact in gesture.contacts:
                 centre = np.asarray(contact.point_mm) + over.shift[frame]
                 kernel = tool.footprint(centre, gesture.footprint_mm, surface.vertices, motion.area)
@@ -113,11 +107,29 @@ def fit(
             step = _STEP_MM / np.abs(way).max()
             flow = (cameras.project(camera, now + step * way) - seen) / step
             columns.append(cells(truth.at_rest_pixels(still, surface.faces, flow), still.tissue))
-        a = camera.mm_per_px * np.stack([c.ravel() for c in columns], axis=1)
-        sure = visible[k] / (_FLOOR_MM**2 + _SHARE**2 * np.square(moved[k]).sum(axis=1))
-        weighted = a.T * np.repeat(sure, 2)
-        rules.append(np.linalg.solve(weighted @ a, weighted))
+        shown_mm = camera.mm_per_px * np.stack([column.ravel() for column in columns], axis=1)
+        rules.append(_solve_rule(shown_mm, moved[k], visible[k]))
     return Reading(np.stack(rules), moved)
+
+
+def _factorise(system: System, displacement: Floats) -> Any:
+    """The sparse LU factors of the tangent (free, free) at a displacement."""
+    tangent = system.tangent(displacement)[system.free][:, system.free].tocsc()
+    options = {"SymmetricMode": True}
+    return splu(tangent, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
+
+
+def _solve_rule(a: Floats, moved: Floats, visible: Floats) -> Floats:
+    """Weighted least squares: (I, 2 P) that turns displacement [mm] into parts of each instrument's force.
+
+    Args:
+        a: (2 P, I) mm that a load of the sequence's size shows in the cells.
+        moved: (P, 2) mm of the true displacement.
+        visible: (P,) part of each cell that shows tissue.
+    """
+    sure = visible / (_FLOOR_MM**2 + _SHARE**2 * np.square(moved).sum(axis=1))
+    weighted = a.T * np.repeat(sure, 2)
+    return np.linalg.solve(weighted @ a, weighted)
 
 
 def cells(values: NDArray[Any], on: NDArray[np.bool_]) -> Floats:

@@ -41,7 +41,7 @@ class Knob:
     other pictures, not cheaper ones, and what is trained on them is another network."""
 
 
-def of(job: Job) -> list[Knob]:
+def list_knobs(job: Job) -> list[Knob]:
     """The knobs that a job has, with its own value among the levels.
 
     Raises:
@@ -49,31 +49,40 @@ def of(job: Job) -> list[Knob]:
     """
     if job.render.subsurface == "volume":
         raise UserError("render.subsurface: volume is a reference itself; tune the job with blur")
-    fem, render = job.fem, job.render
+    knobs = _physics_knobs(job)
+    if job.flow.backend == "ideal":
+        return knobs  # no force is read from its pictures, so nothing here can say how good they must be
+    vertices = [job.anatomy.vertices, min(_VERTICES, job.anatomy.vertices)]
+    knobs += [_number("vertices", "surface", "anatomy.vertices", vertices), *_picture_knobs(job)]
+    if job.flow.backend == "tvl1":
+        warps = [max(FINE_WARPS, job.flow.warps), job.flow.warps, *_WARPS]
+        knobs.append(_number("warps", "flow", "flow.warps", warps))
+    return knobs
+
+
+def _physics_knobs(job: Job) -> list[Knob]:
+    """Law, mesh and, of dynamics, the time step."""
+    fem = job.fem
     own_law = fem.law if fem.law in CHEAPEST_FIRST else "neo-hookean"
     laws = ["neo-hookean", *(law for law in ("stable", "linear") if fem.largest_load <= LARGEST_LOAD[law])]
     if own_law not in laws:
         laws.append(own_law)
+    tets = _down([max(FINE_TETS, fem.tets), fem.tets, *_TETS])
     knobs = [
         Knob("law", "physics", tuple(Level(law, {"fem.law": law}) for law in laws)),
-        Knob(
-            "tets",
-            "physics",
-            tuple(
-                Level(f"{n} P2", {"fem.order": 2, "fem.tets": n})
-                for n in _down([max(FINE_TETS, fem.tets), fem.tets, *_TETS])
-            ),
-        ),
+        Knob("tets", "physics", tuple(Level(f"{n} P2", {"fem.order": 2, "fem.tets": n}) for n in tets)),
     ]
     if fem.time == "dynamic":
         frame = 1 / job.fps
         steps = _down([fem.dt_s / 2, fem.dt_s, *([frame] if frame > fem.dt_s else [])])
         levels = [Level(f"steps of {dt:.3g} s", {"fem.dt_s": dt}) for dt in steps[::-1]]
         knobs.append(Knob("time", "physics", (*levels, Level("at rest", {"fem.time": "quasi-static"}))))
-    if job.flow.backend == "ideal":
-        return knobs  # no force is read from its pictures, so nothing here can say how good they must be
-    vertices = _down([job.anatomy.vertices, min(_VERTICES, job.anatomy.vertices)])
-    knobs.append(Knob("vertices", "surface", tuple(Level(f"{n}", {"anatomy.vertices": n}) for n in vertices)))
+    return knobs
+
+
+def _picture_knobs(job: Job) -> list[Knob]:
+    """Size, light paths and, where the job has them, lens and highlights."""
+    render, glare = job.render, job.light.glare
     sizes = [render.size]
     for part in _SIZES:
         # Multiples of 8, in the shape that was asked for.
@@ -81,39 +90,24 @@ def of(job: Job) -> list[Knob]:
         size = (wide, max(8, round(wide * render.size[1] / render.size[0] / 8) * 8))
         if min(size) >= _FEWEST_PX and size not in sizes:
             sizes.append(size)
-    knobs.append(
-        Knob("size", "picture", tuple(Level(f"{w} x {h}", {"render.size": [w, h]}) for w, h in sizes))
-    )
-    paths = _down([max(FINE_SPP, render.spp), render.spp, *_SPP])
-    knobs.append(Knob("spp", "picture", tuple(Level(f"{n}", {"render.spp": n}) for n in paths)))
+    knobs = [
+        Knob("size", "picture", tuple(Level(f"{w} x {h}", {"render.size": [w, h]}) for w, h in sizes)),
+        _number("spp", "picture", "render.spp", [max(FINE_SPP, render.spp), render.spp, *_SPP]),
+    ]
     if render.aperture_mm > 0:
-        knobs.append(
-            Knob(
-                "depth of field",
-                "picture",
-                (
-                    Level("lens", {"render.aperture_mm": render.aperture_mm}),
-                    Level("pinhole", {"render.aperture_mm": 0.0}),
-                ),
-                turned=False,
-            )
-        )
-    if job.light.glare[1] > 0:
-        knobs.append(
-            Knob(
-                "light",
-                "picture",
-                (
-                    Level("wet highlights", {"light.glare": list(job.light.glare)}),
-                    Level("few highlights", {"light.glare": [0.0, 0.0]}),
-                ),
-                turned=False,
-            )
-        )
-    if job.flow.backend == "tvl1":
-        warps = _down([max(FINE_WARPS, job.flow.warps), job.flow.warps, *_WARPS])
-        knobs.append(Knob("warps", "flow", tuple(Level(f"{n}", {"flow.warps": n}) for n in warps)))
+        lens = Level("lens", {"render.aperture_mm": render.aperture_mm})
+        pinhole = Level("pinhole", {"render.aperture_mm": 0.0})
+        knobs.append(Knob("depth of field", "picture", (lens, pinhole), turned=False))
+    if glare[1] > 0:
+        wet = Level("wet highlights", {"light.glare": list(glare)})
+        few = Level("few highlights", {"light.glare": [0.0, 0.0]})
+        knobs.append(Knob("light", "picture", (wet, few), turned=False))
     return knobs
+
+
+def _number(name: str, kind: str, key: str, values: Iterable[int]) -> Knob:
+    """A knob that is one number of the job, the finer the larger."""
+    return Knob(name, kind, tuple(Level(f"{n}", {key: n}) for n in _down(values)))
 
 
 def finest(knobs: Iterable[Knob]) -> dict[str, Any]:

@@ -74,7 +74,7 @@ class Probe:
         still, lens = film.studio.still, film.studio.camera
         self._still, self._lens = still, lens
         true = np.stack([force_reading.cells(shot.flow, still.tissue) for shot in film.shots[1:]])
-        self._reading = force_reading.fit(
+        self._reading = force_reading.fit_reading(
             job,
             case,
             surface,

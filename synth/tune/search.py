@@ -1,7 +1,7 @@
 """Goal-oriented fidelity: the cheapest job whose error of the force is within a budget of full fidelity's.
 
 A few probe sequences are computed at full fidelity and with one knob turned at a time. What a knob does to
-the force read from them (`tune_reading`) adds up to first order, with its sign, frame by frame; costs
+the force read from them (`force_reading`) adds up to first order, with its sign, frame by frame; costs
 multiply stage by stage. That only orders the candidates: the cheapest one that promises to keep the budget is
 then measured as a whole, on further sequences too, and given up for the next if it does not keep it. The
 sequence that broke the promise is then measured knob by knob as well.
@@ -77,7 +77,7 @@ class _Bench:
             if number != index:
                 other.rest()
         if index not in self._probes:
-            finest = tune_knobs.finest(tune_knobs.of(self.job))
+            finest = tune_knobs.finest(tune_knobs.list_knobs(self.job))
             for attempt in range(_DRAWS):
                 job = probing(self.job, index, attempt)
                 try:
@@ -89,7 +89,7 @@ class _Bench:
         return self._probes[index]
 
 
-def run(job: Job, budget: Budget, journal_file: Path, probes: int, checks: int, report: Report) -> Tuned:
+def tune_job(job: Job, budget: Budget, journal_file: Path, probes: int, checks: int, report: Report) -> Tuned:
     """Finds the cheapest job within the budget.
 
     Args:
@@ -105,7 +105,7 @@ def run(job: Job, budget: Budget, journal_file: Path, probes: int, checks: int, 
     Raises:
         UserError: a probe sequence cannot be carried out at full fidelity.
     """
-    knobs = tune_knobs.of(job)
+    knobs = tune_knobs.list_knobs(job)
     journal = Journal(journal_file, _state(job))
     levels = sum(len(knob.levels) for knob in knobs)
     total = probes * (levels + 2) + 2 * probes + 3 * checks
@@ -115,33 +115,10 @@ def run(job: Job, budget: Budget, journal_file: Path, probes: int, checks: int, 
     full = joint(bench, whole, "full fidelity", [knob.levels[0] for knob in knobs], 0.0)
     own_levels = [own(knob, job) for knob in knobs]
     mine = joint(bench, whole, "the job as it is", own_levels, sweep.error(own_levels))
-    tried: list[Joint] = []
-    allowed = budget.share
-    seen: set[tuple[str, ...]] = set()
     # The budget is counted from full fidelity, which keeps it by itself.
     last = own_levels if mine.error <= budget.share else [knob.levels[0] for knob in knobs]
-    best: tuple[list[Level], Joint] | None = None
-    while len(tried) < _TRIES:
-        picked = sweep.cheapest(allowed, own_levels, seen)
-        if picked is None or sweep.price(picked) >= sweep.price(best[0] if best else last):
-            break
-        seen.add(tuple(level.words for level in picked))
-        found = joint(bench, whole, f"try {len(tried) + 1}", picked, sweep.error(picked))
-        tried.append(found)
-        limit = best[1].cost if best else mine.cost if last is own_levels else np.inf
-        if found.error <= budget.share and found.cost < limit:
-            # It kept more than it promised: something cheaper may keep the budget too.
-            best = picked, found
-            allowed *= float(np.clip(budget.share / max(found.error, 1e-9), *_MORE))
-            continue
-        if best:
-            break
-        surprise = whole[int(np.argmax(found.errors))]
-        if sweep.knows(surprise):
-            # Promises are held to less, by what this one missed, but not to little for a single surprise.
-            allowed *= float(np.clip(budget.share / found.error, *_STEP))
-        else:
-            sweep.learn(surprise)  # which knob did it?
+    limit = mine.cost if last is own_levels else np.inf
+    best, tried = _try_settings(bench, sweep, whole, budget.share, own_levels, last, limit)
     if best is None:
         best = last, joint(bench, whole, f"try {len(tried) + 1}", last, sweep.error(last))
         tried.append(best[1])
@@ -152,14 +129,63 @@ def run(job: Job, budget: Budget, journal_file: Path, probes: int, checks: int, 
     )
 
 
-def again(
+def _try_settings(
+    bench: _Bench,
+    sweep: Sweep,
+    whole: range,
+    share: float,
+    own_levels: list[Level],
+    last: list[Level],
+    limit: float,
+) -> tuple[tuple[list[Level], Joint] | None, list[Joint]]:
+    """Measures settings as a whole, the cheapest first that promises to keep the budget.
+
+    Args:
+        bench, sweep: what measures, and what it promises.
+        whole: sequences to measure on.
+        share: the budget.
+        own_levels: the job's.
+        last: what is taken if nothing cheaper keeps the budget.
+        limit: cost [CPU-s a frame] below which a setting must stay.
+
+    Returns:
+        The cheapest setting that kept the budget, None if there is none; and all that were measured.
+    """
+    tried: list[Joint] = []
+    seen: set[tuple[str, ...]] = set()
+    best: tuple[list[Level], Joint] | None = None
+    allowed = share
+    while len(tried) < _TRIES:
+        picked = sweep.cheapest(allowed, own_levels, seen)
+        if picked is None or sweep.price(picked) >= sweep.price(best[0] if best else last):
+            break
+        found = joint(bench, whole, f"try {len(tried) + 1}", picked, sweep.error(picked))
+        seen.add(found.levels)
+        tried.append(found)
+        if found.error <= share and found.cost < limit:
+            # It kept more than it promised: something cheaper may keep the budget too.
+            best, limit = (picked, found), found.cost
+            allowed *= float(np.clip(share / max(found.error, 1e-9), *_MORE))
+            continue
+        if best:
+            break
+        surprise = whole[int(np.argmax(found.errors))]
+        if sweep.knows(surprise):
+            # Promises are held to less, by what this one missed, but not to little for a single surprise.
+            allowed *= float(np.clip(share / found.error, *_STEP))
+        else:
+            sweep.learn(surprise)  # which knob did it?
+    return best, tried
+
+
+def measure_again(
     found: Tuned, journal_file: Path, first: int, count: int, report: Report
 ) -> tuple[Joint, Joint, Joint]:
     """Full fidelity, the job as it was and the tuned one, on sequences that had no part in the choice.
 
     Args:
         found: the answer.
-        journal_file: as in `run`.
+        journal_file: as in `tune_job`.
         first: number of the first such sequence; the choice used those below.
         count: how many.
         report: progress.
@@ -216,7 +242,7 @@ def joint(
 ) -> Joint:
     """A setting as a whole, against full fidelity, on some sequences."""
     changes = merged(levels)
-    finest = tune_knobs.finest(tune_knobs.of(bench.job))
+    finest = tune_knobs.finest(tune_knobs.list_knobs(bench.job))
     errors: list[float] = []
     totals: list[float] = []
     apart: list[float] = []

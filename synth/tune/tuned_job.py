@@ -22,7 +22,7 @@ _PATHS = ("anatomy.mesh", "appearance.photo", "render.calibration")
 _WIDTH = 98
 
 
-def write(found: Tuned, source: str, overrides: Sequence[str], out: Path) -> Job:
+def write_tuned(found: Tuned, source: str, overrides: Sequence[str], out: Path) -> Job:
     """Writes the tuned job to `out`, which must not exist, and gives it back as read from there.
 
     Raises:
@@ -36,7 +36,7 @@ def write(found: Tuned, source: str, overrides: Sequence[str], out: Path) -> Job
         raise UserError(f"{out}: exists already") from None
     except OSError as error:
         raise UserError(f"{out}: cannot be written ({error.strerror})") from error
-    return reader.load(str(out))
+    return reader.load_job(str(out))
 
 
 def commented(found: Tuned, source: str, overrides: Sequence[str], folder: Path) -> str:
@@ -44,7 +44,7 @@ def commented(found: Tuned, source: str, overrides: Sequence[str], folder: Path)
 
     Args:
         found: what was measured.
-        source, overrides: as given to `config.load`.
+        source, overrides: as given to `reader.load_job`.
         folder: where the file will be, from which relative paths start.
     """
     path = Path(source)

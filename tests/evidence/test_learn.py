@@ -118,7 +118,7 @@ def test_an_error_over_wider_cells_is_without_what_averages_out(clips: list[Clip
 
 
 def test_a_fine_grid_gets_pictures_of_a_pixel_a_cell() -> None:
-    job = reader.load("tiny").model_copy(update={"render": Render(size=(192, 144))})
+    job = reader.load_job("tiny").model_copy(update={"render": Render(size=(192, 144))})
     assert pictured(job, Grid(128)) == job
     assert pictured(job, Grid(256)).render.size == (384, 288)
 

@@ -10,9 +10,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 from synth.dataset.folder import claim
-from synth.dataset.index import write
+from synth.dataset.index import write_index
 from synth.engine.journal import Account
-from synth.engine.run import Options, run
+from synth.engine.run import Options, run_job
 from synth.engine.worker_process import Attempt
 from synth.job.schema import Job
 from synth.publish import card
@@ -53,23 +53,23 @@ def in_process(job: Job, root: Path, work: Callable[..., None]) -> None:
     with claim(root, job) as folder:
         for index in range(job.sequences):
             work(job, index, root, lambda *_: None)
-        write(folder)
-        card.write(folder)
+        write_index(folder)
+        card.write_card(folder)
 
 
 def start(root: Path, job: Job, work: str) -> subprocess.Popen[bytes]:
     """A run in a process of its own, which can be killed."""
     program = (
         "import sys; sys.path[:0] = sys.argv[4:]; from pathlib import Path; import fake_run; "
-        "fake_run.run_job(Path(sys.argv[1]), sys.argv[2], sys.argv[3])"
+        "fake_run.run_here(Path(sys.argv[1]), sys.argv[2], sys.argv[3])"
     )
     words = [str(root), job.model_dump_json(), work, str(HERE), str(HERE.parents[1])]
     return subprocess.Popen([sys.executable, "-c", program, *words])
 
 
-def run_job(root: Path, job: str, work: str) -> None:
+def run_here(root: Path, job: str, work: str) -> None:
     """What the process of `start` does."""
-    run(Job.model_validate_json(job), root, options(work), Silent())
+    run_job(Job.model_validate_json(job), root, options(work), Silent())
 
 
 def wait_for(condition: Callable[[], bool], seconds: float = 60.0) -> None:

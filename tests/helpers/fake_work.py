@@ -167,7 +167,7 @@ def consistent(job: Job, index: int, folder: Path, report: Report, fault: str = 
         writer.put_frame("depth", t, np.full((height, width), -1.0 if fault == "depth" and t else distance))
         pressed = 1e-3 if fault == "load_rest" and t == 0 else share[t]
         writer.put_frame("traction", t, pressed * spot[..., None] * load)
-        writer.put_frame("flow_tvl1", t, recovered)
+        writer.put_frame("flow_recovered", t, recovered)
         writer.put_frame("flow_confidence", t, np.ones((height, width)))
     focal *= 0.5 if fault == "camera" else 1.0
     tip = np.zeros((frames, 2, 3))

@@ -82,7 +82,7 @@ def write(
         writer.put_frame("traction", t, (share[..., None] * level * peak).astype(np.float32))
         if recovered:
             noisy = flow + noise_px * rng.normal(size=flow.shape) * tissue[..., None]
-            writer.put_frame("flow_tvl1", t, noisy.astype(np.float32))
+            writer.put_frame("flow_recovered", t, noisy.astype(np.float32))
             writer.put_frame("flow_confidence", t, np.full(SIZE, 0.8, np.float32))
     return writer.seal(
         scenario={"relief": {"seed": anatomy_seed}, "family": family, "gesture": {"kind": "pull"}},

@@ -14,5 +14,5 @@ def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
     small = ["sequences=1", "seed=3", "anatomy.vertices=2500", "fem.tets=400", "render.spp=2"]
     folder = tmp_path_factory.mktemp("repo") / "out"
     folder.mkdir()
-    pipeline.render_sequence(reader.load("tiny", small), 0, folder, lambda stage, done, of: None)
+    pipeline.render_sequence(reader.load_job("tiny", small), 0, folder, lambda stage, done, of: None)
     return folder

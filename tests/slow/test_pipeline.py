@@ -47,7 +47,7 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_the_dataset_passes_its_own_checks(undisturbed: Path) -> None:
-    report = verify.run(undisturbed)
+    report = verify.verify_dataset(undisturbed)
     assert report.good, [check.failures for check in report.checks]
 
 

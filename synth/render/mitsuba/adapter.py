@@ -11,6 +11,7 @@ import functools
 import gc
 import os
 import sys
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -106,7 +107,8 @@ def pick(asked: str) -> str:
     if asked == "scalar_rgb":
         return asked
     # Kernels are the same for all scenes of a job; the renderer would keep them in the user's home, for ever.
-    os.environ.setdefault("DRJIT_CACHE_DIR", str(cache.folder("kernels")))
+    with suppress(OSError):  # nowhere to write: compiled anew in every process
+        os.environ.setdefault("DRJIT_CACHE_DIR", str(cache.folder("kernels")))
     os.environ.setdefault("DRJIT_CACHE_MAXSIZE", str(cache.LIMIT_BYTES))
     if asked == "cuda_ad_rgb":
         if not cuda():

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import former_name
 import numpy as np
 import phantom
 import pytest
@@ -54,6 +55,15 @@ def test_a_store_without_recovered_flow(tmp_path: Path) -> None:
     with pytest.raises(UserError, match=r"000000.zarr: holds no recovered flow"):
         load(tmp_path, GRID, ("recovered",))
     assert len(load(tmp_path, GRID, ("ideal",))) == 1
+
+
+def test_a_store_with_recovered_flow_under_its_former_name(tmp_path: Path) -> None:
+    former_name.rename_field(phantom.write(tmp_path, 0, anatomy_seed=1))
+    (found,) = load(tmp_path, GRID, ("recovered",))
+    again = phantom.write(tmp_path / "again", 0, anatomy_seed=1)
+    (now,) = load(again.parent, GRID, ("recovered",))
+    np.testing.assert_array_equal(found.displacement["recovered"], now.displacement["recovered"])
+    assert found.displacement["recovered"].any()
 
 
 def test_folds_share_no_anatomy_and_leave_nobody_out(clips: list[Clip]) -> None:

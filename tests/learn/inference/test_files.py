@@ -91,7 +91,7 @@ def test_predict_on_stores_and_on_arrays_agree(model: Path, dataset: Path, tmp_p
     arrays = tmp_path / "mine.npz"
     np.savez(
         arrays,
-        flow=sequence["flow_tvl1"][:],
+        flow=sequence["flow_recovered"][:],
         confidence=sequence["flow_confidence"][:],
         tissue=sequence["tissue"][:],
         scale_mm_per_px=sequence.attrs["scale_mm_per_px"],

@@ -35,16 +35,16 @@ def dataset(pristine: Path, tmp_path: Path) -> Path:
 
 
 def failing(root: Path, fast: bool = False) -> set[str]:
-    return {check.name for check in verify.run(root, fast=fast).checks if not check.good}
+    return {check.name for check in verify.verify_dataset(root, fast=fast).checks if not check.good}
 
 
 def test_a_good_dataset_passes_and_every_invariant_was_measured(dataset: Path) -> None:
-    report = verify.run(dataset)
+    report = verify.verify_dataset(dataset)
     assert report.good, [check.failures for check in report.checks]
     assert {check.name: check.count > 0 for check in report.checks} == {
         name: True for name in ("dataset", "splits", "readable", "checksum", "finite", "range", *INVARIANTS)
     }
-    assert verify.run(dataset, fast=True).good
+    assert verify.verify_dataset(dataset, fast=True).good
 
 
 @pytest.mark.slow
@@ -68,7 +68,7 @@ def test_a_good_dataset_passes_and_every_invariant_was_measured(dataset: Path) -
 def test_a_faulty_pipeline_is_found_by_the_check_made_for_it(tmp_path: Path, fault: str, check: str) -> None:
     job = JOB.model_copy(update={"sequences": 1, "flow": Job().flow})
     in_process(job, tmp_path / "out", fake_work.wrong(fault))
-    found = next(one for one in verify.run(tmp_path / "out").checks if one.name == check)
+    found = next(one for one in verify.verify_dataset(tmp_path / "out").checks if one.name == check)
     assert not found.good
     assert found.offender.startswith("000000.zarr: ")
     assert found.cpu_s > 0
@@ -85,11 +85,11 @@ def test_a_number_that_is_none_is_found(dataset: Path) -> None:
 
 
 def test_a_split_that_leaks_is_found(dataset: Path) -> None:
-    rows = index.read(dataset).to_pylist()
+    rows = index.read_index(dataset).to_pylist()
     for row, side in zip(rows, ("train", "test"), strict=True):
         row.update(anatomy="mesh-1", split=side)
-    index.save(dataset, rows)
-    leaking = next(check for check in verify.run(dataset).checks if check.name == "splits")
+    index.save_rows(dataset, rows)
+    leaking = next(check for check in verify.verify_dataset(dataset).checks if check.name == "splits")
     assert leaking.offender == "index.parquet: anatomy mesh-1 is in test, train"
 
 
@@ -150,7 +150,7 @@ def test_a_broken_chunk_names_its_store(dataset: Path) -> None:
     shard = next((dataset / "000001.zarr/rgb/c").rglob("0"))
     shard = shard if shard.is_file() else next(path for path in shard.rglob("*") if path.is_file())
     shard.write_bytes(shard.read_bytes()[:-10])
-    report = verify.run(dataset)
+    report = verify.verify_dataset(dataset)
     readable = next(check for check in report.checks if check.name == "readable")
     assert readable.bad == 1
     assert readable.offender.startswith("000001.zarr: rgb: cannot be read")
@@ -168,4 +168,4 @@ def test_command_line_prints_json_and_exits_with_1_or_2(dataset: Path, tmp_path:
     nothing = runner.invoke(app, ["verify", str(tmp_path / "nothing")])
     assert nothing.exit_code == 2
     with pytest.raises(UserError, match="holds no dataset"):
-        verify.run(tmp_path)
+        verify.verify_dataset(tmp_path)

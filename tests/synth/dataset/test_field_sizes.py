@@ -30,7 +30,7 @@ def test_sizes_are_those_of_the_dataset(tmp_path: Path) -> None:
     files = [path for path in (tmp_path / "000000.zarr/flow").rglob("*") if path.is_file()]
     assert rows["flow"]["measured"] == pytest.approx(sum(path.stat().st_size for path in files) / 3)
     assert rows["flow"]["raw"] == 40 * 30 * 2 * 4
-    assert rows["flow_tvl1"]["measured"] == 0.0
+    assert rows["flow_recovered"]["measured"] == 0.0
 
 
 @pytest.mark.parametrize("size", ["640", "x480", "0x4", "axb"])

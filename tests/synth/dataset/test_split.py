@@ -30,7 +30,7 @@ def rows(count: int = 60, anatomies: int = 20) -> list[dict[str, Any]]:
 
 
 def sides(found: list[dict[str, Any]], rule: Rule) -> dict[int, str | None]:
-    return {row["index"]: side for row, side in zip(found, split.assign(found, rule), strict=True)}
+    return {row["index"]: side for row, side in zip(found, split.assign_sides(found, rule), strict=True)}
 
 
 def test_no_anatomy_is_on_two_sides_and_shares_are_kept() -> None:
@@ -88,22 +88,22 @@ def test_leaks_are_named() -> None:
 )
 def test_what_cannot_be_split_is_said_so(rule: Rule, message: str) -> None:
     with pytest.raises(UserError, match=message):
-        split.assign(rows(anatomies=60), rule)
+        split.assign_sides(rows(anatomies=60), rule)
 
 
 def test_words_of_a_command_line() -> None:
-    assert split.parse("family", "0.8, 0, 0.2", ["calf"]) == Rule("family", (0.8, 0.0, 0.2), ("calf",))
+    assert split.parse_rule("family", "0.8, 0, 0.2", ["calf"]) == Rule("family", (0.8, 0.0, 0.2), ("calf",))
     for by, shares in (("colour", "1,0,0"), ("family", "1,0"), ("family", "a,b,c")):
         with pytest.raises(UserError):
-            split.parse(by, shares, [])
+            split.parse_rule(by, shares, [])
 
 
 def test_a_dataset_of_one_brain_is_split_within_it_only_when_told() -> None:
     found = [{**row, "anatomy": "mesh-1"} for row in rows()]
     with pytest.raises(UserError, match=r"1 groups by sequence: too few .*--share-anatomy"):
-        split.assign(found, Rule("sequence"))
+        split.assign_sides(found, Rule("sequence"))
     rule = Rule("sequence", share_anatomy=True)
-    given = [{**row, "split": side} for row, side in zip(found, split.assign(found, rule), strict=True)]
+    given = [{**row, "split": side} for row, side in zip(found, split.assign_sides(found, rule), strict=True)]
     assert set(split.count(given)) == set(split.SIDES)
     assert not split.leaks(given, rule)
     assert split.leaks(given)[0].startswith("anatomy mesh-1 is in")
@@ -121,7 +121,7 @@ def test_sequences_on_one_users_brain_are_one_anatomy_in_every_dataset(tmp_path:
 
     def name(mesh: Path, point: float, seed: int) -> str:
         opening = {"point": (point, 0, 0), "direction": (0, 0, 1)}
-        return identity.anatomy(Job(anatomy={"mesh": mesh, "craniotomy": opening}), seed)  # type: ignore[arg-type]
+        return identity.identify_anatomy(Job(anatomy={"mesh": mesh, "craniotomy": opening}), seed)  # type: ignore[arg-type]
 
     assert name(brain, 0, 1) == name(copy, 5, 2) != name(other, 0, 1)
-    assert identity.anatomy(Job(), 1) != identity.anatomy(Job(), 2)
+    assert identity.identify_anatomy(Job(), 1) != identity.identify_anatomy(Job(), 2)

@@ -13,8 +13,7 @@ import zarr
 from fake_work import attributes, sequence
 
 from synth.checks import contents
-from synth.dataset import fast_read as shard
-from synth.dataset import store
+from synth.dataset import fast_read, store
 from synth.dataset.store import Dataset, Writer, open_sequence
 from synth.errors import NotFinite, UserError
 from synth.fields import FIELDS
@@ -76,7 +75,7 @@ def test_single_frames_are_those_that_zarr_reads(root: Path, monkeypatch: pytest
     found, plain = open_sequence(root / "000002.zarr"), zarr.open_group(str(root / "000002.zarr"), mode="r")
     for name in found.fields:
         column, array = found[name], plain[name]
-        fast = shard.of(array, root / "000002.zarr" / name)
+        fast = fast_read.open_frames(array, root / "000002.zarr" / name)
         assert (fast is not None) == FIELDS[name].framed
         for t in (0, 6, 2, -1, -7):
             assert np.array_equal(column[t], array[t])
@@ -133,7 +132,7 @@ def test_half_floats_are_read_as_floats_within_the_stated_error(root: Path, tmp_
     assert 0 < worst <= stated * (1 + 1e-3)
     assert stated < 0.004, "motion here is below 16 px"
     assert "rounding_px" not in exact.attrs["summary"]
-    assert all(measure.good for _, measure in contents.check(half, [0], False, Stopwatch()))
+    assert all(measure.good for _, measure in contents.check_contents(half, [0], False, Stopwatch()))
 
 
 def test_a_job_says_which_fields_are_kept(tmp_path: Path) -> None:

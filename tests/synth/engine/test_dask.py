@@ -8,11 +8,11 @@ import sys
 from pathlib import Path
 
 import pytest
-from fake_run import Silent, options, run_job, wait_for
+from fake_run import Silent, options, run_here, wait_for
 
 from evidence.engine.dask import local_cluster
 from synth.dataset.folder import Folder
-from synth.dataset.index import dataset_hash, read
+from synth.dataset.index import dataset_hash, read_index
 from synth.engine import run
 from synth.engine.dask import read_slurm, slurm
 from synth.errors import UserError
@@ -38,11 +38,11 @@ class Killing(Silent):
 def test_a_lost_worker_costs_nothing_but_time(tmp_path: Path) -> None:
     root = tmp_path / "cluster"
     with local_cluster(2) as (address, processes):
-        made = run.run(JOB, root, options("slow", engine=f"dask://{address}"), Killing(processes[0].pid))
+        made = run.run_job(JOB, root, options("slow", engine=f"dask://{address}"), Killing(processes[0].pid))
         wait_for(lambda: processes[0].poll() is not None)
     assert (made.done, made.failed) == (6, {})
-    run_job(tmp_path / "local", JOB.model_dump_json(), "sequence")
-    assert made.content_hash == dataset_hash(read(tmp_path / "local").to_pylist())
+    run_here(tmp_path / "local", JOB.model_dump_json(), "sequence")
+    assert made.content_hash == dataset_hash(read_index(tmp_path / "local").to_pylist())
     assert not list(root.glob("*.part"))
 
 
@@ -74,7 +74,7 @@ def test_an_earlier_runs_workers_see_that_its_turn_is_over(tmp_path: Path) -> No
 def test_no_scheduler_is_one_line_and_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("synth.engine.dask._CONNECT", "1s")
     with pytest.raises(UserError, match="no Dask scheduler answers"):
-        run.run(JOB, tmp_path / "out", options("sequence", engine="dask://127.0.0.1:9"), Silent())
+        run.run_job(JOB, tmp_path / "out", options("sequence", engine="dask://127.0.0.1:9"), Silent())
     assert not (tmp_path / "out").exists()
 
 

@@ -27,7 +27,7 @@ JOB = Job(seed=2, sequences=6, frames=3, render={"size": (32, 24)}, flow={"backe
 
 
 def run(root: Path, work: str = "sequence", job: Job = JOB, **more: object) -> Summary:
-    return engine.run(job, root, options(work, **more), Silent())
+    return engine.run_job(job, root, options(work, **more), Silent())
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +48,7 @@ def test_a_finished_dataset_has_its_index_film_and_job_and_is_left_alone(tmp_pat
     first = run(tmp_path / "out")
     for name in ("index.parquet", "preview.mp4", "job.yaml", "dataset.json"):
         assert (tmp_path / "out" / name).is_file()
-    rows = index.read(tmp_path / "out").to_pylist()
+    rows = index.read_index(tmp_path / "out").to_pylist()
     assert [row["index"] for row in rows] == list(range(6))
     before = {path: path.stat().st_mtime_ns for path in (tmp_path / "out").rglob("*/c/*")}
     again = run(tmp_path / "out")
@@ -188,7 +188,7 @@ def test_which_gpus_there_are(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.slow
 def test_an_account_says_rates_time_and_disk(tmp_path: Path) -> None:
     watcher = Silent()
-    engine.run(JOB, tmp_path, options("slow"), watcher)
+    engine.run_job(JOB, tmp_path, options("slow"), watcher)
     last = watcher.last
     assert (last.finished, last.left_s, last.in_flight) == (6, 0.0, {})
     assert last.step_s["fem"] >= 0.05
@@ -207,7 +207,7 @@ def test_a_clock_that_jumps_changes_nothing(
     jumping = options("sequence")
     (tmp_path / "sitecustomize.py").write_text(_JUMPING)
     path = os.pathsep.join([str(tmp_path), jumping.environment["PYTHONPATH"]])
-    made = engine.run(
+    made = engine.run_job(
         JOB, tmp_path / "out", dataclasses.replace(jumping, environment={"PYTHONPATH": path}), Silent()
     )
     assert made.content_hash == undisturbed
@@ -219,7 +219,7 @@ def test_trouble_costs_the_sequence_that_makes_it(tmp_path: Path, monkeypatch: p
     monkeypatch.setattr(engine, "_TRIES", 2)
     job = JOB.model_copy(update={"sequences": 9})
     watcher = Silent()
-    summary = engine.run(job, tmp_path / "out", options("troubled", memory_gb=0.5, workers=2), watcher)
+    summary = engine.run_job(job, tmp_path / "out", options("troubled", memory_gb=0.5, workers=2), watcher)
     assert summary.done == 4
     reasons = summary.failed
     assert "SIGABRT" in reasons[1]
@@ -229,7 +229,7 @@ def test_trouble_costs_the_sequence_that_makes_it(tmp_path: Path, monkeypatch: p
     assert reasons[6] == "the load is past the material's range"
     tries = {key: sum(attempt.index == key for attempt, _ in watcher.attempts) for key in range(9)}
     assert tries == {0: 1, 1: 2, 2: 2, 3: 1, 4: 2, 5: 1, 6: 1, 7: 2, 8: 1}
-    rows = {row["index"]: row for row in index.read(tmp_path / "out").to_pylist()}
+    rows = {row["index"]: row for row in index.read_index(tmp_path / "out").to_pylist()}
     assert rows[4]["status"] == "failed"
     assert rows[4]["reason"] == reasons[4]
     assert "by nought" in Folder(tmp_path / "out").failures()[4]["log"]

@@ -26,12 +26,12 @@ def test_status_during_and_after_a_run(tmp_path: Path) -> None:
     root = tmp_path / "out"
     run = start(root, JOB, "slow")
     wait_for(lambda: bool(root.exists() and (root / ".run/progress.json").exists()))
-    wait_for(lambda: bool(status.of(root).in_flight) or status.of(root).done == 6)
-    seen = status.of(root)
+    wait_for(lambda: bool(status.read_status(root).in_flight) or status.read_status(root).done == 6)
+    seen = status.read_status(root)
     assert seen.total == 6
     assert seen.running or seen.done == 6
     assert run.wait(timeout=60) == 0
-    after = status.of(root)
+    after = status.read_status(root)
     assert (after.done, after.failed, after.running, after.in_flight) == (6, {}, False, {})
     assert after.ahead.sequences == 0
     assert after.stages_cpu_s["render"] > 0
@@ -40,8 +40,8 @@ def test_status_during_and_after_a_run(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_failures_are_counted_by_reason_and_retried(tmp_path: Path) -> None:
     job = JOB.model_copy(update={"sequences": 7})
-    engine.run(job, tmp_path / "out", options("trying"), Silent())
-    seen = status.of(tmp_path / "out")
+    engine.run_job(job, tmp_path / "out", options("trying"), Silent())
+    seen = status.read_status(tmp_path / "out")
     assert (seen.done, seen.failed) == (5, {"the load is past the material's range": 2})
     text = CliRunner().invoke(app, ["status", str(tmp_path / "out")]).stdout
     assert "5 of 7 sequences done, 2 failed" in text
@@ -53,9 +53,9 @@ def test_failures_are_counted_by_reason_and_retried(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_forecast_rests_on_finished_sequences(tmp_path: Path) -> None:
     root = tmp_path / "out"
-    engine.run(JOB, root, options("sequence"), Silent())
+    engine.run_job(JOB, root, options("sequence"), Silent())
     whole = sum(size_forecast.size(path) for path in root.glob("*.zarr"))
-    ahead = size_forecast.of(JOB, root, 600, list(range(6)), 2.0)
+    ahead = size_forecast.forecast_rest(JOB, root, 600, list(range(6)), 2.0)
     assert ahead.bytes == pytest.approx(100 * whole, rel=1e-6)
     assert (ahead.cpu_s, ahead.pilot) == (1200.0, 6)
 
@@ -72,7 +72,7 @@ def test_a_disk_too_small_is_refused_before_anything_is_written(
     usage = namedtuple("usage", "total used free")
     monkeypatch.setattr(shutil, "disk_usage", lambda path: usage(10**9, 10**9, 10**5))
     with pytest.raises(UserError, match=r"6 sequences need .* the disk has 100 kB free"):
-        engine.run(JOB, tmp_path / "out", options("sequence"), Silent())
+        engine.run_job(JOB, tmp_path / "out", options("sequence"), Silent())
     assert not (tmp_path / "out").exists()
 
 

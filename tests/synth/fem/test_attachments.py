@@ -63,7 +63,7 @@ def test_a_falx_in_a_users_mesh_stands_in_the_meshs_own_axes(egg: Path) -> None:
     region = schema.Attachment(
         point=(12.0, 0.0, 12.0), normal=(0.0, 0.0, 1.0), radius_mm=18.0, thickness_mm=6.0, firm_per_mm=20.0
     )
-    surface = brain_surface.load(egg, OPENING)
+    surface = brain_surface.load_brain(egg, OPENING)
     placed = surface.placed((region,))[0]
     np.testing.assert_allclose(np.linalg.norm(placed.point), np.hypot(20, 12), rtol=0.02)
     assert abs(np.dot(placed.normal, (0, 0, 1))) < 1e-12
@@ -94,10 +94,10 @@ def test_an_attachment_without_tissue_or_direction_is_refused(tmp_path: Path) ->
     path = tmp_path / "job.yaml"
     path.write_text("anatomy: {attachments: [{point: [0, 0, -20], radius_mm: -1}]}\n")
     with pytest.raises(UserError, match=r"attachments.*radius_mm"):
-        reader.load(str(path))
+        reader.load_job(str(path))
     path.write_text("anatomy: {attachments: [{point: [0, 0, -20], radius_mm: 5, normall: [1, 0, 0]}]}\n")
     with pytest.raises(UserError, match="did you mean 'normal'"):
-        reader.load(str(path))
+        reader.load_job(str(path))
     path.write_text("anatomy: {attachments: [{radius_mm: 5}]}\n")
     with pytest.raises(UserError, match="point: is missing"):
-        reader.load(str(path))
+        reader.load_job(str(path))

@@ -61,7 +61,7 @@ def test_vtk_in_text_and_binary_of_both_generations(binary: bool, version: str, 
         out += b"\nCONNECTIVITY vtktypeint64\n" + block(flat, ">i8")
     path = tmp_path / "pyramid.vtk"
     path.write_bytes(out + b"\n")
-    vertices, faces = vtk.read(path)
+    vertices, faces = vtk.read_vtk(path)
     np.testing.assert_array_equal(vertices, points)
     assert len(faces) == 6
     assert trimesh.Trimesh(vertices, faces).volume == pytest.approx(4.0)
@@ -80,11 +80,11 @@ def test_a_bad_vtk_file_is_refused_in_one_line(text: str, tmp_path: Path) -> Non
     path = tmp_path / "bad.vtk"
     path.write_text(f"# vtk DataFile Version 3.0\n\nASCII\n{text}")
     with pytest.raises(UserError, match=r"bad\.vtk is no surface that can be read"):
-        brain_surface.load(path, OPENING)
+        brain_surface.load_brain(path, OPENING)
 
 
 def test_surface_is_merged_and_placed(egg: Path) -> None:
-    surface = brain_surface.load(egg, OPENING)
+    surface = brain_surface.load_brain(egg, OPENING)
     assert len(surface.vertices) < 700
     assert surface.vertices[:, 2].max() == pytest.approx(0.0, abs=0.3)
     assert np.ptp(surface.vertices[:, 2]) == pytest.approx(64, rel=0.01)
@@ -101,12 +101,12 @@ def test_axes_are_a_rotation_with_z_outwards() -> None:
 @pytest.mark.slow
 def test_open_surface_is_meshed_whole(egg: Path) -> None:
     anatomy = schema.Anatomy(mesh=egg, craniotomy=OPENING)
-    tets = tetrahedra.from_brain(brain_surface.load(egg, OPENING), anatomy, 800, 2)
+    tets = tetrahedra.from_brain(brain_surface.load_brain(egg, OPENING), anatomy, 800, 2)
     volume = bary_slope(tets.points[tets.cells[:, :4]])[1]
     assert volume.min() > 0
     # Faces lie on the surface in the mean, and not under it as chords.
     assert volume.sum() == pytest.approx(4 / 3 * np.pi * 32 * 26 * 22, rel=0.02)
-    again = tetrahedra.from_brain(brain_surface.load(egg, OPENING), anatomy, 800, 2)
+    again = tetrahedra.from_brain(brain_surface.load_brain(egg, OPENING), anatomy, 800, 2)
     assert np.array_equal(tets.points, again.points)
     assert np.array_equal(tets.cells, again.cells)
     assert not tets.fixed.any()
@@ -117,12 +117,12 @@ def test_no_volume_and_no_surface_at_the_craniotomy_are_refused(egg: Path, tmp_p
     sheet = tmp_path / "sheet.stl"
     trimesh.creation.box((50, 50, 0)).export(sheet)
     with pytest.raises(UserError, match="no volume"):
-        brain_surface.load(sheet, OPENING)
+        brain_surface.load_brain(sheet, OPENING)
     with pytest.raises(UserError, match="no surface within"):
-        brain_surface.load(egg, schema.Craniotomy(point=(90.0, 0.0, 0.0), direction=(1.0, 0.0, 0.0)))
+        brain_surface.load_brain(egg, schema.Craniotomy(point=(90.0, 0.0, 0.0), direction=(1.0, 0.0, 0.0)))
     with pytest.raises(UserError, match="no file"):
-        brain_surface.load(tmp_path / "none.obj", OPENING)
+        brain_surface.load_brain(tmp_path / "none.obj", OPENING)
     torn = tmp_path / "torn.ply"
     torn.write_text("ply\nformat ascii 1.0\nelement vertex 3\n")
     with pytest.raises(UserError, match=r"torn\.ply"):
-        brain_surface.load(torn, OPENING)
+        brain_surface.load_brain(torn, OPENING)

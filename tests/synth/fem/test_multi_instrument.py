@@ -162,9 +162,9 @@ def test_a_job_file_says_both_ways_and_is_refused_in_one_line(tmp_path: Path) ->
     path = tmp_path / "job.yaml"
     path.write_text("fem: {force_mn: 500}\n")
     with pytest.raises(UserError, match=r"force_mn 500 .*largest valid value is 1\.8"):
-        reader.load(str(path))
+        reader.load_job(str(path))
     path.write_text("fem: {law: linear, load: [0.1, 0.5]}\n")
     with pytest.raises(UserError, match=r"load 0\.5 .*largest valid value is 0\.2"):
-        reader.load(str(path))
+        reader.load_job(str(path))
     path.write_text("fem: {force_mn: 1.8}\n")
-    assert reader.load(str(path)).fem.force_mn == (1.8, 1.8)
+    assert reader.load_job(str(path)).fem.force_mn == (1.8, 1.8)

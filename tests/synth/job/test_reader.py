@@ -30,7 +30,7 @@ spp: 3
 
 def problems(text: str, *overrides: str, folder: Path | None = None) -> list[str]:
     with pytest.raises(UserError) as caught:
-        reader.parse(text, "job.yaml", folder or Path(), overrides)
+        reader.parse_job(text, "job.yaml", folder or Path(), overrides)
     return str(caught.value).splitlines()
 
 
@@ -65,7 +65,7 @@ def test_negative_stiffness_and_nan_are_refused() -> None:
 
 
 def test_overrides_win_and_name_themselves_when_wrong() -> None:
-    job = reader.parse(
+    job = reader.parse_job(
         "render: {spp: 2}", "job.yaml", Path(), ["render.spp=8", "render.size=[64, 48]", "fem.load=0.1"]
     )
     assert (job.render.spp, job.render.size, job.fem.load) == (8, (64, 48), (0.1, 0.1))
@@ -79,13 +79,13 @@ def test_overrides_win_and_name_themselves_when_wrong() -> None:
 def test_paths_start_at_the_job_file(tmp_path: Path) -> None:
     (tmp_path / "photo.jpg").write_bytes(b"x")
     (tmp_path / "job.yaml").write_text("appearance: {photo: photo.jpg}\n")
-    assert reader.load(str(tmp_path / "job.yaml")).appearance.photo == (tmp_path / "photo.jpg").resolve()
+    assert reader.load_job(str(tmp_path / "job.yaml")).appearance.photo == (tmp_path / "photo.jpg").resolve()
 
 
 def test_commented_file_and_dump_read_back_as_the_same_job() -> None:
     job = Job(seed=3, fem={"load": 0.05}, appearance={"families": ["pale", "calf"]}, render={"exr": True})
-    assert reader.parse(writer.commented(job), "job.yaml", Path()) == job
-    assert reader.parse(writer.dump(job), "job.yaml", Path()) == job
+    assert reader.parse_job(writer.commented(job), "job.yaml", Path()) == job
+    assert reader.parse_job(writer.dump_job(job), "job.yaml", Path()) == job
 
 
 def test_commented_file_explains_every_key() -> None:
@@ -97,31 +97,31 @@ def test_commented_file_explains_every_key() -> None:
 
 @pytest.mark.parametrize("name", reader.names())
 def test_named_jobs_are_valid(name: str) -> None:
-    assert reader.load(name).sequences >= 1
+    assert reader.load_job(name).sequences >= 1
 
 
 def test_named_jobs_are_those_promised() -> None:
     assert {"tiny", "demo", "paper"} <= set(reader.names())
     with pytest.raises(UserError, match="did you mean 'demo'"):
-        reader.load("demmo")
+        reader.load_job("demmo")
 
 
 def test_identity_is_of_what_shapes_a_sequence(tmp_path: Path) -> None:
-    assert identity.of(Job(sequences=3)) == identity.of(Job(sequences=30))
-    assert identity.of(Job(seed=1)) != identity.of(Job(seed=2))
+    assert identity.identify_job(Job(sequences=3)) == identity.identify_job(Job(sequences=30))
+    assert identity.identify_job(Job(seed=1)) != identity.identify_job(Job(seed=2))
     first, second = tmp_path / "a.jpg", tmp_path / "b.jpg"
     for file in (first, second):
         file.write_bytes(b"picture")
     jobs = [Job(appearance={"photo": file}) for file in (first, second)]
-    assert identity.of(jobs[0]) == identity.of(jobs[1])
+    assert identity.identify_job(jobs[0]) == identity.identify_job(jobs[1])
     second.write_bytes(b"another")
-    assert identity.of(jobs[0]) != identity.of(jobs[1])
+    assert identity.identify_job(jobs[0]) != identity.identify_job(jobs[1])
 
 
 def test_new_and_schema_from_the_command_line(tmp_path: Path) -> None:
     runner, path = CliRunner(), tmp_path / "my job.yaml"
     assert runner.invoke(app, ["new", str(path)]).exit_code == 0
-    assert reader.load(str(path)) == Job()
+    assert reader.load_job(str(path)) == Job()
     again = runner.invoke(app, ["new", str(path)])
     assert again.exit_code == 2
     assert "exists already" in again.stderr

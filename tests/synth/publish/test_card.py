@@ -31,7 +31,7 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
         card={"title": "Pulls: a test", "licence": "cc-by-4.0", "summary": "Made to be read."},
     )
     in_process(job, out, consistent)
-    preview_video.write(out)
+    preview_video.write_preview(out)
     return out
 
 
@@ -55,7 +55,7 @@ def test_every_field_and_column_is_described_and_absent_ones_are_not(root: Path)
 
 
 def test_numbers_are_those_of_the_index(root: Path) -> None:
-    stiffness = [row["young_kpa"] for row in index.read(root).to_pylist()]
+    stiffness = [row["young_kpa"] for row in index.read_index(root).to_pylist()]
     line = next(line for line in text(root).splitlines() if line.startswith("| Young's modulus"))
     assert [float(cell) for cell in line.split("|")[2:5]] == pytest.approx(
         [min(stiffness), float(np.median(stiffness)), max(stiffness)], rel=5e-3

@@ -34,7 +34,7 @@ JOB = Job(
 def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("croissant") / "out"
     in_process(JOB, out, consistent)
-    croissant.write(Folder(out))
+    croissant.write_croissant(Folder(out))
     return out
 
 
@@ -48,7 +48,7 @@ def test_public_validator_is_content_and_reads_the_records(root: Path) -> None:
     records = list(dataset.records("sequences"))
     assert [record["sequences/index"] for record in records] == [0, 1, 2, 3]
     assert [record["sequences/content_hash"].decode() for record in records] == [
-        row["content_hash"] for row in index.read(root).to_pylist()
+        row["content_hash"] for row in index.read_index(root).to_pylist()
     ]
 
 

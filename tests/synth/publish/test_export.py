@@ -46,7 +46,7 @@ def test_folder(root: Path, tmp_path: Path) -> None:
 
 def test_webdataset(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(export, "_SHARD_BYTES", 50_000)
-    export.export(root, tmp_path / "to", "webdataset")
+    export.export_dataset(root, tmp_path / "to", "webdataset")
     found = {}
     shards = sorted((tmp_path / "to").glob("*.tar"))
     for shard in shards:
@@ -66,7 +66,7 @@ def test_webdataset(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
 
 def test_hdf5(root: Path, tmp_path: Path) -> None:
     h5py = pytest.importorskip("h5py")
-    export.export(root, tmp_path / "to", "hdf5")
+    export.export_dataset(root, tmp_path / "to", "hdf5")
     with h5py.File(tmp_path / "to/000001.h5") as file:
         sequence = Dataset(root)[1]
         for name in sequence.fields:
@@ -76,7 +76,7 @@ def test_hdf5(root: Path, tmp_path: Path) -> None:
 
 
 def test_npz_of_the_published_code(root: Path, tmp_path: Path) -> None:
-    export.export(root, tmp_path / "to", "d2fnet-npz")
+    export.export_dataset(root, tmp_path / "to", "d2fnet-npz")
     files = sorted((tmp_path / "to").glob("*/brain_surface_*_auto_projected_*_2d.npz"))
     assert len(files) == 2
     sequence = Dataset(root)[0]
@@ -93,11 +93,11 @@ def test_npz_of_the_published_code(root: Path, tmp_path: Path) -> None:
 
 def test_refusals_leave_nothing(root: Path, tmp_path: Path) -> None:
     with pytest.raises(UserError, match="is not one of folder"):
-        export.export(root, tmp_path / "to", "excel")
+        export.export_dataset(root, tmp_path / "to", "excel")
     with pytest.raises(UserError, match="exists already"):
-        export.export(root, tmp_path, "folder")
+        export.export_dataset(root, tmp_path, "folder")
     with pytest.raises(UserError, match="no such folder"):
-        export.export(tmp_path / "nothing", tmp_path / "to", "folder")
+        export.export_dataset(tmp_path / "nothing", tmp_path / "to", "folder")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -114,8 +114,8 @@ def test_frames_are_those_of_the_store(root: Path) -> None:
         frames[6]
     with pytest.raises(UserError, match="no such field"):
         Frames(root, ["colour"])
-    with pytest.raises(UserError, match="has no flow_tvl1"):
-        Frames(root, ["flow_tvl1"])
+    with pytest.raises(UserError, match="has no flow_recovered"):
+        Frames(root, ["flow_recovered"])
 
 
 @pytest.mark.slow

@@ -54,7 +54,7 @@ def test_a_recording_holds_every_field_on_one_timeline(root: Path, tmp_path: Pat
     rerun = [sys.executable, "-m", "rerun", "rrd"]
     subprocess.run([*rerun, "verify", str(path)], check=True, capture_output=True)
     said = subprocess.run([*rerun, "print", str(path)], check=True, capture_output=True, text=True).stdout
-    for entity in ("camera/frame", "flow", "flow_tvl1", "traction", "force", "tissue"):
+    for entity in ("camera/frame", "flow", "flow_recovered", "traction", "force", "tissue"):
         assert f"- /{entity} - " in said
     assert "000000" in said
     assert "000001" in said

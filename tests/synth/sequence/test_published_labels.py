@@ -90,7 +90,7 @@ def regime(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_the_paper_job_is_the_published_regime() -> None:
-    job = reader.load("paper")
+    job = reader.load_job("paper")
     assert (job.fem.law, job.fem.order, job.fem.tets) == ("corotational", 1, 4096)
     assert (job.fem.young_kpa, job.fem.poisson) == ((0.5, 0.5), 0.4)
     assert (job.fem.time, job.fem.dt_s, job.fem.mass_kg, job.fem.damping) == ("dynamic", 0.03, 1.0, 2.0)
@@ -101,7 +101,7 @@ def test_the_paper_job_is_the_published_regime() -> None:
 
 @pytest.mark.slow
 def test_its_dataset_holds_noisy_labels_beside_the_truth_and_is_read_as_any_other(regime: Path) -> None:
-    report = verify.run(regime)
+    report = verify.verify_dataset(regime)
     assert report.good, [check.failures for check in report.checks]
     sequence = Dataset(regime)[0]
     flow, noisy = sequence["flow"][...], sequence["flow_noisy"][...]

@@ -75,7 +75,7 @@ class Fake:
 def found(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> search.Tuned:
     monkeypatch.setattr(search, "Probe", Fake)
     job = Job.model_validate({"seed": 1, "fem": {"gestures": ["pull"]}})
-    return search.run(job, search.Budget(0.03), tmp_path / "part", 2, 1, lambda done, total, words: None)
+    return search.tune_job(job, search.Budget(0.03), tmp_path / "part", 2, 1, lambda done, total, words: None)
 
 
 def test_a_promise_that_does_not_hold_is_given_up(found: search.Tuned) -> None:
@@ -108,7 +108,7 @@ def test_a_job_within_the_budget_is_better_than_full_fidelity(
     monkeypatch.setattr(search, "Probe", Fake)
     monkeypatch.setattr(search, "joint", joint)
     job = Job.model_validate({"seed": 1, "fem": {"gestures": ["pull"], "law": "neo-hookean"}})
-    done = search.run(job, search.Budget(0.03), tmp_path / "part", 1, 0, lambda done, total, words: None)
+    done = search.tune_job(job, search.Budget(0.03), tmp_path / "part", 1, 0, lambda done, total, words: None)
     assert len(done.tried) > 1
     assert done.best.levels == done.own.levels
     assert tuned_job.changes(done) == []
@@ -123,7 +123,7 @@ def test_what_turns_out_dearer_is_not_taken(monkeypatch: pytest.MonkeyPatch, tmp
 
     monkeypatch.setattr(search, "Probe", Fake)
     monkeypatch.setattr(search, "joint", joint)
-    done = search.run(JOB, search.Budget(0.05), tmp_path / "part", 1, 0, lambda done, total, words: None)
+    done = search.tune_job(JOB, search.Budget(0.05), tmp_path / "part", 1, 0, lambda done, total, words: None)
     assert done.own.error <= 0.05
     assert done.tried[0].error <= 0.05
     assert done.best.cost <= done.own.cost
@@ -140,7 +140,7 @@ def test_a_promise_that_is_more_than_kept_leads_to_a_cheaper_one(
 
     monkeypatch.setattr(search, "Probe", Fake)
     monkeypatch.setattr(search, "joint", joint)
-    done = search.run(JOB, search.Budget(0.03), tmp_path / "part", 1, 0, lambda done, total, words: None)
+    done = search.tune_job(JOB, search.Budget(0.03), tmp_path / "part", 1, 0, lambda done, total, words: None)
     assert done.best.promised > 0.03 >= done.best.error
     assert done.best.cost == min(one.cost for one in done.tried if one.error <= 0.03)
 
@@ -161,7 +161,7 @@ def test_a_sequence_that_breaks_a_promise_is_asked_which_knob_did_it(
             return found
 
     monkeypatch.setattr(search, "Probe", Fast)
-    done = search.run(JOB, search.Budget(0.03), tmp_path / "part", 1, 1, lambda done, total, words: None)
+    done = search.tune_job(JOB, search.Budget(0.03), tmp_path / "part", 1, 1, lambda done, total, words: None)
     assert done.tried[0].errors[1] > 0.2
     assert done.best.error <= 0.03
     levels = dict(zip((knob.name for knob in done.knobs), done.best.levels, strict=True))
@@ -179,7 +179,7 @@ def test_other_pictures_are_no_cheaper_ones(monkeypatch: pytest.MonkeyPatch, tmp
 
     monkeypatch.setattr(search, "Probe", Matte)
     job = Job.model_validate({"seed": 1, "fem": {"gestures": ["pull"]}})
-    done = search.run(job, search.Budget(0.03), tmp_path / "part", 2, 1, lambda done, total, words: None)
+    done = search.tune_job(job, search.Budget(0.03), tmp_path / "part", 2, 1, lambda done, total, words: None)
     assert max(row.saved for row in done.rows if row.knob == "light") > 0.2
     levels = dict(zip((knob.name for knob in done.knobs), done.best.levels, strict=True))
     assert (levels["light"], levels["depth of field"]) == ("wet highlights", "lens")
@@ -193,7 +193,7 @@ def test_nothing_but_full_fidelity_keeps_a_tiny_budget(
     job = Job.model_validate(
         {"seed": 1, "flow": {"backend": "dis"}, "light": {"glare": 0}, "render": {"aperture_mm": 0}}
     )
-    done = search.run(job, search.Budget(1e-4), tmp_path / "part", 1, 0, lambda done, total, words: None)
+    done = search.tune_job(job, search.Budget(1e-4), tmp_path / "part", 1, 0, lambda done, total, words: None)
     assert done.best.error == 0
     levels = dict(zip((knob.name for knob in done.knobs), done.best.levels, strict=True))
     assert (levels["tets"], levels["spp"], levels["size"]) == ("4000 P2", "8", "640 x 480")
@@ -202,7 +202,7 @@ def test_nothing_but_full_fidelity_keeps_a_tiny_budget(
 def test_the_written_job_is_the_persons_own(found: search.Tuned, tmp_path: Path) -> None:
     source, out = tmp_path / "job.yaml", tmp_path / "tuned.yaml"
     source.write_text("seed: 1  # mine\nfem:\n  gestures: [pull]  # only these\n")
-    job = tuned_job.write(found, str(source), [], out)
+    job = tuned_job.write_tuned(found, str(source), [], out)
     text = out.read_text()
     assert "# mine" in text
     assert "# only these" in text
@@ -215,8 +215,8 @@ def test_the_written_job_is_the_persons_own(found: search.Tuned, tmp_path: Path)
     }
     assert different == changed
     with pytest.raises(UserError, match="exists already"):
-        tuned_job.write(found, str(source), [], out)
-    assert reader.load(str(out)) == job
+        tuned_job.write_tuned(found, str(source), [], out)
+    assert reader.load_job(str(out)) == job
 
 
 def test_a_journal_is_of_one_job_and_survives_being_cut_off(tmp_path: Path) -> None:
@@ -240,19 +240,19 @@ def test_a_budget_that_is_none(text: str) -> None:
 
 
 def test_knobs_follow_the_job() -> None:
-    names = {knob.name for knob in knobs.of(Job.model_validate({"fem": {"time": "dynamic"}}))}
+    names = {knob.name for knob in knobs.list_knobs(Job.model_validate({"fem": {"time": "dynamic"}}))}
     assert names == {"law", "tets", "time", "vertices", "size", "spp", "depth of field", "light", "warps"}
     ideal = Job.model_validate({"flow": {"backend": "ideal"}})
-    assert {knob.name for knob in knobs.of(ideal)} == {"law", "tets"}
+    assert {knob.name for knob in knobs.list_knobs(ideal)} == {"law", "tets"}
     with pytest.raises(UserError, match="subsurface"):
-        knobs.of(Job.model_validate({"render": {"subsurface": "volume"}}))
+        knobs.list_knobs(Job.model_validate({"render": {"subsurface": "volume"}}))
 
 
 def test_every_level_is_a_job() -> None:
-    job = reader.load("paper")
-    for knob in knobs.of(job):
+    job = reader.load_job("paper")
+    for knob in knobs.list_knobs(job):
         for level in knob.levels:
-            knobs.changed(job, knobs.finest(knobs.of(job)) | dict(level.changes))
+            knobs.changed(job, knobs.finest(knobs.list_knobs(job)) | dict(level.changes))
 
 
 def test_command_refuses_in_one_line(tmp_path: Path) -> None:
