@@ -26,7 +26,7 @@ def test_scenes_share_their_kernels() -> None:
     import mitsuba as mi
 
     mi.set_variant("llvm_ad_rgb")
-    job = reader.read_job("demo", SMALL)
+    job = reader.load_job("demo", SMALL)
     tips = np.array([[0.0, 0.0, 4.0], [1.0, 0.0, 4.0]])
     shafts = np.tile([0.3, 0.2, 0.93], (2, 1))
     large = []
