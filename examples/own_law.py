@@ -66,7 +66,7 @@ def peak_mm(b: float | None, load: float = 0.3, radius_mm: float = 5.0) -> float
     carry = surface_embedding.embedding(tets, vertices)
     pull = carry.T @ (np.outer(area * pressure, [0.0, 0.0, 1.0]))
     course = np.linspace(0, 1, 5)
-    path = equilibrium.follow(system, course[:, None, None] * pull, course * load)
+    path = equilibrium.solve_path(system, course[:, None, None] * pull, course * load)
     return float(np.linalg.norm(carry @ path.displacement[-1], axis=1).max())
 
 

@@ -105,7 +105,7 @@ def added(
     size = max(float(np.vdot(load, linear)), 0.0) ** 0.5
     safe = np.zeros_like(linear)
     begin = linear if start is None else start
-    moved, state, rest = equilibrium.balance(tissue.system, load, begin, _TOLERANCE * size, safe)
+    moved, state, rest = equilibrium.minimise_energy(tissue.system, load, begin, _TOLERANCE * size, safe)
     if not np.isfinite(state.energy) or rest > _FAILED * size:
         return None
     return picture(tissue.seen, moved - linear), moved

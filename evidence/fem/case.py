@@ -75,7 +75,7 @@ def brain(
 def moved(case: Brain, load: float, way: str, steps: int = 3) -> Floats:
     """(V, 3) mm under a load that was raised in a few steps."""
     part = np.linspace(0, 1, steps + 1)
-    path = equilibrium.follow(case.system, part[:, None, None] * case.load(load, way), load * part)
+    path = equilibrium.solve_path(case.system, part[:, None, None] * case.load(load, way), load * part)
     return np.asarray(case.carry @ path.displacement[-1])
 
 
@@ -89,7 +89,7 @@ def speed(case: Brain, load: float, way: str, frames: int = 60) -> float:
     part = tool.course(_gesture(), frames).load
     loads = part[:, None, None] * case.load(load, way)
     start = time.process_time()
-    path = equilibrium.follow(case.system, loads, load * part)
+    path = equilibrium.solve_path(case.system, loads, load * part)
     for u in path.displacement:
         case.carry @ u
     return 1e3 * (time.process_time() - start) / frames

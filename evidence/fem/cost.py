@@ -47,7 +47,7 @@ def gestures(on: case.Patch, load: float) -> list[Row]:
             )
             loads = np.stack([carry.T @ (on.area[:, None] * t) for t in traction])
             start = time.process_time()
-            path = equilibrium.follow(system, loads, np.full(_FRAMES, load))
+            path = equilibrium.solve_path(system, loads, np.full(_FRAMES, load))
             for u in path.displacement:
                 carry @ u
             spent = 1e3 * (time.process_time() - start) / _FRAMES
@@ -82,7 +82,7 @@ def _sequence(law: str, load: float) -> Row:
     contact = gesture.contacts[0]
     kernel = tool.footprint(np.asarray(contact.point_mm), gesture.footprint_mm, on.vertices, on.area)
     peak = np.outer(carry.T @ (on.area * kernel), contact.force_mn)
-    equilibrium.follow(system, part[:, None, None] * peak, load * part)
+    equilibrium.solve_path(system, part[:, None, None] * peak, load * part)
     times.append(time.process_time())
     spent = dict(zip(("mesh", "fem", "embedding", "factor", "equilibrium"), np.diff(times), strict=True))
     return {"law": law, "load": load, "peak_rss_mb": memory} | {f"{k}_s": float(v) for k, v in spent.items()}

@@ -117,9 +117,9 @@ def contacts(
         if law == "linear":  # by itself: `follow` refuses elements that such loads turn inside out
             moved = block.system.solve(load)
         else:
-            moved = equilibrium.follow(block.system, np.stack([0.5 * load, load]), np.zeros(2)).displacement[
-                -1
-            ]
+            moved = equilibrium.solve_path(
+                block.system, np.stack([0.5 * load, load]), np.zeros(2)
+            ).displacement[-1]
         forces[k] = TO_CAMERA @ (size * way)
         fields.append(picture(seen, moved))
     return forces, fields

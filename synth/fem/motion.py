@@ -15,7 +15,7 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
-from synth.fem.equilibrium import TOLERANCE, NoEquilibrium, Path, balance, check
+from synth.fem.equilibrium import TOLERANCE, NoEquilibrium, Path, check_state, minimise_energy
 from synth.fem.mesh.element import bary_slope
 from synth.fem.mesh.tetrahedra import Tets
 from synth.fem.system import State, assemble
@@ -39,7 +39,7 @@ class Clock:
     """Prony terms: the part of the stiffness that is lost, and its time [s]."""
 
 
-def march(
+def march_in_time(
     tets: Tets, law: str, poisson: float, young_kpa: float, loads: Floats, named: Floats, clock: Clock
 ) -> Path:
     """Motion from rest under loads at even times; between them they change evenly.
@@ -54,7 +54,7 @@ def march(
         clock: time.
 
     Raises:
-        As `equilibrium.follow`.
+        As `equilibrium.solve_path`.
     """
     dt = clock.step_s / clock.substeps
     fade = [(g, tau, np.exp(-dt / tau), tau / dt * -np.expm1(-dt / tau)) for g, tau in clock.relaxation]
@@ -79,15 +79,15 @@ def march(
             if pull:
                 ahead = ((2 * u - before) / dt**2 + clock.damping / dt * u) / pull
                 load = load + pull * mass[:, None] * ahead
-            new, state, rest = balance(system, load / firm, u + (u - before), TOLERANCE * size, u)
-            check(system, new, state, t, float(named[t]))
+            new, state, norm = minimise_energy(system, load / firm, u + (u - before), TOLERANCE * size, u)
+            check_state(system, new, state, t, float(named[t]))
             now = tissue.state(new).force
             for k, (g, _, decay, even) in enumerate(fade):
                 history[k] = decay * history[k] + g * even * (now - elastic)
             before, u, elastic = u, new, now
-            if rest > 2 * TOLERANCE * size:
+            if norm > 2 * TOLERANCE * size:
                 raise NoEquilibrium(f"frame {t}: no equilibrium at load {named[t]:.3g}; lower the load")
-        states.append((u, tissue.state(u), rest / size))
+        states.append((u, tissue.state(u), norm / size))
     return Path(
         np.stack([u for u, _, _ in states]),
         np.array([s.jacobian for _, s, _ in states]),

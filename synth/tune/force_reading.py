@@ -84,7 +84,7 @@ def fit(
     carry = surface_embedding.embedding(tets, surface.vertices)
     young = case.tissue.young_kpa
     loads = np.stack([carry.T @ (motion.area[:, None] * motion.traction[f]) for f in frames]) / young
-    path = equilibrium.follow(system, loads, np.zeros(len(frames)))
+    path = equilibrium.solve_path(system, loads, np.zeros(len(frames)))
     size = float(np.sqrt(np.square(motion.by_instrument[frames]).sum(axis=(1, 2)).mean()))
     courses = [tool.course(gesture, job.frames) for gesture in case.gestures]
     rules = []

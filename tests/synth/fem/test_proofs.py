@@ -162,7 +162,7 @@ def loaded(law: str, load: float, kind: str) -> tuple[System, Floats]:
 def test_fast_solver_agrees_with_newtons_method(law: str, kind: str) -> None:
     system, load = loaded(law, 0.15, kind)
     part = np.array([0.0, 0.4, 0.8, 1.0])
-    path = equilibrium.follow(system, part[:, None, None] * load, 0.15 * part)
+    path = equilibrium.solve_path(system, part[:, None, None] * load, 0.15 * part)
     exact = newton(system, load, path.displacement[-1], 1e-8)
     assert np.linalg.norm(path.displacement[-1] - exact) <= 1e-3 * np.linalg.norm(exact)
 
@@ -172,8 +172,8 @@ def test_a_guess_past_inversion_does_not_spoil_the_step() -> None:
     still = np.zeros_like(load)
     wild = np.random.default_rng(0).normal(size=load.shape) * 20
     assert not np.isfinite(system.state(wild).energy)
-    u, state, rest = equilibrium.balance(system, load, wild, 1e-3, still)
-    usual, _, _ = equilibrium.balance(system, load, still, 1e-3, still)
+    u, state, rest = equilibrium.minimise_energy(system, load, wild, 1e-3, still)
+    usual, _, _ = equilibrium.minimise_energy(system, load, still, 1e-3, still)
     assert np.isfinite(state.energy)
     assert rest <= 1e-3
     np.testing.assert_array_equal(u, usual)
