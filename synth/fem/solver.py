@@ -92,12 +92,12 @@ def deform(
         [tool.tractions(g, over, skin_vertices, area) for g, over in zip(gestures, courses, strict=True)],
         axis=0,
     )
-    carry = surface_embedding.embedding(tets, skin_vertices)
+    carry = surface_embedding.embed(tets, skin_vertices)
     # One load per kPa of E; displacement depends on no more than that.
-    loads = np.stack([carry.T @ (area[:, None] * t) for t in traction / tissue.young_kpa])
+    loads = np.stack([carry.gather(area[:, None] * t) for t in traction / tissue.young_kpa])
     named = np.max([g.load * over.load for g, over in zip(gestures, courses, strict=True)], axis=0)
     path = solve_volume(fem, tissue, tets, loads, named, fps)
-    displacement = np.stack([carry @ u for u in path.displacement])
+    displacement = np.stack([carry.move(u) for u in path.displacement])
     tip, shaft = place_instruments(gestures, courses, skin_vertices, skin_faces, displacement)
     forces = [
         np.outer(over.load, np.sum([c.force_mn for c in g.contacts], axis=0))

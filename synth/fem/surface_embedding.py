@@ -1,6 +1,17 @@
-"""The fine surface on the volume mesh: it follows by a sparse matrix B, and its loads go back by B'."""
+"""The fine surface on the volume mesh: it rides on the nearest place of it, and its loads go back there.
+
+What stands out of the mesh (vessels, or the gap between a smooth surface and flat faces) is carried by a
+rigid motion: the displacement u(p) of the nearest place p, and the rotation there for the rest of the way,
+
+    u(x) = u(p) + w(p) x (x - p),    w = 1/2 curl u.
+
+The whole gradient would carry strain as well, and its transpose would turn every force out there into a pair
+of opposed forces on one element, without bound as elements get smaller.
+"""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse as sp
@@ -14,19 +25,45 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 
-def embedding(tets: Tets, vertices: Floats) -> sp.csr_array:
-    """Matrix that carries nodal displacement to surface vertices.
+@dataclass(frozen=True, eq=False)
+class Embedding:
+    """V points of a surface on a volume of N nodes. `gather` is the transpose of `move`: work is kept, and
+    since `move` holds every rigid motion, so are force and moment."""
 
-    A vertex takes the value at the nearest place of the volume and, for the rest of the way, the gradient
-    there: rows sum to 1 and linear fields come back exactly, inside and outside; B' keeps force and moment.
+    value: sp.csr_array
+    """(V, N) shape functions at the nearest places."""
+    corner: sp.csr_array
+    """(V, 4 K) where the nearest places are, of the 4 corners of K tetrahedra: the gradient is even there."""
+    spin: sp.csr_array
+    """(12 K, 3 N) half the displacement's curl at those corners."""
+    arm: Floats
+    """(V, 3) mm from the nearest place."""
 
-    Args:
-        tets: the volume.
-        vertices: (V, 3) mm; inside, or a little outside.
+    def move(self, u: Floats) -> Floats:
+        """Displacement (V, 3, ...) mm of the points, from the nodes' (N, 3, ...) mm."""
+        moved = (self.value @ u.reshape(len(u), -1)).reshape(-1, *u.shape[1:])
+        if self.corner.shape[1] == 0:
+            return np.asarray(moved)
+        spin = self.spin @ u.reshape(3 * len(u), -1)
+        turned = self.corner @ spin.reshape(self.corner.shape[1], -1)
+        return np.asarray(moved + _cross(turned.reshape(moved.shape), self._arm(moved)))
 
-    Returns:
-        (V, N).
-    """
+    def gather(self, force: Floats) -> Floats:
+        """Nodal forces (N, 3, ...) mN, from those at the points, (V, 3, ...) mN."""
+        flat = force.reshape(len(force), -1)
+        nodal = (self.value.T @ flat).reshape(-1, *force.shape[1:])
+        if self.corner.shape[1] == 0:
+            return np.asarray(nodal)
+        moment = _cross(self._arm(force), force).reshape(flat.shape)
+        couple = self.spin.T @ (self.corner.T @ moment).reshape(self.spin.shape[0], -1)
+        return np.asarray(nodal + couple.reshape(nodal.shape))
+
+    def _arm(self, like: Floats) -> Floats:
+        return self.arm.reshape(*self.arm.shape, *(1,) * (like.ndim - 2))
+
+
+def embed(tets: Tets, vertices: Floats) -> Embedding:
+    """Puts surface vertices (V, 3) mm, inside a volume or a little outside, where they ride on it."""
     outer = np.zeros(len(tets.points), bool)
     outer[boundary(tets.cells[:, :4], 1)] = True
     reach = vertices.min(axis=0), vertices.max(axis=0)
@@ -41,14 +78,37 @@ def embedding(tets: Tets, vertices: Floats) -> sp.csr_array:
         np.ascontiguousarray(corner[chosen]), slope[chosen], np.ascontiguousarray(vertices)
     )
     owner = chosen[owner]
-    place = np.einsum("vc,vcd->vd", bary, corner[owner])
-    step = np.einsum("vcd,vd->vc", slope[owner], vertices - place)
-    value = shape(bary, tets.order)
-    if np.abs(step).max(initial=0) > 0:
-        value = value + np.einsum("vnc,vc->vn", shape_slope(bary, tets.order), step)
+    arm = vertices - np.einsum("vc,vcd->vd", bary, corner[owner])
     rows = np.repeat(np.arange(len(vertices)), tets.cells.shape[1])
     size = (len(vertices), len(tets.points))
-    return sp.coo_array((value.ravel(), (rows, tets.cells[owner].ravel())), shape=size).tocsr()
+    value = sp.coo_array((shape(bary, tets.order).ravel(), (rows, tets.cells[owner].ravel())), shape=size)
+    outside = np.flatnonzero(np.abs(arm).max(axis=1) > 1e-9)
+    used, place = np.unique(owner[outside], return_inverse=True)
+    columns = 4 * place[:, None] + np.arange(4)
+    where = sp.coo_array(
+        (bary[outside].ravel(), (np.repeat(outside, 4), columns.ravel())),
+        shape=(len(vertices), 4 * len(used)),
+    )
+    return Embedding(value.tocsr(), where.tocsr(), _half_curl(tets, used, slope[used]), arm)
+
+
+def _half_curl(tets: Tets, used: Ints, slope: Floats) -> sp.csr_array:
+    """Half the curl at the corners of K tetrahedra, (12 K, 3 N) 1/mm; `slope` (K, 4, 3) of barycentrics."""
+    gradient = np.einsum("cnb,kbd->kcnd", shape_slope(np.eye(4), tets.order), slope)  # (K, 4, n, 3)
+    nodes = np.broadcast_to(tets.cells[used][:, None, :], gradient.shape[:3])
+    at = np.broadcast_to(np.arange(4 * len(used)).reshape(-1, 4, 1), gradient.shape[:3])
+    half = [(i, j, k, 0.5) for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1))]
+    half += [(i, k, j, -0.5) for i, j, k, _ in half]  # curl_i = d_j u_k - d_k u_j
+    rows = np.concatenate([(3 * at + i).ravel() for i, _, _, _ in half])
+    columns = np.concatenate([(3 * nodes + k).ravel() for _, _, k, _ in half])
+    values = np.concatenate([(sign * gradient[..., j]).ravel() for _, j, _, sign in half])
+    size = (12 * len(used), 3 * len(tets.points))
+    return sp.coo_array((values, (rows, columns)), shape=size).tocsr()
+
+
+def _cross(a: Floats, b: Floats) -> Floats:
+    """Of vectors along axis 1."""
+    return np.stack([a[:, i] * b[:, j] - a[:, j] * b[:, i] for i, j in ((1, 2), (2, 0), (0, 1))], axis=1)
 
 
 def vertex_area(vertices: Floats, faces: NDArray[np.integer]) -> Floats:

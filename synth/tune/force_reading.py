@@ -81,9 +81,9 @@ def fit(
     )
     tets = pipeline.build(job.model_copy(update={"fem": plain}), case)[1]
     system = assemble(tets, "neo-hookean", case.tissue.poisson)
-    carry = surface_embedding.embedding(tets, surface.vertices)
+    carry = surface_embedding.embed(tets, surface.vertices)
     young = case.tissue.young_kpa
-    loads = np.stack([carry.T @ (motion.area[:, None] * motion.traction[f]) for f in frames]) / young
+    loads = np.stack([carry.gather(motion.area[:, None] * motion.traction[f]) for f in frames]) / young
     path = equilibrium.solve_path(system, loads, np.zeros(len(frames)))
     size = float(np.sqrt(np.square(motion.by_instrument[frames]).sum(axis=(1, 2)).mean()))
     courses = [tool.course(gesture, job.frames) for gesture in case.gestures]
@@ -101,15 +101,15 @@ def fit(
         columns = []
         for gesture, over in zip(case.gestures, courses, strict=True):
             # A load of the sequence's size along the instrument's direction: errors come out as parts of it.
-            pull = np.zeros_like(carry.T @ now)
+            pull = np.zeros_like(tets.points)
             for contact in gesture.contacts:
                 centre = np.asarray(contact.point_mm) + over.shift[frame]
                 kernel = tool.footprint(centre, gesture.footprint_mm, surface.vertices, motion.area)
-                pull += np.outer(carry.T @ (motion.area * kernel), contact.force_mn)
+                pull += carry.gather(np.outer(motion.area * kernel, contact.force_mn))
             pull *= size / (young * gesture.force_mn)
             answer = np.zeros(pull.size)
             answer[system.free] = factor.solve(pull.ravel()[system.free])
-            way = carry @ answer.reshape(-1, 3)
+            way = carry.move(answer.reshape(-1, 3))
             step = _STEP_MM / np.abs(way).max()
             flow = (cameras.project(camera, now + step * way) - seen) / step
             columns.append(cells(truth.at_rest_pixels(still, surface.faces, flow), still.tissue))
