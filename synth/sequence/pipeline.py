@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from synth.dataset.store import Writer
 from synth.fem import solver, tool
 from synth.fem.mesh import tetrahedra
+from synth.fem.mesh.relief import HeightMap
 from synth.fem.mesh.tetrahedra import Tets
 from synth.fem.solver import Deformation
 from synth.fields import FIELDS
@@ -161,7 +162,8 @@ def build(job: Job, case: Scenario) -> tuple[Surface, Tets]:
     focus = [place for gesture in case.gestures for place in tool.focus(gesture)]
     surface, whole = cortex(job, case)
     if whole is None:
-        return surface, tetrahedra.block(job.anatomy, job.fem.tets, job.fem.order, focus)
+        height = HeightMap(surface.pia, surface.extent_mm)
+        return surface, tetrahedra.block(job.anatomy, job.fem.tets, job.fem.order, focus, height)
     return surface, tetrahedra.from_brain(whole, job.anatomy, job.fem.tets, job.fem.order, focus)
 
 
