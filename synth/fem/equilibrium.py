@@ -33,7 +33,7 @@ class Path:
     displacement: Floats
     """(T, N, 3) mm."""
     jacobian: Floats
-    """(T,) smallest det F."""
+    """(T,) smallest det F, at quadrature points and the elements' corners."""
     energy: Floats
     """(T,) mN mm."""
     residual: Floats
@@ -54,7 +54,7 @@ def solve_path(system: System, loads: Floats, named: Floats) -> Path:
         NotFinite: a number is none.
     """
     path: list[tuple[Floats, State]] = []
-    residual = np.zeros(len(loads))
+    residual, least = np.zeros(len(loads)), np.ones(len(loads))
     peak = loads[np.abs(loads).max(axis=(1, 2)).argmax()]
     linear = _LinearResponse(system)
     at_peak = linear(peak)
@@ -79,7 +79,7 @@ def solve_path(system: System, loads: Floats, named: Floats) -> Path:
             residual[step] = norm / scale
             if proportional and all(abs(factor - k) > 1e-3 for k, _ in known):
                 known.append((factor, u))
-        check_state(system, u, state, step, float(named[step]))
+        least[step] = check_state(system, u, state, step, float(named[step]))
         if residual[step] > TOLERANCE:
             raise NoEquilibrium(
                 f"frame {step}: no equilibrium at load {named[step]:.3g} "
@@ -88,7 +88,7 @@ def solve_path(system: System, loads: Floats, named: Floats) -> Path:
         path.append((u, state))
     return Path(
         np.stack([u for u, _ in path]),
-        np.array([s.jacobian for _, s in path]),
+        least,
         np.array([s.energy for _, s in path]),
         residual,
     )
@@ -119,15 +119,21 @@ class _LinearResponse:
         return u + left * response
 
 
-def check_state(system: System, u: Floats, state: State, frame: int, load: float) -> None:
-    """Refuses displacements u (N, 3) mm that are no deformation: `NotFinite` or `InvertedElement`."""
+def check_state(system: System, u: Floats, state: State, frame: int, load: float) -> float:
+    """Smallest det F; refuses displacements u (N, 3) mm that are no deformation.
+
+    Raises:
+        NotFinite, InvertedElement
+    """
     if not np.isfinite(u).all() or not np.isfinite(state.energy):
         raise NotFinite(f"frame {frame}: the deformation at load {load:.3g} is not finite")
-    if state.jacobian <= LEAST_JACOBIAN:
+    least, element = system.least_jacobian(u)
+    if least <= LEAST_JACOBIAN:
         raise InvertedElement(
-            f"frame {frame}: load {load:.3g} turns element {system.worst(u)} inside out or nearly so "
-            f"(det F {state.jacobian:.2f}, more than {LEAST_JACOBIAN:g} is needed); lower the load"
+            f"frame {frame}: load {load:.3g} turns element {element} inside out or nearly so "
+            f"(det F {least:.2f}, more than {LEAST_JACOBIAN:g} is needed); lower the load"
         )
+    return least
 
 
 def minimise_energy(

@@ -47,7 +47,7 @@ class Deformation:
     shaft: Floats
     """(T, 2 I, 3) unit vectors from tip to hand."""
     min_jacobian: Floats
-    """(T,) smallest det F in the volume."""
+    """(T,) smallest det F in the volume, at quadrature points and corners."""
     energy: Floats
     """(T,) mN mm stored."""
     residual: Floats
@@ -131,7 +131,7 @@ def solve_volume(
     if fem.time == "quasi-static" and not fem.relaxation:
         return equilibrium.solve_path(assemble(tets, tissue.law, tissue.poisson), loads, named)
     return motion.march_in_time(
-        tets, tissue.law, tissue.poisson, tissue.young_kpa, loads, named, clock(fem, fps)
+        tets, tissue.law, tissue.poisson, tissue.young_kpa, loads, named, clock(fem, fps, tets)
     )
 
 
@@ -151,10 +151,11 @@ def place_instruments(
     return np.concatenate([tip for tip, _ in poses], axis=1), np.concatenate([s for _, s in poses], axis=1)
 
 
-def clock(fem: schema.Fem, fps: float) -> motion.Clock:
+def clock(fem: schema.Fem, fps: float, tets: Tets) -> motion.Clock:
     """Steps no longer than `fem.dt_s`, a whole number of them a frame."""
     dynamic = fem.time == "dynamic"
     substeps = int(np.ceil(1 / fps / fem.dt_s - 1e-9)) if dynamic else 1
+    mass = fem.mass_kg or fem.density_kg_m3 * 1e-9 * motion.volume(tets).sum()
     return motion.Clock(
-        1 / fps, substeps, fem.mass_kg if dynamic else 0.0, fem.damping if dynamic else 0.0, fem.relaxation
+        1 / fps, substeps, float(mass) if dynamic else 0.0, fem.damping if dynamic else 0.0, fem.relaxation
     )

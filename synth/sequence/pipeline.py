@@ -133,15 +133,18 @@ def render_sequence(job: Job, index: int, folder: Path, report: Report) -> Path:
         scale_mm_per_px=float(still.scale_mm_per_px),
         young_kpa=case.tissue.young_kpa,
         poisson=case.tissue.poisson,
-        mechanics=_mechanics(case, motion, rotation),
+        mechanics=_mechanics(job, case, motion, rotation),
         variant=studio.variant,
         timings=watch.report(),
     )
 
 
-def _mechanics(case: Scenario, motion: Deformation, rotation: NDArray[np.float64]) -> dict[str, Any]:
+def _mechanics(
+    job: Job, case: Scenario, motion: Deformation, rotation: NDArray[np.float64]
+) -> dict[str, Any]:
     return {
         "law": case.tissue.law,
+        "elastic": job.fem.time == "quasi-static" and not job.fem.relaxation,
         "min_jacobian": motion.min_jacobian.tolist(),
         "energy_mn_mm": motion.energy.tolist(),
         "residual": motion.residual.tolist(),

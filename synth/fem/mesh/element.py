@@ -105,15 +105,16 @@ class Quadrature:
     """N, number of nodes."""
 
 
-def quadrature(points: Floats, cells: Ints, order: int) -> Quadrature:
+def quadrature(points: Floats, cells: Ints, order: int, at: Floats | None = None) -> Quadrature:
     """Prepares a mesh.
 
     Args:
         points: (N, 3) mm, all nodes; sides of quadratic elements may be curved.
         cells: (M, 4 or 10).
         order: 1 or 2.
+        at: (Q, 4) barycentric places in every element. Empty: `TET_POINTS`.
     """
-    at = TET_POINTS[order]
+    at = TET_POINTS[order] if at is None else at
     gradient, determinant = gradients(points[cells], at)
     return Quadrature(
         cells.astype(np.int32), np.ascontiguousarray(gradient), determinant / (6 * len(at)), len(points)

@@ -7,7 +7,7 @@ import pytest
 import scipy.sparse as sp
 from pydantic import ValidationError
 
-from synth.fem import equilibrium
+from synth.fem import equilibrium, solver
 from synth.fem.mesh import tetrahedra
 from synth.fem.mesh.tetrahedra import Tets
 from synth.fem.motion import Clock, march_in_time, nodal_mass
@@ -78,6 +78,14 @@ def test_nodal_mass_is_the_whole_mass_at_its_centre(order: int) -> None:
     assert mass.min() > 0
     assert mass.sum() == pytest.approx(1.3)
     np.testing.assert_allclose(mass @ tets.points / 1.3, [0, 0, -5], atol=1e-9)
+
+
+def test_the_mass_is_that_of_the_tissue_unless_given() -> None:
+    tets = cube()  # 10 mm
+    asked = schema.Fem(time="dynamic", density_kg_m3=1040.0)
+    assert solver.clock(asked, 25.0, tets).mass_kg == pytest.approx(1.04e-3)
+    assert solver.clock(asked.model_copy(update={"mass_kg": 0.7}), 25.0, tets).mass_kg == 0.7
+    assert solver.clock(schema.Fem(), 25.0, tets).mass_kg == 0.0
 
 
 def test_relaxation_cannot_take_all_stiffness() -> None:

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scipy.sparse as sp
+from dome import patch
 from newton import newton
 from scipy.optimize import brentq
 from scipy.sparse.linalg import splu
@@ -21,6 +22,7 @@ from synth.fem.mesh.refine import refine
 from synth.fem.mesh.tetrahedra import Tets
 from synth.fem.system import System, assemble
 from synth.job import schema
+from synth.job.law_limits import LEAST_JACOBIAN
 
 Floats = np.ndarray
 
@@ -147,13 +149,12 @@ def loaded(law: str, load: float, kind: str) -> tuple[System, Floats]:
     """A block under one contact, and the load for E = 1 kPa."""
     anatomy = schema.Anatomy()
     tets = tetrahedra.block(anatomy, 700, 2, ((2.0, 1.0, 4.0),))
-    outer = np.unique(tetrahedra.boundary(tets.cells[:, :4], 1))
-    area = np.zeros(len(tets.points))
-    area[outer] = 1.0
-    area[tets.points[:, 2] < -15] = 0.0
-    kernel = tool.footprint(np.array([2.0, 1.0]), 4.0, tets.points, area) * area
+    vertices, faces = patch()
+    area = surface_embedding.vertex_area(vertices, faces)
+    kernel = tool.footprint(np.array([2.0, 1.0]), 4.0, vertices, area) * area
     way = np.array([0.5, 0.0, 0.87 if kind == "pull" else -0.87])
-    return assemble(tets, law, 0.4), np.outer(kernel, 16.0 * load * way)
+    force = surface_embedding.embed(tets, vertices).gather(np.outer(kernel, 16.0 * load * way))
+    return assemble(tets, law, 0.4), force
 
 
 @pytest.mark.parametrize(
@@ -177,3 +178,18 @@ def test_a_guess_past_inversion_does_not_spoil_the_step() -> None:
     assert np.isfinite(state.energy)
     assert rest <= 1e-3
     np.testing.assert_array_equal(u, usual)
+
+
+def test_a_corner_that_is_pressed_flat_on_the_surface_is_refused() -> None:
+    """No quadrature point is near it."""
+    system, load = loaded("stable", 0.1, "push")
+    top = int(np.abs(load).sum(axis=1)[system.mesh.cells[:, :4]].max(axis=1).argmax())
+    corner = system.mesh.cells[top, :4][np.abs(load).sum(axis=1)[system.mesh.cells[top, :4]].argmax()]
+    u = np.zeros_like(load)
+    u[corner, 2] = -1e-3
+    u *= 0.9 / (1 - system.least_jacobian(u)[0])  # det F is linear in one node's displacement
+    state = system.state(u)
+    assert system.least_jacobian(u)[0] == pytest.approx(0.1)
+    assert state.jacobian > 2 * LEAST_JACOBIAN
+    with pytest.raises(equilibrium.InvertedElement, match="element"):
+        equilibrium.check_state(system, u, state, 3, 0.1)
