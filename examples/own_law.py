@@ -63,11 +63,11 @@ def peak_mm(b: float | None, load: float = 0.3, radius_mm: float = 5.0) -> float
     vertices = np.column_stack([xy, tetrahedra.dome(xy, Anatomy().dome_mm)])
     area = np.full(len(vertices), 0.25)
     pressure = tool.footprint(np.zeros(2), radius_mm, vertices, area) * load * radius_mm**2  # E = 1 kPa
-    carry = surface_embedding.embedding(tets, vertices)
-    pull = carry.T @ (np.outer(area * pressure, [0.0, 0.0, 1.0]))
+    carry = surface_embedding.embed(tets, vertices)
+    pull = carry.gather(np.outer(area * pressure, [0.0, 0.0, 1.0]))
     course = np.linspace(0, 1, 5)
-    path = equilibrium.follow(system, course[:, None, None] * pull, course * load)
-    return float(np.linalg.norm(carry @ path.displacement[-1], axis=1).max())
+    path = equilibrium.solve_path(system, course[:, None, None] * pull, course * load)
+    return float(np.linalg.norm(carry.move(path.displacement[-1]), axis=1).max())
 
 
 if __name__ == "__main__":

@@ -10,13 +10,13 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-import scipy.sparse as sp
 from numpy.typing import NDArray
 from scipy.spatial import Delaunay
 
 from synth.fem import surface_embedding
 from synth.fem.mesh import tetrahedra
 from synth.fem.mesh.tetrahedra import Tets
+from synth.fem.surface_embedding import Embedding
 from synth.fem.system import System, assemble
 from synth.job import schema
 
@@ -57,21 +57,16 @@ class Block:
         volume = tetrahedra.block(_ANATOMY, tets, order)
         return cls(volume, assemble(volume, law, 0.4))
 
-    def carry(self, xy: Floats) -> sp.csr_array:
-        """(P, N) what gives the motion of surface points (P, 2), camera x, y [mm], from the volume's.
-
-        Its transpose carries loads on them to the volume.
-        """
+    def carry(self, xy: Floats) -> Embedding:
+        """How surface points (P, 2), camera x, y [mm], ride on the volume."""
         world = xy * np.array([1.0, -1.0])
         on_dome = np.column_stack([world, tetrahedra.dome(world, _ANATOMY.dome_mm)])
-        return surface_embedding.embedding(self.volume, on_dome)
+        return surface_embedding.embed(self.volume, on_dome)
 
 
-def picture(carry: sp.csr_array, moved: Floats) -> Floats:
+def picture(carry: Embedding, moved: Floats) -> Floats:
     """What the camera sees, (P, 2, ...) mm at points, of a volume's motion (N, 3, ...) mm in world axes."""
-    flat = moved.reshape(len(moved), -1)
-    world = (carry @ flat).reshape(-1, *moved.shape[1:])
-    return np.asarray(np.einsum("ab,pb...->pa...", TO_CAMERA[:2], world), np.float64)
+    return np.asarray(np.einsum("ab,pb...->pa...", TO_CAMERA[:2], carry.move(moved)), np.float64)
 
 
 @lru_cache(maxsize=4)
@@ -89,9 +84,9 @@ def build(point_mm: float = 1.0, node_mm: float = 1.2, tets: int = 3000) -> Comp
     seen, held = block.carry(points), block.carry(nodes)
     columns = np.empty((len(nodes), 3, 2, len(points)))
     for some in np.array_split(np.arange(len(nodes)), max(1, len(nodes) // _AT_ONCE)):
-        shares = held[some].toarray()
         for axis in range(3):
-            u = block.system.solve(np.einsum("kn,a->nak", shares, TO_CAMERA[axis]))
+            unit = np.einsum("kl,a->kal", np.eye(len(nodes))[:, some], TO_CAMERA[axis])
+            u = block.system.solve(held.gather(unit))
             columns[some, axis] = picture(seen, u).transpose(2, 1, 0)
     matrix = columns.transpose(2, 3, 0, 1).reshape(2 * len(points), 3 * len(nodes))
     return Compliance(matrix, points, nodes, _areas(nodes))

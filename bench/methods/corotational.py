@@ -14,13 +14,13 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from bench.methods import inverse
 from bench.methods.compliance import TO_CAMERA, Block, Compliance, picture
 from bench.methods.inverse import Contact
 from synth.fem import equilibrium
+from synth.fem.surface_embedding import Embedding
 from synth.fem.system import System
 
 Floats = NDArray[np.float64]
@@ -40,10 +40,10 @@ class Tissue:
     """A co-rotational block under a compliance's points and nodes, E = 1 kPa."""
 
     system: System
-    seen: sp.csr_array
-    """(P, N) surface displacement at the compliance's points."""
-    held: sp.csr_array
-    """(K, N) what carries loads from the compliance's nodes."""
+    seen: Embedding
+    """Surface displacement at the compliance's points."""
+    held: Embedding
+    """What carries loads from the compliance's nodes."""
 
 
 @lru_cache(maxsize=2)
@@ -95,7 +95,7 @@ def added(
         (P, 2) mm and the volume's displacement (N, 3) mm; None without an equilibrium.
     """
     share = inverse.kernel(known, contact.place)
-    load = np.outer(np.asarray(tissue.held.T @ share), TO_CAMERA.T @ contact.force)
+    load = tissue.held.gather(np.outer(share, TO_CAMERA.T @ contact.force))
     linear = tissue.system.solve(load)
     stiff = picture(tissue.seen, linear).T.ravel()
     wanted = np.einsum("mka,k,a->m", known.matrix.reshape(len(stiff), -1, 3), share, contact.force)
@@ -105,7 +105,7 @@ def added(
     size = max(float(np.vdot(load, linear)), 0.0) ** 0.5
     safe = np.zeros_like(linear)
     begin = linear if start is None else start
-    moved, state, rest = equilibrium.balance(tissue.system, load, begin, _TOLERANCE * size, safe)
+    moved, state, rest = equilibrium.minimise_energy(tissue.system, load, begin, _TOLERANCE * size, safe)
     if not np.isfinite(state.energy) or rest > _FAILED * size:
         return None
     return picture(tissue.seen, moved - linear), moved

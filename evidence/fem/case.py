@@ -6,12 +6,12 @@ import time
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from synth.fem import equilibrium, surface_embedding, tool
 from synth.fem.material import Tissue
 from synth.fem.mesh import tetrahedra
+from synth.fem.surface_embedding import Embedding
 from synth.fem.system import System, assemble
 from synth.job import schema
 
@@ -52,14 +52,14 @@ class Brain:
     """A mesh finest under one contact, its equations and the surface on it."""
 
     system: System
-    carry: sp.csr_array
+    carry: Embedding
     kernel: Floats
-    """(N,) nodal share of a unit force."""
+    """(V,) share of a unit force at every vertex."""
     radius_mm: float
 
     def load(self, load: float, way: str) -> Floats:
         """(N, 3) mN for E = 1 kPa at P = `load`."""
-        return np.outer(self.kernel, load * self.radius_mm**2 * np.array(WAYS[way]))
+        return self.carry.gather(np.outer(self.kernel, load * self.radius_mm**2 * np.array(WAYS[way])))
 
 
 def brain(
@@ -67,16 +67,16 @@ def brain(
 ) -> Brain:
     """Meshes, assembles and embeds."""
     volume = tetrahedra.block(ANATOMY, tets, order, (contact,))
-    carry = surface_embedding.embedding(volume, on.vertices)
+    carry = surface_embedding.embed(volume, on.vertices)
     pressure = tool.footprint(np.array(contact[:2]), contact[2], on.vertices, on.area)
-    return Brain(assemble(volume, law, poisson), carry, carry.T @ (on.area * pressure), contact[2])
+    return Brain(assemble(volume, law, poisson), carry, on.area * pressure, contact[2])
 
 
 def moved(case: Brain, load: float, way: str, steps: int = 3) -> Floats:
     """(V, 3) mm under a load that was raised in a few steps."""
     part = np.linspace(0, 1, steps + 1)
-    path = equilibrium.follow(case.system, part[:, None, None] * case.load(load, way), load * part)
-    return np.asarray(case.carry @ path.displacement[-1])
+    path = equilibrium.solve_path(case.system, part[:, None, None] * case.load(load, way), load * part)
+    return case.carry.move(path.displacement[-1])
 
 
 def error(u: Floats, exact: Floats, on: Patch) -> float:
@@ -89,9 +89,9 @@ def speed(case: Brain, load: float, way: str, frames: int = 60) -> float:
     part = tool.course(_gesture(), frames).load
     loads = part[:, None, None] * case.load(load, way)
     start = time.process_time()
-    path = equilibrium.follow(case.system, loads, load * part)
+    path = equilibrium.solve_path(case.system, loads, load * part)
     for u in path.displacement:
-        case.carry @ u
+        case.carry.move(u)
     return 1e3 * (time.process_time() - start) / frames
 
 

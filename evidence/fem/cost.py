@@ -34,7 +34,7 @@ def gestures(on: case.Patch, load: float) -> list[Row]:
             places = [place for one in crew_ for place in tool.focus(one)]
             volume = tetrahedra.block(case.ANATOMY, fem.tets, fem.order, places)
             carry, system = (
-                surface_embedding.embedding(volume, on.vertices),
+                surface_embedding.embed(volume, on.vertices),
                 assemble(volume, law, tissue.poisson),
             )
             courses = [tool.course(one, _FRAMES) for one in crew_]
@@ -45,11 +45,11 @@ def gestures(on: case.Patch, load: float) -> list[Row]:
                 ],
                 axis=0,
             )
-            loads = np.stack([carry.T @ (on.area[:, None] * t) for t in traction])
+            loads = np.stack([carry.gather(on.area[:, None] * t) for t in traction])
             start = time.process_time()
-            path = equilibrium.follow(system, loads, np.full(_FRAMES, load))
+            path = equilibrium.solve_path(system, loads, np.full(_FRAMES, load))
             for u in path.displacement:
-                carry @ u
+                carry.move(u)
             spent = 1e3 * (time.process_time() - start) / _FRAMES
             rows.append({"gesture": kind, "law": law, "load": load, "ms_a_frame": spent})
     return rows
@@ -74,15 +74,15 @@ def _sequence(law: str, load: float) -> Row:
     solver.deform(fem, tissue, gesture, volume, on.vertices, on.faces, _FRAMES, 25.0)
     times.append(time.process_time())
     memory = _peak_mb()
-    carry = surface_embedding.embedding(volume, on.vertices)
+    carry = surface_embedding.embed(volume, on.vertices)
     times.append(time.process_time())
     system = assemble(volume, law, tissue.poisson)
     times.append(time.process_time())
     part = tool.course(gesture, _FRAMES).load
     contact = gesture.contacts[0]
     kernel = tool.footprint(np.asarray(contact.point_mm), gesture.footprint_mm, on.vertices, on.area)
-    peak = np.outer(carry.T @ (on.area * kernel), contact.force_mn)
-    equilibrium.follow(system, part[:, None, None] * peak, load * part)
+    peak = carry.gather(np.outer(on.area * kernel, contact.force_mn))
+    equilibrium.solve_path(system, part[:, None, None] * peak, load * part)
     times.append(time.process_time())
     spent = dict(zip(("mesh", "fem", "embedding", "factor", "equilibrium"), np.diff(times), strict=True))
     return {"law": law, "load": load, "peak_rss_mb": memory} | {f"{k}_s": float(v) for k, v in spent.items()}

@@ -180,17 +180,17 @@ def steps(tets: int) -> list[Row]:
     whole = tetrahedra.block(fem_case.ANATOMY, tets, 2, (_CONTACT,))
     on = fem_case.patch(3600)
     pressure = tool.footprint(np.array(_CONTACT[:2]), _CONTACT[2], on.vertices, on.area)
-    unit = surface_embedding.embedding(whole, on.vertices).T @ (on.area * pressure)
-    peak = np.outer(unit, 0.15 * _CONTACT[2] ** 2 * np.array([0.0, 0.0, 1.0]))
+    force = 0.15 * _CONTACT[2] ** 2 * np.outer(on.area * pressure, [0.0, 0.0, 1.0])
+    peak = surface_embedding.embed(whole, on.vertices).gather(force)
     for law in NUMBER:
         case = assemble(whole, law, 0.4)
-        still = equilibrium.follow(case, np.stack([0.5 * peak, peak]), np.full(2, 0.15)).displacement[-1]
+        still = equilibrium.solve_path(case, np.stack([0.5 * peak, peak]), np.full(2, 0.15)).displacement[-1]
         for step in (0.03, 0.1, 0.3, 1.0):
 
             def run(step: float = step, law: str = law, still: Floats = still) -> tuple[Floats, float]:
                 at = np.minimum(np.arange(0, 7 + step / 2, step), 1.0)
                 clock = motion.Clock(step, 1, 1.0, 2.0)
-                path = motion.march(whole, law, 0.4, 0.5, at[:, None, None] * peak, 0.15 * at, clock)
+                path = motion.march_in_time(whole, law, 0.4, 0.5, at[:, None, None] * peak, 0.15 * at, clock)
                 gap = path.displacement[-1] - still
                 return path.displacement[-1], float(np.linalg.norm(gap) / np.linalg.norm(still))
 
@@ -205,7 +205,7 @@ def slivers(tets: int) -> list[Row]:
     """
     on, rows = fem_case.patch(_VERTICES), []
     whole = tetrahedra.block(fem_case.ANATOMY, tets, 1, (_CONTACT,))
-    carry = surface_embedding.embedding(whole, on.vertices)
+    carry = surface_embedding.embed(whole, on.vertices)
     pressure = tool.footprint(np.array(_CONTACT[:2]), _CONTACT[2], on.vertices, on.area)
     centre = whole.points[whole.cells].mean(axis=1)
     nearest = np.linalg.norm(centre - [0, 0, -6.0], axis=1).argsort()
@@ -216,7 +216,7 @@ def slivers(tets: int) -> list[Row]:
 
             def run(flat: float = flat, law: str = law, true: Floats | None = true) -> tuple[Floats, float]:
                 system = assemble(_pressed(whole, cell, corner, flat), law, 0.4)
-                case = fem_case.Brain(system, carry, carry.T @ (on.area * pressure), _CONTACT[2])
+                case = fem_case.Brain(system, carry, on.area * pressure, _CONTACT[2])
                 u = fem_case.moved(case, 0.2, "pull", 3)
                 return u, 0.0 if true is None else fem_case.error(u, true, on)
 

@@ -79,14 +79,14 @@ def measure(file: Path, outwards: Floats, tets: list[int], refined: int) -> dict
         whole = tetrahedra.from_brain(placed, anatomy, count, 2, ((0.0, 0.0, _RADIUS_MM),))
         spent = time.process_time() - start
         corner = whole.points[whole.cells[:, :4]]
-        carry, system = surface_embedding.embedding(whole, vertices), assemble(whole, "linear", 0.4)
+        carry, system = surface_embedding.embed(whole, vertices), assemble(whole, "linear", 0.4)
         row = {
             "tets": len(whole.cells),
             "volume_kept": float(bary_slope(corner)[1].sum()) / volume,
             "quality": float(quality(corner).min()),
             "mesh_cpu_s": spent,
         }
-        return row, [carry @ system.solve(np.outer(carry.T @ kernel, way)) for way in _WAYS.values()]
+        return row, [carry.move(system.solve(carry.gather(np.outer(kernel, way)))) for way in _WAYS.values()]
 
     reference, exact = moved(refined)
     rows = []

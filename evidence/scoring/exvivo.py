@@ -20,6 +20,7 @@ from bench.tracking.tracking import Progress
 from synth.errors import UserError
 from synth.fem import solver, tool
 from synth.fem.mesh import tetrahedra
+from synth.fem.mesh.relief import HeightMap
 from synth.fem.solver import Deformation
 from synth.job import schema as jobs
 from synth.render.anatomy import surface as anatomy
@@ -150,7 +151,8 @@ def _moved(
 ) -> Deformation:
     """The path from no load to full: a gesture that only rises."""
     rising = tool.Gesture(**{**vars(gesture), "timing": (0.02, 1.0, 2.0, 3.0)})
-    tets = tetrahedra.block(job.anatomy, job.fem.tets, job.fem.order, tool.focus(gesture))
+    height = HeightMap(surface.pia, surface.extent_mm)
+    tets = tetrahedra.block(job.anatomy, job.fem.tets, job.fem.order, tool.focus(gesture), height)
     return solver.deform(
         job.fem, case.tissue, rising, tets, surface.vertices, surface.faces,
         job.frames, job.fps,

@@ -112,14 +112,13 @@ def contacts(
         way = np.array([flat * np.cos(around), flat * np.sin(around), up * rng.choice([-1, 1])])
         if law != "linear":
             size = rng.uniform(*_LOAD) * young_kpa * radius**2
-        held = share @ block.carry(at + radius * disc).toarray()
-        load = np.outer(held, size * way) / young_kpa
+        load = block.carry(at + radius * disc).gather(np.outer(share, size * way)) / young_kpa
         if law == "linear":  # by itself: `follow` refuses elements that such loads turn inside out
             moved = block.system.solve(load)
         else:
-            moved = equilibrium.follow(block.system, np.stack([0.5 * load, load]), np.zeros(2)).displacement[
-                -1
-            ]
+            moved = equilibrium.solve_path(
+                block.system, np.stack([0.5 * load, load]), np.zeros(2)
+            ).displacement[-1]
         forces[k] = TO_CAMERA @ (size * way)
         fields.append(picture(seen, moved))
     return forces, fields

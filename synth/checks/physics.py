@@ -18,6 +18,7 @@ Floats = NDArray[np.floating]
 
 # A point may come back so far off: tissue that is pressed together or seen at a slant lands in few pixels.
 _RETURN_PX = 4.0
+_COMPLIANCE_STEP = 0.25
 
 
 def seal(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
@@ -66,6 +67,30 @@ def force(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
         if in_view and norm > 0.05 * peak:
             total = (traction * area[..., None]).sum(axis=(0, 1), dtype=np.float64)
             yield Measure(float(np.linalg.norm(total - applied[t])) / norm, 0.01, f"frame {t}")
+
+
+def compliance(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
+    """Displacement per force changes from frame to frame no faster than the force does, plus a quarter.
+
+    2 energy / |force|^2 is the loaded mean of the displacement along the force, per force. Motion with
+    inertia or relaxation is left out: there the past counts too.
+    """
+    mechanics = sequence.attrs.get("mechanics") or {}
+    # Sequences from before `elastic` was kept: among the named jobs only `paper` has inertia, and this law.
+    if (
+        not mechanics.get("elastic", mechanics.get("law") != "corotational")
+        or "energy_mn_mm" not in mechanics
+    ):
+        return
+    energy = np.asarray(mechanics["energy_mn_mm"], np.float64)
+    forces = np.stack([one["force_mn"] for one in mechanics["instruments"]], axis=1)
+    size = np.linalg.norm(forces, axis=(1, 2))
+    for t in range(1, len(energy)):
+        if min(size[t - 1], size[t]) > 0.05 * size.max():
+            here, before = energy[t] / size[t] ** 2, energy[t - 1] / size[t - 1] ** 2
+            changed = float(np.linalg.norm(forces[t] - forces[t - 1])) / float(min(size[t - 1], size[t]))
+            step = float(np.exp(np.abs(np.log(here / before)))) - 1
+            yield Measure(step, _COMPLIANCE_STEP + changed, f"frame {t}")
 
 
 def visibility(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
@@ -135,6 +160,7 @@ INVARIANTS: dict[str, Invariant] = {
         schema,
         rest,
         force,
+        compliance,
         visibility,
         warp,
         forward_backward,

@@ -15,7 +15,7 @@ Floats = NDArray[np.float64]
 
 TOLERANCE = 2e-4
 """Force out of balance, as a part of the load, at which a step ends."""
-_MEMORY, _STEPS = 8, 200
+_HISTORY, _ITERATIONS, _ARMIJO = 8, 200, 1e-4
 
 
 class NoEquilibrium(UserError):
@@ -33,14 +33,14 @@ class Path:
     displacement: Floats
     """(T, N, 3) mm."""
     jacobian: Floats
-    """(T,) smallest det F."""
+    """(T,) smallest det F, at quadrature points and the elements' corners."""
     energy: Floats
     """(T,) mN mm."""
     residual: Floats
     """(T,) force out of balance over the load, in the norm of the inverse stiffness; 0 without load."""
 
 
-def follow(system: System, loads: Floats, named: Floats) -> Path:
+def solve_path(system: System, loads: Floats, named: Floats) -> Path:
     """Equilibrium under each load in turn.
 
     Args:
@@ -54,28 +54,32 @@ def follow(system: System, loads: Floats, named: Floats) -> Path:
         NotFinite: a number is none.
     """
     path: list[tuple[Floats, State]] = []
-    residual = np.zeros(len(loads))
+    residual, least = np.zeros(len(loads)), np.ones(len(loads))
     peak = loads[np.abs(loads).max(axis=(1, 2)).argmax()]
-    answers = _Answers(system)
-    first = answers(peak)
-    square = float(np.vdot(peak, peak)) or 1.0
-    size = float(np.sqrt(np.vdot(peak, first))) or 1.0
+    linear = _LinearResponse(system)
+    at_peak = linear(peak)
+    peak_squared = float(np.vdot(peak, peak)) or 1.0
+    scale = float(np.sqrt(np.vdot(peak, at_peak))) or 1.0
     known: list[tuple[float, Floats]] = [(0.0, np.zeros_like(peak))]
     for step, load in enumerate(loads):
         if system.law == "linear":
-            u = answers(load)
+            u = linear(load)
             state = system.state(u)
-            residual[step] = np.linalg.norm(_free(system, load - state.force)) / np.sqrt(square)
+            residual[step] = np.linalg.norm(_on_free(system, load - state.force)) / np.sqrt(peak_squared)
         else:
-            part = float(np.vdot(load, peak)) / square
-            alike = float(np.abs(load - part * peak).max()) <= 1e-9 * float(np.abs(peak).max())
+            factor = float(np.vdot(load, peak)) / peak_squared
+            proportional = float(np.abs(load - factor * peak).max()) <= 1e-9 * float(np.abs(peak).max())
             last = path[-1][0] if path else np.zeros_like(load)
-            start = _guess(known, part, first) if alike else last + answers(load - loads[step - 1])
-            u, state, rest = balance(system, load, start, TOLERANCE * size, last)
-            residual[step] = rest / size
-            if alike and all(abs(part - k) > 1e-3 for k, _ in known):
-                known.append((part, u))
-        check(system, u, state, step, float(named[step]))
+            start = (
+                _interpolate_states(known, factor, at_peak)
+                if proportional
+                else last + linear(load - loads[step - 1])
+            )
+            u, state, norm = minimise_energy(system, load, start, TOLERANCE * scale, last)
+            residual[step] = norm / scale
+            if proportional and all(abs(factor - k) > 1e-3 for k, _ in known):
+                known.append((factor, u))
+        least[step] = check_state(system, u, state, step, float(named[step]))
         if residual[step] > TOLERANCE:
             raise NoEquilibrium(
                 f"frame {step}: no equilibrium at load {named[step]:.3g} "
@@ -84,49 +88,55 @@ def follow(system: System, loads: Floats, named: Floats) -> Path:
         path.append((u, state))
     return Path(
         np.stack([u for u, _ in path]),
-        np.array([s.jacobian for _, s in path]),
+        least,
         np.array([s.energy for _, s in path]),
         residual,
     )
 
 
-class _Answers:
+class _LinearResponse:
     """Linear displacement under loads that are mostly mixtures of few: one solve for each new direction."""
 
     def __init__(self, system: System) -> None:
         self._system = system
-        self._loads: list[Floats] = []
-        self._moved: list[Floats] = []
+        self._directions: list[Floats] = []
+        self._responses: list[Floats] = []
 
     def __call__(self, load: Floats) -> Floats:
         size = float(np.linalg.norm(load))
-        u, rest = np.zeros_like(load), load
-        for direction, moved in zip(self._loads, self._moved, strict=True):
-            share = float(np.vdot(direction, rest))
-            u = u + share * moved
-            rest = rest - share * direction
-        left = float(np.linalg.norm(rest))
+        u, remainder = np.zeros_like(load), load
+        for direction, response in zip(self._directions, self._responses, strict=True):
+            share = float(np.vdot(direction, remainder))
+            u = u + share * response
+            remainder = remainder - share * direction
+        left = float(np.linalg.norm(remainder))
         if left <= 1e-10 * size:
             return u
-        direction = rest / left
-        moved = self._system.solve(direction)
-        self._loads.append(direction)
-        self._moved.append(moved)
-        return u + left * moved
+        direction = remainder / left
+        response = self._system.solve(direction)
+        self._directions.append(direction)
+        self._responses.append(response)
+        return u + left * response
 
 
-def check(system: System, u: Floats, state: State, frame: int, load: float) -> None:
-    """Refuses displacements u (N, 3) mm that are no deformation: `NotFinite` or `InvertedElement`."""
+def check_state(system: System, u: Floats, state: State, frame: int, load: float) -> float:
+    """Smallest det F; refuses displacements u (N, 3) mm that are no deformation.
+
+    Raises:
+        NotFinite, InvertedElement
+    """
     if not np.isfinite(u).all() or not np.isfinite(state.energy):
         raise NotFinite(f"frame {frame}: the deformation at load {load:.3g} is not finite")
-    if state.jacobian <= LEAST_JACOBIAN:
+    least, element = system.least_jacobian(u)
+    if least <= LEAST_JACOBIAN:
         raise InvertedElement(
-            f"frame {frame}: load {load:.3g} turns element {system.worst(u)} inside out or nearly so "
-            f"(det F {state.jacobian:.2f}, more than {LEAST_JACOBIAN:g} is needed); lower the load"
+            f"frame {frame}: load {load:.3g} turns element {element} inside out or nearly so "
+            f"(det F {least:.2f}, more than {LEAST_JACOBIAN:g} is needed); lower the load"
         )
+    return least
 
 
-def balance(
+def minimise_energy(
     system: System, load: Floats, start: Floats, tolerance: float, safe: Floats
 ) -> tuple[Floats, State, float]:
     """Minimises stored energy less the load's work by L-BFGS on the factored rest stiffness.
@@ -139,80 +149,90 @@ def balance(
         load: (N, 3) mN.
         start: (N, 3) mm.
         safe: (N, 3) mm, a state of finite energy, for when the guess `start` has none.
-        tolerance: on the norm sqrt(r' K^-1 r) of what is out of balance, in sqrt(mN mm).
+        tolerance: on the residual's norm sqrt(r' K^-1 r), in sqrt(mN mm).
 
     Returns:
-        Displacement, its state and the norm reached; the caller judges it.
+        Displacement, its state and the residual's norm; the caller judges it.
     """
     u, state = start, system.state(start)
     if not np.isfinite(state.energy):
         u, state = safe, system.state(safe)
-    slope = _free(system, state.force - load)
-    memory: list[tuple[Floats, Floats, float]] = []
-    rest = np.inf
-    for _ in range(_STEPS):
-        direct = system.solve(slope)
-        rest = max(float(np.vdot(slope, direct)), 0.0) ** 0.5
-        if rest <= tolerance:
+    gradient = _on_free(system, state.force - load)
+    history: list[tuple[Floats, Floats, float]] = []
+    norm = np.inf
+    for _ in range(_ITERATIONS):
+        preconditioned = system.solve(gradient)
+        norm = max(float(np.vdot(gradient, preconditioned)), 0.0) ** 0.5
+        if norm <= tolerance:
             break
-        step = -_descent(slope, direct, memory, system)
-        fall = float(np.vdot(slope, step))
-        if fall >= 0:
-            memory.clear()
-            step, fall = -direct, -(rest**2)
-        length, level = 1.0, state.energy - float(np.vdot(load, u))
+        direction = -_two_loop_recursion(gradient, preconditioned, history, system)
+        derivative = float(np.vdot(gradient, direction))
+        if derivative >= 0:
+            history.clear()
+            direction, derivative = -preconditioned, -(norm**2)
+        length, potential = 1.0, state.energy - float(np.vdot(load, u))
         for _ in range(30):
-            trial = u + length * step
-            new = system.state(trial)
-            value = new.energy - float(np.vdot(load, trial))
-            if np.isfinite(value) and value <= level + 1e-4 * length * fall + 1e-14 * abs(level):
+            trial = u + length * direction
+            trial_state = system.state(trial)
+            value = trial_state.energy - float(np.vdot(load, trial))
+            # The last term: rounding, near the minimum.
+            if np.isfinite(value) and value <= potential + _ARMIJO * length * derivative + 1e-14 * abs(
+                potential
+            ):
                 break
             length *= 0.5
         else:
             break
-        after = _free(system, new.force - load)
-        s, y = length * step, after - slope
-        bend = float(np.vdot(s, y))
-        if bend > 1e-12 * float(np.sqrt(np.vdot(s, s) * np.vdot(y, y))):
-            memory.append((s, y, bend))
-            del memory[:-_MEMORY]
-        u, state, slope = trial, new, after
-    return u, state, rest
+        trial_gradient = _on_free(system, trial_state.force - load)
+        s, y = length * direction, trial_gradient - gradient
+        curvature = float(np.vdot(s, y))
+        if curvature > 1e-12 * float(np.sqrt(np.vdot(s, s) * np.vdot(y, y))):
+            history.append((s, y, curvature))
+            del history[:-_HISTORY]
+        u, state, gradient = trial, trial_state, trial_gradient
+    return u, state, norm
 
 
-def _descent(
-    slope: Floats, direct: Floats, memory: list[tuple[Floats, Floats, float]], system: System
+def _two_loop_recursion(
+    gradient: Floats, preconditioned: Floats, history: list[tuple[Floats, Floats, float]], system: System
 ) -> Floats:
-    """The inverse Hessian on the slope, by two loops round the rest stiffness."""
-    if not memory:
-        return direct
-    q, rates = slope.copy(), []
-    for s, y, bend in reversed(memory):
-        rate = float(np.vdot(s, q)) / bend
-        q -= rate * y
-        rates.append(rate)
+    """The inverse Hessian on the gradient (Nocedal & Wright, algorithm 7.4), the rest stiffness as its seed.
+
+    Args:
+        gradient: (N, 3) mN.
+        preconditioned: (N, 3) mm, the inverse rest stiffness on it.
+        history: steps s (N, 3) mm, the gradient's changes y (N, 3) mN over them, and s'y.
+        system: the equations.
+    """
+    if not history:
+        return preconditioned
+    q, alphas = gradient.copy(), []
+    for s, y, curvature in reversed(history):
+        alpha = float(np.vdot(s, q)) / curvature
+        q -= alpha * y
+        alphas.append(alpha)
     r = system.solve(q)
-    for (s, y, bend), rate in zip(memory, reversed(rates), strict=True):
-        r += s * (rate - float(np.vdot(y, r)) / bend)
+    for (s, y, curvature), alpha in zip(history, reversed(alphas), strict=True):
+        r += s * (alpha - float(np.vdot(y, r)) / curvature)
     return r
 
 
-def _guess(known: list[tuple[float, Floats]], part: float, first: Floats) -> Floats:
-    """The next state, through the known ones nearest in load: elastic states depend on nothing else."""
-    nearest = sorted(known, key=lambda k: abs(k[0] - part))[:3]
+def _interpolate_states(known: list[tuple[float, Floats]], factor: float, at_peak: Floats) -> Floats:
+    """The state at a load factor, through the three nearest known: elastic states depend on nothing else."""
+    nearest = sorted(known, key=lambda k: abs(k[0] - factor))[:3]
     if len(nearest) == 1:
-        return part * first
-    value = np.zeros_like(first)
+        return factor * at_peak
+    value = np.zeros_like(at_peak)
     for i, (at, u) in enumerate(nearest):
-        share = 1.0
+        lagrange = 1.0
         for j, (other, _) in enumerate(nearest):
             if j != i:
-                share *= (part - other) / (at - other)
-        value += share * u
+                lagrange *= (factor - other) / (at - other)
+        value += lagrange * u
     return value
 
 
-def _free(system: System, force: Floats) -> Floats:
+def _on_free(system: System, force: Floats) -> Floats:
     """The force without what the walls take."""
     out = np.zeros(force.size)
     out[system.free] = force.ravel()[system.free]

@@ -65,6 +65,22 @@ def stress(law: int, strain: Floats, mu: float, lam: float, out: Floats, energy:
 
 
 @compiled
+def least_determinant(strain: Floats) -> tuple[float, int]:
+    """Smallest det F of (n, 3, 3) displacement gradients F - I, and which one has it."""
+    least, where = np.inf, 0
+    f = np.empty((3, 3))
+    for n in range(len(strain)):
+        for i in range(3):
+            for j in range(3):
+                f[i, j] = strain[n, i, j]
+            f[i, i] += 1
+        det = _det(f)
+        if det < least:
+            least, where = det, n
+    return least, where
+
+
+@compiled
 def tangent(law: int, strain: Floats, mu: float, lam: float, out: Floats) -> None:
     """Derivative of the stress, in place.
 

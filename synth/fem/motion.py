@@ -15,8 +15,8 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
-from synth.fem.equilibrium import TOLERANCE, NoEquilibrium, Path, balance, check
-from synth.fem.mesh.element import bary_slope
+from synth.fem.equilibrium import TOLERANCE, NoEquilibrium, Path, check_state, minimise_energy
+from synth.fem.mesh.element import quadrature
 from synth.fem.mesh.tetrahedra import Tets
 from synth.fem.system import State, assemble
 
@@ -39,7 +39,7 @@ class Clock:
     """Prony terms: the part of the stiffness that is lost, and its time [s]."""
 
 
-def march(
+def march_in_time(
     tets: Tets, law: str, poisson: float, young_kpa: float, loads: Floats, named: Floats, clock: Clock
 ) -> Path:
     """Motion from rest under loads at even times; between them they change evenly.
@@ -54,7 +54,7 @@ def march(
         clock: time.
 
     Raises:
-        As `equilibrium.follow`.
+        As `equilibrium.solve_path`.
     """
     dt = clock.step_s / clock.substeps
     fade = [(g, tau, np.exp(-dt / tau), tau / dt * -np.expm1(-dt / tau)) for g, tau in clock.relaxation]
@@ -69,7 +69,7 @@ def march(
     size = float(np.sqrt(np.vdot(peak, system.solve(peak)))) / firm
     u = before = np.zeros_like(loads[0])
     elastic, history = np.zeros_like(u), [np.zeros_like(u) for _ in fade]
-    states: list[tuple[Floats, State, float]] = []
+    states: list[tuple[Floats, State, float, float]] = []
     for t in range(len(loads)):
         for sub in range(1, clock.substeps + 1 if t else 2):
             share = sub / clock.substeps
@@ -79,20 +79,20 @@ def march(
             if pull:
                 ahead = ((2 * u - before) / dt**2 + clock.damping / dt * u) / pull
                 load = load + pull * mass[:, None] * ahead
-            new, state, rest = balance(system, load / firm, u + (u - before), TOLERANCE * size, u)
-            check(system, new, state, t, float(named[t]))
+            new, state, norm = minimise_energy(system, load / firm, u + (u - before), TOLERANCE * size, u)
+            least = check_state(system, new, state, t, float(named[t]))
             now = tissue.state(new).force
             for k, (g, _, decay, even) in enumerate(fade):
                 history[k] = decay * history[k] + g * even * (now - elastic)
             before, u, elastic = u, new, now
-            if rest > 2 * TOLERANCE * size:
+            if norm > 2 * TOLERANCE * size:
                 raise NoEquilibrium(f"frame {t}: no equilibrium at load {named[t]:.3g}; lower the load")
-        states.append((u, tissue.state(u), rest / size))
+        states.append((u, tissue.state(u), norm / size, least))
     return Path(
-        np.stack([u for u, _, _ in states]),
-        np.array([s.jacobian for _, s, _ in states]),
-        np.array([s.energy + 0.5 * float(np.vdot(u, tets.hold @ u)) for u, s, _ in states]),
-        np.array([r for _, _, r in states]),
+        np.stack([u for u, _, _, _ in states]),
+        np.array([least for _, _, _, least in states]),
+        np.array([s.energy + 0.5 * float(np.vdot(u, tets.hold @ u)) for u, s, _, _ in states]),
+        np.array([r for _, _, r, _ in states]),
     )
 
 
@@ -101,7 +101,11 @@ def nodal_mass(tets: Tets, mass_kg: float) -> Floats:
 
     Hinton, Rock & Zienkiewicz, Earthq. Eng. Struct. Dyn. 4, 1976.
     """
-    volume = bary_slope(tets.points[tets.cells[:, :4]])[1]
     shares = np.full(4, 0.25) if tets.order == 1 else np.repeat([1 / 36, 4 / 27], [4, 6])
-    spread = np.bincount(tets.cells.ravel(), np.outer(volume, shares).ravel(), len(tets.points))
-    return np.asarray(mass_kg * spread / volume.sum())
+    spread = np.bincount(tets.cells.ravel(), np.outer(volume(tets), shares).ravel(), len(tets.points))
+    return np.asarray(mass_kg * spread / spread.sum())
+
+
+def volume(tets: Tets) -> Floats:
+    """(M,) mm^3 of the elements."""
+    return np.asarray(quadrature(tets.points, tets.cells, tets.order).weight.sum(axis=1))

@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from synth.fem import equilibrium, motion, surface_embedding, tool
-from synth.fem.equilibrium import InvertedElement
+from synth.fem.equilibrium import InvertedElement, Path
 from synth.fem.material import Tissue, check_load
 from synth.fem.mesh.tetrahedra import Tets
 from synth.fem.system import assemble
-from synth.fem.tool import Gesture
+from synth.fem.tool import Course, Gesture
 from synth.job import schema
 
 __all__ = ["Deformation", "InvertedElement", "deform"]
@@ -47,7 +47,7 @@ class Deformation:
     shaft: Floats
     """(T, 2 I, 3) unit vectors from tip to hand."""
     min_jacobian: Floats
-    """(T,) smallest det F in the volume."""
+    """(T,) smallest det F in the volume, at quadrature points and corners."""
     energy: Floats
     """(T,) mN mm stored."""
     residual: Floats
@@ -83,32 +83,25 @@ def deform(
         InvertedElement: names frame, load and element.
         NotFinite: a number is none.
     """
-    crew = (gesture, *further)
-    for one in crew:
+    gestures = (gesture, *further)
+    for one in gestures:
         check_load(tissue.law, one.load)
-    carry = surface_embedding.embedding(tets, skin_vertices)
+    courses = [tool.course(one, frames) for one in gestures]
     area = surface_embedding.vertex_area(skin_vertices, skin_faces)
-    courses = [tool.course(one, frames) for one in crew]
-    traction = np.zeros((frames, len(skin_vertices), 3))
-    for one, over in zip(crew, courses, strict=True):
-        traction += tool.tractions(one, over, skin_vertices, area)
-
+    traction = np.sum(
+        [tool.tractions(g, over, skin_vertices, area) for g, over in zip(gestures, courses, strict=True)],
+        axis=0,
+    )
+    carry = surface_embedding.embed(tets, skin_vertices)
     # One load per kPa of E; displacement depends on no more than that.
-    loads = np.stack([carry.T @ (area[:, None] * t) for t in traction / tissue.young_kpa])
-    named = np.max([one.load * over.load for one, over in zip(crew, courses, strict=True)], axis=0)
-    if fem.time == "quasi-static" and not fem.relaxation:
-        path = equilibrium.follow(assemble(tets, tissue.law, tissue.poisson), loads, named)
-    else:
-        path = motion.march(tets, tissue.law, tissue.poisson, tissue.young_kpa, loads, named, clock(fem, fps))
-    displacement = np.stack([carry @ u for u in path.displacement])
-    surface = skin_vertices + displacement
-    poses = [
-        tool.pose(one, over, skin_vertices, skin_faces, surface)
-        for one, over in zip(crew, courses, strict=True)
-    ]
+    loads = np.stack([carry.gather(area[:, None] * t) for t in traction / tissue.young_kpa])
+    named = np.max([g.load * over.load for g, over in zip(gestures, courses, strict=True)], axis=0)
+    path = solve_volume(fem, tissue, tets, loads, named, fps)
+    displacement = np.stack([carry.move(u) for u in path.displacement])
+    tip, shaft = place_instruments(gestures, courses, skin_vertices, skin_faces, displacement)
     forces = [
-        np.outer(over.load, np.sum([c.force_mn for c in one.contacts], axis=0))
-        for one, over in zip(crew, courses, strict=True)
+        np.outer(over.load, np.sum([c.force_mn for c in g.contacts], axis=0))
+        for g, over in zip(gestures, courses, strict=True)
     ]
     return Deformation(
         rest=skin_vertices,
@@ -119,18 +112,50 @@ def deform(
         force=np.sum(forces, axis=0),
         by_instrument=np.stack(forces, axis=1),
         time=np.arange(frames) / fps,
-        tip=np.concatenate([tip for tip, _ in poses], axis=1),
-        shaft=np.concatenate([shaft for _, shaft in poses], axis=1),
+        tip=tip,
+        shaft=shaft,
         min_jacobian=path.jacobian,
         energy=path.energy * tissue.young_kpa,
         residual=path.residual,
     )
 
 
-def clock(fem: schema.Fem, fps: float) -> motion.Clock:
+def solve_volume(
+    fem: schema.Fem, tissue: Tissue, tets: Tets, loads: Floats, named: Floats, fps: float
+) -> Path:
+    """The volume under (T, N, 3) mN for E = 1 kPa: in equilibrium, or in motion where the job asks for time.
+
+    Raises:
+        As `equilibrium.solve_path`.
+    """
+    if fem.time == "quasi-static" and not fem.relaxation:
+        return equilibrium.solve_path(assemble(tets, tissue.law, tissue.poisson), loads, named)
+    return motion.march_in_time(
+        tets, tissue.law, tissue.poisson, tissue.young_kpa, loads, named, clock(fem, fps, tets)
+    )
+
+
+def place_instruments(
+    gestures: Sequence[Gesture],
+    courses: Sequence[Course],
+    skin_vertices: Floats,
+    skin_faces: Ints,
+    displacement: Floats,
+) -> tuple[Floats, Floats]:
+    """Tips (T, 2 I, 3) mm and unit vectors to the hand (T, 2 I, 3) of I instruments on (T, V, 3) mm."""
+    surface = skin_vertices + displacement
+    poses = [
+        tool.pose(g, over, skin_vertices, skin_faces, surface)
+        for g, over in zip(gestures, courses, strict=True)
+    ]
+    return np.concatenate([tip for tip, _ in poses], axis=1), np.concatenate([s for _, s in poses], axis=1)
+
+
+def clock(fem: schema.Fem, fps: float, tets: Tets) -> motion.Clock:
     """Steps no longer than `fem.dt_s`, a whole number of them a frame."""
     dynamic = fem.time == "dynamic"
     substeps = int(np.ceil(1 / fps / fem.dt_s - 1e-9)) if dynamic else 1
+    mass = fem.mass_kg or fem.density_kg_m3 * 1e-9 * motion.volume(tets).sum()
     return motion.Clock(
-        1 / fps, substeps, fem.mass_kg if dynamic else 0.0, fem.damping if dynamic else 0.0, fem.relaxation
+        1 / fps, substeps, float(mass) if dynamic else 0.0, fem.damping if dynamic else 0.0, fem.relaxation
     )

@@ -1,54 +1,149 @@
-"""The fine surface on the volume mesh: it follows by a sparse matrix B, and its loads go back by B'."""
+"""The fine surface on the volume mesh: it rides on the nearest place of it, and its loads go back there.
+
+What stands out of the mesh (vessels, or the gap between a smooth surface and flat faces) is carried by a
+rigid motion: the displacement u(p) of the nearest place p, and the rotation there for the rest of the way,
+
+    u(x) = u(p) + w(p) x (x - p),    w = 1/2 curl u.
+
+The whole gradient would carry strain as well, and its transpose would turn every force out there into a pair
+of opposed forces on one element, without bound as elements get smaller.
+"""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
-from synth.fem.mesh.element import bary_slope, shape, shape_slope
-from synth.fem.mesh.tetrahedra import Tets, boundary
+from synth.fem.mesh.element import gradients, shape
+from synth.fem.mesh.tetrahedra import FACES, Tets, outer_faces
 from synth.system.jit import compiled
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 
-def embedding(tets: Tets, vertices: Floats) -> sp.csr_array:
-    """Matrix that carries nodal displacement to surface vertices.
+_EVEN_MM = 2.0  # over which rotation is averaged
 
-    A vertex takes the value at the nearest place of the volume and, for the rest of the way, the gradient
-    there: rows sum to 1 and linear fields come back exactly, inside and outside; B' keeps force and moment.
+
+@dataclass(frozen=True, eq=False)
+class Embedding:
+    """V points of a surface on a volume of N nodes. `gather` is the transpose of `move`: work is kept, and
+    since `move` holds every rigid motion, so are force and moment."""
+
+    value: sp.csr_array
+    """(V, N) shape functions at the nearest places."""
+    corner: sp.csr_array
+    """(V, K) where the nearest places are between the K corners of outer faces."""
+    mean: Floats
+    """(K, K) what averages the rotation at those corners."""
+    spin: sp.csr_array
+    """(3 K, 3 N) half the displacement's curl at those corners."""
+    arm: Floats
+    """(V, 3) mm from the nearest place."""
+
+    def move(self, u: Floats) -> Floats:
+        """Displacement (V, 3, ...) mm of the points, from the nodes' (N, 3, ...) mm."""
+        moved = (self.value @ u.reshape(len(u), -1)).reshape(-1, *u.shape[1:])
+        spin = self.spin @ u.reshape(3 * len(u), -1)
+        turned = self.corner @ (self.mean @ spin.reshape(len(self.mean), -1))
+        return np.asarray(moved + _cross(turned.reshape(moved.shape), self._arm(moved)))
+
+    def gather(self, force: Floats) -> Floats:
+        """Nodal forces (N, 3, ...) mN, from those at the points, (V, 3, ...) mN."""
+        flat = force.reshape(len(force), -1)
+        nodal = (self.value.T @ flat).reshape(-1, *force.shape[1:])
+        moment = _cross(self._arm(force), force).reshape(flat.shape)
+        couple = self.spin.T @ (self.mean.T @ (self.corner.T @ moment)).reshape(self.spin.shape[0], -1)
+        return np.asarray(nodal + couple.reshape(nodal.shape))
+
+    def _arm(self, like: Floats) -> Floats:
+        return self.arm.reshape(*self.arm.shape, *(1,) * (like.ndim - 2))
+
+
+def embed(tets: Tets, vertices: Floats) -> Embedding:
+    """Puts the vertices (V, 3) mm of a surface where they ride: on the nearest outer face of a volume."""
+    owner, off = outer_faces(tets.cells)
+    faces = FACES[off]
+    nodes = tets.cells[owner[:, None], faces]
+    face, on_face = _nearest(np.ascontiguousarray(tets.points[nodes]), np.ascontiguousarray(vertices))
+    bary = np.zeros((len(vertices), 4))
+    np.put_along_axis(bary, faces[face], on_face, axis=1)
+    value = _sparse(shape(bary, tets.order), tets.cells[owner[face]], len(tets.points))
+    used = np.unique(face)
+    corners, local = np.unique(nodes[used], return_inverse=True)
+    local = local.reshape(-1, 3)
+    mean, lumped = _averaging(tets.points[nodes[used]], local, len(corners))
+    return Embedding(
+        value,
+        _sparse(on_face, local[np.searchsorted(used, face)], len(corners)),
+        mean,
+        _half_curl(tets, owner[used], faces[used], local, lumped),
+        vertices - value @ tets.points,
+    )
+
+
+def _sparse(values: Floats, columns: Ints, width: int) -> sp.csr_array:
+    """Rows (V, n) of values at columns, as (V, width)."""
+    rows = np.repeat(np.arange(len(values)), values.shape[1])
+    whole = sp.coo_array((values.ravel(), (rows, columns.ravel())), shape=(len(values), width)).tocsr()
+    whole.eliminate_zeros()
+    return whole
+
+
+def _averaging(corner: Floats, local: Ints, count: int) -> tuple[Floats, Floats]:
+    """What averages values at the corners of faces (F, 3, 3) mm over `_EVEN_MM`, however small the faces.
+
+    Helmholtz' filter (1 - l^2 Laplacian)^-1 (Lazarov & Sigmund, Int. J. Numer. Meth. Eng. 86, 2011): rows sum
+    to 1.
+
+    Args:
+        corner: (F, 3, 3) mm.
+        local: (F, 3) which of the K corners they are.
+        count: K.
+
+    Returns:
+        (K, K), and the area (F, 3) mm^2 of each face's part in its corner's as a share of the latter.
+    """
+    sides = np.roll(corner, -1, axis=1) - np.roll(corner, 1, axis=1)  # each opposite its corner
+    area = 0.5 * np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)
+    stiff = np.einsum("fid,fjd->fij", sides, sides) / (4 * area[:, None, None])
+    whole = np.zeros((count, count))
+    np.add.at(whole, (local[:, :, None], local[:, None, :]), _EVEN_MM**2 * stiff)
+    mass = np.bincount(local.ravel(), np.repeat(area / 3, 3), count)
+    whole[np.diag_indices(count)] += mass
+    return np.asarray(np.linalg.inv(whole) * mass), (area / 3)[:, None] / mass[local]
+
+
+def _half_curl(tets: Tets, owner: Ints, faces: Ints, local: Ints, share: Floats) -> sp.csr_array:
+    """Half the curl at K corners of faces, (3 K, 3 N) 1/mm: the mean of the faces' elements there.
 
     Args:
         tets: the volume.
-        vertices: (V, 3) mm; inside, or a little outside.
-
-    Returns:
-        (V, N).
+        owner: (F,) the faces' elements.
+        faces: (F, 3) which of their corners.
+        local: (F, 3) which of the K corners.
+        share: (F, 3) of each element in its corner's mean.
     """
-    outer = np.zeros(len(tets.points), bool)
-    outer[boundary(tets.cells[:, :4], 1)] = True
-    reach = vertices.min(axis=0), vertices.max(axis=0)
-    corner = tets.points[tets.cells[:, :4]]
-    margin = 0.25 * float((reach[1] - reach[0]).max()) + 1e-9
-    near = ((corner.max(axis=1) >= reach[0] - margin) & (corner.min(axis=1) <= reach[1] + margin)).all(axis=1)
-    chosen = np.flatnonzero(near) if near.any() else np.arange(len(corner))
-    # Surface tetrahedra first: most vertices are in one, and the search ends early.
-    chosen = chosen[np.argsort(~outer[tets.cells[chosen, :4]].any(axis=1), kind="stable")]
-    slope, _ = bary_slope(corner)
-    owner, bary = _nearest(
-        np.ascontiguousarray(corner[chosen]), slope[chosen], np.ascontiguousarray(vertices)
-    )
-    owner = chosen[owner]
-    place = np.einsum("vc,vcd->vd", bary, corner[owner])
-    step = np.einsum("vcd,vd->vc", slope[owner], vertices - place)
-    value = shape(bary, tets.order)
-    if np.abs(step).max(initial=0) > 0:
-        value = value + np.einsum("vnc,vc->vn", shape_slope(bary, tets.order), step)
-    rows = np.repeat(np.arange(len(vertices)), tets.cells.shape[1])
-    size = (len(vertices), len(tets.points))
-    return sp.coo_array((value.ravel(), (rows, tets.cells[owner].ravel())), shape=size).tocsr()
+    gradient = gradients(tets.points[tets.cells[owner]], np.eye(4))[0]  # (F, 4, n, 3)
+    gradient = 0.5 * share[:, :, None, None] * np.take_along_axis(gradient, faces[:, :, None, None], axis=1)
+    nodes = np.broadcast_to(tets.cells[owner][:, None, :], gradient.shape[:3])
+    at = np.broadcast_to(local[:, :, None], gradient.shape[:3])
+    # curl_i = d_j u_k - d_k u_j
+    parts = [(i, k, gradient[..., j]) for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1))]
+    parts += [(i, j, -gradient[..., k]) for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1))]
+    rows = np.concatenate([(3 * at + i).ravel() for i, _, _ in parts])
+    columns = np.concatenate([(3 * nodes + k).ravel() for _, k, _ in parts])
+    values = np.concatenate([value.ravel() for _, _, value in parts])
+    size = (3 * (int(local.max()) + 1), 3 * len(tets.points))
+    return sp.coo_array((values, (rows, columns)), shape=size).tocsr()
+
+
+def _cross(a: Floats, b: Floats) -> Floats:
+    """Of vectors along axis 1."""
+    return np.stack([a[:, i] * b[:, j] - a[:, j] * b[:, i] for i, j in ((1, 2), (2, 0), (0, 1))], axis=1)
 
 
 def vertex_area(vertices: Floats, faces: NDArray[np.integer]) -> Floats:
@@ -59,66 +154,36 @@ def vertex_area(vertices: Floats, faces: NDArray[np.integer]) -> Floats:
 
 
 @compiled
-def _nearest(corner: Floats, slope: Floats, vertices: Floats) -> tuple[Ints, Floats]:
-    """For each vertex the nearest tetrahedron and the barycentrics of the nearest place in it."""
+def _nearest(corner: Floats, vertices: Floats) -> tuple[Ints, Floats]:
+    """For each vertex the nearest triangle of (F, 3, 3) mm, and the barycentrics of the place."""
     count = len(corner)
     low, high = np.empty((count, 3)), np.empty((count, 3))
     for t in range(count):
         for d in range(3):
-            low[t, d] = min(corner[t, 0, d], corner[t, 1, d], corner[t, 2, d], corner[t, 3, d])
-            high[t, d] = max(corner[t, 0, d], corner[t, 1, d], corner[t, 2, d], corner[t, 3, d])
+            low[t, d] = min(corner[t, 0, d], corner[t, 1, d], corner[t, 2, d])
+            high[t, d] = max(corner[t, 0, d], corner[t, 1, d], corner[t, 2, d])
     owner = np.zeros(len(vertices), np.int64)
-    bary = np.zeros((len(vertices), 4))
-    trial = np.empty(4)
+    bary = np.zeros((len(vertices), 3))
+    trial = np.empty(3)
     last = 0
     for v in range(len(vertices)):
         x = vertices[v]
         best = np.inf
         for step in range(count + 1):
-            t = last if step == 0 else step - 1  # neighbours in the list are mostly in one tetrahedron
+            t = last if step == 0 else step - 1  # neighbours in the list are mostly on one triangle
             box = 0.0
             for d in range(3):
                 gap = max(low[t, d] - x[d], x[d] - high[t, d], 0.0)
                 box += gap * gap
             if box >= best:
                 continue
-            distance = _place(corner[t], slope[t], x, trial)
+            distance = _on_triangle(corner[t, 0], corner[t, 1], corner[t, 2], x, trial)
             if distance < best:
                 best = distance
                 owner[v] = t
                 bary[v] = trial
-                if best == 0.0:
-                    break
         last = owner[v]
     return owner, bary
-
-
-@compiled
-def _place(corner: Floats, slope: Floats, x: Floats, bary: Floats) -> float:
-    """Squared distance of x from a tetrahedron; `bary` becomes the nearest place's."""
-    inside = True
-    bary[0] = 1.0
-    for c in range(1, 4):
-        b = 0.0
-        for d in range(3):
-            b += slope[c, d] * (x[d] - corner[0, d])
-        bary[c] = b
-        bary[0] -= b
-        inside = inside and b >= 0.0
-    if inside and bary[0] >= 0.0:
-        return 0.0
-    best = np.inf
-    w = np.empty(3)
-    result = np.zeros(4)
-    for off in range(4):
-        i, j, k = (off + 1) % 4, (off + 2) % 4, (off + 3) % 4
-        distance = _on_triangle(corner[i], corner[j], corner[k], x, w)
-        if distance < best:
-            best = distance
-            result[:] = 0.0
-            result[i], result[j], result[k] = w[0], w[1], w[2]
-    bary[:] = result
-    return best
 
 
 @compiled

@@ -11,7 +11,7 @@ from scipy.sparse.linalg import SuperLU, splu
 
 from synth.errors import UserError
 from synth.fem.assembly import divergence, gradient, stiffness
-from synth.fem.laws import NUMBER, lame, stress, tangent
+from synth.fem.laws import NUMBER, lame, least_determinant, stress, tangent
 from synth.fem.mesh.element import Quadrature, quadrature, quality
 from synth.fem.mesh.tetrahedra import Tets
 
@@ -49,6 +49,8 @@ class System:
     """(3N, 3N) mN/mm at rest, springs included."""
     factor: SuperLU
     """Of the free part of it."""
+    corners: Quadrature
+    """The same mesh seen at the corners of its elements."""
 
     def solve(self, force: Floats) -> Floats:
         """Displacement of the linear law, (N, 3) mm, under (N, 3) mN; of K loads at once, (N, 3, K) each."""
@@ -77,11 +79,18 @@ class System:
         tangent(NUMBER[self.law], strain, *lame(1.0, self.poisson), moduli)
         return (stiffness(self.mesh, moduli) + _springs(self.hold)).tocsr()
 
-    def worst(self, u: Floats) -> int:
-        """The element with the smallest det F at (N, 3) mm."""
-        strain = np.empty((self.mesh.weight.size, 3, 3))
-        gradient(self.mesh.cells, self.mesh.slope, u, strain)
-        return int(np.linalg.det(strain + np.eye(3)).argmin() // self.mesh.weight.shape[1])
+    def least_jacobian(self, u: Floats) -> tuple[float, int]:
+        """Smallest det F at (N, 3) mm and its element, corners included.
+
+        Under a contact J is smallest on the surface, beyond any quadrature point.
+        """
+        found = []
+        for mesh in (self.mesh, self.corners):
+            strain = np.empty((mesh.weight.size, 3, 3))
+            gradient(mesh.cells, mesh.slope, u, strain)
+            least, at = least_determinant(strain)
+            found.append((float(least), int(at) // mesh.weight.shape[1]))
+        return min(found)
 
 
 def assemble(tets: Tets, law: str, poisson: float) -> System:
@@ -110,7 +119,8 @@ def assemble(tets: Tets, law: str, poisson: float) -> System:
         diag_pivot_thresh=0.0,
         options={"SymmetricMode": True},
     )
-    return System(mesh, law, poisson, free, tets.hold, whole, factor)
+    corners = quadrature(tets.points, tets.cells, tets.order, np.eye(4))
+    return System(mesh, law, poisson, free, tets.hold, whole, factor, corners)
 
 
 def hooke(young: float, poisson: float) -> Floats:

@@ -147,8 +147,10 @@ class Fem(Section):
     """Equilibrium in every frame, or motion with inertia (backward Euler)."""
     dt_s: Annotated[FiniteFloat, Field(gt=0, le=1)] = 0.03
     """Dynamic: longest time step [s]; a frame holds a whole number of steps."""
-    mass_kg: Positive = 1.0
-    """Dynamic: mass of the whole brain [kg]."""
+    density_kg_m3: Positive = 1040.0
+    """Dynamic: density [kg/m3]; of grey and white matter by Barber et al., Acta Neurol. Scand. 46, 1970."""
+    mass_kg: Positive | None = None
+    """Dynamic: mass of the whole volume [kg]; given, it takes the place of `density_kg_m3`."""
     damping: NonNegative = 2.0
     """Dynamic: damping by mass [1/s]."""
     relaxation: Annotated[

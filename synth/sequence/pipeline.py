@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from synth.dataset.store import Writer
 from synth.fem import solver, tool
 from synth.fem.mesh import tetrahedra
+from synth.fem.mesh.relief import HeightMap
 from synth.fem.mesh.tetrahedra import Tets
 from synth.fem.solver import Deformation
 from synth.fields import FIELDS
@@ -199,15 +200,18 @@ def _seal(shooting: _Shooting) -> Path:
         scale_mm_per_px=float(shooting.studio.still.scale_mm_per_px),
         young_kpa=case.tissue.young_kpa,
         poisson=case.tissue.poisson,
-        mechanics=_mechanics(case, shooting.motion, view.rotation),
+        mechanics=_mechanics(shooting.job, case, shooting.motion, view.rotation),
         variant=shooting.studio.variant,
         timings=shooting.watch.report(),
     )
 
 
-def _mechanics(case: Scenario, motion: Deformation, rotation: NDArray[np.float64]) -> dict[str, Any]:
+def _mechanics(
+    job: Job, case: Scenario, motion: Deformation, rotation: NDArray[np.float64]
+) -> dict[str, Any]:
     return {
         "law": case.tissue.law,
+        "elastic": job.fem.time == "quasi-static" and not job.fem.relaxation,
         "min_jacobian": motion.min_jacobian.tolist(),
         "energy_mn_mm": motion.energy.tolist(),
         "residual": motion.residual.tolist(),
@@ -228,7 +232,8 @@ def build(job: Job, case: Scenario) -> tuple[Surface, Tets]:
     focus = [place for gesture in case.gestures for place in tool.focus(gesture)]
     surface, whole = cortex(job, case)
     if whole is None:
-        return surface, tetrahedra.block(job.anatomy, job.fem.tets, job.fem.order, focus)
+        height = HeightMap(surface.pia, surface.extent_mm)
+        return surface, tetrahedra.block(job.anatomy, job.fem.tets, job.fem.order, focus, height)
     return surface, tetrahedra.from_brain(whole, job.anatomy, job.fem.tets, job.fem.order, focus)
 
 

@@ -81,10 +81,10 @@ def fit_reading(
     )
     tets = pipeline.build(job.model_copy(update={"fem": plain}), case)[1]
     system = assemble(tets, "neo-hookean", case.tissue.poisson)
-    carry = surface_embedding.embedding(tets, surface.vertices)
+    carry = surface_embedding.embed(tets, surface.vertices)
     young = case.tissue.young_kpa
-    loads = np.stack([carry.T @ (motion.area[:, None] * motion.traction[f]) for f in frames]) / young
-    path = equilibrium.follow(system, loads, np.zeros(len(frames)))
+    loads = np.stack([carry.gather(motion.area[:, None] * motion.traction[f]) for f in frames]) / young
+    path = equilibrium.solve_path(system, loads, np.zeros(len(frames)))
     size = float(np.sqrt(np.square(motion.by_instrument[frames]).sum(axis=(1, 2)).mean()))
     courses = [tool.course(gesture, job.frames) for gesture in case.gestures]
     rules = []
@@ -99,11 +99,11 @@ def fit_reading(
             for contact in gesture.contacts:
                 centre = np.asarray(contact.point_mm) + over.shift[frame]
                 kernel = tool.footprint(centre, gesture.footprint_mm, surface.vertices, motion.area)
-                pull += np.outer(carry.T @ (motion.area * kernel), contact.force_mn)
+                pull += carry.gather(np.outer(motion.area * kernel, contact.force_mn))
             pull *= size / (young * gesture.force_mn)
             answer = np.zeros(pull.size)
             answer[system.free] = factor.solve(pull.ravel()[system.free])
-            way = carry @ answer.reshape(-1, 3)
+            way = carry.move(answer.reshape(-1, 3))
             step = _STEP_MM / np.abs(way).max()
             flow = (cameras.project(camera, now + step * way) - seen) / step
             columns.append(cells(truth.at_rest_pixels(still, surface.faces, flow), still.tissue))

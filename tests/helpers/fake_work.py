@@ -172,6 +172,8 @@ def consistent(job: Job, index: int, folder: Path, report: Report, fault: str = 
     focal *= 0.5 if fault == "camera" else 1.0
     tip = np.zeros((frames, 2, 3))
     tip[:, :, 0] = (6.0 * share * distance / 1000.0 + (3.0 if fault == "contact" else 0.0))[:, None]
+    energy = 0.4 * np.square(share) * (load @ load)
+    energy[-1] *= 1.7 if fault == "compliance" else 1.0
     described = attributes(index, rng)
     described["scenario"]["gesture"]["footprint_mm"] = 3.0
     described["scale_mm_per_px"] = distance / 1000.0 * (1.5 if fault == "scale" else 1.0)
@@ -181,7 +183,11 @@ def consistent(job: Job, index: int, folder: Path, report: Report, fault: str = 
         distortion=[0.0] * 5,
         rotation=np.eye(3).tolist(),
         translation=[0.0, 0.0, distance],
-        mechanics={"instruments": [{"tip_mm": tip.tolist()}]},
+        mechanics={
+            "elastic": True,
+            "energy_mn_mm": energy.tolist(),
+            "instruments": [{"tip_mm": tip.tolist(), "force_mn": force.tolist()}],
+        },
     )
 
 

@@ -105,16 +105,41 @@ class Quadrature:
     """N, number of nodes."""
 
 
-def quadrature(points: Floats, cells: Ints, order: int) -> Quadrature:
-    """Prepares a mesh of straight tetrahedra.
+def quadrature(points: Floats, cells: Ints, order: int, at: Floats | None = None) -> Quadrature:
+    """Prepares a mesh.
 
     Args:
-        points: (N, 3) mm, all nodes.
+        points: (N, 3) mm, all nodes; sides of quadratic elements may be curved.
         cells: (M, 4 or 10).
         order: 1 or 2.
+        at: (Q, 4) barycentric places in every element. Empty: `TET_POINTS`.
     """
-    slope, volume = bary_slope(points[cells[:, :4]])
-    at = TET_POINTS[order]
-    gradient = np.einsum("qnb,mbd->mqnd", shape_slope(at, order), slope)
-    weight = np.repeat(volume[:, None] / len(at), len(at), axis=1)
-    return Quadrature(cells.astype(np.int32), np.ascontiguousarray(gradient), weight, len(points))
+    at = TET_POINTS[order] if at is None else at
+    gradient, determinant = gradients(points[cells], at)
+    return Quadrature(
+        cells.astype(np.int32), np.ascontiguousarray(gradient), determinant / (6 * len(at)), len(points)
+    )
+
+
+def gradients(nodes: Floats, bary: Floats) -> tuple[Floats, Floats]:
+    """Gradients of the shape functions of isoparametric elements.
+
+    Args:
+        nodes: (M, 4 or 10, 3) mm.
+        bary: (Q, 4).
+
+    Returns:
+        (M, Q, n, 3) 1/mm, and (M, Q) mm^3: 6 times the volume of a straight element, negative inside out.
+    """
+    local = shape_slope(bary, 1 if nodes.shape[1] == 4 else 2)
+    local = local[..., 1:] - local[..., :1]  # (Q, n, 3): the first coordinate is what the others leave of 1
+    jacobian = np.einsum("qnk,mnd->mqkd", local, nodes)
+    return np.einsum("qnk,mqdk->mqnd", local, np.linalg.inv(jacobian)), np.linalg.det(jacobian)
+
+
+def jacobians(points: Floats, cells: Ints) -> Floats:
+    """Jacobian at the corners and quadrature points over that of the straight element, (M, 4 + Q)."""
+    order = 1 if cells.shape[1] == 4 else 2
+    determinant = gradients(points[cells], np.vstack([np.eye(4), TET_POINTS[order]]))[1]
+    straight = np.linalg.det(points[cells[:, 1:4]] - points[cells[:, :1]])
+    return np.asarray(determinant / straight[:, None])

@@ -15,6 +15,7 @@ from synth.fem.mesh.element import TRI_POINTS, TRI_WEIGHTS, bary_slope, face_sha
 from synth.fem.mesh.fit import fit
 from synth.fem.mesh.lattice_stuffing import stuff
 from synth.fem.mesh.refine import edges_of, refine
+from synth.fem.mesh.relief import HeightMap, raise_top
 from synth.geometry.brain_surface import Brain
 from synth.job import schema
 
@@ -33,13 +34,16 @@ _FLAT = 0.8  # the dome is round up to this part of its radius, level beyond (un
 _KUHN = np.array([[0, 1, 3, 7], [0, 5, 1, 7], [0, 3, 2, 7], [0, 2, 6, 7], [0, 4, 5, 7], [0, 6, 4, 7]])
 """Six tetrahedra of a cube with corners numbered x + 2y + 4z, round its diagonal."""
 
+FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])
+"""Corners of the four faces of a tetrahedron, each opposite its corner, counter-clockwise from outside."""
+
 
 @dataclass(frozen=True)
 class Tets:
     """A meshed brain, in world axes."""
 
     points: Floats
-    """(N, 3) mm: corners first, then (order 2) edge midpoints."""
+    """(N, 3) mm: corners first, then (order 2) nodes on the edges, in their middle but for curved ones."""
     cells: Ints
     """(M, 4) or (M, 10), positively oriented; midsides in the order of `refine.EDGES`."""
     order: int
@@ -49,7 +53,13 @@ class Tets:
     """(N, N) mm, for E = 1 kPa: springs of the skull on the surface round the opening, and of attachments."""
 
 
-def block(anatomy: schema.Anatomy, tets: int, order: int, focus: Sequence[Contact] = ()) -> Tets:
+def block(
+    anatomy: schema.Anatomy,
+    tets: int,
+    order: int,
+    focus: Sequence[Contact] = (),
+    height: HeightMap | None = None,
+) -> Tets:
     """A domed block, fixed at its sides and bottom, held by the skull round the opening.
 
     Args:
@@ -57,6 +67,7 @@ def block(anatomy: schema.Anatomy, tets: int, order: int, focus: Sequence[Contac
         tets: number of tetrahedra to aim for.
         order: 1 or 2.
         focus: where the load will be; finest there. Empty: finest in the whole opening.
+        height: of the surface over the opening and its rim. Empty: the bare dome.
 
     Raises:
         UserError: the block is too shallow for its dome, or an attachment holds nothing.
@@ -71,7 +82,19 @@ def block(anatomy: schema.Anatomy, tets: int, order: int, focus: Sequence[Contac
     opening = anatomy.craniotomy.radius_mm
     points, cells = refine(points, cells, _grading(opening, focus), tets)
     wall = (np.abs(np.abs(points[:, :2]) - size[:2] / 2) < 1e-9).any(axis=1) | (points[:, 2] < 1e-9 - size[2])
-    points[:, 2] += dome(points[:, :2], anatomy.dome_mm) * (1 + points[:, 2] / size[2])
+    points, cells = lengthened(points, cells, order)
+    faces = boundary(cells, order)
+
+    def ground(xy: Floats) -> Floats:
+        return dome(xy, anatomy.dome_mm)
+
+    points = raise_top(
+        points,
+        cells,
+        faces[(points[faces, 2] > -1e-9).all(axis=1)],
+        ground,
+        ground if height is None else height.over(ground),
+    )
     # A face is on a wall if its three corners are; the upper edge of the walls belongs to both.
     return _finished(points, cells, order, wall, anatomy.craniotomy, anatomy.attachments)
 
@@ -94,6 +117,7 @@ def from_brain(
     if top < -anatomy.craniotomy.radius_mm:
         raise UserError("anatomy.craniotomy: there is no volume under the opening")
     held = brain.placed(anatomy.attachments)
+    points, cells = lengthened(points, cells, order)
     return _finished(points, cells, order, np.zeros(len(points), bool), anatomy.craniotomy, held)
 
 
@@ -113,15 +137,17 @@ def lengthened(points: Floats, cells: Ints, order: int) -> tuple[Floats, Ints]:
 
 def boundary(cells: Ints, order: int) -> Ints:
     """Faces with one tetrahedron, (F, 3 or 6), counter-clockwise seen from outside; midsides 01, 02, 12."""
-    corners = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])
-    sides = np.array([[7, 8, 9], [6, 5, 9], [4, 6, 8], [5, 4, 7]])
-    faces = cells[:, corners].reshape(-1, 3)
-    key = np.sort(faces, axis=1)
+    owner, off = outer_faces(cells)
+    local = FACES if order == 1 else np.hstack([FACES, [[7, 8, 9], [6, 5, 9], [4, 6, 8], [5, 4, 7]]])
+    return np.asarray(cells[owner[:, None], local[off]])
+
+
+def outer_faces(cells: Ints) -> tuple[Ints, Ints]:
+    """Of the faces with one tetrahedron: which (F,), and the corner of it that is off the face (F,)."""
+    key = np.sort(cells[:, FACES].reshape(-1, 3), axis=1)
     _, first, count = np.unique(key, axis=0, return_index=True, return_counts=True)
     alone = np.sort(first[count == 1])
-    if order == 1:
-        return np.asarray(faces[alone])
-    return np.asarray(np.hstack([faces, cells[:, sides].reshape(-1, 3)])[alone])
+    return alone // 4, alone % 4
 
 
 def _grading(opening_mm: float, focus: Sequence[Contact]) -> Callable[[Floats], Floats]:
@@ -198,10 +224,8 @@ def _finished(
     at: schema.Craniotomy,
     held: Sequence[schema.Attachment],
 ) -> Tets:
-    faces = boundary(cells, 1)
-    on_wall = wall[faces].all(axis=1)
-    points, cells = lengthened(points, cells, order)
     faces = boundary(cells, order)
+    on_wall = wall[faces[:, :3]].all(axis=1)
     fixed = np.zeros(len(points), bool)
     fixed[faces[on_wall]] = True
     hold = _springs(points, faces[~on_wall], order, at) + attachments.springs(points, cells, order, held)

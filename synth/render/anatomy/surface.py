@@ -58,6 +58,8 @@ class Surface:
     """(F, 3), counter-clockwise seen from outside."""
     uv: npt.NDArray[np.float32]
     """(V, 2): world x, y over `extent_mm`, from 0 to 1."""
+    pia: Floats
+    """(n, n) mm, height at the vertices without vessels; rows go with y, columns with x."""
     extent_mm: float
     """Side of the square patch."""
     sulci: Map
@@ -151,10 +153,12 @@ def _surface(
     axis = np.linspace(-extent / 2, extent / 2, side)
     x, y = np.meshgrid(axis, axis)
     xy = np.stack([x.ravel(), y.ravel()], axis=1)
-    z = height(xy).astype(np.float64) + noise.sample(bulge(tree.veins, extent), xy, extent)
+    pia = height(xy).astype(np.float64)
+    z = pia + noise.sample(bulge(tree.veins, extent), xy, extent)
     return Surface(
         vertices=np.concatenate([xy, z[:, None]], axis=1),
         faces=_grid_faces(side),
+        pia=pia.reshape(side, side),
         uv=(xy / extent + 0.5).astype(np.float32),
         extent_mm=extent,
         sulci=sulci,

@@ -63,6 +63,7 @@ def test_a_good_dataset_passes_and_every_invariant_was_measured(dataset: Path) -
         ("scale", "camera"),
         ("contact", "contact"),
         ("depth", "range"),
+        ("compliance", "compliance"),
     ],
 )
 def test_a_faulty_pipeline_is_found_by_the_check_made_for_it(tmp_path: Path, fault: str, check: str) -> None:

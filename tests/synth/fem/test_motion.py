@@ -7,10 +7,10 @@ import pytest
 import scipy.sparse as sp
 from pydantic import ValidationError
 
-from synth.fem import equilibrium
+from synth.fem import equilibrium, solver
 from synth.fem.mesh import tetrahedra
 from synth.fem.mesh.tetrahedra import Tets
-from synth.fem.motion import Clock, march, nodal_mass
+from synth.fem.motion import Clock, march_in_time, nodal_mass
 from synth.fem.system import assemble
 from synth.job import schema
 
@@ -35,7 +35,7 @@ def test_creep_under_a_held_load_is_the_closed_form() -> None:
     loads = np.repeat(load[None], frames, axis=0)
     loads[0] = 0
     clock = Clock(step_s=0.02, relaxation=((lost, tau),))
-    path = march(tets, "linear", 0.4, 1.0, loads, np.full(frames, 0.1), clock)
+    path = march_in_time(tets, "linear", 0.4, 1.0, loads, np.full(frames, 0.1), clock)
     sudden = assemble(tets, "linear", 0.4).solve(load)
     grown = np.einsum("tnd,nd->t", path.displacement, sudden) / np.vdot(sudden, sudden)
     since = 0.02 * np.arange(frames) - 0.01  # the load comes on evenly within the first step
@@ -48,7 +48,7 @@ def test_a_step_keeps_the_balance_of_momentum(law: str) -> None:
     tets, frames, dt, damping = cube(), 8, 0.02, 2.0
     loads = np.linspace(0, 1, frames)[:, None, None] * pulled(tets, 3.0)
     clock = Clock(step_s=dt, mass_kg=0.2, damping=damping)
-    u = march(tets, law, 0.4, 2.0, loads, np.linspace(0, 0.1, frames), clock).displacement
+    u = march_in_time(tets, law, 0.4, 2.0, loads, np.linspace(0, 0.1, frames), clock).displacement
     mass = nodal_mass(tets, 0.2)[:, None]
     system = assemble(tets, law, 0.4)
     for t in range(2, frames):
@@ -63,8 +63,10 @@ def test_a_step_keeps_the_balance_of_momentum(law: str) -> None:
 def test_damped_motion_ends_in_equilibrium() -> None:
     tets, frames = cube(), 40
     loads = np.minimum(np.arange(frames) / 3, 1)[:, None, None] * pulled(tets, 3.0)
-    path = march(tets, "neo-hookean", 0.4, 2.0, loads, np.full(frames, 0.1), Clock(0.1, 2, 0.001, 30.0))
-    still = equilibrium.follow(assemble(tets, "neo-hookean", 0.4), loads[[0, -1]], np.full(2, 0.1))
+    path = march_in_time(
+        tets, "neo-hookean", 0.4, 2.0, loads, np.full(frames, 0.1), Clock(0.1, 2, 0.001, 30.0)
+    )
+    still = equilibrium.solve_path(assemble(tets, "neo-hookean", 0.4), loads[[0, -1]], np.full(2, 0.1))
     gap = np.linalg.norm(path.displacement[-1] - still.displacement[-1])
     assert gap <= 2e-3 * np.linalg.norm(still.displacement[-1])
 
@@ -76,6 +78,14 @@ def test_nodal_mass_is_the_whole_mass_at_its_centre(order: int) -> None:
     assert mass.min() > 0
     assert mass.sum() == pytest.approx(1.3)
     np.testing.assert_allclose(mass @ tets.points / 1.3, [0, 0, -5], atol=1e-9)
+
+
+def test_the_mass_is_that_of_the_tissue_unless_given() -> None:
+    tets = cube()  # 10 mm
+    asked = schema.Fem(time="dynamic", density_kg_m3=1040.0)
+    assert solver.clock(asked, 25.0, tets).mass_kg == pytest.approx(1.04e-3)
+    assert solver.clock(asked.model_copy(update={"mass_kg": 0.7}), 25.0, tets).mass_kg == 0.7
+    assert solver.clock(schema.Fem(), 25.0, tets).mass_kg == 0.0
 
 
 def test_relaxation_cannot_take_all_stiffness() -> None:

@@ -98,7 +98,7 @@ def test_a_linear_scene_is_solved_once_for_each_direction_of_load(monkeypatch: p
     one, other = np.random.default_rng(0).normal(size=(2, *tets.points.shape))
     share = np.array([[0.0, 0.0], [0.5, 0.0], [1.0, 0.3], [0.2, 1.0], [0.0, 0.1]])
     loads = 1e-3 * np.einsum("tk,knd->tnd", share, np.stack([one, other]))
-    moved = equilibrium.follow(system, loads, np.full(5, 0.1)).displacement
+    moved = equilibrium.solve_path(system, loads, np.full(5, 0.1)).displacement
     assert len(solved) == 2
     for u, load in zip(moved, loads, strict=True):
         np.testing.assert_allclose(u, solve(system, load), atol=1e-10)

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scipy.sparse as sp
+from dome import patch
 from newton import newton
 from scipy.optimize import brentq
 from scipy.sparse.linalg import splu
@@ -21,6 +22,7 @@ from synth.fem.mesh.refine import refine
 from synth.fem.mesh.tetrahedra import Tets
 from synth.fem.system import System, assemble
 from synth.job import schema
+from synth.job.law_limits import LEAST_JACOBIAN
 
 Floats = np.ndarray
 
@@ -75,10 +77,10 @@ def test_kernel_on_a_half_space(poisson: float) -> None:
     vertices = np.column_stack([top, np.zeros(len(top))])
     area = surface_embedding.vertex_area(vertices, faces)
     kernel = tool.footprint(np.zeros(2), a, vertices, area)
-    carry = surface_embedding.embedding(tets, vertices)
-    load = np.outer(carry.T @ (area * kernel), [0, 0, -1.0])
+    carry = surface_embedding.embed(tets, vertices)
+    load = carry.gather(np.outer(area * kernel, [0, 0, -1.0]))
     u = shell + system.solve(load - (system.stiffness @ shell.ravel()).reshape(-1, 3))
-    centre = -(carry @ u)[n * n // 2, 2]
+    centre = -carry.move(u)[n * n // 2, 2]
     assert centre == pytest.approx(1.0186 * (1 - poisson**2) / a, rel=0.005)
 
 
@@ -148,13 +150,12 @@ def loaded(law: str, load: float, kind: str) -> tuple[System, Floats]:
     """A block under one contact, and the load for E = 1 kPa."""
     anatomy = schema.Anatomy()
     tets = tetrahedra.block(anatomy, 700, 2, ((2.0, 1.0, 4.0),))
-    outer = np.unique(tetrahedra.boundary(tets.cells[:, :4], 1))
-    area = np.zeros(len(tets.points))
-    area[outer] = 1.0
-    area[tets.points[:, 2] < -15] = 0.0
-    kernel = tool.footprint(np.array([2.0, 1.0]), 4.0, tets.points, area) * area
+    vertices, faces = patch()
+    area = surface_embedding.vertex_area(vertices, faces)
+    kernel = tool.footprint(np.array([2.0, 1.0]), 4.0, vertices, area) * area
     way = np.array([0.5, 0.0, 0.87 if kind == "pull" else -0.87])
-    return assemble(tets, law, 0.4), np.outer(kernel, 16.0 * load * way)
+    force = surface_embedding.embed(tets, vertices).gather(np.outer(kernel, 16.0 * load * way))
+    return assemble(tets, law, 0.4), force
 
 
 @pytest.mark.parametrize(
@@ -163,7 +164,7 @@ def loaded(law: str, load: float, kind: str) -> tuple[System, Floats]:
 def test_fast_solver_agrees_with_newtons_method(law: str, kind: str) -> None:
     system, load = loaded(law, 0.15, kind)
     part = np.array([0.0, 0.4, 0.8, 1.0])
-    path = equilibrium.follow(system, part[:, None, None] * load, 0.15 * part)
+    path = equilibrium.solve_path(system, part[:, None, None] * load, 0.15 * part)
     exact = newton(system, load, path.displacement[-1], 1e-8)
     assert np.linalg.norm(path.displacement[-1] - exact) <= 1e-3 * np.linalg.norm(exact)
 
@@ -173,8 +174,23 @@ def test_a_guess_past_inversion_does_not_spoil_the_step() -> None:
     still = np.zeros_like(load)
     wild = np.random.default_rng(0).normal(size=load.shape) * 20
     assert not np.isfinite(system.state(wild).energy)
-    u, state, rest = equilibrium.balance(system, load, wild, 1e-3, still)
-    usual, _, _ = equilibrium.balance(system, load, still, 1e-3, still)
+    u, state, rest = equilibrium.minimise_energy(system, load, wild, 1e-3, still)
+    usual, _, _ = equilibrium.minimise_energy(system, load, still, 1e-3, still)
     assert np.isfinite(state.energy)
     assert rest <= 1e-3
     np.testing.assert_array_equal(u, usual)
+
+
+def test_a_corner_that_is_pressed_flat_on_the_surface_is_refused() -> None:
+    """No quadrature point is near it."""
+    system, load = loaded("stable", 0.1, "push")
+    top = int(np.abs(load).sum(axis=1)[system.mesh.cells[:, :4]].max(axis=1).argmax())
+    corner = system.mesh.cells[top, :4][np.abs(load).sum(axis=1)[system.mesh.cells[top, :4]].argmax()]
+    u = np.zeros_like(load)
+    u[corner, 2] = -1e-3
+    u *= 0.9 / (1 - system.least_jacobian(u)[0])  # det F is linear in one node's displacement
+    state = system.state(u)
+    assert system.least_jacobian(u)[0] == pytest.approx(0.1)
+    assert state.jacobian > 2 * LEAST_JACOBIAN
+    with pytest.raises(equilibrium.InvertedElement, match="element"):
+        equilibrium.check_state(system, u, state, 3, 0.1)

@@ -13,7 +13,9 @@ from synth.errors import UserError
 from synth.fem import surface_embedding, tool
 from synth.fem.material import Tissue
 from synth.fem.mesh import tetrahedra
+from synth.fem.mesh.refine import EDGES
 from synth.fem.solver import Deformation, InvertedElement, deform
+from synth.fem.system import assemble
 from synth.fem.tool import Gesture
 from synth.job import law_limits, schema
 
@@ -42,24 +44,53 @@ def test_transfer_keeps_force_and_moment() -> None:
     vertices = vertices + np.random.default_rng(0).uniform(
         -0.7, 0.7, vertices.shape
     )  # off the mesh's surface
-    carry = surface_embedding.embedding(tets, vertices)
+    carry = surface_embedding.embed(tets, vertices)
     load = np.random.default_rng(1).normal(size=(len(vertices), 3))
-    volume = carry.T @ load
-    assert np.abs(carry.sum(axis=1) - 1).max() <= 1e-12
+    volume = carry.gather(load)
+    assert np.abs(carry.value.sum(axis=1) - 1).max() <= 1e-12
     assert np.abs(volume.sum(axis=0) - load.sum(axis=0)).max() <= 1e-12 * np.abs(load).sum()
     moment = np.cross(vertices, load).sum(axis=0)
     assert np.abs(np.cross(tets.points, volume).sum(axis=0) - moment).max() <= 1e-9 * np.abs(moment).max()
 
 
+def test_what_stands_out_of_the_mesh_rides_by_rotation() -> None:
+    tets = tetrahedra.block(ANATOMY, 400, 2)
+    vertices, _ = patch()
+    above = vertices + np.array([0, 0, 1.0])
+    carry = surface_embedding.embed(tets, above)
+    turn, stretch = np.array([[0, -0.3, 0.2], [0.3, 0, -0.1], [-0.2, 0.1, 0]]), np.diag([0.1, -0.2, 0.4])
+    moved = carry.move(tets.points @ (turn + stretch).T)
+    np.testing.assert_allclose(moved, above @ turn.T + (above - carry.arm) @ stretch.T, atol=1e-10)
+
+
+def test_a_load_on_what_stands_out_neither_grows_nor_diverges() -> None:
+    vertices, faces = patch(121, 20.0)
+    bumps = vertices.copy()
+    bumps[:, 2] += np.cos(np.pi * vertices[:, 0] / 2) ** 8  # ridges 1 mm high, 2 mm apart
+    work = []
+    for surface in (vertices, bumps):
+        area = surface_embedding.vertex_area(surface, faces)
+        force = np.outer(area * tool.footprint(np.zeros(2), 4.0, surface, area), [0.0, 0.0, -1.0])
+        for tets in (400, 3000):
+            volume = tetrahedra.block(ANATOMY, tets, 2, ((0.0, 0.0, 4.0),))
+            carry = surface_embedding.embed(volume, surface)
+            u = carry.move(assemble(volume, "linear", 0.4).solve(carry.gather(force)))
+            work.append(np.vdot(force, u))
+    assert work == pytest.approx([work[1]] * 4, rel=0.1)
+
+
 @pytest.mark.parametrize("order", [1, 2])
 def test_embedding_reproduces_what_the_elements_can_hold(order: int) -> None:
     tets = tetrahedra.block(ANATOMY, 400, order)
+    if order == 2:
+        ends = tets.points[tets.cells[:, EDGES]]
+        tets.points[tets.cells[:, 4:]] = ends.mean(axis=2)  # curved sides hold no quadratic field
     rng = np.random.default_rng(0)
-    cells = rng.integers(len(tets.cells), size=300)
-    inside = np.einsum("vc,vcd->vd", rng.dirichlet(np.ones(4), 300), tets.points[tets.cells[cells, :4]])
+    faces = rng.choice(tetrahedra.boundary(tets.cells, 1), size=300)
+    on = np.einsum("vc,vcd->vd", rng.dirichlet(np.ones(3), 300), tets.points[faces])
     for power in range(1, order + 1):
-        carried = surface_embedding.embedding(tets, inside) @ tets.points**power
-        assert np.abs(carried - inside**power).max() <= 1e-9 * np.abs(inside).max() ** power
+        carried = surface_embedding.embed(tets, on).move(tets.points**power)
+        assert np.abs(carried - on**power).max() <= 1e-9 * np.abs(on).max() ** power
 
 
 @pytest.mark.parametrize("kind", ["pull", "push", "slide", "grasp", "retract", "tap"])

@@ -1,0 +1,115 @@
+"""The upper boundary of a block follows gyri and sulci, as well as its faces can.
+
+The heights of its nodes are those whose faces lie on the surface in the mean (least squares over the faces):
+what is thinner than a face averages out, not hit or missed by a corner. Quadratic faces are curved.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sp
+from numpy.typing import NDArray
+from scipy.interpolate import LinearNDInterpolator
+from scipy.ndimage import map_coordinates
+from scipy.sparse.linalg import spsolve
+
+from synth.fem.mesh.element import face_shape, jacobians, quality
+from synth.fem.mesh.refine import EDGES
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Field = Callable[[Floats], Floats]
+"""Height (n,) mm at (n, 2) mm."""
+
+_FADE_MM = 3.0  # over which the map passes into what lies round it
+_LATTICE = 7
+_PLACES = (
+    np.array([(i, j, _LATTICE - 1 - i - j) for i in range(_LATTICE) for j in range(_LATTICE - i)]) + 1 / 3
+) / _LATTICE
+"""(28, 3) even barycentric places on a face."""
+_SOUND, _UNBENT = 0.1, 0.3  # least mean ratio, and least Jacobian of a curved element over its straight one's
+_TURNS = 24
+
+
+@dataclass(frozen=True, eq=False)
+class HeightMap:
+    """Heights over a square round the opening's centre."""
+
+    height: Floats
+    """(n, n) mm, at a grid whose corners are those of the square; rows go with y, columns with x."""
+    extent_mm: float
+    """Side of the square."""
+
+    def over(self, ground: Field) -> Field:
+        """The map within its inner circle, passing into another field beyond."""
+
+        def height(xy: Floats) -> Floats:
+            half, last = self.extent_mm / 2, len(self.height) - 1
+            at = (xy / self.extent_mm + 0.5) * last
+            known = map_coordinates(self.height, [at[:, 1], at[:, 0]], order=1, mode="nearest")
+            s = np.clip((half - np.hypot(xy[:, 0], xy[:, 1])) / _FADE_MM, 0, 1)
+            below = ground(xy)
+            return np.asarray(below + s * s * (3 - 2 * s) * (known - below))
+
+        return height
+
+
+def raise_top(points: Floats, cells: Ints, faces: Ints, ground: Field, height: Field) -> Floats:
+    """Bends a box so that its upper side lies on a height field.
+
+    Args:
+        points: (N, 3) mm, z from -depth to 0; midsides in the middle of their sides.
+        cells: (M, 4 or 10).
+        faces: (F, 3 or 6) of the upper side.
+        ground: smooth; the box is bent after it as a whole.
+        height: what the upper side is to be; where elements would get bad, it is only partly.
+
+    Returns:
+        (N, 3) mm. Sides are straight but for those of quadratic elements on the upper side.
+    """
+    corners = int(cells[:, :4].max()) + 1
+    sinking = 1 + points[:, 2] / -points[:, 2].min()
+    base = points + np.outer(ground(points[:, :2]) * sinking, [0.0, 0.0, 1.0])
+    place = np.einsum("qc,fcd->fqd", _PLACES, points[faces[:, :3], :2])
+    top, wanted = _fit_heights(points, faces, height(place.reshape(-1, 2)).reshape(place.shape[:2]))
+    rise = np.zeros(len(points))
+    first = top[top < corners]
+    rise[top] = wanted - base[top, 2]
+    below = np.setdiff1d(np.arange(corners), first)
+    rise[below] = sinking[below] * LinearNDInterpolator(points[first, :2], rise[first])(points[below, :2])
+
+    quadratic = cells.shape[1] == 10
+    ends = np.zeros((len(points), 2), np.int64)
+    ends[:corners] = np.arange(corners)[:, None]
+    if quadratic:
+        ends[cells[:, 4:]] = cells[:, EDGES]
+    whole = base[:, 2] + rise
+    bulge = np.where(np.isin(np.arange(len(points)), top), whole - whole[ends].mean(axis=1), 0.0)
+    share, raised = np.ones(len(points)), base.copy()
+    best = np.minimum(_SOUND, quality(base[cells[:, :4]]))
+    for turn in range(_TURNS):
+        raised[:, 2] = (base[:, 2] + share * rise)[ends].mean(axis=1) + share * bulge
+        bent = jacobians(raised, cells).min(axis=1)
+        bad = (quality(raised[cells[:, :4]]) < best - 1e-12) | (bent < _UNBENT)
+        if not bad.any():
+            return raised
+        share[cells[bad]] *= 0.5 if turn < _TURNS // 4 else 0.0
+    return base
+
+
+def _fit_heights(points: Floats, faces: Ints, wanted: Floats) -> tuple[Ints, Floats]:
+    """The nodes of faces and the heights (K,) mm of them that fit (F, 28) mm at `_PLACES` best."""
+    corner = points[faces[:, :3], :2]
+    side, other = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
+    area = 0.5 * np.abs(side[:, 0] * other[:, 1] - side[:, 1] * other[:, 0])
+    value = face_shape(_PLACES, 1 if faces.shape[1] == 3 else 2)
+    local = np.einsum("f,qi,qj->fij", area, value, value)
+    used, at = np.unique(faces, return_inverse=True)
+    at, n = at.reshape(faces.shape), faces.shape[1]
+    rows, columns = np.repeat(at, n, axis=1).ravel(), np.tile(at, (1, n)).ravel()
+    matrix = sp.coo_array((local.ravel(), (rows, columns)), shape=(len(used),) * 2).tocsc()
+    asked = np.bincount(at.ravel(), np.einsum("f,qi,fq->fi", area, value, wanted).ravel(), len(used))
+    return used, np.asarray(spsolve(matrix, asked))

@@ -1,0 +1,60 @@
+"""The block's upper boundary on gyri and sulci: how close, and never at the elements' expense."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from dome import ANATOMY
+
+from synth.fem.mesh import tetrahedra
+from synth.fem.mesh.element import face_shape, jacobians, quality
+from synth.fem.mesh.relief import HeightMap
+from synth.fem.mesh.tetrahedra import Tets
+
+EXTENT, SIDE = 34.0, 171
+FOCUS = ((1.0, 2.0, 4.0),)
+
+
+def sulci(depth: float, spacing: float) -> HeightMap:
+    """Parallel valleys across a dome."""
+    x = np.linspace(-EXTENT / 2, EXTENT / 2, SIDE)
+    xy = np.stack(np.meshgrid(x, x), axis=-1).reshape(-1, 2)
+    valley = 0.5 * depth * (1 - np.cos(2 * np.pi * xy[:, 0] / spacing))
+    return HeightMap((tetrahedra.dome(xy, ANATOMY.dome_mm) - valley).reshape(SIDE, SIDE), EXTENT)
+
+
+def gap(tets: Tets, height: HeightMap) -> float:
+    """Root mean square height between the mesh and the map under the contact, mm."""
+    faces = tetrahedra.boundary(tets.cells, tets.order)
+    middle = tets.points[faces[:, :3]].mean(axis=1)
+    near = faces[np.hypot(middle[:, 0] - 1.0, middle[:, 1] - 2.0) < 4.0]
+    bary = np.random.default_rng(0).dirichlet(np.ones(3), 40)
+    at = np.einsum("qn,fnd->fqd", face_shape(bary, tets.order), tets.points[near]).reshape(-1, 3)
+    wanted = height.over(lambda xy: tetrahedra.dome(xy, ANATOMY.dome_mm))(at[:, :2])
+    return float(np.sqrt(np.mean((at[:, 2] - wanted) ** 2)))
+
+
+@pytest.mark.parametrize(("order", "most"), [(1, 0.06), (2, 0.02)])
+def test_the_boundary_lies_on_the_relief(order: int, most: float) -> None:
+    height = sulci(1.4, 10.0)
+    tets = tetrahedra.block(ANATOMY, 1600, order, FOCUS, height)
+    assert gap(tets, height) < most
+    assert gap(tetrahedra.block(ANATOMY, 1600, order, FOCUS), height) > 0.4
+
+
+def test_what_is_thinner_than_a_face_averages_out() -> None:
+    bare, fine = (tetrahedra.block(ANATOMY, 1600, 2, FOCUS, sulci(depth, 0.9)) for depth in (0.0, 1.0))
+    faces = tetrahedra.boundary(bare.cells, 1)
+    top = np.unique(faces[bare.points[faces, 2].min(axis=1) > -0.5])
+    top = top[np.hypot(*(bare.points[top, :2] - FOCUS[0][:2]).T) < 4]
+    assert fine.points[top, 2] - bare.points[top, 2] == pytest.approx(-0.5, abs=0.25)
+
+
+@pytest.mark.parametrize("order", [1, 2])
+def test_a_wild_relief_leaves_the_elements_sound(order: int) -> None:
+    rough = HeightMap(np.random.default_rng(0).normal(0, 30.0, (SIDE, SIDE)), EXTENT)
+    for tets in (tetrahedra.block(ANATOMY, n, order, FOCUS, rough) for n in (400, 3000)):
+        plain = tetrahedra.block(ANATOMY, 400, order, FOCUS)
+        least = quality(plain.points[plain.cells[:, :4]]).min()
+        assert quality(tets.points[tets.cells[:, :4]]).min() >= min(0.1, least) - 1e-9
+        assert jacobians(tets.points, tets.cells).min() >= 0.3
