@@ -6,7 +6,7 @@ from __future__ import annotations
 import json as json_
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -74,7 +74,7 @@ def train_command(
 
     from learn.data.clips import load, sources
     from learn.data.split import groups, nested, ungrouped
-    from learn.settings import override
+    from learn.settings import override, replace
     from learn.settings import preset as of
     from learn.training.threads import set_threads
     from learn.training.train import train

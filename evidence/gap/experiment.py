@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ from evidence.gap.runs import KEYS, Tests, Training, carry_out, followed
 from learn.data.clips import Clip, load
 from learn.data.split import Split, folds, nested
 from learn.evaluation.statistics import interval
-from learn.settings import Settings
+from learn.settings import Settings, replace
 from synth.dataset.store import Dataset
 from synth.errors import UserError
 

@@ -20,6 +20,7 @@ from learn.data.split import Split
 from learn.evaluation.evaluate import evaluate
 from learn.inference.predict import load
 from learn.settings import Settings
+from learn.settings import replace as changed
 from learn.training.train import train
 from synth.dataset.folder import write_whole
 from synth.dataset.store import Sequence as Stored
@@ -105,7 +106,7 @@ def carry_out(
         say: told what is under way.
     """
     kind = {"I": "ideal", "R": "recovered", "N": "recovered", "mixed": "mixed"}[training.kind]
-    chosen = replace(settings, input=kind, seed=training.seed)  # type: ignore[arg-type]
+    chosen = changed(settings, input=kind, seed=training.seed)
     file = folder / f"{training.name}.json"
     asked = {name: [c.content_hash for c in part] for name, (part, _) in tests.items()}
     if file.is_file():

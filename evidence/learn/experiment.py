@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -19,7 +18,7 @@ from learn.data.clips import Clip, load
 from learn.data.grid import Grid
 from learn.loss import GHOSTLESS, Objective
 from learn.network.d2fnet import Architecture
-from learn.settings import Settings, preset
+from learn.settings import Settings, preset, replace
 from learn.training.threads import set_threads
 from synth.errors import UserError
 from synth.job import reader

@@ -9,7 +9,6 @@ from __future__ import annotations
 import json as json_
 import time
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import replace
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Annotated
@@ -27,7 +26,7 @@ from learn.data.grid import Grid
 from learn.data.split import nested
 from learn.evaluation.evaluate import evaluate
 from learn.inference.predict import load
-from learn.settings import preset
+from learn.settings import preset, replace
 from learn.training.threads import set_threads
 from learn.training.train import train
 from synth.errors import UserError

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json as json_
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -24,7 +23,7 @@ from learn.data.split import Split, nested
 from learn.evaluation.evaluate import Report, evaluate
 from learn.inference.predict import Predictor, load
 from learn.loss import GHOSTLESS
-from learn.settings import Settings
+from learn.settings import Settings, replace
 from learn.training.threads import set_threads
 from learn.training.train import train
 from synth.errors import UserError

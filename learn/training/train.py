@@ -23,7 +23,7 @@ from learn.data.split import Split, groups
 from learn.evaluation.metrics import Moments, agreement
 from learn.loss import SHARES, at, full, gradient_shares, loss
 from learn.network.monai_unet import build
-from learn.settings import Settings
+from learn.settings import Settings, replace
 from learn.training.batches import Batch, Frames, inputs, measure_scales
 from learn.training.gpu_batches import held
 from learn.training.log import Log
@@ -234,7 +234,7 @@ def _open(out: Path, card: Card) -> dict[str, Any] | None:
         checkpoint.write_card(out, card)
         return None
     there = checkpoint.read_card(out)
-    if there.settings != dataclasses.replace(card.settings, epochs=there.settings.epochs):
+    if there.settings != replace(card.settings, epochs=there.settings.epochs):
         raise UserError(f"{out}: holds a model trained with other settings; choose another folder")
     if there.split != card.split or there.scales != card.scales:
         raise UserError(f"{out}: holds a model trained on other data; choose another folder")

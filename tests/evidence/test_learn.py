@@ -26,7 +26,7 @@ from learn.data.grid import Grid
 from learn.data.split import nested
 from learn.inference.predict import Predictor, load
 from learn.loss import Objective
-from learn.settings import PRESETS, preset
+from learn.settings import PRESETS, preset, replace
 from learn.training.train import train
 from synth.errors import UserError
 from synth.job import reader
@@ -39,8 +39,8 @@ GRID = Grid(32)
 def model(clips: list[Clip], tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("bench") / "model"
     settings = preset("tiny", size=32, epochs=1, objective=Objective(kind="mse"))
-    arch = dataclasses.replace(settings.arch, levels=2, width=8, output="magnitude")
-    train(clips, nested(clips, 3, 0, 0), dataclasses.replace(settings, arch=arch), out)
+    arch = replace(settings.arch, levels=2, width=8, output="magnitude")
+    train(clips, nested(clips, 3, 0, 0), replace(settings, arch=arch), out)
     return out
 
 
@@ -136,16 +136,16 @@ def test_errors_are_of_runs_that_were_trained_as_the_preset_is(tmp_path: Path) -
     runs = [run for run in preset_runs() if run.settings.size == PRESETS["cpu"].size]
     own = [shape(run.settings.arch) == shape(PRESETS["cpu"].arch) for run in runs]
     cpu, other = runs[own.index(True)], runs[own.index(False)]
-    again = Run("again", dataclasses.replace(other.settings, seed=1))
+    again = Run("again", replace(other.settings, seed=1))
     kept(tmp_path, cpu, [1.0, 2.0, 3.0, 4.0])
     kept(tmp_path, other, [1.5, 2.5, 3.0, 4.5])
     kept(tmp_path, again, [2.5, 2.5, 3.0, 4.5])
-    mse = dataclasses.replace(cpu.settings, objective=Objective(kind="mse"), seed=7)
+    mse = replace(cpu.settings, objective=Objective(kind="mse"), seed=7)
     kept(tmp_path, Run("another-loss", mse), [9.0] * 4)
-    kept(tmp_path, Run("longer", dataclasses.replace(cpu.settings, epochs=99, seed=8)), [9.0] * 4)
-    decayed = dataclasses.replace(cpu.settings, weight_decay=0.1, seed=9)
+    kept(tmp_path, Run("longer", replace(cpu.settings, epochs=99, seed=8)), [9.0] * 4)
+    decayed = replace(cpu.settings, weight_decay=0.1, seed=9)
     kept(tmp_path, Run("other-decay", decayed), [9.0] * 4)
-    elsewhere = dataclasses.replace(cpu.settings, seed=10)
+    elsewhere = replace(cpu.settings, seed=10)
     kept(tmp_path, Run("on-recovered", elsewhere, source="recovered"), [9.0] * 4)
     found = errors(tmp_path)
     assert set(found) == {(shape(r.settings.arch), 128) for r in (cpu, other)}
@@ -160,7 +160,7 @@ def test_errors_are_of_runs_that_were_trained_as_the_preset_is(tmp_path: Path) -
 def test_runs_that_were_tested_on_other_sequences_are_not_averaged(tmp_path: Path) -> None:
     first = next(preset_runs())
     kept(tmp_path, first, [1.0, 2.0, 3.0])
-    kept(tmp_path, Run("again", dataclasses.replace(first.settings, seed=1)), [1.0, 2.0])
+    kept(tmp_path, Run("again", replace(first.settings, seed=1)), [1.0, 2.0])
     with pytest.raises(UserError, match="different sequences"):
         errors(tmp_path)
 

@@ -15,7 +15,7 @@ from learn.data.clips import Clip
 from learn.evaluation.evaluate import Report, evaluate, score
 from learn.evaluation.metrics import Moments, agreement, contact_mm, ghost_share, line
 from learn.network.d2fnet import Architecture
-from learn.settings import Settings
+from learn.settings import Settings, replace
 from learn.training.batches import measure_scales
 from synth.errors import UserError
 
@@ -127,8 +127,8 @@ class Knowing:
 @pytest.mark.parametrize(("condition", "passes"), [("none", 1), ("film", 5)])
 def test_columns_of_stiffness(clips: list[Clip], condition: str, passes: int) -> None:
     c = card(clips, "vector")
-    arch = dataclasses.replace(c.settings.arch, condition=condition)  # type: ignore[arg-type]
-    c = dataclasses.replace(c, settings=dataclasses.replace(c.settings, arch=arch))
+    arch = replace(c.settings.arch, condition=condition)
+    c = dataclasses.replace(c, settings=replace(c.settings, arch=arch))
     clip = clips[2]
     knowing = Knowing(clip, c)
     pressed = {clip.content_hash: 1.1 * clip.young_kpa}

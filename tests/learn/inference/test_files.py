@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 from pathlib import Path
 
@@ -210,29 +209,3 @@ def test_bad_files(tmp_path: Path, dataset: Path) -> None:
     phantom.write(tmp_path / "x", 0, anatomy_seed=0, recovered=False)
     with pytest.raises(UserError, match="holds no recovered flow"):
         first(tmp_path / "x")
-
-
-def test_settings_from_words() -> None:
-    got = override(
-        preset("tiny"), ["arch.width=8", "batch=3", "augment=false", "arch.bounds=1,2,3", "objective.low=0.1"]
-    )
-    assert (got.arch.width, got.batch, got.augment, got.arch.bounds) == (8, 3, False, (1.0, 2.0, 3.0))
-    assert got.objective.low == 0.1
-    assert dataclasses.replace(got, batch=8).arch.stem == preset("tiny").arch.stem
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ("bacth=3", r"bacth=3: unknown setting, did you mean 'batch'"),
-        ("arch.widht=3", r"did you mean 'arch.width'"),
-        ("batch=many", "not a value of type int"),
-        ("augment=1", "not a value of type bool"),
-        ("arch=3", "unknown setting"),
-        ("batch=0", "batch 0: must be positive"),
-        ("schedule=step", "unknown schedule 'step'"),
-    ],
-)
-def test_settings_that_cannot_be(change: str, message: str) -> None:
-    with pytest.raises(UserError, match=message):
-        override(preset("tiny"), [change])
