@@ -19,7 +19,11 @@ from synth.errors import UserError
 from synth.system.cli_errors import Commands
 
 if TYPE_CHECKING:
+    from learn.checkpoint import Card
+    from learn.data.clips import Clip
+    from learn.data.split import Split
     from learn.evaluation.statistics import Paired
+    from learn.settings import Settings
 
 app = typer.Typer(
     cls=Commands,
@@ -70,14 +74,9 @@ def train_command(
     json: Json = False,
 ) -> None:
     """Train D2FNet on a dataset. An interrupted run is continued by the same command."""
-    from lightning_fabric import Fabric
-
-    from learn.data.clips import load, sources
-    from learn.data.split import groups, nested, ungrouped
-    from learn.settings import override, replace
-    from learn.settings import preset as of
+    from learn.settings import override
+    from learn.settings import preset as named
     from learn.training.threads import set_threads
-    from learn.training.train import train
 
     set_threads(threads)
     options = {
@@ -97,27 +96,10 @@ def train_command(
         "seed": seed,
     }
     given = [f"{k}={v}" for k, v in options.items() if v is not None]
-    settings = override(of(preset), [*given, *(changes or [])])
-    with _bar("Reading sequences") as tell:
-        clips = load(dataset, settings.grid, sources(settings.input), cache=cache, report=tell)
-    if settings.share_anatomy:
-        clips = ungrouped(clips)
-        _console.print("One brain may be on several sides of the split: scores say nothing of other brains.")
-    if folds is None:
-        settings = replace(settings, folds=min(settings.folds, len(set(groups(clips)))))
-    split = nested(clips, settings.folds, settings.fold, settings.seed, settings.held_out_family)
-    fabric = Fabric(accelerator=accelerator, devices=devices, precision=settings.precision)
-    with _bar("Training") as tell:
-        card = train(
-            clips,
-            split,
-            settings,
-            out,
-            fabric=fabric,
-            report=lambda done, of_, numbers: tell(done, of_),
-            log=(lambda numbers: None) if json or not fabric.is_global_zero else _log,
-        )
-    if not fabric.is_global_zero:
+    settings = override(named(preset), [*given, *(changes or [])])
+    clips, split, settings = _divided(dataset, settings, named(preset), cache, fixed=folds is not None)
+    card, first = _train(clips, split, settings, out, accelerator, devices, quiet=json)
+    if not first:
         return
     result = {"model": str(out), "epoch": card.epoch, "select_r2": card.score}
     result |= {k: len(v) for k, v in card.split.items()}
@@ -129,6 +111,72 @@ def train_command(
             f"{result['select']} select sequences; fitted on {result['fit']}, "
             f"{result['test']} kept for `learn eval`."
         )
+
+
+def _divided(
+    dataset: Path, settings: Settings, base: Settings, cache: Path | None, *, fixed: bool
+) -> tuple[list[Clip], Split, Settings]:
+    """The sequences, who of them is fitted, chooses and is kept, and the settings as that made them.
+
+    `base`: the preset that was changed; `fixed`: whether the number of folds was asked for.
+    """
+    from learn.data.clips import load, sources
+    from learn.data.split import groups, keep_written, nested, ungrouped
+    from learn.settings import replace
+    from synth.dataset.index import written_sides
+    from synth.dataset.split import rule
+
+    with _bar("Reading sequences") as tell:
+        clips = load(dataset, settings.grid, sources(settings.input), cache=cache, report=tell)
+    sides = written_sides(dataset)
+    if sides is not None:
+        asked = [k for k in ("folds", "fold", "held_out_family") if getattr(settings, k) != getattr(base, k)]
+        if asked:
+            raise UserError(
+                f"{dataset}: is split already (split.json, by `synth split`): leave out {', '.join(asked)}"
+            )
+        settings = replace(settings, share_anatomy=settings.share_anatomy or rule(dataset).share_anatomy)
+    if settings.share_anatomy:
+        clips = ungrouped(clips)
+        _console.print("One brain may be on several sides of the split: scores say nothing of other brains.")
+    if sides is not None:
+        _console.print(
+            "The dataset's own split: what `synth split` marks test is neither fitted nor chosen on."
+        )
+        return clips, keep_written(clips, sides, settings.seed), settings
+    if not fixed:
+        settings = replace(settings, folds=min(settings.folds, len(set(groups(clips)))))
+    split = nested(clips, settings.folds, settings.fold, settings.seed, settings.held_out_family)
+    return clips, split, settings
+
+
+def _train(
+    clips: list[Clip],
+    split: Split,
+    settings: Settings,
+    out: Path,
+    accelerator: str,
+    devices: int,
+    *,
+    quiet: bool,
+) -> tuple[Card, bool]:
+    """Trains with a bar; the best epoch's card, and whether this process is the one that speaks."""
+    from lightning_fabric import Fabric
+
+    from learn.training.train import train
+
+    fabric = Fabric(accelerator=accelerator, devices=devices, precision=settings.precision)
+    with _bar("Training") as tell:
+        card = train(
+            clips,
+            split,
+            settings,
+            out,
+            fabric=fabric,
+            report=lambda done, of_, numbers: tell(done, of_),
+            log=(lambda numbers: None) if quiet or not fabric.is_global_zero else _log,
+        )
+    return card, fabric.is_global_zero
 
 
 def _log(numbers: dict[str, float]) -> None:
@@ -159,6 +207,7 @@ def eval_command(
     from learn.evaluation.evaluate import compare, evaluate, unseen
     from learn.inference.predict import load as load_model
     from learn.training.threads import set_threads
+    from synth.dataset.index import written_sides
 
     set_threads(threads)
     predictor = load_model(model)
@@ -179,6 +228,10 @@ def eval_command(
                 f"{against}: is of another grid or target than {model}; their maps can't be paired"
             )
         chosen = chosen if all else unseen(chosen, other.card)
+    sides = None if all else written_sides(dataset)
+    if sides is not None and "test" in sides.values():
+        chosen = [c for c in chosen if sides.get(c.content_hash) == "test"]
+        _console.print("The dataset's own split: only what `synth split` marks test is scored.")
     if not chosen:
         raise UserError(
             f"{dataset}: the model was fitted or chosen on every sequence here; --all scores them anyway"

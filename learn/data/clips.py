@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from learn.data.grid import Grid, Resampler, centre, settled
+from synth.dataset.split import name_anatomy
 from synth.dataset.store import Dataset, Sequence
 from synth.errors import UserError
 
@@ -109,7 +110,7 @@ def read(sequence: Sequence, grid: Grid, wanted: Iterable[str]) -> Clip:
     return Clip(
         name=where,
         content_hash=str(attrs["content_hash"]),
-        group=_anatomy(attrs),
+        group=name_anatomy(attrs),
         family=str(scenario.get("family", "")),
         gesture=str((scenario.get("gesture") or {}).get("kind", "")),
         young_kpa=young,
@@ -119,17 +120,6 @@ def read(sequence: Sequence, grid: Grid, wanted: Iterable[str]) -> Clip:
         density=density,
         force=sequence["force"][:],
     )
-
-
-def _anatomy(attrs: Mapping[str, Any]) -> str:
-    """What names the anatomy across datasets: `anatomy_id`; in older stores the seed of the relief; a
-    sequence
-    with neither is alone. All sequences of one user's brain are one anatomy."""
-    named = attrs.get("anatomy_id")
-    if named is not None:
-        return str(named)
-    seed = ((attrs.get("scenario") or {}).get("relief") or {}).get("seed")
-    return str(attrs["content_hash"]) if seed is None else f"seed-{seed}"
 
 
 def load(

@@ -27,6 +27,7 @@ from learn.settings import Settings, replace
 from learn.training.batches import Batch, Frames, inputs, measure_scales
 from learn.training.gpu_batches import held
 from learn.training.log import Log
+from synth.dataset.split import find_crossings
 from synth.errors import UserError
 
 LOOK = 16
@@ -216,11 +217,8 @@ def moments(true: torch.Tensor, said: torch.Tensor) -> Moments:
 
 def _provenance(clips: Sequence[Clip], split: Split) -> tuple[dict[str, list[str]], dict[str, list[str]]]:
     parts = {"fit": split.fit, "select": split.select, "test": split.test}
-    number = groups(clips)
-    seen = {number[i] for i in (*split.fit, *split.select)}
-    if seen & {number[i] for i in split.test} or {number[i] for i in split.fit} & {
-        number[i] for i in split.select
-    }:
+    number, sides = groups(clips), [(i, side) for side, part in parts.items() for i in part]
+    if find_crossings([number[i] for i, _ in sides], [side for _, side in sides]):
         raise UserError("the split shares an anatomy between fit, select and test")
     return (
         {k: [clips[i].content_hash for i in v] for k, v in parts.items()},

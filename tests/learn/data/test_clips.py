@@ -6,9 +6,10 @@ import numpy as np
 import phantom
 import pytest
 
-from learn.data.clips import Clip, _anatomy, load, target
+from learn.data.clips import Clip, load, target
 from learn.data.grid import Grid
 from learn.data.split import folds, groups, nested, ungrouped
+from synth.dataset.split import name_anatomy
 from synth.errors import UserError
 
 GRID = Grid(32)
@@ -111,12 +112,12 @@ def test_anatomies_are_told_apart_by_what_a_sequence_says() -> None:
 
     job = Job.model_validate({"sequences": 6, "anatomy": {"variety": 3}})
     cases = [{"scenario": scenario.draw(job, i).as_dict(), "content_hash": f"hash{i}"} for i in range(6)]
-    names = [_anatomy(case) for case in cases]
+    names = [name_anatomy(case) for case in cases]
     assert names[:3] == names[3:]
     assert len(set(names)) == 3
     # A user's brain is one anatomy, whatever relief was drawn on it.
-    assert {_anatomy({**case, "anatomy_id": "mesh-5f"}) for case in cases} == {"mesh-5f"}
-    assert _anatomy({"content_hash": "h", "scenario": {}}) == "h"
+    assert {name_anatomy({**case, "anatomy_id": "mesh-5f"}) for case in cases} == {"mesh-5f"}
+    assert name_anatomy({"content_hash": "h", "scenario": {}}) == "h"
 
 
 def test_one_brain_is_split_only_when_asked_to(clips: list[Clip]) -> None:
