@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from learn.checkpoint import Card
     from learn.data.clips import Clip
     from learn.data.split import Split
+    from learn.evaluation.evaluate import Report
+    from learn.evaluation.metrics import Metric
     from learn.evaluation.statistics import Paired
     from learn.settings import Settings
 
@@ -248,7 +250,7 @@ def eval_command(
         return
     Console().print(_table(report, source, all))
     if second is not None:
-        Console().print(_pairs(pairs, str(against)))
+        Console().print(_pairs(pairs, str(against), predictor.card))
 
 
 @app.command("predict", epilog="Example: learn predict model video.mp4 --scale 0.05 --young 1.5")
@@ -330,32 +332,9 @@ def export_command(
     _console.print(f"{file}: differs from PyTorch by at most {worst:.1e} of full scale")
 
 
-_ROWS = (
-    ("force_r2_pooled", "total force: R², all frames", ""),
-    ("force_mae", "total force: MAE", "mN"),
-    ("force_rmse", "total force: RMSE", "mN"),
-    ("force_bias", "total force: bias", "mN"),
-    ("force_r", "total force: correlation", ""),
-    ("force_ccc", "total force: concordance", ""),
-    ("vector_error_mn", "total force: error of the vector", "mN"),
-    ("peak_error_share", "peak force: relative error", ""),
-    ("map_r2_pooled", "force map: R², all cells", ""),
-    ("map_mae", "force map: MAE", "map"),
-    ("map_rmse", "force map: RMSE", "map"),
-    ("map_r", "force map: correlation", ""),
-    ("vector_r2", "force map: R² of components", ""),
-    ("ghost", "ghosts: contact-free area above 5 mN", ""),
-    ("ghost_relative", "ghosts: contact-free area above 5% of scale", ""),
-    ("ghost_far", "ghosts: the same beyond 2 mm of a contact", ""),
-    ("stray_mn", "ghosts: force on contact-free area", "mN"),
-    ("low_over_mn", "over-prediction in low-force frames", "mN"),
-    ("localisation_mm", "contact centre: median error", "mm"),
-    ("calibration_slope", "calibration: slope of truth on answer", ""),
-)
-
-
-def _table(report: Any, source: str, seen: bool) -> Table:
+def _table(report: Report, source: str, seen: bool) -> Table:
     from learn.evaluation.evaluate import YOUNG
+    from learn.evaluation.metrics import METRICS
 
     which = "sequences, seen ones too" if seen else "unseen sequences"
     table = Table(
@@ -366,35 +345,42 @@ def _table(report: Any, source: str, seen: bool) -> Table:
     for head in heads:
         table.add_column(head, justify="right")
     columns, sure = [report.summary(y) for y in YOUNG], report.intervals()
-    unit = "mN" if report.card.settings.target == "intensity" else "mN/mm²"
-    for key, name, u in _ROWS:
-        if key not in columns[0]:
+    for key, metric in METRICS.items():
+        if not metric.listed or key not in columns[0]:
             continue
-        label = f"{name} [{unit if u == 'map' else u}]" if u else name
-        cells = [_cell(c.get(key)) for c in columns]
+        cells = [_cell(metric, c.get(key)) for c in columns]
         if key in sure and sure[key].low == sure[key].low:
-            cells[0] += f" [{_cell(sure[key].low)}, {_cell(sure[key].high)}]"
-        table.add_row(label, *cells)
+            cells[0] += f" [{_cell(metric, sure[key].low)}, {_cell(metric, sure[key].high)}]"
+        table.add_row(_label(metric, report.card), *cells)
     return table
 
 
-def _pairs(pairs: Mapping[str, Paired], against: str) -> Table:
+def _pairs(pairs: Mapping[str, Paired], against: str, card: Card) -> Table:
     """Differences, this model minus the other, sequence by sequence."""
+    from learn.evaluation.metrics import METRICS
+
     table = Table(title=f"against {against}, paired by sequence", title_justify="left")
     for head in ("", "difference [95%]", "p", "larger on"):
         table.add_column(head, justify="left" if not head else "right")
-    for key, name, unit in _ROWS:
-        if key in pairs:
+    for key, metric in METRICS.items():
+        if metric.listed and key in pairs:
             d, pair = pairs[key].difference, pairs[key]
-            label = f"{name} [{unit}]" if unit else name
             table.add_row(
-                label, f"{d.mean:+.3g} [{d.low:+.3g}, {d.high:+.3g}]", f"{pair.p:.2g}", f"{pair.wins:.0%}"
+                _label(metric, card),
+                f"{d.mean:+.3g} [{d.low:+.3g}, {d.high:+.3g}]",
+                f"{pair.p:.2g}",
+                f"{pair.wins:.0%}",
             )
     return table
 
 
-def _cell(value: float | None) -> str:
-    return "-" if value is None or value != value else f"{value:.3g}"
+def _label(metric: Metric, card: Card) -> str:
+    """A score's heading, in the unit of the model's map."""
+    return metric.heading.replace("mN/mm²", "mN") if card.settings.target == "intensity" else metric.heading
+
+
+def _cell(metric: Metric, value: float | None) -> str:
+    return "-" if value is None or value != value else f"{value:.{metric.digits}g}"
 
 
 @contextmanager

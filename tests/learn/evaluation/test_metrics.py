@@ -13,7 +13,7 @@ import torchmetrics
 from learn.checkpoint import Card
 from learn.data.clips import Clip
 from learn.evaluation.evaluate import Report, evaluate, score
-from learn.evaluation.metrics import Moments, agreement, contact_mm, ghost_share, line
+from learn.evaluation.metrics import METRICS, Moments, agreement, contact_mm, ghost_share, line
 from learn.network.d2fnet import Architecture
 from learn.settings import Settings, replace
 from learn.training.batches import measure_scales
@@ -111,6 +111,35 @@ def test_a_mirrored_answer_is_not_forgiven(clips: list[Clip]) -> None:
     assert got["map_r2"] == pytest.approx(1, abs=1e-6)
     assert got["vector_r2"] < 0.7
     assert got["vector_error_mn"] > 0
+
+
+def test_every_number_is_declared_once_and_the_truth_is_the_best_of_all_answers(clips: list[Clip]) -> None:
+    c = card(clips, "vector")
+    away = {
+        "low": lambda value: value,
+        "high": lambda value: -value,
+        "zero": abs,
+        "one": lambda value: abs(value - 1),
+    }
+
+    def summary(factor: float, more: float) -> dict[str, float]:
+        """Of the truth times a factor, and as much force again in the picture's corner."""
+        found = []
+        for clip in clips:
+            said = truth(clip, "vector") * np.float32(factor)
+            said[:, :, :12, :12] += np.float32(more * said.max())
+            said *= clip.mask
+            found.append(score(clip, said, c, head=factor * clip.force))
+        return Report({"known": found}, c).summary()
+
+    best, worse = summary(1, 0), summary(2, 1)
+    assert set(best) == set(METRICS)
+    for key, metric in METRICS.items():
+        assert away[metric.best](best[key]) < away[metric.best](worse[key]), key
+    assert len({metric.name for metric in METRICS.values()}) == len(METRICS)
+    listed = [metric.heading for metric in METRICS.values() if metric.listed]
+    assert listed[1:3] == ["total force: MAE [mN]", "total force: RMSE [mN]"]
+    assert "force map: MAE [mN/mm²]" in listed
 
 
 class Knowing:
