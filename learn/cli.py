@@ -248,9 +248,10 @@ def eval_command(
             found["against"] = {"model": str(against), "paired": {k: asdict(v) for k, v in pairs.items()}}
         print(json_.dumps(found))
         return
-    Console().print(_table(report, source, all))
+    screen = Console(markup=False)  # "[mN]" is a unit
+    screen.print(_table(report, source, all))
     if second is not None:
-        Console().print(_pairs(pairs, str(against), predictor.card))
+        screen.print(_pairs(pairs, str(against), predictor.card))
 
 
 @app.command("predict", epilog="Example: learn predict model video.mp4 --scale 0.05 --young 1.5")

@@ -214,7 +214,8 @@ def test_command_line(dataset: Path, tmp_path: Path) -> None:
     assert len(result["sequences"]) == len(checkpoint.read_card(out).split["test"])
     table = run(app, ["eval", str(out), str(dataset), "--against", str(out)])
     assert "unseen sequences" in table.output
-    assert "paired by sequence" in " ".join(table.output.split())
+    shown, paired = " ".join(table.output.split()).split("paired by sequence")
+    assert all(unit in part for unit in ("[mN]", "[mN/mm²]", "[mm]") for part in (shown, paired))
     done = run(app, ["eval", str(out), str(dataset), "--against", str(out), "--json"])
     pairs = json.loads(done.stdout)["against"]["paired"]
     assert pairs["map_rmse"]["difference"]["mean"] == 0
