@@ -122,14 +122,14 @@ def _divided(
 
     `base`: the preset that was changed; `fixed`: whether the number of folds was asked for.
     """
-    from learn.data.clips import load, sources
+    from learn.data.clips import load_clips, sources
     from learn.data.split import groups, keep_written, nested, ungrouped
     from learn.settings import replace
     from synth.dataset.index import written_sides
     from synth.dataset.split import rule
 
     with _bar("Reading sequences") as tell:
-        clips = load(dataset, settings.grid, sources(settings.input), cache=cache, report=tell)
+        clips = load_clips(dataset, settings.grid, sources(settings.input), cache=cache, report=tell)
     sides = written_sides(dataset)
     if sides is not None:
         asked = [k for k in ("folds", "fold", "held_out_family") if getattr(settings, k) != getattr(base, k)]
@@ -204,25 +204,25 @@ def eval_command(
     json: Json = False,
 ) -> None:
     """Score a model on the sequences it has not seen; forces in mN."""
-    from learn.data.clips import FIELDS, load
+    from learn.data.clips import FIELDS, load_clips
     from learn.data.split import ungrouped
     from learn.evaluation.evaluate import compare, evaluate, unseen
-    from learn.inference.predict import load as load_model
+    from learn.inference.predict import load_predictor
     from learn.training.threads import set_threads
     from synth.dataset.index import written_sides
 
     set_threads(threads)
-    predictor = load_model(model)
+    predictor = load_predictor(model)
     trained = predictor.card.settings.input
     source = input or ("recovered" if trained == "mixed" else trained)
     if source not in FIELDS:
         raise UserError(f"unknown input {source!r}: one of {', '.join(FIELDS)}")
     with _bar("Reading sequences") as tell:
-        clips = load(dataset, predictor.grid, (source,), cache=cache, report=tell)
+        clips = load_clips(dataset, predictor.grid, (source,), cache=cache, report=tell)
     if predictor.card.settings.share_anatomy:
         clips = ungrouped(clips)
         _console.print("The model was chosen on brains it is scored on: this says nothing of other brains.")
-    other = None if against is None else load_model(against)
+    other = None if against is None else load_predictor(against)
     chosen = clips if all else unseen(clips, predictor.card)
     if other is not None:
         if other.grid != predictor.grid or other.card.settings.target != predictor.card.settings.target:
@@ -276,11 +276,11 @@ def predict_command(
     import numpy as np
 
     from learn.inference.apply import Filmed, apply, motions
-    from learn.inference.predict import load as load_model
+    from learn.inference.predict import load_predictor
     from learn.training.threads import set_threads
 
     set_threads(threads)
-    predictor = load_model(model, quick=True)
+    predictor = load_predictor(model, quick=True)
     peaks = {}
     for motion in motions(source, input, Filmed(scale, tissue, flow)):
         found = apply(predictor, motion, young)
@@ -306,11 +306,11 @@ def calibrate_command(
 ) -> None:
     """Estimate the tissue's stiffness from one press whose force is known."""
     from learn.inference.apply import calibrate, motions
-    from learn.inference.predict import load as load_model
+    from learn.inference.predict import load_predictor
     from learn.training.threads import set_threads
 
     set_threads(threads)
-    predictor = load_model(model)
+    predictor = load_predictor(model)
     found = {motion.name: calibrate(predictor, motion) for motion in motions(press, input)}
     if json:
         print(json_.dumps({"young_kpa": found}))
@@ -327,9 +327,9 @@ def export_command(
 ) -> None:
     """Write a model for other programs, checked against PyTorch to 1e-4."""
     from learn.inference.export import export
-    from learn.inference.predict import load as load_model
+    from learn.inference.predict import load_predictor
 
-    worst = export(load_model(model), file, format)
+    worst = export(load_predictor(model), file, format)
     _console.print(f"{file}: differs from PyTorch by at most {worst:.1e} of full scale")
 
 

@@ -130,14 +130,14 @@ def _nearest(x: Floats, force: Floats, group: NDArray[np.intp]) -> Callable[[Flo
 
 def _network(fit: Sequence[Clip], folder: Path, epochs: int, seed: int) -> Answer:
     from learn.data.split import Split
-    from learn.inference.predict import load
+    from learn.inference.predict import load_predictor
     from learn.settings import preset
     from learn.training.train import train
 
     select = max(2, len(fit) // 5)
     settings = preset("tiny", size=GRID.size, epochs=epochs, input="recovered", seed=seed)
     train(fit, Split(tuple(range(select, len(fit))), tuple(range(select)), ()), settings, folder)
-    predictor = load(folder)
+    predictor = load_predictor(folder)
 
     def answer(clip: Clip) -> Floats:
         said, _ = predictor.answer(

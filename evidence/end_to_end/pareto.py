@@ -277,7 +277,7 @@ class Made:
 
     def _followed(self, index: int, flow: str) -> Clip:
         sequence = open_sequence(location.store(self._folder, index))
-        clip = data.read(sequence, GRID, ("ideal",))
+        clip = data.read_clip(sequence, GRID, ("ideal",))
         if flow == "ideal":
             return replace(clip, displacement=clip.displacement | {"recovered": clip.displacement["ideal"]})
         estimator = pipeline.estimator(self._flow(flow))

@@ -17,7 +17,7 @@ from bench.output import forest_plot, machine, result_page
 from bench.output import write as results
 from evidence.gap import gap
 from evidence.gap.runs import KEYS, Tests, Training, carry_out, followed
-from learn.data.clips import Clip, load
+from learn.data.clips import Clip, load_clips
 from learn.data.split import Split, folds, nested
 from learn.evaluation.statistics import interval
 from learn.settings import Settings, replace
@@ -63,7 +63,7 @@ def run(
         UserError: no such family, or data that lacks a flow.
     """
     stored = list(Dataset(dataset))
-    clips = load(dataset, settings.grid, ("ideal", "recovered"), cache=cache)
+    clips = load_clips(dataset, settings.grid, ("ideal", "recovered"), cache=cache)
     split, seen_test = parts(clips, held_out, settings)
     results: dict[str, Any] = {}
     untrained: dict[str, list[dict[str, Any]]] = {}

@@ -18,7 +18,7 @@ from learn.data.clips import Clip, pack, unpack
 from learn.data.grid import Grid
 from learn.data.split import Split
 from learn.evaluation.evaluate import evaluate
-from learn.inference.predict import load
+from learn.inference.predict import load_predictor
 from learn.settings import Settings
 from learn.settings import replace as changed
 from learn.training.train import train
@@ -121,7 +121,7 @@ def carry_out(
     model = models / f"{training.model}-{_digest(chosen, used, split)}"
     card = train(used, split, chosen, model)
     spent = time.process_time() - began
-    predictor = load(model)
+    predictor = load_predictor(model)
     errors = {}
     for name, (part, source) in tests.items():
         rows = evaluate(predictor, part, source).per_clip()

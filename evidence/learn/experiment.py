@@ -14,7 +14,7 @@ from evidence.learn.labels import clips as labels
 from evidence.learn.labels import press
 from evidence.learn.runs import Run, carry_out
 from evidence.learn.summary import write
-from learn.data.clips import Clip, load
+from learn.data.clips import Clip, load_clips
 from learn.data.grid import Grid
 from learn.loss import GHOSTLESS, Objective
 from learn.network.d2fnet import Architecture
@@ -166,7 +166,7 @@ def experiment(
             packed[grid.size] = (
                 labels(pictured(job(), grid), grid, cache)
                 if rendered is None
-                else load(rendered, grid, ("ideal", "recovered"), cache=cache)
+                else load_clips(rendered, grid, ("ideal", "recovered"), cache=cache)
             )
         return packed[grid.size]
 

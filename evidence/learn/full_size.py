@@ -25,7 +25,7 @@ from learn.data.clips import pack, unpack
 from learn.data.grid import Grid
 from learn.data.split import nested
 from learn.evaluation.evaluate import evaluate
-from learn.inference.predict import load
+from learn.inference.predict import load_predictor
 from learn.settings import preset, replace
 from learn.training.threads import set_threads
 from learn.training.train import train
@@ -82,7 +82,7 @@ def full_size(
     began = time.perf_counter()
     card = train(clips, split, settings, out / "model", fabric=fabric, log=lambda numbers: say(str(numbers)))
     trained = time.perf_counter() - began
-    predictor = load(out / "model", fabric.device)
+    predictor = load_predictor(out / "model", fabric.device)
     known = evaluate(predictor, [clips[i] for i in split.test], "ideal")
     seen = len(split.fit) * frames
     result = {

@@ -16,7 +16,7 @@ from evidence.learn.controls import beyond_mean_map, controls, mean_map
 from learn.data.clips import Clip
 from learn.data.split import nested
 from learn.evaluation.evaluate import evaluate
-from learn.inference.predict import Predictor, load
+from learn.inference.predict import Predictor, load_predictor
 from learn.inference.stiffness import stiffness
 from learn.settings import Settings
 from learn.training.train import train
@@ -68,7 +68,7 @@ def carry_out(
         clock.write_text(f"{time.process_time() - began:.1f}")
     # A run that was stopped and continued has no time to tell.
     spent = float(clock.read_text()) if clock.is_file() else None
-    predictor = load(models / run.name)
+    predictor = load_predictor(models / run.name)
     pressed = None
     if presses is not None:
         pressed = {clips[i].content_hash: _pressed(predictor, presses(i)) for i in split.test[:PRESSES]}

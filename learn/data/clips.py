@@ -70,7 +70,7 @@ def sources(wanted: Input) -> tuple[str, ...]:
     return ("ideal", "recovered") if wanted == "mixed" else (wanted,)
 
 
-def read(sequence: Sequence, grid: Grid, wanted: Iterable[str]) -> Clip:
+def read_clip(sequence: Sequence, grid: Grid, wanted: Iterable[str]) -> Clip:
     """One store on the grid.
 
     `wanted`: any of `ideal`, `recovered`, `noisy`. Raises UserError if the store lacks the flow or has no
@@ -105,8 +105,8 @@ def read(sequence: Sequence, grid: Grid, wanted: Iterable[str]) -> Clip:
             displacement[source][t] = resample.mean(moved, tissue) * mask
         if surest:
             confidence[t] = resample.mean(sequence["flow_confidence"][t], tissue) * mask
-        load = sequence["traction"][t].transpose(2, 0, 1) * area
-        density[t] = settled(resample.sum(load), mask) / np.float32(grid.pitch_mm**2 * young)
+        load_clips = sequence["traction"][t].transpose(2, 0, 1) * area
+        density[t] = settled(resample.sum(load_clips), mask) / np.float32(grid.pitch_mm**2 * young)
     return Clip(
         name=where,
         content_hash=str(attrs["content_hash"]),
@@ -122,7 +122,7 @@ def read(sequence: Sequence, grid: Grid, wanted: Iterable[str]) -> Clip:
     )
 
 
-def load(
+def load_clips(
     root: Path,
     grid: Grid,
     wanted: Iterable[str],
@@ -141,7 +141,7 @@ def load(
     for i, sequence in enumerate(dataset):
         report(i, len(dataset))
         clips.append(
-            read(sequence, grid, wanted) if cache is None else _packed(sequence, grid, wanted, cache)
+            read_clip(sequence, grid, wanted) if cache is None else _packed(sequence, grid, wanted, cache)
         )
     report(len(dataset), len(dataset))
     return clips
@@ -150,7 +150,7 @@ def load(
 def _packed(sequence: Sequence, grid: Grid, wanted: tuple[str, ...], cache: Path) -> Clip:
     key = f"{sequence.attrs['content_hash']}-{grid.size}-{grid.extent_mm:g}-{'+'.join(wanted)}-v{_VERSION}"
     if not (cache / key).is_dir():
-        pack(read(sequence, grid, wanted), cache / key)
+        pack(read_clip(sequence, grid, wanted), cache / key)
     return unpack(cache / key)
 
 

@@ -24,7 +24,7 @@ from evidence.learn.table import markdown
 from learn.data.clips import Clip
 from learn.data.grid import Grid
 from learn.data.split import nested
-from learn.inference.predict import Predictor, load
+from learn.inference.predict import Predictor, load_predictor
 from learn.loss import Objective
 from learn.settings import PRESETS, preset, replace
 from learn.training.train import train
@@ -103,7 +103,7 @@ def test_an_error_over_wider_cells_is_without_what_averages_out(clips: list[Clip
     clip = dataclasses.replace(clips[2], mask=np.ones((32, 32), np.float32))
 
     class Rough:
-        card = load(model).card
+        card = load_predictor(model).card
 
         @staticmethod
         def density(moved: object, mask: object, young_kpa: float) -> NDArray[np.float32]:
@@ -177,7 +177,7 @@ def test_a_word_that_no_network_holds_needs_times_to_show(tmp_path: Path) -> Non
 
 
 def test_controls_score_what_they_must(clips: list[Clip], model: Path) -> None:
-    found = controls(load(model), clips[:3], "ideal", clips[3:])
+    found = controls(load_predictor(model), clips[:3], "ideal", clips[3:])
     assert found["zero"]["map_r2_pooled"] <= 0
     assert found["identity"]["map_rmse"] == 0
     assert found["identity"]["map_r2_pooled"] == 1
@@ -187,10 +187,10 @@ def test_controls_score_what_they_must(clips: list[Clip], model: Path) -> None:
 def test_the_mean_map_is_a_mean_that_knows_no_turn_and_its_skill_beyond_itself_is_none(
     clips: list[Clip], model: Path
 ) -> None:
-    card = load(model).card
+    card = load_predictor(model).card
     base = mean_map(clips[:3], card, clips[3:])
     assert beyond_mean_map(base, base)["map"]["mean"] == 0
-    truth = controls(load(model), clips[:3], "ideal", clips[3:])
+    truth = controls(load_predictor(model), clips[:3], "ideal", clips[3:])
     assert truth["mean map"]["map_r2_pooled"] < truth["input"]["map_r2_pooled"]
     # On a full mask the mean map holds the fitted frames' mean force, whichever way they are turned.
     full = [dataclasses.replace(c, mask=np.ones_like(c.mask)) for c in clips]

@@ -6,7 +6,7 @@ import numpy as np
 import phantom
 import pytest
 
-from learn.data.clips import Clip, load, target
+from learn.data.clips import Clip, load_clips, target
 from learn.data.grid import Grid
 from learn.data.split import folds, groups, nested, ungrouped
 from synth.dataset.split import name_anatomy
@@ -41,7 +41,7 @@ def test_the_papers_intensity_peaks_at_the_total_force(clips: list[Clip]) -> Non
 
 def test_a_packed_cache_gives_the_same_and_is_used(dataset: Path, clips: list[Clip], tmp_path: Path) -> None:
     for _ in range(2):
-        packed = load(dataset, GRID, ("ideal", "recovered"), cache=tmp_path)
+        packed = load_clips(dataset, GRID, ("ideal", "recovered"), cache=tmp_path)
     for a, b in zip(clips, packed, strict=True):
         np.testing.assert_array_equal(a.density, b.density)
         np.testing.assert_array_equal(a.displacement["recovered"], b.displacement["recovered"])
@@ -53,8 +53,8 @@ def test_a_packed_cache_gives_the_same_and_is_used(dataset: Path, clips: list[Cl
 def test_a_store_without_recovered_flow(tmp_path: Path) -> None:
     phantom.write(tmp_path, 0, anatomy_seed=1, recovered=False)
     with pytest.raises(UserError, match=r"000000.zarr: holds no recovered flow"):
-        load(tmp_path, GRID, ("recovered",))
-    assert len(load(tmp_path, GRID, ("ideal",))) == 1
+        load_clips(tmp_path, GRID, ("recovered",))
+    assert len(load_clips(tmp_path, GRID, ("ideal",))) == 1
 
 
 def test_folds_share_no_anatomy_and_leave_nobody_out(clips: list[Clip]) -> None:

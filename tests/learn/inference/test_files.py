@@ -20,7 +20,7 @@ from learn.data.grid import Grid
 from learn.inference import video_flow
 from learn.inference.apply import motions
 from learn.inference.export import examples, export
-from learn.inference.predict import load as load_model
+from learn.inference.predict import load_predictor
 from learn.inference.stiffness import stiffness
 from learn.network.d2fnet import D2FNet
 from learn.network.monai_unet import build
@@ -59,7 +59,7 @@ def model(
 
 @pytest.mark.parametrize("kind", ["torchscript", "onnx"])
 def test_an_exported_model_says_the_same(model: Path, tmp_path: Path, kind: str) -> None:
-    predictor = load_model(model)
+    predictor = load_predictor(model)
     file = tmp_path / "net"
     worst = export(predictor, file, kind)
     said = predictor.density(
@@ -77,10 +77,10 @@ def test_an_unfaithful_export_is_refused_and_removed(
 ) -> None:
     monkeypatch.setattr("learn.inference.export.TOLERANCE", -1.0)
     with pytest.raises(UserError, match="differs from PyTorch"):
-        export(load_model(model), tmp_path / "net", "torchscript")
+        export(load_predictor(model), tmp_path / "net", "torchscript")
     assert not list(tmp_path.iterdir())
     with pytest.raises(UserError, match="unknown format 'tflite'"):
-        export(load_model(model), tmp_path / "net", "tflite")
+        export(load_predictor(model), tmp_path / "net", "tflite")
 
 
 def test_predict_on_stores_and_on_arrays_agree(model: Path, dataset: Path, tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ from learn.data.clips import Clip
 from learn.data.split import Split, nested
 from learn.evaluation.evaluate import unseen
 from learn.evaluation.metrics import Moments
-from learn.inference.predict import load as load_model
+from learn.inference.predict import load_predictor
 from learn.loss import SHARES, Objective
 from learn.settings import Settings, preset, replace
 from learn.training.batches import Frames
@@ -103,7 +103,7 @@ def test_only_unseen_sequences_are_scored(clips: list[Clip], split: Split, model
 
 
 def test_prediction_on_a_picture_is_that_on_the_grid(model: Path, dataset: Path, clips: list[Clip]) -> None:
-    predictor = load_model(model)
+    predictor = load_predictor(model)
     sequence = Dataset(dataset)[4]
     map_ = predictor(
         sequence["flow"][3],
@@ -125,7 +125,7 @@ def test_prediction_on_a_picture_is_that_on_the_grid(model: Path, dataset: Path,
 
 
 def test_the_same_motion_filmed_at_another_resolution_is_the_same_force(model: Path) -> None:
-    predictor = load_model(model)
+    predictor = load_predictor(model)
 
     def force(size: int, scale: float) -> float:
         node = (np.arange(size) - (size - 1) / 2) * scale
@@ -142,11 +142,11 @@ def test_the_same_motion_filmed_at_another_resolution_is_the_same_force(model: P
 )
 def test_another_grid(model: Path, shape: tuple[int, ...], message: str) -> None:
     with pytest.raises(UserError, match=message):
-        load_model(model).density(np.zeros(shape, np.float32), np.ones((32, 32), np.float32), 1.0)
+        load_predictor(model).density(np.zeros(shape, np.float32), np.ones((32, 32), np.float32), 1.0)
 
 
 def test_bad_numbers(model: Path) -> None:
-    predictor = load_model(model)
+    predictor = load_predictor(model)
     flow, tissue = np.zeros((8, 8, 2), np.float32), np.ones((8, 8), bool)
     with pytest.raises(UserError, match="young_kpa -1"):
         predictor(flow, tissue, 0.1, -1.0)
@@ -167,20 +167,20 @@ def broken(model: Path, to: Path, file: str, data: bytes) -> Path:
 def test_corrupt_checkpoints(model: Path, tmp_path: Path) -> None:
     whole = (model / "weights.pt").read_bytes()
     with pytest.raises(UserError, match="corrupt checkpoint"):
-        load_model(broken(model, tmp_path / "a", "weights.pt", whole[: len(whole) // 2]))
+        load_predictor(broken(model, tmp_path / "a", "weights.pt", whole[: len(whole) // 2]))
     with pytest.raises(UserError, match="corrupt checkpoint"):
-        load_model(broken(model, tmp_path / "b", "weights.pt", b"not a model"))
+        load_predictor(broken(model, tmp_path / "b", "weights.pt", b"not a model"))
     with pytest.raises(UserError, match="corrupt model configuration"):
-        load_model(broken(model, tmp_path / "c", "config.json", b"{}"))
+        load_predictor(broken(model, tmp_path / "c", "config.json", b"{}"))
     config = json.loads((model / "config.json").read_text())
     damaged = {**config, "settings": {**config["settings"], "epochs": "many"}}
     with pytest.raises(UserError, match=r"corrupt model configuration \(settings.epochs: "):
-        load_model(broken(model, tmp_path / "e", "config.json", json.dumps(damaged).encode()))
+        load_predictor(broken(model, tmp_path / "e", "config.json", json.dumps(damaged).encode()))
     config["settings"]["arch"]["width"] = 8
     with pytest.raises(UserError, match=r"not those of the network in config\.json"):
-        load_model(broken(model, tmp_path / "d", "config.json", json.dumps(config).encode()))
+        load_predictor(broken(model, tmp_path / "d", "config.json", json.dumps(config).encode()))
     with pytest.raises(UserError, match="no model here"):
-        load_model(tmp_path / "nothing")
+        load_predictor(tmp_path / "nothing")
 
 
 def test_a_folder_with_another_run_is_not_overwritten(clips: list[Clip], split: Split, model: Path) -> None:
