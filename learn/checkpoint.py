@@ -6,16 +6,17 @@ import json
 import os
 import pickle
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
+from pydantic import ConfigDict, TypeAdapter, ValidationError
 from torch import nn
 
 from learn.data.grid import Scales
 from learn.network.monai_unet import build
-from learn.settings import Settings, from_dict
+from learn.settings import Settings
 from synth.errors import UserError
 
 _FORMAT, _VERSION = "sulcus-model", 1
@@ -24,6 +25,8 @@ _FORMAT, _VERSION = "sulcus-model", 1
 @dataclass(frozen=True)
 class Card:
     """What a model says of itself: enough to use it without the data it came from."""
+
+    __pydantic_config__ = ConfigDict(extra="forbid")
 
     settings: Settings
     scales: Scales
@@ -38,10 +41,13 @@ class Card:
     """R² on the select sequences at the chosen epoch."""
 
 
+_CARD = TypeAdapter(Card)
+
+
 def write_card(folder: Path, card: Card) -> None:
     """Writes config.json into a model's folder, whole or not at all."""
     folder.mkdir(parents=True, exist_ok=True)
-    tree = {"format": _FORMAT, "version": _VERSION, **asdict(card)}
+    tree = {"format": _FORMAT, "version": _VERSION, **_CARD.dump_python(card)}
     _replace(folder / "config.json", (json.dumps(tree, indent=1) + "\n").encode())
 
 
@@ -54,11 +60,16 @@ def read_card(folder: Path) -> Card:
         tree = json.loads(file.read_text())
         if tree.pop("format") != _FORMAT or tree.pop("version") != _VERSION:
             raise UserError(f"{file}: not a model of this version")
-        return Card(settings=from_dict(tree.pop("settings")), scales=Scales(**tree.pop("scales")), **tree)
+        return _CARD.validate_python(tree)
+    except ValidationError as error:
+        wrong = [(one["type"], ".".join(map(str, one["loc"])), one["msg"]) for one in error.errors()]
+        unknown = [at for kind, at, _ in wrong if kind in ("extra_forbidden", "unexpected_keyword_argument")]
+        if unknown:
+            raise UserError(
+                f"{file}: made by another version of this program (no '{unknown[0]}' here)"
+            ) from None
+        raise UserError(f"{file}: corrupt model configuration ({wrong[0][1]}: {wrong[0][2]})") from None
     except (ValueError, KeyError, TypeError, AttributeError) as error:
-        _, unknown, key = str(error).partition("got an unexpected keyword argument ")
-        if unknown:  # as dataclasses say it
-            raise UserError(f"{file}: made by another version of this program (no {key} here)") from None
         raise UserError(f"{file}: corrupt model configuration ({error})") from None
 
 

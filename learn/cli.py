@@ -6,9 +6,9 @@ from __future__ import annotations
 import json as json_
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
@@ -19,7 +19,13 @@ from synth.errors import UserError
 from synth.system.cli_errors import Commands
 
 if TYPE_CHECKING:
+    from learn.checkpoint import Card
+    from learn.data.clips import Clip
+    from learn.data.split import Split
+    from learn.evaluation.evaluate import Report
+    from learn.evaluation.metrics import Metric
     from learn.evaluation.statistics import Paired
+    from learn.settings import Settings
 
 app = typer.Typer(
     cls=Commands,
@@ -71,14 +77,9 @@ def train_command(
     json: Json = False,
 ) -> None:
     """Train D2FNet on a dataset. An interrupted run is continued by the same command."""
-    from lightning_fabric import Fabric
-
-    from learn.data.clips import load, sources
-    from learn.data.split import groups, nested, ungrouped
     from learn.settings import override
-    from learn.settings import preset as of
+    from learn.settings import preset as named
     from learn.training.threads import set_threads
-    from learn.training.train import train
 
     set_threads(threads)
     options = {
@@ -98,27 +99,10 @@ def train_command(
         "seed": seed,
     }
     given = [f"{k}={v}" for k, v in options.items() if v is not None]
-    settings = override(of(preset), [*given, *(changes or [])])
-    with _bar("Reading sequences") as tell:
-        clips = load(dataset, settings.grid, sources(settings.input), cache=cache, report=tell)
-    if settings.share_anatomy:
-        clips = ungrouped(clips)
-        _console.print("One brain may be on several sides of the split: scores say nothing of other brains.")
-    if folds is None:
-        settings = replace(settings, folds=min(settings.folds, len(set(groups(clips)))))
-    split = nested(clips, settings.folds, settings.fold, settings.seed, settings.held_out_family)
-    fabric = Fabric(accelerator=accelerator, devices=devices, precision=settings.precision)
-    with _bar("Training") as tell:
-        card = train(
-            clips,
-            split,
-            settings,
-            out,
-            fabric=fabric,
-            report=lambda done, of_, numbers: tell(done, of_),
-            log=(lambda numbers: None) if json or not fabric.is_global_zero else _log,
-        )
-    if not fabric.is_global_zero:
+    settings = override(named(preset), [*given, *(changes or [])])
+    clips, split, settings = _divided(dataset, settings, named(preset), cache, fixed=folds is not None)
+    card, first = _train(clips, split, settings, out, accelerator, devices, quiet=json)
+    if not first:
         return
     result = {"model": str(out), "epoch": card.epoch, "select_r2": card.score}
     result |= {k: len(v) for k, v in card.split.items()}
@@ -130,6 +114,72 @@ def train_command(
             f"{result['select']} select sequences; fitted on {result['fit']}, "
             f"{result['test']} kept for `learn eval`."
         )
+
+
+def _divided(
+    dataset: Path, settings: Settings, base: Settings, cache: Path | None, *, fixed: bool
+) -> tuple[list[Clip], Split, Settings]:
+    """The sequences, who of them is fitted, chooses and is kept, and the settings as that made them.
+
+    `base`: the preset that was changed; `fixed`: whether the number of folds was asked for.
+    """
+    from learn.data.clips import load_clips, sources
+    from learn.data.split import groups, keep_written, nested, ungrouped
+    from learn.settings import replace
+    from synth.dataset.index import written_sides
+    from synth.dataset.split import read_rule
+
+    with _bar("Reading sequences") as tell:
+        clips = load_clips(dataset, settings.grid, sources(settings.input), cache=cache, report=tell)
+    sides = written_sides(dataset)
+    if sides is not None:
+        asked = [k for k in ("folds", "fold", "held_out_family") if getattr(settings, k) != getattr(base, k)]
+        if asked:
+            raise UserError(
+                f"{dataset}: is split already (split.json, by `synth split`): leave out {', '.join(asked)}"
+            )
+        settings = replace(settings, share_anatomy=settings.share_anatomy or read_rule(dataset).share_anatomy)
+    if settings.share_anatomy:
+        clips = ungrouped(clips)
+        _console.print("One brain may be on several sides of the split: scores say nothing of other brains.")
+    if sides is not None:
+        _console.print(
+            "The dataset's own split: what `synth split` marks test is neither fitted nor chosen on."
+        )
+        return clips, keep_written(clips, sides, settings.seed), settings
+    if not fixed:
+        settings = replace(settings, folds=min(settings.folds, len(set(groups(clips)))))
+    split = nested(clips, settings.folds, settings.fold, settings.seed, settings.held_out_family)
+    return clips, split, settings
+
+
+def _train(
+    clips: list[Clip],
+    split: Split,
+    settings: Settings,
+    out: Path,
+    accelerator: str,
+    devices: int,
+    *,
+    quiet: bool,
+) -> tuple[Card, bool]:
+    """Trains with a bar; the best epoch's card, and whether this process is the one that speaks."""
+    from lightning_fabric import Fabric
+
+    from learn.training.train import train
+
+    fabric = Fabric(accelerator=accelerator, devices=devices, precision=settings.precision)
+    with _bar("Training") as tell:
+        card = train(
+            clips,
+            split,
+            settings,
+            out,
+            fabric=fabric,
+            report=lambda done, of_, numbers: tell(done, of_),
+            log=(lambda numbers: None) if quiet or not fabric.is_global_zero else _log,
+        )
+    return card, fabric.is_global_zero
 
 
 def _log(numbers: dict[str, float]) -> None:
@@ -155,24 +205,25 @@ def eval_command(
     json: Json = False,
 ) -> None:
     """Score a model on the sequences it has not seen; forces in mN."""
-    from learn.data.clips import FIELDS, load
+    from learn.data.clips import FIELDS, load_clips
     from learn.data.split import ungrouped
     from learn.evaluation.evaluate import compare, evaluate, unseen
-    from learn.inference.predict import load as load_model
+    from learn.inference.predict import load_predictor
     from learn.training.threads import set_threads
+    from synth.dataset.index import written_sides
 
     set_threads(threads)
-    predictor = load_model(model)
+    predictor = load_predictor(model)
     trained = predictor.card.settings.input
     source = input or ("recovered" if trained == "mixed" else trained)
     if source not in FIELDS:
         raise UserError(f"unknown input {source!r}: one of {', '.join(FIELDS)}")
     with _bar("Reading sequences") as tell:
-        clips = load(dataset, predictor.grid, (source,), cache=cache, report=tell)
+        clips = load_clips(dataset, predictor.grid, (source,), cache=cache, report=tell)
     if predictor.card.settings.share_anatomy:
         clips = ungrouped(clips)
         _console.print("The model was chosen on brains it is scored on: this says nothing of other brains.")
-    other = None if against is None else load_model(against)
+    other = None if against is None else load_predictor(against)
     chosen = clips if all else unseen(clips, predictor.card)
     if other is not None:
         if other.grid != predictor.grid or other.card.settings.target != predictor.card.settings.target:
@@ -180,6 +231,10 @@ def eval_command(
                 f"{against}: is of another grid or target than {model}; their maps can't be paired"
             )
         chosen = chosen if all else unseen(chosen, other.card)
+    sides = None if all else written_sides(dataset)
+    if sides is not None and "test" in sides.values():
+        chosen = [c for c in chosen if sides.get(c.content_hash) == "test"]
+        _console.print("The dataset's own split: only what `synth split` marks test is scored.")
     if not chosen:
         raise UserError(
             f"{dataset}: the model was fitted or chosen on every sequence here; --all scores them anyway"
@@ -194,9 +249,10 @@ def eval_command(
             found["against"] = {"model": str(against), "paired": {k: asdict(v) for k, v in pairs.items()}}
         print(json_.dumps(found))
         return
-    Console().print(_table(report, source, all))
+    screen = Console(markup=False)  # "[mN]" is a unit
+    screen.print(_table(report, source, all))
     if second is not None:
-        Console().print(_pairs(pairs, str(against)))
+        screen.print(_pairs(pairs, str(against), predictor.card))
 
 
 @app.command("predict", epilog="Example: learn predict model video.mp4 --scale 0.05 --young 1.5")
@@ -230,12 +286,12 @@ def predict_command(
     import numpy as np
 
     from learn.inference.apply import Filmed, apply, motions
-    from learn.inference.predict import load as load_model
+    from learn.inference.predict import load_predictor
     from learn.inference.video_flow import Settings
     from learn.training.threads import set_threads
 
     set_threads(threads)
-    predictor = load_model(model, quick=True)
+    predictor = load_predictor(model, quick=True)
     filmed = Filmed(scale, tissue, Settings(flow, shrink, rate or None))
     peaks = {}
     for motion in motions(source, input, filmed):
@@ -264,11 +320,11 @@ def calibrate_command(
 ) -> None:
     """Estimate the tissue's stiffness from one press whose force is known."""
     from learn.inference.apply import calibrate, motions
-    from learn.inference.predict import load as load_model
+    from learn.inference.predict import load_predictor
     from learn.training.threads import set_threads
 
     set_threads(threads)
-    predictor = load_model(model)
+    predictor = load_predictor(model)
     found = {motion.name: calibrate(predictor, motion) for motion in motions(press, input)}
     if json:
         print(json_.dumps({"young_kpa": found}))
@@ -285,38 +341,15 @@ def export_command(
 ) -> None:
     """Write a model for other programs, checked against PyTorch to 1e-4."""
     from learn.inference.export import export
-    from learn.inference.predict import load as load_model
+    from learn.inference.predict import load_predictor
 
-    worst = export(load_model(model), file, format)
+    worst = export(load_predictor(model), file, format)
     _console.print(f"{file}: differs from PyTorch by at most {worst:.1e} of full scale")
 
 
-_ROWS = (
-    ("force_r2_pooled", "total force: R², all frames", ""),
-    ("force_mae", "total force: MAE", "mN"),
-    ("force_rmse", "total force: RMSE", "mN"),
-    ("force_bias", "total force: bias", "mN"),
-    ("force_r", "total force: correlation", ""),
-    ("force_ccc", "total force: concordance", ""),
-    ("vector_error_mn", "total force: error of the vector", "mN"),
-    ("peak_error_share", "peak force: relative error", ""),
-    ("map_r2_pooled", "force map: R², all cells", ""),
-    ("map_mae", "force map: MAE", "map"),
-    ("map_rmse", "force map: RMSE", "map"),
-    ("map_r", "force map: correlation", ""),
-    ("vector_r2", "force map: R² of components", ""),
-    ("ghost", "ghosts: contact-free area above 5 mN", ""),
-    ("ghost_relative", "ghosts: contact-free area above 5% of scale", ""),
-    ("ghost_far", "ghosts: the same beyond 2 mm of a contact", ""),
-    ("stray_mn", "ghosts: force on contact-free area", "mN"),
-    ("low_over_mn", "over-prediction in low-force frames", "mN"),
-    ("localisation_mm", "contact centre: median error", "mm"),
-    ("calibration_slope", "calibration: slope of truth on answer", ""),
-)
-
-
-def _table(report: Any, source: str, seen: bool) -> Table:
+def _table(report: Report, source: str, seen: bool) -> Table:
     from learn.evaluation.evaluate import YOUNG
+    from learn.evaluation.metrics import METRICS
 
     which = "sequences, seen ones too" if seen else "unseen sequences"
     table = Table(
@@ -327,35 +360,42 @@ def _table(report: Any, source: str, seen: bool) -> Table:
     for head in heads:
         table.add_column(head, justify="right")
     columns, sure = [report.summary(y) for y in YOUNG], report.intervals()
-    unit = "mN" if report.card.settings.target == "intensity" else "mN/mm²"
-    for key, name, u in _ROWS:
-        if key not in columns[0]:
+    for key, metric in METRICS.items():
+        if not metric.listed or key not in columns[0]:
             continue
-        label = f"{name} [{unit if u == 'map' else u}]" if u else name
-        cells = [_cell(c.get(key)) for c in columns]
+        cells = [_cell(metric, c.get(key)) for c in columns]
         if key in sure and sure[key].low == sure[key].low:
-            cells[0] += f" [{_cell(sure[key].low)}, {_cell(sure[key].high)}]"
-        table.add_row(label, *cells)
+            cells[0] += f" [{_cell(metric, sure[key].low)}, {_cell(metric, sure[key].high)}]"
+        table.add_row(_label(metric, report.card), *cells)
     return table
 
 
-def _pairs(pairs: Mapping[str, Paired], against: str) -> Table:
+def _pairs(pairs: Mapping[str, Paired], against: str, card: Card) -> Table:
     """Differences, this model minus the other, sequence by sequence."""
+    from learn.evaluation.metrics import METRICS
+
     table = Table(title=f"against {against}, paired by sequence", title_justify="left")
     for head in ("", "difference [95%]", "p", "larger on"):
         table.add_column(head, justify="left" if not head else "right")
-    for key, name, unit in _ROWS:
-        if key in pairs:
+    for key, metric in METRICS.items():
+        if metric.listed and key in pairs:
             d, pair = pairs[key].difference, pairs[key]
-            label = f"{name} [{unit}]" if unit else name
             table.add_row(
-                label, f"{d.mean:+.3g} [{d.low:+.3g}, {d.high:+.3g}]", f"{pair.p:.2g}", f"{pair.wins:.0%}"
+                _label(metric, card),
+                f"{d.mean:+.3g} [{d.low:+.3g}, {d.high:+.3g}]",
+                f"{pair.p:.2g}",
+                f"{pair.wins:.0%}",
             )
     return table
 
 
-def _cell(value: float | None) -> str:
-    return "-" if value is None or value != value else f"{value:.3g}"
+def _label(metric: Metric, card: Card) -> str:
+    """A score's heading, in the unit of the model's map."""
+    return metric.heading.replace("mN/mm²", "mN") if card.settings.target == "intensity" else metric.heading
+
+
+def _cell(metric: Metric, value: float | None) -> str:
+    return "-" if value is None or value != value else f"{value:.{metric.digits}g}"
 
 
 @contextmanager

@@ -16,67 +16,50 @@ measured against the frame's own force, so a weak press weighs as much as a stro
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 import torch
 from torch import Tensor
 
 from synth.errors import UserError
-
-Kind = Literal["antighost", "hinge", "mse", "mae", "huber", "published"]
-KINDS = ("antighost", "hinge", "mse", "mae", "huber", "published")
+from synth.job.types import NonNegative, Section, Share
 
 
-@dataclass(frozen=True)
-class Objective:
+class Objective(Section):
     """Which loss, and its weights.
 
     `antighost` (squared error, dearer where a low force is over-predicted, and R²), `hinge` (squared error,
-    R²
-    and a linear price of force on contact-free tissue), `published` (as `antighost`, with the published
-    code's R²
-    that is blind to bias), `mse`, `mae`, `huber`.
+    R² and a linear price of force on contact-free tissue), `published` (as `antighost`, with the published
+    code's R² that is blind to bias), `mse`, `mae`, `huber`.
     """
 
-    kind: Kind = "antighost"
-    r2_weight: float = 0.3
+    kind: Literal["antighost", "hinge", "mse", "mae", "huber", "published"] = "antighost"
+    r2_weight: Share = 0.3
     """Share of the R² term; the rest is the squared error. (Heraoui et al.: 0.3.)"""
     r2_scope: Literal["batch", "frame"] = "batch"
     """Over what SSE/SST is taken: the whole batch, as published, or each frame, then their mean."""
-    ghost_weight: float = 3.0
+    ghost_weight: NonNegative = 3.0
     """Price of a squared over-prediction where the true force is low. (Heraoui et al.: 3.)"""
-    low: float = 0.05
+    low: NonNegative = 0.05
     """A force is low under this share of `unit`."""
     rule: Literal["pixel", "frame"] = "pixel"
     """`pixel`: low where the pixel's own force is; `frame`: in frames whose mean over the tissue is, as
     the published code has it (true for nearly every frame: a contact covers little of the picture)."""
-    stray_weight: float = 8.0
+    stray_weight: NonNegative = 8.0
     """`hinge`: price of the mean force density on contact-free tissue [mN/mm²], in units of `spread`."""
-    stray_cap: float = 0.0
+    stray_cap: NonNegative = 0.0
     """`hinge`: share of `unit` from which on more force on contact-free tissue costs no more; 0 is none. The
     rim of a strong contact, where the best guess is well above it, then isn't pulled down."""
-    ramp: tuple[float, float] = (0.25, 0.75)
+    ramp: tuple[NonNegative, NonNegative] = (0.25, 0.75)
     """`hinge`: shares of the run between which the price grows from none to full. Paid from the start it is
     cheapest to say nothing, and a network learns that first."""
-    free: float = 0.01
+    free: NonNegative = 0.01
     """`hinge`: tissue is contact-free where its true density is under this share of `unit`."""
-    total_weight: float = 0.0
+    total_weight: NonNegative = 0.0
     """Weight of the squared error of the map's total force, in units of the training data's largest."""
-    head_weight: float = 0.3
+    head_weight: NonNegative = 0.3
     """The same of the total-force head, for a network that has one."""
-
-    def __post_init__(self) -> None:
-        if self.kind not in KINDS:
-            raise UserError(f"unknown loss {self.kind!r}: one of {', '.join(KINDS)}")
-        weights = ["ghost_weight", "low", "stray_weight", "stray_cap", "free"]
-        weights += ["total_weight", "head_weight"]
-        if not (0 <= self.r2_weight <= 1 and all(getattr(self, w) >= 0 for w in weights)):
-            raise UserError("loss weights: r2_weight in 0..1, the others not negative")
-        if self.r2_scope not in ("batch", "frame"):
-            raise UserError(f"unknown r2_scope {self.r2_scope!r}: batch or frame")
-        if self.rule not in ("pixel", "frame"):
-            raise UserError(f"unknown low-force rule {self.rule!r}: pixel or frame")
 
 
 GHOSTLESS = Objective(kind="hinge", r2_weight=0.5, r2_scope="frame", stray_weight=8.0)
@@ -87,7 +70,7 @@ def at(objective: Objective, progress: float) -> Objective:
     """The objective at a point 0..1 of the run."""
     start, full = objective.ramp
     share = min(max((progress - start) / max(full - start, 1e-9), 0.0), 1.0)
-    return replace(objective, stray_weight=objective.stray_weight * share)
+    return objective.model_copy(update={"stray_weight": objective.stray_weight * share})
 
 
 def full(objective: Objective, progress: float) -> bool:

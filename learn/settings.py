@@ -2,49 +2,54 @@
 
 from __future__ import annotations
 
-import dataclasses
-import difflib
+import re
 from collections.abc import Iterable
-from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
-from learn.data.clips import INPUTS, Input, Target
+from pydantic import Field, model_validator
+
+from learn.data.clips import Input, Target
 from learn.data.grid import Grid
 from learn.loss import GHOSTLESS, Objective
 from learn.network.d2fnet import Architecture
 from synth.errors import UserError
+from synth.job import reader
+from synth.job.types import NonNegative, Positive, Section
+
+Count = Annotated[int, Field(ge=0)]
+AtLeastOne = Annotated[int, Field(ge=1)]
+S = TypeVar("S", bound=Section)
 
 
-@dataclass(frozen=True)
-class Settings:
+class Settings(Section):
     """One training run: same settings, same data, same weights (bit for bit, on one CPU)."""
 
-    size: int = 256
+    size: Annotated[int, Field(ge=16, multiple_of=16)] = 256
     """Cells along the grid's edge."""
-    extent_mm: float = 36.0
+    extent_mm: Positive = 36.0
     """Width of the grid [mm]."""
-    arch: Architecture = field(default_factory=Architecture)
-    objective: Objective = field(default_factory=Objective)
+    arch: Architecture = Architecture()
+    objective: Objective = Objective()
     input: Input = "ideal"
     """Displacement to train on. `mixed`: each frame is ideal or recovered by a draw whose odds move from
     all ideal to all recovered over the first half of the run."""
     target: Target = "density"
-    epochs: int = 50
-    batch: int = 8
-    learning_rate: float = 5e-4
-    weight_decay: float = 1e-5
+    epochs: AtLeastOne = 50
+    batch: AtLeastOne = 8
+    learning_rate: Positive = 5e-4
+    weight_decay: NonNegative = 1e-5
     schedule: Literal["plateau", "cosine"] = "plateau"
     """`plateau`: halved when the score stalls (the paper's); `cosine`: a warm-up over a twentieth of the run,
     then down to zero by a half cosine, for runs too short to wait for a plateau."""
-    patience: int = 5
+    patience: Count = 5
     """`plateau`: epochs without a better score after which the learning rate is halved."""
-    stop: int = 0
+    stop: Count = 0
     """Epochs without a better score after which training ends; 0 never."""
-    clip: float = 1.0
+    clip: Positive = 1.0
     """Largest norm of the gradient."""
     augment: bool = True
     """Quarter turns and mirrors of the grid, vectors turned with it."""
-    frames: int = 0
+    frames: Count = 0
     """Frames a sequence gives an epoch, drawn anew each epoch; 0 takes all."""
     precision: Literal["32-true", "bf16-mixed"] = "32-true"
     channels_last: bool = False
@@ -55,46 +60,31 @@ class Settings:
     deterministic: bool = False
     """Whether operations without a deterministic form are refused. On one CPU the others give equal bits too;
     on a GPU set CUBLAS_WORKSPACE_CONFIG=:4096:8 beside it."""
-    folds: int = 5
-    fold: int = 0
+    folds: AtLeastOne = 5
+    fold: Count = 0
     held_out_family: str | None = None
     share_anatomy: bool = False
     """Whether one brain's sequences may be on several sides of the split, for a dataset of a single brain."""
-    seed: int = 0
+    seed: Count = 0
 
-    def __post_init__(self) -> None:
-        if self.input not in INPUTS:
-            raise UserError(f"unknown input {self.input!r}: one of {', '.join(INPUTS)}")
-        if self.target not in ("density", "intensity"):
-            raise UserError(f"unknown target {self.target!r}: density or intensity")
+    @model_validator(mode="after")
+    def _goes_together(self) -> Settings:
         if self.target == "intensity" and self.arch.output != "magnitude":
-            raise UserError("target 'intensity' has no direction: it needs output 'magnitude'")
-        if self.schedule not in ("plateau", "cosine"):
-            raise UserError(f"unknown schedule {self.schedule!r}: plateau or cosine")
-        if self.resident not in ("auto", "yes", "no"):
-            raise UserError(f"unknown resident {self.resident!r}: auto, yes or no")
-        for name in ("epochs", "batch", "learning_rate", "clip"):
-            if not getattr(self, name) > 0:
-                raise UserError(f"{name} {getattr(self, name)}: must be positive")
-        self.arch.check(self.size)
+            raise ValueError("target 'intensity' has no direction: it needs output 'magnitude'")
+        halved = self.arch.stem * 2**self.arch.levels
+        if self.size % halved:
+            raise ValueError(
+                f"input size {self.size} does not divide by {halved} "
+                f"(stem {self.arch.stem}, {self.arch.levels} levels)"
+            )
+        return self
 
     @property
     def grid(self) -> Grid:
         return Grid(self.size, self.extent_mm)
 
     def as_dict(self) -> dict[str, Any]:
-        return dataclasses.asdict(self)
-
-
-def from_dict(tree: dict[str, Any]) -> Settings:
-    """The inverse of `as_dict`. Raises TypeError or UserError for anything else."""
-    tree = dict(tree)
-    arch = dict(tree.pop("arch"))
-    arch["bounds"] = tuple(arch["bounds"])
-    objective = dict(tree.pop("objective"))
-    if "ramp" in objective:
-        objective["ramp"] = tuple(objective["ramp"])
-    return Settings(arch=Architecture(**arch), objective=Objective(**objective), **tree)
+        return self.model_dump()
 
 
 PRESETS: dict[str, Settings] = {
@@ -137,44 +127,23 @@ PRESETS: dict[str, Settings] = {
 
 
 def override(settings: Settings, changes: Iterable[str]) -> Settings:
-    """Settings with `key=value` or `arch.key=value` replaced, values read as the field's own type.
+    """Settings with `key=value` or `arch.key=value` replaced, values in YAML; a list also as `1,2,3`.
 
-    Raises UserError for an unknown key (with the nearest one) or a value of another type.
+    Raises UserError: a line for each unknown key (with the nearest one) and each value that can't be.
     """
-    top: dict[str, Any] = {}
-    inner: dict[str, dict[str, Any]] = {"arch": {}, "objective": {}}
-    for change in changes:
-        key, _, text = change.partition("=")
-        section, dot, name = key.rpartition(".")
-        owner = getattr(settings, section, None) if dot and section in inner else settings
-        if (dot and section not in inner) or not hasattr(owner, name) or name in inner or not text:
-            known = [f.name for f in dataclasses.fields(settings) if f.name not in inner]
-            known += [f"{s}.{f.name}" for s in inner for f in dataclasses.fields(getattr(settings, s))]
-            near = difflib.get_close_matches(key, known, 1)
-            hint = f", did you mean {near[0]!r}?" if near else ": expected key=value"
-            raise UserError(f"{change}: unknown setting{hint}")
-        (inner[section] if dot else top)[name] = _value(getattr(owner, name), text, change)
-    nested = {k: dataclasses.replace(getattr(settings, k), **v) for k, v in inner.items() if v}
-    return dataclasses.replace(settings, **top, **nested)
+    return reader.override(settings, [re.sub(r"=\(?([^][()]*,[^][()]*)\)?$", r"=[\1]", c) for c in changes])
 
 
-def _value(old: Any, text: str, change: str) -> Any:
-    """`text` as a value of the type of `old`."""
-    try:
-        if isinstance(old, bool):
-            return {"true": True, "false": False}[text.lower()]
-        if isinstance(old, tuple):
-            values = tuple(float(v) for v in text.strip("[]()").split(","))
-            if len(values) != len(old):
-                raise ValueError
-            return values
-        return type(old)(text) if old is not None else text
-    except (ValueError, KeyError):
-        raise UserError(f"{change}: not a value of type {type(old).__name__}") from None
+def replace(settings: S, **changes: Any) -> S:
+    """Settings, an architecture or an objective with some values replaced, and checked anew.
+
+    Raises pydantic's ValidationError for a value that can't be: these come from code, not from a person.
+    """
+    return type(settings).model_validate(dict(settings) | changes)
 
 
 def preset(name: str, **changes: Any) -> Settings:
     """A preset with some settings replaced. Raises UserError for an unknown name."""
     if name not in PRESETS:
         raise UserError(f"unknown preset {name!r}: one of {', '.join(PRESETS)}")
-    return dataclasses.replace(PRESETS[name], **changes)
+    return replace(PRESETS[name], **changes)

@@ -25,9 +25,9 @@ class Model:
             folder: of the model.
             quick: spend half a second on a graph that takes a third less a frame.
         """
-        from learn.inference.predict import load
+        from learn.inference.predict import load_predictor
 
-        self.predictor: Predictor = load(folder, quick=quick)
+        self.predictor: Predictor = load_predictor(folder, quick=quick)
         self._reader: tuple[Scene, ForceReader] | None = None
 
     def described(self) -> dict[str, object]:

@@ -93,14 +93,14 @@ def fit_baselines(train: Path | None, model: Path) -> dict[str, Method]:
     if train is None:
         return methods
     from learn.checkpoint import read_card
-    from learn.data.clips import read
+    from learn.data.clips import read_clip
 
     hashes = set(read_card(model).split.get("fit", []))
     chosen = [s for s in Dataset(train) if s.attrs["content_hash"] in hashes]
     if not chosen:
         raise UserError(f"{train}: holds none of the sequences that {model} was fitted on")
     source = "recovered" if all("flow_recovered" in s for s in chosen) else "ideal"
-    return methods | baseline.fitted([read(s, baseline.GRID, (source,)) for s in chosen], source)
+    return methods | baseline.fitted([read_clip(s, baseline.GRID, (source,)) for s in chosen], source)
 
 
 def score_demo(dataset: Path, model: Path, out: Path, settings: Settings) -> Result:

@@ -108,7 +108,7 @@ def _cpu_s(made: Stored) -> float:
 
 
 def _time_flows(made: Stored, job: Job, flows: Sequence[str], found: defaultdict[str, list[float]]) -> None:
-    clip = data.read(made, GRID, ("ideal",))
+    clip = data.read_clip(made, GRID, ("ideal",))
     rgb, tools = made["rgb"][...], made["tool"][...].astype(bool)
     for flow in flows:
         began = time.process_time()

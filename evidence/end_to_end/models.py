@@ -100,12 +100,12 @@ def network_settings(epochs: int, seed: int) -> Settings:
 
 def _network(fit: Sequence[Clip], folder: Path, epochs: int, seed: int) -> Answer:
     from learn.data.split import Split
-    from learn.inference.predict import load
+    from learn.inference.predict import load_predictor
     from learn.training.train import train
 
     select, settings = max(2, len(fit) // 5), network_settings(epochs, seed)
     train(fit, Split(tuple(range(select, len(fit))), tuple(range(select)), ()), settings, folder)
-    predictor = load(folder)
+    predictor = load_predictor(folder)
 
     def answer(clip: Clip) -> Floats:
         said, _ = predictor.answer(

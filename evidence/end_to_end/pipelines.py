@@ -149,7 +149,7 @@ class Sequences:
 
     def _recover(self, index: int, flow: Flow) -> Clip:
         sequence = open_sequence(location.store(self._folder, index))
-        clip = data.read(sequence, GRID, ("ideal",))
+        clip = data.read_clip(sequence, GRID, ("ideal",))
         if flow.backend == "ideal":
             return replace(clip, displacement=clip.displacement | {"recovered": clip.displacement["ideal"]})
         hidden = mask.hidden(sequence["rgb"][...], sequence["tool"][...].astype(bool))

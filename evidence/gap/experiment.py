@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +16,10 @@ from bench.output import forest_plot, machine, result_page
 from bench.output import write as results
 from evidence.gap import gap
 from evidence.gap.runs import KEYS, Tests, Training, carry_out, kept_flow, write_table
-from learn.data.clips import Clip, load
+from learn.data.clips import Clip, load_clips
 from learn.data.split import Split, folds, nested
 from learn.evaluation.statistics import interval
-from learn.settings import Settings
+from learn.settings import Settings, replace
 from synth.dataset.store import Dataset
 from synth.errors import UserError
 
@@ -62,7 +62,7 @@ def run(
         UserError: no such family, or data that lacks a flow.
     """
     stored = list(Dataset(dataset))
-    clips = load(dataset, settings.grid, ("ideal", "recovered"), cache=cache)
+    clips = load_clips(dataset, settings.grid, ("ideal", "recovered"), cache=cache)
     split, seen_test = parts(clips, held_out, settings)
     runs: dict[Training, dict[str, Any]] = {}
     for flow in flows:

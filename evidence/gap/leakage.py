@@ -21,7 +21,7 @@ from bench.methods import baselines
 from bench.methods.protocol import Answer
 from bench.output import forest_plot, machine, result_page, write
 from bench.scoring import metrics
-from learn.data.clips import Clip, load
+from learn.data.clips import Clip, load_clips
 from learn.data.split import groups
 
 Curve = NDArray[np.float64]
@@ -37,7 +37,7 @@ def leakage(
     seed: Annotated[int, typer.Option(help="Of the folds.")] = 0,
 ) -> None:
     """Random-frame against whole-recording split on one dataset: what leakage does to every simple method."""
-    clips = load(dataset, baselines.GRID, ("recovered",))
+    clips = load_clips(dataset, baselines.GRID, ("recovered",))
     found = {
         name: answers(clips, fold, Console(stderr=True))
         for name, fold in (

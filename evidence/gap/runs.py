@@ -19,8 +19,9 @@ from learn.data.clips import Clip
 from learn.data.grid import Grid
 from learn.data.split import Split
 from learn.evaluation.evaluate import evaluate
-from learn.inference.predict import load
+from learn.inference.predict import load_predictor
 from learn.settings import Settings
+from learn.settings import replace as changed
 from learn.training.train import train
 from synth.dataset.store import Sequence as Stored
 
@@ -98,7 +99,7 @@ def carry_out(
         say: told what is under way.
     """
     kind = {"I": "ideal", "R": "recovered", "N": "recovered", "mixed": "mixed"}[training.kind]
-    chosen = replace(settings, input=kind, seed=training.seed)  # type: ignore[arg-type]
+    chosen = changed(settings, input=kind, seed=training.seed)
     # Training on ideal flow is the same whatever flow the test recovers.
     flow = "" if training.kind == "I" else f"-{training.flow}"
     seen = [clips[i].content_hash for i in (*split.fit, *split.select)]
@@ -123,7 +124,7 @@ def carry_out(
 
 
 def _errors(model: Path, tests: Tests) -> dict[str, dict[str, list[float]]]:
-    predictor = load(model)
+    predictor = load_predictor(model)
     found = {}
     for name, (part, source) in tests.items():
         rows = evaluate(predictor, part, source).per_clip()

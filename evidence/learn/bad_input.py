@@ -12,7 +12,7 @@ import numpy as np
 
 from learn.data.clips import Clip
 from learn.inference.apply import motions
-from learn.inference.predict import load
+from learn.inference.predict import load_predictor
 from learn.settings import Settings
 from learn.training.batches import Frames
 from synth.errors import UserError
@@ -25,7 +25,7 @@ def bad_inputs(model: Path, scratch: Path) -> list[dict[str, Any]]:
     """
     shutil.rmtree(scratch, ignore_errors=True)
     scratch.mkdir(parents=True)
-    predictor = load(model)
+    predictor = load_predictor(model)
     n = predictor.grid.size
     ones, moved = np.ones((n, n), np.float32), np.zeros((1, 2, n, n), np.float32)
 
@@ -60,10 +60,14 @@ def bad_inputs(model: Path, scratch: Path) -> list[dict[str, Any]]:
         ),
         "no scale": lambda: next(motions(arrays("b", flow=flow, tissue=still), "recovered")),
         "a video without a scale": lambda: next(motions(scratch / "c.mp4", "recovered")),
-        "checkpoint cut short": lambda: load(broken("d", "weights.pt", weights[: len(weights) // 2])),
-        "checkpoint of another network": lambda: load(broken("e", "config.json", json.dumps(card).encode())),
-        "configuration damaged": lambda: load(broken("f", "config.json", b"{")),
-        "no model there": lambda: load(scratch / "nothing"),
+        "checkpoint cut short": lambda: load_predictor(
+            broken("d", "weights.pt", weights[: len(weights) // 2])
+        ),
+        "checkpoint of another network": lambda: load_predictor(
+            broken("e", "config.json", json.dumps(card).encode())
+        ),
+        "configuration damaged": lambda: load_predictor(broken("f", "config.json", b"{")),
+        "no model there": lambda: load_predictor(scratch / "nothing"),
     }
     return [_try(name, case, scratch) for name, case in cases.items()]
 

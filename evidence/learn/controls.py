@@ -12,6 +12,7 @@ from learn.data.clips import Clip, target
 from learn.evaluation.evaluate import ClipScore, Report, evaluate, score
 from learn.evaluation.statistics import skill
 from learn.inference.predict import Predictor
+from learn.settings import replace as changed
 
 KEYS = (
     "map_r2_pooled",
@@ -49,9 +50,7 @@ def mean_map(clips: Sequence[Clip], card: Card, fit: Sequence[Clip]) -> Report:
 
     A network that was trained on labels dealt out anew can say this much and no more.
     """
-    plain = replace(
-        card, settings=replace(card.settings, arch=replace(card.settings.arch, output="magnitude"))
-    )
+    plain = _of_lengths(card)
     sums = np.zeros(fit[0].mask.shape)
     tissue = np.zeros_like(sums)
     for clip in fit:
@@ -97,6 +96,12 @@ def _truth(clips: Sequence[Clip], card: Card) -> Report:
     return Report({"known": [score(c, _maps(c, card), card) for c in clips]}, card)
 
 
+def _of_lengths(card: Card) -> Card:
+    """A card whose maps are lengths."""
+    arch = changed(card.settings.arch, output="magnitude")
+    return replace(card, settings=changed(card.settings, arch=arch))
+
+
 def _moved(clips: Sequence[Clip], card: Card, source: str) -> Report:
     sizes = [np.linalg.norm(c.displacement[source], axis=1, keepdims=True) * c.young_kpa for c in clips]
     true = [np.linalg.norm(_maps(c, card), axis=1, keepdims=True) for c in clips]
@@ -104,8 +109,6 @@ def _moved(clips: Sequence[Clip], card: Card, source: str) -> Report:
         sum(float((s.astype(np.float64) * v).sum()) for s, v in zip(sizes, other, strict=True))
         for other in (true, sizes)
     )
-    plain = replace(
-        card, settings=replace(card.settings, arch=replace(card.settings.arch, output="magnitude"))
-    )
+    plain = _of_lengths(card)
     said = [(s * (over / under)).astype(np.float32) for s in sizes]
     return Report({"known": [score(c, s, plain) for c, s in zip(clips, said, strict=True)]}, plain)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 import json
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -17,11 +16,11 @@ from evidence.learn.labels import clips as labels
 from evidence.learn.labels import press
 from evidence.learn.runs import Run, carry_out
 from evidence.learn.summary import write
-from learn.data.clips import Clip, load
+from learn.data.clips import Clip, load_clips
 from learn.data.grid import Grid
 from learn.loss import GHOSTLESS, Objective
 from learn.network.d2fnet import Architecture
-from learn.settings import Settings, preset
+from learn.settings import Settings, preset, replace
 from learn.training.threads import set_threads
 from synth.errors import UserError
 from synth.job import reader
@@ -169,7 +168,7 @@ def experiment(
             packed[grid.size] = (
                 labels(pictured(job(), grid), grid, cache)
                 if rendered is None
-                else load(rendered, grid, ("ideal", "recovered"), cache=cache)
+                else load_clips(rendered, grid, ("ideal", "recovered"), cache=cache)
             )
         return packed[grid.size]
 

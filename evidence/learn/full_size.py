@@ -10,7 +10,6 @@ import json as json_
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import replace
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Annotated, Any
@@ -28,8 +27,8 @@ from learn.data.clips import Clip
 from learn.data.grid import Grid
 from learn.data.split import nested
 from learn.evaluation.evaluate import evaluate
-from learn.inference.predict import load
-from learn.settings import Settings, preset
+from learn.inference.predict import load_predictor
+from learn.settings import Settings, preset, replace
 from learn.training.threads import set_threads
 from learn.training.train import train
 from synth.errors import UserError
@@ -101,7 +100,7 @@ def train_and_score(
     began = time.perf_counter()
     card = train(clips, split, settings, model, fabric=fabric, log=lambda numbers: say(str(numbers)))
     trained = time.perf_counter() - began
-    report = evaluate(load(model, fabric.device), [clips[i] for i in split.test], "ideal")
+    report = evaluate(load_predictor(model, fabric.device), [clips[i] for i in split.test], "ideal")
     seen = sum(clips[i].frames for i in split.fit)
     return {
         "machine": describe() | {"device": str(fabric.device), "torch": torch.__version__},

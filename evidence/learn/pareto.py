@@ -6,7 +6,7 @@ import itertools
 import json as json_
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -130,7 +130,7 @@ def measure(choices: Sequence[Choice], repeats: int, device: str = "cpu") -> lis
             "ms_p95": round(float(np.quantile(own, 0.95)), 3),
             "ms_least": round(min(own), 3),
             "frames": len(own),
-            "arch": asdict(choice.arch),
+            "arch": choice.arch.model_dump(),
         }
         for choice, cost, own in zip(choices, costs, times, strict=True)
     ]

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -22,7 +22,7 @@ from evidence.learn.experiment import BESIDE, small
 from evidence.learn.run_table import column, read
 from learn.evaluation.statistics import Interval, interval, paired
 from learn.network.d2fnet import Architecture
-from learn.settings import PRESETS
+from learn.settings import PRESETS, replace
 from synth.errors import UserError
 
 GRIDS = {PRESETS[name].size: name for name in BESIDE}
@@ -88,7 +88,7 @@ def errors(root: Path) -> Known:
 
 def architecture(tree: dict[str, Any]) -> Architecture:
     """An architecture as a run's settings hold it."""
-    return Architecture(**tree | {"bounds": tuple(tree["bounds"])})
+    return Architecture.model_validate(tree)
 
 
 def _alike(tree: dict[str, Any]) -> bool:
@@ -98,7 +98,7 @@ def _alike(tree: dict[str, Any]) -> bool:
     preset, study, arch = PRESETS[GRIDS[tree["size"]]], small(), architecture(tree["arch"])
     sizes = {k: getattr(arch, k) for k in ("name", "width", "stem", "levels", "detail")}
     own = replace(study.arch, **sizes, dropout=preset.arch.dropout)
-    loss = asdict(preset.objective) | {"ramp": list(preset.objective.ramp)}
+    loss = preset.objective.model_dump(mode="json")
     # Squared error has no weights: what else stood in its tree, in other versions, decided nothing.
     same = tree["objective"] == loss or tree["objective"]["kind"] == loss["kind"] == "mse"
     asked = replace(study, seed=tree["seed"], size=tree["size"], arch=own).as_dict()

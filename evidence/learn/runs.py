@@ -17,7 +17,7 @@ from evidence.learn.controls import beyond_mean_map, controls, mean_map
 from learn.data.clips import Clip
 from learn.data.split import Split, nested
 from learn.evaluation.evaluate import evaluate
-from learn.inference.predict import Predictor, load
+from learn.inference.predict import Predictor, load_predictor
 from learn.inference.stiffness import stiffness
 from learn.settings import Settings
 from learn.training.train import train
@@ -113,7 +113,7 @@ def _score(
     model: Path,
     presses: Callable[[int], Clip] | None,
 ) -> dict[str, Any]:
-    predictor, pressed = load(model), None
+    predictor, pressed = load_predictor(model), None
     if presses is not None:
         pressed = {clips[i].content_hash: _pressed(predictor, presses(i)) for i in split.test[:PRESSES]}
     fitted, tested = [clips[i] for i in split.fit], [clips[i] for i in split.test]

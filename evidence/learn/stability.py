@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json as json_
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -24,9 +23,9 @@ from learn.data.clips import Clip
 from learn.data.grid import Grid
 from learn.data.split import Split, nested
 from learn.evaluation.evaluate import Report, evaluate
-from learn.inference.predict import Predictor, load
+from learn.inference.predict import Predictor, load_predictor
 from learn.loss import GHOSTLESS
-from learn.settings import Settings
+from learn.settings import Settings, replace
 from learn.training.threads import set_threads
 from learn.training.train import train
 from synth.errors import UserError
@@ -115,7 +114,7 @@ def _tiny(**changes: Any) -> Settings:
 
 def _fit(clips: Sequence[Clip], split: Split, settings: Settings, folder: Path) -> Predictor:
     train(clips, split, settings, folder)
-    return load(folder)
+    return load_predictor(folder)
 
 
 def _numbers(report: Report, young: str = "known") -> Row:
@@ -208,7 +207,7 @@ def _contacts(clips: list[Clip], split: Split, two: list[Clip], trained: dict[st
     cases = {"one": test, "two, superposed": pairs, "two, simulated together": two}
     return [
         {"contacts": case, "sequences": len(asked), "trained with": name}
-        | _numbers(evaluate(load(model), asked, "ideal"))
+        | _numbers(evaluate(load_predictor(model), asked, "ideal"))
         for case, asked in cases.items()
         for name, model in trained.items()
     ]
@@ -232,7 +231,7 @@ def _confidence(clips: list[Clip], split: Split, folder: Path) -> list[Row]:
 
 
 def _shown(clips: list[Clip], split: Split, name: str, model: Path) -> list[Row]:
-    predictor, grid, rng = load(model), Grid(small().size), np.random.default_rng(3)
+    predictor, grid, rng = load_predictor(model), Grid(small().size), np.random.default_rng(3)
     test = [clips[i] for i in split.test]
     plain = evaluate(predictor, test, "ideal")
     rows: list[Row] = [{"shown": "as it is"} | _numbers(plain)]

@@ -9,19 +9,23 @@ import numpy as np
 
 from evidence.learn.run_table import column, read
 from evidence.learn.table import markdown
+from learn.evaluation.metrics import METRICS
 from learn.evaluation.statistics import Interval, interval, paired, pooled_r2, pooled_r2_difference
 from learn.loss import SHARES
 
-COLUMNS = (
-    ("map_r2", "map R²"),
-    ("map_rmse", "map RMSE [mN/mm²]"),
-    ("force_mae", "total force MAE [mN]"),
-    ("peak_error_share", "peak force error"),
-    ("ghost_relative", "ghost area"),
-    ("ghost_far", "ghost area beyond 2 mm"),
-    ("stray_mn", "force off contact [mN]"),
-    ("low_over_mn", "over in low frames [mN]"),
-    ("localisation_mm", "contact centre [mm]"),
+COLUMNS = tuple(
+    (key, METRICS[key].column)
+    for key in (
+        "map_r2",
+        "map_rmse",
+        "force_mae",
+        "peak_error_share",
+        "ghost_relative",
+        "ghost_far",
+        "stray_mn",
+        "low_over_mn",
+        "localisation_mm",
+    )
 )
 
 
@@ -101,8 +105,8 @@ def _stiffness(found: list[dict[str, Any]]) -> list[dict[str, object]]:
 
 
 def _controls(found: list[dict[str, Any]]) -> list[dict[str, object]]:
-    heads = {"map_r2_pooled": "map R²", "force_r2_pooled": "force R²", "map_rmse": "map RMSE [mN/mm²]"}
-    heads |= {"ghost_relative": "ghost area"}
+    shown = ("map_r2_pooled", "force_r2_pooled", "map_rmse", "ghost_relative")
+    heads = {key: METRICS[key].column for key in shown}
     rows: list[dict[str, object]] = []
     for r in found:
         if r["name"] in _SHOWN:

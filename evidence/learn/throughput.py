@@ -12,7 +12,6 @@ import json as json_
 import tempfile
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -30,7 +29,7 @@ from learn.data.grid import Scales
 from learn.loss import Objective, loss
 from learn.network.d2fnet import Architecture
 from learn.network.monai_unet import build
-from learn.settings import Settings
+from learn.settings import Settings, replace
 from learn.training.batches import Frames, inputs, measure_scales
 from learn.training.threads import set_threads
 

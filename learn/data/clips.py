@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from learn.data.grid import Grid, Resampler, centre, settled
+from synth.dataset.split import name_anatomy
 from synth.dataset.store import Dataset, Sequence
 from synth.errors import UserError
 
@@ -69,7 +70,7 @@ def sources(wanted: Input) -> tuple[str, ...]:
     return ("ideal", "recovered") if wanted == "mixed" else (wanted,)
 
 
-def read(sequence: Sequence, grid: Grid, wanted: Iterable[str]) -> Clip:
+def read_clip(sequence: Sequence, grid: Grid, wanted: Iterable[str]) -> Clip:
     """One store on the grid.
 
     `wanted`: any of `ideal`, `recovered`, `noisy`. Raises UserError if the store lacks the flow or has no
@@ -104,12 +105,12 @@ def read(sequence: Sequence, grid: Grid, wanted: Iterable[str]) -> Clip:
             displacement[source][t] = resample.mean(moved, tissue) * mask
         if surest:
             confidence[t] = resample.mean(sequence["flow_confidence"][t], tissue) * mask
-        load = sequence["traction"][t].transpose(2, 0, 1) * area
-        density[t] = settled(resample.sum(load), mask) / np.float32(grid.pitch_mm**2 * young)
+        load_clips = sequence["traction"][t].transpose(2, 0, 1) * area
+        density[t] = settled(resample.sum(load_clips), mask) / np.float32(grid.pitch_mm**2 * young)
     return Clip(
         name=where,
         content_hash=str(attrs["content_hash"]),
-        group=_anatomy(attrs),
+        group=name_anatomy(attrs),
         family=str(scenario.get("family", "")),
         gesture=str((scenario.get("gesture") or {}).get("kind", "")),
         young_kpa=young,
@@ -121,18 +122,7 @@ def read(sequence: Sequence, grid: Grid, wanted: Iterable[str]) -> Clip:
     )
 
 
-def _anatomy(attrs: Mapping[str, Any]) -> str:
-    """What names the anatomy across datasets: `anatomy_id`; in older stores the seed of the relief; a
-    sequence
-    with neither is alone. All sequences of one user's brain are one anatomy."""
-    named = attrs.get("anatomy_id")
-    if named is not None:
-        return str(named)
-    seed = ((attrs.get("scenario") or {}).get("relief") or {}).get("seed")
-    return str(attrs["content_hash"]) if seed is None else f"seed-{seed}"
-
-
-def load(
+def load_clips(
     root: Path,
     grid: Grid,
     wanted: Iterable[str],
@@ -151,7 +141,7 @@ def load(
     for i, sequence in enumerate(dataset):
         report(i, len(dataset))
         clips.append(
-            read(sequence, grid, wanted) if cache is None else _packed(sequence, grid, wanted, cache)
+            read_clip(sequence, grid, wanted) if cache is None else _packed(sequence, grid, wanted, cache)
         )
     report(len(dataset), len(dataset))
     return clips
@@ -160,7 +150,7 @@ def load(
 def _packed(sequence: Sequence, grid: Grid, wanted: tuple[str, ...], cache: Path) -> Clip:
     key = f"{sequence.attrs['content_hash']}-{grid.size}-{grid.extent_mm:g}-{'+'.join(wanted)}-v{_VERSION}"
     if not (cache / key).is_dir():
-        pack(read(sequence, grid, wanted), cache / key)
+        pack(read_clip(sequence, grid, wanted), cache / key)
     return unpack(cache / key)
 
 

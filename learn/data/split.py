@@ -1,13 +1,18 @@
-"""Who may be trained on, who chooses the epoch, and who is asked at the end: never the same anatomy twice."""
+"""Who is fitted, who chooses the epoch, and who is asked at the end: never the same anatomy twice.
+
+Groups, and that none may be on two sides, are `synth.dataset.split`'s; a dataset that `synth split` has split
+keeps that split.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from learn.data.clips import Clip
+from synth.dataset.split import SIDES, join_groups
 from synth.errors import UserError
 
 _HINT = "; share_anatomy=true splits one brain's sequences, and says nothing of other brains"
@@ -24,32 +29,13 @@ class Split:
 
 def ungrouped(clips: Sequence[Clip]) -> list[Clip]:
     """The clips with every sequence a group of its own: for a dataset of a single brain, whose sequences
-    can't be
-    kept apart by anatomy. Scores then say nothing of other brains."""
+    can't be kept apart by anatomy. Scores then say nothing of other brains."""
     return [replace(c, group=f"{c.group}/{c.content_hash}") for c in clips]
 
 
 def groups(clips: Sequence[Clip]) -> list[int]:
     """A group number for each clip: equal where two share an anatomy or are the same sequence twice."""
-    number: dict[str, int] = {}
-    root: list[int] = []
-
-    def find(i: int) -> int:
-        while root[i] != i:
-            i = root[i]
-        return i
-
-    out = []
-    for clip in clips:
-        seen = [find(number[key]) for key in (f"a{clip.group}", f"h{clip.content_hash}") if key in number]
-        here = min(seen) if seen else len(root)
-        if not seen:
-            root.append(here)
-        for other in seen:
-            root[other] = here
-        number[f"a{clip.group}"] = number[f"h{clip.content_hash}"] = here
-        out.append(here)
-    return [find(g) for g in out]
+    return join_groups([c.group for c in clips], [c.content_hash for c in clips])
 
 
 def folds(clips: Sequence[Clip], count: int, seed: int) -> list[tuple[int, ...]]:
@@ -92,6 +78,30 @@ def nested(
             raise UserError(f"no sequence of family {held_out_family!r} to hold out; there are: {known}")
     seen = {number[i] for i in test}
     rest = [i for i, g in enumerate(number) if g not in seen]
+    select, fit = _choosers(clips, rest, seed, fold if held_out_family is not None else 0)
+    return Split(fit, select, test)
+
+
+def keep_written(clips: Sequence[Clip], sides: Mapping[str, str], seed: int) -> Split:
+    """The split that the dataset came with: its train, validation and test are fit, select and test.
+
+    `sides`: by content hash (`synth.dataset.index.written_sides`). Without a validation side, a fifth of the
+    train side chooses the epoch. Raises UserError if too few are left to fit and choose.
+    """
+    train, validation, test = (
+        tuple(i for i, c in enumerate(clips) if sides.get(c.content_hash) == side) for side in SIDES
+    )
+    if train and validation:
+        return Split(train, validation, test)
+    select, fit = _choosers(clips, train, seed, 0)
+    return Split(fit, select, test)
+
+
+def _choosers(
+    clips: Sequence[Clip], rest: Sequence[int], seed: int, part: int
+) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """A fifth of what is left beside the test, to choose the epoch, and the others, to fit."""
+    number = groups(clips)
     left = len({number[i] for i in rest})
     if left < 2:
         raise UserError(
@@ -99,7 +109,6 @@ def nested(
             "them beside the test" + _HINT
         )
     parts = folds([clips[i] for i in rest], min(5, left), seed)
-    chosen = fold % len(parts) if held_out_family is not None else 0
+    chosen = part % len(parts)
     select = tuple(rest[i] for i in parts[chosen])
-    fit = tuple(sorted(rest[i] for k, part in enumerate(parts) if k != chosen for i in part))
-    return Split(fit, select, test)
+    return select, tuple(sorted(rest[i] for k, fold in enumerate(parts) if k != chosen for i in fold))

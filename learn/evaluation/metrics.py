@@ -1,13 +1,119 @@
-"""Numbers that say how right a force is: pure functions on arrays, in the arrays' own unit."""
+"""How right a force is: what each number is, and pure functions on arrays, in the arrays' own unit."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 Floats = NDArray[np.floating]
+
+
+@dataclass(frozen=True)
+class Metric:
+    """One score: what it is called and how it is shown, wherever it is shown."""
+
+    name: str
+    unit: str
+    """As shown: ms and % are made of s and shares; empty for a number."""
+    about: str
+    best: Literal["low", "high", "zero", "one", ""] = ""
+    """Which value is the best; empty for what is no merit."""
+    digits: int = 3
+    """How many digits are shown."""
+    relative: bool = False
+    """Whether a constant factor on the prediction leaves it as it is, or it speaks of the truth alone."""
+    column: str = ""
+    """Heading in a narrow table; empty: not there."""
+    listed: bool = True
+    """Whether `learn eval` lists it; its JSON holds it in any case."""
+
+    @property
+    def cell_unit(self) -> str:
+        """What is written behind each number under a heading."""
+        return self.unit if self.unit in ("%", "ms") else ""
+
+    @property
+    def heading(self) -> str:
+        """The name, with its unit if the numbers are shown without."""
+        return f"{self.name} [{self.unit}]" if self.unit and not self.cell_unit else self.name
+
+
+_DENSITY = "mN/mm²"
+METRICS = {
+    "force_r2_pooled": Metric(
+        "total force: R², all frames", "", "R² over the frames of all sequences", "high", column="force R²"
+    ),
+    "force_r2": Metric("total force: R²", "", "1 − SSE/SST over frames", "high", listed=False),
+    "force_mae": Metric(
+        "total force: MAE", "mN", "mean error of the total force", "low", column="total force MAE [mN]"
+    ),
+    "force_rmse": Metric("total force: RMSE", "mN", "RMSE of the total force", "low"),
+    "force_bias": Metric("total force: bias", "mN", "mean of answer minus truth", "zero"),
+    "force_r": Metric("total force: correlation", "", "Pearson's r over frames", "high"),
+    "force_ccc": Metric("total force: concordance", "", "Lin's concordance over frames", "high"),
+    "vector_error_mn": Metric("total force: error of the vector", "mN", "length of its error", "low"),
+    "head_error_mn": Metric(
+        "total force: error of the head", "mN", "error of the total-force head", "low", listed=False
+    ),
+    "peak_error_share": Metric(
+        "peak force: relative error", "", "share of the largest force", "low", column="peak force error"
+    ),
+    "map_r2_pooled": Metric(
+        "force map: R², all cells", "", "R² over the cells of all sequences", "high", column="map R²"
+    ),
+    "unit_map_r2_pooled": Metric(
+        "force map: R², all cells, at E = 1 kPa", "", "the same of maps over E", "high", listed=False
+    ),
+    "map_r2": Metric(
+        "force map: R²", "", "1 − SSE/SST over tissue cells", "high", column="map R²", listed=False
+    ),
+    "map_mae": Metric("force map: MAE", _DENSITY, "mean error of the force map", "low"),
+    "map_rmse": Metric(
+        "force map: RMSE", _DENSITY, "RMSE of the force map", "low", column="map RMSE [mN/mm²]"
+    ),
+    "map_bias": Metric("force map: bias", _DENSITY, "mean of answer minus truth", "zero", listed=False),
+    "map_r": Metric("force map: correlation", "", "Pearson's r over tissue cells", "high"),
+    "map_ccc": Metric("force map: concordance", "", "Lin's concordance over cells", "high", listed=False),
+    "vector_r2": Metric("force map: R² of components", "", "1 − SSE/SST of x, y and z", "high"),
+    "ghost": Metric(
+        "ghosts: contact-free area above 5 mN", "", "share where a contact-sized patch would carry it", "low"
+    ),
+    "ghost_relative": Metric(
+        "ghosts: contact-free area above 5% of scale", "", "share of the area", "low", column="ghost area"
+    ),
+    "ghost_far": Metric(
+        "ghosts: the same beyond 2 mm of a contact",
+        "",
+        "the rim left out",
+        "low",
+        column="ghost area beyond 2 mm",
+    ),
+    "stray_mn": Metric(
+        "ghosts: force on contact-free area", "mN", "mean over frames", "low", column="force off contact [mN]"
+    ),
+    "low_over_mn": Metric(
+        "over-prediction in low-force frames",
+        "mN",
+        "of the total force",
+        "low",
+        column="over in low frames [mN]",
+    ),
+    "localisation_mm": Metric(
+        "contact centre: median error",
+        "mm",
+        "distance of said from true",
+        "low",
+        column="contact centre [mm]",
+    ),
+    "calibration_slope": Metric("calibration: slope of truth on answer", "", "by least squares", "one"),
+    "calibration_offset_mn": Metric(
+        "calibration: offset of truth on answer", "mN", "by least squares", "zero", listed=False
+    ),
+}
+"""By key of `learn eval --json`: the only place that says what a score is."""
 
 
 @dataclass(frozen=True)

@@ -49,7 +49,7 @@ class Portable(nn.Module):
         return y
 
 
-def names(card: Card) -> list[str]:
+def input_names(card: Card) -> list[str]:
     """The file's inputs, in order."""
     arch = card.settings.arch
     extra = ["confidence"] * arch.confidence + ["log_young"] * (arch.condition == "film")
@@ -71,7 +71,7 @@ def examples(card: Card, batch: int, seed: int = 0) -> list[Tensor]:
         "confidence": rng.uniform(size=(batch, 1, n, n)),
         "log_young": rng.normal(size=(batch, 1)),
     }
-    return [torch.from_numpy(np.array(found[name], np.float32)) for name in names(card)]
+    return [torch.from_numpy(np.array(found[name], np.float32)) for name in input_names(card)]
 
 
 @torch.no_grad()
@@ -111,7 +111,7 @@ def _gap(said: tuple[Tensor, ...], expected: tuple[Tensor, ...], card: Card) -> 
     )
 
 
-def outputs(card: Card) -> list[str]:
+def output_names(card: Card) -> list[str]:
     """The file's outputs, in order."""
     return ["density", "total_force"] if card.settings.arch.total else ["density"]
 
@@ -121,8 +121,8 @@ def describe(card: Card, kind: str, difference: float) -> dict[str, Any]:
     grid = card.settings.grid
     return {
         "format": kind,
-        "inputs": names(card),
-        "outputs": outputs(card),
+        "inputs": input_names(card),
+        "outputs": output_names(card),
         "output": "force density per unit stiffness [mN/mm2 at E = 1 kPa]; components x, y, z in camera axes"
         if card.settings.arch.components == 3
         else f"{card.settings.target} per unit stiffness, one component",
@@ -163,14 +163,14 @@ def _onnx(module: Portable, card: Card, file: Path) -> Any:
             module,
             tuple(examples(card, 2)),
             str(file),
-            input_names=names(card),
-            output_names=outputs(card),
-            dynamic_axes={name: {0: "batch"} for name in [*names(card), *outputs(card)]},
+            input_names=input_names(card),
+            output_names=output_names(card),
+            dynamic_axes={name: {0: "batch"} for name in [*input_names(card), *output_names(card)]},
             dynamo=False,
             opset_version=17,
         )
     session = runtime.InferenceSession(str(file), providers=["CPUExecutionProvider"])
-    order = names(card)
+    order = input_names(card)
 
     def run(inputs: list[Tensor]) -> tuple[Tensor, ...]:
         named = {name: value.numpy() for name, value in zip(order, inputs, strict=True)}

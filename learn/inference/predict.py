@@ -202,7 +202,9 @@ class Predictor:
         return density, np.concatenate(totals) * (scales.force * young_kpa) if totals else None
 
 
-def load(model_dir: Path | str, device: torch.device | str = "cpu", quick: bool = False) -> Predictor:
+def load_predictor(
+    model_dir: Path | str, device: torch.device | str = "cpu", quick: bool = False
+) -> Predictor:
     """A model folder as `learn train` writes it. Raises UserError if it is missing or corrupt."""
     model, card = checkpoint.load_model(Path(model_dir))
     return Predictor(model, card, device, quick)

@@ -9,40 +9,37 @@ bounded heads (low, middle, high force) fused by soft weights. Width 32 on 256²
 from __future__ import annotations
 
 import copy
-from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import torch
 import torch.nn.functional as F
+from pydantic import Field, model_validator
 from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from synth.errors import UserError
-
-Output = Literal["magnitude", "vector"]
-COMPONENTS: dict[str, int] = {"magnitude": 1, "vector": 3}
+from synth.job.types import Positive, Section
 
 
-@dataclass(frozen=True)
-class Architecture:
+class Architecture(Section):
     """Everything that decides the network's shape; stored in the checkpoint."""
 
     name: Literal["d2fnet", "unet", "monai-unet"] = "d2fnet"
-    width: int = 32
+    width: Annotated[int, Field(ge=4, multiple_of=4)] = 32
     """Channels of the first level; each level doubles them."""
-    levels: int = 4
+    levels: Annotated[int, Field(ge=1, le=5)] = 4
     """Times the picture is halved after the stem."""
-    stem: int = 1
+    stem: Annotated[int, Field(ge=1, le=4)] = 1
     """Stride of the first convolution; 4 makes the network live (`d2fnet-s`)."""
     detail: bool = False
     """With a stem of 4: strides two and two, and what the first sees also reaches the answer by a skip of
     its own, so that a contact's rim is drawn at half the input's resolution, not a quarter."""
-    output: Output = "vector"
+    output: Literal["magnitude", "vector"] = "vector"
     """`magnitude`: force density ≥ 0; `vector`: its x, y, z in camera axes."""
-    bounds: tuple[float, float, float] = (0.25, 0.75, 1.5)
+    bounds: tuple[Positive, Positive, Positive] = (0.25, 0.75, 1.5)
     """Largest value each head can give, in units of the training data's 99.9th percentile. The paper's
     heads stop at 1/6, 1/2 and 1 of the largest force it has; half as much again is kept in hand here."""
-    dropout: float = 0.1
+    dropout: Annotated[float, Field(ge=0, lt=1)] = 0.1
     confidence: bool = False
     """Whether a sixth channel holds the flow's confidence."""
     total: bool = False
@@ -50,19 +47,13 @@ class Architecture:
     condition: Literal["none", "film"] = "none"
     """`film`: Young's modulus modulates the bottleneck (feature-wise affine; Perez et al. 2018)."""
 
-    def __post_init__(self) -> None:
-        if self.name not in ("d2fnet", "unet", "monai-unet"):
-            raise UserError(f"unknown model {self.name!r}: d2fnet, unet or monai-unet")
-        if self.output not in COMPONENTS:
-            raise UserError(f"unknown output {self.output!r}: magnitude or vector")
-        if self.stem not in (1, 2, 4) or not 1 <= self.levels <= 5 or self.width < 4 or self.width % 4:
-            raise UserError(
-                f"architecture: stem {self.stem} (1, 2 or 4), levels {self.levels} (1-5), "
-                f"width {self.width} (a multiple of 4)"
-            )
-
+    @model_validator(mode="after")
+    def _stem_is_possible(self) -> Architecture:
+        if self.stem == 3:
+            raise ValueError("a stem is 1, 2 or 4")
         if self.detail and (self.stem != 4 or self.name == "monai-unet"):
-            raise UserError("architecture: detail goes with a stem of 4")
+            raise ValueError("detail goes with a stem of 4")
+        return self
 
     @property
     def inputs(self) -> int:
@@ -70,15 +61,7 @@ class Architecture:
 
     @property
     def components(self) -> int:
-        return COMPONENTS[self.output]
-
-    def check(self, size: int) -> None:
-        """Raises UserError if an N×N input can't be halved as often as this network does."""
-        if size % (self.stem * 2**self.levels):
-            raise UserError(
-                f"input size {size} does not divide by {self.stem * 2**self.levels} "
-                f"(stem {self.stem}, {self.levels} levels)"
-            )
+        return 1 if self.output == "magnitude" else 3
 
 
 class Gate(nn.Module):

@@ -23,10 +23,11 @@ from learn.data.split import Split, groups
 from learn.evaluation.metrics import Moments, agreement
 from learn.loss import SHARES, at, full, gradient_shares, loss
 from learn.network.monai_unet import build
-from learn.settings import Settings
+from learn.settings import Settings, replace
 from learn.training.batches import Batch, Frames, inputs, measure_scales
 from learn.training.gpu_batches import held
 from learn.training.log import Log
+from synth.dataset.split import find_crossings
 from synth.errors import UserError
 
 LOOK = 16
@@ -59,8 +60,63 @@ def train(
     fit, select = [clips[i] for i in split.fit], [clips[i] for i in split.select]
     scales = measure_scales(fit, settings)
     card = Card(settings, scales, typical_young(fit), *_provenance(clips, split))
-    state = _open(out, card)
+    run = _start(settings, _open(out, card))
+    net: Any = torch.compile(run.model) if settings.compile else run.model
+    net, run.optimizer = fabric.setup(net, run.optimizer)
+    frames, chooser = held(fit, settings, fabric.device), held(select, settings, fabric.device)
 
+    with Log(out, run.epoch) if fabric.is_global_zero else nullcontext() as write:
+        for epoch in range(run.epoch, settings.epochs):
+            if settings.stop and run.waited >= settings.stop:
+                break
+            numbers = _epoch(fabric, net, run.optimizer, frames, scales, epoch, report)
+            numbers |= select_score(net, chooser, scales, fabric.device)
+            improved = run.end_epoch(numbers["select_r2"], settings)
+            numbers |= {"epoch": epoch + 1.0, "lr": run.optimizer.param_groups[0]["lr"]}
+            if write is not None:
+                write(epoch, numbers)
+                if improved:
+                    checkpoint.save_tensors(out / "weights.pt", _cpu(run.model.state_dict()))
+                    checkpoint.write_card(out, dataclasses.replace(card, epoch=run.epoch, score=run.best))
+                checkpoint.save_tensors(out / "last.pt", run.as_dict())
+            fabric.barrier()
+            log(numbers)
+    return checkpoint.read_card(out)
+
+
+@dataclasses.dataclass
+class _Run:
+    """A run between two epochs: what continuing it needs."""
+
+    model: torch.nn.Module
+    optimizer: Any
+    plateau: ReduceLROnPlateau
+    epoch: int = 0
+    """Epochs done."""
+    best: float = -math.inf
+    """R² on the select sequences of the epoch that is kept."""
+    waited: int = 0
+    """Epochs since then."""
+
+    def end_epoch(self, score: float, settings: Settings) -> bool:
+        """Takes an epoch's score into account; whether it is the best so far."""
+        self.epoch += 1
+        if settings.schedule == "plateau":
+            self.plateau.step(score)
+        # Before its price is whole no epoch has been asked to have no ghosts: none of those is chosen.
+        asked = full(settings.objective, self.epoch / settings.epochs)
+        improved = asked and score > self.best
+        self.best, self.waited = (score, 0) if improved else (self.best, self.waited + asked)
+        return improved
+
+    def as_dict(self) -> dict[str, Any]:
+        plain = {"epoch": self.epoch, "best": self.best, "waited": self.waited}
+        moving = {"optimizer": self.optimizer.state_dict(), "plateau": self.plateau.state_dict()}
+        return plain | {"model": _cpu(self.model.state_dict())} | moving
+
+
+def _start(settings: Settings, state: dict[str, Any] | None) -> _Run:
+    """A fresh run, or one that goes on from a state as `_Run.as_dict` gave it."""
     torch.manual_seed(settings.seed)
     model = build(settings.arch)
     if settings.channels_last:
@@ -69,45 +125,13 @@ def train(
         model.parameters(), lr=settings.learning_rate, weight_decay=settings.weight_decay
     )
     plateau = ReduceLROnPlateau(optimizer, mode="max", factor=0.5, patience=settings.patience)
-    start, best, waited = 0, -math.inf, 0
+    run = _Run(model, optimizer, plateau)
     if state is not None:
         model.load_state_dict(state["model"])
         optimizer.load_state_dict(state["optimizer"])
         plateau.load_state_dict(state["plateau"])
-        start, best, waited = state["epoch"], state["best"], state["waited"]
-    net, optimizer = fabric.setup(torch.compile(model) if settings.compile else model, optimizer)
-    frames, chooser = held(fit, settings, fabric.device), held(select, settings, fabric.device)
-
-    with Log(out, start) if fabric.is_global_zero else nullcontext() as write:
-        for epoch in range(start, settings.epochs):
-            if settings.stop and waited >= settings.stop:
-                break
-            numbers = _epoch(fabric, net, optimizer, frames, scales, epoch, report)
-            numbers |= select_score(net, chooser, scales, fabric.device)
-            score = numbers["select_r2"]
-            if settings.schedule == "plateau":
-                plateau.step(score)
-            # Before its price is whole no epoch has been asked to have no ghosts: none of those is chosen.
-            asked = full(settings.objective, (epoch + 1) / settings.epochs)
-            improved = asked and score > best
-            best, waited = (score, 0) if improved else (best, waited + asked)
-            numbers |= {"epoch": epoch + 1.0, "lr": optimizer.param_groups[0]["lr"]}
-            if write is not None:
-                write(epoch, numbers)
-                if improved:
-                    checkpoint.save_tensors(out / "weights.pt", _cpu(model.state_dict()))
-                    checkpoint.write_card(out, dataclasses.replace(card, epoch=epoch + 1, score=score))
-                state = {
-                    "epoch": epoch + 1,
-                    "best": best,
-                    "waited": waited,
-                    "model": _cpu(model.state_dict()),
-                }
-                state |= {"optimizer": optimizer.state_dict(), "plateau": plateau.state_dict()}
-                checkpoint.save_tensors(out / "last.pt", state)
-            fabric.barrier()
-            log(numbers)
-    return checkpoint.read_card(out)
+        run.epoch, run.best, run.waited = state["epoch"], state["best"], state["waited"]
+    return run
 
 
 def _epoch(
@@ -216,11 +240,8 @@ def moments(true: torch.Tensor, said: torch.Tensor) -> Moments:
 
 def _provenance(clips: Sequence[Clip], split: Split) -> tuple[dict[str, list[str]], dict[str, list[str]]]:
     parts = {"fit": split.fit, "select": split.select, "test": split.test}
-    number = groups(clips)
-    seen = {number[i] for i in (*split.fit, *split.select)}
-    if seen & {number[i] for i in split.test} or {number[i] for i in split.fit} & {
-        number[i] for i in split.select
-    }:
+    number, sides = groups(clips), [(i, side) for side, part in parts.items() for i in part]
+    if find_crossings([number[i] for i, _ in sides], [side for _, side in sides]):
         raise UserError("the split shares an anatomy between fit, select and test")
     return (
         {k: [clips[i].content_hash for i in v] for k, v in parts.items()},
@@ -234,7 +255,7 @@ def _open(out: Path, card: Card) -> dict[str, Any] | None:
         checkpoint.write_card(out, card)
         return None
     there = checkpoint.read_card(out)
-    if there.settings != dataclasses.replace(card.settings, epochs=there.settings.epochs):
+    if there.settings != replace(card.settings, epochs=there.settings.epochs):
         raise UserError(f"{out}: holds a model trained with other settings; choose another folder")
     if there.split != card.split or there.scales != card.scales:
         raise UserError(f"{out}: holds a model trained on other data; choose another folder")

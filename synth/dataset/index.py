@@ -70,8 +70,8 @@ def read_index(root: Path) -> pa.Table:
         raise UserError(f"{path}: is damaged ({str(error).splitlines()[0]})") from error
 
 
-def write_index(folder: Folder) -> list[dict[str, Any]]:
-    """Brings the index up to date with the folder; rows that it has already are kept. Returns all rows."""
+def collect(folder: Folder) -> list[dict[str, Any]]:
+    """All rows but for their sides, as the folder is now; those that the index has already are kept."""
     known: dict[int, dict[str, Any]] = {}
     if (folder.root / NAME).exists():
         table = read_index(folder.root)
@@ -81,7 +81,24 @@ def write_index(folder: Folder) -> list[dict[str, Any]]:
     for key, failure in folder.failures().items():
         if key not in rows:
             rows[key] = {"index": key, "status": "failed", "reason": failure["reason"]}
-    ordered = [rows[key] for key in sorted(rows)]
+    return [rows[key] for key in sorted(rows)]
+
+
+def written_sides(root: Path) -> dict[str, str] | None:
+    """The side of every sequence by its content hash, as `synth split` decided; None where nobody did.
+
+    UserError if the dataset has too few groups for its rule.
+    """
+    if not split.is_written(root):
+        return None
+    rows = collect(Folder(root))
+    sides = split.assign_sides(rows, split.read_rule(root))
+    return {row["content_hash"]: side for row, side in zip(rows, sides, strict=True) if side is not None}
+
+
+def write_index(folder: Folder) -> list[dict[str, Any]]:
+    """Brings the index up to date with the folder. Returns all rows."""
+    ordered = collect(folder)
     try:
         sides = split.assign_sides(ordered, split.read_rule(folder.root))
     except UserError:  # too few groups to have some on every side
@@ -112,7 +129,7 @@ def row_of(sequence: Sequence) -> dict[str, Any]:
         "status": "done",
         "path": sequence.path.name,
         "content_hash": attrs["content_hash"],
-        "anatomy": attrs.get("anatomy_id", str(scenario.get("anatomy"))),
+        "anatomy": split.name_anatomy(attrs),
         "family": scenario.get("family"),
         "gesture": gesture.get("kind"),
         "young_kpa": attrs.get("young_kpa"),

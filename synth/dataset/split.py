@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal, cast, get_args
@@ -29,6 +29,11 @@ class Rule:
     held_out: tuple[str, ...] = ()
     share_anatomy: bool = False
     """Whether one brain may be on several sides: scores then say nothing of other brains."""
+
+
+def is_written(root: Path) -> bool:
+    """Whether the dataset in `root` was given a rule of its own (`synth split`)."""
+    return (root / _NAME).exists()
 
 
 def read_rule(root: Path) -> Rule:
@@ -118,13 +123,51 @@ def leaks(rows: Sequence[Mapping[str, Any]], chosen: Rule | None = None) -> list
     for row in rows:
         if row["status"] == "done" and row.get("split") in SIDES[:2] and row["family"] in chosen.held_out:
             found.append(f"family {row['family']} is held out and in {row['split']}")
+    done = [row for row in rows if row["status"] == "done" and row.get("split")]
     for name in ("content_hash",) if chosen.share_anatomy else ("anatomy", "content_hash"):
-        seen: dict[Any, set[str]] = {}
-        for row in rows:
-            if row["status"] == "done" and row.get("split"):
-                seen.setdefault(row[name], set()).add(row["split"])
-        found += [f"{name} {key} is in {', '.join(sorted(on))}" for key, on in seen.items() if len(on) > 1]
+        crossing = find_crossings([row[name] for row in done], [row["split"] for row in done])
+        found += [f"{name} {key} is in {', '.join(on)}" for key, on in crossing.items()]
     return found
+
+
+def find_crossings(groups: Sequence[Hashable], sides: Sequence[str]) -> dict[Hashable, list[str]]:
+    """Groups that are on more than one side, and on which: there must be none. One entry a sequence."""
+    on: dict[Hashable, set[str]] = {}
+    for group, side in zip(groups, sides, strict=True):
+        on.setdefault(group, set()).add(side)
+    return {group: sorted(found) for group, found in on.items() if len(found) > 1}
+
+
+def join_groups(*keys: Sequence[Hashable]) -> list[int]:
+    """A number for each sequence, equal where two share a key or are joined by others that do.
+
+    `keys`: of everything that must not be on two sides, one value a sequence. The number is the place of the
+    group's first sequence.
+    """
+    root = list(range(len(keys[0])))
+
+    def find(i: int) -> int:
+        while root[i] != i:
+            root[i] = root[root[i]]
+            i = root[i]
+        return i
+
+    for values in keys:
+        first: dict[Hashable, int] = {}
+        for i, value in enumerate(values):
+            here, there = find(i), find(first.setdefault(value, i))
+            root[max(here, there)] = min(here, there)
+    return [find(i) for i in range(len(root))]
+
+
+def name_anatomy(attrs: Mapping[str, Any]) -> str:
+    """What names a sequence's anatomy across datasets: `anatomy_id`, in older stores the seed of the relief;
+    a sequence with neither is alone. All sequences of one user's brain are one anatomy."""
+    named = attrs.get("anatomy_id")
+    if named is not None:
+        return str(named)
+    seed = ((attrs.get("scenario") or {}).get("relief") or {}).get("seed")
+    return str(attrs["content_hash"]) if seed is None else f"seed-{seed}"
 
 
 def _groups(rows: Sequence[Mapping[str, Any]], by: By, share_anatomy: bool) -> dict[int, str]:
@@ -139,20 +182,11 @@ def _groups(rows: Sequence[Mapping[str, Any]], by: By, share_anatomy: bool) -> d
         named = {row["index"]: str(row[by]) for row in rows}
     if share_anatomy:
         return named
-    parent = {name: name for name in named.values()}
-
-    def root(name: str) -> str:
-        while parent[name] != name:
-            parent[name] = parent[parent[name]]
-            name = parent[name]
-        return name
-
-    first: dict[Any, str] = {}
-    for row in rows:
-        name = root(named[row["index"]])
-        other = root(first.setdefault(row["anatomy"], name))
-        parent[max(name, other)] = min(name, other)
-    return {key: root(name) for key, name in named.items()}
+    names, least = list(named.values()), dict[int, str]()
+    number = join_groups(names, [row["anatomy"] for row in rows])
+    for group, name in zip(number, names, strict=True):
+        least[group] = min(name, least.get(group, name))
+    return {key: least[group] for key, group in zip(named, number, strict=True)}
 
 
 def _shuffled(name: str) -> str:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import difflib
 import typing
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
 from ruamel.yaml import YAML
@@ -16,6 +16,8 @@ from ruamel.yaml.error import MarkedYAMLError
 
 from synth.errors import UserError
 from synth.job.schema import Job
+
+Model = TypeVar("Model", bound=BaseModel)
 
 Loc = tuple[str | int, ...]
 """Where in the job: keys and positions from the top."""
@@ -82,14 +84,38 @@ def parse_job(text: str, label: str, folder: Path, overrides: Sequence[str] = ()
     try:
         job = Job.model_validate(values)
     except ValidationError as error:
-        for one in error.errors(include_url=False):
-            at = _trim(one["loc"])
-            unknown = one["type"] == "extra_forbidden"
-            place = _place(written, at, label, given, key=unknown)
-            problems.append((*place, f"{_dotted(at)}{_message(one, at)}"))
+        for at, unknown, what in _mistakes(error, Job):
+            problems.append((*_place(written, at, label, given, key=unknown), what))
     if problems or job is None:
         raise UserError("\n".join(f"{where}: {what}" for _, where, what in sorted(set(problems))))
     return job
+
+
+def override(settings: Model, overrides: Iterable[str]) -> Model:
+    """`settings` with `key=value` or `section.key=value` replaced, the value in YAML.
+
+    Raises UserError: one line for every mistake, `'batch=many': batch: a whole number is needed, ...`.
+    """
+    values = settings.model_dump()
+    given = _apply(values, overrides)
+    try:
+        return type(settings).model_validate(values)
+    except ValidationError as error:
+        lines = {f"{_given(given, at)}{what}" for at, _, what in _mistakes(error, type(settings))}
+        raise UserError("\n".join(sorted(lines))) from None
+
+
+def _given(given: dict[Loc, str], at: Loc) -> str:
+    """The override that a mistake at `at` lies in; nothing when it takes several to make it."""
+    touching = (text for place, text in given.items() if at and place[: len(at)] == at[: len(place)])
+    return next((f"'{text}': " for text in touching), "")
+
+
+def _mistakes(error: ValidationError, model: type[BaseModel]) -> Iterator[tuple[Loc, bool, str]]:
+    """Where each mistake is, whether it is a key that is not known, and what to say of it."""
+    for one in error.errors(include_url=False):
+        at = _trim(one["loc"])
+        yield at, one["type"] == "extra_forbidden", f"{_dotted(at)}{_message(one, at, model)}"
 
 
 def _text(path: Path) -> str:
@@ -196,10 +222,10 @@ def _dotted(at: Loc) -> str:
     return f"{text}: " if text else ""
 
 
-def _message(error: Any, at: Loc) -> str:
+def _message(error: Any, at: Loc, model: type[BaseModel]) -> str:
     kind, context = str(error["type"]), error.get("ctx", {})
     if kind == "extra_forbidden":
-        return f"unknown key{_did_you_mean(at)}"
+        return f"unknown key{_did_you_mean(at, model)}"
     if kind == "literal_error":
         close = difflib.get_close_matches(str(error["input"]), str(context["expected"]).split("'")[1::2], 1)
         return f"{error['input']!r} is not one of {context['expected']}" + (
@@ -218,19 +244,18 @@ def _message(error: Any, at: Loc) -> str:
     return f"{_KINDS.get(kind, error['msg'])}, not {error['input']!r}"
 
 
-def _did_you_mean(at: Loc) -> str:
-    model = _model_at(at[:-1])
-    close = difflib.get_close_matches(str(at[-1]), list(model.model_fields), 1, 0.6)
+def _did_you_mean(at: Loc, model: type[BaseModel]) -> str:
+    block = _model_at(at[:-1], model)
+    close = difflib.get_close_matches(str(at[-1]), list(block.model_fields), 1, 0.6)
     if close:
         return f", did you mean '{close[0]}'?"
-    elsewhere = [place for place in places() if place[-1] == at[-1]]
+    elsewhere = [place for place in places(model) if place[-1] == at[-1]]
     if elsewhere:
         return f", did you mean '{'.'.join(map(str, elsewhere[0]))}'?"
-    return f"; known are {', '.join(model.model_fields)}"
+    return f"; known are {', '.join(block.model_fields)}"
 
 
-def _model_at(at: Loc) -> type[BaseModel]:
-    model: type[BaseModel] = Job
+def _model_at(at: Loc, model: type[BaseModel]) -> type[BaseModel]:
     for step in at:
         if isinstance(step, int):  # an item of a list of sections
             continue

@@ -11,7 +11,7 @@ import pytest
 from evidence import defaults_on_front as fronts
 from evidence.defaults_on_front import Front, Point
 from learn.loss import Objective
-from learn.settings import PRESETS
+from learn.settings import PRESETS, preset
 from synth.errors import UserError
 
 RESULTS = Path(__file__).parents[2] / "docs" / "results"
@@ -37,7 +37,7 @@ def test_every_preset_of_learn_but_the_published_one_has_a_front() -> None:
 
 def test_a_preset_whose_loss_changed_has_no_error(monkeypatch: pytest.MonkeyPatch) -> None:
     """What was measured with another loss doesn't stand for it."""
-    changed = replace(PRESETS["cpu"], objective=Objective(kind="mae"))
+    changed = preset("cpu", objective=Objective(kind="mae"))
     monkeypatch.setitem(PRESETS, "cpu", changed)
     with pytest.raises(UserError, match="not among"):
         next(front for front in fronts.gather(RESULTS) if front.room == "learn, cpu").find()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,7 @@ from evidence.gap import experiment, gap, runs
 from learn.data.clips import Clip
 from learn.data.split import nested
 from learn.loss import Objective
-from learn.settings import preset
+from learn.settings import preset, replace
 
 RESULTS = Path(__file__).parents[2] / "docs" / "results" / "gap"
 

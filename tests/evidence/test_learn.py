@@ -26,9 +26,9 @@ from evidence.learn.table import markdown
 from learn.data.clips import Clip
 from learn.data.grid import Grid
 from learn.data.split import nested
-from learn.inference.predict import Predictor, load
+from learn.inference.predict import Predictor, load_predictor
 from learn.loss import Objective
-from learn.settings import PRESETS, preset
+from learn.settings import PRESETS, preset, replace
 from learn.training.train import train
 from synth.errors import UserError
 from synth.job import reader
@@ -41,8 +41,8 @@ GRID = Grid(32)
 def model(clips: list[Clip], tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("bench") / "model"
     settings = preset("tiny", size=32, epochs=1, objective=Objective(kind="mse"))
-    arch = dataclasses.replace(settings.arch, levels=2, width=8, output="magnitude")
-    train(clips, nested(clips, 3, 0, 0), dataclasses.replace(settings, arch=arch), out)
+    arch = replace(settings.arch, levels=2, width=8, output="magnitude")
+    train(clips, nested(clips, 3, 0, 0), replace(settings, arch=arch), out)
     return out
 
 
@@ -105,7 +105,7 @@ def test_an_error_over_wider_cells_is_without_what_averages_out(clips: list[Clip
     clip = dataclasses.replace(clips[2], mask=np.ones((32, 32), np.float32))
 
     class Rough:
-        card = load(model).card
+        card = load_predictor(model).card
 
         @staticmethod
         def density(moved: object, mask: object, young_kpa: float) -> NDArray[np.float32]:
@@ -136,13 +136,13 @@ def test_errors_are_of_runs_that_were_trained_as_the_preset_is(tmp_path: Path) -
     runs = [run for run in preset_runs() if run.settings.size == PRESETS["cpu"].size]
     own = [shape(run.settings.arch) == shape(PRESETS["cpu"].arch) for run in runs]
     cpu, other = runs[own.index(True)], runs[own.index(False)]
-    again = Run("again", dataclasses.replace(other.settings, seed=1))
-    mse = dataclasses.replace(cpu.settings, objective=Objective(kind="mse"), seed=7)
-    decayed = dataclasses.replace(cpu.settings, weight_decay=0.1, seed=9)
-    elsewhere = dataclasses.replace(cpu.settings, seed=10)
+    again = Run("again", replace(other.settings, seed=1))
+    mse = replace(cpu.settings, objective=Objective(kind="mse"), seed=7)
+    decayed = replace(cpu.settings, weight_decay=0.1, seed=9)
+    elsewhere = replace(cpu.settings, seed=10)
     unlike = [
         Run("another-loss", mse),
-        Run("longer", dataclasses.replace(cpu.settings, epochs=99, seed=8)),
+        Run("longer", replace(cpu.settings, epochs=99, seed=8)),
         Run("other-decay", decayed),
         Run("on-recovered", elsewhere, source="recovered"),
     ]
@@ -164,7 +164,7 @@ def test_errors_are_of_runs_that_were_trained_as_the_preset_is(tmp_path: Path) -
 
 def test_runs_that_were_tested_on_other_sequences_are_not_averaged(tmp_path: Path) -> None:
     first = next(preset_runs())
-    again = Run("again", dataclasses.replace(first.settings, seed=1))
+    again = Run("again", replace(first.settings, seed=1))
     run_table.write(tmp_path / "presets", [done(first, [1.0, 2.0, 3.0]), done(again, [1.0, 2.0])])
     with pytest.raises(UserError, match="different sequences"):
         errors(tmp_path)
@@ -193,9 +193,7 @@ def test_a_run_is_answered_from_what_was_kept_only_if_nothing_that_made_it_chang
     clips: list[Clip], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     settings = preset("tiny", size=32, epochs=1, folds=3, objective=Objective(kind="mse"))
-    run = Run(
-        "run", dataclasses.replace(settings, arch=dataclasses.replace(settings.arch, levels=2, width=8))
-    )
+    run = Run("run", replace(settings, arch=replace(settings.arch, levels=2, width=8)))
     trained: list[str] = []
     train = runs.train
     monkeypatch.setattr(runs, "train", lambda *args: trained.append(str(args[3])) or train(*args))
@@ -207,7 +205,7 @@ def test_a_run_is_answered_from_what_was_kept_only_if_nothing_that_made_it_chang
     assert len(trained) == 1
     assert ask() == first
     assert len(trained) == 1
-    ask(dataclasses.replace(run, settings=dataclasses.replace(run.settings, weight_decay=0.1)))
+    ask(dataclasses.replace(run, settings=replace(run.settings, weight_decay=0.1)))
     assert len(trained) == 2
     ask(clips=[dataclasses.replace(clips[0], content_hash="other"), *clips[1:]])
     assert len(trained) == 3
@@ -224,7 +222,7 @@ def test_a_word_that_no_network_holds_needs_times_to_show(tmp_path: Path) -> Non
 
 
 def test_controls_score_what_they_must(clips: list[Clip], model: Path) -> None:
-    found = controls(load(model), clips[:3], "ideal", clips[3:])
+    found = controls(load_predictor(model), clips[:3], "ideal", clips[3:])
     assert found["zero"]["map_r2_pooled"] <= 0
     assert found["identity"]["map_rmse"] == 0
     assert found["identity"]["map_r2_pooled"] == 1
@@ -234,10 +232,10 @@ def test_controls_score_what_they_must(clips: list[Clip], model: Path) -> None:
 def test_the_mean_map_is_a_mean_that_knows_no_turn_and_its_skill_beyond_itself_is_none(
     clips: list[Clip], model: Path
 ) -> None:
-    card = load(model).card
+    card = load_predictor(model).card
     base = mean_map(clips[:3], card, clips[3:])
     assert beyond_mean_map(base, base)["map"]["mean"] == 0
-    truth = controls(load(model), clips[:3], "ideal", clips[3:])
+    truth = controls(load_predictor(model), clips[:3], "ideal", clips[3:])
     assert truth["mean map"]["map_r2_pooled"] < truth["input"]["map_r2_pooled"]
     # On a full mask the mean map holds the fitted frames' mean force, whichever way they are turned.
     full = [dataclasses.replace(c, mask=np.ones_like(c.mask)) for c in clips]

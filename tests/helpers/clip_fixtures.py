@@ -7,7 +7,7 @@ from pathlib import Path
 import phantom
 import pytest
 
-from learn.data.clips import Clip, load
+from learn.data.clips import Clip, load_clips
 from learn.data.grid import Grid
 
 
@@ -22,4 +22,4 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def clips(dataset: Path) -> list[Clip]:
-    return load(dataset, Grid(32), ("ideal", "recovered"))
+    return load_clips(dataset, Grid(32), ("ideal", "recovered"))

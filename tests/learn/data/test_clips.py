@@ -7,9 +7,10 @@ import numpy as np
 import phantom
 import pytest
 
-from learn.data.clips import Clip, _anatomy, load, target
+from learn.data.clips import Clip, load_clips, target
 from learn.data.grid import Grid
 from learn.data.split import folds, groups, nested, ungrouped
+from synth.dataset.split import name_anatomy
 from synth.errors import UserError
 
 GRID = Grid(32)
@@ -41,7 +42,7 @@ def test_the_papers_intensity_peaks_at_the_total_force(clips: list[Clip]) -> Non
 
 def test_a_packed_cache_gives_the_same_and_is_used(dataset: Path, clips: list[Clip], tmp_path: Path) -> None:
     for _ in range(2):
-        packed = load(dataset, GRID, ("ideal", "recovered"), cache=tmp_path)
+        packed = load_clips(dataset, GRID, ("ideal", "recovered"), cache=tmp_path)
     for a, b in zip(clips, packed, strict=True):
         np.testing.assert_array_equal(a.density, b.density)
         np.testing.assert_array_equal(a.displacement["recovered"], b.displacement["recovered"])
@@ -53,15 +54,15 @@ def test_a_packed_cache_gives_the_same_and_is_used(dataset: Path, clips: list[Cl
 def test_a_store_without_recovered_flow(tmp_path: Path) -> None:
     phantom.write(tmp_path, 0, anatomy_seed=1, recovered=False)
     with pytest.raises(UserError, match=r"000000.zarr: holds no recovered flow"):
-        load(tmp_path, GRID, ("recovered",))
-    assert len(load(tmp_path, GRID, ("ideal",))) == 1
+        load_clips(tmp_path, GRID, ("recovered",))
+    assert len(load_clips(tmp_path, GRID, ("ideal",))) == 1
 
 
 def test_a_store_with_recovered_flow_under_its_former_name(tmp_path: Path) -> None:
     former_name.rename_field(phantom.write(tmp_path, 0, anatomy_seed=1))
-    (found,) = load(tmp_path, GRID, ("recovered",))
+    (found,) = load_clips(tmp_path, GRID, ("recovered",))
     again = phantom.write(tmp_path / "again", 0, anatomy_seed=1)
-    (now,) = load(again.parent, GRID, ("recovered",))
+    (now,) = load_clips(again.parent, GRID, ("recovered",))
     np.testing.assert_array_equal(found.displacement["recovered"], now.displacement["recovered"])
     assert found.displacement["recovered"].any()
 
@@ -121,12 +122,12 @@ def test_anatomies_are_told_apart_by_what_a_sequence_says() -> None:
 
     job = Job.model_validate({"sequences": 6, "anatomy": {"variety": 3}})
     cases = [{"scenario": scenario.draw(job, i).as_dict(), "content_hash": f"hash{i}"} for i in range(6)]
-    names = [_anatomy(case) for case in cases]
+    names = [name_anatomy(case) for case in cases]
     assert names[:3] == names[3:]
     assert len(set(names)) == 3
     # A user's brain is one anatomy, whatever relief was drawn on it.
-    assert {_anatomy({**case, "anatomy_id": "mesh-5f"}) for case in cases} == {"mesh-5f"}
-    assert _anatomy({"content_hash": "h", "scenario": {}}) == "h"
+    assert {name_anatomy({**case, "anatomy_id": "mesh-5f"}) for case in cases} == {"mesh-5f"}
+    assert name_anatomy({"content_hash": "h", "scenario": {}}) == "h"
 
 
 def test_one_brain_is_split_only_when_asked_to(clips: list[Clip]) -> None:

@@ -13,9 +13,9 @@ import torchmetrics
 from learn.checkpoint import Card
 from learn.data.clips import Clip
 from learn.evaluation.evaluate import Report, evaluate, score
-from learn.evaluation.metrics import Moments, agreement, contact_mm, ghost_share, line
+from learn.evaluation.metrics import METRICS, Moments, agreement, contact_mm, ghost_share, line
 from learn.network.d2fnet import Architecture
-from learn.settings import Settings
+from learn.settings import Settings, replace
 from learn.training.batches import measure_scales
 from synth.errors import UserError
 
@@ -113,6 +113,35 @@ def test_a_mirrored_answer_is_not_forgiven(clips: list[Clip]) -> None:
     assert got["vector_error_mn"] > 0
 
 
+def test_every_number_is_declared_once_and_the_truth_is_the_best_of_all_answers(clips: list[Clip]) -> None:
+    c = card(clips, "vector")
+    away = {
+        "low": lambda value: value,
+        "high": lambda value: -value,
+        "zero": abs,
+        "one": lambda value: abs(value - 1),
+    }
+
+    def summary(factor: float, more: float) -> dict[str, float]:
+        """Of the truth times a factor, and as much force again in the picture's corner."""
+        found = []
+        for clip in clips:
+            said = truth(clip, "vector") * np.float32(factor)
+            said[:, :, :12, :12] += np.float32(more * said.max())
+            said *= clip.mask
+            found.append(score(clip, said, c, head=factor * clip.force))
+        return Report({"known": found}, c).summary()
+
+    best, worse = summary(1, 0), summary(2, 1)
+    assert set(best) == set(METRICS)
+    for key, metric in METRICS.items():
+        assert away[metric.best](best[key]) < away[metric.best](worse[key]), key
+    assert len({metric.name for metric in METRICS.values()}) == len(METRICS)
+    listed = [metric.heading for metric in METRICS.values() if metric.listed]
+    assert listed[1:3] == ["total force: MAE [mN]", "total force: RMSE [mN]"]
+    assert "force map: MAE [mN/mm²]" in listed
+
+
 class Knowing:
     """Answers a sequence with its truth per unit stiffness times the E it is given."""
 
@@ -127,8 +156,8 @@ class Knowing:
 @pytest.mark.parametrize(("condition", "passes"), [("none", 1), ("film", 5)])
 def test_columns_of_stiffness(clips: list[Clip], condition: str, passes: int) -> None:
     c = card(clips, "vector")
-    arch = dataclasses.replace(c.settings.arch, condition=condition)  # type: ignore[arg-type]
-    c = dataclasses.replace(c, settings=dataclasses.replace(c.settings, arch=arch))
+    arch = replace(c.settings.arch, condition=condition)
+    c = dataclasses.replace(c, settings=replace(c.settings, arch=arch))
     clip = clips[2]
     knowing = Knowing(clip, c)
     pressed = {clip.content_hash: 1.1 * clip.young_kpa}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 from pathlib import Path
 
@@ -20,7 +19,7 @@ from learn.data.clips import Clip
 from learn.data.grid import Grid
 from learn.inference.apply import Filmed, motions
 from learn.inference.export import examples, export
-from learn.inference.predict import load as load_model
+from learn.inference.predict import load_predictor
 from learn.inference.stiffness import stiffness
 from learn.inference.video import read_video
 from learn.inference.video_flow import Footage, Settings, VideoFlow
@@ -61,7 +60,7 @@ def model(
 
 @pytest.mark.parametrize("kind", ["torchscript", "onnx"])
 def test_an_exported_model_says_the_same(model: Path, tmp_path: Path, kind: str) -> None:
-    predictor = load_model(model)
+    predictor = load_predictor(model)
     file = tmp_path / "net"
     worst = export(predictor, file, kind)
     said = predictor.density(
@@ -79,10 +78,10 @@ def test_an_unfaithful_export_is_refused_and_removed(
 ) -> None:
     monkeypatch.setattr("learn.inference.export.TOLERANCE", -1.0)
     with pytest.raises(UserError, match="differs from PyTorch"):
-        export(load_model(model), tmp_path / "net", "torchscript")
+        export(load_predictor(model), tmp_path / "net", "torchscript")
     assert not list(tmp_path.iterdir())
     with pytest.raises(UserError, match="unknown format 'tflite'"):
-        export(load_model(model), tmp_path / "net", "tflite")
+        export(load_predictor(model), tmp_path / "net", "tflite")
 
 
 def test_predict_on_stores_and_on_arrays_agree(model: Path, dataset: Path, tmp_path: Path) -> None:
@@ -212,29 +211,3 @@ def test_bad_files(tmp_path: Path, dataset: Path) -> None:
     phantom.write(tmp_path / "x", 0, anatomy_seed=0, recovered=False)
     with pytest.raises(UserError, match="holds no recovered flow"):
         first(tmp_path / "x")
-
-
-def test_settings_from_words() -> None:
-    got = override(
-        preset("tiny"), ["arch.width=8", "batch=3", "augment=false", "arch.bounds=1,2,3", "objective.low=0.1"]
-    )
-    assert (got.arch.width, got.batch, got.augment, got.arch.bounds) == (8, 3, False, (1.0, 2.0, 3.0))
-    assert got.objective.low == 0.1
-    assert dataclasses.replace(got, batch=8).arch.stem == preset("tiny").arch.stem
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ("bacth=3", r"bacth=3: unknown setting, did you mean 'batch'"),
-        ("arch.widht=3", r"did you mean 'arch.width'"),
-        ("batch=many", "not a value of type int"),
-        ("augment=1", "not a value of type bool"),
-        ("arch=3", "unknown setting"),
-        ("batch=0", "batch 0: must be positive"),
-        ("schedule=step", "unknown schedule 'step'"),
-    ],
-)
-def test_settings_that_cannot_be(change: str, message: str) -> None:
-    with pytest.raises(UserError, match=message):
-        override(preset("tiny"), [change])

@@ -2,11 +2,12 @@ from __future__ import annotations
 
 import pytest
 import torch
+from pydantic import ValidationError
 
 from evidence.learn.cost import flops, parameters
 from learn.network.d2fnet import Architecture, D2FNet, fused
 from learn.network.traced import Quick
-from learn.settings import PRESETS
+from learn.settings import PRESETS, Settings
 from synth.errors import UserError
 
 
@@ -58,7 +59,7 @@ def test_a_stem_with_detail_draws_at_half_the_inputs_resolution(name: str) -> No
     assert y.shape == (1, 1, 64, 64)
     assert moved[30:32, 30:32].max() > 0
     for wrong in ({"stem": 2}, {"name": "monai-unet"}):
-        with pytest.raises(UserError, match="detail goes with a stem of 4"):
+        with pytest.raises(ValidationError, match="detail goes with a stem of 4"):
             Architecture(**{"stem": 4, "detail": True} | wrong)  # type: ignore[arg-type]
 
 
@@ -94,16 +95,22 @@ def test_a_conditioned_network_starts_as_an_unconditioned_one_and_asks_for_stiff
 
 @pytest.mark.parametrize(
     ("change", "message"),
-    [({"stem": 3}, "stem 3"), ({"width": 6}, "width 6"), ({"name": "vit"}, "vit"), ({"output": "xy"}, "xy")],
+    [
+        ({"stem": 3}, "1, 2 or 4"),
+        ({"stem": 8}, "less than or equal to 4"),
+        ({"width": 6}, "multiple of 4"),
+        ({"name": "vit"}, "vit"),
+        ({"output": "xy"}, "xy"),
+    ],
 )
 def test_impossible_shapes(change: dict[str, object], message: str) -> None:
-    with pytest.raises(UserError, match=message):
+    with pytest.raises(ValidationError, match=message):
         Architecture(**change)  # type: ignore[arg-type]
 
 
 def test_an_input_that_cannot_be_halved_often_enough() -> None:
-    with pytest.raises(UserError, match="input size 80 does not divide by 64"):
-        Architecture(stem=4).check(80)
+    with pytest.raises(ValidationError, match="input size 80 does not divide by 64"):
+        Settings(size=80, arch=Architecture(stem=4))
 
 
 def test_folding_batch_norms_changes_nothing_but_the_time() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 import torchmetrics
+from pydantic import ValidationError
 
 from learn.loss import Objective, gradient_shares, loss, unexplained
 from synth.errors import UserError
@@ -150,11 +151,11 @@ def test_the_head_is_held_to_the_total() -> None:
 
 
 def test_bad_weights_and_an_empty_mask() -> None:
-    with pytest.raises(UserError, match="r2_weight"):
+    with pytest.raises(ValidationError, match="r2_weight"):
         Objective(r2_weight=1.5)
-    with pytest.raises(UserError, match="unknown r2_scope 'cell'"):
+    with pytest.raises(ValidationError, match=r"r2_scope\n.*'cell'"):
         Objective(r2_scope="cell")  # type: ignore[arg-type]
-    with pytest.raises(UserError, match="unknown loss 'l3'"):
+    with pytest.raises(ValidationError, match=r"kind\n.*'l3'"):
         Objective(kind="l3")  # type: ignore[arg-type]
     with pytest.raises(UserError, match="without a single tissue cell"):
         loss(SAID, TRUE, torch.zeros_like(MASK), Objective(), 4.0, 2.0)

@@ -17,9 +17,9 @@ from learn.data.clips import Clip
 from learn.data.split import Split, nested
 from learn.evaluation.evaluate import unseen
 from learn.evaluation.metrics import Moments
-from learn.inference.predict import load as load_model
+from learn.inference.predict import load_predictor
 from learn.loss import SHARES, Objective
-from learn.settings import Settings, preset
+from learn.settings import Settings, preset, replace
 from learn.training.batches import Frames
 from learn.training.gpu_batches import Resident, held
 from learn.training.train import moments, train
@@ -31,7 +31,7 @@ run = CliRunner().invoke
 
 def small(**changes: object) -> Settings:
     base = preset("tiny", size=32, epochs=4, objective=Objective())
-    return dataclasses.replace(base, arch=dataclasses.replace(base.arch, levels=2, dropout=0.1), **changes)  # type: ignore[arg-type]
+    return replace(base, arch=replace(base.arch, levels=2, dropout=0.1), **changes)
 
 
 @pytest.fixture(scope="module")
@@ -80,8 +80,8 @@ def test_another_seed_is_another_model(clips: list[Clip], split: Split, model: P
 
 def test_training_learns(clips: list[Clip], tmp_path: Path) -> None:
     """A network that can't even come to remember what it is shown is broken; one that is stuck loses 0.9."""
-    settings = dataclasses.replace(small(epochs=8), batch=4, augment=False, learning_rate=5e-3)
-    settings = dataclasses.replace(settings, arch=dataclasses.replace(settings.arch, dropout=0.0))
+    settings = replace(small(epochs=8), batch=4, augment=False, learning_rate=5e-3)
+    settings = replace(settings, arch=replace(settings.arch, dropout=0.0))
     train(clips, Split((0, 1, 3, 4, 5, 6), (2,), ()), settings, tmp_path / "m")
     losses = [json.loads(line)["loss"] for line in (tmp_path / "m/history.jsonl").read_text().splitlines()]
     assert losses[-1] < 0.6 < 0.8 < losses[0]
@@ -103,7 +103,7 @@ def test_only_unseen_sequences_are_scored(clips: list[Clip], split: Split, model
 
 
 def test_prediction_on_a_picture_is_that_on_the_grid(model: Path, dataset: Path, clips: list[Clip]) -> None:
-    predictor = load_model(model)
+    predictor = load_predictor(model)
     sequence = Dataset(dataset)[4]
     map_ = predictor(
         sequence["flow"][3],
@@ -125,7 +125,7 @@ def test_prediction_on_a_picture_is_that_on_the_grid(model: Path, dataset: Path,
 
 
 def test_the_same_motion_filmed_at_another_resolution_is_the_same_force(model: Path) -> None:
-    predictor = load_model(model)
+    predictor = load_predictor(model)
 
     def force(size: int, scale: float) -> float:
         node = (np.arange(size) - (size - 1) / 2) * scale
@@ -142,11 +142,11 @@ def test_the_same_motion_filmed_at_another_resolution_is_the_same_force(model: P
 )
 def test_another_grid(model: Path, shape: tuple[int, ...], message: str) -> None:
     with pytest.raises(UserError, match=message):
-        load_model(model).density(np.zeros(shape, np.float32), np.ones((32, 32), np.float32), 1.0)
+        load_predictor(model).density(np.zeros(shape, np.float32), np.ones((32, 32), np.float32), 1.0)
 
 
 def test_bad_numbers(model: Path) -> None:
-    predictor = load_model(model)
+    predictor = load_predictor(model)
     flow, tissue = np.zeros((8, 8, 2), np.float32), np.ones((8, 8), bool)
     with pytest.raises(UserError, match="young_kpa -1"):
         predictor(flow, tissue, 0.1, -1.0)
@@ -167,20 +167,20 @@ def broken(model: Path, to: Path, file: str, data: bytes) -> Path:
 def test_corrupt_checkpoints(model: Path, tmp_path: Path) -> None:
     whole = (model / "weights.pt").read_bytes()
     with pytest.raises(UserError, match="corrupt checkpoint"):
-        load_model(broken(model, tmp_path / "a", "weights.pt", whole[: len(whole) // 2]))
+        load_predictor(broken(model, tmp_path / "a", "weights.pt", whole[: len(whole) // 2]))
     with pytest.raises(UserError, match="corrupt checkpoint"):
-        load_model(broken(model, tmp_path / "b", "weights.pt", b"not a model"))
+        load_predictor(broken(model, tmp_path / "b", "weights.pt", b"not a model"))
     with pytest.raises(UserError, match="corrupt model configuration"):
-        load_model(broken(model, tmp_path / "c", "config.json", b"{}"))
+        load_predictor(broken(model, tmp_path / "c", "config.json", b"{}"))
     config = json.loads((model / "config.json").read_text())
-    newer = {**config, "settings": {**config["settings"], "arch": {**config["settings"]["arch"], "heads": 3}}}
-    with pytest.raises(UserError, match="made by another version of this program"):
-        load_model(broken(model, tmp_path / "e", "config.json", json.dumps(newer).encode()))
+    damaged = {**config, "settings": {**config["settings"], "epochs": "many"}}
+    with pytest.raises(UserError, match=r"corrupt model configuration \(settings.epochs: "):
+        load_predictor(broken(model, tmp_path / "e", "config.json", json.dumps(damaged).encode()))
     config["settings"]["arch"]["width"] = 8
     with pytest.raises(UserError, match=r"not those of the network in config\.json"):
-        load_model(broken(model, tmp_path / "d", "config.json", json.dumps(config).encode()))
+        load_predictor(broken(model, tmp_path / "d", "config.json", json.dumps(config).encode()))
     with pytest.raises(UserError, match="no model here"):
-        load_model(tmp_path / "nothing")
+        load_predictor(tmp_path / "nothing")
 
 
 def test_a_folder_with_another_run_is_not_overwritten(clips: list[Clip], split: Split, model: Path) -> None:
@@ -214,7 +214,8 @@ def test_command_line(dataset: Path, tmp_path: Path) -> None:
     assert len(result["sequences"]) == len(checkpoint.read_card(out).split["test"])
     table = run(app, ["eval", str(out), str(dataset), "--against", str(out)])
     assert "unseen sequences" in table.output
-    assert "paired by sequence" in " ".join(table.output.split())
+    shown, paired = " ".join(table.output.split()).split("paired by sequence")
+    assert all(unit in part for unit in ("[mN]", "[mN/mm²]", "[mm]") for part in (shown, paired))
     done = run(app, ["eval", str(out), str(dataset), "--against", str(out), "--json"])
     pairs = json.loads(done.stdout)["against"]["paired"]
     assert pairs["map_rmse"]["difference"]["mean"] == 0
@@ -226,9 +227,10 @@ def test_command_line(dataset: Path, tmp_path: Path) -> None:
     ("extra", "message"),
     [
         (["--folds", "9"], "9 folds"),
-        (["--input", "guessed"], "unknown input 'guessed'"),
+        (["--input", "guessed"], "'input=guessed': input: 'guessed' is not one of 'ideal', 'recovered'"),
         (["--preset", "huge"], "unknown preset 'huge'"),
-        (["--size", "40"], "input size 40 does not divide by 16"),
+        (["--size", "40"], "'size=40': size: Input should be a multiple of 16"),
+        (["--size", "48", "arch.levels=4"], "input size 48 does not divide by 32"),
         (["--target", "intensity"], "needs output 'magnitude'"),
         (["--hold-out", "calf"], "no sequence of family 'calf'"),
     ],
@@ -260,8 +262,8 @@ def test_frames_held_by_the_device_are_the_same_frames(
     clips: list[Clip], output: str, confidence: bool
 ) -> None:
     settings = small(input="mixed", resident="yes")
-    arch = dataclasses.replace(settings.arch, output=output, confidence=confidence)
-    settings = dataclasses.replace(settings, arch=arch)
+    arch = replace(settings.arch, output=output, confidence=confidence)
+    settings = replace(settings, arch=arch)
     streamed, there = Frames(clips, settings), held(clips, settings, torch.device("cpu"))
     assert isinstance(there, Resident)
     items = streamed.order(np.random.default_rng(0), 0.5)

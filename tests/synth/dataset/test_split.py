@@ -109,6 +109,15 @@ def test_a_dataset_of_one_brain_is_split_within_it_only_when_told() -> None:
     assert split.leaks(given)[0].startswith("anatomy mesh-1 is in")
 
 
+def test_groups_are_joined_by_any_key_and_through_others() -> None:
+    anatomies, hashes = "abcadef", "1234562"
+    # a: 0 and 3; the hash 2: 1 and 6; all others alone.
+    assert split.join_groups(anatomies, hashes) == [0, 1, 2, 0, 4, 5, 1]
+    # 5 and 0 by the third key, and so 3.
+    assert split.join_groups(anatomies, hashes, "xyzuvxw") == [0, 1, 2, 0, 4, 0, 1]
+    assert split.find_crossings([0, 1, 0, 1], ["fit", "test", "test", "test"]) == {0: ["fit", "test"]}
+
+
 def test_a_held_out_family_in_training_is_a_leak() -> None:
     found = [{**row, "split": "train"} for row in rows(anatomies=60)]
     assert "family pale is held out and in train" in split.leaks(found, Rule(held_out=("pale",)))

@@ -118,6 +118,6 @@ def test_its_dataset_holds_noisy_labels_beside_the_truth_and_is_read_as_any_othe
     peaks = label.max(axis=(1, 2))
     np.testing.assert_allclose(peaks[loaded], force[loaded], rtol=0.15)
     assert not np.allclose(peaks[loaded], force[loaded], rtol=1e-4)  # the first stage is there as well
-    clip = clips.read(sequence, Grid(32), ("ideal", "recovered"))
+    clip = clips.read_clip(sequence, Grid(32), ("ideal", "recovered"))
     assert np.isfinite(clip.density).all()
     assert clip.density.any()

@@ -1,0 +1,122 @@
+"""One truth of who may be trained on: a dataset that `synth split` has split keeps that split in `learn`."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+
+import phantom
+import pytest
+from typer.testing import CliRunner
+
+from learn.checkpoint import read_card
+from learn.cli import app
+from learn.data.clips import Clip
+from learn.data.split import Split, folds, keep_written, nested
+from synth.dataset import split
+from synth.dataset.index import written_sides
+from synth.dataset.split import Rule
+from synth.errors import UserError
+
+run = CliRunner().invoke
+TINY = ["--preset", "tiny", "--size", "32", "--width", "8", "--epochs", "1", "--json"]
+
+
+@pytest.fixture
+def own(dataset: Path, tmp_path: Path) -> Path:
+    """The phantoms in a folder that may be split."""
+    return Path(shutil.copytree(dataset, tmp_path / "own"))
+
+
+def train(dataset: Path, out: Path, *extra: str) -> dict[str, list[str]]:
+    done = run(app, ["train", str(dataset), "-o", str(out), *TINY, *extra])
+    assert done.exit_code == 0, done.output
+    assert "The dataset's own split: what `synth split` marks test" in " ".join(done.stderr.split())
+    return read_card(out).split
+
+
+def marked(dataset: Path) -> dict[str, set[str]]:
+    sides = written_sides(dataset)
+    assert sides is not None
+    return {side: {key for key, on in sides.items() if on == side} for side in split.SIDES}
+
+
+@pytest.mark.parametrize(
+    "rule", [Rule(shares=(0.5, 0.25, 0.25)), Rule(shares=(0.6, 0.2, 0.2), held_out=("pale",))]
+)
+def test_what_is_marked_is_what_is_fitted_chosen_and_scored(own: Path, tmp_path: Path, rule: Rule) -> None:
+    split.keep(own, rule)
+    on = marked(own)
+    assert all(on.values())
+    used = train(own, tmp_path / "m")
+    assert [set(used[part]) for part in ("fit", "select", "test")] == [on[side] for side in split.SIDES]
+    done = run(app, ["eval", str(tmp_path / "m"), str(own), "--json"])
+    assert done.exit_code == 0, done.output
+    assert len(json.loads(done.stdout)["sequences"]) == len(on["test"])
+
+
+def test_eval_asks_the_held_out_set_of_a_model_that_knew_of_none(own: Path, tmp_path: Path) -> None:
+    done = run(app, ["train", str(own), "-o", str(tmp_path / "m"), "--folds", "3", *TINY])
+    assert done.exit_code == 0, done.output
+    unseen = set(read_card(tmp_path / "m").split["test"])
+    split.keep(own, Rule(shares=(0.25, 0.25, 0.5)))
+    held = unseen & marked(own)["test"]
+    assert 0 < len(held) < len(unseen)
+    done = run(app, ["eval", str(tmp_path / "m"), str(own), "--json"])
+    assert len(json.loads(done.stdout)["sequences"]) == len(held)
+    everything = run(app, ["eval", str(tmp_path / "m"), str(own), "--json", "--all"])
+    assert len(json.loads(everything.stdout)["sequences"]) == 8
+
+
+def test_without_a_validation_side_a_part_of_the_training_side_chooses(own: Path, tmp_path: Path) -> None:
+    split.keep(own, Rule(shares=(0.7, 0.0, 0.3)))
+    on = marked(own)
+    used = train(own, tmp_path / "m")
+    assert set(used["test"]) == on["test"]
+    assert used["select"]
+    assert set(used["fit"]) | set(used["select"]) == on["train"]
+
+
+def test_one_brain_is_split_within_it_where_the_dataset_says_so(tmp_path: Path) -> None:
+    for index in range(5):
+        phantom.write(tmp_path / "own", index, anatomy_seed=1)
+    split.keep(tmp_path / "own", Rule("sequence", (0.6, 0.2, 0.2), share_anatomy=True))
+    used = train(tmp_path / "own", tmp_path / "m")
+    assert {part: len(names) for part, names in used.items()} == {"fit": 3, "select": 1, "test": 1}
+    assert read_card(tmp_path / "m").settings.share_anatomy
+
+
+def test_a_sequence_that_comes_later_has_its_side_too(own: Path) -> None:
+    split.keep(own, Rule())
+    before = marked(own)
+    phantom.write(own, 8, anatomy_seed=9)
+    assert sum(map(len, marked(own).values())) == sum(map(len, before.values())) + 1
+
+
+def test_folds_of_ones_own_do_not_go_with_a_written_split(own: Path, tmp_path: Path) -> None:
+    split.keep(own, Rule())
+    for extra in (["--fold", "1"], ["--folds", "3"], ["--hold-out", "pale"]):
+        done = run(app, ["train", str(own), "-o", str(tmp_path / "m"), *TINY, *extra])
+        assert done.exit_code == 2
+        assert "is split already (split.json, by `synth split`): leave out " in done.stderr
+        assert not (tmp_path / "m").exists()
+
+
+def test_a_written_split_that_leaves_nothing_to_choose_on(clips: Sequence[Clip]) -> None:
+    sides = {c.content_hash: "test" for c in clips[2:]} | {c.content_hash: "train" for c in clips[:2]}
+    with pytest.raises(UserError, match="1 are left of them beside the test"):
+        keep_written(clips, sides, 0)
+
+
+def test_without_a_written_split_the_folds_are_those_they_always_were(
+    dataset: Path, clips: list[Clip]
+) -> None:
+    assert written_sides(dataset) is None
+    assert folds(clips, 3, 0) == [(3, 4, 6), (0, 1, 2), (5, 7)]
+    assert [nested(clips, 3, fold, 0) for fold in range(3)] == [
+        Split((2, 5, 7), (0, 1), (3, 4, 6)),
+        Split((5, 6, 7), (3, 4), (0, 1, 2)),
+        Split((0, 1, 2, 6), (3, 4), (5, 7)),
+    ]
