@@ -164,11 +164,10 @@ def _train(
     quiet: bool,
 ) -> tuple[Card, bool]:
     """Trains with a bar; the best epoch's card, and whether this process is the one that speaks."""
-    from lightning_fabric import Fabric
-
+    from learn.training.threads import make_fabric
     from learn.training.train import train
 
-    fabric = Fabric(accelerator=accelerator, devices=devices, precision=settings.precision)
+    fabric = make_fabric(accelerator=accelerator, devices=devices, precision=settings.precision)
     with _bar("Training") as tell:
         card = train(
             clips,

@@ -16,7 +16,6 @@ from typing import Annotated, Any
 
 import torch
 import typer
-from lightning_fabric import Fabric
 from rich.console import Console
 
 from bench.output.machine import describe
@@ -29,7 +28,7 @@ from learn.data.split import nested
 from learn.evaluation.evaluate import evaluate
 from learn.inference.predict import load_predictor
 from learn.settings import Settings, preset, replace
-from learn.training.threads import set_threads
+from learn.training.threads import make_fabric, set_threads
 from learn.training.train import train
 from synth.errors import UserError
 from synth.job import reader
@@ -96,7 +95,7 @@ def train_and_score(
 ) -> dict[str, Any]:
     """What a training took and what the fold that was kept says of it."""
     split = nested(clips, settings.folds, settings.fold, settings.seed)
-    fabric = Fabric(accelerator=accelerator, devices=1, precision=settings.precision)
+    fabric = make_fabric(accelerator=accelerator, devices=1, precision=settings.precision)
     began = time.perf_counter()
     card = train(clips, split, settings, model, fabric=fabric, log=lambda numbers: say(str(numbers)))
     trained = time.perf_counter() - began

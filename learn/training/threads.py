@@ -1,12 +1,17 @@
-"""How many threads PyTorch takes."""
+"""What a training runs on: threads, and the devices that Fabric puts it on."""
 
 from __future__ import annotations
 
 import os
+import warnings
+from typing import TYPE_CHECKING, Any
 
 import torch
 
 from synth.errors import UserError
+
+if TYPE_CHECKING:
+    from lightning_fabric import Fabric
 
 
 def set_threads(wanted: int | None = None) -> int:
@@ -21,3 +26,12 @@ def set_threads(wanted: int | None = None) -> int:
     count = wanted or min(max(cores // 2, 1), 8)
     torch.set_num_threads(count)
     return count
+
+
+def make_fabric(**settings: Any) -> Fabric:
+    """`Fabric(**settings)`, without its hint that `srun` is there: on a cluster's machines it always is."""
+    from lightning_fabric import Fabric
+
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "The `srun` command is available")
+        return Fabric(**settings)

@@ -27,6 +27,7 @@ from learn.settings import Settings, replace
 from learn.training.batches import Batch, Frames, inputs, measure_scales
 from learn.training.gpu_batches import held
 from learn.training.log import Log
+from learn.training.threads import make_fabric
 from synth.dataset.split import find_crossings
 from synth.errors import UserError
 
@@ -54,7 +55,7 @@ def train(
 
     Returns the card of the best epoch. Raises UserError if `out` holds another run, or on divergence.
     """
-    fabric = fabric or Fabric(accelerator="cpu", devices=1, precision=settings.precision)
+    fabric = fabric or make_fabric(accelerator="cpu", devices=1, precision=settings.precision)
     fabric.launch()
     torch.use_deterministic_algorithms(settings.deterministic)
     fit, select = [clips[i] for i in split.fit], [clips[i] for i in split.select]
