@@ -47,7 +47,7 @@ def marked(dataset: Path) -> dict[str, set[str]]:
     "rule", [Rule(shares=(0.5, 0.25, 0.25)), Rule(shares=(0.6, 0.2, 0.2), held_out=("pale",))]
 )
 def test_what_is_marked_is_what_is_fitted_chosen_and_scored(own: Path, tmp_path: Path, rule: Rule) -> None:
-    split.keep(own, rule)
+    split.keep_rule(own, rule)
     on = marked(own)
     assert all(on.values())
     used = train(own, tmp_path / "m")
@@ -61,7 +61,7 @@ def test_eval_asks_the_held_out_set_of_a_model_that_knew_of_none(own: Path, tmp_
     done = run(app, ["train", str(own), "-o", str(tmp_path / "m"), "--folds", "3", *TINY])
     assert done.exit_code == 0, done.output
     unseen = set(read_card(tmp_path / "m").split["test"])
-    split.keep(own, Rule(shares=(0.25, 0.25, 0.5)))
+    split.keep_rule(own, Rule(shares=(0.25, 0.25, 0.5)))
     held = unseen & marked(own)["test"]
     assert 0 < len(held) < len(unseen)
     done = run(app, ["eval", str(tmp_path / "m"), str(own), "--json"])
@@ -71,7 +71,7 @@ def test_eval_asks_the_held_out_set_of_a_model_that_knew_of_none(own: Path, tmp_
 
 
 def test_without_a_validation_side_a_part_of_the_training_side_chooses(own: Path, tmp_path: Path) -> None:
-    split.keep(own, Rule(shares=(0.7, 0.0, 0.3)))
+    split.keep_rule(own, Rule(shares=(0.7, 0.0, 0.3)))
     on = marked(own)
     used = train(own, tmp_path / "m")
     assert set(used["test"]) == on["test"]
@@ -82,21 +82,21 @@ def test_without_a_validation_side_a_part_of_the_training_side_chooses(own: Path
 def test_one_brain_is_split_within_it_where_the_dataset_says_so(tmp_path: Path) -> None:
     for index in range(5):
         phantom.write(tmp_path / "own", index, anatomy_seed=1)
-    split.keep(tmp_path / "own", Rule("sequence", (0.6, 0.2, 0.2), share_anatomy=True))
+    split.keep_rule(tmp_path / "own", Rule("sequence", (0.6, 0.2, 0.2), share_anatomy=True))
     used = train(tmp_path / "own", tmp_path / "m")
     assert {part: len(names) for part, names in used.items()} == {"fit": 3, "select": 1, "test": 1}
     assert read_card(tmp_path / "m").settings.share_anatomy
 
 
 def test_a_sequence_that_comes_later_has_its_side_too(own: Path) -> None:
-    split.keep(own, Rule())
+    split.keep_rule(own, Rule())
     before = marked(own)
     phantom.write(own, 8, anatomy_seed=9)
     assert sum(map(len, marked(own).values())) == sum(map(len, before.values())) + 1
 
 
 def test_folds_of_ones_own_do_not_go_with_a_written_split(own: Path, tmp_path: Path) -> None:
-    split.keep(own, Rule())
+    split.keep_rule(own, Rule())
     for extra in (["--fold", "1"], ["--folds", "3"], ["--hold-out", "pale"]):
         done = run(app, ["train", str(own), "-o", str(tmp_path / "m"), *TINY, *extra])
         assert done.exit_code == 2
