@@ -73,6 +73,9 @@ def run_job(job: Job, root: Path, options: Options, watcher: Watcher) -> Summary
         KeyboardInterrupt: after the workers are ended; what is sealed stays, the next run goes on.
     """
     workers, memory = options.workers or len(os.sched_getaffinity(0)), options.memory_gb
+    share = slots.share_of_memory(workers) if memory is None else int(memory * 1e9)
+    if options.engine == "local" and options.work == Options.work:  # a stand-in takes what it takes
+        size_forecast.refuse_if_too_long(job, share, workers)
     gpus = slots.gpus(options.gpus, job.render.variant == "cuda_ad_rgb")
     with claim(root, job, mix_versions=options.mix_versions) as folder:
         finished, failures = set(folder.sealed()), folder.failures()
@@ -88,7 +91,7 @@ def run_job(job: Job, root: Path, options: Options, watcher: Watcher) -> Summary
             logs=folder.logs.resolve(),
             scratch=folder.scratch.resolve(),
             work=options.work,
-            memory_bytes=slots.share_of_memory(workers) if memory is None else int(memory * 1e9),
+            memory_bytes=share,
             stall_s=options.stall_s,
             keep_open=(folder.lock_fd,),
             environment={**slots.machine(job, workers), **options.environment},
