@@ -25,7 +25,7 @@ import typer
 from numpy.typing import NDArray
 
 from bench.methods.baselines import GRID
-from bench.output import machine, write
+from bench.output import machine, result_page, write
 from evidence.end_to_end import costs as end_to_end_costs
 from evidence.end_to_end import models, page
 from evidence.end_to_end.models import Answer
@@ -205,7 +205,7 @@ def pareto(
         "rounds": costs.rounds,
     }
     write.keep(out, "pareto.json", found)
-    page.write(found, out)
+    result_page.write(page.drawn(found), out)
     typer.echo(json_.dumps(found) if json else str(out / "index.html"))
 
 

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from bench.output.result_page import markdown
 from evidence.learn.runs import column
-from evidence.learn.table import markdown
 from learn.evaluation.statistics import Interval, interval, paired, pooled_r2, pooled_r2_difference
 from learn.loss import SHARES
 

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from bench.output.plot import Curve, Panel
 
 from bench.output import plot
-from bench.output.plot import Curve, Panel
 from evidence.fem import case, surface
 
 
