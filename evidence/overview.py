@@ -62,10 +62,9 @@ def pareto(
         f"and by more than {100 * defaults_on_front.ALLOWED:.0f}%. Rings mark defaults."
     )
     tables = [result_page.Section("Defaults", rows), _measured(results, PARETO)]
-    pictures = _pictures(results, PARETO, folder)
-    result_page.write(
-        result_page.Page("Error against cost, every room", {}, pictures, tables, (words,)), folder
-    )
+    links = _charts(results, PARETO, folder)
+    page = result_page.Page("Error against cost, every room", {}, (), tables, (words,), links=links)
+    result_page.write(page, folder)
     kept.keep(folder, "fronts.json", rows)
     if json:
         print(json_.dumps(rows))
@@ -97,8 +96,9 @@ def stability(
         _measured(results, STABILITY),
     ]
     folder = out or results / "all" / "stability"
-    pictures = _pictures(results, STABILITY[:-1], folder)
-    result_page.write(result_page.Page("Where it breaks, every room", {}, pictures, sections), folder)
+    links = _charts(results, STABILITY[:-1], folder)
+    page = result_page.Page("Where it breaks, every room", {}, (), sections, links=links)
+    result_page.write(page, folder)
     held = {
         "render cases": len(cases),
         "render cases that held": sum(bool(case["passed"]) for case in cases),
@@ -107,12 +107,9 @@ def stability(
     print(json_.dumps(held) if json else folder / "index.html")
 
 
-def _pictures(results: Path, files: Sequence[str], folder: Path) -> dict[str, None]:
+def _charts(results: Path, files: Sequence[str], folder: Path) -> list[str]:
     """The rooms' own charts, as seen from `folder`."""
-    return {
-        Path(os.path.relpath((results / file).with_name("chart.svg"), folder)).as_posix(): None
-        for file in files
-    }
+    return [os.path.relpath((results / file).with_name("chart.svg"), folder) for file in files]
 
 
 def _measured(results: Path, files: Sequence[str]) -> result_page.Section:

@@ -58,7 +58,7 @@ def stages(found: Tree) -> Page:
     return Page(
         "The whole way, by stage",
         found,
-        {"chart.svg": charts.intervals([chart])},
+        [chart],
         [Section("In all", flat(found))],
         command="bench experiment stages runs/demo/data -o docs/results/pipeline/stages",
         name=_BESIDE,
@@ -68,8 +68,8 @@ def stages(found: Tree) -> Page:
 def live(found: Tree) -> Page:
     """Latency of a live stream."""
     shown = bars({k: found[k] for k in ("p50_ms", "p95_ms", "p99_ms", "mask_ms") if k in found})
-    picture = charts.intervals([Chart("Latency", "ms", shown)])
-    return Page("Flow on a live stream", found, {"chart.svg": picture}, [Section("All", flat(found))])
+    chart = Chart("Latency", "ms", shown)
+    return Page("Flow on a live stream", found, [chart], [Section("All", flat(found))])
 
 
 def cycles(found: Tree) -> Page:
@@ -82,7 +82,7 @@ def cycles(found: Tree) -> Page:
     unit = "CPU time a picture [s]"
     panel = charts.Panel("The same scene in both", unit, "noise / mean", tuple(curves), True, True)
     command = "bench experiment cycles --python PY --spp 2 --spp 4 --spp 16"
-    return _curves("Against Cycles", [panel], found, [Section("Pictures", found["rows"])], command)
+    return Page("Against Cycles", found, [panel], [Section("Pictures", found["rows"])], command=command)
 
 
 def realism(found: Tree) -> Page:
@@ -97,7 +97,7 @@ def realism(found: Tree) -> Page:
     return Page(
         "Against a photograph",
         found,
-        {"chart.svg": charts.intervals([Chart(title, unit, tuple(shown))])},
+        [Chart(title, unit, tuple(shown))],
         [Section("Statistics", found["statistics"])],
         command="bench experiment realism PHOTO",
     )
@@ -115,7 +115,9 @@ def render_cost(folder: Path) -> Page:
     panel = charts.Panel("Memory of one process", "frames or scenes so far", "MB", tuple(curves), log_x=True)
     tables = [Section(name, flat(one)) for name, one in found.items()]
     command = "bench experiment render cost first truth bytes frames scenes"
-    return _curves("Rendering: cost, truth, memory", [panel], {"machine": _machine(found)}, tables, command)
+    return Page(
+        "Rendering: cost, truth, memory", {"machine": _machine(found)}, [panel], tables, command=command
+    )
 
 
 def engine(folder: Path) -> Page:
@@ -126,7 +128,7 @@ def engine(folder: Path) -> Page:
     return Page(
         "Engine: every trial's figures",
         {"machine": _machine(found)},
-        {"chart.svg": charts.intervals([chart])},
+        [chart],
         [Section(name, flat(one)) for name, one in found.items()],
         command="; ".join(_ENGINE_COMMANDS),
         name=_BESIDE,
@@ -148,9 +150,8 @@ def learning(folder: Path) -> Page:
         unit = "mean over tested sequences, BCa interval; in brackets: runs"
         shown.append(Chart(words, unit, tuple(rows)))
     command = " ".join(["bench experiment learn --cache CACHE", *_LEARNING.get(folder.name, ())])
-    picture = {"chart.svg": charts.intervals(shown)}
     tables = [Section("All figures", list(table.values()))]
-    return Page(f"Learning: {folder.name}", {}, picture, tables, command=command)
+    return Page(f"Learning: {folder.name}", {}, shown, tables, command=command)
 
 
 def learn_pareto(folder: Path) -> Page:
@@ -175,11 +176,7 @@ def surface(folder: Path) -> Page:
         panels.append(charts.Panel(words, "tetrahedra", "%", tuple(curves)))
     tables = [Section(name, one["rows"]) for name, one in found.items()]
     commands = "; ".join(one["command"] for one in found.values())
-    return _curves("Real surfaces", panels, {"machine": _machine(found)}, tables, commands)
-
-
-def _curves(title: str, panels: list[charts.Panel], found: Tree, tables: list[Section], command: str) -> Page:
-    return Page(title, found, {"chart.svg": charts.curves(panels)}, tables, command=command)
+    return Page("Real surfaces", {"machine": _machine(found)}, panels, tables, command=commands)
 
 
 def flat(tree: Mapping[str, Any]) -> list[dict[str, Any]]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import html
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +13,10 @@ import jinja2
 from markupsafe import Markup
 
 from bench.output import write as results
+from bench.output.charts import Chart, Panel, curves, intervals
 
 Rows = Sequence[Mapping[str, Any]]
+_NAMES = ("chart.svg", "intervals.svg")
 
 
 @dataclass(frozen=True)
@@ -28,8 +30,9 @@ class Section:
 
     @property
     def columns(self) -> list[str]:
-        """Keys of all rows."""
-        return list(dict.fromkeys(name for row in self.rows for name in row))
+        """Keys of all rows, but for those of trees, which are no cells."""
+        names = dict.fromkeys(name for row in self.rows for name in row)
+        return [name for name in names if not any(isinstance(row.get(name), Mapping) for row in self.rows)]
 
 
 @dataclass(frozen=True)
@@ -39,15 +42,17 @@ class Page:
     title: str
     found: Mapping[str, Any]
     """The data: its command, machine and seed are said if they are in it."""
-    pictures: Mapping[str, str | None]
-    """SVG by file; None: a file that another page has made."""
+    charts: Sequence[Chart | Panel] = ()
+    """Intervals and curves, a picture each kind."""
     sections: Sequence[Section] = ()
     words: Sequence[str] = ()
     """Said before all else; may hold `code` and *emphasis*."""
     command: str = ""
     """Where the data don't name it; several are parted by "; "."""
-    name: str = field(default="index.html")
+    name: str = "index.html"
     """Of the page's file; an ending `.md` makes it Markdown."""
+    links: Sequence[str] = ()
+    """Pictures that other pages have made."""
 
     @property
     def commands(self) -> list[str]:
@@ -61,9 +66,14 @@ class Page:
         seed = f"Seed {self.found['seed']}." if "seed" in self.found else ""
         return f"{f'Machine: {machine}.' if machine else ''} {seed}".strip()
 
-    def text(self, name: str) -> str:
+    @property
+    def pictures(self) -> list[str]:
+        """Files that the page shows."""
+        return [*_NAMES[: len({type(one) for one in self.charts})], *self.links]
+
+    def text(self) -> str:
         """The page as HTML or as Markdown, whichever the name of its file says."""
-        kind = name.rpartition(".")[2]
+        kind = self.name.rpartition(".")[2]
         environment = jinja2.Environment(
             loader=jinja2.PackageLoader("bench.output", "."),
             autoescape=kind == "html",
@@ -76,7 +86,13 @@ class Page:
 
     def files(self) -> dict[str, str]:
         """Text of the page and of its own pictures, by name."""
-        return {self.name: self.text(self.name)} | {k: v for k, v in self.pictures.items() if v is not None}
+        return {self.name: self.text()} | self._drawn()
+
+    def _drawn(self) -> dict[str, str]:
+        panels = [one for one in self.charts if isinstance(one, Panel)]
+        rows = [one for one in self.charts if isinstance(one, Chart)]
+        drawn = ([curves(panels)] if panels else []) + ([intervals(rows)] if rows else [])
+        return dict(zip(_NAMES, drawn, strict=False))
 
 
 def markdown(rows: Rows) -> str:
@@ -88,19 +104,22 @@ def markdown(rows: Rows) -> str:
 
 def write(page: Page, folder: Path) -> list[str]:
     """Writes its files into `folder`; gives back the names of those that changed."""
-    changed = stale(page, folder)
-    for name in changed:
-        results.keep(folder, name, page.files()[name])
-    return changed
+    changed = _changed(page, folder)
+    for name, text in changed.items():
+        results.keep(folder, name, text)
+    return list(changed)
 
 
 def stale(page: Page, folder: Path) -> list[str]:
     """Names of the files in `folder` that are not what the page says."""
-    return [name for name, text in page.files().items() if not _same(folder / name, text)]
+    return list(_changed(page, folder))
 
 
-def _same(file: Path, text: str) -> bool:
-    return file.is_file() and file.read_text("utf-8") == text
+def _changed(page: Page, folder: Path) -> dict[str, str]:
+    def same(name: str, text: str) -> bool:
+        return (folder / name).is_file() and (folder / name).read_text("utf-8") == text
+
+    return {name: text for name, text in page.files().items() if not same(name, text)}
 
 
 def _cell(value: Any) -> str:

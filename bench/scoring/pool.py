@@ -141,7 +141,7 @@ def drawn(tree: Mapping[str, Any], name: str = "index.html") -> result_page.Page
     return result_page.Page(
         f"{count}, {tree['specimens']} specimens, {tree['frames']} frames",
         tree,
-        {"chart.svg": charts.intervals([chart])},
+        [chart],
         (
             result_page.Section("", rows),
             result_page.Section(f"By recording, {tree['main']}", [_line(row) for row in tree["each"]]),

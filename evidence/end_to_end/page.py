@@ -23,10 +23,7 @@ def drawn(found: Mapping[str, Any]) -> result_page.Page:
     return result_page.Page(
         "End to end: error of the force against cost, whole pipelines",
         found,
-        {
-            "chart.svg": charts.curves(panels(found)),
-            "differences.svg": charts.intervals(differences(found)),
-        },
+        [*panels(found), *differences(found)],
         (
             result_page.Section("", words=[f"- {line}" for line in verdicts(found)]),
             result_page.Section("Pipelines", [_line(row) for row in rows], (_MEAN,)),

@@ -141,19 +141,8 @@ def law_table(on: fem_case.Patch) -> list[dict[str, Any]]:
 
 def drawn(found: Mapping[str, Any]) -> result_page.Page:
     """What the data say."""
-    return result_page.Page(
-        "Physics: error against cost",
-        found,
-        {"chart.svg": charts.curves(panels(found))},
-        [
-            result_page.Section(heading, found[name])
-            for name, heading in (
-                ("rows", "Discretisation"),
-                ("gestures", "Gestures"),
-                ("sequence", "A whole sequence"),
-            )
-        ],
-    )
+    tables = [result_page.Section(name, found[name]) for name in ("rows", "gestures", "sequence")]
+    return result_page.Page("Physics: error against cost", found, panels(found), tables)
 
 
 def panels(found: Mapping[str, Any]) -> list[charts.Panel]:

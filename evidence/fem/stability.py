@@ -293,12 +293,8 @@ def _added(parts: list[Row]) -> Row:
 
 def drawn(found: Mapping[str, Any]) -> result_page.Page:
     """What the data say."""
-    return result_page.Page(
-        "Physics: where it breaks",
-        found,
-        {"chart.svg": charts.curves(panels(found))},
-        [result_page.Section("All runs", found["rows"])],
-    )
+    tables = [result_page.Section("All runs", found["rows"])]
+    return result_page.Page("Physics: where it breaks", found, panels(found), tables)
 
 
 def panels(found: Mapping[str, Any]) -> list[charts.Panel]:

@@ -133,7 +133,7 @@ def drawn(record: Mapping[str, Any]) -> result_page.Page:
     return result_page.Page(
         "Flow: asked against measured",
         record,
-        {"chart.svg": charts.intervals(shown)} if shown else {},
+        shown,
         [
             result_page.Section(name, [_cells(row) for row in part["rows"]], (f"`{part['command']}`",))
             for name, part in parts.items()

@@ -62,16 +62,8 @@ def pareto(
 
 def drawn(found: Mapping[str, Any]) -> result_page.Page:
     """What the data say."""
-    return result_page.Page(
-        "Flow: error against time",
-        found,
-        {"chart.svg": charts.curves(panels(found))},
-        [
-            result_page.Section(
-                "All settings", [{k: v for k, v in row.items() if k != "settings"} for row in found["rows"]]
-            )
-        ],
-    )
+    tables = [result_page.Section("All settings", found["rows"])]
+    return result_page.Page("Flow: error against time", found, panels(found), tables)
 
 
 def panels(found: Mapping[str, Any]) -> list[charts.Panel]:

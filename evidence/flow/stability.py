@@ -221,12 +221,8 @@ def _extremes(estimator: Estimator) -> dict[str, bool]:
 
 def drawn(found: Mapping[str, Any]) -> result_page.Page:
     """What the data say."""
-    return result_page.Page(
-        "Flow: where it breaks",
-        found,
-        {"chart.svg": charts.curves(panels(found))},
-        [result_page.Section("All points", found["points"])],
-    )
+    tables = [result_page.Section("All points", found["points"])]
+    return result_page.Page("Flow: where it breaks", found, panels(found), tables)
 
 
 def panels(found: Mapping[str, Any]) -> list[charts.Panel]:

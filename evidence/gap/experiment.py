@@ -219,7 +219,7 @@ def drawn(tree: Mapping[str, Any]) -> result_page.Page:
     return result_page.Page(
         "The sim-to-real gap",
         tree,
-        {"chart.svg": charts.intervals([charts.Chart(title, _UNITS[KEYS[0]], tuple(bars))])},
+        [charts.Chart(title, _UNITS[KEYS[0]], tuple(bars))],
         sections,
         (
             "Does training on the flow recovered from rendered frames close the gap that training on ideal "

@@ -71,11 +71,7 @@ def drawn(tree: Mapping[str, Any]) -> result_page.Page:
     return result_page.Page(
         "What leakage does to a score",
         tree,
-        {
-            "chart.svg": charts.intervals(
-                [charts.Chart(title, "mean error of the total force [mN]", tuple(bars))]
-            )
-        },
+        [charts.Chart(title, "mean error of the total force [mN]", tuple(bars))],
         (result_page.Section("", rows),),
         (
             "Total force from recovered flow, E known, by methods fitted on the other folds: once with "

@@ -246,8 +246,7 @@ def drawn(out: Path, known: Known) -> result_page.Page:
         panels += chart(rows, device)
         sections.append(result_page.Section(device, _lines(rows)))
     title = "Learn: time a frame, and error where it was trained"
-    pictures = {"chart.svg": charts.curves(panels)} if panels else {}
-    return result_page.Page(title, found[0], pictures, sections, _WORDS, name="README.md")
+    return result_page.Page(title, found[0], panels, sections, _WORDS, name="README.md")
 
 
 def with_errors(rows: list[dict[str, Any]], known: Known) -> list[dict[str, Any]]:

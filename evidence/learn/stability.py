@@ -102,7 +102,7 @@ def drawn(out: Path) -> result_page.Page:
     return result_page.Page(
         "Learn: where it breaks",
         next(iter(found.values())),
-        {"chart.svg": charts.intervals(shown)} if shown else {},
+        shown,
         [result_page.Section(_TITLES[name], one["rows"]) for name, one in found.items()],
         (_HOW,),
         "bench stability learn --cache CACHE",

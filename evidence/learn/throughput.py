@@ -96,7 +96,7 @@ def drawn(out: Path) -> result_page.Page:
     return result_page.Page(
         "Learn: what a training step spends where",
         found[0],
-        {"chart.svg": charts.intervals(shown)},
+        shown,
         [result_page.Section(chart.title, one["rows"]) for chart, one in zip(shown, found, strict=True)],
         (_HOW,),
         "bench experiment loading",

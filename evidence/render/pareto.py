@@ -112,12 +112,8 @@ def measure(ours: Case, spp: int, sampler: str, kind: str) -> dict[str, float]:
 
 def drawn(found: Mapping[str, Any]) -> result_page.Page:
     """What the data say."""
-    return result_page.Page(
-        "Rendering: flow error and noise against time",
-        found,
-        {"chart.svg": charts.curves(panels(found))},
-        [result_page.Section("All settings", found["rows"])],
-    )
+    tables = [result_page.Section("All settings", found["rows"])]
+    return result_page.Page("Rendering: flow error and noise against time", found, panels(found), tables)
 
 
 def panels(found: Mapping[str, Any]) -> list[charts.Panel]:

@@ -75,7 +75,7 @@ def stability(
 def drawn(found: Mapping[str, Any]) -> result_page.Page:
     """What the data say."""
     title = "Rendering: a correct frame or a clear error"
-    return result_page.Page(title, found, {}, [result_page.Section("Cases", found["cases"])])
+    return result_page.Page(title, found, (), [result_page.Section("Cases", found["cases"])])
 
 
 def checked(ours: Case, **changes: Any) -> dict[str, Any]:

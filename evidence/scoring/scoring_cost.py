@@ -120,7 +120,7 @@ def drawn(tree: Mapping[str, Any]) -> result_page.Page:
     return result_page.Page(
         "What scoring costs",
         tree,
-        {"chart.svg": charts.intervals([charts.Chart(title, unit, bars)])},
+        [charts.Chart(title, unit, bars)],
         (result_page.Section("", rows),),
         (
             f"A recording of {tree['seconds']:g} s, {width} x {height} at {tree['fps']:g} a second, no "

@@ -124,7 +124,7 @@ def drawn(out: Path) -> result_page.Page:
     return result_page.Page(
         "Tuning: what each knob does to the force, and what it costs",
         rows[0] | {"command": "; ".join(dict.fromkeys(row["command"] for row in rows))},
-        {"chart.svg": charts.curves(panels(rows))},
+        panels(rows),
         sections,
         (_HOW, _WHAT),
         name="README.md",

@@ -16,15 +16,8 @@ _STYLE: Any = {
     "svg.fonttype": "none",
     "text.parse_math": False,
     "font.sans-serif": ["DejaVu Sans"],
-    "font.size": 10,
     "axes.titlesize": 11,
     "axes.titlelocation": "left",
-    "axes.titlepad": 8,
-    "axes.labelsize": 10,
-    "text.color": "#22262b",
-    "axes.labelcolor": "#22262b",
-    "xtick.labelcolor": "#22262b",
-    "ytick.labelcolor": "#22262b",
     # Gridlines stand for ticks: one line less a tick in the file.
     "axes.grid": True,
     "axes.axisbelow": True,
@@ -32,14 +25,13 @@ _STYLE: Any = {
     "axes.edgecolor": "#c9ced6",
     "axes.spines.top": False,
     "axes.spines.right": False,
-    **{f"{axis}tick.{side}": False for axis, side in (("x", "bottom"), ("y", "left"))},
+    "xtick.bottom": False,
+    "ytick.left": False,
     "figure.constrained_layout.w_pad": 0.1,
     "figure.constrained_layout.h_pad": 0.1,
-    "lines.linewidth": 1.6,
     "lines.markersize": 5,
     "legend.frameon": False,
     "legend.fontsize": 9,
-    "legend.handlelength": 1.2,
 }
 _LONG = re.compile(r"\d+\.\d{3,}")
 _NO_METADATA = dict.fromkeys(("Creator", "Date", "Format", "Type"))
