@@ -112,7 +112,9 @@ def render_cost(folder: Path) -> Page:
             memory, count = found[name]["every_tenth_mb"], found[name]["count"]
             so_far = tuple(float(k + 1) * count / len(memory) for k in range(len(memory)))
             curves.append(charts.Curve(words, so_far, tuple(memory)))
-    panel = charts.Panel("Memory of one process", "frames or scenes so far", "MB", tuple(curves), log_x=True)
+    panel = charts.Panel(
+        "Memory of one process", "frames or scenes so far", "memory [MB]", tuple(curves), log_x=True
+    )
     tables = [Section(name, flat(one)) for name, one in found.items()]
     command = "bench experiment render cost first truth bytes frames scenes"
     return Page(

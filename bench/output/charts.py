@@ -179,9 +179,11 @@ def _scale(axis: Any, log: bool) -> None:
     from matplotlib import ticker
 
     if not log:
-        low, high = axis.get_data_interval()
         if axis.axis_name == "y":
-            axis.axes.set_ylim(min(low, 0.0) * 1.08, max(high, 0.0) * 1.08 or 1.0)
+            low, high = axis.get_data_interval()
+            low, high = min(low, 0.0), max(high, 0.0)
+            pad = 0.05 * (high - low) or 1.0
+            axis.axes.set_ylim(low - pad, high + pad)
         axis.set_major_locator(ticker.MaxNLocator(6, steps=[1, 2, 5, 10]))
         return
     getattr(axis.axes, f"set_{axis.axis_name}scale")("log")

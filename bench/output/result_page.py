@@ -57,7 +57,8 @@ class Page:
     @property
     def commands(self) -> list[str]:
         """What was typed."""
-        return (self.command or str(self.found.get("command", ""))).split("; ")
+        said = self.command or str(self.found.get("command", ""))
+        return said.split("; ") if said else []
 
     @property
     def made(self) -> str:

@@ -304,7 +304,7 @@ def panels(found: Mapping[str, Any]) -> list[charts.Panel]:
         "load": "P = F/(E a2)",
         "poisson": "Poisson's ratio",
         "size": "tetrahedra",
-        "sliver": "height left",
+        "sliver": "height left [share]",
         "ramp": "steps to the peak",
         "dt": "time step [s]",
     }

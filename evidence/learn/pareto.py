@@ -296,7 +296,11 @@ def chart(rows: list[dict[str, Any]], device: str) -> list[charts.Panel]:
             title = f"Learn: networks on {size}² beside the preset {name} (on {device})"
             panels.append(
                 charts.Panel(
-                    title, "p50 [ms]", "map RMSE, more than the preset's [%]", tuple(curves), front=True
+                    title,
+                    "median time a frame [ms]",
+                    "map RMSE, more than the preset's [%]",
+                    tuple(curves),
+                    front=True,
                 )
             )
     return panels
