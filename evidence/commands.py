@@ -146,8 +146,8 @@ def pages(
     ] = False,
     json: Json = False,
 ) -> None:
-    """Draws picture and page of every experiment anew from its data, where its own command doesn't."""
-    from evidence import catalogue as drawn
+    """Draws picture and page of every experiment anew from its data."""
+    from evidence import pages as drawn
 
     if not results.is_dir():
         raise UserError(f"{results}: no such folder")

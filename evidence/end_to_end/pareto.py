@@ -20,7 +20,7 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from bench.output import machine, write
+from bench.output import machine, result_page, write
 from evidence.end_to_end import costs as end_to_end_costs
 from evidence.end_to_end import page
 from evidence.end_to_end.costs import Costs
@@ -95,7 +95,7 @@ def pareto(
         "rounds": costs.rounds,
     }
     write.keep(out, "pareto.json", found)
-    page.write(found, out)
+    result_page.write(page.drawn(found), out)
     typer.echo(json_.dumps(found) if json else str(out / "index.html"))
 
 

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json as json_
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 import typer
 
-from bench.output import machine, plot, write
+from bench.output import charts, machine, result_page, write
 from evidence.fem import case as fem_case
 from evidence.fem import cost as fem_cost
 from synth.fem.equilibrium import InvertedElement, NoEquilibrium
@@ -52,8 +53,7 @@ def pareto(
     }
     if out is not None:
         write.keep(out, "pareto.json", found)
-        everything = [*rows, *gestures, *whole]
-        plot.write(panels(found), out, "Physics: error against cost", everything, found)
+        result_page.write(drawn(found), out)
     if json:
         print(json_.dumps(found))
         return
@@ -139,12 +139,18 @@ def law_table(on: fem_case.Patch) -> list[dict[str, Any]]:
     return rows
 
 
-def panels(found: dict[str, Any]) -> list[plot.Panel]:
+def drawn(found: Mapping[str, Any]) -> result_page.Page:
+    """What the data say."""
+    tables = [result_page.Section(name, found[name]) for name in ("rows", "gestures", "sequence")]
+    return result_page.Page("Physics: error against cost", found, panels(found), tables)
+
+
+def panels(found: Mapping[str, Any]) -> list[charts.Panel]:
     """Charts of `pareto.json`: the mesh and law's error against cost, and each law's over the load."""
     rows, laws = found["rows"], found["laws"]
     groups = sorted({(r["law"], r["order"]) for r in rows})
     cost = tuple(
-        plot.Curve(
+        charts.Curve(
             f"{law} P{order}",
             tuple(r["ms_a_frame"] for r in mine),
             tuple(100 * r["error"] for r in mine),
@@ -155,7 +161,7 @@ def panels(found: dict[str, Any]) -> list[plot.Panel]:
         if (mine := [r for r in rows if (r["law"], r["order"]) == (law, order)])
     )
     worth = tuple(
-        plot.Curve(
+        charts.Curve(
             law,
             tuple(load for load, _ in worst),
             tuple(100 * error for _, error in worst),
@@ -164,10 +170,10 @@ def panels(found: dict[str, Any]) -> list[plot.Panel]:
         if (worst := _worst(laws, law))
     )
     return [
-        plot.Panel(
+        charts.Panel(
             "Physics: error against cost", "CPU ms a frame", "error [%]", cost, True, True, front=True
         ),
-        plot.Panel("Physics: laws against neo-Hookean", "P = F/(E a2)", "error [%]", worth, True, True),
+        charts.Panel("Physics: laws against neo-Hookean", "P = F/(E a2)", "error [%]", worth, True, True),
     ]
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json as json_
 import multiprocessing
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -15,7 +15,7 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
-from bench.output import machine, plot, write
+from bench.output import charts, machine, result_page, write
 from evidence.fem import case as fem_case
 from synth.errors import UserError
 from synth.fem import equilibrium, motion, solver, surface_embedding, tool
@@ -65,7 +65,7 @@ def stability(
     }
     if out is not None:
         write.keep(out, "stability.json", found)
-        plot.write(panels(found), out, "Physics: where it breaks", rows, found)
+        result_page.write(drawn(found), out)
     if json:
         print(json_.dumps(found))
         return
@@ -291,14 +291,20 @@ def _added(parts: list[Row]) -> Row:
     return whole
 
 
-def panels(found: dict[str, Any]) -> list[plot.Panel]:
+def drawn(found: Mapping[str, Any]) -> result_page.Page:
+    """What the data say."""
+    tables = [result_page.Section("All runs", found["rows"])]
+    return result_page.Page("Physics: where it breaks", found, panels(found), tables)
+
+
+def panels(found: Mapping[str, Any]) -> list[charts.Panel]:
     """Charts of `stability.json`: error over each thing that is made worse."""
     rows: list[Row] = found["rows"]
     axes = {
         "load": "P = F/(E a2)",
         "poisson": "Poisson's ratio",
         "size": "tetrahedra",
-        "sliver": "height left",
+        "sliver": "height left [share]",
         "ramp": "steps to the peak",
         "dt": "time step [s]",
     }
@@ -307,12 +313,12 @@ def panels(found: dict[str, Any]) -> list[plot.Panel]:
         ours = [r for r in rows if r["sweep"] == sweep and r["error"] is not None and np.isfinite(r["error"])]
         ours = [r for r in ours if r["way"] != "aside" and (sweep != "load" or r["way"] == "push")]
         curves = tuple(
-            plot.Curve(
+            charts.Curve(
                 law,
                 tuple(r["value"] for r in ours if r["law"] == law),
                 tuple(max(100 * r["error"], 1e-3) for r in ours if r["law"] == law),
             )
             for law in dict.fromkeys(r["law"] for r in ours)
         )
-        made.append(plot.Panel(sweep, axis, "error [%]", curves, sweep != "poisson", True))
+        made.append(charts.Panel(f"Physics: {sweep}", axis, "error [%]", curves, sweep != "poisson", True))
     return made

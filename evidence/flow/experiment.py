@@ -6,7 +6,7 @@ import json as json_
 import platform
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
 from itertools import chain
 from pathlib import Path
@@ -17,7 +17,7 @@ import numpy as np
 import torch
 import typer
 
-from bench.output import machine, write
+from bench.output import charts, machine, result_page, write
 from evidence.flow import rendered
 from evidence.flow.chain import ChainTracker
 from evidence.flow.measure import Error, MeanInpainting, against, average, epe, measure
@@ -102,7 +102,7 @@ def experiment(
         command = f"bench experiment flow --only {part} --count {count} --frames {frames} --seed {seed}"
         record[part] = {"command": command, "rows": rows}
         write.keep(out, "results.json", record)
-        write.keep(out, "results.md", _table(record))
+        result_page.write(drawn(record), out)
         if not json:
             for row in rows:
                 typer.echo(_line(row))
@@ -116,23 +116,41 @@ def _line(row: dict[str, object]) -> str:
     return f"{row['what']:<52} {row['on']:<26} {row['measured']:>8.3f} {row['unit']:<6} {asked:<9} {verdict}"
 
 
-def _table(record: dict[str, Any]) -> str:
-    """Every row measured so far, as Markdown."""
-    lines = ["# Flow: asked against measured", ""]
-    for part in (part for part in record if part != "machine"):
-        lines += [
-            f"`{record[part]['command']}`",
-            "",
-            "| what | on | asked | measured | |",
-            "| --- " * 5 + "|",
-        ]
-        for row in record[part]["rows"]:
-            asked = "" if row["asked"] is None else f"{'≥' if row['at_least'] else '≤'} {row['asked']:g}"
-            verdict = {None: "", True: "reached", False: "**not reached**"}[row["reached"]]
-            figure = f"{row['measured']:.3f} {row['unit']}"
-            lines.append(f"| {row['what']} | {row['on']} | {asked} | {figure} | {verdict} |")
-        lines.append("")
-    return "\n".join(lines)
+def drawn(record: Mapping[str, Any]) -> result_page.Page:
+    """What `results.json` says: every figure asked, as a part of what was allowed, and every row."""
+    parts = {name: part for name, part in record.items() if "rows" in part}
+    asked = [row for part in parts.values() for row in part["rows"] if row["asked"]]
+    shown = []
+    for on in dict.fromkeys(row["on"] for row in asked):
+        shares = {
+            row["what"]: (
+                row["asked"] / row["measured"] if row["at_least"] else row["measured"] / row["asked"]
+            )
+            for row in asked
+            if row["on"] == on
+        }
+        shown.append(charts.Chart(f"{on}: reached where at most 1", "measured / asked", charts.bars(shares)))
+    return result_page.Page(
+        "Flow: asked against measured",
+        record,
+        shown,
+        [
+            result_page.Section(name, [_cells(row) for row in part["rows"]], (f"`{part['command']}`",))
+            for name, part in parts.items()
+        ],
+        command="; ".join(part["command"] for part in parts.values()),
+        name="results.md",
+    )
+
+
+def _cells(row: Mapping[str, Any]) -> dict[str, str]:
+    return {
+        "what": row["what"],
+        "on": row["on"],
+        "asked": "" if row["asked"] is None else f"{'≥' if row['at_least'] else '≤'} {row['asked']:g}",
+        "measured": f"{row['measured']:.3f} {row['unit']}",
+        "verdict": {None: "", True: "reached", False: "not reached"}[row["reached"]],
+    }
 
 
 def automatic(picture: Rgb, _: Flags) -> Flags:

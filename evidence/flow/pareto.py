@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json as json_
+from collections.abc import Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -11,7 +12,7 @@ import cv2
 import torch
 import typer
 
-from bench.output import machine, plot, write
+from bench.output import charts, machine, result_page, write
 from evidence.flow.measure import measure
 from evidence.flow.scenes import Recipe, pairs
 from synth.flow.estimator import Estimator
@@ -54,13 +55,18 @@ def pareto(
         "rows": rows,
     }
     write.keep(out, "pareto.json", record)
-    shown = [{key: value for key, value in row.items() if key != "settings"} for row in rows]
-    plot.write(panels(record), out, "Flow: error against time", shown, record)
+    result_page.write(drawn(record), out)
     if json:
         typer.echo(json_.dumps(record))
 
 
-def panels(found: dict[str, Any]) -> list[plot.Panel]:
+def drawn(found: Mapping[str, Any]) -> result_page.Page:
+    """What the data say."""
+    tables = [result_page.Section("All settings", found["rows"])]
+    return result_page.Page("Flow: error against time", found, panels(found), tables)
+
+
+def panels(found: Mapping[str, Any]) -> list[charts.Panel]:
     """Charts of `pareto.json`: endpoint and divergence error against time."""
     rows, made = found["rows"], []
     for title, key in (("endpoint error", "mean"), ("divergence error (relative RMS)", "divergence")):
@@ -68,7 +74,7 @@ def panels(found: dict[str, Any]) -> list[plot.Panel]:
         for family in dict.fromkeys(str(row["family"]) for row in rows):
             own = [row for row in rows if row["family"] == family]
             curves.append(
-                plot.Curve(
+                charts.Curve(
                     family,
                     tuple(1e3 * float(row["cpu_s"]) for row in own),
                     tuple(float(row[key]) for row in own),
@@ -78,7 +84,7 @@ def panels(found: dict[str, Any]) -> list[plot.Panel]:
             )
         unit = "EPE mean [px]" if key == "mean" else "relative RMS"
         made.append(
-            plot.Panel(f"Flow: {title}", "CPU time [ms]", unit, tuple(curves), True, True, front=True)
+            charts.Panel(f"Flow: {title}", "CPU time [ms]", unit, tuple(curves), True, True, front=True)
         )
     return made
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json as json_
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -13,7 +13,7 @@ import numpy as np
 import torch
 import typer
 
-from bench.output import machine, plot, write
+from bench.output import charts, machine, result_page, write
 from evidence.flow.measure import epe
 from evidence.flow.scenes import CLEAN, Flags, Floats, Pair, Recipe, pairs
 from synth.flow import confidence
@@ -85,7 +85,7 @@ def stability(
         "points": [asdict(point) for point in points],
     }
     write.keep(out, "stability.json", record)
-    plot.write(panels(record), out, "Flow: where it breaks", found=record)
+    result_page.write(drawn(record), out)
     typer.echo(json_.dumps(record if json else {k: record[k] for k in list(record)[2:5]}))
 
 
@@ -219,7 +219,13 @@ def _extremes(estimator: Estimator) -> dict[str, bool]:
     return result
 
 
-def panels(found: dict[str, Any]) -> list[plot.Panel]:
+def drawn(found: Mapping[str, Any]) -> result_page.Page:
+    """What the data say."""
+    tables = [result_page.Section("All points", found["points"])]
+    return result_page.Page("Flow: where it breaks", found, panels(found), tables)
+
+
+def panels(found: Mapping[str, Any]) -> list[charts.Panel]:
     """Charts of `stability.json`: error over each trouble."""
     points, made = [Point(**point) for point in found["points"]], []
     for trouble in dict.fromkeys(point.trouble for point in points):
@@ -228,7 +234,7 @@ def panels(found: dict[str, Any]) -> list[plot.Panel]:
             own = [p for p in points if p.trouble == trouble and p.estimator == name]
             if len(own) > 1:
                 y = tuple(max(p.epe, 1e-3) for p in own)
-                curves.append(plot.Curve(name, tuple(p.value for p in own), y))
+                curves.append(charts.Curve(name, tuple(p.value for p in own), y))
         if curves:
-            made.append(plot.Panel(trouble, trouble, "EPE mean [px]", tuple(curves), log_y=True))
+            made.append(charts.Panel(f"Flow: {trouble}", trouble, "EPE mean [px]", tuple(curves), log_y=True))
     return made

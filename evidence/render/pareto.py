@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json as json_
 import time
+from collections.abc import Mapping
 from inspect import signature
 from itertools import product
 from pathlib import Path
@@ -13,7 +14,7 @@ import cv2
 import numpy as np
 import typer
 
-from bench.output import machine, plot, write
+from bench.output import charts, machine, result_page, write
 from evidence.render.case import Case, case
 from synth.job.schema import Job, Render
 from synth.render import instrument
@@ -62,7 +63,7 @@ def pareto(
     }
     if out is not None:
         write.keep(out, "pareto.json", found)
-        plot.write(panels(found), out, "Rendering: flow error and noise against time", rows, found)
+        result_page.write(drawn(found), out)
     if json:
         print(json_.dumps(found))
         return
@@ -109,7 +110,13 @@ def measure(ours: Case, spp: int, sampler: str, kind: str) -> dict[str, float]:
     }
 
 
-def panels(found: dict[str, Any]) -> list[plot.Panel]:
+def drawn(found: Mapping[str, Any]) -> result_page.Page:
+    """What the data say."""
+    tables = [result_page.Section("All settings", found["rows"])]
+    return result_page.Page("Rendering: flow error and noise against time", found, panels(found), tables)
+
+
+def panels(found: Mapping[str, Any]) -> list[charts.Panel]:
     """Charts of `pareto.json`: what flow makes of the pictures, and their noise, against time."""
     made = []
     for key, unit in (("flow_median_px", "flow error, median [px]"), ("noise", "noise / mean")):
@@ -117,7 +124,7 @@ def panels(found: dict[str, Any]) -> list[plot.Panel]:
         for kind in dict.fromkeys((r["width"], r["sampler"], r["integrator"]) for r in found["rows"]):
             own = [r for r in found["rows"] if (r["width"], r["sampler"], r["integrator"]) == kind]
             curves.append(
-                plot.Curve(
+                charts.Curve(
                     f"{kind[1]}, {kind[2]}, {kind[0]} px",
                     tuple(float(r["cpu_s"]) for r in own),
                     tuple(float(r[key]) for r in own),
@@ -126,6 +133,6 @@ def panels(found: dict[str, Any]) -> list[plot.Panel]:
                 )
             )
         made.append(
-            plot.Panel(f"Render: {unit}", "CPU s a picture", unit, tuple(curves), True, True, front=True)
+            charts.Panel(f"Render: {unit}", "CPU s a picture", unit, tuple(curves), True, True, front=True)
         )
     return made

@@ -9,7 +9,7 @@ import shlex
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 import typer
 
-from bench.output import machine, plot, write
+from bench.output import machine, result_page, write
 from evidence.render.case import Case, case
 from synth.errors import UserError
 from synth.geometry.triangles import Shape
@@ -59,8 +59,7 @@ def stability(
     found = {"command": shlex.join(words), "seed": seed, "machine": machine.describe(), "cases": rows}
     if out is not None:
         write.keep(out, "stability.json", found)
-        title = "Rendering: a correct frame or a clear error"
-        plot.write_page(out, title, [plot.credit(found), plot.table(rows)])
+        result_page.write(drawn(found), out)
     if json:
         print(json_.dumps(found))
     else:
@@ -71,6 +70,12 @@ def stability(
         Console(width=140).print(table)
     if not all(row["passed"] for row in rows):
         raise typer.Exit(1)
+
+
+def drawn(found: Mapping[str, Any]) -> result_page.Page:
+    """What the data say."""
+    title = "Rendering: a correct frame or a clear error"
+    return result_page.Page(title, found, (), [result_page.Section("Cases", found["cases"])])
 
 
 def checked(ours: Case, **changes: Any) -> dict[str, Any]:
