@@ -30,6 +30,7 @@ from evidence.end_to_end import costs as end_to_end_costs
 from evidence.end_to_end import models, page
 from evidence.end_to_end.models import Answer
 from evidence.gap.recompute_flow import refollow
+from evidence.measuring import measuring
 from learn.data import clips as data
 from learn.data.clips import Clip
 from learn.evaluation.statistics import interval, paired
@@ -136,6 +137,7 @@ def chosen() -> list[Pipeline]:
     return [p for p in made if p.model not in models.UNLEARNT or (p.world == usual and p.flow != "ideal")]
 
 
+@measuring("--fit 8 --test 6 --out runs/end-to-end")
 def pareto(
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for results.")] = Path(
         "docs/results/end-to-end"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json as json_
 import os
 import shutil
 import signal
@@ -10,37 +9,64 @@ import subprocess
 import sys
 import tempfile
 import time
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import typer
 
-from bench.output import machine, write
+from evidence.engine import work as stand_in
+from evidence.measuring import measuring
 from synth.checks import verify
 from synth.dataset import index
 from synth.dataset.folder import Folder
-
-_PROGRAM = """
-import sys
-from pathlib import Path
-from synth import engine
-from synth.dataset.folder import Folder
-from synth.job.schema import Job
+from synth.engine import run
 from synth.engine.progress import Bars
-root, work, workers, job, retry = sys.argv[1:]
-if retry == "retry":
-    Folder(Path(root)).forgive()
-with Bars() as bars:
-    options = engine.Options(workers=int(workers), work=work)
-    engine.run(Job.model_validate_json(job), Path(root), options, bars)
-"""
+from synth.errors import UserError
+from synth.job import reader
+from synth.job.schema import Job
+
+_PROGRAM = "import sys; from evidence.engine.kills import carry_out; carry_out(*sys.argv[1:])"
+_RETRIES = 20
 
 
+@dataclass(frozen=True)
+class Runs:
+    """How the trial's runs are started."""
+
+    job: str
+    """As JSON."""
+    work: str
+    workers: int
+
+    def start(self, root: Path, frame_s: float, retry: bool = False) -> subprocess.Popen[bytes]:
+        """A run in a process of its own; `retry`: what failed is tried again."""
+        words = [str(root), self.work, str(self.workers), self.job, "retry" if retry else "go on"]
+        return subprocess.Popen(
+            [sys.executable, "-c", _PROGRAM, *words],
+            env={**os.environ, **stand_in.environment(STAND_IN_FRAME_S=frame_s)},
+            stderr=subprocess.DEVNULL,
+        )
+
+
+def carry_out(root: str, work: str, workers: str, job: str, retry: str) -> None:
+    """What the process of a run does."""
+    if retry == "retry":
+        Folder(Path(root)).forgive()
+    with Bars() as bars:
+        options = run.Options(workers=int(workers), work=work)
+        run.run(Job.model_validate_json(job), Path(root), options, bars)
+
+
+@measuring(
+    "--count 20 --out runs/kills",
+    out="docs/results/engine/kills",
+    file="kills.json",
+    text=lambda found: f"{sum(found['sigkills'].values())} SIGKILLs: equal = {found['equal']}",
+    passed=lambda found: found["equal"] and found["checksums_good"] and not found["leftovers"],
+)
 def kills(
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder of the results.")] = Path(
-        "docs/results/engine/kills"
-    ),
     count: Annotated[int, typer.Option(help="Number of SIGKILLs.")] = 200,
     sequences: Annotated[int, typer.Option(help="Sequences of the job.")] = 50,
     workers: Annotated[int, typer.Option(help="Worker processes.")] = 2,
@@ -49,67 +75,66 @@ def kills(
     frame_s: Annotated[float, typer.Option(help="Sleep a frame of the stand-in [s].")] = 0.25,
     pause_s: Annotated[float, typer.Option(help="Longest wait between two kills [s].")] = 2.0,
     seed: Annotated[int, typer.Option(help="Of the kills.")] = 0,
-    json: Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")] = False,
-) -> None:
+) -> dict[str, Any]:
     """Kills runs at random moments, lets them resume, and compares with a run left in peace."""
-    from synth.job import reader
-
-    described = reader.load(job, [f"sequences={sequences}"]).model_dump_json()
-    rng = np.random.default_rng(seed)
-    victims = {"worker": 0, "engine": 0, "both": 0}
+    described = reader.load(job, [f"sequences={sequences}"])
+    runs = Runs(described.model_dump_json(), work, workers)
     with tempfile.TemporaryDirectory() as scratch:
-        root = Path(scratch) / "killed"
-        run: subprocess.Popen[bytes] | None = None
-        starts = retries = 0
-        while sum(victims.values()) < count:
-            if run is None or run.poll() is not None:
-                again = "retry" if root.exists() and Folder(root).failures() else "go on"
-                retries += again == "retry"
-                if len(list(root.glob("*.zarr"))) == sequences:
-                    # All done before all kills: a few sequences are taken away, to be made again.
-                    for path in sorted(root.glob("*.zarr"))[:: max(sequences // 10, 1)]:
-                        shutil.rmtree(path)
-                run = _start(root, work, workers, described, again, frame_s)
-                starts += 1
-            time.sleep(float(rng.uniform(0.05, pause_s)))
-            kind = list(victims)[int(rng.integers(3))]
-            victims[kind] += _kill(run, kind, rng)
-        if run is not None:
-            run.wait()
-        while len(list(root.glob("*.zarr"))) < sequences:
-            _start(root, work, workers, described, "retry", frame_s).wait()
-        calm = Path(scratch) / "calm"
-        _start(calm, work, workers, described, "go on", 0.0).wait()
-        checks = {check.name: check.good for check in verify.run(root).checks}
-        result = {
-            "job": job,
-            "work": work,
-            "sigkills": victims,
-            "sequences": sequences,
-            "starts": starts,
-            "starts_that_retried_failed": retries,
-            "hash_after_kills": index.dataset_hash(index.read(root).to_pylist()),
-            "hash_undisturbed": index.dataset_hash(index.read(calm).to_pylist()),
-            "leftovers": [path.name for path in root.glob("*.part")],
-            "checksums_good": checks["checksum"] and checks["readable"] and checks["seal"],
-            "seed": seed,
-            "machine": machine.describe(),
-        }
-    result["equal"] = result["hash_after_kills"] == result["hash_undisturbed"]
-    write.keep(out, "kills.json", result)
-    print(json_.dumps(result) if json else f"{sum(victims.values())} SIGKILLs: equal = {result['equal']}")
-    if not (result["equal"] and result["checksums_good"] and not result["leftovers"]):
-        raise typer.Exit(1)
+        root, calm = Path(scratch) / "killed", Path(scratch) / "calm"
+        history = _disturb(runs, root, count, sequences, frame_s, pause_s, np.random.default_rng(seed))
+        runs.start(calm, 0.0).wait()
+        found = {"job": job, "work": work, "sequences": sequences, **history, **_compare(root, calm)}
+    return found | {"seed": seed}
 
 
-def _start(
-    root: Path, work: str, workers: int, job: str, retry: str, frame_s: float
-) -> subprocess.Popen[bytes]:
-    return subprocess.Popen(
-        [sys.executable, "-c", _PROGRAM, str(root), work, str(workers), job, retry],
-        env={**os.environ, "STAND_IN_FRAME_S": str(frame_s)},
-        stderr=subprocess.DEVNULL,
-    )
+def _disturb(
+    runs: Runs,
+    root: Path,
+    count: int,
+    sequences: int,
+    frame_s: float,
+    pause_s: float,
+    rng: np.random.Generator,
+) -> dict[str, Any]:
+    """Starts and kills until `count` processes died, then lets the dataset be finished; what was done."""
+    victims = {"worker": 0, "engine": 0, "both": 0}
+    run: subprocess.Popen[bytes] | None = None
+    starts = retries = 0
+    while sum(victims.values()) < count:
+        if run is None or run.poll() is not None:
+            again = root.exists() and bool(Folder(root).failures())
+            retries += again
+            if len(list(root.glob("*.zarr"))) == sequences:
+                # All done before all kills: a few sequences are taken away, to be made again.
+                for path in sorted(root.glob("*.zarr"))[:: max(sequences // 10, 1)]:
+                    shutil.rmtree(path)
+            run = runs.start(root, frame_s, again)
+            starts += 1
+        time.sleep(float(rng.uniform(0.05, pause_s)))
+        kind = list(victims)[int(rng.integers(3))]
+        victims[kind] += _kill(run, kind, rng)
+    if run is not None:
+        run.wait()
+    for _ in range(_RETRIES):
+        if len(list(root.glob("*.zarr"))) == sequences:
+            break
+        runs.start(root, frame_s, retry=True).wait()
+    else:
+        raise UserError(f"{runs.work}: runs that nothing disturbs don't end the job either")
+    return {"sigkills": victims, "starts": starts, "starts_that_retried_failed": retries}
+
+
+def _compare(root: Path, calm: Path) -> dict[str, Any]:
+    """The dataset that was disturbed, beside the other."""
+    checks = {check.name: check.good for check in verify.run(root).checks}
+    ours, theirs = (index.dataset_hash(index.read(folder).to_pylist()) for folder in (root, calm))
+    return {
+        "hash_after_kills": ours,
+        "hash_undisturbed": theirs,
+        "leftovers": [path.name for path in root.glob("*.part")],
+        "checksums_good": checks["checksum"] and checks["readable"] and checks["seal"],
+        "equal": ours == theirs,
+    }
 
 
 def _kill(run: subprocess.Popen[bytes], kind: str, rng: np.random.Generator) -> int:

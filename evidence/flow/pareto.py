@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json as json_
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -11,24 +10,36 @@ import cv2
 import torch
 import typer
 
-from bench.output import machine, plot, write
+from bench.output import machine, plot
 from evidence.flow.measure import measure
 from evidence.flow.scenes import Recipe, pairs
+from evidence.measuring import measuring
 from synth.flow.estimator import Estimator
 from synth.flow.opencv import Dis, OpenCvTvl1
 from synth.flow.tvl1 import Settings, Tvl1
 
 
+def draw(found: dict[str, Any], out: Path) -> None:
+    """Picture and page."""
+    shown = [{key: value for key, value in row.items() if key != "settings"} for row in found["rows"]]
+    plot.write(panels(found), out, "Flow: error against time", shown, found)
+
+
+@measuring(
+    "--out runs/flow --count 2",
+    out=...,
+    said="Folder for pareto.json, chart.svg, index.html.",
+    file="pareto.json",
+    page=draw,
+    text="index.html",
+)
 def pareto(
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for pareto.json, chart.svg, index.html.")],
     count: Annotated[int, typer.Option(min=1, help="Pairs a point.")] = 4,
     seed: Annotated[int, typer.Option(min=0, help="Root of every draw.")] = 2613,
-    json: Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")] = False,
-) -> None:
+) -> dict[str, Any]:
     """Flow: endpoint and divergence error against milliseconds, the default marked."""
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
-    out.mkdir(parents=True, exist_ok=True)
     made = list(pairs(Recipe(), count, seed))
     rows: list[dict[str, Any]] = []
     for family, label, estimator, warm in _candidates():
@@ -44,20 +55,13 @@ def pareto(
             "default": default,
         }
         rows.append(what | asdict(error))
-        if not json:
-            typer.echo(f"{family:12} {label:22} {1e3 * error.cpu_s:6.0f} ms  EPE {error.mean:.3f} px  "
-                       f"divergence {error.divergence:.2f}")  # fmt: skip
-    record = {
-        "command": f"bench pareto flow --count {count} --seed {seed}",
+        typer.echo(f"{family:12} {label:22} {1e3 * error.cpu_s:6.0f} ms  EPE {error.mean:.3f} px  "
+                   f"divergence {error.divergence:.2f}", err=True)  # fmt: skip
+    return {
         "on": "warped procedural cortex, 224², 10 px pull, tool, highlights; CPU time of one thread",
         "machine": machine.describe() | {"torch": torch.__version__, "opencv": cv2.__version__},
         "rows": rows,
     }
-    write.keep(out, "pareto.json", record)
-    shown = [{key: value for key, value in row.items() if key != "settings"} for row in rows]
-    plot.write(panels(record), out, "Flow: error against time", shown, record)
-    if json:
-        typer.echo(json_.dumps(record))
 
 
 def panels(found: dict[str, Any]) -> list[plot.Panel]:

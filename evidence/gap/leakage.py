@@ -21,6 +21,7 @@ from bench.methods import baselines
 from bench.output import forest_plot, machine, result_page, write
 from bench.scoring import metrics
 from bench.tracking.tracking import Answer
+from evidence.measuring import measuring
 from learn.data.clips import Clip, load
 from learn.data.split import groups
 
@@ -29,6 +30,7 @@ _FOLDS = 5
 _SPLITS = {"random frames": 0, "whole recordings": 1}
 
 
+@measuring("out --out runs/leakage")
 def leakage(
     dataset: Annotated[Path, typer.Argument(help="Dataset with recovered flow.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the results.")] = Path(

@@ -18,6 +18,7 @@ from evidence.learn.bad_input import bad_inputs
 from evidence.learn.experiment import RESULTS, small
 from evidence.learn.labels import clips as labels
 from evidence.learn.table import markdown
+from evidence.measuring import measuring
 from learn.data.clips import Clip
 from learn.data.grid import Grid
 from learn.data.split import Split, nested
@@ -45,6 +46,7 @@ Say = Callable[[str], None]
 Row = dict[str, Any]
 
 
+@measuring("--cache cache --seeds 2")
 def stability(
     cache: Annotated[Path, typer.Option(help="Folder for packed sequences and trained models; made once.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for results.")] = RESULTS / "stability",
