@@ -35,7 +35,6 @@ class Outcome:
     "--out runs/gpu",
     out="docs/results/gpu",
     said="Folder for logs and gpu.json.",
-    text=lambda found: "\n".join(f"{one['name']}: exit code {one['exit_code']}" for one in found),
     passed=lambda found: not any(one["exit_code"] for one in found),
 )
 def gpu(

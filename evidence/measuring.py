@@ -9,6 +9,7 @@ from __future__ import annotations
 import inspect
 import json
 import shlex
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +18,8 @@ from typing import Annotated, Any, TypeVar, get_origin
 
 import typer
 from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
 
 from bench.output import machine, write
 
@@ -36,7 +39,7 @@ class Declared:
     said: str
     file: str | None
     page: Callable[[Any, Path], None] | None
-    text: str | Callable[[Any], object]
+    text: str | Callable[[Any], str]
     passed: Callable[[Any], bool] | None
 
 
@@ -51,7 +54,7 @@ def measuring(
     said: str = "Folder of the results.",
     file: str | None = None,
     page: Callable[[Any, Path], None] | None = None,
-    text: str | Callable[[Any], object] = "",
+    text: str | Callable[[Any], str] = "",
     passed: Callable[[Any], bool] | None = None,
 ) -> Callable[[Function], Function]:
     """Declares a measuring command.
@@ -66,8 +69,8 @@ def measuring(
         file: that the data go into, `{name}` standing for a value of the command; None: the function writes
             its own, with `out`.
         page: writes what else is made from the data, a page or a picture, into the folder.
-        text: the data as a person reads them, a text or one of rich's tables; or the file of the folder that
-            is named instead. Empty: the data.
+        text: the data as a person reads them; or the file of the folder that is named instead. Empty: every
+            list of rows as a table, and what else there is line by line.
         passed: whether the exit code is 0.
     """
 
@@ -174,13 +177,34 @@ def _typed(ctx: typer.Context, words: str) -> str:
     return shlex.join(typed)
 
 
-def _say(found: Any, text: str | Callable[[Any], object], folder: Path | None, as_json: bool) -> None:
+def _say(found: Any, text: str | Callable[[Any], str], folder: Path | None, as_json: bool) -> None:
     if as_json:
         print(json.dumps(found))
     elif callable(text):
-        said = text(found)
-        print(said) if isinstance(said, str) else Console(width=140).print(said)
+        print(text(found))
     elif text and folder is not None:
         print(folder / text)
     else:
-        Console().print_json(json.dumps(found))
+        _show(found)
+
+
+def _show(found: Any) -> None:
+    """Data for a person: rows as tables, all else line by line."""
+    console = Console(width=None if sys.stdout.isatty() else 140)
+    for name, value in found.items() if isinstance(found, dict) else [("", found)]:
+        if isinstance(value, dict) and all(isinstance(row, dict) for row in value.values()):
+            value = [{name: key, **row} for key, row in value.items()]
+        if isinstance(value, list) and value and all(isinstance(row, dict) for row in value):
+            columns = list(dict.fromkeys(key for row in value for key in row))
+            table = Table(*columns, title=name)
+            for row in value:
+                table.add_row(*(_cell(row.get(key)) for key in columns))
+            console.print(table)
+        elif name not in ("command", "machine", "meaning"):
+            console.print(f"{name}: {_cell(value)}", markup=False, highlight=False)
+
+
+def _cell(value: Any) -> str:
+    if value is None:
+        return "-"
+    return f"{value:.4g}" if isinstance(value, float) else escape(str(value))

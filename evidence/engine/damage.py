@@ -33,20 +33,10 @@ class Case:
     """Names of the checks that failed."""
 
 
-def said(found: dict[str, Any]) -> str:
-    """How many were missed, and a line a kind."""
-    missed = len(found["missed"])
-    lines = [f"{found['changed']} of {found['stores']} stores changed a value; verify missed {missed}"]
-    for name, row in found["kinds"].items():
-        lines.append(f"  {name:<22} {row['changed']:>3} of {row['stores']:>3} changed, {row['found']} found")
-    return "\n".join(lines)
-
-
 @measuring(
     "out --count 50 --out runs/damage",
     out="docs/results/engine/damage",
     file="damage.json",
-    text=said,
     passed=lambda found: not found["missed"],
 )
 def damage(

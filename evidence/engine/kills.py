@@ -9,7 +9,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from dataclasses import dataclass
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -31,28 +31,13 @@ _PROGRAM = "import sys; from evidence.engine.kills import carry_out; carry_out(*
 _RETRIES = 20
 
 
-@dataclass(frozen=True)
-class Runs:
-    """How the trial's runs are started."""
-
-    job: str
-    """As JSON."""
-    work: str
-    workers: int
-
-    def start(self, root: Path, frame_s: float, retry: bool = False) -> subprocess.Popen[bytes]:
-        """A run in a process of its own; `retry`: what failed is tried again."""
-        words = [str(root), self.work, str(self.workers), self.job, "retry" if retry else "go on"]
-        return subprocess.Popen(
-            [sys.executable, "-c", _PROGRAM, *words],
-            env={**os.environ, **stand_in.environment(STAND_IN_FRAME_S=frame_s)},
-            stderr=subprocess.DEVNULL,
-        )
+Start = Callable[[Path, float, bool], "subprocess.Popen[bytes]"]
+"""Starts a run: its folder, the stand-in's sleep a frame [s], whether what failed is tried again."""
 
 
-def carry_out(root: str, work: str, workers: str, job: str, retry: str) -> None:
+def carry_out(job: str, work: str, workers: str, root: str, again: str) -> None:
     """What the process of a run does."""
-    if retry == "retry":
+    if again == "again":
         Folder(Path(root)).forgive()
     with Bars() as bars:
         options = run.Options(workers=int(workers), work=work)
@@ -63,7 +48,6 @@ def carry_out(root: str, work: str, workers: str, job: str, retry: str) -> None:
     "--count 20 --out runs/kills",
     out="docs/results/engine/kills",
     file="kills.json",
-    text=lambda found: f"{sum(found['sigkills'].values())} SIGKILLs: equal = {found['equal']}",
     passed=lambda found: found["equal"] and found["checksums_good"] and not found["leftovers"],
 )
 def kills(
@@ -78,17 +62,25 @@ def kills(
 ) -> dict[str, Any]:
     """Kills runs at random moments, lets them resume, and compares with a run left in peace."""
     described = reader.load(job, [f"sequences={sequences}"])
-    runs = Runs(described.model_dump_json(), work, workers)
+    words = (described.model_dump_json(), work, str(workers))
+
+    def start(root: Path, frame_s: float, again: bool) -> subprocess.Popen[bytes]:
+        return subprocess.Popen(
+            [sys.executable, "-c", _PROGRAM, *words, str(root), "again" if again else "on"],
+            env={**os.environ, **stand_in.environment(STAND_IN_FRAME_S=frame_s)},
+            stderr=subprocess.DEVNULL,
+        )
+
     with tempfile.TemporaryDirectory() as scratch:
         root, calm = Path(scratch) / "killed", Path(scratch) / "calm"
-        history = _disturb(runs, root, count, sequences, frame_s, pause_s, np.random.default_rng(seed))
-        runs.start(calm, 0.0).wait()
+        history = _disturb(start, root, count, sequences, frame_s, pause_s, np.random.default_rng(seed))
+        start(calm, 0.0, False).wait()
         found = {"job": job, "work": work, "sequences": sequences, **history, **_compare(root, calm)}
     return found | {"seed": seed}
 
 
 def _disturb(
-    runs: Runs,
+    start: Start,
     root: Path,
     count: int,
     sequences: int,
@@ -108,7 +100,7 @@ def _disturb(
                 # All done before all kills: a few sequences are taken away, to be made again.
                 for path in sorted(root.glob("*.zarr"))[:: max(sequences // 10, 1)]:
                     shutil.rmtree(path)
-            run = runs.start(root, frame_s, again)
+            run = start(root, frame_s, again)
             starts += 1
         time.sleep(float(rng.uniform(0.05, pause_s)))
         kind = list(victims)[int(rng.integers(3))]
@@ -118,9 +110,9 @@ def _disturb(
     for _ in range(_RETRIES):
         if len(list(root.glob("*.zarr"))) == sequences:
             break
-        runs.start(root, frame_s, retry=True).wait()
+        start(root, frame_s, True).wait()
     else:
-        raise UserError(f"{runs.work}: runs that nothing disturbs don't end the job either")
+        raise UserError(f"{root}: not complete after {_RETRIES} runs that nothing disturbed")
     return {"sigkills": victims, "starts": starts, "starts_that_retried_failed": retries}
 
 

@@ -23,18 +23,7 @@ from synth.job.schema import Job
 _ASKED = ("status", "report")
 
 
-def said(found: dict[str, Any]) -> str:
-    """A line a command."""
-    rows = ((name, found[name]) for name in _ASKED)
-    return "\n".join(
-        f"{name}: {row['cpu_s']:.2f} CPU-s, {row['wall_s']:.2f} s, {row['peak_mb']:.0f} MB"
-        for name, row in rows
-    )
-
-
-@measuring(
-    "--sequences 10000 --out runs/scale", out="docs/results/engine/scale", file="scale.json", text=said
-)
+@measuring("--sequences 10000 --out runs/scale", out="docs/results/engine/scale", file="scale.json")
 def scale(
     sequences: Annotated[int, typer.Option(help="Rows of the simulated index.")] = 100_000,
     seed: Annotated[int, typer.Option(help="Of the simulated rows.")] = 0,

@@ -21,21 +21,7 @@ _SETS = {
 }
 
 
-def said(found: dict[str, Any]) -> str:
-    """A line a set of fields."""
-    lines = []
-    for row in found["sets"]:
-        ours, plain = row["ours"], row["zarr"]
-        lines.append(
-            f"{row['title']:<28} {row['raw_mb']:5.1f} MB: {ours['median_ms']:.1f} ms "
-            f"(95% within {ours['p95_ms']:.1f}), plain Zarr {plain['median_ms']:.1f} ms"
-        )
-    return "\n".join(lines)
-
-
-@measuring(
-    "out --count 50 --out runs/reading", out="docs/results/engine/reading", file="reading.json", text=said
-)
+@measuring("out --count 50 --out runs/reading", out="docs/results/engine/reading", file="reading.json")
 def reading(
     dataset: Annotated[Path, typer.Argument(help="A rendered dataset.")],
     count: Annotated[int, typer.Option(help="Random frames for each set of fields.")] = 100,

@@ -7,23 +7,13 @@ from typing import Annotated, Any
 
 import numpy as np
 import typer
-from rich.table import Table
 
 from evidence.measuring import measuring
 from synth.dataset.store import Dataset
 from synth.errors import UserError
 
 
-def table(found: dict[str, Any]) -> Table:
-    """A row a stage."""
-    made = Table("stage", "CPU s a frame", "largest", title=f"{found['sequences']} sequences")
-    for name, cost in found["cpu_s_a_frame"].items():
-        made.add_row(name, f"{cost['median']:.3f}", f"{cost['largest']:.3f}")
-    made.add_row("peak memory", f"{found['peak_rss_mb']:.0f} MB", "")
-    return made
-
-
-@measuring("out --out runs/stages", said="Folder for stages.json.", file="stages.json", text=table)
+@measuring("out --out runs/stages", said="Folder for stages.json.", file="stages.json")
 def stages(
     data: Annotated[Path, typer.Argument(help="A dataset made by `synth render`.")],
 ) -> dict[str, Any]:

@@ -21,9 +21,6 @@ from synth.job.schema import Job
     "--sequences 6 --out runs/trouble",
     out="docs/results/engine/trouble",
     file="trouble.json",
-    text=lambda found: (
-        f"{found['done']} done, {len(found['failed'])} failed, {found['ratio']} times the time"
-    ),
     passed=lambda found: (
         found["done_without_trouble"] == found["sequences"] and found["done"] == found["sequences"] - 2
     ),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
@@ -25,39 +24,17 @@ _SETTINGS = (
 )
 
 
-def said(found: dict[str, Any]) -> str:
-    """A line a setting, a law, a gesture and a sequence."""
-    lines = []
-    for row in found["rows"]:
-        lines.append(
-            f"{row['law']:13s} P{row['order']} {row['tets']:6d} tets  {row['ms_a_frame']:6.1f} ms a frame  "
-            f"mesh {100 * row['mesh_error']:5.2f}%  whole {100 * row['error']:.2f}%"
-            f"{'  <- default' if row['default'] else ''}"
-        )
-    for row in found["laws"]:
-        lines.append(f"{row['law']:13s} P {row['load']:4.2f} {row['way']:5s} {row['outcome']}")
-    for row in found["gestures"]:
-        lines.append(
-            f"{row['law']:13s} P {row['load']:4.2f} {row['gesture']:15s} {row['ms_a_frame']:6.1f} ms a frame"
-        )
-    for row in found["sequence"]:
-        spent = ", ".join(f"{k[:-2]} {v:.2f}" for k, v in row.items() if k.endswith("_s"))
-        lines.append(f"{row['law']:13s} whole sequence: {row['peak_rss_mb']:.0f} MB at most; CPU s: {spent}")
-    return "\n".join(lines)
-
-
-def draw(found: dict[str, Any], out: Path) -> None:
-    """Picture and page."""
-    everything = [*found["rows"], *found["gestures"], *found["sequence"]]
-    plot.write(panels(found), out, "Physics: error against cost", everything, found)
-
-
 @measuring(
     "--load 0.3 --out runs/fem",
     said="Folder for data, picture and page.",
     file="pareto.json",
-    page=draw,
-    text=said,
+    page=lambda found, out: plot.write(
+        panels(found),
+        out,
+        "Physics: error against cost",
+        [*found["rows"], *found["gestures"], *found["sequence"]],
+        found,
+    ),
 )
 def pareto(
     load: Annotated[float, typer.Option(help="P = F/(E a^2) at which laws are compared.")] = 0.3,

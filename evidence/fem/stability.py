@@ -7,7 +7,6 @@ from collections import Counter
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
-from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
@@ -37,26 +36,11 @@ _CONTACT = fem_case.CONTACTS[0]
 _VERTICES, _CHUNK = 10_000, 50
 
 
-def said(found: dict[str, Any]) -> str:
-    """A line a row, and the random scenes' counts."""
-    lines = [
-        f"{row['sweep']:8s} {row['law']:13s} {row['way']:5s} {row['value']:8g}  {row['outcome']}"
-        for row in found["rows"]
-    ]
-    return "\n".join([*lines, str(found["random_scenes"])])
-
-
-def draw(found: dict[str, Any], out: Path) -> None:
-    """Picture and page."""
-    plot.write(panels(found), out, "Physics: where it breaks", found["rows"], found)
-
-
 @measuring(
     "--scenes 100 --out runs/fem",
     said="Folder for data, picture and page.",
     file="stability.json",
-    page=draw,
-    text=said,
+    page=lambda found, out: plot.write(panels(found), out, "Physics: where it breaks", found["rows"], found),
 )
 def stability(
     scenes: Annotated[int, typer.Option(help="Random scenes of the default ranges.", min=0)] = 1000,

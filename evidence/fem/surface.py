@@ -26,18 +26,7 @@ _WAYS = {"pull": (0.0, 0.0, 1.0), "aside": (0.87, 0.0, 0.5)}
 _FINE_MM = 0.6  # spacing of the surface that is loaded: a coarser one would press on single points
 
 
-def said(found: dict[str, Any]) -> str:
-    """The surface, and a line a mesh."""
-    lines = [f"{found['vertices']} vertices, {found['faces']} faces, {found['volume_mm3']:.0f} mm^3"]
-    for row in found["rows"]:
-        lines.append(
-            f"{row['tets']:6d} tets  volume {100 * row['volume_kept']:5.1f}%  quality {row['quality']:.2f}  "
-            f"mesh {row['mesh_cpu_s']:.1f} CPU-s  error {100 * row['error']:.2f}%"
-        )
-    return "\n".join(lines)
-
-
-@measuring("brain.obj --direction=-0.4,0.8,0.45", said="Folder for the data.", file="{file}.json", text=said)
+@measuring("brain.obj --direction=-0.4,0.8,0.45", said="Folder for the data.", file="{file}.json")
 def surface(
     file: Annotated[Path, typer.Argument(help="A brain's surface: OBJ, STL, PLY or VTK, in mm.")],
     direction: Annotated[

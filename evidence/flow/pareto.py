@@ -31,7 +31,6 @@ def draw(found: dict[str, Any], out: Path) -> None:
     said="Folder for pareto.json, chart.svg, index.html.",
     file="pareto.json",
     page=draw,
-    text="index.html",
 )
 def pareto(
     count: Annotated[int, typer.Option(min=1, help="Pairs a point.")] = 4,
@@ -55,8 +54,7 @@ def pareto(
             "default": default,
         }
         rows.append(what | asdict(error))
-        typer.echo(f"{family:12} {label:22} {1e3 * error.cpu_s:6.0f} ms  EPE {error.mean:.3f} px  "
-                   f"divergence {error.divergence:.2f}", err=True)  # fmt: skip
+        typer.echo(f"{family}: {label}", err=True)
     return {
         "on": "warped procedural cortex, 224², 10 px pull, tool, highlights; CPU time of one thread",
         "machine": machine.describe() | {"torch": torch.__version__, "opencv": cv2.__version__},

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
-from pathlib import Path
 from typing import Annotated, Any
 
 import cv2
@@ -20,7 +19,6 @@ from synth.flow import confidence
 from synth.flow.estimator import Estimator, create
 from synth.flow.track import Tracker
 
-_VERDICTS = ("identical_frames_largest_px", "extreme_sizes", "flag")
 _COUNTS = ("lost", "flagged", "hits")
 _BROKEN = 1.0  # px: a pixel off by more is lost; so is a frame whose mean is
 
@@ -55,18 +53,12 @@ class Point:
     finite: bool
 
 
-def draw(found: dict[str, Any], out: Path) -> None:
-    """Picture and page."""
-    plot.write(panels(found), out, "Flow: where it breaks", found=found)
-
-
 @measuring(
     "--out runs/flow --methods tvl1,dis",
     out=...,
     said="Folder for stability.json, chart.svg, index.html.",
     file="stability.json",
-    page=draw,
-    text=lambda found: str({key: found[key] for key in _VERDICTS}),
+    page=lambda found, out: plot.write(panels(found), out, "Flow: where it breaks", found=found),
 )
 def stability(
     count: Annotated[int, typer.Option(min=1, help="Pairs a point.")] = 2,
@@ -82,8 +74,7 @@ def stability(
     for trouble, value, made, spoil in _troubles(size, count, seed):
         for name, estimator in estimators.items():
             points.append(_point(trouble, value, name, estimator, made, spoil))
-        of_each = ", ".join(f"{p.estimator} {p.epe:.3f} px" for p in points[-len(estimators) :])
-        typer.echo(f"{trouble} {value:g}: {of_each}", err=True)
+        typer.echo(f"{trouble} {value:g}", err=True)
     return {
         "machine": machine.describe() | {"torch": torch.__version__, "opencv": cv2.__version__},
         "identical_frames_largest_px": {name: _identical(e, size, seed) for name, e in estimators.items()},

@@ -5,13 +5,11 @@ from __future__ import annotations
 import time
 from inspect import signature
 from itertools import product
-from pathlib import Path
 from typing import Annotated, Any
 
 import cv2
 import numpy as np
 import typer
-from rich.table import Table
 
 from bench.output import plot
 from evidence.measuring import measuring
@@ -25,26 +23,13 @@ _STAGE = signature(Studio.stage).parameters
 _DEFAULT = (Render().spp, _STAGE["sampler"].default, _STAGE["integrator"].default, Render().size[0])
 
 
-def table(found: dict[str, Any]) -> Table:
-    """A row a setting."""
-    names = ("spp", "sampler", "integrator", "width", "cpu_s", "noise", "flow_median_px", "flow_p95_px")
-    made = Table(*names, "default")
-    for row in found["rows"]:
-        made.add_row(*(str(row[name]) for name in names), "*" if row["default"] else "")
-    return made
-
-
-def draw(found: dict[str, Any], out: Path) -> None:
-    """Picture and page."""
-    plot.write(panels(found), out, "Rendering: flow error and noise against time", found["rows"], found)
-
-
 @measuring(
     "--spp 2 --spp 8 --out runs/render",
     said="Folder for pareto.json and chart.",
     file="pareto.json",
-    page=draw,
-    text=table,
+    page=lambda found, out: plot.write(
+        panels(found), out, "Rendering: flow error and noise against time", found["rows"], found
+    ),
 )
 def pareto(
     spp: Annotated[list[int], typer.Option(help="Light paths a pixel to try.")] = [1, 2, 4, 8, 16],  # noqa: B006

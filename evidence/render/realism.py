@@ -8,7 +8,6 @@ from typing import Annotated, Any
 import cv2
 import numpy as np
 import typer
-from rich.table import Table
 
 from evidence.measuring import measuring
 from evidence.render import picture_statistics
@@ -19,20 +18,7 @@ from synth.job.schema import Family, Job
 _SIDE, _STEP = 160, 40
 
 
-def table(found: dict[str, Any]) -> Table:
-    """A row a statistic."""
-    made = Table("statistic", "photograph (min, median, max)", "rendered (min, median, max)", "within")
-    for row in found["statistics"]:
-        made.add_row(
-            row["statistic"],
-            "  ".join(f"{v:9.4g}" for v in row["photograph"]),
-            "  ".join(f"{v:9.4g}" for v in row["rendered"]),
-            "yes" if row["median_within_spread"] else "no",
-        )
-    return made
-
-
-@measuring("cortex.jpg", said="Folder for figures and sheet.", file="realism.json", text=table)
+@measuring("cortex.jpg", said="Folder for figures and sheet.", file="realism.json")
 def realism_figures(
     photo: Annotated[Path, typer.Argument(help="A photograph of an exposed cortex.")],
     outline: Annotated[

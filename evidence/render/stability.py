@@ -14,7 +14,6 @@ from typing import Annotated, Any
 import cv2
 import numpy as np
 import typer
-from rich.table import Table
 
 from bench.output import plot
 from evidence.measuring import measuring
@@ -32,27 +31,15 @@ _SMALL = {"size": (160, 120)}
 _LIFT_MM = 2.0
 
 
-def table(found: dict[str, Any]) -> Table:
-    """A row a case."""
-    made = Table("case", "outcome", "held", "figures")
-    for row in found["cases"]:
-        rest = {k: v for k, v in row.items() if k not in ("case", "outcome", "passed")}
-        made.add_row(row["case"], row["outcome"], "yes" if row["passed"] else "NO", str(rest))
-    return made
-
-
-def draw(found: dict[str, Any], out: Path) -> None:
-    """The page."""
-    title = "Rendering: a correct frame or a clear error"
-    plot.write_page(out, title, [plot.credit(found), plot.table(found["cases"])])
-
-
 @measuring(
     "--out runs/render",
     said="Folder for data and page.",
     file="stability.json",
-    page=draw,
-    text=table,
+    page=lambda found, out: plot.write_page(
+        out,
+        "Rendering: a correct frame or a clear error",
+        [plot.credit(found), plot.table(found["cases"])],
+    ),
     passed=lambda found: all(row["passed"] for row in found["cases"]),
 )
 def stability(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
@@ -29,17 +28,12 @@ _LOAD = (0.05, 0.35)
 """P = F/(E a^2) of the contacts on tissue that isn't linear: what the laws can carry."""
 
 
-def write_page(tree: dict[str, Any], out: Path) -> None:
-    """README.md."""
-    write.keep(out, "README.md", readme(tree))
-
-
 @measuring(
     "--count 10",
     out="docs/results/inverse",
     said="Folder for the results.",
     file="results.json",
-    page=write_page,
+    page=lambda tree, out: write.keep(out, "README.md", readme(tree)),
     text="README.md",
 )
 def experiment(

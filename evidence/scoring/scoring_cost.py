@@ -26,17 +26,12 @@ _PERIOD_S, _PEAK_PX, _PX_A_MN = 4.0, 9.0, 0.3
 _SENSOR_HZ = 200.0
 
 
-def write_page(tree: dict[str, Any], out: Path) -> None:
-    """README.md."""
-    write.keep(out, "README.md", readme(tree))
-
-
 @measuring(
     "model --train out",
     out="docs/results/scoring",
     said="Folder for the results.",
     file="results.json",
-    page=write_page,
+    page=lambda tree, out: write.keep(out, "README.md", readme(tree)),
     text="README.md",
 )
 def cost(
