@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from fake_run import in_process
 
-from evidence.engine import damage, dask, faults, kills, trouble, work
+from evidence.engine import damage, dask, faults, kills, large_index, speed, trouble, work
 from synth.job.schema import Job
 
 pytestmark = pytest.mark.slow
@@ -59,3 +59,10 @@ def test_damage_of_every_kind_that_changes_a_value_is_found(tmp_path: Path) -> N
     assert found["changed"] > found["stores"] / 2
     assert all(row["changed"] == row["found"] for row in found["kinds"].values())
     assert all(row["changed"] for row in found["kinds"].values()), "a kind that never changes a value"
+
+
+def test_what_measures_the_engine_in_processes_of_its_own_still_finds_it() -> None:
+    found = large_index.scale(sequences=200)
+    assert min(found[name]["cpu_s"] for name in ("status", "report")) > 0
+    cost = speed.overhead("tiny", 1)
+    assert cost["whole_cpu_s"] > cost["stages_alone_cpu_s"] > cost["store_cpu_s"] > 0
