@@ -16,6 +16,7 @@ import typer
 from bench.output import result_page
 from bench.output import write as kept
 from evidence import defaults_on_front
+from evidence.measuring import measuring
 from synth.errors import UserError
 
 Out = Annotated[Path | None, typer.Option("--out", "-o", help="Folder for the page; all/ in the results.")]
@@ -44,6 +45,7 @@ def _bench(words: list[str]) -> int:
     return subprocess.run([sys.executable, "-m", "bench", *words], check=False).returncode
 
 
+@measuring("--out runs/all")
 def pareto(
     out: Out = None, results: Results = defaults_on_front.RESULTS, run: Again = False, json: Json = False
 ) -> None:
@@ -76,6 +78,7 @@ def pareto(
         raise typer.Exit(1)
 
 
+@measuring("--out runs/all")
 def stability(
     out: Out = None, results: Results = defaults_on_front.RESULTS, run: Again = False, json: Json = False
 ) -> None:

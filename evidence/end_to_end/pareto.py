@@ -25,6 +25,7 @@ from evidence.end_to_end import costs as end_to_end_costs
 from evidence.end_to_end import page
 from evidence.end_to_end.costs import Costs
 from evidence.end_to_end.pipelines import FINE, FRAMES, SIZE, Pipeline, Sequences, Trial, chosen, errors
+from evidence.measuring import measuring
 from learn.evaluation.statistics import interval, paired
 from synth.job.schema import Flow
 
@@ -33,6 +34,7 @@ PARTS = {"": "errors", "across_": "across"}
 a row, and the errors by sequence."""
 
 
+@measuring("--fit 8 --test 6 --out runs/end-to-end")
 def pareto(
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for results.")] = Path(
         "docs/results/end-to-end"
@@ -96,7 +98,7 @@ def pareto(
     }
     write.keep(out, "pareto.json", found)
     result_page.write(page.drawn(found), out)
-    typer.echo(json_.dumps(found) if json else str(out / "index.html"))
+    typer.echo(json_.dumps(found) if json else str(out / "README.md"))
 
 
 def price(one: Pipeline, costs: Costs) -> dict[str, float]:

@@ -22,6 +22,7 @@ from evidence.flow import rendered
 from evidence.flow.chain import ChainTracker
 from evidence.flow.measure import Error, MeanInpainting, against, average, epe, measure
 from evidence.flow.scenes import CLEAN, Flags, Pair, Recipe, Rgb, Stage, pairs
+from evidence.measuring import measuring
 from synth.errors import UserError
 from synth.flow import mask
 from synth.flow.estimator import create
@@ -61,8 +62,14 @@ class Source:
         return pairs(recipe, self.count, self.seed, self.photo)
 
 
+@measuring(
+    "--out runs/flow --only warped",
+    out=...,
+    said="Folder for results.json and results.md.",
+    text="results.md",
+)
 def experiment(
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for results.json and results.md.")],
+    out: Path,
     photo: Annotated[
         Path | None, typer.Option(help="Photograph of a cortex to warp as well; nothing of it is written.")
     ] = None,
@@ -72,8 +79,7 @@ def experiment(
     count: Annotated[int, typer.Option(min=1, help="Pairs a source.")] = 6,
     frames: Annotated[int, typer.Option(min=60, help="Frames of the drift sequence.")] = 200,
     seed: Annotated[int, typer.Option(min=0, help="Root of every draw; 4 and 5 were tuned on.")] = 2641,
-    json: Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")] = False,
-) -> None:
+) -> dict[str, Any]:
     """Flow: endpoint error, divergence, masks, drift and time against what was asked."""
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
@@ -93,9 +99,8 @@ def experiment(
     chosen = [part.strip() for part in only.split(",") if part.strip()]
     if unknown := [part for part in chosen if part not in parts]:
         raise UserError(f"--only: no part {', '.join(unknown)}; there are {', '.join(parts)}")
-    out.mkdir(parents=True, exist_ok=True)
     path = out / "results.json"
-    record = json_.loads(path.read_text()) if path.exists() else {}
+    record: dict[str, Any] = json_.loads(path.read_text()) if path.exists() else {}
     record["machine"] = machine.describe() | {"torch": torch.__version__, "opencv": cv2.__version__}
     for part in chosen:
         rows = [asdict(row) | {"reached": row.reached} for row in parts[part]()]
@@ -103,11 +108,9 @@ def experiment(
         record[part] = {"command": command, "rows": rows}
         write.keep(out, "results.json", record)
         result_page.write(drawn(record), out)
-        if not json:
-            for row in rows:
-                typer.echo(_line(row))
-    if json:
-        typer.echo(json_.dumps(record))
+        for row in rows:
+            typer.echo(_line(row), err=True)
+    return record
 
 
 def _line(row: dict[str, object]) -> str:

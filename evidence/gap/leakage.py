@@ -21,6 +21,7 @@ from bench.methods import baselines
 from bench.methods.protocol import Answer
 from bench.output import charts, machine, result_page, write
 from bench.scoring import metrics
+from evidence.measuring import measuring
 from learn.data.clips import Clip, load_clips
 from learn.data.split import groups
 
@@ -30,6 +31,7 @@ _SPLITS = {"random frames": 0, "whole recordings": 1}
 _HEADS = {"r": "r", "r2": "R²", "mae_mn": "MAE [mN]"}
 
 
+@measuring("out --out runs/leakage")
 def leakage(
     dataset: Annotated[Path, typer.Argument(help="Dataset with recovered flow.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the results.")] = Path(

@@ -20,6 +20,7 @@ from bench.output.machine import describe
 from evidence.learn.cost import flops, parameters
 from evidence.learn.experiment import BESIDE
 from evidence.learn.preset_errors import GRIDS, Known, Shape, architecture, errors, shape
+from evidence.measuring import measuring
 from learn.data.grid import Grid, Scales, channels
 from learn.evaluation.statistics import Interval
 from learn.network.d2fnet import Architecture, fused
@@ -56,6 +57,7 @@ class Choice:
         return ", ".join(found)
 
 
+@measuring("--out runs/learn --repeats 10")
 def pareto(
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for results.")] = Path(
         "docs/results/learn/pareto"

@@ -19,6 +19,7 @@ from evidence.learn.bad_input import bad_inputs
 from evidence.learn.experiment import RESULTS, ideal_runs, small
 from evidence.learn.labels import clips as labels
 from evidence.learn.runs import model_folder
+from evidence.measuring import measuring
 from learn.data.clips import Clip
 from learn.data.grid import Grid
 from learn.data.split import Split, nested
@@ -46,6 +47,7 @@ Say = Callable[[str], None]
 Row = dict[str, Any]
 
 
+@measuring("--cache cache --seeds 2")
 def stability(
     cache: Annotated[Path, typer.Option(help="Folder for packed sequences and trained models; made once.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for results.")] = RESULTS / "stability",

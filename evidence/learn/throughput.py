@@ -24,6 +24,7 @@ from torch.utils.data import DataLoader, Dataset
 from bench.output import charts, result_page
 from bench.output.machine import describe
 from bench.output.write import keep
+from evidence.measuring import measuring
 from learn.data.clips import Clip, pack, unpack
 from learn.data.grid import Scales
 from learn.loss import Objective, loss
@@ -39,6 +40,7 @@ Step = Callable[[], tuple[float, float]]
 """One step; seconds spent on data, and on the network."""
 
 
+@measuring("--steps 3 --out runs/loading")
 def loading(
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for results.")] = Path(
         "docs/results/learn/loading"

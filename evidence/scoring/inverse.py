@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
@@ -13,7 +12,8 @@ from numpy.typing import NDArray
 
 from bench.methods import compliance, corotational, inverse
 from bench.methods.compliance import TO_CAMERA, Block, Compliance, picture
-from bench.output import charts, machine, result_page, write
+from bench.output import charts, result_page
+from evidence.measuring import measuring
 from synth.fem import equilibrium
 
 Floats = NDArray[np.float64]
@@ -28,10 +28,15 @@ _LOAD = (0.05, 0.35)
 """P = F/(E a^2) of the contacts on tissue that isn't linear: what the laws can carry."""
 
 
+@measuring(
+    "--count 10",
+    out="docs/results/inverse",
+    said="Folder for the results.",
+    file="results.json",
+    page=lambda found, out: result_page.write(drawn(found), out),
+    text="README.md",
+)
 def experiment(
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the results.")] = Path(
-        "docs/results/inverse"
-    ),
     count: Annotated[int, typer.Option(min=1, help="Random contacts.")] = 60,
     noise: Annotated[
         float, typer.Option(min=0.0, help="Noise of each component of displacement [mm].")
@@ -41,7 +46,7 @@ def experiment(
         int, typer.Option(help="Of the mesh that makes the data; the inverse has its own.")
     ] = 5000,
     seed: Annotated[int, typer.Option(help="Of contacts and noise; 0 was tuned on.")] = 1,
-) -> None:
+) -> dict[str, Any]:
     """Force of random contacts from noisy displacement, by physics alone.
 
     On linear tissue of 20-300 mN, however far it moves, and on co-rotational and neo-Hookean tissue of loads
@@ -56,7 +61,6 @@ def experiment(
         "tets_data": tets,
         "load": list(_LOAD),
         "seed": seed,
-        "machine": machine.describe(),
         "tissue": {},
     }
     for law in ("linear", "corotational", "neo-hookean"):
@@ -69,9 +73,7 @@ def experiment(
             "mean_peak_mm": float(np.mean([np.linalg.norm(field, axis=1).max() for field in fields])),
             "methods": {name: tried(solve, known, spoilt, forces, young) for name, solve in _METHODS.items()},
         }
-    write.keep(out, "results.json", tree)
-    result_page.write(drawn(tree), out)
-    print(out / "README.md")
+    return tree
 
 
 def tried(

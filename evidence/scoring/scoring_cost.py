@@ -16,8 +16,9 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
-from bench.output import charts, machine, result_page, write
+from bench.output import charts, result_page
 from bench.recording import writer
+from evidence.measuring import measuring
 from evidence.scoring import phantom
 from synth.errors import UserError
 
@@ -25,17 +26,22 @@ _PERIOD_S, _PEAK_PX, _PX_A_MN = 4.0, 9.0, 0.3
 _SENSOR_HZ = 200.0
 
 
+@measuring(
+    "model --train out",
+    out="docs/results/scoring",
+    said="Folder for the results.",
+    file="results.json",
+    page=lambda found, out: result_page.write(drawn(found), out),
+    text="README.md",
+)
 def cost(
     model: Annotated[Path, typer.Argument(help="Model folder of `learn train`.")],
     train: Annotated[Path, typer.Option(help="Its training data: the simpler methods are asked too.")],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the results.")] = Path(
-        "docs/results/scoring"
-    ),
     seconds: Annotated[float, typer.Option(min=2, help="Length of the recording.")] = 60.0,
     fps: Annotated[float, typer.Option(min=1, help="Frames a second.")] = 30.0,
     size: Annotated[tuple[int, int], typer.Option(help="Width and height [px].")] = (680, 480),
     seed: Annotated[int, typer.Option(help="Of the texture.")] = 0,
-) -> None:
+) -> dict[str, Any]:
     """Time and memory of `bench score` on a recording of a moved texture, all methods in the table.
 
     Raises:
@@ -51,19 +57,15 @@ def cost(
         if done.returncode:
             raise UserError(f"the scoring failed: {done.stderr.strip().splitlines()[-1]}")
         scored = json.loads(Path(scratch, "score.json").read_text())
-    tree = {
+    return {
         "seconds": seconds,
         "fps": fps,
         "size": list(size),
         "frames": scored["frames"],
         "wall_s": wall,
         "timings": scored["timings"],
-        "machine": machine.describe(),
         "command": shlex.join(["bench", "experiment", "scoring", "MODEL", "--train", "DATA"]),
     }
-    write.keep(out, "results.json", tree)
-    result_page.write(drawn(tree), out)
-    print(out / "README.md")
 
 
 def record(folder: Path, seconds: float, fps: float, size: tuple[int, int], rng: np.random.Generator) -> None:

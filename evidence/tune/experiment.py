@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import json as json_
+import json
 import sys
 from pathlib import Path
 from typing import Annotated, Any
@@ -12,6 +12,7 @@ import typer
 
 from bench.output import charts, machine, result_page
 from bench.output import write as results
+from evidence.measuring import measuring
 from learn.evaluation.statistics import interval
 from synth.errors import UserError
 from synth.job import reader
@@ -36,10 +37,14 @@ _WHAT = (
 )
 
 
+@measuring(
+    "--only easy --fresh 3",
+    out="docs/results/tune",
+    said="Folder that holds the scenes' jobs and gets the results.",
+    text="README.md",
+)
 def experiment(
-    out: Annotated[
-        Path, typer.Option("--out", "-o", help="Folder that holds the scenes' jobs and gets the results.")
-    ] = Path("docs/results/tune"),
+    out: Path,
     budget: Annotated[
         list[str] | None, typer.Option(help="As in `synth tune`; 'force 5%' and 'force 3%' if not given.")
     ] = None,
@@ -49,8 +54,7 @@ def experiment(
     only: Annotated[
         list[str] | None, typer.Option(help="Scenes; easy, middle and hard if not given.")
     ] = None,
-    json: Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")] = False,
-) -> None:
+) -> list[dict[str, Any]]:
     """Tunes three scenes of different difficulty and checks budget and cost on fresh sequences."""
     budgets = budget or ["force 5%", "force 3%"]
     asked = [search.Budget.parse(one) for one in budgets]
@@ -83,11 +87,10 @@ def experiment(
             results.keep(out, f"{stem}.json", row)
         for journal in journals:
             journal.unlink(missing_ok=True)
-    rows = write(out)
-    print(json_.dumps(rows) if json else out / "README.md")
+    return write_results(out)
 
 
-def write(out: Path) -> list[dict[str, Any]]:
+def write_results(out: Path) -> list[dict[str, Any]]:
     """Picture and README of the scenes whose data are in `out`; gives those back."""
     result_page.write(drawn(out), out)
     return read(out)
@@ -134,7 +137,7 @@ def drawn(out: Path) -> result_page.Page:
 def read(out: Path) -> list[dict[str, Any]]:
     """The data in `out`, scene by scene, the loosest budget first."""
     files = [file for name in _SCENES for file in out.glob(f"{name}-*.json")]
-    rows = [json_.loads(file.read_text("utf-8")) for file in files]
+    rows = [json.loads(file.read_text("utf-8")) for file in files]
     return sorted(rows, key=lambda row: (_SCENES.index(row["scene"]), -row["budget"]))
 
 
