@@ -1,8 +1,8 @@
 """Where each room hangs its measuring commands: `bench pareto X`, `bench stability X` and so on.
 
-A room has a folder here; a file in it holds one plain function whose arguments are typer's, with one line in
-`COMMANDS`. The module is imported only when its command (or its group's help) is asked for, so that
-`bench --help` doesn't load Mitsuba and torch.
+A room has a folder here; a function in it that `evidence.measuring` declares has one line in `COMMANDS`. Its
+module is imported only when its command (or its group's help) is asked for, so that `bench --help` doesn't
+load Mitsuba and torch.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ from __future__ import annotations
 import json as json_
 import shlex
 import sys
-from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Any
@@ -18,81 +17,51 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
+from evidence.measuring import Json, hang_into, measuring
 from synth.errors import UserError
 
-Json = Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")]
+COMMANDS = {
+    "experiment flow": "evidence.flow.experiment:experiment",
+    "stability flow": "evidence.flow.stability:stability",
+    "pareto flow": "evidence.flow.pareto:pareto",
+    "experiment realism": "evidence.render.realism:realism_figures",
+    "experiment render": "evidence.render.cost:experiment",
+    "stability render": "evidence.render.stability:stability",
+    "pareto render": "evidence.render.pareto:pareto",
+    "experiment camera-noise": "evidence.render.camera_noise:camera_noise",
+    "experiment cycles": "evidence.render.cycles:cycles",
+    "experiment throughput": "evidence.render.throughput:throughput",
+    "experiment gpu": "evidence.gpu:gpu",
+    "experiment stages": "evidence.engine.stage_costs:stages",
+    "experiment leakage": "evidence.gap.leakage:leakage",
+    "experiment scoring": "evidence.scoring.scoring_cost:cost",
+    "experiment inverse": "evidence.scoring.inverse:experiment",
+    "experiment learn": "evidence.learn.experiment:experiment",
+    "stability learn": "evidence.learn.stability:stability",
+    "experiment loading": "evidence.learn.throughput:loading",
+    "experiment full-size": "evidence.learn.full_size:full_size",
+    "pareto learn": "evidence.learn.pareto:pareto",
+    "experiment tune": "evidence.tune.experiment:experiment",
+    "pareto end-to-end": "evidence.end_to_end.pareto:pareto",
+    "pareto all": "evidence.overview:pareto",
+    "stability all": "evidence.overview:stability",
+    "pareto fem": "evidence.fem.pareto:pareto",
+    "stability fem": "evidence.fem.stability:stability",
+    "experiment surface": "evidence.fem.surface:surface",
+    "stability damage": "evidence.engine.damage:damage",
+    "experiment scale": "evidence.engine.large_index:scale",
+    "stability dask": "evidence.engine.dask:dask",
+    "stability trouble": "evidence.engine.trouble:trouble",
+    "pareto engine": "evidence.engine.speed:speed",
+    "pareto reading": "evidence.engine.reading:reading",
+    "experiment cost": "evidence.engine.cost:cost",
+    "stability faults": "evidence.engine.faults:faults",
+    "stability kills": "evidence.engine.kills:kills",
+}
+"""Words after `bench`, and the function behind them as module:function.
 
-
-@dataclass(frozen=True)
-class Command:
-    """One room's measuring command."""
-
-    group: str
-    """`pareto` (speed against accuracy), `stability` (where it breaks) or `experiment` (a question)."""
-    name: str
-    """The word after the group."""
-    module: str
-    """Module that holds it."""
-    function: str
-    """Function in that module; its docstring's first line is the help."""
-    example: str
-    """What follows the names in the example of its help."""
-
-
-COMMANDS: tuple[Command, ...] = (
-    Command("experiment", "flow", "evidence.flow.experiment", "experiment", "--out runs/flow --only warped"),
-    Command(
-        "stability", "flow", "evidence.flow.stability", "stability", "--out runs/flow --methods tvl1,dis"
-    ),
-    Command("pareto", "flow", "evidence.flow.pareto", "pareto", "--out runs/flow --count 2"),
-    Command("experiment", "realism", "evidence.render.realism", "realism_figures", "cortex.jpg"),
-    Command("experiment", "render", "evidence.render.cost", "experiment", "cost frames"),
-    Command("stability", "render", "evidence.render.stability", "stability", "--out runs/render"),
-    Command("pareto", "render", "evidence.render.pareto", "pareto", "--spp 2 --spp 8 --out runs/render"),
-    Command("experiment", "camera-noise", "evidence.render.camera_noise", "camera_noise", "flats darks"),
-    Command("experiment", "cycles", "evidence.render.cycles", "cycles", "--python bpy/bin/python"),
-    Command("experiment", "throughput", "evidence.render.throughput", "throughput", "--spp 4 --out runs/gpu"),
-    Command("experiment", "gpu", "evidence.gpu", "gpu", "--out runs/gpu"),
-    Command("experiment", "stages", "evidence.engine.stage_costs", "stages", "out --out runs/stages"),
-    Command("experiment", "leakage", "evidence.gap.leakage", "leakage", "out --out runs/leakage"),
-    Command("experiment", "scoring", "evidence.scoring.scoring_cost", "cost", "model --train out"),
-    Command("experiment", "inverse", "evidence.scoring.inverse", "experiment", "--count 10"),
-    Command(
-        "experiment", "learn", "evidence.learn.experiment", "experiment", "--cache cache --out runs/learn"
-    ),
-    Command("stability", "learn", "evidence.learn.stability", "stability", "--cache cache --seeds 2"),
-    Command("experiment", "loading", "evidence.learn.throughput", "loading", "--steps 3 --out runs/loading"),
-    Command("experiment", "full-size", "evidence.learn.full_size", "full_size", "--cache cache --out full"),
-    Command("pareto", "learn", "evidence.learn.pareto", "pareto", "--out runs/learn --repeats 10"),
-    Command("experiment", "tune", "evidence.tune.experiment", "experiment", "--only easy --fresh 3"),
-    Command(
-        "pareto",
-        "end-to-end",
-        "evidence.end_to_end.pareto",
-        "pareto",
-        "--fit 8 --test 6 --out runs/end-to-end",
-    ),
-    Command("pareto", "all", "evidence.overview", "pareto", "--out runs/all"),
-    Command("stability", "all", "evidence.overview", "stability", "--out runs/all"),
-    Command("pareto", "fem", "evidence.fem.pareto", "pareto", "--load 0.3 --out runs/fem"),
-    Command("stability", "fem", "evidence.fem.stability", "stability", "--scenes 100 --out runs/fem"),
-    Command(
-        "experiment", "surface", "evidence.fem.surface", "surface", "brain.obj --direction=-0.4,0.8,0.45"
-    ),
-    Command("stability", "damage", "evidence.engine.damage", "damage", "out --count 50 --out runs/damage"),
-    Command(
-        "experiment", "scale", "evidence.engine.large_index", "scale", "--sequences 10000 --out runs/scale"
-    ),
-    Command("stability", "dask", "evidence.engine.dask", "dask", "--workers 2 --out runs/dask"),
-    Command("stability", "trouble", "evidence.engine.trouble", "trouble", "--sequences 6 --out runs/trouble"),
-    Command("pareto", "engine", "evidence.engine.speed", "speed", "--rendered 4 --out runs/speed"),
-    Command("pareto", "reading", "evidence.engine.reading", "reading", "out --count 50 --out runs/reading"),
-    Command(
-        "experiment", "cost", "evidence.engine.cost", "cost", "out --frames 1000000 --page docs/scaling.md"
-    ),
-    Command("stability", "faults", "evidence.engine.faults", "faults", "--full tiny --read-only ro"),
-    Command("stability", "kills", "evidence.engine.kills", "kills", "--count 20 --out runs/kills"),
-)
+Groups: `pareto` (speed against accuracy), `stability` (where it breaks), `experiment` (a question).
+"""
 
 
 class Rooms(TyperGroup):
@@ -102,25 +71,23 @@ class Rooms(TyperGroup):
     """
 
     def list_commands(self, ctx: Any) -> list[str]:
-        return [entry.name for entry in COMMANDS if entry.group == self.name]
+        return [words.split()[1] for words in COMMANDS if words.split()[0] == self.name]
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
-        for entry in COMMANDS:
-            if entry.group == self.name and entry.name == cmd_name:
-                return load(entry)
-        return None
+        words = f"{self.name} {cmd_name}"
+        return load_command(words) if words in COMMANDS else None
 
 
-def load(entry: Command) -> Any:
+def load_command(words: str) -> Any:
     """The command behind an entry, its module imported.
 
     Raises:
-        ImportError, AttributeError: the entry names what isn't there (a test loads every entry).
+        ImportError, AttributeError, KeyError: the entry names what isn't there, or isn't declared (a test
+            loads every entry).
     """
+    module, _, function = COMMANDS[words].partition(":")
     single = typer.Typer(add_completion=False, rich_markup_mode=None)
-    single.command(entry.name, epilog=f"Example: bench {entry.group} {entry.name} {entry.example}")(
-        getattr(import_module(entry.module), entry.function)
-    )
+    hang_into(single, getattr(import_module(module), function), words)
     return typer.main.get_command(single)
 
 
@@ -132,13 +99,14 @@ def add_to(app: typer.Typer) -> None:
         ("experiment", "One stated question about one room, answered with numbers."),
     ):
         app.add_typer(typer.Typer(name=name, cls=Rooms, help=said, no_args_is_help=True))
-    app.command(epilog="Example: bench pages docs/results --check")(pages)
+    hang_into(app, pages, "pages")
     app.command("make-exvivo", epilog="Example: bench make-exvivo --out recordings --count 2 --seconds 10")(
         make_exvivo
     )
-    app.command(epilog="Example: bench gap out --cache cache --out runs/gap --held-out calf")(gap)
+    hang_into(app, gap, "gap")
 
 
+@measuring("docs/results --check")
 def pages(
     results: Annotated[Path, typer.Argument(help="Folder of results.")] = Path("docs/results"),
     check: Annotated[
@@ -146,8 +114,8 @@ def pages(
     ] = False,
     json: Json = False,
 ) -> None:
-    """Draws picture and page of every experiment anew from its data, where its own command doesn't."""
-    from evidence import catalogue as drawn
+    """Draws picture and page of every experiment anew from its data."""
+    from evidence import pages as drawn
 
     if not results.is_dir():
         raise UserError(f"{results}: no such folder")
@@ -187,12 +155,16 @@ def make_exvivo(
     print(json_.dumps({"recordings": written}) if json else "\n".join(written))
 
 
+@measuring(
+    "out --cache cache --out runs/gap --held-out calf",
+    out="docs/results/gap",
+    said="Folder for the results.",
+    text=lambda found: "\n".join(f"{name}: {verdict['force_mae']}" for name, verdict in found.items()),
+)
 def gap(
     dataset: Annotated[Path, typer.Argument(help="Dataset rendered in several appearance families.")],
     cache: Annotated[Path, typer.Option(help="Folder for packed sequences and trained networks.")],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the results.")] = Path(
-        "docs/results/gap"
-    ),
+    out: Path,
     held_out: Annotated[str, typer.Option(help="Appearance family that no training sees.")] = "calf",
     flow: Annotated[
         list[str] | None,
@@ -201,8 +173,7 @@ def gap(
     preset: Annotated[str, typer.Option(help="Preset of `learn train`.")] = "tiny",
     epochs: Annotated[int | None, typer.Option(min=1, help="Epochs; the preset's if not given.")] = None,
     seeds: Annotated[int, typer.Option(min=1, help="Networks a training.")] = 2,
-    json: Json = False,
-) -> None:
+) -> dict[str, Any]:
     """How much of the sim-to-real gap training on recovered flow closes, and fitted noise alone."""
     from rich.console import Console
 
@@ -221,9 +192,4 @@ def gap(
         shlex.join(["bench", *sys.argv[1:]]),
         lambda line: Console(stderr=True).print(line, markup=False),
     )
-    if json:
-        print(json_.dumps({name: found["verdict"] for name, found in tree["flows"].items()}))
-    else:
-        for name, found in tree["flows"].items():
-            print(f"{name}: {found['verdict']['force_mae']}")
-        print(out / "README.md")
+    return {name: found["verdict"] for name, found in tree["flows"].items()}

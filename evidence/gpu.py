@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-import json as json_
 import subprocess
 import sys
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from bench.output import machine, write
+from evidence.measuring import measuring
 from synth.errors import UserError
 
 Steps = Sequence[tuple[str, Sequence[str]]]
@@ -31,23 +31,22 @@ class Outcome:
     wall_s: float
 
 
+@measuring(
+    "--out runs/gpu",
+    out="docs/results/gpu",
+    said="Folder for logs and gpu.json.",
+    passed=lambda found: not any(one["exit_code"] for one in found),
+)
 def gpu(
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for logs and gpu.json.")] = Path(
-        "docs/results/gpu"
-    ),
+    out: Path,
     limit: Annotated[float, typer.Option(help="Longest that one step may take [s].")] = 900.0,
-    json: Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")] = False,
-) -> None:
+) -> list[dict[str, Any]]:
     """Checks and times everything that an NVIDIA GPU changes. Exit code 1 if a step fails."""
     from synth.render.mitsuba.adapter import cuda
 
     if not cuda():
         raise UserError("no NVIDIA GPU and driver were found; `synth doctor` says what is missing")
-    found = run(steps(out), out, limit)
-    if json:
-        print(json_.dumps([asdict(outcome) for outcome in found]))
-    if any(outcome.exit_code for outcome in found):
-        raise typer.Exit(1)
+    return [asdict(outcome) for outcome in run_steps(steps(out), out, limit)]
 
 
 def steps(out: Path) -> Steps:
@@ -74,7 +73,7 @@ def steps(out: Path) -> Steps:
     )
 
 
-def run(steps: Steps, out: Path, limit_s: float) -> list[Outcome]:
+def run_steps(steps: Steps, out: Path, limit_s: float) -> list[Outcome]:
     """Runs the steps one after another, each into `NAME.log`; one that fails does not stop the next.
 
     Returns:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import html
 import json as json_
+import os
 import shlex
 import subprocess
 import sys
@@ -13,9 +13,10 @@ from typing import Annotated, Any
 
 import typer
 
-from bench.output import plot
+from bench.output import result_page
 from bench.output import write as kept
 from evidence import defaults_on_front
+from evidence.measuring import measuring
 from synth.errors import UserError
 
 Out = Annotated[Path | None, typer.Option("--out", "-o", help="Folder for the page; all/ in the results.")]
@@ -44,6 +45,7 @@ def _bench(words: list[str]) -> int:
     return subprocess.run([sys.executable, "-m", "bench", *words], check=False).returncode
 
 
+@measuring("--out runs/all")
 def pareto(
     out: Out = None, results: Results = defaults_on_front.RESULTS, run: Again = False, json: Json = False
 ) -> None:
@@ -52,20 +54,19 @@ def pareto(
         again([results / name for name in PARETO])
     gathered = defaults_on_front.gather(results)
     rows = defaults_on_front.table(gathered)
-    parts = [
-        "<p>Each default of the code among the points measured for it, none dearer than it needs to be: off "
-        "the front is by how much it costs more than the cheapest point that errs no more, or errs more than "
-        f"the best that costs no more, whichever is less; "
-        f"{100 * defaults_on_front.ALLOWED:.0f}% are allowed. "
-        "Where errors have intervals (end to end) another rule decides: a default is off the front when a "
-        "point that costs no more errs less beyond the interval of their paired difference, and by more than "
-        f"{100 * defaults_on_front.ALLOWED:.0f}%. Rings mark defaults.</p>",
-        plot.table(rows),
-        plot.charts(list(_pareto_panels(results))),
-        *_credits([results / name for name in PARETO]),
-    ]
     folder = out or results / "all" / "pareto"
-    plot.write_page(folder, "Error against cost, every room", parts)
+    words = (
+        "Each default of the code among the points measured for it, none dearer than it needs to be: off "
+        "the front is by how much it costs more than the cheapest point that errs no more, or errs more "
+        f"than the best that costs no more, whichever is less; {100 * defaults_on_front.ALLOWED:.0f}% are "
+        "allowed. Where errors have intervals (end to end) another rule decides: a default is off the "
+        "front when a point that costs no more errs less beyond the interval of their paired difference, "
+        f"and by more than {100 * defaults_on_front.ALLOWED:.0f}%. Rings mark defaults."
+    )
+    tables = [result_page.Section("Defaults", rows), _measured(results, PARETO)]
+    links = _charts(results, PARETO, folder)
+    page = result_page.Page("Error against cost, every room", {}, (), tables, (words,), links=links)
+    result_page.write(page, folder)
     kept.keep(folder, "fronts.json", rows)
     if json:
         print(json_.dumps(rows))
@@ -77,68 +78,50 @@ def pareto(
         raise typer.Exit(1)
 
 
+@measuring("--out runs/all")
 def stability(
     out: Out = None, results: Results = defaults_on_front.RESULTS, run: Again = False, json: Json = False
 ) -> None:
     """Where everything breaks, room by room, on one page."""
     if run:
         again([results / name for name in STABILITY])
-    from evidence.fem import stability as fem_stability
-    from evidence.flow import stability as flow_stability
-
-    fem, flow, render = (defaults_on_front.read(results / name) for name in STABILITY)
-    parts = [
-        "<h2>Physics</h2>",
-        plot.charts(fem_stability.panels(fem)),
-        "<h2>Flow</h2>",
-        plot.charts(flow_stability.panels(flow)),
-        "<h2>Rendering: a correct frame or a clear error</h2>",
-        plot.table(render["cases"]),
-    ]
-    for file in sorted(results.glob("learn/stability/*.json")):
-        found = defaults_on_front.read(file)
-        if found.get("rows"):
-            parts += [f"<h2>Learning: {html.escape(file.stem)}</h2>", plot.table(found["rows"])]
+    cases = defaults_on_front.read(results / STABILITY[-1])["cases"]
+    learning = [(file.stem, defaults_on_front.read(file)) for file in results.glob("learn/stability/*.json")]
     engine = [
-        {"trial": file.parent.name} | {key: value for key, value in _flat(defaults_on_front.read(file))}
+        {"trial": file.parent.name} | dict(_flat(defaults_on_front.read(file)))
         for file in sorted(results.glob("engine/*/*.json"))
         if file.parent.name in ("damage", "dask", "faults", "kills", "kills-real", "trouble")
     ]
-    parts.append("<h2>Engine</h2>")
-    parts += [plot.table([row]) for row in engine]
-    parts += _credits([results / name for name in STABILITY])
+    sections = [
+        result_page.Section("Rendering: a correct frame or a clear error", cases),
+        *(result_page.Section(f"Learning: {name}", found["rows"]) for name, found in sorted(learning)),
+        *(result_page.Section(f"Engine: {row['trial']}", [row]) for row in engine),
+        _measured(results, STABILITY),
+    ]
     folder = out or results / "all" / "stability"
-    plot.write_page(folder, "Where it breaks, every room", parts)
+    links = _charts(results, STABILITY[:-1], folder)
+    page = result_page.Page("Where it breaks, every room", {}, (), sections, links=links)
+    result_page.write(page, folder)
     held = {
-        "render cases": len(render["cases"]),
-        "render cases that held": sum(bool(case["passed"]) for case in render["cases"]),
+        "render cases": len(cases),
+        "render cases that held": sum(bool(case["passed"]) for case in cases),
         "engine trials": len(engine),
     }
     print(json_.dumps(held) if json else folder / "index.html")
 
 
-def _pareto_panels(results: Path) -> Iterator[plot.Panel]:
-    from evidence.end_to_end import page
-    from evidence.fem import pareto as fem_pareto
-    from evidence.flow import pareto as flow_pareto
-    from evidence.learn import pareto as learn_pareto
-    from evidence.learn import preset_errors
-    from evidence.render import pareto as render_pareto
-
-    yield from page.panels(defaults_on_front.read(results / "end-to-end/pareto.json"))
-    yield from fem_pareto.panels(defaults_on_front.read(results / "fem/pareto/pareto.json"))
-    yield from render_pareto.panels(defaults_on_front.read(results / "render/pareto/pareto.json"))
-    yield from flow_pareto.panels(defaults_on_front.read(results / "flow/pareto/pareto.json"))
-    rows = learn_pareto.with_errors(
-        defaults_on_front.read(results / "learn/pareto/data-cpu.json")["rows"],
-        preset_errors.errors(results / "learn"),
-    )
-    yield from learn_pareto.chart(rows, "cpu")
+def _charts(results: Path, files: Sequence[str], folder: Path) -> list[str]:
+    """The rooms' own charts, as seen from `folder`."""
+    return [os.path.relpath((results / file).with_name("chart.svg"), folder) for file in files]
 
 
-def _credits(files: list[Path]) -> list[str]:
+def _measured(results: Path, files: Sequence[str]) -> result_page.Section:
     """Command and machine of each file."""
-    return [plot.credit(defaults_on_front.read(file)) for file in files]
+    found = {file: defaults_on_front.read(results / file) for file in files}
+    rows = [
+        {"data": file, "command": one.get("command"), **one.get("machine", {})} for file, one in found.items()
+    ]
+    return result_page.Section("Measured", rows)
 
 
 def _flat(found: dict[str, Any]) -> Iterator[tuple[str, Any]]:

@@ -1,165 +1,109 @@
 """What each folder of results shows, drawn from its data alone: `bench pages` writes and checks it.
 
-Rooms whose own command draws points against cost or trouble (`pareto`, `stability`, tuning) are not here.
+Only the pages of all rooms together are not here (`evidence.overview`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from bench.output import forest_plot, plot
-from bench.output.result_page import Chart, Sheet, bars, flat
+from bench.output import charts, result_page
+from bench.output.charts import Chart, bars
+from bench.output.result_page import Page, Section
 from bench.scoring import pool
 from evidence.defaults_on_front import read
-from evidence.gap import experiment, leakage
-from evidence.learn import run_table, summary
+from evidence.learn import preset_errors, run_table, summary
 
 Tree = Mapping[str, Any]
 
 
-def every(results: Path) -> Iterator[tuple[Path, Sheet]]:
-    """The folders that have data, each with its sheet.
+def stale(folder: Path) -> list[Path]:
+    """Files under a folder of results that are not what their data say."""
+    return [place / name for place, page in every(folder) for name in result_page.stale(page, place)]
+
+
+def write(folder: Path) -> list[Path]:
+    """Writes them; gives back those that changed."""
+    return [place / name for place, page in every(folder) for name in result_page.write(page, place)]
+
+
+def every(results: Path) -> Iterator[tuple[Path, Page]]:
+    """The folders that have data, each with its page.
 
     Raises:
         UserError: data that cannot be read.
     """
-    for name, (file, draw) in _FILES.items():
+    for name, (file, drawn) in _FILES.items():
         if (results / name / file).is_file():
+            # A room's module is loaded where it has data: some of them load a renderer.
+            draw = drawn if callable(drawn) else import_module(f"evidence.{drawn}").drawn
             yield results / name, draw(read(results / name / file))
     for name, gather in _FOLDERS.items():
         if any((results / name).rglob("*.json")):
-            yield results / name, gather(results / name)
+            draw = gather if callable(gather) else import_module(f"evidence.{gather}").drawn
+            yield results / name, draw(results / name)
     for runs in sorted(results.glob("learn/*/runs.json")):
         yield runs.parent, learning(runs.parent)
 
 
-def inverse(found: Tree) -> Sheet:
-    """Error by method, a picture a law of the tissue."""
-    charts = [
-        Chart(
-            f"{law} tissue: error of the force's size, 90% within the bar",
-            "mN",
-            tuple(
-                forest_plot.Row(name, m["size_mae_mn"], (m["size_mae_mn"], m["size_p90_mn"]))
-                for name, m in one["methods"].items()
-            ),
-        )
-        for law, one in found["tissue"].items()
-    ]
-    tables = [
-        (f"{law} tissue", [{"method": name} | m for name, m in one["methods"].items()])
-        for law, one in found["tissue"].items()
-    ]
-    return Sheet("Force by physics alone", "bench experiment inverse", found, tuple(charts), tuple(tables))
-
-
-def scoring(found: Tree) -> Sheet:
-    """Time by stage."""
-    stages = {name: t["wall_s"] for name, t in found["timings"].items() if isinstance(t, Mapping)}
-    title = (
-        f"{found['seconds']:g} s of {found['size'][0]} x {found['size'][1]}: {found['wall_s']:.0f} s in all"
-    )
-    timed = [{"stage": n} | dict(t) for n, t in found["timings"].items() if isinstance(t, Mapping)]
-    return Sheet(
-        "What scoring costs",
-        found["command"],
-        found,
-        (Chart(title, "wall s by stage, two processes side by side", bars(stages)),),
-        (("Stages", timed),),
-    )
-
-
-def stages(found: Tree) -> Sheet:
+def stages(found: Tree) -> Page:
     """CPU time a frame by stage, up to the largest of a sequence."""
     costs = found["cpu_s_a_frame"]
     ends = {name: (c["median"], c["largest"]) for name, c in costs.items()}
     rows = bars({name: c["median"] for name, c in costs.items()}, ends)
-    return Sheet(
+    chart = Chart("Median over sequences; the bar ends at the largest", "CPU time a frame [s]", rows)
+    return Page(
         "The whole way, by stage",
-        "bench experiment stages runs/demo/data -o docs/results/pipeline/stages",
         found,
-        (Chart("Median over sequences; the bar ends at the largest", "CPU s a frame", rows),),
-        (("In all", flat(found)),),
+        [chart],
+        [Section("In all", flat(found))],
+        command="bench experiment stages runs/demo/data -o docs/results/pipeline/stages",
+        name=_BESIDE,
     )
 
 
-def flow(found: Tree) -> Sheet:
-    """Every figure asked, as a part of what was allowed."""
-    rows = [row for part in found.values() if "rows" in part for row in part["rows"]]
-    charts = []
-    for on in dict.fromkeys(row["on"] for row in rows if row["asked"]):
-        shares = {
-            row["what"]: (
-                row["asked"] / row["measured"] if row["at_least"] else row["measured"] / row["asked"]
-            )
-            for row in rows
-            if row["on"] == on and row["asked"]
-        }
-        charts.append(Chart(f"{on}: reached where at most 1", "measured / asked", bars(shares)))
-    commands = "; ".join(part["command"] for part in found.values() if "command" in part)
-    return Sheet("Flow: asked against measured", commands, found, tuple(charts), (("Figures", rows),))
-
-
-def live(found: Tree) -> Sheet:
+def live(found: Tree) -> Page:
     """Latency of a live stream."""
-    kept = {k: found[k] for k in ("p50_ms", "p95_ms", "p99_ms", "mask_ms") if k in found}
-    rows = bars(kept)
-    return Sheet(
-        "Flow on a live stream",
-        found["command"],
-        found,
-        (Chart("Latency", "ms", rows),),
-        (("All", flat(found)),),
-    )
+    shown = bars({k: found[k] for k in ("p50_ms", "p95_ms", "p99_ms", "mask_ms") if k in found})
+    chart = Chart("Latency", "ms", shown)
+    return Page("Flow on a live stream", found, [chart], [Section("All", flat(found))])
 
 
-def cycles(found: Tree) -> Sheet:
+def cycles(found: Tree) -> Page:
     """Noise against cost, ours and Cycles'."""
-    curves = tuple(
-        plot.Curve(
-            name,
-            tuple(row["cpu_s"] for row in found["rows"] if row["renderer"] == name),
-            tuple(row["noise"] for row in found["rows"] if row["renderer"] == name),
-            tuple(f"{row['spp']} spp" for row in found["rows"] if row["renderer"] == name),
-        )
-        for name in dict.fromkeys(row["renderer"] for row in found["rows"])
-    )
-    panel = plot.Panel("The same scene in both", "CPU s a picture", "noise / mean", curves, True, True)
+    curves = []
+    for name in dict.fromkeys(row["renderer"] for row in found["rows"]):
+        own = [row for row in found["rows"] if row["renderer"] == name]
+        x, y = (tuple(row[key] for row in own) for key in ("cpu_s", "noise"))
+        curves.append(charts.Curve(name, x, y, tuple(f"{row['spp']} spp" for row in own)))
+    unit = "CPU time a picture [s]"
+    panel = charts.Panel("The same scene in both", unit, "noise / mean", tuple(curves), True, True)
     command = "bench experiment cycles --python PY --spp 2 --spp 4 --spp 16"
-    return Sheet("Against Cycles", command, found, (panel,), (("Pictures", found["rows"]),))
+    return Page("Against Cycles", found, [panel], [Section("Pictures", found["rows"])], command=command)
 
 
-def realism(found: Tree) -> Sheet:
+def realism(found: Tree) -> Page:
     """Statistics of renders in units of the photograph's spread."""
-    rows = []
+    shown = []
     for one in found["statistics"]:
-        (low, middle, high), (a, b, c) = one["photograph"], one["rendered"]
-        wide = max(high - low, 1e-12)
-        rows.append(
-            forest_plot.Row(one["statistic"], (b - middle) / wide, ((a - middle) / wide, (c - middle) / wide))
-        )
+        (low, middle, high), rendered = one["photograph"], one["rendered"]
+        a, b, c = ((value - middle) / max(high - low, 1e-12) for value in rendered)
+        shown.append(charts.Row(one["statistic"], b, (a, c)))
     unit = "quantiles of renders less the photograph's median, over its own spread"
-    return Sheet(
+    title = "Within half a unit or so: as the photograph's own crops differ"
+    return Page(
         "Against a photograph",
-        "bench experiment realism PHOTO",
         found,
-        (Chart("Within half a unit or so: as the photograph's own crops differ", unit, tuple(rows)),),
-        (("Statistics", [{k: str(v) for k, v in one.items()} for one in found["statistics"]]),),
+        [Chart(title, unit, tuple(shown))],
+        [Section("Statistics", found["statistics"])],
+        command="bench experiment realism PHOTO",
     )
 
 
-def loading(found: Tree) -> Sheet:
-    """Time of a training step."""
-    rows = bars({row["way"]: row["frames/s"] for row in found["rows"]})
-    chart = Chart("Training on one thread", "frames a second", rows)
-    return Sheet(
-        "Training throughput", "bench experiment loading", found, (chart,), (("Ways", found["rows"]),)
-    )
-
-
-def render_cost(folder: Path) -> Sheet:
+def render_cost(folder: Path) -> Page:
     """Memory over time, and every other figure in a table."""
     found = {file.stem: read(file) for file in sorted(folder.glob("*.json"))}
     curves = []
@@ -167,77 +111,89 @@ def render_cost(folder: Path) -> Sheet:
         if name in found:
             memory, count = found[name]["every_tenth_mb"], found[name]["count"]
             so_far = tuple(float(k + 1) * count / len(memory) for k in range(len(memory)))
-            curves.append(plot.Curve(words, so_far, tuple(memory)))
-    panel = plot.Panel("Memory of one process", "frames or scenes so far", "MB", tuple(curves), log_x=True)
-    tables = tuple((name, flat(one)) for name, one in found.items())
+            curves.append(charts.Curve(words, so_far, tuple(memory)))
+    panel = charts.Panel(
+        "Memory of one process", "frames or scenes so far", "memory [MB]", tuple(curves), log_x=True
+    )
+    tables = [Section(name, flat(one)) for name, one in found.items()]
     command = "bench experiment render cost first truth bytes frames scenes"
-    return Sheet("Rendering: cost, truth, memory", command, {"machine": _machine(found)}, (panel,), tables)
+    return Page(
+        "Rendering: cost, truth, memory", {"machine": _machine(found)}, [panel], tables, command=command
+    )
 
 
-def engine(folder: Path) -> Sheet:
+def engine(folder: Path) -> Page:
     """Every trial's figures as a part of what was allowed, and all of them in tables."""
     found = {file.parent.name: read(file) for file in sorted(folder.glob("*/*.json"))}
     shares = {words: share(found[name]) for name, words, share in _ENGINE if name in found}
     chart = Chart("Reached where at most 1", "found / allowed", bars(shares))
-    tables = tuple((name, flat(one)) for name, one in found.items())
-    return Sheet("Engine", "; ".join(_ENGINE_COMMANDS), {"machine": _machine(found)}, (chart,), tables)
-
-
-def learning(folder: Path) -> Sheet:
-    """What every loss, network and control comes to, over the tested sequences."""
-    found = [run for run in run_table.read(folder) if not run["control"]]
-    charts = []
-    for key, words in summary.COLUMNS:
-        rows = [
-            forest_plot.Row(f"{name} ({seeds})", value.mean, (value.low, value.high))
-            for name, seeds, value in summary.families(found, key)
-        ]
-        charts.append(
-            Chart(words, "mean over tested sequences, BCa interval; in brackets: runs", tuple(rows))
-        )
-    command = " ".join(["bench experiment learn --cache CACHE", *_LEARNING.get(folder.name, ())])
-    return Sheet(f"Learning: {folder.name}", command, {}, tuple(charts))
-
-
-def learn_stability(folder: Path) -> Sheet:
-    """How much R² of the map each disturbance leaves."""
-    found = {file.stem: read(file) for file in sorted(folder.glob("*.json"))}
-    charts = []
-    for name, one in found.items():
-        rows = [row for row in one["rows"] if row.get("map R²") is not None]
-        if rows:
-            values = {", ".join(str(row[k]) for k in _SAID if k in row): row["map R²"] for row in rows}
-            charts.append(Chart(f"{name}: R² of the map", "pooled over tested sequences", bars(values)))
-    tables = tuple((name, one["rows"]) for name, one in found.items())
-    machine = {"machine": _machine(found)}
-    return Sheet(
-        "Learning: where it breaks", "bench stability learn --cache CACHE", machine, tuple(charts), tables
+    return Page(
+        "Engine: every trial's figures",
+        {"machine": _machine(found)},
+        [chart],
+        [Section(name, flat(one)) for name, one in found.items()],
+        command="; ".join(_ENGINE_COMMANDS),
+        name=_BESIDE,
     )
 
 
-def surface(folder: Path) -> Sheet:
+def learning(folder: Path) -> Page:
+    """What every loss, network and control comes to, over the tested sequences."""
+    found = [run for run in run_table.read(folder) if not run["control"]]
+    shown: list[Chart] = []
+    table: dict[str, dict[str, Any]] = {}
+    for key, words in summary.COLUMNS:
+        rows = []
+        for name, seeds, value in summary.families(found, key):
+            said = f"{name} ({seeds})"
+            rows.append(charts.Row(said, value.mean, (value.low, value.high)))
+            text = f"{value.mean:.4g} [{value.low:.4g}, {value.high:.4g}]"
+            table.setdefault(said, {"runs": said})[words] = text
+        unit = "mean over tested sequences, BCa interval; in brackets: runs"
+        shown.append(Chart(words, unit, tuple(rows)))
+    command = " ".join(["bench experiment learn --cache CACHE", *_LEARNING.get(folder.name, ())])
+    tables = [Section("All figures", list(table.values()))]
+    return Page(f"Learning: {folder.name}", {}, shown, tables, command=command)
+
+
+def learn_pareto(folder: Path) -> Page:
+    """Errors are of the runs beside it."""
+    from evidence.learn import pareto
+
+    return pareto.drawn(folder, preset_errors.errors(folder.parent))
+
+
+def surface(folder: Path) -> Page:
     """Volume kept and error by size of mesh, a real surface each."""
     found = {file.stem: read(file) for file in sorted(folder.glob("*.json"))}
-    panels = [
-        plot.Panel(
-            words,
-            "tetrahedra",
-            unit,
-            tuple(
-                plot.Curve(
-                    name, tuple(r["tets"] for r in one["rows"]), tuple(100 * r[key] for r in one["rows"])
-                )
-                for name, one in found.items()
-            ),
-        )
-        for key, words, unit in (
-            ("error", "Displacement of the opening against the finest mesh", "%"),
-            ("volume_kept", "Volume kept", "%"),
-        )
-    ]
-    tables = tuple((name, one["rows"]) for name, one in found.items())
+    panels = []
+    for key, words in (
+        ("error", "Displacement of the opening against the finest mesh"),
+        ("volume_kept", "Volume kept"),
+    ):
+        curves = []
+        for name, one in found.items():
+            sizes = tuple(row["tets"] for row in one["rows"])
+            curves.append(charts.Curve(name, sizes, tuple(100 * row[key] for row in one["rows"])))
+        panels.append(charts.Panel(words, "tetrahedra", "%", tuple(curves)))
+    tables = [Section(name, one["rows"]) for name, one in found.items()]
     commands = "; ".join(one["command"] for one in found.values())
-    return Sheet("Real surfaces", commands, {"machine": _machine(found)}, tuple(panels), tables)
+    return Page("Real surfaces", {"machine": _machine(found)}, panels, tables, command=commands)
+
+
+def flat(tree: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """What a result says in single values, as rows of two columns; lists and the machine are left out."""
+    rows: list[dict[str, Any]] = []
+
+    def walk(node: Mapping[str, Any], before: str) -> None:
+        for key, value in node.items():
+            if isinstance(value, Mapping) and key != "machine":
+                walk(value, f"{before}{key}: ")
+            elif not isinstance(value, (list, Mapping)):
+                rows.append({"what": f"{before}{key}", "value": value})
+
+    walk(tree, "")
+    return rows
 
 
 def _machine(found: Mapping[str, Tree]) -> dict[str, str]:
@@ -253,8 +209,6 @@ _LEARNING = {
     "recovered": ("--rendered", "DATASET"),
 }
 """Folder of learn's results -> what else its command says."""
-_SAID = ("trained with", "contacts", "gesture", "shown", "trained", "confidence", "s")
-"""What names a row of learn's stability."""
 _ENGINE_COMMANDS = (
     "bench pareto engine",
     "bench pareto reading DATASET",
@@ -275,22 +229,34 @@ _ENGINE: tuple[tuple[str, str, Callable[[Tree], float]], ...] = (
     ("scale", "memory for it, 1 GB", lambda f: f["report"]["peak_mb"] / 1000),
     ("reading", "a random frame, 20 ms", lambda f: f["sets"][1]["ours"]["median_ms"] / 20),
 )
-_FILES: Mapping[str, tuple[str, Callable[[Tree], Sheet]]] = {
-    "exvivo": ("pool.json", pool.drawn),
-    "gap": ("results.json", experiment.drawn),
-    "inverse": ("results.json", inverse),
-    "leakage": ("results.json", leakage.drawn),
-    "scoring": ("results.json", scoring),
+_BESIDE = "figures.html"
+"""Where a README stands, which the site shows as the folder's page."""
+_FILES: Mapping[str, tuple[str, str | Callable[[Tree], Page]]] = {
+    "exvivo": ("pool.json", lambda found: pool.drawn(found, "README.md")),
+    "gap": ("results.json", "gap.experiment"),
+    "inverse": ("results.json", "scoring.inverse"),
+    "leakage": ("results.json", "gap.leakage"),
+    "scoring": ("results.json", "scoring.scoring_cost"),
     "pipeline": ("stages/stages.json", stages),
-    "flow/benchmark": ("results.json", flow),
+    "end-to-end": ("pareto.json", "end_to_end.page"),
+    "fem/pareto": ("pareto.json", "fem.pareto"),
+    "fem/stability": ("stability.json", "fem.stability"),
+    "flow/benchmark": ("results.json", "flow.experiment"),
     "flow/live": ("live.json", live),
+    "flow/pareto": ("pareto.json", "flow.pareto"),
+    "flow/stability": ("stability.json", "flow.stability"),
     "render/cycles": ("cycles.json", cycles),
+    "render/pareto": ("pareto.json", "render.pareto"),
     "render/realism": ("realism.json", realism),
-    "learn/loading": ("data-cpu.json", loading),
+    "render/stability": ("stability.json", "render.stability"),
 }
-_FOLDERS: Mapping[str, Callable[[Path], Sheet]] = {
+"""Folder -> its data, and what draws them: a function here, or the module that has `drawn`."""
+_FOLDERS: Mapping[str, str | Callable[[Path], Page]] = {
     "render/cost": render_cost,
     "engine": engine,
     "fem/surface": surface,
-    "learn/stability": learn_stability,
+    "learn/loading": "learn.throughput",
+    "learn/pareto": learn_pareto,
+    "learn/stability": "learn.stability",
+    "tune": "tune.experiment",
 }

@@ -20,8 +20,3 @@ def describe() -> dict[str, str | int | float]:
         "system": platform.system(),
         "python": platform.python_version(),
     }
-
-
-def line(found: dict[str, str | int | float]) -> str:
-    """`describe`'s answer in a few words."""
-    return f"{found['processor']}, {found['cores']} cores, {found['memory_gb']:.0f} GB, no GPU used"

@@ -1,121 +1,139 @@
-"""The page of an experiment's results: what made them, pictures, tables; and the pictures as one drawing."""
+"""What an experiment's folder shows, as a page to open (`index.html`) or to read (`README.md`)."""
 
 from __future__ import annotations
 
 import html
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from bench.output import forest_plot, plot
+import jinja2
+from markupsafe import Markup
+
 from bench.output import write as results
+from bench.output.charts import Chart, Panel, curves, intervals
 
 Rows = Sequence[Mapping[str, Any]]
+_NAMES = ("chart.svg", "intervals.svg")
 
 
 @dataclass(frozen=True)
-class Chart:
-    """One picture: a line a value."""
+class Section:
+    """A table with its heading and what is said of it; any of them may be empty."""
 
-    title: str
-    unit: str
-    rows: tuple[forest_plot.Row, ...]
+    heading: str
+    rows: Rows = ()
+    words: Sequence[str] = ()
+    """Paragraphs; one that begins with "- " is an item of a list."""
 
-    def drawing(self) -> str:
-        return forest_plot.draw(self.rows, self.title, self.unit)
+    @property
+    def columns(self) -> list[str]:
+        """Keys of all rows, but for those of trees, which are no cells."""
+        names = dict.fromkeys(name for row in self.rows for name in row)
+        return [name for name in names if not any(isinstance(row.get(name), Mapping) for row in self.rows)]
 
 
 @dataclass(frozen=True)
-class Sheet:
-    """What a folder of results shows."""
+class Page:
+    """What made the data, pictures, tables."""
 
     title: str
-    command: str
     found: Mapping[str, Any]
-    """The data: machine and seed, if they are in it, stand under the title."""
-    charts: tuple[Chart | plot.Panel, ...]
-    tables: tuple[tuple[str, Rows], ...] = field(default=())
-    """Each with its heading."""
+    """The data: its command, machine and seed are said if they are in it."""
+    charts: Sequence[Chart | Panel] = ()
+    """Intervals and curves, a picture each kind."""
+    sections: Sequence[Section] = ()
+    words: Sequence[str] = ()
+    """Said before all else; may hold `code` and *emphasis*."""
+    command: str = ""
+    """Where the data don't name it; several are parted by "; "."""
+    name: str = "index.html"
+    """Of the page's file; an ending `.md` makes it Markdown."""
+    links: Sequence[str] = ()
+    """Pictures that other pages have made."""
+
+    @property
+    def commands(self) -> list[str]:
+        """What was typed."""
+        said = self.command or str(self.found.get("command", ""))
+        return said.split("; ") if said else []
+
+    @property
+    def made(self) -> str:
+        """Machine and seed."""
+        machine = ", ".join(f"{key} {value}" for key, value in self.found.get("machine", {}).items())
+        seed = f"Seed {self.found['seed']}." if "seed" in self.found else ""
+        return f"{f'Machine: {machine}.' if machine else ''} {seed}".strip()
+
+    @property
+    def pictures(self) -> list[str]:
+        """Files that the page shows."""
+        return [*_NAMES[: len({type(one) for one in self.charts})], *self.links]
+
+    def text(self) -> str:
+        """The page as HTML or as Markdown, whichever the name of its file says."""
+        kind = self.name.rpartition(".")[2]
+        environment = jinja2.Environment(
+            loader=jinja2.PackageLoader("bench.output", "."),
+            autoescape=kind == "html",
+            undefined=jinja2.StrictUndefined,
+            trim_blocks=True,
+            keep_trailing_newline=True,
+        )
+        environment.filters |= {"cell": _cell, "spans": _spans, "table": markdown}
+        return environment.get_template(f"page.{kind}.jinja").render(page=self)
 
     def files(self) -> dict[str, str]:
-        """Text of `chart.svg`, if there is a chart, and of `index.html`."""
-        drawings = [plot.drawing([c]) if isinstance(c, plot.Panel) else c.drawing() for c in self.charts]
-        seed = f"<p>seed {self.found['seed']}</p>" if "seed" in self.found else ""
-        parts = [plot.credit({**self.found, "command": self.command}), seed, *drawings]
-        for heading, rows in self.tables:
-            parts += [f"<h2>{html.escape(heading)}</h2>", plot.table(rows)] if rows else []
-        page = {"index.html": plot.page(self.title, "\n".join(part for part in parts if part))}
-        return ({"chart.svg": together(drawings)} if drawings else {}) | page
+        """Text of the page and of its own pictures, by name."""
+        return {self.name: self.text()} | self._drawn()
+
+    def _drawn(self) -> dict[str, str]:
+        panels = [one for one in self.charts if isinstance(one, Panel)]
+        rows = [one for one in self.charts if isinstance(one, Chart)]
+        drawn = ([curves(panels)] if panels else []) + ([intervals(rows)] if rows else [])
+        return dict(zip(_NAMES, drawn, strict=False))
 
 
-def together(drawings: Sequence[str]) -> str:
-    """SVGs one below the other, as one."""
-    sizes = [_size(one) for one in drawings]
-    wide, tall = max(w for w, _ in sizes), sum(h for _, h in sizes)
-    top, parts = 0.0, []
-    for one, (w, h) in zip(drawings, sizes, strict=True):
-        # The inner picture's own width, height and style would fight with the place it is given.
-        inner = _OPENING.sub("", one.strip(), count=1)
-        parts.append(
-            f'<svg x="0" y="{top:g}" width="{w:g}" height="{h:g}" viewBox="0 0 {w:g} {h:g}" {_FONT}>'
-        )
-        parts.append(inner)
-        top += h
-    head = f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {wide:g} {tall:g}" {_FONT}>'
-    return (
-        "\n".join([head, f'<rect width="{wide:g}" height="{tall:g}" fill="#fff"/>', *parts, "</svg>"]) + "\n"
-    )
+def markdown(rows: Rows) -> str:
+    """A table in Markdown, columns being the keys of all rows."""
+    names = Section("", rows).columns
+    lines = [names, ["---"] * len(names), *([_cell(row.get(name)) for name in names] for row in rows)]
+    return "\n".join(f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in line)} |" for line in lines)
 
 
-def bars(
-    values: Mapping[str, float], ends: Mapping[str, tuple[float, float]] | None = None
-) -> tuple[forest_plot.Row, ...]:
-    """A line a value, with its interval where there is one."""
-    known = ends or {}
-    nan = (float("nan"), float("nan"))
-    return tuple(forest_plot.Row(name, float(value), known.get(name, nan)) for name, value in values.items())
-
-
-def flat(tree: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """What a result says in single values, as rows of two columns; lists and the machine are left out."""
-    rows: list[dict[str, Any]] = []
-
-    def walk(node: Mapping[str, Any], before: str) -> None:
-        for key, value in node.items():
-            if isinstance(value, Mapping) and key != "machine":
-                walk(value, f"{before}{key}: ")
-            elif not isinstance(value, (list, Mapping)):
-                rows.append({"what": f"{before}{key}", "value": value})
-
-    walk(tree, "")
-    return rows
-
-
-def write(sheet: Sheet, folder: Path) -> list[str]:
+def write(page: Page, folder: Path) -> list[str]:
     """Writes its files into `folder`; gives back the names of those that changed."""
-    changed = {name: text for name, text in sheet.files().items() if not _same(folder / name, text)}
+    changed = _changed(page, folder)
     for name, text in changed.items():
         results.keep(folder, name, text)
     return list(changed)
 
 
-def stale(sheet: Sheet, folder: Path) -> list[str]:
-    """Names of the files in `folder` that are not what the sheet says."""
-    return [name for name, text in sheet.files().items() if not _same(folder / name, text)]
+def stale(page: Page, folder: Path) -> list[str]:
+    """Names of the files in `folder` that are not what the page says."""
+    return list(_changed(page, folder))
 
 
-_OPENING = re.compile(r"<svg[^>]*>")
-_FONT = 'font-family="sans-serif" font-size="12" fill="#22262b"'
+def _changed(page: Page, folder: Path) -> dict[str, str]:
+    def same(name: str, text: str) -> bool:
+        return (folder / name).is_file() and (folder / name).read_text("utf-8") == text
+
+    return {name: text for name, text in page.files().items() if not same(name, text)}
 
 
-def _size(drawing: str) -> tuple[float, float]:
-    found = re.search(r'viewBox="0 0 ([\d.]+) ([\d.]+)"', drawing)
-    if found is None:
-        raise ValueError("a drawing without a viewBox")
-    return float(found[1]), float(found[2])
+def _cell(value: Any) -> str:
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if value is None:
+        return "–"
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
-def _same(file: Path, text: str) -> bool:
-    return file.is_file() and file.read_text("utf-8") == text
+def _spans(line: str) -> Markup:
+    """Markdown's `code` and *emphasis* as HTML."""
+    text = html.escape(line, quote=False)
+    for mark, tag in (("`", "code"), (r"\*", "em")):
+        text = re.sub(f"{mark}(.+?){mark}", rf"<{tag}>\1</{tag}>", text)
+    return Markup(text)

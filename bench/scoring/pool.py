@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from bench.bootstrap import Interval, over_groups
-from bench.output import forest_plot, machine, result_page
+from bench.bootstrap import over_groups
+from bench.output import charts, machine, result_page
 from bench.output import write as results
 from bench.scoring.metrics import METRICS
 from synth.errors import UserError
@@ -113,64 +113,56 @@ def write(tree: dict[str, Any], out: Path, command: str) -> None:
     """pool.json, README.md, chart.svg and index.html in the folder `out`."""
     tree = tree | {"command": command, "machine": machine.describe()}
     results.keep(out, "pool.json", json.dumps(tree, indent=1, allow_nan=False) + "\n")
-    results.keep(out, "README.md", readme(tree))
-    result_page.write(drawn(tree), out)
+    for name in ("README.md", "index.html"):
+        result_page.write(drawn(tree, name), out)
 
 
-def drawn(tree: Mapping[str, Any]) -> result_page.Sheet:
-    """Page and picture of `pool.json`."""
-    rows = tuple(
-        forest_plot.Row(
-            name,
-            _number(m["scores"]["mae_of_peak"]["mean"]),
-            _ends(m["scores"]["mae_of_peak"]),
-            name == tree["main"],
-        )
-        for name, m in tree["methods"].items()
-    )
-    title = f"{len(tree['recordings'])} recordings"
-    chart = result_page.Chart(title, "mean error as a share of the event peak", rows)
-    return result_page.Sheet(title, tree["command"], tree, (chart,))
-
-
-def readme(tree: dict[str, Any]) -> str:
-    """The pooled scores as a table; methods that beat the main one are marked."""
-    shown = [(key, name) for key, name in SCORES if key not in ("bias_mn", "impulse_mae", "dropout")]
-    lines = [
-        f"# {len(tree['recordings'])} recordings, {tree['specimens']} specimens, {tree['frames']} frames",
-        "",
-        "Means over recordings; in brackets 95% intervals, specimens resampled.",
-        "",
-        f"    {tree['command']}",
-        "",
-        f"Machine: {machine.line(tree['machine'])}.",
-        "",
-        "| method | " + " | ".join(name for _, name in (*shown, *_CALIBRATED)) + " |",
-        "|" + " --- |" * (1 + len(shown) + len(_CALIBRATED)),
-    ]
+def drawn(tree: Mapping[str, Any], name: str = "index.html") -> result_page.Page:
+    """What `pool.json` says; methods that beat the main one are marked."""
+    shown = [(key, head) for key, head in SCORES if key not in ("bias_mn", "impulse_mae", "dropout")]
     own = _number(tree["methods"][tree["main"]]["scores"]["mae_mn"]["mean"])
-    for name, method in tree["methods"].items():
-        beats = name != tree["main"] and _number(method["scores"]["mae_mn"]["mean"]) < own
-        cells = [_text(method["scores"][key], METRICS[key].digits) for key, _ in shown]
-        cells += [_text(method["calibrated"][key], METRICS[key].digits) for key, _ in _CALIBRATED]
-        word = name.replace("|", r"\|")
-        lines.append(f"| {'**' + word + '** (better)' if beats else word} | " + " | ".join(cells) + " |")
-    for name, reason in tree["left_out"].items():
-        lines += ["", f"Recording {name} is left out: {reason}."]
-    lines += ["", f"By recording, {tree['main']}:", ""]
-    lines += [
-        "| recording | frames | event peak [mN] | MAE of it | r | clocks' offset [ms] |",
-        "|" + " --- |" * 6,
-    ]
-    for row in tree["each"]:
-        peak, mae, r = (_number(row[key]) for key in ("event_peak_mn", "mae_of_peak", "r"))
-        offset = "–"
-        if row["offset_s"] is not None:
-            offset = f"{1e3 * row['offset_s']:.0f} ± {1e3 * _number(row['offset_deviation_s']):.0f}"
-        lines.append(
-            f"| {row['recording']} | {row['frames']} | {peak:.2f} | {mae:.1%} | {r:.3f} | {offset} |"
+    bars, rows = [], []
+    for method, found in tree["methods"].items():
+        scores, error = found["scores"], found["scores"]["mae_of_peak"]
+        ends = (_number(error["low"]), _number(error["high"]))
+        bars.append(charts.Row(method, _number(error["mean"]), ends, method == tree["main"]))
+        better = method != tree["main"] and _number(scores["mae_mn"]["mean"]) < own
+        rows.append(
+            {"method": f"{method} (better)" if better else method}
+            | {head: _text(scores[key], METRICS[key].digits) for key, head in shown}
+            | {head: _text(found["calibrated"][key], METRICS[key].digits) for key, head in _CALIBRATED}
         )
-    return "\n".join([*lines, "", "![Errors](chart.svg)", ""])
+    count = f"{len(tree['recordings'])} recordings"
+    chart = charts.Chart(count, "mean error as a share of the event peak", tuple(bars))
+    return result_page.Page(
+        f"{count}, {tree['specimens']} specimens, {tree['frames']} frames",
+        tree,
+        [chart],
+        (
+            result_page.Section("", rows),
+            result_page.Section(f"By recording, {tree['main']}", [_line(row) for row in tree["each"]]),
+        ),
+        (
+            "Means over recordings; in brackets 95% intervals, specimens resampled.",
+            *(f"Recording {lost} is left out: {why}." for lost, why in tree["left_out"].items()),
+        ),
+        name=name,
+    )
+
+
+def _line(row: Mapping[str, Any]) -> dict[str, str]:
+    """One recording for the table."""
+    offset = "–"
+    if row["offset_s"] is not None:
+        offset = f"{1e3 * row['offset_s']:.0f} ± {1e3 * _number(row['offset_deviation_s']):.0f}"
+    return {
+        "recording": row["recording"],
+        "frames": str(row["frames"]),
+        "event peak [mN]": f"{_number(row['event_peak_mn']):.2f}",
+        "MAE of it": f"{_number(row['mae_of_peak']):.1%}",
+        "r": f"{_number(row['r']):.3f}",
+        "clocks' offset [ms]": offset,
+    }
 
 
 def _mean(values: Sequence[float | None], specimens: Sequence[str]) -> dict[str, float | None]:
@@ -187,10 +179,6 @@ def _numbers(values: Sequence[float | None]) -> list[float]:
 
 def _number(value: float | None) -> float:
     return math.nan if value is None else value
-
-
-def _ends(value: dict[str, float | None]) -> Interval:
-    return (_number(value["low"]), _number(value["high"]))
 
 
 def _text(value: dict[str, float | None], digits: int) -> str:

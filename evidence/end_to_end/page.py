@@ -1,30 +1,47 @@
-"""The page, chart and README of `bench pareto end-to-end`."""
+"""What `bench pareto end-to-end` shows: charts, verdicts and a table."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
-from bench.output import forest_plot, machine, plot, result_page
-from bench.output import write as results
+from bench.output import charts, result_page
 
-_SHOWN = ("law", "tets", "spp", "flow", "model", "default", "cpu_s", "data_s", "flow_s", "answer_s", "rmse")
-_TITLE = "End to end: error of the force against cost"
 _WHAT = {"": ("the force", "zero"), "across_": ("the force across the line of sight", "across_zero")}
 """By prefix of the names in a row: what is meant, and under which name the error of saying nothing is."""
+_COSTS = {"": "cpu_s", ", of it data": "data_s", ", flow": "flow_s", ", answer": "answer_s"}
+_MEAN = (
+    "The mean over sequences of each one's own ratio is taken, not one ratio over all frames: force goes "
+    "with E and the contact's area, so a few stiff, broad contacts would hold most of the pooled square."
+)
 _UNIT = "more error than the defaults [% of the force], 95% interval"
 
 
-def write(found: Mapping[str, Any], out: Path) -> None:
-    """`chart.svg`, `index.html` and `README.md` in the folder `out`."""
-    rows = [{name: row[name] for name in _SHOWN} for row in found["rows"]]
-    charts: tuple[result_page.Chart | plot.Panel, ...] = (*panels(found), *differences(found))
-    result_page.write(result_page.Sheet(_TITLE, found["command"], found, charts, (("Pipelines", rows),)), out)
-    results.keep(out, "README.md", readme(found))
+def drawn(found: Mapping[str, Any]) -> result_page.Page:
+    """What `pareto.json` says, the cheapest pipeline first."""
+    asked, rows = found["asked"], sorted(found["rows"], key=lambda row: float(row["cpu_s"]))
+    return result_page.Page(
+        "End to end: error of the force against cost, whole pipelines",
+        found,
+        [*panels(found), *differences(found)],
+        (
+            result_page.Section("", words=[f"- {line}" for line in verdicts(found)]),
+            result_page.Section("Pipelines", [_line(row) for row in rows], (_MEAN,)),
+        ),
+        (
+            f"{found['meaning']}.",
+            f"All are asked about the same {len(rows[0]['errors'])} sequences, made with {asked['law']}, "
+            f"{asked['tets']} tetrahedra and {asked['spp']} paths a pixel, scenes that no pipeline has "
+            "seen, from the flow that their own estimator recovers there (those fitted on ideal flow: the "
+            "default one). Physics alone learns nothing and is one dot a flow. Intervals are BCa over "
+            "sequences; the difference is to the defaults with the same model on the same sequences, and "
+            "tells far more than two intervals that overlap. No force at all errs by 100%.",
+        ),
+        name="README.md",
+    )
 
 
-def panels(found: Mapping[str, Any]) -> list[plot.Panel]:
+def panels(found: Mapping[str, Any]) -> list[charts.Panel]:
     """The charts of `pareto.json`, of the whole force and of its part across the line of sight.
 
     A curve a model, a dot a pipeline; and what saying nothing errs by.
@@ -37,7 +54,7 @@ def panels(found: Mapping[str, Any]) -> list[plot.Panel]:
         for model in dict.fromkeys(row["model"] for row in rows):
             own = [row for row in rows if row["model"] == model]
             curves.append(
-                plot.Curve(
+                charts.Curve(
                     model,
                     tuple(float(row["cpu_s"]) for row in own),
                     tuple(100 * float(row[f"{name}rmse"]) for row in own),
@@ -50,21 +67,21 @@ def panels(found: Mapping[str, Any]) -> list[plot.Panel]:
                 )
             )
         level = 100 * float(found[nothing])
-        curves.append(plot.Curve("no force at all", (min(costs), max(costs)), (level, level)))
+        curves.append(charts.Curve("no force at all", (min(costs), max(costs)), (level, level)))
         title = f"End to end: error of {what} (rings: defaults)"
         unit = "RMSE [% of the whole force]"
-        made.append(plot.Panel(title, "CPU s a frame", unit, tuple(curves), False, True, front=True))
+        made.append(charts.Panel(title, "CPU s a frame", unit, tuple(curves), False, True, front=True))
     return made
 
 
-def differences(found: Mapping[str, Any]) -> list[result_page.Chart]:
+def differences(found: Mapping[str, Any]) -> list[charts.Chart]:
     """Every pipeline against the defaults with the same model: the whole force, and the part across.
 
     Those that change the flow are apart: beside them the others' differences would not be seen.
     """
     colour = {model: k for k, model in enumerate(dict.fromkeys(row["model"] for row in found["rows"]))}
     usual = {row["model"]: row for row in found["rows"] if row["default"]}
-    charts = []
+    shown = []
     for part, (what, _) in _WHAT.items():
         for knobs, flows in (("law, mesh, paths", False), ("flow", True)):
             lines = []
@@ -75,52 +92,22 @@ def differences(found: Mapping[str, Any]) -> list[result_page.Chart]:
                 mean, low, high = (100 * value for value in row[f"{part}difference"])
                 cost = 100 * (row["cpu_s"] / standard["cpu_s"] - 1)
                 name = f"{row['model']}: {_change(row, standard)} (cost {cost:+.0f}%)"
-                lines.append(forest_plot.Row(name, mean, (low, high), colour[row["model"]]))
+                lines.append(charts.Row(name, mean, (low, high), colour[row["model"]]))
             title = f"Against the defaults with the same model, {knobs}: {what}"
-            charts.append(result_page.Chart(title, _UNIT, tuple(lines)))
-    return charts
+            shown.append(charts.Chart(title, _UNIT, tuple(lines)))
+    return shown
 
 
-def readme(found: Mapping[str, Any]) -> str:
-    """What was measured, as a table, the cheapest first."""
-    asked, rows = found["asked"], sorted(found["rows"], key=lambda row: float(row["cpu_s"]))
-    sequences = len(rows[0]["errors"])
-    lines = [
-        "# End to end: error of the force against cost, whole pipelines",
-        "",
-        f"    {found['command']}",
-        "",
-        f"Machine: {machine.line(found['machine'])}. {found['meaning']}.",
-        "",
-        f"All are asked about the same {sequences} sequences, made with {asked['law']}, {asked['tets']} "
-        f"tetrahedra and {asked['spp']} paths a pixel, scenes that no pipeline has seen, from the flow that "
-        "their own estimator recovers there (those fitted on ideal flow: the default one). Physics alone "
-        "learns nothing and is one dot a flow. Intervals are BCa over sequences; the difference is to the "
-        "defaults with the same model on the same sequences, and tells far more than two intervals that "
-        "overlap. Defaults are bold; no force at all errs by 100%.",
-        "",
-        "![Error against cost](chart.svg)",
-        "",
-        *(f"- {line}" for line in verdicts(found)),
-        "",
-        "| law | tets | spp | flow | model | CPU s a frame | RMSE | across | along | less the defaults' | "
-        "across |",
-        "| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |",
-    ]
-    for row in rows:
-        cells = [row["law"], row["tets"], row["spp"], row["flow"], row["model"], f"{row['cpu_s']:.3f}"]
-        cells += [_said(row, name) for name in _WHAT] + [f"{100 * row['along_rmse']:.0f}%"]
-        cells += [_points(row[f"{name}difference"]) for name in _WHAT]
-        words = [f"**{cell}**" if row["default"] and cell else str(cell) for cell in cells]
-        lines.append(f"| {' | '.join(words)} |")
-    return "\n".join([*lines, *_NOTES]) + "\n"
-
-
-_NOTES = (
-    "",
-    "The mean over sequences of each one's own ratio is taken, not one ratio over all frames: force goes "
-    "with E and the contact's area, so a few stiff, broad contacts would hold most of the pooled square.",
-)
+def _line(row: Mapping[str, Any]) -> dict[str, Any]:
+    """One pipeline for the table."""
+    cells = {name: row[name] for name in ("law", "tets", "spp", "flow", "model", "default")}
+    cells |= {f"CPU s a frame{part}": f"{row[key]:.3f}" for part, key in _COSTS.items()}
+    cells |= {"RMSE": _said(row, ""), "across": _said(row, "across_")}
+    cells |= {"along": f"{100 * row['along_rmse']:.0f}%"}
+    return cells | {
+        "less the defaults'": _points(row["difference"]),
+        "less the defaults', across": _points(row["across_difference"]),
+    }
 
 
 def verdicts(found: Mapping[str, Any]) -> list[str]:

@@ -20,11 +20,12 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from bench.output import machine, write
+from bench.output import machine, result_page, write
 from evidence.end_to_end import costs as end_to_end_costs
 from evidence.end_to_end import page
 from evidence.end_to_end.costs import Costs
 from evidence.end_to_end.pipelines import FINE, FRAMES, SIZE, Pipeline, Sequences, Trial, chosen, errors
+from evidence.measuring import measuring
 from learn.evaluation.statistics import interval, paired
 from synth.job.schema import Flow
 
@@ -33,6 +34,7 @@ PARTS = {"": "errors", "across_": "across"}
 a row, and the errors by sequence."""
 
 
+@measuring("--fit 8 --test 6 --out runs/end-to-end")
 def pareto(
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for results.")] = Path(
         "docs/results/end-to-end"
@@ -95,8 +97,8 @@ def pareto(
         "rounds": costs.rounds,
     }
     write.keep(out, "pareto.json", found)
-    page.write(found, out)
-    typer.echo(json_.dumps(found) if json else str(out / "index.html"))
+    result_page.write(page.drawn(found), out)
+    typer.echo(json_.dumps(found) if json else str(out / "README.md"))
 
 
 def price(one: Pipeline, costs: Costs) -> dict[str, float]:

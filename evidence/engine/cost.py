@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json as json_
 import resource
 import subprocess
 import sys
@@ -12,7 +11,8 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from bench.output import machine, write
+from bench.output import machine
+from evidence.measuring import measuring
 from synth.dataset import size_forecast
 from synth.dataset.store import Dataset
 from synth.errors import UserError
@@ -23,28 +23,55 @@ _RECYCLED = 16
 _BEGIN, _END = "<!-- measured: bench experiment cost -->\n", "<!-- end -->\n"
 
 
+def tables(found: dict[str, Any]) -> str:
+    """Both tables, in Markdown."""
+    planned, (width, height) = found["planned"], found["frame_px"]
+    hours = planned["cpu_hours"]
+    rate = planned["frames_per_s_a_core"]
+    rows = [
+        *((name, f"{spent:.2f}", "") for name, spent in found["cpu_s_a_frame"].items()),
+        *((name, "", f"{spent:.2f}") for name, spent in found["cpu_s_a_sequence"].items()),
+        (f"start of a worker (imports), once in {_RECYCLED} sequences", "", f"{found['cpu_s_a_start']:.1f}"),
+    ]
+    amounts = [
+        ("processor", f"{hours:,} CPU-hours: {hours / 16:.0f} hours on 16 cores, {hours / 256:.1f} on 256"),
+        ("disk", f"{planned['disk_tb']} TB in {planned['files']:,} files"),
+        ("memory", f"{found['peak_rss_mb'] / 1e3:.1f} GB a worker"),
+        ("a core makes", f"{rate} frames or {size_forecast.amount(rate * found['bytes_a_frame'])} a second"),
+    ]
+    about = (
+        f"{width} x {height} px, {found['variant']}, flow by {found['flow_backend']}, "
+        f"{found['machine']['processor']}; {found['bytes_a_frame'] / 1e6:.2f} MB a frame on disk."
+    )
+    lines = ["| stage | CPU-s a frame | CPU-s a sequence |", "| --- | --- | --- |"]
+    lines += [f"| {' | '.join(row)} |" for row in rows]
+    lines += ["", about, "", f"{planned['frames']:,} frames, as {planned['sequences']:,} sequences:", ""]
+    lines += ["| what | amount |", "| --- | --- |", *(f"| {name} | {text} |" for name, text in amounts)]
+    return "\n".join(lines) + "\n"
+
+
+@measuring(
+    "out --frames 1000000 --page docs/scaling.md",
+    out="docs/results/engine/cost",
+    file="cost.json",
+    text=tables,
+)
 def cost(
     dataset: Annotated[Path, typer.Argument(help="A dataset of the job to be planned; two sequences do.")],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder of the results.")] = Path(
-        "docs/results/engine/cost"
-    ),
     frames: Annotated[int, typer.Option(help="Frames of the dataset to be planned.")] = 1_000_000,
     length: Annotated[int, typer.Option(help="Frames of its sequences.")] = 60,
     page: Annotated[Path | None, typer.Option(help="Also put the tables into this page.")] = None,
-    json: Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")] = False,
-) -> None:
+) -> dict[str, Any]:
     """Says what so many frames take in CPU-hours, disk and memory, at the rates of a rendered dataset."""
     found = {**rates(dataset, length), "machine": machine.describe()}
     found["planned"] = plan(found, frames, length)
-    write.keep(out, "cost.json", found)
-    text = tables(found)
     if page is not None:
         whole = page.read_text("utf-8")
         if _BEGIN not in whole or _END not in whole:
             raise UserError(f"{page}: has no place for the tables ({_BEGIN.strip()} ... {_END.strip()})")
         before, after = whole.split(_BEGIN)[0], whole.split(_END, 1)[1]
-        page.write_text(f"{before}{_BEGIN}{text}{_END}{after}", "utf-8")
-    print(json_.dumps(found) if json else text)
+        page.write_text(f"{before}{_BEGIN}{tables(found)}{_END}{after}", "utf-8")
+    return found
 
 
 def rates(dataset: Path, length: int) -> dict[str, Any]:
@@ -95,33 +122,6 @@ def plan(found: dict[str, Any], frames: int, length: int) -> dict[str, Any]:
         "files": sequences * found["files_a_sequence"],
         "frames_per_s_a_core": round(1 / (each + once / length), 3),
     }
-
-
-def tables(found: dict[str, Any]) -> str:
-    """Both tables, in Markdown."""
-    planned, (width, height) = found["planned"], found["frame_px"]
-    hours = planned["cpu_hours"]
-    rate = planned["frames_per_s_a_core"]
-    rows = [
-        *((name, f"{spent:.2f}", "") for name, spent in found["cpu_s_a_frame"].items()),
-        *((name, "", f"{spent:.2f}") for name, spent in found["cpu_s_a_sequence"].items()),
-        (f"start of a worker (imports), once in {_RECYCLED} sequences", "", f"{found['cpu_s_a_start']:.1f}"),
-    ]
-    amounts = [
-        ("processor", f"{hours:,} CPU-hours: {hours / 16:.0f} hours on 16 cores, {hours / 256:.1f} on 256"),
-        ("disk", f"{planned['disk_tb']} TB in {planned['files']:,} files"),
-        ("memory", f"{found['peak_rss_mb'] / 1e3:.1f} GB a worker"),
-        ("a core makes", f"{rate} frames or {size_forecast.amount(rate * found['bytes_a_frame'])} a second"),
-    ]
-    about = (
-        f"{width} x {height} px, {found['variant']}, flow by {found['flow_backend']}, "
-        f"{found['machine']['processor']}; {found['bytes_a_frame'] / 1e6:.2f} MB a frame on disk."
-    )
-    lines = ["| stage | CPU-s a frame | CPU-s a sequence |", "| --- | --- | --- |"]
-    lines += [f"| {' | '.join(row)} |" for row in rows]
-    lines += ["", about, "", f"{planned['frames']:,} frames, as {planned['sequences']:,} sequences:", ""]
-    lines += ["| what | amount |", "| --- | --- |", *(f"| {name} | {text} |" for name, text in amounts)]
-    return "\n".join(lines) + "\n"
 
 
 def _start() -> float:

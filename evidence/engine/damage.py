@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import json as json_
+import json
 import shutil
 import tempfile
 from collections import Counter
@@ -15,7 +15,7 @@ import numpy as np
 import typer
 import zarr
 
-from bench.output import machine, write
+from evidence.measuring import measuring
 from synth.checks import verify
 from synth.dataset.folder import Folder
 from synth.dataset.store import Dataset
@@ -33,15 +33,17 @@ class Case:
     """Names of the checks that failed."""
 
 
+@measuring(
+    "out --count 50 --out runs/damage",
+    out="docs/results/engine/damage",
+    file="damage.json",
+    passed=lambda found: not found["missed"],
+)
 def damage(
     dataset: Annotated[Path, typer.Argument(help="A small rendered dataset; it is copied, not touched.")],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder of the results.")] = Path(
-        "docs/results/engine/damage"
-    ),
     count: Annotated[int, typer.Option(help="Number of damaged stores.")] = 300,
     seed: Annotated[int, typer.Option(help="Of the damage.")] = 0,
-    json: Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")] = False,
-) -> None:
+) -> dict[str, Any]:
     """Damages stores in every way that disks, copies and people do, and counts what verify misses."""
     rng = np.random.default_rng(seed)
     identity = str(Folder(dataset).described()["identity"])
@@ -58,16 +60,7 @@ def damage(
             found = tuple(check.name for check in verify.verify_sequence(copy, identity) if not check.good)
             cases.append(Case(kind, what, changed, found))
             shutil.rmtree(copy)
-    result = summary(cases, seed)
-    write.keep(out, "damage.json", result)
-    if json:
-        print(json_.dumps(result))
-    else:
-        print(f"{result['changed']} of {count} stores changed a value; verify missed {len(result['missed'])}")
-        for name, row in result["kinds"].items():
-            print(f"  {name:<22} {row['changed']:>3} of {row['stores']:>3} changed, {row['found']} found")
-    if result["missed"]:
-        raise typer.Exit(1)
+    return summary(cases, seed)
 
 
 def summary(cases: list[Case], seed: int) -> dict[str, Any]:
@@ -90,7 +83,6 @@ def summary(cases: list[Case], seed: int) -> dict[str, Any]:
         "kinds": kinds,
         "found_by": dict(Counter(case.found[0] for case in cases if case.changed and case.found)),
         "seed": seed,
-        "machine": machine.describe(),
     }
 
 
@@ -205,23 +197,23 @@ def rewritten_value(store: Path, rng: np.random.Generator) -> str:
 def edited_metadata(store: Path, rng: np.random.Generator) -> str:
     """One number, text or flag anywhere in a zarr.json is another."""
     path = _metadata(store, rng)
-    document = json_.loads(path.read_text())
+    document = json.loads(path.read_text())
     leaves = list(_leaves(document))
     holder, key = leaves[int(rng.integers(len(leaves)))]
     old = holder[key]
     holder[key] = _another(old)
-    path.write_text(json_.dumps(document))
+    path.write_text(json.dumps(document))
     return f"{path.relative_to(store)}: {key}: {old!r} to {holder[key]!r}"
 
 
 def removed_key(store: Path, rng: np.random.Generator) -> str:
     """A key of the metadata, gone."""
     path = _metadata(store, rng)
-    document = json_.loads(path.read_text())
+    document = json.loads(path.read_text())
     leaves = [(holder, key) for holder, key in _leaves(document) if isinstance(holder, dict)]
     holder, key = leaves[int(rng.integers(len(leaves)))]
     del holder[key]
-    path.write_text(json_.dumps(document))
+    path.write_text(json.dumps(document))
     return f"{path.relative_to(store)}: {key}"
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json as json_
 import os
 import signal
 import socket
@@ -13,31 +12,41 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
-from bench.output import machine, write
+from evidence.engine import work
+from evidence.measuring import measuring
 from synth.engine import run
 from synth.engine.progress import Bars
 from synth.job.schema import Job
 
 
-def dask(
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder of the results.")] = Path(
-        "docs/results/engine/dask"
+@measuring(
+    "--workers 2 --out runs/dask",
+    out="docs/results/engine/dask",
+    file="dask.json",
+    passed=lambda found: (
+        found["hash_on_cluster"] == found["hash_on_one_machine"]
+        and found["one_killed"]
+        and not found["leftovers"]
     ),
+)
+def dask(
     sequences: Annotated[int, typer.Option(help="Sequences of the job.")] = 12,
     workers: Annotated[int, typer.Option(help="Dask worker processes.")] = 3,
     frame_s: Annotated[float, typer.Option(help="Sleep a frame of the stand-in [s].")] = 0.2,
-    json: Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")] = False,
-) -> None:
+) -> dict[str, Any]:
     """Runs on Dask workers on this machine, kills one half-way, compares with a local run."""
     picture = {"render": {"size": (64, 48)}, "flow": {"backend": "ideal"}}
     job = Job.model_validate({"seed": 1, "sequences": sequences, "frames": 5, **picture})
-    environment = {"STAND_IN_FRAME_S": str(frame_s)}
-    options = run.Options(work="evidence.engine.work:sequence", environment=environment)
+    options = run.Options(
+        work="evidence.engine.work:sequence", environment=work.environment(STAND_IN_FRAME_S=frame_s)
+    )
+    swift = replace(options, environment=work.environment())
     with tempfile.TemporaryDirectory() as scratch:
         root = Path(scratch) / "cluster"
         with local_cluster(workers) as (address, processes), Bars() as bars:
@@ -45,12 +54,13 @@ def dask(
                 target=_kill_half_way, args=(root, sequences, processes[0]), daemon=True
             )
             killer.start()
-            on_cluster = run.run_job(job, root, _with(options, f"dask://{address}"), bars)
+            on_cluster = run.run_job(job, root, replace(options, engine=f"dask://{address}"), bars)
             killer.join(timeout=10)
             killed = processes[0].poll() is not None
+        leftovers = [path.name for path in root.glob("*.part")]
         with Bars() as bars:
-            here = run.run_job(job, Path(scratch) / "local", run.Options(work=options.work), bars)
-    result = {
+            here = run.run_job(job, Path(scratch) / "local", swift, bars)
+    return {
         "sequences": sequences,
         "dask_workers": workers,
         "one_killed": killed,
@@ -58,14 +68,8 @@ def dask(
         "failed": on_cluster.failed,
         "hash_on_cluster": on_cluster.content_hash,
         "hash_on_one_machine": here.content_hash,
-        "machine": machine.describe(),
+        "leftovers": leftovers,
     }
-    write.keep(out, "dask.json", result)
-    equal = on_cluster.content_hash == here.content_hash
-    text = f"{on_cluster.done} of {sequences} done, one worker killed: {killed}; equal = {equal}"
-    print(json_.dumps(result) if json else text)
-    if not (equal and killed):
-        raise typer.Exit(1)
 
 
 @contextmanager
@@ -90,10 +94,6 @@ def local_cluster(workers: int) -> Iterator[tuple[str, list[subprocess.Popen[byt
             if process.poll() is None:
                 os.killpg(process.pid, signal.SIGKILL)
             process.wait()
-
-
-def _with(options: run.Options, address: str) -> run.Options:
-    return run.Options(work=options.work, environment=options.environment, engine=address)
 
 
 def _kill_half_way(root: Path, sequences: int, victim: subprocess.Popen[bytes]) -> None:

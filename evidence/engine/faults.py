@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import json as json_
 import os
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 from unittest import mock
 
 import typer
 
-from bench.output import machine
+from evidence.engine import work
+from evidence.measuring import measuring
 from synth.checks import verify
 from synth.dataset.folder import Folder
 from synth.engine import run as engine
@@ -23,47 +22,51 @@ from synth.errors import UserError
 from synth.job.schema import Job
 
 
+@measuring(
+    "--full tiny --read-only ro",
+    out="docs/results/engine/faults",
+    file="faults.json",
+)
 def faults(
     full: Annotated[Path, typer.Option(help="A file system of a few megabytes, empty.")],
     read_only: Annotated[Path, typer.Option(help="A read-only file system.")],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder of the results.")] = Path(
-        "docs/results/engine/faults"
-    ),
-    json: Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")] = False,
-) -> None:
+) -> dict[str, Any]:
     """Meets each fault for real, and checks that every store that is left is whole."""
-    found: dict[str, Any] = {}
+    found = {"full disk": _refusal(full / "out")}
+    # As if others had filled it after the forecast.
+    with mock.patch("synth.dataset.size_forecast.refuse_if_too_large"):
+        found["disk that fills up"] = _refusal(full / "out")
+    found["read-only folder"] = _refusal(read_only / "out")
+    return found | meet_oddities()
+
+
+def meet_oddities() -> dict[str, dict[str, Any]]:
+    """The faults that need no file system of their own: a name, a clock, a second run."""
     with tempfile.TemporaryDirectory() as scratch:
-        calm = Path(scratch) / "calm"
-        expected = run(calm).content_hash
-        found["full disk"] = _refusal(lambda: run(full / "out"), full / "out")
-        # As if others had filled it after the forecast.
-        with mock.patch("synth.dataset.size_forecast.refuse_if_too_large"):
-            found["disk that fills up"] = _refusal(lambda: run(full / "out"), full / "out")
-        found["read-only folder"] = _refusal(lambda: run(read_only / "out"), read_only / "out")
-        strange = Path(scratch) / "größe μm 脳 'out'"
-        found["odd name"] = {"equal": run(strange).content_hash == expected}
-        found["clock change"] = {"equal": _with_another_clock(Path(scratch) / "clock") == expected}
-        found["two runs"] = _two_runs(Path(scratch) / "two", expected)
-    result = {**found, "machine": machine.describe()}
-    out.mkdir(parents=True, exist_ok=True)
-    (out / "faults.json").write_text(json_.dumps(result, indent=1, ensure_ascii=False) + "\n")
-    print(json_.dumps(result, indent=None if json else 1, ensure_ascii=False))
+        expected = run_stand_ins(Path(scratch) / "calm").content_hash
+        strange = run_stand_ins(Path(scratch) / "größe μm 脳 'out'").content_hash
+        clock = _hash_with_another_clock(Path(scratch) / "clock")
+        return {
+            "odd name": {"equal": strange == expected},
+            "clock change": {"equal": clock == expected},
+            "two runs": _start_two(Path(scratch) / "two", expected),
+        }
 
 
-def run(root: Path, work: str = "sequence") -> engine.Summary:
-    """A small stand-in run: six sequences of about half a megabyte."""
+def run_stand_ins(root: Path) -> engine.Summary:
+    """A small stand-in run: twelve sequences of about a quarter of a megabyte."""
     job = Job.model_validate(
         {"sequences": 12, "frames": 5, "render": {"size": (160, 120)}, "flow": {"backend": "ideal"}}
     )
+    options = engine.Options(workers=2, work="evidence.engine.work:sequence", environment=work.environment())
     with Bars() as bars:
-        return engine.run_job(job, root, engine.Options(workers=2, work=f"evidence.engine.work:{work}"), bars)
+        return engine.run_job(job, root, options, bars)
 
 
-def _refusal(attempt: Callable[[], Any], root: Path) -> dict[str, Any]:
+def _refusal(root: Path) -> dict[str, Any]:
     """The one line that the user gets, and whether what is left is whole."""
     try:
-        attempt()
+        run_stand_ins(root)
     except UserError as error:
         return {"says": str(error).replace(str(root.parent), "..."), **_left(root)}
     return {"says": "nothing", **_left(root)}
@@ -92,31 +95,39 @@ time.time_ns = lambda: int(time.time() * 1e9)
 """
 
 
-def _with_another_clock(root: Path) -> str:
+_PROGRAM = """
+import sys
+from pathlib import Path
+from evidence.engine.faults import run_stand_ins
+print(run_stand_ins(Path(sys.argv[1])).content_hash)
+"""
+
+
+def _hash_with_another_clock(root: Path) -> str:
     """The hash of a run, workers included, whose clock jumps over decades while it goes on."""
-    program = "import sys; from pathlib import Path; from evidence.engine.faults import run\n"
-    program += "print(run(Path(sys.argv[1])).content_hash)"
     with tempfile.TemporaryDirectory() as early:
         (Path(early) / "sitecustomize.py").write_text(_JUMPING)
-        path = os.pathsep.join(filter(None, [early, os.environ.get("PYTHONPATH", "")]))
-        done = subprocess.run(
-            [sys.executable, "-c", program, str(root)],
-            env={**os.environ, "PYTHONPATH": path},
-            capture_output=True,
-            text=True,
-            check=True,
-        )
+        found = work.environment()
+        found["PYTHONPATH"] = os.pathsep.join([early, found["PYTHONPATH"]])
+        words = [sys.executable, "-c", _PROGRAM, str(root)]
+        done = subprocess.run(words, env={**os.environ, **found}, capture_output=True, text=True, check=True)
     return done.stdout.strip()
 
 
-def _two_runs(root: Path, expected: str) -> dict[str, Any]:
-    program = (
-        "import sys; from pathlib import Path; from evidence.engine.faults import run; run(Path(sys.argv[1]))"
-    )
-    words = [sys.executable, "-c", program, str(root)]
-    environment = {**os.environ, "STAND_IN_FRAME_S": "0.4"}
-    both = [subprocess.Popen(words, env=environment, stderr=subprocess.PIPE, text=True) for _ in range(2)]
+def _start_two(root: Path, expected: str) -> dict[str, Any]:
+    """Two runs on one folder at the same time: exit codes, what the second says, what is there at last."""
+    words = [sys.executable, "-c", _PROGRAM, str(root)]
+    slow = {**os.environ, **work.environment(STAND_IN_FRAME_S=0.4)}
+    both = [
+        subprocess.Popen(words, env=slow, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+        for _ in range(2)
+    ]
     ends = [process.communicate()[1].strip().splitlines()[-1] for process in both]
     codes = sorted(process.returncode for process in both)
     says = next((end for end in ends if "another run" in end), "nothing").replace(str(root.parent), "...")
-    return {"codes": codes, "says": says, "equal": run(root).content_hash == expected, **_left(root)}
+    return {
+        "codes": codes,
+        "says": says,
+        "equal": run_stand_ins(root).content_hash == expected,
+        **_left(root),
+    }

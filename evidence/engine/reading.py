@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json as json_
 import time
 from pathlib import Path
 from typing import Annotated, Any
@@ -11,7 +10,7 @@ import numpy as np
 import typer
 import zarr
 
-from bench.output import machine, write
+from evidence.measuring import measuring
 from synth.dataset.store import Dataset
 from synth.dataset.torch_dataset import Frames
 
@@ -22,15 +21,12 @@ _SETS = {
 }
 
 
+@measuring("out --count 50 --out runs/reading", out="docs/results/engine/reading", file="reading.json")
 def reading(
     dataset: Annotated[Path, typer.Argument(help="A rendered dataset.")],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder of the results.")] = Path(
-        "docs/results/engine/reading"
-    ),
     count: Annotated[int, typer.Option(help="Random frames for each set of fields.")] = 100,
     seed: Annotated[int, typer.Option(help="Of the choice of frames.")] = 0,
-    json: Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")] = False,
-) -> None:
+) -> dict[str, Any]:
     """Reads random frames by the dataset's own reader and by plain Zarr; files are in the system's memory."""
     first = Dataset(dataset)[0]
     every = tuple(name for name in first.fields if first[name].ndim >= 3 and first[name].dims[0] == "frame")
@@ -46,24 +42,13 @@ def reading(
         }
         raw = sum(first[name][0].nbytes for name in fields or every)
         rows.append({"fields": list(fields or every), "title": title, "raw_mb": round(raw / 1e6, 2), **found})
-    result = {
+    return {
         "frame_px": [first.size[1], first.size[0]],
         "sequences": len(Dataset(dataset)),
         "frames_read": count,
         "sets": rows,
         "seed": seed,
-        "machine": machine.describe(),
     }
-    write.keep(out, "reading.json", result)
-    if json:
-        print(json_.dumps(result))
-        return
-    for row in rows:
-        ours, plain = row["ours"], row["zarr"]
-        print(
-            f"{row['title']:<28} {row['raw_mb']:5.1f} MB: {ours['median_ms']:.1f} ms "
-            f"(95% within {ours['p95_ms']:.1f}), plain Zarr {plain['median_ms']:.1f} ms"
-        )
 
 
 def _by_zarr(dataset: Path, fields: tuple[str, ...], frames: int) -> Any:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json as json_
 import os
 import resource
 import subprocess
@@ -10,27 +9,27 @@ import sys
 import tempfile
 from pathlib import Path
 from typing import Annotated, Any
+from unittest import mock
 
 import typer
 
-from bench.output import machine, write
+from evidence.engine import work
 from evidence.engine.trouble import timed
+from evidence.measuring import measuring
 from synth.dataset.store import Dataset
 from synth.engine import run, slots
 from synth.engine.progress import Bars
 from synth.job import reader
+from synth.job.schema import Job
 
 
+@measuring("--rendered 4 --out runs/speed", out="docs/results/engine/speed", file="speed.json")
 def speed(
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder of the results.")] = Path(
-        "docs/results/engine/speed"
-    ),
     job: Annotated[str, typer.Option(help="A job whose rendering is timed for the overhead.")] = "demo",
     rendered: Annotated[int, typer.Option(help="Sequences of it.")] = 8,
     sequences: Annotated[int, typer.Option(help="Stand-in sequences for one worker against two.")] = 24,
     cpu_s: Annotated[float, typer.Option(help="Processor time of each [s].")] = 4.0,
-    json: Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")] = False,
-) -> None:
+) -> dict[str, Any]:
     """Overhead of engine and store over the bare stages, and two workers against one."""
     result: dict[str, Any] = {"overhead": overhead(job, rendered)}
     if sequences:
@@ -45,35 +44,38 @@ def speed(
             "ratio": round(seconds[1] / seconds[2], 3),
             "load_before": round(load, 2),
         }
-    result["machine"] = machine.describe()
-    write.keep(out, "speed.json", result)
-    print(json_.dumps(result, indent=None if json else 1))
+    return result
 
 
-# The stages in one process and nothing else: no engine, no store, no index, no card.
-_BARE = """
-import sys
-from pathlib import Path
-from synth import pipeline
-from synth.job.schema import Job
-class Nowhere:
-    def __init__(self, *_, **__): pass
-    def __getattr__(self, name): return lambda *_, **__: None
-pipeline.Writer = Nowhere
-job = Job.model_validate_json(sys.argv[1])
-for index in range(job.sequences):
-    pipeline.render_sequence(job, index, Path("."), lambda *_: None)
-"""
+class _Nowhere:
+    """Takes what a store takes, and keeps nothing."""
+
+    def __init__(self, *_: Any, **__: Any) -> None: ...
+
+    def __getattr__(self, name: str) -> Any:
+        return lambda *_, **__: None
+
+
+def render_bare(described: str) -> None:
+    """The stages in one process and nothing else: no engine, no store, no index, no card."""
+    from synth.sequence import pipeline
+
+    job = Job.model_validate_json(described)
+    with mock.patch.object(pipeline, "Writer", _Nowhere):
+        for index in range(job.sequences):
+            pipeline.render_sequence(job, index, Path("."), lambda *_: None)
 
 
 def overhead(name: str, count: int) -> dict[str, float | int]:
     """CPU time of a whole run (engine, workers, store, index, film, card) over that of its stages alone."""
     job = reader.load_job(name, [f"sequences={count}"])
-    machine_words = {**os.environ, **slots.machine(job, 1), "OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
+    alone = {**os.environ, **work.environment(), **slots.machine(job, 1)}
+    alone |= {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
+    program = "import sys; from evidence.engine.speed import render_bare; render_bare(sys.argv[1])"
     with tempfile.TemporaryDirectory() as scratch, Bars() as bars:
         before = _cpu()
-        words = [sys.executable, "-c", _BARE, job.model_dump_json()]
-        subprocess.run(words, env=machine_words, cwd=scratch, check=True, stdout=subprocess.DEVNULL)
+        words = [sys.executable, "-c", program, job.model_dump_json()]
+        subprocess.run(words, env=alone, cwd=scratch, check=True, stdout=subprocess.DEVNULL)
         bare = _cpu() - before
         before = _cpu()
         run.run_job(job, Path(scratch) / "out", run.Options(workers=1), bars)

@@ -2,38 +2,23 @@
 
 from __future__ import annotations
 
-import json as json_
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 import typer
 
-from bench.output import write
+from evidence.measuring import measuring
 from synth.dataset.store import Dataset
 from synth.errors import UserError
 
 
+@measuring("out --out runs/stages", said="Folder for stages.json.", file="stages.json")
 def stages(
     data: Annotated[Path, typer.Argument(help="A dataset made by `synth render`.")],
-    out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder for stages.json.")] = None,
-    json: Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")] = False,
-) -> None:
+) -> dict[str, Any]:
     """CPU-seconds a frame and peak memory, stage by stage, of a rendered dataset."""
-    from rich.console import Console
-    from rich.table import Table
-
-    found = measure(Dataset(data))
-    if out is not None:
-        write.keep(out, "stages.json", found)
-    if json:
-        print(json_.dumps(found))
-        return
-    table = Table("stage", "CPU s a frame", "largest", title=f"{found['sequences']} sequences, {data}")
-    for name, cost in found["cpu_s_a_frame"].items():
-        table.add_row(name, f"{cost['median']:.3f}", f"{cost['largest']:.3f}")
-    table.add_row("peak memory", f"{found['peak_rss_mb']:.0f} MB", "")
-    Console().print(table)
+    return measure(Dataset(data))
 
 
 def measure(dataset: Dataset) -> dict[str, Any]:

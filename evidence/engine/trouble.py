@@ -2,52 +2,51 @@
 
 from __future__ import annotations
 
-import json as json_
 import tempfile
 import time
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
-from bench.output import machine, write
+from evidence.engine import work as stand_in
+from evidence.measuring import measuring
 from synth.engine import run
 from synth.engine.progress import Bars
 from synth.engine.run import Options, Summary
 from synth.job.schema import Job
 
 
-def trouble(
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder of the results.")] = Path(
-        "docs/results/engine/trouble"
+@measuring(
+    "--sequences 6 --out runs/trouble",
+    out="docs/results/engine/trouble",
+    file="trouble.json",
+    passed=lambda found: (
+        found["done_without_trouble"] == found["sequences"] and found["done"] == found["sequences"] - 2
     ),
+)
+def trouble(
     sequences: Annotated[int, typer.Option(help="Scenes.")] = 30,
     workers: Annotated[int, typer.Option(help="Worker processes.")] = 2,
     memory_gb: Annotated[float, typer.Option(help="Memory a process may take.")] = 1.0,
     cpu_s: Annotated[float, typer.Option(help="Processor time of the stand-in a scene [s].")] = 4.0,
-    json: Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")] = False,
-) -> None:
+) -> dict[str, Any]:
     """Runs a job with two bad scenes and one without, and compares what is done and how long it takes."""
     picture = {"render": {"size": (64, 48)}, "flow": {"backend": "ideal"}}
     job = Job.model_validate({"seed": 1, "sequences": sequences, "frames": 5, **picture})
     good, good_s = timed(job, "busy", workers, cpu_s, memory_gb)
     bad, bad_s = timed(job, "troubled", workers, cpu_s, memory_gb)
-    result = {
+    return {
         "sequences": sequences,
         "workers": workers,
         "scene_cpu_s": cpu_s,
+        "done_without_trouble": good.done,
         "done": bad.done,
         "failed": bad.failed,
         "seconds_without_trouble": round(good_s, 2),
         "seconds_with_trouble": round(bad_s, 2),
         "ratio": round(bad_s / good_s, 3),
-        "machine": machine.describe(),
     }
-    write.keep(out, "trouble.json", result)
-    text = f"{bad.done} done, {len(bad.failed)} failed, {result['ratio']} times the time"
-    print(json_.dumps(result) if json else text)
-    if good.done != sequences or bad.done != sequences - 2:
-        raise typer.Exit(1)
 
 
 def timed(job: Job, work: str, workers: int, cpu_s: float, memory_gb: float) -> tuple[Summary, float]:
@@ -56,7 +55,7 @@ def timed(job: Job, work: str, workers: int, cpu_s: float, memory_gb: float) -> 
         workers=workers,
         memory_gb=memory_gb,
         work=f"evidence.engine.work:{work}",
-        environment={"STAND_IN_CPU_S": str(cpu_s)},
+        environment=stand_in.environment(STAND_IN_CPU_S=cpu_s),
     )
     with tempfile.TemporaryDirectory() as scratch, Bars() as bars:
         begun = time.perf_counter()

@@ -5,12 +5,20 @@ from __future__ import annotations
 import os
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from evidence.measuring import CHECKOUT
 from synth.dataset.store import Writer
 from synth.job.schema import Job
 from synth.system.stopwatch import Report
+
+
+def environment(**more: object) -> dict[str, str]:
+    """What a process needs to find these stand-ins, wherever the command was given, and `more`."""
+    path = os.pathsep.join(filter(None, [str(CHECKOUT), os.environ.get("PYTHONPATH")]))
+    return {"PYTHONPATH": path, **{name: str(value) for name, value in more.items()}}
 
 
 def sequence(job: Job, index: int, folder: Path, report: Report) -> None:
@@ -31,18 +39,23 @@ def sequence(job: Job, index: int, folder: Path, report: Report) -> None:
         writer.put_frame("depth", t, rng.random((height, width)) + 300)
         writer.put_frame("traction", t, rng.normal(size=(height, width, 3)))
         time.sleep(float(os.environ.get("STAND_IN_FRAME_S", "0")))
-    writer.seal(
-        scenario={
+    writer.seal(**attributes(index, rng))
+
+
+def attributes(index: int, rng: np.random.Generator) -> dict[str, Any]:
+    """What a stand-in's store says of itself."""
+    return {
+        "scenario": {
             "index": index,
             "anatomy": index,
             "family": "healthy",
             "gesture": {"kind": "pull", "load": 0.1},
         },
-        scale_mm_per_px=0.1,
-        young_kpa=float(rng.uniform(0.5, 3)),
-        poisson=0.4,
-        timings={},
-    )
+        "scale_mm_per_px": 0.1,
+        "young_kpa": float(rng.uniform(0.5, 3)),
+        "poisson": 0.4,
+        "timings": {"render": {"cpu_s": time.process_time(), "wall_s": 0.0}},
+    }
 
 
 def troubled(job: Job, index: int, folder: Path, report: Report) -> None:

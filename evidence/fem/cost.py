@@ -30,18 +30,18 @@ def gestures(on: case.Patch, load: float) -> list[Row]:
     for kind in _KINDS:
         fem = _fem(kind, load)
         for law in _LAWS:
-            tissue, crew_ = _drawn(fem, law)
-            places = [place for one in crew_ for place in tool.focus(one)]
+            tissue, hands = _drawn(fem, law)
+            places = [place for one in hands for place in tool.focus(one)]
             volume = tetrahedra.block(case.ANATOMY, fem.tets, fem.order, places)
             carry, system = (
                 surface_embedding.embed(volume, on.vertices),
                 assemble(volume, law, tissue.poisson),
             )
-            courses = [tool.course(one, _FRAMES) for one in crew_]
+            courses = [tool.course(one, _FRAMES) for one in hands]
             traction = np.sum(
                 [
                     tool.tractions(one, over, on.vertices, on.area)
-                    for one, over in zip(crew_, courses, strict=True)
+                    for one, over in zip(hands, courses, strict=True)
                 ],
                 axis=0,
             )

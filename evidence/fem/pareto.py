@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import json as json_
-from pathlib import Path
+from collections.abc import Mapping
 from typing import Annotated, Any
 
 import numpy as np
 import typer
 
-from bench.output import machine, plot, write
+from bench.output import charts, result_page
 from evidence.fem import case as fem_case
 from evidence.fem import cost as fem_cost
+from evidence.measuring import measuring
 from synth.fem.equilibrium import InvertedElement, NoEquilibrium
 from synth.fem.laws import NUMBER
 from synth.job.schema import Fem
@@ -25,53 +25,27 @@ _SETTINGS = (
 )
 
 
+@measuring(
+    "--load 0.3 --out runs/fem",
+    said="Folder for data, picture and page.",
+    file="pareto.json",
+    page=lambda found, out: result_page.write(drawn(found), out),
+)
 def pareto(
     load: Annotated[float, typer.Option(help="P = F/(E a^2) at which laws are compared.")] = 0.3,
     refined: Annotated[int, typer.Option(help="Tetrahedra of the reference, quadratic.")] = 9000,
     contacts: Annotated[int, typer.Option(help="How many of the four contacts.", min=1, max=4)] = 4,
-    out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Folder for data, picture and page.")
-    ] = None,
-    json: Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")] = False,
-) -> None:
+) -> dict[str, Any]:
     """Error against CPU time a frame, for law, order and size; what gestures and a whole sequence cost."""
     on = fem_case.patch()
-    rows = discretisation(on, refined, contacts, load)
-    laws = law_table(on)
-    gestures = fem_cost.gestures(on, 0.15)
-    whole = [fem_cost.sequence("linear", 0.15), fem_cost.sequence("neo-hookean", 0.4)]
-    found = {
-        "command": f"bench pareto fem --load {load:g} --refined {refined} --contacts {contacts}",
-        "machine": machine.describe(),
+    return {
         "meaning": "errors: relative root mean square of displacement in the opening; ms_a_frame: CPU, one "
         "core, 60 frames, 40,000 vertices moved",
-        "rows": rows,
-        "laws": laws,
-        "gestures": gestures,
-        "sequence": whole,
+        "rows": discretisation(on, refined, contacts, load),
+        "laws": law_table(on),
+        "gestures": fem_cost.gestures(on, 0.15),
+        "sequence": [fem_cost.sequence("linear", 0.15), fem_cost.sequence("neo-hookean", 0.4)],
     }
-    if out is not None:
-        write.keep(out, "pareto.json", found)
-        everything = [*rows, *gestures, *whole]
-        plot.write(panels(found), out, "Physics: error against cost", everything, found)
-    if json:
-        print(json_.dumps(found))
-        return
-    for row in rows:
-        print(
-            f"{row['law']:13s} P{row['order']} {row['tets']:6d} tets  {row['ms_a_frame']:6.1f} ms a frame  "
-            f"mesh {100 * row['mesh_error']:5.2f}%  {'whole ' + format(100 * row['error'], '.2f') + '%'}"
-            f"{'  <- default' if row['default'] else ''}"
-        )
-    for row in laws:
-        print(f"{row['law']:13s} P {row['load']:4.2f} {row['way']:5s} {row['outcome']}")
-    for row in gestures:
-        print(
-            f"{row['law']:13s} P {row['load']:4.2f} {row['gesture']:15s} {row['ms_a_frame']:6.1f} ms a frame"
-        )
-    for row in whole:
-        spent = ", ".join(f"{k[:-2]} {v:.2f}" for k, v in row.items() if k.endswith("_s"))
-        print(f"{row['law']:13s} whole sequence: {row['peak_rss_mb']:.0f} MB at most; CPU s: {spent}")
 
 
 def discretisation(on: fem_case.Patch, refined: int, contacts: int, load: float) -> list[dict[str, Any]]:
@@ -139,12 +113,18 @@ def law_table(on: fem_case.Patch) -> list[dict[str, Any]]:
     return rows
 
 
-def panels(found: dict[str, Any]) -> list[plot.Panel]:
+def drawn(found: Mapping[str, Any]) -> result_page.Page:
+    """What the data say."""
+    tables = [result_page.Section(name, found[name]) for name in ("rows", "gestures", "sequence")]
+    return result_page.Page("Physics: error against cost", found, panels(found), tables)
+
+
+def panels(found: Mapping[str, Any]) -> list[charts.Panel]:
     """Charts of `pareto.json`: the mesh and law's error against cost, and each law's over the load."""
     rows, laws = found["rows"], found["laws"]
     groups = sorted({(r["law"], r["order"]) for r in rows})
     cost = tuple(
-        plot.Curve(
+        charts.Curve(
             f"{law} P{order}",
             tuple(r["ms_a_frame"] for r in mine),
             tuple(100 * r["error"] for r in mine),
@@ -155,7 +135,7 @@ def panels(found: dict[str, Any]) -> list[plot.Panel]:
         if (mine := [r for r in rows if (r["law"], r["order"]) == (law, order)])
     )
     worth = tuple(
-        plot.Curve(
+        charts.Curve(
             law,
             tuple(load for load, _ in worst),
             tuple(100 * error for _, error in worst),
@@ -164,10 +144,10 @@ def panels(found: dict[str, Any]) -> list[plot.Panel]:
         if (worst := _worst(laws, law))
     )
     return [
-        plot.Panel(
+        charts.Panel(
             "Physics: error against cost", "CPU ms a frame", "error [%]", cost, True, True, front=True
         ),
-        plot.Panel("Physics: laws against neo-Hookean", "P = F/(E a2)", "error [%]", worth, True, True),
+        charts.Panel("Physics: laws against neo-Hookean", "P = F/(E a2)", "error [%]", worth, True, True),
     ]
 
 

@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-import json as json_
 import multiprocessing
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
-from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 import typer
 from numpy.typing import NDArray
 
-from bench.output import machine, plot, write
+from bench.output import charts, result_page
 from evidence.fem import case as fem_case
+from evidence.measuring import measuring
 from synth.errors import UserError
 from synth.fem import equilibrium, motion, solver, surface_embedding, tool
 from synth.fem.laws import NUMBER
@@ -37,16 +36,18 @@ _CONTACT = fem_case.CONTACTS[0]
 _VERTICES, _CHUNK = 10_000, 50
 
 
+@measuring(
+    "--scenes 100 --out runs/fem",
+    said="Folder for data, picture and page.",
+    file="stability.json",
+    page=lambda found, out: result_page.write(drawn(found), out),
+)
 def stability(
     scenes: Annotated[int, typer.Option(help="Random scenes of the default ranges.", min=0)] = 1000,
     tets: Annotated[int, typer.Option(help="Tetrahedra of every scene and sweep.", min=100)] = 700,
     seed: Annotated[int, typer.Option(help="Of the random scenes.")] = 0,
     workers: Annotated[int, typer.Option(help="Processes.", min=1)] = 1,
-    out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Folder for data, picture and page.")
-    ] = None,
-    json: Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")] = False,
-) -> None:
+) -> dict[str, Any]:
     """Where each law leaves its tolerance, loses equilibrium or inverts, and which guard caught it."""
     sweeps: list[Callable[[int], list[Row]]] = [loads, poissons, ramps, sizes, slivers, steps]
     context = multiprocessing.get_context("spawn")
@@ -56,22 +57,7 @@ def stability(
             for first in range(0, scenes, _CHUNK)
         ]
         rows = [row for part in pool.map(_run, sweeps, [tets] * len(sweeps)) for row in part]
-        random = _added([chunk.result() for chunk in chunks])
-    found = {
-        "command": f"bench stability fem --scenes {scenes} --tets {tets} --seed {seed} --workers {workers}",
-        "machine": machine.describe(),
-        "rows": rows,
-        "random_scenes": random,
-    }
-    if out is not None:
-        write.keep(out, "stability.json", found)
-        plot.write(panels(found), out, "Physics: where it breaks", rows, found)
-    if json:
-        print(json_.dumps(found))
-        return
-    for row in rows:
-        print(f"{row['sweep']:8s} {row['law']:13s} {row['way']:5s} {row['value']:8g}  {row['outcome']}")
-    print(random)
+        return {"rows": rows, "random_scenes": _added([chunk.result() for chunk in chunks])}
 
 
 def _run(sweep: Callable[[int], list[Row]], tets: int) -> list[Row]:
@@ -291,14 +277,20 @@ def _added(parts: list[Row]) -> Row:
     return whole
 
 
-def panels(found: dict[str, Any]) -> list[plot.Panel]:
+def drawn(found: Mapping[str, Any]) -> result_page.Page:
+    """What the data say."""
+    tables = [result_page.Section("All runs", found["rows"])]
+    return result_page.Page("Physics: where it breaks", found, panels(found), tables)
+
+
+def panels(found: Mapping[str, Any]) -> list[charts.Panel]:
     """Charts of `stability.json`: error over each thing that is made worse."""
     rows: list[Row] = found["rows"]
     axes = {
         "load": "P = F/(E a2)",
         "poisson": "Poisson's ratio",
         "size": "tetrahedra",
-        "sliver": "height left",
+        "sliver": "height left [share]",
         "ramp": "steps to the peak",
         "dt": "time step [s]",
     }
@@ -307,12 +299,12 @@ def panels(found: dict[str, Any]) -> list[plot.Panel]:
         ours = [r for r in rows if r["sweep"] == sweep and r["error"] is not None and np.isfinite(r["error"])]
         ours = [r for r in ours if r["way"] != "aside" and (sweep != "load" or r["way"] == "push")]
         curves = tuple(
-            plot.Curve(
+            charts.Curve(
                 law,
                 tuple(r["value"] for r in ours if r["law"] == law),
                 tuple(max(100 * r["error"], 1e-3) for r in ours if r["law"] == law),
             )
             for law in dict.fromkeys(r["law"] for r in ours)
         )
-        made.append(plot.Panel(sweep, axis, "error [%]", curves, sweep != "poisson", True))
+        made.append(charts.Panel(f"Physics: {sweep}", axis, "error [%]", curves, sweep != "poisson", True))
     return made

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json as json_
 import time
 from pathlib import Path
 from typing import Annotated, Any
@@ -12,7 +11,7 @@ import trimesh
 import typer
 from numpy.typing import NDArray
 
-from bench.output import machine, write
+from evidence.measuring import measuring
 from synth.fem import surface_embedding, tool
 from synth.fem.mesh import tetrahedra, winding
 from synth.fem.mesh.element import bary_slope, quality
@@ -27,6 +26,7 @@ _WAYS = {"pull": (0.0, 0.0, 1.0), "aside": (0.87, 0.0, 0.5)}
 _FINE_MM = 0.6  # spacing of the surface that is loaded: a coarser one would press on single points
 
 
+@measuring("brain.obj --direction=-0.4,0.8,0.45", said="Folder for the data.", file="{file}.json")
 def surface(
     file: Annotated[Path, typer.Argument(help="A brain's surface: OBJ, STL, PLY or VTK, in mm.")],
     direction: Annotated[
@@ -34,27 +34,10 @@ def surface(
     ] = "-0.4,0.8,0.45",
     tets: Annotated[str, typer.Option(help="Tetrahedra of the meshes measured.")] = "1600,2500,4000",
     refined: Annotated[int, typer.Option(help="Tetrahedra of the reference.")] = 9000,
-    out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder for the data.")] = None,
-    json: Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")] = False,
-) -> None:
+) -> dict[str, Any]:
     """Volume kept, element quality, time, and error in the opening against a finer mesh."""
     outwards = np.array([float(part) for part in direction.split(",")])
-    found: dict[str, Any] = {
-        "command": f"bench experiment surface {file.name} --direction={direction} --tets {tets} "
-        f"--refined {refined}",
-        "machine": machine.describe(),
-    } | measure(file, outwards, [int(n) for n in tets.split(",")], refined)
-    if out is not None:
-        write.keep(out, f"{file.stem}.json", found)
-    if json:
-        print(json_.dumps(found))
-        return
-    print(f"{found['vertices']} vertices, {found['faces']} faces, {found['volume_mm3']:.0f} mm^3")
-    for row in found["rows"]:
-        print(
-            f"{row['tets']:6d} tets  volume {100 * row['volume_kept']:5.1f}%  quality {row['quality']:.2f}  "
-            f"mesh {row['mesh_cpu_s']:.1f} CPU-s  error {100 * row['error']:.2f}%"
-        )
+    return measure(file, outwards, [int(n) for n in tets.split(",")], refined)
 
 
 def measure(file: Path, outwards: Floats, tets: list[int], refined: int) -> dict[str, Any]:

@@ -6,7 +6,7 @@ import json as json_
 import platform
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
 from itertools import chain
 from pathlib import Path
@@ -17,11 +17,12 @@ import numpy as np
 import torch
 import typer
 
-from bench.output import machine, write
+from bench.output import charts, machine, result_page, write
 from evidence.flow import rendered
 from evidence.flow.chain import ChainTracker
 from evidence.flow.measure import Error, MeanInpainting, against, average, epe, measure
 from evidence.flow.scenes import CLEAN, Flags, Pair, Recipe, Rgb, Stage, pairs
+from evidence.measuring import measuring
 from synth.errors import UserError
 from synth.flow import mask
 from synth.flow.estimator import create
@@ -61,8 +62,14 @@ class Source:
         return pairs(recipe, self.count, self.seed, self.photo)
 
 
+@measuring(
+    "--out runs/flow --only warped",
+    out=...,
+    said="Folder for results.json and results.md.",
+    text="results.md",
+)
 def experiment(
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for results.json and results.md.")],
+    out: Path,
     photo: Annotated[
         Path | None, typer.Option(help="Photograph of a cortex to warp as well; nothing of it is written.")
     ] = None,
@@ -72,8 +79,7 @@ def experiment(
     count: Annotated[int, typer.Option(min=1, help="Pairs a source.")] = 6,
     frames: Annotated[int, typer.Option(min=60, help="Frames of the drift sequence.")] = 200,
     seed: Annotated[int, typer.Option(min=0, help="Root of every draw; 4 and 5 were tuned on.")] = 2641,
-    json: Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")] = False,
-) -> None:
+) -> dict[str, Any]:
     """Flow: endpoint error, divergence, masks, drift and time against what was asked."""
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
@@ -93,21 +99,18 @@ def experiment(
     chosen = [part.strip() for part in only.split(",") if part.strip()]
     if unknown := [part for part in chosen if part not in parts]:
         raise UserError(f"--only: no part {', '.join(unknown)}; there are {', '.join(parts)}")
-    out.mkdir(parents=True, exist_ok=True)
     path = out / "results.json"
-    record = json_.loads(path.read_text()) if path.exists() else {}
+    record: dict[str, Any] = json_.loads(path.read_text()) if path.exists() else {}
     record["machine"] = machine.describe() | {"torch": torch.__version__, "opencv": cv2.__version__}
     for part in chosen:
         rows = [asdict(row) | {"reached": row.reached} for row in parts[part]()]
         command = f"bench experiment flow --only {part} --count {count} --frames {frames} --seed {seed}"
         record[part] = {"command": command, "rows": rows}
         write.keep(out, "results.json", record)
-        write.keep(out, "results.md", _table(record))
-        if not json:
-            for row in rows:
-                typer.echo(_line(row))
-    if json:
-        typer.echo(json_.dumps(record))
+        result_page.write(drawn(record), out)
+        for row in rows:
+            typer.echo(_line(row), err=True)
+    return record
 
 
 def _line(row: dict[str, object]) -> str:
@@ -116,23 +119,41 @@ def _line(row: dict[str, object]) -> str:
     return f"{row['what']:<52} {row['on']:<26} {row['measured']:>8.3f} {row['unit']:<6} {asked:<9} {verdict}"
 
 
-def _table(record: dict[str, Any]) -> str:
-    """Every row measured so far, as Markdown."""
-    lines = ["# Flow: asked against measured", ""]
-    for part in (part for part in record if part != "machine"):
-        lines += [
-            f"`{record[part]['command']}`",
-            "",
-            "| what | on | asked | measured | |",
-            "| --- " * 5 + "|",
-        ]
-        for row in record[part]["rows"]:
-            asked = "" if row["asked"] is None else f"{'≥' if row['at_least'] else '≤'} {row['asked']:g}"
-            verdict = {None: "", True: "reached", False: "**not reached**"}[row["reached"]]
-            figure = f"{row['measured']:.3f} {row['unit']}"
-            lines.append(f"| {row['what']} | {row['on']} | {asked} | {figure} | {verdict} |")
-        lines.append("")
-    return "\n".join(lines)
+def drawn(record: Mapping[str, Any]) -> result_page.Page:
+    """What `results.json` says: every figure asked, as a part of what was allowed, and every row."""
+    parts = {name: part for name, part in record.items() if "rows" in part}
+    asked = [row for part in parts.values() for row in part["rows"] if row["asked"]]
+    shown = []
+    for on in dict.fromkeys(row["on"] for row in asked):
+        shares = {
+            row["what"]: (
+                row["asked"] / row["measured"] if row["at_least"] else row["measured"] / row["asked"]
+            )
+            for row in asked
+            if row["on"] == on
+        }
+        shown.append(charts.Chart(f"{on}: reached where at most 1", "measured / asked", charts.bars(shares)))
+    return result_page.Page(
+        "Flow: asked against measured",
+        record,
+        shown,
+        [
+            result_page.Section(name, [_cells(row) for row in part["rows"]], (f"`{part['command']}`",))
+            for name, part in parts.items()
+        ],
+        command="; ".join(part["command"] for part in parts.values()),
+        name="results.md",
+    )
+
+
+def _cells(row: Mapping[str, Any]) -> dict[str, str]:
+    return {
+        "what": row["what"],
+        "on": row["on"],
+        "asked": "" if row["asked"] is None else f"{'≥' if row['at_least'] else '≤'} {row['asked']:g}",
+        "measured": f"{row['measured']:.3f} {row['unit']}",
+        "verdict": {None: "", True: "reached", False: "not reached"}[row["reached"]],
+    }
 
 
 def automatic(picture: Rgb, _: Flags) -> Flags:

@@ -2,33 +2,37 @@
 
 from __future__ import annotations
 
-import json as json_
+from collections.abc import Mapping
 from dataclasses import asdict, replace
-from pathlib import Path
 from typing import Annotated, Any
 
 import cv2
 import torch
 import typer
 
-from bench.output import machine, plot, write
+from bench.output import charts, machine, result_page
 from evidence.flow.measure import measure
 from evidence.flow.scenes import Recipe, pairs
+from evidence.measuring import measuring
 from synth.flow.estimator import Estimator
 from synth.flow.opencv import Dis, OpenCvTvl1
 from synth.flow.tvl1 import Settings, Tvl1
 
 
+@measuring(
+    "--out runs/flow --count 2",
+    out=...,
+    said="Folder for pareto.json, chart.svg, index.html.",
+    file="pareto.json",
+    page=lambda found, out: result_page.write(drawn(found), out),
+)
 def pareto(
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for pareto.json, chart.svg, index.html.")],
     count: Annotated[int, typer.Option(min=1, help="Pairs a point.")] = 4,
     seed: Annotated[int, typer.Option(min=0, help="Root of every draw.")] = 2613,
-    json: Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")] = False,
-) -> None:
+) -> dict[str, Any]:
     """Flow: endpoint and divergence error against milliseconds, the default marked."""
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
-    out.mkdir(parents=True, exist_ok=True)
     made = list(pairs(Recipe(), count, seed))
     rows: list[dict[str, Any]] = []
     for family, label, estimator, warm in _candidates():
@@ -44,23 +48,21 @@ def pareto(
             "default": default,
         }
         rows.append(what | asdict(error))
-        if not json:
-            typer.echo(f"{family:12} {label:22} {1e3 * error.cpu_s:6.0f} ms  EPE {error.mean:.3f} px  "
-                       f"divergence {error.divergence:.2f}")  # fmt: skip
-    record = {
-        "command": f"bench pareto flow --count {count} --seed {seed}",
+        typer.echo(f"{family}: {label}", err=True)
+    return {
         "on": "warped procedural cortex, 224², 10 px pull, tool, highlights; CPU time of one thread",
         "machine": machine.describe() | {"torch": torch.__version__, "opencv": cv2.__version__},
         "rows": rows,
     }
-    write.keep(out, "pareto.json", record)
-    shown = [{key: value for key, value in row.items() if key != "settings"} for row in rows]
-    plot.write(panels(record), out, "Flow: error against time", shown, record)
-    if json:
-        typer.echo(json_.dumps(record))
 
 
-def panels(found: dict[str, Any]) -> list[plot.Panel]:
+def drawn(found: Mapping[str, Any]) -> result_page.Page:
+    """What the data say."""
+    tables = [result_page.Section("All settings", found["rows"])]
+    return result_page.Page("Flow: error against time", found, panels(found), tables)
+
+
+def panels(found: Mapping[str, Any]) -> list[charts.Panel]:
     """Charts of `pareto.json`: endpoint and divergence error against time."""
     rows, made = found["rows"], []
     for title, key in (("endpoint error", "mean"), ("divergence error (relative RMS)", "divergence")):
@@ -68,7 +70,7 @@ def panels(found: dict[str, Any]) -> list[plot.Panel]:
         for family in dict.fromkeys(str(row["family"]) for row in rows):
             own = [row for row in rows if row["family"] == family]
             curves.append(
-                plot.Curve(
+                charts.Curve(
                     family,
                     tuple(1e3 * float(row["cpu_s"]) for row in own),
                     tuple(float(row[key]) for row in own),
@@ -78,7 +80,7 @@ def panels(found: dict[str, Any]) -> list[plot.Panel]:
             )
         unit = "EPE mean [px]" if key == "mean" else "relative RMS"
         made.append(
-            plot.Panel(f"Flow: {title}", "CPU time [ms]", unit, tuple(curves), True, True, front=True)
+            charts.Panel(f"Flow: {title}", "CPU time [ms]", unit, tuple(curves), True, True, front=True)
         )
     return made
 

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import json as json_
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from pathlib import Path
 from typing import Annotated, Any
 
 import cv2
@@ -13,9 +11,10 @@ import numpy as np
 import torch
 import typer
 
-from bench.output import machine, plot, write
+from bench.output import charts, machine, result_page
 from evidence.flow.measure import epe
 from evidence.flow.scenes import CLEAN, Flags, Floats, Pair, Recipe, pairs
+from evidence.measuring import measuring
 from synth.flow import confidence
 from synth.flow.estimator import Estimator, create
 from synth.flow.track import Tracker
@@ -54,39 +53,35 @@ class Point:
     finite: bool
 
 
+@measuring(
+    "--out runs/flow --methods tvl1,dis",
+    out=...,
+    said="Folder for stability.json, chart.svg, index.html.",
+    file="stability.json",
+    page=lambda found, out: result_page.write(drawn(found), out),
+)
 def stability(
-    out: Annotated[
-        Path, typer.Option("--out", "-o", help="Folder for stability.json, chart.svg, index.html.")
-    ],
     count: Annotated[int, typer.Option(min=1, help="Pairs a point.")] = 2,
     size: Annotated[int, typer.Option(min=64, help="Width and height of the pictures [px].")] = 224,
     seed: Annotated[int, typer.Option(min=0, help="Root of every draw; 8 was tuned on.")] = 2615,
     methods: Annotated[str, typer.Option(help="Comma-separated estimators.")] = "tvl1,opencv-tvl1,dis",
-    json: Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")] = False,
-) -> None:
+) -> dict[str, Any]:
     """Flow: where each estimator breaks, and whether it flags that it did."""
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
-    out.mkdir(parents=True, exist_ok=True)
     estimators = {name: create(name) for name in methods.split(",")}
     points: list[Point] = []
     for trouble, value, made, spoil in _troubles(size, count, seed):
         for name, estimator in estimators.items():
             points.append(_point(trouble, value, name, estimator, made, spoil))
-        if not json:
-            typer.echo(f"{trouble} {value:g}: " + ", ".join(
-                f"{p.estimator} {p.epe:.3f} px" for p in points[-len(estimators):]))  # fmt: skip
-    record = {
-        "command": f"bench stability flow --count {count} --size {size} --seed {seed} --methods {methods}",
+        typer.echo(f"{trouble} {value:g}", err=True)
+    return {
         "machine": machine.describe() | {"torch": torch.__version__, "opencv": cv2.__version__},
         "identical_frames_largest_px": {name: _identical(e, size, seed) for name, e in estimators.items()},
         "extreme_sizes": {name: _extremes(e) for name, e in estimators.items()},
         "flag": {name: _flag([p for p in points if p.estimator == name]) for name in estimators},
         "points": [asdict(point) for point in points],
     }
-    write.keep(out, "stability.json", record)
-    plot.write(panels(record), out, "Flow: where it breaks", found=record)
-    typer.echo(json_.dumps(record if json else {k: record[k] for k in list(record)[2:5]}))
 
 
 Spoil = Callable[[Pair], tuple[Flags, Flags, Floats | None]]
@@ -219,7 +214,13 @@ def _extremes(estimator: Estimator) -> dict[str, bool]:
     return result
 
 
-def panels(found: dict[str, Any]) -> list[plot.Panel]:
+def drawn(found: Mapping[str, Any]) -> result_page.Page:
+    """What the data say."""
+    tables = [result_page.Section("All points", found["points"])]
+    return result_page.Page("Flow: where it breaks", found, panels(found), tables)
+
+
+def panels(found: Mapping[str, Any]) -> list[charts.Panel]:
     """Charts of `stability.json`: error over each trouble."""
     points, made = [Point(**point) for point in found["points"]], []
     for trouble in dict.fromkeys(point.trouble for point in points):
@@ -228,7 +229,7 @@ def panels(found: dict[str, Any]) -> list[plot.Panel]:
             own = [p for p in points if p.trouble == trouble and p.estimator == name]
             if len(own) > 1:
                 y = tuple(max(p.epe, 1e-3) for p in own)
-                curves.append(plot.Curve(name, tuple(p.value for p in own), y))
+                curves.append(charts.Curve(name, tuple(p.value for p in own), y))
         if curves:
-            made.append(plot.Panel(trouble, trouble, "EPE mean [px]", tuple(curves), log_y=True))
+            made.append(charts.Panel(f"Flow: {trouble}", trouble, "EPE mean [px]", tuple(curves), log_y=True))
     return made

@@ -1,4 +1,4 @@
-"""Trains the tool mask's U-Net on masks rendered for it (`flow_toolscenes`).
+"""Trains the tool mask's U-Net on masks rendered for it (`evidence.flow.toolnet_scenes`).
 
     python -m evidence.flow.toolnet_training --scenes 39 --steps 700 --seed 0 -o synth/flow
 

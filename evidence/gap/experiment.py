@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.bootstrap import Interval
-from bench.output import forest_plot, machine, result_page
+from bench.output import charts, machine, result_page
 from bench.output import write as results
 from evidence.gap import gap
 from evidence.gap.runs import KEYS, Tests, Training, carry_out, kept_flow, write_table
@@ -45,7 +45,7 @@ def run(
     command: str,
     say: Callable[[str], None],
 ) -> dict[str, Any]:
-    """Trains, asks and writes runs.parquet, results.json, README.md, chart.svg and index.html.
+    """Trains, asks and writes runs.parquet, results.json, README.md and chart.svg.
 
     Args:
         dataset: rendered, with recovered flow of the back end `tvl1`, of several appearance families.
@@ -176,81 +176,63 @@ def _errors(runs: Sequence[Mapping[str, Any]], test: str, key: str) -> Curve:
 
 
 def write(tree: dict[str, Any], out: Path) -> None:
-    """results.json, README.md, chart.svg and index.html."""
+    """results.json, README.md and chart.svg."""
     results.keep(out, "results.json", _plain(tree))
-    results.keep(out, "README.md", readme(tree))
     result_page.write(drawn(_plain(tree)), out)
 
 
-def drawn(tree: Mapping[str, Any]) -> result_page.Sheet:
-    """Page and picture of `results.json`."""
-    rows = []
+def drawn(tree: Mapping[str, Any]) -> result_page.Page:
+    """What `results.json` says."""
+    bars, sections = [], []
     for group, (flow, found) in enumerate(tree["flows"].items()):
-        errors = found["errors"][KEYS[0]]
         for kind, test in (("I", "I'"), *((kind, "R'") for kind in ("I", *KINDS))):
-            value = errors[kind][test]
-            rows.append(
-                forest_plot.Row(
-                    f"{flow}: {kind} on {_TESTS[test].split(',')[0]}",
-                    value["mean"],
-                    (value["low"], value["high"]),
-                    group,
-                )
-            )
-    title = f"Unseen family ({tree['held_out']}): trained on ... tested on ..."
-    chart = result_page.Chart(title, _UNITS[KEYS[0]], tuple(rows))
-    return result_page.Sheet("The sim-to-real gap", tree["command"], tree, (chart,))
-
-
-def readme(tree: dict[str, Any]) -> str:
-    """The results in words and tables."""
-    lines = [
-        "# The sim-to-real gap",
-        "",
-        "Does training on the flow recovered from rendered frames close the gap that training on ideal",
-        "displacement leaves? I: trained on ideal flow, R: on recovered, N: on ideal with noise fitted to",
-        "the recovered flow's error, mixed: ideal first, recovered later.",
-        "",
-        "    synth render docs/results/gap/data.yaml -o DATA",
-        f"    {tree['command']}",
-        "",
-        f"{_counts(tree['sequences'])}; family held out: {tree['held_out']};",
-        f"{tree['seeds']} network(s) a training, errors averaged over them; 95% BCa intervals.",
-        f"Machine: {machine.line(tree['machine'])}.",
-        "",
-    ]
-    for flow, found in tree["flows"].items():
-        lines += [f"## Flow by {flow}", ""]
+            value = found["errors"][KEYS[0]][kind][test]
+            name = f"{flow}: {kind} on {_TESTS[test].split(',')[0]}"
+            bars.append(charts.Row(name, value["mean"], (value["low"], value["high"]), group))
         noise = found["noise"]
-        lines += [
+        said = (
             f"Fitted noise: gain {noise['gain']:.3f}, {noise['sigma_mm']:.3f} mm a component, "
-            f"correlated over {noise['reach_cells']:.1f} cells.",
-            "",
-        ]
+            f"correlated over {noise['reach_cells']:.1f} cells."
+        )
+        sections.append(result_page.Section(f"Flow by {flow}", words=(said,)))
         for key in KEYS:
-            lines += [f"### {_UNITS[key][0].upper()}{_UNITS[key][1:]}", ""]
-            lines += ["| trained on | " + " | ".join(_TESTS.values()) + " | share of the gap closed |"]
-            lines += ["|" + " --- |" * (len(_TESTS) + 2)]
-            for kind, tests in found["errors"][key].items():
-                cells = [_text((v["low"], v["high"]), v["mean"]) for v in tests.values()]
-                share = "–"
-                if kind in found["closed"][key]:
-                    closed = found["closed"][key][kind]
-                    share = "undefined" if closed["undefined"] else _text(closed["interval"], closed["share"])
-                lines.append(f"| {kind} | " + " | ".join(cells) + f" | {share} |")
-            lines += ["", found["verdict"][key], ""]
-    if tree["better_flow"]:
-        lines += ["## A better flow, before any retraining", ""]
-        for key in KEYS:
-            found = tree["better_flow"][key]
-            share = found["undefined"] or _text(found["interval"], found["share"])
-            lines += [
-                f"Ours instead of plain OpenCV TV-L1 under the network trained on ideal flow, {_UNITS[key]}:",
-                f"{share} of OpenCV's gap closed.",
-                "",
+            rows = [
+                {"trained on": kind}
+                | {_TESTS[test]: _text((v["low"], v["high"]), v["mean"]) for test, v in tests.items()}
+                | {"share of the gap closed": _closed(found["closed"][key].get(kind))}
+                for kind, tests in found["errors"][key].items()
             ]
-    lines += ["![Errors in the unseen family](chart.svg)", ""]
-    return "\n".join(lines)
+            heading = f"{flow}: {_UNITS[key]}"
+            sections.append(result_page.Section(heading, rows, (found["verdict"][key],)))
+    words = [
+        f"Ours instead of plain OpenCV TV-L1 under the network trained on ideal flow, {_UNITS[key]}: "
+        f"{better['undefined'] or _text(better['interval'], better['share'])} of OpenCV's gap closed."
+        for key, better in tree["better_flow"].items()
+    ]
+    if words:
+        sections.append(result_page.Section("A better flow, before any retraining", words=words))
+    title = f"Unseen family ({tree['held_out']}): trained on ... tested on ..."
+    return result_page.Page(
+        "The sim-to-real gap",
+        tree,
+        [charts.Chart(title, _UNITS[KEYS[0]], tuple(bars))],
+        sections,
+        (
+            "Does training on the flow recovered from rendered frames close the gap that training on ideal "
+            "displacement leaves? I: trained on ideal flow, R: on recovered, N: on ideal with noise fitted "
+            "to the recovered flow's error, mixed: ideal first, recovered later.",
+            f"{_counts(tree['sequences'])}; family held out: {tree['held_out']}; {tree['seeds']} network(s) "
+            "a training, errors averaged over them; 95% BCa intervals.",
+        ),
+        f"synth render docs/results/gap/data.yaml -o DATA; {tree['command']}",
+        "README.md",
+    )
+
+
+def _closed(found: Mapping[str, Any] | None) -> str | None:
+    if found is None:
+        return None
+    return "undefined" if found["undefined"] else _text(found["interval"], found["share"])
 
 
 def _counts(sequences: dict[str, int]) -> str:

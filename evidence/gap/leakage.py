@@ -19,16 +19,19 @@ from rich.console import Console
 from bench.bootstrap import over_groups
 from bench.methods import baselines
 from bench.methods.protocol import Answer
-from bench.output import forest_plot, machine, result_page, write
+from bench.output import charts, machine, result_page, write
 from bench.scoring import metrics
+from evidence.measuring import measuring
 from learn.data.clips import Clip, load_clips
 from learn.data.split import groups
 
 Curve = NDArray[np.float64]
 _FOLDS = 5
 _SPLITS = {"random frames": 0, "whole recordings": 1}
+_HEADS = {"r": "r", "r2": "R²", "mae_mn": "MAE [mN]"}
 
 
+@measuring("out --out runs/leakage")
 def leakage(
     dataset: Annotated[Path, typer.Argument(help="Dataset with recovered flow.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the results.")] = Path(
@@ -47,23 +50,40 @@ def leakage(
     }
     tree = summary(clips, found)
     write.keep(out, "results.json", tree)
-    write.keep(out, "README.md", readme(tree))
     result_page.write(drawn(tree), out)
     print(out / "README.md")
 
 
-def drawn(tree: Mapping[str, Any]) -> result_page.Sheet:
-    """Page and picture of `results.json`."""
-    rows = tuple(
-        forest_plot.Row(f"{method}: {split}", value["mae_mn"], tuple(value["mae_interval"]), _SPLITS[split])
-        for method, by_split in tree["methods"].items()
-        for split, value in by_split.items()
-    )
-    chart = result_page.Chart(
-        "The same methods, two ways to split", "mean error of the total force [mN]", rows
-    )
-    return result_page.Sheet(
-        "What leakage does to a score", "bench experiment leakage DATASET", tree, (chart,)
+def drawn(tree: Mapping[str, Any]) -> result_page.Page:
+    """What `results.json` says."""
+    bars, rows = [], []
+    for method, by in tree["methods"].items():
+        row = {"method": method}
+        for name, form in (("r", "{:.3f}"), ("r2", "{:.3f}"), ("mae_mn", "{:.2f} [{:.2f}, {:.2f}]")):
+            for split in _SPLITS:
+                found = by[split]
+                ends = found["mae_interval"] if name == "mae_mn" else ()
+                text = "–" if found[name] is None else form.format(found[name], *ends)
+                row[f"{_HEADS[name]}, {split}"] = text
+        rows.append(row)
+        for split, found in by.items():
+            ends = tuple(found["mae_interval"])
+            bars.append(charts.Row(f"{method}: {split}", found["mae_mn"], ends, _SPLITS[split]))
+    title = "The same methods, two ways to split"
+    return result_page.Page(
+        "What leakage does to a score",
+        tree,
+        [charts.Chart(title, "mean error of the total force [mN]", tuple(bars))],
+        (result_page.Section("", rows),),
+        (
+            "Total force from recovered flow, E known, by methods fitted on the other folds: once with "
+            "single frames dealt to the folds at random, once with whole recordings (and anatomies). Only "
+            "the second says what a new recording would get.",
+            f"{tree['recordings']} recordings, {tree['frames']} frames, {tree['folds']} folds; intervals: "
+            "95%, anatomies resampled.",
+        ),
+        "synth render docs/results/gap/data.yaml -o DATA; bench experiment leakage DATA",
+        "README.md",
     )
 
 
@@ -118,33 +138,6 @@ def summary(clips: Sequence[Clip], found: dict[str, dict[str, list[Curve]]]) -> 
         "machine": machine.describe(),
         "methods": methods,
     }
-
-
-def readme(tree: dict[str, Any]) -> str:
-    """The result as a table."""
-    lines = [
-        "# What leakage does to a score",
-        "",
-        "Total force from recovered flow, E known, by methods fitted on the other folds: once with",
-        "single frames dealt to the folds at random, once with whole recordings (and anatomies). Only the",
-        "second says what a new recording would get.",
-        "",
-        "    synth render docs/results/gap/data.yaml -o DATA",
-        "    bench experiment leakage DATA",
-        "",
-        f"{tree['recordings']} recordings, {tree['frames']} frames, {tree['folds']} folds; intervals: 95%,",
-        f"anatomies resampled. Machine: {machine.line(tree['machine'])}.",
-        "",
-        "| method | r: frames | recordings | R²: frames | recordings | MAE [mN]: frames | recordings |",
-        "|" + " --- |" * 7,
-    ]
-    for name, by in tree["methods"].items():
-        a, b = by["random frames"], by["whole recordings"]
-        r = [f"{v['r']:.3f}" if v["r"] is not None else "–" for v in (a, b)]
-        mae = [f"{v['mae_mn']:.2f} [{v['mae_interval'][0]:.2f}, {v['mae_interval'][1]:.2f}]" for v in (a, b)]
-        word = name.replace("|", r"\|")
-        lines.append(f"| {word} | {r[0]} | {r[1]} | {a['r2']:.3f} | {b['r2']:.3f} | {mae[0]} | {mae[1]} |")
-    return "\n".join([*lines, "", "![Errors by split](chart.svg)", ""])
 
 
 def _by_frame(clips: Sequence[Clip], seed: int) -> list[NDArray[np.intp]]:

@@ -16,6 +16,7 @@ from evidence.learn.labels import clips as labels
 from evidence.learn.labels import press
 from evidence.learn.runs import Run, carry_out
 from evidence.learn.summary import write
+from evidence.measuring import measuring
 from learn.data.clips import Clip, load_clips
 from learn.data.grid import Grid
 from learn.loss import GHOSTLESS, Objective
@@ -140,6 +141,7 @@ def recovered_runs() -> Iterator[Run]:
         yield Run(f"ideal-fold{fold}", replace(base, fold=fold))
 
 
+@measuring("--cache cache --out runs/learn")
 def experiment(
     cache: Annotated[Path, typer.Option(help="Folder for packed sequences; made once.")],
     rendered: Annotated[

@@ -22,6 +22,7 @@ from bench.output.machine import describe
 from bench.output.write import keep
 from evidence.learn.experiment import LOSSES, RESULTS
 from evidence.learn.labels import FINE, whole
+from evidence.measuring import measuring
 from learn.data.clips import Clip
 from learn.data.grid import Grid
 from learn.data.split import nested
@@ -35,6 +36,7 @@ from synth.job import reader
 from synth.job.schema import Job
 
 
+@measuring("--cache cache --out full")
 def full_size(
     cache: Annotated[Path, typer.Option(help="Folder for packed sequences, 1.6 MB a frame at 256².")],
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the model and full.json.")],

@@ -15,12 +15,12 @@ import torch
 import typer
 from rich.console import Console
 
-from bench.output import plot, write
+from bench.output import charts, result_page, write
 from bench.output.machine import describe
 from evidence.learn.cost import flops, parameters
 from evidence.learn.experiment import BESIDE
 from evidence.learn.preset_errors import GRIDS, Known, Shape, architecture, errors, shape
-from evidence.learn.table import markdown
+from evidence.measuring import measuring
 from learn.data.grid import Grid, Scales, channels
 from learn.evaluation.statistics import Interval
 from learn.network.d2fnet import Architecture, fused
@@ -57,6 +57,7 @@ class Choice:
         return ", ".join(found)
 
 
+@measuring("--out runs/learn --repeats 10")
 def pareto(
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for results.")] = Path(
         "docs/results/learn/pareto"
@@ -99,7 +100,7 @@ def pareto(
             f"{row['name']} {row['layout']} {row['precision']}: p50 {row['ms_p50']:.1f} ms, "
             f"p95 {row['ms_p95']:.1f} ms"
         )
-    _write(out, known)
+    result_page.write(drawn(out, known), out)
     if json:
         print(json_.dumps(result))
 
@@ -238,21 +239,16 @@ def _share(against: list[float] | None) -> str | None:
     return None if against is None else "{:+.0%} [{:+.0%}, {:+.0%}]".format(*against)
 
 
-def _write(out: Path, known: Known) -> None:
-    """README.md, chart.svg and index.html from every data file there."""
-    parts, panels, lines = [_HEAD], [], []
-    how: dict[str, Any] = {}
-    for file in sorted(out.glob("data-*.json")):
-        found = json_.loads(file.read_text())
-        device, rows = found["machine"]["device"], found["rows"]
-        with_errors(rows, known)
-        own = _lines(rows)
-        parts.append(f"## {device}\n\n{markdown(own)}\n")
-        lines += [{"device": device} | line for line in own]
+def drawn(out: Path, known: Known) -> result_page.Page:
+    """What every data file in `out` says, with the errors that are known."""
+    found = [json_.loads(file.read_text()) for file in sorted(out.glob("data-*.json"))]
+    panels, sections = [], []
+    for one in found:
+        device, rows = one["machine"]["device"], with_errors(one["rows"], known)
         panels += chart(rows, device)
-        how = how or found
-    write.keep(out, "README.md", "\n".join(parts))
-    plot.write(panels, out, "Learn: error against time", lines, how)
+        sections.append(result_page.Section(device, _lines(rows)))
+    title = "Learn: time a frame, and error where it was trained"
+    return result_page.Page(title, found[0], panels, sections, _WORDS, name="README.md")
 
 
 def with_errors(rows: list[dict[str, Any]], known: Known) -> list[dict[str, Any]]:
@@ -273,7 +269,7 @@ def with_errors(rows: list[dict[str, Any]], known: Known) -> list[dict[str, Any]
     return rows
 
 
-def chart(rows: list[dict[str, Any]], device: str) -> list[plot.Panel]:
+def chart(rows: list[dict[str, Any]], device: str) -> list[charts.Panel]:
     """A chart for each preset's grid: one device's rows that have an error, as they are run live.
 
     Errors are differences from the preset, paired: what sequences have in common would hide them.
@@ -287,7 +283,7 @@ def chart(rows: list[dict[str, Any]], device: str) -> list[plot.Panel]:
         ]
         gaps = {id(r): [100 * v for v in r["against"] or (0.0, 0.0, 0.0)] for r in scored}
         curves = [
-            plot.Curve(
+            charts.Curve(
                 f"stem of {stem}",
                 tuple(r["ms_p50"] for r in own),
                 tuple(gaps[id(r)][0] for r in own),
@@ -301,8 +297,12 @@ def chart(rows: list[dict[str, Any]], device: str) -> list[plot.Panel]:
         if curves:
             title = f"Learn: networks on {size}² beside the preset {name} (on {device})"
             panels.append(
-                plot.Panel(
-                    title, "p50 [ms]", "map RMSE, more than the preset's [%]", tuple(curves), front=True
+                charts.Panel(
+                    title,
+                    "median time a frame [ms]",
+                    "map RMSE, more than the preset's [%]",
+                    tuple(curves),
+                    front=True,
                 )
             )
     return panels
@@ -314,18 +314,16 @@ def _short(row: dict[str, Any]) -> str:
     return f"{name}w{arch.width} stem{arch.stem}{'+detail' if arch.detail else ''} depth{arch.levels}"
 
 
-_HEAD = """# Learn: time a frame, and error where it was trained
-
-`bench pareto learn`. From displacement on the grid to the force map, channels included, batch norms folded,
-one frame at a time; CPU time of one thread on a CPU, wall time on a GPU. `cpu` is the preset of `learn train`
-where none is named, `live` is `d2fnet-s`. Networks beyond 5 GFLOP are timed a few times only; of the others,
-rows with fewer frames than `--repeats` were timed in an earlier run. Machine: 2 cores, no GPU.
-
-Errors are of `bench experiment learn --presets` and, on 64², of the study's own runs: fold 0, with the loss
-and dropout of the grid's preset, in equal steps on the same batches, all saying magnitudes; mean over tested
-sequences (and seeds) with BCa interval, and beside it the difference from the preset, paired by sequences, as
-a share of the preset's error. A front is of one grid, as rendering has one a picture's width. Between grids
-compare the errors over cells of 0.56 mm (64²), onto which answer and truth are averaged, and those of the
-total force. `paper`, the published network (27.7 GFLOP), and what is as large can't be trained on this
-machine and have no error.
-"""
+_WORDS = (
+    "From displacement on the grid to the force map, channels included, batch norms folded, one frame at a "
+    "time; CPU time of one thread on a CPU, wall time on a GPU. `cpu` is the preset of `learn train` where "
+    "none is named, `live` is `d2fnet-s`. Networks beyond 5 GFLOP are timed a few times only; of the "
+    "others, rows with fewer frames than `--repeats` were timed in an earlier run.",
+    "Errors are of `bench experiment learn --presets` and, on 64², of the study's own runs: fold 0, with "
+    "the loss and dropout of the grid's preset, in equal steps on the same batches, all saying magnitudes; "
+    "mean over tested sequences (and seeds) with BCa interval, and beside it the difference from the "
+    "preset, paired by sequences, as a share of the preset's error. A front is of one grid, as rendering "
+    "has one a picture's width. Between grids compare the errors over cells of 0.56 mm (64²), onto which "
+    "answer and truth are averaged, and those of the total force. `paper`, the published network (27.7 "
+    "GFLOP), and what is as large can't be trained on this machine and have no error.",
+)

@@ -11,6 +11,7 @@ import numpy as np
 import typer
 from rich.console import Console
 
+from bench.output import charts, result_page
 from bench.output.machine import describe
 from bench.output.write import keep
 from evidence.learn import corruptions as disturb
@@ -18,7 +19,7 @@ from evidence.learn.bad_input import bad_inputs
 from evidence.learn.experiment import RESULTS, ideal_runs, small
 from evidence.learn.labels import clips as labels
 from evidence.learn.runs import model_folder
-from evidence.learn.table import markdown
+from evidence.measuring import measuring
 from learn.data.clips import Clip
 from learn.data.grid import Grid
 from learn.data.split import Split, nested
@@ -46,6 +47,7 @@ Say = Callable[[str], None]
 Row = dict[str, Any]
 
 
+@measuring("--cache cache --seeds 2")
 def stability(
     cache: Annotated[Path, typer.Option(help="Folder for packed sequences and trained models; made once.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for results.")] = RESULTS / "stability",
@@ -79,23 +81,54 @@ def stability(
         if (not only or name == only) and not file.is_file():
             keep(out, file.name, {"machine": describe(), "rows": part()})
             say(f"{name}: done")
-    found = {n: json_.loads((out / f"{n}.json").read_text()) for n in parts if (out / f"{n}.json").is_file()}
-    text = "\n\n".join(f"## {_TITLES[n]}\n\n{markdown(f['rows'])}" for n, f in found.items())
-    (out / "README.md").write_text(f"{_HEAD}\n{text}\n")
+    result_page.write(drawn(out), out)
     if json:
-        print(json_.dumps({n: f["rows"] for n, f in found.items()}))
+        print(json_.dumps({n: f["rows"] for n, f in _found(out).items()}))
     else:
         Console().print(f"{out / 'README.md'}")
 
 
-_HEAD = """# Learn: where it breaks
+def drawn(out: Path) -> result_page.Page:
+    """What the parts in `out` say, and how much R² of the map each disturbance leaves."""
+    found, shown = _found(out), []
+    for name, one in found.items():
+        rows = [row for row in one["rows"] if row.get("map R²") is not None]
+        values = {
+            ", ".join(f"{said}{row[k]}" for k, said in _SAID.items() if k in row): row["map R²"]
+            for row in rows
+        }
+        if values:
+            shown.append(
+                charts.Chart(
+                    _TITLES[name], "R² of the map, pooled over tested sequences", charts.bars(values)
+                )
+            )
+    return result_page.Page(
+        "Learn: where it breaks",
+        next(iter(found.values())),
+        shown,
+        [result_page.Section(_TITLES[name], one["rows"]) for name, one in found.items()],
+        (_HOW,),
+        "bench stability learn --cache CACHE",
+        "README.md",
+    )
 
-`bench stability learn --cache CACHE`, on the sequences of `../data/labels.yaml`, fold 0 of 3 on a 64² grid.
-Learning rates and label noise with a network of width 8 and stem 4 (two and four epochs a run), gestures and
-confidence with the study's network at half its epochs, the others with the study's `mse-fold0-seed0` and
-`ghostless-fold0-seed0`. R² is pooled over frames (force) or cells (map) of the tested sequences. Machine:
-2 cores, no GPU, one thread.
-"""
+
+def _found(out: Path) -> dict[str, Any]:
+    return {n: json_.loads((out / f"{n}.json").read_text()) for n in _TITLES if (out / f"{n}.json").is_file()}
+
+
+_SAID = dict.fromkeys(("trained with", "contacts", "gesture", "shown", "trained"), "") | {
+    "confidence": "confidence: ",
+    "s": "s = ",
+}
+"""What names a row, and what is said before it."""
+_HOW = (
+    "On the sequences of `../data/labels.yaml`, fold 0 of 3 on a 64² grid, one thread. Learning rates and "
+    "label noise with a network of width 8 and stem 4 (two and four epochs a run), gestures and confidence "
+    "with the study's network at half its epochs, the others with the study's `mse-fold0-seed0` and "
+    "`ghostless-fold0-seed0`. R² is pooled over frames (force) or cells (map) of the tested sequences."
+)
 _TITLES = {
     "rates": "Learning rate × loss weights, over seeds",
     "labels": "Labels off by a factor exp(N(0, s)), one draw a fitted sequence",

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from bench.output.result_page import markdown
 from evidence.learn.run_table import column, read
-from evidence.learn.table import markdown
 from learn.evaluation.metrics import METRICS
 from learn.evaluation.statistics import Interval, interval, paired, pooled_r2, pooled_r2_difference
 from learn.loss import SHARES

@@ -21,9 +21,10 @@ import typer
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
+from bench.output import charts, result_page
 from bench.output.machine import describe
 from bench.output.write import keep
-from evidence.learn.table import markdown
+from evidence.measuring import measuring
 from learn.data.clips import Clip, pack, unpack
 from learn.data.grid import Scales
 from learn.loss import Objective, loss
@@ -39,6 +40,7 @@ Step = Callable[[], tuple[float, float]]
 """One step; seconds spent on data, and on the network."""
 
 
+@measuring("--steps 3 --out runs/loading")
 def loading(
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for results.")] = Path(
         "docs/results/learn/loading"
@@ -73,27 +75,42 @@ def loading(
     result = {"machine": describe() | {"device": device, "threads": 1}, "size": size, "width": width}
     result |= {"batch": batch, "steps": steps, "vertices": VERTICES, "rows": rows}
     keep(out, f"data-{device}.json", result)
-    files = [json_.loads(file.read_text()) for file in sorted(out.glob("data-*.json"))]
-    (out / "README.md").write_text(_HEAD + "\n".join(_section(f) for f in files))
+    result_page.write(drawn(out), out)
     if json:
         print(json_.dumps(result))
     else:
-        print(markdown(rows))
+        print(result_page.markdown(rows))
 
 
-_HEAD = """# Learn: what a training step spends where
+def drawn(out: Path) -> result_page.Page:
+    """What every data file in `out` says."""
+    found = [json_.loads(file.read_text()) for file in sorted(out.glob("data-*.json"))]
+    shown = [
+        charts.Chart(
+            f"{one['machine']['device']}, one thread, {one['size']}², width {one['width']}, stem 1, batch "
+            f"{one['batch']}",
+            "training throughput [frames/s]",
+            charts.bars({row["way"]: row["frames/s"] for row in one["rows"]}),
+        )
+        for one in found
+    ]
+    return result_page.Page(
+        "Learn: what a training step spends where",
+        found[0],
+        shown,
+        [result_page.Section(chart.title, one["rows"]) for chart, one in zip(shown, found, strict=True)],
+        (_HOW,),
+        "bench experiment loading",
+        "README.md",
+    )
 
-`bench experiment loading`. The published loop is our reading of its description, not its code: one .npz a
-sample opened in `__getitem__`, 8000 vertices scattered onto the picture, channels by NumPy, plain DataLoader,
-contiguous float32. Network, batch, optimizer and loss are the same for all rows; ours also turns and mirrors
-every frame.
 
-"""
-
-
-def _section(result: dict[str, Any]) -> str:
-    head = f"{result['machine']['device']}, one thread, {result['size']}², width {result['width']}, stem 1, "
-    return f"## {head}batch {result['batch']}\n\n{markdown(result['rows'])}\n"
+_HOW = (
+    "The published loop is our reading of its description, not its code: one .npz a sample opened in "
+    "`__getitem__`, 8000 vertices scattered onto the picture, channels by NumPy, plain DataLoader, "
+    "contiguous float32. Network, batch, optimizer and loss are the same for all rows; ours also turns and "
+    "mirrors every frame."
+)
 
 
 def _row(name: str, step: Step, steps: int, batch: int) -> dict[str, Any]:

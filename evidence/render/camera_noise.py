@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
-import json as json_
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
+from evidence.measuring import measuring
 from evidence.render import photon_transfer
 from synth.errors import UserError
 
 
+@measuring(
+    "flats darks",
+    text=lambda found: (
+        f"sensor.full_well={found['full_well']:.0f} sensor.read_noise={found['read_noise']:.2f}"
+    ),
+)
 def camera_noise(
     flats: Annotated[
         Path, typer.Argument(help="Folder of raw pictures of an even surface, two of each exposure.")
@@ -21,15 +27,10 @@ def camera_noise(
     full_scale: Annotated[
         float | None, typer.Option(help="Largest grey level; by default what the files can hold.")
     ] = None,
-    json: Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")] = False,
-) -> None:
+) -> dict[str, Any]:
     """Full well and read noise of a camera from its flat and dark frames, as settings of a job."""
     bright, scale = photon_transfer.load(flats)
     dark, other = photon_transfer.load(darks)
     if scale != other:
         raise UserError(f"{flats} and {darks}: pictures of different depth")
-    found = photon_transfer.fit(bright, dark, full_scale or scale)
-    if json:
-        print(json_.dumps(asdict(found)))
-        return
-    print(f"sensor.full_well={found.full_well:.0f} sensor.read_noise={found.read_noise:.2f}")
+    return asdict(photon_transfer.fit(bright, dark, full_scale or scale))

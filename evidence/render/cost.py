@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json as json_
 import os
 import resource
 import subprocess
@@ -17,6 +16,7 @@ import numpy as np
 import typer
 
 from bench.output import machine, write
+from evidence.measuring import measuring
 from evidence.render.case import Case, case
 from synth.job.schema import Job
 
@@ -32,18 +32,16 @@ class Question(StrEnum):
     bytes = "bytes"
 
 
+@measuring("cost frames", said="Folder for one JSON a question.")
 def experiment(
     question: Annotated[list[Question], typer.Argument(help="What to measure.")],
     variant: Annotated[str, typer.Option(help="As in a job's render.variant.")] = "auto",
     spp: Annotated[int, typer.Option(min=1, help="Light paths a pixel.")] = 4,
     count: Annotated[int, typer.Option(min=2, help="Frames or scenes to measure over.")] = 20,
     seed: Annotated[int, typer.Option(help="Of the job.")] = 11,
-    out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder for one JSON a question.")] = None,
-    json: Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")] = False,
-) -> None:
+    out: Path | None = None,
+) -> dict[str, Any]:
     """Time, memory, truth and determinism of 640x480 frames with the instrument in view."""
-    from rich.console import Console
-
     job = Job.model_validate({"seed": seed, "render": {"variant": variant, "spp": spp}})
     measured: dict[str, Any] = {}
     for asked in question:
@@ -53,10 +51,7 @@ def experiment(
         if out is not None:
             name = f"{asked.value}.json" if variant == "auto" else f"{asked.value}-{variant}.json"
             write.keep(out, name, found)
-    if json:
-        print(json_.dumps(measured))
-    else:
-        Console().print_json(json_.dumps(measured))
+    return measured
 
 
 def _cost(job: Job, count: int) -> dict[str, Any]:

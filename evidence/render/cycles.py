@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import json as json_
+import json
 import os
 import subprocess
 import tempfile
@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 import typer
 
-from bench.output import machine, write
+from evidence.measuring import measuring
 from evidence.render.case import Case, case
 from synth.errors import UserError
 from synth.job.schema import Job
@@ -24,16 +24,13 @@ from synth.render.mitsuba.adapter import Wet
 Map = npt.NDArray[np.float32]
 
 
+@measuring("--python bpy/bin/python", said="Folder for cycles.json.", file="cycles.json")
 def cycles(
     python: Annotated[Path, typer.Option(help="A Python that has bpy (pip install bpy).")],
     spp: Annotated[list[int], typer.Option(help="Samples a pixel to try.")] = [1, 2, 4, 8],  # noqa: B006
     seed: Annotated[int, typer.Option(help="Of the job.")] = 11,
-    out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder for cycles.json.")] = None,
-    json: Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")] = False,
-) -> None:
+) -> dict[str, Any]:
     """CPU-seconds and noise of a 640x480 frame, Mitsuba's and Cycles', and their ratio at equal noise."""
-    from rich.console import Console
-
     job = Job.model_validate(
         {"seed": seed, "render": {"distortion": [0.0] * 5, "aperture_mm": 0.0, "variant": "llvm_ad_rgb"}}
     )
@@ -42,13 +39,7 @@ def cycles(
     rows = [{"renderer": "mitsuba", "spp": n, **_mitsuba(ours, n, inside)} for n in spp]
     with tempfile.TemporaryDirectory() as folder:
         rows += _cycles(ours, Path(folder), python, spp, inside)
-    found = {"seed": seed, "rows": rows, "ratio_at_equal_noise": ratio(rows), "machine": machine.describe()}
-    if out is not None:
-        write.keep(out, "cycles.json", found)
-    if json:
-        print(json_.dumps(found))
-    else:
-        Console().print_json(json_.dumps(found))
+    return {"seed": seed, "rows": rows, "ratio_at_equal_noise": ratio(rows)}
 
 
 def ratio(rows: list[dict[str, Any]]) -> float:
@@ -83,7 +74,7 @@ def _cycles(
         raise UserError(
             f"{python}: Cycles did not run ({(done.stderr.strip() or 'no message').splitlines()[-1]})"
         )
-    told = json_.loads((folder / "times.json").read_text("utf-8"))
+    told = json.loads((folder / "times.json").read_text("utf-8"))
     rows = []
     for n in spp:
         pictures = [np.load(folder / f"cycles-{n}-{k}.npy") for k in (1, 2)]
@@ -137,7 +128,7 @@ def _export(ours: Case, folder: Path, spp: list[int]) -> None:
         "threads": int(os.environ.get("SULCUS_THREADS", os.cpu_count() or 1)),
     }
     np.savez(folder / "scene.npz", **arrays)
-    (folder / "scene.json").write_text(json_.dumps(told), "utf-8")
+    (folder / "scene.json").write_text(json.dumps(told), "utf-8")
 
 
 def _noise(one: Map, two: Map, inside: npt.NDArray[np.bool_]) -> float:

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-import json as json_
 import time
+from collections.abc import Mapping
 from inspect import signature
 from itertools import product
-from pathlib import Path
 from typing import Annotated, Any
 
 import cv2
 import numpy as np
 import typer
 
-from bench.output import machine, plot, write
+from bench.output import charts, result_page
+from evidence.measuring import measuring
 from evidence.render.case import Case, case
 from synth.job.schema import Job, Render
 from synth.render import instrument
@@ -24,6 +24,12 @@ _STAGE = signature(Studio.stage).parameters
 _DEFAULT = (Render().spp, _STAGE["sampler"].default, _STAGE["integrator"].default, Render().size[0])
 
 
+@measuring(
+    "--spp 2 --spp 8 --out runs/render",
+    said="Folder for pareto.json and chart.",
+    file="pareto.json",
+    page=lambda found, out: result_page.write(drawn(found), out),
+)
 def pareto(
     spp: Annotated[list[int], typer.Option(help="Light paths a pixel to try.")] = [1, 2, 4, 8, 16],  # noqa: B006
     sampler: Annotated[list[str], typer.Option(help="Mitsuba samplers to try.")] = [  # noqa: B006
@@ -34,13 +40,8 @@ def pareto(
     integrator: Annotated[list[str], typer.Option(help="direct, or path and a depth.")] = ["direct", "path3"],  # noqa: B006
     width: Annotated[list[int], typer.Option(help="Widths of the picture, 4:3.")] = [640, 320],  # noqa: B006
     seed: Annotated[int, typer.Option(help="Of the job.")] = 11,
-    out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder for pareto.json and chart.")] = None,
-    json: Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")] = False,
-) -> None:
+) -> dict[str, Any]:
     """Flow error and noise of rendered frames against the CPU time that they took."""
-    from rich.console import Console
-    from rich.table import Table
-
     rows = []
     for wide in width:
         ours = case(Job.model_validate({"seed": seed, "render": {"size": (wide, wide * 3 // 4)}}), 0)
@@ -51,26 +52,7 @@ def pareto(
             row = {"spp": paths, "sampler": pattern, "integrator": kind, "width": wide}
             row["default"] = (paths, pattern, kind, wide) == _DEFAULT
             rows.append(row | measure(ours, paths, pattern, kind))
-    asked: dict[str, list[Any]] = {"width": width, "spp": spp, "sampler": sampler, "integrator": integrator}
-    words = [f"--{name} {one}" for name, many in asked.items() for one in many]
-    found = {
-        "command": " ".join(["bench pareto render", *words, f"--seed {seed}"]),
-        "seed": seed,
-        "lift_mm": _LIFT,
-        "machine": machine.describe(),
-        "rows": rows,
-    }
-    if out is not None:
-        write.keep(out, "pareto.json", found)
-        plot.write(panels(found), out, "Rendering: flow error and noise against time", rows, found)
-    if json:
-        print(json_.dumps(found))
-        return
-    names = ("spp", "sampler", "integrator", "width", "cpu_s", "noise", "flow_median_px", "flow_p95_px")
-    table = Table(*names, "default")
-    for row in rows:
-        table.add_row(*(str(row[name]) for name in names), "*" if row["default"] else "")
-    Console(width=120).print(table)
+    return {"seed": seed, "lift_mm": _LIFT, "rows": rows}
 
 
 def measure(ours: Case, spp: int, sampler: str, kind: str) -> dict[str, float]:
@@ -109,7 +91,13 @@ def measure(ours: Case, spp: int, sampler: str, kind: str) -> dict[str, float]:
     }
 
 
-def panels(found: dict[str, Any]) -> list[plot.Panel]:
+def drawn(found: Mapping[str, Any]) -> result_page.Page:
+    """What the data say."""
+    tables = [result_page.Section("All settings", found["rows"])]
+    return result_page.Page("Rendering: flow error and noise against time", found, panels(found), tables)
+
+
+def panels(found: Mapping[str, Any]) -> list[charts.Panel]:
     """Charts of `pareto.json`: what flow makes of the pictures, and their noise, against time."""
     made = []
     for key, unit in (("flow_median_px", "flow error, median [px]"), ("noise", "noise / mean")):
@@ -117,7 +105,7 @@ def panels(found: dict[str, Any]) -> list[plot.Panel]:
         for kind in dict.fromkeys((r["width"], r["sampler"], r["integrator"]) for r in found["rows"]):
             own = [r for r in found["rows"] if (r["width"], r["sampler"], r["integrator"]) == kind]
             curves.append(
-                plot.Curve(
+                charts.Curve(
                     f"{kind[1]}, {kind[2]}, {kind[0]} px",
                     tuple(float(r["cpu_s"]) for r in own),
                     tuple(float(r[key]) for r in own),
@@ -126,6 +114,6 @@ def panels(found: dict[str, Any]) -> list[plot.Panel]:
                 )
             )
         made.append(
-            plot.Panel(f"Render: {unit}", "CPU s a picture", unit, tuple(curves), True, True, front=True)
+            charts.Panel(f"Render: {unit}", "CPU s a picture", unit, tuple(curves), True, True, front=True)
         )
     return made

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json as json_
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -10,7 +9,7 @@ import cv2
 import numpy as np
 import typer
 
-from bench.output import machine, write
+from evidence.measuring import measuring
 from evidence.render import picture_statistics
 from evidence.render.case import case
 from synth.errors import UserError
@@ -19,6 +18,7 @@ from synth.job.schema import Family, Job
 _SIDE, _STEP = 160, 40
 
 
+@measuring("cortex.jpg", said="Folder for figures and sheet.", file="realism.json")
 def realism_figures(
     photo: Annotated[Path, typer.Argument(help="A photograph of an exposed cortex.")],
     outline: Annotated[
@@ -29,17 +29,13 @@ def realism_figures(
     frames: Annotated[int, typer.Option(min=1, help="Rendered sequences, one frame of each.")] = 12,
     family: Annotated[str, typer.Option(help="Appearance family.")] = "healthy",
     seed: Annotated[int, typer.Option(help="Of the rendered job.")] = 11,
-    out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder for figures and sheet.")] = None,
+    out: Path | None = None,
     beside: Annotated[
         Path | None,
         typer.Option(help="Also write the frames and the photograph, at equal scale, as this picture."),
     ] = None,
-    json: Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")] = False,
-) -> None:
+) -> dict[str, Any]:
     """Colour, spectrum, gradients and highlights of rendered frames against crops of a photograph."""
-    from rich.console import Console
-    from rich.table import Table
-
     pictures, crops, pixel = _rendered(frames, family, seed)
     reference = _photographed(photo, outline, width_mm / pixel)
     pooled = picture_statistics.pool(reference)
@@ -53,33 +49,20 @@ def realism_figures(
         }
         for name in theirs
     ]
-    found: dict[str, Any] = {
+    if out is not None:
+        out.mkdir(parents=True, exist_ok=True)
+        quality = [cv2.IMWRITE_JPEG_QUALITY, 75, cv2.IMWRITE_JPEG_PROGRESSIVE, 1]
+        cv2.imwrite(str(out / "sheet.jpg"), _sheet(pictures)[..., ::-1], quality)
+    if beside is not None:
+        cv2.imwrite(str(beside), _beside(pictures, _scaled(photo, width_mm / pixel))[..., ::-1])
+    return {
         "family": family,
         "seed": seed,
         "crops": {"photograph": len(reference), "rendered": len(crops), "side_px": _SIDE},
         "photograph_width_mm_assumed": width_mm,
         "mm_per_px": round(pixel, 4),
         "statistics": rows,
-        "machine": machine.describe(),
     }
-    if out is not None:
-        write.keep(out, "realism.json", found)
-        quality = [cv2.IMWRITE_JPEG_QUALITY, 75, cv2.IMWRITE_JPEG_PROGRESSIVE, 1]
-        cv2.imwrite(str(out / "sheet.jpg"), _sheet(pictures)[..., ::-1], quality)
-    if beside is not None:
-        cv2.imwrite(str(beside), _beside(pictures, _scaled(photo, width_mm / pixel))[..., ::-1])
-    if json:
-        print(json_.dumps(found))
-        return
-    table = Table("statistic", "photograph (min, median, max)", "rendered (min, median, max)", "within")
-    for row in rows:
-        table.add_row(
-            str(row["statistic"]),
-            "  ".join(f"{v:9.4g}" for v in theirs[str(row["statistic"])]),
-            "  ".join(f"{v:9.4g}" for v in ours[str(row["statistic"])]),
-            "yes" if row["median_within_spread"] else "no",
-        )
-    Console(width=120).print(table)
 
 
 def _rendered(

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import errno
-import json as json_
 import os
-import shlex
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -17,7 +15,8 @@ import cv2
 import numpy as np
 import typer
 
-from bench.output import machine, plot, write
+from bench.output import result_page
+from evidence.measuring import measuring
 from evidence.render.case import Case, case
 from synth.errors import UserError
 from synth.geometry.triangles import Shape
@@ -32,16 +31,18 @@ _SMALL = {"size": (160, 120)}
 _LIFT_MM = 2.0
 
 
+@measuring(
+    "--out runs/render",
+    said="Folder for data and page.",
+    file="stability.json",
+    page=lambda found, out: result_page.write(drawn(found), out),
+    passed=lambda found: all(row["passed"] for row in found["cases"]),
+)
 def stability(
-    out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder for data and page.")] = None,
     seed: Annotated[int, typer.Option(help="Of the jobs.")] = 11,
     only: Annotated[list[str] | None, typer.Option(help="Cases to try, by name; all if not given.")] = None,
-    json: Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")] = False,
-) -> None:
+) -> dict[str, Any]:
     """Steep folds, grazing views, extreme sizes, missing parts: a correct frame or a clear error."""
-    from rich.console import Console
-    from rich.table import Table
-
     rows: list[dict[str, Any]] = []
     unknown = set(only or []) - set(_TRIALS)
     if unknown:
@@ -54,23 +55,13 @@ def stability(
             figures, outcome = {"error": str(error)}, "clear error"
         passed = outcome == "clear error" or float(figures.get("worst_px", 0.0)) < 1e-2
         rows.append({"case": name, "outcome": outcome, "passed": passed, **figures})
-    words = ["bench", "stability", "render", "--seed", str(seed)]
-    words += [word for name in only or () for word in ("--only", name)]
-    found = {"command": shlex.join(words), "seed": seed, "machine": machine.describe(), "cases": rows}
-    if out is not None:
-        write.keep(out, "stability.json", found)
-        title = "Rendering: a correct frame or a clear error"
-        plot.write_page(out, title, [plot.credit(found), plot.table(rows)])
-    if json:
-        print(json_.dumps(found))
-    else:
-        table = Table("case", "outcome", "held", "figures")
-        for row in rows:
-            rest = {k: v for k, v in row.items() if k not in ("case", "outcome", "passed")}
-            table.add_row(row["case"], row["outcome"], "yes" if row["passed"] else "NO", str(rest))
-        Console(width=140).print(table)
-    if not all(row["passed"] for row in rows):
-        raise typer.Exit(1)
+    return {"seed": seed, "cases": rows}
+
+
+def drawn(found: Mapping[str, Any]) -> result_page.Page:
+    """What the data say."""
+    title = "Rendering: a correct frame or a clear error"
+    return result_page.Page(title, found, (), [result_page.Section("Cases", found["cases"])])
 
 
 def checked(ours: Case, **changes: Any) -> dict[str, Any]:

@@ -2,40 +2,29 @@
 
 from __future__ import annotations
 
-import json as json_
 import time
-from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 import typer
 
-from bench.output import machine, write
+from evidence.measuring import measuring
 from evidence.render.case import case
 from synth.geometry.triangles import Shape
 from synth.job.schema import Job
 from synth.render import instrument, truth
 
 
+@measuring("--spp 4 --out runs/gpu", said="Folder for throughput.json.", file="throughput.json")
 def throughput(
     variant: Annotated[str, typer.Option(help="As in a job's render.variant.")] = "cuda_ad_rgb",
     spp: Annotated[list[int], typer.Option(help="Light paths a pixel.")] = [4, 16],  # noqa: B006
     frames: Annotated[int, typer.Option(min=2, help="Frames to time, after three of warm-up.")] = 60,
     seed: Annotated[int, typer.Option(help="Of the job.")] = 11,
-    out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder for throughput.json.")] = None,
-    json: Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")] = False,
-) -> None:
+) -> dict[str, Any]:
     """Frames a second at 640x480 and each step's share of a frame, by the wall clock."""
-    from rich.console import Console
-
     rows = [measure(variant, paths, frames, seed) for paths in spp]
-    found = {"variant": variant, "seed": seed, "rows": rows, "machine": machine.describe()}
-    if out is not None:
-        write.keep(out, "throughput.json", found)
-    if json:
-        print(json_.dumps(found))
-    else:
-        Console().print_json(json_.dumps(found))
+    return {"variant": variant, "seed": seed, "rows": rows}
 
 
 def measure(variant: str, spp: int, frames: int, seed: int) -> dict[str, Any]:

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
-from pathlib import Path
+from collections.abc import Callable, Mapping
 from typing import Annotated, Any
 
 import numpy as np
@@ -13,7 +12,8 @@ from numpy.typing import NDArray
 
 from bench.methods import compliance, corotational, inverse
 from bench.methods.compliance import TO_CAMERA, Block, Compliance, picture
-from bench.output import machine, write
+from bench.output import charts, result_page
+from evidence.measuring import measuring
 from synth.fem import equilibrium
 
 Floats = NDArray[np.float64]
@@ -28,10 +28,15 @@ _LOAD = (0.05, 0.35)
 """P = F/(E a^2) of the contacts on tissue that isn't linear: what the laws can carry."""
 
 
+@measuring(
+    "--count 10",
+    out="docs/results/inverse",
+    said="Folder for the results.",
+    file="results.json",
+    page=lambda found, out: result_page.write(drawn(found), out),
+    text="README.md",
+)
 def experiment(
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the results.")] = Path(
-        "docs/results/inverse"
-    ),
     count: Annotated[int, typer.Option(min=1, help="Random contacts.")] = 60,
     noise: Annotated[
         float, typer.Option(min=0.0, help="Noise of each component of displacement [mm].")
@@ -41,7 +46,7 @@ def experiment(
         int, typer.Option(help="Of the mesh that makes the data; the inverse has its own.")
     ] = 5000,
     seed: Annotated[int, typer.Option(help="Of contacts and noise; 0 was tuned on.")] = 1,
-) -> None:
+) -> dict[str, Any]:
     """Force of random contacts from noisy displacement, by physics alone.
 
     On linear tissue of 20-300 mN, however far it moves, and on co-rotational and neo-Hookean tissue of loads
@@ -56,7 +61,6 @@ def experiment(
         "tets_data": tets,
         "load": list(_LOAD),
         "seed": seed,
-        "machine": machine.describe(),
         "tissue": {},
     }
     for law in ("linear", "corotational", "neo-hookean"):
@@ -69,9 +73,7 @@ def experiment(
             "mean_peak_mm": float(np.mean([np.linalg.norm(field, axis=1).max() for field in fields])),
             "methods": {name: tried(solve, known, spoilt, forces, young) for name, solve in _METHODS.items()},
         }
-    write.keep(out, "results.json", tree)
-    write.keep(out, "README.md", readme(tree))
-    print(out / "README.md")
+    return tree
 
 
 def tried(
@@ -135,56 +137,59 @@ def errors(true: Floats, said: Floats) -> dict[str, float]:
     }
 
 
-def readme(tree: dict[str, Any]) -> str:
-    """The results as tables."""
-    lines = [
-        "# Force by physics alone",
-        "",
-        f"{tree['contacts']} random contacts on tissue of {tree['young_kpa']:g} kPa, seen from above at 441",
-        f"points; data from {tree['tets_data']} second-order tetrahedra, the linear map of the inverses from",
-        "3000 of their own, the co-rotational law from 1600 of first order.",
-        f"Seed {tree['seed']}; everything was chosen on seed 0.",
-        "",
-        "    bench experiment inverse",
-        "",
-        f"Machine: {machine.line(tree['machine'])}; CPU time of one thread.",
-    ]
+def drawn(tree: Mapping[str, Any]) -> result_page.Page:
+    """What `results.json` says."""
+    unit = "error of the force's size [mN]; the bar: to that of 90%"
+    shown, sections = [], []
     for law, found in tree["tissue"].items():
+        bars = [
+            charts.Row(name, m["size_mae_mn"], (m["size_mae_mn"], m["size_p90_mn"]))
+            for name, m in found["methods"].items()
+        ]
+        shown.append(charts.Chart(f"{law} tissue", unit, tuple(bars)))
         what = (
             f"20-300 mN, {tree['noise_mm']:g} mm of noise a component. At most 20 mN was asked of Tikhonov."
             if law == "linear"
             else f"Loads F/(E a²) of {tree['load'][0]:g} to {tree['load'][1]:g}, "
             f"{tree['bending_noise_mm']:g} mm of noise a component."
         )
-        lines += [
-            "",
-            f"## {law.capitalize()} tissue",
-            "",
-            f"{what} Mean force {found['mean_mn']:.1f} mN, mean peak motion {found['mean_peak_mm']:.2f} mm.",
-            "",
-            "| method | size: MAE [mN] | 90% within [mN] | across the view [mN] | along it [mN] | CPU [ms] |",
-            "|" + " --- |" * 6,
+        mean = f"Mean force {found['mean_mn']:.1f} mN, mean peak motion {found['mean_peak_mm']:.2f} mm."
+        rows = [
+            {"method": name} | {head: form.format_map(m) for head, form in _COLUMNS.items()}
+            for name, m in found["methods"].items()
         ]
-        for name, v in found["methods"].items():
-            lines.append(
-                f"| {name} | {v['size_mae_mn']:.2f} | {v['size_p90_mn']:.2f} | {v['across_mae_mn']:.2f} | "
-                f"{v['along_mae_mn']:.2f} | {v['cpu_ms']:.0f} |"
-            )
-    return "\n".join(
-        [
-            *lines,
-            "",
-            "Plain Tikhonov fails along the view even without noise: its spread loads imitate a load along",
-            "the view by patterns across it, and a finer mesh doesn't help (tried: 9000 tetrahedra). Letting",
-            "only loads near the best contact be large mends most of that; the single contact can't imitate",
-            "at all, once its place and radius move freely (on a grid of places its error was 32 mN).",
-            "Loads past the co-rotational law's range stay with the linear answer.",
-            "",
-            "On tissue that turns under a pull the linear law takes the turn for a load along the view.",
-            "Taking off what the co-rotational law adds mends most of that. An adjoint of that law on the",
-            "force alone ran away along the view, and so does the same correction on second-order tetrahedra",
-            "unless damped: it swings about the answer, and damped to 0.4 over five steps it costs six times",
-            "as much and gains no more.",
-            "",
-        ]
+        sections.append(result_page.Section(f"{law.capitalize()} tissue", rows, (f"{what} {mean}",)))
+    return result_page.Page(
+        "Force by physics alone",
+        tree,
+        shown,
+        (*sections, result_page.Section("What was tried", words=_TRIED)),
+        (
+            f"{tree['contacts']} random contacts on tissue of {tree['young_kpa']:g} kPa, seen from above at "
+            f"441 points; data from {tree['tets_data']} second-order tetrahedra, the linear map of the "
+            "inverses from 3000 of their own, the co-rotational law from 1600 of first order. CPU time of "
+            "one thread; everything was chosen on seed 0.",
+        ),
+        "bench experiment inverse",
+        "README.md",
     )
+
+
+_COLUMNS = {
+    "size: MAE [mN]": "{size_mae_mn:.2f}",
+    "90% within [mN]": "{size_p90_mn:.2f}",
+    "across the view [mN]": "{across_mae_mn:.2f}",
+    "along it [mN]": "{along_mae_mn:.2f}",
+    "CPU [ms]": "{cpu_ms:.0f}",
+}
+_TRIED = (
+    "Plain Tikhonov fails along the view even without noise: its spread loads imitate a load along the view "
+    "by patterns across it, and a finer mesh doesn't help (tried: 9000 tetrahedra). Letting only loads near "
+    "the best contact be large mends most of that; the single contact can't imitate at all, once its place "
+    "and radius move freely (on a grid of places its error was 32 mN). Loads past the co-rotational law's "
+    "range stay with the linear answer.",
+    "On tissue that turns under a pull the linear law takes the turn for a load along the view. Taking off "
+    "what the co-rotational law adds mends most of that. An adjoint of that law on the force alone ran away "
+    "along the view, and so does the same correction on second-order tetrahedra unless damped: it swings "
+    "about the answer, and damped to 0.4 over five steps it costs six times as much and gains no more.",
+)

@@ -8,7 +8,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -16,8 +16,9 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
-from bench.output import machine, write
+from bench.output import charts, result_page
 from bench.recording import writer
+from evidence.measuring import measuring
 from evidence.scoring import phantom
 from synth.errors import UserError
 
@@ -25,17 +26,22 @@ _PERIOD_S, _PEAK_PX, _PX_A_MN = 4.0, 9.0, 0.3
 _SENSOR_HZ = 200.0
 
 
+@measuring(
+    "model --train out",
+    out="docs/results/scoring",
+    said="Folder for the results.",
+    file="results.json",
+    page=lambda found, out: result_page.write(drawn(found), out),
+    text="README.md",
+)
 def cost(
     model: Annotated[Path, typer.Argument(help="Model folder of `learn train`.")],
     train: Annotated[Path, typer.Option(help="Its training data: the simpler methods are asked too.")],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the results.")] = Path(
-        "docs/results/scoring"
-    ),
     seconds: Annotated[float, typer.Option(min=2, help="Length of the recording.")] = 60.0,
     fps: Annotated[float, typer.Option(min=1, help="Frames a second.")] = 30.0,
     size: Annotated[tuple[int, int], typer.Option(help="Width and height [px].")] = (680, 480),
     seed: Annotated[int, typer.Option(help="Of the texture.")] = 0,
-) -> None:
+) -> dict[str, Any]:
     """Time and memory of `bench score` on a recording of a moved texture, all methods in the table.
 
     Raises:
@@ -51,19 +57,15 @@ def cost(
         if done.returncode:
             raise UserError(f"the scoring failed: {done.stderr.strip().splitlines()[-1]}")
         scored = json.loads(Path(scratch, "score.json").read_text())
-    tree = {
+    return {
         "seconds": seconds,
         "fps": fps,
         "size": list(size),
         "frames": scored["frames"],
         "wall_s": wall,
         "timings": scored["timings"],
-        "machine": machine.describe(),
         "command": shlex.join(["bench", "experiment", "scoring", "MODEL", "--train", "DATA"]),
     }
-    write.keep(out, "results.json", tree)
-    write.keep(out, "README.md", readme(tree))
-    print(out / "README.md")
 
 
 def record(folder: Path, seconds: float, fps: float, size: tuple[int, int], rng: np.random.Generator) -> None:
@@ -105,31 +107,29 @@ def _pictures(
     return (phantom.pushed(rest, move) for move in _motion(times))
 
 
-def readme(tree: dict[str, Any]) -> str:
-    """The result in words and a table."""
-    stages = {k: v for k, v in tree["timings"].items() if isinstance(v, dict)}
+def drawn(tree: Mapping[str, Any]) -> result_page.Page:
+    """What `results.json` says."""
+    stages = {k: v for k, v in tree["timings"].items() if isinstance(v, Mapping)}
     memory = sum(v for k, v in tree["timings"].items() if k.endswith("peak_rss_mb"))
-    width, height = tree["size"]
-    bar = r"\|"
-    lines = [
-        "# What scoring costs",
-        "",
-        f"A recording of {tree['seconds']:g} s, {width} x {height} at {tree['fps']:g} a second, no masks;",
-        f"{tree['frames']} frames looked at (10 a second), flow on pictures of at least 320 columns.",
-        f"The whole command took **{tree['wall_s']:.0f} s, {tree['wall_s'] / tree['seconds']:.1f} times the",
-        f"recording's length, and {memory / 1000:.1f} GB** in two processes, which work side by side.",
-        "At most twice the length and 2 GB were asked.",
-        "",
-        f"    {tree['command']}",
-        "",
-        f"Machine: {machine.line(tree['machine'])}.",
-        "",
-        "| stage | CPU [s] | wall [s] |",
-        "| --- | --- | --- |",
-        *(
-            f"| {name.replace('|', bar)} | {v['cpu_s']:.1f} | {v['wall_s']:.1f} |"
-            for name, v in stages.items()
-        ),
-        "",
+    (width, height), ratio = tree["size"], tree["wall_s"] / tree["seconds"]
+    bars = charts.bars({name: t["wall_s"] for name, t in stages.items()})
+    title = f"{tree['seconds']:g} s of {width} x {height}: {tree['wall_s']:.0f} s in all"
+    rows = [
+        {"stage": name, "CPU [s]": f"{t['cpu_s']:.1f}", "wall [s]": f"{t['wall_s']:.1f}"}
+        for name, t in stages.items()
     ]
-    return "\n".join(lines)
+    unit = "wall time by stage [s], two processes side by side"
+    return result_page.Page(
+        "What scoring costs",
+        tree,
+        [charts.Chart(title, unit, bars)],
+        (result_page.Section("", rows),),
+        (
+            f"A recording of {tree['seconds']:g} s, {width} x {height} at {tree['fps']:g} a second, no "
+            f"masks; {tree['frames']} frames looked at (10 a second), flow on pictures of at least 320 "
+            f"columns. The whole command took *{tree['wall_s']:.0f} s, {ratio:.1f} times the recording's "
+            f"length, and {memory / 1000:.1f} GB* in two processes, which work side by side. At most twice "
+            "the length and 2 GB were asked.",
+        ),
+        name="README.md",
+    )

@@ -2,24 +2,23 @@
 
 from __future__ import annotations
 
-import json as json_
+import json
 import sys
-import textwrap
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 import typer
 
-from bench.output import machine, plot
+from bench.output import charts, machine, result_page
 from bench.output import write as results
+from evidence.measuring import measuring
 from learn.evaluation.statistics import interval
 from synth.errors import UserError
 from synth.job import reader
 from synth.tune import search, tuned_job
 
 _SCENES = ("easy", "middle", "hard")
-_KNOBS = "| knob | level | error of the force | takes of the budget | saves of a full frame |"
 _HOW = (
     "Seeds are in the jobs here; probe sequences are drawn from them, and the fresh ones had no part in the "
     "choice. Costs are of physics, scene, rendering and flow, in CPU time; what two "
@@ -38,10 +37,14 @@ _WHAT = (
 )
 
 
+@measuring(
+    "--only easy --fresh 3",
+    out="docs/results/tune",
+    said="Folder that holds the scenes' jobs and gets the results.",
+    text="README.md",
+)
 def experiment(
-    out: Annotated[
-        Path, typer.Option("--out", "-o", help="Folder that holds the scenes' jobs and gets the results.")
-    ] = Path("docs/results/tune"),
+    out: Path,
     budget: Annotated[
         list[str] | None, typer.Option(help="As in `synth tune`; 'force 5%' and 'force 3%' if not given.")
     ] = None,
@@ -51,8 +54,7 @@ def experiment(
     only: Annotated[
         list[str] | None, typer.Option(help="Scenes; easy, middle and hard if not given.")
     ] = None,
-    json: Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")] = False,
-) -> None:
+) -> list[dict[str, Any]]:
     """Tunes three scenes of different difficulty and checks budget and cost on fresh sequences."""
     budgets = budget or ["force 5%", "force 3%"]
     asked = [search.Budget.parse(one) for one in budgets]
@@ -85,28 +87,61 @@ def experiment(
             results.keep(out, f"{stem}.json", row)
         for journal in journals:
             journal.unlink(missing_ok=True)
-    rows = write(out)
-    print(json_.dumps(rows) if json else out / "README.md")
+    return write_results(out)
 
 
-def write(out: Path) -> list[dict[str, Any]]:
-    """Picture, page and README of the scenes whose data are in `out`; gives those back."""
+def write_results(out: Path) -> list[dict[str, Any]]:
+    """Picture and README of the scenes whose data are in `out`; gives those back."""
+    result_page.write(drawn(out), out)
+    return read(out)
+
+
+def drawn(out: Path) -> result_page.Page:
+    """What the data in `out` say."""
     rows = read(out)
-    commands = "; ".join(dict.fromkeys(row["command"] for row in rows))
-    title = "Tuning: what each knob does to the force, and what it costs"
-    plot.write(panels(rows), out, title, table(rows), rows[0] | {"command": commands})
-    results.keep(out, "README.md", readme(rows))
-    return rows
+    sections = [result_page.Section("", table(rows))]
+    for row in rows:
+        knobs = [
+            {
+                "knob": one["knob"],
+                "level": one["level"],
+                "error of the force": _percent(one["change"], "+"),
+                "takes of the budget": _percent(one["error"]),
+                "saves of a full frame": f"{100 * one['saved']:.0f}%",
+            }
+            for one in row["knobs"]
+        ]
+        tried = [("as it was", row["own"]), *((f"try {k}", one) for k, one in enumerate(row["tried"], 1))]
+        whole = [
+            {
+                "measured as a whole": name,
+                "takes": _percent(one["error"]),
+                "promised": None if one["promised"] is None else f"{100 * one['promised']:.2g}%",
+                "CPU s a frame": f"{one['cpu_s_a_frame']:.2f}",
+                "setting": ", ".join(f"{key} {value}" for key, value in one["setting"].items()),
+            }
+            for name, one in tried
+        ]
+        title = f"{row['scene']}, {100 * row['budget']:g}%"
+        sections += [result_page.Section(title, knobs), result_page.Section("", whole)]
+    return result_page.Page(
+        "Tuning: what each knob does to the force, and what it costs",
+        rows[0] | {"command": "; ".join(dict.fromkeys(row["command"] for row in rows))},
+        panels(rows),
+        sections,
+        (_HOW, _WHAT),
+        name="README.md",
+    )
 
 
 def read(out: Path) -> list[dict[str, Any]]:
     """The data in `out`, scene by scene, the loosest budget first."""
     files = [file for name in _SCENES for file in out.glob(f"{name}-*.json")]
-    rows = [json_.loads(file.read_text("utf-8")) for file in files]
+    rows = [json.loads(file.read_text("utf-8")) for file in files]
     return sorted(rows, key=lambda row: (_SCENES.index(row["scene"]), -row["budget"]))
 
 
-def panels(rows: list[dict[str, Any]]) -> list[plot.Panel]:
+def panels(rows: list[dict[str, Any]]) -> list[charts.Panel]:
     """A chart a scene: error of the force over cost, each knob alone and whole settings."""
     made = []
     for row in rows:
@@ -114,7 +149,7 @@ def panels(rows: list[dict[str, Any]]) -> list[plot.Panel]:
         for knob in dict.fromkeys(one["knob"] for one in row["knobs"]):
             own = [one for one in row["knobs"] if one["knob"] == knob and one["error"] is not None]
             curves.append(
-                plot.Curve(
+                charts.Curve(
                     knob,
                     tuple(row["full"]["cpu_s_a_frame"] * (1 - one["saved"]) for one in own),
                     tuple(100 * (base + one["change"]) for one in own),
@@ -123,7 +158,7 @@ def panels(rows: list[dict[str, Any]]) -> list[plot.Panel]:
             )
         whole = [("full", row["full"]), ("the job as it was", row["own"]), ("tuned", row["best"])]
         curves.append(
-            plot.Curve(
+            charts.Curve(
                 "whole job",
                 tuple(one["cpu_s_a_frame"] for _, one in whole),
                 tuple(100 * _mean(one["totals"]) for _, one in whole),
@@ -132,7 +167,7 @@ def panels(rows: list[dict[str, Any]]) -> list[plot.Panel]:
             )
         )
         title = f"{row['scene']}, {100 * row['budget']:g}%: error of the force over cost"
-        made.append(plot.Panel(title, "CPU s a frame", "error of the force [%]", tuple(curves)))
+        made.append(charts.Panel(title, "CPU s a frame", "error of the force [%]", tuple(curves)))
     return made
 
 
@@ -161,44 +196,6 @@ def table(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
             }
         )
     return lines
-
-
-def readme(rows: list[dict[str, Any]]) -> str:
-    """What was asked and what came out."""
-    lines = [
-        "# Tuning: no more than a scene needs",
-        "",
-        *(f"    {command}" for command in dict.fromkeys(row["command"] for row in rows)),
-        "",
-        *textwrap.wrap(f"Machine: {machine.line(rows[0]['machine'])}. {_HOW}", 110),
-        "",
-        *textwrap.wrap(_WHAT, 110),
-        "",
-        "![What each knob does](chart.svg)",
-        "",
-    ]
-    cells = [
-        {key: f"{value:.3g}" if isinstance(value, float) else str(value) for key, value in one.items()}
-        for one in table(rows)
-    ]
-    lines += [f"| {' | '.join(cells[0])} |", "|" + " --- |" * len(cells[0])]
-    lines += [f"| {' | '.join(one.values())} |" for one in cells]
-    for row in rows:
-        lines += ["", f"## {row['scene']}, {100 * row['budget']:g}%", "", _KNOBS, "|" + " --- |" * 5]
-        for one in row["knobs"]:
-            took, change = _percent(one["error"]), _percent(one["change"], "+")
-            saved = f"{100 * one['saved']:.0f}%"
-            lines.append(f"| {one['knob']} | {one['level']} | {change} | {took} | {saved} |")
-        lines += ["", "Measured as a whole:", ""]
-        for name, one in [
-            ("as it was", row["own"]),
-            *((f"try {k}", t) for k, t in enumerate(row["tried"], 1)),
-        ]:
-            said = ", ".join(f"{key} {value}" for key, value in one["setting"].items())
-            promised = "" if one["promised"] is None else f", {100 * one['promised']:.2g}% promised"
-            took = f"takes {_percent(one['error'])}{promised}"
-            lines.append(f"- {name}: {took}, {one['cpu_s_a_frame']:.2f} CPU-s a frame ({said})")
-    return "\n".join(lines) + "\n"
 
 
 def _mean(values: list[float | None]) -> float:

@@ -82,9 +82,7 @@ def _charts(done: pa.Table) -> list[str]:
             (one["values"], one["counts"]) for one in done[name].drop_null().value_counts().to_pylist()
         )
         if counts:
-            found.append(
-                histogram.bars([n for _, n in counts], [str(value) for value, _ in counts], title, "")
-            )
+            found.append(histogram.bars([n for _, n in counts], [str(value) for value, _ in counts], title))
     return found
 
 

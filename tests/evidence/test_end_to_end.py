@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import cast
@@ -12,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from evidence import defaults_on_front, kept
-from evidence.end_to_end import costs, models, page, pareto, pipelines
+from evidence.end_to_end import costs, models, pareto, pipelines
 from evidence.end_to_end.pipelines import Sequences
 from learn.data.clips import Clip
 
@@ -207,10 +206,3 @@ def test_a_front_is_left_beyond_the_paired_interval(cost: float, off: float, hol
     rows = pareto.summarised([row(1.0, usual, default=True), row(cost, other, tets=400)], 0)
     found = defaults_on_front._end_to_end({"rows": rows})
     assert [front.holds() for front in found] == [holds] * len(found)
-
-
-def test_the_page_is_that_of_its_data(tmp_path: Path) -> None:
-    found = json.loads((RESULTS / "end-to-end" / "pareto.json").read_text("utf-8"))
-    page.write(found, tmp_path)
-    for name in ("chart.svg", "index.html", "README.md"):
-        assert (tmp_path / name).read_text("utf-8") == (RESULTS / "end-to-end" / name).read_text("utf-8")

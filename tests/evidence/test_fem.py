@@ -2,40 +2,13 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
 
-from bench.output import plot
-from bench.output.plot import Curve, Panel
 from evidence.fem import case, surface
-
-
-def test_the_page_holds_its_charts_and_rows_and_asks_for_nothing_else(tmp_path: Path) -> None:
-    panels = [
-        Panel(
-            "cost",
-            "ms",
-            "error",
-            (Curve("P2 <fast>", (1.0, 10.0), (4.0, float("nan")), ("700", "1600")),),
-            True,
-        ),
-        Panel("loads", "P", "error", (Curve("linear", (0.0, 0.1, 0.2), (0.0, 1.0, 3.0)),)),
-    ]
-    rows = [{"law": "linear", "error": 0.0123456}, {"law": "stable", "error": None, "why": "a & b"}]
-    found = {"command": "bench pareto fem", "machine": {"cores": 2}}
-    plot.write(panels, tmp_path, "Physics", rows, found)
-    page = (tmp_path / "index.html").read_text("utf-8")
-    assert not re.findall(r"(?:src|href)=", page)
-    assert page.count("<polyline") == 1
-    assert page.count("<circle") == 1 + 3 + 2  # points, and one a name
-    assert "P2 &lt;fast&gt;" in page
-    assert "<td>0.01235</td>" in page
-    assert "a &amp; b" in page
-    assert (tmp_path / "chart.svg").read_text("utf-8").count("<circle") == 6
 
 
 @pytest.mark.slow

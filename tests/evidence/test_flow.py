@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 from pathlib import Path
 
 import av
@@ -18,7 +17,6 @@ from bench.cli import app
 from bench.flow import files
 from bench.methods.network import Model
 from bench.methods.protocol import Answer, Scene
-from bench.output import plot
 from bench.recording.folder import open_recording
 from bench.recording.writer import write_video
 from bench.tracking import live
@@ -119,15 +117,6 @@ def test_scene_holds_its_own_truth() -> None:
 def test_masking_beats_mean_inpainting() -> None:
     made = list(pairs(Recipe(size=128, pull=6.0), 2, 5))
     assert measure(Dis(), made).mean < measure(MeanInpainting(Dis()), made).mean
-
-
-def test_chart_and_page_are_written(tmp_path: Path) -> None:
-    curve = plot.Curve("ours", (0.1, 1.0, 10.0), (0.2, 0.3, float("nan")))
-    marked = plot.Curve("theirs", (0.5,), (0.4,), ("here",))
-    panels = [plot.Panel(str(k), "x", "y", (curve, marked), log_x=True, log_y=True) for k in range(3)]
-    plot.write(panels, tmp_path, "Chart")
-    assert "<circle" in (tmp_path / "chart.svg").read_text()
-    assert not re.findall(r"(?:src|href)=", (tmp_path / "index.html").read_text())
 
 
 def test_bench_flow_scores_a_pair(tmp_path: Path) -> None:

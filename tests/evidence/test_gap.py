@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 from typing import Any
@@ -90,7 +91,7 @@ def test_a_training_is_answered_from_what_was_kept_only_if_nothing_that_made_it_
 
     assert [ask(), ask()] == [1, 1]
     assert ask(settings=replace(settings, weight_decay=0.1)) == 2
-    assert ask([replace(clips[0], content_hash="other"), *clips[1:]]) == 3
+    assert ask([dataclasses.replace(clips[0], content_hash="other"), *clips[1:]]) == 3
     assert ask(flow="dis") == 4
     assert trained[3] == trained[0]  # asked otherwise, but the same network
     monkeypatch.setattr(kept, "code", lambda module: "other")

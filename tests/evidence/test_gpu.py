@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from evidence.gpu import run
+from evidence.gpu import run_steps
 
 
 def test_a_step_that_fails_or_hangs_does_not_stop_the_next(tmp_path: Path) -> None:
@@ -14,7 +14,7 @@ def test_a_step_that_fails_or_hangs_does_not_stop_the_next(tmp_path: Path) -> No
         ("hangs", ("-c", "import time; time.sleep(60)")),
         ("says", ("-c", "print('seen')")),
     )
-    found = run(steps, tmp_path, limit_s=2.0)
+    found = run_steps(steps, tmp_path, limit_s=2.0)
     assert [outcome.exit_code for outcome in found] == [3, -1, 0]
     assert (tmp_path / "says.log").read_text() == "seen\n"
     assert [step["name"] for step in json.loads((tmp_path / "gpu.json").read_text())["steps"]] == [

@@ -53,4 +53,4 @@ def test_remembering_is_only_rewarded_by_random_frames() -> None:
     values = leakage.summary(data, found)["methods"]["memory"]
     assert values["random frames"]["r2"] > 0.8
     assert values["whole recordings"]["r2"] < 0.2
-    assert "memory" in leakage.readme(leakage.summary(data, found))
+    assert "memory" in leakage.drawn(leakage.summary(data, found)).text()

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from bench.output.result_page import markdown
 from evidence import kept
 from evidence.learn import corruptions as disturb
 from evidence.learn import run_table, runs
@@ -22,7 +23,6 @@ from evidence.learn.labels import coarser
 from evidence.learn.pareto import pareto
 from evidence.learn.preset_errors import errors, shape
 from evidence.learn.runs import Run
-from evidence.learn.table import markdown
 from learn.data.clips import Clip
 from learn.data.grid import Grid
 from learn.data.split import nested

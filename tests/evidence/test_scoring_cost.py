@@ -37,7 +37,7 @@ def test_the_result_is_told_with_both_processes_memory() -> None:
         "machine": {"processor": "P", "cores": 2, "memory_gb": 8.0},
         "command": "bench experiment scoring MODEL --train DATA",
     }
-    told = scoring_cost.readme(tree)
-    assert "**90 s, 1.5 times the" in told
+    told = scoring_cost.drawn(tree).text()
+    assert "*90 s, 1.5 times the" in told
     assert "1.2 GB" in told
     assert "| flow | 1.0 | 2.0 |" in told

@@ -40,11 +40,12 @@ def test_means_and_intervals_over_specimens() -> None:
     assert tree["methods"]["zero"]["main_worse_by_mn"]["mean"] == pytest.approx(-1.0)
     assert tree["methods"]["net"]["scores"]["ccc"]["mean"] is None
     assert tree["specimens"] == 2
-    assert "better" not in pool.readme(tree | MADE)
+    assert "better" not in pool.drawn(tree | MADE, "README.md").text()
 
 
 def test_a_better_method_is_marked() -> None:
-    assert "**zero** (better)" in pool.readme(pool.pool([score("a", 5.0), score("b", 6.0)]) | MADE)
+    tree = pool.pool([score("a", 5.0), score("b", 6.0)]) | MADE
+    assert "| zero (better) | 4.00" in pool.drawn(tree, "README.md").text()
 
 
 def test_a_recording_without_scores_is_named() -> None:
@@ -52,7 +53,7 @@ def test_a_recording_without_scores_is_named() -> None:
     tree = pool.pool([score("a", 5.0), lost])
     assert tree["recordings"] == ["a"]
     assert tree["left_out"] == {"b": "clocks not aligned: ambiguous"}
-    assert "Recording b is left out" in pool.readme(tree | MADE)
+    assert "Recording b is left out" in pool.drawn(tree | MADE, "README.md").text()
 
 
 def test_command_reads_folders_and_refuses_the_same_twice(tmp_path: Path) -> None:

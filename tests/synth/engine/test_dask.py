@@ -2,48 +2,19 @@
 
 from __future__ import annotations
 
-import os
-import signal
 import sys
 from pathlib import Path
 
 import pytest
-from fake_run import Silent, options, run_here, wait_for
+from fake_run import Silent, options
 
-from evidence.engine.dask import local_cluster
 from synth.dataset.folder import Folder
-from synth.dataset.index import dataset_hash, read_index
 from synth.engine import run
 from synth.engine.dask import read_slurm, slurm
 from synth.errors import UserError
 from synth.job.schema import Job
 
 JOB = Job(seed=2, sequences=6, frames=3, render={"size": (32, 24)}, flow={"backend": "ideal"})
-
-
-class Killing(Silent):
-    """Kills a worker of the cluster as soon as two sequences have ended."""
-
-    def __init__(self, victim: int) -> None:
-        super().__init__()
-        self.victim = victim
-
-    def end(self, attempt: object, again: bool) -> None:
-        super().end(attempt, again)  # type: ignore[arg-type]
-        if len(self.attempts) == 2:
-            os.killpg(self.victim, signal.SIGKILL)
-
-
-@pytest.mark.slow
-def test_a_lost_worker_costs_nothing_but_time(tmp_path: Path) -> None:
-    root = tmp_path / "cluster"
-    with local_cluster(2) as (address, processes):
-        made = run.run_job(JOB, root, options("slow", engine=f"dask://{address}"), Killing(processes[0].pid))
-        wait_for(lambda: processes[0].poll() is not None)
-    assert (made.done, made.failed) == (6, {})
-    run_here(tmp_path / "local", JOB.model_dump_json(), "sequence")
-    assert made.content_hash == dataset_hash(read_index(tmp_path / "local").to_pylist())
-    assert not list(root.glob("*.part"))
 
 
 def test_the_jobs_script_holds_what_was_asked(tmp_path: Path) -> None:

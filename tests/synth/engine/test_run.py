@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import os
 import re
 import signal
 import threading
@@ -12,7 +11,6 @@ from pathlib import Path
 import pytest
 from fake_run import Silent, options, start, wait_for
 
-from evidence.engine.faults import _JUMPING
 from synth.dataset import index, provenance
 from synth.dataset.folder import Folder
 from synth.engine import run as engine
@@ -201,19 +199,6 @@ def test_an_account_says_rates_time_and_disk(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_clock_that_jumps_changes_nothing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, undisturbed: str
-) -> None:
-    jumping = options("sequence")
-    (tmp_path / "sitecustomize.py").write_text(_JUMPING)
-    path = os.pathsep.join([str(tmp_path), jumping.environment["PYTHONPATH"]])
-    made = engine.run_job(
-        JOB, tmp_path / "out", dataclasses.replace(jumping, environment={"PYTHONPATH": path}), Silent()
-    )
-    assert made.content_hash == undisturbed
-
-
-@pytest.mark.slow
 def test_trouble_costs_the_sequence_that_makes_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert engine._TRIES == 3
     monkeypatch.setattr(engine, "_TRIES", 2)
@@ -293,12 +278,6 @@ def test_two_runs_on_one_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     finally:
         first.wait(timeout=60)
     assert first.returncode == 0
-
-
-@pytest.mark.slow
-def test_folder_names_with_spaces_and_other_letters(tmp_path: Path, undisturbed: str) -> None:
-    strange = tmp_path / "größe μm 脳 out"
-    assert run(strange).content_hash == undisturbed
 
 
 @pytest.mark.slow

@@ -62,12 +62,12 @@ def test_a_killed_job_and_a_drained_node_change_no_byte(tmp_path: Path) -> None:
     described.write_text(DESCRIBED.replace("LOGS", str(tmp_path / "logs")))
     with slurm_cluster.slurm_cluster(tmp_path / "slurm") as node:
         watcher = Disturbing(node)
-        made = run.run(JOB, tmp_path / "cluster", run.Options(engine=str(described)), watcher)
+        made = run.run_job(JOB, tmp_path / "cluster", run.Options(engine=str(described)), watcher)
         assert watcher.killed
         wait_for(lambda: not slurm_cluster.call("squeue", "-h", "-t", "running", "-o", "%i"))
         assert "drain" in slurm_cluster.call("sinfo", "-h", "-o", "%T")
     assert (made.done, made.failed) == (JOB.sequences, {})
-    here = run.run(JOB, tmp_path / "local", run.Options(workers=1), Silent())
+    here = run.run_job(JOB, tmp_path / "local", run.Options(workers=1), Silent())
     assert made.content_hash == here.content_hash
     assert not list((tmp_path / "cluster").glob("*.part"))
     assert not list((Folder(tmp_path / "cluster").state / "failed").glob("*"))

@@ -6,6 +6,7 @@ import re
 from pathlib import Path
 from xml.etree import ElementTree
 
+import matplotlib
 import numpy as np
 import pytest
 from fake_run import in_process
@@ -18,6 +19,8 @@ from synth.dataset import index
 from synth.fields import FIELDS
 from synth.job.schema import Job
 from synth.publish import histogram, preview_video
+
+SVG = "{http://www.w3.org/2000/svg}"
 
 
 @pytest.fixture(scope="module")
@@ -87,7 +90,26 @@ def test_the_command_writes_it_anew(root: Path) -> None:
 def test_histogram_counts_what_it_is_given() -> None:
     picture = histogram.histogram(np.array([1.0, 1.0, 1.0, 3.0, np.nan]), "a < b", "mN", bins=2)
     tree = ElementTree.fromstring(picture)
-    heights = [float(one.get("height", 0)) for one in tree if one.get("fill") == "#3b6ea5"]
+    filled = re.search(r"\.(\w+)\{fill: #3b6ea5", next(tree.iter(SVG + "style")).text or "")
+    assert filled
+    bars = [one.get("d", "") for one in tree.iter(SVG + "path") if one.get("class") == filled[1]]
+    tops = [[float(n) for n in re.findall(r"[\d.]+", bar)[1::2]] for bar in bars]
+    heights = [max(top) - min(top) for top in tops]
     assert heights[0] == pytest.approx(3 * heights[1], rel=0.01)
-    assert "a < b (n = 4)" in "".join(tree.itertext())
+    assert "a < b (n = 4)" in [text.strip() for text in tree.itertext()]
     assert ElementTree.fromstring(histogram.histogram(np.array([]), "none", "")) is not None
+
+
+def test_a_chart_has_the_same_bytes_whatever_the_users_settings() -> None:
+    values = np.array([0.0001234, 0.0005, 0.001])
+    first = histogram.histogram(values, "small", "mN")
+    with matplotlib.rc_context({"font.size": 20.0, "svg.hashsalt": None, "svg.fonttype": "path"}):
+        assert histogram.histogram(values, "small", "mN") == first
+    texts = {text.strip() for text in ElementTree.fromstring(first).itertext()}
+    assert {"0.00025", "0.00050"} <= texts  # coordinates are rounded, what is said is not
+    assert "date" not in first.lower()
+
+
+def test_bars_say_their_counts() -> None:
+    tree = ElementTree.fromstring(histogram.bars([2, 7], ["pull", "a & b"], "Gesture"))
+    assert {"pull", "a & b", "2", "7", "Gesture"} <= {text.strip() for text in tree.itertext()}
