@@ -170,7 +170,7 @@ def drawn(tree: Mapping[str, Any]) -> result_page.Page:
             "inverses from 3000 of their own, the co-rotational law from 1600 of first order. CPU time of "
             "one thread; everything was chosen on seed 0.",
         ),
-        "bench experiment inverse",
+        tree.get("command", "bench experiment inverse"),
         "README.md",
     )
 

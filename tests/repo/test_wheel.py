@@ -72,7 +72,7 @@ def test_its_jobs_and_templates_are_found(installed: Path, tmp_path: Path) -> No
         done = typed(installed, tmp_path, *words)
         assert done.returncode == 0, done.stderr
     assert (tmp_path / "job.yaml").is_file()
-    where = "import synth.job.reader as r; r.load('demo', []); print(r.__file__)"
+    where = "import synth.job.reader as r; r.load_job('demo', []); print(r.__file__)"
     environment = {**os.environ, "PYTHONPATH": str(installed)}
     found = subprocess.run(
         [sys.executable, "-c", where], cwd=tmp_path, capture_output=True, text=True, env=environment
