@@ -79,6 +79,9 @@ COMMANDS: tuple[Command, ...] = (
     Command(
         "experiment", "surface", "evidence.fem.surface", "surface", "brain.obj --direction=-0.4,0.8,0.45"
     ),
+    Command("experiment", "relief", "evidence.fem.relief", "relief", "--scenes 4 --tets 800,1600,5000"),
+    Command("experiment", "slides", "evidence.fem.slides", "slides", "--scenes 10"),
+    Command("experiment", "half-space", "evidence.fem.half_space", "half_space", "--tets 800,1600"),
     Command("stability", "damage", "evidence.engine.damage", "damage", "out --count 50 --out runs/damage"),
     Command(
         "experiment", "scale", "evidence.engine.large_index", "scale", "--sequences 10000 --out runs/scale"
