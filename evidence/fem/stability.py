@@ -19,13 +19,13 @@ from evidence.measuring import measuring
 from synth.errors import UserError
 from synth.fem import equilibrium, motion, solver, surface_embedding, tool
 from synth.fem.laws import NUMBER
-from synth.fem.material import Tissue
 from synth.fem.mesh import tetrahedra
 from synth.fem.mesh.element import quality
 from synth.fem.mesh.tetrahedra import Tets
 from synth.fem.system import assemble
 from synth.job import schema
 from synth.job.law_limits import LEAST_JACOBIAN
+from synth.sequence import pipeline, scenario
 
 Floats = NDArray[np.float64]
 Row = dict[str, Any]
@@ -34,6 +34,7 @@ _LOADS = (0.01, 0.05, 0.1, 0.2, 0.4, 0.8, 1.5, 3.0)
 _POISSONS = (0.0, 0.3, 0.4, 0.45, 0.49, 0.495, 0.499)
 _CONTACT = fem_case.CONTACTS[0]
 _VERTICES, _CHUNK = 10_000, 50
+_SMALL: dict[str, Any] = {"anatomy": {"vertices": 10_000}}
 
 
 @measuring(
@@ -225,20 +226,20 @@ def _alone(bent: Tets, cell: int) -> bool:
     return bool(np.delete(quality(bent.points[bent.cells]), cell).min() > 0.05)
 
 
-def random_scenes(count: int, tets: int, seed: int, first: int = 0, frames: int = 6) -> Row:
-    """Scenes of the default ranges: each ends whole or refused by a named guard, or is counted as silent."""
-    fem, on = schema.Fem(tets=tets), fem_case.patch(3600)
+def random_scenes(count: int, tets: int, seed: int, first: int = 0, frames: int = 12) -> Row:
+    """Scenes of the default job: each ends whole or refused by a named guard, or is counted as silent."""
+    job = schema.Job.model_validate(
+        {"seed": seed, "sequences": 10**6, "frames": frames, "fem": {"tets": tets}} | _SMALL
+    )
     outcome: Counter[str] = Counter()
-    least, kinds, refusals = np.inf, Counter[str](), []
+    least, kinds, refusals, largest = np.inf, Counter[str](), [], 0.0
     for index in range(first, first + count):
-        rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(index,)))
-        tissue = Tissue.draw(fem, rng)
-        gesture = tool.Gesture.draw(fem, fem_case.ANATOMY.craniotomy, tissue, rng)
+        case = scenario.draw(job, index)
         try:
-            volume = tetrahedra.block(fem_case.ANATOMY, tets, fem.order, tool.focus(gesture))
-            motion = solver.deform(fem, tissue, gesture, volume, on.vertices, on.faces, frames, 25.0)
+            motion = pipeline.move(job, case, *pipeline.build(job, case))
         except UserError as refusal:
             outcome[type(refusal).__name__] += 1
+            gesture = case.gesture
             refusals.append({"index": index, "kind": gesture.kind, "load": gesture.load, "why": str(refusal)})
             continue
         total = np.einsum("v,tvd->td", motion.area, motion.traction)
@@ -251,8 +252,9 @@ def random_scenes(count: int, tets: int, seed: int, first: int = 0, frames: int 
             outcome["force not kept"] += 1
         else:
             outcome["whole"] += 1
-        kinds[gesture.kind] += 1
+        kinds[case.gesture.kind] += 1
         least = min(least, float(motion.min_jacobian.min()))
+        largest = max(largest, *compliance_steps(motion).values())
     return {
         "scenes": count,
         "tets": tets,
@@ -260,8 +262,27 @@ def random_scenes(count: int, tets: int, seed: int, first: int = 0, frames: int 
         "outcome": dict(outcome),
         "whole_by_gesture": dict(kinds),
         "least_jacobian": least,
+        "largest_step": largest,
         "refusals": refusals,
     }
+
+
+def compliance_steps(motion: solver.Deformation) -> dict[str, float]:
+    """Largest change of displacement per force from a frame to the next while the force is even within 2%:
+    of the peak and of the mean under the load."""
+    size = np.linalg.norm(motion.force, axis=1)
+    peak = np.linalg.norm(motion.displacement, axis=2).max(axis=1)
+    weight = motion.area * np.linalg.norm(motion.traction, axis=2)
+    mean = np.linalg.norm(np.einsum("tv,tvd->td", weight, motion.displacement), axis=1)
+    mean /= np.maximum(weight.sum(axis=1), 1e-12)
+    even = np.flatnonzero(
+        (np.minimum(size[1:], size[:-1]) > 0.05 * size.max()) & (np.abs(np.diff(size)) < 0.02 * size.max())
+    )
+    found = {}
+    for name, value in (("peak", peak), ("mean", mean)):
+        log = np.log(np.maximum(value, 1e-12) / np.maximum(size, 1e-12))
+        found[name] = float(np.expm1(np.abs(np.diff(log))[even]).max(initial=0.0))
+    return found
 
 
 def _added(parts: list[Row]) -> Row:
@@ -273,6 +294,7 @@ def _added(parts: list[Row]) -> Row:
         whole["whole_by_gesture"].update(part["whole_by_gesture"])
         whole["refusals"] += part["refusals"]
         whole |= {name: part[name] for name in ("tets", "frames")}
+        whole["largest_step"] = max(whole.get("largest_step", 0.0), part["largest_step"])
         whole["least_jacobian"] = min(whole.get("least_jacobian", np.inf), part["least_jacobian"])
     return whole
 

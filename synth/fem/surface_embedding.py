@@ -53,10 +53,13 @@ class Embedding:
 
     def gather(self, force: Floats) -> Floats:
         """Nodal forces (N, 3, ...) mN, from those at the points, (V, 3, ...) mN."""
-        flat = force.reshape(len(force), -1)
-        nodal = (self.value.T @ flat).reshape(-1, *force.shape[1:])
-        moment = _cross(self._arm(force), force).reshape(flat.shape)
-        couple = self.spin.T @ (self.mean.T @ (self.corner.T @ moment)).reshape(self.spin.shape[0], -1)
+        loaded = np.flatnonzero(force.reshape(len(force), -1).any(axis=1))  # few of them, as a rule
+        width = int(np.prod(force.shape[1:]))
+        flat = force[loaded].reshape(len(loaded), width)
+        moment = _cross(self._arm(force)[loaded], force[loaded]).reshape(flat.shape)
+        nodal = (self.value[loaded].T @ flat).reshape(-1, *force.shape[1:])
+        couple = self.mean.T @ (self.corner[loaded].T @ moment)
+        couple = self.spin.T @ couple.reshape(self.spin.shape[0], width // 3)
         return np.asarray(nodal + couple.reshape(nodal.shape))
 
     def _arm(self, like: Floats) -> Floats:

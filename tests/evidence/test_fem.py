@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from evidence.fem import case, surface
+from evidence.fem import case, half_space, relief, surface
+from evidence.fem.stability import random_scenes
 
 
 @pytest.mark.slow
@@ -36,3 +37,23 @@ def test_error_falls_with_the_mesh_and_with_the_order() -> None:
     assert error(2, 1200) < 0.06
     assert error(2, 1200) < 0.7 * error(2, 500)
     assert error(1, 1200) > 3 * error(2, 1200)
+
+
+def test_discs_on_the_half_space_come_out_as_in_the_books() -> None:
+    rows = {(row["disc"], row["part"]): row["error"] for row in half_space.measure(2500, 0.4)}
+    assert max(error for (_, part), error in rows.items() if part.startswith(("u_z", "u_x"))) < 0.025
+    assert max(error for (_, part), error in rows.items() if part.startswith("u_r")) < 0.08
+
+
+def test_a_scene_on_its_relief_converges() -> None:
+    rows = [relief.measure_scene(2, count) for count in (400, 1600, 3500)]
+    coarse, fine = relief.summarise(rows, [400, 1600, 3500])
+    assert fine["mean_worst"] < min(0.03, coarse["mean_worst"])
+    assert relief.summarise([], [400, 1600]) == [{"tets": 400, "against": 1600, "scenes": 0}]
+
+
+def test_random_scenes_are_whole_and_step_evenly() -> None:
+    found = random_scenes(3, 400, 0, frames=6)
+    assert found["outcome"] == {"whole": 3}
+    assert 0 < found["least_jacobian"] <= 1
+    assert found["largest_step"] < 0.25

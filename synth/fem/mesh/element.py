@@ -131,15 +131,21 @@ def gradients(nodes: Floats, bary: Floats) -> tuple[Floats, Floats]:
     Returns:
         (M, Q, n, 3) 1/mm, and (M, Q) mm^3: 6 times the volume of a straight element, negative inside out.
     """
-    local = shape_slope(bary, 1 if nodes.shape[1] == 4 else 2)
-    local = local[..., 1:] - local[..., :1]  # (Q, n, 3): the first coordinate is what the others leave of 1
-    jacobian = np.einsum("qnk,mnd->mqkd", local, nodes)
+    local, jacobian = _mapping(nodes, bary)
     return np.einsum("qnk,mqdk->mqnd", local, np.linalg.inv(jacobian)), np.linalg.det(jacobian)
+
+
+def _mapping(nodes: Floats, bary: Floats) -> tuple[Floats, Floats]:
+    """Derivatives by three local coordinates, of the shape functions (Q, n, 3) and of place (M, Q, 3, 3)."""
+    local = shape_slope(bary, 1 if nodes.shape[1] == 4 else 2)
+    local = local[..., 1:] - local[..., :1]  # the first coordinate is what the others leave of 1
+    flat = np.ascontiguousarray(local.transpose(0, 2, 1).reshape(-1, local.shape[1]))
+    return local, (flat @ nodes).reshape(len(nodes), len(bary), 3, 3)
 
 
 def jacobians(points: Floats, cells: Ints) -> Floats:
     """Jacobian at the corners and quadrature points over that of the straight element, (M, 4 + Q)."""
     order = 1 if cells.shape[1] == 4 else 2
-    determinant = gradients(points[cells], np.vstack([np.eye(4), TET_POINTS[order]]))[1]
+    determinant = np.linalg.det(_mapping(points[cells], np.vstack([np.eye(4), TET_POINTS[order]]))[1])
     straight = np.linalg.det(points[cells[:, 1:4]] - points[cells[:, :1]])
     return np.asarray(determinant / straight[:, None])

@@ -1,0 +1,163 @@
+"""Discs on the half-space against closed forms: u_z and u_r of the default grading, by Poisson's ratio."""
+
+from __future__ import annotations
+
+import json as json_
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+from numpy.typing import NDArray
+from scipy.special import ellipe, ellipk
+
+from bench.output import machine, write
+from evidence.measuring import measuring
+from synth.fem import surface_embedding
+from synth.fem.mesh import tetrahedra
+from synth.fem.mesh.tetrahedra import Tets
+from synth.fem.system import assemble
+from synth.job import schema
+
+Floats = NDArray[np.float64]
+Row = dict[str, Any]
+_RADIUS_MM = 4.5
+_POISSONS = (0.4, 0.45, 0.49)
+_RINGS, _SPOKES = 60, 96
+
+
+@measuring("--tets 800,1600")
+def half_space(
+    tets: Annotated[str, typer.Option(help="Tetrahedra of the meshes.")] = "1600,5000",
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder for the data.")] = None,
+    json: Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")] = False,
+) -> None:
+    """Error of surface displacement under a uniform, a Hertz and a tangential disc, P2, linear law."""
+    rows = [
+        row
+        for count in (int(n) for n in tets.split(","))
+        for poisson in _POISSONS
+        for row in measure(count, poisson)
+    ]
+    found = {"command": f"bench experiment half-space --tets {tets}", "machine": machine.describe()} | {
+        "rows": rows
+    }
+    if out is not None:
+        write.keep(out, "half-space.json", found)
+    if json:
+        print(json_.dumps(found))
+        return
+    for row in rows:
+        print(
+            f"{row['tets']:6d} nu {row['poisson']:4.2f} {row['disc']:10s} {row['part']:12s} "
+            f"{100 * row['error']:5.1f}%"
+        )
+
+
+def measure(count: int, poisson: float) -> list[Row]:
+    """Relative root mean squares inside the disc and outside, to twice its radius."""
+    a = _RADIUS_MM
+    anatomy = schema.Anatomy(dome_mm=1e6)
+    tets = tetrahedra.block(anatomy, count, 2, ((0.0, 0.0, a),))
+    free = Tets(tets.points, tets.cells, 2, tets.fixed, 0 * tets.hold)
+    system = assemble(free, "linear", poisson)
+    ring = a * np.sqrt((np.arange(_RINGS) + 0.5) / _RINGS)
+    turn = 2 * np.pi * (np.arange(_SPOKES) + 0.5) / _SPOKES
+    at = np.stack([np.outer(ring, np.cos(turn)), np.outer(ring, np.sin(turn))], axis=-1).reshape(-1, 2)
+    load = surface_embedding.embed(free, np.column_stack([at, np.zeros(len(at))]))
+    inside, outside = np.linspace(0.15, 0.85, 8) * a, np.linspace(1.15, 2.0, 8) * a
+    rows: list[Row] = []
+    for disc in ("uniform", "hertz", "tangential"):
+        share = np.repeat(np.sqrt(1 - (ring / a) ** 2) if disc == "hertz" else np.ones(_RINGS), _SPOKES)
+        share /= share.sum()
+        way = np.array([1.0, 0.0, 0.0] if disc == "tangential" else [0.0, 0.0, -1.0])
+        fixed = free.points[free.fixed]
+        shell = np.zeros_like(free.points)
+        shell[free.fixed] = point_loads(fixed, at[::7], share[::7] / share[::7].sum(), way, poisson)
+        held = (system.stiffness @ shell.ravel()).reshape(-1, 3)
+        u = shell + system.solve(load.gather(np.outer(share, way)) - held)
+        for place, radii in (("inside", inside), ("outside", outside)):
+            spots = np.concatenate([np.outer(radii, [np.cos(t), np.sin(t)]) for t in turn[::6]])
+            seen = surface_embedding.embed(free, np.column_stack([spots, np.zeros(len(spots))])).move(u)
+            unit = spots / np.linalg.norm(spots, axis=1, keepdims=True)
+            radial = np.einsum("nd,nd->n", seen[:, :2], unit)
+            if disc == "tangential":
+                exact = tangential_mean(radii, a, poisson)
+                got = seen[:, 0].reshape(-1, len(radii)).mean(axis=0)
+                rows.append(_row(count, poisson, disc, f"u_x {place}", got, exact))
+                continue
+            down, out = axial(radii, a, poisson, disc)
+            rows.append(_row(count, poisson, disc, f"u_z {place}", -_mean(seen[:, 2], radii), down))
+            rows.append(_row(count, poisson, disc, f"u_r {place}", _mean(radial, radii), out))
+    return rows
+
+
+def _mean(values: Floats, radii: Floats) -> Floats:
+    return np.asarray(values.reshape(-1, len(radii)).mean(axis=0))
+
+
+def _row(count: int, poisson: float, disc: str, part: str, got: Floats, exact: Floats) -> Row:
+    error = float(np.linalg.norm(got - exact) / np.linalg.norm(exact))
+    return {"tets": count, "poisson": poisson, "disc": disc, "part": part, "error": error}
+
+
+def axial(r: Floats, a: float, poisson: float, disc: str) -> tuple[Floats, Floats]:
+    """Down and outward motion of the surface under a unit force, E = 1 kPa (Johnson, Contact Mechanics, 3.4).
+
+    Args:
+        r: (n,) mm from the middle.
+        a: radius of the disc, mm.
+        poisson: its ratio.
+        disc: `uniform` or `hertz`.
+    """
+    young, force = 1.0, 1.0
+    within = np.where(r < a, np.minimum(r / a, 1), np.minimum(a / r, 1)) ** 2
+    sideways = -(1 - 2 * poisson) * (1 + poisson) / young
+    if disc == "uniform":
+        p = force / (np.pi * a * a)
+        factor = 4 * (1 - poisson**2) * p / (np.pi * young)
+        far = r * (ellipe(within) - (1 - within) * ellipk(within))
+        return factor * np.where(r < a, a * ellipe(within), far), sideways * p / 2 * np.where(
+            r < a, r, a * a / r
+        )
+    p = 1.5 * force / (np.pi * a * a)
+    near = np.pi / (4 * a) * (2 * a * a - r**2)
+    reach = np.minimum(a / r, 1)
+    far = ((2 * a * a - r**2) * np.arcsin(reach) + r * a * np.sqrt(1 - reach**2)) / (2 * a)
+    down = (1 - poisson**2) * p / young * np.where(r < a, near, far)
+    swept = np.where(r < a, 1 - np.clip(1 - (r / a) ** 2, 0, 1) ** 1.5, 1.0)
+    return down, sideways * p * a * a / (3 * r) * swept
+
+
+def tangential_mean(r: Floats, a: float, poisson: float) -> Floats:
+    """u_x, averaged round the ring, under a uniform tangential unit force (Cerruti; Johnson 3.6).
+
+    The kernel of point forces is [(1 - nu)/s + nu (x/s)^2/s] / (2 pi G). The square averages to a half, which
+    leaves 1 - nu/2 of the potential of which a normal load has 1 - nu.
+    """
+    down, _ = axial(r, a, poisson, "uniform")
+    return np.asarray(down / (1 - poisson) * (1 - poisson / 2))
+
+
+def point_loads(points: Floats, at: Floats, share: Floats, way: Floats, poisson: float) -> Floats:
+    """Displacement (N, 3) mm in a half-space z <= 0 under point forces on it (Johnson 3.2, 3.6)."""
+    shear = 1 / (2 * (1 + poisson))
+    out = np.zeros_like(points)
+    for place, part in zip(at, share, strict=True):
+        x, y, z = points[:, 0] - place[0], points[:, 1] - place[1], -points[:, 2]
+        s = np.sqrt(x * x + y * y + z * z)
+        k = part / (4 * np.pi * shear)
+        if way[2]:
+            ring = z / s**3 - (1 - 2 * poisson) / (s * (s + z))
+            out += k * np.column_stack([ring * x, ring * y, -(2 * (1 - poisson) / s + z * z / s**3)])
+        else:
+            side = 1 - 2 * poisson
+            deep = s + z
+            out += k * np.column_stack(
+                [
+                    1 / s + x * x / s**3 + side * (1 / deep - x * x / (s * deep**2)),
+                    x * y / s**3 - side * x * y / (s * deep**2),
+                    -(x * z / s**3 + side * x / (s * deep)),
+                ]
+            )
+    return out

@@ -1,0 +1,49 @@
+"""Slides at constant force over the relief: displacement per force must not jump between frames."""
+
+from __future__ import annotations
+
+import json as json_
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+
+from bench.output import machine, write
+from evidence.fem.stability import compliance_steps
+from evidence.measuring import measuring
+from synth.errors import UserError
+from synth.job.schema import Job
+from synth.sequence import pipeline, scenario
+
+
+@measuring("--scenes 10")
+def slides(
+    scenes: Annotated[int, typer.Option(help="How many.", min=1)] = 100,
+    seed: Annotated[int, typer.Option(help="Of the scenes.")] = 0,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder for the data.")] = None,
+    json: Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")] = False,
+) -> None:
+    """Largest step of displacement per force in random slides of the default job."""
+    job = Job.model_validate({"seed": seed, "sequences": scenes, "fem": {"gestures": ["slide"]}})
+    rows: list[dict[str, Any]] = []
+    for index in range(scenes):
+        case = scenario.draw(job, index)
+        row: dict[str, Any] = {"index": index, "load": case.gesture.load}
+        try:
+            rows.append(row | compliance_steps(pipeline.move(job, case, *pipeline.build(job, case))))
+        except UserError as refusal:
+            rows.append(row | {"refused": str(refusal)})
+    moved = [row for row in rows if "peak" in row]
+    found: dict[str, Any] = {
+        "command": f"bench experiment slides --scenes {scenes} --seed {seed}",
+        "machine": machine.describe(),
+        "refused": len(rows) - len(moved),
+        "worst_peak": max((row["peak"] for row in moved), default=float("nan")),
+        "worst_mean": max((row["mean"] for row in moved), default=float("nan")),
+        "median_peak": float(np.median([row["peak"] for row in moved])),
+        "rows": rows,
+    }
+    if out is not None:
+        write.keep(out, "slides.json", found)
+    print(json_.dumps(found) if json else {key: found[key] for key in list(found)[2:6]})
