@@ -27,7 +27,7 @@ def test_reading_a_dataset(out: Path) -> None:
     assert found["young_kpa"] == pytest.approx(0.81474, abs=1e-4)
     assert found["peak_force_mn"] == pytest.approx(4.2385, abs=1e-3)
     assert found["labelled_force_mn"] == pytest.approx(found["peak_force_mn"], rel=0.02)
-    assert found["largest_motion_px"] == pytest.approx(3.840, abs=0.01)
+    assert found["largest_motion_px"] == pytest.approx(4.308, abs=0.01)
     assert found["median_flow_error_px"] < 0.2
 
 
@@ -40,8 +40,8 @@ def test_rendering_a_frame() -> None:
 
 def test_a_law_of_ones_own_stiffens() -> None:
     soft, stiff = own_law.peak_mm(None), own_law.peak_mm(4.0)
-    assert soft == pytest.approx(1.20, abs=0.01)
-    assert stiff == pytest.approx(1.11, abs=0.01)
+    assert soft == pytest.approx(1.17, abs=0.01)
+    assert stiff == pytest.approx(1.09, abs=0.01)
     assert own_law.peak_mm(1e-4) == pytest.approx(soft, rel=1e-3), "for small b it is neo-Hookean"
 
 
