@@ -247,6 +247,9 @@ _FILES: Mapping[str, tuple[str, str | Callable[[Tree], Page]]] = {
     "flow/stability": ("stability.json", "flow.stability"),
     "render/cycles": ("cycles.json", cycles),
     "render/pareto": ("pareto.json", "render.pareto"),
+    "fem/relief": ("relief.json", "fem.relief"),
+    "fem/slides": ("slides.json", "fem.slides"),
+    "fem/half-space": ("half-space.json", "fem.half_space"),
     "render/realism": ("realism.json", realism),
     "render/stability": ("stability.json", "render.stability"),
 }

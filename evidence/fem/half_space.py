@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json as json_
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -11,7 +12,8 @@ import typer
 from numpy.typing import NDArray
 from scipy.special import ellipe, ellipk
 
-from bench.output import machine, write
+from bench.output import charts, machine, write
+from bench.output.result_page import Page
 from evidence.measuring import measuring
 from synth.fem import surface_embedding
 from synth.fem.mesh import tetrahedra
@@ -161,3 +163,23 @@ def point_loads(points: Floats, at: Floats, share: Floats, way: Floats, poisson:
                 ]
             )
     return out
+
+
+def drawn(found: Mapping[str, Any]) -> Page:
+    """What the data say: the worst of the three discs, for each part and Poisson's ratio."""
+    rows = found["rows"]
+    panels = []
+    for part in dict.fromkeys(row["part"] for row in rows):
+        curves = []
+        for poisson in dict.fromkeys(row["poisson"] for row in rows):
+            mine = [row for row in rows if (row["part"], row["poisson"]) == (part, poisson)]
+            worst = {n: max(100 * row["error"] for row in mine if row["tets"] == n) for n in _sizes(mine)}
+            curves.append(charts.Curve(f"nu {poisson}", tuple(map(float, worst)), tuple(worst.values())))
+        panels.append(
+            charts.Panel(f"{part}, worst disc", "tetrahedra", "error [%]", tuple(curves), log_y=True)
+        )
+    return Page("Discs on the half-space", found, panels)
+
+
+def _sizes(rows: list[Row]) -> list[int]:
+    return sorted({int(row["tets"]) for row in rows})

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json as json_
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -10,7 +11,8 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
-from bench.output import machine, write
+from bench.output import charts, machine, write
+from bench.output.result_page import Page, Section
 from evidence.measuring import measuring
 from synth.errors import UserError
 from synth.fem import equilibrium, surface_embedding, tool
@@ -106,3 +108,17 @@ def summarise(rows: list[Row], sizes: list[int]) -> list[Row]:
             line |= {f"{name[:4]}_median": float(np.median(off)), f"{name[:4]}_worst": float(off.max())}
         made.append(line)
     return made
+
+
+def drawn(found: Mapping[str, Any]) -> Page:
+    """What the data say."""
+    rows = found["summary"]
+    sizes = tuple(float(row["tets"]) for row in rows)
+    curves = tuple(
+        charts.Curve(f"{of}, {which}", sizes, tuple(100 * row[f"{of}_{which}"] for row in rows))
+        for of in ("peak", "mean")
+        for which in ("median", "worst")
+    )
+    title = f"{rows[0]['scenes']} default scenes against {rows[0]['against']} tetrahedra"
+    panel = charts.Panel(title, "tetrahedra", "displacement [%]", curves)
+    return Page(title, found, [panel], [Section("Summary", rows)])

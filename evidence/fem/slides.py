@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import json as json_
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 import typer
 
-from bench.output import machine, write
+from bench.output import charts, machine, write
+from bench.output.result_page import Page, Section
 from evidence.fem.stability import compliance_steps
 from evidence.measuring import measuring
 from synth.errors import UserError
@@ -47,3 +49,13 @@ def slides(
     if out is not None:
         write.keep(out, "slides.json", found)
     print(json_.dumps(found) if json else {key: found[key] for key in list(found)[2:6]})
+
+
+def drawn(found: Mapping[str, Any]) -> Page:
+    """What the data say."""
+    rows = found["rows"]
+    loads, steps = tuple(row["load"] for row in rows), tuple(100 * row["peak"] for row in rows)
+    curve = charts.Curve("peak", loads, steps, labels=tuple(str(row["index"]) for row in rows))
+    title = "Slides: largest change of displacement per force from frame to frame"
+    said = [{name: value for name, value in found.items() if isinstance(value, int | float)}]
+    return Page(title, found, [charts.Panel(title, "load P", "%", (curve,))], [Section("Summary", said)])
