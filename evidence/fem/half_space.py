@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json as json_
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
@@ -12,7 +10,7 @@ import typer
 from numpy.typing import NDArray
 from scipy.special import ellipe, ellipk
 
-from bench.output import charts, machine, write
+from bench.output import charts
 from bench.output.result_page import Page
 from evidence.measuring import measuring
 from synth.fem import surface_embedding
@@ -28,12 +26,19 @@ _POISSONS = (0.4, 0.45, 0.49)
 _RINGS, _SPOKES = 60, 96
 
 
-@measuring("--tets 800,1600")
+def _lines(found: Mapping[str, Any]) -> str:
+    """A line a row."""
+    return "\n".join(
+        f"{row['tets']:6d} nu {row['poisson']:4.2f} {row['disc']:10s} {row['part']:12s} "
+        f"{100 * row['error']:5.1f}%"
+        for row in found["rows"]
+    )
+
+
+@measuring("--tets 800,1600", said="Folder for the data.", file="half-space.json", text=_lines)
 def half_space(
     tets: Annotated[str, typer.Option(help="Tetrahedra of the meshes.")] = "1600,5000",
-    out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder for the data.")] = None,
-    json: Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")] = False,
-) -> None:
+) -> dict[str, Any]:
     """Error of surface displacement under a uniform, a Hertz and a tangential disc, P2, linear law."""
     rows = [
         row
@@ -41,19 +46,7 @@ def half_space(
         for poisson in _POISSONS
         for row in measure(count, poisson)
     ]
-    found = {"command": f"bench experiment half-space --tets {tets}", "machine": machine.describe()} | {
-        "rows": rows
-    }
-    if out is not None:
-        write.keep(out, "half-space.json", found)
-    if json:
-        print(json_.dumps(found))
-        return
-    for row in rows:
-        print(
-            f"{row['tets']:6d} nu {row['poisson']:4.2f} {row['disc']:10s} {row['part']:12s} "
-            f"{100 * row['error']:5.1f}%"
-        )
+    return {"rows": rows}
 
 
 def measure(count: int, poisson: float) -> list[Row]:

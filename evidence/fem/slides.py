@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import json as json_
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 import typer
 
-from bench.output import charts, machine, write
+from bench.output import charts
 from bench.output.result_page import Page, Section
 from evidence.fem.stability import compliance_steps
 from evidence.measuring import measuring
@@ -19,13 +17,16 @@ from synth.job.schema import Job
 from synth.sequence import pipeline, scenario
 
 
-@measuring("--scenes 10")
+@measuring(
+    "--scenes 10",
+    said="Folder for the data.",
+    file="slides.json",
+    text=lambda found: str({key: found[key] for key in list(found)[2:6]}),
+)
 def slides(
     scenes: Annotated[int, typer.Option(help="How many.", min=1)] = 100,
     seed: Annotated[int, typer.Option(help="Of the scenes.")] = 0,
-    out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder for the data.")] = None,
-    json: Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")] = False,
-) -> None:
+) -> dict[str, Any]:
     """Largest step of displacement per force in random slides of the default job."""
     job = Job.model_validate({"seed": seed, "sequences": scenes, "fem": {"gestures": ["slide"]}})
     rows: list[dict[str, Any]] = []
@@ -37,18 +38,13 @@ def slides(
         except UserError as refusal:
             rows.append(row | {"refused": str(refusal)})
     moved = [row for row in rows if "peak" in row]
-    found: dict[str, Any] = {
-        "command": f"bench experiment slides --scenes {scenes} --seed {seed}",
-        "machine": machine.describe(),
+    return {
         "refused": len(rows) - len(moved),
         "worst_peak": max((row["peak"] for row in moved), default=float("nan")),
         "worst_mean": max((row["mean"] for row in moved), default=float("nan")),
         "median_peak": float(np.median([row["peak"] for row in moved])),
         "rows": rows,
     }
-    if out is not None:
-        write.keep(out, "slides.json", found)
-    print(json_.dumps(found) if json else {key: found[key] for key in list(found)[2:6]})
 
 
 def drawn(found: Mapping[str, Any]) -> Page:
