@@ -19,6 +19,7 @@ from bench.scoring import commands
 FPS, SIZE = 25.0, (96, 704)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("output", "young"), [("vector", 2.0), ("magnitude", 2.0), ("vector", None)])
 def test_predict_and_score_agree_at_every_frame(
     output: str, young: float | None, make: Maker, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -95,6 +95,7 @@ def test_turns_keep_the_sense_of_rotation_unless_mirrored() -> None:
     assert senses == [senses[0]] * 4 + [not senses[0]] * 4
 
 
+@pytest.mark.slow
 def test_ridge_says_nothing_of_no_motion(tmp_path: Path) -> None:
     rng = np.random.default_rng(1)
     fit = [clip(rng, k) for k in range(4)]
@@ -104,6 +105,7 @@ def test_ridge_says_nothing_of_no_motion(tmp_path: Path) -> None:
     assert said == pytest.approx(0)
 
 
+@pytest.mark.slow
 def test_ridge_finds_what_is_linear_and_nearest_finds_what_it_knows(tmp_path: Path) -> None:
     rng = np.random.default_rng(2)
     fit, fresh = [clip(rng, k) for k in range(12)], clip(rng, 12)
@@ -130,6 +132,7 @@ def row(cpu_s: float, errors: list[float], *, default: bool = False, tets: int =
     }  # fmt: skip
 
 
+@pytest.mark.slow
 def test_kept_sequences_are_found_only_by_what_made_them(monkeypatch: pytest.MonkeyPatch) -> None:
     world = pipelines.FINE
     job = world.job(1, 4)
@@ -150,6 +153,7 @@ class Given:
         return self._clips
 
 
+@pytest.mark.slow
 def test_kept_errors_are_found_only_by_all_that_made_them(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -25,6 +25,7 @@ def test_a_users_surface_is_measured_against_a_finer_mesh(tmp_path: Path) -> Non
     assert 0.001 < row["error"] < 0.3
 
 
+@pytest.mark.slow
 def test_error_falls_with_the_mesh_and_with_the_order() -> None:
     on, contact = case.patch(3600), case.CONTACTS[0]
     exact = case.moved(case.brain(on, "linear", 2, 2000, contact), 0.1, "pull", 1)
@@ -39,12 +40,14 @@ def test_error_falls_with_the_mesh_and_with_the_order() -> None:
     assert error(1, 1200) > 3 * error(2, 1200)
 
 
+@pytest.mark.slow
 def test_discs_on_the_half_space_come_out_as_in_the_books() -> None:
     rows = {(row["disc"], row["part"]): row["error"] for row in half_space.measure(2500, 0.4)}
     assert max(error for (_, part), error in rows.items() if part.startswith(("u_z", "u_x"))) < 0.025
     assert max(error for (_, part), error in rows.items() if part.startswith("u_r")) < 0.08
 
 
+@pytest.mark.slow
 def test_a_scene_on_its_relief_converges() -> None:
     rows = [relief.measure_scene(2, count) for count in (400, 1600, 3500)]
     coarse, fine = relief.summarise(rows, [400, 1600, 3500])
@@ -52,6 +55,7 @@ def test_a_scene_on_its_relief_converges() -> None:
     assert relief.summarise([], [400, 1600]) == [{"tets": 400, "against": 1600, "scenes": 0}]
 
 
+@pytest.mark.slow
 def test_random_scenes_are_whole_and_step_evenly() -> None:
     found = random_scenes(3, 400, 0, frames=6)
     assert found["outcome"] == {"whole": 3}

@@ -159,6 +159,7 @@ def test_stream_answers_every_frame_and_says_what_it_cost() -> None:
     assert told[1].largest_px < 0.3
 
 
+@pytest.mark.slow
 def test_stream_drops_what_comes_too_fast() -> None:
     (pair,) = pairs(Recipe(size=64, pull=2.0, tool=0.0), 1, 3)
     # The last comes when every machine is done with the first.

@@ -73,6 +73,7 @@ def test_results_are_those_of_the_runs_beside_them() -> None:
     assert {name: tree[name] for name in again} == again
 
 
+@pytest.mark.slow
 def test_a_training_is_answered_from_what_was_kept_only_if_nothing_that_made_it_changed(
     clips: list[Clip], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

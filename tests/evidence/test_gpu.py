@@ -5,9 +5,12 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import pytest
+
 from evidence.gpu import run_steps
 
 
+@pytest.mark.slow
 def test_a_step_that_fails_or_hangs_does_not_stop_the_next(tmp_path: Path) -> None:
     steps = (
         ("fails", ("-c", "raise SystemExit(3)")),

@@ -60,6 +60,7 @@ def test_the_source_of_a_module_is_that_of_all_it_imports_of_ours(
     assert word(evidence__runs="from learn.train import RATE\nB = RATE") != here
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("module", ["learn.runs", "gap.runs", "end_to_end.pipelines"])
 def test_training_and_scoring_are_counted(module: str, monkeypatch: pytest.MonkeyPatch) -> None:
     counted: set[str] = set()

@@ -50,6 +50,7 @@ def rng() -> np.random.Generator:
     return np.random.default_rng(0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("patch", [0.0, 3.0])
 def test_noise_has_its_size_and_leaves_the_rest_frame(clips: list[Clip], patch: float) -> None:
     added = disturb.noisy(clips[0], 0.02, patch, GRID, rng()).displacement["ideal"]
@@ -189,6 +190,7 @@ def test_tables_give_back_what_runs_left(tmp_path: Path) -> None:
     assert np.isnan(run_table.column(both, "map_rmse_wide")).tolist() == [False, True]
 
 
+@pytest.mark.slow
 def test_a_run_is_answered_from_what_was_kept_only_if_nothing_that_made_it_changed(
     clips: list[Clip], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

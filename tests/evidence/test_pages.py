@@ -32,6 +32,7 @@ def texts(folder: Path) -> list[str]:
     return [(folder / name).read_text("utf-8") for name in names if (folder / name).is_file()]
 
 
+@pytest.mark.slow
 def test_pages_are_those_of_the_data() -> None:
     assert pages.stale(RESULTS) == []
 

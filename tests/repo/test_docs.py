@@ -93,6 +93,7 @@ def test_what_is_said_to_be_of_an_example_is(page: Path) -> None:
             assert text.strip() in (ROOT / title).read_text("utf-8"), f"{page.name} and {title} differ"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["README.md", "docs/tutorial.md"])
 def test_python_on_the_pages_runs(
     name: str, out: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
@@ -141,6 +142,7 @@ class _Links(HTMLParser):
                 (self.linked if tag == "a" else self.fetched).append(value)
 
 
+@pytest.mark.slow
 def test_equations_need_no_script(site: Path) -> None:
     science = (site / "science.html").read_text("utf-8")
     fences = len(list(blocks(DOCS / "science.md", "math")))
@@ -170,6 +172,7 @@ def test_pages_open_from_disk_and_every_link_leads_somewhere(site: Path) -> None
     assert not broken, "\n".join(broken)
 
 
+@pytest.mark.slow
 def test_a_broken_link_stops_the_build(tmp_path: Path) -> None:
     (tmp_path / "docs").mkdir()
     shutil.copy(DOCS / "equations.py", tmp_path / "docs")

@@ -119,6 +119,7 @@ def places(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     return build(tmp_path_factory.mktemp("json"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("line", [*QUICK, *(pytest.param(line, marks=pytest.mark.slow) for line in SLOW)])
 def test_no_key_went_missing(line: str, places: dict[str, Path]) -> None:
     kept = json.loads(RECORD.read_text("utf-8"))[line]

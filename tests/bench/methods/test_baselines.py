@@ -128,6 +128,7 @@ def across(known: compliance.Compliance) -> NDArray[np.float64]:
     return np.asarray((u * [1, -1, -1])[:, :2] + 0.1 * rng.normal(size=(len(known.points), 2)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solve", [inverse.tikhonov, inverse.tikhonov_near, inverse.one_contact])
 def test_force_across_the_view_with_another_mesh_and_noise(
     known: compliance.Compliance, across: NDArray[np.float64], solve: object
@@ -137,6 +138,7 @@ def test_force_across_the_view_with_another_mesh_and_noise(
     assert total[:2] == pytest.approx([30, -40], abs=6)
 
 
+@pytest.mark.slow
 def test_one_contact_finds_the_force_along_the_view(known: compliance.Compliance) -> None:
     forces, fields = inverse_experiment.contacts(known, 3, 3.0, 2500, np.random.default_rng(3))
     rng = np.random.default_rng(4)
@@ -146,6 +148,7 @@ def test_one_contact_finds_the_force_along_the_view(known: compliance.Compliance
         assert said == pytest.approx(force, abs=0.12 * np.linalg.norm(force) + 4)
 
 
+@pytest.mark.slow
 def test_corotational_contact_undoes_what_the_tissues_turn_looks_like(known: compliance.Compliance) -> None:
     forces, fields = inverse_experiment.contacts(
         known, 3, 3.0, 2000, np.random.default_rng(5), "corotational"
@@ -163,6 +166,7 @@ def test_corotational_contact_undoes_what_the_tissues_turn_looks_like(known: com
     assert turned < 0.6 * linear
 
 
+@pytest.mark.slow
 def test_loads_past_the_laws_range_stay_with_the_linear_answer(known: compliance.Compliance) -> None:
     _, fields = inverse_experiment.contacts(known, 1, 3.0, 2000, np.random.default_rng(6))
     said = corotational.one_contact(known, fields[0], np.ones(len(known.points)))

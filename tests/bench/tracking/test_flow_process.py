@@ -31,6 +31,7 @@ def elsewhere() -> Iterator[FlowProcess]:
         yield flow
 
 
+@pytest.mark.slow
 def test_the_same_flow_in_both_places(elsewhere: FlowProcess) -> None:
     rest, moved, free = pictures()
     found = []
@@ -46,6 +47,7 @@ def test_the_same_flow_in_both_places(elsewhere: FlowProcess) -> None:
     assert found[1][0].peak_bytes > 1e7
 
 
+@pytest.mark.slow
 def test_errors_of_the_flow_arrive_and_its_end_is_said(elsewhere: FlowProcess) -> None:
     rest, moved, free = pictures()
     with pytest.raises(UserError, match="no estimator"):
@@ -61,6 +63,7 @@ def test_errors_of_the_flow_arrive_and_its_end_is_said(elsewhere: FlowProcess) -
         elsewhere.ask(moved, free)()
 
 
+@pytest.mark.slow
 def test_it_does_not_outlive_a_killed_parent() -> None:
     script = (
         "import os, time; from bench.tracking.flow_process import FlowProcess; flow = FlowProcess();"

@@ -16,6 +16,7 @@ from synth.errors import UserError
 GRID = Grid(32)
 
 
+@pytest.mark.slow
 def test_force_density_times_cell_times_stiffness_is_the_force(clips: list[Clip]) -> None:
     for clip in clips:
         total = clip.density.sum((2, 3)) * GRID.pitch_mm**2 * clip.young_kpa

@@ -55,6 +55,7 @@ class Killed(Exception):
     pass
 
 
+@pytest.mark.slow
 def test_killed_and_resumed_equals_uninterrupted(
     clips: list[Clip], split: Split, model: Path, tmp_path: Path
 ) -> None:
@@ -201,6 +202,7 @@ def test_a_split_that_leaks_is_refused(clips: list[Clip], tmp_path: Path) -> Non
 ARGS = ["--preset", "tiny", "--size", "32", "--epochs", "1", "--json"]
 
 
+@pytest.mark.slow
 def test_command_line(dataset: Path, tmp_path: Path) -> None:
     out = tmp_path / "m"
     done = run(app, ["train", str(dataset), "-o", str(out), "--input", "recovered", *ARGS])

@@ -52,6 +52,7 @@ def test_former_names_lead_to_fields_and_are_none() -> None:
     assert not set(FORMER_NAMES) & set(FIELDS)
 
 
+@pytest.mark.slow
 def test_it_is_read_by_the_name_of_today_and_by_its_own(today: Path, older: Path) -> None:
     now, then = open_sequence(today / "000001.zarr"), open_sequence(older / "000001.zarr")
     assert "flow_tvl1" in zarr.open_group(str(then.path), mode="r")

@@ -42,6 +42,7 @@ def test_number_of_workers_and_order_do_not_matter(tmp_path: Path, undisturbed: 
     assert run(tmp_path / "other", job=other).content_hash != undisturbed
 
 
+@pytest.mark.slow
 def test_a_finished_dataset_has_its_index_film_and_job_and_is_left_alone(tmp_path: Path) -> None:
     first = run(tmp_path / "out")
     for name in ("index.parquet", "preview.mp4", "job.yaml", "dataset.json"):
@@ -232,6 +233,7 @@ def test_a_sequence_that_hangs_is_ended(tmp_path: Path) -> None:
     assert "reported nothing for 1 s" in run(tmp_path / "out", "hanging", job, stall_s=1.0).failed[0]
 
 
+@pytest.mark.slow
 def test_a_job_that_cannot_be_carried_out_leaves_nothing(tmp_path: Path) -> None:
     with pytest.raises(UserError, match=r"^no surface at the craniotomy$"):
         run(tmp_path / "out", "refused")

@@ -34,6 +34,7 @@ def gap(tets: Tets, height: HeightMap) -> float:
     return float(np.sqrt(np.mean((at[:, 2] - wanted) ** 2)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("order", "most"), [(1, 0.06), (2, 0.02)])
 def test_the_boundary_lies_on_the_relief(order: int, most: float) -> None:
     height = sulci(1.4, 10.0)

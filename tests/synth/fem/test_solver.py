@@ -63,6 +63,7 @@ def test_what_stands_out_of_the_mesh_rides_by_rotation() -> None:
     np.testing.assert_allclose(moved, above @ turn.T + (above - carry.arm) @ stretch.T, atol=1e-10)
 
 
+@pytest.mark.slow
 def test_a_load_on_what_stands_out_neither_grows_nor_diverges() -> None:
     vertices, faces = patch(121, 20.0)
     bumps = vertices.copy()

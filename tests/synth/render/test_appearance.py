@@ -58,6 +58,7 @@ def test_planar_maps_are_hardly_stretched(brain: Surface) -> None:
     assert np.sqrt((area * squared).sum() / area.sum()) < 1.05
 
 
+@pytest.mark.slow
 def test_a_photograph_is_the_albedo(brain: Surface, tmp_path: Path) -> None:
     picture = np.zeros((60, 90, 3), np.uint8)
     picture[:, :45], picture[:, 45:] = (30, 60, 200), (40, 180, 60)  # red left, green right, as BGR

@@ -19,6 +19,7 @@ SMALL = ["render.size=[64, 48]", "sequences=4", "anatomy.vertices=2500", "render
 _LARGE = 500  # operations: a kernel that traces light; the rest fill and copy arrays
 
 
+@pytest.mark.slow
 def test_scenes_share_their_kernels() -> None:
     if pick("auto") == "scalar_rgb":
         pytest.skip("no LLVM here, so nothing is compiled")

@@ -125,6 +125,7 @@ def test_without_llvm_the_scalar_variant_is_taken() -> None:
     assert done.stdout.strip() == "scalar_rgb"
 
 
+@pytest.mark.slow
 def test_a_moved_camera_and_weaker_light_are_in_picture_and_truth() -> None:
     ours, vertices = studio("scalar_rgb" if len(VARIANTS) == 1 else VARIANTS[1], spp=16, tool=False)
     pixel = ours.still.scale_mm_per_px
@@ -181,6 +182,7 @@ def test_truth_on_request() -> None:
     assert (first.rgb_right != first.rgb).any()
 
 
+@pytest.mark.slow
 def test_what_is_not_asked_for_is_not_made() -> None:
     ours, vertices = studio(VARIANTS[-1], spp=1)
     shot = ours.frame(vertices, TIPS, SHAFTS, 1)

@@ -58,6 +58,7 @@ def temporary(scratch: Path) -> Path:
     return scratch / f"sulcus-{os.getuid()}"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("home", [{}, {"HOME": "/dev/null"}, {"HOME": ""}], ids=["unset", "file", "empty"])
 def test_without_a_home_the_cache_is_temporary(package: Path, tmp_path: Path, home: dict[str, str]) -> None:
     # The home of the account, which is looked up where the variable is unset, is barred by this one.
@@ -67,12 +68,14 @@ def test_without_a_home_the_cache_is_temporary(package: Path, tmp_path: Path, ho
     assert temporary(tmp_path).stat().st_mode & 0o777 == 0o700
 
 
+@pytest.mark.slow
 def test_a_home_comes_before_that(package: Path, tmp_path: Path) -> None:
     left = run(package, tmp_path, XDG_CACHE_HOME=str(tmp_path / "cache"))
     assert left
     assert all(tmp_path / "cache" in path.parents for path in left)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("foreign", ["open", "link", "file"])
 def test_a_folder_that_others_may_write_is_not_used(package: Path, tmp_path: Path, foreign: str) -> None:
     if foreign == "file":
@@ -86,6 +89,7 @@ def test_a_folder_that_others_may_write_is_not_used(package: Path, tmp_path: Pat
     assert run(package, tmp_path, XDG_CACHE_HOME="/dev/null/cache") == []
 
 
+@pytest.mark.slow
 def test_the_cache_lies_beside_a_package_that_can_be_written(package: Path, tmp_path: Path) -> None:
     shutil.copytree(package, tmp_path / "own")
     for blocked in (tmp_path / "own").rglob("__pycache__"):

@@ -78,6 +78,7 @@ def found(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> search.Tuned:
     return search.tune_job(job, search.Budget(0.03), tmp_path / "part", 2, 1, lambda done, total, words: None)
 
 
+@pytest.mark.slow
 def test_a_promise_that_does_not_hold_is_given_up(found: search.Tuned) -> None:
     assert len(found.tried) > 1
     assert found.tried[0].error > 0.03  # the surprise
@@ -114,6 +115,7 @@ def test_a_job_within_the_budget_is_better_than_full_fidelity(
     assert tuned_job.changes(done) == []
 
 
+@pytest.mark.slow
 def test_what_turns_out_dearer_is_not_taken(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     measured = search.joint
 
@@ -129,6 +131,7 @@ def test_what_turns_out_dearer_is_not_taken(monkeypatch: pytest.MonkeyPatch, tmp
     assert done.best.cost <= done.own.cost
 
 
+@pytest.mark.slow
 def test_a_promise_that_is_more_than_kept_leads_to_a_cheaper_one(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
@@ -169,6 +172,7 @@ def test_a_sequence_that_breaks_a_promise_is_asked_which_knob_did_it(
     assert next(row.change for row in done.rows if row.level == "3") > 0.09
 
 
+@pytest.mark.slow
 def test_other_pictures_are_no_cheaper_ones(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     class Matte(Fake):
         def measure(self, job: Job, pictures: bool = True) -> Measured:
@@ -199,6 +203,7 @@ def test_nothing_but_full_fidelity_keeps_a_tiny_budget(
     assert (levels["tets"], levels["spp"], levels["size"]) == ("4000 P2", "8", "640 x 480")
 
 
+@pytest.mark.slow
 def test_the_written_job_is_the_persons_own(found: search.Tuned, tmp_path: Path) -> None:
     source, out = tmp_path / "job.yaml", tmp_path / "tuned.yaml"
     source.write_text("seed: 1  # mine\nfem:\n  gestures: [pull]  # only these\n")
