@@ -5,6 +5,7 @@ Needs the extra `cluster`. The dataset's folder must be on a file system that al
 
 from __future__ import annotations
 
+import os
 import threading
 import time
 from collections.abc import Iterator
@@ -13,15 +14,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from ruamel.yaml import YAML
-from ruamel.yaml.error import YAMLError
-
 from synth.dataset import provenance
 from synth.engine import slots
 from synth.engine.slots import LocalSlot, Slot, Slots
 from synth.engine.worker_process import Attempt, Setup
 from synth.errors import UserError
 from synth.job.schema import Job
+from synth.system import foreign_file, foreign_yaml
 from synth.system.stopwatch import Report
 
 _TOPIC = "sulcus-progress"
@@ -191,12 +190,10 @@ def slurm(described: dict[str, Any]) -> Any:
 
 def read_slurm(path: Path) -> dict[str, Any]:
     """`jobs` and the arguments of dask_jobqueue.SLURMCluster. UserError for a file that does not say so."""
-    try:
-        found = YAML(typ="safe").load(path.read_text("utf-8"))
-    except FileNotFoundError:
-        raise UserError(f"{path}: is neither local, dask://host:port nor a file") from None
-    except (OSError, YAMLError) as error:
-        raise UserError(f"{path}: cannot be read ({error})") from error
+    if not os.path.lexists(path):
+        raise UserError(f"{path}: is neither local, dask://host:port nor a file")
+    text = foreign_file.read_text(path, foreign_yaml.LARGEST_BYTES)
+    found = foreign_yaml.plain(foreign_yaml.load(text, str(path)), str(path))
     if not isinstance(found, dict) or not isinstance(found.get("jobs"), int) or found["jobs"] < 1:
         raise UserError(f"{path}: must say how many `jobs` to ask for")
     missing = {"cores", "memory"} - found.keys()
