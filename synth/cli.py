@@ -357,6 +357,7 @@ def view(
     from synth.dataset.store import Dataset, open_sequence
     from synth.publish.rerun_view import save_recording, show_sequences
 
+    _end_on_terminate()
     chosen = [open_sequence(location.store(out, k)) for k in sequence] if sequence else [Dataset(out)[0]]
     if save is None:
         show_sequences(chosen, web=web)

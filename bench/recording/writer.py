@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from ruamel.yaml import YAML
 
+from synth.errors import UserError
 from synth.system.whole_file import folder_of as write_whole_folder
 
 __all__ = ["write_force", "write_frames", "write_meta", "write_tip", "write_video", "write_whole_folder"]
@@ -60,6 +61,8 @@ def write_video(path: Path, pictures: Iterator[NDArray[np.uint8]], times_s: Floa
             even = rgb[: rgb.shape[0] // 2 * 2, : rgb.shape[1] // 2 * 2]
             if k == 0:
                 stream.height, stream.width = even.shape[:2]
+            if even.shape[:2] != (stream.height, stream.width) or not even.size:
+                raise UserError(f"{path}: frame {k} of {rgb.shape[1]} x {rgb.shape[0]} px doesn't fit")
             frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(even), format="rgb24")
             frame.pts = round(float(time - times_s[0]) * 90_000)
             frame.time_base = Fraction(1, 90_000)

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import difflib
 import os
+import re
 import reprlib
 import typing
 from collections.abc import Iterable, Iterator, Sequence
 from importlib import resources
-from itertools import islice
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -127,8 +127,12 @@ def _given(given: dict[Loc, str], at: Loc) -> str:
 
 def _mistakes(error: ValidationError, model: type[BaseModel]) -> Iterator[tuple[Loc, bool, str]]:
     """Where each mistake is, whether it is a key that is not known, and what to say of it."""
-    for one in islice(error.errors(include_url=False), _MOST_MISTAKES):
+    found = error.errors(include_url=False)
+    inside = {_trim(one["loc"])[:-1] for one in found[:_MOST_MISTAKES]}
+    for one in found[:_MOST_MISTAKES]:
         at = _trim(one["loc"])
+        if one["type"] == "too_short" and at in inside:  # only right items count: the wrong ones are named
+            continue
         yield at, one["type"] == "extra_forbidden", f"{_dotted(at)}{_message(one, at, model)}"
 
 
@@ -198,7 +202,8 @@ def _place(
 
 def _trim(loc: Loc) -> Loc:
     """The place without the names that pydantic adds for validators and unions."""
-    return tuple(step for step in loc if isinstance(step, int) or "[" not in step)
+    kept = tuple(step for step in loc if isinstance(step, int) or not re.fullmatch(r"[\w-]+\[.*\]", step))
+    return kept or loc  # a key may look so too
 
 
 def _dotted(at: Loc) -> str:
@@ -227,7 +232,11 @@ def _message(error: Any, at: Loc, model: type[BaseModel]) -> str:
         return f"{_short(error['input'])} is out of range, it must be {limits[kind]} {limit:g}"
     if kind == "missing" and isinstance(at[-1], str):
         return "is missing"
-    if kind in ("missing", "too_short", "too_long"):
+    if kind in ("too_short", "too_long"):
+        least = context.get("min_length")
+        bound = f"at most {context.get('max_length')}" if least is None else f"at least {least}"
+        return f"the list has the wrong length, it needs {bound}"
+    if kind == "missing":
         return f"the list has the wrong length ({error['msg'].lower()})"
     return f"{_KINDS.get(kind, error['msg'])}, not {_short(error['input'])}"
 
