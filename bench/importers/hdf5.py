@@ -88,7 +88,7 @@ def read_source(source: Path, use: dict[str, str]) -> Intake:
 
 
 def _refuse_odd(source: Path, role: str, array: Any) -> None:
-    """UserError for an array that is elsewhere, holds no numbers, or is too long, looked at before it is read."""
+    """UserError for an array that is elsewhere, holds no numbers or is too long; nothing of it is read."""
     name, numbers = array.name, array.dtype.kind in "fiu"
     if array.external or array.is_virtual:
         raise UserError(f"{source}: {name} lies in other files, which are not opened; write it into this one")

@@ -15,6 +15,7 @@ LARGEST_JSON = 64 << 20
 """Bytes of a JSON file that is read."""
 LARGEST_PICTURE = 512 << 20
 """Bytes of a still; its pixels are limited too (`synth.system.foreign_picture`)."""
+_LONG = 500
 
 
 def check_file(path: Path, largest: int) -> None:
@@ -32,24 +33,25 @@ def open_file(path: Path, largest: int) -> BufferedReader:
     Raises:
         UserError: there is none, it is a folder, pipe or device, it is larger, or may not be read.
     """
+    name = str(path) if len(str(path)) < _LONG else f"{str(path)[:_LONG]}..."
     try:
         # Opening a pipe would wait for its other end.
-        file = os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb")
+        number = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     except FileNotFoundError:
-        raise UserError(f"{path}: no such file") from None
-    except IsADirectoryError:
-        raise UserError(f"{path}: is a folder, a file is needed") from None
+        raise UserError(f"{name}: no such file") from None
     except OSError as error:
-        raise UserError(f"{path}: cannot be read ({error.strerror})") from None
+        raise UserError(f"{name}: cannot be read ({error.strerror})") from None
     except ValueError:
-        raise UserError(f"{str(path)!r}: is no name of a file") from None
-    about = os.fstat(file.fileno())
+        raise UserError(f"{name!r}: is no name of a file") from None
+    about = os.fstat(number)
     if stat.S_ISREG(about.st_mode) and about.st_size <= largest:
-        return file
-    file.close()
+        return os.fdopen(number, "rb")
+    os.close(number)
     if stat.S_ISREG(about.st_mode):
-        raise UserError(f"{path}: {_amount(about.st_size)} is too large, at most {_amount(largest)} are read")
-    raise UserError(f"{path}: is no regular file (a pipe or device?)")
+        raise UserError(f"{name}: {_amount(about.st_size)} is too large, at most {_amount(largest)} are read")
+    if stat.S_ISDIR(about.st_mode):
+        raise UserError(f"{name}: is a folder, a file is needed")
+    raise UserError(f"{name}: is no regular file (a pipe or device?)")
 
 
 def read_bytes(path: Path, largest: int) -> bytes:

@@ -5,6 +5,7 @@ An alias stands for all that its anchor names, so a kilobyte can say a billion v
 
 from __future__ import annotations
 
+import warnings
 from typing import Any
 
 from ruamel.yaml import YAML
@@ -32,8 +33,10 @@ def load(text: str, label: str) -> Any:
     if len(text) > LARGEST_BYTES:
         raise UserError(f"{label}: {len(text)} characters are too many, at most {LARGEST_BYTES} are read")
     try:
-        _refuse_too_much(text, label)
-        return YAML(typ="rt").load(text)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of anchors used again, which YAML allows
+            _refuse_too_much(text, label)
+            return YAML(typ="rt").load(text)
     except UserError:
         raise
     except MarkedYAMLError as error:
