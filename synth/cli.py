@@ -103,7 +103,10 @@ def render(
         int | None, typer.Option(min=1, help="Processes at a time; one a core if not given.")
     ] = None,
     engine: Annotated[
-        str, typer.Option(help="local, dask://host:port, or a YAML file that describes a SLURM cluster.")
+        str,
+        typer.Option(
+            help="local, dask://host:port, tls://host:port, or a YAML file that describes a SLURM cluster."
+        ),
     ] = "local",
     gpus: Annotated[
         str, typer.Option(help="GPUs that workers take in turn: auto, none, or numbers as 0,1.")

@@ -33,7 +33,7 @@ class Options:
     """How to run; none of it changes a byte of the dataset."""
 
     engine: str = "local"
-    """`local`, `dask://host:port`, or a YAML file that describes a SLURM cluster."""
+    """`local`, `dask://host:port`, `tls://host:port`, or a YAML file that describes a SLURM cluster."""
     workers: int | None = None
     """Processes at a time; default one a core."""
     gpus: str = "auto"

@@ -290,7 +290,7 @@ SOURCES: dict[str, tuple[str, Spoil, str]] = {
     "times in nanoseconds": ("a.h5", instead("time", data=np.arange(4) * 1e8 + 1e9), "look like nanoseconds"),
     "times in milliseconds": ("a.h5", instead("time", data=np.arange(4) * 40.0), "look like milliseconds"),
     "times of an epoch in nanoseconds": ("a.h5", instead("time", data=1.7e18 + np.arange(4)), "in seconds?"),
-    "a time that is none": ("a.h5", instead("time", data=[0, 0.1, np.nan, 0.3]), "the time of frame 2 is nan"),
+    "a time that is none": ("a.h5", instead("time", data=[0, 0.1, np.nan, 0.3]), "time of frame 2 is nan"),
     "one pixel": ("a.h5", pixels(1, 1), "1 x 1 pixels"),
     "no pixel": ("a.h5", instead("frames", shape=(4, 0, 0, 3), dtype="u1"), "frames of shape"),
     "gigapixels": (
