@@ -156,8 +156,8 @@ def claim(root: Path, job: Job, *, mix_versions: bool = False) -> Iterator[Folde
     name = identity.identify_job(job)
     try:
         _refuse_foreign(folder, job, name)
-        makers = _makers(folder, mix_versions)
         _refuse_links(folder)
+        makers = _makers(folder, mix_versions)
         folder.state.mkdir(parents=True, exist_ok=True)
         with _locked(folder.state / "lock") as folder.lock_fd:
             _refuse_foreign(folder, job, name)

@@ -30,7 +30,7 @@ def read_picture(path: Path, flags: int = cv2.IMREAD_COLOR) -> NDArray[np.generi
 
 
 def decode_picture(data: bytes, flags: int = cv2.IMREAD_COLOR) -> NDArray[np.generic]:
-    """The same from the bytes of a file. ValueError for what is none, or too large."""
+    """The same (H, W, 3) from the bytes of a file. ValueError for what is none, or too large."""
     width, height = _stated_size(data)
     refuse_large(width, height)
     try:

@@ -7,8 +7,10 @@ import shutil
 import struct
 import zlib
 from collections.abc import Callable, Iterator
+from fractions import Fraction
 from pathlib import Path
 
+import av
 import hostile
 import numpy as np
 import pytest
@@ -21,7 +23,9 @@ Spoil = Callable[[Path], None]
 
 @pytest.fixture(scope="module")
 def guard() -> Iterator[hostile.Guard]:
-    with hostile.Guard("h5py", "SimpleITK", "rosbags.highlevel", "bench.importers.registry") as one:
+    with hostile.Guard(
+        "h5py", "SimpleITK", "rosbags.highlevel", "bench.importers.registry", "bench.scoring.commands"
+    ) as one:
         yield one
 
 
@@ -179,6 +183,19 @@ def meta(line: str) -> Spoil:
     return lambda folder: (folder / "meta.yaml").write_text(f"scale_mm_per_px: 0.2\n{line}\n") and None
 
 
+def gigapixels(folder: Path) -> None:
+    """A video of a megabyte whose frame, a PNG, is 32,000 pixels square; the container says 32."""
+    shutil.rmtree(folder / "frames")
+    with av.open(str(folder / "video.mov"), "w") as container:
+        stream = container.add_stream("png", rate=1)
+        stream.width = stream.height = 32
+        stream.pix_fmt = "rgb24"
+        packet = av.Packet(png(32_000, 32_000))
+        packet.stream, packet.pts, packet.dts, packet.is_keyframe = stream, 0, 0, True
+        packet.time_base = Fraction(1)
+        container.mux(packet)
+
+
 PLAYLIST = b"#EXTM3U\n#EXT-X-TARGETDURATION:1\n#EXTINF:1,\n/etc/passwd\n#EXT-X-ENDLIST\n"
 RECORDINGS: dict[str, tuple[Spoil, str]] = {
     "frame is a pipe": (pipe("frames/0000.png"), "no regular file"),
@@ -188,6 +205,7 @@ RECORDINGS: dict[str, tuple[Spoil, str]] = {
     "video is a pipe": (video(None), "no regular file"),
     "video is a playlist": (video(PLAYLIST), "not a readable video"),
     "video is a list of files": (video(b"ffconcat version 1.0\nfile /etc/passwd\n"), "not a readable video"),
+    "video of a gigapixel": (gigapixels, "not a readable video"),
     "meta is a pipe": (pipe("meta.yaml"), "no regular file"),
     "meta is a bomb": (meta(ALIASES), "stands for more than"),
     "meta is deep": (meta("specimen: " + "[" * 90_000), "nested deeper"),
