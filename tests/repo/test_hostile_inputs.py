@@ -16,6 +16,9 @@ import numpy as np
 import pytest
 from fake_recording import Maker
 
+from learn.inference.video import read_video
+from synth.publish import preview_video
+
 h5py = pytest.importorskip("h5py", reason="h5py is not installed")
 
 Spoil = Callable[[Path], None]
@@ -254,10 +257,26 @@ def test_one_wrong_time_does_not_take_the_others(guard: hostile.Guard, sound: Pa
     assert "1 rows whose time stands still or runs back left out" in answer.out
 
 
+def test_names_of_files_do_not_steer_a_terminal(guard: hostile.Guard, sound: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "rec"
+    shutil.copytree(sound, folder)
+    (folder / "frames" / "\x1b[31m.png").write_bytes(b"none")
+    answer = guard.answer("bench", "check", folder)
+    assert "\\x1b[31m.png: not a readable picture" in answer.out
+    assert "\x1b" not in answer.out
+
+
 def test_paths_may_hold_a_colon(guard: hostile.Guard, tmp_path: Path) -> None:
     folder = Maker(tmp_path)("tcp:rec", frames=3, size=(24, 32), footage="mp4")
     answer = guard.answer("bench", "check", folder.name, cwd=tmp_path)
     assert "3 of 32 x 24 px" in answer.out
+
+
+def test_a_video_is_written_below_a_colon(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "tcp:out").mkdir()
+    monkeypatch.chdir(tmp_path)
+    made = preview_video.encode_video(Path("tcp:out/a.mp4"), np.zeros((2, 16, 16, 3), np.uint8), 25.0)
+    assert [picture.rgb.shape for picture in read_video(made)] == [(16, 16, 3)] * 2
 
 
 # ---- Sources to import.
