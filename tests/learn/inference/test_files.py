@@ -148,7 +148,7 @@ def test_films_that_are_none(tmp_path: Path) -> None:
         ("torn.mp4", None, "not a readable video"),
         ("film.mp4", "small.png", "4 x 4, the video is 64 x 48"),
         ("film.mp4", "black.png", "marks no tissue"),
-        ("film.mp4", "missing.png", "not a readable picture"),
+        ("film.mp4", "missing.png", "no such file"),
     ):
         with pytest.raises(UserError, match=message):
             next(motions(tmp_path / name, "recovered", Filmed(0.1, tmp_path / mask if mask else None)))
