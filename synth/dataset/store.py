@@ -178,7 +178,8 @@ class _Column:
             shards=shard,
             filters=None,
             compressors=[
-                BloscCodec(cname="zstd", clevel=3, shuffle="shuffle", typesize=dtype.itemsize),
+                # A ninth of the time of zstd at level 3, and half of it in reading, for 8% more bytes.
+                BloscCodec(cname="lz4", clevel=5, shuffle="shuffle", typesize=dtype.itemsize),
                 Crc32cCodec(),
             ],
             dimension_names=field.dims,
