@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal, cast, get_args
 
+from pydantic import FiniteFloat, TypeAdapter, ValidationError
+
 from synth.dataset.folder import write_whole
 from synth.errors import UserError
+from synth.system import foreign_file
 
 By = Literal["anatomy", "family", "gesture", "stiffness", "sequence"]
 """What must not be shared between the sides; `stiffness` splits at quantiles of Young's modulus."""
@@ -25,7 +29,7 @@ class Rule:
     """How a dataset is split; kept beside it, so that one that grows is split as before."""
 
     by: By = "anatomy"
-    shares: tuple[float, float, float] = (0.7, 0.15, 0.15)
+    shares: tuple[FiniteFloat, FiniteFloat, FiniteFloat] = (0.7, 0.15, 0.15)
     held_out: tuple[str, ...] = ()
     share_anatomy: bool = False
     """Whether one brain may be on several sides: scores then say nothing of other brains."""
@@ -38,18 +42,15 @@ def is_written(root: Path) -> bool:
 
 def read_rule(root: Path) -> Rule:
     """The rule of the dataset in `root`; the default if none was given."""
-    try:
-        found = json.loads((root / _NAME).read_text("utf-8"))
-        return Rule(
-            found["by"],
-            tuple(found["shares"]),
-            tuple(found["held_out"]),
-            bool(found.get("share_anatomy", False)),
-        )
-    except FileNotFoundError:
+    if not os.path.lexists(root / _NAME):
         return Rule()
-    except (ValueError, KeyError, TypeError) as error:
-        raise UserError(f"{root / _NAME}: is damaged ({error})") from error
+    found = foreign_file.read_json(root / _NAME)
+    try:
+        return TypeAdapter(Rule).validate_python(found)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        where = ".".join(map(str, first["loc"])) or "all of it"
+        raise UserError(f"{root / _NAME}: is damaged ({where}: {first['msg']})") from None
 
 
 def keep_rule(root: Path, chosen: Rule) -> None:

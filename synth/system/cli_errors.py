@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import sys
 from typing import Any
@@ -11,6 +12,17 @@ from typer.core import TyperGroup
 
 from synth.errors import UserError
 
+# What the state of the machine is to blame for, and no mistake of the program.
+_MACHINE = {
+    errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOTDIR,
+    errno.EISDIR, errno.EEXIST, errno.ENAMETOOLONG, errno.ELOOP, errno.EMFILE, errno.ENFILE,
+}  # fmt: skip
+
+
+def printable(text: str) -> str:
+    """A message with control characters spelt out: what a file is called must not steer a terminal."""
+    return "".join(c if c.isprintable() or c == "\n" else repr(c)[1:-1] for c in text)
+
 
 class Commands(TyperGroup):
     """A typer group (`typer.Typer(cls=Commands)`) that turns UserError into its line and exit code 2."""
@@ -19,7 +31,7 @@ class Commands(TyperGroup):
         try:
             return super().invoke(ctx)
         except UserError as error:
-            typer.echo(f"error: {error}", err=True)
+            typer.echo(f"error: {printable(str(error))}", err=True)
             raise typer.Exit(2) from None
         except KeyboardInterrupt:
             typer.echo("stopped", err=True)
@@ -28,3 +40,12 @@ class Commands(TyperGroup):
             # The reader has gone (`| head`): what is still buffered must not raise again at exit.
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             raise typer.Exit(0) from None
+        except OSError as error:
+            if error.errno not in _MACHINE:
+                raise
+            where = f"{error.filename}: " if error.filename is not None else ""
+            typer.echo(f"error: {printable(where)}{error.strerror}", err=True)
+            raise typer.Exit(2) from None
+        except MemoryError:
+            typer.echo("error: the memory of this machine is not enough for that", err=True)
+            raise typer.Exit(2) from None
