@@ -14,6 +14,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from pydantic import BaseModel, ConfigDict, ValidationError
+
 from synth.dataset import location, provenance
 from synth.errors import UserError
 from synth.job import identity, writer
@@ -22,6 +24,24 @@ from synth.job.schema import Job
 _LOCK_WAIT_S = 5.0
 _NAME = "dataset.json"
 _STATE = ".run"
+
+
+class _Begun(BaseModel):
+    """The job there; all else of it is for `Job` to check."""
+
+    model_config = ConfigDict(extra="allow", strict=True)
+
+    sequences: int
+
+
+class _Described(BaseModel):
+    """What dataset.json holds."""
+
+    model_config = ConfigDict(extra="allow", strict=True)
+
+    identity: str
+    job: _Begun
+    generators: list[dict[str, str]] = []
 
 
 class Folder:
@@ -39,34 +59,37 @@ class Folder:
     def described(self) -> dict[str, Any]:
         """`{"identity", "generators", "job"}` as first written. UserError if this is no dataset of ours."""
         try:
-            found = json.loads((self.root / _NAME).read_text("utf-8"))
-            if not {"identity", "job"} <= found.keys():
-                raise ValueError("keys are missing")
+            found = _Described.model_validate_json((self.root / _NAME).read_bytes())
         except FileNotFoundError:
             raise UserError(f"{self.root}: holds no dataset ({_NAME} is missing)") from None
-        except (OSError, ValueError, AttributeError) as error:
+        except ValidationError as error:
+            raise UserError(f"{self.root / _NAME}: is damaged ({_first(error)})") from None
+        except OSError as error:
             raise UserError(f"{self.root / _NAME}: is damaged ({error})") from error
-        return dict(found)
+        return found.model_dump()
 
     def job(self) -> Job:
         """The dataset's job."""
         try:
             return Job.model_validate(self.described()["job"])
-        except ValueError as error:
-            raise UserError(f"{self.root / _NAME}: is damaged or of another version ({error})") from error
+        except ValidationError as error:
+            why = _first(error)
+            raise UserError(f"{self.root / _NAME}: is damaged or of another version ({why})") from error
 
     def sealed(self) -> list[int]:
         """Indices of the finished sequences, in order."""
         with os.scandir(self.root) as entries:
             names = [entry.name for entry in entries if entry.name.endswith(".zarr")]
-        return sorted(int(name[:-5]) for name in names if name[:-5].isdigit())
+        return sorted(int(name[:-5]) for name in names if name.isascii() and name[:-5].isdigit())
 
     def failures(self) -> dict[int, dict[str, Any]]:
         """`{index: {"reason", "kind", "tries", "log"}}` of the sequences given up."""
         found = {}
         for path in sorted((self.state / "failed").glob("*.json")):
             with contextlib.suppress(ValueError):  # cut short by a power failure: it is tried again
-                found[int(path.stem)] = json.loads(path.read_text("utf-8"))
+                record = json.loads(path.read_text("utf-8"))
+                if isinstance(record, dict) and isinstance(record.get("reason"), str):
+                    found[int(path.stem)] = record
         return found
 
     def mark_failed(self, index: int, *, kind: str, reason: str, tries: int, log: str) -> None:
@@ -98,7 +121,7 @@ class Folder:
         for abandoned in self.scratch.glob("*"):
             shutil.rmtree(abandoned)
         for radiance in self.root.glob("radiance/[0-9]*"):
-            if radiance.name.isdigit():
+            if radiance.name.isascii() and radiance.name.isdigit():
                 self.sweep(int(radiance.name))
 
     def pass_turn(self) -> None:
@@ -138,6 +161,7 @@ def claim(root: Path, job: Job, *, mix_versions: bool = False) -> Iterator[Folde
     name = identity.identify_job(job)
     try:
         _refuse_foreign(folder, job, name)
+        _refuse_links(folder)
         makers = _makers(folder, mix_versions)
         folder.state.mkdir(parents=True, exist_ok=True)
         with _locked(folder.state / "lock") as folder.lock_fd:
@@ -178,6 +202,11 @@ def write_whole(path: Path, text: str | bytes, *, durable: bool = True) -> None:
     part.rename(path)
 
 
+def _first(error: ValidationError) -> str:
+    first = error.errors(include_input=False, include_url=False)[0]
+    return f"{'.'.join(map(str, first['loc'])) or 'all of it'}: {first['msg']}"[:300]
+
+
 def _refuse_foreign(folder: Folder, job: Job, name: str) -> None:
     root = folder.root
     if not root.exists():
@@ -196,9 +225,17 @@ def _refuse_foreign(folder: Folder, job: Job, name: str) -> None:
         changes = _changes(described["job"], job.model_dump(mode="json"))
         what = ", ".join(changes[:4]) or "another mesh or photograph"
         raise UserError(f"{root}: holds the dataset of another job ({what}), choose another folder")
-    before = int(described["job"]["sequences"])
+    before: int = described["job"]["sequences"]
     if before > job.sequences:
         raise UserError(f"{root}: holds {before} sequences of this job, {job.sequences} are asked for")
+
+
+def _refuse_links(folder: Folder) -> None:
+    """UserError for a link where a run writes or removes: in a folder from others it may lead anywhere."""
+    own = (folder.state, *folder.state.glob("*"), *folder.state.glob("*/*"), folder.root / "radiance")
+    for path in (*own, *folder.root.glob("radiance/*"), *folder.root.glob("*.zarr.part")):
+        if path.is_symlink():
+            raise UserError(f"{path}: is a link, which no run leaves; remove it")
 
 
 def _makers(folder: Folder, mix: bool) -> list[dict[str, str]]:

@@ -61,7 +61,7 @@ def stores(where: str) -> list[str]:
     found = []
     for entry in fs.ls(base, detail=False):
         name = str(entry).rstrip("/").rsplit("/", 1)[-1]
-        if name.endswith(".zarr") and name[:-5].isdigit():
+        if name.endswith(".zarr") and name.isascii() and name[:-5].isdigit():
             first, chained, rest = where.partition("::")
             slash = "" if first.endswith("/") else "/"
             found.append(f"{first}{slash}{name}{chained}{rest}")

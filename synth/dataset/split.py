@@ -9,6 +9,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal, cast, get_args
 
+from pydantic import ConfigDict, TypeAdapter, ValidationError
+
 from synth.dataset.folder import write_whole
 from synth.errors import UserError
 
@@ -17,12 +19,15 @@ By = Literal["anatomy", "family", "gesture", "stiffness", "sequence"]
 
 SIDES = ("train", "validation", "test")
 _CLASSES = 10
-_NAME = "split.json"
+_LARGEST_BYTES = 1_000_000
+NAME = "split.json"
 
 
 @dataclass(frozen=True)
 class Rule:
     """How a dataset is split; kept beside it, so that one that grows is split as before."""
+
+    __pydantic_config__ = ConfigDict(extra="forbid", allow_inf_nan=False)
 
     by: By = "anatomy"
     shares: tuple[float, float, float] = (0.7, 0.15, 0.15)
@@ -31,30 +36,34 @@ class Rule:
     """Whether one brain may be on several sides: scores then say nothing of other brains."""
 
 
+_RULE = TypeAdapter(Rule)
+
+
 def is_written(root: Path) -> bool:
     """Whether the dataset in `root` was given a rule of its own (`synth split`)."""
-    return (root / _NAME).exists()
+    return (root / NAME).exists()
 
 
 def read_rule(root: Path) -> Rule:
-    """The rule of the dataset in `root`; the default if none was given."""
-    try:
-        found = json.loads((root / _NAME).read_text("utf-8"))
-        return Rule(
-            found["by"],
-            tuple(found["shares"]),
-            tuple(found["held_out"]),
-            bool(found.get("share_anatomy", False)),
-        )
-    except FileNotFoundError:
+    """The rule of the dataset in `root`; the default if none was given. UserError for what is none."""
+    file = root / NAME
+    if not is_written(root):
         return Rule()
-    except (ValueError, KeyError, TypeError) as error:
-        raise UserError(f"{root / _NAME}: is damaged ({error})") from error
+    try:
+        if not file.is_file() or file.stat().st_size > _LARGEST_BYTES:
+            raise UserError(f"{file}: is not a small regular file")
+        return _RULE.validate_json(file.read_bytes(), strict=True)
+    except ValidationError as error:
+        first = error.errors(include_input=False, include_url=False)[0]
+        at = ".".join(map(str, first["loc"])) or "it"
+        raise UserError(f"{file}: is damaged ({at}: {first['msg']})") from None
+    except OSError as error:
+        raise UserError(f"{file}: cannot be read ({error.strerror})") from error
 
 
 def keep_rule(root: Path, chosen: Rule) -> None:
     """Makes `chosen` the rule of the dataset in `root`."""
-    write_whole(root / _NAME, json.dumps(asdict(chosen), indent=1) + "\n")
+    write_whole(root / NAME, json.dumps(asdict(chosen), indent=1) + "\n")
 
 
 def parse_rule(by: str, shares: str, held_out: Sequence[str], share_anatomy: bool = False) -> Rule:
@@ -90,6 +99,8 @@ def assign_sides(rows: Sequence[Mapping[str, Any]], chosen: Rule) -> list[str | 
     strangers = set(held_out) - {str(row["family"]) for row in done}
     if strangers:
         raise UserError(f"family {', '.join(sorted(strangers))}: no sequence has it")
+    if by == "stiffness" and any(row["young_kpa"] is None for row in done):
+        raise UserError("by stiffness: a sequence says nothing of its Young's modulus")
     group = _groups(done, by, chosen.share_anatomy)
     sealed = {group[row["index"]] for row in done if row["family"] in held_out}
     sizes: dict[str, int] = {}
