@@ -77,6 +77,7 @@ def train_command(
     json: Json = False,
 ) -> None:
     """Train D2FNet on a dataset. An interrupted run is continued by the same command."""
+    from learn.checkpoint import refuse_if_no_room
     from learn.settings import override
     from learn.settings import preset as named
     from learn.training.threads import set_threads
@@ -100,6 +101,7 @@ def train_command(
     }
     given = [f"{k}={v}" for k, v in options.items() if v is not None]
     settings = override(named(preset), [*given, *(changes or [])])
+    refuse_if_no_room(out, settings.arch)
     clips, split, settings = _divided(dataset, settings, named(preset), cache, fixed=folds is not None)
     card, first = _train(clips, split, settings, out, accelerator, devices, quiet=json)
     if not first:

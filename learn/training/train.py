@@ -77,8 +77,8 @@ def train(
             if write is not None:
                 write(epoch, numbers)
                 if improved:
-                    checkpoint.save_tensors(out / "weights.pt", _cpu(run.model.state_dict()))
-                    checkpoint.write_card(out, dataclasses.replace(card, epoch=run.epoch, score=run.best))
+                    best = dataclasses.replace(card, epoch=run.epoch, score=run.best)
+                    checkpoint.write_model(out, best, _cpu(run.model.state_dict()))
                 checkpoint.save_tensors(out / "last.pt", run.as_dict())
             fabric.barrier()
             log(numbers)
@@ -128,10 +128,14 @@ def _start(settings: Settings, state: dict[str, Any] | None) -> _Run:
     plateau = ReduceLROnPlateau(optimizer, mode="max", factor=0.5, patience=settings.patience)
     run = _Run(model, optimizer, plateau)
     if state is not None:
-        model.load_state_dict(state["model"])
-        optimizer.load_state_dict(state["optimizer"])
-        plateau.load_state_dict(state["plateau"])
-        run.epoch, run.best, run.waited = state["epoch"], state["best"], state["waited"]
+        try:
+            model.load_state_dict(state["model"])
+            optimizer.load_state_dict(state["optimizer"])
+            plateau.load_state_dict(state["plateau"])
+            run.epoch, run.best, run.waited = int(state["epoch"]), float(state["best"]), int(state["waited"])
+        except (RuntimeError, ValueError, KeyError, TypeError, AttributeError) as error:
+            why = (str(error).splitlines() or ["of another kind"])[0]
+            raise UserError(f"last.pt: corrupt checkpoint ({why[:200]})") from None
     return run
 
 
@@ -252,7 +256,8 @@ def _provenance(clips: Sequence[Clip], split: Split) -> tuple[dict[str, list[str
 
 def _open(out: Path, card: Card) -> dict[str, Any] | None:
     """The state to go on from, or None for a fresh start in a fresh folder."""
-    if not out.exists() or (out.is_dir() and not any(out.iterdir())):
+    # What a kill left of a first card has a hidden name.
+    if not out.exists() or (out.is_dir() and all(one.name.startswith(".") for one in out.iterdir())):
         checkpoint.write_card(out, card)
         return None
     there = checkpoint.read_card(out)

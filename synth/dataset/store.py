@@ -314,6 +314,11 @@ class Sequence:
         except (ValueError, RecursionError):  # a number that is none, where nobody looks; or without end
             return False
 
+    def read_whole(self, name: str) -> NDArray[Any]:
+        """A field without frames, as `read_sealed`."""
+        (values,) = self.read_sealed(name)
+        return values
+
     def read_sealed(self, name: str) -> Iterator[NDArray[Any]]:
         """A field frame by frame, in order; one without frames whole, at once.
 

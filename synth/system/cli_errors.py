@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import sys
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import typer
 from typer.core import TyperGroup
 
-from synth.errors import UserError
+from synth.errors import Caution, UserError
+
+# What a full or closed disk says, wherever a command meets it.
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
 
 
 class Commands(TyperGroup):
@@ -17,7 +24,8 @@ class Commands(TyperGroup):
 
     def invoke(self, ctx: Any) -> Any:
         try:
-            return super().invoke(ctx)
+            with _cautions():
+                return super().invoke(ctx)
         except UserError as error:
             typer.echo(f"error: {error}", err=True)
             raise typer.Exit(2) from None
@@ -28,3 +36,24 @@ class Commands(TyperGroup):
             # The reader has gone (`| head`): what is still buffered must not raise again at exit.
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             raise typer.Exit(0) from None
+        except OSError as error:
+            if error.errno not in _FULL:
+                raise
+            typer.echo(f"error: {error.filename or 'the disk'}: {error.strerror}", err=True)
+            raise typer.Exit(2) from None
+
+
+@contextmanager
+def _cautions() -> Iterator[None]:
+    """Shows a `Caution` as a line; other warnings as ever."""
+    with warnings.catch_warnings():
+        show = warnings.showwarning
+
+        def say(message: Warning | str, category: type[Warning], *where: Any, **more: Any) -> None:
+            if issubclass(category, Caution):
+                typer.echo(f"note: {message}", err=True)
+            else:
+                show(message, category, *where, **more)
+
+        warnings.showwarning = say
+        yield
