@@ -409,6 +409,7 @@ def _bar(what: str) -> Iterator[Callable[[int, int], None]]:
         TimeRemainingColumn(),
         console=_console,
         transient=True,
+        disable=not _console.is_terminal,  # in a log a bar is an empty line
     ) as progress:
         task = progress.add_task(what, total=None)
         yield lambda done, of: progress.update(task, completed=done, total=of)

@@ -13,14 +13,14 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, ValidationError
 
 from learn.data.grid import Grid, Resampler, centre, settled
 from synth.dataset.split import name_anatomy
 from synth.dataset.store import Dataset, Sequence
 from synth.errors import UserError
 from synth.job import identity
-from synth.job.types import Positive
+from synth.job.types import Positive, first_problem
 
 Input = Literal["ideal", "recovered", "noisy", "mixed"]
 INPUTS = ("ideal", "recovered", "noisy", "mixed")
@@ -226,9 +226,11 @@ def unpack(folder: Path) -> Clip:
         if found != expected:
             raise ValueError("arrays of other shapes")
         return clip
+    except ValidationError as error:
+        why = ": ".join(first_problem(error))
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         why = str(error).splitlines()[0][:200]
-        raise UserError(f"{folder}: damaged packed sequence ({why}); remove it") from None
+    raise UserError(f"{folder}: damaged packed sequence ({why}); remove it")
 
 
 def _mapped(file: Path, checksum: int) -> NDArray[Any]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import shutil
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from pathlib import Path
@@ -61,7 +62,28 @@ def train(
     fit, select = [clips[i] for i in split.fit], [clips[i] for i in split.select]
     scales = measure_scales(fit, settings)
     card = Card(settings, scales, typical_young(fit), *_provenance(clips, split))
-    run = _start(settings, _open(out, card))
+    state = _open(out, card)
+    try:
+        return _go_on(_start(settings, state), card, fit, select, out, report, fabric, log)
+    except (UserError, OSError):
+        # Nothing to go on from: a full disk, say, leaves nothing.
+        if state is None and fabric.is_global_zero and not (out / "last.pt").exists():
+            shutil.rmtree(out)
+        raise
+
+
+def _go_on(
+    run: _Run,
+    card: Card,
+    fit: list[Clip],
+    select: list[Clip],
+    out: Path,
+    report: Report,
+    fabric: Fabric,
+    log: Callable[[dict[str, float]], None],
+) -> Card:
+    """Epoch after epoch to the end; arguments as `train`'s."""
+    settings, scales = card.settings, card.scales
     net: Any = torch.compile(run.model) if settings.compile else run.model
     net, run.optimizer = fabric.setup(net, run.optimizer)
     frames, chooser = held(fit, settings, fabric.device), held(select, settings, fabric.device)

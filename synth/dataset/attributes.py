@@ -9,6 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from synth.errors import UserError
 from synth.fields import FORMAT_VERSION
+from synth.job.types import first_problem
 
 FORMAT = "sulcus-sequence"
 
@@ -99,8 +100,7 @@ def check_attributes(attrs: Mapping[str, Any], where: str) -> None:
     try:
         said = Attributes.model_validate(dict(attrs))
     except ValidationError as error:
-        first = error.errors(include_input=False, include_url=False)[0]
-        at = ".".join(str(step)[:40] for step in first["loc"])
-        raise UserError(f"{where}: the attribute {at} can't be right ({first['msg']})") from None
+        at, why = first_problem(error)
+        raise UserError(f"{where}: the attribute {at} can't be right ({why})") from None
     if said.size[0] * said.size[1] > LARGEST_PIXELS:
         raise UserError(f"{where}: {said.size[0]} x {said.size[1]} pixels a frame is too large")

@@ -20,6 +20,7 @@ from synth.dataset import location, provenance
 from synth.errors import UserError
 from synth.job import identity, writer
 from synth.job.schema import Job
+from synth.job.types import first_problem
 
 _LOCK_WAIT_S = 5.0
 _NAME = "dataset.json"
@@ -63,7 +64,8 @@ class Folder:
         except FileNotFoundError:
             raise UserError(f"{self.root}: holds no dataset ({_NAME} is missing)") from None
         except ValidationError as error:
-            raise UserError(f"{self.root / _NAME}: is damaged ({_first(error)})") from None
+            at, why = first_problem(error)
+            raise UserError(f"{self.root / _NAME}: is damaged ({at or 'all of it'}: {why})") from None
         except OSError as error:
             raise UserError(f"{self.root / _NAME}: is damaged ({error})") from error
         return found.model_dump()
@@ -73,8 +75,8 @@ class Folder:
         try:
             return Job.model_validate(self.described()["job"])
         except ValidationError as error:
-            why = _first(error)
-            raise UserError(f"{self.root / _NAME}: is damaged or of another version ({why})") from error
+            at, why = first_problem(error)
+            raise UserError(f"{self.root / _NAME}: is damaged or of another version ({at}: {why})") from None
 
     def sealed(self) -> list[int]:
         """Indices of the finished sequences, in order."""
@@ -200,11 +202,6 @@ def write_whole(path: Path, text: str | bytes, *, durable: bool = True) -> None:
             file.flush()
             os.fsync(file.fileno())
     part.rename(path)
-
-
-def _first(error: ValidationError) -> str:
-    first = error.errors(include_input=False, include_url=False)[0]
-    return f"{'.'.join(map(str, first['loc'])) or 'all of it'}: {first['msg']}"[:300]
 
 
 def _refuse_foreign(folder: Folder, job: Job, name: str) -> None:

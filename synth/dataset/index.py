@@ -78,21 +78,21 @@ def read_index(root: Path) -> pa.Table:
             raise UserError(f"{path}: no such file")
         if not path.is_file():
             raise UserError(f"{path}: is not a regular file")
+        about = pq.read_metadata(path)
+        if about.num_rows > _MOST_ROWS:
+            raise UserError(f"{path}: holds more than {_MOST_ROWS:,} rows")
+        if about.schema.names != SCHEMA.names:
+            raise UserError(f"{path}: is the index of another program or version{_SPOILT}")
         texts = [field.name for field in SCHEMA if field.type == pa.string()]
         # Texts stay dictionaries until their length is known: a small file can stand for endless ones.
-        with pq.ParquetFile(
+        table = pq.ParquetFile(
             path, memory_map=False, read_dictionary=texts, page_checksum_verification=True
-        ) as file:
-            if file.metadata.num_rows > _MOST_ROWS:
-                raise UserError(f"{path}: holds more than {_MOST_ROWS:,} rows")
-            if file.schema_arrow.names != SCHEMA.names:
-                raise UserError(f"{path}: is the index of another program or version{_SPOILT}")
-            table = file.read(use_threads=False)
+        ).read(use_threads=False)
         for name in texts:
             table = table.set_column(table.schema.names.index(name), name, _plain(table[name]))
         table = table.cast(SCHEMA)
         table.validate(full=True)
-    except (OSError, pa.ArrowException, ValueError, MemoryError) as error:
+    except (OSError, pa.ArrowException, ValueError, LookupError, MemoryError) as error:
         why = (str(error).splitlines() or ["it takes too much memory"])[0]
         raise UserError(f"{path}: is damaged ({why[:200]}){_SPOILT}") from error
     _check_rows(table, path)

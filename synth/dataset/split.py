@@ -13,6 +13,7 @@ from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from synth.dataset.folder import write_whole
 from synth.errors import UserError
+from synth.job.types import first_problem
 
 By = Literal["anatomy", "family", "gesture", "stiffness", "sequence"]
 """What must not be shared between the sides; `stiffness` splits at quantiles of Young's modulus."""
@@ -54,9 +55,8 @@ def read_rule(root: Path) -> Rule:
             raise UserError(f"{file}: is not a small regular file")
         return _RULE.validate_json(file.read_bytes(), strict=True)
     except ValidationError as error:
-        first = error.errors(include_input=False, include_url=False)[0]
-        at = ".".join(map(str, first["loc"])) or "it"
-        raise UserError(f"{file}: is damaged ({at}: {first['msg']})") from None
+        at, why = first_problem(error)
+        raise UserError(f"{file}: is damaged ({at or 'all of it'}: {why})") from None
     except OSError as error:
         raise UserError(f"{file}: cannot be read ({error.strerror})") from error
 
