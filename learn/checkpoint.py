@@ -9,7 +9,6 @@ import hashlib
 import io
 import json
 import os
-import tempfile
 import warnings
 import zipfile
 from collections.abc import Mapping
@@ -27,11 +26,14 @@ from learn.network.monai_unet import build
 from learn.settings import Settings
 from synth.errors import Caution, UserError
 from synth.job import identity
-from synth.job.types import Positive
+from synth.job.types import Positive, first_problem
+from synth.system import foreign_file
+from synth.system.whole_file import write_whole
 
 _FORMAT, _VERSION = "sulcus-model", 1
 _LARGEST_BYTES = 100_000_000
 """Of config.json, which names the sequences that were trained on: a million of them."""
+_LARGEST_WEIGHTS = 64 << 30
 _WEIGHTS, _NEXT = "weights.pt", "weights.next.pt"
 
 
@@ -86,12 +88,11 @@ def read_card(folder: Path) -> Card:
 def _read(folder: Path) -> tuple[Card, bool]:
     """The card, and whether it has a seal, which then holds."""
     file = folder / "config.json"
-    if not file.is_file():
+    if not file.exists():
         raise UserError(f"{folder}: no model here (config.json is missing)")
+    data = foreign_file.read_bytes(file, _LARGEST_BYTES)
     try:
-        if file.stat().st_size > _LARGEST_BYTES:
-            raise UserError(f"{file}: is larger than {_LARGEST_BYTES:,} bytes")
-        tree = json.loads(file.read_text("utf-8"))
+        tree = json.loads(data)
         seal = tree.pop("seal", None)
         rest = {key: value for key, value in tree.items() if key not in ("format", "version")}
         if (tree["format"], tree["version"]) != (_FORMAT, _VERSION):
@@ -101,14 +102,15 @@ def _read(folder: Path) -> tuple[Card, bool]:
             raise UserError(f"{file}: is not as it was written: edited or damaged")
         return card, seal is not None
     except ValidationError as error:
-        wrong = [(one["type"], ".".join(map(str, one["loc"])), one["msg"]) for one in error.errors()]
-        unknown = [at for kind, at, _ in wrong if kind in ("extra_forbidden", "unexpected_keyword_argument")]
+        wrong = [(one["type"], ".".join(map(str, one["loc"]))) for one in error.errors()]
+        unknown = [at for kind, at in wrong if kind in ("extra_forbidden", "unexpected_keyword_argument")]
         if unknown:
             raise UserError(
                 f"{file}: made by another version of this program (no '{unknown[0][:100]}' here)"
             ) from None
-        raise UserError(f"{file}: corrupt model configuration ({wrong[0][1][:100]}: {wrong[0][2]})") from None
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError, OSError) as error:
+        at, why = first_problem(error)
+        raise UserError(f"{file}: corrupt model configuration ({at}: {why})") from None
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise UserError(f"{file}: corrupt model configuration ({str(error)[:200]})") from None
 
 
@@ -119,8 +121,9 @@ def save_tensors(file: Path, tree: Mapping[str, Any]) -> None:
 
 def load_tensors(file: Path) -> dict[str, Any]:
     """Raises UserError if the file is missing or damaged, or holds anything but tensors and plain values."""
-    if not file.is_file():
+    if not file.exists():
         raise UserError(f"{file}: missing")
+    foreign_file.check_file(file, _LARGEST_WEIGHTS)
     try:
         _check_archive(file)
         tree = torch.load(file, map_location="cpu", weights_only=True)
@@ -165,27 +168,14 @@ def fit(state: Mapping[str, Any], arch: Architecture, where: Path) -> nn.Module:
     return model
 
 
-def refuse_if_no_room(folder: Path, arch: Architecture) -> None:
-    """Raises UserError if a training of `arch` can't write to `folder`, or its disk has no room for it.
-
-    Takes the room for a moment and gives it back; a folder that isn't there isn't made.
-    """
-    there = next(path for path in (folder.absolute(), *folder.absolute().parents) if path.exists())
-    if not there.is_dir():
-        raise UserError(f"{there}: is a file, a folder is needed")
+def room_needed(folder: Path, arch: Architecture) -> int:
+    """Bytes that a training of `arch` still takes on the disk of `folder`, at most."""
     with torch.device("meta"):
         numbers = sum(value.numel() for value in build(arch).state_dict().values())
     # Weights, and last.pt with two moments of each beside them; all twice while they are replaced. And logs.
     needed = 2 * 4 * 4 * numbers + 2_000_000
     written = (folder / name for name in (_WEIGHTS, "last.pt"))
-    needed -= sum(file.stat().st_size for file in written if file.is_file())
-    try:
-        with tempfile.TemporaryFile(dir=there) as file:
-            os.posix_fallocate(file.fileno(), 0, max(needed, 1))
-    except OSError as error:
-        raise UserError(
-            f"{folder}: cannot be written ({error.strerror}); {needed / 1e6:.0f} MB are needed"
-        ) from None
+    return max(needed - sum(file.stat().st_size for file in written if file.is_file()), 1)
 
 
 def _find_weights(folder: Path, card: Card) -> Path:
@@ -221,12 +211,9 @@ def _packed(tree: Mapping[str, Any]) -> bytes:
 
 
 def _write(file: Path, data: bytes) -> None:
-    """Writes beside and renames, so that a kill leaves the old file and a full disk nothing new."""
+    """`write_whole`, a full disk as a UserError."""
     try:
-        with tempfile.TemporaryDirectory(prefix=f".{file.name}.", dir=file.parent) as beside:
-            part = Path(beside) / file.name
-            part.write_bytes(data)
-            os.replace(part, file)
+        write_whole(file, data)
     except OSError as error:
         raise UserError(f"{file}: cannot be written ({error.strerror})") from None
 

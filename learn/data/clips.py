@@ -21,6 +21,7 @@ from synth.dataset.store import Dataset, Sequence
 from synth.errors import UserError
 from synth.job import identity
 from synth.job.types import Positive, first_problem
+from synth.system import foreign_file
 
 Input = Literal["ideal", "recovered", "noisy", "mixed"]
 INPUTS = ("ideal", "recovered", "noisy", "mixed")
@@ -212,7 +213,7 @@ class _Said(BaseModel):
 def unpack(folder: Path) -> Clip:
     """A packed clip, memory-mapped. Raises UserError if the folder is not one, or damaged."""
     try:
-        said = _Said.model_validate_json((folder / "clip.json").read_bytes())
+        said = _Said.model_validate_json(foreign_file.read_bytes(folder / "clip.json", 1_000_000))
         arrays: dict[str, Any] = {
             name: _mapped(folder / f"{name}.npy", told) for name, told in said.checksums.items()
         }
@@ -228,7 +229,7 @@ def unpack(folder: Path) -> Clip:
         return clip
     except ValidationError as error:
         why = ": ".join(first_problem(error))
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, UserError) as error:
         why = str(error).splitlines()[0][:200]
     raise UserError(f"{folder}: damaged packed sequence ({why}); remove it")
 
@@ -236,6 +237,7 @@ def unpack(folder: Path) -> Clip:
 def _mapped(file: Path, checksum: int) -> NDArray[Any]:
     if file.name not in _FILES:
         raise ValueError(f"{file.name}: is no array of ours")
+    foreign_file.check_file(file, 64 << 30)
     array: NDArray[Any] = np.load(file, mmap_mode="r", allow_pickle=False)
     if array.dtype != (np.float64 if file.stem == "force" else np.float32):
         raise ValueError(f"{file.name}: is of another type")

@@ -17,6 +17,7 @@ from synth.dataset import location, split
 from synth.dataset.folder import Folder, write_whole
 from synth.dataset.store import Sequence, open_sequence
 from synth.errors import UserError
+from synth.system import foreign_file
 
 NAME = "index.parquet"
 
@@ -61,6 +62,7 @@ SCHEMA = pa.schema(
 )
 
 
+_LARGEST_BYTES = 1 << 30
 _MOST_ROWS = 2_000_000
 _LONGEST_TEXT = 10_000
 _SPOILT = "; `synth card` writes it anew"
@@ -74,10 +76,7 @@ def read_index(root: Path) -> pa.Table:
     """
     path = root / NAME
     try:
-        if not path.exists():
-            raise UserError(f"{path}: no such file")
-        if not path.is_file():
-            raise UserError(f"{path}: is not a regular file")
+        foreign_file.check_file(path, _LARGEST_BYTES)
         about = pq.read_metadata(path)
         if about.num_rows > _MOST_ROWS:
             raise UserError(f"{path}: holds more than {_MOST_ROWS:,} rows")

@@ -4,23 +4,24 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal, cast, get_args
 
-from pydantic import ConfigDict, TypeAdapter, ValidationError
+from pydantic import FiniteFloat, TypeAdapter, ValidationError
 
 from synth.dataset.folder import write_whole
 from synth.errors import UserError
 from synth.job.types import first_problem
+from synth.system import foreign_file
 
 By = Literal["anatomy", "family", "gesture", "stiffness", "sequence"]
 """What must not be shared between the sides; `stiffness` splits at quantiles of Young's modulus."""
 
 SIDES = ("train", "validation", "test")
 _CLASSES = 10
-_LARGEST_BYTES = 1_000_000
 NAME = "split.json"
 
 
@@ -28,16 +29,11 @@ NAME = "split.json"
 class Rule:
     """How a dataset is split; kept beside it, so that one that grows is split as before."""
 
-    __pydantic_config__ = ConfigDict(extra="forbid", allow_inf_nan=False)
-
     by: By = "anatomy"
-    shares: tuple[float, float, float] = (0.7, 0.15, 0.15)
+    shares: tuple[FiniteFloat, FiniteFloat, FiniteFloat] = (0.7, 0.15, 0.15)
     held_out: tuple[str, ...] = ()
     share_anatomy: bool = False
     """Whether one brain may be on several sides: scores then say nothing of other brains."""
-
-
-_RULE = TypeAdapter(Rule)
 
 
 def is_written(root: Path) -> bool:
@@ -47,18 +43,14 @@ def is_written(root: Path) -> bool:
 
 def read_rule(root: Path) -> Rule:
     """The rule of the dataset in `root`; the default if none was given. UserError for what is none."""
-    file = root / NAME
-    if not is_written(root):
+    if not os.path.lexists(root / NAME):
         return Rule()
+    found = foreign_file.read_json(root / NAME)
     try:
-        if not file.is_file() or file.stat().st_size > _LARGEST_BYTES:
-            raise UserError(f"{file}: is not a small regular file")
-        return _RULE.validate_json(file.read_bytes(), strict=True)
+        return TypeAdapter(Rule).validate_python(found)
     except ValidationError as error:
         at, why = first_problem(error)
-        raise UserError(f"{file}: is damaged ({at or 'all of it'}: {why})") from None
-    except OSError as error:
-        raise UserError(f"{file}: cannot be read ({error.strerror})") from error
+        raise UserError(f"{root / NAME}: is damaged ({at or 'all of it'}: {why})") from None
 
 
 def keep_rule(root: Path, chosen: Rule) -> None:

@@ -15,8 +15,16 @@ from typer.core import TyperGroup
 
 from synth.errors import Caution, UserError
 
-# What a full or closed disk says, wherever a command meets it.
-_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
+# What the state of the machine is to blame for, and no mistake of the program.
+_MACHINE = {
+    errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOTDIR,
+    errno.EISDIR, errno.EEXIST, errno.ENAMETOOLONG, errno.ELOOP, errno.EMFILE, errno.ENFILE,
+}  # fmt: skip
+
+
+def printable(text: str) -> str:
+    """A message with control characters spelt out: what a file is called must not steer a terminal."""
+    return "".join(c if c.isprintable() or c == "\n" else repr(c)[1:-1] for c in text)
 
 
 class Commands(TyperGroup):
@@ -27,7 +35,7 @@ class Commands(TyperGroup):
             with _cautions():
                 return super().invoke(ctx)
         except UserError as error:
-            typer.echo(f"error: {error}", err=True)
+            typer.echo(f"error: {printable(str(error))}", err=True)
             raise typer.Exit(2) from None
         except KeyboardInterrupt:
             typer.echo("stopped", err=True)
@@ -37,9 +45,13 @@ class Commands(TyperGroup):
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             raise typer.Exit(0) from None
         except OSError as error:
-            if error.errno not in _FULL:
+            if error.errno not in _MACHINE:
                 raise
-            typer.echo(f"error: {error.filename or 'the disk'}: {error.strerror}", err=True)
+            where = f"{error.filename}: " if error.filename is not None else ""
+            typer.echo(f"error: {printable(where)}{error.strerror}", err=True)
+            raise typer.Exit(2) from None
+        except MemoryError:
+            typer.echo("error: the memory of this machine is not enough for that", err=True)
             raise typer.Exit(2) from None
 
 
@@ -51,7 +63,7 @@ def _cautions() -> Iterator[None]:
 
         def say(message: Warning | str, category: type[Warning], *where: Any, **more: Any) -> None:
             if issubclass(category, Caution):
-                typer.echo(f"note: {message}", err=True)
+                typer.echo(f"note: {printable(str(message))}", err=True)
             else:
                 show(message, category, *where, **more)
 

@@ -69,7 +69,8 @@ class Guard:
 
     def __init__(self, *modules: str) -> None:
         """`modules`: loaded besides the usual ones, so that no case pays for them."""
-        environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(_ROOT), "COLUMNS": "200"}
+        path = os.pathsep.join([str(_ROOT), os.environ.get("HOSTILE_PATH", "")])
+        environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": path, "COLUMNS": "200"}
         self._process = subprocess.Popen(
             [sys.executable, __file__, *_LOADED, *modules],
             stdin=subprocess.PIPE,

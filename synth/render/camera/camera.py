@@ -112,6 +112,12 @@ def place(view: View, render: Render) -> Camera:
     )
 
 
+def refuse_unfit(render: Render) -> None:
+    """UserError for a calibration that can't be read, or was made from pictures of another shape."""
+    if render.calibration is not None:
+        calibration.read(render.calibration).fitted(render.size)
+
+
 def beside(camera: Camera, baseline_mm: float) -> Camera:
     """The second lens of a stereo pair, to the right; its picture is shifted to show the same field."""
     K = camera.K.copy()

@@ -210,7 +210,7 @@ def test_no_run_follows_a_link(dataset: Path, tmp_path: Path, name: str) -> None
         shutil.rmtree(place)
     place.unlink(missing_ok=True)
     place.symlink_to(elsewhere)
-    with pytest.raises(UserError, match="is a link, which no run leaves; remove it"), claim(dataset, JOB):
+    with pytest.raises(UserError, match="is a link, which is not followed; remove it"), claim(dataset, JOB):
         pass
     assert sorted(path.name for path in elsewhere.rglob("*")) == ["scratch", "worker-1.log"]
 
