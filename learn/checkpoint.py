@@ -171,7 +171,7 @@ def fit(state: Mapping[str, Any], arch: Architecture, where: Path) -> nn.Module:
 def room_needed(folder: Path, arch: Architecture) -> int:
     """Bytes that a training of `arch` still takes on the disk of `folder`, at most."""
     with torch.device("meta"):
-        numbers = sum(value.numel() for value in build(arch).state_dict().values())
+        numbers = sum(int(value.numel()) for value in build(arch).state_dict().values())
     # Weights, and last.pt with two moments of each beside them; all twice while they are replaced. And logs.
     needed = 2 * 4 * 4 * numbers + 2_000_000
     written = (folder / name for name in (_WEIGHTS, "last.pt"))
