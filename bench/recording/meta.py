@@ -26,6 +26,10 @@ Row = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
 Span = tuple[FiniteFloat, FiniteFloat]
 
 
+LEAST_INTERVALS = 20
+"""Frame intervals that `sync.calibration_s` must hold for the clocks to be lined up on it."""
+
+
 class _Section(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True, allow_inf_nan=False)
 
