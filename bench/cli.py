@@ -211,12 +211,15 @@ def _typed() -> str:
 def _say(result: Result, folder: Path, json: bool) -> None:
     from rich.console import Console
 
-    from bench.scoring import evaluate_recording, report
+    from bench.scoring import evaluate_recording, headline, report
 
     if json:
         print(json_.dumps(evaluate_recording.as_json(result), allow_nan=False))
         return
     console = Console()
+    first = headline.headline(result)
+    for line in filter(None, (first.refused, *first.warnings)):
+        console.print(line, style="bold red", markup=False, highlight=False)
     console.print(report.terminal_table(result))
     for note in result.notes:
         console.print(f"note: {note}", style="yellow", markup=False, highlight=False)

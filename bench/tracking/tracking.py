@@ -50,6 +50,8 @@ class Tracked:
     """Mean speed of the tissue since the frame before [mm/s]; what is lined up with the sensor."""
     confidence: list[float] = field(default_factory=list)
     """Mean confidence of the flow over the tissue."""
+    trusted: list[bool] = field(default_factory=list)
+    """Whether the frame could be followed; what was said of one that couldn't is no answer."""
     snapshots: list[Snapshot] = field(default_factory=list)
     rest: NDArray[np.uint8] | None = None
     tissue: NDArray[np.bool_] | None = None
@@ -134,6 +136,7 @@ class _Asking:
                 density = answer.density
         inside = scene.tissue
         out.confidence.append(float(confidence[inside].mean()))
+        out.trusted.append(step.found.trusted)
         speed = 0.0
         if self.last is not None and out.time_s:
             moved = np.linalg.norm(flow - self.last, axis=-1)[inside]
