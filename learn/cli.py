@@ -292,16 +292,19 @@ def predict_command(
     set_threads(threads)
     predictor = load_predictor(model, quick=True)
     filmed = Filmed(scale, tissue, Settings(flow, shrink, rate or None))
-    peaks = {}
+    peaks: dict[str, float | None] = {}
     for motion in motions(source, input, filmed):
         found = apply(predictor, motion, young)
         out.mkdir(parents=True, exist_ok=True)
         np.savez_compressed(out / f"{motion.name}.npz", **found)
-        peaks[motion.name] = float(found["total_force_mn"].max())
+        size = found["total_force_mn"][found["trusted"]]
+        peaks[motion.name] = float(size.max()) if len(size) else None
         if not json:
-            count = len(found["total_force_mn"])
-            _console.print(f"{motion.name}: {count} frames, peak force {peaks[motion.name]:.3g} mN")
-            for note in motion.notes():
+            peak = "no force: no frame could be followed"
+            if peaks[motion.name] is not None:
+                peak = f"peak force {peaks[motion.name]:.3g} mN"
+            _console.print(f"{motion.name}: {len(found['trusted'])} frames, {peak}")
+            for note in found["notes"]:
                 _console.print(f"note: {note}", style="yellow", markup=False, highlight=False)
     if json:
         print(json_.dumps({"out": str(out), "peak_force_mn": peaks}))

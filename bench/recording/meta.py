@@ -103,6 +103,15 @@ class Sync(_Section):
     """Largest offset looked for, either way [s]."""
 
 
+class Pulse(_Section):
+    """The tissue's own motion by heart and breath, which is taken off before any method is asked."""
+
+    remove: bool = True
+    """`false`: leave it in."""
+    free_s: tuple[Span, ...] = ()
+    """Spans of video time without contact, (from, to) [s], to find it on; without, the video alone says."""
+
+
 class Meta(_Section):
     """One recording."""
 
@@ -128,6 +137,7 @@ class Meta(_Section):
     """Name of the specimen; recordings of one specimen are never treated as independent."""
     sensor: Sensor = Sensor()
     sync: Sync = Sync()
+    pulse: Pulse = Pulse()
 
     @model_validator(mode="after")
     def _scale_is_known(self) -> Meta:

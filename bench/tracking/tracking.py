@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TypeVar
 
 import cv2
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from bench.methods.protocol import Method, Scene
 from bench.recording.folder import Recording
+from learn.inference.pulse import Pulse
 from learn.inference.video_flow import FlowHere, Footage, Settings, Step, VideoFlow
 from synth.errors import UserError
 from synth.system.stopwatch import Stopwatch
@@ -60,6 +61,8 @@ class Tracked:
     """Height, width of the recording [px]."""
     notes: list[str] = field(default_factory=list)
     timings: dict[str, dict[str, float] | float] = field(default_factory=dict)
+    pulse: list[dict[str, float]] = field(default_factory=list)
+    """rate_hz and amplitude_mm of each rhythm of the tissue's own that was taken off."""
 
 
 def track_recording(
@@ -87,10 +90,31 @@ def track_recording(
     Raises:
         UserError: unreadable video, no frame with a time, rest frame beyond the end, masks of another size.
     """
+    out, found = _track(recording, methods, scale_mm_per_px, settings, pictured, flow, progress, None)
+    if found is None:
+        return out
+    # Contacts are answered for on the tissue as it would lie still: all over again, with that taken off.
+    again, _ = _track(recording, methods, scale_mm_per_px, settings, pictured, flow, progress, found)
+    return again
+
+
+def _track(
+    recording: Recording,
+    methods: Mapping[str, Method],
+    scale_mm_per_px: float,
+    settings: Settings,
+    pictured: str | None,
+    flow: FlowHere | None,
+    progress: Progress,
+    pulse: Pulse | None,
+) -> tuple[Tracked, Pulse | None]:
+    """Once through the video; what was tracked, and the pulse that is still in it."""
     meta = recording.meta
     tool = recording.tool if recording.masks else None
     footage = Footage(recording.frames(), str(recording.folder), recording.tissue_mask, tool, meta.rest_frame)
-    video = VideoFlow(footage, settings, flow)
+    video = VideoFlow(
+        footage, replace(settings, pulse=settings.pulse and meta.pulse.remove), flow, pulse=pulse
+    )
     asking = _Asking(methods, pictured, video.watch)
     for step in video.steps(progress):
         if asking.scene is None:
@@ -109,7 +133,14 @@ def track_recording(
         out.notes.append("no masks/: the tool is found in each picture")
     if video.peak_bytes:
         out.timings["flow_peak_rss_mb"] = round(video.peak_bytes / 1e6, 1)
-    return out
+    if pulse is not None:
+        mm_per_px = scale_mm_per_px * video.shrink
+        out.pulse = [
+            {"rate_hz": rhythm.rate_hz, "amplitude_mm": mm_per_px * size}
+            for rhythm, size in zip(pulse.rhythms, pulse.amplitudes_px, strict=True)
+        ]
+        out.notes.append(pulse.describe(mm_per_px))
+    return out, video.find_pulse(meta.pulse.free_s)
 
 
 class _Asking:
