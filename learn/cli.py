@@ -278,6 +278,9 @@ def predict_command(
     rate: Annotated[
         float, typer.Option(min=0.0, help="At most so many frames a second of a video are looked at; 0: all.")
     ] = 10.0,
+    pulse: Annotated[
+        bool, typer.Option(help="Take the tissue's own motion, heart and breath, off a video's first.")
+    ] = True,
     threads: Threads = None,
     json: Json = False,
 ) -> None:
@@ -291,7 +294,7 @@ def predict_command(
 
     set_threads(threads)
     predictor = load_predictor(model, quick=True)
-    filmed = Filmed(scale, tissue, Settings(flow, shrink, rate or None))
+    filmed = Filmed(scale, tissue, Settings(flow, shrink, rate or None, pulse))
     peaks: dict[str, float | None] = {}
     for motion in motions(source, input, filmed):
         found = apply(predictor, motion, young)

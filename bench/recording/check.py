@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from bench.recording import pixel_scale
 from bench.recording.folder import Recording, open_recording
 from bench.recording.meta import LEAST_INTERVALS
+from learn.inference.quality import find_fault
 from synth.errors import UserError
 
 _WIDEST_MM, _NARROWEST_MM = 300.0, 3.0
@@ -82,10 +83,13 @@ def _check_pictures(
     times: list[float] = []
     size: tuple[int, int] | None = None
     count = timeless = back = 0
+    fault = ""
     try:
         for picture in recording.frames():
             size = size or (picture.rgb.shape[0], picture.rgb.shape[1])
             count += 1
+            if picture.index == recording.meta.rest_frame:
+                fault = find_fault(picture.rgb, recording.tissue_mask(size))
             if picture.time_s is None:
                 timeless += 1
             elif times and picture.time_s <= times[-1]:
@@ -98,6 +102,8 @@ def _check_pictures(
     assert size is not None
     t = np.array(times)
     found.add("ok", "pictures", f"{count} of {size[1]} x {size[0]} px")
+    if fault:
+        found.add("bad", "pictures", f"nothing can be measured: the rest frame is {fault}")
     if len(t) < 2:
         found.add("bad", "times", "fewer than two frames have a time")
         return t, size

@@ -349,6 +349,7 @@ def as_json(result: Result) -> dict[str, Any]:
         "scale": asdict(result.scale),
         "relative_uncertainty": result.relative_uncertainty,
         "noise_floor_mn": result.noise_floor_mn,
+        "fault": done.fault,
         "pulse": done.pulse,
         "aligned": result.aligned,
         "sync": None if result.sync is None else asdict(result.sync),

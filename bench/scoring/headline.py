@@ -42,6 +42,8 @@ def headline(result: Result) -> Headline:
     With a separate press those after its gain come first. Without a known E, or with the press alone, the
     curve's shape follows: what no gain changes. Nothing of it where too many frames were lost.
     """
+    if result.followed.fault:
+        return Headline(f"Nothing can be measured: {result.followed.fault}", ())
     if result.lost.any() and result.lost_share > MOST_LOST:
         share = f"{100 * result.lost_share:.0f}%"
         return Headline(

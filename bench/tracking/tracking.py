@@ -61,6 +61,8 @@ class Tracked:
     """Height, width of the recording [px]."""
     notes: list[str] = field(default_factory=list)
     timings: dict[str, dict[str, float] | float] = field(default_factory=dict)
+    fault: str = ""
+    """Why nothing of the video is a measurement; empty if something may be."""
     pulse: list[dict[str, float]] = field(default_factory=list)
     """rate_hz and amplitude_mm of each rhythm of the tissue's own that was taken off."""
 
@@ -128,7 +130,12 @@ def _track(
         if video.seen <= meta.rest_frame:
             raise UserError(f"{recording.folder}: rest_frame {meta.rest_frame}, but {video.seen} frames")
         raise UserError(f"{recording.folder}: no frame has a time; give frames.csv, or fps in meta.yaml")
+    out.fault = video.fault
+    if out.fault:
+        out.trusted = [False] * len(out.time_s)
     out.size, out.notes, out.timings = video.size, video.notes, video.watch.report()
+    if out.fault:
+        out.notes.append(f"nothing can be measured: {out.fault}")
     if tool is None:
         out.notes.append("no masks/: the tool is found in each picture")
     if video.peak_bytes:

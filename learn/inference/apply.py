@@ -54,6 +54,8 @@ class Motion:
     """How many times smaller than the film's own pictures those are that flow is on."""
     notes: Callable[[], list[str]] = list
     """What was done to the film that its user should know, once its steps are through."""
+    fault: Callable[[], str] = str
+    """Why nothing of it is a measurement, once its steps are through; empty if something may be."""
     again: Callable[[], Motion | None] = lambda: None
     """The same film with the tissue's own motion taken off, if its steps, once through, showed any."""
 
@@ -150,6 +152,7 @@ def _video(path: Path, filmed: Filmed, pulse: Pulse | None = None) -> Motion:
         young_kpa=None,
         shrink=following.shrink,
         notes=notes,
+        fault=lambda: following.fault,
         again=again,
     )
 
@@ -209,6 +212,9 @@ def apply(predictor: Predictor, motion: Motion, young_kpa: float | None = None) 
     still = motion.again()
     if still is not None:
         return apply(predictor, still, young_kpa)
+    fault = motion.fault()
+    if fault:
+        trusted, forces = [False] * len(trusted), [np.full(3, np.nan)] * len(forces)
     total, last = np.array(forces), maps[-1]
     out: dict[str, Any] = {
         "density": np.stack([m.density for m in maps]),
@@ -227,7 +233,9 @@ def apply(predictor: Predictor, motion: Motion, young_kpa: float | None = None) 
     if last.force_mn is not None:
         out["force_mn"] = total
     notes = motion.notes()
-    if not all(trusted):
+    if fault:
+        notes.append(f"nothing can be measured: {fault}")
+    elif not all(trusted):
         notes.append(
             f"{trusted.count(False)} of {len(trusted)} frames could not be followed: they have no force"
         )

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from learn.inference.pulse import Pulse, Span, Surface, find_pulse
+from learn.inference.quality import find_fault
 from learn.inference.video import Picture
 from synth.errors import UserError
 from synth.flow import mask
@@ -146,6 +147,15 @@ class VideoFlow:
         self._period_s = 0.0 if settings.rate_hz is None else 1 / settings.rate_hz
         self._due_s = self._last_s = -math.inf
         self._rest_s: float | None = None
+        self._fault, self._rest_rgb = "", np.zeros((0, 0, 3), np.uint8)
+        self._followed, self._still = 0, True
+
+    @property
+    def fault(self) -> str:
+        """Why nothing of this video is a measurement, said once it is through; empty if something may be."""
+        if self._fault:
+            return f"the rest frame is {self._fault}"
+        return "the picture never changes" if self._followed and self._still else ""
 
     @property
     def notes(self) -> list[str]:
@@ -180,6 +190,8 @@ class VideoFlow:
                 if resting:
                     found = self._rest(small.rgb, blocked)
                     yield Step(small, found, masking_s)
+                elif self._fault:
+                    yield Step(small, self._nothing(), masking_s)
                 else:
                     under_way.append((small, masking_s, self._flow.ask(small.rgb, blocked)))
                 if len(under_way) > self._flow.ahead:
@@ -245,12 +257,24 @@ class VideoFlow:
 
     def _rest(self, rgb: Rgb, blocked: Flags) -> Found:
         """Starts the flow: nothing has moved."""
+        self._fault, self._rest_rgb = find_fault(rgb, self.tissue), rgb
+        if self._fault:
+            return self._nothing()
         self._flow.begin(self.settings.backend, rgb, blocked, self.tissue)
         still = np.zeros((*self.tissue.shape, 2), np.float32)
         return Found(still, (self.tissue & ~blocked).astype(np.float32))
 
+    def _nothing(self) -> Found:
+        """Of a frame in which nothing can be followed."""
+        none = np.zeros(self.tissue.shape, np.float32)
+        return Found(np.stack([none, none], axis=-1), none, trusted=False)
+
     def _step(self, small: Picture, masking_s: float, answer: Callable[[], Found]) -> Step:
         found = answer()
+        self._followed += 1
+        self._still = self._still and np.array_equal(small.rgb, self._rest_rgb)
+        if found.trusted and find_fault(small.rgb, self.tissue):
+            found = replace(found, trusted=False)
         self.watch.add("flow", found.cpu_s, found.wall_s)
         self.peak_bytes = max(self.peak_bytes, found.peak_bytes)
         if self._pulse is not None and small.time_s is not None:
