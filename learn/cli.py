@@ -281,6 +281,9 @@ def predict_command(
     rate: Annotated[
         float, typer.Option(min=0.0, help="At most so many frames a second of a video are looked at; 0: all.")
     ] = 10.0,
+    pulse: Annotated[
+        bool, typer.Option(help="Take the tissue's own motion, heart and breath, off a video's first.")
+    ] = True,
     threads: Threads = None,
     json: Json = False,
 ) -> None:
@@ -294,17 +297,20 @@ def predict_command(
 
     set_threads(threads)
     predictor = load_predictor(model, quick=True)
-    filmed = Filmed(scale, tissue, Settings(flow, shrink, rate or None))
-    peaks = {}
+    filmed = Filmed(scale, tissue, Settings(flow, shrink, rate or None, pulse))
+    peaks: dict[str, float | None] = {}
     for motion in motions(source, input, filmed):
         found = apply(predictor, motion, young)
         out.mkdir(parents=True, exist_ok=True)
         np.savez_compressed(out / f"{motion.name}.npz", **found)
-        peaks[motion.name] = float(found["total_force_mn"].max())
+        size = found["total_force_mn"][found["trusted"]]
+        peaks[motion.name] = float(size.max()) if len(size) else None
         if not json:
-            count = len(found["total_force_mn"])
-            _console.print(f"{motion.name}: {count} frames, peak force {peaks[motion.name]:.3g} mN")
-            for note in motion.notes():
+            peak = "no force: no frame could be followed"
+            if peaks[motion.name] is not None:
+                peak = f"peak force {peaks[motion.name]:.3g} mN"
+            _console.print(f"{motion.name}: {len(found['trusted'])} frames, {peak}")
+            for note in found["notes"]:
                 _console.print(f"note: {note}", style="yellow", markup=False, highlight=False)
     if json:
         print(json_.dumps({"out": str(out), "peak_force_mn": peaks}))

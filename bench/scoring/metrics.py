@@ -30,6 +30,15 @@ METRICS = {
     "ccc": Metric("CCC", "", "Lin's concordance correlation.", "high", column="CCC"),
     "r2": Metric("R²", "", "1 − SSE/SST about the sensor's mean: bias and gain count.", "high", column="R²"),
     "gain": Metric("gain", "", "Least-squares slope of predicted on sensor.", "one", column="gain"),
+    "shape_error": Metric(
+        "shape error",
+        "%",
+        "MAE after the one gain that fits best, over the contacts' mean peak.",
+        "low",
+        3,
+        True,
+        "shape err.",
+    ),
     "lag_s": Metric("lag", "ms", "How late predicted is, at the best correlation.", "zero", 3, True, "lag"),
     "r_at_lag": Metric("r at that lag", "", "Correlation with the lag taken out.", "high", relative=True),
     "contact_f1": Metric("contact F1", "", "F1 of contact, by sample.", "high", column="contact F1"),
@@ -234,6 +243,7 @@ def compute_all(
     scores = agreement(sensor, predicted)
     peaks = np.array([row["peak_mn"] for row in rows])
     peak = float(peaks.mean()) if len(peaks) else float("nan")
+    scores["shape_error"] = ratio(_after_gain(sensor, predicted)["mae_mn"], peak)
     scores |= lag(time_s, sensor, predicted)
     scores |= contact_scores(sensor, predicted, threshold)
     scores |= {
@@ -249,9 +259,20 @@ def compute_all(
     return scores, rows
 
 
+def _after_gain(sensor: Curve, predicted: Curve) -> dict[str, float]:
+    """Agreement of what the one best gain, known in hindsight, leaves of the prediction: its shape."""
+    return agreement(sensor, gain(sensor, predicted, np.isfinite(sensor)) * predicted)
+
+
 def without_newtons(scores: dict[str, float]) -> dict[str, float]:
     """The scores with those that need forces in newtons made NaN: for predictions of unknown stiffness."""
     return {key: value if key in RELATIVE else float("nan") for key, value in scores.items()}
+
+
+def without_prediction(rows: list[dict[str, float]]) -> list[dict[str, float]]:
+    """Contacts as the sensor alone has them: what needs predicted newtons made NaN."""
+    own = ("from_s", "to_s", "peak_mn", "impulse_mns")
+    return [{key: value if key in own else float("nan") for key, value in row.items()} for row in rows]
 
 
 def limits_of_agreement(difference: Curve, group: NDArray[np.integer]) -> dict[str, float]:
