@@ -18,6 +18,10 @@ TOLERANCE = 2e-4
 _HISTORY, _ITERATIONS, _ARMIJO = 8, 200, 1e-4
 
 
+_Step = tuple[Floats, Floats, float, Floats | None]
+"""Step s (N, 3) mm, the gradient's change y (N, 3) mN over it, s'y, and the inverse rest stiffness on y."""
+
+
 class NoEquilibrium(UserError):
     """The iteration found no balance of forces."""
 
@@ -158,10 +162,11 @@ def minimise_energy(
     if not np.isfinite(state.energy):
         u, state = safe, system.state(safe)
     gradient = _on_free(system, state.force - load)
-    history: list[tuple[Floats, Floats, float]] = []
+    history: list[_Step] = []
     norm = np.inf
+    lean = system.membrane is not None
+    preconditioned = system.solve(gradient)
     for _ in range(_ITERATIONS):
-        preconditioned = system.solve(gradient)
         norm = max(float(np.vdot(gradient, preconditioned)), 0.0) ** 0.5
         if norm <= tolerance:
             break
@@ -186,33 +191,37 @@ def minimise_energy(
         trial_gradient = _on_free(system, trial_state.force - load)
         s, y = length * direction, trial_gradient - gradient
         curvature = float(np.vdot(s, y))
+        then, preconditioned = preconditioned, system.solve(trial_gradient)
         if curvature > 1e-12 * float(np.sqrt(np.vdot(s, s) * np.vdot(y, y))):
-            history.append((s, y, curvature))
+            history.append((s, y, curvature, preconditioned - then if lean else None))
             del history[:-_HISTORY]
         u, state, gradient = trial, trial_state, trial_gradient
     return u, state, norm
 
 
 def _two_loop_recursion(
-    gradient: Floats, preconditioned: Floats, history: list[tuple[Floats, Floats, float]], system: System
+    gradient: Floats, preconditioned: Floats, history: list[_Step], system: System
 ) -> Floats:
     """The inverse Hessian on the gradient (Nocedal & Wright, algorithm 7.4), the rest stiffness as its seed.
 
     Args:
         gradient: (N, 3) mN.
         preconditioned: (N, 3) mm, the inverse rest stiffness on it.
-        history: steps s (N, 3) mm, the gradient's changes y (N, 3) mN over them, and s'y.
+        history: the latest steps.
         system: the equations.
     """
     if not history:
         return preconditioned
-    q, alphas = gradient.copy(), []
-    for s, y, curvature in reversed(history):
+    q, r, alphas = gradient.copy(), preconditioned.copy(), []
+    for s, y, curvature, solved in reversed(history):
         alpha = float(np.vdot(s, q)) / curvature
         q -= alpha * y
+        if solved is not None:
+            r -= alpha * solved
         alphas.append(alpha)
-    r = system.solve(q)
-    for (s, y, curvature), alpha in zip(history, reversed(alphas), strict=True):
+    if history[0][3] is None:
+        r = system.solve(q)
+    for (s, y, curvature, _), alpha in zip(history, reversed(alphas), strict=True):
         r += s * (alpha - float(np.vdot(y, r)) / curvature)
     return r
 

@@ -40,7 +40,14 @@ class Clock:
 
 
 def march_in_time(
-    tets: Tets, law: str, poisson: float, young_kpa: float, loads: Floats, named: Floats, clock: Clock
+    tets: Tets,
+    law: str,
+    poisson: float,
+    young_kpa: float,
+    loads: Floats,
+    named: Floats,
+    clock: Clock,
+    sheet: float = 0.0,
 ) -> Path:
     """Motion from rest under loads at even times; between them they change evenly.
 
@@ -52,6 +59,7 @@ def march_in_time(
         loads: (T, N, 3) mN for E = 1 kPa.
         named: (T,) P = F/(E a^2) of each, for messages.
         clock: time.
+        sheet: of a membrane, as in `system.assemble`, for E = 1 kPa; it relaxes as the tissue does.
 
     Raises:
         As `equilibrium.solve_path`.
@@ -62,7 +70,7 @@ def march_in_time(
     pull = (1 / dt**2 + clock.damping / dt) if clock.mass_kg else 0.0
     mass = nodal_mass(tets, clock.mass_kg) / young_kpa
     springs = (tets.hold + sp.diags_array(pull * mass)) / firm
-    system = assemble(replace(tets, hold=sp.csr_array(springs)), law, poisson)
+    system = assemble(replace(tets, hold=sp.csr_array(springs)), law, poisson, sheet)
     tissue = replace(system, hold=sp.csr_array(tets.hold.shape))
 
     peak = loads[np.abs(loads).max(axis=(1, 2)).argmax()]

@@ -129,9 +129,17 @@ def solve_volume(
         As `equilibrium.solve_path`.
     """
     if fem.time == "quasi-static" and not fem.relaxation:
-        return equilibrium.solve_path(assemble(tets, tissue.law, tissue.poisson), loads, named)
+        system = assemble(tets, tissue.law, tissue.poisson, tissue.sheet)
+        return equilibrium.solve_path(system, loads, named)
     return motion.march_in_time(
-        tets, tissue.law, tissue.poisson, tissue.young_kpa, loads, named, clock(fem, fps, tets)
+        tets,
+        tissue.law,
+        tissue.poisson,
+        tissue.young_kpa,
+        loads,
+        named,
+        clock(fem, fps, tets),
+        tissue.sheet,
     )
 
 
