@@ -14,6 +14,7 @@ from bench.output import charts
 from bench.output.result_page import Page
 from evidence.measuring import measuring
 from synth.fem import surface_embedding
+from synth.fem.membrane import Sheet
 from synth.fem.mesh import tetrahedra
 from synth.fem.mesh.tetrahedra import Tets
 from synth.fem.system import assemble
@@ -61,10 +62,10 @@ def measure(count: int, poisson: float, sheet_mm: float = 0.0) -> list[Row]:
         sheet_mm: stiffness of the membrane over Young's modulus of the half-space.
     """
     a = _RADIUS_MM
-    anatomy = schema.Anatomy(dome_mm=1e6, **({"block_mm": _WIDE_MM} if sheet_mm else {}))
+    anatomy = schema.Anatomy(dome_mm=1e6, block_mm=_WIDE_MM if sheet_mm else schema.Anatomy().block_mm)
     tets = tetrahedra.block(anatomy, count, 2, ((0.0, 0.0, a),))
     free = Tets(tets.points, tets.cells, 2, tets.fixed, 0 * tets.hold)
-    system = assemble(free, "linear", poisson, sheet_mm)
+    system = assemble(free, "linear", poisson, Sheet(sheet_mm, 1.0) if sheet_mm else None)
     ring = a * np.sqrt((np.arange(_RINGS) + 0.5) / _RINGS)
     turn = 2 * np.pi * (np.arange(_SPOKES) + 0.5) / _SPOKES
     at = np.stack([np.outer(ring, np.cos(turn)), np.outer(ring, np.sin(turn))], axis=-1).reshape(-1, 2)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from synth.errors import UserError
+from synth.fem.membrane import Sheet
 from synth.job import schema
 from synth.job.law_limits import LARGEST_LOAD
 
@@ -18,6 +19,8 @@ class Pia:
     young_kpa: float
     """Young's modulus at small strain."""
     thickness_mm: float
+    stretch: float
+    """At rest."""
 
 
 @dataclass(frozen=True)
@@ -42,14 +45,21 @@ class Tissue:
         young = _draw_log_uniform(fem.young_kpa, rng)
         # Drawn whether it counts or not, so that no number depends on whether another is asked for.
         asked, intact = fem.membrane, rng.uniform()
-        pia = Pia(_draw_log_uniform(asked.young_kpa, rng), float(rng.uniform(*asked.thickness_mm)))
+        stiff, thick, stretch = (
+            _draw_log_uniform(asked.young_kpa, rng),
+            float(rng.uniform(*asked.thickness_mm)),
+            float(rng.uniform(*asked.stretch)),
+        )
+        pia = Pia(stiff, thick, stretch)
         return cls(young, fem.poisson, law, why, pia if intact < asked.intact else None)
 
     @property
-    def sheet(self) -> float:
-        """Thickness times Young's modulus of the membrane, mN/mm for E = 1 kPa; 0 where there is none."""
+    def sheet(self) -> Sheet | None:
+        """The membrane on tissue of E = 1 kPa."""
         pia = self.membrane
-        return pia.young_kpa * pia.thickness_mm / self.young_kpa if pia else 0.0
+        if pia is None:
+            return None
+        return Sheet(pia.young_kpa * pia.thickness_mm / self.young_kpa, pia.stretch)
 
 
 def _draw_log_uniform(ends: tuple[float, float], rng: np.random.Generator) -> float:

@@ -7,13 +7,16 @@ squared area, S the thickness times Young's modulus,
 
 at small strain S/3 (e:e + (tr e)^2). A sheet so thin wrinkles rather than bear compression, so W is its
 relaxed energy (Pipkin, IMA J. Appl. Math. 36, 1986): where the smaller principal stretch falls below that of
-uniaxial tension, S/6 (c + 2/sqrt(c) - 3) of the larger squared stretch c, and 0 where that is below 1. One
-that bears compression was tried: it buckles, and one scene in eight found no equilibrium.
+uniaxial tension, S/6 (c + 2/sqrt(c) - 3) of the larger squared stretch c, and 0 where that is below 1.
+
+At rest it is stretched already, as in a living head; the pressure inside holds that up, as a load that stays
+what it is. Measured: without a stretch at rest the sheet is slack one way and stiff the other, and the solver
+takes four times as long; one that bears compression buckles.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.sparse as sp
@@ -25,12 +28,18 @@ from synth.system.jit import compiled
 
 Floats = NDArray[np.float64]
 
-_REST_SHARE = 0.5
-"""Of the stiffness at rest in the factor of a sheet that wrinkles, since about half of it gives way: fewest
-steps of the solver, by measurement. Changes no result."""
-
 _POINTS = np.full((3, 3), 1 / 6) + 0.5 * np.eye(3)
 """Barycentric quadrature points of degree 2, of equal weight: exact at small strain for flat faces."""
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """A membrane as it is given, on tissue of E = 1 kPa."""
+
+    stiffness: float
+    """mN/mm: thickness times Young's modulus."""
+    stretch: float
+    """At rest, the same every way; above 1."""
 
 
 @dataclass(frozen=True)
@@ -49,23 +58,44 @@ class Membrane:
     """mN/mm: thickness times Young's modulus."""
     linear: bool
     """For small strain, bearing compression: what fits a volume of the linear law."""
+    square: float
+    """Squared stretch at rest."""
+    balance: Floats
+    """(N, 3) mN that it pulls with at rest, and that the pressure inside holds up."""
+    stored: float
+    """mN mm in it at rest."""
 
     def pull(self, u: Floats, out: Floats) -> float:
-        """Adds its forces at (N, 3) mm to (N, 3) mN, and returns its energy, mN mm."""
+        """Adds its forces at (N, 3) mm to (N, 3) mN, and returns its energy, mN mm; both are 0 at rest."""
+        energy = self._pull(u, out)
+        out -= self.balance
+        return energy - self.stored - float(np.vdot(self.balance, u))
+
+    def _pull(self, u: Floats, out: Floats) -> float:
         return float(
-            _pull(self.faces, self.slope, self.tangent, self.weight, u, self.stiffness, self.linear, out)
+            _pull(
+                self.faces,
+                self.slope,
+                self.tangent,
+                self.weight,
+                u,
+                self.stiffness,
+                self.linear,
+                self.square,
+                out,
+            )
         )
 
-    def stiffness_at(self, u: Floats, *, rest: bool = False) -> sp.csr_array:
-        """(3N, 3N) mN/mm at (N, 3) mm, exact; at rest, where it depends on the way to go, a mean."""
-        place, small = self.tangent, rest or self.linear
-        if not small:
+    def stiffness_at(self, u: Floats) -> sp.csr_array:
+        """(3N, 3N) mN/mm at (N, 3) mm, exact."""
+        place = self.tangent
+        if not self.linear:
             place = place + np.einsum("fqnb,fni->fqib", self.slope, u[self.faces])
-        metric = np.einsum("fqia,fqib->fqab", place, place)
-        share = _REST_SHARE if rest and not self.linear else 1.0
-        stress, moduli = _moduli(metric, share * self.stiffness)
-        if not small:
+        metric = self.square * np.einsum("fqia,fqib->fqab", place, place)
+        stress, moduli = _moduli(metric, self.stiffness)
+        if not self.linear:
             _wrinkle(metric, self.stiffness, stress, moduli)
+        stress, moduli = self.square * stress, self.square**2 * moduli
         bent = np.einsum("fqna,fqib->fqniab", self.slope, place)
         local = np.einsum("fqniab,fqabcd,fqmjcd,fq->fnimj", bent, moduli, bent, self.weight, optimize=True)
         held = np.einsum("fqna,fqab,fqmb,fq->fnm", self.slope, stress, self.slope, self.weight, optimize=True)
@@ -76,13 +106,13 @@ class Membrane:
         return sp.coo_array((local.ravel(), (rows, cols)), shape=(u.size,) * 2).tocsr()
 
 
-def cover(tets: Tets, stiffness: float, *, linear: bool) -> Membrane:
+def cover(tets: Tets, sheet: Sheet, *, linear: bool) -> Membrane:
     """A membrane over all of a volume's surface but the walls that it is cut out at.
 
     Args:
         tets: the volume.
-        stiffness: thickness times Young's modulus, mN/mm.
-        linear: for small strain.
+        sheet: its stiffness and stretch.
+        linear: for small strain, whatever the stretch at rest.
     """
     faces = boundary(tets.cells, tets.order)
     faces = faces[~tets.fixed[faces].all(axis=1)]
@@ -93,14 +123,20 @@ def cover(tets: Tets, stiffness: float, *, linear: bool) -> Membrane:
     area = np.linalg.norm(normal, axis=-1)
     tangent = np.stack([first, np.cross(normal / area[..., None], first)], axis=-1)
     mapping = np.linalg.inv(np.einsum("fqia,fqik->fqak", tangent, side))
-    return Membrane(
+    found = Membrane(
         faces.astype(np.int32),
         np.ascontiguousarray(np.einsum("qnk,fqka->fqna", local, mapping)),
         np.ascontiguousarray(tangent),
         area / (2 * len(_POINTS)),
-        stiffness,
+        sheet.stiffness,
         linear,
+        1.0 if linear else sheet.stretch**2,
+        np.zeros_like(tets.points),
+        0.0,
     )
+    balance = np.zeros_like(tets.points)
+    stored = found._pull(balance.copy(), balance)
+    return replace(found, balance=balance, stored=stored)
 
 
 @compiled
@@ -112,9 +148,10 @@ def _pull(
     u: Floats,
     stiffness: float,
     linear: bool,
+    square: float,
     out: Floats,
 ) -> float:
-    """As `Membrane.pull`."""
+    """Adds the forces of the whole sheet, stretch at rest included, and returns its energy."""
     count, points, nodes, _ = slope.shape
     energy = 0.0
     moved, bent = np.empty((3, 2)), np.empty((3, 2))
@@ -145,7 +182,8 @@ def _pull(
                     xx += bent[i, 0] * bent[i, 0]
                     yy += bent[i, 1] * bent[i, 1]
                     xy += bent[i, 0] * bent[i, 1]
-                density, sxx, syy, sxy = _stretched(xx, yy, xy)
+                density, sxx, syy, sxy = _stretched(square * xx, square * yy, square * xy)
+                sxx, syy, sxy = square * sxx, square * syy, square * sxy
             w = weight[f, q] * stiffness
             energy += w * density
             for n in range(nodes):

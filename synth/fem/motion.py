@@ -16,6 +16,7 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from synth.fem.equilibrium import TOLERANCE, NoEquilibrium, Path, check_state, minimise_energy
+from synth.fem.membrane import Sheet
 from synth.fem.mesh.element import quadrature
 from synth.fem.mesh.tetrahedra import Tets
 from synth.fem.system import State, assemble
@@ -47,7 +48,7 @@ def march_in_time(
     loads: Floats,
     named: Floats,
     clock: Clock,
-    sheet: float = 0.0,
+    sheet: Sheet | None = None,
 ) -> Path:
     """Motion from rest under loads at even times; between them they change evenly.
 
@@ -59,7 +60,7 @@ def march_in_time(
         loads: (T, N, 3) mN for E = 1 kPa.
         named: (T,) P = F/(E a^2) of each, for messages.
         clock: time.
-        sheet: of a membrane, as in `system.assemble`, for E = 1 kPa; it relaxes as the tissue does.
+        sheet: a membrane on the surface; it relaxes as the tissue does.
 
     Raises:
         As `equilibrium.solve_path`.

@@ -12,7 +12,7 @@ from scipy.sparse.linalg import SuperLU, splu
 from synth.errors import UserError
 from synth.fem.assembly import divergence, gradient, stiffness
 from synth.fem.laws import NUMBER, lame, least_determinant, stress, tangent
-from synth.fem.membrane import Membrane, cover
+from synth.fem.membrane import Membrane, Sheet, cover
 from synth.fem.mesh.element import Quadrature, quadrature, quality
 from synth.fem.mesh.tetrahedra import Tets
 
@@ -102,14 +102,14 @@ class System:
         return min(found)
 
 
-def assemble(tets: Tets, law: str, poisson: float, sheet: float = 0.0) -> System:
+def assemble(tets: Tets, law: str, poisson: float, sheet: Sheet | None = None) -> System:
     """Builds and factors the equations.
 
     Args:
         tets: the mesh, its walls and springs.
         law: a key of `laws.NUMBER`.
         poisson: below 0.5.
-        sheet: thickness times Young's modulus of a membrane on the surface, mN/mm; 0: there is none.
+        sheet: a membrane on the surface.
 
     Raises:
         UserError: the mesh holds a tetrahedron that is flat or inside out.
@@ -121,9 +121,9 @@ def assemble(tets: Tets, law: str, poisson: float, sheet: float = 0.0) -> System
         )
     mesh = quadrature(tets.points, tets.cells, tets.order)
     whole = (stiffness(mesh, hooke(1.0, poisson)) + _springs(tets.hold)).tocsr()
-    membrane = cover(tets, sheet, linear=law == "linear") if sheet else None
+    membrane = None if sheet is None else cover(tets, sheet, linear=law == "linear")
     if membrane is not None:
-        whole = (whole + membrane.stiffness_at(np.zeros_like(tets.points), rest=True)).tocsr()
+        whole = (whole + membrane.stiffness_at(np.zeros_like(tets.points))).tocsr()
     free = np.flatnonzero(np.repeat(~tets.fixed, 3))
     # Symmetric and positive definite: no pivoting, an ordering of A + A'.
     factor = splu(

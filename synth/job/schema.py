@@ -22,6 +22,7 @@ from synth.job.types import (
     Section,
     Share,
     ShareRange,
+    StretchRange,
     Vector,
 )
 
@@ -123,6 +124,26 @@ class Membrane(Section):
     the toe of the curve it is thousands (ovine 7,700: Fluids Barriers CNS 17, 2020)."""
     thickness_mm: PositiveRange = (0.05, 0.2)
     """Its thickness [mm], drawn uniformly. What counts is thickness times modulus."""
+    stretch: StretchRange = (1.01, 1.03)
+    """How far it is stretched at rest, drawn uniformly. Not from a measurement: its pull then balances a
+    pressure of 3-350 Pa (at most 2.6 mmHg) under a dome of 70 mm radius, which a living head has."""
+
+
+class Pulse(Section):
+    """Heart and breath: the exposed surface rises and falls, by a pressure from below. Default: it is still.
+
+    Amplitudes are of the middle of the opening, peak to peak, drawn uniformly as the rates are. In a patient
+    below 0.8 mm, with peaks at 0.2 and 1 Hz (Faria et al., Med. Phys. 41, 2014).
+    """
+
+    heart_mm: NonNegativeRange = (0.0, 0.0)
+    """Motion with the heart [mm]."""
+    heart_hz: PositiveRange = (1.0, 1.7)
+    """Heart beats a second."""
+    breath_mm: NonNegativeRange = (0.0, 0.0)
+    """Motion with the breath [mm]."""
+    breath_hz: PositiveRange = (0.2, 0.35)
+    """Breaths a second."""
 
 
 class Fem(Section):
@@ -142,6 +163,8 @@ class Fem(Section):
     """Poisson's ratio."""
     membrane: Membrane = Membrane()
     """The pia-arachnoid on the surface."""
+    pulse: Pulse = Pulse()
+    """Motion of the exposed surface that no tool makes."""
     load: PositiveRange = (0.05, 0.4)
     """Peak load as P = F/(E a^2), dimensionless, so that one range suits every stiffness."""
     force_mn: PositiveRange | None = None
