@@ -210,9 +210,12 @@ def _seal(shooting: _Shooting) -> Path:
 def _mechanics(
     job: Job, case: Scenario, motion: Deformation, rotation: NDArray[np.float64]
 ) -> dict[str, Any]:
+    still = case.pulse is None
     return {
         "law": case.tissue.law,
-        "elastic": job.fem.time == "quasi-static" and not job.fem.relaxation,
+        # Whether the tools' forces alone say what is stored.
+        "elastic": job.fem.time == "quasi-static" and not job.fem.relaxation and still,
+        **({} if case.pulse is None else {"pulse_mm": case.pulse.height(motion.time).tolist()}),
         "min_jacobian": motion.min_jacobian.tolist(),
         "energy_mn_mm": motion.energy.tolist(),
         "residual": motion.residual.tolist(),
@@ -275,6 +278,8 @@ def move(job: Job, case: Scenario, surface: Surface, tets: Tets) -> Deformation:
         job.frames,
         job.fps,
         case.further,
+        case.pulse,
+        job.anatomy.craniotomy,
     )
 
 
