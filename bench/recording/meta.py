@@ -28,6 +28,10 @@ Row = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
 Span = tuple[FiniteFloat, FiniteFloat]
 
 
+LEAST_INTERVALS = 20
+"""Frame intervals that `sync.calibration_s` must hold for the clocks to be lined up on it."""
+
+
 class _Section(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True, allow_inf_nan=False)
 
@@ -101,6 +105,15 @@ class Sync(_Section):
     """Largest offset looked for, either way [s]."""
 
 
+class Pulse(_Section):
+    """The tissue's own motion by heart and breath, which is taken off before any method is asked."""
+
+    remove: bool = True
+    """`false`: leave it in."""
+    free_s: tuple[Span, ...] = ()
+    """Spans of video time without contact, (from, to) [s], to find it on; without, the video alone says."""
+
+
 class Meta(_Section):
     """One recording."""
 
@@ -126,6 +139,7 @@ class Meta(_Section):
     """Name of the specimen; recordings of one specimen are never treated as independent."""
     sensor: Sensor = Sensor()
     sync: Sync = Sync()
+    pulse: Pulse = Pulse()
 
     @model_validator(mode="after")
     def _scale_is_known(self) -> Meta:

@@ -97,10 +97,13 @@ def _worth_a_process(frames: int | None) -> bool:
 def fit_baselines(train: Path | None, model: Path) -> dict[str, Method]:
     """Those that need no data, and, given the training data, those fitted on the model's own fit sequences.
 
+    They are fitted once for a model, and kept for its next recording.
+
     Raises:
         UserError: none of the model's sequences is in `train`.
     """
     from bench.methods import baselines as baseline
+    from bench.methods import kept_rules
 
     methods = baseline.physical()
     if train is None:
@@ -113,7 +116,12 @@ def fit_baselines(train: Path | None, model: Path) -> dict[str, Method]:
     if not chosen:
         raise UserError(f"{train}: holds none of the sequences that {model} was fitted on")
     source = "recovered" if all("flow_recovered" in s for s in chosen) else "ideal"
-    return methods | baseline.fitted([read_clip(s, baseline.GRID, (source,)) for s in chosen], source)
+
+    def fit() -> dict[str, baseline.Rule]:
+        return baseline.fitted_rules([read_clip(s, baseline.GRID, (source,)) for s in chosen], source)
+
+    rules = kept_rules.keep_rules([s.attrs["content_hash"] for s in chosen], source, fit)
+    return methods | {name: baseline.Baseline(rule) for name, rule in rules.items()}
 
 
 def score_demo(dataset: Path, model: Path, out: Path, settings: Settings) -> Result:

@@ -20,6 +20,7 @@ from synth.dataset import location, provenance
 from synth.errors import UserError
 from synth.job import identity, writer
 from synth.job.schema import Job
+from synth.job.types import first_problem
 from synth.system import foreign_file, whole_file
 from synth.system.whole_file import write_whole as write_whole
 
@@ -56,17 +57,16 @@ class Folder:
         try:
             return _Described.model_validate(found).model_dump(exclude_unset=True)
         except ValidationError as error:
-            first = error.errors(include_url=False)[0]
-            where = ".".join(map(str, first["loc"])) or "all of it"
-            raise UserError(f"{self.root / _NAME}: is damaged ({where}: {first['msg']})") from None
+            at, why = first_problem(error)
+            raise UserError(f"{self.root / _NAME}: is damaged ({at or 'all of it'}: {why})") from None
 
     def job(self) -> Job:
         """The dataset's job."""
         try:
             return Job.model_validate(self.described()["job"])
-        except ValueError as error:
-            said = " ".join(str(error).split())[:300]
-            raise UserError(f"{self.root / _NAME}: is damaged or of another version ({said})") from None
+        except ValidationError as error:
+            at, why = first_problem(error)
+            raise UserError(f"{self.root / _NAME}: is damaged or of another version ({at}: {why})") from None
 
     def sealed(self) -> list[int]:
         """Indices of the finished sequences, in order."""
@@ -211,9 +211,9 @@ def _refuse_foreign(folder: Folder, job: Job, name: str) -> None:
 
 
 def _refuse_links(folder: Folder) -> None:
-    """A link where the program makes folders of its own leads what it writes and sweeps elsewhere."""
-    own = (folder.state, folder.logs, folder.scratch, folder.state / "failed", folder.state / "lock")
-    for place in (*own, folder.root / "radiance"):
+    """A link where a run writes or sweeps leads it elsewhere."""
+    own = (folder.state, *folder.state.glob("*"), *folder.state.glob("*/*"), folder.root / "radiance")
+    for place in (*own, *folder.root.glob("radiance/*"), *folder.root.glob("*.zarr.part")):
         if place.is_symlink():
             raise UserError(f"{place}: is a link, which is not followed; remove it")
 

@@ -5,12 +5,15 @@ from __future__ import annotations
 import errno
 import os
 import sys
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import typer
 from typer.core import TyperGroup
 
-from synth.errors import UserError
+from synth.errors import Caution, UserError
 
 # What the state of the machine is to blame for, and no mistake of the program.
 _MACHINE = {
@@ -29,7 +32,8 @@ class Commands(TyperGroup):
 
     def invoke(self, ctx: Any) -> Any:
         try:
-            return super().invoke(ctx)
+            with _cautions():
+                return super().invoke(ctx)
         except UserError as error:
             typer.echo(f"error: {printable(str(error))}", err=True)
             raise typer.Exit(2) from None
@@ -49,3 +53,19 @@ class Commands(TyperGroup):
         except MemoryError:
             typer.echo("error: the memory of this machine is not enough for that", err=True)
             raise typer.Exit(2) from None
+
+
+@contextmanager
+def _cautions() -> Iterator[None]:
+    """Shows a `Caution` as a line; other warnings as ever."""
+    with warnings.catch_warnings():
+        show = warnings.showwarning
+
+        def say(message: Warning | str, category: type[Warning], *where: Any, **more: Any) -> None:
+            if issubclass(category, Caution):
+                typer.echo(f"note: {printable(str(message))}", err=True)
+            else:
+                show(message, category, *where, **more)
+
+        warnings.showwarning = say
+        yield

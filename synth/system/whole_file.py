@@ -81,6 +81,8 @@ def made_folder(path: Path, room_bytes: int = 0) -> Iterator[None]:
         for one in made:
             try:
                 one.rmdir()
+            except FileNotFoundError:  # the block has done so
+                continue
             except OSError:  # something else is in it by now, or it was never made
                 break
         raise

@@ -196,6 +196,8 @@ def _aside(render: Render, rng: np.random.Generator) -> tuple[float, float]:
 
 
 def _distort(flat: Floats, distortion: Floats) -> Floats:
+    if not distortion.any():
+        return flat
     k1, k2, p1, p2, k3 = distortion
     x, y = flat[:, 0], flat[:, 1]
     r2 = x * x + y * y

@@ -13,7 +13,7 @@ import pytest
 import torch
 from typer.testing import CliRunner
 
-from learn.checkpoint import Card, save_tensors, write_card
+from learn.checkpoint import Card, write_model
 from learn.cli import app
 from learn.data.clips import Clip
 from learn.data.grid import Grid
@@ -53,8 +53,7 @@ def model(
                 conv.weight.normal_(0, 200.0)  # type: ignore[union-attr,operator]
         if isinstance(net, D2FNet) and net.film is not None:
             net.film.weight.normal_(0, 0.2)
-    write_card(out, Card(settings, measure_scales(clips, settings), 1.2, {}, {}))
-    save_tensors(out / "weights.pt", net.state_dict())
+    write_model(out, Card(settings, measure_scales(clips, settings), 1.2, {}, {}), net.state_dict())
     return out
 
 
