@@ -65,7 +65,7 @@ def solve_path(system: System, loads: Floats, named: Floats) -> Path:
         if system.law == "linear":
             u = linear(load)
             state = system.state(u)
-            residual[step] = np.linalg.norm(_on_free(system, load - state.force)) / np.sqrt(peak_squared)
+            residual[step] = np.linalg.norm(on_free(system, load - state.force)) / np.sqrt(peak_squared)
         else:
             factor = float(np.vdot(load, peak)) / peak_squared
             proportional = float(np.abs(load - factor * peak).max()) <= 1e-9 * float(np.abs(peak).max())
@@ -157,7 +157,7 @@ def minimise_energy(
     u, state = start, system.state(start)
     if not np.isfinite(state.energy):
         u, state = safe, system.state(safe)
-    gradient = _on_free(system, state.force - load)
+    gradient = on_free(system, state.force - load)
     history: list[tuple[Floats, Floats, float]] = []
     norm = np.inf
     for _ in range(_ITERATIONS):
@@ -183,7 +183,7 @@ def minimise_energy(
             length *= 0.5
         else:
             break
-        trial_gradient = _on_free(system, trial_state.force - load)
+        trial_gradient = on_free(system, trial_state.force - load)
         s, y = length * direction, trial_gradient - gradient
         curvature = float(np.vdot(s, y))
         if curvature > 1e-12 * float(np.sqrt(np.vdot(s, s) * np.vdot(y, y))):
@@ -232,7 +232,7 @@ def _interpolate_states(known: list[tuple[float, Floats]], factor: float, at_pea
     return value
 
 
-def _on_free(system: System, force: Floats) -> Floats:
+def on_free(system: System, force: Floats) -> Floats:
     """The force without what the walls take."""
     out = np.zeros(force.size)
     out[system.free] = force.ravel()[system.free]
