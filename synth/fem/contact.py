@@ -1,20 +1,23 @@
 """A rigid tip on soft tissue: unilateral contact with Coulomb friction, condensed to where the two may meet.
 
-The skin under a tip is divided into P overlapping patches. With y their mean displacement, f the forces on them and
-C their compliance by the stiffness at rest,
+The skin under a tip is divided into P overlapping patches. With y their mean displacement, f the forces on
+them and C their compliance by the stiffness at rest,
 
     y = y0 + C f,    f = f(y - d),    W' f = Q,
 
-y0 being what all else does (other loads, the law's nonlinear part), d the tip's displacement, which is free along the
-axes W, where the force Q is given. The contact's law f is stiff springs (penalty): pressure in proportion to
-penetration, none in tension; along the surface a spring up to Coulomb's limit, held between steps by an anchor
-(return mapping: Simo & Laursen, Comput. Struct. 42, 1992; Wriggers, Computational Contact Mechanics, 2006, ch. 5).
-Solved by a semi-smooth Newton method, each of whose steps is over the patches in contact.
+y0 being what all else does (other loads, the law's nonlinear part), d the tip's displacement, which is free
+along the axes W, where the force Q is given. The contact's law f is stiff springs (penalty): pressure in
+proportion to
+penetration, none in tension; along the surface a spring up to Coulomb's limit, held between steps by an
+anchor (return mapping: Simo & Laursen, Comput. Struct. 42, 1992; Wriggers, Computational Contact Mechanics,
+2006,
+ch. 5). Solved by a semi-smooth Newton method, each of whose steps is over the patches in contact.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 import scipy.sparse as sp
@@ -24,6 +27,7 @@ from synth.errors import UserError
 from synth.fem.equilibrium import NoEquilibrium
 from synth.fem.surface_embedding import Embedding
 from synth.fem.system import System
+from synth.job.law_limits import SPHERE
 
 Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -34,6 +38,7 @@ _CONE = 0.7  # of the rounding's height; above it the tip goes on nearly straigh
 _SPRING = 200.0  # times E/a: what it adds to the depth of a flat tip is 0.76 E/a over it, 0.4%
 _NEAR = 0.03  # times a: how deep a tip that has to press, but touches nothing, is set
 _ITERATIONS, _LENGTHS = 60, (1.0, 0.5, 0.25, 0.1)
+_WORSE = 0.95  # of an error is what a step has to leave at most, or it is shortened
 _AT_ONCE = 24  # loads
 _CLOSE = 1e-9  # of the tip's radius (gaps) and of the load (forces)
 
@@ -51,16 +56,16 @@ class Tip:
 
     flat_mm: float
     edge_mm: float
+    radius_mm: float
+    """a, about how wide it touches when it presses hardest: what the contact's springs go by."""
 
     @classmethod
     def named(cls, shape: str, radius_mm: float) -> Tip:
-        """`flat`, with an edge of `EDGE` of its radius, or `sphere`."""
-        edge = radius_mm if shape == "sphere" else EDGE * radius_mm
-        return cls(radius_mm - edge, edge)
-
-    @property
-    def radius_mm(self) -> float:
-        return self.flat_mm + self.edge_mm
+        """Of a contact's radius a: `flat`, its edge rounded by `EDGE` a, or `sphere`, of radius `SPHERE`
+        a."""
+        if shape == "sphere":
+            return cls(0.0, SPHERE * radius_mm, radius_mm)
+        return cls((1 - EDGE) * radius_mm, EDGE * radius_mm, radius_mm)
 
     def gap(self, at: Floats) -> tuple[Floats, Floats, Floats]:
         """Distance from the tip.
@@ -166,6 +171,11 @@ def divide(
     """
     around = reach_mm + 1.5 * spacing_mm
     seen = np.flatnonzero(_away(vertices[:, :2], places) <= around)
+    if len(seen) < 3:
+        raise UserError(
+            f"fem.footprint_mm: a tip of {reach_mm:.2g} mm touches fewer than 3 vertices of the surface; "
+            "raise it, or anatomy.vertices"
+        )
     spot = vertices[seen, :2] / spacing_mm
     low = np.floor(spot).astype(np.int64)
     part = spot - low
@@ -175,11 +185,6 @@ def divide(
     value = (tent * area[seen, None]).ravel()
     share = sp.coo_array((value, (patch.ravel(), np.repeat(np.arange(len(seen)), 4)))).tocsr()
     share = share[(_away(spacing_mm * grid, places) <= reach_mm) & (share.sum(axis=1) > 0)]
-    if len(seen) < 3 or share.shape[0] == 0:
-        raise UserError(
-            f"fem.footprint_mm: a tip of {reach_mm:.2g} mm touches fewer than 3 vertices of the surface; "
-            "raise it, or anatomy.vertices"
-        )
     own = Embedding(carry.value[seen], carry.corner[seen], carry.mean, carry.spin, carry.arm[seen])
     rest = np.asarray((share @ vertices[seen]) / share.sum(axis=1)[:, None])
     offsets = _spread(share, vertices[seen], rest)
@@ -192,7 +197,8 @@ def _away(at: Floats, places: Floats) -> Floats:
 
 
 def _spread(share: sp.csr_array, vertices: Floats, rest: Floats) -> Floats:
-    """Places (P, 9, 3) mm about patches' middles with the patches' own second moments, in the skin's slope."""
+    """Places (P, 9, 3) mm about patches' middles with the patches' own second moments, in the skin's
+    slope."""
     weight = share.sum(axis=1)
     pairs = (vertices[:, :, None] * vertices[:, None]).reshape(-1, 9)
     moment = (share @ pairs / weight[:, None]).reshape(-1, 3, 3) - rest[:, :, None] * rest[:, None]
@@ -214,7 +220,8 @@ def _without_slivers(share: sp.csr_array, least_mm2: float) -> sp.csr_array:
 
 @dataclass(frozen=True, eq=False)
 class Condensed:
-    """What forces on all patches do to the nodes and to the patches, by the stiffness at rest, for E = 1 kPa."""
+    """What forces on all patches do to the nodes and to the patches, by the stiffness at rest, for E = 1
+    kPa."""
 
     patches: tuple[Patches, ...]
     """One set a tip."""
@@ -323,7 +330,12 @@ class Touch:
 
 
 def touch(
-    solid: Condensed, poses: tuple[Pose | None, ...], y0: Floats, hold: Hold, drive: tuple[Floats, ...]
+    solid: Condensed,
+    poses: tuple[Pose | None, ...],
+    y0: Floats,
+    hold: Hold,
+    drive: tuple[Floats, ...],
+    start: Floats | None = None,
 ) -> Touch:
     """Solves the contact.
 
@@ -333,13 +345,14 @@ def touch(
         y0: (P, 3) mm, displacement of the patches without the tips.
         hold: from the step before.
         drive: (k,) mm a tip, where to begin.
+        start: (P, 3) mm, where to begin with the patches; empty: without contact.
 
     Raises:
         NoEquilibrium: Newton's method has not settled.
     """
     meeting = _Meeting(solid, poses, hold)
-    y, q = y0, meeting.bring_near(y0, np.concatenate([np.zeros(0), *drive]))
-    force, slope = meeting.forces(y, q)
+    y, q = y0 if start is None else start, np.concatenate([np.zeros(0), *drive])
+    q, force, slope = meeting.forces(y, q)
     error = meeting.error(y0, y, force)
     for _ in range(_ITERATIONS):
         if error <= 1:
@@ -348,14 +361,14 @@ def touch(
         dy = y0 + (solid.compliance @ new.ravel()).reshape(-1, 3) - y
         trials = []
         for length in _LENGTHS:
-            at, by = y + length * dy, meeting.bring_near(y + length * dy, q + length * dq)
-            force, slope = meeting.forces(at, by)
+            at = y + length * dy
+            by, force, slope = meeting.forces(at, q + length * dq)
             trials.append((meeting.error(y0, at, force), at, by, force, slope))
-            if trials[-1][0] < (1 - 0.1 * length) * error:
+            if trials[-1][0] < _WORSE * error:
                 break
         else:
             trials.sort(key=lambda t: t[0])
-        error, y, q, force, slope = trials[-1] if trials[-1][0] < error else trials[0]
+        error, y, q, force, slope = trials[-1] if trials[-1][0] < _WORSE * error else trials[0]
     raise NoEquilibrium("the contact between tip and tissue does not settle")
 
 
@@ -368,7 +381,7 @@ class _Meeting:
         self._own = [np.flatnonzero(solid.owner == k) for k in range(len(poses))]
         widths = [0 if pose is None else pose.free.shape[1] for pose in poses]
         ends = np.cumsum([0, *widths])
-        self._columns = [slice(a, b) for a, b in zip(ends[:-1], ends[1:], strict=True)]
+        self._columns = [slice(a, b) for a, b in pairwise(ends)]
         self._axes = np.zeros((len(self._rest), 3, int(ends[-1])))
         self._asked = np.zeros(int(ends[-1]))
         for own, pose, columns in zip(self._own, poses, self._columns, strict=True):
@@ -387,20 +400,12 @@ class _Meeting:
         """Mean over the k-th tip's patches of `Tip.gap`, their middles being at (n, 3) mm in its axes."""
         return mean_gap(pose.tip, at, self._offsets[self._own[k]] @ pose.turn.T)
 
-    def bring_near(self, y: Floats, q: Floats) -> Floats:
-        """A tip that has to press but touches nothing is moved until it does."""
-        q = q.copy()
-        for k, pose in enumerate(self._poses):
-            if pose is None or not pose.free.shape[1]:
-                continue
-            least = float(self._gap(k, pose, self._seen(k, pose, y, q))[0].min())
-            if least >= 0:
-                way = -pose.free.T @ pose.turn[2]
-                q[self._columns[k]] += (least + _NEAR * pose.tip.radius_mm) * way / (way @ way)
-        return q
+    def forces(self, y: Floats, q: Floats) -> tuple[Floats, Floats, Floats]:
+        """Forces on the patches (P, 3) mN and their derivative by the patches' places (P, 3, 3) mN/mm.
 
-    def forces(self, y: Floats, q: Floats) -> tuple[Floats, Floats]:
-        """Forces on the patches (P, 3) mN and their derivative by the patches' places (P, 3, 3) mN/mm."""
+        A tip that has to press, but touches nothing, is moved until it does: the first that is given back is
+        the drive with that in it.
+        """
         force, slope = np.zeros_like(self._rest), np.zeros((len(self._rest), 3, 3))
         for k, pose in enumerate(self._poses):
             if pose is None:
@@ -408,6 +413,12 @@ class _Meeting:
             own = self._own[k]
             at = self._seen(k, pose, y, q)
             gap, normal, bend = self._gap(k, pose, at)
+            if pose.free.shape[1] and gap.min() >= 0:
+                way = -pose.free.T @ pose.turn[2]
+                q = q.copy()
+                q[self._columns[k]] += (gap.min() + _NEAR * pose.tip.radius_mm) * way / (way @ way)
+                at = self._seen(k, pose, y, q)
+                gap, normal, bend = self._gap(k, pose, at)
             on = np.flatnonzero(gap < 0)
             spring = _SPRING / pose.tip.radius_mm * self._area[own[on]]
             f, d = _press(gap[on], normal[on], bend[on], spring, self._area[own[on]])
@@ -418,7 +429,7 @@ class _Meeting:
                 f, d = f + rub, d + d_rub
             force[own[on]] = f @ pose.turn
             slope[own[on]] = pose.turn.T @ d @ pose.turn
-        return force, slope
+        return q, force, slope
 
     def _slid(self, k: int, pose: Pose, on: NDArray[np.int64], at: Floats) -> tuple[Floats, Floats]:
         """What springs along the surface are stretched by (n, 3) mm, and its derivative by the place (n,).
@@ -459,11 +470,14 @@ class _Meeting:
         whole[n:, :n] = np.einsum("pik,pij->kpj", axes, d).reshape(free, n)
         whole[n:, n:] = -np.einsum("pik,pil->kl", axes, d_axes)
         right = np.append(self._misfit(y0, y, force)[on].ravel(), self._amiss(force))
-        step = np.linalg.solve(whole, right)
+        try:
+            step = np.linalg.solve(whole, right)
+        except np.linalg.LinAlgError:
+            raise NoEquilibrium("the contact between tip and tissue does not settle") from None
         dq = step[n:]
         new = force.copy()
         new[on] += np.einsum("pij,pj->pi", d, step[:n].reshape(-1, 3) - axes @ dq)
-        return new, dq
+        return new, np.asarray(dq, np.float64)
 
     def result(self, y: Floats, q: Floats, force: Floats) -> Touch:
         """The step's end: patches that slip take their anchors with them."""
@@ -491,9 +505,7 @@ def _unit(vectors: Floats) -> Floats:
     return np.asarray(vectors / np.linalg.norm(vectors, axis=1, keepdims=True))
 
 
-def _press(
-    gap: Floats, normal: Floats, bend: Floats, spring: Floats, area: Floats
-) -> tuple[Floats, Floats]:
+def _press(gap: Floats, normal: Floats, bend: Floats, spring: Floats, area: Floats) -> tuple[Floats, Floats]:
     """Normal forces (n, 3) mN of patches inside the tip, and their derivative (n, 3, 3) mN/mm.
 
     In the derivative pressure is at most E, or a tip that starts too deep would throw tissue aside.

@@ -71,7 +71,7 @@ def solve_path(system: System, loads: Floats, named: Floats) -> Path:
             proportional = float(np.abs(load - factor * peak).max()) <= 1e-9 * float(np.abs(peak).max())
             last = path[-1][0] if path else np.zeros_like(load)
             start = (
-                _interpolate_states(known, factor, at_peak)
+                interpolate_states(known, factor, at_peak)
                 if proportional
                 else last + linear(load - loads[step - 1])
             )
@@ -217,7 +217,7 @@ def _two_loop_recursion(
     return r
 
 
-def _interpolate_states(known: list[tuple[float, Floats]], factor: float, at_peak: Floats) -> Floats:
+def interpolate_states(known: list[tuple[float, Floats]], factor: float, at_peak: Floats) -> Floats:
     """The state at a load factor, through the three nearest known: elastic states depend on nothing else."""
     nearest = sorted(known, key=lambda k: abs(k[0] - factor))[:3]
     if len(nearest) == 1:

@@ -1,8 +1,10 @@
-"""Rigid tips over the frames of a sequence: where they are driven, the tissue's equilibrium, what they press with.
+"""Rigid tips over the frames of a sequence: where they are driven, the tissue's equilibrium, what they press
+with.
 
-The law's nonlinear part goes into the contact's free displacement and is corrected from outside: with K the stiffness
-at rest, u <- K^-1 (load + contact's forces + K u - force(u)), sped up by Anderson's mixing (Walker & Ni, SIAM J. Numer.
-Anal. 49, 2011) in the norm of K.
+The law's nonlinear part goes into the contact's free displacement and is corrected from outside: with K the
+stiffness at rest, u <- K^-1 (load + contact's forces + K u - force(u)), sped up by Anderson's mixing (Walker
+& Ni,
+SIAM J. Numer. Anal. 49, 2011) in the norm of K.
 """
 
 from __future__ import annotations
@@ -16,7 +18,7 @@ from numpy.typing import NDArray
 from synth.errors import UserError
 from synth.fem import contact, tool
 from synth.fem.contact import Condensed, Hold, Patches, Pose, Tip, Touch, mean_gap
-from synth.fem.equilibrium import TOLERANCE, NoEquilibrium, Path, check_state, on_free
+from synth.fem.equilibrium import TOLERANCE, NoEquilibrium, Path, check_state, interpolate_states, on_free
 from synth.fem.material import Tissue
 from synth.fem.surface_embedding import Embedding
 from synth.fem.system import State, System
@@ -26,8 +28,11 @@ from synth.job.law_limits import LARGEST_LOAD, RIGID_GESTURES, depth_of_load
 
 Floats = NDArray[np.float64]
 
-_SPACING, _MOST = 0.2, 110.0  # of patches, as a part of the radius; coarser where a slide would need more of them
-_REACH = {"flat": 1.05, "sphere": 0.9}  # of the radius: where a tip may touch
+_SPACING, _MOST = (
+    0.2,
+    110.0,
+)  # of patches, as a part of the radius; coarser where a slide would need more of them
+_REACH = 1.05  # of the radius: where a tip may touch
 _MEMORY, _ROUNDS, _CUTS = 6, 40, 4
 
 
@@ -49,6 +54,12 @@ class Drive:
     """(T,) mN along it, for E = 1 kPa; None: the depth is given."""
     depth: Floats | None
     """(T,) mm along it."""
+
+    def part(self, t: int) -> float:
+        """How much of its largest force or depth is asked for in frame t."""
+        course = self.force if self.depth is None else self.depth
+        assert course is not None
+        return float(course[t] / max(course.max(), 1e-300))
 
     def pose(self, t: int) -> Pose | None:
         """In frame t; None while it is away."""
@@ -124,8 +135,7 @@ def press_skin(
         share = solid.area[own] / solid.area[own].sum()
         most[own] = np.outer(share, g.load * g.footprint_mm**2 * one.way)
     peak = loads[np.abs(loads).max(axis=(1, 2)).argmax()] + solid.gather(most)
-    scale = float(np.sqrt(np.vdot(peak, system.solve(peak)))) or 1.0
-    path, found, middle = press(system, solid, tips, loads, named, scale)
+    path, found, middle = press(system, solid, tips, loads, named, peak)
     traction = np.zeros((len(loads), *skin.vertices.shape))
     force = np.zeros((len(loads), len(tips), 3))
     ends = np.zeros((len(loads), len(tips), 2, 3))
@@ -145,8 +155,8 @@ def _check_depth(fem: schema.Fem, tissue: Tissue, gesture: Gesture, force: Float
     t, largest = int(size.argmax()), LARGEST_LOAD[tissue.law]
     if fem.depth_mm is not None and size[t] > largest:
         raise UserError(
-            f"frame {t}: the depth asked for takes a load of {size[t]:.3g}, past the range of the {tissue.law} "
-            f"law, {largest:g}; lower fem.depth_mm"
+            f"frame {t}: the depth asked for takes a load of {size[t]:.3g}, past the range of the "
+            f"{tissue.law} law, {largest:g}; lower fem.depth_mm"
         )
 
 
@@ -156,12 +166,10 @@ def _within(turn: Floats, aside: Floats) -> Floats:
     return np.asarray(flat * (np.linalg.norm(aside) / np.linalg.norm(flat, axis=1))[:, None])
 
 
-def cover(
-    fem: schema.Fem, gesture: Gesture, over: Course, skin: Skin, owner: int = 0
-) -> Patches:
+def cover(fem: schema.Fem, gesture: Gesture, over: Course, skin: Skin, owner: int = 0) -> Patches:
     """Patches wherever a gesture's tip may touch the skin; `owner` is the tip's number."""
     radius = gesture.footprint_mm
-    reach = _REACH[fem.tip] * radius
+    reach = _REACH * radius
     length = float(np.hypot(*gesture.path_mm))
     swept = np.pi * reach**2 + 2 * reach * length
     places = np.asarray(gesture.contacts[0].point_mm) + np.unique(over.shift, axis=0)
@@ -172,8 +180,10 @@ def cover(
 def drive(fem: schema.Fem, tissue: Tissue, gesture: Gesture, over: Course, skin: Patches) -> Drive:
     """How a gesture drives its tip.
 
-    A push or tap moves along its direction until the force along it is met, held aside by the hand; a slide is
-    pressed straight down and moved along its path. The tip's axis is the normal of the surface's mean plane under it.
+    A push or tap moves along its direction until the force along it is met, held aside by the hand; a slide
+    is pressed straight down and moved along its path. The tip's axis is the normal of the surface's mean
+    plane
+    under it.
 
     Args:
         fem: the job's section.
@@ -220,7 +230,7 @@ def _lay(tip: Tip, at: Floats, skin: Patches) -> tuple[Floats, Floats]:
 
 
 def press(
-    system: System, solid: Condensed, tips: Sequence[Drive], loads: Floats, named: Floats, scale: float
+    system: System, solid: Condensed, tips: Sequence[Drive], loads: Floats, named: Floats, peak: Floats
 ) -> tuple[Path, Floats, Floats]:
     """Equilibrium of tissue, tips and other loads, frame by frame.
 
@@ -230,17 +240,20 @@ def press(
         tips: K, one for each of the patches' owners.
         loads: (T, N, 3) mN of whatever else there is, for E = 1 kPa.
         named: (T,) P = F/(E a^2) of each frame, for messages.
-        scale: sqrt(mN mm), the size of the load in the norm of the inverse stiffness.
+        peak: (N, 3) mN, about what the largest load is; equilibrium is to a part of it.
 
     Returns:
-        The volume's states; forces on the patches (T, P, 3) mN for E = 1 kPa; where the tips' lowest points were
-        (T, K, 3) mm, or, while they are away, would touch.
+        The volume's states; forces on the patches (T, P, 3) mN for E = 1 kPa; where the tips' lowest points
+        were (T, K, 3) mm, or, while they are away, would touch.
 
     Raises:
         InvertedElement, NotFinite: as `equilibrium.solve_path`.
         NoEquilibrium: the iteration stalled; names frame and load.
     """
     count = len(solid.owner)
+    at_peak = system.solve(peak)
+    scale = float(np.sqrt(np.vdot(peak, at_peak))) or 1.0
+    known = [(0.0, np.zeros_like(peak))]
     at = _Standing(np.zeros_like(loads[0]), None, Hold.none(count), tuple(np.zeros(0) for _ in tips), 0.0)
     before: _Asked = _Asked(tuple(None for _ in tips), np.zeros_like(loads[0]))
     steps: list[tuple[Floats, State, float, float]] = []
@@ -248,6 +261,10 @@ def press(
     middle = np.stack([one.origin for one in tips], axis=1)
     for t, load in enumerate(loads):
         asked = _Asked(tuple(one.pose(t) for one in tips), load)
+        factor = tips[0].part(t)
+        if len(tips) == 1 and not load.any() and not np.ptp(tips[0].origin, axis=0).any():
+            # But for friction's past, elastic states depend on the load alone.
+            at = replace(at, guess=interpolate_states(known, factor, at_peak))
         try:
             at = _advance(system, solid, at, before, asked, TOLERANCE * scale, _CUTS)
         except NoEquilibrium as stalled:
@@ -256,6 +273,8 @@ def press(
         least = check_state(system, at.u, at.state, t, float(named[t]))
         steps.append((at.u, at.state, least, at.norm / scale))
         forces[t] = at.force(count)
+        if all(abs(factor - one) > 1e-3 for one, _ in known):
+            known.append((factor, at.u))
         for k, pose in enumerate(asked.poses):
             if pose is not None:
                 middle[t, k] = pose.origin + pose.free @ at.drive[k]
@@ -278,7 +297,7 @@ class _Asked:
 
     def after(self, before: _Asked, share: float) -> _Asked:
         """A part of the way here."""
-        poses = []
+        poses: list[Pose | None] = []
         for old, new in zip(before.poses, self.poses, strict=True):
             if new is None:
                 poses.append(None)
@@ -306,6 +325,8 @@ class _Standing:
     drive: tuple[Floats, ...]
     norm: float
     touch: Touch | None = None
+    guess: Floats | None = None
+    """(N, 3) mm, where to look for the next."""
 
     def force(self, count: int) -> Floats:
         """(P, 3) mN."""
@@ -327,14 +348,13 @@ def _advance(
     except NoEquilibrium:
         if cuts == 0:
             raise
+    at = replace(at, guess=None)
     half = asked.after(before, 0.5)
     middle = _advance(system, solid, at, before, half, tolerance, cuts - 1)
     return _advance(system, solid, middle, half, asked, tolerance, cuts - 1)
 
 
-def _settle(
-    system: System, solid: Condensed, at: _Standing, asked: _Asked, tolerance: float
-) -> _Standing:
+def _settle(system: System, solid: Condensed, at: _Standing, asked: _Asked, tolerance: float) -> _Standing:
     """Equilibrium of one step.
 
     Raises:
@@ -346,12 +366,16 @@ def _settle(
         else old
         for pose, old in zip(asked.poses, at.drive, strict=True)
     )
-    u, state = at.u, at.state or system.state(at.u)
+    u = at.u if at.guess is None else at.guess
+    state = system.state(u)
+    if not np.isfinite(state.energy):
+        u, state = at.u, system.state(at.u)
     mixed: list[tuple[Floats, Floats, Floats]] = []
+    start = None if at.touch is None else at.touch.moved
     for _ in range(_ROUNDS):
         free = system.solve(asked.load - state.force)
-        met = contact.touch(solid, asked.poses, solid.move(u + free), at.hold, drive)
-        drive = met.drive
+        met = contact.touch(solid, asked.poses, solid.move(u + free), at.hold, drive, start)
+        drive, start = met.drive, met.moved
         step = free + solid.pushed(met.force)
         out = on_free(system, asked.load + solid.gather(met.force) - state.force)
         norm = max(float(np.vdot(out, step)), 0.0) ** 0.5
@@ -364,7 +388,8 @@ def _settle(
 
 
 def _mix(mixed: list[tuple[Floats, Floats, Floats]]) -> Floats:
-    """Anderson's next state (N, 3) mm from states, the fixed-point steps there, and these times the stiffness."""
+    """Anderson's next state (N, 3) mm from states, the fixed-point steps there, and these times the
+    stiffness."""
     u, step, out = mixed[-1]
     if len(mixed) == 1:
         return u + step

@@ -138,9 +138,9 @@ class Fem(Section):
     ] = ("pull", "push", "slide", "grasp", "retract", "tap")
     """Kinds of gesture that sequences are drawn from, in equal shares."""
     contact: Literal["traction", "rigid"] = "traction"
-    """How an instrument loads tissue: a given traction, or (push, slide and tap) a rigid tip that presses and rubs."""
+    """What loads tissue: a given traction or, for push, slide and tap, a rigid tip that presses and rubs."""
     tip: Literal["flat", "sphere"] = "flat"
-    """Rigid contact: a flat end of radius a, its edge rounded by a quarter of it, or a sphere of radius a."""
+    """Rigid contact: a flat end of radius a, its edge rounded by a / 4, or a sphere of radius 2 a."""
     friction: Annotated[FiniteFloat, Field(ge=0, le=1)] = 0.2
     """Rigid contact: Coulomb's coefficient; 0.09-0.20, brain on metal (Rashid et al., J. Mech. Behav. Biomed.
     Mater. 14, 2012)."""
@@ -183,7 +183,9 @@ class Fem(Section):
             raise ValueError("contact: rigid is for quasi-static tissue without relaxation")
         if not set(self.gestures) & set(RIGID_GESTURES):
             raise ValueError(f"contact: rigid is for {', '.join(RIGID_GESTURES)}; name one in gestures")
-        if self.depth_mm is not None and (self.force_mn is not None or set(self.gestures) - set(RIGID_GESTURES)):
+        if self.depth_mm is not None and (
+            self.force_mn is not None or set(self.gestures) - set(RIGID_GESTURES)
+        ):
             raise ValueError(f"depth_mm is for {', '.join(RIGID_GESTURES)} alone, without force_mn")
         return self
 
@@ -195,8 +197,9 @@ class Fem(Section):
         if self.depth_mm is not None and load > largest:
             depth = depth_of_load(self.tip, largest, self.poisson) * self.footprint_mm[0]
             raise ValueError(
-                f"depth_mm {self.depth_mm[1]:g} under the smallest contact ({self.footprint_mm[0]:g} mm) takes a "
-                f"load of {load:.3g}, past the range of the {law} law; the largest valid value is {depth:.3g}"
+                f"depth_mm {self.depth_mm[1]:g} under the smallest contact ({self.footprint_mm[0]:g} mm) "
+                f"takes a load of {load:.3g}, past the range of the {law} law; the largest valid value is "
+                f"{depth:.3g}"
             )
         if self.force_mn is None and load > largest:
             raise ValueError(

@@ -209,7 +209,8 @@ def _seal(shooting: _Shooting) -> Path:
 def _mechanics(
     job: Job, case: Scenario, motion: Deformation, rotation: NDArray[np.float64]
 ) -> dict[str, Any]:
-    return {
+    contact = {} if job.fem.contact == "traction" else {"contact": job.fem.contact}
+    return contact | {
         "law": case.tissue.law,
         "elastic": job.fem.time == "quasi-static" and not job.fem.relaxation,
         "min_jacobian": motion.min_jacobian.tolist(),
