@@ -218,7 +218,7 @@ def _two_loop_recursion(
 
 
 def interpolate_states(known: list[tuple[float, Floats]], factor: float, at_peak: Floats) -> Floats:
-    """The state at a load factor, through the three nearest known: elastic states depend on nothing else."""
+    """The state (N, 3) mm at a load factor, through the three nearest known: it depends on no more."""
     nearest = sorted(known, key=lambda k: abs(k[0] - factor))[:3]
     if len(nearest) == 1:
         return factor * at_peak
@@ -233,7 +233,7 @@ def interpolate_states(known: list[tuple[float, Floats]], factor: float, at_peak
 
 
 def on_free(system: System, force: Floats) -> Floats:
-    """The force without what the walls take."""
+    """The force (N, 3) mN without what the walls take."""
     out = np.zeros(force.size)
     out[system.free] = force.ravel()[system.free]
     return out.reshape(-1, 3)

@@ -88,8 +88,8 @@ def limits(folder: Folder) -> list[str]:
     if job.fem.contact == "rigid":
         held = ", ".join(kind for kind in job.fem.gestures if kind not in RIGID_GESTURES)
         found.append(
-            f"Push, slide and tap are a rigid tip ({job.fem.tip}, friction {job.fem.friction:g}) in contact, as "
-            "wide as the footprint, not as the instrument that is seen"
+            f"Push, slide and tap are a rigid tip ({job.fem.tip}, friction {job.fem.friction:g}) in contact, "
+            "as wide as the footprint, not as the instrument that is seen"
             + (f"; {held}: a given traction." if held else ".")
         )
     load = job.fem.largest_load

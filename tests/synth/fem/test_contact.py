@@ -36,7 +36,7 @@ def drawn(section: schema.Fem, seed: int = 5) -> Gesture:
 def test_a_tips_gap_has_the_gradient_that_it_says(shape: str) -> None:
     tip = Tip.named(shape, 4.0)
     at = np.random.default_rng(0).uniform([-3.9, -3.9, -1], [3.9, 3.9, 0.6], (400, 3))
-    gap, normal, bend = tip.gap(at)
+    _, normal, bend = tip.gap(at)
     for axis in range(3):
         for side, values in ((normal[:, axis], 0), (bend[:, axis], 1)):
             step = np.zeros(3)
