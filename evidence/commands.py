@@ -52,6 +52,7 @@ COMMANDS = {
     "experiment relief": "evidence.fem.relief:relief",
     "experiment slides": "evidence.fem.slides:slides",
     "experiment half-space": "evidence.fem.half_space:half_space",
+    "experiment contact": "evidence.fem.contact:rigid",
     "stability damage": "evidence.engine.damage:damage",
     "experiment scale": "evidence.engine.large_index:scale",
     "stability dask": "evidence.engine.dask:dask",

@@ -251,6 +251,7 @@ _FILES: Mapping[str, tuple[str, str | Callable[[Tree], Page]]] = {
     "fem/relief": ("relief.json", "fem.relief"),
     "fem/slides": ("slides.json", "fem.slides"),
     "fem/half-space": ("half-space.json", "fem.half_space"),
+    "fem/contact": ("contact.json", "fem.contact"),
     "render/realism": ("realism.json", realism),
     "render/stability": ("stability.json", "render.stability"),
 }

@@ -211,7 +211,8 @@ def _mechanics(
     job: Job, case: Scenario, motion: Deformation, rotation: NDArray[np.float64]
 ) -> dict[str, Any]:
     still = case.pulse is None
-    return {
+    contact = {} if job.fem.contact == "traction" else {"contact": job.fem.contact}
+    return contact | {
         "law": case.tissue.law,
         # Whether the tools' forces alone say what is stored.
         "elastic": job.fem.time == "quasi-static" and not job.fem.relaxation and still,
