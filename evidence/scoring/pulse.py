@@ -134,12 +134,14 @@ def record(
         own = beat(time, contact["phase"], size) - beat(float(times[0]), contact["phase"], size)
         moved = moved + beats * own / contact["mm_per_px"]
         # Where a point of this frame was at rest: by fixed point, for motion is given at rest.
-        back = moved
+        back = moved = moved.astype(np.float32)
         for _ in range(8):
-            at = [(axis - back[..., i]).astype(np.float32) for i, axis in enumerate((x, y))]
-            back = cv2.remap(moved.astype(np.float32), *at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        at = [(axis - back[..., i]).astype(np.float32) for i, axis in enumerate((x, y))]
-        rgb = cv2.remap(rest, *at, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
+            back = cv2.remap(
+                moved, x - back[..., 0], y - back[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+            )
+        rgb = cv2.remap(
+            rest, x - back[..., 0], y - back[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT
+        )
         noisy = np.clip(rgb + rng.normal(0, 1.5, rgb.shape), 0, 255).astype(np.uint8)
         cv2.imwrite(str(folder / "frames" / f"{k:04d}.png"), noisy[..., ::-1])
     inside = np.hypot(x - (size - 1) / 2, y - (size - 1) / 2) < 0.46 * size
