@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from synth.errors import UserError
-from synth.system.cli_errors import Commands
+from synth.system.cli_errors import Commands, printable
 
 if TYPE_CHECKING:
     from bench.scoring.evaluate_recording import Result
@@ -111,7 +111,7 @@ def check(
         print(json_.dumps({"usable": checking.is_usable(found), "findings": [asdict(f) for f in found]}))
     else:
         for finding in found:
-            print(f"{finding.state:<5}{finding.what:<11}{finding.said}")
+            print(printable(f"{finding.state:<5}{finding.what:<11}{finding.said}"))
     if not checking.is_usable(found):
         raise typer.Exit(2)
 

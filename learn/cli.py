@@ -77,9 +77,11 @@ def train_command(
     json: Json = False,
 ) -> None:
     """Train D2FNet on a dataset. An interrupted run is continued by the same command."""
+    from learn.checkpoint import room_needed
     from learn.settings import override
     from learn.settings import preset as named
     from learn.training.threads import set_threads
+    from synth.system.whole_file import made_folder
 
     set_threads(threads)
     options = {
@@ -100,8 +102,9 @@ def train_command(
     }
     given = [f"{k}={v}" for k, v in options.items() if v is not None]
     settings = override(named(preset), [*given, *(changes or [])])
-    clips, split, settings = _divided(dataset, settings, named(preset), cache, fixed=folds is not None)
-    card, first = _train(clips, split, settings, out, accelerator, devices, quiet=json)
+    with made_folder(out, room_needed(out, settings.arch)):
+        clips, split, settings = _divided(dataset, settings, named(preset), cache, fixed=folds is not None)
+        card, first = _train(clips, split, settings, out, accelerator, devices, quiet=json)
     if not first:
         return
     result = {"model": str(out), "epoch": card.epoch, "select_r2": card.score}
@@ -413,6 +416,7 @@ def _bar(what: str) -> Iterator[Callable[[int, int], None]]:
         TimeRemainingColumn(),
         console=_console,
         transient=True,
+        disable=not _console.is_terminal,  # in a log a bar is an empty line
     ) as progress:
         task = progress.add_task(what, total=None)
         yield lambda done, of: progress.update(task, completed=done, total=of)

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import linregress
 from sklearn.metrics import f1_score, mean_absolute_error, r2_score, root_mean_squared_error
+
+from learn.evaluation.metrics import Metric
 
 Curve = NDArray[np.float64]
 """(T,) float64."""
@@ -17,33 +18,6 @@ SURGICAL_FORCE_MN = 300.0
 """The 0.3 N below which 70% of tool-tissue forces in neurosurgery lie."""
 
 _LARGEST_LAG_S = 0.5
-
-
-class Metric(NamedTuple):
-    """One score: what it is called and how it is shown, wherever it is shown."""
-
-    name: str
-    unit: str
-    """As shown: mN, ms and % are made of mN, s and shares; empty for a number."""
-    about: str
-    best: Literal["low", "high", "zero", "one", ""] = ""
-    """Which value is the best; empty for what is no merit."""
-    digits: int = 3
-    """Behind the point in tables of plain text, in the score's own unit."""
-    relative: bool = False
-    """Whether a constant factor on the prediction leaves it as it is, or it speaks of the sensor alone."""
-    column: str = ""
-    """Heading in the report's table; empty: not there."""
-
-    @property
-    def heading(self) -> str:
-        """The name, with its unit if its numbers are shown without: those of force."""
-        return f"{self.name} [mN]" if self.unit == "mN" else self.name
-
-    @property
-    def cell_unit(self) -> str:
-        """What is written behind each number under a heading."""
-        return "" if self.unit == "mN" else self.unit
 
 
 METRICS = {

@@ -15,6 +15,7 @@ from bench.output import charts, machine, result_page
 from bench.output import write as results
 from bench.scoring.metrics import METRICS
 from synth.errors import UserError
+from synth.system import foreign_file
 
 SCORES = tuple(
     (key, METRICS[key].heading)
@@ -37,10 +38,10 @@ def read(paths: Sequence[Path]) -> list[dict[str, Any]]:
     for path in paths:
         file = path / "score.json" if path.is_dir() else path
         try:
-            tree = json.loads(file.read_text(encoding="utf-8"))
-        except (OSError, ValueError):
-            raise UserError(f"{path}: holds no readable score.json") from None
-        if tree.get("format") != "sulcus-score":
+            tree = foreign_file.read_json(file)
+        except UserError as error:
+            raise UserError(f"{path}: holds no readable score.json ({error})") from None
+        if not isinstance(tree, dict) or tree.get("format") != "sulcus-score":
             raise UserError(f"{path}: not written by `bench score`")
         found.append(tree)
     if not found:

@@ -23,8 +23,9 @@ from rich.table import Table
 from bench.scoring import charts, metrics
 from bench.scoring.evaluate_recording import Result
 from bench.scoring.headline import headline
-from bench.scoring.metrics import METRICS, Metric
+from bench.scoring.metrics import METRICS
 from bench.tracking.tracking import Snapshot
+from learn.evaluation.metrics import Metric
 from synth.dataset.folder import write_whole
 from synth.publish import picture
 

@@ -6,9 +6,10 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import partial
-from itertools import chain
+from itertools import chain, repeat
 from pathlib import Path
 from typing import Any, NamedTuple
+from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -94,20 +95,20 @@ def _stored(sequence: Sequence, source: str) -> Motion:
         raise UserError(f"unknown input {source!r}: {', '.join(FIELDS)}")
     if FIELDS[source] not in sequence:
         raise UserError(f"{sequence.path}: holds no {source} flow")
-    flow = sequence[FIELDS[source]]
+    scale, young = (sequence.attrs.get(name) for name in ("scale_mm_per_px", "young_kpa"))
+    if scale is None or young is None:
+        raise UserError(f"{sequence.path}: lacks the attribute young_kpa or scale_mm_per_px")
     sure = source == "recovered" and "flow_confidence" in sequence
-    confidence = sequence["flow_confidence"] if sure else None
-    time_s = sequence["time"][:]
+    given = sequence.read_sealed("flow_confidence") if sure else repeat(None, sequence.frames)
+    time_s, tissue, force = (sequence.read_whole(name) for name in ("time", "tissue", "force"))
+    frames = zip(sequence.read_sealed(FIELDS[source]), given, time_s, strict=True)
     return Motion(
         name=sequence.path.stem,
-        steps=(
-            Step(flow[t], None if confidence is None else confidence[t], t, float(time_s[t]))
-            for t in range(sequence.frames)
-        ),
-        tissue=sequence["tissue"][:].astype(bool),
-        scale_mm_per_px=float(sequence.attrs["scale_mm_per_px"]),
-        young_kpa=float(sequence.attrs["young_kpa"]),
-        force_mn=np.linalg.norm(sequence["force"][:], axis=1),
+        steps=(Step(flow, confidence, t, float(at)) for t, (flow, confidence, at) in enumerate(frames)),
+        tissue=tissue.astype(bool),
+        scale_mm_per_px=float(scale),
+        young_kpa=float(young),
+        force_mn=np.linalg.norm(force, axis=1),
     )
 
 
@@ -161,7 +162,7 @@ def _arrays(path: Path) -> Motion:
     try:
         with np.load(path, allow_pickle=False) as file:
             found = {name: file[name] for name in file.files}
-    except (OSError, ValueError, EOFError) as error:
+    except (OSError, ValueError, EOFError, BadZipFile) as error:
         raise UserError(f"{path}: cannot be read as .npz ({error})") from None
     missing = {"flow", "tissue", "scale_mm_per_px"} - found.keys()
     if missing:
