@@ -30,6 +30,7 @@ app = typer.Typer(
 
 Backend = Annotated[str, typer.Option(help="Flow estimator, as in a job's flow.backend.")]
 Young = Annotated[float | None, typer.Option(help="Young's modulus of the tissue [kPa], if known.")]
+Phantom = Annotated[bool, typer.Option("--phantom", help="It shows a phantom: forces beyond 50 N are meant.")]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")]
 
 
@@ -64,6 +65,7 @@ def score(
         Path | None, typer.Option(help="The model's training data: simpler methods are fitted on it too.")
     ] = None,
     also: Annotated[list[str] | None, typer.Option(help="A further model, as NAME=FOLDER.")] = None,
+    phantom: Phantom = False,
     json: Json = False,
 ) -> None:
     """Force from a recording's video, scored against its sensor: score.json and report.html."""
@@ -72,7 +74,7 @@ def score(
 
     others = {name: Path(folder) for name, folder in _pairs("--also", also, "NAME=FOLDER").items()}
     settings = Settings(backend=flow, shrink=shrink, rate_hz=rate or None, pulse=pulse)
-    result = commands.score_recording(recording, model, out, settings, title, train, others)
+    result = commands.score_recording(recording, model, out, settings, title, train, others, phantom)
     _say(result, out or Path(f"{result.recording}-score"), json)
 
 
@@ -96,6 +98,7 @@ def pool(
 @app.command(epilog="Example: bench check recording")
 def check(
     recording: Annotated[Path, typer.Argument(help="Recording folder.")],
+    phantom: Phantom = False,
     json: Json = False,
 ) -> None:
     """Says what of a recording is usable and what is missing. Exit code 2 if nothing is."""
@@ -103,7 +106,7 @@ def check(
 
     from bench.recording import check as checking
 
-    found = checking.check_recording(recording)
+    found = checking.check_recording(recording, phantom)
     if json:
         print(json_.dumps({"usable": checking.is_usable(found), "findings": [asdict(f) for f in found]}))
     else:
@@ -118,14 +121,17 @@ def check(
 )
 def import_(
     source: Annotated[
-        Path, typer.Argument(help="A .mha or .igs.mha sequence, .bag, .mcap, .db3, ROS 2 bag folder or .h5.")
+        Path,
+        typer.Argument(help="A .mha, .bag, .mcap, .db3, ROS 2 bag folder, .h5, folder of pictures or .npy."),
     ],
     out: Annotated[Path, typer.Option("--out", "-o", help="Recording folder to write.")],
     scale: Annotated[float | None, typer.Option(help="mm a pixel; else fill in meta.yaml.")] = None,
     young: Young = None,
     use: Annotated[
         list[str] | None,
-        typer.Option(help="ROLE=NAME where there is a choice: frames, frame_time, force, force_time, tip."),
+        typer.Option(
+            help="ROLE=NAME where one is to be named: frames, frame_time, force, force_time, tip, fps."
+        ),
     ] = None,
     newtons: Annotated[
         float, typer.Option(min=1e-6, help="Newtons in the source's unit of force: 0.001 if it is in mN.")
@@ -234,22 +240,27 @@ def flow(
     first: Annotated[Path, typer.Argument(help="Picture at rest.")],
     second: Annotated[Path, typer.Argument(help="Picture after the motion.")],
     truth: Annotated[
-        Path | None, typer.Argument(help="True flow: .flo (Middlebury) or .png (KITTI). Empty: not scored.")
+        Path | None, typer.Argument(help="True flow: .flo, .png (KITTI) or .npz. Empty: not scored.")
     ] = None,
     flow: Backend = "tvl1",
     glare: Annotated[bool, typer.Option("--glare/--no-glare", help="Mask highlights first.")] = False,
-    out: Annotated[Path | None, typer.Option("--out", "-o", help="Write the flow: .flo or .png.")] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="File for the flow: .flo, .png, .npz.")
+    ] = None,
     json: Json = False,
 ) -> None:
     """Flow between any two pictures, scored against a flow file."""
     from bench.flow import pair
 
-    found = pair.score_pair(first, second, truth, flow, glare, out)
+    moved, found = pair.score_pair(first, second, truth, flow, glare, out)
     if json:
-        typer.echo(json_.dumps(pair.as_dict(found, out)))
-    elif found is None:
-        typer.echo(f"written to {out}" if out else "nothing asked for: give a truth or --out")
-    else:
+        typer.echo(json_.dumps(pair.as_dict(moved, found, out)))
+        return
+    lengths = f"mean |flow| {moved.mean_px:.3f} px, 98% within {moved.p98_px:.3f} px"
+    typer.echo(f"{lengths}, confidence {moved.confidence:.2f}")
+    if out is not None:
+        typer.echo(f"written to {out}")
+    if found is not None:
         typer.echo(
             f"EPE {found.epe:.3f} px, 95% within {found.p95:.3f} px, outliers {found.outliers:.1%}; "
             f"{found.trusted:.0%} trusted, EPE {found.trusted_epe:.3f} px there"

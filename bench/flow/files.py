@@ -1,7 +1,8 @@
-"""Flow on disk: Middlebury `.flo` and KITTI 16-bit PNG."""
+"""Flow on disk: Middlebury `.flo`, KITTI 16-bit PNG, and NumPy's `.npz` with the confidence beside it."""
 
 from __future__ import annotations
 
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from synth.errors import UserError
 from synth.system import foreign_file, foreign_picture
 from synth.system.foreign_picture import LARGEST_PIXELS
 
+_FORMATS = "{}: flow files are .flo (Middlebury), .png (KITTI) or .npz"
 _UNKNOWN = 1e9  # px: Middlebury marks what isn't known by larger values
 
 Floats = NDArray[np.float32]
@@ -20,21 +22,25 @@ Flags = NDArray[np.bool_]
 
 
 def read_flow(path: Path) -> tuple[Floats, Flags]:
-    """Flow (H, W, 2) float32 px and where it is known (H, W); by suffix, `.flo` or `.png`.
+    """Flow (H, W, 2) float32 px and where it is known (H, W); by suffix, `.flo`, `.png` or `.npz`.
 
     Raises:
         UserError: no such format, or a file that isn't what its name says.
     """
-    readers = {".flo": _read_flo, ".png": _read_kitti}
+    readers = {".flo": _read_flo, ".png": _read_kitti, ".npz": _read_npz}
     if path.suffix.lower() not in readers:
-        raise UserError(f"{path}: flow files are .flo (Middlebury) or .png (KITTI)")
+        raise UserError(_FORMATS.format(path))
     if not path.is_file():
         raise UserError(f"{path}: no such file")
     return readers[path.suffix.lower()](path)
 
 
-def write_flow(path: Path, flow: Floats, known: Flags | None = None) -> None:
+def write_flow(
+    path: Path, flow: Floats, known: Flags | None = None, confidence: Floats | None = None
+) -> None:
     """Writes flow (H, W, 2) px; known: (H, W), everything by default. KITTI keeps 1/64 px and +-512 px.
+
+    `confidence`: (H, W) in 0..1; only an `.npz` holds it.
 
     Raises:
         UserError: no such format, or displacements that KITTI's PNG can't hold.
@@ -49,8 +55,11 @@ def write_flow(path: Path, flow: Floats, known: Flags | None = None) -> None:
         coded = np.round(np.where(known[..., None], flow, 0) * 64 + 2**15).astype(np.uint16)
         # OpenCV's order is B, G, R: known, v, u.
         cv2.imwrite(str(path), np.dstack([known.astype(np.uint16), coded[..., 1], coded[..., 0]]))
+    elif path.suffix.lower() == ".npz":
+        sure = known.astype(np.float32) if confidence is None else confidence.astype(np.float32)
+        np.savez_compressed(path, flow=flow.astype(np.float32), known=known, confidence=sure)
     else:
-        raise UserError(f"{path}: flow files are .flo (Middlebury) or .png (KITTI)")
+        raise UserError(_FORMATS.format(path))
 
 
 def _read_flo(path: Path) -> tuple[Floats, Flags]:
@@ -61,6 +70,19 @@ def _read_flo(path: Path) -> tuple[Floats, Flags]:
         raise UserError(f"{path}: not a whole Middlebury .flo file")
     flow = np.frombuffer(data, "<f4", offset=12).reshape(height, width, 2)
     known = np.all(np.abs(flow) < _UNKNOWN, axis=-1)
+    return np.where(known[..., None], flow, 0).astype(np.float32), known
+
+
+def _read_npz(path: Path) -> tuple[Floats, Flags]:
+    """`flow` (H, W, 2) px, and `known` (H, W) if not all of it is."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            flow = file["flow"].astype(np.float32)
+            known = file["known"].astype(bool) if "known" in file else np.isfinite(flow).all(axis=-1)
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+        raise UserError(f"{path}: holds no array named flow") from None
+    if flow.ndim != 3 or flow.shape[2] != 2 or known.shape != flow.shape[:2]:
+        raise UserError(f"{path}: flow of shape {flow.shape}, expected (H, W, 2)")
     return np.where(known[..., None], flow, 0).astype(np.float32), known
 
 

@@ -31,9 +31,21 @@ class Score:
     pixels: int
 
 
+@dataclass(frozen=True)
+class Motion:
+    """What the flow says, whether or not there is a truth."""
+
+    mean_px: float
+    """Mean length."""
+    p98_px: float
+    """98th percentile of the length."""
+    confidence: float
+    """Mean confidence."""
+
+
 def score_pair(
     first: Path, second: Path, truth: Path | None, backend: str, masks: bool, out: Path | None
-) -> Score | None:
+) -> tuple[Motion, Score | None]:
     """Computes the flow from `first` to `second`, writes it to `out`, and scores it if there is a truth.
 
     Raises:
@@ -46,20 +58,22 @@ def score_pair(
     usable = (~mask.glare(one), ~mask.glare(two)) if masks else (every, every)
     flow, trust = create(backend).flow(one, two, *usable)
     if out is not None:
-        files.write_flow(out, flow)
+        files.write_flow(out, flow, confidence=trust)
+    lengths = np.linalg.norm(flow, axis=-1)
+    moved = Motion(float(lengths.mean()), float(np.percentile(lengths, 98)), float(trust.mean()))
     if truth is None:
-        return None
+        return moved, None
     real, known = files.read_flow(truth)
     if real.shape != flow.shape:
         raise UserError(f"{truth}: {real.shape[1]} x {real.shape[0]} px, the pictures have other size")
     if not known.any():
         raise UserError(f"{truth}: no pixel's flow is known")
-    return _score(flow, real, trust, known)
+    return moved, _score(flow, real, trust, known)
 
 
-def as_dict(score: Score | None, out: Path | None) -> dict[str, float | int | str | None]:
-    """For JSON, which has no NaN: where the flow was written, and the scores if there was a truth."""
-    found = {} if score is None else asdict(score)
+def as_dict(moved: Motion, score: Score | None, out: Path | None) -> dict[str, float | int | str | None]:
+    """For JSON, which has no NaN: the motion, where it was written, and the scores if there was a truth."""
+    found = asdict(moved) | ({} if score is None else asdict(score))
     plain = {name: None if value != value else value for name, value in found.items()}
     return {**plain, "out": None if out is None else str(out)}
 

@@ -23,7 +23,8 @@ from synth.system.foreign_picture import refuse_large
 
 Floats = NDArray[np.float64]
 ROLES = ("frames", "frame_time", "force", "force_time", "tip")
-"""What a source may hold; `--use ROLE=NAME` says under which name."""
+"""What a source may hold; `--use ROLE=NAME` says under which name; `--use fps=RATE` times bare pictures."""
+_PLAIN = "bench.importers.plain_files"
 _MAKERS = {
     ".mha": "bench.importers.igsio",
     ".h5": "bench.importers.hdf5",
@@ -31,6 +32,7 @@ _MAKERS = {
     ".bag": "bench.importers.rosbag",
     ".mcap": "bench.importers.rosbag",
     ".db3": "bench.importers.rosbag",
+    ".npy": _PLAIN,
 }
 _CRF_LOSSLESS = 0
 _LARGEST_BYTES = 1 << 42
@@ -62,7 +64,16 @@ class Intake:
 
 def supported(path: Path) -> bool:
     """Whether the name is that of a source to import, and not of a recording folder."""
-    return path.suffix.lower() in _MAKERS or (path / "metadata.yaml").is_file()
+    return _maker(path) is not None
+
+
+def _maker(path: Path) -> str | None:
+    """The module that reads it; None if none does."""
+    if not path.is_dir():
+        return _MAKERS.get(path.suffix.lower())
+    if (path / "metadata.yaml").is_file():
+        return "bench.importers.rosbag"
+    return _PLAIN if import_module(_PLAIN).is_picture_folder(path) else None
 
 
 def read_source(source: Path, use: Mapping[str, str] | None = None) -> Intake:
@@ -78,14 +89,16 @@ def read_source(source: Path, use: Mapping[str, str] | None = None) -> Intake:
     if not source.is_dir():
         foreign_file.check_file(source, _LARGEST_BYTES)
     known = ", ".join(sorted(_MAKERS))
-    if not supported(source):
-        raise UserError(f"{source}: not a format that can be imported ({known}, or a folder of a ROS 2 bag)")
-    unknown = sorted(set(use or {}) - set(ROLES))
+    maker = _maker(source)
+    if maker is None:
+        raise UserError(
+            f"{source}: not a format that can be imported ({known}, a folder of pictures or of a ROS 2 bag)"
+        )
+    unknown = sorted(set(use or {}) - {*ROLES, "fps"})
     if unknown:
         raise UserError(f"--use {unknown[0]}=...: one of {', '.join(ROLES)}")
-    module = import_module("bench.importers.rosbag" if source.is_dir() else _MAKERS[source.suffix.lower()])
     with _damage_told(source):
-        found: Intake = module.read_source(source, dict(use or {}))
+        found: Intake = import_module(maker).read_source(source, dict(use or {}))
     _refuse_odd(source, found)
 
     def pictures() -> Iterator[NDArray[np.uint8]]:

@@ -22,6 +22,7 @@ from sklearn.neighbors import KNeighborsRegressor
 from bench.methods import compliance, corotational, inverse
 from bench.methods.protocol import Answer, Method, Scene
 from learn.data.grid import Grid
+from learn.inference.force_reader import assumed_young
 from learn.inference.predict import View
 
 if TYPE_CHECKING:
@@ -61,8 +62,7 @@ class Baseline:
             moved = resample.mean(flow.transpose(2, 0, 1) * scene.scale_mm_per_px, scene.tissue)
             last = (flow, scene, moved, resample.mean(confidence, scene.tissue))
             Baseline._last = last
-        young = 1.0 if scene.young_kpa is None else scene.young_kpa
-        return Answer(young * self._rule(last[2], view[1].mask, last[3]))
+        return Answer(assumed_young(scene.young_kpa) * self._rule(last[2], view[1].mask, last[3]))
 
 
 def physical() -> dict[str, Method]:

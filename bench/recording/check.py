@@ -41,11 +41,14 @@ class _Findings(list[Finding]):
         self.append(Finding(state, what, said))
 
 
-def check_recording(folder: Path) -> list[Finding]:
-    """Opens a recording, decodes its pictures and compares what its files say. Raises no UserError."""
+def check_recording(folder: Path, phantom: bool = False) -> list[Finding]:
+    """Opens a recording, decodes its pictures and compares what its files say. Raises no UserError.
+
+    `phantom`: as of `open_recording`.
+    """
     found = _Findings()
     try:
-        recording = open_recording(folder)
+        recording = open_recording(folder, phantom)
     except UserError as error:
         found.add("bad", "recording", str(error))
         return found
@@ -58,9 +61,9 @@ def check_recording(folder: Path) -> list[Finding]:
         found.add("ok", "scale", said)
     except UserError as error:
         found.add("bad", "scale", str(error))
-    times, size = _check_pictures(recording, found)
+    times, size, count = _check_pictures(recording, found)
     if size is not None:
-        _check_masks(recording, size, found)
+        _check_masks(recording, size, count, found)
         width = scale.mm_per_px * size[1] if scale is not None else _NARROWEST_MM
         if not _NARROWEST_MM <= width <= _WIDEST_MM:
             said = f"the picture would be {width:.3g} mm wide: is the scale in mm/px?"
@@ -78,8 +81,8 @@ def is_usable(found: list[Finding]) -> bool:
 
 def _check_pictures(
     recording: Recording, found: _Findings
-) -> tuple[NDArray[np.float64], tuple[int, int] | None]:
-    """Times of the usable frames [s], and height and width of the first."""
+) -> tuple[NDArray[np.float64], tuple[int, int] | None, int]:
+    """Times of the usable frames [s], height and width of the first, and how many frames there are."""
     times: list[float] = []
     size: tuple[int, int] | None = None
     count = timeless = back = 0
@@ -98,7 +101,7 @@ def _check_pictures(
                 times.append(picture.time_s)
     except UserError as error:
         found.add("odd" if count else "bad", "pictures", str(error))
-        return np.array(times), size
+        return np.array(times), size, count
     assert size is not None
     t = np.array(times)
     found.add("ok", "pictures", f"{count} of {size[1]} x {size[0]} px")
@@ -106,24 +109,26 @@ def _check_pictures(
         found.add("bad", "pictures", f"nothing can be measured: the rest frame is {fault}")
     if len(t) < 2:
         found.add("bad", "times", "fewer than two frames have a time")
-        return t, size
+        return t, size, count
     steps = np.diff(t)
     step = float(np.median(steps))
-    found.add("ok", "times", f"{t[-1] - t[0]:.2f} s at {1 / step:.4g} frames a second")
+    # From the first frame to the last: stamps that come in bursts have a median step of their own.
+    rate = (len(t) - 1) / (t[-1] - t[0])
+    found.add("ok", "times", f"{t[-1] - t[0]:.2f} s at {rate:.4g} frames a second")
     if timeless or back:
         found.add("odd", "times", f"{timeless} frames without a time, {back} whose time runs back")
     if (jumps := steps > _JUMP * step).any():
         longest = int(steps.argmax())
         where = f"the longest {steps[longest]:.3g} s at {t[longest]:.3g} s"
         found.add("odd", "times", f"{jumps.sum()} gaps, {where}")
-    if not 0.5 <= 1 / step <= 1000:
-        found.add("odd", "times", f"{1 / step:.3g} frames a second: are the times in seconds?")
+    if not 0.5 <= rate <= 1000:
+        found.add("odd", "times", f"{rate:.3g} frames a second: are the times in seconds?")
     if recording.meta.rest_frame >= count:
         found.add("bad", "rest frame", f"rest_frame is {recording.meta.rest_frame} of {count} frames")
-    return t, size
+    return t, size, count
 
 
-def _check_masks(recording: Recording, size: tuple[int, int], found: _Findings) -> None:
+def _check_masks(recording: Recording, size: tuple[int, int], frames: int, found: _Findings) -> None:
     try:
         tissue = recording.tissue_mask(size)
         if recording.tissue is None:
@@ -131,10 +136,10 @@ def _check_masks(recording: Recording, size: tuple[int, int], found: _Findings) 
         elif not tissue.any():
             found.add("bad", "tissue", "tissue.png marks nothing")
         if not recording.masks:
-            found.add("lack", "tool", "no masks/: the tool is looked for in each picture")
+            found.add("lack", "tool", recording.describe_tool(frames))
         else:
             recording.tool(next(iter(recording.masks)), size)
-            found.add("ok", "tool", f"{len(recording.masks)} masks")
+            found.add("ok", "tool", recording.describe_tool(frames))
     except UserError as error:
         found.add("bad", "masks", str(error))
 
@@ -147,9 +152,9 @@ def _check_sensor(recording: Recording, times: NDArray[np.float64], found: _Find
     t = force.time_s
     lacking = 1 - float(np.isfinite(force.force_mn).all(axis=1).mean())
     peak = float(np.nanmax(np.linalg.norm(force.force_mn, axis=1)))
-    rate = 1 / float(np.median(np.diff(t)))
+    rate = (len(t) - 1) / (t[-1] - t[0])
     found.add("ok", "sensor", f"{len(t)} rows at {rate:.4g} a second, up to {peak:.3g} mN")
-    if peak > 1000 * _SURGICAL_N:
+    if peak > 1000 * _SURGICAL_N and meta.tissue == "brain":
         said = f"{peak / 1000:.3g} N is much for a brain: is force.csv in newtons?"
         found.add("odd", "sensor", said)
     if peak == 0:

@@ -20,12 +20,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.recording import csv_table, meta
-from bench.recording.meta import Meta
+from bench.recording.meta import Meta, Span
 from learn.inference import video
 from learn.inference.video import Picture
 from synth.errors import UserError
 
 _LARGEST_FORCE_N = 50.0
+_EPOCH_S = 1e8  # three years: no recording is as long, so such a time counts from 1970
 
 
 @dataclass(frozen=True)
@@ -78,6 +79,12 @@ class Recording:
         """(H, W) tool mask of a frame, or None if there is none for it. UserError for one of another size."""
         return video.read_mask(self.masks[index], size) if index in self.masks else None
 
+    def describe_tool(self, frames: int) -> str:
+        """What is taken for the tool in how many frames, for `bench check` and `bench score` alike."""
+        if not self.masks:
+            return "no masks/: the tool is looked for in each picture"
+        return f"masks/ has {len(self.masks)} of {frames} frames; the others are taken for free of a tool"
+
     def tissue_mask(self, size: tuple[int, int]) -> NDArray[np.bool_]:
         """(H, W) where tissue may be tracked in the rest frame; everywhere without `tissue.png`."""
         return np.ones(size, bool) if self.tissue is None else video.read_mask(self.tissue, size)
@@ -92,8 +99,12 @@ class Recording:
         return replace(picture, time_s=time_s)
 
 
-def open_recording(folder: Path) -> Recording:
-    """Reads everything but the pictures.
+def open_recording(folder: Path, phantom: bool = False) -> Recording:
+    """Reads everything but the pictures. Times since 1970 are brought to the recording's start.
+
+    Args:
+        folder: of the recording.
+        phantom: it shows one, whatever meta.yaml says of the tissue.
 
     Raises:
         UserError: no folder, bad meta.yaml, neither or both of video and frames, a CSV that can't be used.
@@ -103,15 +114,55 @@ def open_recording(folder: Path) -> Recording:
     if not folder.is_dir():
         raise UserError(f"{folder}: no such recording folder")
     about = meta.read_meta(folder / "meta.yaml")
+    if phantom:
+        about = about.model_copy(update={"tissue": "phantom"})
     movie, pictures = _footage(folder)
     notes: list[str] = []
     times = _frame_times(folder / "frames.csv", notes)
     force = _force(folder / "force.csv", about, notes)
+    about, times, force = _from_start(about, times, force, notes)
     numbered = [path for path in sorted(folder.glob("masks/*.png")) if re.fullmatch("[0-9]{1,9}", path.stem)]
     masks = {int(path.stem): path for path in numbered}
     still = folder / "tissue.png"
     tissue = still if os.path.lexists(still) else None
     return Recording(folder, about, movie, pictures, times, force, masks, tissue, tuple(notes))
+
+
+def _from_start(
+    about: Meta, times: NDArray[np.float64] | None, force: Force | None, notes: list[str]
+) -> tuple[Meta, NDArray[np.float64] | None, Force | None]:
+    """Times since 1970 counted from the first frame instead, those of meta.yaml's spans among them."""
+    known = np.zeros(0) if times is None else times[np.isfinite(times)]
+    start = float(known[0]) if len(known) and known[0] > _EPOCH_S else 0.0
+    felt = force is not None and bool(force.time_s[0] > _EPOCH_S)
+    if force is not None and felt != bool(start):
+        one, other = ("force.csv", "the video") if felt else ("frames.csv", "force.csv")
+        notes.append(f"{one} counts from 1970, {other} doesn't: nobody can tell where one lies on the other")
+        return about, times, force
+    if not start:
+        return about, times, force
+    notes.append(f"times since 1970 are counted from {start:.3f} s on")
+    if times is not None:
+        times = times - start
+    if force is not None:
+        force = replace(force, time_s=force.time_s - start)
+    return _spans_from(about, start), times, force
+
+
+def _spans_from(about: Meta, start: float) -> Meta:
+    """The same with the spans that count from 1970 counted from `start` [s] on."""
+
+    def moved(span: Span | None) -> Span | None:
+        return span if span is None or span[0] < _EPOCH_S else (span[0] - start, span[1] - start)
+
+    def every(spans: tuple[Span, ...]) -> tuple[Span | None, ...]:
+        return tuple(moved(span) for span in spans)
+
+    sync = about.sync.model_copy(update={"calibration_s": moved(about.sync.calibration_s)})
+    sensor = about.sensor.model_copy(update={"free_s": every(about.sensor.free_s)})
+    pulse = about.pulse.model_copy(update={"free_s": every(about.pulse.free_s)})
+    parts = {"sync": sync, "sensor": sensor, "pulse": pulse, "press_s": moved(about.press_s)}
+    return about.model_copy(update=parts)
 
 
 def _footage(folder: Path) -> tuple[Path | None, tuple[Path, ...]]:
@@ -193,9 +244,10 @@ def _force(path: Path, about: Meta, notes: list[str]) -> Force | None:
         )
         newtons[~usable] = np.nan
     largest = float(np.nanmax(np.abs(newtons)))
-    if largest > _LARGEST_FORCE_N:
+    if largest > _LARGEST_FORCE_N and about.tissue == "brain":
         raise UserError(
-            f"{path}: force reaches {largest:.4g} N, more than any brain bears; are the columns in mN?"
+            f"{path}: force reaches {largest:.4g} N, more than any brain bears; are the columns in mN? "
+            "(of a phantom: --phantom, or tissue: phantom in meta.yaml)"
         )
     gravity = None
     if all(name in columns for name in ("gx", "gy", "gz")):

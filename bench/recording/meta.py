@@ -6,6 +6,7 @@ import os
 from pathlib import Path
 from typing import Annotated, Literal
 
+import numpy as np
 from pydantic import (
     BaseModel,
     BeforeValidator,
@@ -81,6 +82,8 @@ class Sensor(_Section):
     axes: Literal["camera", "sensor"] = "sensor"
     """`camera`: fx, fy, fz are along the camera's x (right), y (down), z (forward), so that components are
     scored too. `sensor`: only the magnitude is."""
+    to_camera: tuple[Row, Row, Row] | None = None
+    """Rows of the rotation from the sensor's axes to the camera's; with it components are scored too."""
     acts_on: Literal["tissue", "tool"] = "tissue"
     """On what the written force acts; a force on the tool is turned round."""
     low_pass_hz: Positive | None = 10.0
@@ -89,6 +92,19 @@ class Sensor(_Section):
     """Spans without contact, (from, to) on the sensor's clock [s]: for tare, drift and noise floor."""
     mass_g: Annotated[FiniteFloat, Field(ge=0)] = 0.0
     """Mass beyond a tool-mounted sensor [g], for gravity; needs columns gx, gy, gz in force.csv."""
+
+    @model_validator(mode="after")
+    def _is_a_rotation(self) -> Sensor:
+        if self.to_camera is not None:
+            rows = np.array(self.to_camera)
+            if not np.allclose(rows @ rows.T, np.eye(3), atol=0.02) or np.linalg.det(rows) < 0:
+                raise ValueError("to_camera must be a rotation: three unit rows, square to one another")
+        return self
+
+    @property
+    def in_camera_axes(self) -> bool:
+        """Whether force components are along the camera's axes, by themselves or once turned."""
+        return self.axes == "camera" or self.to_camera is not None
 
 
 class Sync(_Section):
@@ -135,6 +151,8 @@ class Meta(_Section):
     """Frame with the tissue unloaded; displacement is measured from it."""
     press_s: Span | None = None
     """Span of video time holding a separate press for calibrating one gain [s]; left out of the scores."""
+    tissue: Literal["brain", "phantom"] = "brain"
+    """`phantom`: made to be pushed hard, so that forces beyond any brain's are no mistake."""
     specimen: str = ""
     """Name of the specimen; recordings of one specimen are never treated as independent."""
     sensor: Sensor = Sensor()

@@ -27,13 +27,15 @@ def draw_force(result: Result) -> Figure:
     main = curves.methods[result.main]
     data: list[Figure] = []
     spread = 1.96 * result.relative_uncertainty
-    if spread > 0:
-        low, high = main * (1 - min(spread, 1.0)), main * (1 + spread)
+    # A filled band knows no gaps: one for each run of frames.
+    for number, (first, last) in enumerate(_spans(np.isfinite(main)) if spread > 0 else ()):
+        part = slice(first, last + 1)
+        low, high = main[part] * (1 - min(spread, 1.0)), main[part] * (1 + spread)
         data += [
-            _line(time, low, "", "rgba(0,0,0,0)", showlegend=False, hoverinfo="skip"),
+            _line(time[part], low, "", "rgba(0,0,0,0)", showlegend=False, hoverinfo="skip"),
             _line(
-                time, high, f"±{100 * spread:.0f}% scale, stiffness", "rgba(0,0,0,0)",
-                fill="tonexty", fillcolor=BAND, hoverinfo="skip",
+                time[part], high, f"±{100 * spread:.0f}% scale, stiffness", "rgba(0,0,0,0)",
+                fill="tonexty", fillcolor=BAND, hoverinfo="skip", showlegend=number == 0, legendgroup="band",
             ),
         ]  # fmt: skip
     if curves.sensor is not None:
@@ -81,10 +83,10 @@ def scale_curves(result: Result) -> Curves:
             result.sensor_mn, {n: gains[n] * s for n, s in sizes.items()}, "force [mN], gain of the press"
         )
     if result.sensor_mn is None:
-        return Curves(None, {n: s / _largest(s) for n, s in sizes.items()}, "force / its largest")
+        return Curves(None, {n: s / _largest(s) for n, s in sizes.items()}, "force / largest")
     top, kept = _largest(result.sensor_mn), result.scored
     brought = {n: metrics.gain(result.sensor_mn, s, kept) * s / top for n, s in sizes.items()}
-    return Curves(result.sensor_mn / top, brought, "force / the sensor's largest, one gain a method")
+    return Curves(result.sensor_mn / top, brought, "force / largest")
 
 
 def _largest(values: NDArray[np.float64]) -> float:

@@ -38,6 +38,7 @@ def score_recording(
     title: str = "",
     train: Path | None = None,
     also: Mapping[str, Path] | None = None,
+    phantom: bool = False,
 ) -> Result:
     """Scores one recording and writes score.json and report.html, both whole or not at all.
 
@@ -49,6 +50,7 @@ def score_recording(
         out: folder for the results; `NAME-score` here if None.
         settings: of this run.
         title: heading of the report.
+        phantom: the recording shows one, so that its forces may be beyond any brain's.
 
     Raises:
         UserError: recording, model or settings that can't be used; nothing is written then.
@@ -57,7 +59,7 @@ def score_recording(
 
     # NumPy's BLAS too: a second thread of its own waits for a core that the flow has.
     threadpool_limits(set_threads(None))
-    opened = open_recording(recording)
+    opened = open_recording(recording, phantom)
     folder = out or Path(f"{opened.name}-score")
     with whole_file.made_folder(folder, _ROOM_BYTES):
         result = _score(opened, model, settings, train, also)

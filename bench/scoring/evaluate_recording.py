@@ -297,7 +297,7 @@ def _scored(
     x, y = size[kept], length[kept]
     scores, events = metrics.compute_all(time_s, size, length, truth.floor_mn, kept)
     components: dict[str, dict[str, float]] = {}
-    if recording.meta.sensor.axes == "camera" and np.isfinite(force).any(axis=0).all():
+    if recording.meta.sensor.in_camera_axes and np.isfinite(force).any(axis=0).all():
         components = {axis: metrics.agreement(axes[kept, k], force[kept, k]) for k, axis in enumerate("xyz")}
     rng = np.random.default_rng(_SEED)
     intervals = bootstrap.agreement(x, y, rng)

@@ -10,7 +10,7 @@ from bench.scoring.evaluate_recording import MOST_LOST, Result
 from bench.scoring.metrics import METRICS
 
 _NEWTONS = ("mae_mn", "mae_of_peak", "r", "ccc", "r2", "ghost_rate")
-_SHAPE = ("r", "shape_error", "lag_s", "events")
+_SHAPE = ("r", "shape_error", "lag_s")
 _PRESSED = ("mae_mn", "mae_of_peak", "r2")
 
 

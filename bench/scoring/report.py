@@ -23,8 +23,9 @@ from rich.table import Table
 from bench.scoring import charts, metrics
 from bench.scoring.evaluate_recording import Result
 from bench.scoring.headline import headline
-from bench.scoring.metrics import METRICS, Metric
+from bench.scoring.metrics import METRICS
 from bench.tracking.tracking import Snapshot
+from learn.evaluation.metrics import Metric
 from synth.dataset.folder import write_whole
 from synth.publish import picture
 
@@ -32,7 +33,7 @@ _PEAKS, _WORST = 4, 2
 
 _COLUMNS = {key: metric for key, metric in METRICS.items() if metric.column}
 _NARROW = ("mae_mn", "mae_of_peak", "r", "shape_error", "r2", "bias_mn", "ghost_rate")
-"""What a terminal's eighty columns hold."""
+"""What a terminal's eighty columns hold, and the report's first table."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +80,8 @@ def render_report(result: Result, title: str) -> str:
         title=title,
         result=result,
         main=main,
-        metrics=_columns(result),
+        first={key: metric for key, metric in _columns(result).items() if key in _NARROW},
+        more={key: metric for key, metric in _columns(result).items() if key not in _NARROW},
         headline=headline(result),
         best=_best(result),
         beaten_by=beaten_by(result),
@@ -194,7 +196,7 @@ def pictures(result: Result) -> tuple[list[Panel], float, float]:
 
 def moments(result: Result) -> list[tuple[str, Snapshot]]:
     """The snapshots nearest the largest forces of separate contacts, and the ones with the largest errors."""
-    snaps = result.followed.snapshots
+    snaps = [snap for snap in result.followed.snapshots if not result.lost[snap.position]]
     if not snaps:
         return []
     at = np.array([snap.position for snap in snaps])
@@ -219,7 +221,8 @@ def moments(result: Result) -> list[tuple[str, Snapshot]]:
 
 def _caption(result: Result, snap: Snapshot) -> str:
     k = snap.position
-    words = f"{result.time_s[k]:.2f} s, predicted {shown(float(result.methods[result.main].size_mn[k]))} mN"
+    said = shown(float(result.methods[result.main].size_mn[k]))
+    words = f"{result.time_s[k]:.2f} s, predicted {said} {'mN' if result.absolute else 'mN a kPa'}"
     if result.sensor_mn is not None and math.isfinite(result.sensor_mn[k]):
         words += f", sensor {shown(float(result.sensor_mn[k]))} mN"
     return words

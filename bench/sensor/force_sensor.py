@@ -49,6 +49,9 @@ def process_force(force: Force, sensor: Sensor, offset_s: float, causal: bool = 
     """
     steps: list[str] = []
     values = _weightless(force, sensor, steps)
+    if sensor.to_camera is not None:
+        values = values @ np.array(sensor.to_camera).T
+        steps.append("turned to the camera's axes")
     values, drift = _tared(force.time_s, values, sensor, steps)
     values = _smooth(force.time_s, values, sensor.low_pass_hz, causal, steps)
     floor = _floor(force.time_s, values, sensor)

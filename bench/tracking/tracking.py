@@ -136,8 +136,7 @@ def _track(
     out.size, out.notes, out.timings = video.size, video.notes, video.watch.report()
     if out.fault:
         out.notes.append(f"nothing can be measured: {out.fault}")
-    if tool is None:
-        out.notes.append("no masks/: the tool is found in each picture")
+    out.notes.append(recording.describe_tool(video.seen))
     if video.peak_bytes:
         out.timings["flow_peak_rss_mb"] = round(video.peak_bytes / 1e6, 1)
     if pulse is not None:

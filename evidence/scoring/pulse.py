@@ -29,6 +29,7 @@ YOUNG_KPA = 3.0
 _CONTACT_MM = 4.0
 _RADIUS_MM = 12.0
 _FPS = 10.0
+_ASKED = 1.3
 _HEART, _BREATH = (0.4, 1.2), (0.25, 0.25)  # mm, Hz
 
 
@@ -134,12 +135,14 @@ def record(
         own = beat(time, contact["phase"], size) - beat(float(times[0]), contact["phase"], size)
         moved = moved + beats * own / contact["mm_per_px"]
         # Where a point of this frame was at rest: by fixed point, for motion is given at rest.
-        back = moved
+        back = moved = moved.astype(np.float32)
         for _ in range(8):
-            at = [(axis - back[..., i]).astype(np.float32) for i, axis in enumerate((x, y))]
-            back = cv2.remap(moved.astype(np.float32), *at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        at = [(axis - back[..., i]).astype(np.float32) for i, axis in enumerate((x, y))]
-        rgb = cv2.remap(rest, *at, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
+            back = cv2.remap(
+                moved, x - back[..., 0], y - back[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+            )
+        rgb = cv2.remap(
+            rest, x - back[..., 0], y - back[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT
+        )
         noisy = np.clip(rgb + rng.normal(0, 1.5, rgb.shape), 0, 255).astype(np.uint8)
         cv2.imwrite(str(folder / "frames" / f"{k:04d}.png"), noisy[..., ::-1])
     inside = np.hypot(x - (size - 1) / 2, y - (size - 1) / 2) < 0.46 * size
@@ -174,7 +177,7 @@ def score(folder: Path, methods: Mapping[str, Method], backend: str) -> Result:
 
 def drawn(tree: Mapping[str, Any]) -> result_page.Page:
     """A bar a method: how many times its error of still tissue it has, median over recordings."""
-    rows, bars = [], []
+    rows, bars, missed = [], [], []
     names = list(dict.fromkeys(row["method"] for row in tree["rows"]))
     for name in names:
         own = [row for row in tree["rows"] if row["method"] == name]
@@ -188,6 +191,8 @@ def drawn(tree: Mapping[str, Any]) -> result_page.Page:
             | {f"{what} [mN]": cell for what, cell in cells.items()}
             | {f"{what}, times still, worst": f"{ratio.max():.2f}" for what, ratio in ratios.items()}
         )
+        if ratios["taken off"].max() > _ASKED:
+            missed.append(name)
         if name != "zero":
             low, high = float(ratios["taken off"].min()), float(ratios["taken off"].max())
             bars.append(charts.Row(name, float(np.median(ratios["taken off"])), (low, high), False))
@@ -210,6 +215,8 @@ def drawn(tree: Mapping[str, Any]) -> result_page.Page:
             f"{_BREATH[0]:g} mm at {_BREATH[1]:g} Hz, both in the plane of the picture and in closed form. "
             "Mean absolute error; bars: from the least to the most over recordings.",
             f"Found (median over the tissue): {found}. Found on still tissue: {still_found}.",
+            f"Asked: at most {_ASKED:g} times the error on still tissue. "
+            f"Missed: {', '.join(missed) or 'by none'}.",
         ),
         name="README.md",
     )

@@ -9,6 +9,14 @@ from numpy.typing import NDArray
 
 from learn.inference.predict import ForceMap, Predictor
 
+UNKNOWN_YOUNG_KPA = 1.0
+"""Tissue whose E nobody knows is answered for as if it were of this: forces are then right up to a factor."""
+
+
+def assumed_young(young_kpa: float | None) -> float:
+    """E to answer for [kPa]: the one known, else `UNKNOWN_YOUNG_KPA`; for every method, learnt or not."""
+    return UNKNOWN_YOUNG_KPA if young_kpa is None else young_kpa
+
 
 class ForceReader:
     """Reads the frames of one video.
@@ -51,9 +59,10 @@ class ForceReader:
         said = self._predictor(flow, self._tissue, self._scale, self._young_kpa, confidence)
         if said.young_known:
             return said
-        head = None if said.head_mn is None else said.head_mn / said.young_kpa
-        density = said.density / np.float32(said.young_kpa)
-        return replace(said, density=density, head_mn=head, young_kpa=1.0)
+        part = assumed_young(None) / said.young_kpa
+        head = None if said.head_mn is None else part * said.head_mn
+        density = np.float32(part) * said.density
+        return replace(said, density=density, head_mn=head, young_kpa=assumed_young(None))
 
 
 def _total(said: ForceMap) -> NDArray[np.float64]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import cv2
+import numpy as np
 import pytest
 from fake_recording import Bump, Maker
 
@@ -40,3 +42,19 @@ def test_a_press_of_two_frames_and_a_span_without_samples_are_foreseen(make: Mak
     found = check.check_recording(folder)
     assert any(f.what == "press" and f.state == "odd" for f in found)
     assert any("no samples between 5 and 6 s" in f.said and f.state == "bad" for f in found)
+
+
+def test_check_and_score_say_the_same_of_the_tool(make: Maker) -> None:
+    """Without masks the tool is looked for in both; with masks of some frames, in neither's others."""
+    bare, masked = make("bare", frames=4), make("masked", frames=4)
+    (masked / "masks").mkdir()
+    cv2.imwrite(str(masked / "masks" / "0002.png"), np.zeros((96, 128), np.uint8))
+    for folder, found in ((bare, "each picture"), (masked, "1 of 4 frames")):
+        said = next(f.said for f in check.check_recording(folder) if f.what == "tool")
+        recording = open_recording(folder)
+        scale = pixel_scale.find_scale(recording.meta, folder)
+        notes = evaluate_recording.evaluate_recording(
+            recording, {"bump": Bump()}, "bump", scale, Settings("dis"), {}
+        ).notes
+        assert found in said
+        assert any(found in note for note in notes), notes

@@ -30,6 +30,8 @@ function look(frame) {{
   return {{
     width: inner.documentElement.scrollWidth,
     charts: inner.querySelectorAll(".main-svg").length,
+    cut: [...inner.querySelectorAll(".scroll")].filter(e => e.scrollWidth > e.clientWidth).length,
+    fixed: inner.defaultView.getComputedStyle(inner.querySelector(".methods tbody th")).position,
     broken: [...inner.images].filter(i => !i.complete || i.naturalWidth === 0).length,
     smallest: Math.min(...text.map(e => parseFloat(inner.defaultView.getComputedStyle(e).fontSize))),
   }};
@@ -43,7 +45,7 @@ addEventListener("load", () => setTimeout(() => {{
 @pytest.mark.slow
 @pytest.mark.skipif(BROWSER is None, reason="no Chromium here (Debian: apt-get install chromium)")
 def test_report_in_a_browser(make: Maker, tmp_path: Path) -> None:
-    folder = make(frames=8)
+    folder = make(frames=16, meta={"press_s": [0.2, 0.8]})
     recording = open_recording(folder)
     methods = {"bump": Bump(), "a method with a rather long name": Bump()}
     result = evaluate_recording.evaluate_recording(
@@ -71,3 +73,5 @@ def test_report_in_a_browser(make: Maker, tmp_path: Path) -> None:
         assert found["broken"] == 0
         assert found["width"] <= width
         assert found["smallest"] >= 11
+        assert found["fixed"] == "sticky", "a row that is scrolled keeps its name"
+        assert width < 1400 or found["cut"] == 0, "at a desk every column is seen"

@@ -1,0 +1,122 @@
+"""What comes without a container: folders of pictures, .npy arrays, CSV tables as ROS tools write them."""
+
+from __future__ import annotations
+
+import csv
+import re
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bench.importers.registry import Floats, Intake, as_rgb
+from bench.recording import csv_table
+from learn.inference import video
+from synth.errors import UserError
+
+STILLS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
+_SECONDS = ("t_s", "time", "timestamp", "t", "time_s", "%time", "__time")
+_FORCES = (
+    ("fx_n", "fy_n", "fz_n"),
+    ("fx", "fy", "fz"),
+    ("wrench.force.x", "wrench.force.y", "wrench.force.z"),
+    ("field.wrench.force.x", "field.wrench.force.y", "field.wrench.force.z"),
+    ("force.x", "force.y", "force.z"),
+)
+_STAMP = ("header.stamp.sec", "header.stamp.nanosec")
+_Pictures = Callable[[], Iterator[NDArray[np.uint8]]]
+_NANOSECONDS = 1e15  # larger numbers are no seconds of any clock: `rostopic echo -p` writes nanoseconds
+
+
+def is_picture_folder(path: Path) -> bool:
+    """Whether a folder holds pictures and is no recording already."""
+    return path.is_dir() and not (path / "meta.yaml").is_file() and bool(_pictures(path))
+
+
+def read_source(source: Path, use: dict[str, str]) -> Intake:
+    """A folder of pictures, in the order of their numbers, or an .npy of (T, H, W[, C]).
+
+    Times are those of `--use frame_time=TABLE.csv`, or frames over `--use fps=RATE`. Forces are those of
+    `--use force=TABLE.csv`, in the columns that ROS tools write or t_s, fx_n, fy_n, fz_n.
+
+    Raises:
+        UserError: no times, a table without the columns, or not as many times as pictures.
+    """
+    pictures, count = _array(source) if source.is_file() else _folder(source)
+    times = _times(source, use, count)
+    force_s, force = np.zeros(0), np.zeros((0, 3))
+    if "force" in use:
+        force_s, force = read_forces(Path(use["force"]))
+    return Intake(times, pictures, force_s, force)
+
+
+def read_forces(path: Path) -> tuple[Floats, Floats]:
+    """Times (N,) s and forces (N, 3) in the table's unit. UserError if it has no such columns."""
+    header = _header(path)
+    names = next((names for names in _FORCES if set(names) <= set(header)), None)
+    if names is None:
+        raise UserError(f"{path}: no columns of force; the header has {', '.join(header)}")
+    return _seconds(path, header), np.column_stack(list(csv_table.read_csv(path, names).values()))
+
+
+def _seconds(path: Path, header: list[str]) -> Floats:
+    """(N,) s of a table's rows."""
+    if set(_STAMP) <= set(header):
+        stamp = csv_table.read_csv(path, _STAMP)
+        return np.asarray(stamp[_STAMP[0]] + 1e-9 * stamp[_STAMP[1]], np.float64)
+    name = next((name for name in _SECONDS if name in header), None)
+    if name is None:
+        raise UserError(f"{path}: no column of times; the header has {', '.join(header)}")
+    time = csv_table.read_csv(path, (name,))[name]
+    return np.asarray(1e-9 * time if np.nanmax(time) > _NANOSECONDS else time, np.float64)
+
+
+def _header(path: Path) -> list[str]:
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            first = file.readline()
+    except (OSError, UnicodeDecodeError) as error:
+        raise UserError(f"{path}: unreadable ({error})") from None
+    cells = next(csv.reader([first], delimiter=";" if first.count(";") > first.count(",") else ","), [])
+    return [name.strip().lower() for name in cells]
+
+
+def _times(source: Path, use: dict[str, str], count: int) -> Floats:
+    if "frame_time" in use:
+        path = Path(use["frame_time"])
+        times = _seconds(path, _header(path))
+        if len(times) != count:
+            raise UserError(f"{path}: {len(times)} times for {count} pictures of {source}")
+        return times
+    try:
+        rate = float(use["fps"])
+    except (KeyError, ValueError):
+        raise UserError(
+            f"{source}: pictures without times; say --use frame_time=TABLE.csv or --use fps=RATE"
+        ) from None
+    if not (np.isfinite(rate) and rate > 0):
+        raise UserError(f"--use fps={use['fps']}: must be positive")
+    return np.arange(count) / rate
+
+
+def _pictures(folder: Path) -> list[Path]:
+    def number(path: Path) -> list[tuple[int, str]]:
+        return [(int(p), "") if p.isdigit() else (-1, p) for p in re.split(r"(\d+)", path.stem)]
+
+    return sorted((p for p in folder.iterdir() if p.suffix.lower() in STILLS), key=number)
+
+
+def _folder(folder: Path) -> tuple[_Pictures, int]:
+    paths = tuple(_pictures(folder))
+    return lambda: (picture.rgb for picture in video.read_pictures(paths)), len(paths)
+
+
+def _array(path: Path) -> tuple[_Pictures, int]:
+    try:
+        film = np.load(path, mmap_mode="r", allow_pickle=False)
+    except (OSError, ValueError, EOFError):
+        raise UserError(f"{path}: not a readable .npy array") from None
+    if film.ndim not in (3, 4):
+        raise UserError(f"{path}: an array of shape {film.shape}, expected (T, H, W) or (T, H, W, C)")
+    return lambda: (as_rgb(np.asarray(picture)) for picture in film), len(film)
