@@ -26,6 +26,18 @@ class Track:
     """(T,), False where the frame could not be followed."""
 
 
+@dataclass(frozen=True, eq=False)
+class Solved:
+    """One answer for a frame."""
+
+    flow: Flow
+    """(H, W, 2) px."""
+    confidence: Map
+    """(H, W) in 0..1; 0 outside the tissue and where it is masked."""
+    level: float
+    """Mean confidence over what is not masked."""
+
+
 class Tracker:
     """Frames in, displacement from the rest frame out, one at a time, for streams as for recordings.
 
@@ -57,6 +69,8 @@ class Tracker:
         """Whether the last frame could be followed."""
         self.resets = 0
         """How often a frame was solved again from nothing, and better."""
+        self.level = 1.0
+        """Mean confidence of the last frame over what was not masked."""
         self._good: Flow | None = None
         self._level = 1.0
 
@@ -73,24 +87,33 @@ class Tracker:
         """
         if frame.shape != self.rest.shape or blocked.shape != self.tissue.shape:
             raise UserError(f"flow: frame {frame.shape} does not fit the rest frame {self.rest.shape}")
+        found = self.solve(frame, blocked, self._good)
+        if self._good is not None and self.is_doubtful(found):
+            again = self.solve(frame, blocked, None)
+            if again.level > found.level:
+                found, self.resets = again, self.resets + 1
+        return self.accept(found)
+
+    def solve(self, frame: Rgb, blocked: Flags, initial: Flow | None) -> Solved:
+        """One answer for a frame; nothing is remembered of it. Arguments as `step` and `start`."""
         seen = max(1, int(np.count_nonzero(self.usable & ~blocked)))
+        flow, confidence = self.estimator.flow(self.rest, frame, self.usable, ~blocked, initial)
+        confidence = confidence * self.tissue
+        return Solved(flow, confidence, float(confidence.sum(dtype=np.float64)) / seen)
 
-        def solve(initial: Flow | None) -> tuple[Flow, Map, float]:
-            flow, confidence = self.estimator.flow(self.rest, frame, self.usable, ~blocked, initial)
-            confidence = confidence * self.tissue
-            return flow, confidence, float(confidence.sum(dtype=np.float64)) / seen
+    def is_doubtful(self, found: Solved) -> bool:
+        """Whether an answer is so much worse than the last good one's that others are tried."""
+        return found.level < max(_TRUSTED, _DROP * self._level)
 
-        flow, confidence, level = solve(self._good)
-        if self._good is not None and level < max(_TRUSTED, _DROP * self._level):
-            again = solve(None)
-            if again[2] > level:
-                (flow, confidence, level), self.resets = again, self.resets + 1
-        self.trusted = level >= _TRUSTED
+    def accept(self, found: Solved) -> tuple[Flow, Map]:
+        """Makes it the frame's answer; the next one starts from it if it can be trusted."""
+        self.level, self.trusted = found.level, found.level >= _TRUSTED
+        confidence = found.confidence
         if self.trusted:
-            self._good, self._level = flow, level
+            self._good, self._level = found.flow, found.level
         else:
             confidence = np.minimum(confidence, 0.5 * _TRUSTED)
-        return flow * self.tissue[..., None], confidence
+        return found.flow * self.tissue[..., None], confidence
 
 
 def track(
