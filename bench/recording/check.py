@@ -10,12 +10,14 @@ from numpy.typing import NDArray
 
 from bench.recording import pixel_scale
 from bench.recording.folder import Recording, open_recording
+from learn.inference.video_flow import Account, Footage, Settings, VideoFlow
 from synth.errors import UserError
 
 _WIDEST_MM, _NARROWEST_MM = 300.0, 3.0
 _SOFTEST_KPA, _STIFFEST_KPA = 0.05, 100.0
 _JUMP = 3.0  # median intervals
 _SURGICAL_N = 5.0
+_LOOKED_AT = 12  # frames that are followed to see whether they can be
 
 
 @dataclass(frozen=True)
@@ -120,13 +122,30 @@ def _check_masks(recording: Recording, size: tuple[int, int], found: _Findings) 
             found.add("lack", "tissue", "no tissue.png: the whole picture is taken for tissue")
         elif not tissue.any():
             found.add("bad", "tissue", "tissue.png marks nothing")
-        if not recording.masks:
-            found.add("lack", "tool", "no masks/: the tool is looked for in each picture")
+        if not recording.has_masks:
+            found.add("lack", "tool", "no masks/, no mask.png: the tool is looked for in each picture")
         else:
-            recording.tool(next(iter(recording.masks)), size)
-            found.add("ok", "tool", f"{len(recording.masks)} masks")
+            recording.tool(next(iter(recording.masks), 0), size)
+            for_all = " and one for all other frames" if recording.mask else ""
+            found.add("ok", "tool", f"{len(recording.masks)} masks{for_all}")
+        _check_following(recording, found)
     except UserError as error:
         found.add("bad", "masks", str(error))
+
+
+def _check_following(recording: Recording, found: _Findings) -> None:
+    """Follows a few frames as `bench score` would: what is masked, and whether the tissue can be followed."""
+    first = recording.meta.rest_frame
+    count = recording.expected_frames() or _LOOKED_AT
+    wanted = {first, *np.linspace(first, max(count - 1, first), _LOOKED_AT).astype(int).tolist()}
+    pictures = (picture for picture in recording.frames() if picture.index in wanted)
+    tool = recording.tool if recording.has_masks else None
+    footage = Footage(pictures, str(recording.folder), recording.tissue_mask, tool, first)
+    video, account = VideoFlow(footage, Settings(rate_hz=None)), Account()
+    for step in video.steps():
+        account.add(step.found, video.tissue)
+    if account.frames:
+        found.add("odd" if account.is_odd else "ok", "following", account.describe())
 
 
 def _check_sensor(recording: Recording, times: NDArray[np.float64], found: _Findings) -> None:

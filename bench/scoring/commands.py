@@ -6,6 +6,7 @@ import os
 import shutil
 from collections.abc import Mapping
 from contextlib import closing, nullcontext
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from threadpoolctl import threadpool_limits
@@ -14,7 +15,7 @@ from bench.methods.network import Model
 from bench.methods.protocol import Method
 from bench.output.progress_bar import counting
 from bench.recording import pixel_scale
-from bench.recording.folder import open_recording
+from bench.recording.folder import Recording, open_recording
 from bench.recording.from_sequence import export_recording
 from bench.scoring import evaluate_recording, report
 from bench.scoring.evaluate_recording import Result, Settings
@@ -28,6 +29,21 @@ _LONG = 100
 """Frames from which a second process is worth the seconds that it takes to start."""
 
 
+@dataclass(frozen=True)
+class Seen:
+    """What of a recording's pictures is looked at, instead of what its folder says."""
+
+    masks: Path | None = None
+    """Folder with the tool's masks."""
+    region: tuple[int, int, int, int] | None = None
+    """Left, top, width and height [px]."""
+
+    def within(self, recording: Recording) -> Recording:
+        """The recording so seen. UserError: no masks in the folder."""
+        masked = recording if self.masks is None else recording.with_masks(self.masks)
+        return replace(masked, region=self.region)
+
+
 def score_recording(
     recording: Path,
     model: Path,
@@ -36,6 +52,7 @@ def score_recording(
     title: str = "",
     train: Path | None = None,
     also: Mapping[str, Path] | None = None,
+    seen: Seen = Seen(),
 ) -> Result:
     """Scores one recording and writes score.json and report.html, both whole or not at all.
 
@@ -47,6 +64,7 @@ def score_recording(
         out: folder for the results; `NAME-score` here if None.
         settings: of this run.
         title: heading of the report.
+        seen: other masks than the recording's, and a region of interest.
 
     Raises:
         UserError: recording, model or settings that can't be used; nothing is written then.
@@ -55,7 +73,7 @@ def score_recording(
 
     # NumPy's BLAS too: a second thread of its own waits for a core that the flow has.
     threadpool_limits(set_threads(None))
-    opened = open_recording(recording)
+    opened = seen.within(open_recording(recording))
     total = opened.expected_frames()
     # Started first, for it takes seconds to begin; the methods are fitted meanwhile.
     with closing(FlowProcess()) if _worth_a_process(total) else nullcontext() as flow:

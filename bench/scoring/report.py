@@ -23,7 +23,7 @@ from rich.table import Table
 from bench.scoring import charts, metrics
 from bench.scoring.evaluate_recording import Result
 from bench.scoring.metrics import METRICS
-from bench.tracking.tracking import Snapshot
+from bench.tracking.tracking import Snapshot, picture_masks
 from synth.dataset.folder import write_whole
 from synth.publish import picture
 
@@ -83,6 +83,8 @@ def render_report(result: Result, title: str) -> str:
         agreement="scatter" in figures,
         panels=panels,
         flow_px=flow_px,
+        masks=None if (masked := picture_masks(result.followed)) is None else _jpeg(masked),
+        masked=result.followed.account.describe(),
         force_kpa=force_kpa,
         # "</" would end the script element early.
         figures=json.dumps(figures, allow_nan=False).replace("</", "<\\/"),

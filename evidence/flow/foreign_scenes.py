@@ -1,14 +1,14 @@
 """Recordings whose motion is known in closed form, on pictures that no renderer of ours made.
 
-Photographs that scikit-image's wheel carries, and drawn phantoms, are warped by an analytic field; tools, lamps,
-highlights, endoscopes, compression and mishaps of the camera are drawn over them. Nothing is shared with
+Photographs that scikit-image's wheel carries, and drawn phantoms, are warped by an analytic field; tools,
+lamps, highlights, endoscopes, compression and mishaps of the camera are drawn over them. Nothing is shared with
 `synth.render`, nor with the scenes that trained the tool net.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from importlib.util import find_spec
 
 import cv2
@@ -105,7 +105,7 @@ def _recipe(index: int, half: str, surfaces: list[str]) -> Recipe:
     return Recipe(
         index=index,
         half=half,
-        # In turn, so that few scenes hold all surfaces and tools; 3 and 13 share no factor with their numbers.
+        # In turn, so that few scenes hold all surfaces and tools; 3 shares no factor with 7.
         surface=surfaces[number % len(surfaces)],
         tool=["", *_TOOLS][(3 * number + number // 7) % 7],
         tool_at_rest=bool(some[0] < 0.25),
@@ -129,7 +129,9 @@ class _Surface:
     def sample(self, at: Floats) -> Floats:
         """(H, W, 3) in 0..1 at (H, W, 2) pixels (x, y)."""
         where = [(at[..., k] + _MARGIN + 0.5) * _FINE - 0.5 for k in (1, 0)]
-        planes = [map_coordinates(c, where, order=3, mode="mirror", prefilter=False) for c in self.coefficients]
+        planes = [
+            map_coordinates(c, where, order=3, mode="mirror", prefilter=False) for c in self.coefficients
+        ]
         return np.asarray(np.stack(planes, -1), np.float32)
 
 
@@ -142,7 +144,7 @@ def surface(name: str, size: int, rng: np.random.Generator) -> _Surface:
 
 
 def _photograph(name: str, fine: int) -> Floats:
-    from skimage import data
+    from skimage import data  # type: ignore[import-not-found, unused-ignore]
 
     picture = np.asarray(getattr(data, name)())
     picture = np.repeat(picture[..., None], 3, -1) if picture.ndim == 2 else picture[..., :3]
@@ -151,7 +153,7 @@ def _photograph(name: str, fine: int) -> Floats:
     square = picture[top : top + side, left : left + side].astype(np.float32)
     square = square / (255 if picture.dtype == np.uint8 else max(float(square.max()), 1.0))
     ways = cv2.INTER_AREA if side > fine else cv2.INTER_CUBIC
-    return np.clip(cv2.resize(square, (fine, fine), interpolation=ways), 0, 1)
+    return np.asarray(np.clip(cv2.resize(square, (fine, fine), interpolation=ways), 0, 1), np.float32)
 
 
 def _drawn(name: str, fine: int, rng: np.random.Generator) -> Floats:
@@ -160,7 +162,7 @@ def _drawn(name: str, fine: int, rng: np.random.Generator) -> Floats:
     paper = 1 + 0.02 * noise_field(shape, 60, rng)
     if name == "dots":  # dark dots on a light silicone membrane, or white ones on a dark one
         light, ink = ((0.82, 0.80, 0.74), 0.10) if rng.random() < 0.5 else ((0.14, 0.13, 0.13), 0.95)
-        return _over(light * paper[..., None], _dots(fine, rng, 16 * _FINE / 2, 3.0 * _FINE), ink)
+        return _over(np.array(light) * paper[..., None], _dots(fine, rng, 16 * _FINE / 2, 3.0 * _FINE), ink)
     if name == "speckle":
         grains = (noise_field(shape, 3.2 * _FINE, rng) > 0.1).astype(np.float32)
         grains = cv2.GaussianBlur(grains, (0, 0), 0.4 * _FINE)
@@ -171,7 +173,7 @@ def _drawn(name: str, fine: int, rng: np.random.Generator) -> Floats:
         fine_noise = 0.02 * noise_field(shape, 6 * _FINE, rng)[..., None]
         gel = np.array([0.85, 0.62, 0.58]) * paper[..., None]
         hue = np.where(noise_field(shape, 150 * _FINE, rng)[..., None] > 0, (0.6, 0.1, 0.1), (0.2, 0.2, 0.5))
-        return np.clip(gel + 0.8 * line * (hue - gel) + fine_noise, 0, 1).astype(np.float32)
+        return np.asarray(np.clip(gel + 0.8 * line * (hue - gel) + fine_noise, 0, 1), np.float32)
     level = {"white": 0.93, "grey": 0.5, "dark": 0.13}[name]
     grain = 0.25 * min(level, 1 - level) + 0.02
     noise = noise_field(shape, 5 * _FINE, rng) + noise_field(shape, 24 * _FINE, rng)
@@ -184,48 +186,62 @@ def _drawn(name: str, fine: int, rng: np.random.Generator) -> Floats:
 def _dots(fine: int, rng: np.random.Generator, apart: float, radius: float) -> Floats:
     """Cover in 0..1 by discs on a shaken grid, (fine, fine)."""
     cover = np.zeros((fine, fine), np.uint8)
-    for x, y in np.stack(np.meshgrid(np.arange(0, fine, apart), np.arange(0, fine, apart)), -1).reshape(-1, 2):
+    for x, y in np.stack(np.meshgrid(np.arange(0, fine, apart), np.arange(0, fine, apart)), -1).reshape(
+        -1, 2
+    ):
         centre = 16 * (np.array([x, y]) + rng.uniform(-0.3, 0.3, 2) * apart)
         cv2.circle(cover, tuple(centre.astype(int).tolist()), int(16 * radius), 255, -1, cv2.LINE_AA, 4)
     return np.asarray(cover / 255, np.float32)
 
 
 def _over(picture: NDArray[np.floating], cover: Floats, ink: float) -> Floats:
-    return np.clip(picture + cover[..., None] * (ink - picture), 0, 1).astype(np.float32)
+    return np.asarray(np.clip(picture + cover[..., None] * (ink - picture), 0, 1), np.float32)
 
 
-Field = Callable[[Floats], Floats]
-"""(..., 2) px → displacement of largest length 1."""
+@dataclass(frozen=True, eq=False)
+class Field:
+    """A motion in closed form whose largest displacement is 1 px."""
 
+    motion: str
+    centre: NDArray[np.float64]
+    """(2,) px."""
+    radius: float
+    """px."""
+    way: NDArray[np.float64]
+    """(2,) unit vector."""
 
-def field(motion: str, size: int, rng: np.random.Generator) -> Field:
-    """The motion in closed form; its largest displacement is 1 px."""
-    centre = size * np.array([rng.uniform(0.38, 0.62), rng.uniform(0.38, 0.62)])
-    radius, turn = size * rng.uniform(0.16, 0.26), rng.uniform(0, 2 * np.pi)
-    way = np.array([np.cos(turn), np.sin(turn)])
+    @classmethod
+    def draw(cls, motion: str, size: int, rng: np.random.Generator) -> Field:
+        """One of the kind, somewhere near the middle of the picture."""
+        centre = size * np.array([rng.uniform(0.38, 0.62), rng.uniform(0.38, 0.62)])
+        radius, turn = size * rng.uniform(0.16, 0.26), rng.uniform(0, 2 * np.pi)
+        return cls(motion, centre, radius, np.array([np.cos(turn), np.sin(turn)]))
 
-    def displaced(at: Floats) -> Floats:
-        away = at - centre
-        square = (away**2).sum(-1, keepdims=True) / radius**2
-        if motion == "shift":
-            return np.asarray(np.broadcast_to(way, at.shape), np.float32)
-        if motion == "pull":  # as a point load on a half space, level within the contact
-            return np.asarray(way * np.exp(-square / 16) / np.sqrt(1 + square), np.float32)
+    def at(self, place: Floats) -> Floats:
+        """(..., 2) px → displacement, (..., 2)."""
+        away = place - self.centre
+        square = (away**2).sum(-1, keepdims=True) / self.radius**2
+        if self.motion == "shift":
+            return np.asarray(np.broadcast_to(self.way, place.shape), np.float32)
+        if self.motion == "pull":  # as a point load on a half space, level within the contact
+            return np.asarray(self.way * np.exp(-square / 16) / np.sqrt(1 + square), np.float32)
         # r exp(-r²/2R²) is largest at R, where it is R exp(-1/2).
-        radial = away / radius * np.exp(0.5 - 0.5 * square)
-        if motion == "twist":
+        radial = away / self.radius * np.exp(0.5 - 0.5 * square)
+        if self.motion == "twist":
             return np.asarray(np.stack([-radial[..., 1], radial[..., 0]], -1), np.float32)
-        return np.asarray(radial if motion == "press from behind" else -radial, np.float32)
+        return np.asarray(radial if self.motion == "press from behind" else -radial, np.float32)
 
-    displaced.centre = centre  # type: ignore[attr-defined]
-    return displaced
+    def steepest(self, size: int) -> float:
+        """Largest derivative [1/px], at least a millionth."""
+        found = self.at(_grid(size))
+        return max(
+            1e-6, *(float(np.abs(np.gradient(found[..., c], axis=a)).max()) for c in (0, 1) for a in (0, 1))
+        )
 
 
-def _steepest(move: Field, size: int) -> float:
-    """Largest derivative of the unit field [1/px]."""
+def _grid(size: int) -> Floats:
     y, x = np.mgrid[:size, :size].astype(np.float32)
-    found = move(np.stack([x, y], -1))
-    return float(max(np.abs(np.gradient(found[..., c], axis=a)).max() for c in (0, 1) for a in (0, 1)))
+    return np.stack([x, y], -1)
 
 
 def amplitudes(frames: int) -> NDArray[np.float64]:
@@ -237,13 +253,10 @@ def amplitudes(frames: int) -> NDArray[np.float64]:
 def film(recipe: Recipe, size: int = 192, frames: int = 16) -> Iterator[Shown]:
     """The recording's frames, the rest frame first."""
     rng = np.random.default_rng([1805, recipe.index])
-    skin = surface(recipe.surface, size, rng)
-    move = field(recipe.motion, size, rng)
-    peak = min(recipe.peak_px, 0.5 / max(_steepest(move, size), 1e-6)) * size / 192
-    stage = _Stage(recipe, size, skin, move, peak, rng)
+    stage = _Stage.build(recipe, size, rng)
     plan = _plan(recipe, frames, rng)
-    for t, (amplitude, mishap) in enumerate(plan):
-        yield stage.shoot(amplitude, t / frames, mishap, rng)
+    for amplitude, mishap in plan:
+        yield stage.shoot(amplitude, mishap, rng)
 
 
 def _plan(recipe: Recipe, frames: int, rng: np.random.Generator) -> list[tuple[float, str]]:
@@ -264,82 +277,91 @@ def _plan(recipe: Recipe, frames: int, rng: np.random.Generator) -> list[tuple[f
 
 @dataclass(frozen=True, eq=False)
 class _Stage:
+    """What doesn't change from frame to frame."""
+
     recipe: Recipe
     size: int
     skin: _Surface
     move: Field
     peak: float
-    rng: np.random.Generator
+    """px."""
+    wet: Floats
+    """(H, W) whose high values shine."""
+    drift: Floats
+    """(H, W) by which they change with the surface's tilt."""
+    angle: float
+    """Of the shaft [rad]."""
+    rest_blocked: Flags
+    """(H, W): tool or highlight in the rest frame, or next to them."""
 
-    def __post_init__(self) -> None:
-        shape = (self.size, self.size)
-        wet = noise_field(shape, self.size / 14, self.rng) + noise_field(shape, self.size / 4, self.rng)
-        object.__setattr__(self, "wet", wet)
-        object.__setattr__(self, "drift", noise_field(shape, self.size / 5, self.rng))
-        object.__setattr__(self, "angle", self.rng.uniform(0, 2 * np.pi))
+    @classmethod
+    def build(cls, recipe: Recipe, size: int, rng: np.random.Generator) -> _Stage:
+        skin = surface(recipe.surface, size, rng)
+        move = Field.draw(recipe.motion, size, rng)
+        peak = min(recipe.peak_px, 0.5 / move.steepest(size)) * size / 192
+        shape = (size, size)
+        wet = noise_field(shape, size / 14, rng) + noise_field(shape, size / 4, rng)
+        drift, angle = noise_field(shape, size / 5, rng), rng.uniform(0, 2 * np.pi)
+        stage = cls(recipe, size, skin, move, peak, wet, drift, angle, np.zeros(shape, bool))
+        blank = np.zeros((*shape, 3), np.float32)
+        _, glare = stage._shine(blank, 0.0)
+        _, tool = stage._tool(blank, 0.0, np.zeros((*shape, 2), np.float32))
+        return replace(stage, rest_blocked=_near(glare | tool))
 
-    def shoot(self, amplitude: float, time: float, mishap: str, rng: np.random.Generator) -> Shown:
+    def shoot(self, amplitude: float, mishap: str, rng: np.random.Generator) -> Shown:
         """One frame."""
         size, recipe = self.size, self.recipe
-        y, x = np.mgrid[:size, :size].astype(np.float32)
-        grid = np.stack([x, y], -1)
+        grid = _grid(size)
         jump = np.array([18.0, -11.0]) * size / 192 if mishap == "jump" else np.zeros(2)
 
         def moved(at: Floats) -> Floats:
-            return np.asarray(amplitude * self.peak * self.move(at) + jump, np.float32)
+            return np.asarray(amplitude * self.peak * self.move.at(at) + jump, np.float32)
 
         source = grid
         for _ in range(40):  # s = y - u(s): a contraction, for |grad u| is at most 1/2
             source = grid - moved(source)
         flow = moved(grid)
-        bulge = 1 + 0.08 * amplitude * np.exp(-((grid - self.move.centre) ** 2).sum(-1) / (0.3 * size) ** 2)  # type: ignore[attr-defined]
+        bulge = 1 + 0.08 * amplitude * np.exp(-((grid - self.move.centre) ** 2).sum(-1) / (0.3 * size) ** 2)
         picture = self.skin.sample(source) * bulge[..., None] * np.array(_LAMPS[recipe.lamp])
         picture, glare = self._shine(picture, amplitude)
-        picture, tool = self._tool(picture, amplitude, time, flow)
+        picture, tool = self._tool(picture, amplitude, flow)
         scope = np.ones((size, size), bool)
         if recipe.scope:
-            scope = np.hypot(x - size / 2, y - size / 2) < 0.48 * size
+            scope = np.linalg.norm(grid - size / 2, axis=-1) < 0.48 * size
             picture = np.where(scope[..., None], picture, 0.01)
         cover = np.zeros((size, size), bool)
         if mishap == "covered":
             cover[:, : int(0.9 * size)] = True
             picture = np.where(cover[..., None], (0.7, 0.68, 0.66), picture)
         if mishap == "black":
-            picture = 0.01 * picture
+            picture = np.zeros_like(picture)
         if mishap == "defocus":
             picture = cv2.GaussianBlur(picture, (0, 0), 0.03 * size)
         rgb = self._sense(np.asarray(picture, np.float32), rng)
-        blocked = cv2.dilate((glare | tool).astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
+        blocked = _near(glare | tool)
         now_free = scope & ~blocked & ~cover
         at = grid + flow
         seen = cv2.remap(now_free.astype(np.float32), at[..., 0], at[..., 1], cv2.INTER_LINEAR) > 0.99
-        rest_blocked = self._rest_blocked()
-        return Shown(rgb, flow, seen & scope & ~rest_blocked, now_free, amplitude, mishap)
-
-    def _rest_blocked(self) -> Flags:
-        blank = np.zeros((self.size, self.size, 3), np.float32)
-        _, glare = self._shine(blank, 0.0)
-        _, tool = self._tool(blank, 0.0, 0.0, np.zeros((self.size, self.size, 2), np.float32))
-        return cv2.dilate((glare | tool).astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
+        return Shown(rgb, flow, seen & scope & ~self.rest_blocked, now_free, amplitude, mishap)
 
     def _shine(self, picture: Floats, amplitude: float) -> tuple[Floats, Flags]:
         """Highlights that stay with the light."""
         if self.recipe.glare <= 0:
             return picture, np.zeros(picture.shape[:2], bool)
-        level = np.quantile(self.wet, 1 - self.recipe.glare)  # type: ignore[attr-defined]
-        now = self.wet + 0.3 * amplitude * self.drift  # type: ignore[attr-defined]
+        level = np.quantile(self.wet, 1 - self.recipe.glare)
+        now = self.wet + 0.3 * amplitude * self.drift
         strength = np.clip((now - level) / 0.2 + 0.5, 0, 1)[..., None]
         lit = picture + strength * (1.08 * np.array(_LAMPS[self.recipe.lamp]) - picture)
         return np.asarray(lit, np.float32), strength[..., 0] > 0.1
 
-    def _tool(self, picture: Floats, amplitude: float, time: float, flow: Floats) -> tuple[Floats, Flags]:
+    def _tool(self, picture: Floats, amplitude: float, flow: Floats) -> tuple[Floats, Flags]:
         """A shaft from the border to the contact, which it follows; away at rest unless it starts there."""
         recipe, size = self.recipe, self.size
         mask = np.zeros((size, size), np.uint8)
-        if not recipe.tool or recipe.motion == "press from behind" and not recipe.tool_at_rest:
+        if not recipe.tool or (recipe.motion == "press from behind" and not recipe.tool_at_rest):
             return picture, mask.astype(bool)
-        shaft = np.array([np.cos(self.angle), np.sin(self.angle)])  # type: ignore[attr-defined]
-        centre = self.move.centre  # type: ignore[attr-defined]
+        shaft = np.array([np.cos(self.angle), np.sin(self.angle)])
+        centre = self.move.centre
         row, column = np.clip(centre[::-1].round().astype(int), 0, size - 1)
         near = 1.0 if amplitude > 0.02 else 0.0
         back = (0.12 if recipe.tool_at_rest else 1.2) * (1 - near) * size
@@ -349,14 +371,14 @@ class _Stage:
         finger = recipe.tool == "gloved finger"
         width = size * (0.22 if finger else 0.09)
         end = tip + 2 * size * shaft
-        thick = int(round(width))
+        thick = round(width)
         points = [tuple((16 * p).round().astype(int).tolist()) for p in (tip, end)]
         if finger:
             cv2.line(mask, points[0], points[1], 1, thick, cv2.LINE_8, 4)
         else:
             side = np.array([-shaft[1], shaft[0]])
-            outline = [tip - 0.12 * width * side, tip + 0.12 * width * side, tip + width * shaft + width / 2 * side,
-                       end + width / 2 * side, end - width / 2 * side, tip + width * shaft - width / 2 * side]  # fmt: skip
+            neck, half = tip + width * shaft, 0.5 * width * side
+            outline = [tip - 0.24 * half, tip + 0.24 * half, neck + half, end + half, end - half, neck - half]
             cv2.fillConvexPoly(mask, np.round(16 * np.array(outline)).astype(np.int32), 1, cv2.LINE_8, 4)
         y, x = np.mgrid[:size, :size].astype(np.float32)
         across = ((x - tip[0]) * -shaft[1] + (y - tip[1]) * shaft[0]) / (width / 2)
@@ -379,5 +401,10 @@ class _Stage:
         rgb = np.clip(np.round(255 * picture + noise), 0, 255).astype(np.uint8)
         if self.recipe.quality:
             _, packed = cv2.imencode(".jpg", rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, self.recipe.quality])
-            rgb = np.ascontiguousarray(cv2.imdecode(packed, cv2.IMREAD_COLOR)[..., ::-1])
+            rgb = np.ascontiguousarray(np.asarray(cv2.imdecode(packed, cv2.IMREAD_COLOR))[..., ::-1])
         return np.asarray(rgb, np.uint8)
+
+
+def _near(mask: Flags) -> Flags:
+    """(H, W) grown by 4 px: soft rims and the shadow's edge are neither."""
+    return np.asarray(cv2.dilate(mask.astype(np.uint8), np.ones((9, 9), np.uint8)) > 0, bool)

@@ -38,10 +38,12 @@ _SHARE = 0.05  # a frame
 
 @dataclass(frozen=True, eq=False)
 class Proposal:
-    """What was found in a picture that may be no tissue, (H, W) each."""
+    """What was found in a picture that may be no tissue, and what is known to be none, (H, W) each."""
 
     glare: Flags
     tool: Flags
+    known: Flags
+    """Masked without being asked."""
 
     def within(self, tissue: Flags) -> Proposal:
         """Without the kind that takes more of the tissue than anything real does."""
@@ -50,7 +52,7 @@ class Proposal:
             kind if np.count_nonzero(kind & tissue) <= most else np.zeros_like(kind)
             for kind in (self.glare, self.tool)
         )
-        return Proposal(glare, tool)
+        return replace(self, glare=glare, tool=tool)
 
     @property
     def either(self) -> Flags:
@@ -97,17 +99,16 @@ class ChoosingTracker:
     """
 
     def __init__(self, backend: str | Estimator, rest: Rgb, found: Proposal, tissue: Flags) -> None:
-        """Starts at rest, where nothing has to be masked yet. Arguments and errors as `Tracker`.
+        """Starts at rest, where nothing proposed has to be masked yet. Arguments and errors as `Tracker`.
 
         Args:
             found: of the rest frame.
         """
-        nothing = np.zeros_like(tissue)
-        self.tracker = Tracker(backend, rest, nothing, tissue)
+        self.tracker = Tracker(backend, rest, found.known, tissue)
         self.rest_found = found.within(tissue)
-        self.rest_blocked = nothing
+        self.rest_blocked = found.known
         """(H, W) what is masked in the rest frame, by the last choice."""
-        self.blocked = nothing
+        self.blocked = found.known
         """(H, W) what is masked in the last frame."""
         self.regained = False
         """Whether the last frame can be trusted because its masks were chosen anew, or for starting from nothing."""
@@ -122,13 +123,19 @@ class ChoosingTracker:
         """Whether the last frame could be followed."""
         return self.tracker.trusted
 
+    @property
+    def lost(self) -> str:
+        """Why the last frame could not be followed; empty if it could."""
+        return self.tracker.lost
+
     def step(self, frame: Rgb, found: Proposal) -> tuple[Flow, Map]:
         """As `Tracker.step`; found: what may be no tissue in the frame."""
         tracker, tissue = self.tracker, self.tracker.tissue
         found = found.within(tissue)
         pieces = found.pieces()
         masked, known = self._remembered(pieces)
-        new = np.count_nonzero(found.either & ~known) > _NEW * np.count_nonzero(tissue)
+        masked |= found.known
+        new = bool(np.count_nonzero(found.either & ~known) > _NEW * np.count_nonzero(tissue))
         self._frames += 1
         self.regained = False
         resets = tracker.resets
@@ -174,12 +181,11 @@ class ChoosingTracker:
     ) -> tuple[Solved, Flags]:
         """Tries all proposals and none, keeps those that earn it, and gives the answer and its masks."""
         tracker = self.tracker
-        nothing = np.zeros_like(tracker.tissue)
-        answers = {}
-        for name, rest, now in (("bare", nothing, nothing), ("all", self.rest_found.either, found.either)):
-            answers[name] = self._solve(frame, rest, now, first, masked)
-        bare, full = answers["bare"], answers["all"]
+        fixed = self.rest_found.known
+        bare = self._solve(frame, fixed, found.known, first, masked)
+        full = self._solve(frame, fixed | self.rest_found.either, found.known | found.either, first, masked)
         rest, now = self._earned(frame, pieces, bare.flow, full.flow)
+        rest, now = rest | fixed, now | found.known
         motion = _motion(bare.flow, tracker.tissue)
         if tracker.trusted and motion < self._tested_px:
             # What was found out at more motion stands: a highlight pulls at nothing while nothing moves.
@@ -189,7 +195,7 @@ class ChoosingTracker:
             # Nothing is learned from a frame that can't be followed; its answer is what fits best where all of
             # them look: without masks, a still highlight would vouch for stillness.
             common = tracker.usable & ~(masked | now | rest)
-            tries = [(first, masked), (chosen, now), (bare, nothing)]
+            tries = [(first, masked), (chosen, now), (bare, found.known)]
             levels = [float(one.confidence[common].mean()) if common.any() else 0.0 for one, _ in tries]
             best = int(np.argmax(levels))
             if not best:
@@ -211,14 +217,13 @@ class ChoosingTracker:
         finally:
             self.tracker.usable = before
 
-    def _earned(
-        self, frame: Rgb, pieces: Pieces, bare: Flow, full: Flow
-    ) -> tuple[Flags, Flags]:
+    def _earned(self, frame: Rgb, pieces: Pieces, bare: Flow, full: Flow) -> tuple[Flags, Flags]:
         """(H, W) what is masked in the rest frame and in this one."""
-        now = _normalised(frame)
-        residual, residual_full = (_residual(self._rest_picture, now, flow) for flow in (bare, full))
+        shown = _normalised(frame)
+        residual, residual_full = (_residual(self._rest_picture, shown, flow) for flow in (bare, full))
         moved = [np.stack([_at_rest(layer, flow) for layer in pieces.number]) for flow in (bare, full)]
-        inside = self.tracker.tissue & _stays(bare) & _stays(full)
+        # What is known to be no tissue is counted nowhere.
+        inside = self.tracker.tissue & ~self.rest_found.known & _stays(bare) & _stays(full)
         common = inside & ~((self._rest_pieces.number > 0) | (moved[0] > 0) | (moved[1] > 0)).any(0)
         usual = float(residual[common].mean()) if common.any() else float(np.median(residual))
         gain = np.where(common, residual - residual_full, 0)
@@ -233,20 +238,21 @@ class ChoosingTracker:
                 ring = _ring(piece) & common
                 enough = np.count_nonzero(ring) >= _SMALLEST
                 around = float(residual[ring].mean()) if beside and enough else usual
-                kept[number] = float(residual[piece].mean()) > max(around + _UNEXPLAINED, _TIMES * around) or (
-                    enough and float(gain[ring].mean()) > _GAIN
-                )
+                kept[number] = float(residual[piece].mean()) > max(
+                    around + _UNEXPLAINED, _TIMES * around
+                ) or (enough and float(gain[ring].mean()) > _GAIN)
             return judged.whole(kept)
 
         # What something covers now is no worse at rest: there the neighbours are as little explained.
         still = self._rest_pieces
         rest = earning(still.number, still, True)[still.number].any(0)
-        return rest, earning(moved[0], pieces, False)[pieces.number].any(0)
+        now = earning(moved[0], pieces, False)[pieces.number].any(0)
+        return np.asarray(rest, bool), np.asarray(now, bool)
 
 
 def _ring(piece: Flags) -> Flags:
     wide = 2 * _RING_PX + 1
-    return cv2.dilate(piece.astype(np.uint8), np.ones((wide, wide), np.uint8)) > 0
+    return np.asarray(cv2.dilate(piece.astype(np.uint8), np.ones((wide, wide), np.uint8)) > 0, bool)
 
 
 def _stays(flow: Flow) -> Flags:

@@ -67,6 +67,8 @@ class Tracker:
         self.usable = tissue & ~rest_blocked
         self.trusted = True
         """Whether the last frame could be followed."""
+        self.lost = ""
+        """Why the last frame could not be followed; empty if it could."""
         self.resets = 0
         """How often a frame was solved again from nothing, and better."""
         self.level = 1.0
@@ -108,6 +110,7 @@ class Tracker:
     def accept(self, found: Solved) -> tuple[Flow, Map]:
         """Makes it the frame's answer; the next one starts from it if it can be trusted."""
         self.level, self.trusted = found.level, found.level >= _TRUSTED
+        self.lost = "" if self.trusted else f"confidence {found.level:.2f}"
         confidence = found.confidence
         if self.trusted:
             self._good, self._level = found.flow, found.level
