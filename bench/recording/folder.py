@@ -89,7 +89,7 @@ class Recording:
         return None if path is None else video.read_mask(path, size)
 
     def tissue_mask(self, size: tuple[int, int]) -> NDArray[np.bool_]:
-        """(H, W) where tissue may be tracked in the rest frame: `tissue.png`, else everywhere; in the region."""
+        """(H, W) where tissue may be tracked in the rest frame: `tissue.png`, else everywhere."""
         tissue = np.ones(size, bool) if self.tissue is None else video.read_mask(self.tissue, size)
         if self.region is not None:
             left, top, width, height = self.region

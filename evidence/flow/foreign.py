@@ -1,4 +1,4 @@
-"""`bench stability recordings`: recordings that no renderer of ours made, followed as `bench score` follows one."""
+"""`bench stability recordings`: films that no renderer of ours made, followed as `bench score` does."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ class Row:
     r_dis: float
     """The same of OpenCV's DIS on the plain pictures, all frames that show the tissue."""
     lost: int
-    """Frames off by more than 1 px and a fifth of the motion, or that show less than a fifth of the tissue."""
+    """Frames off by over 1 px and a fifth of the motion, or that show less than a fifth of the tissue."""
     flagged: int
     hits: int
     """Frames that are both."""
@@ -177,7 +177,10 @@ def _correlation(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
 Figure = Callable[[Mapping[str, NDArray[Any]]], float]
 
 _FIGURES: dict[str, tuple[str, Figure]] = {
-    "scenes with at most 3% of free tissue masked": ("≥ 0.95", lambda t: float(np.mean(t["covered"] <= 0.03))),
+    "scenes with at most 3% of free tissue masked": (
+        "≥ 0.95",
+        lambda t: float(np.mean(t["covered"] <= 0.03)),
+    ),
     "largest share of free tissue masked": ("≤ 0.2", lambda t: float(t["covered"].max())),
     "EPE / better of all masks and none, mean over scenes": (
         "≤ 1.05",
@@ -248,4 +251,3 @@ def drawn(found: Mapping[str, Any]) -> result_page.Page:
         result_page.Section("Scenes furthest behind the better of all masks and none", found["worst"]),
     ]
     return result_page.Page("Flow: recordings from elsewhere", found, [chart], sections)
-

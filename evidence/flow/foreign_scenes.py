@@ -1,8 +1,8 @@
 """Recordings whose motion is known in closed form, on pictures that no renderer of ours made.
 
 Photographs that scikit-image's wheel carries, and drawn phantoms, are warped by an analytic field; tools,
-lamps, highlights, endoscopes, compression and mishaps of the camera are drawn over them. Nothing is shared with
-`synth.render`, nor with the scenes that trained the tool net.
+lamps, highlights, endoscopes, compression and mishaps of the camera are drawn over them. Nothing is shared
+with `synth.render`, nor with the scenes that trained the tool net.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Masks that have to earn their place: which of the found tools and highlights are masked, by the video alone.
+"""Masks that have to earn their place: which found tools and highlights are masked, by the video alone.
 
 A mask that is wrong blanks tissue, and a detector trained elsewhere can be wrong about a whole recording. So
 what `synth.flow.mask` finds is a proposal. Two flows are computed, with every proposal masked and with none;
@@ -25,7 +25,8 @@ _TIMES = 1.7  # ... and as a factor
 _GAIN = 0.01  # local deviations by which masking lowers the residual around a piece
 _RING_PX = 8
 _CELLS = 6  # a body is judged in parts of this share of the picture's longer side;
-_MOST = 0.7  # where more than this share of it is masked, all of it is
+_MOST = 0.7  # where more than this share of it is masked, all of it is,
+_NEARLY_ALL = 0.9  # and where more than this of a kind is, with its specks, all of the kind
 _CAPPED = 1.5  # local deviations: one wrong pixel counts no more
 _SMALLEST = 20  # px: smaller pieces are not judged
 _JOINED_PX = 3  # highlights so near to each other are one piece
@@ -85,17 +86,25 @@ class Pieces:
     """(n,) the connected body of each number."""
 
     def whole(self, kept: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """(n,) with all of those bodies of which most is kept. kept: (n,)."""
-        size = np.bincount(self.number.ravel(), minlength=len(self.body)).astype(float)
-        size[0] = 0
-        _, body = np.unique(self.body, return_inverse=True)
-        share = np.bincount(body, size * kept) / np.maximum(np.bincount(body, size), 1)
-        return np.asarray(kept | (share > _MOST)[body], bool) & (np.arange(len(kept)) > 0)
+        """(n,) with all of those bodies, and of those kinds, of which most is kept. kept: (n,)."""
+        result = kept.copy()
+        for layer in self.number:
+            size = np.bincount(layer.ravel(), minlength=len(self.body)).astype(float)
+            size[0] = 0
+            _, body = np.unique(self.body, return_inverse=True)
+            share = np.bincount(body, size * kept) / np.maximum(np.bincount(body, size), 1)
+            result |= (share > _MOST)[body] & (size > 0)
+            if (size * result).sum() > _NEARLY_ALL * size.sum():
+                result |= size > 0
+        result[0] = False
+        return result
 
 
 class ChoosingTracker:
-    """A `Tracker` that is given proposals and chooses its masks: at first motion, as motion grows, when
-    something new turns up, and when trust falls; never more than about a tenth of solutions beyond one a frame.
+    """A `Tracker` that is given proposals and chooses its masks.
+
+    It does so at first motion, as motion grows, when something new turns up, and when trust falls; beyond the
+    first frames, solutions for it are at most a twentieth of the others.
     """
 
     def __init__(self, backend: str | Estimator, rest: Rgb, found: Proposal, tissue: Flags) -> None:
@@ -111,7 +120,7 @@ class ChoosingTracker:
         self.blocked = found.known
         """(H, W) what is masked in the last frame."""
         self.regained = False
-        """Whether the last frame can be trusted because its masks were chosen anew, or for starting from nothing."""
+        """Whether the last frame can be trusted only for other masks, or for a start from nothing."""
         self._rest_pieces = self.rest_found.pieces()
         self._rest_picture = _normalised(rest)
         self._verdict = np.zeros((2, *tissue.shape), np.int8)  # 1 masked, -1 not, 0 not known
@@ -142,7 +151,8 @@ class ChoosingTracker:
         flow, confidence = tracker.step(frame, masked)
         proposed = bool((found.either | self.rest_found.either).any())
         if proposed and self._is_due(flow, new):
-            first = Solved(flow, confidence, tracker.level)
+            first = tracker.last
+            assert first is not None
             better, masked = self._choose(frame, found, pieces, first, masked, known)
             if better is not first:
                 doubted = not tracker.trusted
@@ -192,15 +202,13 @@ class ChoosingTracker:
             rest, now = self.rest_blocked, np.where(known, masked, now)
         chosen = self._solve(frame, rest, now, first, masked)
         if tracker.is_doubtful(chosen):
-            # Nothing is learned from a frame that can't be followed; its answer is what fits best where all of
-            # them look: without masks, a still highlight would vouch for stillness.
+            # Nothing is learned from a frame that can't be followed; its answer is what fits best where all
+            # of them look: without masks, a still highlight would vouch for stillness.
             common = tracker.usable & ~(masked | now | rest)
             tries = [(first, masked), (chosen, now), (bare, found.known)]
-            levels = [float(one.confidence[common].mean()) if common.any() else 0.0 for one, _ in tries]
-            best = int(np.argmax(levels))
-            if not best:
-                return first, masked
-            return replace(tries[best][0], level=min(levels[best], tries[best][0].level)), tries[best][1]
+            judged = [tracker.judge(one.flow, one.confidence, common) for one, _ in tries]
+            best = max(range(len(tries)), key=lambda k: judged[k].level)
+            return (judged[best], tries[best][1]) if best else (first, masked)
         self._tested_px = max(motion, self._tested_px)
         self.rest_blocked = rest
         tracker.usable = tracker.tissue & ~rest
@@ -219,8 +227,8 @@ class ChoosingTracker:
 
     def _earned(self, frame: Rgb, pieces: Pieces, bare: Flow, full: Flow) -> tuple[Flags, Flags]:
         """(H, W) what is masked in the rest frame and in this one."""
-        shown = _normalised(frame)
-        residual, residual_full = (_residual(self._rest_picture, shown, flow) for flow in (bare, full))
+        now = _normalised(frame)
+        residual, residual_full = (_residual(self._rest_picture, now, flow) for flow in (bare, full))
         moved = [np.stack([_at_rest(layer, flow) for layer in pieces.number]) for flow in (bare, full)]
         # What is known to be no tissue is counted nowhere.
         inside = self.tracker.tissue & ~self.rest_found.known & _stays(bare) & _stays(full)
@@ -245,9 +253,12 @@ class ChoosingTracker:
 
         # What something covers now is no worse at rest: there the neighbours are as little explained.
         still = self._rest_pieces
-        rest = earning(still.number, still, True)[still.number].any(0)
-        now = earning(moved[0], pieces, False)[pieces.number].any(0)
-        return np.asarray(rest, bool), np.asarray(now, bool)
+        kept_rest, kept = earning(still.number, still, True), earning(moved[0], pieces, False)
+        for before, after in zip(still.number, pieces.number, strict=True):
+            shown = after[after > 0]
+            if len(shown) and kept[shown].mean() > _NEARLY_ALL:
+                kept_rest[before[before > 0]] = True  # the kind has proved right
+        return np.asarray(kept_rest[still.number].any(0), bool), np.asarray(kept[pieces.number].any(0), bool)
 
 
 def _ring(piece: Flags) -> Flags:
