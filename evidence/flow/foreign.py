@@ -14,12 +14,14 @@ import typer
 from numpy.typing import NDArray
 
 from bench.output import charts, result_page
+from evidence.flow import foreign_pairs
 from evidence.flow.foreign_scenes import Recipe, Shown, film, recipes
 from evidence.flow.measure import epe
 from evidence.measuring import measuring
 from learn.inference.video import Picture
 from learn.inference.video_flow import Footage, Settings, VideoFlow
 
+_cv2: Any = cv2  # its type stubs leave out the contributed modules
 _WAYS = ("auto", "both", "none")
 """Masks of which each recording is followed with."""
 _SPOILT = ("black", "covered", "defocus", "jump")
@@ -85,6 +87,7 @@ def recordings(
     count: Annotated[int, typer.Option(min=2, help="Recordings.")] = 48,
     size: Annotated[int, typer.Option(min=64, help="Width and height of the pictures [px].")] = 160,
     frames: Annotated[int, typer.Option(min=6, help="Frames of each.")] = 14,
+    pairs: Annotated[int, typer.Option(min=0, help="Pairs of speckle, layers and a street's pan.")] = 6,
     long: Annotated[int, typer.Option(help="Frames of the recordings that are timed; 0: none.")] = 150,
 ) -> dict[str, Any]:
     """Flow: masks, trust and error on recordings of known motion that no renderer of ours made."""
@@ -95,6 +98,8 @@ def recordings(
         rows.append(judge(recipe, list(film(recipe, size, frames))))
         typer.echo(_line(rows[-1]), err=True)
     found: dict[str, Any] = {"half": half, "summary": summarise(rows)}
+    if pairs:
+        found["pairs"] = foreign_pairs.rows(pairs, 2711 if half == "reporting" else 11)
     if long:
         found["time"] = _times(recipes(half, 2), size, long)
     return found | {"worst": [asdict(row) for row in sorted(rows, key=_badness)[-6:]]}
@@ -133,7 +138,7 @@ def follow(shown: Sequence[Shown], masks: str) -> Followed:
 
 def _dis(shown: Sequence[Shown]) -> NDArray[np.float64]:
     """Mean length of the flow [px] of OpenCV's DIS, medium, rest frame to now, without masks."""
-    solver = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    solver = _cv2.DISOpticalFlow_create(_cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     grey = [cv2.cvtColor(one.rgb, cv2.COLOR_RGB2GRAY) for one in shown]
     blank: Any = None
     flows = [solver.calc(grey[0], now, blank) for now in grey[1:]]
@@ -247,6 +252,7 @@ def drawn(found: Mapping[str, Any]) -> result_page.Page:
     chart = charts.Chart(f"Unseen recordings ({found['half']} half), 95% over scenes", "found", rows)
     sections = [
         result_page.Section("Asked against found", found["summary"]),
+        result_page.Section("Pairs as other fields have them", found.get("pairs", [])),
         result_page.Section("Time with chosen masks / with none", found.get("time", [])),
         result_page.Section("Scenes furthest behind the better of all masks and none", found["worst"]),
     ]

@@ -111,14 +111,14 @@ class Tracker:
 
     def judge(self, flow: Flow, confidence: Map, where: Flags) -> Solved:
         """An answer as it is where one looks, (H, W)."""
-        seen = np.count_nonzero(where)
+        seen = int(np.count_nonzero(where))
         inside = confidence * where
         return Solved(
             flow,
             confidence,
             level=float(inside.sum(dtype=np.float64)) / max(1, seen),
             matched=float(np.count_nonzero(inside >= DOUBTFUL)) / max(1, seen),
-            seen=seen / max(1, np.count_nonzero(self.tissue)),
+            seen=seen / max(1, int(np.count_nonzero(self.tissue))),
         )
 
     def is_doubtful(self, found: Solved) -> bool:
