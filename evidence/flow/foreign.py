@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, replace
+from functools import partial
+from multiprocessing import get_context
 from typing import Annotated, Any, Literal
 
 import cv2
@@ -87,6 +90,7 @@ def recordings(
     count: Annotated[int, typer.Option(min=2, help="Recordings.")] = 48,
     size: Annotated[int, typer.Option(min=64, help="Width and height of the pictures [px].")] = 160,
     frames: Annotated[int, typer.Option(min=6, help="Frames of each.")] = 14,
+    jobs: Annotated[int, typer.Option(min=1, help="Processes.")] = 2,
     pairs: Annotated[int, typer.Option(min=0, help="Pairs of speckle, layers and a street's pan.")] = 6,
     long: Annotated[int, typer.Option(help="Frames of the recordings that are timed; 0: none.")] = 150,
 ) -> dict[str, Any]:
@@ -94,15 +98,22 @@ def recordings(
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
     rows = []
-    for recipe in recipes(half, count):
-        rows.append(judge(recipe, list(film(recipe, size, frames))))
-        typer.echo(_line(rows[-1]), err=True)
+    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
+        for row in pool.map(partial(_judged, size=size, frames=frames), recipes(half, count)):
+            rows.append(row)
+            typer.echo(_line(row), err=True)
     found: dict[str, Any] = {"half": half, "summary": summarise(rows)}
     if pairs:
         found["pairs"] = foreign_pairs.rows(pairs, 2711 if half == "reporting" else 11)
     if long:
         found["time"] = _times(recipes(half, 2), size, long)
     return found | {"worst": [asdict(row) for row in sorted(rows, key=_badness)[-6:]]}
+
+
+def _judged(recipe: Recipe, size: int, frames: int) -> Row:
+    torch.set_num_threads(1)
+    cv2.setNumThreads(1)
+    return judge(recipe, list(film(recipe, size, frames)))
 
 
 def _line(row: Row) -> str:

@@ -30,6 +30,7 @@ _NEARLY_ALL = 0.9  # and where more than this of a kind is, with its specks, all
 _CAPPED = 1.5  # local deviations: one wrong pixel counts no more
 _SMALLEST = 20  # px: smaller pieces are not judged
 _JOINED_PX = 3  # highlights so near to each other are one piece
+_AS_GOOD = 0.99  # share of the confidence without masks that has to be left, where both look
 _GROWN = 1.5  # the choice is made again when motion has grown by this factor,
 _STILL_PX = 0.5  # from this on,
 _NEW = 0.005  # or when a piece of this share of the tissue turns up where none was
@@ -209,6 +210,10 @@ class ChoosingTracker:
             judged = [tracker.judge(one.flow, one.confidence, common) for one, _ in tries]
             best = max(range(len(tries)), key=lambda k: judged[k].level)
             return (judged[best], tries[best][1]) if best else (first, masked)
+        both_see = tracker.tissue & ~(now | rest)
+        levels = [tracker.judge(one.flow, one.confidence, both_see).level for one in (chosen, bare)]
+        if levels[0] < _AS_GOOD * levels[1]:
+            rest, now, chosen = fixed, found.known, bare
         self._tested_px = max(motion, self._tested_px)
         self.rest_blocked = rest
         tracker.usable = tracker.tissue & ~rest
