@@ -107,7 +107,10 @@ def recordings(
         found["pairs"] = foreign_pairs.rows(pairs, 2711 if half == "reporting" else 11)
     if long:
         found["time"] = _times(recipes(half, 2), size, long)
-    return found | {"worst": [asdict(row) for row in sorted(rows, key=_badness)[-6:]]}
+    worst = [asdict(row) for row in sorted(rows, key=_badness)[-6:]]
+    return found | {
+        "worst": [{k: round(v, 4) if isinstance(v, float) else v for k, v in one.items()} for one in worst]
+    }
 
 
 def _judged(recipe: Recipe, size: int, frames: int) -> Row:
