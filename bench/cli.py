@@ -66,6 +66,13 @@ def score(
     ] = None,
     also: Annotated[list[str] | None, typer.Option(help="A further model, as NAME=FOLDER.")] = None,
     phantom: Phantom = False,
+    masks: Annotated[
+        str,
+        typer.Option(help="auto, none, glare, tool, both, or a folder of NNNNNN.png or mask.png: the tool."),
+    ] = "auto",
+    region: Annotated[
+        str, typer.Option(help="LEFT,TOP,WIDTH,HEIGHT [px]: only this part of the picture is followed.")
+    ] = "",
     json: Json = False,
 ) -> None:
     """Force from a recording's video, scored against its sensor: score.json and report.html."""
@@ -73,8 +80,12 @@ def score(
     from bench.scoring.evaluate_recording import Settings
 
     others = {name: Path(folder) for name, folder in _pairs("--also", also, "NAME=FOLDER").items()}
-    settings = Settings(backend=flow, shrink=shrink, rate_hz=rate or None, pulse=pulse)
-    result = commands.score_recording(recording, model, out, settings, title, train, others, phantom)
+    from learn.inference.video_flow import MASKS
+
+    kind, folder = (masks, None) if masks in MASKS else ("auto", Path(masks))
+    settings = Settings(backend=flow, shrink=shrink, rate_hz=rate or None, pulse=pulse, masks=kind)
+    seen = commands.Seen(folder, _rectangle(region))
+    result = commands.score_recording(recording, model, out, settings, title, train, others, phantom, seen)
     _say(result, out or Path(f"{result.recording}-score"), json)
 
 
@@ -313,6 +324,19 @@ def live(
         typer.echo(json_.dumps(summary))
     else:
         typer.echo(", ".join(f"{name} {value:.4g}" for name, value in summary.items()))
+
+
+def _rectangle(text: str) -> tuple[int, int, int, int] | None:
+    """Of LEFT,TOP,WIDTH,HEIGHT; None of nothing. UserError if it isn't that."""
+    if not text:
+        return None
+    try:
+        left, top, width, height = (int(part) for part in text.split(","))
+    except ValueError:
+        raise UserError(f"--region {text}: give LEFT,TOP,WIDTH,HEIGHT in pixels") from None
+    if min(left, top) < 0 or min(width, height) < 1:
+        raise UserError(f"--region {text}: outside the picture")
+    return left, top, width, height
 
 
 def _with_evidence() -> None:

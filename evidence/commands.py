@@ -23,6 +23,7 @@ from synth.errors import UserError
 COMMANDS = {
     "experiment flow": "evidence.flow.experiment:experiment",
     "stability flow": "evidence.flow.stability:stability",
+    "stability recordings": "evidence.flow.foreign:recordings",
     "pareto flow": "evidence.flow.pareto:pareto",
     "experiment realism": "evidence.render.realism:realism_figures",
     "experiment render": "evidence.render.cost:experiment",

@@ -245,6 +245,7 @@ _FILES: Mapping[str, tuple[str, str | Callable[[Tree], Page]]] = {
     "flow/benchmark": ("results.json", "flow.experiment"),
     "flow/live": ("live.json", live),
     "flow/pareto": ("pareto.json", "flow.pareto"),
+    "flow/recordings": ("recordings.json", "flow.foreign"),
     "flow/stability": ("stability.json", "flow.stability"),
     "render/cycles": ("cycles.json", cycles),
     "render/pareto": ("pareto.json", "render.pareto"),

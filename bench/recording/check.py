@@ -12,6 +12,7 @@ from bench.recording import pixel_scale
 from bench.recording.folder import Recording, open_recording
 from bench.recording.meta import LEAST_INTERVALS
 from learn.inference.quality import find_fault
+from learn.inference.video_flow import Account, Footage, Settings, VideoFlow
 from synth.errors import UserError
 
 _WIDEST_MM, _NARROWEST_MM = 300.0, 3.0
@@ -20,6 +21,7 @@ _JUMP = 3.0  # median intervals
 _SURGICAL_N = 5.0
 _RATE_HZ = 10.0  # frames a second that are looked at unless more are asked for
 _LEAST_PRESS = 5  # frames of a press that settle its gain
+_LOOKED_AT = 12  # frames that are followed to see whether they can be
 
 
 @dataclass(frozen=True)
@@ -135,13 +137,27 @@ def _check_masks(recording: Recording, size: tuple[int, int], frames: int, found
             found.add("lack", "tissue", "no tissue.png: the whole picture is taken for tissue")
         elif not tissue.any():
             found.add("bad", "tissue", "tissue.png marks nothing")
-        if not recording.masks:
-            found.add("lack", "tool", recording.describe_tool(frames))
-        else:
-            recording.tool(next(iter(recording.masks)), size)
-            found.add("ok", "tool", recording.describe_tool(frames))
+        if recording.has_masks:
+            recording.tool(next(iter(recording.masks), 0), size)
+        found.add("ok" if recording.has_masks else "lack", "tool", recording.describe_tool(frames))
+        _check_following(recording, found)
     except UserError as error:
         found.add("bad", "masks", str(error))
+
+
+def _check_following(recording: Recording, found: _Findings) -> None:
+    """Follows a few frames as `bench score` would: what is masked, and whether the tissue can be followed."""
+    first = recording.meta.rest_frame
+    count = recording.expected_frames() or _LOOKED_AT
+    wanted = {first, *np.linspace(first, max(count - 1, first), _LOOKED_AT).astype(int).tolist()}
+    pictures = (picture for picture in recording.frames() if picture.index in wanted)
+    tool = recording.tool if recording.has_masks else None
+    footage = Footage(pictures, str(recording.folder), recording.tissue_mask, tool, first)
+    video, account = VideoFlow(footage, Settings(rate_hz=None, pulse=False)), Account()
+    for step in video.steps():
+        account.add(step.found, video.tissue)
+    if account.frames:
+        found.add("odd" if account.is_odd else "ok", "following", account.describe())
 
 
 def _check_sensor(recording: Recording, times: NDArray[np.float64], found: _Findings) -> None:

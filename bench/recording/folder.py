@@ -5,6 +5,7 @@ video.mp4 or frames/*.png
 frames.csv             optional: frame,t_s      (else the video's own presentation times)
 force.csv              optional: t_s,fx_n,fy_n,fz_n
 masks/NNNNNN.png       optional: white where the tool is, in the frame of that number
+mask.png               optional: the same for all frames that have none of their own
 tissue.png             optional: white where tissue may be tracked, in the rest frame
 """
 
@@ -56,6 +57,15 @@ class Recording:
     tissue: Path | None
     notes: tuple[str, ...]
     """What was found odd and how it was taken; every one goes into the report."""
+    mask: Path | None = None
+    """For frames that have none in `masks`."""
+    region: tuple[int, int, int, int] | None = None
+    """Left, top, width and height [px] of the part of the picture that is looked at."""
+
+    @property
+    def has_masks(self) -> bool:
+        """Whether somebody said where the tool is."""
+        return bool(self.masks) or self.mask is not None
 
     @property
     def name(self) -> str:
@@ -77,17 +87,32 @@ class Recording:
 
     def tool(self, index: int, size: tuple[int, int]) -> NDArray[np.bool_] | None:
         """(H, W) tool mask of a frame, or None if there is none for it. UserError for one of another size."""
-        return video.read_mask(self.masks[index], size) if index in self.masks else None
+        path = self.masks.get(index, self.mask)
+        return None if path is None else video.read_mask(path, size)
 
     def describe_tool(self, frames: int) -> str:
         """What is taken for the tool in how many frames, for `bench check` and `bench score` alike."""
-        if not self.masks:
-            return "no masks/: the tool is looked for in each picture"
-        return f"masks/ has {len(self.masks)} of {frames} frames; the others are taken for free of a tool"
+        if not self.has_masks:
+            return "no masks/, no mask.png: the tool is looked for in each picture"
+        others = "mask.png stands for" if self.mask else "no tool is taken to be in"
+        return f"masks/ has {len(self.masks)} of {frames} frames; {others} the others"
 
     def tissue_mask(self, size: tuple[int, int]) -> NDArray[np.bool_]:
-        """(H, W) where tissue may be tracked in the rest frame; everywhere without `tissue.png`."""
-        return np.ones(size, bool) if self.tissue is None else video.read_mask(self.tissue, size)
+        """(H, W) where tissue may be tracked in the rest frame: `tissue.png`, else everywhere."""
+        tissue = np.ones(size, bool) if self.tissue is None else video.read_mask(self.tissue, size)
+        if self.region is not None:
+            left, top, width, height = self.region
+            inside = np.zeros(size, bool)
+            inside[top : top + height, left : left + width] = True
+            tissue &= inside
+        return tissue
+
+    def with_masks(self, folder: Path) -> Recording:
+        """Its tool as another folder has it. UserError if that holds neither NNNNNN.png nor mask.png."""
+        masks, still = _masks(folder, folder)
+        if not masks and still is None:
+            raise UserError(f"{folder}: holds neither masks NNNNNN.png nor mask.png")
+        return replace(self, masks=masks, mask=still)
 
     def _timed(self, picture: Picture) -> Picture:
         time_s, fps = picture.time_s, self.meta.fps
@@ -121,11 +146,17 @@ def open_recording(folder: Path, phantom: bool = False) -> Recording:
     times = _frame_times(folder / "frames.csv", notes)
     force = _force(folder / "force.csv", about, notes)
     about, times, force = _from_start(about, times, force, notes)
-    numbered = [path for path in sorted(folder.glob("masks/*.png")) if re.fullmatch("[0-9]{1,9}", path.stem)]
-    masks = {int(path.stem): path for path in numbered}
+    masks, mask = _masks(folder / "masks", folder)
     still = folder / "tissue.png"
     tissue = still if os.path.lexists(still) else None
-    return Recording(folder, about, movie, pictures, times, force, masks, tissue, tuple(notes))
+    return Recording(folder, about, movie, pictures, times, force, masks, tissue, tuple(notes), mask)
+
+
+def _masks(folder: Path, beside: Path) -> tuple[dict[int, Path], Path | None]:
+    """Masks by frame, and the one for all others."""
+    numbered = [path for path in sorted(folder.glob("*.png")) if re.fullmatch("[0-9]{1,9}", path.stem)]
+    still = beside / "mask.png"
+    return {int(path.stem): path for path in numbered}, still if os.path.lexists(still) else None
 
 
 def _from_start(

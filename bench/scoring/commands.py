@@ -6,6 +6,7 @@ import os
 import shutil
 from collections.abc import Mapping
 from contextlib import closing, nullcontext
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from threadpoolctl import threadpool_limits
@@ -30,6 +31,21 @@ _LONG = 100
 """Frames from which a second process is worth the seconds that it takes to start."""
 
 
+@dataclass(frozen=True)
+class Seen:
+    """What of a recording's pictures is looked at, instead of what its folder says."""
+
+    masks: Path | None = None
+    """Folder with the tool's masks."""
+    region: tuple[int, int, int, int] | None = None
+    """Left, top, width and height [px]."""
+
+    def within(self, recording: Recording) -> Recording:
+        """The recording so seen. UserError: no masks in the folder."""
+        masked = recording if self.masks is None else recording.with_masks(self.masks)
+        return replace(masked, region=self.region)
+
+
 def score_recording(
     recording: Path,
     model: Path,
@@ -39,6 +55,7 @@ def score_recording(
     train: Path | None = None,
     also: Mapping[str, Path] | None = None,
     phantom: bool = False,
+    seen: Seen = Seen(),
 ) -> Result:
     """Scores one recording and writes score.json and report.html, both whole or not at all.
 
@@ -51,6 +68,7 @@ def score_recording(
         settings: of this run.
         title: heading of the report.
         phantom: the recording shows one, so that its forces may be beyond any brain's.
+        seen: other masks than the recording's, and a region of interest.
 
     Raises:
         UserError: recording, model or settings that can't be used; nothing is written then.
@@ -59,7 +77,7 @@ def score_recording(
 
     # NumPy's BLAS too: a second thread of its own waits for a core that the flow has.
     threadpool_limits(set_threads(None))
-    opened = open_recording(recording, phantom)
+    opened = seen.within(open_recording(recording, phantom))
     folder = out or Path(f"{opened.name}-score")
     with whole_file.made_folder(folder, _ROOM_BYTES):
         result = _score(opened, model, settings, train, also)

@@ -357,6 +357,7 @@ def as_json(result: Result) -> dict[str, Any]:
         "sensor_steps": list(result.steps),
         "settings": result.settings,
         "environment": result.environment,
+        "masks": {"kind": result.settings.get("masks"), "frames": done.account.frames, **done.account.shares},
         "timings": done.timings,
         "curve": {
             "frame": done.frame,

@@ -24,7 +24,7 @@ from bench.scoring import charts, metrics
 from bench.scoring.evaluate_recording import Result
 from bench.scoring.headline import headline
 from bench.scoring.metrics import METRICS
-from bench.tracking.tracking import Snapshot
+from bench.tracking.tracking import Snapshot, picture_masks
 from learn.evaluation.metrics import Metric
 from synth.dataset.folder import write_whole
 from synth.publish import picture
@@ -91,6 +91,8 @@ def render_report(result: Result, title: str) -> str:
         correlogram="correlogram" in figures,
         panels=panels,
         flow_px=flow_px,
+        masks=None if (masked := picture_masks(result.followed)) is None else _jpeg(masked),
+        masked=result.followed.account.describe(),
         force_kpa=force_kpa,
         # "</" would end the script element early.
         figures=json.dumps(figures, allow_nan=False).replace("</", "<\\/"),

@@ -19,6 +19,7 @@ from typing import TypeVar
 
 from learn.inference.video_flow import Flags, FlowHere, Found, Rgb
 from synth.errors import UserError
+from synth.flow.mask_choice import Proposal
 
 T = TypeVar("T")
 
@@ -37,11 +38,11 @@ class FlowProcess(FlowHere):
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
-    def begin(self, backend: str, rest: Rgb, blocked: Flags, tissue: Flags) -> None:
+    def begin(self, backend: str, rest: Rgb, blocked: Flags | Proposal, tissue: Flags) -> None:
         """See `FlowHere`."""
         self._submit(_begin, backend, rest, blocked, tissue)()
 
-    def ask(self, rgb: Rgb, blocked: Flags) -> Callable[[], Found]:
+    def ask(self, rgb: Rgb, blocked: Flags | Proposal) -> Callable[[], Found]:
         """See `FlowHere`."""
         return self._submit(_step, rgb, blocked)
 
@@ -87,10 +88,10 @@ def _end_with_parent() -> None:
         os._exit(1)
 
 
-def _begin(backend: str, rest: Rgb, blocked: Flags, tissue: Flags) -> None:
+def _begin(backend: str, rest: Rgb, blocked: Flags | Proposal, tissue: Flags) -> None:
     _flow.begin(backend, rest, blocked, tissue)
 
 
-def _step(rgb: Rgb, blocked: Flags) -> Found:
+def _step(rgb: Rgb, blocked: Flags | Proposal) -> Found:
     found = _flow.ask(rgb, blocked)()
     return replace(found, peak_bytes=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024)

@@ -19,6 +19,7 @@ from bench.output import machine
 from bench.output import write as results
 from learn.inference.video_flow import Flags, FlowHere, Footage, Rgb, Settings, Step, VideoFlow
 from synth.errors import UserError
+from synth.flow.mask_choice import Proposal
 
 
 @dataclass(frozen=True)
@@ -121,10 +122,10 @@ def watch_video(
 class _Warm(FlowHere):
     """Flow that has run once before the clock starts: loading isn't latency."""
 
-    def begin(self, backend: str, rest: Rgb, blocked: Flags, tissue: Flags) -> None:
+    def begin(self, backend: str, rest: Rgb, blocked: Flags | Proposal, tissue: Flags) -> None:
         """See `FlowHere`."""
         super().begin(backend, rest, blocked, tissue)
-        self.tracker.step(rest, blocked)
+        self.ask(rest, blocked)
 
 
 class _Pace:

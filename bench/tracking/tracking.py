@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from bench.methods.protocol import Method, Scene
 from bench.recording.folder import Recording
 from learn.inference.pulse import Pulse
-from learn.inference.video_flow import FlowHere, Footage, Settings, Step, VideoFlow
+from learn.inference.video_flow import Account, FlowHere, Footage, Settings, Step, VideoFlow
 from synth.errors import UserError
 from synth.system.stopwatch import Stopwatch
 
@@ -53,6 +53,8 @@ class Tracked:
     """Mean confidence of the flow over the tissue."""
     trusted: list[bool] = field(default_factory=list)
     """Whether the frame could be followed; what was said of one that couldn't is no answer."""
+    account: Account = field(default_factory=Account)
+    """What was masked, lost and regained."""
     snapshots: list[Snapshot] = field(default_factory=list)
     rest: NDArray[np.uint8] | None = None
     tissue: NDArray[np.bool_] | None = None
@@ -112,13 +114,14 @@ def _track(
 ) -> tuple[Tracked, Pulse | None]:
     """Once through the video; what was tracked, and the pulse that is still in it."""
     meta = recording.meta
-    tool = recording.tool if recording.masks else None
+    tool = recording.tool if recording.has_masks else None
     footage = Footage(recording.frames(), str(recording.folder), recording.tissue_mask, tool, meta.rest_frame)
     video = VideoFlow(
         footage, replace(settings, pulse=settings.pulse and meta.pulse.remove), flow, pulse=pulse
     )
     asking = _Asking(methods, pictured, video.watch)
     for step in video.steps(progress):
+        asking.out.account.add(step.found, video.tissue)
         if asking.scene is None:
             asking.scene = Scene(video.tissue, scale_mm_per_px * video.shrink, meta.young_kpa)
             asking.out.rest = _shrunk(step.picture.rgb)
@@ -137,6 +140,8 @@ def _track(
     if out.fault:
         out.notes.append(f"nothing can be measured: {out.fault}")
     out.notes.append(recording.describe_tool(video.seen))
+    if out.account.is_odd:
+        out.notes.append(out.account.describe())
     if video.peak_bytes:
         out.timings["flow_peak_rss_mb"] = round(video.peak_bytes / 1e6, 1)
     if pulse is not None:
@@ -205,3 +210,17 @@ def _shrunk(array: NDArray[A]) -> NDArray[A]:
     if ratio == 1.0:
         return array
     return np.asarray(cv2.resize(array, None, fx=ratio, fy=ratio, interpolation=cv2.INTER_AREA), array.dtype)
+
+
+def picture_masks(tracked: Tracked) -> NDArray[np.uint8] | None:
+    """The rest frame, red where the picture is masked, the more often the redder, and yellow where the rest
+    frame itself is; (h, w, 3). None if nothing is."""
+    account, rest = tracked.account, tracked.rest
+    if rest is None or account.where is None or (account.rest_blocked is None and not account.where.any()):
+        return None
+    often = _shrunk(account.where / max(account.frames, 1))[..., None]
+    shown = rest * (1 - 0.7 * often) + 0.7 * often * np.array([230, 40, 30])
+    if account.rest_blocked is not None:
+        still = _shrunk(account.rest_blocked.astype(np.float32))[..., None]
+        shown = shown * (1 - 0.5 * still) + 0.5 * still * np.array([240, 200, 30])
+    return np.asarray(np.clip(shown, 0, 255), np.uint8)

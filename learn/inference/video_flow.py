@@ -21,6 +21,7 @@ from learn.inference.quality import find_fault
 from learn.inference.video import Picture
 from synth.errors import UserError
 from synth.flow import mask
+from synth.flow.mask_choice import ChoosingTracker, Proposal
 from synth.flow.track import Tracker
 from synth.system.stopwatch import Stopwatch
 
@@ -31,6 +32,19 @@ Size = tuple[int, int]
 
 WIDTH_KEPT = 320
 """Columns that `shrink` 0 leaves a picture at least: the networks' grids are no finer."""
+
+
+_MUCH = 0.2
+"""Share of the tissue masked, or of the frames lost, that is worth a look."""
+
+MASKS = {
+    "auto": "what is found and proves useful",
+    "glare": "all highlights that are found",
+    "tool": "all that is taken for a tool",
+    "both": "both, whatever they do",
+    "none": "nothing",
+}
+"""What is masked; a tool whose outline is given is masked in any case but `glare` and `none`."""
 
 
 @dataclass(frozen=True)
@@ -45,6 +59,8 @@ class Settings:
     """At most so many frames a second are looked at; None: all."""
     pulse: bool = True
     """Whether the tissue's own periodic motion is looked for, and taken off."""
+    masks: str = "auto"
+    """What of tools and highlights is masked, one of `MASKS`."""
 
 
 def everywhere(size: Size) -> Flags:
@@ -77,10 +93,66 @@ class Found:
     """(h, w) in 0..1."""
     trusted: bool = True
     """Whether the frame could be followed."""
+    lost: str = ""
+    """Why not; empty if it could."""
+    regained: bool = False
+    """It could, but only from nothing or with other masks."""
+    is_rest: bool = False
+    """It is the rest frame itself."""
+    blocked: Flags | None = None
+    """(h, w) what was masked in the picture; None: nothing."""
+    rest_blocked: Flags | None = None
+    """(h, w) what was masked in the rest frame for it; None: nothing."""
     cpu_s: float = 0.0
     wall_s: float = 0.0
     peak_bytes: int = 0
     """Memory of the process that computed it, if it was another."""
+
+
+@dataclass(eq=False)
+class Account:
+    """What masks and trust came to over a video, without its rest frame."""
+
+    frames: int = 0
+    lost: int = 0
+    regained: int = 0
+    masked: float = 0.0
+    """Sum over frames of the share of tissue that was masked."""
+    where: NDArray[np.float32] | None = None
+    """(h, w) in how many frames a pixel of the picture was masked."""
+    rest_blocked: Flags | None = None
+    """(h, w) what of the rest frame was masked at last."""
+
+    def add(self, found: Found, tissue: Flags) -> None:
+        """Counts a frame; the rest frame starts it anew."""
+        if found.is_rest:
+            self.frames, self.where = 0, np.zeros(tissue.shape, np.float32)
+            return
+        assert self.where is not None
+        self.frames += 1
+        self.lost += not found.trusted
+        self.regained += found.regained
+        self.rest_blocked = found.rest_blocked
+        if found.blocked is not None:
+            self.masked += np.count_nonzero(found.blocked & tissue) / np.count_nonzero(tissue)
+            self.where += found.blocked
+
+    @property
+    def shares(self) -> dict[str, float]:
+        """Shares of the tissue masked, and of the frames lost and regained."""
+        n = max(self.frames, 1)
+        return {"masked": self.masked / n, "lost": self.lost / n, "regained": self.regained / n}
+
+    @property
+    def is_odd(self) -> bool:
+        """Whether somebody should look at it."""
+        return self.shares["masked"] > _MUCH or self.shares["lost"] > _MUCH
+
+    def describe(self) -> str:
+        """A line for a person."""
+        said = f"{100 * self.shares['masked']:.2g}% of the tissue is masked on average; "
+        lost = f"{self.lost} of {self.frames} frames looked at could not be followed"
+        return said + lost + (f", {self.regained} only at a second try" if self.regained else "")
 
 
 class FlowHere:
@@ -89,16 +161,38 @@ class FlowHere:
     ahead = 0
     """How many frames may be asked before the first is waited for."""
 
-    def begin(self, backend: str, rest: Rgb, blocked: Flags, tissue: Flags) -> None:
-        """The rest frame; arguments and errors as `Tracker`."""
-        self.tracker = Tracker(backend, rest, blocked, tissue)
+    def begin(self, backend: str, rest: Rgb, blocked: Flags | Proposal, tissue: Flags) -> None:
+        """The rest frame; arguments and errors as `Tracker`, or, of a proposal, as `ChoosingTracker`."""
+        self.tracker: Tracker | ChoosingTracker = (
+            ChoosingTracker(backend, rest, blocked, tissue)
+            if isinstance(blocked, Proposal)
+            else Tracker(backend, rest, blocked, tissue)
+        )
 
-    def ask(self, rgb: Rgb, blocked: Flags) -> Callable[[], Found]:
+    def ask(self, rgb: Rgb, blocked: Flags | Proposal) -> Callable[[], Found]:
         """Gives a frame, (h, w, 3) and (h, w); what comes back waits for its flow, errors as `Tracker`."""
-        cpu, wall = time.process_time(), time.perf_counter()
-        flow, confidence = self.tracker.step(rgb, blocked)
-        spent = time.process_time() - cpu, time.perf_counter() - wall
-        found = Found(flow, confidence, self.tracker.trusted, *spent)
+        cpu, wall, tracker = time.process_time(), time.perf_counter(), self.tracker
+        if isinstance(tracker, ChoosingTracker):
+            assert isinstance(blocked, Proposal)
+            flow, confidence = tracker.step(rgb, blocked)
+            masked, rest_masked, regained = tracker.blocked, tracker.rest_blocked, tracker.regained
+        else:
+            assert not isinstance(blocked, Proposal)
+            resets = tracker.resets
+            flow, confidence = tracker.step(rgb, blocked)
+            masked, rest_masked = blocked, tracker.tissue & ~tracker.usable
+            regained = tracker.trusted and tracker.resets > resets
+        found = Found(
+            flow,
+            confidence,
+            tracker.trusted,
+            tracker.lost,
+            regained,
+            blocked=masked if masked.any() else None,
+            rest_blocked=rest_masked if rest_masked.any() else None,
+            cpu_s=time.process_time() - cpu,
+            wall_s=time.perf_counter() - wall,
+        )
         return lambda: found
 
 
@@ -132,7 +226,12 @@ class VideoFlow:
             flow: where flow is computed, closed by the caller; None: here.
             is_due: whether a frame after the rest frame, at its time [s], is to be worked on.
             pulse: motion of the tissue's own that is taken off the flow of every frame.
+
+        Raises:
+            UserError: no such masks.
         """
+        if settings.masks not in MASKS:
+            raise UserError(f"masks: no kind {settings.masks!r}; there are {', '.join(MASKS)}")
         self.footage, self.settings, self.watch = footage, settings, Stopwatch()
         self.tissue = np.zeros((0, 0), bool)
         """(h, w), shrunk as the pictures are; empty before the rest frame."""
@@ -240,7 +339,7 @@ class VideoFlow:
         if self.settings.pulse and self._pulse is None:
             self.surface = Surface(self.tissue)
 
-    def _prepare(self, picture: Picture) -> tuple[Picture, Flags, float]:
+    def _prepare(self, picture: Picture) -> tuple[Picture, Flags | Proposal, float]:
         """A frame shrunk, what of it is no tissue (h, w), and the time that took [s]."""
         height, width = picture.rgb.shape[:2]
         if (height, width) != self.size:
@@ -248,21 +347,30 @@ class VideoFlow:
         began = time.perf_counter()
         with self.watch.stage("mask"):
             rgb = shrink_picture(picture.rgb, self.shrink)
-            blocked = mask.glare(rgb)
-            if self.footage.tool is None:
-                blocked |= mask.tool(rgb)
-            elif (tool := self.footage.tool(picture.index, self.size)) is not None:
-                blocked |= shrink_mask(tool, self.shrink, 0)
+            blocked = self._masks(picture.index, rgb)
         return replace(picture, rgb=rgb), blocked, time.perf_counter() - began
 
-    def _rest(self, rgb: Rgb, blocked: Flags) -> Found:
+    def _masks(self, index: int, rgb: Rgb) -> Flags | Proposal:
+        """What of a frame is no tissue, (h, w), or may be none."""
+        kind, nothing = self.settings.masks, np.zeros(rgb.shape[:2], bool)
+        glare = nothing if kind in ("none", "tool") else mask.glare(rgb)
+        tool = known = nothing
+        if kind not in ("none", "glare"):
+            if self.footage.tool is None:
+                tool = mask.tool(rgb)
+            elif (given := self.footage.tool(index, self.size)) is not None:
+                known = shrink_mask(given, self.shrink, 0)
+        return Proposal(glare, tool, known) if kind == "auto" else glare | tool | known
+
+    def _rest(self, rgb: Rgb, blocked: Flags | Proposal) -> Found:
         """Starts the flow: nothing has moved."""
         self._fault, self._rest_rgb = find_fault(rgb, self.tissue), rgb
         if self._fault:
             return self._nothing()
         self._flow.begin(self.settings.backend, rgb, blocked, self.tissue)
         still = np.zeros((*self.tissue.shape, 2), np.float32)
-        return Found(still, (self.tissue & ~blocked).astype(np.float32))
+        sure = blocked.known if isinstance(blocked, Proposal) else blocked
+        return Found(still, (self.tissue & ~sure).astype(np.float32), is_rest=True)
 
     def _nothing(self) -> Found:
         """Of a frame in which nothing can be followed."""

@@ -8,9 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from synth.errors import UserError
+from synth.flow.confidence import DOUBTFUL
 from synth.flow.estimator import Estimator, Flags, Flow, Map, Rgb, create
 
-_TRUSTED = 0.5  # mean confidence of what is seen; frames below it are flagged
+_DOUBTED = 0.5  # mean confidence of what is seen; frames below it are tried again from nothing
+_MATCHED = 0.4  # share of what is seen that is no lost pixel; frames below it are lost
+_LEAST = 0.02  # of the tissue must be free of masks for anything to be said
 _DROP = 0.85  # a fall below this share of the last good frame's confidence is looked into
 
 
@@ -24,6 +27,22 @@ class Track:
     """(T, H, W) in 0..1; 0 outside the tissue, under the tool and in glare."""
     trusted: NDArray[np.bool_]
     """(T,), False where the frame could not be followed."""
+
+
+@dataclass(frozen=True, eq=False)
+class Solved:
+    """One answer for a frame."""
+
+    flow: Flow
+    """(H, W, 2) px."""
+    confidence: Map
+    """(H, W) in 0..1; 0 outside the tissue and where it is masked."""
+    level: float
+    """Mean confidence over what is not masked."""
+    matched: float
+    """Share of that whose confidence says that it is not lost."""
+    seen: float
+    """Share of the tissue that is not masked."""
 
 
 class Tracker:
@@ -55,8 +74,12 @@ class Tracker:
         self.usable = tissue & ~rest_blocked
         self.trusted = True
         """Whether the last frame could be followed."""
+        self.lost = ""
+        """Why the last frame could not be followed; empty if it could."""
         self.resets = 0
         """How often a frame was solved again from nothing, and better."""
+        self.last: Solved | None = None
+        """The last frame's answer as it was found."""
         self._good: Flow | None = None
         self._level = 1.0
 
@@ -73,24 +96,50 @@ class Tracker:
         """
         if frame.shape != self.rest.shape or blocked.shape != self.tissue.shape:
             raise UserError(f"flow: frame {frame.shape} does not fit the rest frame {self.rest.shape}")
-        seen = max(1, int(np.count_nonzero(self.usable & ~blocked)))
+        found = self.solve(frame, blocked, self._good)
+        if self._good is not None and self.is_doubtful(found):
+            again = self.solve(frame, blocked, None)
+            if again.level > found.level:
+                found, self.resets = again, self.resets + 1
+        return self.accept(found)
 
-        def solve(initial: Flow | None) -> tuple[Flow, Map, float]:
-            flow, confidence = self.estimator.flow(self.rest, frame, self.usable, ~blocked, initial)
-            confidence = confidence * self.tissue
-            return flow, confidence, float(confidence.sum(dtype=np.float64)) / seen
+    def solve(self, frame: Rgb, blocked: Flags, initial: Flow | None) -> Solved:
+        """One answer for a frame; nothing is remembered of it. Arguments as `step` and `start`."""
+        flow, confidence = self.estimator.flow(self.rest, frame, self.usable, ~blocked, initial)
+        confidence = confidence * self.tissue
+        return self.judge(flow, confidence, self.usable & ~blocked)
 
-        flow, confidence, level = solve(self._good)
-        if self._good is not None and level < max(_TRUSTED, _DROP * self._level):
-            again = solve(None)
-            if again[2] > level:
-                (flow, confidence, level), self.resets = again, self.resets + 1
-        self.trusted = level >= _TRUSTED
+    def judge(self, flow: Flow, confidence: Map, where: Flags) -> Solved:
+        """An answer as it is where one looks, (H, W)."""
+        seen = int(np.count_nonzero(where))
+        inside = confidence * where
+        return Solved(
+            flow,
+            confidence,
+            level=float(inside.sum(dtype=np.float64)) / max(1, seen),
+            matched=float(np.count_nonzero(inside >= DOUBTFUL)) / max(1, seen),
+            seen=seen / max(1, int(np.count_nonzero(self.tissue))),
+        )
+
+    def is_doubtful(self, found: Solved) -> bool:
+        """Whether an answer is so much worse than the last good one's that others are tried."""
+        return found.level < max(_DOUBTED, _DROP * self._level)
+
+    def accept(self, found: Solved) -> tuple[Flow, Map]:
+        """Makes it the frame's answer; the next one starts from it if it can be trusted."""
+        self.last = found
+        self.lost = ""
+        if found.seen < _LEAST:
+            self.lost = f"masks leave {100 * found.seen:.2g}% of the tissue"
+        elif found.matched < _MATCHED:
+            self.lost = f"only {100 * found.matched:.0f}% of what is seen matches the rest frame"
+        self.trusted = not self.lost
+        confidence = found.confidence
         if self.trusted:
-            self._good, self._level = flow, level
+            self._good, self._level = found.flow, found.level
         else:
-            confidence = np.minimum(confidence, 0.5 * _TRUSTED)
-        return flow * self.tissue[..., None], confidence
+            confidence = np.minimum(confidence, 0.5 * DOUBTFUL)
+        return found.flow * self.tissue[..., None], confidence
 
 
 def track(

@@ -67,6 +67,9 @@ class Settings:
     """3x3 median of the flow after each warp (Wedel et al., An improved algorithm for TV-L1, 2009)."""
     warm_warps: int = 3
     """Linearisations a level with an initial flow."""
+    steady_px: float = 0.1
+    """The last flow is averaged over its neighbours where that changes it by less than about this: what goes
+    there is noise, and a step in the flow stays. 0: not at all."""
     steep: float = 0.1
     """Where the first guess's gradient [px/px] is this large, lambda doubles: smoothness costs most there."""
     fine_levels: int = 2
@@ -170,7 +173,7 @@ class Tvl1:
             initial, settings = None if coarse is None else finer(coarse, levels[0]), s
         else:
             settings = replace(s, warps=s.warm_warps)
-        found = solve(levels[: s.fine_levels], initial, settings)
+        found = steadied(solve(levels[: s.fine_levels], initial, settings), s.steady_px)
         back = None
         if self.checked and len(levels) > 1:
             back = solve(
@@ -291,6 +294,17 @@ def _fused(level: Level, flow: Tensor, weight: Tensor, s: Settings) -> Tensor:
                 median=s.median,
             )
     return torch.from_numpy(found)
+
+
+def steadied(flow: Tensor, within_px: float) -> Tensor:
+    """Flow (B, 2, H, W) px, averaged about as by a Gaussian of 1.4 px where that changes it little."""
+    if within_px <= 0:
+        return flow
+    smooth = flow
+    for _ in range(3):
+        smooth = image.box(smooth, 1)
+    change = smooth - flow
+    return flow + change * torch.exp(-(change * change).sum(1, keepdim=True) / within_px**2)
 
 
 def finer(flow: Tensor, level: Level) -> Tensor:

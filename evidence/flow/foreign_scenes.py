@@ -1,0 +1,410 @@
+"""Recordings whose motion is known in closed form, on pictures that no renderer of ours made.
+
+Photographs that scikit-image's wheel carries, and drawn phantoms, are warped by an analytic field; tools,
+lamps, highlights, endoscopes, compression and mishaps of the camera are drawn over them. Nothing is shared
+with `synth.render`, nor with the scenes that trained the tool net.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from importlib.util import find_spec
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates, spline_filter
+
+from evidence.flow.scenes import Flags, Floats, Rgb, noise_field
+
+_FINE = 2  # samples of the source a pixel
+_MARGIN = 24  # px of the source beyond the picture, that motion may bring in
+_PHOTOGRAPHS = (
+    "astronaut", "brick", "camera", "cell", "chelsea", "coffee", "coins", "grass", "gravel",
+    "hubble_deep_field", "immunohistochemistry", "moon", "retina", "rocket",
+)  # fmt: skip
+_DRAWN = ("dots", "speckle", "white", "grey", "dark", "tubes")
+_TOOLS = {
+    "steel": (0.55, 0.57, 0.60),
+    "gold": (0.80, 0.62, 0.25),
+    "black": (0.06, 0.06, 0.07),
+    "blue": (0.10, 0.25, 0.70),
+    "white plastic": (0.92, 0.92, 0.90),
+    "gloved finger": (0.86, 0.80, 0.66),
+}
+_MOTIONS = ("pull", "press", "press from behind", "shift", "twist")
+_LAMPS = {"white": (1.0, 1.0, 1.0), "warm": (1.1, 0.9, 0.62), "cold": (0.8, 0.95, 1.15)}
+_MISHAPS = ("doubled", "dropped", "black", "defocus", "covered", "jump")
+HALVES = ("tuning", "reporting")
+"""Even scenes and even pictures (in alphabetical order) are tuned on, odd ones are reported."""
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """One recording. Lengths in px."""
+
+    index: int
+    half: str
+    surface: str
+    tool: str
+    """Its colour; empty: none."""
+    tool_at_rest: bool
+    """The tool already is in the rest frame, beside the contact."""
+    motion: str
+    peak_px: float
+    lamp: str
+    glare: float
+    """Share of the picture in highlights."""
+    scope: bool
+    """An endoscope's round picture."""
+    mono: bool
+    quality: int
+    """Of JPEG; 0: not compressed."""
+    noise: float
+    """Grey levels."""
+    mishaps: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """One frame and all that is true of it."""
+
+    rgb: Rgb
+    flow: Floats
+    """(H, W, 2) px from the rest frame, on its pixels."""
+    seen: Flags
+    """(H, W) on the rest frame's pixels: tissue that both pictures show, free of tool and glare."""
+    free: Flags
+    """(H, W) on this frame's pixels: tissue without tool and glare, nor next to them."""
+    amplitude: float
+    """Share of the full motion."""
+    mishap: str
+
+
+def recipes(half: str, count: int, photographs: bool | None = None) -> list[Recipe]:
+    """The first `count` recordings of a half; each is drawn from its number alone.
+
+    Args:
+        half: one of `HALVES`.
+        count: how many.
+        photographs: use scikit-image's; None: if it is installed.
+    """
+    there = find_spec("skimage") is not None if photographs is None else photographs
+    side = HALVES.index(half)
+    surfaces = [f"drawn {name}" for name in _DRAWN]
+    if there:
+        surfaces += list(_PHOTOGRAPHS[side::2])
+    return [_recipe(2 * k + side, half, surfaces) for k in range(count)]
+
+
+def _recipe(index: int, half: str, surfaces: list[str]) -> Recipe:
+    rng = np.random.default_rng([1804, index])
+    number = index // 2
+    some = rng.random(8)
+    return Recipe(
+        index=index,
+        half=half,
+        # In turn, so that few scenes hold all surfaces and tools; 3 shares no factor with 7.
+        surface=surfaces[number % len(surfaces)],
+        tool=["", *_TOOLS][(3 * number + number // 7) % 7],
+        tool_at_rest=bool(some[0] < 0.25),
+        motion=_MOTIONS[(2 * number + number // 5) % 5],
+        peak_px=float(np.exp(rng.uniform(np.log(1.5), np.log(10)))),
+        lamp=list(_LAMPS)[int(rng.choice(3, p=[0.6, 0.25, 0.15]))],
+        glare=float(rng.uniform(0.01, 0.08)) if some[1] < 0.35 else 0.0,
+        scope=bool(some[2] < 0.2),
+        mono=bool(some[3] < 0.2),
+        quality=int(rng.choice([0, 95, 75, 40])),
+        noise=float(rng.choice([0.5, 1.5, 4.0])),
+        mishaps=tuple(name for name in _MISHAPS if rng.random() < 0.22),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Surface:
+    coefficients: tuple[Floats, ...]
+    """Cubic-spline coefficients of each colour, `_FINE` samples a pixel."""
+
+    def sample(self, at: Floats) -> Floats:
+        """(H, W, 3) in 0..1 at (H, W, 2) pixels (x, y)."""
+        where = [(at[..., k] + _MARGIN + 0.5) * _FINE - 0.5 for k in (1, 0)]
+        planes = [
+            map_coordinates(c, where, order=3, mode="mirror", prefilter=False) for c in self.coefficients
+        ]
+        return np.asarray(np.stack(planes, -1), np.float32)
+
+
+def surface(name: str, size: int, rng: np.random.Generator) -> _Surface:
+    """A picture of (size + 2 margins) px, without what pixels can't show."""
+    fine = _FINE * (size + 2 * _MARGIN)
+    picture = _drawn(name[6:], fine, rng) if name.startswith("drawn ") else _photograph(name, fine)
+    picture = cv2.GaussianBlur(picture, (0, 0), 0.55 * _FINE)
+    return _Surface(tuple(spline_filter(picture[..., c], 3, np.float32, "mirror") for c in range(3)))
+
+
+def _photograph(name: str, fine: int) -> Floats:
+    from skimage import data  # type: ignore[import-not-found, unused-ignore]
+
+    picture = np.asarray(getattr(data, name)())
+    picture = np.repeat(picture[..., None], 3, -1) if picture.ndim == 2 else picture[..., :3]
+    side = min(picture.shape[:2])
+    top, left = (picture.shape[0] - side) // 2, (picture.shape[1] - side) // 2
+    square = picture[top : top + side, left : left + side].astype(np.float32)
+    square = square / (255 if picture.dtype == np.uint8 else max(float(square.max()), 1.0))
+    ways = cv2.INTER_AREA if side > fine else cv2.INTER_CUBIC
+    return np.asarray(np.clip(cv2.resize(square, (fine, fine), interpolation=ways), 0, 1), np.float32)
+
+
+def _drawn(name: str, fine: int, rng: np.random.Generator) -> Floats:
+    """A phantom: (fine, fine, 3) in 0..1."""
+    shape = (fine, fine)
+    paper = 1 + 0.02 * noise_field(shape, 60, rng)
+    if name == "dots":  # dark dots on a light silicone membrane, or white ones on a dark one
+        light, ink = ((0.82, 0.80, 0.74), 0.10) if rng.random() < 0.5 else ((0.14, 0.13, 0.13), 0.95)
+        return _over(np.array(light) * paper[..., None], _dots(fine, rng, 16 * _FINE / 2, 3.0 * _FINE), ink)
+    if name == "speckle":
+        grains = (noise_field(shape, 3.2 * _FINE, rng) > 0.1).astype(np.float32)
+        grains = cv2.GaussianBlur(grains, (0, 0), 0.4 * _FINE)
+        return np.repeat((0.12 + 0.72 * grains)[..., None], 3, -1)
+    if name == "tubes":  # red and blue tubes below a pink gel
+        wave = noise_field(shape, 60 * _FINE, rng)
+        line = np.exp(-((wave / (np.hypot(*np.gradient(wave)) + 1e-3) / (2.5 * _FINE)) ** 2))[..., None]
+        fine_noise = 0.02 * noise_field(shape, 6 * _FINE, rng)[..., None]
+        gel = np.array([0.85, 0.62, 0.58]) * paper[..., None]
+        hue = np.where(noise_field(shape, 150 * _FINE, rng)[..., None] > 0, (0.6, 0.1, 0.1), (0.2, 0.2, 0.5))
+        return np.asarray(np.clip(gel + 0.8 * line * (hue - gel) + fine_noise, 0, 1), np.float32)
+    level = {"white": 0.93, "grey": 0.5, "dark": 0.13}[name]
+    grain = 0.25 * min(level, 1 - level) + 0.02
+    noise = noise_field(shape, 5 * _FINE, rng) + noise_field(shape, 24 * _FINE, rng)
+    body = level * paper + 0.5 * grain * noise
+    picture = np.repeat(body[..., None], 3, -1) * np.array([1.0, 0.99, 0.97])
+    marks = _dots(fine, rng, 22 * _FINE, 1.5 * _FINE)
+    return _over(picture, 0.7 * marks, 0.25 if level > 0.4 else 0.45)
+
+
+def _dots(fine: int, rng: np.random.Generator, apart: float, radius: float) -> Floats:
+    """Cover in 0..1 by discs on a shaken grid, (fine, fine)."""
+    cover = np.zeros((fine, fine), np.uint8)
+    for x, y in np.stack(np.meshgrid(np.arange(0, fine, apart), np.arange(0, fine, apart)), -1).reshape(
+        -1, 2
+    ):
+        centre = 16 * (np.array([x, y]) + rng.uniform(-0.3, 0.3, 2) * apart)
+        cv2.circle(cover, tuple(centre.astype(int).tolist()), int(16 * radius), 255, -1, cv2.LINE_AA, 4)
+    return np.asarray(cover / 255, np.float32)
+
+
+def _over(picture: NDArray[np.floating], cover: Floats, ink: float) -> Floats:
+    return np.asarray(np.clip(picture + cover[..., None] * (ink - picture), 0, 1), np.float32)
+
+
+@dataclass(frozen=True, eq=False)
+class Field:
+    """A motion in closed form whose largest displacement is 1 px."""
+
+    motion: str
+    centre: NDArray[np.float64]
+    """(2,) px."""
+    radius: float
+    """px."""
+    way: NDArray[np.float64]
+    """(2,) unit vector."""
+
+    @classmethod
+    def draw(cls, motion: str, size: int, rng: np.random.Generator) -> Field:
+        """One of the kind, somewhere near the middle of the picture."""
+        centre = size * np.array([rng.uniform(0.38, 0.62), rng.uniform(0.38, 0.62)])
+        radius, turn = size * rng.uniform(0.16, 0.26), rng.uniform(0, 2 * np.pi)
+        return cls(motion, centre, radius, np.array([np.cos(turn), np.sin(turn)]))
+
+    def at(self, place: Floats) -> Floats:
+        """(..., 2) px → displacement, (..., 2)."""
+        away = place - self.centre
+        square = (away**2).sum(-1, keepdims=True) / self.radius**2
+        if self.motion == "shift":
+            return np.asarray(np.broadcast_to(self.way, place.shape), np.float32)
+        if self.motion == "pull":  # as a point load on a half space, level within the contact
+            return np.asarray(self.way * np.exp(-square / 16) / np.sqrt(1 + square), np.float32)
+        # r exp(-r²/2R²) is largest at R, where it is R exp(-1/2).
+        radial = away / self.radius * np.exp(0.5 - 0.5 * square)
+        if self.motion == "twist":
+            return np.asarray(np.stack([-radial[..., 1], radial[..., 0]], -1), np.float32)
+        return np.asarray(radial if self.motion == "press from behind" else -radial, np.float32)
+
+    def steepest(self, size: int) -> float:
+        """Largest derivative [1/px], at least a millionth."""
+        found = self.at(_grid(size))
+        return max(
+            1e-6, *(float(np.abs(np.gradient(found[..., c], axis=a)).max()) for c in (0, 1) for a in (0, 1))
+        )
+
+
+def _grid(size: int) -> Floats:
+    y, x = np.mgrid[:size, :size].astype(np.float32)
+    return np.stack([x, y], -1)
+
+
+def amplitudes(frames: int) -> NDArray[np.float64]:
+    """A press and a weaker one, (frames,) in 0..1; the first frame and one between are at rest."""
+    t = np.linspace(0, 1, frames)
+    return np.where(t < 0.55, np.sin(np.pi * t / 0.55) ** 2, 0.7 * np.sin(np.pi * (t - 0.55) / 0.45) ** 2)
+
+
+def film(recipe: Recipe, size: int = 192, frames: int = 16) -> Iterator[Shown]:
+    """The recording's frames, the rest frame first."""
+    rng = np.random.default_rng([1805, recipe.index])
+    stage = _Stage.build(recipe, size, rng)
+    plan = _plan(recipe, frames, rng)
+    for amplitude, mishap in plan:
+        yield stage.shoot(amplitude, mishap, rng)
+
+
+def _plan(recipe: Recipe, frames: int, rng: np.random.Generator) -> list[tuple[float, str]]:
+    """Amplitude and mishap of each frame."""
+    curve = amplitudes(frames).tolist()
+    plan = [(a, "") for a in curve]
+    places = rng.permutation(np.arange(2, frames))[: len(recipe.mishaps)]
+    for place, name in zip(places.tolist(), recipe.mishaps, strict=False):
+        if name == "doubled":
+            plan[place] = (plan[place - 1][0], name)
+        elif name == "dropped":
+            plan[place:-1] = plan[place + 1 :]
+            plan[-1] = (curve[-1], "")
+        else:
+            plan[place] = (plan[place][0], name)
+    return plan
+
+
+@dataclass(frozen=True, eq=False)
+class _Stage:
+    """What doesn't change from frame to frame."""
+
+    recipe: Recipe
+    size: int
+    skin: _Surface
+    move: Field
+    peak: float
+    """px."""
+    wet: Floats
+    """(H, W) whose high values shine."""
+    drift: Floats
+    """(H, W) by which they change with the surface's tilt."""
+    angle: float
+    """Of the shaft [rad]."""
+    rest_blocked: Flags
+    """(H, W): tool or highlight in the rest frame, or next to them."""
+
+    @classmethod
+    def build(cls, recipe: Recipe, size: int, rng: np.random.Generator) -> _Stage:
+        skin = surface(recipe.surface, size, rng)
+        move = Field.draw(recipe.motion, size, rng)
+        peak = min(recipe.peak_px, 0.5 / move.steepest(size)) * size / 192
+        shape = (size, size)
+        wet = noise_field(shape, size / 14, rng) + noise_field(shape, size / 4, rng)
+        drift, angle = noise_field(shape, size / 5, rng), rng.uniform(0, 2 * np.pi)
+        stage = cls(recipe, size, skin, move, peak, wet, drift, angle, np.zeros(shape, bool))
+        blank = np.zeros((*shape, 3), np.float32)
+        _, glare = stage._shine(blank, 0.0)
+        _, tool = stage._tool(blank, 0.0, np.zeros((*shape, 2), np.float32))
+        return replace(stage, rest_blocked=_near(glare | tool))
+
+    def shoot(self, amplitude: float, mishap: str, rng: np.random.Generator) -> Shown:
+        """One frame."""
+        size, recipe = self.size, self.recipe
+        grid = _grid(size)
+        jump = np.array([18.0, -11.0]) * size / 192 if mishap == "jump" else np.zeros(2)
+
+        def moved(at: Floats) -> Floats:
+            return np.asarray(amplitude * self.peak * self.move.at(at) + jump, np.float32)
+
+        source = grid
+        for _ in range(40):  # s = y - u(s): a contraction, for |grad u| is at most 1/2
+            source = grid - moved(source)
+        flow = moved(grid)
+        bulge = 1 + 0.08 * amplitude * np.exp(-((grid - self.move.centre) ** 2).sum(-1) / (0.3 * size) ** 2)
+        picture = self.skin.sample(source) * bulge[..., None] * np.array(_LAMPS[recipe.lamp])
+        picture, glare = self._shine(picture, amplitude)
+        picture, tool = self._tool(picture, amplitude, flow)
+        scope = np.ones((size, size), bool)
+        if recipe.scope:
+            scope = np.linalg.norm(grid - size / 2, axis=-1) < 0.48 * size
+            picture = np.where(scope[..., None], picture, 0.01)
+        cover = np.zeros((size, size), bool)
+        if mishap == "covered":
+            cover[:, : int(0.9 * size)] = True
+            picture = np.where(cover[..., None], (0.7, 0.68, 0.66), picture)
+        if mishap == "black":
+            picture = np.zeros_like(picture)
+        if mishap == "defocus":
+            picture = cv2.GaussianBlur(picture, (0, 0), 0.03 * size)
+        rgb = self._sense(np.asarray(picture, np.float32), rng)
+        blocked = _near(glare | tool)
+        now_free = scope & ~blocked & ~cover
+        at = grid + flow
+        seen = cv2.remap(now_free.astype(np.float32), at[..., 0], at[..., 1], cv2.INTER_LINEAR) > 0.99
+        return Shown(rgb, flow, seen & scope & ~self.rest_blocked, now_free, amplitude, mishap)
+
+    def _shine(self, picture: Floats, amplitude: float) -> tuple[Floats, Flags]:
+        """Highlights that stay with the light."""
+        if self.recipe.glare <= 0:
+            return picture, np.zeros(picture.shape[:2], bool)
+        level = np.quantile(self.wet, 1 - self.recipe.glare)
+        now = self.wet + 0.3 * amplitude * self.drift
+        strength = np.clip((now - level) / 0.2 + 0.5, 0, 1)[..., None]
+        lit = picture + strength * (1.08 * np.array(_LAMPS[self.recipe.lamp]) - picture)
+        return np.asarray(lit, np.float32), strength[..., 0] > 0.1
+
+    def _tool(self, picture: Floats, amplitude: float, flow: Floats) -> tuple[Floats, Flags]:
+        """A shaft from the border to the contact, which it follows; away at rest unless it starts there."""
+        recipe, size = self.recipe, self.size
+        mask = np.zeros((size, size), np.uint8)
+        if not recipe.tool or (recipe.motion == "press from behind" and not recipe.tool_at_rest):
+            return picture, mask.astype(bool)
+        shaft = np.array([np.cos(self.angle), np.sin(self.angle)])
+        centre = self.move.centre
+        row, column = np.clip(centre[::-1].round().astype(int), 0, size - 1)
+        near = 1.0 if amplitude > 0.02 else 0.0
+        back = (0.12 if recipe.tool_at_rest else 1.2) * (1 - near) * size
+        if recipe.motion == "press from behind":
+            back = 0.15 * size  # rests beside, at the same place all the time
+        tip = centre + (flow[row, column] if near else 0) + back * shaft
+        finger = recipe.tool == "gloved finger"
+        width = size * (0.22 if finger else 0.09)
+        end = tip + 2 * size * shaft
+        thick = round(width)
+        points = [tuple((16 * p).round().astype(int).tolist()) for p in (tip, end)]
+        if finger:
+            cv2.line(mask, points[0], points[1], 1, thick, cv2.LINE_8, 4)
+        else:
+            side = np.array([-shaft[1], shaft[0]])
+            neck, half = tip + width * shaft, 0.5 * width * side
+            outline = [tip - 0.24 * half, tip + 0.24 * half, neck + half, end + half, end - half, neck - half]
+            cv2.fillConvexPoly(mask, np.round(16 * np.array(outline)).astype(np.int32), 1, cv2.LINE_8, 4)
+        y, x = np.mgrid[:size, :size].astype(np.float32)
+        across = ((x - tip[0]) * -shaft[1] + (y - tip[1]) * shaft[0]) / (width / 2)
+        along = (x - tip[0]) * shaft[0] + (y - tip[1]) * shaft[1]
+        shade = 1 - 0.45 * np.clip(np.abs(across), 0, 1) ** 2
+        if recipe.tool in ("steel", "gold", "black"):
+            shade = shade + 0.35 * np.exp(-(((across - 0.3) / 0.12) ** 2))
+        if recipe.tool in ("steel", "blue"):
+            shade = shade * np.where((along / size * 10) % 3 < 0.3, 0.6, 1.0)
+        colour = shade[..., None] * np.array(_TOOLS[recipe.tool]) * np.array(_LAMPS[recipe.lamp])
+        soft = cv2.GaussianBlur(mask.astype(np.float32), (0, 0), 0.7)[..., None]
+        shadow = 1 - 0.25 * cv2.GaussianBlur(np.roll(mask, 4, 0).astype(np.float32), (0, 0), 3)[..., None]
+        lit = picture * shadow * (1 - soft) + soft * colour
+        return np.asarray(lit, np.float32), mask.astype(bool)
+
+    def _sense(self, picture: Floats, rng: np.random.Generator) -> Rgb:
+        if self.recipe.mono:
+            picture = np.repeat(picture.mean(-1, keepdims=True), 3, -1)
+        noise = rng.normal(0, self.recipe.noise, picture.shape[:2] + ((1,) if self.recipe.mono else (3,)))
+        rgb = np.clip(np.round(255 * picture + noise), 0, 255).astype(np.uint8)
+        if self.recipe.quality:
+            _, packed = cv2.imencode(".jpg", rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, self.recipe.quality])
+            rgb = np.ascontiguousarray(np.asarray(cv2.imdecode(packed, cv2.IMREAD_COLOR))[..., ::-1])
+        return np.asarray(rgb, np.uint8)
+
+
+def _near(mask: Flags) -> Flags:
+    """(H, W) grown by 4 px: soft rims and the shadow's edge are neither."""
+    return np.asarray(cv2.dilate(mask.astype(np.uint8), np.ones((9, 9), np.uint8)) > 0, bool)

@@ -1,0 +1,112 @@
+"""Masks that have to earn their place."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter, shift
+
+from synth.flow.mask_choice import ChoosingTracker, Proposal
+
+_SIZE = 96
+_NOTHING = np.zeros((_SIZE, _SIZE), bool)
+_MIDDLE = np.zeros((_SIZE, _SIZE), bool)
+_MIDDLE[30:66, 30:66] = True
+
+
+def _texture() -> NDArray[np.float64]:
+    rng = np.random.default_rng(5)
+    field = gaussian_filter(rng.standard_normal((_SIZE, _SIZE)), 1.6)
+    return 120 + 35 * field / field.std()
+
+
+def _picture(grey: NDArray[np.float64]) -> NDArray[np.uint8]:
+    return np.repeat(np.clip(grey, 0, 255).astype(np.uint8)[..., None], 3, -1)
+
+
+def _moved(by_px: float) -> NDArray[np.float64]:
+    return shift(_texture(), (0, by_px), order=5, mode="mirror")
+
+
+def _tracker(rest: NDArray[np.uint8], found: Proposal) -> ChoosingTracker:
+    return ChoosingTracker("tvl1", rest, found, ~_NOTHING)
+
+
+def test_tissue_that_is_taken_for_a_tool_is_not_masked() -> None:
+    wrong = Proposal(_NOTHING, _MIDDLE, _NOTHING)
+    tracker = _tracker(_picture(_texture()), wrong)
+    for by_px in (1.0, 2.0):
+        flow, _ = tracker.step(_picture(_moved(by_px)), wrong)
+    assert not tracker.blocked.any()
+    assert not tracker.rest_blocked.any()
+    assert np.abs(flow[30:66, 30:66] - [2.0, 0.0]).mean() < 0.05
+
+
+def test_mask_over_everything_is_dropped_and_the_flow_is_that_without() -> None:
+    wrong = Proposal(_NOTHING, ~_NOTHING, _NOTHING)
+    tracker = _tracker(_picture(_texture()), wrong)
+    flow, _ = tracker.step(_picture(_moved(2.0)), wrong)
+    assert tracker.trusted
+    assert np.abs(flow[8:-8, 8:-8] - [2.0, 0.0]).mean() < 0.05
+
+
+def test_tool_that_comes_between_is_masked() -> None:
+    tracker = _tracker(_picture(_texture()), Proposal(_NOTHING, _NOTHING, _NOTHING))
+    for by_px in (1.0, 2.0):
+        now = _picture(np.where(_MIDDLE, 60.0, _moved(by_px)))
+        tracker.step(now, Proposal(_NOTHING, _MIDDLE, _NOTHING))
+    assert tracker.blocked[36:60, 36:60].mean() > 0.9
+
+
+def test_highlights_that_stay_while_the_tissue_moves_are_masked_and_help() -> None:
+    spots = gaussian_filter(np.random.default_rng(1).standard_normal((_SIZE, _SIZE)), 3)
+    wet = spots > np.quantile(spots, 0.85)
+    shine = Proposal(wet, _NOTHING, _NOTHING)
+    errors = {}
+    for name, found in (("chosen", shine), ("none", Proposal(_NOTHING, _NOTHING, _NOTHING))):
+        tracker = _tracker(_picture(np.where(wet, 250.0, _texture())), found)
+        for by_px in (1.5, 3.0):
+            flow, _ = tracker.step(_picture(np.where(wet, 250.0, _moved(by_px))), found)
+        errors[name] = float(np.abs(flow - [3.0, 0.0]).mean())
+        if name == "chosen":
+            assert tracker.blocked[wet].mean() > 0.8
+    assert errors["chosen"] < 0.7 * errors["none"]
+
+
+def test_what_is_known_to_be_a_tool_is_masked_without_being_asked() -> None:
+    known = Proposal(_NOTHING, _NOTHING, _MIDDLE)
+    tracker = _tracker(_picture(_texture()), known)
+    _, confidence = tracker.step(_picture(_moved(1.0)), known)
+    assert tracker.blocked[_MIDDLE].all()
+    assert not confidence[_MIDDLE].any()
+
+
+def test_nothing_is_learned_from_a_blank_frame() -> None:
+    spots = gaussian_filter(np.random.default_rng(1).standard_normal((_SIZE, _SIZE)), 3)
+    wet = spots > np.quantile(spots, 0.85)
+    shine = Proposal(wet, _NOTHING, _NOTHING)
+    tracker = _tracker(_picture(np.where(wet, 250.0, _texture())), shine)
+    for by_px in (1.5, 3.0):
+        tracker.step(_picture(np.where(wet, 250.0, _moved(by_px))), shine)
+    before = tracker.rest_blocked
+    tracker.step(np.zeros((_SIZE, _SIZE, 3), np.uint8), shine)
+    assert not tracker.trusted
+    assert tracker.lost
+    np.testing.assert_array_equal(tracker.rest_blocked, before)
+    tracker.step(_picture(np.where(wet, 250.0, _moved(3.0))), shine)
+    assert tracker.trusted
+    assert tracker.blocked[wet].mean() > 0.8
+
+
+@pytest.mark.parametrize("share", [0.0, 0.7])
+def test_whole_bodies_are_kept_of_which_most_earned_it(share: float) -> None:
+    pieces = Proposal(_NOTHING, _MIDDLE, _NOTHING).pieces()
+    earned = np.zeros(len(pieces.body), bool)
+    size = np.bincount(pieces.number.ravel())
+    for number in np.argsort(-size[1:]) + 1:
+        if size[earned].sum() <= share * size[1:].sum():
+            earned[number] = True
+    kept = pieces.whole(earned)
+    assert kept[1:].all() == (size[earned].sum() > 0.7 * size[1:].sum())
+    assert not kept[0]
