@@ -221,7 +221,8 @@ class Store(Section):
     extra: Annotated[tuple[str, ...], AfterValidator(lambda names: _known(names, fields.EXTRA))] = ()
     """Fields to keep besides the usual ones."""
     without: Annotated[tuple[str, ...], AfterValidator(lambda names: _known(names, fields.SPARED))] = ()
-    """Fields to leave out, of those that can be spared: depth, flow_confidence."""
+    """Fields to leave out, of those that can be spared: depth, flow_confidence, and of a second lens
+    flow_right, visible_right, depth_right."""
     flow: Literal["float32", "float16"] = "float32"
     """Type of both flows stored; float16 rounds motion below 16 px by at most 0.004 px, below 32 by 0.008."""
 
@@ -299,4 +300,5 @@ class Job(Section):
     def kept_fields(self) -> tuple[str, ...]:
         """Names of the fields that its sequences hold."""
         recovered = self.flow.backend != "ideal"
-        return fields.kept(self.store.extra, self.store.without, recovered=recovered)
+        stereo = self.render.stereo_mm > 0
+        return fields.kept(self.store.extra, self.store.without, recovered=recovered, stereo=stereo)

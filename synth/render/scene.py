@@ -77,6 +77,8 @@ class Shot:
     flow_right: Map | None = None
     visible_right: Mask | None = None
     depth_right: Map | None = None
+    motion: Map | None = None
+    """(H, W, 3) mm from the rest frame to this one, camera axes, at rest pixels; with a second lens."""
 
 
 class Studio:
@@ -111,8 +113,11 @@ class Studio:
         rest = Shape(surface.vertices, surface.faces)
         self.still = truth.still(camera, rest, self.rim.shape)
         self._right: Still | None = None
-        if any(name.endswith("_right") for name in self._extra):
-            self._right = truth.still(beside(camera, job.render.stereo_mm), rest, self.rim.shape)
+        self.right: Camera | None = None
+        """The second lens at rest, where the job has one."""
+        if job.render.stereo_mm:
+            self.right = beside(camera, job.render.stereo_mm)
+            self._right = truth.still(self.right, rest, self.rim.shape)
         self.lamps = light.lamps(camera, look.light)
         kinds = instrument.choose(gestures, np.random.default_rng([look.rim_seed, 2]))
         self._tool = instrument.build(kinds) if job.render.tool else None
@@ -154,7 +159,7 @@ class Studio:
             other = truth.now(beside(camera, baseline), self._right, *shapes)
             picture = self.develop(self._gathered(moments, seed + 1, baseline), seed + 1)
             extra |= {"rgb_right": picture, "flow_right": other.flow}
-            extra |= {"visible_right": other.visible, "depth_right": other.depth}
+            extra |= {"visible_right": other.visible, "depth_right": other.depth, "motion": seen.motion}
         return Shot(
             rgb=self.develop(radiance, seed),
             radiance=radiance,
@@ -165,6 +170,21 @@ class Studio:
             glare=self._glare(radiance, seen, now),
             **extra,
         )
+
+    def disparity(self) -> Map:
+        """Rest disparity (H, W) px without distortion, see `synth.fields`; 0 off the tissue.
+
+        Raises:
+            ValueError: the job has no second lens.
+        """
+        if self.right is None:
+            raise ValueError("there is no second lens")
+        width, height = self.camera.size
+        depth = self.still.points[:, 2].reshape(height, width)
+        shift = self.right.K[0, 2] - self.camera.K[0, 2]
+        away = np.where(self.still.tissue, depth, 1.0)
+        wide = self.camera.K[0, 0] * self._render.stereo_mm / away - shift
+        return np.where(self.still.tissue, wide, 0.0).astype(np.float32)
 
     def traction(self, nodal: Floats) -> Map:
         """Traction (V, 3) kPa, world axes, at rest pixels: (H, W, 3) kPa, camera axes; 0 off tissue."""

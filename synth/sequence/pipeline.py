@@ -33,9 +33,10 @@ from synth.sequence.scenario import Scenario
 from synth.sequence.timeline import Timeline
 from synth.system.stopwatch import Report, Stopwatch
 
-# Fields that the renderer gives by frame; those of `store.extra` are attributes of its `Shot` as well, but
-# for the published method's.
+# Fields that the renderer gives by frame, and of a second lens; those of `store.extra` are attributes of its
+# `Shot` as well, but for the published method's.
 _SHOT = ("rgb", "flow", "visible", "tool", "glare", "depth")
+_STEREO = ("rgb_right", "flow_right", "visible_right", "depth_right", "motion")
 _PUBLISHED = ("flow_noisy", "intensity")
 
 
@@ -104,6 +105,8 @@ def render_sequence(job: Job, index: int, folder: Path, report: Report) -> Path:
     writer.put("force", motion.force @ view.rotation.T)  # labels are in camera axes
     writer.put("tissue", still.tissue)
     writer.put("area", still.area)
+    if studio.right is not None:
+        writer.put("disparity", studio.disparity())
 
     shooting = _Shooting(job, index, case, view, motion, studio, writer, watch, report)
     film = _render_frames(shooting)
@@ -123,7 +126,7 @@ def _render_frames(shooting: _Shooting) -> _Film:
         labels = Published.begin(job.labels, studio.still.tissue, job.frames, rng)
     names = [
         name
-        for name in (*_SHOT, *job.store.extra)
+        for name in dict.fromkeys((*_SHOT, *(_STEREO if job.render.stereo_mm else ()), *job.store.extra))
         if FIELDS[name].framed and not (_coded(job) and name.startswith("rgb"))
     ]
     line = Timeline(motion, shooting.view, shooting.case.sway, shooting.case.look.light, job.fps)
@@ -203,7 +206,24 @@ def _seal(shooting: _Shooting) -> Path:
         mechanics=_mechanics(shooting.job, case, shooting.motion, view.rotation),
         variant=shooting.studio.variant,
         timings=shooting.watch.report(),
+        **_second_lens(shooting),
     )
+
+
+def _second_lens(shooting: _Shooting) -> dict[str, Any]:
+    """The attribute `right` of a stereo sequence: K, distortion and pose of the second lens at rest."""
+    lens = shooting.studio.right
+    if lens is None:
+        return {}
+    return {
+        "right": {
+            "baseline_mm": shooting.job.render.stereo_mm,
+            "K": lens.K.tolist(),
+            "distortion": lens.distortion.tolist(),
+            "rotation": lens.rotation.tolist(),
+            "translation": lens.translation.tolist(),
+        }
+    }
 
 
 def _mechanics(
