@@ -32,9 +32,10 @@ class Field:
     unit: str
     meaning: str
     length: int = 0
-    kept: Literal["always", "usually", "recovered", "stereo", "asked"] = "always"
+    kept: Literal["always", "usually", "recovered", "stereo", "stereo recovered", "asked"] = "always"
     """`usually`: unless the job's `store.without` names it; `recovered`: with an estimator of flow (and as
-    before); `stereo`: with a second lens (and as before); `asked`: when `store.extra` names it."""
+    before); `stereo`: with a second lens (and as before); `stereo recovered`: with both, unless `flow.stereo`
+    is none; `asked`: when `store.extra` names it."""
     half: bool = False
     """Whether `store.flow: float16` stores it in half the space."""
     packed: float = 0.1
@@ -289,6 +290,29 @@ FIELDS: dict[str, Field] = {
             low=-1e4,
             high=1e4,
         ),
+        Field(
+            "motion_recovered",
+            (*_VIDEO, "xyz"),
+            "float32",
+            "mm",
+            "motion recovered from both eyes' videos as the job's flow.stereo says, camera axes",
+            length=3,
+            kept="stereo recovered",
+            packed=0.7,
+            low=-1e4,
+            high=1e4,
+        ),
+        Field(
+            "motion_deviation",
+            (*_VIDEO, "xyz"),
+            "float32",
+            "mm",
+            "standard deviation of each component of motion_recovered, estimated with it; 0 outside tissue",
+            length=3,
+            kept="stereo recovered",
+            packed=0.7,
+            low=0.0,
+        ),
     )
 }
 """Every field by name, in the order in which they are hashed and listed."""
@@ -308,7 +332,12 @@ def find_field(name: str) -> Field | None:
 
 
 def kept(
-    extra: Iterable[str], without: Iterable[str], *, recovered: bool, stereo: bool = False
+    extra: Iterable[str],
+    without: Iterable[str],
+    *,
+    recovered: bool,
+    stereo: bool = False,
+    motion: bool = False,
 ) -> tuple[str, ...]:
     """Names of the fields that a sequence holds, in the table's order.
 
@@ -317,8 +346,9 @@ def kept(
         without: as the job's `store.without`.
         recovered: whether an estimator of flow runs.
         stereo: whether there is a second lens.
+        motion: whether motion is recovered from both.
     """
-    conditions = {"recovered": recovered, "stereo": stereo}
+    conditions = {"recovered": recovered, "stereo": stereo, "stereo recovered": motion}
     kinds = {"always", "usually", *(kind for kind, holds in conditions.items() if holds)}
     chosen = {name for name, field in FIELDS.items() if field.kept in kinds} | set(extra)
     return tuple(name for name in FIELDS if name in chosen - set(without))

@@ -17,6 +17,7 @@ _KEPT = {
     "usually": "unless in `store.without`",
     "recovered": "with an estimator of flow",
     "stereo": "with `render.stereo_mm`",
+    "stereo recovered": "with both of these",
     "asked": "if in `store.extra`",
 }
 

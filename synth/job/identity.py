@@ -23,6 +23,8 @@ def identify_job(job: Job) -> str:
     sequences: sequence 3 is the same in a dataset of 24 and of 48, so a dataset can be extended.
     """
     described = job.model_dump(mode="json", exclude={"sequences", "card"})
+    if not job.render.stereo_mm:
+        del described["flow"]["stereo"]  # says nothing of one eye's sequences
     described["anatomy"]["mesh"] = _digest(job.anatomy.mesh)
     described["appearance"]["photo"] = _digest(job.appearance.photo)
     described["render"]["calibration"] = _digest(job.render.calibration)

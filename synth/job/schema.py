@@ -204,6 +204,9 @@ class Flow(Section):
     """Estimator: tvl1, opencv-tvl1, dis or an installed plug-in's; `ideal` computes no recovered flow."""
     warps: Annotated[int, Field(ge=1, le=12)] = 3
     """tvl1: linearisations a level of a frame that starts from the one before; twice as many from nothing."""
+    stereo: Literal["joint", "fused", "none"] = "joint"
+    """With `render.stereo_mm`: motion in three dimensions from both eyes' pictures at once (joint), from a
+    flow in each eye (fused), or not recovered."""
 
 
 def _known(names: tuple[str, ...], known: tuple[str, ...]) -> tuple[str, ...]:
@@ -301,4 +304,7 @@ class Job(Section):
         """Names of the fields that its sequences hold."""
         recovered = self.flow.backend != "ideal"
         stereo = self.render.stereo_mm > 0
-        return fields.kept(self.store.extra, self.store.without, recovered=recovered, stereo=stereo)
+        motion = stereo and recovered and self.flow.stereo != "none"
+        return fields.kept(
+            self.store.extra, self.store.without, recovered=recovered, stereo=stereo, motion=motion
+        )

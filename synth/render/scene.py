@@ -79,6 +79,8 @@ class Shot:
     depth_right: Map | None = None
     motion: Map | None = None
     """(H, W, 3) mm from the rest frame to this one, camera axes, at rest pixels; with a second lens."""
+    tool_right: Mask | None = None
+    """(H, W) the second lens's pixels of this frame; with one."""
 
 
 class Studio:
@@ -159,7 +161,8 @@ class Studio:
             other = truth.now(beside(camera, baseline), self._right, *shapes)
             picture = self.develop(self._gathered(moments, seed + 1, baseline), seed + 1)
             extra |= {"rgb_right": picture, "flow_right": other.flow}
-            extra |= {"visible_right": other.visible, "depth_right": other.depth, "motion": seen.motion}
+            extra |= {"visible_right": other.visible, "depth_right": other.depth}
+            extra |= {"motion": seen.motion, "tool_right": other.tool}
         return Shot(
             rgb=self.develop(radiance, seed),
             radiance=radiance,
@@ -170,6 +173,13 @@ class Studio:
             glare=self._glare(radiance, seen, now),
             **extra,
         )
+
+    @property
+    def tissue_right(self) -> Mask:
+        """(H, W) brain in the second lens's rest frame. ValueError: there is no second lens."""
+        if self._right is None:
+            raise ValueError("there is no second lens")
+        return self._right.tissue
 
     def disparity(self) -> Map:
         """Rest disparity (H, W) px without distortion, see `synth.fields`; 0 off the tissue.
