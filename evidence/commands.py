@@ -22,6 +22,7 @@ from synth.errors import UserError
 
 COMMANDS = {
     "experiment flow": "evidence.flow.experiment:experiment",
+    "experiment stereo": "evidence.flow.stereo:experiment",
     "stability flow": "evidence.flow.stability:stability",
     "pareto flow": "evidence.flow.pareto:pareto",
     "experiment realism": "evidence.render.realism:realism_figures",

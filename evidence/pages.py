@@ -245,6 +245,7 @@ _FILES: Mapping[str, tuple[str, str | Callable[[Tree], Page]]] = {
     "flow/live": ("live.json", live),
     "flow/pareto": ("pareto.json", "flow.pareto"),
     "flow/stability": ("stability.json", "flow.stability"),
+    "flow/stereo": ("stereo.json", "flow.stereo"),
     "render/cycles": ("cycles.json", cycles),
     "render/pareto": ("pareto.json", "render.pareto"),
     "fem/relief": ("relief.json", "fem.relief"),
