@@ -18,6 +18,7 @@ from bench.output import charts, result_page
 from evidence.measuring import measuring
 from synth.checks import optics, stereo
 from synth.dataset.store import Dataset, Sequence
+from synth.errors import UserError
 from synth.flow import mask
 from synth.flow.stereo import rest
 from synth.flow.stereo.rig import Eye, Rig
@@ -48,7 +49,7 @@ class Sample:
 
 @measuring(
     "data-640 data-320 --pair motorcycle",
-    out=Path("docs/results/flow/stereo"),
+    out="docs/results/flow/stereo",
     file="stereo.json",
     page=lambda found, folder: result_page.write(drawn(found), folder),
     text="index.html",
@@ -84,8 +85,7 @@ def experiment(
                 | figures(ours)
                 | {"cost_ratio": round(ratio, 2), "epipolar_px": round(float(np.median(offs)), 3)}
             )
-    found = {"rows": rows}
-    return found if pair is None else found | {"pair": real_pair(pair)}
+    return {"rows": rows} | ({} if pair is None else {"pair": real_pair(pair)})
 
 
 def figures(samples: list[Sample]) -> dict[str, float]:
@@ -114,23 +114,29 @@ def figures(samples: list[Sample]) -> dict[str, float]:
 
 def real_pair(folder: Path) -> list[dict[str, Any]]:
     """Pixels off by more than 2 px on a real rectified pair whose disparity is known, and at its edges."""
-    left, right = (cv2.imread(str(folder / f"{eye}.png"))[..., ::-1] for eye in ("left", "right"))
+    left, right = (_grey(folder / f"{eye}.png") for eye in ("left", "right"))
     archive = np.load(folder / "disp.npz")
     truth = archive[archive.files[0]].astype(np.float32)
     known = np.isfinite(truth) & (truth > 0)
     every = np.ones(truth.shape, bool)
     steps = cv2.morphologyEx(np.where(known, truth, 0), cv2.MORPH_GRADIENT, np.ones((3, 3))) > 3 * _OFF_PX
     edge = cv2.dilate(steps.astype(np.uint8), np.ones((7, 7), np.uint8)).astype(bool)
-    grey = [(one @ np.float32([0.2, 0.6, 0.2])).astype(np.float32) for one in (left, right)]
     rows = []
     for name, refine in (("OpenCV SGBM, holes filled", False), ("ours", True)):
-        found = rest.match(*grey, every, every, (0, int(np.nanmax(truth[known])) + 8), refine=refine)
+        found = rest.match(left, right, every, every, (0, int(np.nanmax(truth[known])) + 8), refine=refine)
         off = np.abs(found.disparity - truth)
         if not refine:
             alone = (off > _OFF_PX) | ~found.found
             rows.append({"method": "OpenCV SGBM, holes count"} | _shares(alone, off, known, edge))
         rows.append({"method": name} | _shares(off > _OFF_PX, off, known, edge))
     return rows
+
+
+def _grey(path: Path) -> NDArray[np.float32]:
+    picture = cv2.imread(str(path))
+    if picture is None:
+        raise UserError(f"{path}: not a readable picture")
+    return np.asarray(picture[..., ::-1] @ np.array([0.2, 0.6, 0.2], np.float32), np.float32)
 
 
 def _shares(bad: NDArray[np.bool_], off: Floats, known: NDArray[np.bool_], edge: NDArray[np.bool_]) -> Any:
