@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -10,7 +11,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from synth.errors import UserError
-from synth.flow.stereo import depth_motion, rest
+from synth.flow.stereo import calibration, depth_motion, rest
 from synth.flow.stereo.depth_motion import Solver
 from synth.flow.stereo.rig import Eye, Rectified, Rig
 from synth.flow.stereo.track import StereoTracker, still_frames
@@ -89,6 +90,31 @@ def test_rectified_rows_and_depths_are_opencvs_projections(rig: Rig) -> None:
         planes = np.stack([np.full(SIZE[::-1], part, np.float32) for part in flow[k]])
         found = rectified.motion(field, np.full_like(field, change[k]), planes)[at[1], at[0]]
         np.testing.assert_allclose(found, moved[k] - points[k], atol=0.03)
+
+
+def test_a_calibration_that_opencv_wrote_is_read(tmp_path: Path) -> None:
+    def written(name: str, rotation: np.ndarray) -> Path:
+        storage = cv2.FileStorage(str(tmp_path / name), cv2.FILE_STORAGE_WRITE)
+        for number, eye in (("1", TURNED.left), ("2", TURNED.right)):
+            storage.write(f"M{number}", eye.K)
+            storage.write(f"D{number}", eye.distortion[None])
+        storage.write("R", rotation)
+        storage.write("T", TURNED.translation[:, None] / 25.0)
+        storage.release()
+        return tmp_path / name
+
+    found = calibration.read_rig(written("pair.yaml", TURN), SIZE, mm_per_unit=25.0)
+    np.testing.assert_allclose(found.right.K, TURNED.right.K)
+    np.testing.assert_allclose(found.left.distortion, TURNED.left.distortion)
+    np.testing.assert_allclose(found.rotation, TURN, atol=1e-12)
+    np.testing.assert_allclose(found.translation, TURNED.translation)
+    with pytest.raises(UserError, match="no rotation"):
+        calibration.read_rig(written("bent.yaml", 1.1 * TURN), SIZE)
+    (tmp_path / "none.yaml").write_text("%YAML:1.0\n---\nR: 3\n")
+    with pytest.raises(UserError, match="left camera matrix"):
+        calibration.read_rig(tmp_path / "none.yaml", SIZE)
+    with pytest.raises(UserError, match="cannot be read"):
+        calibration.read_rig(tmp_path / "missing.yaml", SIZE)
 
 
 def test_a_left_camera_on_the_right_is_refused() -> None:
