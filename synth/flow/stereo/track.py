@@ -18,6 +18,7 @@ from synth.flow.stereo.rig import Rectified, Rig
 _GREY = np.array([0.2, 0.6, 0.2], np.float32)  # as `image.tensor`
 _STILL_PX = 0.3  # frames whose flow is nearly everywhere below this are at rest
 _RESTS = 4
+_LOST = 0.05  # of what is seen at rest: a frame that shows less is no place to start from
 
 
 @dataclass(frozen=True)
@@ -121,7 +122,8 @@ class StereoTracker:
         pictures = Pictures(self._left, self._right, self._usable, now, other, now_usable, other_usable)
         straight = r.flow(flow)
         change = self.solver.solve(pictures, straight, self.rest.disparity, self.px_per_mm, self._change)
-        self._change = change.px
+        lost = float(change.seen.sum()) < _LOST * float(self._usable.sum())
+        self._change = None if lost else change.px
         return self._moved(change, straight, confidence, "joint")
 
     def fuse(self, flow: Flow, confidence: Map, right_flow: Flow, right_confidence: Map) -> Moved:

@@ -178,6 +178,22 @@ def test_a_dent_and_a_shift_are_found_in_millimetres(tier: str) -> None:
     assert (moved.deviation[inner] > 0).all()
 
 
+def test_a_blocked_eye_is_doubted_and_forgotten() -> None:
+    picture = texture(np.random.default_rng(6))
+    every = np.ones(SIZE[::-1], bool)
+    rest_frame = seen(picture, COLUMNS, ROWS)
+    tracker = StereoTracker(PARALLEL, rest_frame[None], rest_frame[None], ~every, ~every, every)
+    still = np.zeros((*every.shape, 2), np.float32), np.ones(every.shape, np.float32)
+    sure = tracker.step(rest_frame, rest_frame, ~every, ~every, *still)
+    blind = tracker.step(rest_frame, np.zeros_like(rest_frame), ~every, every, *still)
+    again = tracker.step(rest_frame, rest_frame, ~every, ~every, *still)
+    inner = (slice(10, -10), slice(10, -10), 2)
+    assert np.abs(sure.motion[inner]).max() < 0.05
+    assert np.abs(blind.motion[inner]).max() < 0.05
+    assert (blind.deviation[inner] > 3 * sure.deviation[inner]).all()
+    np.testing.assert_allclose(again.motion, sure.motion, atol=1e-3)
+
+
 def _source(along: np.ndarray) -> np.ndarray:
     """Rest columns (H, W) that are seen at each pixel once tissue has moved by (along, -0.8)."""
     x = COLUMNS.astype(np.float64)
