@@ -37,6 +37,7 @@ COMMANDS = {
     "experiment leakage": "evidence.gap.leakage:leakage",
     "experiment scoring": "evidence.scoring.scoring_cost:cost",
     "experiment inverse": "evidence.scoring.inverse:experiment",
+    "experiment pulse": "evidence.scoring.pulse:experiment",
     "experiment learn": "evidence.learn.experiment:experiment",
     "stability learn": "evidence.learn.stability:stability",
     "experiment loading": "evidence.learn.throughput:loading",

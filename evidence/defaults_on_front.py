@@ -109,11 +109,10 @@ def gather(results: Path = RESULTS) -> list[Front]:
 
 
 def _fem(found: Mapping[str, Any]) -> Front:
-    from synth.job.law_limits import choose
     from synth.job.schema import Fem
 
     fem = Fem()
-    law = choose(fem.law, fem.largest_load, fem.tolerance)[0]
+    law = fem.chosen_law[0]
     points = [
         Point(
             (row["law"], row["order"], row["tets"]),

@@ -23,7 +23,6 @@ from synth.dataset import location, provenance
 from synth.dataset.store import open_sequence
 from synth.flow import mask
 from synth.job import identity
-from synth.job.law_limits import choose
 from synth.job.schema import Fem, Flow, Job, Render
 from synth.sequence import pipeline
 
@@ -62,7 +61,7 @@ class World:
 def default_world() -> World:
     """What a job without these keys gets at this load."""
     fem = Fem(load=LOAD)
-    return World(choose(fem.law, fem.largest_load, fem.tolerance)[0], fem.tets, Render().spp)
+    return World(fem.chosen_law[0], fem.tets, Render().spp)
 
 
 FINE = World("neo-hookean", 3000, 8)

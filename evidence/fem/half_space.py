@@ -1,4 +1,4 @@
-"""Discs on the half-space against closed forms: u_z and u_r of the default grading, by Poisson's ratio."""
+"""Discs on the half-space, bare against closed forms and under a membrane against Hankel integrals."""
 
 from __future__ import annotations
 
@@ -8,12 +8,13 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 from numpy.typing import NDArray
-from scipy.special import ellipe, ellipk
+from scipy.special import ellipe, ellipk, j0, j1
 
 from bench.output import charts
 from bench.output.result_page import Page
 from evidence.measuring import measuring
 from synth.fem import surface_embedding
+from synth.fem.membrane import Sheet
 from synth.fem.mesh import tetrahedra
 from synth.fem.mesh.tetrahedra import Tets
 from synth.fem.system import assemble
@@ -24,13 +25,15 @@ Row = dict[str, Any]
 _RADIUS_MM = 4.5
 _POISSONS = (0.4, 0.45, 0.49)
 _RINGS, _SPOKES = 60, 96
+_SHEETS = (0.0, 5.0, 50.0)
+_WIDE_MM = (800.0, 800.0, 480.0)  # a membrane spreads the load: its far field is not the bare half-space's
 
 
 def _lines(found: Mapping[str, Any]) -> str:
     """A line a row."""
     return "\n".join(
-        f"{row['tets']:6d} nu {row['poisson']:4.2f} {row['disc']:10s} {row['part']:12s} "
-        f"{100 * row['error']:5.1f}%"
+        f"{row['tets']:6d} nu {row['poisson']:4.2f} sheet {row['sheet_mm']:3g} "
+        f"{row['disc']:10s} {row['part']:12s} {100 * row['error']:5.1f}%"
         for row in found["rows"]
     )
 
@@ -39,23 +42,30 @@ def _lines(found: Mapping[str, Any]) -> str:
 def half_space(
     tets: Annotated[str, typer.Option(help="Tetrahedra of the meshes.")] = "1600,5000",
 ) -> dict[str, Any]:
-    """Error of surface displacement under a uniform, a Hertz and a tangential disc, P2, linear law."""
+    """Error of surface displacement under uniform, Hertz and tangential discs, bare and with a membrane."""
     rows = [
         row
         for count in (int(n) for n in tets.split(","))
         for poisson in _POISSONS
-        for row in measure(count, poisson)
+        for sheet in _SHEETS
+        for row in measure(count, poisson, sheet)
     ]
     return {"rows": rows}
 
 
-def measure(count: int, poisson: float) -> list[Row]:
-    """Relative root mean squares inside the disc and outside, to twice its radius."""
+def measure(count: int, poisson: float, sheet_mm: float = 0.0) -> list[Row]:
+    """Relative root mean squares inside the disc and outside, to twice its radius.
+
+    Args:
+        count: tetrahedra to aim for.
+        poisson: of the half-space.
+        sheet_mm: stiffness of the membrane over Young's modulus of the half-space.
+    """
     a = _RADIUS_MM
-    anatomy = schema.Anatomy(dome_mm=1e6)
+    anatomy = schema.Anatomy(dome_mm=1e6, block_mm=_WIDE_MM if sheet_mm else schema.Anatomy().block_mm)
     tets = tetrahedra.block(anatomy, count, 2, ((0.0, 0.0, a),))
     free = Tets(tets.points, tets.cells, 2, tets.fixed, 0 * tets.hold)
-    system = assemble(free, "linear", poisson)
+    system = assemble(free, "linear", poisson, Sheet(sheet_mm, 1.0) if sheet_mm else None)
     ring = a * np.sqrt((np.arange(_RINGS) + 0.5) / _RINGS)
     turn = 2 * np.pi * (np.arange(_SPOKES) + 0.5) / _SPOKES
     at = np.stack([np.outer(ring, np.cos(turn)), np.outer(ring, np.sin(turn))], axis=-1).reshape(-1, 2)
@@ -77,13 +87,18 @@ def measure(count: int, poisson: float) -> list[Row]:
             unit = spots / np.linalg.norm(spots, axis=1, keepdims=True)
             radial = np.einsum("nd,nd->n", seen[:, :2], unit)
             if disc == "tangential":
-                exact = tangential_mean(radii, a, poisson)
-                got = seen[:, 0].reshape(-1, len(radii)).mean(axis=0)
-                rows.append(_row(count, poisson, disc, f"u_x {place}", got, exact))
-                continue
-            down, out = axial(radii, a, poisson, disc)
-            rows.append(_row(count, poisson, disc, f"u_z {place}", -_mean(seen[:, 2], radii), down))
-            rows.append(_row(count, poisson, disc, f"u_r {place}", _mean(radial, radii), out))
+                exact = {"u_x": tangential_mean(radii, a, poisson)}
+                got = {"u_x": _mean(seen[:, 0], radii)}
+            else:
+                exact = dict(zip(("u_z", "u_r"), axial(radii, a, poisson, disc), strict=True))
+                got = {"u_z": -_mean(seen[:, 2], radii), "u_r": _mean(radial, radii)}
+            if sheet_mm:
+                exact = covered(radii, a, poisson, sheet_mm, disc)
+            for part, value in got.items():
+                rows.append(
+                    {"tets": count, "poisson": poisson, "sheet_mm": sheet_mm, "disc": disc}
+                    | {"part": f"{part} {place}", "error": _error(value, exact[part])}
+                )
     return rows
 
 
@@ -91,9 +106,8 @@ def _mean(values: Floats, radii: Floats) -> Floats:
     return np.asarray(values.reshape(-1, len(radii)).mean(axis=0))
 
 
-def _row(count: int, poisson: float, disc: str, part: str, got: Floats, exact: Floats) -> Row:
-    error = float(np.linalg.norm(got - exact) / np.linalg.norm(exact))
-    return {"tets": count, "poisson": poisson, "disc": disc, "part": part, "error": error}
+def _error(got: Floats, exact: Floats) -> float:
+    return float(np.linalg.norm(got - exact) / np.linalg.norm(exact))
 
 
 def axial(r: Floats, a: float, poisson: float, disc: str) -> tuple[Floats, Floats]:
@@ -134,6 +148,39 @@ def tangential_mean(r: Floats, a: float, poisson: float) -> Floats:
     return np.asarray(down / (1 - poisson) * (1 - poisson / 2))
 
 
+def covered(r: Floats, a: float, poisson: float, sheet_mm: float, disc: str) -> dict[str, Floats]:
+    """Motion of the surface under a linear membrane without thickness, by Hankel integrals; E = 1 kPa.
+
+    A surface wave k of the half-space moves by (1 - nu) t / (G k) along its own load, along or across the
+    surface, by (1 - 2 nu) t / (2 G k) crosswise, and sideways by t / (G k) (Johnson 2.8, 3.2, in waves). The
+    membrane takes 4/3 S k^2 of what moves along the wave and S k^2 / 3 of what moves sideways.
+
+    Args:
+        r: (n,) mm from the middle.
+        a: radius of the disc, mm.
+        poisson: of the half-space.
+        sheet_mm: S, thickness times Young's modulus of the membrane.
+        disc: `uniform`, `hertz` or `tangential`, of unit force.
+
+    Returns:
+        u_z and u_r as in `axial`, or u_x as in `tangential_mean`, (n,) mm.
+    """
+    shear = 1 / (2 * (1 + poisson))
+    k = (np.arange(400_000) + 0.5) * 2e-3 / a
+    x = k * a
+    load = 3 * (np.sin(x) - x * np.cos(x)) / x**3 if disc == "hertz" else 2 * j1(x) / x
+    load = load / (2 * np.pi) * k * (k[1] - k[0])
+    own, cross = (1 - poisson) / (shear * k), (1 - 2 * poisson) / (2 * shear * k)
+    held = 4 / 3 * sheet_mm * k * k
+    straight = np.stack([j0(k * at) for at in r])
+    if disc == "tangential":
+        sideways = 1 / (shear * k + sheet_mm / 3 * k * k)
+        return {"u_x": 0.5 * straight @ (load * (own / (1 + own * held) + sideways))}
+    down = own - cross**2 * held / (1 + own * held)
+    out = np.stack([j1(k * at) for at in r]) @ (load * cross / (1 + own * held))
+    return {"u_z": straight @ (load * down), "u_r": -out}
+
+
 def point_loads(points: Floats, at: Floats, share: Floats, way: Floats, poisson: float) -> Floats:
     """Displacement (N, 3) mm in a half-space z <= 0 under point forces on it (Johnson 3.2, 3.6)."""
     shear = 1 / (2 * (1 + poisson))
@@ -159,15 +206,20 @@ def point_loads(points: Floats, at: Floats, share: Floats, way: Floats, poisson:
 
 
 def drawn(found: Mapping[str, Any]) -> Page:
-    """What the data say: the worst of the three discs, for each part and Poisson's ratio."""
+    """What the data say: the worst of the three discs, for each part, Poisson's ratio and membrane."""
     rows = found["rows"]
     panels = []
     for part in dict.fromkeys(row["part"] for row in rows):
         curves = []
-        for poisson in dict.fromkeys(row["poisson"] for row in rows):
-            mine = [row for row in rows if (row["part"], row["poisson"]) == (part, poisson)]
+        for poisson, sheet in dict.fromkeys((row["poisson"], row.get("sheet_mm", 0)) for row in rows):
+            one = (part, poisson, sheet)
+            mine = [row for row in rows if (row["part"], row["poisson"], row.get("sheet_mm", 0)) == one]
             worst = {n: max(100 * row["error"] for row in mine if row["tets"] == n) for n in _sizes(mine)}
-            curves.append(charts.Curve(f"nu {poisson}", tuple(map(float, worst)), tuple(worst.values())))
+            curves.append(
+                charts.Curve(
+                    f"nu {poisson}, sheet {sheet:g} mm", tuple(map(float, worst)), tuple(worst.values())
+                )
+            )
         panels.append(
             charts.Panel(f"{part}, worst disc", "tetrahedra", "error [%]", tuple(curves), log_y=True)
         )

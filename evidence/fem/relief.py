@@ -84,7 +84,7 @@ def peak_and_mean(case: Scenario, volume: Tets, vertices: Floats, faces: NDArray
     carry = surface_embedding.embed(volume, vertices)
     parts = np.array([0.5, 1.0])
     path = equilibrium.solve_path(
-        assemble(volume, case.tissue.law, case.tissue.poisson),
+        assemble(volume, case.tissue.law, case.tissue.poisson, case.tissue.sheet),
         parts[:, None, None] * carry.gather(force),
         gesture.load * parts,
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import combinations_with_replacement
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,11 @@ Floats = NDArray[np.float64]
 TOLERANCE = 2e-4
 """Force out of balance, as a part of the load, at which a step ends."""
 _HISTORY, _ITERATIONS, _ARMIJO = 8, 200, 1e-4
+_DIRECTIONS = 3  # of loads, up to which states are foretold from all that are known
+
+
+_Step = tuple[Floats, Floats, float, Floats | None]
+"""Step s (N, 3) mm, the gradient's change y (N, 3) mN over it, s'y, and the inverse rest stiffness on y."""
 
 
 class NoEquilibrium(UserError):
@@ -40,13 +46,15 @@ class Path:
     """(T,) force out of balance over the load, in the norm of the inverse stiffness; 0 without load."""
 
 
-def solve_path(system: System, loads: Floats, named: Floats) -> Path:
+def solve_path(system: System, loads: Floats, named: Floats, *, lean: bool = False) -> Path:
     """Equilibrium under each load in turn.
 
     Args:
         system: the equations.
         loads: (T, N, 3) mN for E = 1 kPa.
         named: (T,) P = F/(E a^2) of each, for messages.
+        lean: one solve a step rather than two, and starts from all states found: the same answer within the
+            tolerance but not to the last bit, so that scenes without a need for it keep theirs.
 
     Raises:
         InvertedElement: names frame, load and element.
@@ -61,6 +69,7 @@ def solve_path(system: System, loads: Floats, named: Floats) -> Path:
     peak_squared = float(np.vdot(peak, peak)) or 1.0
     scale = float(np.sqrt(np.vdot(peak, at_peak))) or 1.0
     known: list[tuple[float, Floats]] = [(0.0, np.zeros_like(peak))]
+    bends = _Bends(linear)
     for step, load in enumerate(loads):
         if system.law == "linear":
             u = linear(load)
@@ -70,12 +79,15 @@ def solve_path(system: System, loads: Floats, named: Floats) -> Path:
             factor = float(np.vdot(load, peak)) / peak_squared
             proportional = float(np.abs(load - factor * peak).max()) <= 1e-9 * float(np.abs(peak).max())
             last = path[-1][0] if path else np.zeros_like(load)
-            start = (
-                _interpolate_states(known, factor, at_peak)
-                if proportional
-                else last + linear(load - loads[step - 1])
-            )
-            u, state, norm = minimise_energy(system, load, start, TOLERANCE * scale, last)
+            if proportional:
+                start = _interpolate_states(known, factor, at_peak)
+            elif lean:
+                start = bends.guess(load)
+            else:
+                start = last + linear(load - loads[step - 1])
+            u, state, norm = minimise_energy(system, load, start, TOLERANCE * scale, last, lean=lean)
+            if lean:
+                bends.learn(load, u)
             residual[step] = norm / scale
             if proportional and all(abs(factor - k) > 1e-3 for k, _ in known):
                 known.append((factor, u))
@@ -102,6 +114,10 @@ class _LinearResponse:
         self._directions: list[Floats] = []
         self._responses: list[Floats] = []
 
+    def shares(self, load: Floats) -> Floats:
+        """Of each direction so far in a load, (K,)."""
+        return np.array([float(np.vdot(direction, load)) for direction in self._directions])
+
     def __call__(self, load: Floats) -> Floats:
         size = float(np.linalg.norm(load))
         u, remainder = np.zeros_like(load), load
@@ -117,6 +133,47 @@ class _LinearResponse:
         self._directions.append(direction)
         self._responses.append(response)
         return u + left * response
+
+
+class _Bends:
+    """States under loads that mix a few directions: what they add to the linear response, by least squares.
+
+    What is added is taken as of second and third degree in the directions' shares.
+    """
+
+    def __init__(self, linear: _LinearResponse) -> None:
+        self._linear = linear
+        self._shares: list[Floats] = []
+        self._added: list[Floats] = []
+
+    def learn(self, load: Floats, u: Floats) -> None:
+        """Keeps the state u (N, 3) mm under a load (N, 3) mN."""
+        straight = self._linear(load)
+        self._shares.append(self._linear.shares(load))
+        self._added.append(u - straight)
+
+    def guess(self, load: Floats) -> Floats:
+        """The state under a load."""
+        u = self._linear(load)
+        shares = self._linear.shares(load)
+        known = np.zeros((len(self._shares) + 1, len(shares)))
+        for row, one in zip(known, [*self._shares, shares], strict=True):
+            row[: len(one)] = one
+        known = known[:, np.abs(known[:-1]).max(axis=0, initial=0) > 0]
+        if not 0 < known.shape[1] <= _DIRECTIONS:
+            return u + (self._added[-1] if self._added else 0.0)
+        known /= np.abs(known).max(axis=0)
+        terms = np.stack(
+            [
+                known[:, list(which)].prod(axis=1)
+                for degree in (2, 3)
+                for which in combinations_with_replacement(range(known.shape[1]), degree)
+            ],
+            axis=1,
+        )
+        for part, added in zip(terms[-1] @ np.linalg.pinv(terms[:-1], 1e-6), self._added, strict=True):
+            u = u + part * added
+        return u
 
 
 def check_state(system: System, u: Floats, state: State, frame: int, load: float) -> float:
@@ -137,7 +194,7 @@ def check_state(system: System, u: Floats, state: State, frame: int, load: float
 
 
 def minimise_energy(
-    system: System, load: Floats, start: Floats, tolerance: float, safe: Floats
+    system: System, load: Floats, start: Floats, tolerance: float, safe: Floats, *, lean: bool = False
 ) -> tuple[Floats, State, float]:
     """Minimises stored energy less the load's work by L-BFGS on the factored rest stiffness.
 
@@ -150,6 +207,7 @@ def minimise_energy(
         start: (N, 3) mm.
         safe: (N, 3) mm, a state of finite energy, for when the guess `start` has none.
         tolerance: on the residual's norm sqrt(r' K^-1 r), in sqrt(mN mm).
+        lean: as in `solve_path`.
 
     Returns:
         Displacement, its state and the residual's norm; the caller judges it.
@@ -158,10 +216,10 @@ def minimise_energy(
     if not np.isfinite(state.energy):
         u, state = safe, system.state(safe)
     gradient = _on_free(system, state.force - load)
-    history: list[tuple[Floats, Floats, float]] = []
+    history: list[_Step] = []
     norm = np.inf
+    preconditioned = system.solve(gradient)
     for _ in range(_ITERATIONS):
-        preconditioned = system.solve(gradient)
         norm = max(float(np.vdot(gradient, preconditioned)), 0.0) ** 0.5
         if norm <= tolerance:
             break
@@ -186,33 +244,37 @@ def minimise_energy(
         trial_gradient = _on_free(system, trial_state.force - load)
         s, y = length * direction, trial_gradient - gradient
         curvature = float(np.vdot(s, y))
+        then, preconditioned = preconditioned, system.solve(trial_gradient)
         if curvature > 1e-12 * float(np.sqrt(np.vdot(s, s) * np.vdot(y, y))):
-            history.append((s, y, curvature))
+            history.append((s, y, curvature, preconditioned - then if lean else None))
             del history[:-_HISTORY]
         u, state, gradient = trial, trial_state, trial_gradient
     return u, state, norm
 
 
 def _two_loop_recursion(
-    gradient: Floats, preconditioned: Floats, history: list[tuple[Floats, Floats, float]], system: System
+    gradient: Floats, preconditioned: Floats, history: list[_Step], system: System
 ) -> Floats:
     """The inverse Hessian on the gradient (Nocedal & Wright, algorithm 7.4), the rest stiffness as its seed.
 
     Args:
         gradient: (N, 3) mN.
         preconditioned: (N, 3) mm, the inverse rest stiffness on it.
-        history: steps s (N, 3) mm, the gradient's changes y (N, 3) mN over them, and s'y.
+        history: the latest steps.
         system: the equations.
     """
     if not history:
         return preconditioned
-    q, alphas = gradient.copy(), []
-    for s, y, curvature in reversed(history):
+    q, r, alphas = gradient.copy(), preconditioned.copy(), []
+    for s, y, curvature, solved in reversed(history):
         alpha = float(np.vdot(s, q)) / curvature
         q -= alpha * y
+        if solved is not None:
+            r -= alpha * solved
         alphas.append(alpha)
-    r = system.solve(q)
-    for (s, y, curvature), alpha in zip(history, reversed(alphas), strict=True):
+    if history[0][3] is None:
+        r = system.solve(q)
+    for (s, y, curvature, _), alpha in zip(history, reversed(alphas), strict=True):
         r += s * (alpha - float(np.vdot(y, r)) / curvature)
     return r
 

@@ -7,8 +7,20 @@ from dataclasses import dataclass
 import numpy as np
 
 from synth.errors import UserError
+from synth.fem.membrane import Sheet
 from synth.job import schema
-from synth.job.law_limits import LARGEST_LOAD, choose
+from synth.job.law_limits import LARGEST_LOAD
+
+
+@dataclass(frozen=True)
+class Pia:
+    """What is drawn for an intact membrane."""
+
+    young_kpa: float
+    """Young's modulus at small strain."""
+    thickness_mm: float
+    stretch: float
+    """At rest."""
 
 
 @dataclass(frozen=True)
@@ -23,13 +35,35 @@ class Tissue:
     """Material law, a key of `laws.NUMBER`."""
     why: str = "asked for"
     """Why this law."""
+    membrane: Pia | None = None
+    """The membrane on the surface; None where it is stripped."""
 
     @classmethod
     def draw(cls, fem: schema.Fem, rng: np.random.Generator) -> Tissue:
         """E log-uniformly: half as stiff and twice as stiff are as likely."""
-        low, high = np.log(fem.young_kpa)
-        law, why = choose(fem.law, fem.largest_load, fem.tolerance)
-        return cls(float(np.exp(rng.uniform(low, high))), fem.poisson, law, why)
+        law, why = fem.chosen_law
+        young = _draw_log_uniform(fem.young_kpa, rng)
+        # Drawn whether it counts or not, so that no number depends on whether another is asked for.
+        asked, intact = fem.membrane, rng.uniform()
+        stiff, thick, stretch = (
+            _draw_log_uniform(asked.young_kpa, rng),
+            float(rng.uniform(*asked.thickness_mm)),
+            float(rng.uniform(*asked.stretch)),
+        )
+        pia = Pia(stiff, thick, stretch)
+        return cls(young, fem.poisson, law, why, pia if intact < asked.intact else None)
+
+    @property
+    def sheet(self) -> Sheet | None:
+        """The membrane on tissue of E = 1 kPa."""
+        pia = self.membrane
+        if pia is None:
+            return None
+        return Sheet(pia.young_kpa * pia.thickness_mm / self.young_kpa, pia.stretch)
+
+
+def _draw_log_uniform(ends: tuple[float, float], rng: np.random.Generator) -> float:
+    return float(np.exp(rng.uniform(*np.log(ends))))
 
 
 def check_load(law: str, load: float) -> None:

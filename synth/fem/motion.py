@@ -16,6 +16,7 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from synth.fem.equilibrium import TOLERANCE, NoEquilibrium, Path, check_state, minimise_energy
+from synth.fem.membrane import Sheet
 from synth.fem.mesh.element import quadrature
 from synth.fem.mesh.tetrahedra import Tets
 from synth.fem.system import State, assemble
@@ -40,7 +41,14 @@ class Clock:
 
 
 def march_in_time(
-    tets: Tets, law: str, poisson: float, young_kpa: float, loads: Floats, named: Floats, clock: Clock
+    tets: Tets,
+    law: str,
+    poisson: float,
+    young_kpa: float,
+    loads: Floats,
+    named: Floats,
+    clock: Clock,
+    sheet: Sheet | None = None,
 ) -> Path:
     """Motion from rest under loads at even times; between them they change evenly.
 
@@ -52,6 +60,7 @@ def march_in_time(
         loads: (T, N, 3) mN for E = 1 kPa.
         named: (T,) P = F/(E a^2) of each, for messages.
         clock: time.
+        sheet: a membrane on the surface; it relaxes as the tissue does.
 
     Raises:
         As `equilibrium.solve_path`.
@@ -62,7 +71,7 @@ def march_in_time(
     pull = (1 / dt**2 + clock.damping / dt) if clock.mass_kg else 0.0
     mass = nodal_mass(tets, clock.mass_kg) / young_kpa
     springs = (tets.hold + sp.diags_array(pull * mass)) / firm
-    system = assemble(replace(tets, hold=sp.csr_array(springs)), law, poisson)
+    system = assemble(replace(tets, hold=sp.csr_array(springs)), law, poisson, sheet)
     tissue = replace(system, hold=sp.csr_array(tets.hold.shape))
 
     peak = loads[np.abs(loads).max(axis=(1, 2)).argmax()]

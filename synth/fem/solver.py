@@ -12,6 +12,7 @@ from synth.fem import equilibrium, motion, surface_embedding, tool
 from synth.fem.equilibrium import InvertedElement, Path
 from synth.fem.material import Tissue, check_load
 from synth.fem.mesh.tetrahedra import Tets
+from synth.fem.pulse import Pulse, lift
 from synth.fem.system import assemble
 from synth.fem.tool import Course, Gesture
 from synth.job import schema
@@ -64,6 +65,8 @@ def deform(
     frames: int,
     fps: float,
     further: Sequence[Gesture] = (),
+    pulse: Pulse | None = None,
+    opening: schema.Craniotomy | None = None,
 ) -> Deformation:
     """Moves a brain as gestures ask.
 
@@ -77,6 +80,8 @@ def deform(
         frames: T >= 2.
         fps: 1/s.
         further: gestures of more instruments at the same time.
+        pulse: of heart and breath; no part of force and traction.
+        opening: where the surface is exposed to it.
 
     Raises:
         UserError: the load is past the law's range, or the contact is not on the surface.
@@ -96,7 +101,19 @@ def deform(
     # One load per kPa of E; displacement depends on no more than that.
     loads = np.stack([carry.gather(area[:, None] * t) for t in traction / tissue.young_kpa])
     named = np.max([g.load * over.load for g, over in zip(gestures, courses, strict=True)], axis=0)
-    path = solve_volume(fem, tissue, tets, loads, named, fps)
+    time = np.arange(frames) / fps
+    timeless = fem.time == "quasi-static" and not fem.relaxation
+    if timeless or pulse is not None:
+        system = assemble(tets, tissue.law, tissue.poisson, tissue.sheet)
+    if pulse is not None:
+        raising = lift(system, carry, skin_vertices, skin_faces, opening or schema.Craniotomy())
+        loads += pulse.height(time)[:, None, None] * raising
+    if timeless:
+        path = equilibrium.solve_path(
+            system, loads, named, lean=pulse is not None or tissue.sheet is not None
+        )
+    else:
+        path = march_in_time(fem, tissue, tets, loads, named, fps)
     displacement = np.stack([carry.move(u) for u in path.displacement])
     tip, shaft = place_instruments(gestures, courses, skin_vertices, skin_faces, displacement)
     forces = [
@@ -111,7 +128,7 @@ def deform(
         area=area,
         force=np.sum(forces, axis=0),
         by_instrument=np.stack(forces, axis=1),
-        time=np.arange(frames) / fps,
+        time=time,
         tip=tip,
         shaft=shaft,
         min_jacobian=path.jacobian,
@@ -120,18 +137,23 @@ def deform(
     )
 
 
-def solve_volume(
+def march_in_time(
     fem: schema.Fem, tissue: Tissue, tets: Tets, loads: Floats, named: Floats, fps: float
 ) -> Path:
-    """The volume under (T, N, 3) mN for E = 1 kPa: in equilibrium, or in motion where the job asks for time.
+    """The volume in motion under (T, N, 3) mN for E = 1 kPa.
 
     Raises:
         As `equilibrium.solve_path`.
     """
-    if fem.time == "quasi-static" and not fem.relaxation:
-        return equilibrium.solve_path(assemble(tets, tissue.law, tissue.poisson), loads, named)
     return motion.march_in_time(
-        tets, tissue.law, tissue.poisson, tissue.young_kpa, loads, named, clock(fem, fps, tets)
+        tets,
+        tissue.law,
+        tissue.poisson,
+        tissue.young_kpa,
+        loads,
+        named,
+        clock(fem, fps, tets),
+        tissue.sheet,
     )
 
 

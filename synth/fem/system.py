@@ -12,6 +12,7 @@ from scipy.sparse.linalg import SuperLU, splu
 from synth.errors import UserError
 from synth.fem.assembly import divergence, gradient, stiffness
 from synth.fem.laws import NUMBER, lame, least_determinant, stress, tangent
+from synth.fem.membrane import Membrane, Sheet, cover
 from synth.fem.mesh.element import Quadrature, quadrature, quality
 from synth.fem.mesh.tetrahedra import Tets
 
@@ -27,9 +28,9 @@ class State:
     """What a displacement does to the tissue, for E = 1 kPa."""
 
     energy: float
-    """mN mm, stored in tissue and springs."""
+    """mN mm, stored in tissue, membrane and springs."""
     force: Floats
-    """(N, 3) mN that the tissue and its springs put up."""
+    """(N, 3) mN that the tissue, its membrane and its springs put up."""
     jacobian: float
     """Smallest det F at the quadrature points."""
 
@@ -46,11 +47,13 @@ class System:
     hold: sp.csr_array
     """(N, N) mN/mm."""
     stiffness: sp.csr_array
-    """(3N, 3N) mN/mm at rest, springs included."""
+    """(3N, 3N) mN/mm at rest, springs and membrane included."""
     factor: SuperLU
     """Of the free part of it."""
     corners: Quadrature
     """The same mesh seen at the corners of its elements."""
+    membrane: Membrane | None = None
+    """On its surface."""
 
     def solve(self, force: Floats) -> Floats:
         """Displacement of the linear law, (N, 3) mm, under (N, 3) mN; of K loads at once, (N, 3, K) each."""
@@ -69,15 +72,21 @@ class System:
         divergence(self.mesh.cells, self.mesh.slope, self.mesh.weight, answer, force)
         spring = self.hold @ u
         energy = float(density @ self.mesh.weight.ravel()) + 0.5 * float(np.vdot(u, spring))
-        return State(energy, force + spring, float(least))
+        force += spring
+        if self.membrane is not None:
+            energy += self.membrane.pull(u, force)
+        return State(energy, force, float(least))
 
     def tangent(self, u: Floats) -> sp.csr_array:
-        """Stiffness at (N, 3) mm, (3N, 3N) mN/mm, springs included."""
+        """Stiffness at (N, 3) mm, (3N, 3N) mN/mm, springs and membrane included."""
         strain = np.empty((self.mesh.weight.size, 3, 3))
         gradient(self.mesh.cells, self.mesh.slope, u, strain)
         moduli = np.empty((len(strain), 3, 3, 3, 3))
         tangent(NUMBER[self.law], strain, *lame(1.0, self.poisson), moduli)
-        return (stiffness(self.mesh, moduli) + _springs(self.hold)).tocsr()
+        whole = stiffness(self.mesh, moduli) + _springs(self.hold)
+        if self.membrane is not None:
+            whole = whole + self.membrane.stiffness_at(u)
+        return whole.tocsr()
 
     def least_jacobian(self, u: Floats) -> tuple[float, int]:
         """Smallest det F at (N, 3) mm and its element, corners included.
@@ -93,13 +102,14 @@ class System:
         return min(found)
 
 
-def assemble(tets: Tets, law: str, poisson: float) -> System:
+def assemble(tets: Tets, law: str, poisson: float, sheet: Sheet | None = None) -> System:
     """Builds and factors the equations.
 
     Args:
         tets: the mesh, its walls and springs.
         law: a key of `laws.NUMBER`.
         poisson: below 0.5.
+        sheet: a membrane on the surface.
 
     Raises:
         UserError: the mesh holds a tetrahedron that is flat or inside out.
@@ -111,6 +121,9 @@ def assemble(tets: Tets, law: str, poisson: float) -> System:
         )
     mesh = quadrature(tets.points, tets.cells, tets.order)
     whole = (stiffness(mesh, hooke(1.0, poisson)) + _springs(tets.hold)).tocsr()
+    membrane = None if sheet is None else cover(tets, sheet, linear=law == "linear")
+    if membrane is not None:
+        whole = (whole + membrane.stiffness_at(np.zeros_like(tets.points))).tocsr()
     free = np.flatnonzero(np.repeat(~tets.fixed, 3))
     # Symmetric and positive definite: no pivoting, an ordering of A + A'.
     factor = splu(
@@ -120,7 +133,7 @@ def assemble(tets: Tets, law: str, poisson: float) -> System:
         options={"SymmetricMode": True},
     )
     corners = quadrature(tets.points, tets.cells, tets.order, np.eye(4))
-    return System(mesh, law, poisson, free, tets.hold, whole, factor, corners)
+    return System(mesh, law, poisson, free, tets.hold, whole, factor, corners, membrane)
 
 
 def hooke(young: float, poisson: float) -> Floats:

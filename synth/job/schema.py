@@ -22,6 +22,7 @@ from synth.job.types import (
     Section,
     Share,
     ShareRange,
+    StretchRange,
     Vector,
 )
 
@@ -112,6 +113,39 @@ class Appearance(Section):
     """Blood on the rim, from none (0) to soaked (1). Empty: as the family has it."""
 
 
+class Membrane(Section):
+    """The pia-arachnoid, a thin stiff sheet on the surface that wrinkles under compression. Default: none."""
+
+    intact: Share = 0.0
+    """Part of the sequences that have it; from the others it is stripped, as from many ex vivo specimens."""
+    young_kpa: PositiveRange = (100.0, 1000.0)
+    """Its Young's modulus at small strain [kPa], drawn log-uniformly. Human: about 900 (3 times a shear
+    modulus of 300: Vandemaele et al., Acta Biomater. 2025); less where it is slack or partly stripped. Past
+    the toe of the curve it is thousands (ovine 7,700: Fluids Barriers CNS 17, 2020)."""
+    thickness_mm: PositiveRange = (0.05, 0.2)
+    """Its thickness [mm], drawn uniformly. What counts is thickness times modulus."""
+    stretch: StretchRange = (1.01, 1.03)
+    """How far it is stretched at rest, drawn uniformly. Not from a measurement: its pull then balances a
+    pressure of 3-350 Pa (at most 2.6 mmHg) under a dome of 70 mm radius, which a living head has."""
+
+
+class Pulse(Section):
+    """Heart and breath: the exposed surface rises and falls, by a pressure from below. Default: it is still.
+
+    Amplitudes are of the middle of the opening, peak to peak, drawn uniformly as the rates are. In a patient
+    below 0.8 mm, with peaks at 0.2 and 1 Hz (Faria et al., Med. Phys. 41, 2014).
+    """
+
+    heart_mm: NonNegativeRange = (0.0, 0.0)
+    """Motion with the heart [mm]."""
+    heart_hz: PositiveRange = (1.0, 1.7)
+    """Heart beats a second."""
+    breath_mm: NonNegativeRange = (0.0, 0.0)
+    """Motion with the breath [mm]."""
+    breath_hz: PositiveRange = (0.2, 0.35)
+    """Breaths a second."""
+
+
 class Fem(Section):
     """The physics of the tissue and of the load."""
 
@@ -127,6 +161,10 @@ class Fem(Section):
     """Young's modulus E [kPa], drawn log-uniformly."""
     poisson: Annotated[FiniteFloat, Field(ge=0, lt=0.5)] = 0.4
     """Poisson's ratio."""
+    membrane: Membrane = Membrane()
+    """The pia-arachnoid on the surface."""
+    pulse: Pulse = Pulse()
+    """Motion of the exposed surface that no tool makes."""
     load: PositiveRange = (0.05, 0.4)
     """Peak load as P = F/(E a^2), dimensionless, so that one range suits every stiffness."""
     force_mn: PositiveRange | None = None
@@ -167,7 +205,7 @@ class Fem(Section):
     @model_validator(mode="after")
     def _load_is_in_the_laws_range(self) -> Fem:
         load = self.largest_load
-        law, _ = choose(self.law, load, self.tolerance)
+        law, _ = self.chosen_law
         largest = LARGEST_LOAD[law]
         if self.force_mn is None and load > largest:
             raise ValueError(
@@ -181,6 +219,13 @@ class Fem(Section):
                 f"the largest valid value is {largest * young * radius**2:.4g}"
             )
         return self
+
+    @property
+    def chosen_law(self) -> tuple[str, str]:
+        """The material law of every sequence, and why."""
+        if self.law == "auto" and self.membrane.intact > 0:
+            return "neo-hookean", "a membrane stretches as it bends, which the linear law leaves out"
+        return choose(self.law, self.largest_load, self.tolerance)
 
     @property
     def largest_load(self) -> float:

@@ -4,7 +4,15 @@ from __future__ import annotations
 
 from typing import Annotated, Any
 
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    FiniteFloat,
+    ValidationError,
+)
 
 
 def _pair(value: Any) -> Any:
@@ -34,7 +42,15 @@ _Tilt = Annotated[FiniteFloat, Field(ge=0, le=40)]
 LightTilt = Annotated[tuple[_Tilt, _Tilt], BeforeValidator(_pair), AfterValidator(_ordered)]
 _Kelvin = Annotated[FiniteFloat, Field(ge=2000, le=12_000)]
 LightKelvin = Annotated[tuple[_Kelvin, _Kelvin], BeforeValidator(_pair), AfterValidator(_ordered)]
+_Stretch = Annotated[FiniteFloat, Field(ge=1.005, le=1.2)]
+StretchRange = Annotated[tuple[_Stretch, _Stretch], BeforeValidator(_pair), AfterValidator(_ordered)]
 Vector = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
+
+
+def first_problem(error: ValidationError) -> tuple[str, str]:
+    """Where the first mistake is, keys joined by dots (empty: all of it), and what it is; both short."""
+    first = error.errors(include_input=False, include_url=False)[0]
+    return ".".join(str(step)[:40] for step in first["loc"])[:200], first["msg"].splitlines()[0][:200]
 
 
 class Section(BaseModel):

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from synth.dataset import index, split
+from synth.dataset import index, location, split
 from synth.dataset.folder import Folder, write_whole
 from synth.dataset.store import Sequence, open_sequence
 from synth.fields import FIELDS
@@ -38,7 +38,7 @@ def write_card(folder: Folder) -> Path:
             write_whole(pictures / f"{name}.svg", histogram.histogram(values, title, unit))
             shown.append({"title": title, "path": f"card/{name}.svg"})
     best = max(done, key=lambda row: row["peak_flow_px"] or 0.0, default=None)
-    sequence = None if best is None else open_sequence(folder.root / best["path"])
+    sequence = None if best is None else open_sequence(location.store(folder.root, best["index"]))
     example = None if sequence is None else _example(sequence, pictures)
     text = _template().render(
         **_facts(job, rows, done),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -24,9 +25,9 @@ from synth.flow.track import Track
 from synth.geometry import brain_surface
 from synth.geometry.brain_surface import Brain
 from synth.job import identity
-from synth.job.schema import Flow, Job
+from synth.job.schema import Anatomy, Flow, Job
 from synth.render.anatomy import surface as anatomy
-from synth.render.anatomy.surface import Surface
+from synth.render.anatomy.surface import Relief, Surface
 from synth.render.camera import camera, video
 from synth.render.camera.camera import Camera
 from synth.render.scene import Studio
@@ -277,9 +278,12 @@ def _second_lens(shooting: _Shooting) -> dict[str, Any]:
 def _mechanics(
     job: Job, case: Scenario, motion: Deformation, rotation: NDArray[np.float64]
 ) -> dict[str, Any]:
+    still = case.pulse is None
     return {
         "law": case.tissue.law,
-        "elastic": job.fem.time == "quasi-static" and not job.fem.relaxation,
+        # Whether the tools' forces alone say what is stored.
+        "elastic": job.fem.time == "quasi-static" and not job.fem.relaxation and still,
+        **({} if case.pulse is None else {"pulse_mm": case.pulse.height(motion.time).tolist()}),
         "min_jacobian": motion.min_jacobian.tolist(),
         "energy_mn_mm": motion.energy.tolist(),
         "residual": motion.residual.tolist(),
@@ -306,11 +310,28 @@ def build(job: Job, case: Scenario) -> tuple[Surface, Tets]:
 
 
 def cortex(job: Job, case: Scenario) -> tuple[Surface, Brain | None]:
-    """The fine surface of a scenario, and the user's brain that it is a part of, if it is."""
-    if job.anatomy.mesh is None:
-        return anatomy.procedural(case.relief, job.anatomy), None
-    whole = brain_surface.load_brain(job.anatomy.mesh, job.anatomy.craniotomy)
-    return anatomy.from_brain(whole.vertices, whole.faces, case.relief, job.anatomy), whole
+    """The fine surface of a scenario, and the user's brain that it is a part of, if it is.
+
+    Sequences that share an anatomy (`anatomy.variety`) share these: their arrays are read-only.
+    """
+    written = job.anatomy.mesh.stat() if job.anatomy.mesh and job.anatomy.mesh.is_file() else None
+    return _cortex(job.anatomy, case.relief, written and (written.st_mtime_ns, written.st_size))
+
+
+@lru_cache(maxsize=4)
+def _cortex(section: Anatomy, relief: Relief, written: object) -> tuple[Surface, Brain | None]:
+    """As `cortex`; `written` tells a mesh from one that replaced it."""
+    whole = None
+    if section.mesh is None:
+        surface = anatomy.procedural(relief, section)
+    else:
+        whole = brain_surface.load_brain(section.mesh, section.craniotomy)
+        surface = anatomy.from_brain(whole.vertices, whole.faces, relief, section)
+    for shared in (surface, whole):
+        for value in vars(shared).values() if shared else ():
+            if isinstance(value, np.ndarray):
+                value.flags.writeable = False
+    return surface, whole
 
 
 def move(job: Job, case: Scenario, surface: Surface, tets: Tets) -> Deformation:
@@ -325,6 +346,8 @@ def move(job: Job, case: Scenario, surface: Surface, tets: Tets) -> Deformation:
         job.frames,
         job.fps,
         case.further,
+        case.pulse,
+        job.anatomy.craniotomy,
     )
 
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from synth.fem import multi_instrument
 from synth.fem.material import Tissue
+from synth.fem.pulse import Pulse
 from synth.fem.tool import Gesture
 from synth.job.schema import Job
 from synth.render.anatomy.surface import Relief
@@ -18,7 +19,7 @@ from synth.render.scene import Look
 
 # First element of the spawn key: anatomies are shared between sequences, everything else is not.
 _ANATOMY, _SEQUENCE = 0, 1
-_TISSUE, _GESTURE, _LOOK, _VIEW, _NOISE, _FURTHER, _LABELS, _SWAY = range(8)
+_TISSUE, _GESTURE, _LOOK, _VIEW, _NOISE, _FURTHER, _LABELS, _SWAY, _PULSE = range(9)
 
 
 @dataclass(frozen=True)
@@ -41,6 +42,8 @@ class Scenario:
     look: Look
     view: View
     sway: Sway
+    pulse: Pulse | None
+    """None where only tools move the tissue."""
 
     @property
     def gestures(self) -> tuple[Gesture, ...]:
@@ -71,6 +74,7 @@ def draw(job: Job, index: int) -> Scenario:
         look=Look.draw(job, family, _generator(job, _SEQUENCE, index, _LOOK)),
         view=View.draw(job.render, _generator(job, _SEQUENCE, index, _VIEW)),
         sway=Sway.draw(job.render, _generator(job, _SEQUENCE, index, _SWAY)),
+        pulse=Pulse.draw(job.fem.pulse, _generator(job, _SEQUENCE, index, _PULSE)),
     )
 
 

@@ -80,7 +80,7 @@ def fit_reading(
         update={"law": "neo-hookean", "order": 2, "tets": _TETS, "time": "quasi-static", "relaxation": ()}
     )
     tets = pipeline.build(job.model_copy(update={"fem": plain}), case)[1]
-    system = assemble(tets, "neo-hookean", case.tissue.poisson)
+    system = assemble(tets, "neo-hookean", case.tissue.poisson, case.tissue.sheet)
     carry = surface_embedding.embed(tets, surface.vertices)
     young = case.tissue.young_kpa
     loads = np.stack([carry.gather(motion.area[:, None] * motion.traction[f]) for f in frames]) / young

@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 
 from synth.dataset import provenance
 from synth.errors import UserError
-from synth.job.law_limits import choose
 from synth.job.schema import Job
 from synth.tune import knobs as tune_knobs
 from synth.tune.checkpoint import Journal
@@ -229,7 +228,7 @@ def own(knob: Knob, job: Job) -> Level:
     """The level of a knob that a job has."""
     values = job.model_dump(mode="json")
     if knob.name == "law":
-        law = choose(job.fem.law, job.fem.largest_load, job.fem.tolerance)[0]
+        law = job.fem.chosen_law[0]
         return next((one for one in knob.levels if one.words == law), knob.levels[0])
     for level in knob.levels:
         if all(_value(values, key) == value for key, value in level.changes.items() if key != "fem.order"):

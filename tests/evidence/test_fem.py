@@ -61,3 +61,16 @@ def test_random_scenes_are_whole_and_step_evenly() -> None:
     assert found["outcome"] == {"whole": 3}
     assert 0 < found["least_jacobian"] <= 1
     assert found["largest_step"] < 0.25
+
+
+@pytest.mark.slow
+def test_a_membrane_on_the_half_space_comes_out_as_the_hankel_integrals() -> None:
+    radii = np.array([1.0, 3.0, 6.0])
+    for disc in ("uniform", "hertz"):  # without a membrane, the integrals are the closed forms
+        found = half_space.covered(radii, 4.5, 0.45, 0.0, disc)
+        down, out = half_space.axial(radii, 4.5, 0.45, disc)
+        np.testing.assert_allclose(found["u_z"], down, rtol=2e-5)
+        np.testing.assert_allclose(found["u_r"], out, rtol=2e-5)
+    rows = half_space.measure(3000, 0.4, 50.0)
+    assert max(row["error"] for row in rows if not row["part"].startswith("u_r")) < 0.03
+    assert max(row["error"] for row in rows) < 0.08

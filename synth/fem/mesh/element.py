@@ -64,6 +64,19 @@ def face_shape(bary: Floats, order: int) -> Floats:
     return np.concatenate([bary * (2 * bary - 1), sides], axis=-1)
 
 
+def face_shape_slope(bary: Floats, order: int) -> Floats:
+    """Derivatives of `face_shape` by the second and third barycentric coordinate, (Q, 3 or 6, 2)."""
+    eye = np.broadcast_to(np.eye(3), (len(bary), 3, 3))
+    slope = eye
+    if order == 2:
+        sides = [
+            bary[:, [i], None] * np.eye(3)[j] + bary[:, [j], None] * np.eye(3)[i]
+            for i, j in ((0, 1), (0, 2), (1, 2))
+        ]
+        slope = np.concatenate([eye * (4 * bary - 1)[:, None, :], 4 * np.concatenate(sides, axis=1)], axis=1)
+    return np.asarray(slope[..., 1:] - slope[..., :1])
+
+
 def bary_slope(corners: Floats) -> tuple[Floats, Floats]:
     """Gradients of the barycentric coordinates and volumes of straight tetrahedra.
 

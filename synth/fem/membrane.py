@@ -1,0 +1,240 @@
+"""A thin stiff sheet on the surface of the volume: the pia-arachnoid as a membrane.
+
+Incompressible neo-Hookean under plane stress. With C the surface's metric over its rest metric, det C its
+squared area, S the thickness times Young's modulus,
+
+    W = S/6 (tr C + 1/det C - 3)    a unit of area at rest, mN/mm,
+
+at small strain S/3 (e:e + (tr e)^2). A sheet so thin wrinkles rather than bear compression, so W is its
+relaxed energy (Pipkin, IMA J. Appl. Math. 36, 1986): where the smaller principal stretch falls below that of
+uniaxial tension, S/6 (c + 2/sqrt(c) - 3) of the larger squared stretch c, and 0 where that is below 1.
+
+At rest it is stretched already, as in a living head; the pressure inside holds that up, as a load that stays
+what it is. Measured: without a stretch at rest the sheet is slack one way and stiff the other, and the solver
+takes four times as long; one that bears compression buckles.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy.sparse as sp
+from numpy.typing import NDArray
+
+from synth.fem.mesh.element import face_shape_slope
+from synth.fem.mesh.tetrahedra import Tets, boundary
+from synth.system.jit import compiled
+
+Floats = NDArray[np.float64]
+
+_POINTS = np.full((3, 3), 1 / 6) + 0.5 * np.eye(3)
+"""Barycentric quadrature points of degree 2, of equal weight: exact at small strain for flat faces."""
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """A membrane as it is given, on tissue of E = 1 kPa."""
+
+    stiffness: float
+    """mN/mm: thickness times Young's modulus."""
+    stretch: float
+    """At rest, the same every way; above 1."""
+
+
+@dataclass(frozen=True)
+class Membrane:
+    """F faces of the surface, Q quadrature points and n nodes each."""
+
+    faces: NDArray[np.int32]
+    """(F, n) nodes."""
+    slope: Floats
+    """(F, Q, n, 2) 1/mm, of the shape functions along the two rest tangents."""
+    tangent: Floats
+    """(F, Q, 3, 2) orthonormal tangents at rest."""
+    weight: Floats
+    """(F, Q) mm^2 at rest."""
+    stiffness: float
+    """mN/mm: thickness times Young's modulus."""
+    linear: bool
+    """For small strain, bearing compression: what fits a volume of the linear law."""
+    square: float
+    """Squared stretch at rest."""
+    balance: Floats
+    """(N, 3) mN that it pulls with at rest, and that the pressure inside holds up."""
+    stored: float
+    """mN mm in it at rest."""
+
+    def pull(self, u: Floats, out: Floats) -> float:
+        """Adds its forces at (N, 3) mm to (N, 3) mN, and returns its energy, mN mm; both are 0 at rest."""
+        energy = self._pull(u, out)
+        out -= self.balance
+        return energy - self.stored - float(np.vdot(self.balance, u))
+
+    def _pull(self, u: Floats, out: Floats) -> float:
+        return float(
+            _pull(
+                self.faces,
+                self.slope,
+                self.tangent,
+                self.weight,
+                u,
+                self.stiffness,
+                self.linear,
+                self.square,
+                out,
+            )
+        )
+
+    def stiffness_at(self, u: Floats) -> sp.csr_array:
+        """(3N, 3N) mN/mm at (N, 3) mm, exact."""
+        place = self.tangent
+        if not self.linear:
+            place = place + np.einsum("fqnb,fni->fqib", self.slope, u[self.faces])
+        metric = self.square * np.einsum("fqia,fqib->fqab", place, place)
+        stress, moduli = _moduli(metric, self.stiffness)
+        if not self.linear:
+            _wrinkle(metric, self.stiffness, stress, moduli)
+        stress, moduli = self.square * stress, self.square**2 * moduli
+        bent = np.einsum("fqna,fqib->fqniab", self.slope, place)
+        local = np.einsum("fqniab,fqabcd,fqmjcd,fq->fnimj", bent, moduli, bent, self.weight, optimize=True)
+        held = np.einsum("fqna,fqab,fqmb,fq->fnm", self.slope, stress, self.slope, self.weight, optimize=True)
+        local += np.einsum("fnm,ij->fnimj", held, np.eye(3))
+        faces, n = len(self.faces), 3 * self.faces.shape[1]
+        dof = (3 * self.faces[:, :, None] + np.arange(3, dtype=np.int32)).reshape(faces, n)
+        rows, cols = np.repeat(dof, n, axis=1).ravel(), np.tile(dof, (1, n)).ravel()
+        return sp.coo_array((local.ravel(), (rows, cols)), shape=(u.size,) * 2).tocsr()
+
+
+def cover(tets: Tets, sheet: Sheet, *, linear: bool) -> Membrane:
+    """A membrane over all of a volume's surface but the walls that it is cut out at.
+
+    Args:
+        tets: the volume.
+        sheet: its stiffness and stretch.
+        linear: for small strain, whatever the stretch at rest.
+    """
+    faces = boundary(tets.cells, tets.order)
+    faces = faces[~tets.fixed[faces].all(axis=1)]
+    local = face_shape_slope(_POINTS, tets.order)
+    side = np.einsum("qnk,fni->fqik", local, tets.points[faces])
+    first = side[..., 0] / np.linalg.norm(side[..., 0], axis=-1, keepdims=True)
+    normal = np.cross(side[..., 0], side[..., 1])
+    area = np.linalg.norm(normal, axis=-1)
+    tangent = np.stack([first, np.cross(normal / area[..., None], first)], axis=-1)
+    mapping = np.linalg.inv(np.einsum("fqia,fqik->fqak", tangent, side))
+    found = Membrane(
+        faces.astype(np.int32),
+        np.ascontiguousarray(np.einsum("qnk,fqka->fqna", local, mapping)),
+        np.ascontiguousarray(tangent),
+        area / (2 * len(_POINTS)),
+        sheet.stiffness,
+        linear,
+        1.0 if linear else sheet.stretch**2,
+        np.zeros_like(tets.points),
+        0.0,
+    )
+    balance = np.zeros_like(tets.points)
+    stored = found._pull(balance.copy(), balance)
+    return replace(found, balance=balance, stored=stored)
+
+
+@compiled
+def _pull(
+    faces: NDArray[np.int32],
+    slope: Floats,
+    tangent: Floats,
+    weight: Floats,
+    u: Floats,
+    stiffness: float,
+    linear: bool,
+    square: float,
+    out: Floats,
+) -> float:
+    """Adds the forces of the whole sheet, stretch at rest included, and returns its energy."""
+    count, points, nodes, _ = slope.shape
+    energy = 0.0
+    moved, bent = np.empty((3, 2)), np.empty((3, 2))
+    for f in range(count):
+        for q in range(points):
+            moved[:] = 0.0
+            for n in range(nodes):
+                a, b = slope[f, q, n, 0], slope[f, q, n, 1]
+                for i in range(3):
+                    v = u[faces[f, n], i]
+                    moved[i, 0] += v * a
+                    moved[i, 1] += v * b
+            if linear:
+                bent[:] = tangent[f, q]
+                xx, yy, xy = 0.0, 0.0, 0.0
+                for i in range(3):
+                    xx += bent[i, 0] * moved[i, 0]
+                    yy += bent[i, 1] * moved[i, 1]
+                    xy += 0.5 * (bent[i, 0] * moved[i, 1] + bent[i, 1] * moved[i, 0])
+                trace = xx + yy
+                density = (xx * xx + yy * yy + 2 * xy * xy + trace * trace) / 3
+                sxx, syy, sxy = 2 / 3 * (xx + trace), 2 / 3 * (yy + trace), 2 / 3 * xy
+            else:
+                xx, yy, xy = 0.0, 0.0, 0.0
+                for i in range(3):
+                    bent[i, 0] = tangent[f, q, i, 0] + moved[i, 0]
+                    bent[i, 1] = tangent[f, q, i, 1] + moved[i, 1]
+                    xx += bent[i, 0] * bent[i, 0]
+                    yy += bent[i, 1] * bent[i, 1]
+                    xy += bent[i, 0] * bent[i, 1]
+                density, sxx, syy, sxy = _stretched(square * xx, square * yy, square * xy)
+                sxx, syy, sxy = square * sxx, square * syy, square * sxy
+            w = weight[f, q] * stiffness
+            energy += w * density
+            for n in range(nodes):
+                a, b = slope[f, q, n, 0], slope[f, q, n, 1]
+                along, aside = w * (sxx * a + sxy * b), w * (sxy * a + syy * b)
+                for i in range(3):
+                    out[faces[f, n], i] += bent[i, 0] * along + bent[i, 1] * aside
+    return energy
+
+
+@compiled
+def _stretched(xx: float, yy: float, xy: float) -> tuple[float, float, float, float]:
+    """Energy and second Piola-Kirchhoff stress (xx, yy, xy) at the metric C, for S = 1."""
+    det = xx * yy - xy * xy
+    half = 0.5 * (xx - yy)
+    away = np.sqrt(half * half + xy * xy)
+    large = 0.5 * (xx + yy) + away
+    if large <= 1.0:
+        return 0.0, 0.0, 0.0, 0.0
+    if det < np.sqrt(large):  # the smaller stretch is below that of uniaxial tension
+        pull = (1 - large**-1.5) / 6
+        c, s = half / away, xy / away  # cosine and sine of twice the angle to the larger stretch
+        return (large + 2 / np.sqrt(large) - 3) / 6, pull * (1 + c), pull * (1 - c), pull * s
+    over = 1 / (det * det)
+    energy = (xx + yy + 1 / det - 3) / 6
+    return energy, (1 - yy * over) / 3, (1 - xx * over) / 3, xy * over / 3
+
+
+def _moduli(metric: Floats, stiffness: float) -> tuple[Floats, Floats]:
+    """Second Piola-Kirchhoff stress (..., 2, 2) and its derivative by strain, without wrinkles."""
+    inverse, det = np.linalg.inv(metric), np.linalg.det(metric)[..., None, None]
+    stress = stiffness / 3 * (np.eye(2) - inverse / det)
+    crossed = np.einsum("...ac,...bd->...abcd", inverse, inverse)
+    crossed = 0.5 * (crossed + np.swapaxes(crossed, -1, -2))
+    whole = np.einsum("...ab,...cd->...abcd", inverse, inverse) + crossed
+    return stress, 2 * stiffness / 3 * whole / det[..., None, None]
+
+
+def _wrinkle(metric: Floats, stiffness: float, stress: Floats, moduli: Floats) -> None:
+    """Puts the relaxed stress and its derivative where the sheet wrinkles or is slack."""
+    values, ways = np.linalg.eigh(metric)
+    large, small = values[..., 1], values[..., 0]
+    slack = large <= 1
+    creased = ~slack & (small * large < np.sqrt(large))
+    stress[slack], moduli[slack] = 0, 0
+    c, n, m = large[creased], ways[creased][..., 1], ways[creased][..., 0]
+    pull = stiffness / 3 * (1 - c**-1.5)
+    along, aside = np.einsum("pa,pb->pab", n, n), np.einsum("pa,pb->pab", n, m)
+    aside = aside + np.swapaxes(aside, -1, -2)
+    stress[creased] = pull[:, None, None] * along
+    steep = stiffness * c**-2.5
+    turn = pull / (c - small[creased])
+    moduli[creased] = np.einsum("p,pab,pcd->pabcd", steep, along, along)
+    moduli[creased] += np.einsum("p,pab,pcd->pabcd", turn, aside, aside)

@@ -1,0 +1,82 @@
+"""Heart and breath: the exposed surface rises and falls by a pressure from below.
+
+In tissue that hardly changes its volume, a pressure inside is the same as a pull of that size on what the
+skull leaves open. So the pulse is a load on the opening, scaled to the motion that is asked for; it is no
+tool's, and no part of any label.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from synth.fem.surface_embedding import Embedding
+from synth.fem.system import System
+from synth.job import schema
+
+Floats = NDArray[np.float64]
+
+_SECOND, _PEAK_TO_PEAK = (
+    0.4,
+    2.4293,
+)  # share of twice the heart's rate: a steep rise and a slow fall; what it spans
+_MIDDLE = 0.25  # part of the opening's radius over which its motion is meant
+
+
+@dataclass(frozen=True)
+class Pulse:
+    """What is drawn for one sequence."""
+
+    heart_mm: float
+    """How far the middle of the opening moves with the heart, peak to peak."""
+    heart_hz: float
+    heart_rad: float
+    """Phase in frame 0."""
+    breath_mm: float
+    """As `heart_mm`, with the breath."""
+    breath_hz: float
+    breath_rad: float
+
+    @classmethod
+    def draw(cls, asked: schema.Pulse, rng: np.random.Generator) -> Pulse | None:
+        """Amplitudes, rates and phases uniformly; None where nothing moves."""
+        drawn = cls(
+            *(float(rng.uniform(*ends)) for ends in (asked.heart_mm, asked.heart_hz, (0, 2 * np.pi))),
+            *(float(rng.uniform(*ends)) for ends in (asked.breath_mm, asked.breath_hz, (0, 2 * np.pi))),
+        )
+        return drawn if drawn.heart_mm or drawn.breath_mm else None
+
+    def height(self, time: Floats) -> Floats:
+        """How far the middle of the opening is above where it is in frame 0, mm, at (T,) s from there."""
+        heart, breath = (
+            rad + 2 * np.pi * hz * np.append(0.0, time)
+            for rad, hz in ((self.heart_rad, self.heart_hz), (self.breath_rad, self.breath_hz))
+        )
+        beat = (np.sin(heart) + _SECOND * np.sin(2 * heart)) / _PEAK_TO_PEAK
+        above = self.heart_mm * beat + 0.5 * self.breath_mm * np.sin(breath)
+        return np.asarray(above[1:] - above[0])
+
+
+def lift(
+    system: System, carry: Embedding, vertices: Floats, faces: NDArray[np.integer], at: schema.Craniotomy
+) -> Floats:
+    """The load that raises the middle of the opening by 1 mm under the linear law, (N, 3) mN for E = 1 kPa.
+
+    Args:
+        system: the volume.
+        carry: the surface on it.
+        vertices: (V, 3) mm.
+        faces: (F, 3), counter-clockwise seen from outside.
+        at: the opening; beyond its radius the pressure falls to none over the rim.
+    """
+    corner = vertices[faces]
+    facing = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]) / 6
+    outward = np.zeros_like(vertices)
+    np.add.at(outward, faces.ravel(), np.repeat(facing, 3, axis=0))
+    reach = np.hypot(vertices[:, 0], vertices[:, 1])
+    bare = np.clip(1 - (reach - at.radius_mm) / at.rim_mm, 0, 1)
+    load = carry.gather((bare * bare * (3 - 2 * bare))[:, None] * outward)
+    middle = reach <= max(_MIDDLE * at.radius_mm, float(reach.min()))
+    return np.asarray(load / carry.move(system.solve(load))[middle, 2].mean())
