@@ -22,6 +22,7 @@ from synth.errors import UserError
 
 COMMANDS = {
     "experiment flow": "evidence.flow.experiment:experiment",
+    "experiment stereo": "evidence.flow.stereo:experiment",
     "stability flow": "evidence.flow.stability:stability",
     "stability recordings": "evidence.flow.foreign:recordings",
     "pareto flow": "evidence.flow.pareto:pareto",

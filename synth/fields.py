@@ -32,9 +32,10 @@ class Field:
     unit: str
     meaning: str
     length: int = 0
-    kept: Literal["always", "usually", "recovered", "asked"] = "always"
+    kept: Literal["always", "usually", "recovered", "stereo", "stereo recovered", "asked"] = "always"
     """`usually`: unless the job's `store.without` names it; `recovered`: with an estimator of flow (and as
-    before); `asked`: when `store.extra` names it."""
+    before); `stereo`: with a second lens (and as before); `stereo recovered`: with both, unless `flow.stereo`
+    is none; `asked`: when `store.extra` names it."""
     half: bool = False
     """Whether `store.flow: float16` stores it in half the space."""
     packed: float = 0.1
@@ -52,7 +53,7 @@ class Field:
     @property
     def optional(self) -> bool:
         """Whether a sequence of the default job may lack it."""
-        return self.kept in ("recovered", "asked")
+        return self.kept not in ("always", "usually")
 
     def shape(self, frames: int, size: tuple[int, int]) -> tuple[int, ...]:
         """Shape for `frames` frames of `size` = (height, width) [px]."""
@@ -239,7 +240,7 @@ FIELDS: dict[str, Field] = {
             "sRGB",
             "picture of the second lens of a stereo pair, render.stereo_mm to the right",
             length=3,
-            kept="asked",
+            kept="stereo",
             packed=1.0,
         ),
         Field(
@@ -249,31 +250,81 @@ FIELDS: dict[str, Field] = {
             "px",
             "as flow, in the second lens's pictures; 0 outside tissue",
             length=2,
-            kept="asked",
+            kept="stereo",
             half=True,
             packed=0.4,
             low=-1e4,
             high=1e4,
         ),
-        Field("visible_right", _VIDEO, "bool", "-", "as visible, in those pictures", kept="asked"),
+        Field("visible_right", _VIDEO, "bool", "-", "as visible, in those pictures", kept="stereo"),
         Field(
             "depth_right",
             _VIDEO,
             "float32",
             "mm",
             "as depth, in the second lens's pictures",
-            kept="asked",
+            kept="stereo",
             packed=0.6,
+            low=0.0,
+        ),
+        Field(
+            "motion",
+            (*_VIDEO, "xyz"),
+            "float32",
+            "mm",
+            "true motion of the material points from the rest frame to this one, camera axes (each frame's "
+            "own), on the rest frame's pixels; 0 outside tissue",
+            length=3,
+            kept="stereo",
+            packed=0.25,
+            low=-1e4,
+            high=1e4,
+        ),
+        Field(
+            "disparity",
+            _STILL,
+            "float32",
+            "px",
+            "column of a rest pixel's point in the left eye less that in the right, without distortion: "
+            "K[0,0] B / depth - (K_right[0,2] - K[0,2]); 0 outside tissue",
+            kept="stereo",
+            packed=0.6,
+            low=-1e4,
+            high=1e4,
+        ),
+        Field(
+            "motion_recovered",
+            (*_VIDEO, "xyz"),
+            "float32",
+            "mm",
+            "motion recovered from both eyes' videos as the job's flow.stereo says, camera axes",
+            length=3,
+            kept="stereo recovered",
+            packed=0.7,
+            low=-1e4,
+            high=1e4,
+        ),
+        Field(
+            "motion_deviation",
+            (*_VIDEO, "xyz"),
+            "float32",
+            "mm",
+            "standard deviation of each component of motion_recovered, estimated with it; 0 outside tissue",
+            length=3,
+            kept="stereo recovered",
+            packed=0.7,
             low=0.0,
         ),
     )
 }
 """Every field by name, in the order in which they are hashed and listed."""
 
-EXTRA = tuple(name for name, field in FIELDS.items() if field.kept == "asked")
-"""What a job's `store.extra` may name."""
+_RIGHT = ("rgb_right", "flow_right", "visible_right", "depth_right")
 
-SPARED = ("depth", "flow_confidence")
+EXTRA = tuple(name for name, field in FIELDS.items() if field.kept == "asked" or name in _RIGHT)
+"""What a job's `store.extra` may name; the second lens's, once asked for one by one, come with it."""
+
+SPARED = ("depth", "flow_confidence", "flow_right", "visible_right", "depth_right")
 """What a job's `store.without` may name: nothing else can be computed without the rest."""
 
 
@@ -282,14 +333,24 @@ def find_field(name: str) -> Field | None:
     return FIELDS.get(FORMER_NAMES.get(name, name))
 
 
-def kept(extra: Iterable[str], without: Iterable[str], *, recovered: bool) -> tuple[str, ...]:
+def kept(
+    extra: Iterable[str],
+    without: Iterable[str],
+    *,
+    recovered: bool,
+    stereo: bool = False,
+    motion: bool = False,
+) -> tuple[str, ...]:
     """Names of the fields that a sequence holds, in the table's order.
 
     Args:
         extra: as the job's `store.extra`.
         without: as the job's `store.without`.
         recovered: whether an estimator of flow runs.
+        stereo: whether there is a second lens.
+        motion: whether motion is recovered from both.
     """
-    kinds = {"always", "usually", *(("recovered",) if recovered else ())}
+    conditions = {"recovered": recovered, "stereo": stereo, "stereo recovered": motion}
+    kinds = {"always", "usually", *(kind for kind, holds in conditions.items() if holds)}
     chosen = {name for name, field in FIELDS.items() if field.kept in kinds} | set(extra)
     return tuple(name for name in FIELDS if name in chosen - set(without))

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from typing import Any
 
 import cv2
 import numpy as np
@@ -28,9 +29,7 @@ def camera(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
     if not inner.any():
         return
     pixels = cameras.pixel_grid(view.size)
-    flat = cameras.undistort((pixels - view.K[:2, 2]) / np.diag(view.K)[:2], view.distortion)
-    rays = np.concatenate([flat, np.ones((len(flat), 1))], axis=1).reshape(height, width, 3)
-    points = rays * depth[..., None]
+    points = rays(view, pixels).reshape(height, width, 3) * depth[..., None]
     across, down = 0.5 * (points[1:-1, 2:] - points[1:-1, :-2]), 0.5 * (points[2:, 1:-1] - points[:-2, 1:-1])
     spanned = np.linalg.norm(np.cross(across, down), axis=-1)
     inside = inner[1:-1, 1:-1]
@@ -72,16 +71,22 @@ def contact(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
         yield Measure(off, spread * footprint + view.mm_per_px, f"frame {t}")
 
 
-def camera_of(sequence: Sequence) -> cameras.Camera:
-    """The camera that took a sequence; aperture and focus are not kept."""
-    attrs, (height, width) = sequence.attrs, sequence.size
+def rays(view: cameras.Camera, pixels: Floats) -> Floats:
+    """Directions (N, 3) of the centre rays of pixels (N, 2), camera axes, z = 1."""
+    flat = cameras.undistort((pixels - view.K[:2, 2]) / np.diag(view.K)[:2], view.distortion)
+    return np.concatenate([flat, np.ones((len(flat), 1))], axis=1)
+
+
+def camera_of(sequence: Sequence, lens: Mapping[str, Any] | None = None) -> cameras.Camera:
+    """The camera of a sequence, or another `lens` of its attributes; aperture and focus aren't kept."""
+    lens, (height, width) = lens or sequence.attrs, sequence.size
     return cameras.Camera(
-        K=np.asarray(attrs["K"], np.float64),
-        distortion=np.asarray(attrs["distortion"], np.float64),
-        rotation=np.asarray(attrs["rotation"], np.float64),
-        translation=np.asarray(attrs["translation"], np.float64),
+        K=np.asarray(lens["K"], np.float64),
+        distortion=np.asarray(lens["distortion"], np.float64),
+        rotation=np.asarray(lens["rotation"], np.float64),
+        translation=np.asarray(lens["translation"], np.float64),
         size=(width, height),
         aperture_mm=0.0,
         focus_mm=0.0,
-        mm_per_px=float(attrs["scale_mm_per_px"]),
+        mm_per_px=float(sequence.attrs["scale_mm_per_px"]),
     )

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from synth.checks import optics
+from synth.checks import optics, stereo
 from synth.checks.measure import Invariant, Measure, truth
 from synth.dataset.store import Sequence
 from synth.fields import FIELDS
@@ -186,6 +186,7 @@ INVARIANTS: dict[str, Invariant] = {
         forward_backward,
         optics.camera,
         optics.contact,
+        stereo.stereo,
     )
 }
 """Every invariant by name, in the order in which they are checked."""

@@ -16,6 +16,8 @@ _KEPT = {
     "always": "always",
     "usually": "unless in `store.without`",
     "recovered": "with an estimator of flow",
+    "stereo": "with `render.stereo_mm`",
+    "stereo recovered": "with both of these",
     "asked": "if in `store.extra`",
 }
 
@@ -67,12 +69,16 @@ def lines(size: tuple[int, int], sequence: Sequence | None = None) -> Iterator[s
         sizes = f"{size_forecast.amount(row.raw)}{per} | {size_forecast.amount(stored)}{per}"
         words = (f"`{row.name}`", row.axes, row.dtype, row.unit, row.kept, sizes, row.meaning)
         yield f"| {' | '.join(words)} |"
-    usual = [row for row in found if FIELDS[row.name].kept != "asked" and TIME in row.axes]
+    usual = [
+        row
+        for row in found
+        if FIELDS[row.name].kept in ("always", "usually", "recovered") and TIME in row.axes
+    ]
     stored = sum(row.stored if row.measured is None else row.measured for row in usual)
     raw = sum(row.raw for row in usual)
     yield ""
     yield (
-        f"A frame of {width} x {height} px, without what is only kept if asked for: "
+        f"A frame of {width} x {height} px, without a second lens and what is only kept if asked for: "
         f"{size_forecast.amount(raw)} in memory, {size_forecast.amount(stored)} on disk."
     )
 
@@ -94,6 +100,17 @@ motion, 0.008 px below 32. The largest error of a sequence is measured as it is 
 `summary.rounding_px`. Readers give float32 either way.
 
 Older stores call `flow_recovered` by its former name, `flow_tvl1`; both names are read.
+
+`render.stereo_mm: B` adds a second lens B mm to the right of the first, axes parallel, with the same focal
+length f = `K[0,0]` and distortion, and its principal point moved so that both pictures show the same field:
+
+    K_right[0,2] = K[0,2] + f B / z,    translation_right = translation - (B, 0, 0),
+
+z being the distance of the craniotomy's centre along the axis. The attribute `right` holds `K`, `distortion`,
+`rotation`, `translation` and `baseline_mm`. Without distortion both eyes see a point on the same row, and its
+depth is
+
+    Z = f B / (disparity + K_right[0,2] - K[0,2]).
 
 """
 

@@ -77,7 +77,7 @@ def estimate_memory(job: Job) -> float:
     and a quarter more: not beyond what was measured by half.
     """
     width, height = job.render.size
-    pixels = width * height * (2 if any(name.endswith("_right") for name in job.store.extra) else 1)
+    pixels = width * height * (2 if job.render.stereo_mm else 1)
     film = _FILM_BYTES + (_FLOW_BYTES if job.flow.backend != "ideal" else 0)
     each = _MOTION_BYTES * job.anatomy.vertices + film * pixels
     return _MARGIN * (_PROGRAM_BYTES + _STAGE_BYTES * pixels + each * job.frames)

@@ -30,6 +30,8 @@ def identify_job(job: Job) -> str:
     sequences: sequence 3 is the same in a dataset of 24 and of 48, so a dataset can be extended.
     """
     described = job.model_dump(mode="json", exclude={"sequences", "card"})
+    if not job.render.stereo_mm:
+        del described["flow"]["stereo"]  # says nothing of one eye's sequences
     for (block, name), largest in FILES.items():
         described[str(block)][str(name)] = _digest(getattr(getattr(job, str(block)), str(name)), largest)
     return hashlib.blake2b(canonical(described), digest_size=16).hexdigest()

@@ -101,7 +101,8 @@ class Render(Section):
     vibration_mm: NonNegativeRange = (0.0, 0.0)
     """Vibration of the microscope at 4-14 Hz, standard deviation [mm]; it is part of the flow."""
     stereo_mm: NonNegative = 0.0
-    """Distance of a second lens to the right, for the fields `*_right` [mm]; 0: there is none."""
+    """Distance of a second lens to the right [mm], for a stereo dataset: its pictures, and motion in three
+    dimensions, true and recovered; 0: there is none."""
     subsurface: Literal["blur", "volume"] = "blur"
     """How light spreads in tissue: by a blurred albedo, or followed through a volume (a reference: slow)."""
     exr: bool = False

@@ -283,6 +283,9 @@ class Flow(Section):
     """Estimator: tvl1, opencv-tvl1, dis or an installed plug-in's; `ideal` computes no recovered flow."""
     warps: Annotated[int, Field(ge=1, le=12)] = 3
     """tvl1: linearisations a level of a frame that starts from the one before; twice as many from nothing."""
+    stereo: Literal["joint", "fused", "none"] = "joint"
+    """With `render.stereo_mm`: motion in three dimensions from both eyes' pictures at once (joint), from a
+    flow in each eye (fused), or not recovered."""
 
 
 def _known(names: tuple[str, ...], known: tuple[str, ...]) -> tuple[str, ...]:
@@ -300,7 +303,8 @@ class Store(Section):
     extra: Annotated[tuple[str, ...], AfterValidator(lambda names: _known(names, fields.EXTRA))] = ()
     """Fields to keep besides the usual ones."""
     without: Annotated[tuple[str, ...], AfterValidator(lambda names: _known(names, fields.SPARED))] = ()
-    """Fields to leave out, of those that can be spared: depth, flow_confidence."""
+    """Fields to leave out, of those that can be spared: depth, flow_confidence, and of a second lens
+    flow_right, visible_right, depth_right."""
     flow: Literal["float32", "float16"] = "float32"
     """Type of both flows stored; float16 rounds motion below 16 px by at most 0.004 px, below 32 by 0.008."""
 
@@ -378,4 +382,8 @@ class Job(Section):
     def kept_fields(self) -> tuple[str, ...]:
         """Names of the fields that its sequences hold."""
         recovered = self.flow.backend != "ideal"
-        return fields.kept(self.store.extra, self.store.without, recovered=recovered)
+        stereo = self.render.stereo_mm > 0
+        motion = stereo and recovered and self.flow.stereo != "none"
+        return fields.kept(
+            self.store.extra, self.store.without, recovered=recovered, stereo=stereo, motion=motion
+        )

@@ -52,6 +52,8 @@ def write_card(folder: Folder) -> Path:
         variant="-" if sequence is None else sequence.attrs.get("variant", "-"),
         versions="" if sequence is None else _versions(sequence.attrs.get("versions", {})),
         fields=_fields(sequence),
+        present=job.kept_fields,
+        stereo_mm=job.render.stereo_mm,
         columns=_columns(),
         limits=limits(folder),
         command="synth render job.yaml -o FOLDER",

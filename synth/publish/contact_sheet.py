@@ -66,7 +66,7 @@ def draw_sheet(job: Job, count: int) -> Sheet:
 
 
 def _frame(job: Job, index: int, repeats: int) -> tuple[NDArray[np.uint8], float]:
-    """A scenario's picture and the CPU time [s] of the last of `repeats`."""
+    """A scenario's picture (the left eye beside the right) and the CPU time [s] of the last of `repeats`."""
     case = scenario.draw(job, index)
     surface, _ = pipeline.cortex(job, case)
     view, gestures = camera.place(case.view, job.render), case.gestures
@@ -79,11 +79,12 @@ def _frame(job: Job, index: int, repeats: int) -> tuple[NDArray[np.uint8], float
         with watch.stage("frame"):
             shot = studio.frame(surface.vertices, tips, shafts, seed)
         spent = watch.cpu_s("frame")
+    picture = shot.rgb if shot.rgb_right is None else np.hstack([shot.rgb, shot.rgb_right])
     label = f"{index}  {case.family}  {case.gesture.kind}"
     place, font = (6, job.render.size[1] - 8), cv2.FONT_HERSHEY_SIMPLEX
     for colour, thick in (((0, 0, 0), 3), ((255, 255, 255), 1)):
-        cv2.putText(shot.rgb, label, place, font, 0.4, colour, thick, cv2.LINE_AA)
-    return shot.rgb, spent
+        cv2.putText(picture, label, place, font, 0.4, colour, thick, cv2.LINE_AA)
+    return picture, spent
 
 
 def _poised(gesture: Gesture, surface: Surface) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -18,6 +18,7 @@ from synth.fields import FIELDS
 from synth.system import whole_file
 
 _SHARD_BYTES = 1 << 30
+_PICTURES = ("rgb", "rgb_right")
 # The published loader drops nodes right of this pixel, and takes every file to have the nodes of the first.
 _D2FNET_LARGEST_X = 1400.0
 _D2FNET_NODES = 20_000
@@ -43,20 +44,26 @@ def export_dataset(root: Path, target: Path, to: str) -> int:
 
 
 def folder(dataset: Dataset, target: Path) -> None:
-    """`NNNNNN/rgb/TTTT.png`, other fields as `NNNNNN/FIELD.npy`, attributes as `NNNNNN/attributes.json`."""
+    """`NNNNNN/rgb/TTTT.png`, other fields as `NNNNNN/FIELD.npy`, attributes as `NNNNNN/attributes.json`.
+
+    A second lens's pictures are in `NNNNNN/rgb_right/`.
+    """
     for sequence in dataset:
         here = target / f"{sequence.index:06d}"
-        (here / "rgb").mkdir(parents=True)
-        for t in range(sequence.frames):
-            (here / "rgb" / f"{t:04d}.png").write_bytes(_png(sequence["rgb"][t]))
         for name in sequence.fields:
-            if name != "rgb":
+            (here / name if name in _PICTURES else here).mkdir(parents=True, exist_ok=True)
+            for t in range(sequence.frames if name in _PICTURES else 0):
+                (here / name / f"{t:04d}.png").write_bytes(_png(sequence[name][t]))
+            if name not in _PICTURES:
                 np.save(here / f"{name}.npy", sequence[name][:])
         (here / "attributes.json").write_text(json.dumps(sequence.attrs, indent=1), "utf-8")
 
 
 def webdataset(dataset: Dataset, target: Path) -> None:
-    """Tar shards with a sample a frame: `NNNNNN_TTTT.rgb.png`, `.FIELD.npy` and `.json` (the attributes)."""
+    """Tar shards with a sample a frame: `NNNNNN_TTTT.rgb.png`, `.FIELD.npy` and `.json` (the attributes).
+
+    A second lens's pictures are `.rgb_right.png`.
+    """
     samples, shard = _samples(dataset), 0
     pending = next(samples, None)
     while pending is not None:
@@ -156,8 +163,8 @@ def _samples(dataset: Dataset) -> Iterator[tuple[str, dict[str, bytes]]]:
 def _frame(sequence: Sequence, t: int) -> dict[str, bytes]:
     found = {}
     for name in sequence.fields:
-        if name == "rgb":
-            found["rgb.png"] = _png(sequence["rgb"][t])
+        if name in _PICTURES:
+            found[f"{name}.png"] = _png(sequence[name][t])
         elif FIELDS[name].dims[0] == "frame":
             found[f"{name}.npy"] = _npy(np.asarray(sequence[name][t]))
         else:

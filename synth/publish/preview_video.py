@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from synth.dataset.store import Dataset
+from synth.dataset.store import Dataset, Sequence
 from synth.system import whole_file
 
 _LARGEST_PX = 1280
@@ -29,7 +29,7 @@ def write_preview(root: Path) -> Path | None:
     chosen = np.unique(np.linspace(0, len(dataset) - 1, _TILES).round().astype(int))
     columns = int(np.ceil(np.sqrt(len(chosen))))
     videos = [dataset[int(k)] for k in chosen]
-    height, width = videos[0].size
+    height, width = _picture(videos[0], 0).shape[:2]
     step = max(1, -(-columns * width // _LARGEST_PX))
     rows = -(-len(videos) // columns)
     frames = max(video.frames for video in videos)
@@ -38,9 +38,16 @@ def write_preview(root: Path) -> Path | None:
     for k, video in enumerate(videos):
         top, left = k // columns * tall, k % columns * wide
         for t in range(frames):
-            picture = video["rgb"][min(t, video.frames - 1)]
+            picture = _picture(video, min(t, video.frames - 1))
             film[t, top : top + tall, left : left + wide] = picture[::step, ::step]
     return encode_video(path(root), film, float(videos[0].attrs["fps"]))
+
+
+def _picture(video: Sequence, t: int) -> NDArray[np.uint8]:
+    """Frame t (H, W, 3); of a stereo sequence (H, 2W, 3), the left eye beside the right."""
+    if "rgb_right" not in video:
+        return video["rgb"][t]
+    return np.hstack([video["rgb"][t], video["rgb_right"][t]])
 
 
 def encode_video(target: Path, film: NDArray[np.uint8], fps: float) -> Path:

@@ -19,7 +19,6 @@ from synth.checks import optics
 from synth.dataset.store import Sequence
 from synth.errors import UserError
 from synth.publish import picture
-from synth.render.camera import camera as cameras
 
 Floats = NDArray[np.float64]
 
@@ -101,14 +100,13 @@ def surface(sequence: Sequence, t: int, step: int) -> tuple[Floats, NDArray[np.i
     rows, columns = rest.reshape(-1, 2).T
     width, height = view.size
     flow, depth = sequence["flow"][t][rows, columns], sequence["depth"][t]
-    pixels = np.stack([columns, rows], axis=1) + flow.astype(np.float64)
+    pixels = np.stack([columns, rows], axis=1).astype(np.float64) + flow
     near = np.clip(pixels.round().astype(int), 0, [width - 1, height - 1])
     seen = sequence["tissue"][:][rows, columns] & sequence["visible"][t][rows, columns]
     seen &= depth[near[:, 1], near[:, 0]] > 0
-    flat = cameras.undistort((pixels - view.K[:2, 2]) / np.diag(view.K)[:2], view.distortion)
-    rays = np.concatenate([flat, np.ones((len(flat), 1))], axis=1)
     points = (
-        rays * np.where(seen, depth[near[:, 1], near[:, 0]], sequence["depth"][0][rows, columns])[:, None]
+        optics.rays(view, pixels)
+        * np.where(seen, depth[near[:, 1], near[:, 0]], sequence["depth"][0][rows, columns])[:, None]
     )
     number = np.arange(len(rows)).reshape(rest.shape[:2])
     a, b, c, d = (
@@ -129,6 +127,11 @@ def _log(rerun: Any, stream: Any, sequence: Sequence) -> None:
     grey = np.repeat(first.mean(axis=2, keepdims=True), 3, axis=2).astype(np.uint8)
     stream.log("/", rerun.ViewCoordinates.RDF, static=True)
     stream.log("camera", rerun.Pinhole(image_from_camera=view.K, resolution=[width, height]), static=True)
+    if "right" in attrs:
+        other = optics.camera_of(sequence, attrs["right"])
+        aside = other.rotation @ (other.centre - view.centre)
+        stream.log("right", rerun.Transform3D(translation=aside), static=True)
+        stream.log("right", rerun.Pinhole(image_from_camera=other.K, resolution=[width, height]), static=True)
     stream.log("force", rerun.SeriesLines(names=["x mN", "y mN", "z mN", "length mN"]), static=True)
     stream.log("about", rerun.TextDocument(_about(sequence), media_type="text/markdown"), static=True)
     for t in frames:
@@ -136,6 +139,9 @@ def _log(rerun: Any, stream: Any, sequence: Sequence) -> None:
         stream.set_time("time", duration=float(time[t]))
         rgb = sequence["rgb"][t]
         stream.log("camera/frame", rerun.Image(rgb).compress(jpeg_quality=_JPEG_QUALITY))
+        if "rgb_right" in sequence:
+            shown = rerun.Image(sequence["rgb_right"][t]).compress(jpeg_quality=_JPEG_QUALITY)
+            stream.log("right/frame", shown)
         for name in flows:
             colours = picture.flow_colours(sequence[name][t], longest)
             shown = picture.overlay(grey, colours, 0.65 * tissue.astype(np.float32))

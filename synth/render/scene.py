@@ -77,6 +77,10 @@ class Shot:
     flow_right: Map | None = None
     visible_right: Mask | None = None
     depth_right: Map | None = None
+    motion: Map | None = None
+    """(H, W, 3) mm from the rest frame to this one, camera axes, at rest pixels; with a second lens."""
+    tool_right: Mask | None = None
+    """(H, W) the second lens's pixels of this frame; with one."""
 
 
 class Studio:
@@ -111,8 +115,11 @@ class Studio:
         rest = Shape(surface.vertices, surface.faces)
         self.still = truth.still(camera, rest, self.rim.shape)
         self._right: Still | None = None
-        if any(name.endswith("_right") for name in self._extra):
-            self._right = truth.still(beside(camera, job.render.stereo_mm), rest, self.rim.shape)
+        self.right: Camera | None = None
+        """The second lens at rest, where the job has one."""
+        if job.render.stereo_mm:
+            self.right = beside(camera, job.render.stereo_mm)
+            self._right = truth.still(self.right, rest, self.rim.shape)
         self.lamps = light.lamps(camera, look.light)
         kinds = instrument.choose(gestures, np.random.default_rng([look.rim_seed, 2]))
         self._tool = instrument.build(kinds) if job.render.tool else None
@@ -155,6 +162,7 @@ class Studio:
             picture = self.develop(self._gathered(moments, seed + 1, baseline), seed + 1)
             extra |= {"rgb_right": picture, "flow_right": other.flow}
             extra |= {"visible_right": other.visible, "depth_right": other.depth}
+            extra |= {"motion": seen.motion, "tool_right": other.tool}
         return Shot(
             rgb=self.develop(radiance, seed),
             radiance=radiance,
@@ -165,6 +173,28 @@ class Studio:
             glare=self._glare(radiance, seen, now),
             **extra,
         )
+
+    @property
+    def tissue_right(self) -> Mask:
+        """(H, W) brain in the second lens's rest frame. ValueError: there is no second lens."""
+        if self._right is None:
+            raise ValueError("there is no second lens")
+        return self._right.tissue
+
+    def disparity(self) -> Map:
+        """Rest disparity (H, W) px without distortion, see `synth.fields`; 0 off the tissue.
+
+        Raises:
+            ValueError: the job has no second lens.
+        """
+        if self.right is None:
+            raise ValueError("there is no second lens")
+        width, height = self.camera.size
+        depth = self.still.points[:, 2].reshape(height, width)
+        shift = self.right.K[0, 2] - self.camera.K[0, 2]
+        away = np.where(self.still.tissue, depth, 1.0)
+        wide = self.camera.K[0, 0] * self._render.stereo_mm / away - shift
+        return np.where(self.still.tissue, wide, 0.0).astype(np.float32)
 
     def traction(self, nodal: Floats) -> Map:
         """Traction (V, 3) kPa, world axes, at rest pixels: (H, W, 3) kPa, camera axes; 0 off tissue."""

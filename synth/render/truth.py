@@ -56,6 +56,8 @@ class Still:
     """(H, W, 3)."""
     directions: Floats
     """(H*W, 3) of the pixels' centre rays, camera axes, unit z: the lens's own, wherever the camera goes."""
+    points: Floats
+    """(H*W, 3) mm of what the pixels see, camera axes; 0 off the tissue."""
 
 
 @dataclass(frozen=True)
@@ -64,6 +66,8 @@ class Now:
 
     flow: npt.NDArray[np.float32]
     """(H, W, 2) px, rest pixels; 0 off the tissue."""
+    motion: npt.NDArray[np.float32]
+    """(H, W, 3) mm, rest pixels, from the rest frame's camera axes to this one's; 0 off the tissue."""
     visible: Mask
     """(H, W), rest pixels: the point is in the picture and nothing hides it."""
     depth: npt.NDArray[np.float32]
@@ -120,6 +124,7 @@ def still(camera: Camera, surface: Shape, rim: Shape) -> Still:
         face=face.reshape(height, width),
         bary=np.where(on_tissue[:, None], hits.bary, 0.0).reshape(height, width, 3),
         directions=directions,
+        points=directions * np.where(on_tissue, hits.along, 0.0)[:, None],
     )
 
 
@@ -149,10 +154,13 @@ def now(camera: Camera, rest: Still, surface: Shape, rim: Shape, tool: Shape | N
     inside = ((pierced >= -0.5) & (pierced < np.array([width, height]) - 0.5)).all(axis=1)
     flow = np.zeros((len(pixels), 2), np.float32)
     flow[on] = pierced - pixels[on]
+    motion = np.zeros((len(pixels), 3), np.float32)
+    motion[on] = local - rest.points[on]
     visible = np.zeros(len(pixels), bool)
     visible[on] = clear & inside
     return Now(
         flow=flow.reshape(height, width, 2),
+        motion=motion.reshape(height, width, 3),
         visible=visible.reshape(height, width),
         depth=depth.reshape(height, width).astype(np.float32),
         tool=(hits.face >= len(surface.faces) + len(rim.faces)).reshape(height, width),

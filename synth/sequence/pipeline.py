@@ -19,6 +19,9 @@ from synth.fem.solver import Deformation
 from synth.fields import FIELDS
 from synth.flow import mask, track, tvl1
 from synth.flow.estimator import Estimator, create
+from synth.flow.stereo import rig
+from synth.flow.stereo import track as stereo
+from synth.flow.track import Track
 from synth.geometry import brain_surface
 from synth.geometry.brain_surface import Brain
 from synth.job import identity
@@ -34,9 +37,10 @@ from synth.sequence.scenario import Scenario
 from synth.sequence.timeline import Timeline
 from synth.system.stopwatch import Report, Stopwatch
 
-# Fields that the renderer gives by frame; those of `store.extra` are attributes of its `Shot` as well, but
-# for the published method's.
+# Fields that the renderer gives by frame, and of a second lens; those of `store.extra` are attributes of its
+# `Shot` as well, but for the published method's.
 _SHOT = ("rgb", "flow", "visible", "tool", "glare", "depth")
+_STEREO = ("rgb_right", "flow_right", "visible_right", "depth_right", "motion")
 _PUBLISHED = ("flow_noisy", "intensity")
 
 
@@ -66,6 +70,8 @@ class _Film:
     """The same of the second lens; None where the job keeps none."""
     tools: NDArray[np.bool_]
     """(T, H, W) pixels of the instruments."""
+    tools_right: NDArray[np.bool_] | None
+    """The same of the second lens."""
     poses: NDArray[np.float64]
     """(T, 4, 4) mm, world to camera axes."""
 
@@ -105,12 +111,16 @@ def render_sequence(job: Job, index: int, folder: Path, report: Report) -> Path:
     writer.put("force", motion.force @ view.rotation.T)  # labels are in camera axes
     writer.put("tissue", still.tissue)
     writer.put("area", still.area)
+    if studio.right is not None:
+        writer.put("disparity", studio.disparity())
 
     shooting = _Shooting(job, index, case, view, motion, studio, writer, watch, report)
     film = _render_frames(shooting)
-    rgb = _write_video(shooting, film)
+    film = _write_video(shooting, film)
     if job.flow.backend != "ideal":
-        _recover_flow(shooting, rgb, film.tools)
+        recovered = _recover_flow(shooting, film)
+        if writer.wants("motion_recovered"):
+            _recover_motion(shooting, film, recovered)
     return _seal(shooting)
 
 
@@ -124,13 +134,14 @@ def _render_frames(shooting: _Shooting) -> _Film:
         labels = Published.begin(job.labels, studio.still.tissue, job.frames, rng)
     names = [
         name
-        for name in (*_SHOT, *job.store.extra)
+        for name in dict.fromkeys((*_SHOT, *(_STEREO if job.render.stereo_mm else ()), *job.store.extra))
         if FIELDS[name].framed and not (_coded(job) and name.startswith("rgb"))
     ]
     line = Timeline(motion, shooting.view, shooting.case.sway, shooting.case.look.light, job.fps)
     rgb = np.empty((job.frames, height, width, 3), np.uint8)
     rgb_right = np.empty_like(rgb) if writer.wants("rgb_right") else None
     tools = np.empty((job.frames, height, width), bool)
+    tools_right = None if rgb_right is None else np.empty_like(tools)
     poses = np.tile(np.eye(4), (job.frames, 1, 1))
     for t, seed in enumerate(scenario.frame_seeds(job, shooting.index)):
         shooting.report("render", t, job.frames)
@@ -149,22 +160,25 @@ def _render_frames(shooting: _Shooting) -> _Film:
         rgb[t], tools[t] = shot.rgb, shot.tool
         if rgb_right is not None and shot.rgb_right is not None:
             rgb_right[t] = shot.rgb_right
+        if tools_right is not None and shot.tool_right is not None:
+            tools_right[t] = shot.tool_right
         lens = now.camera or shooting.view
         poses[t, :3, :3], poses[t, :3, 3] = lens.rotation, lens.translation
-    return _Film(rgb, rgb_right, tools, poses)
+    return _Film(rgb, rgb_right, tools, tools_right, poses)
 
 
-def _write_video(shooting: _Shooting, film: _Film) -> NDArray[np.uint8]:
-    """Writes the cameras' poses, and video through its codec if it has one; returns video as kept."""
-    job, writer, rgb = shooting.job, shooting.writer, film.rgb
+def _write_video(shooting: _Shooting, film: _Film) -> _Film:
+    """Writes the cameras' poses, and video through its codec if it has one; returns the film as kept."""
+    job, writer, rgb, rgb_right = shooting.job, shooting.writer, film.rgb, film.rgb_right
     with shooting.watch.stage("store"):
         writer.put("camera", film.poses)
         if _coded(job):
             rgb = video.recorded(rgb, job.sensor, job.fps)
             writer.put("rgb", rgb)
-            if film.rgb_right is not None:
-                writer.put("rgb_right", video.recorded(film.rgb_right, job.sensor, job.fps))
-    return rgb
+            if rgb_right is not None:
+                rgb_right = video.recorded(rgb_right, job.sensor, job.fps)
+                writer.put("rgb_right", rgb_right)
+    return replace(film, rgb=rgb, rgb_right=rgb_right)
 
 
 def _coded(job: Job) -> bool:
@@ -172,20 +186,57 @@ def _coded(job: Job) -> bool:
     return job.sensor.bitrate_mbps is not None
 
 
-def _recover_flow(shooting: _Shooting, rgb: NDArray[np.uint8], tools: NDArray[np.bool_]) -> None:
-    """Follows the video (T, H, W, 3) with the job's estimator and writes what it finds.
+def _recover_flow(shooting: _Shooting, film: _Film) -> Track:
+    """Follows the video with the job's estimator and writes what it finds.
 
-    It has what a real pipeline has: the tool's outline (T, H, W), and glare as the picture shows it.
+    It has what a real pipeline has: the tool's outline, and glare as the picture shows it.
     """
     job, writer = shooting.job, shooting.writer
     shooting.report("flow", 0, job.frames)
     with shooting.watch.stage("flow"):
         tissue = shooting.studio.still.tissue
-        recovered = track.track(estimator(job.flow), rgb, mask.hidden(rgb, tools), tissue)
+        recovered = track.track(estimator(job.flow), film.rgb, mask.hidden(film.rgb, film.tools), tissue)
     with shooting.watch.stage("store"):
         for t in range(job.frames):
             writer.put_frame("flow_recovered", t, recovered.flow[t])
             writer.put_frame("flow_confidence", t, recovered.confidence[t])
+    return recovered
+
+
+def _recover_motion(shooting: _Shooting, film: _Film, left: Track) -> None:
+    """Adds the right eye to the left one's flow and writes motion in three dimensions, frame by frame."""
+    job, writer, studio = shooting.job, shooting.writer, shooting.studio
+    if film.rgb_right is None or film.tools_right is None or studio.right is None:
+        raise ValueError("there is no second lens")
+    blocked = mask.hidden(film.rgb, film.tools), mask.hidden(film.rgb_right, film.tools_right)
+    with shooting.watch.stage("stereo"):
+        pair = rig.Rig(
+            left=rig.Eye(shooting.view.K, shooting.view.distortion),
+            right=rig.Eye(studio.right.K, studio.right.distortion),
+            rotation=np.eye(3),
+            translation=np.array([-job.render.stereo_mm, 0.0, 0.0]),
+            size=job.render.size,
+        )
+        still = stereo.still_frames(left.flow, studio.still.tissue)
+        eyes = film.rgb[:still], film.rgb_right[:still]
+        tracker = stereo.StereoTracker(pair, *eyes, blocked[0][0], blocked[1][0], studio.still.tissue)
+        right = None
+        if job.flow.stereo == "fused":
+            right = track.track(estimator(job.flow), film.rgb_right, blocked[1], studio.tissue_right)
+    for t in range(job.frames):
+        shooting.report("stereo", t, job.frames)
+        with shooting.watch.stage("stereo"):
+            seen = left.flow[t], left.confidence[t]
+            if t == 0:
+                moved = tracker.rest_motion()
+            elif right is not None:
+                moved = tracker.fuse(*seen, right.flow[t], right.confidence[t])
+            else:
+                eyes = film.rgb[t], film.rgb_right[t]
+                moved = tracker.step(*eyes, blocked[0][t], blocked[1][t], *seen)
+        with shooting.watch.stage("store"):
+            writer.put_frame("motion_recovered", t, moved.motion)
+            writer.put_frame("motion_deviation", t, moved.deviation)
 
 
 def _seal(shooting: _Shooting) -> Path:
@@ -204,7 +255,24 @@ def _seal(shooting: _Shooting) -> Path:
         mechanics=_mechanics(shooting.job, case, shooting.motion, view.rotation),
         variant=shooting.studio.variant,
         timings=shooting.watch.report(),
+        **_second_lens(shooting),
     )
+
+
+def _second_lens(shooting: _Shooting) -> dict[str, Any]:
+    """The attribute `right` of a stereo sequence: K, distortion and pose of the second lens at rest."""
+    lens = shooting.studio.right
+    if lens is None:
+        return {}
+    return {
+        "right": {
+            "baseline_mm": shooting.job.render.stereo_mm,
+            "K": lens.K.tolist(),
+            "distortion": lens.distortion.tolist(),
+            "rotation": lens.rotation.tolist(),
+            "translation": lens.translation.tolist(),
+        }
+    }
 
 
 def _mechanics(

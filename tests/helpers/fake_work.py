@@ -133,8 +133,27 @@ def consistent(job: Job, index: int, folder: Path, report: Report, fault: str = 
         writer.put_frame("depth", t, np.full((height, width), -1.0 if fault == "depth" and t else distance))
         pressed = 1e-3 if fault == "load_rest" and t == 0 else share[t]
         writer.put_frame("traction", t, pressed * spot[..., None] * load)
+        if job.render.stereo_mm:
+            aside = np.zeros((height, width, 3))
+            aside[..., 0] = flow[..., 0] * distance / focal
+            aside[..., 2] = 0.1 * tissue if fault == "motion" else 0.0
+            writer.put_frame("motion", t, aside)
+            writer.put_frame("rgb_right", t, np.repeat(picture[..., None], 3, axis=-1).astype(np.uint8))
+            writer.put_frame("flow_right", t, -flow if fault == "right_flow" else flow)
+            writer.put_frame("visible_right", t, ~gone)
+            writer.put_frame("depth_right", t, np.full((height, width), distance + (fault == "right_depth")))
         writer.put_frame("flow_recovered", t, recovered)
         writer.put_frame("flow_confidence", t, np.ones((height, width)))
+    writer.put("disparity", np.full((height, width), 1.0 if fault == "disparity" else 0.0))
+    baseline = job.render.stereo_mm
+    shifted = width / 2 + focal * baseline / distance
+    right = {
+        "K": [[focal, 0, shifted], [0, focal, height / 2], [0, 0, 1]],
+        "distortion": [0.0] * 5,
+        "rotation": np.eye(3).tolist(),
+        "translation": [-baseline, 0.0, distance],
+        "baseline_mm": baseline,
+    }
     focal *= 0.5 if fault == "camera" else 1.0
     tip = np.zeros((frames, 2, 3))
     tip[:, :, 0] = (6.0 * share * distance / 1000.0 + (3.0 if fault == "contact" else 0.0))[:, None]
@@ -149,6 +168,7 @@ def consistent(job: Job, index: int, folder: Path, report: Report, fault: str = 
         distortion=[0.0] * 5,
         rotation=np.eye(3).tolist(),
         translation=[0.0, 0.0, distance],
+        **({"right": right} if baseline else {}),
         mechanics={
             "elastic": True,
             "energy_mn_mm": energy.tolist(),

@@ -15,6 +15,7 @@ ORDER = (
     "synth.fields",
     "synth.system",
     "synth.flow",
+    "synth.flow.stereo",
     "synth.job",
     "synth.geometry",
     "synth.fem.mesh",

@@ -19,7 +19,8 @@ from synth.dataset import index
 from synth.errors import UserError
 from synth.job.schema import Job
 
-JOB = Job(seed=1, sequences=2, frames=5, render={"size": (96, 72)}, flow={"backend": "ideal"})
+PAIR = {"size": (96, 72), "stereo_mm": 24.0}
+JOB = Job(seed=1, sequences=2, frames=5, render=PAIR, flow={"backend": "ideal"})
 
 
 @pytest.fixture(scope="module")
@@ -64,6 +65,10 @@ def test_a_good_dataset_passes_and_every_invariant_was_measured(dataset: Path) -
         ("contact", "contact"),
         ("depth", "range"),
         ("compliance", "compliance"),
+        ("motion", "stereo"),
+        ("disparity", "stereo"),
+        ("right_flow", "stereo"),
+        ("right_depth", "stereo"),
     ],
 )
 def test_a_faulty_pipeline_is_found_by_the_check_made_for_it(tmp_path: Path, fault: str, check: str) -> None:

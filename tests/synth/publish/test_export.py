@@ -28,7 +28,7 @@ def quiet(stage: str, done: int, of: int) -> None:
 @pytest.fixture(scope="module")
 def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("export")
-    job = Job(sequences=2, frames=3, render={"size": (48, 36)}, flow={"backend": "ideal"})
+    job = Job(sequences=2, frames=3, render={"size": (48, 36), "stereo_mm": 24.0}, flow={"backend": "ideal"})
     for index in range(2):
         consistent(job, index, out, quiet)
     return out
@@ -39,8 +39,9 @@ def test_folder(root: Path, tmp_path: Path) -> None:
     sequence = Dataset(root)[1]
     here = tmp_path / "to" / "000001"
     assert np.array_equal(np.asarray(Image.open(here / "rgb/0002.png")), sequence["rgb"][2])
+    assert np.array_equal(np.asarray(Image.open(here / "rgb_right/0001.png")), sequence["rgb_right"][1])
     for name in sequence.fields:
-        assert name == "rgb" or np.array_equal(np.load(here / f"{name}.npy"), sequence[name][:])
+        assert name.startswith("rgb") or np.array_equal(np.load(here / f"{name}.npy"), sequence[name][:])
     assert json.loads((here / "attributes.json").read_text()) == sequence.attrs
 
 

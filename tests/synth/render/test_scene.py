@@ -4,6 +4,7 @@ import subprocess
 import sys
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
@@ -180,6 +181,23 @@ def test_truth_on_request() -> None:
         np.median(first.depth[ours.still.tissue]), rel=0.01
     )
     assert (first.rgb_right != first.rgb).any()
+
+
+def test_rest_disparity_triangulates_to_the_rest_points() -> None:
+    ours, _ = studio(VARIANTS[-1], spp=1, tool=False, stereo_mm=20.0)
+    assert ours.right is not None
+    rows, columns = (at[::50] for at in np.nonzero(ours.still.tissue))
+    pixels = np.stack([columns, rows], 1).astype(np.float64)
+    left, right = ours.camera, ours.right
+    straight = cv2.undistortPoints(pixels[:, None], left.K, left.distortion, P=left.K)[:, 0]
+    across = straight - np.stack([ours.disparity()[rows, columns], np.zeros(len(rows))], 1)
+    poses = [np.eye(3, 4), np.concatenate([np.eye(3), [[-20.0], [0.0], [0.0]]], axis=1)]
+    there = cv2.triangulatePoints(left.K @ poses[0], right.K @ poses[1], straight.T, across.T)
+    expected = ours.still.points.reshape(*ours.still.tissue.shape, 3)[rows, columns]
+    np.testing.assert_allclose((there[:3] / there[3]).T, expected, atol=0.05)
+    without, _ = studio(VARIANTS[-1], spp=1, tool=False)
+    with pytest.raises(ValueError, match="no second lens"):
+        without.disparity()
 
 
 @pytest.mark.slow

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 import trimesh
@@ -141,3 +142,16 @@ def test_a_camera_that_moves_is_part_of_the_flow(surface: Surface, lens: Camera)
     now = truth.now(later, rest, shape, NOTHING, None)
     expected = 0.5 * lens.K[0, 0] / lens.translation[2]
     assert np.median(now.flow[rest.tissue][:, 0]) == pytest.approx(expected, rel=0.02)
+
+
+def test_motion_lands_where_opencv_projects_it(surface: Surface, lens: Camera) -> None:
+    rest = truth.still(lens, Shape(surface.vertices, surface.faces), NOTHING)
+    moved = Shape(bump(surface), surface.faces)
+    now = truth.now(lens, rest, moved, NOTHING, None)
+    on = rest.tissue
+    points = rest.points.reshape(*on.shape, 3)[on] + now.motion[on]
+    seen = cv2.projectPoints(points, np.zeros(3), np.zeros(3), lens.K, lens.distortion)[0][:, 0]
+    pixels = camera.pixel_grid(lens.size).reshape(*on.shape, 2)[on]
+    np.testing.assert_allclose(seen - pixels, now.flow[on], atol=2e-4)
+    assert np.abs(now.motion[on][:, 2]).max() > 1.0
+    assert not now.motion[~on].any()

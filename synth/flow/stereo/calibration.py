@@ -1,0 +1,56 @@
+"""Reading a stereo calibration that OpenCV wrote, as `stereoCalibrate` gives it: YAML, XML or JSON."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from synth.errors import UserError
+from synth.flow.stereo.rig import Eye, Floats, Rig
+
+_LEFT = ("K1", "M1", "cameraMatrix1", "camera_matrix_1", "CM1"), ("D1", "distCoeffs1", "dist_coeffs_1")
+_RIGHT = ("K2", "M2", "cameraMatrix2", "camera_matrix_2", "CM2"), ("D2", "distCoeffs2", "dist_coeffs_2")
+_ORTHOGONAL = 1e-3
+
+
+def read_rig(path: Path, size: tuple[int, int], mm_per_unit: float = 1.0) -> Rig:
+    """The pair of cameras in a file: K1, D1, K2, D2, R and T, or OpenCV's samples' names for them.
+
+    Args:
+        path: of the file.
+        size: width, height of the pictures that it was made from [px].
+        mm_per_unit: of T: the chessboard's squares say it.
+
+    Raises:
+        UserError: it cannot be read, or what it holds are no two cameras.
+    """
+    try:
+        storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
+    except (cv2.error, SystemError) as error:
+        raise UserError(f"{path}: cannot be read as a calibration ({error})") from error
+    if not storage.isOpened():
+        raise UserError(f"{path}: cannot be read as a calibration")
+
+    def matrix(names: Sequence[str], what: str) -> Floats:
+        found = (storage.getNode(name).mat() for name in names if not storage.getNode(name).empty())
+        first = next((one for one in found if one is not None), None)
+        if first is None or not np.isfinite(first).all():
+            raise UserError(f"{path}: holds no {what} ({', '.join(names)})")
+        return np.asarray(first, np.float64)
+
+    eyes = []
+    for (matrices, lenses), eye in ((_LEFT, "left"), (_RIGHT, "right")):
+        K = matrix(matrices, f"{eye} camera matrix")
+        if K.shape != (3, 3) or min(K[0, 0], K[1, 1]) <= 0:
+            raise UserError(f"{path}: the {eye} camera matrix is none")
+        eyes.append(Eye(K, matrix(lenses, f"{eye} distortion").ravel()))
+    rotation, translation = matrix(("R",), "rotation"), matrix(("T",), "translation").ravel()
+    if rotation.size == 3:
+        rotation = np.asarray(cv2.Rodrigues(rotation)[0], np.float64)
+    straight = rotation.shape == (3, 3) and np.abs(rotation @ rotation.T - np.eye(3)).max() < _ORTHOGONAL
+    if not straight or np.linalg.det(rotation) < 0 or translation.shape != (3,) or not translation.any():
+        raise UserError(f"{path}: R is no rotation or T no translation")
+    return Rig(eyes[0], eyes[1], rotation, mm_per_unit * translation, size)

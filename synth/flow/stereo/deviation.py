@@ -1,0 +1,65 @@
+"""How far recovered motion may be off: a standard deviation for each component, calibrated.
+
+From the posterior of the depth solver: with precision a of the data and stiffness b of a thin plate, both by
+cell, the variance is 1 / (8 sqrt(a b)) (the plate's Green's function at 0). What else tells how far a motion
+is off (strain, what the eyes disagree on, the flow's confidence with its way back, how far it went)
+enters as powers, whose exponents were fitted to the errors on rendered sequences (`bench experiment stereo`
+measures the z-scores on others).
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from synth.flow.stereo.depth_motion import Change
+
+Map = NDArray[np.float32]
+Tier = Literal["joint", "fused"]
+
+_AROUND = (5, 5)  # cells whose pictures a cell's depth rests on
+
+# Exponents of 1 (e), posterior deviation [px], strain, misfit, doubt, way [px].
+ALONG: dict[Tier, tuple[float, ...]] = {
+    "joint": (0.663, 1.039, -0.023, 0.328, 0.09, 0.029),
+    "fused": (-1.015, 0.77, -0.191, 0.139, -0.02, 0.232),
+}
+"""For the change of disparity, in px."""
+ACROSS: dict[Tier, tuple[float, ...]] = {
+    "joint": (0.709, 1.137, -0.505, 0.396, 0.325, 0.37),
+    "fused": (1.424, 1.46, -0.706, 0.31, 0.293, 0.276),
+}
+"""For each component of the flow, in px."""
+
+
+def features(change: Change, steepness: Map, doubt: Map, way: Map) -> NDArray[np.float64]:
+    """What a deviation depends on, as logarithms, (6, h, w) by cell.
+
+    Args:
+        change: of the solver.
+        steepness: (h, w), the flow's gradient [px/px].
+        doubt: (h, w) in 0..1, one less the flow's confidence.
+        way: (h, w) px, length of the flow.
+    """
+    precision = cv2.blur(change.precision, _AROUND, borderType=cv2.BORDER_REPLICATE) + 1e-3
+    posterior = 1 / np.sqrt(8 * np.sqrt(precision * change.stiffness))
+    return np.log(
+        np.stack(
+            [
+                np.full(doubt.shape, np.e),
+                posterior,
+                steepness + 0.002,
+                np.clip(cv2.blur(change.misfit, (3, 3)), 0.2, 20),
+                np.clip(doubt, 0, 1) + 0.05,
+                way + 0.1,
+            ]
+        ).astype(np.float64)
+    )
+
+
+def deviation(found: NDArray[np.float64], exponents: tuple[float, ...]) -> Map:
+    """Standard deviation [px] by cell, (h, w), of `features`."""
+    return np.asarray(np.exp(np.tensordot(exponents, found, 1)), np.float32)

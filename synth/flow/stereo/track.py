@@ -1,0 +1,187 @@
+"""Motion in three dimensions through a stereo video: rest to now, each frame starting from the one before."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from synth.errors import UserError
+from synth.flow import fused, image
+from synth.flow.estimator import Flags, Flow, Map, Rgb
+from synth.flow.stereo import deviation, rest
+from synth.flow.stereo.depth_motion import Change, Pictures, Settings, Solver, fine
+from synth.flow.stereo.rig import Rectified, Rig
+
+_GREY = np.array([0.2, 0.6, 0.2], np.float32)  # as `image.tensor`
+_STILL_PX = 0.3  # frames whose flow is nearly everywhere below this are at rest
+_RESTS = 4
+_LOST = 0.05  # of what is seen at rest: a frame that shows less is no place to start from
+
+
+@dataclass(frozen=True)
+class Moved:
+    """One frame's motion since rest, on the left eye's rest pixels."""
+
+    motion: NDArray[np.float32]
+    """(H, W, 3) mm, the left camera's axes; 0 outside the tissue."""
+    deviation: NDArray[np.float32]
+    """(H, W, 3) mm, standard deviation of each component; 0 outside the tissue."""
+
+
+class StereoTracker:
+    """The right eye beside a flow of the left one: frames and flow in, motion in three dimensions out.
+
+    The flow comes from a `synth.flow.track.Tracker` (or anything else) and is not changed.
+    """
+
+    def __init__(
+        self,
+        rig: Rig,
+        lefts: NDArray[np.uint8],
+        rights: NDArray[np.uint8],
+        left_blocked: Flags,
+        right_blocked: Flags,
+        tissue: Flags,
+        settings: Settings | None = None,
+    ) -> None:
+        """Starts at rest.
+
+        Args:
+            rig: the pair of cameras.
+            lefts: (n, H, W, 3) uint8, the left eye's first n frames, all at rest; frame 0 is the rest frame.
+            rights: the same of the right eye.
+            left_blocked: (H, W), tool and glare in the rest frame.
+            right_blocked: (H, W), the same of the right eye.
+            tissue: (H, W), where there is tissue, in the left eye.
+            settings: of the depth solver; None: the default.
+
+        Raises:
+            UserError: the rest pictures don't match, or shapes that don't fit.
+        """
+        width, height = rig.size
+        if (
+            lefts.shape != rights.shape
+            or lefts.shape[1:3] != (height, width)
+            or tissue.shape != (height, width)
+        ):
+            raise UserError(
+                f"stereo: pictures {lefts.shape[1:3]} and {rights.shape[1:3]}, tissue {tissue.shape} and "
+                f"calibration {(height, width)} differ"
+            )
+        self.rectified, self.tissue = Rectified(rig), tissue
+        r = self.rectified
+        usable = (r.flags(tissue & ~left_blocked, 0), r.flags(~right_blocked, 1))
+        self.rest = rest.match(
+            np.stack([r.picture(picture @ _GREY, 0) for picture in lefts]),
+            np.stack([r.picture(picture @ _GREY, 1) for picture in rights]),
+            *usable,
+        )
+        """Rest disparity, and how far off the calibration is."""
+        self.solver = Solver((height, width), settings)
+        self._left, _ = self._normalised(lefts[0], usable[0], 0)
+        right, known = self._normalised(rights[0], usable[1], 1)
+        self._right, self._usable = np.empty_like(right), np.empty_like(right)
+        aside = np.stack([-self.rest.disparity, np.zeros_like(right)])
+        fused.warp_into(right, known, aside, self._right, self._usable)
+        self._usable *= usable[0]
+        middle = float(np.median(r.depth(self.rest.disparity)[usable[0]]))
+        self.px_per_mm = r.focal * r.baseline_mm / middle**2
+        """Change of disparity of tissue that moves 1 mm along the line of sight."""
+        self._change: Map | None = None
+
+    def rest_motion(self) -> Moved:
+        """Of the rest frame itself: no motion, and that for certain."""
+        nothing = np.zeros((*self.tissue.shape, 3), np.float32)
+        return Moved(nothing, nothing.copy())
+
+    def step(
+        self,
+        left: Rgb,
+        right: Rgb,
+        left_blocked: Flags,
+        right_blocked: Flags,
+        flow: Flow,
+        confidence: Map,
+    ) -> Moved:
+        """Motion since rest in the next frame.
+
+        Args:
+            left: (H, W, 3) uint8.
+            right: (H, W, 3) uint8.
+            left_blocked: (H, W), tool and glare.
+            right_blocked: (H, W).
+            flow: (H, W, 2) px, the left eye's.
+            confidence: (H, W) in 0..1, of that flow.
+        """
+        r = self.rectified
+        now, now_usable = self._normalised(left, r.flags(~left_blocked, 0), 0)
+        other, other_usable = self._normalised(right, r.flags(~right_blocked, 1), 1)
+        pictures = Pictures(self._left, self._right, self._usable, now, other, now_usable, other_usable)
+        straight = r.flow(flow)
+        change = self.solver.solve(pictures, straight, self.rest.disparity, self.px_per_mm, self._change)
+        lost = float(change.seen.sum()) < _LOST * float(self._usable.sum())
+        self._change = None if lost else change.px
+        return self._moved(change, straight, confidence, "joint")
+
+    def fuse(self, flow: Flow, confidence: Map, right_flow: Flow, right_confidence: Map) -> Moved:
+        """The cheap way: motion from two flows that know nothing of each other, each from its own rest frame.
+
+        Args:
+            flow: (H, W, 2) px, the left eye's.
+            confidence: (H, W) in 0..1.
+            right_flow: (H, W, 2) px, the right eye's, on its own rest pixels.
+            right_confidence: (H, W) in 0..1.
+        """
+        r = self.rectified
+        straight, other = r.flow(flow), r.flow(right_flow, 1)
+        aside = np.stack([-self.rest.disparity, np.zeros_like(self.rest.disparity)])
+        there, seen, trust = np.empty_like(aside[0]), np.empty_like(aside[0]), np.empty_like(aside[0])
+        every = np.ones_like(there)
+        fused.warp_into(r.picture(right_confidence, 1), every, aside, trust, seen)
+        fused.warp_into(other[0], every, aside, there, seen)
+        weight = np.clip(r.picture(confidence, 0) * trust, 0, 1) * seen * self._usable
+        change = self.solver.smooth(straight[0] - there, weight, straight, self.px_per_mm)
+        return self._moved(change, straight, confidence, "fused")
+
+    def _moved(self, change: Change, flow: Map, confidence: Map, tier: deviation.Tier) -> Moved:
+        r, disparity = self.rectified, self.rest.disparity
+        self.features = self._features(change, flow, confidence)
+        """What the last frame's deviations were made from, (6, h, w): see `deviation.features`."""
+        along = deviation.deviation(self.features, deviation.ALONG[tier]) / self.px_per_mm
+        across = deviation.deviation(self.features, deviation.ACROSS[tier])
+        across *= float(np.median(r.depth(disparity))) / r.focal
+        motion = r.motion(disparity, change.px, flow)
+        spread = [fine(part, self.solver.cell, disparity.shape) for part in (across, across, along)]
+        planes = [r.back(np.ascontiguousarray(motion[..., k])) for k in range(3)]
+        inside = self.tissue[..., None]
+        return Moved(
+            np.stack(planes, axis=-1) * inside,
+            np.stack([np.maximum(r.back(part), 1e-4) for part in spread], axis=-1) * inside,
+        )
+
+    def _features(self, change: Change, flow: Map, confidence: Map) -> NDArray[np.float64]:
+        coarse = self.solver.coarse
+        doubt = 1 - coarse(self.rectified.picture(confidence, 0))
+        return deviation.features(
+            change, self.solver.steepness(flow), doubt, coarse(np.hypot(flow[0], flow[1]))
+        )
+
+    def _normalised(self, rgb: Rgb, usable: Flags, eye: int) -> tuple[Map, Map]:
+        """The rectified picture in local deviations and where it is usable, both (H, W) float32."""
+        known = usable.astype(np.float32)
+        grey = torch.from_numpy(self.rectified.picture(rgb @ _GREY, eye))[None, None]
+        return image.normalise(grey, torch.from_numpy(known)[None, None])[0, 0].numpy(), known
+
+
+def still_frames(flow: NDArray[np.float32], tissue: Flags) -> int:
+    """How many of the first frames of a flow (T, H, W, 2) px are at rest: 1 to 4."""
+    count = 1
+    while count < min(len(flow), _RESTS):
+        length = np.linalg.norm(flow[count][tissue], axis=-1)
+        if length.size and np.quantile(length, 0.98) > _STILL_PX:
+            break
+        count += 1
+    return count

@@ -1,0 +1,234 @@
+"""The second eye: what OpenCV says of the same rig, and motion in space that was put in."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter
+
+from synth.errors import UserError
+from synth.flow.stereo import calibration, depth_motion, rest
+from synth.flow.stereo.depth_motion import Solver
+from synth.flow.stereo.rig import Eye, Rectified, Rig
+from synth.flow.stereo.track import StereoTracker, still_frames
+
+SIZE = (160, 120)
+FOCAL, BASE, AWAY = 1370.0, 24.0, 300.0
+K = np.array([[FOCAL, 0, 79.5], [0, FOCAL, 59.5], [0, 0, 1.0]])
+K_RIGHT = K + np.array([[0, 0, FOCAL * BASE / AWAY], [0, 0, 0], [0, 0, 0]])
+PARALLEL = Rig(Eye(K, np.zeros(5)), Eye(K_RIGHT, np.zeros(5)), np.eye(3), np.array([-BASE, 0.0, 0.0]), SIZE)
+TURN = cv2.Rodrigues(np.array([0.004, 0.08, 0.01]))[0]
+TURNED = Rig(
+    Eye(K, np.array([-0.2, 0.1, 0.002, -0.001, 0.0])),
+    Eye(np.diag([1.01, 1.01, 1.0]) @ K, np.array([-0.1, 0.0, 0.0, 0.001, 0.0])),
+    TURN,
+    TURN @ np.array([-BASE, 0.4, -0.8]),
+    SIZE,
+)
+COLUMNS, ROWS = np.meshgrid(np.arange(SIZE[0]), np.arange(SIZE[1]))
+
+
+def texture(rng: np.random.Generator) -> np.ndarray:
+    """A picture larger than what is seen, with detail of all sizes."""
+    noise = rng.normal(size=(400, 400))
+    rough = sum(gaussian_filter(noise, s) * s for s in (1.2, 2.5, 6.0))
+    return np.asarray(128 + 30 * rough / rough.std(), np.float32)
+
+
+def seen(picture: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """(H, W, 3) uint8: the picture at x, y from its middle."""
+    found = cv2.remap(picture, (x + 120).astype(np.float32), (y + 140).astype(np.float32), cv2.INTER_CUBIC)
+    return np.repeat(np.clip(found, 0, 255).astype(np.uint8)[..., None], 3, axis=-1)
+
+
+def dent(amount: float) -> np.ndarray:
+    """Change of disparity (H, W) px of a dent in the middle."""
+    return -amount * np.exp(-((COLUMNS - 80) ** 2 + (ROWS - 60) ** 2) / (2 * 18.0**2))
+
+
+@pytest.mark.parametrize("rig", [PARALLEL, TURNED])
+def test_rectified_rows_and_depths_are_opencvs_projections(rig: Rig) -> None:
+    rng = np.random.default_rng(3)
+    points = np.stack([rng.uniform(-8, 8, 50), rng.uniform(-6, 6, 50), rng.uniform(290, 310, 50)], axis=1)
+    moved = points + rng.normal(scale=1.0, size=points.shape)
+    rectified = Rectified(rig)
+    turn = cv2.Rodrigues(rig.rotation)[0]
+
+    def straight(where: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Rectified pixels of points in both eyes, by way of each eye's own picture."""
+        found = []
+        for eye, pose in enumerate(((np.zeros(3), np.zeros(3)), (turn, rig.translation))):
+            lens = (rig.left, rig.right)[eye]
+            own = cv2.projectPoints(where, *pose, lens.K, lens.distortion)[0][:, 0]
+            inverse = rectified._inverse[eye]
+            x, y = (
+                cv2.remap(part, *own.T.astype(np.float32)[:, None], cv2.INTER_LINEAR)[0] for part in inverse
+            )
+            found.append(np.stack([x, y], axis=1))
+        return found[0], found[1]
+
+    left, right = straight(points)
+    inside = ((left > 2) & (left < np.array(SIZE) - 3) & (right > 2) & (right < np.array(SIZE) - 3)).all(
+        axis=1
+    )
+    assert inside.sum() > 15
+    np.testing.assert_allclose(left[inside, 1], right[inside, 1], atol=0.02)
+    disparity = np.float32(left[:, 0] - right[:, 0])
+    depth = rectified.depth(disparity)
+    turned = points @ rectified._turns[0].T
+    np.testing.assert_allclose(depth[inside], turned[inside, 2], rtol=1e-3)
+    after_left, after_right = straight(moved)
+    flow, change = after_left - left, (after_left - after_right)[:, 0] - disparity
+    for k in np.flatnonzero(inside)[:10]:
+        # `motion` is told of a whole picture: one whose pixel nearest to the point is the point.
+        at = np.rint(left[k]).astype(int)
+        field = np.full(SIZE[::-1], disparity[k], np.float32)
+        planes = np.stack([np.full(SIZE[::-1], part, np.float32) for part in flow[k]])
+        found = rectified.motion(field, np.full_like(field, change[k]), planes)[at[1], at[0]]
+        np.testing.assert_allclose(found, moved[k] - points[k], atol=0.03)
+
+
+def test_a_calibration_that_opencv_wrote_is_read(tmp_path: Path) -> None:
+    def written(name: str, rotation: np.ndarray) -> Path:
+        storage = cv2.FileStorage(str(tmp_path / name), cv2.FILE_STORAGE_WRITE)
+        for number, eye in (("1", TURNED.left), ("2", TURNED.right)):
+            storage.write(f"M{number}", eye.K)
+            storage.write(f"D{number}", eye.distortion[None])
+        storage.write("R", rotation)
+        storage.write("T", TURNED.translation[:, None] / 25.0)
+        storage.release()
+        return tmp_path / name
+
+    found = calibration.read_rig(written("pair.yaml", TURN), SIZE, mm_per_unit=25.0)
+    np.testing.assert_allclose(found.right.K, TURNED.right.K)
+    np.testing.assert_allclose(found.left.distortion, TURNED.left.distortion)
+    np.testing.assert_allclose(found.rotation, TURN, atol=1e-12)
+    np.testing.assert_allclose(found.translation, TURNED.translation)
+    with pytest.raises(UserError, match="no rotation"):
+        calibration.read_rig(written("bent.yaml", 1.1 * TURN), SIZE)
+    (tmp_path / "none.yaml").write_text("%YAML:1.0\n---\nR: 3\n")
+    with pytest.raises(UserError, match="left camera matrix"):
+        calibration.read_rig(tmp_path / "none.yaml", SIZE)
+    with pytest.raises(UserError, match="cannot be read"):
+        calibration.read_rig(tmp_path / "missing.yaml", SIZE)
+
+
+def test_a_left_camera_on_the_right_is_refused() -> None:
+    with pytest.raises(UserError, match="not to the right"):
+        Rectified(replace(PARALLEL, translation=np.array([BASE, 0.0, 0.0])))
+
+
+def test_rest_disparity_of_a_slope_with_a_step() -> None:
+    picture = texture(np.random.default_rng(1))
+    truth = 4.3 + 0.03 * (COLUMNS - 80) + 3.0 * (ROWS > 60)
+    left = seen(picture, COLUMNS, ROWS)[..., 0].astype(np.float32)
+    # The right eye sees at x - d what the left one sees at x: solved for by fixed-point steps.
+    x = COLUMNS.astype(np.float64)
+    for _ in range(30):
+        x = COLUMNS + 4.3 + 0.03 * (x - 80) + 3.0 * (ROWS > 60)
+    right = seen(picture, x, ROWS)[..., 0].astype(np.float32)
+    every = np.ones(truth.shape, bool)
+    found = rest.match(left, right, every, every, (-16, 31))
+    coarse = rest.match(left, right, every, every, (-16, 31), refine=False)
+    inner = (slice(8, -8), slice(16, -16))
+    error, before = (np.abs(one.disparity - truth)[inner] for one in (found, coarse))
+    assert np.median(error) < 0.05
+    assert error.mean() < before.mean()
+    assert (error > 2).mean() < 0.02
+    assert found.epipolar_px < 0.05
+    with pytest.raises(UserError, match="don't match"):
+        rest.match(left, np.zeros_like(left), every, every)
+
+
+@pytest.mark.parametrize("tier", ["joint", "fused"])
+def test_a_dent_and_a_shift_are_found_in_millimetres(tier: str) -> None:
+    rng = np.random.default_rng(5)
+    picture = texture(rng)
+    d, v = dent(0.6), -0.8
+    u = 1.7 - 4.0 * d  # tissue that gives way strains
+    every = np.ones(SIZE[::-1], bool)
+    none = ~every
+
+    def noisy(rgb: np.ndarray) -> np.ndarray:
+        return np.clip(rgb + rng.normal(scale=2.0, size=rgb.shape), 0, 255).astype(np.uint8)
+
+    # Tissue lies at the distance at which rest disparity is 0.
+    first = noisy(seen(picture, COLUMNS, ROWS)), noisy(seen(picture, COLUMNS, ROWS))
+    left, right = (noisy(seen(picture, _source(along), ROWS - v)) for along in (u, u - d))
+    tracker = StereoTracker(PARALLEL, first[0][None], first[1][None], none, none, every)
+    flow = np.stack([u, np.full_like(u, v)], axis=-1).astype(np.float32)
+    trust = np.ones(every.shape, np.float32)
+    if tier == "joint":
+        moved = tracker.step(left, right, none, none, flow, trust)
+    else:
+        other = np.stack([u - d, np.full_like(d, v)], axis=-1).astype(np.float32)
+        moved = tracker.fuse(flow, trust, other, trust)
+    depth = FOCAL * BASE / (FOCAL * BASE / AWAY + d)
+    inner = (slice(10, -10), slice(10, -10))
+    error = (moved.motion[..., 2] - (depth - AWAY))[inner]
+    assert (depth - AWAY).max() > 1.5
+    assert np.sqrt((error**2).mean()) < 0.12
+    assert moved.motion[60, 80, 2] == pytest.approx(depth[60, 80] - AWAY, abs=0.2)
+    across = moved.motion[60, 80, :2] - np.array([u[60, 80], v]) * AWAY / FOCAL
+    assert np.abs(across).max() < 0.02
+    assert (moved.deviation[inner] > 0).all()
+
+
+def test_a_blocked_eye_is_doubted_and_forgotten() -> None:
+    picture = texture(np.random.default_rng(6))
+    every = np.ones(SIZE[::-1], bool)
+    rest_frame = seen(picture, COLUMNS, ROWS)
+    tracker = StereoTracker(PARALLEL, rest_frame[None], rest_frame[None], ~every, ~every, every)
+    still = np.zeros((*every.shape, 2), np.float32), np.ones(every.shape, np.float32)
+    sure = tracker.step(rest_frame, rest_frame, ~every, ~every, *still)
+    blind = tracker.step(rest_frame, np.zeros_like(rest_frame), ~every, every, *still)
+    again = tracker.step(rest_frame, rest_frame, ~every, ~every, *still)
+    inner = (slice(10, -10), slice(10, -10), 2)
+    assert np.abs(sure.motion[inner]).max() < 0.05
+    assert np.abs(blind.motion[inner]).max() < 0.05
+    assert (blind.deviation[inner] > 3 * sure.deviation[inner]).all()
+    np.testing.assert_allclose(again.motion, sure.motion, atol=1e-3)
+
+
+def _source(along: np.ndarray) -> np.ndarray:
+    """Rest columns (H, W) that are seen at each pixel once tissue has moved by (along, -0.8)."""
+    x = COLUMNS.astype(np.float64)
+    for _ in range(40):
+        rows = (ROWS + 0.8).astype(np.float32)
+        x = COLUMNS - cv2.remap(along, x.astype(np.float32), rows, cv2.INTER_LINEAR, borderMode=1)
+    return x
+
+
+def test_nothing_seen_says_nothing_and_is_most_doubtful() -> None:
+    solver = Solver((120, 160))
+    flow = np.zeros((2, 120, 160), np.float32)
+    weight = np.ones((120, 160), np.float32)
+    weight[:, 80:] = 0
+    samples = np.full((120, 160), 0.5, np.float32)
+    samples[:, 80:] = 50.0
+    found = solver.smooth(samples, weight, flow, 1.0)
+    assert found.px[60, 20] == pytest.approx(0.5, abs=1e-3)
+    assert np.abs(found.px).max() < 1.0, "what has no weight must not pull"
+    assert (found.precision[:, 24:] == 0).all()
+
+
+def test_the_plate_is_free_to_tilt_and_not_to_bend() -> None:
+    bends = depth_motion.second_differences((9, 11))
+    rows, columns = np.mgrid[:9, :11]
+    assert np.abs(bends @ (2.0 + 0.3 * columns - 0.7 * rows).ravel()).max() < 1e-12
+    assert np.abs(bends @ (columns**2).ravel()).max() == pytest.approx(2.0)
+    assert np.abs(bends @ (columns * rows).ravel()).max() == pytest.approx(np.sqrt(2))
+
+
+def test_frames_at_rest_are_counted_until_something_moves() -> None:
+    flow = np.zeros((8, 4, 4, 2), np.float32)
+    tissue = np.ones((4, 4), bool)
+    assert still_frames(flow, tissue) == 4
+    flow[2:] = 1.0
+    assert still_frames(flow, tissue) == 2
+    flow[1] = 1.0
+    assert still_frames(flow, tissue) == 1

@@ -1,0 +1,58 @@
+"""A second lens alone makes a stereo sequence; without one nothing of it is there."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from synth.checks import stereo
+from synth.dataset.store import open_sequence
+from synth.job import identity, reader
+from synth.job.schema import Job
+from synth.sequence.pipeline import render_sequence
+
+EYE = {"rgb_right", "flow_right", "visible_right", "depth_right", "motion", "disparity"}
+RECOVERED = {"motion_recovered", "motion_deviation"}
+
+
+def test_what_is_kept_follows_from_the_second_lens() -> None:
+    one, two = Job(), Job(render={"stereo_mm": 24})
+    assert not (EYE | RECOVERED) & set(one.kept_fields)
+    assert set(two.kept_fields) - set(one.kept_fields) == EYE | RECOVERED
+    still = Job(render={"stereo_mm": 24}, flow={"stereo": "none"})
+    assert set(two.kept_fields) - set(still.kept_fields) == RECOVERED
+    fewer = Job(render={"stereo_mm": 24}, store={"without": ["flow_right"]})
+    assert "flow_right" not in fewer.kept_fields
+    with pytest.raises(ValueError, match="needs a second lens"):
+        Job(store={"extra": ["rgb_right"]})
+
+
+def test_how_motion_is_recovered_tells_only_stereo_jobs_apart() -> None:
+    def named(stereo_mm: float, way: str) -> str:
+        return identity.identify_job(Job(render={"stereo_mm": stereo_mm}, flow={"stereo": way}))
+
+    assert named(0, "joint") == named(0, "none")
+    assert named(24, "joint") != named(24, "none")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("way", ["joint", "fused"])
+def test_a_rendered_pair_agrees_and_gives_motion_back(tmp_path: Path, way: str) -> None:
+    changes = ["frames=4", "render.size=[160,120]", "render.stereo_mm=24", f"flow.stereo={way}"]
+    job = reader.load_job("tiny", [*changes, "sequences=1", "render.spp=4"])
+    sequence = open_sequence(render_sequence(job, 0, tmp_path, lambda *_: None))
+    measures = list(stereo.stereo(sequence, [0, 2]))
+    assert len(measures) > 8
+    assert all(one.good for one in measures), [one for one in measures if not one.good]
+    tissue, found = sequence["tissue"][:], sequence["motion_recovered"][:]
+    assert not found[0].any()
+    assert not found[:, ~tissue].any()
+    assert (sequence["motion_deviation"][2][tissue] > 0).all()
+    t = int(np.abs(sequence["motion"][..., 2]).max(axis=(1, 2)).argmax())
+    seen = tissue & sequence["visible"][t] & ~sequence["tool"][0]
+    error = (found - sequence["motion"][:])[t][seen]
+    # At 160 px a pixel of disparity is 2.7 mm of depth.
+    assert np.sqrt(np.square(error[:, 2]).mean()) < 0.2
+    assert sequence.attrs["right"]["baseline_mm"] == 24
