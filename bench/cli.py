@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from synth.errors import UserError
-from synth.system.cli_errors import Commands
+from synth.system.cli_errors import Commands, printable
 
 if TYPE_CHECKING:
     from bench.scoring.evaluate_recording import Result
@@ -56,6 +56,9 @@ def score(
     rate: Annotated[
         float, typer.Option(min=0.0, help="At most so many frames a second are looked at; 0: all.")
     ] = 10.0,
+    pulse: Annotated[
+        bool, typer.Option(help="Take the tissue's own motion, heart and breath, off before any method.")
+    ] = True,
     title: Annotated[str, typer.Option(help="Heading of the report.")] = "",
     train: Annotated[
         Path | None, typer.Option(help="The model's training data: simpler methods are fitted on it too.")
@@ -68,7 +71,7 @@ def score(
     from bench.scoring.evaluate_recording import Settings
 
     others = {name: Path(folder) for name, folder in _pairs("--also", also, "NAME=FOLDER").items()}
-    settings = Settings(backend=flow, shrink=shrink, rate_hz=rate or None)
+    settings = Settings(backend=flow, shrink=shrink, rate_hz=rate or None, pulse=pulse)
     result = commands.score_recording(recording, model, out, settings, title, train, others)
     _say(result, out or Path(f"{result.recording}-score"), json)
 
@@ -105,7 +108,7 @@ def check(
         print(json_.dumps({"usable": checking.is_usable(found), "findings": [asdict(f) for f in found]}))
     else:
         for finding in found:
-            print(f"{finding.state:<5}{finding.what:<11}{finding.said}")
+            print(printable(f"{finding.state:<5}{finding.what:<11}{finding.said}"))
     if not checking.is_usable(found):
         raise typer.Exit(2)
 
@@ -211,12 +214,15 @@ def _typed() -> str:
 def _say(result: Result, folder: Path, json: bool) -> None:
     from rich.console import Console
 
-    from bench.scoring import evaluate_recording, report
+    from bench.scoring import evaluate_recording, headline, report
 
     if json:
         print(json_.dumps(evaluate_recording.as_json(result), allow_nan=False))
         return
     console = Console()
+    first = headline.headline(result)
+    for line in filter(None, (first.refused, *first.warnings)):
+        console.print(line, style="bold red", markup=False, highlight=False)
     console.print(report.terminal_table(result))
     for note in result.notes:
         console.print(f"note: {note}", style="yellow", markup=False, highlight=False)

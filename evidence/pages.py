@@ -235,6 +235,7 @@ _FILES: Mapping[str, tuple[str, str | Callable[[Tree], Page]]] = {
     "exvivo": ("pool.json", lambda found: pool.drawn(found, "README.md")),
     "gap": ("results.json", "gap.experiment"),
     "inverse": ("results.json", "scoring.inverse"),
+    "pulse": ("results.json", "scoring.pulse"),
     "leakage": ("results.json", "gap.leakage"),
     "scoring": ("results.json", "scoring.scoring_cost"),
     "pipeline": ("stages/stages.json", stages),
@@ -250,6 +251,7 @@ _FILES: Mapping[str, tuple[str, str | Callable[[Tree], Page]]] = {
     "fem/relief": ("relief.json", "fem.relief"),
     "fem/slides": ("slides.json", "fem.slides"),
     "fem/half-space": ("half-space.json", "fem.half_space"),
+    "fem/contact": ("contact.json", "fem.contact"),
     "render/realism": ("realism.json", realism),
     "render/stability": ("stability.json", "render.stability"),
 }

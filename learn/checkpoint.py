@@ -1,25 +1,40 @@
-"""A trained model on disk: a folder with config.json, weights.pt, history.jsonl and what resuming needs."""
+"""A trained model on disk: a folder with config.json, weights.pt, history.jsonl and what resuming needs.
+
+The card, config.json, holds a hash of the weights and one of itself, so that neither can change unseen.
+"""
 
 from __future__ import annotations
 
+import hashlib
+import io
 import json
 import os
-import pickle
+import warnings
+import zipfile
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import torch
-from pydantic import ConfigDict, TypeAdapter, ValidationError
-from torch import nn
+from pydantic import ConfigDict, Field, FiniteFloat, TypeAdapter, ValidationError
+from torch import Tensor, nn
 
 from learn.data.grid import Scales
+from learn.network.d2fnet import Architecture
 from learn.network.monai_unet import build
 from learn.settings import Settings
-from synth.errors import UserError
+from synth.errors import Caution, UserError
+from synth.job import identity
+from synth.job.types import Positive, first_problem
+from synth.system import foreign_file
+from synth.system.whole_file import write_whole
 
 _FORMAT, _VERSION = "sulcus-model", 1
+_LARGEST_BYTES = 100_000_000
+"""Of config.json, which names the sequences that were trained on: a million of them."""
+_LARGEST_WEIGHTS = 64 << 30
+_WEIGHTS, _NEXT = "weights.pt", "weights.next.pt"
 
 
 @dataclass(frozen=True)
@@ -30,15 +45,17 @@ class Card:
 
     settings: Settings
     scales: Scales
-    typical_young_kpa: float
+    typical_young_kpa: Positive
     """Geometric mean of E in the training data: stands in where E is unknown."""
     split: dict[str, list[str]]
     """Content hashes of the sequences that were fitted, that chose the epoch, and that were left."""
     groups: dict[str, list[str]]
     """The anatomies of each, so that a sequence of a seen anatomy is never taken for unseen."""
-    epoch: int = 0
-    score: float = 0.0
+    epoch: Annotated[int, Field(ge=0)] = 0
+    score: FiniteFloat = 0.0
     """R² on the select sequences at the chosen epoch."""
+    weights_hash: str = ""
+    """Of weights.pt; empty before an epoch is kept, and in folders from before there were hashes."""
 
 
 _CARD = TypeAdapter(Card)
@@ -47,68 +64,163 @@ _CARD = TypeAdapter(Card)
 def write_card(folder: Path, card: Card) -> None:
     """Writes config.json into a model's folder, whole or not at all."""
     folder.mkdir(parents=True, exist_ok=True)
-    tree = {"format": _FORMAT, "version": _VERSION, **_CARD.dump_python(card)}
-    _replace(folder / "config.json", (json.dumps(tree, indent=1) + "\n").encode())
+    tree = {"format": _FORMAT, "version": _VERSION, **_CARD.dump_python(card, mode="json")}
+    tree["seal"] = _hash(identity.canonical(tree))
+    _write(folder / "config.json", (json.dumps(tree, indent=1) + "\n").encode())
+
+
+def write_model(folder: Path, card: Card, state: Mapping[str, Tensor]) -> Card:
+    """Writes weights and card, so that a kill leaves the old ones or the new ones; the card as written."""
+    folder.mkdir(parents=True, exist_ok=True)
+    data = _packed(state)
+    card = replace(card, weights_hash=_hash(data))
+    _write(folder / _NEXT, data)
+    write_card(folder, card)
+    os.replace(folder / _NEXT, folder / _WEIGHTS)
+    return card
 
 
 def read_card(folder: Path) -> Card:
-    """Raises UserError if there is no model, or its config is damaged or of another version."""
+    """Raises UserError if there is no model, or its config is damaged, edited or of another version."""
+    return _read(folder)[0]
+
+
+def _read(folder: Path) -> tuple[Card, bool]:
+    """The card, and whether it has a seal, which then holds."""
     file = folder / "config.json"
-    if not file.is_file():
+    if not file.exists():
         raise UserError(f"{folder}: no model here (config.json is missing)")
+    data = foreign_file.read_bytes(file, _LARGEST_BYTES)
     try:
-        tree = json.loads(file.read_text())
-        if tree.pop("format") != _FORMAT or tree.pop("version") != _VERSION:
+        tree = json.loads(data)
+        seal = tree.pop("seal", None)
+        rest = {key: value for key, value in tree.items() if key not in ("format", "version")}
+        if (tree["format"], tree["version"]) != (_FORMAT, _VERSION):
             raise UserError(f"{file}: not a model of this version")
-        return _CARD.validate_python(tree)
+        card = _CARD.validate_json(json.dumps(rest), strict=True)
+        if seal is not None and seal != _hash(identity.canonical(tree)):
+            raise UserError(f"{file}: is not as it was written: edited or damaged")
+        return card, seal is not None
     except ValidationError as error:
-        wrong = [(one["type"], ".".join(map(str, one["loc"])), one["msg"]) for one in error.errors()]
-        unknown = [at for kind, at, _ in wrong if kind in ("extra_forbidden", "unexpected_keyword_argument")]
+        wrong = [(one["type"], ".".join(map(str, one["loc"]))) for one in error.errors()]
+        unknown = [at for kind, at in wrong if kind in ("extra_forbidden", "unexpected_keyword_argument")]
         if unknown:
             raise UserError(
-                f"{file}: made by another version of this program (no '{unknown[0]}' here)"
+                f"{file}: made by another version of this program (no '{unknown[0][:100]}' here)"
             ) from None
-        raise UserError(f"{file}: corrupt model configuration ({wrong[0][1]}: {wrong[0][2]})") from None
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise UserError(f"{file}: corrupt model configuration ({error})") from None
+        at, why = first_problem(error)
+        raise UserError(f"{file}: corrupt model configuration ({at}: {why})") from None
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        raise UserError(f"{file}: corrupt model configuration ({str(error)[:200]})") from None
 
 
 def save_tensors(file: Path, tree: Mapping[str, Any]) -> None:
-    """Tensors and plain values, written beside and renamed, so a kill leaves the old file."""
-    part = file.with_suffix(file.suffix + f".part{os.getpid()}")
-    torch.save(dict(tree), part)
-    os.replace(part, file)
+    """Tensors and plain values, whole or not at all. Raises UserError if the file can't be written."""
+    _write(file, _packed(tree))
 
 
 def load_tensors(file: Path) -> dict[str, Any]:
-    """Raises UserError if the file is missing, truncated or holds anything but tensors and plain values."""
-    if not file.is_file():
+    """Raises UserError if the file is missing or damaged, or holds anything but tensors and plain values."""
+    if not file.exists():
         raise UserError(f"{file}: missing")
+    foreign_file.check_file(file, _LARGEST_WEIGHTS)
     try:
+        _check_archive(file)
         tree = torch.load(file, map_location="cpu", weights_only=True)
-    except (RuntimeError, EOFError, ValueError, KeyError, pickle.UnpicklingError, OSError) as error:
-        why = str(error).splitlines()[0].split(". ")[0]
-        raise UserError(f"{file}: corrupt checkpoint ({why})") from None
+    except Exception as error:  # archive, unpickler and tensors have no common error for damage
+        why = (str(error).splitlines() or [type(error).__name__])[0].split(". ")[0]
+        raise UserError(f"{file}: corrupt checkpoint ({why[:200]})") from None
     if not isinstance(tree, dict):
         raise UserError(f"{file}: corrupt checkpoint (holds no state)")
     return tree
 
 
 def load_model(folder: Path) -> tuple[nn.Module, Card]:
-    """The trained network, in evaluation mode on the CPU, and its card."""
-    card = read_card(folder)
-    model = build(card.settings.arch)
-    state = load_tensors(folder / "weights.pt")
-    try:
-        model.load_state_dict(state)
-    except RuntimeError:
-        raise UserError(f"{folder}: the weights are not those of the network in config.json") from None
+    """The trained network, in evaluation mode on the CPU, and its card.
+
+    Raises UserError if card or weights are damaged, edited, or not each other's. A folder from before there
+    were hashes is read, with a `Caution`.
+    """
+    card, sealed = _read(folder)
+    state = load_tensors(_find_weights(folder, card) if sealed else folder / _WEIGHTS)
+    model = fit(state, card.settings.arch, folder)
     if not all(torch.isfinite(v).all() for v in state.values()):
         raise UserError(f"{folder}: the weights hold NaN or infinity")
+    if not sealed:
+        said = f"{folder}: was made before models had hashes: nothing shows whether its card was edited"
+        warnings.warn(said, Caution, stacklevel=2)
     return model.eval(), card
 
 
-def _replace(file: Path, data: bytes) -> None:
-    part = file.with_suffix(file.suffix + f".part{os.getpid()}")
-    part.write_bytes(data)
-    os.replace(part, file)
+def fit(state: Mapping[str, Any], arch: Architecture, where: Path) -> nn.Module:
+    """The network of `arch` with the weights of `state`. Raises UserError, before it takes memory for them,
+    if they aren't its own."""
+    with torch.device("meta"):
+        expected = {name: value.shape for name, value in build(arch).state_dict().items()}
+    found = {name: value.shape for name, value in state.items() if isinstance(value, Tensor)}
+    if len(found) != len(state) or found != expected:
+        raise UserError(f"{where}: the weights are not those of the network in config.json")
+    model = build(arch)
+    try:
+        model.load_state_dict(state)
+    except RuntimeError as error:
+        raise UserError(f"{where}: the weights can't be used ({str(error).splitlines()[0]})") from None
+    return model
+
+
+def room_needed(folder: Path, arch: Architecture) -> int:
+    """Bytes that a training of `arch` still takes on the disk of `folder`, at most."""
+    with torch.device("meta"):
+        numbers = sum(int(value.numel()) for value in build(arch).state_dict().values())
+    # Weights, and last.pt with two moments of each beside them; all twice while they are replaced. And logs.
+    needed = 2 * 4 * 4 * numbers + 2_000_000
+    written = (folder / name for name in (_WEIGHTS, "last.pt"))
+    return max(needed - sum(file.stat().st_size for file in written if file.is_file()), 1)
+
+
+def _find_weights(folder: Path, card: Card) -> Path:
+    """The weights that the card was written for: under their next name if a kill came in between."""
+    for file in (folder / _WEIGHTS, folder / _NEXT):
+        if file.is_file():
+            with file.open("rb") as opened:
+                if hashlib.file_digest(opened, _hasher).hexdigest() == card.weights_hash:
+                    return file
+    if not (folder / _WEIGHTS).exists():
+        raise UserError(f"{folder / _WEIGHTS}: missing")
+    load_tensors(folder / _WEIGHTS)  # may say more of what is wrong
+    raise UserError(f"{folder / _WEIGHTS}: not the weights that config.json was written for, or damaged")
+
+
+def _check_archive(file: Path) -> None:
+    """ValueError or what zipfile raises if a checksum of the archive is wrong, which PyTorch doesn't look at.
+
+    Also if it would be larger in memory than on disk.
+    """
+    with zipfile.ZipFile(file) as archive:
+        if sum(entry.file_size for entry in archive.infolist()) > file.stat().st_size:
+            raise ValueError("packed")
+        damaged = archive.testzip()
+    if damaged is not None:
+        raise ValueError(f"a checksum of {damaged} does not match")
+
+
+def _packed(tree: Mapping[str, Any]) -> bytes:
+    held = io.BytesIO()
+    torch.save(dict(tree), held)
+    return held.getvalue()
+
+
+def _write(file: Path, data: bytes) -> None:
+    """`write_whole`, a full disk as a UserError."""
+    try:
+        write_whole(file, data)
+    except OSError as error:
+        raise UserError(f"{file}: cannot be written ({error.strerror})") from None
+
+
+def _hasher() -> Any:
+    return hashlib.blake2b(digest_size=16)
+
+
+def _hash(data: bytes) -> str:
+    return hashlib.blake2b(data, digest_size=16).hexdigest()

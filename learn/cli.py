@@ -77,9 +77,11 @@ def train_command(
     json: Json = False,
 ) -> None:
     """Train D2FNet on a dataset. An interrupted run is continued by the same command."""
+    from learn.checkpoint import room_needed
     from learn.settings import override
     from learn.settings import preset as named
     from learn.training.threads import set_threads
+    from synth.system.whole_file import made_folder
 
     set_threads(threads)
     options = {
@@ -100,8 +102,9 @@ def train_command(
     }
     given = [f"{k}={v}" for k, v in options.items() if v is not None]
     settings = override(named(preset), [*given, *(changes or [])])
-    clips, split, settings = _divided(dataset, settings, named(preset), cache, fixed=folds is not None)
-    card, first = _train(clips, split, settings, out, accelerator, devices, quiet=json)
+    with made_folder(out, room_needed(out, settings.arch)):
+        clips, split, settings = _divided(dataset, settings, named(preset), cache, fixed=folds is not None)
+        card, first = _train(clips, split, settings, out, accelerator, devices, quiet=json)
     if not first:
         return
     result = {"model": str(out), "epoch": card.epoch, "select_r2": card.score}
@@ -278,6 +281,9 @@ def predict_command(
     rate: Annotated[
         float, typer.Option(min=0.0, help="At most so many frames a second of a video are looked at; 0: all.")
     ] = 10.0,
+    pulse: Annotated[
+        bool, typer.Option(help="Take the tissue's own motion, heart and breath, off a video's first.")
+    ] = True,
     threads: Threads = None,
     json: Json = False,
 ) -> None:
@@ -291,17 +297,20 @@ def predict_command(
 
     set_threads(threads)
     predictor = load_predictor(model, quick=True)
-    filmed = Filmed(scale, tissue, Settings(flow, shrink, rate or None))
-    peaks = {}
+    filmed = Filmed(scale, tissue, Settings(flow, shrink, rate or None, pulse))
+    peaks: dict[str, float | None] = {}
     for motion in motions(source, input, filmed):
         found = apply(predictor, motion, young)
         out.mkdir(parents=True, exist_ok=True)
         np.savez_compressed(out / f"{motion.name}.npz", **found)
-        peaks[motion.name] = float(found["total_force_mn"].max())
+        size = found["total_force_mn"][found["trusted"]]
+        peaks[motion.name] = float(size.max()) if len(size) else None
         if not json:
-            count = len(found["total_force_mn"])
-            _console.print(f"{motion.name}: {count} frames, peak force {peaks[motion.name]:.3g} mN")
-            for note in motion.notes():
+            peak = "no force: no frame could be followed"
+            if peaks[motion.name] is not None:
+                peak = f"peak force {peaks[motion.name]:.3g} mN"
+            _console.print(f"{motion.name}: {len(found['trusted'])} frames, {peak}")
+            for note in found["notes"]:
                 _console.print(f"note: {note}", style="yellow", markup=False, highlight=False)
     if json:
         print(json_.dumps({"out": str(out), "peak_force_mn": peaks}))
@@ -407,6 +416,7 @@ def _bar(what: str) -> Iterator[Callable[[int, int], None]]:
         TimeRemainingColumn(),
         console=_console,
         transient=True,
+        disable=not _console.is_terminal,  # in a log a bar is an empty line
     ) as progress:
         task = progress.add_task(what, total=None)
         yield lambda done, of: progress.update(task, completed=done, total=of)

@@ -24,9 +24,9 @@ S = TypeVar("S", bound=Section)
 class Settings(Section):
     """One training run: same settings, same data, same weights (bit for bit, on one CPU)."""
 
-    size: Annotated[int, Field(ge=16, multiple_of=16)] = 256
+    size: Annotated[int, Field(ge=16, le=1024, multiple_of=16)] = 256
     """Cells along the grid's edge."""
-    extent_mm: Positive = 36.0
+    extent_mm: Annotated[Positive, Field(le=1e4)] = 36.0
     """Width of the grid [mm]."""
     arch: Architecture = Architecture()
     objective: Objective = Objective()

@@ -103,7 +103,10 @@ def render(
         int | None, typer.Option(min=1, help="Processes at a time; one a core if not given.")
     ] = None,
     engine: Annotated[
-        str, typer.Option(help="local, dask://host:port, or a YAML file that describes a SLURM cluster.")
+        str,
+        typer.Option(
+            help="local, dask://host:port, tls://host:port, or a YAML file that describes a SLURM cluster."
+        ),
     ] = "local",
     gpus: Annotated[
         str, typer.Option(help="GPUs that workers take in turn: auto, none, or numbers as 0,1.")
@@ -357,6 +360,7 @@ def view(
     from synth.dataset.store import Dataset, open_sequence
     from synth.publish.rerun_view import save_recording, show_sequences
 
+    _end_on_terminate()
     chosen = [open_sequence(location.store(out, k)) for k in sequence] if sequence else [Dataset(out)[0]]
     if save is None:
         show_sequences(chosen, web=web)

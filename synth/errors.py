@@ -13,3 +13,7 @@ class UserError(Exception):
 
 class NotFinite(UserError):
     """A computed value is NaN or infinite: the sequence is stopped and marked failed."""
+
+
+class Caution(UserWarning):
+    """Something that the user should know, though nothing is refused; command lines print it to stderr."""

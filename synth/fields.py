@@ -138,6 +138,8 @@ FIELDS: dict[str, Field] = {
             "total load on the tissue, camera axes",
             length=3,
             packed=3.5,
+            low=-1e6,
+            high=1e6,
         ),
         Field(
             "flow_recovered",

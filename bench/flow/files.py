@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from synth.errors import UserError
+from synth.system import foreign_file, foreign_picture
+from synth.system.foreign_picture import LARGEST_PIXELS
 
 _UNKNOWN = 1e9  # px: Middlebury marks what isn't known by larger values
 
@@ -52,17 +55,19 @@ def write_flow(path: Path, flow: Floats, known: Flags | None = None) -> None:
 
 def _read_flo(path: Path) -> tuple[Floats, Flags]:
     """Baker et al., IJCV 2011: magic number, width, height, then rows of u, v; little-endian floats."""
-    flow = cv2.readOpticalFlow(str(path))
-    if flow is None:
+    data = foreign_file.read_bytes(path, 12 + 8 * LARGEST_PIXELS)
+    width, height = np.frombuffer(data[4:12], "<i4") if data[:4] == b"PIEH" and len(data) >= 12 else (0, 0)
+    if min(width, height) < 1 or len(data) != 12 + 8 * int(width) * int(height):
         raise UserError(f"{path}: not a whole Middlebury .flo file")
+    flow = np.frombuffer(data, "<f4", offset=12).reshape(height, width, 2)
     known = np.all(np.abs(flow) < _UNKNOWN, axis=-1)
     return np.where(known[..., None], flow, 0).astype(np.float32), known
 
 
 def _read_kitti(path: Path) -> tuple[Floats, Flags]:
     """Geiger et al., CVPR 2012: 16-bit RGB PNG, u and v as (value - 2^15)/64, B 1 where known."""
-    coded = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-    if coded is None or coded.dtype != np.uint16 or coded.ndim != 3 or coded.shape[2] != 3:
+    coded: NDArray[Any] = foreign_picture.read_picture(path, cv2.IMREAD_UNCHANGED)
+    if coded.dtype != np.uint16 or coded.ndim != 3 or coded.shape[2] != 3:
         raise UserError(f"{path}: not a KITTI flow PNG (16 bits, three channels)")
     known = coded[..., 0] > 0
     flow = (coded[..., 2:0:-1].astype(np.float32) - 2**15) / 64

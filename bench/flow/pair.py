@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from bench.flow import files
 from synth.errors import UserError
 from synth.flow import mask
 from synth.flow.estimator import Flags, Flow, Map, Rgb, create
+from synth.system import foreign_picture
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,4 @@ def _score(flow: Flow, real: Flow, trust: Map, known: Flags) -> Score:
 
 
 def _picture(path: Path) -> Rgb:
-    picture = cv2.imread(str(path), cv2.IMREAD_COLOR)
-    if picture is None:
-        raise UserError(f"{path}: not a readable picture")
-    return np.ascontiguousarray(picture[..., ::-1])
+    return np.ascontiguousarray(foreign_picture.read_picture(path)[..., ::-1], np.uint8)

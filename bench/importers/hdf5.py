@@ -9,8 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.importers.registry import ROLES, Intake, as_rgb
+from bench.importers.registry import MOST_FRAMES, ROLES, Intake, as_rgb
 from synth.errors import UserError
+from synth.system.foreign_picture import refuse_large
+
+_LARGEST_CHUNK = 1 << 30
 
 _USUAL = {
     "frames": ("frames", "images", "image", "rgb", "video", "color"),
@@ -49,6 +52,12 @@ def read_source(source: Path, use: dict[str, str]) -> Intake:
             f"{source}: no {'frames' if frames is None else 'frame_time'} found; say --use; "
             f"there are {', '.join(sorted(arrays)) or 'no arrays'}"
         )
+    for role, array in chosen.items():
+        if array is not None:
+            _refuse_odd(source, role, array)
+    if frames.ndim not in (3, 4) or not all(frames.shape):
+        raise UserError(f"{source}: frames of shape {frames.shape}, expected (T, height, width[, channels])")
+    refuse_large(frames.shape[2], frames.shape[1])
     seconds = np.asarray(times[:], np.float64).ravel()
     if len(seconds) != len(frames):
         raise UserError(f"{source}: {len(frames)} frames, {len(seconds)} frame times")
@@ -76,6 +85,22 @@ def read_source(source: Path, use: dict[str, str]) -> Intake:
             yield as_rgb(np.asarray(frames[k]))
 
     return Intake(seconds, pictures, force_s, force, tip)
+
+
+def _refuse_odd(source: Path, role: str, array: Any) -> None:
+    """UserError for an array that is elsewhere, holds no numbers or is too long; nothing of it is read."""
+    name, numbers = array.name, array.dtype.kind in "fiu"
+    if array.external or array.is_virtual:
+        raise UserError(f"{source}: {name} lies in other files, which are not opened; write it into this one")
+    if not numbers or array.ndim == 0:
+        raise UserError(
+            f"{source}: {name} of type {array.dtype} and shape {array.shape} is no row of numbers"
+        )
+    if role != "frames" and array.size > 6 * MOST_FRAMES:
+        raise UserError(f"{source}: {name} has {array.size} numbers, too many for a {role}")
+    chunk = int(np.prod(array.chunks or (1,), dtype=object)) * array.dtype.itemsize
+    if chunk > _LARGEST_CHUNK:
+        raise UserError(f"{source}: {name} is kept in pieces of {chunk / 1e9:.1f} GB, too large to be read")
 
 
 def _chosen(source: Path, role: str, use: dict[str, str], arrays: dict[str, Any]) -> Any:

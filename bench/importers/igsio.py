@@ -10,8 +10,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.importers.registry import Floats, Intake, as_rgb, one_of
+from bench.importers.registry import MOST_FRAMES, Floats, Intake, as_rgb, one_of
 from synth.errors import UserError
+from synth.system import foreign_file
+from synth.system.foreign_picture import refuse_large
+
+_LARGEST_BYTES = 1 << 42
+_LONGEST_LINE = 65536
 
 Fields = dict[str, dict[int, str]]
 """Text of a field by name and frame."""
@@ -32,6 +37,7 @@ def read_source(source: Path, use: dict[str, str]) -> Intake:
         import SimpleITK
     except ImportError:
         raise UserError("reading .mha needs SimpleITK: pip install 'sulcus[readers]'") from None
+    _refuse_elsewhere(source)
     reader = SimpleITK.ImageFileReader()
     reader.SetFileName(str(source))
     try:
@@ -43,6 +49,9 @@ def read_source(source: Path, use: dict[str, str]) -> Intake:
     if len(size) != 3:
         raise UserError(f"{source}: a picture, not a sequence of pictures")
     count = size[2]
+    refuse_large(size[0], size[1])
+    if count > MOST_FRAMES:
+        raise UserError(f"{source}: {count} frames are too many")
     stamp = use.get("frame_time", "Timestamp")
     if stamp not in fields:
         raise UserError(
@@ -68,6 +77,22 @@ def read_source(source: Path, use: dict[str, str]) -> Intake:
 
     good = np.isfinite(force).all(axis=1) if len(force) else np.zeros(0, bool)
     return Intake(times, pictures, times[: len(force)][good], force[good], tip, tuple(notes))
+
+
+def _refuse_elsewhere(source: Path) -> None:
+    """UserError for a head that names another file for its pictures, or has none of a MetaImage's lines."""
+    with foreign_file.open_file(source, _LARGEST_BYTES) as file:
+        while line := file.readline(_LONGEST_LINE):
+            key, _, value = line.partition(b"=")
+            if key.strip() == b"ElementDataFile":
+                if value.strip() == b"LOCAL":
+                    return
+                raise UserError(
+                    f"{source}: its pictures lie in another file, which is not opened; write .mha"
+                )
+            if not value or len(line) == _LONGEST_LINE:
+                break
+    raise UserError(f"{source}: not a readable MetaImage")
 
 
 def _fields(reader: Any) -> Fields:

@@ -7,7 +7,8 @@ the libraries kept for them; what comes out is the layout that everything else h
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,8 @@ from numpy.typing import NDArray
 
 from bench.recording import writer
 from synth.errors import UserError
+from synth.system import foreign_file
+from synth.system.foreign_picture import refuse_large
 
 Floats = NDArray[np.float64]
 ROLES = ("frames", "frame_time", "force", "force_time", "tip")
@@ -30,6 +33,14 @@ _MAKERS = {
     ".db3": "bench.importers.rosbag",
 }
 _CRF_LOSSLESS = 0
+_LARGEST_BYTES = 1 << 42
+_LEAST_PX = 8
+_LATEST_S = 1e11
+_LONGEST_STEP_S = 10.0
+_UNITS = {"milliseconds": 1e-3, "microseconds": 1e-6, "nanoseconds": 1e-9}
+
+MOST_FRAMES = 10_000_000
+"""That a source may say it has, and times that a sensor may have in it."""
 
 
 @dataclass(frozen=True)
@@ -64,8 +75,8 @@ def read_source(source: Path, use: Mapping[str, str] | None = None) -> Intake:
     Raises:
         UserError: another format, a library that is not installed, nothing usable, or an ambiguous choice.
     """
-    if not source.exists():
-        raise UserError(f"{source}: no such file")
+    if not source.is_dir():
+        foreign_file.check_file(source, _LARGEST_BYTES)
     known = ", ".join(sorted(_MAKERS))
     if not supported(source):
         raise UserError(f"{source}: not a format that can be imported ({known}, or a folder of a ROS 2 bag)")
@@ -73,10 +84,50 @@ def read_source(source: Path, use: Mapping[str, str] | None = None) -> Intake:
     if unknown:
         raise UserError(f"--use {unknown[0]}=...: one of {', '.join(ROLES)}")
     module = import_module("bench.importers.rosbag" if source.is_dir() else _MAKERS[source.suffix.lower()])
-    found: Intake = module.read_source(source, dict(use or {}))
+    with _damage_told(source):
+        found: Intake = module.read_source(source, dict(use or {}))
+    _refuse_odd(source, found)
+
+    def pictures() -> Iterator[NDArray[np.uint8]]:
+        with _damage_told(source):
+            size = None
+            for k, picture in enumerate(found.pictures()):
+                height, width = picture.shape[:2]
+                if (height, width) != (size := size or (height, width)):
+                    raise UserError(
+                        f"{source}: frame {k} is {width} x {height}, those before it {size[::-1]}"
+                    )
+                yield picture
+
+    return replace(found, pictures=pictures)
+
+
+@contextmanager
+def _damage_told(source: Path) -> Iterator[None]:
+    """What the libraries raise over a damaged file, and that is nearly anything, as one line."""
+    try:
+        yield
+    except (UserError, KeyboardInterrupt, GeneratorExit):
+        raise
+    except Exception as error:
+        said = (str(error).splitlines() or [""])[0][:200] or type(error).__name__
+        raise UserError(f"{source}: damaged, or not what its name says ({said})") from error
+
+
+def _refuse_odd(source: Path, found: Intake) -> None:
+    """UserError for times that are none, or in another unit than seconds."""
+    for what, times in (("frame", found.times_s), ("force", found.force_s), ("tip", found.tip[:, 0])):
+        if not (np.abs(times) < _LATEST_S).all():
+            k = int(np.argmin(np.abs(times) < _LATEST_S))
+            raise UserError(f"{source}: the time of {what} {k} is {times[k]:g}: are they in seconds?")
+        step = float(np.median(np.abs(np.diff(times)))) if len(times) > 1 else 0.0
+        if step >= _LONGEST_STEP_S:
+            unit = next((name for name, size in _UNITS.items() if step * size < 1), "another unit")
+            raise UserError(
+                f"{source}: {what}s are {step:g} s apart: their times look like {unit}, not seconds"
+            )
     if len(found.times_s) == 0:
         raise UserError(f"{source}: holds no frames")
-    return found
 
 
 def write_recording(
@@ -138,6 +189,12 @@ def as_rgb(picture: NDArray[Any], order: str = "rgb") -> NDArray[np.uint8]:
         picture = np.repeat(picture[..., None], 3, axis=2)
     if picture.ndim != 3 or picture.shape[2] not in (3, 4):
         raise UserError(f"pictures of shape {picture.shape}: grey, or 3 or 4 channels are read")
+    height, width = picture.shape[:2]
+    if min(height, width) < _LEAST_PX:
+        raise UserError(
+            f"pictures of {width} x {height} pixels: at least {_LEAST_PX} x {_LEAST_PX} are needed"
+        )
+    refuse_large(width, height)
     colours = picture[..., :3]
     return np.ascontiguousarray(colours[..., ::-1] if order == "bgr" else colours, np.uint8)
 

@@ -6,13 +6,14 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from bench.importers.registry import Intake, as_rgb, one_of
 from synth.errors import UserError
+from synth.system import foreign_file, foreign_picture, foreign_yaml
 
+_LARGEST_BYTES = 1 << 42
 _PICTURES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 _FORCES = ("geometry_msgs/msg/WrenchStamped", "geometry_msgs/msg/Vector3Stamped")
 _TIPS = (
@@ -38,6 +39,9 @@ def read_source(source: Path, use: dict[str, str]) -> Intake:
     except ImportError:
         raise UserError("reading bags needs rosbags: pip install 'sulcus[readers]'") from None
 
+    if source.is_dir():
+        _refuse_elsewhere(source)
+
     def opened() -> Any:
         return AnyReader([source], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
 
@@ -60,6 +64,21 @@ def read_source(source: Path, use: dict[str, str]) -> Intake:
 
     forces = np.array(force, np.float64).reshape(-1, 4)
     return Intake(stamps, pictures, forces[:, 0], forces[:, 1:], np.array(tip, np.float64).reshape(-1, 4))
+
+
+def _refuse_elsewhere(folder: Path) -> None:
+    """UserError for a bag whose metadata.yaml is none, or names files that don't lie in its folder."""
+    path = folder / "metadata.yaml"
+    text = foreign_file.read_text(path, foreign_yaml.LARGEST_BYTES)
+    told = foreign_yaml.plain(foreign_yaml.load(text, str(path)), str(path))
+    about = told.get("rosbag2_bagfile_information") if isinstance(told, dict) else None
+    names = about.get("relative_file_paths") if isinstance(about, dict) else None
+    if not isinstance(names, list):
+        raise UserError(f"{path}: doesn't say which files hold the bag")
+    for name in map(str, names):
+        if name != Path(name).name:
+            raise UserError(f"{path}: names {name}, which is not in its folder")
+        foreign_file.check_file(folder / name, _LARGEST_BYTES)
 
 
 def _topic(bag: Any, role: str, kinds: tuple[str, ...], use: dict[str, str]) -> str | None:
@@ -93,10 +112,7 @@ def _place(message: Any) -> tuple[float, float, float]:
 
 def _picture(source: Path, message: Any) -> NDArray[np.uint8]:
     if hasattr(message, "format"):
-        bgr = cv2.imdecode(np.asarray(message.data, np.uint8), cv2.IMREAD_COLOR)
-        if bgr is None:
-            raise UserError(f"{source}: a compressed picture can't be decoded")
-        return as_rgb(bgr.astype(np.uint8), "bgr")
+        return as_rgb(foreign_picture.decode_picture(bytes(message.data)).astype(np.uint8), "bgr")
     channels = _CHANNELS.get(message.encoding)
     if channels is None:
         raise UserError(f"{source}: pictures in encoding {message.encoding}; {', '.join(_CHANNELS)} are read")

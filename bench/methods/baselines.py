@@ -7,6 +7,7 @@ for a linear solid, force over E is a function of displacement.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -124,21 +125,29 @@ def _size_only(value: float) -> Floats:
     return np.array([value, np.nan, np.nan])
 
 
+# Rules are parts of functions that have a name, so that what is fitted can be kept in a file.
+
+
 def _constant(value: float) -> Rule:
-    return lambda moved, mask, sure: _size_only(value)
+    return partial(_say_power, value, 0.0)
 
 
 def _linear(peak: Floats, size: Floats) -> Rule:
-    slope = float(peak @ size) / max(float(peak @ peak), 1e-12)
-    return lambda moved, mask, sure: _size_only(slope * _peak(moved, mask))
+    return partial(_say_power, float(peak @ size) / max(float(peak @ peak), 1e-12), 1.0)
 
 
 def _power(peak: Floats, size: Floats) -> Rule:
     """a d^b, least squares on logarithms over the frames with some load and some motion."""
     used = (size > 0.05 * size.max()) & (peak > 0.05 * peak.max())
     b, log_a = np.polyfit(np.log(peak[used]), np.log(size[used]), 1) if used.sum() > 2 else (1.0, 0.0)
-    a, b = float(np.exp(log_a)), float(np.clip(b, 0.2, 4))
-    return lambda moved, mask, sure: _size_only(a * _peak(moved, mask) ** b)
+    return partial(_say_power, float(np.exp(log_a)), float(np.clip(b, 0.2, 4)))
+
+
+def _say_power(
+    a: float, b: float, moved: NDArray[np.float32], mask: NDArray[np.float32], sure: NDArray[np.float32]
+) -> Floats:
+    """a d^b of the peak displacement d."""
+    return _size_only(a * _peak(moved, mask) ** b)
 
 
 def _rows(moved: NDArray[np.float32], mask: NDArray[np.float32]) -> Floats:
@@ -147,9 +156,18 @@ def _rows(moved: NDArray[np.float32], mask: NDArray[np.float32]) -> Floats:
 
 
 def _by(basis: TruncatedSVD, regressor: Ridge | KNeighborsRegressor) -> Rule:
-    return lambda moved, mask, sure: np.asarray(
-        regressor.predict(basis.transform(_rows(moved[None], mask[None])))[0], np.float64
-    )
+    return partial(_say_regressed, basis, regressor)
+
+
+def _say_regressed(
+    basis: TruncatedSVD,
+    regressor: Ridge | KNeighborsRegressor,
+    moved: NDArray[np.float32],
+    mask: NDArray[np.float32],
+    sure: NDArray[np.float32],
+) -> Floats:
+    said = regressor.predict(basis.transform(_rows(moved[None], mask[None])))
+    return np.asarray(said[0], np.float64)
 
 
 def ridge(
@@ -196,13 +214,17 @@ def _boosting(clips: Sequence[Clip], source: str, rng: np.random.Generator) -> R
     chosen = rng.permutation(len(x))[:_PIXELS]
     trees = HistGradientBoostingRegressor(max_iter=120, learning_rate=0.1, max_leaf_nodes=31, random_state=0)
     trees.fit(x[chosen], y[chosen])
-    cell = GRID.pitch_mm**2
+    return partial(_say_by_pixel, trees)
 
-    def rule(moved: NDArray[np.float32], mask: NDArray[np.float32], sure: NDArray[np.float32]) -> Floats:
-        said = np.clip(trees.predict(_pixels(moved)[mask > 0]), 0, None)
-        return _size_only(cell * float(said.sum()))
 
-    return rule
+def _say_by_pixel(
+    trees: HistGradientBoostingRegressor,
+    moved: NDArray[np.float32],
+    mask: NDArray[np.float32],
+    sure: NDArray[np.float32],
+) -> Floats:
+    said = np.clip(trees.predict(_pixels(moved)[mask > 0]), 0, None)
+    return _size_only(GRID.pitch_mm**2 * float(said.sum()))
 
 
 def _pixels(moved: NDArray[np.float32]) -> Floats:

@@ -10,12 +10,16 @@ from numpy.typing import NDArray
 
 from bench.recording import pixel_scale
 from bench.recording.folder import Recording, open_recording
+from bench.recording.meta import LEAST_INTERVALS
+from learn.inference.quality import find_fault
 from synth.errors import UserError
 
 _WIDEST_MM, _NARROWEST_MM = 300.0, 3.0
 _SOFTEST_KPA, _STIFFEST_KPA = 0.05, 100.0
 _JUMP = 3.0  # median intervals
 _SURGICAL_N = 5.0
+_RATE_HZ = 10.0  # frames a second that are looked at unless more are asked for
+_LEAST_PRESS = 5  # frames of a press that settle its gain
 
 
 @dataclass(frozen=True)
@@ -62,6 +66,7 @@ def check_recording(folder: Path) -> list[Finding]:
             said = f"the picture would be {width:.3g} mm wide: is the scale in mm/px?"
             found.add("odd", "scale", said)
     _check_sensor(recording, times, found)
+    _check_spans(recording, times, found)
     _check_stiffness(recording, found)
     return found
 
@@ -78,10 +83,13 @@ def _check_pictures(
     times: list[float] = []
     size: tuple[int, int] | None = None
     count = timeless = back = 0
+    fault = ""
     try:
         for picture in recording.frames():
             size = size or (picture.rgb.shape[0], picture.rgb.shape[1])
             count += 1
+            if picture.index == recording.meta.rest_frame:
+                fault = find_fault(picture.rgb, recording.tissue_mask(size))
             if picture.time_s is None:
                 timeless += 1
             elif times and picture.time_s <= times[-1]:
@@ -94,6 +102,8 @@ def _check_pictures(
     assert size is not None
     t = np.array(times)
     found.add("ok", "pictures", f"{count} of {size[1]} x {size[0]} px")
+    if fault:
+        found.add("bad", "pictures", f"nothing can be measured: the rest frame is {fault}")
     if len(t) < 2:
         found.add("bad", "times", "fewer than two frames have a time")
         return t, size
@@ -157,6 +167,35 @@ def _check_sensor(recording: Recording, times: NDArray[np.float64], found: _Find
         ratio = (t[-1] - t[0]) / (times[-1] - times[0])
         if not 0.01 <= ratio <= 100:
             found.add("odd", "clocks", f"the sensor's record is {ratio:.3g} times as long: seconds?")
+
+
+def _check_spans(recording: Recording, times: NDArray[np.float64], found: _Findings) -> None:
+    """Whether the spans that calibrate are long enough, and in the record, before anything is computed."""
+    meta = recording.meta
+    if len(times) < 2:
+        return
+    rate = min((len(times) - 1) / (times[-1] - times[0]), _RATE_HZ)
+    span = meta.sync.calibration_s if meta.sync.method == "correlate" else None
+    if span is not None:
+        least = LEAST_INTERVALS / rate
+        inside = max(min(span[1], times[-1]) - max(span[0], times[0]), 0.0)
+        said = f"sync.calibration_s holds {inside:.3g} s of video, {least:.3g} s are needed"
+        found.add("ok" if inside >= least else "odd", "clocks", said)
+        if recording.force is not None:
+            t, margin = recording.force.time_s, meta.sync.search_s
+            lacks = max(t[0] - (span[0] - margin), (span[1] + margin) - t[-1], 0.0)
+            if lacks > 0:
+                said = f"force.csv lacks {lacks:.3g} s of sync.calibration_s and {margin:g} s on either side"
+                found.add("odd", "clocks", said)
+    if meta.press_s is not None:
+        inside_s = max(min(meta.press_s[1], times[-1]) - max(meta.press_s[0], times[0]), 0.0)
+        least = _LEAST_PRESS / rate
+        said = f"press_s holds {inside_s:.3g} s of video, {least:.3g} s are needed"
+        found.add("ok" if inside_s >= least else "odd", "press", said)
+    for start, stop in meta.sensor.free_s:
+        force = recording.force
+        if force is not None and not ((force.time_s >= start) & (force.time_s <= stop)).any():
+            found.add("bad", "sensor", f"sensor.free_s: no samples between {start:g} and {stop:g} s")
 
 
 def _check_stiffness(recording: Recording, found: _Findings) -> None:

@@ -10,8 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from synth.errors import UserError
+from synth.system import foreign_file
 
-_LARGEST_BYTES = 2 << 30
+_LARGEST_BYTES = 512 << 20
+_LONG = 200
 
 
 def read_csv(
@@ -27,19 +29,13 @@ def read_csv(
     Raises:
         UserError: unreadable, too large, a column missing, no rows, a cell that is no number (with its line).
     """
-    try:
-        if path.stat().st_size > _LARGEST_BYTES:
-            raise UserError(f"{path}: {path.stat().st_size / 1e9:.1f} GB is too large for a table; split it")
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            first = file.readline()
-            delimiter = ";" if first.count(";") > first.count(",") else ","
-            header = [name.strip().lower() for name in next(csv.reader([first], delimiter=delimiter), [])]
-            _check_header(path, header, required)
-            wanted = [name for name in (*required, *optional) if name in header]
-            columns = [header.index(name) for name in wanted]
-            body = _body(path, file.read().splitlines(), delimiter, columns)
-    except (OSError, UnicodeDecodeError) as error:
-        raise UserError(f"{path}: unreadable ({error})") from None
+    first, *lines = foreign_file.read_text(path, _LARGEST_BYTES, "utf-8-sig").splitlines() or [""]
+    delimiter = ";" if first.count(";") > first.count(",") else ","
+    header = [name.strip().lower() for name in _cells(path, 1, first, delimiter)]
+    _check_header(path, header, required)
+    wanted = [name for name in (*required, *optional) if name in header]
+    columns = [header.index(name) for name in wanted]
+    body = _body(path, lines, delimiter, columns)
     return {name: body[:, k] for k, name in enumerate(wanted)}
 
 
@@ -47,11 +43,16 @@ def _check_header(path: Path, header: list[str], required: Sequence[str]) -> Non
     missing = [name for name in required if name not in header]
     if missing:
         raise UserError(
-            f"{path}:1: missing column {', '.join(missing)}; the header has {', '.join(header) or 'nothing'}"
+            f"{path}:1: missing column {', '.join(missing)}; the header has {_listed(header) or 'nothing'}"
         )
     twice = sorted({name for name in required if header.count(name) > 1})
     if twice:
         raise UserError(f"{path}:1: column {', '.join(twice)} is there more than once")
+
+
+def _listed(header: list[str]) -> str:
+    names = ", ".join(header)
+    return names if names.isprintable() and len(names) <= _LONG else f"{names[:_LONG]!r}..."
 
 
 def _body(path: Path, lines: list[str], delimiter: str, columns: list[int]) -> NDArray[np.float64]:
@@ -74,7 +75,7 @@ def _body(path: Path, lines: list[str], delimiter: str, columns: list[int]) -> N
 
 
 def _row(path: Path, number: int, line: str, delimiter: str, columns: list[int]) -> list[float]:
-    cells = next(csv.reader([line], delimiter=delimiter))
+    cells = _cells(path, number, line, delimiter)
     if len(cells) <= max(columns):
         raise UserError(f"{path}:{number}: {len(cells)} cells, {max(columns) + 1} expected (cut off?)")
     values = []
@@ -83,5 +84,12 @@ def _row(path: Path, number: int, line: str, delimiter: str, columns: list[int])
         try:
             values.append(float(text) if text else float("nan"))
         except ValueError:
-            raise UserError(f"{path}:{number}: '{text[:40]}' is not a number") from None
+            raise UserError(f"{path}:{number}: {text[:40]!r} is not a number") from None
     return values
+
+
+def _cells(path: Path, number: int, line: str, delimiter: str) -> list[str]:
+    try:
+        return next(csv.reader([line], delimiter=delimiter), [])
+    except csv.Error as error:
+        raise UserError(f"{path}:{number}: no line of a table ({error})") from None

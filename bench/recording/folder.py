@@ -10,6 +10,7 @@ tissue.png             optional: white where tissue may be tracked, in the rest 
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -106,11 +107,11 @@ def open_recording(folder: Path) -> Recording:
     notes: list[str] = []
     times = _frame_times(folder / "frames.csv", notes)
     force = _force(folder / "force.csv", about, notes)
-    masks = {int(path.stem): path for path in sorted(folder.glob("masks/*.png")) if path.stem.isdigit()}
+    numbered = [path for path in sorted(folder.glob("masks/*.png")) if re.fullmatch("[0-9]{1,9}", path.stem)]
+    masks = {int(path.stem): path for path in numbered}
     still = folder / "tissue.png"
-    return Recording(
-        folder, about, movie, pictures, times, force, masks, still if still.is_file() else None, tuple(notes)
-    )
+    tissue = still if os.path.lexists(still) else None
+    return Recording(folder, about, movie, pictures, times, force, masks, tissue, tuple(notes))
 
 
 def _footage(folder: Path) -> tuple[Path | None, tuple[Path, ...]]:
@@ -125,11 +126,12 @@ def _footage(folder: Path) -> tuple[Path | None, tuple[Path, ...]]:
 
 
 def _natural(path: Path) -> list[tuple[int, str]]:
-    return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", path.stem)]
+    parts = re.split("([0-9]+)", path.stem)  # every second is a number
+    return [(int(part), "") if k % 2 else (-1, part) for k, part in enumerate(parts)]
 
 
 def _frame_times(path: Path, notes: list[str]) -> NDArray[np.float64] | None:
-    if not path.is_file():
+    if not os.path.lexists(path):
         return None
     columns = csv_table.read_csv(path, ("frame", "t_s"))
     frame, time = columns["frame"], columns["t_s"]
@@ -155,8 +157,21 @@ def _frame_times(path: Path, notes: list[str]) -> NDArray[np.float64] | None:
     return times
 
 
+def _rising(time: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """(N,) rows kept of a clock that runs back: those at which it reaches new ground.
+
+    Seen from the start or from the end, whichever keeps more: one wrong time must not take all that follow.
+    """
+    if len(time) == 0:
+        return np.zeros(0, bool)
+    onwards = np.append(True, time[1:] > np.maximum.accumulate(time)[:-1])
+    back = time[::-1]
+    backwards = np.append(True, back[1:] < np.minimum.accumulate(back)[:-1])[::-1]
+    return np.asarray(onwards if onwards.sum() >= backwards.sum() else backwards, bool)
+
+
 def _force(path: Path, about: Meta, notes: list[str]) -> Force | None:
-    if not path.is_file():
+    if not os.path.lexists(path):
         return None
     columns = csv_table.read_csv(path, ("t_s", "fx_n", "fy_n", "fz_n"), ("gx", "gy", "gz"))
     time = columns["t_s"]
@@ -165,8 +180,7 @@ def _force(path: Path, about: Meta, notes: list[str]) -> Force | None:
     if not kept.all():
         notes.append(f"{path.name}: {np.sum(~kept)} rows without a time left out")
     time, newtons = time[kept], newtons[kept]
-    # A clock that runs back: rows are kept only while time reaches new ground.
-    new = np.concatenate([[True], time[1:] > np.maximum.accumulate(time)[:-1]]) if len(time) else kept[:0]
+    new = _rising(time)
     if not new.all():
         notes.append(f"{path.name}: {np.sum(~new)} rows whose time stands still or runs back left out")
     time, newtons = time[new], newtons[new]

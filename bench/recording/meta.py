@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -14,16 +15,21 @@ from pydantic import (
     ValidationError,
     model_validator,
 )
-from ruamel.yaml import YAML
-from ruamel.yaml.error import MarkedYAMLError, YAMLError
 
 from synth.errors import UserError
+from synth.system import foreign_file, foreign_yaml
+
+_MOST_MISTAKES = 10
 
 Positive = Annotated[FiniteFloat, Field(gt=0)]
 Share = Annotated[FiniteFloat, Field(ge=0, lt=1)]
 Point = tuple[FiniteFloat, FiniteFloat]
 Row = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
 Span = tuple[FiniteFloat, FiniteFloat]
+
+
+LEAST_INTERVALS = 20
+"""Frame intervals that `sync.calibration_s` must hold for the clocks to be lined up on it."""
 
 
 class _Section(BaseModel):
@@ -99,6 +105,15 @@ class Sync(_Section):
     """Largest offset looked for, either way [s]."""
 
 
+class Pulse(_Section):
+    """The tissue's own motion by heart and breath, which is taken off before any method is asked."""
+
+    remove: bool = True
+    """`false`: leave it in."""
+    free_s: tuple[Span, ...] = ()
+    """Spans of video time without contact, (from, to) [s], to find it on; without, the video alone says."""
+
+
 class Meta(_Section):
     """One recording."""
 
@@ -124,6 +139,7 @@ class Meta(_Section):
     """Name of the specimen; recordings of one specimen are never treated as independent."""
     sensor: Sensor = Sensor()
     sync: Sync = Sync()
+    pulse: Pulse = Pulse()
 
     @model_validator(mode="after")
     def _scale_is_known(self) -> Meta:
@@ -140,28 +156,22 @@ def read_meta(path: Path) -> Meta:
     Raises:
         UserError: no such file, not YAML, or (all at once) every field that is wrong.
     """
-    try:
-        content = YAML(typ="safe").load(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise UserError(f"{path}: missing; a recording needs at least scale_mm_per_px there") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise UserError(f"{path}: unreadable ({error})") from None
-    except MarkedYAMLError as error:
-        mark = error.problem_mark
-        where = f":{mark.line + 1}:{mark.column + 1}" if mark else ""
-        raise UserError(f"{path}{where}: not YAML: {error.problem}") from None
-    except YAMLError as error:
-        raise UserError(f"{path}: not YAML: {error}".splitlines()[0]) from None
+    if not os.path.lexists(path):
+        raise UserError(f"{path}: missing; a recording needs at least scale_mm_per_px there")
+    text = foreign_file.read_text(path, foreign_yaml.LARGEST_BYTES)
+    content = foreign_yaml.plain(foreign_yaml.load(text, str(path)), str(path))
     if not isinstance(content, dict):
         raise UserError(f"{path}: expected keys and values such as 'scale_mm_per_px: 0.05'")
     try:
         return Meta.model_validate(content)
     except ValidationError as error:
-        raise UserError("; ".join(_line(path, detail) for detail in error.errors())) from None
+        mistakes = [_line(path, detail) for detail in error.errors()[:_MOST_MISTAKES]]
+        raise UserError("; ".join(mistakes)) from None
 
 
 def _line(path: Path, detail: object) -> str:
     assert isinstance(detail, dict)
-    key = ".".join(str(part) for part in detail["loc"]) or "recording"
+    keys = [part if isinstance(part, int) or part.isprintable() else repr(part) for part in detail["loc"]]
+    key = ".".join(str(part)[:40] for part in keys) or "recording"
     message = str(detail["msg"]).removeprefix("Value error, ")
-    return f"{path}: {key}: {message[0].lower()}{message[1:]}"
+    return f"{path}: {key}: {message[0].lower()}{message[1:200]}"

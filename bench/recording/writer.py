@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
 from fractions import Fraction
 from pathlib import Path
 
@@ -14,28 +12,11 @@ from numpy.typing import NDArray
 from ruamel.yaml import YAML
 
 from synth.errors import UserError
+from synth.system.whole_file import folder_of as write_whole_folder
+
+__all__ = ["write_force", "write_frames", "write_meta", "write_tip", "write_video", "write_whole_folder"]
 
 Floats = NDArray[np.float64]
-
-
-@contextmanager
-def write_whole_folder(folder: Path) -> Iterator[Path]:
-    """A folder to fill, which gets its name when the block ends well and is gone when it doesn't.
-
-    Raises:
-        UserError: it exists already.
-    """
-    if folder.exists():
-        raise UserError(f"{folder}: exists already")
-    part = folder.with_name(folder.name + ".part")
-    shutil.rmtree(part, ignore_errors=True)
-    part.mkdir(parents=True)
-    try:
-        yield part
-    except BaseException:
-        shutil.rmtree(part, ignore_errors=True)
-        raise
-    part.rename(folder)
 
 
 def write_frames(folder: Path, time_s: Floats) -> None:
@@ -68,7 +49,8 @@ def write_video(path: Path, pictures: Iterator[NDArray[np.uint8]], times_s: Floa
         times_s: (T,) rising [s].
         crf: x264's quality, 0 is lossless (4:4:4 colour).
     """
-    with av.open(str(path), "w") as container:
+    # By "file:" a colon in the path is no protocol.
+    with av.open(f"file:{path}", "w", format="mp4") as container:
         rate = (
             max(1, round((len(times_s) - 1) / max(times_s[-1] - times_s[0], 1e-3))) if len(times_s) > 1 else 1
         )
@@ -79,6 +61,8 @@ def write_video(path: Path, pictures: Iterator[NDArray[np.uint8]], times_s: Floa
             even = rgb[: rgb.shape[0] // 2 * 2, : rgb.shape[1] // 2 * 2]
             if k == 0:
                 stream.height, stream.width = even.shape[:2]
+            if even.shape[:2] != (stream.height, stream.width) or not even.size:
+                raise UserError(f"{path}: frame {k} of {rgb.shape[1]} x {rgb.shape[0]} px doesn't fit")
             frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(even), format="rgb24")
             frame.pts = round(float(time - times_s[0]) * 90_000)
             frame.time_base = Fraction(1, 90_000)

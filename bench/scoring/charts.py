@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from bench.scoring import metrics
 from bench.scoring.evaluate_recording import Result
+from bench.sensor.clock_sync import Offset
 
 Figure = dict[str, Any]
 
@@ -18,8 +21,10 @@ OTHERS = ("#8a6d00", "#2b7a4b", "#a04f9c", "#b8562b", "#5b6b7a", "#00798c", "#7a
 
 
 def draw_force(result: Result) -> Figure:
-    """Force over time: the sensor, the main method with its band of uncertainty, the rest on demand."""
-    time, main = _list(result.time_s), result.methods[result.main].size_mn
+    """Force over time: the sensor, the main method with its band of uncertainty, the sizes of flow, the rest
+    on demand. Lost frames are gaps, shaded. Without a known E all curves are brought to one height."""
+    time, curves = _list(result.time_s), scale_curves(result)
+    main = curves.methods[result.main]
     data: list[Figure] = []
     spread = 1.96 * result.relative_uncertainty
     if spread > 0:
@@ -31,22 +36,90 @@ def draw_force(result: Result) -> Figure:
                 fill="tonexty", fillcolor=BAND, hoverinfo="skip",
             ),
         ]  # fmt: skip
-    if result.sensor_mn is not None:
-        data.append(_line(time, result.sensor_mn, "sensor", SENSOR, width=2.5))
+    if curves.sensor is not None:
+        data.append(_line(time, curves.sensor, "sensor", SENSOR, width=2.5))
     data.append(_line(time, main, result.main, MAIN, width=2.5))
     rest = [name for name in result.methods if name != result.main]
     for k, name in enumerate(rest):
         data.append(
             _line(
                 time,
-                result.methods[name].size_mn,
+                curves.methods[name],
                 name,
                 OTHERS[k % len(OTHERS)],
                 width=1.5,
-                visible="legendonly",
+                visible=True if result.methods[name].gain else "legendonly",
             )
         )
-    return _figure(data, "time [s]", "force [mN]", legend=True)
+    figure = _figure(data, "time [s]", curves.axis, legend=True)
+    figure["layout"]["shapes"] = [_shade(result.time_s, run) for run in _spans(result.lost)]
+    return figure
+
+
+@dataclass(frozen=True)
+class Curves:
+    """What the chart of forces shows."""
+
+    sensor: NDArray[np.float64] | None
+    methods: dict[str, NDArray[np.float64]]
+    """(T,) each."""
+    axis: str
+
+
+def scale_curves(result: Result) -> Curves:
+    """Forces as they stand; without a known E brought to what can be compared.
+
+    With a separate press to newtons, by its gain. Without, the sensor to its largest value and each method
+    to the sensor by the one gain that fits best; without a sensor each method to its own largest value.
+    """
+    sizes = {name: method.size_mn for name, method in result.methods.items()}
+    if result.absolute:
+        return Curves(result.sensor_mn, sizes, "force [mN]")
+    gains = {name: method.calibrated.get("gain", math.nan) for name, method in result.methods.items()}
+    if math.isfinite(gains[result.main]):
+        return Curves(
+            result.sensor_mn, {n: gains[n] * s for n, s in sizes.items()}, "force [mN], gain of the press"
+        )
+    if result.sensor_mn is None:
+        return Curves(None, {n: s / _largest(s) for n, s in sizes.items()}, "force / its largest")
+    top, kept = _largest(result.sensor_mn), result.scored
+    brought = {n: metrics.gain(result.sensor_mn, s, kept) * s / top for n, s in sizes.items()}
+    return Curves(result.sensor_mn / top, brought, "force / the sensor's largest, one gain a method")
+
+
+def _largest(values: NDArray[np.float64]) -> float:
+    """1 where there is none above zero."""
+    return float(np.nanmax(values, initial=0.0)) or 1.0
+
+
+def _spans(flags: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """First and last index of each run of True."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(int)))
+    return [(int(a), int(b) - 1) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+
+
+def _shade(time_s: NDArray[np.float64], span: tuple[int, int]) -> Figure:
+    """From the last frame that was followed to the next one that was."""
+    left, right = time_s[max(span[0] - 1, 0)], time_s[min(span[1] + 1, len(time_s) - 1)]
+    return {
+        "type": "rect", "xref": "x", "yref": "paper", "x0": float(left), "x1": float(right), "y0": 0, "y1": 1,
+        "fillcolor": "rgba(194,53,43,0.10)", "line": {"width": 0}, "layer": "below",
+    }  # fmt: skip
+
+
+def draw_correlogram(found: Offset) -> Figure:
+    """Correlation of force and motion at every offset that was tried, and the one that was found best."""
+    offsets, r = np.array(found.correlogram).T
+    figure = _figure(
+        [
+            _line(_list(offsets), r, "", MAIN, width=2),
+            _dots(np.array([found.offset_s]), np.array([found.r]), "best"),
+        ],
+        "offset added to the sensor's times [s]",
+        "correlation",
+    )
+    figure["data"][1]["marker"] = {"color": RED, "size": 9}
+    return figure
 
 
 def draw_scatter(result: Result) -> Figure:

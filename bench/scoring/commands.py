@@ -14,16 +14,18 @@ from bench.methods.network import Model
 from bench.methods.protocol import Method
 from bench.output.progress_bar import counting
 from bench.recording import pixel_scale
-from bench.recording.folder import open_recording
+from bench.recording.folder import Recording, open_recording
 from bench.recording.from_sequence import export_recording
 from bench.scoring import evaluate_recording, report
 from bench.scoring.evaluate_recording import Result, Settings
 from bench.tracking.flow_process import FlowProcess
 from synth.dataset.store import Dataset, Sequence
 from synth.errors import UserError
+from synth.system import whole_file
 
 MAIN = "D2FNet"
 """Name under which the given model stands in every table."""
+_ROOM_BYTES = 32 << 20  # score.json and report.html, with the charts' program in it
 _LONG = 100
 """Frames from which a second process is worth the seconds that it takes to start."""
 
@@ -56,6 +58,22 @@ def score_recording(
     # NumPy's BLAS too: a second thread of its own waits for a core that the flow has.
     threadpool_limits(set_threads(None))
     opened = open_recording(recording)
+    folder = out or Path(f"{opened.name}-score")
+    with whole_file.made_folder(folder, _ROOM_BYTES):
+        result = _score(opened, model, settings, train, also)
+        # Both are written before either has its name.
+        with (
+            whole_file.part_of(folder / "score.json") as scores,
+            whole_file.part_of(folder / "report.html") as page,
+        ):
+            evaluate_recording.write_json(result, scores)
+            report.write_report(result, page, title)
+    return result
+
+
+def _score(
+    opened: Recording, model: Path, settings: Settings, train: Path | None, also: Mapping[str, Path] | None
+) -> Result:
     total = opened.expected_frames()
     # Started first, for it takes seconds to begin; the methods are fitted meanwhile.
     with closing(FlowProcess()) if _worth_a_process(total) else nullcontext() as flow:
@@ -64,17 +82,12 @@ def score_recording(
         methods: dict[str, Method] = {MAIN: network}
         methods |= {name: Model(folder, quick=True) for name, folder in (also or {}).items()}
         methods |= fit_baselines(train, model)
-        found = pixel_scale.find_scale(opened.meta, recording)
+        found = pixel_scale.find_scale(opened.meta, opened.folder)
         with counting(f"scoring {opened.name}", total) as progress:
             about = {"model": network.described()}
-            result = evaluate_recording.evaluate_recording(
+            return evaluate_recording.evaluate_recording(
                 opened, methods, MAIN, found, settings, about, progress, flow
             )
-    folder = out or Path(f"{opened.name}-score")
-    folder.mkdir(parents=True, exist_ok=True)
-    evaluate_recording.write_json(result, folder / "score.json")
-    report.write_report(result, folder / "report.html", title)
-    return result
 
 
 def _worth_a_process(frames: int | None) -> bool:
@@ -84,10 +97,13 @@ def _worth_a_process(frames: int | None) -> bool:
 def fit_baselines(train: Path | None, model: Path) -> dict[str, Method]:
     """Those that need no data, and, given the training data, those fitted on the model's own fit sequences.
 
+    They are fitted once for a model, and kept for its next recording.
+
     Raises:
         UserError: none of the model's sequences is in `train`.
     """
     from bench.methods import baselines as baseline
+    from bench.methods import kept_rules
 
     methods = baseline.physical()
     if train is None:
@@ -100,7 +116,12 @@ def fit_baselines(train: Path | None, model: Path) -> dict[str, Method]:
     if not chosen:
         raise UserError(f"{train}: holds none of the sequences that {model} was fitted on")
     source = "recovered" if all("flow_recovered" in s for s in chosen) else "ideal"
-    return methods | baseline.fitted([read_clip(s, baseline.GRID, (source,)) for s in chosen], source)
+
+    def fit() -> dict[str, baseline.Rule]:
+        return baseline.fitted_rules([read_clip(s, baseline.GRID, (source,)) for s in chosen], source)
+
+    rules = kept_rules.keep_rules([s.attrs["content_hash"] for s in chosen], source, fit)
+    return methods | {name: baseline.Baseline(rule) for name, rule in rules.items()}
 
 
 def score_demo(dataset: Path, model: Path, out: Path, settings: Settings) -> Result:
@@ -116,6 +137,8 @@ def score_demo(dataset: Path, model: Path, out: Path, settings: Settings) -> Res
     """
     chosen = find_unseen(dataset, model)
     folder = out / "recording"
+    if folder.is_symlink():
+        raise UserError(f"{folder}: is a link, which is not followed; remove it")
     if folder.exists():
         shutil.rmtree(folder)
     export_recording(chosen, folder)

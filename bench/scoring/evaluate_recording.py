@@ -6,7 +6,7 @@ import json
 import math
 import platform
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from bench import bootstrap
 from bench.bootstrap import Interval
+from bench.methods.flow_size import FlowSize, flow_sizes
 from bench.methods.protocol import Method
 from bench.recording.folder import Force, Recording
 from bench.recording.pixel_scale import Scale
@@ -29,6 +30,19 @@ from synth.system import packages
 
 Curve = NDArray[np.float64]
 _SEED = 0  # of the bootstrap: the same recording gives the same intervals
+MOST_LOST = 0.2
+"""Share of lost frames above which no number stands for a recording: the rest are the easy ones."""
+
+
+@dataclass(frozen=True)
+class Gain:
+    """The one factor that makes a force of a length of flow."""
+
+    mn_per_mm: float
+    """NaN where nothing determines it."""
+    source: str
+    """`press`: the separate one. `hindsight`: the scored frames themselves, the best there is. Without a
+    sensor the name of the method whose curve it was brought to."""
 
 
 @dataclass(frozen=True)
@@ -50,6 +64,8 @@ class Scored:
     """Scores after one gain found on the separate press, and that gain; empty without a press."""
     worse_by_mn: Interval | None
     """Interval of the main method's MAE minus this one's, paired; None for the main method."""
+    gain: Gain | None = None
+    """Of a baseline that has no newtons of its own; None for all others."""
 
 
 @dataclass(frozen=True)
@@ -71,6 +87,8 @@ class Result:
     noise_floor_mn: float
     scored: NDArray[np.bool_]
     """(T,) whether the frame counts: calibration spans don't."""
+    lost: NDArray[np.bool_]
+    """(T,) whether the frame could not be followed: no method has an answer there."""
     sync: Offset | None
     """What the search for the clocks' offset found; None if they weren't searched."""
     notes: tuple[str, ...]
@@ -78,6 +96,18 @@ class Result:
     settings: dict[str, Any]
     environment: dict[str, str]
     followed: Tracked
+    absolute: bool = True
+    """Whether E is known, so that forces are in newtons and not those of tissue of 1 kPa."""
+
+    @property
+    def aligned(self) -> bool:
+        """Whether the clocks are as stated, or were found; not where the search had to be refused."""
+        return self.sync is None or not self.sync.refused
+
+    @property
+    def lost_share(self) -> float:
+        """Share of the frames to be scored that were lost."""
+        return float(self.lost[self.scored].mean()) if self.scored.any() else 0.0
 
 
 def evaluate_recording(
@@ -105,6 +135,8 @@ def evaluate_recording(
     Raises:
         UserError: as `track_recording` and `force_sensor.process_force`.
     """
+    # Whoever is scored has these two to beat.
+    methods = {main: methods[main], **flow_sizes(), **methods}
     done = track_recording(
         recording, methods, scale.mm_per_px, settings, pictured=main, flow=flow, progress=progress
     )
@@ -118,7 +150,13 @@ def evaluate_recording(
             "changes are given, and those after the gain of a separate press if there is one"
         )
     kept = _kept(recording, time, notes)
-    forces = {name: np.array(curve) for name, curve in done.force_mn.items()}
+    lost = ~np.array(done.trusted)
+    if lost.any():
+        notes.append(f"{lost.sum()} of {len(lost)} frames could not be followed: gaps, not scored")
+    forces = {name: np.array(curve, np.float64) for name, curve in done.force_mn.items()}
+    for force in forces.values():
+        force[lost] = np.nan
+    gains = _brought_to_newtons(forces, methods, truth, kept, _pressed(recording, time), main)
     return Result(
         recording=recording.name,
         main=main,
@@ -126,20 +164,59 @@ def evaluate_recording(
         sensor_mn=truth.size_mn,
         sensor_axes_mn=truth.axes_mn,
         methods={
-            name: _scored(time, force, forces[main], truth, kept, recording, name == main)
+            name: replace(
+                _scored(time, force, forces[main], truth, kept, recording, name == main), gain=gains.get(name)
+            )
             for name, force in forces.items()
         },
         scale=scale,
         relative_uncertainty=math.hypot(scale.uncertainty, meta.young_uncertainty),
         noise_floor_mn=truth.floor_mn,
         scored=kept,
+        lost=lost,
         sync=truth.sync,
         notes=tuple(notes),
         steps=truth.steps,
         settings={**asdict(settings), **described, "meta": meta.model_dump(mode="json", exclude_none=True)},
         environment=environment(),
         followed=done,
+        absolute=meta.young_kpa is not None,
     )
+
+
+def _pressed(recording: Recording, time: Curve) -> NDArray[np.bool_] | None:
+    """(T,) the frames of the calibrating press; None if there is none."""
+    span = recording.meta.press_s
+    return None if span is None else (time >= span[0]) & (time <= span[1])
+
+
+def _brought_to_newtons(
+    forces: Mapping[str, Curve],
+    methods: Mapping[str, Method],
+    truth: _Truth,
+    kept: NDArray[np.bool_],
+    press: NDArray[np.bool_] | None,
+    main: str,
+) -> dict[str, Gain]:
+    """Multiplies, in place, each length of flow by its one gain.
+
+    On the press if there is one. Else in hindsight, which flatters: a method that loses against that may
+    only lack a gain, one that follows the sensor less well lacks more.
+    """
+    gains = {}
+    for name in (name for name, method in methods.items() if isinstance(method, FlowSize)):
+        size = _length(forces[name])
+        if truth.size_mn is None:
+            gain = Gain(metrics.gain(_length(forces[main]), size, np.ones(len(size), bool)), main)
+        else:
+            gain = Gain(float("nan"), "")
+            if press is not None:
+                gain = Gain(metrics.gain(truth.size_mn, size, press), "press")
+            if not math.isfinite(gain.mn_per_mm):
+                gain = Gain(metrics.gain(truth.size_mn, size, kept), "hindsight")
+        forces[name][:] *= gain.mn_per_mm
+        gains[name] = gain
+    return gains
 
 
 def _kept(recording: Recording, time: Curve, notes: list[str]) -> NDArray[np.bool_]:
@@ -179,9 +256,11 @@ def _truth(recording: Recording, done: Tracked, time: Curve, notes: list[str]) -
     elif meta.sync.method == "correlate":
         found = _offset(force, recording, done, time)
         if found.refused:
-            notes.append(f"clocks could not be aligned ({found.refused}): predictions only")
-            return _Truth(sync=found)
-        offset = found.offset_s
+            notes.append(
+                f"clocks could not be aligned ({found.refused}): scored at the offset stated, {offset:g} s"
+            )
+        else:
+            offset = found.offset_s
     processed = force_sensor.process_force(force, meta.sensor, offset)
     axes = force_sensor.force_at(processed, time)
     covered = int(np.isfinite(axes).all(axis=1).sum())
@@ -225,13 +304,13 @@ def _scored(
     worse = None if is_main else bootstrap.difference(x, _length(main)[kept], y, rng)
     absolute = recording.meta.young_kpa is not None
     if not absolute:
-        scores, events = metrics.without_newtons(scores), []
+        scores, events = metrics.without_newtons(scores), metrics.without_prediction(events)
         components = {axis: metrics.without_newtons(values) for axis, values in components.items()}
         intervals, worse = {key: intervals[key] for key in intervals if key in metrics.RELATIVE}, None
     calibrated: dict[str, float] = {}
-    if recording.meta.press_s is not None:
-        low, high = recording.meta.press_s
-        gain = metrics.gain(size, length, (time_s >= low) & (time_s <= high))
+    press = _pressed(recording, time_s)
+    if press is not None:
+        gain = metrics.gain(size, length, press)
         calibrated = {"gain": gain, **metrics.agreement(x, gain * y)}
         calibrated["mae_of_peak"] = metrics.ratio(calibrated["mae_mn"], scores["event_peak_mn"])
     return Scored(force, length, scores, components, events, intervals, calibrated, worse)
@@ -253,6 +332,7 @@ def as_json(result: Result) -> dict[str, Any]:
         "recording": result.recording,
         "main": result.main,
         "frames": len(result.time_s),
+        "lost": {"frames": int(result.lost.sum()), "share": result.lost_share, "most": MOST_LOST},
         "scores": result.methods[result.main].scores,
         "methods": {
             name: {
@@ -260,6 +340,7 @@ def as_json(result: Result) -> dict[str, Any]:
                 "intervals": m.intervals,
                 "calibrated": m.calibrated,
                 "worse_by_mn": m.worse_by_mn,
+                "gain": None if m.gain is None else asdict(m.gain),
                 "components": m.components,
                 "events": m.events,
             }
@@ -268,6 +349,9 @@ def as_json(result: Result) -> dict[str, Any]:
         "scale": asdict(result.scale),
         "relative_uncertainty": result.relative_uncertainty,
         "noise_floor_mn": result.noise_floor_mn,
+        "fault": done.fault,
+        "pulse": done.pulse,
+        "aligned": result.aligned,
         "sync": None if result.sync is None else asdict(result.sync),
         "notes": list(result.notes),
         "sensor_steps": list(result.steps),
@@ -278,6 +362,7 @@ def as_json(result: Result) -> dict[str, Any]:
             "frame": done.frame,
             "t_s": result.time_s,
             "scored": result.scored,
+            "lost": result.lost,
             "sensor_mn": result.sensor_mn,
             "sensor_axes_mn": result.sensor_axes_mn,
             "confidence": done.confidence,

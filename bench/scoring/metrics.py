@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import linregress
 from sklearn.metrics import f1_score, mean_absolute_error, r2_score, root_mean_squared_error
+
+from learn.evaluation.metrics import Metric
 
 Curve = NDArray[np.float64]
 """(T,) float64."""
@@ -17,33 +18,6 @@ SURGICAL_FORCE_MN = 300.0
 """The 0.3 N below which 70% of tool-tissue forces in neurosurgery lie."""
 
 _LARGEST_LAG_S = 0.5
-
-
-class Metric(NamedTuple):
-    """One score: what it is called and how it is shown, wherever it is shown."""
-
-    name: str
-    unit: str
-    """As shown: mN, ms and % are made of mN, s and shares; empty for a number."""
-    about: str
-    best: Literal["low", "high", "zero", "one", ""] = ""
-    """Which value is the best; empty for what is no merit."""
-    digits: int = 3
-    """Behind the point in tables of plain text, in the score's own unit."""
-    relative: bool = False
-    """Whether a constant factor on the prediction leaves it as it is, or it speaks of the sensor alone."""
-    column: str = ""
-    """Heading in the report's table; empty: not there."""
-
-    @property
-    def heading(self) -> str:
-        """The name, with its unit if its numbers are shown without: those of force."""
-        return f"{self.name} [mN]" if self.unit == "mN" else self.name
-
-    @property
-    def cell_unit(self) -> str:
-        """What is written behind each number under a heading."""
-        return "" if self.unit == "mN" else self.unit
 
 
 METRICS = {
@@ -56,6 +30,15 @@ METRICS = {
     "ccc": Metric("CCC", "", "Lin's concordance correlation.", "high", column="CCC"),
     "r2": Metric("R²", "", "1 − SSE/SST about the sensor's mean: bias and gain count.", "high", column="R²"),
     "gain": Metric("gain", "", "Least-squares slope of predicted on sensor.", "one", column="gain"),
+    "shape_error": Metric(
+        "shape error",
+        "%",
+        "MAE after the one gain that fits best, over the contacts' mean peak.",
+        "low",
+        3,
+        True,
+        "shape err.",
+    ),
     "lag_s": Metric("lag", "ms", "How late predicted is, at the best correlation.", "zero", 3, True, "lag"),
     "r_at_lag": Metric("r at that lag", "", "Correlation with the lag taken out.", "high", relative=True),
     "contact_f1": Metric("contact F1", "", "F1 of contact, by sample.", "high", column="contact F1"),
@@ -260,6 +243,7 @@ def compute_all(
     scores = agreement(sensor, predicted)
     peaks = np.array([row["peak_mn"] for row in rows])
     peak = float(peaks.mean()) if len(peaks) else float("nan")
+    scores["shape_error"] = ratio(_after_gain(sensor, predicted)["mae_mn"], peak)
     scores |= lag(time_s, sensor, predicted)
     scores |= contact_scores(sensor, predicted, threshold)
     scores |= {
@@ -275,9 +259,20 @@ def compute_all(
     return scores, rows
 
 
+def _after_gain(sensor: Curve, predicted: Curve) -> dict[str, float]:
+    """Agreement of what the one best gain, known in hindsight, leaves of the prediction: its shape."""
+    return agreement(sensor, gain(sensor, predicted, np.isfinite(sensor)) * predicted)
+
+
 def without_newtons(scores: dict[str, float]) -> dict[str, float]:
     """The scores with those that need forces in newtons made NaN: for predictions of unknown stiffness."""
     return {key: value if key in RELATIVE else float("nan") for key, value in scores.items()}
+
+
+def without_prediction(rows: list[dict[str, float]]) -> list[dict[str, float]]:
+    """Contacts as the sensor alone has them: what needs predicted newtons made NaN."""
+    own = ("from_s", "to_s", "peak_mn", "impulse_mns")
+    return [{key: value if key in own else float("nan") for key, value in row.items()} for row in rows]
 
 
 def limits_of_agreement(difference: Curve, group: NDArray[np.integer]) -> dict[str, float]:

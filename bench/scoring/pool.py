@@ -15,11 +15,12 @@ from bench.output import charts, machine, result_page
 from bench.output import write as results
 from bench.scoring.metrics import METRICS
 from synth.errors import UserError
+from synth.system import foreign_file
 
 SCORES = tuple(
     (key, METRICS[key].heading)
-    for key in ("mae_mn", "mae_of_peak", "r", "ccc", "r2", "bias_mn", "contact_f1", "ghost_rate", "peak_mae",
-                "impulse_mae", "dropout")
+    for key in ("mae_mn", "mae_of_peak", "r", "shape_error", "ccc", "r2", "bias_mn", "contact_f1",
+                "ghost_rate", "peak_mae", "impulse_mae", "dropout")
 )  # fmt: skip
 _CALIBRATED = (
     *((key, f"{METRICS[key].heading}, gain set") for key in ("mae_of_peak", "r2")),
@@ -37,10 +38,10 @@ def read(paths: Sequence[Path]) -> list[dict[str, Any]]:
     for path in paths:
         file = path / "score.json" if path.is_dir() else path
         try:
-            tree = json.loads(file.read_text(encoding="utf-8"))
-        except (OSError, ValueError):
-            raise UserError(f"{path}: holds no readable score.json") from None
-        if tree.get("format") != "sulcus-score":
+            tree = foreign_file.read_json(file)
+        except UserError as error:
+            raise UserError(f"{path}: holds no readable score.json ({error})") from None
+        if not isinstance(tree, dict) or tree.get("format") != "sulcus-score":
             raise UserError(f"{path}: not written by `bench score`")
         found.append(tree)
     if not found:
@@ -49,7 +50,7 @@ def read(paths: Sequence[Path]) -> list[dict[str, Any]]:
     twice = {name for name in names if names.count(name) > 1}
     if twice:
         raise UserError(f"recording {min(twice)} is given twice")
-    if not any(tree["scores"] for tree in found):
+    if not any(_reason(tree) == "" for tree in found):
         raise UserError("none of the recordings was scored against a sensor")
     if len({tree["main"] for tree in found}) > 1:
         raise UserError("the scores are of different main methods")
@@ -61,7 +62,7 @@ def pool(found: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
     Recordings that were not scored (no sensor, clocks not aligned) are left out and named.
     """
-    every, found = found, [tree for tree in found if tree["scores"]]
+    every, found = found, [tree for tree in found if not _reason(tree)]
     methods = [m for m in found[0]["methods"] if all(m in tree["methods"] for tree in found)]
     specimens = [tree["settings"]["meta"].get("specimen") or tree["recording"] for tree in found]
     main = found[0]["main"]
@@ -69,7 +70,7 @@ def pool(found: Sequence[dict[str, Any]]) -> dict[str, Any]:
     for method in methods:
         rows = [tree["methods"][method] for tree in found]
         out[method] = {
-            "scores": {key: _mean([row["scores"][key] for row in rows], specimens) for key, _ in SCORES},
+            "scores": {key: _mean([row["scores"].get(key) for row in rows], specimens) for key, _ in SCORES},
             "calibrated": {
                 key: _mean([row["calibrated"].get(key) for row in rows], specimens) for key, _ in _CALIBRATED
             },
@@ -83,7 +84,7 @@ def pool(found: Sequence[dict[str, Any]]) -> dict[str, Any]:
         "version": 1,
         "main": main,
         "recordings": [tree["recording"] for tree in found],
-        "left_out": {tree["recording"]: _reason(tree) for tree in every if not tree["scores"]},
+        "left_out": {tree["recording"]: _reason(tree) for tree in every if _reason(tree)},
         "each": [_each(tree) for tree in found],
         "specimens": len(set(specimens)),
         "frames": sum(tree["frames"] for tree in found),
@@ -92,9 +93,11 @@ def pool(found: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 
 def _reason(tree: dict[str, Any]) -> str:
-    """Why a recording has no scores."""
+    """Why a recording is left out; empty if it isn't. Clocks that may be off say nothing of a method."""
     refused = (tree.get("sync") or {}).get("refused")
-    return f"clocks not aligned: {refused}" if refused else "no sensor"
+    if refused:
+        return f"clocks not aligned: {refused}"
+    return "" if tree["scores"] else "no sensor"
 
 
 def _each(tree: dict[str, Any]) -> dict[str, Any]:
@@ -106,6 +109,7 @@ def _each(tree: dict[str, Any]) -> dict[str, Any]:
         **{key: tree["scores"].get(key) for key in ("event_peak_mn", "mae_of_peak", "r")},
         "offset_s": found.get("offset_s"),
         "offset_deviation_s": found.get("deviation_s"),
+        "lost": (tree.get("lost") or {}).get("share"),
     }
 
 
@@ -119,7 +123,9 @@ def write(tree: dict[str, Any], out: Path, command: str) -> None:
 
 def drawn(tree: Mapping[str, Any], name: str = "index.html") -> result_page.Page:
     """What `pool.json` says; methods that beat the main one are marked."""
-    shown = [(key, head) for key, head in SCORES if key not in ("bias_mn", "impulse_mae", "dropout")]
+    first = tree["methods"][tree["main"]]["scores"]
+    hidden = ("bias_mn", "impulse_mae", "dropout")
+    shown = [(key, head) for key, head in SCORES if key not in hidden and key in first]
     own = _number(tree["methods"][tree["main"]]["scores"]["mae_mn"]["mean"])
     bars, rows = [], []
     for method, found in tree["methods"].items():
@@ -162,7 +168,7 @@ def _line(row: Mapping[str, Any]) -> dict[str, str]:
         "MAE of it": f"{_number(row['mae_of_peak']):.1%}",
         "r": f"{_number(row['r']):.3f}",
         "clocks' offset [ms]": offset,
-    }
+    } | ({"lost": f"{row['lost']:.0%}"} if row.get("lost") is not None else {})
 
 
 def _mean(values: Sequence[float | None], specimens: Sequence[str]) -> dict[str, float | None]:

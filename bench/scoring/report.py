@@ -22,7 +22,8 @@ from rich.table import Table
 
 from bench.scoring import charts, metrics
 from bench.scoring.evaluate_recording import Result
-from bench.scoring.metrics import METRICS
+from bench.scoring.headline import headline
+from bench.scoring.metrics import METRICS, Metric
 from bench.tracking.tracking import Snapshot
 from synth.dataset.folder import write_whole
 from synth.publish import picture
@@ -30,7 +31,8 @@ from synth.publish import picture
 _PEAKS, _WORST = 4, 2
 
 _COLUMNS = {key: metric for key, metric in METRICS.items() if metric.column}
-_TILES = ("mae_mn", "mae_of_peak", "r", "ccc", "r2", "ghost_rate")
+_NARROW = ("mae_mn", "mae_of_peak", "r", "shape_error", "r2", "bias_mn", "ghost_rate")
+"""What a terminal's eighty columns hold."""
 
 
 @dataclass(frozen=True)
@@ -70,17 +72,21 @@ def render_report(result: Result, title: str) -> str:
     if math.isfinite(main.scores.get("mae_mn", math.nan)):
         figures["scatter"] = charts.draw_scatter(result)
         figures["bland"] = charts.draw_bland_altman(result, limits_of_agreement(result))
+    if result.sync is not None and result.sync.correlogram:
+        figures["correlogram"] = charts.draw_correlogram(result.sync)
     panels, flow_px, force_kpa = pictures(result)
     return environment.get_template("report.html.jinja").render(
         title=title,
         result=result,
         main=main,
-        metrics=_COLUMNS,
-        tiles={key: METRICS[key] for key in _TILES},
+        metrics=_columns(result),
+        headline=headline(result),
         best=_best(result),
         beaten_by=beaten_by(result),
+        losses=[_described(result, name) for name in beaten_by(result)],
         surely=[n for n in beaten_by(result) if (w := result.methods[n].worse_by_mn) and w[0] > 0],
         agreement="scatter" in figures,
+        correlogram="correlogram" in figures,
         panels=panels,
         flow_px=flow_px,
         force_kpa=force_kpa,
@@ -100,14 +106,25 @@ def terminal_table(result: Result) -> Table:
     if not result.methods[result.main].scores:
         table.add_column(escape("largest force [mN]"), justify="right")
         for name, method in result.methods.items():
-            table.add_row(name, shown(float(np.nanmax(method.size_mn))))
+            sizes = method.size_mn[np.isfinite(method.size_mn)]
+            table.add_row(name, shown(float(sizes.max()) if len(sizes) else None))
         return table
-    columns = {key: metric for key, metric in _COLUMNS.items() if key in {*_TILES, "bias_mn"}}
+    columns = {key: metric for key, metric in _columns(result).items() if key in _NARROW}
     for metric in columns.values():
         table.add_column(escape(metric.column), justify="right", no_wrap=True)
     for name, method in result.methods.items():
         table.add_row(name, *(shown(method.scores[key], m.cell_unit) for key, m in columns.items()))
     return table
+
+
+def _columns(result: Result) -> dict[str, Metric]:
+    """The table's columns: those in which some method has a number."""
+    every = [method.scores for method in result.methods.values()]
+    return {
+        key: metric
+        for key, metric in _COLUMNS.items()
+        if any(math.isfinite(scores.get(key, math.nan)) for scores in every)
+    }
 
 
 def limits_of_agreement(result: Result) -> dict[str, float]:
@@ -130,6 +147,11 @@ def beaten_by(result: Result) -> list[str]:
         for name, method in result.methods.items()
         if name != result.main and method.scores.get("mae_mn", math.inf) < own
     ]
+
+
+def _described(result: Result, name: str) -> str:
+    gain = result.methods[name].gain
+    return f"{name} (its gain set in hindsight)" if gain and gain.source == "hindsight" else name
 
 
 def shown(value: float | None, unit: str = "") -> str:

@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench import bootstrap
+from bench.recording.meta import LEAST_INTERVALS
 
 Curve = NDArray[np.float64]
 
 _STEPS_PER_FRAME = 8
-_LEAST_INTERVALS = 20
 _LEAST_R = 0.4
 _RESAMPLES = 300
 _SAME_PEAK = 0.95
@@ -37,6 +37,8 @@ class Offset:
     """Standard deviation of the offset over all bootstrap resamples, other peaks included [s]."""
     refused: str
     """Why the offset must not be used; empty when it may be."""
+    correlogram: tuple[tuple[float, float], ...] = ()
+    """Offset [s] and correlation of every candidate; empty where none could be tried."""
 
 
 def find_offset(
@@ -58,15 +60,15 @@ def find_offset(
     good = np.isfinite(force_mn).all(axis=1)
     t, force = sensor_s[good], force_mn[good]
     widths = np.diff(frame_s)
-    if len(widths) < _LEAST_INTERVALS:
-        return _none(f"only {len(widths)} frame intervals in the calibration span, {_LEAST_INTERVALS} needed")
+    if len(widths) < LEAST_INTERVALS:
+        return _none(f"only {len(widths)} frame intervals in the calibration span, {LEAST_INTERVALS} needed")
     frame = float(np.median(widths))
     step = frame / _STEPS_PER_FRAME
     offsets = np.arange(-round(search_s / step), round(search_s / step) + 1) * step
     change = np.stack([_change(frame_s - offset, t, force) / widths for offset in offsets])
     moved = speed[1:]
     usable = np.isfinite(change).all(axis=0) & np.isfinite(moved)
-    if usable.sum() < _LEAST_INTERVALS:
+    if usable.sum() < LEAST_INTERVALS:
         return _none("the sensor doesn't cover the calibration span with the search's margin on both sides")
     change, moved = change[:, usable], moved[usable]
     r = _correlations(np.ones((1, len(moved))), change, moved)[0]
@@ -86,7 +88,8 @@ def find_offset(
         refused = f"force and motion correlate by only {r[best]:.2f}"
     elif there.mean() < _SAME_PEAK:
         refused = f"ambiguous: {100 * (1 - there.mean()):.0f}% of resamples put the peak elsewhere"
-    return Offset(_refined(offsets, r, best), float(r[best]), zero, deviation, refused)
+    tried = tuple(zip(offsets.tolist(), r.tolist(), strict=True))
+    return Offset(_refined(offsets, r, best), float(r[best]), zero, deviation, refused, tried)
 
 
 def _change(frame_s: Curve, sensor_s: Curve, force_mn: NDArray[np.float64]) -> Curve:

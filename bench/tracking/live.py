@@ -88,7 +88,7 @@ def watch_video(
     if method is not None and scale_mm_per_px is None:
         raise UserError("a model needs --scale (mm a pixel): forces have no meaning without it")
     account, pace = Watched(), _Pace(paced)
-    video = VideoFlow(footage, Settings(backend, shrink, rate_hz=None), _Warm(), pace.is_due)
+    video = VideoFlow(footage, Settings(backend, shrink, rate_hz=None, pulse=False), _Warm(), pace.is_due)
     scene: Scene | None = None
     for step in video.steps():
         if scene is None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TypeVar
 
 import cv2
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from bench.methods.protocol import Method, Scene
 from bench.recording.folder import Recording
+from learn.inference.pulse import Pulse
 from learn.inference.video_flow import FlowHere, Footage, Settings, Step, VideoFlow
 from synth.errors import UserError
 from synth.system.stopwatch import Stopwatch
@@ -50,6 +51,8 @@ class Tracked:
     """Mean speed of the tissue since the frame before [mm/s]; what is lined up with the sensor."""
     confidence: list[float] = field(default_factory=list)
     """Mean confidence of the flow over the tissue."""
+    trusted: list[bool] = field(default_factory=list)
+    """Whether the frame could be followed; what was said of one that couldn't is no answer."""
     snapshots: list[Snapshot] = field(default_factory=list)
     rest: NDArray[np.uint8] | None = None
     tissue: NDArray[np.bool_] | None = None
@@ -58,6 +61,10 @@ class Tracked:
     """Height, width of the recording [px]."""
     notes: list[str] = field(default_factory=list)
     timings: dict[str, dict[str, float] | float] = field(default_factory=dict)
+    fault: str = ""
+    """Why nothing of the video is a measurement; empty if something may be."""
+    pulse: list[dict[str, float]] = field(default_factory=list)
+    """rate_hz and amplitude_mm of each rhythm of the tissue's own that was taken off."""
 
 
 def track_recording(
@@ -85,10 +92,31 @@ def track_recording(
     Raises:
         UserError: unreadable video, no frame with a time, rest frame beyond the end, masks of another size.
     """
+    out, found = _track(recording, methods, scale_mm_per_px, settings, pictured, flow, progress, None)
+    if found is None:
+        return out
+    # Contacts are answered for on the tissue as it would lie still: all over again, with that taken off.
+    again, _ = _track(recording, methods, scale_mm_per_px, settings, pictured, flow, progress, found)
+    return again
+
+
+def _track(
+    recording: Recording,
+    methods: Mapping[str, Method],
+    scale_mm_per_px: float,
+    settings: Settings,
+    pictured: str | None,
+    flow: FlowHere | None,
+    progress: Progress,
+    pulse: Pulse | None,
+) -> tuple[Tracked, Pulse | None]:
+    """Once through the video; what was tracked, and the pulse that is still in it."""
     meta = recording.meta
     tool = recording.tool if recording.masks else None
     footage = Footage(recording.frames(), str(recording.folder), recording.tissue_mask, tool, meta.rest_frame)
-    video = VideoFlow(footage, settings, flow)
+    video = VideoFlow(
+        footage, replace(settings, pulse=settings.pulse and meta.pulse.remove), flow, pulse=pulse
+    )
     asking = _Asking(methods, pictured, video.watch)
     for step in video.steps(progress):
         if asking.scene is None:
@@ -102,12 +130,24 @@ def track_recording(
         if video.seen <= meta.rest_frame:
             raise UserError(f"{recording.folder}: rest_frame {meta.rest_frame}, but {video.seen} frames")
         raise UserError(f"{recording.folder}: no frame has a time; give frames.csv, or fps in meta.yaml")
+    out.fault = video.fault
+    if out.fault:
+        out.trusted = [False] * len(out.time_s)
     out.size, out.notes, out.timings = video.size, video.notes, video.watch.report()
+    if out.fault:
+        out.notes.append(f"nothing can be measured: {out.fault}")
     if tool is None:
         out.notes.append("no masks/: the tool is found in each picture")
     if video.peak_bytes:
         out.timings["flow_peak_rss_mb"] = round(video.peak_bytes / 1e6, 1)
-    return out
+    if pulse is not None:
+        mm_per_px = scale_mm_per_px * video.shrink
+        out.pulse = [
+            {"rate_hz": rhythm.rate_hz, "amplitude_mm": mm_per_px * size}
+            for rhythm, size in zip(pulse.rhythms, pulse.amplitudes_px, strict=True)
+        ]
+        out.notes.append(pulse.describe(mm_per_px))
+    return out, video.find_pulse(meta.pulse.free_s)
 
 
 class _Asking:
@@ -134,6 +174,7 @@ class _Asking:
                 density = answer.density
         inside = scene.tissue
         out.confidence.append(float(confidence[inside].mean()))
+        out.trusted.append(step.found.trusted)
         speed = 0.0
         if self.last is not None and out.time_s:
             moved = np.linalg.norm(flow - self.last, axis=-1)[inside]

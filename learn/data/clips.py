@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
-import os
-import shutil
+import tempfile
+import zlib
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, ValidationError
 
 from learn.data.grid import Grid, Resampler, centre, settled
 from synth.dataset.split import name_anatomy
 from synth.dataset.store import Dataset, Sequence
 from synth.errors import UserError
+from synth.job import identity
+from synth.job.types import Positive, first_problem
+from synth.system import foreign_file
 
 Input = Literal["ideal", "recovered", "noisy", "mixed"]
 INPUTS = ("ideal", "recovered", "noisy", "mixed")
@@ -29,8 +34,9 @@ _CURE = {
     "recovered": "render with flow.backend other than 'ideal'",
     "noisy": "render with store.extra: [flow_noisy]",
 }
-_VERSION = 3
+_VERSION = 4
 _ARRAYS = ("mask", "confidence", "density", "force")
+_FILES = {f"{name}.npy" for name in (*_ARRAYS, *(f"displacement-{source}" for source in FIELDS))}
 _PLAIN = ("name", "content_hash", "group", "family", "gesture", "young_kpa")
 
 
@@ -74,7 +80,7 @@ def read_clip(sequence: Sequence, grid: Grid, wanted: Iterable[str]) -> Clip:
     """One store on the grid.
 
     `wanted`: any of `ideal`, `recovered`, `noisy`. Raises UserError if the store lacks the flow or has no
-    tissue.
+    tissue, or values are not those that were sealed.
     """
     attrs = sequence.attrs
     where = sequence.path.name
@@ -85,41 +91,47 @@ def read_clip(sequence: Sequence, grid: Grid, wanted: Iterable[str]) -> Clip:
                 f"{where}: holds no {source} flow (field {FIELDS[source]}); {_CURE[source]}, "
                 "or use --input ideal"
             )
-    scenario: dict[str, Any] = attrs.get("scenario") or {}
-    try:
-        young, scale = float(attrs["young_kpa"]), float(attrs["scale_mm_per_px"])
-    except KeyError as missing:
-        raise UserError(f"{where}: lacks the attribute {missing.args[0]}") from None
-    tissue = sequence["tissue"][:].astype(bool)
+    if attrs.get("young_kpa") is None or attrs.get("scale_mm_per_px") is None:
+        raise UserError(f"{where}: lacks the attribute young_kpa or scale_mm_per_px")
+    young, scale = float(attrs["young_kpa"]), float(attrs["scale_mm_per_px"])
+    tissue, area, force = (sequence.read_whole(name) for name in ("tissue", "area", "force"))
     resample = Resampler((tissue.shape[0], tissue.shape[1]), scale, centre(tissue), grid)
     mask = (resample.cover(tissue) > 0.5).astype(np.float32)
-    area = sequence["area"][:]
     n, frames = grid.size, sequence.frames
     displacement = {s: np.empty((frames, 2, n, n), np.float32) for s in wanted}
     confidence = np.ones((frames, n, n), np.float32)
     density = np.empty((frames, 3, n, n), np.float32)
-    surest = "recovered" in wanted and "flow_confidence" in sequence
-    for t in range(frames):
-        for source in wanted:
-            moved = sequence[FIELDS[source]][t].transpose(2, 0, 1) * scale
+    for source in wanted:
+        for t, flow in enumerate(sequence.read_sealed(FIELDS[source])):
+            moved = flow.transpose(2, 0, 1) * scale
             displacement[source][t] = resample.mean(moved, tissue) * mask
-        if surest:
-            confidence[t] = resample.mean(sequence["flow_confidence"][t], tissue) * mask
-        load_clips = sequence["traction"][t].transpose(2, 0, 1) * area
-        density[t] = settled(resample.sum(load_clips), mask) / np.float32(grid.pitch_mm**2 * young)
+    if "recovered" in wanted and "flow_confidence" in sequence:
+        for t, sure in enumerate(sequence.read_sealed("flow_confidence")):
+            confidence[t] = resample.mean(sure, tissue) * mask
+    for t, traction in enumerate(sequence.read_sealed("traction")):
+        load = traction.transpose(2, 0, 1) * area
+        density[t] = settled(resample.sum(load), mask) / np.float32(grid.pitch_mm**2 * young)
     return Clip(
-        name=where,
-        content_hash=str(attrs["content_hash"]),
-        group=name_anatomy(attrs),
-        family=str(scenario.get("family", "")),
-        gesture=str((scenario.get("gesture") or {}).get("kind", "")),
-        young_kpa=young,
+        **_plain(sequence),
         mask=mask,
         displacement=displacement,
         confidence=confidence,
         density=density,
-        force=sequence["force"][:],
+        force=force,
     )
+
+
+def _plain(sequence: Sequence) -> dict[str, Any]:
+    """What a clip takes from the attributes."""
+    scenario: dict[str, Any] = sequence.attrs.get("scenario") or {}
+    return {
+        "name": sequence.path.name,
+        "content_hash": sequence.attrs["content_hash"],
+        "group": name_anatomy(sequence.attrs),
+        "family": scenario.get("family") or "",
+        "gesture": (scenario.get("gesture") or {}).get("kind") or "",
+        "young_kpa": float(sequence.attrs["young_kpa"]),
+    }
 
 
 def load_clips(
@@ -133,7 +145,8 @@ def load_clips(
     """All sealed sequences of a dataset, in order.
 
     `cache`: folder of packed arrays, made on first use and memory-mapped after; keyed by content hash and
-    grid, so it can be shared and can't be stale. Raises UserError for an empty dataset.
+    grid, so it can be shared and can't be stale. Raises UserError for an empty dataset, and for a sequence
+    whose attributes or values are not those that were sealed.
     """
     wanted = tuple(wanted)
     dataset = Dataset(root)
@@ -148,42 +161,93 @@ def load_clips(
 
 
 def _packed(sequence: Sequence, grid: Grid, wanted: tuple[str, ...], cache: Path) -> Clip:
-    key = f"{sequence.attrs['content_hash']}-{grid.size}-{grid.extent_mm:g}-{'+'.join(wanted)}-v{_VERSION}"
-    if not (cache / key).is_dir():
-        pack(read_clip(sequence, grid, wanted), cache / key)
-    return unpack(cache / key)
+    # The content hash is no word of the store's own: opening it has checked that it is its attributes', and
+    # reading a field that it is the hash there. What is packed under it is what it stands for.
+    said = [sequence.attrs["content_hash"], grid.size, grid.extent_mm, *wanted, _VERSION]
+    folder = cache / hashlib.blake2b(identity.canonical(said), digest_size=16).hexdigest()
+    if not folder.is_dir():
+        pack(read_clip(sequence, grid, wanted), folder)
+    found = unpack(folder)
+    if found.displacement.keys() != set(wanted) or found.density.shape[-1] != grid.size:
+        raise UserError(f"{folder}: packed sequence of another grid or input; remove it")
+    return replace(found, **_plain(sequence))
 
 
 def pack(clip: Clip, folder: Path) -> None:
-    """Writes a clip as plain arrays, beside and renamed; a folder that is there already stays."""
-    part = folder.with_name(f"{folder.name}.part{os.getpid()}")
-    part.mkdir(parents=True, exist_ok=True)
-    for name in _ARRAYS:
-        np.save(part / f"{name}.npy", getattr(clip, name))
-    for source, values in clip.displacement.items():
-        np.save(part / f"displacement-{source}.npy", values)
+    """Writes a clip as plain arrays, beside and renamed; a folder that is there already stays.
+
+    Raises UserError, and leaves nothing, if it can't be written.
+    """
+    arrays = {name: getattr(clip, name) for name in _ARRAYS}
+    arrays |= {f"displacement-{source}": values for source, values in clip.displacement.items()}
     plain = {name: getattr(clip, name) for name in _PLAIN}
-    (part / "clip.json").write_text(json.dumps(plain | {"sources": list(clip.displacement)}))
-    if folder.is_dir():
-        shutil.rmtree(part)
-    else:
-        part.rename(folder)
+    sums = {name: _checksum(values) for name, values in arrays.items()}
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.parent) as beside:
+            part = Path(beside) / folder.name
+            part.mkdir()
+            for name, values in arrays.items():
+                np.save(part / f"{name}.npy", values)
+            (part / "clip.json").write_text(json.dumps(plain | {"checksums": sums}))
+            if not folder.is_dir():
+                part.rename(folder)
+    except OSError as error:
+        raise UserError(f"{folder}: cannot be written ({error.strerror})") from None
+
+
+class _Said(BaseModel):
+    """clip.json of a packed clip."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
+
+    name: str
+    content_hash: str
+    group: str
+    family: str
+    gesture: str
+    young_kpa: Positive
+    checksums: dict[str, int]
 
 
 def unpack(folder: Path) -> Clip:
-    """A packed clip, memory-mapped. Raises UserError if the folder is not one."""
-
-    def mapped(name: str) -> NDArray[Any]:
-        array: NDArray[Any] = np.load(folder / f"{name}.npy", mmap_mode="r")
-        return array
-
+    """A packed clip, memory-mapped. Raises UserError if the folder is not one, or damaged."""
     try:
-        plain = json.loads((folder / "clip.json").read_text())
-        displacement = {source: mapped(f"displacement-{source}") for source in plain.pop("sources")}
-        arrays: dict[str, Any] = {name: mapped(name) for name in _ARRAYS}
-        return Clip(**plain, displacement=displacement, **arrays)
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise UserError(f"{folder}: damaged packed sequence ({error}); remove it") from None
+        said = _Said.model_validate_json(foreign_file.read_bytes(folder / "clip.json", 1_000_000))
+        arrays: dict[str, Any] = {
+            name: _mapped(folder / f"{name}.npy", told) for name, told in said.checksums.items()
+        }
+        displacement = {s: arrays.pop(f"displacement-{s}") for s in FIELDS if f"displacement-{s}" in arrays}
+        clip = Clip(**said.model_dump(exclude={"checksums"}), displacement=displacement, **arrays)
+        frames, n = len(clip.density), clip.mask.shape[-1]
+        expected = {"mask": (n, n), "confidence": (frames, n, n), "density": (frames, 3, n, n)}
+        expected |= {"force": (frames, 3)} | {s: (frames, 2, n, n) for s in displacement}
+        found = {name: getattr(clip, name).shape for name in _ARRAYS}
+        found |= {s: values.shape for s, values in displacement.items()}
+        if found != expected:
+            raise ValueError("arrays of other shapes")
+        return clip
+    except ValidationError as error:
+        why = ": ".join(first_problem(error))
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, UserError) as error:
+        why = str(error).splitlines()[0][:200]
+    raise UserError(f"{folder}: damaged packed sequence ({why}); remove it")
+
+
+def _mapped(file: Path, checksum: int) -> NDArray[Any]:
+    if file.name not in _FILES:
+        raise ValueError(f"{file.name}: is no array of ours")
+    foreign_file.check_file(file, 64 << 30)
+    array: NDArray[Any] = np.load(file, mmap_mode="r", allow_pickle=False)
+    if array.dtype != (np.float64 if file.stem == "force" else np.float32):
+        raise ValueError(f"{file.name}: is of another type")
+    if _checksum(array) != checksum:
+        raise ValueError(f"{file.name}: the checksum does not match")
+    return array
+
+
+def _checksum(values: NDArray[Any]) -> int:
+    return zlib.crc32(np.ascontiguousarray(values).reshape(-1).view(np.uint8).data)
 
 
 def target(clip: Clip, frame: int, kind: Target, components: int) -> NDArray[np.float32]:

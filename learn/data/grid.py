@@ -16,6 +16,7 @@ from scipy import ndimage, sparse
 from torch import Tensor
 
 from synth.errors import UserError
+from synth.job.types import Positive
 
 CHANNELS = ("dx", "dy", "magnitude", "mask", "divergence")
 CONFIDENCE = "confidence"
@@ -48,13 +49,13 @@ class Scales:
     One scale serves dx and dy: two would make the answer depend on how the camera is turned.
     """
 
-    displacement_mm: float
-    divergence: float
-    target: float
+    displacement_mm: Positive
+    divergence: Positive
+    target: Positive
     """Force density per unit stiffness [mN/mm² at E = 1 kPa] (or intensity [mN at E = 1 kPa])."""
-    force: float
+    force: Positive
     """Total force per unit stiffness [mN at E = 1 kPa]."""
-    spread: float
+    spread: Positive
     """Root mean square of the target over tissue cells and components, unit of `target`."""
 
 

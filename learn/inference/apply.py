@@ -6,9 +6,10 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import partial
-from itertools import chain
+from itertools import chain, repeat
 from pathlib import Path
 from typing import Any, NamedTuple
+from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +18,7 @@ from learn.data.clips import FIELDS
 from learn.inference import video
 from learn.inference.force_reader import ForceReader
 from learn.inference.predict import Predictor, View
+from learn.inference.pulse import Pulse
 from learn.inference.stiffness import stiffness
 from learn.inference.video_flow import Footage, Settings, VideoFlow, everywhere
 from synth.dataset.store import Dataset, Sequence, open_sequence
@@ -33,6 +35,8 @@ class Step(NamedTuple):
     frame: int
     """Number in the film."""
     time_s: float = math.nan
+    trusted: bool = True
+    """Whether the frame could be followed."""
 
 
 @dataclass(frozen=True)
@@ -51,6 +55,10 @@ class Motion:
     """How many times smaller than the film's own pictures those are that flow is on."""
     notes: Callable[[], list[str]] = list
     """What was done to the film that its user should know, once its steps are through."""
+    fault: Callable[[], str] = str
+    """Why nothing of it is a measurement, once its steps are through; empty if something may be."""
+    again: Callable[[], Motion | None] = lambda: None
+    """The same film with the tissue's own motion taken off, if its steps, once through, showed any."""
 
 
 @dataclass(frozen=True)
@@ -87,42 +95,66 @@ def _stored(sequence: Sequence, source: str) -> Motion:
         raise UserError(f"unknown input {source!r}: {', '.join(FIELDS)}")
     if FIELDS[source] not in sequence:
         raise UserError(f"{sequence.path}: holds no {source} flow")
-    flow = sequence[FIELDS[source]]
+    scale, young = (sequence.attrs.get(name) for name in ("scale_mm_per_px", "young_kpa"))
+    if scale is None or young is None:
+        raise UserError(f"{sequence.path}: lacks the attribute young_kpa or scale_mm_per_px")
     sure = source == "recovered" and "flow_confidence" in sequence
-    confidence = sequence["flow_confidence"] if sure else None
-    time_s = sequence["time"][:]
+    given = sequence.read_sealed("flow_confidence") if sure else repeat(None, sequence.frames)
+    time_s, tissue, force = (sequence.read_whole(name) for name in ("time", "tissue", "force"))
+    frames = zip(sequence.read_sealed(FIELDS[source]), given, time_s, strict=True)
     return Motion(
         name=sequence.path.stem,
-        steps=(
-            Step(flow[t], None if confidence is None else confidence[t], t, float(time_s[t]))
-            for t in range(sequence.frames)
-        ),
-        tissue=sequence["tissue"][:].astype(bool),
-        scale_mm_per_px=float(sequence.attrs["scale_mm_per_px"]),
-        young_kpa=float(sequence.attrs["young_kpa"]),
-        force_mn=np.linalg.norm(sequence["force"][:], axis=1),
+        steps=(Step(flow, confidence, t, float(at)) for t, (flow, confidence, at) in enumerate(frames)),
+        tissue=tissue.astype(bool),
+        scale_mm_per_px=float(scale),
+        young_kpa=float(young),
+        force_mn=np.linalg.norm(force, axis=1),
     )
 
 
-def _video(path: Path, filmed: Filmed) -> Motion:
+def _video(path: Path, filmed: Filmed, pulse: Pulse | None = None) -> Motion:
     if filmed.scale_mm_per_px is None:
         raise UserError(f"{path}: a video doesn't say how large it shows things; give --scale in mm a pixel")
     drawn = filmed.tissue
     tissue = everywhere if drawn is None else partial(video.read_mask, drawn)
-    following = VideoFlow(Footage(video.read_video(path, video.FPS), str(path), tissue), filmed.settings)
+    following = VideoFlow(
+        Footage(video.read_video(path, video.FPS), str(path), tissue), filmed.settings, pulse=pulse
+    )
     steps = (
-        Step(step.found.flow, step.found.confidence, step.picture.index, step.picture.time_s or 0.0)
+        Step(
+            step.found.flow,
+            step.found.confidence,
+            step.picture.index,
+            step.picture.time_s or 0.0,
+            step.found.trusted,
+        )
         for step in following.steps()
     )
     rest = next(steps)
+    mm_per_px = filmed.scale_mm_per_px * following.shrink
+
+    def again() -> Motion | None:
+        found = following.find_pulse()
+        return None if found is None else _video(path, filmed, found)
+
+    def notes() -> list[str]:
+        if pulse is None:
+            return following.notes
+        return [
+            *following.notes,
+            f"the whole surface moves by itself, {pulse.describe(mm_per_px)}: taken off",
+        ]
+
     return Motion(
         name=path.stem,
         steps=chain([rest], steps),
         tissue=following.tissue,
-        scale_mm_per_px=filmed.scale_mm_per_px * following.shrink,
+        scale_mm_per_px=mm_per_px,
         young_kpa=None,
         shrink=following.shrink,
-        notes=lambda: following.notes,
+        notes=notes,
+        fault=lambda: following.fault,
+        again=again,
     )
 
 
@@ -130,7 +162,7 @@ def _arrays(path: Path) -> Motion:
     try:
         with np.load(path, allow_pickle=False) as file:
             found = {name: file[name] for name in file.files}
-    except (OSError, ValueError, EOFError) as error:
+    except (OSError, ValueError, EOFError, BadZipFile) as error:
         raise UserError(f"{path}: cannot be read as .npz ({error})") from None
     missing = {"flow", "tissue", "scale_mm_per_px"} - found.keys()
     if missing:
@@ -162,23 +194,33 @@ def apply(predictor: Predictor, motion: Motion, young_kpa: float | None = None) 
     """Force of every frame of a film, ready for np.savez; what is done to it is `ForceReader`'s.
 
     `young_kpa` overrides the film's own. Returns `frame` (T,), `time_s` (T,) where the film has times,
-    `total_force_mn` (T,), `force_mn` (T, 3) for a model that gives direction, and as the network says it
+    `trusted` (T,) whether a frame could be followed (its force is NaN if not), `total_force_mn` (T,),
+    `force_mn` (T, 3) for a model that gives direction, and as the network says it
     `density` (T, C, N, N) mN/mm² and `head_mn` (T, C) of one with a total-force head; `mask` (N, N),
-    `pitch_mm`, `centre_px` (x, y) in the film's own pixels, `young_kpa`, `young_known`.
+    `pitch_mm`, `centre_px` (x, y) in the film's own pixels, `young_kpa`, `young_known`, and `notes`: what
+    was done to the film that its user should know.
     """
     young = young_kpa if young_kpa is not None else motion.young_kpa
     reader = ForceReader(predictor, motion.tissue, motion.scale_mm_per_px, young)
-    frames, times, forces, maps = [], [], [], []
+    frames, times, forces, maps, trusted = [], [], [], [], []
     for step in motion.steps:
         force, said = reader.read(step.flow, step.confidence)
         frames.append(step.frame)
         times.append(step.time_s)
-        forces.append(force)
+        forces.append(force if step.trusted else np.full(3, np.nan))
+        trusted.append(step.trusted)
         maps.append(said)
+    still = motion.again()
+    if still is not None:
+        return apply(predictor, still, young_kpa)
+    fault = motion.fault()
+    if fault:
+        trusted, forces = [False] * len(trusted), [np.full(3, np.nan)] * len(forces)
     total, last = np.array(forces), maps[-1]
     out: dict[str, Any] = {
         "density": np.stack([m.density for m in maps]),
-        "total_force_mn": np.sqrt(np.nansum(total**2, axis=1)),
+        "total_force_mn": np.where(trusted, np.sqrt(np.nansum(total**2, axis=1)), np.nan),
+        "trusted": np.array(trusted),
         "mask": last.view.mask,
         "pitch_mm": predictor.grid.pitch_mm,
         # A picture begins half a pixel before its first pixel, whatever its pixels' size.
@@ -191,6 +233,14 @@ def apply(predictor: Predictor, motion: Motion, young_kpa: float | None = None) 
         out["time_s"] = np.array(times)
     if last.force_mn is not None:
         out["force_mn"] = total
+    notes = motion.notes()
+    if fault:
+        notes.append(f"nothing can be measured: {fault}")
+    elif not all(trusted):
+        notes.append(
+            f"{trusted.count(False)} of {len(trusted)} frames could not be followed: they have no force"
+        )
+    out["notes"] = np.array(notes, dtype=str)
     heads = [m.head_mn for m in maps if m.head_mn is not None]
     if heads:
         out["head_mn"] = np.stack(heads)
@@ -203,7 +253,7 @@ def calibrate(predictor: Predictor, press: Motion) -> float:
         raise UserError(f"{press.name}: holds no force to calibrate on (force_mn in an .npz)")
     view = View(press.tissue, press.scale_mm_per_px, predictor.grid)
     moved, sure = [], []
-    for flow, confidence, _, _ in press.steps:
+    for flow, confidence, *_ in press.steps:
         moved.append(view.resample.mean(flow.transpose(2, 0, 1) * press.scale_mm_per_px, press.tissue))
         if confidence is not None:
             sure.append(view.resample.mean(confidence, press.tissue))

@@ -171,8 +171,8 @@ class Predictor:
         """Force density of frames already on the grid, and their total force if the network has that head.
 
         `displacement`: (T, 2, N, N) mm; `mask`: (N, N) 0/1; `confidence`: (T, N, N). Returns (T, C, N, N)
-        mN/mm² at `young_kpa` and (T, C) mN or None. Raises UserError for another grid, or displacement that
-        isn't finite.
+        mN/mm² at `young_kpa` and (T, C) mN or None. Raises UserError for another grid, and for displacement
+        or an answer that isn't finite.
         """
         n, settings, scales = self.grid.size, self.card.settings, self.card.scales
         if displacement.ndim != 4 or displacement.shape[1:] != (2, n, n):
@@ -198,8 +198,12 @@ class Predictor:
                 said, total = said
                 totals.append(total.double().cpu().numpy())
             maps.append(said.float().cpu().numpy())
-        density = np.concatenate(maps) * np.float32(scales.target * young_kpa)
-        return density, np.concatenate(totals) * (scales.force * young_kpa) if totals else None
+        with np.errstate(over="ignore", invalid="ignore"):  # said below
+            density = np.concatenate(maps) * np.float32(scales.target * young_kpa)
+            total = np.concatenate(totals) * (scales.force * young_kpa) if totals else None
+        if not (np.isfinite(density).all() and (total is None or np.isfinite(total).all())):
+            raise UserError("the model answers NaN or infinity: its weights or scales can't be right")
+        return density, total
 
 
 def load_predictor(

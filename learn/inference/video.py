@@ -7,11 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import av
-import cv2
 import numpy as np
+from av.container import InputContainer
 from numpy.typing import NDArray
 
 from synth.errors import UserError
+from synth.system import foreign_file, foreign_picture
+from synth.system.foreign_picture import LARGEST_PIXELS, refuse_large
 
 SUFFIXES = (".mp4", ".mov", ".mkv", ".avi", ".webm", ".m4v")
 
@@ -20,7 +22,14 @@ FPS = 25.0
 
 Rgb = NDArray[np.uint8]
 
-_LARGEST_PIXELS = 40_000_000
+_LARGEST_BYTES = 1 << 40
+
+# What FFmpeg may open: by its content a file could also be a list of other files and addresses.
+_CONTAINERS = {
+    "format_whitelist": "mov,matroska,webm,avi,mpegts,mpeg,asf,ogg,flv",
+    "protocol_whitelist": "file",
+    "max_pixels": str(LARGEST_PIXELS),
+}
 
 
 @dataclass(frozen=True)
@@ -43,28 +52,23 @@ def read_video(path: Path, fps: float | None = None) -> Iterator[Picture]:
     Raises:
         UserError: not a video, no video stream, or pictures beyond 40 megapixels.
     """
-    try:
-        container = av.open(str(path))
-    except (av.error.FFmpegError, OSError) as error:
-        raise UserError(f"{path}: not a readable video ({_reason(error)})") from None
-    with container:
+    with _open_video(path) as container:
         if not container.streams.video:
             raise UserError(f"{path}: holds no video stream")
         stream = container.streams.video[0]
-        if stream.width * stream.height > _LARGEST_PIXELS:
-            raise UserError(f"{path}: {stream.width} x {stream.height} pixels a frame is too large")
         # Two cores at most: a bench machine scores several recordings at a time.
         stream.thread_type = "AUTO"
         stream.codec_context.thread_count = 2
         index = 0
         try:
             for frame in container.decode(stream):
+                refuse_large(frame.width, frame.height)
                 rgb = np.rot90(frame.to_ndarray(format="rgb24"), frame.rotation // 90)
                 unstated = None if fps is None else index / fps
                 time_s = unstated if frame.pts is None else float(frame.time)
                 yield Picture(index, time_s, np.ascontiguousarray(rgb))
                 index += 1
-        except av.error.FFmpegError as error:
+        except (av.error.FFmpegError, ValueError) as error:
             if index == 0:
                 raise UserError(f"{path}: not a readable video ({_reason(error)})") from None
         if index == 0:
@@ -73,10 +77,19 @@ def read_video(path: Path, fps: float | None = None) -> Iterator[Picture]:
 
 def count_frames(path: Path) -> int | None:
     """Number of frames that the container states; None if it doesn't. UserError if it is no video."""
+    with _open_video(path) as container:
+        return int(container.streams.video[0].frames) or None if container.streams.video else None
+
+
+def _open_video(path: Path) -> InputContainer:
+    foreign_file.check_file(path, _LARGEST_BYTES)
     try:
-        with av.open(str(path)) as container:
-            return int(container.streams.video[0].frames) or None if container.streams.video else None
-    except (av.error.FFmpegError, OSError) as error:
+        # By "file:" a colon in the path is no protocol.
+        container: InputContainer = av.open(f"file:{path}", options=_CONTAINERS)
+        for stream in container.streams.video:
+            refuse_large(stream.width, stream.height)
+        return container
+    except (av.error.FFmpegError, OSError, ValueError) as error:
         raise UserError(f"{path}: not a readable video ({_reason(error)})") from None
 
 
@@ -103,10 +116,7 @@ def read_picture(path: Path) -> Rgb:
     Raises:
         UserError: unreadable.
     """
-    bgr = cv2.imread(str(path), cv2.IMREAD_COLOR)
-    if bgr is None:
-        raise UserError(f"{path}: not a readable picture")
-    return np.ascontiguousarray(bgr[..., ::-1]).astype(np.uint8)
+    return np.ascontiguousarray(foreign_picture.read_picture(path)[..., ::-1]).astype(np.uint8)
 
 
 def read_mask(path: Path, size: tuple[int, int]) -> NDArray[np.bool_]:

@@ -9,13 +9,15 @@ from __future__ import annotations
 import math
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from learn.inference.pulse import Pulse, Span, Surface, find_pulse
+from learn.inference.quality import find_fault
 from learn.inference.video import Picture
 from synth.errors import UserError
 from synth.flow import mask
@@ -41,6 +43,8 @@ class Settings:
     """Flow is computed on pictures this many times smaller; 0: the most that leaves `WIDTH_KEPT` columns."""
     rate_hz: float | None = 10.0
     """At most so many frames a second are looked at; None: all."""
+    pulse: bool = True
+    """Whether the tissue's own periodic motion is looked for, and taken off."""
 
 
 def everywhere(size: Size) -> Flags:
@@ -118,6 +122,7 @@ class VideoFlow:
         settings: Settings,
         flow: FlowHere | None = None,
         is_due: Callable[[int, float], bool] = lambda index, time_s: True,
+        pulse: Pulse | None = None,
     ) -> None:
         """Nothing is decoded yet.
 
@@ -126,6 +131,7 @@ class VideoFlow:
             settings: how.
             flow: where flow is computed, closed by the caller; None: here.
             is_due: whether a frame after the rest frame, at its time [s], is to be worked on.
+            pulse: motion of the tissue's own that is taken off the flow of every frame.
         """
         self.footage, self.settings, self.watch = footage, settings, Stopwatch()
         self.tissue = np.zeros((0, 0), bool)
@@ -134,10 +140,22 @@ class VideoFlow:
         """How many times smaller than `size`, height and width of the video's own pictures, these are."""
         self.seen = self.peak_bytes = 0
         """Frames decoded, and memory of the flow's own process."""
-        self._flow, self._is_due = flow or FlowHere(), is_due
+        self.surface: Surface | None = None
+        """How the tissue moved by and large; kept while `settings.pulse` asks for it and none is off."""
+        self._flow, self._is_due, self._pulse = flow or FlowHere(), is_due, pulse
         self._left_out: Counter[str] = Counter()
         self._period_s = 0.0 if settings.rate_hz is None else 1 / settings.rate_hz
         self._due_s = self._last_s = -math.inf
+        self._rest_s: float | None = None
+        self._fault, self._rest_rgb = "", np.zeros((0, 0, 3), np.uint8)
+        self._followed, self._still = 0, True
+
+    @property
+    def fault(self) -> str:
+        """Why nothing of this video is a measurement, said once it is through; empty if something may be."""
+        if self._fault:
+            return f"the rest frame is {self._fault}"
+        return "the picture never changes" if self._followed and self._still else ""
 
     @property
     def notes(self) -> list[str]:
@@ -172,6 +190,8 @@ class VideoFlow:
                 if resting:
                     found = self._rest(small.rgb, blocked)
                     yield Step(small, found, masking_s)
+                elif self._fault:
+                    yield Step(small, self._nothing(), masking_s)
                 else:
                     under_way.append((small, masking_s, self._flow.ask(small.rgb, blocked)))
                 if len(under_way) > self._flow.ahead:
@@ -179,6 +199,16 @@ class VideoFlow:
             progress(self.seen)
         for waiting in under_way:
             yield self._step(*waiting)
+
+    def find_pulse(self, free_s: Sequence[Span] = ()) -> Pulse | None:
+        """The tissue's own motion, once all steps are through; None where none is seen or was asked for.
+
+        `free_s`: spans without contact, if known [s].
+        """
+        if self.surface is None or self._rest_s is None:
+            return None
+        with self.watch.stage("pulse"):
+            return find_pulse(self.surface, self._rest_s, free_s)
 
     def _is_wanted(self, index: int, time_s: float | None) -> bool:
         """Whether a frame is looked at; what isn't is counted."""
@@ -206,6 +236,9 @@ class VideoFlow:
         self.tissue = shrink_mask(self.footage.tissue(self.size), self.shrink, 127)
         if not self.tissue.any():
             raise UserError(f"{self.footage.name}: the picture of the tissue marks no tissue")
+        self._rest_s = picture.time_s
+        if self.settings.pulse and self._pulse is None:
+            self.surface = Surface(self.tissue)
 
     def _prepare(self, picture: Picture) -> tuple[Picture, Flags, float]:
         """A frame shrunk, what of it is no tissue (h, w), and the time that took [s]."""
@@ -224,14 +257,30 @@ class VideoFlow:
 
     def _rest(self, rgb: Rgb, blocked: Flags) -> Found:
         """Starts the flow: nothing has moved."""
+        self._fault, self._rest_rgb = find_fault(rgb, self.tissue), rgb
+        if self._fault:
+            return self._nothing()
         self._flow.begin(self.settings.backend, rgb, blocked, self.tissue)
         still = np.zeros((*self.tissue.shape, 2), np.float32)
         return Found(still, (self.tissue & ~blocked).astype(np.float32))
 
+    def _nothing(self) -> Found:
+        """Of a frame in which nothing can be followed."""
+        none = np.zeros(self.tissue.shape, np.float32)
+        return Found(np.stack([none, none], axis=-1), none, trusted=False)
+
     def _step(self, small: Picture, masking_s: float, answer: Callable[[], Found]) -> Step:
         found = answer()
+        self._followed += 1
+        self._still = self._still and np.array_equal(small.rgb, self._rest_rgb)
+        if found.trusted and find_fault(small.rgb, self.tissue):
+            found = replace(found, trusted=False)
         self.watch.add("flow", found.cpu_s, found.wall_s)
         self.peak_bytes = max(self.peak_bytes, found.peak_bytes)
+        if self._pulse is not None and small.time_s is not None:
+            found = replace(found, flow=found.flow - self._pulse.at(small.time_s))
+        elif self.surface is not None and small.time_s is not None and found.trusted:
+            self.surface.add(small.time_s, found.flow, found.confidence)
         return Step(small, found, masking_s)
 
 

@@ -25,7 +25,7 @@ class Architecture(Section):
     """Everything that decides the network's shape; stored in the checkpoint."""
 
     name: Literal["d2fnet", "unet", "monai-unet"] = "d2fnet"
-    width: Annotated[int, Field(ge=4, multiple_of=4)] = 32
+    width: Annotated[int, Field(ge=4, le=512, multiple_of=4)] = 32
     """Channels of the first level; each level doubles them."""
     levels: Annotated[int, Field(ge=1, le=5)] = 4
     """Times the picture is halved after the stem."""

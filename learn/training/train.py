@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import shutil
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from pathlib import Path
@@ -61,7 +62,28 @@ def train(
     fit, select = [clips[i] for i in split.fit], [clips[i] for i in split.select]
     scales = measure_scales(fit, settings)
     card = Card(settings, scales, typical_young(fit), *_provenance(clips, split))
-    run = _start(settings, _open(out, card))
+    state = _open(out, card)
+    try:
+        return _go_on(_start(settings, state), card, fit, select, out, report, fabric, log)
+    except (UserError, OSError):
+        # Nothing to go on from: a full disk, say, leaves nothing.
+        if state is None and fabric.is_global_zero and not (out / "last.pt").exists():
+            shutil.rmtree(out)
+        raise
+
+
+def _go_on(
+    run: _Run,
+    card: Card,
+    fit: list[Clip],
+    select: list[Clip],
+    out: Path,
+    report: Report,
+    fabric: Fabric,
+    log: Callable[[dict[str, float]], None],
+) -> Card:
+    """Epoch after epoch to the end; arguments as `train`'s."""
+    settings, scales = card.settings, card.scales
     net: Any = torch.compile(run.model) if settings.compile else run.model
     net, run.optimizer = fabric.setup(net, run.optimizer)
     frames, chooser = held(fit, settings, fabric.device), held(select, settings, fabric.device)
@@ -77,8 +99,8 @@ def train(
             if write is not None:
                 write(epoch, numbers)
                 if improved:
-                    checkpoint.save_tensors(out / "weights.pt", _cpu(run.model.state_dict()))
-                    checkpoint.write_card(out, dataclasses.replace(card, epoch=run.epoch, score=run.best))
+                    best = dataclasses.replace(card, epoch=run.epoch, score=run.best)
+                    checkpoint.write_model(out, best, _cpu(run.model.state_dict()))
                 checkpoint.save_tensors(out / "last.pt", run.as_dict())
             fabric.barrier()
             log(numbers)
@@ -128,10 +150,14 @@ def _start(settings: Settings, state: dict[str, Any] | None) -> _Run:
     plateau = ReduceLROnPlateau(optimizer, mode="max", factor=0.5, patience=settings.patience)
     run = _Run(model, optimizer, plateau)
     if state is not None:
-        model.load_state_dict(state["model"])
-        optimizer.load_state_dict(state["optimizer"])
-        plateau.load_state_dict(state["plateau"])
-        run.epoch, run.best, run.waited = state["epoch"], state["best"], state["waited"]
+        try:
+            model.load_state_dict(state["model"])
+            optimizer.load_state_dict(state["optimizer"])
+            plateau.load_state_dict(state["plateau"])
+            run.epoch, run.best, run.waited = int(state["epoch"]), float(state["best"]), int(state["waited"])
+        except (RuntimeError, ValueError, KeyError, TypeError, AttributeError) as error:
+            why = (str(error).splitlines() or ["of another kind"])[0]
+            raise UserError(f"last.pt: corrupt checkpoint ({why[:200]})") from None
     return run
 
 
@@ -252,7 +278,8 @@ def _provenance(clips: Sequence[Clip], split: Split) -> tuple[dict[str, list[str
 
 def _open(out: Path, card: Card) -> dict[str, Any] | None:
     """The state to go on from, or None for a fresh start in a fresh folder."""
-    if not out.exists() or (out.is_dir() and not any(out.iterdir())):
+    # What a kill left of a first card has a hidden name.
+    if not out.exists() or (out.is_dir() and all(one.name.startswith(".") for one in out.iterdir())):
         checkpoint.write_card(out, card)
         return None
     there = checkpoint.read_card(out)

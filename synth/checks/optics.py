@@ -50,6 +50,8 @@ def contact(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
     still, tips = camera_of(sequence), np.asarray(instruments[0]["tip_mm"], np.float64)
     scenario, time = sequence.attrs["scenario"], sequence["time"][:]
     footprint = float(scenario["gesture"]["footprint_mm"])
+    # Over the relief a rigid tip's load may be anywhere under it.
+    spread = 1.0 if sequence.attrs["mechanics"].get("contact") == "rigid" else 0.1
     sway = Sway(**scenario["sway"]) if "sway" in scenario else None
     area, tissue = sequence["area"][:], sequence["tissue"][:]
     inside = cv2.erode(tissue.astype(np.uint8), np.ones((5, 5), np.uint8), borderValue=0).astype(bool)
@@ -67,7 +69,7 @@ def contact(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
         view = sway.at(still, float(time[t])) if sway else still
         seen = cameras.to_pixels(view, cameras.to_camera(view, tips[t].reshape(-1, 3))).mean(axis=0)
         off = float(np.hypot(x - seen[0], y - seen[1])) * view.mm_per_px
-        yield Measure(off, 0.1 * footprint + view.mm_per_px, f"frame {t}")
+        yield Measure(off, spread * footprint + view.mm_per_px, f"frame {t}")
 
 
 def camera_of(sequence: Sequence) -> cameras.Camera:

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from synth.checks import optics
 from synth.checks.measure import Invariant, Measure, truth
-from synth.dataset import store
 from synth.dataset.store import Sequence
 from synth.fields import FIELDS
 
@@ -23,9 +22,7 @@ _COMPLIANCE_STEP = 0.25
 
 def seal(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
     """The attributes are those that were sealed, under the name that was given."""
-    attrs = sequence.attrs
-    yield truth(attrs.get("seal_hash") == store.seal_hash(attrs), "attributes were edited")
-    yield truth(attrs["content_hash"] == store.content_hash(attrs), "attributes were edited")
+    yield truth(sequence.is_sealed(), "attributes were edited")
     yield truth(sequence.path.stem == f"{sequence.index:06d}", "is another sequence than its name says")
 
 
@@ -82,15 +79,38 @@ def compliance(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
         or "energy_mn_mm" not in mechanics
     ):
         return
+    instruments = mechanics["instruments"]
+    forces = np.stack([one["force_mn"] for one in instruments], axis=1)
+    tips, footprint = None, 1.0
+    if mechanics.get("contact") == "rigid":
+        tips = np.concatenate([one["tip_mm"] for one in instruments], axis=1)
+        footprint = float(sequence.attrs["scenario"]["gesture"]["footprint_mm"])
     energy = np.asarray(mechanics["energy_mn_mm"], np.float64)
-    forces = np.stack([one["force_mn"] for one in mechanics["instruments"]], axis=1)
+    for t, step, limit in compliance_steps(energy, forces, tips, footprint):
+        yield Measure(step, limit, f"frame {t}")
+
+
+def compliance_steps(
+    energy: Floats, forces: Floats, tips: Floats | None, footprint_mm: float
+) -> Iterator[tuple[int, float, float]]:
+    """Steps of displacement per force: frame, relative step and its limit.
+
+    Args:
+        energy: (T,) mN mm.
+        forces: (T, I, 3) mN.
+        tips: (T, n, 3) mm of rigid ones, which touch another relief as they slide; None: tractions.
+        footprint_mm: their radius: along it, displacement per force may change by once itself.
+    """
     size = np.linalg.norm(forces, axis=(1, 2))
     for t in range(1, len(energy)):
         if min(size[t - 1], size[t]) > 0.05 * size.max():
             here, before = energy[t] / size[t] ** 2, energy[t - 1] / size[t - 1] ** 2
             changed = float(np.linalg.norm(forces[t] - forces[t - 1])) / float(min(size[t - 1], size[t]))
             step = float(np.exp(np.abs(np.log(here / before)))) - 1
-            yield Measure(step, _COMPLIANCE_STEP + changed, f"frame {t}")
+            slid = 0.0
+            if tips is not None:
+                slid = float(np.linalg.norm((tips[t] - tips[t - 1])[:, :2], axis=1).max()) / footprint_mm
+            yield t, step, _COMPLIANCE_STEP + changed + slid
 
 
 def visibility(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:

@@ -116,7 +116,7 @@ def _checks() -> dict[str, Check]:
 
 def _sequence(path: Path, name: str, checks: dict[str, Check], fast: bool) -> None:
     try:
-        sequence = open_sequence(path)
+        sequence = open_sequence(path, sealed=False)
         frames = _frames(sequence, fast)
     except UserError as error:
         checks["readable"].add(Measure(1.0, 0.0, _without(path, str(error))), path.name)
@@ -180,7 +180,7 @@ def _dataset(
         return
     for key in sealed:
         try:
-            found = open_sequence(location.store(folder.root, key))
+            found = open_sequence(location.store(folder.root, key), sealed=False)
         except UserError:
             continue  # found and named by the check of that sequence
         now, row = index.row_of(found), rows.get(key, {})
@@ -191,8 +191,26 @@ def _dataset(
         yield "dataset", truth(known, "made by a version that dataset.json does not name"), found.path.name
     surplus = sorted(key for key, row in rows.items() if row["status"] == "done" and key not in sealed)
     yield "dataset", truth(not surplus, f"rows without a sequence: {surplus[:3]}"), index.NAME
-    leaking = split.leaks(list(rows.values()), split.read_rule(folder.root))
+    try:
+        rule = split.read_rule(folder.root)
+    except UserError as error:
+        yield "splits", truth(False, str(error)), split.NAME
+        return
+    leaking = split.leaks(list(rows.values()), rule) or _misplaced(list(rows.values()), rule)
     yield "splits", truth(not leaking, "; ".join(leaking[:3]) or "none"), index.NAME
+
+
+def _misplaced(rows: list[dict[str, Any]], rule: split.Rule) -> list[str]:
+    """Sequences that the index puts on another side than the rule does."""
+    try:
+        sides = split.assign_sides(rows, rule)
+    except UserError:  # too few groups to have some on every side
+        sides = [None] * len(rows)
+    return [
+        f"sequence {row['index']} is in {row['split']}, by the rule in {side}"
+        for row, side in zip(rows, sides, strict=True)
+        if row["split"] != side
+    ]
 
 
 def _without(path: Path, text: str) -> str:

@@ -14,14 +14,27 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from pydantic import BaseModel, ValidationError
+
 from synth.dataset import location, provenance
 from synth.errors import UserError
 from synth.job import identity, writer
 from synth.job.schema import Job
+from synth.job.types import first_problem
+from synth.system import foreign_file, whole_file
+from synth.system.whole_file import write_whole as write_whole
 
 _LOCK_WAIT_S = 5.0
 _NAME = "dataset.json"
 _STATE = ".run"
+
+
+class _Described(BaseModel):
+    """What `dataset.json` holds."""
+
+    identity: str
+    job: dict[str, Any]
+    generators: list[dict[str, str]] = []
 
 
 class Folder:
@@ -38,35 +51,38 @@ class Folder:
 
     def described(self) -> dict[str, Any]:
         """`{"identity", "generators", "job"}` as first written. UserError if this is no dataset of ours."""
+        if not os.path.lexists(self.root / _NAME):
+            raise UserError(f"{self.root}: holds no dataset ({_NAME} is missing)")
+        found = foreign_file.read_json(self.root / _NAME)
         try:
-            found = json.loads((self.root / _NAME).read_text("utf-8"))
-            if not {"identity", "job"} <= found.keys():
-                raise ValueError("keys are missing")
-        except FileNotFoundError:
-            raise UserError(f"{self.root}: holds no dataset ({_NAME} is missing)") from None
-        except (OSError, ValueError, AttributeError) as error:
-            raise UserError(f"{self.root / _NAME}: is damaged ({error})") from error
-        return dict(found)
+            return _Described.model_validate(found).model_dump(exclude_unset=True)
+        except ValidationError as error:
+            at, why = first_problem(error)
+            raise UserError(f"{self.root / _NAME}: is damaged ({at or 'all of it'}: {why})") from None
 
     def job(self) -> Job:
         """The dataset's job."""
         try:
             return Job.model_validate(self.described()["job"])
-        except ValueError as error:
-            raise UserError(f"{self.root / _NAME}: is damaged or of another version ({error})") from error
+        except ValidationError as error:
+            at, why = first_problem(error)
+            raise UserError(f"{self.root / _NAME}: is damaged or of another version ({at}: {why})") from None
 
     def sealed(self) -> list[int]:
         """Indices of the finished sequences, in order."""
         with os.scandir(self.root) as entries:
-            names = [entry.name for entry in entries if entry.name.endswith(".zarr")]
-        return sorted(int(name[:-5]) for name in names if name[:-5].isdigit())
+            found = [location.index_of(entry.name) for entry in entries]
+        return sorted(index for index in found if index is not None)
 
     def failures(self) -> dict[int, dict[str, Any]]:
         """`{index: {"reason", "kind", "tries", "log"}}` of the sequences given up."""
         found = {}
         for path in sorted((self.state / "failed").glob("*.json")):
-            with contextlib.suppress(ValueError):  # cut short by a power failure: it is tried again
-                found[int(path.stem)] = json.loads(path.read_text("utf-8"))
+            # What is cut short by a power failure, or none of ours: it is tried again.
+            with contextlib.suppress(UserError, ValueError):
+                failure = foreign_file.read_json(path)
+                if isinstance(failure, dict) and isinstance(failure.get("reason"), str):
+                    found[int(path.stem)] = failure
         return found
 
     def mark_failed(self, index: int, *, kind: str, reason: str, tries: int, log: str) -> None:
@@ -93,12 +109,14 @@ class Folder:
         """Removes every leftover of interrupted attempts."""
         for part in self.root.glob("*.zarr.part"):
             shutil.rmtree(part)
+        for place in (self.root, self.state, self.state / "failed"):
+            whole_file.sweep(place)
         for log in self.logs.glob("worker-*.log"):
             log.unlink()
         for abandoned in self.scratch.glob("*"):
             shutil.rmtree(abandoned)
         for radiance in self.root.glob("radiance/[0-9]*"):
-            if radiance.name.isdigit():
+            if radiance.name.isascii() and radiance.name.isdigit():
                 self.sweep(int(radiance.name))
 
     def pass_turn(self) -> None:
@@ -138,6 +156,7 @@ def claim(root: Path, job: Job, *, mix_versions: bool = False) -> Iterator[Folde
     name = identity.identify_job(job)
     try:
         _refuse_foreign(folder, job, name)
+        _refuse_links(folder)
         makers = _makers(folder, mix_versions)
         folder.state.mkdir(parents=True, exist_ok=True)
         with _locked(folder.state / "lock") as folder.lock_fd:
@@ -166,18 +185,6 @@ def claim(root: Path, job: Job, *, mix_versions: bool = False) -> Iterator[Folde
         raise
 
 
-def write_whole(path: Path, text: str | bytes, *, durable: bool = True) -> None:
-    """Writes a small file so that it is there in full or not at all; `durable`: after a power failure too."""
-    data = text.encode() if isinstance(text, str) else text
-    part = path.with_name(f".{path.name}.part")
-    with part.open("wb") as file:
-        file.write(data)
-        if durable:
-            file.flush()
-            os.fsync(file.fileno())
-    part.rename(path)
-
-
 def _refuse_foreign(folder: Folder, job: Job, name: str) -> None:
     root = folder.root
     if not root.exists():
@@ -186,7 +193,9 @@ def _refuse_foreign(folder: Folder, job: Job, name: str) -> None:
         raise UserError(f"{root}: is a file, a folder is needed")
     if not (root / _NAME).exists():
         others = sorted(
-            entry.name for entry in root.iterdir() if entry.name not in (_STATE, f".{_NAME}.part")
+            entry.name
+            for entry in root.iterdir()
+            if entry.name != _STATE and not whole_file.is_part(entry.name, _NAME)
         )
         if others:
             raise UserError(f"{root}: holds other files ({others[0]}), choose an empty or new folder")
@@ -196,9 +205,17 @@ def _refuse_foreign(folder: Folder, job: Job, name: str) -> None:
         changes = _changes(described["job"], job.model_dump(mode="json"))
         what = ", ".join(changes[:4]) or "another mesh or photograph"
         raise UserError(f"{root}: holds the dataset of another job ({what}), choose another folder")
-    before = int(described["job"]["sequences"])
+    before = folder.job().sequences
     if before > job.sequences:
         raise UserError(f"{root}: holds {before} sequences of this job, {job.sequences} are asked for")
+
+
+def _refuse_links(folder: Folder) -> None:
+    """A link where a run writes or sweeps leads it elsewhere."""
+    own = (folder.state, *folder.state.glob("*"), *folder.state.glob("*/*"), folder.root / "radiance")
+    for place in (*own, *folder.root.glob("radiance/*"), *folder.root.glob("*.zarr.part")):
+        if place.is_symlink():
+            raise UserError(f"{place}: is a link, which is not followed; remove it")
 
 
 def _makers(folder: Folder, mix: bool) -> list[dict[str, str]]:

@@ -5,16 +5,19 @@ from __future__ import annotations
 import hashlib
 import io
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from synth.dataset import location, split
 from synth.dataset.folder import Folder, write_whole
 from synth.dataset.store import Sequence, open_sequence
 from synth.errors import UserError
+from synth.system import foreign_file
 
 NAME = "index.parquet"
 
@@ -59,24 +62,79 @@ SCHEMA = pa.schema(
 )
 
 
+_LARGEST_BYTES = 1 << 30
+_MOST_ROWS = 2_000_000
+_LONGEST_TEXT = 10_000
+_SPOILT = "; `synth card` writes it anew"
+
+
 def read_index(root: Path) -> pa.Table:
-    """The index as it was last written. UserError when it is missing or damaged."""
+    """The index as it was last written.
+
+    Raises:
+        UserError: missing, damaged, of another program or version, or with rows that no dataset has.
+    """
     path = root / NAME
     try:
-        return pq.read_table(path, memory_map=False)
-    except FileNotFoundError:
-        raise UserError(f"{path}: no such file") from None
-    except (OSError, pa.ArrowInvalid) as error:
-        raise UserError(f"{path}: is damaged ({str(error).splitlines()[0]})") from error
+        foreign_file.check_file(path, _LARGEST_BYTES)
+        about = pq.read_metadata(path)
+        if about.num_rows > _MOST_ROWS:
+            raise UserError(f"{path}: holds more than {_MOST_ROWS:,} rows")
+        if about.schema.names != SCHEMA.names:
+            raise UserError(f"{path}: is the index of another program or version{_SPOILT}")
+        texts = [field.name for field in SCHEMA if field.type == pa.string()]
+        # Texts stay dictionaries until their length is known: a small file can stand for endless ones.
+        table = pq.ParquetFile(
+            path, memory_map=False, read_dictionary=texts, page_checksum_verification=True
+        ).read(use_threads=False)
+        for name in texts:
+            table = table.set_column(table.schema.names.index(name), name, _plain(table[name]))
+        table = table.cast(SCHEMA)
+        table.validate(full=True)
+    except (OSError, pa.ArrowException, ValueError, LookupError, MemoryError) as error:
+        why = (str(error).splitlines() or ["it takes too much memory"])[0]
+        raise UserError(f"{path}: is damaged ({why[:200]}){_SPOILT}") from error
+    _check_rows(table, path)
+    return table
+
+
+def _plain(column: pa.ChunkedArray) -> pa.ChunkedArray:
+    """Texts as such. ValueError if they are none, or one is too long."""
+    if not pa.types.is_dictionary(column.type) or column.type.value_type != pa.string():
+        raise ValueError("a text is none")
+    for chunk in column.chunks:
+        if (pc.max(pc.binary_length(chunk.dictionary)).as_py() or 0) > _LONGEST_TEXT:
+            raise ValueError("a text is too long")
+    return column.cast(pa.string())
+
+
+def _check_rows(table: pa.Table, path: Path) -> None:
+    """UserError if rows say what no writer of ours does: readers take them at their word."""
+    number, done = table["index"], pc.equal(table["status"], "done")
+    told = table.filter(done)
+    named = [f"{key:06d}.zarr" for key in told["index"].to_pylist() if key is not None]
+    hashed = pc.match_substring_regex(told["content_hash"], "^[0-9a-f]{32}$")
+    right = {
+        "index": number.null_count == 0 and (pc.min(number).as_py() or 0) >= 0,
+        "index, twice": pc.count_distinct(number).as_py() == len(table),
+        "status": not len(table) or pc.all(pc.is_in(table["status"], pa.array(["done", "failed"]))).as_py(),
+        "path": told["path"].to_pylist() == named,
+        "content_hash": told["content_hash"].null_count == 0 and pc.all(hashed).as_py() is not False,
+        "split": pc.all(pc.is_in(table["split"], pa.array([*split.SIDES, None]))).as_py() is not False,
+    }
+    wrong = [name for name, good in right.items() if not good]
+    if wrong:
+        raise UserError(f"{path}: rows can't be right ({wrong[0]}){_SPOILT}")
 
 
 def collect(folder: Folder) -> list[dict[str, Any]]:
-    """All rows but for their sides, as the folder is now; those that the index has already are kept."""
+    """All rows but for their sides, as the folder is now; those that the index has already are kept.
+
+    An index that can't be read is made anew: all that it says is in the stores.
+    """
     known: dict[int, dict[str, Any]] = {}
-    if (folder.root / NAME).exists():
-        table = read_index(folder.root)
-        rows_before = table.to_pylist() if table.schema.equals(SCHEMA) else []
-        known = {row["index"]: row for row in rows_before if row["status"] == "done"}
+    with suppress(UserError):
+        known = {row["index"]: row for row in read_index(folder.root).to_pylist() if row["status"] == "done"}
     rows = {key: known.get(key) or row_of(_open(folder, key)) for key in folder.sealed()}
     for key, failure in folder.failures().items():
         if key not in rows:
@@ -87,11 +145,13 @@ def collect(folder: Folder) -> list[dict[str, Any]]:
 def written_sides(root: Path) -> dict[str, str] | None:
     """The side of every sequence by its content hash, as `synth split` decided; None where nobody did.
 
-    UserError if the dataset has too few groups for its rule.
+    From what the sealed stores say, not the index: that may be edited. UserError if the dataset has too few
+    groups for its rule.
     """
     if not split.is_written(root):
         return None
-    rows = collect(Folder(root))
+    folder = Folder(root)
+    rows = [row_of(_open(folder, key)) for key in folder.sealed()]
     sides = split.assign_sides(rows, split.read_rule(root))
     return {row["content_hash"]: side for row, side in zip(rows, sides, strict=True) if side is not None}
 
@@ -113,7 +173,7 @@ def save_rows(root: Path, rows: Iterable[Mapping[str, Any]]) -> None:
     """Writes the rows; columns that a row lacks are null."""
     table = pa.Table.from_pylist([dict(row) for row in rows], schema=SCHEMA)
     buffer = io.BytesIO()
-    pq.write_table(table, buffer, compression="zstd")
+    pq.write_table(table, buffer, compression="zstd", write_page_checksum=True)
     write_whole(root / NAME, buffer.getvalue())
 
 

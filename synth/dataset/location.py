@@ -29,6 +29,13 @@ def store(root: Path, index: int) -> Path:
     return root / f"{index:06d}.zarr"
 
 
+def index_of(name: str) -> int | None:
+    """The index of the sequence whose sealed store is called so; None if none's is."""
+    number = name.removesuffix(".zarr")
+    known = number.isascii() and number.isdigit() and name == f"{int(number):06d}.zarr"
+    return int(number) if known else None
+
+
 def find_place(where: Path | str) -> Place:
     """The place of a path or an address such as `s3://bucket/out/000000.zarr` or `zip://000000.zarr::out.zip`.
 
@@ -61,7 +68,7 @@ def stores(where: str) -> list[str]:
     found = []
     for entry in fs.ls(base, detail=False):
         name = str(entry).rstrip("/").rsplit("/", 1)[-1]
-        if name.endswith(".zarr") and name[:-5].isdigit():
+        if index_of(name) is not None:
             first, chained, rest = where.partition("::")
             slash = "" if first.endswith("/") else "/"
             found.append(f"{first}{slash}{name}{chained}{rest}")

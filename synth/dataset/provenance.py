@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import ast
+import contextlib
 import hashlib
 import json
+import os
+import sys
+import tempfile
 from collections.abc import Collection, Iterable
 from functools import cache
 from pathlib import Path
 
 from synth.system import packages
+from synth.system.cache import folder
 
 # Where the making of a sequence begins, and what it uses that decides no value.
 _MAKER = "synth.sequence.pipeline"
@@ -37,7 +42,7 @@ def generator() -> dict[str, str]:
     from synth.fields import FORMAT_VERSION
 
     home = Path(__file__).parents[2]
-    return {"format": str(FORMAT_VERSION), **_versions(home, _makers(home))}
+    return {"format": str(FORMAT_VERSION), "code": _known(home), **_computing()}
 
 
 def source(modules: Iterable[str], ours: Collection[str], home: Path = Path(__file__).parents[2]) -> str:
@@ -45,7 +50,7 @@ def source(modules: Iterable[str], ours: Collection[str], home: Path = Path(__fi
 
     `ours`: packages under `home` that are followed into.
     """
-    return word(_versions(home, _imports(home, modules, ours)))
+    return word({"code": _code(home, _imports(home, modules, ours)), **_computing()})
 
 
 def fingerprint() -> str:
@@ -59,13 +64,39 @@ def word(made_by: dict[str, str]) -> str:
     return hashlib.blake2b(described, digest_size=8).hexdigest()
 
 
-def _versions(home: Path, files: Iterable[Path]) -> dict[str, str]:
+def _known(home: Path) -> str:
+    """`_code` of what makes a sequence, kept by the files' bytes: parsing takes a second of every process."""
+    held = hashlib.blake2b(sys.version.encode(), digest_size=16)
+    for path in sorted(file for kind in ("*.py", "*.pt") for file in (home / "synth").rglob(kind)):
+        held.update(f"{path.relative_to(home)}\n{path.stat().st_size}\n".encode() + path.read_bytes())
+    try:
+        kept = folder("fingerprints") / held.hexdigest()
+        if kept.is_file():
+            return kept.read_text("ascii")
+    except OSError:
+        return _code(home, _makers(home))
+    found = _code(home, _makers(home))
+    with (
+        contextlib.suppress(OSError),
+        tempfile.NamedTemporaryFile("w", dir=kept.parent, delete=False) as file,
+    ):
+        file.write(found)
+        file.close()
+        os.replace(file.name, kept)
+    return found
+
+
+def _code(home: Path, files: Iterable[Path]) -> str:
     total = hashlib.blake2b(digest_size=8)
     for path in sorted(files):
         total.update(f"{path.relative_to(home)}\n".encode())
         total.update(_statements(path).encode() if path.suffix == ".py" else path.read_bytes())
-    computing = {name: found for name, found in packages.versions().items() if name in _COMPUTING}
-    return {"code": total.hexdigest(), **computing}
+    return total.hexdigest()
+
+
+def _computing() -> dict[str, str]:
+    """Versions of the packages that compute."""
+    return {name: found for name, found in packages.versions().items() if name in _COMPUTING}
 
 
 def _makers(home: Path) -> set[Path]:

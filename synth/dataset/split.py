@@ -4,20 +4,25 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal, cast, get_args
 
+from pydantic import FiniteFloat, TypeAdapter, ValidationError
+
 from synth.dataset.folder import write_whole
 from synth.errors import UserError
+from synth.job.types import first_problem
+from synth.system import foreign_file
 
 By = Literal["anatomy", "family", "gesture", "stiffness", "sequence"]
 """What must not be shared between the sides; `stiffness` splits at quantiles of Young's modulus."""
 
 SIDES = ("train", "validation", "test")
 _CLASSES = 10
-_NAME = "split.json"
+NAME = "split.json"
 
 
 @dataclass(frozen=True)
@@ -25,7 +30,7 @@ class Rule:
     """How a dataset is split; kept beside it, so that one that grows is split as before."""
 
     by: By = "anatomy"
-    shares: tuple[float, float, float] = (0.7, 0.15, 0.15)
+    shares: tuple[FiniteFloat, FiniteFloat, FiniteFloat] = (0.7, 0.15, 0.15)
     held_out: tuple[str, ...] = ()
     share_anatomy: bool = False
     """Whether one brain may be on several sides: scores then say nothing of other brains."""
@@ -33,28 +38,24 @@ class Rule:
 
 def is_written(root: Path) -> bool:
     """Whether the dataset in `root` was given a rule of its own (`synth split`)."""
-    return (root / _NAME).exists()
+    return (root / NAME).exists()
 
 
 def read_rule(root: Path) -> Rule:
-    """The rule of the dataset in `root`; the default if none was given."""
-    try:
-        found = json.loads((root / _NAME).read_text("utf-8"))
-        return Rule(
-            found["by"],
-            tuple(found["shares"]),
-            tuple(found["held_out"]),
-            bool(found.get("share_anatomy", False)),
-        )
-    except FileNotFoundError:
+    """The rule of the dataset in `root`; the default if none was given. UserError for what is none."""
+    if not os.path.lexists(root / NAME):
         return Rule()
-    except (ValueError, KeyError, TypeError) as error:
-        raise UserError(f"{root / _NAME}: is damaged ({error})") from error
+    found = foreign_file.read_json(root / NAME)
+    try:
+        return TypeAdapter(Rule).validate_python(found)
+    except ValidationError as error:
+        at, why = first_problem(error)
+        raise UserError(f"{root / NAME}: is damaged ({at or 'all of it'}: {why})") from None
 
 
 def keep_rule(root: Path, chosen: Rule) -> None:
     """Makes `chosen` the rule of the dataset in `root`."""
-    write_whole(root / _NAME, json.dumps(asdict(chosen), indent=1) + "\n")
+    write_whole(root / NAME, json.dumps(asdict(chosen), indent=1) + "\n")
 
 
 def parse_rule(by: str, shares: str, held_out: Sequence[str], share_anatomy: bool = False) -> Rule:
@@ -90,6 +91,8 @@ def assign_sides(rows: Sequence[Mapping[str, Any]], chosen: Rule) -> list[str | 
     strangers = set(held_out) - {str(row["family"]) for row in done}
     if strangers:
         raise UserError(f"family {', '.join(sorted(strangers))}: no sequence has it")
+    if by == "stiffness" and any(row["young_kpa"] is None for row in done):
+        raise UserError("by stiffness: a sequence says nothing of its Young's modulus")
     group = _groups(done, by, chosen.share_anatomy)
     sealed = {group[row["index"]] for row in done if row["family"] in held_out}
     sizes: dict[str, int] = {}

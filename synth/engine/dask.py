@@ -5,6 +5,8 @@ Needs the extra `cluster`. The dataset's folder must be on a file system that al
 
 from __future__ import annotations
 
+import os
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -13,15 +15,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from ruamel.yaml import YAML
-from ruamel.yaml.error import YAMLError
-
 from synth.dataset import provenance
 from synth.engine import slots
 from synth.engine.slots import LocalSlot, Slot, Slots
 from synth.engine.worker_process import Attempt, Setup
 from synth.errors import UserError
 from synth.job.schema import Job
+from synth.system import foreign_file, foreign_yaml
 from synth.system.stopwatch import Report
 
 _TOPIC = "sulcus-progress"
@@ -36,7 +36,10 @@ _kept = threading.local()
 
 @contextmanager
 def open_slots(engine: str, setup: Setup) -> Iterator[Slots]:
-    """The slots of `dask://host:port`, or of a SLURM cluster described in a YAML file.
+    """The slots of `dask://host:port`, `tls://host:port`, or of a SLURM cluster described in a YAML file.
+
+    Whoever reaches a scheduler can run code on it, so a note on stderr says where one is reached unencrypted
+    or listens on every interface. The certificates of `tls://` are those of Dask's own configuration.
 
     Raises:
         UserError: the extra is not installed, no scheduler answers, the file is wrong.
@@ -50,11 +53,13 @@ def open_slots(engine: str, setup: Setup) -> Iterator[Slots]:
     travelling = replace(
         setup, keep_open=(), environment=own, memory_bytes=None, generator=provenance.fingerprint()
     )
-    with _cluster(engine) as (address, expected):
+    with _cluster(engine) as (address, expected, security):
         try:
-            client = distributed.Client(address, timeout=_CONNECT)
+            client = distributed.Client(address, timeout=_CONNECT, security=security)
         except (OSError, TimeoutError, ValueError) as error:
             raise UserError(f"{engine}: no Dask scheduler answers ({error})") from error
+        except (TypeError, RuntimeError) as error:
+            raise UserError(f"{engine}: Dask's configuration lacks certificates ({error})") from error
         with client:
             try:
                 client.wait_for_workers(1, timeout=_WAIT_FOR_WORKERS_S)
@@ -161,16 +166,45 @@ def _why(future: Any) -> str:
 
 
 @contextmanager
-def _cluster(engine: str) -> Iterator[tuple[str, int]]:
-    """(address of the scheduler, slots that will come)."""
-    if engine.startswith("dask://"):
-        yield f"tcp://{engine.removeprefix('dask://')}", 0
+def _cluster(engine: str) -> Iterator[tuple[str, int, Any]]:
+    """(address of the scheduler, slots to come, certificates where Dask's configuration has none)."""
+    if engine.startswith(("dask://", "tls://")):
+        _note(open_to(engine))
+        yield engine.replace("dask://", "tcp://", 1), 0, None
         return
     described = read_slurm(Path(engine))
+    _note(open_to(described))
     jobs = int(described.pop("jobs"))
     with slurm(described) as cluster:
         cluster.scale(jobs=jobs)
-        yield cluster.scheduler_address, jobs * int(described["cores"])
+        yield cluster.scheduler_address, jobs * int(described["cores"]), cluster.security
+
+
+def open_to(cluster: str | dict[str, Any]) -> str:
+    """Who could run code on a cluster, an address or what `read_slurm` gives; empty where that is guarded.
+
+    Raises:
+        UserError: an address without a host or a port.
+    """
+    if isinstance(cluster, str):
+        kind, _, place = cluster.partition("://")
+        host, _, port = place.rpartition(":")
+        if not host or not (port.isascii() and port.isdigit()):
+            raise UserError(f"{cluster}: an address is written {kind}://host:port")
+        local = host in ("localhost", "[::1]") or host.startswith("127.")
+        return "" if kind == "tls" or local else f"{host} is reached unencrypted (tls://... is not)"
+    scheduler = cluster.get("scheduler_options")
+    stated = {*cluster, *(scheduler if isinstance(scheduler, dict) else ())}
+    found = (
+        [] if {"interface", "host"} & stated else ["the scheduler listens on every interface (`interface:`)"]
+    )
+    found += [] if cluster.get("security") else ["and is reached unencrypted (`security: true`)"]
+    return " ".join(found).removeprefix("and ")
+
+
+def _note(who: str) -> None:
+    if who:
+        print(f"note: {who}: whoever is in that network can run code there", file=sys.stderr)
 
 
 def slurm(described: dict[str, Any]) -> Any:
@@ -191,12 +225,10 @@ def slurm(described: dict[str, Any]) -> Any:
 
 def read_slurm(path: Path) -> dict[str, Any]:
     """`jobs` and the arguments of dask_jobqueue.SLURMCluster. UserError for a file that does not say so."""
-    try:
-        found = YAML(typ="safe").load(path.read_text("utf-8"))
-    except FileNotFoundError:
-        raise UserError(f"{path}: is neither local, dask://host:port nor a file") from None
-    except (OSError, YAMLError) as error:
-        raise UserError(f"{path}: cannot be read ({error})") from error
+    if not os.path.lexists(path):
+        raise UserError(f"{path}: is neither local, dask://host:port, tls://host:port nor a file")
+    text = foreign_file.read_text(path, foreign_yaml.LARGEST_BYTES)
+    found = foreign_yaml.plain(foreign_yaml.load(text, str(path)), str(path))
     if not isinstance(found, dict) or not isinstance(found.get("jobs"), int) or found["jobs"] < 1:
         raise UserError(f"{path}: must say how many `jobs` to ask for")
     missing = {"cores", "memory"} - found.keys()

@@ -20,6 +20,7 @@ from synth.engine.worker_process import Attempt, Setup
 from synth.errors import UserError
 from synth.job.schema import Job
 from synth.publish import card, croissant, preview_video
+from synth.render.camera import camera as cameras
 from synth.system.stopwatch import Report
 
 _TRIES = 3
@@ -32,7 +33,7 @@ class Options:
     """How to run; none of it changes a byte of the dataset."""
 
     engine: str = "local"
-    """`local`, `dask://host:port`, or a YAML file that describes a SLURM cluster."""
+    """`local`, `dask://host:port`, `tls://host:port`, or a YAML file that describes a SLURM cluster."""
     workers: int | None = None
     """Processes at a time; default one a core."""
     gpus: str = "auto"
@@ -76,6 +77,7 @@ def run_job(job: Job, root: Path, options: Options, watcher: Watcher) -> Summary
     share = slots.share_of_memory(workers) if memory is None else int(memory * 1e9)
     if options.engine == "local" and options.work == Options.work:  # a stand-in takes what it takes
         size_forecast.refuse_if_too_long(job, share, workers)
+    cameras.refuse_unfit(job.render)
     gpus = slots.gpus(options.gpus, job.render.variant == "cuda_ad_rgb")
     with claim(root, job, mix_versions=options.mix_versions) as folder:
         finished, failures = set(folder.sealed()), folder.failures()

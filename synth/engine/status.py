@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import fcntl
-import json
 import os
 import shutil
 from collections import Counter
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
+
+from pydantic import TypeAdapter, ValidationError
 
 from synth.dataset import location, size_forecast
 from synth.dataset.folder import Folder
@@ -18,6 +19,7 @@ from synth.dataset.store import open_sequence
 from synth.engine.journal import Account
 from synth.engine.progress import clock, rates, remaining
 from synth.errors import UserError
+from synth.system import foreign_file
 
 
 @dataclass(frozen=True)
@@ -104,7 +106,7 @@ def lines(status: Status) -> list[str]:
 def _journal(folder: Folder) -> Account | None:
     """What the run at work says of itself; None when none is at work."""
     try:
-        descriptor = os.open(folder.state / "lock", os.O_RDONLY)
+        descriptor = os.open(folder.state / "lock", os.O_RDONLY | os.O_NONBLOCK)
     except FileNotFoundError:
         return None
     try:
@@ -118,8 +120,8 @@ def _journal(folder: Folder) -> Account | None:
 
 def _account(folder: Folder) -> Account:
     try:
-        return Account(**json.loads((folder.state / "progress.json").read_text("utf-8")))
-    except (FileNotFoundError, ValueError, TypeError):  # it has only just begun, or is of another version
+        return TypeAdapter(Account).validate_python(foreign_file.read_json(folder.state / "progress.json"))
+    except (UserError, ValidationError):  # it has only just begun, or is of another version
         return Account(0, 0.0, 0, None, True, {}, None, None, 0, {})
 
 

@@ -74,13 +74,13 @@ def solve_path(system: System, loads: Floats, named: Floats, *, lean: bool = Fal
         if system.law == "linear":
             u = linear(load)
             state = system.state(u)
-            residual[step] = np.linalg.norm(_on_free(system, load - state.force)) / np.sqrt(peak_squared)
+            residual[step] = np.linalg.norm(on_free(system, load - state.force)) / np.sqrt(peak_squared)
         else:
             factor = float(np.vdot(load, peak)) / peak_squared
             proportional = float(np.abs(load - factor * peak).max()) <= 1e-9 * float(np.abs(peak).max())
             last = path[-1][0] if path else np.zeros_like(load)
             if proportional:
-                start = _interpolate_states(known, factor, at_peak)
+                start = interpolate_states(known, factor, at_peak)
             elif lean:
                 start = bends.guess(load)
             else:
@@ -215,7 +215,7 @@ def minimise_energy(
     u, state = start, system.state(start)
     if not np.isfinite(state.energy):
         u, state = safe, system.state(safe)
-    gradient = _on_free(system, state.force - load)
+    gradient = on_free(system, state.force - load)
     history: list[_Step] = []
     norm = np.inf
     preconditioned = system.solve(gradient)
@@ -241,7 +241,7 @@ def minimise_energy(
             length *= 0.5
         else:
             break
-        trial_gradient = _on_free(system, trial_state.force - load)
+        trial_gradient = on_free(system, trial_state.force - load)
         s, y = length * direction, trial_gradient - gradient
         curvature = float(np.vdot(s, y))
         then, preconditioned = preconditioned, system.solve(trial_gradient)
@@ -279,8 +279,8 @@ def _two_loop_recursion(
     return r
 
 
-def _interpolate_states(known: list[tuple[float, Floats]], factor: float, at_peak: Floats) -> Floats:
-    """The state at a load factor, through the three nearest known: elastic states depend on nothing else."""
+def interpolate_states(known: list[tuple[float, Floats]], factor: float, at_peak: Floats) -> Floats:
+    """The state (N, 3) mm at a load factor, through the three nearest known: it depends on no more."""
     nearest = sorted(known, key=lambda k: abs(k[0] - factor))[:3]
     if len(nearest) == 1:
         return factor * at_peak
@@ -294,8 +294,8 @@ def _interpolate_states(known: list[tuple[float, Floats]], factor: float, at_pea
     return value
 
 
-def _on_free(system: System, force: Floats) -> Floats:
-    """The force without what the walls take."""
+def on_free(system: System, force: Floats) -> Floats:
+    """The force (N, 3) mN without what the walls take."""
     out = np.zeros(force.size)
     out[system.free] = force.ravel()[system.free]
     return out.reshape(-1, 3)

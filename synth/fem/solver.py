@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from synth.fem import equilibrium, motion, surface_embedding, tool
+from synth.fem import equilibrium, indentation, motion, surface_embedding, tool
 from synth.fem.equilibrium import InvertedElement, Path
 from synth.fem.material import Tissue, check_load
 from synth.fem.mesh.tetrahedra import Tets
@@ -92,8 +92,11 @@ def deform(
         check_load(tissue.law, one.load)
     courses = [tool.course(one, frames) for one in gestures]
     area = surface_embedding.vertex_area(skin_vertices, skin_faces)
+    rigid = [k for k, one in enumerate(gestures) if indentation.applies(fem, one)]
+    given = [k for k in range(len(gestures)) if k not in rigid]
     traction = np.sum(
-        [tool.tractions(g, over, skin_vertices, area) for g, over in zip(gestures, courses, strict=True)],
+        [tool.tractions(gestures[k], courses[k], skin_vertices, area) for k in given]
+        or [np.zeros((frames, *skin_vertices.shape))],
         axis=0,
     )
     carry = surface_embedding.embed(tets, skin_vertices)
@@ -107,7 +110,13 @@ def deform(
     if pulse is not None:
         raising = lift(system, carry, skin_vertices, skin_faces, opening or schema.Craniotomy())
         loads += pulse.height(time)[:, None, None] * raising
-    if timeless:
+    pressed = None
+    if rigid:
+        played = [(gestures[k], courses[k]) for k in rigid]
+        skin = indentation.Skin(carry, skin_vertices, area)
+        pressed = indentation.press_skin(fem, tissue, played, skin, system, loads, named)
+        path, traction = pressed.path, traction + pressed.traction
+    elif timeless:
         path = equilibrium.solve_path(
             system, loads, named, lean=pulse is not None or tissue.sheet is not None
         )
@@ -119,6 +128,10 @@ def deform(
         np.outer(over.load, np.sum([c.force_mn for c in g.contacts], axis=0))
         for g, over in zip(gestures, courses, strict=True)
     ]
+    if pressed is not None:
+        for which, k in enumerate(rigid):
+            forces[k] = pressed.force[:, which]
+            tip[:, 2 * k : 2 * k + 2] = tool.hover(gestures[k], courses[k], pressed.tips[:, which])
     return Deformation(
         rest=skin_vertices,
         faces=skin_faces,

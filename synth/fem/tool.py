@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from synth.errors import UserError
 from synth.fem.material import Tissue
 from synth.job import schema
+from synth.job.law_limits import RIGID_GESTURES, load_of_depth
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -71,6 +72,9 @@ class Gesture:
         footprint = float(rng.uniform(*fem.footprint_mm))
         size = tissue.young_kpa * footprint**2
         load = float(rng.uniform(*fem.load) if fem.force_mn is None else rng.uniform(*fem.force_mn) / size)
+        if fem.depth_mm is not None and kind in RIGID_GESTURES:
+            depth = float(rng.uniform(*fem.depth_mm))
+            load = load_of_depth(fem.tip, depth / footprint, tissue.poisson)
         spread = footprint * float(rng.uniform(1.2, 1.8) if kind == "grasp" else rng.uniform(0.1, 0.9))
         path = float(rng.uniform(3, 8)) if kind == "slide" else 0.0
         azimuth = float(rng.uniform(0, 360))
@@ -80,12 +84,15 @@ class Gesture:
         point = radius * np.array([np.cos(angle), np.sin(angle)])
         turn = rng.uniform(0, 2 * np.pi)
         along = np.array([np.cos(turn), np.sin(turn)])
-        cone = np.cos(np.radians(fem.cone_deg))
+        cone, friction = np.cos(np.radians(fem.cone_deg)), _FRICTION
+        if fem.contact == "rigid" and kind in RIGID_GESTURES:
+            friction = fem.friction
+            cone = max(cone, 1 / np.hypot(1, friction))  # beyond Coulomb's cone a tip would slip off
         rise = rng.uniform(cone, 1.0)
         if kind == "retract":  # sideways, as a spatula holds tissue away
             rise = rng.uniform(0.1, max(cone, 0.3))
         elif kind == "slide":
-            rise = 1 / np.hypot(1, _FRICTION)
+            rise = 1 / np.hypot(1, friction)
         up = rise if kind in ("pull", "grasp") else -rise
         way = np.append(np.sqrt(1 - rise**2) * along, up)
         across = np.radians(azimuth + 90)
@@ -223,8 +230,7 @@ def anchors(
     gesture: Gesture, over: Course, vertices: Floats, faces: NDArray[np.integer]
 ) -> tuple[Ints, Floats]:
     """Where the tips touch: (T, K, 3) vertices of the surface and their weights (T, K, 3)."""
-    turn = np.radians(gesture.azimuth_deg + 90)
-    aside = 0.5 * gesture.spread_mm * np.array([np.cos(turn), np.sin(turn)])
+    aside = 0.5 * gesture.spread_mm * across(gesture)[:2]
     start = np.asarray(gesture.point_mm) - 0.5 * np.asarray(gesture.path_mm)
     reach = np.abs(aside).max() + np.abs(gesture.path_mm).max() + 3 * gesture.footprint_mm
     near = faces[(np.abs(vertices[faces, :2] - start).max(axis=2) <= reach).any(axis=1)]
@@ -261,10 +267,18 @@ def pose(
     touched = np.stack(
         [np.einsum("kc,kcd->kd", w, at[c]) for w, c, at in zip(weights, corners, surface, strict=True)]
     )
-    hand = shaft(gesture)
-    return touched + gesture.hover_mm * over.away[:, None, None] * hand, np.broadcast_to(
-        hand, touched.shape
-    ).copy()
+    return hover(gesture, over, touched), np.broadcast_to(shaft(gesture), touched.shape).copy()
+
+
+def hover(gesture: Gesture, over: Course, touched: Floats) -> Floats:
+    """Tips (T, 2, 3) mm, away from where they touch (T, 2, 3) mm while the instrument comes and goes."""
+    return np.asarray(touched + gesture.hover_mm * over.away[:, None, None] * shaft(gesture))
+
+
+def across(gesture: Gesture) -> Floats:
+    """Unit vector from the instrument's first tip to its second, (3,) world axes, level."""
+    turn = np.radians(gesture.azimuth_deg + 90)
+    return np.array([np.cos(turn), np.sin(turn), 0.0])
 
 
 def shaft(gesture: Gesture) -> Floats:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,9 +13,13 @@ from numpy.typing import NDArray
 
 from synth.errors import UserError
 from synth.geometry import vtk
+from synth.job import identity
 from synth.job.schema import Attachment, Craniotomy
+from synth.system import foreign_file
 
 Floats = NDArray[np.float64]
+
+_KINDS = ("obj", "stl", "ply", "off", "vtk")
 
 
 @dataclass(frozen=True)
@@ -95,14 +100,21 @@ def _heights(vertices: Floats, faces: NDArray[np.int64]) -> Floats:
 
 
 def _read(path: Path) -> tuple[Floats, NDArray[np.int64]]:
-    if not path.is_file():
-        raise UserError(f"anatomy.mesh: there is no file {path}")
+    kind = path.suffix.lower().removeprefix(".")
+    if kind not in _KINDS:
+        raise UserError(f"anatomy.mesh: {path.name} is none of {', '.join(_KINDS)}")
     try:
-        if path.suffix.lower() == ".vtk":
-            return _merged(*vtk.read_vtk(path))
-        mesh = trimesh.load(path, force="mesh", process=False)
-    except (ValueError, IndexError, KeyError, NotImplementedError, UnicodeDecodeError) as error:
-        raise UserError(f"anatomy.mesh: {path.name} is no surface that can be read ({error})") from error
+        data = foreign_file.read_bytes(path, identity.FILES["anatomy", "mesh"])
+    except UserError as error:
+        raise UserError(f"anatomy.mesh: {error}") from None
+    try:
+        if kind == "vtk":
+            return _merged(*vtk.read_vtk(data))
+        # Given bytes, trimesh has no folder in which to look for further files that this one names.
+        mesh = trimesh.load(io.BytesIO(data), file_type=kind, force="mesh", process=False)
+    except Exception as error:  # each format's reader raises what it likes
+        said = (str(error).splitlines() or [type(error).__name__])[0][:200]
+        raise UserError(f"anatomy.mesh: {path.name} is no surface that can be read ({said})") from error
     if not isinstance(mesh, trimesh.Trimesh):
         raise UserError(f"anatomy.mesh: {path.name} holds no surface")
     return _merged(np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64))

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+
+from synth.system.jit import compiled
 
 Floats = npt.NDArray[np.float64]
 
@@ -24,16 +26,28 @@ def normals(shape: Shape) -> Floats:
 
     Summed in the faces' own order: the renderer's own sum over threads would not be the same twice.
     """
-    corners = shape.vertices[shape.faces]
-    face = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    total = np.zeros_like(shape.vertices)
-    for axis in range(3):
-        for corner in range(3):
-            total[:, axis] += np.bincount(
-                shape.faces[:, corner], face[:, axis], minlength=len(shape.vertices)
-            )
+    total = _area_weighted(np.ascontiguousarray(shape.vertices, np.float64), shape.faces)
     length = np.linalg.norm(total, axis=1, keepdims=True)
     flat = length[:, 0] < 1e-12
     total[flat] = [0.0, 0.0, 1.0]
     length[flat] = 1.0
     return np.asarray(total / length)
+
+
+def _area_weighted_loop(vertices, faces):  # type: ignore[no-untyped-def]
+    total = np.zeros_like(vertices)
+    # A corner at a time: rounding is then that of a sum over all first corners, all second and all third.
+    for corner in range(3):
+        for f in range(len(faces)):
+            a, b, c = faces[f]
+            x, y, z = vertices[a, 0], vertices[a, 1], vertices[a, 2]
+            d0, d1, d2 = vertices[b, 0] - x, vertices[b, 1] - y, vertices[b, 2] - z
+            e0, e1, e2 = vertices[c, 0] - x, vertices[c, 1] - y, vertices[c, 2] - z
+            at = faces[f, corner]
+            total[at, 0] += d1 * e2 - d2 * e1
+            total[at, 1] += d2 * e0 - d0 * e2
+            total[at, 2] += d0 * e1 - d1 * e0
+    return total
+
+
+_area_weighted: Any = compiled(_area_weighted_loop)

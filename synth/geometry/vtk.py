@@ -6,8 +6,6 @@ connectivity.
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -18,13 +16,13 @@ _TYPES = {"float": ">f4", "double": ">f8", "int": ">i4", "long": ">i8", "vtktype
 _TRIANGLE, _POLYGON, _QUAD = 5, 7, 9
 
 
-def read_vtk(path: Path) -> tuple[Floats, Ints]:
-    """Vertices (V, 3) and triangles (F, 3) of a file; polygons are cut into fans.
+def read_vtk(data: bytes) -> tuple[Floats, Ints]:
+    """Vertices (V, 3) and triangles (F, 3) of a file's bytes; polygons are cut into fans.
 
     Raises:
         ValueError: no legacy VTK file of polygons.
     """
-    return _Reader(path.read_bytes()).surface()
+    return _Reader(data).surface()
 
 
 class _Reader:

@@ -7,8 +7,15 @@ import json
 from pathlib import Path
 from typing import Any
 
-from synth.errors import UserError
 from synth.job.schema import Job
+from synth.system import foreign_file
+
+FILES: dict[tuple[str | int, ...], int] = {
+    ("anatomy", "mesh"): 1 << 30,
+    ("appearance", "photo"): foreign_file.LARGEST_PICTURE,
+    ("render", "calibration"): 1 << 20,
+}
+"""Paths in a job, as places in it, and the bytes that such a file may have."""
 
 
 def canonical(value: Any) -> bytes:
@@ -23,9 +30,8 @@ def identify_job(job: Job) -> str:
     sequences: sequence 3 is the same in a dataset of 24 and of 48, so a dataset can be extended.
     """
     described = job.model_dump(mode="json", exclude={"sequences", "card"})
-    described["anatomy"]["mesh"] = _digest(job.anatomy.mesh)
-    described["appearance"]["photo"] = _digest(job.appearance.photo)
-    described["render"]["calibration"] = _digest(job.render.calibration)
+    for (block, name), largest in FILES.items():
+        described[str(block)][str(name)] = _digest(getattr(getattr(job, str(block)), str(name)), largest)
     return hashlib.blake2b(canonical(described), digest_size=16).hexdigest()
 
 
@@ -34,15 +40,12 @@ def identify_anatomy(job: Job, seed: int) -> str:
 
     A brain is one anatomy wherever it is opened and whatever vessels are drawn on it.
     """
-    mesh = _digest(job.anatomy.mesh)
+    mesh = _digest(job.anatomy.mesh, FILES["anatomy", "mesh"])
     return f"seed-{seed}" if mesh is None else f"mesh-{mesh[:16]}"
 
 
-def _digest(path: Path | None) -> str | None:
+def _digest(path: Path | None, largest: int) -> str | None:
     if path is None:
         return None
-    try:
-        with path.open("rb") as file:
-            return hashlib.file_digest(file, lambda: hashlib.blake2b(digest_size=16)).hexdigest()
-    except OSError as error:
-        raise UserError(f"{path}: cannot be read ({error.strerror})") from error
+    with foreign_file.open_file(path, largest) as file:
+        return hashlib.file_digest(file, lambda: hashlib.blake2b(digest_size=16)).hexdigest()

@@ -21,6 +21,10 @@ LEAST_JACOBIAN = 0.2
 """Smallest det F a frame may hold; below it, elements are about to turn inside out."""
 
 
+RIGID_GESTURES = ("push", "slide", "tap")
+"""What a rigid tip can do; tissue that is pulled, grasped or held aside is held by more than pressure."""
+
+
 def law_error(law: str, load: float) -> float:
     """Error of a law at P = `load` as a part, between the lines of `LAW_ERROR`; infinite past its end."""
     if law == "neo-hookean":
@@ -42,3 +46,26 @@ def choose(law: str, load: float, tolerance: float) -> tuple[str, str]:
         if error <= tolerance:
             return name, f"cheapest law within {tolerance:.1%} up to P = {load:g}: measured error {error:.1%}"
     raise AssertionError("neo-Hookean is the reference: its error is none")
+
+
+SPHERE = 2.0
+"""Radius of a rigid sphere as a multiple of the contact's radius a: at P = 0.4 it touches within 0.8 a."""
+
+
+def depth_of_load(tip: str, load: float, poisson: float) -> float:
+    """How deep a rigid tip sinks into a half-space, as a part of its radius (Sneddon, Int. J. Eng. Sci. 3,
+    1965).
+
+    Args:
+        tip: `flat` (taken as sharp-edged) or `sphere` (taken as a paraboloid of radius `SPHERE` a).
+        load: P = F/(E a^2).
+        poisson: its ratio.
+    """
+    pressed = load * (1 - poisson**2)
+    return pressed / 2 if tip == "flat" else float((0.75 * pressed) ** (2 / 3) / SPHERE ** (1 / 3))
+
+
+def load_of_depth(tip: str, depth: float, poisson: float) -> float:
+    """The inverse of `depth_of_load`: P = F/(E a^2) at a depth that is a part of the radius a."""
+    pressed = 2 * depth if tip == "flat" else depth**1.5 * SPHERE**0.5 / 0.75
+    return float(pressed / (1 - poisson**2))

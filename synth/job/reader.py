@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import difflib
+import os
+import re
+import reprlib
 import typing
 from collections.abc import Iterable, Iterator, Sequence
 from importlib import resources
@@ -10,20 +13,21 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
-from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedMap, CommentedSeq
-from ruamel.yaml.error import MarkedYAMLError
 
 from synth.errors import UserError
+from synth.job import identity
 from synth.job.schema import Job
+from synth.system import foreign_file, foreign_yaml
 
 Model = TypeVar("Model", bound=BaseModel)
 
 Loc = tuple[str | int, ...]
 """Where in the job: keys and positions from the top."""
 
-# Paths that are resolved and must exist, as places in the job.
-_FILES: tuple[Loc, ...] = (("anatomy", "mesh"), ("appearance", "photo"), ("render", "calibration"))
+_MOST_MISTAKES = 20
+_DEEPEST = 8  # keys of an override, one in another
+_LONG = 80
 
 _KINDS = {
     "int_parsing": "a whole number is needed",
@@ -60,26 +64,35 @@ def load_job(source: str, overrides: Sequence[str] = ()) -> Job:
     Raises:
         UserError: one line for every mistake, `job.yaml:12:3: render.sppp: unknown key, did you mean 'spp'?`
     """
-    path = Path(source)
-    if path.exists() or source not in names():
-        text, label, folder = _text(path), source, path.resolve().parent
-    else:
-        text = (resources.files("synth.job") / "named" / f"{source}.yaml").read_text("utf-8")
-        label, folder = f"{source} (a named job)", Path.cwd()
+    text, label, folder = read_source(source)
     return parse_job(text, label, folder, overrides)
+
+
+def read_source(source: str) -> tuple[str, str, Path]:
+    """Text of a job file or named job, its name in messages, and where its relative paths start."""
+    if source in names() and not os.path.lexists(source):
+        text = (resources.files("synth.job") / "named" / f"{source}.yaml").read_text("utf-8")
+        return text, f"{source} (a named job)", Path.cwd()
+    if not os.path.lexists(source):
+        close = difflib.get_close_matches(source[:_LONG], names(), 1)
+        hint = f"did you mean '{close[0]}'?" if close else f"nor a job called so ({', '.join(names())})"
+        raise UserError(f"{_cut(source)}: no such file; {hint}")
+    text = foreign_file.read_text(Path(source), foreign_yaml.LARGEST_BYTES)
+    return text, source, Path(source).resolve().parent
 
 
 def parse_job(text: str, label: str, folder: Path, overrides: Sequence[str] = ()) -> Job:
     """The job in `text`; `label` names it in messages and its relative paths start at `folder`."""
-    written = _yaml(text, label)
+    written = foreign_yaml.load(text, label)
     if not isinstance(written, CommentedMap):
         raise UserError(f"{label}:1:1: a job is a block of `key: value` lines")
-    values = _plain(written)
+    values = foreign_yaml.plain(written, label)
     given = _apply(values, overrides)
     problems = []
-    for at in _FILES:
+    for at, largest in identity.FILES.items():
         base = Path.cwd() if at in given else folder
-        problems += _resolve(values, at, base, _place(written, at, label, given))
+        what = _resolve(values, at, base, largest)
+        problems += [(*_place(written, at, label, given), f"{_dotted(at)}{what}")] if what else []
     job = None
     try:
         job = Job.model_validate(values)
@@ -87,7 +100,8 @@ def parse_job(text: str, label: str, folder: Path, overrides: Sequence[str] = ()
         for at, unknown, what in _mistakes(error, Job):
             problems.append((*_place(written, at, label, given, key=unknown), what))
     if problems or job is None:
-        raise UserError("\n".join(f"{where}: {what}" for _, where, what in sorted(set(problems))))
+        lines = [f"{where}: {what}" for _, where, what in sorted(set(problems))]
+        raise UserError("\n".join(lines))
     return job
 
 
@@ -113,41 +127,13 @@ def _given(given: dict[Loc, str], at: Loc) -> str:
 
 def _mistakes(error: ValidationError, model: type[BaseModel]) -> Iterator[tuple[Loc, bool, str]]:
     """Where each mistake is, whether it is a key that is not known, and what to say of it."""
-    for one in error.errors(include_url=False):
+    found = error.errors(include_url=False)
+    inside = {_trim(one["loc"])[:-1] for one in found[:_MOST_MISTAKES]}
+    for one in found[:_MOST_MISTAKES]:
         at = _trim(one["loc"])
+        if one["type"] == "too_short" and at in inside:  # only right items count: the wrong ones are named
+            continue
         yield at, one["type"] == "extra_forbidden", f"{_dotted(at)}{_message(one, at, model)}"
-
-
-def _text(path: Path) -> str:
-    try:
-        return path.read_text("utf-8")
-    except FileNotFoundError:
-        close = difflib.get_close_matches(str(path), names(), 1)
-        hint = f"did you mean '{close[0]}'?" if close else f"nor a job called so ({', '.join(names())})"
-        raise UserError(f"{path}: no such file; {hint}") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise UserError(f"{path}: cannot be read ({error})") from error
-
-
-def _yaml(text: str, label: str) -> Any:
-    reader = YAML(typ="rt")
-    try:
-        return reader.load(text)
-    except MarkedYAMLError as error:
-        mark = error.problem_mark or error.context_mark
-        where = f"{label}:{mark.line + 1}:{mark.column + 1}" if mark else label
-        problem = str(error.problem or error.context).splitlines()[0]
-        raise UserError(f"{where}: {problem}") from None
-    except Exception as error:  # the reader raises bare ValueErrors for odd scalars and control characters
-        raise UserError(f"{label}: is not YAML ({str(error).splitlines()[0]})") from error
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
-    if isinstance(value, list):
-        return [_plain(item) for item in value]
-    return value
 
 
 def _apply(values: dict[Any, Any], overrides: Iterable[str]) -> dict[Loc, str]:
@@ -156,31 +142,35 @@ def _apply(values: dict[Any, Any], overrides: Iterable[str]) -> dict[Loc, str]:
     for text in overrides:
         dotted, equals, value = text.partition("=")
         at: Loc = tuple(dotted.strip().split("."))
-        if not equals or not all(at):
-            raise UserError(f"{text}: an override is written section.key=value")
+        if not equals or not all(at) or len(at) > _DEEPEST:
+            raise UserError(f"{_cut(text)}: an override is written section.key=value")
         block: Any = values
         for key in at[:-1]:
             if not isinstance(block.get(key), dict):
                 block[key] = {}
             block = block[key]
-        block[at[-1]] = _plain(_yaml(value, text)) if value.strip() else None
+        label = _cut(text)
+        block[at[-1]] = foreign_yaml.plain(foreign_yaml.load(value, label), label) if value.strip() else None
         given[at] = text
     return given
 
 
-def _resolve(
-    values: dict[Any, Any], at: Loc, base: Path, place: tuple[int, str]
-) -> list[tuple[int, str, str]]:
+def _resolve(values: dict[Any, Any], at: Loc, base: Path, largest: int) -> str:
+    """Makes the path at `at` absolute; what is wrong with it, or nothing."""
     block: Any = values
     for key in at[:-1]:
         block = block.get(key) if isinstance(block, dict) else None
     if not isinstance(block, dict) or not isinstance(block.get(at[-1]), str):
-        return []
-    path = (base / Path(block[at[-1]]).expanduser()).resolve()
-    if not path.is_file():
-        return [(*place, f"{_dotted(at)}no such file ({path})")]
+        return ""
+    try:
+        path = (base / Path(block[at[-1]]).expanduser()).resolve()
+        foreign_file.check_file(path, largest)
+    except UserError as error:
+        return str(error)
+    except (RuntimeError, ValueError, OSError):  # nobody's home, a NUL, a circle of links, too long a name
+        return f"{_cut(repr(block[at[-1]]))} is no name of a file"
     block[at[-1]] = str(path)
-    return []
+    return ""
 
 
 def _place(
@@ -212,13 +202,15 @@ def _place(
 
 def _trim(loc: Loc) -> Loc:
     """The place without the names that pydantic adds for validators and unions."""
-    return tuple(step for step in loc if isinstance(step, int) or "[" not in step)
+    kept = tuple(step for step in loc if isinstance(step, int) or not re.fullmatch(r"[\w-]+\[.*\]", step))
+    return kept or loc  # a key may look so too
 
 
 def _dotted(at: Loc) -> str:
     text = ""
     for step in at:
-        text += f"[{step}]" if isinstance(step, int) else f".{step}" if text else str(step)
+        name = _cut(step if str(step).isprintable() else repr(step)) if isinstance(step, str) else ""
+        text += f".{name}" if name and text else name or f"[{step}]"
     return f"{text}: " if text else ""
 
 
@@ -227,26 +219,42 @@ def _message(error: Any, at: Loc, model: type[BaseModel]) -> str:
     if kind == "extra_forbidden":
         return f"unknown key{_did_you_mean(at, model)}"
     if kind == "literal_error":
-        close = difflib.get_close_matches(str(error["input"]), str(context["expected"]).split("'")[1::2], 1)
-        return f"{error['input']!r} is not one of {context['expected']}" + (
+        given = str(error["input"])[:_LONG]
+        close = difflib.get_close_matches(given, str(context["expected"]).split("'")[1::2], 1)
+        return f"{_short(error['input'])} is not one of {context['expected']}" + (
             f"; did you mean '{close[0]}'?" if close else ""
         )
     if kind == "value_error":
-        return str(context["error"])
+        return _cut(str(context["error"]), 4 * _LONG)
     limits = {"greater_than": ">", "greater_than_equal": ">=", "less_than": "<", "less_than_equal": "<="}
     if kind in limits:
         limit = context[{">": "gt", ">=": "ge", "<": "lt", "<=": "le"}[limits[kind]]]
-        return f"{error['input']!r} is out of range, it must be {limits[kind]} {limit:g}"
+        return f"{_short(error['input'])} is out of range, it must be {limits[kind]} {limit:g}"
     if kind == "missing" and isinstance(at[-1], str):
         return "is missing"
-    if kind in ("missing", "too_short", "too_long"):
+    if kind in ("too_short", "too_long"):
+        least = context.get("min_length")
+        bound = f"at most {context.get('max_length')}" if least is None else f"at least {least}"
+        return f"the list has the wrong length, it needs {bound}"
+    if kind == "missing":
         return f"the list has the wrong length ({error['msg'].lower()})"
-    return f"{_KINDS.get(kind, error['msg'])}, not {error['input']!r}"
+    return f"{_KINDS.get(kind, error['msg'])}, not {_short(error['input'])}"
+
+
+def _short(value: Any) -> str:
+    """A value as it would be written, its middle left out where it is long."""
+    shortened = reprlib.Repr()
+    shortened.maxstring = shortened.maxother = _LONG
+    return shortened.repr(value)
+
+
+def _cut(text: str, most: int = 80) -> str:
+    return text if len(text) <= most else f"{text[: most - 3]}..."
 
 
 def _did_you_mean(at: Loc, model: type[BaseModel]) -> str:
     block = _model_at(at[:-1], model)
-    close = difflib.get_close_matches(str(at[-1]), list(block.model_fields), 1, 0.6)
+    close = difflib.get_close_matches(str(at[-1])[:_LONG], list(block.model_fields), 1, 0.6)
     if close:
         return f", did you mean '{close[0]}'?"
     elsewhere = [place for place in places(model) if place[-1] == at[-1]]

@@ -9,7 +9,7 @@ from pydantic import AfterValidator, BeforeValidator, Field, FiniteFloat, model_
 
 from synth import fields
 from synth.flow.estimator import names
-from synth.job.law_limits import LARGEST_LOAD, choose
+from synth.job.law_limits import LARGEST_LOAD, RIGID_GESTURES, choose, depth_of_load, load_of_depth
 from synth.job.microscope import Light as Light
 from synth.job.microscope import Render as Render
 from synth.job.microscope import Sensor as Sensor
@@ -190,6 +190,15 @@ class Fem(Section):
         tuple[Literal["pull", "push", "slide", "grasp", "retract", "tap"], ...], Field(min_length=1)
     ] = ("pull", "push", "slide", "grasp", "retract", "tap")
     """Kinds of gesture that sequences are drawn from, in equal shares."""
+    contact: Literal["traction", "rigid"] = "traction"
+    """What loads tissue: a given traction or, for push, slide and tap, a rigid tip that presses and rubs."""
+    tip: Literal["flat", "sphere"] = "flat"
+    """Rigid contact: a flat end of radius a, its edge rounded by a / 4, or a sphere of radius 2 a."""
+    friction: Annotated[FiniteFloat, Field(ge=0, le=1)] = 0.2
+    """Rigid contact: Coulomb's coefficient; 0.09-0.20, brain on metal (Rashid et al., J. Mech. Behav. Biomed.
+    Mater. 14, 2012)."""
+    depth_mm: PositiveRange | None = None
+    """Rigid contact: peak depth of the tip below first touch [mm]; given, it takes the place of `load`."""
     instruments: InstrumentRange = (1, 1)
     """How many instruments act at once, each with a gesture, load, direction and timing of its own."""
     ramp: PositiveRange = (0.25, 0.35)
@@ -218,10 +227,33 @@ class Fem(Section):
         return self
 
     @model_validator(mode="after")
+    def _rigid_contact_is_possible(self) -> Fem:
+        if self.contact == "traction":
+            if self.depth_mm is not None:
+                raise ValueError("depth_mm needs contact: rigid")
+            return self
+        if self.time != "quasi-static" or self.relaxation:
+            raise ValueError("contact: rigid is for quasi-static tissue without relaxation")
+        if not set(self.gestures) & set(RIGID_GESTURES):
+            raise ValueError(f"contact: rigid is for {', '.join(RIGID_GESTURES)}; name one in gestures")
+        if self.depth_mm is not None and (
+            self.force_mn is not None or set(self.gestures) - set(RIGID_GESTURES)
+        ):
+            raise ValueError(f"depth_mm is for {', '.join(RIGID_GESTURES)} alone, without force_mn")
+        return self
+
+    @model_validator(mode="after")
     def _load_is_in_the_laws_range(self) -> Fem:
         load = self.largest_load
         law, _ = self.chosen_law
         largest = LARGEST_LOAD[law]
+        if self.depth_mm is not None and load > largest:
+            depth = depth_of_load(self.tip, largest, self.poisson[1]) * self.footprint_mm[0]
+            raise ValueError(
+                f"depth_mm {self.depth_mm[1]:g} under the smallest contact ({self.footprint_mm[0]:g} mm) "
+                f"takes a load of {load:.3g}, past the range of the {law} law; the largest valid value is "
+                f"{depth:.3g}"
+            )
         if self.force_mn is None and load > largest:
             raise ValueError(
                 f"load {load:g} is past the range of the {law} law; the largest valid value is {largest:g}"
@@ -250,6 +282,8 @@ class Fem(Section):
     @property
     def largest_load(self) -> float:
         """Largest P = F/(E a^2) that can be drawn."""
+        if self.depth_mm is not None:
+            return load_of_depth(self.tip, self.depth_mm[1] / self.footprint_mm[0], self.poisson[1])
         if self.force_mn is None:
             return self.load[1]
         return self.force_mn[1] / (self.young_kpa[0] * self.footprint_mm[0] ** 2)

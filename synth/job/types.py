@@ -4,7 +4,15 @@ from __future__ import annotations
 
 from typing import Annotated, Any
 
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    FiniteFloat,
+    ValidationError,
+)
 
 
 def _pair(value: Any) -> Any:
@@ -39,6 +47,12 @@ StretchRange = Annotated[tuple[_Stretch, _Stretch], BeforeValidator(_pair), Afte
 _Poisson = Annotated[FiniteFloat, Field(ge=0, lt=0.5)]
 PoissonRange = Annotated[tuple[_Poisson, _Poisson], BeforeValidator(_pair), AfterValidator(_ordered)]
 Vector = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
+
+
+def first_problem(error: ValidationError) -> tuple[str, str]:
+    """Where the first mistake is, keys joined by dots (empty: all of it), and what it is; both short."""
+    first = error.errors(include_input=False, include_url=False)[0]
+    return ".".join(str(step)[:40] for step in first["loc"])[:200], first["msg"].splitlines()[0][:200]
 
 
 class Section(BaseModel):

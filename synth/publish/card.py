@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from synth.dataset import index, split
+from synth.dataset import index, location, split
 from synth.dataset.folder import Folder, write_whole
 from synth.dataset.store import Sequence, open_sequence
 from synth.fields import FIELDS
+from synth.job.law_limits import RIGID_GESTURES
 from synth.job.schema import Job
 from synth.publish import histogram
 
@@ -38,7 +39,7 @@ def write_card(folder: Folder) -> Path:
             write_whole(pictures / f"{name}.svg", histogram.histogram(values, title, unit))
             shown.append({"title": title, "path": f"card/{name}.svg"})
     best = max(done, key=lambda row: row["peak_flow_px"] or 0.0, default=None)
-    sequence = None if best is None else open_sequence(folder.root / best["path"])
+    sequence = None if best is None else open_sequence(location.store(folder.root, best["index"]))
     example = None if sequence is None else _example(sequence, pictures)
     text = _template().render(
         **_facts(job, rows, done),
@@ -83,6 +84,13 @@ def limits(folder: Folder) -> list[str]:
         "What video alone can tell is traction divided by stiffness: give a method `young_kpa`, or score it "
         "without scale.",
     ]
+    if job.fem.contact == "rigid":
+        held = ", ".join(kind for kind in job.fem.gestures if kind not in RIGID_GESTURES)
+        found.append(
+            f"Push, slide and tap are a rigid tip ({job.fem.tip}, friction {job.fem.friction:g}) in contact, "
+            "as wide as the footprint, not as the instrument that is seen"
+            + (f"; {held}: a given traction." if held else ".")
+        )
     load = job.fem.largest_load
     if job.fem.law == "linear" and load > 0.05:
         found.append(f"Linear elasticity is exact to some percent up to P = 0.05; loads go to {load:.2g}.")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-import shutil
 import tarfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -16,6 +15,7 @@ from numpy.typing import NDArray
 from synth.dataset.store import Dataset, Sequence
 from synth.errors import UserError
 from synth.fields import FIELDS
+from synth.system import whole_file
 
 _SHARD_BYTES = 1 << 30
 # The published loader drops nodes right of this pixel, and takes every file to have the nodes of the first.
@@ -36,19 +36,9 @@ def export_dataset(root: Path, target: Path, to: str) -> int:
     """
     if to not in FORMATS:
         raise UserError(f"{to}: is not one of {', '.join(FORMATS)}")
-    if target.exists():
-        raise UserError(f"{target}: exists already")
     dataset = Dataset(root)
-    part = target.with_name(f".{target.name}.part")
-    if part.exists():
-        shutil.rmtree(part)
-    part.mkdir(parents=True)
-    try:
+    with whole_file.folder_of(target) as part:
         FORMATS[to](dataset, part)
-        part.rename(target)
-    finally:
-        if part.exists():
-            shutil.rmtree(part)
     return len(dataset)
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from synth.dataset.store import Dataset
+from synth.system import whole_file
 
 _LARGEST_PX = 1280
 _TILES = 9
@@ -47,8 +48,8 @@ def encode_video(target: Path, film: NDArray[np.uint8], fps: float) -> Path:
     import av
 
     film = film[:, : film.shape[1] // 2 * 2, : film.shape[2] // 2 * 2]
-    part = target.with_name(f".{target.name}.part")
-    with av.open(str(part), "w", format="mp4") as container:
+    # By "file:" a colon in the path is no protocol.
+    with whole_file.part_of(target) as part, av.open(f"file:{part}", "w", format="mp4") as container:
         stream: Any = container.add_stream("h264", rate=Fraction(fps).limit_denominator(1000))
         stream.height, stream.width = film.shape[1:3]
         stream.pix_fmt, stream.options = "yuv420p", {"crf": "23", "threads": "1"}
@@ -56,5 +57,4 @@ def encode_video(target: Path, film: NDArray[np.uint8], fps: float) -> Path:
             frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="rgb24")
             container.mux(stream.encode(frame))
         container.mux(stream.encode(None))
-    part.rename(target)
     return target

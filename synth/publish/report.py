@@ -11,7 +11,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from synth.dataset import index
+from synth.dataset import index, location
 from synth.dataset.folder import Folder, write_whole
 from synth.dataset.store import Sequence, open_sequence
 from synth.errors import UserError
@@ -42,7 +42,7 @@ def write_report(root: Path, target: Path) -> Path:
     environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined)
     page = environment.from_string(text).render(
         title=folder.job().card.title,
-        facts=_facts(table, done, int(described["job"]["sequences"])),
+        facts=_facts(table, done, folder.job().sequences),
         thumbnails=_thumbnails(root, done),
         charts=_charts(done),
         failures=_failures(table),
@@ -101,14 +101,16 @@ def _thumbnails(root: Path, done: pa.Table) -> list[dict[str, str]]:
     for k in np.unique(np.linspace(0, max(len(done) - 1, 0), _THUMBNAILS).astype(int))[: len(done)]:
         row = done.slice(int(k), 1).to_pylist()[0]
         try:
-            sequence = open_sequence(root / row["path"])
+            # Not by the path in the table, which may lead anywhere.
+            place = location.store(root, int(row["index"]))
+            sequence = open_sequence(place)
             jpeg = _jpeg(sequence)
         except UserError:
             continue  # moved away or damaged: `synth verify` is for that
         gesture, family = row["gesture"] or "-", row["family"] or "-"
         numbers = f"{row['peak_force_mn']:.3g} mN, {row['young_kpa']:.2g} kPa"
         caption = f"{row['index']:06d} {gesture}, {family}, {numbers}"
-        found.append({"path": row["path"], "jpeg": jpeg, "caption": caption})
+        found.append({"path": place.name, "jpeg": jpeg, "caption": caption})
     return found
 
 

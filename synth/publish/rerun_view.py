@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
+import signal
 import subprocess
 import sys
 import tempfile
@@ -68,10 +71,17 @@ def show_sequences(sequences: Iterable[Sequence], *, web: bool) -> None:
     with tempfile.TemporaryDirectory() as scratch:
         path = Path(scratch) / "sequences.rrd"
         save_recording(sequences, path)
-        done = subprocess.run(command(path, web=web))
-    if done.returncode:
+        # A group of its own: the viewer starts a process in its turn, which must not stay when this one ends.
+        viewer = subprocess.Popen(command(path, web=web), start_new_session=True)
+        try:
+            code = viewer.wait()
+        finally:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(viewer.pid, signal.SIGTERM)
+            viewer.wait()
+    if code:
         hint = "" if web else "; without a window system use --web, or --save and open the file elsewhere"
-        raise UserError(f"the viewer ended with code {done.returncode}{hint}")
+        raise UserError(f"the viewer ended with code {code}{hint}")
 
 
 def command(path: Path, *, web: bool) -> list[str]:

@@ -259,11 +259,10 @@ class Studio:
         height, width = radiance.shape[:2]
         faces = self.surface.faces
         on = (now.hits.face >= 0) & (now.hits.face < len(faces))
-        corners = faces[now.hits.face[on]]
-        bary = now.hits.bary[on]
-        uv = np.einsum("nk,nkc->nc", bary, self.surface.uv[corners].astype(np.float64))
+        face, bary = now.hits.face[on], now.hits.bary[on]
+        uv = truth.blend(faces, face, bary, self.surface.uv)
         albedo = noise.sample(self._coat.albedo, uv - 0.5, 1.0)
-        light_in = np.einsum("nk,nkc->nc", bary, moment.power * self._irradiance(moment.vertices)[corners])
+        light_in = truth.blend(faces, face, bary, moment.power * self._irradiance(moment.vertices))
         diffuse = (albedo * light_in).mean(axis=1)
         excess = radiance.reshape(-1, 3)[on].mean(axis=1) - 1.05 * diffuse
         glare = np.zeros(height * width, bool)

@@ -74,17 +74,21 @@ class Now:
     """This frame's pixels, over tissue, rim and tool, in this order."""
 
 
-def cast(camera: Camera, shapes: Sequence[Shape], pixels: Floats, directions: Floats) -> Hits:
+def cast(camera: Camera, shapes: Sequence[Shape], pixels: Floats | None, directions: Floats) -> Hits:
     """First triangle that each ray from the lens meets; faces are numbered through all shapes.
 
     Args:
         camera: the camera.
         shapes: what is there, world axes.
-        pixels: (N, 2) px where the rays pierce the picture; those outside it meet nothing.
+        pixels: (N, 2) px where the rays pierce the picture; those outside it meet nothing. None: all
+            pixels' centres, row by row.
         directions: (N, 3) in camera axes, of any length, each through its pixel.
     """
     width, height = camera.size
-    order, start = _bins(pixels, width, height)
+    if pixels is None:
+        order, start = np.arange(width * height), np.arange(width * height + 1)
+    else:
+        order, start = _bins(pixels, width, height)
     world = np.concatenate([shape.vertices for shape in shapes])
     first = np.cumsum([0] + [len(shape.vertices) for shape in shapes])
     faces = np.concatenate([shape.faces + at for shape, at in zip(shapes, first, strict=False)])
@@ -103,7 +107,7 @@ def still(camera: Camera, surface: Shape, rim: Shape) -> Still:
     width, height = camera.size
     pixels = cameras.pixel_grid(camera.size)
     directions = _forward(camera, pixels)
-    hits = cast(camera, [surface, rim], pixels, directions)
+    hits = cast(camera, [surface, rim], None, directions)
     on_tissue = (hits.face >= 0) & (hits.face < len(surface.faces))
     face = np.where(on_tissue, hits.face, -1).astype(np.int32)
     corners = cameras.to_camera(camera, surface.vertices)[surface.faces[face[on_tissue]]]
@@ -132,13 +136,13 @@ def now(camera: Camera, rest: Still, surface: Shape, rim: Shape, tool: Shape | N
     width, height = camera.size
     shapes = [surface, rim] if tool is None else [surface, rim, tool]
     pixels = cameras.pixel_grid(camera.size)
-    hits = cast(camera, shapes, pixels, rest.directions)
+    hits = cast(camera, shapes, None, rest.directions)
     seen = hits.face >= 0
     depth = np.where(seen, hits.along, 0.0)  # directions have unit z
 
     on = rest.tissue.ravel()
-    corners = surface.vertices[surface.faces[rest.face.ravel()[on]]]
-    local = cameras.to_camera(camera, np.einsum("nk,nkc->nc", rest.bary.reshape(-1, 3)[on], corners))
+    carried = blend(surface.faces, rest.face.ravel()[on], rest.bary.reshape(-1, 3)[on], surface.vertices)
+    local = cameras.to_camera(camera, carried)
     pierced = cameras.to_pixels(camera, local)
     blocked = cast(camera, shapes, pierced, local)
     clear = (1 - blocked.along) * np.linalg.norm(local, axis=1) < _HIDDEN_MM
@@ -167,7 +171,7 @@ def onwards(hits: Hits, faces: Indices, vertices: Floats, camera: Camera) -> npt
     """
     width, height = camera.size
     on = (hits.face >= 0) & (hits.face < len(faces))
-    points = np.einsum("nk,nkc->nc", hits.bary[on], vertices[faces[hits.face[on]]])
+    points = blend(faces, hits.face[on], hits.bary[on], vertices)
     flow = np.zeros((len(on), 2), np.float32)
     flow[on] = cameras.project(camera, points) - cameras.pixel_grid(camera.size)[on]
     return flow.reshape(height, width, 2)
@@ -181,7 +185,7 @@ def facing(camera: Camera, hits: Hits, shapes: Sequence[Shape | None]) -> npt.ND
     faces = np.concatenate([shape.faces + at for shape, at in zip(there, first, strict=False)])
     vertex = np.concatenate([normals(shape) for shape in there]) @ camera.rotation.T
     on = hits.face >= 0
-    smooth = np.einsum("nk,nkc->nc", hits.bary[on], vertex[faces[hits.face[on]]])
+    smooth = blend(faces, hits.face[on], hits.bary[on], vertex)
     found = np.zeros((len(on), 3), np.float32)
     found[on] = smooth / np.maximum(np.linalg.norm(smooth, axis=1, keepdims=True), 1e-12)
     return found.reshape(height, width, 3)
@@ -189,8 +193,17 @@ def facing(camera: Camera, hits: Hits, shapes: Sequence[Shape | None]) -> npt.ND
 
 def at_rest_pixels(rest: Still, faces: Indices, nodal: Floats) -> npt.NDArray[np.float32]:
     """A quantity of the fine surface's vertices (V, C) at rest pixels (H, W, C); 0 off the tissue."""
-    values = np.einsum("hwk,hwkc->hwc", rest.bary, nodal[faces[rest.face]])
-    return np.where(rest.tissue[..., None], values, 0.0).astype(np.float32)
+    values = blend(faces, rest.face.ravel(), rest.bary.reshape(-1, 3), nodal)
+    return values.reshape(*rest.face.shape, -1).astype(np.float32)
+
+
+def blend(faces: Indices, face: Indices, bary: Floats, nodal: npt.NDArray[np.floating]) -> Floats:
+    """A quantity of vertices (V, C) at points of triangles: which (N,), weights (N, 3).
+
+    0 where `face` is negative or beyond `faces`.
+    """
+    found: Floats = _blend(faces, face, bary, np.ascontiguousarray(nodal, np.float64))
+    return found
 
 
 def _forward(camera: Camera, pixels: Floats) -> Floats:
@@ -275,4 +288,17 @@ def _cast_loop(points, flat, faces, directions, order, start, width, height):  #
     return face, best_u, best_v, best
 
 
+def _blend_loop(faces, face, bary, nodal):  # type: ignore[no-untyped-def]
+    found = np.zeros((len(face), nodal.shape[1]))
+    for n in range(len(face)):
+        if face[n] < 0 or face[n] >= len(faces):
+            continue
+        a, b, c = faces[face[n]]
+        u, v, w = bary[n, 0], bary[n, 1], bary[n, 2]
+        for k in range(nodal.shape[1]):
+            found[n, k] = u * nodal[a, k] + v * nodal[b, k] + w * nodal[c, k]
+    return found
+
+
 _cast: Any = compiled(_cast_loop)
+_blend: Any = compiled(_blend_loop)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -21,9 +22,9 @@ from synth.flow.estimator import Estimator, create
 from synth.geometry import brain_surface
 from synth.geometry.brain_surface import Brain
 from synth.job import identity
-from synth.job.schema import Flow, Job
+from synth.job.schema import Anatomy, Flow, Job
 from synth.render.anatomy import surface as anatomy
-from synth.render.anatomy.surface import Surface
+from synth.render.anatomy.surface import Relief, Surface
 from synth.render.camera import camera, video
 from synth.render.camera.camera import Camera
 from synth.render.scene import Studio
@@ -210,7 +211,8 @@ def _mechanics(
     job: Job, case: Scenario, motion: Deformation, rotation: NDArray[np.float64]
 ) -> dict[str, Any]:
     still = case.pulse is None
-    return {
+    contact = {} if job.fem.contact == "traction" else {"contact": job.fem.contact}
+    return contact | {
         "law": case.tissue.law,
         # Whether the tools' forces alone say what is stored.
         "elastic": job.fem.time == "quasi-static" and not job.fem.relaxation and still,
@@ -242,11 +244,28 @@ def build(job: Job, case: Scenario) -> tuple[Surface, Tets]:
 
 
 def cortex(job: Job, case: Scenario) -> tuple[Surface, Brain | None]:
-    """The fine surface of a scenario, and the user's brain that it is a part of, if it is."""
-    if job.anatomy.mesh is None:
-        return anatomy.procedural(case.relief, job.anatomy), None
-    whole = brain_surface.load_brain(job.anatomy.mesh, job.anatomy.craniotomy)
-    return anatomy.from_brain(whole.vertices, whole.faces, case.relief, job.anatomy), whole
+    """The fine surface of a scenario, and the user's brain that it is a part of, if it is.
+
+    Sequences that share an anatomy (`anatomy.variety`) share these: their arrays are read-only.
+    """
+    written = job.anatomy.mesh.stat() if job.anatomy.mesh and job.anatomy.mesh.is_file() else None
+    return _cortex(job.anatomy, case.relief, written and (written.st_mtime_ns, written.st_size))
+
+
+@lru_cache(maxsize=4)
+def _cortex(section: Anatomy, relief: Relief, written: object) -> tuple[Surface, Brain | None]:
+    """As `cortex`; `written` tells a mesh from one that replaced it."""
+    whole = None
+    if section.mesh is None:
+        surface = anatomy.procedural(relief, section)
+    else:
+        whole = brain_surface.load_brain(section.mesh, section.craniotomy)
+        surface = anatomy.from_brain(whole.vertices, whole.faces, relief, section)
+    for shared in (surface, whole):
+        for value in vars(shared).values() if shared else ():
+            if isinstance(value, np.ndarray):
+                value.flags.writeable = False
+    return surface, whole
 
 
 def move(job: Job, case: Scenario, surface: Surface, tets: Tets) -> Deformation:

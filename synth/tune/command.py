@@ -61,6 +61,8 @@ def tune(
         file=sys.stderr,
     )
     journal = target.with_name(target.name + ".part")
+    if journal.is_symlink():
+        raise UserError(f"{journal}: is a link, which is not followed; remove it")
     found = tuning.tune_job(read, asked, journal, probes, checks, _said())
     tuned_job.write_tuned(found, job, overrides or [], target)
     journal.unlink(missing_ok=True)

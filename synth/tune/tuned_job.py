@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import textwrap
 from collections.abc import Sequence
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +15,7 @@ from ruamel.yaml.comments import CommentedMap
 from synth.errors import UserError
 from synth.job import reader
 from synth.job.schema import Job
+from synth.system import foreign_yaml
 from synth.tune.search import Joint, Row, Tuned, own
 
 _PATHS = ("anatomy.mesh", "appearance.photo", "render.calibration")
@@ -47,22 +47,15 @@ def commented(found: Tuned, source: str, overrides: Sequence[str], folder: Path)
         source, overrides: as given to `reader.load_job`.
         folder: where the file will be, from which relative paths start.
     """
-    path = Path(source)
-    if path.exists() or source not in reader.names():
-        written, home = path.read_text("utf-8"), path.resolve().parent
-    else:
-        written, home = (
-            (resources.files("synth.job") / "named" / f"{source}.yaml").read_text("utf-8"),
-            Path.cwd(),
-        )
+    written, label, home = reader.read_source(source)
     yaml = YAML(typ="rt")
     yaml.width = 110
-    tree = yaml.load(written)
+    tree = foreign_yaml.load(written, label)
     if not isinstance(tree, CommentedMap):
         tree = CommentedMap()
     for one in overrides:
         key, _, value = one.partition("=")
-        _set(tree, key.strip(), YAML(typ="rt").load(value), "")
+        _set(tree, key.strip(), foreign_yaml.load(value, one), "")
     values = found.job.model_dump(mode="json")
     if home != folder:
         for key in _PATHS:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from evidence.fem import case, half_space, relief, surface
+from evidence.fem import case, contact, half_space, relief, surface
 from evidence.fem.stability import random_scenes
 
 
@@ -61,6 +61,26 @@ def test_random_scenes_are_whole_and_step_evenly() -> None:
     assert found["outcome"] == {"whole": 3}
     assert 0 < found["least_jacobian"] <= 1
     assert found["largest_step"] < 0.25
+
+
+@pytest.mark.slow
+def test_rigid_tips_on_the_half_space_come_out_as_in_the_books() -> None:
+    solid = contact.half_space(1600, 0.2)
+    for tip, (_, radii) in contact.SHAPES.items():
+        for radius in radii:
+            row = contact.indent(solid, tip, radius)
+            assert abs(row["depth_error"]) <= 0.03, row
+            if tip.startswith("sphere"):
+                assert abs(row["radius_error"]) <= 0.03, row
+
+
+@pytest.mark.slow
+def test_a_dragged_tip_sticks_then_slips_as_cattaneo_found() -> None:
+    for row in contact.drag(contact.half_space(1600, 0.2)):
+        assert row["tangential"] == pytest.approx(row["exact"], abs=0.02)
+        assert row["most_over_coulomb"] <= 1 + 1e-9
+        assert row["normal_off"] <= 1e-8
+        assert (row["sticking"] > 0) == (row["shift"] < 1)
 
 
 @pytest.mark.slow

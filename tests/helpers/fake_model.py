@@ -6,7 +6,8 @@ from pathlib import Path
 
 import torch
 
-from learn.checkpoint import Card, save_tensors, write_card
+from learn import checkpoint
+from learn.checkpoint import Card
 from learn.data.grid import Scales
 from learn.network.d2fnet import D2FNet
 from learn.network.monai_unet import build
@@ -22,6 +23,6 @@ def write_model(folder: Path, *changes: str) -> Path:
     with torch.no_grad():
         for conv in net.heads.ranges:  # type: ignore[union-attr]
             conv.weight.normal_(0, 200.0)  # type: ignore[union-attr,operator]
-    write_card(folder, Card(settings, Scales(1.0, 0.2, 1.0, 100.0, 0.3), 1.7, {}, {}))
-    save_tensors(folder / "weights.pt", net.state_dict())
+    card = Card(settings, Scales(1.0, 0.2, 1.0, 100.0, 0.3), 1.7, {}, {})
+    checkpoint.write_model(folder, card, net.state_dict())
     return folder

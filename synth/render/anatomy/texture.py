@@ -15,6 +15,7 @@ from synth.render.anatomy.surface import Surface
 from synth.render.appearance.family import Colour
 from synth.render.appearance.look import Look
 from synth.render.mitsuba.adapter import Wet
+from synth.system import foreign_picture
 
 Map = npt.NDArray[np.float32]
 Floats = npt.NDArray[np.float64]
@@ -190,9 +191,10 @@ def _film(
 
 def _photograph(path: Path, pixels: int) -> Map:
     """The middle square of a photograph as linear albedo."""
-    image = cv2.imread(str(path), cv2.IMREAD_COLOR)
-    if image is None:
-        raise UserError(f"appearance.photo: {path} is not a picture that can be read")
+    try:
+        image = foreign_picture.read_picture(path)
+    except UserError as error:
+        raise UserError(f"appearance.photo: {error}") from None
     side = min(image.shape[:2])
     top, left = (image.shape[0] - side) // 2, (image.shape[1] - side) // 2
     square = cv2.resize(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,8 @@ import numpy as np
 import numpy.typing as npt
 
 from synth.errors import UserError
+from synth.job import identity
+from synth.system import foreign_file
 
 Floats = npt.NDArray[np.float64]
 
@@ -26,6 +29,9 @@ _LENS = (
     "D1",
     "dist",
 )
+_LARGEST = 1e6  # of anything in px or of a lens
+_DEEPEST = 50
+_NESTING = re.compile(r"(?P<opens>[\[{]|<(?=\w)|[-?] +(?=[-?] )|\w: +(?=\w+: ))|[\]}]|</|/>")
 _SIZE = (("image_width", "image_height"), ("image_Width", "image_Height"), ("width", "height"))
 
 
@@ -67,16 +73,23 @@ def read(path: Path) -> Calibration:
     Raises:
         UserError: it cannot be read, or what it holds is no pinhole with Brown-Conrady distortion.
     """
-    found = _json(path) if path.suffix.lower() == ".json" else _storage(path)
+    try:
+        text = foreign_file.read_text(path, identity.FILES["render", "calibration"])
+    except UserError as error:
+        raise UserError(f"render.calibration: {error}") from None
+    found = _json(path, text) if path.suffix.lower() == ".json" else _storage(path, text)
     K = _array(path, found, _MATRIX, "camera matrix")
     if K.shape != (3, 3):
         raise UserError(f"render.calibration: {path.name}: the camera matrix is {K.shape}, not 3 x 3")
-    if not (np.isfinite(K).all() and K[0, 0] > 0 and K[1, 1] > 0) or abs(K[0, 1]) > 1e-6 * K[0, 0]:
+    if (
+        not (np.isfinite(K).all() and K[0, 0] > 0 and K[1, 1] > 0 and np.abs(K).max() < _LARGEST)
+        or abs(K[0, 1]) > 1e-6 * K[0, 0]
+    ):
         raise UserError(
             f"render.calibration: {path.name}: the camera matrix is not that of a camera without skew"
         )
     lens = _array(path, found, _LENS, "distortion coefficients").ravel()
-    if not np.isfinite(lens).all() or len(lens) < 4 or np.abs(lens[5:]).max(initial=0) > 0:
+    if not (np.abs(lens) < _LARGEST).all() or len(lens) < 4 or np.abs(lens[5:]).max(initial=0) > 0:
         raise UserError(
             f"render.calibration: {path.name}: {len(lens)} distortion coefficients; "
             "needed are k1 k2 p1 p2 and perhaps k3 (no rational, thin-prism or fisheye model)"
@@ -84,27 +97,36 @@ def read(path: Path) -> Calibration:
     size = None
     for wide, tall in _SIZE:
         if wide in found and tall in found:
-            size = (int(float(found[wide])), int(float(found[tall])))
+            try:
+                size = (int(float(found[wide])), int(float(found[tall])))
+            except (TypeError, ValueError, OverflowError):
+                size = (0, 0)
+            if min(size) < 1:
+                raise UserError(
+                    f"render.calibration: {path.name}: {wide} and {tall} are no size of a picture"
+                )
     return Calibration(K, np.resize(np.append(lens, np.zeros(5)), 5), size)
 
 
-def _json(path: Path) -> dict[str, Any]:
+def _json(path: Path, text: str) -> dict[str, Any]:
     try:
-        found = json.loads(path.read_text("utf-8"))
-    except OSError as error:
-        raise UserError(f"render.calibration: {path}: {error.strerror}") from error
-    except ValueError as error:
+        found = json.loads(text)
+    except (ValueError, RecursionError) as error:
         raise UserError(f"render.calibration: {path.name}: is no JSON ({error})") from error
     if not isinstance(found, dict):
         raise UserError(f"render.calibration: {path.name}: holds no named values")
     return found
 
 
-def _storage(path: Path) -> dict[str, Any]:
-    if not path.is_file():
-        raise UserError(f"render.calibration: there is no file {path}")
+def _storage(path: Path, text: str) -> dict[str, Any]:
+    depth = deepest = 0
+    for token in _NESTING.finditer(text):
+        depth += 1 if token["opens"] else -1
+        deepest = max(deepest, depth)
+    if deepest > _DEEPEST:  # OpenCV's parser calls itself for each level, and ends the process
+        raise UserError(f"render.calibration: {path.name}: is nested deeper than {_DEEPEST} levels")
     try:
-        storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
+        storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
         root = storage.root()
         if not storage.isOpened() or not root.isMap():
             raise UserError(f"render.calibration: {path.name}: is no OpenCV calibration (YAML, XML or JSON)")
@@ -117,22 +139,19 @@ def _storage(path: Path) -> dict[str, Any]:
                 found[name] = node.real()
         return found
     except (cv2.error, SystemError) as error:
-        why = str(error).strip().splitlines()[-1]
+        why = (str(error).strip().splitlines() or ["it is damaged"])[-1][:200]
         raise UserError(f"render.calibration: {path.name}: is no OpenCV calibration ({why})") from error
 
 
 def _array(path: Path, found: dict[str, Any], names: tuple[str, ...], what: str) -> Floats:
     for name in names:
         value = found.get(name)
-        if isinstance(value, dict):  # OpenCV's own JSON: {"rows": 3, "cols": 3, "data": [...]}
-            value = (
-                np.reshape(value.get("data", []), (int(value.get("rows", -1)), -1))
-                if value.get("data")
-                else None
-            )
-        if value is not None:
-            try:
-                return np.asarray(value, np.float64)
-            except (TypeError, ValueError) as error:
-                raise UserError(f"render.calibration: {path.name}: {name} holds no numbers") from error
+        if value is None:
+            continue
+        try:
+            if isinstance(value, dict):  # OpenCV's own JSON: {"rows": 3, "cols": 3, "data": [...]}
+                value = np.reshape(value["data"], (int(value["rows"]), -1))
+            return np.asarray(value, np.float64)
+        except (KeyError, TypeError, ValueError, OverflowError, RecursionError):
+            raise UserError(f"render.calibration: {path.name}: {name} holds no numbers") from None
     raise UserError(f"render.calibration: {path.name}: holds no {what} (looked for {', '.join(names)})")

@@ -112,6 +112,12 @@ def place(view: View, render: Render) -> Camera:
     )
 
 
+def refuse_unfit(render: Render) -> None:
+    """UserError for a calibration that can't be read, or was made from pictures of another shape."""
+    if render.calibration is not None:
+        calibration.read(render.calibration).fitted(render.size)
+
+
 def beside(camera: Camera, baseline_mm: float) -> Camera:
     """The second lens of a stereo pair, to the right; its picture is shifted to show the same field."""
     K = camera.K.copy()
@@ -190,6 +196,8 @@ def _aside(render: Render, rng: np.random.Generator) -> tuple[float, float]:
 
 
 def _distort(flat: Floats, distortion: Floats) -> Floats:
+    if not distortion.any():
+        return flat
     k1, k2, p1, p2, k3 = distortion
     x, y = flat[:, 0], flat[:, 1]
     r2 = x * x + y * y

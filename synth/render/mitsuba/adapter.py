@@ -154,7 +154,6 @@ class Stage:
         if self._jit:
             register_glow(variant)
         _limit_threads()
-        forget()
         self.variant = variant
         self._mi = mi
         self._faces = {name: body.faces for name, body in bodies.items()}

@@ -97,7 +97,7 @@ CASES: dict[str, tuple[Spoil, str]] = {
     "half a calibration": (meta("calibration: {bar_mm: 5}", drop="scale"), "one whole way"),
     "no checkerboard": (
         meta("calibration: {checkerboard: none.png, corners: [7, 5], square_mm: 2}", drop="scale"),
-        "not a readable picture",
+        "no such file",
     ),
     "zero stiffness": (meta("young_kpa: 0", drop="young"), "greater than 0"),
     "stiffness in pascal": (meta("young_kpa: 1200", drop="young"), "is it in kPa"),

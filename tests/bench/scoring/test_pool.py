@@ -49,7 +49,7 @@ def test_a_better_method_is_marked() -> None:
 
 
 def test_a_recording_without_scores_is_named() -> None:
-    lost = score("b", 2.0) | {"scores": {}, "sync": {"refused": "ambiguous"}}
+    lost = score("b", 2.0) | {"sync": {"refused": "ambiguous"}}
     tree = pool.pool([score("a", 5.0), lost])
     assert tree["recordings"] == ["a"]
     assert tree["left_out"] == {"b": "clocks not aligned: ambiguous"}

@@ -13,7 +13,7 @@ import pytest
 import torch
 from typer.testing import CliRunner
 
-from learn.checkpoint import Card, save_tensors, write_card
+from learn.checkpoint import Card, write_model
 from learn.cli import app
 from learn.data.clips import Clip
 from learn.data.grid import Grid
@@ -53,8 +53,7 @@ def model(
                 conv.weight.normal_(0, 200.0)  # type: ignore[union-attr,operator]
         if isinstance(net, D2FNet) and net.film is not None:
             net.film.weight.normal_(0, 0.2)
-    write_card(out, Card(settings, measure_scales(clips, settings), 1.2, {}, {}))
-    save_tensors(out / "weights.pt", net.state_dict())
+    write_model(out, Card(settings, measure_scales(clips, settings), 1.2, {}, {}), net.state_dict())
     return out
 
 
@@ -148,7 +147,7 @@ def test_films_that_are_none(tmp_path: Path) -> None:
         ("torn.mp4", None, "not a readable video"),
         ("film.mp4", "small.png", "4 x 4, the video is 64 x 48"),
         ("film.mp4", "black.png", "marks no tissue"),
-        ("film.mp4", "missing.png", "not a readable picture"),
+        ("film.mp4", "missing.png", "no such file"),
     ):
         with pytest.raises(UserError, match=message):
             next(motions(tmp_path / name, "recovered", Filmed(0.1, tmp_path / mask if mask else None)))

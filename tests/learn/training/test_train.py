@@ -178,6 +178,7 @@ def test_corrupt_checkpoints(model: Path, tmp_path: Path) -> None:
     with pytest.raises(UserError, match=r"corrupt model configuration \(settings.epochs: "):
         load_predictor(broken(model, tmp_path / "e", "config.json", json.dumps(damaged).encode()))
     config["settings"]["arch"]["width"] = 8
+    del config["seal"]
     with pytest.raises(UserError, match=r"not those of the network in config\.json"):
         load_predictor(broken(model, tmp_path / "d", "config.json", json.dumps(config).encode()))
     with pytest.raises(UserError, match="no model here"):
@@ -251,9 +252,9 @@ def test_bad_input_is_one_line_and_exit_2(
 def test_nothing_unseen_is_said_so(dataset: Path, tmp_path: Path) -> None:
     out = tmp_path / "m"
     run(app, ["train", str(dataset), "-o", str(out), *ARGS])
-    config = json.loads((out / "config.json").read_text())
-    config["groups"]["fit"] += config["groups"].pop("test")
-    (out / "config.json").write_text(json.dumps(config))
+    card = checkpoint.read_card(out)
+    groups = {**card.groups, "fit": [*card.groups["fit"], *card.groups["test"]], "test": []}
+    checkpoint.write_card(out, dataclasses.replace(card, groups=groups))
     done = run(app, ["eval", str(out), str(dataset)])
     assert done.exit_code == 2
     assert "--all scores them anyway" in done.stderr

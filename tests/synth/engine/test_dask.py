@@ -10,7 +10,7 @@ from fake_run import Silent, options
 
 from synth.dataset.folder import Folder
 from synth.engine import run
-from synth.engine.dask import read_slurm, slurm
+from synth.engine.dask import open_to, read_slurm, slurm
 from synth.errors import UserError
 from synth.job.schema import Job
 
@@ -52,10 +52,10 @@ def test_no_scheduler_is_one_line_and_leaves_nothing(tmp_path: Path, monkeypatch
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (None, "is neither local, dask://host:port nor a file"),
+        (None, "is neither local, dask://host:port, tls://host:port nor a file"),
         ("cores: 4\nmemory: 8GB\n", "how many `jobs`"),
         ("jobs: 4\n", "cores and memory"),
-        ("jobs: [", "cannot be read"),
+        ("jobs: [", "not YAML"),
     ],
 )
 def test_slurm_files_that_do_not_do(tmp_path: Path, text: str | None, message: str) -> None:
@@ -63,3 +63,36 @@ def test_slurm_files_that_do_not_do(tmp_path: Path, text: str | None, message: s
         (tmp_path / "slurm.yaml").write_text(text)
     with pytest.raises(UserError, match=message):
         read_slurm(tmp_path / "slurm.yaml")
+
+
+@pytest.mark.parametrize(
+    ("cluster", "said"),
+    [
+        ("dask://127.0.0.1:8786", ""),
+        ("dask://localhost:8786", ""),
+        ("dask://node7:8786", "node7 is reached unencrypted"),
+        ("tls://node7:8786", ""),
+        ({"cores": 1}, "every interface"),
+        ({"cores": 1, "security": True}, "every interface"),
+        ({"interface": "ib0"}, "unencrypted"),
+        ({"scheduler_options": {"host": "10.0.0.1"}}, "unencrypted"),
+        ({"interface": "ib0", "security": True}, ""),
+    ],
+)
+def test_who_could_run_code_is_said(cluster: str | dict[str, object], said: str) -> None:
+    assert said in open_to(cluster)
+    assert bool(said) == bool(open_to(cluster))
+
+
+@pytest.mark.parametrize("address", ["dask://", "dask://host", "tls://:1", "dask://host:x"])
+def test_an_address_needs_a_host_and_a_port(address: str) -> None:
+    with pytest.raises(UserError, match="host:port"):
+        open_to(address)
+
+
+def test_without_certificates_tls_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("distributed", reason="the extra `cluster` is not installed")
+    monkeypatch.setattr("synth.engine.dask._CONNECT", "1s")
+    with pytest.raises(UserError, match=r"tls://127\.0\.0\.1:9: "):
+        run.run_job(JOB, tmp_path / "out", options("sequence", engine="tls://127.0.0.1:9"), Silent())
+    assert not (tmp_path / "out").exists()

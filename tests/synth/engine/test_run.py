@@ -124,6 +124,22 @@ def test_what_moves_into_a_package_still_counts(tmp_path: Path) -> None:
     assert {"synth/__init__.py", "synth/job/__init__.py", "synth/job/schema.py"} <= counted
 
 
+def test_the_kept_hash_is_that_of_the_files_as_they_are(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(provenance, "folder", lambda name: tmp_path)
+    job = "synth/job.py"
+    found = []
+    for text in ("class Job:\n    spp = 4\n", "class Job:\n    spp = 8\n", "class Job:\n    spp = 4\n"):
+        home = _tree(tmp_path / "home", synth__job=text)
+        assert (home / job).read_text() == text
+        found.append(provenance._known(home))
+        assert found[-1] == provenance._known(home) == provenance._code(home, provenance._makers(home))
+    assert found[0] != found[1]
+    assert found[0] == found[2]
+    assert len([file for file in tmp_path.iterdir() if file.is_file()]) == 2
+
+
 def test_an_import_that_leads_nowhere_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(LookupError, match=r"synth\.job: there is no such module"):
         provenance._makers(_tree(tmp_path / "a"))

@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import builtins
+import contextlib
+import os
+import signal
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -79,3 +83,40 @@ def test_without_the_extra_it_is_one_line(root: Path, monkeypatch: pytest.Monkey
     made = CliRunner().invoke(app, ["view", str(root), "--save", str(root / "a.rrd")])
     assert made.exit_code == 2
     assert "pip install 'sulcus[view]'" in made.output
+
+
+@pytest.mark.slow
+def test_the_viewers_own_process_ends_with_the_command(root: Path, tmp_path: Path) -> None:
+    """`python -m rerun` starts the viewer in its turn; a SIGTERM to ours must not leave that behind."""
+    environment = {**os.environ, "TMPDIR": str(tmp_path)}
+    words = [sys.executable, "-m", "synth", "view", str(root), "--web"]
+    started = subprocess.Popen(words, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    try:
+        assert waited(lambda: len(of_viewer(tmp_path)) >= 2, 120), of_viewer(tmp_path)
+        started.terminate()
+        started.wait(60)
+        assert waited(lambda: not of_viewer(tmp_path), 30), of_viewer(tmp_path)
+    finally:
+        started.kill()
+        started.wait()
+        for process in of_viewer(tmp_path):
+            os.kill(process, signal.SIGKILL)
+
+
+def of_viewer(scratch: Path) -> list[int]:
+    """Processes that were given a recording in `scratch`."""
+    found = []
+    for entry in Path("/proc").glob("[0-9]*"):
+        with contextlib.suppress(OSError):
+            words = (entry / "cmdline").read_bytes().split(b"\0")
+            if any(word.startswith(f"{scratch}/".encode()) for word in words):
+                found.append(int(entry.name))
+    return found
+
+
+def waited(true: Callable[[], bool], seconds: float) -> bool:
+    """Whether it comes true in that time."""
+    until = time.monotonic() + seconds
+    while not true() and time.monotonic() < until:
+        time.sleep(0.2)
+    return true()

@@ -97,3 +97,35 @@ def test_the_cache_lies_beside_a_package_that_can_be_written(package: Path, tmp_
     left = run(tmp_path / "own", tmp_path, XDG_CACHE_HOME=str(tmp_path / "cache"))
     assert tmp_path / "own/synth/render/__pycache__" in {path.parent for path in left}
     assert not (tmp_path / "cache").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("home", ["unset", "read-only"])
+def test_a_sequence_is_rendered_where_nothing_else_can_be_written(
+    package: Path, tmp_path: Path, home: str
+) -> None:
+    """As an unprivileged user has it: the whole program from a package, and with a home, that are not theirs.
+
+    A file stands where the home's folders would be made, which stops root too.
+    """
+    scratch = tmp_path / "scratch"
+    scratch.mkdir()
+    (tmp_path / "home").write_text("")
+    kept = {key: value for key, value in os.environ.items() if key in ("PATH", "LANG", "OMP_NUM_THREADS")}
+    homes = {} if home == "unset" else {"HOME": str(tmp_path / "home")}
+    changes = ["sequences=1", "frames=2", "render.size=[64,48]", "fem.tets=400", "anatomy.vertices=4000"]
+    # Without HOME the account's own folder is looked up, which may well be writable: it is barred.
+    where = {"TMPDIR": str(scratch), "PYTHONPATH": str(package), "XDG_CACHE_HOME": "/dev/null/cache"}
+    done = subprocess.run(
+        [sys.executable, "-m", "synth", "render", "tiny", "-o", str(tmp_path / "out"), *changes],
+        env={**kept, **homes, **where},
+        cwd=scratch,
+        capture_output=True,
+        text=True,
+        timeout=900,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert (tmp_path / "out/000000.zarr").is_dir()
+    loops = {path.name.split("-")[0] for path in scratch.rglob("*.nbi")}
+    assert "truth._cast_loop" in loops, loops
+    assert "fused.linearise" in loops, loops

@@ -1,0 +1,41 @@
+"""How much the tissue moves, and nothing else: the baselines that any method has to beat.
+
+A method of force that follows the sensor no better than the mean length of the flow has learnt nothing from
+where the tissue moves. Lengths are no forces: whoever scores them finds the one gain between the two.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bench.methods.protocol import Answer, Scene
+
+PEAK_PERCENTILE = 98.0
+"""What 2% of the tissue exceeds: the largest displacement, but for outliers."""
+
+
+class FlowSize:
+    """One number of the flow's length over the tissue that is seen [mm], in place of a force."""
+
+    def __init__(self, measure: Callable[[NDArray[np.float64]], float]) -> None:
+        """`measure`: lengths (P,) mm, at least one, to a number [mm]."""
+        self._measure = measure
+
+    def __call__(
+        self, flow: NDArray[np.float32], confidence: NDArray[np.float32], scene: Scene, picture: bool
+    ) -> Answer:
+        """See `Method`; NaN where nothing of the tissue is seen."""
+        seen = scene.tissue & (confidence > 0)
+        lengths = np.linalg.norm(flow[seen].astype(np.float64), axis=1) * scene.scale_mm_per_px
+        return Answer(np.array([self._measure(lengths) if len(lengths) else np.nan, np.nan, np.nan]))
+
+
+def flow_sizes() -> dict[str, FlowSize]:
+    """Mean and peak length of the flow, by the names they have in every table."""
+    return {
+        "mean |flow|": FlowSize(lambda lengths: float(lengths.mean())),
+        "peak |flow|": FlowSize(lambda lengths: float(np.percentile(lengths, PEAK_PERCENTILE))),
+    }

@@ -1,0 +1,215 @@
+"""A cortex that beats: what its own motion does to each method's error, left in and taken off."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any
+
+import cv2
+import numpy as np
+import typer
+from numpy.typing import NDArray
+
+from bench.methods import baselines
+from bench.methods.compliance import TO_CAMERA, Block, picture
+from bench.methods.protocol import Method
+from bench.output import charts, result_page
+from bench.recording import pixel_scale, writer
+from bench.recording.folder import open_recording
+from bench.scoring import evaluate_recording
+from bench.scoring.evaluate_recording import Result, Settings
+from evidence.measuring import measuring
+from evidence.scoring import phantom
+
+Floats = NDArray[np.float64]
+
+YOUNG_KPA = 3.0
+_CONTACT_MM = 4.0
+_RADIUS_MM = 12.0
+_FPS = 10.0
+_HEART, _BREATH = (0.4, 1.2), (0.25, 0.25)  # mm, Hz
+
+
+@measuring(
+    "--seconds 20",
+    out="docs/results/pulse",
+    said="Folder for the results.",
+    file="results.json",
+    page=lambda found, out: result_page.write(drawn(found), out),
+    text="README.md",
+)
+def experiment(
+    seconds: Annotated[float, typer.Option(min=14.0, help="Length of each recording.")] = 30.0,
+    count: Annotated[int, typer.Option(min=1, help="Recordings, each of another contact.")] = 3,
+    size: Annotated[int, typer.Option(min=96, help="Side of the pictures [px].")] = 224,
+    backend: Annotated[str, typer.Option(help="Flow estimator.")] = "tvl1",
+    seed: Annotated[int, typer.Option(help="Of textures, contacts and their times.")] = 1,
+) -> dict[str, Any]:
+    """Error of every method on FEM contacts: on still tissue, on beating, and with the beat taken off."""
+    rows = []
+    for k in range(count):
+        rng = np.random.default_rng([seed, k])
+        contact = draw_contact(rng, seconds, size)
+        with tempfile.TemporaryDirectory() as scratch:
+            runs: dict[str, Result] = {}
+            for name, beats, remove in (("still", 0, True), ("left in", 1, False), ("taken off", 1, True)):
+                folder = Path(scratch, name)
+                record(folder, contact, beats, size, remove, np.random.default_rng([seed, k, 1]))
+                runs[name] = score(folder, baselines.physical(), backend)
+        for method in runs["still"].methods:
+            row: dict[str, Any] = {"recording": k, "method": method}
+            row |= {f"{name}_mn": run.methods[method].scores["mae_mn"] for name, run in runs.items()}
+            rows.append(row)
+        rows[-1]["found"] = runs["taken off"].followed.pulse
+        rows[-1]["found_on_still"] = runs["still"].followed.pulse
+    return {"seconds": seconds, "count": count, "size": size, "backend": backend, "seed": seed, "rows": rows}
+
+
+def draw_contact(rng: np.random.Generator, seconds: float, size: int) -> dict[str, Any]:
+    """A contact's times, force and displacement on linear tissue, from a mesh that no method knows.
+
+    Returns:
+        time_s (T,), force_mn (T, 3), field (size, size, 2) px a mN of its own direction, mm_per_px.
+    """
+    mm_per_px = 2 * _RADIUS_MM / size
+    block = Block.build("linear", 2500, 2)
+    place, steps = rng.uniform(-3, 3, 2), np.arange(-_CONTACT_MM, _CONTACT_MM + 0.1, 0.8)
+    x, y = (axis.ravel() for axis in np.meshgrid(steps, steps))
+    share = np.clip(1 - (x**2 + y**2) / _CONTACT_MM**2, 0, None) ** 2
+    held = block.carry(np.column_stack([x, y])[share > 0] + place)
+    direction = rng.normal(size=3) * [1.0, 1.0, 0.5]
+    direction /= np.linalg.norm(direction)
+    load = held.gather(np.outer(share[share > 0] / share.sum(), TO_CAMERA.T @ direction))
+    coarse = np.linspace(-_RADIUS_MM - 1, _RADIUS_MM + 1, 41)
+    at = np.column_stack([axis.ravel() for axis in np.meshgrid(coarse, coarse)])
+    moved = picture(block.carry(at), block.system.solve(load)).reshape(41, 41, 2) / YOUNG_KPA
+    where = ((np.arange(size) - (size - 1) / 2) * mm_per_px + _RADIUS_MM + 1) / (coarse[1] - coarse[0])
+    across, down = np.meshgrid(where.astype(np.float32), where.astype(np.float32))
+    field = cv2.remap(moved.astype(np.float32), across, down, cv2.INTER_CUBIC) / mm_per_px
+    time_s = np.arange(0, seconds, 1 / _FPS)
+    force, begin = np.zeros(len(time_s)), 2.0
+    while begin < seconds - 3:
+        long, peak = rng.uniform(1.0, 2.5), rng.uniform(15, 40)
+        inside = (time_s > begin) & (time_s < begin + long)
+        force += inside * peak * np.sin(np.pi * (time_s - begin) / long) ** 2
+        begin += long + rng.uniform(0.8, 2.0)
+    return {
+        "time_s": time_s, "force_mn": force[:, None] * direction, "field": field, "mm_per_px": mm_per_px,
+        "phase": rng.uniform(0, 2 * np.pi, 2),
+    }  # fmt: skip
+
+
+def beat(time_s: float, phase: Floats, size: int) -> Floats:
+    """(size, size, 2) mm by which heart and breath have moved the surface: closed form."""
+    y, x = (np.mgrid[:size, :size] - (size - 1) / 2) / (size / 2)
+    bulge = 1 - 0.5 * (x**2 + y**2)
+    heart = np.stack([0.8 * bulge + 0.2 * x * bulge, 0.6 * bulge + 0.2 * y * bulge], axis=-1)
+    breath = np.stack([-0.3 + 0.2 * y, 0.9 + 0.1 * x], axis=-1)
+    turns = [2 * np.pi * rate * time_s + p for (_, rate), p in zip((_HEART, _BREATH), phase, strict=True)]
+    wave = np.sin(turns[0]) + 0.3 * np.sin(2 * turns[0])
+    return np.asarray(_HEART[0] * wave * heart + _BREATH[0] * np.sin(turns[1]) * breath, np.float64)
+
+
+def record(
+    folder: Path, contact: Mapping[str, Any], beats: float, size: int, remove: bool, rng: np.random.Generator
+) -> None:
+    """Writes the recording: a texture that contact and beat move together, the sensor, no masks.
+
+    Args:
+        folder: made.
+        contact: of `draw_contact`.
+        beats: how much of the beat there is; 0: the tissue is still.
+        size: side of the pictures [px].
+        remove: what meta.yaml asks for.
+        rng: of the texture and the camera's noise.
+    """
+    (folder / "frames").mkdir(parents=True)
+    rest = phantom.texture(size, size, rng)
+    y, x = np.mgrid[:size, :size].astype(np.float32)
+    times, force = contact["time_s"], contact["force_mn"]
+    for k, time in enumerate(times):
+        moved = float(np.linalg.norm(force[k])) * contact["field"]
+        own = beat(time, contact["phase"], size) - beat(float(times[0]), contact["phase"], size)
+        moved = moved + beats * own / contact["mm_per_px"]
+        # Where a point of this frame was at rest: by fixed point, for motion is given at rest.
+        back = moved
+        for _ in range(8):
+            at = [(axis - back[..., i]).astype(np.float32) for i, axis in enumerate((x, y))]
+            back = cv2.remap(moved.astype(np.float32), *at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        at = [(axis - back[..., i]).astype(np.float32) for i, axis in enumerate((x, y))]
+        rgb = cv2.remap(rest, *at, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
+        noisy = np.clip(rgb + rng.normal(0, 1.5, rgb.shape), 0, 255).astype(np.uint8)
+        cv2.imwrite(str(folder / "frames" / f"{k:04d}.png"), noisy[..., ::-1])
+    inside = np.hypot(x - (size - 1) / 2, y - (size - 1) / 2) < 0.46 * size
+    cv2.imwrite(str(folder / "tissue.png"), inside.astype(np.uint8) * 255)
+    (folder / "masks").mkdir()  # no instrument is seen
+    cv2.imwrite(str(folder / "masks" / "000000.png"), np.zeros((size, size), np.uint8))
+    writer.write_frames(folder, times)
+    writer.write_force(folder, times, force / 1000)
+    writer.write_meta(
+        folder,
+        {
+            "scale_mm_per_px": float(contact["mm_per_px"]),
+            "young_kpa": YOUNG_KPA,
+            "pulse": {"remove": remove},
+            "sensor": {"axes": "camera", "low_pass_hz": None},
+        },
+    )
+
+
+def score(folder: Path, methods: Mapping[str, Method], backend: str) -> Result:
+    """The recording scored, all of its frames."""
+    opened = open_recording(folder)
+    return evaluate_recording.evaluate_recording(
+        opened,
+        methods,
+        next(iter(methods)),
+        pixel_scale.find_scale(opened.meta, folder),
+        Settings(backend, shrink=1, rate_hz=None),
+        {},
+    )
+
+
+def drawn(tree: Mapping[str, Any]) -> result_page.Page:
+    """A bar a method: how many times its error of still tissue it has, median over recordings."""
+    rows, bars = [], []
+    names = list(dict.fromkeys(row["method"] for row in tree["rows"]))
+    for name in names:
+        own = [row for row in tree["rows"] if row["method"] == name]
+        still = np.array([row["still_mn"] for row in own])
+        ratios = {
+            what: np.array([row[f"{what}_mn"] for row in own]) / still for what in ("left in", "taken off")
+        }
+        cells = {what: f"{np.mean([row[f'{what}_mn'] for row in own]):.2f}" for what in ("still", *ratios)}
+        rows.append(
+            {"method": name}
+            | {f"{what} [mN]": cell for what, cell in cells.items()}
+            | {f"{what}, times still, worst": f"{ratio.max():.2f}" for what, ratio in ratios.items()}
+        )
+        if name != "zero":
+            low, high = float(ratios["taken off"].min()), float(ratios["taken off"].max())
+            bars.append(charts.Row(name, float(np.median(ratios["taken off"])), (low, high), False))
+    found = "; ".join(
+        ", ".join(f"{one['amplitude_mm']:.2f} mm at {one['rate_hz']:.3f} Hz" for one in row["found"])
+        for row in tree["rows"]
+        if "found" in row
+    )
+    still_found = sum(len(row["found_on_still"]) for row in tree["rows"] if "found" in row) or "nothing"
+    title = "Error on beating tissue over that on still tissue, the beat taken off"
+    return result_page.Page(
+        "A cortex that beats",
+        tree,
+        [charts.Chart(title, "times the error on still tissue", tuple(bars))],
+        (result_page.Section("", rows),),
+        (
+            f"{tree['count']} recordings of {tree['seconds']:g} s, 10 frames a second, {tree['size']} px: "
+            f"FEM contacts of 15 to 40 mN on linear tissue, E = {YOUNG_KPA:g} kPa, from a mesh that no "
+            f"method knows. Heart {_HEART[0]:g} mm at {_HEART[1]:g} Hz with an overtone, breath "
+            f"{_BREATH[0]:g} mm at {_BREATH[1]:g} Hz, both in the plane of the picture and in closed form. "
+            "Mean absolute error; bars: from the least to the most over recordings.",
+            f"Found (median over the tissue): {found}. Found on still tissue: {still_found}.",
+        ),
+        name="README.md",
+    )

@@ -1,0 +1,101 @@
+"""The tissue's own motion: found where there is one, left where there is none, told from contacts."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from learn.inference.pulse import Pulse, Surface, find_pulse
+
+SIZE = (120, 160)
+MM_PER_PX = 0.16
+Y, X = (np.mgrid[: SIZE[0], : SIZE[1]] - np.array(SIZE)[:, None, None] / 2) / 80
+HEART = np.stack([0.8 - 0.3 * (X**2 + Y**2), 0.5 + 0.3 * Y], axis=-1)
+BREATH = np.stack([-0.2 + 0.3 * X, 0.9 + 0.2 * Y], axis=-1)
+AWAY = (X - 0.2) ** 2 + (Y + 0.1) ** 2
+CONTACT = np.stack([np.exp(-AWAY / 0.05) + 0.1 / (1 + 4 * AWAY), 0.3 * np.exp(-AWAY / 0.08)], axis=-1)
+
+
+def film(
+    seconds: float = 20.0,
+    heart_mm: float = 0.4,
+    breath_mm: float = 0.25,
+    contact_mm: float = 1.5,
+    period_s: float | None = None,
+    wander: float = 0.0,
+) -> tuple[Surface, NDArray[np.float64], list[NDArray[np.float64]]]:
+    """What is tracked, its times, and the tissue's own motion [px] in closed form."""
+    rng = np.random.default_rng(0)
+    time = np.arange(0, seconds, 0.1) + rng.uniform(-0.02, 0.02, round(10 * seconds))
+    load = np.zeros_like(time)
+    if period_s is not None:
+        load = np.clip(np.sin(2 * np.pi * time / period_s), 0, None)
+    else:
+        begin = 2.0
+        while begin < seconds - 2:
+            long = rng.uniform(1, 2.5)
+            inside = (time > begin) & (time < begin + long)
+            load += inside * rng.uniform(0.5, 1) * np.sin(np.pi * (time - begin) / long)
+            begin += long + rng.uniform(0.8, 2.5)
+    surface, lay = Surface(np.ones(SIZE, bool)), []
+    for t, force in zip(time, load, strict=True):
+        turn = 2 * np.pi * 1.2 * t + wander * np.sin(2 * np.pi * t / seconds)
+        beat = heart_mm * (np.sin(turn) + 0.3 * np.sin(2 * turn)) * HEART
+        own = (beat + breath_mm * np.sin(2 * np.pi * 0.25 * t + 1) * BREATH) / MM_PER_PX
+        lay.append(own)
+        noise = rng.normal(0, 0.05, (SIZE[0] // 8, SIZE[1] // 8, 2)).repeat(8, 0).repeat(8, 1)
+        flow = own - lay[0] + force * contact_mm / MM_PER_PX * CONTACT + noise
+        surface.add(float(t), flow.astype(np.float32), np.ones(SIZE, np.float32))
+    return surface, time, [own - lay[0] for own in lay]
+
+
+def left(pulse: Pulse, time: NDArray[np.float64], truth: list[NDArray[np.float64]]) -> float:
+    """Root mean square of what is wrongly left in or taken off [mm]."""
+    return MM_PER_PX * float(
+        np.sqrt(np.mean([np.square(pulse.at(t) - own).mean() for t, own in zip(time, truth, strict=True)]))
+    )
+
+
+@pytest.mark.slow
+def test_heart_and_breath_between_contacts_are_found() -> None:
+    surface, time, truth = film()
+    pulse = find_pulse(surface, time[0])
+    assert pulse is not None
+    assert [rhythm.rate_hz for rhythm in pulse.rhythms] == pytest.approx([1.2, 0.25], rel=0.01)
+    assert left(pulse, time, truth) < 0.01
+    assert "mm at 1.2 Hz and" in pulse.describe(MM_PER_PX)
+    # The heart's way from one end to the other, by its definition.
+    turn = np.linspace(0, 2 * np.pi, 200)
+    wave = np.ptp(np.sin(turn) + 0.3 * np.sin(2 * turn)) / 2
+    expected = 0.4 * wave * np.median(np.linalg.norm(HEART, axis=-1))
+    assert MM_PER_PX * pulse.amplitudes_px[0] == pytest.approx(expected, rel=0.03)
+
+
+@pytest.mark.slow
+def test_a_rate_that_wanders_is_followed() -> None:
+    surface, time, truth = film(breath_mm=0.0, wander=0.7)
+    pulse = find_pulse(surface, time[0])
+    assert pulse is not None
+    assert left(pulse, time, truth) < 0.05
+
+
+@pytest.mark.parametrize("period_s", [None, 2.0, 0.9])
+def test_contacts_alone_are_no_pulse_periodic_ones_neither(period_s: float | None) -> None:
+    surface, time, _ = film(heart_mm=0.0, breath_mm=0.0, period_s=period_s)
+    assert find_pulse(surface, float(time[0])) is None
+
+
+def test_noise_alone_and_a_short_film_are_no_pulse() -> None:
+    surface, time, _ = film(heart_mm=0.0, breath_mm=0.0, contact_mm=0.0)
+    assert find_pulse(surface, float(time[0])) is None
+    surface, time, _ = film(seconds=2.5)
+    assert find_pulse(surface, float(time[0])) is None
+
+
+def test_a_given_span_without_contact_is_enough() -> None:
+    surface, time, truth = film(seconds=16, breath_mm=0.0, period_s=6.0)
+    pulse = find_pulse(surface, float(time[0]), [(3.0, 6.0), (9.0, 12.0)])
+    assert pulse is not None
+    assert pulse.free_share == pytest.approx(6 / 16, abs=0.02)
+    assert left(pulse, time, truth) < 0.01
