@@ -19,7 +19,6 @@ from synth.fem import equilibrium, surface_embedding, tool
 from synth.fem.mesh import tetrahedra
 from synth.fem.mesh.relief import HeightMap
 from synth.fem.mesh.tetrahedra import Tets
-from synth.fem.system import assemble
 from synth.job.schema import Job
 from synth.sequence import pipeline, scenario
 from synth.sequence.scenario import Scenario
@@ -84,7 +83,7 @@ def peak_and_mean(case: Scenario, volume: Tets, vertices: Floats, faces: NDArray
     carry = surface_embedding.embed(volume, vertices)
     parts = np.array([0.5, 1.0])
     path = equilibrium.solve_path(
-        assemble(volume, case.tissue.law, case.tissue.poisson, case.tissue.sheet),
+        case.tissue.equations(volume),
         parts[:, None, None] * carry.gather(force),
         gesture.load * parts,
     )

@@ -84,12 +84,13 @@ def _local(slope: Floats, weight: Floats, moduli: Floats, out: Floats) -> None:
                             )
 
 
-def stiffness(mesh: Quadrature, moduli: Floats) -> sp.csr_array:
+def stiffness(mesh: Quadrature, moduli: Floats, along: Floats | None = None) -> sp.csr_array:
     """Tangent stiffness.
 
     Args:
         mesh: the elements.
         moduli: (M * Q, 3, 3, 3, 3) kPa, dP/dF at every point; or (1, 3, 3, 3, 3), one for all.
+        along: (M, n, 3) sqrt(mN/mm): its outer products with itself are added to the elements' stiffness.
 
     Returns:
         (3N, 3N) mN/mm, degrees of freedom node by node.
@@ -97,6 +98,8 @@ def stiffness(mesh: Quadrature, moduli: Floats) -> sp.csr_array:
     elements, n = mesh.cells.shape
     local = np.empty((elements, n, 3, n, 3))
     _local(mesh.slope, mesh.weight, moduli, local)
+    if along is not None:
+        local += along[:, :, :, None, None] * along[:, None, None]
     dof = (3 * mesh.cells[:, :, None] + np.arange(3, dtype=np.int32)).reshape(elements, 3 * n)
     rows, cols = np.repeat(dof, 3 * n, axis=1).ravel(), np.tile(dof, (1, 3 * n)).ravel()
     return sp.coo_array((local.ravel(), (rows, cols)), shape=(3 * mesh.nodes,) * 2).tocsr()

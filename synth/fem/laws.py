@@ -65,6 +65,101 @@ def stress(law: int, strain: Floats, mu: float, lam: float, out: Floats, energy:
 
 
 @compiled
+def resist_swelling(law: int, strain: Floats, weight: Floats, lam: float, out: Floats) -> float:
+    """Adds lam/2 times the square of each element's mean swelling, in place.
+
+    Swelling is what a law squares in its own last term: tr e, tr(R'F - I), J - 1 or log J.
+
+    Args:
+        law, strain: as in `stress`, Q points an element in turn.
+        weight: (M, Q) mm^3.
+        lam: kPa.
+        out: (M * Q, 3, 3) kPa, added to.
+
+    Returns:
+        Energy, mN mm; infinite where the law has no value.
+    """
+    elements, points = weight.shape
+    slope = np.empty((points, 3, 3))
+    energy = 0.0
+    for e in range(elements):
+        whole, volume = 0.0, 0.0
+        for q in range(points):
+            swelling = _swelling(law, strain[e * points + q], slope[q])
+            whole += weight[e, q] * swelling
+            volume += weight[e, q]
+        mean = whole / volume
+        energy += 0.5 * lam * volume * mean * mean
+        for q in range(points):
+            out[e * points + q] += lam * mean * slope[q]
+    return energy
+
+
+@compiled
+def swellings(law: int, strain: Floats, value: Floats, slope: Floats) -> None:
+    """Swelling (n,) of (n, 3, 3) displacement gradients, and its derivative (n, 3, 3) by them, in place."""
+    for n in range(len(strain)):
+        value[n] = _swelling(law, strain[n], slope[n])
+
+
+@compiled
+def bend_swelling(law: int, strain: Floats, pressure: Floats, out: Floats) -> None:
+    """Adds pressure (n,) times the second derivative of swelling to (n, 3, 3, 3, 3), in place."""
+    f, g = np.empty((3, 3)), np.empty((3, 3))
+    for n in range(len(strain)):
+        p, a = pressure[n], out[n]
+        f[:] = strain[n]
+        for i in range(3):
+            f[i, i] += 1
+        if law == 1:
+            _turning(f, g, p, a)
+        elif law == 2:
+            for i in range(3):
+                for j in range(3):
+                    for k in range(3):
+                        for m in range(3):
+                            if i != k and j != m:
+                                a[i, j, k, m] += p * _turn(i, k) * _turn(j, m) * f[3 - i - k, 3 - j - m]
+        elif law == 3:
+            _cofactor(f, g)
+            g /= _det(f)
+            for i in range(3):
+                for j in range(3):
+                    for k in range(3):
+                        for m in range(3):
+                            a[i, j, k, m] -= p * g[i, m] * g[k, j]
+
+
+@compiled
+def _swelling(law: int, h: Floats, slope: Floats) -> float:
+    """Of one displacement gradient; `slope` becomes its derivative. Infinite where a law has no value."""
+    f = h.copy()
+    for i in range(3):
+        f[i, i] += 1
+    if law == 0:
+        for i in range(3):
+            for j in range(3):
+                slope[i, j] = i == j
+        return f[0, 0] + f[1, 1] + f[2, 2] - 3  # type: ignore[no-any-return]
+    if law == 1:
+        _rotation(f, slope)
+        total = -3.0
+        for i in range(3):
+            for j in range(3):
+                total += slope[i, j] * f[i, j]
+        return total
+    det = _det(f)
+    _cofactor(f, slope)
+    if law == 2:
+        return det - 1
+    if det <= 0:
+        slope[:] = 0
+        return np.inf
+    slope /= det
+    return np.log(det)  # type: ignore[no-any-return]
+
+
+@compiled
 def least_determinant(strain: Floats) -> tuple[float, int]:
     """Smallest det F of (n, 3, 3) displacement gradients F - I, and which one has it."""
     least, where = np.inf, 0
@@ -168,7 +263,25 @@ def _neo_hookean(f: Floats, det: float, c: Floats, mu: float, lam: float, p: Flo
 
 @compiled
 def _corotational_tangent(f: Floats, r: Floats, mu: float, lam: float, a: Floats) -> None:
-    """With R'F = S and R'dF = G: dR = R W, where W is skew and its axis w = (tr S - S)^-1 axis(G - G')."""
+    _rotation(f, r)
+    trace = 0.0
+    for i in range(3):
+        for j in range(3):
+            trace += r[i, j] * f[i, j]
+    for i in range(3):
+        for j in range(3):
+            for k in range(3):
+                for m in range(3):
+                    a[i, j, k, m] = 2 * mu * ((i == k) * (j == m)) + lam * r[k, m] * r[i, j]
+    _turning(f, r, lam * (trace - 3) - 2 * mu, a)
+
+
+@compiled
+def _turning(f: Floats, r: Floats, part: float, a: Floats) -> None:
+    """Adds `part` of the rotation's derivative.
+
+    With R'F = S and R'dF = G: dR = R W, where W is skew and its axis w = (tr S - S)^-1 axis(G - G').
+    """
     _rotation(f, r)
     s, b, inverse = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
     for i in range(3):
@@ -195,11 +308,7 @@ def _corotational_tangent(f: Floats, r: Floats, mu: float, lam: float, a: Floats
                 turned[i, 2] = r[i, 0] * w[1] - r[i, 1] * w[0]
             for i in range(3):
                 for j in range(3):
-                    a[i, j, k, m] = (
-                        2 * mu * ((i == k) * (j == m))
-                        + (lam * (trace - 3) - 2 * mu) * turned[i, j]
-                        + lam * r[k, m] * r[i, j]
-                    )
+                    a[i, j, k, m] += part * turned[i, j]
 
 
 @compiled

@@ -8,6 +8,8 @@ import numpy as np
 
 from synth.errors import UserError
 from synth.fem.membrane import Sheet
+from synth.fem.mesh.tetrahedra import Tets
+from synth.fem.system import System, assemble
 from synth.job import schema
 from synth.job.law_limits import LARGEST_LOAD
 
@@ -37,6 +39,10 @@ class Tissue:
     """Why this law."""
     membrane: Pia | None = None
     """The membrane on the surface; None where it is stripped."""
+    averaged: bool = False
+    """Elements resist their mean change of volume, as nearly incompressible tissue needs."""
+    skull: str = "bonded"
+    """`bonded` or `slip`."""
 
     @classmethod
     def draw(cls, fem: schema.Fem, rng: np.random.Generator) -> Tissue:
@@ -51,7 +57,14 @@ class Tissue:
             float(rng.uniform(*asked.stretch)),
         )
         pia = Pia(stiff, thick, stretch)
-        return cls(young, fem.poisson, law, why, pia if intact < asked.intact else None)
+        poisson, skull = float(rng.uniform(*fem.poisson)), str(rng.choice(fem.skull))
+        return cls(
+            young, poisson, law, why, pia if intact < asked.intact else None, fem.averages_volume, skull
+        )
+
+    def equations(self, tets: Tets, law: str | None = None) -> System:
+        """The equations of a volume of it, of its own law or another."""
+        return assemble(tets, law or self.law, self.poisson, self.sheet, averaged=self.averaged)
 
     @property
     def sheet(self) -> Sheet | None:

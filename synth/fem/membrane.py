@@ -11,7 +11,7 @@ uniaxial tension, S/6 (c + 2/sqrt(c) - 3) of the larger squared stretch c, and 0
 
 At rest it is stretched already, as in a living head; the pressure inside holds that up, as a load that stays
 what it is. Measured: without a stretch at rest the sheet is slack one way and stiff the other, and the solver
-takes four times as long; one that bears compression buckles.
+takes several times as long; one that bears compression buckles.
 """
 
 from __future__ import annotations

@@ -49,6 +49,8 @@ def march_in_time(
     named: Floats,
     clock: Clock,
     sheet: Sheet | None = None,
+    *,
+    averaged: bool = False,
 ) -> Path:
     """Motion from rest under loads at even times; between them they change evenly.
 
@@ -61,6 +63,7 @@ def march_in_time(
         named: (T,) P = F/(E a^2) of each, for messages.
         clock: time.
         sheet: a membrane on the surface; it relaxes as the tissue does.
+        averaged: as in `system.assemble`.
 
     Raises:
         As `equilibrium.solve_path`.
@@ -71,8 +74,11 @@ def march_in_time(
     pull = (1 / dt**2 + clock.damping / dt) if clock.mass_kg else 0.0
     mass = nodal_mass(tets, clock.mass_kg) / young_kpa
     springs = (tets.hold + sp.diags_array(pull * mass)) / firm
-    system = assemble(replace(tets, hold=sp.csr_array(springs)), law, poisson, sheet)
-    tissue = replace(system, hold=sp.csr_array(tets.hold.shape))
+    slip = None if tets.slip is None else sp.csr_array(tets.slip / firm)
+    held = replace(tets, hold=sp.csr_array(springs), slip=slip)
+    system = assemble(held, law, poisson, sheet, averaged=averaged)
+    tissue = replace(system, hold=sp.csr_array(tets.hold.shape), slip=None)
+    skull = replace(system, hold=tets.hold, slip=tets.slip)
 
     peak = loads[np.abs(loads).max(axis=(1, 2)).argmax()]
     size = float(np.sqrt(np.vdot(peak, system.solve(peak)))) / firm
@@ -100,7 +106,7 @@ def march_in_time(
     return Path(
         np.stack([u for u, _, _, _ in states]),
         np.array([least for _, _, _, least in states]),
-        np.array([s.energy + 0.5 * float(np.vdot(u, tets.hold @ u)) for u, s, _, _ in states]),
+        np.array([s.energy + 0.5 * float(np.vdot(u, skull.springs(u))) for u, s, _, _ in states]),
         np.array([r for _, _, r, _ in states]),
     )
 

@@ -13,7 +13,6 @@ from synth.fem.equilibrium import InvertedElement, Path
 from synth.fem.material import Tissue, check_load
 from synth.fem.mesh.tetrahedra import Tets
 from synth.fem.pulse import Pulse, lift
-from synth.fem.system import assemble
 from synth.fem.tool import Course, Gesture
 from synth.job import schema
 
@@ -107,7 +106,7 @@ def deform(
     time = np.arange(frames) / fps
     timeless = fem.time == "quasi-static" and not fem.relaxation
     if timeless or pulse is not None:
-        system = assemble(tets, tissue.law, tissue.poisson, tissue.sheet)
+        system = tissue.equations(tets)
     if pulse is not None:
         raising = lift(system, carry, skin_vertices, skin_faces, opening or schema.Craniotomy())
         loads += pulse.height(time)[:, None, None] * raising
@@ -167,6 +166,7 @@ def march_in_time(
         named,
         clock(fem, fps, tets),
         tissue.sheet,
+        averaged=tissue.averaged,
     )
 
 

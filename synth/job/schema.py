@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import AfterValidator, Field, FiniteFloat, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, FiniteFloat, model_validator
 
 from synth import fields
 from synth.flow.estimator import names
@@ -17,6 +17,7 @@ from synth.job.types import (
     InstrumentRange,
     NonNegative,
     NonNegativeRange,
+    PoissonRange,
     Positive,
     PositiveRange,
     Section,
@@ -113,6 +114,14 @@ class Appearance(Section):
     """Blood on the rim, from none (0) to soaked (1). Empty: as the family has it."""
 
 
+_LOCKS = 0.42  # Poisson's ratio past which radial motion is off by more than a sixth at the default mesh
+Skulls = Annotated[
+    tuple[Literal["bonded", "slip"], ...],
+    Field(min_length=1),
+    BeforeValidator(lambda value: (value,) if isinstance(value, str) else value),
+]
+
+
 class Membrane(Section):
     """The pia-arachnoid, a thin stiff sheet on the surface that wrinkles under compression. Default: none."""
 
@@ -159,8 +168,14 @@ class Fem(Section):
     """Number of tetrahedra to aim for; graded towards the craniotomy."""
     young_kpa: PositiveRange = (0.5, 3.0)
     """Young's modulus E [kPa], drawn log-uniformly."""
-    poisson: Annotated[FiniteFloat, Field(ge=0, lt=0.5)] = 0.4
-    """Poisson's ratio."""
+    poisson: PoissonRange = (0.4, 0.4)
+    """Poisson's ratio, drawn uniformly. Brain within seconds: 0.45 to nearly 0.5; drained: less."""
+    volume: Literal["auto", "pointwise", "averaged"] = "auto"
+    """Where quadratic elements resist a change of volume: at every point, or in their mean, which nearly
+    incompressible tissue needs lest they lock; auto averages where `poisson` goes past 0.42."""
+    skull: Skulls = ("bonded",)
+    """How tissue is held round the opening, one or both, in equal shares: bonded to the skull, or free to
+    slip along it (subarachnoid fluid)."""
     membrane: Membrane = Membrane()
     """The pia-arachnoid on the surface."""
     pulse: Pulse = Pulse()
@@ -233,7 +248,7 @@ class Fem(Section):
         law, _ = self.chosen_law
         largest = LARGEST_LOAD[law]
         if self.depth_mm is not None and load > largest:
-            depth = depth_of_load(self.tip, largest, self.poisson) * self.footprint_mm[0]
+            depth = depth_of_load(self.tip, largest, self.poisson[1]) * self.footprint_mm[0]
             raise ValueError(
                 f"depth_mm {self.depth_mm[1]:g} under the smallest contact ({self.footprint_mm[0]:g} mm) "
                 f"takes a load of {load:.3g}, past the range of the {law} law; the largest valid value is "
@@ -253,6 +268,11 @@ class Fem(Section):
         return self
 
     @property
+    def averages_volume(self) -> bool:
+        """Whether elements resist their mean change of volume."""
+        return self.volume == "averaged" or (self.volume == "auto" and self.poisson[1] > _LOCKS)
+
+    @property
     def chosen_law(self) -> tuple[str, str]:
         """The material law of every sequence, and why."""
         if self.law == "auto" and self.membrane.intact > 0:
@@ -263,7 +283,7 @@ class Fem(Section):
     def largest_load(self) -> float:
         """Largest P = F/(E a^2) that can be drawn."""
         if self.depth_mm is not None:
-            return load_of_depth(self.tip, self.depth_mm[1] / self.footprint_mm[0], self.poisson)
+            return load_of_depth(self.tip, self.depth_mm[1] / self.footprint_mm[0], self.poisson[1])
         if self.force_mn is None:
             return self.load[1]
         return self.force_mn[1] / (self.young_kpa[0] * self.footprint_mm[0] ** 2)

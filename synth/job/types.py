@@ -44,6 +44,8 @@ _Kelvin = Annotated[FiniteFloat, Field(ge=2000, le=12_000)]
 LightKelvin = Annotated[tuple[_Kelvin, _Kelvin], BeforeValidator(_pair), AfterValidator(_ordered)]
 _Stretch = Annotated[FiniteFloat, Field(ge=1.005, le=1.2)]
 StretchRange = Annotated[tuple[_Stretch, _Stretch], BeforeValidator(_pair), AfterValidator(_ordered)]
+_Poisson = Annotated[FiniteFloat, Field(ge=0, lt=0.5)]
+PoissonRange = Annotated[tuple[_Poisson, _Poisson], BeforeValidator(_pair), AfterValidator(_ordered)]
 Vector = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
 
 

@@ -82,8 +82,7 @@ def limits(folder: Folder) -> list[str]:
             "The motion is quasi-static: within 3% of damped dynamics after a hold of 0.3 s, not before."
         )
     found += [
-        "Tissue is homogeneous and isotropic: no membranes, no stiffness of vessels, no bleeding, "
-        "breathing or heart beat.",
+        *_left_out(job),
         "What video alone can tell is traction divided by stiffness: give a method `young_kpa`, or score it "
         "without scale.",
     ]
@@ -105,8 +104,11 @@ def limits(folder: Folder) -> list[str]:
         found.append(
             "Linear tetrahedra are too stiff at a coarse mesh: compare `fem.tets` with the convergence study."
         )
-    if job.fem.poisson > 0.45 and job.fem.order == 1:
-        found.append(f"Linear tetrahedra lock at a Poisson's ratio of {job.fem.poisson:g}.")
+    poisson = job.fem.poisson[1]
+    if poisson > 0.45 and job.fem.order == 1:
+        found.append(f"Linear tetrahedra lock at a Poisson's ratio of {poisson:g}.")
+    elif poisson > 0.42 and not job.fem.averages_volume:
+        found.append(f"Elements lock at a Poisson's ratio of {poisson:g}: motion beside a press is wrong.")
     if job.anatomy.mesh is None:
         found.append("The brain is a procedural block: its gyri look right and belong to nobody.")
     noisy = sorted({"flow_noisy", "intensity"} & set(job.store.extra))
@@ -120,6 +122,27 @@ def limits(folder: Folder) -> list[str]:
             "There is no recovered flow: a network trained on this has never seen a tracker's errors."
         )
     return found
+
+
+def _left_out(job: Job) -> list[str]:
+    """What of a living brain's mechanics is in, and what is not."""
+    membrane, beat, breath = job.fem.membrane.intact, job.fem.pulse.heart_mm[1], job.fem.pulse.breath_mm[1]
+    present = {"membrane": membrane, "heart beat": beat, "breath": breath}
+    absent = "".join(f", no {name}" for name, size in present.items() if not size)
+    said = [f"Tissue is homogeneous and isotropic: no stiffness of vessels, no bleeding{absent}."]
+    if membrane:
+        said.append(
+            f"The pia-arachnoid is on {membrane:.0%} of the sequences (drawn), an elastic sheet; it "
+            "wrinkles, does not stiffen as it stretches, and its stretch at rest is assumed, not measured."
+        )
+    if beat or breath:
+        said.append(
+            "Heart and breath raise the exposed surface by a pressure that no label holds: `force` and "
+            "`traction` are the tools' alone."
+        )
+    if "slip" in job.fem.skull:
+        said.append("Where the scenario says `slip`, tissue slides along the skull without friction.")
+    return said
 
 
 def column(rows: Iterable[Mapping[str, Any]], name: str) -> NDArray[np.float64]:

@@ -304,10 +304,11 @@ def build(job: Job, case: Scenario) -> tuple[Surface, Tets]:
     """The fine surface of a scenario and the volume under it, finest where its contacts are."""
     focus = [place for gesture in case.gestures for place in tool.focus(gesture)]
     surface, whole = cortex(job, case)
+    mesh, slips = (job.fem.tets, job.fem.order, focus), case.tissue.skull == "slip"
     if whole is None:
         height = HeightMap(surface.pia, surface.extent_mm)
-        return surface, tetrahedra.block(job.anatomy, job.fem.tets, job.fem.order, focus, height)
-    return surface, tetrahedra.from_brain(whole, job.anatomy, job.fem.tets, job.fem.order, focus)
+        return surface, tetrahedra.block(job.anatomy, *mesh, height, slips=slips)
+    return surface, tetrahedra.from_brain(whole, job.anatomy, *mesh, slips=slips)
 
 
 def cortex(job: Job, case: Scenario) -> tuple[Surface, Brain | None]:

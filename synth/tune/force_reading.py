@@ -19,7 +19,7 @@ from scipy.sparse.linalg import splu
 
 from synth.fem import equilibrium, surface_embedding, tool
 from synth.fem.solver import Deformation
-from synth.fem.system import System, assemble
+from synth.fem.system import System
 from synth.job.schema import Job
 from synth.render import truth
 from synth.render.anatomy.surface import Surface
@@ -80,7 +80,7 @@ def fit_reading(
         update={"law": "neo-hookean", "order": 2, "tets": _TETS, "time": "quasi-static", "relaxation": ()}
     )
     tets = pipeline.build(job.model_copy(update={"fem": plain}), case)[1]
-    system = assemble(tets, "neo-hookean", case.tissue.poisson, case.tissue.sheet)
+    system = case.tissue.equations(tets, "neo-hookean")
     carry = surface_embedding.embed(tets, surface.vertices)
     young = case.tissue.young_kpa
     loads = np.stack([carry.gather(motion.area[:, None] * motion.traction[f]) for f in frames]) / young

@@ -51,6 +51,8 @@ class Tets:
     """(N,) nodes that cannot move: the walls a block is cut out at."""
     hold: sp.csr_array
     """(N, N) mm, for E = 1 kPa: springs of the skull on the surface round the opening, and of attachments."""
+    slip: sp.csr_array | None = None
+    """(3N, 3N) mm: springs along the surface's normal alone, where tissue slips along the skull."""
 
 
 def block(
@@ -59,6 +61,8 @@ def block(
     order: int,
     focus: Sequence[Contact] = (),
     height: HeightMap | None = None,
+    *,
+    slips: bool = False,
 ) -> Tets:
     """A domed block, fixed at its sides and bottom, held by the skull round the opening.
 
@@ -68,6 +72,7 @@ def block(
         order: 1 or 2.
         focus: where the load will be; finest there. Empty: finest in the whole opening.
         height: of the surface over the opening and its rim. Empty: the bare dome.
+        slips: tissue slips along the skull round the opening, rather than being bonded to it.
 
     Raises:
         UserError: the block is too shallow for its dome, or an attachment holds nothing.
@@ -96,11 +101,17 @@ def block(
         ground if height is None else height.over(ground),
     )
     # A face is on a wall if its three corners are; the upper edge of the walls belongs to both.
-    return _finished(points, cells, order, wall, anatomy.craniotomy, anatomy.attachments)
+    return _finished(points, cells, order, wall, anatomy.craniotomy, anatomy.attachments, slips)
 
 
 def from_brain(
-    brain: Brain, anatomy: schema.Anatomy, tets: int, order: int, focus: Sequence[Contact] = ()
+    brain: Brain,
+    anatomy: schema.Anatomy,
+    tets: int,
+    order: int,
+    focus: Sequence[Contact] = (),
+    *,
+    slips: bool = False,
 ) -> Tets:
     """A user's whole brain, held by the skull everywhere but in the opening.
 
@@ -118,7 +129,7 @@ def from_brain(
         raise UserError("anatomy.craniotomy: there is no volume under the opening")
     held = brain.placed(anatomy.attachments)
     points, cells = lengthened(points, cells, order)
-    return _finished(points, cells, order, np.zeros(len(points), bool), anatomy.craniotomy, held)
+    return _finished(points, cells, order, np.zeros(len(points), bool), anatomy.craniotomy, held, slips)
 
 
 def dome(xy: Floats, radius_mm: float) -> Floats:
@@ -224,27 +235,52 @@ def _finished(
     wall: NDArray[np.bool_],
     at: schema.Craniotomy,
     held: Sequence[schema.Attachment],
+    slips: bool,
 ) -> Tets:
     faces = boundary(cells, order)
     on_wall = wall[faces[:, :3]].all(axis=1)
     fixed = np.zeros(len(points), bool)
     fixed[faces[on_wall]] = True
-    hold = _springs(points, faces[~on_wall], order, at) + attachments.springs(points, cells, order, held)
-    return Tets(points, cells, order, fixed, sp.csr_array(hold))
+    bonded, slip = _springs(points, faces[~on_wall], order, at, slips)
+    hold = bonded + attachments.springs(points, cells, order, held)
+    return Tets(points, cells, order, fixed, sp.csr_array(hold), slip if slips else None)
 
 
-def _springs(points: Floats, faces: Ints, order: int, at: schema.Craniotomy) -> sp.csr_array:
-    """The skull: springs on the surface that grow, over the rim's width, from none in the opening to firm."""
+def _springs(
+    points: Floats, faces: Ints, order: int, at: schema.Craniotomy, slips: bool
+) -> tuple[sp.csr_array, sp.csr_array]:
+    """The skull: springs on the surface that grow, over the rim's width, from none in the opening to firm.
+
+    Returns:
+        (N, N) mm of those that hold every way, and (3N, 3N) of those along the normal alone. Deep below,
+        where nerves and vessels tether the brain, all hold every way.
+    """
     corner = points[faces[:, :3]]
-    area = 0.5 * np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1)
+    facing = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    area = 0.5 * np.linalg.norm(facing, axis=1)
     place = np.einsum("qc,fcd->fqd", TRI_POINTS, corner)
     out = np.hypot(place[..., 0], place[..., 1]) - at.radius_mm
     firm = np.clip(out / at.rim_mm, 0, 1)
     # Deep below, it is the far side of the brain, which no opening bares.
-    firm[place[..., 2] < -2 * at.radius_mm] = 1
+    deep = place[..., 2] < -2 * at.radius_mm
+    firm[deep] = 1
     value = face_shape(TRI_POINTS, order)
     pressed = _FIRM_PER_MM * firm * firm * (3 - 2 * firm) * area[:, None] * TRI_WEIGHTS
-    local = np.einsum("fq,qi,qj->fij", pressed, value, value)
     n = faces.shape[1]
-    rows, cols = np.repeat(faces, n, axis=1).ravel(), np.tile(faces, (1, n)).ravel()
-    return sp.coo_array((local.ravel(), (rows, cols)), shape=(len(points),) * 2).tocsr()
+
+    def gathered(part: Floats) -> sp.coo_array:
+        local = np.einsum("fq,qi,qj->fij", part, value, value)
+        rows, cols = np.repeat(faces, n, axis=1).ravel(), np.tile(faces, (1, n)).ravel()
+        return sp.coo_array((local.ravel(), (rows, cols)), shape=(len(points),) * 2)
+
+    if not slips:
+        return gathered(pressed).tocsr(), sp.csr_array((3 * len(points),) * 2)
+    normal = facing / (2 * area)[:, None]
+    slip = sp.csr_array((3 * len(points),) * 2)
+    for i in range(3):
+        for j in range(3):
+            one = np.zeros((3, 3))
+            one[i, j] = 1
+            part = np.where(deep, 0, pressed) * (normal[:, i] * normal[:, j])[:, None]
+            slip = slip + sp.kron(gathered(part), one, format="csr")
+    return gathered(np.where(deep, pressed, 0)).tocsr(), sp.csr_array(slip)

@@ -11,13 +11,13 @@ import skfem
 from skfem.models.elasticity import lame_parameters, linear_elasticity
 
 from synth.errors import UserError
-from synth.fem.assembly import stiffness
-from synth.fem.laws import NUMBER, stress, tangent
+from synth.fem.assembly import gradient, stiffness
+from synth.fem.laws import NUMBER, lame, stress, tangent
 from synth.fem.mesh import tetrahedra
 from synth.fem.mesh.element import quadrature, quality
 from synth.fem.mesh.refine import bisect, refine
 from synth.fem.mesh.tetrahedra import Tets
-from synth.fem.system import System, assemble, hooke
+from synth.fem.system import POINTWISE, System, assemble, hooke
 from synth.job import schema
 
 LAWS = sorted(NUMBER)
@@ -54,12 +54,13 @@ def test_stiffness_is_scikit_fems(order: int) -> None:
     assert error <= 1e-12 * abs(ours).max()
 
 
+@pytest.mark.parametrize("averaged", [False, True])
 @pytest.mark.parametrize("law", LAWS)
 @pytest.mark.parametrize("order", [1, 2])
-def test_patch(law: str, order: int) -> None:
+def test_patch(averaged: bool, law: str, order: int) -> None:
     """Under a uniform strain on the boundary, the inside follows it: forces at inner nodes vanish."""
     tets = cube(order)
-    system = assemble(tets, law, 0.4)
+    system = assemble(tets, law, 0.4, averaged=averaged)
     strain = np.array([[0.05, 0.02, -0.03], [0.01, -0.04, 0.02], [0.03, 0.0, 0.06]])
     force = system.state(tets.points @ strain.T).force
     assert np.abs(force[~tets.fixed]).max() <= 1e-12 * np.abs(force).max()
@@ -76,9 +77,10 @@ def test_linear_solution_with_prescribed_boundary_is_the_uniform_strain(order: i
     assert np.abs(shell + inner - exact).max() <= 1e-12
 
 
+@pytest.mark.parametrize("averaged", [False, True])
 @pytest.mark.parametrize("law", [name for name in LAWS if name != "linear"])
-def test_rigid_rotation_gives_no_force(law: str) -> None:
-    system = assemble(cube(2), law, 0.4)
+def test_rigid_rotation_gives_no_force(averaged: bool, law: str) -> None:
+    system = assemble(cube(2), law, 0.4, averaged=averaged)
     points = cube(2).points
     turn, _ = np.linalg.qr(np.random.default_rng(2).normal(size=(3, 3)))
     turn *= np.sign(np.linalg.det(turn))
@@ -88,9 +90,10 @@ def test_rigid_rotation_gives_no_force(law: str) -> None:
     assert state.jacobian == pytest.approx(1.0, abs=1e-12)
 
 
+@pytest.mark.parametrize("averaged", [False, True])
 @pytest.mark.parametrize("law", LAWS)
-def test_force_is_the_slope_of_the_energy(law: str) -> None:
-    system, rng = assemble(cube(2), law, 0.4), np.random.default_rng(3)
+def test_force_is_the_slope_of_the_energy(averaged: bool, law: str) -> None:
+    system, rng = assemble(cube(2), law, 0.4, averaged=averaged), np.random.default_rng(3)
     u, step = 0.004 * rng.normal(size=(system.mesh.nodes, 3)), rng.normal(size=(system.mesh.nodes, 3))
     h = 2e-6
     slope = (system.state(u + h * step).energy - system.state(u - h * step).energy) / (2 * h)
@@ -115,14 +118,43 @@ def test_tangent_is_the_slope_of_the_stress(law: str) -> None:
             assert (error <= 1e-7 * np.abs(moduli).max(axis=(1, 2, 3, 4))).all()
 
 
+@pytest.mark.parametrize("averaged", [False, True])
 @pytest.mark.parametrize("law", LAWS)
-def test_every_law_is_hookes_at_rest(law: str) -> None:
-    system, rng = assemble(cube(1), law, 0.3), np.random.default_rng(4)
+def test_every_law_is_hookes_at_rest(averaged: bool, law: str) -> None:
+    system, rng = assemble(cube(2), law, 0.45, averaged=averaged), np.random.default_rng(4)
     u = rng.normal(size=(system.mesh.nodes, 3))
     h = 1e-6
     tangent = (system.state(h * u).force - system.state(-h * u).force) / (2 * h)
     hooke = (system.stiffness @ u.ravel()).reshape(-1, 3)
     assert np.abs(tangent - hooke).max() <= 1e-7 * np.abs(hooke).max()
+
+
+@pytest.mark.parametrize("averaged", [False, True])
+@pytest.mark.parametrize("law", LAWS)
+def test_stiffness_at_a_state_is_the_slope_of_the_force(averaged: bool, law: str) -> None:
+    system, rng, h = assemble(cube(2), law, 0.47, averaged=averaged), np.random.default_rng(6), 1e-6
+    assert (system.averaged > 0) == averaged
+    u, step = 0.004 * rng.normal(size=(system.mesh.nodes, 3)), rng.normal(size=(system.mesh.nodes, 3))
+    slope = (system.state(u + h * step).force - system.state(u - h * step).force) / (2 * h)
+    found = (system.tangent(u) @ step.ravel()).reshape(-1, 3)
+    assert np.abs(found - slope).max() <= 1e-5 * np.abs(slope).max()
+
+
+def test_mean_swelling_is_resisted_by_lambda_and_the_rest_by_its_part_at_points() -> None:
+    """Even swelling costs the same both ways; what varies within an element only what acts at points."""
+    tets, poisson = cube(2), 0.49
+    mu, lam = lame(1.0, poisson)
+    plain, mean = (assemble(tets, "linear", poisson, averaged=one) for one in (False, True))
+    even = 0.01 * tets.points
+    assert mean.state(even).energy == pytest.approx(plain.state(even).energy, rel=1e-12)
+    u = 0.01 * np.random.default_rng(7).normal(size=tets.points.shape)
+    strain = np.empty((plain.mesh.weight.size, 3, 3))
+    gradient(plain.mesh.cells, plain.mesh.slope, u, strain)
+    weight = plain.mesh.weight
+    swelling = np.trace(strain, axis1=1, axis2=2).reshape(weight.shape)
+    whole = (swelling * weight).sum(axis=1, keepdims=True) / weight.sum(axis=1, keepdims=True)
+    saved = 0.5 * (lam - POINTWISE * mu) * float((weight * (swelling**2 - whole**2)).sum())
+    assert plain.state(u).energy - mean.state(u).energy == pytest.approx(saved, rel=1e-9)
 
 
 def test_bisection_conforms_and_keeps_volume_and_orientation() -> None:

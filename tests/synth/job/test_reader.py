@@ -41,7 +41,7 @@ def test_every_mistake_at_once_with_line_and_column() -> None:
         "job.yaml:2:9: frames: a whole number is needed, not 'many'",
         "job.yaml:4:3: render.sppp: unknown key, did you mean 'spp'?",
         "job.yaml:5:8: render.spp: 0 is out of range, it must be >= 1",
-        "job.yaml:8:12: fem.poisson: 0.5 is out of range, it must be < 0.5",
+        "job.yaml:8:12: fem.poisson[0]: 0.5 is out of range, it must be < 0.5",
         "job.yaml:9:9: fem.load: the lower end 3 is above the upper end 1",
         "job.yaml:12:1: spp: unknown key, did you mean 'render.spp'?",
     ):
