@@ -118,6 +118,12 @@ def surface(sequence: Sequence, t: int, step: int) -> tuple[Floats, NDArray[np.i
 
 def _log(rerun: Any, stream: Any, sequence: Sequence) -> None:
     attrs, (height, width) = sequence.attrs, sequence.size
+    needed = ("K", "distortion", "rotation", "translation", "scale_mm_per_px", "young_kpa")
+    lacking = [name for name in needed if sequence.attrs.get(name) is None]
+    peaks = ("peak_flow_px", "peak_traction_kpa")
+    lacking += [name for name in peaks if not isinstance(sequence.attrs.get("summary", {}).get(name), float)]
+    if lacking:
+        raise UserError(f"{sequence.path}: says nothing of {', '.join(lacking)}, which a view needs")
     view, frames = optics.camera_of(sequence), range(sequence.frames)
     force, time = sequence["force"][:], sequence["time"][:]
     flows = [name for name in ("flow", "flow_recovered") if name in sequence]
