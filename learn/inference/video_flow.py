@@ -366,7 +366,7 @@ class VideoFlow:
         """Starts the flow: nothing has moved."""
         self._fault, self._rest_rgb = find_fault(rgb, self.tissue), rgb
         if self._fault:
-            return self._nothing()
+            return replace(self._nothing(), is_rest=True)
         self._flow.begin(self.settings.backend, rgb, blocked, self.tissue)
         still = np.zeros((*self.tissue.shape, 2), np.float32)
         sure = blocked.known if isinstance(blocked, Proposal) else blocked

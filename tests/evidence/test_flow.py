@@ -141,8 +141,9 @@ def test_bench_flow_without_a_truth_answers_in_json_too(tmp_path: Path) -> None:
         cv2.imwrite(str(tmp_path / name), np.full((32, 32, 3), 90, np.uint8))
     out = tmp_path / "out.flo"
     words = ["flow", str(tmp_path / "a.png"), str(tmp_path / "b.png"), "--flow", "dis", "--json"]
-    assert json.loads(CliRunner().invoke(app, [*words, "-o", str(out)]).stdout) == {"out": str(out)}
-    assert json.loads(CliRunner().invoke(app, words).stdout) == {"out": None}
+    for more, written in ((["-o", str(out)], str(out)), ([], None)):
+        told = json.loads(CliRunner().invoke(app, [*words, *more]).stdout)
+        assert told == {"out": written, "mean_px": 0, "p98_px": 0, "confidence": 1}
 
 
 def test_stream_answers_every_frame_and_says_what_it_cost() -> None:
@@ -224,7 +225,7 @@ def test_live_answers_with_the_forces_that_scoring_finds(tmp_path: Path, model: 
     # The stream has looked at the rest frame twice and so starts its first flow warm; what differs is a share
     # of the motion's part alone, the network's answer to none being taken off.
     assert [frame.force_mn for frame in streamed] == pytest.approx(scored, rel=0.25)
-    assert any("tool is found" in note for note in followed.notes)
+    assert any("tool is looked for" in note for note in followed.notes)
 
 
 def test_scoring_without_masks_leaves_the_instrument_out(tmp_path: Path) -> None:

@@ -66,10 +66,10 @@ def test_training_and_scoring_are_counted(module: str, monkeypatch: pytest.Monke
     counted: set[str] = set()
     home = Path(provenance.__file__).parents[2]
 
-    def versions(at: Path, files: set[Path]) -> dict[str, str]:
+    def code(at: Path, files: set[Path]) -> str:
         counted.update(str(file.relative_to(home)) for file in files)
-        return {}
+        return ""
 
-    monkeypatch.setattr(provenance, "_versions", versions)
+    monkeypatch.setattr(provenance, "_code", code)
     kept.code.__wrapped__(f"evidence.{module}")
     assert {"learn/training/train.py", "learn/loss.py", "synth/flow/tvl1.py"} <= counted

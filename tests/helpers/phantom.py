@@ -71,9 +71,10 @@ def write(
     writer.put("area", area)
     share = density(gx, gy)
     share /= (share * area).sum()
+    picture = np.random.default_rng(index).integers(60, 120, (*SIZE, 3), dtype=np.uint8)
     for t, level in enumerate(ramp):
         flow = displacement(gx, gy, level * peak, young) / SCALE_MM_PER_PX * tissue[..., None]
-        writer.put_frame("rgb", t, np.full((*SIZE, 3), 90, np.uint8))
+        writer.put_frame("rgb", t, np.roll(picture, t, axis=1))
         writer.put_frame("flow", t, flow.astype(np.float32))
         writer.put_frame("visible", t, tissue)
         writer.put_frame("tool", t, np.zeros(SIZE, bool))

@@ -17,7 +17,7 @@ from synth.checks.physics import INVARIANTS
 from synth.cli import app
 from synth.dataset import index
 from synth.errors import UserError
-from synth.job.schema import Job
+from synth.job.schema import Flow, Job
 
 PAIR = {"size": (96, 72), "stereo_mm": 24.0}
 JOB = Job(seed=1, sequences=2, frames=5, render=PAIR, flow={"backend": "ideal"})
@@ -72,7 +72,7 @@ def test_a_good_dataset_passes_and_every_invariant_was_measured(dataset: Path) -
     ],
 )
 def test_a_faulty_pipeline_is_found_by_the_check_made_for_it(tmp_path: Path, fault: str, check: str) -> None:
-    job = JOB.model_copy(update={"sequences": 1, "flow": Job().flow})
+    job = JOB.model_copy(update={"sequences": 1, "flow": Flow(stereo="none")})
     in_process(job, tmp_path / "out", fake_work.wrong(fault))
     found = next(one for one in verify.verify_dataset(tmp_path / "out").checks if one.name == check)
     assert not found.good
