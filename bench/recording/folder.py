@@ -94,6 +94,8 @@ class Recording:
         """What is taken for the tool in how many frames, for `bench check` and `bench score` alike."""
         if not self.has_masks:
             return "no masks/, no mask.png: the tool is looked for in each picture"
+        if len(self.masks) >= frames:
+            return f"masks/ has all {frames} frames"
         others = "mask.png stands for" if self.mask else "no tool is taken to be in"
         return f"masks/ has {len(self.masks)} of {frames} frames; {others} the others"
 
