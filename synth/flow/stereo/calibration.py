@@ -10,6 +10,7 @@ import numpy as np
 
 from synth.errors import UserError
 from synth.flow.stereo.rig import Eye, Floats, Rig
+from synth.system import foreign_file, foreign_storage
 
 _LEFT = ("K1", "M1", "cameraMatrix1", "camera_matrix_1", "CM1"), ("D1", "distCoeffs1", "dist_coeffs_1")
 _RIGHT = ("K2", "M2", "cameraMatrix2", "camera_matrix_2", "CM2"), ("D2", "distCoeffs2", "dist_coeffs_2")
@@ -27,16 +28,10 @@ def read_rig(path: Path, size: tuple[int, int], mm_per_unit: float = 1.0) -> Rig
     Raises:
         UserError: it cannot be read, or what it holds are no two cameras.
     """
-    try:
-        storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
-    except (cv2.error, SystemError) as error:
-        raise UserError(f"{path}: cannot be read as a calibration ({error})") from error
-    if not storage.isOpened():
-        raise UserError(f"{path}: cannot be read as a calibration")
+    held = foreign_storage.read_storage(str(path), foreign_file.read_text(path, foreign_storage.LARGEST))
 
     def matrix(names: Sequence[str], what: str) -> Floats:
-        found = (storage.getNode(name).mat() for name in names if not storage.getNode(name).empty())
-        first = next((one for one in found if one is not None), None)
+        first = next((held[name] for name in names if isinstance(held.get(name), np.ndarray)), None)
         if first is None or not np.isfinite(first).all():
             raise UserError(f"{path}: holds no {what} ({', '.join(names)})")
         return np.asarray(first, np.float64)

@@ -113,8 +113,11 @@ def test_a_calibration_that_opencv_wrote_is_read(tmp_path: Path) -> None:
     (tmp_path / "none.yaml").write_text("%YAML:1.0\n---\nR: 3\n")
     with pytest.raises(UserError, match="left camera matrix"):
         calibration.read_rig(tmp_path / "none.yaml", SIZE)
-    with pytest.raises(UserError, match="cannot be read"):
+    with pytest.raises(UserError, match="no such file"):
         calibration.read_rig(tmp_path / "missing.yaml", SIZE)
+    (tmp_path / "deep.yaml").write_text("%YAML:1.0\n---\nR: " + "[" * 90_000)  # ended the process
+    with pytest.raises(UserError, match="nested deeper"):
+        calibration.read_rig(tmp_path / "deep.yaml", SIZE)
 
 
 def test_a_left_camera_on_the_right_is_refused() -> None:
