@@ -62,7 +62,13 @@ def _body(path: Path, lines: list[str], delimiter: str, columns: list[int]) -> N
     try:
         # loadtxt's C parser; the slow way only to name the line at fault.
         return np.loadtxt(
-            rows, delimiter=delimiter, usecols=columns, ndmin=2, comments=None, dtype=np.float64
+            rows,
+            delimiter=delimiter,
+            usecols=columns,
+            ndmin=2,
+            comments=None,
+            quotechar='"',
+            dtype=np.float64,
         )
     except (ValueError, IndexError):
         return np.array(

@@ -76,7 +76,8 @@ class Recording:
         return video.count_frames(self.video) if self.video else len(self.pictures)
 
     def frames(self) -> Iterator[Picture]:
-        """Upright frames in order, with times: frames.csv's, else the video's, else `fps` in meta.yaml.
+        """Upright frames in order, with times: those of frames.csv alone if there is one, else the video's, else by
+        `fps` of meta.yaml.
 
         Raises:
             UserError: unreadable video or picture.
@@ -121,7 +122,7 @@ class Recording:
         if self.times_s is not None:
             known = picture.index < len(self.times_s) and np.isfinite(self.times_s[picture.index])
             time_s = float(self.times_s[picture.index]) if known else None
-        if time_s is None and fps is not None:
+        elif time_s is None and fps is not None:
             time_s = picture.index / fps
         return replace(picture, time_s=time_s)
 

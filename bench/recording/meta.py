@@ -91,7 +91,8 @@ class Sensor(_Section):
     free_s: tuple[Span, ...] = ()
     """Spans without contact, (from, to) on the sensor's clock [s]: for tare, drift and noise floor."""
     mass_g: Annotated[FiniteFloat, Field(ge=0)] = 0.0
-    """Mass beyond a tool-mounted sensor [g], for gravity; needs columns gx, gy, gz in force.csv."""
+    """Mass beyond a tool-mounted sensor [g], for gravity; needs columns gx, gy, gz in force.csv: the unit vector along
+    gravity in the sensor's axes."""
 
     @model_validator(mode="after")
     def _is_a_rotation(self) -> Sensor:

@@ -17,6 +17,7 @@ STANDARD_GRAVITY = 9.80665
 
 _GAP = 5.0  # median sample times after which samples are apart
 _ORDER = 4
+_NO_UNIT = 0.1  # how far from 1 the length of gravity's direction may be
 
 
 @dataclass(frozen=True)
@@ -45,7 +46,8 @@ def process_force(force: Force, sensor: Sensor, offset_s: float, causal: bool = 
         causal: the low-pass runs forward only, as a live system's must (its delay is then in the curve).
 
     Raises:
-        UserError: a contact-free span without samples, a mass without gravity columns.
+        UserError: a contact-free span without samples, a mass without gravity columns, or with columns
+            that hold no unit vector.
     """
     steps: list[str] = []
     values = _weightless(force, sensor, steps)
@@ -78,6 +80,13 @@ def _weightless(force: Force, sensor: Sensor, steps: list[str]) -> NDArray[np.fl
     if force.gravity is None:
         raise UserError(
             "sensor.mass_g is given, but force.csv has no columns gx, gy, gz for the direction of gravity"
+        )
+    length = np.linalg.norm(force.gravity, axis=1)
+    off = np.abs(length - 1)
+    if np.nanmax(off, initial=0.0) > _NO_UNIT:
+        raise UserError(
+            f"force.csv: gx, gy, gz have the length {length[np.nanargmax(off)]:.4g} at "
+            f"{force.time_s[np.nanargmax(off)]:.6g} s; a unit vector along gravity is needed, not m/s²"
         )
     sign = -1.0 if sensor.acts_on == "tool" else 1.0  # the file's sign was turned on reading
     steps.append(f"weight of {sensor.mass_g:g} g beyond the sensor taken off")

@@ -77,6 +77,25 @@ def test_stamps_as_tools_write_them(tmp_path: Path, header: str, row: str, secon
     assert force.tolist() == [[1, 2, 3]]
 
 
+@pytest.mark.parametrize(("rate_hz", "unit", "word"), [(1000, 1e3, "milli"), (1000, 1e6, "micro")])
+def test_a_fast_sensors_other_unit_is_told_by_the_video(
+    tmp_path: Path, rate_hz: float, unit: float, word: str
+) -> None:
+    np.save(tmp_path / "film.npy", FILM)
+    table = tmp_path / "ft.csv"
+
+    def read(seconds: float, of: float) -> registry.Intake:
+        rows = [f"{of * k / rate_hz:.6f},0,0,1" for k in range(int(seconds * rate_hz))]
+        table.write_text("\n".join(["t_s,fx,fy,fz", *rows]) + "\n")
+        return registry.read_source(tmp_path / "film.npy", {"fps": "25", "force": str(table)})
+
+    with pytest.raises(UserError, match=f"they look like {word}seconds, not seconds|their times look like"):
+        read(1, unit)
+    assert len(read(1, 1).force) == 1000
+    # Seconds of a sensor that ran for two minutes beside half a second of video.
+    assert len(read(120, 1).force) == 120_000
+
+
 def test_what_lacks_is_said(pictures: Path, tmp_path: Path) -> None:
     with pytest.raises(UserError, match="pictures without times"):
         registry.read_source(pictures)

@@ -44,8 +44,11 @@ def test_gravity_of_what_hangs_on_a_turning_tool() -> None:
     raw = Force(t, -on_tool, down)  # the reader has turned the sign: force on the tissue
     got = force_sensor.process_force(raw, Sensor(acts_on="tool", mass_g=20, low_pass_hz=None), 0.0)
     assert got.force_mn == pytest.approx(three(50 * np.exp(-((t - 2) ** 2))), abs=1e-9)
-    with pytest.raises(UserError, match="gx, gy, gz"):
+    with pytest.raises(UserError, match="has no columns gx, gy, gz"):
         force_sensor.process_force(Force(t, -on_tool), Sensor(mass_g=20), 0.0)
+    # As an accelerometer gives it; the weight taken off would be ten times that of what hangs there.
+    with pytest.raises(UserError, match=r"gx, gy, gz have the length 9.807 at .* s; a unit vector"):
+        force_sensor.process_force(Force(t, -on_tool, 9.80665 * down), Sensor(mass_g=20), 0.0)
 
 
 @pytest.mark.parametrize("causal", [False, True])
