@@ -285,9 +285,7 @@ def _offset(force: Force, recording: Recording, done: Tracked, time: Curve) -> O
     trusted = np.array(done.trusted)
     # A speed is of two frames: where either is lost it is of the flow's mistake.
     speed = np.where(trusted & np.append(True, trusted[:-1]), done.speed, np.nan)
-    return clock_sync.find_offset(
-        time[inside], speed[inside], smooth.time_s, smooth.force_mn, about.search_s
-    )
+    return clock_sync.find_offset(time[inside], speed[inside], smooth.time_s, smooth.force_mn, about.search_s)
 
 
 def _scored(

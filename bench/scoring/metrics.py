@@ -179,8 +179,8 @@ def events(time_s: Curve, contact: NDArray[np.bool_], shortest_s: float = 0.15) 
 def per_event(time_s: Curve, sensor: Curve, predicted: Curve, spans: list[Event]) -> list[dict[str, float]]:
     """One row a contact: peaks [mN], impulses [mN s] (trapezoidal) and their errors.
 
-    Times, peak and impulse are the sensor's alone. Errors are over the samples that have a prediction, and NaN
-    where fewer than two have.
+    Times, peak and impulse are the sensor's alone. Errors are over the samples that have a prediction, and
+    NaN where fewer than two have.
     """
     rows = []
     for span in spans:

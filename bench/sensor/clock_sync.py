@@ -48,7 +48,8 @@ def find_offset(
 
     Args:
         frame_s: (T,) times of the frames in the calibration span [s].
-        speed: (T,) mean speed of the tissue over the interval that ends at each frame [mm/s]; NaN are left out.
+        speed: (T,) mean speed of the tissue over the interval that ends at each frame [mm/s]; NaN are left
+            out.
         sensor_s: (N,) the sensor's own times [s].
         force_mn: (N, 3) [mN]; NaN rows are left out.
         search_s: largest offset looked for, either way [s].

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import cv2
@@ -94,6 +95,18 @@ def test_a_fast_sensors_other_unit_is_told_by_the_video(
     assert len(read(1, 1).force) == 1000
     # Seconds of a sensor that ran for two minutes beside half a second of video.
     assert len(read(120, 1).force) == 120_000
+
+
+def test_pictures_are_named_as_they_please(pictures: Path) -> None:
+    (pictures / "img3.png").rename(pictures / "img3².png")
+    assert len(registry.read_source(pictures, {"fps": "5"}).times_s) == 12
+
+
+def test_a_table_that_is_a_pipe_is_refused(pictures: Path, tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    for use in ({"frame_time": str(tmp_path / "pipe")}, {"fps": "5", "force": str(tmp_path / "pipe")}):
+        with pytest.raises(UserError, match="no regular file"):
+            registry.read_source(pictures, use)
 
 
 def test_what_lacks_is_said(pictures: Path, tmp_path: Path) -> None:

@@ -108,6 +108,7 @@ CASES: dict[str, tuple[Spoil, str]] = {
         meta("sync: {method: correlate, calibration_s: [0, 0.3]}"),
         "could not be aligned",
     ),
+    "press backwards": (meta("press_s: [0.5, 0.2]"), "press_s: a span must end after its beginning"),
     "no pictures": (gone("frames"), "neither video"),
     "video and pictures": (both, "keep one"),
     "picture is broken": (data("frames/0003.png", b"png?"), "not a readable picture"),
