@@ -74,7 +74,7 @@ def trunks(
 
 
 def _joined(line: Floats, nodes: Floats, near: float) -> tuple[Floats, int]:
-    """The part of a path before it meets earlier nodes, from there on, and the node; all of it and -1 if none.
+    """The part of a path up to earlier nodes, from there on, and which it meets; all of it and -1 if none.
 
     Of the path's two ends the one that runs longer before it meets them is kept.
     """

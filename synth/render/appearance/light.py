@@ -101,7 +101,7 @@ def spot(camera: Camera, rest: Camera, lighting: Lighting) -> Map:
     away = (np.linalg.norm(met, axis=-1) / field).astype(np.float32)
     across, down = (np.linspace(0, _RAYS - 1, n, dtype=np.float32) for n in (width, height))
     away = cv2.remap(away, *np.meshgrid(across, down), cv2.INTER_LINEAR)
-    return np.clip((np.float32(lighting.even + _FADE) - away) / np.float32(_FADE), 0, 1)
+    return np.asarray(np.clip((lighting.even + _FADE - away) / _FADE, 0, 1), np.float32)
 
 
 def _towards(camera: Camera, lighting: Lighting, side: float) -> Floats:
