@@ -20,7 +20,7 @@ _SPARSE_DEG = 17.0  # slope that mirrors the main lamp into the lens where highl
 _STEEPEST_DEG = 6.5
 _FADE = 0.6  # widths of the field over which the spot ends
 _RAYS = 65  # across a picture
-_WINDOW_DEG = 0.9  # radius of a lamp's window, seen from the tissue
+_WINDOW_DEG = 0.7  # radius of a lamp's window, seen from the tissue
 
 
 @dataclass(frozen=True)
