@@ -69,7 +69,7 @@ def brain(
     volume = tetrahedra.block(ANATOMY, tets, order, (contact,))
     carry = surface_embedding.embed(volume, on.vertices)
     pressure = tool.footprint(np.array(contact[:2]), contact[2], on.vertices, on.area)
-    averaged = schema.Fem(order=order).averages_volume
+    averaged = schema.Fem.model_validate({"order": order}).averages_volume
     return Brain(assemble(volume, law, poisson, averaged=averaged), carry, on.area * pressure, contact[2])
 
 
