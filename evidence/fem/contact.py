@@ -46,7 +46,7 @@ def rigid(
     tets: Annotated[str, typer.Option(help="Tetrahedra of the half-space's meshes.")] = "1600,5000",
     spacing: Annotated[
         str, typer.Option(help="Of the patches, as parts of the radius, one a mesh.")
-    ] = "0.2,0.15",
+    ] = "0.17,0.15",
     scenes: Annotated[int, typer.Option(help="Random scenes of each tip.", min=1)] = 100,
     timed: Annotated[int, typer.Option(help="Of these, how many are done as a traction too.", min=1)] = 20,
     seed: Annotated[int, typer.Option(help="Of the scenes.")] = 0,
