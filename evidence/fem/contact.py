@@ -92,7 +92,7 @@ def half_space(count: int, spacing: float) -> Condensed:
     a = _RADIUS_MM
     tets = tetrahedra.block(schema.Anatomy(dome_mm=1e6), count, 2, ((0.0, 0.0, a),))
     free = Tets(tets.points, tets.cells, 2, tets.fixed, 0 * tets.hold)
-    system = assemble(free, "linear", _POISSON)
+    system = assemble(free, "linear", _POISSON, averaged=True)
     side = np.arange(-1.5 * a, 1.5 * a, _SKIN_MM)
     flat = np.stack(np.meshgrid(side, side, indexing="ij"), axis=-1).reshape(-1, 2)
     skin = np.column_stack([flat, np.zeros(len(flat))])
