@@ -23,8 +23,15 @@ from learn.training.threads import set_threads
 RIDGE, NETWORK, PHYSICS, NOTHING = models.RIDGE, "d2fnet-s", models.PHYSICS, "no force at all"
 ON_PLAIN, ON_MIXTURE, SHUFFLED, UNFITTED = "plain", "mixture", "plain, labels dealt out anew", "nothing"
 FLOWS = ("ideal", "recovered")
+Floats = NDArray[np.float64]
 Errors = dict[str, dict[str, list[float | None]]]
-"""World → `whole`, `across` → error of every sequence; None: it was refused."""
+"""World → part → error of every sequence [%]; None: it was refused."""
+PARTS = {
+    "across": "the force across the line of sight",
+    "scaled": "the same, times the one factor that fits the sequence best",
+    "whole": "the force",
+}
+"""The second is what is left where the stiffness that a recording shows is calibrated."""
 
 
 @dataclass(frozen=True)
@@ -145,18 +152,29 @@ def _read(clip: Clip, one: Reader) -> Clip:
     if one.flow == "ideal":
         sure = np.ones_like(sure)
     clip = replace(clip, displacement={"recovered": moved}, confidence=sure)
-    return clip if one.model == NETWORK else coarse(clip)
+    for _ in range({NETWORK: 0, PHYSICS: 1}.get(one.model, 2)):
+        clip = coarse(clip)
+    return clip
 
 
 def _asked(answer: Answer, one: Reader, clips: Sequence[Clip | None]) -> dict[str, list[float | None]]:
-    found: dict[str, list[float | None]] = {"whole": [], "across": []}
+    found: dict[str, list[float | None]] = {part: [] for part in PARTS}
     for clip in clips:
-        off = clip and errors([answer(_read(clip, one))], [clip.force])
-        for name, key in (("whole", "errors"), ("across", "across")):
-            found[name].append(off and round(off[key][0], 4))
+        off = None if clip is None else errors_of(answer(_read(clip, one)), clip.force)
+        for part in PARTS:
+            found[part].append(None if off is None else round(100 * off[part], 1))
     return found
 
 
-def as_array(values: Sequence[float | None]) -> NDArray[np.float64]:
-    """(S,), NaN for a sequence that was refused."""
-    return np.array([np.nan if value is None else value for value in values])
+def errors_of(said: Floats, force: Floats) -> dict[str, float]:
+    """Root mean square errors of one sequence as a part of its force, (T, 3) mN both, by part."""
+    off = errors([said], [force])
+    across, true = said[:, :2], force[:, :2]
+    gain = max(float(np.vdot(across, true)) / max(float(np.vdot(across, across)), 1e-12), 0.0)
+    scaled = np.square(gain * across - true).sum() / np.square(force).sum()
+    return {"whole": off["errors"][0], "across": off["across"][0], "scaled": float(np.sqrt(scaled))}
+
+
+def as_array(values: Sequence[float | None]) -> Floats:
+    """(S,) of 1, from %; NaN for a sequence that was refused."""
+    return np.array([np.nan if value is None else value / 100 for value in values])

@@ -62,11 +62,11 @@ def measure(
 
 def timed(index: int, seed: int, job: Mapping[str, Any] | None = None) -> dict[str, float | None]:
     """CPU seconds a frame of one scene in every world, None where it is refused; `job`: what else it says."""
-    found = {}
+    found: dict[str, float | None] = {}
     for name, fem in worlds().items():
         kinds = {"gestures": RIGID_GESTURES} if name in PRESSING else {}
         asked = Job.model_validate(
-            {"seed": seed, "sequences": 10**6} | (job or {}) | {"fem": kinds | dict(fem)}
+            {"seed": seed, "sequences": 10**6, **(job or {}), "fem": kinds | dict(fem)}
         )
         case = scenario.draw(asked, index)
         pipeline.cortex(asked, case)  # the surface is every world's
@@ -104,6 +104,6 @@ def ratios(found: Mapping[str, list[float | None]], seed: int) -> dict[str, Rati
         pairs = [(a, b) for a, b in zip(found[name], found[against], strict=True) if a and b]
         logs = np.log([a / b for a, b in pairs])
         mean = interval(logs, np.random.default_rng(seed))
-        ends = (float(np.exp(x)) for x in (mean.mean, mean.low, mean.high, logs.max()))
-        made[name] = Ratio(*ends, len(pairs), against)
+        ratio, low, high, worst = (float(np.exp(x)) for x in (mean.mean, mean.low, mean.high, logs.max()))
+        made[name] = Ratio(ratio, low, high, worst, len(pairs), against)
     return made

@@ -15,6 +15,7 @@ from evidence.mechanics.answers import (
     NOTHING,
     ON_MIXTURE,
     ON_PLAIN,
+    PARTS,
     PHYSICS,
     RIDGE,
     SHUFFLED,
@@ -25,8 +26,6 @@ from evidence.mechanics.costs import Ratio
 from evidence.mechanics.worlds import PLAIN, STEEP, WORLDS
 from learn.evaluation.statistics import Interval, interval, paired
 
-PARTS = {"across": "the force across the line of sight", "whole": "the force"}
-READERS = ((RIDGE, ON_PLAIN), (RIDGE, ON_MIXTURE), (NETWORK, ON_PLAIN), (NETWORK, ON_MIXTURE))
 _WORDS = (
     "A sequence of every world shows the same anatomy, contact, load and look as the plain one of its "
     "number, with other mechanics. *Error* is of the force, root mean square over frames as a part of the "
@@ -90,7 +89,7 @@ def drawn(found: Mapping[str, Any]) -> result_page.Page:
     return result_page.Page(
         "Mechanics: which a force reader must have seen, and what they cost",
         found,
-        [*panels(data), *_errors(data)],
+        panels(data),
         sections,
         _WORDS,
         name="README.md",
@@ -98,31 +97,26 @@ def drawn(found: Mapping[str, Any]) -> result_page.Page:
 
 
 def panels(data: Found) -> list[charts.Panel]:
-    """Effect on the force read from recovered flow against cost: a reader a panel, a world a dot."""
+    """Effect on the force read from recovered flow against cost: a model a panel, a world a colour.
+
+    A dot is fitted on plain tissue, a ringed one on the mixture.
+    """
     made = []
-    for model, fit in READERS:
+    for model in (RIDGE, NETWORK):
         curves = []
         for world in WORLDS:
             if world in (PLAIN, STEEP):
                 continue
-            more = data.more(model, fit, "recovered", world, "across")
-            dot = (100 * more.mean,), (world,), ((100 * more.low, 100 * more.high),)
-            curves.append(charts.Curve(world, (data.cost(world).ratio,), dot[0], dot[1], ends=dot[2]))
-        title = f"{model}, fitted on the {fit}{' world' * (fit == ON_PLAIN)}"
-        y = "more error across [% of the force]"
-        made.append(charts.Panel(title, "mechanics, CPU over the plain world's", y, tuple(curves)))
+            more = [data.more(model, fit, "recovered", world, "across") for fit in (ON_PLAIN, ON_MIXTURE)]
+            means = tuple(100 * one.mean for one in more)
+            ends = tuple((100 * one.low, 100 * one.high) for one in more)
+            cost = (data.cost(world).ratio,) * 2
+            labels = (ON_PLAIN, ON_MIXTURE)
+            curves.append(charts.Curve(world, cost, means, labels, (1,), ends, named=False))
+        title = f"{model}, recovered flow (ringed: fitted on the mixture)"
+        y = "more error across the line of sight [% of the force]"
+        made.append(charts.Panel(title, "mechanics, CPU over plain", y, tuple(curves)))
     return made
-
-
-def _errors(data: Found) -> Iterator[charts.Chart]:
-    for model, fit in READERS:
-        rows = []
-        for world in WORLDS:
-            for colour, flow in enumerate(FLOWS):
-                one = data.error(model, fit, flow, world, "across")
-                ends = (100 * one.low, 100 * one.high)
-                rows.append(charts.Row(f"{world}, {flow}", 100 * one.mean, ends, colour))
-        yield charts.Chart(f"{model}, fitted on {fit}", "error across the line of sight [%]", tuple(rows))
 
 
 def _line(data: Found, flow: str, world: str, part: str) -> dict[str, str]:
@@ -158,7 +152,9 @@ def verdicts(data: Found) -> list[str]:
     lines = []
     for model in (RIDGE, NETWORK):
         level = data.error(model, ON_PLAIN, "recovered", PLAIN, "across").mean
-        hurt, not_told, mended = [], [], []
+        hurt: list[str] = []
+        not_told: list[str] = []
+        mended: list[str] = []
         for world in WORLDS:
             if world in (PLAIN, STEEP):
                 continue

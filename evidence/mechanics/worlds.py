@@ -30,7 +30,7 @@ from synth.job.schema import Fem, Job
 from synth.sequence import pipeline
 
 FINE = Grid(2 * GRID.size, GRID.extent_mm)
-"""The network's grid: a cell of the baselines' is four of its."""
+"""The network's grid."""
 
 FRAMES, FPS, SIZE, VERTICES = 8, 8.0, (192, 144), 8000
 """A second, as a sequence of the default job: a heart beats once or twice in it."""
@@ -84,7 +84,7 @@ MIXTURE = [name for name, world in WORLDS.items() if world.mixed]
 def job(name: str, seed: int, count: int) -> Job:
     """The job of a world's sequences; of one that is alone, no tool does anything and none of it is seen."""
     alone = name in _ALONE
-    fem = _ALONE[name] | {"load": _UNTOUCHED} if alone else WORLDS[name].fem
+    fem = _ALONE[name] | {"load": _UNTOUCHED} if alone else dict(WORLDS[name].fem)
     return Job.model_validate(
         {
             "seed": seed,
@@ -93,7 +93,7 @@ def job(name: str, seed: int, count: int) -> Job:
             "fps": FPS,
             "anatomy": {"vertices": VERTICES},
             # The law that the default job chooses, whatever the load.
-            "fem": {"gestures": ["pull", "push"], "law": "neo-hookean"} | fem,
+            "fem": {"gestures": ["pull", "push"], "law": "neo-hookean", **fem},
             "render": {"size": SIZE, "spp": 1 if alone else 4},
             "flow": {"backend": "ideal" if alone else "tvl1"},
         }
@@ -186,7 +186,10 @@ def taken_off(clip: Clip, own: Clip) -> Clip:
 
 
 def coarse(clip: Clip) -> Clip:
-    """A clip of `FINE` on the baselines' grid: means over the tissue of four cells."""
+    """A clip on half as many cells each way: means over the tissue of four.
+
+    From `FINE`, once is the grid of the physics inverse; twice, cells of 1.5 mm, is enough for a linear rule.
+    """
     share = _quarter(np.asarray(clip.mask))
     mask = (share > 0.5).astype(np.float32)
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from bench.output import result_page
+from evidence.end_to_end import models
 from evidence.mechanics import answers, costs, experiment, page
 from evidence.mechanics.answers import NOTHING, UNFITTED, Reader, Trial
 from evidence.mechanics.worlds import (
@@ -125,9 +126,18 @@ def test_costs_are_compared_scene_by_scene_and_refusals_are_no_cost() -> None:
     seconds[STEEP] = [1.5, 2.0, 1.0, 1.0]
     found = costs.ratios(seconds, 0)
     assert found[PLAIN].ratio == pytest.approx(1)
-    assert (found["rigid tip"].ratio, found["rigid tip"].scenes) == (pytest.approx(6 ** (1 / 3)), 3)
+    assert found["rigid tip"].scenes == 3
+    assert found["rigid tip"].ratio == pytest.approx(6 ** (1 / 3))
     assert found["rigid tip"].worst == pytest.approx(3)
     assert found["rigid tip"].against == STEEP
+
+
+def test_errors_of_known_answers() -> None:
+    force = np.tile([3.0, 0.0, 4.0], (2, 1))
+    assert answers.errors_of(0 * force, force) == pytest.approx({"whole": 1, "across": 0.6, "scaled": 0.6})
+    assert answers.errors_of(force / 4, force) == pytest.approx({"whole": 0.75, "across": 0.45, "scaled": 0})
+    # A factor below zero is no stiffness.
+    assert answers.errors_of(-force, force)["scaled"] == pytest.approx(0.6)
 
 
 def results(off: float) -> dict[str, Any]:
@@ -142,7 +152,8 @@ def results(off: float) -> dict[str, Any]:
             values = [
                 level + some * (more * (1 + 0.1 * (k % 3 - 1)) + 0.01 * ((k + own) % 3)) for k in range(6)
             ]
-            rows.append({**vars(one), "world": name, "across": values, "whole": values})
+            values = [round(100 * value, 1) for value in values]
+            rows.append({**vars(one), "world": name} | dict.fromkeys(answers.PARTS, values))
     seconds = {name: [1.0, 1.1, 1.2] for name in costs.worlds()}
     return {"seed": 0, "rows": rows, "seconds": seconds, "refused": []}
 
@@ -157,7 +168,7 @@ def test_the_page_says_which_worlds_hurt_and_which_the_mixture_mends() -> None:
         assert "membrane, 200 mN/mm (-20)" in rest.split("The mixture")[1]
     assert "100 to 100%" in lines[2]
     files = page.drawn(results(0.2)).files()
-    assert set(files) == {"README.md", "chart.svg", "intervals.svg"}
+    assert set(files) == {"README.md", "chart.svg"}
     assert "+20" in files["README.md"]
 
 
@@ -174,12 +185,14 @@ def test_a_few_small_scenes_from_job_to_page(tmp_path: Path, monkeypatch: pytest
     assert len(made) == len(trial.wanted()) == len(dict.fromkeys(trial.wanted()))
     found = {one: trial.errors(one) for one in answers.readers()}
     for world in WORLDS:
-        assert found[Reader(NOTHING, UNFITTED, "ideal")][world]["whole"] == [1.0]
-    assert all(np.isfinite(v["whole"]).all() for one in found.values() for v in one.values())
+        assert found[Reader(NOTHING, UNFITTED, "ideal")][world]["whole"] == [100.0]
+    assert all(
+        np.isfinite(answers.as_array(v["whole"])).all() for one in found.values() for v in one.values()
+    )
     # Kept: nothing is rendered, fitted or asked again.
     monkeypatch.setattr("synth.sequence.pipeline.render_sequence", None)
-    monkeypatch.setattr(answers.models, "build", None)
-    monkeypatch.setattr(answers.models, "train_network", None)
+    monkeypatch.setattr(models, "build", None)
+    monkeypatch.setattr(models, "train_network", None)
     assert all(scenes.make(name, index) == "" for scenes, name, index in trial.wanted())
     assert {one: trial.errors(one) for one in answers.readers()} == found
     data = {"seed": 1, "rows": experiment.rows_of(found), "refused": []}
