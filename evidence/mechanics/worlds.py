@@ -77,7 +77,7 @@ WORLDS: dict[str, World] = {
 """All that are asked about. The membranes are the ends of the job's range of thickness times modulus;
 `in vivo` is the job of that name, membrane and pulse together, which the mixture doesn't hold."""
 
-_ALONE = {"pulse alone": {"pulse": _PULSE}, "in vivo, alone": _ALIVE}
+_ALONE: dict[str, dict[str, Any]] = {"pulse alone": {"pulse": _PULSE}, "in vivo, alone": _ALIVE}
 MIXTURE = [name for name, world in WORLDS.items() if world.mixed]
 
 
