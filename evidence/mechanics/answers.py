@@ -51,9 +51,9 @@ def readers() -> list[Reader]:
     """The dearest first: a pool is then done soonest."""
     fits = (ON_PLAIN, ON_MIXTURE)
     made = [Reader(NETWORK, fit, flow) for fit in fits for flow in FLOWS]
-    made += [Reader(PHYSICS, UNFITTED, flow) for flow in FLOWS]
+    made += [Reader(PHYSICS, UNFITTED, "recovered")]
     made += [Reader(RIDGE, fit, flow) for fit in fits for flow in FLOWS]
-    return [*made, Reader(RIDGE, SHUFFLED, "recovered"), Reader(NOTHING, UNFITTED, "ideal")]
+    return [*made, Reader(RIDGE, SHUFFLED, "recovered"), Reader(NOTHING, UNFITTED, "recovered")]
 
 
 def network_settings(epochs: int, seed: int) -> Settings:

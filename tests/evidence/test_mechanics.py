@@ -185,7 +185,7 @@ def test_a_few_small_scenes_from_job_to_page(tmp_path: Path, monkeypatch: pytest
     assert len(made) == len(trial.wanted()) == len(dict.fromkeys(trial.wanted()))
     found = {one: trial.errors(one) for one in answers.readers()}
     for world in WORLDS:
-        assert found[Reader(NOTHING, UNFITTED, "ideal")][world]["whole"] == [100.0]
+        assert found[Reader(NOTHING, UNFITTED, "recovered")][world]["whole"] == [100.0]
     assert all(
         np.isfinite(answers.as_array(v["whole"])).all() for one in found.values() for v in one.values()
     )
