@@ -22,8 +22,6 @@ from evidence.mechanics import answers, costs, page
 from evidence.mechanics.answers import Errors, Reader, Trial
 from evidence.mechanics.worlds import MIXTURE, Scenes
 
-_CHILD = 60  # sequences a process makes before another takes its place
-
 
 @measuring(
     "--fit 14 --test 4 --epochs 2 --scenes 1 --out runs/mechanics",
@@ -38,10 +36,10 @@ def experiment(
         Path,
         typer.Option(help="Folder for sequences, networks and answers; what is there already is used."),
     ] = Path("runs/mechanics-work"),
-    fit: Annotated[int, typer.Option(min=14, help="Sequences to fit on, of each of the two.")] = 56,
-    test: Annotated[int, typer.Option(min=3, help="Sequences that are asked in every world.")] = 16,
-    epochs: Annotated[int, typer.Option(min=1, help="Of the network.")] = 40,
-    scenes: Annotated[int, typer.Option(min=1, help="Whose mechanics are timed in every world.")] = 8,
+    fit: Annotated[int, typer.Option(min=14, help="Sequences to fit on, of each of the two.")] = 35,
+    test: Annotated[int, typer.Option(min=3, help="Sequences that are asked in every world.")] = 12,
+    epochs: Annotated[int, typer.Option(min=1, help="Of the network.")] = 60,
+    scenes: Annotated[int, typer.Option(min=1, help="Whose mechanics are timed in every world.")] = 6,
     rounds: Annotated[int, typer.Option(min=1, help="How often; the least counts.")] = 2,
     seed: Annotated[int, typer.Option(min=0, help="Root of every draw.")] = 41,
     workers: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
@@ -59,7 +57,6 @@ def experiment(
         "seed": seed,
         "fitted": {"sequences": fit, "mixture": MIXTURE},
         "refused": refused,
-        "cost": [{"world": name} | asdict(one) for name, one in costs.ratios(spent, seed).items()],
         "seconds": spent,
         "rows": rows_of(found),
     }
@@ -101,6 +98,5 @@ def rows_of(found: Mapping[Reader, Errors]) -> list[dict[str, Any]]:
 
 
 def _pool(workers: int) -> ProcessPoolExecutor:
-    return ProcessPoolExecutor(
-        workers, mp_context=multiprocessing.get_context("spawn"), max_tasks_per_child=_CHILD
-    )
+    # Without max_tasks_per_child: Python 3.11's pool stands still when it replaces a process.
+    return ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn"))
