@@ -16,6 +16,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from synth.errors import UserError
+from synth.system import whole_file
 from synth.system.cli_errors import Commands
 
 if TYPE_CHECKING:
@@ -300,9 +301,13 @@ def predict_command(
     filmed = Filmed(scale, tissue, Settings(flow, shrink, rate or None, pulse))
     peaks: dict[str, float | None] = {}
     for motion in motions(source, input, filmed):
+        written = out / f"{motion.name}.npz"
+        if written.exists() and written.samefile(source):
+            raise UserError(f"{written}: is what is read, and would be overwritten; say another --out")
         found = apply(predictor, motion, young)
         out.mkdir(parents=True, exist_ok=True)
-        np.savez_compressed(out / f"{motion.name}.npz", **found)
+        with whole_file.part_of(written) as part, part.open("wb") as file:
+            np.savez_compressed(file, **found)
         size = found["total_force_mn"][found["trusted"]]
         peaks[motion.name] = float(size.max()) if len(size) else None
         if not json:

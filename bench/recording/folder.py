@@ -76,7 +76,9 @@ class Recording:
         return video.count_frames(self.video) if self.video else len(self.pictures)
 
     def frames(self) -> Iterator[Picture]:
-        """Upright frames in order, with times: frames.csv's, else the video's, else `fps` in meta.yaml.
+        """Upright frames in order, with times.
+
+        Those of frames.csv alone if there is one, else the video's, else by `fps` of meta.yaml.
 
         Raises:
             UserError: unreadable video or picture.
@@ -121,7 +123,7 @@ class Recording:
         if self.times_s is not None:
             known = picture.index < len(self.times_s) and np.isfinite(self.times_s[picture.index])
             time_s = float(self.times_s[picture.index]) if known else None
-        if time_s is None and fps is not None:
+        elif time_s is None and fps is not None:
             time_s = picture.index / fps
         return replace(picture, time_s=time_s)
 
@@ -200,7 +202,7 @@ def _spans_from(about: Meta, start: float) -> Meta:
 
 def _footage(folder: Path) -> tuple[Path | None, tuple[Path, ...]]:
     movies = sorted(path for path in folder.glob("video.*") if path.suffix.lower() in video.SUFFIXES)
-    pictures = tuple(sorted(folder.glob("frames/*.png"), key=_natural))
+    pictures = tuple(sorted(folder.glob("frames/*.png"), key=natural_order))
     if len(movies) + bool(pictures) > 1:
         found = [path.name for path in movies] + ["frames/"] * bool(pictures)
         raise UserError(f"{folder}: holds {' and '.join(found)}; keep one of them")
@@ -209,7 +211,8 @@ def _footage(folder: Path) -> tuple[Path | None, tuple[Path, ...]]:
     return (movies[0] if movies else None), pictures
 
 
-def _natural(path: Path) -> list[tuple[int, str]]:
+def natural_order(path: Path) -> list[tuple[int, str]]:
+    """Key that sorts names by the numbers in them: a2 before a10."""
     parts = re.split("([0-9]+)", path.stem)  # every second is a number
     return [(int(part), "") if k % 2 else (-1, part) for k, part in enumerate(parts)]
 

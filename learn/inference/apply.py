@@ -9,7 +9,6 @@ from functools import partial
 from itertools import chain, repeat
 from pathlib import Path
 from typing import Any, NamedTuple
-from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +22,7 @@ from learn.inference.stiffness import stiffness
 from learn.inference.video_flow import Footage, Settings, VideoFlow, everywhere
 from synth.dataset.store import Dataset, Sequence, open_sequence
 from synth.errors import UserError
+from synth.system import foreign_arrays
 
 
 class Step(NamedTuple):
@@ -140,10 +140,7 @@ def _video(path: Path, filmed: Filmed, pulse: Pulse | None = None) -> Motion:
     def notes() -> list[str]:
         if pulse is None:
             return following.notes
-        return [
-            *following.notes,
-            f"the whole surface moves by itself, {pulse.describe(mm_per_px)}: taken off",
-        ]
+        return [*following.notes, pulse.describe(mm_per_px)]
 
     return Motion(
         name=path.stem,
@@ -159,22 +156,20 @@ def _video(path: Path, filmed: Filmed, pulse: Pulse | None = None) -> Motion:
 
 
 def _arrays(path: Path) -> Motion:
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            found = {name: file[name] for name in file.files}
-    except (OSError, ValueError, EOFError, BadZipFile) as error:
-        raise UserError(f"{path}: cannot be read as .npz ({error})") from None
+    found = foreign_arrays.read_arrays(path)
     missing = {"flow", "tissue", "scale_mm_per_px"} - found.keys()
     if missing:
         raise UserError(f"{path}: lacks {', '.join(sorted(missing))}")
     flow, tissue = found["flow"].astype(np.float32), found["tissue"].astype(bool)
-    if flow.ndim != 4 or flow.shape[1:] != (*tissue.shape, 2):
+    if tissue.ndim != 2:
+        raise UserError(f"{path}: tissue is {tissue.shape}, expected (H, W)")
+    if flow.ndim != 4 or flow.shape[1:] != (*tissue.shape, 2) or not len(flow):
         h, w = tissue.shape
         raise UserError(f"{path}: flow is {flow.shape}, expected (T, {h}, {w}, 2) like the tissue")
     confidence = found.get("confidence")
     if confidence is not None and confidence.shape != flow.shape[:3]:
         raise UserError(f"{path}: confidence is {confidence.shape}, expected {flow.shape[:3]}")
-    young, force = found.get("young_kpa"), found.get("force_mn")
+    force = found.get("force_mn")
     if force is not None and force.shape != (len(flow),):
         raise UserError(f"{path}: force_mn is {force.shape}, expected ({len(flow)},)")
     return Motion(
@@ -184,10 +179,17 @@ def _arrays(path: Path) -> Motion:
             for t, f in enumerate(flow)
         ),
         tissue=tissue,
-        scale_mm_per_px=float(found["scale_mm_per_px"]),
-        young_kpa=None if young is None else float(young),
+        scale_mm_per_px=_positive(path, found, "scale_mm_per_px"),
+        young_kpa=_positive(path, found, "young_kpa") if "young_kpa" in found else None,
         force_mn=None if force is None else force.astype(np.float64),
     )
+
+
+def _positive(path: Path, found: dict[str, NDArray[Any]], name: str) -> float:
+    """The one number under a name. UserError if it is another number of them, or not positive."""
+    if found[name].size != 1 or not 0 < found[name].item() < math.inf:
+        raise UserError(f"{path}: {name} must be one positive number")
+    return float(found[name].item())
 
 
 def apply(predictor: Predictor, motion: Motion, young_kpa: float | None = None) -> dict[str, Any]:

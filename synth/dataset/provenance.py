@@ -29,7 +29,16 @@ _NO_PART = {
         "dataset.provenance",
     )
 }
-_COMPUTING = ("mitsuba", "drjit", "numpy", "scipy", "opencv-contrib-python-headless", "torch")
+_COMPUTING = (
+    "mitsuba",
+    "drjit",
+    "numpy",
+    "scipy",
+    "opencv-contrib-python-headless",
+    "torch",
+    "numba",
+    "llvmlite",
+)
 
 
 @cache
