@@ -109,7 +109,7 @@ def _network(fit: Sequence[Clip], folder: Path, epochs: int, seed: int) -> Answe
 
     def answer(clip: Clip) -> Floats:
         said, _ = predictor.answer(
-            np.asarray(clip.displacement["recovered"]), clip.mask, clip.young_kpa, np.asarray(clip.confidence)
+            np.asarray(clip.displacement["recovered"]), clip.mask, clip.young_kpa, clip.sure("recovered")
         )
         return np.asarray(said.sum(axis=(2, 3)) * GRID.pitch_mm**2, np.float64)
 
