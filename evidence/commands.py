@@ -23,6 +23,7 @@ from synth.errors import UserError
 COMMANDS = {
     "experiment flow": "evidence.flow.experiment:experiment",
     "experiment stereo": "evidence.flow.stereo:experiment",
+    "experiment second-eye": "evidence.end_to_end.second_eye:experiment",
     "stability flow": "evidence.flow.stability:stability",
     "stability recordings": "evidence.flow.foreign:recordings",
     "pareto flow": "evidence.flow.pareto:pareto",

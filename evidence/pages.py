@@ -248,6 +248,7 @@ _FILES: Mapping[str, tuple[str, str | Callable[[Tree], Page]]] = {
     "flow/pareto": ("pareto.json", "flow.pareto"),
     "flow/recordings": ("recordings.json", "flow.foreign"),
     "flow/stability": ("stability.json", "flow.stability"),
+    "flow/second-eye": ("second-eye.json", "end_to_end.second_eye"),
     "flow/stereo": ("stereo.json", "flow.stereo"),
     "render/cycles": ("cycles.json", cycles),
     "render/pareto": ("pareto.json", "render.pareto"),

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from learn.inference.predict import ForceMap, Predictor
+from synth.flow.stereo.track import Moved
 
 UNKNOWN_YOUNG_KPA = 1.0
 """Tissue whose E nobody knows is answered for as if it were of this: forces are then right up to a factor."""
@@ -39,24 +40,27 @@ class ForceReader:
         self._zero: NDArray[np.float64] | None = None
 
     def read(
-        self, flow: NDArray[np.float32], confidence: NDArray[np.float32] | None
+        self, flow: NDArray[np.float32], confidence: NDArray[np.float32] | None, moved: Moved | None = None
     ) -> tuple[NDArray[np.float64], ForceMap]:
         """Total force of a frame, and the map as the model says it, nothing taken off; errors as `Predictor`.
 
-        `flow`: (H, W, 2) px; `confidence`: (H, W). The force: (3,) mN on the tissue in camera axes; of a
-        model without direction the size in x, the rest NaN.
+        `flow`: (H, W, 2) px; `confidence`: (H, W); `moved`: of two eyes. The force: (3,) mN on the tissue in
+        camera axes; of a model without direction the size in x, the rest NaN.
         """
-        said = self._say(flow, confidence)
+        said = self._say(flow, confidence, moved)
         if self._zero is None:
             sure = None if confidence is None else self._tissue.astype(np.float32)
-            self._zero = _total(self._say(np.zeros_like(flow), sure))
+            still = None if moved is None else Moved(0 * moved.motion, 0 * moved.deviation)
+            self._zero = _total(self._say(np.zeros_like(flow), sure, still))
         force = _total(said) - self._zero
         if said.force_mn is None:
             force[0] = max(force[0], 0.0)
         return force, said
 
-    def _say(self, flow: NDArray[np.float32], confidence: NDArray[np.float32] | None) -> ForceMap:
-        said = self._predictor(flow, self._tissue, self._scale, self._young_kpa, confidence)
+    def _say(
+        self, flow: NDArray[np.float32], confidence: NDArray[np.float32] | None, moved: Moved | None
+    ) -> ForceMap:
+        said = self._predictor(flow, self._tissue, self._scale, self._young_kpa, confidence, moved)
         if said.young_known:
             return said
         part = assumed_young(None) / said.young_kpa

@@ -83,7 +83,12 @@ def test_the_mechanics_stand_on_the_card(root: Path) -> None:
             "|Every contact is a given traction",
         ),
         (
-            {"membrane": {"intact": 0.5}, "pulse": {"breath_mm": 1.0}, "poisson": [0.4, 0.49], "skull": "slip"},
+            {
+                "membrane": {"intact": 0.5},
+                "pulse": {"breath_mm": 1.0},
+                "poisson": [0.4, 0.49],
+                "skull": "slip",
+            },
             "no bleeding, no heart beat.|on 50% of the sequences|Heart and breath raise"
             "|drawn from 0.4 to 0.49|slides along the skull",
         ),
