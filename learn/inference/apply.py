@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from learn.data.clips import FIELDS
 from learn.inference import video
 from learn.inference.force_reader import ForceReader
+from learn.inference.mask_files import MaskFiles
 from learn.inference.predict import Predictor, View
 from learn.inference.pulse import Pulse
 from learn.inference.stiffness import stiffness
@@ -70,6 +71,8 @@ class Filmed:
     """A picture, white where there is tissue; everywhere if not given."""
     settings: Settings = field(default_factory=Settings)
     """How it is followed."""
+    tool: MaskFiles | None = None
+    """Where the tool is; looked for in the pictures if not given."""
 
 
 def motions(path: Path, source: str, filmed: Filmed | None = None) -> Iterator[Motion]:
@@ -117,9 +120,9 @@ def _video(path: Path, filmed: Filmed, pulse: Pulse | None = None) -> Motion:
         raise UserError(f"{path}: a video doesn't say how large it shows things; give --scale in mm a pixel")
     drawn = filmed.tissue
     tissue = everywhere if drawn is None else partial(video.read_mask, drawn)
-    following = VideoFlow(
-        Footage(video.read_video(path, video.FPS), str(path), tissue), filmed.settings, pulse=pulse
-    )
+    tool = filmed.tool.read if filmed.tool else None
+    footage = Footage(video.read_video(path, video.FPS), str(path), tissue, tool)
+    following = VideoFlow(footage, filmed.settings, pulse=pulse)
     steps = (
         Step(
             step.found.flow,
