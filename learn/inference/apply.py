@@ -200,8 +200,9 @@ def apply(predictor: Predictor, motion: Motion, young_kpa: float | None = None) 
     `trusted` (T,) whether a frame could be followed (its force is NaN if not), `total_force_mn` (T,),
     `force_mn` (T, 3) for a model that gives direction, and as the network says it
     `density` (T, C, N, N) mN/mm² and `head_mn` (T, C) of one with a total-force head; `mask` (N, N),
-    `pitch_mm`, `centre_px` (x, y) in the film's own pixels, `young_kpa`, `young_known`, and `notes`: what
-    was done to the film that its user should know.
+    `pitch_mm`, `centre_px` (x, y) of the grid in the film's own pixels, `centres_px` (T, 2) the same by frame
+    (mask and centre are the last frame's; they change only where the tissue is wider than the grid),
+    `young_kpa`, `young_known`, and `notes`: what was done to the film that its user should know.
     """
     young = young_kpa if young_kpa is not None else motion.young_kpa
     reader = ForceReader(predictor, motion.tissue, motion.scale_mm_per_px, young)
@@ -231,12 +232,13 @@ def apply(predictor: Predictor, motion: Motion, young_kpa: float | None = None) 
         "young_kpa": last.young_kpa,
         "young_known": last.young_known,
         "frame": np.array(frames),
+        "centres_px": motion.shrink * (np.array([m.view.resample.centre_px for m in maps]) + 0.5) - 0.5,
     }
     if np.isfinite(times).any():
         out["time_s"] = np.array(times)
     if last.force_mn is not None:
         out["force_mn"] = total
-    notes = motion.notes()
+    notes = motion.notes() + reader.notes
     if fault:
         notes.append(f"nothing can be measured: {fault}")
     elif not all(trusted):

@@ -25,7 +25,7 @@ _TIMES = 1.7  # ... and as a factor
 _GAIN = 0.01  # local deviations by which masking lowers the residual around a piece
 _GAIN_OF_ALL = 0.0015  # the same around all highlights, where that changes the flow by
 _DIFFERENT_PX = 0.1  # as much: then so much around one of them is enough
-_GAIN_EACH = 0.004
+_GAIN_EACH = 0.006
 _RING_PX = 8
 _CELLS = 6  # a body is judged in parts of this share of the picture's longer side;
 _MOST = 0.7  # where more than this share of it is masked, all of it is,
@@ -132,6 +132,7 @@ class ChoosingTracker:
         self._tested_px = 0.0
         self._frames = self._extra = 0
         self._is_learning = True
+        self._proved = [False, False]  # highlights, tools
 
     @property
     def trusted(self) -> bool:
@@ -176,11 +177,15 @@ class ChoosingTracker:
         return flow, confidence
 
     def _remembered(self, pieces: Pieces) -> tuple[Flags, Flags]:
-        """(H, W) what is masked as it was in the frame before, and which pieces have such a past."""
+        """(H, W) what is masked as it was in the frame before, and what has such a past, or is of a kind that
+        was right."""
         number = pieces.number.ravel()
         votes = np.bincount(number, self._verdict.ravel(), len(pieces.body))
         known = np.bincount(number, self._verdict.ravel() != 0, len(pieces.body))
         kept, old = votes > 0, known >= 0.5 * np.bincount(number, minlength=len(pieces.body))
+        for layer, proved in zip(pieces.number, self._proved, strict=True):
+            fresh = np.setdiff1d(layer, np.flatnonzero(old)) if proved else []
+            kept[fresh] = old[fresh] = True  # a tool that comes back is the tool it was
         kept[0] = old[0] = False
         return np.asarray(kept[pieces.number].any(0), bool), np.asarray(old[pieces.number].any(0), bool)
 
@@ -230,6 +235,9 @@ class ChoosingTracker:
             return (judged[best], answers[best][1]) if best else (first, masked)
         if all(self._is_better(bare, chosen, where, 1 / _AS_GOOD) for where in (both_see, beyond)):
             rest, now, chosen = still.known, found.known, bare
+        if motion >= self._tested_px:
+            shares = [now[layer > 0].mean() if layer.any() else 0.0 for layer in pieces.number]
+            self._proved = [bool(share > _NEARLY_ALL) for share in shares]
         self._tested_px = max(motion, self._tested_px)
         self.rest_blocked = rest
         tracker.usable = tracker.tissue & ~rest
