@@ -284,9 +284,10 @@ class ChoosingTracker:
             before, flow_before = after, flow
         kept_rest, kept = still.whole(kept_rest), pieces.whole(kept)
         for before, after in zip(still.number, pieces.number, strict=True):
-            shown = after[after > 0]
-            if len(shown) and kept[shown].mean() > _NEARLY_ALL:
-                kept_rest[before[before > 0]] = True  # the kind has proved right
+            # A kind that has proved right in one picture is right in the other.
+            at_rest, later = (k[n[n > 0]] for k, n in ((kept_rest, before), (kept, after)))
+            if any(len(shown) and shown.mean() > _NEARLY_ALL for shown in (at_rest, later)):
+                kept_rest[before[before > 0]] = kept[after[after > 0]] = True
         return np.asarray(kept_rest[still.number].any(0), bool), np.asarray(kept[pieces.number].any(0), bool)
 
 
