@@ -298,6 +298,12 @@ def predict_command(
     pulse: Annotated[
         bool, typer.Option(help="Take the tissue's own motion, heart and breath, off a video's first.")
     ] = True,
+    masks: Annotated[
+        str,
+        typer.Option(
+            help="Of a video: auto, none, glare, tool, both, or a folder of NNNNNN.png or mask.png: the tool."
+        ),
+    ] = "auto",
     threads: Threads = None,
     json: Json = False,
 ) -> None:
@@ -305,13 +311,15 @@ def predict_command(
     import numpy as np
 
     from learn.inference.apply import Filmed, apply, motions
+    from learn.inference.mask_files import read_choice
     from learn.inference.predict import load_predictor
     from learn.inference.video_flow import Settings
     from learn.training.threads import set_threads
 
     set_threads(threads)
     predictor = load_predictor(model, quick=True)
-    filmed = Filmed(scale, tissue, Settings(flow, shrink, rate or None, pulse))
+    kind, files = read_choice(masks)
+    filmed = Filmed(scale, tissue, Settings(flow, shrink, rate or None, pulse, kind), files)
     peaks: dict[str, float | None] = {}
     for motion in motions(source, predictor.stored(input), filmed):
         written = out / f"{motion.name}.npz"

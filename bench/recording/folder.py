@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from bench.recording import csv_table, meta
 from bench.recording.meta import Meta, Span
 from learn.inference import video
+from learn.inference.mask_files import MaskFiles
 from learn.inference.video import Picture
 from synth.errors import UserError
 
@@ -101,8 +102,7 @@ class Recording:
 
     def tool(self, index: int, size: tuple[int, int]) -> NDArray[np.bool_] | None:
         """(H, W) tool mask of a frame, or None if there is none for it. UserError for one of another size."""
-        path = self.masks.get(index, self.mask)
-        return None if path is None else video.read_mask(path, size)
+        return MaskFiles(self.masks, self.mask).read(index, size)
 
     def describe_tool(self, frames: int) -> str:
         """What is taken for the tool in how many frames, for `bench check` and `bench score` alike."""
@@ -123,12 +123,9 @@ class Recording:
             tissue &= inside
         return tissue
 
-    def with_masks(self, folder: Path) -> Recording:
-        """Its tool as another folder has it. UserError if that holds neither NNNNNN.png nor mask.png."""
-        masks, still = _masks(folder, folder)
-        if not masks and still is None:
-            raise UserError(f"{folder}: holds neither masks NNNNNN.png nor mask.png")
-        return replace(self, masks=masks, mask=still)
+    def with_masks(self, files: MaskFiles) -> Recording:
+        """Its tool as other files have it."""
+        return replace(self, masks=files.numbered, mask=files.still)
 
     def _timed(self, picture: Picture) -> Picture:
         time_s, fps = picture.time_s, self.meta.fps
@@ -162,13 +159,14 @@ def open_recording(folder: Path, phantom: bool = False) -> Recording:
     times = _frame_times(folder / "frames.csv", notes)
     force = _force(folder / "force.csv", about, notes)
     about, times, force = _from_start(about, times, force, notes)
-    masks, mask = _masks(folder / "masks", folder)
+    tools = MaskFiles.find(folder / "masks", folder)
     still = folder / "tissue.png"
     tissue = still if os.path.lexists(still) else None
     right, depths = _second_eye(folder, about)
     return Recording(
-        folder, about, movie, pictures, times, force, masks, tissue, tuple(notes), mask, None, right, depths
-    )
+        folder, about, movie, pictures, times, force, tools.numbered, tissue, tuple(notes), tools.still,
+        None, right, depths,
+    )  # fmt: skip
 
 
 def _second_eye(folder: Path, about: Meta) -> tuple[Path | tuple[Path, ...], tuple[Path, ...]]:
@@ -192,13 +190,6 @@ def _second_eye(folder: Path, about: Meta) -> tuple[Path | tuple[Path, ...], tup
         if said is not None and not found:
             raise UserError(f"{folder}: meta.yaml says {key}, but there is no {what}")
     return right, depths
-
-
-def _masks(folder: Path, beside: Path) -> tuple[dict[int, Path], Path | None]:
-    """Masks by frame, and the one for all others."""
-    numbered = [path for path in sorted(folder.glob("*.png")) if re.fullmatch("[0-9]{1,9}", path.stem)]
-    still = beside / "mask.png"
-    return {int(path.stem): path for path in numbered}, still if os.path.lexists(still) else None
 
 
 def _from_start(

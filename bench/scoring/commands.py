@@ -20,6 +20,7 @@ from bench.recording.from_sequence import export_recording
 from bench.scoring import evaluate_recording, report
 from bench.scoring.evaluate_recording import Result, Settings
 from bench.tracking.flow_process import FlowProcess
+from learn.inference.mask_files import MaskFiles
 from synth.dataset.store import Dataset, Sequence
 from synth.errors import UserError
 from synth.system import whole_file
@@ -36,13 +37,13 @@ _LONG = 100
 class Seen:
     """What of a recording's pictures is looked at, instead of what its folder says."""
 
-    masks: Path | None = None
-    """Folder with the tool's masks."""
+    masks: MaskFiles | None = None
+    """The tool's masks."""
     region: tuple[int, int, int, int] | None = None
     """Left, top, width and height [px]."""
 
     def within(self, recording: Recording) -> Recording:
-        """The recording so seen. UserError: no masks in the folder."""
+        """The recording so seen."""
         masked = recording if self.masks is None else recording.with_masks(self.masks)
         return replace(masked, region=self.region)
 

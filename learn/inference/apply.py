@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from learn.data.clips import FIELDS, has_depth
 from learn.inference import video
 from learn.inference.force_reader import ForceReader
+from learn.inference.mask_files import MaskFiles
 from learn.inference.predict import Predictor, View
 from learn.inference.pulse import Pulse
 from learn.inference.stiffness import stiffness
@@ -73,6 +74,8 @@ class Filmed:
     """A picture, white where there is tissue; everywhere if not given."""
     settings: Settings = field(default_factory=Settings)
     """How it is followed."""
+    tool: MaskFiles | None = None
+    """Where the tool is; looked for in the pictures if not given."""
 
 
 def motions(path: Path, source: str, filmed: Filmed | None = None) -> Iterator[Motion]:
@@ -133,9 +136,9 @@ def _video(path: Path, filmed: Filmed, pulse: Pulse | None = None) -> Motion:
         raise UserError(f"{path}: a video doesn't say how large it shows things; give --scale in mm a pixel")
     drawn = filmed.tissue
     tissue = everywhere if drawn is None else partial(video.read_mask, drawn)
-    following = VideoFlow(
-        Footage(video.read_video(path, video.FPS), str(path), tissue), filmed.settings, pulse=pulse
-    )
+    tool = filmed.tool.read if filmed.tool else None
+    footage = Footage(video.read_video(path, video.FPS), str(path), tissue, tool)
+    following = VideoFlow(footage, filmed.settings, pulse=pulse)
     steps = (
         Step(
             step.found.flow,
@@ -227,8 +230,9 @@ def apply(predictor: Predictor, motion: Motion, young_kpa: float | None = None) 
     `trusted` (T,) whether a frame could be followed (its force is NaN if not), `total_force_mn` (T,),
     `force_mn` (T, 3) for a model that gives direction, and as the network says it
     `density` (T, C, N, N) mN/mm² and `head_mn` (T, C) of one with a total-force head; `mask` (N, N),
-    `pitch_mm`, `centre_px` (x, y) in the film's own pixels, `young_kpa`, `young_known`, and `notes`: what
-    was done to the film that its user should know.
+    `pitch_mm`, `centre_px` (x, y) of the grid in the film's own pixels, `centres_px` (T, 2) the same by frame
+    (mask and centre are the last frame's; they change only where the tissue is wider than the grid),
+    `young_kpa`, `young_known`, and `notes`: what was done to the film that its user should know.
     """
     young = young_kpa if young_kpa is not None else motion.young_kpa
     reader = ForceReader(predictor, motion.tissue, motion.scale_mm_per_px, young)
@@ -258,12 +262,13 @@ def apply(predictor: Predictor, motion: Motion, young_kpa: float | None = None) 
         "young_kpa": last.young_kpa,
         "young_known": last.young_known,
         "frame": np.array(frames),
+        "centres_px": motion.shrink * (np.array([m.view.resample.centre_px for m in maps]) + 0.5) - 0.5,
     }
     if np.isfinite(times).any():
         out["time_s"] = np.array(times)
     if last.force_mn is not None:
         out["force_mn"] = total
-    notes = motion.notes()
+    notes = motion.notes() + reader.notes
     if fault:
         notes.append(f"nothing can be measured: {fault}")
     elif not all(trusted):
