@@ -46,7 +46,7 @@ def rigid(
     tets: Annotated[str, typer.Option(help="Tetrahedra of the half-space's meshes.")] = "1600,5000",
     spacing: Annotated[
         str, typer.Option(help="Of the patches, as parts of the radius, one a mesh.")
-    ] = "0.2,0.15",
+    ] = "0.17,0.15",
     scenes: Annotated[int, typer.Option(help="Random scenes of each tip.", min=1)] = 100,
     timed: Annotated[int, typer.Option(help="Of these, how many are done as a traction too.", min=1)] = 20,
     seed: Annotated[int, typer.Option(help="Of the scenes.")] = 0,
@@ -92,7 +92,7 @@ def half_space(count: int, spacing: float) -> Condensed:
     a = _RADIUS_MM
     tets = tetrahedra.block(schema.Anatomy(dome_mm=1e6), count, 2, ((0.0, 0.0, a),))
     free = Tets(tets.points, tets.cells, 2, tets.fixed, 0 * tets.hold)
-    system = assemble(free, "linear", _POISSON)
+    system = assemble(free, "linear", _POISSON, averaged=True)
     side = np.arange(-1.5 * a, 1.5 * a, _SKIN_MM)
     flat = np.stack(np.meshgrid(side, side, indexing="ij"), axis=-1).reshape(-1, 2)
     skin = np.column_stack([flat, np.zeros(len(flat))])

@@ -25,11 +25,10 @@ def stiffness(
 ) -> float:
     """Young's modulus [kPa] that makes the answer to a press fit its force best, in the least squares.
 
-    `displacement`: (T, 2, N, N) mm on the model's grid; `mask`: (N, N); `force_mn`: (T,) size of the known
-    force;
-    `confidence`: (T, N, N). A network conditioned on E is asked again with each estimate until it stays
-    within a
-    thousandth. Raises UserError if the lengths differ, or if there is no force or no answer to fit.
+    `displacement`: (T, 2, N, N) mm on the model's grid, of a model of two eyes (T, 3, N, N); `mask`: (N, N);
+    `force_mn`: (T,) size of the known force; `confidence`: as `Predictor.answer`. A network conditioned on E
+    is asked again with each estimate until it stays within a thousandth. Raises UserError if the lengths
+    differ, or if there is no force or no answer to fit.
     """
     if len(force_mn) != len(displacement):
         raise UserError(f"calibration press: {len(force_mn)} forces for {len(displacement)} frames")

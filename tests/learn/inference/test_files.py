@@ -146,6 +146,12 @@ def test_a_video_is_followed_and_predicted(model: Path, tmp_path: Path) -> None:
     with np.load(tmp_path / "film.npz") as found:
         assert found["total_force_mn"].shape == (3,)
         assert found["young_known"]
+        assert found["trusted"].all()
+    (tmp_path / "tools").mkdir()
+    cv2.imwrite(str(tmp_path / "tools" / "mask.png"), np.full((48, 64), 255, np.uint8))
+    assert run(app, [*args, "--masks", str(tmp_path / "tools"), "--flow", "dis"]).exit_code == 0
+    with np.load(tmp_path / "film.npz") as found:
+        assert found["trusted"].tolist() == [True, False, False]
     footage = Footage(read_video(tmp_path / "film.mp4"), "film", lambda size: marked > 0)
     seen = [step.found.flow for step in VideoFlow(footage, Settings("dis", rate_hz=None)).steps()]
     assert np.abs(seen[0]).max() == 0
