@@ -77,7 +77,9 @@ class ForceReader:
         said += f", and was moved there {self.placing.moves} times" if self.placing.moves else ""
         share = self._at_border / self._in_all if self._in_all > 0 else 0.0
         if share > _MUCH_AT_BORDER:
-            said += f"; {100 * share:.0f}% of the force lies at the border of that, and what is beyond is lost"
+            said += (
+                f"; {100 * share:.0f}% of the force lies at the border of that, and what is beyond is lost"
+            )
         return [said]
 
     def _say(

@@ -39,8 +39,12 @@ class Placing:
         self._ends = [(float(axis.min()), float(axis.max())) for axis in (columns, rows)]
 
     def place(self, flow: NDArray[np.float32], confidence: NDArray[np.float32] | None) -> Point:
-        """The grid's centre for a frame; flow: (H, W, 2) px; confidence: (H, W), motion is looked for where it
-        is no lost pixel's."""
+        """The grid's centre for a frame.
+
+        Args:
+            flow: (H, W, 2) px.
+            confidence: (H, W) in 0..1: motion is looked for where no pixel is lost; None: everywhere.
+        """
         if self.fits:
             return self.centre_px
         sure = self._tissue if confidence is None else self._tissue & (confidence >= DOUBTFUL)

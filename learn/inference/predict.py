@@ -147,8 +147,8 @@ class Predictor:
 
         `flow`: (H, W, 2) px, motion from the rest frame on the rest frame's pixels; `tissue`: (H, W) bool;
         `young_kpa`: None stands for the training data's typical value; `confidence`: (H, W) 0..1, used only
-        by a model with that channel (1 if not given); `centre_px`: as of `View`. Raises UserError for other shapes or values that aren't
-        finite.
+        by a model with that channel (1 if not given); `centre_px`: as of `View`. Raises UserError for other
+        shapes or values that aren't finite.
         """
         if flow.ndim != 3 or flow.shape[2] != 2 or flow.shape[:2] != tissue.shape:
             raise UserError(f"flow: expected ({tissue.shape[0]}, {tissue.shape[1]}, 2), got {flow.shape}")
