@@ -57,8 +57,16 @@ def stability(
             pool.submit(random_scenes, min(_CHUNK, scenes - first), tets, seed, first)
             for first in range(0, scenes, _CHUNK)
         ]
+        living = [
+            pool.submit(random_scenes, min(_CHUNK, scenes - first), tets, seed, first, everything=True)
+            for first in range(0, scenes, _CHUNK)
+        ]
         rows = [row for part in pool.map(_run, sweeps, [tets] * len(sweeps)) for row in part]
-        return {"rows": rows, "random_scenes": _added([chunk.result() for chunk in chunks])}
+        return {
+            "rows": rows,
+            "random_scenes": _added([chunk.result() for chunk in chunks]),
+            "with_everything": _added([chunk.result() for chunk in living]),
+        }
 
 
 def _run(sweep: Callable[[int], list[Row]], tets: int) -> list[Row]:
@@ -227,14 +235,36 @@ def _alone(bent: Tets, cell: int) -> bool:
     return bool(np.delete(quality(bent.points[bent.cells]), cell).min() > 0.05)
 
 
-def random_scenes(count: int, tets: int, seed: int, first: int = 0, frames: int = 12) -> Row:
-    """Scenes of the default job: each ends whole or refused by a named guard, or is counted as silent."""
-    job = schema.Job.model_validate(
-        {"seed": seed, "sequences": 10**6, "frames": frames, "fem": {"tets": tets}} | _SMALL
-    )
+def living(seed: int, index: int) -> Row:
+    """Keys of `fem` that put in all there is: membrane, pulse, nu, skull, elements, how tools touch."""
+    rng = np.random.default_rng((seed, index))
+    return {
+        "membrane": {"intact": 0.7},
+        "pulse": {"heart_mm": (0.0, 0.5), "breath_mm": (0.0, 0.6)},
+        "poisson": (0.4, 0.49),
+        "skull": ("bonded", "slip"),
+        "volume": str(rng.choice(["auto", "pointwise"], p=[0.8, 0.2])),
+        "contact": str(rng.choice(["traction", "rigid"])),
+        "tip": str(rng.choice(["flat", "sphere"])),
+        "friction": round(float(rng.uniform(0, 1)), 3),
+        "instruments": (1, 2),
+    }
+
+
+def random_scenes(
+    count: int, tets: int, seed: int, first: int = 0, frames: int = 12, *, everything: bool = False
+) -> Row:
+    """Scenes of the default job: each ends whole or refused by a named guard, or is counted as silent.
+
+    With `everything`, of one that has all that can be asked for, drawn scene by scene (`living`).
+    """
     outcome: Counter[str] = Counter()
     least, kinds, refusals, largest = np.inf, Counter[str](), [], 0.0
     for index in range(first, first + count):
+        asked = {"tets": tets} | (living(seed, index) if everything else {})
+        job = schema.Job.model_validate(
+            {"seed": seed, "sequences": 10**6, "frames": frames, "fem": asked} | _SMALL
+        )
         case = scenario.draw(job, index)
         try:
             motion = pipeline.move(job, case, *pipeline.build(job, case))
