@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from bench.output import charts, result_page
 from evidence.fem import case as fem_case
 from evidence.measuring import measuring
+from synth.checks import physics
 from synth.errors import UserError
 from synth.fem import equilibrium, motion, solver, surface_embedding, tool
 from synth.fem.laws import NUMBER
@@ -259,7 +260,7 @@ def random_scenes(
     With `everything`, of one that has all that can be asked for, drawn scene by scene (`living`).
     """
     outcome: Counter[str] = Counter()
-    least, kinds, refusals, largest = np.inf, Counter[str](), [], 0.0
+    least, kinds, refusals, largest, over = np.inf, Counter[str](), [], 0.0, 0.0
     for index in range(first, first + count):
         asked = {"tets": tets} | (living(seed, index) if everything else {})
         job = schema.Job.model_validate(
@@ -285,7 +286,9 @@ def random_scenes(
             outcome["whole"] += 1
         kinds[case.gesture.kind] += 1
         least = min(least, float(motion.min_jacobian.min()))
-        largest = max(largest, *compliance_steps(motion).values())
+        over = max(over, over_verify(motion, case, rigid=job.fem.contact == "rigid"))
+        if case.pulse is None:
+            largest = max(largest, *compliance_steps(motion).values())
     return {
         "scenes": count,
         "tets": tets,
@@ -294,8 +297,18 @@ def random_scenes(
         "whole_by_gesture": dict(kinds),
         "least_jacobian": least,
         "largest_step": largest,
+        "over_verify": over,
         "refusals": refusals,
     }
+
+
+def over_verify(motion: solver.Deformation, case: scenario.Scenario, *, rigid: bool) -> float:
+    """Largest step of displacement per force over what `synth verify` allows: 1 is its limit."""
+    work = motion.energy if case.pulse is None else motion.tool_work
+    pulse = None if case.pulse is None else motion.pulse_work
+    tips, footprint = motion.tip if rigid else None, case.gesture.footprint_mm
+    steps = physics.compliance_steps(work, motion.by_instrument, tips, footprint, pulse)
+    return max((step / limit for _, step, limit in steps), default=0.0)
 
 
 def compliance_steps(motion: solver.Deformation) -> dict[str, float]:
@@ -325,7 +338,8 @@ def _added(parts: list[Row]) -> Row:
         whole["whole_by_gesture"].update(part["whole_by_gesture"])
         whole["refusals"] += part["refusals"]
         whole |= {name: part[name] for name in ("tets", "frames")}
-        whole["largest_step"] = max(whole.get("largest_step", 0.0), part["largest_step"])
+        for name in ("largest_step", "over_verify"):
+            whole[name] = max(whole.get(name, 0.0), part[name])
         whole["least_jacobian"] = min(whole.get("least_jacobian", np.inf), part["least_jacobian"])
     return whole
 
