@@ -69,7 +69,9 @@ def _cycles(
     worker = Path(__file__).with_name("cycles_worker.py")
     # Its own packages and nothing of ours.
     clean = {k: v for k, v in os.environ.items() if not k.startswith(("PYTHON", "VIRTUAL_ENV"))}
-    done = subprocess.run([str(python), str(worker), str(folder)], capture_output=True, text=True, env=clean)
+    # -P: in the worker's own folder this file is named as Blender's add-on is, which would not be found.
+    command = [str(python), "-P", str(worker), str(folder)]
+    done = subprocess.run(command, capture_output=True, text=True, env=clean)
     if done.returncode or not (folder / "times.json").exists():
         raise UserError(
             f"{python}: Cycles did not run ({(done.stderr.strip() or 'no message').splitlines()[-1]})"
