@@ -304,6 +304,8 @@ def random_scenes(
 
 def over_verify(motion: solver.Deformation, case: scenario.Scenario, *, rigid: bool) -> float:
     """Largest step of displacement per force over what `synth verify` allows: 1 is its limit."""
+    if case.pulse is not None and case.further:
+        return 0.0  # is not judged
     work = motion.energy if case.pulse is None else motion.tool_work
     pulse = None if case.pulse is None else motion.pulse_work
     tips, footprint = motion.tip if rigid else None, case.gesture.footprint_mm

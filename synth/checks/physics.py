@@ -82,6 +82,8 @@ def compliance(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
     if not (elastic or raised is not None) or known not in mechanics:
         return
     instruments = mechanics["instruments"]
+    if raised is not None and len(instruments) > 1:
+        return  # their shares of the pulse may cancel, what is not known of them does not
     forces = np.stack([one["force_mn"] for one in instruments], axis=1)
     tips, footprint = None, 1.0
     if mechanics.get("contact") == "rigid":

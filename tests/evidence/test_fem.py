@@ -50,6 +50,7 @@ def test_discs_on_the_half_space_come_out_as_in_the_books() -> None:
 @pytest.mark.slow
 def test_a_scene_on_its_relief_converges() -> None:
     rows = [relief.measure_scene(2, count) for count in (400, 1600, 3500)]
+    assert {row["code"] for row in rows} == {relief.code()}
     coarse, fine = relief.summarise(rows, [400, 1600, 3500])
     assert fine["mean_worst"] < min(0.03, coarse["mean_worst"])
     assert relief.summarise([], [400, 1600]) == [{"tets": 400, "against": 1600, "scenes": 0}]
