@@ -36,6 +36,9 @@ _WORDS = (
     f"A rigid tip can't push aside by more than friction holds, so it is compared with `{STEEP}`: tractions "
     "within the same cone. *Taken off*: the tissue's own motion is subtracted as it was, which no removal "
     "does better. Tikhonov is physics alone, that of the plain world.",
+    "*The one factor* is fitted to the true force, so what it leaves is what no calibration of the stiffness "
+    "mends; direction and course alone remain, which a rule that turns with the picture has even from labels "
+    "dealt out anew.",
     "Costs are CPU time of the mechanics of a scene of the default job (mesh, equations, 24 frames), all "
     "worlds in turn in one process, as a ratio to the world compared with; a rigid tip's scenes are those "
     "that press.",
