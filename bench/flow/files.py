@@ -78,7 +78,7 @@ def _read_npz(path: Path) -> tuple[Floats, Flags]:
     if "flow" not in found:
         raise UserError(f"{path}: holds no array named flow")
     flow = found["flow"].astype(np.float32)
-    known = found["known"].astype(bool) if "known" in found else np.isfinite(flow).all(axis=-1)
+    known = np.asarray(found["known"] if "known" in found else np.isfinite(flow).all(axis=-1), bool)
     if flow.ndim != 3 or flow.shape[2] != 2 or known.shape != flow.shape[:2]:
         raise UserError(f"{path}: flow of shape {flow.shape}, expected (H, W, 2)")
     return np.where(known[..., None], flow, 0).astype(np.float32), known

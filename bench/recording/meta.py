@@ -38,6 +38,9 @@ def _must_run_forward(span: tuple[float, float]) -> tuple[float, float]:
 Span = Annotated[tuple[FiniteFloat, FiniteFloat], AfterValidator(_must_run_forward)]
 
 
+TAKEN_MM = 32.0
+"""Width that a picture of unknown scale is taken to have [mm]: about what a microscope shows of a cortex."""
+
 LEAST_INTERVALS = 20
 """Frame intervals that `sync.calibration_s` must hold for the clocks to be lined up on it."""
 
@@ -164,8 +167,9 @@ class Depth(_Section):
 class Meta(_Section):
     """One recording."""
 
-    scale_mm_per_px: Positive | None = None
-    """Millimetres a pixel at the tissue. This or `calibration`."""
+    scale_mm_per_px: Positive | Literal["unknown"] | None = None
+    """Millimetres a pixel at the tissue, or `unknown`: then only relative force is known. This or
+    `calibration`."""
     calibration: Calibration | None = None
     """How to find the scale."""
     scale_uncertainty: Share | None = None

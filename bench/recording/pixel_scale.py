@@ -12,10 +12,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from bench.recording.meta import Calibration, Meta
+from bench.recording.folder import open_recording
+from bench.recording.meta import TAKEN_MM, Calibration, Meta
 from learn.inference import video
 from synth.errors import UserError
 
+_UNKNOWN = 0.99  # relative: nothing is known
 _STATED = 0.02  # what a stated scale is trusted to without more
 _POINT_PX = 1.0  # standard error of a point set by hand
 _DISTANCE = 0.01  # relative standard error of a stated working distance
@@ -35,8 +37,12 @@ def find_scale(meta: Meta, folder: Path) -> Scale:
     """The recording's scale, from what `meta.yaml` offers.
 
     Raises:
-        UserError: a checkerboard that isn't found, points that coincide.
+        UserError: a checkerboard that isn't found, points that coincide; of an unknown scale, no picture.
     """
+    if meta.scale_mm_per_px == "unknown":
+        wide = next(iter(open_recording(folder).frames())).rgb.shape[1]
+        source = f"unknown: the picture is taken to be {TAKEN_MM:g} mm wide"
+        return Scale(TAKEN_MM / wide, _first(meta.scale_uncertainty, _UNKNOWN), source)
     if meta.scale_mm_per_px is not None:
         return Scale(meta.scale_mm_per_px, _first(meta.scale_uncertainty, _STATED), "stated")
     assert meta.calibration is not None

@@ -33,6 +33,10 @@ Curve = NDArray[np.float64]
 _SEED = 0  # of the bootstrap: the same recording gives the same intervals
 MOST_LOST = 0.2
 """Share of lost frames above which no number stands for a recording: the rest are the easy ones."""
+_NO_YOUNG = (
+    "Young's modulus unknown: forces are those of tissue of 1 kPa, so only scores that no factor changes are "
+    "given, and those after the gain of a separate press if there is one"
+)
 
 
 @dataclass(frozen=True)
@@ -146,17 +150,9 @@ def evaluate_recording(
     notes = [*recording.notes, *done.notes]
     truth = _truth(recording, done, time, notes)
     if meta.young_kpa is None:
-        notes.append(
-            "Young's modulus unknown: forces are those of tissue of 1 kPa, so only scores that no factor "
-            "changes are given, and those after the gain of a separate press if there is one"
-        )
+        notes.append(_NO_YOUNG)
     kept = _kept(recording, time, notes)
-    lost = ~np.array(done.trusted)
-    if lost.any():
-        notes.append(f"{lost.sum()} of {len(lost)} frames could not be followed: gaps, not scored")
-    forces = {name: np.array(curve, np.float64) for name, curve in done.force_mn.items()}
-    for force in forces.values():
-        force[lost] = np.nan
+    forces, lost = _with_gaps(done, notes)
     gains = _brought_to_newtons(forces, methods, truth, kept, _pressed(recording, time), main)
     return Result(
         recording=recording.name,
@@ -165,10 +161,8 @@ def evaluate_recording(
         sensor_mn=truth.size_mn,
         sensor_axes_mn=truth.axes_mn,
         methods={
-            name: replace(
-                _scored(time, force, forces[main], truth, kept, recording, name == main), gain=gains.get(name)
-            )
-            for name, force in forces.items()
+            name: replace(one, gain=gains.get(name))
+            for name, one in _all_scored(time, forces, main, truth, kept, recording).items()
         },
         scale=scale,
         relative_uncertainty=math.hypot(2 * scale.uncertainty, meta.young_uncertainty),
@@ -183,6 +177,31 @@ def evaluate_recording(
         followed=done,
         absolute=meta.young_kpa is not None,
     )
+
+
+def _with_gaps(done: Tracked, notes: list[str]) -> tuple[dict[str, Curve], NDArray[np.bool_]]:
+    """Each method's forces (T, 3), NaN in frames that could not be followed, and those, (T,)."""
+    lost = ~np.array(done.trusted)
+    if lost.any():
+        notes.append(f"{lost.sum()} of {len(lost)} frames could not be followed: gaps, not scored")
+    forces = {name: np.array(curve, np.float64) for name, curve in done.force_mn.items()}
+    for force in forces.values():
+        force[lost] = np.nan
+    return forces, lost
+
+
+def _all_scored(
+    time_s: Curve,
+    forces: Mapping[str, Curve],
+    main: str,
+    truth: _Truth,
+    kept: NDArray[np.bool_],
+    recording: Recording,
+) -> dict[str, Scored]:
+    return {
+        name: _scored(time_s, force, forces[main], truth, kept, recording, name == main)
+        for name, force in forces.items()
+    }
 
 
 def _pressed(recording: Recording, time: Curve) -> NDArray[np.bool_] | None:

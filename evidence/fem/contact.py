@@ -16,9 +16,8 @@ from scipy.integrate import quad
 from bench.output import charts
 from bench.output.result_page import Page, Section
 from evidence.fem.half_space import point_loads
-from evidence.fem.stability import compliance_steps
+from evidence.fem.stability import compliance_steps, over_verify
 from evidence.measuring import measuring
-from synth.checks import physics
 from synth.errors import UserError
 from synth.fem import contact, surface_embedding
 from synth.fem.contact import Condensed, Hold, Pose, Tip, Touch
@@ -264,16 +263,10 @@ def random_scene(tip: str, index: int, seed: int, timed: bool) -> Row:
             "load": round(case.gesture.load, 4),
             "least_jacobian": round(float(motion.min_jacobian.min()), 3),
             "label_off": float(np.abs(total - motion.force).max() / np.abs(motion.force).max()),
-            "over_verify": round(over_verify(motion, case.gesture.footprint_mm), 3),
+            "over_verify": round(over_verify(motion, case, rigid=True), 3),
             "work_off": round(work_off(motion), 5),
         }
     )
-
-
-def over_verify(motion: Deformation, footprint_mm: float) -> float:
-    """Largest step of displacement per force over what `synth verify` allows: 1 is its limit."""
-    steps = physics.compliance_steps(motion.energy, motion.by_instrument, motion.tip, footprint_mm)
-    return max((step / limit for _, step, limit in steps), default=0.0)
 
 
 def work_off(motion: Deformation) -> float:

@@ -113,6 +113,9 @@ def _settings(told: dict[str, Any]) -> None:
     scene.world = bpy.data.worlds.new("dark")
     scene.world.use_nodes = True
     scene.world.node_tree.nodes["Background"].inputs[1].default_value = 0.0
+    import addon_utils  # type: ignore[import-not-found]  # on the path once bpy is loaded
+
+    addon_utils.enable("cycles")  # a fresh bpy starts without it
     scene.render.engine = "CYCLES"
     scene.render.resolution_x, scene.render.resolution_y = told["size"]
     scene.render.resolution_percentage = 100

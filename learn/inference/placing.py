@@ -41,7 +41,9 @@ class Placing:
     def place(self, flow: NDArray[np.float32], confidence: NDArray[np.float32] | None) -> Point:
         """The grid's centre for a frame.
 
-        `flow`: (H, W, 2) px; `confidence`: (H, W); motion of lost pixels is not looked at.
+        Args:
+            flow: (H, W, 2) px.
+            confidence: (H, W) in 0..1: motion is looked for where no pixel is lost; None: everywhere.
         """
         if self.fits:
             return self.centre_px

@@ -54,6 +54,17 @@ class Deformation:
     """(T,) mN mm stored."""
     residual: Floats
     """(T,) force out of balance as a part of the load, both in the norm of the inverse stiffness."""
+    pulse_work: Floats
+    """(T,) mN mm, half of traction times what the pulse alone moves it by; see `tool_work`."""
+
+    @property
+    def tool_work(self) -> Floats:
+        """(T,) mN mm, half of traction times the motion that is the tools'.
+
+        Under the linear law, and without a pulse, it is the energy stored.
+        """
+        whole = np.einsum("v,tvd,tvd->t", self.area, self.traction, self.displacement, optimize=True)
+        return np.asarray(0.5 * whole - self.pulse_work)
 
 
 def deform(
@@ -95,6 +106,7 @@ def deform(
     area = surface_embedding.vertex_area(skin_vertices, skin_faces)
     skin = indentation.Skin(surface_embedding.embed(tets, skin_vertices), skin_vertices, area)
     time = np.arange(frames) / fps
+    height = np.zeros(frames) if pulse is None else pulse.height(time)
     traction = sum_tractions(
         [(g, over) for g, over in played if not indentation.applies(fem, g)], frames, skin
     )
@@ -102,9 +114,11 @@ def deform(
     loads = np.stack([skin.carry.gather(area[:, None] * t) for t in traction / tissue.young_kpa])
     timeless = fem.time == "quasi-static" and not fem.relaxation
     system = tissue.equations(tets) if timeless or pulse is not None else None
+    raised = np.zeros_like(skin_vertices)
     if pulse is not None and system is not None:
         raising = lift(system, skin.carry, skin_vertices, skin_faces, opening or schema.Craniotomy())
-        loads += pulse.height(time)[:, None, None] * raising
+        loads += height[:, None, None] * raising
+        raised = skin.carry.move(system.solve(raising))
     named = np.max([g.load * over.load for g, over in played], axis=0)
     pressed = None
     if system is None or not timeless:
@@ -131,6 +145,7 @@ def deform(
         min_jacobian=path.jacobian,
         energy=path.energy * tissue.young_kpa,
         residual=path.residual,
+        pulse_work=0.5 * height * np.einsum("v,tvd,vd->t", area, traction, raised, optimize=True),
     )
 
 

@@ -17,7 +17,7 @@ _LARGEST_BYTES = 64 << 30
 
 
 def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
-    """The arrays of an .npz by name, of numbers and truth values only.
+    """The arrays of an .npz by name, of any shape (A, ...), of numbers and truth values only.
 
     Raises:
         UserError: no regular file, no .npz, damaged, too large for the memory, or an array of something else.

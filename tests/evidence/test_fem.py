@@ -9,7 +9,7 @@ import pytest
 import trimesh
 
 from evidence.fem import case, contact, half_space, relief, surface
-from evidence.fem.stability import random_scenes
+from evidence.fem.stability import living, random_scenes
 
 
 @pytest.mark.slow
@@ -61,6 +61,18 @@ def test_random_scenes_are_whole_and_step_evenly() -> None:
     assert found["outcome"] == {"whole": 3}
     assert 0 < found["least_jacobian"] <= 1
     assert found["largest_step"] < 0.25
+
+
+@pytest.mark.slow
+def test_random_scenes_with_everything_on_are_whole() -> None:
+    asked = [living(0, index) for index in range(20)]
+    assert {(one["contact"], one["tip"], one["volume"]) for one in asked} >= {
+        ("rigid", "flat", "auto"),
+        ("rigid", "sphere", "auto"),
+        ("traction", "flat", "auto"),
+    }
+    found = random_scenes(3, 300, 0, frames=6, everything=True)
+    assert found["outcome"] == {"whole": 3}
 
 
 @pytest.mark.slow
