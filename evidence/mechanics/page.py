@@ -32,13 +32,16 @@ _WORDS = (
     "force's own, mean over sequences; *more* is by how much it is above that in the plain world on the "
     "same sequences, *mixture less plain* by how much fitting on the mixture errs more than on plain; "
     "intervals are BCa over sequences. No anatomy that is asked about was fitted. No force at all errs by "
-    "100%.",
+    "100%, and across the line of sight by that part of it.",
     f"A rigid tip can't push aside by more than friction holds, so it is compared with `{STEEP}`: tractions "
     "within the same cone. *Taken off*: the tissue's own motion is subtracted as it was, which no removal "
     "does better. Tikhonov is physics alone, that of the plain world.",
+    "*The one factor* is fitted to the true force, so what it leaves is what no calibration of the stiffness "
+    "mends; direction and course alone remain, which a rule that turns with the picture has even from labels "
+    "dealt out anew.",
     "Costs are CPU time of the mechanics of a scene of the default job (mesh, equations, 24 frames), all "
     "worlds in turn in one process, as a ratio to the world compared with; a rigid tip's scenes are those "
-    "that press.",
+    "that press. Other work ran on the machine.",
 )
 
 
@@ -129,6 +132,7 @@ def _line(data: Found, flow: str, world: str, part: str) -> dict[str, str]:
         cells[f"{model}: mixture less plain"] = _points(data.gained(model, flow, world, part))
     if flow == "recovered":
         cells[PHYSICS] = _said(data.error(PHYSICS, UNFITTED, flow, world, part))
+    cells[NOTHING] = _said(data.error(NOTHING, UNFITTED, "recovered", world, part))
     return cells
 
 
@@ -172,10 +176,12 @@ def verdicts(data: Found) -> list[str]:
             f"{_points(at_home)} points on plain tissue."
         )
     nothing = [data.error(NOTHING, UNFITTED, "recovered", world, "whole").mean for world in WORLDS]
-    shuffled = data.error(RIDGE, SHUFFLED, "recovered", PLAIN, "whole")
+    shuffled, across = (data.error(RIDGE, SHUFFLED, "recovered", PLAIN, part) for part in ("whole", "across"))
+    none = data.error(NOTHING, UNFITTED, "recovered", PLAIN, "across")
     lines.append(
         f"Controls: no force at all errs by {100 * min(nothing):.0f} to {100 * max(nothing):.0f}% in every "
-        f"world; a ridge fitted on labels dealt out anew by {_said(shuffled)}."
+        f"world; a ridge fitted on labels dealt out anew by {_said(shuffled)}; across the line of sight by "
+        f"{_said(none)} and {_said(across)}."
     )
     return lines
 

@@ -123,7 +123,12 @@ def mechanics(job: Job) -> list[str]:
     present = {"membrane": membrane, "heart beat": beat, "breath": breath}
     absent = "".join(f", no {name}" for name, size in present.items() if not size)
     said = [f"Tissue is homogeneous and isotropic: no stiffness of vessels, no bleeding{absent}."]
-    if membrane:
+    if not membrane:
+        said.append(
+            "Force across the line of sight that is read on a cortex with its pia-arachnoid on, by what was "
+            "fitted without one, is off by half of it (a soft one) or not read at all."
+        )
+    else:
         said.append(
             f"The pia-arachnoid is on {membrane:.0%} of the sequences (drawn), an elastic sheet; it "
             "wrinkles, does not stiffen as it stretches, and its stretch at rest is assumed, not measured."

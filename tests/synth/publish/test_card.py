@@ -80,7 +80,7 @@ def test_the_mechanics_stand_on_the_card(root: Path) -> None:
         (
             {},
             "no membrane, no heart beat, no breath|Poisson's ratio is 0.4;|is bonded to the skull round"
-            "|Every contact is a given traction",
+            "|Every contact is a given traction|by what was fitted without one",
         ),
         (
             {
@@ -102,6 +102,7 @@ def test_the_card_says_which_mechanics_are_in_and_which_are_not(fem: dict[str, A
     words = "\n".join(card.mechanics(Job.model_validate({"fem": fem})))
     for phrase in said.split("|"):
         assert phrase in words
+    assert ("fitted without one" in words) == ("membrane" not in fem)
     absent = {"on 50%": "membrane", "Heart and breath raise": "pulse", "rigid tip": "contact"}
     assert not [phrase for phrase, key in absent.items() if key not in fem and phrase in words]
 
