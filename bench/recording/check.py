@@ -22,8 +22,9 @@ _JUMP = 3.0  # median intervals
 _SURGICAL_N = 5.0
 _RATE_HZ = 10.0  # frames a second that are looked at unless more are asked for
 _LEAST_PRESS = 5  # frames of a press that settle its gain
-_OFF_ROWS_PX = 0.5  # of small pictures: the calibration is not this pair's, or no longer
-_NOISY_MM = 0.16  # depth motion from which on force is no better than with one eye
+OFF_ROWS_PX = 0.5  # of small pictures: the calibration is not this pair's, or no longer
+NOISY_MM = 0.16  # depth motion from which on force is no better than with one eye
+LATE = 0.22  # share of the motion that the second eye doesn't show: it is of another moment
 _LOOKED_AT = 12  # frames that are followed to see whether they can be
 
 
@@ -164,7 +165,7 @@ def _check_following(recording: Recording, found: _Findings) -> None:
             second.move(step)
     if second is not None:
         sight = second.sight
-        odd = sight.epipolar_px > _OFF_ROWS_PX or not sight.noise_mm < _NOISY_MM
+        odd = sight.epipolar_px > OFF_ROWS_PX or not sight.noise_mm < NOISY_MM or sight.lag > LATE
         found.add("odd" if odd else "ok", "second eye", sight.describe())
     if account.frames:
         found.add("odd" if account.is_odd else "ok", "following", account.describe())

@@ -22,6 +22,7 @@ from synth.system import foreign_file, foreign_picture
 
 Flags = NDArray[np.bool_]
 _LARGEST_BYTES = 1 << 30  # of an array of points
+_MOVED_PX = 0.5  # less says nothing of when
 
 
 @dataclass(frozen=True)
@@ -34,13 +35,16 @@ class Sight:
     """Median distance of what matches from its row, on the pictures that flow is computed on; NaN: none."""
     noise_mm: float
     """Median deviation of depth motion over the tissue, and over the frames looked at."""
+    lag: float = 0.0
+    """Share of the motion that the second eye doesn't show, exceeded in a tenth of the frames that moved: its
+    pictures are of another moment. 0 for a depth camera, which can't tell."""
 
     def describe(self) -> str:
         """A line for a person."""
         noise = f"depth motion is known to ± {self.noise_mm:.2g} mm"
         if np.isnan(self.baseline_mm):
             return f"a depth camera; {noise}"
-        rows = f"rows {self.epipolar_px:.2g} px off"
+        rows = f"rows {self.epipolar_px:.2g} px off, {100 * self.lag:.0f}% of the motion late"
         return f"a second eye {self.baseline_mm:.3g} mm to the right, {rows}; {noise}"
 
 
@@ -54,6 +58,7 @@ class SecondEye:
         self._depth: DepthTracker | None = None
         self._rights: Iterator[Picture] = iter(recording.right_frames()) if recording.right else iter(())
         self._noise: list[float] = []
+        self._lags: list[float] = []
 
     @property
     def sight(self) -> Sight:
@@ -61,7 +66,8 @@ class SecondEye:
         noise = float(np.median(self._noise)) if self._noise else float("nan")
         if self._stereo is None:
             return Sight(float("nan"), float("nan"), noise)
-        return Sight(self._stereo.rectified.baseline_mm, self._stereo.rest.epipolar_px, noise)
+        lag = float(np.percentile(self._lags, 90)) if self._lags else 0.0
+        return Sight(self._stereo.rectified.baseline_mm, self._stereo.rest.epipolar_px, noise, lag)
 
     def move(self, step: Step) -> Moved:
         """Motion of a frame since rest; the first step is the rest frame.
@@ -82,6 +88,8 @@ class SecondEye:
             moved = self._stereo.step(
                 step.picture.rgb, right, blocked, self._hidden(right, blocked), found.flow, found.confidence
             )
+            if np.percentile(np.abs(found.flow[tissue]), 98) > _MOVED_PX:
+                self._lags.append(abs(self._stereo.lag))
         else:
             depth = self._depths(step.picture.index)
             if self._depth is None:
