@@ -31,6 +31,9 @@ app = typer.Typer(
 Backend = Annotated[str, typer.Option(help="Flow estimator, as in a job's flow.backend.")]
 Young = Annotated[float | None, typer.Option(help="Young's modulus of the tissue [kPa], if known.")]
 Phantom = Annotated[bool, typer.Option("--phantom", help="It shows a phantom: forces beyond 50 N are meant.")]
+Masks = Annotated[
+    str, typer.Option(help="auto, none, glare, tool, both, or a folder of NNNNNN.png or mask.png: the tool.")
+]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")]
 
 
@@ -66,10 +69,7 @@ def score(
     ] = None,
     also: Annotated[list[str] | None, typer.Option(help="A further model, as NAME=FOLDER.")] = None,
     phantom: Phantom = False,
-    masks: Annotated[
-        str,
-        typer.Option(help="auto, none, glare, tool, both, or a folder of NNNNNN.png or mask.png: the tool."),
-    ] = "auto",
+    masks: Masks = "auto",
     region: Annotated[
         str, typer.Option(help="LEFT,TOP,WIDTH,HEIGHT [px]: only this part of the picture is followed.")
     ] = "",
@@ -80,11 +80,11 @@ def score(
     from bench.scoring.evaluate_recording import Settings
 
     others = {name: Path(folder) for name, folder in _pairs("--also", also, "NAME=FOLDER").items()}
-    from learn.inference.video_flow import MASKS
+    from learn.inference.mask_files import read_choice
 
-    kind, folder = (masks, None) if masks in MASKS else ("auto", Path(masks))
+    kind, files = read_choice(masks)
     settings = Settings(backend=flow, shrink=shrink, rate_hz=rate or None, pulse=pulse, masks=kind)
-    seen = commands.Seen(folder, _rectangle(region))
+    seen = commands.Seen(files, _rectangle(region))
     result = commands.score_recording(recording, model, out, settings, title, train, others, phantom, seen)
     _say(result, out or Path(f"{result.recording}-score"), json)
 
@@ -286,6 +286,7 @@ def live(
     young: Young = None,
     flow: Backend = "tvl1",
     shrink: Annotated[int, typer.Option(min=1, max=8, help="Pictures this many times smaller.")] = 1,
+    masks: Masks = "auto",
     every: Annotated[bool, typer.Option("--every", help="Work on every frame, however late.")] = False,
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="Folder for live.json: latencies and the machine.")
@@ -295,9 +296,11 @@ def live(
     """Masks, flow and force of a video as it runs: latency percentiles and dropped frames."""
     from bench.methods.network import Model
     from bench.tracking import live as stream
+    from learn.inference.mask_files import read_choice
     from learn.inference.video import FPS, read_video
     from learn.inference.video_flow import Footage
 
+    kind, files = read_choice(masks)
     method = None if model is None else Model(model)
 
     def tell(frame: stream.Frame) -> None:
@@ -308,8 +311,9 @@ def live(
         )
 
     account = stream.watch_video(
-        Footage(read_video(video, FPS), str(video)),
+        Footage(read_video(video, FPS), str(video), tool=files.read if files else None),
         backend=flow,
+        masks=kind,
         method=method,
         scale_mm_per_px=scale,
         young_kpa=young,
@@ -319,7 +323,8 @@ def live(
     )
     summary = account.summary()
     if out is not None:
-        stream.write_live(out, summary, backend=flow, shrink=shrink, paced=not every, model=model is not None)
+        how = {"backend": flow, "shrink": shrink, "masks": masks, "paced": not every}
+        stream.write_live(out, summary, **how, model=model is not None)
     if json:
         typer.echo(json_.dumps(summary))
     else:

@@ -57,6 +57,7 @@ COMMANDS = {
     "experiment slides": "evidence.fem.slides:slides",
     "experiment half-space": "evidence.fem.half_space:half_space",
     "experiment contact": "evidence.fem.contact:rigid",
+    "experiment mechanics": "evidence.mechanics.experiment:experiment",
     "stability damage": "evidence.engine.damage:damage",
     "experiment scale": "evidence.engine.large_index:scale",
     "stability dask": "evidence.engine.dask:dask",

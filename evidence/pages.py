@@ -238,6 +238,7 @@ _FILES: Mapping[str, tuple[str, str | Callable[[Tree], Page]]] = {
     "pulse": ("results.json", "scoring.pulse"),
     "leakage": ("results.json", "gap.leakage"),
     "scoring": ("results.json", "scoring.scoring_cost"),
+    "mechanics": ("results.json", "mechanics.page"),
     "pipeline": ("stages/stages.json", stages),
     "end-to-end": ("pareto.json", "end_to_end.page"),
     "fem/pareto": ("pareto.json", "fem.pareto"),

@@ -16,6 +16,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from synth.errors import UserError
+from synth.system import whole_file
 from synth.system.cli_errors import Commands
 
 if TYPE_CHECKING:
@@ -297,6 +298,12 @@ def predict_command(
     pulse: Annotated[
         bool, typer.Option(help="Take the tissue's own motion, heart and breath, off a video's first.")
     ] = True,
+    masks: Annotated[
+        str,
+        typer.Option(
+            help="Of a video: auto, none, glare, tool, both, or a folder of NNNNNN.png or mask.png: the tool."
+        ),
+    ] = "auto",
     threads: Threads = None,
     json: Json = False,
 ) -> None:
@@ -304,18 +311,24 @@ def predict_command(
     import numpy as np
 
     from learn.inference.apply import Filmed, apply, motions
+    from learn.inference.mask_files import read_choice
     from learn.inference.predict import load_predictor
     from learn.inference.video_flow import Settings
     from learn.training.threads import set_threads
 
     set_threads(threads)
     predictor = load_predictor(model, quick=True)
-    filmed = Filmed(scale, tissue, Settings(flow, shrink, rate or None, pulse))
+    kind, files = read_choice(masks)
+    filmed = Filmed(scale, tissue, Settings(flow, shrink, rate or None, pulse, kind), files)
     peaks: dict[str, float | None] = {}
     for motion in motions(source, predictor.stored(input), filmed):
+        written = out / f"{motion.name}.npz"
+        if written.exists() and written.samefile(source):
+            raise UserError(f"{written}: is what is read, and would be overwritten; say another --out")
         found = apply(predictor, motion, young)
         out.mkdir(parents=True, exist_ok=True)
-        np.savez_compressed(out / f"{motion.name}.npz", **found)
+        with whole_file.part_of(written) as part, part.open("wb") as file:
+            np.savez_compressed(file, **found)
         size = found["total_force_mn"][found["trusted"]]
         peaks[motion.name] = float(size.max()) if len(size) else None
         if not json:

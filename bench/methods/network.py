@@ -43,6 +43,11 @@ class Model:
             "target": settings.target,
         }
 
+    @property
+    def notes(self) -> list[str]:
+        """What is to be known of how the last recording was read, once it is."""
+        return [] if self._reader is None else self._reader[1].notes
+
     def __call__(
         self, flow: NDArray[np.float32], confidence: NDArray[np.float32], scene: Scene, picture: bool
     ) -> Answer:

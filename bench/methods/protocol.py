@@ -36,7 +36,7 @@ class Answer:
 
 
 class Method(Protocol):
-    """Displacement to force, frame by frame."""
+    """Displacement to force, frame by frame. One that has `notes: list[str]` is asked for them at the end."""
 
     def __call__(
         self, flow: NDArray[np.float32], confidence: NDArray[np.float32], scene: Scene, picture: bool

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.recording import pixel_scale
+from bench.recording import clocks, pixel_scale
 from bench.recording.folder import Recording, open_recording
 from bench.recording.meta import LEAST_INTERVALS
 from bench.recording.second_eye import SecondEye
@@ -198,7 +198,8 @@ def _check_sensor(recording: Recording, times: NDArray[np.float64], found: _Find
         found.add("ok" if share > 0.9 else "odd", "clocks", said)
         ratio = (t[-1] - t[0]) / (times[-1] - times[0])
         if not 0.01 <= ratio <= 100:
-            found.add("odd", "clocks", f"the sensor's record is {ratio:.3g} times as long: seconds?")
+            said = f"the sensor's record is {ratio:.3g} times as long: seconds?"
+            found.add("odd", "clocks", clocks.find_other_unit(times, t) or said)
 
 
 def _check_spans(recording: Recording, times: NDArray[np.float64], found: _Findings) -> None:

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from bench.recording import csv_table, meta
 from bench.recording.meta import Meta, Span
 from learn.inference import video
+from learn.inference.mask_files import MaskFiles
 from learn.inference.video import Picture
 from synth.errors import UserError
 
@@ -82,7 +83,9 @@ class Recording:
         return video.count_frames(self.video) if self.video else len(self.pictures)
 
     def frames(self) -> Iterator[Picture]:
-        """Upright frames in order, with times: frames.csv's, else the video's, else `fps` in meta.yaml.
+        """Upright frames in order, with times.
+
+        Those of frames.csv alone if there is one, else the video's, else by `fps` of meta.yaml.
 
         Raises:
             UserError: unreadable video or picture.
@@ -99,8 +102,7 @@ class Recording:
 
     def tool(self, index: int, size: tuple[int, int]) -> NDArray[np.bool_] | None:
         """(H, W) tool mask of a frame, or None if there is none for it. UserError for one of another size."""
-        path = self.masks.get(index, self.mask)
-        return None if path is None else video.read_mask(path, size)
+        return MaskFiles(self.masks, self.mask).read(index, size)
 
     def describe_tool(self, frames: int) -> str:
         """What is taken for the tool in how many frames, for `bench check` and `bench score` alike."""
@@ -121,19 +123,16 @@ class Recording:
             tissue &= inside
         return tissue
 
-    def with_masks(self, folder: Path) -> Recording:
-        """Its tool as another folder has it. UserError if that holds neither NNNNNN.png nor mask.png."""
-        masks, still = _masks(folder, folder)
-        if not masks and still is None:
-            raise UserError(f"{folder}: holds neither masks NNNNNN.png nor mask.png")
-        return replace(self, masks=masks, mask=still)
+    def with_masks(self, files: MaskFiles) -> Recording:
+        """Its tool as other files have it."""
+        return replace(self, masks=files.numbered, mask=files.still)
 
     def _timed(self, picture: Picture) -> Picture:
         time_s, fps = picture.time_s, self.meta.fps
         if self.times_s is not None:
             known = picture.index < len(self.times_s) and np.isfinite(self.times_s[picture.index])
             time_s = float(self.times_s[picture.index]) if known else None
-        if time_s is None and fps is not None:
+        elif time_s is None and fps is not None:
             time_s = picture.index / fps
         return replace(picture, time_s=time_s)
 
@@ -157,24 +156,34 @@ def open_recording(folder: Path, phantom: bool = False) -> Recording:
         about = about.model_copy(update={"tissue": "phantom"})
     movie, pictures = _footage(folder)
     notes: list[str] = []
+    if about.scale_mm_per_px == "unknown":
+        # Force goes with the scale as it goes with E: of either unknown, a factor is.
+        about = about.model_copy(update={"young_kpa": None})
+        notes.append(
+            f"scale unknown: answers are per pixel, on a picture taken to be {meta.TAKEN_MM:g} mm wide, and right "
+            "up to a factor"
+        )
     times = _frame_times(folder / "frames.csv", notes)
     force = _force(folder / "force.csv", about, notes)
     about, times, force = _from_start(about, times, force, notes)
-    masks, mask = _masks(folder / "masks", folder)
+    tools = MaskFiles.find(folder / "masks", folder)
     still = folder / "tissue.png"
     tissue = still if os.path.lexists(still) else None
     right, depths = _second_eye(folder, about)
     return Recording(
-        folder, about, movie, pictures, times, force, masks, tissue, tuple(notes), mask, None, right, depths
-    )
+        folder, about, movie, pictures, times, force, tools.numbered, tissue, tuple(notes), tools.still,
+        None, right, depths,
+    )  # fmt: skip
 
 
 def _second_eye(folder: Path, about: Meta) -> tuple[Path | tuple[Path, ...], tuple[Path, ...]]:
     """Video or pictures of the right eye, and depth pictures; UserError if meta.yaml says otherwise."""
     movies = sorted(path for path in folder.glob("right.*") if path.suffix.lower() in video.SUFFIXES)
-    pictures = tuple(sorted(folder.glob("right/*.png"), key=_natural))
+    pictures = tuple(sorted(folder.glob("right/*.png"), key=natural_order))
     depths = tuple(
-        sorted((path for path in folder.glob("depth/*") if path.suffix in (".png", ".npy")), key=_natural)
+        sorted(
+            (path for path in folder.glob("depth/*") if path.suffix in (".png", ".npy")), key=natural_order
+        )
     )
     if len(movies) + bool(pictures) > 1:
         raise UserError(f"{folder}: holds {movies[0].name} and right/ or another right.*; keep one of them")
@@ -188,13 +197,6 @@ def _second_eye(folder: Path, about: Meta) -> tuple[Path | tuple[Path, ...], tup
         if said is not None and not found:
             raise UserError(f"{folder}: meta.yaml says {key}, but there is no {what}")
     return right, depths
-
-
-def _masks(folder: Path, beside: Path) -> tuple[dict[int, Path], Path | None]:
-    """Masks by frame, and the one for all others."""
-    numbered = [path for path in sorted(folder.glob("*.png")) if re.fullmatch("[0-9]{1,9}", path.stem)]
-    still = beside / "mask.png"
-    return {int(path.stem): path for path in numbered}, still if os.path.lexists(still) else None
 
 
 def _from_start(
@@ -236,7 +238,7 @@ def _spans_from(about: Meta, start: float) -> Meta:
 
 def _footage(folder: Path) -> tuple[Path | None, tuple[Path, ...]]:
     movies = sorted(path for path in folder.glob("video.*") if path.suffix.lower() in video.SUFFIXES)
-    pictures = tuple(sorted(folder.glob("frames/*.png"), key=_natural))
+    pictures = tuple(sorted(folder.glob("frames/*.png"), key=natural_order))
     if len(movies) + bool(pictures) > 1:
         found = [path.name for path in movies] + ["frames/"] * bool(pictures)
         raise UserError(f"{folder}: holds {' and '.join(found)}; keep one of them")
@@ -245,7 +247,8 @@ def _footage(folder: Path) -> tuple[Path | None, tuple[Path, ...]]:
     return (movies[0] if movies else None), pictures
 
 
-def _natural(path: Path) -> list[tuple[int, str]]:
+def natural_order(path: Path) -> list[tuple[int, str]]:
+    """Key that sorts names by the numbers in them: a2 before a10."""
     parts = re.split("([0-9]+)", path.stem)  # every second is a number
     return [(int(part), "") if k % 2 else (-1, part) for k, part in enumerate(parts)]
 

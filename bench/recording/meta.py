@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import (
+    AfterValidator,
     BaseModel,
     BeforeValidator,
     ConfigDict,
@@ -26,8 +27,19 @@ Positive = Annotated[FiniteFloat, Field(gt=0)]
 Share = Annotated[FiniteFloat, Field(ge=0, lt=1)]
 Point = tuple[FiniteFloat, FiniteFloat]
 Row = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
-Span = tuple[FiniteFloat, FiniteFloat]
 
+
+def _must_run_forward(span: tuple[float, float]) -> tuple[float, float]:
+    if span[0] >= span[1]:
+        raise ValueError(f"a span must end after its beginning, not run from {span[0]:g} to {span[1]:g} s")
+    return span
+
+
+Span = Annotated[tuple[FiniteFloat, FiniteFloat], AfterValidator(_must_run_forward)]
+
+
+TAKEN_MM = 32.0
+"""Width that a picture of unknown scale is taken to have [mm]: about what a microscope shows of a cortex."""
 
 LEAST_INTERVALS = 20
 """Frame intervals that `sync.calibration_s` must hold for the clocks to be lined up on it."""
@@ -91,7 +103,8 @@ class Sensor(_Section):
     free_s: tuple[Span, ...] = ()
     """Spans without contact, (from, to) on the sensor's clock [s]: for tare, drift and noise floor."""
     mass_g: Annotated[FiniteFloat, Field(ge=0)] = 0.0
-    """Mass beyond a tool-mounted sensor [g], for gravity; needs columns gx, gy, gz in force.csv."""
+    """Mass beyond a tool-mounted sensor [g], for gravity; needs columns gx, gy, gz in force.csv: the unit
+    vector along gravity in the sensor's axes."""
 
     @model_validator(mode="after")
     def _is_a_rotation(self) -> Sensor:
@@ -154,8 +167,9 @@ class Depth(_Section):
 class Meta(_Section):
     """One recording."""
 
-    scale_mm_per_px: Positive | None = None
-    """Millimetres a pixel at the tissue. This or `calibration`."""
+    scale_mm_per_px: Positive | Literal["unknown"] | None = None
+    """Millimetres a pixel at the tissue, or `unknown`: then only relative force is known. This or
+    `calibration`."""
     calibration: Calibration | None = None
     """How to find the scale."""
     scale_uncertainty: Share | None = None

@@ -1,4 +1,8 @@
-"""Millimetres a pixel, and how sure they are. Force goes with the scale, so 5% of scale is 5% of force."""
+"""Millimetres a pixel, and how sure they are.
+
+At equal flow in pixels both the depth u and the size a of the dent go with the scale. On an elastic body
+F = E a² g(u/a), so force goes with the scale's square: 5% of scale is 10% of force.
+"""
 
 from __future__ import annotations
 
@@ -8,10 +12,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from bench.recording.meta import Calibration, Meta
+from bench.recording.folder import open_recording
+from bench.recording.meta import TAKEN_MM, Calibration, Meta
 from learn.inference import video
 from synth.errors import UserError
 
+_UNKNOWN = 0.99  # relative: nothing is known
 _STATED = 0.02  # what a stated scale is trusted to without more
 _POINT_PX = 1.0  # standard error of a point set by hand
 _DISTANCE = 0.01  # relative standard error of a stated working distance
@@ -31,8 +37,12 @@ def find_scale(meta: Meta, folder: Path) -> Scale:
     """The recording's scale, from what `meta.yaml` offers.
 
     Raises:
-        UserError: a checkerboard that isn't found, points that coincide.
+        UserError: a checkerboard that isn't found, points that coincide; of an unknown scale, no picture.
     """
+    if meta.scale_mm_per_px == "unknown":
+        wide = next(iter(open_recording(folder).frames())).rgb.shape[1]
+        source = f"unknown: the picture is taken to be {TAKEN_MM:g} mm wide"
+        return Scale(TAKEN_MM / wide, _first(meta.scale_uncertainty, _UNKNOWN), source)
     if meta.scale_mm_per_px is not None:
         return Scale(meta.scale_mm_per_px, _first(meta.scale_uncertainty, _STATED), "stated")
     assert meta.calibration is not None
@@ -61,7 +71,7 @@ def _bar(ends: tuple[tuple[float, float], tuple[float, float]], length_mm: float
 
 
 def _checkerboard(path: Path, corners: tuple[int, int], square_mm: float) -> Scale:
-    """Mean length of the squares' sides around the picture's middle; its spread over the board is the error.
+    """Mean length of the squares' sides over the whole board; their spread is the error.
 
     On a board that lies flat and square to the view all sides are equal; tilt and distortion show as spread.
     """

@@ -20,6 +20,7 @@ from bench.recording.from_sequence import export_recording
 from bench.scoring import evaluate_recording, report
 from bench.scoring.evaluate_recording import Result, Settings
 from bench.tracking.flow_process import FlowProcess
+from learn.inference.mask_files import MaskFiles
 from synth.dataset.store import Dataset, Sequence
 from synth.errors import UserError
 from synth.system import whole_file
@@ -27,6 +28,7 @@ from synth.system import whole_file
 MAIN = "D2FNet"
 """Name under which the given model stands in every table."""
 _ROOM_BYTES = 32 << 20  # score.json and report.html, with the charts' program in it
+_MARK = "made-by-demo.txt"
 _LONG = 100
 """Frames from which a second process is worth the seconds that it takes to start."""
 
@@ -35,13 +37,13 @@ _LONG = 100
 class Seen:
     """What of a recording's pictures is looked at, instead of what its folder says."""
 
-    masks: Path | None = None
-    """Folder with the tool's masks."""
+    masks: MaskFiles | None = None
+    """The tool's masks."""
     region: tuple[int, int, int, int] | None = None
     """Left, top, width and height [px]."""
 
     def within(self, recording: Recording) -> Recording:
-        """The recording so seen. UserError: no masks in the folder."""
+        """The recording so seen."""
         masked = recording if self.masks is None else recording.with_masks(self.masks)
         return replace(masked, region=self.region)
 
@@ -157,15 +159,19 @@ def score_demo(dataset: Path, model: Path, out: Path, settings: Settings) -> Res
         out: gets recording/, score.json and report.html; what an earlier demo left there is replaced.
 
     Raises:
-        UserError: the model has seen every sequence, or as `score_recording`.
+        UserError: the model has seen every sequence, a recording/ that no demo left, or as
+            `score_recording`.
     """
     chosen = find_unseen(dataset, model)
     folder = out / "recording"
     if folder.is_symlink():
         raise UserError(f"{folder}: is a link, which is not followed; remove it")
     if folder.exists():
+        if not (folder / _MARK).is_file():
+            raise UserError(f"{folder}: not from `bench demo`, so not replaced; remove it, or say --out")
         shutil.rmtree(folder)
     export_recording(chosen, folder)
+    (folder / _MARK).write_text("`bench demo` wrote this folder and replaces it when it runs again.\n")
     return score_recording(
         folder, model, out, settings, f"Force from video: sequence {chosen.index}, unseen in training"
     )

@@ -17,6 +17,7 @@ from bench import bootstrap
 from bench.bootstrap import Interval
 from bench.methods.flow_size import FlowSize, flow_sizes
 from bench.methods.protocol import Method
+from bench.recording import clocks
 from bench.recording.folder import Force, Recording
 from bench.recording.pixel_scale import Scale
 from bench.scoring import metrics
@@ -32,6 +33,10 @@ Curve = NDArray[np.float64]
 _SEED = 0  # of the bootstrap: the same recording gives the same intervals
 MOST_LOST = 0.2
 """Share of lost frames above which no number stands for a recording: the rest are the easy ones."""
+_NO_YOUNG = (
+    "Young's modulus unknown: forces are those of tissue of 1 kPa, so only scores that no factor changes are "
+    "given, and those after the gain of a separate press if there is one"
+)
 
 
 @dataclass(frozen=True)
@@ -83,7 +88,7 @@ class Result:
     methods: dict[str, Scored]
     scale: Scale
     relative_uncertainty: float
-    """Of every force, from scale and stiffness."""
+    """One standard deviation of every force, from scale (whose square force goes with) and stiffness."""
     noise_floor_mn: float
     scored: NDArray[np.bool_]
     """(T,) whether the frame counts: calibration spans don't."""
@@ -145,17 +150,9 @@ def evaluate_recording(
     notes = [*recording.notes, *done.notes]
     truth = _truth(recording, done, time, notes)
     if meta.young_kpa is None:
-        notes.append(
-            "Young's modulus unknown: forces are those of tissue of 1 kPa, so only scores that no factor "
-            "changes are given, and those after the gain of a separate press if there is one"
-        )
+        notes.append(_NO_YOUNG)
     kept = _kept(recording, time, notes)
-    lost = ~np.array(done.trusted)
-    if lost.any():
-        notes.append(f"{lost.sum()} of {len(lost)} frames could not be followed: gaps, not scored")
-    forces = {name: np.array(curve, np.float64) for name, curve in done.force_mn.items()}
-    for force in forces.values():
-        force[lost] = np.nan
+    forces, lost = _with_gaps(done, notes)
     gains = _brought_to_newtons(forces, methods, truth, kept, _pressed(recording, time), main)
     return Result(
         recording=recording.name,
@@ -164,13 +161,11 @@ def evaluate_recording(
         sensor_mn=truth.size_mn,
         sensor_axes_mn=truth.axes_mn,
         methods={
-            name: replace(
-                _scored(time, force, forces[main], truth, kept, recording, name == main), gain=gains.get(name)
-            )
-            for name, force in forces.items()
+            name: replace(one, gain=gains.get(name))
+            for name, one in _all_scored(time, forces, main, truth, kept, recording).items()
         },
         scale=scale,
-        relative_uncertainty=math.hypot(scale.uncertainty, meta.young_uncertainty),
+        relative_uncertainty=math.hypot(2 * scale.uncertainty, meta.young_uncertainty),
         noise_floor_mn=truth.floor_mn,
         scored=kept,
         lost=lost,
@@ -182,6 +177,31 @@ def evaluate_recording(
         followed=done,
         absolute=meta.young_kpa is not None,
     )
+
+
+def _with_gaps(done: Tracked, notes: list[str]) -> tuple[dict[str, Curve], NDArray[np.bool_]]:
+    """Each method's forces (T, 3), NaN in frames that could not be followed, and those, (T,)."""
+    lost = ~np.array(done.trusted)
+    if lost.any():
+        notes.append(f"{lost.sum()} of {len(lost)} frames could not be followed: gaps, not scored")
+    forces = {name: np.array(curve, np.float64) for name, curve in done.force_mn.items()}
+    for force in forces.values():
+        force[lost] = np.nan
+    return forces, lost
+
+
+def _all_scored(
+    time_s: Curve,
+    forces: Mapping[str, Curve],
+    main: str,
+    truth: _Truth,
+    kept: NDArray[np.bool_],
+    recording: Recording,
+) -> dict[str, Scored]:
+    return {
+        name: _scored(time_s, force, forces[main], truth, kept, recording, name == main)
+        for name, force in forces.items()
+    }
 
 
 def _pressed(recording: Recording, time: Curve) -> NDArray[np.bool_] | None:
@@ -267,6 +287,10 @@ def _truth(recording: Recording, done: Tracked, time: Curve, notes: list[str]) -
     if covered == 0:
         notes.append("force.csv and the video share no time: predictions only; are both clocks in seconds?")
         return _Truth(steps=processed.steps, sync=found)
+    other = clocks.find_other_unit(time, force.time_s)
+    if other:
+        notes.append(f"{other}: predictions only, nothing is scored")
+        return _Truth()
     if covered < len(time):
         notes.append(f"the sensor covers {covered} of {len(time)} frames; only those are scored")
     return _Truth(axes, processed.noise_floor_mn, processed.steps, found)
@@ -277,9 +301,10 @@ def _offset(force: Force, recording: Recording, done: Tracked, time: Curve) -> O
     assert about.calibration_s is not None
     inside = (time >= about.calibration_s[0]) & (time <= about.calibration_s[1])
     smooth = force_sensor.process_force(force, recording.meta.sensor, 0.0)
-    return clock_sync.find_offset(
-        time[inside], np.array(done.speed)[inside], smooth.time_s, smooth.force_mn, about.search_s
-    )
+    trusted = np.array(done.trusted)
+    # A speed is of two frames: where either is lost it is of the flow's mistake.
+    speed = np.where(trusted & np.append(True, trusted[:-1]), done.speed, np.nan)
+    return clock_sync.find_offset(time[inside], speed[inside], smooth.time_s, smooth.force_mn, about.search_s)
 
 
 def _scored(

@@ -36,7 +36,7 @@ class Frame:
     trusted: bool
     largest_px: float
     force_mn: float | None
-    """Magnitude of the total force; None without a model."""
+    """Magnitude of the total force; None without a model, and of a frame that could not be followed."""
 
 
 @dataclass
@@ -68,6 +68,7 @@ def watch_video(
     scale_mm_per_px: float | None = None,
     young_kpa: float | None = None,
     shrink: int = 1,
+    masks: str = "auto",
     paced: bool = True,
     told: Callable[[Frame], None] = lambda frame: None,
 ) -> Watched:
@@ -80,6 +81,7 @@ def watch_video(
         scale_mm_per_px: of the video's own pixels.
         young_kpa: of the tissue, if known.
         shrink: pictures are made this many times smaller first.
+        masks: as of `Settings`.
         paced: drop what arrives meanwhile; False: work on every frame.
         told: of every frame's answer.
 
@@ -89,7 +91,8 @@ def watch_video(
     if method is not None and scale_mm_per_px is None:
         raise UserError("a model needs --scale (mm a pixel): forces have no meaning without it")
     account, pace = Watched(), _Pace(paced)
-    video = VideoFlow(footage, Settings(backend, shrink, rate_hz=None, pulse=False), _Warm(), pace.is_due)
+    settings = Settings(backend, shrink, rate_hz=None, pulse=False, masks=masks)
+    video = VideoFlow(footage, settings, _Warm(), pace.is_due)
     scene: Scene | None = None
     for step in video.steps():
         if scene is None:
@@ -98,7 +101,7 @@ def watch_video(
             pace.start(step)
             continue
         began, found, force = time.perf_counter(), step.found, None
-        if method is not None:
+        if method is not None and found.trusted:
             force = method(found.flow, found.confidence, scene, False).size_mn
         end = time.perf_counter()
         seen: NDArray[np.bool_] = found.confidence > 0

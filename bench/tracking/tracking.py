@@ -154,6 +154,8 @@ def _track(
     if out.fault:
         out.notes.append(f"nothing can be measured: {out.fault}")
     out.notes.append(recording.describe_tool(video.seen))
+    for name, method in methods.items():
+        out.notes += [f"{name}: {note}" for note in getattr(method, "notes", ())]
     if out.account.is_odd:
         out.notes.append(out.account.describe())
     if video.peak_bytes:

@@ -103,11 +103,16 @@ def network_settings(epochs: int, seed: int) -> Settings:
 
 
 def _network(fit: Sequence[Clip], folder: Path, epochs: int, seed: int) -> Answer:
+    return train_network(fit, network_settings(epochs, seed), folder)
+
+
+def train_network(fit: Sequence[Clip], settings: Settings, folder: Path) -> Answer:
+    """A network of vectors; the first fifth of `fit` chooses the epoch. Its training is kept in `folder`."""
     from learn.data.split import Split
     from learn.inference.predict import load_predictor
     from learn.training.train import train
 
-    select, settings = max(2, len(fit) // 5), network_settings(epochs, seed)
+    select = max(2, len(fit) // 5)
     train(fit, Split(tuple(range(select, len(fit))), tuple(range(select)), ()), settings, folder)
     predictor = load_predictor(folder)
 
@@ -115,6 +120,6 @@ def _network(fit: Sequence[Clip], folder: Path, epochs: int, seed: int) -> Answe
         said, _ = predictor.answer(
             np.asarray(clip.displacement["recovered"]), clip.mask, clip.young_kpa, clip.sure("recovered")
         )
-        return np.asarray(said.sum(axis=(2, 3)) * GRID.pitch_mm**2, np.float64)
+        return np.asarray(said.sum(axis=(2, 3)) * settings.grid.pitch_mm**2, np.float64)
 
     return answer

@@ -20,6 +20,7 @@ from bench.recording import pixel_scale, writer
 from bench.recording.folder import open_recording
 from bench.scoring import evaluate_recording
 from bench.scoring.evaluate_recording import Result, Settings
+from evidence.flow.scenes import inverse
 from evidence.measuring import measuring
 from evidence.scoring import phantom
 
@@ -134,15 +135,8 @@ def record(
         moved = float(np.linalg.norm(force[k])) * contact["field"]
         own = beat(time, contact["phase"], size) - beat(float(times[0]), contact["phase"], size)
         moved = moved + beats * own / contact["mm_per_px"]
-        # Where a point of this frame was at rest: by fixed point, for motion is given at rest.
-        back = moved = moved.astype(np.float32)
-        for _ in range(8):
-            back = cv2.remap(
-                moved, x - back[..., 0], y - back[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-            )
-        rgb = cv2.remap(
-            rest, x - back[..., 0], y - back[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT
-        )
+        source = inverse(moved.astype(np.float32))
+        rgb = cv2.remap(rest, source[..., 0], source[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
         noisy = np.clip(rgb + rng.normal(0, 1.5, rgb.shape), 0, 255).astype(np.uint8)
         cv2.imwrite(str(folder / "frames" / f"{k:04d}.png"), noisy[..., ::-1])
     inside = np.hypot(x - (size - 1) / 2, y - (size - 1) / 2) < 0.46 * size

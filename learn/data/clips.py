@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from learn.data.grid import Grid, Resampler, centre, certainty, settled
+from synth.dataset import provenance
 from synth.dataset.split import name_anatomy
 from synth.dataset.store import Dataset, Sequence
 from synth.errors import UserError
@@ -43,7 +44,6 @@ _CURE = {
     "motion": "render with render.stereo_mm and flow.backend other than 'ideal'",
     "motion-ideal": "render with render.stereo_mm",
 }
-_VERSION = 4
 _ARRAYS = ("mask", "confidence", "density", "force")
 _SPATIAL = "motion_confidence"
 _FILES = {f"{name}.npy" for name in (*_ARRAYS, _SPATIAL, *(f"displacement-{source}" for source in FIELDS))}
@@ -185,26 +185,29 @@ def load_clips(
 ) -> list[Clip]:
     """All sealed sequences of a dataset, in order.
 
-    `cache`: folder of packed arrays, made on first use and memory-mapped after; keyed by content hash and
-    grid, so it can be shared and can't be stale. Raises UserError for an empty dataset, and for a sequence
-    whose attributes or values are not those that were sealed.
+    `cache`: folder of packed arrays, made on first use and memory-mapped after; keyed by content hash, grid
+    and the code that packs, so it can be shared and can't be stale. Raises UserError for an empty dataset,
+    and for a sequence whose attributes or values are not those that were sealed.
     """
     wanted = tuple(wanted)
     dataset = Dataset(root)
     clips = []
+    code = "" if cache is None else provenance.source([__name__], ("synth", "learn"))
     for i, sequence in enumerate(dataset):
         report(i, len(dataset))
         clips.append(
-            read_clip(sequence, grid, wanted) if cache is None else _packed(sequence, grid, wanted, cache)
+            read_clip(sequence, grid, wanted)
+            if cache is None
+            else _packed(sequence, grid, wanted, cache, code)
         )
     report(len(dataset), len(dataset))
     return clips
 
 
-def _packed(sequence: Sequence, grid: Grid, wanted: tuple[str, ...], cache: Path) -> Clip:
+def _packed(sequence: Sequence, grid: Grid, wanted: tuple[str, ...], cache: Path, code: str) -> Clip:
     # The content hash is no word of the store's own: opening it has checked that it is its attributes', and
     # reading a field that it is the hash there. What is packed under it is what it stands for.
-    said = [sequence.attrs["content_hash"], grid.size, grid.extent_mm, *wanted, _VERSION]
+    said = [sequence.attrs["content_hash"], grid.size, grid.extent_mm, *wanted, code]
     folder = cache / hashlib.blake2b(identity.canonical(said), digest_size=16).hexdigest()
     if not folder.is_dir():
         pack(read_clip(sequence, grid, wanted), folder)
@@ -233,8 +236,11 @@ def pack(clip: Clip, folder: Path) -> None:
             for name, values in arrays.items():
                 np.save(part / f"{name}.npy", values)
             (part / "clip.json").write_text(json.dumps(plain | {"checksums": sums}))
-            if not folder.is_dir():
+            try:
                 part.rename(folder)
+            except OSError:
+                if not folder.is_dir():  # else another run was faster
+                    raise
     except OSError as error:
         raise UserError(f"{folder}: cannot be written ({error.strerror})") from None
 

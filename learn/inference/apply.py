@@ -9,7 +9,6 @@ from functools import partial
 from itertools import chain, repeat
 from pathlib import Path
 from typing import Any, NamedTuple
-from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +16,7 @@ from numpy.typing import NDArray
 from learn.data.clips import FIELDS, has_depth
 from learn.inference import video
 from learn.inference.force_reader import ForceReader
+from learn.inference.mask_files import MaskFiles
 from learn.inference.predict import Predictor, View
 from learn.inference.pulse import Pulse
 from learn.inference.stiffness import stiffness
@@ -24,6 +24,7 @@ from learn.inference.video_flow import Footage, Settings, VideoFlow, everywhere
 from synth.dataset.store import Dataset, Sequence, open_sequence
 from synth.errors import UserError
 from synth.flow.stereo.track import Moved
+from synth.system import foreign_arrays
 
 
 class Step(NamedTuple):
@@ -73,6 +74,8 @@ class Filmed:
     """A picture, white where there is tissue; everywhere if not given."""
     settings: Settings = field(default_factory=Settings)
     """How it is followed."""
+    tool: MaskFiles | None = None
+    """Where the tool is; looked for in the pictures if not given."""
 
 
 def motions(path: Path, source: str, filmed: Filmed | None = None) -> Iterator[Motion]:
@@ -133,9 +136,9 @@ def _video(path: Path, filmed: Filmed, pulse: Pulse | None = None) -> Motion:
         raise UserError(f"{path}: a video doesn't say how large it shows things; give --scale in mm a pixel")
     drawn = filmed.tissue
     tissue = everywhere if drawn is None else partial(video.read_mask, drawn)
-    following = VideoFlow(
-        Footage(video.read_video(path, video.FPS), str(path), tissue), filmed.settings, pulse=pulse
-    )
+    tool = filmed.tool.read if filmed.tool else None
+    footage = Footage(video.read_video(path, video.FPS), str(path), tissue, tool)
+    following = VideoFlow(footage, filmed.settings, pulse=pulse)
     steps = (
         Step(
             step.found.flow,
@@ -156,10 +159,7 @@ def _video(path: Path, filmed: Filmed, pulse: Pulse | None = None) -> Motion:
     def notes() -> list[str]:
         if pulse is None:
             return following.notes
-        return [
-            *following.notes,
-            f"the whole surface moves by itself, {pulse.describe(mm_per_px)}: taken off",
-        ]
+        return [*following.notes, pulse.describe(mm_per_px)]
 
     return Motion(
         name=path.stem,
@@ -175,29 +175,27 @@ def _video(path: Path, filmed: Filmed, pulse: Pulse | None = None) -> Motion:
 
 
 def _arrays(path: Path) -> Motion:
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            found = {name: file[name] for name in file.files}
-    except (OSError, ValueError, EOFError, BadZipFile) as error:
-        raise UserError(f"{path}: cannot be read as .npz ({error})") from None
+    found = foreign_arrays.read_arrays(path)
     told = {"motion", "deviation"} if "motion" in found else {"flow"}
     missing = (told | {"tissue", "scale_mm_per_px"}) - found.keys()
     if missing:
         raise UserError(f"{path}: lacks {', '.join(sorted(missing))}")
     tissue = found["tissue"].astype(bool)
+    if tissue.ndim != 2:
+        raise UserError(f"{path}: tissue is {tissue.shape}, expected (H, W)")
     space = [found[name].astype(np.float32) for name in ("motion", "deviation")] if len(told) == 2 else []
     if any(one.ndim != 4 or one.shape != (len(space[0]), *tissue.shape, 3) for one in space):
         h, w = tissue.shape
         raise UserError(f"{path}: motion and deviation must be (T, {h}, {w}, 3) like the tissue")
-    scale = found["scale_mm_per_px"].astype(np.float32)
+    scale = _positive(path, found, "scale_mm_per_px")
     flow = space[0][..., :2] / scale if space else found["flow"].astype(np.float32)
-    if flow.ndim != 4 or flow.shape[1:] != (*tissue.shape, 2):
+    if flow.ndim != 4 or flow.shape[1:] != (*tissue.shape, 2) or not len(flow):
         h, w = tissue.shape
         raise UserError(f"{path}: flow is {flow.shape}, expected (T, {h}, {w}, 2) like the tissue")
     confidence = found.get("confidence")
     if confidence is not None and confidence.shape != flow.shape[:3]:
         raise UserError(f"{path}: confidence is {confidence.shape}, expected {flow.shape[:3]}")
-    young, force = found.get("young_kpa"), found.get("force_mn")
+    force = found.get("force_mn")
     if force is not None and force.shape != (len(flow),):
         raise UserError(f"{path}: force_mn is {force.shape}, expected ({len(flow)},)")
     return Motion(
@@ -212,10 +210,17 @@ def _arrays(path: Path) -> Motion:
             for t, f in enumerate(flow)
         ),
         tissue=tissue,
-        scale_mm_per_px=float(found["scale_mm_per_px"]),
-        young_kpa=None if young is None else float(young),
+        scale_mm_per_px=scale,
+        young_kpa=_positive(path, found, "young_kpa") if "young_kpa" in found else None,
         force_mn=None if force is None else force.astype(np.float64),
     )
+
+
+def _positive(path: Path, found: dict[str, NDArray[Any]], name: str) -> float:
+    """The one number under a name. UserError if it is another number of them, or not positive."""
+    if found[name].size != 1 or not 0 < found[name].item() < math.inf:
+        raise UserError(f"{path}: {name} must be one positive number")
+    return float(found[name].item())
 
 
 def apply(predictor: Predictor, motion: Motion, young_kpa: float | None = None) -> dict[str, Any]:
@@ -225,8 +230,9 @@ def apply(predictor: Predictor, motion: Motion, young_kpa: float | None = None) 
     `trusted` (T,) whether a frame could be followed (its force is NaN if not), `total_force_mn` (T,),
     `force_mn` (T, 3) for a model that gives direction, and as the network says it
     `density` (T, C, N, N) mN/mm² and `head_mn` (T, C) of one with a total-force head; `mask` (N, N),
-    `pitch_mm`, `centre_px` (x, y) in the film's own pixels, `young_kpa`, `young_known`, and `notes`: what
-    was done to the film that its user should know.
+    `pitch_mm`, `centre_px` (x, y) of the grid in the film's own pixels, `centres_px` (T, 2) the same by frame
+    (mask and centre are the last frame's; they change only where the tissue is wider than the grid),
+    `young_kpa`, `young_known`, and `notes`: what was done to the film that its user should know.
     """
     young = young_kpa if young_kpa is not None else motion.young_kpa
     reader = ForceReader(predictor, motion.tissue, motion.scale_mm_per_px, young)
@@ -256,12 +262,13 @@ def apply(predictor: Predictor, motion: Motion, young_kpa: float | None = None) 
         "young_kpa": last.young_kpa,
         "young_known": last.young_known,
         "frame": np.array(frames),
+        "centres_px": motion.shrink * (np.array([m.view.resample.centre_px for m in maps]) + 0.5) - 0.5,
     }
     if np.isfinite(times).any():
         out["time_s"] = np.array(times)
     if last.force_mn is not None:
         out["force_mn"] = total
-    notes = motion.notes()
+    notes = motion.notes() + reader.notes
     if fault:
         notes.append(f"nothing can be measured: {fault}")
     elif not all(trusted):

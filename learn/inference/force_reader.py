@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from learn.inference.placing import Placing, Point, share_at_border
 from learn.inference.predict import ForceMap, Predictor
 from synth.flow.stereo.track import Moved
+
+_MUCH_AT_BORDER = 0.1  # share of the force; what is spread evenly has a quarter there
 
 UNKNOWN_YOUNG_KPA = 1.0
 """Tissue whose E nobody knows is answered for as if it were of this: forces are then right up to a factor."""
@@ -37,7 +41,10 @@ class ForceReader:
         """`tissue`: (H, W) in the rest frame; `young_kpa`: of the tissue [kPa], None if unknown."""
         self._predictor, self._tissue = predictor, tissue
         self._scale, self._young_kpa = scale_mm_per_px, young_kpa
-        self._zero: NDArray[np.float64] | None = None
+        self._zero: dict[Point, NDArray[np.float64]] = {}
+        self.placing = Placing(tissue, scale_mm_per_px, predictor.grid)
+        """Where the network's grid lies."""
+        self._at_border = self._in_all = 0.0
 
     def read(
         self, flow: NDArray[np.float32], confidence: NDArray[np.float32] | None, moved: Moved | None = None
@@ -47,20 +54,44 @@ class ForceReader:
         `flow`: (H, W, 2) px; `confidence`: (H, W); `moved`: of two eyes. The force: (3,) mN on the tissue in
         camera axes; of a model without direction the size in x, the rest NaN.
         """
-        said = self._say(flow, confidence, moved)
-        if self._zero is None:
+        place = self.placing.place(flow, confidence)
+        said = self._say(flow, confidence, moved, place)
+        if place not in self._zero:
             sure = None if confidence is None else self._tissue.astype(np.float32)
             still = None if moved is None else Moved(0 * moved.motion, 0 * moved.deviation)
-            self._zero = _total(self._say(np.zeros_like(flow), sure, still))
-        force = _total(said) - self._zero
+            self._zero[place] = _total(self._say(np.zeros_like(flow), sure, still, place))
+        force = _total(said) - self._zero[place]
+        share = share_at_border(said.magnitude, said.view.mask)
+        if not self.placing.fits and math.isfinite(share):
+            size = float(np.sqrt(np.nansum(force**2)))
+            self._at_border, self._in_all = self._at_border + share * size, self._in_all + size
         if said.force_mn is None:
             force[0] = max(force[0], 0.0)
         return force, said
 
+    @property
+    def notes(self) -> list[str]:
+        """What its user should know of where the grid lay, once the frames are read."""
+        if self.placing.fits:
+            return []
+        wide = self._predictor.grid.extent_mm
+        said = f"the tissue is wider than the network's {wide:g} mm: it looks at what moves most"
+        said += f", and was moved there {self.placing.moves} times" if self.placing.moves else ""
+        share = self._at_border / self._in_all if self._in_all > 0 else 0.0
+        if share > _MUCH_AT_BORDER:
+            said += f"; {100 * share:.0f}% of the force lies at the border of that, what is beyond is lost"
+        return [said]
+
     def _say(
-        self, flow: NDArray[np.float32], confidence: NDArray[np.float32] | None, moved: Moved | None
+        self,
+        flow: NDArray[np.float32],
+        confidence: NDArray[np.float32] | None,
+        moved: Moved | None,
+        place: Point,
     ) -> ForceMap:
-        said = self._predictor(flow, self._tissue, self._scale, self._young_kpa, confidence, moved)
+        said = self._predictor(
+            flow, self._tissue, self._scale, self._young_kpa, confidence, moved, centre_px=place
+        )
         if said.young_known:
             return said
         part = assumed_young(None) / said.young_kpa

@@ -86,12 +86,19 @@ def total_force(density: NDArray[np.float32], kind: str, grid: Grid) -> NDArray[
 class View:
     """A still picture's geometry (tissue and scale), prepared once and used for each of its frames."""
 
-    def __init__(self, tissue: NDArray[np.bool_], scale_mm_per_px: float, grid: Grid) -> None:
+    def __init__(
+        self,
+        tissue: NDArray[np.bool_],
+        scale_mm_per_px: float,
+        grid: Grid,
+        centre_px: tuple[float, float] | None = None,
+    ) -> None:
+        """`centre_px`: (x, y) on which the grid is centred; None: the middle of the tissue."""
         if tissue.ndim != 2:
             raise UserError(f"tissue mask: expected (H, W), got {tissue.shape}")
         self.tissue = tissue.astype(bool)
         self.resample = Resampler(
-            (tissue.shape[0], tissue.shape[1]), scale_mm_per_px, centre(self.tissue), grid
+            (tissue.shape[0], tissue.shape[1]), scale_mm_per_px, centre_px or centre(self.tissue), grid
         )
         self.mask = (self.resample.cover(self.tissue) > 0.5).astype(np.float32)
 
@@ -126,16 +133,22 @@ class Predictor:
         """The same, of a store: what a real pipeline recovers if none is given."""
         return self.readable(source or ("motion" if self.card.settings.arch.depth else "recovered"))
 
-    def view(self, tissue: NDArray[np.bool_], scale_mm_per_px: float) -> View:
-        """Prepares a picture's geometry; the last one is kept."""
+    def view(
+        self,
+        tissue: NDArray[np.bool_],
+        scale_mm_per_px: float,
+        centre_px: tuple[float, float] | None = None,
+    ) -> View:
+        """Prepares a picture's geometry, as `View`; the last one is kept."""
         last = self._view
         if (
             last is None
+            or (centre_px or centre(last.tissue)) != last.resample.centre_px
             or last.resample.scale_mm_per_px != float(scale_mm_per_px)
             or last.tissue.shape != tissue.shape
             or not np.array_equal(last.tissue, tissue)
         ):
-            self._view = last = View(tissue, scale_mm_per_px, self.grid)
+            self._view = last = View(tissue, scale_mm_per_px, self.grid, centre_px)
         return last
 
     def __call__(
@@ -146,18 +159,21 @@ class Predictor:
         young_kpa: float | None = None,
         confidence: NDArray[np.float32] | None = None,
         moved: Moved | None = None,
+        *,
+        centre_px: tuple[float, float] | None = None,
     ) -> ForceMap:
         """Force map of one frame.
 
         `flow`: (H, W, 2) px, motion from the rest frame on the rest frame's pixels; `tissue`: (H, W) bool;
         `young_kpa`: None stands for the training data's typical value; `confidence`: (H, W) 0..1, used only
         by a model with that channel (1 if not given); `moved`: motion in three dimensions and its deviation,
-        which a model of two eyes is told instead of flow and confidence. Raises UserError for other shapes or
-        values that aren't finite, and where such a model is told of one eye alone.
+        which a model of two eyes is told instead of flow and confidence; `centre_px`: as of `View`. Raises
+        UserError for other shapes or values that aren't finite, and where such a model is told of one eye
+        alone.
         """
         if young_kpa is not None and not (np.isfinite(young_kpa) and young_kpa > 0):
             raise UserError(f"young_kpa {young_kpa}: must be positive")
-        view = self.view(tissue, scale_mm_per_px)
+        view = self.view(tissue, scale_mm_per_px, centre_px)
         displacement, sure = self.on_grid(view, flow, confidence, moved)
         young = young_kpa or self.card.typical_young_kpa
         known = None if sure is None else sure[None]

@@ -23,6 +23,9 @@ _LARGEST = 0.4  # of the tissue: proposals that take more are no instrument and 
 _UNEXPLAINED = 0.12  # local deviations by which a piece's residual exceeds that of what isn't proposed ...
 _TIMES = 1.7  # ... and as a factor
 _GAIN = 0.01  # local deviations by which masking lowers the residual around a piece
+_GAIN_OF_ALL = 0.0015  # the same around all highlights, where that changes the flow by
+_DIFFERENT_PX = 0.1  # as much: then so much around one of them is enough
+_GAIN_EACH = 0.006
 _RING_PX = 8
 _CELLS = 6  # a body is judged in parts of this share of the picture's longer side;
 _MOST = 0.7  # where more than this share of it is masked, all of it is,
@@ -30,6 +33,7 @@ _NEARLY_ALL = 0.9  # and where more than this of a kind is, with its specks, all
 _CAPPED = 1.5  # local deviations: one wrong pixel counts no more
 _SMALLEST = 20  # px: smaller pieces are not judged
 _JOINED_PX = 3  # highlights so near to each other are one piece
+_LEAST_BEYOND = 0.05  # share of the tissue away from proposals that is enough to judge by
 _AS_GOOD = 0.99  # share of the confidence without masks that has to be left, where both look
 _GROWN = 1.5  # the choice is made again when motion has grown by this factor,
 _STILL_PX = 0.5  # from this on,
@@ -127,11 +131,18 @@ class ChoosingTracker:
         self._verdict = np.zeros((2, *tissue.shape), np.int8)  # 1 masked, -1 not, 0 not known
         self._tested_px = 0.0
         self._frames = self._extra = 0
+        self._is_learning = True
+        self._proved = [False, False]  # highlights, tools
 
     @property
     def trusted(self) -> bool:
         """Whether the last frame could be followed."""
         return self.tracker.trusted
+
+    @property
+    def tested(self) -> bool:
+        """Whether masks have been chosen on some motion."""
+        return self._tested_px > 0
 
     @property
     def lost(self) -> str:
@@ -147,7 +158,7 @@ class ChoosingTracker:
         masked |= found.known
         new = bool(np.count_nonzero(found.either & ~known) > _NEW * np.count_nonzero(tissue))
         self._frames += 1
-        self.regained = False
+        self.regained, self._is_learning = False, True
         resets = tracker.resets
         flow, confidence = tracker.step(frame, masked)
         proposed = bool((found.either | self.rest_found.either).any())
@@ -161,16 +172,20 @@ class ChoosingTracker:
                 self.regained = doubted and tracker.trusted
         self.regained |= tracker.trusted and tracker.resets > resets
         self.blocked = masked
-        if tracker.trusted:
+        if tracker.trusted and self._is_learning:
             self._verdict = np.where(pieces.number > 0, np.where(masked, 1, -1), 0).astype(np.int8)
         return flow, confidence
 
     def _remembered(self, pieces: Pieces) -> tuple[Flags, Flags]:
-        """(H, W) what is masked as it was in the frame before, and which pieces have such a past."""
+        """(H, W) what is masked as it was in the frame before, and what has such a past, or is of a kind that
+        was right."""
         number = pieces.number.ravel()
         votes = np.bincount(number, self._verdict.ravel(), len(pieces.body))
         known = np.bincount(number, self._verdict.ravel() != 0, len(pieces.body))
         kept, old = votes > 0, known >= 0.5 * np.bincount(number, minlength=len(pieces.body))
+        for layer, proved in zip(pieces.number, self._proved, strict=True):
+            fresh = np.setdiff1d(layer, np.flatnonzero(old)) if proved else []
+            kept[fresh] = old[fresh] = True  # a tool that comes back is the tool it was
         kept[0] = old[0] = False
         return np.asarray(kept[pieces.number].any(0), bool), np.asarray(old[pieces.number].any(0), bool)
 
@@ -191,79 +206,155 @@ class ChoosingTracker:
         known: Flags,
     ) -> tuple[Solved, Flags]:
         """Tries all proposals and none, keeps those that earn it, and gives the answer and its masks."""
-        tracker = self.tracker
-        fixed = self.rest_found.known
-        bare = self._solve(frame, fixed, found.known, first, masked)
-        full = self._solve(frame, fixed | self.rest_found.either, found.known | found.either, first, masked)
-        rest, now = self._earned(frame, pieces, bare.flow, full.flow)
-        rest, now = rest | fixed, now | found.known
+        tracker, still = self.tracker, self.rest_found
+        tries = _Tries(self, frame, first, masked)
+        bare = tries.solve(still.known, found.known)
+        # Highlights by themselves, too: a tool that is none must not speak against them.
+        shine = tries.solve(still.known | still.glare, found.known | found.glare)
+        full = tries.solve(still.known | still.either, found.known | found.either)
+        rest, now = self._earned(frame, pieces, bare.flow, (shine.flow, full.flow))
+        rest, now = rest | still.known, now | found.known
         motion = _motion(bare.flow, tracker.tissue)
         if tracker.trusted and motion < self._tested_px:
             # What was found out at more motion stands: a highlight pulls at nothing while nothing moves.
             rest, now = self.rest_blocked, np.where(known, masked, now)
-        chosen = self._solve(frame, rest, now, first, masked)
-        if tracker.is_doubtful(chosen):
+        chosen = tries.solve(rest, now)
+        both_see = tracker.tissue & ~(now | rest)
+        # Next to a proposal the confidence speaks of the proposal, too.
+        beyond = both_see & ~_ring(found.either | still.either)
+        if np.count_nonzero(beyond) < _LEAST_BEYOND * np.count_nonzero(tracker.tissue):
+            beyond = both_see
+        if tracker.is_doubtful(chosen) and not (chosen.is_matched and self._is_better(chosen, bare, beyond)):
             # Nothing is learned from a frame that can't be followed; its answer is what fits best where all
             # of them look: without masks, a still highlight would vouch for stillness.
-            common = tracker.usable & ~(masked | now | rest)
-            tries = [(first, masked), (chosen, now), (bare, found.known)]
-            judged = [tracker.judge(one.flow, one.confidence, common) for one, _ in tries]
-            best = max(range(len(tries)), key=lambda k: judged[k].level)
-            return (judged[best], tries[best][1]) if best else (first, masked)
-        both_see = tracker.tissue & ~(now | rest)
-        levels = [tracker.judge(one.flow, one.confidence, both_see).level for one in (chosen, bare)]
-        if levels[0] < _AS_GOOD * levels[1]:
-            rest, now, chosen = fixed, found.known, bare
+            common = beyond & tracker.usable & ~masked
+            self._is_learning = False
+            answers = [(first, masked), (chosen, now), (bare, found.known)]
+            judged = [tracker.judge(one.flow, one.confidence, common) for one, _ in answers]
+            best = max(range(len(answers)), key=lambda k: judged[k].level)
+            return (judged[best], answers[best][1]) if best else (first, masked)
+        if all(self._is_better(bare, chosen, where, 1 / _AS_GOOD) for where in (both_see, beyond)):
+            rest, now, chosen = still.known, found.known, bare
+        if motion >= self._tested_px:
+            shares = [now[layer > 0].mean() if layer.any() else 0.0 for layer in pieces.number]
+            self._proved = [bool(share > _NEARLY_ALL) for share in shares]
         self._tested_px = max(motion, self._tested_px)
         self.rest_blocked = rest
         tracker.usable = tracker.tissue & ~rest
         return chosen, now
 
-    def _solve(self, frame: Rgb, rest: Flags, now: Flags, first: Solved, masked: Flags) -> Solved:
-        if np.array_equal(rest, self.rest_blocked) and np.array_equal(now, masked):
-            return first
+    def _is_better(self, one: Solved, other: Solved, where: Flags, by: float = 1.0) -> bool:
+        """Whether an answer has more than `by` times the other's confidence, (H, W) where."""
+        levels = [self.tracker.judge(each.flow, each.confidence, where).level for each in (one, other)]
+        return levels[0] > by * levels[1]
+
+    def solve(self, frame: Rgb, rest: Flags, now: Flags, initial: Flow | None) -> Solved:
+        """A frame's answer with other masks, (H, W) of the rest frame and of it; it is counted."""
         before, self.tracker.usable = self.tracker.usable, self.tracker.tissue & ~rest
-        warm = first.flow if self.tracker.trusted and self._tested_px > 0 else None
         try:
-            self._extra += 1 if warm is not None else 2
-            return self.tracker.solve(frame, now, warm)
+            self._extra += 1 if initial is not None else 2
+            return self.tracker.solve(frame, now, initial)
         finally:
             self.tracker.usable = before
 
-    def _earned(self, frame: Rgb, pieces: Pieces, bare: Flow, full: Flow) -> tuple[Flags, Flags]:
-        """(H, W) what is masked in the rest frame and in this one."""
-        now = _normalised(frame)
-        residual, residual_full = (_residual(self._rest_picture, now, flow) for flow in (bare, full))
-        moved = [np.stack([_at_rest(layer, flow) for layer in pieces.number]) for flow in (bare, full)]
-        # What is known to be no tissue is counted nowhere.
-        inside = self.tracker.tissue & ~self.rest_found.known & _stays(bare) & _stays(full)
-        common = inside & ~((self._rest_pieces.number > 0) | (moved[0] > 0) | (moved[1] > 0)).any(0)
-        usual = float(residual[common].mean()) if common.any() else float(np.median(residual))
-        gain = np.where(common, residual - residual_full, 0)
+    def _earned(
+        self, frame: Rgb, pieces: Pieces, bare: Flow, without: tuple[Flow, Flow]
+    ) -> tuple[Flags, Flags]:
+        """(H, W) what is masked in the rest frame and in this one.
 
-        def earning(where: NDArray[np.int32], judged: Pieces, beside: bool) -> NDArray[np.bool_]:
-            """By number; beside: judged against what lies around a piece, not against all tissue."""
-            kept = np.zeros(len(judged.body), bool)
-            for number in np.flatnonzero(np.bincount(where.ravel()) >= _SMALLEST):
-                piece = (where == number).any(0) & inside
-                if not number or np.count_nonzero(piece) < _SMALLEST:
-                    continue
-                ring = _ring(piece) & common
-                enough = np.count_nonzero(ring) >= _SMALLEST
-                around = float(residual[ring].mean()) if beside and enough else usual
-                kept[number] = float(residual[piece].mean()) > max(
-                    around + _UNEXPLAINED, _TIMES * around
-                ) or (enough and float(gain[ring].mean()) > _GAIN)
-            return judged.whole(kept)
-
-        # What something covers now is no worse at rest: there the neighbours are as little explained.
-        still = self._rest_pieces
-        kept_rest, kept = earning(still.number, still, True), earning(moved[0], pieces, False)
+        `without`: the flow with all highlights masked, and that with all tools masked too.
+        """
+        now, still = _normalised(frame), self._rest_pieces
+        residual = before = _residual(self._rest_picture, now, bare)
+        kept_rest, kept = (np.zeros(len(each.body), bool) for each in (still, pieces))
+        flow_before = bare
+        for kind, flow in enumerate(without):
+            moved = [np.stack([_at_rest(layer, f) for layer in pieces.number]) for f in (bare, flow)]
+            # What is known to be no tissue is counted nowhere.
+            inside = self.tracker.tissue & ~self.rest_found.known & _stays(bare) & _stays(flow)
+            common = inside & ~((still.number > 0) | (moved[0] > 0) | (moved[1] > 0)).any(0)
+            after = _residual(self._rest_picture, now, flow)
+            seen = _Evidence(residual, before - after, inside, common)
+            least = _GAIN
+            if kind == 0 and seen.together((still.number[0] > 0) | (moved[0][0] > 0), flow_before - flow):
+                least = _GAIN_EACH  # highlights have one cause
+            # What something covers now is no worse at rest: there the neighbours are as little explained.
+            kept_rest |= seen.earning(still.number[kind], len(still.body), least, beside=True)
+            kept |= seen.earning(moved[0][kind], len(pieces.body), least, beside=False)
+            before, flow_before = after, flow
+        kept_rest, kept = still.whole(kept_rest), pieces.whole(kept)
         for before, after in zip(still.number, pieces.number, strict=True):
-            shown = after[after > 0]
-            if len(shown) and kept[shown].mean() > _NEARLY_ALL:
-                kept_rest[before[before > 0]] = True  # the kind has proved right
+            # A kind that has proved right in one picture is right in the other.
+            at_rest, later = (k[n[n > 0]] for k, n in ((kept_rest, before), (kept, after)))
+            if any(len(shown) and shown.mean() > _NEARLY_ALL for shown in (at_rest, later)):
+                kept_rest[before[before > 0]] = kept[after[after > 0]] = True
         return np.asarray(kept_rest[still.number].any(0), bool), np.asarray(kept[pieces.number].any(0), bool)
+
+
+class _Tries:
+    """Answers for one frame with one mask and another, each solved once."""
+
+    def __init__(self, tracker: ChoosingTracker, frame: Rgb, first: Solved, masked: Flags) -> None:
+        """`first`: the answer with what is masked, (H, W), so far."""
+        self._tracker, self._frame = tracker, frame
+        is_warm = tracker.trusted and tracker.tested
+        self._initial = first.flow if is_warm else None
+        self._solved = [(tracker.rest_blocked, masked, first)]
+
+    def solve(self, rest: Flags, now: Flags) -> Solved:
+        """With those masks, (H, W) of the rest frame and of this one."""
+        for one, other, solved in self._solved:
+            if np.array_equal(one, rest) and np.array_equal(other, now):
+                return solved
+        self._solved.append((rest, now, self._tracker.solve(self._frame, rest, now, self._initial)))
+        return self._solved[-1][2]
+
+
+@dataclass(frozen=True, eq=False)
+class _Evidence:
+    """What two flows, without masks and with, leave unexplained of a frame, (H, W) each."""
+
+    residual: Map
+    """Of the flow without masks [local deviations]."""
+    gain: Map
+    """By how much masking lowers it."""
+    inside: Flags
+    """What is tissue and in the picture."""
+    common: Flags
+    """What of that is proposed by nothing."""
+
+    def earning(
+        self, where: NDArray[np.int32], numbers: int, least: float, beside: bool
+    ) -> NDArray[np.bool_]:
+        """(numbers,) which pieces earn being masked.
+
+        Args:
+            where: (H, W), the pieces' numbers.
+            numbers: how many there are.
+            least: gain around a piece that is enough [local deviations].
+            beside: judged against what lies around a piece, not against all tissue.
+        """
+        kept = np.zeros(numbers, bool)
+        usual = self.residual[self.common] if self.common.any() else np.median(self.residual)
+        for number in np.flatnonzero(np.bincount(where.ravel()) >= _SMALLEST):
+            piece = (where == number) & self.inside
+            if not number or np.count_nonzero(piece) < _SMALLEST:
+                continue
+            ring = _ring(piece) & self.common
+            enough = np.count_nonzero(ring) >= _SMALLEST
+            around = float(np.mean(self.residual[ring] if beside and enough else usual))
+            kept[number] = float(self.residual[piece].mean()) > max(
+                around + _UNEXPLAINED, _TIMES * around
+            ) or (enough and float(self.gain[ring].mean()) > least)
+        return kept
+
+    def together(self, where: Flags, change: Flow) -> bool:
+        """Whether masking all of it, (H, W), explains more around it; change: of the flow, (H, W, 2) px."""
+        ring = _ring(where) & self.common
+        if np.count_nonzero(ring) < _SMALLEST:
+            return False
+        differs = float(np.linalg.norm(change[ring], axis=-1).mean())
+        return float(self.gain[ring].mean()) > _GAIN_OF_ALL and differs > _DIFFERENT_PX
 
 
 def _ring(piece: Flags) -> Flags:

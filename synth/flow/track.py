@@ -44,6 +44,11 @@ class Solved:
     seen: float
     """Share of the tissue that is not masked."""
 
+    @property
+    def is_matched(self) -> bool:
+        """Whether enough of what is seen is found again."""
+        return self.matched >= _MATCHED
+
 
 class Tracker:
     """Frames in, displacement from the rest frame out, one at a time, for streams as for recordings.
@@ -131,7 +136,7 @@ class Tracker:
         self.lost = ""
         if found.seen < _LEAST:
             self.lost = f"masks leave {100 * found.seen:.2g}% of the tissue"
-        elif found.matched < _MATCHED:
+        elif not found.is_matched:
             self.lost = f"only {100 * found.matched:.0f}% of what is seen matches the rest frame"
         self.trusted = not self.lost
         confidence = found.confidence

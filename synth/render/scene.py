@@ -27,7 +27,7 @@ Floats = npt.NDArray[np.float64]
 Map = npt.NDArray[np.float32]
 Mask = npt.NDArray[np.bool_]
 
-_RIM_ROUGHNESS, _RIM_DRY = 0.05, 0.25
+_RIM_ROUGHNESS, _RIM_DRY = 0.09, 0.35
 _VOLUME = "volume128"
 _AMBIENT = 0.05  # of the lamps' light comes from everywhere
 _GLARE = 0.35  # specular radiance, as a share of full scale, that hides what is under it
@@ -250,7 +250,8 @@ class Studio:
             if tool:
                 self._stage.move("tool", tool.vertices)
                 self._stage.mirror("tool", self._mirrored(tool.vertices))
-        return self._stage.render(seed % 2**32, camera)
+        spot = light.spot(camera, self.camera, self._look.light)
+        return self._stage.render(seed % 2**32, camera) * spot[..., None]
 
     def bodies(self, vertices: Floats, tool: Floats) -> dict[str, Body]:
         """Everything in the scene with its material; vertices (V, 3) and (T, 3) mm as given."""
@@ -293,7 +294,8 @@ class Studio:
         uv = truth.blend(faces, face, bary, self.surface.uv)
         albedo = noise.sample(self._coat.albedo, uv - 0.5, 1.0)
         light_in = truth.blend(faces, face, bary, moment.power * self._irradiance(moment.vertices))
-        diffuse = (albedo * light_in).mean(axis=1)
+        spot = light.spot(moment.camera or self.camera, self.camera, self._look.light).ravel()[on]
+        diffuse = spot * (albedo * light_in).mean(axis=1)
         excess = radiance.reshape(-1, 3)[on].mean(axis=1) - 1.05 * diffuse
         glare = np.zeros(height * width, bool)
         glare[on] = excess * self._look.sensor.exposure > _GLARE

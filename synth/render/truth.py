@@ -261,6 +261,8 @@ def _cast_loop(points, flat, faces, directions, order, start, width, height):  #
         # Written so that a corner behind the lens (NaN) drops the face.
         if not (right >= 0 and bottom >= 0 and left <= width - 1 and top <= height - 1):
             continue
+        if np.isnan(flat[a, 0] + flat[b, 0] + flat[c, 0]):  # min and max pass over some
+            continue
         x0, x1 = int(max(np.ceil(left), 0)), int(min(np.floor(right), width - 1))
         y0, y1 = int(max(np.ceil(top), 0)), int(min(np.floor(bottom), height - 1))
         a0, a1, a2 = points[a]

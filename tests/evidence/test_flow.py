@@ -183,6 +183,11 @@ def test_live_runs_on_a_video_and_refuses_what_is_none(tmp_path: Path) -> None:
     ran = CliRunner().invoke(app, ["live", str(path), "--flow", "dis", "--every", "--json"])
     assert ran.exit_code == 0, ran.output
     assert json.loads(ran.output)["frames"] == 2
+    assert json.loads(ran.output)["untrusted"] == 0
+    (tmp_path / "drawn").mkdir()
+    cv2.imwrite(str(tmp_path / "drawn" / "mask.png"), np.full((64, 64), 255, np.uint8))
+    covered = ["live", str(path), "--flow", "dis", "--every", "--masks", str(tmp_path / "drawn"), "--json"]
+    assert json.loads(CliRunner().invoke(app, covered).output)["untrusted"] == 2
     (tmp_path / "no.mp4").write_text("no video")
     with pytest.raises(UserError):
         live.watch_video(Footage(read_video(tmp_path / "no.mp4"), "no"))

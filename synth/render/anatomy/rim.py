@@ -21,7 +21,7 @@ Map = npt.NDArray[np.float32]
 _AROUND, _OUT, _INNER = 320, 42, 6  # at most: points around, rings outwards, rings of the cut edge
 _SEGMENT_PX = 4.0  # points around are no nearer than this in the picture: the mesh is built anew every frame
 _WIDTH_MM = 26.0  # beyond the opening; the picture ends before
-_LIP_MM = 0.4  # how far the cut edge leans over the brain
+_LIP_MM = 0.3  # how far the cut edge reaches over the brain
 _LAID_MM = (-3.0, -1.5, -1.2, -0.95, -0.7, -0.3)
 _PATTY_MM = 0.55  # thickness of a cotton patty
 
@@ -66,10 +66,10 @@ def build(surface: Surface, radius_mm: float, look: Look, mm_per_px: float) -> R
     angle = np.linspace(0, 2 * np.pi, around, endpoint=False)
     edge = radius_mm * _outline(rng, angle)
     out = _WIDTH_MM * np.linspace(0, 1, rings) ** 1.6
-    # From below the brain's surface up to the lip that leans over it, round that, and away.
-    away = np.concatenate([[0.1, 0.0, -0.7 * _LIP_MM, -_LIP_MM, -0.8 * _LIP_MM, -0.3 * _LIP_MM], out + 0.12])
+    # The cut edge rises out of the brain's surface towards the lens, rounds, and goes on outwards.
+    away = np.concatenate([-_LIP_MM * np.array([1.0, 0.97, 0.88, 0.7, 0.4, 0.1]), out + 0.12])
     up = np.concatenate(
-        [[-1.8, -0.5, -0.15, -0.02, 0.2, 0.4], 0.5 + 1.5 * (1 - np.exp(-out / 3.5)) + 0.05 * out]
+        [[-1.8, -0.1, 0.12, 0.27, 0.39, 0.46], 0.5 + 1.5 * (1 - np.exp(-out / 3.5)) + 0.05 * out]
     )
     radius = edge[:, None] + away[None]
     xy = np.stack([radius * np.cos(angle)[:, None], radius * np.sin(angle)[:, None]], axis=-1)
@@ -123,8 +123,8 @@ def paint(rim: Rim, look: Look, pixels: int) -> Coat:
     # The lip is thin and pale; under it the light is lost.
     lip = np.exp(-(((away + 0.1) / 0.35) ** 2))[..., None]
     under = np.clip(-away - 0.9, 0, 1)[..., None]
-    colour = colour * (1 + 0.12 * lip) * np.exp(-under * np.array([0.8, 2.0, 2.2], np.float32))
-    bumps = 0.035 * mid + 0.004 * fine + 0.02 * noise.band(rng, pixels, extent, 1.4, 0.5)
+    colour = colour * (1 + 0.12 * lip) * np.exp(-under * np.array([0.35, 0.9, 1.0], np.float32))
+    bumps = 0.035 * mid + 0.006 * noise.band(rng, pixels, extent, 1.4, 0.5)
     if rim.patty:
         colour, bumps = _cotton(rng, rim.patty, colour, bumps, x, y, look.blood)
     colour = np.clip(colour, 0.006, 0.92).astype(np.float32)
@@ -132,7 +132,7 @@ def paint(rim: Rim, look: Look, pixels: int) -> Coat:
         np.clip(0.55 + 0.3 * wide - 0.8 * blood, 0.02, 1), (256, 256), interpolation=cv2.INTER_AREA
     )
     return Coat(
-        colour, normals(noise.blur(bumps.astype(np.float32), 0.08, extent), extent), dry.astype(np.float32)
+        colour, normals(noise.blur(bumps.astype(np.float32), 0.2, extent), extent), dry.astype(np.float32)
     )
 
 
@@ -141,7 +141,7 @@ def shade(rim: Rim, extent_mm: float) -> Map:
     axis = noise.centres(512, extent_mm)
     x, y = np.meshgrid(axis, axis)
     inside = np.maximum(_edge_at(rim, np.arctan2(y, x)) - _LIP_MM - np.hypot(x, y), 0)
-    return np.asarray(1 - 0.45 * np.exp(-inside / 0.45) - 0.12 * np.exp(-inside / 2.0), np.float32)
+    return np.asarray(1 - 0.35 * np.exp(-inside / 0.6) - 0.14 * np.exp(-inside / 2.0), np.float32)
 
 
 def _polar(rim: Rim, pixels: int) -> tuple[Map, Map, Map, Map]:

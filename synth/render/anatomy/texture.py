@@ -63,7 +63,7 @@ def cortex(surface: Surface, look: Look, pixels: int, photo: Path | None, shade:
     rng = np.random.default_rng([surface.seed, 2])
     tubes = {
         name: tube.raster(getattr(surface.vessels, name), pixels, extent)
-        for name in ("veins", "arteries", "capillaries")
+        for name in ("veins", "arteries", "deep")
     }
     sulci = cv2.resize(surface.sulci, (pixels, pixels), interpolation=cv2.INTER_LINEAR)
     albedo = _photograph(photo, pixels) if photo else _painted(rng, look, sulci, tubes, pixels, extent)
@@ -111,28 +111,32 @@ def _painted(
     beside = noise.blur(arterial, 0.7, extent) + noise.blur(thickness(tubes["veins"]), 1.1, extent)
     blush = look.blush * (0.04 + 0.3 * sulci) + (0.25 + 0.9 * sulci) * beside
     blush = blush * np.clip(1 + 0.3 * cv2.resize(mottle, (pixels, pixels)), 0.2, 2)
+    # What runs deeper is a broad, pale shadow of blood.
+    blush = blush + look.capillary * noise.blur(thickness(tubes["deep"]), 0.16, extent)
     albedo = albedo * np.exp(-blush[..., None] * np.array([0.16, 1.0, 1.0], np.float32))
-    albedo = albedo * (1 - look.shade * sulci[..., None] * np.array([0.35, 0.5, 0.42], np.float32))
-    albedo = _arterial(albedo, tubes, look, cv2.resize(wide, (pixels, pixels)))
+    # Fluid stands in the clefts, and little light comes back out of them.
+    cleft = look.shade * (0.7 * sulci + 1.8 * np.clip(sulci - 0.5, 0, 1))
+    albedo = albedo * np.exp(-cleft[..., None] * np.array([0.5, 0.75, 0.62], np.float32))
     albedo = _veined(rng, albedo, tubes["veins"], look, extent)
+    albedo = _arterial(albedo, tubes["arteries"], look, cv2.resize(wide, (pixels, pixels)))
     # Light that enters tissue leaves it nearby, red farthest: a blur stands in for the volume.
     for channel, width in enumerate((0.055, 0.032, 0.026)):
         albedo[..., channel] = noise.blur(np.ascontiguousarray(albedo[..., channel]), width, extent)
     return np.asarray(np.clip(albedo, 0.01, 0.95), np.float32)
 
 
-def _arterial(albedo: Map, tubes: dict[str, tuple[Map, Map]], look: Look, wide: Map) -> Map:
-    arterial = thickness(tubes["arteries"])
+def _arterial(albedo: Map, tube: tuple[Map, Map], look: Look, wide: Map) -> Map:
+    distance, radius = tube
+    arterial = thickness(tube)
     # Even the finest stop much of the green: blood is nearly opaque to it within a tenth of a millimetre.
     reach = 0.30 * (1 - np.exp(-arterial / 0.16)) + 0.08 * arterial
-    blood = look.arterial * reach + look.capillary * 0.9 * thickness(tubes["capillaries"])
     fade = np.clip(0.95 + 0.25 * wide, 0.4, 1.2)
-    red = albedo * np.exp(-(blood * fade)[..., None] * _ARTERIAL)
-    # The wall of a wide one scatters a little light of its own along its crest.
-    distance, radius = tubes["arteries"]
-    crest = np.exp(-((distance / np.maximum(0.55 * radius, 1e-3)) ** 2)) * np.clip((radius - 0.2) / 0.2, 0, 1)
-    wall = np.array([0.62, 0.16, 0.14], np.float32)
-    return np.asarray(red + (0.4 * crest)[..., None] * (wall - red), np.float32)
+    red = albedo * np.exp(-(look.arterial * reach * fade)[..., None] * _ARTERIAL)
+    # A wide one hides what is under it: its wall scatters light of its own, most along the crest.
+    thick = np.clip((radius - 0.1) / 0.2, 0, 1) * (distance < radius)
+    crest = np.exp(-((distance / np.maximum(0.7 * radius, 1e-3)) ** 2))
+    wall = np.array([0.56, 0.105, 0.075], np.float32) * (0.72 + 0.38 * crest)[..., None]
+    return np.asarray(red + (0.75 * thick)[..., None] * (wall - red), np.float32)
 
 
 def _veined(rng: np.random.Generator, albedo: Map, tube: tuple[Map, Map], look: Look, extent: float) -> Map:
@@ -174,18 +178,16 @@ def _film(
     def fine(image: Map) -> Map:
         return np.asarray(cv2.resize(image, (pixels, pixels), interpolation=cv2.INTER_CUBIC), np.float32)
 
-    relief = 0.2 * thickness(tubes["arteries"]) + 0.15 * thickness(tubes["capillaries"])
-    relief = noise.blur(relief, look.film_mm, extent)
+    relief = noise.blur(0.22 * thickness(tubes["arteries"]), look.film_mm, extent)
     pools = noise.fractal(rng, coarse, extent, 5.0, 1.5)
-    dry = np.clip(0.35 + 0.45 * pools - 0.5 * cv2.resize(sulci, (coarse, coarse)), 0.05, 1.0)
-    swell = fine(noise.band(rng, coarse, extent, 2.4, 0.5) * 0.0065)
-    rough = fine(noise.band(rng, coarse, extent, 0.6, 0.5) * 0.0050)
-    # The mesh of fibres round a vein makes a string of sparks of its crest's highlight.
+    dry = np.clip(0.5 + 0.45 * pools - 0.5 * cv2.resize(sulci, (coarse, coarse)), 0.05, 1.0)
+    swell = fine(noise.band(rng, coarse, extent, 2.2, 0.5) * 0.011)
+    rough = fine(noise.band(rng, coarse, extent, 0.6, 0.5) * 0.0014)
+    # The wall of a vein is taut and smooth: its crest mirrors the lamp in one line.
     distance, radius = tubes["veins"]
     on_vein = noise.blur((distance < radius).astype(np.float32), 0.1, extent)
-    strings = noise.band(rng, pixels, extent, 0.34, 0.4) * 0.0042
-    height = relief + look.bump * (swell + fine(dry) * rough * (1 - on_vein) + strings * on_vein)
-    bare = np.maximum(dry, 0.5 * cv2.resize(on_vein, (coarse, coarse), interpolation=cv2.INTER_AREA))
+    height = relief + look.bump * (1 - 0.9 * on_vein) * (swell + fine(dry) * rough)
+    bare = dry * (1 - cv2.resize(on_vein, (coarse, coarse), interpolation=cv2.INTER_AREA))
     return np.asarray(height, np.float32), np.asarray(np.clip(bare, 0, 1), np.float32)
 
 

@@ -26,7 +26,9 @@ def raster(tree: Tree, pixels: int, extent_mm: float) -> tuple[Map, Map]:
     which = np.repeat(np.arange(len(child)), count)
     step = (np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)) / (count[which] - 1)
     points = start[which] + step[:, None] * (end - start)[which]
-    radii = tree.radius[tree.parent[child]][which] * (1 - step) + tree.radius[child][which] * step
+    # A twig is no wider where it leaves its trunk than further on.
+    first = np.minimum(tree.radius[tree.parent[child]], 1.3 * tree.radius[child])
+    radii = first[which] * (1 - step) + tree.radius[child][which] * step
     pixel = np.floor((points / extent_mm + 0.5) * pixels).astype(np.int64)
     inside = ((pixel >= 0) & (pixel < pixels)).all(axis=1)
     pixel, radii = pixel[inside], radii[inside].astype(np.float32)

@@ -13,6 +13,7 @@ from fake_recording import Bump, Maker
 from bench.recording.check import check_recording
 from bench.recording.folder import open_recording
 from bench.tracking.tracking import picture_masks, track_recording
+from learn.inference.mask_files import read_choice
 from learn.inference.video_flow import Settings
 from synth.errors import UserError
 
@@ -40,12 +41,16 @@ def test_masks_of_another_folder_take_the_place_of_the_recordings_own(tmp_path: 
     folder = Maker(tmp_path)(frames=4)
     _write(folder / "mask.png", 10)
     _write(tmp_path / "drawn" / "mask.png", 50)
-    found = open_recording(folder).with_masks(tmp_path / "drawn").tool(3, _SIZE)
+    kind, files = read_choice(str(tmp_path / "drawn"))
+    assert kind == "auto"
+    assert files is not None
+    found = open_recording(folder).with_masks(files).tool(3, _SIZE)
     assert found is not None
     assert found[0].sum() == 50
     (tmp_path / "empty").mkdir()
     with pytest.raises(UserError, match=r"mask\.png"):
-        open_recording(folder).with_masks(tmp_path / "empty")
+        read_choice(str(tmp_path / "empty"))
+    assert read_choice("glare") == ("glare", None)
 
 
 def test_only_the_region_is_tissue(tmp_path: Path) -> None:

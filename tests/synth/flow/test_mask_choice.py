@@ -74,6 +74,37 @@ def test_highlights_that_stay_while_the_tissue_moves_are_masked_and_help() -> No
     assert errors["chosen"] < 0.7 * errors["none"]
 
 
+def _faint(by_px: float, noise: int) -> NDArray[np.float64]:
+    """Texture so faint that still highlights, and the camera's own noise, speak louder."""
+    grain = np.random.default_rng(noise).normal(0, 4, (_SIZE, _SIZE))
+    return 120 + 0.2 * (_moved(by_px) - 120) + grain
+
+
+def test_highlights_over_faint_texture_do_not_vouch_for_stillness() -> None:
+    spots = gaussian_filter(np.random.default_rng(1).standard_normal((_SIZE, _SIZE)), 3)
+    wet = spots > np.quantile(spots, 0.85)
+    found = Proposal(wet, _NOTHING, _NOTHING)
+    errors = {}
+    for name, given in (("chosen", found), ("none", Proposal(_NOTHING, _NOTHING, _NOTHING))):
+        tracker = _tracker(_picture(np.where(wet, 250.0, _faint(0.0, 2))), given)
+        for k, by_px in enumerate((1.5, 3.0, 3.0)):
+            flow, _ = tracker.step(_picture(np.where(wet, 250.0, _faint(by_px, 3 + k))), given)
+        errors[name] = float(np.abs(flow - [3.0, 0.0])[8:-8, 8:-8].mean())
+    assert errors["chosen"] < 0.4 * errors["none"]
+
+
+def test_tool_that_comes_back_is_masked_at_once() -> None:
+    tracker = _tracker(_picture(_texture()), Proposal(_NOTHING, _NOTHING, _NOTHING))
+    there, away = Proposal(_NOTHING, _MIDDLE, _NOTHING), Proposal(_NOTHING, _NOTHING, _NOTHING)
+    for by_px, found in ((3.0, there), (0.0, away)):
+        grey = np.where(_MIDDLE & found.tool, 60.0, _moved(by_px))
+        tracker.step(_picture(grey), found)
+    solved = tracker._extra
+    tracker.step(_picture(np.where(_MIDDLE, 60.0, _moved(1.0))), there)
+    assert tracker.blocked[36:60, 36:60].mean() > 0.9
+    assert tracker._extra == solved, "it was found out before"
+
+
 def test_what_is_known_to_be_a_tool_is_masked_without_being_asked() -> None:
     known = Proposal(_NOTHING, _NOTHING, _MIDDLE)
     tracker = _tracker(_picture(_texture()), known)

@@ -1,0 +1,86 @@
+"""Where the network's grid lies on a picture that is wider than it: on what moves."""
+
+from __future__ import annotations
+
+import math
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from learn.data.grid import Grid, centre
+from synth.flow.confidence import DOUBTFUL
+
+Point = tuple[float, float]
+"""(x, y) px."""
+
+_CUT_OFF = 0.005  # share of the tissue beyond the grid that doesn't count
+_STILL_PX = 0.5  # motion that says where something happens
+_COARSE = 8  # the place is looked for on a map this much coarser
+_STRAYED = 0.25  # of the grid's width: nearer than that to its centre, motion doesn't move the grid
+_RIM = 16  # the border is this part of the grid's width
+
+
+class Placing:
+    """Places the grid frame by frame; it stays as long as what moves is in its middle."""
+
+    def __init__(self, tissue: NDArray[np.bool_], scale_mm_per_px: float, grid: Grid) -> None:
+        """`tissue`: (H, W). UserError if it is empty."""
+        self.centre_px = centre(tissue)
+        """Where the grid's centre lies now."""
+        self.moves = 0
+        """How often it was moved."""
+        rows, columns = np.nonzero(tissue)
+        self._half = 0.5 * grid.extent_mm / scale_mm_per_px
+        away = np.maximum(abs(columns - self.centre_px[0]), abs(rows - self.centre_px[1]))
+        self.fits = float(np.mean(away > self._half + 0.5)) <= _CUT_OFF
+        """Whether the grid covers all of the tissue, so that it needn't be placed."""
+        self._tissue = tissue
+        self._ends = [(float(axis.min()), float(axis.max())) for axis in (columns, rows)]
+
+    def place(self, flow: NDArray[np.float32], confidence: NDArray[np.float32] | None) -> Point:
+        """The grid's centre for a frame.
+
+        Args:
+            flow: (H, W, 2) px.
+            confidence: (H, W) in 0..1: motion is looked for where no pixel is lost; None: everywhere.
+        """
+        if self.fits:
+            return self.centre_px
+        sure = self._tissue if confidence is None else self._tissue & (confidence >= DOUBTFUL)
+        power = np.square(flow.astype(np.float32)).sum(-1) * sure
+        if float(np.quantile(power[self._tissue][::7], 0.98)) < _STILL_PX**2:
+            return self.centre_px
+        found = self._within(self._strongest(power))
+        if max(abs(a - b) for a, b in zip(found, self.centre_px, strict=True)) > _STRAYED * 2 * self._half:
+            self.centre_px, self.moves = found, self.moves + 1
+        return self.centre_px
+
+    def _strongest(self, power: NDArray[np.float32]) -> Point:
+        """About which point most of the motion lies; of two places the stronger, not their middle."""
+        height, width = power.shape
+        size = (max(1, width // _COARSE), max(1, height // _COARSE))
+        small = cv2.resize(power, size, interpolation=cv2.INTER_AREA)
+        step = width / size[0], height / size[1]
+        near = cv2.GaussianBlur(small, (0, 0), max(0.5 * self._half / step[0], 0.5), borderType=0)
+        row, column = np.unravel_index(int(near.argmax()), near.shape)
+        return (float(column) + 0.5) * step[0] - 0.5, (float(row) + 0.5) * step[1] - 0.5
+
+    def _within(self, point: Point) -> Point:
+        """The nearest centre whose grid doesn't reach beyond the tissue more than it must."""
+        placed = []
+        for value, (low, high) in zip(point, self._ends, strict=True):
+            low, high = low + self._half, high - self._half
+            placed.append(min(max(value, low), high) if low < high else (low + high) / 2)
+        return placed[0], placed[1]
+
+
+def share_at_border(density: NDArray[np.float32], mask: NDArray[np.float32]) -> float:
+    """Share of the force that lies at the grid's own border; NaN where there is none.
+
+    `density`: (N, N) lengths; `mask`: (N, N) where there is tissue.
+    """
+    rim = max(1, len(mask) // _RIM)
+    weight = density * (mask > 0)
+    whole = float(weight.sum())
+    return 1 - float(weight[rim:-rim, rim:-rim].sum()) / whole if whole > 0 else math.nan

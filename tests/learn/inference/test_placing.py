@@ -1,0 +1,78 @@
+"""Where the grid lies on a picture that is wider than it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fake_model import write_model
+from numpy.typing import NDArray
+
+from learn.data.grid import Grid
+from learn.inference.force_reader import ForceReader
+from learn.inference.placing import Placing, share_at_border
+from learn.inference.predict import load_predictor
+
+_WIDE = np.ones((240, 480), bool)  # 48 x 96 mm
+_MM_PER_PX = 0.2
+_GRID = Grid(32, 36.0)
+
+
+def _bump(x: float, y: float, height: float = 4.0) -> NDArray[np.float32]:
+    rows, columns = np.mgrid[: _WIDE.shape[0], : _WIDE.shape[1]]
+    near = np.exp(-((columns - x) ** 2 + (rows - y) ** 2) / (2 * 15.0**2))
+    return np.stack([height * near, 0.5 * height * near], -1).astype(np.float32)
+
+
+def test_grid_that_covers_the_tissue_stays_in_its_middle() -> None:
+    small = np.zeros_like(_WIDE)
+    small[40:200, 60:220] = True
+    placing = Placing(small, _MM_PER_PX, _GRID)
+    assert placing.fits
+    assert placing.place(_bump(70, 50), None) == pytest.approx((139.5, 119.5))
+
+
+def test_grid_goes_to_what_moves_and_not_beyond_the_tissue() -> None:
+    placing = Placing(_WIDE, _MM_PER_PX, _GRID)
+    assert placing.place(_bump(400, 120, 0.1), None) == pytest.approx((239.5, 119.5)), "nothing moves yet"
+    assert placing.place(_bump(360, 120), None) == pytest.approx((360, 119.5), abs=8)
+    assert placing.place(_bump(375, 120), None)[0] == pytest.approx(360, abs=8), "that is near enough"
+    assert placing.place(_bump(30, 120), None) == pytest.approx((90, 119.5), abs=5)
+    assert placing.moves == 2
+
+
+def test_of_two_places_the_stronger_and_none_that_is_lost() -> None:
+    placing = Placing(_WIDE, _MM_PER_PX, _GRID)
+    both = _bump(100, 120, 5.0) + _bump(380, 120, 3.0)
+    sure = np.ones(_WIDE.shape, np.float32)
+    sure[:, :240] = 0.1
+    assert placing.place(both, sure)[0] == pytest.approx(380, abs=10)
+    assert placing.place(both, None)[0] == pytest.approx(100, abs=10)
+
+
+def test_force_is_that_of_the_part_that_moves(tmp_path: Path) -> None:
+    """The same contact, far off the middle of a wide picture and alone on a picture as wide as the grid."""
+    predictor = load_predictor(write_model(tmp_path / "model", "arch.output=vector"))
+    reader = ForceReader(predictor, _WIDE, _MM_PER_PX, 1.0)
+    moved = _bump(370, 120)
+    force, said = reader.read(moved, None)
+    x, y = (round(2 * value) / 2 for value in reader.placing.centre_px)
+    half = round(predictor.grid.extent_mm / _MM_PER_PX / 2)
+    top, left = round(y + 0.5) - half, round(x + 0.5) - half
+    cut = slice(top, top + 2 * half), slice(left, left + 2 * half)
+    alone, _ = ForceReader(predictor, _WIDE[cut], _MM_PER_PX, 1.0).read(moved[cut], None)
+    assert force == pytest.approx(alone, rel=0.05, abs=0.02 * float(np.abs(alone).max()))
+    middle = predictor(moved, _WIDE, _MM_PER_PX, 1.0).force_mn
+    assert middle is not None
+    assert float(np.linalg.norm(middle - said.force_mn)) > 0.2 * float(np.linalg.norm(alone))
+    assert any("wider than the network's" in note for note in reader.notes)
+
+
+def test_share_at_the_border() -> None:
+    density, mask = np.zeros((32, 32), np.float32), np.ones((32, 32), np.float32)
+    assert np.isnan(share_at_border(density, mask))
+    density[16, 16], density[0, 5] = 3.0, 1.0
+    assert share_at_border(density, mask) == pytest.approx(0.25)
+    mask[0] = 0
+    assert share_at_border(density, mask) == 0
