@@ -33,6 +33,8 @@ class Sight:
     """NaN of a depth camera."""
     epipolar_px: float
     """Median distance of what matches from its row, on the pictures that flow is computed on; NaN: none."""
+    mm_per_px: float
+    """What a pixel of the recording spans at the tissue in the rest frame, by the second eye."""
     noise_mm: float
     """Median deviation of depth motion over the tissue, and over the frames looked at."""
     lag: float = 0.0
@@ -65,9 +67,14 @@ class SecondEye:
         """What it came to, once steps are through."""
         noise = float(np.median(self._noise)) if self._noise else float("nan")
         if self._stereo is None:
-            return Sight(float("nan"), float("nan"), noise)
+            assert self._depth is not None
+            away, focal = self._depth.distance_mm, float(self._depth.K[0, 0])
+            scale = away / focal / self._video.shrink
+            return Sight(float("nan"), float("nan"), scale, noise)
         lag = float(np.percentile(self._lags, 90)) if self._lags else 0.0
-        return Sight(self._stereo.rectified.baseline_mm, self._stereo.rest.epipolar_px, noise, lag)
+        r, rest = self._stereo.rectified, self._stereo.rest
+        scale = self._stereo.distance_mm / r.focal / self._video.shrink
+        return Sight(r.baseline_mm, rest.epipolar_px, scale, noise, lag)
 
     def move(self, step: Step) -> Moved:
         """Motion of a frame since rest; the first step is the rest frame.

@@ -88,8 +88,9 @@ class StereoTracker:
         aside = np.stack([-self.rest.disparity, np.zeros_like(right)])
         fused.warp_into(right, known, aside, self._right, self._usable)
         self._usable *= usable[0]
-        middle = float(np.median(r.depth(self.rest.disparity)[usable[0]]))
-        self.px_per_mm = r.focal * r.baseline_mm / middle**2
+        self.distance_mm = float(np.median(r.depth(self.rest.disparity)[usable[0]]))
+        """Median of the tissue's, at rest."""
+        self.px_per_mm = r.focal * r.baseline_mm / self.distance_mm**2
         """Change of disparity of tissue that moves 1 mm along the line of sight."""
         self._change: Map | None = None
 
