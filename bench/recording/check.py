@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from bench.recording import clocks, pixel_scale
 from bench.recording.folder import Recording, open_recording
 from bench.recording.meta import LEAST_INTERVALS
-from bench.recording.second_eye import SecondEye, Sight
+from bench.recording.second_eye import LATE, SecondEye, Sight
 from learn.inference.quality import find_fault
 from learn.inference.video_flow import Account, Footage, Settings, VideoFlow
 from synth.errors import UserError
@@ -25,7 +25,6 @@ _RATE_HZ = 10.0  # frames a second that are looked at unless more are asked for
 _LEAST_PRESS = 5  # frames of a press that settle its gain
 OFF_ROWS_PX = 0.5  # of small pictures: the calibration is not this pair's, or no longer
 NOISY_MM = 0.16  # depth motion from which on force is no better than with one eye
-LATE = 0.22  # share of the motion that the second eye doesn't show: it is of another moment
 _OTHER_SCALE = 0.1  # by more than that the scale and the second eye's calibration contradict each other
 _LOOKED_AT = 12  # frames that are followed to see whether they can be
 

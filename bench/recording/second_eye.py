@@ -22,6 +22,8 @@ from synth.system import foreign_file, foreign_picture
 
 Flags = NDArray[np.bool_]
 _LARGEST_BYTES = 1 << 30  # of an array of points
+LATE = 0.22
+"""Share of the motion that the second eye doesn't show from which on it is of another moment."""
 _MOVED_PX = 0.5  # less says nothing of when
 
 
@@ -46,7 +48,9 @@ class Sight:
         noise = f"depth motion is known to ± {self.noise_mm:.2g} mm"
         if np.isnan(self.baseline_mm):
             return f"a depth camera; {noise}"
-        rows = f"rows {self.epipolar_px:.2g} px off, {100 * self.lag:.0f}% of the motion late"
+        rows = f"rows {self.epipolar_px:.2g} px off"
+        if self.lag > LATE:
+            rows += f", {100 * self.lag:.0f}% of the motion at another moment than the left eye's"
         return f"a second eye {self.baseline_mm:.3g} mm to the right, {rows}; {noise}"
 
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from bench.output import charts, result_page
 from bench.recording import check
+from bench.recording.second_eye import LATE
 from evidence.flow.stereo import rig_of
 from evidence.measuring import measuring
 from synth.dataset.store import Dataset, Sequence
@@ -76,7 +77,7 @@ def stability(
         "meaning": f"rms_mm: error of depth motion over seen tissue; stated_mm: rms of its stated deviation; "
         "epipolar_px: what the rest pair says of the calibration; lag: share of motion that the right eye "
         "doesn't show, exceeded in a tenth of frames; flagged (as by bench check): stated_mm at least "
-        f"{check.NOISY_MM}, epipolar_px above {check.OFF_ROWS_PX} or lag above {check.LATE}, or refused; "
+        f"{check.NOISY_MM}, epipolar_px above {check.OFF_ROWS_PX} or lag above {LATE}, or refused; "
         "silent: "
         f"rms_mm above {WRONG_MM}, more than {_SAYS:g} times what is stated, and not flagged",
         "rows": rows,
@@ -180,7 +181,7 @@ def judged(error: Floats, spread: Floats, epipolar_px: list[float], lags: list[f
     rms, stated = (float(np.sqrt(np.square(one).mean())) for one in (error, spread))
     off, lag = float(np.median(epipolar_px)), float(np.median(lags))
     z = np.abs(error) / spread
-    flagged = stated >= check.NOISY_MM or off > check.OFF_ROWS_PX or lag > check.LATE
+    flagged = stated >= check.NOISY_MM or off > check.OFF_ROWS_PX or lag > LATE
     return {
         "rms_mm": round(rms, 4),
         "stated_mm": round(stated, 4),

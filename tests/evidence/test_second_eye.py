@@ -10,6 +10,7 @@ import phantom
 import pytest
 
 from bench.recording import check
+from bench.recording.second_eye import LATE
 from evidence.end_to_end import second_eye
 from evidence.flow import stereo_stability
 from evidence.flow.stereo_stability import View, judged, troubles
@@ -100,7 +101,7 @@ def test_what_is_wrong_and_not_said_is_silent() -> None:
     by_rows = judged(off, np.full(len(off), 0.05), [check.OFF_ROWS_PX + 0.1], [0.0])
     assert by_rows["flagged"]
     assert not by_rows["silent"]
-    assert judged(off, np.full(len(off), 0.05), [0.1], [check.LATE + 0.1])["flagged"]
+    assert judged(off, np.full(len(off), 0.05), [0.1], [LATE + 0.1])["flagged"]
     assert judged(np.array([]), np.array([]), [], [])["flagged"]
 
 
