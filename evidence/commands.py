@@ -25,6 +25,7 @@ COMMANDS = {
     "experiment stereo": "evidence.flow.stereo:experiment",
     "experiment second-eye": "evidence.end_to_end.second_eye:experiment",
     "stability flow": "evidence.flow.stability:stability",
+    "stability stereo": "evidence.flow.stereo_stability:stability",
     "stability recordings": "evidence.flow.foreign:recordings",
     "pareto flow": "evidence.flow.pareto:pareto",
     "experiment realism": "evidence.render.realism:realism_figures",

@@ -250,6 +250,7 @@ _FILES: Mapping[str, tuple[str, str | Callable[[Tree], Page]]] = {
     "flow/stability": ("stability.json", "flow.stability"),
     "flow/second-eye": ("second-eye.json", "end_to_end.second_eye"),
     "flow/stereo": ("stereo.json", "flow.stereo"),
+    "flow/stereo-stability": ("stability.json", "flow.stereo_stability"),
     "render/cycles": ("cycles.json", cycles),
     "render/pareto": ("pareto.json", "render.pareto"),
     "fem/relief": ("relief.json", "fem.relief"),

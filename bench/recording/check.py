@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 from bench.recording import clocks, pixel_scale
 from bench.recording.folder import Recording, open_recording
 from bench.recording.meta import LEAST_INTERVALS
-from bench.recording.second_eye import SecondEye
+from bench.recording.second_eye import LATE, SecondEye, Sight
 from learn.inference.quality import find_fault
 from learn.inference.video_flow import Account, Footage, Settings, VideoFlow
 from synth.errors import UserError
@@ -22,8 +23,9 @@ _JUMP = 3.0  # median intervals
 _SURGICAL_N = 5.0
 _RATE_HZ = 10.0  # frames a second that are looked at unless more are asked for
 _LEAST_PRESS = 5  # frames of a press that settle its gain
-_OFF_ROWS_PX = 0.5  # of small pictures: the calibration is not this pair's, or no longer
-_NOISY_MM = 0.16  # depth motion from which on force is no better than with one eye
+OFF_ROWS_PX = 0.5  # of small pictures: the calibration is not this pair's, or no longer
+NOISY_MM = 0.16  # depth motion from which on force is no better than with one eye
+_OTHER_SCALE = 0.1  # by more than that the scale and the second eye's calibration contradict each other
 _LOOKED_AT = 12  # frames that are followed to see whether they can be
 
 
@@ -161,13 +163,25 @@ def _check_following(recording: Recording, found: _Findings) -> None:
     for step in video.steps():
         account.add(step.found, video.tissue)
         if second is not None:
-            second.move(step)
+            try:
+                second.move(step)
+            except UserError as error:
+                found.add("bad", "second eye", str(error))
+                second = None
     if second is not None:
-        sight = second.sight
-        odd = sight.epipolar_px > _OFF_ROWS_PX or not sight.noise_mm < _NOISY_MM
-        found.add("odd" if odd else "ok", "second eye", sight.describe())
+        _check_sight(second.sight, recording, found)
     if account.frames:
         found.add("odd" if account.is_odd else "ok", "following", account.describe())
+
+
+def _check_sight(sight: Sight, recording: Recording, found: _Findings) -> None:
+    odd = sight.epipolar_px > OFF_ROWS_PX or not sight.noise_mm < NOISY_MM or sight.lag > LATE
+    found.add("odd" if odd else "ok", "second eye", sight.describe())
+    with contextlib.suppress(UserError):  # said already
+        stated = pixel_scale.find_scale(recording.meta, recording.folder).mm_per_px
+        if abs(sight.mm_per_px / stated - 1) > _OTHER_SCALE:
+            said = f"{stated:.4g} mm/px, but the second eye finds {sight.mm_per_px:.4g}"
+            found.add("odd", "scale", said)
 
 
 def _check_sensor(recording: Recording, times: NDArray[np.float64], found: _Findings) -> None:

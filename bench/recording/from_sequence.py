@@ -11,12 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.recording import writer
+from synth.checks import optics, stereo
 from synth.dataset.store import Sequence
 from synth.errors import UserError
+
+_PAIR = "stereo.yaml"
 
 
 def export_recording(sequence: Sequence, folder: Path, frames: Literal["png", "mp4"] = "png") -> Path:
     """Writes one recording: frames or video, times, force in camera axes, tool masks, tissue, meta.yaml.
+
+    Of a stereo sequence the right eye and the pair's calibration too.
 
     Nothing that the recorded scene wouldn't have given is written: no true flow, no traction, no glare mask.
 
@@ -47,7 +52,7 @@ def _fill(sequence: Sequence, part: Path, frames: Literal["png", "mp4"]) -> None
     _write(part / "tissue.png", np.asarray(sequence["tissue"][:], bool)[even].astype(np.uint8) * 255)
     writer.write_force(part, time, np.asarray(sequence["force"][:], np.float64) / 1000)
     writer.write_frames(part, time)
-    about = {
+    about: dict[str, object] = {
         "scale_mm_per_px": float(sequence.attrs["scale_mm_per_px"]),
         "scale_uncertainty": 0.0,
         "young_kpa": float(sequence.attrs["young_kpa"]),
@@ -55,6 +60,9 @@ def _fill(sequence: Sequence, part: Path, frames: Literal["png", "mp4"]) -> None
         "specimen": f"anatomy {_anatomy(sequence)}",
         "sensor": {"axes": "camera", "acts_on": "tissue", "low_pass_hz": None},
     }
+    if "rgb_right" in sequence:
+        _second_eye(sequence, part, frames, time)
+        about["stereo"] = {"calibration": _PAIR}
     writer.write_meta(part, about)
 
 
@@ -68,6 +76,28 @@ def _footage(sequence: Sequence, part: Path, kind: Literal["png", "mp4"], time: 
     (part / "frames").mkdir()
     for t, rgb in enumerate(pictures):
         _write(part / "frames" / f"{t:06d}.png", rgb[..., ::-1])
+
+
+def _second_eye(
+    sequence: Sequence, part: Path, kind: Literal["png", "mp4"], time: NDArray[np.float64]
+) -> None:
+    """The right eye's film and the pair's calibration, as OpenCV's `stereoCalibrate` would have given it."""
+    pictures = (np.asarray(sequence["rgb_right"][t], np.uint8) for t in range(sequence.frames))
+    if kind == "mp4":
+        writer.write_video(part / "right.mp4", pictures, time)
+    else:
+        (part / "right").mkdir()
+        for t, rgb in enumerate(pictures):
+            _write(part / "right" / f"{t:06d}.png", rgb[..., ::-1])
+    left, right = optics.camera_of(sequence), stereo.right_of(sequence)
+    away = (right.translation - left.translation)[:, None]
+    storage = cv2.FileStorage(str(part / _PAIR), cv2.FILE_STORAGE_WRITE)
+    for number, eye in (("1", left), ("2", right)):
+        storage.write(f"K{number}", eye.K)
+        storage.write(f"D{number}", np.atleast_2d(eye.distortion))
+    storage.write("R", right.rotation @ left.rotation.T)
+    storage.write("T", away)
+    storage.release()
 
 
 def _anatomy(sequence: Sequence) -> str:

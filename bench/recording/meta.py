@@ -204,6 +204,10 @@ class Meta(_Section):
             raise ValueError("give either scale_mm_per_px or calibration")
         if self.stereo is not None and self.depth is not None:
             raise ValueError("give stereo or depth, not both")
+        if self.scale_mm_per_px == "unknown" and (self.stereo or self.depth) is not None:
+            raise ValueError(
+                "a second eye measures in millimetres: give the scale, which bench check compares"
+            )
         if self.sync.method == "correlate" and self.sync.calibration_s is None:
             raise ValueError("sync.method correlate needs sync.calibration_s")
         return self

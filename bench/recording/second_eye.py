@@ -22,6 +22,9 @@ from synth.system import foreign_file, foreign_picture
 
 Flags = NDArray[np.bool_]
 _LARGEST_BYTES = 1 << 30  # of an array of points
+LATE = 0.22
+"""Share of the motion that the second eye doesn't show from which on it is of another moment."""
+_MOVED_PX = 0.5  # less says nothing of when
 
 
 @dataclass(frozen=True)
@@ -32,8 +35,13 @@ class Sight:
     """NaN of a depth camera."""
     epipolar_px: float
     """Median distance of what matches from its row, on the pictures that flow is computed on; NaN: none."""
+    mm_per_px: float
+    """What a pixel of the recording spans at the tissue in the rest frame, by the second eye."""
     noise_mm: float
     """Median deviation of depth motion over the tissue, and over the frames looked at."""
+    lag: float = 0.0
+    """Share of the motion that the second eye doesn't show, exceeded in a tenth of the frames that moved: its
+    pictures are of another moment. 0 for a depth camera, which can't tell."""
 
     def describe(self) -> str:
         """A line for a person."""
@@ -41,6 +49,8 @@ class Sight:
         if np.isnan(self.baseline_mm):
             return f"a depth camera; {noise}"
         rows = f"rows {self.epipolar_px:.2g} px off"
+        if self.lag > LATE:
+            rows += f", {100 * self.lag:.0f}% of the motion at another moment than the left eye's"
         return f"a second eye {self.baseline_mm:.3g} mm to the right, {rows}; {noise}"
 
 
@@ -54,14 +64,21 @@ class SecondEye:
         self._depth: DepthTracker | None = None
         self._rights: Iterator[Picture] = iter(recording.right_frames()) if recording.right else iter(())
         self._noise: list[float] = []
+        self._lags: list[float] = []
 
     @property
     def sight(self) -> Sight:
         """What it came to, once steps are through."""
         noise = float(np.median(self._noise)) if self._noise else float("nan")
         if self._stereo is None:
-            return Sight(float("nan"), float("nan"), noise)
-        return Sight(self._stereo.rectified.baseline_mm, self._stereo.rest.epipolar_px, noise)
+            assert self._depth is not None
+            away, focal = self._depth.distance_mm, float(self._depth.K[0, 0])
+            scale = away / focal / self._video.shrink
+            return Sight(float("nan"), float("nan"), scale, noise)
+        lag = float(np.percentile(self._lags, 90)) if self._lags else 0.0
+        r, rest = self._stereo.rectified, self._stereo.rest
+        scale = self._stereo.distance_mm / r.focal / self._video.shrink
+        return Sight(r.baseline_mm, rest.epipolar_px, scale, noise, lag)
 
     def move(self, step: Step) -> Moved:
         """Motion of a frame since rest; the first step is the rest frame.
@@ -82,6 +99,8 @@ class SecondEye:
             moved = self._stereo.step(
                 step.picture.rgb, right, blocked, self._hidden(right, blocked), found.flow, found.confidence
             )
+            if np.percentile(np.abs(found.flow[tissue]), 98) > _MOVED_PX:
+                self._lags.append(abs(self._stereo.lag))
         else:
             depth = self._depths(step.picture.index)
             if self._depth is None:

@@ -196,19 +196,7 @@ def _network(root: Path, way: str, epochs: int) -> list[Floats]:
 
 def drawn(found: Mapping[str, Any]) -> result_page.Page:
     """What `second-eye.json` says: one eye against two, and against baseline, resolution and cost."""
-    shown: list[charts.Chart | charts.Panel] = [
-        charts.Chart(
-            f"{name.capitalize()} error of the force, ridge",
-            "share of the force",
-            tuple(
-                charts.Row(row["way"], row[name], (row[f"{name}_low"], row[f"{name}_high"]), k // 2)
-                for k, row in enumerate(found["rows"])
-            ),
-        )
-        for name in ("whole", "along")
-    ]
-    if found["same_scenes"]:
-        shown += _panels(found["same_scenes"])
+    shown = _panels(found["same_scenes"]) if found["same_scenes"] else []
     sections = [result_page.Section("Ridge, folds over sequences", found["rows"])]
     if found["same_scenes"]:
         sections.append(result_page.Section("The same scenes, seen by other rigs", found["same_scenes"]))

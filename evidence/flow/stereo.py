@@ -81,7 +81,7 @@ def experiment(
             ours = [one for one in samples if one.tier == tier]
             ratio = sum(c[tier] for c in costs) / sum(c["flow"] for c in costs)
             rows.append(
-                {"size": f"{width} x {height}", "way": tier, "sequences": len(costs)}
+                {"data": root.name, "size": f"{width} x {height}", "way": tier, "sequences": len(costs)}
                 | figures(ours)
                 | {"cost_ratio": round(ratio, 2), "epipolar_px": round(float(np.median(offs)), 3)}
             )
@@ -226,7 +226,7 @@ def drawn(found: Mapping[str, Any]) -> result_page.Page:
     """What `stereo.json` says: what was asked as a part of what was allowed, z-scores, every row."""
     shares, scores = {}, {}
     for row in found["rows"]:
-        who = f"{row['way']}, {row['size']}"
+        who = f"{row['way']}, {row['data']}"
         for key, words, limits in _ASKED:
             if row["size"] in limits:
                 shares[f"{words}: {who}"] = abs(row[key]) / limits[row["size"]]

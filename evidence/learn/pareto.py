@@ -53,7 +53,9 @@ class Choice:
 
     @property
     def preset(self) -> str:
-        found = [k for k, v in PRESETS.items() if v.size == self.size and shape(v.arch) == shape(self.arch)]
+        # Those of two eyes have other channels: nothing of theirs was timed here.
+        one_eye = {k: v for k, v in PRESETS.items() if not v.arch.depth}
+        found = [k for k, v in one_eye.items() if v.size == self.size and shape(v.arch) == shape(self.arch)]
         return ", ".join(found)
 
 

@@ -34,7 +34,9 @@ def test_errors_bias_and_scores_are_those_put_in() -> None:
 
 
 def test_the_page_shows_each_figure_that_was_asked() -> None:
-    row = {"size": "640 x 480", "way": "joint", "cost_ratio": 1.5} | figures([sample(0.0, 0.02, 0.02)])
+    row = {"data": "stereo-640", "size": "640 x 480", "way": "joint", "cost_ratio": 1.5} | figures(
+        [sample(0.0, 0.02, 0.02)]
+    )
     page = drawn({"rows": [row], "pair": [{"method": "ours", "off_by_2px": 0.1}]})
     shares = {one.name: one.value for one in page.charts[0].rows}  # type: ignore[union-attr]
     assert len(shares) == 4

@@ -44,6 +44,8 @@ class DepthTracker:
         if not self._known.any():
             raise UserError("depth: the rest frame has no depth of the tissue")
         self._rest = np.where(self._known, rest, np.median(rest[self._known])).astype(np.float32)
+        self.distance_mm = float(np.median(rest[self._known]))
+        """Median of the tissue's, at rest."""
         self.solver = Solver((tissue.shape[0], tissue.shape[1]), settings)
         self.noise_mm = float("nan")
         """Median deviation of depth motion over the tissue in the last frame."""

@@ -88,6 +88,8 @@ class Change:
     """(h, w) by cell: mean square of the residuals left, in their median's; 1 where nothing is seen."""
     seen: Map
     """(H, W) 0 or 1: in all four pictures."""
+    lag: float = 0.0
+    """Share of the left eye's motion that the right one doesn't show: of eyes that aren't of one moment."""
 
 
 class Solver:
@@ -147,7 +149,8 @@ class Solver:
             np.maximum(sums[0], 0, out=sums[0])
             change = fine(self._settled(prior, sums[0], sums[1]), self.cell, disparity.shape)
         misfit = np.where(sums[3] > 0, sums[2] / np.maximum(sums[3], 1), 1)
-        return Change(change, sums[0].astype(np.float32), stiffness, misfit.astype(np.float32), both)
+        lag = _lag(right_now[0] - less[0], right_now[2], flow[1], both, noise[0])
+        return Change(change, sums[0].astype(np.float32), stiffness, misfit.astype(np.float32), both, lag)
 
     def smooth(self, samples: Map, weight: Map, flow: Map, px_per_mm: float) -> Change:
         """The same prior on changes of disparity found elsewhere, pixel by pixel; Student's weights as well.
@@ -257,6 +260,26 @@ def _noise(residual: Map, mask: Map) -> Map:
     if not some.shape[1]:
         return np.ones(3, np.float32)
     return np.asarray(np.maximum(np.median(some * some, axis=1) / _MEDIAN, 1e-6), np.float32)
+
+
+def _lag(residual: Map, slope: Map, down: Map, mask: Map, noise: np.float32) -> float:
+    """What part of the motion down the picture is missing in the right eye.
+
+    Rectified eyes show it alike, whatever the depth, so that a residual along the slope is of another moment.
+
+    Args:
+        residual: (H, W) of the brightness.
+        slope: (H, W) its derivative by y.
+        down: (H, W) px, the left eye's flow by y.
+        mask: (H, W).
+        noise: variance of the residual.
+    """
+    some = (slice(None, None, 2), slice(None, None, 2))
+    q, along = residual[some], (slope * down)[some]
+    weight = mask[some] / (1 + q * q / (_FREEDOM * noise))
+    # Without motion nothing is late: a prior of a tenth of a pixel's worth.
+    little = 0.01 * float((weight * slope[some] ** 2).sum()) + 1e-9
+    return float((weight * along * q).sum()) / (float((weight * along * along).sum()) + little)
 
 
 @vectorised

@@ -18,6 +18,7 @@ from synth.flow.stereo.rig import Rectified, Rig
 _GREY = np.array([0.2, 0.6, 0.2], np.float32)  # as `image.tensor`
 _STILL_PX = 0.3  # frames whose flow is nearly everywhere below this are at rest
 _RESTS = 4
+_IN_TIME = 0.12  # share of the motion that eyes of one moment may seem to differ by
 _LOST = 0.05  # of what is seen at rest: a frame that shows less is no place to start from
 
 
@@ -87,8 +88,9 @@ class StereoTracker:
         aside = np.stack([-self.rest.disparity, np.zeros_like(right)])
         fused.warp_into(right, known, aside, self._right, self._usable)
         self._usable *= usable[0]
-        middle = float(np.median(r.depth(self.rest.disparity)[usable[0]]))
-        self.px_per_mm = r.focal * r.baseline_mm / middle**2
+        self.distance_mm = float(np.median(r.depth(self.rest.disparity)[usable[0]]))
+        """Median of the tissue's, at rest."""
+        self.px_per_mm = r.focal * r.baseline_mm / self.distance_mm**2
         """Change of disparity of tissue that moves 1 mm along the line of sight."""
         self._change: Map | None = None
 
@@ -150,7 +152,13 @@ class StereoTracker:
         r, disparity = self.rectified, self.rest.disparity
         self.features = self._features(change, flow, confidence)
         """What the last frame's deviations were made from, (6, h, w): see `deviation.features`."""
-        along = deviation.deviation(self.features, deviation.ALONG[tier]) / self.px_per_mm
+        self.lag = change.lag
+        """Share of the last frame's motion that the right eye didn't show: 0 for eyes of one moment."""
+        # What of another moment's motion passes for depth.
+        late = np.sqrt(max(change.lag**2 - _IN_TIME**2, 0.0)) * self.solver.coarse(
+            np.abs(flow[0]) + np.abs(change.px)
+        )
+        along = np.hypot(deviation.deviation(self.features, deviation.ALONG[tier]), late) / self.px_per_mm
         across = deviation.deviation(self.features, deviation.ACROSS[tier])
         across *= float(np.median(r.depth(disparity))) / r.focal
         motion = r.motion(disparity, change.px, flow)

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from bench.methods import baselines, compliance, corotational, inverse
-from bench.methods.protocol import Method, Scene
+from bench.methods.protocol import InSpace, Method, Scene
 from evidence.scoring import inverse as inverse_experiment
 from learn.data.clips import Clip
+from synth.errors import UserError
+from synth.flow.stereo.track import Moved
 
 N = baselines.GRID.size
 
@@ -188,3 +192,44 @@ def test_inverse_of_nothing_is_nothing(known: compliance.Compliance) -> None:
     none = np.zeros((len(known.points), 2))
     for solve in (inverse.tikhonov, inverse.tikhonov_near, inverse.one_contact, corotational.one_contact):
         assert np.abs(solve(known, none, np.ones(len(none)))).max() < 1e-9
+
+
+def test_fitted_on_two_eyes_asks_for_two() -> None:
+    told = []
+    for clip in clips():
+        moved = clip.displacement["recovered"]
+        told.append(
+            replace(clip, displacement={"motion": np.concatenate([moved, 0.5 * moved[:, :1]], axis=1)})
+        )
+    method = baselines.fitted(told, "motion")["ridge on PCA of flow"]
+    force = np.array([6.0, 0, 0])
+    scene = Scene(np.ones((96, 96), bool), 36 / 96, 1.0)
+    axis = (np.arange(96) - 47.5) * 36 / 96
+    bump = np.exp(-(axis[None] ** 2 + axis[:, None] ** 2) / 50)[..., None]
+    seen = (0.05 * np.array([*force[:2], 0.5 * force[0]]) * bump).astype(np.float32)
+    flow, sure = seen[..., :2] / np.float32(scene.scale_mm_per_px), np.ones((96, 96), np.float32)
+    assert isinstance(method, InSpace)
+    said = method.in_space(flow, sure, Moved(seen, np.full_like(seen, 0.01)), scene, False)
+    assert said.size_mn == pytest.approx(6, rel=0.12)
+    with pytest.raises(UserError, match="second eye"):
+        method(flow, sure, scene, False)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("solve", [inverse.tikhonov, inverse.tikhonov_near, inverse.one_contact])
+def test_a_force_along_the_view_is_seen_by_two_eyes(solve: object) -> None:
+    assert callable(solve)
+    known = compliance.build(point_mm=1.5, node_mm=2.0, tets=1500, components=3)
+    rng = np.random.default_rng(0)
+    block = compliance.Block.build("linear", 2500, 2)
+    held = block.carry(np.array([[2.0, -3.0], [2.5, -3.0], [2.0, -2.5], [1.5, -3.0]]))
+    # 40 mN into the tissue, away from the camera.
+    u = block.carry(known.points).move(block.system.solve(held.gather(np.tile([2.5, 0.0, -10.0], (4, 1)))))
+    seen = u * [1, -1, -1] + 0.05 * rng.normal(size=(len(known.points), 3))
+    weight = np.ones((len(known.points), 3))
+    total = solve(known, seen, weight)
+    assert total == pytest.approx([10, 0, 40], abs=5)
+    # What isn't trusted has no part in it.
+    spoilt = seen + np.where(known.points[:, :1] < -6, 5.0, 0.0)
+    weight[known.points[:, 0] < -6] = 0
+    assert solve(known, spoilt, weight) == pytest.approx([10, 0, 40], abs=6)

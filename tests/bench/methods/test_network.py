@@ -28,7 +28,7 @@ def test_the_rest_frame_is_the_zero_and_unknown_tissue_has_1_kpa(
     view = View(tissue, 0.1, Grid(16))
 
     def predictor(
-        flow: np.ndarray, where: object, scale: float, young: float | None, sure: object
+        flow: np.ndarray, where: object, scale: float, young: float | None, *more: object, **place: object
     ) -> ForceMap:
         """Total force of 2 mN and 1 mN a pixel of motion, for each kPa."""
         per_kpa = np.array([2.0 + float(flow.sum()), 1.0, 0.0])[: 3 if vector else 1]
@@ -36,6 +36,7 @@ def test_the_rest_frame_is_the_zero_and_unknown_tissue_has_1_kpa(
         density[:, 8, 8] = (young or typical) * per_kpa / Grid(16).pitch_mm ** 2
         return ForceMap(density, Grid(16), "density", young or typical, young is not None, view)
 
+    predictor.grid = Grid(16)  # type: ignore[attr-defined]
     model = Model.__new__(Model)
     model.predictor, model._reader = predictor, None  # type: ignore[assignment]
     scene = Scene(tissue, 0.1, young_kpa)

@@ -138,6 +138,17 @@ def test_check_report_and_scores_name_it(make: Make, second: str) -> None:
     (said,) = [one for one in check_recording(folder) if one.what == "second eye"]
     assert ("24 mm to the right" if second == "right" else "a depth camera") in said.said
     assert "depth motion is known to" in said.said
+    assert not [one for one in check_recording(folder) if one.what == "scale" and one.state != "ok"]
+    about = (folder / "meta.yaml").read_text()
+    wrong = about.replace(f"{AWAY / FOCAL}", f"{2 * AWAY / FOCAL}")
+    assert wrong != about
+    (folder / "meta.yaml").write_text(wrong)
+    (odd,) = [one for one in check_recording(folder) if one.what == "scale" and one.state == "odd"]
+    assert "the second eye finds 0.219" in odd.said
+    (folder / "meta.yaml").write_text(wrong.replace(f"{2 * AWAY / FOCAL}", "unknown"))
+    with pytest.raises(UserError, match="measures in millimetres"):
+        open_recording(folder)
+    (folder / "meta.yaml").write_text(about)
     methods = {"main": Looking(), "near": baselines.physical()["Tikhonov near the contact"]}
     result = evaluate_recording(
         open_recording(folder), methods, "main", Scale(AWAY / FOCAL, 0.02, "stated"), SETTINGS, {}
@@ -157,6 +168,7 @@ def test_what_does_not_go_together_is_refused(make: Make) -> None:
     (folder / "right/2.png").unlink()
     with pytest.raises(UserError, match="right eye has no frame 2"):
         track_recording(open_recording(folder), {"it": Looking()}, 0.2, SETTINGS)
+    assert [one for one in check_recording(folder) if one.what == "second eye" and one.state == "bad"]
     about = (folder / "meta.yaml").read_text()
     writer.write_meta(folder, {"scale_mm_per_px": 0.2, "fps": 10.0})
     with pytest.raises(UserError, match=r"must say how it is calibrated .stereo:."):

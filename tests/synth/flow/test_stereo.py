@@ -206,6 +206,28 @@ def test_a_blocked_eye_is_doubted_and_forgotten() -> None:
     np.testing.assert_allclose(again.motion, sure.motion, atol=1e-3)
 
 
+def test_a_right_eye_of_another_moment_is_found_out() -> None:
+    rng = np.random.default_rng(7)
+    picture = texture(rng)
+    every = np.ones(SIZE[::-1], bool)
+    rest_frame = seen(picture, COLUMNS, ROWS)
+    now, before = (seen(picture, COLUMNS - 1.5 * part, ROWS - 1.2 * part) for part in (1.0, 0.5))
+    flow = np.tile(np.array([1.5, 1.2], np.float32), (*every.shape, 1))
+    trust = np.ones(every.shape, np.float32)
+    lags, spreads, errors = [], [], []
+    for right in (now, before):
+        tracker = StereoTracker(PARALLEL, rest_frame[None], rest_frame[None], ~every, ~every, every)
+        moved = tracker.step(now, right, ~every, ~every, flow, trust)
+        inner = (slice(10, -10), slice(10, -10), 2)
+        lags.append(tracker.lag)
+        spreads.append(np.median(moved.deviation[inner]))
+        errors.append(np.sqrt(np.square(moved.motion[inner]).mean()))
+    assert abs(lags[0]) < 0.05
+    assert lags[1] == pytest.approx(0.5, abs=0.2)
+    assert errors[1] > 10 * errors[0], "half of the motion passes for depth"
+    assert spreads[1] > 0.5 * errors[1]
+
+
 def _source(along: np.ndarray) -> np.ndarray:
     """Rest columns (H, W) that are seen at each pixel once tissue has moved by (along, -0.8)."""
     x = COLUMNS.astype(np.float64)

@@ -7,8 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from bench.methods.protocol import Answer, Scene
+from bench.recording.folder import open_recording
+from bench.recording.from_sequence import export_recording
+from bench.tracking.tracking import track_recording
+from learn.inference.video_flow import Settings
 from synth.checks import stereo
 from synth.dataset.store import open_sequence
+from synth.flow.stereo.track import Moved
 from synth.job import identity, reader
 from synth.job.schema import Job
 from synth.sequence.pipeline import render_sequence
@@ -56,3 +62,24 @@ def test_a_rendered_pair_agrees_and_gives_motion_back(tmp_path: Path, way: str) 
     # At 160 px a pixel of disparity is 2.7 mm of depth.
     assert np.sqrt(np.square(error[:, 2]).mean()) < 0.2
     assert sequence.attrs["right"]["baseline_mm"] == 24
+    # As a recording of its own, from its files alone.
+    made = open_recording(export_recording(sequence, tmp_path / "recording"))
+    told: list[Moved] = []
+
+    class Looking:
+        def __call__(self, flow: np.ndarray, confidence: np.ndarray, scene: Scene, picture: bool) -> Answer:
+            raise AssertionError("there is a second eye")
+
+        def in_space(
+            self, flow: np.ndarray, confidence: np.ndarray, moved: Moved, scene: Scene, picture: bool
+        ) -> Answer:
+            told.append(moved)
+            return Answer(np.zeros(3))
+
+    settings = Settings(rate_hz=None, pulse=False)
+    done = track_recording(made, {"it": Looking()}, sequence.attrs["scale_mm_per_px"], settings)
+    assert done.sight is not None
+    assert done.sight.baseline_mm == pytest.approx(24, rel=1e-4)
+    assert done.sight.mm_per_px == pytest.approx(sequence.attrs["scale_mm_per_px"], rel=0.05)
+    again = (told[t].motion - sequence["motion"][t])[seen]
+    assert np.sqrt(np.square(again[:, 2]).mean()) < 0.2
