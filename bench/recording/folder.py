@@ -146,8 +146,8 @@ def open_recording(folder: Path, phantom: bool = False) -> Recording:
         # Force goes with the scale as it goes with E: of either unknown, a factor is.
         about = about.model_copy(update={"young_kpa": None})
         notes.append(
-            f"scale unknown: answers are per pixel, on a picture taken to be {meta.TAKEN_MM:g} mm wide, and right "
-            "up to a factor"
+            "scale unknown: answers are per pixel, on a picture taken to be "
+            f"{meta.TAKEN_MM:g} mm wide, and right up to a factor"
         )
     times = _frame_times(folder / "frames.csv", notes)
     force = _force(folder / "force.csv", about, notes)

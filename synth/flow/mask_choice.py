@@ -184,8 +184,9 @@ class ChoosingTracker:
         known = np.bincount(number, self._verdict.ravel() != 0, len(pieces.body))
         kept, old = votes > 0, known >= 0.5 * np.bincount(number, minlength=len(pieces.body))
         for layer, proved in zip(pieces.number, self._proved, strict=True):
-            fresh = np.setdiff1d(layer, np.flatnonzero(old)) if proved else []
-            kept[fresh] = old[fresh] = True  # a tool that comes back is the tool it was
+            if proved:
+                fresh = np.setdiff1d(layer, np.flatnonzero(old))
+                kept[fresh] = old[fresh] = True  # a tool that comes back is the tool it was
         kept[0] = old[0] = False
         return np.asarray(kept[pieces.number].any(0), bool), np.asarray(old[pieces.number].any(0), bool)
 
@@ -326,9 +327,7 @@ class _Evidence:
     common: Flags
     """What of that is proposed by nothing."""
 
-    def earning(
-        self, where: NDArray[np.int32], numbers: int, one: bool, beside: bool
-    ) -> NDArray[np.bool_]:
+    def earning(self, where: NDArray[np.int32], numbers: int, one: bool, beside: bool) -> NDArray[np.bool_]:
         """(numbers,) which pieces earn being masked.
 
         Args:
