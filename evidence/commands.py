@@ -23,6 +23,7 @@ from synth.errors import UserError
 COMMANDS = {
     "experiment flow": "evidence.flow.experiment:experiment",
     "experiment stereo": "evidence.flow.stereo:experiment",
+    "experiment second-eye": "evidence.end_to_end.second_eye:experiment",
     "stability flow": "evidence.flow.stability:stability",
     "stability recordings": "evidence.flow.foreign:recordings",
     "pareto flow": "evidence.flow.pareto:pareto",
@@ -55,6 +56,7 @@ COMMANDS = {
     "experiment slides": "evidence.fem.slides:slides",
     "experiment half-space": "evidence.fem.half_space:half_space",
     "experiment contact": "evidence.fem.contact:rigid",
+    "experiment mechanics": "evidence.mechanics.experiment:experiment",
     "stability damage": "evidence.engine.damage:damage",
     "experiment scale": "evidence.engine.large_index:scale",
     "stability dask": "evidence.engine.dask:dask",

@@ -16,6 +16,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from synth.errors import UserError
+from synth.system import whole_file
 from synth.system.cli_errors import Commands
 
 if TYPE_CHECKING:
@@ -39,6 +40,10 @@ _console = Console(stderr=True)
 
 Root = Annotated[Path, typer.Argument(help="Dataset: a folder of NNNNNN.zarr stores.")]
 Cache = Annotated[Path | None, typer.Option(help="Folder for packed arrays; made once, shared by runs.")]
+_STORED = (
+    "A store's displacement: ideal, recovered or noisy, of two eyes motion or motion-ideal; what is "
+    "recovered if not given."
+)
 Threads = Annotated[int | None, typer.Option(help="CPU threads; half the cores if not given.")]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON on stdout instead of a table.")]
 
@@ -51,9 +56,15 @@ def train_command(
         typer.Argument(help="Any setting, as in a model's config.json: arch.confidence=true batch=16."),
     ] = None,
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the model.")] = Path("model"),
-    preset: Annotated[str, typer.Option(help="tiny, cpu, live or paper.")] = "cpu",
+    preset: Annotated[
+        str, typer.Option(help="tiny, cpu, live or paper; of two eyes eyes or eyes-live.")
+    ] = "cpu",
     input: Annotated[
-        str | None, typer.Option(help="ideal, recovered, noisy (the published noise) or mixed.")
+        str | None,
+        typer.Option(
+            help="ideal, recovered, noisy (the published noise) or mixed; of two eyes motion (recovered), "
+            "motion-ideal or motion-mixed."
+        ),
     ] = None,
     epochs: Annotated[int | None, typer.Option(help="Passes over the training frames.")] = None,
     batch: Annotated[int | None, typer.Option(help="Frames a step.")] = None,
@@ -78,6 +89,7 @@ def train_command(
 ) -> None:
     """Train D2FNet on a dataset. An interrupted run is continued by the same command."""
     from learn.checkpoint import room_needed
+    from learn.data.clips import has_depth
     from learn.settings import override
     from learn.settings import preset as named
     from learn.training.threads import set_threads
@@ -86,6 +98,7 @@ def train_command(
     set_threads(threads)
     options = {
         "input": input,
+        "arch.depth": None if input is None else has_depth(input),
         "epochs": epochs,
         "batch": batch,
         "learning_rate": learning_rate,
@@ -196,7 +209,10 @@ def eval_command(
     model: Annotated[Path, typer.Argument(help="Model folder.")],
     dataset: Root,
     input: Annotated[
-        str | None, typer.Option(help="ideal, recovered or noisy; as trained if not given.")
+        str | None,
+        typer.Option(
+            help="ideal, recovered or noisy; of two eyes motion or motion-ideal; as trained if not given."
+        ),
     ] = None,
     against: Annotated[
         Path | None, typer.Option(help="A second model: paired tests on the sequences neither has seen.")
@@ -207,7 +223,7 @@ def eval_command(
     json: Json = False,
 ) -> None:
     """Score a model on the sequences it has not seen; forces in mN."""
-    from learn.data.clips import FIELDS, load_clips
+    from learn.data.clips import load_clips, scored
     from learn.data.split import ungrouped
     from learn.evaluation.evaluate import compare, evaluate, unseen
     from learn.inference.predict import load_predictor
@@ -216,10 +232,7 @@ def eval_command(
 
     set_threads(threads)
     predictor = load_predictor(model)
-    trained = predictor.card.settings.input
-    source = input or ("recovered" if trained == "mixed" else trained)
-    if source not in FIELDS:
-        raise UserError(f"unknown input {source!r}: one of {', '.join(FIELDS)}")
+    source = predictor.readable(input or scored(predictor.card.settings.input))
     with _bar("Reading sequences") as tell:
         clips = load_clips(dataset, predictor.grid, (source,), cache=cache, report=tell)
     if predictor.card.settings.share_anatomy:
@@ -228,6 +241,7 @@ def eval_command(
     other = None if against is None else load_predictor(against)
     chosen = clips if all else unseen(clips, predictor.card)
     if other is not None:
+        other.readable(source)
         if other.grid != predictor.grid or other.card.settings.target != predictor.card.settings.target:
             raise UserError(
                 f"{against}: is of another grid or target than {model}; their maps can't be paired"
@@ -262,7 +276,7 @@ def predict_command(
     model: Annotated[Path, typer.Argument(help="Model folder.")],
     source: Annotated[Path, typer.Argument(help="Dataset, NNNNNN.zarr store, video, or .npz of flow.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for NAME.npz files.")] = Path("forces"),
-    input: Annotated[str, typer.Option(help="A store's flow: ideal, recovered or noisy.")] = "recovered",
+    input: Annotated[str | None, typer.Option(help=_STORED)] = None,
     young: Annotated[float | None, typer.Option(help="Young's modulus [kPa], instead of the data's.")] = None,
     scale: Annotated[float | None, typer.Option(help="A video's scale [mm a pixel].")] = None,
     tissue: Annotated[
@@ -307,10 +321,14 @@ def predict_command(
     kind, files = read_choice(masks)
     filmed = Filmed(scale, tissue, Settings(flow, shrink, rate or None, pulse, kind), files)
     peaks: dict[str, float | None] = {}
-    for motion in motions(source, input, filmed):
+    for motion in motions(source, predictor.stored(input), filmed):
+        written = out / f"{motion.name}.npz"
+        if written.exists() and written.samefile(source):
+            raise UserError(f"{written}: is what is read, and would be overwritten; say another --out")
         found = apply(predictor, motion, young)
         out.mkdir(parents=True, exist_ok=True)
-        np.savez_compressed(out / f"{motion.name}.npz", **found)
+        with whole_file.part_of(written) as part, part.open("wb") as file:
+            np.savez_compressed(file, **found)
         size = found["total_force_mn"][found["trusted"]]
         peaks[motion.name] = float(size.max()) if len(size) else None
         if not json:
@@ -330,7 +348,7 @@ def calibrate_command(
     press: Annotated[
         Path, typer.Argument(help="One press with known force: NNNNNN.zarr store, or .npz with force_mn.")
     ],
-    input: Annotated[str, typer.Option(help="A store's flow: ideal, recovered or noisy.")] = "recovered",
+    input: Annotated[str | None, typer.Option(help=_STORED)] = None,
     threads: Threads = None,
     json: Json = False,
 ) -> None:
@@ -341,7 +359,8 @@ def calibrate_command(
 
     set_threads(threads)
     predictor = load_predictor(model)
-    found = {motion.name: calibrate(predictor, motion) for motion in motions(press, input)}
+    stored = predictor.stored(input)
+    found = {motion.name: calibrate(predictor, motion) for motion in motions(press, stored)}
     if json:
         print(json_.dumps({"young_kpa": found}))
     else:

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import Field, model_validator
 
-from learn.data.clips import Input, Target
+from learn.data.clips import Input, Target, has_depth
 from learn.data.grid import Grid
 from learn.loss import GHOSTLESS, Objective
 from learn.network.d2fnet import Architecture
@@ -32,7 +32,8 @@ class Settings(Section):
     objective: Objective = Objective()
     input: Input = "ideal"
     """Displacement to train on. `mixed`: each frame is ideal or recovered by a draw whose odds move from
-    all ideal to all recovered over the first half of the run."""
+    all ideal to all recovered over the first half of the run. `motion`, `motion-ideal`, `motion-mixed`: in
+    three dimensions, as two eyes recover it, true, or both; they go with `arch.depth`."""
     target: Target = "density"
     epochs: AtLeastOne = 50
     batch: AtLeastOne = 8
@@ -71,6 +72,8 @@ class Settings(Section):
     def _goes_together(self) -> Settings:
         if self.target == "intensity" and self.arch.output != "magnitude":
             raise ValueError("target 'intensity' has no direction: it needs output 'magnitude'")
+        if self.arch.depth != has_depth(self.input):
+            raise ValueError(f"input {self.input!r} goes with arch.depth {str(not self.arch.depth).lower()}")
         halved = self.arch.stem * 2**self.arch.levels
         if self.size % halved:
             raise ValueError(
@@ -119,6 +122,27 @@ PRESETS: dict[str, Settings] = {
         size=256,
         arch=Architecture(width=16, stem=4, levels=3, output="magnitude", dropout=0.05),
         objective=GHOSTLESS,
+        learning_rate=1e-3,
+    ),
+    # Two eyes: `cpu` and `live` told motion in three dimensions. Force is then seen along the view as well,
+    # so they answer with vectors, and squared error is what serves those.
+    "eyes": Settings(
+        size=128,
+        arch=Architecture(width=16, stem=4, levels=4, confidence=True, depth=True, dropout=0.05),
+        input="motion-mixed",
+        epochs=24,
+        objective=Objective(kind="mse"),
+        learning_rate=1e-3,
+        schedule="cosine",
+        channels_last=True,
+        batch=8,
+        frames=12,
+    ),
+    "eyes-live": Settings(
+        size=256,
+        arch=Architecture(width=16, stem=4, levels=3, confidence=True, depth=True, dropout=0.05),
+        input="motion-mixed",
+        objective=Objective(kind="mse"),
         learning_rate=1e-3,
     ),
     # The network, loss weights and schedule of Heraoui et al., on our targets.

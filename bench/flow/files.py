@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from synth.errors import UserError
-from synth.system import foreign_file, foreign_picture
+from synth.system import foreign_arrays, foreign_file, foreign_picture
 from synth.system.foreign_picture import LARGEST_PIXELS
 
 _FORMATS = "{}: flow files are .flo (Middlebury), .png (KITTI) or .npz"
@@ -75,12 +74,11 @@ def _read_flo(path: Path) -> tuple[Floats, Flags]:
 
 def _read_npz(path: Path) -> tuple[Floats, Flags]:
     """`flow` (H, W, 2) px, and `known` (H, W) if not all of it is."""
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            flow = file["flow"].astype(np.float32)
-            known = file["known"].astype(bool) if "known" in file else np.isfinite(flow).all(axis=-1)
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
-        raise UserError(f"{path}: holds no array named flow") from None
+    found = foreign_arrays.read_arrays(path)
+    if "flow" not in found:
+        raise UserError(f"{path}: holds no array named flow")
+    flow = found["flow"].astype(np.float32)
+    known = np.asarray(found["known"] if "known" in found else np.isfinite(flow).all(axis=-1), bool)
     if flow.ndim != 3 or flow.shape[2] != 2 or known.shape != flow.shape[:2]:
         raise UserError(f"{path}: flow of shape {flow.shape}, expected (H, W, 2)")
     return np.where(known[..., None], flow, 0).astype(np.float32), known

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.importers.registry import MOST_FRAMES, ROLES, Intake, as_rgb
+from bench.importers.registry import MOST_FRAMES, ROLES, Floats, Intake, as_rgb
 from synth.errors import UserError
 from synth.system.foreign_picture import refuse_large
 
@@ -73,18 +73,23 @@ def read_source(source: Path, use: dict[str, str]) -> Intake:
             raise UserError(
                 f"{source}: {len(force)} forces, {len(force_s)} times for them; say --use force_time="
             )
-    tip = np.zeros((0, 4))
-    if chosen["tip"] is not None:
-        place = np.asarray(chosen["tip"][:], np.float64)
-        if place.shape != (len(seconds), 3):
-            raise UserError(f"{source}: tip of shape {place.shape}, expected ({len(seconds)}, 3)")
-        tip = np.column_stack([seconds, place])
+    tip = _tip(source, chosen["tip"], seconds)
 
     def pictures() -> Iterator[NDArray[np.uint8]]:
         for k in range(len(frames)):
             yield as_rgb(np.asarray(frames[k]))
 
     return Intake(seconds, pictures, force_s, force, tip)
+
+
+def _tip(source: Path, array: Any, seconds: Floats) -> Floats:
+    """(M, 4) time [s] and place; (0, 4) without one."""
+    if array is None:
+        return np.zeros((0, 4))
+    place = np.asarray(array[:], np.float64)
+    if place.shape != (len(seconds), 3):
+        raise UserError(f"{source}: tip of shape {place.shape}, expected ({len(seconds)}, 3)")
+    return np.column_stack([seconds, place])
 
 
 def _refuse_odd(source: Path, role: str, array: Any) -> None:

@@ -137,6 +137,8 @@ def _column(source: Path, name: str, values: dict[int, str], count: int, widths:
     out = np.full((count, width), np.nan)
     for k, row in rows.items():
         try:
+            if len(row) != width:  # one number would be taken for all
+                raise ValueError
             out[k] = [float(word) for word in row]
         except ValueError:
             raise UserError(f"{source}: field {name} of frame {k} is not {width} numbers") from None

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -12,6 +10,7 @@ from numpy.typing import NDArray
 
 from bench.importers.registry import Floats, Intake, as_rgb
 from bench.recording import csv_table
+from bench.recording.folder import natural_order
 from learn.inference import video
 from synth.errors import UserError
 
@@ -53,7 +52,7 @@ def read_source(source: Path, use: dict[str, str]) -> Intake:
 
 def read_forces(path: Path) -> tuple[Floats, Floats]:
     """Times (N,) s and forces (N, 3) in the table's unit. UserError if it has no such columns."""
-    header = _header(path)
+    header = csv_table.read_header(path)
     names = next((names for names in _FORCES if set(names) <= set(header)), None)
     if names is None:
         raise UserError(f"{path}: no columns of force; the header has {', '.join(header)}")
@@ -72,20 +71,10 @@ def _seconds(path: Path, header: list[str]) -> Floats:
     return np.asarray(1e-9 * time if np.nanmax(time) > _NANOSECONDS else time, np.float64)
 
 
-def _header(path: Path) -> list[str]:
-    try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            first = file.readline()
-    except (OSError, UnicodeDecodeError) as error:
-        raise UserError(f"{path}: unreadable ({error})") from None
-    cells = next(csv.reader([first], delimiter=";" if first.count(";") > first.count(",") else ","), [])
-    return [name.strip().lower() for name in cells]
-
-
 def _times(source: Path, use: dict[str, str], count: int) -> Floats:
     if "frame_time" in use:
         path = Path(use["frame_time"])
-        times = _seconds(path, _header(path))
+        times = _seconds(path, csv_table.read_header(path))
         if len(times) != count:
             raise UserError(f"{path}: {len(times)} times for {count} pictures of {source}")
         return times
@@ -101,10 +90,7 @@ def _times(source: Path, use: dict[str, str], count: int) -> Floats:
 
 
 def _pictures(folder: Path) -> list[Path]:
-    def number(path: Path) -> list[tuple[int, str]]:
-        return [(int(p), "") if p.isdigit() else (-1, p) for p in re.split(r"(\d+)", path.stem)]
-
-    return sorted((p for p in folder.iterdir() if p.suffix.lower() in STILLS), key=number)
+    return sorted((p for p in folder.iterdir() if p.suffix.lower() in STILLS), key=natural_order)
 
 
 def _folder(folder: Path) -> tuple[_Pictures, int]:

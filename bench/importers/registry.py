@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.recording import writer
+from bench.recording import clocks, writer
 from synth.errors import UserError
 from synth.system import foreign_file
 from synth.system.foreign_picture import refuse_large
@@ -39,7 +39,6 @@ _LARGEST_BYTES = 1 << 42
 _LEAST_PX = 8
 _LATEST_S = 1e11
 _LONGEST_STEP_S = 10.0
-_UNITS = {"milliseconds": 1e-3, "microseconds": 1e-6, "nanoseconds": 1e-9}
 
 MOST_FRAMES = 10_000_000
 """That a source may say it has, and times that a sensor may have in it."""
@@ -135,10 +134,13 @@ def _refuse_odd(source: Path, found: Intake) -> None:
             raise UserError(f"{source}: the time of {what} {k} is {times[k]:g}: are they in seconds?")
         step = float(np.median(np.abs(np.diff(times)))) if len(times) > 1 else 0.0
         if step >= _LONGEST_STEP_S:
-            unit = next((name for name, size in _UNITS.items() if step * size < 1), "another unit")
+            unit = next((name for name, size in clocks.UNITS.items() if step * size < 1), "another unit")
             raise UserError(
                 f"{source}: {what}s are {step:g} s apart: their times look like {unit}, not seconds"
             )
+    other = clocks.find_other_unit(found.times_s, found.force_s)
+    if other:
+        raise UserError(f"{source}: {other}")
     if len(found.times_s) == 0:
         raise UserError(f"{source}: holds no frames")
 

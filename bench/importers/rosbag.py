@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -51,9 +51,9 @@ def read_source(source: Path, use: dict[str, str]) -> Intake:
                       (("frames", _PICTURES), ("force", _FORCES), ("tip", _TIPS))}  # fmt: skip
             if topics["frames"] is None:
                 raise UserError(f"{source}: holds no topic of pictures")
-            stamps = np.array([time for time, _ in _messages(bag, topics["frames"])])
-            force = [(t, *_vector(m)) for t, m in _messages(bag, topics["force"])]
-            tip = [(t, *(1000.0 * v for v in _place(m))) for t, m in _messages(bag, topics["tip"])]
+            stamps = _table(bag, topics["frames"], lambda message: (), 0)[:, 0]
+            force = _table(bag, topics["force"], _vector, 3)
+            tip = _table(bag, topics["tip"], _place, 3) * [1.0, 1000.0, 1000.0, 1000.0]
     except (AnyReaderError, OSError, ValueError, KeyError) as error:
         raise UserError(f"{source}: not a readable bag ({str(error).splitlines()[0]})") from None
 
@@ -62,8 +62,7 @@ def read_source(source: Path, use: dict[str, str]) -> Intake:
             for _, message in _messages(bag, topics["frames"]):
                 yield _picture(source, message)
 
-    forces = np.array(force, np.float64).reshape(-1, 4)
-    return Intake(stamps, pictures, forces[:, 0], forces[:, 1:], np.array(tip, np.float64).reshape(-1, 4))
+    return Intake(stamps, pictures, force[:, 0], force[:, 1:], tip)
 
 
 def _refuse_elsewhere(folder: Path) -> None:
@@ -87,12 +86,25 @@ def _topic(bag: Any, role: str, kinds: tuple[str, ...], use: dict[str, str]) -> 
 
 
 def _messages(bag: Any, topic: str | None) -> Iterator[tuple[float, Any]]:
-    """Stamp [s] and message, in the bag's order."""
-    for connection, logged, raw in bag.messages([c for c in bag.connections if c.topic == topic]):
-        message = bag.deserialize(raw, connection.msgtype)
-        stamp = message.header.stamp
-        seconds = stamp.sec + 1e-9 * stamp.nanosec
-        yield (seconds if seconds > 0 else 1e-9 * logged), message
+    """Time on the bag's own clock [s] and message, in the bag's order; nothing of no topic."""
+    chosen = [c for c in bag.connections if c.topic == topic]
+    if not chosen:  # of which rosbags would give every message
+        return
+    for connection, logged, raw in bag.messages(chosen):
+        yield 1e-9 * logged, bag.deserialize(raw, connection.msgtype)
+
+
+def _table(
+    bag: Any, topic: str | None, read: Callable[[Any], tuple[float, ...]], width: int
+) -> NDArray[np.float64]:
+    """(N, 1 + width) times [s] and what is read of each message; one clock for all of them."""
+    rows = [
+        (logged, message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec, *read(message))
+        for logged, message in _messages(bag, topic)
+    ]
+    table = np.array(rows, np.float64).reshape(-1, 2 + width)
+    clock = 1 if (table[:, 1] > 0).any() else 0
+    return np.column_stack([table[:, clock], table[:, 2:]])
 
 
 def _vector(message: Any) -> tuple[float, float, float]:

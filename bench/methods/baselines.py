@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,9 +21,12 @@ from sklearn.neighbors import KNeighborsRegressor
 
 from bench.methods import compliance, corotational, inverse
 from bench.methods.protocol import Answer, Method, Scene
-from learn.data.grid import Grid
+from learn.data.clips import has_depth
+from learn.data.grid import Grid, certainty
 from learn.inference.force_reader import assumed_young
 from learn.inference.predict import View
+from synth.errors import UserError
+from synth.flow.stereo.track import Moved
 
 if TYPE_CHECKING:
     from learn.data.clips import Clip
@@ -31,7 +34,9 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 Rule = Callable[[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]], Floats]
 """Displacement (2, N, N) mm, mask (N, N) 0/1, confidence (N, N) → force over E, (3,) mN/kPa; NaN: magnitude
-only, in x."""
+only, in x. Of two eyes (3, N, N) mm and (2, N, N), across and along the view."""
+Space = Literal["never", "where seen", "always"]
+"""Whether a rule reads motion in three dimensions."""
 
 GRID = Grid(48)
 _COMPONENTS = 20
@@ -43,32 +48,54 @@ _SURE = 0.3
 class Baseline:
     """A rule behind the bench's protocol. The last frame put on the grid is shared between baselines."""
 
-    _last: tuple[NDArray[np.float32], Scene, NDArray[np.float32], NDArray[np.float32]] | None = None
+    _last: ClassVar[
+        dict[int, tuple[NDArray[np.float32], Scene, NDArray[np.float32], NDArray[np.float32]]]
+    ] = {}
     _view: tuple[Scene, View] | None = None
 
-    def __init__(self, rule: Rule) -> None:
-        self._rule = rule
+    def __init__(self, rule: Rule, space: Space = "never") -> None:
+        self._rule, self._space = rule, space
 
     def __call__(
         self, flow: NDArray[np.float32], confidence: NDArray[np.float32], scene: Scene, picture: bool
     ) -> Answer:
         """See `Method`."""
+        if self._space == "always":
+            raise UserError("fitted on motion in three dimensions: it needs a second eye or depth pictures")
+        return self._answer(flow, flow * np.float32(scene.scale_mm_per_px), confidence, scene)
+
+    def in_space(
+        self,
+        flow: NDArray[np.float32],
+        confidence: NDArray[np.float32],
+        moved: Moved,
+        scene: Scene,
+        picture: bool,
+    ) -> Answer:
+        """See `InSpace`."""
+        if self._space == "never":
+            return self(flow, confidence, scene, picture)
+        return self._answer(moved.motion, moved.motion, certainty(moved.deviation), scene)
+
+    def _answer(
+        self, key: NDArray[np.float32], shift: NDArray[np.float32], sure: NDArray[np.float32], scene: Scene
+    ) -> Answer:
+        """Of displacement (H, W, C) mm and its confidence ([2,] H, W); equal where `key` is the same."""
         view = Baseline._view
         if view is None or view[0] is not scene:
             Baseline._view = view = (scene, View(scene.tissue, scene.scale_mm_per_px, GRID))
-        last = Baseline._last
-        if last is None or last[0] is not flow or last[1] is not scene:
-            resample = view[1].resample
-            moved = resample.mean(flow.transpose(2, 0, 1) * scene.scale_mm_per_px, scene.tissue)
-            last = (flow, scene, moved, resample.mean(confidence, scene.tissue))
-            Baseline._last = last
+        last = Baseline._last.get(shift.shape[-1])
+        if last is None or last[0] is not key or last[1] is not scene:
+            mean = view[1].resample.mean
+            last = (key, scene, mean(shift.transpose(2, 0, 1), scene.tissue), mean(sure, scene.tissue))
+            Baseline._last[shift.shape[-1]] = last
         return Answer(assumed_young(scene.young_kpa) * self._rule(last[2], view[1].mask, last[3]))
 
 
 def physical() -> dict[str, Method]:
-    """Those that need no training data."""
+    """Those that need no training data; where a second eye sees motion along the view, they read that too."""
     zero: Method = Baseline(lambda moved, mask, sure: np.array([0.0, np.nan, np.nan]))
-    return {"zero": zero} | {name: Baseline(rule) for name, rule in physical_rules().items()}
+    return {"zero": zero} | {name: Baseline(rule, "where seen") for name, rule in physical_rules().items()}
 
 
 def physical_rules() -> dict[str, Rule]:
@@ -84,7 +111,8 @@ def physical_rules() -> dict[str, Rule]:
 
 def fitted(clips: Sequence[Clip], source: str, seed: int = 0) -> dict[str, Method]:
     """Those fitted on sequences, behind the bench's protocol. Arguments as `fitted_rules`."""
-    return {name: Baseline(rule) for name, rule in fitted_rules(clips, source, seed).items()}
+    space: Space = "always" if has_depth(source) else "never"
+    return {name: Baseline(rule, space) for name, rule in fitted_rules(clips, source, seed).items()}
 
 
 def fitted_rules(clips: Sequence[Clip], source: str, seed: int = 0) -> dict[str, Rule]:
@@ -92,7 +120,7 @@ def fitted_rules(clips: Sequence[Clip], source: str, seed: int = 0) -> dict[str,
 
     Args:
         clips: on `GRID`.
-        source: which displacement, `recovered` or `ideal`.
+        source: which displacement, `recovered` or `ideal`, of two eyes `motion` or `motion-ideal`.
         seed: of what is drawn (pixels for boosting).
     """
     moved = np.concatenate([clip.displacement[source] for clip in clips])
@@ -118,7 +146,7 @@ def fitted_rules(clips: Sequence[Clip], source: str, seed: int = 0) -> dict[str,
 
 def _peak(moved: NDArray[np.float32], mask: NDArray[np.float32]) -> float:
     """Displacement that 2% of the tissue exceeds [mm]: the largest, but for outliers."""
-    return float(np.percentile(np.hypot(*moved)[mask > 0], 98)) if (mask > 0).any() else 0.0
+    return float(np.percentile(np.linalg.norm(moved, axis=0)[mask > 0], 98)) if (mask > 0).any() else 0.0
 
 
 def _size_only(value: float) -> Floats:
@@ -151,7 +179,7 @@ def _say_power(
 
 
 def _rows(moved: NDArray[np.float32], mask: NDArray[np.float32]) -> Floats:
-    """(T, 2, N, N) mm, (T, N, N) → masked displacement, (T, 2 N N)."""
+    """(T, C, N, N) mm, (T, N, N) → masked displacement, (T, C N N)."""
     return (moved * mask[:, None]).reshape(len(moved), -1).astype(np.float64)
 
 
@@ -228,9 +256,9 @@ def _say_by_pixel(
 
 
 def _pixels(moved: NDArray[np.float32]) -> Floats:
-    """Displacement, its length and its four derivatives at every cell, (N, N, 7)."""
+    """Displacement, its length and its derivatives at every cell, (N, N, 7), of two eyes (N, N, 10)."""
     slopes = [d / GRID.pitch_mm for part in moved for d in np.gradient(part)]
-    return np.stack([*moved, np.hypot(*moved), *slopes], axis=-1).astype(np.float64)
+    return np.stack([*moved, np.linalg.norm(moved, axis=0), *slopes], axis=-1).astype(np.float64)
 
 
 def _groups(clips: Sequence[Clip]) -> NDArray[np.intp]:
@@ -242,12 +270,17 @@ def _inverse(solve: Callable[[compliance.Compliance, Floats, Floats], Floats]) -
     """Displacement at the compliance's points, from the grid, weighted by confidence."""
 
     def rule(moved: NDArray[np.float32], mask: NDArray[np.float32], sure: NDArray[np.float32]) -> Floats:
-        known = compliance.build()
+        known = compliance.build(components=len(moved))
         at = known.points.T[::-1] / GRID.pitch_mm + (GRID.size - 1) / 2
         seen = np.stack([map_coordinates(part, at, order=1, mode="nearest") for part in moved], axis=1)
-        weight = map_coordinates(mask * np.where(sure > _SURE, sure, 0), at, order=1, mode="constant")
-        if (weight > 0).sum() < 20 or not np.abs(seen).max() > 0:
+        # Flow that is hardly sure is wrong; motion in space says how far it is off, and weighs that much.
+        sure = sure.reshape(-1, *mask.shape)
+        least = _SURE if len(sure) == 1 else 0.0
+        used = (map_coordinates(mask * np.where(s > least, s, 0), at, order=1, mode="constant") for s in sure)
+        across, *along = (one.astype(np.float64) for one in used)
+        if (across > 0).sum() < 20 or not np.abs(seen).max() > 0:
             return np.zeros(3)
-        return solve(known, seen.astype(np.float64), weight.astype(np.float64))
+        weight = np.stack([across, across, *along], axis=1) if along else across
+        return solve(known, seen.astype(np.float64), weight)
 
     return rule

@@ -35,7 +35,8 @@ class Compliance:
     """Displacement seen at points of the opening for loads at nodes of it, E = 1 kPa."""
 
     matrix: Floats
-    """(2 P, 3 K): in-plane displacement [mm], x of every point, then y, for x, y, z loads of 1 mN a node."""
+    """(C P, 3 K): displacement [mm], x of every point, then y, then z if a second eye sees it (C = 3), for x,
+    y, z loads of 1 mN a node."""
     points: Floats
     """(P, 2) where displacement is seen, camera x, y from the opening's centre [mm]."""
     nodes: Floats
@@ -64,31 +65,32 @@ class Block:
         return surface_embedding.embed(self.volume, on_dome)
 
 
-def picture(carry: Embedding, moved: Floats) -> Floats:
-    """What the camera sees, (P, 2, ...) mm at points, of a volume's motion (N, 3, ...) mm in world axes."""
-    return np.asarray(np.einsum("ab,pb...->pa...", TO_CAMERA[:2], carry.move(moved)), np.float64)
+def picture(carry: Embedding, moved: Floats, components: int = 2) -> Floats:
+    """What the camera sees, (P, C, ...) mm at points, of a volume's motion (N, 3, ...) mm in world axes."""
+    return np.asarray(np.einsum("ab,pb...->pa...", TO_CAMERA[:components], carry.move(moved)), np.float64)
 
 
 @lru_cache(maxsize=4)
-def build(point_mm: float = 1.0, node_mm: float = 1.2, tets: int = 3000) -> Compliance:
+def build(point_mm: float = 1.0, node_mm: float = 1.2, tets: int = 3000, components: int = 2) -> Compliance:
     """Solves one linear problem a node and axis, on one factorisation.
 
     Args:
         point_mm: spacing of the points, which reach to the opening's edge.
         node_mm: spacing of the nodes, which stay as far inside it.
         tets: of the map's own mesh, second order.
+        components: of the displacement that is seen: 2 by one eye, 3 by two.
     """
     block = Block.build("linear", tets, 2)
     radius_mm = _ANATOMY.craniotomy.radius_mm
     points, nodes = _disc(point_mm, radius_mm), _disc(node_mm, radius_mm - node_mm)
     seen, held = block.carry(points), block.carry(nodes)
-    columns = np.empty((len(nodes), 3, 2, len(points)))
+    columns = np.empty((len(nodes), 3, components, len(points)))
     for some in np.array_split(np.arange(len(nodes)), max(1, len(nodes) // _AT_ONCE)):
         for axis in range(3):
             unit = np.einsum("kl,a->kal", np.eye(len(nodes))[:, some], TO_CAMERA[axis])
             u = block.system.solve(held.gather(unit))
-            columns[some, axis] = picture(seen, u).transpose(2, 1, 0)
-    matrix = columns.transpose(2, 3, 0, 1).reshape(2 * len(points), 3 * len(nodes))
+            columns[some, axis] = picture(seen, u, components).transpose(2, 1, 0)
+    matrix = columns.transpose(2, 3, 0, 1).reshape(components * len(points), 3 * len(nodes))
     return Compliance(matrix, points, nodes, _areas(nodes))
 
 

@@ -61,8 +61,8 @@ def one_contact(known: Compliance, displacement: Floats, weight: Floats) -> Floa
 
     Args:
         known: for the points seen.
-        displacement: (P, 2) mm.
-        weight: (P,) >= 0; 0 where nothing is seen.
+        displacement: (P, C) mm, C = 2 of one eye, 3 of two, as the compliance.
+        weight: (P,) or (P, C) >= 0; 0 where nothing is seen.
 
     Returns:
         (3,) mN for E = 1 kPa, camera axes.
@@ -92,12 +92,13 @@ def added(
         start: (N, 3) mm, a displacement nearby; None: the linear one.
 
     Returns:
-        (P, 2) mm and the volume's displacement (N, 3) mm; None without an equilibrium.
+        (P, C) mm and the volume's displacement (N, 3) mm; None without an equilibrium.
     """
     share = inverse.kernel(known, contact.place)
     load = tissue.held.gather(np.outer(share, TO_CAMERA.T @ contact.force))
     linear = tissue.system.solve(load)
-    stiff = picture(tissue.seen, linear).T.ravel()
+    components = len(known.matrix) // len(known.points)
+    stiff = picture(tissue.seen, linear, components).T.ravel()
     wanted = np.einsum("mka,k,a->m", known.matrix.reshape(len(stiff), -1, 3), share, contact.force)
     # The load that moves the stiffer mesh as far as this one moves the map's.
     give = float(stiff @ wanted) / max(float(stiff @ stiff), 1e-30)
@@ -108,4 +109,4 @@ def added(
     moved, state, rest = equilibrium.minimise_energy(tissue.system, load, begin, _TOLERANCE * size, safe)
     if not np.isfinite(state.energy) or rest > _FAILED * size:
         return None
-    return picture(tissue.seen, moved - linear), moved
+    return picture(tissue.seen, moved - linear, components), moved

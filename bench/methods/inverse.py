@@ -20,7 +20,8 @@ Floats = NDArray[np.float64]
 
 _RATIOS = np.geomspace(1e-7, 1e1, 33)
 _ALONG_VIEW = 5.0
-"""Loads along the view are let be this much larger a priori, as in depth-weighted minimum-norm imaging."""
+"""Loads along the view are let be this much larger a priori, as in depth-weighted minimum-norm imaging;
+where a second eye sees them move tissue as far as others, they are not."""
 _RADII_MM = (3.0, 4.0, 5.0, 6.0)
 _LOG_RADII = (np.log(2.0), np.log(9.0))
 _CORRELATED = 3.0
@@ -39,8 +40,8 @@ def tikhonov(compliance: Compliance, displacement: Floats, weight: Floats) -> Fl
 
     Args:
         compliance: for the points seen.
-        displacement: (P, 2) mm.
-        weight: (P,) >= 0; 0 where nothing is seen.
+        displacement: (P, C) mm, C = 2 of one eye, 3 of two, as the compliance.
+        weight: (P,) >= 0; 0 where nothing is seen; or (P, C), of each component.
 
     Returns:
         (3,) mN for E = 1 kPa, camera axes.
@@ -68,8 +69,9 @@ def _smallest(
 ) -> Floats:
     """Tikhonov's answer with loads `smooth_mm` wide at the nodes, `prior` their standard deviations."""
     used = prior > 0.05
-    root = np.sqrt(np.tile(weight, 2))
-    size = np.array([1.0, 1.0, _ALONG_VIEW]) * prior[used, None]
+    root = np.sqrt(_by_row(weight, displacement))
+    along = _ALONG_VIEW if displacement.shape[1] == 2 else 1.0
+    size = np.array([1.0, 1.0, along]) * prior[used, None]
     a = (atoms(compliance, smooth_mm)[:, used] * size).reshape(len(root), -1) * root[:, None]
     u = displacement.T.ravel() * root
     values, vectors = eigh(a.T @ a)
@@ -77,13 +79,19 @@ def _smallest(
     projected = vectors.T @ (a.T @ u)
     inside = np.divide(projected**2, values, out=np.zeros_like(values), where=values > 1e-12 * values[-1])
     outside = max(float(u @ u - inside.sum()), 0.0)
-    n = 2 * float((weight > 0).sum())
+    n = float((root > 0).sum())
     levels = np.maximum(_RATIOS * values[-1], 1e-30)
     damp = levels[:, None] / (values + levels[:, None])
     free = np.maximum(n - _CORRELATED * (1 - damp).sum(axis=1), 1e-9)
     score = (outside + (inside * damp**2).sum(axis=1)) / free**2
     x = vectors @ (projected / (values + levels[int(np.argmin(score))]))
     return np.asarray((x.reshape(-1, 3) * size).sum(axis=0), np.float64)
+
+
+def _by_row(weight: Floats, displacement: Floats) -> Floats:
+    """(C P,) weights in the order of the matrix's rows."""
+    every = weight if weight.ndim == 2 else np.repeat(weight[:, None], displacement.shape[1], axis=1)
+    return np.asarray(every.T.ravel(), np.float64)
 
 
 def _spacing(compliance: Compliance) -> float:
@@ -121,7 +129,7 @@ def contact(compliance: Compliance, displacement: Floats, weight: Floats) -> Con
     Without any motion it stands in the middle and carries nothing. The last answer is remembered: two of the
     baselines ask for the same one.
     """
-    return _contact(compliance, displacement.tobytes(), weight.tobytes())
+    return _contact(compliance, displacement.shape[1], displacement.tobytes(), weight.tobytes())
 
 
 def forget() -> None:
@@ -130,10 +138,12 @@ def forget() -> None:
 
 
 @lru_cache(maxsize=1)
-def _contact(compliance: Compliance, moved: bytes, sure: bytes) -> Contact:
-    displacement, weight = np.frombuffer(moved).reshape(-1, 2), np.frombuffer(sure)
+def _contact(compliance: Compliance, components: int, moved: bytes, sure: bytes) -> Contact:
+    displacement, weight = np.frombuffer(moved).reshape(-1, components), np.frombuffer(sure)
+    if len(weight) != len(displacement):
+        weight = weight.reshape(displacement.shape)
     # A start needs no more than every other point.
-    square = np.tile(weight, 2)[::2]
+    square = _by_row(weight, displacement)[::2]
     u = displacement.T.ravel()[::2]
     best, start = 0.0, np.zeros(3)
     for radius in _RADII_MM:
@@ -157,12 +167,12 @@ def settle(
 
     Args:
         compliance: for the points seen.
-        displacement: (P, 2) mm.
-        weight: (P,) >= 0.
+        displacement: (P, C) mm.
+        weight: (P,) or (P, C) >= 0.
         start: (3,) x, y [mm] and the logarithm of the radius.
         step: of the search's first simplex [mm].
     """
-    root = np.tile(np.sqrt(weight), 2)
+    root = np.sqrt(_by_row(weight, displacement))
     u = displacement.T.ravel() * root
     by_node = compliance.matrix.reshape(len(root), -1, 3)
     farthest = float(np.linalg.norm(compliance.nodes, axis=1).max())
@@ -212,7 +222,7 @@ def kernel(compliance: Compliance, place: Floats) -> Floats:
 
 @lru_cache(maxsize=8)
 def atoms(compliance: Compliance, radius_mm: float) -> Floats:
-    """Displacement for contacts of 1 mN spread as (1 - r^2/a^2)^2 about each node, (2 P, K, 3) mm."""
+    """Displacement for contacts of 1 mN spread as (1 - r^2/a^2)^2 about each node, (C P, K, 3) mm."""
     count = len(compliance.nodes)
     apart = np.square(compliance.nodes[:, None] - compliance.nodes[None]).sum(axis=-1) / radius_mm**2
     share = np.clip(1 - apart, 0, None) ** 2 * compliance.node_area[:, None]

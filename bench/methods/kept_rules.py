@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import os
 import pickle
 from collections.abc import Callable, Sequence
-from pathlib import Path
 
 import sklearn
 
-from bench.methods import baselines
 from bench.methods.baselines import Rule
+from synth.dataset import provenance
 from synth.system import cache
+from synth.system.whole_file import write_whole
 
 _MOST = 8
 
@@ -26,19 +25,17 @@ def keep_rules(hashes: Sequence[str], source: str, fit: Callable[[], dict[str, R
         source: which displacement they are fitted on.
         fit: fits them.
     """
-    code = Path(baselines.__file__).read_bytes()
-    said = "\n".join([sklearn.__version__, source, *hashes]).encode()
+    code = provenance.source(["bench.methods.baselines"], ("synth", "learn", "bench"))
+    said = "\n".join([code, sklearn.__version__, source, *hashes]).encode()
     folder = cache.folder("baselines")
-    file = folder / f"{hashlib.sha256(code + said).hexdigest()[:32]}.pickle"
+    file = folder / f"{hashlib.sha256(said).hexdigest()[:32]}.pickle"
     # Half a file, of a disk that was full, is no fit; nor is one of another Python.
     with contextlib.suppress(OSError, EOFError, pickle.UnpicklingError, AttributeError, ImportError):
         rules: dict[str, Rule] = pickle.loads(file.read_bytes())
         return rules
     rules = fit()
-    part = file.with_suffix(f".{os.getpid()}")
     with contextlib.suppress(OSError):
-        part.write_bytes(pickle.dumps(rules))
-        part.replace(file)
+        write_whole(file, pickle.dumps(rules), durable=False)
         for old in sorted(folder.glob("*.pickle"), key=lambda one: one.stat().st_mtime)[:-_MOST]:
             old.unlink()
     return rules

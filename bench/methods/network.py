@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.methods.protocol import Answer, Scene
+from synth.flow.stereo.track import Moved
 
 if TYPE_CHECKING:
     from learn.inference.force_reader import ForceReader
@@ -51,10 +52,31 @@ class Model:
         self, flow: NDArray[np.float32], confidence: NDArray[np.float32], scene: Scene, picture: bool
     ) -> Answer:
         """See `Method`."""
+        return self._answer(flow, confidence, None, scene, picture)
+
+    def in_space(
+        self,
+        flow: NDArray[np.float32],
+        confidence: NDArray[np.float32],
+        moved: Moved,
+        scene: Scene,
+        picture: bool,
+    ) -> Answer:
+        """See `InSpace`; a network of one eye reads flow all the same."""
+        return self._answer(flow, confidence, moved, scene, picture)
+
+    def _answer(
+        self,
+        flow: NDArray[np.float32],
+        confidence: NDArray[np.float32],
+        moved: Moved | None,
+        scene: Scene,
+        picture: bool,
+    ) -> Answer:
         from learn.inference.force_reader import ForceReader
 
         if self._reader is None or self._reader[0] is not scene:
             reader = ForceReader(self.predictor, scene.tissue, scene.scale_mm_per_px, scene.young_kpa)
             self._reader = scene, reader
-        force, said = self._reader[1].read(flow, confidence)
+        force, said = self._reader[1].read(flow, confidence, moved)
         return Answer(force, said.to_image() if picture else None)

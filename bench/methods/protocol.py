@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
+
+from synth.flow.stereo.track import Moved
 
 
 @dataclass(frozen=True)
@@ -47,4 +49,20 @@ class Method(Protocol):
             scene: the recording's constants.
             picture: whether `density` is wanted.
         """
+        ...
+
+
+@runtime_checkable
+class InSpace(Protocol):
+    """A method that can also read motion in three dimensions, where a recording has a second eye or depth."""
+
+    def in_space(
+        self,
+        flow: NDArray[np.float32],
+        confidence: NDArray[np.float32],
+        moved: Moved,
+        scene: Scene,
+        picture: bool,
+    ) -> Answer:
+        """As a `Method`; `moved`: motion [mm] in camera axes and its standard deviation, (H, W, 3) each."""
         ...

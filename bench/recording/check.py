@@ -8,9 +8,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.recording import pixel_scale
+from bench.recording import clocks, pixel_scale
 from bench.recording.folder import Recording, open_recording
 from bench.recording.meta import LEAST_INTERVALS
+from bench.recording.second_eye import SecondEye
 from learn.inference.quality import find_fault
 from learn.inference.video_flow import Account, Footage, Settings, VideoFlow
 from synth.errors import UserError
@@ -21,6 +22,8 @@ _JUMP = 3.0  # median intervals
 _SURGICAL_N = 5.0
 _RATE_HZ = 10.0  # frames a second that are looked at unless more are asked for
 _LEAST_PRESS = 5  # frames of a press that settle its gain
+_OFF_ROWS_PX = 0.5  # of small pictures: the calibration is not this pair's, or no longer
+_NOISY_MM = 0.16  # depth motion from which on force is no better than with one eye
 _LOOKED_AT = 12  # frames that are followed to see whether they can be
 
 
@@ -154,8 +157,15 @@ def _check_following(recording: Recording, found: _Findings) -> None:
     tool = recording.tool if recording.has_masks else None
     footage = Footage(pictures, str(recording.folder), recording.tissue_mask, tool, first)
     video, account = VideoFlow(footage, Settings(rate_hz=None, pulse=False)), Account()
+    second = SecondEye(recording, video) if recording.right or recording.depths else None
     for step in video.steps():
         account.add(step.found, video.tissue)
+        if second is not None:
+            second.move(step)
+    if second is not None:
+        sight = second.sight
+        odd = sight.epipolar_px > _OFF_ROWS_PX or not sight.noise_mm < _NOISY_MM
+        found.add("odd" if odd else "ok", "second eye", sight.describe())
     if account.frames:
         found.add("odd" if account.is_odd else "ok", "following", account.describe())
 
@@ -187,7 +197,8 @@ def _check_sensor(recording: Recording, times: NDArray[np.float64], found: _Find
         found.add("ok" if share > 0.9 else "odd", "clocks", said)
         ratio = (t[-1] - t[0]) / (times[-1] - times[0])
         if not 0.01 <= ratio <= 100:
-            found.add("odd", "clocks", f"the sensor's record is {ratio:.3g} times as long: seconds?")
+            said = f"the sensor's record is {ratio:.3g} times as long: seconds?"
+            found.add("odd", "clocks", clocks.find_other_unit(times, t) or said)
 
 
 def _check_spans(recording: Recording, times: NDArray[np.float64], found: _Findings) -> None:

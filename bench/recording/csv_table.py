@@ -29,14 +29,24 @@ def read_csv(
     Raises:
         UserError: unreadable, too large, a column missing, no rows, a cell that is no number (with its line).
     """
-    first, *lines = foreign_file.read_text(path, _LARGEST_BYTES, "utf-8-sig").splitlines() or [""]
-    delimiter = ";" if first.count(";") > first.count(",") else ","
-    header = [name.strip().lower() for name in _cells(path, 1, first, delimiter)]
+    header, delimiter, lines = _split(path)
     _check_header(path, header, required)
     wanted = [name for name in (*required, *optional) if name in header]
     columns = [header.index(name) for name in wanted]
     body = _body(path, lines, delimiter, columns)
     return {name: body[:, k] for k, name in enumerate(wanted)}
+
+
+def read_header(path: Path) -> list[str]:
+    """Names of the columns, in lower case. UserError if it is unreadable or too large."""
+    return _split(path)[0]
+
+
+def _split(path: Path) -> tuple[list[str], str, list[str]]:
+    """Names of the columns, what separates them, and the lines below."""
+    first, *lines = foreign_file.read_text(path, _LARGEST_BYTES, "utf-8-sig").splitlines() or [""]
+    delimiter = ";" if first.count(";") > first.count(",") else ","
+    return [name.strip().lower() for name in _cells(path, 1, first, delimiter)], delimiter, lines
 
 
 def _check_header(path: Path, header: list[str], required: Sequence[str]) -> None:
@@ -62,7 +72,13 @@ def _body(path: Path, lines: list[str], delimiter: str, columns: list[int]) -> N
     try:
         # loadtxt's C parser; the slow way only to name the line at fault.
         return np.loadtxt(
-            rows, delimiter=delimiter, usecols=columns, ndmin=2, comments=None, dtype=np.float64
+            rows,
+            delimiter=delimiter,
+            usecols=columns,
+            ndmin=2,
+            comments=None,
+            quotechar='"',
+            dtype=np.float64,
         )
     except (ValueError, IndexError):
         return np.array(

@@ -7,6 +7,8 @@ force.csv              optional: t_s,fx_n,fy_n,fz_n
 masks/NNNNNN.png       optional: white where the tool is, in the frame of that number
 mask.png               optional: the same for all frames that have none of their own
 tissue.png             optional: white where tissue may be tracked, in the rest frame
+right.mp4 or right/*.png   optional: the second eye, frame by frame, with `stereo` in meta.yaml
+depth/*.png or *.npy   optional: depth (H, W) or points (H, W, 3), frame by frame, with `depth` in meta.yaml
 """
 
 from __future__ import annotations
@@ -62,6 +64,10 @@ class Recording:
     """For frames that have none in `masks`."""
     region: tuple[int, int, int, int] | None = None
     """Left, top, width and height [px] of the part of the picture that is looked at."""
+    right: Path | tuple[Path, ...] = ()
+    """Video or pictures of the second eye; empty: none."""
+    depths: tuple[Path, ...] = ()
+    """Depth pictures; empty: none."""
 
     @property
     def has_masks(self) -> bool:
@@ -77,7 +83,9 @@ class Recording:
         return video.count_frames(self.video) if self.video else len(self.pictures)
 
     def frames(self) -> Iterator[Picture]:
-        """Upright frames in order, with times: frames.csv's, else the video's, else `fps` in meta.yaml.
+        """Upright frames in order, with times.
+
+        Those of frames.csv alone if there is one, else the video's, else by `fps` of meta.yaml.
 
         Raises:
             UserError: unreadable video or picture.
@@ -85,6 +93,12 @@ class Recording:
         source = video.read_video(self.video) if self.video else video.read_pictures(self.pictures)
         for picture in source:
             yield self._timed(picture)
+
+    def right_frames(self) -> Iterator[Picture]:
+        """The second eye's frames in order; UserError: unreadable."""
+        return (
+            video.read_pictures(self.right) if isinstance(self.right, tuple) else video.read_video(self.right)
+        )
 
     def tool(self, index: int, size: tuple[int, int]) -> NDArray[np.bool_] | None:
         """(H, W) tool mask of a frame, or None if there is none for it. UserError for one of another size."""
@@ -118,7 +132,7 @@ class Recording:
         if self.times_s is not None:
             known = picture.index < len(self.times_s) and np.isfinite(self.times_s[picture.index])
             time_s = float(self.times_s[picture.index]) if known else None
-        if time_s is None and fps is not None:
+        elif time_s is None and fps is not None:
             time_s = picture.index / fps
         return replace(picture, time_s=time_s)
 
@@ -146,8 +160,8 @@ def open_recording(folder: Path, phantom: bool = False) -> Recording:
         # Force goes with the scale as it goes with E: of either unknown, a factor is.
         about = about.model_copy(update={"young_kpa": None})
         notes.append(
-            "scale unknown: answers are per pixel, on a picture taken to be "
-            f"{meta.TAKEN_MM:g} mm wide, and right up to a factor"
+            f"scale unknown: answers are per pixel, on a picture taken to be {meta.TAKEN_MM:g} mm wide, "
+            "and right up to a factor"
         )
     times = _frame_times(folder / "frames.csv", notes)
     force = _force(folder / "force.csv", about, notes)
@@ -155,9 +169,34 @@ def open_recording(folder: Path, phantom: bool = False) -> Recording:
     tools = MaskFiles.find(folder / "masks", folder)
     still = folder / "tissue.png"
     tissue = still if os.path.lexists(still) else None
+    right, depths = _second_eye(folder, about)
     return Recording(
-        folder, about, movie, pictures, times, force, tools.numbered, tissue, tuple(notes), tools.still
+        folder, about, movie, pictures, times, force, tools.numbered, tissue, tuple(notes), tools.still,
+        None, right, depths,
+    )  # fmt: skip
+
+
+def _second_eye(folder: Path, about: Meta) -> tuple[Path | tuple[Path, ...], tuple[Path, ...]]:
+    """Video or pictures of the right eye, and depth pictures; UserError if meta.yaml says otherwise."""
+    movies = sorted(path for path in folder.glob("right.*") if path.suffix.lower() in video.SUFFIXES)
+    pictures = tuple(sorted(folder.glob("right/*.png"), key=natural_order))
+    depths = tuple(
+        sorted(
+            (path for path in folder.glob("depth/*") if path.suffix in (".png", ".npy")), key=natural_order
+        )
     )
+    if len(movies) + bool(pictures) > 1:
+        raise UserError(f"{folder}: holds {movies[0].name} and right/ or another right.*; keep one of them")
+    right = movies[0] if movies else pictures
+    for found, said, key, what in (
+        (right, about.stereo, "stereo", "right.mp4 or right/*.png"),
+        (depths, about.depth, "depth", "depth/*.png or depth/*.npy"),
+    ):
+        if found and said is None:
+            raise UserError(f"{folder}: holds {what}; meta.yaml must say how it is calibrated ({key}:)")
+        if said is not None and not found:
+            raise UserError(f"{folder}: meta.yaml says {key}, but there is no {what}")
+    return right, depths
 
 
 def _from_start(
@@ -199,7 +238,7 @@ def _spans_from(about: Meta, start: float) -> Meta:
 
 def _footage(folder: Path) -> tuple[Path | None, tuple[Path, ...]]:
     movies = sorted(path for path in folder.glob("video.*") if path.suffix.lower() in video.SUFFIXES)
-    pictures = tuple(sorted(folder.glob("frames/*.png"), key=_natural))
+    pictures = tuple(sorted(folder.glob("frames/*.png"), key=natural_order))
     if len(movies) + bool(pictures) > 1:
         found = [path.name for path in movies] + ["frames/"] * bool(pictures)
         raise UserError(f"{folder}: holds {' and '.join(found)}; keep one of them")
@@ -208,7 +247,8 @@ def _footage(folder: Path) -> tuple[Path | None, tuple[Path, ...]]:
     return (movies[0] if movies else None), pictures
 
 
-def _natural(path: Path) -> list[tuple[int, str]]:
+def natural_order(path: Path) -> list[tuple[int, str]]:
+    """Key that sorts names by the numbers in them: a2 before a10."""
     parts = re.split("([0-9]+)", path.stem)  # every second is a number
     return [(int(part), "") if k % 2 else (-1, part) for k, part in enumerate(parts)]
 

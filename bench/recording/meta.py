@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import (
+    AfterValidator,
     BaseModel,
     BeforeValidator,
     ConfigDict,
@@ -26,7 +27,15 @@ Positive = Annotated[FiniteFloat, Field(gt=0)]
 Share = Annotated[FiniteFloat, Field(ge=0, lt=1)]
 Point = tuple[FiniteFloat, FiniteFloat]
 Row = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
-Span = tuple[FiniteFloat, FiniteFloat]
+
+
+def _must_run_forward(span: tuple[float, float]) -> tuple[float, float]:
+    if span[0] >= span[1]:
+        raise ValueError(f"a span must end after its beginning, not run from {span[0]:g} to {span[1]:g} s")
+    return span
+
+
+Span = Annotated[tuple[FiniteFloat, FiniteFloat], AfterValidator(_must_run_forward)]
 
 
 TAKEN_MM = 32.0
@@ -94,7 +103,8 @@ class Sensor(_Section):
     free_s: tuple[Span, ...] = ()
     """Spans without contact, (from, to) on the sensor's clock [s]: for tare, drift and noise floor."""
     mass_g: Annotated[FiniteFloat, Field(ge=0)] = 0.0
-    """Mass beyond a tool-mounted sensor [g], for gravity; needs columns gx, gy, gz in force.csv."""
+    """Mass beyond a tool-mounted sensor [g], for gravity; needs columns gx, gy, gz in force.csv: the unit
+    vector along gravity in the sensor's axes."""
 
     @model_validator(mode="after")
     def _is_a_rotation(self) -> Sensor:
@@ -133,6 +143,27 @@ class Pulse(_Section):
     """Spans of video time without contact, (from, to) [s], to find it on; without, the video alone says."""
 
 
+class Stereo(_Section):
+    """The second eye of `right.mp4` or `right/`."""
+
+    calibration: Path
+    """The pair's calibration as OpenCV writes it (K1, D1, K2, D2, R, T), in the recording's folder; for
+    pictures of the size that the recording has."""
+    mm_per_unit: Positive = 1.0
+    """Millimetres in a unit of T: the side of a chessboard's square, say."""
+
+
+class Depth(_Section):
+    """The depth pictures of `depth/`, on the video's pixels."""
+
+    focal_px: Positive
+    """Focal length of the video's pictures [px]."""
+    centre_px: Point | None = None
+    """Principal point (x, y) [px]; the middle if not given."""
+    mm_per_unit: Positive = 1.0
+    """Millimetres in a unit of the pictures: 1 for the 16-bit PNG of most depth cameras."""
+
+
 class Meta(_Section):
     """One recording."""
 
@@ -159,6 +190,10 @@ class Meta(_Section):
     """`phantom`: made to be pushed hard, so that forces beyond any brain's are no mistake."""
     specimen: str = ""
     """Name of the specimen; recordings of one specimen are never treated as independent."""
+    stereo: Stereo | None = None
+    """Of a recording with a second eye."""
+    depth: Depth | None = None
+    """Of a recording with a depth camera."""
     sensor: Sensor = Sensor()
     sync: Sync = Sync()
     pulse: Pulse = Pulse()
@@ -167,6 +202,8 @@ class Meta(_Section):
     def _scale_is_known(self) -> Meta:
         if (self.scale_mm_per_px is None) == (self.calibration is None):
             raise ValueError("give either scale_mm_per_px or calibration")
+        if self.stereo is not None and self.depth is not None:
+            raise ValueError("give stereo or depth, not both")
         if self.sync.method == "correlate" and self.sync.calibration_s is None:
             raise ValueError("sync.method correlate needs sync.calibration_s")
         return self

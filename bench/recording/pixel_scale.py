@@ -1,4 +1,8 @@
-"""Millimetres a pixel, and how sure they are. Force goes with the scale, so 5% of scale is 5% of force."""
+"""Millimetres a pixel, and how sure they are.
+
+At equal flow in pixels both the depth u and the size a of the dent go with the scale. On an elastic body
+F = E a² g(u/a), so force goes with the scale's square: 5% of scale is 10% of force.
+"""
 
 from __future__ import annotations
 
@@ -67,7 +71,7 @@ def _bar(ends: tuple[tuple[float, float], tuple[float, float]], length_mm: float
 
 
 def _checkerboard(path: Path, corners: tuple[int, int], square_mm: float) -> Scale:
-    """Mean length of the squares' sides around the picture's middle; its spread over the board is the error.
+    """Mean length of the squares' sides over the whole board; their spread is the error.
 
     On a board that lies flat and square to the view all sides are equal; tilt and distortion show as spread.
     """

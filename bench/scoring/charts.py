@@ -109,6 +109,19 @@ def _shade(time_s: NDArray[np.float64], span: tuple[int, int]) -> Figure:
     }  # fmt: skip
 
 
+def draw_components(result: Result) -> Figure:
+    """The main method's force along the camera's axes over time, and the sensor's where it has them."""
+    time, force = _list(result.time_s), result.methods[result.main].force_mn
+    sensor = result.sensor_axes_mn if result.methods[result.main].components else None
+    data: list[Figure] = []
+    for k, axis in enumerate(("x, right", "y, down", "z, away")):
+        if sensor is not None:
+            data.append(_line(time, sensor[:, k], f"{axis}: sensor", OTHERS[k], width=1, dash="dot"))
+        data.append(_line(time, force[:, k], axis, OTHERS[k], width=2))
+    unit = "force [mN]" if result.absolute else "force [mN a kPa]"
+    return _figure(data, "time [s]", unit, legend=True)
+
+
 def draw_correlogram(found: Offset) -> Figure:
     """Correlation of force and motion at every offset that was tried, and the one that was found best."""
     offsets, r = np.array(found.correlogram).T

@@ -28,6 +28,7 @@ from synth.system import whole_file
 MAIN = "D2FNet"
 """Name under which the given model stands in every table."""
 _ROOM_BYTES = 32 << 20  # score.json and report.html, with the charts' program in it
+_MARK = "made-by-demo.txt"
 _LONG = 100
 """Frames from which a second process is worth the seconds that it takes to start."""
 
@@ -102,7 +103,7 @@ def _score(
         network = Model(model, quick=True)
         methods: dict[str, Method] = {MAIN: network}
         methods |= {name: Model(folder, quick=True) for name, folder in (also or {}).items()}
-        methods |= fit_baselines(train, model)
+        methods |= fit_baselines(train, model, bool(opened.right or opened.depths))
         found = pixel_scale.find_scale(opened.meta, opened.folder)
         with counting(f"scoring {opened.name}", total) as progress:
             about = {"model": network.described()}
@@ -115,10 +116,11 @@ def _worth_a_process(frames: int | None) -> bool:
     return len(os.sched_getaffinity(0)) > 1 and (frames or _LONG) >= _LONG
 
 
-def fit_baselines(train: Path | None, model: Path) -> dict[str, Method]:
+def fit_baselines(train: Path | None, model: Path, two_eyes: bool = False) -> dict[str, Method]:
     """Those that need no data, and, given the training data, those fitted on the model's own fit sequences.
 
-    They are fitted once for a model, and kept for its next recording.
+    They are fitted once for a model, and kept for its next recording; for one with a second eye on motion in
+    three dimensions, if the data have it.
 
     Raises:
         UserError: none of the model's sequences is in `train`.
@@ -137,12 +139,15 @@ def fit_baselines(train: Path | None, model: Path) -> dict[str, Method]:
     if not chosen:
         raise UserError(f"{train}: holds none of the sequences that {model} was fitted on")
     source = "recovered" if all("flow_recovered" in s for s in chosen) else "ideal"
+    if two_eyes and all("motion_recovered" in s for s in chosen):
+        source = "motion"
 
     def fit() -> dict[str, baseline.Rule]:
         return baseline.fitted_rules([read_clip(s, baseline.GRID, (source,)) for s in chosen], source)
 
     rules = kept_rules.keep_rules([s.attrs["content_hash"] for s in chosen], source, fit)
-    return methods | {name: baseline.Baseline(rule) for name, rule in rules.items()}
+    space: baseline.Space = "always" if source == "motion" else "never"
+    return methods | {name: baseline.Baseline(rule, space) for name, rule in rules.items()}
 
 
 def score_demo(dataset: Path, model: Path, out: Path, settings: Settings) -> Result:
@@ -154,15 +159,19 @@ def score_demo(dataset: Path, model: Path, out: Path, settings: Settings) -> Res
         out: gets recording/, score.json and report.html; what an earlier demo left there is replaced.
 
     Raises:
-        UserError: the model has seen every sequence, or as `score_recording`.
+        UserError: the model has seen every sequence, a recording/ that no demo left, or as
+            `score_recording`.
     """
     chosen = find_unseen(dataset, model)
     folder = out / "recording"
     if folder.is_symlink():
         raise UserError(f"{folder}: is a link, which is not followed; remove it")
     if folder.exists():
+        if not (folder / _MARK).is_file():
+            raise UserError(f"{folder}: not from `bench demo`, so not replaced; remove it, or say --out")
         shutil.rmtree(folder)
     export_recording(chosen, folder)
+    (folder / _MARK).write_text("`bench demo` wrote this folder and replaces it when it runs again.\n")
     return score_recording(
         folder, model, out, settings, f"Force from video: sequence {chosen.index}, unseen in training"
     )

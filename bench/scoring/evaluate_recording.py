@@ -17,6 +17,7 @@ from bench import bootstrap
 from bench.bootstrap import Interval
 from bench.methods.flow_size import FlowSize, flow_sizes
 from bench.methods.protocol import Method
+from bench.recording import clocks
 from bench.recording.folder import Force, Recording
 from bench.recording.pixel_scale import Scale
 from bench.scoring import metrics
@@ -87,7 +88,7 @@ class Result:
     methods: dict[str, Scored]
     scale: Scale
     relative_uncertainty: float
-    """Of every force, from scale and stiffness."""
+    """One standard deviation of every force, from scale (whose square force goes with) and stiffness."""
     noise_floor_mn: float
     scored: NDArray[np.bool_]
     """(T,) whether the frame counts: calibration spans don't."""
@@ -164,7 +165,7 @@ def evaluate_recording(
             for name, one in _all_scored(time, forces, main, truth, kept, recording).items()
         },
         scale=scale,
-        relative_uncertainty=math.hypot(scale.uncertainty, meta.young_uncertainty),
+        relative_uncertainty=math.hypot(2 * scale.uncertainty, meta.young_uncertainty),
         noise_floor_mn=truth.floor_mn,
         scored=kept,
         lost=lost,
@@ -286,6 +287,10 @@ def _truth(recording: Recording, done: Tracked, time: Curve, notes: list[str]) -
     if covered == 0:
         notes.append("force.csv and the video share no time: predictions only; are both clocks in seconds?")
         return _Truth(steps=processed.steps, sync=found)
+    other = clocks.find_other_unit(time, force.time_s)
+    if other:
+        notes.append(f"{other}: predictions only, nothing is scored")
+        return _Truth()
     if covered < len(time):
         notes.append(f"the sensor covers {covered} of {len(time)} frames; only those are scored")
     return _Truth(axes, processed.noise_floor_mn, processed.steps, found)
@@ -296,9 +301,10 @@ def _offset(force: Force, recording: Recording, done: Tracked, time: Curve) -> O
     assert about.calibration_s is not None
     inside = (time >= about.calibration_s[0]) & (time <= about.calibration_s[1])
     smooth = force_sensor.process_force(force, recording.meta.sensor, 0.0)
-    return clock_sync.find_offset(
-        time[inside], np.array(done.speed)[inside], smooth.time_s, smooth.force_mn, about.search_s
-    )
+    trusted = np.array(done.trusted)
+    # A speed is of two frames: where either is lost it is of the flow's mistake.
+    speed = np.where(trusted & np.append(True, trusted[:-1]), done.speed, np.nan)
+    return clock_sync.find_offset(time[inside], speed[inside], smooth.time_s, smooth.force_mn, about.search_s)
 
 
 def _scored(
@@ -370,6 +376,7 @@ def as_json(result: Result) -> dict[str, Any]:
         "noise_floor_mn": result.noise_floor_mn,
         "fault": done.fault,
         "pulse": done.pulse,
+        "second_eye": None if done.sight is None else asdict(done.sight),
         "aligned": result.aligned,
         "sync": None if result.sync is None else asdict(result.sync),
         "notes": list(result.notes),

@@ -55,7 +55,8 @@ def headline(result: Result) -> Headline:
     warnings = []
     if result.sync is not None and not result.aligned:
         warnings.append(
-            f"The clocks could not be aligned ({result.sync.refused}): scored as they stand in the files"
+            f"The clocks could not be aligned ({result.sync.refused}): scored at the offset stated, "
+            f"{result.settings['meta']['sync']['offset_s']:g} s"
         )
     tiles: list[Tile] = []
     if math.isfinite(main.calibrated.get("mae_mn", math.nan)):

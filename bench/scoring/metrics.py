@@ -177,28 +177,43 @@ def events(time_s: Curve, contact: NDArray[np.bool_], shortest_s: float = 0.15) 
 
 
 def per_event(time_s: Curve, sensor: Curve, predicted: Curve, spans: list[Event]) -> list[dict[str, float]]:
-    """One row a contact: peaks [mN], impulses [mN s] (trapezoidal) and their errors."""
+    """One row a contact: peaks [mN], impulses [mN s] (trapezoidal) and their errors.
+
+    Times, peak and impulse are the sensor's alone. Errors are over the samples that have a prediction, and
+    NaN where fewer than two have.
+    """
     rows = []
     for span in spans:
         part = slice(span.start, span.stop)
-        good = np.isfinite(sensor[part]) & np.isfinite(predicted[part])
-        if good.sum() < 2:
+        felt = np.isfinite(sensor[part])
+        if felt.sum() < 2:
             continue
-        t, x, y = time_s[part][good], sensor[part][good], predicted[part][good]
-        peak, impulse = float(x.max()), float(np.trapezoid(x, t))
+        t, x, y = time_s[part][felt], sensor[part][felt], predicted[part][felt]
         rows.append(
             {
                 "from_s": float(t[0]),
                 "to_s": float(t[-1]),
-                "peak_mn": peak,
-                "predicted_peak_mn": float(y.max()),
-                "peak_error": ratio(float(y.max()) - peak, peak),
-                "impulse_mns": impulse,
-                "impulse_error": ratio(float(np.trapezoid(y, t)) - impulse, impulse),
-                "mae_mn": float(np.abs(y - x).mean()),
+                "peak_mn": float(x.max()),
+                "impulse_mns": float(np.trapezoid(x, t)),
+                **_event_errors(t, x, y),
             }
         )
     return rows
+
+
+def _event_errors(t: Curve, x: Curve, y: Curve) -> dict[str, float]:
+    """What a contact's prediction `y` makes of the sensor's `x` where there is one."""
+    said = np.isfinite(y)
+    if said.sum() < 2:
+        return dict.fromkeys(("predicted_peak_mn", "peak_error", "impulse_error", "mae_mn"), float("nan"))
+    t, x, y = t[said], x[said], y[said]
+    peak, impulse = float(x.max()), float(np.trapezoid(x, t))
+    return {
+        "predicted_peak_mn": float(y.max()),
+        "peak_error": ratio(float(y.max()) - peak, peak),
+        "impulse_error": ratio(float(np.trapezoid(y, t)) - impulse, impulse),
+        "mae_mn": float(np.abs(y - x).mean()),
+    }
 
 
 def contact_scores(sensor: Curve, predicted: Curve, threshold_mn: float) -> dict[str, float]:
@@ -308,7 +323,8 @@ def limits_of_agreement(difference: Curve, group: NDArray[np.integer]) -> dict[s
 
 
 def _mean_size(rows: list[dict[str, float]], key: str) -> float:
-    return float(np.mean([abs(row[key]) for row in rows])) if rows else float("nan")
+    sizes = [abs(row[key]) for row in rows if np.isfinite(row[key])]
+    return float(np.mean(sizes)) if sizes else float("nan")
 
 
 def ratio(above: float, below: float) -> float:

@@ -13,6 +13,7 @@ import numpy as np
 from bench.bootstrap import over_groups
 from bench.output import charts, machine, result_page
 from bench.output import write as results
+from bench.scoring.evaluate_recording import MOST_LOST
 from bench.scoring.metrics import METRICS
 from synth.errors import UserError
 from synth.system import foreign_file
@@ -51,7 +52,8 @@ def read(paths: Sequence[Path]) -> list[dict[str, Any]]:
     if twice:
         raise UserError(f"recording {min(twice)} is given twice")
     if not any(_reason(tree) == "" for tree in found):
-        raise UserError("none of the recordings was scored against a sensor")
+        why = "; ".join(f"{tree['recording']}: {_reason(tree)}" for tree in found)
+        raise UserError(f"no recording that can be pooled ({why})")
     if len({tree["main"] for tree in found}) > 1:
         raise UserError("the scores are of different main methods")
     return found
@@ -60,7 +62,7 @@ def read(paths: Sequence[Path]) -> list[dict[str, Any]]:
 def pool(found: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Means over recordings with 95% intervals, specimens resampled; methods that all have.
 
-    Recordings that were not scored (no sensor, clocks not aligned) are left out and named.
+    Recordings that were not scored (no sensor, clocks not aligned, too much lost) are left out and named.
     """
     every, found = found, [tree for tree in found if not _reason(tree)]
     methods = [m for m in found[0]["methods"] if all(m in tree["methods"] for tree in found)]
@@ -93,7 +95,12 @@ def pool(found: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 
 def _reason(tree: dict[str, Any]) -> str:
-    """Why a recording is left out; empty if it isn't. Clocks that may be off say nothing of a method."""
+    """Why a recording is left out, as its own report gives no number; empty if it isn't."""
+    if tree.get("fault"):
+        return f"nothing can be measured: {tree['fault']}"
+    lost = tree.get("lost") or {}
+    if (lost.get("share") or 0.0) > lost.get("most", MOST_LOST):
+        return f"{100 * lost['share']:.0f}% of its frames were lost"
     refused = (tree.get("sync") or {}).get("refused")
     if refused:
         return f"clocks not aligned: {refused}"

@@ -24,7 +24,7 @@ from bench.scoring import charts, metrics
 from bench.scoring.evaluate_recording import Result
 from bench.scoring.headline import headline
 from bench.scoring.metrics import METRICS
-from bench.tracking.tracking import Snapshot, picture_masks
+from bench.tracking.tracking import Snapshot, Tracked, picture_masks
 from learn.evaluation.metrics import Metric
 from synth.dataset.folder import write_whole
 from synth.publish import picture
@@ -44,6 +44,8 @@ class Panel:
     frame: str
     flow: str
     force: str | None
+    depth: str | None = None
+    """Motion along the view."""
 
 
 def write_report(result: Result, path: Path, title: str = "") -> None:
@@ -70,6 +72,8 @@ def render_report(result: Result, title: str) -> str:
     environment.filters["shown"] = shown
     main = result.methods[result.main]
     figures = {"force": charts.draw_force(result)}
+    if np.isfinite(main.force_mn).any(axis=0).all():
+        figures["components"] = charts.draw_components(result)
     if math.isfinite(main.scores.get("mae_mn", math.nan)):
         figures["scatter"] = charts.draw_scatter(result)
         figures["bland"] = charts.draw_bland_altman(result, limits_of_agreement(result))
@@ -89,6 +93,8 @@ def render_report(result: Result, title: str) -> str:
         surely=[n for n in beaten_by(result) if (w := result.methods[n].worse_by_mn) and w[0] > 0],
         agreement="scatter" in figures,
         correlogram="correlogram" in figures,
+        components="components" in figures,
+        depth_mm=_largest_depth(result.followed),
         panels=panels,
         flow_px=flow_px,
         masks=None if (masked := picture_masks(result.followed)) is None else _jpeg(masked),
@@ -192,8 +198,26 @@ def pictures(result: Result) -> tuple[list[Panel], float, float]:
             weight = tissue * np.clip(0.15 + snap.density / max(force_kpa, 1e-12), 0, 0.9)
             dark = (0.6 * grey).astype(np.uint8)
             pushed = _jpeg(picture.overlay(dark, picture.heat(snap.density, force_kpa), weight))
-        panels.append(Panel(caption, _jpeg(snap.rgb), _jpeg(moved), pushed))
+        sunk = None
+        if snap.depth is not None:
+            sunk = _jpeg(_depth_colours(grey, snap.depth, _largest_depth(done), tissue))
+        panels.append(Panel(caption, _jpeg(snap.rgb), _jpeg(moved), pushed, sunk))
     return panels, flow_px, force_kpa
+
+
+def _largest_depth(done: Tracked) -> float:
+    """Motion along the view [mm] at full colour; 0 without a second eye."""
+    seen = [np.abs(snap.depth) for snap in done.snapshots if snap.depth is not None]
+    return max(float(np.percentile(np.stack(seen), 99.8)), 1e-3) if seen else 0.0
+
+
+def _depth_colours(
+    grey: NDArray[np.uint8], depth: NDArray[np.float32], largest: float, tissue: NDArray[np.float32]
+) -> NDArray[np.uint8]:
+    """Blue where the tissue went away from the camera, red where it came nearer, (h, w, 3)."""
+    share = np.clip(depth / largest, -1, 1)[..., None]
+    colours = np.where(share > 0, np.array([31, 111, 235]), np.array([194, 53, 43])).astype(np.uint8)
+    return picture.overlay(grey, colours, 0.85 * np.abs(share[..., 0]) * tissue)
 
 
 def moments(result: Result) -> list[tuple[str, Snapshot]]:

@@ -48,7 +48,8 @@ def find_offset(
 
     Args:
         frame_s: (T,) times of the frames in the calibration span [s].
-        speed: (T,) mean speed of the tissue over the interval that ends at each frame [mm/s].
+        speed: (T,) mean speed of the tissue over the interval that ends at each frame [mm/s]; NaN are left
+            out.
         sensor_s: (N,) the sensor's own times [s].
         force_mn: (N, 3) [mN]; NaN rows are left out.
         search_s: largest offset looked for, either way [s].
@@ -68,6 +69,12 @@ def find_offset(
     change = np.stack([_change(frame_s - offset, t, force) / widths for offset in offsets])
     moved = speed[1:]
     usable = np.isfinite(change).all(axis=0) & np.isfinite(moved)
+    followed = int(np.isfinite(moved).sum())
+    if followed < LEAST_INTERVALS:
+        return _none(
+            f"only {followed} of {len(widths)} frame intervals in the calibration span could be followed, "
+            f"{LEAST_INTERVALS} needed"
+        )
     if usable.sum() < LEAST_INTERVALS:
         return _none("the sensor doesn't cover the calibration span with the search's margin on both sides")
     change, moved = change[:, usable], moved[usable]

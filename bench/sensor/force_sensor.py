@@ -15,8 +15,10 @@ from synth.errors import UserError
 STANDARD_GRAVITY = 9.80665
 """m/s² = mN/g."""
 
-_GAP = 5.0  # median sample times after which samples are apart
+_GAP = 5.0  # sample times after which samples are apart
+_ACROSS = 32  # samples over which the sample time is taken
 _ORDER = 4
+_NO_UNIT = 0.1  # how far from 1 the length of gravity's direction may be
 
 
 @dataclass(frozen=True)
@@ -45,7 +47,8 @@ def process_force(force: Force, sensor: Sensor, offset_s: float, causal: bool = 
         causal: the low-pass runs forward only, as a live system's must (its delay is then in the curve).
 
     Raises:
-        UserError: a contact-free span without samples, a mass without gravity columns.
+        UserError: a contact-free span without samples, a mass without gravity columns, or with columns
+            that hold no unit vector.
     """
     steps: list[str] = []
     values = _weightless(force, sensor, steps)
@@ -64,7 +67,7 @@ def force_at(processed: Processed, time_s: NDArray[np.float64]) -> NDArray[np.fl
     """Force at the given times by linear interpolation, (T, 3) mN; NaN in gaps and outside the samples."""
     t, values = processed.time_s, processed.force_mn
     out = np.stack([np.interp(time_s, t, column, left=np.nan, right=np.nan) for column in values.T], axis=1)
-    step = float(np.median(np.diff(t)))
+    step = _step(t)
     after = np.clip(np.searchsorted(t, time_s), 1, len(t) - 1)
     # Frame times that fall in a hole of the sensor's record have no truth.
     hole = (t[after] - t[after - 1] > _GAP * step) & (time_s != t[after]) & (time_s != t[after - 1])
@@ -79,6 +82,13 @@ def _weightless(force: Force, sensor: Sensor, steps: list[str]) -> NDArray[np.fl
         raise UserError(
             "sensor.mass_g is given, but force.csv has no columns gx, gy, gz for the direction of gravity"
         )
+    length = np.linalg.norm(force.gravity, axis=1)
+    off = np.abs(length - 1)
+    if np.nanmax(off, initial=0.0) > _NO_UNIT:
+        raise UserError(
+            f"force.csv: gx, gy, gz have the length {length[np.nanargmax(off)]:.4g} at "
+            f"{force.time_s[np.nanargmax(off)]:.6g} s; a unit vector along gravity is needed, not m/s²"
+        )
     sign = -1.0 if sensor.acts_on == "tool" else 1.0  # the file's sign was turned on reading
     steps.append(f"weight of {sensor.mass_g:g} g beyond the sensor taken off")
     return np.asarray(force.force_mn - sign * sensor.mass_g * STANDARD_GRAVITY * force.gravity, np.float64)
@@ -90,14 +100,15 @@ def _tared(
     """Subtracts the zero: a line through the medians of the contact-free spans, constant beyond them."""
     if not sensor.free_s:
         return values, 0.0
-    middles, zeros = [], []
-    for start, stop in sorted(sensor.free_s):
+    found = []
+    for start, stop in sensor.free_s:
         inside = (time_s >= start) & (time_s <= stop) & np.isfinite(values).all(axis=1)
         if not inside.any():
             raise UserError(f"sensor.free_s: no samples between {start:g} and {stop:g} s")
-        middles.append(float(time_s[inside].mean()))
-        zeros.append(np.median(values[inside], axis=0))
-    zero = np.stack([np.interp(time_s, middles, column) for column in np.array(zeros).T], axis=1)
+        found.append((float(time_s[inside].mean()), *np.median(values[inside], axis=0)))
+    # By the middles, for a span may lie in another.
+    middles, *zeros = np.array(sorted(found)).T
+    zero = np.stack([np.interp(time_s, middles, column) for column in zeros], axis=1)
     drift = float(np.linalg.norm(zero - zero[0], axis=1).max())
     word = "tare" if len(middles) == 1 else f"tare and drift ({drift:.1f} mN)"
     steps.append(f"{word} from {len(middles)} contact-free span{'s' * (len(middles) > 1)}")
@@ -114,18 +125,20 @@ def _smooth(
     """Butterworth on each unbroken run of samples, brought to a uniform clock and back."""
     if cut_hz is None:
         return values
-    step = float(np.median(np.diff(time_s)))
+    step = _step(time_s)
     if cut_hz >= 0.4 / step:
         steps.append(f"no low-pass: {cut_hz:g} Hz is too near half the sensor's {1 / step:.4g} Hz")
         return values
     sos = signal.butter(_ORDER, cut_hz, fs=1 / step, output="sos")
     out = np.full_like(values, np.nan)
     good = np.asarray(np.isfinite(values).all(axis=1), bool)
+    short: list[int] = []
     for run in runs(time_s, good, _GAP * step):
         t = time_s[run]
         even = np.arange(t[0], t[-1] + step / 2, step)
         if len(even) <= 3 * (2 * len(sos) + 1):
             out[run] = values[run]
+            short.append(len(run))
             continue
         for k in range(values.shape[1]):
             x = np.interp(even, t, values[run, k])
@@ -137,7 +150,16 @@ def _smooth(
             out[run, k] = np.interp(t, even, y)
     way = "causal" if causal else "zero-phase"
     steps.append(f"{way} Butterworth low-pass, order {_ORDER}, {cut_hz:g} Hz")
+    if short:
+        steps.append(f"not filtered: {sum(short)} samples in {len(short)} runs too short for it")
     return out
+
+
+def _step(time_s: NDArray[np.float64]) -> float:
+    """Time from sample to sample [s]: the mean over a few dozen, so that it is true of stamps that come in
+    bursts, and the median of those means, so that holes in the record don't count."""
+    across = min(_ACROSS, max(len(time_s) // 4, 1))
+    return float(np.median(time_s[across:] - time_s[:-across])) / across
 
 
 def runs(time_s: NDArray[np.float64], good: NDArray[np.bool_], gap_s: float) -> list[NDArray[np.intp]]:

@@ -10,11 +10,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.methods.protocol import Method, Scene
+from bench.methods.protocol import InSpace, Method, Scene
 from bench.recording.folder import Recording
+from bench.recording.second_eye import SecondEye, Sight
 from learn.inference.pulse import Pulse
 from learn.inference.video_flow import Account, FlowHere, Footage, Settings, Step, VideoFlow
 from synth.errors import UserError
+from synth.flow.stereo.track import Moved
 from synth.system.stopwatch import Stopwatch
 
 A = TypeVar("A", bound=np.generic)
@@ -36,6 +38,8 @@ class Snapshot:
     """(h, w, 2), in pixels of the shrunken picture."""
     density: NDArray[np.float32] | None
     """(h, w) kPa."""
+    depth: NDArray[np.float32] | None = None
+    """(h, w) mm, motion along the view, away from the camera; None without a second eye."""
 
 
 @dataclass
@@ -65,6 +69,8 @@ class Tracked:
     timings: dict[str, dict[str, float] | float] = field(default_factory=dict)
     fault: str = ""
     """Why nothing of the video is a measurement; empty if something may be."""
+    sight: Sight | None = None
+    """What the second eye or the depth camera is good for; None: there is none, or it was not used."""
     pulse: list[dict[str, float]] = field(default_factory=list)
     """rate_hz and amplitude_mm of each rhythm of the tissue's own that was taken off."""
 
@@ -120,15 +126,23 @@ def _track(
         footage, replace(settings, pulse=settings.pulse and meta.pulse.remove), flow, pulse=pulse
     )
     asking = _Asking(methods, pictured, video.watch)
+    two = bool(recording.right or recording.depths)
+    second = SecondEye(recording, video) if two and pulse is None else None
     for step in video.steps(progress):
         asking.out.account.add(step.found, video.tissue)
         if asking.scene is None:
             asking.scene = Scene(video.tissue, scale_mm_per_px * video.shrink, meta.young_kpa)
             asking.out.rest = _shrunk(step.picture.rgb)
             asking.out.tissue = _shrunk(video.tissue.astype(np.uint8) * 255) > 127
+        moved = None
+        if second is not None:
+            with video.watch.stage("second eye"):
+                moved = second.move(step)
         if step.picture.time_s is not None:
-            asking.ask(step, step.picture.time_s, asking.scene)
+            asking.ask(step, step.picture.time_s, asking.scene, moved)
     out = asking.out
+    if second is not None:
+        out.sight = second.sight
     if not out.time_s:
         if video.seen <= meta.rest_frame:
             raise UserError(f"{recording.folder}: rest_frame {meta.rest_frame}, but {video.seen} frames")
@@ -146,6 +160,13 @@ def _track(
         out.notes.append(out.account.describe())
     if video.peak_bytes:
         out.timings["flow_peak_rss_mb"] = round(video.peak_bytes / 1e6, 1)
+    if out.sight is not None:
+        out.notes.append(out.sight.describe())
+    if two and pulse is not None:
+        # Flow without the pulse and depth with it would be a motion that nothing made.
+        out.notes.append(
+            "the tissue's own motion is off the flow, not off depth: the second eye was not used (--no-pulse)"
+        )
     if pulse is not None:
         mm_per_px = scale_mm_per_px * video.shrink
         out.pulse = [
@@ -166,7 +187,7 @@ class _Asking:
         self.last: NDArray[np.float32] | None = None
         self.stride = 1
 
-    def ask(self, step: Step, time_s: float, scene: Scene) -> None:
+    def ask(self, step: Step, time_s: float, scene: Scene, moved: Moved | None) -> None:
         """Records what the methods say of a frame at its time [s]."""
         flow, confidence, out = step.found.flow, step.found.confidence, self.out
         position = len(out.time_s)
@@ -174,7 +195,11 @@ class _Asking:
         density = None
         for name, method in self.methods.items():
             with self.watch.stage(name):
-                answer = method(flow, confidence, scene, wanted and name == self.pictured)
+                shown = wanted and name == self.pictured
+                if moved is not None and isinstance(method, InSpace):
+                    answer = method.in_space(flow, confidence, moved, scene, shown)
+                else:
+                    answer = method(flow, confidence, scene, shown)
             out.force_mn[name].append(answer.force_mn)
             if name == self.pictured:
                 density = answer.density
@@ -183,20 +208,23 @@ class _Asking:
         out.trusted.append(step.found.trusted)
         speed = 0.0
         if self.last is not None and out.time_s:
-            moved = np.linalg.norm(flow - self.last, axis=-1)[inside]
-            speed = float(moved.mean()) * scene.scale_mm_per_px / (time_s - out.time_s[-1])
+            lengths = np.linalg.norm(flow - self.last, axis=-1)[inside]
+            speed = float(lengths.mean()) * scene.scale_mm_per_px / (time_s - out.time_s[-1])
         out.speed.append(speed)
         self.last = flow
         out.frame.append(step.picture.index)
         out.time_s.append(time_s)
         if wanted:
-            self._keep(position, step, density)
+            self._keep(position, step, density, moved)
 
-    def _keep(self, position: int, step: Step, density: NDArray[np.float32] | None) -> None:
+    def _keep(
+        self, position: int, step: Step, density: NDArray[np.float32] | None, moved: Moved | None
+    ) -> None:
         """Keeps at most so many, evenly: when full, every other one goes and the stride doubles."""
         small = None if density is None else _shrunk(density)
         flow = _shrunk(step.found.flow) * np.float32(_ratio(step.picture.rgb.shape[1]))
-        self.out.snapshots.append(Snapshot(position, _shrunk(step.picture.rgb), flow, small))
+        depth = None if moved is None else _shrunk(np.ascontiguousarray(moved.motion[..., 2]))
+        self.out.snapshots.append(Snapshot(position, _shrunk(step.picture.rgb), flow, small, depth))
         if len(self.out.snapshots) >= _MOST_SNAPSHOTS:
             self.out.snapshots = self.out.snapshots[::2]
             self.stride *= 2

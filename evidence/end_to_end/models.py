@@ -47,18 +47,21 @@ def build(model: str, fit: Sequence[Clip], folder: Path, epochs: int, seed: int)
                 ]
             )
         )
-    x, force, group = _samples([t for clip in fit for t in turned(clip)])
+    x, force, group = samples(fit)
     live = np.abs(x).max(axis=0) > 0
     x = x[:, live]
-    regressor: Any = baselines.nearest(x, force)
-    if model == RIDGE:
-        # Every sequence weighs alike, as it does in the score: what is linear may be scaled.
-        size = np.array([np.sqrt(np.square(force[group == k]).sum(axis=1).mean()) for k in np.unique(group)])
-        x, force = x / size[group, None], force / size[group, None]
-        # Flow shows the force along the line of sight far less well than that across it.
-        parts = (slice(0, 2), slice(2, 3))
-        regressor = baselines.ridge(x, force, group % _FOLDS, _STRENGTHS, parts)
-    return lambda clip: clip.young_kpa * np.asarray(regressor.predict(_rows(clip)[:, live]))
+    regressor: Any = baselines.nearest(x, force) if model == NEAREST else fit_ridge(x, force, group)
+    return lambda clip: clip.young_kpa * np.asarray(regressor.predict(rows(clip)[:, live]))
+
+
+def fit_ridge(x: Floats, force: Floats, group: NDArray[np.intp]) -> Any:
+    """Ridge from displacement to force over E; arguments as `samples` gives them."""
+    # Every sequence weighs alike, as it does in the score: what is linear may be scaled.
+    size = np.array([np.sqrt(np.square(force[group == k]).sum(axis=1).mean()) for k in np.unique(group)])
+    x, force = x / size[group, None], force / size[group, None]
+    # Flow shows the force along the line of sight far less well than that across it.
+    parts = (slice(0, 2), slice(2, 3))
+    return baselines.ridge(x, force, group % _FOLDS, _STRENGTHS, parts)
 
 
 def turned(clip: Clip) -> list[Clip]:
@@ -80,14 +83,15 @@ def _turned(clip: Clip, quarter: int, mirror: bool) -> Clip:
     )
 
 
-def _rows(clip: Clip) -> Floats:
-    """Displacement of a clip, (T, 2 N N) mm."""
-    return (clip.displacement["recovered"] * clip.mask).reshape(clip.frames, -1).astype(np.float64)
+def rows(clip: Clip, source: str = "recovered") -> Floats:
+    """Displacement of a clip, (T, 2 N N) mm, of two eyes (T, 3 N N)."""
+    return (clip.displacement[source] * clip.mask).reshape(clip.frames, -1).astype(np.float64)
 
 
-def _samples(clips: Sequence[Clip]) -> tuple[Floats, Floats, NDArray[np.intp]]:
-    """All frames: displacement, force over E (n, 3), and which sequence; a sequence's turns are together."""
-    x = np.concatenate([_rows(clip) for clip in clips])
+def samples(fit: Sequence[Clip], source: str = "recovered") -> tuple[Floats, Floats, NDArray[np.intp]]:
+    """Frames of all turns: displacement, force over E (n, 3), and which sequence; its turns are together."""
+    clips = [t for clip in fit for t in turned(clip)]
+    x = np.concatenate([rows(clip, source) for clip in clips])
     force = np.concatenate([clip.force / clip.young_kpa for clip in clips])
     group = np.concatenate([np.full(clip.frames, k // _TURNS) for k, clip in enumerate(clips)])
     return x, force, group
@@ -99,18 +103,23 @@ def network_settings(epochs: int, seed: int) -> Settings:
 
 
 def _network(fit: Sequence[Clip], folder: Path, epochs: int, seed: int) -> Answer:
+    return train_network(fit, network_settings(epochs, seed), folder)
+
+
+def train_network(fit: Sequence[Clip], settings: Settings, folder: Path) -> Answer:
+    """A network of vectors; the first fifth of `fit` chooses the epoch. Its training is kept in `folder`."""
     from learn.data.split import Split
     from learn.inference.predict import load_predictor
     from learn.training.train import train
 
-    select, settings = max(2, len(fit) // 5), network_settings(epochs, seed)
+    select = max(2, len(fit) // 5)
     train(fit, Split(tuple(range(select, len(fit))), tuple(range(select)), ()), settings, folder)
     predictor = load_predictor(folder)
 
     def answer(clip: Clip) -> Floats:
         said, _ = predictor.answer(
-            np.asarray(clip.displacement["recovered"]), clip.mask, clip.young_kpa, np.asarray(clip.confidence)
+            np.asarray(clip.displacement["recovered"]), clip.mask, clip.young_kpa, clip.sure("recovered")
         )
-        return np.asarray(said.sum(axis=(2, 3)) * GRID.pitch_mm**2, np.float64)
+        return np.asarray(said.sum(axis=(2, 3)) * settings.grid.pitch_mm**2, np.float64)
 
     return answer

@@ -65,11 +65,12 @@ class Brain:
 def brain(
     on: Patch, law: str, order: int, tets: int, contact: tuple[float, float, float], poisson: float = 0.4
 ) -> Brain:
-    """Meshes, assembles and embeds."""
+    """Meshes, assembles and embeds; elements are those that a job of this order gets."""
     volume = tetrahedra.block(ANATOMY, tets, order, (contact,))
     carry = surface_embedding.embed(volume, on.vertices)
     pressure = tool.footprint(np.array(contact[:2]), contact[2], on.vertices, on.area)
-    return Brain(assemble(volume, law, poisson), carry, on.area * pressure, contact[2])
+    averaged = schema.Fem.model_validate({"order": order}).averages_volume
+    return Brain(assemble(volume, law, poisson, averaged=averaged), carry, on.area * pressure, contact[2])
 
 
 def moved(case: Brain, load: float, way: str, steps: int = 3) -> Floats:

@@ -14,7 +14,6 @@ from evidence.fem import case
 from synth.fem import equilibrium, multi_instrument, solver, surface_embedding, tool
 from synth.fem.material import Tissue
 from synth.fem.mesh import tetrahedra
-from synth.fem.system import assemble
 from synth.job import schema
 
 Row = dict[str, Any]
@@ -35,7 +34,7 @@ def gestures(on: case.Patch, load: float) -> list[Row]:
             volume = tetrahedra.block(case.ANATOMY, fem.tets, fem.order, places)
             carry, system = (
                 surface_embedding.embed(volume, on.vertices),
-                assemble(volume, law, tissue.poisson),
+                tissue.equations(volume),
             )
             courses = [tool.course(one, _FRAMES) for one in hands]
             traction = np.sum(
@@ -76,7 +75,7 @@ def _sequence(law: str, load: float) -> Row:
     memory = _peak_mb()
     carry = surface_embedding.embed(volume, on.vertices)
     times.append(time.process_time())
-    system = assemble(volume, law, tissue.poisson)
+    system = tissue.equations(volume)
     times.append(time.process_time())
     part = tool.course(gesture, _FRAMES).load
     contact = gesture.contacts[0]
@@ -101,7 +100,7 @@ def _fem(kind: str, load: float) -> schema.Fem:
 
 
 def _drawn(fem: schema.Fem, law: str) -> tuple[Tissue, tuple[tool.Gesture, ...]]:
-    tissue, rng = Tissue(1.0, 0.4, law), np.random.default_rng(0)
+    tissue, rng = Tissue(1.0, 0.4, law, averaged=fem.averages_volume), np.random.default_rng(0)
     opening = case.ANATOMY.craniotomy
     first = tool.Gesture.draw(fem, opening, tissue, rng)
     return tissue, (first, *multi_instrument.further(first, fem, opening, tissue, rng))

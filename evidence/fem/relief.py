@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json as json_
 from collections.abc import Mapping
+from functools import cache
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 from bench.output import charts, machine, write
 from bench.output.result_page import Page, Section
 from evidence.measuring import measuring
+from synth.dataset import provenance
 from synth.errors import UserError
 from synth.fem import equilibrium, surface_embedding, tool
 from synth.fem.mesh import tetrahedra
@@ -26,19 +28,32 @@ from synth.sequence.scenario import Scenario
 Floats = NDArray[np.float64]
 Row = dict[str, Any]
 _JOB = Job(sequences=1000)
+_MAKERS = (
+    "synth.fem.equilibrium",
+    "synth.fem.material",
+    "synth.fem.mesh.relief",
+    "synth.fem.mesh.tetrahedra",
+    "synth.fem.surface_embedding",
+    "synth.fem.tool",
+    "synth.job.schema",
+    "synth.render.anatomy.surface",
+)
 
 
 @measuring("--scenes 4 --tets 800,1600,5000")
 def relief(
     scenes: Annotated[int, typer.Option(help="How many of the default job.", min=1)] = 40,
     tets: Annotated[str, typer.Option(help="Tetrahedra; the last is the reference.")] = "1600,5000,20000",
-    out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder; what is there stays.")] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Folder; what this code made there stays.")
+    ] = None,
     json: Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")] = False,
 ) -> None:
     """Peak and loaded mean of default scenes at full load, by mesh, against the finest mesh."""
     sizes = [int(n) for n in tets.split(",")]
     kept = out / "relief.json" if out is not None else None
     rows: list[Row] = json_.loads(kept.read_text("utf-8"))["rows"] if kept and kept.exists() else []
+    rows = [row for row in rows if row.get("code") == code()]
     found: Row = {}
     for count in reversed(sizes):
         for index in range(scenes):
@@ -59,12 +74,19 @@ def relief(
         print(line)
 
 
+@cache
+def code() -> str:
+    """One word for what decides a row: what scenes are drawn from, their surface, mesh and equations."""
+    return provenance.source(_MAKERS, {"synth"})
+
+
 def measure_scene(index: int, count: int) -> Row:
     """Largest displacement and the mean under the load, weighted by it, mm, at a scene's full load."""
     case = scenario.draw(_JOB, index)
     surface, _ = pipeline.cortex(_JOB, case)
     height = HeightMap(surface.pia, surface.extent_mm)
-    row: Row = {"index": index, "tets": count, "kind": case.gesture.kind, "load": case.gesture.load}
+    row: Row = {"code": code(), "index": index, "tets": count}
+    row |= {"kind": case.gesture.kind, "load": case.gesture.load}
     volume = tetrahedra.block(_JOB.anatomy, count, _JOB.fem.order, tool.focus(case.gesture), height)
     try:
         return row | peak_and_mean(case, volume, surface.vertices, surface.faces)

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from bench.output import charts, result_page
 from evidence.fem import case as fem_case
 from evidence.measuring import measuring
+from synth.checks import physics
 from synth.errors import UserError
 from synth.fem import equilibrium, motion, solver, surface_embedding, tool
 from synth.fem.laws import NUMBER
@@ -57,8 +58,16 @@ def stability(
             pool.submit(random_scenes, min(_CHUNK, scenes - first), tets, seed, first)
             for first in range(0, scenes, _CHUNK)
         ]
+        living = [
+            pool.submit(random_scenes, min(_CHUNK, scenes - first), tets, seed, first, everything=True)
+            for first in range(0, scenes, _CHUNK)
+        ]
         rows = [row for part in pool.map(_run, sweeps, [tets] * len(sweeps)) for row in part]
-        return {"rows": rows, "random_scenes": _added([chunk.result() for chunk in chunks])}
+        return {
+            "rows": rows,
+            "random_scenes": _added([chunk.result() for chunk in chunks]),
+            "with_everything": _added([chunk.result() for chunk in living]),
+        }
 
 
 def _run(sweep: Callable[[int], list[Row]], tets: int) -> list[Row]:
@@ -170,14 +179,15 @@ def steps(tets: int) -> list[Row]:
     force = 0.15 * _CONTACT[2] ** 2 * np.outer(on.area * pressure, [0.0, 0.0, 1.0])
     peak = surface_embedding.embed(whole, on.vertices).gather(force)
     for law in NUMBER:
-        case = assemble(whole, law, 0.4)
+        case = assemble(whole, law, 0.4, averaged=True)
         still = equilibrium.solve_path(case, np.stack([0.5 * peak, peak]), np.full(2, 0.15)).displacement[-1]
         for step in (0.03, 0.1, 0.3, 1.0):
 
             def run(step: float = step, law: str = law, still: Floats = still) -> tuple[Floats, float]:
                 at = np.minimum(np.arange(0, 7 + step / 2, step), 1.0)
                 clock = motion.Clock(step, 1, 1.0, 2.0)
-                path = motion.march_in_time(whole, law, 0.4, 0.5, at[:, None, None] * peak, 0.15 * at, clock)
+                loads = at[:, None, None] * peak
+                path = motion.march_in_time(whole, law, 0.4, 0.5, loads, 0.15 * at, clock, averaged=True)
                 gap = path.displacement[-1] - still
                 return path.displacement[-1], float(np.linalg.norm(gap) / np.linalg.norm(still))
 
@@ -226,14 +236,36 @@ def _alone(bent: Tets, cell: int) -> bool:
     return bool(np.delete(quality(bent.points[bent.cells]), cell).min() > 0.05)
 
 
-def random_scenes(count: int, tets: int, seed: int, first: int = 0, frames: int = 12) -> Row:
-    """Scenes of the default job: each ends whole or refused by a named guard, or is counted as silent."""
-    job = schema.Job.model_validate(
-        {"seed": seed, "sequences": 10**6, "frames": frames, "fem": {"tets": tets}} | _SMALL
-    )
+def living(seed: int, index: int) -> Row:
+    """Keys of `fem` that put in all there is: membrane, pulse, nu, skull, elements, how tools touch."""
+    rng = np.random.default_rng((seed, index))
+    return {
+        "membrane": {"intact": 0.7},
+        "pulse": {"heart_mm": (0.0, 0.5), "breath_mm": (0.0, 0.6)},
+        "poisson": (0.4, 0.49),
+        "skull": ("bonded", "slip"),
+        "volume": str(rng.choice(["auto", "pointwise"], p=[0.8, 0.2])),
+        "contact": str(rng.choice(["traction", "rigid"])),
+        "tip": str(rng.choice(["flat", "sphere"])),
+        "friction": round(float(rng.uniform(0, 1)), 3),
+        "instruments": (1, 2),
+    }
+
+
+def random_scenes(
+    count: int, tets: int, seed: int, first: int = 0, frames: int = 12, *, everything: bool = False
+) -> Row:
+    """Scenes of the default job: each ends whole or refused by a named guard, or is counted as silent.
+
+    With `everything`, of one that has all that can be asked for, drawn scene by scene (`living`).
+    """
     outcome: Counter[str] = Counter()
-    least, kinds, refusals, largest = np.inf, Counter[str](), [], 0.0
+    least, kinds, refusals, largest, over = np.inf, Counter[str](), [], 0.0, 0.0
     for index in range(first, first + count):
+        asked = {"tets": tets} | (living(seed, index) if everything else {})
+        job = schema.Job.model_validate(
+            {"seed": seed, "sequences": 10**6, "frames": frames, "fem": asked} | _SMALL
+        )
         case = scenario.draw(job, index)
         try:
             motion = pipeline.move(job, case, *pipeline.build(job, case))
@@ -254,7 +286,9 @@ def random_scenes(count: int, tets: int, seed: int, first: int = 0, frames: int 
             outcome["whole"] += 1
         kinds[case.gesture.kind] += 1
         least = min(least, float(motion.min_jacobian.min()))
-        largest = max(largest, *compliance_steps(motion).values())
+        over = max(over, over_verify(motion, case, rigid=job.fem.contact == "rigid"))
+        if case.pulse is None:
+            largest = max(largest, *compliance_steps(motion).values())
     return {
         "scenes": count,
         "tets": tets,
@@ -263,8 +297,18 @@ def random_scenes(count: int, tets: int, seed: int, first: int = 0, frames: int 
         "whole_by_gesture": dict(kinds),
         "least_jacobian": least,
         "largest_step": largest,
+        "over_verify": over,
         "refusals": refusals,
     }
+
+
+def over_verify(motion: solver.Deformation, case: scenario.Scenario, *, rigid: bool) -> float:
+    """Largest step of displacement per force over what `synth verify` allows: 1 is its limit."""
+    work = motion.energy if case.pulse is None else motion.tool_work
+    pulse = None if case.pulse is None else motion.pulse_work
+    tips, footprint = motion.tip if rigid else None, case.gesture.footprint_mm
+    steps = physics.compliance_steps(work, motion.by_instrument, tips, footprint, pulse)
+    return max((step / limit for _, step, limit in steps), default=0.0)
 
 
 def compliance_steps(motion: solver.Deformation) -> dict[str, float]:
@@ -294,7 +338,8 @@ def _added(parts: list[Row]) -> Row:
         whole["whole_by_gesture"].update(part["whole_by_gesture"])
         whole["refusals"] += part["refusals"]
         whole |= {name: part[name] for name in ("tets", "frames")}
-        whole["largest_step"] = max(whole.get("largest_step", 0.0), part["largest_step"])
+        for name in ("largest_step", "over_verify"):
+            whole[name] = max(whole.get(name, 0.0), part[name])
         whole["least_jacobian"] = min(whole.get("least_jacobian", np.inf), part["least_jacobian"])
     return whole
 

@@ -62,7 +62,10 @@ def measure(file: Path, outwards: Floats, tets: list[int], refined: int) -> dict
         whole = tetrahedra.from_brain(placed, anatomy, count, 2, ((0.0, 0.0, _RADIUS_MM),))
         spent = time.process_time() - start
         corner = whole.points[whole.cells[:, :4]]
-        carry, system = surface_embedding.embed(whole, vertices), assemble(whole, "linear", 0.4)
+        carry, system = (
+            surface_embedding.embed(whole, vertices),
+            assemble(whole, "linear", 0.4, averaged=True),
+        )
         row = {
             "tets": len(whole.cells),
             "volume_kept": float(bary_slope(corner)[1].sum()) / volume,

@@ -114,8 +114,7 @@ def _export(ours: Case, folder: Path, spp: list[int]) -> None:
             "position": lamp.position.tolist(),
             "target": lamp.target.tolist(),
             "intensity": list(lamp.intensity),
-            "cutoff_deg": lamp.cutoff_deg,
-            "beam_deg": lamp.beam_deg,
+            "radius": lamp.radius,
         }
         for lamp in studio.lamps
     ]

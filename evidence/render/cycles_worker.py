@@ -85,8 +85,7 @@ def _lamp(index: int, told: dict[str, Any]) -> None:
     strength = max(told["intensity"])
     light.energy = strength * 4 * np.pi**2  # Blender's watt of a point, over solid angle and pi
     light.color = [value / strength for value in told["intensity"]]
-    light.spot_size, light.shadow_soft_size = 2 * np.deg2rad(told["cutoff_deg"]), 0.0
-    light.spot_blend = 1 - told["beam_deg"] / told["cutoff_deg"]
+    light.spot_size, light.shadow_soft_size = np.deg2rad(60.0), told["radius"]  # past the picture
     lamp = bpy.data.objects.new(f"lamp{index}", light)
     lamp.location = told["position"]
     towards = mathutils.Vector(told["target"]) - mathutils.Vector(told["position"])
@@ -114,6 +113,9 @@ def _settings(told: dict[str, Any]) -> None:
     scene.world = bpy.data.worlds.new("dark")
     scene.world.use_nodes = True
     scene.world.node_tree.nodes["Background"].inputs[1].default_value = 0.0
+    import addon_utils  # type: ignore[import-not-found]  # on the path once bpy is loaded
+
+    addon_utils.enable("cycles")  # a fresh bpy starts without it
     scene.render.engine = "CYCLES"
     scene.render.resolution_x, scene.render.resolution_y = told["size"]
     scene.render.resolution_percentage = 100

@@ -9,13 +9,14 @@ import zlib
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from learn.data.grid import Grid, Resampler, centre, settled
+from learn.data.grid import Grid, Resampler, centre, certainty, settled
+from synth.dataset import provenance
 from synth.dataset.split import name_anatomy
 from synth.dataset.store import Dataset, Sequence
 from synth.errors import UserError
@@ -23,20 +24,29 @@ from synth.job import identity
 from synth.job.types import Positive, first_problem
 from synth.system import foreign_file
 
-Input = Literal["ideal", "recovered", "noisy", "mixed"]
-INPUTS = ("ideal", "recovered", "noisy", "mixed")
+Input = Literal["ideal", "recovered", "noisy", "mixed", "motion", "motion-ideal", "motion-mixed"]
+INPUTS = get_args(Input)
 Target = Literal["density", "intensity"]
-FIELDS = {"ideal": "flow", "recovered": "flow_recovered", "noisy": "flow_noisy"}
+FIELDS = {
+    "ideal": "flow",
+    "recovered": "flow_recovered",
+    "noisy": "flow_noisy",
+    "motion": "motion_recovered",
+    "motion-ideal": "motion",
+}
 """Field of a store that holds each displacement. `noisy` is the published regime: true flow with its
-noise."""
+noise. `motion` has three components, as two eyes recover them; `motion-ideal` is the truth."""
+_MIXED = {"mixed": ("ideal", "recovered"), "motion-mixed": ("motion-ideal", "motion")}
 _CURE = {
     "ideal": "render it anew",
     "recovered": "render with flow.backend other than 'ideal'",
     "noisy": "render with store.extra: [flow_noisy]",
+    "motion": "render with render.stereo_mm and flow.backend other than 'ideal'",
+    "motion-ideal": "render with render.stereo_mm",
 }
-_VERSION = 4
 _ARRAYS = ("mask", "confidence", "density", "force")
-_FILES = {f"{name}.npy" for name in (*_ARRAYS, *(f"displacement-{source}" for source in FIELDS))}
+_SPATIAL = "motion_confidence"
+_FILES = {f"{name}.npy" for name in (*_ARRAYS, _SPATIAL, *(f"displacement-{source}" for source in FIELDS))}
 _PLAIN = ("name", "content_hash", "group", "family", "gesture", "young_kpa")
 
 
@@ -54,7 +64,8 @@ class Clip:
     mask: NDArray[np.float32]
     """(N, N) 0/1, tissue."""
     displacement: dict[str, NDArray[np.float32]]
-    """`ideal`, `recovered` and/or `noisy`: (T, 2, N, N) mm in picture axes."""
+    """`ideal`, `recovered` and/or `noisy`: (T, 2, N, N) mm in picture axes; `motion` and/or `motion-ideal`:
+    (T, 3, N, N) mm in camera axes."""
     confidence: NDArray[np.float32]
     """(T, N, N) 0..1 of the recovered flow; 1 where there is none."""
     density: NDArray[np.float32]
@@ -63,23 +74,48 @@ class Clip:
     is carried by the nearest cell that is; only what lies off the grid is in `force` alone."""
     force: NDArray[np.float64]
     """(T, 3) total force on the tissue, camera axes [mN]."""
+    motion_confidence: NDArray[np.float32] | None = None
+    """(T, 2, N, N) 0..1 of the motion that two eyes recover, across and along the view; None without it."""
 
     @property
     def frames(self) -> int:
         return len(self.density)
+
+    def sure(self, source: str) -> NDArray[np.float32]:
+        """Confidence in a displacement, (T, 1, N, N), or (T, 2, N, N) of motion; 1 where it is true."""
+        if source == "recovered":
+            return np.asarray(self.confidence)[:, None]
+        if source == "motion" and self.motion_confidence is not None:
+            return np.asarray(self.motion_confidence)
+        return np.broadcast_to(np.float32(1), (self.frames, components(source) - 1, *self.mask.shape))
+
+
+def has_depth(wanted: str) -> bool:
+    """Whether an input kind or a source is motion in three dimensions, which one eye doesn't see."""
+    return wanted.startswith("motion")
+
+
+def components(wanted: str) -> int:
+    """Of its displacement: 2 or 3."""
+    return 3 if has_depth(wanted) else 2
+
+
+def scored(wanted: Input) -> str:
+    """The source that a model of an input kind is scored on and used with: of a mixture the real one."""
+    return sources(wanted)[-1]
 
 
 def sources(wanted: Input) -> tuple[str, ...]:
     """Which displacements an input kind needs."""
     if wanted not in INPUTS:
         raise UserError(f"unknown input {wanted!r}: one of {', '.join(INPUTS)}")
-    return ("ideal", "recovered") if wanted == "mixed" else (wanted,)
+    return _MIXED.get(wanted, (wanted,))
 
 
 def read_clip(sequence: Sequence, grid: Grid, wanted: Iterable[str]) -> Clip:
     """One store on the grid.
 
-    `wanted`: any of `ideal`, `recovered`, `noisy`. Raises UserError if the store lacks the flow or has no
+    `wanted`: any of `FIELDS`. Raises UserError if the store lacks the flow (or the second eye) or has no
     tissue, or values are not those that were sealed.
     """
     attrs = sequence.attrs
@@ -87,9 +123,9 @@ def read_clip(sequence: Sequence, grid: Grid, wanted: Iterable[str]) -> Clip:
     wanted = tuple(wanted)
     for source in wanted:
         if FIELDS[source] not in sequence:
+            what = "motion of two eyes" if has_depth(source) else f"{source} flow"
             raise UserError(
-                f"{where}: holds no {source} flow (field {FIELDS[source]}); {_CURE[source]}, "
-                "or use --input ideal"
+                f"{where}: holds no {what} (field {FIELDS[source]}); {_CURE[source]}, or use --input ideal"
             )
     if attrs.get("young_kpa") is None or attrs.get("scale_mm_per_px") is None:
         raise UserError(f"{where}: lacks the attribute young_kpa or scale_mm_per_px")
@@ -98,16 +134,20 @@ def read_clip(sequence: Sequence, grid: Grid, wanted: Iterable[str]) -> Clip:
     resample = Resampler((tissue.shape[0], tissue.shape[1]), scale, centre(tissue), grid)
     mask = (resample.cover(tissue) > 0.5).astype(np.float32)
     n, frames = grid.size, sequence.frames
-    displacement = {s: np.empty((frames, 2, n, n), np.float32) for s in wanted}
+    displacement = {s: np.empty((frames, components(s), n, n), np.float32) for s in wanted}
     confidence = np.ones((frames, n, n), np.float32)
     density = np.empty((frames, 3, n, n), np.float32)
     for source in wanted:
+        mm = 1.0 if has_depth(source) else scale
         for t, flow in enumerate(sequence.read_sealed(FIELDS[source])):
-            moved = flow.transpose(2, 0, 1) * scale
-            displacement[source][t] = resample.mean(moved, tissue) * mask
+            displacement[source][t] = resample.mean(flow.transpose(2, 0, 1) * mm, tissue) * mask
     if "recovered" in wanted and "flow_confidence" in sequence:
         for t, sure in enumerate(sequence.read_sealed("flow_confidence")):
             confidence[t] = resample.mean(sure, tissue) * mask
+    spatial = None
+    if "motion" in wanted:
+        spread = sequence.read_sealed("motion_deviation")
+        spatial = np.stack([resample.mean(certainty(deviation), tissue) * mask for deviation in spread])
     for t, traction in enumerate(sequence.read_sealed("traction")):
         load = traction.transpose(2, 0, 1) * area
         density[t] = settled(resample.sum(load), mask) / np.float32(grid.pitch_mm**2 * young)
@@ -118,6 +158,7 @@ def read_clip(sequence: Sequence, grid: Grid, wanted: Iterable[str]) -> Clip:
         confidence=confidence,
         density=density,
         force=force,
+        motion_confidence=spatial,
     )
 
 
@@ -144,26 +185,29 @@ def load_clips(
 ) -> list[Clip]:
     """All sealed sequences of a dataset, in order.
 
-    `cache`: folder of packed arrays, made on first use and memory-mapped after; keyed by content hash and
-    grid, so it can be shared and can't be stale. Raises UserError for an empty dataset, and for a sequence
-    whose attributes or values are not those that were sealed.
+    `cache`: folder of packed arrays, made on first use and memory-mapped after; keyed by content hash, grid
+    and the code that packs, so it can be shared and can't be stale. Raises UserError for an empty dataset,
+    and for a sequence whose attributes or values are not those that were sealed.
     """
     wanted = tuple(wanted)
     dataset = Dataset(root)
     clips = []
+    code = "" if cache is None else provenance.source([__name__], ("synth", "learn"))
     for i, sequence in enumerate(dataset):
         report(i, len(dataset))
         clips.append(
-            read_clip(sequence, grid, wanted) if cache is None else _packed(sequence, grid, wanted, cache)
+            read_clip(sequence, grid, wanted)
+            if cache is None
+            else _packed(sequence, grid, wanted, cache, code)
         )
     report(len(dataset), len(dataset))
     return clips
 
 
-def _packed(sequence: Sequence, grid: Grid, wanted: tuple[str, ...], cache: Path) -> Clip:
+def _packed(sequence: Sequence, grid: Grid, wanted: tuple[str, ...], cache: Path, code: str) -> Clip:
     # The content hash is no word of the store's own: opening it has checked that it is its attributes', and
     # reading a field that it is the hash there. What is packed under it is what it stands for.
-    said = [sequence.attrs["content_hash"], grid.size, grid.extent_mm, *wanted, _VERSION]
+    said = [sequence.attrs["content_hash"], grid.size, grid.extent_mm, *wanted, code]
     folder = cache / hashlib.blake2b(identity.canonical(said), digest_size=16).hexdigest()
     if not folder.is_dir():
         pack(read_clip(sequence, grid, wanted), folder)
@@ -180,6 +224,8 @@ def pack(clip: Clip, folder: Path) -> None:
     """
     arrays = {name: getattr(clip, name) for name in _ARRAYS}
     arrays |= {f"displacement-{source}": values for source, values in clip.displacement.items()}
+    if clip.motion_confidence is not None:
+        arrays[_SPATIAL] = clip.motion_confidence
     plain = {name: getattr(clip, name) for name in _PLAIN}
     sums = {name: _checksum(values) for name, values in arrays.items()}
     try:
@@ -190,8 +236,11 @@ def pack(clip: Clip, folder: Path) -> None:
             for name, values in arrays.items():
                 np.save(part / f"{name}.npy", values)
             (part / "clip.json").write_text(json.dumps(plain | {"checksums": sums}))
-            if not folder.is_dir():
+            try:
                 part.rename(folder)
+            except OSError:
+                if not folder.is_dir():  # else another run was faster
+                    raise
     except OSError as error:
         raise UserError(f"{folder}: cannot be written ({error.strerror})") from None
 
@@ -221,8 +270,10 @@ def unpack(folder: Path) -> Clip:
         clip = Clip(**said.model_dump(exclude={"checksums"}), displacement=displacement, **arrays)
         frames, n = len(clip.density), clip.mask.shape[-1]
         expected = {"mask": (n, n), "confidence": (frames, n, n), "density": (frames, 3, n, n)}
-        expected |= {"force": (frames, 3)} | {s: (frames, 2, n, n) for s in displacement}
+        expected |= {"force": (frames, 3)} | {s: (frames, components(s), n, n) for s in displacement}
         found = {name: getattr(clip, name).shape for name in _ARRAYS}
+        if "motion" in displacement:
+            expected[_SPATIAL], found[_SPATIAL] = (frames, 2, n, n), arrays[_SPATIAL].shape
         found |= {s: values.shape for s, values in displacement.items()}
         if found != expected:
             raise ValueError("arrays of other shapes")

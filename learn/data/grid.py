@@ -20,8 +20,12 @@ from synth.job.types import Positive
 
 CHANNELS = ("dx", "dy", "magnitude", "mask", "divergence")
 CONFIDENCE = "confidence"
+DEPTH = ("dz", "confidence of dz")
+"""What a second eye adds, after all others; the last for a network that is told confidence."""
 SMOOTHING_MM = 0.5
 """Standard deviation of the Gaussian under the derivative [mm]; physical, so that resolutions agree."""
+HALF_SURE_MM = 0.04
+"""Standard deviation at which motion is half trusted [mm]: the error that force bears in depth motion."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +50,7 @@ class Grid:
 class Scales:
     """99.9th percentiles of the training data, by which input and target are divided; and one spread.
 
-    One scale serves dx and dy: two would make the answer depend on how the camera is turned.
+    One scale serves dx and dy (and dz): two would make the answer depend on how the camera is turned.
     """
 
     displacement_mm: Positive
@@ -187,10 +191,11 @@ def divergence(displacement: Tensor, mask: Tensor, pitch_mm: float) -> Tensor:
 
     Smoothing and differences use only masked cells (normalised convolution; at the mask's edge the
     difference is one-sided), so that the step from tissue to nothing isn't read as strain.
-    `displacement`: (B, 2, N, N) mm, `mask`: (B, 1, N, N) 0/1. Returns (B, 1, N, N).
+    `displacement`: (B, 2, N, N) mm (or 3: the third has no part in it), `mask`: (B, 1, N, N) 0/1. Returns
+    (B, 1, N, N).
     """
     sigma = SMOOTHING_MM / pitch_mm
-    smooth = _smooth(displacement * mask, sigma) / _smooth(mask, sigma).clamp_min(1e-6)
+    smooth = _smooth(displacement[:, :2] * mask, sigma) / _smooth(mask, sigma).clamp_min(1e-6)
     return (_difference(smooth[:, :1], mask, 3) + _difference(smooth[:, 1:2], mask, 2)) * mask / pitch_mm
 
 
@@ -240,16 +245,26 @@ def _smoother(size: int, sigma_px: float) -> Tensor:
 def channels(
     displacement: Tensor, mask: Tensor, pitch_mm: float, scales: Scales, confidence: Tensor | None = None
 ) -> Tensor:
-    """The network's input, in the order of CHANNELS, with `confidence` last if given.
+    """The network's input, in the order of CHANNELS, then `confidence` if given, then DEPTH of a second eye.
 
-    `displacement`: (B, 2, N, N) mm in picture axes; `mask`: (B, 1, N, N) 0/1;
-    `confidence`: (B, 1, N, N) in 0..1. Returns (B, 5 or 6, N, N), dimensionless.
+    `displacement`: (B, 2, N, N) mm in picture axes, or (B, 3, N, N) mm in camera axes; `mask`: (B, 1, N, N)
+    0/1; `confidence`: (B, 1, N, N) in 0..1, with depth (B, 2, N, N). Returns (B, 5 to 8, N, N) without unit.
     Source: Heraoui et al., the five channels of D2FNet; here in mm and with one displacement scale.
     """
     moved = displacement * mask / scales.displacement_mm
     # Not vector_norm: over so short an axis it takes ten times as long as the planes by themselves.
-    length = (moved[:, :1].square() + moved[:, 1:].square()).sqrt()
-    parts = [moved, length, mask, divergence(displacement, mask, pitch_mm) / scales.divergence]
+    length = (moved[:, :1].square() + moved[:, 1:2].square()).sqrt()
+    parts = [moved[:, :2], length, mask, divergence(displacement, mask, pitch_mm) / scales.divergence]
     if confidence is not None:
-        parts.append(confidence * mask)
+        parts.append(confidence[:, :1] * mask)
+    parts.append(moved[:, 2:])
+    if confidence is not None:
+        parts.append(confidence[:, 1:] * mask)
     return torch.cat(parts, dim=1)
+
+
+def certainty(deviation_mm: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Confidence in 0..1 of motion across and along the view, (2, ...), from its deviation (..., 3) mm."""
+    across = np.sqrt(np.square(deviation_mm[..., :2]).mean(axis=-1))
+    spread = np.stack([across, deviation_mm[..., 2]])
+    return np.asarray(1 / (1 + np.square(spread / HALF_SURE_MM)), np.float32)

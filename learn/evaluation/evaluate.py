@@ -280,8 +280,7 @@ def _answers(predictor: Predictor, clip: Clip, source: str, young: Mapping[str, 
     """
 
     def ask(given: float) -> Answer:
-        sure = np.asarray(clip.confidence) if source == "recovered" else None
-        return predictor.answer(np.asarray(clip.displacement[source]), clip.mask, given, sure)
+        return predictor.answer(np.asarray(clip.displacement[source]), clip.mask, given, clip.sure(source))
 
     if predictor.card.settings.arch.condition == "film":
         return {name: ask(given) for name, given in young.items()}

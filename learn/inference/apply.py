@@ -9,12 +9,11 @@ from functools import partial
 from itertools import chain, repeat
 from pathlib import Path
 from typing import Any, NamedTuple
-from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
 
-from learn.data.clips import FIELDS
+from learn.data.clips import FIELDS, has_depth
 from learn.inference import video
 from learn.inference.force_reader import ForceReader
 from learn.inference.mask_files import MaskFiles
@@ -24,6 +23,8 @@ from learn.inference.stiffness import stiffness
 from learn.inference.video_flow import Footage, Settings, VideoFlow, everywhere
 from synth.dataset.store import Dataset, Sequence, open_sequence
 from synth.errors import UserError
+from synth.flow.stereo.track import Moved
+from synth.system import foreign_arrays
 
 
 class Step(NamedTuple):
@@ -38,6 +39,8 @@ class Step(NamedTuple):
     time_s: float = math.nan
     trusted: bool = True
     """Whether the frame could be followed."""
+    moved: Moved | None = None
+    """In three dimensions, where two eyes saw it."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +82,8 @@ def motions(path: Path, source: str, filmed: Filmed | None = None) -> Iterator[M
     """What `path` holds: a dataset folder, one NNNNNN.zarr store, an .npz of arrays, or a video.
 
     An .npz holds `flow` (T, H, W, 2) px, `tissue` (H, W), `scale_mm_per_px`, and if known `young_kpa`,
-    `confidence` (T, H, W) and `force_mn` (T,). A video's first frame is its rest frame. Raises UserError for
+    `confidence` (T, H, W) and `force_mn` (T,); or, of two eyes, `motion` and `deviation` (T, H, W, 3) mm
+    instead of flow and confidence. A video's first frame is its rest frame. Raises UserError for
     anything else, and for a video without a scale.
     """
     if path.suffix.lower() in video.SUFFIXES:
@@ -97,17 +101,29 @@ def _stored(sequence: Sequence, source: str) -> Motion:
     if source not in FIELDS:
         raise UserError(f"unknown input {source!r}: {', '.join(FIELDS)}")
     if FIELDS[source] not in sequence:
-        raise UserError(f"{sequence.path}: holds no {source} flow")
+        what = "motion of two eyes" if has_depth(source) else f"{source} flow"
+        raise UserError(f"{sequence.path}: holds no {what} (field {FIELDS[source]})")
     scale, young = (sequence.attrs.get(name) for name in ("scale_mm_per_px", "young_kpa"))
     if scale is None or young is None:
         raise UserError(f"{sequence.path}: lacks the attribute young_kpa or scale_mm_per_px")
     sure = source == "recovered" and "flow_confidence" in sequence
     given = sequence.read_sealed("flow_confidence") if sure else repeat(None, sequence.frames)
     time_s, tissue, force = (sequence.read_whole(name) for name in ("time", "tissue", "force"))
-    frames = zip(sequence.read_sealed(FIELDS[source]), given, time_s, strict=True)
+    nothing = repeat(None, sequence.frames)
+    spread = sequence.read_sealed("motion_deviation") if source == "motion" else nothing
+    frames = zip(sequence.read_sealed(FIELDS[source]), given, spread, time_s, strict=True)
+
+    def steps() -> Iterator[Step]:
+        for t, (seen, confidence, deviation, at) in enumerate(frames):
+            if has_depth(source):
+                moved = Moved(seen, np.zeros_like(seen) if deviation is None else deviation)
+                yield Step(np.asarray(seen[..., :2] / scale, np.float32), None, t, float(at), moved=moved)
+            else:
+                yield Step(seen, confidence, t, float(at))
+
     return Motion(
         name=sequence.path.stem,
-        steps=(Step(flow, confidence, t, float(at)) for t, (flow, confidence, at) in enumerate(frames)),
+        steps=steps(),
         tissue=tissue.astype(bool),
         scale_mm_per_px=float(scale),
         young_kpa=float(young),
@@ -143,10 +159,7 @@ def _video(path: Path, filmed: Filmed, pulse: Pulse | None = None) -> Motion:
     def notes() -> list[str]:
         if pulse is None:
             return following.notes
-        return [
-            *following.notes,
-            f"the whole surface moves by itself, {pulse.describe(mm_per_px)}: taken off",
-        ]
+        return [*following.notes, pulse.describe(mm_per_px)]
 
     return Motion(
         name=path.stem,
@@ -162,35 +175,52 @@ def _video(path: Path, filmed: Filmed, pulse: Pulse | None = None) -> Motion:
 
 
 def _arrays(path: Path) -> Motion:
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            found = {name: file[name] for name in file.files}
-    except (OSError, ValueError, EOFError, BadZipFile) as error:
-        raise UserError(f"{path}: cannot be read as .npz ({error})") from None
-    missing = {"flow", "tissue", "scale_mm_per_px"} - found.keys()
+    found = foreign_arrays.read_arrays(path)
+    told = {"motion", "deviation"} if "motion" in found else {"flow"}
+    missing = (told | {"tissue", "scale_mm_per_px"}) - found.keys()
     if missing:
         raise UserError(f"{path}: lacks {', '.join(sorted(missing))}")
-    flow, tissue = found["flow"].astype(np.float32), found["tissue"].astype(bool)
-    if flow.ndim != 4 or flow.shape[1:] != (*tissue.shape, 2):
+    tissue = found["tissue"].astype(bool)
+    if tissue.ndim != 2:
+        raise UserError(f"{path}: tissue is {tissue.shape}, expected (H, W)")
+    space = [found[name].astype(np.float32) for name in ("motion", "deviation")] if len(told) == 2 else []
+    if any(one.ndim != 4 or one.shape != (len(space[0]), *tissue.shape, 3) for one in space):
+        h, w = tissue.shape
+        raise UserError(f"{path}: motion and deviation must be (T, {h}, {w}, 3) like the tissue")
+    scale = _positive(path, found, "scale_mm_per_px")
+    flow = space[0][..., :2] / scale if space else found["flow"].astype(np.float32)
+    if flow.ndim != 4 or flow.shape[1:] != (*tissue.shape, 2) or not len(flow):
         h, w = tissue.shape
         raise UserError(f"{path}: flow is {flow.shape}, expected (T, {h}, {w}, 2) like the tissue")
     confidence = found.get("confidence")
     if confidence is not None and confidence.shape != flow.shape[:3]:
         raise UserError(f"{path}: confidence is {confidence.shape}, expected {flow.shape[:3]}")
-    young, force = found.get("young_kpa"), found.get("force_mn")
+    force = found.get("force_mn")
     if force is not None and force.shape != (len(flow),):
         raise UserError(f"{path}: force_mn is {force.shape}, expected ({len(flow)},)")
     return Motion(
         name=path.stem,
         steps=(
-            Step(f, None if confidence is None else confidence[t].astype(np.float32), t)
+            Step(
+                f,
+                None if confidence is None else confidence[t].astype(np.float32),
+                t,
+                moved=Moved(space[0][t], space[1][t]) if space else None,
+            )
             for t, f in enumerate(flow)
         ),
         tissue=tissue,
-        scale_mm_per_px=float(found["scale_mm_per_px"]),
-        young_kpa=None if young is None else float(young),
+        scale_mm_per_px=scale,
+        young_kpa=_positive(path, found, "young_kpa") if "young_kpa" in found else None,
         force_mn=None if force is None else force.astype(np.float64),
     )
+
+
+def _positive(path: Path, found: dict[str, NDArray[Any]], name: str) -> float:
+    """The one number under a name. UserError if it is another number of them, or not positive."""
+    if found[name].size != 1 or not 0 < found[name].item() < math.inf:
+        raise UserError(f"{path}: {name} must be one positive number")
+    return float(found[name].item())
 
 
 def apply(predictor: Predictor, motion: Motion, young_kpa: float | None = None) -> dict[str, Any]:
@@ -208,7 +238,7 @@ def apply(predictor: Predictor, motion: Motion, young_kpa: float | None = None) 
     reader = ForceReader(predictor, motion.tissue, motion.scale_mm_per_px, young)
     frames, times, forces, maps, trusted = [], [], [], [], []
     for step in motion.steps:
-        force, said = reader.read(step.flow, step.confidence)
+        force, said = reader.read(step.flow, step.confidence, step.moved)
         frames.append(step.frame)
         times.append(step.time_s)
         forces.append(force if step.trusted else np.full(3, np.nan))
@@ -257,10 +287,7 @@ def calibrate(predictor: Predictor, press: Motion) -> float:
     if press.force_mn is None:
         raise UserError(f"{press.name}: holds no force to calibrate on (force_mn in an .npz)")
     view = View(press.tissue, press.scale_mm_per_px, predictor.grid)
-    moved, sure = [], []
-    for flow, confidence, *_ in press.steps:
-        moved.append(view.resample.mean(flow.transpose(2, 0, 1) * press.scale_mm_per_px, press.tissue))
-        if confidence is not None:
-            sure.append(view.resample.mean(confidence, press.tissue))
+    told = [predictor.on_grid(view, step.flow, step.confidence, step.moved) for step in press.steps]
+    sure = [confidence for _, confidence in told if confidence is not None]
     given = np.stack(sure) if sure else None
-    return stiffness(predictor, np.stack(moved), view.mask, press.force_mn, given)
+    return stiffness(predictor, np.stack([moved for moved, _ in told]), view.mask, press.force_mn, given)

@@ -2,11 +2,10 @@
 
 The file's input is displacement in mm on the grid, not the channels, so that nobody has to rebuild them:
 `displacement` (B, 2, N, N) mm and `mask` (B, 1, N, N) 0/1 (for some models `confidence` (B, 1, N, N) 0..1 and
-`log_young` (B, 1) ln(E/kPa)); its output is force density per unit stiffness (B, C, N, N) [mN/mm² at 1 kPa].
-Times E in kPa it is mN/mm², times the cell's area and summed, mN. A network with a total-force head gives
-that
-too, (B, C) [mN at 1 kPa]. How a picture's flow comes onto the grid
-is written into the .json beside it.
+`log_young` (B, 1) ln(E/kPa); of two eyes `displacement` (B, 3, N, N) and `confidence` (B, 2, N, N)). Its
+output is force density per unit stiffness (B, C, N, N) [mN/mm² at 1 kPa]. Times E in kPa it is mN/mm², times
+the cell's area and summed, mN. A network with a total-force head gives that too, (B, C) [mN at 1 kPa]. How a
+picture's flow comes onto the grid is written into the .json beside it.
 """
 
 from __future__ import annotations
@@ -22,8 +21,9 @@ import torch
 from torch import Tensor, nn
 
 from learn.checkpoint import Card
-from learn.data.grid import SMOOTHING_MM, channels
+from learn.data.grid import HALF_SURE_MM, SMOOTHING_MM, channels
 from learn.inference.predict import Predictor
+from learn.network.d2fnet import Architecture
 from synth.errors import UserError
 
 TOLERANCE = 1e-4
@@ -61,14 +61,15 @@ def examples(card: Card, batch: int, seed: int = 0) -> list[Tensor]:
     n = card.settings.size
     rng = np.random.default_rng(seed)
     y, x = np.meshgrid(np.linspace(-1, 1, n), np.linspace(-1, 1, n), indexing="ij")
-    a = rng.normal(size=(batch, 2, 6))
+    parts = card.settings.arch.displacements
+    a = rng.normal(size=(batch, parts, 6))
     basis = np.stack([np.ones_like(x), x, y, x * y, np.cos(3 * x), np.sin(3 * y)])
     moved = np.einsum("bck,kyx->bcyx", a, basis) * card.scales.displacement_mm / 3
     mask = np.broadcast_to(x**2 + y**2 < 0.7, (batch, 1, n, n))
     found = {
         "displacement": moved,
         "mask": mask,
-        "confidence": rng.uniform(size=(batch, 1, n, n)),
+        "confidence": rng.uniform(size=(batch, parts - 1, n, n)),
         "log_young": rng.normal(size=(batch, 1)),
     }
     return [torch.from_numpy(np.array(found[name], np.float32)) for name in input_names(card)]
@@ -128,7 +129,7 @@ def describe(card: Card, kind: str, difference: float) -> dict[str, Any]:
         else f"{card.settings.target} per unit stiffness, one component",
         "grid": {"size": grid.size, "pitch_mm": grid.pitch_mm, "extent_mm": grid.extent_mm},
         "preprocessing": [
-            "flow [px] times the picture's scale [mm/px] is displacement [mm]; x right, y down",
+            *_told(card.settings.arch),
             "the grid's centre lies on the centroid of the tissue mask in the rest picture",
             "displacement: mean over tissue pixels under hat functions as wide as the coarser of cell and "
             "pixel",
@@ -139,6 +140,19 @@ def describe(card: Card, kind: str, difference: float) -> dict[str, Any]:
         "typical_young_kpa": card.typical_young_kpa,
         "largest_difference_from_pytorch": difference,
     }
+
+
+def _told(arch: Architecture) -> list[str]:
+    """Where displacement, and the confidence of two eyes, come from."""
+    if not arch.depth:
+        return ["flow [px] times the picture's scale [mm/px] is displacement [mm]; x right, y down"]
+    said = ["displacement [mm] is motion in camera axes, x right, y down, z away, as a second eye gives it"]
+    if arch.confidence:
+        said.append(
+            "confidence, across and along the view: means over tissue of 1 / (1 + (s / s0)^2), "
+            f"s0 = {HALF_SURE_MM} mm, s the motion's standard deviation [mm] (of dx and dy the rms)"
+        )
+    return said
 
 
 def _torchscript(module: Portable, card: Card, file: Path) -> Any:

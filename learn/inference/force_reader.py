@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from learn.inference.placing import Placing, Point, share_at_border
 from learn.inference.predict import ForceMap, Predictor
+from synth.flow.stereo.track import Moved
 
 _MUCH_AT_BORDER = 0.1  # share of the force; what is spread evenly has a quarter there
 
@@ -46,18 +47,19 @@ class ForceReader:
         self._at_border = self._in_all = 0.0
 
     def read(
-        self, flow: NDArray[np.float32], confidence: NDArray[np.float32] | None
+        self, flow: NDArray[np.float32], confidence: NDArray[np.float32] | None, moved: Moved | None = None
     ) -> tuple[NDArray[np.float64], ForceMap]:
         """Total force of a frame, and the map as the model says it, nothing taken off; errors as `Predictor`.
 
-        `flow`: (H, W, 2) px; `confidence`: (H, W). The force: (3,) mN on the tissue in camera axes; of a
-        model without direction the size in x, the rest NaN.
+        `flow`: (H, W, 2) px; `confidence`: (H, W); `moved`: of two eyes. The force: (3,) mN on the tissue in
+        camera axes; of a model without direction the size in x, the rest NaN.
         """
         place = self.placing.place(flow, confidence)
-        said = self._say(flow, confidence, place)
+        said = self._say(flow, confidence, moved, place)
         if place not in self._zero:
             sure = None if confidence is None else self._tissue.astype(np.float32)
-            self._zero[place] = _total(self._say(np.zeros_like(flow), sure, place))
+            still = None if moved is None else Moved(0 * moved.motion, 0 * moved.deviation)
+            self._zero[place] = _total(self._say(np.zeros_like(flow), sure, still, place))
         force = _total(said) - self._zero[place]
         share = share_at_border(said.magnitude, said.view.mask)
         if not self.placing.fits and math.isfinite(share):
@@ -77,15 +79,19 @@ class ForceReader:
         said += f", and was moved there {self.placing.moves} times" if self.placing.moves else ""
         share = self._at_border / self._in_all if self._in_all > 0 else 0.0
         if share > _MUCH_AT_BORDER:
-            said += (
-                f"; {100 * share:.0f}% of the force lies at the border of that, and what is beyond is lost"
-            )
+            said += f"; {100 * share:.0f}% of the force lies at the border of that, what is beyond is lost"
         return [said]
 
     def _say(
-        self, flow: NDArray[np.float32], confidence: NDArray[np.float32] | None, place: Point
+        self,
+        flow: NDArray[np.float32],
+        confidence: NDArray[np.float32] | None,
+        moved: Moved | None,
+        place: Point,
     ) -> ForceMap:
-        said = self._predictor(flow, self._tissue, self._scale, self._young_kpa, confidence, place)
+        said = self._predictor(
+            flow, self._tissue, self._scale, self._young_kpa, confidence, moved, centre_px=place
+        )
         if said.young_known:
             return said
         part = assumed_young(None) / said.young_kpa

@@ -14,10 +14,12 @@ from torch import nn
 
 from learn import checkpoint
 from learn.checkpoint import Card
-from learn.data.grid import Grid, Resampler, centre, channels
+from learn.data.clips import FIELDS, has_depth
+from learn.data.grid import Grid, Resampler, centre, certainty, channels
 from learn.network.d2fnet import fused
 from learn.network.traced import Quick
 from synth.errors import UserError
+from synth.flow.stereo.track import Moved
 
 
 @dataclass(frozen=True)
@@ -116,6 +118,21 @@ class Predictor:
             self._say = Quick(model, card.settings.arch, card.settings.size)
         self._view: View | None = None
 
+    def readable(self, source: str) -> str:
+        """The source of displacement as given, if this model can read it; else UserError."""
+        fit = [name for name in FIELDS if has_depth(name) == self.card.settings.arch.depth]
+        if source not in fit:
+            raise UserError(
+                f"this model can't read input {source!r}: it takes {', '.join(fit)}"
+                if source in FIELDS
+                else f"unknown input {source!r}: one of {', '.join(fit)}"
+            )
+        return source
+
+    def stored(self, source: str | None) -> str:
+        """The same, of a store: what a real pipeline recovers if none is given."""
+        return self.readable(source or ("motion" if self.card.settings.arch.depth else "recovered"))
+
     def view(
         self,
         tissue: NDArray[np.bool_],
@@ -141,28 +158,58 @@ class Predictor:
         scale_mm_per_px: float,
         young_kpa: float | None = None,
         confidence: NDArray[np.float32] | None = None,
+        moved: Moved | None = None,
+        *,
         centre_px: tuple[float, float] | None = None,
     ) -> ForceMap:
         """Force map of one frame.
 
         `flow`: (H, W, 2) px, motion from the rest frame on the rest frame's pixels; `tissue`: (H, W) bool;
         `young_kpa`: None stands for the training data's typical value; `confidence`: (H, W) 0..1, used only
-        by a model with that channel (1 if not given); `centre_px`: as of `View`. Raises UserError for other
-        shapes or values that aren't finite.
+        by a model with that channel (1 if not given); `moved`: motion in three dimensions and its deviation,
+        which a model of two eyes is told instead of flow and confidence; `centre_px`: as of `View`. Raises
+        UserError for other shapes or values that aren't finite, and where such a model is told of one eye
+        alone.
         """
-        if flow.ndim != 3 or flow.shape[2] != 2 or flow.shape[:2] != tissue.shape:
-            raise UserError(f"flow: expected ({tissue.shape[0]}, {tissue.shape[1]}, 2), got {flow.shape}")
         if young_kpa is not None and not (np.isfinite(young_kpa) and young_kpa > 0):
             raise UserError(f"young_kpa {young_kpa}: must be positive")
         view = self.view(tissue, scale_mm_per_px, centre_px)
-        moved = view.resample.mean(flow.transpose(2, 0, 1) * view.resample.scale_mm_per_px, view.tissue)
-        sure = None if confidence is None else view.resample.mean(confidence, view.tissue)[None]
+        displacement, sure = self.on_grid(view, flow, confidence, moved)
         young = young_kpa or self.card.typical_young_kpa
-        density, total = self.answer(moved[None], view.mask, young, sure)
+        known = None if sure is None else sure[None]
+        density, total = self.answer(displacement[None], view.mask, young, known)
         head = None if total is None else total[0]
         return ForceMap(
             density[0], self.grid, self.card.settings.target, young, young_kpa is not None, view, head
         )
+
+    def on_grid(
+        self,
+        view: View,
+        flow: NDArray[np.float32],
+        confidence: NDArray[np.float32] | None = None,
+        moved: Moved | None = None,
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
+        """What the network is told of a frame: displacement (C, N, N) mm and its confidence (C - 1, N, N).
+
+        Arguments and errors as `__call__`.
+        """
+        height, width = view.tissue.shape
+        if flow.shape != (height, width, 2):
+            raise UserError(f"flow: expected ({height}, {width}, 2), got {flow.shape}")
+        mean = view.resample.mean
+        if not self.card.settings.arch.depth:
+            shift = mean(flow.transpose(2, 0, 1) * view.resample.scale_mm_per_px, view.tissue)
+            return shift, None if confidence is None else mean(confidence, view.tissue)[None]
+        if moved is None:
+            raise UserError(
+                "this model reads motion in three dimensions: it needs a second eye or depth pictures"
+            )
+        for what, values in (("motion", moved.motion), ("its deviation", moved.deviation)):
+            if values.shape != (height, width, 3):
+                raise UserError(f"{what}: expected ({height}, {width}, 3), got {values.shape}")
+        shift = mean(moved.motion.transpose(2, 0, 1), view.tissue)
+        return shift, mean(certainty(moved.deviation), view.tissue)
 
     def density(
         self,
@@ -184,15 +231,17 @@ class Predictor:
     ) -> tuple[NDArray[np.float32], NDArray[np.float64] | None]:
         """Force density of frames already on the grid, and their total force if the network has that head.
 
-        `displacement`: (T, 2, N, N) mm; `mask`: (N, N) 0/1; `confidence`: (T, N, N). Returns (T, C, N, N)
-        mN/mm² at `young_kpa` and (T, C) mN or None. Raises UserError for another grid, and for displacement
-        or an answer that isn't finite.
+        `displacement`: (T, 2, N, N) mm, of a model of two eyes (T, 3, N, N); `mask`: (N, N) 0/1;
+        `confidence`: (T, 1, N, N), with depth (T, 2, N, N). Returns (T, C, N, N) mN/mm² at `young_kpa` and
+        (T, C) mN or None. Raises UserError for another grid or number of components, and for displacement or
+        an answer that isn't finite.
         """
         n, settings, scales = self.grid.size, self.card.settings, self.card.scales
-        if displacement.ndim != 4 or displacement.shape[1:] != (2, n, n):
+        parts = settings.arch.displacements
+        if displacement.ndim != 4 or displacement.shape[1:] != (parts, n, n):
             raise UserError(
-                f"this model takes displacement of shape (T, 2, {n}, {n}) [dx, dy in mm], "
-                f"got {displacement.shape}"
+                f"this model takes displacement of shape (T, {parts}, {n}, {n}) "
+                f"[{', '.join(('dx', 'dy', 'dz')[:parts])} in mm], got {displacement.shape}"
             )
         if not np.isfinite(displacement).all():
             raise UserError("displacement holds NaN or infinity")
@@ -202,10 +251,10 @@ class Predictor:
             m = torch.from_numpy(np.array(mask)).to(self.device).expand(len(u), 1, n, n)
             sure = None
             if settings.arch.confidence:
-                sure = torch.ones_like(m)
+                sure = torch.ones_like(m).expand(-1, parts - 1, -1, -1)
                 if confidence is not None:
                     part = np.array(confidence[start : start + settings.batch])
-                    sure = torch.from_numpy(part)[:, None].to(self.device)
+                    sure = torch.from_numpy(part).to(self.device)
             log_young = torch.full((len(u), 1), float(np.log(young_kpa)), device=self.device)
             said = self._say(channels(u, m, self.grid.pitch_mm, scales, sure), log_young)
             if settings.arch.total:

@@ -25,18 +25,16 @@ def stiffness(
 ) -> float:
     """Young's modulus [kPa] that makes the answer to a press fit its force best, in the least squares.
 
-    `displacement`: (T, 2, N, N) mm on the model's grid; `mask`: (N, N); `force_mn`: (T,) size of the known
-    force;
-    `confidence`: (T, N, N). A network conditioned on E is asked again with each estimate until it stays
-    within a
-    thousandth. Raises UserError if the lengths differ, or if there is no force or no answer to fit.
+    `displacement`: (T, 2, N, N) mm on the model's grid, of a model of two eyes (T, 3, N, N); `mask`: (N, N);
+    `force_mn`: (T,) size of the known force; `confidence`: as `Predictor.answer`. A network conditioned on E
+    is asked again with each estimate until it stays within a thousandth. Raises UserError if the lengths
+    differ, or if there is no force or no answer to fit.
     """
     if len(force_mn) != len(displacement):
         raise UserError(f"calibration press: {len(force_mn)} forces for {len(displacement)} frames")
-    kind, grid = predictor.card.settings.target, predictor.grid
     young = predictor.card.typical_young_kpa
     for _ in range(_ROUNDS if predictor.card.settings.arch.condition == "film" else 1):
-        said = total_force(predictor.density(displacement, mask, young, confidence), kind, grid)
+        said = _sizes(predictor, displacement, mask, young, confidence)
         fit = float(said @ force_mn), float(said @ said)
         if not (np.isfinite(fit).all() and min(fit) > 0):
             raise UserError("calibration press: no force was given, or the model sees none in the motion")
@@ -44,3 +42,20 @@ def stiffness(
         if abs(young / before - 1) < _CLOSE:
             break
     return young
+
+
+def _sizes(
+    predictor: Predictor,
+    displacement: NDArray[np.float32],
+    mask: NDArray[np.float32],
+    young: float,
+    confidence: NDArray[np.float32] | None,
+) -> NDArray[np.float64]:
+    """(T,) size of the force as `ForceReader` gives it: what is said of the rest frame is taken off [mN]."""
+    said = predictor.density(displacement, mask, young, confidence)
+    still = None if confidence is None else mask[None]
+    zero = predictor.density(np.zeros_like(displacement[:1]), mask, young, still)
+    kind, grid = predictor.card.settings.target, predictor.grid
+    if said.shape[1] == 3:
+        return total_force(said - zero, kind, grid)
+    return np.maximum(total_force(said, kind, grid) - total_force(zero, kind, grid), 0.0)

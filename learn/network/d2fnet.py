@@ -9,11 +9,11 @@ bounded heads (low, middle, high force) fused by soft weights. Width 32 on 256²
 from __future__ import annotations
 
 import copy
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import torch
 import torch.nn.functional as F
-from pydantic import Field, model_validator
+from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
@@ -42,6 +42,9 @@ class Architecture(Section):
     dropout: Annotated[float, Field(ge=0, lt=1)] = 0.1
     confidence: bool = False
     """Whether a sixth channel holds the flow's confidence."""
+    depth: bool = False
+    """Whether it is told motion along the view too, from a second eye: `input` motion; with confidence its
+    confidence as well."""
     total: bool = False
     """Whether a further head reads the total force from the bottleneck, also what lies beyond the grid."""
     condition: Literal["none", "film"] = "none"
@@ -55,9 +58,20 @@ class Architecture(Section):
             raise ValueError("detail goes with a stem of 4")
         return self
 
+    @model_serializer(mode="wrap")
+    def _as_before(self, plain: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Without `depth` where there is none, so that one eye's models are written as they always were."""
+        tree: dict[str, Any] = plain(self)
+        return tree if self.depth else {key: value for key, value in tree.items() if key != "depth"}
+
     @property
     def inputs(self) -> int:
-        return 6 if self.confidence else 5
+        return 5 + self.confidence + self.depth * (1 + self.confidence)
+
+    @property
+    def displacements(self) -> int:
+        """Components of the displacement that it is told."""
+        return 3 if self.depth else 2
 
     @property
     def components(self) -> int:
@@ -161,7 +175,7 @@ class Total(nn.Module):
 
 
 class D2FNet(nn.Module):
-    """(B, 5|6, N, N) channels → (B, 1|3, N, N) force map in units of `Scales.target`, 0 outside the mask.
+    """(B, 5 to 8, N, N) channels → (B, 1|3, N, N) force map in units of `Scales.target`, 0 outside the mask.
 
     With `arch.total` a pair: the map and (B, 1|3) total force in units of `Scales.force`.
     """

@@ -21,11 +21,11 @@ class Batch:
     """Frames on one device, in physical units."""
 
     displacement: Tensor
-    """(B, 2, N, N) mm."""
+    """(B, 2, N, N) mm, with depth (B, 3, N, N)."""
     mask: Tensor
     """(B, 1, N, N) 0/1."""
     confidence: Tensor
-    """(B, 1, N, N) 0..1."""
+    """(B, 1, N, N) 0..1, with depth (B, 2, N, N)."""
     target: Tensor
     """(B, C, N, N) in the unit of `Scales.target`."""
     force: Tensor
@@ -109,11 +109,11 @@ class Frames:
         }
         for c, t, source, turn in items:
             clip, how = self.clips[c], (turn % 4, turn >= 4)
-            confidence = clip.confidence[t] if source == "recovered" else np.ones_like(clip.mask)
+            sure = [turned(plane[None], *how) for plane in clip.sure(source)[t]]
             truth = target(clip, t, self.settings.target, self.settings.arch.components)
             columns["displacement"].append(turned(clip.displacement[source][t], *how))
             columns["mask"].append(turned(clip.mask[None], *how))
-            columns["confidence"].append(turned(np.asarray(confidence)[None], *how))
+            columns["confidence"].append(np.concatenate(sure))
             columns["target"].append(turned(truth, *how))
             columns["force"].append(turned(self.force[c][t][:, None, None], *how)[:, 0, 0])
         young = [[np.log(self.clips[c].young_kpa)] for c, *_ in items]

@@ -53,7 +53,7 @@ class Resident(Frames):
         self._mask = whole([np.asarray(c.mask)[None, None] for c in self.clips])
         self._sure = None
         if settings.arch.confidence:
-            self._sure = whole([np.asarray(c.confidence)[:, None] for c in self.clips])
+            self._sure = {s: whole([c.sure(s) for c in self.clips]) for s in self.sources}
         self._true = whole(
             [np.stack([target(c, t, settings.target, parts) for t in range(c.frames)]) for c in self.clips]
         )
@@ -77,8 +77,9 @@ class Resident(Frames):
         clip = torch.tensor([c for c, *_ in items], device=self._device)
         mask = turned(self._mask[clip], turn)
         sure = torch.ones_like(mask)
-        if self._sure is not None and source == "recovered":
-            sure = turned(self._sure[at], turn)
+        if self._sure is not None:
+            planes = self._sure[source][at]
+            sure = turned(planes.flatten(0, 1)[:, None], turn).reshape(planes.shape)
         return {
             "displacement": turned(self._moved[source][at], turn),
             "mask": mask,
@@ -96,7 +97,8 @@ def held(clips: Sequence[Clip], settings: Settings, device: torch.device) -> Fra
         return Frames(clips, settings)
     if mode == "auto":
         arch = settings.arch
-        planes = 2 * len(sources(settings.input)) + arch.components + arch.confidence
+        told = arch.displacements + arch.confidence * (1 + arch.depth)
+        planes = told * len(sources(settings.input)) + arch.components
         needed = sum(c.frames for c in clips) * planes * 4 * settings.size**2
         if needed > SHARE * torch.cuda.mem_get_info(device)[0]:
             return Frames(clips, settings)

@@ -18,6 +18,7 @@ Floats = NDArray[np.floating]
 # A point may come back so far off: tissue that is pressed together or seen at a slant lands in few pixels.
 _RETURN_PX = 4.0
 _COMPLIANCE_STEP = 0.25
+_PULSE_KNOWN = 0.1
 
 
 def seal(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
@@ -69,15 +70,16 @@ def force(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
 def compliance(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
     """Displacement per force changes from frame to frame no faster than the force does, plus a quarter.
 
-    2 energy / |force|^2 is the loaded mean of the displacement along the force, per force. Motion with
-    inertia or relaxation is left out: there the past counts too.
+    2 energy / |force|^2 is the loaded mean of the displacement along the force, per force. With a pulse, the
+    tools' work on the motion that is theirs stands for the energy. Motion with inertia or relaxation is left
+    out: there the past counts too.
     """
     mechanics = sequence.attrs.get("mechanics") or {}
+    raised = mechanics.get("pulse_work_mn_mm")
     # Sequences from before `elastic` was kept: among the named jobs only `paper` has inertia, and this law.
-    if (
-        not mechanics.get("elastic", mechanics.get("law") != "corotational")
-        or "energy_mn_mm" not in mechanics
-    ):
+    elastic = mechanics.get("elastic", mechanics.get("law") != "corotational")
+    known = "tool_work_mn_mm" if raised is not None else "energy_mn_mm"
+    if not (elastic or raised is not None) or known not in mechanics:
         return
     instruments = mechanics["instruments"]
     forces = np.stack([one["force_mn"] for one in instruments], axis=1)
@@ -85,32 +87,41 @@ def compliance(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
     if mechanics.get("contact") == "rigid":
         tips = np.concatenate([one["tip_mm"] for one in instruments], axis=1)
         footprint = float(sequence.attrs["scenario"]["gesture"]["footprint_mm"])
-    energy = np.asarray(mechanics["energy_mn_mm"], np.float64)
-    for t, step, limit in compliance_steps(energy, forces, tips, footprint):
+    work = np.asarray(mechanics[known], np.float64)
+    pulse = None if raised is None else np.asarray(raised, np.float64)
+    for t, step, limit in compliance_steps(work, forces, tips, footprint, pulse):
         yield Measure(step, limit, f"frame {t}")
 
 
 def compliance_steps(
-    energy: Floats, forces: Floats, tips: Floats | None, footprint_mm: float
+    work: Floats,
+    forces: Floats,
+    tips: Floats | None,
+    footprint_mm: float,
+    pulse: Floats | None = None,
 ) -> Iterator[tuple[int, float, float]]:
     """Steps of displacement per force: frame, relative step and its limit.
 
     Args:
-        energy: (T,) mN mm.
+        work: (T,) mN mm, half of force times displacement.
         forces: (T, I, 3) mN.
         tips: (T, n, 3) mm of rigid ones, which touch another relief as they slide; None: tractions.
         footprint_mm: their radius: along it, displacement per force may change by once itself.
+        pulse: (T,) mN mm, of the pulse's own displacement, which is not in `work`. It is known to a tenth
+            only (of a neo-Hookean law, whose answer to the pulse is taken as linear).
     """
+    beat = np.zeros(len(work)) if pulse is None else _PULSE_KNOWN * np.abs(pulse)
     size = np.linalg.norm(forces, axis=(1, 2))
-    for t in range(1, len(energy)):
-        if min(size[t - 1], size[t]) > 0.05 * size.max():
-            here, before = energy[t] / size[t] ** 2, energy[t - 1] / size[t - 1] ** 2
+    for t in range(1, len(work)):
+        unsure = max(beat[t - 1 : t + 1] / np.maximum(work[t - 1 : t + 1], 1e-300))
+        if min(size[t - 1], size[t]) > 0.05 * size.max() and 0 <= unsure < _COMPLIANCE_STEP:
+            here, before = work[t] / size[t] ** 2, work[t - 1] / size[t - 1] ** 2
             changed = float(np.linalg.norm(forces[t] - forces[t - 1])) / float(min(size[t - 1], size[t]))
             step = float(np.exp(np.abs(np.log(here / before)))) - 1
             slid = 0.0
             if tips is not None:
                 slid = float(np.linalg.norm((tips[t] - tips[t - 1])[:, :2], axis=1).max()) / footprint_mm
-            yield t, step, _COMPLIANCE_STEP + changed + slid
+            yield t, step, _COMPLIANCE_STEP + changed + slid + 2 * float(unsure)
 
 
 def visibility(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:

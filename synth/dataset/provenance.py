@@ -5,16 +5,16 @@ from __future__ import annotations
 import ast
 import contextlib
 import hashlib
+import itertools
 import json
-import os
 import sys
-import tempfile
 from collections.abc import Collection, Iterable
 from functools import cache
 from pathlib import Path
 
 from synth.system import packages
 from synth.system.cache import folder
+from synth.system.whole_file import write_whole
 
 # Where the making of a sequence begins, and what it uses that decides no value.
 _MAKER = "synth.sequence.pipeline"
@@ -29,7 +29,16 @@ _NO_PART = {
         "dataset.provenance",
     )
 }
-_COMPUTING = ("mitsuba", "drjit", "numpy", "scipy", "opencv-contrib-python-headless", "torch")
+_COMPUTING = (
+    "mitsuba",
+    "drjit",
+    "numpy",
+    "scipy",
+    "opencv-contrib-python-headless",
+    "torch",
+    "numba",
+    "llvmlite",
+)
 
 
 @cache
@@ -42,7 +51,7 @@ def generator() -> dict[str, str]:
     from synth.fields import FORMAT_VERSION
 
     home = Path(__file__).parents[2]
-    return {"format": str(FORMAT_VERSION), "code": _known(home), **_computing()}
+    return {"format": str(FORMAT_VERSION), "code": _kept(home, _makers(home), {"synth"}), **_computing()}
 
 
 def source(modules: Iterable[str], ours: Collection[str], home: Path = Path(__file__).parents[2]) -> str:
@@ -50,7 +59,7 @@ def source(modules: Iterable[str], ours: Collection[str], home: Path = Path(__fi
 
     `ours`: packages under `home` that are followed into.
     """
-    return word({"code": _code(home, _imports(home, modules, ours)), **_computing()})
+    return word({"code": _kept(home, modules, ours), **_computing()})
 
 
 def fingerprint() -> str:
@@ -64,25 +73,22 @@ def word(made_by: dict[str, str]) -> str:
     return hashlib.blake2b(described, digest_size=8).hexdigest()
 
 
-def _known(home: Path) -> str:
-    """`_code` of what makes a sequence, kept by the files' bytes: parsing takes a second of every process."""
-    held = hashlib.blake2b(sys.version.encode(), digest_size=16)
-    for path in sorted(file for kind in ("*.py", "*.pt") for file in (home / "synth").rglob(kind)):
-        held.update(f"{path.relative_to(home)}\n{path.stat().st_size}\n".encode() + path.read_bytes())
+def _kept(home: Path, modules: Iterable[str], ours: Collection[str]) -> str:
+    """`_code` of all that modules import, kept by the files' bytes: parsing takes a second."""
+    modules = sorted(modules)
+    held = hashlib.blake2b("\n".join([sys.version, *modules, "", *sorted(ours)]).encode(), digest_size=16)
+    for package, kind in itertools.product(sorted(ours), ("*.py", "*.pt")):
+        for path in sorted((home / package).rglob(kind)):
+            held.update(f"{path.relative_to(home)}\n{path.stat().st_size}\n".encode() + path.read_bytes())
     try:
         kept = folder("fingerprints") / held.hexdigest()
         if kept.is_file():
             return kept.read_text("ascii")
     except OSError:
-        return _code(home, _makers(home))
-    found = _code(home, _makers(home))
-    with (
-        contextlib.suppress(OSError),
-        tempfile.NamedTemporaryFile("w", dir=kept.parent, delete=False) as file,
-    ):
-        file.write(found)
-        file.close()
-        os.replace(file.name, kept)
+        return _code(home, _imports(home, modules, ours))
+    found = _code(home, _imports(home, modules, ours))
+    with contextlib.suppress(OSError):
+        write_whole(kept, found, durable=False)
     return found
 
 
@@ -99,9 +105,9 @@ def _computing() -> dict[str, str]:
     return {name: found for name, found in packages.versions().items() if name in _COMPUTING}
 
 
-def _makers(home: Path) -> set[Path]:
-    """Files that the maker of sequences is made of."""
-    return _imports(home, [_MAKER, *estimators(home)], {"synth"})
+def _makers(home: Path) -> list[str]:
+    """Modules that make a sequence, with all that they import."""
+    return [_MAKER, *estimators(home)]
 
 
 def estimators(home: Path = Path(__file__).parents[2]) -> list[str]:

@@ -28,10 +28,8 @@ from synth.job.law_limits import LARGEST_LOAD, RIGID_GESTURES, depth_of_load
 
 Floats = NDArray[np.float64]
 
-_SPACING, _MOST = (
-    0.2,
-    110.0,
-)  # of patches, as a part of the radius; coarser where a slide would need more of them
+# Of patches, as a part of the radius; coarser where a slide would need more of them.
+_SPACING, _MOST = 0.17, 110.0
 _REACH = 1.05  # of the radius: where a tip may touch
 _MEMORY, _ROUNDS, _CUTS = 6, 40, 4
 

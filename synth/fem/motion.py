@@ -39,6 +39,58 @@ class Clock:
     relaxation: tuple[tuple[float, float], ...] = ()
     """Prony terms: the part of the stiffness that is lost, and its time [s]."""
 
+    @property
+    def dt(self) -> float:
+        """Step of the solver [s]."""
+        return self.step_s / self.substeps
+
+    @property
+    def fade(self) -> list[tuple[float, float, float]]:
+        """Of each Prony term, its part, what is left of it after a step, and the same in the mean of it."""
+        return [
+            (part, float(np.exp(-self.dt / tau)), float(tau / self.dt * -np.expm1(-self.dt / tau)))
+            for part, tau in self.relaxation
+        ]
+
+    @property
+    def firmness(self) -> float:
+        """How stiff the tissue is to a change within a step, as a part of that to a sudden load."""
+        return 1 - sum(part for part, _, _ in self.fade) + sum(part * even for part, _, even in self.fade)
+
+    @property
+    def pull(self) -> float:
+        """Backward Euler's mass and damping as a spring, 1/s^2; 0 without inertia."""
+        return (1 / self.dt**2 + self.damping / self.dt) if self.mass_kg else 0.0
+
+    def ahead(self, u: Floats, before: Floats) -> Floats:
+        """Where that spring has no force (N, 3) mm, after two states of a step's distance."""
+        kept = (2 * u - before) / self.dt**2 + self.damping / self.dt * u
+        return np.asarray(kept / self.pull)
+
+
+class _Memory:
+    """What relaxing tissue keeps of its past, as nodal forces."""
+
+    def __init__(self, clock: Clock) -> None:
+        self._fade = clock.fade
+        self._elastic: Floats | None = None
+        self._history: list[Floats] = []
+
+    def add(self, load: Floats) -> Floats:
+        """A step's load (N, 3) mN with the past in it."""
+        if self._elastic is not None:
+            for (part, decay, even), past in zip(self._fade, self._history, strict=True):
+                load = load - decay * past + part * even * self._elastic
+        return load
+
+    def keep(self, now: Floats) -> None:
+        """Takes up the elastic forces (N, 3) mN at a step's end."""
+        if self._elastic is None:
+            self._elastic, self._history = np.zeros_like(now), [np.zeros_like(now) for _ in self._fade]
+        for k, (part, decay, even) in enumerate(self._fade):
+            self._history[k] = decay * self._history[k] + part * even * (now - self._elastic)
+        self._elastic = now
+
 
 def march_in_time(
     tets: Tets,
@@ -68,10 +120,7 @@ def march_in_time(
     Raises:
         As `equilibrium.solve_path`.
     """
-    dt = clock.step_s / clock.substeps
-    fade = [(g, tau, np.exp(-dt / tau), tau / dt * -np.expm1(-dt / tau)) for g, tau in clock.relaxation]
-    firm = 1 - sum(g for g, _, _, _ in fade) + sum(g * even for g, _, _, even in fade)
-    pull = (1 / dt**2 + clock.damping / dt) if clock.mass_kg else 0.0
+    memory, firm, pull = _Memory(clock), clock.firmness, clock.pull
     mass = nodal_mass(tets, clock.mass_kg) / young_kpa
     springs = (tets.hold + sp.diags_array(pull * mass)) / firm
     slip = None if tets.slip is None else sp.csr_array(tets.slip / firm)
@@ -83,23 +132,18 @@ def march_in_time(
     peak = loads[np.abs(loads).max(axis=(1, 2)).argmax()]
     size = float(np.sqrt(np.vdot(peak, system.solve(peak)))) / firm
     u = before = np.zeros_like(loads[0])
-    elastic, history = np.zeros_like(u), [np.zeros_like(u) for _ in fade]
     states: list[tuple[Floats, State, float, float]] = []
     for t in range(len(loads)):
         for sub in range(1, clock.substeps + 1 if t else 2):
             share = sub / clock.substeps
             load = loads[t] if t == 0 else (1 - share) * loads[t - 1] + share * loads[t]
-            for (g, _, decay, even), h in zip(fade, history, strict=True):
-                load = load - decay * h + g * even * elastic
+            load = memory.add(load)
             if pull:
-                ahead = ((2 * u - before) / dt**2 + clock.damping / dt * u) / pull
-                load = load + pull * mass[:, None] * ahead
+                load = load + pull * mass[:, None] * clock.ahead(u, before)
             new, state, norm = minimise_energy(system, load / firm, u + (u - before), TOLERANCE * size, u)
             least = check_state(system, new, state, t, float(named[t]))
-            now = tissue.state(new).force
-            for k, (g, _, decay, even) in enumerate(fade):
-                history[k] = decay * history[k] + g * even * (now - elastic)
-            before, u, elastic = u, new, now
+            memory.keep(tissue.state(new).force)
+            before, u = u, new
             if norm > 2 * TOLERANCE * size:
                 raise NoEquilibrium(f"frame {t}: no equilibrium at load {named[t]:.3g}; lower the load")
         states.append((u, tissue.state(u), norm / size, least))

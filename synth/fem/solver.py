@@ -20,6 +20,8 @@ __all__ = ["Deformation", "InvertedElement", "deform"]
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int32]
+Played = tuple[Gesture, Course]
+"""A gesture and how it goes over the frames."""
 
 
 @dataclass(frozen=True)
@@ -52,6 +54,17 @@ class Deformation:
     """(T,) mN mm stored."""
     residual: Floats
     """(T,) force out of balance as a part of the load, both in the norm of the inverse stiffness."""
+    pulse_work: Floats
+    """(T,) mN mm, half of traction times what the pulse alone moves it by; see `tool_work`."""
+
+    @property
+    def tool_work(self) -> Floats:
+        """(T,) mN mm, half of traction times the motion that is the tools'.
+
+        Under the linear law, and without a pulse, it is the energy stored.
+        """
+        whole = np.einsum("v,tvd,tvd->t", self.area, self.traction, self.displacement, optimize=True)
+        return np.asarray(0.5 * whole - self.pulse_work)
 
 
 def deform(
@@ -87,51 +100,37 @@ def deform(
         InvertedElement: names frame, load and element.
         NotFinite: a number is none.
     """
-    gestures = (gesture, *further)
-    for one in gestures:
+    for one in (gesture, *further):
         check_load(tissue.law, one.load)
-    courses = [tool.course(one, frames) for one in gestures]
+    played = [(one, tool.course(one, frames)) for one in (gesture, *further)]
     area = surface_embedding.vertex_area(skin_vertices, skin_faces)
-    rigid = [k for k, one in enumerate(gestures) if indentation.applies(fem, one)]
-    given = [k for k in range(len(gestures)) if k not in rigid]
-    traction = np.sum(
-        [tool.tractions(gestures[k], courses[k], skin_vertices, area) for k in given]
-        or [np.zeros((frames, *skin_vertices.shape))],
-        axis=0,
-    )
-    carry = surface_embedding.embed(tets, skin_vertices)
-    # One load per kPa of E; displacement depends on no more than that.
-    loads = np.stack([carry.gather(area[:, None] * t) for t in traction / tissue.young_kpa])
-    named = np.max([g.load * over.load for g, over in zip(gestures, courses, strict=True)], axis=0)
+    skin = indentation.Skin(surface_embedding.embed(tets, skin_vertices), skin_vertices, area)
     time = np.arange(frames) / fps
+    height = np.zeros(frames) if pulse is None else pulse.height(time)
+    traction = sum_tractions(
+        [(g, over) for g, over in played if not indentation.applies(fem, g)], frames, skin
+    )
+    # One load per kPa of E; displacement depends on no more than that.
+    loads = np.stack([skin.carry.gather(area[:, None] * t) for t in traction / tissue.young_kpa])
     timeless = fem.time == "quasi-static" and not fem.relaxation
-    if timeless or pulse is not None:
-        system = tissue.equations(tets)
-    if pulse is not None:
-        raising = lift(system, carry, skin_vertices, skin_faces, opening or schema.Craniotomy())
-        loads += pulse.height(time)[:, None, None] * raising
+    system = tissue.equations(tets) if timeless or pulse is not None else None
+    raised = np.zeros_like(skin_vertices)
+    if pulse is not None and system is not None:
+        raising = lift(system, skin.carry, skin_vertices, skin_faces, opening or schema.Craniotomy())
+        loads += height[:, None, None] * raising
+        raised = skin.carry.move(system.solve(raising))
+    named = np.max([g.load * over.load for g, over in played], axis=0)
     pressed = None
-    if rigid:
-        played = [(gestures[k], courses[k]) for k in rigid]
-        skin = indentation.Skin(carry, skin_vertices, area)
-        pressed = indentation.press_skin(fem, tissue, played, skin, system, loads, named)
-        path, traction = pressed.path, traction + pressed.traction
-    elif timeless:
-        path = equilibrium.solve_path(
-            system, loads, named, lean=pulse is not None or tissue.sheet is not None
-        )
-    else:
+    if system is None or not timeless:
         path = march_in_time(fem, tissue, tets, loads, named, fps)
-    displacement = np.stack([carry.move(u) for u in path.displacement])
-    tip, shaft = place_instruments(gestures, courses, skin_vertices, skin_faces, displacement)
-    forces = [
-        np.outer(over.load, np.sum([c.force_mn for c in g.contacts], axis=0))
-        for g, over in zip(gestures, courses, strict=True)
-    ]
-    if pressed is not None:
-        for which, k in enumerate(rigid):
-            forces[k] = pressed.force[:, which]
-            tip[:, 2 * k : 2 * k + 2] = tool.hover(gestures[k], courses[k], pressed.tips[:, which])
+    elif rigid := [(g, over) for g, over in played if indentation.applies(fem, g)]:
+        pressed = indentation.press_skin(fem, tissue, rigid, skin, system, loads, named)
+        path, traction = pressed.path, traction + pressed.traction
+    else:
+        lean = pulse is not None or tissue.sheet is not None
+        path = equilibrium.solve_path(system, loads, named, lean=lean)
+    displacement = np.stack([skin.carry.move(u) for u in path.displacement])
+    forces, tip, shaft = play_instruments(fem, played, pressed, skin, skin_faces, displacement)
     return Deformation(
         rest=skin_vertices,
         faces=skin_faces,
@@ -146,7 +145,14 @@ def deform(
         min_jacobian=path.jacobian,
         energy=path.energy * tissue.young_kpa,
         residual=path.residual,
+        pulse_work=0.5 * height * np.einsum("v,tvd,vd->t", area, traction, raised, optimize=True),
     )
+
+
+def sum_tractions(played: Sequence[Played], frames: int, skin: indentation.Skin) -> Floats:
+    """What gestures that are given as tractions load the skin with, (T, V, 3) kPa."""
+    each = [tool.tractions(gesture, over, skin.vertices, skin.area) for gesture, over in played]
+    return np.asarray(np.sum(each or [np.zeros((frames, *skin.vertices.shape))], axis=0))
 
 
 def march_in_time(
@@ -170,20 +176,38 @@ def march_in_time(
     )
 
 
-def place_instruments(
-    gestures: Sequence[Gesture],
-    courses: Sequence[Course],
-    skin_vertices: Floats,
+def play_instruments(
+    fem: schema.Fem,
+    played: Sequence[Played],
+    pressed: indentation.Pressed | None,
+    skin: indentation.Skin,
     skin_faces: Ints,
     displacement: Floats,
-) -> tuple[Floats, Floats]:
-    """Tips (T, 2 I, 3) mm and unit vectors to the hand (T, 2 I, 3) of I instruments on (T, V, 3) mm."""
-    surface = skin_vertices + displacement
-    poses = [
-        tool.pose(g, over, skin_vertices, skin_faces, surface)
-        for g, over in zip(gestures, courses, strict=True)
-    ]
-    return np.concatenate([tip for tip, _ in poses], axis=1), np.concatenate([s for _, s in poses], axis=1)
+) -> tuple[list[Floats], Floats, Floats]:
+    """What I instruments do to the skin as it moves by (T, V, 3) mm.
+
+    Args:
+        fem: the job's section.
+        played: the gestures and their courses.
+        pressed: what those that are rigid have found.
+        skin: at rest.
+        skin_faces: (F, 3).
+        displacement: of the skin.
+
+    Returns:
+        Forces (T, 3) mN of each, tips (T, 2 I, 3) mm and unit vectors to the hand (T, 2 I, 3).
+    """
+    surface = skin.vertices + displacement
+    poses = [tool.pose(g, over, skin.vertices, skin_faces, surface) for g, over in played]
+    tip = np.concatenate([tip for tip, _ in poses], axis=1)
+    shaft = np.concatenate([shaft for _, shaft in poses], axis=1)
+    forces = [np.outer(over.load, np.sum([c.force_mn for c in g.contacts], axis=0)) for g, over in played]
+    if pressed is not None:
+        rigid = [k for k, (g, _) in enumerate(played) if indentation.applies(fem, g)]
+        for which, k in enumerate(rigid):
+            forces[k] = pressed.force[:, which]
+            tip[:, 2 * k : 2 * k + 2] = tool.hover(*played[k], pressed.tips[:, which])
+    return forces, tip, shaft
 
 
 def clock(fem: schema.Fem, fps: float, tets: Tets) -> motion.Clock:

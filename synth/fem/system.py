@@ -34,9 +34,10 @@ _FLATTEST = (
 
 POINTWISE = 1.0
 """Of mu: how much of lambda still acts at every point where the rest acts on elements' means (Nagtegaal,
-Parks & Rice, Comput. Meth. Appl. Mech. Eng. 4, 1974; this much steadies them). Radial motion beside a press
-at nu 0.49 is then a quarter off, at 1,600 to 5,000 tetrahedra; with all of lambda at points it was off by
-twice its own size, with none of it by 60% (`bench experiment half-space`)."""
+Parks & Rice, Comput. Meth. Appl. Mech. Eng. 4, 1974; this much steadies them). Chosen on discs on the
+half-space at nu 0.49, where radial motion beside a press is then a quarter off, at 1,600 to 5,000 tetrahedra;
+with all of lambda at points it is off by twice its own size, with none of it by 60% (`bench experiment
+half-space`). docs/results/fem has it on a block it was not chosen on."""
 
 
 @dataclass(frozen=True)

@@ -26,16 +26,17 @@ def glare(rgb: NDArray[np.uint8], dilate_px: int = 1) -> NDArray[np.bool_]:
     Returns:
         (H, W) bool, True in glare.
     """
-    whiteness = rgb.min(axis=2)
+    red, green, blue = (np.ascontiguousarray(rgb[..., k]) for k in range(3))
+    least, most = np.minimum(red, green), np.maximum(red, green)
+    whiteness = np.minimum(least, blue)
+    second = np.maximum(least, np.minimum(most, blue))
     height, width = whiteness.shape
     small = cv2.resize(
         whiteness, (max(1, width // _SHRINK), max(1, height // _SHRINK)), interpolation=cv2.INTER_AREA
     )
     window = max(3, (max(height, width) // (4 * _SHRINK)) | 1)
     median = cv2.resize(cv2.medianBlur(small, window), (width, height), interpolation=cv2.INTER_LINEAR)
-    bright = (whiteness.astype(np.float32) > median + _ABOVE) | (
-        np.partition(rgb, 1, axis=2)[..., 1] > _CLIPPED
-    )
+    bright = (whiteness.astype(np.float32) > median + _ABOVE) | (second > _CLIPPED)
     return _grow(bright, dilate_px)
 
 

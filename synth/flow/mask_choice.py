@@ -77,8 +77,11 @@ class Proposal:
             count, label = cv2.connectedComponents(grown)
             layers.append(np.where(where, (label + last) * cells + cell + 1, 0))
             last += count
-        found, number = np.unique(np.stack([np.zeros_like(cell), *layers]), return_inverse=True)
-        return Pieces(number[1:].astype(np.int32), (found - 1) // cells)
+        code = np.stack(layers)
+        there = np.zeros(last * cells + 1, bool)  # instead of sorting all pixels, a tenth of a live frame
+        there[code] = True
+        there[0] = True
+        return Pieces((np.cumsum(there) - 1)[code].astype(np.int32), (np.flatnonzero(there) - 1) // cells)
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import trimesh
 from numpy.typing import NDArray
 
 from synth.errors import UserError
@@ -107,6 +106,8 @@ def _read(path: Path) -> tuple[Floats, NDArray[np.int64]]:
         data = foreign_file.read_bytes(path, identity.FILES["anatomy", "mesh"])
     except UserError as error:
         raise UserError(f"anatomy.mesh: {error}") from None
+    import trimesh  # here: a tenth of what a worker imports, and most jobs have no such file
+
     try:
         if kind == "vtk":
             return _merged(*vtk.read_vtk(data))

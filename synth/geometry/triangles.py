@@ -21,13 +21,21 @@ class Shape(NamedTuple):
     """(F, 3)."""
 
 
+def lengths(vectors: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """Length (...) of short vectors (..., C): the bytes of `norm`, which takes ten times as long."""
+    total = vectors[..., 0] * vectors[..., 0]
+    for k in range(1, vectors.shape[-1]):
+        total += vectors[..., k] * vectors[..., k]
+    return np.asarray(np.sqrt(total, out=total))
+
+
 def normals(shape: Shape) -> Floats:
     """Unit normals (V, 3) of vertices, faces weighted by area; z where faces have none.
 
     Summed in the faces' own order: the renderer's own sum over threads would not be the same twice.
     """
     total = _area_weighted(np.ascontiguousarray(shape.vertices, np.float64), shape.faces)
-    length = np.linalg.norm(total, axis=1, keepdims=True)
+    length = lengths(total)[:, None]
     flat = length[:, 0] < 1e-12
     total[flat] = [0.0, 0.0, 1.0]
     length[flat] = 1.0

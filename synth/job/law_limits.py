@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-LARGEST_LOAD = {"linear": 0.2, "corotational": 0.2, "stable": 0.4, "neo-hookean": 0.4}
-"""Largest P = F/(E a^2) at which a law is accepted: its worst error there is 6.2%. Neo-Hookean, which the
-others are measured against, is taken to hold while its stable relative agrees as well with it."""
+LARGEST_LOAD = {"linear": 0.2, "corotational": 0.2, "stable": 0.3, "neo-hookean": 0.4}
+"""Largest P = F/(E a^2) at which a law is accepted: its worst error there is 6.0%, and a straight push of the
+default mesh holds det F over 0.5. Neo-Hookean is what the others are measured against."""
 
 LAW_ERROR = {
-    "linear": ((0.02, 0.0049), (0.05, 0.0126), (0.1, 0.0260), (0.15, 0.0403), (0.2, 0.0557)),
-    "stable": ((0.05, 0.0033), (0.1, 0.0070), (0.15, 0.0113), (0.2, 0.0163), (0.3, 0.0306), (0.4, 0.0616)),
-    "corotational": ((0.02, 0.0049), (0.05, 0.0119), (0.1, 0.0236), (0.15, 0.0357), (0.2, 0.0532)),
+    "linear": ((0.02, 0.0051), (0.05, 0.0133), (0.1, 0.0275), (0.15, 0.0429), (0.2, 0.0597)),
+    "stable": ((0.02, 0.0014), (0.05, 0.0035), (0.1, 0.0075), (0.15, 0.0122), (0.2, 0.0180), (0.3, 0.0373)),
+    "corotational": ((0.02, 0.0048), (0.05, 0.0118), (0.1, 0.0234), (0.15, 0.0371), (0.2, 0.0570)),
 }
 """Load and error against neo-Hookean, the worst of pushing, pulling and dragging aside, nu 0.4; from
 `bench pareto fem` (docs/results/fem/pareto)."""

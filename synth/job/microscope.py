@@ -24,11 +24,11 @@ class Light(Section):
     """The microscope's lamps."""
 
     glare: ShareRange = (0.0, 0.3)
-    """Wet highlights: 0 the few sparks of a well placed lamp, 1 up to a third of the tissue outshone."""
+    """Wet highlights: 0 as few as lamps beside the lens leave (2% of the tissue), 1 four times as many."""
     tilt_deg: LightTilt | None = None
-    """Angle between main lamp and optical axis, 0-40, to any side. Empty: the lamp is where `glare` asks."""
+    """Angle between main lamp and optical axis, 0-40, to any side. Empty: at most 6.5, as `glare` asks."""
     main: ShareRange = (0.5, 0.68)
-    """Share of light from the main lamp; the rest comes from two beside it, which stand for a ring."""
+    """Share of light from the main lamp; the rest comes from one across the lens."""
     power: PositiveRange = (0.95, 1.1)
     """Illumination, against one that just fills the sensor with white."""
     kelvin: LightKelvin = (4200.0, 5600.0)

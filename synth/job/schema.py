@@ -114,7 +114,6 @@ class Appearance(Section):
     """Blood on the rim, from none (0) to soaked (1). Empty: as the family has it."""
 
 
-_LOCKS = 0.42  # Poisson's ratio past which radial motion is off by more than a sixth at the default mesh
 Skulls = Annotated[
     tuple[Literal["bonded", "slip"], ...],
     Field(min_length=1),
@@ -171,8 +170,8 @@ class Fem(Section):
     poisson: PoissonRange = (0.4, 0.4)
     """Poisson's ratio, drawn uniformly. Brain within seconds: 0.45 to nearly 0.5; drained: less."""
     volume: Literal["auto", "pointwise", "averaged"] = "auto"
-    """Where quadratic elements resist a change of volume: at every point, or in their mean, which nearly
-    incompressible tissue needs lest they lock; auto averages where `poisson` goes past 0.42."""
+    """Where elements resist a change of volume: at every point, or in their mean, without which quadratic
+    ones move too little aside from a press; auto averages those and leaves linear ones as they are."""
     skull: Skulls = ("bonded",)
     """How tissue is held round the opening, one or both, in equal shares: bonded to the skull, or free to
     slip along it (subarachnoid fluid)."""
@@ -270,7 +269,7 @@ class Fem(Section):
     @property
     def averages_volume(self) -> bool:
         """Whether elements resist their mean change of volume."""
-        return self.volume == "averaged" or (self.volume == "auto" and self.poisson[1] > _LOCKS)
+        return self.volume == "averaged" or (self.volume == "auto" and self.order == 2)
 
     @property
     def chosen_law(self) -> tuple[str, str]:

@@ -82,17 +82,10 @@ def limits(folder: Folder) -> list[str]:
             "The motion is quasi-static: within 3% of damped dynamics after a hold of 0.3 s, not before."
         )
     found += [
-        *_left_out(job),
+        *mechanics(job),
         "What video alone can tell is traction divided by stiffness: give a method `young_kpa`, or score it "
         "without scale.",
     ]
-    if job.fem.contact == "rigid":
-        held = ", ".join(kind for kind in job.fem.gestures if kind not in RIGID_GESTURES)
-        found.append(
-            f"Push, slide and tap are a rigid tip ({job.fem.tip}, friction {job.fem.friction:g}) in contact, "
-            "as wide as the footprint, not as the instrument that is seen"
-            + (f"; {held}: a given traction." if held else ".")
-        )
     load = job.fem.largest_load
     if job.fem.law == "linear" and load > 0.05:
         found.append(f"Linear elasticity is exact to some percent up to P = 0.05; loads go to {load:.2g}.")
@@ -124,7 +117,7 @@ def limits(folder: Folder) -> list[str]:
     return found
 
 
-def _left_out(job: Job) -> list[str]:
+def mechanics(job: Job) -> list[str]:
     """What of a living brain's mechanics is in, and what is not."""
     membrane, beat, breath = job.fem.membrane.intact, job.fem.pulse.heart_mm[1], job.fem.pulse.breath_mm[1]
     present = {"membrane": membrane, "heart beat": beat, "breath": breath}
@@ -140,9 +133,26 @@ def _left_out(job: Job) -> list[str]:
             "Heart and breath raise the exposed surface by a pressure that no label holds: `force` and "
             "`traction` are the tools' alone."
         )
+    low, high = job.fem.poisson
+    ratio = f"{low:g}" if low == high else f"drawn from {low:g} to {high:g}"
+    said.append(f"Poisson's ratio is {ratio}; tissue within seconds of a load has 0.45 to nearly 0.5.")
+    skull = "is bonded to the skull round the opening and doesn't slide along it."
     if "slip" in job.fem.skull:
-        said.append("Where the scenario says `slip`, tissue slides along the skull without friction.")
-    return said
+        skull = "slides along the skull without friction, with no fluid between them."
+        if "bonded" in job.fem.skull:
+            skull = "is bonded to the skull or, where the scenario says `slip`, slides along it freely."
+    return [*said, f"Tissue {skull}", _contact(job)]
+
+
+def _contact(job: Job) -> str:
+    """What loads the tissue."""
+    if job.fem.contact == "traction":
+        return "Every contact is a given traction on the footprint; no tip of a shape is pressed in or rubs."
+    held = ", ".join(kind for kind in job.fem.gestures if kind not in RIGID_GESTURES)
+    return (
+        f"Push, slide and tap are a rigid tip ({job.fem.tip}, friction {job.fem.friction:g}) in contact, "
+        "as wide as the footprint, not as the instrument that is seen"
+    ) + (f"; {held}: a given traction." if held else ".")
 
 
 def column(rows: Iterable[Mapping[str, Any]], name: str) -> NDArray[np.float64]:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from synth.geometry.triangles import Shape, normals
+from synth.geometry.triangles import Shape, lengths, normals
 from synth.render.camera import camera as cameras
 from synth.render.camera.camera import Camera
 from synth.system.jit import compiled
@@ -25,7 +25,10 @@ Mask = npt.NDArray[np.bool_]
 
 _HIDDEN_MM = 1e-3  # nearer to the lens than a point by more than this hides it
 _NEAR_MM = 1.0
-_PAD_PX = 1.5  # triangles bow a little under distortion
+# Triangles bow a little under distortion, small ones less: how far outside their corners to look for them.
+_PAD_PX = 1.5
+_LEAST_PAD_PX, _PAD_SHARE = 0.25, 1 / 16
+_SURELY = 2e-10  # share of a triangle: further outside, no rounding brings a ray back onto it
 
 
 @dataclass(frozen=True)
@@ -88,22 +91,39 @@ def cast(camera: Camera, shapes: Sequence[Shape], pixels: Floats | None, directi
             pixels' centres, row by row.
         directions: (N, 3) in camera axes, of any length, each through its pixel.
     """
+    return _meet(camera, _Scene.seen(camera, shapes), pixels, directions)
+
+
+@dataclass(frozen=True)
+class _Scene:
+    """All shapes as one camera sees them."""
+
+    points: Floats
+    """(V, 3) mm, camera axes; NaN behind the lens or at it, so that faces keep their numbers."""
+    flat: Floats
+    """(V, 2) px."""
+    faces: Indices
+    """(F, 3)."""
+
+    @classmethod
+    def seen(cls, camera: Camera, shapes: Sequence[Shape]) -> _Scene:
+        world = np.concatenate([shape.vertices for shape in shapes])
+        first = np.cumsum([0] + [len(shape.vertices) for shape in shapes])
+        faces = np.concatenate([shape.faces + at for shape, at in zip(shapes, first, strict=False)])
+        points = cameras.to_camera(camera, world)
+        points[points[:, 2] < _NEAR_MM] = np.nan
+        return cls(points, cameras.to_pixels(camera, points), faces)
+
+
+def _meet(camera: Camera, scene: _Scene, pixels: Floats | None, directions: Floats) -> Hits:
+    """See `cast`."""
     width, height = camera.size
     if pixels is None:
         order, start = np.arange(width * height), np.arange(width * height + 1)
     else:
         order, start = _bins(pixels, width, height)
-    world = np.concatenate([shape.vertices for shape in shapes])
-    first = np.cumsum([0] + [len(shape.vertices) for shape in shapes])
-    faces = np.concatenate([shape.faces + at for shape, at in zip(shapes, first, strict=False)])
-    points = cameras.to_camera(camera, world)
-    # Behind the lens or at it nothing is seen; kept in the list so that faces keep their numbers.
-    points[points[:, 2] < _NEAR_MM] = np.nan
-    flat = cameras.to_pixels(camera, points)
-    face, u, v, along = _cast(points, flat, faces, directions, order, start, width, height)
-    hit = face >= 0
-    bary = np.where(hit[:, None], np.stack([1 - u - v, u, v], axis=1), 0.0)
-    return Hits(face, bary, along)
+    directions = np.ascontiguousarray(directions)
+    return Hits(*_cast(scene.points, scene.flat, scene.faces, directions, order, start, width, height))
 
 
 def still(camera: Camera, surface: Shape, rim: Shape) -> Still:
@@ -141,7 +161,8 @@ def now(camera: Camera, rest: Still, surface: Shape, rim: Shape, tool: Shape | N
     width, height = camera.size
     shapes = [surface, rim] if tool is None else [surface, rim, tool]
     pixels = cameras.pixel_grid(camera.size)
-    hits = cast(camera, shapes, None, rest.directions)
+    scene = _Scene.seen(camera, shapes)
+    hits = _meet(camera, scene, None, rest.directions)
     seen = hits.face >= 0
     depth = np.where(seen, hits.along, 0.0)  # directions have unit z
 
@@ -149,8 +170,8 @@ def now(camera: Camera, rest: Still, surface: Shape, rim: Shape, tool: Shape | N
     carried = blend(surface.faces, rest.face.ravel()[on], rest.bary.reshape(-1, 3)[on], surface.vertices)
     local = cameras.to_camera(camera, carried)
     pierced = cameras.to_pixels(camera, local)
-    blocked = cast(camera, shapes, pierced, local)
-    clear = (1 - blocked.along) * np.linalg.norm(local, axis=1) < _HIDDEN_MM
+    blocked = _meet(camera, scene, pierced, local)
+    clear = (1 - blocked.along) * lengths(local) < _HIDDEN_MM
     inside = ((pierced >= -0.5) & (pierced < np.array([width, height]) - 0.5)).all(axis=1)
     flow = np.zeros((len(pixels), 2), np.float32)
     flow[on] = pierced - pixels[on]
@@ -238,28 +259,44 @@ def _footprint(camera: Camera, corners: Floats, directions: Floats, on: Mask, al
 
 def _bins(pixels: Floats, width: int, height: int) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
     """Rays sorted by the pixel they pierce: order (M,) and where each pixel's rays start (H*W + 1,)."""
-    cell = np.floor(pixels + 0.5).astype(np.int64)
-    inside = ((cell >= 0) & (cell < np.array([width, height]))).all(axis=1)
-    key = cell[:, 1] * width + cell[:, 0]
-    which = np.flatnonzero(inside)
-    order = which[np.argsort(key[which], kind="stable")]
-    start = np.concatenate([[0], np.cumsum(np.bincount(key[which], minlength=width * height))])
+    found: tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]] = _sort(pixels, width, height)
+    return found
+
+
+def _sort_loop(pixels, width, height):  # type: ignore[no-untyped-def]
+    key = np.full(len(pixels), -1, np.int64)
+    start = np.zeros(width * height + 1, np.int64)
+    for n in range(len(pixels)):
+        x, y = np.floor(pixels[n, 0] + 0.5), np.floor(pixels[n, 1] + 0.5)
+        if 0 <= x < width and 0 <= y < height:
+            key[n] = np.int64(y) * width + np.int64(x)
+            start[key[n] + 1] += 1
+    for cell in range(width * height):
+        start[cell + 1] += start[cell]
+    free = start[:-1].copy()
+    order = np.empty(start[-1], np.int64)
+    for n in range(len(pixels)):
+        if key[n] >= 0:
+            order[free[key[n]]] = n
+            free[key[n]] += 1
     return order, start
 
 
 def _cast_loop(points, flat, faces, directions, order, start, width, height):  # type: ignore[no-untyped-def]
     count = len(directions)
     face = np.full(count, -1, np.int32)
-    best_u, best_v = np.zeros(count), np.zeros(count)
+    bary = np.zeros((count, 3))
     best = np.full(count, np.inf)
     for f in range(len(faces)):
         a, b, c = faces[f]
-        left = min(flat[a, 0], flat[b, 0], flat[c, 0]) - _PAD_PX
-        right = max(flat[a, 0], flat[b, 0], flat[c, 0]) + _PAD_PX
-        top = min(flat[a, 1], flat[b, 1], flat[c, 1]) - _PAD_PX
-        bottom = max(flat[a, 1], flat[b, 1], flat[c, 1]) + _PAD_PX
+        left, right = min(flat[a, 0], flat[b, 0], flat[c, 0]), max(flat[a, 0], flat[b, 0], flat[c, 0])
+        top, bottom = min(flat[a, 1], flat[b, 1], flat[c, 1]), max(flat[a, 1], flat[b, 1], flat[c, 1])
+        pad = min(_PAD_PX, _LEAST_PAD_PX + _PAD_SHARE * max(right - left, bottom - top))
+        left, right, top, bottom = left - pad, right + pad, top - pad, bottom + pad
         # Written so that a corner behind the lens (NaN) drops the face.
         if not (right >= 0 and bottom >= 0 and left <= width - 1 and top <= height - 1):
+            continue
+        if np.isnan(flat[a, 0] + flat[b, 0] + flat[c, 0]):  # min and max pass over some
             continue
         x0, x1 = int(max(np.ceil(left), 0)), int(min(np.floor(right), width - 1))
         y0, y1 = int(max(np.ceil(top), 0)), int(min(np.floor(bottom), height - 1))
@@ -276,24 +313,29 @@ def _cast_loop(points, flat, faces, directions, order, start, width, height):  #
                 i = order[k]
                 d0, d1, d2 = directions[i, 0], directions[i, 1], directions[i, 2]
                 facing = n0 * d0 + n1 * d1 + n2 * d2
+                # A hair over the edge still counts: rays through shared edges must not slip between faces.
+                # Most rays miss by far more, which is seen without a division, and in one branch.
+                across, down = q0 * d0 + q1 * d1 + q2 * d2, r0 * d0 + r1 * d1 + r2 * d2
+                side = 1.0 if facing >= 0.0 else -1.0
+                hair = _SURELY * abs(facing)
+                if (side * across < -hair) | (side * down < -hair) | (side * (across + down - facing) > hair):
+                    continue
                 if facing == 0.0:
                     continue
                 inverse = 1.0 / facing
-                # A hair over the edge still counts: rays through shared edges must not slip between faces.
-                u = (q0 * d0 + q1 * d1 + q2 * d2) * inverse
+                u = across * inverse
                 if u < -1e-10 or u > 1.0 + 1e-10:
                     continue
-                v = (r0 * d0 + r1 * d1 + r2 * d2) * inverse
+                v = down * inverse
                 if v < -1e-10 or u + v > 1.0 + 1e-10:
                     continue
                 t = offset * inverse
                 if t <= 0.0 or t >= best[i]:
                     continue
                 best[i] = t
-                best_u[i] = u
-                best_v[i] = v
+                bary[i, 0], bary[i, 1], bary[i, 2] = 1 - u - v, u, v
                 face[i] = f
-    return face, best_u, best_v, best
+    return face, bary, best
 
 
 def _blend_loop(faces, face, bary, nodal):  # type: ignore[no-untyped-def]
@@ -308,5 +350,6 @@ def _blend_loop(faces, face, bary, nodal):  # type: ignore[no-untyped-def]
     return found
 
 
+_sort: Any = compiled(_sort_loop)
 _cast: Any = compiled(_cast_loop)
 _blend: Any = compiled(_blend_loop)

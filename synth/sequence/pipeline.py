@@ -278,13 +278,19 @@ def _second_lens(shooting: _Shooting) -> dict[str, Any]:
 def _mechanics(
     job: Job, case: Scenario, motion: Deformation, rotation: NDArray[np.float64]
 ) -> dict[str, Any]:
-    still = case.pulse is None
-    contact = {} if job.fem.contact == "traction" else {"contact": job.fem.contact}
-    return contact | {
+    timeless = job.fem.time == "quasi-static" and not job.fem.relaxation
+    special: dict[str, Any] = {} if job.fem.contact == "traction" else {"contact": job.fem.contact}
+    if case.pulse is not None:
+        special |= {"pulse_mm": case.pulse.height(motion.time).tolist()}
+    if case.pulse is not None and timeless:
+        special |= {
+            "tool_work_mn_mm": motion.tool_work.tolist(),
+            "pulse_work_mn_mm": motion.pulse_work.tolist(),
+        }
+    return special | {
         "law": case.tissue.law,
         # Whether the tools' forces alone say what is stored.
-        "elastic": job.fem.time == "quasi-static" and not job.fem.relaxation and still,
-        **({} if case.pulse is None else {"pulse_mm": case.pulse.height(motion.time).tolist()}),
+        "elastic": timeless and case.pulse is None,
         "min_jacobian": motion.min_jacobian.tolist(),
         "energy_mn_mm": motion.energy.tolist(),
         "residual": motion.residual.tolist(),

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from synth.geometry.triangles import lengths
 from synth.job.schema import Labels
 
 Map = NDArray[np.float32]
@@ -32,7 +33,7 @@ def intensity(traction: NDArray[np.floating], force_mn: float) -> NDArray[np.flo
     Returns:
         (H, W, 3) mN, in the axes of `traction`.
     """
-    peak = float(np.linalg.norm(traction, axis=-1).max(initial=0.0))
+    peak = float(lengths(traction).max(initial=0.0))
     return np.asarray(traction, np.float64) * (force_mn / peak if peak > 0 else 0.0)
 
 
@@ -42,7 +43,7 @@ def with_noise(
     """First stage: normal noise on the labels (H, W, 3) mN of the tissue (H, W)."""
     out = np.zeros_like(label)
     mine = label[tissue]
-    deviation = noise.force_std_mn + noise.force_share * np.linalg.norm(mine, axis=1, keepdims=True)
+    deviation = noise.force_std_mn + noise.force_share * lengths(mine)[:, None]
     deviation = np.where(rng.random((len(mine), 1)) < noise.outliers, noise.outlier_scale, 1.0) * deviation
     out[tissue] = mine + deviation * rng.normal(size=mine.shape) + noise.force_bias_mn
     return out
@@ -122,7 +123,7 @@ class Published:
         label = intensity(traction, float(np.linalg.norm(force_mn)))
         if t > 0:
             label = with_noise(label, self.tissue, self.noise, self.rng)
-        size = np.linalg.norm(label, axis=-1)
+        size = lengths(label)
         if self.chosen[t] and t > 0:
             flow, size = disturbed(flow, size, self.tissue, self.noise, self.rng)
         return {"flow_noisy": flow, "intensity": size.astype(np.float32)}

@@ -14,6 +14,8 @@ _SHAPING = (
     "opencv-contrib-python-headless",
     "torch",
     "zarr",
+    "numba",
+    "llvmlite",
 )
 
 

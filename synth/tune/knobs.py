@@ -49,7 +49,7 @@ def list_knobs(job: Job) -> list[Knob]:
     """
     if job.render.subsurface == "volume":
         raise UserError("render.subsurface: volume is a reference itself; tune the job with blur")
-    knobs = _physics_knobs(job)
+    knobs = [*_physics_knobs(job), *_world_knobs(job)]
     if job.flow.backend == "ideal":
         return knobs  # no force is read from its pictures, so nothing here can say how good they must be
     vertices = [job.anatomy.vertices, min(_VERTICES, job.anatomy.vertices)]
@@ -61,7 +61,7 @@ def list_knobs(job: Job) -> list[Knob]:
 
 
 def _physics_knobs(job: Job) -> list[Knob]:
-    """Law, mesh and, of dynamics, the time step."""
+    """Law, mesh, elements and, of dynamics, the time step."""
     fem = job.fem
     own_law = fem.law if fem.law in CHEAPEST_FIRST else "neo-hookean"
     laws = ["neo-hookean", *(law for law in ("stable", "linear") if fem.largest_load <= LARGEST_LOAD[law])]
@@ -72,12 +72,39 @@ def _physics_knobs(job: Job) -> list[Knob]:
         Knob("law", "physics", tuple(Level(law, {"fem.law": law}) for law in laws)),
         Knob("tets", "physics", tuple(Level(f"{n} P2", {"fem.order": 2, "fem.tets": n}) for n in tets)),
     ]
+    if fem.volume != "pointwise":
+        means, points = Level("averaged", {"fem.volume": fem.volume}), {"fem.volume": "pointwise"}
+        knobs.append(Knob("volume", "physics", (means, Level("pointwise", points))))
     if fem.time == "dynamic":
         frame = 1 / job.fps
         steps = _down([fem.dt_s / 2, fem.dt_s, *([frame] if frame > fem.dt_s else [])])
         levels = [Level(f"steps of {dt:.3g} s", {"fem.dt_s": dt}) for dt in steps[::-1]]
         knobs.append(Knob("time", "physics", (*levels, Level("at rest", {"fem.time": "quasi-static"}))))
     return knobs
+
+
+def _world_knobs(job: Job) -> list[Knob]:
+    """What a living brain has and a plain one has not: told, not turned, since the plain one is another
+    world."""
+    fem, values = job.fem, job.model_dump(mode="json")["fem"]
+    plain: dict[str, tuple[str, str, Any]] = {}
+    if fem.membrane.intact > 0:
+        plain["membrane"] = "membrane", "stripped", values["membrane"] | {"intact": 0.0}
+    if fem.poisson != (0.4, 0.4):
+        plain["poisson"] = "nu {:g} to {:g}".format(*fem.poisson), "nu 0.4", [0.4, 0.4]
+    if fem.skull != ("bonded",):
+        plain["skull"] = " or ".join(fem.skull), "bonded", ["bonded"]
+    if fem.contact == "rigid" and fem.depth_mm is None:
+        plain["contact"] = "rigid tip", "traction", "traction"
+    return [
+        Knob(
+            name,
+            "physics",
+            (Level(words, {f"fem.{name}": values[name]}), Level(other, {f"fem.{name}": value})),
+            turned=False,
+        )
+        for name, (words, other, value) in plain.items()
+    ]
 
 
 def _picture_knobs(job: Job) -> list[Knob]:

@@ -62,7 +62,9 @@ def test_the_source_of_a_module_is_that_of_all_it_imports_of_ours(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("module", ["learn.runs", "gap.runs", "end_to_end.pipelines"])
-def test_training_and_scoring_are_counted(module: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_training_and_scoring_are_counted(
+    module: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     counted: set[str] = set()
     home = Path(provenance.__file__).parents[2]
 
@@ -71,5 +73,6 @@ def test_training_and_scoring_are_counted(module: str, monkeypatch: pytest.Monke
         return ""
 
     monkeypatch.setattr(provenance, "_code", code)
+    monkeypatch.setattr(provenance, "folder", lambda name: tmp_path)
     kept.code.__wrapped__(f"evidence.{module}")
     assert {"learn/training/train.py", "learn/loss.py", "synth/flow/tvl1.py"} <= counted

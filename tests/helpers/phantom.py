@@ -39,6 +39,16 @@ def displacement(
     return np.stack([ux - inward * x, uy - inward * y], axis=-1)
 
 
+def depth_motion(
+    x: NDArray[np.float64], y: NDArray[np.float64], force: NDArray[np.float64], young_kpa: float
+) -> NDArray[np.float64]:
+    """(H, W) displacement [mm] into the tissue under the same force."""
+    rho = np.sqrt(x**2 + y**2 + RADIUS_MM**2 / 2)
+    shear = (1 + POISSON) / (np.pi * young_kpa)
+    across = (force[0] * x + force[1] * y) / rho**2
+    return np.asarray(shear * ((1 - POISSON) * force[2] / rho + (1 - 2 * POISSON) / 2 * across))
+
+
 def write(
     folder: Path,
     index: int,
@@ -48,10 +58,16 @@ def write(
     recovered: bool = True,
     family: str = "healthy",
     noise_px: float = 0.05,
+    two_eyes: bool = False,
 ) -> Path:
     """One sequence: a contact somewhere, a direction, a ramp up to a peak; deterministic in `index`."""
     rng = np.random.default_rng([7, index])
-    job = Job(frames=frames, flow={"backend": "opencv-tvl1" if recovered else "ideal"})  # type: ignore[arg-type]
+    job = Job(
+        frames=frames,
+        flow={"backend": "opencv-tvl1" if recovered else "ideal"},  # type: ignore[arg-type]
+        render={"stereo_mm": 24.0 if two_eyes else 0.0},  # type: ignore[arg-type]
+        store={"without": ("flow_right", "visible_right", "depth_right") if two_eyes else ()},  # type: ignore[arg-type]
+    )
     rows, cols = SIZE
     young = float(np.exp(rng.uniform(np.log(0.5), np.log(3.0))))
     at = rng.uniform(-4, 4, 2)
@@ -69,6 +85,7 @@ def write(
     writer.put("force", ramp[:, None] * peak)
     writer.put("tissue", tissue)
     writer.put("area", area)
+    writer.put("disparity", np.zeros(SIZE, np.float32))
     share = density(gx, gy)
     share /= (share * area).sum()
     picture = np.random.default_rng(index).integers(60, 120, (*SIZE, 3), dtype=np.uint8)
@@ -85,6 +102,15 @@ def write(
             noisy = flow + noise_px * rng.normal(size=flow.shape) * tissue[..., None]
             writer.put_frame("flow_recovered", t, noisy.astype(np.float32))
             writer.put_frame("flow_confidence", t, np.full(SIZE, 0.8, np.float32))
+        if two_eyes:
+            depth = depth_motion(gx, gy, level * peak, young)[..., None] * tissue[..., None]
+            motion = np.concatenate([flow * SCALE_MM_PER_PX, depth], axis=-1)
+            writer.put_frame("motion", t, motion.astype(np.float32))
+            off = 0.02 * rng.normal(size=motion.shape) * tissue[..., None]
+            writer.put_frame("motion_recovered", t, (motion + off).astype(np.float32))
+            spread = np.array([0.02, 0.02, 0.04], np.float32) * tissue[..., None]
+            writer.put_frame("motion_deviation", t, spread.astype(np.float32))
+            writer.put_frame("rgb_right", t, np.roll(picture, t, axis=1))
     return writer.seal(
         scenario={"relief": {"seed": anatomy_seed}, "family": family, "gesture": {"kind": "pull"}},
         scale_mm_per_px=SCALE_MM_PER_PX,

@@ -10,9 +10,11 @@ import numpy as np
 
 from synth.errors import UserError
 from synth.flow.stereo.rig import Eye, Floats, Rig
+from synth.system import foreign_file, foreign_storage
 
 _LEFT = ("K1", "M1", "cameraMatrix1", "camera_matrix_1", "CM1"), ("D1", "distCoeffs1", "dist_coeffs_1")
 _RIGHT = ("K2", "M2", "cameraMatrix2", "camera_matrix_2", "CM2"), ("D2", "distCoeffs2", "dist_coeffs_2")
+_TERMS = (4, 5, 8, 12, 14)
 _ORTHOGONAL = 1e-3
 
 
@@ -27,16 +29,10 @@ def read_rig(path: Path, size: tuple[int, int], mm_per_unit: float = 1.0) -> Rig
     Raises:
         UserError: it cannot be read, or what it holds are no two cameras.
     """
-    try:
-        storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
-    except (cv2.error, SystemError) as error:
-        raise UserError(f"{path}: cannot be read as a calibration ({error})") from error
-    if not storage.isOpened():
-        raise UserError(f"{path}: cannot be read as a calibration")
+    held = foreign_storage.read_storage(str(path), foreign_file.read_text(path, foreign_storage.LARGEST))
 
     def matrix(names: Sequence[str], what: str) -> Floats:
-        found = (storage.getNode(name).mat() for name in names if not storage.getNode(name).empty())
-        first = next((one for one in found if one is not None), None)
+        first = next((held[name] for name in names if isinstance(held.get(name), np.ndarray)), None)
         if first is None or not np.isfinite(first).all():
             raise UserError(f"{path}: holds no {what} ({', '.join(names)})")
         return np.asarray(first, np.float64)
@@ -46,7 +42,10 @@ def read_rig(path: Path, size: tuple[int, int], mm_per_unit: float = 1.0) -> Rig
         K = matrix(matrices, f"{eye} camera matrix")
         if K.shape != (3, 3) or min(K[0, 0], K[1, 1]) <= 0:
             raise UserError(f"{path}: the {eye} camera matrix is none")
-        eyes.append(Eye(K, matrix(lenses, f"{eye} distortion").ravel()))
+        lens = matrix(lenses, f"{eye} distortion").ravel()
+        if lens.size not in _TERMS:
+            raise UserError(f"{path}: the {eye} distortion has {lens.size} terms, OpenCV's has {_TERMS}")
+        eyes.append(Eye(K, lens))
     rotation, translation = matrix(("R",), "rotation"), matrix(("T",), "translation").ravel()
     if rotation.size == 3:
         rotation = np.asarray(cv2.Rodrigues(rotation)[0], np.float64)

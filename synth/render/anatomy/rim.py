@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import cv2
 import numpy as np
@@ -21,7 +22,7 @@ Map = npt.NDArray[np.float32]
 _AROUND, _OUT, _INNER = 320, 42, 6  # at most: points around, rings outwards, rings of the cut edge
 _SEGMENT_PX = 4.0  # points around are no nearer than this in the picture: the mesh is built anew every frame
 _WIDTH_MM = 26.0  # beyond the opening; the picture ends before
-_LIP_MM = 0.4  # how far the cut edge leans over the brain
+_LIP_MM = 0.3  # how far the cut edge reaches over the brain
 _LAID_MM = (-3.0, -1.5, -1.2, -0.95, -0.7, -0.3)
 _PATTY_MM = 0.55  # thickness of a cotton patty
 
@@ -66,10 +67,10 @@ def build(surface: Surface, radius_mm: float, look: Look, mm_per_px: float) -> R
     angle = np.linspace(0, 2 * np.pi, around, endpoint=False)
     edge = radius_mm * _outline(rng, angle)
     out = _WIDTH_MM * np.linspace(0, 1, rings) ** 1.6
-    # From below the brain's surface up to the lip that leans over it, round that, and away.
-    away = np.concatenate([[0.1, 0.0, -0.7 * _LIP_MM, -_LIP_MM, -0.8 * _LIP_MM, -0.3 * _LIP_MM], out + 0.12])
+    # The cut edge rises out of the brain's surface towards the lens, rounds, and goes on outwards.
+    away = np.concatenate([-_LIP_MM * np.array([1.0, 0.97, 0.88, 0.7, 0.4, 0.1]), out + 0.12])
     up = np.concatenate(
-        [[-1.8, -0.5, -0.15, -0.02, 0.2, 0.4], 0.5 + 1.5 * (1 - np.exp(-out / 3.5)) + 0.05 * out]
+        [[-1.8, -0.1, 0.12, 0.27, 0.39, 0.46], 0.5 + 1.5 * (1 - np.exp(-out / 3.5)) + 0.05 * out]
     )
     radius = edge[:, None] + away[None]
     xy = np.stack([radius * np.cos(angle)[:, None], radius * np.sin(angle)[:, None]], axis=-1)
@@ -101,11 +102,40 @@ def paint(rim: Rim, look: Look, pixels: int) -> Coat:
     """Dura, blood and what lies beyond, as maps over the rim's square."""
     rng = np.random.default_rng([look.rim_seed, 1])
     extent = rim.extent_mm
-    x, y, angle, away = _polar(rim, pixels)
     wide = noise.fractal(rng, pixels, extent, 8.0, 2.6)
     mid = noise.fractal(rng, pixels, extent, 2.2, 2.3)
     fine = noise.fractal(rng, pixels, extent, 0.6, 1.6)
-    fibres = _streaks(rng, angle, away, float(rim.edge.mean()))
+    across = noise.fractal(rng, 512, 512.0, 24.0, 1.2)
+    swell = noise.band(rng, pixels, extent, 1.4, 0.5)
+    axis = noise.centres(pixels, extent)
+    x, y = np.broadcast_to(axis, (pixels, pixels)), np.broadcast_to(axis[:, None], (pixels, pixels))
+    maps = [x, y, wide, mid, fine, swell]
+    if rim.patty:
+        ragged = noise.fractal(rng, pixels, 60.0, 1.5, 1.5)
+        weave = noise.band(rng, pixels, 60.0, 0.5, 0.5)
+        maps += [ragged, weave, noise.fractal(rng, pixels, 60.0, 4.0, 2.0)]
+    colour, bumps, thin = noise.in_rows(partial(_paint_rows, rim, look, across), *maps)
+    dry = cv2.resize(thin, (256, 256), interpolation=cv2.INTER_AREA)
+    return Coat(
+        colour, normals(noise.blur(bumps.astype(np.float32), 0.2, extent), extent), dry.astype(np.float32)
+    )
+
+
+def _paint_rows(
+    rim: Rim,
+    look: Look,
+    across: Map,
+    x: Map,
+    y: Map,
+    wide: Map,
+    mid: Map,
+    fine: Map,
+    swell: Map,
+    *cotton: Map,
+) -> tuple[Map, Map, Map]:
+    """Colour (r, n, 3), bumps mm and share without a film (r, n) of some rows at x, y mm, of noise (r, n)."""
+    angle, away = _polar(rim, x, y)
+    fibres = _streaks(across, angle, away, float(rim.edge.mean()))
     dura = np.asarray(look.dura, np.float32) * (1 + 0.05 * fibres + 0.05 * mid + 0.02 * fine)[..., None]
     beyond = np.asarray(look.beyond, np.float32) * (1 + 0.18 * mid + 0.04 * fine)[..., None]
     fat = np.array([0.72, 0.46, 0.22], np.float32) * (1 + 0.10 * fine)[..., None]
@@ -123,17 +153,12 @@ def paint(rim: Rim, look: Look, pixels: int) -> Coat:
     # The lip is thin and pale; under it the light is lost.
     lip = np.exp(-(((away + 0.1) / 0.35) ** 2))[..., None]
     under = np.clip(-away - 0.9, 0, 1)[..., None]
-    colour = colour * (1 + 0.12 * lip) * np.exp(-under * np.array([0.8, 2.0, 2.2], np.float32))
-    bumps = 0.035 * mid + 0.004 * fine + 0.02 * noise.band(rng, pixels, extent, 1.4, 0.5)
+    colour = colour * (1 + 0.12 * lip) * np.exp(-under * np.array([0.35, 0.9, 1.0], np.float32))
+    bumps = 0.035 * mid + 0.006 * swell
     if rim.patty:
-        colour, bumps = _cotton(rng, rim.patty, colour, bumps, x, y, look.blood)
+        colour, bumps = _cotton(cotton, rim.patty, colour, bumps, x, y, look.blood)
     colour = np.clip(colour, 0.006, 0.92).astype(np.float32)
-    dry = cv2.resize(
-        np.clip(0.55 + 0.3 * wide - 0.8 * blood, 0.02, 1), (256, 256), interpolation=cv2.INTER_AREA
-    )
-    return Coat(
-        colour, normals(noise.blur(bumps.astype(np.float32), 0.08, extent), extent), dry.astype(np.float32)
-    )
+    return colour, bumps, np.clip(0.55 + 0.3 * wide - 0.8 * blood, 0.02, 1)
 
 
 def shade(rim: Rim, extent_mm: float) -> Map:
@@ -141,14 +166,12 @@ def shade(rim: Rim, extent_mm: float) -> Map:
     axis = noise.centres(512, extent_mm)
     x, y = np.meshgrid(axis, axis)
     inside = np.maximum(_edge_at(rim, np.arctan2(y, x)) - _LIP_MM - np.hypot(x, y), 0)
-    return np.asarray(1 - 0.45 * np.exp(-inside / 0.45) - 0.12 * np.exp(-inside / 2.0), np.float32)
+    return np.asarray(1 - 0.35 * np.exp(-inside / 0.6) - 0.14 * np.exp(-inside / 2.0), np.float32)
 
 
-def _polar(rim: Rim, pixels: int) -> tuple[Map, Map, Map, Map]:
-    axis = noise.centres(pixels, rim.extent_mm)
-    x, y = np.meshgrid(axis, axis)
+def _polar(rim: Rim, x: Map, y: Map) -> tuple[Map, Map]:
     angle = np.arctan2(y, x)
-    return x, y, angle, (np.hypot(x, y) - _edge_at(rim, angle)).astype(np.float32)
+    return angle, (np.hypot(x, y) - _edge_at(rim, angle)).astype(np.float32)
 
 
 def _edge_at(rim: Rim, angle: Map) -> Map:
@@ -157,9 +180,8 @@ def _edge_at(rim: Rim, angle: Map) -> Map:
     return np.asarray(np.interp(angle % (2 * np.pi), around, closed), np.float32)
 
 
-def _streaks(rng: np.random.Generator, angle: Map, away: Map, radius: float) -> Map:
-    """Fibres that run outwards with the folded flap: noise drawn long in one direction; unit variance."""
-    across = noise.fractal(rng, 512, 512.0, 24.0, 1.2)
+def _streaks(across: Map, angle: Map, away: Map, radius: float) -> Map:
+    """Fibres that run outwards with the folded flap: noise (512, 512) drawn long in one direction."""
     u = (angle / (2 * np.pi) % 1.0 * 512).astype(np.float32)
     v = (np.clip(away, 0, None) * 2.2 * 512 / (2 * np.pi * radius) % 512).astype(np.float32)
     return np.asarray(cv2.remap(across, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP), np.float32)
@@ -186,14 +208,14 @@ def _outside(patty: Patty, x: Floats | Map, y: Floats | Map) -> Map:
 
 
 def _cotton(
-    rng: np.random.Generator, patty: Patty, colour: Map, bumps: Map, x: Map, y: Map, blood: float
+    drawn: tuple[Map, ...], patty: Patty, colour: Map, bumps: Map, x: Map, y: Map, blood: float
 ) -> tuple[Map, Map]:
     """White felt with a blue thread, a little soaked at its edges."""
-    far = _outside(patty, x, y) + 0.12 * noise.fractal(rng, len(x), 60.0, 1.5, 1.5)
+    ragged, weave, stains = drawn
+    far = _outside(patty, x, y) + 0.12 * ragged
     cover = _step(0.5 - far / 0.25)[..., None]
-    weave = noise.band(rng, len(x), 60.0, 0.5, 0.5)
     felt = np.array([0.86, 0.82, 0.76], np.float32) * (1 + 0.06 * weave)[..., None]
-    soaked = blood * np.clip(1.2 + far / 1.2 + 0.5 * noise.fractal(rng, len(x), 60.0, 4.0, 2.0), 0, 1.5)
+    soaked = blood * np.clip(1.2 + far / 1.2 + 0.5 * stains, 0, 1.5)
     felt = felt * np.exp(-soaked[..., None] * np.array([0.15, 1.3, 1.4], np.float32))
     c, s = np.cos(patty.turn), np.sin(patty.turn)
     along, across = (

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -16,6 +17,7 @@ from synth.render.appearance.family import Colour
 from synth.render.appearance.look import Look
 from synth.render.mitsuba.adapter import Wet
 from synth.system import foreign_picture
+from synth.system.jit import vectorised
 
 Map = npt.NDArray[np.float32]
 Floats = npt.NDArray[np.float64]
@@ -63,7 +65,7 @@ def cortex(surface: Surface, look: Look, pixels: int, photo: Path | None, shade:
     rng = np.random.default_rng([surface.seed, 2])
     tubes = {
         name: tube.raster(getattr(surface.vessels, name), pixels, extent)
-        for name in ("veins", "arteries", "capillaries")
+        for name in ("veins", "arteries", "deep")
     }
     sulci = cv2.resize(surface.sulci, (pixels, pixels), interpolation=cv2.INTER_LINEAR)
     albedo = _photograph(photo, pixels) if photo else _painted(rng, look, sulci, tubes, pixels, extent)
@@ -80,8 +82,20 @@ def normals(height: Map, extent_mm: float) -> Map:
     pixel = extent_mm / height.shape[0]
     dx = cv2.Sobel(height, cv2.CV_32F, 1, 0, ksize=3, scale=1 / (8 * pixel))
     dy = cv2.Sobel(height, cv2.CV_32F, 0, 1, ksize=3, scale=1 / (8 * pixel))
-    length = np.sqrt(1 + dx * dx + dy * dy)
-    return np.stack([-dx / length, -dy / length, 1 / length], axis=-1).astype(np.float32)
+    found = np.empty((*height.shape, 3), np.float32)
+    _tilt(dx, dy, found)
+    return found
+
+
+@vectorised
+def _tilt(dx: Map, dy: Map, normal: Map) -> None:
+    """Unit normals (n, n, 3) of slopes dx, dy (n, n)."""
+    one = np.float32(1)
+    for y in range(dx.shape[0]):
+        for x in range(dx.shape[1]):
+            a, b = dx[y, x], dy[y, x]
+            length = np.sqrt(one + a * a + b * b)
+            normal[y, x, 0], normal[y, x, 1], normal[y, x, 2] = -a / length, -b / length, one / length
 
 
 def thickness(tube: tuple[Map, Map]) -> Map:
@@ -103,58 +117,93 @@ def _painted(
     mottle = noise.fractal(rng, coarse, extent, 3.0, 1.3)
     share = np.clip(0.62 + 0.42 * wide + 0.04 * mottle, 0, 1)
     share = cv2.resize(share, (pixels, pixels), interpolation=cv2.INTER_CUBIC)[..., None]
-    albedo = np.asarray(look.crown, np.float32) * share + np.asarray(look.flush, np.float32) * (1 - share)
     grain = noise.fractal(rng, pixels, extent, 0.35, 1.2)
-    albedo = albedo * (1 + look.grain * grain[..., None] * np.array([0.5, 1.0, 1.2], np.float32))
     # Blood in the pia: more of it in the sulci and beside arteries.
-    arterial = thickness(tubes["arteries"])
-    beside = noise.blur(arterial, 0.7, extent) + noise.blur(thickness(tubes["veins"]), 1.1, extent)
-    blush = look.blush * (0.04 + 0.3 * sulci) + (0.25 + 0.9 * sulci) * beside
-    blush = blush * np.clip(1 + 0.3 * cv2.resize(mottle, (pixels, pixels)), 0.2, 2)
-    albedo = albedo * np.exp(-blush[..., None] * np.array([0.16, 1.0, 1.0], np.float32))
-    albedo = albedo * (1 - look.shade * sulci[..., None] * np.array([0.35, 0.5, 0.42], np.float32))
-    albedo = _arterial(albedo, tubes, look, cv2.resize(wide, (pixels, pixels)))
+    beside = noise.blur(thickness(tubes["arteries"]), 0.7, extent)
+    beside = beside + noise.blur(thickness(tubes["veins"]), 1.1, extent)
+    (albedo,) = noise.in_rows(
+        partial(_blushed, look),
+        share,
+        grain,
+        sulci,
+        beside,
+        cv2.resize(mottle, (pixels, pixels)),
+        noise.blur(thickness(tubes["deep"]), 0.16, extent),
+    )
     albedo = _veined(rng, albedo, tubes["veins"], look, extent)
+    shown = cv2.resize(wide, (pixels, pixels))
+    (albedo,) = noise.in_rows(partial(_arterial, look), albedo, shown, *tubes["arteries"])
     # Light that enters tissue leaves it nearby, red farthest: a blur stands in for the volume.
     for channel, width in enumerate((0.055, 0.032, 0.026)):
         albedo[..., channel] = noise.blur(np.ascontiguousarray(albedo[..., channel]), width, extent)
-    return np.asarray(np.clip(albedo, 0.01, 0.95), np.float32)
+    return np.asarray(np.clip(albedo, 0.01, 0.95, out=albedo), np.float32)
 
 
-def _arterial(albedo: Map, tubes: dict[str, tuple[Map, Map]], look: Look, wide: Map) -> Map:
-    arterial = thickness(tubes["arteries"])
+def _blushed(
+    look: Look, share: Map, grain: Map, sulci: Map, beside: Map, mottle: Map, deep: Map
+) -> tuple[Map]:
+    """Albedo (r, n, 3) of some rows without the vessels of the pia; `deep`: blood that lies under it [mm]."""
+    albedo = np.asarray(look.crown, np.float32) * share + np.asarray(look.flush, np.float32) * (1 - share)
+    albedo = albedo * (1 + look.grain * grain[..., None] * np.array([0.5, 1.0, 1.2], np.float32))
+    blush = look.blush * (0.04 + 0.3 * sulci) + (0.25 + 0.9 * sulci) * beside
+    blush = blush * np.clip(1 + 0.3 * mottle, 0.2, 2) + look.capillary * deep
+    albedo = albedo * np.exp(-blush[..., None] * np.array([0.16, 1.0, 1.0], np.float32))
+    # Fluid stands in the clefts, and little light comes back out of them.
+    cleft = look.shade * (0.7 * sulci + 1.8 * np.clip(sulci - 0.5, 0, 1))
+    return (albedo * np.exp(-cleft[..., None] * np.array([0.5, 0.75, 0.62], np.float32)),)
+
+
+def _arterial(look: Look, albedo: Map, wide: Map, distance: Map, radius: Map) -> tuple[Map]:
+    """Albedo (r, n, 3) of some rows with their arteries."""
+    arterial = thickness((distance, radius))
     # Even the finest stop much of the green: blood is nearly opaque to it within a tenth of a millimetre.
     reach = 0.30 * (1 - np.exp(-arterial / 0.16)) + 0.08 * arterial
-    blood = look.arterial * reach + look.capillary * 0.9 * thickness(tubes["capillaries"])
     fade = np.clip(0.95 + 0.25 * wide, 0.4, 1.2)
-    red = albedo * np.exp(-(blood * fade)[..., None] * _ARTERIAL)
-    # The wall of a wide one scatters a little light of its own along its crest.
-    distance, radius = tubes["arteries"]
-    crest = np.exp(-((distance / np.maximum(0.55 * radius, 1e-3)) ** 2)) * np.clip((radius - 0.2) / 0.2, 0, 1)
-    wall = np.array([0.62, 0.16, 0.14], np.float32)
-    return np.asarray(red + (0.4 * crest)[..., None] * (wall - red), np.float32)
+    red = albedo * np.exp(-(look.arterial * reach * fade)[..., None] * _ARTERIAL)
+    # A wide one hides what is under it: its wall scatters light of its own, most along the crest.
+    thick = np.clip((radius - 0.1) / 0.2, 0, 1) * (distance < radius)
+    crest = np.exp(-((distance / np.maximum(0.7 * radius, 1e-3)) ** 2))
+    wall = np.array([0.56, 0.105, 0.075], np.float32) * (0.72 + 0.38 * crest)[..., None]
+    return (np.asarray(red + (0.75 * thick)[..., None] * (wall - red), np.float32),)
 
 
 def _veined(rng: np.random.Generator, albedo: Map, tube: tuple[Map, Map], look: Look, extent: float) -> Map:
     """Veins: wine red where thin or seen at their sides, slate along the crest, here more and there less."""
     distance, radius = tube
     pixels = len(albedo)
-    across = np.clip(distance / np.maximum(radius, 1e-3), 0, 1)
+    across = np.asarray(np.clip(distance / np.maximum(radius, 1e-3), 0, 1), np.float32)
     thick = np.clip((radius - 0.12) / 0.3, 0, 1)
     along = cv2.resize(noise.band(rng, 256, extent, 9.0, 0.6), (pixels, pixels))
-    slate = np.clip(0.55 + 0.4 * along, 0.08, 1) * thick * np.exp(-((across / 0.55) ** 2))
     streak = cv2.resize(noise.fractal(rng, 1024, extent, 1.5, 1.0), (pixels, pixels))
+    cover = noise.blur(np.clip((1 - across**2) * 2.2, 0, 1).astype(np.float32), 0.05, extent)
+    halo = noise.blur(((across < 1) * thick).astype(np.float32), 0.45, extent)
+    # Not every stretch lies on the surface: some shimmer through the arachnoid.
+    depth = cv2.resize(noise.band(rng, 256, extent, 7.0, 0.6), (pixels, pixels))
+    return noise.in_rows(partial(_overlaid, look), albedo, across, thick, along, streak, cover, halo, depth)[
+        0
+    ]
+
+
+def _overlaid(
+    look: Look,
+    albedo: Map,
+    across: Map,
+    thick: Map,
+    along: Map,
+    streak: Map,
+    cover: Map,
+    halo: Map,
+    depth: Map,
+) -> tuple[Map]:
+    """Some rows of `_veined`."""
+    slate = np.clip(0.55 + 0.4 * along, 0.08, 1) * thick * np.exp(-((across / 0.55) ** 2))
     slate = np.clip(slate * (1 + 0.12 * streak), 0, 1)[..., None]
     thin = np.array([0.50, 0.13, 0.15], np.float32) + 0.06 * along[..., None]
     wine = np.asarray(look.wine, np.float32) * thick[..., None] + thin * (1 - thick[..., None])
     wall = np.asarray(look.vein, np.float32) * slate + wine * (1 - slate)
-    cover = noise.blur(np.clip((1 - across**2) * 2.2, 0, 1).astype(np.float32), 0.05, extent)[..., None]
-    halo = noise.blur(((across < 1) * thick).astype(np.float32), 0.45, extent)[..., None]
-    soft = albedo * np.exp(-0.8 * halo * np.array([0.45, 1.0, 0.75], np.float32))
-    # Not every stretch lies on the surface: some shimmer through the arachnoid.
-    depth = cv2.resize(noise.band(rng, 256, extent, 7.0, 0.6), (pixels, pixels))
-    cover = cover * np.clip(0.9 + 0.15 * depth, 0.5, 0.97)[..., None]
-    return np.asarray(soft * (1 - cover) + wall * cover, np.float32)
+    soft = albedo * np.exp(-0.8 * halo[..., None] * np.array([0.45, 1.0, 0.75], np.float32))
+    cover = cover[..., None] * np.clip(0.9 + 0.15 * depth, 0.5, 0.97)[..., None]
+    return (np.asarray(soft * (1 - cover) + wall * cover, np.float32),)
 
 
 def _film(
@@ -174,18 +223,16 @@ def _film(
     def fine(image: Map) -> Map:
         return np.asarray(cv2.resize(image, (pixels, pixels), interpolation=cv2.INTER_CUBIC), np.float32)
 
-    relief = 0.2 * thickness(tubes["arteries"]) + 0.15 * thickness(tubes["capillaries"])
-    relief = noise.blur(relief, look.film_mm, extent)
+    relief = noise.blur(0.22 * thickness(tubes["arteries"]), look.film_mm, extent)
     pools = noise.fractal(rng, coarse, extent, 5.0, 1.5)
-    dry = np.clip(0.35 + 0.45 * pools - 0.5 * cv2.resize(sulci, (coarse, coarse)), 0.05, 1.0)
-    swell = fine(noise.band(rng, coarse, extent, 2.4, 0.5) * 0.0065)
-    rough = fine(noise.band(rng, coarse, extent, 0.6, 0.5) * 0.0050)
-    # The mesh of fibres round a vein makes a string of sparks of its crest's highlight.
+    dry = np.clip(0.5 + 0.45 * pools - 0.5 * cv2.resize(sulci, (coarse, coarse)), 0.05, 1.0)
+    swell = fine(noise.band(rng, coarse, extent, 2.2, 0.5) * 0.011)
+    rough = fine(noise.band(rng, coarse, extent, 0.6, 0.5) * 0.0014)
+    # The wall of a vein is taut and smooth: its crest mirrors the lamp in one line.
     distance, radius = tubes["veins"]
     on_vein = noise.blur((distance < radius).astype(np.float32), 0.1, extent)
-    strings = noise.band(rng, pixels, extent, 0.34, 0.4) * 0.0042
-    height = relief + look.bump * (swell + fine(dry) * rough * (1 - on_vein) + strings * on_vein)
-    bare = np.maximum(dry, 0.5 * cv2.resize(on_vein, (coarse, coarse), interpolation=cv2.INTER_AREA))
+    height = relief + look.bump * (1 - 0.9 * on_vein) * (swell + fine(dry) * rough)
+    bare = dry * (1 - cv2.resize(on_vein, (coarse, coarse), interpolation=cv2.INTER_AREA))
     return np.asarray(height, np.float32), np.asarray(np.clip(bare, 0, 1), np.float32)
 
 

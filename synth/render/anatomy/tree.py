@@ -12,8 +12,11 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
+from synth.render.anatomy import noise
+
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
+Map = npt.NDArray[np.float32]
 
 
 @dataclass(frozen=True)
@@ -38,6 +41,7 @@ def grow(
     reach: float,
     kill: float,
     wander: float,
+    inertia: float = 0.0,
     rng: np.random.Generator,
 ) -> tuple[Floats, Ints]:
     """Space colonisation: nodes step towards the attractors nearest to them until none is left in reach.
@@ -51,6 +55,7 @@ def grow(
         reach: farthest attractor that pulls [mm].
         kill: an attractor this near is used up [mm].
         wander: random part of a step's direction, as a share.
+        inertia: part that a twig keeps of its direction, as a share: it bends, and does not turn on the spot.
         rng: where the wandering comes from.
 
     Returns:
@@ -63,6 +68,7 @@ def grow(
     distance = np.where(cKDTree(nodes).query(attractors)[0] < kill, 0.0, distance)
     total = len(nodes)
     children = np.bincount(parent[parent >= 0], minlength=total)
+    heading = np.zeros((total, 2))  # of what is grown here; a given node sprouts to any side
     for _ in range(int(4 * reach / step) + 400):
         keep = distance > kill
         attractors, distance, nearest = attractors[keep], distance[keep], nearest[keep]
@@ -77,7 +83,7 @@ def grow(
             [np.bincount(index, toward[:, axis]).astype(np.float64) for axis in (0, 1)], axis=1
         )
         direction /= np.maximum(np.linalg.norm(direction, axis=1, keepdims=True), 1e-9)
-        direction += wander * rng.standard_normal(direction.shape)
+        direction += inertia * heading[pulled] + wander * rng.standard_normal(direction.shape)
         direction /= np.linalg.norm(direction, axis=1, keepdims=True)
         # A node pulled evenly from two sides would sprout the same twig for ever.
         free = children[pulled] < 3
@@ -89,6 +95,7 @@ def grow(
         sprouts = positions[pulled[free]] + step * direction[free]
         children[pulled[free]] += 1
         children = np.concatenate([children, np.zeros(len(sprouts), children.dtype)])
+        heading = np.concatenate([heading, direction[free]])
         all_nodes.append(sprouts)
         all_parent.append(pulled[free])
         near, which = cKDTree(sprouts).query(attractors)
@@ -121,7 +128,7 @@ def taper(nodes: Floats, parent: Ints, length: float) -> Floats:
     for node in range(len(up) - 1, -1, -1):
         if up[node] >= 0:
             left[up[node]] = max(left[up[node]], left[node] + segment[node])
-    return np.asarray(0.4 + 0.6 * np.clip(np.asarray(left) / length, 0, 1))
+    return np.asarray(0.55 + 0.45 * np.clip(np.asarray(left) / length, 0, 1))
 
 
 def pruned(nodes: Floats, parent: Ints, fixed: int, shortest: int) -> tuple[Floats, Ints]:
@@ -141,11 +148,23 @@ def pruned(nodes: Floats, parent: Ints, fixed: int, shortest: int) -> tuple[Floa
     return nodes[kept], np.where(parent[kept] >= 0, number[parent[kept]], -1)
 
 
-def scattered(extent_mm: float, spacing: float, rng: np.random.Generator) -> Floats:
-    """Points (n, 2) mm about `spacing` apart: a jittered grid, which neither clumps nor lines up."""
-    side = int(extent_mm / spacing)
+def scattered(
+    extent_mm: float, spacing: float, rng: np.random.Generator, density: Map | None = None
+) -> Floats:
+    """Points (n, 2) mm about `spacing` apart: a jittered grid, which neither clumps nor lines up.
+
+    Args:
+        extent_mm: side of the square.
+        spacing: of the points [mm].
+        rng: where they come from.
+        density: (m, m) share of the points that stay; all of them if not given.
+    """
+    side = max(1, int(extent_mm / spacing))
     cell = np.stack(np.meshgrid(np.arange(side), np.arange(side)), axis=-1).reshape(-1, 2)
-    return ((cell + rng.random(cell.shape)) / side - 0.5) * extent_mm
+    points = ((cell + rng.random(cell.shape)) / side - 0.5) * extent_mm
+    if density is None:
+        return points
+    return points[rng.random(len(points)) < noise.sample(density, points, extent_mm)]
 
 
 def relaxed(nodes: Floats, parent: Ints, fixed: int, rounds: int) -> Floats:

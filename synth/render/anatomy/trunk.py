@@ -7,12 +7,15 @@ import numpy as np
 import numpy.typing as npt
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
+from scipy.spatial import cKDTree
 
 from synth.render.anatomy import noise
 
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 Map = npt.NDArray[np.float32]
+
+_SHORTEST = 8  # steps of a path that is worth a vessel: it joins another before it gets anywhere
 
 
 def trunks(
@@ -27,6 +30,8 @@ def trunks(
 ) -> tuple[tuple[Floats, Ints], Floats]:
     """Paths across the square along the sulci, as nodes with parents, and the trunk radius of each node.
 
+    A path that meets an earlier one ends there and springs from it: vessels join, they don't cross.
+
     Args:
         sulci: (n, n) 0 on a crown to 1 in a sulcus.
         extent_mm: side of the square.
@@ -38,28 +43,51 @@ def trunks(
     """
     side = 72
     depth = cv2.resize(sulci, (side, side), interpolation=cv2.INTER_AREA)
-    nodes, parents, radii = [], [], []
-    total = 0
+    nodes, parents, radii = np.zeros((0, 2)), np.zeros(0, np.int64), np.zeros(0)
     taken = np.zeros((side, side), np.float32)
     for trunk in range(max(1, count)):
         cost = 0.12 + (1 - np.clip(depth, 0, 1)) ** 2 + 0.35 * rng.random((side, side)) + 2.5 * taken
         angle = rng.uniform(0, 2 * np.pi) + trunk * 2 * np.pi / count
         turn = rng.uniform(0.6, 1.0) * np.pi
-        ends = [_border(angle, side), _border(angle + turn, side)]
-        path = _cheapest(cost, ends[0], ends[1])
-        taken[path[:, 1].astype(int), path[:, 0].astype(int)] = 1.0
-        taken = np.maximum(taken, cv2.GaussianBlur(taken, (0, 0), 1.5))
+        path = _cheapest(cost, _border(angle, side), _border(angle + turn, side))
         line = ((path + 0.5) / side - 0.5) * extent_mm
+        line, root = _joined(line, nodes, 0.04 * extent_mm)
+        if len(line) < _SHORTEST:
+            continue
+        pixel = np.rint((line / extent_mm + 0.5) * side - 0.5).astype(int)
+        taken[pixel[:, 1], pixel[:, 0]] = 1.0
+        taken = np.maximum(taken, cv2.GaussianBlur(taken, (0, 0), 1.5))
         line = _resampled(_smoothed(line, smooth), 0.18)
         line = line + meander(rng, line, extent_mm, 0.55, wiggle)
-        nodes.append(line)
-        parents.append(np.concatenate([[-1], np.arange(len(line) - 1) + total]))
+        own = rng.uniform(*radius)
+        if root >= 0:
+            along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
+            line = line + np.exp(-along / (0.1 * extent_mm))[:, None] * (nodes[root] - line[0])
+            own = min(own, rng.uniform(0.6, 0.85) * radii[root])
         taper = np.linspace(1.0, rng.uniform(0.55, 0.85), len(line))
         # No vessel is as wide as itself a few millimetres on.
         swell = 1 + 0.1 * noise.sample(noise.band(rng, 128, extent_mm, 6.0, 0.5), line, extent_mm)
-        radii.append(rng.uniform(*radius) * taper * np.clip(swell, 0.75, 1.3))
-        total += len(line)
-    return (np.concatenate(nodes), np.concatenate(parents).astype(np.int64)), np.concatenate(radii)
+        parents = np.concatenate([parents, [root], np.arange(len(line) - 1) + len(nodes)])
+        nodes = np.concatenate([nodes, line])
+        radii = np.concatenate([radii, own * taper * np.clip(swell, 0.75, 1.3)])
+    return (nodes, parents.astype(np.int64)), radii
+
+
+def _joined(line: Floats, nodes: Floats, near: float) -> tuple[Floats, int]:
+    """The part of a path up to earlier nodes, from there on, and which it meets; all of it and -1 if none.
+
+    Of the path's two ends the one that runs longer before it meets them is kept.
+    """
+    if not len(nodes):
+        return line, -1
+    away, which = cKDTree(nodes).query(line)
+    met = np.flatnonzero(away < near)
+    if not len(met):
+        return line, -1
+    before, after = line[: met[0] + 1], line[met[-1] :]
+    if len(before) >= len(after):
+        return before[::-1], int(which[met[0]])
+    return after, int(which[met[-1]])
 
 
 def meander(

@@ -1,4 +1,4 @@
-"""Vessels of the pia: veins and arteries from trunks along the sulci, and the web of their finest twigs."""
+"""Vessels of the pia: veins and arteries from trunks along the sulci down to the finest arterioles."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from synth.render.anatomy import trunk
+from synth.render.anatomy import noise, trunk
 from synth.render.anatomy.tree import Tree, grow, murray, pruned, relaxed, scattered, taper
 
 Floats = npt.NDArray[np.float64]
@@ -21,7 +21,8 @@ class Vessels:
 
     veins: Tree
     arteries: Tree
-    capillaries: Tree
+    deep: Tree
+    """Under the pia, seen through the tissue."""
 
 
 def grow_all(sulci: Map, extent_mm: float, rng: np.random.Generator) -> Vessels:
@@ -34,73 +35,66 @@ def grow_all(sulci: Map, extent_mm: float, rng: np.random.Generator) -> Vessels:
     """
     many = extent_mm / 34.0
     trunks, radius = trunk.trunks(
-        sulci, extent_mm, rng, round(many * rng.integers(1, 3)), (0.6, 1.2), smooth=60, wiggle=0.0
+        sulci, extent_mm, rng, round(many * rng.integers(1, 4)), (0.55, 1.2), smooth=60, wiggle=0.0
     )
-    veins = _tree(extent_mm, rng, trunks, spacings=(6.5,), leaf=0.13, wander=0.35)
-    veins = _widen(veins, radius)
+    veins = _tree(extent_mm, rng, trunks, radius, spacings=(9.0, 5.5), leaf=0.1, wander=0.3)
     trunks, radius = trunk.trunks(
-        sulci, extent_mm, rng, round(many * rng.integers(3, 6)), (0.2, 0.38), smooth=18, wiggle=0.12
+        sulci, extent_mm, rng, round(many * rng.integers(4, 7)), (0.2, 0.4), smooth=40, wiggle=0.12
     )
-    arteries = _tree(extent_mm, rng, trunks, spacings=(4.2, 2.0, 1.15), leaf=0.05, wander=0.42)
-    arteries = _widen(arteries, radius)
-    return Vessels(veins, arteries, _web(arteries, extent_mm, rng))
+    # No gyrus has as dense a web as the next.
+    rich = 0.9 + 0.35 * noise.band(rng, 128, extent_mm, 9.0, 0.5)
+    rich = np.clip(rich, 0.3, 1.0).astype(np.float32)
+    arteries = _tree(
+        extent_mm, rng, trunks, radius, spacings=(4.6, 2.4, 1.3, 0.72), leaf=0.042, wander=0.25, density=rich
+    )
+    return Vessels(veins, arteries, _deep(sulci, extent_mm, rng))
 
 
 def _tree(
     extent_mm: float,
     rng: np.random.Generator,
     trunks: tuple[Floats, Ints],
+    own: Floats,
     *,
     spacings: tuple[float, ...],
     leaf: float,
     wander: float,
+    density: Map | None = None,
 ) -> Tree:
-    """Branches from the trunks, then finer ones from those, one round for each spacing [mm]."""
+    """Branches from the trunks of radii `own` (N,) mm, then finer ones from those: a round a spacing [mm]."""
     nodes, parent = trunks
     fixed = len(nodes)
     for spacing in spacings:
         step = 0.15 * min(spacing, 1.6)
-        between = np.linalg.norm(nodes[1] - nodes[0])
         grown = len(nodes)
+        between = np.linalg.norm(nodes[1] - nodes[0])
         nodes, parent = grow(
             nodes,
             parent,
-            scattered(extent_mm, spacing, rng),
-            buds=_sprouting(grown, float(between) / (1.3 * spacing), rng),
+            scattered(extent_mm, spacing, rng, density),
+            buds=_sprouting(len(nodes), float(between) / (0.9 * spacing), rng),
             step=step,
             reach=9.0,
             kill=0.5 * spacing,
             wander=wander,
+            inertia=0.8,
             rng=rng,
         )
-        nodes, parent = pruned(nodes, parent, grown, shortest=int(0.7 * spacing / step))
-    nodes = relaxed(nodes, parent, fixed, rounds=4)
+        nodes, parent = pruned(nodes, parent, grown, shortest=int(0.55 * spacing / step))
+    nodes = relaxed(nodes, parent, fixed, rounds=12)
     nodes = nodes + trunk.meander(rng, nodes, extent_mm, 0.3, 0.22)
-    return Tree(nodes, parent, murray(parent, leaf) * taper(nodes, parent, 1.6))
+    radius = murray(parent, leaf) * taper(nodes, parent, 0.9)
+    radius[:fixed] = np.maximum(np.minimum(radius[:fixed], 1.3 * own), own)
+    radius[fixed:] = np.minimum(radius[fixed:], 0.8 * own.max())
+    return Tree(nodes, parent, radius)
 
 
-def _web(arteries: Tree, extent_mm: float, rng: np.random.Generator) -> Tree:
-    """Twigs finer than the arteries' own, grown from them into what they left empty."""
-    fixed = len(arteries.nodes)
-    nodes, parent = grow(
-        arteries.nodes,
-        arteries.parent,
-        scattered(extent_mm, 0.55, rng),
-        buds=_sprouting(fixed, 0.25, rng),
-        step=0.13,
-        reach=2.4,
-        kill=0.27,
-        wander=0.45,
-        rng=rng,
+def _deep(sulci: Map, extent_mm: float, rng: np.random.Generator) -> Tree:
+    """Vessels that shimmer through the tissue: another tree, coarser than the finest of the pia."""
+    trunks, radius = trunk.trunks(
+        sulci, extent_mm, rng, round(3 * extent_mm / 34.0), (0.1, 0.2), smooth=18, wiggle=0.2
     )
-    nodes = relaxed(nodes, parent, fixed, rounds=3)
-    radius = np.minimum(murray(parent, 0.028), 0.06) * taper(nodes, parent, 0.8)
-    # Only the twigs and what they spring from: the arteries are drawn on their own.
-    drawn = np.arange(len(nodes)) >= fixed
-    drawn[parent[fixed:]] = True
-    number = np.cumsum(drawn) - 1
-    up = np.where(np.arange(len(nodes)) >= fixed, number[parent], -1)
-    return Tree(nodes[drawn], up[drawn], radius[drawn])
+    return _tree(extent_mm, rng, trunks, radius, spacings=(3.6, 1.9), leaf=0.05, wander=0.35)
 
 
 def _sprouting(count: int, share: float, rng: np.random.Generator) -> npt.NDArray[np.bool_]:
@@ -108,11 +102,3 @@ def _sprouting(count: int, share: float, rng: np.random.Generator) -> npt.NDArra
     buds = rng.random(count) < share
     buds[count // 2] |= not buds.any()
     return np.asarray(buds)
-
-
-def _widen(tree: Tree, trunk: Floats) -> Tree:
-    radius = tree.radius.copy()
-    radius[: len(trunk)] = np.maximum(np.minimum(radius[: len(trunk)], 1.3 * trunk), trunk)
-    widest = trunk.max()
-    radius[len(trunk) :] = np.minimum(radius[len(trunk) :], 0.8 * widest)
-    return Tree(tree.nodes, tree.parent, radius)

@@ -29,8 +29,8 @@ class Ranges(NamedTuple):
 
 FAMILIES: dict[Family, Ranges] = {
     "healthy": Ranges(
-        crown=(0.95, 0.74, 0.41),
-        flush=(0.92, 0.5, 0.31),
+        crown=(0.95, 0.79, 0.49),
+        flush=(0.93, 0.57, 0.38),
         vein=(0.4, 0.32, 0.42),
         wine=(0.2, 0.045, 0.045),
         arterial=(1.1, 1.5),
@@ -44,8 +44,8 @@ FAMILIES: dict[Family, Ranges] = {
         beyond=(0.46, 0.07, 0.04),
     ),
     "hyperaemic": Ranges(
-        crown=(0.86, 0.46, 0.29),
-        flush=(0.78, 0.32, 0.22),
+        crown=(0.88, 0.52, 0.35),
+        flush=(0.80, 0.37, 0.26),
         vein=(0.3, 0.2, 0.29),
         wine=(0.16, 0.03, 0.035),
         arterial=(1.3, 1.8),
@@ -59,8 +59,8 @@ FAMILIES: dict[Family, Ranges] = {
         beyond=(0.46, 0.06, 0.04),
     ),
     "pale": Ranges(
-        crown=(0.92, 0.8, 0.6),
-        flush=(0.88, 0.69, 0.52),
+        crown=(0.92, 0.84, 0.67),
+        flush=(0.89, 0.74, 0.58),
         vein=(0.42, 0.38, 0.48),
         wine=(0.25, 0.09, 0.1),
         arterial=(0.7, 1.0),
@@ -74,8 +74,8 @@ FAMILIES: dict[Family, Ranges] = {
         beyond=(0.5, 0.13, 0.09),
     ),
     "oedematous": Ranges(
-        crown=(0.93, 0.75, 0.5),
-        flush=(0.88, 0.61, 0.42),
+        crown=(0.93, 0.80, 0.57),
+        flush=(0.89, 0.66, 0.48),
         vein=(0.42, 0.35, 0.44),
         wine=(0.25, 0.09, 0.09),
         arterial=(0.8, 1.1),
@@ -89,8 +89,8 @@ FAMILIES: dict[Family, Ranges] = {
         beyond=(0.46, 0.08, 0.05),
     ),
     "calf": Ranges(
-        crown=(0.8, 0.6, 0.45),
-        flush=(0.72, 0.45, 0.34),
+        crown=(0.81, 0.64, 0.50),
+        flush=(0.73, 0.48, 0.38),
         vein=(0.24, 0.12, 0.13),
         wine=(0.14, 0.035, 0.03),
         arterial=(0.6, 1.0),

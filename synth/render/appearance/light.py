@@ -1,9 +1,10 @@
-"""The microscope's lamps: a main beam, and two beside it that stand for the ring."""
+"""The microscope's lamps: two windows beside its lens, near enough to the axis that shadows are short."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -12,12 +13,14 @@ from synth.render.camera.camera import Camera
 from synth.render.mitsuba.adapter import Lamp
 
 Floats = npt.NDArray[np.float64]
+Map = npt.NDArray[np.float32]
 
-_APART = 1.35  # between the main lamp and each of the others, round the optical axis [rad]
-# A dome of 70 mm under an opening of 12 mm faces at most 10 degrees aside: a lamp that only a slope of 17
-# mirrors lights sparks on vessels and sulci, and none of the crowns.
-_SPARSE_DEG = 17.0
-_STEEPEST_DEG = 40.0
+_APART = 2.2  # between the lamps, round the optical axis [rad]
+_SPARSE_DEG = 17.0  # slope that mirrors the main lamp into the lens where highlights are fewest
+_STEEPEST_DEG = 6.5
+_FADE = 0.6  # widths of the field over which the spot ends
+_RAYS = 65  # across a picture
+_WINDOW_DEG = 0.7  # radius of a lamp's window, seen from the tissue
 
 
 @dataclass(frozen=True)
@@ -25,9 +28,9 @@ class Lighting:
     """Light of one sequence."""
 
     glare: float
-    """0 few highlights to 1 a third of the tissue."""
+    """0 few highlights to 1 many."""
     mirror_deg: float
-    """Slope of the surface that mirrors the main lamp into the lens; used without `tilt_deg`."""
+    """Slope that mirrors the main lamp into the lens, if the lamp stays beside it; not with `tilt_deg`."""
     tilt_deg: float | None
     """Angle between main lamp and optical axis, if the job sets one."""
     azimuth_deg: float
@@ -70,29 +73,39 @@ def lamps(camera: Camera, lighting: Lighting) -> list[Lamp]:
     """Lamps that together give a white surface in the opening a radiance of about 1."""
     colour = blackbody(lighting.kelvin)
     distance = float(np.linalg.norm(camera.centre))
-    target = np.zeros(3)
-    field = camera.size[0] * camera.mm_per_px
-    beam = np.rad2deg(np.arctan(lighting.even * field / distance))
-    cutoff = np.rad2deg(np.arctan((lighting.even + 0.6) * field / distance))
     # Radiance of a white diffuser square to the light is I / (pi d^2); the opening is not square to it.
     total = lighting.power * np.pi * distance**2
-
-    def lamp(position: Floats, share: float, weight: float) -> Lamp:
-        r, g, b = (share * total * colour).tolist()
-        return Lamp(position, target, (r, g, b), float(cutoff), float(beam), weight)
-
-    # With weights 2:1:1 the four strata of a multijittered pixel look at the same lamps in every pixel, and
-    # the choice of a lamp makes no noise.
+    window = distance * float(np.tan(np.deg2rad(_WINDOW_DEG)))
     made = []
-    for side, share, weight in ((0.0, lighting.main, 2.0), (1.0, 0.0, 1.0), (-1.0, 0.0, 1.0)):
+    # Of equal weight: each has half of a multijittered pixel's strata, and the choice makes no noise.
+    for side, share in ((0.0, lighting.main), (1.0, 1 - lighting.main)):
         towards = _towards(camera, lighting, side)
-        share = share or (1 - lighting.main) / 2
-        made.append(lamp(distance * towards, share / max(float(towards[2]), 0.3), weight))
+        r, g, b = (share * total * colour / max(float(towards[2]), 0.3)).tolist()
+        made.append(Lamp(distance * towards, np.zeros(3), window, (r, g, b), 1.0))
     return made
 
 
+def spot(camera: Camera, rest: Camera, lighting: Lighting) -> Map:
+    """Share (H, W) of the lamps' light that reaches what each pixel of a camera sees at the opening's height.
+
+    Even in the middle and fading outside; it moves with the microscope at `rest`.
+    """
+    field = rest.size[0] * rest.mm_per_px
+    axis = rest.centre / np.linalg.norm(rest.centre)
+    width, height = camera.size
+    # A smooth field: some rays are enough.
+    columns, rows = (np.linspace(0, n - 1, _RAYS) for n in (width, height))
+    x, y = np.meshgrid((columns - camera.K[0, 2]) / camera.K[0, 0], (rows - camera.K[1, 2]) / camera.K[1, 1])
+    rays = np.stack([x, y, np.ones_like(x)], axis=-1) @ camera.rotation
+    met = camera.centre - (camera.centre @ axis / (rays @ axis))[..., None] * rays
+    away = (np.linalg.norm(met, axis=-1) / field).astype(np.float32)
+    across, down = (np.linspace(0, _RAYS - 1, n, dtype=np.float32) for n in (width, height))
+    away = cv2.remap(away, *np.meshgrid(across, down), cv2.INTER_LINEAR)
+    return np.asarray(np.clip((lighting.even + _FADE - away) / _FADE, 0, 1), np.float32)
+
+
 def _towards(camera: Camera, lighting: Lighting, side: float) -> Floats:
-    """Unit direction (3,) from the craniotomy to the main lamp (side 0) or to one beside it (1, -1)."""
+    """Unit direction (3,) from the craniotomy to the main lamp (side 0) or to the one across the lens (1)."""
     axis = camera.centre / np.linalg.norm(camera.centre)
     turn = np.deg2rad(lighting.azimuth_deg) + side * _APART
     if lighting.tilt_deg is not None:

@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import json
-import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
 from synth.errors import UserError
 from synth.job import identity
-from synth.system import foreign_file
+from synth.system import foreign_file, foreign_storage
 
 Floats = npt.NDArray[np.float64]
 
@@ -30,8 +28,6 @@ _LENS = (
     "dist",
 )
 _LARGEST = 1e6  # of anything in px or of a lens
-_DEEPEST = 50
-_NESTING = re.compile(r"(?P<opens>[\[{]|<(?=\w)|[-?] +(?=[-?] )|\w: +(?=\w+: ))|[\]}]|</|/>")
 _SIZE = (("image_width", "image_height"), ("image_Width", "image_Height"), ("width", "height"))
 
 
@@ -75,9 +71,10 @@ def read(path: Path) -> Calibration:
     """
     try:
         text = foreign_file.read_text(path, identity.FILES["render", "calibration"])
+        is_json = path.suffix.lower() == ".json"
+        found = _json(path, text) if is_json else foreign_storage.read_storage(path.name, text)
     except UserError as error:
         raise UserError(f"render.calibration: {error}") from None
-    found = _json(path, text) if path.suffix.lower() == ".json" else _storage(path, text)
     K = _array(path, found, _MATRIX, "camera matrix")
     if K.shape != (3, 3):
         raise UserError(f"render.calibration: {path.name}: the camera matrix is {K.shape}, not 3 x 3")
@@ -112,35 +109,10 @@ def _json(path: Path, text: str) -> dict[str, Any]:
     try:
         found = json.loads(text)
     except (ValueError, RecursionError) as error:
-        raise UserError(f"render.calibration: {path.name}: is no JSON ({error})") from error
+        raise UserError(f"{path.name}: is no JSON ({error})") from error
     if not isinstance(found, dict):
-        raise UserError(f"render.calibration: {path.name}: holds no named values")
+        raise UserError(f"{path.name}: holds no named values")
     return found
-
-
-def _storage(path: Path, text: str) -> dict[str, Any]:
-    depth = deepest = 0
-    for token in _NESTING.finditer(text):
-        depth += 1 if token["opens"] else -1
-        deepest = max(deepest, depth)
-    if deepest > _DEEPEST:  # OpenCV's parser calls itself for each level, and ends the process
-        raise UserError(f"render.calibration: {path.name}: is nested deeper than {_DEEPEST} levels")
-    try:
-        storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
-        root = storage.root()
-        if not storage.isOpened() or not root.isMap():
-            raise UserError(f"render.calibration: {path.name}: is no OpenCV calibration (YAML, XML or JSON)")
-        found: dict[str, Any] = {}
-        for name in root.keys():  # noqa: SIM118 - a FileNode is no dictionary
-            node = root.getNode(name)
-            if node.isMap():
-                found[name] = node.mat()
-            elif node.isInt() or node.isReal():
-                found[name] = node.real()
-        return found
-    except (cv2.error, SystemError) as error:
-        why = (str(error).strip().splitlines() or ["it is damaged"])[-1][:200]
-        raise UserError(f"render.calibration: {path.name}: is no OpenCV calibration ({why})") from error
 
 
 def _array(path: Path, found: dict[str, Any], names: tuple[str, ...], what: str) -> Floats:

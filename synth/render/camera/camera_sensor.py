@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from synth.job import schema
+from synth.system.jit import vectorised
 
 Map = npt.NDArray[np.float32]
 
@@ -71,19 +72,34 @@ def record(radiance: Map, sensor: Sensor, rng: np.random.Generator) -> npt.NDArr
     """
     light = radiance * (sensor.exposure * _falloff(radiance.shape[:2], sensor.vignette))[..., None]
     light = _scatter(light, sensor.bloom)
-    electrons = np.maximum(light, 0) * np.float32(sensor.full_well)
-    # A Poisson count this large is a Gaussian to within the readout noise.
-    noise = rng.standard_normal(electrons.shape, dtype=np.float32)
-    electrons = electrons + noise * np.sqrt(electrons + np.float32(sensor.read_noise**2))
-    steps = np.float32(2**sensor.bits - 1)
-    digital = np.rint(np.clip(electrons / np.float32(sensor.full_well), 0, 1) * steps) / steps
-    balanced = np.clip(digital * np.asarray(sensor.white, np.float32), 0, 1)
+    balanced = rng.standard_normal(light.shape, dtype=np.float32)
+    well, read = np.float32(sensor.full_well), np.float32(sensor.read_noise**2)
+    steps, white = np.float32(2**sensor.bits - 1), np.asarray(sensor.white, np.float32)
+    _convert(np.asarray(light, np.float32), well, read, steps, white, balanced)
     if sensor.bayer:
         balanced = _demosaiced(balanced)
     video = _tone(balanced, sensor.contrast)
     video = _sharpen(video, sensor.sharpening)
-    video = _thinned(np.clip(video, 0, 1), sensor.chroma)
-    return np.rint(np.clip(video, 0, 1) * 255).astype(np.uint8)
+    video = _thinned(np.clip(video, 0, 1, out=video), sensor.chroma)
+    np.clip(video, 0, 1, out=video)
+    video *= np.float32(255)
+    return np.rint(video, out=video).astype(np.uint8)
+
+
+@vectorised
+def _convert(
+    light: Map, well: np.float32, read: np.float32, steps: np.float32, white: Map, noise: Map
+) -> None:
+    """Noise, converter and white balance; takes normal `noise` (H, W, 3) and leaves the picture in it."""
+    zero, one = np.float32(0), np.float32(1)
+    for y in range(light.shape[0]):
+        for x in range(light.shape[1]):
+            for k in range(3):
+                electrons = max(light[y, x, k], zero) * well
+                # A Poisson count this large is a Gaussian to within the readout noise.
+                electrons = electrons + noise[y, x, k] * np.sqrt(electrons + read)
+                digital = np.rint(min(max(electrons / well, zero), one) * steps) / steps
+                noise[y, x, k] = min(max(digital * white[k], zero), one)
 
 
 def _demosaiced(balanced: Map) -> Map:
@@ -131,12 +147,28 @@ def _tone(linear: Map, contrast: float) -> Map:
     levels = np.linspace(0, 1, 4097, dtype=np.float32)
     encoded = np.where(levels <= 0.0031308, 12.92 * levels, 1.055 * levels ** (1 / 2.4) - 0.055)
     curve = (encoded + contrast * (encoded * encoded * (3 - 2 * encoded) - encoded)).astype(np.float32)
-    at = linear * 4096
-    low = np.minimum(at.astype(np.int32), 4095)
-    return np.asarray(curve[low] + (at - low) * (curve[low + 1] - curve[low]), np.float32)
+    video = np.empty(linear.shape, np.float32)
+    _look_up(np.ascontiguousarray(linear, np.float32), curve, video)
+    return video
+
+
+@vectorised
+def _look_up(linear: Map, curve: Map, video: Map) -> None:
+    """A curve (4097,) over 0 to 1, read at linear (H, W, 3) in double precision, into `video`."""
+    for y in range(linear.shape[0]):
+        for x in range(linear.shape[1]):
+            for k in range(3):
+                at = linear[y, x, k] * np.float32(4096)
+                low = int(at)
+                if low > 4095:
+                    low = 4095
+                video[y, x, k] = curve[low] + (at - low) * (curve[low + 1] - curve[low])
 
 
 def _sharpen(video: Map, amount: float) -> Map:
     if amount == 0:
         return video
-    return np.asarray(video + amount * (video - cv2.GaussianBlur(video, (0, 0), 1.0)), np.float32)
+    sharp = cv2.GaussianBlur(video, (0, 0), 1.0)
+    np.subtract(video, sharp, out=sharp)
+    sharp *= np.float32(amount)
+    return np.asarray(np.add(video, sharp, out=sharp), np.float32)

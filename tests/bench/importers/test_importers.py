@@ -56,7 +56,13 @@ def hdf5(path: Path) -> Path:
     return path
 
 
-def mcap(path: Path) -> Path:
+LATE_S = 1e6
+"""How late the bag's own clock is."""
+
+
+def mcap(
+    path: Path, topics: tuple[str, ...] = ("/camera", "/ft", "/tip"), unstamped: tuple[str, ...] = ()
+) -> Path:
     """A ROS 2 bag folder; the .mcap in it can be read alone as well."""
     pytest.importorskip("rosbags", reason="rosbags is not installed")
     from rosbags.rosbag2 import StoragePlugin, Writer
@@ -65,36 +71,41 @@ def mcap(path: Path) -> Path:
     store = get_typestore(Stores.ROS2_HUMBLE)
     kind = store.types
     with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as bag:
-        topics = {
+        written = {
             name: bag.add_connection(name, message, typestore=store)
             for name, message in (
                 ("/camera", "sensor_msgs/msg/Image"),
                 ("/ft", "geometry_msgs/msg/WrenchStamped"),
                 ("/tip", "geometry_msgs/msg/PoseStamped"),
             )
+            if name in topics
         }
         for k, picture in enumerate(footage()):
             whole = int(TIMES[k])
-            stamp = kind["builtin_interfaces/msg/Time"](whole, round(1e9 * (TIMES[k] - whole)) + 1)
-            head = kind["std_msgs/msg/Header"](stamp, "")
+            stamp = kind["builtin_interfaces/msg/Time"](whole, round(1e9 * (TIMES[k] - whole)))
+            none = kind["builtin_interfaces/msg/Time"](0, 0)
+            heads = {
+                name: kind["std_msgs/msg/Header"](none if name in unstamped else stamp, "")
+                for name in ("/camera", "/ft", "/tip")
+            }
             vector = kind["geometry_msgs/msg/Vector3"]
             bgr = np.ascontiguousarray(picture[..., ::-1]).ravel()
             messages = {
-                "/camera": kind["sensor_msgs/msg/Image"](head, 12, 16, "bgr8", 0, 48, bgr),
+                "/camera": kind["sensor_msgs/msg/Image"](heads["/camera"], 12, 16, "bgr8", 0, 48, bgr),
                 "/ft": kind["geometry_msgs/msg/WrenchStamped"](
-                    head, kind["geometry_msgs/msg/Wrench"](vector(*FORCE[k]), vector(0.0, 0.0, 0.0))
+                    heads["/ft"], kind["geometry_msgs/msg/Wrench"](vector(*FORCE[k]), vector(0.0, 0.0, 0.0))
                 ),
                 "/tip": kind["geometry_msgs/msg/PoseStamped"](
-                    head,
+                    heads["/tip"],
                     kind["geometry_msgs/msg/Pose"](
                         kind["geometry_msgs/msg/Point"](*(TIP[k] / 1000)),
                         kind["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0),
                     ),
                 ),
             }
-            for name, message in messages.items():
-                raw = store.serialize_cdr(message, message.__msgtype__)
-                bag.write(topics[name], round(1e9 * TIMES[k]) + 1, raw)
+            for name, connection in written.items():
+                raw = store.serialize_cdr(messages[name], messages[name].__msgtype__)
+                bag.write(connection, round(1e9 * (LATE_S + TIMES[k])), raw)
     return path
 
 
@@ -125,6 +136,30 @@ def test_a_lone_mcap_is_read(tmp_path: Path) -> None:
     found = registry.read_source(next(folder.glob("*.mcap")))
     assert len(found.times_s) == 4
     assert next(found.pictures()).shape == (12, 16, 3)
+
+
+@pytest.mark.parametrize("topics", [("/camera",), ("/camera", "/ft"), ("/camera", "/tip")])
+def test_a_bag_may_lack_forces_and_tip(tmp_path: Path, topics: tuple[str, ...]) -> None:
+    found = registry.read_source(mcap(tmp_path / "bag", topics))
+    assert len(found.force) == len(found.force_s) == (4 if "/ft" in topics else 0)
+    assert found.tip.shape == (4 if "/tip" in topics else 0, 4)
+
+
+def test_the_bags_clock_stands_in_for_topics_without_stamps_alone(tmp_path: Path) -> None:
+    """A stamp that is zero, as the first of a simulated clock, is one where the topic's others are not."""
+    found = registry.read_source(mcap(tmp_path / "bag", unstamped=("/tip",)))
+    assert found.times_s == pytest.approx(TIMES)
+    assert found.force_s == pytest.approx(TIMES)
+    assert found.tip[:, 0] == pytest.approx(LATE_S + TIMES)
+
+
+def test_a_force_of_one_number_among_those_of_three_is_refused(tmp_path: Path) -> None:
+    source = igs(tmp_path / "a.mha")
+    data = source.read_bytes()
+    source.write_bytes(data.replace(b"Frame0002_Force = 0.2 0.1 0.0", b"Frame0002_Force = 0.2"))
+    assert source.read_bytes() != data
+    with pytest.raises(UserError, match="Force of frame 2 is not 3 numbers"):
+        registry.read_source(source)
 
 
 def spoil_text(path: Path) -> Path:

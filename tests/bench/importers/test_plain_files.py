@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import cv2
@@ -75,6 +76,37 @@ def test_stamps_as_tools_write_them(tmp_path: Path, header: str, row: str, secon
     time, force = plain_files.read_forces(tmp_path / "t.csv")
     assert time == pytest.approx([seconds])
     assert force.tolist() == [[1, 2, 3]]
+
+
+@pytest.mark.parametrize(("rate_hz", "unit", "word"), [(1000, 1e3, "milli"), (1000, 1e6, "micro")])
+def test_a_fast_sensors_other_unit_is_told_by_the_video(
+    tmp_path: Path, rate_hz: float, unit: float, word: str
+) -> None:
+    np.save(tmp_path / "film.npy", FILM)
+    table = tmp_path / "ft.csv"
+
+    def read(seconds: float, of: float) -> registry.Intake:
+        rows = [f"{of * k / rate_hz:.6f},0,0,1" for k in range(int(seconds * rate_hz))]
+        table.write_text("\n".join(["t_s,fx,fy,fz", *rows]) + "\n")
+        return registry.read_source(tmp_path / "film.npy", {"fps": "25", "force": str(table)})
+
+    with pytest.raises(UserError, match=f"they look like {word}seconds, not seconds|their times look like"):
+        read(1, unit)
+    assert len(read(1, 1).force) == 1000
+    # Seconds of a sensor that ran for two minutes beside half a second of video.
+    assert len(read(120, 1).force) == 120_000
+
+
+def test_pictures_are_named_as_they_please(pictures: Path) -> None:
+    (pictures / "img3.png").rename(pictures / "img3².png")
+    assert len(registry.read_source(pictures, {"fps": "5"}).times_s) == 12
+
+
+def test_a_table_that_is_a_pipe_is_refused(pictures: Path, tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    for use in ({"frame_time": str(tmp_path / "pipe")}, {"fps": "5", "force": str(tmp_path / "pipe")}):
+        with pytest.raises(UserError, match="no regular file"):
+            registry.read_source(pictures, use)
 
 
 def test_what_lacks_is_said(pictures: Path, tmp_path: Path) -> None:

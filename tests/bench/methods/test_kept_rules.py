@@ -10,6 +10,7 @@ import pytest
 from bench.methods import baselines, kept_rules
 from bench.methods.baselines import Rule
 from learn.data.clips import Clip
+from synth.dataset import provenance
 from synth.system import cache
 
 N = baselines.GRID.size
@@ -50,3 +51,6 @@ def test_rules_are_fitted_once_for_a_model(tmp_path: Path, monkeypatch: pytest.M
         file.write_bytes(file.read_bytes()[:100])  # a disk that was full
     kept_rules.keep_rules(["a", "b"], "recovered", fit)
     assert len(times) == 4
+    monkeypatch.setattr(provenance, "source", lambda *asked: "other code")
+    kept_rules.keep_rules(["a", "b"], "recovered", fit)
+    assert len(times) == 5

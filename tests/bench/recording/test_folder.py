@@ -92,6 +92,27 @@ def test_table_names_the_line(tmp_path: Path) -> None:
     assert np.isnan(got["a"][1])
 
 
+def test_a_quoted_cell_is_one_cell_in_every_row(tmp_path: Path) -> None:
+    file = tmp_path / "t.csv"
+    file.write_text('note,t_s,fx_n\n"a, then b",1,2\nc,3,4\n"say ""x"", y",5,"6"\n')
+    got = csv_table.read_csv(file, ("t_s", "fx_n"))
+    assert got["t_s"].tolist() == [1, 3, 5]
+    assert got["fx_n"].tolist() == [2, 4, 6]
+    file.write_text('note,t_s,fx_n\n"x,7,8,y",1,2\n')
+    assert csv_table.read_csv(file, ("t_s", "fx_n"))["t_s"].tolist() == [1], "shifted in silence"
+
+
+@pytest.mark.parametrize("footage", ["png", "mp4"])
+def test_frames_that_the_table_lacks_have_no_time(make: Maker, footage: str) -> None:
+    folder = make(frames=4, footage=footage, meta={"fps": 10.0})
+    (folder / "frames.csv").write_text("frame,t_s\n0,100\n2,100.4\n")
+    assert [frame.time_s for frame in open_recording(folder).frames()] == [100, None, 100.4, None]
+    (folder / "frames.csv").unlink()
+    if footage == "png":
+        times = [frame.time_s for frame in open_recording(folder).frames()]
+        assert times == pytest.approx([0, 0.1, 0.2, 0.3])
+
+
 def test_meta_tells_all_errors_at_once(make: Maker) -> None:
     folder = make(frames=2, force=False)
     (folder / "meta.yaml").write_text("scale_mm_per_px: -1\nyoung: 3\nrest_frame: 0\n")

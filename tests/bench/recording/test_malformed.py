@@ -108,6 +108,7 @@ CASES: dict[str, tuple[Spoil, str]] = {
         meta("sync: {method: correlate, calibration_s: [0, 0.3]}"),
         "could not be aligned",
     ),
+    "press backwards": (meta("press_s: [0.5, 0.2]"), "press_s: a span must end after its beginning"),
     "no pictures": (gone("frames"), "neither video"),
     "video and pictures": (both, "keep one"),
     "picture is broken": (data("frames/0003.png", b"png?"), "not a readable picture"),
@@ -128,7 +129,14 @@ CASES: dict[str, tuple[Spoil, str]] = {
     "force has words": (text("force.csv", HEAD + "0,0,0,0\n1,a,0,0\n"), "'a' is not a number"),
     "force row cut off": (rows(lambda lines: [*lines[:-1], lines[-1][:6]]), "cut off"),
     "force in millinewtons": (rows(lambda lines: [f"{k / 100},{k * 90},0,0" for k in range(90)]), "in mN"),
-    "sensor clock in ms": (rows(lambda lines: [f"{k * 10},0.1,0,0" for k in range(90)]), "covers"),
+    "sensor clock in ms": (
+        rows(lambda lines: [f"{k * 10},0.1,0,0" for k in range(90)]),
+        "look like milliseconds, not seconds: predictions only",
+    ),
+    "fast sensor's clock in ms": (
+        rows(lambda lines: [f"{k},0.1,0,0" for k in range(900)]),
+        "look like milliseconds, not seconds: predictions only",
+    ),
     "sensor clock elsewhere": (
         rows(lambda lines: [f"{1e9 + k},0.1,0,0" for k in range(90)]),
         "share no time",

@@ -19,6 +19,7 @@ from bench.recording.folder import open_recording
 from bench.scoring import charts, evaluate_recording, pool, report
 from bench.scoring.evaluate_recording import Result, Settings
 from bench.scoring.headline import headline
+from bench.sensor import clock_sync
 from learn.inference.video_flow import Flags, FlowHere, Found, Rgb
 
 SIZE = (96, 128)
@@ -72,6 +73,24 @@ def test_lost_frames_are_out_of_the_scores_gaps_in_the_curves_and_counted(make: 
     assert tree["curve"]["predicted_mn"]["bump"][7] is None
     assert any("3 of 30 frames could not be followed" in note for note in some.notes)
     assert headline(some).refused == ""
+
+
+def test_force_goes_with_the_scales_square_so_its_error_counts_twice(make: Maker) -> None:
+    result = run(make(frames=4, meta={"scale_uncertainty": 0.05, "young_uncertainty": 0.1}))
+    assert result.relative_uncertainty == pytest.approx(math.hypot(0.10, 0.1))
+
+
+def test_lost_frames_have_no_part_in_the_clocks_search(make: Maker, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Their flow of 50 px would be the largest motion of all, and into them and out of them."""
+    asked: list[np.ndarray] = []
+
+    def find(frame_s: object, speed: np.ndarray, *rest: object) -> clock_sync.Offset:
+        asked.append(speed)
+        return clock_sync.Offset(0.0, 1.0, 1.0, 0.0, "")
+
+    monkeypatch.setattr(clock_sync, "find_offset", find)
+    run(make(meta={"sync": {"method": "correlate", "calibration_s": [0, 2.05]}}), {7, 8, 20})
+    assert np.flatnonzero(np.isnan(asked[0])).tolist() == [7, 8, 9, 20]
 
 
 def test_over_a_fifth_lost_no_number_is_said_first(make: Maker) -> None:

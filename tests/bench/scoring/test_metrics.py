@@ -80,6 +80,26 @@ def test_peak_and_impulse_errors() -> None:
     assert rows[0]["impulse_mns"] == pytest.approx(100 * np.sqrt(0.1 * np.pi), rel=0.02)
 
 
+def test_what_the_sensor_felt_is_no_matter_of_the_prediction() -> None:
+    """Half of one contact, its peak too, and all of another were lost: the sensor felt them all the same."""
+    t = np.arange(0, 8, 0.01)
+    felt = [100 * np.exp(-((t - at) ** 2) / 0.1) for at in (2, 4, 6)]
+    x = np.sum(felt, axis=0)
+    y = 1.2 * x
+    y[(t > 1.9) & (t < 2.5) | (t > 3) & (t < 5)] = np.nan
+    whole, whole_rows = metrics.compute_all(t, x, 1.2 * x)
+    scores, rows = metrics.compute_all(t, x, y)
+    assert scores["events"] == 3
+    for key in ("from_s", "to_s", "peak_mn", "impulse_mns"):
+        assert [row[key] for row in rows] == pytest.approx([row[key] for row in whole_rows])
+    assert scores["event_peak_mn"] == pytest.approx(whole["event_peak_mn"])
+    for key in ("predicted_peak_mn", "peak_error", "impulse_error", "mae_mn"):
+        assert np.isnan(rows[1][key])
+    assert [rows[k]["peak_error"] for k in (0, 2)] == pytest.approx([0.2, 0.2]), "over what was followed"
+    assert scores["peak_mae"] == pytest.approx(0.2)
+    assert scores["impulse_mae"] == pytest.approx(0.2)
+
+
 def test_ghosts_are_counted_only_without_contact() -> None:
     t = np.arange(200) / 20
     x = np.where((t > 4) & (t < 6), 100.0, 0.0)

@@ -56,6 +56,23 @@ def test_a_recording_without_scores_is_named() -> None:
     assert "Recording b is left out" in pool.drawn(tree | MADE, "README.md").text()
 
 
+@pytest.mark.parametrize(
+    ("odd", "why"),
+    [
+        ({"lost": {"frames": 3, "share": 0.3, "most": 0.2}}, "30% of its frames were lost"),
+        ({"fault": "the picture never changes"}, "nothing can be measured: the picture never changes"),
+    ],
+)
+def test_what_its_own_report_refuses_is_not_pooled(odd: dict[str, Any], why: str, tmp_path: Path) -> None:
+    fine = {"lost": {"frames": 2, "share": 0.2, "most": 0.2}, "fault": ""}
+    tree = pool.pool([score("a", 5.0) | fine, score("b", 1.0) | odd])
+    assert tree["left_out"] == {"b": why}
+    assert tree["methods"]["net"]["scores"]["mae_mn"]["mean"] == 5.0
+    (tmp_path / "score.json").write_text(json.dumps(score("b", 1.0) | odd))
+    with pytest.raises(UserError, match=f"no recording that can be pooled .b: {why}"):
+        pool.read([tmp_path])
+
+
 def test_command_reads_folders_and_refuses_the_same_twice(tmp_path: Path) -> None:
     for name in "ab":
         (tmp_path / name).mkdir()

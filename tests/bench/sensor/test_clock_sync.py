@@ -62,6 +62,17 @@ def test_lag_beyond_the_search_is_refused() -> None:
     assert clock_sync.find_offset(*recording(0.5), search_s=0.3).refused
 
 
+def test_intervals_that_were_not_followed_are_left_out() -> None:
+    frames, speed, t, force = recording(0.2)
+    lost = np.arange(20, 60)
+    speed[lost] = np.nan
+    found = clock_sync.find_offset(frames, speed, t, force, 0.7)
+    assert found.refused == ""
+    assert found.offset_s == pytest.approx(0.2, abs=1 / 25)
+    speed[15:] = np.nan
+    assert "could be followed" in clock_sync.find_offset(frames, speed, t, force, 0.7).refused
+
+
 def test_too_short_a_span_and_a_still_one_are_refused() -> None:
     frames, speed, t, force = recording(0.0)
     assert "frame intervals" in clock_sync.find_offset(frames[:10], speed[:10], t, force, 0.5).refused

@@ -44,8 +44,11 @@ def test_gravity_of_what_hangs_on_a_turning_tool() -> None:
     raw = Force(t, -on_tool, down)  # the reader has turned the sign: force on the tissue
     got = force_sensor.process_force(raw, Sensor(acts_on="tool", mass_g=20, low_pass_hz=None), 0.0)
     assert got.force_mn == pytest.approx(three(50 * np.exp(-((t - 2) ** 2))), abs=1e-9)
-    with pytest.raises(UserError, match="gx, gy, gz"):
+    with pytest.raises(UserError, match="has no columns gx, gy, gz"):
         force_sensor.process_force(Force(t, -on_tool), Sensor(mass_g=20), 0.0)
+    # As an accelerometer gives it; the weight taken off would be ten times that of what hangs there.
+    with pytest.raises(UserError, match=r"gx, gy, gz have the length 9.807 at .* s; a unit vector"):
+        force_sensor.process_force(Force(t, -on_tool, 9.80665 * down), Sensor(mass_g=20), 0.0)
 
 
 @pytest.mark.parametrize("causal", [False, True])
@@ -63,6 +66,36 @@ def test_low_pass_delays_only_when_causal(causal: bool) -> None:
         assert delay_s == pytest.approx(2.613 / (2 * np.pi * 8), abs=0.002)
     else:
         assert delay_s == pytest.approx(0, abs=0.001)
+
+
+@pytest.mark.parametrize(("burst", "filtered"), [(4, True), (40, False)])
+def test_stamps_in_bursts_are_filtered_or_said_not_to_be(burst: int, filtered: bool) -> None:
+    """A link that delivers samples of 500 Hz in packets, all of one packet stamped within 10 us each."""
+    n = np.arange(8000)
+    t = 0.002 * burst * (n // burst) + 1e-5 * (n % burst)
+    raw = Force(t, three(np.sin(2 * np.pi * 0.002 * n) + np.sin(2 * np.pi * 60 * 0.002 * n)))
+    got = force_sensor.process_force(raw, Sensor(low_pass_hz=8), 0.0)
+    error = np.abs(got.force_mn[:, 0] - np.sin(2 * np.pi * 0.002 * n))[500:-500].max()
+    if filtered:
+        assert error < 0.1
+        assert np.isfinite(force_sensor.force_at(got, np.array([1.0011, 2.0037]))).all()
+    assert any("not filtered" in step for step in got.steps) is not filtered
+
+
+def test_a_hole_changes_no_sample_time() -> None:
+    t = np.concatenate([np.arange(0, 5, 0.01), np.arange(2000, 2005, 0.01)])
+    got = force_sensor.process_force(Force(t, three(np.sin(2 * np.pi * 30 * t))), Sensor(), 0.0)
+    assert got.steps == ("zero-phase Butterworth low-pass, order 4, 10 Hz",)
+    assert np.abs(got.force_mn[50:450]).max() < 0.05
+
+
+def test_a_free_span_within_another_is_taken_by_its_middle() -> None:
+    t = np.arange(0, 10, 0.01)
+    raw = Force(t, three(3 * t))
+    about = Sensor(low_pass_hz=None, free_s=((0, 10), (1, 2), (8, 9)))
+    got = force_sensor.process_force(raw, about, 0.0)
+    inner = (t > 1.6) & (t < 8.4)
+    assert np.abs(got.force_mn[inner]).max() < 0.05
 
 
 def test_frames_in_a_hole_have_no_truth() -> None:

@@ -7,9 +7,10 @@ import numpy as np
 import phantom
 import pytest
 
-from learn.data.clips import Clip, load_clips, target
+from learn.data.clips import Clip, load_clips, pack, target, unpack
 from learn.data.grid import Grid
 from learn.data.split import folds, groups, nested, ungrouped
+from synth.dataset import provenance
 from synth.dataset.split import name_anatomy
 from synth.errors import UserError
 
@@ -50,6 +51,37 @@ def test_a_packed_cache_gives_the_same_and_is_used(dataset: Path, clips: list[Cl
         assert isinstance(b.density, np.memmap)
         assert (a.name, a.group, a.family, a.young_kpa) == (b.name, b.group, b.family, b.young_kpa)
     assert len(list(tmp_path.iterdir())) == len(clips)
+
+
+def test_other_code_packs_anew(dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    load_clips(dataset, GRID, ("ideal",), cache=tmp_path)
+    before = set(tmp_path.iterdir())
+    asked: list[list[str]] = []
+
+    def source(modules: list[str], ours: tuple[str, ...]) -> str:
+        asked.append(list(modules))
+        return "other code"
+
+    monkeypatch.setattr(provenance, "source", source)
+    load_clips(dataset, GRID, ("ideal",), cache=tmp_path)
+    assert asked == [["learn.data.clips"]]  # which imports the grid
+    assert len(set(tmp_path.iterdir()) - before) == len(before)
+
+
+def test_two_runs_may_pack_the_same_at_once(
+    clips: list[Clip], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real = Path.rename
+
+    def late(part: Path, to: Path) -> Path:
+        monkeypatch.setattr(Path, "rename", real)
+        pack(clips[0], to)  # the other run is done at the last moment
+        return real(part, to)
+
+    monkeypatch.setattr(Path, "rename", late)
+    pack(clips[0], tmp_path / "packed")
+    assert [path.name for path in tmp_path.iterdir()] == ["packed"]
+    np.testing.assert_array_equal(unpack(tmp_path / "packed").density, clips[0].density)
 
 
 def test_a_store_without_recovered_flow(tmp_path: Path) -> None:

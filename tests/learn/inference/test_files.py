@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 
 import av
@@ -17,9 +18,11 @@ from learn.checkpoint import Card, write_model
 from learn.cli import app
 from learn.data.clips import Clip
 from learn.data.grid import Grid
+from learn.inference import apply
 from learn.inference.apply import Filmed, motions
 from learn.inference.export import examples, export
 from learn.inference.predict import load_predictor
+from learn.inference.pulse import Pulse, Rhythm
 from learn.inference.stiffness import stiffness
 from learn.inference.video import read_video
 from learn.inference.video_flow import Footage, Settings, VideoFlow
@@ -83,6 +86,17 @@ def test_an_unfaithful_export_is_refused_and_removed(
         export(load_predictor(model), tmp_path / "net", "tflite")
 
 
+def test_predict_never_writes_over_what_it_reads(model: Path, dataset: Path, tmp_path: Path) -> None:
+    sequence = Dataset(dataset)[2]
+    mine = tmp_path / "mine.npz"
+    np.savez(mine, flow=sequence["flow"][:], tissue=sequence["tissue"][:], scale_mm_per_px=0.5)
+    before = mine.read_bytes()
+    done = run(app, ["predict", str(model), str(mine), "-o", str(tmp_path)])
+    assert (done.exit_code, len(done.stderr.splitlines())) == (2, 1), done.output
+    assert "would be overwritten" in done.stderr
+    assert mine.read_bytes() == before
+
+
 def test_predict_on_stores_and_on_arrays_agree(model: Path, dataset: Path, tmp_path: Path) -> None:
     store = sorted(dataset.glob("*.zarr"))[2]
     sequence = Dataset(dataset)[2]
@@ -144,6 +158,14 @@ def test_a_video_is_followed_and_predicted(model: Path, tmp_path: Path) -> None:
     np.testing.assert_allclose(seen[2][16:32, 16:48].mean((0, 1)), [2, 0], atol=0.3)
 
 
+def test_a_pulse_that_was_taken_off_is_said_once(tmp_path: Path) -> None:
+    write_film(tmp_path / "film.mp4", 1)
+    beat = Rhythm(1.2, np.zeros(1), np.zeros(1), np.zeros((2, 1, 2)))
+    found = Pulse((beat,), np.zeros((48, 64, 1), np.float32), np.zeros((1, 2)), (0.5,), 1.0)
+    notes = " ".join(apply._video(tmp_path / "film.mp4", Filmed(0.1), found).notes())
+    assert notes.count("the whole surface moves by itself") == notes.count("taken off") == 1
+
+
 def test_films_that_are_none(tmp_path: Path) -> None:
     write_film(tmp_path / "film.mp4", 1)
     (tmp_path / "torn.mp4").write_bytes(b"no film")
@@ -162,6 +184,7 @@ def test_films_that_are_none(tmp_path: Path) -> None:
 def test_stiffness_from_a_press(clips: list[Clip], dataset: Path, tmp_path: Path) -> None:
     """A model that is right per unit stiffness finds E, whatever E it starts from; film or not."""
     clip = clips[2]
+    at_rest = 0.3 * np.abs(clip.density).max() * clip.mask
 
     class Right:
         grid = Grid(32)
@@ -170,9 +193,10 @@ def test_stiffness_from_a_press(clips: list[Clip], dataset: Path, tmp_path: Path
             settings = override(preset("tiny"), ["size=32", "arch.levels=2", f"arch.condition={condition}"])
             self.card, self.exponent = Card(settings, measure_scales(clips, settings), 0.7, {}, {}), exponent
 
-        def density(self, moved: object, mask: object, young: float, sure: object) -> np.ndarray:
-            # A conditioned network may lean on E; it is right where E is.
-            return clip.density * np.float32(young * (young / clip.young_kpa) ** self.exponent)
+        def density(self, moved: np.ndarray, mask: object, young: float, sure: object) -> np.ndarray:
+            # A conditioned network may lean on E; it is right where E is. Its answer to no motion is not 0.
+            said = clip.density if moved.any() else 0 * clip.density[: len(moved)]
+            return (said + at_rest) * np.float32(young * (young / clip.young_kpa) ** self.exponent)
 
     force = np.linalg.norm(clip.force, axis=1)
     for right in (Right("none", 0.0), Right("film", -0.3)):
@@ -204,10 +228,26 @@ def test_bad_files(tmp_path: Path, dataset: Path) -> None:
     np.savez(tmp_path / "a.npz", flow=np.zeros((2, 4, 4, 2)))
     np.savez(tmp_path / "b.npz", flow=np.zeros((2, 4, 4, 2)), tissue=np.ones((4, 5)), scale_mm_per_px=0.1)
     (tmp_path / "c.npz").write_bytes(b"PK no")
+    flow, tissue = np.zeros((2, 4, 4, 2)), np.ones((4, 4))
+    np.savez(tmp_path / "g.npz", flow=flow, tissue=np.ones((2, 4, 4)), scale_mm_per_px=0.1)
+    np.savez(tmp_path / "h.npz", flow=flow, tissue=tissue, scale_mm_per_px=[0.1, 0.1])
+    np.savez(tmp_path / "i.npz", flow=flow[:0], tissue=tissue, scale_mm_per_px=0.1)
+    np.savez(tmp_path / "j.npz", flow=flow, tissue=tissue, scale_mm_per_px=0.1, young_kpa=np.nan)
+    np.savez(tmp_path / "k.npz", flow=flow, tissue=tissue, scale_mm_per_px="wide")
+    np.save(tmp_path / "l.npy", flow)
+    (tmp_path / "l.npy").rename(tmp_path / "l.npz")
+    os.mkfifo(tmp_path / "m.npz")
     for name, message in (
         ("a.npz", "lacks scale_mm_per_px, tissue"),
         ("b.npz", r"flow is \(2, 4, 4, 2\)"),
         ("c.npz", "cannot be read"),
+        ("g.npz", r"tissue is \(2, 4, 4\)"),
+        ("h.npz", "scale_mm_per_px must be one positive number"),
+        ("i.npz", r"flow is \(0, 4, 4, 2\)"),
+        ("j.npz", "young_kpa must be one positive number"),
+        ("k.npz", "scale_mm_per_px is no array of numbers"),
+        ("l.npz", "cannot be read as .npz"),
+        ("m.npz", "no regular file"),
         ("d.mp4", "give --scale in mm a pixel"),
         ("e.zarr", "no such sequence"),
     ):

@@ -83,9 +83,13 @@ def test_another_versions_dataset_is_continued_only_when_told(
         run(root, job=JOB.model_copy(update={"sequences": 7}), mix_versions=False)
 
 
+def _counted_files(home: Path) -> set[Path]:
+    return provenance._imports(home, provenance._makers(home), {"synth"})
+
+
 def test_what_makes_a_sequence_counts_and_what_keeps_it_does_not() -> None:
     home = Path(provenance.__file__).parents[2]
-    counted = {str(path.relative_to(home)) for path in provenance._makers(home)}
+    counted = {str(path.relative_to(home)) for path in _counted_files(home)}
     assert {
         "synth/sequence/scenario.py",
         "synth/job/schema.py",
@@ -120,7 +124,7 @@ def test_what_moves_into_a_package_still_counts(tmp_path: Path) -> None:
         synth__job__init="from synth.job.schema import Job\n",
         synth__job__schema="class Job:\n    spp = 4\n",
     )
-    counted = {str(path.relative_to(home)) for path in provenance._makers(home)}
+    counted = {str(path.relative_to(home)) for path in _counted_files(home)}
     assert {"synth/__init__.py", "synth/job/__init__.py", "synth/job/schema.py"} <= counted
 
 
@@ -133,8 +137,10 @@ def test_the_kept_hash_is_that_of_the_files_as_they_are(
     for text in ("class Job:\n    spp = 4\n", "class Job:\n    spp = 8\n", "class Job:\n    spp = 4\n"):
         home = _tree(tmp_path / "home", synth__job=text)
         assert (home / job).read_text() == text
-        found.append(provenance._known(home))
-        assert found[-1] == provenance._known(home) == provenance._code(home, provenance._makers(home))
+        asked = home, provenance._makers(home), {"synth"}
+        found.append(provenance._kept(*asked))
+        assert found[-1] == provenance._kept(*asked)
+        assert found[-1] == provenance._code(home, _counted_files(home))
     assert found[0] != found[1]
     assert found[0] == found[2]
     assert len([file for file in tmp_path.iterdir() if file.is_file()]) == 2
@@ -142,13 +148,13 @@ def test_the_kept_hash_is_that_of_the_files_as_they_are(
 
 def test_an_import_that_leads_nowhere_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(LookupError, match=r"synth\.job: there is no such module"):
-        provenance._makers(_tree(tmp_path / "a"))
+        _counted_files(_tree(tmp_path / "a"))
     with pytest.raises(LookupError, match="doesn't say what 'Job' is"):
-        provenance._makers(_tree(tmp_path / "b", synth__job__init="def __getattr__(name): ...\n"))
+        _counted_files(_tree(tmp_path / "b", synth__job__init="def __getattr__(name): ...\n"))
     home = _tree(tmp_path / "c", synth__job="class Job: ...\n")
     (home / "synth/dataset/store.py").unlink()
     with pytest.raises(LookupError, match=r"synth\.dataset\.store: there is no such module"):
-        provenance._makers(home)
+        _counted_files(home)
 
 
 @pytest.mark.slow

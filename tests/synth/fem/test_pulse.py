@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from dome import ANATOMY, patch
+from numpy.typing import NDArray
 
+from synth.checks import physics
 from synth.fem import solver, tool
 from synth.fem.material import Tissue
 from synth.fem.mesh import tetrahedra
@@ -14,6 +16,7 @@ from synth.job import reader, schema
 from synth.job.schema import Job
 from synth.sequence import scenario
 
+Floats = NDArray[np.float64]
 RATE, FRAMES = 10.0, 61
 
 
@@ -93,3 +96,20 @@ def test_states_do_not_depend_on_how_they_were_foretold() -> None:
     lean = equilibrium.solve_path(system, loads, named, lean=True)
     slow = equilibrium.solve_path(system, loads, named)
     assert np.abs(lean.displacement - slow.displacement).max() <= 2e-3 * np.abs(slow.displacement).max()
+
+
+def test_a_jump_is_found_in_spite_of_the_pulse() -> None:
+    beating = moved(Pulse(0.6, 1.2, 0.2, 0.8, 0.3, 1.0), "neo-hookean")
+
+    def worst(work: Floats, pulse: Floats | None) -> float:
+        steps = list(physics.compliance_steps(work, beating.by_instrument, None, 1.0, pulse))
+        assert len(steps) > FRAMES / 3
+        return max(step / limit for _, step, limit in steps)
+
+    assert worst(beating.energy, None) > 1  # the pulse's own motion is no jump of the tissue
+    assert worst(beating.tool_work, beating.pulse_work) < 0.5
+    jumped = beating.tool_work.copy()
+    jumped[FRAMES // 2 :] *= 1.7
+    assert worst(jumped, beating.pulse_work) > 1
+    still = moved(None, "linear")
+    np.testing.assert_allclose(still.tool_work, still.energy, atol=1e-9 * still.energy.max())

@@ -113,8 +113,20 @@ def test_a_calibration_that_opencv_wrote_is_read(tmp_path: Path) -> None:
     (tmp_path / "none.yaml").write_text("%YAML:1.0\n---\nR: 3\n")
     with pytest.raises(UserError, match="left camera matrix"):
         calibration.read_rig(tmp_path / "none.yaml", SIZE)
-    with pytest.raises(UserError, match="cannot be read"):
+    storage = cv2.FileStorage(str(tmp_path / "six.yaml"), cv2.FILE_STORAGE_WRITE)
+    for name in ("K1", "K2", "R"):
+        storage.write(name, np.eye(3))
+    storage.write("D1", np.zeros((1, 6)))
+    storage.write("D2", np.zeros((1, 5)))
+    storage.write("T", np.ones((3, 1)))
+    storage.release()
+    with pytest.raises(UserError, match="the left distortion has 6 terms"):
+        calibration.read_rig(tmp_path / "six.yaml", SIZE)
+    with pytest.raises(UserError, match="no such file"):
         calibration.read_rig(tmp_path / "missing.yaml", SIZE)
+    (tmp_path / "deep.yaml").write_text("%YAML:1.0\n---\nR: " + "[" * 90_000)  # ended the process
+    with pytest.raises(UserError, match="nested deeper"):
+        calibration.read_rig(tmp_path / "deep.yaml", SIZE)
 
 
 def test_a_left_camera_on_the_right_is_refused() -> None:

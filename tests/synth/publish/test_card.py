@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree
 
 import matplotlib
@@ -16,9 +17,10 @@ from typer.testing import CliRunner
 
 from synth.cli import app
 from synth.dataset import index
+from synth.dataset.folder import Folder
 from synth.fields import FIELDS
 from synth.job.schema import Job
-from synth.publish import histogram, preview_video
+from synth.publish import card, histogram, preview_video
 
 SVG = "{http://www.w3.org/2000/svg}"
 
@@ -65,6 +67,43 @@ def test_numbers_are_those_of_the_index(root: Path) -> None:
     )
     assert "3 sequences (9 frames, 64 × 48 px)" in text(root)
     assert "Made to be read." in text(root)
+
+
+def test_the_mechanics_stand_on_the_card(root: Path) -> None:
+    for line in card.mechanics(Folder(root).job()):
+        assert line in text(root)
+
+
+@pytest.mark.parametrize(
+    ("fem", "said"),
+    [
+        (
+            {},
+            "no membrane, no heart beat, no breath|Poisson's ratio is 0.4;|is bonded to the skull round"
+            "|Every contact is a given traction",
+        ),
+        (
+            {
+                "membrane": {"intact": 0.5},
+                "pulse": {"breath_mm": 1.0},
+                "poisson": [0.4, 0.49],
+                "skull": "slip",
+            },
+            "no bleeding, no heart beat.|on 50% of the sequences|Heart and breath raise"
+            "|drawn from 0.4 to 0.49|slides along the skull",
+        ),
+        (
+            {"contact": "rigid", "gestures": ["push", "pull"], "skull": ["bonded", "slip"]},
+            "rigid tip (flat, friction 0.2)|; pull: a given traction.|where the scenario says `slip`",
+        ),
+    ],
+)
+def test_the_card_says_which_mechanics_are_in_and_which_are_not(fem: dict[str, Any], said: str) -> None:
+    words = "\n".join(card.mechanics(Job.model_validate({"fem": fem})))
+    for phrase in said.split("|"):
+        assert phrase in words
+    absent = {"on 50%": "membrane", "Heart and breath raise": "pulse", "rigid tip": "contact"}
+    assert not [phrase for phrase, key in absent.items() if key not in fem and phrase in words]
 
 
 def test_every_picture_that_is_shown_exists_and_markdown_holds_together(root: Path) -> None:

@@ -110,6 +110,21 @@ def test_what_hides_a_point_makes_it_invisible(surface: Surface, lens: Camera) -
     np.testing.assert_allclose(now.flow[rest.tissue], 0, atol=1e-5)
 
 
+@pytest.mark.parametrize("turn", range(3))
+def test_a_triangle_with_a_corner_behind_the_lens_is_dropped(lens: Camera, turn: int) -> None:
+    """Whichever of the three it is; the other two are in the picture, where rays would meet NaN."""
+    _, directions = camera.rays(lens, camera.pixel_grid(lens.size))
+    directions = directions @ lens.rotation.T
+    seen = directions.reshape(72, 96, 3)[[10, 60], [12, 80]]
+    corners = np.concatenate([80.0 * seen / seen[:, 2:], [[0.0, 6.0, -3.0]]])
+    shape = Shape(
+        (corners - lens.translation) @ lens.rotation, np.array([np.roll([0, 1, 2], turn)], np.int32)
+    )
+    hits = truth.cast(lens, [shape], None, directions)
+    assert (hits.face < 0).all()
+    assert np.isinf(hits.along).all()
+
+
 def test_areas_of_pixels_add_up_to_the_surfaces(surface: Surface) -> None:
     render = Render(size=(320, 240), field_mm=(60.0, 60.0), tilt_deg=(20.0, 20.0))
     lens = camera.place(View.draw(render, np.random.default_rng(2)), render)

@@ -246,16 +246,38 @@ def test_a_budget_that_is_none(text: str) -> None:
 
 def test_knobs_follow_the_job() -> None:
     names = {knob.name for knob in knobs.list_knobs(Job.model_validate({"fem": {"time": "dynamic"}}))}
-    assert names == {"law", "tets", "time", "vertices", "size", "spp", "depth of field", "light", "warps"}
+    assert names == {
+        "law",
+        "tets",
+        "volume",
+        "time",
+        "vertices",
+        "size",
+        "spp",
+        "depth of field",
+        "light",
+        "warps",
+    }
     ideal = Job.model_validate({"flow": {"backend": "ideal"}})
-    assert {knob.name for knob in knobs.list_knobs(ideal)} == {"law", "tets"}
+    assert {knob.name for knob in knobs.list_knobs(ideal)} == {"law", "tets", "volume"}
+    living = Job.model_validate(
+        {"fem": {"membrane": {"intact": 1}, "poisson": [0.4, 0.49], "skull": "slip", "contact": "rigid"}}
+    )
+    told = {knob.name: knob for knob in knobs.list_knobs(living) if not knob.turned}
+    assert set(told) == {"membrane", "poisson", "skull", "contact", "depth of field", "light"}
+    for knob in told.values():
+        assert search.own(knob, living) is knob.levels[0]
+    plain = knobs.changed(living, search.merged([knob.levels[1] for knob in told.values()])).fem
+    assert (plain.membrane.intact, plain.poisson, plain.skull) == (0, (0.4, 0.4), ("bonded",))
+    assert plain.contact == "traction"
+    assert plain.membrane.young_kpa == living.fem.membrane.young_kpa
     with pytest.raises(UserError, match="subsurface"):
         knobs.list_knobs(Job.model_validate({"render": {"subsurface": "volume"}}))
 
 
-def test_every_level_is_a_job() -> None:
-    job = reader.load_job("paper")
-    for knob in knobs.list_knobs(job):
+@pytest.mark.parametrize("name", ["paper", "in-vivo"])
+def test_every_level_is_a_job(name: str) -> None:
+    for knob in knobs.list_knobs(job := reader.load_job(name)):
         for level in knob.levels:
             knobs.changed(job, knobs.finest(knobs.list_knobs(job)) | dict(level.changes))
 

@@ -1,0 +1,195 @@
+"""The second eye of a recording, or its depth camera, beside the flow: motion in three dimensions a frame."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from bench.recording.folder import Recording
+from learn.inference.video import Picture
+from learn.inference.video_flow import Step, VideoFlow, shrink_picture
+from synth.errors import UserError
+from synth.flow import mask
+from synth.flow.stereo import calibration
+from synth.flow.stereo.depth_camera import DepthTracker
+from synth.flow.stereo.rig import Eye, Floats, Rig
+from synth.flow.stereo.track import Moved, StereoTracker
+from synth.system import foreign_file, foreign_picture
+
+Flags = NDArray[np.bool_]
+_LARGEST_BYTES = 1 << 30  # of an array of points
+
+
+@dataclass(frozen=True)
+class Sight:
+    """What the second eye is good for, for `bench check` and the report."""
+
+    baseline_mm: float
+    """NaN of a depth camera."""
+    epipolar_px: float
+    """Median distance of what matches from its row, on the pictures that flow is computed on; NaN: none."""
+    noise_mm: float
+    """Median deviation of depth motion over the tissue, and over the frames looked at."""
+
+    def describe(self) -> str:
+        """A line for a person."""
+        noise = f"depth motion is known to ± {self.noise_mm:.2g} mm"
+        if np.isnan(self.baseline_mm):
+            return f"a depth camera; {noise}"
+        rows = f"rows {self.epipolar_px:.2g} px off"
+        return f"a second eye {self.baseline_mm:.3g} mm to the right, {rows}; {noise}"
+
+
+class SecondEye:
+    """Follows the steps of a `VideoFlow`, each once and in order."""
+
+    def __init__(self, recording: Recording, video: VideoFlow) -> None:
+        """Nothing is read yet."""
+        self._recording, self._video = recording, video
+        self._stereo: StereoTracker | None = None
+        self._depth: DepthTracker | None = None
+        self._rights: Iterator[Picture] = iter(recording.right_frames()) if recording.right else iter(())
+        self._noise: list[float] = []
+
+    @property
+    def sight(self) -> Sight:
+        """What it came to, once steps are through."""
+        noise = float(np.median(self._noise)) if self._noise else float("nan")
+        if self._stereo is None:
+            return Sight(float("nan"), float("nan"), noise)
+        return Sight(self._stereo.rectified.baseline_mm, self._stereo.rest.epipolar_px, noise)
+
+    def move(self, step: Step) -> Moved:
+        """Motion of a frame since rest; the first step is the rest frame.
+
+        Raises:
+            UserError: the second eye has no such frame, or can't be read; a calibration that isn't its own.
+        """
+        found, tissue = step.found, self._video.tissue
+        if self._video.fault or not (found.trusted or found.is_rest):
+            # Nothing was followed: no method's answer counts there.
+            return Moved(*np.zeros((2, *tissue.shape, 3), np.float32))
+        blocked = _or_none(found.blocked, tissue)
+        if self._recording.right:
+            right = self._right(step.picture.index)
+            if self._stereo is None:
+                self._stereo = self._begin(step, right, blocked)
+                return self._stereo.rest_motion()
+            moved = self._stereo.step(
+                step.picture.rgb, right, blocked, self._hidden(right, blocked), found.flow, found.confidence
+            )
+        else:
+            depth = self._depths(step.picture.index)
+            if self._depth is None:
+                self._depth = DepthTracker(self._K(), depth, blocked, tissue)
+                return self._depth.rest_motion()
+            moved = self._depth.step(depth, blocked, found.flow, found.confidence)
+        self._noise.append(float(np.median(moved.deviation[..., 2][tissue])))
+        return moved
+
+    def _begin(self, step: Step, right: NDArray[np.uint8], blocked: Flags) -> StereoTracker:
+        about, folder = self._recording.meta.stereo, self._recording.folder
+        assert about is not None
+        height, width = self._video.size
+        rig = calibration.read_rig(folder / about.calibration, (width, height), about.mm_per_unit)
+        left = step.picture.rgb
+        return StereoTracker(
+            shrunk(rig, self._video.shrink),
+            left[None],
+            right[None],
+            blocked,
+            self._hidden(right, blocked),
+            self._video.tissue,
+        )
+
+    def _hidden(self, right: NDArray[np.uint8], left: Flags) -> Flags:
+        return _hidden(right, self._video.settings.masks, left)
+
+    def _right(self, index: int) -> NDArray[np.uint8]:
+        """The second eye's frame of that number, shrunk as the video's."""
+        for picture in self._rights:
+            if picture.index == index:
+                if picture.rgb.shape[:2] != self._video.size:
+                    raise UserError(
+                        f"{self._recording.folder}: the right eye's frame {index} is of another size"
+                    )
+                return shrink_picture(picture.rgb, self._video.shrink)
+        raise UserError(f"{self._recording.folder}: the right eye has no frame {index}")
+
+    def _K(self) -> Floats:
+        about, shrink = self._recording.meta.depth, self._video.shrink
+        assert about is not None
+        height, width = self._video.size
+        x, y = about.centre_px or ((width - 1) / 2, (height - 1) / 2)
+        K = np.array([[about.focal_px, 0, x], [0, about.focal_px, y], [0, 0, 1.0]])
+        return _smaller(K, shrink)
+
+    def _depths(self, index: int) -> NDArray[np.float32]:
+        """Depth (h, w) mm of a frame; of points their third coordinate."""
+        recording, about = self._recording, self._recording.meta.depth
+        assert about is not None
+        if index >= len(recording.depths):
+            raise UserError(f"{recording.folder}: depth/ has no frame {index}")
+        path = recording.depths[index]
+        if path.suffix == ".npy":
+            foreign_file.check_file(path, _LARGEST_BYTES)
+            try:
+                found = np.load(path, allow_pickle=False)
+            except (OSError, ValueError, EOFError) as error:
+                raise UserError(f"{path}: not a readable array ({str(error)[:100]})") from None
+        else:
+            found = foreign_picture.read_picture(path, cv2.IMREAD_UNCHANGED)
+        if found.ndim == 3 and found.shape[2] == 3 and found.dtype.kind == "f":
+            found = found[..., 2]
+        if found.ndim != 2 or found.shape != self._video.size or found.dtype.kind not in "uif":
+            height, width = self._video.size
+            raise UserError(
+                f"{path}: {found.shape} {found.dtype}; depth is ({height}, {width}) numbers, points are "
+                f"({height}, {width}, 3) of them with a point"
+            )
+        depth = found.astype(np.float32) * np.float32(about.mm_per_unit)
+        known = np.isfinite(depth) & (depth > 0)
+        share = _shrunk(known.astype(np.float32), self._video.shrink)
+        total = _shrunk(np.where(known, depth, 0).astype(np.float32), self._video.shrink)
+        return np.where(share > 0.5, total / np.maximum(share, 1e-6), 0).astype(np.float32)
+
+
+def shrunk(rig: Rig, shrink: int) -> Rig:
+    """The same pair with pictures `shrink` times smaller, cut as `shrink_picture` cuts them."""
+    left, right = (Eye(_smaller(eye.K, shrink), eye.distortion) for eye in (rig.left, rig.right))
+    size = (rig.size[0] // shrink, rig.size[1] // shrink)
+    return Rig(left, right, rig.rotation, rig.translation, size)
+
+
+def _smaller(K: Floats, shrink: int) -> Floats:
+    """K of pictures whose pixels hold shrink x shrink of the old: a picture begins half a pixel early."""
+    out = K / shrink
+    out[:2, 2] = (K[:2, 2] + 0.5) / shrink - 0.5
+    out[2] = [0, 0, 1]
+    return np.asarray(out, np.float64)
+
+
+def _shrunk(field: NDArray[np.float32], shrink: int) -> NDArray[np.float32]:
+    height, width = (side // shrink for side in field.shape)
+    cut = field[: height * shrink, : width * shrink]
+    return np.asarray(cv2.resize(cut, (width, height), interpolation=cv2.INTER_AREA), np.float32)
+
+
+def _hidden(rgb: NDArray[np.uint8], kind: str, left: Flags) -> Flags:
+    """(H, W) tool and glare as the right eye's picture alone shows them: nobody said where they are.
+
+    `kind`: one of `video_flow.MASKS`; of `auto`, only where something proved worth masking in the left eye's.
+    """
+    nothing = np.zeros(rgb.shape[:2], bool)
+    if kind == "none" or (kind == "auto" and not left.any()):
+        return nothing
+    glare = nothing if kind == "tool" else mask.glare(rgb)
+    return glare if kind == "glare" else glare | mask.tool(rgb)
+
+
+def _or_none(blocked: Flags | None, tissue: Flags) -> Flags:
+    return np.zeros_like(tissue) if blocked is None else blocked

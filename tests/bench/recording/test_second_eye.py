@@ -1,0 +1,196 @@
+"""A recording's second eye and depth camera, on a photograph warped by a motion in space that was put in."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from skimage import data
+
+from bench.methods import baselines
+from bench.methods.protocol import Answer, Scene
+from bench.recording import writer
+from bench.recording.check import check_recording
+from bench.recording.folder import open_recording
+from bench.recording.pixel_scale import Scale
+from bench.scoring import report
+from bench.scoring.evaluate_recording import as_json, evaluate_recording
+from bench.tracking.tracking import track_recording
+from learn.inference.video_flow import Settings
+from synth.errors import UserError
+from synth.flow.stereo.track import Moved
+
+SIZE = (160, 120)
+FOCAL, BASE, AWAY = 1370.0, 24.0, 300.0
+K = np.array([[FOCAL, 0, 79.5], [0, FOCAL, 59.5], [0, 0, 1.0]])
+COLUMNS, ROWS = np.meshgrid(np.arange(SIZE[0]), np.arange(SIZE[1]))
+DENT = np.exp(-((COLUMNS - 80) ** 2 + (ROWS - 60) ** 2) / (2 * 22.0**2))
+SETTINGS = Settings(rate_hz=None, pulse=False, masks="none")
+Make = Callable[..., Path]
+
+
+def seen(along: np.ndarray) -> np.ndarray:
+    """(H, W, 3) uint8 RGB: the photograph once its points have moved `along` px to the right."""
+    wide = cv2.resize(data.astronaut(), (420, 420), interpolation=cv2.INTER_AREA)
+    x = source(along) + 60
+    return np.asarray(cv2.remap(wide, x.astype(np.float32), (ROWS + 30).astype(np.float32), cv2.INTER_CUBIC))
+
+
+def source(along: np.ndarray) -> np.ndarray:
+    """Rest columns (H, W) that are seen at each pixel."""
+    x = COLUMNS.astype(np.float64)
+    for _ in range(40):
+        x = COLUMNS - cv2.remap(along, x.astype(np.float32), ROWS.astype(np.float32), cv2.INTER_LINEAR)
+    return x
+
+
+def rise(amount: float) -> np.ndarray:
+    """(H, W) mm that tissue on the left rest pixels went away by."""
+    return np.asarray(FOCAL * BASE / (FOCAL * BASE / AWAY - amount * DENT) - AWAY)
+
+
+@pytest.fixture
+def make(tmp_path: Path) -> Make:
+    """Three frames: rest, half a dent, a dent. Tissue lies where disparity is 0."""
+
+    def made(second: str) -> Path:
+        folder = tmp_path / second
+        for name in ("frames", "right", "depth"):
+            (folder / name).mkdir(parents=True)
+        for t, amount in enumerate((0.0, 0.3, 0.6)):
+            u, d = 2.5 * amount * DENT, -amount * DENT
+            cv2.imwrite(str(folder / f"frames/{t}.png"), seen(u)[..., ::-1])
+            if second == "right":
+                cv2.imwrite(str(folder / f"right/{t}.png"), seen(u - d)[..., ::-1])
+            if second == "depth":
+                now = AWAY + cv2.remap(rise(amount), *map(np.float32, (source(u), ROWS)), cv2.INTER_LINEAR)
+                points = np.stack([np.zeros_like(now), np.zeros_like(now), now], axis=-1)
+                np.save(folder / f"depth/{t}.npy", (points if t else now).astype(np.float32))
+        about: dict[str, object] = {"scale_mm_per_px": AWAY / FOCAL, "young_kpa": 1.0, "fps": 10.0}
+        if second == "right":
+            storage = cv2.FileStorage(str(folder / "pair.yaml"), cv2.FILE_STORAGE_WRITE)
+            right = K + np.array([[0, 0, FOCAL * BASE / AWAY], [0, 0, 0], [0, 0, 0]])
+            for name, value in {
+                "K1": K,
+                "K2": right,
+                "R": np.eye(3),
+                "T": np.array([[-1.0], [0], [0]]),
+            }.items():
+                storage.write(name, value)
+            for name in ("D1", "D2"):
+                storage.write(name, np.zeros((1, 5)))
+            storage.release()
+            about["stereo"] = {"calibration": "pair.yaml", "mm_per_unit": BASE}
+        else:
+            about["depth"] = {"focal_px": FOCAL}
+        writer.write_meta(folder, about)
+        return folder
+
+    return made
+
+
+class Looking:
+    """Keeps what it is told."""
+
+    def __init__(self) -> None:
+        self.told: list[Moved] = []
+
+    def __call__(self, flow: np.ndarray, confidence: np.ndarray, scene: Scene, picture: bool) -> Answer:
+        raise AssertionError("there is a second eye")
+
+    def in_space(
+        self, flow: np.ndarray, confidence: np.ndarray, moved: Moved, scene: Scene, picture: bool
+    ) -> Answer:
+        self.told.append(moved)
+        return Answer(moved.motion[50:70, 70:90].mean(axis=(0, 1)).astype(np.float64))
+
+
+@pytest.mark.parametrize("second", ["right", "depth"])
+def test_motion_in_space_is_what_was_put_in(make: Make, second: str) -> None:
+    method = Looking()
+    done = track_recording(open_recording(make(second)), {"it": method}, AWAY / FOCAL, SETTINGS)
+    assert len(method.told) == 3
+    assert not method.told[0].motion.any()
+    inner = (slice(15, -15), slice(15, -15))
+    for moved, amount in zip(method.told[1:], (0.3, 0.6), strict=True):
+        error = moved.motion[..., 2] - rise(amount)
+        assert rise(amount).max() > 0.75
+        assert np.sqrt((error[inner] ** 2).mean()) < 0.12
+        assert moved.motion[60, 80, 2] == pytest.approx(rise(amount)[60, 80], rel=0.15)
+        assert moved.motion[60, 80, 0] == pytest.approx(2.5 * amount * AWAY / FOCAL, abs=0.05)
+        assert (moved.deviation[inner] > 0).all()
+    assert done.sight is not None
+    if second == "right":
+        assert done.sight.baseline_mm == pytest.approx(BASE, rel=1e-3)
+        assert done.sight.epipolar_px < 0.1
+    else:
+        assert np.isnan(done.sight.baseline_mm)
+    assert done.sight.noise_mm > 0
+
+
+@pytest.mark.parametrize("second", ["right", "depth"])
+def test_check_report_and_scores_name_it(make: Make, second: str) -> None:
+    folder = make(second)
+    (said,) = [one for one in check_recording(folder) if one.what == "second eye"]
+    assert ("24 mm to the right" if second == "right" else "a depth camera") in said.said
+    assert "depth motion is known to" in said.said
+    methods = {"main": Looking(), "near": baselines.physical()["Tikhonov near the contact"]}
+    result = evaluate_recording(
+        open_recording(folder), methods, "main", Scale(AWAY / FOCAL, 0.02, "stated"), SETTINGS, {}
+    )
+    tree = as_json(result)
+    assert (tree["second_eye"]["baseline_mm"] is None) == (second == "depth")
+    assert json.dumps(tree)
+    page = report.render_report(result, "two eyes")
+    assert "motion along the view" in page
+    assert 'id="components"' in page
+    # Pushed away from the camera: physics that sees it says so.
+    assert result.methods["near"].force_mn[2, 2] > np.abs(result.methods["near"].force_mn[2, 1])
+
+
+def test_what_does_not_go_together_is_refused(make: Make) -> None:
+    folder = make("right")
+    (folder / "right/2.png").unlink()
+    with pytest.raises(UserError, match="right eye has no frame 2"):
+        track_recording(open_recording(folder), {"it": Looking()}, 0.2, SETTINGS)
+    about = (folder / "meta.yaml").read_text()
+    writer.write_meta(folder, {"scale_mm_per_px": 0.2, "fps": 10.0})
+    with pytest.raises(UserError, match=r"must say how it is calibrated .stereo:."):
+        open_recording(folder)
+    (folder / "meta.yaml").write_text(about)
+    for picture in (folder / "right").iterdir():
+        picture.unlink()
+    with pytest.raises(UserError, match=r"says stereo, but there is no right"):
+        open_recording(folder)
+
+
+def test_depth_of_another_size_or_kind_is_refused(make: Make) -> None:
+    folder = make("depth")
+    np.save(folder / "depth/1.npy", np.ones((7, 8), np.float32))
+    with pytest.raises(UserError, match=r"depth is \(120, 160\) numbers"):
+        track_recording(open_recording(folder), {"it": Looking()}, 0.2, SETTINGS)
+    (folder / "depth/1.npy").write_bytes(b"no array")
+    with pytest.raises(UserError, match="not a readable array"):
+        track_recording(open_recording(folder), {"it": Looking()}, 0.2, SETTINGS)
+
+
+def test_sixteen_bit_depth_and_two_eyes_smaller(make: Make) -> None:
+    folder = make("depth")
+    for t in range(3):
+        values = np.load(folder / f"depth/{t}.npy")
+        depth = values if values.ndim == 2 else values[..., 2]
+        cv2.imwrite(str(folder / f"depth/{t}.png"), np.rint(100 * depth).astype(np.uint16))
+        (folder / f"depth/{t}.npy").unlink()
+    writer.write_meta(
+        folder, {"scale_mm_per_px": 0.2, "fps": 10.0, "depth": {"focal_px": FOCAL, "mm_per_unit": 0.01}}
+    )
+    method = Looking()
+    small = Settings(shrink=2, rate_hz=None, pulse=False, masks="none")
+    track_recording(open_recording(folder), {"it": method}, 0.2, small)
+    assert method.told[2].motion.shape == (60, 80, 3)
+    # So small a picture says little of depth, which the prior then flattens.
+    assert method.told[2].motion[30, 40, 2] == pytest.approx(rise(0.6)[60, 80], rel=0.3)
