@@ -323,8 +323,8 @@ def live(
     )
     summary = account.summary()
     if out is not None:
-        how = {"backend": flow, "shrink": shrink, "masks": masks, "paced": not every}
-        stream.write_live(out, summary, **how, model=model is not None)
+        how: dict[str, str | int | bool] = {"backend": flow, "shrink": shrink, "masks": masks}
+        stream.write_live(out, summary, **how, paced=not every, model=model is not None)
     if json:
         typer.echo(json_.dumps(summary))
     else:

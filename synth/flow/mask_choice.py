@@ -134,7 +134,7 @@ class ChoosingTracker:
         self._verdict = np.zeros((2, *tissue.shape), np.int8)  # 1 masked, -1 not, 0 not known
         self._tested_px = 0.0
         self._frames = self._extra = 0
-        self._is_learning = True
+        self._is_learning, self._vouching = True, False
         self._proved = [False, False]  # highlights, tools
 
     @property
@@ -187,8 +187,9 @@ class ChoosingTracker:
         known = np.bincount(number, self._verdict.ravel() != 0, len(pieces.body))
         kept, old = votes > 0, known >= 0.5 * np.bincount(number, minlength=len(pieces.body))
         for layer, proved in zip(pieces.number, self._proved, strict=True):
-            fresh = np.setdiff1d(layer, np.flatnonzero(old)) if proved else []
-            kept[fresh] = old[fresh] = True  # a tool that comes back is the tool it was
+            if proved:
+                fresh = np.setdiff1d(layer, np.flatnonzero(old))
+                kept[fresh] = old[fresh] = True  # a tool that comes back is the tool it was
         kept[0] = old[0] = False
         return np.asarray(kept[pieces.number].any(0), bool), np.asarray(old[pieces.number].any(0), bool)
 
@@ -210,7 +211,7 @@ class ChoosingTracker:
     ) -> tuple[Solved, Flags]:
         """Tries all proposals and none, keeps those that earn it, and gives the answer and its masks."""
         tracker, still = self.tracker, self.rest_found
-        tries = _Tries(self, frame, first, masked)
+        tries, self._vouching = _Tries(self, frame, first, masked), False
         bare = tries.solve(still.known, found.known)
         # Highlights by themselves, too: a tool that is none must not speak against them.
         shine = tries.solve(still.known | still.glare, found.known | found.glare)
@@ -236,7 +237,10 @@ class ChoosingTracker:
             judged = [tracker.judge(one.flow, one.confidence, common) for one, _ in answers]
             best = max(range(len(answers)), key=lambda k: judged[k].level)
             return (judged[best], answers[best][1]) if best else (first, masked)
-        if all(self._is_better(bare, chosen, where, 1 / _AS_GOOD) for where in (both_see, beyond)):
+        # Highlights that hold their neighbours still have more confidence than the truth.
+        if not self._vouching and all(
+            self._is_better(bare, chosen, where, 1 / _AS_GOOD) for where in (both_see, beyond)
+        ):
             rest, now, chosen = still.known, found.known, bare
         if motion >= self._tested_px:
             shares = [now[layer > 0].mean() if layer.any() else 0.0 for layer in pieces.number]
@@ -278,12 +282,12 @@ class ChoosingTracker:
             common = inside & ~((still.number > 0) | (moved[0] > 0) | (moved[1] > 0)).any(0)
             after = _residual(self._rest_picture, now, flow)
             seen = _Evidence(residual, before - after, inside, common)
-            least = _GAIN
-            if kind == 0 and seen.together((still.number[0] > 0) | (moved[0][0] > 0), flow_before - flow):
-                least = _GAIN_EACH  # highlights have one cause
+            # Highlights have one cause.
+            one = kind == 0 and seen.together((still.number[0] > 0) | (moved[0][0] > 0), flow_before - flow)
+            self._vouching |= one
             # What something covers now is no worse at rest: there the neighbours are as little explained.
-            kept_rest |= seen.earning(still.number[kind], len(still.body), least, beside=True)
-            kept |= seen.earning(moved[0][kind], len(pieces.body), least, beside=False)
+            kept_rest |= seen.earning(still.number[kind], len(still.body), one, beside=True)
+            kept |= seen.earning(moved[0][kind], len(pieces.body), one, beside=False)
             before, flow_before = after, flow
         kept_rest, kept = still.whole(kept_rest), pieces.whole(kept)
         for before, after in zip(still.number, pieces.number, strict=True):
@@ -326,15 +330,13 @@ class _Evidence:
     common: Flags
     """What of that is proposed by nothing."""
 
-    def earning(
-        self, where: NDArray[np.int32], numbers: int, least: float, beside: bool
-    ) -> NDArray[np.bool_]:
+    def earning(self, where: NDArray[np.int32], numbers: int, one: bool, beside: bool) -> NDArray[np.bool_]:
         """(numbers,) which pieces earn being masked.
 
         Args:
             where: (H, W), the pieces' numbers.
             numbers: how many there are.
-            least: gain around a piece that is enough [local deviations].
+            one: they are right by and large: less gain is enough, and where none can be seen none is asked.
             beside: judged against what lies around a piece, not against all tissue.
         """
         kept = np.zeros(numbers, bool)
@@ -348,7 +350,7 @@ class _Evidence:
             around = float(np.mean(self.residual[ring] if beside and enough else usual))
             kept[number] = float(self.residual[piece].mean()) > max(
                 around + _UNEXPLAINED, _TIMES * around
-            ) or (enough and float(self.gain[ring].mean()) > least)
+            ) or (float(self.gain[ring].mean()) > (_GAIN_EACH if one else _GAIN) if enough else one)
         return kept
 
     def together(self, where: Flags, change: Flow) -> bool:

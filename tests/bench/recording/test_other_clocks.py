@@ -99,3 +99,16 @@ def test_a_phantom_may_be_pushed_with_more_than_50_newtons(make: Maker) -> None:
     said = make("said", frames=4, meta={"tissue": "phantom"})
     writer.write_force(said, t, np.outer(80 * t / t[-1], [0.0, 0.0, 1.0]))
     assert open_recording(said).force is not None
+
+
+def test_unknown_scale_gives_answers_up_to_a_factor_and_says_so(make: Maker) -> None:
+    one = run(make("one", frames=20, meta={"scale_mm_per_px": "unknown", "young_kpa": 1.0}))
+    known = run(make("two", frames=20, meta={"scale_mm_per_px": 32 / 128, "young_kpa": 1.0}))
+    assert one.scale.mm_per_px == known.scale.mm_per_px
+    assert known.absolute
+    assert not one.absolute
+    assert any("scale unknown" in note for note in one.notes)
+    scores, newtons = one.methods["bump"].scores, known.methods["bump"].scores
+    assert scores["r"] == pytest.approx(newtons["r"])
+    assert np.isfinite(newtons["mae_mn"])
+    assert not np.isfinite(scores.get("mae_mn", np.nan))
