@@ -51,8 +51,7 @@ def realism_figures(
     ]
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
-        quality = [cv2.IMWRITE_JPEG_QUALITY, 75, cv2.IMWRITE_JPEG_PROGRESSIVE, 1]
-        cv2.imwrite(str(out / "sheet.jpg"), _sheet(pictures)[..., ::-1], quality)
+        cv2.imwrite(str(out / "sheet.webp"), _sheet(pictures)[..., ::-1], [cv2.IMWRITE_WEBP_QUALITY, 60])
     if beside is not None:
         cv2.imwrite(str(beside), _beside(pictures, _scaled(photo, width_mm / pixel))[..., ::-1])
     return {
