@@ -40,9 +40,10 @@ def dural_vessels(edge: Floats, rng: np.random.Generator) -> Tree:
     mean = float(edge.mean())
     # A stem: where it starts (angle, mm from the edge), how it leans, its width, steps, and what it leaves.
     stems: list[tuple[float, float, float, float, int, int]] = []
-    for _ in range(int(rng.integers(8, 13))):
-        first = rng.uniform(0, 2 * np.pi), rng.uniform(1.5, 6.0), rng.normal(0, 0.3)
-        stems.append((*first, rng.uniform(0.09, 0.2) * rng.choice([-1, 1]), 60, -1))
+    count, way = int(rng.integers(6, 10)), rng.choice([-1, 1])
+    for k in range(count):
+        first = 2 * np.pi * (k + rng.uniform(0, 0.8)) / count, rng.uniform(1.5, 6.0), rng.normal(0, 0.3)
+        stems.append((*first, way * rng.uniform(0.09, 0.2), 60, -1))
     while stems:
         angle, away, lean, width, steps, before = stems.pop()
         for step in range(steps):
@@ -53,9 +54,9 @@ def dural_vessels(edge: Floats, rng: np.random.Generator) -> Tree:
             radius.append(own)
             before = len(nodes) - 1
             # On along the edge (a width's sign is its way round), swaying, and held to the dura.
-            lean = 0.97 * lean + rng.normal(0, 0.09) - 0.012 * (away - 3.8)
-            angle, away = angle + 0.25 * np.sign(width) / r, away + 0.25 * lean
-            if own > 0.05 and rng.random() < 0.06:
+            lean = 0.94 * lean + rng.normal(0, 0.09) - 0.02 * (away - 3.8)
+            angle, away = angle + 0.25 * np.sign(width) / r, float(np.clip(away + 0.25 * lean, 0.8, 8.0))
+            if own > 0.06 and rng.random() < 0.045:
                 fork = lean + rng.choice([-1, 1]) * rng.uniform(0.7, 1.3)
                 stems.append(
                     (angle, away, fork, 0.65 * np.sign(width) * own, int(0.6 * (steps - step)), before)
