@@ -26,6 +26,7 @@ from synth.errors import UserError
 from synth.flow.estimator import Estimator, create
 
 _LOST_PX = 1.0
+_NONE_LOST = 1e-3  # share: where neither loses more there is no ratio to speak of
 _NOISE = 1.5  # grey levels, added to both warped pictures
 _SOFT_PX = 0.7  # and both are blurred by this first: their own noise would move with the tissue
 PAIRS = {
@@ -119,6 +120,9 @@ def _ratio(ours: str, theirs: str, figures: Mapping[str, list[list[float]]]) -> 
     for k, figure in enumerate(_FIGURES):
         ratios = one[drawn, k].mean(axis=1) / np.maximum(other[drawn, k].mean(axis=1), 1e-9)
         middle = one[:, k].mean() / max(other[:, k].mean(), 1e-9)
+        if figure == "lost" and max(one[:, k].mean(), other[:, k].mean()) < _NONE_LOST:
+            row |= {figure: None, "lost_within_20_percent": None}
+            continue
         row[figure] = [round(float(value), 3) for value in (middle, *np.quantile(ratios, (0.025, 0.975)))]
         row[f"{figure}_within_20_percent"] = bool(1 / 1.2 <= middle <= 1.2)
     return row
@@ -172,11 +176,7 @@ def drawn(found: Mapping[str, Any]) -> Page:
     ]
     ratios = [
         {"rendered": row["rendered"], "photograph": row["photograph"]}
-        | {
-            said[f]: f"{row[f][0]:.2f} [{row[f][1]:.2f}, {row[f][2]:.2f}]"
-            f"{'' if row[f + '_within_20_percent'] else ', not within 20%'}"
-            for f in _FIGURES
-        }
+        | {said[figure]: _said(row, figure) for figure in _FIGURES}
         for row in found["ratios"]
     ]
     words = (
@@ -186,3 +186,12 @@ def drawn(found: Mapping[str, Any]) -> Page:
     )
     sections = [Section("Errors", cells), Section("Rendered over photograph", ratios)]
     return Page("Flow on rendered tissue and on a photograph", found, charts, sections, [words])
+
+
+def _said(row: Mapping[str, Any], figure: str) -> str:
+    """A ratio with its interval, and whether it is as asked."""
+    if row[figure] is None:
+        return f"none lost in either (under {_NONE_LOST:.1%})"
+    middle, low, high = row[figure]
+    verdict = "" if row[f"{figure}_within_20_percent"] else ", not within 20%"
+    return f"{middle:.2f} [{low:.2f}, {high:.2f}]{verdict}"

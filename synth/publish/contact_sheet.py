@@ -71,8 +71,8 @@ def _frame(job: Job, index: int, repeats: int) -> tuple[NDArray[np.uint8], float
     surface, _ = pipeline.cortex(job, case)
     view, gestures = camera.place(case.view, job.render), case.gestures
     studio = Studio(surface, case.look, view, job, [gesture.kind for gesture in gestures])
-    poised = [poised(gesture, surface) for gesture in gestures]
-    tips, shafts = (np.concatenate(part) for part in zip(*poised, strict=True))
+    ready = [poised(gesture, surface) for gesture in gestures]
+    tips, shafts = (np.concatenate(part) for part in zip(*ready, strict=True))
     seed = scenario.frame_seeds(job, index)[0]
     for _ in range(repeats):
         watch = Stopwatch()

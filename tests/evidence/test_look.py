@@ -55,6 +55,9 @@ def test_what_is_alike_has_a_ratio_of_one_and_what_is_not_is_said() -> None:
     row = look._ratio("a", "b", {"a": same, "b": same})
     assert row["mean_px"] == [1.0, 1.0, 1.0]
     assert row["lost_within_20_percent"]
+    kept = [[*row[:2], 0.0001] for row in same]
+    assert look._ratio("a", "b", {"a": kept, "b": kept})["lost"] is None
+    assert look._ratio("a", "b", {"a": same, "b": kept})["lost_within_20_percent"] is False
     row = look._ratio("a", "b", {"a": worse, "b": same})
     assert row["p95_px"] == [1.5, 1.5, 1.5]
     assert not row["p95_px_within_20_percent"]
