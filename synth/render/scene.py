@@ -323,7 +323,8 @@ class Studio:
         inside = rim.inside(self.rim, *np.meshgrid(axis, axis))[..., None]
         around = 0.5 * (np.asarray(self._look.dura) + np.asarray(self._look.beyond))
         wound = (small * inside + around.astype(np.float32) * (1 - inside)).astype(np.float32)
-        return reflection.Theatre(wound, extent, tuple(self.lamps), self._look.rim_seed)
+        r, g, b = (self._look.light.power * light.blackbody(self._look.light.kelvin)).tolist()
+        return reflection.Theatre(wound, extent, tuple(self.lamps), (r, g, b), self._look.rim_seed)
 
     def _mirrored(self, steel: Shape) -> Floats:
         return reflection.glow(steel, self._coating(), self.camera.centre, self._theatre)

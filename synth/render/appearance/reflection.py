@@ -38,6 +38,8 @@ class Theatre:
     """Side of the square that it covers."""
     lamps: tuple[Lamp, ...]
     """The microscope's."""
+    light: tuple[float, float, float]
+    """Colour and power of what lights the wound and the theatre; 1 is white that just fills the sensor."""
     seed: int
     """Of the lamps on the ceiling."""
 
@@ -65,7 +67,7 @@ def glow(tool: Shape, coat: npt.NDArray[np.floating], eye: Floats, theatre: Thea
     straight = _STEEL * _TINT + coat[:, None] * (_BLACK - _STEEL * _TINT)
     # Schlick, An inexpensive BRDF model for physically-based rendering, 1994.
     share = straight + (1 - straight) * np.clip(1 - facing, 0, 1) ** 5
-    seen = _surroundings(tool.vertices, mirrored, theatre)
+    seen = _surroundings(tool.vertices, mirrored, theatre) * np.asarray(theatre.light)
     for lamp in theatre.lamps:
         seen += _window(tool.vertices, normal, towards, lamp)
     return np.asarray(share * seen)

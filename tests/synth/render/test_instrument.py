@@ -95,7 +95,7 @@ def test_steel_mirrors_the_wound_below_it_and_the_lamps_above() -> None:
     wound = np.zeros((8, 8, 3), np.float32)
     wound[..., 0] = 0.9
     lamp = Lamp(np.array([10.0, 0, 300]), np.zeros(3), 3.0, (3e5, 3e5, 3e5), 1.0)
-    theatre = reflection.Theatre(wound, 40.0, (), 1)
+    theatre = reflection.Theatre(wound, 40.0, (), (1.0, 1.0, 1.0), 1)
     faces = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
     bare, black = np.zeros(4, np.float32), np.ones(4, np.float32)
     # Turned by 60 degrees a face that is seen mirrors what lies below it.
@@ -103,6 +103,8 @@ def test_steel_mirrors_the_wound_below_it_and_the_lamps_above() -> None:
     tilted = Shape((square - square[0]) @ np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]]) + square[0], faces)
     seen = reflection.glow(tilted, bare, eye, theatre)
     assert (seen[:, 0] > 3 * seen[:, 1]).all()
+    warm = reflection.glow(tilted, bare, eye, replace(theatre, light=(1.2, 1.0, 0.5)))
+    np.testing.assert_allclose(warm, seen * [1.2, 1.0, 0.5])
     # Lying flat it mirrors the lamp beside the lens, many times what a black coat does.
     flat = Shape(square, faces)
     lit, dark = (reflection.glow(flat, bare, eye, replace(theatre, lamps=lamps)) for lamps in ((lamp,), ()))
