@@ -124,7 +124,7 @@ def _export(ours: Case, folder: Path, spp: list[int]) -> None:
                 "index": body.material.index,
             }
         else:
-            bodies[name] = {"roughness": 0.25, "metallic": 1 - body.material.satin}
+            bodies[name] = {"roughness": 0.25, "metallic": 0.9}
     lamps = [
         {
             "position": lamp.position.tolist(),

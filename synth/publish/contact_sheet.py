@@ -71,8 +71,8 @@ def _frame(job: Job, index: int, repeats: int) -> tuple[NDArray[np.uint8], float
     surface, _ = pipeline.cortex(job, case)
     view, gestures = camera.place(case.view, job.render), case.gestures
     studio = Studio(surface, case.look, view, job, [gesture.kind for gesture in gestures])
-    poised = [_poised(gesture, surface) for gesture in gestures]
-    tips, shafts = (np.concatenate(part) for part in zip(*poised, strict=True))
+    ready = [poised(gesture, surface) for gesture in gestures]
+    tips, shafts = (np.concatenate(part) for part in zip(*ready, strict=True))
     seed = scenario.frame_seeds(job, index)[0]
     for _ in range(repeats):
         watch = Stopwatch()
@@ -87,7 +87,7 @@ def _frame(job: Job, index: int, repeats: int) -> tuple[NDArray[np.uint8], float
     return picture, spent
 
 
-def _poised(gesture: Gesture, surface: Surface) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def poised(gesture: Gesture, surface: Surface) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Tips (2, 3) mm on the surface where the gesture begins, and shafts (2, 3)."""
     azimuth, rise = np.deg2rad([gesture.azimuth_deg, gesture.elevation_deg])
     shaft = np.array([np.cos(azimuth) * np.cos(rise), np.sin(azimuth) * np.cos(rise), np.sin(rise)])
