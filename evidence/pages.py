@@ -258,6 +258,9 @@ _FILES: Mapping[str, tuple[str, str | Callable[[Tree], Page]]] = {
     "fem/half-space": ("half-space.json", "fem.half_space"),
     "fem/contact": ("contact.json", "fem.contact"),
     "render/realism": ("realism.json", realism),
+    "render/texture": ("texture.json", "render.texture"),
+    "render/classifier": ("classifier.json", "render.classifier"),
+    "render/fit": ("fit.json", "render.fit"),
     "render/stability": ("stability.json", "render.stability"),
 }
 """Folder -> its data, and what draws them: a function here, or the module that has `drawn`."""

@@ -53,7 +53,7 @@ def realism_figures(
         out.mkdir(parents=True, exist_ok=True)
         cv2.imwrite(str(out / "sheet.webp"), _sheet(pictures)[..., ::-1], [cv2.IMWRITE_WEBP_QUALITY, 60])
     if beside is not None:
-        cv2.imwrite(str(beside), _beside(pictures, _scaled(photo, width_mm / pixel))[..., ::-1])
+        cv2.imwrite(str(beside), _beside(pictures, scaled_photograph(photo, width_mm / pixel))[..., ::-1])
     return {
         "family": family,
         "seed": seed,
@@ -87,7 +87,7 @@ def _rendered(
 
 def _photographed(photo: Path, outline: str, width_px: float) -> list[picture_statistics.Picture]:
     """Crops of the photograph inside the outline, at the rendered frames' scale."""
-    image = _scaled(photo, width_px)
+    image = scaled_photograph(photo, width_px)
     corners = np.array([[float(v) for v in pair.split(",")] for pair in outline.split()])
     inside = np.zeros(image.shape[:2], np.uint8)
     cv2.fillPoly(inside, [np.rint(corners * np.array(image.shape[1::-1])).astype(np.int32)], 1)
@@ -97,7 +97,7 @@ def _photographed(photo: Path, outline: str, width_px: float) -> list[picture_st
     return crops
 
 
-def _scaled(photo: Path, width_px: float) -> picture_statistics.Picture:
+def scaled_photograph(photo: Path, width_px: float) -> picture_statistics.Picture:
     """The photograph (H, W, 3) sRGB, `width_px` wide."""
     image = cv2.imread(str(photo), cv2.IMREAD_COLOR)
     if image is None:
