@@ -121,11 +121,11 @@ def test_a_picture_that_holds_too_little_is_refused(tmp_path: Path) -> None:
     ):
         read_photograph(dark, 35.0, None)
     small = written(tmp_path / "small.png", scene(200, 150))
-    with pytest.raises(UserError, match="200 x 150 pixels; at least 160 each way"):
+    with pytest.raises(UserError, match=r"200 x 150 pixels; at least 160 each way"):
         read_photograph(small, 35.0, None)
     photo = written(tmp_path / "photo.png", scene())
     mask = written(tmp_path / "mask.png", np.zeros((300, 400), np.uint8))
-    with pytest.raises(UserError, match="mask.png: is 400 x 300 pixels, the photograph 640 x 480"):
+    with pytest.raises(UserError, match=r"mask.png: is 400 x 300 pixels, the photograph 640 x 480"):
         read_photograph(photo, 35.0, mask)
 
 
