@@ -51,7 +51,7 @@ def read_photograph(path: Path, width_mm: float, mask: Path | None) -> Photograp
         raise UserError(
             f"{path}: {rgb.shape[1]} x {rgb.shape[0]} pixels; at least {_SMALLEST_PX} each way are needed"
         )
-    usable = find_cortex(rgb) if mask is None else _mask(mask, rgb)
+    usable = find_cortex(rgb, own) if mask is None else _mask(mask, rgb)
     finer = max(1.0, usual_mm_per_px() / own)
     if finer > 1.02:
         rgb = np.asarray(

@@ -56,7 +56,7 @@ def _parts(photograph: View, size: tuple[int, int], count: int) -> list[Picture]
 
 
 def _column(pictures: list[Picture], name: str) -> Picture:
-    framed = [cv2.copyMakeBorder(np.ascontiguousarray(p), *[_GAP] * 4, cv2.BORDER_CONSTANT) for p in pictures]
+    framed = [np.pad(one, ((_GAP, _GAP), (_GAP, _GAP), (0, 0))) for one in pictures]
     column = np.vstack([np.zeros((24, framed[0].shape[1], 3), np.uint8), *framed])
     cv2.putText(column, name, (_GAP, 17), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (255, 255, 255), 1, cv2.LINE_AA)
     return np.asarray(column, np.uint8)

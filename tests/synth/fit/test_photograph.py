@@ -48,19 +48,19 @@ def written(path: Path, rgb: np.ndarray, **how: object) -> Path:
 
 
 def test_the_opening_is_found_and_the_instrument_left_out() -> None:
-    with_tool, truth = find_cortex(scene()), opening()
+    with_tool, truth = find_cortex(scene(), 0.08), opening()
     rod = np.zeros(truth.shape, np.uint8)
     cv2.line(rod, (640, 480), (360, 270), 1, 20)
     rod = (rod > 0) & truth
     assert (with_tool & rod).sum() < 0.1 * rod.sum()
     assert (with_tool & ~truth).sum() < 0.03 * truth.sum()
     assert (with_tool & truth).sum() > 0.6 * (truth & ~rod).sum()
-    assert (find_cortex(scene(tool=False)) & truth).sum() > 0.8 * truth.sum()
+    assert (find_cortex(scene(tool=False), 0.08) & truth).sum() > 0.8 * truth.sum()
 
 
 def test_a_picture_of_no_cortex_has_none() -> None:
-    assert not find_cortex(np.zeros((300, 400, 3), np.uint8)).any()
-    assert not find_cortex(np.full((300, 400, 3), (20, 25, 90), np.uint8)).any()
+    assert not find_cortex(np.zeros((300, 400, 3), np.uint8), 0.1).any()
+    assert not find_cortex(np.full((300, 400, 3), (20, 25, 90), np.uint8), 0.1).any()
 
 
 def test_a_photograph_is_brought_to_the_jobs_scale_and_cut(tmp_path: Path) -> None:

@@ -77,4 +77,5 @@ def test_blur_widens_an_edge_by_its_own_width() -> None:
     low, high = np.interp([0.1587, 0.8413], light[54:75], np.arange(54, 75))
     assert (high - low) / 2 == pytest.approx(2.0, rel=0.05)
     sharp = record(edge, plain, np.random.default_rng(0))
-    assert set(np.unique(sharp[32, :, 1])) == {0, 188}
+    assert sharp[32, :64, 1].max() < 2
+    assert sharp[32, 64:, 1].min() > 186
