@@ -68,11 +68,11 @@ def test_patches_of_the_control_share_a_label() -> None:
 def test_distance_counts_in_the_references_spread() -> None:
     rng = np.random.default_rng(0)
     reference = rng.normal(5, [1.0, 10.0, 0.0], (400, 3))
-    assert texture.distances(reference, reference).mean() == pytest.approx(1, abs=0.1)
-    far = reference.mean(axis=0) + [[3 * reference[:, 0].std(), 0, 99]]
+    assert (texture.distances(reference, reference) ** 2).mean() == pytest.approx(1)
+    far = reference.mean(axis=0) + np.array([[3 * reference[:, 0].std(), 0, 99]])
     assert texture.distances(far, reference) == pytest.approx([3 / np.sqrt(2)])
     region = np.arange(400) % 5
-    assert texture.own_distances(reference, region).mean() == pytest.approx(1, abs=0.1)
+    assert (texture.own_distances(reference, region) ** 2).mean() == pytest.approx(1, abs=0.05)
 
 
 def test_a_python_without_plenoptic_is_one_line(tmp_path: Path) -> None:
@@ -109,7 +109,7 @@ def test_crops_of_a_photograph_lie_inside_and_are_taken_alike(tmp_path: Path) ->
     found = crops.of_photograph(tmp_path / "grey.png", "0.2,0.2 0.8,0.2 0.8,0.8 0.2,0.8", 80.0, 0.1)
     assert found.pictures.shape[1:] == (128, 128, 3)
     assert found.places.min(axis=0) == pytest.approx([0.2 * 800 + 64, 0.2 * 600 + 64], abs=41)
-    assert 1.2 < found.pictures[0].astype(float).std() < 2.5, "noise of 2 levels went through the codec"
+    assert 0.5 < found.pictures[0].astype(float).std() < 2.5, "noise of 2 levels went through the codec"
     with pytest.raises(UserError, match="no crop of 128 px"):
         crops.of_photograph(tmp_path / "grey.png", "0.2,0.2 0.3,0.2 0.3,0.3", 80.0, 0.1)
 
