@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -62,8 +63,8 @@ MADE: tuple[tuple[str, Family, int, dict[str, float]], ...] = (
 def fit(
     photo: Annotated[Path | None, typer.Option(help="Also a photograph of exposed cortex.")] = None,
     width_mm: Annotated[float, typer.Option(help="What the photograph's width spans.")] = 110.0,
-    rounds: Annotated[int, typer.Option(min=2, help="Of the search.")] = 7,
-    anatomies: Annotated[int, typer.Option(min=1, help="Rendered in each round.")] = 3,
+    rounds: Annotated[int, typer.Option(min=2, help="Of the search.")] = 5,
+    anatomies: Annotated[int, typer.Option(min=1, help="Rendered in each round.")] = 2,
     keep: Annotated[
         Path | None, typer.Option(help="Folder for jobs and pictures; they are not results.")
     ] = None,
@@ -73,6 +74,8 @@ def fit(
     with tempfile.TemporaryDirectory() as temporary:
         folder = keep or Path(temporary)
         folder.mkdir(parents=True, exist_ok=True)
+        if photo is not None:
+            pictures.append(_distance("photograph", _fitted(photo, width_mm, rounds, anatomies, folder)))
         for name, family, seed, turned in MADE:
             asked = parameters.start(family) | turned
             file = folder / f"{family}.jpg"
@@ -80,8 +83,6 @@ def fit(
             found = _fitted(file, _FIELD_MM, rounds, anatomies, folder)
             pictures.append(_distance(name, found))
             rows += compare(name, known, found.fitted.values)
-        if photo is not None:
-            pictures.append(_distance("photograph", _fitted(photo, width_mm, rounds, anatomies, folder)))
     return {"rounds": rounds, "anatomies": anatomies, "pictures": pictures, "parameters": rows}
 
 
@@ -131,9 +132,12 @@ def compare(name: str, known: dict[str, float], found: dict[str, float]) -> list
 
 def _fitted(photo: Path, width_mm: float, rounds: int, anatomies: int, folder: Path) -> fitting.Outcome:
     out = folder / f"look-{photo.stem}.yaml"
-    return fitting.fit_photograph(
-        photo, out, width_mm, None, folder / f"fit-{photo.stem}.jpg", rounds, anatomies, lambda turn, at: None
-    )
+    sheet = folder / f"fit-{photo.stem}.jpg"
+
+    def said(turn: int, at: float) -> None:
+        print(f"{photo.stem}: round {turn} of {rounds}, distance {at:.3f}", file=sys.stderr, flush=True)
+
+    return fitting.fit_photograph(photo, out, width_mm, None, sheet, rounds, anatomies, said)
 
 
 def _distance(name: str, found: fitting.Outcome) -> dict[str, Any]:
