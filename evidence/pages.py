@@ -258,9 +258,6 @@ _FILES: Mapping[str, tuple[str, str | Callable[[Tree], Page]]] = {
     "fem/half-space": ("half-space.json", "fem.half_space"),
     "fem/contact": ("contact.json", "fem.contact"),
     "render/realism": ("realism.json", realism),
-    "render/texture": ("texture.json", "render.texture"),
-    "render/classifier": ("classifier.json", "render.classifier"),
-    "render/fit": ("fit.json", "render.fit"),
     "render/stability": ("stability.json", "render.stability"),
 }
 """Folder -> its data, and what draws them: a function here, or the module that has `drawn`."""
@@ -268,6 +265,7 @@ _FOLDERS: Mapping[str, str | Callable[[Path], Page]] = {
     "render/cost": render_cost,
     "engine": engine,
     "fem/surface": surface,
+    "render/look": "render.look_page",
     "learn/loading": "learn.throughput",
     "learn/pareto": learn_pareto,
     "learn/stability": "learn.stability",

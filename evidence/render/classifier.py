@@ -12,8 +12,6 @@ import typer
 from scipy.stats import rankdata
 from torch import nn
 
-from bench.output.charts import Chart, Row
-from bench.output.result_page import Page, Section
 from evidence.measuring import measuring
 from evidence.render import crops as cutting
 
@@ -26,7 +24,7 @@ _MM_PER_PX = 0.0547
 _BLOCKS = 40  # patches of the photograph that the control gives one label each
 
 
-@measuring("cortex.jpg", file="classifier.json", out="docs/results/render/classifier")
+@measuring("cortex.jpg", file="classifier.json", out="docs/results/render/look")
 def classifier(
     photo: Annotated[Path, typer.Argument(help="A photograph of an exposed cortex.")],
     look: Annotated[
@@ -160,18 +158,3 @@ def _scores(net: nn.Module, pictures: npt.NDArray[np.uint8]) -> Floats:
 
 def _tensor(pictures: npt.NDArray[np.uint8]) -> torch.Tensor:
     return torch.from_numpy(np.ascontiguousarray(pictures.transpose(0, 3, 1, 2))).float() / 127.5 - 1
-
-
-def drawn(found: dict[str, Any]) -> Page:
-    """AUC by source, from the lowest to the highest fold."""
-    rows = tuple(Row(one["crops"], one["auc"], (one["lowest"], one["highest"])) for one in found["rows"])
-    chart = Chart(
-        "0.5: not to be told apart; 1: always", "held-out AUC: mean, lowest to highest of five folds", rows
-    )
-    return Page(
-        "A classifier of patches",
-        found,
-        [chart],
-        [Section("Trials", found["rows"])],
-        command="bench experiment classifier PHOTO --look LOOK",
-    )

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 import tempfile
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -13,8 +12,6 @@ import numpy as np
 import numpy.typing as npt
 import typer
 
-from bench.output.charts import Chart, Row
-from bench.output.result_page import Page, Section
 from evidence.measuring import measuring
 from evidence.render.case import case
 from synth.fit import fitting, parameters
@@ -59,7 +56,7 @@ MADE: tuple[tuple[str, Family, int, dict[str, float]], ...] = (
 """Name, family, seed and what of the parameters is not the family's."""
 
 
-@measuring("--photo cortex.jpg", file="fit.json", out="docs/results/render/fit")
+@measuring("--photo cortex.jpg", file="fit.json", out="docs/results/render/look")
 def fit(
     photo: Annotated[Path | None, typer.Option(help="Also a photograph of exposed cortex.")] = None,
     width_mm: Annotated[float, typer.Option(help="What the photograph's width spans.")] = 110.0,
@@ -112,19 +109,26 @@ def write_picture(path: Path, values: dict[str, float], family: Family, seed: in
 
 
 def compare(name: str, known: dict[str, float], found: dict[str, float]) -> list[dict[str, Any]]:
-    """Known and found value of each parameter; the error is relative, of `blur` and `glare` absolute."""
-    rows = []
+    """Known and found value of each parameter, of a colour that channel that is farthest off.
+
+    The error is relative, of `blur` and `glare` absolute, since they may be nothing.
+    """
+    worst: dict[str, tuple[float, str]] = {}
     for one in parameters.PARAMETERS:
-        truth, value = known[one.name], found[one.name]
-        error = value - truth if one.name in ("blur", "glare") else value / truth - 1
+        off = abs(found[one.name] / known[one.name] - 1)
+        worst[one.name.split()[0]] = max(worst.get(one.name.split()[0], (-1.0, "")), (off, one.name))
+    rows = []
+    for short, (off, full) in worst.items():
+        truth, value = known[full], found[full]
+        error = value - truth if full in ("blur", "glare") else value / truth - 1
         rows.append(
             {
                 "picture": name,
-                "parameter": one.name,
+                "parameter": short,
                 "known": float(f"{truth:.3g}"),
                 "found": float(f"{value:.3g}"),
                 "error": round(error, 3),
-                "within_15": abs(value / truth - 1) <= 0.15,
+                "within_15": off <= 0.15,
             }
         )
     return rows
@@ -150,19 +154,3 @@ def _distance(name: str, found: fitting.Outcome) -> dict[str, Any]:
         "ratio": round(found.after / found.before, 3),
         "at_a_limit": ", ".join(found.fitted.bounded),
     }
-
-
-def drawn(found: Mapping[str, Any]) -> Page:
-    """Error of each parameter, by picture."""
-    charts = []
-    for name in dict.fromkeys(row["picture"] for row in found["parameters"]):
-        own = [row for row in found["parameters"] if row["picture"] == name]
-        rows = tuple(Row(row["parameter"], 100 * row["error"], (100 * row["error"],) * 2) for row in own)
-        charts.append(Chart(name, "found less known [%]; glare and blur: times 100", rows))
-    return Page(
-        "Fitting a look",
-        found,
-        charts,
-        [Section("Distance from the picture", found["pictures"]), Section("Parameters", found["parameters"])],
-        command="bench experiment fit --photo PHOTO",
-    )

@@ -15,8 +15,6 @@ import numpy as np
 import numpy.typing as npt
 import typer
 
-from bench.output.charts import Chart, Row
-from bench.output.result_page import Page, Section
 from evidence.measuring import measuring
 from evidence.render import crops as cutting
 from synth.errors import UserError
@@ -27,7 +25,7 @@ _REGIONS = 5
 _MM_PER_PX = 0.0547
 
 
-@measuring("cortex.jpg --python ps/bin/python", file="texture.json", out="docs/results/render/texture")
+@measuring("cortex.jpg --python ps/bin/python", file="texture.json", out="docs/results/render/look")
 def texture(
     photo: Annotated[Path, typer.Argument(help="A photograph of an exposed cortex.")],
     python: Annotated[Path, typer.Option(help="A Python that has plenoptic (pip install plenoptic).")],
@@ -117,17 +115,3 @@ def _row(name: str, own: Floats, limit: float) -> dict[str, Any]:
         "p90": round(float(high), 3),
         "median_within": bool(middle <= limit),
     }
-
-
-def drawn(found: dict[str, Any]) -> Page:
-    """Median and 80% of the crops, by source."""
-    rows = tuple(Row(one["crops"], one["median"], (one["p10"], one["p90"])) for one in found["rows"])
-    unit = "distance, in spreads of the photograph's crops: median, from p10 to p90"
-    title = f"Within the photograph's own spread: median at most {found['limit_p90_of_photograph']}"
-    return Page(
-        "Texture against a photograph",
-        found,
-        [Chart(title, unit, rows)],
-        [Section("Crops", found["rows"])],
-        command="bench experiment texture PHOTO --python PY --look LOOK",
-    )

@@ -54,7 +54,7 @@ def fit(
         raise UserError(f"{sheet}: is no name of a picture (.png, .jpg, .webp)")
     if out.exists():
         raise UserError(f"{out}: exists already")
-    frames = (rounds + 2) * anatomies + 1
+    frames = (rounds + 2) * anatomies
     print(
         f"{frames} small frames: about {(frames * _FRAME_S + _START_S) / 60:.1f} CPU-minutes", file=sys.stderr
     )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -67,13 +67,12 @@ def fit_photograph(
     theirs = measure(given.view)
     scale = given.view.mm_per_px
     fitted = search(theirs, Setting(scale, tuple(range(anatomies)), given.compression), rounds, said)
-    unseen = Setting(scale, tuple(range(_UNSEEN, _UNSEEN + anatomies)), given.compression)
-    plain = Setting(scale, unseen.anatomies, Compression())
+    unseen = Setting(scale, tuple(range(_UNSEEN, _UNSEEN + anatomies)), Compression())
     best = parameters.as_job(fitted.values, fitted.family)
-    before = [candidate.render({}, plain, index, exact=False) for index in unseen.anatomies]
-    after = [candidate.render(best, unseen, index) for index in unseen.anatomies]
-    unpacked = candidate.render(best, plain, _UNSEEN).rgb
-    made = look_file.sections(fitted, given.compression.chroma, given.compression.bitrate_mbps(unpacked))
+    before = [candidate.render({}, unseen, index, exact=False) for index in unseen.anatomies]
+    bare = [candidate.render(best, unseen, index) for index in unseen.anatomies]
+    after = [replace(view, rgb=given.compression.apply(view.rgb)) for view in bare]
+    made = look_file.sections(fitted, given.compression.chroma, given.compression.bitrate_mbps(bare[0].rgb))
     found = Outcome(
         fitted,
         made,
