@@ -34,8 +34,8 @@ def classifier(
         str, typer.Option(help="Polygon of the cortex in it, as shares: x,y x,y ...")
     ] = cutting.OUTLINE,
     width_mm: Annotated[float, typer.Option(help="What the photograph's width spans.")] = 110.0,
-    frames: Annotated[int, typer.Option(min=5, help="Rendered sequences, one frame of each.")] = 12,
-    epochs: Annotated[int, typer.Option(min=1, help="Of training, a fold.")] = 12,
+    frames: Annotated[int, typer.Option(min=5, help="Rendered sequences, one frame of each.")] = 5,
+    epochs: Annotated[int, typer.Option(min=1, help="Of training, a fold.")] = 10,
     seed: Annotated[int, typer.Option(help="Of the rendered jobs and the training.")] = 31,
 ) -> dict[str, Any]:
     """AUC of a patch classifier, photograph against rendered crops; two controls have to be near 0.5."""
@@ -130,7 +130,7 @@ def _trained(pictures: npt.NDArray[np.uint8], label: Ints, epochs: int, seed: in
         schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, epochs)
         net.train()
         for _ in range(epochs):
-            for part in torch.randperm(len(data), generator=order).split(_BATCH):
+            for part in torch.split(torch.randperm(len(data), generator=order), _BATCH):
                 if len(part) < 2:
                     continue
                 turn, mirror = (
@@ -143,7 +143,7 @@ def _trained(pictures: npt.NDArray[np.uint8], label: Ints, epochs: int, seed: in
                 said = net(batch)[:, 0]
                 nn.functional.binary_cross_entropy_with_logits(
                     said, truth[part], pos_weight=weight
-                ).backward()
+                ).backward()  # type: ignore[no-untyped-call]
                 optimiser.step()
             schedule.step()
     return net.eval()
@@ -152,7 +152,7 @@ def _trained(pictures: npt.NDArray[np.uint8], label: Ints, epochs: int, seed: in
 def _scores(net: nn.Module, pictures: npt.NDArray[np.uint8]) -> Floats:
     with torch.no_grad():
         return np.asarray(
-            torch.cat([net(part)[:, 0] for part in _tensor(pictures).split(64)]).double().numpy()
+            torch.cat([net(part)[:, 0] for part in torch.split(_tensor(pictures), 64)]).double().numpy()
         )
 
 

@@ -40,7 +40,7 @@ class Crops:
     """(N, 2) middles in the photograph [px]; of rendered ones the sequence, twice."""
 
 
-def of_photograph(photo: Path, outline: str, width_mm: float, mm_per_px: float, step: int = 40) -> Crops:
+def of_photograph(photo: Path, outline: str, width_mm: float, mm_per_px: float, step: int = 56) -> Crops:
     """Crops of the photograph that lie inside an outline.
 
     Raises:
@@ -91,7 +91,7 @@ def taken(rgb: Picture, seed: int) -> Picture:
     noise = np.random.default_rng([seed, 5]).normal(0, _NOISE, rgb.shape)
     noisy = np.clip(rgb + noise, 0, 255).astype(np.uint8)
     _, packed = cv2.imencode(".jpg", noisy[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
-    return np.ascontiguousarray(cv2.imdecode(packed, cv2.IMREAD_COLOR)[..., ::-1])
+    return np.ascontiguousarray(np.asarray(cv2.imdecode(packed, cv2.IMREAD_COLOR), np.uint8)[..., ::-1])
 
 
 def regions(places: npt.NDArray[np.float64], count: int) -> npt.NDArray[np.int64]:

@@ -36,7 +36,7 @@ def texture(
         str, typer.Option(help="Polygon of the cortex in it, as shares: x,y x,y ...")
     ] = cutting.OUTLINE,
     width_mm: Annotated[float, typer.Option(help="What the photograph's width spans.")] = 110.0,
-    frames: Annotated[int, typer.Option(min=2, help="Rendered sequences, one frame of each.")] = 12,
+    frames: Annotated[int, typer.Option(min=2, help="Rendered sequences, one frame of each.")] = 5,
     seed: Annotated[int, typer.Option(help="Of the rendered jobs.")] = 31,
 ) -> dict[str, Any]:
     """Distance of rendered crops' texture from a photograph's, in the spread of the photograph's own."""

@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-_FRAME_S = 3.0  # CPU of a frame that is tried, 480 x 360, on one core
+_FRAME_S = 4.0  # CPU of a frame that is tried, 480 x 360, on one core
 _START_S = 8.0
 
 

@@ -21,7 +21,7 @@ def sections(fitted: Fitted, chroma: str, bitrate_mbps: float | None) -> dict[st
     for name in ("arterial", "film_mm"):
         middle = fitted.values[name]
         found["appearance"]["own"][name] = [middle * (1 - _AROUND), middle * (1 + _AROUND)]
-    glare = fitted.values["glare"]
+    glare = found["light"]["glare"][0]
     found["light"]["glare"] = [max(0.0, glare - 0.05), min(1.0, glare + 0.05)]
     found["sensor"] |= {"chroma": chroma}
     if bitrate_mbps is not None:

@@ -20,6 +20,7 @@ _BRIGHTEST = 0.95
 _FULL_WELL, _READ_NOISE = 12_000.0, 11.0
 _SHARPENING = 0.25
 _COLOURS = ("crown", "flush", "vein", "wine")
+_BESIDE_DEG, _FARTHER_DEG = 6.5, 30.0  # of a lamp from the axis where `glare` is 0, and more at -1
 _EVEN = 0.65  # widths of the field: the spot then reaches the corners, and `vignette` says all that is lost
 
 Scale = Literal["log", "linear", "share"]
@@ -86,7 +87,7 @@ PARAMETERS: tuple[Parameter, ...] = (
         0.3,
         3.0,
     ),
-    Parameter("glare", {"highlight share": 1.6, "highlight area": 1.5}, 0.0, 1.0, 0.5, "linear"),
+    Parameter("glare", {"highlight share": 1.6, "highlight area": 1.0}, -1.0, 1.0, 0.5, "linear"),
     Parameter("film_mm", {"highlight area": 0.4}, 0.01, 0.3),
     Parameter("vignette", {"vignette": 0.93}, 0.0, 0.95, 0.5, "linear"),
     Parameter(
@@ -99,7 +100,8 @@ PARAMETERS: tuple[Parameter, ...] = (
     ),
     Parameter("noise", {"noise": 0.88}, 0.1, 8.0, 1.5),
 )
-"""`blur` below 0 stands for sharpening; `noise` is relative to that of 12,000 electrons at full scale."""
+"""`glare` below 0 stands for lamps farther from the axis, `blur` below 0 for sharpening; `noise` is relative
+to that of 12,000 electrons at full scale."""
 
 SPREAD = {
     **{
@@ -173,16 +175,14 @@ def as_job(values: dict[str, float], family: Family) -> dict[str, Any]:
     longer = max(1.0, max(max(own[c]) for c in _COLOURS) / _BRIGHTEST)
     own = {c: [float(np.clip(v / longer, 0.005, _BRIGHTEST)) for v in own[c]] for c in _COLOURS}
     own |= {name: [values[name]] * 2 for name in ("arterial", "film_mm")}
-    noise, blur = values["noise"], values["blur"]
+    noise, blur, glare = values["noise"], values["blur"], values["glare"]
+    light = {"glare": [max(glare, 0.0)] * 2, "kelvin": [KELVIN] * 2, "power": [1.0] * 2, "even": [_EVEN] * 2}
+    if glare < 0:
+        light["tilt_deg"] = [_BESIDE_DEG - _FARTHER_DEG * glare] * 2
     return {
         "anatomy": {"vessel_density": values["density"], "vessel_calibre": values["calibre"]},
         "appearance": {"families": [family], "own": own},
-        "light": {
-            "glare": [values["glare"]] * 2,
-            "kelvin": [KELVIN] * 2,
-            "power": [1.0] * 2,
-            "even": [_EVEN] * 2,
-        },
+        "light": light,
         "sensor": {
             "exposure": [EXPOSURE * longer] * 2,
             "full_well": [_FULL_WELL / noise**2] * 2,

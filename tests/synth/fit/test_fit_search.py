@@ -76,10 +76,10 @@ def test_what_the_photograph_does_not_show_stays_the_familys(monkeypatch: pytest
 
 
 def test_a_parameter_at_its_limit_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    theirs = law(TRUTH | {"glare": -0.8})
+    theirs = law(TRUTH | {"glare": -2.5})
     found = searched(monkeypatch, theirs, 1.0, worst=0.8)
     assert "glare" in found.bounded
-    assert found.values["glare"] == 0
+    assert found.values["glare"] == -1
     assert found.values["density"] == pytest.approx(TRUTH["density"], rel=0.15)
 
 
@@ -93,6 +93,16 @@ def test_what_is_brighter_than_tissue_is_a_longer_exposure() -> None:
     assert longer == pytest.approx(2, rel=0.01)
     assert max(sections["appearance"]["own"]["crown"]) == pytest.approx(0.95)
     assert longer * sections["appearance"]["own"]["vein"][1] == pytest.approx(values["vein g"])
+
+
+def test_fewer_highlights_than_beside_the_lens_are_lamps_farther_away() -> None:
+    beside, far = (
+        parameters.as_job(parameters.start("pale") | {"glare": g}, "pale")["light"] for g in (0.2, -0.5)
+    )
+    assert beside["glare"] == [0.2, 0.2]
+    assert "tilt_deg" not in beside
+    assert far["glare"] == [0, 0]
+    assert far["tilt_deg"] == [21.5, 21.5]
 
 
 def test_blur_below_nothing_is_sharpening() -> None:
