@@ -60,7 +60,7 @@ MADE: tuple[tuple[str, Family, int, dict[str, float]], ...] = (
 def fit(
     photo: Annotated[Path | None, typer.Option(help="Also a photograph of exposed cortex.")] = None,
     width_mm: Annotated[float, typer.Option(help="What the photograph's width spans.")] = 110.0,
-    rounds: Annotated[int, typer.Option(min=2, help="Of the search.")] = 5,
+    rounds: Annotated[int, typer.Option(min=2, help="Of the search.")] = 4,
     anatomies: Annotated[int, typer.Option(min=1, help="Rendered in each round.")] = 2,
     keep: Annotated[
         Path | None, typer.Option(help="Folder for jobs and pictures; they are not results.")

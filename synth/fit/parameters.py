@@ -56,7 +56,7 @@ def _colour(name: str, channel: str) -> Parameter:
     """Vessels stand out from a brighter crown in more grey levels."""
     lifts = {"crown r": 0.15, "crown g": 0.35}.get(f"{name} {channel}")
     seen = _contrast(*[lifts] * 4) if lifts else {}
-    return Parameter(f"{name} {channel}", {f"{name} {channel}": 1.2, **seen}, 0.01, 3.0, 1.0)
+    return Parameter(f"{name} {channel}", {f"{name} {channel}": 1.2, **seen}, 0.01, 3.0, 0.6)
 
 
 # Slopes: two anatomies of the healthy family at 0.055 mm a pixel, each parameter turned up and down.
@@ -73,6 +73,7 @@ PARAMETERS: tuple[Parameter, ...] = (
         {"density": 0.75, "fineness": 0.2, "vein share": 0.7, **_contrast(0.41, 0.43, 0.43, 0.3)},
         0.35,
         2.8,
+        0.4,
     ),
     Parameter(
         "calibre",
@@ -81,11 +82,11 @@ PARAMETERS: tuple[Parameter, ...] = (
             "density": 0.3,
             "vein share": 1.2,
             "arterial": 0.06,
-            **{f"{part} {channel}": -0.7 for part in ("vein", "wine") for channel in "gb"},
             **_contrast(0.32, 0.37, 0.39, 0.34),
         },
         0.3,
         3.0,
+        0.4,
     ),
     Parameter("glare", {"highlight share": 1.6, "highlight area": 1.0}, -1.0, 1.0, 0.5, "linear"),
     Parameter("film_mm", {"highlight area": 0.4}, 0.01, 0.3),

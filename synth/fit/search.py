@@ -41,7 +41,8 @@ def search(
 
     Every round all anatomies are rendered, and all parameters take the step that would, by their slopes,
     bring the statistics nearest to the photograph's, each counted in the spread that it has between frames.
-    The slopes needn't be right for that: where the statistics agree, no step is left.
+    The slopes needn't be right for that: where the statistics agree, no step is left. A round that came out
+    worse is gone back on, and the next step is half as long.
 
     Args:
         theirs: the photograph's statistics.
@@ -54,13 +55,16 @@ def search(
     told = [one for one in PARAMETERS if any(np.isfinite(theirs[name]) for name in _own(one))]
     values = first
     tried: list[tuple[float, dict[str, float], dict[str, float]]] = []
+    reach = _LARGEST
     for turn in range(rounds):
         sections = parameters.as_job(values, family)
         found = measured([render(sections, setting, index) for index in setting.anatomies])
         tried.append((parameters.distance(found, theirs), values, found))
         said(turn + 1, tried[-1][0])
-        values = values | _stepped(told, values, first, found, theirs)
-    best = min(tried, key=lambda one: one[0])
+        best = min(tried, key=lambda one: one[0])
+        if best is not tried[-1]:
+            reach /= 2
+        values = best[1] | _stepped(told, best, first, theirs, reach)
     left = tuple(one.name for one in PARAMETERS if one not in told)
     bounded = tuple(one.name for one in told if not one.low < best[1][one.name] < one.high)
     return Fitted(family, best[1], best[2], best[0], left, bounded)
@@ -89,12 +93,13 @@ def _own(one: Parameter) -> list[str]:
 
 def _stepped(
     told: list[Parameter],
-    values: dict[str, float],
+    best: tuple[float, dict[str, float], dict[str, float]],
     first: dict[str, float],
-    found: dict[str, float],
     theirs: dict[str, float],
+    reach: float,
 ) -> dict[str, float]:
     """The parameters after a step of least squares within limits, drawn weakly to where they started."""
+    _, values, found = best
     names = [name for name in SPREAD if np.isfinite(theirs[name]) and np.isfinite(found[name])]
     slopes = np.array([[one.effects.get(name, 0.0) for one in told] for name in names])
     spread = _SURER * np.array([SPREAD[name] for name in names])
@@ -107,9 +112,7 @@ def _stepped(
     low = np.array([one.onto(one.low) for one in told]) - here
     high = np.array([one.onto(one.high) for one in told]) - here
     room = 1e-9
-    step = lsq_linear(
-        matrix, wanted, (np.maximum(low, -_LARGEST) - room, np.minimum(high, _LARGEST) + room)
-    ).x
+    step = lsq_linear(matrix, wanted, (np.maximum(low, -reach) - room, np.minimum(high, reach) + room)).x
     return {
         one.name: float(np.clip(one.back(a + d), one.low, one.high))
         for one, a, d in zip(told, here, step, strict=True)

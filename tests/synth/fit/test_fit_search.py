@@ -63,7 +63,9 @@ def test_parameters_are_found_though_the_slopes_are_wrong(
     theirs = law(TRUTH, steeper)
     found = searched(monkeypatch, theirs, steeper)
     for name in ("density", "calibre", "vignette", "noise", "glare", "crown g", "vein b"):
-        assert found.values[name] == pytest.approx(TRUTH[name], rel=0.1), name
+        # What frames say little of is drawn a little to the family.
+        close = 0.15 if name in ("density", "calibre") else 0.1
+        assert found.values[name] == pytest.approx(TRUTH[name], rel=close), name
     assert found.left == () == found.bounded
 
 
