@@ -37,6 +37,7 @@ def classifier(
     frames: Annotated[int, typer.Option(min=5, help="Rendered sequences, one frame of each.")] = 5,
     epochs: Annotated[int, typer.Option(min=1, help="Of training, a fold.")] = 10,
     seed: Annotated[int, typer.Option(help="Of the rendered jobs and the training.")] = 31,
+    cache: Annotated[Path | None, typer.Option(help="Folder that keeps rendered crops.")] = None,
 ) -> dict[str, Any]:
     """AUC of a patch classifier, photograph against rendered crops; two controls have to be near 0.5."""
     torch.set_num_threads(1)
@@ -46,7 +47,7 @@ def classifier(
     sources: list[tuple[str, Path | None]] = [("default job", None), *((one.stem, one) for one in look or [])]
     rows = []
     for name, file in sources:
-        ours = cutting.of_job(cutting.read_job(file, frames, seed), _MM_PER_PX)
+        ours = cutting.kept_of_job(cutting.read_job(file, frames, seed), _MM_PER_PX, cache)
         pictures = np.concatenate([theirs.pictures, ours.pictures])
         label = np.repeat([0, 1], [len(theirs.pictures), len(ours.pictures)])
         fold = np.concatenate([region, ours.places[:, 0].astype(np.int64) % _FOLDS])
@@ -65,6 +66,7 @@ def classifier(
 
 def held_out(
     pictures: npt.NDArray[np.uint8], label: Ints, fold: Ints, epochs: int, seed: int
+    cache: Annotated[Path | None, typer.Option(help="Folder that keeps rendered crops.")] = None,
 ) -> dict[str, Any]:
     """AUC of each fold on crops of it that no crop of its region or sequence was trained on.
 

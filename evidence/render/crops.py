@@ -13,10 +13,12 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from evidence import kept
 from evidence.render.case import case
 from evidence.render.realism import scaled_photograph
 from synth.errors import UserError
 from synth.job import reader
+from synth.job.identity import identify_job
 from synth.job.schema import Job
 
 Picture = npt.NDArray[np.uint8]
@@ -76,6 +78,19 @@ def of_job(job: Job, mm_per_px: float, step: int = 64) -> Crops:
             pictures.append(crop)
             places.append((index, index))
     return Crops(np.stack(pictures), np.array(places, float))
+
+
+def kept_of_job(job: Job, mm_per_px: float, cache: Path | None) -> Crops:
+    """The same, kept in a folder by job and code, if there is one."""
+    if cache is None:
+        return of_job(job, mm_per_px)
+    file = cache / f"{kept.word(__name__, identify_job(job), job.sequences, mm_per_px)}.npz"
+    if not file.exists():
+        found = of_job(job, mm_per_px)
+        cache.mkdir(parents=True, exist_ok=True)
+        np.savez(file, pictures=found.pictures, places=found.places)
+    with np.load(file) as told:
+        return Crops(told["pictures"], told["places"])
 
 
 def read_job(look: Path | None, frames: int, seed: int) -> Job:

@@ -38,6 +38,7 @@ def texture(
     width_mm: Annotated[float, typer.Option(help="What the photograph's width spans.")] = 110.0,
     frames: Annotated[int, typer.Option(min=2, help="Rendered sequences, one frame of each.")] = 5,
     seed: Annotated[int, typer.Option(help="Of the rendered jobs.")] = 31,
+    cache: Annotated[Path | None, typer.Option(help="Folder that keeps rendered crops.")] = None,
 ) -> dict[str, Any]:
     """Distance of rendered crops' texture from a photograph's, in the spread of the photograph's own."""
     theirs = cutting.of_photograph(photo, outline, width_mm, _MM_PER_PX)
@@ -48,7 +49,7 @@ def texture(
     limit = float(np.quantile(own, 0.9))
     rows = [_row("photograph, region left out", own, limit)]
     for name, file in sources:
-        ours = cutting.of_job(cutting.read_job(file, frames, seed), _MM_PER_PX)
+        ours = cutting.kept_of_job(cutting.read_job(file, frames, seed), _MM_PER_PX, cache)
         found = described(ours.pictures, python)
         rows.append(_row(name, distances(found, measured), limit))
     return {
