@@ -66,7 +66,6 @@ def classifier(
 
 def held_out(
     pictures: npt.NDArray[np.uint8], label: Ints, fold: Ints, epochs: int, seed: int
-    cache: Annotated[Path | None, typer.Option(help="Folder that keeps rendered crops.")] = None,
 ) -> dict[str, Any]:
     """AUC of each fold on crops of it that no crop of its region or sequence was trained on.
 
