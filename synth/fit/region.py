@@ -71,7 +71,7 @@ def _pieces(found: Mask, wide: npt.NDArray[np.uint8]) -> Mask:
     large = area >= _PIECE * area[1:].max()
     large[0] = False
     side = len(wide)
-    padded = cv2.copyMakeBorder(large[label].astype(np.uint8), *[side] * 4, cv2.BORDER_REPLICATE)
+    padded = np.pad(large[label].astype(np.uint8), side, mode="edge")
     closed = cv2.morphologyEx(padded, cv2.MORPH_CLOSE, wide)[side:-side, side:-side]
     return np.asarray(closed > 0)
 

@@ -15,8 +15,8 @@ import numpy as np
 import numpy.typing as npt
 import typer
 
+from evidence.look import crops as cutting
 from evidence.measuring import measuring
-from evidence.render import crops as cutting
 from synth.errors import UserError
 
 Floats = npt.NDArray[np.float64]

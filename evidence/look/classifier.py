@@ -12,8 +12,8 @@ import typer
 from scipy.stats import rankdata
 from torch import nn
 
+from evidence.look import crops as cutting
 from evidence.measuring import measuring
-from evidence.render import crops as cutting
 
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]

@@ -47,10 +47,7 @@ def _classifier(found: Tree) -> tuple[Chart, Section]:
 
 
 def _fit(found: Tree) -> tuple[Chart, Section]:
-    """Errors of each parameter over the pictures of known parameters."""
-    rows = []
-    for name in dict.fromkeys(row["parameter"] for row in found["parameters"]):
-        errors = [100 * row["error"] for row in found["parameters"] if row["parameter"] == name]
-        rows.append(Row(name, sum(errors) / len(errors), (min(errors), max(errors))))
-    unit = "found less known [%], lowest to highest of the pictures; glare and blur: times 100"
-    return Chart("Fit: known parameters found again", unit, tuple(rows)), Section("Fit", found["pictures"])
+    """Distance from each picture, after as a part of before."""
+    rows = tuple(Row(one["picture"], one["ratio"]) for one in found["pictures"])
+    chart = Chart("Fit: half of what it was, or less", "distance after the fit / before", rows)
+    return chart, Section("Fit", found["pictures"])
