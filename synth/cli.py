@@ -10,6 +10,7 @@ from typing import Annotated
 
 import typer
 
+from synth.fit.command import fit
 from synth.system.cli_errors import Commands
 from synth.tune.command import tune
 
@@ -33,6 +34,7 @@ Mix = Annotated[
 Json = Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")]
 
 app.command(epilog='Example: synth tune demo --budget "force 3%" --out tuned.yaml')(tune)
+app.command(epilog="Example: synth fit photo.jpg --out look.yaml --width-mm 38 --sheet fit.jpg")(fit)
 
 
 @app.command(epilog="Example: synth new job.yaml")

@@ -14,6 +14,7 @@ from synth.job.microscope import Light as Light
 from synth.job.microscope import Render as Render
 from synth.job.microscope import Sensor as Sensor
 from synth.job.types import (
+    Colour,
     InstrumentRange,
     NonNegative,
     NonNegativeRange,
@@ -85,6 +86,10 @@ class Anatomy(Section):
     """Procedural relief: depth of the sulci as seen from outside [mm]."""
     vertices: Annotated[int, Field(ge=400, le=400_000)] = 40_000
     """Vertices of the fine surface that is loaded, moved and rendered."""
+    vessel_density: Annotated[FiniteFloat, Field(ge=0.3, le=3)] = 1.0
+    """Length of the vessels on an area, against the usual."""
+    vessel_calibre: Annotated[FiniteFloat, Field(ge=0.2, le=4)] = 1.0
+    """Radii of the vessels, against the usual."""
     craniotomy: Craniotomy = Craniotomy()
     """Where the skull is open."""
     attachments: tuple[Attachment, ...] = ()
@@ -101,11 +106,37 @@ class Anatomy(Section):
 Family = Literal["healthy", "hyperaemic", "pale", "oedematous", "calf"]
 
 
+class Own(Section):
+    """A family of your own: each key that is given takes the place of the family's value. Default: none.
+
+    `synth fit` writes it from a photograph. Colours are linear RGB, and vary a little between sequences.
+    """
+
+    crown: Colour | None = None
+    """Reflectance of the gyri's crowns."""
+    flush: Colour | None = None
+    """Reflectance where more blood shines through."""
+    vein: Colour | None = None
+    """Reflectance of a thick vein along its crest."""
+    wine: Colour | None = None
+    """Reflectance of a thick vein at its sides."""
+    arterial: NonNegativeRange | None = None
+    """Strength of the arteries' red; healthy: 1.1-1.5."""
+    capillary: NonNegativeRange | None = None
+    """Strength of the vessels that shimmer through the tissue; healthy: 1.4-2.2."""
+    shade: NonNegativeRange | None = None
+    """Darkening of the sulci; healthy: 0.3-0.6."""
+    film_mm: PositiveRange | None = None
+    """Width of what the wet film evens out [mm]; healthy: 0.035-0.06."""
+
+
 class Appearance(Section):
     """How the surface looks."""
 
     families: tuple[Family, ...] = ("healthy",)
     """Appearance families that sequences are drawn from, in equal shares."""
+    own: Own = Own()
+    """A family of your own, on top of the named ones."""
     photo: Path | None = None
     """A photograph used as albedo, relative to the job file. Empty: procedural vessels and parenchyma."""
     cottonoid: Share = 0.2

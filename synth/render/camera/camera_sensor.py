@@ -30,6 +30,8 @@ class Sensor:
     """Of the converter."""
     vignette: float = 0.15
     """Share of light lost in the picture's corners."""
+    blur: float = 0.0
+    """Standard deviation of the optics' blur [px]."""
     bloom: float = 0.03
     """Share of light that the optics scatter around."""
     contrast: float = 0.35
@@ -51,6 +53,8 @@ class Sensor:
             white=white,
             full_well=float(rng.uniform(*section.full_well)),
             read_noise=float(rng.uniform(*section.read_noise)),
+            vignette=section.vignette,
+            blur=section.blur_px,
             contrast=float(rng.uniform(*section.contrast)),
             sharpening=float(rng.uniform(*section.sharpening)),
             bayer=section.bayer,
@@ -71,6 +75,8 @@ def record(radiance: Map, sensor: Sensor, rng: np.random.Generator) -> npt.NDArr
         (H, W, 3) uint8.
     """
     light = radiance * (sensor.exposure * _falloff(radiance.shape[:2], sensor.vignette))[..., None]
+    if sensor.blur > 0:
+        light = cv2.GaussianBlur(light, (0, 0), sensor.blur)
     light = _scatter(light, sensor.bloom)
     balanced = rng.standard_normal(light.shape, dtype=np.float32)
     well, read = np.float32(sensor.full_well), np.float32(sensor.read_noise**2)
