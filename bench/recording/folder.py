@@ -230,7 +230,8 @@ def _spans_from(about: Meta, start: float) -> Meta:
         return tuple(moved(span) for span in spans)
 
     sync = about.sync.model_copy(update={"calibration_s": moved(about.sync.calibration_s)})
-    sensor = about.sensor.model_copy(update={"free_s": every(about.sensor.free_s)})
+    told = about.sensor
+    sensor = told.model_copy(update={"free_s": every(told.free_s), "turn_s": moved(told.turn_s)})
     pulse = about.pulse.model_copy(update={"free_s": every(about.pulse.free_s)})
     parts = {"sync": sync, "sensor": sensor, "pulse": pulse, "press_s": moved(about.press_s)}
     return about.model_copy(update=parts)

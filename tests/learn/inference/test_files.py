@@ -161,7 +161,14 @@ def test_a_video_is_followed_and_predicted(model: Path, tmp_path: Path) -> None:
 def test_a_pulse_that_was_taken_off_is_said_once(tmp_path: Path) -> None:
     write_film(tmp_path / "film.mp4", 1)
     beat = Rhythm(1.2, np.zeros(1), np.zeros(1), np.zeros((2, 1, 2)))
-    found = Pulse((beat,), np.zeros((48, 64, 1), np.float32), np.zeros((1, 2)), (0.5,), 1.0)
+    found = Pulse(
+        (beat,),
+        np.zeros((48, 64, 1), np.float32),
+        np.zeros((1, 2)),
+        np.zeros((48, 64, 2), np.float32),
+        (0.5,),
+        1.0,
+    )
     notes = " ".join(apply._video(tmp_path / "film.mp4", Filmed(0.1), found).notes())
     assert notes.count("the whole surface moves by itself") == notes.count("taken off") == 1
 
