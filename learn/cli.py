@@ -278,7 +278,9 @@ def predict_command(
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for NAME.npz files.")] = Path("forces"),
     input: Annotated[str | None, typer.Option(help=_STORED)] = None,
     young: Annotated[float | None, typer.Option(help="Young's modulus [kPa], instead of the data's.")] = None,
-    scale: Annotated[float | None, typer.Option(help="A video's scale [mm a pixel].")] = None,
+    scale: Annotated[
+        str | None, typer.Option(help="A video's scale [mm a pixel], or unknown: forces up to a factor.")
+    ] = None,
     tissue: Annotated[
         Path | None,
         typer.Option(help="A picture, white where the video shows tissue; everywhere if not given."),
@@ -313,13 +315,14 @@ def predict_command(
     from learn.inference.apply import Filmed, apply, motions
     from learn.inference.mask_files import read_choice
     from learn.inference.predict import load_predictor
+    from learn.inference.scale import read_scale
     from learn.inference.video_flow import Settings
     from learn.training.threads import set_threads
 
     set_threads(threads)
     predictor = load_predictor(model, quick=True)
     kind, files = read_choice(masks)
-    filmed = Filmed(scale, tissue, Settings(flow, shrink, rate or None, pulse, kind), files)
+    filmed = Filmed(read_scale(scale), tissue, Settings(flow, shrink, rate or None, pulse, kind), files)
     peaks: dict[str, float | None] = {}
     for motion in motions(source, predictor.stored(input), filmed):
         written = out / f"{motion.name}.npz"

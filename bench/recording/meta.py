@@ -38,9 +38,6 @@ def _must_run_forward(span: tuple[float, float]) -> tuple[float, float]:
 Span = Annotated[tuple[FiniteFloat, FiniteFloat], AfterValidator(_must_run_forward)]
 
 
-TAKEN_MM = 32.0
-"""Width that a picture of unknown scale is taken to have [mm]: about what a microscope shows of a cortex."""
-
 LEAST_INTERVALS = 20
 """Frame intervals that `sync.calibration_s` must hold for the clocks to be lined up on it."""
 
