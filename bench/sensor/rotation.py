@@ -25,9 +25,8 @@ _FLAT = 0.1  # of the largest standard deviation of force: a direction with less
 _EXPLAINED = 0.5  # share of the motion's variance
 _SURE_DEG = 15.0
 _RESAMPLES = 100
-_FREEDOM = np.sqrt(
-    2.5
-)  # six numbers, of which a gain and a rotation leave two: angle over misfit, if isotropic
+# The angle's deviation over the misfit: of six numbers of equal error a gain and a rotation leave two.
+_FREEDOM = float(np.sqrt(2.5))
 _STARTS = Rotation.create_group("O")
 
 

@@ -157,6 +157,19 @@ def _track(
         if video.seen <= meta.rest_frame:
             raise UserError(f"{recording.folder}: rest_frame {meta.rest_frame}, but {video.seen} frames")
         raise UserError(f"{recording.folder}: no frame has a time; give frames.csv, or fps in meta.yaml")
+    _tell(out, video, recording, methods, pulse, scale_mm_per_px * video.shrink)
+    return out, video.find_pulse(meta.pulse.free_s)
+
+
+def _tell(
+    out: Tracked,
+    video: VideoFlow,
+    recording: Recording,
+    methods: Mapping[str, Method],
+    pulse: Pulse | None,
+    mm_per_px: float,
+) -> None:
+    """Says what was done to the video, which is through, and what somebody should know of it."""
     out.fault = video.fault
     if out.fault:
         out.trusted = [False] * len(out.time_s)
@@ -172,19 +185,18 @@ def _track(
         out.timings["flow_peak_rss_mb"] = round(video.peak_bytes / 1e6, 1)
     if out.sight is not None:
         out.notes.append(out.sight.describe())
-    if two and pulse is not None:
+    if pulse is None:
+        return
+    if recording.right or recording.depths:
         # Flow without the pulse and depth with it would be a motion that nothing made.
         out.notes.append(
             "the tissue's own motion is off the flow, not off depth: the second eye was not used (--no-pulse)"
         )
-    if pulse is not None:
-        mm_per_px = scale_mm_per_px * video.shrink
-        out.pulse = [
-            {"rate_hz": rhythm.rate_hz, "amplitude_mm": mm_per_px * size}
-            for rhythm, size in zip(pulse.rhythms, pulse.amplitudes_px, strict=True)
-        ]
-        out.notes.append(pulse.describe(mm_per_px))
-    return out, video.find_pulse(meta.pulse.free_s)
+    out.pulse = [
+        {"rate_hz": rhythm.rate_hz, "amplitude_mm": mm_per_px * size}
+        for rhythm, size in zip(pulse.rhythms, pulse.amplitudes_px, strict=True)
+    ]
+    out.notes.append(pulse.describe(mm_per_px))
 
 
 def _is_within(span: Span | None, step: Step) -> bool:

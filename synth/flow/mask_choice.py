@@ -43,7 +43,7 @@ _AWAY_PX = 6  # so far away from them, a tenth of which moves by
 _AWAY_MOVES_PX = 0.6  # this, and if less than
 _AWAY_MATCHED = 0.6  # this share of that, and than
 _ALL_MATCHED = 0.9  # this of all that is seen, is found again: the highlights vouch for themselves
-_SPARE = 24  # solutions beyond one a frame that are allowed at once (one from nothing counts twice), and
+_SPARE = 10  # solutions beyond one a frame that are allowed at once (one from nothing counts twice), and
 _SHARE = 0.05  # a frame
 
 
