@@ -38,11 +38,10 @@ _AS_GOOD = 0.99  # share of the confidence without masks that has to be left, wh
 _GROWN = 1.5  # the choice is made again when motion has grown by this factor,
 _STILL_PX = 0.5  # from this on,
 _NEW = 0.005  # or when a piece of this share of the tissue turns up where none was
-_HELD = 0.25  # highlights hold the picture still where they move by less than this share of what is
+_HELD = 0.2  # highlights hold the picture still where they move by less than this share of what is
 _AWAY_PX = 6  # so far away from them, a tenth of which moves by
-_AWAY_MOVES_PX = 0.6  # this, and if less than
-_AWAY_MATCHED = 0.6  # this share of that, and than
-_ALL_MATCHED = 0.9  # this of all that is seen, is found again: the highlights vouch for themselves
+_AWAY_MOVES_PX = 0.6  # this, if less than
+_AWAY_MATCHED = 0.5  # this share of that is found again: the highlights vouch for themselves alone
 _SPARE = 10  # solutions beyond one a frame that are allowed at once (one from nothing counts twice), and
 _SHARE = 0.05  # a frame
 
@@ -215,13 +214,14 @@ class ChoosingTracker:
         they are what is found again. Away from them hardly anything is, and what little is known there moves.
         """
         tracker, last = self.tracker, self.tracker.last
-        glare = self.rest_found.glare | found.glare
+        before, now = self.rest_found.glare, found.glare
         assert last is not None
-        if last.matched >= _ALL_MATCHED or not glare.any():
-            return False
         seen = tracker.usable & ~self.blocked
-        shining, away = seen & glare, seen & ~_ring(glare, _AWAY_PX)
-        if np.count_nonzero(shining) < _SMALLEST or np.count_nonzero(away) < _LEAST_BEYOND * seen.size:
+        shining = seen & before & now  # what shines in one picture alone doesn't stay
+        if np.count_nonzero(shining) < _SMALLEST:
+            return False
+        away = seen & ~_ring(before | now, _AWAY_PX)
+        if np.count_nonzero(away) < _LEAST_BEYOND * seen.size:
             return False
         length = np.hypot(last.flow[..., 0], last.flow[..., 1])
         moves = float(np.quantile(length[away], 0.9))

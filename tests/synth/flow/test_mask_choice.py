@@ -97,20 +97,18 @@ def test_highlights_over_faint_texture_do_not_vouch_for_stillness(wrong_px: int)
     assert errors["chosen"] < 0.4 * errors["none"]
 
 
-@pytest.mark.parametrize(("contrast", "held"), [(0.04, True), (1.0, False)])
+@pytest.mark.parametrize(("contrast", "held"), [(0.06, True), (1.0, False)])
 def test_highlights_that_alone_say_that_nothing_moves_are_not_believed(contrast: float, held: bool) -> None:
-    spots = gaussian_filter(np.random.default_rng(1).standard_normal((_SIZE, _SIZE)), 3)
-    wet = spots > np.quantile(spots, 0.93)
+    spots = gaussian_filter(np.random.default_rng(1).standard_normal((_SIZE, _SIZE)), 6)
+    wet = spots > np.quantile(spots, 0.95)
     found = Proposal(wet, _NOTHING, _NOTHING)
     tracker = _tracker(_picture(np.where(wet, 250.0, _faint(0.0, 2, contrast))), found)
-    lost, off = [], []
-    for k, by_px in enumerate((1.5, 3.0, 3.0, 3.0)):
+    for k, by_px in enumerate((1.5, 3.0, 3.0)):
         flow, confidence = tracker.step(_picture(np.where(wet, 250.0, _faint(by_px, 3 + k, contrast))), found)
-        lost.append(tracker.lost)
-        off.append(float(np.linalg.norm(flow - [by_px, 0.0], axis=-1)[~wet].mean()))
-        assert (confidence.max() < 0.3) == bool(tracker.lost)
-    assert (max(off) > 1) == held
-    assert any("highlights" in why for why in lost) == held
+        off = float(np.linalg.norm(flow - [by_px, 0.0], axis=-1)[~wet].mean())
+        assert (off > 1) == held, "what proves nothing if it is followed after all"
+        assert ("highlights" in tracker.lost) == held
+        assert (confidence.max() < 0.3) == held
 
 
 def test_tool_that_comes_back_is_masked_at_once() -> None:
