@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
@@ -118,8 +118,12 @@ def train_command(
     with made_folder(out, room_needed(out, settings.arch)):
         clips, split, settings = _divided(dataset, settings, named(preset), cache, fixed=folds is not None)
         card, first = _train(clips, split, settings, out, accelerator, devices, quiet=json)
-    if not first:
-        return
+    if first:
+        _tell_trained(card, settings, out, json)
+
+
+def _tell_trained(card: Card, settings: Settings, out: Path, json: bool) -> None:
+    """The best epoch, on stdout or for a person."""
     result = {"model": str(out), "epoch": card.epoch, "select_r2": card.score}
     result |= {k: len(v) for k, v in card.split.items()}
     if json:
@@ -225,10 +229,9 @@ def eval_command(
     """Score a model on the sequences it has not seen; forces in mN."""
     from learn.data.clips import load_clips, scored
     from learn.data.split import ungrouped
-    from learn.evaluation.evaluate import compare, evaluate, unseen
+    from learn.evaluation.evaluate import compare, evaluate
     from learn.inference.predict import load_predictor
     from learn.training.threads import set_threads
-    from synth.dataset.index import written_sides
 
     set_threads(threads)
     predictor = load_predictor(model)
@@ -239,22 +242,14 @@ def eval_command(
         clips = ungrouped(clips)
         _console.print("The model was chosen on brains it is scored on: this says nothing of other brains.")
     other = None if against is None else load_predictor(against)
-    chosen = clips if all else unseen(clips, predictor.card)
     if other is not None:
         other.readable(source)
         if other.grid != predictor.grid or other.card.settings.target != predictor.card.settings.target:
             raise UserError(
                 f"{against}: is of another grid or target than {model}; their maps can't be paired"
             )
-        chosen = chosen if all else unseen(chosen, other.card)
-    sides = None if all else written_sides(dataset)
-    if sides is not None and "test" in sides.values():
-        chosen = [c for c in chosen if sides.get(c.content_hash) == "test"]
-        _console.print("The dataset's own split: only what `synth split` marks test is scored.")
-    if not chosen:
-        raise UserError(
-            f"{dataset}: the model was fitted or chosen on every sequence here; --all scores them anyway"
-        )
+    cards = [one.card for one in (predictor, other) if one is not None]
+    chosen = clips if all else _unseen(clips, dataset, cards)
     with _bar("Evaluating") as tell:
         report = evaluate(predictor, chosen, source, tell)
         second = None if other is None else evaluate(other, chosen, source, tell)
@@ -271,6 +266,25 @@ def eval_command(
         screen.print(_pairs(pairs, str(against), predictor.card))
 
 
+def _unseen(clips: list[Clip], dataset: Path, cards: list[Card]) -> list[Clip]:
+    """Those that no model has seen, of a split dataset the test side; UserError if there are none."""
+    from learn.evaluation.evaluate import unseen
+    from synth.dataset.index import written_sides
+
+    chosen = clips
+    for card in cards:
+        chosen = unseen(chosen, card)
+    sides = written_sides(dataset)
+    if sides is not None and "test" in sides.values():
+        chosen = [c for c in chosen if sides.get(c.content_hash) == "test"]
+        _console.print("The dataset's own split: only what `synth split` marks test is scored.")
+    if not chosen:
+        raise UserError(
+            f"{dataset}: the model was fitted or chosen on every sequence here; --all scores them anyway"
+        )
+    return chosen
+
+
 @app.command("predict", epilog="Example: learn predict model video.mp4 --scale 0.05 --young 1.5")
 def predict_command(
     model: Annotated[Path, typer.Argument(help="Model folder.")],
@@ -278,7 +292,9 @@ def predict_command(
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for NAME.npz files.")] = Path("forces"),
     input: Annotated[str | None, typer.Option(help=_STORED)] = None,
     young: Annotated[float | None, typer.Option(help="Young's modulus [kPa], instead of the data's.")] = None,
-    scale: Annotated[float | None, typer.Option(help="A video's scale [mm a pixel].")] = None,
+    scale: Annotated[
+        str | None, typer.Option(help="A video's scale [mm a pixel], or unknown: forces up to a factor.")
+    ] = None,
     tissue: Annotated[
         Path | None,
         typer.Option(help="A picture, white where the video shows tissue; everywhere if not given."),
@@ -308,38 +324,42 @@ def predict_command(
     json: Json = False,
 ) -> None:
     """Write the force maps and force curves that a model sees in stores, videos or arrays of flow."""
-    import numpy as np
-
     from learn.inference.apply import Filmed, apply, motions
     from learn.inference.mask_files import read_choice
     from learn.inference.predict import load_predictor
+    from learn.inference.scale import read_scale
     from learn.inference.video_flow import Settings
     from learn.training.threads import set_threads
 
     set_threads(threads)
     predictor = load_predictor(model, quick=True)
     kind, files = read_choice(masks)
-    filmed = Filmed(scale, tissue, Settings(flow, shrink, rate or None, pulse, kind), files)
+    filmed = Filmed(read_scale(scale), tissue, Settings(flow, shrink, rate or None, pulse, kind), files)
     peaks: dict[str, float | None] = {}
     for motion in motions(source, predictor.stored(input), filmed):
         written = out / f"{motion.name}.npz"
         if written.exists() and written.samefile(source):
             raise UserError(f"{written}: is what is read, and would be overwritten; say another --out")
-        found = apply(predictor, motion, young)
-        out.mkdir(parents=True, exist_ok=True)
-        with whole_file.part_of(written) as part, part.open("wb") as file:
-            np.savez_compressed(file, **found)
-        size = found["total_force_mn"][found["trusted"]]
-        peaks[motion.name] = float(size.max()) if len(size) else None
-        if not json:
-            peak = "no force: no frame could be followed"
-            if peaks[motion.name] is not None:
-                peak = f"peak force {peaks[motion.name]:.3g} mN"
-            _console.print(f"{motion.name}: {len(found['trusted'])} frames, {peak}")
-            for note in found["notes"]:
-                _console.print(f"note: {note}", style="yellow", markup=False, highlight=False)
+        peaks[motion.name] = _write_forces(apply(predictor, motion, young), written, motion.name, quiet=json)
     if json:
         print(json_.dumps({"out": str(out), "peak_force_mn": peaks}))
+
+
+def _write_forces(found: Mapping[str, Any], file: Path, name: str, *, quiet: bool) -> float | None:
+    """Writes what `apply` found, whole; its peak force [mN], None where no frame could be followed."""
+    import numpy as np
+
+    file.parent.mkdir(parents=True, exist_ok=True)
+    with whole_file.part_of(file) as part, part.open("wb") as stream:
+        np.savez_compressed(stream, **found)
+    size = found["total_force_mn"][found["trusted"]]
+    peak = float(size.max()) if len(size) else None
+    if not quiet:
+        said = "no force: no frame could be followed" if peak is None else f"peak force {peak:.3g} mN"
+        _console.print(f"{name}: {len(found['trusted'])} frames, {said}")
+        for note in found["notes"]:
+            _console.print(f"note: {note}", style="yellow", markup=False, highlight=False)
+    return peak
 
 
 @app.command("calibrate", epilog="Example: learn calibrate model press.npz")

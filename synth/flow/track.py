@@ -87,6 +87,7 @@ class Tracker:
         """The last frame's answer as it was found."""
         self._good: Flow | None = None
         self._level = 1.0
+        self._before: tuple[Flow | None, float] = None, 1.0  # both as they were a frame ago
 
     def start(self, initial: Flow | None) -> None:
         """Sets what the next frame starts from, (H, W, 2) px; None: from nothing."""
@@ -101,6 +102,7 @@ class Tracker:
         """
         if frame.shape != self.rest.shape or blocked.shape != self.tissue.shape:
             raise UserError(f"flow: frame {frame.shape} does not fit the rest frame {self.rest.shape}")
+        self._before = self._good, self._level
         found = self.solve(frame, blocked, self._good)
         if self._good is not None and self.is_doubtful(found):
             again = self.solve(frame, blocked, None)
@@ -139,12 +141,20 @@ class Tracker:
         elif not found.is_matched:
             self.lost = f"only {100 * found.matched:.0f}% of what is seen matches the rest frame"
         self.trusted = not self.lost
-        confidence = found.confidence
         if self.trusted:
             self._good, self._level = found.flow, found.level
-        else:
-            confidence = np.minimum(confidence, 0.5 * DOUBTFUL)
-        return found.flow * self.tissue[..., None], confidence
+        return self._said(found)
+
+    def doubt(self, reason: str) -> tuple[Flow, Map]:
+        """Takes back that the frame could be followed, once it is accepted; what is said of it then."""
+        assert self.last is not None
+        self.lost, self.trusted = reason, False
+        self._good, self._level = self._before
+        return self._said(self.last)
+
+    def _said(self, found: Solved) -> tuple[Flow, Map]:
+        sure = found.confidence if self.trusted else np.minimum(found.confidence, 0.5 * DOUBTFUL)
+        return found.flow * self.tissue[..., None], sure
 
 
 def track(
