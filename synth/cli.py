@@ -219,16 +219,55 @@ def report(
     print(write_report(out, to or out / "report.html"))
 
 
-@app.command(epilog="Example: synth export out out-hdf5 --to hdf5")
+@app.command(epilog="Example: synth export out out-hf --to hf")
 def export(
     out: Out,
     target: Annotated[Path, typer.Argument(help="The new folder.")],
-    to: Annotated[str, typer.Option("--to", help="folder, webdataset, hdf5 or d2fnet-npz.")] = "folder",
+    to: Annotated[
+        str,
+        typer.Option(
+            "--to",
+            help="folder, hf, webdataset, lerobot, endonerf, hdf5, d2fnet-npz or video (MP4 to look at).",
+        ),
+    ] = "folder",
+    overlay: Annotated[
+        list[str] | None,
+        typer.Option(help="Over a video: flow, recovered, force, or none; repeat for more. Flow and force."),
+    ] = None,
+    interval: Annotated[
+        str | None, typer.Option(help="Of a video: from one time to another, FIRST:LAST in seconds.")
+    ] = None,
 ) -> None:
-    """Writes the dataset in a format of others."""
-    from synth.publish.export import export_dataset
+    """Writes the dataset in a format of others, or as films to look at."""
+    from functools import partial
 
-    print(f"{export_dataset(out, target, to)} sequences in {target}")
+    from synth.errors import UserError
+    from synth.publish.export import formats, overlay_video
+
+    if to == "video":
+        drawn = [name for name in overlay or ("flow", "force") if name != "none"]
+        write = partial(overlay_video.write_films, overlays=drawn, interval_s=_interval(interval))
+        print(f"{formats.write_export(out, target, write)} films in {target}")
+    elif overlay or interval:
+        raise UserError("--overlay and --interval are of a video: say --to video")
+    else:
+        print(f"{formats.export_dataset(out, target, to)} sequences in {target}")
+
+
+def _interval(text: str | None) -> tuple[float, float] | None:
+    """FIRST:LAST in seconds; either may be left out."""
+    from synth.errors import UserError
+
+    if text is None:
+        return None
+    first, colon, last = text.partition(":")
+    try:
+        told = (float(first or "-inf"), float(last or "inf"))
+    except ValueError:
+        told = (1.0, 0.0)
+    if not colon or not told[0] <= told[1]:
+        raise UserError(f"--interval {text}: is not FIRST:LAST in seconds")
+    return told
 
 
 @app.command(epilog="Example: synth card out")
