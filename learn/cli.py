@@ -16,7 +16,6 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from synth.errors import UserError
-from synth.system import whole_file
 from synth.system.cli_errors import Commands
 
 if TYPE_CHECKING:
@@ -275,7 +274,9 @@ def eval_command(
 def predict_command(
     model: Annotated[Path, typer.Argument(help="Model folder.")],
     source: Annotated[Path, typer.Argument(help="Dataset, NNNNNN.zarr store, video, or .npz of flow.")],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for NAME.npz files.")] = Path("forces"),
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for NAME.npz and .force.csv.")] = Path(
+        "forces"
+    ),
     input: Annotated[str | None, typer.Option(help=_STORED)] = None,
     young: Annotated[float | None, typer.Option(help="Young's modulus [kPa], instead of the data's.")] = None,
     scale: Annotated[float | None, typer.Option(help="A video's scale [mm a pixel].")] = None,
@@ -304,15 +305,15 @@ def predict_command(
             help="Of a video: auto, none, glare, tool, both, or a folder of NNNNNN.png or mask.png: the tool."
         ),
     ] = "auto",
+    overlay: Annotated[bool, typer.Option(help="Also NAME.force.mp4, the force over the film.")] = True,
     threads: Threads = None,
     json: Json = False,
 ) -> None:
     """Write the force maps and force curves that a model sees in stores, videos or arrays of flow."""
-    import numpy as np
-
     from learn.inference.apply import Filmed, apply, motions
     from learn.inference.mask_files import read_choice
     from learn.inference.predict import load_predictor
+    from learn.inference.prediction_file import write_overlay, write_prediction
     from learn.inference.video_flow import Settings
     from learn.training.threads import set_threads
 
@@ -326,9 +327,12 @@ def predict_command(
         if written.exists() and written.samefile(source):
             raise UserError(f"{written}: is what is read, and would be overwritten; say another --out")
         found = apply(predictor, motion, young)
-        out.mkdir(parents=True, exist_ok=True)
-        with whole_file.part_of(written) as part, part.open("wb") as file:
-            np.savez_compressed(file, **found)
+        write_prediction(found, out / motion.name)
+        if overlay:
+            pictures = (
+                source if source.is_file() or source.suffix == ".zarr" else source / f"{motion.name}.zarr"
+            )
+            write_overlay(found, pictures, out / motion.name)
         size = found["total_force_mn"][found["trusted"]]
         peaks[motion.name] = float(size.max()) if len(size) else None
         if not json:

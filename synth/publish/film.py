@@ -11,7 +11,7 @@ from synth.publish.picture import Rgb, heat, overlay
 _CURVE_PX = 64
 _LEFT_PX = 4
 _TURNS = 5
-_INK, _LINE, _SHADE = (40, 40, 40), (200, 60, 20), (235, 200, 180)
+_INK, _LINE = (40, 40, 40), (200, 60, 20)
 
 
 def carried(values: NDArray[np.floating], flow: NDArray[np.floating]) -> NDArray[np.float32]:
@@ -39,41 +39,16 @@ def glow(picture: Rgb, values: NDArray[np.floating], largest: float) -> Rgb:
     return overlay(picture, heat(values, largest), np.where(share > 0.02, 0.2 + 0.6 * share, 0.0))
 
 
-def draw_curve(
-    time_s: NDArray[np.floating],
-    values: NDArray[np.floating],
-    width_px: int,
-    unit: str,
-    band: tuple[NDArray[np.floating], NDArray[np.floating]] | None = None,
-) -> Rgb:
-    """A strip (h, width_px, 3) with values over time, gaps where they are NaN, and a band of uncertainty.
-
-    Args:
-        time_s: (T,).
-        values: (T,).
-        width_px: of the strip.
-        unit: of the values.
-        band: its lower and upper edge, (T,) each.
-    """
+def draw_curve(time_s: NDArray[np.floating], values: NDArray[np.floating], width_px: int, unit: str) -> Rgb:
+    """A strip (h, width_px, 3) with values over time, gaps where they are NaN. Both (T,)."""
     strip = np.full((_CURVE_PX, width_px, 3), 255, np.uint8)
-    edges = [values] if band is None else [values, *band]
-    finite = np.concatenate([one[np.isfinite(one)] for one in edges])
-    top = max(float(finite.max()), 1e-9) if finite.size else 1.0
-    x = _columns(len(values), width_px)
-
-    def y(one: NDArray[np.floating]) -> NDArray[np.int64]:
-        level = np.clip(np.nan_to_num(one) / top, 0, 1)
-        return np.round((_CURVE_PX - 6) - level * (_CURVE_PX - 24)).astype(int)
-
-    sure = np.isfinite(np.stack(edges)).all(0)
+    sure = np.isfinite(values)
+    top = max(float(values[sure].max()), 1e-9) if sure.any() else 1.0
+    level = np.clip(np.nan_to_num(values) / top, 0, 1)
+    y = np.round((_CURVE_PX - 6) - level * (_CURVE_PX - 24)).astype(int)
+    places = [(int(column), int(row)) for column, row in zip(_columns(len(values), width_px), y, strict=True)]
     for k in np.flatnonzero(sure[1:] & sure[:-1]):
-        ends = slice(k, k + 2)
-        if band is not None:
-            low, high = (np.stack([x[ends], y(edge)[ends]], axis=1) for edge in band)
-            cv2.fillConvexPoly(strip, np.concatenate([low, high[::-1]]).astype(np.int32), _SHADE)
-    for k in np.flatnonzero(sure[1:] & sure[:-1]):
-        first, second = (tuple(int(v) for v in (x[j], y(values)[j])) for j in (k, k + 1))
-        cv2.line(strip, first, second, _LINE, 1, cv2.LINE_AA)
+        cv2.line(strip, places[k], places[k + 1], _LINE, 1, cv2.LINE_AA)
     text = f"0 to {top:.3g} {unit}, {time_s[0]:.2f} to {time_s[-1]:.2f} s"
     cv2.putText(strip, text, (_LEFT_PX, 12), cv2.FONT_HERSHEY_SIMPLEX, 0.4, _INK, 1, cv2.LINE_AA)
     return strip

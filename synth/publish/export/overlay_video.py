@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from collections.abc import Sequence as Several
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -49,32 +49,29 @@ def write_films(
 
 def draw_film(
     sequence: Sequence, overlays: Several[str], interval_s: tuple[float, float] | None = None
-) -> NDArray[np.uint8]:
-    """The frames of that time, (T, h, W, 3); with `force` the curve is below the picture. Raises as above."""
+) -> Iterator[Rgb]:
+    """The frames of that time, (h, W, 3) each; with `force` its curve is below. Raises as above."""
     for name in overlays:
         if OVERLAYS[name] not in sequence:
             raise UserError(f"{sequence.path}: holds no {OVERLAYS[name]}")
     time = sequence["time"][:]
     first, last = interval_s or (-np.inf, np.inf)
-    chosen = np.flatnonzero((time >= first) & (time <= last))
-    if not len(chosen):
+    chosen = [int(t) for t in np.flatnonzero((time >= first) & (time <= last))]
+    if not chosen:
         raise UserError(f"{sequence.path}: has no frame between {first:g} and {last:g} s")
-    tissue, force = sequence["tissue"][:], np.linalg.norm(sequence["force"][:], axis=1)
+    return _drawn(sequence, overlays, chosen)
+
+
+def _drawn(sequence: Sequence, overlays: Several[str], chosen: list[int]) -> Iterator[Rgb]:
+    tissue, size = sequence["tissue"][:], np.linalg.norm(sequence["force"][:], axis=1)
     largest = {
-        name: max(float(np.linalg.norm(sequence[OVERLAYS[name]][int(t)], axis=-1).max()) for t in chosen)
+        name: max(float(np.linalg.norm(sequence[OVERLAYS[name]][t], axis=-1).max()) for t in chosen)
         for name in overlays
     }
-    curve = None
-    if "force" in overlays:
-        curve = film.draw_curve(time[chosen], force[chosen], sequence.size[1], "mN")
-    draw = partial(_frame, sequence, tissue=tissue, largest=largest)
-    pictures = (draw(int(t)) for t in chosen)
-    return np.stack(
-        [
-            picture if curve is None else np.vstack([picture, film.mark(curve, k, len(chosen))])
-            for k, picture in enumerate(pictures)
-        ]
-    )
+    curve = film.draw_curve(sequence["time"][:][chosen], size[chosen], sequence.size[1], "mN")
+    for k, t in enumerate(chosen):
+        picture = _frame(sequence, t, tissue, largest)
+        yield np.vstack([picture, film.mark(curve, k, len(chosen))]) if "force" in overlays else picture
 
 
 def _frame(sequence: Sequence, t: int, tissue: NDArray[np.bool_], largest: dict[str, float]) -> Rgb:

@@ -151,6 +151,10 @@ def _keys(path: str) -> set[str]:
         return {name.split(".")[0] for name in archive.getnames()}
 
 
+def drawn(*words: Any) -> np.ndarray:
+    return np.stack(list(overlay_video.draw_film(*words)))
+
+
 def film(path: Path) -> list[tuple[float, np.ndarray]]:
     """Time [s] and picture of each frame of a video."""
     with av.open(str(path)) as container:
@@ -357,16 +361,16 @@ def test_endonerfs_second_eye_is_rectified(tmp_path: Path) -> None:
 
 def test_films_show_what_is_asked(root: Path, tmp_path: Path) -> None:
     sequence = Dataset(root)[0]
-    bare = overlay_video.draw_film(sequence, [])
+    bare = drawn(sequence, [])
     assert np.array_equal(bare[1][20:], sequence["rgb"][1][20:])
-    forced, moved = (overlay_video.draw_film(sequence, [name]) for name in ("force", "flow"))
+    forced, moved = (drawn(sequence, [name]) for name in ("force", "flow"))
     assert forced.shape[1] > bare.shape[1] == moved.shape[1]
     changed = np.abs(forced[2, : sequence.size[0]].astype(int) - bare[2]).sum(-1) > 30
     size = np.linalg.norm(sequence["traction"][2], axis=-1)
     at = np.unravel_index(size.argmax(), size.shape)
     peak = np.array(at) + sequence["flow"][2][at][::-1]
     assert changed[tuple(np.round(peak).astype(int))], "the glow is where the loaded tissue has moved to"
-    assert len(overlay_video.draw_film(sequence, ["flow"], (0.5 / sequence.attrs["fps"], np.inf))) == 2
+    assert len(drawn(sequence, ["flow"], (0.5 / sequence.attrs["fps"], np.inf))) == 2
     with pytest.raises(UserError, match="holds no flow_recovered"):
         overlay_video.draw_film(sequence, ["recovered"])
     with pytest.raises(UserError, match="has no frame between"):
