@@ -297,32 +297,10 @@ def verify(
     json: Json = False,
 ) -> None:
     """Checks a dataset against its own invariants. Exit code 1 when one fails."""
-    from rich.console import Console
-    from rich.table import Table
-
     from synth.checks.verify import verify_dataset
 
     report = verify_dataset(out, fast=fast)
-    if json:
-        print(json_.dumps(report.as_dict()))
-    else:
-        table = Table("check", "measures", "bad", "worst", "limit", "where", "CPU s", title=f"{out}")
-        for check in report.checks:
-            mark = "[red]" if check.bad else ""
-            table.add_row(
-                f"{mark}{check.name}",
-                str(check.count),
-                f"{mark}{check.bad}",
-                f"{check.worst:.3g}",
-                f"{check.limit:.3g}",
-                check.offender,
-                f"{check.cpu_s:.2f}",
-            )
-        Console().print(table)
-        for check in report.checks:
-            for failure in check.failures[:20]:
-                print(f"{check.name}: {failure}")
-        print("good" if report.good else "not good")
+    print(json_.dumps(report.as_dict()) if json else "\n".join(report.lines()))
     if not report.good:
         raise typer.Exit(1)
 
