@@ -31,7 +31,6 @@ app = typer.Typer(
     cls=Commands,
     help="Learn force from displacement.",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,  # "[kPa]" is a unit, not markup
 )

@@ -18,7 +18,6 @@ app = typer.Typer(
     cls=Commands,
     help="Surgical-microscope sequences of a brain surface under load, with exact force and motion.",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,  # "[kPa]" is a unit, not markup
 )
