@@ -80,13 +80,15 @@ def preview(
     if not cv2.imwrite(str(out), made.picture[..., ::-1]):
         raise UserError(f"{out}: cannot be written as PNG")
     if json:
-        found = {"sheet": str(out), "render_cpu_s": made.render_cpu_s, "disk_bytes": made.disk_bytes}
-        print(json_.dumps(found))
+        cpu_s = sum(made.stages_cpu_s.values())
+        about = {"cpu_s": cpu_s, "stages_cpu_s": made.stages_cpu_s, "disk_bytes": made.disk_bytes}
+        print(json_.dumps({"sheet": str(out), "render_cpu_s": made.stages_cpu_s["render"], **about}))
         return
     print(f"wrote {out}")
+    stages = ", ".join(f"{name} {spent / 60:.1f}" for name, spent in made.stages_cpu_s.items())
     print(
-        f"the whole job: {read.sequences} sequences of {read.frames} frames, "
-        f"{made.render_cpu_s / 60:.1f} CPU-minutes of rendering (physics and flow come on top), "
+        f"the whole job: {read.sequences} sequences of {read.frames} frames, about "
+        f"{sum(made.stages_cpu_s.values()) / 60:.1f} CPU-minutes ({stages}), "
         f"{amount(made.disk_bytes)} of disk"
     )
 

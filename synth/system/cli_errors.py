@@ -45,7 +45,8 @@ class Commands(TyperGroup):
             if package not in _EXTRAS:
                 raise
             extra = _EXTRAS[package]
-            typer.echo(f"error: this needs the package {package}: pip install 'sulcus[{extra}]'", err=True)
+            how = f"pip install '.[{extra}]' in the clone"
+            typer.echo(f"error: this needs the package {package}, of the extra {extra}: {how}", err=True)
             raise typer.Exit(2) from None
         except KeyboardInterrupt:
             typer.echo("stopped", err=True)
