@@ -122,14 +122,15 @@ def _drawn(found: dict[str, Any], times: NDArray[np.floating], pictures: Iterato
     for t, picture in enumerate(pictures):
         shrink = max(1, -(-picture.shape[1] // _WIDEST_PX))
         small = cv2.resize(picture, None, fx=1 / shrink, fy=1 / shrink, interpolation=cv2.INTER_AREA)
+        small = film.legible(np.asarray(small, np.uint8))
         values = on_picture(size[t], found, t, picture.shape[:2])
-        values = cv2.resize(values, (small.shape[1], small.shape[0]), interpolation=cv2.INTER_AREA)
+        values = cv2.resize(values, (small.shape[1], small.shape[0]), interpolation=cv2.INTER_LINEAR)
         if curve is None:
             curve = film.draw_curve(times, force, small.shape[1], "mN")
         known = "" if found["young_known"] else f", if E is {found['young_kpa']:.3g} kPa"
         said = f"{force[t]:.1f} mN{known}" if found["trusted"][t] else "could not be followed"
-        shown = film.glow(np.asarray(small, np.uint8), values, largest) if found["trusted"][t] else small
-        shown = film.caption(np.asarray(shown, np.uint8), f"{times[t]:.2f} s  {said}")
+        shown = film.glow(small, values, largest) if found["trusted"][t] else small
+        shown = film.caption(shown, f"{times[t]:.2f} s  {said}")
         yield np.vstack([shown, film.mark(curve, t, len(force))])
 
 

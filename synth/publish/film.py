@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from synth.publish.picture import Rgb, heat, overlay
 
 _CURVE_PX = 64
+_WIDE_PX = 480
 _LEFT_PX = 4
 _TURNS = 5
 _INK, _LINE = (40, 40, 40), (200, 60, 20)
@@ -59,6 +60,12 @@ def mark(curve: Rgb, k: int, count: int) -> Rgb:
     marked = curve.copy()
     marked[16:, _columns(count, curve.shape[1])[k]] = _INK
     return marked
+
+
+def legible(picture: Rgb) -> Rgb:
+    """The picture, each pixel repeated so that a line of text has room on it."""
+    times = -(-_WIDE_PX // picture.shape[1])
+    return picture.repeat(times, axis=0).repeat(times, axis=1)
 
 
 def caption(picture: Rgb, text: str) -> Rgb:

@@ -32,7 +32,7 @@ def write_films(
     Args:
         dataset: the sequences.
         target: the folder.
-        overlays: of `OVERLAYS`; none: the bare film.
+        overlays: of `OVERLAYS`; none: the film as it is.
         interval_s: first and last time [s]; all if not given.
 
     Raises:
@@ -68,10 +68,15 @@ def _drawn(sequence: Sequence, overlays: Several[str], chosen: list[int]) -> Ite
         name: max(float(np.linalg.norm(sequence[OVERLAYS[name]][t], axis=-1).max()) for t in chosen)
         for name in overlays
     }
-    curve = film.draw_curve(sequence["time"][:][chosen], size[chosen], sequence.size[1], "mN")
     for k, t in enumerate(chosen):
+        if not overlays:
+            yield sequence["rgb"][t]
+            continue
         picture = _frame(sequence, t, tissue, largest)
-        yield np.vstack([picture, film.mark(curve, k, len(chosen))]) if "force" in overlays else picture
+        if "force" in overlays:
+            curve = film.draw_curve(sequence["time"][:][chosen], size[chosen], picture.shape[1], "mN")
+            picture = np.vstack([picture, film.mark(curve, k, len(chosen))])
+        yield picture
 
 
 def _frame(sequence: Sequence, t: int, tissue: NDArray[np.bool_], largest: dict[str, float]) -> Rgb:
@@ -86,4 +91,4 @@ def _frame(sequence: Sequence, t: int, tissue: NDArray[np.bool_], largest: dict[
         step_px = max(sequence.size[1] // 24, 8)
         picture = arrows(picture, sequence[OVERLAYS[name]][t], tissue, step_px, gain)
         said.append(f"{OVERLAYS[name]} x{gain}")
-    return film.caption(picture, "  ".join(said))
+    return film.caption(film.legible(picture), "  ".join(said))
