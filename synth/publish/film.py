@@ -56,20 +56,20 @@ def draw_curve(time_s: NDArray[np.floating], values: NDArray[np.floating], width
 
 
 def mark(curve: Rgb, k: int, count: int) -> Rgb:
-    """The strip with a line at the k-th of `count` values."""
+    """The strip (h, w, 3) with a line at the k-th of `count` values."""
     marked = curve.copy()
     marked[16:, _columns(count, curve.shape[1])[k]] = _INK
     return marked
 
 
 def legible(picture: Rgb) -> Rgb:
-    """The picture, each pixel repeated so that a line of text has room on it."""
+    """The picture (H, W, 3), each pixel repeated so that a line of text has room on it."""
     times = -(-_WIDE_PX // picture.shape[1])
     return picture.repeat(times, axis=0).repeat(times, axis=1)
 
 
 def caption(picture: Rgb, text: str) -> Rgb:
-    """The picture with a line of text at its top, readable on any ground."""
+    """The picture (H, W, 3) with a line of text at its top, readable on any ground."""
     canvas = np.ascontiguousarray(picture)
     for colour, thick in (((0, 0, 0), 3), ((255, 255, 255), 1)):
         cv2.putText(canvas, text, (_LEFT_PX, 14), cv2.FONT_HERSHEY_SIMPLEX, 0.4, colour, thick, cv2.LINE_AA)

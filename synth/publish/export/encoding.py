@@ -23,7 +23,7 @@ def as_png(picture: NDArray[Any]) -> bytes:
 
 
 def as_npy(values: NDArray[Any]) -> bytes:
-    """A .npy file."""
+    """A .npy file of an array (...) of any shape."""
     file = io.BytesIO()
     np.save(file, values)
     return file.getvalue()

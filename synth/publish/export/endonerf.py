@@ -39,8 +39,16 @@ class _Maps(NamedTuple):
         return np.asarray(cv2.remap(picture, self.x, self.y, cv2.INTER_CUBIC))
 
     def nearest(self, picture: NDArray[Any], outside: float = 0) -> NDArray[Any]:
-        border = {"borderMode": cv2.BORDER_CONSTANT, "borderValue": outside}
-        return np.asarray(cv2.remap(picture, self.x, self.y, cv2.INTER_NEAREST, **border))
+        return np.asarray(
+            cv2.remap(
+                picture,
+                self.x,
+                self.y,
+                cv2.INTER_NEAREST,
+                borderMode=cv2.BORDER_CONSTANT,
+                borderValue=outside,
+            )
+        )
 
 
 def write_scenes(dataset: Dataset, target: Path) -> None:

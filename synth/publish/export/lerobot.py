@@ -116,7 +116,7 @@ def _write_rows(episode: _Episode, columns: dict[str, Numbers], target: Path) ->
 
 def _describe(episode: _Episode, columns: dict[str, Numbers], frames: int) -> dict[str, Any]:
     """The row of an episode in `meta/episodes`."""
-    place = {f"data/{name}": value for name, value in episode.place.items()}
+    place: dict[str, Any] = {f"data/{name}": value for name, value in episode.place.items()}
     for name in _cameras(episode.sequence):
         video = f"videos/{_key(name)}"
         place |= {f"{video}/{what}": value for what, value in episode.place.items()}
