@@ -27,7 +27,7 @@ def test_reading_a_dataset(out: Path) -> None:
     assert found["young_kpa"] == pytest.approx(0.81474, abs=1e-4)
     assert found["peak_force_mn"] == pytest.approx(4.2385, abs=1e-3)
     assert found["labelled_force_mn"] == pytest.approx(found["peak_force_mn"], rel=0.02)
-    assert found["largest_motion_px"] == pytest.approx(4.308, abs=0.01)
+    assert found["largest_motion_px"] == pytest.approx(4.569, abs=0.01)
     assert found["median_flow_error_px"] < 0.2
 
 
@@ -35,7 +35,7 @@ def test_rendering_a_frame() -> None:
     shot = render_frame.frame()
     assert np.linalg.norm(shot.flow, axis=2).max() == pytest.approx(4.82, abs=0.01)
     assert shot.rgb.shape == (240, 320, 3)
-    assert shot.rgb[100:140, 140:180].mean() == pytest.approx(130.1, abs=3)
+    assert shot.rgb[100:140, 140:180].mean() == pytest.approx(151.6, abs=3)
 
 
 def test_a_law_of_ones_own_stiffens() -> None:
@@ -55,7 +55,7 @@ def test_the_laws_stress_is_the_slope_of_its_energy() -> None:
 
 
 def test_a_flow_back_end_of_ones_own(out: Path) -> None:
-    assert own_flow.error_px(Dataset(out)[0]) == pytest.approx(0.378, rel=0.1)
+    assert own_flow.error_px(Dataset(out)[0]) == pytest.approx(0.2575, rel=0.1)
 
 
 def test_a_method_of_ones_own(out: Path, tmp_path: Path) -> None:
@@ -63,5 +63,5 @@ def test_a_method_of_ones_own(out: Path, tmp_path: Path) -> None:
 
     found = own_method.score_springs(export_recording(Dataset(out)[0], tmp_path / "recording")).methods
     assert found["spring"].scores["r"] == pytest.approx(0.99, abs=0.01)
-    assert found["spring"].scores["mae_mn"] == pytest.approx(0.98, rel=0.1)
+    assert found["spring"].scores["mae_mn"] == pytest.approx(0.847, rel=0.1)
     assert found["stiffer"].scores["r"] == pytest.approx(found["spring"].scores["r"], abs=1e-6)
