@@ -31,7 +31,7 @@ def measure_cost(job: Job) -> dict[str, float]:
 
 def _cost(job: Job, index: int, folder: Path) -> dict[str, float]:
     """Of one sequence."""
-    if job.frames <= _LONG:
+    if job.frames <= _SHORT + _LONG:
         return _stages(job, index, job.frames, folder)
     short, long = (_stages(job, index, frames, folder) for frames in (_SHORT, _LONG))
     more = (job.frames - _LONG) / (_LONG - _SHORT)
