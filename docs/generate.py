@@ -206,6 +206,28 @@ def _room(module: str, folders: dict[str, Path]) -> str:
     return max((name for name in folders if f"{module}.".startswith(f"{name}.")), key=len, default="")
 
 
+_TITLES = {
+    "all": "All on one page",
+    "end-to-end": "Whole pipelines",
+    "engine": "Engine and clusters",
+    "exvivo": "Ex vivo stand-ins",
+    "fem": "Physics",
+    "flow": "Optical flow and stereo",
+    "gap": "Sim-to-real gap",
+    "inverse": "Force by physics alone",
+    "learn": "Networks",
+    "pipeline": "Time of each stage",
+    "pulse": "Heart beat and breath",
+    "scoring": "Cost of scoring",
+    "tune": "Choice of fidelity",
+}
+
+
+def _title(room: str) -> str:
+    """A room of docs/results as the site calls it."""
+    return _TITLES.get(room, room.replace("-", " ").capitalize())
+
+
 def _site() -> str:
     """mkdocs.yml with the rooms of docs/results as they are found."""
     head = (ROOT / "mkdocs.yml").read_text("utf-8").partition(_LISTED)[0]
@@ -214,7 +236,7 @@ def _site() -> str:
         f"{_LISTED}: the rooms of docs/results as they are found.",
         "  - Results:",
         "      - results/README.md",
-        *(f"      - {page.parent.name}: {page.relative_to(DOCS).as_posix()}" for page in pages),
+        *(f"      - {_title(page.parent.name)}: {page.relative_to(DOCS).as_posix()}" for page in pages),
         "",
         "exclude_docs: |",
         "  *.py",

@@ -15,7 +15,7 @@ import pyarrow.parquet as pq
 
 from synth.dataset import location, split
 from synth.dataset.folder import Folder, write_whole
-from synth.dataset.store import Sequence, open_sequence
+from synth.dataset.store import Dataset, Sequence, open_sequence
 from synth.errors import UserError
 from synth.system import foreign_file
 
@@ -154,6 +154,18 @@ def written_sides(root: Path) -> dict[str, str] | None:
     rows = [row_of(_open(folder, key)) for key in folder.sealed()]
     sides = split.assign_sides(rows, split.read_rule(root))
     return {row["content_hash"]: side for row, side in zip(rows, sides, strict=True) if side is not None}
+
+
+def group_by_side(dataset: Dataset) -> dict[str, list[int]]:
+    """Positions of a dataset's sequences by side, in the order train, validation, test; sides without any
+    are left out. All are "train" where nobody decided. UserError as `written_sides`.
+    """
+    sides = written_sides(dataset.root)
+    if sides is None:
+        return {"train": list(range(len(dataset)))}
+    told = [sides.get(sequence.attrs["content_hash"]) for sequence in dataset]
+    groups = {side: [k for k, one in enumerate(told) if one == side] for side in split.SIDES}
+    return {side: chosen for side, chosen in groups.items() if chosen}
 
 
 def write_index(folder: Folder) -> list[dict[str, Any]]:

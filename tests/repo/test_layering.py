@@ -30,6 +30,7 @@ ORDER = (
     "synth.sequence",
     "synth.checks",
     "synth.publish",
+    "synth.publish.export",
     "synth.engine",
     "synth.tune",
     "synth.fit",
