@@ -32,10 +32,17 @@ def test_reading_a_dataset(out: Path) -> None:
 
 
 def test_rendering_a_frame() -> None:
-    shot = render_frame.frame()
-    assert np.linalg.norm(shot.flow, axis=2).max() == pytest.approx(4.82, abs=0.01)
-    assert shot.rgb.shape == (240, 320, 3)
-    assert shot.rgb[100:140, 140:180].mean() == pytest.approx(130.1, abs=3)
+    scene = render_frame.push()
+    frame = scene.frame(scene.strongest)
+    found = render_frame.describe(scene, frame)
+    assert found["force_mn"] == pytest.approx(FORCE, rel=1e-3)
+    assert found["labelled_force_mn"] == pytest.approx(found["force_mn"], rel=0.03)
+    assert found["largest_motion_mm"] == pytest.approx(MOTION, rel=1e-2)
+    assert found["largest_flow_px"] == pytest.approx(FLOW, rel=1e-2)
+    assert frame.rgb.shape == (240, 320, 3)
+    twice = render_frame.push(0.15)
+    assert np.linalg.norm(twice.force, axis=1).max() == pytest.approx(found["force_mn"] / 2, rel=1e-6)
+    assert twice.motion.displacement[twice.strongest].min() > scene.motion.displacement[scene.strongest].min()
 
 
 def test_a_law_of_ones_own_stiffens() -> None:
