@@ -17,7 +17,7 @@ import bench
 class Spring:
     """Force as stiffness times the mean displacement of the tissue: blind to direction, and to depth."""
 
-    def __init__(self, mm: float) -> None:
+    def __init__(self, mm: float = 60.0) -> None:
         self.mm = mm
         """Mean displacement of 1 mm is what E times this much squared, in mN, would do."""
 

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from threadpoolctl import threadpool_limits
 
+from bench.methods import plugins
 from bench.methods.network import Model
 from bench.methods.protocol import Method
 from bench.output.progress_bar import counting
@@ -176,7 +177,9 @@ def _score(
         methods |= fit_baselines(train, model, bool(opened.right or opened.depths))
         found = pixel_scale.find_scale(opened.meta, opened.folder)
         with counting(f"scoring {opened.name}", total) as progress:
-            about = {"model": network.described()}
+            about: dict[str, object] = {"model": network.described()}
+            if sources := plugins.sources():
+                about["plug_ins"] = sources
             return evaluate_recording.evaluate_recording(
                 opened, methods, MAIN, found, settings, about, progress, flow
             )
@@ -187,7 +190,9 @@ def _worth_a_process(frames: int | None) -> bool:
 
 
 def fit_baselines(train: Path | None, model: Path | None, two_eyes: bool = False) -> dict[str, Method]:
-    """Those that need no data, and, given the training data, those fitted on the model's own fit sequences.
+    """Those that need no data, those of installed packages, and, given the training data, the fitted ones.
+
+    These are fitted on the model's own fit sequences.
 
     They are fitted once for a model, and kept for its next recording; for one with a second eye on motion in
     three dimensions, if the data have it.
@@ -199,6 +204,10 @@ def fit_baselines(train: Path | None, model: Path | None, two_eyes: bool = False
     from bench.methods import kept_rules
 
     methods = baseline.physical()
+    others = plugins.installed()
+    if taken := {MAIN, *methods, *baseline.FITTED} & set(others):
+        raise UserError(f"method {min(taken)}: a plug-in's name is taken by one of ours; rename it")
+    methods |= others
     if train is None or model is None:
         return methods
     from learn.checkpoint import read_card

@@ -37,7 +37,7 @@ SCHEMA = pa.schema(
             },
         ),
         pa.field("family", pa.string(), metadata={"meaning": "appearance family"}),
-        pa.field("gesture", pa.string(), metadata={"meaning": "kind of gesture"}),
+        pa.field("gesture", pa.string(), metadata={"meaning": "kind of gesture, of every instrument"}),
         pa.field("young_kpa", pa.float64(), metadata={"meaning": "Young's modulus", "unit": "kPa"}),
         pa.field("poisson", pa.float64(), metadata={"meaning": "Poisson's ratio"}),
         pa.field("load", pa.float64(), metadata={"meaning": "peak load F/(E a^2)"}),
@@ -181,7 +181,8 @@ def row_of(sequence: Sequence) -> dict[str, Any]:
     """The row of a finished sequence, from its attributes."""
     attrs = sequence.attrs
     scenario, summary = attrs.get("scenario", {}), attrs.get("summary", {})
-    gesture = scenario.get("gesture", {})
+    gesture = scenario.get("gesture") or {}
+    kinds = [one.get("kind") for one in (gesture, *(scenario.get("further") or ()))]
     scale, flow = attrs.get("scale_mm_per_px"), summary.get("peak_flow_px")
     stages = [stage for stage in attrs.get("timings", {}).values() if isinstance(stage, dict)]
     return {
@@ -191,7 +192,7 @@ def row_of(sequence: Sequence) -> dict[str, Any]:
         "content_hash": attrs["content_hash"],
         "anatomy": split.name_anatomy(attrs),
         "family": scenario.get("family"),
-        "gesture": gesture.get("kind"),
+        "gesture": " + ".join(kind for kind in kinds if kind) or None,
         "young_kpa": attrs.get("young_kpa"),
         "poisson": attrs.get("poisson"),
         "load": gesture.get("load"),

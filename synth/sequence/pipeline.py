@@ -16,7 +16,7 @@ from synth.flow import mask, track
 from synth.flow.stereo import rig
 from synth.flow.stereo import track as stereo
 from synth.flow.track import Track
-from synth.job import identity
+from synth.job import identity, law_plugins
 from synth.job.schema import Job
 from synth.render.camera import video
 from synth.sequence import scenario
@@ -221,6 +221,7 @@ def _seal(shooting: _Shooting) -> Path:
     return shooting.writer.seal(
         scenario=case.as_dict(),
         anatomy_id=identity.identify_anatomy(shooting.job, case.relief.seed),
+        **_opening(shooting.job, case),
         K=view.K.tolist(),
         distortion=view.distortion.tolist(),
         rotation=view.rotation.tolist(),
@@ -233,6 +234,12 @@ def _seal(shooting: _Shooting) -> Path:
         timings=shooting.watch.report(),
         **_second_lens(shooting),
     )
+
+
+def _opening(job: Job, case: Scenario) -> dict[str, Any]:
+    """The attribute `opening_id` of a sequence on a user's brain."""
+    named = identity.identify_opening(job, case.anatomy)
+    return {} if named is None else {"opening_id": named}
 
 
 def _second_lens(shooting: _Shooting) -> dict[str, Any]:
@@ -256,6 +263,8 @@ def _mechanics(
 ) -> dict[str, Any]:
     timeless = job.fem.time == "quasi-static" and not job.fem.relaxation
     special: dict[str, Any] = {} if job.fem.contact == "traction" else {"contact": job.fem.contact}
+    if law_from := law_plugins.source(case.tissue.law):
+        special["law_from"] = law_from
     if case.pulse is not None:
         special |= {"pulse_mm": case.pulse.height(motion.time).tolist()}
     if case.pulse is not None and timeless:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
+from itertools import islice
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +23,7 @@ from synth.geometry import brain_surface
 from synth.geometry.brain_surface import Brain
 from synth.job.schema import Anatomy, Flow, Job
 from synth.render.anatomy import surface as anatomy
+from synth.render.anatomy import survey
 from synth.render.anatomy.surface import Relief, Surface
 from synth.render.camera import camera, video
 from synth.render.camera.camera import Camera
@@ -32,6 +34,8 @@ from synth.sequence.timeline import Timeline
 from synth.system.stopwatch import Report, Stopwatch
 
 Floats = NDArray[np.float64]
+
+_TRIES = 5  # of openings nearest to one that can't be
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -215,7 +219,9 @@ def cortex(job: Job, case: Scenario) -> tuple[Surface, Brain | None]:
     Sequences that share an anatomy (`anatomy.variety`) share these: their arrays are read-only.
     """
     written = job.anatomy.mesh.stat() if job.anatomy.mesh and job.anatomy.mesh.is_file() else None
-    return _cortex(job.anatomy, case.relief, written and (written.st_mtime_ns, written.st_size))
+    return _cortex(
+        job.anatomy.opened(case.anatomy), case.relief, written and (written.st_mtime_ns, written.st_size)
+    )
 
 
 @lru_cache(maxsize=4)
@@ -225,13 +231,40 @@ def _cortex(section: Anatomy, relief: Relief, written: object) -> tuple[Surface,
     if section.mesh is None:
         surface = anatomy.procedural(relief, section)
     else:
-        whole = brain_surface.load_brain(section.mesh, section.craniotomy)
-        surface = anatomy.from_brain(whole.vertices, whole.faces, relief, section)
+        try:
+            surface, whole = _opened(section, relief)
+        except UserError as error:
+            if not str(error).startswith("anatomy.craniotomy"):
+                raise
+            raise UserError(f"{error}{_nearest_opening(section, relief)}") from None
     for shared in (surface, whole):
         for value in vars(shared).values() if shared else ():
             if isinstance(value, np.ndarray):
                 value.flags.writeable = False
     return surface, whole
+
+
+def _opened(section: Anatomy, relief: Relief) -> tuple[Surface, Brain]:
+    assert section.mesh is not None
+    whole = brain_surface.load_brain(section.mesh, section.craniotomy)
+    return anatomy.from_brain(whole.vertices, whole.faces, relief, section), whole
+
+
+def _nearest_opening(section: Anatomy, relief: Relief) -> str:
+    """Where the nearest opening that works is, in words that end a message."""
+    assert section.mesh is not None
+    asked = np.asarray(section.craniotomy.point)
+    ground = survey.Ground(*brain_surface.read_brain(section.mesh))
+    for site in islice(survey.by_distance(ground, asked, section.craniotomy.radius_mm), _TRIES):
+        point, direction = np.round(site.point, 2).tolist(), np.round(site.direction, 3).tolist()
+        there = section.craniotomy.model_copy(update={"point": tuple(point), "direction": tuple(direction)})
+        try:
+            _opened(section.model_copy(update={"craniotomy": there}), relief)
+        except UserError:
+            continue
+        away = np.linalg.norm(site.point - asked)
+        return f"; {away:.3g} mm away it works: point: {point}, direction: {direction} (see `synth place`)"
+    return f"; nowhere on {section.mesh.name} an opening of that radius works (see `synth place`)"
 
 
 def move(job: Job, case: Scenario, surface: Surface, tets: Tets) -> Deformation:

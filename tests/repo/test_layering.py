@@ -32,6 +32,7 @@ ORDER = (
     "synth.publish",
     "synth.engine",
     "synth.tune",
+    "synth.place",
     "synth.cli",
     "synth.__main__",
     "learn",
