@@ -214,7 +214,7 @@ class Demand:
 class Fem(Section):
     """The physics of the tissue and of the load."""
 
-    law: Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]+$"), AfterValidator(_law)] = "auto"
+    law: Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]+$", max_length=100), AfterValidator(_law)] = "auto"
     """Material law: linear, corotational, stable, neo-hookean or an installed plug-in's; auto takes the
     cheapest of ours whose error at the largest load is within `tolerance`."""
     tolerance: Annotated[FiniteFloat, Field(gt=0, le=1)] = 0.05

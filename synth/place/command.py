@@ -31,17 +31,17 @@ class Placed:
             }
             for site in self.found.chosen
         ]
-        others = len(self.found.others)
         return {
             "openings": said,
-            "others": others,
+            "others": len(self.found.others),
             "radius_mm": self.found.radius_mm,
+            "note": self.found.note,
             "out": str(self.folder),
         }
 
     def lines(self) -> list[str]:
         """For a terminal: a line an opening, then the job's lines of the best."""
-        said = []
+        said = [f"note: {self.found.note}"] if self.found.note else []
         for number, site in enumerate(self.found.chosen, 1):
             x, y, z = site.point
             u, v, w = site.direction

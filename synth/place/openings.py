@@ -8,7 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import scipy.sparse as sp
 from numpy.typing import NDArray
+from scipy.sparse.csgraph import connected_components
 
 from synth.errors import UserError
 from synth.geometry import brain_surface
@@ -20,6 +22,7 @@ from synth.sequence import scenario, scene
 Floats = NDArray[np.float64]
 
 _APART = 1.5  # of the opening's radius: chosen ones are different places
+_HOLES = 1.0  # of its extent: how long the rim of a brain's hole may be
 _TETS = 400  # of the volume that is tried: whether it meshes, not how well
 
 
@@ -39,6 +42,24 @@ class Survey:
     others: tuple[Site, ...]
     """All other places looked at, judged by their surface alone."""
 
+    @property
+    def note(self) -> str:
+        """What its user should know of the surface; empty if it is closed but for small holes."""
+        edges = np.sort(np.concatenate([self.faces[:, [k, (k + 1) % 3]] for k in range(3)]), axis=1)
+        each, times = np.unique(edges, axis=0, return_counts=True)
+        rim = each[times == 1]
+        size = np.linalg.norm(np.diff(self.vertices[rim], axis=1)[:, 0], axis=1)
+        count = len(self.vertices)
+        joined = sp.coo_array((np.ones(len(rim)), (rim[:, 0], rim[:, 1])), (count, count))
+        _, loop = connected_components(joined, directed=False)
+        border = float(np.bincount(loop[rim[:, 0]], size, 1).max())  # of the longest rim
+        if border <= _HOLES * float(np.ptp(self.vertices, axis=0).max()):
+            return ""
+        return (
+            f"{self.path.name} is open along {border:.0f} mm: a sheet of cortex, not a brain. It can be "
+            "opened and meshed, but displacement is then 20 to 35% off; close it first"
+        )
+
 
 def find_openings(path: Path, radius_mm: float, count: int) -> Survey:
     """The best `count` openings of a brain, far from one another.
@@ -54,6 +75,7 @@ def find_openings(path: Path, radius_mm: float, count: int) -> Survey:
     vertices, faces = brain_surface.read_brain(path)
     sites = survey.survey(Ground(vertices, faces), radius_mm)
     works = [site for site in sites if not site.fault]
+    works = [site for site in works if not site.cut] or works
     chosen: list[Site] = []
     why = ""
     for site in survey.apart(works, _APART * radius_mm):

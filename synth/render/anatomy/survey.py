@@ -19,6 +19,7 @@ _PIXEL_MM = 2.0
 _PER_MM2 = 1.5  # samples of the surface: every pixel of it then holds some
 _MOST_SAMPLES = 600_000
 _WHOLE = 0.97  # of the opening itself must be surface
+_FLAT = 0.01  # of the radius, median from the best plane: over a dome of 70 mm radius it is twice as much
 _STEEPEST_MM = 4.0  # rms departure from a dome; a cleft in the opening has more
 
 
@@ -36,6 +37,8 @@ class Site:
     """How far the surface departs from a smooth dome over the opening, rms; its gyri and sulci."""
     fault: str
     """Why it can't be opened there; empty if it can."""
+    cut: bool = False
+    """Most of it is flat: a wall that the surface was cut at, rather than cortex."""
 
 
 class Ground:
@@ -101,22 +104,24 @@ class Ground:
         dome = columns @ np.linalg.lstsq(columns, height[there], rcond=None)[0]
         relief = float(np.sqrt(np.mean((height[there] - dome) ** 2)))
         middle = height[there][np.hypot(x, y)[there].argmin()]
-        return Site(point + middle * turn[2], out, filled, relief, _fault(filled, whole, relief))
+        flat = _off_plane(columns[:, :3], height[there]) < _FLAT * radius_mm
+        return Site(point + middle * turn[2], out, filled, relief, _fault(filled, whole, relief), flat)
 
 
 def survey(ground: Ground, radius_mm: float, count: int = 300) -> list[Site]:
-    """Places all over a surface, the best first: those that can be opened, the evenest before others."""
+    """Places all over a surface, the best first: those that can be opened, cortex before cut walls, the
+    evenest before others."""
     found = [ground.judge(ground.points[k], ground.outward(k), radius_mm) for k in ground.spread(count)]
-    return sorted(found, key=lambda site: (bool(site.fault), site.relief_mm))
+    return sorted(found, key=lambda site: (bool(site.fault), site.cut, site.relief_mm))
 
 
 def by_distance(ground: Ground, point: Floats, radius_mm: float, count: int = 400) -> Iterator[Site]:
-    """Places that can be opened, from the one nearest to a point (3,) mm on; judged as they are asked for."""
+    """Cortex that can be opened, from the place nearest to a point (3,) mm on; judged as it is asked for."""
     places = ground.spread(count)
     away = np.linalg.norm(ground.points[places] - point, axis=1)
     for k in places[np.argsort(away)]:
         site = ground.judge(ground.points[k], ground.outward(k), radius_mm)
-        if not site.fault:
+        if not site.fault and not site.cut:
             yield site
 
 
@@ -127,6 +132,22 @@ def apart(sites: list[Site], least_mm: float) -> list[Site]:
         if all(np.linalg.norm(site.point - other.point) >= least_mm for other in kept):
             kept.append(site)
     return kept
+
+
+def _off_plane(columns: Floats, height: Floats) -> float:
+    """Median distance from the plane that fits half of the heights (n,) best, by least trimmed squares.
+
+    Started from each half of the disc, as an edge may lie to any side.
+    """
+    x, y, found = columns[:, 1], columns[:, 2], np.inf
+    for kept in (x < 0, x > 0, y < 0, y > 0):
+        for _ in range(8):
+            if kept.sum() < 6:
+                break
+            off = np.abs(height - columns @ np.linalg.lstsq(columns[kept], height[kept], rcond=None)[0])
+            found = min(found, float(np.median(off)))
+            kept = off <= np.median(off)
+    return found
 
 
 def _fault(filled: float, whole: float, relief: float) -> str:

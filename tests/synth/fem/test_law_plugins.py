@@ -59,6 +59,7 @@ def test_the_same_law_gives_the_same_equations(own: str, averaged: bool) -> None
     assert apart < 1e-6 * abs(ours.tangent(u)).max(), "by differences, so not to rounding"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("more", [{}, {"time": "dynamic"}, {"contact": "rigid"}, {"membrane": {"intact": 1}}])
 def test_the_same_law_moves_the_tissue_alike(own: str, more: dict[str, object]) -> None:
     def moved(law: str) -> Floats:

@@ -25,6 +25,8 @@ from synth.render.anatomy import survey
 from synth.render.anatomy.survey import Ground
 from synth.sequence import scenario, scene
 
+pytestmark = pytest.mark.slow
+
 RADIUS = 8.0
 
 
@@ -57,6 +59,7 @@ def test_of_a_box_the_middles_of_its_sides_are_best() -> None:
     sites = survey.survey(Ground(np.asarray(box.vertices), np.asarray(box.faces)), 12.0)
     works = [site for site in sites if not site.fault]
     assert len(works) > 6
+    assert all(site.cut for site in works), "flat as a cut"
     for site in survey.apart(works, 18.0)[:6]:
         assert np.abs(site.direction).max() > np.cos(np.radians(5))
         assert np.sort(np.abs(site.point))[1] < 20
@@ -156,6 +159,28 @@ def test_what_is_no_brain_is_one_line(tmp_path: Path) -> None:
     assert done.exit_code == 2
     assert done.output.strip() == "error: anatomy.mesh: sheet.stl encloses no volume"
     assert not (tmp_path / "out").exists()
+
+
+def test_an_open_sheet_is_told_from_a_brain_with_holes(found: openings.Survey) -> None:
+    assert not found.note, "the egg lacks a few faces"
+    half = found.faces[(found.vertices[found.faces][:, :, 2] > 0).all(axis=1)]
+    sheet = openings.Survey(found.path, found.vertices, half, RADIUS, found.chosen, ())
+    rim = np.pi * (3 * (32 + 26) - np.sqrt((3 * 32 + 26) * (32 + 3 * 26)))  # Ramanujan's ellipse
+    told = re.findall(r"egg\.stl is open along (\d+) mm", sheet.note)
+    assert float(told[0]) == pytest.approx(rim, rel=0.3)
+
+
+def test_the_wall_that_a_brain_was_cut_at_is_no_cortex(tmp_path: Path) -> None:
+    """Half an egg: its flat side is the evenest place of all, and not where a brain is opened."""
+    ball = trimesh.creation.icosphere(subdivisions=4)
+    ball.vertices = ball.vertices * (40.0, 36.0, 34.0)
+    trimesh.intersections.slice_mesh_plane(ball, [0, 0, 1], [0, 0, 0], cap=True).export(tmp_path / "half.stl")
+    half = openings.find_openings(tmp_path / "half.stl", RADIUS, 4)
+    cut = [site for site in (*half.chosen, *half.others) if site.cut and not site.fault]
+    assert cut
+    assert all(site.direction[2] < -0.99 for site in cut)
+    assert min(site.relief_mm for site in cut) < min(site.relief_mm for site in half.chosen)
+    assert not any(site.cut for site in half.chosen)
 
 
 def test_the_page_offers_the_lines_of_every_place_that_works(found: openings.Survey, tmp_path: Path) -> None:

@@ -23,6 +23,7 @@ def scene(job: synth.Job) -> synth.Scene:
     return synth.simulate(job, 1)
 
 
+@pytest.mark.slow
 def test_it_is_what_a_dataset_holds(
     scene: synth.Scene, job: synth.Job, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
