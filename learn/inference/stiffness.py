@@ -53,7 +53,7 @@ def _sizes(
 ) -> NDArray[np.float64]:
     """(T,) size of the force as `ForceReader` gives it: what is said of the rest frame is taken off [mN]."""
     said = predictor.density(displacement, mask, young, confidence)
-    still = None if confidence is None else mask[None]
+    still = None if confidence is None else np.broadcast_to(mask, (1, *confidence.shape[1:]))
     zero = predictor.density(np.zeros_like(displacement[:1]), mask, young, still)
     kind, grid = predictor.card.settings.target, predictor.grid
     if said.shape[1] == 3:
