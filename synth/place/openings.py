@@ -22,7 +22,7 @@ from synth.sequence import scenario, scene
 Floats = NDArray[np.float64]
 
 _APART = 1.5  # of the opening's radius: chosen ones are different places
-_HOLES = 1.0  # of its extent: how long the rim of a brain's hole may be
+_HOLES = 2.0  # of its extent: how long the rim of a brain's hole may be
 _TETS = 400  # of the volume that is tried: whether it meshes, not how well
 
 

@@ -34,8 +34,8 @@ def draw_openings(found: Survey) -> NDArray[np.uint8]:
         _draw(axes, found, vertices, faces, name)
     figure.suptitle(f"{found.path.name}: openings of {found.radius_mm:g} mm radius, best first")
     figure.tight_layout()
-    canvas.draw()
-    return np.asarray(canvas.buffer_rgba())[..., :3].copy()
+    canvas.draw()  # type: ignore[no-untyped-call]
+    return np.asarray(canvas.buffer_rgba())[..., :3].copy()  # type: ignore[no-untyped-call]
 
 
 def thinned(
@@ -74,7 +74,7 @@ def _draw(axes: Axes, found: Survey, vertices: Floats, faces: NDArray[np.int64],
     grey = 0.35 + 0.6 * facing[order, None]
     axes.add_collection(
         PolyCollection(
-            corner[order][:, :, [across, up]], facecolors=grey * [0.95, 0.8, 0.78], edgecolors="face"
+            list(corner[order][:, :, [across, up]]), facecolors=grey * [0.95, 0.8, 0.78], edgecolors="face"
         )
     )
     turn = np.linspace(0, 2 * np.pi, 49)
@@ -86,9 +86,8 @@ def _draw(axes: Axes, found: Survey, vertices: Floats, faces: NDArray[np.int64],
         other = np.cross(site.direction, side)
         ring = site.point + found.radius_mm * (np.outer(np.cos(turn), side) + np.outer(np.sin(turn), other))
         axes.plot(ring[:, across], ring[:, up], color="#0b5394", lw=1.8)
-        axes.text(
-            *site.point[[across, up]], str(number), ha="center", va="center", weight="bold", color="#0b5394"
-        )
+        x, y = (float(site.point[k]) for k in (across, up))
+        axes.text(x, y, str(number), ha="center", va="center", weight="bold", color="#0b5394")
     axes.set(
         title=f"seen {name.replace('along', 'from')}",
         xlabel=f"{'xyz'[across]} [mm]",

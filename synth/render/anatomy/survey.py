@@ -115,7 +115,7 @@ def survey(ground: Ground, radius_mm: float, count: int = 300) -> list[Site]:
     return sorted(found, key=lambda site: (bool(site.fault), site.cut, site.relief_mm))
 
 
-def by_distance(ground: Ground, point: Floats, radius_mm: float, count: int = 400) -> Iterator[Site]:
+def by_distance(ground: Ground, point: Floats, radius_mm: float, count: int = 200) -> Iterator[Site]:
     """Cortex that can be opened, from the place nearest to a point (3,) mm on; judged as it is asked for."""
     places = ground.spread(count)
     away = np.linalg.norm(ground.points[places] - point, axis=1)
