@@ -106,3 +106,9 @@ def check_attributes(attrs: Mapping[str, Any], where: str) -> None:
         raise UserError(f"{where}: the attribute {at} can't be right ({why})") from None
     if said.size[0] * said.size[1] > LARGEST_PIXELS:
         raise UserError(f"{where}: {said.size[0]} x {said.size[1]} pixels a frame is too large")
+
+
+def name_gestures(scenario: Mapping[str, Any]) -> str:
+    """Gestures of all instruments of a sequence, by its attribute `scenario`: "pull + push"; may be empty."""
+    each = [scenario.get("gesture") or {}, *(scenario.get("further") or ())]
+    return " + ".join(one["kind"] for one in each if one.get("kind"))

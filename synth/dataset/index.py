@@ -14,6 +14,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from synth.dataset import location, split
+from synth.dataset.attributes import name_gestures
 from synth.dataset.folder import Folder, write_whole
 from synth.dataset.store import Sequence, open_sequence
 from synth.errors import UserError
@@ -182,7 +183,6 @@ def row_of(sequence: Sequence) -> dict[str, Any]:
     attrs = sequence.attrs
     scenario, summary = attrs.get("scenario", {}), attrs.get("summary", {})
     gesture = scenario.get("gesture") or {}
-    kinds = [one.get("kind") for one in (gesture, *(scenario.get("further") or ()))]
     scale, flow = attrs.get("scale_mm_per_px"), summary.get("peak_flow_px")
     stages = [stage for stage in attrs.get("timings", {}).values() if isinstance(stage, dict)]
     return {
@@ -192,7 +192,7 @@ def row_of(sequence: Sequence) -> dict[str, Any]:
         "content_hash": attrs["content_hash"],
         "anatomy": split.name_anatomy(attrs),
         "family": scenario.get("family"),
-        "gesture": " + ".join(kind for kind in kinds if kind) or None,
+        "gesture": name_gestures(scenario) or None,
         "young_kpa": attrs.get("young_kpa"),
         "poisson": attrs.get("poisson"),
         "load": gesture.get("load"),

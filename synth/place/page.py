@@ -38,6 +38,7 @@ def render_page(found: Survey, folder: Path) -> str:
             "direction": np.round(site.direction, 3).tolist(),
             "rank": rank,
             "fault": site.fault,
+            "cut": site.cut,
             "relief": None if not np.isfinite(site.relief_mm) else round(site.relief_mm, 2),
             "lines": "" if site.fault else lines(found.path, site, found.radius_mm, folder),
         }

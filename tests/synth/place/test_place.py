@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shutil
+import subprocess
 from pathlib import Path
 
 import numpy as np
@@ -197,6 +198,37 @@ def test_the_page_offers_the_lines_of_every_place_that_works(found: openings.Sur
     corners = np.array(told["x"])
     assert np.ptp(corners, axis=1) == pytest.approx([64, 52, 44], abs=0.5)
     assert np.array(told["faces"]).max() < corners.shape[1]
+
+
+CLICKS = """
+const html = require("fs").readFileSync(process.argv[1], "utf8");
+const own = [...html.matchAll(/<script>([\\s\\S]*?)<\\/script>/g)].pop()[1];
+const nodes = {}; let click;
+const node = id => nodes[id] ??= {kids: [], append(x) { this.kids.push(x); }, on(e, f) { click = f; }};
+global.document = {getElementById: node, createElement: () => ({})};
+global.Plotly = {newPlot: () => {}};
+new Function(own)();
+const told = [nodes.said.textContent];
+nodes.best.kids[1].onclick();
+told.push(nodes.lines.textContent);
+click({points: [{x: 0, y: 0, z: 23}]});
+told.push(nodes.lines.textContent);
+console.log(JSON.stringify(told));
+"""
+
+
+@pytest.mark.skipif(shutil.which("node") is None, reason="no Node to run the page's script")
+def test_a_click_on_the_page_gives_the_nearest_places_lines(found: openings.Survey, tmp_path: Path) -> None:
+    page.write_page(found, tmp_path / "openings.html")
+    words = ["node", "-e", CLICKS, str(tmp_path / "openings.html")]
+    done = subprocess.run(words, capture_output=True, text=True, check=True)
+    first, second, clicked = json.loads(done.stdout)
+    assert first.startswith("Opening 1: ")
+    sites = [site for site in (*found.chosen, *found.others) if not site.fault]
+    near = min(sites, key=lambda site: float(np.linalg.norm(np.round(site.point, 2) - [0, 0, 23])))
+    for text, site in ((second, found.chosen[1]), (clicked, near)):
+        point = YAML(typ="safe").load(text)["anatomy"]["craniotomy"]["point"]
+        assert point == pytest.approx(site.point.tolist(), abs=0.006)
 
 
 def test_the_picture_shows_every_opening_from_somewhere(found: openings.Survey) -> None:
