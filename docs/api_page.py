@@ -64,7 +64,7 @@ def _described(name: str, value: Any) -> Iterator[str]:
     """A function or class as Markdown."""
     yield from ("", f"### {name}", "")
     if not inspect.isclass(value):
-        yield from ("```python", f"{_signed(name, value)}", "```", "", *_said(value.__doc__))
+        yield from (f"    {_signed(name, value)}", "", *_said(value.__doc__))
         return
     yield from _said(value.__doc__)
     if issubclass(value, BaseModel):

@@ -168,7 +168,7 @@ def test_an_open_sheet_is_told_from_a_brain_with_holes(found: openings.Survey) -
     sheet = openings.Survey(found.path, found.vertices, half, RADIUS, found.chosen, ())
     rim = np.pi * (3 * (32 + 26) - np.sqrt((3 * 32 + 26) * (32 + 3 * 26)))  # Ramanujan's ellipse
     told = re.findall(r"egg\.stl is open along (\d+) mm", sheet.note)
-    assert float(told[0]) == pytest.approx(rim, rel=0.3)
+    assert rim < float(told[0]) < 1.5 * rim, "it goes along edges, in a zigzag"
 
 
 def test_the_wall_that_a_brain_was_cut_at_is_no_cortex(tmp_path: Path) -> None:
