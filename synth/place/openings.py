@@ -14,6 +14,7 @@ from scipy.sparse.csgraph import connected_components
 
 from synth.errors import UserError
 from synth.geometry import brain_surface
+from synth.job import writer
 from synth.job.schema import Anatomy, Craniotomy, Fem, Job
 from synth.render.anatomy import survey
 from synth.render.anatomy.survey import Ground, Site
@@ -133,7 +134,7 @@ def lines(path: Path, site: Site, radius_mm: float, folder: Path = Path()) -> st
     mesh = os.path.relpath(path.resolve(), folder.resolve())
     return (
         "anatomy:\n"
-        f"  mesh: {mesh}\n"
+        f"  mesh: {writer.scalar(Path(mesh))}\n"
         "  craniotomy:\n"
         f"    point: {list(said.point)}\n"
         f"    direction: {list(said.direction)}\n"

@@ -153,6 +153,12 @@ def test_the_command_leaves_a_picture_a_page_and_a_job_that_works(egg: Path, tmp
     assert "job.yaml: exists already" in again.output
 
 
+def test_a_brain_of_an_odd_name_gives_lines_that_can_be_read(found: openings.Survey, tmp_path: Path) -> None:
+    odd = tmp_path / 'a: brain #2 "x".obj'
+    read = YAML(typ="safe").load(openings.lines(odd, found.chosen[0], RADIUS, tmp_path))
+    assert read["anatomy"]["mesh"] == odd.name
+
+
 def test_what_is_no_brain_is_one_line(tmp_path: Path) -> None:
     sheet = tmp_path / "sheet.stl"
     trimesh.creation.box((50, 50, 0)).export(sheet)
