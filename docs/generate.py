@@ -1,8 +1,8 @@
 """Writes the pages that say what the code says: `python docs/generate.py`, which `make docs` runs.
 
 Job keys and meta.yaml come from their schemas, fields from the field table, commands from the command lines'
-own help, the map of rooms from the packages' docstrings, the site's list of results from its folders. A test
-fails when a page says something else.
+own help, the Python packages from their docstrings, the map of rooms from the packages', the site's list of
+results from its folders. A test fails when a page says something else.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+import api_page
 import typer
 from pydantic import BaseModel
 
@@ -66,6 +67,7 @@ def pages() -> dict[Path, str]:
         DOCS / "reference" / "job.md": _job(),
         DOCS / "reference" / "recording.md": _recording(),
         DOCS / "reference" / "commands.md": _commands(),
+        DOCS / "reference" / "python.md": api_page.write_page(_WRITTEN),
         ROOT / "CONTRIBUTING.md": _contributing(),
         ROOT / "mkdocs.yml": _site(),
     }

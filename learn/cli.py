@@ -159,7 +159,10 @@ def _divided(
         settings = replace(settings, share_anatomy=settings.share_anatomy or read_rule(dataset).share_anatomy)
     if settings.share_anatomy:
         clips = ungrouped(clips)
-        _console.print("One brain may be on several sides of the split: scores say nothing of other brains.")
+        apart = "" if len(set(groups(clips))) == len(clips) else " Its openings are kept apart."
+        _console.print(
+            f"One brain may be on several sides of the split: scores say nothing of other brains.{apart}"
+        )
     if sides is not None:
         _console.print(
             "The dataset's own split: what `synth split` marks test is neither fitted nor chosen on."

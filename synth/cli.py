@@ -95,6 +95,23 @@ def preview(
     )
 
 
+@app.command(epilog="Example: synth place brain.obj --radius 12 --out openings")
+def place(
+    brain: Annotated[Path, typer.Argument(help="A brain's surface: OBJ, STL, PLY, OFF or VTK, in mm.")],
+    radius: Annotated[float, typer.Option(min=3.0, max=60.0, help="Of the opening [mm].")] = 12.0,
+    count: Annotated[int, typer.Option("--count", "-n", min=1, max=20, help="Openings to rank.")] = 6,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Folder for openings.png, openings.html and job.yaml.")
+    ] = None,
+    json: Json = False,
+) -> None:
+    """Finds where a brain can be opened, ranks the best places, draws them and writes the job's lines."""
+    from synth.place import command
+
+    found = command.place(brain, radius, count, out or Path(f"{brain.stem}-openings"))
+    print(json_.dumps(found.as_dict()) if json else "\n".join(found.lines()))
+
+
 @app.command(epilog="Example: synth render demo --out out render.spp=8 sequences=100")
 def render(
     job: Source,

@@ -14,6 +14,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from synth.dataset import location, split
+from synth.dataset.attributes import name_gestures
 from synth.dataset.folder import Folder, write_whole
 from synth.dataset.store import Dataset, Sequence, open_sequence
 from synth.errors import UserError
@@ -37,7 +38,7 @@ SCHEMA = pa.schema(
             },
         ),
         pa.field("family", pa.string(), metadata={"meaning": "appearance family"}),
-        pa.field("gesture", pa.string(), metadata={"meaning": "kind of gesture"}),
+        pa.field("gesture", pa.string(), metadata={"meaning": "kind of gesture, of every instrument"}),
         pa.field("young_kpa", pa.float64(), metadata={"meaning": "Young's modulus", "unit": "kPa"}),
         pa.field("poisson", pa.float64(), metadata={"meaning": "Poisson's ratio"}),
         pa.field("load", pa.float64(), metadata={"meaning": "peak load F/(E a^2)"}),
@@ -193,7 +194,7 @@ def row_of(sequence: Sequence) -> dict[str, Any]:
     """The row of a finished sequence, from its attributes."""
     attrs = sequence.attrs
     scenario, summary = attrs.get("scenario", {}), attrs.get("summary", {})
-    gesture = scenario.get("gesture", {})
+    gesture = scenario.get("gesture") or {}
     scale, flow = attrs.get("scale_mm_per_px"), summary.get("peak_flow_px")
     stages = [stage for stage in attrs.get("timings", {}).values() if isinstance(stage, dict)]
     return {
@@ -203,7 +204,7 @@ def row_of(sequence: Sequence) -> dict[str, Any]:
         "content_hash": attrs["content_hash"],
         "anatomy": split.name_anatomy(attrs),
         "family": scenario.get("family"),
-        "gesture": gesture.get("kind"),
+        "gesture": name_gestures(scenario) or None,
         "young_kpa": attrs.get("young_kpa"),
         "poisson": attrs.get("poisson"),
         "load": gesture.get("load"),

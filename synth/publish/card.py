@@ -153,11 +153,20 @@ def _contact(job: Job) -> str:
     """What loads the tissue."""
     if job.fem.contact == "traction":
         return "Every contact is a given traction on the footprint; no tip of a shape is pressed in or rubs."
-    held = ", ".join(kind for kind in job.fem.gestures if kind not in RIGID_GESTURES)
+    held = ", ".join(kind for kind in sorted(job.fem.kinds) if kind not in RIGID_GESTURES)
     return (
         f"Push, slide and tap are a rigid tip ({job.fem.tip}, friction {job.fem.friction:g}) in contact, "
         "as wide as the footprint, not as the instrument that is seen"
     ) + (f"; {held}: a given traction." if held else ".")
+
+
+def _at_once(job: Job) -> str:
+    """How many gestures a sequence shows."""
+    least, most = (max(count, len(job.fem.crew), 1) for count in job.fem.instruments)
+    if most == 1:
+        return "One gesture"
+    asked = ", as the job's `fem.crew` asks" if job.fem.crew else ""
+    return f"{least if least == most else f'{least} to {most}'} gestures at once{asked},"
 
 
 def column(rows: Iterable[Mapping[str, Any]], name: str) -> NDArray[np.float64]:
@@ -188,8 +197,8 @@ def _facts(job: Job, rows: list[dict[str, Any]], done: list[dict[str, Any]]) -> 
         "splits": share(done, "split") if any(row.get("split") for row in done) else "",
         "failed": [row for row in rows if row["status"] == "failed"],
         "instance": (
-            f"One gesture on one anatomy: {job.frames} frames at {job.fps:g} frames a second, from rest "
-            "through the approach of the instrument and the rise of the load to its release."
+            f"{_at_once(job)} on one anatomy: {job.frames} frames at {job.fps:g} frames a second, from rest "
+            "through the approach of the instruments and the rise of the load to its release."
         ),
         "mesh": job.anatomy.mesh is not None,
         "photo": job.appearance.photo is not None,

@@ -75,7 +75,7 @@ def _frame(job: Job, index: int) -> NDArray[np.uint8]:
     seed = scenario.frame_seeds(job, index)[0]
     shot = studio.frame(surface.vertices, tips, shafts, seed)
     picture = shot.rgb if shot.rgb_right is None else np.hstack([shot.rgb, shot.rgb_right])
-    label = f"{index}  {case.family}  {case.gesture.kind}"
+    label = f"{index}  {case.family}  {' + '.join(one.kind for one in gestures)}"
     place, font = (6, job.render.size[1] - 8), cv2.FONT_HERSHEY_SIMPLEX
     for colour, thick in (((0, 0, 0), 3), ((255, 255, 255), 1)):
         cv2.putText(picture, label, place, font, 0.4, colour, thick, cv2.LINE_AA)

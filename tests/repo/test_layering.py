@@ -34,6 +34,7 @@ ORDER = (
     "synth.engine",
     "synth.tune",
     "synth.fit",
+    "synth.place",
     "synth.cli",
     "synth.__main__",
     "learn",
