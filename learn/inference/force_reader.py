@@ -13,7 +13,7 @@ from learn.inference.placing import Placing, Point, share_at_border
 from learn.inference.predict import ForceMap, Predictor, total_force
 from learn.uncertainty.conformal import LEVELS
 from learn.uncertainty.features import is_moving
-from learn.uncertainty.intervals import Band, Said
+from learn.uncertainty.intervals import Band, Intervals, Said
 from synth.flow.stereo.track import Moved
 
 _MUCH_AT_BORDER = 0.1  # share of the force; what is spread evenly has a quarter there
@@ -50,7 +50,7 @@ class ForceReader:
         self.placing = Placing(tissue, scale_mm_per_px, predictor.grid)
         """Where the network's grid lies."""
         self._at_border = self._in_all = 0.0
-        self._far: list[float] = []
+        self._bounded, self._far = False, list[float]()
 
     def read(
         self, flow: NDArray[np.float32], confidence: NDArray[np.float32] | None, moved: Moved | None = None
@@ -81,10 +81,10 @@ class ForceReader:
 
         What is asked of here is what `notes` say of an unseen world.
         """
-        found = self._predictor.card.intervals
-        if found is None or said.motion is None:
+        if said.motion is None:
             return None
-        one = said_by(force, said)
+        found, one = self._intervals(), said_by(force, said)
+        self._bounded = True
         if is_moving(one.motion)[0]:
             self._far.append(float(found.world.distance(one.motion)[0]))
         return {level: found.bound(one, level).times(said.young_kpa) for level in LEVELS}
@@ -93,10 +93,9 @@ class ForceReader:
         self, force: NDArray[np.float64], said: ForceMap
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
         """Ends of the 90% interval of each cell of `ForceMap.magnitude`, (N, N) twice; None as of `bound`."""
-        found = self._predictor.card.intervals
-        if found is None or said.motion is None:
+        if said.motion is None:
             return None
-        low, high = found.bound_map(said_by(force, said))
+        low, high = self._intervals().bound_map(said_by(force, said))
         young = np.float32(said.young_kpa)
         return young * low[0], young * high[0]
 
@@ -105,11 +104,15 @@ class ForceReader:
         """What its user should know, once the frames are read: of where the grid lay, and of intervals."""
         return self._notes_of_place() + self._notes_of_intervals()
 
-    def _notes_of_intervals(self) -> list[str]:
+    def _intervals(self) -> Intervals:
         found = self._predictor.card.intervals
-        if found is None:
+        assert found is not None, "a map has its motion from a model with intervals only"
+        return found
+
+    def _notes_of_intervals(self) -> list[str]:
+        if not self._bounded:
             return []
-        notes = []
+        notes, found = [], self._intervals()
         if found.source in ("ideal", "motion-ideal"):
             notes.append("intervals are of true motion: of recovered motion they are too narrow")
         far, usual = np.array(self._far), found.world.usual

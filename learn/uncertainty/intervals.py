@@ -139,6 +139,21 @@ class Intervals:
     sequences: int
     """How many sequences those are."""
 
+    def __post_init__(self) -> None:
+        frame, count = len(self.features), len(self.features) - len(ANSWER)
+        for spread, wanted in (
+            (self.size, frame),
+            *((one, frame) for one in self.axes),
+            (self.map, frame + 2),
+        ):
+            rule = spread.scale
+            if not len(rule.slopes) == len(rule.low) == len(rule.high) == wanted:
+                raise ValueError(f"a scale is not of {wanted} features")
+            if spread.factors.keys() != {str(level) for level in LEVELS}:
+                raise ValueError(f"levels are not {', '.join(map(str, LEVELS))}")
+        if [len(row) for row in (self.world.middle, *self.world.precision)] != [count] * (count + 1):
+            raise ValueError(f"the world is not of {count} features")
+
     def bound(self, said: Said, level: float = LEVEL) -> Band:
         """Intervals of the force of frames, per unit stiffness. UserError for another level."""
         self._check(level)
