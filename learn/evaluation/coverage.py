@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +16,7 @@ from learn.evaluation.evaluate import FREE
 from learn.evaluation.fit_intervals import read_said, read_truth
 from learn.evaluation.statistics import Interval, interval
 from learn.inference.predict import Predictor
+from learn.uncertainty.conformal import LEVELS
 from learn.uncertainty.features import is_moving
 from learn.uncertainty.intervals import Intervals, Said, Truth
 from synth.errors import UserError
@@ -21,7 +24,7 @@ from synth.errors import UserError
 
 @dataclass(frozen=True)
 class Coverage:
-    """Whether intervals of one level hold: shares of frames (or cells), means over sequences."""
+    """Whether intervals of one level hold: shares of frames (or cells), means over sequences with 95% BCa."""
 
     level: float
     size: Interval
@@ -39,21 +42,44 @@ class Coverage:
     distance: float
     """Median distance of moving frames, as a multiple of that."""
 
+    def as_dict(self) -> dict[str, Any]:
+        """JSON-ready; NaN as null."""
+        shares = {"size": self.size, **dict(zip("xyz", self.axes, strict=True))}
+        shares |= {"map": self.map, "contact": self.contact}
+        widths = {"width_mn": self.width_mn, "width_of_peak": self.width_of_peak}
+        widths |= {f"width_{axis}_mn": w for axis, w in zip("xyz", self.axes_width_mn, strict=True)}
+        rest = widths | {"unseen": self.unseen, "distance": self.distance}
+        return {
+            "level": self.level,
+            **{k: {"mean": _known(i.mean), "low": _known(i.low), "high": _known(i.high)} for k, i in shares.items()},
+            **{k: _known(v) for k, v in rest.items()},
+        }  # fmt: skip
 
-def coverage(predictor: Predictor, clips: Sequence[Clip], source: str, level: float) -> Coverage:
-    """Holds a model's intervals against sequences of known truth. Raises UserError if it has none."""
+
+def cover(predictor: Predictor, clips: Sequence[Clip], source: str) -> list[Coverage]:
+    """Holds a model's intervals, at every level, against sequences of known truth.
+
+    Raises UserError if it has none.
+    """
     found = predictor.card.intervals
     if found is None:
         raise UserError("the model has no intervals; `learn intervals` fits them")
-    rows, far = [], []
+    rows: dict[float, list[list[float]]] = {level: [] for level in LEVELS}
+    far = [np.zeros(0)]
     for clip in clips:
         said, truth = read_said(predictor, clip, source), read_truth(clip, predictor.card)
-        rows.append(_held(found, said, truth, clip, predictor.card, level))
+        for level, held in rows.items():
+            held.append(_held(found, said, truth, clip, predictor.card, level))
         far.append((found.world.distance(said.motion) / found.world.usual)[is_moving(said.motion)])
-    values, moved = np.array(rows), np.concatenate([np.zeros(0), *far])
-    rng = np.random.default_rng(0)
+    moved = np.concatenate(far)
+    return [_summed(level, np.array(held), moved) for level, held in rows.items()]
+
+
+def _summed(level: float, values: NDArray[np.float64], moved: NDArray[np.float64]) -> Coverage:
+    """`values`: (n, 11) of `_held`; `moved`: distances of the moving frames, as multiples of the usual."""
+    rng, nan = np.random.default_rng(0), float("nan")
     shares = [interval(values[:, k], rng) for k in range(6)]
-    means = [float(np.nanmean(v)) if np.isfinite(v).any() else float("nan") for v in values[:, 6:].T]
+    means = [float(np.nanmean(v)) if np.isfinite(v).any() else nan for v in values[:, 6:].T]
     return Coverage(
         level=level,
         size=shares[0],
@@ -63,9 +89,13 @@ def coverage(predictor: Predictor, clips: Sequence[Clip], source: str, level: fl
         width_mn=means[0],
         width_of_peak=means[1],
         axes_width_mn=(means[2], means[3], means[4]),
-        unseen=float((moved > 1).mean()) if len(moved) else float("nan"),
-        distance=float(np.median(moved)) if len(moved) else float("nan"),
+        unseen=float((moved > 1).mean()) if len(moved) else nan,
+        distance=float(np.median(moved)) if len(moved) else nan,
     )
+
+
+def _known(value: float) -> float | None:
+    return value if math.isfinite(value) else None
 
 
 def _held(found: Intervals, said: Said, truth: Truth, clip: Clip, card: Card, level: float) -> list[float]:

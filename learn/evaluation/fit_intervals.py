@@ -76,10 +76,14 @@ def add_intervals(
     why, found = find_obstacle(chosen, kept), None
     if not why:
         found = fit_intervals(predictor, fitted, chosen, kept, source, report)
-    names, brains = dict(predictor.card.split), dict(predictor.card.groups)
+    taken = {clip.content_hash for clip in kept}, {clip.group for clip in kept}
+    names, brains = (
+        {part: [one for one in told if one not in gone] for part, told in parts.items()}
+        for parts, gone in zip((predictor.card.split, predictor.card.groups), taken, strict=True)
+    )
     if kept:
         names["intervals"] = [clip.content_hash for clip in kept]
-        brains["intervals"] = sorted({clip.group for clip in kept})
+        brains["intervals"] = sorted(taken[1])
     card = replace(predictor.card, intervals=found, no_intervals=why, split=names, groups=brains)
     write_card(folder, card)
     return card

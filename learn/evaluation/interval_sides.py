@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -49,34 +49,32 @@ def find_obstacle(chosen: Sequence[Clip], kept: Sequence[Clip]) -> str:
     return ""
 
 
-def find_sides(clips: Sequence[Clip], card: Card, test: Sequence[str], from_test: bool) -> Split:
-    """Who of a dataset's sequences a trained model's intervals are fitted on.
+def find_sides(clips: Sequence[Clip], card: Card, test: Collection[str], from_test: bool) -> Split:
+    """Who of a dataset's sequences a trained model's intervals are fitted on, brain by brain.
 
-    Kept for it is what was already, else everything that the model has not met and that is no test; with
-    `from_test` half of the brains of the test instead, drawn, and the other half stays it.
+    Kept for it is what was already; else every brain that the model has not met and that has no test
+    sequence; with `from_test` half of the brains of the test instead, drawn, and the other half stays it.
 
     Args:
         clips: of the dataset.
+        card: of the model.
         test: content hashes of those marked test, beside the card's.
         from_test: whether test sequences may be taken.
     """
-    side = {h: part for part, hashes in card.split.items() for h in hashes}
-    met = {g for part in ("fit", "select") for g in card.groups.get(part, [])}
-    tests = {*card.split.get("test", []), *test}
-    fit_, select = (
-        tuple(i for i, c in enumerate(clips) if side.get(c.content_hash) == part)
-        for part in ("fit", "select")
-    )
-    already = tuple(i for i, c in enumerate(clips) if side.get(c.content_hash) == "intervals")
-    new = [i for i, c in enumerate(clips) if c.content_hash not in side or c.content_hash in tests]
-    new = [i for i in new if clips[i].group not in met]
+    number = groups(clips)
+
+    def brains(part: str, more: Collection[str] = ()) -> set[int]:
+        hashes, names = {*card.split.get(part, ()), *more}, set(card.groups.get(part, ()))
+        return {number[i] for i, c in enumerate(clips) if c.content_hash in hashes or c.group in names}
+
+    def of(chosen: Collection[int]) -> tuple[int, ...]:
+        return tuple(i for i in range(len(clips)) if number[i] in chosen)
+
+    fitted, chosen = brains("fit"), brains("select")
+    kept, tests = brains("intervals"), brains("test", test) - fitted - chosen
     if from_test:
-        mine = [i for i in new if clips[i].content_hash in tests]
-        number = groups(clips)
-        names = np.unique([number[i] for i in mine])
-        drawn = set(np.random.default_rng(card.settings.seed).permutation(names)[: len(names) // 2].tolist())
-        kept = tuple(i for i in mine if number[i] in drawn)
-    else:
-        kept = already or tuple(i for i in new if clips[i].content_hash not in tests)
-    taken = {clips[i].content_hash for i in kept}
-    return Split(fit_, select, tuple(i for i in new if clips[i].content_hash in tests - taken), kept)
+        drawn = np.random.default_rng(card.settings.seed).permutation(sorted(tests))
+        kept = {int(brain) for brain in drawn[: len(tests) // 2]}
+    elif not kept:
+        kept = set(number) - fitted - chosen - tests
+    return Split(of(fitted), of(chosen), of(tests - kept), of(kept))
