@@ -24,11 +24,13 @@ _OPENINGS = 3  # fit, select and test
 
 @dataclass(frozen=True)
 class Split:
-    """Indices into the list of clips; the three share no sequence, no group and no held-out family."""
+    """Indices into the list of clips; the parts share no sequence, no group and no held-out family."""
 
     fit: tuple[int, ...]
     select: tuple[int, ...]
     test: tuple[int, ...]
+    intervals: tuple[int, ...] = ()
+    """Neither fitted nor chosen on, and no test: what intervals are fitted on."""
 
 
 def ungrouped(clips: Sequence[Clip]) -> list[Clip]:

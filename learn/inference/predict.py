@@ -18,6 +18,7 @@ from learn.data.clips import FIELDS, has_depth
 from learn.data.grid import Grid, Resampler, centre, certainty, channels
 from learn.network.d2fnet import fused
 from learn.network.traced import Quick
+from learn.uncertainty.features import motion_features
 from synth.errors import UserError
 from synth.flow.stereo.track import Moved
 
@@ -38,6 +39,8 @@ class ForceMap:
     view: View
     head_mn: NDArray[np.float64] | None = None
     """(C,) total force [mN] of a network with a total-force head, forces beyond the grid included."""
+    motion: NDArray[np.float64] | None = None
+    """(F,) `motion_features` of the frame, by a model with intervals."""
 
     @property
     def magnitude(self) -> NDArray[np.float32]:
@@ -179,8 +182,11 @@ class Predictor:
         known = None if sure is None else sure[None]
         density, total = self.answer(displacement[None], view.mask, young, known)
         head = None if total is None else total[0]
+        motion = None
+        if self.card.intervals is not None:
+            motion = motion_features(displacement[None], view.mask, known, self.grid.extent_mm)[0]
         return ForceMap(
-            density[0], self.grid, self.card.settings.target, young, young_kpa is not None, view, head
+            density[0], self.grid, self.card.settings.target, young, young_kpa is not None, view, head, motion
         )
 
     def on_grid(

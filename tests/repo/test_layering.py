@@ -39,6 +39,7 @@ ORDER = (
     "synth.__main__",
     "learn",
     "learn.data",
+    "learn.uncertainty",
     "learn.network",
     "learn.loss",
     "learn.settings",
