@@ -266,6 +266,7 @@ _FOLDERS: Mapping[str, str | Callable[[Path], Page]] = {
     "render/cost": render_cost,
     "engine": engine,
     "fem/surface": surface,
+    "render/look": "look.page",
     "learn/loading": "learn.throughput",
     "learn/pareto": learn_pareto,
     "learn/stability": "learn.stability",

@@ -21,7 +21,7 @@ from evidence.flow import rendered
 from evidence.flow.measure import epe
 from evidence.flow.scenes import CLEAN, Flags, Floats, Pair, Rgb, Stage, noise_field
 from evidence.measuring import measuring
-from evidence.render.realism import OUTLINE, outlined, scaled
+from evidence.render.realism import OUTLINE, outlined, scaled_photograph
 from synth.errors import UserError
 from synth.flow.estimator import Estimator, create
 
@@ -58,7 +58,7 @@ def look(
         crop = _window(wet.tissue, wet.pair.flow, size)
         own = _cropped(wet.pair, crop)
         scales.append(wet.mm_per_px)
-        image = scaled(photo, width_mm / wet.mm_per_px)
+        image = scaled_photograph(photo, width_mm / wet.mm_per_px)
         rng = np.random.default_rng([seed, k])
         there = _somewhere(outlined(outline, image.shape[:2]), size, rng)
         shares.append(float(own.glare.mean()))

@@ -57,7 +57,7 @@ def realism_figures(
         out.mkdir(parents=True, exist_ok=True)
         cv2.imwrite(str(out / "sheet.webp"), _sheet(pictures)[..., ::-1], [cv2.IMWRITE_WEBP_QUALITY, 45])
     if beside is not None:
-        cv2.imwrite(str(beside), _beside(pictures, scaled(photo, width_mm / pixel))[..., ::-1])
+        cv2.imwrite(str(beside), _beside(pictures, scaled_photograph(photo, width_mm / pixel))[..., ::-1])
     return {
         "family": family,
         "seed": seed,
@@ -91,7 +91,7 @@ def _rendered(
 
 def _photographed(photo: Path, outline: str, width_px: float) -> list[picture_statistics.Picture]:
     """Crops of the photograph inside the outline, at the rendered frames' scale."""
-    image = scaled(photo, width_px)
+    image = scaled_photograph(photo, width_px)
     crops = picture_statistics.tiles(image, outlined(outline, image.shape[:2]), _SIDE, _STEP)
     if not crops:
         raise UserError(f"{photo}: no crop of {_SIDE} px fits inside the outline")
@@ -106,7 +106,7 @@ def outlined(outline: str, shape: tuple[int, ...]) -> np.ndarray[Any, np.dtype[n
     return inside > 0
 
 
-def scaled(photo: Path, width_px: float) -> picture_statistics.Picture:
+def scaled_photograph(photo: Path, width_px: float) -> picture_statistics.Picture:
     """The photograph (H, W, 3) sRGB, `width_px` wide."""
     image = cv2.imread(str(photo), cv2.IMREAD_COLOR)
     if image is None:
