@@ -28,6 +28,8 @@ COMMANDS = {
     "stability stereo": "evidence.flow.stereo_stability:stability",
     "stability recordings": "evidence.flow.foreign:recordings",
     "pareto flow": "evidence.flow.pareto:pareto",
+    "experiment look-flow": "evidence.flow.look:look",
+    "experiment gallery": "evidence.render.gallery:gallery",
     "experiment realism": "evidence.render.realism:realism_figures",
     "experiment texture": "evidence.look.texture:texture",
     "experiment classifier": "evidence.look.classifier:classifier",

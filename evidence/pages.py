@@ -244,6 +244,7 @@ _FILES: Mapping[str, tuple[str, str | Callable[[Tree], Page]]] = {
     "fem/pareto": ("pareto.json", "fem.pareto"),
     "fem/stability": ("stability.json", "fem.stability"),
     "flow/benchmark": ("results.json", "flow.experiment"),
+    "flow/look": ("look.json", "flow.look"),
     "flow/live": ("live.json", live),
     "flow/pareto": ("pareto.json", "flow.pareto"),
     "flow/recordings": ("recordings.json", "flow.foreign"),

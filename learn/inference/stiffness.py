@@ -1,8 +1,7 @@
 """Stiffness from one press: what video can't know, from a moment in which the force is known.
 
 The network's answer per unit stiffness times E is the force, so one press with a known force (a weight, a
-sensor
-on the tool) gives E for the rest of the recording.
+sensor on the tool) gives E for the rest of the recording.
 """
 
 from __future__ import annotations
@@ -53,7 +52,7 @@ def _sizes(
 ) -> NDArray[np.float64]:
     """(T,) size of the force as `ForceReader` gives it: what is said of the rest frame is taken off [mN]."""
     said = predictor.density(displacement, mask, young, confidence)
-    still = None if confidence is None else mask[None]
+    still = None if confidence is None else np.broadcast_to(mask, (1, *confidence.shape[1:]))
     zero = predictor.density(np.zeros_like(displacement[:1]), mask, young, still)
     kind, grid = predictor.card.settings.target, predictor.grid
     if said.shape[1] == 3:

@@ -113,3 +113,6 @@ class Render(Section):
     """Also write the linear radiance of every frame as EXR."""
     tool: bool = True
     """Show the instrument."""
+    scenery: tuple[Literal["retractor", "cottonoid", "bone", "drape"], ...] = ()
+    """What else may lie about the opening, each in three of four sequences: a retractor's blade and cotton
+    patties over its edge, the bone's cut edge, drapes in the corners. It hides tissue and is none."""

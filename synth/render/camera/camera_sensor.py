@@ -42,6 +42,8 @@ class Sensor:
     """One colour a pixel (RGGB)."""
     chroma: str = "4:4:4"
     """Colour resolution of the video: 4:4:4, 4:2:2 or 4:2:0."""
+    coded: bool = False
+    """Whether a codec follows, which thins the colours out itself."""
 
     @classmethod
     def draw(
@@ -58,8 +60,8 @@ class Sensor:
             contrast=float(rng.uniform(*section.contrast)),
             sharpening=float(rng.uniform(*section.sharpening)),
             bayer=section.bayer,
-            # A codec thins the colours out itself.
-            chroma=section.chroma if section.bitrate_mbps is None else "4:4:4",
+            chroma=section.chroma,
+            coded=section.bitrate_mbps is not None,
         )
 
 
@@ -86,7 +88,8 @@ def record(radiance: Map, sensor: Sensor, rng: np.random.Generator) -> npt.NDArr
         balanced = _demosaiced(balanced)
     video = _tone(balanced, sensor.contrast)
     video = _sharpen(video, sensor.sharpening)
-    video = _thinned(np.clip(video, 0, 1, out=video), sensor.chroma)
+    np.clip(video, 0, 1, out=video)
+    video = video if sensor.coded else _thinned(video, sensor.chroma)
     np.clip(video, 0, 1, out=video)
     video *= np.float32(255)
     return np.rint(video, out=video).astype(np.uint8)
