@@ -23,7 +23,6 @@ app = typer.Typer(
     cls=Commands,
     help="Measures: recordings against force sensors, methods against one another.",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,  # "[kPa]" is a unit, not markup
 )

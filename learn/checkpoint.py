@@ -24,6 +24,7 @@ from learn.data.grid import Scales
 from learn.network.d2fnet import Architecture
 from learn.network.monai_unet import build
 from learn.settings import Settings
+from learn.uncertainty.intervals import Intervals
 from synth.errors import Caution, UserError
 from synth.job import identity
 from synth.job.types import Positive, first_problem
@@ -35,6 +36,8 @@ _LARGEST_BYTES = 100_000_000
 """Of config.json, which names the sequences that were trained on: a million of them."""
 _LARGEST_WEIGHTS = 64 << 30
 _WEIGHTS, _NEXT = "weights.pt", "weights.next.pt"
+SEEN = ("fit", "select", "intervals")
+"""Parts of `Card.split` that no score of the model may be of."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +51,8 @@ class Card:
     typical_young_kpa: Positive
     """Geometric mean of E in the training data: stands in where E is unknown."""
     split: dict[str, list[str]]
-    """Content hashes of the sequences that were fitted, that chose the epoch, and that were left."""
+    """Content hashes of the sequences that were fitted (`fit`), that chose the epoch (`select`), that were
+    left (`test`), and, if any, that were kept for intervals (`intervals`)."""
     groups: dict[str, list[str]]
     """The anatomies of each, so that a sequence of a seen anatomy is never taken for unseen."""
     epoch: Annotated[int, Field(ge=0)] = 0
@@ -56,6 +60,10 @@ class Card:
     """R² on the select sequences at the chosen epoch."""
     weights_hash: str = ""
     """Of weights.pt; empty before an epoch is kept, and in folders from before there were hashes."""
+    intervals: Intervals | None = None
+    """How far off its answers may be; None where nobody fitted that, or it could not be."""
+    no_intervals: str = ""
+    """Why it could not be; empty if it could, or nobody tried."""
 
 
 _CARD = TypeAdapter(Card)

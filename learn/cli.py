@@ -16,7 +16,6 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from synth.errors import UserError
-from synth.system import whole_file
 from synth.system.cli_errors import Commands
 
 if TYPE_CHECKING:
@@ -32,7 +31,6 @@ app = typer.Typer(
     cls=Commands,
     help="Learn force from displacement.",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,  # "[kPa]" is a unit, not markup
 )
@@ -161,7 +159,10 @@ def _divided(
         settings = replace(settings, share_anatomy=settings.share_anatomy or read_rule(dataset).share_anatomy)
     if settings.share_anatomy:
         clips = ungrouped(clips)
-        _console.print("One brain may be on several sides of the split: scores say nothing of other brains.")
+        apart = "" if len(set(groups(clips))) == len(clips) else " Its openings are kept apart."
+        _console.print(
+            f"One brain may be on several sides of the split: scores say nothing of other brains.{apart}"
+        )
     if sides is not None:
         _console.print(
             "The dataset's own split: what `synth split` marks test is neither fitted nor chosen on."
@@ -289,7 +290,9 @@ def _unseen(clips: list[Clip], dataset: Path, cards: list[Card]) -> list[Clip]:
 def predict_command(
     model: Annotated[Path, typer.Argument(help="Model folder.")],
     source: Annotated[Path, typer.Argument(help="Dataset, NNNNNN.zarr store, video, or .npz of flow.")],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for NAME.npz files.")] = Path("forces"),
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for NAME.npz and .force.csv.")] = Path(
+        "forces"
+    ),
     input: Annotated[str | None, typer.Option(help=_STORED)] = None,
     young: Annotated[float | None, typer.Option(help="Young's modulus [kPa], instead of the data's.")] = None,
     scale: Annotated[
@@ -320,6 +323,7 @@ def predict_command(
             help="Of a video: auto, none, glare, tool, both, or a folder of NNNNNN.png or mask.png: the tool."
         ),
     ] = "auto",
+    overlay: Annotated[bool, typer.Option(help="Also NAME.force.mp4, the force over the film.")] = True,
     threads: Threads = None,
     json: Json = False,
 ) -> None:
@@ -327,6 +331,7 @@ def predict_command(
     from learn.inference.apply import Filmed, apply, motions
     from learn.inference.mask_files import read_choice
     from learn.inference.predict import load_predictor
+    from learn.inference.prediction_file import write_overlay, write_prediction
     from learn.inference.scale import read_scale
     from learn.inference.video_flow import Settings
     from learn.training.threads import set_threads
@@ -340,18 +345,18 @@ def predict_command(
         written = out / f"{motion.name}.npz"
         if written.exists() and written.samefile(source):
             raise UserError(f"{written}: is what is read, and would be overwritten; say another --out")
-        peaks[motion.name] = _write_forces(apply(predictor, motion, young), written, motion.name, quiet=json)
+        found = apply(predictor, motion, young)
+        write_prediction(found, out / motion.name)
+        if overlay:
+            one = source.is_file() or source.suffix == ".zarr"
+            write_overlay(found, source if one else source / f"{motion.name}.zarr", out / motion.name)
+        peaks[motion.name] = _say_peak(found, motion.name, quiet=json)
     if json:
         print(json_.dumps({"out": str(out), "peak_force_mn": peaks}))
 
 
-def _write_forces(found: Mapping[str, Any], file: Path, name: str, *, quiet: bool) -> float | None:
-    """Writes what `apply` found, whole; its peak force [mN], None where no frame could be followed."""
-    import numpy as np
-
-    file.parent.mkdir(parents=True, exist_ok=True)
-    with whole_file.part_of(file) as part, part.open("wb") as stream:
-        np.savez_compressed(stream, **found)
+def _say_peak(found: Mapping[str, Any], name: str, *, quiet: bool) -> float | None:
+    """The peak [mN] of what `apply` found, None where no frame could be followed; prints it and the notes."""
     size = found["total_force_mn"][found["trusted"]]
     peak = float(size.max()) if len(size) else None
     if not quiet:

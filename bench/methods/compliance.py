@@ -54,9 +54,9 @@ class Block:
 
     @classmethod
     def build(cls, law: str, tets: int, order: int) -> Block:
-        """A block of about that many tetrahedra, with Poisson's ratio 0.4."""
+        """A block of about that many tetrahedra, with Poisson's ratio 0.4; elements as a job's are."""
         volume = tetrahedra.block(_ANATOMY, tets, order)
-        return cls(volume, assemble(volume, law, 0.4))
+        return cls(volume, assemble(volume, law, 0.4, averaged=order == 2))
 
     def carry(self, xy: Floats) -> Embedding:
         """How surface points (P, 2), camera x, y [mm], ride on the volume."""

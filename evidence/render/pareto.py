@@ -15,6 +15,7 @@ import typer
 from bench.output import charts, result_page
 from evidence.measuring import measuring
 from evidence.render.case import Case, case
+from evidence.render.cycles import noises
 from synth.job.schema import Job, Render
 from synth.render import instrument
 from synth.render.scene import Studio
@@ -58,8 +59,8 @@ def pareto(
 def measure(ours: Case, spp: int, sampler: str, kind: str) -> dict[str, float]:
     """Seconds of CPU a picture, its noise, and what DIS flow makes of a pull of 1.5 mm.
 
-    Noise is the root mean square over tissue of the difference of two pictures over sqrt(2), as a share of
-    their mean. Flow error is against the truth, over visible tissue away from the instrument.
+    Noise is that of two pictures over tissue (`cycles.noises`). Flow error is against the truth, over
+    visible tissue away from the instrument.
     """
     studio = ours.studio
     forceps = instrument.build(("forceps",))
@@ -75,7 +76,6 @@ def measure(ours: Case, spp: int, sampler: str, kind: str) -> dict[str, float]:
         spent.append(time.process_time() - start)
     one, two, three = pictures
     tissue = studio.still.tissue & ~studio.frame(ours.vertices, ours.tips, ours.shafts, 0).tool
-    noise = float(np.sqrt(((one - two)[tissue] ** 2).mean() / 2) / one[tissue].mean())
     truth = studio.frame(ours.moved(_LIFT), ours.held(_LIFT), ours.shafts, 4)
     rest, now = (studio.develop(picture, 9 + k) for k, picture in enumerate((one, three)))
     estimator = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
@@ -85,7 +85,7 @@ def measure(ours: Case, spp: int, sampler: str, kind: str) -> dict[str, float]:
     error = np.linalg.norm(flow - truth.flow, axis=-1)[inside]
     return {
         "cpu_s": round(float(np.median(spent)), 3),
-        "noise": round(noise, 4),
+        **noises(one, two, tissue),
         "flow_median_px": round(float(np.median(error)), 3),
         "flow_p95_px": round(float(np.quantile(error, 0.95)), 3),
     }
@@ -100,7 +100,11 @@ def drawn(found: Mapping[str, Any]) -> result_page.Page:
 def panels(found: Mapping[str, Any]) -> list[charts.Panel]:
     """Charts of `pareto.json`: what flow makes of the pictures, and their noise, against time."""
     made = []
-    for key, unit in (("flow_median_px", "flow error, median [px]"), ("noise", "noise / mean")):
+    for key, unit in (
+        ("flow_median_px", "flow error, median [px]"),
+        ("noise", "noise / mean"),
+        ("noise_clipped", "noise / mean, clipped"),
+    ):
         curves = []
         for kind in dict.fromkeys((r["width"], r["sampler"], r["integrator"]) for r in found["rows"]):
             own = [r for r in found["rows"] if (r["width"], r["sampler"], r["integrator"]) == kind]

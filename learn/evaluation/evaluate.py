@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from learn.checkpoint import Card
+from learn.checkpoint import SEEN, Card
 from learn.data.clips import Clip, amount, target
 from learn.data.grid import Grid
 from learn.evaluation.metrics import Moments, agreement, contact_mm, ghost_share, line
@@ -306,7 +306,7 @@ def compare(a: Report, b: Report) -> dict[str, Paired]:
 
 
 def unseen(clips: Sequence[Clip], card: Card) -> list[Clip]:
-    """Clips of no sequence and no anatomy that the model was fitted or chosen on."""
-    hashes = {h for part in ("fit", "select") for h in card.split.get(part, [])}
-    seen = {g for part in ("fit", "select") for g in card.groups.get(part, [])}
+    """Clips of no sequence and no anatomy that the model was fitted or chosen on, or its intervals fitted."""
+    hashes = {h for part in SEEN for h in card.split.get(part, [])}
+    seen = {g for part in SEEN for g in card.groups.get(part, [])}
     return [c for c in clips if c.content_hash not in hashes and c.group not in seen]

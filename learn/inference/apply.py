@@ -232,14 +232,9 @@ def _positive(path: Path, found: dict[str, NDArray[Any]], name: str) -> float:
 def apply(predictor: Predictor, motion: Motion, young_kpa: float | None = None) -> dict[str, Any]:
     """Force of every frame of a film, ready for np.savez; what is done to it is `ForceReader`'s.
 
-    `young_kpa` overrides the film's own, but not where the scale is unknown. Returns `frame` (T,),
-    `time_s` (T,) where the film has times,
-    `trusted` (T,) whether a frame could be followed (its force is NaN if not), `total_force_mn` (T,),
-    `force_mn` (T, 3) for a model that gives direction, and as the network says it
-    `density` (T, C, N, N) mN/mm² and `head_mn` (T, C) of one with a total-force head; `mask` (N, N),
-    `pitch_mm`, `centre_px` (x, y) of the grid in the film's own pixels, `centres_px` (T, 2) the same by frame
-    (mask and centre are the last frame's; they change only where the tissue is wider than the grid),
-    `young_kpa`, `young_known`, and `notes`: what was done to the film that its user should know.
+    `young_kpa` overrides the film's own, but not where the scale is unknown. Returns fields of
+    `prediction_file.FIELDS`, those that the film and the model have. Mask and centre are the last frame's;
+    they change only where the tissue is wider than the grid.
     """
     young = young_kpa if young_kpa is not None else motion.young_kpa
     if not motion.scale_known:
@@ -266,6 +261,7 @@ def apply(predictor: Predictor, motion: Motion, young_kpa: float | None = None) 
         "trusted": np.array(trusted),
         "mask": last.view.mask,
         "pitch_mm": predictor.grid.pitch_mm,
+        "scale_mm_per_px": motion.scale_mm_per_px / motion.shrink,
         # A picture begins half a pixel before its first pixel, whatever its pixels' size.
         "centre_px": motion.shrink * (np.array(last.view.resample.centre_px) + 0.5) - 0.5,
         "young_kpa": last.young_kpa,

@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from learn.data.grid import Grid
 from learn.inference.placing import Placing, Point, share_at_border
-from learn.inference.predict import ForceMap, Predictor
+from learn.inference.predict import ForceMap, Predictor, total_force
+from learn.uncertainty.conformal import LEVELS
+from learn.uncertainty.features import is_moving
+from learn.uncertainty.intervals import Band, Intervals, Said
 from synth.flow.stereo.track import Moved
 
 _MUCH_AT_BORDER = 0.1  # share of the force; what is spread evenly has a quarter there
+_MANY_UNSEEN = 0.05  # share of the moving frames; of held-out ones it is a hundredth
 
 UNKNOWN_YOUNG_KPA = 1.0
 """Tissue whose E nobody knows is answered for as if it were of this: forces are then right up to a factor."""
@@ -21,6 +27,34 @@ UNKNOWN_YOUNG_KPA = 1.0
 def assumed_young(young_kpa: float | None) -> float:
     """E to answer for [kPa]: the one known, else `UNKNOWN_YOUNG_KPA`; for every method, learnt or not."""
     return UNKNOWN_YOUNG_KPA if young_kpa is None else young_kpa
+
+
+def predict_force(
+    model: Predictor,
+    flow: Iterable[NDArray[np.float32]],
+    tissue: NDArray[np.bool_],
+    scale_mm_per_px: float,
+    young_kpa: float | None = None,
+    confidence: Iterable[NDArray[np.float32]] | None = None,
+) -> NDArray[np.float64]:
+    """The force curve of one film: (T, 3) mN on the tissue, camera axes; what the rest frame says taken off.
+
+    Of a model without direction the size is in x and the rest NaN.
+
+    Args:
+        model: of `load_model`.
+        flow: T times (H, W, 2) px, motion from the rest frame at the rest frame's pixels.
+        tissue: (H, W), in the rest frame.
+        scale_mm_per_px: of the picture.
+        young_kpa: of the tissue; None: forces are those of tissue of 1 kPa.
+        confidence: T times (H, W) in 0..1, for a model that reads it.
+
+    Raises:
+        UserError: shapes that don't fit, values that aren't finite, or a model of two eyes.
+    """
+    reader = ForceReader(model, np.asarray(tissue, bool), scale_mm_per_px, young_kpa)
+    pairs = ((one, None) for one in flow) if confidence is None else zip(flow, confidence, strict=True)
+    return np.array([reader.read(one, sure)[0] for one, sure in pairs]).reshape(-1, 3)
 
 
 class ForceReader:
@@ -45,6 +79,7 @@ class ForceReader:
         self.placing = Placing(tissue, scale_mm_per_px, predictor.grid)
         """Where the network's grid lies."""
         self._at_border = self._in_all = 0.0
+        self._bounded, self._far = False, list[float]()
 
     def read(
         self, flow: NDArray[np.float32], confidence: NDArray[np.float32] | None, moved: Moved | None = None
@@ -69,9 +104,57 @@ class ForceReader:
             force[0] = max(force[0], 0.0)
         return force, said
 
+    def bound(self, force: NDArray[np.float64], said: ForceMap) -> dict[float, Band] | None:
+        """By level, the intervals of a frame's force as `read` gave it, T = 1 [mN]; of the force of tissue of
+        1 kPa where E is unknown. None of a model without intervals.
+
+        What is asked of here is what `notes` say of an unseen world.
+        """
+        if said.motion is None:
+            return None
+        found, one = self._intervals(), said_by(force, said)
+        self._bounded = True
+        if is_moving(one.motion)[0]:
+            self._far.append(float(found.world.distance(one.motion)[0]))
+        return {level: found.bound(one, level).times(said.young_kpa) for level in LEVELS}
+
+    def bound_map(
+        self, force: NDArray[np.float64], said: ForceMap
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
+        """Ends of the 90% interval of each cell of `ForceMap.magnitude`, (N, N) twice; None as of `bound`."""
+        if said.motion is None:
+            return None
+        low, high = self._intervals().bound_map(said_by(force, said))
+        young = np.float32(said.young_kpa)
+        return young * low[0], young * high[0]
+
     @property
     def notes(self) -> list[str]:
-        """What its user should know of where the grid lay, once the frames are read."""
+        """What its user should know, once the frames are read: of where the grid lay, and of intervals."""
+        return self._notes_of_place() + self._notes_of_intervals()
+
+    def _intervals(self) -> Intervals:
+        found = self._predictor.card.intervals
+        assert found is not None, "a map has its motion from a model with intervals only"
+        return found
+
+    def _notes_of_intervals(self) -> list[str]:
+        if not self._bounded:
+            return []
+        notes, found = [], self._intervals()
+        if found.source in ("ideal", "motion-ideal"):
+            notes.append("intervals are of true motion: of recovered motion they are too narrow")
+        far, usual = np.array(self._far), found.world.usual
+        unseen = float((far > usual).mean()) if len(far) else 0.0
+        if unseen > _MANY_UNSEEN:
+            notes.append(
+                f"unseen world: {100 * unseen:.0f}% of the frames that moved do so unlike anything that the "
+                f"model was trained on (distance {np.median(far[far > usual]):.2g}; 99% of held-out frames "
+                f"stay under {usual:.2g}); intervals are widened by as much, and may still be too narrow"
+            )
+        return notes
+
+    def _notes_of_place(self) -> list[str]:
         if self.placing.fits:
             return []
         wide = self._predictor.grid.extent_mm
@@ -98,6 +181,31 @@ class ForceReader:
         head = None if said.head_mn is None else part * said.head_mn
         density = np.float32(part) * said.density
         return replace(said, density=density, head_mn=head, young_kpa=assumed_young(None))
+
+
+def said_by(force: NDArray[np.float64], said: ForceMap) -> Said:
+    """One frame as intervals are asked for it; `force`: (3,) mN as `ForceReader.read` gave it."""
+    assert said.motion is not None
+    young = said.young_kpa
+    map_ = said.magnitude[None] / np.float32(young)
+    return Said(said.motion[None], force[None] / young, map_, said.grid.pitch_mm)
+
+
+def net_force(
+    density: NDArray[np.float32], still: NDArray[np.float32], kind: str, grid: Grid
+) -> NDArray[np.float64]:
+    """(T, 3) total force of frames (T, C, N, N), as `ForceReader.read` gives it: less that of `still`.
+
+    `still`: (C, N, N), the answer to no motion; `kind`: `density` or `intensity`.
+    """
+    if density.shape[1] == 3:
+        whole: NDArray[np.float64] = density.astype(np.float64).sum((2, 3)) - still.astype(np.float64).sum(
+            (1, 2)
+        )
+        return whole * grid.pitch_mm**2
+    size = total_force(density, kind, grid) - total_force(still[None], kind, grid)
+    nothing = np.full_like(size, np.nan)
+    return np.stack([np.maximum(size, 0.0), nothing, nothing], axis=1)
 
 
 def _total(said: ForceMap) -> NDArray[np.float64]:

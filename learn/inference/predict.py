@@ -18,6 +18,7 @@ from learn.data.clips import FIELDS, has_depth
 from learn.data.grid import Grid, Resampler, centre, certainty, channels
 from learn.network.d2fnet import fused
 from learn.network.traced import Quick
+from learn.uncertainty.features import motion_features
 from synth.errors import UserError
 from synth.flow.stereo.track import Moved
 
@@ -38,6 +39,8 @@ class ForceMap:
     view: View
     head_mn: NDArray[np.float64] | None = None
     """(C,) total force [mN] of a network with a total-force head, forces beyond the grid included."""
+    motion: NDArray[np.float64] | None = None
+    """(F,) `motion_features` of the frame, by a model with intervals."""
 
     @property
     def magnitude(self) -> NDArray[np.float32]:
@@ -179,8 +182,11 @@ class Predictor:
         known = None if sure is None else sure[None]
         density, total = self.answer(displacement[None], view.mask, young, known)
         head = None if total is None else total[0]
+        motion = None
+        if self.card.intervals is not None:
+            motion = motion_features(displacement[None], view.mask, known, self.grid.extent_mm)[0]
         return ForceMap(
-            density[0], self.grid, self.card.settings.target, young, young_kpa is not None, view, head
+            density[0], self.grid, self.card.settings.target, young, young_kpa is not None, view, head, motion
         )
 
     def on_grid(
@@ -267,6 +273,20 @@ class Predictor:
         if not (np.isfinite(density).all() and (total is None or np.isfinite(total).all())):
             raise UserError("the model answers NaN or infinity: its weights or scales can't be right")
         return density, total
+
+
+def load_model(name: Path | str, device: str = "cpu", *, quick: bool = False) -> Predictor:
+    """A trained model, to be asked frame by frame (`Predictor`) or for a whole film (`predict_force`).
+
+    Args:
+        name: the folder that `learn train` wrote.
+        device: PyTorch's name of where it runs.
+        quick: spend a second on a graph that runs a fifth faster on a CPU.
+
+    Raises:
+        UserError: the folder is missing, damaged or edited.
+    """
+    return load_predictor(name, device, quick)
 
 
 def load_predictor(

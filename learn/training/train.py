@@ -267,9 +267,11 @@ def moments(true: torch.Tensor, said: torch.Tensor) -> Moments:
 
 def _provenance(clips: Sequence[Clip], split: Split) -> tuple[dict[str, list[str]], dict[str, list[str]]]:
     parts = {"fit": split.fit, "select": split.select, "test": split.test}
+    if split.intervals:
+        parts["intervals"] = split.intervals
     number, sides = groups(clips), [(i, side) for side, part in parts.items() for i in part]
     if find_crossings([number[i] for i, _ in sides], [side for _, side in sides]):
-        raise UserError("the split shares an anatomy between fit, select and test")
+        raise UserError("the split shares an anatomy between its parts")
     return (
         {k: [clips[i].content_hash for i in v] for k, v in parts.items()},
         {k: sorted({clips[i].group for i in v}) for k, v in parts.items()},

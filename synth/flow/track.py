@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from synth.errors import UserError
+from synth.flow import mask
 from synth.flow.confidence import DOUBTFUL
 from synth.flow.estimator import Estimator, Flags, Flow, Map, Rgb, create
 
@@ -155,6 +156,26 @@ class Tracker:
     def _said(self, found: Solved) -> tuple[Flow, Map]:
         sure = found.confidence if self.trusted else np.minimum(found.confidence, 0.5 * DOUBTFUL)
         return found.flow * self.tissue[..., None], sure
+
+
+def recover_flow(
+    frames: NDArray[np.uint8],
+    tool: NDArray[np.bool_],
+    tissue: Flags,
+    backend: str | Estimator = "tvl1",
+) -> Track:
+    """Displacement through a video whose instruments' outlines are known; glare is found in the pictures.
+
+    Args:
+        frames: (T, H, W, 3) uint8, sRGB; frame 0 is the rest frame.
+        tool: (T, H, W), pixels of instruments.
+        tissue: (H, W), where there is tissue to follow in the rest frame.
+        backend: an estimator, or the name of one: tvl1, opencv-tvl1, dis or a plug-in's.
+
+    Raises:
+        UserError: no such estimator, no frames, or shapes that don't fit.
+    """
+    return track(backend, frames, mask.hidden(frames, tool), tissue)
 
 
 def track(

@@ -30,8 +30,10 @@ def test_every_room_has_a_front() -> None:
 
 
 def test_every_preset_of_learn_but_the_published_one_has_a_front() -> None:
+    """Those of two eyes are `cpu` and `live` with another input; nothing of theirs was varied yet."""
     fronts = {front.room: front for front in GATHERED if front.room.startswith("learn")}
-    assert set(fronts) == {f"learn, {name}" for name in PRESETS if name != "paper"}
+    one_eye = {name for name, settings in PRESETS.items() if not settings.arch.depth}
+    assert set(fronts) == {f"learn, {name}" for name in one_eye - {"paper"}}
     assert all(len(front.points) > 2 for front in fronts.values())
 
 

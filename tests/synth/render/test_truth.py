@@ -52,6 +52,33 @@ def test_rays_meet_what_trimesh_meets(surface: Surface, lens: Camera) -> None:
     np.testing.assert_allclose(ours, expected, atol=1e-6)
 
 
+@pytest.mark.parametrize("vertices", [400, 2500])
+def test_triangles_that_bow_under_an_endoscopes_lens_lose_no_ray(vertices: int) -> None:
+    """Faces of up to some 20 px through a lens 60 mm away that shortens the corner by a tenth."""
+    section = Anatomy(vertices=vertices)
+    coarse = anatomy.procedural(Relief.draw(section, np.random.default_rng(5)), section)
+    bent = (-0.9, 0.8, 0.01, -0.01, 0.0)
+    render = Render(size=(320, 240), working_distance_mm=(60.0, 60.0), distortion=bent)
+    near = camera.place(View.draw(render, np.random.default_rng(2)), render)
+    rest = truth.still(near, Shape(coarse.vertices, coarse.faces), NOTHING)
+    pixels = camera.pixel_grid(near.size)[::11]
+    origins, directions = camera.rays(near, pixels)
+    straight = (pixels - near.K[:2, 2]) / np.diag(near.K)[:2]
+    seen = directions @ near.rotation.T
+    shift = np.linalg.norm(seen[:, :2] / seen[:, 2:] - straight, axis=1) * near.K[0, 0]
+    assert shift.max() > 5, "a lens that bends nothing proves nothing"
+    mesh = trimesh.Trimesh(coarse.vertices, coarse.faces, process=False)
+    where, ray, _ = mesh.ray.intersects_location(origins, directions, multiple_hits=False)
+    expected = np.full((len(pixels), 3), np.nan)
+    expected[ray] = where
+    ours = np.einsum(
+        "nk,nkc->nc", rest.bary.reshape(-1, 3)[::11], coarse.vertices[coarse.faces[rest.face.ravel()[::11]]]
+    )
+    ours[~rest.tissue.ravel()[::11]] = np.nan
+    assert np.isfinite(expected).all(axis=1).sum() > 2000
+    np.testing.assert_allclose(ours, expected, atol=1e-6)
+
+
 def test_flow_is_the_projections_finite_difference(surface: Surface, lens: Camera) -> None:
     shape = Shape(surface.vertices, surface.faces)
     rest = truth.still(lens, shape, NOTHING)

@@ -23,7 +23,7 @@ flat = np.array([[-1.0, -1.0], [2.0, -1.0], [-1.0, 2.0]])
 directions = np.array([[0.0, 0.0, 1.0], [0.9, 0.9, 1.0]])
 faces = np.array([[0, 1, 2]], np.int32)
 found = truth._cast(corners, flat, faces, directions, np.array([0, 1]), np.array([0, 1, 2]), 2, 1)
-print(found[0].tolist(), round(float(found[3][0]), 6))
+print(found[0].tolist(), round(float(found[2][0]), 6))
 """
 
 

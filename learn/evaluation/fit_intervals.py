@@ -1,0 +1,116 @@
+"""A model's intervals fitted on sequences of known truth, and written into its card."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from learn.checkpoint import Card, write_card
+from learn.data.clips import Clip, scored, target
+from learn.data.split import Split, groups
+from learn.evaluation.interval_sides import find_obstacle
+from learn.inference.force_reader import net_force
+from learn.inference.predict import Predictor, length
+from learn.uncertainty.features import motion_features, motion_names
+from learn.uncertainty.intervals import Example, Intervals, Said, Truth, fit, make_example
+from learn.uncertainty.world import fit_world
+from synth.errors import UserError
+
+_MOST_FITTED = 500  # sequences that the distance is measured from
+
+Report = Callable[[int, int], None]
+
+
+def fit_intervals(
+    predictor: Predictor,
+    fitted: Sequence[Clip],
+    chosen: Sequence[Clip],
+    kept: Sequence[Clip],
+    source: str | None = None,
+    report: Report = lambda done, of: None,
+) -> Intervals:
+    """Intervals of a model, from sequences of known truth.
+
+    `fitted`: what the network was fitted on, from which a frame's distance is measured; `chosen` and `kept`
+    as of `find_obstacle`, none of them fitted; `source`: displacement that the intervals hold for, None: the
+    one that the model is scored on. Raises UserError with the obstacle, or if nothing moves.
+    """
+    why = find_obstacle(chosen, kept)
+    if why:
+        raise UserError(why)
+    card = predictor.card
+    source = source or scored(card.settings.input)
+    units, rng = (card.scales.force, card.scales.target), np.random.default_rng(card.settings.seed)
+    of = len(chosen) + len(kept)
+
+    def see(clip: Clip, unit: int, done: int) -> Example:
+        report(done, of)
+        said, truth = read_said(predictor, clip, source), read_truth(clip, card)
+        return make_example(said, truth, clip.mask, unit, units, rng)
+
+    number = groups(kept)
+    scale_on = [see(clip, 0, k) for k, clip in enumerate(chosen)]
+    factors_on = [see(clip, number[k], len(chosen) + k) for k, clip in enumerate(kept)]
+    report(of, of)
+    some = rng.permutation(len(fitted))[:_MOST_FITTED]
+    world = fit_world([_motion(predictor, fitted[i], source) for i in some], [one.motion for one in scale_on])
+    if world is None:
+        raise UserError("nothing moves in the sequences that the intervals are to be fitted on")
+    return fit(scale_on, factors_on, world, motion_names(card.settings.arch.depth), units, source)
+
+
+def add_intervals(
+    folder: Path,
+    predictor: Predictor,
+    clips: Sequence[Clip],
+    split: Split,
+    source: str | None = None,
+    report: Report = lambda done, of: None,
+) -> Card:
+    """Fits intervals and writes them, or why there are none, into the card of a model's folder; that card."""
+    fitted, chosen, kept = ([clips[i] for i in part] for part in (split.fit, split.select, split.intervals))
+    why, found = find_obstacle(chosen, kept), None
+    if not why:
+        found = fit_intervals(predictor, fitted, chosen, kept, source, report)
+    taken = {clip.content_hash for clip in kept}, {clip.group for clip in kept}
+    names, brains = (
+        {part: [one for one in told if one not in gone] for part, told in parts.items()}
+        for parts, gone in zip((predictor.card.split, predictor.card.groups), taken, strict=True)
+    )
+    if kept:
+        names["intervals"] = [clip.content_hash for clip in kept]
+        brains["intervals"] = sorted(taken[1])
+    card = replace(predictor.card, intervals=found, no_intervals=why, split=names, groups=brains)
+    write_card(folder, card)
+    return card
+
+
+def read_said(predictor: Predictor, clip: Clip, source: str) -> Said:
+    """What the model says of a sequence, per unit stiffness; no motion is no force, as to `ForceReader`."""
+    shift, mask, grid = np.asarray(clip.displacement[source]), clip.mask, predictor.grid
+    sure, young = clip.sure(source), clip.young_kpa
+    kind = predictor.card.settings.target
+    density, _ = predictor.answer(shift, mask, young, sure)
+    still, _ = predictor.answer(np.zeros_like(shift[:1]), mask, young, np.ones_like(sure[:1]) * mask)
+    return Said(
+        motion=motion_features(shift, mask, sure, grid.extent_mm),
+        force=net_force(density, still[0], kind, grid) / young,
+        magnitude=length(density) / np.float32(young),
+        pitch_mm=grid.pitch_mm,
+    )
+
+
+def read_truth(clip: Clip, card: Card) -> Truth:
+    """The force that a sensor would feel, and the map as the network should say it."""
+    kind, parts = card.settings.target, 3 if card.settings.arch.output == "vector" else 1
+    true = np.stack([target(clip, t, kind, parts) for t in range(clip.frames)])
+    return Truth(clip.force / clip.young_kpa, length(true))
+
+
+def _motion(predictor: Predictor, clip: Clip, source: str) -> NDArray[np.float64]:
+    shift = np.asarray(clip.displacement[source])
+    return motion_features(shift, clip.mask, clip.sure(source), predictor.grid.extent_mm)

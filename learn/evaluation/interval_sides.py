@@ -1,0 +1,80 @@
+"""Who intervals are fitted on: sequences that were neither fitted nor chosen on, and are no test."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from learn.checkpoint import Card
+from learn.data.clips import Clip
+from learn.data.split import Split, groups
+from learn.uncertainty import conformal
+from learn.uncertainty.conformal import LEVELS
+
+LEAST_CHOSEN = 3
+"""Brains that the scale of the errors must be seen on."""
+
+
+def keep_back(clips: Sequence[Clip], split: Split, seed: int) -> Split:
+    """The split with half of the brains that choose the epoch kept for intervals instead.
+
+    They are drawn, not dealt by size, so that they are like any brain to come. Where half would be too few
+    for 90%, the split stays as it is.
+    """
+    number = groups(clips)
+    names = np.unique([number[i] for i in split.select])
+    if len(names) < 2 * conformal.least_units(LEVELS[0]):
+        return split
+    drawn = np.random.default_rng([seed, 0x1E7]).permutation(names)[: len(names) // 2]
+    kept = tuple(i for i in split.select if number[i] in drawn)
+    return replace(split, select=tuple(i for i in split.select if i not in kept), intervals=kept)
+
+
+def find_obstacle(chosen: Sequence[Clip], kept: Sequence[Clip]) -> str:
+    """Why there can be no intervals; empty if there can be.
+
+    `chosen`: sequences that the scale is fitted on; `kept`: those that the factors come from.
+    """
+    least = conformal.least_units(LEVELS[0])
+    parts = (
+        ("kept for intervals", kept, least),
+        ("left to choose the epoch, on which the scale of errors is fitted", chosen, LEAST_CHOSEN),
+    )
+    for what, part, needed in parts:
+        found = len(set(groups(part)))
+        if found < needed:
+            return f"{found} brains are {what}; {LEVELS[0]:.0%} intervals need {needed}"
+    return ""
+
+
+def find_sides(clips: Sequence[Clip], card: Card, test: Collection[str], from_test: bool) -> Split:
+    """Who of a dataset's sequences a trained model's intervals are fitted on, brain by brain.
+
+    Kept for it is what was already; else every brain that the model has not met and that has no test
+    sequence; with `from_test` half of the brains of the test instead, drawn, and the other half stays it.
+
+    Args:
+        clips: of the dataset.
+        card: of the model.
+        test: content hashes of those marked test, beside the card's.
+        from_test: whether test sequences may be taken.
+    """
+    number = groups(clips)
+
+    def brains(part: str, more: Collection[str] = ()) -> set[int]:
+        hashes, names = {*card.split.get(part, ()), *more}, set(card.groups.get(part, ()))
+        return {number[i] for i, c in enumerate(clips) if c.content_hash in hashes or c.group in names}
+
+    def of(chosen: Collection[int]) -> tuple[int, ...]:
+        return tuple(i for i in range(len(clips)) if number[i] in chosen)
+
+    fitted, chosen = brains("fit"), brains("select")
+    kept, tests = brains("intervals"), brains("test", test) - fitted - chosen
+    if from_test:
+        drawn = np.random.default_rng(card.settings.seed).permutation(sorted(tests))
+        kept = {int(brain) for brain in drawn[: len(tests) // 2]}
+    elif not kept:
+        kept = set(number) - fitted - chosen - tests
+    return Split(of(fitted), of(chosen), of(tests - kept), of(kept))

@@ -1,0 +1,115 @@
+"""What is known of a frame without its truth: how much moved, in what way, how surely it was followed."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+MOTION = ("log motion", "divergence", "uniform share", "spread", "confidence", "tissue share")
+DEPTH = ("log depth motion", "confidence of depth")
+"""What a second eye adds."""
+ANSWER = ("log size", "log area")
+"""Of the answer; the scale of an error is predicted from these too."""
+
+FLOOR_MM = 0.005
+"""Added to lengths of motion before their logarithm: under the noise of any flow."""
+RESTING_MM = 0.02
+"""Under this much motion [mm, root mean square] a frame says nothing of its world."""
+_REACH_MM = 10.0  # length that makes a divergence a motion
+_ACROSS = 32  # cells that are looked at, along an edge
+_LOW_SHARE = 0.02  # of the training data's force: below it all forces are alike
+
+
+def motion_names(depth: bool) -> tuple[str, ...]:
+    """Names of `motion_features`, of one eye or two."""
+    return MOTION + DEPTH * depth
+
+
+def motion_features(
+    displacement: NDArray[np.float32],
+    mask: NDArray[np.float32],
+    confidence: NDArray[np.float32] | None,
+    extent_mm: float,
+) -> Floats:
+    """Features of each frame, in the order of `motion_names`.
+
+    None needs the stiffness. Speed is not among them: sequences have no rate that a film shares.
+
+    Args:
+        displacement: (T, 2 or 3, N, N) mm.
+        mask: (N, N) 0/1, tissue.
+        confidence: (T, 1 or 2, N, N) in 0..1; None: 1.
+        extent_mm: width of the grid.
+
+    Returns:
+        (T, F).
+    """
+    inside = mask > 0
+    shift, weight = _coarse(displacement * inside, inside)
+    here = weight > 0.5
+    u = np.moveaxis(shift, 1, -1)[:, here].astype(np.float64)
+    squared = np.square(u[..., :2]).sum(-1)
+    motion = np.sqrt(squared.mean(1))
+    stretch = _REACH_MM * _divergence(shift[:, :2], here, extent_mm / weight.shape[0])
+    sure = np.ones((len(u), displacement.shape[1] - 1)) if confidence is None else _mean(confidence, inside)
+    columns = [
+        np.log(motion + FLOOR_MM),
+        np.log((stretch + FLOOR_MM) / (motion + FLOOR_MM)),
+        np.linalg.norm(u[..., :2].mean(1), axis=-1) / (motion + FLOOR_MM),
+        np.sqrt(squared).mean(1) / (motion + FLOOR_MM),
+        sure[:, 0],
+        np.full(len(u), inside.mean()),
+    ]
+    if displacement.shape[1] == 3:
+        depth = np.sqrt(np.square(u[..., 2]).mean(1))
+        columns += [np.log((depth + FLOOR_MM) / (motion + FLOOR_MM)), sure[:, 1]]
+    return np.stack(columns, axis=1)
+
+
+def is_moving(motion: Floats) -> NDArray[np.bool_]:
+    """(T,) whether a frame of `motion_features` (T, F) has moved enough to say anything."""
+    return np.asarray(motion[:, 0] > np.log(RESTING_MM + FLOOR_MM))
+
+
+def answer_features(size: Floats, magnitude: NDArray[np.float32], cell_mm2: float) -> Floats:
+    """Features of each frame's answer, in the order of `ANSWER`, (T, 2).
+
+    Args:
+        size: (T,) of the total force, as a share of the training data's.
+        magnitude: (T, N, N) of the map, any unit.
+        cell_mm2: area of a cell.
+    """
+    flat = magnitude.reshape(len(magnitude), -1).astype(np.float64)
+    area = cell_mm2 * flat.sum(1) ** 2 / np.maximum(np.square(flat).sum(1), 1e-30)
+    return np.stack([np.log(size + _LOW_SHARE), np.log(area + 1.0)], axis=1)
+
+
+def _coarse(values: NDArray[np.float32], inside: NDArray[np.bool_]) -> tuple[Floats, Floats]:
+    """(T, C, n, n) means over the tissue of blocks of cells, and the share of each that is tissue, (n, n)."""
+    block = max(1, len(inside) // _ACROSS)
+    n = len(inside) // block
+    cut = slice(0, n * block)
+
+    def pool(a: NDArray[np.floating | np.bool_]) -> Floats:
+        parts = a[..., cut, cut].reshape(*a.shape[:-2], n, block, n, block)
+        return np.asarray(parts.mean(axis=(-3, -1), dtype=np.float64))
+
+    share = pool(inside)
+    return pool(values) / np.where(share > 0, share, 1.0), share
+
+
+def _divergence(shift: Floats, here: NDArray[np.bool_], pitch_mm: float) -> Floats:
+    """(T,) root mean square of the divergence of (T, 2, n, n), by forward differences within the tissue."""
+    ends = here[:-1, :-1] & here[:-1, 1:] & here[1:, :-1]
+    if not ends.any():
+        return np.zeros(len(shift))
+    across = np.diff(shift[:, 0], axis=2)[:, :-1][:, ends]
+    down = np.diff(shift[:, 1], axis=1)[:, :, :-1][:, ends]
+    return np.asarray(np.sqrt(np.square((across + down) / pitch_mm).mean(1)))
+
+
+def _mean(confidence: NDArray[np.float32], inside: NDArray[np.bool_]) -> Floats:
+    """(T, C) mean over the tissue."""
+    return np.asarray(confidence[..., inside].mean(-1, dtype=np.float64))

@@ -1,0 +1,57 @@
+"""The size that an error is expected to have, from what is known without the truth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import FiniteFloat
+
+from synth.job.types import Positive
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Scale:
+    """A log-linear rule. Beyond the features it was fitted on it goes on as at their edge."""
+
+    intercept: FiniteFloat
+    slopes: tuple[FiniteFloat, ...]
+    low: tuple[FiniteFloat, ...]
+    """Smallest of each feature that it was fitted on."""
+    high: tuple[FiniteFloat, ...]
+    """Largest."""
+    least: Positive
+    """Below this no error is expected to be, in the unit of the error."""
+
+    def predict(self, features: Floats) -> Floats:
+        """(...,) > 0 for features (..., F)."""
+        held = np.clip(features, self.low, self.high)
+        return np.asarray(np.maximum(np.exp(self.intercept + held @ np.array(self.slopes)), self.least))
+
+
+def fit_scale(features: Floats, error: Floats, weight: Floats, least: float) -> Scale:
+    """Least squares on the logarithm of the error, slightly held back (ridge).
+
+    Args:
+        features: (n, F).
+        error: (n,) ≥ 0.
+        weight: (n,) > 0, of each.
+        least: what is added to an error before its logarithm, in its unit; > 0.
+    """
+    from sklearn.linear_model import Ridge  # a second to load, and not needed to apply what was fitted
+
+    middle, spread = features.mean(0), np.maximum(features.std(0), 1e-6)
+    rule = Ridge(alpha=1.0).fit(
+        (features - middle) / spread, np.log(error + least), sample_weight=weight / weight.mean()
+    )
+    slopes = rule.coef_ / spread
+    return Scale(
+        intercept=float(rule.intercept_ - middle @ slopes),
+        slopes=tuple(slopes.tolist()),
+        low=tuple(features.min(0).tolist()),
+        high=tuple(features.max(0).tolist()),
+        least=least,
+    )

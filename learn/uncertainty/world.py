@@ -1,0 +1,68 @@
+"""How far what a frame shows lies from everything that was fitted."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import FiniteFloat
+
+from learn.uncertainty.conformal import share_quantile
+from learn.uncertainty.features import is_moving
+from synth.job.types import Positive
+
+Floats = NDArray[np.float64]
+
+USUAL = 0.99
+"""Share of held-out frames that are no further than `World.usual`."""
+_LEAST_SPREAD = 0.05  # of a feature: logarithms and shares tell no worlds apart by less
+
+
+@dataclass(frozen=True)
+class World:
+    """The features of the fitted sequences, as one ellipsoid."""
+
+    middle: tuple[FiniteFloat, ...]
+    precision: tuple[tuple[FiniteFloat, ...], ...]
+    """(F, F), inverse covariance."""
+    usual: Positive
+    """Distance that 99% of held-out frames stay within, every sequence weighing alike."""
+
+    def distance(self, motion: Floats) -> Floats:
+        """(T,) Mahalanobis distance of frames (T, F) of `motion_features`; 0 of those that hardly moved."""
+        off = motion - np.array(self.middle)
+        squared = np.einsum("ti,ij,tj->t", off, np.array(self.precision), off)
+        return np.where(is_moving(motion), np.sqrt(np.maximum(squared, 0)), 0.0)
+
+    def widening(self, motion: Floats) -> Floats:
+        """(T,) what intervals are multiplied by: how many times further than usual a frame is, 1 at least."""
+        return np.maximum(self.distance(motion) / self.usual, 1.0)
+
+
+def fit_world(fitted: Sequence[Floats], held_out: Sequence[Floats]) -> World | None:
+    """The ellipsoid of the moving frames of the fitted sequences; None if either hold none.
+
+    Covariance with the shrinkage of Ledoit and Wolf (2004), on features of unit variance.
+
+    Args:
+        fitted: `motion_features` of each sequence, (T, F).
+        held_out: the same of sequences that were not fitted.
+    """
+    from sklearn.covariance import LedoitWolf  # a second to load, and not needed to apply what was fitted
+
+    moved = [motion[is_moving(motion)] for motion in fitted]
+    others = [motion for motion in held_out if is_moving(motion).any()]
+    if sum(map(len, moved)) < 2 or not others:
+        return None
+    seen = np.concatenate(moved)
+    spread = np.maximum(seen.std(0), _LEAST_SPREAD)
+    shrunk = LedoitWolf().fit(seen / spread).covariance_
+    # Where nothing varied there is no variance to invert.
+    least = (_LEAST_SPREAD / spread) ** 2
+    precision = np.linalg.inv(shrunk + np.diag(np.maximum(least - np.diag(shrunk), 0.0)))
+    precision = precision / np.outer(spread, spread)
+    world = World(tuple(seen.mean(0).tolist()), tuple(map(tuple, precision.tolist())), 1.0)
+    usual = share_quantile([world.distance(m)[is_moving(m)] for m in others], USUAL)
+    return World(world.middle, world.precision, max(usual, 1e-6))

@@ -1,0 +1,48 @@
+"""Intervals written by hand: half widths that are the same for every frame."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+
+from learn.checkpoint import read_card, write_card
+from learn.uncertainty.features import ANSWER, motion_names
+from learn.uncertainty.intervals import Intervals, Spread
+from learn.uncertainty.scale import Scale
+from learn.uncertainty.world import World
+
+FACTORS = {"0.9": 2.0, "0.68": 1.0}
+
+
+def make(
+    size: float = 5.0,
+    axes: tuple[float, float, float] = (3.0, 4.0, 50.0),
+    density: float = 0.5,
+    usual: float = 1e6,
+    source: str = "recovered",
+) -> Intervals:
+    """Half widths of the 68% interval, per unit stiffness; half of those of the 90% one.
+
+    `usual`: distance, in logarithm of motion from 1 mm, beyond which a frame is of another world.
+    """
+    names = (*motion_names(False), *ANSWER)
+
+    def spread(half: float, features: int) -> Spread:
+        scale = Scale(float(np.log(half)), (0.0,) * features, (-1e9,) * features, (1e9,) * features, 1e-9)
+        return Spread(scale, dict(FACTORS))
+
+    count = len(names) - len(ANSWER)
+    along = tuple(tuple(float(i == j == 0) for j in range(count)) for i in range(count))
+    x, y, z = (spread(half, len(names)) for half in axes)
+    return Intervals(
+        names, 100.0, 1.0, spread(size, len(names)), (x, y, z), spread(density, len(names) + 2),
+        World((0.0,) * count, along, usual), source, 19, 19,
+    )  # fmt: skip
+
+
+def give(folder: Path, intervals: Intervals) -> Path:
+    """The model's folder, its card with these intervals."""
+    write_card(folder, dataclasses.replace(read_card(folder), intervals=intervals))
+    return folder

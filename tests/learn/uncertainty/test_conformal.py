@@ -1,0 +1,83 @@
+"""Coverage of hierarchical split conformal prediction on data whose truth is a formula."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from learn.uncertainty import conformal
+
+Floats = NDArray[np.float64]
+
+DRAWS = 2000
+
+
+def coverage(
+    units: int, frames: int, own: float, level: float, seed: int, naive: bool = False
+) -> tuple[float, float]:
+    """Share of a new unit's frames within the quantile, mean over draws, and its standard error.
+
+    A frame's score is the size of its unit's error plus `own` times one of its own.
+    """
+    rng, held = np.random.default_rng(seed), np.empty(DRAWS)
+    for k in range(DRAWS):
+        errors = rng.normal(size=(units + 1, 1)) + own * rng.normal(size=(units + 1, frames))
+        scores = np.abs(errors)
+        if naive:
+            pooled = np.sort(scores[:-1].ravel())
+            bound = pooled[math.ceil((len(pooled) + 1) * level) - 1]
+        else:
+            bound = conformal.quantile(list(scores[:-1]), level)
+        held[k] = (scores[-1] <= bound).mean()
+    return float(held.mean()), float(held.std() / math.sqrt(DRAWS))
+
+
+@pytest.mark.parametrize(("units", "level"), [(9, 0.9), (12, 0.9), (19, 0.9), (24, 0.68)])
+def test_where_a_unit_errs_as_one_coverage_is_exactly_that_of_ranks(units: int, level: float) -> None:
+    found, error = coverage(units, 6, 0.0, level, seed=units)
+    exact = math.ceil((units + 1) * level - 1e-9) / (units + 1)
+    assert exact >= level
+    assert found == pytest.approx(exact, abs=3.5 * error)
+
+
+@pytest.mark.parametrize("own", [0.3, 3.0])
+def test_it_covers_what_it_says_however_frames_go_together(own: float) -> None:
+    found, error = coverage(19, 6, own, 0.9, seed=1)
+    assert found >= 0.9 - 3 * error
+    assert found <= 0.9 + 1 / 20 + 3 * error
+
+
+def test_frames_pooled_as_if_independent_cover_too_little() -> None:
+    found, error = coverage(12, 40, 0.05, 0.9, seed=2, naive=True)
+    assert found < 0.9 - 6 * error
+    held, error = coverage(12, 40, 0.05, 0.9, seed=2)
+    assert held >= 0.9 - 3 * error
+
+
+def test_long_easy_units_do_not_outvote_short_hard_ones() -> None:
+    """Every unit weighs alike: a frame of a new unit, drawn unit first, is what coverage is of."""
+    rng, held, pooled = np.random.default_rng(3), [], []
+    for _ in range(1000):
+        hard = rng.random(21) < 0.3
+        scores = [np.abs(rng.normal(size=4 if h else 60)) * (10 if h else 1) for h in hard]
+        held.append((scores[-1] <= conformal.quantile(scores[:-1], 0.9)).mean())
+        pooled.append((scores[-1] <= np.quantile(np.concatenate(scores[:-1]), 0.9)).mean())
+    assert np.mean(held) >= 0.9 - 3 * np.std(held) / math.sqrt(len(held))
+    assert np.mean(pooled) < 0.82
+
+
+@pytest.mark.parametrize(("level", "least"), [(0.9, 9), (0.68, 3), (0.5, 1), (0.95, 19)])
+def test_too_few_units_have_no_finite_bound(level: float, least: int) -> None:
+    assert conformal.least_units(level) == least
+    scores = [np.array([1.0, 2.0])] * least
+    assert conformal.quantile(scores, level) == 2.0
+    assert math.isinf(conformal.quantile(scores[1:], level)) if least > 1 else True
+
+
+def test_the_plain_quantile_is_numpy_s_where_units_are_alike() -> None:
+    values = np.random.default_rng(4).normal(size=(50, 20))
+    found = conformal.share_quantile(list(values), 0.99)
+    assert found == np.quantile(values, 0.99, method="inverted_cdf")

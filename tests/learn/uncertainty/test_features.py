@@ -1,0 +1,131 @@
+"""Features of motions that are formulas, and the distance from clouds of known covariance."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from learn.uncertainty.features import (
+    FLOOR_MM,
+    MOTION,
+    answer_features,
+    is_moving,
+    motion_features,
+    motion_names,
+)
+from learn.uncertainty.scale import fit_scale
+from learn.uncertainty.world import World, fit_world
+
+Floats = NDArray[np.float64]
+
+EXTENT_MM = 32.0
+
+
+def field(n: int, kind: str) -> NDArray[np.float32]:
+    """(1, 2, n, n) mm: the whole picture moved by (0.3, 0.4) mm, or a stretch of 2% in x and 1% in y."""
+    at = (np.arange(n) - (n - 1) / 2) * EXTENT_MM / n
+    x, y = np.meshgrid(at, at)
+    shift = (0.3 + 0 * x, 0.4 + 0 * y) if kind == "moved" else (0.02 * x, 0.01 * y)
+    return np.stack(shift)[None].astype(np.float32)
+
+
+def named(features: Floats) -> dict[str, float]:
+    return dict(zip(MOTION, features[0].tolist(), strict=True))
+
+
+@pytest.mark.parametrize("n", [32, 64, 256])
+def test_a_picture_that_moves_as_one_does_not_stretch(n: int) -> None:
+    found = named(motion_features(field(n, "moved"), np.ones((n, n), np.float32), None, EXTENT_MM))
+    share = 0.5 / (0.5 + FLOOR_MM)
+    assert found["log motion"] == pytest.approx(np.log(0.5 + FLOOR_MM), abs=1e-6)
+    assert found["uniform share"] == pytest.approx(share, abs=1e-5)
+    assert found["spread"] == pytest.approx(share, abs=1e-5)
+    assert found["divergence"] == pytest.approx(np.log(FLOOR_MM / (0.5 + FLOOR_MM)), abs=1e-2)
+    assert (found["confidence"], found["tissue share"]) == (1, 1)
+
+
+@pytest.mark.parametrize("n", [32, 64, 256])
+def test_a_stretch_has_the_divergence_it_has(n: int) -> None:
+    mask = np.ones((n, n), np.float32)
+    mask[: n // 2] = 0
+    sure = np.full((1, 1, n, n), 0.25, np.float32)
+    shift = np.where(mask > 0, field(n, "stretched"), np.float32(99))
+    found = named(motion_features(shift, mask, sure, EXTENT_MM))
+    # Mean squares over the lower half, of width 32 and height 16 mm, the centre being at its upper edge.
+    motion = np.sqrt(0.02**2 * 32**2 / 12 + 0.01**2 * 16**2 / 3)
+    assert found["log motion"] == pytest.approx(np.log(motion + FLOOR_MM), abs=0.01)
+    expected = np.log((10 * 0.03 + FLOOR_MM) / (motion + FLOOR_MM))
+    assert found["divergence"] == pytest.approx(expected, abs=0.02)
+    assert (found["confidence"], found["tissue share"]) == (0.25, 0.5)
+
+
+def test_a_second_eye_adds_depth() -> None:
+    shift = np.concatenate([field(32, "moved"), np.full((1, 1, 32, 32), -0.5, np.float32)], axis=1)
+    sure = np.ones((1, 2, 32, 32), np.float32) * np.array([1, 0.5], np.float32)[:, None, None]
+    found = motion_features(shift, np.ones((32, 32), np.float32), sure, EXTENT_MM)[0]
+    assert dict(zip(motion_names(True), found, strict=True))["log depth motion"] == pytest.approx(0, abs=1e-6)
+    assert found[-1] == 0.5
+
+
+def test_stillness_is_no_motion_and_no_number_is_lost() -> None:
+    still = motion_features(np.zeros((2, 2, 32, 32), np.float32), np.ones((32, 32), np.float32), None, 32.0)
+    assert np.isfinite(still).all()
+    assert not is_moving(still).any()
+    answer = answer_features(np.zeros(2), np.zeros((2, 8, 8), np.float32), 1.0)
+    assert np.isfinite(answer).all()
+
+
+def test_the_area_of_an_answer_is_that_of_a_plateau() -> None:
+    plateau = np.zeros((1, 64, 64), np.float32)
+    plateau[:, 10:20, 30:40] = 7.0
+    assert np.exp(answer_features(np.ones(1), plateau, 0.25)[0, 1]) == pytest.approx(100 * 0.25 + 1)
+
+
+def cloud(rng: np.random.Generator, sequences: int, frames: int = 10) -> list[Floats]:
+    """Moving frames of known middle and covariance."""
+    mix = np.array([[1.0, 0.0, 0.0], [0.5, 0.7, 0.0], [-0.2, 0.1, 0.4]])
+    return [np.array([3.0, 1.0, -2.0]) + rng.normal(size=(frames, 3)) @ mix.T for _ in range(sequences)]
+
+
+def test_distance_is_mahalanobis_and_its_99th_that_of_chi_squared() -> None:
+    rng = np.random.default_rng(0)
+    world = fit_world(cloud(rng, 1000), cloud(rng, 1000))
+    assert world is not None
+    assert world.usual == pytest.approx(np.sqrt(chi2.ppf(0.99, 3)), rel=0.03)
+    mix = np.array([[1.0, 0.0, 0.0], [0.5, 0.7, 0.0], [-0.2, 0.1, 0.4]])
+    far = np.array([[3.0, 1.0, -2.0]]) + 9 * mix[:, 2]
+    assert world.distance(far)[0] == pytest.approx(9.0, rel=0.03)
+    assert world.widening(far)[0] == pytest.approx(9.0 / world.usual, rel=0.03)
+    assert world.widening(np.array([[3.0, 1.0, -2.0]]))[0] == 1
+
+
+def test_what_never_varied_is_far_when_it_does_and_not_infinitely() -> None:
+    rng = np.random.default_rng(1)
+    flat = [np.column_stack([one[:, 0], np.ones(len(one))]) for one in cloud(rng, 50)]
+    world = fit_world(flat, flat)
+    assert world is not None
+    other = world.distance(np.array([[3.0, 1.5]]))[0]
+    assert world.usual < other < 100
+
+
+def test_a_resting_frame_is_of_no_world() -> None:
+    rng = np.random.default_rng(2)
+    world = fit_world(cloud(rng, 20), cloud(rng, 20))
+    assert world is not None
+    assert world.distance(np.array([[-5.0, 80.0, 80.0]]))[0] == 0
+    resting = [np.full((4, 3), -5.0)]
+    assert fit_world(resting, cloud(rng, 3)) is None
+    assert fit_world(cloud(rng, 3), resting) is None
+
+
+def test_the_scale_of_an_error_is_found_and_held_at_the_edge() -> None:
+    rng = np.random.default_rng(3)
+    x = rng.uniform(-1, 1, (4000, 2))
+    error = np.exp(0.5 + 1.5 * x[:, 0]) * np.exp(0.2 * rng.normal(size=4000))
+    scale = fit_scale(x, error, np.ones(4000), 1e-6)
+    assert scale.slopes == pytest.approx((1.5, 0.0), abs=0.02)
+    assert scale.predict(np.zeros(2)) == pytest.approx(np.exp(0.5), rel=0.02)
+    assert scale.predict(np.array([9.0, 0.0])) == pytest.approx(np.exp(2.0), rel=0.03)
+    assert World((0.0,), ((1.0,),), 1.0).distance(np.array([[2.0]]))[0] == 2
