@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from learn.data.clips import FIELDS, has_depth
 from learn.inference import video
+from learn.inference.ends import Ends
 from learn.inference.force_reader import ForceReader
 from learn.inference.mask_files import MaskFiles
 from learn.inference.predict import Predictor, View
@@ -232,11 +233,15 @@ def apply(predictor: Predictor, motion: Motion, young_kpa: float | None = None) 
     `density` (T, C, N, N) mN/mm² and `head_mn` (T, C) of one with a total-force head; `mask` (N, N),
     `pitch_mm`, `centre_px` (x, y) of the grid in the film's own pixels, `centres_px` (T, 2) the same by frame
     (mask and centre are the last frame's; they change only where the tissue is wider than the grid),
-    `young_kpa`, `young_known`, and `notes`: what was done to the film that its user should know.
+    `young_kpa`, `young_known`, and `notes`: what was done to the film that its user should know. Of a model
+    with intervals also `low_mn` and `high_mn` (T,), ends of the 90% interval of the total force's size,
+    `low68_mn` and `high68_mn` (T,), `force_low_mn` and `force_high_mn` (T, 3), 90%, of its components,
+    `density_low` and `density_high` (T, N, N), 90%, of the length of the map.
     """
     young = young_kpa if young_kpa is not None else motion.young_kpa
     reader = ForceReader(predictor, motion.tissue, motion.scale_mm_per_px, young)
     frames, times, forces, maps, trusted = [], [], [], [], []
+    ends = Ends(reader)
     for step in motion.steps:
         force, said = reader.read(step.flow, step.confidence, step.moved)
         frames.append(step.frame)
@@ -244,6 +249,7 @@ def apply(predictor: Predictor, motion: Motion, young_kpa: float | None = None) 
         forces.append(force if step.trusted else np.full(3, np.nan))
         trusted.append(step.trusted)
         maps.append(said)
+        ends.add(force, said, step.trusted)
     still = motion.again()
     if still is not None:
         return apply(predictor, still, young_kpa)
@@ -275,6 +281,7 @@ def apply(predictor: Predictor, motion: Motion, young_kpa: float | None = None) 
         notes.append(
             f"{trusted.count(False)} of {len(trusted)} frames could not be followed: they have no force"
         )
+    out |= ends.stacked(np.array(trusted))
     out["notes"] = np.array(notes, dtype=str)
     heads = [m.head_mn for m in maps if m.head_mn is not None]
     if heads:
