@@ -58,7 +58,7 @@ def test_columns_coverage_and_width(make: Maker, tmp_path: Path) -> None:
     assert tree["curve"]["high_mn"] == {"told": [60 + HALF] * count}
     assert [name for name, one in tree["methods"].items() if "interval" in one] == ["told"]
     bands = [line for line in charts.draw_force(result)["data"] if line.get("fill") == "tonexty"]
-    assert [line["name"] for line in bands] == ["90% interval"]
+    assert [line["name"] for line in bands] == ["90% interval", "±8% scale, stiffness"]
     assert bands[0]["y"] == [60 + HALF] * count
     report.write_report(result, tmp_path / "report.html")
     assert "90% interval is" in (tmp_path / "report.html").read_text()
