@@ -1,5 +1,5 @@
-"""`learn train | eval | predict | calibrate | export`: from a dataset to a model, honest numbers, forces
-and a file."""
+"""`learn train | intervals | eval | predict | calibrate | export`: from a dataset to a model, honest numbers,
+forces and a file."""
 
 from __future__ import annotations
 
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from learn.checkpoint import Card
     from learn.data.clips import Clip
     from learn.data.split import Split
+    from learn.evaluation.coverage import Coverage
     from learn.evaluation.evaluate import Report
     from learn.evaluation.metrics import Metric
     from learn.evaluation.statistics import Paired
@@ -117,7 +118,7 @@ def train_command(
         clips, split, settings = _divided(dataset, settings, named(preset), cache, fixed=folds is not None)
         card, first = _train(clips, split, settings, out, accelerator, devices, quiet=json)
     if first:
-        _tell_trained(card, settings, out, json)
+        _tell_trained(_bounded(card, clips, split, out), settings, out, json)
 
 
 def _tell_trained(card: Card, settings: Settings, out: Path, json: bool) -> None:
@@ -130,7 +131,7 @@ def _tell_trained(card: Card, settings: Settings, out: Path, json: bool) -> None
         _console.print(
             f"Model in {out}: epoch {card.epoch} of {settings.epochs}, R² {card.score:.3f} on "
             f"{result['select']} select sequences; fitted on {result['fit']}, "
-            f"{result['test']} kept for `learn eval`."
+            f"{result['test']} kept for `learn eval`. {_told_of_intervals(card)}"
         )
 
 
@@ -143,6 +144,7 @@ def _divided(
     """
     from learn.data.clips import load_clips, sources
     from learn.data.split import groups, keep_written, nested, ungrouped
+    from learn.evaluation.interval_sides import keep_back
     from learn.settings import replace
     from synth.dataset.index import written_sides
     from synth.dataset.split import read_rule
@@ -167,11 +169,11 @@ def _divided(
         _console.print(
             "The dataset's own split: what `synth split` marks test is neither fitted nor chosen on."
         )
-        return clips, keep_written(clips, sides, settings.seed), settings
+        return clips, keep_back(clips, keep_written(clips, sides, settings.seed), settings.seed), settings
     if not fixed:
         settings = replace(settings, folds=min(settings.folds, len(set(groups(clips)))))
     split = nested(clips, settings.folds, settings.fold, settings.seed, settings.held_out_family)
-    return clips, split, settings
+    return clips, keep_back(clips, split, settings.seed), settings
 
 
 def _train(
@@ -202,6 +204,79 @@ def _train(
     return card, fabric.is_global_zero
 
 
+def _bounded(card: Card, clips: list[Clip], split: Split, out: Path) -> Card:
+    """The card of a trained model with its intervals, fitted if they aren't yet, or why there are none."""
+    from learn.evaluation.fit_intervals import add_intervals
+    from learn.inference.predict import load_predictor
+
+    if card.intervals is not None or not card.weights_hash:
+        return card
+    with _bar("Fitting intervals") as tell:
+        return add_intervals(out, load_predictor(out), clips, split, report=tell)
+
+
+def _told_of_intervals(card: Card) -> str:
+    found = card.intervals
+    if found is None:
+        return f"No intervals: {card.no_intervals or 'no epoch was kept'}."
+    return f"Intervals from {found.sequences} sequences of {found.units} brains, for {found.source} motion."
+
+
+@app.command("intervals", epilog="Example: learn intervals model out")
+def intervals_command(
+    model: Annotated[Path, typer.Argument(help="Model folder; its card gets them.")],
+    datasets: Annotated[
+        list[Path], typer.Argument(help="The training data, and any with sequences that the model never met.")
+    ],
+    input: Annotated[str | None, typer.Option(help=_STORED.replace("what is recovered", "as scored"))] = None,
+    from_test: Annotated[
+        bool,
+        typer.Option(
+            "--from-test", help="Take half of the test's brains; `learn eval` leaves them out then."
+        ),
+    ] = False,
+    threads: Threads = None,
+    cache: Cache = None,
+    json: Json = False,
+) -> None:
+    """Fit how far off a trained model's answers may be, on sequences that it was not fitted or chosen on."""
+    from learn.data.clips import load_clips, scored
+    from learn.data.split import ungrouped
+    from learn.evaluation.fit_intervals import add_intervals
+    from learn.evaluation.interval_sides import find_obstacle, find_sides
+    from learn.inference.predict import load_predictor
+    from learn.training.threads import set_threads
+    from synth.dataset.index import written_sides
+
+    set_threads(threads)
+    predictor = load_predictor(model)
+    source = predictor.readable(input or scored(predictor.card.settings.input))
+    with _bar("Reading sequences") as tell:
+        read = [load_clips(one, predictor.grid, (source,), cache=cache, report=tell) for one in datasets]
+    clips = [clip for part in read for clip in part]
+    if predictor.card.settings.share_anatomy:
+        clips = ungrouped(clips)
+    marked = [(written_sides(one) or {}).items() for one in datasets]
+    tests = [name for part in marked for name, side in part if side == "test"]
+    split = find_sides(clips, predictor.card, tests, from_test)
+    if not split.fit:
+        raise UserError(
+            f"{datasets[0]}: holds no sequence that {model} was fitted on; name its training data"
+        )
+    why = find_obstacle([clips[i] for i in split.select], [clips[i] for i in split.intervals])
+    if why:
+        hint = "" if from_test else "; name a dataset that it never met, or say --from-test"
+        raise UserError(f"{model}: {why}{hint}")
+    with _bar("Fitting intervals") as tell:
+        card = add_intervals(model, predictor, clips, split, source, tell)
+    assert card.intervals is not None
+    if json:
+        found = {"units": card.intervals.units, "sequences": card.intervals.sequences, "input": source}
+        print(json_.dumps({"model": str(model), **found}))
+    else:
+        _console.print(_told_of_intervals(card))
+
+
 def _log(numbers: dict[str, float]) -> None:
     _console.print(
         f"epoch {numbers['epoch']:.0f}: loss {numbers['loss']:.4f}, select R² {numbers['select_r2']:.3f}, "
@@ -230,6 +305,7 @@ def eval_command(
     """Score a model on the sequences it has not seen; forces in mN."""
     from learn.data.clips import load_clips, scored
     from learn.data.split import ungrouped
+    from learn.evaluation.coverage import cover
     from learn.evaluation.evaluate import compare, evaluate
     from learn.inference.predict import load_predictor
     from learn.training.threads import set_threads
@@ -255,14 +331,19 @@ def eval_command(
         report = evaluate(predictor, chosen, source, tell)
         second = None if other is None else evaluate(other, chosen, source, tell)
     pairs = {} if second is None else compare(second, report)
+    covered = [] if predictor.card.intervals is None else cover(predictor, chosen, source)
     if json:
         found = {"model": str(model), "input": source, **report.as_dict()}
+        if covered:
+            found["coverage"] = [one.as_dict() for one in covered]
         if second is not None:
             found["against"] = {"model": str(against), "paired": {k: asdict(v) for k, v in pairs.items()}}
         print(json_.dumps(found))
         return
     screen = Console(markup=False)  # "[mN]" is a unit
     screen.print(_table(report, source, all))
+    if covered:
+        screen.print(_coverage(covered))
     if second is not None:
         screen.print(_pairs(pairs, str(against), predictor.card))
 
@@ -427,6 +508,29 @@ def _table(report: Report, source: str, seen: bool) -> Table:
         if key in sure and sure[key].low == sure[key].low:
             cells[0] += f" [{_cell(metric, sure[key].low)}, {_cell(metric, sure[key].high)}]"
         table.add_row(_label(metric, report.card), *cells)
+    return table
+
+
+def _coverage(covered: list[Coverage]) -> Table:
+    """Whether the model's intervals hold, and how wide they are."""
+    table = Table(title="intervals", title_justify="left")
+    for head in ("", *(f"{one.level:.0%}" for one in covered)):
+        table.add_column(head, justify="right" if head else "left")
+    shares = [
+        {
+            "force within": one.size,
+            **{f"{axis} within": share for axis, share in zip("xyz", one.axes, strict=True)},
+            "map within": one.map,
+            "map within, contact": one.contact,
+        }
+        for one in covered
+    ]
+    for name in shares[0]:
+        held = [share[name] for share in shares]
+        table.add_row(name, *(f"{s.mean:.0%} [{s.low:.0%}, {s.high:.0%}]" for s in held))
+    table.add_row("width of the force's [mN]", *(f"{one.width_mn:.3g}" for one in covered))
+    table.add_row("the same over the peak", *(f"{one.width_of_peak:.0%}" for one in covered))
+    table.add_row("moving frames of an unseen world", *(f"{one.unseen:.0%}" for one in covered))
     return table
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -74,9 +75,19 @@ class Model:
         picture: bool,
     ) -> Answer:
         from learn.inference.force_reader import ForceReader
+        from learn.uncertainty.intervals import LEVEL
 
         if self._reader is None or self._reader[0] is not scene:
             reader = ForceReader(self.predictor, scene.tissue, scene.scale_mm_per_px, scene.young_kpa)
             self._reader = scene, reader
-        force, said = self._reader[1].read(flow, confidence, moved)
-        return Answer(force, said.to_image() if picture else None)
+        reader = self._reader[1]
+        force, said = reader.read(flow, confidence, moved)
+        answer = Answer(force, said.to_image() if picture else None)
+        # Which frames are lost, and show no world, is known to who asks.
+        bounds = reader.bound(force, said, counted=False)
+        if bounds is None:
+            return answer
+        band = bounds[LEVEL]
+        return replace(
+            answer, low_mn=float(band.low[0]), high_mn=float(band.high[0]), distance=reader.distance(said)
+        )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
@@ -29,6 +30,12 @@ class Answer:
     """(3,) force on the tissue in camera axes [mN]; a method of magnitudes only puts it into x, rest NaN."""
     density: NDArray[np.float32] | None = None
     """(H, W) size of the force density on the rest frame's pixels [kPa], for the pictures."""
+    low_mn: float = math.nan
+    """Lower end of the 90% interval of the force's size; NaN of a method that knows none."""
+    high_mn: float = math.nan
+    """Upper end."""
+    distance: float = math.nan
+    """Of the frame from what the method was fitted on, as of `ForceReader.distance`; NaN as that."""
 
     @property
     def size_mn(self) -> float:

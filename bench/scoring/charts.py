@@ -17,6 +17,7 @@ from bench.sensor.clock_sync import Offset
 Figure = dict[str, Any]
 
 SENSOR, MAIN, BAND, RED = "#3b3f46", "#1f6feb", "rgba(31,111,235,0.15)", "#c2352b"
+INTERVAL = "rgba(43,122,75,0.15)"
 OTHERS = ("#8a6d00", "#2b7a4b", "#a04f9c", "#b8562b", "#5b6b7a", "#00798c", "#7a5195", "#6b8e23", "#a61c3c")
 
 
@@ -26,18 +27,13 @@ def draw_force(result: Result) -> Figure:
     time, curves = _list(result.time_s), scale_curves(result)
     main = curves.methods[result.main]
     data: list[Figure] = []
+    bound = result.methods[result.main]
+    if result.absolute and bound.low_mn is not None and bound.high_mn is not None:
+        data += _band(time, bound.low_mn, bound.high_mn, f"{bound.held['level']:.0%} interval", INTERVAL)
     spread = 1.96 * result.relative_uncertainty
-    # A filled band knows no gaps: one for each run of frames.
-    for number, (first, last) in enumerate(_spans(np.isfinite(main)) if spread > 0 else ()):
-        part = slice(first, last + 1)
-        low, high = main[part] * (1 - min(spread, 1.0)), main[part] * (1 + spread)
-        data += [
-            _line(time[part], low, "", "rgba(0,0,0,0)", showlegend=False, hoverinfo="skip"),
-            _line(
-                time[part], high, f"±{100 * spread:.0f}% scale, stiffness", "rgba(0,0,0,0)",
-                fill="tonexty", fillcolor=BAND, hoverinfo="skip", showlegend=number == 0, legendgroup="band",
-            ),
-        ]  # fmt: skip
+    if spread > 0:
+        low, high = main * (1 - min(spread, 1.0)), main * (1 + spread)
+        data += _band(time, low, high, f"±{100 * spread:.0f}% scale, stiffness", BAND)
     if curves.sensor is not None:
         data.append(_line(time, curves.sensor, "sensor", SENSOR, width=2.5))
     data.append(_line(time, main, result.main, MAIN, width=2.5))
@@ -56,6 +52,23 @@ def draw_force(result: Result) -> Figure:
     figure = _figure(data, "time [s]", curves.axis, legend=True)
     figure["layout"]["shapes"] = [_shade(result.time_s, run) for run in _spans(result.lost)]
     return figure
+
+
+def _band(
+    time: Sequence[float | None], low: NDArray[np.float64], high: NDArray[np.float64], name: str, colour: str
+) -> list[Figure]:
+    """The space between two curves (T,). A filled band knows no gaps: one for each run of frames."""
+    data: list[Figure] = []
+    for number, (first, last) in enumerate(_spans(np.isfinite(low) & np.isfinite(high))):
+        part = slice(first, last + 1)
+        data += [
+            _line(time[part], low[part], "", "rgba(0,0,0,0)", showlegend=False, hoverinfo="skip"),
+            _line(
+                time[part], high[part], name, "rgba(0,0,0,0)",
+                fill="tonexty", fillcolor=colour, hoverinfo="skip", showlegend=number == 0, legendgroup=name,
+            ),
+        ]  # fmt: skip
+    return data
 
 
 @dataclass(frozen=True)

@@ -258,10 +258,10 @@ def score_demo(dataset: Path, model: Path, out: Path, settings: Settings) -> Res
 
 def find_unseen(dataset: Path, model: Path) -> Sequence:
     """The first sequence that the model was neither fitted nor chosen on. UserError if there is none."""
-    from learn.checkpoint import read_card
+    from learn.checkpoint import SEEN, read_card
 
     split = read_card(model).split
-    seen = {name for part in ("fit", "select") for name in split.get(part, [])}
+    seen = {name for part in SEEN for name in split.get(part, [])}
     for sequence in Dataset(dataset):
         if sequence.attrs["content_hash"] not in seen:
             return sequence

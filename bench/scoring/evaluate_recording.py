@@ -6,7 +6,7 @@ import json
 import math
 import platform
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,15 +19,17 @@ from bench.methods.flow_size import FlowSize, flow_sizes
 from bench.methods.protocol import Method
 from bench.recording import clocks
 from bench.recording.folder import Force, Recording
-from bench.recording.meta import Sensor, Span
+from bench.recording.meta import Meta, Sensor, Span
 from bench.recording.pixel_scale import Scale
 from bench.scoring import metrics
 from bench.sensor import clock_sync, force_sensor
 from bench.sensor.clock_sync import Offset
 from bench.sensor.rotation import Turn, find_turn
 from bench.tracking.tracking import Progress, Tracked, track_recording
+from learn.inference.force_reader import describe_unseen
 from learn.inference.video_flow import FlowHere
 from learn.inference.video_flow import Settings as Settings
+from learn.uncertainty.intervals import LEVEL
 from synth.dataset.folder import write_whole
 from synth.system import packages
 
@@ -73,6 +75,12 @@ class Scored:
     """Interval of the main method's MAE minus this one's, paired; None for the main method."""
     gain: Gain | None = None
     """Of a baseline that has no newtons of its own; None for all others."""
+    low_mn: Curve | None = None
+    """(T,) lower end of the 90% interval of the size [mN]; None of a method that knows none."""
+    high_mn: Curve | None = None
+    """(T,) upper end."""
+    held: dict[str, float] = field(default_factory=dict)
+    """What that interval came to: `level`, mean `width_mn` and, where the sensor says, `coverage`."""
 
 
 @dataclass(frozen=True)
@@ -157,6 +165,7 @@ def evaluate_recording(
         notes.append(_NO_YOUNG)
     kept = _kept(recording, time, notes)
     forces, lost = _with_gaps(done, notes)
+    bounds = _bounds(done, lost, notes)
     gains = _brought_to_newtons(forces, methods, truth, kept, _pressed(recording, time), main)
     return Result(
         recording=recording.name,
@@ -165,7 +174,7 @@ def evaluate_recording(
         sensor_mn=truth.size_mn,
         sensor_axes_mn=truth.axes_mn,
         methods={
-            name: replace(one, gain=gains.get(name))
+            name: _bounded(replace(one, gain=gains.get(name)), bounds.get(name), truth.size_mn, kept, meta)
             for name, one in _all_scored(time, forces, main, truth, kept, recording).items()
         },
         scale=scale,
@@ -193,6 +202,34 @@ def _with_gaps(done: Tracked, notes: list[str]) -> tuple[dict[str, Curve], NDArr
     for force in forces.values():
         force[lost] = np.nan
     return forces, lost
+
+
+def _bounds(done: Tracked, lost: NDArray[np.bool_], notes: list[str]) -> dict[str, Curve]:
+    """Ends of each method's interval, (T, 2), NaN in lost frames; of the methods that know any."""
+    found = {}
+    for name, rows in done.bounds.items():
+        table = np.array(rows, np.float64)
+        table[lost] = np.nan
+        if np.isfinite(table[:, 0]).any():
+            found[name] = table[:, :2]
+            notes += [f"{name}: {said}" for said in describe_unseen(table[np.isfinite(table[:, 2]), 2])]
+    return found
+
+
+def _bounded(
+    one: Scored, ends: Curve | None, sensor_mn: Curve | None, kept: NDArray[np.bool_], meta: Meta
+) -> Scored:
+    """A method's scores with its intervals, (T, 2), and what they hold of the sensor's scored frames."""
+    if ends is None:
+        return one
+    low, high = ends[:, 0], ends[:, 1]
+    said = kept & np.isfinite(low)
+    held = {"level": LEVEL, "width_mn": float((high - low)[said].mean()) if said.any() else math.nan}
+    if sensor_mn is not None and meta.young_kpa is not None:
+        said &= np.isfinite(sensor_mn)
+        within = (sensor_mn >= low) & (sensor_mn <= high)
+        held["coverage"] = float(within[said].mean()) if said.any() else math.nan
+    return replace(one, low_mn=low, high_mn=high, held=held)
 
 
 def _all_scored(
@@ -397,6 +434,7 @@ def as_json(result: Result) -> dict[str, Any]:
         "scores": result.methods[result.main].scores,
         "methods": {
             name: {
+                **({"interval": m.held} if m.held else {}),
                 "scores": m.scores,
                 "intervals": m.intervals,
                 "calibrated": m.calibrated,
@@ -432,11 +470,17 @@ def as_json(result: Result) -> dict[str, Any]:
             "confidence": done.confidence,
             "predicted_mn": {name: m.size_mn for name, m in result.methods.items()},
             "predicted_axes_mn": {name: m.force_mn for name, m in result.methods.items()},
+            **{end: ends for end in ("low_mn", "high_mn") if (ends := _ends(result, end))},
         },
     }
     plain = _plain(tree)
     assert isinstance(plain, dict)
     return plain
+
+
+def _ends(result: Result, end: str) -> dict[str, Curve]:
+    """By method, one end of its interval; of those that have any."""
+    return {name: getattr(m, end) for name, m in result.methods.items() if m.held}
 
 
 def write_json(result: Result, path: Path) -> None:

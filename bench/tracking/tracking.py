@@ -53,6 +53,8 @@ class Tracked:
     time_s: list[float] = field(default_factory=list)
     force_mn: dict[str, list[NDArray[np.float64]]] = field(default_factory=dict)
     """By method: (3,) each."""
+    bounds: dict[str, list[tuple[float, float, float]]] = field(default_factory=dict)
+    """By method: `low_mn`, `high_mn` and `distance` of each `Answer`."""
     speed: list[float] = field(default_factory=list)
     """Mean speed of the tissue since the frame before [mm/s]; what is lined up with the sensor."""
     confidence: list[float] = field(default_factory=list)
@@ -210,7 +212,7 @@ class _Asking:
 
     def __init__(self, methods: Mapping[str, Method], pictured: str | None, watch: Stopwatch) -> None:
         self.methods, self.pictured, self.watch = methods, pictured, watch
-        self.out = Tracked(force_mn={name: [] for name in methods})
+        self.out = Tracked(force_mn={name: [] for name in methods}, bounds={name: [] for name in methods})
         self.scene: Scene | None = None
         self.last: NDArray[np.float32] | None = None
         self.stride = 1
@@ -229,6 +231,7 @@ class _Asking:
                 else:
                     answer = method(flow, confidence, scene, shown)
             out.force_mn[name].append(answer.force_mn)
+            out.bounds[name].append((answer.low_mn, answer.high_mn, answer.distance))
             if name == self.pictured:
                 density = answer.density
         inside = scene.tissue

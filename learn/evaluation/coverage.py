@@ -49,11 +49,10 @@ class Coverage:
         widths = {"width_mn": self.width_mn, "width_of_peak": self.width_of_peak}
         widths |= {f"width_{axis}_mn": w for axis, w in zip("xyz", self.axes_width_mn, strict=True)}
         rest = widths | {"unseen": self.unseen, "distance": self.distance}
-        return {
-            "level": self.level,
-            **{k: {"mean": _known(i.mean), "low": _known(i.low), "high": _known(i.high)} for k, i in shares.items()},
-            **{k: _known(v) for k, v in rest.items()},
-        }  # fmt: skip
+        told: dict[str, Any] = {"level": self.level}
+        for name, share in shares.items():
+            told[name] = {"mean": _known(share.mean), "low": _known(share.low), "high": _known(share.high)}
+        return told | {name: _known(value) for name, value in rest.items()}
 
 
 def cover(predictor: Predictor, clips: Sequence[Clip], source: str) -> list[Coverage]:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from learn.data.clips import FIELDS, has_depth
 from learn.inference import video
+from learn.inference.ends import Ends
 from learn.inference.force_reader import ForceReader
 from learn.inference.mask_files import MaskFiles
 from learn.inference.predict import Predictor, View
@@ -241,6 +242,7 @@ def apply(predictor: Predictor, motion: Motion, young_kpa: float | None = None) 
         young = None
     reader = ForceReader(predictor, motion.tissue, motion.scale_mm_per_px, young)
     frames, times, forces, maps, trusted = [], [], [], [], []
+    ends = Ends(reader)
     for step in motion.steps:
         force, said = reader.read(step.flow, step.confidence, step.moved)
         frames.append(step.frame)
@@ -248,6 +250,7 @@ def apply(predictor: Predictor, motion: Motion, young_kpa: float | None = None) 
         forces.append(force if step.trusted else np.full(3, np.nan))
         trusted.append(step.trusted)
         maps.append(said)
+        ends.add(force, said, step.trusted)
     still = motion.again()
     if still is not None:
         return apply(predictor, still, young_kpa)
@@ -280,6 +283,7 @@ def apply(predictor: Predictor, motion: Motion, young_kpa: float | None = None) 
         notes.append(
             f"{trusted.count(False)} of {len(trusted)} frames could not be followed: they have no force"
         )
+    out |= ends.stacked(np.array(trusted))
     out["notes"] = np.array(notes, dtype=str)
     heads = [m.head_mn for m in maps if m.head_mn is not None]
     if heads:

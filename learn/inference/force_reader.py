@@ -104,29 +104,45 @@ class ForceReader:
             force[0] = max(force[0], 0.0)
         return force, said
 
-    def bound(self, force: NDArray[np.float64], said: ForceMap) -> dict[float, Band] | None:
+    def bound(
+        self, force: NDArray[np.float64], said: ForceMap, counted: bool = True
+    ) -> dict[float, Band] | None:
         """By level, the intervals of a frame's force as `read` gave it, T = 1 [mN]; of the force of tissue of
         1 kPa where E is unknown. None of a model without intervals.
 
-        What is asked of here is what `notes` say of an unseen world.
+        What is counted here is what `notes` say of an unseen world.
         """
         if said.motion is None:
             return None
         found, one = self._intervals(), said_by(force, said)
         self._bounded = True
-        if is_moving(one.motion)[0]:
-            self._far.append(float(found.world.distance(one.motion)[0]))
+        if counted and is_moving(one.motion)[0]:
+            self._far.append(self.distance(said))
         return {level: found.bound(one, level).times(said.young_kpa) for level in LEVELS}
+
+    def distance(self, said: ForceMap) -> float:
+        """Of a frame from what was fitted, over what 99% of held-out frames stay under.
+
+        NaN where nothing moved, and of a model without intervals.
+        """
+        if said.motion is None or not is_moving(said.motion[None])[0]:
+            return math.nan
+        world = self._intervals().world
+        return float(world.distance(said.motion[None])[0] / world.usual)
 
     def bound_map(
         self, force: NDArray[np.float64], said: ForceMap
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
-        """Ends of the 90% interval of each cell of `ForceMap.magnitude`, (N, N) twice; None as of `bound`."""
+        """Ends of the 90% interval of each cell of `ForceMap.magnitude`, (N, N) twice; None as of `bound`.
+
+        Off the tissue both are the map itself.
+        """
         if said.motion is None:
             return None
         low, high = self._intervals().bound_map(said_by(force, said))
-        young = np.float32(said.young_kpa)
-        return young * low[0], young * high[0]
+        young, inside = np.float32(said.young_kpa), said.view.mask > 0
+        off = said.magnitude
+        return np.where(inside, young * low[0], off), np.where(inside, young * high[0], off)
 
     @property
     def notes(self) -> list[str]:
@@ -144,15 +160,7 @@ class ForceReader:
         notes, found = [], self._intervals()
         if found.source in ("ideal", "motion-ideal"):
             notes.append("intervals are of true motion: of recovered motion they are too narrow")
-        far, usual = np.array(self._far), found.world.usual
-        unseen = float((far > usual).mean()) if len(far) else 0.0
-        if unseen > _MANY_UNSEEN:
-            notes.append(
-                f"unseen world: {100 * unseen:.0f}% of the frames that moved do so unlike anything that the "
-                f"model was trained on (distance {np.median(far[far > usual]):.2g}; 99% of held-out frames "
-                f"stay under {usual:.2g}); intervals are widened by as much, and may still be too narrow"
-            )
-        return notes
+        return notes + describe_unseen(np.array(self._far))
 
     def _notes_of_place(self) -> list[str]:
         if self.placing.fits:
@@ -183,6 +191,21 @@ class ForceReader:
         return replace(said, density=density, head_mn=head, young_kpa=assumed_young(None))
 
 
+def describe_unseen(distance: NDArray[np.float64]) -> list[str]:
+    """A line for a person if too many frames are further from what was fitted than they should be.
+
+    `distance`: (n,) of the frames that moved, as of `ForceReader.distance`.
+    """
+    far = distance[distance > 1]
+    if len(far) <= _MANY_UNSEEN * len(distance):
+        return []
+    return [
+        f"unseen world: {100 * len(far) / len(distance):.0f}% of the frames that moved do so unlike anything "
+        f"that it was trained on (distance {np.median(far):.2g} times what 99% of held-out frames stay in); "
+        "intervals are widened by as much, and may still be too narrow"
+    ]
+
+
 def said_by(force: NDArray[np.float64], said: ForceMap) -> Said:
     """One frame as intervals are asked for it; `force`: (3,) mN as `ForceReader.read` gave it."""
     assert said.motion is not None
@@ -199,10 +222,8 @@ def net_force(
     `still`: (C, N, N), the answer to no motion; `kind`: `density` or `intensity`.
     """
     if density.shape[1] == 3:
-        whole: NDArray[np.float64] = density.astype(np.float64).sum((2, 3)) - still.astype(np.float64).sum(
-            (1, 2)
-        )
-        return whole * grid.pitch_mm**2
+        whole, rest = (part.astype(np.float64).sum((-2, -1)) for part in (density, still))
+        return np.asarray((whole - rest) * grid.pitch_mm**2)
     size = total_force(density, kind, grid) - total_force(still[None], kind, grid)
     nothing = np.full_like(size, np.nan)
     return np.stack([np.maximum(size, 0.0), nothing, nothing], axis=1)
