@@ -1,1 +1,28 @@
 """Scoring recordings and comparing methods."""
+
+from importlib import import_module
+from typing import Any
+
+# Name -> where it is, looked up when first asked for; as in `synth`.
+_WHERE = {
+    "Answer": "bench.methods.protocol",
+    "Method": "bench.methods.protocol",
+    "Result": "bench.scoring.evaluate_recording",
+    "Scene": "bench.methods.protocol",
+    "Settings": "bench.scoring.evaluate_recording",
+    "export_recording": "bench.recording.from_sequence",
+    "score": "bench.scoring.commands",
+}
+
+__all__ = [*_WHERE]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _WHERE:
+        raise AttributeError(f"module 'bench' has no attribute {name!r}")
+    value = globals()[name] = getattr(import_module(_WHERE[name]), name)
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

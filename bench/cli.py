@@ -23,7 +23,6 @@ app = typer.Typer(
     cls=Commands,
     help="Measures: recordings against force sensors, methods against one another.",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,  # "[kPa]" is a unit, not markup
 )
@@ -136,7 +135,7 @@ def import_(
         typer.Argument(help="A .mha, .bag, .mcap, .db3, ROS 2 bag folder, .h5, folder of pictures or .npy."),
     ],
     out: Annotated[Path, typer.Option("--out", "-o", help="Recording folder to write.")],
-    scale: Annotated[float | None, typer.Option(help="mm a pixel; else fill in meta.yaml.")] = None,
+    scale: Annotated[str | None, typer.Option(help="mm a pixel, or unknown; else fill in meta.yaml.")] = None,
     young: Young = None,
     use: Annotated[
         list[str] | None,
@@ -152,11 +151,12 @@ def import_(
     """Turns another system's recording into a recording folder."""
     from bench.importers import registry
     from bench.output.progress_bar import counting
+    from learn.inference.scale import read_scale
 
     found = registry.read_source(source, _pairs("--use", use, "ROLE=NAME"))
     about: dict[str, object] = {"young_kpa": young if young is not None else "unknown"}
     if scale is not None:
-        about["scale_mm_per_px"] = scale
+        about["scale_mm_per_px"] = read_scale(scale)
     with counting(f"importing {source.name}", len(found.times_s)) as progress:
         registry.write_recording(found, out, newtons, about, progress)
     notes = list(found.notes)
@@ -282,7 +282,9 @@ def flow(
 def live(
     video: Annotated[Path, typer.Argument(help="Video; its first frame is the rest frame.")],
     model: Annotated[Path | None, typer.Option("--model", "-m", help="Model folder: forces too.")] = None,
-    scale: Annotated[float | None, typer.Option(help="mm a pixel of the video; needed with a model.")] = None,
+    scale: Annotated[
+        str | None, typer.Option(help="mm a pixel of the video, or unknown; needed with a model.")
+    ] = None,
     young: Young = None,
     flow: Backend = "tvl1",
     shrink: Annotated[int, typer.Option(min=1, max=8, help="Pictures this many times smaller.")] = 1,
@@ -297,6 +299,7 @@ def live(
     from bench.methods.network import Model
     from bench.tracking import live as stream
     from learn.inference.mask_files import read_choice
+    from learn.inference.scale import UNKNOWN_NOTE, read_scale
     from learn.inference.video import FPS, read_video
     from learn.inference.video_flow import Footage
 
@@ -315,13 +318,15 @@ def live(
         backend=flow,
         masks=kind,
         method=method,
-        scale_mm_per_px=scale,
+        scale_mm_per_px=read_scale(scale),
         young_kpa=young,
         shrink=shrink,
         paced=not every,
         told=(lambda frame: None) if json else tell,
     )
     summary = account.summary()
+    if scale == "unknown":
+        typer.echo(f"note: {UNKNOWN_NOTE}", err=True)
     if out is not None:
         how: dict[str, str | int | bool] = {"backend": flow, "shrink": shrink, "masks": masks}
         stream.write_live(out, summary, **how, paced=not every, model=model is not None)

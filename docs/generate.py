@@ -1,8 +1,8 @@
 """Writes the pages that say what the code says: `python docs/generate.py`, which `make docs` runs.
 
 Job keys and meta.yaml come from their schemas, fields from the field table, commands from the command lines'
-own help, the map of rooms from the packages' docstrings, the site's list of results from its folders. A test
-fails when a page says something else.
+own help, the Python packages from their docstrings, the map of rooms from the packages', the site's list of
+results from its folders. A test fails when a page says something else.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+import api_page
 import typer
 from pydantic import BaseModel
 
@@ -66,6 +67,7 @@ def pages() -> dict[Path, str]:
         DOCS / "reference" / "job.md": _job(),
         DOCS / "reference" / "recording.md": _recording(),
         DOCS / "reference" / "commands.md": _commands(),
+        DOCS / "reference" / "python.md": api_page.write_page(_WRITTEN),
         ROOT / "CONTRIBUTING.md": _contributing(),
         ROOT / "mkdocs.yml": _site(),
     }
@@ -206,6 +208,28 @@ def _room(module: str, folders: dict[str, Path]) -> str:
     return max((name for name in folders if f"{module}.".startswith(f"{name}.")), key=len, default="")
 
 
+_TITLES = {
+    "all": "All on one page",
+    "end-to-end": "Whole pipelines",
+    "engine": "Engine and clusters",
+    "exvivo": "Ex vivo stand-ins",
+    "fem": "Physics",
+    "flow": "Optical flow and stereo",
+    "gap": "Sim-to-real gap",
+    "inverse": "Force by physics alone",
+    "learn": "Networks",
+    "pipeline": "Time of each stage",
+    "pulse": "Heart beat and breath",
+    "scoring": "Cost of scoring",
+    "tune": "Choice of fidelity",
+}
+
+
+def _title(room: str) -> str:
+    """A room of docs/results as the site calls it."""
+    return _TITLES.get(room, room.replace("-", " ").capitalize())
+
+
 def _site() -> str:
     """mkdocs.yml with the rooms of docs/results as they are found."""
     head = (ROOT / "mkdocs.yml").read_text("utf-8").partition(_LISTED)[0]
@@ -214,7 +238,7 @@ def _site() -> str:
         f"{_LISTED}: the rooms of docs/results as they are found.",
         "  - Results:",
         "      - results/README.md",
-        *(f"      - {page.parent.name}: {page.relative_to(DOCS).as_posix()}" for page in pages),
+        *(f"      - {_title(page.parent.name)}: {page.relative_to(DOCS).as_posix()}" for page in pages),
         "",
         "exclude_docs: |",
         "  *.py",

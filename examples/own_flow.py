@@ -11,23 +11,24 @@ Installed in a package, an entry point makes it a job's `flow.backend` and a `--
 from __future__ import annotations
 
 import sys
-from pathlib import Path
 
 import cv2
 import numpy as np
 
-from synth.dataset.store import Dataset, Sequence
-from synth.flow import mask
-from synth.flow.estimator import Flags, Flow, Map, Rgb
-from synth.flow.track import track
+import synth
 
 
 class Farneback:
     """G. Farneback, "Two-frame motion estimation based on polynomial expansion", SCIA 2003."""
 
     def flow(
-        self, rest: Rgb, now: Rgb, rest_usable: Flags, now_usable: Flags, initial: Flow | None = None
-    ) -> tuple[Flow, Map]:
+        self,
+        rest: np.ndarray,
+        now: np.ndarray,
+        rest_usable: np.ndarray,
+        now_usable: np.ndarray,
+        initial: np.ndarray | None = None,
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Flow (H, W, 2) px at the pixels of `rest`, and how far it is to be trusted, (H, W) in 0..1."""
         first, second = (cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY) for picture in (rest, now))
         start = np.zeros((*first.shape, 2), np.float32) if initial is None else initial.copy()
@@ -40,15 +41,15 @@ class Farneback:
         return np.asarray(found, np.float32), (rest_usable * (seen > 0.9)).astype(np.float32)
 
 
-def error_px(sequence: Sequence) -> float:
+def error_px(sequence: synth.Sequence) -> float:
     """Mean endpoint error over visible tissue of all frames but the first."""
-    frames = sequence["rgb"][:]
-    blocked = sequence["tool"][:] | np.stack([mask.glare(frame) for frame in frames])
-    recovered = track(Farneback(), frames, blocked, sequence["tissue"][:])
+    recovered = synth.recover_flow(
+        sequence["rgb"][:], sequence["tool"][:], sequence["tissue"][:], Farneback()
+    )
     error = np.linalg.norm(recovered.flow - sequence["flow"][:], axis=3)
     return float(error[1:][sequence["visible"][1:]].mean())
 
 
 if __name__ == "__main__":
-    for sequence in Dataset(Path(sys.argv[1])):
+    for sequence in synth.Dataset(sys.argv[1]):
         print(sequence.index, f"{error_px(sequence):.3f} px")

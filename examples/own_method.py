@@ -11,35 +11,31 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.methods.protocol import Answer, Scene
-from bench.recording import pixel_scale
-from bench.recording.folder import open_recording
-from bench.scoring import evaluate_recording
+import bench
 
 
 class Spring:
     """Force as stiffness times the mean displacement of the tissue: blind to direction, and to depth."""
 
-    def __init__(self, mm: float) -> None:
+    def __init__(self, mm: float = 60.0) -> None:
         self.mm = mm
         """Mean displacement of 1 mm is what E times this much squared, in mN, would do."""
 
-    def __call__(self, flow: np.ndarray, confidence: np.ndarray, scene: Scene, picture: bool) -> Answer:
+    def __call__(
+        self, flow: np.ndarray, confidence: np.ndarray, scene: bench.Scene, picture: bool
+    ) -> bench.Answer:
         """Force from flow (H, W, 2) px and its confidence (H, W), the bench's `Method`."""
         moved_mm = np.linalg.norm(flow, axis=2) * scene.scale_mm_per_px
         young = scene.young_kpa or 1.0  # unknown: the bench then scores shapes only
         size = young * self.mm * np.average(moved_mm, weights=confidence * scene.tissue + 1e-9)
-        return Answer(np.array([size, np.nan, np.nan]))  # a magnitude: no direction
+        return bench.Answer(np.array([size, np.nan, np.nan]))  # a magnitude: no direction
 
 
-def score_springs(recording: Path) -> evaluate_recording.Result:
+def score_springs(recording: Path) -> bench.Result:
     """The recording's scores under two springs."""
-    opened = open_recording(recording)
     methods = {"spring": Spring(60.0), "stiffer": Spring(120.0)}
-    found = pixel_scale.find_scale(opened.meta, recording)
-    return evaluate_recording.evaluate_recording(
-        opened, methods, "spring", found, evaluate_recording.Settings(rate_hz=None), {}
-    )
+    every_frame = bench.Settings(rate_hz=None)
+    return bench.score(recording, methods=methods, settings=every_frame, baselines=False)
 
 
 if __name__ == "__main__":

@@ -6,14 +6,13 @@ python examples/read_dataset.py out
 from __future__ import annotations
 
 import sys
-from pathlib import Path
 
 import numpy as np
 
-from synth.dataset.store import Dataset, Sequence
+import synth
 
 
-def describe(sequence: Sequence) -> dict[str, float]:
+def describe(sequence: synth.Sequence) -> dict[str, float]:
     """A sequence in five numbers."""
     force = np.linalg.norm(sequence["force"][:], axis=1)  # (T,) mN
     t = int(force.argmax())
@@ -34,5 +33,5 @@ def describe(sequence: Sequence) -> dict[str, float]:
 
 
 if __name__ == "__main__":
-    for sequence in Dataset(Path(sys.argv[1])):
+    for sequence in synth.Dataset(sys.argv[1]):
         print(sequence.index, {name: round(value, 3) for name, value in describe(sequence).items()})

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
@@ -16,7 +16,6 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from synth.errors import UserError
-from synth.system import whole_file
 from synth.system.cli_errors import Commands
 
 if TYPE_CHECKING:
@@ -33,7 +32,6 @@ app = typer.Typer(
     cls=Commands,
     help="Learn force from displacement.",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,  # "[kPa]" is a unit, not markup
 )
@@ -119,9 +117,12 @@ def train_command(
     with made_folder(out, room_needed(out, settings.arch)):
         clips, split, settings = _divided(dataset, settings, named(preset), cache, fixed=folds is not None)
         card, first = _train(clips, split, settings, out, accelerator, devices, quiet=json)
-    if not first:
-        return
-    card = _bounded(card, clips, split, out)
+    if first:
+        _tell_trained(_bounded(card, clips, split, out), settings, out, json)
+
+
+def _tell_trained(card: Card, settings: Settings, out: Path, json: bool) -> None:
+    """The best epoch, on stdout or for a person."""
     result = {"model": str(out), "epoch": card.epoch, "select_r2": card.score}
     result |= {k: len(v) for k, v in card.split.items()}
     if json:
@@ -160,7 +161,10 @@ def _divided(
         settings = replace(settings, share_anatomy=settings.share_anatomy or read_rule(dataset).share_anatomy)
     if settings.share_anatomy:
         clips = ungrouped(clips)
-        _console.print("One brain may be on several sides of the split: scores say nothing of other brains.")
+        apart = "" if len(set(groups(clips))) == len(clips) else " Its openings are kept apart."
+        _console.print(
+            f"One brain may be on several sides of the split: scores say nothing of other brains.{apart}"
+        )
     if sides is not None:
         _console.print(
             "The dataset's own split: what `synth split` marks test is neither fitted nor chosen on."
@@ -302,10 +306,9 @@ def eval_command(
     from learn.data.clips import load_clips, scored
     from learn.data.split import ungrouped
     from learn.evaluation.coverage import cover
-    from learn.evaluation.evaluate import compare, evaluate, unseen
+    from learn.evaluation.evaluate import compare, evaluate
     from learn.inference.predict import load_predictor
     from learn.training.threads import set_threads
-    from synth.dataset.index import written_sides
 
     set_threads(threads)
     predictor = load_predictor(model)
@@ -316,22 +319,14 @@ def eval_command(
         clips = ungrouped(clips)
         _console.print("The model was chosen on brains it is scored on: this says nothing of other brains.")
     other = None if against is None else load_predictor(against)
-    chosen = clips if all else unseen(clips, predictor.card)
     if other is not None:
         other.readable(source)
         if other.grid != predictor.grid or other.card.settings.target != predictor.card.settings.target:
             raise UserError(
                 f"{against}: is of another grid or target than {model}; their maps can't be paired"
             )
-        chosen = chosen if all else unseen(chosen, other.card)
-    sides = None if all else written_sides(dataset)
-    if sides is not None and "test" in sides.values():
-        chosen = [c for c in chosen if sides.get(c.content_hash) == "test"]
-        _console.print("The dataset's own split: only what `synth split` marks test is scored.")
-    if not chosen:
-        raise UserError(
-            f"{dataset}: the model was fitted or chosen on every sequence here; --all scores them anyway"
-        )
+    cards = [one.card for one in (predictor, other) if one is not None]
+    chosen = clips if all else _unseen(clips, dataset, cards)
     with _bar("Evaluating") as tell:
         report = evaluate(predictor, chosen, source, tell)
         second = None if other is None else evaluate(other, chosen, source, tell)
@@ -353,14 +348,37 @@ def eval_command(
         screen.print(_pairs(pairs, str(against), predictor.card))
 
 
+def _unseen(clips: list[Clip], dataset: Path, cards: list[Card]) -> list[Clip]:
+    """Those that no model has seen, of a split dataset the test side; UserError if there are none."""
+    from learn.evaluation.evaluate import unseen
+    from synth.dataset.index import written_sides
+
+    chosen = clips
+    for card in cards:
+        chosen = unseen(chosen, card)
+    sides = written_sides(dataset)
+    if sides is not None and "test" in sides.values():
+        chosen = [c for c in chosen if sides.get(c.content_hash) == "test"]
+        _console.print("The dataset's own split: only what `synth split` marks test is scored.")
+    if not chosen:
+        raise UserError(
+            f"{dataset}: the model was fitted or chosen on every sequence here; --all scores them anyway"
+        )
+    return chosen
+
+
 @app.command("predict", epilog="Example: learn predict model video.mp4 --scale 0.05 --young 1.5")
 def predict_command(
     model: Annotated[Path, typer.Argument(help="Model folder.")],
     source: Annotated[Path, typer.Argument(help="Dataset, NNNNNN.zarr store, video, or .npz of flow.")],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for NAME.npz files.")] = Path("forces"),
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for NAME.npz and .force.csv.")] = Path(
+        "forces"
+    ),
     input: Annotated[str | None, typer.Option(help=_STORED)] = None,
     young: Annotated[float | None, typer.Option(help="Young's modulus [kPa], instead of the data's.")] = None,
-    scale: Annotated[float | None, typer.Option(help="A video's scale [mm a pixel].")] = None,
+    scale: Annotated[
+        str | None, typer.Option(help="A video's scale [mm a pixel], or unknown: forces up to a factor.")
+    ] = None,
     tissue: Annotated[
         Path | None,
         typer.Option(help="A picture, white where the video shows tissue; everywhere if not given."),
@@ -386,42 +404,48 @@ def predict_command(
             help="Of a video: auto, none, glare, tool, both, or a folder of NNNNNN.png or mask.png: the tool."
         ),
     ] = "auto",
+    overlay: Annotated[bool, typer.Option(help="Also NAME.force.mp4, the force over the film.")] = True,
     threads: Threads = None,
     json: Json = False,
 ) -> None:
     """Write the force maps and force curves that a model sees in stores, videos or arrays of flow."""
-    import numpy as np
-
     from learn.inference.apply import Filmed, apply, motions
     from learn.inference.mask_files import read_choice
     from learn.inference.predict import load_predictor
+    from learn.inference.prediction_file import write_overlay, write_prediction
+    from learn.inference.scale import read_scale
     from learn.inference.video_flow import Settings
     from learn.training.threads import set_threads
 
     set_threads(threads)
     predictor = load_predictor(model, quick=True)
     kind, files = read_choice(masks)
-    filmed = Filmed(scale, tissue, Settings(flow, shrink, rate or None, pulse, kind), files)
+    filmed = Filmed(read_scale(scale), tissue, Settings(flow, shrink, rate or None, pulse, kind), files)
     peaks: dict[str, float | None] = {}
     for motion in motions(source, predictor.stored(input), filmed):
         written = out / f"{motion.name}.npz"
         if written.exists() and written.samefile(source):
             raise UserError(f"{written}: is what is read, and would be overwritten; say another --out")
         found = apply(predictor, motion, young)
-        out.mkdir(parents=True, exist_ok=True)
-        with whole_file.part_of(written) as part, part.open("wb") as file:
-            np.savez_compressed(file, **found)
-        size = found["total_force_mn"][found["trusted"]]
-        peaks[motion.name] = float(size.max()) if len(size) else None
-        if not json:
-            peak = "no force: no frame could be followed"
-            if peaks[motion.name] is not None:
-                peak = f"peak force {peaks[motion.name]:.3g} mN"
-            _console.print(f"{motion.name}: {len(found['trusted'])} frames, {peak}")
-            for note in found["notes"]:
-                _console.print(f"note: {note}", style="yellow", markup=False, highlight=False)
+        write_prediction(found, out / motion.name)
+        if overlay:
+            one = source.is_file() or source.suffix == ".zarr"
+            write_overlay(found, source if one else source / f"{motion.name}.zarr", out / motion.name)
+        peaks[motion.name] = _say_peak(found, motion.name, quiet=json)
     if json:
         print(json_.dumps({"out": str(out), "peak_force_mn": peaks}))
+
+
+def _say_peak(found: Mapping[str, Any], name: str, *, quiet: bool) -> float | None:
+    """The peak [mN] of what `apply` found, None where no frame could be followed; prints it and the notes."""
+    size = found["total_force_mn"][found["trusted"]]
+    peak = float(size.max()) if len(size) else None
+    if not quiet:
+        said = "no force: no frame could be followed" if peak is None else f"peak force {peak:.3g} mN"
+        _console.print(f"{name}: {len(found['trusted'])} frames, {said}")
+        for note in found["notes"]:
+            _console.print(f"note: {note}", style="yellow", markup=False, highlight=False)
+    return peak
 
 
 @app.command("calibrate", epilog="Example: learn calibrate model press.npz")

@@ -1,1 +1,39 @@
 """Synthesis of surgical-microscope sequences with exact physical ground truth."""
+
+from importlib import import_module
+from typing import Any
+
+# Name -> where it is. Looked up when first asked for: importing this package loads nothing but this file.
+# `__init__.pyi` says the same to type checkers; a test holds the two together.
+_WHERE = {
+    "Dataset": "synth.dataset.store",
+    "Estimator": "synth.flow.estimator",
+    "Frame": "synth.sequence.scene",
+    "Job": "synth.job.schema",
+    "Law": "synth.job.law_plugins",
+    "Scene": "synth.sequence.scene",
+    "Sequence": "synth.dataset.store",
+    "Summary": "synth.engine.run",
+    "Track": "synth.flow.track",
+    "UserError": "synth.errors",
+    "add_law": "synth.job.law_plugins",
+    "load_job": "synth.job.reader",
+    "open_sequence": "synth.dataset.store",
+    "simulate": "synth.sequence.scene",
+    "recover_flow": "synth.flow.track",
+}
+
+__all__ = ["render", *_WHERE]
+
+
+def __getattr__(name: str) -> Any:
+    if name == "render":  # the room of that name, which can be called: see there
+        return import_module("synth.render")
+    if name not in _WHERE:
+        raise AttributeError(f"module 'synth' has no attribute {name!r}")
+    value = globals()[name] = getattr(import_module(_WHERE[name]), name)
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

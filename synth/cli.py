@@ -10,6 +10,7 @@ from typing import Annotated
 
 import typer
 
+from synth.fit.command import fit
 from synth.system.cli_errors import Commands
 from synth.tune.command import tune
 
@@ -18,7 +19,6 @@ app = typer.Typer(
     cls=Commands,
     help="Surgical-microscope sequences of a brain surface under load, with exact force and motion.",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,  # "[kPa]" is a unit, not markup
 )
@@ -33,6 +33,7 @@ Mix = Annotated[
 Json = Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")]
 
 app.command(epilog='Example: synth tune demo --budget "force 3%" --out tuned.yaml')(tune)
+app.command(epilog="Example: synth fit photo.jpg --out look.yaml --width-mm 38 --sheet fit.jpg")(fit)
 
 
 @app.command(epilog="Example: synth new job.yaml")
@@ -81,15 +82,34 @@ def preview(
     if not cv2.imwrite(str(out), made.picture[..., ::-1]):
         raise UserError(f"{out}: cannot be written as PNG")
     if json:
-        found = {"sheet": str(out), "render_cpu_s": made.render_cpu_s, "disk_bytes": made.disk_bytes}
-        print(json_.dumps(found))
+        cpu_s = sum(made.stages_cpu_s.values())
+        about = {"cpu_s": cpu_s, "stages_cpu_s": made.stages_cpu_s, "disk_bytes": made.disk_bytes}
+        print(json_.dumps({"sheet": str(out), "render_cpu_s": made.stages_cpu_s["render"], **about}))
         return
     print(f"wrote {out}")
+    stages = ", ".join(f"{name} {spent / 60:.1f}" for name, spent in made.stages_cpu_s.items())
     print(
-        f"the whole job: {read.sequences} sequences of {read.frames} frames, "
-        f"{made.render_cpu_s / 60:.1f} CPU-minutes of rendering (physics and flow come on top), "
+        f"the whole job: {read.sequences} sequences of {read.frames} frames, about "
+        f"{sum(made.stages_cpu_s.values()) / 60:.1f} CPU-minutes ({stages}), "
         f"{amount(made.disk_bytes)} of disk"
     )
+
+
+@app.command(epilog="Example: synth place brain.obj --radius 12 --out openings")
+def place(
+    brain: Annotated[Path, typer.Argument(help="A brain's surface: OBJ, STL, PLY, OFF or VTK, in mm.")],
+    radius: Annotated[float, typer.Option(min=3.0, max=60.0, help="Of the opening [mm].")] = 12.0,
+    count: Annotated[int, typer.Option("--count", "-n", min=1, max=20, help="Openings to rank.")] = 6,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Folder for openings.png, openings.html and job.yaml.")
+    ] = None,
+    json: Json = False,
+) -> None:
+    """Finds where a brain can be opened, ranks the best places, draws them and writes the job's lines."""
+    from synth.place import command
+
+    found = command.place(brain, radius, count, out or Path(f"{brain.stem}-openings"))
+    print(json_.dumps(found.as_dict()) if json else "\n".join(found.lines()))
 
 
 @app.command(epilog="Example: synth render demo --out out render.spp=8 sequences=100")
@@ -219,16 +239,55 @@ def report(
     print(write_report(out, to or out / "report.html"))
 
 
-@app.command(epilog="Example: synth export out out-hdf5 --to hdf5")
+@app.command(epilog="Example: synth export out out-hf --to hf")
 def export(
     out: Out,
     target: Annotated[Path, typer.Argument(help="The new folder.")],
-    to: Annotated[str, typer.Option("--to", help="folder, webdataset, hdf5 or d2fnet-npz.")] = "folder",
+    to: Annotated[
+        str,
+        typer.Option(
+            "--to",
+            help="folder, hf, webdataset, lerobot, endonerf, hdf5, d2fnet-npz or video (MP4 to look at).",
+        ),
+    ] = "folder",
+    overlay: Annotated[
+        list[str] | None,
+        typer.Option(help="Over a video: flow, recovered, force, or none; repeat for more. Flow and force."),
+    ] = None,
+    interval: Annotated[
+        str | None, typer.Option(help="Of a video: from one time to another, FIRST:LAST in seconds.")
+    ] = None,
 ) -> None:
-    """Writes the dataset in a format of others."""
-    from synth.publish.export import export_dataset
+    """Writes the dataset in a format of others, or as films to look at."""
+    from functools import partial
 
-    print(f"{export_dataset(out, target, to)} sequences in {target}")
+    from synth.errors import UserError
+    from synth.publish.export import formats, overlay_video
+
+    if to == "video":
+        drawn = [name for name in overlay or ("flow", "force") if name != "none"]
+        write = partial(overlay_video.write_films, overlays=drawn, interval_s=_interval(interval))
+        print(f"{formats.write_export(out, target, write)} films in {target}")
+    elif overlay or interval:
+        raise UserError("--overlay and --interval are of a video: say --to video")
+    else:
+        print(f"{formats.export_dataset(out, target, to)} sequences in {target}")
+
+
+def _interval(text: str | None) -> tuple[float, float] | None:
+    """FIRST:LAST in seconds; either may be left out."""
+    from synth.errors import UserError
+
+    if text is None:
+        return None
+    first, colon, last = text.partition(":")
+    try:
+        told = (float(first or "-inf"), float(last or "inf"))
+    except ValueError:
+        told = (1.0, 0.0)
+    if not colon or not told[0] <= told[1]:
+        raise UserError(f"--interval {text}: is not FIRST:LAST in seconds")
+    return told
 
 
 @app.command(epilog="Example: synth card out")
@@ -258,32 +317,10 @@ def verify(
     json: Json = False,
 ) -> None:
     """Checks a dataset against its own invariants. Exit code 1 when one fails."""
-    from rich.console import Console
-    from rich.table import Table
-
     from synth.checks.verify import verify_dataset
 
     report = verify_dataset(out, fast=fast)
-    if json:
-        print(json_.dumps(report.as_dict()))
-    else:
-        table = Table("check", "measures", "bad", "worst", "limit", "where", "CPU s", title=f"{out}")
-        for check in report.checks:
-            mark = "[red]" if check.bad else ""
-            table.add_row(
-                f"{mark}{check.name}",
-                str(check.count),
-                f"{mark}{check.bad}",
-                f"{check.worst:.3g}",
-                f"{check.limit:.3g}",
-                check.offender,
-                f"{check.cpu_s:.2f}",
-            )
-        Console().print(table)
-        for check in report.checks:
-            for failure in check.failures[:20]:
-                print(f"{check.name}: {failure}")
-        print("good" if report.good else "not good")
+    print(json_.dumps(report.as_dict()) if json else "\n".join(report.lines()))
     if not report.good:
         raise typer.Exit(1)
 

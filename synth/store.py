@@ -1,5 +1,6 @@
-"""`from synth.store import Dataset`, the import that readers of a dataset know."""
+"""`from synth.store import Dataset, Frames`, the imports that readers of a dataset know."""
 
 from synth.dataset.store import Dataset, Sequence, open_sequence
+from synth.dataset.torch_dataset import Frames
 
-__all__ = ["Dataset", "Sequence", "open_sequence"]
+__all__ = ["Dataset", "Frames", "Sequence", "open_sequence"]

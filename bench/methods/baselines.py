@@ -38,6 +38,15 @@ only, in x. Of two eyes (3, N, N) mm and (2, N, N), across and along the view.""
 Space = Literal["never", "where seen", "always"]
 """Whether a rule reads motion in three dimensions."""
 
+FITTED = (
+    "mean",
+    "linear in |d|",
+    "power law in |d|",
+    "ridge on PCA of flow",
+    "k-NN on PCA of flow",
+    "boosting per pixel",
+)
+"""Names of those that need data."""
 GRID = Grid(48)
 _COMPONENTS = 20
 _NEIGHBOURS = 5

@@ -18,7 +18,11 @@ PEAK_PERCENTILE = 98.0
 
 
 class FlowSize:
-    """One number of the flow's length over the tissue that is seen [mm], in place of a force."""
+    """One number of the flow's length over the tissue [mm], in place of a force.
+
+    Over all of it, though what is masked is but smoothly filled in: a mask that takes a part of what moves,
+    and in some frames only, would change the number more than that does.
+    """
 
     def __init__(self, measure: Callable[[NDArray[np.float64]], float]) -> None:
         """`measure`: lengths (P,) mm, at least one, to a number [mm]."""
@@ -28,9 +32,9 @@ class FlowSize:
         self, flow: NDArray[np.float32], confidence: NDArray[np.float32], scene: Scene, picture: bool
     ) -> Answer:
         """See `Method`; NaN where nothing of the tissue is seen."""
-        seen = scene.tissue & (confidence > 0)
-        lengths = np.linalg.norm(flow[seen].astype(np.float64), axis=1) * scene.scale_mm_per_px
-        return Answer(np.array([self._measure(lengths) if len(lengths) else np.nan, np.nan, np.nan]))
+        lengths = np.linalg.norm(flow[scene.tissue].astype(np.float64), axis=1) * scene.scale_mm_per_px
+        seen = bool((confidence[scene.tissue] > 0).any())
+        return Answer(np.array([self._measure(lengths) if seen else np.nan, np.nan, np.nan]))
 
 
 def flow_sizes() -> dict[str, FlowSize]:

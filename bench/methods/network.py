@@ -18,18 +18,18 @@ if TYPE_CHECKING:
 
 
 class Model:
-    """A model folder of `learn train`. Without a known E it answers for tissue of 1 kPa."""
+    """A model of `learn train`. Without a known E it answers for tissue of 1 kPa."""
 
-    def __init__(self, folder: Path, quick: bool = False) -> None:
+    def __init__(self, model: Path | Predictor, quick: bool = False) -> None:
         """Loads the network; UserError if it can't be read.
 
         Args:
-            folder: of the model.
-            quick: spend half a second on a graph that takes a third less a frame.
+            model: its folder, or the model itself.
+            quick: of a folder: spend half a second on a graph that takes a third less a frame.
         """
         from learn.inference.predict import load_predictor
 
-        self.predictor: Predictor = load_predictor(folder, quick=quick)
+        self.predictor: Predictor = load_predictor(model, quick=quick) if isinstance(model, Path) else model
         self._reader: tuple[Scene, ForceReader] | None = None
 
     def described(self) -> dict[str, object]:

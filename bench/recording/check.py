@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from bench.recording import clocks, pixel_scale
 from bench.recording.folder import Recording, open_recording
-from bench.recording.meta import LEAST_INTERVALS
+from bench.recording.meta import LEAST_INTERVALS, LEAST_TURNING
 from bench.recording.second_eye import LATE, SecondEye, Sight
 from learn.inference.quality import find_fault
 from learn.inference.video_flow import Account, Footage, Settings, VideoFlow
@@ -221,23 +221,22 @@ def _check_spans(recording: Recording, times: NDArray[np.float64], found: _Findi
     if len(times) < 2:
         return
     rate = min((len(times) - 1) / (times[-1] - times[0]), _RATE_HZ)
-    span = meta.sync.calibration_s if meta.sync.method == "correlate" else None
-    if span is not None:
-        least = LEAST_INTERVALS / rate
-        inside = max(min(span[1], times[-1]) - max(span[0], times[0]), 0.0)
-        said = f"sync.calibration_s holds {inside:.3g} s of video, {least:.3g} s are needed"
-        found.add("ok" if inside >= least else "odd", "clocks", said)
-        if recording.force is not None:
-            t, margin = recording.force.time_s, meta.sync.search_s
-            lacks = max(t[0] - (span[0] - margin), (span[1] + margin) - t[-1], 0.0)
-            if lacks > 0:
-                said = f"force.csv lacks {lacks:.3g} s of sync.calibration_s and {margin:g} s on either side"
-                found.add("odd", "clocks", said)
-    if meta.press_s is not None:
-        inside_s = max(min(meta.press_s[1], times[-1]) - max(meta.press_s[0], times[0]), 0.0)
-        least = _LEAST_PRESS / rate
-        said = f"press_s holds {inside_s:.3g} s of video, {least:.3g} s are needed"
-        found.add("ok" if inside_s >= least else "odd", "press", said)
+    clock = meta.sync.calibration_s if meta.sync.method == "correlate" else None
+    for part, name, span, frames in (
+        ("clocks", "sync.calibration_s", clock, LEAST_INTERVALS),
+        ("sensor", "sensor.turn_s", meta.sensor.turn_s, LEAST_TURNING),
+        ("press", "press_s", meta.press_s, _LEAST_PRESS),
+    ):
+        if span is not None:
+            inside_s = max(min(span[1], times[-1]) - max(span[0], times[0]), 0.0)
+            said = f"{name} holds {inside_s:.3g} s of video, {frames / rate:.3g} s are needed"
+            found.add("ok" if inside_s >= frames / rate else "odd", part, said)
+    if clock is not None and recording.force is not None:
+        t, margin = recording.force.time_s, meta.sync.search_s
+        lacks = max(t[0] - (clock[0] - margin), (clock[1] + margin) - t[-1], 0.0)
+        if lacks > 0:
+            said = f"force.csv lacks {lacks:.3g} s of sync.calibration_s and {margin:g} s on either side"
+            found.add("odd", "clocks", said)
     for start, stop in meta.sensor.free_s:
         force = recording.force
         if force is not None and not ((force.time_s >= start) & (force.time_s <= stop)).any():

@@ -26,6 +26,7 @@ from bench.recording import csv_table, meta
 from bench.recording.meta import Meta, Span
 from learn.inference import video
 from learn.inference.mask_files import MaskFiles
+from learn.inference.scale import UNKNOWN_NOTE
 from learn.inference.video import Picture
 from synth.errors import UserError
 
@@ -157,12 +158,8 @@ def open_recording(folder: Path, phantom: bool = False) -> Recording:
     movie, pictures = _footage(folder)
     notes: list[str] = []
     if about.scale_mm_per_px == "unknown":
-        # Force goes with the scale as it goes with E: of either unknown, a factor is.
         about = about.model_copy(update={"young_kpa": None})
-        notes.append(
-            f"scale unknown: answers are per pixel, on a picture taken to be {meta.TAKEN_MM:g} mm wide, "
-            "and right up to a factor"
-        )
+        notes.append(UNKNOWN_NOTE)
     times = _frame_times(folder / "frames.csv", notes)
     force = _force(folder / "force.csv", about, notes)
     about, times, force = _from_start(about, times, force, notes)
@@ -230,7 +227,8 @@ def _spans_from(about: Meta, start: float) -> Meta:
         return tuple(moved(span) for span in spans)
 
     sync = about.sync.model_copy(update={"calibration_s": moved(about.sync.calibration_s)})
-    sensor = about.sensor.model_copy(update={"free_s": every(about.sensor.free_s)})
+    told = about.sensor
+    sensor = told.model_copy(update={"free_s": every(told.free_s), "turn_s": moved(told.turn_s)})
     pulse = about.pulse.model_copy(update={"free_s": every(about.pulse.free_s)})
     parts = {"sync": sync, "sensor": sensor, "pulse": pulse, "press_s": moved(about.press_s)}
     return about.model_copy(update=parts)

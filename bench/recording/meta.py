@@ -38,11 +38,11 @@ def _must_run_forward(span: tuple[float, float]) -> tuple[float, float]:
 Span = Annotated[tuple[FiniteFloat, FiniteFloat], AfterValidator(_must_run_forward)]
 
 
-TAKEN_MM = 32.0
-"""Width that a picture of unknown scale is taken to have [mm]: about what a microscope shows of a cortex."""
-
 LEAST_INTERVALS = 20
 """Frame intervals that `sync.calibration_s` must hold for the clocks to be lined up on it."""
+
+LEAST_TURNING = 20
+"""Frames that `sensor.turn_s` must hold for the sensor's rotation to be found on it."""
 
 
 class _Section(BaseModel):
@@ -96,6 +96,9 @@ class Sensor(_Section):
     scored too. `sensor`: only the magnitude is."""
     to_camera: tuple[Row, Row, Row] | None = None
     """Rows of the rotation from the sensor's axes to the camera's; with it components are scored too."""
+    turn_s: Span | None = None
+    """Span of video time in which the tool pulls and pushes in many directions [s]: that rotation is found on
+    it, and it is left out of the scores."""
     acts_on: Literal["tissue", "tool"] = "tissue"
     """On what the written force acts; a force on the tool is turned round."""
     low_pass_hz: Positive | None = 10.0
@@ -107,11 +110,13 @@ class Sensor(_Section):
     vector along gravity in the sensor's axes."""
 
     @model_validator(mode="after")
-    def _is_a_rotation(self) -> Sensor:
+    def _has_one_rotation(self) -> Sensor:
         if self.to_camera is not None:
             rows = np.array(self.to_camera)
             if not np.allclose(rows @ rows.T, np.eye(3), atol=0.02) or np.linalg.det(rows) < 0:
                 raise ValueError("to_camera must be a rotation: three unit rows, square to one another")
+        if self.turn_s is not None and self.in_camera_axes:
+            raise ValueError("turn_s finds what to_camera or axes: camera says: give one of them")
         return self
 
     @property

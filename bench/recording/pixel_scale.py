@@ -13,8 +13,9 @@ import cv2
 import numpy as np
 
 from bench.recording.folder import open_recording
-from bench.recording.meta import TAKEN_MM, Calibration, Meta
+from bench.recording.meta import Calibration, Meta
 from learn.inference import video
+from learn.inference.scale import TAKEN_MM, take_scale
 from synth.errors import UserError
 
 _UNKNOWN = 0.99  # relative: nothing is known
@@ -42,7 +43,7 @@ def find_scale(meta: Meta, folder: Path) -> Scale:
     if meta.scale_mm_per_px == "unknown":
         wide = next(iter(open_recording(folder).frames())).rgb.shape[1]
         source = f"unknown: the picture is taken to be {TAKEN_MM:g} mm wide"
-        return Scale(TAKEN_MM / wide, _first(meta.scale_uncertainty, _UNKNOWN), source)
+        return Scale(take_scale("unknown", wide), _first(meta.scale_uncertainty, _UNKNOWN), source)
     if meta.scale_mm_per_px is not None:
         return Scale(meta.scale_mm_per_px, _first(meta.scale_uncertainty, _STATED), "stated")
     assert meta.calibration is not None

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from threadpoolctl import threadpool_limits
 
+from bench.methods import plugins
 from bench.methods.network import Model
 from bench.methods.protocol import Method
 from bench.output.progress_bar import counting
@@ -21,6 +22,7 @@ from bench.scoring import evaluate_recording, report
 from bench.scoring.evaluate_recording import Result, Settings
 from bench.tracking.flow_process import FlowProcess
 from learn.inference.mask_files import MaskFiles
+from learn.inference.predict import Predictor
 from synth.dataset.store import Dataset, Sequence
 from synth.errors import UserError
 from synth.system import whole_file
@@ -46,6 +48,81 @@ class Seen:
         """The recording so seen."""
         masked = recording if self.masks is None else recording.with_masks(self.masks)
         return replace(masked, region=self.region)
+
+
+def score(
+    recording: str | Path,
+    model: str | Path | Predictor | None = None,
+    *,
+    methods: Mapping[str, Method] | None = None,
+    baselines: bool = True,
+    train: str | Path | None = None,
+    settings: Settings | None = None,
+    out: str | Path | None = None,
+    title: str = "",
+    progress: bool = False,
+) -> Result:
+    """Scores a model, methods of one's own, or both, on a recording; writes only where `out` says.
+
+    Args:
+        recording: its folder.
+        model: of `learn.load_model`, or its folder; it is called D2FNet in the tables.
+        methods: further ones by name; the first is what the result is about where there is no model.
+        baselines: whether the simpler methods are scored beside.
+        train: the dataset the model was trained on; those that need data are fitted on the same sequences.
+        settings: flow back end, rate, masks; as the command's if None.
+        out: folder for score.json and report.html.
+        title: heading of the report.
+        progress: whether a bar is drawn, in a terminal or a notebook.
+
+    Returns:
+        `Result.methods[name].scores` has the numbers, `Result.time_s` and `.size_mn` of each the curves.
+
+    Raises:
+        UserError: recording, model or settings that can't be used, or nothing to score.
+    """
+    if model is None and not methods:
+        raise UserError("score: nothing to score; give a model or methods")
+    if train is not None and (model is None or isinstance(model, Predictor)):
+        raise UserError("score: train needs the model's folder, which says what it was fitted on")
+    network = None if model is None else Model(model if isinstance(model, Predictor) else Path(model))
+    chosen: dict[str, Method] = {MAIN: network} if network else {}
+    chosen |= methods or {}
+    opened = open_recording(Path(recording))
+    if baselines:
+        folder = Path(model) if isinstance(model, (str, Path)) else None
+        two_eyes = bool(opened.right or opened.depths)
+        simple = fit_baselines(Path(train) if train else None, folder, two_eyes)
+        chosen = {**chosen, **{name: one for name, one in simple.items() if name not in chosen}}
+    bar = counting(f"scoring {opened.name}", opened.expected_frames()) if progress else nullcontext(_untold)
+    with bar as told:
+        result = evaluate_recording.evaluate_recording(
+            opened,
+            chosen,
+            MAIN if network else next(iter(chosen)),
+            pixel_scale.find_scale(opened.meta, opened.folder),
+            settings or Settings(),
+            {"model": network.described()} if network else {},
+            told,
+        )
+    if out is not None:
+        with whole_file.made_folder(Path(out), _ROOM_BYTES):
+            write_result(result, Path(out), title)
+    return result
+
+
+def _untold(done: int) -> None:
+    """A progress that nobody is told of."""
+
+
+def write_result(result: Result, folder: Path, title: str) -> None:
+    """Writes score.json and report.html: both are whole before either has its name."""
+    with (
+        whole_file.part_of(folder / "score.json") as scores,
+        whole_file.part_of(folder / "report.html") as page,
+    ):
+        evaluate_recording.write_json(result, scores)
+        report.write_report(result, page, title)
 
 
 def score_recording(
@@ -83,13 +160,7 @@ def score_recording(
     folder = out or Path(f"{opened.name}-score")
     with whole_file.made_folder(folder, _ROOM_BYTES):
         result = _score(opened, model, settings, train, also)
-        # Both are written before either has its name.
-        with (
-            whole_file.part_of(folder / "score.json") as scores,
-            whole_file.part_of(folder / "report.html") as page,
-        ):
-            evaluate_recording.write_json(result, scores)
-            report.write_report(result, page, title)
+        write_result(result, folder, title)
     return result
 
 
@@ -106,7 +177,9 @@ def _score(
         methods |= fit_baselines(train, model, bool(opened.right or opened.depths))
         found = pixel_scale.find_scale(opened.meta, opened.folder)
         with counting(f"scoring {opened.name}", total) as progress:
-            about = {"model": network.described()}
+            about: dict[str, object] = {"model": network.described()}
+            if sources := plugins.sources():
+                about["plug_ins"] = sources
             return evaluate_recording.evaluate_recording(
                 opened, methods, MAIN, found, settings, about, progress, flow
             )
@@ -116,8 +189,10 @@ def _worth_a_process(frames: int | None) -> bool:
     return len(os.sched_getaffinity(0)) > 1 and (frames or _LONG) >= _LONG
 
 
-def fit_baselines(train: Path | None, model: Path, two_eyes: bool = False) -> dict[str, Method]:
-    """Those that need no data, and, given the training data, those fitted on the model's own fit sequences.
+def fit_baselines(train: Path | None, model: Path | None, two_eyes: bool = False) -> dict[str, Method]:
+    """Those that need no data, those of installed packages, and, given the training data, the fitted ones.
+
+    These are fitted on the model's own fit sequences.
 
     They are fitted once for a model, and kept for its next recording; for one with a second eye on motion in
     three dimensions, if the data have it.
@@ -129,7 +204,11 @@ def fit_baselines(train: Path | None, model: Path, two_eyes: bool = False) -> di
     from bench.methods import kept_rules
 
     methods = baseline.physical()
-    if train is None:
+    others = plugins.installed()
+    if taken := {MAIN, *methods, *baseline.FITTED} & set(others):
+        raise UserError(f"method {min(taken)}: a plug-in's name is taken by one of ours; rename it")
+    methods |= others
+    if train is None or model is None:
         return methods
     from learn.checkpoint import read_card
     from learn.data.clips import read_clip

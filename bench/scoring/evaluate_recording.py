@@ -19,11 +19,12 @@ from bench.methods.flow_size import FlowSize, flow_sizes
 from bench.methods.protocol import Method
 from bench.recording import clocks
 from bench.recording.folder import Force, Recording
-from bench.recording.meta import Meta
+from bench.recording.meta import Meta, Sensor, Span
 from bench.recording.pixel_scale import Scale
 from bench.scoring import metrics
 from bench.sensor import clock_sync, force_sensor
 from bench.sensor.clock_sync import Offset
+from bench.sensor.rotation import Turn, find_turn
 from bench.tracking.tracking import Progress, Tracked, track_recording
 from learn.inference.force_reader import describe_unseen
 from learn.inference.video_flow import FlowHere
@@ -110,6 +111,8 @@ class Result:
     settings: dict[str, Any]
     environment: dict[str, str]
     followed: Tracked
+    turn: Turn | None = None
+    """The sensor's rotation as found on `sensor.turn_s`; None if it was stated, or nobody asked."""
     absolute: bool = True
     """Whether E is known, so that forces are in newtons and not those of tissue of 1 kPa."""
 
@@ -185,6 +188,7 @@ def evaluate_recording(
         settings={**asdict(settings), **described, "meta": meta.model_dump(mode="json", exclude_none=True)},
         environment=environment(),
         followed=done,
+        turn=truth.turn,
         absolute=meta.young_kpa is not None,
     )
 
@@ -280,11 +284,16 @@ def _brought_to_newtons(
 def _kept(recording: Recording, time: Curve, notes: list[str]) -> NDArray[np.bool_]:
     """(T,) whether a frame is scored: those that something was calibrated on are not."""
     meta, kept = recording.meta, np.ones(len(time), bool)
-    for what, span in (("calibration of the clocks", meta.sync.calibration_s), ("press", meta.press_s)):
+    calibrating = (
+        ("calibration of the clocks", meta.sync.calibration_s),
+        ("sensor's rotation", meta.sensor.turn_s),
+        ("press", meta.press_s),
+    )
+    for what, span in calibrating:
         if span is not None:
             inside = (time >= span[0]) & (time <= span[1])
             kept &= ~inside
-            notes.append(f"{inside.sum()} frames of the {what} ({span[0]:g} to {span[1]:g} s) are not scored")
+            notes.append(f"{inside.sum()} frames of the {what} ({_words(span)}) are not scored")
     return kept
 
 
@@ -296,6 +305,8 @@ class _Truth:
     floor_mn: float = 0.0
     steps: tuple[str, ...] = ()
     sync: Offset | None = None
+    turn: Turn | None = None
+    in_camera_axes: bool = False
 
     @property
     def size_mn(self) -> Curve | None:
@@ -319,19 +330,27 @@ def _truth(recording: Recording, done: Tracked, time: Curve, notes: list[str]) -
             )
         else:
             offset = found.offset_s
-    processed = force_sensor.process_force(force, meta.sensor, offset)
+    sensor, turn = meta.sensor, None
+    if sensor.turn_s is not None:
+        turn = _turn(force, sensor, offset, done)
+        if turn.refused:
+            notes.append(f"no rotation of the sensor found ({turn.refused}): components are not scored")
+        else:
+            notes.append(f"the sensor's rotation was found on {_words(sensor.turn_s)}: {turn.describe()}")
+            sensor = sensor.model_copy(update={"to_camera": turn.rows})
+    processed = force_sensor.process_force(force, sensor, offset)
     axes = force_sensor.force_at(processed, time)
     covered = int(np.isfinite(axes).all(axis=1).sum())
     if covered == 0:
         notes.append("force.csv and the video share no time: predictions only; are both clocks in seconds?")
-        return _Truth(steps=processed.steps, sync=found)
+        return _Truth(steps=processed.steps, sync=found, turn=turn)
     other = clocks.find_other_unit(time, force.time_s)
     if other:
         notes.append(f"{other}: predictions only, nothing is scored")
         return _Truth()
     if covered < len(time):
         notes.append(f"the sensor covers {covered} of {len(time)} frames; only those are scored")
-    return _Truth(axes, processed.noise_floor_mn, processed.steps, found)
+    return _Truth(axes, processed.noise_floor_mn, processed.steps, found, turn, sensor.in_camera_axes)
 
 
 def _offset(force: Force, recording: Recording, done: Tracked, time: Curve) -> Offset:
@@ -343,6 +362,22 @@ def _offset(force: Force, recording: Recording, done: Tracked, time: Curve) -> O
     # A speed is of two frames: where either is lost it is of the flow's mistake.
     speed = np.where(trusted & np.append(True, trusted[:-1]), done.speed, np.nan)
     return clock_sync.find_offset(time[inside], speed[inside], smooth.time_s, smooth.force_mn, about.search_s)
+
+
+def _turn(force: Force, sensor: Sensor, offset_s: float, done: Tracked) -> Turn:
+    """The sensor's rotation to the camera's axes, from how the tissue moved over `sensor.turn_s`."""
+    if done.turning is None:
+        return find_turn(np.zeros((0, 1, 2)), np.zeros((0, 1)), np.zeros((0, 3)))
+    moved, seen = (np.stack(parts).astype(np.float64) for parts in (done.turning.moved, done.turning.seen))
+    count, time = len(seen), np.array(done.turning.time_s)
+    processed = force_sensor.process_force(force, sensor, offset_s)
+    return find_turn(
+        moved.reshape(count, -1, 2), seen.reshape(count, -1), force_sensor.force_at(processed, time)
+    )
+
+
+def _words(span: Span) -> str:
+    return f"{span[0]:g} to {span[1]:g} s"
 
 
 def _scored(
@@ -360,7 +395,7 @@ def _scored(
     x, y = size[kept], length[kept]
     scores, events = metrics.compute_all(time_s, size, length, truth.floor_mn, kept)
     components: dict[str, dict[str, float]] = {}
-    if recording.meta.sensor.in_camera_axes and np.isfinite(force).any(axis=0).all():
+    if truth.in_camera_axes and np.isfinite(force).any(axis=0).all():
         components = {axis: metrics.agreement(axes[kept, k], force[kept, k]) for k, axis in enumerate("xyz")}
     rng = np.random.default_rng(_SEED)
     intervals = bootstrap.agreement(x, y, rng)
@@ -418,6 +453,7 @@ def as_json(result: Result) -> dict[str, Any]:
         "second_eye": None if done.sight is None else asdict(done.sight),
         "aligned": result.aligned,
         "sync": None if result.sync is None else asdict(result.sync),
+        "turn": None if result.turn is None else asdict(result.turn),
         "notes": list(result.notes),
         "sensor_steps": list(result.steps),
         "settings": result.settings,

@@ -1,1 +1,1 @@
-"""The force sensor: its samples and its clock."""
+"""The force sensor: its samples, its clock and its axes."""

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from bench.methods.protocol import Method, Scene
 from bench.output import machine
 from bench.output import write as results
+from learn.inference.scale import StatedScale, take_scale
 from learn.inference.video_flow import Flags, FlowHere, Footage, Rgb, Settings, Step, VideoFlow
 from synth.errors import UserError
 from synth.flow.mask_choice import Proposal
@@ -65,7 +66,7 @@ def watch_video(
     *,
     backend: str = "tvl1",
     method: Method | None = None,
-    scale_mm_per_px: float | None = None,
+    scale_mm_per_px: StatedScale | None = None,
     young_kpa: float | None = None,
     shrink: int = 1,
     masks: str = "auto",
@@ -78,7 +79,7 @@ def watch_video(
         footage: the video.
         backend: flow estimator.
         method: a model that makes force of flow; needs the scale.
-        scale_mm_per_px: of the video's own pixels.
+        scale_mm_per_px: of the video's own pixels; unknown: forces are right up to a factor, whatever E is.
         young_kpa: of the tissue, if known.
         shrink: pictures are made this many times smaller first.
         masks: as of `Settings`.
@@ -89,7 +90,7 @@ def watch_video(
         UserError: unreadable video, fewer than two frames, or a model without a scale.
     """
     if method is not None and scale_mm_per_px is None:
-        raise UserError("a model needs --scale (mm a pixel): forces have no meaning without it")
+        raise UserError("a model needs --scale (mm a pixel, or unknown): forces have no meaning without it")
     account, pace = Watched(), _Pace(paced)
     settings = Settings(backend, shrink, rate_hz=None, pulse=False, masks=masks)
     video = VideoFlow(footage, settings, _Warm(), pace.is_due)
@@ -97,7 +98,8 @@ def watch_video(
     for step in video.steps():
         if scene is None:
             account.size = video.tissue.shape
-            scene = Scene(video.tissue, (scale_mm_per_px or 1.0) * video.shrink, young_kpa)
+            mm_per_px = take_scale(scale_mm_per_px or 1.0, video.size[1]) * video.shrink
+            scene = Scene(video.tissue, mm_per_px, None if scale_mm_per_px == "unknown" else young_kpa)
             pace.start(step)
             continue
         began, found, force = time.perf_counter(), step.found, None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import TypeVar
 
 import cv2
@@ -12,8 +13,9 @@ from numpy.typing import NDArray
 
 from bench.methods.protocol import InSpace, Method, Scene
 from bench.recording.folder import Recording
+from bench.recording.meta import Span
 from bench.recording.second_eye import SecondEye, Sight
-from learn.inference.pulse import Pulse
+from learn.inference.pulse import Pulse, Surface
 from learn.inference.video_flow import Account, FlowHere, Footage, Settings, Step, VideoFlow
 from synth.errors import UserError
 from synth.flow.stereo.track import Moved
@@ -73,6 +75,8 @@ class Tracked:
     """Why nothing of the video is a measurement; empty if something may be."""
     sight: Sight | None = None
     """What the second eye or the depth camera is good for; None: there is none, or it was not used."""
+    turning: Surface | None = None
+    """How the tissue moved over `sensor.turn_s`; None without that span."""
     pulse: list[dict[str, float]] = field(default_factory=list)
     """rate_hz and amplitude_mm of each rhythm of the tissue's own that was taken off."""
 
@@ -102,12 +106,15 @@ def track_recording(
     Raises:
         UserError: unreadable video, no frame with a time, rest frame beyond the end, masks of another size.
     """
-    out, found = _track(recording, methods, scale_mm_per_px, settings, pictured, flow, progress, None)
-    if found is None:
-        return out
-    # Contacts are answered for on the tissue as it would lie still: all over again, with that taken off.
-    again, _ = _track(recording, methods, scale_mm_per_px, settings, pictured, flow, progress, found)
-    return again
+    watch = Stopwatch()
+    once = partial(_track, recording, methods, scale_mm_per_px, settings, pictured, flow, progress, watch)
+    out, found = once(None)
+    if found is not None:
+        # Contacts are answered for on the tissue as it would lie still: all over again, with that taken off.
+        out, _ = once(found)
+    # Of both times through, for whoever asks what an answer costs.
+    out.timings |= watch.report()
+    return out
 
 
 def _track(
@@ -118,16 +125,16 @@ def _track(
     pictured: str | None,
     flow: FlowHere | None,
     progress: Progress,
+    watch: Stopwatch,
     pulse: Pulse | None,
 ) -> tuple[Tracked, Pulse | None]:
     """Once through the video; what was tracked, and the pulse that is still in it."""
     meta = recording.meta
     tool = recording.tool if recording.has_masks else None
     footage = Footage(recording.frames(), str(recording.folder), recording.tissue_mask, tool, meta.rest_frame)
-    video = VideoFlow(
-        footage, replace(settings, pulse=settings.pulse and meta.pulse.remove), flow, pulse=pulse
-    )
-    asking = _Asking(methods, pictured, video.watch)
+    asked = replace(settings, pulse=settings.pulse and meta.pulse.remove)
+    video = VideoFlow(footage, asked, flow, pulse=pulse, watch=watch)
+    asking = _Asking(methods, pictured, watch)
     two = bool(recording.right or recording.depths)
     second = SecondEye(recording, video) if two and pulse is None else None
     for step in video.steps(progress):
@@ -138,10 +145,13 @@ def _track(
             asking.out.tissue = _shrunk(video.tissue.astype(np.uint8) * 255) > 127
         moved = None
         if second is not None:
-            with video.watch.stage("second eye"):
+            with watch.stage("second eye"):
                 moved = second.move(step)
         if step.picture.time_s is not None:
             asking.ask(step, step.picture.time_s, asking.scene, moved)
+            if _is_within(meta.sensor.turn_s, step):
+                asking.out.turning = asking.out.turning or Surface(video.tissue)
+                asking.out.turning.add(step.picture.time_s, step.found.flow, step.found.confidence)
     out = asking.out
     if second is not None:
         out.sight = second.sight
@@ -149,10 +159,23 @@ def _track(
         if video.seen <= meta.rest_frame:
             raise UserError(f"{recording.folder}: rest_frame {meta.rest_frame}, but {video.seen} frames")
         raise UserError(f"{recording.folder}: no frame has a time; give frames.csv, or fps in meta.yaml")
+    _tell(out, video, recording, methods, pulse, scale_mm_per_px * video.shrink)
+    return out, video.find_pulse(meta.pulse.free_s)
+
+
+def _tell(
+    out: Tracked,
+    video: VideoFlow,
+    recording: Recording,
+    methods: Mapping[str, Method],
+    pulse: Pulse | None,
+    mm_per_px: float,
+) -> None:
+    """Says what was done to the video, which is through, and what somebody should know of it."""
     out.fault = video.fault
     if out.fault:
         out.trusted = [False] * len(out.time_s)
-    out.size, out.notes, out.timings = video.size, video.notes, video.watch.report()
+    out.size, out.notes = video.size, video.notes
     if out.fault:
         out.notes.append(f"nothing can be measured: {out.fault}")
     out.notes.append(recording.describe_tool(video.seen))
@@ -164,19 +187,24 @@ def _track(
         out.timings["flow_peak_rss_mb"] = round(video.peak_bytes / 1e6, 1)
     if out.sight is not None:
         out.notes.append(out.sight.describe())
-    if two and pulse is not None:
+    if pulse is None:
+        return
+    if recording.right or recording.depths:
         # Flow without the pulse and depth with it would be a motion that nothing made.
         out.notes.append(
             "the tissue's own motion is off the flow, not off depth: the second eye was not used (--no-pulse)"
         )
-    if pulse is not None:
-        mm_per_px = scale_mm_per_px * video.shrink
-        out.pulse = [
-            {"rate_hz": rhythm.rate_hz, "amplitude_mm": mm_per_px * size}
-            for rhythm, size in zip(pulse.rhythms, pulse.amplitudes_px, strict=True)
-        ]
-        out.notes.append(pulse.describe(mm_per_px))
-    return out, video.find_pulse(meta.pulse.free_s)
+    out.pulse = [
+        {"rate_hz": rhythm.rate_hz, "amplitude_mm": mm_per_px * size}
+        for rhythm, size in zip(pulse.rhythms, pulse.amplitudes_px, strict=True)
+    ]
+    out.notes.append(pulse.describe(mm_per_px))
+
+
+def _is_within(span: Span | None, step: Step) -> bool:
+    """Whether a frame that could be followed lies in a span of video time."""
+    time_s = step.picture.time_s
+    return span is not None and time_s is not None and span[0] <= time_s <= span[1] and step.found.trusted
 
 
 class _Asking:

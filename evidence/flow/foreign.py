@@ -88,6 +88,7 @@ def recordings(
         Literal["tuning", "reporting"], typer.Option(help="Settings were chosen on `tuning`.")
     ] = "reporting",
     count: Annotated[int, typer.Option(min=2, help="Recordings.")] = 48,
+    first: Annotated[int, typer.Option(min=0, help="How many of the half are passed over.")] = 0,
     size: Annotated[int, typer.Option(min=64, help="Width and height of the pictures [px].")] = 160,
     frames: Annotated[int, typer.Option(min=6, help="Frames of each.")] = 14,
     jobs: Annotated[int, typer.Option(min=1, help="Processes.")] = 2,
@@ -99,14 +100,14 @@ def recordings(
     cv2.setNumThreads(1)
     rows = []
     with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
-        for row in pool.map(partial(_judged, size=size, frames=frames), recipes(half, count)):
+        for row in pool.map(partial(_judged, size=size, frames=frames), recipes(half, count, first=first)):
             rows.append(row)
             typer.echo(_line(row), err=True)
     found: dict[str, Any] = {"half": half, "summary": summarise(rows)}
     if pairs:
         found["pairs"] = foreign_pairs.rows(pairs, 2711 if half == "reporting" else 11)
     if long:
-        found["time"] = _times(recipes(half, 2), size, long)
+        found["time"] = _times(recipes(half, 2, first=first), size, long)
     worst = [asdict(row) for row in sorted(rows, key=_badness)[-6:]]
     return found | {
         "worst": [{k: round(v, 4) if isinstance(v, float) else v for k, v in one.items()} for one in worst]

@@ -82,20 +82,21 @@ class Shown:
     mishap: str
 
 
-def recipes(half: str, count: int, photographs: bool | None = None) -> list[Recipe]:
-    """The first `count` recordings of a half; each is drawn from its number alone.
+def recipes(half: str, count: int, photographs: bool | None = None, first: int = 0) -> list[Recipe]:
+    """So many recordings of a half; each is drawn from its number alone.
 
     Args:
         half: one of `HALVES`.
         count: how many.
         photographs: use scikit-image's; None: if it is installed.
+        first: how many of the half's are passed over.
     """
     there = find_spec("skimage") is not None if photographs is None else photographs
     side = HALVES.index(half)
     surfaces = [f"drawn {name}" for name in _DRAWN]
     if there:
         surfaces += list(_PHOTOGRAPHS[side::2])
-    return [_recipe(2 * k + side, half, surfaces) for k in range(count)]
+    return [_recipe(2 * k + side, half, surfaces) for k in range(first, first + count)]
 
 
 def _recipe(index: int, half: str, surfaces: list[str]) -> Recipe:

@@ -51,6 +51,8 @@ class WetPair:
     """(H, W), by threshold, now."""
     share: float
     """Of the tissue's pixels in the now frame, taken for glare by threshold."""
+    mm_per_px: float
+    """At the craniotomy's centre."""
 
 
 def pairs(wet: Wet, count: int, seed: int) -> Iterator[WetPair]:
@@ -115,6 +117,7 @@ def _pair(job: Job, index: int, wet: Wet) -> WetPair:
         rest_glare=mask.glare(before.rgb),
         now_glare=automatic,
         share=float(automatic[tissue].mean()),
+        mm_per_px=view.mm_per_px,
     )
 
 

@@ -1,6 +1,6 @@
 """The runs of an experiment as two tables: a line a run (`runs.json`), one a sequence (`sequences.parquet`).
 
-What runs have in common of their settings stands once. A run's numbers have six digits, moments seven.
+What runs have in common of their settings stands once. A run's numbers have six digits, a sequence's seven.
 `pandas.read_parquet` shows the second to whoever wants to check.
 """
 
@@ -37,7 +37,7 @@ MOMENTS = ("n", "t", "p", "tt", "pp", "tp")
 _OF_YOUNG = ("map_r2_pooled", "force_r2_pooled", "force_mae")
 _LEFT_OUT = ("sequences", "intervals", "scales", "definitions")
 _DIGITS = 6
-_TYPES = ((("run", "sequence"), pa.string()), (SCORES, pa.float64()), (MOMENTS, pa.float32()))
+_TYPES = ((("run", "sequence"), pa.string()), (SCORES + MOMENTS, pa.float32()))
 _SCHEMA = pa.schema([(name, kind) for names, kind in _TYPES for name in names])
 
 

@@ -36,9 +36,12 @@ def cycles(
     )
     ours = case(job, 0)
     inside = ours.studio.still.tissue & ~ours.studio.frame(ours.vertices, ours.tips, ours.shafts, 0).tool
-    rows = [{"renderer": "mitsuba", "spp": n, **_mitsuba(ours, n, inside)} for n in spp]
+    rows: list[dict[str, Any]] = []
+    for n in spp:
+        found, grey = _mitsuba(ours, n, inside)
+        rows.append({"renderer": "mitsuba", "spp": n} | found)
     with tempfile.TemporaryDirectory() as folder:
-        rows += _cycles(ours, Path(folder), python, spp, inside)
+        rows += _cycles(ours, Path(folder), python, spp, inside, grey)
     return {
         "seed": seed,
         "rows": rows,
@@ -58,7 +61,8 @@ def ratio(rows: list[dict[str, Any]], kind: str) -> float:
     return float(np.exp(np.interp(np.log(mine[kind]), noise, spent)) / mine["cpu_s"])
 
 
-def _mitsuba(ours: Case, spp: int, inside: npt.NDArray[np.bool_]) -> dict[str, float]:
+def _mitsuba(ours: Case, spp: int, inside: npt.NDArray[np.bool_]) -> tuple[dict[str, float], float]:
+    """Time and noise, and the median of the light."""
     tool = instrument.pose(instrument.build(("forceps",)), ours.tips, ours.shafts)
     stage = ours.studio.stage(ours.vertices, tool, spp)
     spent, pictures = [], []
@@ -67,12 +71,14 @@ def _mitsuba(ours: Case, spp: int, inside: npt.NDArray[np.bool_]) -> dict[str, f
         stage.move("cortex", ours.vertices)
         pictures.append(stage.render(k))
         spent.append(time.process_time() - start)
-    return {"cpu_s": round(min(spent[1:]), 3)} | noises(pictures[1], pictures[2], inside)
+    found = {"cpu_s": round(min(spent[1:]), 3)} | noises(pictures[1], pictures[2], inside)
+    return found, float(np.median(pictures[1][inside]))
 
 
 def _cycles(
-    ours: Case, folder: Path, python: Path, spp: list[int], inside: npt.NDArray[np.bool_]
+    ours: Case, folder: Path, python: Path, spp: list[int], inside: npt.NDArray[np.bool_], grey: float
 ) -> list[dict[str, Any]]:
+    """As `_mitsuba`; Cycles' lamps have other units, so that white is where ours is for the same median."""
     _export(ours, folder, spp)
     worker = Path(__file__).with_name("cycles_worker.py")
     # Its own packages and nothing of ours.
@@ -95,7 +101,7 @@ def _cycles(
                 "spp": n,
                 "cpu_s": round(min(told["cpu_s"][str(n)][1:]), 3),
             }
-            | noises(pictures[0], pictures[1], inside)
+            | noises(pictures[0], pictures[1], inside, float(np.median(pictures[0][inside])) / grey)
         )
     return rows
 
@@ -118,7 +124,7 @@ def _export(ours: Case, folder: Path, spp: list[int]) -> None:
                 "index": body.material.index,
             }
         else:
-            bodies[name] = {"roughness": 0.25, "metallic": 1 - body.material.satin}
+            bodies[name] = {"roughness": 0.25, "metallic": 0.9}
     lamps = [
         {
             "position": lamp.position.tolist(),
@@ -140,11 +146,11 @@ def _export(ours: Case, folder: Path, spp: list[int]) -> None:
     (folder / "scene.json").write_text(json.dumps(told), "utf-8")
 
 
-def noises(one: Map, two: Map, inside: npt.NDArray[np.bool_]) -> dict[str, float]:
+def noises(one: Map, two: Map, inside: npt.NDArray[np.bool_], white: float = 1.0) -> dict[str, float]:
     """Root mean square of a picture's noise over a mask, as a share of the mean: of all its light, where
     mirrored lamps weigh most, and of what a camera keeps of it, whose full scale is a white surface's light.
     """
-    kinds = {"noise": (one, two), "noise_clipped": (np.minimum(one, 1), np.minimum(two, 1))}
+    kinds = {"noise": (one, two), "noise_clipped": (np.minimum(one, white), np.minimum(two, white))}
     return {
         kind: round(float(np.sqrt(((a - b)[inside] ** 2).mean() / 2) / a[inside].mean()), 5)
         for kind, (a, b) in kinds.items()

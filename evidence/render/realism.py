@@ -16,6 +16,11 @@ from synth.errors import UserError
 from synth.job.schema import Family, Job
 
 _SIDE, _STEP = 160, 40
+OUTLINE = (
+    "0.2,0.56 0.29,0.31 0.39,0.19 0.52,0.16 0.6,0.29 0.67,0.42 0.71,0.6 0.67,0.73 0.6,0.86 0.47,0.91"
+    " 0.37,0.86 0.28,0.76"
+)
+"""Of the cortex in the photograph that the figures here are of."""
 
 
 @measuring("cortex.jpg", said="Folder for figures and sheet.", file="realism.json")
@@ -23,8 +28,7 @@ def realism_figures(
     photo: Annotated[Path, typer.Argument(help="A photograph of an exposed cortex.")],
     outline: Annotated[
         str, typer.Option(help="Polygon of the cortex in it, as shares: x,y x,y x,y ...")
-    ] = "0.2,0.56 0.29,0.31 0.39,0.19 0.52,0.16 0.6,0.29 0.67,0.42 0.71,0.6 0.67,0.73 0.6,0.86 0.47,0.91"
-    " 0.37,0.86 0.28,0.76",
+    ] = OUTLINE,
     width_mm: Annotated[float, typer.Option(help="What the photograph's width spans in the field.")] = 110.0,
     frames: Annotated[int, typer.Option(min=1, help="Rendered sequences, one frame of each.")] = 12,
     family: Annotated[str, typer.Option(help="Appearance family.")] = "healthy",
@@ -51,9 +55,9 @@ def realism_figures(
     ]
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
-        cv2.imwrite(str(out / "sheet.webp"), _sheet(pictures)[..., ::-1], [cv2.IMWRITE_WEBP_QUALITY, 60])
+        cv2.imwrite(str(out / "sheet.webp"), _sheet(pictures)[..., ::-1], [cv2.IMWRITE_WEBP_QUALITY, 45])
     if beside is not None:
-        cv2.imwrite(str(beside), _beside(pictures, _scaled(photo, width_mm / pixel))[..., ::-1])
+        cv2.imwrite(str(beside), _beside(pictures, scaled_photograph(photo, width_mm / pixel))[..., ::-1])
     return {
         "family": family,
         "seed": seed,
@@ -87,17 +91,22 @@ def _rendered(
 
 def _photographed(photo: Path, outline: str, width_px: float) -> list[picture_statistics.Picture]:
     """Crops of the photograph inside the outline, at the rendered frames' scale."""
-    image = _scaled(photo, width_px)
-    corners = np.array([[float(v) for v in pair.split(",")] for pair in outline.split()])
-    inside = np.zeros(image.shape[:2], np.uint8)
-    cv2.fillPoly(inside, [np.rint(corners * np.array(image.shape[1::-1])).astype(np.int32)], 1)
-    crops = picture_statistics.tiles(image, inside > 0, _SIDE, _STEP)
+    image = scaled_photograph(photo, width_px)
+    crops = picture_statistics.tiles(image, outlined(outline, image.shape[:2]), _SIDE, _STEP)
     if not crops:
         raise UserError(f"{photo}: no crop of {_SIDE} px fits inside the outline")
     return crops
 
 
-def _scaled(photo: Path, width_px: float) -> picture_statistics.Picture:
+def outlined(outline: str, shape: tuple[int, ...]) -> np.ndarray[Any, np.dtype[np.bool_]]:
+    """Pixels (H, W) inside a polygon given as shares of the picture, "x,y x,y ..."."""
+    corners = np.array([[float(v) for v in pair.split(",")] for pair in outline.split()])
+    inside = np.zeros(shape, np.uint8)
+    cv2.fillPoly(inside, [np.rint(corners * np.array(shape[::-1])).astype(np.int32)], 1)
+    return inside > 0
+
+
+def scaled_photograph(photo: Path, width_px: float) -> picture_statistics.Picture:
     """The photograph (H, W, 3) sRGB, `width_px` wide."""
     image = cv2.imread(str(photo), cv2.IMREAD_COLOR)
     if image is None:

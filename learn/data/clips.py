@@ -47,7 +47,7 @@ _CURE = {
 _ARRAYS = ("mask", "confidence", "density", "force")
 _SPATIAL = "motion_confidence"
 _FILES = {f"{name}.npy" for name in (*_ARRAYS, _SPATIAL, *(f"displacement-{source}" for source in FIELDS))}
-_PLAIN = ("name", "content_hash", "group", "family", "gesture", "young_kpa")
+_PLAIN = ("name", "content_hash", "group", "family", "gesture", "young_kpa", "opening")
 
 
 @dataclass(frozen=True)
@@ -76,6 +76,8 @@ class Clip:
     """(T, 3) total force on the tissue, camera axes [mN]."""
     motion_confidence: NDArray[np.float32] | None = None
     """(T, 2, N, N) 0..1 of the motion that two eyes recover, across and along the view; None without it."""
+    opening: str = ""
+    """Which place of a user's brain it shows; empty of procedural ones, and of older stores."""
 
     @property
     def frames(self) -> int:
@@ -172,6 +174,7 @@ def _plain(sequence: Sequence) -> dict[str, Any]:
         "family": scenario.get("family") or "",
         "gesture": (scenario.get("gesture") or {}).get("kind") or "",
         "young_kpa": float(sequence.attrs["young_kpa"]),
+        "opening": sequence.attrs.get("opening_id") or "",
     }
 
 
@@ -256,6 +259,7 @@ class _Said(BaseModel):
     family: str
     gesture: str
     young_kpa: Positive
+    opening: str
     checksums: dict[str, int]
 
 

@@ -15,7 +15,11 @@ from learn.data.clips import Clip
 from synth.dataset.split import SIDES, join_groups
 from synth.errors import UserError
 
-_HINT = "; share_anatomy=true splits one brain's sequences, and says nothing of other brains"
+_HINT = (
+    "; share_anatomy=true splits one brain by its openings (`synth place` finds them, craniotomy.also lists "
+    "them), or else by sequence, and says nothing of other brains"
+)
+_OPENINGS = 3  # fit, select and test
 
 
 @dataclass(frozen=True)
@@ -30,8 +34,11 @@ class Split:
 
 
 def ungrouped(clips: Sequence[Clip]) -> list[Clip]:
-    """The clips with every sequence a group of its own: for a dataset of a single brain, whose sequences
-    can't be kept apart by anatomy. Scores then say nothing of other brains."""
+    """The clips without their anatomies as groups: for a dataset of a single brain, whose sequences can't be
+    kept apart by anatomy. Each place that the brain is opened at is a group where there are three or more of
+    them, else every sequence is. Scores then say nothing of other brains."""
+    if len({c.opening for c in clips if c.opening}) >= _OPENINGS:
+        return [replace(c, group=c.opening or f"{c.group}/{c.content_hash}") for c in clips]
     return [replace(c, group=f"{c.group}/{c.content_hash}") for c in clips]
 
 

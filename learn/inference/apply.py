@@ -20,6 +20,7 @@ from learn.inference.force_reader import ForceReader
 from learn.inference.mask_files import MaskFiles
 from learn.inference.predict import Predictor, View
 from learn.inference.pulse import Pulse
+from learn.inference.scale import UNKNOWN_NOTE, StatedScale, take_scale
 from learn.inference.stiffness import stiffness
 from learn.inference.video_flow import Footage, Settings, VideoFlow, everywhere
 from synth.dataset.store import Dataset, Sequence, open_sequence
@@ -62,6 +63,8 @@ class Motion:
     """What was done to the film that its user should know, once its steps are through."""
     fault: Callable[[], str] = str
     """Why nothing of it is a measurement, once its steps are through; empty if something may be."""
+    scale_known: bool = True
+    """False: a width was taken for the picture's, so E is of no use, and forces are right up to a factor."""
     again: Callable[[], Motion | None] = lambda: None
     """The same film with the tissue's own motion taken off, if its steps, once through, showed any."""
 
@@ -70,7 +73,7 @@ class Motion:
 class Filmed:
     """What a video doesn't say of itself."""
 
-    scale_mm_per_px: float | None = None
+    scale_mm_per_px: StatedScale | None = None
     tissue: Path | None = None
     """A picture, white where there is tissue; everywhere if not given."""
     settings: Settings = field(default_factory=Settings)
@@ -134,7 +137,10 @@ def _stored(sequence: Sequence, source: str) -> Motion:
 
 def _video(path: Path, filmed: Filmed, pulse: Pulse | None = None) -> Motion:
     if filmed.scale_mm_per_px is None:
-        raise UserError(f"{path}: a video doesn't say how large it shows things; give --scale in mm a pixel")
+        raise UserError(
+            f"{path}: a video doesn't say how large it shows things; give --scale in mm a pixel, or unknown"
+        )
+    scale_known = filmed.scale_mm_per_px != "unknown"
     drawn = filmed.tissue
     tissue = everywhere if drawn is None else partial(video.read_mask, drawn)
     tool = filmed.tool.read if filmed.tool else None
@@ -151,16 +157,15 @@ def _video(path: Path, filmed: Filmed, pulse: Pulse | None = None) -> Motion:
         for step in following.steps()
     )
     rest = next(steps)
-    mm_per_px = filmed.scale_mm_per_px * following.shrink
+    mm_per_px = take_scale(filmed.scale_mm_per_px, following.size[1]) * following.shrink
 
     def again() -> Motion | None:
         found = following.find_pulse()
         return None if found is None else _video(path, filmed, found)
 
     def notes() -> list[str]:
-        if pulse is None:
-            return following.notes
-        return [*following.notes, pulse.describe(mm_per_px)]
+        said = following.notes if scale_known else [UNKNOWN_NOTE, *following.notes]
+        return said if pulse is None else [*said, pulse.describe(mm_per_px)]
 
     return Motion(
         name=path.stem,
@@ -171,6 +176,7 @@ def _video(path: Path, filmed: Filmed, pulse: Pulse | None = None) -> Motion:
         shrink=following.shrink,
         notes=notes,
         fault=lambda: following.fault,
+        scale_known=scale_known,
         again=again,
     )
 
@@ -227,18 +233,13 @@ def _positive(path: Path, found: dict[str, NDArray[Any]], name: str) -> float:
 def apply(predictor: Predictor, motion: Motion, young_kpa: float | None = None) -> dict[str, Any]:
     """Force of every frame of a film, ready for np.savez; what is done to it is `ForceReader`'s.
 
-    `young_kpa` overrides the film's own. Returns `frame` (T,), `time_s` (T,) where the film has times,
-    `trusted` (T,) whether a frame could be followed (its force is NaN if not), `total_force_mn` (T,),
-    `force_mn` (T, 3) for a model that gives direction, and as the network says it
-    `density` (T, C, N, N) mN/mm² and `head_mn` (T, C) of one with a total-force head; `mask` (N, N),
-    `pitch_mm`, `centre_px` (x, y) of the grid in the film's own pixels, `centres_px` (T, 2) the same by frame
-    (mask and centre are the last frame's; they change only where the tissue is wider than the grid),
-    `young_kpa`, `young_known`, and `notes`: what was done to the film that its user should know. Of a model
-    with intervals also `low_mn` and `high_mn` (T,), ends of the 90% interval of the total force's size,
-    `low68_mn` and `high68_mn` (T,), `force_low_mn` and `force_high_mn` (T, 3), 90%, of its components,
-    `density_low` and `density_high` (T, N, N), 90%, of the length of the map.
+    `young_kpa` overrides the film's own, but not where the scale is unknown. Returns fields of
+    `prediction_file.FIELDS`, those that the film and the model have. Mask and centre are the last frame's;
+    they change only where the tissue is wider than the grid.
     """
     young = young_kpa if young_kpa is not None else motion.young_kpa
+    if not motion.scale_known:
+        young = None
     reader = ForceReader(predictor, motion.tissue, motion.scale_mm_per_px, young)
     frames, times, forces, maps, trusted = [], [], [], [], []
     ends = Ends(reader)
@@ -249,7 +250,8 @@ def apply(predictor: Predictor, motion: Motion, young_kpa: float | None = None) 
         forces.append(force if step.trusted else np.full(3, np.nan))
         trusted.append(step.trusted)
         maps.append(said)
-        ends.add(force, said, step.trusted)
+        if motion.scale_known:
+            ends.add(force, said, step.trusted)
     still = motion.again()
     if still is not None:
         return apply(predictor, still, young_kpa)
@@ -263,6 +265,7 @@ def apply(predictor: Predictor, motion: Motion, young_kpa: float | None = None) 
         "trusted": np.array(trusted),
         "mask": last.view.mask,
         "pitch_mm": predictor.grid.pitch_mm,
+        "scale_mm_per_px": motion.scale_mm_per_px / motion.shrink,
         # A picture begins half a pixel before its first pixel, whatever its pixels' size.
         "centre_px": motion.shrink * (np.array(last.view.resample.centre_px) + 0.5) - 0.5,
         "young_kpa": last.young_kpa,

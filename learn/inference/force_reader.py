@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
@@ -26,6 +27,34 @@ UNKNOWN_YOUNG_KPA = 1.0
 def assumed_young(young_kpa: float | None) -> float:
     """E to answer for [kPa]: the one known, else `UNKNOWN_YOUNG_KPA`; for every method, learnt or not."""
     return UNKNOWN_YOUNG_KPA if young_kpa is None else young_kpa
+
+
+def predict_force(
+    model: Predictor,
+    flow: Iterable[NDArray[np.float32]],
+    tissue: NDArray[np.bool_],
+    scale_mm_per_px: float,
+    young_kpa: float | None = None,
+    confidence: Iterable[NDArray[np.float32]] | None = None,
+) -> NDArray[np.float64]:
+    """The force curve of one film: (T, 3) mN on the tissue, camera axes; what the rest frame says taken off.
+
+    Of a model without direction the size is in x and the rest NaN.
+
+    Args:
+        model: of `load_model`.
+        flow: T times (H, W, 2) px, motion from the rest frame at the rest frame's pixels.
+        tissue: (H, W), in the rest frame.
+        scale_mm_per_px: of the picture.
+        young_kpa: of the tissue; None: forces are those of tissue of 1 kPa.
+        confidence: T times (H, W) in 0..1, for a model that reads it.
+
+    Raises:
+        UserError: shapes that don't fit, values that aren't finite, or a model of two eyes.
+    """
+    reader = ForceReader(model, np.asarray(tissue, bool), scale_mm_per_px, young_kpa)
+    pairs = ((one, None) for one in flow) if confidence is None else zip(flow, confidence, strict=True)
+    return np.array([reader.read(one, sure)[0] for one, sure in pairs]).reshape(-1, 3)
 
 
 class ForceReader:

@@ -36,6 +36,7 @@ _LEFT = 0.5  # share of what moves without contact that may be left when all is 
 _LEAST_PX = 0.03  # below what flow can tell, nothing is taken off
 _EVEN = 3.0  # 95th percentile of the amplitude over its median; a contact's is larger
 _KNOT_S = 4.0
+_NOISE_PX = 0.15  # what the rest frame's noise may do to the flow of a cell; more is something that happened
 
 
 @dataclass
@@ -96,15 +97,17 @@ class Pulse:
     """(h, w, B) at the pixels, 0 outside the tissue."""
     offset: Floats
     """(B, 2) coefficients of where the rest frame lay, from which motion is measured [px]."""
+    still: NDArray[np.float32]
+    """(h, w, 2) what all frames without contact have in common besides: the rest frame's own noise [px]."""
     amplitudes_px: tuple[float, ...]
     """Of each rhythm: half of the way from one end to the other, median over the tissue [px]."""
     free_share: float
     """Share of the frames that it was fitted on: those taken for free of contact."""
 
     def at(self, time_s: float) -> NDArray[np.float32]:
-        """(h, w, 2) px by which the surface has moved by itself since the rest frame."""
+        """(h, w, 2) px by which the surface has moved by itself since the rest frame, or seems to have."""
         now = sum((rhythm.at(np.array([time_s]))[0] for rhythm in self.rhythms), self.offset)
-        return np.asarray(self.basis @ now.astype(np.float32), np.float32)
+        return np.asarray(self.basis @ now.astype(np.float32) + self.still, np.float32)
 
     def describe(self, mm_per_px: float) -> str:
         """Amplitudes and rates in words; `mm_per_px`: of the pixels that flow is on."""
@@ -156,7 +159,26 @@ def find_pulse(surface: Surface, rest_s: float, free_s: Sequence[Span] = ()) -> 
     sizes = tuple(float(np.median(_amplitude(rhythm, basis))) for rhythm in rhythms)
     own = sum((rhythm.at(time_s) for rhythm in rhythms), np.zeros(1))
     offset = _at_rest(time_s[free], (coefficients - own)[free], rest_s)
-    return Pulse(rhythms, _at_pixels(surface.tissue), offset, sizes, float(free.mean()))
+    common = np.zeros((len(used), 2), np.float32)
+    common[used] = _in_common(basis, coefficients[free], moved[free], seen[free])
+    still = (
+        cv2.resize(common.reshape(rows, _COLUMNS, 2), surface.tissue.shape[::-1]) * surface.tissue[..., None]
+    )
+    return Pulse(rhythms, _at_pixels(surface.tissue), offset, still, sizes, float(free.mean()))
+
+
+def _in_common(basis: Floats, coefficients: Floats, moved: Floats, seen: Floats) -> Floats:
+    """(P, 2) median over frames without contact of what smooth motion leaves [px], `_NOISE_PX` at most.
+
+    Every flow is measured from the rest frame, so its noise moves the same places in all frames alike.
+    """
+    left = moved - np.einsum("pa,tac->tpc", basis, coefficients)
+    left[seen == 0] = np.nan
+    enough = (seen > 0).mean(axis=0) > 0.5
+    common = np.zeros(left.shape[1:])
+    common[enough] = np.nanmedian(left[:, enough], axis=0)
+    length = np.linalg.norm(common, axis=1, keepdims=True)
+    return np.asarray(common * np.minimum(1, _NOISE_PX / np.maximum(length, 1e-9)), np.float64)
 
 
 def _at_rest(time_s: Floats, left: Floats, rest_s: float) -> Floats:

@@ -1,8 +1,7 @@
 """Stiffness from one press: what video can't know, from a moment in which the force is known.
 
 The network's answer per unit stiffness times E is the force, so one press with a known force (a weight, a
-sensor
-on the tool) gives E for the rest of the recording.
+sensor on the tool) gives E for the rest of the recording.
 """
 
 from __future__ import annotations

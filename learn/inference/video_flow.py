@@ -217,6 +217,7 @@ class VideoFlow:
         flow: FlowHere | None = None,
         is_due: Callable[[int, float], bool] = lambda index, time_s: True,
         pulse: Pulse | None = None,
+        watch: Stopwatch | None = None,
     ) -> None:
         """Nothing is decoded yet.
 
@@ -226,13 +227,14 @@ class VideoFlow:
             flow: where flow is computed, closed by the caller; None: here.
             is_due: whether a frame after the rest frame, at its time [s], is to be worked on.
             pulse: motion of the tissue's own that is taken off the flow of every frame.
+            watch: what the time spent is added to; None: one of its own.
 
         Raises:
             UserError: no such masks.
         """
         if settings.masks not in MASKS:
             raise UserError(f"masks: no kind {settings.masks!r}; there are {', '.join(MASKS)}")
-        self.footage, self.settings, self.watch = footage, settings, Stopwatch()
+        self.footage, self.settings, self.watch = footage, settings, watch or Stopwatch()
         self.tissue = np.zeros((0, 0), bool)
         """(h, w), shrunk as the pictures are; empty before the rest frame."""
         self.shrink, self.size = settings.shrink, (0, 0)

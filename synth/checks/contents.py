@@ -55,6 +55,6 @@ def check_contents(
             yield "checksum", truth(good, f"{name}: values are not those that were written")
         yield "finite", truth(finite, f"{name}: holds values that are no numbers")
         if finite and field.low is not None:
-            yield "range", Measure(field.low - low, 0.0, f"{name}: smallest value {low:g} {field.unit}")
+            yield "range", Measure(field.low - low, 0.0, f"{name}: smallest value {low:g}", field.unit)
         if finite and field.high is not None:
-            yield "range", Measure(high - field.high, 0.0, f"{name}: largest value {high:g} {field.unit}")
+            yield "range", Measure(high - field.high, 0.0, f"{name}: largest value {high:g}", field.unit)

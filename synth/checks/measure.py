@@ -17,6 +17,8 @@ class Measure:
     value: float
     limit: float
     where: str
+    unit: str = "-"
+    """Of value and limit."""
 
     @property
     def good(self) -> bool:

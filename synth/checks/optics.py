@@ -68,7 +68,7 @@ def contact(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
         view = sway.at(still, float(time[t])) if sway else still
         seen = cameras.to_pixels(view, cameras.to_camera(view, tips[t].reshape(-1, 3))).mean(axis=0)
         off = float(np.hypot(x - seen[0], y - seen[1])) * view.mm_per_px
-        yield Measure(off, spread * footprint + view.mm_per_px, f"frame {t}")
+        yield Measure(off, spread * footprint + view.mm_per_px, f"frame {t}", "mm")
 
 
 def rays(view: cameras.Camera, pixels: Floats) -> Floats:

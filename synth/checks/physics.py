@@ -41,14 +41,15 @@ def schema(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
 
 def rest(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
     """Frame 0 is at rest: no true or recovered motion [px], no force [mN], no load [kPa]."""
-    yield Measure(float(np.abs(sequence["flow"][0]).max()), 0.02, "flow in frame 0")
+    yield Measure(float(np.abs(sequence["flow"][0]).max()), 0.02, "flow in frame 0", "px")
     if "flow_recovered" in sequence:
-        yield Measure(float(np.abs(sequence["flow_recovered"][0]).max()), 0.02, "recovered flow in frame 0")
+        most = float(np.abs(sequence["flow_recovered"][0]).max())
+        yield Measure(most, 0.02, "recovered flow in frame 0", "px")
     force = np.linalg.norm(sequence["force"][:], axis=1)
-    yield Measure(float(force[0]), 1e-6 * max(float(force.max()), 1e-9), "force in frame 0")
+    yield Measure(float(force[0]), 1e-6 * max(float(force.max()), 1e-9), "force in frame 0", "mN")
     most = float(np.abs(sequence["traction"][int(np.argmax(force))]).max())
     least = float(np.abs(sequence["traction"][0]).max())
-    yield Measure(least, 1e-6 * max(most, 1e-9), "traction in frame 0")
+    yield Measure(least, 1e-6 * max(most, 1e-9), "traction in frame 0", "kPa")
 
 
 def force(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:

@@ -33,13 +33,13 @@ def stereo(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
     pixels = np.stack([columns, rows], axis=1).astype(np.float64)
     points = optics.rays(left, pixels) * rest_depth[rows, columns][:, None]
     disparity = sequence["disparity"][:][rows, columns]
-    yield Measure(_worst(disparity - _wide(left, right, points)), 1e-3, "rest disparity from depth")
+    yield Measure(_worst(disparity - _wide(left, right, points)), 1e-3, "rest disparity from depth", "px")
     half = _HALF_PX if sequence["flow"].stored == np.float16 else 0.0
     for t in frames:
         moved = points + sequence["motion"][t][rows, columns]
         flow = cameras.to_pixels(left, moved) - pixels
         off = _worst(sequence["flow"][t][rows, columns] - flow)
-        yield Measure(off, 1e-3 + half, f"frame {t}: left flow from motion")
+        yield Measure(off, 1e-3 + half, f"frame {t}: left flow from motion", "px")
         for ending, view in (("", left), ("_right", right)):
             yield from _eye(sequence, t, ending, view, points, moved, (rows, columns))
 
@@ -73,8 +73,9 @@ def _eye(
         here = _sampled(sequence["visible_right"][t].astype(np.float32), start) > 0.99
         if (here & seen).sum() > 50:
             off = np.abs(found - (end - start))[here & seen].max(axis=1)
-            yield Measure(float(np.median(off)), 5e-3 + half, f"frame {t}: right flow from motion")
-            yield Measure(float(np.quantile(off, 0.95)), 0.1 + half, f"frame {t}: right flow of nearly all")
+            yield Measure(float(np.median(off)), 5e-3 + half, f"frame {t}: right flow from motion", "px")
+            most = float(np.quantile(off, 0.95))
+            yield Measure(most, 0.1 + half, f"frame {t}: right flow of nearly all", "px")
         seen = seen & here
     name = f"depth{ending}"
     if name in sequence and seen.sum() > 50:

@@ -33,6 +33,8 @@ class Check:
     bad: int = 0
     worst: float = 0.0
     limit: float = 0.0
+    unit: str = "-"
+    """Of worst and limit."""
     offender: str = ""
     cpu_s: float = 0.0
     failures: list[str] = field(default_factory=list)
@@ -52,6 +54,7 @@ class Check:
             not self.offender or measure.severity > Measure(self.worst, self.limit, "").severity
         ):
             self.worst, self.limit, self.offender = measure.value, measure.limit, where
+            self.unit = measure.unit
 
 
 @dataclass(frozen=True)
@@ -69,6 +72,20 @@ class Report:
 
     def as_dict(self) -> dict[str, Any]:
         return {**asdict(self), "good": self.good}
+
+    def lines(self) -> list[str]:
+        """For a person: a line a check, then every failure; as wide as they need to be."""
+        head = ("check", "measures", "bad", "worst", "limit", "unit", "CPU s", "where")
+        rows = [head, *(_row(check) for check in self.checks)]
+        widths = [max(len(row[k]) for row in rows) for k in range(len(head))]
+        table = ["  ".join(f"{cell:<{wide}}" for cell, wide in zip(row, widths, strict=True)) for row in rows]
+        failures = [f"{check.name}: {failure}" for check in self.checks for failure in check.failures]
+        return [*(line.rstrip() for line in table), *failures, "good" if self.good else "not good"]
+
+
+def _row(check: Check) -> tuple[str, ...]:
+    numbers = (f"{check.worst:.3g}", f"{check.limit:.3g}", check.unit) if check.offender else ("", "", "")
+    return (check.name, str(check.count), str(check.bad), *numbers, f"{check.cpu_s:.2f}", check.offender)
 
 
 def verify_dataset(root: Path, *, fast: bool = False) -> Report:

@@ -45,6 +45,7 @@ class _Relief(_Block):
 class _Scenario(_Block):
     family: _Text | None = None
     gesture: _Gesture | None = None
+    further: Annotated[list[_Gesture], Field(max_length=100)] | None = None
     relief: _Relief | None = None
 
 
@@ -65,6 +66,7 @@ class Attributes(_Block):
     flow_backend: _Text | None = None
     job: _Text | None = None
     anatomy_id: _Text | None = None
+    opening_id: _Text | None = None
     variant: _Text | None = None
     young_kpa: Annotated[float, Field(gt=0, le=1e6)] | None = None
     poisson: Annotated[float, Field(ge=0, lt=0.5)] | None = None
@@ -104,3 +106,9 @@ def check_attributes(attrs: Mapping[str, Any], where: str) -> None:
         raise UserError(f"{where}: the attribute {at} can't be right ({why})") from None
     if said.size[0] * said.size[1] > LARGEST_PIXELS:
         raise UserError(f"{where}: {said.size[0]} x {said.size[1]} pixels a frame is too large")
+
+
+def name_gestures(scenario: Mapping[str, Any]) -> str:
+    """Gestures of all instruments of a sequence, by its attribute `scenario`: "pull + push"; may be empty."""
+    each = [scenario.get("gesture") or {}, *(scenario.get("further") or ())]
+    return " + ".join(one["kind"] for one in each if one.get("kind"))

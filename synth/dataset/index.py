@@ -14,8 +14,9 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from synth.dataset import location, split
+from synth.dataset.attributes import name_gestures
 from synth.dataset.folder import Folder, write_whole
-from synth.dataset.store import Sequence, open_sequence
+from synth.dataset.store import Dataset, Sequence, open_sequence
 from synth.errors import UserError
 from synth.system import foreign_file
 
@@ -37,7 +38,7 @@ SCHEMA = pa.schema(
             },
         ),
         pa.field("family", pa.string(), metadata={"meaning": "appearance family"}),
-        pa.field("gesture", pa.string(), metadata={"meaning": "kind of gesture"}),
+        pa.field("gesture", pa.string(), metadata={"meaning": "kind of gesture, of every instrument"}),
         pa.field("young_kpa", pa.float64(), metadata={"meaning": "Young's modulus", "unit": "kPa"}),
         pa.field("poisson", pa.float64(), metadata={"meaning": "Poisson's ratio"}),
         pa.field("load", pa.float64(), metadata={"meaning": "peak load F/(E a^2)"}),
@@ -156,6 +157,18 @@ def written_sides(root: Path) -> dict[str, str] | None:
     return {row["content_hash"]: side for row, side in zip(rows, sides, strict=True) if side is not None}
 
 
+def group_by_side(dataset: Dataset) -> dict[str, list[int]]:
+    """Positions of a dataset's sequences by side, in the order train, validation, test; sides without any
+    are left out. All are "train" where nobody decided. UserError as `written_sides`.
+    """
+    sides = written_sides(dataset.root)
+    if sides is None:
+        return {"train": list(range(len(dataset)))}
+    told = [sides.get(sequence.attrs["content_hash"]) for sequence in dataset]
+    groups = {side: [k for k, one in enumerate(told) if one == side] for side in split.SIDES}
+    return {side: chosen for side, chosen in groups.items() if chosen}
+
+
 def write_index(folder: Folder) -> list[dict[str, Any]]:
     """Brings the index up to date with the folder. Returns all rows."""
     ordered = collect(folder)
@@ -181,7 +194,7 @@ def row_of(sequence: Sequence) -> dict[str, Any]:
     """The row of a finished sequence, from its attributes."""
     attrs = sequence.attrs
     scenario, summary = attrs.get("scenario", {}), attrs.get("summary", {})
-    gesture = scenario.get("gesture", {})
+    gesture = scenario.get("gesture") or {}
     scale, flow = attrs.get("scale_mm_per_px"), summary.get("peak_flow_px")
     stages = [stage for stage in attrs.get("timings", {}).values() if isinstance(stage, dict)]
     return {
@@ -191,7 +204,7 @@ def row_of(sequence: Sequence) -> dict[str, Any]:
         "content_hash": attrs["content_hash"],
         "anatomy": split.name_anatomy(attrs),
         "family": scenario.get("family"),
-        "gesture": gesture.get("kind"),
+        "gesture": name_gestures(scenario) or None,
         "young_kpa": attrs.get("young_kpa"),
         "poisson": attrs.get("poisson"),
         "load": gesture.get("load"),

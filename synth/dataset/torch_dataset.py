@@ -26,7 +26,7 @@ class Frames:
     Fields without a frame axis come whole; `index` and `frame` say where an item is from. Safe in workers
     that are forked or spawned: a process opens its own stores.
 
-        frames = Frames("out", ["rgb", "flow", "traction"])
+        frames = Frames("out", ["rgb", "flow", "traction"])  # from synth.store import Frames
         loader = torch.utils.data.DataLoader(frames, batch_size=8, num_workers=2)
     """
 

@@ -12,13 +12,14 @@ from rich.text import Text
 from synth.dataset import size_forecast
 from synth.engine.journal import Account
 from synth.engine.worker_process import Attempt
+from synth.system.terminal import draws_bars
 
 # Without a terminal a line is printed at most so often.
 _QUIET_S = 10.0
 
 
 class Bars(Progress):
-    """A bar for the dataset and one for every sequence in work; plain lines where there is no terminal.
+    """A bar for the dataset and one for every sequence in work; plain lines where nothing can be drawn.
 
     What is left is the run's own estimate: rich knows nothing of workers whose first sequences also compile.
     """
@@ -28,7 +29,7 @@ class Bars(Progress):
         console = Console(stderr=True)
         columns = [TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()]
         left = TextColumn("{task.fields[left]}", style="cyan")
-        super().__init__(*columns, left, console=console, disable=not console.is_terminal)
+        super().__init__(*columns, left, console=console, disable=not draws_bars(console))
         self._bars: dict[int, TaskID] = {}
         self._dataset = self.add_task("sequences", total=None, left="")
         self._said = time.monotonic()

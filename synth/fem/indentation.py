@@ -24,7 +24,8 @@ from synth.fem.surface_embedding import Embedding
 from synth.fem.system import State, System
 from synth.fem.tool import Course, Gesture
 from synth.job import schema
-from synth.job.law_limits import LARGEST_LOAD, RIGID_GESTURES, depth_of_load
+from synth.job.law_limits import RIGID_GESTURES, depth_of_load
+from synth.job.law_plugins import largest_load
 
 Floats = NDArray[np.float64]
 
@@ -150,7 +151,7 @@ def press_skin(
 def _check_depth(fem: schema.Fem, tissue: Tissue, gesture: Gesture, force: Floats) -> None:
     """Refuses forces (T, 3) mN, found under a given depth, that are past the law's range."""
     size = np.linalg.norm(force, axis=1) / (tissue.young_kpa * gesture.footprint_mm**2)
-    t, largest = int(size.argmax()), LARGEST_LOAD[tissue.law]
+    t, largest = int(size.argmax()), largest_load(tissue.law)
     if fem.depth_mm is not None and size[t] > largest:
         raise UserError(
             f"frame {t}: the depth asked for takes a load of {size[t]:.3g}, past the range of the "

@@ -11,7 +11,7 @@ from synth.fem.membrane import Sheet
 from synth.fem.mesh.tetrahedra import Tets
 from synth.fem.system import System, assemble
 from synth.job import schema
-from synth.job.law_limits import LARGEST_LOAD
+from synth.job.law_plugins import largest_load
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class Tissue:
     poisson: float
     """Poisson's ratio."""
     law: str
-    """Material law, a key of `laws.NUMBER`."""
+    """Material law, a key of `laws.NUMBER` or a plug-in's name."""
     why: str = "asked for"
     """Why this law."""
     membrane: Pia | None = None
@@ -83,13 +83,13 @@ def check_load(law: str, load: float) -> None:
     """Refuses a load past what a law is known to describe.
 
     Args:
-        law: a key of `LARGEST_LOAD`.
+        law: its name.
         load: P = F/(E a^2).
 
     Raises:
         UserError: names the largest valid value.
     """
-    largest = LARGEST_LOAD[law]
+    largest = largest_load(law)
     if load > largest * (1 + 1e-9):  # a force turned into a load may be off by rounding
         raise UserError(
             f"fem.load: {load:g} is past the range of the {law} law; the largest valid value is {largest:g}"

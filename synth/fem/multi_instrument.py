@@ -9,13 +9,67 @@ from synth.errors import UserError
 from synth.fem.material import Tissue
 from synth.fem.tool import Gesture, focus, shaft
 from synth.job import schema
+from synth.job.instrument import CLEAR_MM, Instrument
 
 Floats = NDArray[np.float64]
 
 _TRIES = 400
+_ROUNDS = 8
 _OVERLAP = 0.6  # centres at least this part of both radii apart: the pressures' sum peaks 10% above one's
 _BLADE_MM, _SPREADING, _BODY_MM = 3.0, 0.3, 14.0  # room an instrument needs at its tip, growing up the shaft
 _LENGTH_MM, _STEPS = 110.0, 23
+
+
+def draw_crew(
+    fem: schema.Fem,
+    craniotomy: schema.Craniotomy,
+    tissue: Tissue,
+    rng: np.random.Generator,
+    others: np.random.Generator,
+) -> tuple[Gesture, ...]:
+    """Draws the gestures of all instruments: those of `fem.crew` as they are asked, then the rest.
+
+    Those that have a place come first, so that nothing that is drawn stands where one is wanted.
+
+    Args:
+        fem, craniotomy, tissue: as in `Gesture.draw`.
+        rng: random numbers of this sequence's first gesture.
+        others: of its further ones.
+
+    Raises:
+        UserError: the opening has no room for so many, or not there.
+    """
+    if not fem.crew:
+        first = Gesture.draw(fem, craniotomy, tissue, rng)
+        return (first, *further(first, fem, craniotomy, tissue, others))
+    count = max(int(others.integers(fem.instruments[0], fem.instruments[1] + 1)), len(fem.crew))
+    asked = [*fem.crew, *[Instrument()] * (count - len(fem.crew))]
+    order = sorted(range(count), key=lambda k: asked[k].place is None)
+    for _ in range(_ROUNDS):
+        found: dict[int, Gesture] = {}
+        for k in order:
+            for _ in range(_TRIES):
+                trial = Gesture.draw(fem, craniotomy, tissue, others if k else rng, asked[k])
+                if fits(trial, craniotomy) and all(room(trial, other) >= 0 for other in found.values()):
+                    found[k] = trial
+                    break
+            else:
+                break  # the shaft of one before may stand in the way: all anew
+        else:
+            return tuple(found[k] for k in range(count))
+    beside = f" beside the other {len(found)}" if found else ""
+    raise UserError(
+        f"fem.crew: instrument {k} has no room{beside} in an opening of {craniotomy.radius_mm:g} mm "
+        "radius; change its place, lower its footprint_mm, or widen anatomy.craniotomy.radius_mm"
+    )
+
+
+def fits(gesture: Gesture, craniotomy: schema.Craniotomy) -> bool:
+    """Whether all that a gesture loads is in the opening, clear of its rim."""
+    path, start = np.asarray(gesture.path_mm), np.array([c.point_mm for c in gesture.contacts])
+    ends = np.concatenate([start, start + path])
+    free = craniotomy.radius_mm - gesture.footprint_mm - CLEAR_MM
+    return bool(np.hypot(*ends.T).max() <= max(free, 0.0) + 1e-9)
 
 
 def further(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import scipy.sparse as sp
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 from scipy.sparse.linalg import SuperLU, splu
 
 from synth.errors import UserError
+from synth.fem import foreign_law
 from synth.fem.assembly import divergence, gradient, stiffness
 from synth.fem.laws import (
     NUMBER,
@@ -89,11 +91,12 @@ class System:
         strain, answer, density = np.empty((count, 3, 3)), np.empty((count, 3, 3)), np.empty(count)
         gradient(self.mesh.cells, self.mesh.slope, u, strain)
         mu, lam = lame(1.0, self.poisson)
-        number = NUMBER[self.law]
-        least = stress(number, strain, mu, lam - self.averaged, answer, density)
+        own = self.law in NUMBER
+        act = partial(stress, NUMBER[self.law]) if own else partial(foreign_law.stress, self.law)
+        least = act(strain, mu, lam - self.averaged, answer, density)
         energy = float(density @ self.mesh.weight.ravel())
         if self.averaged:
-            energy += resist_swelling(number, strain, self.mesh.weight, self.averaged, answer)
+            energy += resist_swelling(_swelling(self.law), strain, self.mesh.weight, self.averaged, answer)
         force = np.empty_like(u)
         divergence(self.mesh.cells, self.mesh.slope, self.mesh.weight, answer, force)
         spring = self.springs(u)
@@ -109,11 +112,13 @@ class System:
         gradient(self.mesh.cells, self.mesh.slope, u, strain)
         moduli = np.empty((len(strain), 3, 3, 3, 3))
         mu, lam = lame(1.0, self.poisson)
-        tangent(NUMBER[self.law], strain, mu, lam - self.averaged, moduli)
+        own = self.law in NUMBER
+        bend = partial(tangent, NUMBER[self.law]) if own else partial(foreign_law.tangent, self.law)
+        bend(strain, mu, lam - self.averaged, moduli)
         along = None
         if self.averaged:
             along, pressure = average(self.mesh, self.law, strain, self.averaged)
-            bend_swelling(NUMBER[self.law], strain, pressure, moduli)
+            bend_swelling(_swelling(self.law), strain, pressure, moduli)
         whole = stiffness(self.mesh, moduli, along) + _springs(self.hold, self.slip)
         if self.membrane is not None:
             whole = whole + self.membrane.stiffness_at(u)
@@ -145,7 +150,7 @@ def assemble(
 
     Args:
         tets: the mesh, its walls and springs.
-        law: a key of `laws.NUMBER`.
+        law: a key of `laws.NUMBER`, or a plug-in's name.
         poisson: below 0.5.
         sheet: a membrane on the surface.
         averaged: resist each element's mean swelling rather than that at every point, but for `POINTWISE`.
@@ -189,7 +194,7 @@ def average(mesh: Quadrature, law: str, strain: Floats, lam: float) -> tuple[Flo
         (M, n, 3) for `stiffness`, and the pressure (M * Q,) kPa that multiplies the second derivative.
     """
     value, slope = np.empty(len(strain)), np.empty_like(strain)
-    swellings(NUMBER[law], strain, value, slope)
+    swellings(_swelling(law), strain, value, slope)
     volume = mesh.weight.sum(axis=1)
     mean = (value.reshape(mesh.weight.shape) * mesh.weight).sum(axis=1) / volume
     slope = slope.reshape(*mesh.weight.shape, 3, 3)
@@ -203,6 +208,11 @@ def hooke(young: float, poisson: float) -> Floats:
     moduli = np.empty((1, 3, 3, 3, 3))
     tangent(NUMBER["linear"], np.zeros((1, 3, 3)), *lame(young, poisson), moduli)
     return moduli
+
+
+def _swelling(law: str) -> int:
+    """The law whose measure of swelling an element's mean is taken of; plug-ins' is log J."""
+    return NUMBER.get(law, NUMBER["neo-hookean"])
 
 
 def _springs(hold: sp.csr_array, slip: sp.csr_array | None) -> sp.csr_array:

@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 from synth.errors import UserError
 from synth.fem.material import Tissue
 from synth.job import schema
+from synth.job.instrument import CLEAR_MM, Instrument
 from synth.job.law_limits import RIGID_GESTURES, load_of_depth
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-_INSIDE_MM = 1.0  # clear of the rim
 _PINCH = 0.5  # a grasp's tips press towards each other with this part of their pull
 _FRICTION = 0.4  # a sliding tip drags with this part of its push
 
@@ -65,23 +65,35 @@ class Gesture:
 
     @classmethod
     def draw(
-        cls, fem: schema.Fem, craniotomy: schema.Craniotomy, tissue: Tissue, rng: np.random.Generator
+        cls,
+        fem: schema.Fem,
+        craniotomy: schema.Craniotomy,
+        tissue: Tissue,
+        rng: np.random.Generator,
+        asked: Instrument = Instrument(),
     ) -> Gesture:
-        """Draws one gesture: contact uniformly in the opening, direction uniformly in its cone."""
-        kind = str(rng.choice(fem.gestures))
-        footprint = float(rng.uniform(*fem.footprint_mm))
+        """Draws one gesture: contact uniformly in the opening, direction uniformly in its cone; or as asked.
+
+        Where it is asked for a place, what is drawn may reach beyond the opening: see `fits`.
+        """
+        drawn, want = str(rng.choice(fem.gestures)), fem.demand(asked)
+        kind = asked.gesture or drawn
+        footprint = float(rng.uniform(*want.footprint_mm))
         size = tissue.young_kpa * footprint**2
-        load = float(rng.uniform(*fem.load) if fem.force_mn is None else rng.uniform(*fem.force_mn) / size)
-        if fem.depth_mm is not None and kind in RIGID_GESTURES:
-            depth = float(rng.uniform(*fem.depth_mm))
+        given = want.load if want.force_mn is None else want.force_mn
+        load = float(rng.uniform(*given)) / (1.0 if want.force_mn is None else size)
+        if want.depth_mm is not None and kind in RIGID_GESTURES:
+            depth = float(rng.uniform(*want.depth_mm))
             load = load_of_depth(fem.tip, depth / footprint, tissue.poisson)
         spread = footprint * float(rng.uniform(1.2, 1.8) if kind == "grasp" else rng.uniform(0.1, 0.9))
         path = float(rng.uniform(3, 8)) if kind == "slide" else 0.0
         azimuth = float(rng.uniform(0, 360))
         reach = footprint + 0.5 * (path if kind == "slide" else spread if kind == "grasp" else 0.0)
-        room = max(craniotomy.radius_mm - reach - _INSIDE_MM, 0.0)
+        room = max(craniotomy.radius_mm - reach - CLEAR_MM, 0.0)
         radius, angle = room * np.sqrt(rng.uniform()), rng.uniform(0, 2 * np.pi)
         point = radius * np.array([np.cos(angle), np.sin(angle)])
+        if asked.place is not None:
+            point = np.asarray(asked.place, np.float64)
         turn = rng.uniform(0, 2 * np.pi)
         along = np.array([np.cos(turn), np.sin(turn)])
         cone, friction = np.cos(np.radians(fem.cone_deg)), _FRICTION
@@ -93,6 +105,10 @@ class Gesture:
             rise = rng.uniform(0.1, max(cone, 0.3))
         elif kind == "slide":
             rise = 1 / np.hypot(1, friction)
+        if asked.direction is not None:
+            whole = np.asarray(asked.direction) / np.linalg.norm(asked.direction)
+            along = whole[:2] / (np.hypot(*whole[:2]) or 1.0)
+            rise = rise if kind == "slide" else abs(float(whole[2]))
         up = rise if kind in ("pull", "grasp") else -rise
         way = np.append(np.sqrt(1 - rise**2) * along, up)
         across = np.radians(azimuth + 90)
@@ -110,6 +126,7 @@ class Gesture:
         full = touch + float(rng.uniform(*ramp))
         release = float(rng.uniform(0.85, 0.92))
         hold = float(rng.uniform(0.5, 0.7) if kind in ("retract", "slide") else rng.uniform(0.15, 0.5))
+        timing = (touch, full, full + hold * (release - full), release)
         return cls(
             kind=kind,
             contacts=tuple(
@@ -127,7 +144,7 @@ class Gesture:
             spread_mm=spread,
             hover_mm=float(rng.uniform(6, 12)),
             taps=int(rng.integers(2, 4)) if kind == "tap" else 1,
-            timing=(touch, full, full + hold * (release - full), release),
+            timing=asked.timing or timing,
         )
 
 

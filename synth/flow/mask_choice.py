@@ -38,7 +38,11 @@ _AS_GOOD = 0.99  # share of the confidence without masks that has to be left, wh
 _GROWN = 1.5  # the choice is made again when motion has grown by this factor,
 _STILL_PX = 0.5  # from this on,
 _NEW = 0.005  # or when a piece of this share of the tissue turns up where none was
-_SPARE = 24  # solutions beyond one a frame that are allowed at once (one from nothing counts twice), and
+_HELD = 0.2  # highlights hold the picture still where they move by less than this share of what is
+_AWAY_PX = 6  # so far away from them, a tenth of which moves by
+_AWAY_MOVES_PX = 0.6  # this, if less than
+_AWAY_MATCHED = 0.5  # this share of that is found again: the highlights vouch for themselves alone
+_SPARE = 10  # solutions beyond one a frame that are allowed at once (one from nothing counts twice), and
 _SHARE = 0.05  # a frame
 
 
@@ -175,6 +179,9 @@ class ChoosingTracker:
                 self.regained = doubted and tracker.trusted
         self.regained |= tracker.trusted and tracker.resets > resets
         self.blocked = masked
+        if tracker.trusted and self._is_held_still(found):
+            flow, confidence = tracker.doubt("highlights that stay where they are hold the picture still")
+            self.regained = False
         if tracker.trusted and self._is_learning:
             self._verdict = np.where(pieces.number > 0, np.where(masked, 1, -1), 0).astype(np.int8)
         return flow, confidence
@@ -199,6 +206,28 @@ class ChoosingTracker:
         if new or not self.tracker.trusted:
             return True
         return _motion(flow, self.tracker.tissue) > max(_STILL_PX, _GROWN * self._tested_px)
+
+    def _is_held_still(self, found: Proposal) -> bool:
+        """Whether only highlights say that nothing moves.
+
+        Over tissue so faint that noise hides it, nothing contradicts highlights that stay with the light, and
+        they are what is found again. Away from them hardly anything is, and what little is known there moves.
+        """
+        tracker, last = self.tracker, self.tracker.last
+        before, now = self.rest_found.glare, found.glare
+        assert last is not None
+        seen = tracker.usable & ~self.blocked
+        shining = seen & before & now  # what shines in one picture alone doesn't stay
+        if np.count_nonzero(shining) < _SMALLEST:
+            return False
+        away = seen & ~_ring(before | now, _AWAY_PX)
+        if np.count_nonzero(away) < _LEAST_BEYOND * seen.size:
+            return False
+        length = np.hypot(last.flow[..., 0], last.flow[..., 1])
+        moves = float(np.quantile(length[away], 0.9))
+        if moves < _AWAY_MOVES_PX or float(np.median(length[shining])) >= _HELD * moves:
+            return False
+        return tracker.judge(last.flow, last.confidence, away).matched < _AWAY_MATCHED
 
     def _choose(
         self,
@@ -362,8 +391,8 @@ class _Evidence:
         return float(self.gain[ring].mean()) > _GAIN_OF_ALL and differs > _DIFFERENT_PX
 
 
-def _ring(piece: Flags) -> Flags:
-    wide = 2 * _RING_PX + 1
+def _ring(piece: Flags, away_px: int = _RING_PX) -> Flags:
+    wide = 2 * away_px + 1
     return np.asarray(cv2.dilate(piece.astype(np.uint8), np.ones((wide, wide), np.uint8)) > 0, bool)
 
 

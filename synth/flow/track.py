@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from synth.errors import UserError
+from synth.flow import mask
 from synth.flow.confidence import DOUBTFUL
 from synth.flow.estimator import Estimator, Flags, Flow, Map, Rgb, create
 
@@ -87,6 +88,7 @@ class Tracker:
         """The last frame's answer as it was found."""
         self._good: Flow | None = None
         self._level = 1.0
+        self._before: tuple[Flow | None, float] = None, 1.0  # both as they were a frame ago
 
     def start(self, initial: Flow | None) -> None:
         """Sets what the next frame starts from, (H, W, 2) px; None: from nothing."""
@@ -101,6 +103,7 @@ class Tracker:
         """
         if frame.shape != self.rest.shape or blocked.shape != self.tissue.shape:
             raise UserError(f"flow: frame {frame.shape} does not fit the rest frame {self.rest.shape}")
+        self._before = self._good, self._level
         found = self.solve(frame, blocked, self._good)
         if self._good is not None and self.is_doubtful(found):
             again = self.solve(frame, blocked, None)
@@ -139,12 +142,40 @@ class Tracker:
         elif not found.is_matched:
             self.lost = f"only {100 * found.matched:.0f}% of what is seen matches the rest frame"
         self.trusted = not self.lost
-        confidence = found.confidence
         if self.trusted:
             self._good, self._level = found.flow, found.level
-        else:
-            confidence = np.minimum(confidence, 0.5 * DOUBTFUL)
-        return found.flow * self.tissue[..., None], confidence
+        return self._said(found)
+
+    def doubt(self, reason: str) -> tuple[Flow, Map]:
+        """Takes back that the frame could be followed, once it is accepted; what is said of it then."""
+        assert self.last is not None
+        self.lost, self.trusted = reason, False
+        self._good, self._level = self._before
+        return self._said(self.last)
+
+    def _said(self, found: Solved) -> tuple[Flow, Map]:
+        sure = found.confidence if self.trusted else np.minimum(found.confidence, 0.5 * DOUBTFUL)
+        return found.flow * self.tissue[..., None], sure
+
+
+def recover_flow(
+    frames: NDArray[np.uint8],
+    tool: NDArray[np.bool_],
+    tissue: Flags,
+    backend: str | Estimator = "tvl1",
+) -> Track:
+    """Displacement through a video whose instruments' outlines are known; glare is found in the pictures.
+
+    Args:
+        frames: (T, H, W, 3) uint8, sRGB; frame 0 is the rest frame.
+        tool: (T, H, W), pixels of instruments.
+        tissue: (H, W), where there is tissue to follow in the rest frame.
+        backend: an estimator, or the name of one: tvl1, opencv-tvl1, dis or a plug-in's.
+
+    Raises:
+        UserError: no such estimator, no frames, or shapes that don't fit.
+    """
+    return track(backend, frames, mask.hidden(frames, tool), tissue)
 
 
 def track(

@@ -57,14 +57,9 @@ def load_brain(path: Path, craniotomy: Craniotomy) -> Brain:
     Raises:
         UserError: the file cannot be read, encloses no volume, or has no surface at the craniotomy.
     """
-    vertices, faces = _read(path)
     if craniotomy.point is None or craniotomy.direction is None:
         raise UserError("anatomy.mesh needs craniotomy.point and craniotomy.direction")
-    if not np.isfinite(vertices).all():
-        raise UserError(f"anatomy.mesh: {path.name} holds coordinates that are no numbers")
-    span = np.ptp(vertices, axis=0) if len(vertices) else np.zeros(3)
-    if len(faces) < 4 or span.min() < 1e-3 * span.max() or _volume(vertices, faces) < 1e-3 * span.prod():
-        raise UserError(f"anatomy.mesh: {path.name} encloses no volume")
+    vertices, faces = read_brain(path)
     out = np.asarray(craniotomy.direction) / np.linalg.norm(craniotomy.direction)
     turn, origin = axes(out), np.asarray(craniotomy.point)
     placed = (vertices - origin) @ turn.T
@@ -78,6 +73,21 @@ def load_brain(path: Path, craniotomy: Craniotomy) -> Brain:
     placed[:, 2] -= heights.max()
     origin = origin + heights.max() * turn[2]
     return Brain(np.ascontiguousarray(placed), faces.astype(np.int32), origin, turn)
+
+
+def read_brain(path: Path) -> tuple[Floats, NDArray[np.int64]]:
+    """A surface in the file's axes, merged: vertices (V, 3) mm and faces (F, 3).
+
+    Raises:
+        UserError: the file cannot be read, or encloses no volume.
+    """
+    vertices, faces = _read(path)
+    if not np.isfinite(vertices).all():
+        raise UserError(f"anatomy.mesh: {path.name} holds coordinates that are no numbers")
+    span = np.ptp(vertices, axis=0) if len(vertices) else np.zeros(3)
+    if len(faces) < 4 or span.min() < 1e-3 * span.max() or _volume(vertices, faces) < 1e-3 * span.prod():
+        raise UserError(f"anatomy.mesh: {path.name} encloses no volume")
+    return vertices, faces
 
 
 def axes(out: Floats) -> Floats:

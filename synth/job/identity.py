@@ -32,6 +32,10 @@ def identify_job(job: Job) -> str:
     described = job.model_dump(mode="json", exclude={"sequences", "card"})
     if not job.render.stereo_mm:
         del described["flow"]["stereo"]  # says nothing of one eye's sequences
+    if not job.fem.crew:
+        del described["fem"]["crew"]  # so that jobs without one are what they were
+    if not job.anatomy.craniotomy.also:
+        del described["anatomy"]["craniotomy"]["also"]
     for (block, name), largest in FILES.items():
         described[str(block)][str(name)] = _digest(getattr(getattr(job, str(block)), str(name)), largest)
     return hashlib.blake2b(canonical(described), digest_size=16).hexdigest()
@@ -44,6 +48,14 @@ def identify_anatomy(job: Job, seed: int) -> str:
     """
     mesh = _digest(job.anatomy.mesh, FILES["anatomy", "mesh"])
     return f"seed-{seed}" if mesh is None else f"mesh-{mesh[:16]}"
+
+
+def identify_opening(job: Job, anatomy: int) -> str | None:
+    """Which place of a user's brain a sequence shows, across datasets; None of a procedural one."""
+    where = job.anatomy.opened(anatomy).craniotomy
+    if job.anatomy.mesh is None or where.point is None:
+        return None
+    return f"{identify_anatomy(job, 0)} at " + ", ".join(f"{value:g}" for value in where.point)
 
 
 def _digest(path: Path | None, largest: int) -> str | None:

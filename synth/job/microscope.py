@@ -48,6 +48,10 @@ class Sensor(Section):
     """Photoelectrons at full scale: photon noise is the root of what is counted."""
     read_noise: NonNegativeRange = (8.0, 14.0)
     """Noise of the readout, standard deviation [electrons]."""
+    vignette: Share = 0.15
+    """Share of light lost in the picture's corners."""
+    blur_px: Annotated[FiniteFloat, Field(ge=0, le=8)] = 0.0
+    """Blur of the optics beyond the aperture's: standard deviation of a Gaussian [px]."""
     contrast: ShareRange = (0.25, 0.55)
     """Tone curve: weight of an S over plain sRGB."""
     sharpening: NonNegativeRange = (0.15, 0.4)
@@ -109,3 +113,6 @@ class Render(Section):
     """Also write the linear radiance of every frame as EXR."""
     tool: bool = True
     """Show the instrument."""
+    scenery: tuple[Literal["retractor", "cottonoid", "bone", "drape"], ...] = ()
+    """What else may lie about the opening, each in three of four sequences: a retractor's blade and cotton
+    patties over its edge, the bone's cut edge, drapes in the corners. It hides tissue and is none."""

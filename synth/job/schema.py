@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import difflib
+import math
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -9,11 +12,16 @@ from pydantic import AfterValidator, BeforeValidator, Field, FiniteFloat, model_
 
 from synth import fields
 from synth.flow.estimator import names
-from synth.job.law_limits import LARGEST_LOAD, RIGID_GESTURES, choose, depth_of_load, load_of_depth
+from synth.job import law_plugins
+from synth.job.instrument import CLEAR_MM, Kind
+from synth.job.instrument import Instrument as Instrument
+from synth.job.law_limits import RIGID_GESTURES, choose, depth_of_load, load_of_depth
+from synth.job.law_plugins import largest_load
 from synth.job.microscope import Light as Light
 from synth.job.microscope import Render as Render
 from synth.job.microscope import Sensor as Sensor
 from synth.job.types import (
+    Colour,
     InstrumentRange,
     NonNegative,
     NonNegativeRange,
@@ -28,6 +36,21 @@ from synth.job.types import (
 )
 
 
+class Place(Section):
+    """A place on the brain's surface."""
+
+    point: Vector
+    """A point on (or near) the surface, in the mesh's own axes [mm]."""
+    direction: Vector
+    """Outward direction there, in the mesh's own axes; normalised."""
+
+    @model_validator(mode="after")
+    def _direction_has_length(self) -> Place:
+        if not any(self.direction):
+            raise ValueError("direction has no length")
+        return self
+
+
 class Craniotomy(Section):
     """Where the skull is open."""
 
@@ -39,6 +62,9 @@ class Craniotomy(Section):
     """Radius of the opening [mm]."""
     rim_mm: Positive = 3.0
     """Width over which the rim's hold on the brain grows from none to firm [mm]."""
+    also: Annotated[tuple[Place, ...], Field(max_length=100)] = ()
+    """Further places on the same mesh, each with point and direction: anatomies take them in turn, the first
+    being `point`. `learn train` can then tell openings apart, though not brains."""
 
     @model_validator(mode="after")
     def _direction_has_length(self) -> Craniotomy:
@@ -85,6 +111,10 @@ class Anatomy(Section):
     """Procedural relief: depth of the sulci as seen from outside [mm]."""
     vertices: Annotated[int, Field(ge=400, le=400_000)] = 40_000
     """Vertices of the fine surface that is loaded, moved and rendered."""
+    vessel_density: Annotated[FiniteFloat, Field(ge=0.3, le=3)] = 1.0
+    """Length of the vessels on an area, against the usual."""
+    vessel_calibre: Annotated[FiniteFloat, Field(ge=0.2, le=4)] = 1.0
+    """Radii of the vessels, against the usual."""
     craniotomy: Craniotomy = Craniotomy()
     """Where the skull is open."""
     attachments: tuple[Attachment, ...] = ()
@@ -95,10 +125,46 @@ class Anatomy(Section):
     def _mesh_is_placed(self) -> Anatomy:
         if self.mesh is not None and (self.craniotomy.point is None or self.craniotomy.direction is None):
             raise ValueError("a mesh needs craniotomy.point and craniotomy.direction")
+        if self.mesh is None and self.craniotomy.also:
+            raise ValueError("craniotomy.also is for a mesh; a procedural block is opened in its middle")
         return self
+
+    def opened(self, number: int) -> Anatomy:
+        """The section with the place that anatomy `number` is opened at as its only one."""
+        where = self.craniotomy
+        if not where.also:
+            return self
+        turn = number % (len(where.also) + 1)
+        place = where if turn == 0 else where.also[turn - 1]
+        moved = {"point": place.point, "direction": place.direction, "also": ()}
+        return self.model_copy(update={"craniotomy": where.model_copy(update=moved)})
 
 
 Family = Literal["healthy", "hyperaemic", "pale", "oedematous", "calf"]
+
+
+class Own(Section):
+    """A family of your own: each key that is given takes the place of the family's value. Default: none.
+
+    `synth fit` writes it from a photograph. Colours are linear RGB, and vary a little between sequences.
+    """
+
+    crown: Colour | None = None
+    """Reflectance of the gyri's crowns."""
+    flush: Colour | None = None
+    """Reflectance where more blood shines through."""
+    vein: Colour | None = None
+    """Reflectance of a thick vein along its crest."""
+    wine: Colour | None = None
+    """Reflectance of a thick vein at its sides."""
+    arterial: NonNegativeRange | None = None
+    """Strength of the arteries' red; healthy: 1.1-1.5."""
+    capillary: NonNegativeRange | None = None
+    """Strength of the vessels that shimmer through the tissue; healthy: 1.4-2.2."""
+    shade: NonNegativeRange | None = None
+    """Darkening of the sulci; healthy: 0.3-0.6."""
+    film_mm: PositiveRange | None = None
+    """Width of what the wet film evens out [mm]; healthy: 0.035-0.06."""
 
 
 class Appearance(Section):
@@ -106,6 +172,8 @@ class Appearance(Section):
 
     families: tuple[Family, ...] = ("healthy",)
     """Appearance families that sequences are drawn from, in equal shares."""
+    own: Own = Own()
+    """A family of your own, on top of the named ones."""
     photo: Path | None = None
     """A photograph used as albedo, relative to the job file. Empty: procedural vessels and parenchyma."""
     cottonoid: Share = 0.2
@@ -154,11 +222,32 @@ class Pulse(Section):
     """Breaths a second."""
 
 
+def _law(name: str) -> str:
+    known = ("auto", *law_plugins.names())
+    if name not in known:
+        close = difflib.get_close_matches(name, known, 1)
+        hint = f"; did you mean '{close[0]}'?" if close else ""
+        raise ValueError(f"there is no law {name!r}; there are {', '.join(known)}{hint}")
+    return name
+
+
+@dataclass(frozen=True)
+class Demand:
+    """How hard an instrument may load tissue: the ranges that count for it."""
+
+    load: tuple[float, float]
+    """P = F/(E a^2), where neither force nor depth is given."""
+    force_mn: tuple[float, float] | None
+    depth_mm: tuple[float, float] | None
+    footprint_mm: tuple[float, float]
+
+
 class Fem(Section):
     """The physics of the tissue and of the load."""
 
-    law: Literal["auto", "linear", "corotational", "stable", "neo-hookean"] = "auto"
-    """Material law; auto takes the cheapest whose error at the largest load is within `tolerance`."""
+    law: Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]+$", max_length=100), AfterValidator(_law)] = "auto"
+    """Material law: linear, corotational, stable, neo-hookean or an installed plug-in's; auto takes the
+    cheapest of ours whose error at the largest load is within `tolerance`."""
     tolerance: Annotated[FiniteFloat, Field(gt=0, le=1)] = 0.05
     """Error against neo-Hookean that `law: auto` accepts, as a part of the displacement."""
     order: Literal[1, 2] = 2
@@ -185,9 +274,14 @@ class Fem(Section):
     """Peak force of a contact [mN]; given, it takes the place of `load`."""
     footprint_mm: PositiveRange = (3.0, 6.0)
     """Radius a of the contact [mm]."""
-    gestures: Annotated[
-        tuple[Literal["pull", "push", "slide", "grasp", "retract", "tap"], ...], Field(min_length=1)
-    ] = ("pull", "push", "slide", "grasp", "retract", "tap")
+    gestures: Annotated[tuple[Kind, ...], Field(min_length=1)] = (
+        "pull",
+        "push",
+        "slide",
+        "grasp",
+        "retract",
+        "tap",
+    )
     """Kinds of gesture that sequences are drawn from, in equal shares."""
     contact: Literal["traction", "rigid"] = "traction"
     """What loads tissue: a given traction or, for push, slide and tap, a rigid tip that presses and rubs."""
@@ -200,6 +294,9 @@ class Fem(Section):
     """Rigid contact: peak depth of the tip below first touch [mm]; given, it takes the place of `load`."""
     instruments: InstrumentRange = (1, 1)
     """How many instruments act at once, each with a gesture, load, direction and timing of its own."""
+    crew: Annotated[tuple[Instrument, ...], Field(max_length=3)] = ()
+    """Instruments as asked, the first ones of `instruments` (there are at least so many): a list of {gesture,
+    place, direction, load, force_mn, footprint_mm, timing}, each of them drawn where it is left out."""
     ramp: PositiveRange = (0.25, 0.35)
     """Time in which the load grows to its peak, as a part of the sequence."""
     cone_deg: Annotated[FiniteFloat, Field(ge=0, le=80)] = 65.0
@@ -233,38 +330,77 @@ class Fem(Section):
             return self
         if self.time != "quasi-static" or self.relaxation:
             raise ValueError("contact: rigid is for quasi-static tissue without relaxation")
-        if not set(self.gestures) & set(RIGID_GESTURES):
+        if not self.kinds & set(RIGID_GESTURES):
             raise ValueError(f"contact: rigid is for {', '.join(RIGID_GESTURES)}; name one in gestures")
-        if self.depth_mm is not None and (
-            self.force_mn is not None or set(self.gestures) - set(RIGID_GESTURES)
-        ):
+        forced = self.force_mn is not None or any(one.force_mn for one in self.crew)
+        if self.depth_mm is not None and (forced or self.kinds - set(RIGID_GESTURES)):
             raise ValueError(f"depth_mm is for {', '.join(RIGID_GESTURES)} alone, without force_mn")
+        for k, one in enumerate(self.crew):
+            if one.direction is None or one.gesture not in ("push", "tap"):
+                continue
+            if -one.direction[2] * math.hypot(1, self.friction) < math.hypot(*one.direction) * (1 - 1e-9):
+                raise ValueError(
+                    f"crew[{k}].direction: a rigid tip would slip off; at most "
+                    f"{math.degrees(math.atan(self.friction)):.3g} degrees from straight down"
+                )
         return self
 
     @model_validator(mode="after")
     def _load_is_in_the_laws_range(self) -> Fem:
-        load = self.largest_load
         law, _ = self.chosen_law
-        largest = LARGEST_LOAD[law]
-        if self.depth_mm is not None and load > largest:
-            depth = depth_of_load(self.tip, largest, self.poisson[1]) * self.footprint_mm[0]
-            raise ValueError(
-                f"depth_mm {self.depth_mm[1]:g} under the smallest contact ({self.footprint_mm[0]:g} mm) "
+        largest = largest_load(law)
+        for where, one in self._demands:
+            said = self._past_range(one, law, largest)
+            if said:
+                raise ValueError(where + said)
+        return self
+
+    def _past_range(self, one: Demand, law: str, largest: float) -> str:
+        """What is wrong with a demand, if it is past what the law holds for."""
+        load = self._largest(one)
+        if one.depth_mm is not None and load > largest:
+            depth = depth_of_load(self.tip, largest, self.poisson[1]) * one.footprint_mm[0]
+            return (
+                f"depth_mm {one.depth_mm[1]:g} under the smallest contact ({one.footprint_mm[0]:g} mm) "
                 f"takes a load of {load:.3g}, past the range of the {law} law; the largest valid value is "
                 f"{depth:.3g}"
             )
-        if self.force_mn is None and load > largest:
-            raise ValueError(
-                f"load {load:g} is past the range of the {law} law; the largest valid value is {largest:g}"
-            )
-        if self.force_mn is not None and load > largest * (1 + 1e-9):
-            young, radius = self.young_kpa[0], self.footprint_mm[0]
-            raise ValueError(
-                f"force_mn {self.force_mn[1]:g} on the softest tissue ({young:g} kPa) under the smallest "
+        if one.force_mn is None and load > largest:
+            return f"load {load:g} is past the range of the {law} law; the largest valid value is {largest:g}"
+        if one.force_mn is not None and load > largest * (1 + 1e-9):
+            young, radius = self.young_kpa[0], one.footprint_mm[0]
+            return (
+                f"force_mn {one.force_mn[1]:g} on the softest tissue ({young:g} kPa) under the smallest "
                 f"contact ({radius:g} mm) is a load of {load:.3g}, past the range of the {law} law; "
                 f"the largest valid value is {largest * young * radius**2:.4g}"
             )
-        return self
+        return ""
+
+    def demand(self, asked: Instrument) -> Demand:
+        """The ranges that count for an instrument: its own where it says so."""
+        footprint = asked.footprint_mm or self.footprint_mm
+        if asked.load or asked.force_mn:
+            return Demand(asked.load or self.load, asked.force_mn, None, footprint)
+        return Demand(self.load, self.force_mn, self.depth_mm, footprint)
+
+    @property
+    def _demands(self) -> list[tuple[str, Demand]]:
+        """What can be drawn: of each instrument that is asked for, and of those that aren't."""
+        drawn = [("", self.demand(Instrument()))] if self.instruments[1] > len(self.crew) else []
+        return drawn + [(f"crew[{k}]: ", self.demand(one)) for k, one in enumerate(self.crew)]
+
+    def _largest(self, one: Demand) -> float:
+        if one.depth_mm is not None:
+            return load_of_depth(self.tip, one.depth_mm[1] / one.footprint_mm[0], self.poisson[1])
+        if one.force_mn is None:
+            return one.load[1]
+        return one.force_mn[1] / (self.young_kpa[0] * one.footprint_mm[0] ** 2)
+
+    @property
+    def kinds(self) -> set[str]:
+        """Gestures that can occur."""
+        drawn = self.instruments[1] > len(self.crew) or any(one.gesture is None for one in self.crew)
+        return {one.gesture for one in self.crew if one.gesture} | (set(self.gestures) if drawn else set())
 
     @property
     def averages_volume(self) -> bool:
@@ -281,11 +417,7 @@ class Fem(Section):
     @property
     def largest_load(self) -> float:
         """Largest P = F/(E a^2) that can be drawn."""
-        if self.depth_mm is not None:
-            return load_of_depth(self.tip, self.depth_mm[1] / self.footprint_mm[0], self.poisson[1])
-        if self.force_mn is None:
-            return self.load[1]
-        return self.force_mn[1] / (self.young_kpa[0] * self.footprint_mm[0] ** 2)
+        return max(self._largest(one) for _, one in self._demands)
 
 
 def _estimator(name: str) -> str:
@@ -395,6 +527,18 @@ class Job(Section):
         asked = [name for name in self.store.extra if name.endswith("_right")]
         if asked and self.render.stereo_mm == 0:
             raise ValueError(f"store.extra: {asked[0]} needs a second lens; set render.stereo_mm")
+        return self
+
+    @model_validator(mode="after")
+    def _crew_is_in_the_opening(self) -> Job:
+        radius = self.anatomy.craniotomy.radius_mm
+        for k, one in enumerate(self.fem.crew):
+            least = self.fem.demand(one).footprint_mm[0]
+            if one.place is not None and math.hypot(*one.place) + least + CLEAR_MM > radius:
+                raise ValueError(
+                    f"fem.crew[{k}].place: {math.hypot(*one.place):.3g} mm from the middle, a contact of "
+                    f"{least:g} mm radius reaches under the rim of an opening of {radius:g} mm radius"
+                )
         return self
 
     @property

@@ -46,6 +46,8 @@ _Stretch = Annotated[FiniteFloat, Field(ge=1.005, le=1.2)]
 StretchRange = Annotated[tuple[_Stretch, _Stretch], BeforeValidator(_pair), AfterValidator(_ordered)]
 _Poisson = Annotated[FiniteFloat, Field(ge=0, lt=0.5)]
 PoissonRange = Annotated[tuple[_Poisson, _Poisson], BeforeValidator(_pair), AfterValidator(_ordered)]
+_Reflectance = Annotated[FiniteFloat, Field(ge=0.005, le=0.95)]
+Colour = tuple[_Reflectance, _Reflectance, _Reflectance]
 Vector = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
 
 

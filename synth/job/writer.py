@@ -114,6 +114,9 @@ def scalar(value: Any) -> str:
         return json.dumps(str(value), ensure_ascii=False)
     if isinstance(value, bool):
         return "true" if value else "false"
+    if isinstance(value, BaseModel):
+        given = {name: getattr(value, name) for name in type(value).model_fields}
+        return f"{{{', '.join(f'{name}: {scalar(one)}' for name, one in given.items() if one is not None)}}}"
     if isinstance(value, tuple):
         return f"[{', '.join(scalar(item) for item in value)}]"
     return str(value)

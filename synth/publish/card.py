@@ -41,7 +41,7 @@ def write_card(folder: Folder) -> Path:
     best = max(done, key=lambda row: row["peak_flow_px"] or 0.0, default=None)
     sequence = None if best is None else open_sequence(location.store(folder.root, best["index"]))
     example = None if sequence is None else _example(sequence, pictures)
-    text = _template().render(
+    text = template("card.md.jinja").render(
         **_facts(job, rows, done),
         card=job.card,
         charts=shown,
@@ -54,7 +54,7 @@ def write_card(folder: Folder) -> Path:
         fields=_fields(sequence),
         present=job.kept_fields,
         stereo_mm=job.render.stereo_mm,
-        columns=_columns(),
+        columns=columns(),
         limits=limits(folder),
         command="synth render job.yaml -o FOLDER",
     )
@@ -153,11 +153,20 @@ def _contact(job: Job) -> str:
     """What loads the tissue."""
     if job.fem.contact == "traction":
         return "Every contact is a given traction on the footprint; no tip of a shape is pressed in or rubs."
-    held = ", ".join(kind for kind in job.fem.gestures if kind not in RIGID_GESTURES)
+    held = ", ".join(kind for kind in sorted(job.fem.kinds) if kind not in RIGID_GESTURES)
     return (
         f"Push, slide and tap are a rigid tip ({job.fem.tip}, friction {job.fem.friction:g}) in contact, "
         "as wide as the footprint, not as the instrument that is seen"
     ) + (f"; {held}: a given traction." if held else ".")
+
+
+def _at_once(job: Job) -> str:
+    """How many gestures a sequence shows."""
+    least, most = (max(count, len(job.fem.crew), 1) for count in job.fem.instruments)
+    if most == 1:
+        return "One gesture"
+    asked = ", as the job's `fem.crew` asks" if job.fem.crew else ""
+    return f"{least if least == most else f'{least} to {most}'} gestures at once{asked},"
 
 
 def column(rows: Iterable[Mapping[str, Any]], name: str) -> NDArray[np.float64]:
@@ -180,7 +189,7 @@ def _facts(job: Job, rows: list[dict[str, Any]], done: list[dict[str, Any]]) -> 
         "width": job.render.size[0],
         "height": job.render.size[1],
         "backend": job.flow.backend,
-        "size_category": _size_category(len(done)),
+        "size_category": size_category(len(done)),
         "ranges": [_range(done, name, *words) for name, words in _CHARTS.items()],
         "families": share(done, "family"),
         "gestures": share(done, "gesture"),
@@ -188,8 +197,8 @@ def _facts(job: Job, rows: list[dict[str, Any]], done: list[dict[str, Any]]) -> 
         "splits": share(done, "split") if any(row.get("split") for row in done) else "",
         "failed": [row for row in rows if row["status"] == "failed"],
         "instance": (
-            f"One gesture on one anatomy: {job.frames} frames at {job.fps:g} frames a second, from rest "
-            "through the approach of the instrument and the rise of the load to its release."
+            f"{_at_once(job)} on one anatomy: {job.frames} frames at {job.fps:g} frames a second, from rest "
+            "through the approach of the instruments and the rise of the load to its release."
         ),
         "mesh": job.anatomy.mesh is not None,
         "photo": job.appearance.photo is not None,
@@ -218,7 +227,8 @@ def _fields(sequence: Sequence | None) -> list[dict[str, str]]:
     ]
 
 
-def _columns() -> list[dict[str, str]]:
+def columns() -> list[dict[str, str]]:
+    """Name, unit and meaning of each column of the index."""
     described = []
     for field in index.SCHEMA:
         notes = {key.decode(): value.decode() for key, value in (field.metadata or {}).items()}
@@ -230,7 +240,7 @@ def _versions(found: Mapping[str, str]) -> str:
     return ", ".join(f"{name} {version}" for name, version in found.items())
 
 
-def _size_category(count: int) -> str:
+def size_category(count: int) -> str:
     """The Hugging Face hub's classes."""
     for limit, name in ((1_000, "n<1K"), (10_000, "1K<n<10K"), (100_000, "10K<n<100K")):
         if count < limit:
@@ -259,8 +269,9 @@ def _example(sequence: Sequence, pictures: Path) -> str:
     return "card/example.png"
 
 
-def _template() -> Any:
+def template(name: str) -> Any:
+    """A page of this room, ready to render."""
     import jinja2
 
-    text = (Path(__file__).parent / "card.md.jinja").read_text("utf-8")
+    text = (Path(__file__).parent / name).read_text("utf-8")
     return jinja2.Environment(trim_blocks=True, undefined=jinja2.StrictUndefined).from_string(text)

@@ -12,11 +12,11 @@ from scipy.spatial import cKDTree
 from synth.dataset import size_forecast
 from synth.fem.tool import Gesture
 from synth.job.schema import Job
+from synth.publish import cost_probe
 from synth.render.anatomy.surface import Surface
 from synth.render.camera import camera
 from synth.render.scene import Studio
 from synth.sequence import pipeline, scenario
-from synth.system.stopwatch import Stopwatch
 
 _TILE_PX = 320
 _OPENING_MM = 1.0  # two tips closer than this would be one
@@ -28,8 +28,8 @@ class Sheet:
 
     picture: NDArray[np.uint8]
     """(H, W, 3)."""
-    render_cpu_s: float
-    """Rendering the whole job; physics and recovered flow come on top."""
+    stages_cpu_s: dict[str, float]
+    """Processor time of the whole job by stage, without what each worker takes to start."""
     disk_bytes: float
     """The whole dataset."""
 
@@ -37,7 +37,8 @@ class Sheet:
 def draw_sheet(job: Job, count: int) -> Sheet:
     """Draws `count` scenarios spread over the job, each in the moment before its load.
 
-    Nothing is deformed: the sheet shows anatomy, appearance, light, view and instrument.
+    Nothing is deformed: the sheet shows anatomy, appearance, light, view and instrument. What the job costs
+    is measured on a few of its sequences, carried out in short.
 
     Raises:
         UserError: the job cannot be carried out.
@@ -52,42 +53,36 @@ def draw_sheet(job: Job, count: int) -> Sheet:
             "anatomy": job.anatomy.model_copy(update={"vertices": min(job.anatomy.vertices, 20_000)}),
         }
     )
-    tiles = [_frame(quick, int(index), 1)[0] for index in chosen]
+    tiles = [_frame(quick, int(index)) for index in chosen]
     columns = int(np.ceil(np.sqrt(len(tiles))))
     tiles += [np.zeros_like(tiles[0])] * (-len(tiles) % columns)
     rows = [np.hstack(tiles[k : k + columns]) for k in range(0, len(tiles), columns)]
-    # The second frame of a scene costs what all later ones will.
-    each = _frame(job, int(chosen[0]), 2)[1]
     return Sheet(
         picture=np.vstack(rows),
-        render_cpu_s=each * job.frames * job.sequences,
+        stages_cpu_s=cost_probe.measure_cost(job),
         disk_bytes=size_forecast.estimate(job) * job.sequences,
     )
 
 
-def _frame(job: Job, index: int, repeats: int) -> tuple[NDArray[np.uint8], float]:
-    """A scenario's picture (the left eye beside the right) and the CPU time [s] of the last of `repeats`."""
+def _frame(job: Job, index: int) -> NDArray[np.uint8]:
+    """A scenario's picture (the left eye beside the right)."""
     case = scenario.draw(job, index)
     surface, _ = pipeline.cortex(job, case)
     view, gestures = camera.place(case.view, job.render), case.gestures
     studio = Studio(surface, case.look, view, job, [gesture.kind for gesture in gestures])
-    poised = [_poised(gesture, surface) for gesture in gestures]
-    tips, shafts = (np.concatenate(part) for part in zip(*poised, strict=True))
+    ready = [poised(gesture, surface) for gesture in gestures]
+    tips, shafts = (np.concatenate(part) for part in zip(*ready, strict=True))
     seed = scenario.frame_seeds(job, index)[0]
-    for _ in range(repeats):
-        watch = Stopwatch()
-        with watch.stage("frame"):
-            shot = studio.frame(surface.vertices, tips, shafts, seed)
-        spent = watch.cpu_s("frame")
+    shot = studio.frame(surface.vertices, tips, shafts, seed)
     picture = shot.rgb if shot.rgb_right is None else np.hstack([shot.rgb, shot.rgb_right])
-    label = f"{index}  {case.family}  {case.gesture.kind}"
+    label = f"{index}  {case.family}  {' + '.join(one.kind for one in gestures)}"
     place, font = (6, job.render.size[1] - 8), cv2.FONT_HERSHEY_SIMPLEX
     for colour, thick in (((0, 0, 0), 3), ((255, 255, 255), 1)):
         cv2.putText(picture, label, place, font, 0.4, colour, thick, cv2.LINE_AA)
-    return picture, spent
+    return picture
 
 
-def _poised(gesture: Gesture, surface: Surface) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def poised(gesture: Gesture, surface: Surface) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Tips (2, 3) mm on the surface where the gesture begins, and shafts (2, 3)."""
     azimuth, rise = np.deg2rad([gesture.azimuth_deg, gesture.elevation_deg])
     shaft = np.array([np.cos(azimuth) * np.cos(rise), np.sin(azimuth) * np.cos(rise), np.sin(rise)])

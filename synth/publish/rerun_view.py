@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from synth.checks import optics
+from synth.dataset.attributes import name_gestures
 from synth.dataset.store import Sequence
 from synth.errors import UserError
 from synth.publish import picture
@@ -166,9 +167,9 @@ def _log(rerun: Any, stream: Any, sequence: Sequence) -> None:
 
 def _about(sequence: Sequence) -> str:
     attrs = sequence.attrs
-    gesture = attrs.get("scenario", {}).get("gesture", {})
+    gestures = name_gestures(attrs.get("scenario") or {})
     return (
-        f"# Sequence {sequence.index}\n\n{gesture.get('kind', '')}, E = {attrs['young_kpa']:.3g} kPa, "
+        f"# Sequence {sequence.index}\n\n{gestures}, E = {attrs['young_kpa']:.3g} kPa, "
         f"{attrs['scale_mm_per_px']:.3g} mm/px\n\nflow: hue is direction; full colour is "
         f"{attrs['summary']['peak_flow_px']:.3g} px\n\ntraction: brightest is "
         f"{attrs['summary']['peak_traction_kpa']:.3g} kPa\n"

@@ -1,4 +1,4 @@
-"""Instruments as meshes that follow tips and shafts: forceps, dissector, suction tube, spatula."""
+"""Instruments as meshes that follow tips and shafts: forceps of two kinds, dissector, suction, spatula."""
 
 from __future__ import annotations
 
@@ -10,22 +10,34 @@ import numpy as np
 import numpy.typing as npt
 
 from synth.errors import UserError
+from synth.geometry.triangles import lengths
 
 Floats = npt.NDArray[np.float64]
-Kind = Literal["forceps", "dissector", "suction", "spatula"]
+Kind = Literal["forceps", "bayonet", "dissector", "suction", "spatula"]
 
-_AROUND = 36
+_AROUND = 40
 _LENGTH_MM = 110.0
+_COAT_MM = 11.0  # from the tip
+
+_TIP_MM: dict[Kind, float] = {
+    "forceps": 0.45,
+    "bayonet": 0.45,
+    "dissector": 1.5,
+    "suction": 1.2,
+    "spatula": 3.0,
+}  # half width of what touches tissue
+_CLIMB_MM, _REACH_MM = 0.30, 0.40  # how far fluid climbs at a tip, and over what distance that falls off
 
 # What a hand would take for each gesture, and how often.
 _HABITS: dict[str, tuple[tuple[Kind, ...], tuple[float, ...]]] = {
-    "pull": (("forceps",), (1.0,)),
-    "grasp": (("forceps",), (1.0,)),
+    "pull": (("forceps", "bayonet"), (0.5, 0.5)),
+    "grasp": (("forceps", "bayonet"), (0.5, 0.5)),
     "push": (("dissector", "suction"), (0.6, 0.4)),
     "slide": (("dissector", "suction"), (0.5, 0.5)),
     "tap": (("dissector", "suction"), (0.7, 0.3)),
     "retract": (("spatula", "dissector"), (0.7, 0.3)),
 }
+_COATED = 0.4  # share of instruments whose end is coated black, against sticking and glare
 
 
 @dataclass(frozen=True)
@@ -49,6 +61,8 @@ class Instrument:
     """(F, 3) over all parts."""
     uv: npt.NDArray[np.float32]
     """(V, 2): round the bar, along it."""
+    coat: npt.NDArray[np.float32]
+    """(V,) 0 bare steel to 1 under a black coating."""
 
 
 def choose(gestures: Sequence[str], rng: np.random.Generator) -> tuple[Kind, ...]:
@@ -60,20 +74,30 @@ def choose(gestures: Sequence[str], rng: np.random.Generator) -> tuple[Kind, ...
     return tuple(chosen)
 
 
-def build(kinds: Sequence[Kind]) -> Instrument:
-    """The mesh of some instruments, to be placed by `pose`."""
+def finish(kinds: Sequence[Kind], rng: np.random.Generator) -> tuple[bool, ...]:
+    """Whether the end of each is coated black."""
+    return tuple(bool(drawn) for drawn in rng.random(len(kinds)) < _COATED)
+
+
+def build(kinds: Sequence[Kind], coated: Sequence[bool] | None = None) -> Instrument:
+    """The mesh of some instruments, to be placed by `pose`; the `coated` have black ends, by default none."""
     parts = tuple(_PARTS[kind]() for kind in kinds)
-    faces, uv, total = [], [], 0
-    for part in (part for own in parts for part in own):
-        skin, flat = _skin(len(part.profile) // (_AROUND + 1))
-        faces.append(skin + total)
-        uv.append(flat)
-        total += len(part.profile)
+    black = coated if coated is not None else [False] * len(parts)
+    faces, uv, coat, total = [], [], [], 0
+    for own, ends in zip(parts, black, strict=True):
+        for part in own:
+            skin, flat = _skin(len(part.profile) // (_AROUND + 1))
+            faces.append(skin + total)
+            uv.append(flat)
+            # The coating ends in a sharp ring.
+            coat.append(ends / (1 + np.exp(np.clip((part.profile[:, 2] - _COAT_MM) / 0.12, -40, 40))))
+            total += len(part.profile)
     return Instrument(
         kinds=tuple(kinds),
         parts=parts,
         faces=np.concatenate(faces).astype(np.int32),
         uv=np.concatenate(uv).astype(np.float32),
+        coat=np.concatenate(coat).astype(np.float32),
     )
 
 
@@ -101,6 +125,17 @@ def pose(instrument: Instrument, tips: Floats, shafts: Floats) -> Floats:
             across = np.array([0.0, 0.0, 1.0]) if follows is None else ends[1] - ends[0]
             placed.append(tip + part.profile @ _axes(shaft, across))
     return np.concatenate(placed)
+
+
+def film(instrument: Instrument, tips: Floats, surface: Floats) -> Floats:
+    """Height (V,) mm that the wet film of a surface (V, 3) mm climbs at tips (2n, 3) mm that touch it."""
+    height = np.zeros(len(surface))
+    for k, kind in enumerate(instrument.kinds):
+        ends = tips[2 * k : 2 * k + 2]
+        for end in ends if len(instrument.parts[k]) == 2 else ends.mean(axis=0, keepdims=True):
+            away = lengths(surface - end) - _TIP_MM[kind]
+            height = np.maximum(height, _CLIMB_MM * np.exp(-np.maximum(away, 0) / _REACH_MM))
+    return height
 
 
 def _axes(shaft: Floats, across: Floats) -> Floats:
@@ -136,12 +171,27 @@ def _round_off(s: Floats, over: float) -> Floats:
 
 def _forceps() -> tuple[Part, ...]:
     """Two tines: a blunt tip that widens into a flat blade, bowed outwards (to -x for side 1)."""
+    return _tines(np.zeros(96))
+
+
+def _bayonet() -> tuple[Part, ...]:
+    """Forceps bent twice, so that the hand is out of the lens's way."""
+    s = _along(96)
+    step = np.clip((s - 24.0) / 14.0, 0, 1)
+    return _tines(13.0 * step**2 * (3 - 2 * step))
+
+
+def _tines(aside: Floats) -> tuple[Part, ...]:
+    """Two tines whose rings are shifted by `aside` (96,) mm across their flat sides."""
     s = _along(96)
     close = _round_off(s, 0.45)
     wide = (0.42 + 0.9 * (1 - np.exp(-s / 9.0)) + 1.3 * (1 - np.exp(-s / 45.0))) * close
     thick = (0.34 + 0.42 * (1 - np.exp(-s / 8.0)) + 0.3 * (1 - np.exp(-s / 40.0))) * close
     bow = 5.5 * (1 - np.exp(-((s / 38.0) ** 1.5)))
-    return tuple(Part(_sweep(s, thick, wide, -side * bow, 0.7), side) for side in (1, -1))
+    shift = np.zeros((len(s), _AROUND + 1, 3))
+    shift[..., 1] = aside[:, None]
+    flat = shift.reshape(-1, 3)
+    return tuple(Part(_sweep(s, thick, wide, -side * bow, 0.7) + flat, side) for side in (1, -1))
 
 
 def _dissector() -> tuple[Part, ...]:
@@ -176,7 +226,13 @@ def _spatula() -> tuple[Part, ...]:
     return (Part(_sweep(s, thick, wide, bow, 0.35), 0),)
 
 
-_PARTS = {"forceps": _forceps, "dissector": _dissector, "suction": _suction, "spatula": _spatula}
+_PARTS = {
+    "forceps": _forceps,
+    "bayonet": _bayonet,
+    "dissector": _dissector,
+    "suction": _suction,
+    "spatula": _spatula,
+}
 
 
 def _skin(rings: int) -> tuple[npt.NDArray[np.int64], Floats]:

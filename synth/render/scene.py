@@ -6,13 +6,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 
 from synth.geometry.triangles import Shape, normals
 from synth.job.schema import Job
 from synth.render import instrument, truth
-from synth.render.anatomy import noise, rim, texture
+from synth.render.anatomy import noise, rim, scenery, texture
 from synth.render.anatomy.surface import Surface
 from synth.render.appearance import light, reflection
 from synth.render.appearance.look import Look
@@ -30,6 +31,9 @@ Mask = npt.NDArray[np.bool_]
 
 _RIM_ROUGHNESS, _RIM_DRY = 0.09, 0.35
 _VOLUME = "volume128"
+_MIRRORED_PX = 48  # of the wound that steel mirrors: its finish shows no more
+_SATIN = 0.10  # share of light that steel's finish scatters evenly
+_DULL = 0.8  # a retractor's finish, between steel (0) and black (1): it must not dazzle
 _AMBIENT = 0.05  # of the lamps' light comes from everywhere
 _GLARE = 0.35  # specular radiance, as a share of full scale, that hides what is under it
 
@@ -113,17 +117,22 @@ class Studio:
             job.appearance.photo,
             rim.shade(self.rim, surface.extent_mm),
         )
+        self._blade = self._retractor()
         rest = Shape(surface.vertices, surface.faces)
-        self.still = truth.still(camera, rest, self.rim.shape)
+        self.frame_of_opening = rim.joined(self.rim.shape, self._blade)
+        """Rim and scenery, which never move."""
+        self.still = truth.still(camera, rest, self.frame_of_opening)
         self._right: Still | None = None
         self.right: Camera | None = None
         """The second lens at rest, where the job has one."""
         if job.render.stereo_mm:
             self.right = beside(camera, job.render.stereo_mm)
-            self._right = truth.still(self.right, rest, self.rim.shape)
+            self._right = truth.still(self.right, rest, self.frame_of_opening)
         self.lamps = light.lamps(camera, look.light)
-        kinds = instrument.choose(gestures, np.random.default_rng([look.rim_seed, 2]))
-        self._tool = instrument.build(kinds) if job.render.tool else None
+        hand = np.random.default_rng([look.rim_seed, 2])
+        kinds = instrument.choose(gestures, hand)
+        self._tool = instrument.build(kinds, instrument.finish(kinds, hand)) if job.render.tool else None
+        self._theatre = self._surroundings()
         self._stage: Stage | None = None
 
     def frame(self, vertices: Floats, tips: Floats, shafts: Floats, seed: int) -> Shot:
@@ -145,7 +154,7 @@ class Studio:
         tool = self._posed(now)
         moments = shutter or (now,)
         radiance = self._gathered(moments, seed, 0.0)
-        shapes = (Shape(now.vertices, self.surface.faces), self.rim.shape, tool)
+        shapes = (Shape(now.vertices, self.surface.faces), self.frame_of_opening, tool)
         seen = truth.now(camera, self.still, *shapes)
         extra: dict[str, Any] = {}
         if "flow_next" in self._extra:
@@ -246,11 +255,12 @@ class Studio:
         if self._stage is None:
             points = np.zeros((0, 3)) if tool is None else tool.vertices
             self._stage = self.stage(moment.vertices, points, self._render.spp)
-        else:
-            self._stage.move("cortex", moment.vertices)
-            if tool:
-                self._stage.move("tool", tool.vertices)
-                self._stage.mirror("tool", self._mirrored(tool.vertices))
+        film = None if self._tool is None else instrument.film(self._tool, moment.tips, moment.vertices)
+        self._stage.move("cortex", moment.vertices, film)
+        if tool:
+            steel = self._steel(tool.vertices)
+            self._stage.move("tool", steel.vertices)
+            self._stage.mirror("tool", self._mirrored(steel))
         spot = light.spot(camera, self.camera, self._look.light)
         return self._stage.render(seed % 2**32, camera) * spot[..., None]
 
@@ -277,14 +287,47 @@ class Studio:
                 frame.wet(_RIM_ROUGHNESS, _RIM_DRY, ambient),
             ),
         }
-        if self._tool:
-            steel = Metal((0.66, 0.66, 0.66), along=0.16, across=0.42, satin=0.22, glow=self._mirrored(tool))
-            bodies["tool"] = Body(tool, self._tool.faces, self._tool.uv, steel)
+        if self._tool or "retractor" in self._render.scenery:
+            steel = self._steel(tool)
+            metal = Metal(reflection.tint(self._coating(), _SATIN), glow=self._mirrored(steel))
+            uv = np.zeros((len(steel.vertices), 2), np.float32)
+            bodies["tool"] = Body(steel.vertices, steel.faces, uv, metal)
         return bodies
 
-    def _mirrored(self, tool: Floats) -> Floats:
-        assert self._tool is not None
-        return reflection.glow(Shape(tool, self._tool.faces), self.camera.centre, self._look.rim_seed)
+    def _retractor(self) -> Shape:
+        """The blade over the rim; empty where there is none."""
+        if "retractor" not in self._look.scenery:
+            return Shape(np.zeros((0, 3)), np.zeros((0, 3), np.int32))
+        points = np.concatenate([self.surface.vertices, self.rim.vertices])
+        return scenery.retractor(self.rim.edge, points, np.random.default_rng([self._look.rim_seed, 5]))
+
+    def _steel(self, tool: Floats) -> Shape:
+        """All steel as one mesh, instruments at (T, 3) mm first: one kernel with a retractor and without."""
+        faces = np.zeros((0, 3), np.int32) if self._tool is None else self._tool.faces
+        steel = rim.joined(Shape(tool, faces), self._blade)
+        # The renderer takes no mesh without faces.
+        return steel if len(steel.faces) else Shape(np.full((3, 3), -1e3), np.array([[0, 1, 2]], np.int32))
+
+    def _coating(self) -> Map:
+        """(V,) of `_steel`: 1 where it is coated black, and between where it is dull."""
+        if self._tool is None and not len(self._blade.vertices):
+            return np.zeros(3, np.float32)
+        dull = np.full(len(self._blade.vertices), _DULL, np.float32)
+        return dull if self._tool is None else np.concatenate([self._tool.coat, dull])
+
+    def _surroundings(self) -> reflection.Theatre:
+        """What steel mirrors: the cortex with the rim around it, coarse, and the lamps."""
+        extent = self.surface.extent_mm
+        small = cv2.resize(self._coat.albedo, (_MIRRORED_PX, _MIRRORED_PX), interpolation=cv2.INTER_AREA)
+        axis = noise.centres(_MIRRORED_PX, extent)
+        inside = rim.inside(self.rim, *np.meshgrid(axis, axis))[..., None]
+        around = 0.5 * (np.asarray(self._look.dura) + np.asarray(self._look.beyond))
+        wound = (small * inside + around.astype(np.float32) * (1 - inside)).astype(np.float32)
+        r, g, b = (self._look.light.power * light.blackbody(self._look.light.kelvin)).tolist()
+        return reflection.Theatre(wound, extent, tuple(self.lamps), (r, g, b), self._look.rim_seed)
+
+    def _mirrored(self, steel: Shape) -> Floats:
+        return reflection.glow(steel, self._coating(), self.camera.centre, self._theatre)
 
     def _glare(self, radiance: Map, now: truth.Now, moment: Moment) -> Mask:
         """Tissue whose radiance exceeds what its diffuse part could send."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -11,31 +10,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from synth.dataset.store import Writer
-from synth.fem import solver, tool
-from synth.fem.mesh import tetrahedra
-from synth.fem.mesh.relief import HeightMap
-from synth.fem.mesh.tetrahedra import Tets
 from synth.fem.solver import Deformation
 from synth.fields import FIELDS
-from synth.flow import mask, track, tvl1
-from synth.flow.estimator import Estimator, create
+from synth.flow import mask, track
 from synth.flow.stereo import rig
 from synth.flow.stereo import track as stereo
 from synth.flow.track import Track
-from synth.geometry import brain_surface
-from synth.geometry.brain_surface import Brain
-from synth.job import identity
-from synth.job.schema import Anatomy, Flow, Job
-from synth.render.anatomy import surface as anatomy
-from synth.render.anatomy.surface import Relief, Surface
-from synth.render.camera import camera, video
-from synth.render.camera.camera import Camera
-from synth.render.scene import Studio
+from synth.job import identity, law_plugins
+from synth.job.schema import Job
+from synth.render.camera import video
 from synth.sequence import scenario
 from synth.sequence.published_labels import Published
 from synth.sequence.scenario import Scenario
-from synth.sequence.timeline import Timeline
+from synth.sequence.scene import Scene, build, cortex, estimator, move, simulate
 from synth.system.stopwatch import Report, Stopwatch
+
+__all__ = ["build", "cortex", "estimator", "move", "render_sequence"]
 
 # Fields that the renderer gives by frame, and of a second lens; those of `store.extra` are attributes of its
 # `Shot` as well, but for the published method's.
@@ -48,16 +38,14 @@ _PUBLISHED = ("flow_noisy", "intensity")
 class _Shooting:
     """A sequence about to be rendered: what all later stages share."""
 
-    job: Job
-    index: int
-    case: Scenario
-    view: Camera
-    """At rest."""
-    motion: Deformation
-    studio: Studio
+    scene: Scene
     writer: Writer
     watch: Stopwatch
     report: Report
+
+    @property
+    def job(self) -> Job:
+        return self.scene.job
 
 
 @dataclass(frozen=True)
@@ -92,29 +80,20 @@ def render_sequence(job: Job, index: int, folder: Path, report: Report) -> Path:
         UserError: the job cannot be carried out (surface, load, inverted element), in one line.
     """
     watch = Stopwatch()
-    case = scenario.draw(job, index)
-    view = camera.place(case.view, job.render)
-
-    report("mesh", 0, 1)
-    with watch.stage("mesh"):
-        surface, tets = build(job, case)
-    report("fem", 0, 1)
-    with watch.stage("fem"):
-        motion = move(job, case, surface, tets)
+    scene = simulate(job, index, report, watch)
     with watch.stage("scene"):
-        studio = Studio(surface, case.look, view, job, [gesture.kind for gesture in case.gestures])
-        still = studio.still
+        studio = scene.studio
 
     width, height = job.render.size
     writer = Writer(folder, index, frames=job.frames, size=(height, width), job=job)
-    writer.put("time", motion.time)
-    writer.put("force", motion.force @ view.rotation.T)  # labels are in camera axes
-    writer.put("tissue", still.tissue)
-    writer.put("area", still.area)
+    writer.put("time", scene.motion.time)
+    writer.put("force", scene.force)  # labels are in camera axes
+    writer.put("tissue", scene.tissue)
+    writer.put("area", scene.area)
     if studio.right is not None:
         writer.put("disparity", studio.disparity())
 
-    shooting = _Shooting(job, index, case, view, motion, studio, writer, watch, report)
+    shooting = _Shooting(scene, writer, watch, report)
     film = _render_frames(shooting)
     film = _write_video(shooting, film)
     if job.flow.backend != "ideal":
@@ -126,35 +105,31 @@ def render_sequence(job: Job, index: int, folder: Path, report: Report) -> Path:
 
 def _render_frames(shooting: _Shooting) -> _Film:
     """Renders every frame and writes its fields, but for video that a codec must see whole."""
-    job, motion, studio, writer = shooting.job, shooting.motion, shooting.studio, shooting.writer
+    job, scene, writer = shooting.job, shooting.scene, shooting.writer
     width, height = job.render.size
     labels = None
     if set(_PUBLISHED) & set(job.store.extra):
-        rng = scenario.label_rng(job, shooting.index)
-        labels = Published.begin(job.labels, studio.still.tissue, job.frames, rng)
+        rng = scenario.label_rng(job, scene.index)
+        labels = Published.begin(job.labels, scene.tissue, job.frames, rng)
     names = [
         name
         for name in dict.fromkeys((*_SHOT, *(_STEREO if job.render.stereo_mm else ()), *job.store.extra))
         if FIELDS[name].framed and not (_coded(job) and name.startswith("rgb"))
     ]
-    line = Timeline(motion, shooting.view, shooting.case.sway, shooting.case.look.light, job.fps)
     rgb = np.empty((job.frames, height, width, 3), np.uint8)
     rgb_right = np.empty_like(rgb) if writer.wants("rgb_right") else None
     tools = np.empty((job.frames, height, width), bool)
     tools_right = None if rgb_right is None else np.empty_like(tools)
     poses = np.tile(np.eye(4), (job.frames, 1, 1))
-    for t, seed in enumerate(scenario.frame_seeds(job, shooting.index)):
+    for t in range(job.frames):
         shooting.report("render", t, job.frames)
         with shooting.watch.stage("render"):
-            now = line.at(t)
-            lit = line.open(t, job.sensor.shutter, job.sensor.subframes)
-            shot = studio.shoot(now, seed, lit, line.at(t + 1))
-            traction = studio.traction(motion.traction[t])
+            shot = scene.frame(t)
         with shooting.watch.stage("store"):
-            made = labels.frame(t, shot.flow, traction, motion.force[t]) if labels else {}
+            made = labels.frame(t, shot.flow, shot.traction, scene.motion.force[t]) if labels else {}
             for name in names:
                 writer.put_frame(name, t, made[name] if name in made else getattr(shot, name))
-            writer.put_frame("traction", t, traction)
+            writer.put_frame("traction", t, shot.traction)
             if job.render.exr:
                 writer.put_exr(t, shot.radiance)
         rgb[t], tools[t] = shot.rgb, shot.tool
@@ -162,8 +137,7 @@ def _render_frames(shooting: _Shooting) -> _Film:
             rgb_right[t] = shot.rgb_right
         if tools_right is not None and shot.tool_right is not None:
             tools_right[t] = shot.tool_right
-        lens = now.camera or shooting.view
-        poses[t, :3, :3], poses[t, :3, 3] = lens.rotation, lens.translation
+        poses[t, :3, :3], poses[t, :3, 3] = shot.camera.rotation, shot.camera.translation
     return _Film(rgb, rgb_right, tools, tools_right, poses)
 
 
@@ -194,8 +168,8 @@ def _recover_flow(shooting: _Shooting, film: _Film) -> Track:
     job, writer = shooting.job, shooting.writer
     shooting.report("flow", 0, job.frames)
     with shooting.watch.stage("flow"):
-        tissue = shooting.studio.still.tissue
-        recovered = track.track(estimator(job.flow), film.rgb, mask.hidden(film.rgb, film.tools), tissue)
+        tissue = shooting.scene.tissue
+        recovered = track.recover_flow(film.rgb, film.tools, tissue, estimator(job.flow))
     with shooting.watch.stage("store"):
         for t in range(job.frames):
             writer.put_frame("flow_recovered", t, recovered.flow[t])
@@ -205,13 +179,14 @@ def _recover_flow(shooting: _Shooting, film: _Film) -> Track:
 
 def _recover_motion(shooting: _Shooting, film: _Film, left: Track) -> None:
     """Adds the right eye to the left one's flow and writes motion in three dimensions, frame by frame."""
-    job, writer, studio = shooting.job, shooting.writer, shooting.studio
+    job, writer, scene = shooting.job, shooting.writer, shooting.scene
+    studio = scene.studio
     if film.rgb_right is None or film.tools_right is None or studio.right is None:
         raise ValueError("there is no second lens")
     blocked = mask.hidden(film.rgb, film.tools), mask.hidden(film.rgb_right, film.tools_right)
     with shooting.watch.stage("stereo"):
         pair = rig.Rig(
-            left=rig.Eye(shooting.view.K, shooting.view.distortion),
+            left=rig.Eye(scene.view.K, scene.view.distortion),
             right=rig.Eye(studio.right.K, studio.right.distortion),
             rotation=np.eye(3),
             translation=np.array([-job.render.stereo_mm, 0.0, 0.0]),
@@ -241,27 +216,35 @@ def _recover_motion(shooting: _Shooting, film: _Film, left: Track) -> None:
 
 def _seal(shooting: _Shooting) -> Path:
     """Seals the store with what was drawn and measured as its attributes; returns its path."""
-    case, view = shooting.case, shooting.view
+    scene = shooting.scene
+    case, view = scene.scenario, scene.view
     return shooting.writer.seal(
         scenario=case.as_dict(),
         anatomy_id=identity.identify_anatomy(shooting.job, case.relief.seed),
+        **_opening(shooting.job, case),
         K=view.K.tolist(),
         distortion=view.distortion.tolist(),
         rotation=view.rotation.tolist(),
         translation=view.translation.tolist(),
-        scale_mm_per_px=float(shooting.studio.still.scale_mm_per_px),
+        scale_mm_per_px=scene.scale_mm_per_px,
         young_kpa=case.tissue.young_kpa,
         poisson=case.tissue.poisson,
-        mechanics=_mechanics(shooting.job, case, shooting.motion, view.rotation),
-        variant=shooting.studio.variant,
+        mechanics=_mechanics(shooting.job, case, scene.motion, view.rotation),
+        variant=scene.studio.variant,
         timings=shooting.watch.report(),
         **_second_lens(shooting),
     )
 
 
+def _opening(job: Job, case: Scenario) -> dict[str, Any]:
+    """The attribute `opening_id` of a sequence on a user's brain."""
+    named = identity.identify_opening(job, case.anatomy)
+    return {} if named is None else {"opening_id": named}
+
+
 def _second_lens(shooting: _Shooting) -> dict[str, Any]:
     """The attribute `right` of a stereo sequence: K, distortion and pose of the second lens at rest."""
-    lens = shooting.studio.right
+    lens = shooting.scene.studio.right
     if lens is None:
         return {}
     return {
@@ -280,6 +263,8 @@ def _mechanics(
 ) -> dict[str, Any]:
     timeless = job.fem.time == "quasi-static" and not job.fem.relaxation
     special: dict[str, Any] = {} if job.fem.contact == "traction" else {"contact": job.fem.contact}
+    if law_from := law_plugins.source(case.tissue.law):
+        special["law_from"] = law_from
     if case.pulse is not None:
         special |= {"pulse_mm": case.pulse.height(motion.time).tolist()}
     if case.pulse is not None and timeless:
@@ -304,63 +289,3 @@ def _mechanics(
             for k, gesture in enumerate(case.gestures)
         ],
     }
-
-
-def build(job: Job, case: Scenario) -> tuple[Surface, Tets]:
-    """The fine surface of a scenario and the volume under it, finest where its contacts are."""
-    focus = [place for gesture in case.gestures for place in tool.focus(gesture)]
-    surface, whole = cortex(job, case)
-    mesh, slips = (job.fem.tets, job.fem.order, focus), case.tissue.skull == "slip"
-    if whole is None:
-        height = HeightMap(surface.pia, surface.extent_mm)
-        return surface, tetrahedra.block(job.anatomy, *mesh, height, slips=slips)
-    return surface, tetrahedra.from_brain(whole, job.anatomy, *mesh, slips=slips)
-
-
-def cortex(job: Job, case: Scenario) -> tuple[Surface, Brain | None]:
-    """The fine surface of a scenario, and the user's brain that it is a part of, if it is.
-
-    Sequences that share an anatomy (`anatomy.variety`) share these: their arrays are read-only.
-    """
-    written = job.anatomy.mesh.stat() if job.anatomy.mesh and job.anatomy.mesh.is_file() else None
-    return _cortex(job.anatomy, case.relief, written and (written.st_mtime_ns, written.st_size))
-
-
-@lru_cache(maxsize=4)
-def _cortex(section: Anatomy, relief: Relief, written: object) -> tuple[Surface, Brain | None]:
-    """As `cortex`; `written` tells a mesh from one that replaced it."""
-    whole = None
-    if section.mesh is None:
-        surface = anatomy.procedural(relief, section)
-    else:
-        whole = brain_surface.load_brain(section.mesh, section.craniotomy)
-        surface = anatomy.from_brain(whole.vertices, whole.faces, relief, section)
-    for shared in (surface, whole):
-        for value in vars(shared).values() if shared else ():
-            if isinstance(value, np.ndarray):
-                value.flags.writeable = False
-    return surface, whole
-
-
-def move(job: Job, case: Scenario, surface: Surface, tets: Tets) -> Deformation:
-    """The scenario's gestures, carried out on that surface and volume."""
-    return solver.deform(
-        job.fem,
-        case.tissue,
-        case.gesture,
-        tets,
-        surface.vertices,
-        surface.faces,
-        job.frames,
-        job.fps,
-        case.further,
-        case.pulse,
-        job.anatomy.craniotomy,
-    )
-
-
-def estimator(flow: Flow) -> Estimator:
-    """The estimator that a job asks for."""
-    if flow.backend != "tvl1":
-        return create(flow.backend)
-    return tvl1.Tvl1(replace(tvl1.Settings(), warps=2 * flow.warps, warm_warps=flow.warps))

@@ -60,7 +60,13 @@ def draw(job: Job, index: int) -> Scenario:
     family = job.appearance.families[index % len(job.appearance.families)]
     opening = job.anatomy.craniotomy
     tissue = Tissue.draw(job.fem, _generator(job, _SEQUENCE, index, _TISSUE))
-    gesture = Gesture.draw(job.fem, opening, tissue, _generator(job, _SEQUENCE, index, _GESTURE))
+    gesture, *further = multi_instrument.draw_crew(
+        job.fem,
+        opening,
+        tissue,
+        _generator(job, _SEQUENCE, index, _GESTURE),
+        _generator(job, _SEQUENCE, index, _FURTHER),
+    )
     return Scenario(
         index=index,
         anatomy=anatomy,
@@ -68,9 +74,7 @@ def draw(job: Job, index: int) -> Scenario:
         relief=Relief.draw(job.anatomy, _generator(job, _ANATOMY, anatomy, 0)),
         tissue=tissue,
         gesture=gesture,
-        further=multi_instrument.further(
-            gesture, job.fem, opening, tissue, _generator(job, _SEQUENCE, index, _FURTHER)
-        ),
+        further=tuple(further),
         look=Look.draw(job, family, _generator(job, _SEQUENCE, index, _LOOK)),
         view=View.draw(job.render, _generator(job, _SEQUENCE, index, _VIEW)),
         sway=Sway.draw(job.render, _generator(job, _SEQUENCE, index, _SWAY)),

@@ -21,6 +21,9 @@ _MACHINE = {
     errno.EISDIR, errno.EEXIST, errno.ENAMETOOLONG, errno.ELOOP, errno.EMFILE, errno.ENFILE,
 }  # fmt: skip
 
+_EXTRAS = {"plotly": "bench", "sklearn": "bench"}
+"""Packages that commands import and a plain installation lacks, and the extra that brings them."""
+
 
 def printable(text: str) -> str:
     """A message with control characters spelt out: what a file is called must not steer a terminal."""
@@ -36,6 +39,14 @@ class Commands(TyperGroup):
                 return super().invoke(ctx)
         except UserError as error:
             typer.echo(f"error: {printable(str(error))}", err=True)
+            raise typer.Exit(2) from None
+        except ModuleNotFoundError as error:
+            package = (error.name or "").partition(".")[0]
+            if package not in _EXTRAS:
+                raise
+            extra = _EXTRAS[package]
+            how = f"pip install '.[{extra}]' in the clone"
+            typer.echo(f"error: this needs the package {package}, of the extra {extra}: {how}", err=True)
             raise typer.Exit(2) from None
         except KeyboardInterrupt:
             typer.echo("stopped", err=True)

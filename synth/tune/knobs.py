@@ -63,9 +63,11 @@ def list_knobs(job: Job) -> list[Knob]:
 def _physics_knobs(job: Job) -> list[Knob]:
     """Law, mesh, elements and, of dynamics, the time step."""
     fem = job.fem
-    own_law = fem.law if fem.law in CHEAPEST_FIRST else "neo-hookean"
+    own_law = "neo-hookean" if fem.law == "auto" else fem.law
     laws = ["neo-hookean", *(law for law in ("stable", "linear") if fem.largest_load <= LARGEST_LOAD[law])]
-    if own_law not in laws:
+    if own_law not in CHEAPEST_FIRST:
+        laws = [own_law]  # a plug-in's is another tissue, not a cheaper way to the same one
+    elif own_law not in laws:
         laws.append(own_law)
     tets = _down([max(FINE_TETS, fem.tets), fem.tets, *_TETS])
     knobs = [

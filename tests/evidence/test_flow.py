@@ -230,6 +230,15 @@ def test_live_answers_with_the_forces_that_scoring_finds(tmp_path: Path, model: 
     # The stream has looked at the rest frame twice and so starts its first flow warm; what differs is a share
     # of the motion's part alone, the network's answer to none being taken off.
     assert [frame.force_mn for frame in streamed] == pytest.approx(scored, rel=0.25)
+    forces: list[list[float | None]] = []
+    for scale, young in (("unknown", 5.0), (32.0 / summary["width"], None)):
+        streamed.clear()
+        live.watch_video(
+            Footage(read_video(folder / "video.mp4"), "video"), method=Model(model), scale_mm_per_px=scale,
+            young_kpa=young, paced=False, told=streamed.append,
+        )  # fmt: skip
+        forces.append([frame.force_mn for frame in streamed])
+    assert forces[0] == forces[1]
     assert any("tool is looked for" in note for note in followed.notes)
 
 

@@ -19,6 +19,7 @@ import fake_work
 import numpy as np
 import phantom
 import pytest
+from egg_brain import soup, written
 from fake_recording import Maker, texture
 from fake_run import in_process
 from typer.testing import CliRunner
@@ -36,6 +37,7 @@ QUICK = (
     "synth split {out}",
     "synth fields",
     "synth doctor {folder}",
+    "synth place {folder}/egg.stl --radius 8 --count 2 --out {folder}/openings",
     "learn eval {model} {data}",
     "learn eval {model} {data} --against {model}",
     "learn predict {model} {data} --out {folder}/forces",
@@ -69,6 +71,7 @@ def build(folder: Path) -> dict[str, Path]:
     (folder / "data").mkdir()
     for index in range(4):
         phantom.write(folder / "data", index, anatomy_seed=index)
+    written(folder / "egg.stl", soup())
     make = Maker(folder)
     places = {"folder": folder, "out": folder / "out", "data": folder / "data", "model": folder / "model"}
     places |= {"recording": make(frames=12), "film": make("film", frames=6, footage="mp4")}

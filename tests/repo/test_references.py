@@ -44,6 +44,8 @@ def there(name: str) -> bool:
     for depth in range(len(parts), 0, -1):
         base = ROOT.joinpath(*parts[:depth])
         path = base / "__init__.py" if base.is_dir() else base.with_suffix(".py")
+        if path.with_suffix(".pyi").is_file():  # says what a package looks up when asked
+            path = path.with_suffix(".pyi")
         if path.is_file():
             return depth == len(parts) or parts[depth] in defined(path)
     return False

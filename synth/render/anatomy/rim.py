@@ -1,4 +1,4 @@
-"""What frames the opening: the cut dura with its lip, blood on it, what lies beyond, and a cotton patty."""
+"""What frames the opening: cut dura with vessels and stitches, blood on it, what lies beyond, cotton."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from synth.geometry.triangles import Shape
-from synth.render.anatomy import noise
+from synth.render.anatomy import noise, scenery, tube
 from synth.render.anatomy.surface import Surface
 from synth.render.anatomy.texture import Coat, normals
 from synth.render.appearance.look import Look
@@ -25,6 +25,8 @@ _WIDTH_MM = 26.0  # beyond the opening; the picture ends before
 _LIP_MM = 0.3  # how far the cut edge reaches over the brain
 _LAID_MM = (-3.0, -1.5, -1.2, -0.95, -0.7, -0.3)
 _PATTY_MM = 0.55  # thickness of a cotton patty
+_THREAD_MM = 0.075  # half width of a stitch's thread
+_BONE_MM = 2.0  # how far the bone's cut edge stands above the dura
 
 
 @dataclass(frozen=True)
@@ -52,6 +54,14 @@ class Rim:
     edge: Floats
     """(A,) mm: radius of the opening's edge at even angles."""
     patty: Patty | None
+    stitches: Floats
+    """(n,) rad: where threads hold the dura."""
+    flap: Floats
+    """(A,) mm beyond the edge where bone begins; empty: there is none in view."""
+    cloth: Floats
+    """(A,) mm beyond the edge where drapes begin; empty: there are none in view."""
+    patties: int
+    """How many lie over the opening's edge."""
 
     @property
     def shape(self) -> Shape:
@@ -80,6 +90,11 @@ def build(surface: Surface, radius_mm: float, look: Look, mm_per_px: float) -> R
     lift = np.clip(away - 0.1, 0, 3.0) / 3.0
     z = height + up[None] + lift * noise.sample(folds, xy.reshape(-1, 2), extent).reshape(radius.shape)
     patty = _patty(rng, edge) if look.cottonoid else None
+    held = scenery.stitches(edge, rng)
+    z = z + _folded(angle[:, None], away[None], edge, held, rng)
+    flap = _ragged(rng, angle, 2.9, 0.35) if "bone" in look.scenery else np.zeros(0)
+    cloth = _ragged(rng, angle, 7.2, 0.8) if "drape" in look.scenery else np.zeros(0)
+    z = z + _raised(away[None], flap, cloth, noise.band(rng, 128, extent, 7.0, 0.5), xy, extent)
     if patty:
         over = _step((0.3 - _outside(patty, xy[..., 0], xy[..., 1])) / 0.6)
         # Cotton lies over folds rather than in them.
@@ -88,14 +103,54 @@ def build(surface: Surface, radius_mm: float, look: Look, mm_per_px: float) -> R
     # The cut edge stands upright: on the maps it is laid flat inside the opening, or it had no width there.
     flat = edge[:, None] + np.concatenate([_LAID_MM, away[len(_LAID_MM) :]])[None]
     laid = np.stack([flat * np.cos(angle)[:, None], flat * np.sin(angle)[:, None]], axis=-1).reshape(-1, 2)
+    parts = [(vertices, _faces(around, _INNER + rings), laid)]
+    if "cottonoid" in look.scenery:
+        # Their felt is painted in the middle of the maps, where the opening is.
+        parts += scenery.patties(edge, np.concatenate([surface.vertices, vertices]), rng)
+    first = np.cumsum([0] + [len(part[0]) for part in parts])
     return Rim(
-        vertices,
-        _faces(around, _INNER + rings),
-        (laid / extent + 0.5).astype(np.float32),
+        np.concatenate([part[0] for part in parts]),
+        np.concatenate([part[1] + at for part, at in zip(parts, first, strict=False)]).astype(np.int32),
+        (np.concatenate([part[2] for part in parts]) / extent + 0.5).astype(np.float32),
         extent,
         edge,
         patty,
+        held,
+        flap,
+        cloth,
+        len(parts) - 1,
     )
+
+
+def _folded(angle: Floats, away: Floats, edge: Floats, held: Floats, rng: np.random.Generator) -> Floats:
+    """Height (A, R) mm of the dura's turned-over edge, and of the tents and folds that stitches pull up."""
+    roll = 0.7 + 0.3 * np.cos(angle * int(rng.integers(3, 6)) + rng.uniform(0, 2 * np.pi))
+    raised = 0.38 * roll * np.exp(-(((away - 1.0) / 0.55) ** 2)) - 0.2 * np.exp(-(((away - 2.1) / 0.35) ** 2))
+    for stitch in held:
+        aside = (np.mod(angle - stitch + np.pi, 2 * np.pi) - np.pi) * float(edge.mean())
+        tent = np.exp(-((aside / 1.3) ** 2) - ((away - 0.9) / 1.4) ** 2)
+        tense = np.cos(aside * 4.2) * np.exp(-((aside / 2.6) ** 2)) * np.exp(-(((away - 2.2) / 2.0) ** 2))
+        raised = raised + np.where(away > 0, 0.5 * tent + 0.13 * tense, 0.0)
+    return np.asarray(raised)
+
+
+def _ragged(rng: np.random.Generator, angle: Floats, mean: float, spread: float) -> Floats:
+    """A distance (A,) mm that wanders round the opening."""
+    wave = np.full_like(angle, mean)
+    for order in range(2, 14):
+        wave += rng.normal(0, spread / order**0.7) * np.cos(order * angle + rng.uniform(0, 2 * np.pi))
+    return np.maximum(wave, 0.6 * mean)
+
+
+def _raised(away: Floats, flap: Floats, cloth: Floats, folds: Map, xy: Floats, extent: float) -> Floats:
+    """Height (A, R) mm that bone and drapes add."""
+    raised = np.zeros(xy.shape[:2])
+    if len(flap):
+        raised += _BONE_MM * _step((away - flap[:, None]) / 0.7 - 0.5)
+    if len(cloth):
+        wavy = noise.sample(folds, xy.reshape(-1, 2), extent).reshape(raised.shape)
+        raised += _step((away - cloth[:, None]) / 1.2 - 0.5) * (1.2 + 0.7 * wavy)
+    return raised
 
 
 def paint(rim: Rim, look: Look, pixels: int) -> Coat:
@@ -109,8 +164,9 @@ def paint(rim: Rim, look: Look, pixels: int) -> Coat:
     swell = noise.band(rng, pixels, extent, 1.4, 0.5)
     axis = noise.centres(pixels, extent)
     x, y = np.broadcast_to(axis, (pixels, pixels)), np.broadcast_to(axis[:, None], (pixels, pixels))
-    maps = [x, y, wide, mid, fine, swell]
-    if rim.patty:
+    vessels = tube.raster(scenery.dural_vessels(rim.edge, rng), pixels, extent)
+    maps = [x, y, wide, mid, fine, swell, *vessels]
+    if rim.patty or rim.patties:
         ragged = noise.fractal(rng, pixels, 60.0, 1.5, 1.5)
         weave = noise.band(rng, pixels, 60.0, 0.5, 0.5)
         maps += [ragged, weave, noise.fractal(rng, pixels, 60.0, 4.0, 2.0)]
@@ -131,17 +187,28 @@ def _paint_rows(
     mid: Map,
     fine: Map,
     swell: Map,
+    distance: Map,
+    radius: Map,
     *cotton: Map,
 ) -> tuple[Map, Map, Map]:
     """Colour (r, n, 3), bumps mm and share without a film (r, n) of some rows at x, y mm, of noise (r, n)."""
     angle, away = _polar(rim, x, y)
     fibres = _streaks(across, angle, away, float(rim.edge.mean()))
     dura = np.asarray(look.dura, np.float32) * (1 + 0.05 * fibres + 0.05 * mid + 0.02 * fine)[..., None]
+    # Its own vessels shimmer through its outer layer.
+    chord = 2 * np.sqrt(np.maximum(radius**2 - distance**2, 0))
+    flush = 0.35 * np.exp(-np.maximum(distance - radius, 0) / 0.25) * np.clip(radius / 0.2, 0, 1)
+    dura = dura * np.exp(-(4.5 * chord + flush)[..., None] * np.array([0.35, 1.0, 0.95], np.float32))
     beyond = np.asarray(look.beyond, np.float32) * (1 + 0.18 * mid + 0.04 * fine)[..., None]
     fat = np.array([0.72, 0.46, 0.22], np.float32) * (1 + 0.10 * fine)[..., None]
     reach = 4.8 + 1.6 * wide
-    outer = _step((away - reach) / 1.0 + 0.2 * mid)
-    yellow = (0.7 * _step(wide * 1.5 - 1.4 + 0.4 * mid) * outer)[..., None]
+    bumps = 0.035 * mid + 0.006 * swell
+    if len(rim.flap):
+        reach = _round(rim.flap, angle)
+        beyond = _bone(beyond, away - reach, mid, fine)
+        bumps = np.where(away > reach + 0.6, 0.4, 1.0).astype(np.float32) * bumps
+    outer = _step((away - reach) / 1.0 + 0.2 * mid) if not len(rim.flap) else _step((away - reach) / 0.3)
+    yellow = (0.7 * _step(wide * 1.5 - 1.4 + 0.4 * mid) * outer)[..., None] * (not len(rim.flap))
     colour = dura * (1 - outer[..., None]) + beyond * outer[..., None]
     colour = colour * (1 - yellow) + fat * yellow
     # Blood runs along the fibres and gathers: where the noise says so and in the fold behind the flap.
@@ -154,11 +221,77 @@ def _paint_rows(
     lip = np.exp(-(((away + 0.1) / 0.35) ** 2))[..., None]
     under = np.clip(-away - 0.9, 0, 1)[..., None]
     colour = colour * (1 + 0.12 * lip) * np.exp(-under * np.array([0.35, 0.9, 1.0], np.float32))
-    bumps = 0.035 * mid + 0.006 * swell
-    if rim.patty:
-        colour, bumps = _cotton(cotton, rim.patty, colour, bumps, x, y, look.blood)
+    # Behind the turned-over edge there is a crease, into which blood runs.
+    crease = np.exp(-(((away - 2.1 - 0.3 * wide) / 0.3) ** 2))[..., None]
+    colour = colour * np.exp(-(0.1 + 0.35 * look.blood) * crease * np.array([0.5, 1.5, 1.6], np.float32))
+    dry = np.clip(0.55 + 0.3 * wide - 0.8 * blood, 0.02, 1)
+    if len(rim.cloth):
+        colour, bumps, dry = _draped(look, away - _round(rim.cloth, angle), mid, fine, colour, bumps, dry)
+    colour, bumps = _topped(rim, look, cotton, (x, y), (angle, away), colour, bumps)
     colour = np.clip(colour, 0.006, 0.92).astype(np.float32)
-    return colour, bumps, np.clip(0.55 + 0.3 * wide - 0.8 * blood, 0.02, 1)
+    return colour, np.asarray(bumps, np.float32), np.asarray(dry, np.float32)
+
+
+def _topped(
+    rim: Rim,
+    look: Look,
+    cotton: tuple[Map, ...],
+    place: tuple[Map, Map],
+    polar: tuple[Map, Map],
+    colour: Map,
+    bumps: Map,
+) -> tuple[Map, Map]:
+    """Colour and bumps with stitches and patties on top, at x, y mm and angle, mm from the edge."""
+    thread, ridge = _threads(rim, *polar)
+    colour = colour + thread[..., None] * (np.array([0.025, 0.025, 0.035], np.float32) - colour)
+    bumps = bumps + ridge
+    if rim.patty:
+        colour, bumps = _cotton(cotton, rim.patty, colour, bumps, *place, look.blood)
+    if rim.patties:
+        middle = Patty((0.0, 0.0), 0.0, scenery.PATTY_MM)
+        colour, bumps = _cotton(cotton, middle, colour, bumps, *place, look.blood)
+    return colour, bumps
+
+
+def _bone(beyond: Map, past: Map, mid: Map, fine: Map) -> Map:
+    """Colours with bone over its first millimetres: spongy where it is cut, ivory on top, bled on."""
+    ivory = np.array([0.82, 0.71, 0.54], np.float32) * (1 + 0.06 * mid + 0.03 * fine)[..., None]
+    ivory = ivory * np.exp(-np.clip(0.7 * mid - 0.5, 0, 2)[..., None] * np.array([0.2, 1.2, 1.4], np.float32))
+    spongy = np.array([0.62, 0.30, 0.22], np.float32) * (1 + 0.25 * fine)[..., None]
+    cut = 0.6 * np.exp(-(((past - 0.35) / 0.25) ** 2))[..., None]
+    bone = ivory * (1 - cut) + spongy * cut
+    top = _step((3.9 + 0.5 * mid - past) / 0.6)[..., None]
+    return np.asarray(bone * top + beyond * (1 - top), np.float32)
+
+
+def _draped(
+    look: Look, past: Map, mid: Map, fine: Map, colour: Map, bumps: Map, dry: Map
+) -> tuple[Map, Map, Map]:
+    """Colour, bumps and dryness with blue or green cloth `past` mm beyond its border, bled on there."""
+    dye = ((0.07, 0.20, 0.42), (0.06, 0.28, 0.26))[look.rim_seed % 2]
+    cloth = np.asarray(dye, np.float32) * (1 + 0.10 * fine + 0.05 * mid)[..., None]
+    bled = np.clip(look.blood * (1.1 - past / 2.0) + 0.3 * mid, 0, 1.2)[..., None]
+    cloth = cloth * (1 - 0.6 * np.minimum(bled, 1)) + np.array([0.22, 0.02, 0.02], np.float32) * 0.6 * bled
+    cover = _step(past / 0.3 - 0.5)
+    blend = cover[..., None]
+    return (
+        np.asarray(colour * (1 - blend) + cloth * blend, np.float32),
+        np.asarray(bumps * (1 - cover) + 0.012 * fine * cover, np.float32),
+        np.asarray(np.maximum(dry, cover), np.float32),
+    )
+
+
+def _threads(rim: Rim, angle: Map, away: Map) -> tuple[Map, Map]:
+    """Share covered by the stitches' threads, and their height mm: two strands from each, meeting far out."""
+    covered = np.zeros_like(away)
+    mean = float(rim.edge.mean())
+    for stitch in rim.stitches:
+        aside = (np.mod(angle - stitch + np.pi, 2 * np.pi) - np.pi) * (mean + away)
+        # A loop that is round where it goes through, drawn together far out.
+        apart = 0.42 * np.sqrt(np.clip((away - 0.9) / 0.7, 0, 1)) * np.clip(1 - (away - 1.0) / 12.0, 0, 1)
+        line = np.where(away > 0.9, np.abs(np.abs(aside) - apart), 9.0)
+        covered = np.maximum(covered, _step((_THREAD_MM - line) / 0.06 + 0.2))
+    return np.asarray(covered, np.float32), np.asarray(0.08 * covered, np.float32)
 
 
 def shade(rim: Rim, extent_mm: float) -> Map:
@@ -169,13 +302,29 @@ def shade(rim: Rim, extent_mm: float) -> Map:
     return np.asarray(1 - 0.35 * np.exp(-inside / 0.6) - 0.14 * np.exp(-inside / 2.0), np.float32)
 
 
+def joined(one: Shape, other: Shape) -> Shape:
+    """Two meshes as one, the first's vertices first."""
+    faces = np.concatenate([one.faces, other.faces + len(one.vertices)]).astype(np.int32)
+    return Shape(np.concatenate([one.vertices, other.vertices]), faces)
+
+
+def inside(rim: Rim, x: Map, y: Map) -> Map:
+    """Share of the opening at x, y mm (...): 1 in it, 0 under the rim, soft over a millimetre."""
+    return _step((_edge_at(rim, np.arctan2(y, x)) - np.hypot(x, y)) / 1.0)
+
+
 def _polar(rim: Rim, x: Map, y: Map) -> tuple[Map, Map]:
     angle = np.arctan2(y, x)
     return angle, (np.hypot(x, y) - _edge_at(rim, angle)).astype(np.float32)
 
 
 def _edge_at(rim: Rim, angle: Map) -> Map:
-    closed = np.append(rim.edge, rim.edge[0])
+    return _round(rim.edge, angle)
+
+
+def _round(values: Floats, angle: Map) -> Map:
+    """Values (A,) at even angles, at other angles."""
+    closed = np.append(values, values[0])
     around = np.linspace(0, 2 * np.pi, len(closed))
     return np.asarray(np.interp(angle % (2 * np.pi), around, closed), np.float32)
 

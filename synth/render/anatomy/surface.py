@@ -7,7 +7,7 @@ what lies deeper is never seen.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -23,7 +23,10 @@ from synth.render.anatomy.vessels import Vessels
 Floats = npt.NDArray[np.float64]
 Map = npt.NDArray[np.float32]
 
-_MARGIN_MM = 5.0  # reach under the rim: no drawn tilt or pull shows the patch's edge
+MARGIN_MM = 5.0
+"""Reach under the rim: no drawn tilt or pull shows the patch's edge."""
+LEAST_FILLED = 0.65
+"""Share of the patch under which a user's brain must have surface."""
 _RELIEF_PX = 512
 _BULGE_PX = 1024
 
@@ -98,7 +101,7 @@ def from_brain(
     """
     extent = _extent(anatomy)
     height = _height_map(vertices, faces, extent, _RELIEF_PX // 2)
-    if np.isnan(height).mean() > 0.35:
+    if np.isnan(height).mean() > 1 - LEAST_FILLED:
         raise UserError("anatomy.craniotomy: the brain's surface does not fill the opening there")
     height = _filled(height)
     # The arachnoid bridges what is narrower than itself: a closing, then a smoothing.
@@ -119,7 +122,7 @@ def bulge(tree: Tree, extent_mm: float) -> Map:
 
 
 def _extent(anatomy: schema.Anatomy) -> float:
-    return 2 * (anatomy.craniotomy.radius_mm + _MARGIN_MM)
+    return 2 * (anatomy.craniotomy.radius_mm + MARGIN_MM)
 
 
 def _dome(xy: Floats, radius: float) -> Floats:
@@ -148,7 +151,7 @@ def _surface(
     extent: float,
 ) -> Surface:
     rng = np.random.default_rng([relief.seed, 1])
-    tree = vessels.grow_all(sulci, extent, rng)
+    tree = _vessels(sulci, extent, rng, anatomy)
     side = max(20, round(anatomy.vertices**0.5))
     axis = np.linspace(-extent / 2, extent / 2, side)
     x, y = np.meshgrid(axis, axis)
@@ -165,6 +168,16 @@ def _surface(
         vessels=tree,
         seed=relief.seed,
     )
+
+
+def _vessels(sulci: Map, extent: float, rng: np.random.Generator, anatomy: schema.Anatomy) -> Vessels:
+    """Vessels of the job's density and calibre: those of a larger patch, shrunk, are denser."""
+    dense, wide = anatomy.vessel_density, anatomy.vessel_calibre
+    grown = vessels.grow_all(sulci, extent * dense, rng)
+    if dense == wide == 1:
+        return grown
+    trees = (grown.veins, grown.arteries, grown.deep)
+    return Vessels(*(replace(one, nodes=one.nodes / dense, radius=one.radius * wide) for one in trees))
 
 
 def _grid_faces(side: int) -> npt.NDArray[np.int32]:

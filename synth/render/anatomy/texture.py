@@ -25,6 +25,9 @@ Floats = npt.NDArray[np.float64]
 # Light lost in a millimetre of vessel, red, green, blue: blood seen through its wall, by eye on photographs.
 _ARTERIAL = np.array([0.38, 8.0, 9.6], np.float32)
 _TEXELS_A_PIXEL = 2.2
+_BLEEDINGS = 3.5  # on a patch where the rim is soaked with blood
+_CLIMB = 0.16  # of a vessel's radius, which the film climbs beside it
+_CLIMB_MM = 0.16  # over which that falls off
 
 
 @dataclass(frozen=True)
@@ -121,6 +124,7 @@ def _painted(
     # Blood in the pia: more of it in the sulci and beside arteries.
     beside = noise.blur(thickness(tubes["arteries"]), 0.7, extent)
     beside = beside + noise.blur(thickness(tubes["veins"]), 1.1, extent)
+    spots = _bleedings(rng, look, pixels, extent)
     (albedo,) = noise.in_rows(
         partial(_blushed, look),
         share,
@@ -129,6 +133,8 @@ def _painted(
         beside,
         cv2.resize(mottle, (pixels, pixels)),
         noise.blur(thickness(tubes["deep"]), 0.16, extent),
+        _strands(rng, sulci, extent),
+        spots,
     )
     albedo = _veined(rng, albedo, tubes["veins"], look, extent)
     shown = cv2.resize(wide, (pixels, pixels))
@@ -140,17 +146,58 @@ def _painted(
 
 
 def _blushed(
-    look: Look, share: Map, grain: Map, sulci: Map, beside: Map, mottle: Map, deep: Map
+    look: Look,
+    share: Map,
+    grain: Map,
+    sulci: Map,
+    beside: Map,
+    mottle: Map,
+    deep: Map,
+    strands: Map,
+    spots: Map,
 ) -> tuple[Map]:
-    """Albedo (r, n, 3) of some rows without the vessels of the pia; `deep`: blood that lies under it [mm]."""
+    """Albedo (r, n, 3) of some rows without the vessels of the pia.
+
+    `deep`: blood that lies under it [mm]; `strands`: share of arachnoid that bridges; `spots`: spilt blood.
+    """
     albedo = np.asarray(look.crown, np.float32) * share + np.asarray(look.flush, np.float32) * (1 - share)
     albedo = albedo * (1 + look.grain * grain[..., None] * np.array([0.5, 1.0, 1.2], np.float32))
-    blush = look.blush * (0.04 + 0.3 * sulci) + (0.25 + 0.9 * sulci) * beside
+    blush = look.blush * (0.04 + 0.3 * sulci) + (0.32 + 1.1 * sulci) * beside
     blush = blush * np.clip(1 + 0.3 * mottle, 0.2, 2) + look.capillary * deep
     albedo = albedo * np.exp(-blush[..., None] * np.array([0.16, 1.0, 1.0], np.float32))
     # Fluid stands in the clefts, and little light comes back out of them.
     cleft = look.shade * (0.7 * sulci + 1.8 * np.clip(sulci - 0.5, 0, 1))
-    return (albedo * np.exp(-cleft[..., None] * np.array([0.5, 0.75, 0.62], np.float32)),)
+    albedo = albedo * np.exp(-cleft[..., None] * np.array([0.5, 0.75, 0.62], np.float32))
+    # Over the deepest the fluid is grey, and the arachnoid a haze with whiter strands.
+    haze = np.clip(0.45 * np.clip((sulci - 0.45) / 0.4, 0, 1) + 0.35 * strands, 0, 0.7)[..., None]
+    fluid = np.array(look.crown, np.float32) * np.array([0.50, 0.50, 0.72], np.float32)
+    milk = fluid + strands[..., None] * (np.array([0.62, 0.52, 0.48], np.float32) - fluid)
+    albedo = albedo + haze * look.shade * (milk - albedo)
+    return (albedo * np.exp(-spots[..., None] * np.array([0.12, 1.5, 2.3], np.float32)),)
+
+
+def _strands(rng: np.random.Generator, sulci: Map, extent: float) -> Map:
+    """Share (n, n) of the arachnoid's fibres where it bridges a cleft: thin lines, most of them across it."""
+    small = 512
+    wave = noise.band(rng, small, extent, 1.6, 0.4)
+    slope = np.hypot(*np.gradient(wave, extent / small)).astype(np.float32)
+    line = np.exp(-((wave / np.maximum(slope, 0.5) / 0.07) ** 2))
+    over = np.clip((cv2.resize(sulci, (small, small)) - 0.5) / 0.3, 0, 1)
+    return np.asarray(cv2.resize((line * over).astype(np.float32), sulci.shape[::-1]), np.float32)
+
+
+def _bleedings(rng: np.random.Generator, look: Look, pixels: int, extent: float) -> Map:
+    """Optical depth (n, n) of a few small bleedings under the arachnoid, ragged and thin at their edges."""
+    small = 512
+    axis = noise.centres(small, extent)
+    ragged = noise.fractal(rng, small, extent, 2.5, 1.7)
+    total = np.zeros((small, small), np.float32)
+    for _ in range(int(rng.poisson(_BLEEDINGS * look.blood))):
+        x, y = rng.uniform(-0.4, 0.4, 2) * extent
+        radius, depth = rng.uniform(0.4, 1.6), rng.uniform(0.3, 0.9)
+        away = np.hypot(axis[None] - x, axis[:, None] - y) / radius
+        total += depth * np.clip(1.25 - away + 0.3 * ragged, 0, 1).astype(np.float32)
+    return np.asarray(cv2.resize(total, (pixels, pixels), interpolation=cv2.INTER_CUBIC), np.float32)
 
 
 def _arterial(look: Look, albedo: Map, wide: Map, distance: Map, radius: Map) -> tuple[Map]:
@@ -223,7 +270,8 @@ def _film(
     def fine(image: Map) -> Map:
         return np.asarray(cv2.resize(image, (pixels, pixels), interpolation=cv2.INTER_CUBIC), np.float32)
 
-    relief = noise.blur(0.22 * thickness(tubes["arteries"]), look.film_mm, extent)
+    relief = 0.22 * thickness(tubes["arteries"]) + _meniscus(tubes["arteries"]) + _meniscus(tubes["veins"])
+    relief = noise.blur(relief, look.film_mm, extent)
     pools = noise.fractal(rng, coarse, extent, 5.0, 1.5)
     dry = np.clip(0.5 + 0.45 * pools - 0.5 * cv2.resize(sulci, (coarse, coarse)), 0.05, 1.0)
     swell = fine(noise.band(rng, coarse, extent, 2.2, 0.5) * 0.011)
@@ -234,6 +282,14 @@ def _film(
     height = relief + look.bump * (1 - 0.9 * on_vein) * (swell + fine(dry) * rough)
     bare = dry * (1 - cv2.resize(on_vein, (coarse, coarse), interpolation=cv2.INTER_AREA))
     return np.asarray(height, np.float32), np.asarray(np.clip(bare, 0, 1), np.float32)
+
+
+def _meniscus(tube: tuple[Map, Map]) -> Map:
+    """Height (n, n) mm of the fluid that climbs beside vessels; none on a vessel's crest."""
+    distance, radius = tube
+    beyond = distance - radius
+    steep = np.where(beyond > 0, _CLIMB_MM, np.maximum(0.3 * radius, 1e-3))
+    return np.asarray(_CLIMB * np.minimum(radius, 0.45) * np.exp(-np.abs(beyond) / steep), np.float32)
 
 
 def _photograph(path: Path, pixels: int) -> Map:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -10,6 +10,8 @@ from synth.job.schema import Family, Job
 from synth.render.appearance.family import FAMILIES, Colour
 from synth.render.appearance.light import Lighting, balance
 from synth.render.camera.camera_sensor import Sensor
+
+_SHOWN = 0.75  # share of the sequences that show a part of `render.scenery`
 
 
 @dataclass(frozen=True)
@@ -51,6 +53,8 @@ class Look:
     """What lies outside the dura: muscle, or the bone of a specimen."""
     cottonoid: bool
     """Whether a cotton patty lies on the rim."""
+    scenery: tuple[str, ...]
+    """What else lies about the opening, of what the job allows."""
     rim_seed: int
     light: Lighting
     sensor: Sensor
@@ -60,8 +64,8 @@ class Look:
         """A look of `family` under the job's light, seen by its sensor."""
         lighting = Lighting.draw(job.light, rng)
         glare = lighting.glare
-        ranges = FAMILIES[family]
-        return cls(
+        ranges = FAMILIES[family]._replace(**job.appearance.own.model_dump(exclude_none=True))
+        drawn = cls(
             family=family,
             crown=_near(ranges.crown, rng),
             flush=_near(ranges.flush, rng),
@@ -81,10 +85,18 @@ class Look:
             dura=_near(ranges.dura, rng),
             beyond=_near(ranges.beyond, rng),
             cottonoid=bool(rng.uniform() < job.appearance.cottonoid),
+            scenery=(),
             rim_seed=int(rng.integers(2**31)),
             light=lighting,
             sensor=Sensor.draw(job.sensor, balance(lighting.kelvin + rng.uniform(-250, 350)), rng),
         )
+        return replace(drawn, scenery=_shown(job.render.scenery, drawn.rim_seed))
+
+
+def _shown(parts: tuple[str, ...], seed: int) -> tuple[str, ...]:
+    """Which of the parts that a job allows one sequence shows; from a seed, so that nothing else changes."""
+    seen = np.random.default_rng([seed, 4]).random(len(parts)) < _SHOWN
+    return tuple(part for part, shown in zip(parts, seen, strict=True) if shown)
 
 
 def _near(colour: Colour, rng: np.random.Generator) -> Colour:

@@ -1,50 +1,121 @@
-"""What polished steel mirrors of its surroundings: the tissue below, a dark theatre with its lamps above.
+"""What polished steel mirrors: the wound below it, a dark theatre with its lamps, the microscope's windows.
 
-The lamps that light the scene are points, and the rest of the theatre lights nothing: only steel shows it.
+It is evaluated at vertices, with the finish as a blur: a renderer's own reflection of small bright lamps is
+grain at few paths a pixel, and the rest of the theatre lights nothing else.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import numpy.typing as npt
+from scipy.ndimage import map_coordinates
 
 from synth.geometry.triangles import Shape, normals
+from synth.render.mitsuba.adapter import Lamp
 
 Floats = npt.NDArray[np.float64]
+Map = npt.NDArray[np.float32]
 
-_TISSUE = np.array([0.50, 0.20, 0.13])
-_DRAPE = np.array([0.05, 0.10, 0.12])
-_CEILING = np.array([0.10, 0.11, 0.12])
-_LAMPS = 5
+_STEEL, _BLACK = 0.58, 0.045
+"""Reflectance at right angles of machined steel and of the coating."""
+_TINT = np.array([1.0, 0.985, 0.96])
+_DRAPE = np.array([0.02, 0.045, 0.055])
+_CEILING = np.array([0.16, 0.17, 0.18])
+_LAMPS = 7
+_FINISH = 0.30  # GGX alpha of machined steel
+_FADE_MM = 22.0  # from the opening's middle, where the wound ends and drapes begin
 
 
-def glow(tool: Shape, eye: Floats, seed: int) -> Floats:
-    """Radiance (V, 3) that each vertex of a tool mirrors towards the lens at `eye` (3,) mm."""
+@dataclass(frozen=True)
+class Theatre:
+    """What is around the instruments."""
+
+    wound: Map
+    """(n, n, 3) linear colour of cortex and rim, seen from above."""
+    extent_mm: float
+    """Side of the square that it covers."""
+    lamps: tuple[Lamp, ...]
+    """The microscope's."""
+    light: tuple[float, float, float]
+    """Colour and power of what lights the wound and the theatre; 1 is white that just fills the sensor."""
+    seed: int
+    """Of the lamps on the ceiling."""
+
+
+def tint(coat: npt.NDArray[np.floating], satin: float) -> Floats:
+    """Diffuse reflectance (V, 3) of steel under a black `coat` (V,), of which a share `satin` is even."""
+    bare, black = satin * _STEEL * _TINT, np.full(3, 0.03)
+    return np.asarray(bare + coat[:, None] * (black - bare))
+
+
+def glow(tool: Shape, coat: npt.NDArray[np.floating], eye: Floats, theatre: Theatre) -> Floats:
+    """Radiance (V, 3) that each vertex of a tool mirrors towards the lens at `eye` (3,) mm.
+
+    Args:
+        tool: the instruments where they are.
+        coat: (V,) 0 bare to 1 coated black.
+        eye: the lens.
+        theatre: what they mirror.
+    """
     normal = normals(tool)
     towards = eye - tool.vertices
     towards /= np.linalg.norm(towards, axis=1, keepdims=True)
     facing = np.einsum("nc,nc->n", normal, towards)[:, None]
     mirrored = 2 * facing * normal - towards
-    # Nearer to its tip steel sees more of the tissue and less of the room.
-    near = 1 / (1 + (np.maximum(tool.vertices[:, 2:], 0) / 18.0) ** 2)
-    return np.asarray(0.62 * _surroundings(mirrored, near, np.random.default_rng([seed, 3])))
+    straight = _STEEL * _TINT + coat[:, None] * (_BLACK - _STEEL * _TINT)
+    # Schlick, An inexpensive BRDF model for physically-based rendering, 1994.
+    share = straight + (1 - straight) * np.clip(1 - facing, 0, 1) ** 5
+    seen = _surroundings(tool.vertices, mirrored, theatre) * np.asarray(theatre.light)
+    for lamp in theatre.lamps:
+        seen += _window(tool.vertices, normal, towards, lamp)
+    return np.asarray(share * seen)
 
 
-def _surroundings(direction: Floats, near: Floats, rng: np.random.Generator) -> Floats:
-    """Radiance (N, 3) from directions (N, 3)."""
+def _surroundings(place: Floats, direction: Floats, theatre: Theatre) -> Floats:
+    """Radiance (N, 3) that arrives at places (N, 3) mm from directions (N, 3)."""
     up = direction[:, 2:]
     below = 1 / (1 + np.exp((up + 0.05) / 0.09))
+    # Where the mirrored ray meets the wound's plane; nearly level ones see drapes.
+    steep = np.maximum(-direction[:, 2], 0.05)
+    far = np.maximum(place[:, 2], 0.0) / steep
+    met = place[:, :2] + far[:, None] * direction[:, :2]
+    pixel = ((met / theatre.extent_mm + 0.5) * len(theatre.wound) - 0.5).T[::-1]
+    planes = np.moveaxis(theatre.wound, -1, 0)
+    wound = np.stack([map_coordinates(one, pixel, order=1, mode="nearest") for one in planes], axis=-1)
+    lit = 1 / (1 + np.exp(np.clip((np.linalg.norm(met, axis=1) - _FADE_MM) / 3.0, -40, 40)))[:, None]
+    ground = lit * 0.8 * wound + (1 - lit) * _DRAPE
     high = np.clip(up, 0, 1) ** 0.5
     room = (1 - high) * _DRAPE + high * _CEILING
-    lamps = np.zeros_like(up)
+    return np.asarray(below * ground + (1 - below) * (room + _ceiling_lamps(direction, theatre.seed)))
+
+
+def _ceiling_lamps(direction: Floats, seed: int) -> Floats:
+    """Radiance (N, 1) of the theatre's own lamps."""
+    rng = np.random.default_rng([seed, 3])
+    total = np.zeros((len(direction), 1))
     for azimuth, height, size, power in zip(
         rng.uniform(0, 2 * np.pi, _LAMPS),
-        rng.uniform(0.25, 0.9, _LAMPS),
+        rng.uniform(0.05, 0.8, _LAMPS),
         rng.uniform(0.10, 0.28, _LAMPS),
-        rng.uniform(0.4, 1.6, _LAMPS),
+        rng.uniform(0.6, 2.6, _LAMPS),
         strict=True,
     ):
         flat = np.sqrt(1 - height**2)
         middle = np.array([flat * np.cos(azimuth), flat * np.sin(azimuth), height])
-        lamps += power * np.exp(-np.maximum(1 - direction @ middle, 0) / (0.5 * size**2))[:, None]
-    return np.asarray(below * near * _TISSUE + (1 - below) * (room + lamps))
+        total += power * np.exp(-np.maximum(1 - direction @ middle, 0) / (0.5 * size**2))[:, None]
+    return total
+
+
+def _window(place: Floats, normal: Floats, towards: Floats, lamp: Lamp) -> Floats:
+    """A microscope's window mirrored by a machined finish, (N, 3): Trowbridge and Reitz's lobe (GGX)."""
+    way = lamp.position - place
+    away2 = np.einsum("nc,nc->n", way, way)
+    way /= np.sqrt(away2)[:, None]
+    half = way + towards
+    half /= np.linalg.norm(half, axis=1, keepdims=True)
+    in_line = np.clip(np.einsum("nc,nc->n", normal, half), 0, 1) ** 2
+    lobe = _FINISH**2 / (np.pi * (in_line * (_FINISH**2 - 1) + 1) ** 2)
+    lit = np.einsum("nc,nc->n", normal, way) > 0
+    return np.asarray((lit * lobe / (4 * away2))[:, None] * np.asarray(lamp.intensity))

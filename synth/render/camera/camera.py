@@ -25,7 +25,7 @@ class View:
     """How the microscope looks at the craniotomy in one sequence."""
 
     field_mm: float
-    """Width of the field of view at the craniotomy."""
+    """Width of the field of view at the craniotomy [mm]; a calibration's, where there is one."""
     working_distance_mm: float
     tilt_deg: float
     """Angle between the optical axis and the craniotomy's normal."""
@@ -36,11 +36,11 @@ class View:
     focus_mm: float
     """Distance of the plane in focus beyond the craniotomy's centre."""
     off_centre: tuple[float, float]
-    """Principal point from the middle of the picture, in its widths; x, y."""
+    """Principal point from the middle of the picture, in its widths; x, y. Likewise."""
 
     @classmethod
     def draw(cls, render: Render, rng: np.random.Generator) -> View:
-        return cls(
+        drawn = cls(
             field_mm=float(rng.uniform(*render.field_mm)),
             working_distance_mm=float(rng.uniform(*render.working_distance_mm)),
             tilt_deg=float(rng.uniform(*render.tilt_deg)),
@@ -49,6 +49,12 @@ class View:
             focus_mm=float(rng.uniform(-0.5, 0.5)),
             off_centre=_aside(render, rng),
         )
+        if render.calibration is None:
+            return drawn
+        K, width = calibration.read(render.calibration).fitted(render.size), render.size[0]
+        x, y = (K[:2, 2] - (np.array(render.size) - 1) / 2) / width
+        field_mm = float(width * drawn.working_distance_mm / K[0, 0])
+        return replace(drawn, field_mm=field_mm, off_centre=(float(x), float(y)))
 
 
 @dataclass(frozen=True)

@@ -30,6 +30,8 @@ class Sensor:
     """Of the converter."""
     vignette: float = 0.15
     """Share of light lost in the picture's corners."""
+    blur: float = 0.0
+    """Standard deviation of the optics' blur [px]."""
     bloom: float = 0.03
     """Share of light that the optics scatter around."""
     contrast: float = 0.35
@@ -40,6 +42,8 @@ class Sensor:
     """One colour a pixel (RGGB)."""
     chroma: str = "4:4:4"
     """Colour resolution of the video: 4:4:4, 4:2:2 or 4:2:0."""
+    coded: bool = False
+    """Whether a codec follows, which thins the colours out itself."""
 
     @classmethod
     def draw(
@@ -51,11 +55,13 @@ class Sensor:
             white=white,
             full_well=float(rng.uniform(*section.full_well)),
             read_noise=float(rng.uniform(*section.read_noise)),
+            vignette=section.vignette,
+            blur=section.blur_px,
             contrast=float(rng.uniform(*section.contrast)),
             sharpening=float(rng.uniform(*section.sharpening)),
             bayer=section.bayer,
-            # A codec thins the colours out itself.
-            chroma=section.chroma if section.bitrate_mbps is None else "4:4:4",
+            chroma=section.chroma,
+            coded=section.bitrate_mbps is not None,
         )
 
 
@@ -71,6 +77,8 @@ def record(radiance: Map, sensor: Sensor, rng: np.random.Generator) -> npt.NDArr
         (H, W, 3) uint8.
     """
     light = radiance * (sensor.exposure * _falloff(radiance.shape[:2], sensor.vignette))[..., None]
+    if sensor.blur > 0:
+        light = cv2.GaussianBlur(light, (0, 0), sensor.blur)
     light = _scatter(light, sensor.bloom)
     balanced = rng.standard_normal(light.shape, dtype=np.float32)
     well, read = np.float32(sensor.full_well), np.float32(sensor.read_noise**2)
@@ -80,7 +88,8 @@ def record(radiance: Map, sensor: Sensor, rng: np.random.Generator) -> npt.NDArr
         balanced = _demosaiced(balanced)
     video = _tone(balanced, sensor.contrast)
     video = _sharpen(video, sensor.sharpening)
-    video = _thinned(np.clip(video, 0, 1, out=video), sensor.chroma)
+    np.clip(video, 0, 1, out=video)
+    video = video if sensor.coded else _thinned(video, sensor.chroma)
     np.clip(video, 0, 1, out=video)
     video *= np.float32(255)
     return np.rint(video, out=video).astype(np.uint8)

@@ -57,16 +57,12 @@ class Wet:
 
 @dataclass(frozen=True)
 class Metal:
-    """A brushed conductor."""
+    """A polished body: what it scatters is the renderer's, what it mirrors is given."""
 
-    reflectance: tuple[float, float, float]
-    along: float
-    """GGX alpha along the brushing (the first texture axis)."""
-    across: float
-    satin: float
-    """Share of light that the finish scatters evenly."""
+    tint: Floats
+    """(V, 3) share of light that the finish scatters evenly at vertices."""
     glow: Floats
-    """(V, 3) radiance that vertices mirror of what lights nothing; `Stage.mirror` renews it."""
+    """(V, 3) radiance that vertices mirror; `Stage.mirror` renews it."""
 
 
 @dataclass(frozen=True)
@@ -167,9 +163,13 @@ class Stage:
         self._scene = mi.load_dict(scene)
         self._parameters = mi.traverse(self._scene)
 
-    def move(self, name: str, vertices: Floats) -> None:
-        """New positions (V, 3) mm of a body's vertices."""
-        bent = normals(Shape(vertices, self._faces[name]))
+    def move(self, name: str, vertices: Floats, film: Floats | None = None) -> None:
+        """New positions (V, 3) mm of a body's vertices; light sees them under a `film` of heights (V,) mm."""
+        wet = vertices
+        if film is not None:
+            wet = vertices.copy()
+            wet[:, 2] += film
+        bent = normals(Shape(wet, self._faces[name]))
         for key, values in (("vertex_positions", vertices), ("vertex_normals", bent)):
             flat = _aligned(values, np.float32)
             self._parameters[f"{name}.{key}"] = self._mi.Float(flat) if self._jit else flat
@@ -274,6 +274,7 @@ def _mesh(mi: Any, name: str, body: Body) -> Any:
     )
     if isinstance(body.material, Metal):
         mesh.add_attribute("vertex_glow", 3, _aligned(body.material.glow, np.float32))
+        mesh.add_attribute("vertex_tint", 3, _aligned(body.material.tint, np.float32))
     parameters = mi.traverse(mesh)
     parameters["vertex_positions"] = _aligned(body.vertices, np.float32)
     bent = normals(Shape(body.vertices, body.faces))
@@ -308,25 +309,8 @@ def _glow(mi: Any, material: Wet | Metal) -> dict[str, Any]:
 
 def _material(mi: Any, material: Wet | Metal) -> dict[str, Any]:
     if isinstance(material, Metal):
-        return {
-            "type": "twosided",
-            "satin": {
-                "type": "blendbsdf",
-                "weight": material.satin,
-                "brushed": {
-                    "type": "roughconductor",
-                    "material": "none",
-                    "distribution": "ggx",
-                    "alpha_u": material.along,
-                    "alpha_v": material.across,
-                    "specular_reflectance": {"type": "rgb", "value": list(material.reflectance)},
-                },
-                "scattered": {
-                    "type": "diffuse",
-                    "reflectance": {"type": "rgb", "value": list(material.reflectance)},
-                },
-            },
-        }
+        scattered = {"type": "mesh_attribute", "name": "vertex_tint"}
+        return {"type": "twosided", "satin": {"type": "diffuse", "reflectance": scattered}}
     if material.volume:
         bent = material.normal * np.float32(0.5) + np.float32(0.5)
         return mitsuba_volume.boundary(_bitmap(mi, bent), material.roughness)

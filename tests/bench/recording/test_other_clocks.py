@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
-from fake_recording import Bump, Maker, force_curve
+from fake_recording import Bump, Maker, force_curve, texture
 from scipy.spatial.transform import Rotation
 
 from bench.recording import check, pixel_scale, writer
@@ -82,10 +83,39 @@ def test_a_sensor_that_lies_across_is_turned_into_the_cameras_axes(make: Maker) 
     assert set(result.methods["bump"].components) == {"x", "y", "z"}
 
 
+@pytest.mark.slow
+def test_the_rotation_is_found_on_a_span_and_that_is_not_scored(make: Maker) -> None:
+    turn = Rotation.from_euler("xyz", [40, -25, 70], degrees=True).as_matrix()
+    folder = make(frames=60, meta={"sensor": {"turn_s": [0, 4.05], "low_pass_hz": None}})
+    time = np.arange(60) / 10
+    # Pulled to and fro in the picture, and pressed: the bump gives way to the pull alone.
+    way = np.stack([np.sin(2.1 * time), np.sin(3.3 * time + 1), 0.6 * np.sin(1.3 * time)], axis=1)
+    rest, (y, x) = texture(96, 128), np.mgrid[:96, :128].astype(np.float32)
+    bump = np.exp(-((x - 64) ** 2 + (y - 48) ** 2) / (2 * 18**2))
+    for k, (right, down, _) in enumerate(3 * (way - way[0])):
+        moved = cv2.remap(rest, x - np.float32(right) * bump, y - np.float32(down) * bump, cv2.INTER_CUBIC)
+        cv2.imwrite(str(folder / "frames" / f"{k:04d}.png"), moved[..., ::-1])
+    in_camera = 0.05 * (way - way[0])
+    writer.write_force(folder, time, in_camera @ turn)  # R^T f, as rows
+    assert any("sensor.turn_s holds 4.05 s" in f.said for f in check.check_recording(folder))
+    result = run(folder)
+    assert result.turn is not None
+    off = np.degrees(Rotation.from_matrix(result.turn.rows @ turn.T).magnitude())
+    assert off < min(3 * result.turn.deviation_deg, 6), result.turn
+    assert result.sensor_axes_mn == pytest.approx(1000 * in_camera, abs=12)
+    assert set(result.methods["bump"].components) == {"x", "y", "z"}
+    assert not result.scored[time <= 4.05].any()
+    assert result.scored[time > 4.05].all()
+    assert any(f"± {result.turn.deviation_deg:.1f}°" in note for note in result.notes)
+
+
 def test_what_is_no_rotation_is_refused(make: Maker) -> None:
     mirrored = make("a", frames=2, meta={"sensor": {"to_camera": [[1, 0, 0], [0, 1, 0], [0, 0, -1]]}})
     with pytest.raises(UserError, match="must be a rotation"):
         open_recording(mirrored)
+    both = make("b", frames=2, meta={"sensor": {"axes": "camera", "turn_s": [0, 1]}})
+    with pytest.raises(UserError, match="give one of them"):
+        open_recording(both)
 
 
 def test_a_phantom_may_be_pushed_with_more_than_50_newtons(make: Maker) -> None:

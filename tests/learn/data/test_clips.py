@@ -169,6 +169,24 @@ def test_one_brain_is_split_only_when_asked_to(clips: list[Clip]) -> None:
     one = [replace(c, group="mesh-5f") for c in clips]
     with pytest.raises(UserError, match="share_anatomy=true"):
         nested(one, 3, 0, 0)
+    with pytest.raises(UserError, match=r"`synth place` finds them, craniotomy\.also lists them"):
+        nested(one, 3, 0, 0)
     alone = ungrouped(one)
     split = nested(alone, 3, 0, 0)
     assert len(split.fit) + len(split.select) + len(split.test) == len(clips)
+
+
+def test_one_brains_openings_are_kept_apart(clips: list[Clip]) -> None:
+    from dataclasses import replace
+
+    def opened(count: int) -> list[Clip]:
+        return [replace(c, group="mesh-5f", opening=f"mesh-5f at {k % count}") for k, c in enumerate(clips)]
+
+    assert len(clips) > 3
+    apart = ungrouped(opened(3))
+    assert len(set(groups(apart))) == 3
+    split = nested(apart, 3, 0, 0)
+    sides = [{apart[k].opening for k in part} for part in (split.fit, split.select, split.test)]
+    assert all(sides)
+    assert len(set.union(*sides)) == sum(len(side) for side in sides), "no opening on two sides"
+    assert len(set(groups(ungrouped(opened(2))))) == len(clips), "two can't be on three sides"

@@ -23,6 +23,7 @@ from learn.inference.apply import Filmed, motions
 from learn.inference.export import examples, export
 from learn.inference.predict import load_predictor
 from learn.inference.pulse import Pulse, Rhythm
+from learn.inference.scale import UNKNOWN_NOTE
 from learn.inference.stiffness import stiffness
 from learn.inference.video import read_video
 from learn.inference.video_flow import Footage, Settings, VideoFlow
@@ -158,10 +159,35 @@ def test_a_video_is_followed_and_predicted(model: Path, tmp_path: Path) -> None:
     np.testing.assert_allclose(seen[2][16:32, 16:48].mean((0, 1)), [2, 0], atol=0.3)
 
 
+def test_an_unknown_scale_is_said_and_takes_e_with_it(
+    model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_film(tmp_path / "film.mp4", 1)
+    monkeypatch.chdir(tmp_path)
+    film = ["predict", str(model), "film.mp4", "--flow", "dis"]
+    # A picture of 64 px taken to be 32 mm wide; E is of no use.
+    for name, asked in (("asked", ["--scale", "unknown", "--young", "3"]), ("as", ["--scale", "0.5"])):
+        done = run(app, [*film, *asked, "--out", name])
+        assert done.exit_code == 0, done.output
+    unknown, stated = (np.load(Path(name, "film.npz")) for name in ("asked", "as"))
+    np.testing.assert_array_equal(unknown["total_force_mn"], stated["total_force_mn"])
+    assert not unknown["young_known"]
+    assert unknown["notes"][0] == UNKNOWN_NOTE
+    assert UNKNOWN_NOTE not in stated["notes"]
+    assert "or unknown" in run(app, [*film, "--scale", "-1"]).output
+
+
 def test_a_pulse_that_was_taken_off_is_said_once(tmp_path: Path) -> None:
     write_film(tmp_path / "film.mp4", 1)
     beat = Rhythm(1.2, np.zeros(1), np.zeros(1), np.zeros((2, 1, 2)))
-    found = Pulse((beat,), np.zeros((48, 64, 1), np.float32), np.zeros((1, 2)), (0.5,), 1.0)
+    found = Pulse(
+        (beat,),
+        np.zeros((48, 64, 1), np.float32),
+        np.zeros((1, 2)),
+        np.zeros((48, 64, 2), np.float32),
+        (0.5,),
+        1.0,
+    )
     notes = " ".join(apply._video(tmp_path / "film.mp4", Filmed(0.1), found).notes())
     assert notes.count("the whole surface moves by itself") == notes.count("taken off") == 1
 
@@ -248,7 +274,7 @@ def test_bad_files(tmp_path: Path, dataset: Path) -> None:
         ("k.npz", "scale_mm_per_px is no array of numbers"),
         ("l.npz", "cannot be read as .npz"),
         ("m.npz", "no regular file"),
-        ("d.mp4", "give --scale in mm a pixel"),
+        ("d.mp4", "give --scale in mm a pixel, or unknown"),
         ("e.zarr", "no such sequence"),
     ):
         with pytest.raises(UserError, match=message):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -24,8 +26,9 @@ def film(
     contact_mm: float = 1.5,
     period_s: float | None = None,
     wander: float = 0.0,
+    rest_px: float = 0.0,
 ) -> tuple[Surface, NDArray[np.float64], list[NDArray[np.float64]]]:
-    """What is tracked, its times, and the tissue's own motion [px] in closed form."""
+    """What is tracked, its times, and the tissue's own motion and the rest frame's noise [px]."""
     rng = np.random.default_rng(0)
     time = np.arange(0, seconds, 0.1) + rng.uniform(-0.02, 0.02, round(10 * seconds))
     load = np.zeros_like(time)
@@ -39,15 +42,16 @@ def film(
             load += inside * rng.uniform(0.5, 1) * np.sin(np.pi * (time - begin) / long)
             begin += long + rng.uniform(0.8, 2.5)
     surface, lay = Surface(np.ones(SIZE, bool)), []
+    at_rest = rng.normal(0, rest_px, (SIZE[0] // 8, SIZE[1] // 8, 2)).repeat(8, 0).repeat(8, 1)
     for t, force in zip(time, load, strict=True):
         turn = 2 * np.pi * 1.2 * t + wander * np.sin(2 * np.pi * t / seconds)
         beat = heart_mm * (np.sin(turn) + 0.3 * np.sin(2 * turn)) * HEART
         own = (beat + breath_mm * np.sin(2 * np.pi * 0.25 * t + 1) * BREATH) / MM_PER_PX
         lay.append(own)
         noise = rng.normal(0, 0.05, (SIZE[0] // 8, SIZE[1] // 8, 2)).repeat(8, 0).repeat(8, 1)
-        flow = own - lay[0] + force * contact_mm / MM_PER_PX * CONTACT + noise
+        flow = own - lay[0] + force * contact_mm / MM_PER_PX * CONTACT + noise + at_rest
         surface.add(float(t), flow.astype(np.float32), np.ones(SIZE, np.float32))
-    return surface, time, [own - lay[0] for own in lay]
+    return surface, time, [own - lay[0] + at_rest for own in lay]
 
 
 def left(pulse: Pulse, time: NDArray[np.float64], truth: list[NDArray[np.float64]]) -> float:
@@ -70,6 +74,18 @@ def test_heart_and_breath_between_contacts_are_found() -> None:
     wave = np.ptp(np.sin(turn) + 0.3 * np.sin(2 * turn)) / 2
     expected = 0.4 * wave * np.median(np.linalg.norm(HEART, axis=-1))
     assert MM_PER_PX * pulse.amplitudes_px[0] == pytest.approx(expected, rel=0.03)
+
+
+@pytest.mark.slow
+def test_the_rest_frames_own_noise_is_taken_off_but_nothing_larger() -> None:
+    surface, time, truth = film(rest_px=0.06)
+    pulse = find_pulse(surface, time[0])
+    assert pulse is not None
+    assert left(pulse, time, truth) < 0.7 * left(replace(pulse, still=0 * pulse.still), time, truth)
+    surface, time, _ = film(rest_px=0.5)
+    pulse = find_pulse(surface, time[0])
+    assert pulse is not None
+    assert np.linalg.norm(pulse.still, axis=-1).max() == pytest.approx(0.15, abs=0.01)
 
 
 @pytest.mark.slow

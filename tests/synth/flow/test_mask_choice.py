@@ -74,10 +74,10 @@ def test_highlights_that_stay_while_the_tissue_moves_are_masked_and_help() -> No
     assert errors["chosen"] < 0.7 * errors["none"]
 
 
-def _faint(by_px: float, noise: int) -> NDArray[np.float64]:
+def _faint(by_px: float, noise: int, contrast: float = 0.3) -> NDArray[np.float64]:
     """Texture so faint that still highlights, and the camera's own noise, speak louder."""
     grain = np.random.default_rng(noise).normal(0, 3, (_SIZE, _SIZE))
-    return 120 + 0.3 * (_moved(by_px) - 120) + grain
+    return 120 + contrast * (_moved(by_px) - 120) + grain
 
 
 @pytest.mark.parametrize("wrong_px", [0, 36])
@@ -95,6 +95,20 @@ def test_highlights_over_faint_texture_do_not_vouch_for_stillness(wrong_px: int)
             flow, _ = tracker.step(_picture(np.where(wet, 250.0, _faint(by_px, 3 + k))), given)
         errors[name] = float(np.abs(flow - [3.0, 0.0])[8:-8, 40:-8].mean())
     assert errors["chosen"] < 0.4 * errors["none"]
+
+
+@pytest.mark.parametrize(("contrast", "held"), [(0.06, True), (1.0, False)])
+def test_highlights_that_alone_say_that_nothing_moves_are_not_believed(contrast: float, held: bool) -> None:
+    spots = gaussian_filter(np.random.default_rng(1).standard_normal((_SIZE, _SIZE)), 6)
+    wet = spots > np.quantile(spots, 0.95)
+    found = Proposal(wet, _NOTHING, _NOTHING)
+    tracker = _tracker(_picture(np.where(wet, 250.0, _faint(0.0, 2, contrast))), found)
+    for k, by_px in enumerate((1.5, 3.0, 3.0)):
+        flow, confidence = tracker.step(_picture(np.where(wet, 250.0, _faint(by_px, 3 + k, contrast))), found)
+        off = float(np.linalg.norm(flow - [by_px, 0.0], axis=-1)[~wet].mean())
+        assert (off > 1) == held, "what proves nothing if it is followed after all"
+        assert ("highlights" in tracker.lost) == held
+        assert (confidence.max() < 0.3) == held
 
 
 def test_tool_that_comes_back_is_masked_at_once() -> None:

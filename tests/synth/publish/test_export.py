@@ -18,7 +18,8 @@ from synth.dataset.store import Dataset
 from synth.dataset.torch_dataset import Frames
 from synth.errors import UserError
 from synth.job.schema import Job
-from synth.publish import export
+from synth.publish.export import webdataset
+from synth.publish.export.formats import export_dataset
 
 
 def quiet(stage: str, done: int, of: int) -> None:
@@ -46,8 +47,8 @@ def test_folder(root: Path, tmp_path: Path) -> None:
 
 
 def test_webdataset(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(export, "_SHARD_BYTES", 50_000)
-    export.export_dataset(root, tmp_path / "to", "webdataset")
+    monkeypatch.setattr(webdataset, "_SHARD_BYTES", 50_000)
+    export_dataset(root, tmp_path / "to", "webdataset")
     found = {}
     shards = sorted((tmp_path / "to").glob("*.tar"))
     for shard in shards:
@@ -67,7 +68,7 @@ def test_webdataset(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
 
 def test_hdf5(root: Path, tmp_path: Path) -> None:
     h5py = pytest.importorskip("h5py")
-    export.export_dataset(root, tmp_path / "to", "hdf5")
+    export_dataset(root, tmp_path / "to", "hdf5")
     with h5py.File(tmp_path / "to/000001.h5") as file:
         sequence = Dataset(root)[1]
         for name in sequence.fields:
@@ -77,7 +78,7 @@ def test_hdf5(root: Path, tmp_path: Path) -> None:
 
 
 def test_npz_of_the_published_code(root: Path, tmp_path: Path) -> None:
-    export.export_dataset(root, tmp_path / "to", "d2fnet-npz")
+    export_dataset(root, tmp_path / "to", "d2fnet-npz")
     files = sorted((tmp_path / "to").glob("*/brain_surface_*_auto_projected_*_2d.npz"))
     assert len(files) == 2
     sequence = Dataset(root)[0]
@@ -94,11 +95,11 @@ def test_npz_of_the_published_code(root: Path, tmp_path: Path) -> None:
 
 def test_refusals_leave_nothing(root: Path, tmp_path: Path) -> None:
     with pytest.raises(UserError, match="is not one of folder"):
-        export.export_dataset(root, tmp_path / "to", "excel")
+        export_dataset(root, tmp_path / "to", "excel")
     with pytest.raises(UserError, match="exists already"):
-        export.export_dataset(root, tmp_path, "folder")
+        export_dataset(root, tmp_path, "folder")
     with pytest.raises(UserError, match="no such folder"):
-        export.export_dataset(tmp_path / "nothing", tmp_path / "to", "folder")
+        export_dataset(tmp_path / "nothing", tmp_path / "to", "folder")
     assert list(tmp_path.iterdir()) == []
 
 

@@ -51,6 +51,18 @@ def test_the_camera_projects_as_opencv_does(tmp_path: Path) -> None:
     np.testing.assert_allclose(camera.project(lens, points), expected[:, 0], atol=1e-6)
 
 
+def test_the_view_that_is_kept_says_what_was_seen(tmp_path: Path) -> None:
+    """Drawn for a lens without distortion, the view is the calibrated camera but for that."""
+    path = written(tmp_path / "c.yaml")
+    view = camera.View.draw(Render(calibration=path), np.random.default_rng(3))
+    seen = camera.place(view, Render(calibration=path))
+    plain = camera.place(view, Render(field_mm=(view.field_mm, view.field_mm)))
+    assert plain.K[0] == pytest.approx(seen.K[0])
+    assert plain.K[1, 2] == pytest.approx(seen.K[1, 2])
+    drawn = camera.View.draw(Render(), np.random.default_rng(3))
+    assert view.working_distance_mm == drawn.working_distance_mm, "nothing else is drawn anew"
+
+
 def test_another_size_of_the_same_shape_keeps_the_field(tmp_path: Path) -> None:
     found = calibration.read(written(tmp_path / "c.yaml")).fitted((320, 240))
     # The corner of the picture, half a pixel outside the first centre, is where it was.

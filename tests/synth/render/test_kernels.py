@@ -20,14 +20,15 @@ _LARGE = 500  # operations: a kernel that traces light; the rest fill and copy a
 
 
 @pytest.mark.slow
-def test_scenes_share_their_kernels() -> None:
+@pytest.mark.parametrize("scenery", ["[]", "[retractor, cottonoid, bone, drape]"])
+def test_scenes_share_their_kernels(scenery: str) -> None:
     if pick("auto") == "scalar_rgb":
         pytest.skip("no LLVM here, so nothing is compiled")
     import drjit as dr
     import mitsuba as mi
 
     mi.set_variant("llvm_ad_rgb")
-    job = reader.load_job("demo", SMALL)
+    job = reader.load_job("demo", [*SMALL, f"render.scenery={scenery}"])
     tips = np.array([[0.0, 0.0, 4.0], [1.0, 0.0, 4.0]])
     shafts = np.tile([0.3, 0.2, 0.93], (2, 1))
     large = []

@@ -44,6 +44,17 @@ def test_thinned_chroma_keeps_brightness() -> None:
     assert away[..., 1].max() > 15
 
 
+def test_before_a_codec_colours_are_left_to_it_and_the_sensor_says_so() -> None:
+    section = Section.model_validate({"bitrate_mbps": 5.0, "chroma": "4:2:0"})
+    sensor = Sensor.draw(section, (1.0, 1.0, 1.0), np.random.default_rng(0))
+    assert sensor.chroma == "4:2:0"
+    coded, full = (
+        record(scene(), replace(PLAIN, chroma=chroma, coded=coded), np.random.default_rng(0))
+        for chroma, coded in ((sensor.chroma, sensor.coded), ("4:4:4", False))
+    )
+    assert np.array_equal(coded, full)
+
+
 @pytest.mark.parametrize(("chroma", "depth"), [("4:2:0", 8), ("4:4:4", 10)])
 def test_the_codec_loses_more_at_a_lower_bitrate_and_always_the_same(chroma: str, depth: int) -> None:
     rng = np.random.default_rng(1)

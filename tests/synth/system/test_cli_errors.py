@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import errno
 import os
+import tomllib
+from importlib import import_module
 
 import pytest
 import typer
+from sources import ROOT, imports, sources
 from typer.testing import CliRunner
 
 from synth.errors import UserError
+from synth.system import cli_errors
 from synth.system.cli_errors import Commands
 
 
@@ -32,6 +36,30 @@ def ended(error: BaseException) -> tuple[int, str, BaseException | None]:
 def test_a_full_or_barred_disk_is_one_line(number: int) -> None:
     code, said, _ = ended(OSError(number, os.strerror(number), "out/score.json"))
     assert (code, said) == (2, f"error: out/score.json: {os.strerror(number)}\n")
+
+
+def test_a_package_of_an_extra_is_named_with_it() -> None:
+    code, said, _ = ended(ModuleNotFoundError("No module named 'sklearn'", name="sklearn.metrics"))
+    assert (code, said.count("\n")) == (2, 1)
+    assert "pip install '.[bench]'" in said
+    _, _, trace = ended(ModuleNotFoundError("No module named 'synth.shop'", name="synth.shop"))
+    assert isinstance(trace, ModuleNotFoundError), "a module of ours that is missing is our mistake"
+
+
+def test_extras_are_those_of_the_project_and_no_command_of_the_core_needs_them() -> None:
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]["optional-dependencies"]
+    asked = {"sklearn": "scikit-learn", "plotly": "plotly"}
+    for package, extra in cli_errors._EXTRAS.items():
+        assert any(line.startswith(asked[package]) for line in extras[extra])
+    for path in sources("synth", "learn"):
+        used = {name.partition(".")[0] for name in imports(path)}
+        assert not used & set(cli_errors._EXTRAS), path
+
+
+@pytest.mark.parametrize("room", ["synth", "learn", "bench"])
+def test_completion_can_be_installed(room: str) -> None:
+    said = CliRunner().invoke(import_module(f"{room}.cli").app, ["--help"]).output
+    assert "--install-completion" in said
 
 
 def test_too_little_memory_is_one_line() -> None:

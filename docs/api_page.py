@@ -1,0 +1,126 @@
+"""The reference page of the Python packages, from signatures and docstrings."""
+
+from __future__ import annotations
+
+import ast
+import inspect
+import re
+import textwrap
+from collections.abc import Iterator
+from importlib import import_module
+from typing import Any
+
+from pydantic import BaseModel
+
+PACKAGES = {
+    "synth": "Scenes and datasets.",
+    "learn": "From displacement to force, by a trained network.",
+    "bench": "Scores against a force sensor.",
+}
+_CHAIN = """
+import learn
+import synth
+
+job = synth.load_job("tiny", ["seed=3"])  # or synth.Job(...)
+scene = synth.simulate(job, 0)  # built and moved
+frames = list(scene.frames())  # pictures and truth
+seen = scene.recover_flow(frames)
+model = learn.load_model("model")
+about = scene.tissue, scene.scale_mm_per_px, scene.young_kpa
+force = learn.predict_force(model, seen.flow, *about, seen.confidence)  # (T, 3) mN; true is scene.force
+""".strip()
+_SECTION = re.compile(r"^(Args|Returns|Raises):$")
+
+
+def write_page(written: str) -> str:
+    """The page; `written` says who writes it."""
+    lines = [
+        "# The Python packages",
+        "",
+        f"{written} What is named here stays; what is imported from inside a",
+    ]
+    lines += [
+        "package may change. Importing a package loads nothing: each name is looked up when first used.",
+        "",
+    ]
+    lines += [
+        "Whole programs are in `examples`, among them a notebook from a job to a force curve. The shortest:"
+    ]
+    lines += ["", "```python", _CHAIN, "```"]
+    for name, what in PACKAGES.items():
+        lines += ["", f"## {name}", "", what]
+        package = import_module(name)
+        for public in sorted(package.__all__, key=lambda one: (one[0].isupper(), one.lower())):
+            value = (
+                import_module("synth.engine.render").render
+                if public == "render"
+                else getattr(package, public)
+            )
+            lines += _described(f"{name}.{public}", value)
+    return "\n".join(lines) + "\n"
+
+
+def _described(name: str, value: Any) -> Iterator[str]:
+    """A function or class as Markdown."""
+    yield from ("", f"### {name}", "")
+    if not inspect.isclass(value):
+        yield from (f"    {_signed(name, value)}", "", *_said(value.__doc__))
+        return
+    yield from _said(value.__doc__)
+    if issubclass(value, BaseModel):
+        yield from ("", "Its keys are those of [the job file](job.md), as keywords and nested mappings.")
+        return
+    if issubclass(value, BaseException):
+        return
+    members = list(_members(value))
+    if members:
+        yield from ("", "| of it | what |", "| --- | --- |")
+        for member, what in members:
+            text = " ".join(what.split("\n\n")[0].split()).replace("|", r"\|")
+            yield f"| `{member}` | {text} |"
+
+
+def _members(value: type) -> Iterator[tuple[str, str]]:
+    """Public attributes, properties and methods that say what they are, in the order of the source."""
+    tree = ast.parse(textwrap.dedent(inspect.getsource(value))).body[0]
+    assert isinstance(tree, ast.ClassDef)
+    for node, after in zip(tree.body, [*tree.body[1:], None], strict=True):
+        if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
+            text = after.value if isinstance(after, ast.Expr) else None
+            if not node.target.id.startswith("_") and isinstance(text, ast.Constant):
+                yield node.target.id, str(text.value)
+        elif isinstance(node, ast.FunctionDef) and (not node.name.startswith("_") or node.name == "__call__"):
+            said = ast.get_docstring(node)
+            plain = any(
+                isinstance(one, ast.Name) and one.id.endswith("property") for one in node.decorator_list
+            )
+            names = [one.arg for one in node.args.args[1:]]
+            called = "" if node.name == "__call__" else node.name
+            if said:
+                yield (node.name if plain else f"{called}({', '.join(names)})"), said
+
+
+def _signed(name: str, function: Any) -> str:
+    """How it is called, without types."""
+    shown = [
+        one.replace(annotation=inspect.Parameter.empty)
+        for one in inspect.signature(function).parameters.values()
+    ]
+    return name + str(inspect.Signature(shown))
+
+
+def _said(text: str | None) -> Iterator[str]:
+    """A docstring as Markdown: paragraphs, and its sections as lists."""
+    inside = ""
+    for line in inspect.cleandoc(text or "").splitlines():
+        section = _SECTION.match(line)
+        if section:
+            inside = section[1]
+            yield from (f"**{inside}**", "")
+        elif inside and line.startswith("    ") and not line.startswith("     "):
+            key, colon, rest = line.strip().partition(": ")
+            yield f"- `{key}`: {rest}" if colon and inside != "Returns" else f"- {line.strip()}"
+        elif inside and line.strip():
+            yield f"  {line.strip()}"
+        else:
+            yield line

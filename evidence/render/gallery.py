@@ -1,0 +1,157 @@
+"""The gallery: families, instruments, lights, cameras and scenery side by side, made anew by one command."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Any, get_args
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import typer
+
+from evidence.measuring import CHECKOUT, measuring
+from synth.job.schema import Family, Job
+from synth.publish.contact_sheet import poised
+from synth.render import instrument
+from synth.render.camera import camera
+from synth.render.instrument import Kind
+from synth.render.scene import Studio
+from synth.sequence import pipeline, scenario
+
+Picture = npt.NDArray[np.uint8]
+Settings = dict[str, Any]
+
+_GESTURES: dict[Kind, str] = {
+    "forceps": "pull",
+    "bayonet": "grasp",
+    "dissector": "push",
+    "suction": "tap",
+    "spatula": "retract",
+}
+_LIGHTS: dict[str, Settings] = {
+    "few highlights": {"light": {"glare": 0.0}},
+    "many highlights": {"light": {"glare": 0.8}},
+    "tilted lamp": {"light": {"tilt_deg": 30.0, "main": 0.9}},
+    "3000 K": {"light": {"kelvin": 3000.0, "even": 0.22}},
+}
+_CAMERAS: dict[str, Settings] = {
+    "default": {},
+    "noisy": {"sensor": {"full_well": 900.0, "read_noise": 25.0, "sharpening": 1.2}},
+    "one chip": {"sensor": {"bayer": True, "contrast": 1.0}},
+    "wide": {"render": {"field_mm": 46.0, "tilt_deg": 28.0, "distortion": (-0.25, 0, 0, 0, 0)}},
+}
+_SCENERY: dict[str, Kind] = {
+    "bone": "forceps",
+    "drape": "dissector",
+    "cottonoid": "suction",
+    "retractor": "bayonet",
+}
+_CAPTION_PX = 15
+
+
+@measuring("-o docs", out="docs", said="Folder of the two pictures and their page.", text="gallery.md")
+def gallery(
+    seed: Annotated[int, typer.Option(min=0, help="Of the rendered jobs.")] = 7,
+    width: Annotated[int, typer.Option(min=64, help="Of a tile [px].")] = 160,
+    quality: Annotated[int, typer.Option(min=1, max=100, help="Of WebP.")] = 48,
+    out: Path = CHECKOUT / "docs",
+) -> dict[str, Any]:
+    """Draws families x instruments and lights x cameras as pictures, with a page around them."""
+    size = (width, width * 3 // 4)
+    looks = [
+        [_tile({"appearance": {"families": (family,)}}, kind, size, seed + row, f"{family}, {kind}")
+         for kind in get_args(Kind)]
+        for row, family in enumerate(get_args(Family))
+    ]  # fmt: skip
+    views = [
+        [
+            _tile(_merged(lamp, lens), "forceps", size, seed, f"{lit}; {name}")
+            for name, lens in _CAMERAS.items()
+        ]
+        for lit, lamp in _LIGHTS.items()
+    ]
+    around = [
+        _tile({"render": {"scenery": (part,)}}, kind, size, seed + 3, part) for part, kind in _SCENERY.items()
+    ]
+    out.mkdir(parents=True, exist_ok=True)
+    sizes = {}
+    for name, rows in (("gallery-looks", looks), ("gallery-views", [*views, around])):
+        picture = np.vstack([np.hstack(row) for row in rows])
+        file = out / f"{name}.webp"
+        cv2.imwrite(str(file), picture[..., ::-1], [cv2.IMWRITE_WEBP_QUALITY, quality])
+        sizes[file.name] = file.stat().st_size
+    (out / "gallery.md").write_text(_PAGE, "utf-8")
+    return {"bytes": sizes, "tiles": sum(len(row) for row in [*looks, *views, around])}
+
+
+def _tile(settings: Settings, kind: Kind, size: tuple[int, int], seed: int, caption: str) -> Picture:
+    """One frame before its load, under its caption."""
+    job = Job.model_validate(
+        _merged(
+            {
+                "seed": seed,
+                "fem": {"gestures": (_GESTURES[kind],)},
+                "render": {"size": size, "spp": 16},
+                "anatomy": {"vertices": 20_000},
+            },
+            settings,
+        )
+    )
+    case = scenario.draw(job, 0)
+    surface, _ = pipeline.cortex(job, case)
+    look = replace(case.look, rim_seed=_seed_of(kind, case.gesture.kind), scenery=job.render.scenery)
+    studio = Studio(surface, look, camera.place(case.view, job.render), job, [case.gesture.kind])
+    shot = studio.frame(surface.vertices, *poised(case.gesture, surface), scenario.frame_seeds(job, 0)[0])
+    band = np.full((_CAPTION_PX, size[0], 3), 255, np.uint8)
+    cv2.putText(band, caption, (3, 11), cv2.FONT_HERSHEY_SIMPLEX, 0.34, (40, 40, 40), 1, cv2.LINE_AA)
+    return np.vstack([band, shot.rgb])
+
+
+def _seed_of(kind: Kind, gesture: str) -> int:
+    """The first seed of a rim whose hand takes that instrument for a gesture."""
+    taken = (instrument.choose([gesture], np.random.default_rng([seed, 2])) for seed in itertools.count())
+    return next(seed for seed, kinds in enumerate(taken) if kinds == (kind,))
+
+
+def _merged(*parts: Settings) -> Settings:
+    """Sections of a job, later ones over earlier ones."""
+    whole: Settings = {}
+    for name, value in itertools.chain.from_iterable(part.items() for part in parts):
+        whole[name] = {**whole.get(name, {}), **value} if isinstance(value, dict) else value
+    return whole
+
+
+def _listed(names: Sequence[str]) -> str:
+    return ", ".join(names[:-1]) + f" and {names[-1]}"
+
+
+_PAGE = f"""# Gallery
+
+All of it, pictures and page, is made by
+
+    bench experiment gallery
+
+Frames before their load, 16 light paths a pixel. What each key does: [the job file](reference/job.md).
+
+## Families and instruments
+
+`appearance.families`: {_listed(get_args(Family))}. Instruments follow from
+`fem.gestures`; four in ten have an end that is coated black.
+Every row has an anatomy of its own, every tile the hand that takes its instrument.
+
+![Five families in rows, five instruments in columns](gallery-looks.webp)
+
+## Lights, cameras, scenery
+
+Lights (`light.*`) in rows, cameras (`sensor.*`, `render.*`) in columns, the same sequence throughout: a lamp
+tilted by 30 degrees, a narrow spot of 3000 K; few photoelectrons and much sharpening, one chip with a hard
+contrast, a wide tilted lens with barrel distortion. In the last row what `render.scenery` may lay about the
+opening: {_listed(list(_SCENERY))}.
+Scenery hides tissue and is none: no label is under it.
+
+![Four lights in rows, four cameras in columns, scenery in the last row](gallery-views.webp)
+"""

@@ -1,0 +1,163 @@
+"""What `learn predict` leaves: NAME.npz with the fields of a table, NAME.force.csv, NAME.force.mp4 to see."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from learn.inference import video
+from learn.inference.predict import length
+from synth.dataset.store import Sequence, open_sequence
+from synth.publish import film
+from synth.publish.preview_video import encode_video
+from synth.system import whole_file
+from synth.system.whole_file import write_whole
+
+Rgb = NDArray[np.uint8]
+
+_WIDEST_PX = 1280
+
+
+class PredictedField(NamedTuple):
+    """One array of NAME.npz."""
+
+    axes: str
+    unit: str
+    meaning: str
+
+
+FIELDS: dict[str, PredictedField] = {
+    "frame": PredictedField("T", "-", "number in the film"),
+    "time_s": PredictedField("T", "s", "on the film's clock; absent where it has none"),
+    "trusted": PredictedField("T", "-", "whether the frame could be followed"),
+    "total_force_mn": PredictedField("T", "mN", "size of the total force on the tissue; NaN if not trusted"),
+    "force_mn": PredictedField(
+        "T, 3", "mN", "total force on the tissue, camera axes (x right, y down, z away); of a vector model"
+    ),
+    "low_mn": PredictedField(
+        "T", "mN", "lower end of the 90% interval of that size; of a model with intervals"
+    ),
+    "high_mn": PredictedField("T", "mN", "upper end"),
+    "low68_mn": PredictedField("T", "mN", "lower end of the 68% interval"),
+    "high68_mn": PredictedField("T", "mN", "upper end"),
+    "force_low_mn": PredictedField("T, 3", "mN", "lower ends of the 90% intervals of the force's x, y, z"),
+    "force_high_mn": PredictedField("T, 3", "mN", "upper ends; wide where the model or the camera sees none"),
+    "density": PredictedField(
+        "T, C, N, N",
+        "mN/mm²",
+        "force density on the network's grid, nothing taken off: its size (C = 1) or x, y, z; of a model of "
+        "the published target the intensity [mN]",
+    ),
+    "density_low": PredictedField("T, N, N", "mN/mm²", "lower end of the 90% interval of the map's length"),
+    "density_high": PredictedField("T, N, N", "mN/mm²", "upper end"),
+    "head_mn": PredictedField("T, C", "mN", "what a network with a head for the total force says of it"),
+    "mask": PredictedField("N, N", "-", "cells with tissue"),
+    "pitch_mm": PredictedField("", "mm", "width of a cell"),
+    "scale_mm_per_px": PredictedField("", "mm/px", "of the film's own pixels"),
+    "centre_px": PredictedField("2", "px", "x, y of the grid's centre in the film's own pixels, last frame"),
+    "centres_px": PredictedField("T, 2", "px", "the same by frame"),
+    "young_kpa": PredictedField("", "kPa", "Young's modulus that forces are for: all are proportional to it"),
+    "young_known": PredictedField("", "-", "whether it was given or is the film's own; else assumed"),
+    "notes": PredictedField("K", "-", "what was done to the film that its user should know"),
+}
+"""Every field by name, in the order in which the documentation lists them."""
+
+COLUMNS = ("frame", "time_s", "trusted", "total_force_mn", "force_x_mn", "force_y_mn", "force_z_mn")
+"""Of NAME.force.csv; empty where there is no value."""
+
+ENDS = ("low_mn", "high_mn")
+"""Further columns, of a model with intervals."""
+
+
+def write_prediction(found: dict[str, Any], stem: Path) -> None:
+    """`stem`.npz and `stem`.force.csv, whole or not at all, of what `apply` returns."""
+    stem.parent.mkdir(parents=True, exist_ok=True)
+    with whole_file.part_of(stem.with_name(f"{stem.name}.npz")) as part, part.open("wb") as file:
+        np.savez_compressed(file, **{name: found[name] for name in FIELDS if name in found})
+    write_whole(stem.with_name(f"{stem.name}.force.csv"), tabulate(found), durable=False)
+
+
+def tabulate(found: dict[str, Any]) -> str:
+    """The force by frame as CSV, a row a frame, `COLUMNS` on top, and `ENDS` where there are intervals."""
+    text = io.StringIO()
+    table = csv.writer(text, lineterminator="\n")
+    ends = [name for name in ENDS if name in found]
+    table.writerow([*COLUMNS, *ends])
+    for t, number in enumerate(found["frame"]):
+        time = found["time_s"][t] if "time_s" in found else np.nan
+        force = found["force_mn"][t] if "force_mn" in found else (np.nan,) * 3
+        bounds = (found[name][t] for name in ends)
+        values = [_number(value) for value in (time, found["total_force_mn"][t], *force, *bounds)]
+        table.writerow([int(number), values[0], int(found["trusted"][t]), *values[1:]])
+    return text.getvalue()
+
+
+def write_overlay(found: dict[str, Any], source: Path, stem: Path) -> Path | None:
+    """`stem`.force.mp4: the frames that were looked at, with the force map over them and its curve below.
+
+    The map lies where the tissue was at rest. None, and no file, where the source holds no pictures.
+
+    Args:
+        found: what `apply` returns.
+        source: a video, or a sequence's store.
+        stem: of the file.
+    """
+    pictures = _pictures(source, {int(number) for number in found["frame"]})
+    if pictures is None:
+        return None
+    times = found.get("time_s", np.arange(len(found["frame"])) / video.FPS)
+    step = float(np.median(np.diff(times))) if len(times) > 1 else 0.0
+    fps = float(np.clip(1 / step, 1, 120)) if step > 0 else video.FPS
+    return encode_video(stem.with_name(f"{stem.name}.force.mp4"), _drawn(found, times, pictures), fps)
+
+
+def _number(value: float) -> str:
+    return f"{value:.6g}" if np.isfinite(value) else ""
+
+
+def _pictures(source: Path, wanted: set[int]) -> Iterator[Rgb] | None:
+    if source.suffix.lower() in video.SUFFIXES:
+        return (one.rgb for one in video.read_video(source, video.FPS) if one.index in wanted)
+    if source.suffix != ".zarr":
+        return None
+    sequence: Sequence = open_sequence(source)
+    return (sequence["rgb"][t] for t in sorted(wanted))
+
+
+def _drawn(found: dict[str, Any], times: NDArray[np.floating], pictures: Iterator[Rgb]) -> Iterator[Rgb]:
+    force, size = found["total_force_mn"], length(found["density"])
+    largest, curve = float(np.max(size, initial=0.0)), None
+    for t, picture in enumerate(pictures):
+        shrink = max(1, -(-picture.shape[1] // _WIDEST_PX))
+        small = cv2.resize(picture, None, fx=1 / shrink, fy=1 / shrink, interpolation=cv2.INTER_AREA)
+        small = film.legible(np.asarray(small, np.uint8))
+        values = on_picture(size[t], found, t, picture.shape[:2])
+        values = cv2.resize(values, (small.shape[1], small.shape[0]), interpolation=cv2.INTER_LINEAR)
+        if curve is None:
+            curve = film.draw_curve(times, force, small.shape[1], "mN")
+        known = "" if found["young_known"] else f", if E is {found['young_kpa']:.3g} kPa"
+        said = f"{force[t]:.1f} mN{known}" if found["trusted"][t] else "could not be followed"
+        shown = film.glow(small, values, largest) if found["trusted"][t] else small
+        shown = film.caption(shown, f"{times[t]:.2f} s  {said}")
+        yield np.vstack([shown, film.mark(curve, t, len(force))])
+
+
+def on_picture(
+    cells: NDArray[np.floating], found: dict[str, Any], t: int, shape: tuple[int, ...]
+) -> NDArray[np.float32]:
+    """Values of the grid's cells (N, N) at the film's own pixels, (H, W); 0 outside the grid."""
+    step = float(found["scale_mm_per_px"]) / float(found["pitch_mm"])
+    offset = (np.array(cells.shape[::-1]) - 1) / 2 - step * np.asarray(found["centres_px"][t])
+    way = np.array([[step, 0, offset[0]], [0, step, offset[1]]])
+    size = (shape[1], shape[0])
+    return np.asarray(
+        cv2.warpAffine(cells.astype(np.float32), way, size, flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP),
+        np.float32,
+    )

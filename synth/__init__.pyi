@@ -1,0 +1,16 @@
+from synth.dataset.store import Dataset as Dataset
+from synth.dataset.store import Sequence as Sequence
+from synth.dataset.store import open_sequence as open_sequence
+from synth.engine.render import render as render
+from synth.engine.run import Summary as Summary
+from synth.errors import UserError as UserError
+from synth.flow.estimator import Estimator as Estimator
+from synth.flow.track import Track as Track
+from synth.flow.track import recover_flow as recover_flow
+from synth.job.law_plugins import Law as Law
+from synth.job.law_plugins import add_law as add_law
+from synth.job.reader import load_job as load_job
+from synth.job.schema import Job as Job
+from synth.sequence.scene import Frame as Frame
+from synth.sequence.scene import Scene as Scene
+from synth.sequence.scene import simulate as simulate

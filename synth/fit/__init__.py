@@ -1,0 +1,1 @@
+"""Fitting a family of the job to one photograph, by the statistics of pictures."""

@@ -1,0 +1,64 @@
+"""The arrays that the published training code reads."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from synth.dataset.store import Dataset, Sequence
+from synth.errors import UserError
+
+# The published loader drops nodes right of this pixel, and takes every file to have the nodes of the first.
+_LARGEST_X = 1400.0
+_NODES = 20_000
+
+
+def write_npz(dataset: Dataset, target: Path) -> None:
+    """What the published training code globs: `run_NNNNNN/brain_surface_NNNNNN_auto_projected_NNNNNN_2d.npz`.
+
+    Arrays as there (github.com/D3MIA/D2FNet, d2fnet/dataset.py): `disp2d` (T, N, 2) mm, `force_mag` (T, N) N,
+    `projected_pixels` (T, N, 2) px. N is the same in every file, as that code needs. Displacement
+    is in the picture's plane and not the world's, and `force_mag` is their "intensity" (peak = total force)
+    made from the true traction; README.txt in the export says so.
+    """
+    count = min(int(sequence["tissue"][:].sum()) for sequence in dataset)
+    count = min(count, _NODES)
+    if not count:
+        raise UserError(f"{dataset.root}: a sequence shows no tissue")
+    for sequence in dataset:
+        name = f"{sequence.index:06d}"
+        (target / f"run_{name}").mkdir()
+        path = target / f"run_{name}" / f"brain_surface_{name}_auto_projected_{name}_2d.npz"
+        moved, pressed, seen = _arrays(sequence, count)
+        np.savez_compressed(path, disp2d=moved, force_mag=pressed, projected_pixels=seen)
+    (target / "README.txt").write_text(_NOTE, "utf-8")
+
+
+def _arrays(sequence: Sequence, count: int) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
+    pixels = np.argwhere(sequence["tissue"][:])
+    rows, columns = pixels[np.linspace(0, len(pixels) - 1, count).round().astype(int)].T
+    scale = float(sequence.attrs["scale_mm_per_px"])
+    shrink = min(1.0, _LARGEST_X / sequence.size[1])
+    force = np.linalg.norm(sequence["force"][:], axis=1)
+    moved = np.empty((sequence.frames, count, 2), np.float32)
+    pressed = np.zeros((sequence.frames, count), np.float32)
+    seen = np.empty_like(moved)
+    rest = np.stack([columns, rows], axis=-1)
+    for t in range(sequence.frames):
+        flow = sequence["flow"][t][rows, columns]
+        size = np.linalg.norm(sequence["traction"][t], axis=-1)
+        moved[t] = scale * flow
+        seen[t] = shrink * (rest + flow)
+        if size.max() > 0:
+            pressed[t] = size[rows, columns] / size.max() * force[t] / 1000
+    return moved, pressed, seen
+
+
+_NOTE = """\
+Layout of github.com/D3MIA/D2FNet: disp2d (T, N, 2) mm, force_mag (T, N) N, projected_pixels (T, N, 2) px.
+disp2d is the motion in the picture's plane times the scale, not world x and y.
+force_mag is the "intensity" map, its peak scaled to the total force; the true traction is in the Zarr stores.
+"""

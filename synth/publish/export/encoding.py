@@ -1,0 +1,29 @@
+"""Pictures and arrays as bytes of files."""
+
+from __future__ import annotations
+
+import io
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+PICTURES = ("rgb", "rgb_right")
+"""Fields that are pictures."""
+
+
+def as_png(picture: NDArray[Any]) -> bytes:
+    """A PNG of (H, W, 3) uint8, (H, W) uint8 or uint16, or of a mask (H, W) bool: 0 and 255."""
+    from PIL import Image
+
+    file = io.BytesIO()
+    values = 255 * picture.astype(np.uint8) if picture.dtype == bool else picture
+    Image.fromarray(values).save(file, "PNG", compress_level=3)
+    return file.getvalue()
+
+
+def as_npy(values: NDArray[Any]) -> bytes:
+    """A .npy file of an array (...) of any shape."""
+    file = io.BytesIO()
+    np.save(file, values)
+    return file.getvalue()

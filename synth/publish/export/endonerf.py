@@ -1,0 +1,141 @@
+"""The layout of EndoNeRF (github.com/med-air/EndoNeRF), which reconstructions of deforming tissue read.
+
+A folder a sequence: `images/`, `depth/` and `masks/` as NNNNNN.png, and `poses_bounds.npy` (T, 17): by row
+the camera's pose 3 x 5 (axes right, up, backward; its place; height, width, focal length), then the nearest
+and farthest depth. Those programs know a pinhole in the middle of the picture only: pictures are undistorted
+and moved there, which is the one thing that is resampled.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from synth.dataset.store import Dataset, Sequence
+from synth.errors import UserError
+from synth.publish.export.encoding import as_png
+
+UNIT_MM = 0.01
+"""One step of a depth picture, and so the unit of lengths: 16 bits reach to 655 mm."""
+
+_TO_OPENGL = np.diag([1.0, -1.0, -1.0])
+
+Floats = NDArray[np.float64]
+
+
+class _Maps(NamedTuple):
+    """Where a pixel of the pinhole's picture lies in the recorded one, for cv2.remap."""
+
+    x: NDArray[np.float32]
+    y: NDArray[np.float32]
+
+    def smooth(self, picture: NDArray[Any]) -> NDArray[Any]:
+        return np.asarray(cv2.remap(picture, self.x, self.y, cv2.INTER_CUBIC))
+
+    def nearest(self, picture: NDArray[Any], outside: float = 0) -> NDArray[Any]:
+        return np.asarray(
+            cv2.remap(
+                picture,
+                self.x,
+                self.y,
+                cv2.INTER_NEAREST,
+                borderMode=cv2.BORDER_CONSTANT,
+                borderValue=outside,
+            )
+        )
+
+
+def write_scenes(dataset: Dataset, target: Path) -> None:
+    """A folder a sequence, named by its index; a second lens's pictures are in `images_right/`, rectified.
+
+    Masks are white where there is no tissue to reconstruct: on the instrument and beyond the picture. World
+    axes are those of frame 0's camera. `scene.json` says unit, focal length, baseline and force.
+
+    Raises:
+        UserError: a sequence has no depth, or its microscope moved and its poses were not kept.
+    """
+    for sequence in dataset:
+        if "depth" not in sequence:
+            raise UserError(f"{sequence.path}: holds no depth: the job's store.without left it out")
+        here = target / f"{sequence.index:06d}"
+        focal = float(np.asarray(sequence.attrs["K"])[0, 0])
+        maps = _maps(sequence, sequence.attrs, focal)
+        bounds = _write_pictures(sequence, maps, here)
+        poses = [
+            np.concatenate([_pose(pose), [[sequence.size[0]], [sequence.size[1]], [focal]]], axis=1).ravel()
+            for pose in _poses(sequence)
+        ]
+        np.save(here / "poses_bounds.npy", np.concatenate([poses, bounds], axis=1))
+        about: dict[str, Any] = {
+            "unit_mm": UNIT_MM,
+            "focal_px": focal,
+            "fps": sequence.attrs["fps"],
+            "force_mn": sequence["force"][:].tolist(),
+            "young_kpa": sequence.attrs["young_kpa"],
+        }
+        if "rgb_right" in sequence:
+            _write_right(sequence, focal, here)
+            about["baseline_mm"] = sequence.attrs["right"]["baseline_mm"]
+        (here / "scene.json").write_text(json.dumps(about, indent=1), "utf-8")
+
+
+def _maps(sequence: Sequence, lens: dict[str, Any], focal: float) -> _Maps:
+    """From a pinhole whose axis meets the pixel (W // 2, H // 2), where those programs take it to be."""
+    height, width = sequence.size
+    middle = np.array([[focal, 0, width // 2], [0, focal, height // 2], [0, 0, 1]], np.float64)
+    K, distortion = np.asarray(lens["K"], np.float64), np.asarray(lens["distortion"], np.float64)
+    x, y = cv2.initUndistortRectifyMap(K, distortion, np.eye(3), middle, (width, height), cv2.CV_32FC1)
+    return _Maps(np.asarray(x, np.float32), np.asarray(y, np.float32))
+
+
+def _write_pictures(sequence: Sequence, maps: _Maps, here: Path) -> Floats:
+    """Images, depth and masks; returns nearest and farthest depth by frame, (T, 2)."""
+    for name in ("images", "depth", "masks"):
+        (here / name).mkdir(parents=True, exist_ok=True)
+    bounds = []
+    for t in range(sequence.frames):
+        depth = np.round(maps.nearest(sequence["depth"][t]) / UNIT_MM)
+        if depth.max() > np.iinfo(np.uint16).max:
+            raise UserError(f"{sequence.path}: is deeper than 16 bits hold at {UNIT_MM:g} mm")
+        covered = maps.nearest(sequence["tool"][t].astype(np.uint8), outside=1).astype(bool) | (depth == 0)
+        name = f"{t:06d}.png"
+        (here / "images" / name).write_bytes(as_png(maps.smooth(sequence["rgb"][t])))
+        (here / "depth" / name).write_bytes(as_png(depth.astype(np.uint16)))
+        (here / "masks" / name).write_bytes(as_png(covered))
+        seen = depth[~covered]
+        bounds.append([seen.min(), seen.max()] if seen.size else [0.0, 0.0])
+    return np.array(bounds)
+
+
+def _write_right(sequence: Sequence, focal: float, here: Path) -> None:
+    maps = _maps(sequence, sequence.attrs["right"], focal)
+    (here / "images_right").mkdir()
+    for t in range(sequence.frames):
+        (here / "images_right" / f"{t:06d}.png").write_bytes(as_png(maps.smooth(sequence["rgb_right"][t])))
+
+
+def _poses(sequence: Sequence) -> Iterator[Floats]:
+    """Camera of frame t to that of frame 0, (4, 4), in mm and OpenCV's axes."""
+    if "camera" in sequence:
+        poses = sequence["camera"][:]
+        yield from (poses[0] @ np.linalg.inv(pose) for pose in poses)
+        return
+    sway = sequence.attrs.get("scenario", {}).get("sway", {})
+    if sway.get("drift_mm") or sway.get("vibration_mm"):
+        raise UserError(
+            f"{sequence.path}: the microscope moves and its poses were not kept; "
+            "render with store.extra=[camera]"
+        )
+    yield from [np.eye(4)] * sequence.frames
+
+
+def _pose(pose: Floats) -> Floats:
+    """(3, 4) in axes right, up, backward, and in the scene's unit."""
+    turned = _TO_OPENGL @ pose[:3, :3] @ _TO_OPENGL
+    return np.concatenate([turned, (_TO_OPENGL @ pose[:3, 3:]) / UNIT_MM], axis=1)

@@ -1,0 +1,46 @@
+"""Plain files: a folder of PNG and .npy, and HDF5."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+from synth.dataset.store import Dataset
+from synth.errors import UserError
+from synth.fields import FIELDS
+from synth.publish.export.encoding import PICTURES, as_png
+
+
+def write_folder(dataset: Dataset, target: Path) -> None:
+    """`NNNNNN/rgb/TTTT.png`, other fields as `NNNNNN/FIELD.npy`, attributes as `NNNNNN/attributes.json`.
+
+    A second lens's pictures are in `NNNNNN/rgb_right/`.
+    """
+    for sequence in dataset:
+        here = target / f"{sequence.index:06d}"
+        for name in sequence.fields:
+            (here / name if name in PICTURES else here).mkdir(parents=True, exist_ok=True)
+            for t in range(sequence.frames if name in PICTURES else 0):
+                (here / name / f"{t:04d}.png").write_bytes(as_png(sequence[name][t]))
+            if name not in PICTURES:
+                np.save(here / f"{name}.npy", sequence[name][:])
+        (here / "attributes.json").write_text(json.dumps(sequence.attrs, indent=1), "utf-8")
+
+
+def write_hdf5(dataset: Dataset, target: Path) -> None:
+    """`NNNNNN.h5` with the fields as datasets, a chunk a frame, and `attributes` as JSON."""
+    try:
+        import h5py
+    except ImportError:
+        raise UserError("HDF5 needs the package h5py: pip install h5py") from None
+    for sequence in dataset:
+        with h5py.File(target / f"{sequence.index:06d}.h5", "w") as file:
+            file.attrs["attributes"] = json.dumps(sequence.attrs)
+            for name in sequence.fields:
+                values = sequence[name][:]
+                chunks = (1, *values.shape[1:]) if FIELDS[name].framed else None
+                packing = {"compression": "gzip", "compression_opts": 4, "shuffle": True} if chunks else {}
+                made = file.create_dataset(name, data=values, chunks=chunks, **packing)
+                made.attrs["unit"], made.attrs["meaning"] = FIELDS[name].unit, FIELDS[name].meaning

@@ -1,0 +1,291 @@
+"""One scene in memory: a sequence of a job built and moved, its frames rendered when they are asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
+from itertools import islice
+
+import numpy as np
+from numpy.typing import NDArray
+
+from synth.errors import UserError
+from synth.fem import solver, tool
+from synth.fem.mesh import tetrahedra
+from synth.fem.mesh.relief import HeightMap
+from synth.fem.mesh.tetrahedra import Tets
+from synth.fem.solver import Deformation
+from synth.flow import track, tvl1
+from synth.flow.estimator import Estimator, create
+from synth.flow.track import Track
+from synth.geometry import brain_surface
+from synth.geometry.brain_surface import Brain
+from synth.job.schema import Anatomy, Flow, Job
+from synth.render.anatomy import surface as anatomy
+from synth.render.anatomy import survey
+from synth.render.anatomy.surface import Relief, Surface
+from synth.render.camera import camera, video
+from synth.render.camera.camera import Camera
+from synth.render.scene import Shot, Studio
+from synth.sequence import scenario
+from synth.sequence.scenario import Scenario
+from synth.sequence.timeline import Timeline
+from synth.system.stopwatch import Report, Stopwatch
+
+Floats = NDArray[np.float64]
+
+_TRIES = 5  # of openings nearest to one that can't be
+
+
+@dataclass(frozen=True, kw_only=True)
+class Frame(Shot):
+    """One frame of a scene: the picture, what is true of it, and the force that made it.
+
+    Everything of a `Shot` (`rgb`, `flow`, `visible`, `depth`, `tool`, `glare`, ...; None what the job doesn't
+    keep), in the units and axes of a dataset's fields, and:
+    """
+
+    index: int
+    """Which frame; 0 is the rest frame."""
+    time_s: float
+    traction: NDArray[np.float32]
+    """(H, W, 3) kPa on the tissue, camera axes, at the rest frame's pixels: the label."""
+    force: Floats
+    """(3,) mN on the tissue, camera axes: the sum of traction times `Scene.area`."""
+    camera: Camera
+    """The microscope at that time."""
+
+
+@dataclass(frozen=True)
+class Scene:
+    """One sequence of a job, built and moved; nothing is written. `simulate` makes it.
+
+    What a frame needs is computed when it is asked for: light and pictures cost nothing until then.
+    """
+
+    job: Job
+    index: int
+    """Which sequence of the job."""
+    scenario: Scenario
+    """Everything drawn for it."""
+    surface: Surface
+    """The fine surface at rest, world axes."""
+    motion: Deformation
+    """Surface, loads and instruments over T frames, world axes: `displacement` (T, V, 3) mm."""
+    view: Camera
+    """The microscope at rest."""
+
+    @cached_property
+    def studio(self) -> Studio:
+        """The renderer with this scene in it."""
+        kinds = [gesture.kind for gesture in self.scenario.gestures]
+        return Studio(self.surface, self.scenario.look, self.view, self.job, kinds)
+
+    @cached_property
+    def _timeline(self) -> Timeline:
+        case = self.scenario
+        return Timeline(self.motion, self.view, case.sway, case.look.light, self.job.fps)
+
+    @cached_property
+    def _seeds(self) -> list[int]:
+        return scenario.frame_seeds(self.job, self.index)
+
+    def __len__(self) -> int:
+        return self.job.frames
+
+    @property
+    def force(self) -> Floats:
+        """(T, 3) mN on the tissue, camera axes."""
+        return self.motion.force @ self.view.rotation.T
+
+    @property
+    def strongest(self) -> int:
+        """The frame of the largest force."""
+        return int(np.linalg.norm(self.motion.force, axis=1).argmax())
+
+    @property
+    def young_kpa(self) -> float:
+        """Young's modulus of the tissue."""
+        return self.scenario.tissue.young_kpa
+
+    @property
+    def tissue(self) -> NDArray[np.bool_]:
+        """(H, W) brain in the rest frame."""
+        return self.studio.still.tissue
+
+    @property
+    def area(self) -> NDArray[np.float32]:
+        """(H, W) mm^2 of rest surface that each pixel of the rest frame sees."""
+        return self.studio.still.area
+
+    @property
+    def scale_mm_per_px(self) -> float:
+        """Scale at the craniotomy."""
+        return float(self.studio.still.scale_mm_per_px)
+
+    def frame(self, t: int) -> Frame:
+        """Renders frame `t`, 0 <= t < T: the same whatever was rendered before it.
+
+        Raises:
+            UserError: there is no such frame.
+        """
+        if not 0 <= t < len(self):
+            raise UserError(f"frame {t}: the scene has frames 0 to {len(self) - 1}")
+        job, line = self.job, self._timeline
+        now = line.at(t)
+        lit = line.open(t, job.sensor.shutter, job.sensor.subframes)
+        shot = self.studio.shoot(now, self._seeds[t], lit, line.at(t + 1))
+        return Frame(
+            **vars(shot),
+            index=t,
+            time_s=float(self.motion.time[t]),
+            traction=self.studio.traction(self.motion.traction[t]),
+            force=self.force[t],
+            camera=now.camera or self.view,
+        )
+
+    def frames(self) -> Iterator[Frame]:
+        """Renders the frames in order, one at a time."""
+        return (self.frame(t) for t in range(len(self)))
+
+    def recover_flow(self, frames: Sequence[Frame], backend: str | Estimator | None = None) -> Track:
+        """What a tracker finds in the pictures: flow (T, H, W, 2) px, its confidence (T, H, W), trust (T,).
+
+        It is told what a real pipeline knows, the instruments' outlines and glare as the picture shows it,
+        and sees the pictures as the job's codec leaves them.
+
+        Args:
+            frames: of this scene, from the rest frame on.
+            backend: an estimator or its name; the job's if None.
+
+        Raises:
+            UserError: no such estimator, or frames that don't begin at rest.
+        """
+        if not frames or frames[0].index != 0:
+            raise UserError("recover_flow: the frames must begin with the rest frame, number 0")
+        chosen = self.job.flow.backend if backend is None else backend
+        if chosen == "ideal":
+            raise UserError("flow.backend: `ideal` recovers nothing; name an estimator")
+        found = estimator(self.job.flow) if backend is None else chosen
+        rgb, tools = np.stack([one.rgb for one in frames]), np.stack([one.tool for one in frames])
+        if self.job.sensor.bitrate_mbps is not None:
+            rgb = video.recorded(rgb, self.job.sensor, self.job.fps)
+        return track.recover_flow(rgb, tools, self.tissue, found)
+
+
+def simulate(job: Job, index: int = 0, report: Report | None = None, watch: Stopwatch | None = None) -> Scene:
+    """Builds sequence `index` of a job and carries out its gestures; nothing is rendered or written yet.
+
+    The scene is the one that `synth render` computes for that job and index.
+
+    Args:
+        job: the job; it may ask for more sequences than are ever made.
+        index: which of its sequences, 0 <= index < job.sequences.
+        report: told of progress, stage by stage.
+        watch: adds up the time of each stage.
+
+    Raises:
+        UserError: no such sequence, or a job that cannot be carried out (surface, load, inverted element).
+    """
+    if not 0 <= index < job.sequences:
+        raise UserError(f"sequence {index}: the job has sequences 0 to {job.sequences - 1}")
+    report, watch = report or (lambda stage, done, of: None), watch or Stopwatch()
+    case = scenario.draw(job, index)
+    view = camera.place(case.view, job.render)
+    report("mesh", 0, 1)
+    with watch.stage("mesh"):
+        surface, tets = build(job, case)
+    report("fem", 0, 1)
+    with watch.stage("fem"):
+        motion = move(job, case, surface, tets)
+    return Scene(job, index, case, surface, motion, view)
+
+
+def build(job: Job, case: Scenario) -> tuple[Surface, Tets]:
+    """The fine surface of a scenario and the volume under it, finest where its contacts are."""
+    focus = [place for gesture in case.gestures for place in tool.focus(gesture)]
+    surface, whole = cortex(job, case)
+    mesh, slips = (job.fem.tets, job.fem.order, focus), case.tissue.skull == "slip"
+    if whole is None:
+        height = HeightMap(surface.pia, surface.extent_mm)
+        return surface, tetrahedra.block(job.anatomy, *mesh, height, slips=slips)
+    return surface, tetrahedra.from_brain(whole, job.anatomy, *mesh, slips=slips)
+
+
+def cortex(job: Job, case: Scenario) -> tuple[Surface, Brain | None]:
+    """The fine surface of a scenario, and the user's brain that it is a part of, if it is.
+
+    Sequences that share an anatomy (`anatomy.variety`) share these: their arrays are read-only.
+    """
+    written = job.anatomy.mesh.stat() if job.anatomy.mesh and job.anatomy.mesh.is_file() else None
+    return _cortex(
+        job.anatomy.opened(case.anatomy), case.relief, written and (written.st_mtime_ns, written.st_size)
+    )
+
+
+@lru_cache(maxsize=4)
+def _cortex(section: Anatomy, relief: Relief, written: object) -> tuple[Surface, Brain | None]:
+    """As `cortex`; `written` tells a mesh from one that replaced it."""
+    whole = None
+    if section.mesh is None:
+        surface = anatomy.procedural(relief, section)
+    else:
+        try:
+            surface, whole = _opened(section, relief)
+        except UserError as error:
+            if not str(error).startswith("anatomy.craniotomy"):
+                raise
+            raise UserError(f"{error}{_nearest_opening(section, relief)}") from None
+    for shared in (surface, whole):
+        for value in vars(shared).values() if shared else ():
+            if isinstance(value, np.ndarray):
+                value.flags.writeable = False
+    return surface, whole
+
+
+def _opened(section: Anatomy, relief: Relief) -> tuple[Surface, Brain]:
+    assert section.mesh is not None
+    whole = brain_surface.load_brain(section.mesh, section.craniotomy)
+    return anatomy.from_brain(whole.vertices, whole.faces, relief, section), whole
+
+
+def _nearest_opening(section: Anatomy, relief: Relief) -> str:
+    """Where the nearest opening that works is, in words that end a message."""
+    assert section.mesh is not None
+    asked = np.asarray(section.craniotomy.point)
+    ground = survey.Ground(*brain_surface.read_brain(section.mesh))
+    for site in islice(survey.by_distance(ground, asked, section.craniotomy.radius_mm), _TRIES):
+        point, direction = np.round(site.point, 2).tolist(), np.round(site.direction, 3).tolist()
+        there = section.craniotomy.model_copy(update={"point": tuple(point), "direction": tuple(direction)})
+        try:
+            _opened(section.model_copy(update={"craniotomy": there}), relief)
+        except UserError:
+            continue
+        away = np.linalg.norm(site.point - asked)
+        return f"; {away:.3g} mm away it works: point: {point}, direction: {direction} (see `synth place`)"
+    return f"; nowhere on {section.mesh.name} an opening of that radius works (see `synth place`)"
+
+
+def move(job: Job, case: Scenario, surface: Surface, tets: Tets) -> Deformation:
+    """The scenario's gestures, carried out on that surface and volume."""
+    return solver.deform(
+        job.fem,
+        case.tissue,
+        case.gesture,
+        tets,
+        surface.vertices,
+        surface.faces,
+        job.frames,
+        job.fps,
+        case.further,
+        case.pulse,
+        job.anatomy.craniotomy,
+    )
+
+
+def estimator(flow: Flow) -> Estimator:
+    """The estimator that a job asks for."""
+    if flow.backend != "tvl1":
+        return create(flow.backend)
+    return tvl1.Tvl1(replace(tvl1.Settings(), warps=2 * flow.warps, warm_warps=flow.warps))

@@ -1,0 +1,128 @@
+"""Methods of other packages stand in scores, table and report beside ours; what goes wrong is one line."""
+
+from __future__ import annotations
+
+import ast
+import io
+import json
+from pathlib import Path
+
+import pytest
+import tiny_package
+from fake_model import write_model
+from fake_recording import Maker
+from rich.console import Console
+
+import bench
+from bench.methods import baselines, plugins
+from bench.scoring import commands, report
+from synth.errors import UserError
+
+CODE = '''
+import numpy as np
+import bench
+
+
+class Push:
+    """The inverse of what the recording was made with, off by a tenth."""
+
+    notes = ("a note of the plug-in",)
+
+    def __call__(self, flow, confidence, scene, picture):
+        height, width = flow.shape[:2]
+        middle = flow[height // 2 - 4 : height // 2 + 4, width // 2 - 4 : width // 2 + 4, 0]
+        return bench.Answer(np.array([44.0 * float(np.median(middle)), 0.0, 0.0]))
+
+
+class Raises(Push):
+    def __call__(self, flow, confidence, scene, picture):
+        raise KeyError("nothing")
+
+
+class Short(Push):
+    def __call__(self, flow, confidence, scene, picture):
+        return bench.Answer(np.zeros(2))
+
+
+class Wide(Push):
+    def __call__(self, flow, confidence, scene, picture):
+        return bench.Answer(np.zeros(3), np.zeros((2, 2)))
+
+
+def nothing():
+    return None
+'''
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return Maker(tmp_path_factory.mktemp("plugins"))(frames=8)
+
+
+def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, **named: str) -> None:
+    points = {plugins.GROUP: {name: f"lab_methods:{at}" for name, at in named.items()}}
+    tiny_package.install(tmp_path / "site", "lab_methods", CODE, points, monkeypatch)
+
+
+@pytest.mark.slow
+def test_it_is_scored_and_shown_beside_the_network(
+    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    installed(tmp_path, monkeypatch, pushes="Push")
+    model = write_model(tmp_path / "model", "arch.output=vector")
+    settings = bench.Settings(rate_hz=None, pulse=False)
+    result = commands.score_recording(recording, model, tmp_path / "score", settings)
+    assert next(iter(result.methods)) == "D2FNet"
+    own = result.methods["pushes"]
+    assert own.scores["mae_mn"] < result.methods["zero"].scores["mae_mn"] / 3
+    assert own.worse_by_mn is not None, "paired with the network on the same frames"
+    assert "a note of the plug-in" in " ".join(result.notes)
+    told = json.loads((tmp_path / "score/score.json").read_text("utf-8"))
+    assert told["methods"]["pushes"]["scores"]["mae_mn"] == pytest.approx(own.scores["mae_mn"])
+    assert told["settings"]["plug_ins"] == {"pushes": "lab_methods 1.2"}
+    assert "pushes" in (tmp_path / "score/report.html").read_text("utf-8")
+    console = Console(file=io.StringIO(), width=200)
+    console.print(report.terminal_table(result))
+    assert "pushes" in console.file.getvalue()  # type: ignore[attr-defined]
+    again = bench.score(recording, model, settings=settings)
+    assert again.methods["pushes"].scores == pytest.approx(own.scores, nan_ok=True)
+    assert "pushes" not in bench.score(recording, model, settings=settings, baselines=False).methods
+
+
+@pytest.mark.parametrize(
+    ("at", "words"),
+    [
+        ("Raises", r"method own \(lab_methods:Raises\): KeyError: 'nothing'"),
+        ("Short", r"gives force of shape \(2,\), expected \(3,\)"),
+        ("Wide", r"gives density of shape \(2, 2\)"),
+        ("nothing", "is no method, it cannot be called"),
+        ("Missing", "cannot be made, AttributeError"),
+    ],
+)
+def test_what_is_wrong_in_it_is_one_line(
+    at: str, words: str, recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    installed(tmp_path, monkeypatch, own=at)
+    model = write_model(tmp_path / "model", "arch.output=vector")
+    with pytest.raises(UserError, match=words) as raised:
+        bench.score(recording, model, settings=bench.Settings(rate_hz=None, pulse=False))
+    assert len(str(raised.value).splitlines()) == 1
+
+
+@pytest.mark.parametrize("name", ["zero", "mean", "D2FNet"])
+def test_a_name_of_ours_is_not_taken(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    installed(tmp_path, monkeypatch, **{name: "Push"})
+    with pytest.raises(UserError, match=f"method {name}: a plug-in's name is taken by one of ours"):
+        commands.fit_baselines(None, None)
+
+
+def test_the_names_of_fitted_methods_are_all_told() -> None:
+    """The list that plug-ins' names are held against is what fitting gives."""
+    tree = ast.parse(Path(baselines.__file__).read_text("utf-8"))
+    (fit,) = (n for n in tree.body if isinstance(n, ast.FunctionDef) and n.name == "fitted_rules")
+    named = {
+        node.value
+        for node in ast.walk(fit)
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and node.value in baselines.FITTED
+    }
+    assert named == set(baselines.FITTED)

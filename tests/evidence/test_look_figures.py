@@ -1,0 +1,153 @@
+"""Crops, texture distances and the patch classifier on pictures whose answer is known."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from sklearn.metrics import roc_auc_score
+
+from evidence.look import classifier, crops, fit, texture
+from synth.errors import UserError
+from synth.fit import parameters
+from synth.job.schema import Job
+
+
+def textured(count: int, sigma: float, seed: int) -> np.ndarray:
+    """Crops (N, 128, 128, 3) of noise blurred by `sigma` px."""
+    import cv2
+
+    rng = np.random.default_rng(seed)
+    found = []
+    for _ in range(count):
+        field = cv2.GaussianBlur(rng.standard_normal((128, 128)), (0, 0), sigma)
+        found.append(np.repeat(128 + 30 * field[..., None] / field.std(), 3, axis=2))
+    return np.clip(np.stack(found), 0, 255).astype(np.uint8)
+
+
+def test_auc_is_scikit_learns() -> None:
+    rng = np.random.default_rng(0)
+    label = rng.integers(0, 2, 60)
+    score = np.round(label + rng.normal(0, 1, 60), 1)
+    assert classifier.auc(score, label) == pytest.approx(roc_auc_score(label, score))
+    assert classifier.auc(np.zeros(60), label) == 0.5
+
+
+@pytest.mark.slow
+def test_the_classifier_tells_textures_apart_and_not_what_is_the_same() -> None:
+    same, other = textured(60, 1.0, 1), textured(60, 2.5, 2)
+    label = np.repeat([0, 1], [60, 60])
+    fold = np.tile(np.arange(5), 24)
+    apart = classifier.held_out(np.concatenate([same, other]), label, fold, 6, 3)
+    assert apart["auc"] > 0.95
+    alike = classifier.held_out(np.concatenate([same, textured(60, 1.0, 5)]), label, fold, 6, 3)
+    assert abs(alike["auc"] - 0.5) < 0.2
+
+
+def test_regions_are_apart_and_of_a_size() -> None:
+    places = np.stack(np.meshgrid(np.arange(10.0), np.arange(10.0)), axis=-1).reshape(-1, 2)
+    region = crops.regions(places, 5)
+    assert np.bincount(region).tolist() == [20] * 5
+    middles = np.array([places[region == k].mean(axis=0) for k in range(5)])
+    nearest = np.linalg.norm(middles[:, None] - middles[None], axis=2)[~np.eye(5, dtype=bool)].min()
+    assert nearest > 3
+
+
+def test_patches_of_the_control_share_a_label() -> None:
+    places = np.stack(np.meshgrid(np.arange(20.0), np.arange(20.0)), axis=-1).reshape(-1, 2)
+    label = classifier.block_labels(places, np.random.default_rng(0))
+    assert 0.3 < label.mean() < 0.7
+    grid = label.reshape(20, 20)
+    assert (grid[:, 1:] == grid[:, :-1]).mean() > 0.7
+
+
+def test_distance_counts_in_the_references_spread() -> None:
+    rng = np.random.default_rng(0)
+    reference = rng.normal(5, [1.0, 10.0, 0.0], (400, 3))
+    assert (texture.distances(reference, reference) ** 2).mean() == pytest.approx(1)
+    far = reference.mean(axis=0) + np.array([[3 * reference[:, 0].std(), 0, 99]])
+    assert texture.distances(far, reference) == pytest.approx([3 / np.sqrt(2)])
+    region = np.arange(400) % 5
+    assert (texture.own_distances(reference, region) ** 2).mean() == pytest.approx(1, abs=0.05)
+
+
+def test_a_python_without_plenoptic_is_one_line(tmp_path: Path) -> None:
+    bare = tmp_path / "bare"
+    bare.write_text(f"#!/bin/sh\nexec {sys.executable} -S -c 'raise ImportError(\"no plenoptic here\")'\n")
+    bare.chmod(0o755)
+    with pytest.raises(UserError, match=r"plenoptic did not run \(ImportError: no plenoptic here\)"):
+        texture.described(textured(1, 1.0, 0), bare)
+    with pytest.raises(UserError, match="cannot be run"):
+        texture.described(textured(1, 1.0, 0), tmp_path / "none")
+
+
+def test_the_worker_keeps_crops_in_order(tmp_path: Path) -> None:
+    """The worker with a stand-in for plenoptic that gives mean and spread."""
+    (tmp_path / "plenoptic.py").write_text(
+        "import torch\n"
+        "class models:\n"
+        "    class PortillaSimoncelli(torch.nn.Module):\n"
+        "        def __init__(self, size, n_scales, spatial_corr_width): super().__init__()\n"
+        "        def forward(self, x): return torch.stack([x.mean((2, 3)), x.std((2, 3))], -1)\n"
+    )
+    shim = tmp_path / "py"
+    shim.write_text(f'#!/bin/sh\nPYTHONPATH={tmp_path} exec {sys.executable} "$@"\n')
+    shim.chmod(0o755)
+    pictures = np.stack([np.full((128, 128, 3), level, np.uint8) for level in range(0, 200, 5)])
+    found = texture.described(pictures, shim)
+    assert found.shape == (40, 2)
+    np.testing.assert_allclose(found[:, 0], np.arange(0, 200, 5) / 255, atol=1e-3)
+    assert subprocess.run([shim, "-c", "import plenoptic"], check=False).returncode == 0
+
+
+def test_crops_of_a_photograph_lie_inside_and_are_taken_alike(tmp_path: Path) -> None:
+    Image.fromarray(np.full((600, 800, 3), 120, np.uint8)).save(tmp_path / "grey.png")
+    found = crops.of_photograph(tmp_path / "grey.png", "0.2,0.2 0.8,0.2 0.8,0.8 0.2,0.8", 80.0, 0.1)
+    assert found.pictures.shape[1:] == (128, 128, 3)
+    assert found.places.min(axis=0) == pytest.approx([0.2 * 800 + 64, 0.2 * 600 + 64], abs=41)
+    assert 0.5 < found.pictures[0].astype(float).std() < 2.5, "noise of 2 levels went through the codec"
+    with pytest.raises(UserError, match="no crop of 128 px"):
+        crops.of_photograph(tmp_path / "grey.png", "0.2,0.2 0.3,0.2 0.3,0.3", 80.0, 0.1)
+
+
+@pytest.mark.slow
+def test_crops_of_a_job_are_tissue_without_its_tools_and_codec() -> None:
+    job = Job.model_validate(
+        {
+            "sequences": 2,
+            "anatomy": {"vertices": 3000},
+            "sensor": {"bitrate_mbps": 0.2},
+            "render": {"size": [400, 300]},
+        }
+    )
+    found = crops.of_job(job, 0.0547, step=40)
+    assert set(found.places[:, 0]) == {0.0, 1.0}
+    red, blue = (found.pictures[..., k].astype(float).mean() for k in (0, 2))
+    assert red > 1.2 * blue
+
+
+def test_errors_are_relative_but_for_what_may_be_nothing() -> None:
+    known = parameters.start("pale") | {"blur": 1.0, "glare": 0.2}
+    found = known | {"density": 1.1, "blur": 0.7, "glare": 0.25, "crown r": 1.2 * known["crown r"]}
+    rows = {row["parameter"]: row for row in fit.compare("one", known, found)}
+    assert rows["density"]["error"] == pytest.approx(0.1)
+    assert (rows["blur"]["error"], rows["glare"]["error"]) == pytest.approx((-0.3, 0.05))
+    assert [name for name, row in rows.items() if not row["within_15"]] == ["crown", "glare", "blur"]
+
+
+def test_the_page_draws_what_is_there(tmp_path: Path) -> None:
+    from bench.output import write
+    from evidence.look import page as look_page
+
+    row = {"crops": "default job", "count": 9, "p10": 1.0, "median": 1.2, "p90": 1.5, "median_within": True}
+    told = {"command": "bench experiment texture x.jpg", "machine": {"cores": 2}}
+    write.keep(tmp_path, "texture.json", {**told, "limit_p90_of_photograph": 1.4, "rows": [row]})
+    page = look_page.drawn(tmp_path)
+    assert [chart.rows[0].name for chart in page.charts] == ["default job"]
+    write.keep(tmp_path, "fit.json", {**told, "pictures": [{"picture": "a", "ratio": 0.4}], "parameters": []})
+    drawn = look_page.drawn(tmp_path).charts[1].rows
+    assert [(row.name, row.value) for row in drawn] == [("a", 0.4)]

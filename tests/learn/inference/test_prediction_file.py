@@ -1,0 +1,128 @@
+"""What `learn predict` leaves behind is documented, and says the same in all of its files."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import av
+import numpy as np
+import phantom
+import pytest
+from fake_model import write_model
+from sources import ROOT
+from typer.testing import CliRunner
+
+from learn.cli import app
+from learn.inference import prediction_file
+from learn.inference.apply import apply, motions
+from learn.inference.predict import View, load_predictor
+from synth.dataset.store import Dataset
+from synth.publish.preview_video import encode_video
+
+FILES = ["000000.force.csv", "000000.force.mp4", "000000.npz"]
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("predicted")
+    phantom.write(folder, 0, anatomy_seed=0)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_model(tmp_path_factory.mktemp("model"), "arch.output=vector")
+
+
+def predict(*words: object) -> dict[str, object]:
+    done = CliRunner().invoke(app, ["predict", *map(str, words), "--json"])
+    assert done.exit_code == 0, (done.output, done.exception)
+    found: dict[str, object] = json.loads(done.stdout)
+    return found
+
+
+def frames(path: Path) -> list[np.ndarray]:
+    with av.open(str(path)) as container:
+        return [one.to_ndarray(format="rgb24") for one in container.decode(video=0)]
+
+
+@pytest.mark.parametrize("source", ["", "000000.zarr"])
+def test_a_dataset_and_a_store_give_the_three_files(
+    data: Path, model: Path, tmp_path: Path, source: str
+) -> None:
+    predict(model, data / source, "--out", tmp_path)
+    assert sorted(path.name for path in tmp_path.iterdir()) == FILES
+    sequence = Dataset(data)[0]
+    with np.load(tmp_path / "000000.npz") as found:
+        assert set(found.files) <= set(prediction_file.FIELDS)
+        assert found["scale_mm_per_px"] == pytest.approx(sequence.attrs["scale_mm_per_px"])
+        rows = list(csv.DictReader((tmp_path / "000000.force.csv").read_text().splitlines()))
+        assert tuple(rows[0]) == prediction_file.COLUMNS
+        assert [float(row["total_force_mn"]) for row in rows] == pytest.approx(
+            found["total_force_mn"], rel=1e-5
+        )
+        assert [float(row["force_y_mn"]) for row in rows] == pytest.approx(found["force_mn"][:, 1], rel=1e-5)
+        assert [float(row["time_s"]) for row in rows] == pytest.approx(sequence["time"][:], rel=1e-5)
+    film = frames(tmp_path / "000000.force.mp4")
+    assert len(film) == sequence.frames
+    assert film[0].shape[0] > sequence.size[0], "the curve lies below the picture"
+
+
+def test_a_video_keeps_its_own_file(data: Path, model: Path, tmp_path: Path) -> None:
+    """Predicting beside a film, its name and the prediction's don't meet."""
+    film = encode_video(tmp_path / "film.mp4", Dataset(data)[0]["rgb"][:], 10.0)
+    before = film.read_bytes()
+    predict(model, film, "--out", tmp_path, "--scale", "0.1", "--flow", "dis", "--rate", "5", "--no-pulse")
+    assert film.read_bytes() == before
+    with np.load(tmp_path / "film.npz") as found:
+        assert len(frames(tmp_path / "film.force.mp4")) == len(found["frame"])
+
+
+def test_no_overlay_and_arrays_of_flow_have_no_film(data: Path, model: Path, tmp_path: Path) -> None:
+    predict(model, data, "--out", tmp_path / "a", "--no-overlay")
+    sequence = Dataset(data)[0]
+    flow = {"flow": sequence["flow"][:], "tissue": sequence["tissue"][:]}
+    np.savez(tmp_path / "mine.npz", scale_mm_per_px=0.1, **flow)
+    predict(model, tmp_path / "mine.npz", "--out", tmp_path / "a")
+    names = {path.name for path in (tmp_path / "a").iterdir()}
+    assert names == {"000000.npz", "000000.force.csv", "mine.npz", "mine.force.csv"}
+    first = (tmp_path / "a/mine.force.csv").read_text().splitlines()[1].split(",")
+    assert first[1] == "", "an array of flow has no times"
+
+
+def test_untrusted_frames_are_empty_in_the_table() -> None:
+    found = {
+        "frame": np.arange(2),
+        "trusted": np.array([True, False]),
+        "total_force_mn": np.array([1.5, np.nan]),
+    }
+    assert prediction_file.tabulate(found).splitlines()[1:] == ["0,,1,1.5,,,", "1,,0,,,,"]
+
+
+def test_the_map_lies_where_the_network_saw_it(data: Path, model: Path) -> None:
+    """Against the network's own way from the grid to the picture."""
+    (motion,) = motions(data / "000000.zarr", "ideal")
+    predictor = load_predictor(model)
+    found = apply(predictor, motion)
+    view = View(motion.tissue, motion.scale_mm_per_px, predictor.grid)
+    n = predictor.grid.size
+    cells = np.exp(-((np.arange(n)[:, None] - 0.6 * n) ** 2 + (np.arange(n) - 0.4 * n) ** 2) / 20)
+    there = prediction_file.on_picture(cells, found, 2, motion.tissue.shape)
+    back = view.resample.mean(there, np.ones(motion.tissue.shape, bool))
+    seen = view.mask > 0
+    assert np.abs(back - cells)[seen].max() < 0.1
+    row, column = (np.average(axis, weights=there) for axis in np.indices(there.shape))
+    x, y = found["centres_px"][2]
+    step = found["pitch_mm"] / found["scale_mm_per_px"]
+    assert column == pytest.approx(x + (0.4 * n - (n - 1) / 2) * step, abs=1.0)
+    assert row == pytest.approx(y + (0.6 * n - (n - 1) / 2) * step, abs=1.0)
+
+
+def test_every_field_and_column_is_documented() -> None:
+    page = (ROOT / "docs/reference/predictions.md").read_text("utf-8")
+    for name, field in prediction_file.FIELDS.items():
+        assert f"| `{name}` | {field.axes or '-'} | {field.unit} | {field.meaning} |" in page
+    for name in prediction_file.COLUMNS:
+        assert f"`{name}`" in page

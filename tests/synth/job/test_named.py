@@ -1,0 +1,34 @@
+"""Jobs that come with the program: all can be drawn, and the page of recipes has them with what it says."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from synth.job import reader
+from synth.sequence import scenario
+
+PAGE = (Path(__file__).resolve().parents[3] / "docs" / "recipes.md").read_text("utf-8")
+
+
+@pytest.mark.parametrize("name", reader.names())
+def test_it_is_read_drawn_and_on_the_page(name: str) -> None:
+    job = reader.load_job(name)
+    for index in range(min(job.sequences, 5)):
+        assert scenario.draw(job, index).gestures
+    assert f"| `{name}` |" in PAGE
+
+
+def test_each_is_what_it_is_called() -> None:
+    stereo, calf, endoscope, living = (
+        reader.load_job(name) for name in ("stereo", "ex-vivo-calf", "endoscope", "in-vivo")
+    )
+    assert stereo.render.stereo_mm == 24
+    assert "motion_recovered" in stereo.kept_fields
+    assert (calf.appearance.families, calf.fem.contact) == (("calf",), "rigid")
+    assert calf.fem.membrane.intact == calf.fem.pulse.heart_mm[1] == 0
+    assert endoscope.render.working_distance_mm[1] < 100
+    assert endoscope.render.distortion[0] < -0.2
+    assert living.fem.membrane.intact == 1
+    assert living.fem.pulse.heart_mm[1] > 0

@@ -1,0 +1,67 @@
+"""A scene from a script is the one that a dataset holds, frame by frame, and needs no folder."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import synth
+from synth.sequence.pipeline import render_sequence
+
+SMALL = ["seed=3", "frames=3", "anatomy.vertices=2500", "fem.tets=400", "render.spp=1", "render.size=[96,72]"]
+
+
+@pytest.fixture(scope="module")
+def job() -> synth.Job:
+    return synth.load_job("tiny", SMALL)
+
+
+@pytest.fixture(scope="module")
+def scene(job: synth.Job) -> synth.Scene:
+    return synth.simulate(job, 1)
+
+
+@pytest.mark.slow
+def test_it_is_what_a_dataset_holds(
+    scene: synth.Scene, job: synth.Job, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    frames = list(scene.frames())
+    recovered = scene.recover_flow(frames)
+    assert not list(tmp_path.iterdir()), "no folder"
+    stored = synth.open_sequence(render_sequence(job, 1, tmp_path, lambda *_: None))
+    for name in ("rgb", "flow", "visible", "depth", "tool", "glare", "traction"):
+        np.testing.assert_array_equal(np.stack([getattr(one, name) for one in frames]), stored[name][:], name)
+    for name in ("area", "tissue", "force"):
+        np.testing.assert_array_equal(np.asarray(getattr(scene, name), stored[name].dtype), stored[name][:])
+    assert [one.time_s for one in frames] == pytest.approx(stored["time"][:].tolist())
+    np.testing.assert_array_equal(recovered.flow, stored["flow_recovered"][:])
+    np.testing.assert_array_equal(recovered.confidence, stored["flow_confidence"][:])
+    assert scene.young_kpa == stored.attrs["young_kpa"]
+    assert scene.scale_mm_per_px == stored.attrs["scale_mm_per_px"]
+
+
+def test_a_frame_does_not_depend_on_those_before_it(scene: synth.Scene, job: synth.Job) -> None:
+    assert scene.strongest == int(np.linalg.norm(scene.force, axis=1).argmax()) > 0
+    alone = synth.simulate(job, 1).frame(2)
+    again = scene.frame(2)
+    np.testing.assert_array_equal(alone.rgb, again.rgb)
+    labelled = np.einsum("hwk,hw->k", again.traction, scene.area)
+    assert np.linalg.norm(labelled - again.force) < 0.1 * np.linalg.norm(again.force) + 1e-6
+    np.testing.assert_allclose(again.force, scene.force[2])
+
+
+def test_what_cannot_be_is_said(scene: synth.Scene, job: synth.Job) -> None:
+    with pytest.raises(synth.UserError, match="sequence 2: the job has sequences 0 to 1"):
+        synth.simulate(job, 2)
+    with pytest.raises(synth.UserError, match="frame 3: the scene has frames 0 to 2"):
+        scene.frame(3)
+    rest, other = scene.frame(0), scene.frame(2)
+    with pytest.raises(synth.UserError, match="must begin with the rest frame"):
+        scene.recover_flow([other, rest])
+    with pytest.raises(synth.UserError, match="no estimator 'no'"):
+        scene.recover_flow([rest, other], "no")
+    with pytest.raises(synth.UserError, match="`ideal` recovers nothing"):
+        scene.recover_flow([rest, other], "ideal")
