@@ -56,8 +56,8 @@ _CAPTION_PX = 15
 @measuring("-o docs", out="docs", said="Folder of the two pictures and their page.", text="gallery.md")
 def gallery(
     seed: Annotated[int, typer.Option(min=0, help="Of the rendered jobs.")] = 7,
-    width: Annotated[int, typer.Option(min=64, help="Of a tile [px].")] = 160,
-    quality: Annotated[int, typer.Option(min=1, max=100, help="Of WebP.")] = 48,
+    width: Annotated[int, typer.Option(min=64, help="Of a tile [px].")] = 144,
+    quality: Annotated[int, typer.Option(min=1, max=100, help="Of WebP.")] = 46,
     out: Path = CHECKOUT / "docs",
 ) -> dict[str, Any]:
     """Draws families x instruments and lights x cameras as pictures, with a page around them."""

@@ -41,22 +41,24 @@ FIELDS: dict[str, PredictedField] = {
     "force_mn": PredictedField(
         "T, 3", "mN", "total force on the tissue, camera axes (x right, y down, z away); of a vector model"
     ),
-    "low_mn": PredictedField(
-        "T", "mN", "lower end of the 90% interval of that size; of a model with intervals"
-    ),
-    "high_mn": PredictedField("T", "mN", "upper end"),
-    "low68_mn": PredictedField("T", "mN", "lower end of the 68% interval"),
-    "high68_mn": PredictedField("T", "mN", "upper end"),
-    "force_low_mn": PredictedField("T, 3", "mN", "lower ends of the 90% intervals of the force's x, y, z"),
-    "force_high_mn": PredictedField("T, 3", "mN", "upper ends; wide where the model or the camera sees none"),
     "density": PredictedField(
         "T, C, N, N",
         "mN/mm²",
         "force density on the network's grid, nothing taken off: its size (C = 1) or x, y, z; of a model of "
         "the published target the intensity [mN]",
     ),
-    "density_low": PredictedField("T, N, N", "mN/mm²", "lower end of the 90% interval of the map's length"),
-    "density_high": PredictedField("T, N, N", "mN/mm²", "upper end"),
+    "low_mn": PredictedField(
+        "T", "mN", "lower end of the size's 90% interval; this and its like of a model with intervals"
+    ),
+    "high_mn": PredictedField("T", "mN", "upper end of it"),
+    "low68_mn": PredictedField("T", "mN", "lower end of the size's 68% interval"),
+    "high68_mn": PredictedField("T", "mN", "upper end of it"),
+    "force_low_mn": PredictedField("T, 3", "mN", "lower ends of the components' 90% intervals, camera axes"),
+    "force_high_mn": PredictedField("T, 3", "mN", "upper ends of them"),
+    "density_low": PredictedField(
+        "T, N, N", "mN/mm²", "lower end of the 90% interval of the density's length"
+    ),
+    "density_high": PredictedField("T, N, N", "mN/mm²", "upper end of it"),
     "head_mn": PredictedField("T, C", "mN", "what a network with a head for the total force says of it"),
     "mask": PredictedField("N, N", "-", "cells with tissue"),
     "pitch_mm": PredictedField("", "mm", "width of a cell"),
@@ -69,11 +71,9 @@ FIELDS: dict[str, PredictedField] = {
 }
 """Every field by name, in the order in which the documentation lists them."""
 
-COLUMNS = ("frame", "time_s", "trusted", "total_force_mn", "force_x_mn", "force_y_mn", "force_z_mn")
+_ENDS = ("low_mn", "high_mn")
+COLUMNS = ("frame", "time_s", "trusted", "total_force_mn", "force_x_mn", "force_y_mn", "force_z_mn", *_ENDS)
 """Of NAME.force.csv; empty where there is no value."""
-
-ENDS = ("low_mn", "high_mn")
-"""Further columns, of a model with intervals."""
 
 
 def write_prediction(found: dict[str, Any], stem: Path) -> None:
@@ -85,16 +85,15 @@ def write_prediction(found: dict[str, Any], stem: Path) -> None:
 
 
 def tabulate(found: dict[str, Any]) -> str:
-    """The force by frame as CSV, a row a frame, `COLUMNS` on top, and `ENDS` where there are intervals."""
+    """The force by frame as CSV, a row a frame, `COLUMNS` on top."""
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
-    ends = [name for name in ENDS if name in found]
-    table.writerow([*COLUMNS, *ends])
+    table.writerow(COLUMNS)
     for t, number in enumerate(found["frame"]):
         time = found["time_s"][t] if "time_s" in found else np.nan
         force = found["force_mn"][t] if "force_mn" in found else (np.nan,) * 3
-        bounds = (found[name][t] for name in ends)
-        values = [_number(value) for value in (time, found["total_force_mn"][t], *force, *bounds)]
+        ends = [found[name][t] if name in found else np.nan for name in _ENDS]
+        values = [_number(value) for value in (time, found["total_force_mn"][t], *force, *ends)]
         table.writerow([int(number), values[0], int(found["trusted"][t]), *values[1:]])
     return text.getvalue()
 
@@ -143,7 +142,8 @@ def _drawn(found: dict[str, Any], times: NDArray[np.floating], pictures: Iterato
         if curve is None:
             curve = film.draw_curve(times, force, small.shape[1], "mN")
         known = "" if found["young_known"] else f", if E is {found['young_kpa']:.3g} kPa"
-        said = f"{force[t]:.1f} mN{known}" if found["trusted"][t] else "could not be followed"
+        ends = f" [{found['low_mn'][t]:.1f}, {found['high_mn'][t]:.1f}]" if "low_mn" in found else ""
+        said = f"{force[t]:.1f} mN{ends}{known}" if found["trusted"][t] else "could not be followed"
         shown = film.glow(small, values, largest) if found["trusted"][t] else small
         shown = film.caption(shown, f"{times[t]:.2f} s  {said}")
         yield np.vstack([shown, film.mark(curve, t, len(force))])

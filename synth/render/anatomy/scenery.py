@@ -33,7 +33,10 @@ def stitches(edge: Floats, rng: np.random.Generator) -> Floats:
 
 
 def dural_vessels(edge: Floats, rng: np.random.Generator) -> Tree:
-    """Meningeal vessels (nodes in world x, y mm) that run over the dura round an opening and branch."""
+    """Meningeal vessels (nodes in world x, y mm) that run over the dura round an opening and branch.
+
+    `edge`: (A,) mm, radius of the opening at even angles; `rng`: where they run.
+    """
     nodes: list[Floats] = []
     parent: list[int] = []
     radius: list[float] = []
@@ -101,7 +104,11 @@ def patties(edge: Floats, points: Floats, rng: np.random.Generator) -> list[tupl
 
 
 def retractor(edge: Floats, points: Floats, rng: np.random.Generator) -> Shape:
-    """A blade of steel from outside over the rim, bent down into the opening; arguments as for `patties`."""
+    """A blade of steel from outside over the rim, bent down into the opening.
+
+    `edge`: (A,) mm, radius of the opening at even angles; `points`: (N, 3) mm, of what it may lie on; `rng`:
+    from where it comes.
+    """
     around, wide = float(rng.uniform(0, 2 * np.pi)), float(rng.uniform(2.8, 4.2))
     outwards = np.array([np.cos(around), np.sin(around)])
     across = np.array([-outwards[1], outwards[0]])

@@ -183,9 +183,9 @@ def test_a_film_of_unknown_scale_has_none(vector: Path, scale_known: bool) -> No
     steps = iter([Step(flow(0.0), None, 0), Step(flow(0.4), None, 1, trusted=False)])
     film = Motion("film", steps, np.ones(SHAPE, bool), SCALE, 2.0, scale_known=scale_known)
     found = apply(load_predictor(vector), film)
-    header, *rows = prediction_file.tabulate(found).splitlines()
+    rows = prediction_file.tabulate(found).splitlines()[1:]
     assert ("low_mn" in found) == ("density_high" in found) == scale_known
-    assert header.endswith("high_mn") == scale_known
+    assert rows[0].endswith(",,") != scale_known
     if scale_known:
         assert found["high_mn"][0] == pytest.approx(found["total_force_mn"][0] + 20)
         assert np.isnan(found["low_mn"][1])

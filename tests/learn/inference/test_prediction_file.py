@@ -98,7 +98,7 @@ def test_untrusted_frames_are_empty_in_the_table() -> None:
         "trusted": np.array([True, False]),
         "total_force_mn": np.array([1.5, np.nan]),
     }
-    assert prediction_file.tabulate(found).splitlines()[1:] == ["0,,1,1.5,,,", "1,,0,,,,"]
+    assert prediction_file.tabulate(found).splitlines()[1:] == ["0,,1,1.5,,,,,", "1,,0,,,,,,"]
 
 
 def test_the_map_lies_where_the_network_saw_it(data: Path, model: Path) -> None:
