@@ -250,7 +250,8 @@ def apply(predictor: Predictor, motion: Motion, young_kpa: float | None = None) 
         forces.append(force if step.trusted else np.full(3, np.nan))
         trusted.append(step.trusted)
         maps.append(said)
-        ends.add(force, said, step.trusted)
+        if motion.scale_known:
+            ends.add(force, said, step.trusted)
     still = motion.again()
     if still is not None:
         return apply(predictor, still, young_kpa)

@@ -30,6 +30,7 @@ LEVEL = LEVELS[0]
 """What is given where only one is."""
 _AROUND_MM = 3.0  # how far aside a contact may be found
 _LOW_SHARE = 0.01  # of the training data's density: below it all densities are alike
+_NEAR = 0.02  # of the training data's density: a cell with so much nearby is at a contact
 _LEAST = 1e-3  # of the training data's force and density: no error is expected to be smaller
 
 
@@ -131,6 +132,9 @@ class Intervals:
     size: Spread
     axes: tuple[Spread, Spread, Spread]
     map: Spread
+    """Of cells near which the answer is as good as nothing."""
+    contact: Spread
+    """Of all others: they are few, and err more."""
     world: World
     source: str
     """Displacement that they hold for, as in `learn.data.clips.FIELDS`."""
@@ -145,6 +149,7 @@ class Intervals:
             (self.size, frame),
             *((one, frame) for one in self.axes),
             (self.map, frame + 2),
+            (self.contact, frame + 2),
         ):
             rule = spread.scale
             if not len(rule.slopes) == len(rule.low) == len(rule.high) == wanted:
@@ -168,7 +173,8 @@ class Intervals:
         """Ends of the interval of each cell of the map, (T, N, N) twice; unit and errors as `bound`."""
         self._check(level)
         features = frame_features(said, self.force_unit)
-        half = self.map.half(cell_features(said, features, self.map_unit), level)
+        cells = cell_features(said, features, self.map_unit)
+        half = np.where(_at_contact(cells), self.contact.half(cells, level), self.map.half(cells, level))
         half = half * self._widening(said.motion, features)[:, None, None]
         low = np.maximum(said.magnitude - half, 0.0)
         return low.astype(np.float32), (said.magnitude + half).astype(np.float32)
@@ -242,31 +248,59 @@ def fit(
     features, weight = _stacked(chosen, "features"), _weights([len(one.features) for one in chosen])
     error = _stacked(chosen, "error")
     scales = [fit_scale(features, e, weight, _LEAST * units[0]) for e in error.T]
-    cells = fit_scale(
-        _stacked(chosen, "cell_features"),
-        _stacked(chosen, "cell_error"),
-        _weights([len(one.cell_error) for one in chosen]),
-        _LEAST * units[1],
-    )
     wide = [_widen(world, scales[0], one.motion, one.features) for one in kept]
     both = list(zip(kept, wide, strict=True))
     spreads = [
         _spread(scale, kept, [one.error[:, k] / (w * scale.predict(one.features)) for one, w in both])
         for k, scale in enumerate(scales)
     ]
-    of_map = [one.cell_error / (w[one.cell_frame] * cells.predict(one.cell_features)) for one, w in both]
     return Intervals(
         features=(*names, *ANSWER),
         force_unit=units[0],
         map_unit=units[1],
         size=spreads[0],
         axes=(spreads[1], spreads[2], spreads[3]),
-        map=_spread(cells, kept, of_map),
+        map=_cell_spread(chosen, kept, wide, units[1], near=False),
+        contact=_cell_spread(chosen, kept, wide, units[1], near=True),
         world=world,
         source=source,
         units=count,
         sequences=len(kept),
     )
+
+
+def _cell_spread(
+    chosen: Sequence[Example], kept: Sequence[Example], wide: Sequence[Floats], unit: float, *, near: bool
+) -> Spread:
+    """Scale and factors of the cells at a contact or of the others (conformal by class: Vovk 2012).
+
+    Of all cells where too few units have any of that class.
+    """
+    least = conformal.least_units(LEVELS[0])
+    of_class = [_at_contact(one.cell_features) == near for one in (*chosen, *kept)]
+    seen = len({one.unit for one, part in zip(kept, of_class[len(chosen) :], strict=True) if part.any()})
+    if seen < least or not any(part.any() for part in of_class[: len(chosen)]):
+        of_class = [np.ones_like(part) for part in of_class]
+    first = [(one, part) for one, part in zip(chosen, of_class, strict=False) if part.any()]
+    last = [
+        (one, w, part) for one, w, part in zip(kept, wide, of_class[len(chosen) :], strict=True) if part.any()
+    ]
+    scale = fit_scale(
+        np.concatenate([one.cell_features[part] for one, part in first]),
+        np.concatenate([one.cell_error[part] for one, part in first]),
+        _weights([int(part.sum()) for _, part in first]),
+        _LEAST * unit,
+    )
+    scores = [
+        (one.cell_error / (w[one.cell_frame] * scale.predict(one.cell_features)))[part]
+        for one, w, part in last
+    ]
+    return _spread(scale, [one for one, _, _ in last], scores)
+
+
+def _at_contact(cells: Floats) -> NDArray[np.bool_]:
+    """(...,) whether the answer says something at or near a cell, of `cell_features` (..., G)."""
+    return np.asarray(cells[..., -1] > np.log(_NEAR + _LOW_SHARE))
 
 
 def _spread(scale: Scale, kept: Sequence[Example], scores: Sequence[Floats]) -> Spread:

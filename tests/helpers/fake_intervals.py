@@ -37,7 +37,8 @@ def make(
     along = tuple(tuple(float(i == j == 0) for j in range(count)) for i in range(count))
     x, y, z = (spread(half, len(names)) for half in axes)
     return Intervals(
-        names, 100.0, 1.0, spread(size, len(names)), (x, y, z), spread(density, len(names) + 2),
+        names, 100.0, 1.0, spread(size, len(names)), (x, y, z),
+        spread(density, len(names) + 2), spread(density, len(names) + 2),
         World((0.0,) * count, along, usual), source, 19, 19,
     )  # fmt: skip
 

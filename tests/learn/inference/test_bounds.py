@@ -13,6 +13,8 @@ import pytest
 from numpy.typing import NDArray
 
 from learn.checkpoint import read_card, write_card
+from learn.inference import prediction_file
+from learn.inference.apply import Motion, Step, apply
 from learn.inference.force_reader import ForceReader, net_force
 from learn.inference.predict import load_predictor
 from learn.uncertainty.intervals import LEVEL
@@ -172,3 +174,20 @@ def test_an_edited_interval_is_seen(vector: Path) -> None:
     file.write_text(file.read_text().replace('"usual": 1000000.0', '"usual": 1000001.0'))
     with pytest.raises(UserError, match="edited or damaged"):
         read_card(vector)
+
+
+@pytest.mark.parametrize("scale_known", [True, False])
+def test_a_film_of_unknown_scale_has_none(vector: Path, scale_known: bool) -> None:
+    """Its forces are of no unit, and its motion in mm is of no world."""
+    fake_intervals.give(vector, fake_intervals.make())
+    steps = iter([Step(flow(0.0), None, 0), Step(flow(0.4), None, 1, trusted=False)])
+    film = Motion("film", steps, np.ones(SHAPE, bool), SCALE, 2.0, scale_known=scale_known)
+    found = apply(load_predictor(vector), film)
+    rows = prediction_file.tabulate(found).splitlines()[1:]
+    assert ("low_mn" in found) == ("density_high" in found) == scale_known
+    assert rows[0].endswith(",,") != scale_known
+    if scale_known:
+        assert found["high_mn"][0] == pytest.approx(found["total_force_mn"][0] + 20)
+        assert np.isnan(found["low_mn"][1])
+        assert np.isnan(found["force_high_mn"][1]).all()
+        assert rows[1].endswith(",,")
