@@ -73,6 +73,8 @@ def write_card(folder: Path, card: Card) -> None:
     """Writes config.json into a model's folder, whole or not at all."""
     folder.mkdir(parents=True, exist_ok=True)
     tree = {"format": _FORMAT, "version": _VERSION, **_CARD.dump_python(card, mode="json")}
+    # Where nobody tried, as before there were any.
+    tree = {k: v for k, v in tree.items() if k not in ("intervals", "no_intervals") or v}
     tree["seal"] = _hash(identity.canonical(tree))
     _write(folder / "config.json", (json.dumps(tree, indent=1) + "\n").encode())
 

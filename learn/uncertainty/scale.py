@@ -41,15 +41,14 @@ def fit_scale(features: Floats, error: Floats, weight: Floats, least: float) -> 
         weight: (n,) > 0, of each.
         least: what is added to an error before its logarithm, in its unit; > 0.
     """
-    from sklearn.linear_model import Ridge  # a second to load, and not needed to apply what was fitted
-
-    middle, spread = features.mean(0), np.maximum(features.std(0), 1e-6)
-    rule = Ridge(alpha=1.0).fit(
-        (features - middle) / spread, np.log(error + least), sample_weight=weight / weight.mean()
-    )
-    slopes = rule.coef_ / spread
+    spread = np.maximum(features.std(0), 1e-6)
+    wanted, share = np.log(error + least), weight / weight.mean()
+    middle, level = np.average(features, 0, share), float(np.average(wanted, weights=share))
+    told = (features - middle) / spread
+    held = told.T @ (share[:, None] * told) + np.eye(told.shape[1])
+    slopes = np.linalg.solve(held, told.T @ (share * (wanted - level))) / spread
     return Scale(
-        intercept=float(rule.intercept_ - middle @ slopes),
+        intercept=level - float(middle @ slopes),
         slopes=tuple(slopes.tolist()),
         low=tuple(features.min(0).tolist()),
         high=tuple(features.max(0).tolist()),

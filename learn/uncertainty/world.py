@@ -50,15 +50,13 @@ def fit_world(fitted: Sequence[Floats], held_out: Sequence[Floats]) -> World | N
         fitted: `motion_features` of each sequence, (T, F).
         held_out: the same of sequences that were not fitted.
     """
-    from sklearn.covariance import LedoitWolf  # a second to load, and not needed to apply what was fitted
-
     moved = [motion[is_moving(motion)] for motion in fitted]
     others = [motion for motion in held_out if is_moving(motion).any()]
     if sum(map(len, moved)) < 2 or not others:
         return None
     seen = np.concatenate(moved)
     spread = np.maximum(seen.std(0), _LEAST_SPREAD)
-    shrunk = LedoitWolf().fit(seen / spread).covariance_
+    shrunk = shrunk_covariance(seen / spread)
     # Where nothing varied there is no variance to invert.
     least = (_LEAST_SPREAD / spread) ** 2
     precision = np.linalg.inv(shrunk + np.diag(np.maximum(least - np.diag(shrunk), 0.0)))
@@ -66,3 +64,19 @@ def fit_world(fitted: Sequence[Floats], held_out: Sequence[Floats]) -> World | N
     world = World(tuple(seen.mean(0).tolist()), tuple(map(tuple, precision.tolist())), 1.0)
     usual = share_quantile([world.distance(m)[is_moving(m)] for m in others], USUAL)
     return World(world.middle, world.precision, max(usual, 1e-6))
+
+
+def shrunk_covariance(samples: Floats) -> Floats:
+    """(F, F) covariance of (n, F) samples, drawn towards a multiple of the identity as far as its noise asks.
+
+    Ledoit & Wolf, "A well-conditioned estimator for large-dimensional covariance matrices", J. Multivar.
+    Anal. 88, 2004.
+    """
+    count, parts = samples.shape
+    centred = samples - samples.mean(0)
+    plain = centred.T @ centred / count
+    mean = np.trace(plain) / parts
+    away = float(((plain - mean * np.eye(parts)) ** 2).sum())
+    noise = float(((centred**2).sum(1) ** 2).mean() - (plain**2).sum()) / count
+    share = min(noise / away, 1.0) if away > 0 else 0.0
+    return np.asarray((1 - share) * plain + share * mean * np.eye(parts))

@@ -61,6 +61,7 @@ def place(brain: Path, radius_mm: float, count: int, folder: Path) -> Placed:
         UserError: the brain cannot be used, or the folder holds another's job.
     """
     import cv2
+    import plotly.offline  # noqa: F401  # the page's, of the extra `bench`: found missing before the search
 
     if (folder / "job.yaml").exists():
         raise UserError(f"{folder / 'job.yaml'}: exists already")

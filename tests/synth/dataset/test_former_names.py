@@ -22,7 +22,8 @@ from synth.dataset.torch_dataset import Frames
 from synth.errors import UserError
 from synth.fields import FIELDS, FORMER_NAMES
 from synth.job.schema import Job
-from synth.publish import card, export
+from synth.publish import card
+from synth.publish.export import formats
 
 JOB = Job(seed=3, sequences=2, frames=4, render={"size": (48, 40)}, store={"flow": "float16"})
 """With recovered flow: the default's estimator is tvl1."""
@@ -87,7 +88,7 @@ def test_frames_sizes_exports_and_card_take_it(today: Path, older: Path, tmp_pat
         assert np.array_equal(Frames(older, [name])[5][name], Frames(today, [name])[5][name])
     sizes = {row.name: row.measured for row in field_sizes.rows((40, 48), Dataset(older)[0])}
     assert (sizes["flow_recovered"] or 0) > 0
-    export.export_dataset(older, tmp_path / "to", "folder")
+    formats.export_dataset(older, tmp_path / "to", "folder")
     assert (tmp_path / "to/000000/flow_recovered.npy").is_file()
     assert "`flow_recovered`" in (older / "README.md").read_text()
 
