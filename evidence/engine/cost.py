@@ -15,11 +15,10 @@ from bench.output import machine
 from evidence.measuring import measuring
 from synth.dataset import size_forecast
 from synth.dataset.store import Dataset
+from synth.engine.slots import SEQUENCES_A_PROCESS
 from synth.errors import UserError
 
 _BY_FRAME = ("render", "flow", "store")
-# A worker process is replaced after so many sequences (synth.engine.slots).
-_RECYCLED = 16
 _BEGIN, _END = "<!-- measured: bench experiment cost -->\n", "<!-- end -->\n"
 
 
@@ -31,7 +30,11 @@ def tables(found: dict[str, Any]) -> str:
     rows = [
         *((name, f"{spent:.2f}", "") for name, spent in found["cpu_s_a_frame"].items()),
         *((name, "", f"{spent:.2f}") for name, spent in found["cpu_s_a_sequence"].items()),
-        (f"start of a worker (imports), once in {_RECYCLED} sequences", "", f"{found['cpu_s_a_start']:.1f}"),
+        (
+            f"start of a worker (imports), once in {SEQUENCES_A_PROCESS} sequences",
+            "",
+            f"{found['cpu_s_a_start']:.1f}",
+        ),
     ]
     amounts = [
         ("processor", f"{hours:,} CPU-hours: {hours / 16:.0f} hours on 16 cores, {hours / 256:.1f} on 256"),
@@ -113,7 +116,7 @@ def plan(found: dict[str, Any], frames: int, length: int) -> dict[str, Any]:
     """What `frames` frames take, as sequences of `length`."""
     sequences = -(-frames // length)
     each = sum(found["cpu_s_a_frame"].values())
-    once = sum(found["cpu_s_a_sequence"].values()) + found["cpu_s_a_start"] / _RECYCLED
+    once = sum(found["cpu_s_a_sequence"].values()) + found["cpu_s_a_start"] / SEQUENCES_A_PROCESS
     return {
         "frames": frames,
         "sequences": sequences,

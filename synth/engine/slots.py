@@ -19,7 +19,7 @@ from synth.system.stopwatch import Report
 
 # A process that has computed so many is replaced, should a library leak: none was seen to, over 16 sequences
 # (731 MB after the last, 736 after the second); starting anew costs what half a sequence does.
-_RECYCLE = 128
+SEQUENCES_A_PROCESS = 128
 
 
 class Slot(Protocol):
@@ -46,7 +46,7 @@ class LocalSlot:
     def run(self, index: int, report: Report, stop: threading.Event) -> Attempt:
         self._child = self._child or Child(self._setup)
         attempt = self._child.run(index, report, stop)
-        if attempt.kind not in ("done", "input") or self._child.finished >= _RECYCLE:
+        if attempt.kind not in ("done", "input") or self._child.finished >= SEQUENCES_A_PROCESS:
             self.close()
         return attempt
 
