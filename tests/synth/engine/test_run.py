@@ -312,7 +312,7 @@ def test_killed_and_resumed_equals_undisturbed(
     victim = start(tmp_path / "out", JOB, "stuck")
     wait_for(lambda: len(list((tmp_path / "out").glob("*.zarr"))) >= 1)
     victim.send_signal(kill)
-    victim.wait(timeout=30)
+    victim.wait(timeout=60)
     assert victim.returncode != 0
     left = len(list((tmp_path / "out").glob("*.zarr")))
     assert 1 <= left < 6
