@@ -14,13 +14,13 @@ from torch import nn
 
 from evidence.look import crops as cutting
 from evidence.measuring import measuring
+from evidence.render.realism import OUTLINE
 
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 
 _FOLDS = 5
 _BATCH, _RATE, _WIDTH = 32, 2e-3, 16
-_MM_PER_PX = 0.0547
 _BLOCKS = 40  # patches of the photograph that the control gives one label each
 
 
@@ -32,7 +32,7 @@ def classifier(
     ] = None,
     outline: Annotated[
         str, typer.Option(help="Polygon of the cortex in it, as shares: x,y x,y ...")
-    ] = cutting.OUTLINE,
+    ] = OUTLINE,
     width_mm: Annotated[float, typer.Option(help="What the photograph's width spans.")] = 110.0,
     frames: Annotated[int, typer.Option(min=5, help="Rendered sequences, one frame of each.")] = 5,
     epochs: Annotated[int, typer.Option(min=1, help="Of training, a fold.")] = 10,
@@ -41,13 +41,12 @@ def classifier(
 ) -> dict[str, Any]:
     """AUC of a patch classifier, photograph against rendered crops; two controls have to be near 0.5."""
     torch.set_num_threads(1)
-    theirs = cutting.of_photograph(photo, outline, width_mm, _MM_PER_PX)
+    theirs = cutting.of_photograph(photo, outline, width_mm, cutting.MM_PER_PX)
     region = cutting.regions(theirs.places, _FOLDS)
     rng = np.random.default_rng(seed)
-    sources: list[tuple[str, Path | None]] = [("default job", None), *((one.stem, one) for one in look or [])]
     rows = []
-    for name, file in sources:
-        ours = cutting.kept_of_job(cutting.read_job(file, frames, seed), _MM_PER_PX, cache)
+    for name, file in cutting.name_jobs(look):
+        ours = cutting.kept_of_job(cutting.read_job(file, frames, seed), cutting.MM_PER_PX, cache)
         pictures = np.concatenate([theirs.pictures, ours.pictures])
         label = np.repeat([0, 1], [len(theirs.pictures), len(ours.pictures)])
         fold = np.concatenate([region, ours.places[:, 0].astype(np.int64) % _FOLDS])
@@ -61,7 +60,7 @@ def classifier(
     rows.append(
         {"crops": "control: photograph, itself", **held_out(theirs.pictures, label, region, epochs, seed)}
     )
-    return {"side_px": cutting.SIDE_PX, "mm_per_px": _MM_PER_PX, "epochs": epochs, "rows": rows}
+    return {"side_px": cutting.SIDE_PX, "mm_per_px": cutting.MM_PER_PX, "epochs": epochs, "rows": rows}
 
 
 def held_out(

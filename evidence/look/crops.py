@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from evidence import kept
 from evidence.render.case import case
-from evidence.render.realism import scaled_photograph
+from evidence.render.realism import outlined, scaled_photograph
 from synth.errors import UserError
 from synth.job import reader
 from synth.job.identity import identify_job
@@ -25,11 +25,8 @@ Picture = npt.NDArray[np.uint8]
 
 SIDE_PX = 128
 _NOISE, _QUALITY = 2.0, 90  # grey levels; of JPEG
-OUTLINE = (
-    "0.2,0.56 0.29,0.31 0.39,0.19 0.52,0.16 0.6,0.29 0.67,0.42 0.71,0.6 0.67,0.73 0.6,0.86 0.47,0.91"
-    " 0.37,0.86 0.28,0.76"
-)
-"""Of the cortex in the reference photograph, as shares of its width and height."""
+MM_PER_PX = 0.0547
+"""Of all crops."""
 
 
 @dataclass(frozen=True)
@@ -49,10 +46,7 @@ def of_photograph(photo: Path, outline: str, width_mm: float, mm_per_px: float, 
         UserError: it is no picture, or no crop fits.
     """
     image = scaled_photograph(photo, width_mm / mm_per_px)
-    corners = np.array([[float(v) for v in pair.split(",")] for pair in outline.split()])
-    inside = np.zeros(image.shape[:2], np.uint8)
-    cv2.fillPoly(inside, [np.rint(corners * np.array(image.shape[1::-1])).astype(np.int32)], 1)
-    found = _cut(taken(image, 0), inside > 0, step)
+    found = _cut(taken(image, 0), outlined(outline, image.shape[:2]), step)
     if not found:
         raise UserError(f"{photo}: no crop of {SIDE_PX} px fits inside the outline")
     return Crops(np.stack([one for one, _ in found]), np.array([place for _, place in found], float))
@@ -91,6 +85,11 @@ def kept_of_job(job: Job, mm_per_px: float, cache: Path | None) -> Crops:
         np.savez(file, pictures=found.pictures, places=found.places)
     with np.load(file) as told:
         return Crops(told["pictures"], told["places"])
+
+
+def name_jobs(look: list[Path] | None) -> list[tuple[str, Path | None]]:
+    """What is compared, by name: the default job, then files as `synth fit` writes them."""
+    return [("default job", None), *((one.stem, one) for one in look or [])]
 
 
 def read_job(look: Path | None, frames: int, seed: int) -> Job:

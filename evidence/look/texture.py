@@ -17,12 +17,12 @@ import typer
 
 from evidence.look import crops as cutting
 from evidence.measuring import measuring
+from evidence.render.realism import OUTLINE
 from synth.errors import UserError
 
 Floats = npt.NDArray[np.float64]
 
 _REGIONS = 5
-_MM_PER_PX = 0.0547
 
 
 @measuring("cortex.jpg --python ps/bin/python", file="texture.json", out="docs/results/render/look")
@@ -34,22 +34,20 @@ def texture(
     ] = None,
     outline: Annotated[
         str, typer.Option(help="Polygon of the cortex in it, as shares: x,y x,y ...")
-    ] = cutting.OUTLINE,
+    ] = OUTLINE,
     width_mm: Annotated[float, typer.Option(help="What the photograph's width spans.")] = 110.0,
     frames: Annotated[int, typer.Option(min=2, help="Rendered sequences, one frame of each.")] = 5,
     seed: Annotated[int, typer.Option(help="Of the rendered jobs.")] = 31,
     cache: Annotated[Path | None, typer.Option(help="Folder that keeps rendered crops.")] = None,
 ) -> dict[str, Any]:
     """Distance of rendered crops' texture from a photograph's, in the spread of the photograph's own."""
-    theirs = cutting.of_photograph(photo, outline, width_mm, _MM_PER_PX)
-    sources: list[tuple[str, Path | None]] = [("default job", None)]
-    sources += [(one.stem, one) for one in look or []]
+    theirs = cutting.of_photograph(photo, outline, width_mm, cutting.MM_PER_PX)
     measured = described(theirs.pictures, python)
     own = own_distances(measured, cutting.regions(theirs.places, _REGIONS))
     limit = float(np.quantile(own, 0.9))
     rows = [_row("photograph, region left out", own, limit)]
-    for name, file in sources:
-        ours = cutting.kept_of_job(cutting.read_job(file, frames, seed), _MM_PER_PX, cache)
+    for name, file in cutting.name_jobs(look):
+        ours = cutting.kept_of_job(cutting.read_job(file, frames, seed), cutting.MM_PER_PX, cache)
         found = described(ours.pictures, python)
         rows.append(_row(name, distances(found, measured), limit))
     return {
