@@ -153,7 +153,7 @@ class Studio:
         camera = now.camera or self.camera
         tool = self._posed(now)
         moments = shutter or (now,)
-        radiance = self._gathered(moments, seed, 0.0)
+        radiance, light_right = self._gathered(moments, seed)
         shapes = (Shape(now.vertices, self.surface.faces), self.frame_of_opening, tool)
         seen = truth.now(camera, self.still, *shapes)
         extra: dict[str, Any] = {}
@@ -169,7 +169,7 @@ class Studio:
         if self._right is not None:
             baseline = self._render.stereo_mm
             other = truth.now(beside(camera, baseline), self._right, *shapes)
-            picture = self.develop(self._gathered(moments, seed + 1, baseline), seed + 1)
+            picture = self.develop(light_right, seed + 1)
             extra |= {"rgb_right": picture, "flow_right": other.flow}
             extra |= {"visible_right": other.visible, "depth_right": other.depth}
             extra |= {"motion": seen.motion, "tool_right": other.tool}
@@ -240,17 +240,25 @@ class Studio:
             return None
         return Shape(instrument.pose(self._tool, now.tips, now.shafts), self._tool.faces)
 
-    def _gathered(self, moments: Sequence[Moment], seed: int, baseline: float) -> Map:
-        """Mean light of some moments in the lens, or in one `baseline` mm to its right."""
-        pictures = []
+    def _gathered(self, moments: Sequence[Moment], seed: int) -> tuple[Map, Map]:
+        """Mean light of some moments in the lens and in the second one; zeros where there is none."""
+        left: list[Map] = []
+        right: list[Map] = []
         for k, moment in enumerate(moments):
             camera = moment.camera or self.camera
-            if baseline:
-                camera = beside(camera, baseline)
-            pictures.append(np.float32(moment.power) * self._expose(moment, camera, seed + 7919 * k))
-        return np.asarray(np.mean(pictures, axis=0), np.float32)
+            power = np.float32(moment.power)
+            stage = self._staged(moment)
+            left.append(power * self._expose(stage, camera, seed + 7919 * k))
+            if self._right is not None:
+                second = beside(camera, self._render.stereo_mm)
+                right.append(power * self._expose(stage, second, seed + 1 + 7919 * k))
+        return (
+            np.asarray(np.mean(left, axis=0), np.float32),
+            np.asarray(np.mean(right or np.zeros_like(left), axis=0), np.float32),
+        )
 
-    def _expose(self, moment: Moment, camera: Camera, seed: int) -> Map:
+    def _staged(self, moment: Moment) -> Stage:
+        """The stage with everything where it is at that moment."""
         tool = self._posed(moment)
         if self._stage is None:
             points = np.zeros((0, 3)) if tool is None else tool.vertices
@@ -261,8 +269,11 @@ class Studio:
             steel = self._steel(tool.vertices)
             self._stage.move("tool", steel.vertices)
             self._stage.mirror("tool", self._mirrored(steel))
+        return self._stage
+
+    def _expose(self, stage: Stage, camera: Camera, seed: int) -> Map:
         spot = light.spot(camera, self.camera, self._look.light)
-        return self._stage.render(seed % 2**32, camera) * spot[..., None]
+        return stage.render(seed % 2**32, camera) * spot[..., None]
 
     def bodies(self, vertices: Floats, tool: Floats) -> dict[str, Body]:
         """Everything in the scene with its material; vertices (V, 3) and (T, 3) mm as given."""

@@ -59,7 +59,9 @@ def in_process(job: Job, root: Path, work: Callable[..., None]) -> None:
 
 def start(root: Path, job: Job, work: str) -> subprocess.Popen[bytes]:
     """A run in a process of its own, which can be killed."""
+    # A shell that runs tests in its background has them ignore SIGINT, and every child of theirs.
     program = (
+        "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); "
         "import sys; sys.path[:0] = sys.argv[4:]; from pathlib import Path; import fake_run; "
         "fake_run.run_here(Path(sys.argv[1]), sys.argv[2], sys.argv[3])"
     )

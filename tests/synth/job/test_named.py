@@ -32,3 +32,17 @@ def test_each_is_what_it_is_called() -> None:
     assert endoscope.render.distortion[0] < -0.2
     assert living.fem.membrane.intact == 1
     assert living.fem.pulse.heart_mm[1] > 0
+
+
+def test_what_the_missions_ask_about_is_never_shown() -> None:
+    shown, look, mechanics = (
+        reader.load_job(name) for name in ("mission", "mission-unseen", "mission-mechanics")
+    )
+    assert not set(look.appearance.families) & set(shown.appearance.families)
+    assert look.anatomy.gyrus_mm[1] <= shown.anatomy.gyrus_mm[0]
+    assert look.anatomy.sulcus_mm[0] >= shown.anatomy.sulcus_mm[1]
+    assert look.fem == shown.fem
+    assert (shown.fem.contact, mechanics.fem.contact) == ("traction", "rigid")
+    assert shown.fem.pulse.heart_mm[1] == 0 < mechanics.fem.pulse.heart_mm[0]
+    assert mechanics.appearance.families == shown.appearance.families
+    assert len({job.seed for job in (shown, look, mechanics)}) == 3
