@@ -50,6 +50,7 @@ COMMANDS = {
     "stability learn": "evidence.learn.stability:stability",
     "experiment loading": "evidence.learn.throughput:loading",
     "experiment full-size": "evidence.learn.full_size:full_size",
+    "experiment foreign": "evidence.foreign.recordings:foreign",
     "experiment curves": "evidence.curves.experiment:experiment",
     "pareto learn": "evidence.learn.pareto:pareto",
     "experiment tune": "evidence.tune.experiment:experiment",

@@ -1,0 +1,1 @@
+"""Recordings that other programs make: mechanics by felupe, pictures by Blender, each in its own Python."""
