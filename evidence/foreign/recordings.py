@@ -72,13 +72,15 @@ def foreign(
             if not folder.exists():
                 with writer.write_whole_folder(folder) as part:
                     rng = np.random.default_rng([seed, KINDS.index(kind), index])
-                    _fill(part, kind, rng, (seconds, fps, spp), (mechanics_python, pictures_python))
+                    film, pythons = (seconds, fps, spp), (mechanics_python, pictures_python)
+                    _fill(part, folder.name, kind, rng, film, pythons)
             made.append(str(folder))
     return {"recordings": made}
 
 
 def _fill(
     part: Path,
+    name: str,
     kind: str,
     rng: np.random.Generator,
     film: tuple[float, float, int],
@@ -128,7 +130,7 @@ def _fill(
         {
             "scale_mm_per_px": _DISTANCE_MM / focal,
             "young_kpa": young,
-            "specimen": part.name,
+            "specimen": name,
             "sensor": {"axes": "camera", "acts_on": "tissue", "free_s": [[0.1, _STILL_S - 0.2]]},
             "sync": {"method": "clock"},
         },

@@ -95,6 +95,7 @@ def test_a_recording_says_the_force_that_was_put_in(
     peaks = [rows[np.argmax(seen * (np.abs(rows[:, 0] - t) < 0.75)), 3] for t in (2.75, 4.25, 5.75, 7.25)]
     assert [bool(peak > 0) for peak in peaks] == down
     assert (asked["mechanics"]["pulse_mm"] > 0) == (kind == "pulse")
+    assert opened.meta.specimen == f"{kind}-0"
     assert opened.meta.young_kpa == pytest.approx(asked["mechanics"]["young_kpa"])
 
 
