@@ -245,6 +245,8 @@ def apply(predictor: Predictor, motion: Motion, young_kpa: float | None = None) 
     ends = Ends(reader)
     for step in motion.steps:
         force, said = reader.read(step.flow, step.confidence, step.moved)
+        if not step.trusted:
+            reader.forget_last()
         frames.append(step.frame)
         times.append(step.time_s)
         forces.append(force if step.trusted else np.full(3, np.nan))

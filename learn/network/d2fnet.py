@@ -53,6 +53,9 @@ class Architecture(Section):
     prior: Literal["none", "channel", "residual"] = "none"
     """`channel`: it is also told the tractions by which a half-space would move so; `residual`: and they are
     its answer before anything is learnt, which it scales and corrects. Of one eye those across the view."""
+    window: Literal[1, 3, 5] = 1
+    """Frames whose displacement it is told: the present one and those before it, never a later one. Before
+    the first is the rest frame."""
 
     @model_validator(mode="after")
     def _stem_is_possible(self) -> Architecture:
@@ -68,12 +71,13 @@ class Architecture(Section):
     def _as_before(self, plain: SerializerFunctionWrapHandler) -> dict[str, Any]:
         """Without what came later and isn't used, so that models are written as they always were."""
         tree: dict[str, Any] = plain(self)
-        unused = {"depth": False, "prior": "none"}
+        unused = {"depth": False, "prior": "none", "window": 1}
         return {key: value for key, value in tree.items() if key not in unused or value != unused[key]}
 
     @property
     def inputs(self) -> int:
-        return 5 + self.confidence + self.depth * (1 + self.confidence)
+        now = 5 + self.confidence + self.depth * (1 + self.confidence)
+        return now + (self.window - 1) * self.displacements
 
     @property
     def displacements(self) -> int:

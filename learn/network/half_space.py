@@ -130,7 +130,7 @@ def kernel(cells: int, parts: int) -> Floats:
     half-space.
     """
     points = (np.arange(4) - 1.5) / 4
-    return np.mean([_at(cells, parts, y, x) for y in points for x in points], axis=0)
+    return np.asarray(np.mean([_at(cells, parts, y, x) for y in points for x in points], axis=0))
 
 
 def _at(cells: int, parts: int, y: float, x: float) -> Floats:
