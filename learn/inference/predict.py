@@ -16,6 +16,7 @@ from learn import checkpoint
 from learn.checkpoint import Card
 from learn.data.clips import FIELDS, has_depth
 from learn.data.grid import Grid, Resampler, centre, certainty, channels, windowed
+from learn.inference.shipped import find_model
 from learn.network.d2fnet import fused
 from learn.network.traced import Quick
 from learn.uncertainty.features import motion_features
@@ -290,7 +291,7 @@ def load_model(name: Path | str, device: str = "cpu", *, quick: bool = False) ->
     """A trained model, to be asked frame by frame (`Predictor`) or for a whole film (`predict_force`).
 
     Args:
-        name: the folder that `learn train` wrote.
+        name: the folder that `learn train` wrote, or `mono` or `stereo`, if they come with this version.
         device: PyTorch's name of where it runs.
         quick: spend a second on a graph that runs a fifth faster on a CPU.
 
@@ -303,6 +304,7 @@ def load_model(name: Path | str, device: str = "cpu", *, quick: bool = False) ->
 def load_predictor(
     model_dir: Path | str, device: torch.device | str = "cpu", quick: bool = False
 ) -> Predictor:
-    """A model folder as `learn train` writes it. Raises UserError if it is missing or corrupt."""
-    model, card = checkpoint.load_model(Path(model_dir))
+    """A model folder as `learn train` writes it, or the name of one that comes along. UserError if it is
+    missing or corrupt."""
+    model, card = checkpoint.load_model(find_model(model_dir))
     return Predictor(model, card, device, quick)

@@ -71,7 +71,8 @@ def _inverse(moved: Tensor, root: Tensor) -> Tensor:
     symmetric (Betti), so its spectrum is an interval, and no system is solved.
     """
     cells, parts = int(moved.shape[-1]), int(moved.shape[1])
-    waves, back, table = (value.to(moved) for value in _compliance(cells, parts))
+    # Cloned, so that an exported graph holds them once, not once a term.
+    waves, back, table = (value.to(moved).clone() for value in _compliance(cells, parts))
     top, terms = _filter(cells, parts)
     last, now = torch.zeros_like(moved), root * moved
     said = terms[0] * now

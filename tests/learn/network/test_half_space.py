@@ -174,6 +174,8 @@ def test_trained_read_and_exported(clips: list[Clip], tmp_path: Path, prior: str
     assert len(evaluate(predictor, clips[:1], "ideal").clips) == 1
     for kind in ("torchscript", "onnx"):
         assert export(predictor, tmp_path / kind, kind) < 1e-4
+        size = (tmp_path / kind).stat().st_size - (out / "weights.pt").stat().st_size
+        assert size < 1_000_000, "its constants once, not once a term"
 
 
 def test_the_traced_graph_says_the_same(tmp_path: Path) -> None:
