@@ -24,7 +24,7 @@ from torch import Tensor, nn
 from learn.checkpoint import Card
 from learn.data.grid import HALF_SURE_MM, SMOOTHING_MM, channels
 from learn.inference.predict import Predictor
-from learn.network.d2fnet import Architecture
+from learn.network.d2fnet import Architecture, D2FNet
 from synth.errors import UserError
 
 TOLERANCE = 1e-4
@@ -37,6 +37,8 @@ class Portable(nn.Module):
     def __init__(self, model: nn.Module, card: Card) -> None:
         super().__init__()
         self.model, self.card = model, card
+        if isinstance(model, D2FNet) and model.prior is not None:
+            model.prior.hold(card.settings.size, card.settings.arch.displacements)
 
     def forward(self, displacement: Tensor, mask: Tensor, *extra: Tensor) -> Tensor | tuple[Tensor, Tensor]:
         arch, more = self.card.settings.arch, list(extra)

@@ -1,4 +1,4 @@
-"""Networks that come with the package: `mono` of one eye, `stereo` of two; folders under `learn/models`."""
+"""Networks that come with the package: `mono` of one eye, `stereo` of two, each a folder in `MODELS`."""
 
 from __future__ import annotations
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import functools
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -27,6 +28,9 @@ SMOOTH = 1 / 36
 """Of the grid's width (1 mm of 36): the wave number whose inverse this is, is let through by half."""
 TERMS = 18
 """Products with the compliance a frame; what it says is then within 1% of Tikhonov's, of noise too."""
+
+
+_HELD = ("rows", "columns", "rows_back", "columns_back", "table")
 
 
 class HalfSpace(nn.Module):
@@ -47,6 +51,14 @@ class HalfSpace(nn.Module):
         """`displacement_mm` and `traction` [mN/mm²]: what 1 stands for; `extent_mm`: the grid's width."""
         self.gain.fill_(displacement_mm / (extent_mm * traction))
 
+    def hold(self, size: int, parts: int) -> None:
+        """Keeps what one grid needs with the module: an exported graph then has it once, not once a term.
+
+        `size`: N; `parts`: C. To be done to a copy: its weights hold it then, for ONNX knows those by name.
+        """
+        for name, value in zip(_HELD, _compliance(size // _fold(size), parts), strict=True):
+            self.register_buffer(name, value)
+
     def forward(self, moved: Tensor, mask: Tensor) -> Tensor:
         with torch.autocast(moved.device.type, enabled=False):
             shift, inside = moved.float(), mask.float()
@@ -54,7 +66,10 @@ class HalfSpace(nn.Module):
             fold = _fold(size)
             seen = F.avg_pool2d(inside, fold)
             mean = F.avg_pool2d(shift * inside, fold) / seen.clamp_min(1e-6)
-            said = _inverse(mean * (size // fold) * self.gain, seen.sqrt())
+            held = dict(self.named_buffers())
+            basis = [held[name] for name in _HELD if name in held]
+            basis = basis or [one.to(shift) for one in _compliance(size // fold, int(shift.shape[1]))]
+            said = _inverse(mean * (size // fold) * self.gain, seen.sqrt(), basis)
             said = F.interpolate(said, scale_factor=float(fold), mode="bilinear", align_corners=False)
             return said * inside
 
@@ -64,38 +79,37 @@ def _fold(size: int) -> int:
     return next(k for k in range(1, size + 1) if size % k == 0 and size // k <= CELLS)
 
 
-def _inverse(moved: Tensor, root: Tensor) -> Tensor:
+def _inverse(moved: Tensor, root: Tensor, basis: Sequence[Tensor]) -> Tensor:
     """Tractions (B, C, M, M) that explain displacements in cells, both weighed by `root` (B, 1, M, M) twice.
 
     Tikhonov's S / (S² + λ) with S = root G root, as a Chebyshev polynomial of S: the compliance G is
     symmetric (Betti), so its spectrum is an interval, and no system is solved.
     """
-    cells, parts = int(moved.shape[-1]), int(moved.shape[1])
-    # Cloned, so that an exported graph holds them once, not once a term.
-    waves, back, table = (value.to(moved).clone() for value in _compliance(cells, parts))
-    top, terms = _filter(cells, parts)
+    top, terms = _filter(int(moved.shape[-1]), int(moved.shape[1]))
     last, now = torch.zeros_like(moved), root * moved
     said = terms[0] * now
     for k, term in enumerate(terms[1:]):
-        step = root * _moved(root * now, waves, back, table) * (2 / top) - now
+        step = root * _moved(root * now, basis) * (2 / top) - now
         last, now = now, (2 * step - last if k else step)
         said = said + term * now
     return root * said
 
 
-def _moved(traction: Tensor, waves: Tensor, back: Tensor, table: Tensor) -> Tensor:
+def _moved(traction: Tensor, basis: Sequence[Tensor]) -> Tensor:
     """What tractions (B, C, M, M) move, in cells: a convolution by products with cosines and sines, which,
     unlike a Fourier transform, every program that reads ONNX knows."""
-    parts, half = int(traction.shape[1]), len(waves) // 2
-    wave = (waves @ traction @ waves.T).reshape(-1, parts, 2, half, 2, half).transpose(3, 4)
+    rows, columns, rows_back, columns_back, table = basis
+    parts, half = int(traction.shape[1]), int(table.shape[-1])
+    wave = (rows @ traction @ columns).reshape(-1, parts, 2, half, 2, half).transpose(3, 4)
     wave = (table * wave.reshape(-1, 1, 4 * parts, half, half)).sum(2)
     wave = wave.reshape(-1, parts, 2, 2, half, half).transpose(3, 4)
-    return back.T @ wave.reshape(-1, parts, 2 * half, 2 * half) @ back
+    return rows_back @ wave.reshape(-1, parts, 2 * half, 2 * half) @ columns_back
 
 
 @functools.lru_cache(maxsize=8)
-def _compliance(cells: int, parts: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Cosines and sines (2K, M), the same weighed for the way back, and (4C, 4C, K, K) between them."""
+def _compliance(cells: int, parts: int) -> tuple[Tensor, ...]:
+    """`_HELD`: cosines and sines, (2K, M) for rows and (M, 2K) for columns; weighed for the way back, (M, 2K)
+    and (2K, M); and (4C, 4C, K, K) from those of tractions to those of what they move."""
     # Twice the cells: what is moved at one edge must not come in again at the other.
     k = np.arange(cells + 1) * math.pi / cells
     at, away = np.outer(k, np.arange(cells)), np.outer(k, np.arange(1 - cells, cells))
@@ -104,9 +118,9 @@ def _compliance(cells: int, parts: int) -> tuple[Tensor, Tensor, Tensor]:
     trig, turn = np.stack([np.cos(away), np.sin(away)]), np.array([[[1, 0], [0, 1]], [[0, -1], [1, 0]]])
     spectrum = np.einsum("dcyx,pky,qlx->dcpqkl", kernel(cells, parts), trig, trig, optimize=True)
     table = np.einsum("dcpqkl,prs,qtu->drtcsukl", spectrum, turn, turn, optimize=True)
-    found = waves, waves * weight, table.reshape(4 * parts, 4 * parts, len(k), len(k))
-    first, second, third = (torch.from_numpy(v.astype(np.float32)) for v in found)
-    return first.reshape(-1, cells), second.reshape(-1, cells), third
+    rows, back = waves.reshape(-1, cells), (waves * weight).reshape(-1, cells)
+    found = rows, rows.T, back.T, back, table.reshape(4 * parts, 4 * parts, len(k), len(k))
+    return tuple(torch.from_numpy(np.array(one, np.float32, order="C")) for one in found)
 
 
 @functools.lru_cache(maxsize=8)

@@ -18,6 +18,7 @@ from learn.data.clips import Clip
 from learn.data.grid import windowed
 from learn.data.split import nested
 from learn.evaluation.evaluate import evaluate
+from learn.inference.apply import Motion, Step, apply
 from learn.inference.export import examples, export
 from learn.inference.force_reader import ForceReader
 from learn.inference.predict import Predictor, load_predictor
@@ -98,6 +99,17 @@ def test_a_frame_that_was_lost_is_as_if_it_had_not_been(model: Path, film: Film)
     two.read(100 * film[2], None)
     two.forget_last()
     assert np.array_equal(one.read(film[6], None)[0], two.read(film[6], None)[0])
+
+
+def test_a_film_with_a_lost_frame_is_read_as_if_without_it(model: Path, film: Film) -> None:
+    def told(frames: list[int]) -> Motion:
+        steps = (Step(film[t] if t != 3 else 100 * film[3], None, t, t / 10, t != 3) for t in frames)
+        return Motion("film", steps, TISSUE, SCALE, 2.0)
+
+    predictor = load_predictor(model)
+    lost, without = apply(predictor, told([*range(7)])), apply(predictor, told([0, 1, 2, 4, 5, 6]))
+    assert np.isnan(lost["total_force_mn"][3])
+    np.testing.assert_array_equal(np.delete(lost["density"], 3, axis=0), without["density"])
 
 
 def test_a_network_of_one_frame_remembers_nothing(tmp_path: Path, film: Film) -> None:
