@@ -48,7 +48,10 @@ def score(
     recording: Annotated[
         Path, typer.Argument(help="Recording folder: meta.yaml, video or frames, force.csv.")
     ],
-    model: Annotated[Path, typer.Option("--model", "-m", help="Model folder of `learn train`.")],
+    model: Annotated[
+        Path | None,
+        typer.Option("--model", "-m", help="Model folder of `learn train`, mono or stereo (`learn models`)."),
+    ] = None,
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="Folder for score.json and report.html; NAME-score.")
     ] = None,
@@ -281,7 +284,9 @@ def flow(
 @app.command(epilog="Example: bench live video.mp4 --model model --scale 0.05 --young 1.5")
 def live(
     video: Annotated[Path, typer.Argument(help="Video; its first frame is the rest frame.")],
-    model: Annotated[Path | None, typer.Option("--model", "-m", help="Model folder: forces too.")] = None,
+    model: Annotated[
+        Path | None, typer.Option("--model", "-m", help="Model folder, mono or stereo: forces too.")
+    ] = None,
     scale: Annotated[
         str | None, typer.Option(help="mm a pixel of the video, or unknown; needed with a model.")
     ] = None,
@@ -303,11 +308,14 @@ def live(
     from bench.tracking import live as stream
     from learn.inference.mask_files import read_choice
     from learn.inference.scale import UNKNOWN_NOTE, read_scale
+    from learn.inference.shipped import choose_model
     from learn.inference.video import FPS, read_video
     from learn.inference.video_flow import Footage
     from learn.training.threads import set_threads
 
     kind, files = read_choice(masks)
+    # Without a scale there is no force: flow alone is what is asked for.
+    model = model or (choose_model(two_eyes=False) if scale else None)
     method = None if model is None else Model(model, quick=True)
 
     def tell(frame: stream.Frame) -> None:

@@ -1,11 +1,13 @@
 """A trained model on disk: a folder with config.json, weights.pt, history.jsonl and what resuming needs.
 
-The card, config.json, holds a hash of the weights and one of itself, so that neither can change unseen.
+A model that comes with the package has weights.safetensors instead, which any program can read. The card,
+config.json, holds a hash of the weights and one of itself, so that neither can change unseen.
 """
 
 from __future__ import annotations
 
 import hashlib
+import importlib
 import io
 import json
 import os
@@ -35,7 +37,7 @@ _FORMAT, _VERSION = "sulcus-model", 1
 _LARGEST_BYTES = 100_000_000
 """Of config.json, which names the sequences that were trained on: a million of them."""
 _LARGEST_WEIGHTS = 64 << 30
-_WEIGHTS, _NEXT = "weights.pt", "weights.next.pt"
+_WEIGHTS, _NEXT, _SAFE = "weights.pt", "weights.next.pt", "weights.safetensors"
 SEEN = ("fit", "select", "intervals")
 """Parts of `Card.split` that no score of the model may be of."""
 
@@ -59,7 +61,7 @@ class Card:
     score: FiniteFloat = 0.0
     """R² on the select sequences at the chosen epoch."""
     weights_hash: str = ""
-    """Of weights.pt; empty before an epoch is kept, and in folders from before there were hashes."""
+    """Of the file of weights; empty before an epoch is kept, and in folders from before there were hashes."""
     intervals: Intervals | None = None
     """How far off its answers may be; None where nobody fitted that, or it could not be."""
     no_intervals: str = ""
@@ -79,11 +81,18 @@ def write_card(folder: Path, card: Card) -> None:
     _write(folder / "config.json", (json.dumps(tree, indent=1) + "\n").encode())
 
 
-def write_model(folder: Path, card: Card, state: Mapping[str, Tensor]) -> Card:
-    """Writes weights and card, so that a kill leaves the old ones or the new ones; the card as written."""
+def write_model(folder: Path, card: Card, state: Mapping[str, Tensor], *, safe: bool = False) -> Card:
+    """Writes weights and card, so that a kill leaves the old ones or the new ones; the card as written.
+
+    `safe`: as weights.safetensors, into a folder that holds no model yet.
+    """
     folder.mkdir(parents=True, exist_ok=True)
-    data = _packed(state)
+    data = _safetensors().save({k: v.contiguous() for k, v in state.items()}) if safe else _packed(state)
     card = replace(card, weights_hash=_hash(data))
+    if safe:
+        _write(folder / _SAFE, data)
+        write_card(folder, card)
+        return card
     _write(folder / _NEXT, data)
     write_card(folder, card)
     os.replace(folder / _NEXT, folder / _WEIGHTS)
@@ -134,7 +143,10 @@ def load_tensors(file: Path) -> dict[str, Any]:
     if not file.exists():
         raise UserError(f"{file}: missing")
     foreign_file.check_file(file, _LARGEST_WEIGHTS)
+    safe = _safetensors() if file.suffix == ".safetensors" else None
     try:
+        if safe is not None:
+            return dict(safe.load_file(file))
         _check_archive(file)
         tree = torch.load(file, map_location="cpu", weights_only=True)
     except Exception as error:  # archive, unpickler and tensors have no common error for damage
@@ -190,15 +202,14 @@ def room_needed(folder: Path, arch: Architecture) -> int:
 
 def _find_weights(folder: Path, card: Card) -> Path:
     """The weights that the card was written for: under their next name if a kill came in between."""
-    for file in (folder / _WEIGHTS, folder / _NEXT):
+    for file in (folder / _WEIGHTS, folder / _NEXT, folder / _SAFE):
         if file.is_file():
             with file.open("rb") as opened:
                 if hashlib.file_digest(opened, _hasher).hexdigest() == card.weights_hash:
                     return file
-    if not (folder / _WEIGHTS).exists():
-        raise UserError(f"{folder / _WEIGHTS}: missing")
-    load_tensors(folder / _WEIGHTS)  # may say more of what is wrong
-    raise UserError(f"{folder / _WEIGHTS}: not the weights that config.json was written for, or damaged")
+    file = folder / (_SAFE if (folder / _SAFE).exists() else _WEIGHTS)
+    load_tensors(file)  # may say more of what is wrong
+    raise UserError(f"{file}: not the weights that config.json was written for, or damaged")
 
 
 def _check_archive(file: Path) -> None:
@@ -212,6 +223,13 @@ def _check_archive(file: Path) -> None:
         damaged = archive.testzip()
     if damaged is not None:
         raise ValueError(f"a checksum of {damaged} does not match")
+
+
+def _safetensors() -> Any:
+    try:
+        return importlib.import_module("safetensors.torch")
+    except ImportError:
+        raise UserError("weights.safetensors needs a package: pip install safetensors") from None
 
 
 def _packed(tree: Mapping[str, Any]) -> bytes:

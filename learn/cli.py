@@ -1,5 +1,5 @@
-"""`learn train | intervals | eval | predict | calibrate | export`: from a dataset to a model, honest numbers,
-forces and a file."""
+"""`learn train | intervals | eval | predict | calibrate | export | models`: from a dataset to a model, honest
+numbers, forces and a file."""
 
 from __future__ import annotations
 
@@ -240,6 +240,7 @@ def intervals_command(
     json: Json = False,
 ) -> None:
     """Fit how far off a trained model's answers may be, on sequences that it was not fitted or chosen on."""
+    from learn.checkpoint import read_card
     from learn.data.clips import load_clips, scored
     from learn.data.split import ungrouped
     from learn.evaluation.fit_intervals import add_intervals
@@ -249,6 +250,7 @@ def intervals_command(
     from synth.dataset.index import written_sides
 
     set_threads(threads)
+    read_card(model)  # his own: what comes along is not changed
     predictor = load_predictor(model)
     source = predictor.readable(input or scored(predictor.card.settings.input))
     with _bar("Reading sequences") as tell:
@@ -369,8 +371,13 @@ def _unseen(clips: list[Clip], dataset: Path, cards: list[Card]) -> list[Clip]:
 
 @app.command("predict", epilog="Example: learn predict model video.mp4 --scale 0.05 --young 1.5")
 def predict_command(
-    model: Annotated[Path, typer.Argument(help="Model folder.")],
-    source: Annotated[Path, typer.Argument(help="Dataset, NNNNNN.zarr store, video, or .npz of flow.")],
+    model: Annotated[
+        Path, typer.Argument(help="Model folder, mono or stereo; may be left out if one of these is there.")
+    ],
+    source: Annotated[
+        Path | None,
+        typer.Argument(help="Dataset, NNNNNN.zarr store, video, or .npz of flow.", show_default=False),
+    ] = None,
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for NAME.npz and .force.csv.")] = Path(
         "forces"
     ),
@@ -409,15 +416,22 @@ def predict_command(
     json: Json = False,
 ) -> None:
     """Write the force maps and force curves that a model sees in stores, videos or arrays of flow."""
-    from learn.inference.apply import Filmed, apply, motions
+    from learn.inference.apply import Filmed, apply, has_second_eye, motions
     from learn.inference.mask_files import read_choice
     from learn.inference.predict import load_predictor
     from learn.inference.prediction_file import write_overlay, write_prediction
     from learn.inference.scale import read_scale
+    from learn.inference.shipped import NONE, choose_model, shipped
     from learn.inference.video_flow import Settings
     from learn.training.threads import set_threads
 
     set_threads(threads)
+    if source is None:
+        source = model
+        chosen = choose_model(has_second_eye(source)) if shipped() else None
+        if chosen is None:
+            raise UserError(f"{source}: say the model's folder before it: {NONE}")
+        model = chosen
     predictor = load_predictor(model, quick=True)
     kind, files = read_choice(masks)
     filmed = Filmed(read_scale(scale), tissue, Settings(flow, shrink, rate or None, pulse, kind), files)
@@ -486,6 +500,33 @@ def export_command(
 
     worst = export(load_predictor(model), file, format)
     _console.print(f"{file}: differs from PyTorch by at most {worst:.1e} of full scale")
+
+
+@app.command("models", epilog="Example: learn models")
+def models_command(json: Json = False) -> None:
+    """List the networks that come with this version."""
+    from learn.checkpoint import read_card
+    from learn.inference.shipped import NONE, describe, hash_data, shipped, size_bytes
+
+    found = {name: (folder, read_card(folder)) for name, folder in shipped().items()}
+    if json:
+        rows = [
+            {
+                "name": name,
+                "folder": str(folder),
+                "bytes": size_bytes(folder),
+                "data": hash_data(card),
+                "eyes": 2 if card.settings.arch.depth else 1,
+                "select_r2": card.score,
+            }
+            for name, (folder, card) in found.items()
+        ]
+        print(json_.dumps(rows))
+        return
+    for name, (folder, card) in found.items():
+        print(f"{name}: {describe(card)}, {size_bytes(folder) / 1e6:.1f} MB ({folder / 'README.md'})")
+    if not found:
+        print(NONE)
 
 
 def _table(report: Report, source: str, seen: bool) -> Table:

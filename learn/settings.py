@@ -72,6 +72,8 @@ class Settings(Section):
     def _goes_together(self) -> Settings:
         if self.target == "intensity" and self.arch.output != "magnitude":
             raise ValueError("target 'intensity' has no direction: it needs output 'magnitude'")
+        if self.target == "intensity" and self.arch.prior != "none":
+            raise ValueError("arch.prior is a density: it goes with target 'density'")
         if self.arch.depth != has_depth(self.input):
             raise ValueError(f"input {self.input!r} goes with arch.depth {str(not self.arch.depth).lower()}")
         halved = self.arch.stem * 2**self.arch.levels

@@ -22,6 +22,7 @@ from bench.scoring.evaluate_recording import Result, Settings
 from bench.tracking import flow_process
 from learn.inference.mask_files import MaskFiles
 from learn.inference.predict import Predictor
+from learn.inference.shipped import NONE, choose_model, find_model, shipped
 from synth.dataset.store import Dataset, Sequence
 from synth.errors import UserError
 from synth.system import whole_file
@@ -65,7 +66,8 @@ def score(
 
     Args:
         recording: its folder.
-        model: of `learn.load_model`, or its folder; it is called D2FNet in the tables.
+        model: of `learn.load_model`, its folder, mono or stereo; it is called D2FNet in the tables. Where
+            neither it nor methods are given, what comes with this version.
         methods: further ones by name; the first is what the result is about where there is no model.
         baselines: whether the simpler methods are scored beside.
         train: the dataset the model was trained on; those that need data are fitted on the same sequences.
@@ -80,18 +82,19 @@ def score(
     Raises:
         UserError: recording, model or settings that can't be used, or nothing to score.
     """
-    if model is None and not methods:
+    if model is None and not methods and not shipped():
         raise UserError("score: nothing to score; give a model or methods")
     if train is not None and (model is None or isinstance(model, Predictor)):
         raise UserError("score: train needs the model's folder, which says what it was fitted on")
+    opened = open_recording(Path(recording))
+    if not methods and not isinstance(model, Predictor):
+        model = _folder(model, opened)
     network = None if model is None else Model(model if isinstance(model, Predictor) else Path(model))
     chosen: dict[str, Method] = {MAIN: network} if network else {}
     chosen |= methods or {}
-    opened = open_recording(Path(recording))
     if baselines:
         folder = Path(model) if isinstance(model, (str, Path)) else None
-        two_eyes = bool(opened.right or opened.depths)
-        simple = fit_baselines(Path(train) if train else None, folder, two_eyes)
+        simple = fit_baselines(Path(train) if train else None, folder, _two_eyes(opened))
         chosen = {**chosen, **{name: one for name, one in simple.items() if name not in chosen}}
     bar = counting(f"scoring {opened.name}", opened.expected_frames()) if progress else nullcontext(_untold)
     with bar as told:
@@ -110,6 +113,18 @@ def score(
     return result
 
 
+def _two_eyes(opened: Recording) -> bool:
+    return bool(opened.right or opened.depths)
+
+
+def _folder(model: str | Path | None, opened: Recording) -> Path:
+    """Of the model to score: the one named, else what comes along for so many eyes. UserError if nothing."""
+    found = choose_model(_two_eyes(opened)) if model is None else find_model(model)
+    if found is None:
+        raise UserError(f"say --model: {NONE}")
+    return found
+
+
 def _untold(done: int) -> None:
     """A progress that nobody is told of."""
 
@@ -126,7 +141,7 @@ def write_result(result: Result, folder: Path, title: str) -> None:
 
 def score_recording(
     recording: Path,
-    model: Path,
+    model: Path | None,
     out: Path | None,
     settings: Settings,
     title: str = "",
@@ -139,7 +154,7 @@ def score_recording(
 
     Args:
         recording: its folder.
-        model: folder of `learn train`.
+        model: folder of `learn train`, mono or stereo; None: what comes with this version.
         train: the dataset the model was trained on; simpler methods are fitted on the same sequences.
         also: further models by name.
         out: folder for the results; `NAME-score` here if None.
@@ -156,9 +171,10 @@ def score_recording(
     # NumPy's BLAS too: a second thread of its own waits for a core that the flow has.
     threadpool_limits(set_threads(None))
     opened = seen.within(open_recording(recording, phantom))
+    chosen = _folder(model, opened)
     folder = out or Path(f"{opened.name}-score")
     with whole_file.made_folder(folder, _ROOM_BYTES):
-        result = _score(opened, model, settings, train, also)
+        result = _score(opened, chosen, settings, train, also)
         write_result(result, folder, title)
     return result
 
@@ -173,7 +189,7 @@ def _score(
         network = Model(model, quick=True)
         methods: dict[str, Method] = {MAIN: network}
         methods |= {name: Model(folder, quick=True) for name, folder in (also or {}).items()}
-        methods |= fit_baselines(train, model, bool(opened.right or opened.depths))
+        methods |= fit_baselines(train, model, _two_eyes(opened))
         found = pixel_scale.find_scale(opened.meta, opened.folder)
         with counting(f"scoring {opened.name}", total) as progress:
             about: dict[str, object] = {"model": network.described()}
@@ -208,7 +224,7 @@ def fit_baselines(train: Path | None, model: Path | None, two_eyes: bool = False
     from learn.checkpoint import read_card
     from learn.data.clips import read_clip
 
-    hashes = set(read_card(model).split.get("fit", []))
+    hashes = set(read_card(find_model(model)).split.get("fit", []))
     chosen = [s for s in Dataset(train) if s.attrs["content_hash"] in hashes]
     if not chosen:
         raise UserError(f"{train}: holds none of the sequences that {model} was fitted on")
@@ -255,7 +271,7 @@ def find_unseen(dataset: Path, model: Path) -> Sequence:
     """The first sequence that the model was neither fitted nor chosen on. UserError if there is none."""
     from learn.checkpoint import SEEN, read_card
 
-    split = read_card(model).split
+    split = read_card(find_model(model)).split
     seen = {name for part in SEEN for name in split.get(part, [])}
     for sequence in Dataset(dataset):
         if sequence.attrs["content_hash"] not in seen:

@@ -101,6 +101,17 @@ def motions(path: Path, source: str, filmed: Filmed | None = None) -> Iterator[M
             yield _stored(sequence, source)
 
 
+def has_second_eye(path: Path) -> bool:
+    """Whether what `motions` reads tells of motion in three dimensions; of a dataset its first sequence."""
+    if path.suffix.lower() in video.SUFFIXES:
+        return False
+    if path.suffix == ".npz":
+        return "motion" in foreign_arrays.read_arrays(path)
+    stored = path.name.endswith((".zarr", ".zarr.part"))
+    first = open_sequence(path) if stored else next(iter(Dataset(path)), None)
+    return first is not None and FIELDS["motion"] in first
+
+
 def _stored(sequence: Sequence, source: str) -> Motion:
     if source not in FIELDS:
         raise UserError(f"unknown input {source!r}: {', '.join(FIELDS)}")
@@ -245,6 +256,8 @@ def apply(predictor: Predictor, motion: Motion, young_kpa: float | None = None) 
     ends = Ends(reader)
     for step in motion.steps:
         force, said = reader.read(step.flow, step.confidence, step.moved)
+        if not step.trusted:
+            reader.forget_last()
         frames.append(step.frame)
         times.append(step.time_s)
         forces.append(force if step.trusted else np.full(3, np.nan))

@@ -2,10 +2,11 @@
 
 The file's input is displacement in mm on the grid, not the channels, so that nobody has to rebuild them:
 `displacement` (B, 2, N, N) mm and `mask` (B, 1, N, N) 0/1 (for some models `confidence` (B, 1, N, N) 0..1 and
-`log_young` (B, 1) ln(E/kPa); of two eyes `displacement` (B, 3, N, N) and `confidence` (B, 2, N, N)). Its
-output is force density per unit stiffness (B, C, N, N) [mN/mm² at 1 kPa]. Times E in kPa it is mN/mm², times
-the cell's area and summed, mN. A network with a total-force head gives that too, (B, C) [mN at 1 kPa]. How a
-picture's flow comes onto the grid is written into the .json beside it.
+`log_young` (B, 1) ln(E/kPa); of two eyes `displacement` (B, 3, N, N) and `confidence` (B, 2, N, N); with a
+window earlier frames' displacement behind the present one's, latest first). Its output is force density per
+unit stiffness (B, C, N, N) [mN/mm² at 1 kPa]. Times E in kPa it is mN/mm², times the cell's area and summed,
+mN. A network with a total-force head gives that too, (B, C) [mN at 1 kPa]. How a picture's flow comes onto
+the grid is written into the .json beside it.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from torch import Tensor, nn
 from learn.checkpoint import Card
 from learn.data.grid import HALF_SURE_MM, SMOOTHING_MM, channels
 from learn.inference.predict import Predictor
-from learn.network.d2fnet import Architecture
+from learn.network.d2fnet import Architecture, D2FNet
 from synth.errors import UserError
 
 TOLERANCE = 1e-4
@@ -36,12 +37,17 @@ class Portable(nn.Module):
     def __init__(self, model: nn.Module, card: Card) -> None:
         super().__init__()
         self.model, self.card = model, card
+        if isinstance(model, D2FNet) and model.prior is not None:
+            model.prior.hold(card.settings.size, card.settings.arch.displacements)
 
     def forward(self, displacement: Tensor, mask: Tensor, *extra: Tensor) -> Tensor | tuple[Tensor, Tensor]:
         arch, more = self.card.settings.arch, list(extra)
         confidence = more.pop(0) if arch.confidence else None
         log_young = more.pop(0) if arch.condition == "film" else None
-        x = channels(displacement, mask, self.card.settings.grid.pitch_mm, self.card.scales, confidence)
+        now, earlier = displacement[:, : arch.displacements], None
+        if arch.window > 1:
+            earlier = displacement[:, arch.displacements :]
+        x = channels(now, mask, self.card.settings.grid.pitch_mm, self.card.scales, confidence, earlier)
         said = self.model(x, log_young)
         if arch.total:
             return said[0] * self.card.scales.target, said[1] * self.card.scales.force
@@ -62,7 +68,7 @@ def examples(card: Card, batch: int, seed: int = 0) -> list[Tensor]:
     rng = np.random.default_rng(seed)
     y, x = np.meshgrid(np.linspace(-1, 1, n), np.linspace(-1, 1, n), indexing="ij")
     parts = card.settings.arch.displacements
-    a = rng.normal(size=(batch, parts, 6))
+    a = rng.normal(size=(batch, parts * card.settings.arch.window, 6))
     basis = np.stack([np.ones_like(x), x, y, x * y, np.cos(3 * x), np.sin(3 * y)])
     moved = np.einsum("bck,kyx->bcyx", a, basis) * card.scales.displacement_mm / 3
     mask = np.broadcast_to(x**2 + y**2 < 0.7, (batch, 1, n, n))
@@ -145,14 +151,25 @@ def describe(card: Card, kind: str, difference: float) -> dict[str, Any]:
 def _told(arch: Architecture) -> list[str]:
     """Where displacement, and the confidence of two eyes, come from."""
     if not arch.depth:
-        return ["flow [px] times the picture's scale [mm/px] is displacement [mm]; x right, y down"]
+        said = ["flow [px] times the picture's scale [mm/px] is displacement [mm]; x right, y down"]
+        return said + _windowed(arch)
     said = ["displacement [mm] is motion in camera axes, x right, y down, z away, as a second eye gives it"]
     if arch.confidence:
         said.append(
             "confidence, across and along the view: means over tissue of 1 / (1 + (s / s0)^2), "
             f"s0 = {HALF_SURE_MM} mm, s the motion's standard deviation [mm] (of dx and dy the rms)"
         )
-    return said
+    return said + _windowed(arch)
+
+
+def _windowed(arch: Architecture) -> list[str]:
+    """In which order frames are told, to a network that is told several."""
+    if arch.window == 1:
+        return []
+    return [
+        f"displacement holds {arch.window} frames of {arch.displacements} components: the present one, then "
+        "those before it, the latest first; zeros stand for what was before the rest frame"
+    ]
 
 
 def _torchscript(module: Portable, card: Card, file: Path) -> Any:

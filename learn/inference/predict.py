@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,8 @@ from torch import nn
 from learn import checkpoint
 from learn.checkpoint import Card
 from learn.data.clips import FIELDS, has_depth
-from learn.data.grid import Grid, Resampler, centre, certainty, channels
+from learn.data.grid import Grid, Resampler, centre, certainty, channels, windowed
+from learn.inference.shipped import find_model
 from learn.network.d2fnet import fused
 from learn.network.traced import Quick
 from learn.uncertainty.features import motion_features
@@ -114,6 +115,8 @@ class Predictor:
     ) -> None:
         """`quick`: spend a second on a graph that runs a fifth faster on a CPU, for live use and films."""
         self.card, self.grid = card, card.settings.grid
+        self.window = card.settings.arch.window
+        """Frames that it is told at a time."""
         self.device = torch.device(device)
         self.model = fused(model).to(self.device)
         self._say: Callable[..., Any] = self.model
@@ -164,15 +167,17 @@ class Predictor:
         moved: Moved | None = None,
         *,
         centre_px: tuple[float, float] | None = None,
+        before: Sequence[tuple[NDArray[np.float32], Moved | None]] = (),
     ) -> ForceMap:
         """Force map of one frame.
 
         `flow`: (H, W, 2) px, motion from the rest frame on the rest frame's pixels; `tissue`: (H, W) bool;
         `young_kpa`: None stands for the training data's typical value; `confidence`: (H, W) 0..1, used only
         by a model with that channel (1 if not given); `moved`: motion in three dimensions and its deviation,
-        which a model of two eyes is told instead of flow and confidence; `centre_px`: as of `View`. Raises
-        UserError for other shapes or values that aren't finite, and where such a model is told of one eye
-        alone.
+        which a model of two eyes is told instead of flow and confidence; `centre_px`: as of `View`; `before`:
+        flow and motion of the frames before this one, in order, for a model with a window: what is missing is
+        taken for the rest frame. Raises UserError for other shapes or values that aren't finite, and where
+        such a model is told of one eye alone.
         """
         if young_kpa is not None and not (np.isfinite(young_kpa) and young_kpa > 0):
             raise UserError(f"young_kpa {young_kpa}: must be positive")
@@ -180,7 +185,9 @@ class Predictor:
         displacement, sure = self.on_grid(view, flow, confidence, moved)
         young = young_kpa or self.card.typical_young_kpa
         known = None if sure is None else sure[None]
-        density, total = self.answer(displacement[None], view.mask, young, known)
+        past = [self.on_grid(view, seen, None, space)[0] for seen, space in before]
+        history = np.stack(past) if past else None
+        density, total = self.answer(displacement[None], view.mask, young, known, history)
         head = None if total is None else total[0]
         motion = None
         if self.card.intervals is not None:
@@ -234,13 +241,15 @@ class Predictor:
         mask: NDArray[np.float32],
         young_kpa: float,
         confidence: NDArray[np.float32] | None = None,
+        before: NDArray[np.float32] | None = None,
     ) -> tuple[NDArray[np.float32], NDArray[np.float64] | None]:
         """Force density of frames already on the grid, and their total force if the network has that head.
 
         `displacement`: (T, 2, N, N) mm, of a model of two eyes (T, 3, N, N); `mask`: (N, N) 0/1;
-        `confidence`: (T, 1, N, N), with depth (T, 2, N, N). Returns (T, C, N, N) mN/mm² at `young_kpa` and
-        (T, C) mN or None. Raises UserError for another grid or number of components, and for displacement or
-        an answer that isn't finite.
+        `confidence`: (T, 1, N, N), with depth (T, 2, N, N). To a model with a window the frames are one
+        film's, in order, and `before` (K, 2|3, N, N) mm those before it. Returns (T, C, N, N) mN/mm² at
+        `young_kpa` and (T, C) mN or None. Raises UserError for another grid or number of components, and for
+        displacement or an answer that isn't finite.
         """
         n, settings, scales = self.grid.size, self.card.settings, self.card.scales
         parts = settings.arch.displacements
@@ -249,11 +258,12 @@ class Predictor:
                 f"this model takes displacement of shape (T, {parts}, {n}, {n}) "
                 f"[{', '.join(('dx', 'dy', 'dz')[:parts])} in mm], got {displacement.shape}"
             )
-        if not np.isfinite(displacement).all():
+        if not np.isfinite(displacement).all() or not (before is None or np.isfinite(before).all()):
             raise UserError("displacement holds NaN or infinity")
+        told = windowed(displacement, settings.arch.window, before)
         maps, totals = [], []
-        for start in range(0, len(displacement), settings.batch):
-            u = torch.from_numpy(np.array(displacement[start : start + settings.batch])).to(self.device)
+        for start in range(0, len(told), settings.batch):
+            u = torch.from_numpy(np.array(told[start : start + settings.batch])).to(self.device)
             m = torch.from_numpy(np.array(mask)).to(self.device).expand(len(u), 1, n, n)
             sure = None
             if settings.arch.confidence:
@@ -262,7 +272,9 @@ class Predictor:
                     part = np.array(confidence[start : start + settings.batch])
                     sure = torch.from_numpy(part).to(self.device)
             log_young = torch.full((len(u), 1), float(np.log(young_kpa)), device=self.device)
-            said = self._say(channels(u, m, self.grid.pitch_mm, scales, sure), log_young)
+            earlier = u[:, parts:] if settings.arch.window > 1 else None
+            x = channels(u[:, :parts], m, self.grid.pitch_mm, scales, sure, earlier)
+            said = self._say(x, log_young)
             if settings.arch.total:
                 said, total = said
                 totals.append(total.double().cpu().numpy())
@@ -279,7 +291,7 @@ def load_model(name: Path | str, device: str = "cpu", *, quick: bool = False) ->
     """A trained model, to be asked frame by frame (`Predictor`) or for a whole film (`predict_force`).
 
     Args:
-        name: the folder that `learn train` wrote.
+        name: the folder that `learn train` wrote, or `mono` or `stereo`, if they come with this version.
         device: PyTorch's name of where it runs.
         quick: spend a second on a graph that runs a fifth faster on a CPU.
 
@@ -292,6 +304,7 @@ def load_model(name: Path | str, device: str = "cpu", *, quick: bool = False) ->
 def load_predictor(
     model_dir: Path | str, device: torch.device | str = "cpu", quick: bool = False
 ) -> Predictor:
-    """A model folder as `learn train` writes it. Raises UserError if it is missing or corrupt."""
-    model, card = checkpoint.load_model(Path(model_dir))
+    """A model folder as `learn train` writes it, or the name of one that comes along. UserError if it is
+    missing or corrupt."""
+    model, card = checkpoint.load_model(find_model(model_dir))
     return Predictor(model, card, device, quick)

@@ -17,6 +17,7 @@ from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, mod
 from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
+from learn.network.half_space import HalfSpace
 from synth.errors import UserError
 from synth.job.types import Positive, Section
 
@@ -49,6 +50,12 @@ class Architecture(Section):
     """Whether a further head reads the total force from the bottleneck, also what lies beyond the grid."""
     condition: Literal["none", "film"] = "none"
     """`film`: Young's modulus modulates the bottleneck (feature-wise affine; Perez et al. 2018)."""
+    prior: Literal["none", "channel", "residual"] = "none"
+    """`channel`: it is also told the tractions by which a half-space would move so; `residual`: and they are
+    its answer before anything is learnt, which it scales and corrects. Of one eye those across the view."""
+    window: Literal[1, 3, 5] = 1
+    """Frames whose displacement it is told: the present one and those before it, never a later one. Before
+    the first is the rest frame."""
 
     @model_validator(mode="after")
     def _stem_is_possible(self) -> Architecture:
@@ -56,22 +63,31 @@ class Architecture(Section):
             raise ValueError("a stem is 1, 2 or 4")
         if self.detail and (self.stem != 4 or self.name == "monai-unet"):
             raise ValueError("detail goes with a stem of 4")
+        if self.prior != "none" and self.name == "monai-unet":
+            raise ValueError("monai-unet has no prior")
         return self
 
     @model_serializer(mode="wrap")
     def _as_before(self, plain: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Without `depth` where there is none, so that one eye's models are written as they always were."""
+        """Without what came later and isn't used, so that models are written as they always were."""
         tree: dict[str, Any] = plain(self)
-        return tree if self.depth else {key: value for key, value in tree.items() if key != "depth"}
+        unused = {"depth": False, "prior": "none", "window": 1}
+        return {key: value for key, value in tree.items() if key not in unused or value != unused[key]}
 
     @property
     def inputs(self) -> int:
-        return 5 + self.confidence + self.depth * (1 + self.confidence)
+        now = 5 + self.confidence + self.depth * (1 + self.confidence)
+        return now + (self.window - 1) * self.displacements
 
     @property
     def displacements(self) -> int:
         """Components of the displacement that it is told."""
         return 3 if self.depth else 2
+
+    @property
+    def seen(self) -> int:
+        """Channels of the first convolution: `inputs`, and the prior."""
+        return self.inputs + self.displacements * (self.prior != "none")
 
     @property
     def components(self) -> int:
@@ -136,12 +152,15 @@ class Pyramid(nn.Module):
 class Heads(nn.Module):
     """Three bounded readings of the same features, mixed a pixel at a time by soft weights.
 
-    A magnitude is a sigmoid times its bound; a component has a sign and is a tanh times its bound.
+    A magnitude is a sigmoid times its bound; a component, or a correction, has a sign and is a tanh times its
+    bound.
     """
 
-    def __init__(self, inputs: int, components: int, bounds: tuple[float, float, float]) -> None:
+    def __init__(
+        self, inputs: int, components: int, bounds: tuple[float, float, float], signed: bool
+    ) -> None:
         super().__init__()
-        self.signed = components > 1
+        self.signed = signed
         self.components = components
         inner = max(inputs // 2, 4)
         self.features = nn.Conv2d(inputs, inner, 3, padding=1)
@@ -175,7 +194,7 @@ class Total(nn.Module):
 
 
 class D2FNet(nn.Module):
-    """(B, 5 to 8, N, N) channels → (B, 1|3, N, N) force map in units of `Scales.target`, 0 outside the mask.
+    """(B, `arch.inputs`, N, N) → (B, 1|3, N, N) force map in units of `Scales.target`, 0 outside the mask.
 
     With `arch.total` a pair: the map and (B, 1|3) total force in units of `Scales.force`.
     """
@@ -185,16 +204,17 @@ class D2FNet(nn.Module):
         self.arch = arch
         full = arch.name == "d2fnet"
         widths = [arch.width * 2**i for i in range(arch.levels + 1)]
-        first = arch.inputs
+        first = arch.seen
+        self.prior = HalfSpace() if arch.prior != "none" else None
         self.stem: nn.Module = nn.Identity()
         fine = arch.width // 2 if arch.detail else 0
         self.fine: nn.Module | None = None
         if arch.stem > 1:
             s = 2 if arch.detail else arch.stem
-            self.stem = nn.Conv2d(fine or arch.inputs, arch.width, 2 * s, stride=s, padding=s // 2)
+            self.stem = nn.Conv2d(fine or arch.seen, arch.width, 2 * s, stride=s, padding=s // 2)
             first = arch.width
         if fine:
-            self.fine = nn.Sequential(nn.Conv2d(arch.inputs, fine, 4, stride=2, padding=1), nn.ReLU())
+            self.fine = nn.Sequential(nn.Conv2d(arch.seen, fine, 4, stride=2, padding=1), nn.ReLU())
             self.rise = nn.ConvTranspose2d(arch.width, fine, 2, stride=2)
             self.draw = Block(2 * fine, fine, 0.0, False)
         self.down = nn.ModuleList(
@@ -208,20 +228,26 @@ class D2FNet(nn.Module):
             nn.ConvTranspose2d(a, b, 2, stride=2) for a, b in zip(widths[:0:-1], widths[-2::-1], strict=True)
         )
         self.merge = nn.ModuleList(Block(2 * b, b, arch.dropout, full) for b in widths[-2::-1])
+        residual = arch.prior == "residual"
         self.heads: nn.Module = (
-            Heads(fine or arch.width, arch.components, arch.bounds)
+            Heads(fine or arch.width, arch.components, arch.bounds, arch.components > 1 or residual)
             if full
             else nn.Conv2d(fine or arch.width, arch.components, 1)
         )
+        # Tissue that is held moves less than a half-space: by how much is soon learnt.
+        self.stiffness = nn.Parameter(torch.ones(arch.displacements, 1, 1)) if residual else None
         self.apply(_start)
-        _start_small(self.heads)
+        _start_small(self.heads, 0.0 if residual else 0.02)
         if self.film is not None:
             nn.init.zeros_(self.film.weight)
             nn.init.zeros_(self.film.bias)
 
     def forward(self, x: Tensor, log_young: Tensor | None = None) -> Tensor | tuple[Tensor, Tensor]:
         """`log_young`: (B, 1) ln(E / 1 kPa), used only by a `film` network."""
-        mask = x[:, 3:4]
+        mask, physical = x[:, 3:4], None
+        if self.prior is not None:
+            physical = self.prior(told_motion(x, self.arch), mask)
+            x = torch.cat([x, physical], dim=1)
         seen = x if self.fine is None else self.fine(x)
         h = self.stem(seen)
         skips = []
@@ -244,7 +270,23 @@ class D2FNet(nn.Module):
         if self.arch.stem > 1:
             times = 2.0 if self.fine is not None else float(self.arch.stem)
             y = F.interpolate(y, scale_factor=times, mode="bilinear", align_corners=False)
+        if physical is not None and self.stiffness is not None:
+            y = _corrected(physical * self.stiffness, y)
         return y * mask if total is None else (y * mask, total)
+
+
+def told_motion(x: Tensor, arch: Architecture) -> Tensor:
+    """The displacement among a network's channels, (B, 2|3, N, N)."""
+    along = 5 + arch.confidence
+    return torch.cat([x[:, :2], x[:, along : along + 1]], dim=1) if arch.depth else x[:, :2]
+
+
+def _corrected(physical: Tensor, correction: Tensor) -> Tensor:
+    """The prior (B, 2|3, N, N) with what was learnt on top: components, or a magnitude ≥ 0."""
+    if correction.shape[1] == 1:
+        return (physical.square().sum(1, keepdim=True).sqrt() + correction).clamp_min(0)
+    # One eye sees nothing along the view: there is nothing to correct.
+    return F.pad(physical, (0, 0, 0, 0, 0, 3 - physical.shape[1])) + correction
 
 
 def _start(module: nn.Module) -> None:
@@ -255,17 +297,17 @@ def _start(module: nn.Module) -> None:
             nn.init.zeros_(module.bias)
 
 
-def _start_small(heads: nn.Module) -> None:
+def _start_small(heads: nn.Module, std: float) -> None:
     """Begin near no force at all: half a bound everywhere would be one large ghost to unlearn.
 
     A bias of -2 is a tenth of a bound; at -4 the sigmoids are so flat that little force left at the start is
-    also slow to go.
+    also slow to go. A correction (`std` 0) begins at none.
     """
     last = list(heads.ranges) if isinstance(heads, Heads) else [heads]
     unsigned = isinstance(heads, Heads) and not heads.signed
     for conv in last:
         if isinstance(conv, nn.Conv2d) and conv.bias is not None:
-            nn.init.normal_(conv.weight, std=0.02)
+            nn.init.normal_(conv.weight, std=std)
             nn.init.constant_(conv.bias, -2.0 if unsigned else 0.0)
 
 

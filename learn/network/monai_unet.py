@@ -13,7 +13,7 @@ from synth.errors import UserError
 
 
 class MonaiUNet(nn.Module):
-    """(B, 5|6, N, N) channels → (B, 1|3, N, N) force map in units of `Scales.target`, 0 outside the mask.
+    """(B, `arch.inputs`, N, N) → (B, 1|3, N, N) force map in units of `Scales.target`, 0 outside the mask.
 
     Residual U-Net of MONAI (Kerfoot et al. 2018) with `arch.levels` halvings of `arch.width` channels; no
     heads

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from learn.data.clips import Clip, amount, sources, target
-from learn.data.grid import Scales, channels, divergence
+from learn.data.grid import Scales, channels, divergence, windowed
 from learn.settings import Settings
 from synth.errors import UserError
 
@@ -21,7 +21,7 @@ class Batch:
     """Frames on one device, in physical units."""
 
     displacement: Tensor
-    """(B, 2, N, N) mm, with depth (B, 3, N, N)."""
+    """(B, 2, N, N) mm, with depth (B, 3, N, N); with a window earlier frames' behind it, latest first."""
     mask: Tensor
     """(B, 1, N, N) 0/1."""
     confidence: Tensor
@@ -40,7 +40,9 @@ class Batch:
 def inputs(batch: Batch, settings: Settings, scales: Scales) -> Tensor:
     """The network's channels for a batch."""
     extra = batch.confidence if settings.arch.confidence else None
-    return channels(batch.displacement, batch.mask, settings.grid.pitch_mm, scales, extra)
+    moved, parts = batch.displacement, settings.arch.displacements
+    earlier = moved[:, parts:] if settings.arch.window > 1 else None
+    return channels(moved[:, :parts], batch.mask, settings.grid.pitch_mm, scales, extra, earlier)
 
 
 def turned(values: NDArray[np.float32], quarter: int, mirror: bool) -> NDArray[np.float32]:
@@ -107,11 +109,14 @@ class Frames:
             "target": [],
             "force": [],
         }
+        more = self.settings.arch.window - 1
         for c, t, source, turn in items:
             clip, how = self.clips[c], (turn % 4, turn >= 4)
             sure = [turned(plane[None], *how) for plane in clip.sure(source)[t]]
             truth = target(clip, t, self.settings.target, self.settings.arch.components)
-            columns["displacement"].append(turned(clip.displacement[source][t], *how))
+            told = windowed(clip.displacement[source][max(t - more, 0) : t + 1], more + 1)[-1]
+            frames = np.split(np.asarray(told), more + 1)
+            columns["displacement"].append(np.concatenate([turned(one, *how) for one in frames]))
             columns["mask"].append(turned(clip.mask[None], *how))
             columns["confidence"].append(np.concatenate(sure))
             columns["target"].append(turned(truth, *how))

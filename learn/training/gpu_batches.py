@@ -80,8 +80,14 @@ class Resident(Frames):
         if self._sure is not None:
             planes = self._sure[source][at]
             sure = turned(planes.flatten(0, 1)[:, None], turn).reshape(planes.shape)
+        frame = torch.tensor([t for _, t, _, _ in items], device=self._device)
+        told = []
+        for k in range(self.settings.arch.window):
+            # Before the first frame of a sequence nothing has moved.
+            there = (frame >= k).view(-1, 1, 1, 1)
+            told.append(turned(self._moved[source][(at - k).clamp_min(0)] * there, turn))
         return {
-            "displacement": turned(self._moved[source][at], turn),
+            "displacement": torch.cat(told, dim=1),
             "mask": mask,
             "confidence": sure,
             "target": turned(self._true[at], turn),

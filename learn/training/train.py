@@ -23,6 +23,7 @@ from learn.data.grid import Scales
 from learn.data.split import Split, groups
 from learn.evaluation.metrics import Moments, agreement
 from learn.loss import SHARES, at, full, gradient_shares, loss
+from learn.network.d2fnet import D2FNet
 from learn.network.monai_unet import build
 from learn.settings import Settings, replace
 from learn.training.batches import Batch, Frames, inputs, measure_scales
@@ -64,7 +65,7 @@ def train(
     card = Card(settings, scales, typical_young(fit), *_provenance(clips, split))
     state = _open(out, card)
     try:
-        return _go_on(_start(settings, state), card, fit, select, out, report, fabric, log)
+        return _go_on(_start(card, state), card, fit, select, out, report, fabric, log)
     except (UserError, OSError):
         # Nothing to go on from: a full disk, say, leaves nothing.
         if state is None and fabric.is_global_zero and not (out / "last.pt").exists():
@@ -138,10 +139,13 @@ class _Run:
         return plain | {"model": _cpu(self.model.state_dict())} | moving
 
 
-def _start(settings: Settings, state: dict[str, Any] | None) -> _Run:
+def _start(card: Card, state: dict[str, Any] | None) -> _Run:
     """A fresh run, or one that goes on from a state as `_Run.as_dict` gave it."""
+    settings, scales = card.settings, card.scales
     torch.manual_seed(settings.seed)
     model = build(settings.arch)
+    if isinstance(model, D2FNet) and model.prior is not None:
+        model.prior.set_units(scales.displacement_mm, settings.extent_mm, scales.target)
     if settings.channels_last:
         model = model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     optimizer = torch.optim.AdamW(

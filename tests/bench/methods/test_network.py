@@ -36,7 +36,7 @@ def test_the_rest_frame_is_the_zero_and_unknown_tissue_has_1_kpa(
         density[:, 8, 8] = (young or typical) * per_kpa / Grid(16).pitch_mm ** 2
         return ForceMap(density, Grid(16), "density", young or typical, young is not None, view)
 
-    predictor.grid = Grid(16)  # type: ignore[attr-defined]
+    predictor.grid, predictor.window = Grid(16), 1  # type: ignore[attr-defined]
     model = Model.__new__(Model)
     model.predictor, model._reader = predictor, None  # type: ignore[assignment]
     scene = Scene(tissue, 0.1, young_kpa)

@@ -1,0 +1,113 @@
+"""Networks that come with the package: `mono` of one eye, `stereo` of two, each a folder in `MODELS`."""
+
+from __future__ import annotations
+
+import hashlib
+import shutil
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from learn import checkpoint
+from learn.checkpoint import Card
+from synth.errors import UserError
+from synth.job import identity
+from synth.system.whole_file import write_whole
+
+MODELS = Path(__file__).parents[1] / "models"
+NAMES = ("mono", "stereo")
+LARGEST_BYTES = 4_000_000
+"""Of a network that comes along, all of its files."""
+NONE = "no trained network comes with this version; train one: learn train DATASET --out model"
+
+
+def shipped() -> dict[str, Path]:
+    """The networks that are there, by name."""
+    return {name: MODELS / name for name in NAMES if (MODELS / name / "config.json").is_file()}
+
+
+def find_model(named: Path | str) -> Path:
+    """The folder of a model that somebody named: his own, else of what comes along.
+
+    Raises UserError if he means one that could come along, and doesn't.
+    """
+    if str(named) not in NAMES or Path(named).exists():
+        return Path(named)
+    if str(named) not in shipped():
+        raise UserError(f"{named}: no such folder, and {NONE}")
+    return shipped()[str(named)]
+
+
+def choose_model(two_eyes: bool) -> Path | None:
+    """The one to use where none is named: `stereo` for what two eyes saw, else `mono`; None if not there."""
+    found = shipped()
+    return next((found[name] for name in ("stereo", "mono")[not two_eyes :] if name in found), None)
+
+
+def hash_data(card: Card) -> str:
+    """Of all sequences that a model was fitted, chosen and to be tested on; their order doesn't count."""
+    named = {part: sorted(hashes) for part, hashes in card.split.items()}
+    return hashlib.blake2b(identity.canonical(named), digest_size=16).hexdigest()
+
+
+def pack_model(
+    model: Path, folder: Path, commit: str, metrics: Mapping[str, str], limits: Sequence[str]
+) -> Card:
+    """Writes a trained model as one that comes along: weights.safetensors, config.json and a card, README.md.
+
+    Args:
+        model: folder of `learn train`.
+        folder: of the new one, `MODELS` and its name; replaced if it is there.
+        commit: of the code that trained it.
+        metrics: what was measured, and the figure with its unit.
+        limits: what it can't do, a sentence each.
+
+    Raises:
+        UserError: the model is damaged, or larger than `LARGEST_BYTES`; nothing is left then.
+    """
+    net, card = checkpoint.load_model(model)
+    shutil.rmtree(folder, ignore_errors=True)
+    card = checkpoint.write_model(folder, card, net.state_dict(), safe=True)
+    write_whole(folder / "README.md", _readme(folder.name, card, commit, metrics, limits).encode())
+    size = size_bytes(folder)
+    if size > LARGEST_BYTES:
+        shutil.rmtree(folder)
+        raise UserError(
+            f"{model}: takes {size / 1e6:.1f} MB, what comes along at most {LARGEST_BYTES / 1e6:g}; "
+            "train it with a smaller arch.width"
+        )
+    return card
+
+
+def size_bytes(folder: Path) -> int:
+    """Of all files in a model's folder."""
+    return sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
+
+
+def describe(card: Card) -> str:
+    """A line for a person."""
+    settings, arch = card.settings, card.settings.arch
+    eyes = "two eyes" if arch.depth else "one eye"
+    return (
+        f"{eyes}, {arch.output}, {settings.size}² cells, {settings.extent_mm:g} mm, input {settings.input}; "
+        f"R² {card.score:.3f} on sequences that chose it, {len(card.split.get('fit', []))} fitted"
+    )
+
+
+def _readme(name: str, card: Card, commit: str, metrics: Mapping[str, str], limits: Sequence[str]) -> str:
+    rows = {"data (hash of its sequences)": hash_data(card), "commit": commit, **metrics}
+    return "\n".join(
+        [
+            f"# {name}",
+            "",
+            f"{describe(card).capitalize()}.",
+            "",
+            "| what | |",
+            "| --- | --- |",
+            *(f"| {what} | {value} |" for what, value in rows.items()),
+            "",
+            "Limits:",
+            "",
+            *(f"- {one}" for one in limits),
+            "",
+        ]
+    )
