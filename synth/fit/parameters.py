@@ -71,20 +71,20 @@ PARAMETERS: tuple[Parameter, ...] = (
     *(_colour(name, channel) for name in _COLOURS for channel in "rgb"),
     Parameter(
         "arterial",
-        {"arterial": 0.22, "density": 0.16, "sharpness": 0.15, **_contrast(0.3, 0.23, 0.16, 0.08)},
+        {"arterial": 0.27, "density": 0.15, "sharpness": 0.15, **_contrast(0.3, 0.23, 0.16, 0.08)},
         0.15,
         4.0,
     ),
     Parameter(
         "density",
-        {"density": 0.75, "arterial": 0.12, "fineness": 0.15, **_contrast(0.42, 0.4, 0.3, 0.1)},
+        {"density": 0.8, "arterial": 0.14, "fineness": 0.12, **_contrast(0.42, 0.4, 0.3, 0.1)},
         0.35,
         2.8,
         0.4,
     ),
     Parameter(
         "calibre",
-        {"fineness": 0.53, "density": 0.34, "vein share": 0.8, **_contrast(0.29, 0.35, 0.36, 0.31)},
+        {"fineness": 0.4, "density": 0.2, "vein share": 0.9, **_contrast(0.29, 0.35, 0.36, 0.31)},
         0.3,
         3.0,
         0.4,
@@ -98,8 +98,8 @@ PARAMETERS: tuple[Parameter, ...] = (
         "blur",
         {
             "sharpness": -0.46,
-            "arterial": -0.16,
-            "density": -0.25,
+            "arterial": -0.28,
+            "density": -0.27,
             "highlight area": 0.6,
             **_contrast(-0.54, -0.22, -0.07, -0.03),
         },
@@ -119,11 +119,12 @@ SPREAD = {
         for name, s in zip(_COLOURS, (0.05, 0.05, 0.15, 0.1), strict=True)
         for channel in "rgb"
     },
-    "vignette": 0.04,
-    "vein share": 0.4,
-    "arterial": 0.05,
+    # 0.04 between anatomies; but a wider field than the frames' falls off by the brain's curvature too.
+    "vignette": 0.15,
+    "vein share": 0.5,
+    "arterial": 0.06,
     "fineness": 0.08,
-    "density": 0.1,
+    "density": 0.12,
     "highlight share": 0.22,
     "highlight area": 0.2,
     "noise": 0.04,

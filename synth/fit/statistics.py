@@ -63,6 +63,7 @@ class Parts:
     tissue: Mask
     artery: Mask
     vein: Mask
+    """Wide dark vessels; among them may be arteries."""
     highlight: Mask
 
 
@@ -81,7 +82,7 @@ def measure(view: View) -> dict[str, float]:
     flat = np.asarray(1 - lost * np.minimum(view.corner2, 1), np.float32)[..., None]
     found = {"vignette": lost}
     found |= _tissue(base / flat, parts.tissue)
-    found |= _veins(linear / flat, parts.vein, view.mm_per_px)
+    found |= _veins(linear / flat, _blue(parts.vein, linear, view.mm_per_px), view.mm_per_px)
     found["vein share"] = float(parts.vein.sum() / max(view.usable.sum(), 1))
     found |= _arteries(linear, surround, parts, view.mm_per_px)
     found |= _highlights(parts.highlight, view)
@@ -105,7 +106,7 @@ def find_parts(view: View, linear: Map) -> tuple[Parts, Map]:
     fine = cv2.GaussianBlur(linear, (0, 0), 0.8)
     darker = np.log(np.maximum(surround, 1e-3) / np.maximum(fine, 1e-3))
     dark_red = (darker[..., 0] > _DARK_RED) & clear
-    vein = _blue(_opened(dark_red, 0.5 * _VEIN_MM / view.mm_per_px), linear, view.mm_per_px)
+    vein = _opened(dark_red, 0.5 * _VEIN_MM / view.mm_per_px)
     near_vein = cv2.dilate(vein.astype(np.uint8), _disc(0.3 / view.mm_per_px)) > 0
     vessel = (darker[..., 1] > _DARK) & clear
     # Wide red places without an edge of their own are blood in the pia.
