@@ -54,10 +54,13 @@ def classifier(
     names, own = cues.table(theirs.pictures)
     rng = np.random.default_rng(seed)
     rows, alone, told = [], {}, []
-    for name, file in cutting.name_jobs(look):
+    jobs = cutting.name_jobs(look)
+    for name, file in jobs:
         ours = cutting.kept_of_job(cutting.read_job(file, frames, seed), cutting.MM_PER_PX, cache)
         both = Split.of(theirs, ours, region)
-        for part, pictures in parts(both.pictures).items():
+        # What of it gives crops away is asked of the last look, the one that is fitted.
+        asked = parts(both.pictures) if file is jobs[-1][1] else {"everything": both.pictures}
+        for part, pictures in asked.items():
             rows.append({"crops": name, "of": part, **held_out(pictures, both, epochs, seed)})
         figures = np.concatenate([own, cues.table(ours.pictures)[1]])
         alone[name] = figures

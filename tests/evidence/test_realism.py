@@ -25,6 +25,16 @@ def test_a_spectrum_of_known_slope_is_found() -> None:
     assert statistics(grey(128 + 30 * field / field.std()))["spectrum slope"] == pytest.approx(-2, abs=0.25)
 
 
+def test_elongation_is_the_ratio_of_a_highlights_sides() -> None:
+    light = np.full((200, 200), 150.0)
+    light[20:24, 20:40] = 255
+    light[100:104, 100:104] = 255
+    light[150:153, 20:35] = 255
+    assert statistics(grey(light))["highlight elongation"] == pytest.approx(5, rel=0.02), "of 1, 5 and 5"
+    light[150:153, 20:35] = 150
+    assert statistics(grey(light))["highlight elongation"] == pytest.approx((5 + 1) / 2, rel=0.02)
+
+
 def test_highlights_are_counted_and_sized() -> None:
     light = np.full((200, 200), 150.0)
     light[20:24, 20:24] = 255
