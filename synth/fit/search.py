@@ -16,7 +16,8 @@ from synth.render.appearance.family import FAMILIES
 
 _LARGEST = 0.8  # step of a parameter, against how far it may be from the family's
 _SURER = 0.6  # several frames are, than one
-_DECIDED = 0.15
+DECIDED = 0.15
+"""Standard deviation of a parameter, on its scale, up to which a picture is said to tell it."""
 _OUTLIER = 4.0  # spreads off: beyond, a statistic counts less, for no job may reach it (P. J. Huber, 1964)
 # Green and blue over red in frames, against those of the reflectances they were rendered with.
 _SEEN_G, _SEEN_B = 0.825, 0.735
@@ -42,7 +43,7 @@ class Fitted:
     @property
     def undecided(self) -> tuple[str, ...]:
         """Parameters that one such picture doesn't tell within 15%."""
-        return tuple(name for name, sd in self.unsure.items() if sd > _DECIDED)
+        return tuple(name for name, sd in self.unsure.items() if sd > DECIDED)
 
 
 def search(

@@ -198,8 +198,15 @@ def test_crops_of_a_job_are_tissue_without_its_tools_and_codec() -> None:
 def test_errors_are_relative_but_for_what_may_be_nothing() -> None:
     known = parameters.start("pale") | {"blur": 1.0, "glare": 0.2}
     found = known | {"density": 1.1, "blur": 0.7, "glare": 0.25, "crown r": 1.2 * known["crown r"]}
-    rows = {row["parameter"]: row for row in fit.compare("one", known, found)}
+    rows = {
+        row["parameter"]: row for row in fit.compare("one", known, found, {"density": 0.17, "noise": 0.1})
+    }
     assert rows["density"]["error"] == pytest.approx(0.1)
+    assert [(rows[k]["sd"], rows[k]["decided"]) for k in ("density", "noise", "vein")] == [
+        (0.17, False),
+        (0.1, True),
+        (None, False),
+    ]
     assert (rows["blur"]["error"], rows["glare"]["error"]) == pytest.approx((-0.3, 0.05))
     assert [name for name, row in rows.items() if not row["within_15"]] == ["crown", "glare", "blur"]
 
