@@ -74,6 +74,7 @@ PARAMETERS: tuple[Parameter, ...] = (
         {"arterial": 0.27, "density": 0.15, "sharpness": 0.15, **_contrast(0.3, 0.23, 0.16, 0.08)},
         0.15,
         4.0,
+        0.4,
     ),
     Parameter(
         "density",
@@ -90,9 +91,9 @@ PARAMETERS: tuple[Parameter, ...] = (
         0.4,
     ),
     Parameter(
-        "glare", {"highlight share": 1.7, "highlight area": 1.9, "noise": 0.2}, -1.0, 1.0, 0.5, "linear"
+        "glare", {"highlight share": 1.7, "highlight area": 1.9, "noise": 0.2}, -1.0, 1.0, 0.8, "linear"
     ),
-    Parameter("film_mm", {"highlight area": 0.44}, 0.01, 0.3),
+    Parameter("film_mm", {"highlight area": 0.44}, 0.01, 0.3, 0.5),
     Parameter("vignette", {"vignette": 0.82}, 0.0, 0.95, 0.5, "linear"),
     Parameter(
         "blur",
@@ -105,7 +106,7 @@ PARAMETERS: tuple[Parameter, ...] = (
         },
         -1.5,
         4.0,
-        1.5,
+        1.0,
         "linear",
     ),
     Parameter("noise", {"noise": 0.95}, 0.1, 8.0, 1.5),
