@@ -93,7 +93,7 @@ def linear(figures: Floats, label: Ints, fold: Ints, near: npt.NDArray[np.bool_]
 
 
 def _colour(lab: Map) -> dict[str, float]:
-    found = {}
+    found: dict[str, float] = {}
     for k, name in enumerate("Lab"):
         found |= {f"{name} mean": float(lab[..., k].mean()), f"{name} sd": float(lab[..., k].std())}
     found["chroma"] = float(np.hypot(lab[..., 1], lab[..., 2]).mean())

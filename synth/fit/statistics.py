@@ -123,7 +123,8 @@ def _blue(dark: Mask, linear: Map, mm_per_px: float) -> Mask:
     near = _smooth(linear, dark, 0.35 / mm_per_px)
     crest = dark & (near[..., 2] > _BLUE * np.maximum(near[..., 0], 1e-3))
     core = _opened(crest, 0.25 * _VEIN_MM / mm_per_px)
-    return dark & (cv2.dilate(core.astype(np.uint8), _disc(_BLUE_MM / mm_per_px)) > 0)
+    near_core = cv2.dilate(core.astype(np.uint8), _disc(_BLUE_MM / mm_per_px)) > 0
+    return np.asarray(dark & near_core)
 
 
 def highlights(rgb: Picture) -> Mask:
