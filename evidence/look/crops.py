@@ -117,6 +117,11 @@ def regions(places: npt.NDArray[np.float64], count: int) -> npt.NDArray[np.int64
     return sector
 
 
+def overlapping(places: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
+    """Which crops (N, N) of one picture show some of the same."""
+    return np.asarray((np.abs(places[:, None] - places[None]) < SIDE_PX).all(axis=2))
+
+
 def _cut(rgb: Picture, inside: npt.NDArray[np.bool_], step: int) -> list[tuple[Picture, Any]]:
     """Crops that lie wholly inside a mask, with their middles."""
     summed = cv2.integral(inside.astype(np.uint8))

@@ -14,7 +14,7 @@ import typer
 
 from evidence.measuring import measuring
 from evidence.render.case import case
-from synth.fit import fitting, parameters
+from synth.fit import fitting, parameters, search
 from synth.job.schema import Family, Job
 from synth.render.appearance.light import balance
 from synth.sequence import scenario
@@ -79,7 +79,7 @@ def fit(
             known = write_picture(file, asked, family, seed)
             found = _fitted(file, _FIELD_MM, rounds, anatomies, folder)
             pictures.append(_distance(name, found))
-            rows += compare(name, known, found.fitted.values)
+            rows += compare(name, known, found.fitted.values, found.fitted.unsure)
     return {"rounds": rounds, "anatomies": anatomies, "pictures": pictures, "parameters": rows}
 
 
@@ -108,10 +108,13 @@ def write_picture(path: Path, values: dict[str, float], family: Family, seed: in
     return values | drawn_ones
 
 
-def compare(name: str, known: dict[str, float], found: dict[str, float]) -> list[dict[str, Any]]:
+def compare(
+    name: str, known: dict[str, float], found: dict[str, float], unsure: dict[str, float]
+) -> list[dict[str, Any]]:
     """Known and found value of each parameter, of a colour that channel that is farthest off.
 
-    The error is relative, of `blur` and `glare` absolute, since they may be nothing.
+    The error is relative, of `blur` and `glare` absolute, since they may be nothing. `sd` is what the fit
+    says of itself, on the parameter's scale, and `decided` whether the picture then tells it within 15%.
     """
     worst: dict[str, tuple[float, str]] = {}
     for one in parameters.PARAMETERS:
@@ -129,6 +132,8 @@ def compare(name: str, known: dict[str, float], found: dict[str, float]) -> list
                 "found": float(f"{value:.3g}"),
                 "error": round(error, 3),
                 "within_15": off <= 0.15,
+                "sd": round(unsure[full], 2) if full in unsure else None,
+                "decided": unsure.get(full, np.inf) <= search.DECIDED,
             }
         )
     return rows

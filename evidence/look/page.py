@@ -8,7 +8,11 @@ from bench.output.charts import Chart, Row
 from bench.output.result_page import Page, Section
 from evidence.defaults_on_front import read
 
-_TABLES = {"texture": "rows", "classifier": "rows", "fit": "pictures"}
+_TABLES = {
+    "texture": ("rows",),
+    "classifier": ("rows", "linear", "cues"),
+    "fit": ("pictures", "parameters"),
+}
 
 
 def drawn(folder: Path) -> Page:
@@ -23,7 +27,12 @@ def drawn(folder: Path) -> Page:
         unit = "distance in spreads of the photograph's crops: median, from p10 to p90"
         limit = found["texture"]["limit_p90_of_photograph"]
         charts.append(Chart(f"Texture: within the photograph's own at most {limit}", unit, rows))
-    tables = [Section(name, found[name][key]) for name, key in _TABLES.items() if name in found]
+    tables = [
+        Section(name if key == keys[0] else f"{name}: {key}", found[name][key])
+        for name, keys in _TABLES.items()
+        for key in keys
+        if found.get(name, {}).get(key)
+    ]
     commands = "; ".join(one["command"] for one in found.values())
     machine = next(iter(found.values()))["machine"]
     return Page("The look against a photograph", {"machine": machine}, charts, tables, command=commands)

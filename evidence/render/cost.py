@@ -19,6 +19,10 @@ from bench.output import machine, write
 from evidence.measuring import measuring
 from evidence.render.case import Case, case
 from synth.job.schema import Job
+from synth.sequence import scenario
+
+_NOISE_SEEDS = 4
+_SCENERY = ("retractor", "cottonoid", "bone", "drape")
 
 
 class Question(StrEnum):
@@ -28,6 +32,7 @@ class Question(StrEnum):
     first = "first"
     frames = "frames"
     scenes = "scenes"
+    scenery = "scenery"
     truth = "truth"
     bytes = "bytes"
 
@@ -101,6 +106,48 @@ def _scenes(job: Job, count: int) -> dict[str, Any]:
         _shoot(case(job.model_copy(update={"seed": job.seed + k}), 0), 0)
         resident.append(_resident_mb())
     return _growth(resident, after=max(count // 10, 1))
+
+
+def _scenery(job: Job, count: int) -> dict[str, Any]:
+    """A frame's CPU and its tissue's noise with all scenery allowed over those with none, in turns."""
+    told = job.render.model_dump() | {"scenery": _SCENERY}
+    full = Job.model_validate({**job.model_dump(exclude={"render"}), "render": told})
+    rows, shown = [], []
+    for index in range(2):
+        cases = {}
+        for name, of in (("none", job), ("scenery", full)):
+            start = time.process_time()
+            cases[name] = case(of, index)
+            _shoot(cases[name], 0)
+            rows.append({"scene": index, "with": name, "first_s": time.process_time() - start})
+        shown.append(list(scenario.draw(full, index).look.scenery))
+        spent: dict[str, list[float]] = {name: [] for name in cases}
+        for k in range(count):
+            for name in sorted(cases, reverse=bool(k % 2)):
+                start = time.process_time()
+                _shoot(cases[name], k)
+                spent[name].append(time.process_time() - start)
+        tissue = cases["none"].studio.still.tissue & cases["scenery"].studio.still.tissue
+        for row, (name, one) in zip(rows[-2:], cases.items(), strict=True):
+            row |= {"frame_s": float(np.median(spent[name])), **_noise(one, tissue)}
+        rows[-1]["ratio"] = float(np.median(np.array(spent["scenery"]) / spent["none"]))
+    return {"count": count, "shown": shown, "rows": [_short(row) for row in rows]}
+
+
+def _noise(ours: Case, where: np.ndarray[Any, np.dtype[np.bool_]]) -> dict[str, float]:
+    """Standard deviation of the light over seeds, as a share of its mean, over pixels of a mask."""
+    light = np.stack(
+        [
+            ours.studio.frame(ours.vertices, ours.tips, ours.shafts, k).radiance.mean(axis=2)[where]
+            for k in range(_NOISE_SEEDS)
+        ]
+    ).astype(np.float64)
+    share = light.std(axis=0, ddof=1) / np.maximum(light.mean(axis=0), 1e-6)
+    return {"noise_median": float(np.median(share)), "noise_mean": float(share.mean())}
+
+
+def _short(row: dict[str, Any]) -> dict[str, Any]:
+    return {k: float(f"{v:.4g}") if isinstance(v, float) else v for k, v in row.items()}
 
 
 def _truth(job: Job, count: int) -> dict[str, Any]:
@@ -196,6 +243,7 @@ _MEASURES = {
     Question.first: _first,
     Question.frames: _frames,
     Question.scenes: _scenes,
+    Question.scenery: _scenery,
     Question.truth: _truth,
     Question.bytes: _bytes,
 }

@@ -21,8 +21,8 @@ def statistics(rgb: Picture) -> dict[str, float]:
 
     Lab means and standard deviations (CIE 1976, D65), the slope of the radial power spectrum of L from 1/64
     to 1/4 cycles a pixel (natural scenes: about -2; D. J. Field 1987), the kurtosis of its horizontal and
-    vertical gradients, the share of highlight pixels, and the median and 90th percentile of the areas of
-    connected highlights [px].
+    vertical gradients, the share of highlight pixels, the median and 90th percentile of the areas of
+    connected highlights [px], and the median elongation (ratio of axes) of those over 4 px; else 1.
     """
     lab = _lab(rgb)
     found: dict[str, float] = {}
@@ -95,10 +95,22 @@ def _kurtosis(light: npt.NDArray[np.float32]) -> float:
 def _highlights(light: npt.NDArray[np.float32]) -> dict[str, float]:
     around = cv2.medianBlur(np.clip(light * 2.55, 0, 255).astype(np.uint8), 31) / 2.55
     bright = ((light > around + _BRIGHTER_L) & (light > _WHITE_L)).astype(np.uint8)
-    count, _, stats, _ = cv2.connectedComponentsWithStats(bright, connectivity=8)
+    count, label, stats, _ = cv2.connectedComponentsWithStats(bright, connectivity=8)
     areas: Any = stats[1:, cv2.CC_STAT_AREA] if count > 1 else np.zeros(1)
     return {
         "highlight share": float(bright.mean()),
         "highlight area median": float(np.median(areas)),
         "highlight area p90": float(np.quantile(areas, 0.9)),
+        "highlight elongation": _elongation(label, np.flatnonzero(stats[1:, cv2.CC_STAT_AREA] > 4) + 1),
     }
+
+
+def _elongation(label: npt.NDArray[np.int32], chosen: npt.NDArray[np.int64]) -> float:
+    """Median ratio of the axes of the ellipses that have the second moments of some labels' pixels."""
+    found = [1.0]
+    for k in chosen:
+        away = np.argwhere(label == k).astype(float)
+        # A pixel is a square, not a point.
+        spread = np.linalg.eigvalsh(np.cov(away.T, bias=True) + np.eye(2) / 12)
+        found.append(float(np.sqrt(spread[1] / spread[0])))
+    return float(np.median(found[1:] or found))

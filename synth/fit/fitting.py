@@ -103,6 +103,10 @@ def summary(found: Outcome) -> list[str]:
         if np.isfinite(value) and np.isfinite(found.fitted.statistics[name])
     }
     worst = sorted(off, key=lambda name: -abs(off[name]))[:4]
+    if found.fitted.undecided:
+        lines.append(
+            f"not decided by this picture, one standard deviation: {look_file.undecided(found.fitted)}"
+        )
     lines.append("farthest off: " + ", ".join(f"{name} {off[name]:+.2f}" for name in worst))
     return lines
 
@@ -117,6 +121,8 @@ def as_dict(found: Outcome) -> dict[str, Any]:
         "parameters": found.fitted.values,
         "not_seen": list(found.fitted.left),
         "at_a_limit": list(found.fitted.bounded),
+        "standard_deviations": found.fitted.unsure,
+        "not_decided": list(found.fitted.undecided),
         "photograph": _known(found.photograph),
         "rendered": _known(found.fitted.statistics),
         "job": found.sections,

@@ -43,7 +43,22 @@ def text(fitted: Fitted, found: dict[str, Any], heading: list[str]) -> str:
         lines.append(f"Not to be seen in it, as the family {fitted.family} has them: {_named(fitted.left)}.")
     if fitted.bounded:
         lines.append(f"At a limit, look at the picture: {_named(fitted.bounded)}.")
+    if fitted.undecided:
+        lines.append(f"Not decided by this picture, one standard deviation: {undecided(fitted)}.")
     return "".join(f"# {line}\n" for line in lines) + out.getvalue()
+
+
+def undecided(fitted: Fitted) -> str:
+    """What the picture doesn't tell within 15%, each with its standard deviation, of a colour the largest."""
+    widest: dict[str, float] = {}
+    for name in fitted.undecided:
+        short = name.split()[0]
+        widest[short] = max(widest.get(short, 0.0), fitted.unsure[name])
+    linear = {one.name for one in parameters.PARAMETERS if one.scale == "linear"}
+    return ", ".join(
+        f"{name} {sd:.2f}" if name in linear else f"{name} {100 * np.expm1(sd):.0f}%"
+        for name, sd in widest.items()
+    )
 
 
 def _named(names: tuple[str, ...]) -> str:

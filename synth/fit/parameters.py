@@ -53,53 +53,63 @@ def _contrast(*slopes: float) -> dict[str, float]:
 
 
 def _colour(name: str, channel: str) -> Parameter:
-    """Vessels stand out from a brighter crown in more grey levels."""
+    """Vessels stand out from a brighter crown; a vein's sides hardly show but along its crest."""
+    own, also = {
+        "crown": (1.0, {f"flush {channel}": 0.2}),
+        "flush": (0.45, {}),
+        "vein": (0.6, {f"wine {channel}": 0.3}),
+        "wine": (0.08, {f"vein {channel}": 0.25}),
+    }[name]
     lifts = {"crown r": 0.15, "crown g": 0.35}.get(f"{name} {channel}")
     seen = _contrast(*[lifts] * 4) if lifts else {}
-    return Parameter(f"{name} {channel}", {f"{name} {channel}": 1.2, **seen}, 0.01, 3.0, 0.6)
+    return Parameter(f"{name} {channel}", {f"{name} {channel}": own, **also, **seen}, 0.01, 3.0, 0.6)
 
 
-# Slopes: two anatomies of the healthy family at 0.055 mm a pixel, each parameter turned up and down.
+# Slopes: two anatomies of the healthy family at 0.055 mm a pixel, each parameter turned up by 0.3 on its
+# scale (blur by 0.5 px).
 PARAMETERS: tuple[Parameter, ...] = (
     *(_colour(name, channel) for name in _COLOURS for channel in "rgb"),
     Parameter(
         "arterial",
-        {"arterial": 0.27, "density": 0.2, "sharpness": 0.17, **_contrast(0.37, 0.28, 0.2, 0.11)},
+        {"arterial": 0.27, "density": 0.15, "sharpness": 0.15, **_contrast(0.3, 0.23, 0.16, 0.08)},
         0.15,
         4.0,
+        0.4,
     ),
     Parameter(
         "density",
-        {"density": 0.75, "fineness": 0.2, "vein share": 0.7, **_contrast(0.41, 0.43, 0.43, 0.3)},
+        {"density": 0.8, "arterial": 0.14, "fineness": 0.12, **_contrast(0.42, 0.4, 0.3, 0.1)},
         0.35,
         2.8,
         0.4,
     ),
     Parameter(
         "calibre",
-        {
-            "fineness": 0.5,
-            "density": 0.3,
-            "vein share": 1.2,
-            "arterial": 0.06,
-            **_contrast(0.32, 0.37, 0.39, 0.34),
-        },
+        {"fineness": 0.4, "density": 0.2, "vein share": 0.9, **_contrast(0.29, 0.35, 0.36, 0.31)},
         0.3,
         3.0,
         0.4,
     ),
-    Parameter("glare", {"highlight share": 1.6, "highlight area": 1.0}, -1.0, 1.0, 0.5, "linear"),
-    Parameter("film_mm", {"highlight area": 0.4}, 0.01, 0.3),
-    Parameter("vignette", {"vignette": 0.93}, 0.0, 0.95, 0.5, "linear"),
+    Parameter(
+        "glare", {"highlight share": 1.7, "highlight area": 1.9, "noise": 0.2}, -1.0, 1.0, 0.8, "linear"
+    ),
+    Parameter("film_mm", {"highlight area": 0.44}, 0.01, 0.3, 0.5),
+    Parameter("vignette", {"vignette": 0.82}, 0.0, 0.95, 0.5, "linear"),
     Parameter(
         "blur",
-        {"sharpness": -0.32, "arterial": -0.23, "density": -0.19, **_contrast(-0.39, -0.17, -0.07, -0.03)},
+        {
+            "sharpness": -0.46,
+            "arterial": -0.28,
+            "density": -0.27,
+            "highlight area": 0.6,
+            **_contrast(-0.54, -0.22, -0.07, -0.03),
+        },
         -1.5,
         4.0,
-        1.5,
+        1.0,
         "linear",
     ),
-    Parameter("noise", {"noise": 0.88}, 0.1, 8.0, 1.5),
+    Parameter("noise", {"noise": 0.95}, 0.1, 8.0, 1.5),
 )
 """`glare` below 0 stands for lamps farther from the axis, `blur` below 0 for sharpening; `noise` is relative
 to that of 12,000 electrons at full scale."""
@@ -107,19 +117,20 @@ to that of 12,000 electrons at full scale."""
 SPREAD = {
     **{
         f"{name} {channel}": s
-        for name, s in zip(_COLOURS, (0.06, 0.04, 0.15, 0.1), strict=True)
+        for name, s in zip(_COLOURS, (0.05, 0.05, 0.15, 0.1), strict=True)
         for channel in "rgb"
     },
-    "vignette": 0.04,
+    # 0.04 between anatomies; but a wider field than the frames' falls off by the brain's curvature too.
+    "vignette": 0.15,
     "vein share": 0.5,
     "arterial": 0.06,
-    "fineness": 0.18,
-    "density": 0.2,
-    "highlight share": 0.2,
-    "highlight area": 0.3,
-    "noise": 0.05,
-    "sharpness": 0.07,
-    **_contrast(*[0.06] * 4),
+    "fineness": 0.08,
+    "density": 0.12,
+    "highlight share": 0.22,
+    "highlight area": 0.2,
+    "noise": 0.04,
+    "sharpness": 0.05,
+    **_contrast(*[0.05] * 4),
 }
 """Of the statistics that are fitted to, on their scales: standard deviation between frames of one job."""
 

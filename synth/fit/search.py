@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.optimize import lsq_linear
@@ -14,9 +14,13 @@ from synth.fit.parameters import PARAMETERS, SPREAD, Parameter
 from synth.job.schema import Family
 from synth.render.appearance.family import FAMILIES
 
-_LARGEST = 0.6  # step of a parameter on its scale
+_LARGEST = 0.8  # step of a parameter, against how far it may be from the family's
 _SURER = 0.6  # several frames are, than one
-_OUTLIER = 8.0  # spreads off: a statistic that no job reaches must not draw all others along
+DECIDED = 0.15
+"""Standard deviation of a parameter, on its scale, up to which a picture is said to tell it."""
+_OUTLIER = 4.0  # spreads off: beyond, a statistic counts less, for no job may reach it (P. J. Huber, 1964)
+# Green and blue over red in frames, against those of the reflectances they were rendered with.
+_SEEN_G, _SEEN_B = 0.825, 0.735
 
 
 @dataclass(frozen=True)
@@ -32,6 +36,14 @@ class Fitted:
     """Parameters that the photograph says nothing of: as the family has them."""
     bounded: tuple[str, ...]
     """Parameters that ended at a limit."""
+    unsure: dict[str, float] = field(default_factory=dict)
+    """Standard deviation of each parameter that the photograph says something of, on its scale: what other
+    anatomies of the same parameters differ by."""
+
+    @property
+    def undecided(self) -> tuple[str, ...]:
+        """Parameters that one such picture doesn't tell within 15%."""
+        return tuple(name for name, sd in self.unsure.items() if sd > DECIDED)
 
 
 def search(
@@ -67,7 +79,8 @@ def search(
         values = best[1] | _stepped(told, best, first, theirs, reach)
     left = tuple(one.name for one in PARAMETERS if one not in told)
     bounded = tuple(one.name for one in told if not one.low < best[1][one.name] < one.high)
-    return Fitted(family, best[1], best[2], best[0], left, bounded)
+    unsure = _unsure(told, theirs, len(setting.anatomies))
+    return Fitted(family, best[1], best[2], best[0], left, bounded, unsure)
 
 
 def nearest_family(theirs: dict[str, float]) -> Family:
@@ -78,12 +91,25 @@ def nearest_family(theirs: dict[str, float]) -> Family:
         total = 0.0
         for name in ("crown", "flush"):
             r, g, b = getattr(ranges, name)
-            for channel, value in (("g", g), ("b", b)):
+            for channel, value in (("g", _SEEN_G * g), ("b", _SEEN_B * b)):
                 seen = theirs[f"{name} {channel}"] / max(theirs[f"{name} r"], 1e-3)
                 total += float(np.log(max(seen, 1e-3) / (value / r)) ** 2)
         return total if np.isfinite(total) else 0.0
 
     return min(FAMILIES, key=off)
+
+
+def _unsure(told: list[Parameter], theirs: dict[str, float], frames: int) -> dict[str, float]:
+    """Standard deviation of each parameter, on its scale, from the slopes and what anatomies differ by.
+
+    The photograph is one draw and the frames are a few; where both say nothing it is the family's own.
+    """
+    names = [name for name in SPREAD if np.isfinite(theirs[name])]
+    spread = np.sqrt(1 + 1 / frames) * np.array([SPREAD[name] for name in names])
+    slopes = np.array([[one.effects.get(name, 0.0) for one in told] for name in names]) / spread[:, None]
+    known = slopes.T @ slopes + np.diag([1 / one.vague**2 for one in told])
+    deviation = np.sqrt(np.diag(np.linalg.inv(known)))
+    return {one.name: float(sd) for one, sd in zip(told, deviation, strict=True)}
 
 
 def _own(one: Parameter) -> list[str]:
@@ -107,12 +133,14 @@ def _stepped(
     here = np.array([one.onto(values[one.name]) for one in told])
     home = np.array([one.onto(first[one.name]) for one in told])
     vague = np.array([one.vague for one in told])
-    matrix = np.concatenate([slopes / spread[:, None], np.diag(1 / vague)])
-    wanted = np.concatenate([np.clip(lacks / spread, -_OUTLIER, _OUTLIER), (home - here) / vague])
+    weight = np.sqrt(_OUTLIER / np.maximum(np.abs(lacks / spread), _OUTLIER)) / spread
+    matrix = np.concatenate([slopes * weight[:, None], np.diag(1 / vague)])
+    wanted = np.concatenate([lacks * weight, (home - here) / vague])
+    most = reach * vague
     low = np.array([one.onto(one.low) for one in told]) - here
     high = np.array([one.onto(one.high) for one in told]) - here
     room = 1e-9
-    step = lsq_linear(matrix, wanted, (np.maximum(low, -reach) - room, np.minimum(high, reach) + room)).x
+    step = lsq_linear(matrix, wanted, (np.maximum(low, -most) - room, np.minimum(high, most) + room)).x
     return {
         one.name: float(np.clip(one.back(a + d), one.low, one.high))
         for one, a, d in zip(told, here, step, strict=True)

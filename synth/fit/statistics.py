@@ -22,6 +22,10 @@ _SURROUND_MM = 5.0  # a vessel is darker than the bright part of what lies so fa
 _DARK = 0.35  # log green below its surround: a vessel
 _DARK_RED = 0.4  # log red below its surround: a vein, for arteries let red through
 _VEIN_MM = 0.45  # veins narrower than this have no crest to speak of
+_BLUE, _BLUE_MM = (
+    0.27,
+    0.8,
+)  # blue over red along a vein's crest, which no artery has; from there to its sides
 _TISSUE_MM = 0.5  # the colour of tissue is taken over so much of it
 _WHITE, _ABOVE = 200.0, 30.0  # grey levels of a highlight's smallest channel, and above its surround
 _BANDS_PX = (0.7, 1.4, 2.8, 5.6, 11.2)
@@ -59,6 +63,7 @@ class Parts:
     tissue: Mask
     artery: Mask
     vein: Mask
+    """Wide dark vessels; among them may be arteries."""
     highlight: Mask
 
 
@@ -77,7 +82,7 @@ def measure(view: View) -> dict[str, float]:
     flat = np.asarray(1 - lost * np.minimum(view.corner2, 1), np.float32)[..., None]
     found = {"vignette": lost}
     found |= _tissue(base / flat, parts.tissue)
-    found |= _veins(linear / flat, parts.vein, view.mm_per_px)
+    found |= _veins(linear / flat, _blue(parts.vein, linear, view.mm_per_px), view.mm_per_px)
     found["vein share"] = float(parts.vein.sum() / max(view.usable.sum(), 1))
     found |= _arteries(linear, surround, parts, view.mm_per_px)
     found |= _highlights(parts.highlight, view)
@@ -111,6 +116,15 @@ def find_parts(view: View, linear: Map) -> tuple[Parts, Map]:
     artery = _without_specks(vessel & ~near_vein & ~pool, view.mm_per_px)
     grown = cv2.dilate((vessel | vein).astype(np.uint8), _disc(0.12 / view.mm_per_px)) > 0
     return Parts(clear & ~grown & ~near_vein, artery, vein, highlight), surround
+
+
+def _blue(dark: Mask, linear: Map, mm_per_px: float) -> Mask:
+    """Of wide dark vessels the veins, which scatter blue along their crest; wide arteries don't."""
+    near = _smooth(linear, dark, 0.35 / mm_per_px)
+    crest = dark & (near[..., 2] > _BLUE * np.maximum(near[..., 0], 1e-3))
+    core = _opened(crest, 0.25 * _VEIN_MM / mm_per_px)
+    near_core = cv2.dilate(core.astype(np.uint8), _disc(_BLUE_MM / mm_per_px)) > 0
+    return np.asarray(dark & near_core)
 
 
 def highlights(rgb: Picture) -> Mask:
@@ -188,7 +202,7 @@ def _veins(linear: Map, vein: Mask, mm_per_px: float) -> dict[str, float]:
         return dict.fromkeys(names, np.nan)
     depth = cv2.distanceTransform(vein.astype(np.uint8), cv2.DIST_L2, 5)
     widest = cv2.dilate(depth, _disc(0.8 / mm_per_px))
-    crest, side = vein & (depth > 0.6 * widest), vein & (depth <= 0.4 * widest)
+    crest, side = vein & (depth > 0.6 * widest), vein & (depth > 0.1 * widest) & (depth <= 0.4 * widest)
     values = [*np.median(linear[crest], axis=0), *np.median(linear[side], axis=0)]
     return dict(zip(names, map(float, values), strict=True))
 

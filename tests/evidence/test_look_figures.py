@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 from sklearn.metrics import roc_auc_score
 
-from evidence.look import classifier, crops, fit, texture
+from evidence.look import classifier, crops, cues, fit, texture
 from synth.errors import UserError
 from synth.fit import parameters
 from synth.job.schema import Job
@@ -33,8 +33,8 @@ def test_auc_is_scikit_learns() -> None:
     rng = np.random.default_rng(0)
     label = rng.integers(0, 2, 60)
     score = np.round(label + rng.normal(0, 1, 60), 1)
-    assert classifier.auc(score, label) == pytest.approx(roc_auc_score(label, score))
-    assert classifier.auc(np.zeros(60), label) == 0.5
+    assert cues.auc(score, label) == pytest.approx(roc_auc_score(label, score))
+    assert cues.auc(np.zeros(60), label) == 0.5
 
 
 @pytest.mark.slow
@@ -42,10 +42,75 @@ def test_the_classifier_tells_textures_apart_and_not_what_is_the_same() -> None:
     same, other = textured(60, 1.0, 1), textured(60, 2.5, 2)
     label = np.repeat([0, 1], [60, 60])
     fold = np.tile(np.arange(5), 24)
-    apart = classifier.held_out(np.concatenate([same, other]), label, fold, 6, 3)
-    assert apart["auc"] > 0.95
-    alike = classifier.held_out(np.concatenate([same, textured(60, 1.0, 5)]), label, fold, 6, 3)
-    assert abs(alike["auc"] - 0.5) < 0.2
+    nothing = np.zeros((120, 120), bool)
+    apart = classifier.Split(np.concatenate([same, other]), label, fold, nothing)
+    assert classifier.held_out(apart.pictures, apart, 6, 3)["auc"] > 0.95
+    alike = classifier.Split(np.concatenate([same, textured(60, 1.0, 5)]), label, fold, nothing)
+    assert abs(classifier.held_out(alike.pictures, alike, 6, 3)["auc"] - 0.5) < 0.2
+
+
+def test_a_crop_that_shows_some_of_a_held_out_one_is_not_trained_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    places = np.array([[64.0 * k, 0.0] for k in range(8)])
+    near = crops.overlapping(places)
+    assert near[0].tolist() == [True, True] + [False] * 6
+    split = classifier.Split(textured(8, 1.0, 0), np.array([0, 1] * 4), np.arange(8) // 4, near)
+    taught: list[int] = []
+    monkeypatch.setattr(classifier, "_trained", lambda pictures, *_: taught.append(len(pictures)))
+    monkeypatch.setattr(classifier, "_scores", lambda _, pictures: np.arange(len(pictures)) / 9)
+    classifier.held_out(split.pictures, split, 1, 0)
+    assert taught == [3, 3], "the fourth and fifth overlap across the border"
+
+
+def test_shuffled_labels_stay_in_their_fold_and_tell_nothing_on_the_mean() -> None:
+    rng = np.random.default_rng(0)
+    figures, label = rng.normal(size=(100, 6)), np.repeat([0, 1], [70, 30])
+    figures[label == 1] += 3
+    split = classifier.Split(textured(1, 1.0, 0), label, np.arange(100) % 5, np.eye(100, dtype=bool))
+    assert cues.linear(figures, label, split.fold, split.near) > 0.99
+    mixed = [split.shuffled(rng) for _ in range(150)]
+    for k in range(5):
+        assert mixed[0].label[split.fold == k].sum() == label[split.fold == k].sum()
+    found = [cues.linear(figures, one.label, one.fold, one.near) for one in mixed]
+    assert np.mean(found) == pytest.approx(0.5, abs=4 * np.std(found) / np.sqrt(150))
+    assert 0.03 < np.std(found) < 0.12
+
+
+def test_every_cue_sees_what_it_is_named_for() -> None:
+    import cv2
+
+    rng = np.random.default_rng(1)
+    plain = textured(1, 1.0, 1)[0]
+    flat = np.full((128, 128, 3), (200, 150, 110), np.uint8)
+    at = cues.describe(plain)
+    noisy = np.clip(plain + rng.normal(0, 4, plain.shape), 0, 255).astype(np.uint8)
+    assert cues.describe(noisy)["noise luma"] > at["noise luma"] + 1
+    blurred = cues.describe(cv2.GaussianBlur(plain, (0, 0), 2))
+    assert blurred["sharpness luma"] < at["sharpness luma"] - 0.2
+    grain = np.clip(flat + rng.normal(0, 4, flat.shape), 0, 255).astype(np.uint8)
+    soft = np.clip(flat + 4 * cv2.GaussianBlur(rng.normal(0, 3, flat.shape), (0, 0), 0.8), 0, 255)
+    assert (
+        cues.describe(soft.astype(np.uint8))["noise neighbours"]
+        > cues.describe(grain)["noise neighbours"] + 0.2
+    )
+    assert cues.describe(grain)["slope fine"] == pytest.approx(0, abs=0.3)
+    assert cues.describe(soft.astype(np.uint8))["slope fine"] < -1
+    _, packed = cv2.imencode(".jpg", grain, [cv2.IMWRITE_JPEG_QUALITY, 30])
+    assert cues.describe(cv2.imdecode(packed, 1))["grid of 8 px"] > 2 * cues.describe(grain)["grid of 8 px"]
+    lab = cv2.cvtColor(flat[:1, :1].astype(np.float32) / 255, cv2.COLOR_RGB2LAB)[0, 0]
+    assert [cues.describe(flat)[f"{k} mean"] for k in "Lab"] == pytest.approx(lab, abs=1e-3)
+    clipped = flat.copy()
+    clipped[:32, :, 0] = 255
+    assert cues.describe(clipped)["red clipped"] == 0.25
+    assert cues.describe(clipped)["red p99"] == 255
+
+
+def test_the_farthest_cue_comes_first() -> None:
+    figures = np.array([[0.0, 1], [1, 0], [2, 5], [3, 6]])
+    rows = classifier.tell_apart(["none", "some"], 2, {"job": figures[[0, 2, 1, 3]][:, ::-1]})
+    assert [(row["cue"], row["job, auc"]) for row in rows] == [("some", 0.75), ("none", 0.5)]
+    rows = classifier.tell_apart(["one", "two"], 2, {"job": figures})
+    assert [row["job, auc"] for row in rows] == [1, 1]
+    assert (rows[0]["photograph"], rows[0]["job, median"]) == (0.5, 2.5)
 
 
 def test_regions_are_apart_and_of_a_size() -> None:
@@ -133,8 +198,15 @@ def test_crops_of_a_job_are_tissue_without_its_tools_and_codec() -> None:
 def test_errors_are_relative_but_for_what_may_be_nothing() -> None:
     known = parameters.start("pale") | {"blur": 1.0, "glare": 0.2}
     found = known | {"density": 1.1, "blur": 0.7, "glare": 0.25, "crown r": 1.2 * known["crown r"]}
-    rows = {row["parameter"]: row for row in fit.compare("one", known, found)}
+    rows = {
+        row["parameter"]: row for row in fit.compare("one", known, found, {"density": 0.17, "noise": 0.1})
+    }
     assert rows["density"]["error"] == pytest.approx(0.1)
+    assert [(rows[k]["sd"], rows[k]["decided"]) for k in ("density", "noise", "vein")] == [
+        (0.17, False),
+        (0.1, True),
+        (None, False),
+    ]
     assert (rows["blur"]["error"], rows["glare"]["error"]) == pytest.approx((-0.3, 0.05))
     assert [name for name, row in rows.items() if not row["within_15"]] == ["crown", "glare", "blur"]
 

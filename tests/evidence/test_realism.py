@@ -25,6 +25,16 @@ def test_a_spectrum_of_known_slope_is_found() -> None:
     assert statistics(grey(128 + 30 * field / field.std()))["spectrum slope"] == pytest.approx(-2, abs=0.25)
 
 
+def test_elongation_is_the_ratio_of_a_highlights_sides() -> None:
+    light = np.full((200, 200), 150.0)
+    light[20:24, 20:40] = 255
+    light[100:104, 100:104] = 255
+    light[150:153, 20:35] = 255
+    assert statistics(grey(light))["highlight elongation"] == pytest.approx(5, rel=0.02), "of 1, 5 and 5"
+    light[150:153, 20:35] = 150
+    assert statistics(grey(light))["highlight elongation"] == pytest.approx((5 + 1) / 2, rel=0.02)
+
+
 def test_highlights_are_counted_and_sized() -> None:
     light = np.full((200, 200), 150.0)
     light[20:24, 20:24] = 255
@@ -57,3 +67,22 @@ def test_a_histogram_is_as_far_as_its_brightness() -> None:
     lift = statistics(grey(noise + 60))["L mean"] - statistics(grey(noise))["L mean"]
     assert lighter["L histogram"] == pytest.approx(lift, rel=0.05)
     assert lighter["a histogram"] < 0.5
+
+
+def test_noise_is_the_spread_over_seeds_as_a_share_of_the_light() -> None:
+    from types import SimpleNamespace
+
+    from evidence.render import cost
+
+    def frame(_: object, __: object, ___: object, seed: int) -> SimpleNamespace:
+        light = np.random.default_rng(seed).normal(0.5, 0.05, (300, 300))
+        light[:, :100] *= 100
+        return SimpleNamespace(radiance=np.repeat(light[..., None], 3, axis=2))
+
+    case = SimpleNamespace(studio=SimpleNamespace(frame=frame), vertices=None, tips=None, shafts=None)
+    where = np.zeros((300, 300), bool)
+    where[:, 100:] = True
+    found = cost._noise(case, where)  # type: ignore[arg-type]
+    # Of four draws: chi's mean with three degrees of freedom is 0.92 of the deviation.
+    assert found["noise_mean"] == pytest.approx(0.1 * 0.921, rel=0.02)
+    assert found["noise_median"] < found["noise_mean"]

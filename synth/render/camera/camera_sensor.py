@@ -13,6 +13,9 @@ from synth.system.jit import vectorised
 
 Map = npt.NDArray[np.float32]
 
+_HEADROOM = 2.0  # times full scale that the sensor still measures, where a knee leaves room for it
+_STEPS = 4096  # of the tone curve, over full scale
+
 
 @dataclass(frozen=True)
 class Sensor:
@@ -21,7 +24,7 @@ class Sensor:
     exposure: float = 1.0
     """Share of full scale that radiance 1 fills."""
     white: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    """White balance: gain of red, green, blue."""
+    """White balance: gain of red, green, blue. A channel of less than 1 still reaches full scale."""
     full_well: float = 12_000.0
     """Photoelectrons at full scale."""
     read_noise: float = 12.0
@@ -34,6 +37,8 @@ class Sensor:
     """Standard deviation of the optics' blur [px]."""
     bloom: float = 0.03
     """Share of light that the optics scatter around."""
+    knee: float = 0.8
+    """Share of full scale above which light is compressed, so that highlights keep some drawing; 1: none."""
     contrast: float = 0.35
     """Weight of the tone curve's S over a straight line."""
     sharpening: float = 0.3
@@ -76,17 +81,21 @@ def record(radiance: Map, sensor: Sensor, rng: np.random.Generator) -> npt.NDArr
     Returns:
         (H, W, 3) uint8.
     """
-    light = radiance * (sensor.exposure * _falloff(radiance.shape[:2], sensor.vignette))[..., None]
+    white = np.asarray(sensor.white, np.float32)
+    # Gains below 1 are taken off the exposure: what fills the sensor has to be white, not short of a colour.
+    least = white.min()
+    light = radiance * (least * sensor.exposure * _falloff(radiance.shape[:2], sensor.vignette))[..., None]
     if sensor.blur > 0:
         light = cv2.GaussianBlur(light, (0, 0), sensor.blur)
     light = _scatter(light, sensor.bloom)
     balanced = rng.standard_normal(light.shape, dtype=np.float32)
     well, read = np.float32(sensor.full_well), np.float32(sensor.read_noise**2)
-    steps, white = np.float32(2**sensor.bits - 1), np.asarray(sensor.white, np.float32)
-    _convert(np.asarray(light, np.float32), well, read, steps, white, balanced)
+    most = np.float32(_HEADROOM if sensor.knee < 1 else 1)
+    steps = np.float32(2**sensor.bits - 1) / most
+    _convert(np.asarray(light, np.float32), well, read, steps, most, white / least, balanced)
     if sensor.bayer:
         balanced = _demosaiced(balanced)
-    video = _tone(balanced, sensor.contrast)
+    video = _tone(balanced, sensor.contrast, sensor.knee)
     video = _sharpen(video, sensor.sharpening)
     np.clip(video, 0, 1, out=video)
     video = video if sensor.coded else _thinned(video, sensor.chroma)
@@ -97,18 +106,27 @@ def record(radiance: Map, sensor: Sensor, rng: np.random.Generator) -> npt.NDArr
 
 @vectorised
 def _convert(
-    light: Map, well: np.float32, read: np.float32, steps: np.float32, white: Map, noise: Map
+    light: Map,
+    well: np.float32,
+    read: np.float32,
+    steps: np.float32,
+    most: np.float32,
+    white: Map,
+    noise: Map,
 ) -> None:
-    """Noise, converter and white balance; takes normal `noise` (H, W, 3) and leaves the picture in it."""
-    zero, one = np.float32(0), np.float32(1)
+    """Noise, converter of so many `steps` and white balance, up to `most` times full scale.
+
+    Takes normal `noise` (H, W, 3) and leaves the picture in it.
+    """
+    zero = np.float32(0)
     for y in range(light.shape[0]):
         for x in range(light.shape[1]):
             for k in range(3):
                 electrons = max(light[y, x, k], zero) * well
                 # A Poisson count this large is a Gaussian to within the readout noise.
                 electrons = electrons + noise[y, x, k] * np.sqrt(electrons + read)
-                digital = np.rint(min(max(electrons / well, zero), one) * steps) / steps
-                noise[y, x, k] = min(max(digital * white[k], zero), one)
+                digital = np.rint(min(max(electrons / well, zero), most) * steps) / steps
+                noise[y, x, k] = min(max(digital * white[k], zero), most)
 
 
 def _demosaiced(balanced: Map) -> Map:
@@ -116,9 +134,9 @@ def _demosaiced(balanced: Map) -> Map:
     mosaic = balanced[..., 1].copy()
     mosaic[::2, ::2] = balanced[::2, ::2, 0]
     mosaic[1::2, 1::2] = balanced[1::2, 1::2, 2]
-    raw = np.rint(mosaic * 65535).astype(np.uint16)
+    raw = np.rint(mosaic * (65535 / _HEADROOM)).astype(np.uint16)
     # OpenCV names a pattern by its second row's second and third pixel: this one is red first.
-    return np.asarray(cv2.cvtColor(raw, cv2.COLOR_BayerBG2RGB_EA), np.float32) / np.float32(65535)
+    return np.asarray(cv2.cvtColor(raw, cv2.COLOR_BayerBG2RGB_EA), np.float32) * np.float32(_HEADROOM / 65535)
 
 
 def _thinned(video: Map, chroma: str) -> Map:
@@ -151,26 +169,43 @@ def _scatter(light: Map, share: float) -> Map:
     return np.asarray((1 - share) * light + share * halo, np.float32)
 
 
-def _tone(linear: Map, contrast: float) -> Map:
-    """sRGB transfer (IEC 61966-2-1), then an S-curve that keeps black, middle and white."""
-    levels = np.linspace(0, 1, 4097, dtype=np.float32)
-    encoded = np.where(levels <= 0.0031308, 12.92 * levels, 1.055 * levels ** (1 / 2.4) - 0.055)
+def _tone(linear: Map, contrast: float, knee: float) -> Map:
+    """A knee, the sRGB transfer (IEC 61966-2-1), then an S-curve that keeps black, middle and white."""
+    levels = np.linspace(0, _HEADROOM, int(_HEADROOM * _STEPS) + 1, dtype=np.float32)
+    encoded = _encoded(_compressed(levels, knee))
     curve = (encoded + contrast * (encoded * encoded * (3 - 2 * encoded) - encoded)).astype(np.float32)
     video = np.empty(linear.shape, np.float32)
     _look_up(np.ascontiguousarray(linear, np.float32), curve, video)
     return video
 
 
+def _compressed(levels: Map, knee: float) -> Map:
+    """Linear light with what is above a knee bent towards full scale, which `_HEADROOM` reaches; smoothly."""
+    if knee >= 1:
+        return np.minimum(levels, 1)
+    room = 1 - knee
+    bent = -np.expm1(-np.maximum(levels - knee, 0) / room) / -np.expm1(-(_HEADROOM - knee) / room)
+    return np.asarray(np.minimum(levels, knee) + room * bent, np.float32)
+
+
+def _encoded(linear: Map) -> Map:
+    """The sRGB transfer (IEC 61966-2-1) of linear light."""
+    return np.asarray(
+        np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055), np.float32
+    )
+
+
 @vectorised
 def _look_up(linear: Map, curve: Map, video: Map) -> None:
-    """A curve (4097,) over 0 to 1, read at linear (H, W, 3) in double precision, into `video`."""
+    """A curve of `_STEPS` a full scale, read at linear (H, W, 3) in double precision, into `video`."""
+    last = len(curve) - 2
     for y in range(linear.shape[0]):
         for x in range(linear.shape[1]):
             for k in range(3):
-                at = linear[y, x, k] * np.float32(4096)
+                at = linear[y, x, k] * np.float32(_STEPS)
                 low = int(at)
-                if low > 4095:
-                    low = 4095
+                if low > last:
+                    low = last
                 video[y, x, k] = curve[low] + (at - low) * (curve[low + 1] - curve[low])
 
 

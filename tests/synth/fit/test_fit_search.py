@@ -78,11 +78,62 @@ def test_what_the_photograph_does_not_show_stays_the_familys(monkeypatch: pytest
 
 
 def test_a_parameter_at_its_limit_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    theirs = law(TRUTH | {"glare": -2.5})
+    theirs = law(TRUTH | {"glare": -1.6})
     found = searched(monkeypatch, theirs, 1.0, worst=0.8)
     assert "glare" in found.bounded
     assert found.values["glare"] == -1
     assert found.values["density"] == pytest.approx(TRUTH["density"], rel=0.15)
+
+
+def test_what_is_far_off_arrives_in_few_rounds(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Noise has a figure of its own: that it is many spreads off mustn't shorten its steps."""
+    theirs = law(TRUTH | {"noise": 5.0})
+    said: list[float] = []
+    given: dict[str, dict[str, float]] = {}
+    monkeypatch.setattr(search.parameters, "as_job", lambda values, _: given.update(now=values) or {})
+    monkeypatch.setattr(search, "render", lambda *_: None)
+    monkeypatch.setattr(search, "measured", lambda _: law(given["now"]))
+    found = search.search(theirs, SETTING, 4, lambda _, at: said.append(at))
+    assert found.values["noise"] == pytest.approx(5, rel=0.15)
+    assert found.values["vignette"] == pytest.approx(0.4, rel=0.15)
+
+
+def test_what_a_picture_does_not_decide_is_named_and_what_it_shows_is_not(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    theirs = law(TRUTH)
+    found = searched(monkeypatch, theirs, 1.0)
+    assert {"wine r", "film_mm"} <= set(found.undecided)
+    assert not {"crown r", "crown g", "noise"} & set(found.undecided)
+    small = searched(monkeypatch, theirs | {"noise": np.nan}, 1.0)
+    assert "noise" not in small.unsure, "nothing is said of it: it is among those left as the family's"
+
+
+def test_deviations_are_those_of_repeated_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Against a Monte Carlo of the statistics' own spread, for a parameter that other ones trade against."""
+    rng = np.random.default_rng(0)
+    at = parameters.start("healthy")
+    told = list(PARAMETERS)
+    names = list(SPREAD)
+    slopes = np.array([[one.effects.get(name, 0.0) for one in told] for name in names])
+    spread = np.array([SPREAD[name] for name in names])
+    home = np.diag([1 / one.vague for one in told])
+    matrix = np.concatenate([slopes / spread[:, None], home])
+    true = rng.normal(size=(4000, len(told))) * [one.vague for one in told]
+    seen = true @ slopes.T + spread * rng.normal(size=(4000, len(names)))
+    given = np.concatenate([seen / spread, np.zeros((4000, len(told)))], axis=1)
+    off = np.linalg.lstsq(matrix, given.T, rcond=None)[0].T - true
+    theirs = law(at)
+    expected = search._unsure(told, theirs, 10**9)
+    np.testing.assert_allclose(off.std(axis=0), list(expected.values()), rtol=0.06)
+
+
+@pytest.mark.parametrize("family", parameters.FAMILIES)
+def test_each_family_is_nearest_to_itself_as_frames_show_it(family: str) -> None:
+    at = parameters.start(family)
+    seen = {"g": 0.83, "b": 0.74, "r": 1.0}
+    theirs = {f"{name} {k}": seen[k] * at[f"{name} {k}"] for name in ("crown", "flush") for k in "rgb"}
+    assert search.nearest_family(theirs) == family
 
 
 def test_what_is_brighter_than_tissue_is_a_longer_exposure() -> None:
@@ -118,7 +169,13 @@ def test_the_file_is_a_job_with_these_values() -> None:
     from synth.job import reader
 
     fitted = search.Fitted(
-        "calf", parameters.start("calf") | {"density": 1.3}, {}, 0.2, ("vein r", "vein g"), ("glare",)
+        "calf",
+        parameters.start("calf") | {"density": 1.3},
+        {},
+        0.2,
+        ("vein r", "vein g"),
+        ("glare",),
+        {"wine r": 0.5, "wine g": 0.2, "crown r": 0.1, "blur": 0.3},
     )
     written = look_file.text(fitted, look_file.sections(fitted, "4:2:0", 6.5), ["Fitted to x.jpg."])
     job = reader.parse_job(written, "look.yaml", reader.Path.cwd())
@@ -129,8 +186,9 @@ def test_the_file_is_a_job_with_these_values() -> None:
     assert (job.sensor.chroma, job.sensor.bitrate_mbps) == ("4:2:0", 6.5)
     low, high = job.appearance.own.arterial or (0, 0)
     assert low < 0.8 < high
-    assert written.splitlines()[:3] == [
+    assert written.splitlines()[:4] == [
         "# Fitted to x.jpg.",
         "# Not to be seen in it, as the family calf has them: vein.",
         "# At a limit, look at the picture: glare.",
+        "# Not decided by this picture, one standard deviation: wine 65%, blur 0.30.",
     ]

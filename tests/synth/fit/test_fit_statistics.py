@@ -79,6 +79,13 @@ def test_a_vein_is_no_artery() -> None:
     assert found["vein share"] == pytest.approx(24 * length / (SIZE[0] * SIZE[1]), rel=0.15)
 
 
+def test_a_wide_artery_is_no_vein_though_it_is_dark() -> None:
+    picture = tissue()
+    cv2.line(picture, (0, 100), (SIZE[1], 160), (0.26, 0.05, 0.05), 16)
+    found = seen(picture)
+    assert np.isnan(found["vein r"])
+
+
 def test_noise_of_known_size_is_found_and_blur_lowers_sharpness() -> None:
     picture = encoded(lines(8, 3)).astype(float)
     noise = 3 * np.random.default_rng(1).standard_normal(SIZE)[..., None]

@@ -7,7 +7,7 @@ import pytest
 
 from synth.render.camera.camera_sensor import Sensor, record
 
-PLAIN = Sensor(vignette=0.0, bloom=0.0, contrast=0.0, sharpening=0.0)
+PLAIN = Sensor(vignette=0.0, bloom=0.0, knee=1.0, contrast=0.0, sharpening=0.0)
 
 
 def flat(level: float, side: int = 200) -> np.ndarray:
@@ -40,6 +40,28 @@ def test_white_balance_multiplies_channels() -> None:
     sensor = replace(PLAIN, white=(1.5, 1.0, 0.5), full_well=1e6, read_noise=0.0)
     seen = linear(record(flat(0.4), sensor, np.random.default_rng(0)).astype(float)).mean(axis=(0, 1))
     np.testing.assert_allclose(seen, [0.6, 0.4, 0.2], rtol=0.02)
+
+
+def test_what_fills_the_sensor_is_white_under_any_lamp() -> None:
+    sensor = replace(PLAIN, white=(0.79, 1.0, 1.26))
+    for knee in (1.0, 0.8):
+        assert (record(flat(5.0), replace(sensor, knee=knee), np.random.default_rng(0)) == 255).all()
+
+
+def test_the_knee_leaves_what_is_below_and_keeps_bright_things_apart() -> None:
+    quiet = replace(PLAIN, full_well=1e9, read_noise=0.0, bits=24)
+    ramp = np.linspace(0, 2, 401, dtype=np.float32)[None, :, None].repeat(3, 2)
+    bent, straight = (
+        linear(record(ramp, replace(quiet, knee=knee), np.random.default_rng(0)).astype(float))[0, :, 0]
+        for knee in (0.8, 1.0)
+    )
+    below = ramp[0, :, 0] <= 0.8
+    np.testing.assert_array_equal(bent[below], straight[below])
+    np.testing.assert_allclose(straight, np.minimum(ramp[0, :, 0], 1), atol=0.005)
+    expected = 0.8 + 0.2 * (1 - np.exp((0.8 - ramp[0, :, 0]) / 0.2)) / (1 - np.exp(-6.0))
+    np.testing.assert_allclose(bent[~below], expected[~below], atol=0.005)
+    assert (np.diff(bent) >= 0).all()
+    assert bent[240] - bent[200] > 0.04, "1.2 of full scale is brighter than 1"
 
 
 def test_bloom_keeps_the_light() -> None:

@@ -33,23 +33,24 @@ def test_a_map_in_rows_is_the_map_at_once() -> None:
 def test_the_sensor_is_the_chain_of_its_parts() -> None:
     radiance = (1.3 * RNG.random((60, 80, 3)) ** 2).astype(np.float32)
     sensor = Sensor(white=(1.1, 1.0, 0.8), bloom=0.0, vignette=0.0)
-    electrons = radiance * np.float32(sensor.exposure) * np.float32(sensor.full_well)
+    least = np.float32(0.8)
+    electrons = radiance * (least * np.float32(sensor.exposure)) * np.float32(sensor.full_well)
     drawn = np.random.default_rng(1).standard_normal(electrons.shape, dtype=np.float32)
     electrons = electrons + drawn * np.sqrt(electrons + np.float32(sensor.read_noise**2))
-    steps = np.float32(2**sensor.bits - 1)
-    digital = np.rint(np.clip(electrons / np.float32(sensor.full_well), 0, 1) * steps) / steps
-    balanced = np.clip(digital * np.asarray(sensor.white, np.float32), 0, 1)
-    video = camera_sensor._tone(balanced, sensor.contrast)
+    steps = np.float32(2**sensor.bits - 1) / np.float32(2)
+    digital = np.rint(np.clip(electrons / np.float32(sensor.full_well), 0, 2) * steps) / steps
+    balanced = np.clip(digital * (np.asarray(sensor.white, np.float32) / least), 0, 2)
+    video = camera_sensor._tone(balanced, sensor.contrast, sensor.knee)
     video = video + sensor.sharpening * (video - cv2.GaussianBlur(video, (0, 0), 1.0))
     wanted = np.rint(np.clip(video, 0, 1) * 255).astype(np.uint8)
     assert np.array_equal(record(radiance, sensor, np.random.default_rng(1)), wanted)
 
 
 def test_the_tone_curve_is_read_between_its_points() -> None:
-    levels = np.linspace(0, 1, 4097, dtype=np.float32)
-    curve = camera_sensor._tone(levels.reshape(-1, 1, 1).repeat(3, 2), 0.35)[:, 0, 0].astype(np.float64)
-    light = RNG.random((30, 40, 3), np.float32)
-    assert camera_sensor._tone(light, 0.35) == pytest.approx(np.interp(light, levels, curve), abs=1e-6)
+    levels = np.linspace(0, 2, 8193, dtype=np.float32)
+    curve = camera_sensor._tone(levels.reshape(-1, 1, 1).repeat(3, 2), 0.35, 0.8)[:, 0, 0].astype(np.float64)
+    light = 2 * RNG.random((30, 40, 3), np.float32)
+    assert camera_sensor._tone(light, 0.35, 0.8) == pytest.approx(np.interp(light, levels, curve), abs=1e-6)
 
 
 def test_normals_of_a_height_map_are_unit_vectors_across_its_slope() -> None:
