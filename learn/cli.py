@@ -158,9 +158,11 @@ def _divided(
             raise UserError(
                 f"{dataset}: is split already (split.json, by `synth split`): leave out {', '.join(asked)}"
             )
-        settings = replace(settings, share_anatomy=settings.share_anatomy or read_rule(dataset).share_anatomy)
+        rule = read_rule(dataset)
+        settings = replace(settings, share_anatomy=settings.share_anatomy or rule.share_anatomy)
     if settings.share_anatomy:
-        clips = ungrouped(clips)
+        # A written split that doesn't keep openings apart would have one on two sides.
+        clips = ungrouped(clips, by_opening=None if sides is None or rule.by == "opening" else False)
         apart = "" if len(set(groups(clips))) == len(clips) else " Its openings are kept apart."
         _console.print(
             f"One brain may be on several sides of the split: scores say nothing of other brains.{apart}"
@@ -241,7 +243,7 @@ def intervals_command(
 ) -> None:
     """Fit how far off a trained model's answers may be, on sequences that it was not fitted or chosen on."""
     from learn.data.clips import load_clips, scored
-    from learn.data.split import ungrouped
+    from learn.data.split import are_openings, ungrouped
     from learn.evaluation.fit_intervals import add_intervals
     from learn.evaluation.interval_sides import find_obstacle, find_sides
     from learn.inference.predict import load_predictor
@@ -255,7 +257,7 @@ def intervals_command(
         read = [load_clips(one, predictor.grid, (source,), cache=cache, report=tell) for one in datasets]
     clips = [clip for part in read for clip in part]
     if predictor.card.settings.share_anatomy:
-        clips = ungrouped(clips)
+        clips = ungrouped(clips, by_opening=are_openings(predictor.card.groups))
     marked = [(written_sides(one) or {}).items() for one in datasets]
     tests = [name for part in marked for name, side in part if side == "test"]
     split = find_sides(clips, predictor.card, tests, from_test)
@@ -304,7 +306,7 @@ def eval_command(
 ) -> None:
     """Score a model on the sequences it has not seen; forces in mN."""
     from learn.data.clips import load_clips, scored
-    from learn.data.split import ungrouped
+    from learn.data.split import are_openings, ungrouped
     from learn.evaluation.coverage import cover
     from learn.evaluation.evaluate import compare, evaluate
     from learn.inference.predict import load_predictor
@@ -316,7 +318,7 @@ def eval_command(
     with _bar("Reading sequences") as tell:
         clips = load_clips(dataset, predictor.grid, (source,), cache=cache, report=tell)
     if predictor.card.settings.share_anatomy:
-        clips = ungrouped(clips)
+        clips = ungrouped(clips, by_opening=are_openings(predictor.card.groups))
         _console.print("The model was chosen on brains it is scored on: this says nothing of other brains.")
     other = None if against is None else load_predictor(against)
     if other is not None:

@@ -200,7 +200,9 @@ def status(out: Out, json: Json = False) -> None:
 @app.command("split", epilog="Example: synth split out --by anatomy --hold-out calf")
 def split_command(
     out: Out,
-    by: Annotated[str, typer.Option(help="anatomy, family, gesture, stiffness or sequence.")] = "anatomy",
+    by: Annotated[
+        str, typer.Option(help="anatomy, opening, family, gesture, stiffness or sequence.")
+    ] = "anatomy",
     shares: Annotated[str, typer.Option(help="For train, validation and test.")] = "0.7,0.15,0.15",
     hold_out: Annotated[
         list[str] | None, typer.Option(help="An appearance family that is only for testing.")
@@ -222,9 +224,13 @@ def split_command(
     rows = index.write_index(folder)
     split.assign_sides(rows, chosen)
     split.keep_rule(out, chosen)
-    counts = split.count(index.write_index(folder))
+    rows = index.write_index(folder)
+    counts = split.count(rows)
     if not counts:
         raise UserError(f"{out}: holds no finished sequence")
+    warning = split.warn_of_strangers(rows, chosen)
+    if warning:
+        print(f"warning: {warning}", file=sys.stderr)
     print(json_.dumps(counts) if json else ", ".join(f"{side} {n}" for side, n in counts.items()))
 
 

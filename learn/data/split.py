@@ -20,6 +20,7 @@ _HINT = (
     "them), or else by sequence, and says nothing of other brains"
 )
 _OPENINGS = 3  # fit, select and test
+_SEQUENCE = "/"  # between the anatomy and the sequence in a group's name; in none of an anatomy or opening
 
 
 @dataclass(frozen=True)
@@ -33,13 +34,20 @@ class Split:
     """Neither fitted nor chosen on, and no test: what intervals are fitted on."""
 
 
-def ungrouped(clips: Sequence[Clip]) -> list[Clip]:
+def ungrouped(clips: Sequence[Clip], *, by_opening: bool | None = None) -> list[Clip]:
     """The clips without their anatomies as groups: for a dataset of a single brain, whose sequences can't be
-    kept apart by anatomy. Each place that the brain is opened at is a group where there are three or more of
-    them, else every sequence is. Scores then say nothing of other brains."""
-    if len({c.opening for c in clips if c.opening}) >= _OPENINGS:
-        return [replace(c, group=c.opening or f"{c.group}/{c.content_hash}") for c in clips]
-    return [replace(c, group=f"{c.group}/{c.content_hash}") for c in clips]
+    kept apart by anatomy. Each place that the brain is opened at is a group, or else every sequence is; not
+    told, the former where there are three or more. Scores then say nothing of other brains."""
+    if by_opening is None:
+        by_opening = len({c.opening for c in clips if c.opening}) >= _OPENINGS
+    if by_opening:
+        return [replace(c, group=c.opening or c.group) for c in clips]
+    return [replace(c, group=f"{c.group}{_SEQUENCE}{c.content_hash}") for c in clips]
+
+
+def are_openings(groups: Mapping[str, Sequence[str]]) -> bool:
+    """Whether the groups of a model's card, of `ungrouped`, are openings and not sequences."""
+    return not all(_SEQUENCE in name for part in groups.values() for name in part)
 
 
 def groups(clips: Sequence[Clip]) -> list[int]:
