@@ -115,13 +115,14 @@ def check(
     from dataclasses import asdict
 
     from bench.recording import check as checking
+    from synth.system.text_lines import hang
 
     found = checking.check_recording(recording, phantom)
     if json:
         print(json_.dumps({"usable": checking.is_usable(found), "findings": [asdict(f) for f in found]}))
     else:
         for finding in found:
-            print(printable(f"{finding.state:<5}{finding.what:<11}{finding.said}"))
+            print("\n".join(hang(f"{finding.state:<5}{finding.what:<11}", printable(finding.said))))
     if not checking.is_usable(found):
         raise typer.Exit(2)
 
@@ -243,7 +244,8 @@ def _say(result: Result, folder: Path, json: bool) -> None:
     console.print(report.terminal_table(result))
     for note in result.notes:
         console.print(f"note: {note}", style="yellow", markup=False, highlight=False)
-    console.print(f"report: {folder / 'report.html'}", markup=False, highlight=False)
+    # A path is to be copied: never broken into lines.
+    console.print(f"report: {folder / 'report.html'}", markup=False, highlight=False, soft_wrap=True)
 
 
 @app.command(epilog="Example: bench flow rest.png moved.png truth.flo --flow tvl1")
@@ -262,6 +264,7 @@ def flow(
 ) -> None:
     """Flow between any two pictures, scored against a flow file."""
     from bench.flow import pair
+    from synth.system.text_lines import hang
 
     moved, found = pair.score_pair(first, second, truth, flow, glare, out)
     if json:
@@ -272,10 +275,11 @@ def flow(
     if out is not None:
         typer.echo(f"written to {out}")
     if found is not None:
-        typer.echo(
+        told = (
             f"EPE {found.epe:.3f} px, 95% within {found.p95:.3f} px, outliers {found.outliers:.1%}; "
             f"{found.trusted:.0%} trusted, EPE {found.trusted_epe:.3f} px there"
         )
+        typer.echo("\n".join(hang("", told)))
 
 
 @app.command(epilog="Example: bench live video.mp4 --model model --scale 0.05 --young 1.5")

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
@@ -495,13 +496,9 @@ def _table(report: Report, source: str, seen: bool) -> Table:
     from learn.evaluation.metrics import METRICS
 
     which = "sequences, seen ones too" if seen else "unseen sequences"
-    table = Table(
-        title=f"{len(report.clips)} {which}, {source} flow; mean over sequences", title_justify="left"
-    )
-    table.add_column("")
-    heads = ("E known [95%]", "E taken ×½", "E taken ×2", "E unknown")
-    for head in heads:
-        table.add_column(head, justify="right")
+    table = _open_table(f"{len(report.clips)} {which}, {source} flow; mean over sequences")
+    for head in ("E known [95%]", "E × ½", "E × 2", "E unknown"):
+        table.add_column(head, justify="right", no_wrap=True)
     columns, sure = [report.summary(y) for y in YOUNG], report.intervals()
     for key, metric in METRICS.items():
         if not metric.listed or key not in columns[0]:
@@ -513,11 +510,18 @@ def _table(report: Report, source: str, seen: bool) -> Table:
     return table
 
 
+def _open_table(title: str) -> Table:
+    """A table that keeps its numbers whole in eighty columns: labels wrap, there are no upright lines."""
+    table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
+    table.add_column("", overflow="fold")
+    return table
+
+
 def _coverage(covered: list[Coverage]) -> Table:
     """Whether the model's intervals hold, and how wide they are."""
-    table = Table(title="intervals", title_justify="left")
-    for head in ("", *(f"{one.level:.0%}" for one in covered)):
-        table.add_column(head, justify="right" if head else "left")
+    table = _open_table("intervals")
+    for one in covered:
+        table.add_column(f"{one.level:.0%}", justify="right", no_wrap=True)
     shares = [
         {
             "force within": one.size,
@@ -540,9 +544,9 @@ def _pairs(pairs: Mapping[str, Paired], against: str, card: Card) -> Table:
     """Differences, this model minus the other, sequence by sequence."""
     from learn.evaluation.metrics import METRICS
 
-    table = Table(title=f"against {against}, paired by sequence", title_justify="left")
-    for head in ("", "difference [95%]", "p", "larger on"):
-        table.add_column(head, justify="left" if not head else "right")
+    table = _open_table(f"against {against}, paired by sequence")
+    for head in ("difference [95%]", "p", "larger on"):
+        table.add_column(head, justify="right", no_wrap=True)
     for key, metric in METRICS.items():
         if metric.listed and key in pairs:
             d, pair = pairs[key].difference, pairs[key]

@@ -419,6 +419,7 @@ def doctor(
 ) -> None:
     """Says what this machine offers, and what to do about what it lacks."""
     from synth.system.doctor import findings
+    from synth.system.text_lines import hang
 
     found = findings(folder)
     if json:
@@ -426,6 +427,7 @@ def doctor(
         return
     width = max(len(finding.what) for finding in found)
     for finding in found:
-        print(f"{'ok  ' if finding.good else 'LACK'} {finding.what:<{width}}  {finding.found}")
+        said = hang(f"{'ok  ' if finding.good else 'LACK'} {finding.what:<{width}}  ", finding.found)
         if not finding.good:
-            print(f"     {'':<{width}}  -> {finding.advice}")
+            said += hang(f"     {'':<{width}}  -> ", finding.advice)
+        print("\n".join(said))

@@ -18,8 +18,8 @@ from synth.job.types import first_problem
 from synth.system import foreign_file
 
 By = Literal["anatomy", "opening", "family", "gesture", "stiffness", "sequence"]
-"""What must not be shared between the sides: `opening` is the place that a user's brain is opened at, else the
-anatomy; `stiffness` splits at quantiles of Young's modulus."""
+"""What must not be shared between the sides: `opening` is the place that a user's brain is opened at, else
+the anatomy; `stiffness` splits at quantiles of Young's modulus."""
 
 SIDES = ("train", "validation", "test")
 _CLASSES = 10
@@ -60,7 +60,7 @@ def keep_rule(root: Path, chosen: Rule) -> None:
 
 
 def parse_rule(by: str, shares: str, held_out: Sequence[str], share_anatomy: bool = False) -> Rule:
-    """A rule from the words of a command line; by opening, one brain is shared. UserError for what is none."""
+    """A rule from the words of a command line, UserError for what is none; by opening, a brain is shared."""
     if by not in get_args(By):
         raise UserError(f"by {by}: is not one of {', '.join(get_args(By))}")
     try:
