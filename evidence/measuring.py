@@ -197,10 +197,13 @@ def _show(found: Any) -> None:
             value = [{name: key, **row} for key, row in value.items()]
         if isinstance(value, list) and value and all(isinstance(row, dict) for row in value):
             columns = list(dict.fromkeys(key for row in value for key in row))
-            table = Table(*columns, title=name, title_justify="left")
+            table = Table(*map(escape, columns), title=escape(name), title_justify="left")
             for row in value:
                 table.add_row(*(_cell(row.get(key)) for key in columns))
-            if console.measure(table).maximum <= console.width:
+            if (
+                console.measure(table, options=console.options.update(max_width=10_000)).maximum
+                <= console.width
+            ):
                 console.print(table)
                 continue
             # Too wide: row by row, rather than cut off.

@@ -76,7 +76,7 @@ class Report:
 
     def lines(self) -> list[str]:
         """For a person: each check and where its worst measure is, wrapped, then every failure in a line."""
-        head = ("check", "measures", "bad", "worst", "limit", "unit", "CPU s", "where")
+        head = ("check", "count", "bad", "worst", "limit", "unit", "CPU s", "where")
         rows = [head, *(_row(check) for check in self.checks)]
         widths = [max(len(row[k]) for row in rows) for k in range(len(head) - 1)]
         table = []

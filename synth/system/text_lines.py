@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 import textwrap
 
-_LEAST = 24
+_LEAST = 16
 
 
 def columns() -> int:

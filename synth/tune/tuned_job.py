@@ -111,21 +111,19 @@ def summary(found: Tuned) -> list[str]:
 
 
 def lines(found: Tuned) -> list[str]:
-    """Each level of each knob by itself, as a table."""
+    """Each level of each knob by itself, as a table; "was": what the job had."""
     mine = {knob.name: own(knob, found.job).words for knob in found.knobs}
     picked = {knob.name: level.words for knob, level in zip(found.knobs, found.chosen, strict=True)}
     out = [
-        f"{'':15s} {'':18s} {'error':>12}  {'of the':>12}  saves of",
-        f"{'knob':15s} {'level':18s} {'of force':>12}  {'budget':>12}  a frame",
+        f"{'':14s} {'':17s} {'error':>12} {'of the':>12}   saves",
+        f"{'knob':14s} {'level':17s} {'of force':>12} {'budget':>12} a frame",
     ]
     for row in found.rows:
         marks = [
-            word
-            for word, levels in (("chosen", picked), ("as it was", mine))
-            if levels[row.knob] == row.level
+            word for word, levels in (("chosen", picked), ("was", mine)) if levels[row.knob] == row.level
         ]
-        front = f"{row.knob:15s} {row.level:18s} "
-        moves = f"{_grown(row.change):>12}  {_percent(row.error):>12}  {100 * row.saved:6.0f}%"
+        front = f"{row.knob:14s} {row.level:17s} "
+        moves = f"{_grown(row.change):>12} {_percent(row.error):>12} {100 * row.saved:6.0f}%"
         told = hang(front, row.why, _TABLE) if row.why else [front + moves]
         told[-1] = f"{told[-1]}  {', '.join(marks)}".rstrip()
         out += told
