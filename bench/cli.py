@@ -353,6 +353,9 @@ def _rectangle(text: str) -> tuple[int, int, int, int] | None:
     return left, top, width, height
 
 
+_MEASURING = ("experiment", "pareto", "stability", "pages", "gap", "make-exvivo")
+
+
 def _with_evidence() -> None:
     """Adds the commands that measure this project itself, where their code is: in a checkout."""
     checkout = Path(__file__).resolve().parents[1]
@@ -360,6 +363,18 @@ def _with_evidence() -> None:
         if str(checkout) not in sys.path:
             sys.path.append(str(checkout))
         import_module("evidence.commands").add_to(app)
+        return
+    anything = {"ignore_unknown_options": True, "allow_extra_args": True}
+    for name in _MEASURING:
+        app.command(name, hidden=True, context_settings=anything, add_help_option=False)(_refuse_measuring)
+
+
+def _refuse_measuring(context: typer.Context) -> None:
+    name = context.info_name
+    raise UserError(
+        f"bench {name}: measures the program itself and is in no installation; in a clone's folder it is "
+        f"python -m bench {name}"
+    )
 
 
 _with_evidence()

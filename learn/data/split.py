@@ -65,7 +65,7 @@ def folds(clips: Sequence[Clip], count: int, seed: int) -> list[tuple[int, ...]]
     if not 2 <= count <= len(names):
         raise UserError(
             f"{count} folds: between 2 and {len(names)} are possible, for {len(clips)} sequences hold "
-            f"{len(names)} different anatomies" + _HINT * (len(names) < 3)
+            f"{len(names)} different anatomies" + _advise(clips) * (len(names) < 3)
         )
     size = {int(g): int((group == g).sum()) for g in names}
     bins: list[list[int]] = [[] for _ in range(count)]
@@ -114,6 +114,12 @@ def keep_written(clips: Sequence[Clip], sides: Mapping[str, str], seed: int) -> 
     return Split(fit, select, test)
 
 
+def _advise(clips: Sequence[Clip]) -> str:
+    """How to come to more groups."""
+    alone = len(set(groups(clips))) == len(clips)
+    return "; here each sequence is one: render more of them" if alone else _HINT
+
+
 def _choosers(
     clips: Sequence[Clip], rest: Sequence[int], seed: int, part: int
 ) -> tuple[tuple[int, ...], tuple[int, ...]]:
@@ -123,7 +129,7 @@ def _choosers(
     if left < 2:
         raise UserError(
             f"fit, select and test need an anatomy each: {len(set(number))} are there, {left} are left of "
-            "them beside the test" + _HINT
+            "them beside the test" + _advise(clips)
         )
     parts = folds([clips[i] for i in rest], min(5, left), seed)
     chosen = part % len(parts)
