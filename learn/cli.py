@@ -281,10 +281,10 @@ def intervals_command(
 
 
 def _log(numbers: dict[str, float]) -> None:
-    _console.print(
-        f"epoch {numbers['epoch']:.0f}: loss {numbers['loss']:.4f}, select R² {numbers['select_r2']:.3f}, "
-        f"gradient {numbers['share_error']:.0%} squared error, {numbers['share_r2']:.0%} R²"
-    )
+    told = f"epoch {numbers['epoch']:.0f}: loss {numbers['loss']:.4f}, select R² {numbers['select_r2']:.3f}"
+    if numbers["share_r2"]:  # of a loss of two parts
+        told += f", gradient {numbers['share_error']:.0%} squared error, {numbers['share_r2']:.0%} R²"
+    _console.print(told)
 
 
 @app.command("eval", epilog="Example: learn eval model out --against other-model")

@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from rich.console import Console
 from rich.table import Table
 
+from bench.scoring import report
 from evidence import measuring
 from learn.cli import _coverage, _pairs, _table
 from learn.evaluation.coverage import Coverage
@@ -39,8 +40,8 @@ def terminal(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "80")
 
 
-def shown(table: Table) -> str:
-    console = Console(width=80, file=io.StringIO(), markup=False)
+def shown(table: Table, *, markup: bool = False) -> str:
+    console = Console(width=80, file=io.StringIO(), markup=markup)
     console.print(table)
     return cast(io.StringIO, console.file).getvalue()
 
@@ -134,6 +135,22 @@ def test_eval_against_another_and_its_intervals() -> None:
     whole(text)
     assert text.count("100% [95%, 100%]") == 6 * len(LEVELS)
     assert "width of the force's [mN]" in text
+
+
+def test_score() -> None:
+    scores = {
+        "mae_mn": 123.4, "mae_of_peak": 12.3456, "bias_mn": -1234.0, "r": -0.979, "r2": -123.4,
+        "shape_error": 1.25, "ghost_rate": 1.0,
+    }  # fmt: skip
+    names = ["D2FNet", "Tikhonov, FEM compliance", "one contact, co-rotational FEM", "my [draft] method"]
+    methods = {name: SimpleNamespace(scores=scores) for name in names}
+    result: Any = SimpleNamespace(recording="calf 3 [left]", methods=methods, main="D2FNet")
+    text = shown(report.terminal_table(result), markup=True)
+    whole(text)
+    assert "calf 3 [left]" in text
+    for unit in ("MAE [mN]", "bias [mN]", "1234.6%", "125.0%", "-1234", "-0.979"):
+        assert unit in text
+    assert {word for name in names for word in name.split()} <= set(words(text))
 
 
 def test_place(monkeypatch: pytest.MonkeyPatch) -> None:
