@@ -300,15 +300,19 @@ def live(
     json: Json = False,
 ) -> None:
     """Masks, flow and force of a video as it runs: latency percentiles and dropped frames."""
+    from threadpoolctl import threadpool_limits
+
     from bench.methods.network import Model
+    from bench.tracking import flow_process
     from bench.tracking import live as stream
     from learn.inference.mask_files import read_choice
     from learn.inference.scale import UNKNOWN_NOTE, read_scale
     from learn.inference.video import FPS, read_video
     from learn.inference.video_flow import Footage
+    from learn.training.threads import set_threads
 
     kind, files = read_choice(masks)
-    method = None if model is None else Model(model)
+    method = None if model is None else Model(model, quick=True)
 
     def tell(frame: stream.Frame) -> None:
         force = "" if frame.force_mn is None else f"  {frame.force_mn:8.2f} mN"
@@ -317,17 +321,20 @@ def live(
             f"frame {frame.index:5}  {1e3 * frame.latency_s:7.1f} ms  {frame.largest_px:6.2f} px{force}{mark}"
         )
 
-    account = stream.watch_video(
-        Footage(read_video(video, FPS), str(video), tool=files.read if files else None),
-        backend=flow,
-        masks=kind,
-        method=method,
-        scale_mm_per_px=read_scale(scale),
-        young_kpa=young,
-        shrink=shrink,
-        paced=not every,
-        told=(lambda frame: None) if json else tell,
-    )
+    threadpool_limits(set_threads(None))
+    with flow_process.elsewhere() as process:
+        account = stream.watch_video(
+            Footage(read_video(video, FPS), str(video), tool=files.read if files else None),
+            backend=flow,
+            masks=kind,
+            method=method,
+            scale_mm_per_px=read_scale(scale),
+            young_kpa=young,
+            shrink=shrink,
+            paced=not every,
+            told=(lambda frame: None) if json else tell,
+            flow=process,
+        )
     summary = account.summary()
     if scale == "unknown":
         typer.echo(f"note: {UNKNOWN_NOTE}", err=True)

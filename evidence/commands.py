@@ -50,6 +50,7 @@ COMMANDS = {
     "stability learn": "evidence.learn.stability:stability",
     "experiment loading": "evidence.learn.throughput:loading",
     "experiment full-size": "evidence.learn.full_size:full_size",
+    "experiment curves": "evidence.curves.experiment:experiment",
     "pareto learn": "evidence.learn.pareto:pareto",
     "experiment tune": "evidence.tune.experiment:experiment",
     "pareto end-to-end": "evidence.end_to_end.pareto:pareto",
@@ -181,6 +182,10 @@ def gap(
     cache: Annotated[Path, typer.Option(help="Folder for packed sequences and trained networks.")],
     out: Path,
     held_out: Annotated[str, typer.Option(help="Appearance family that no training sees.")] = "calf",
+    unseen: Annotated[
+        Path | None, typer.Option(help="Dataset that no training sees; it takes the held-out family's place.")
+    ] = None,
+    fit: Annotated[int | None, typer.Option(min=20, help="Take so many sequences of `dataset` only.")] = None,
     flow: Annotated[
         list[str] | None,
         typer.Option(help="Back end of the recovered flow; each is a whole experiment. [default: both]"),
@@ -206,5 +211,7 @@ def gap(
         seeds,
         shlex.join(["bench", *sys.argv[1:]]),
         lambda line: Console(stderr=True).print(line, markup=False),
+        unseen,
+        fit,
     )
     return {name: found["verdict"] for name, found in tree["flows"].items()}

@@ -149,7 +149,7 @@ def fitted_rules(clips: Sequence[Clip], source: str, seed: int = 0) -> dict[str,
     strengths, fold = np.geomspace(1e-4, 1e2, 13), _groups(clips) % 4
     rules["ridge on PCA of flow"] = _by(basis, ridge(features, force, fold, strengths))
     rules["k-NN on PCA of flow"] = _by(basis, nearest(features, force))
-    rules["boosting per pixel"] = _boosting(clips, source, np.random.default_rng(seed))
+    rules["boosting per pixel"] = boosting(clips, source, np.random.default_rng(seed))
     return rules
 
 
@@ -239,34 +239,45 @@ def nearest(x: Floats, y: Floats) -> KNeighborsRegressor:
     return KNeighborsRegressor(min(_NEIGHBOURS, len(x)), algorithm="brute").fit(x, y)
 
 
-def _boosting(clips: Sequence[Clip], source: str, rng: np.random.Generator) -> Rule:
-    """Gradient-boosted trees from a pixel's own channels to the length of its force density."""
+def boosting(clips: Sequence[Clip], source: str, rng: np.random.Generator, grid: Grid = GRID) -> Rule:
+    """Gradient-boosted trees from a pixel's own channels to the length of its force density.
+
+    Args:
+        clips: on `grid`.
+        source: which displacement.
+        rng: draws the pixels that are fitted on.
+        grid: of the clips, and of what the rule will be asked about.
+    """
     features, target = [], []
+    most = -(-4 * _PIXELS // len(clips))  # a clip gives no more: thousands of them would fill the memory
     for clip in clips:
-        inside = clip.mask > 0
+        frame, *at = np.nonzero(np.broadcast_to(clip.mask > 0, (clip.frames, *clip.mask.shape)))
+        taken = rng.permutation(len(frame))[:most]
         for t in range(clip.frames):
-            features.append(_pixels(clip.displacement[source][t])[inside])
-            target.append(np.linalg.norm(clip.density[t], axis=0)[inside])
+            cells = tuple(axis[taken[frame[taken] == t]] for axis in at)
+            features.append(_pixels(clip.displacement[source][t], grid)[cells])
+            target.append(np.linalg.norm(clip.density[t], axis=0)[cells])
     x, y = np.concatenate(features), np.concatenate(target)
     chosen = rng.permutation(len(x))[:_PIXELS]
     trees = HistGradientBoostingRegressor(max_iter=120, learning_rate=0.1, max_leaf_nodes=31, random_state=0)
     trees.fit(x[chosen], y[chosen])
-    return partial(_say_by_pixel, trees)
+    return partial(_say_by_pixel, trees, grid)
 
 
 def _say_by_pixel(
     trees: HistGradientBoostingRegressor,
+    grid: Grid,
     moved: NDArray[np.float32],
     mask: NDArray[np.float32],
     sure: NDArray[np.float32],
 ) -> Floats:
-    said = np.clip(trees.predict(_pixels(moved)[mask > 0]), 0, None)
-    return _size_only(GRID.pitch_mm**2 * float(said.sum()))
+    said = np.clip(trees.predict(_pixels(moved, grid)[mask > 0]), 0, None)
+    return _size_only(grid.pitch_mm**2 * float(said.sum()))
 
 
-def _pixels(moved: NDArray[np.float32]) -> Floats:
+def _pixels(moved: NDArray[np.float32], grid: Grid) -> Floats:
     """Displacement, its length and its derivatives at every cell, (N, N, 7), of two eyes (N, N, 10)."""
-    slopes = [d / GRID.pitch_mm for part in moved for d in np.gradient(part)]
+    slopes = [d / grid.pitch_mm for part in moved for d in np.gradient(part)]
     return np.stack([*moved, np.linalg.norm(moved, axis=0), *slopes], axis=-1).astype(np.float64)
 
 

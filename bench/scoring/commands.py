@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 from collections.abc import Mapping
-from contextlib import closing, nullcontext
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -20,7 +19,7 @@ from bench.recording.folder import Recording, open_recording
 from bench.recording.from_sequence import export_recording
 from bench.scoring import evaluate_recording, report
 from bench.scoring.evaluate_recording import Result, Settings
-from bench.tracking.flow_process import FlowProcess
+from bench.tracking import flow_process
 from learn.inference.mask_files import MaskFiles
 from learn.inference.predict import Predictor
 from synth.dataset.store import Dataset, Sequence
@@ -169,7 +168,7 @@ def _score(
 ) -> Result:
     total = opened.expected_frames()
     # Started first, for it takes seconds to begin; the methods are fitted meanwhile.
-    with closing(FlowProcess()) if _worth_a_process(total) else nullcontext() as flow:
+    with flow_process.elsewhere() if (total or _LONG) >= _LONG else nullcontext() as flow:
         # Quick as in `learn predict`: to the last digit the same network.
         network = Model(model, quick=True)
         methods: dict[str, Method] = {MAIN: network}
@@ -183,10 +182,6 @@ def _score(
             return evaluate_recording.evaluate_recording(
                 opened, methods, MAIN, found, settings, about, progress, flow
             )
-
-
-def _worth_a_process(frames: int | None) -> bool:
-    return len(os.sched_getaffinity(0)) > 1 and (frames or _LONG) >= _LONG
 
 
 def fit_baselines(train: Path | None, model: Path | None, two_eyes: bool = False) -> dict[str, Method]:

@@ -6,18 +6,19 @@ each (measured: two threads took longer than one).
 
 from __future__ import annotations
 
+import contextlib
 import os
 import resource
 import signal
 import threading
-from collections.abc import Callable
-from concurrent.futures import Future, ProcessPoolExecutor
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import replace
 from multiprocessing import get_context, parent_process
 from typing import TypeVar
 
-from learn.inference.video_flow import Flags, FlowHere, Found, Rgb
+from learn.inference.video_flow import Asked, Flags, FlowHere, Found, Rgb
 from synth.errors import UserError
 from synth.flow.mask_choice import Proposal
 
@@ -40,22 +41,32 @@ class FlowProcess(FlowHere):
 
     def begin(self, backend: str, rest: Rgb, blocked: Flags | Proposal, tissue: Flags) -> None:
         """See `FlowHere`."""
-        self._submit(_begin, backend, rest, blocked, tissue)()
+        _result(self._submit(_begin, backend, rest, blocked, tissue))
 
-    def ask(self, rgb: Rgb, blocked: Flags | Proposal) -> Callable[[], Found]:
+    def ask(self, rgb: Rgb, blocked: Flags | Proposal) -> Asked:
         """See `FlowHere`."""
-        return self._submit(_step, rgb, blocked)
+        future = self._submit(_step, rgb, blocked)
+        return Asked(lambda: _result(future), lambda within_s: bool(wait([future], within_s).done))
 
     def close(self) -> None:
         """Ends it, after the frame that it is at."""
         self._pool.shutdown(cancel_futures=True)
 
-    def _submit(self, task: Callable[..., T], *given: object) -> Callable[[], T]:
+    def _submit(self, task: Callable[..., T], *given: object) -> Future[T]:
         try:
-            future = self._pool.submit(task, *given)
+            return self._pool.submit(task, *given)
         except BrokenProcessPool:
             raise _gone() from None
-        return lambda: _result(future)
+
+
+@contextlib.contextmanager
+def elsewhere() -> Iterator[FlowProcess | None]:
+    """Another process for the flow, closed at the end; None where there is but one core."""
+    if len(os.sched_getaffinity(0)) < 2:
+        yield None
+        return
+    with contextlib.closing(FlowProcess()) as process:
+        yield process
 
 
 def _result(future: Future[T]) -> T:

@@ -18,7 +18,7 @@ from bench.methods.protocol import Method, Scene
 from bench.output import machine
 from bench.output import write as results
 from learn.inference.scale import StatedScale, take_scale
-from learn.inference.video_flow import Flags, FlowHere, Footage, Rgb, Settings, Step, VideoFlow
+from learn.inference.video_flow import Asked, Flags, FlowHere, Footage, Rgb, Settings, Step, VideoFlow
 from synth.errors import UserError
 from synth.flow.mask_choice import Proposal
 
@@ -72,6 +72,7 @@ def watch_video(
     masks: str = "auto",
     paced: bool = True,
     told: Callable[[Frame], None] = lambda frame: None,
+    flow: FlowHere | None = None,
 ) -> Watched:
     """Follows the video from its first frame on, which is taken as the rest frame.
 
@@ -85,6 +86,8 @@ def watch_video(
         masks: as of `Settings`.
         paced: drop what arrives meanwhile; False: work on every frame.
         told: of every frame's answer.
+        flow: where it is computed, closed by the caller; None: here. In another process a frame's flow runs
+            while the next is masked and the one before is asked for its force.
 
     Raises:
         UserError: unreadable video, fewer than two frames, or a model without a scale.
@@ -93,7 +96,7 @@ def watch_video(
         raise UserError("a model needs --scale (mm a pixel, or unknown): forces have no meaning without it")
     account, pace = Watched(), _Pace(paced)
     settings = Settings(backend, shrink, rate_hz=None, pulse=False, masks=masks)
-    video = VideoFlow(footage, settings, _Warm(), pace.is_due)
+    video = VideoFlow(footage, settings, _Warm(flow or FlowHere()), pace.is_due, spare_s=pace.spare_s)
     scene: Scene | None = None
     for step in video.steps():
         if scene is None:
@@ -109,7 +112,7 @@ def watch_video(
         seen: NDArray[np.bool_] = found.confidence > 0
         frame = Frame(
             index=step.picture.index,
-            latency_s=end - pace.arrival_s,
+            latency_s=end - pace.arrivals_s.pop(step.picture.index),
             stages_s={"mask": step.masking_s, "flow": found.wall_s, "force": end - began},
             confidence=float(found.confidence[seen].mean()) if seen.any() else 0.0,
             trusted=found.trusted,
@@ -127,17 +130,26 @@ def watch_video(
 class _Warm(FlowHere):
     """Flow that has run once before the clock starts: loading isn't latency."""
 
+    def __init__(self, flow: FlowHere) -> None:
+        self._flow, self.ahead = flow, flow.ahead
+
     def begin(self, backend: str, rest: Rgb, blocked: Flags | Proposal, tissue: Flags) -> None:
         """See `FlowHere`."""
-        super().begin(backend, rest, blocked, tissue)
-        self.ask(rest, blocked)
+        self._flow.begin(backend, rest, blocked, tissue)
+        self._flow.ask(rest, blocked).take()
+
+    def ask(self, rgb: Rgb, blocked: Flags | Proposal) -> Asked:
+        """See `FlowHere`."""
+        return self._flow.ask(rgb, blocked)
 
 
 class _Pace:
     """Lets frames arrive as the video's own clock has them."""
 
     def __init__(self, paced: bool) -> None:
-        self.paced, self.dropped, self.arrival_s = paced, 0, 0.0
+        self.paced, self.dropped = paced, 0
+        self.arrivals_s: dict[int, float] = {}
+        """Of frames that are worked on, by index."""
 
     def start(self, rest: Step) -> None:
         """The clock starts with the rest frame."""
@@ -146,12 +158,19 @@ class _Pace:
     def is_due(self, index: int, time_s: float) -> bool:
         """Waits until a frame arrives; False if it has a successor already."""
         since, now = time_s - self.first_s, time.perf_counter()
-        self.arrival_s = self.began_s + since if self.paced else now
-        if self.arrival_s < now - since / index:
+        arrival_s = self.began_s + since if self.paced else now
+        if arrival_s < now - since / index:
             self.dropped += 1
             return False
-        time.sleep(max(0.0, self.arrival_s - now))
+        self.arrivals_s[index] = arrival_s
+        time.sleep(max(0.0, arrival_s - now))
         return True
+
+    def spare_s(self, time_s: float) -> float:
+        """How long it is to the arrival of a frame [s]."""
+        if not self.paced:
+            return 0.0
+        return max(0.0, self.began_s + time_s - self.first_s - time.perf_counter())
 
 
 def write_live(out: Path, summary: dict[str, float | int], **how: str | int | bool) -> None:

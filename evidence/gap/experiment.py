@@ -17,7 +17,7 @@ from bench.output import write as results
 from evidence.gap import gap
 from evidence.gap.runs import KEYS, Tests, Training, carry_out, kept_flow, write_table
 from learn.data.clips import Clip, load_clips
-from learn.data.split import Split, folds, nested
+from learn.data.split import Split, folds, groups, nested
 from learn.evaluation.statistics import interval
 from learn.settings import Settings, replace
 from synth.dataset.store import Dataset
@@ -44,6 +44,8 @@ def run(
     seeds: int,
     command: str,
     say: Callable[[str], None],
+    unseen: Path | None = None,
+    fit: int | None = None,
 ) -> dict[str, Any]:
     """Trains, asks and writes runs.parquet, results.json, README.md and chart.svg.
 
@@ -57,13 +59,21 @@ def run(
         seeds: networks a training; a sequence's error is the mean over them.
         command: as typed, for the README.
         say: told what is under way.
+        unseen: a dataset that is the unseen world instead of a family of `dataset`.
+        fit: of `dataset` only so many sequences, the first ones.
 
     Raises:
         UserError: no such family, or data that lacks a flow.
     """
-    stored = list(Dataset(dataset))
-    clips = load_clips(dataset, settings.grid, ("ideal", "recovered"), cache=cache)
-    split, seen_test = parts(clips, held_out, settings)
+    stored = list(Dataset(dataset))[:fit]
+    clips = load_clips(dataset, settings.grid, ("ideal", "recovered"), cache=cache)[:fit]
+    if unseen is None:
+        split, seen_test = parts(clips, held_out, settings)
+    else:
+        held_out = unseen.name
+        others = load_clips(unseen, settings.grid, ("ideal", "recovered"), cache=cache)
+        split, seen_test = beside(clips, others, settings)
+        stored, clips = [*stored, *Dataset(unseen)], [*clips, *others]
     runs: dict[Training, dict[str, Any]] = {}
     for flow in flows:
         used = clips
@@ -126,6 +136,24 @@ def parts(clips: Sequence[Clip], held_out: str, settings: Settings) -> tuple[Spl
     if not fit or not select:
         raise UserError("too few anatomies for fit, select and two tests: render more sequences")
     return Split(fit, select, split.test), tuple(sorted(aside))
+
+
+def beside(
+    clips: Sequence[Clip], unseen: Sequence[Clip], settings: Settings
+) -> tuple[Split, tuple[int, ...]]:
+    """Fit and select from `clips`, with all of `unseen`, which follow them, as test; and a test of `clips`.
+
+    Raises:
+        UserError: a sequence or an anatomy is on both sides, or too few are left.
+    """
+    aside = folds(clips, 5, 1)[0]
+    rest = [i for i in range(len(clips)) if i not in set(aside)]
+    inner = nested([clips[i] for i in rest], settings.folds, settings.fold, 0)
+    fit, select = (tuple(rest[i] for i in part) for part in ((*inner.fit, *inner.test), inner.select))
+    number = groups([*clips, *unseen])
+    if set(number[: len(clips)]) & set(number[len(clips) :]):
+        raise UserError("the dataset that is to be unseen shares an anatomy with the other")
+    return Split(fit, select, tuple(range(len(clips), len(number)))), tuple(sorted(aside))
 
 
 def summary(trained: Mapping[str, Sequence[Mapping[str, Any]]]) -> dict[str, Any]:
@@ -211,7 +239,7 @@ def drawn(tree: Mapping[str, Any]) -> result_page.Page:
     ]
     if words:
         sections.append(result_page.Section("A better flow, before any retraining", words=words))
-    title = f"Unseen family ({tree['held_out']}): trained on ... tested on ..."
+    title = f"Unseen ({tree['held_out']}): trained on ... tested on ..."
     return result_page.Page(
         "The sim-to-real gap",
         tree,
@@ -221,7 +249,7 @@ def drawn(tree: Mapping[str, Any]) -> result_page.Page:
             "Does training on the flow recovered from rendered frames close the gap that training on ideal "
             "displacement leaves? I: trained on ideal flow, R: on recovered, N: on ideal with noise fitted "
             "to the recovered flow's error, mixed: ideal first, recovered later.",
-            f"{_counts(tree['sequences'])}; family held out: {tree['held_out']}; {tree['seeds']} network(s) "
+            f"{_counts(tree['sequences'])}; held out: {tree['held_out']}; {tree['seeds']} network(s) "
             "a training, errors averaged over them; 95% BCa intervals.",
         ),
         f"synth render docs/results/gap/data.yaml -o DATA; {tree['command']}",

@@ -155,6 +155,19 @@ class Account:
         return said + lost + (f", {self.regained} only at a second try" if self.regained else "")
 
 
+@dataclass(frozen=True)
+class Asked:
+    """The flow of a frame that is on its way."""
+
+    take: Callable[[], Found]
+    """Waits for it; errors as `Tracker`."""
+    is_there: Callable[[float], bool] = lambda within_s: True
+    """Whether it is there, or will be within so many seconds, which it waits for."""
+
+    def __call__(self) -> Found:
+        return self.take()
+
+
 class FlowHere:
     """Where flow is computed: in this process, at once."""
 
@@ -169,7 +182,7 @@ class FlowHere:
             else Tracker(backend, rest, blocked, tissue)
         )
 
-    def ask(self, rgb: Rgb, blocked: Flags | Proposal) -> Callable[[], Found]:
+    def ask(self, rgb: Rgb, blocked: Flags | Proposal) -> Asked:
         """Gives a frame, (h, w, 3) and (h, w); what comes back waits for its flow, errors as `Tracker`."""
         cpu, wall, tracker = time.process_time(), time.perf_counter(), self.tracker
         if isinstance(tracker, ChoosingTracker):
@@ -193,7 +206,7 @@ class FlowHere:
             cpu_s=time.process_time() - cpu,
             wall_s=time.perf_counter() - wall,
         )
-        return lambda: found
+        return Asked(lambda: found)
 
 
 @dataclass(frozen=True, eq=False)
@@ -218,6 +231,7 @@ class VideoFlow:
         is_due: Callable[[int, float], bool] = lambda index, time_s: True,
         pulse: Pulse | None = None,
         watch: Stopwatch | None = None,
+        spare_s: Callable[[float], float] = lambda time_s: 0.0,
     ) -> None:
         """Nothing is decoded yet.
 
@@ -228,6 +242,7 @@ class VideoFlow:
             is_due: whether a frame after the rest frame, at its time [s], is to be worked on.
             pulse: motion of the tissue's own that is taken off the flow of every frame.
             watch: what the time spent is added to; None: one of its own.
+            spare_s: how long it is to a frame's arrival [s]: answers that are there until then come first.
 
         Raises:
             UserError: no such masks.
@@ -244,6 +259,7 @@ class VideoFlow:
         self.surface: Surface | None = None
         """How the tissue moved by and large; kept while `settings.pulse` asks for it and none is off."""
         self._flow, self._is_due, self._pulse = flow or FlowHere(), is_due, pulse
+        self._spare_s = spare_s
         self._left_out: Counter[str] = Counter()
         self._period_s = 0.0 if settings.rate_hz is None else 1 / settings.rate_hz
         self._due_s = self._last_s = -math.inf
@@ -276,13 +292,15 @@ class VideoFlow:
             UserError: unreadable video, no tissue, masks or frames of another size, no such estimator.
         """
         pictures = iter(self.footage.pictures)
-        under_way: deque[tuple[Picture, float, Callable[[], Found]]] = deque()
+        under_way: deque[tuple[Picture, float, Asked]] = deque()
         while True:
             with self.watch.stage("decode"):
                 picture = next(pictures, None)
             if picture is None:
                 break
             self.seen += 1
+            while under_way and under_way[0][2].is_there(self._spare_s(picture.time_s or 0.0)):
+                yield self._step(*under_way.popleft())
             if self._is_wanted(picture.index, picture.time_s):
                 resting = self.tissue.size == 0
                 if resting:
@@ -379,7 +397,7 @@ class VideoFlow:
         none = np.zeros(self.tissue.shape, np.float32)
         return Found(np.stack([none, none], axis=-1), none, trusted=False)
 
-    def _step(self, small: Picture, masking_s: float, answer: Callable[[], Found]) -> Step:
+    def _step(self, small: Picture, masking_s: float, answer: Asked) -> Step:
         found = answer()
         self._followed += 1
         self._still = self._still and np.array_equal(small.rgb, self._rest_rgb)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from learn.data.clips import Clip
 from learn.data.split import nested
 from learn.loss import Objective
 from learn.settings import preset, replace
+from synth.errors import UserError
 
 RESULTS = Path(__file__).parents[2] / "docs" / "results" / "gap"
 
@@ -98,3 +100,19 @@ def test_a_training_is_answered_from_what_was_kept_only_if_nothing_that_made_it_
     monkeypatch.setattr(kept, "code", lambda module: "other")
     assert ask() == 5
     assert len(set(trained)) == 4
+
+
+def test_another_dataset_is_the_unseen_world() -> None:
+    def made(name: str, count: int) -> list[Any]:
+        return [SimpleNamespace(group=f"{name}{k // 2}", content_hash=f"{name}{k}") for k in range(count)]
+
+    ours, theirs = made("a", 60), made("b", 8)
+    split, seen = experiment.beside(ours, theirs, preset("tiny"))
+    assert split.test == tuple(range(60, 68))
+    parts = [set(split.fit), set(split.select), set(seen)]
+    assert set.union(*parts) == set(range(60))
+    assert sum(map(len, parts)) == 60
+    anatomies = [{i // 2 for i in part} for part in parts]
+    assert sum(map(len, anatomies)) == len(set.union(*anatomies))
+    with pytest.raises(UserError, match="shares an anatomy"):
+        experiment.beside(ours, made("a", 4), preset("tiny"))

@@ -1,0 +1,1 @@
+"""What more sequences buy: learning curves."""

@@ -1,0 +1,288 @@
+"""Who reads the force in `bench experiment curves`: fitted on so many sequences, asked about others."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import cache, partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from sklearn.decomposition import TruncatedSVD
+
+from bench.methods import baselines
+from evidence import kept
+from evidence.end_to_end import models
+from evidence.end_to_end.pipelines import errors
+from evidence.gap import gap
+from evidence.mechanics.worlds import coarse
+from learn.data.clips import Clip, load_clips
+from learn.data.grid import Grid
+from learn.data.split import Split
+from learn.evaluation.evaluate import evaluate
+from learn.evaluation.statistics import interval
+from learn.inference.predict import load_predictor
+from learn.loss import Objective
+from learn.network.d2fnet import Architecture
+from learn.settings import Settings
+from learn.training.threads import set_threads
+from learn.training.train import train
+from synth.dataset.store import Dataset
+from synth.errors import UserError
+
+Floats = NDArray[np.float64]
+Answer = Callable[[Clip], Floats]
+
+RIDGE, NEAREST, BOOSTING, SMALL, LARGE = "ridge", "k-NN", "boosting", "d2fnet-s", "D2FNet"
+MODELS = (RIDGE, NEAREST, BOOSTING, SMALL, LARGE)
+INPUTS = ("ideal", "noise", "recovered", "mixed")
+NETWORKS: dict[str, Architecture] = {
+    SMALL: Architecture(width=16, stem=2, levels=3, output="vector", confidence=True, dropout=0.0),
+    LARGE: Architecture(width=32, stem=1, levels=4, output="vector", confidence=True, dropout=0.05),
+}
+GRID = Grid(64)
+_SOURCES = {
+    1: {"ideal": "ideal", "recovered": "recovered"},
+    2: {"ideal": "motion-ideal", "recovered": "motion"},
+}
+_COMPONENTS = 200  # principal components of displacement
+_BASIS = 150  # sequences that they are found on
+_LEAST, _MOST = 4, 80  # epochs
+
+
+@dataclass(frozen=True)
+class Reader:
+    """One point of a curve."""
+
+    model: str
+    input: str
+    eyes: int
+    size: int
+    """Sequences fitted on: the dataset's first ones."""
+    seed: int
+
+    @property
+    def slug(self) -> str:
+        return f"{self.model}-{self.input}-{self.eyes}-{self.size}-{self.seed}"
+
+    def source(self, what: str) -> str:
+        """The clips' name of a displacement."""
+        return _SOURCES[self.eyes][what]
+
+
+@dataclass(frozen=True)
+class World:
+    """What is fitted on and asked, and where that stays."""
+
+    data: Path
+    unseen: tuple[Path, ...]
+    asked: int
+    choosing: int
+    steps: int
+    work: Path
+
+    def check(self) -> int:
+        """Largest number of sequences to fit on. Raises UserError if none is left."""
+        left = len(Dataset(self.data)) - self.asked - self.choosing
+        if left < 1:
+            raise UserError(f"{self.data}: too few sequences for those that choose and those that are asked")
+        return left
+
+    def pack(self) -> None:
+        """Reads every dataset once: later readings, in other processes, are of packed arrays."""
+        for root in (self.data, *self.unseen):
+            _load(root, self.work)
+
+    def generation_cpu_s(self) -> float:
+        """Median over sequences: the first of a process compiles for all of them."""
+        timings = [one.attrs["timings"].values() for one in Dataset(self.data)]
+        return float(np.median([sum(t["cpu_s"] for t in spent if isinstance(t, dict)) for spent in timings]))
+
+    def counts(self) -> dict[str, int]:
+        """Sequences asked about."""
+        return {"same world": self.asked} | {root.name: len(Dataset(root)) for root in self.unseen}
+
+    def rows(self, one: Reader) -> list[dict[str, Any]]:
+        """What the reader errs by in every world asked about."""
+        set_threads(1)
+        clips = _load(self.data, self.work)
+        fit, rest = clips[: one.size], clips[-self.asked - self.choosing :]
+        choose = rest[: min(self.choosing, max(4, one.size // 5))]
+        tests = {"same world": rest[self.choosing :]}
+        tests |= {root.name: _load(root, self.work) for root in self.unseen}
+        used = [clip.content_hash for part in (fit, choose, *tests.values()) for clip in part]
+        key = kept.word(__name__, asdict(one), self.steps, used)
+
+        def compute() -> list[dict[str, Any]]:
+            began = time.process_time()
+            answer, model = self._fitted(one, fit, choose, key)
+            spent = time.process_time() - began
+            hours = (spent + one.size * self.generation_cpu_s()) / 3600
+            return [
+                asdict(one)
+                | {"asked": name, "fit_cpu_s": round(spent, 1), "cpu_h": round(hours, 3)}
+                | _figures(answer, part, self._bare(name), one)
+                | _map_figures(model, part, one)
+                for name, part in tests.items()
+            ]
+
+        found: list[dict[str, Any]] = kept.result(self.work / "rows", one.slug, key, compute)
+        return found
+
+    def _bare(self, name: str) -> list[bool]:
+        """Which of the sequences asked about have no membrane."""
+        if name == "same world":
+            return _bare(self.data)[-self.asked :]
+        return next(_bare(root) for root in self.unseen if root.name == name)
+
+    def _fitted(
+        self, one: Reader, fit: Sequence[Clip], choose: Sequence[Clip], key: str
+    ) -> tuple[Answer, Path | None]:
+        if one.model in NETWORKS:
+            folder = self.work / "networks" / f"{one.slug}-{key}"
+            return _network(one, fit, choose, self.steps, folder), folder
+        source = one.source(one.input)
+        if one.model == BOOSTING:
+            rng = np.random.default_rng(one.seed)
+            small = [coarse(clip) for clip in fit]
+            rule = baselines.boosting(small, source, rng, Grid(GRID.size // 2))
+            asked = one.source("recovered")
+            return partial(_by_frame, rule, asked), None
+        return _by_components(one, fit, source), None
+
+
+def _by_frame(rule: baselines.Rule, source: str, clip: Clip) -> Floats:
+    """What a rule of single frames says of a clip, on half its grid."""
+    small = coarse(clip)
+    said = [rule(moved, small.mask, small.mask) for moved in small.displacement[source]]
+    return clip.young_kpa * np.stack(said)
+
+
+@cache
+def _load(root: Path, work: Path) -> list[Clip]:
+    wanted = [source for sources in _SOURCES.values() for source in sources.values()]
+    return load_clips(root, GRID, wanted, cache=work / "clips")
+
+
+@cache
+def _bare(root: Path) -> list[bool]:
+    return [not one.attrs["scenario"]["tissue"].get("membrane") for one in Dataset(root)]
+
+
+def _by_components(one: Reader, fit: Sequence[Clip], source: str) -> Answer:
+    """Ridge or nearest neighbours on principal components of displacement, in eight turns."""
+    small = [coarse(clip) for clip in fit]
+    # Not centred: no motion stays zero.
+    x, _, _ = models.samples(small[:_BASIS], source)
+    basis = TruncatedSVD(min(_COMPONENTS, min(x.shape) - 1), random_state=0).fit(x)
+    features, forces, groups = [], [], []
+    for start in range(0, len(small), _BASIS):
+        x, force, group = models.samples(small[start : start + _BASIS], source)
+        features.append(basis.transform(x))
+        forces.append(force)
+        groups.append(group + start)
+    x, force, group = np.concatenate(features), np.concatenate(forces), np.concatenate(groups)
+    regressor: Any = models.fit_ridge(x, force, group) if one.model == RIDGE else baselines.nearest(x, force)
+    asked = one.source("recovered")
+    return lambda clip: (
+        clip.young_kpa * np.asarray(regressor.predict(basis.transform(models.rows(coarse(clip), asked))))
+    )
+
+
+def network_settings(one: Reader, steps: int, frames: int) -> Settings:
+    """Of a network's training: as many epochs as make up `steps` batches of the `frames` there are."""
+    batch = 8
+    epochs = int(np.clip(round(steps * batch / frames), _LEAST, _MOST))
+    depth = one.eyes == 2
+    given = "recovered" if one.input == "noise" else one.input
+    names = {"ideal": "motion-ideal", "recovered": "motion", "mixed": "motion-mixed"}
+    return Settings.model_validate(
+        {
+            "size": GRID.size,
+            "arch": {**dict(NETWORKS[one.model]), "depth": depth},
+            "objective": Objective(kind="mse"),
+            "input": names[given] if depth else given,
+            "epochs": epochs,
+            "batch": batch,
+            "learning_rate": 1.5e-3,
+            "schedule": "cosine",
+            "channels_last": True,
+            "seed": one.seed,
+        }
+    )
+
+
+def _network(one: Reader, fit: Sequence[Clip], choose: Sequence[Clip], steps: int, folder: Path) -> Answer:
+    settings = network_settings(one, steps, sum(clip.frames for clip in fit))
+    clips = [*fit, *choose]
+    if one.input == "noise":
+        clips = noisy(clips, len(fit), one.seed)
+    split = Split(tuple(range(len(fit))), tuple(range(len(fit), len(clips))), ())
+    train(clips, split, settings, folder)
+    predictor, source = load_predictor(folder), one.source("recovered")
+
+    def answer(clip: Clip) -> Floats:
+        moved = np.asarray(clip.displacement[source])
+        said, _ = predictor.answer(moved, clip.mask, clip.young_kpa, clip.sure(source))
+        return np.asarray(said.sum(axis=(2, 3)) * GRID.pitch_mm**2, np.float64)
+
+    return answer
+
+
+def noisy(clips: Sequence[Clip], fitted: int, seed: int) -> list[Clip]:
+    """The clips with recovered flow replaced by true flow and the noise fitted on the first `fitted`."""
+    known = clips[:fitted]
+    noise = gap.fit_noise(
+        [np.asarray(c.displacement["ideal"]) for c in known],
+        [np.asarray(c.displacement["recovered"]) for c in known],
+        [c.mask for c in known],
+    )
+
+    def spoilt(k: int, clip: Clip) -> Clip:
+        made = noise.add(np.asarray(clip.displacement["ideal"]), clip.mask, np.random.default_rng([seed, k]))
+        return replace(clip, displacement={**clip.displacement, "recovered": made})
+
+    return [spoilt(k, clip) for k, clip in enumerate(clips)]
+
+
+def _figures(answer: Answer, part: Sequence[Clip], bare: Sequence[bool], one: Reader) -> dict[str, Any]:
+    """Errors of the force as parts of it, means over sequences with their intervals, and the gain."""
+    said, true = [answer(clip) for clip in part], [clip.force for clip in part]
+    sizes = [np.nan_to_num(s[:, 0]) if one.model == BOOSTING else np.linalg.norm(s, axis=1) for s in said]
+    own = [np.linalg.norm(force, axis=1) for force in true]
+    found: dict[str, Sequence[float] | None] = {
+        "force_size": [
+            float(np.sqrt(np.square(a - b).mean() / np.square(b).mean()))
+            for a, b in zip(sizes, own, strict=True)
+        ],
+        "whole": None,
+        "across": None,
+        "along": None,
+        "bare": None,
+    }
+    if one.model != BOOSTING:
+        off = errors(said, true)
+        found |= {"whole": off["errors"], "across": off["across"], "along": off["along"]}
+        found["bare"] = [e for e, alone in zip(off["errors"], bare, strict=True) if alone] or None
+    row: dict[str, Any] = {}
+    for name, values in found.items():
+        mean = None if values is None else interval(np.array(values), np.random.default_rng(0))
+        row |= {
+            name: mean and round(mean.mean, 4),
+            f"{name}_low": mean and round(mean.low, 4),
+            f"{name}_high": mean and round(mean.high, 4),
+        }
+    all_said, all_true = np.concatenate(sizes), np.concatenate(own)
+    row["gain"] = round(float(all_said @ all_true / (all_true @ all_true)), 3)
+    return row
+
+
+def _map_figures(model: Path | None, part: Sequence[Clip], one: Reader) -> dict[str, Any]:
+    """R² of the force map over all cells, and the share of contact-free area that says a force."""
+    if model is None:
+        return {"map_r2": None, "ghosts": None}
+    known = evaluate(load_predictor(model), part, one.source("recovered")).summary()
+    return {"map_r2": round(known["map_r2_pooled"], 4), "ghosts": round(known["ghost_relative"], 5)}
