@@ -10,20 +10,25 @@ from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
+import typer
 from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 from rich.table import Table
+from typer.testing import CliRunner
 
+from bench.cli import app as bench
 from bench.scoring import report
 from evidence import measuring
 from learn.cli import _coverage, _pairs, _table
+from learn.cli import app as learn
 from learn.evaluation.coverage import Coverage
 from learn.evaluation.metrics import METRICS
 from learn.evaluation.statistics import Interval, Paired
 from learn.uncertainty.conformal import LEVELS
 from synth.checks.measure import Measure
 from synth.checks.verify import Check, Report
+from synth.cli import app as synth
 from synth.dataset import field_sizes
 from synth.fields import FIELDS
 from synth.place import command, openings
@@ -62,6 +67,15 @@ def test_wrapped_words_are_all_there(head: str, said: list[str]) -> None:
     assert all(line[: len(head)].strip() == (head.strip() if k == 0 else "") for k, line in enumerate(lines))
     assert [word for line in lines for word in line[len(head) :].split()] == said
     assert all(len(line) <= 60 for line in lines)
+
+
+@pytest.mark.parametrize("app", [synth, learn, bench])
+def test_help_names_every_command_in_a_whole_sentence(app: typer.Typer) -> None:
+    said = CliRunner().invoke(app, ["--help"]).stdout
+    whole(said)
+    listed = said.split("Commands:")[1]
+    assert "..." not in listed
+    assert listed.count(".\n") >= len(app.registered_commands)
 
 
 def test_a_long_path_stays_whole() -> None:
