@@ -16,8 +16,8 @@ from synth.dataset.split import SIDES, join_groups
 from synth.errors import UserError
 
 _HINT = (
-    "; share_anatomy=true splits one brain by its openings (`synth place` finds them, craniotomy.also lists "
-    "them), or else by sequence, and says nothing of other brains"
+    "; share_anatomy=true, or `synth split --by opening`, splits one brain by its openings (`synth place` "
+    "finds them, craniotomy.also lists them), or else by sequence, and says nothing of other brains"
 )
 _OPENINGS = 3  # fit, select and test
 _SEQUENCE = "/"  # between the anatomy and the sequence in a group's name; in none of an anatomy or opening
@@ -62,6 +62,9 @@ def folds(clips: Sequence[Clip], count: int, seed: int) -> list[tuple[int, ...]]
     """
     group = np.array(groups(clips))
     names = np.random.default_rng(seed).permutation(np.unique(group))
+    if len(names) < 2:
+        held = f"{len(clips)} sequences hold {len(names)} anatomy, and a split needs two at least"
+        raise UserError(held + _advise(clips))
     if not 2 <= count <= len(names):
         raise UserError(
             f"{count} folds: between 2 and {len(names)} are possible, for {len(clips)} sequences hold "

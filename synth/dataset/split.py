@@ -145,9 +145,8 @@ def warn_of_strangers(rows: Sequence[Mapping[str, Any]], chosen: Rule) -> str | 
         return None
     parts = "openings" if chosen.by == "opening" else "sequences"
     brains = "1 brain is" if count == 1 else f"{count} brains are"
-    return (
-        f"{brains} on several sides: {parts} of one brain are no strangers, and scores say nothing of others"
-    )
+    nothing = "scores say nothing of other brains"
+    return f"{brains} on several sides: {parts} of one brain are no strangers, and {nothing}"
 
 
 def find_crossings(groups: Sequence[Hashable], sides: Sequence[str]) -> dict[Hashable, list[str]]:

@@ -173,7 +173,7 @@ def test_one_brain_is_split_only_when_asked_to(clips: list[Clip]) -> None:
     from dataclasses import replace
 
     one = [replace(c, group="mesh-5f") for c in clips]
-    with pytest.raises(UserError, match="share_anatomy=true"):
+    with pytest.raises(UserError, match=r"hold 1 anatomy.*share_anatomy=true"):
         nested(one, 3, 0, 0)
     with pytest.raises(UserError, match=r"`synth place` finds them, craniotomy\.also lists them"):
         nested(one, 3, 0, 0)
