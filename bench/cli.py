@@ -118,13 +118,14 @@ def check(
     from dataclasses import asdict
 
     from bench.recording import check as checking
+    from synth.system.text_lines import hang
 
     found = checking.check_recording(recording, phantom)
     if json:
         print(json_.dumps({"usable": checking.is_usable(found), "findings": [asdict(f) for f in found]}))
     else:
         for finding in found:
-            print(printable(f"{finding.state:<5}{finding.what:<11}{finding.said}"))
+            print("\n".join(hang(f"{finding.state:<5}{finding.what:<11}", printable(finding.said))))
     if not checking.is_usable(found):
         raise typer.Exit(2)
 
@@ -246,7 +247,8 @@ def _say(result: Result, folder: Path, json: bool) -> None:
     console.print(report.terminal_table(result))
     for note in result.notes:
         console.print(f"note: {note}", style="yellow", markup=False, highlight=False)
-    console.print(f"report: {folder / 'report.html'}", markup=False, highlight=False)
+    # A path is to be copied: never broken into lines.
+    console.print(f"report: {folder / 'report.html'}", markup=False, highlight=False, soft_wrap=True)
 
 
 @app.command(epilog="Example: bench flow rest.png moved.png truth.flo --flow tvl1")
@@ -265,6 +267,7 @@ def flow(
 ) -> None:
     """Flow between any two pictures, scored against a flow file."""
     from bench.flow import pair
+    from synth.system.text_lines import hang
 
     moved, found = pair.score_pair(first, second, truth, flow, glare, out)
     if json:
@@ -275,10 +278,11 @@ def flow(
     if out is not None:
         typer.echo(f"written to {out}")
     if found is not None:
-        typer.echo(
+        told = (
             f"EPE {found.epe:.3f} px, 95% within {found.p95:.3f} px, outliers {found.outliers:.1%}; "
             f"{found.trusted:.0%} trusted, EPE {found.trusted_epe:.3f} px there"
         )
+        typer.echo("\n".join(hang("", told)))
 
 
 @app.command(epilog="Example: bench live video.mp4 --model model --scale 0.05 --young 1.5")
@@ -364,6 +368,9 @@ def _rectangle(text: str) -> tuple[int, int, int, int] | None:
     return left, top, width, height
 
 
+_MEASURING = ("experiment", "pareto", "stability", "pages", "gap", "make-exvivo")
+
+
 def _with_evidence() -> None:
     """Adds the commands that measure this project itself, where their code is: in a checkout."""
     checkout = Path(__file__).resolve().parents[1]
@@ -371,6 +378,18 @@ def _with_evidence() -> None:
         if str(checkout) not in sys.path:
             sys.path.append(str(checkout))
         import_module("evidence.commands").add_to(app)
+        return
+    anything = {"ignore_unknown_options": True, "allow_extra_args": True}
+    for name in _MEASURING:
+        app.command(name, hidden=True, context_settings=anything, add_help_option=False)(_refuse_measuring)
+
+
+def _refuse_measuring(context: typer.Context) -> None:
+    name = context.info_name
+    raise UserError(
+        f"bench {name}: measures the program itself and is in no installation; in a clone's folder it is "
+        f"python -m bench {name}"
+    )
 
 
 _with_evidence()

@@ -22,6 +22,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from bench.output import machine, write
+from synth.system.text_lines import hang
 
 CHECKOUT = Path(__file__).resolve().parents[1]
 """Where the code is; a default folder below `docs/results` is one of its own, wherever a command is given."""
@@ -196,10 +197,20 @@ def _show(found: Any) -> None:
             value = [{name: key, **row} for key, row in value.items()]
         if isinstance(value, list) and value and all(isinstance(row, dict) for row in value):
             columns = list(dict.fromkeys(key for row in value for key in row))
-            table = Table(*columns, title=name)
+            table = Table(*map(escape, columns), title=escape(name), title_justify="left")
             for row in value:
                 table.add_row(*(_cell(row.get(key)) for key in columns))
-            console.print(table)
+            if (
+                console.measure(table, options=console.options.update(max_width=10_000)).maximum
+                <= console.width
+            ):
+                console.print(table)
+                continue
+            # Too wide: row by row, rather than cut off.
+            console.print(name, markup=False, highlight=False)
+            for row in value:
+                told = ", ".join(f"{key} {_cell(row[key])}" for key in columns if key in row)
+                console.print("\n".join(hang("  ", told, console.width)), markup=False, highlight=False)
         elif name not in ("command", "machine", "meaning"):
             console.print(f"{name}: {_cell(value)}", markup=False, highlight=False)
 

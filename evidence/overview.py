@@ -18,6 +18,7 @@ from bench.output import write as kept
 from evidence import defaults_on_front
 from evidence.measuring import measuring
 from synth.errors import UserError
+from synth.system.text_lines import hang
 
 Out = Annotated[Path | None, typer.Option("--out", "-o", help="Folder for the page; all/ in the results.")]
 Results = Annotated[Path, typer.Option(help="Folder that holds the rooms' results.")]
@@ -72,7 +73,8 @@ def pareto(
         print(json_.dumps(rows))
     else:
         for row in rows:
-            print(f"{row['room']:34s} {row['default']:44s} {row['off the front']} off the front")
+            front = f"{row['off the front']:>6} off the front  {row['room']}: "
+            print("\n".join(hang(front, str(row["default"]))))
         print(folder / "index.html")
     if not all(front.holds() for front in gathered):
         raise typer.Exit(1)

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
@@ -158,9 +159,11 @@ def _divided(
             raise UserError(
                 f"{dataset}: is split already (split.json, by `synth split`): leave out {', '.join(asked)}"
             )
-        settings = replace(settings, share_anatomy=settings.share_anatomy or read_rule(dataset).share_anatomy)
+        rule = read_rule(dataset)
+        settings = replace(settings, share_anatomy=settings.share_anatomy or rule.share_anatomy)
     if settings.share_anatomy:
-        clips = ungrouped(clips)
+        # A written split that doesn't keep openings apart would have one on two sides.
+        clips = ungrouped(clips, by_opening=None if sides is None or rule.by == "opening" else False)
         apart = "" if len(set(groups(clips))) == len(clips) else " Its openings are kept apart."
         _console.print(
             f"One brain may be on several sides of the split: scores say nothing of other brains.{apart}"
@@ -242,7 +245,7 @@ def intervals_command(
     """Fit how far off a trained model's answers may be, on sequences that it was not fitted or chosen on."""
     from learn.checkpoint import read_card
     from learn.data.clips import load_clips, scored
-    from learn.data.split import ungrouped
+    from learn.data.split import are_openings, ungrouped
     from learn.evaluation.fit_intervals import add_intervals
     from learn.evaluation.interval_sides import find_obstacle, find_sides
     from learn.inference.predict import load_predictor
@@ -257,7 +260,7 @@ def intervals_command(
         read = [load_clips(one, predictor.grid, (source,), cache=cache, report=tell) for one in datasets]
     clips = [clip for part in read for clip in part]
     if predictor.card.settings.share_anatomy:
-        clips = ungrouped(clips)
+        clips = ungrouped(clips, by_opening=are_openings(predictor.card.groups))
     marked = [(written_sides(one) or {}).items() for one in datasets]
     tests = [name for part in marked for name, side in part if side == "test"]
     split = find_sides(clips, predictor.card, tests, from_test)
@@ -280,10 +283,10 @@ def intervals_command(
 
 
 def _log(numbers: dict[str, float]) -> None:
-    _console.print(
-        f"epoch {numbers['epoch']:.0f}: loss {numbers['loss']:.4f}, select R² {numbers['select_r2']:.3f}, "
-        f"gradient {numbers['share_error']:.0%} squared error, {numbers['share_r2']:.0%} R²"
-    )
+    told = f"epoch {numbers['epoch']:.0f}: loss {numbers['loss']:.4f}, select R² {numbers['select_r2']:.3f}"
+    if numbers["share_r2"]:  # of a loss of two parts
+        told += f", gradient {numbers['share_error']:.0%} squared error, {numbers['share_r2']:.0%} R²"
+    _console.print(told)
 
 
 @app.command("eval", epilog="Example: learn eval model out --against other-model")
@@ -306,7 +309,7 @@ def eval_command(
 ) -> None:
     """Score a model on the sequences it has not seen; forces in mN."""
     from learn.data.clips import load_clips, scored
-    from learn.data.split import ungrouped
+    from learn.data.split import are_openings, ungrouped
     from learn.evaluation.coverage import cover
     from learn.evaluation.evaluate import compare, evaluate
     from learn.inference.predict import load_predictor
@@ -318,7 +321,7 @@ def eval_command(
     with _bar("Reading sequences") as tell:
         clips = load_clips(dataset, predictor.grid, (source,), cache=cache, report=tell)
     if predictor.card.settings.share_anatomy:
-        clips = ungrouped(clips)
+        clips = ungrouped(clips, by_opening=are_openings(predictor.card.groups))
         _console.print("The model was chosen on brains it is scored on: this says nothing of other brains.")
     other = None if against is None else load_predictor(against)
     if other is not None:
@@ -534,13 +537,9 @@ def _table(report: Report, source: str, seen: bool) -> Table:
     from learn.evaluation.metrics import METRICS
 
     which = "sequences, seen ones too" if seen else "unseen sequences"
-    table = Table(
-        title=f"{len(report.clips)} {which}, {source} flow; mean over sequences", title_justify="left"
-    )
-    table.add_column("")
-    heads = ("E known [95%]", "E taken ×½", "E taken ×2", "E unknown")
-    for head in heads:
-        table.add_column(head, justify="right")
+    table = _open_table(f"{len(report.clips)} {which}, {source} flow; mean over sequences")
+    for head in ("E known [95%]", "E × ½", "E × 2", "E unknown"):
+        table.add_column(head, justify="right", no_wrap=True)
     columns, sure = [report.summary(y) for y in YOUNG], report.intervals()
     for key, metric in METRICS.items():
         if not metric.listed or key not in columns[0]:
@@ -552,11 +551,18 @@ def _table(report: Report, source: str, seen: bool) -> Table:
     return table
 
 
+def _open_table(title: str) -> Table:
+    """A table that keeps its numbers whole in eighty columns: labels wrap, there are no upright lines."""
+    table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
+    table.add_column("", overflow="fold")
+    return table
+
+
 def _coverage(covered: list[Coverage]) -> Table:
     """Whether the model's intervals hold, and how wide they are."""
-    table = Table(title="intervals", title_justify="left")
-    for head in ("", *(f"{one.level:.0%}" for one in covered)):
-        table.add_column(head, justify="right" if head else "left")
+    table = _open_table("intervals")
+    for one in covered:
+        table.add_column(f"{one.level:.0%}", justify="right", no_wrap=True)
     shares = [
         {
             "force within": one.size,
@@ -579,9 +585,9 @@ def _pairs(pairs: Mapping[str, Paired], against: str, card: Card) -> Table:
     """Differences, this model minus the other, sequence by sequence."""
     from learn.evaluation.metrics import METRICS
 
-    table = Table(title=f"against {against}, paired by sequence", title_justify="left")
-    for head in ("", "difference [95%]", "p", "larger on"):
-        table.add_column(head, justify="left" if not head else "right")
+    table = _open_table(f"against {against}, paired by sequence")
+    for head in ("difference [95%]", "p", "larger on"):
+        table.add_column(head, justify="right", no_wrap=True)
     for key, metric in METRICS.items():
         if metric.listed and key in pairs:
             d, pair = pairs[key].difference, pairs[key]

@@ -200,7 +200,9 @@ def status(out: Out, json: Json = False) -> None:
 @app.command("split", epilog="Example: synth split out --by anatomy --hold-out calf")
 def split_command(
     out: Out,
-    by: Annotated[str, typer.Option(help="anatomy, family, gesture, stiffness or sequence.")] = "anatomy",
+    by: Annotated[
+        str, typer.Option(help="anatomy, opening, family, gesture, stiffness or sequence.")
+    ] = "anatomy",
     shares: Annotated[str, typer.Option(help="For train, validation and test.")] = "0.7,0.15,0.15",
     hold_out: Annotated[
         list[str] | None, typer.Option(help="An appearance family that is only for testing.")
@@ -222,9 +224,13 @@ def split_command(
     rows = index.write_index(folder)
     split.assign_sides(rows, chosen)
     split.keep_rule(out, chosen)
-    counts = split.count(index.write_index(folder))
+    rows = index.write_index(folder)
+    counts = split.count(rows)
     if not counts:
         raise UserError(f"{out}: holds no finished sequence")
+    warning = split.warn_of_strangers(rows, chosen)
+    if warning:
+        print(f"warning: {warning}", file=sys.stderr)
     print(json_.dumps(counts) if json else ", ".join(f"{side} {n}" for side, n in counts.items()))
 
 
@@ -413,6 +419,7 @@ def doctor(
 ) -> None:
     """Says what this machine offers, and what to do about what it lacks."""
     from synth.system.doctor import findings
+    from synth.system.text_lines import hang
 
     found = findings(folder)
     if json:
@@ -420,6 +427,7 @@ def doctor(
         return
     width = max(len(finding.what) for finding in found)
     for finding in found:
-        print(f"{'ok  ' if finding.good else 'LACK'} {finding.what:<{width}}  {finding.found}")
+        said = hang(f"{'ok  ' if finding.good else 'LACK'} {finding.what:<{width}}  ", finding.found)
         if not finding.good:
-            print(f"     {'':<{width}}  -> {finding.advice}")
+            said += hang(f"     {'':<{width}}  -> ", finding.advice)
+        print("\n".join(said))

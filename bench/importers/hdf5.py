@@ -36,7 +36,7 @@ def read_source(source: Path, use: dict[str, str]) -> Intake:
     try:
         import h5py
     except ImportError:
-        raise UserError("reading HDF5 needs h5py: pip install 'sulcus[readers]'") from None
+        raise UserError("reading HDF5 needs h5py: pip install '.[readers]' in the clone") from None
     try:
         file = h5py.File(source, "r")
     except OSError:

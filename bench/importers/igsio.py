@@ -36,7 +36,7 @@ def read_source(source: Path, use: dict[str, str]) -> Intake:
     try:
         import SimpleITK
     except ImportError:
-        raise UserError("reading .mha needs SimpleITK: pip install 'sulcus[readers]'") from None
+        raise UserError("reading .mha needs SimpleITK: pip install '.[readers]' in the clone") from None
     _refuse_elsewhere(source)
     reader = SimpleITK.ImageFileReader()
     reader.SetFileName(str(source))

@@ -37,7 +37,7 @@ def read_source(source: Path, use: dict[str, str]) -> Intake:
         from rosbags.highlevel import AnyReader, AnyReaderError
         from rosbags.typesys import Stores, get_typestore
     except ImportError:
-        raise UserError("reading bags needs rosbags: pip install 'sulcus[readers]'") from None
+        raise UserError("reading bags needs rosbags: pip install '.[readers]' in the clone") from None
 
     if source.is_dir():
         _refuse_elsewhere(source)

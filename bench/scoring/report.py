@@ -111,19 +111,21 @@ def render_report(result: Result, title: str) -> str:
 def terminal_table(result: Result) -> Table:
     """The methods' scores for a terminal."""
     # Eighty columns: a name may take two lines, a number never.
-    table = Table(title=result.recording, title_justify="left", box=box.SIMPLE)
-    table.add_column("method")
+    title = escape(result.recording)
+    tight = (0, 1, 0, 0)
+    table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, padding=tight, pad_edge=False)
+    table.add_column("method", overflow="fold")
     if not result.methods[result.main].scores:
         table.add_column(escape("largest force [mN]"), justify="right")
         for name, method in result.methods.items():
             sizes = method.size_mn[np.isfinite(method.size_mn)]
-            table.add_row(name, shown(float(sizes.max()) if len(sizes) else None))
+            table.add_row(escape(name), shown(float(sizes.max()) if len(sizes) else None))
         return table
     columns = {key: metric for key, metric in _columns(result).items() if key in _NARROW}
     for metric in columns.values():
         table.add_column(escape(metric.column), justify="right", no_wrap=True)
     for name, method in result.methods.items():
-        table.add_row(name, *(shown(method.scores[key], m.cell_unit) for key, m in columns.items()))
+        table.add_row(escape(name), *(shown(method.scores[key], m.cell_unit) for key, m in columns.items()))
     return table
 
 

@@ -16,10 +16,11 @@ from synth.dataset.split import SIDES, join_groups
 from synth.errors import UserError
 
 _HINT = (
-    "; share_anatomy=true splits one brain by its openings (`synth place` finds them, craniotomy.also lists "
-    "them), or else by sequence, and says nothing of other brains"
+    "; share_anatomy=true, or `synth split --by opening`, splits one brain by its openings (`synth place` "
+    "finds them, craniotomy.also lists them), or else by sequence, and says nothing of other brains"
 )
 _OPENINGS = 3  # fit, select and test
+_SEQUENCE = "/"  # between the anatomy and the sequence in a group's name; in none of an anatomy or opening
 
 
 @dataclass(frozen=True)
@@ -33,13 +34,20 @@ class Split:
     """Neither fitted nor chosen on, and no test: what intervals are fitted on."""
 
 
-def ungrouped(clips: Sequence[Clip]) -> list[Clip]:
+def ungrouped(clips: Sequence[Clip], *, by_opening: bool | None = None) -> list[Clip]:
     """The clips without their anatomies as groups: for a dataset of a single brain, whose sequences can't be
-    kept apart by anatomy. Each place that the brain is opened at is a group where there are three or more of
-    them, else every sequence is. Scores then say nothing of other brains."""
-    if len({c.opening for c in clips if c.opening}) >= _OPENINGS:
-        return [replace(c, group=c.opening or f"{c.group}/{c.content_hash}") for c in clips]
-    return [replace(c, group=f"{c.group}/{c.content_hash}") for c in clips]
+    kept apart by anatomy. Each place that the brain is opened at is a group, or else every sequence is; not
+    told, the former where there are three or more. Scores then say nothing of other brains."""
+    if by_opening is None:
+        by_opening = len({c.opening for c in clips if c.opening}) >= _OPENINGS
+    if by_opening:
+        return [replace(c, group=c.opening or c.group) for c in clips]
+    return [replace(c, group=f"{c.group}{_SEQUENCE}{c.content_hash}") for c in clips]
+
+
+def are_openings(groups: Mapping[str, Sequence[str]]) -> bool:
+    """Whether the groups of a model's card, of `ungrouped`, are openings and not sequences."""
+    return not all(_SEQUENCE in name for part in groups.values() for name in part)
 
 
 def groups(clips: Sequence[Clip]) -> list[int]:
@@ -54,10 +62,13 @@ def folds(clips: Sequence[Clip], count: int, seed: int) -> list[tuple[int, ...]]
     """
     group = np.array(groups(clips))
     names = np.random.default_rng(seed).permutation(np.unique(group))
+    if len(names) < 2:
+        held = f"{len(clips)} sequences hold {len(names)} anatomy, and a split needs two at least"
+        raise UserError(held + _advise(clips))
     if not 2 <= count <= len(names):
         raise UserError(
             f"{count} folds: between 2 and {len(names)} are possible, for {len(clips)} sequences hold "
-            f"{len(names)} different anatomies" + _HINT * (len(names) < 3)
+            f"{len(names)} different anatomies" + _advise(clips) * (len(names) < 3)
         )
     size = {int(g): int((group == g).sum()) for g in names}
     bins: list[list[int]] = [[] for _ in range(count)]
@@ -106,6 +117,12 @@ def keep_written(clips: Sequence[Clip], sides: Mapping[str, str], seed: int) -> 
     return Split(fit, select, test)
 
 
+def _advise(clips: Sequence[Clip]) -> str:
+    """How to come to more groups."""
+    alone = len(set(groups(clips))) == len(clips)
+    return "; here each sequence is one: render more of them" if alone else _HINT
+
+
 def _choosers(
     clips: Sequence[Clip], rest: Sequence[int], seed: int, part: int
 ) -> tuple[tuple[int, ...], tuple[int, ...]]:
@@ -115,7 +132,7 @@ def _choosers(
     if left < 2:
         raise UserError(
             f"fit, select and test need an anatomy each: {len(set(number))} are there, {left} are left of "
-            "them beside the test" + _HINT
+            "them beside the test" + _advise(clips)
         )
     parts = folds([clips[i] for i in rest], min(5, left), seed)
     chosen = part % len(parts)

@@ -187,7 +187,7 @@ def _onnx(module: Portable, card: Card, file: Path) -> Any:
         importlib.import_module("onnx")
         runtime: Any = importlib.import_module("onnxruntime")
     except ImportError as missing:
-        raise UserError(f"ONNX export needs {missing.name}: pip install 'sulcus[export]'") from None
+        raise UserError(f"ONNX export needs {missing.name}: pip install '.[export]' in the clone") from None
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         torch.onnx.export(

@@ -18,6 +18,7 @@ from synth.dataset.store import Sequence, open_sequence
 from synth.errors import UserError
 from synth.job import identity
 from synth.system.stopwatch import Stopwatch
+from synth.system.text_lines import hang
 
 _FAST_FRAMES = 2
 _FAST_SEQUENCES = 20
@@ -74,13 +75,16 @@ class Report:
         return {**asdict(self), "good": self.good}
 
     def lines(self) -> list[str]:
-        """For a person: a line a check, then every failure; as wide as they need to be."""
-        head = ("check", "measures", "bad", "worst", "limit", "unit", "CPU s", "where")
+        """For a person: each check and where its worst measure is, wrapped, then every failure in a line."""
+        head = ("check", "count", "bad", "worst", "limit", "unit", "CPU s", "where")
         rows = [head, *(_row(check) for check in self.checks)]
-        widths = [max(len(row[k]) for row in rows) for k in range(len(head))]
-        table = ["  ".join(f"{cell:<{wide}}" for cell, wide in zip(row, widths, strict=True)) for row in rows]
+        widths = [max(len(row[k]) for row in rows) for k in range(len(head) - 1)]
+        table = []
+        for *cells, where in rows:
+            front = "".join(f"{cell:<{wide}}  " for cell, wide in zip(cells, widths, strict=True))
+            table += hang(front, where)
         failures = [f"{check.name}: {failure}" for check in self.checks for failure in check.failures]
-        return [*(line.rstrip() for line in table), *failures, "good" if self.good else "not good"]
+        return [*table, *failures, "good" if self.good else "not good"]
 
 
 def _row(check: Check) -> tuple[str, ...]:

@@ -11,6 +11,7 @@ import numpy as np
 from synth.dataset import size_forecast
 from synth.dataset.store import Sequence
 from synth.fields import FIELDS, TIME, Field
+from synth.system.text_lines import hang
 
 _KEPT = {
     "always": "always",
@@ -39,6 +40,11 @@ class Row:
     """The same in a dataset at hand."""
     meaning: str
 
+    @property
+    def on_disk(self) -> float:
+        """As measured, or else by the ratio."""
+        return self.stored if self.measured is None else self.measured
+
 
 def rows(size: tuple[int, int], sequence: Sequence | None = None) -> Iterator[Row]:
     """Every field in the table's order; size: (height, width) [px]; `sequence` gives what is measured."""
@@ -57,35 +63,69 @@ def rows(size: tuple[int, int], sequence: Sequence | None = None) -> Iterator[Ro
         )
 
 
+_HEADS = ("field", "axes", "type", "unit", "in memory", "on disk")
+
+
 def lines(size: tuple[int, int], sequence: Sequence | None = None) -> Iterator[str]:
-    """The table in Markdown, and the sum of what a default job keeps of a frame."""
-    height, width = size
+    """For a terminal: two lines a field or more, and the sum of what a default job keeps of a frame."""
     found = list(rows(size, sequence))
+    told = [(row.name, row.axes, row.dtype, row.unit, *_amounts(row)) for row in found]
+    widths = [max(map(len, column)) for column in zip(_HEADS, *told, strict=True)]
+
+    def line(cells: tuple[str, ...]) -> str:
+        left = [f"{cell:<{wide}}" for cell, wide in zip(cells[:4], widths[:4], strict=True)]
+        right = [f"{cell:>{wide}}" for cell, wide in zip(cells[4:], widths[4:], strict=True)]
+        return "  ".join(left + right)
+
+    yield line(_HEADS)
+    for row, cells in zip(found, told, strict=True):
+        yield line(cells)
+        kept = "" if row.kept == _KEPT["always"] else f" (kept {row.kept})"
+        yield from hang("    ", row.meaning + kept)
+    yield ""
+    yield from hang(
+        "", f"Sizes are of a frame; without frames among its axes, of a sequence. {_sum(size, found)}"
+    )
+
+
+def table(size: tuple[int, int]) -> Iterator[str]:
+    """The same in Markdown, for a page."""
+    found = list(rows(size))
     yield "| field | axes | type | unit | kept | in memory | on disk | meaning |"
     yield "| --- | --- | --- | --- | --- | ---: | ---: | --- |"
     for row in found:
-        stored = row.stored if row.measured is None else row.measured
         per = "" if TIME in row.axes else " a sequence"
-        sizes = f"{size_forecast.amount(row.raw)}{per} | {size_forecast.amount(stored)}{per}"
+        sizes = " | ".join(f"{amount}{per}" for amount in _amounts(row))
         words = (f"`{row.name}`", row.axes, row.dtype, row.unit, row.kept, sizes, row.meaning)
         yield f"| {' | '.join(words)} |"
+    yield ""
+    yield _sum(size, found)
+
+
+def _amounts(row: Row) -> tuple[str, str]:
+    """In memory and on disk, as measured where there is a dataset."""
+    return size_forecast.amount(row.raw), size_forecast.amount(row.on_disk)
+
+
+def _sum(size: tuple[int, int], found: list[Row]) -> str:
+    height, width = size
     usual = [
         row
         for row in found
         if FIELDS[row.name].kept in ("always", "usually", "recovered") and TIME in row.axes
     ]
-    stored = sum(row.stored if row.measured is None else row.measured for row in usual)
-    raw = sum(row.raw for row in usual)
-    yield ""
-    yield (
+    raw, stored = (
+        size_forecast.amount(sum(sizes)) for sizes in zip(*((r.raw, r.on_disk) for r in usual), strict=True)
+    )
+    return (
         f"A frame of {width} x {height} px, without a second lens and what is only kept if asked for: "
-        f"{size_forecast.amount(raw)} in memory, {size_forecast.amount(stored)} on disk."
+        f"{raw} in memory, {stored} on disk."
     )
 
 
 def page() -> str:
     """docs/fields.md."""
-    return _HEAD + "\n".join(lines((480, 640))) + "\n"
+    return _HEAD + "\n".join(table((480, 640))) + "\n"
 
 
 _HEAD = """\

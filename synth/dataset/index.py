@@ -37,6 +37,11 @@ SCHEMA = pa.schema(
                 "dataset; sequences that share it belong on one side of a split"
             },
         ),
+        pa.field(
+            "opening",
+            pa.string(),
+            metadata={"meaning": "where a user's brain is opened: the same place, the same name everywhere"},
+        ),
         pa.field("family", pa.string(), metadata={"meaning": "appearance family"}),
         pa.field("gesture", pa.string(), metadata={"meaning": "kind of gesture, of every instrument"}),
         pa.field("young_kpa", pa.float64(), metadata={"meaning": "Young's modulus", "unit": "kPa"}),
@@ -203,6 +208,7 @@ def row_of(sequence: Sequence) -> dict[str, Any]:
         "path": sequence.path.name,
         "content_hash": attrs["content_hash"],
         "anatomy": split.name_anatomy(attrs),
+        "opening": attrs.get("opening_id"),
         "family": scenario.get("family"),
         "gesture": name_gestures(scenario) or None,
         "young_kpa": attrs.get("young_kpa"),

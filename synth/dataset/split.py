@@ -17,8 +17,9 @@ from synth.errors import UserError
 from synth.job.types import first_problem
 from synth.system import foreign_file
 
-By = Literal["anatomy", "family", "gesture", "stiffness", "sequence"]
-"""What must not be shared between the sides; `stiffness` splits at quantiles of Young's modulus."""
+By = Literal["anatomy", "opening", "family", "gesture", "stiffness", "sequence"]
+"""What must not be shared between the sides: `opening` is the place that a user's brain is opened at, else
+the anatomy; `stiffness` splits at quantiles of Young's modulus."""
 
 SIDES = ("train", "validation", "test")
 _CLASSES = 10
@@ -59,14 +60,14 @@ def keep_rule(root: Path, chosen: Rule) -> None:
 
 
 def parse_rule(by: str, shares: str, held_out: Sequence[str], share_anatomy: bool = False) -> Rule:
-    """A rule from the words of a command line. UserError for what is none."""
+    """A rule from the words of a command line, UserError for what is none; by opening, a brain is shared."""
     if by not in get_args(By):
         raise UserError(f"by {by}: is not one of {', '.join(get_args(By))}")
     try:
         train, validation, test = (float(word) for word in shares.split(","))
     except ValueError:
         raise UserError(f"shares {shares}: three numbers are needed, as 0.7,0.15,0.15") from None
-    return Rule(cast(By, by), (train, validation, test), tuple(held_out), share_anatomy)
+    return Rule(cast(By, by), (train, validation, test), tuple(held_out), share_anatomy or by == "opening")
 
 
 def count(rows: Sequence[Mapping[str, Any]]) -> dict[str, int]:
@@ -105,11 +106,9 @@ def assign_sides(rows: Sequence[Mapping[str, Any]], chosen: Rule) -> list[str | 
     free = sorted(sizes.keys() - sealed, key=lambda name: (-sizes[name], _shuffled(name)))
     sides = [k for k in range(3) if shares[k] > 0]
     if len(free) + bool(sealed) < len(sides):
-        hint = (
-            ""
-            if share_anatomy
-            else "; --share-anatomy splits within a brain, for a model of that brain alone"
-        )
+        hint = "; --share-anatomy splits within a brain, for a model of that brain alone"
+        if share_anatomy:
+            hint = "; craniotomy.also in the job lists further openings" if by == "opening" else ""
         needing = ", ".join(SIDES[k] for k in sides)
         raise UserError(f"{len(sizes)} groups by {by}: too few for {needing} to have one each{hint}")
     for name in free:
@@ -127,10 +126,27 @@ def leaks(rows: Sequence[Mapping[str, Any]], chosen: Rule | None = None) -> list
         if row["status"] == "done" and row.get("split") in SIDES[:2] and row["family"] in chosen.held_out:
             found.append(f"family {row['family']} is held out and in {row['split']}")
     done = [row for row in rows if row["status"] == "done" and row.get("split")]
-    for name in ("content_hash",) if chosen.share_anatomy else ("anatomy", "content_hash"):
-        crossing = find_crossings([row[name] for row in done], [row["split"] for row in done])
+    told = {"content_hash": [row["content_hash"] for row in done]}
+    if not chosen.share_anatomy:
+        told = {"anatomy": [row["anatomy"] for row in done], **told}
+    elif chosen.by == "opening":
+        told = {"opening": [_name_opening(row) for row in done], **told}
+    for name, keys in told.items():
+        crossing = find_crossings(keys, [row["split"] for row in done])
         found += [f"{name} {key} is in {', '.join(on)}" for key, on in crossing.items()]
     return found
+
+
+def warn_of_strangers(rows: Sequence[Mapping[str, Any]], chosen: Rule) -> str | None:
+    """What to say of brains that are on several sides; None if there are none."""
+    done = [row for row in rows if row["status"] == "done" and row.get("split")]
+    count = len(find_crossings([row["anatomy"] for row in done], [row["split"] for row in done]))
+    if not count:
+        return None
+    parts = "openings" if chosen.by == "opening" else "sequences"
+    brains = "1 brain is" if count == 1 else f"{count} brains are"
+    nothing = "scores say nothing of other brains"
+    return f"{brains} on several sides: {parts} of one brain are no strangers, and {nothing}"
 
 
 def find_crossings(groups: Sequence[Hashable], sides: Sequence[str]) -> dict[Hashable, list[str]]:
@@ -181,6 +197,8 @@ def _groups(rows: Sequence[Mapping[str, Any]], by: By, share_anatomy: bool) -> d
         named = {row["index"]: f"E{sum(row['young_kpa'] >= edge for edge in edges)}" for row in rows}
     elif by == "sequence":
         named = {row["index"]: str(row["content_hash"]) for row in rows}
+    elif by == "opening":
+        named = {row["index"]: _name_opening(row) for row in rows}
     else:
         named = {row["index"]: str(row[by]) for row in rows}
     if share_anatomy:
@@ -190,6 +208,11 @@ def _groups(rows: Sequence[Mapping[str, Any]], by: By, share_anatomy: bool) -> d
     for group, name in zip(number, names, strict=True):
         least[group] = min(name, least.get(group, name))
     return {key: least[group] for key, group in zip(named, number, strict=True)}
+
+
+def _name_opening(row: Mapping[str, Any]) -> str:
+    """A procedural brain, which is opened at one place, and stores that don't say where: the anatomy."""
+    return str(row.get("opening") or row["anatomy"])
 
 
 def _shuffled(name: str) -> str:

@@ -29,6 +29,7 @@ _TICK_S = 0.5
 _REPORT_S = 1.0
 _WAIT_FOR_WORKERS_S = 600
 _CONNECT = "20s"
+_LACKING = "needs the extra `cluster`: pip install '.[cluster]' in the clone"
 
 # On a Dask worker: the slot of each of its threads, kept from sequence to sequence.
 _kept = threading.local()
@@ -47,7 +48,7 @@ def open_slots(engine: str, setup: Setup) -> Iterator[Slots]:
     try:
         import distributed
     except ImportError:
-        raise UserError("a Dask engine needs the extra `cluster`: pip install 'sulcus[cluster]'") from None
+        raise UserError(f"a Dask engine {_LACKING}") from None
     # The lock cannot travel; a worker sees by the turn that its run is over.
     own = {key: value for key, value in (setup.environment or {}).items() if not key.startswith("SULCUS_")}
     travelling = replace(
@@ -216,7 +217,7 @@ def slurm(described: dict[str, Any]) -> Any:
     try:
         from dask_jobqueue import SLURMCluster
     except ImportError:
-        raise UserError("a SLURM engine needs the extra `cluster`: pip install 'sulcus[cluster]'") from None
+        raise UserError(f"a SLURM engine {_LACKING}") from None
     try:
         return SLURMCluster(**described)
     except (TypeError, ValueError) as error:

@@ -9,6 +9,7 @@ from typing import Any
 from synth.errors import UserError
 from synth.place import openings, page, picture
 from synth.place.openings import Survey
+from synth.system.text_lines import hang
 from synth.system.whole_file import made_folder, part_of, write_whole
 
 _ROOM_BYTES = 32 << 20  # the page, with the charts' program in it
@@ -41,14 +42,13 @@ class Placed:
 
     def lines(self) -> list[str]:
         """For a terminal: a line an opening, then the job's lines of the best."""
-        said = [f"note: {self.found.note}"] if self.found.note else []
+        said = hang("note: ", self.found.note) if self.found.note else []
+        said.append(f"   {'point [mm]':<28}  {'direction':<24}  relief [mm]")
         for number, site in enumerate(self.found.chosen, 1):
             x, y, z = site.point
             u, v, w = site.direction
-            said.append(
-                f"{number}  point [{x:.2f}, {y:.2f}, {z:.2f}]  direction [{u:.3f}, {v:.3f}, {w:.3f}]  "
-                f"relief {site.relief_mm:.2f} mm"
-            )
+            point, direction = f"[{x:.2f}, {y:.2f}, {z:.2f}]", f"[{u:.3f}, {v:.3f}, {w:.3f}]"
+            said.append(f"{number:<2} {point:<28}  {direction:<24}  {site.relief_mm:.2f}")
         said += [f"{self.folder}: openings.png, openings.html to click, job.yaml:", ""]
         best = openings.lines(self.found.path, self.found.chosen[0], self.found.radius_mm, self.folder)
         return [*said, *best.splitlines()]

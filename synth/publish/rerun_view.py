@@ -180,5 +180,5 @@ def _rerun() -> Any:
     try:
         import rerun
     except ImportError:
-        raise UserError("viewing needs the extra `view`: pip install 'sulcus[view]'") from None
+        raise UserError("viewing needs the extra `view`: pip install '.[view]' in the clone") from None
     return rerun

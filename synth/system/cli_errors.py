@@ -33,6 +33,14 @@ def printable(text: str) -> str:
 class Commands(TyperGroup):
     """A typer group (`typer.Typer(cls=Commands)`) that turns UserError into its line and exit code 2."""
 
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        """The commands with all of their first sentences, wrapped where click would cut them off."""
+        commands = [(name, self.get_command(ctx, name)) for name in self.list_commands(ctx)]
+        rows = [(name, one.get_short_help_str(1000)) for name, one in commands if one and not one.hidden]
+        if rows:
+            with formatter.section("Commands"):
+                formatter.write_dl(rows)
+
     def invoke(self, ctx: Any) -> Any:
         try:
             with _cautions():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import importlib.util
 import os
 import platform
@@ -52,6 +53,7 @@ def _findings(folder: Path) -> Iterator[Finding]:
     yield Finding(
         "renderer", variant, variant != "scalar_rgb", "the slow variant works; LLVM halves the time"
     )
+    yield from _lacking()
     yield _kernels()
     for name, version in packages.versions().items():
         yield Finding(name, version)
@@ -66,6 +68,19 @@ def _memory() -> Iterator[Finding]:
         yield Finding(
             "memory", f"{size:.1f} GB", size >= _LEAST_MEMORY_GB, "use --workers 1 and a smaller render.size"
         )
+
+
+def _lacking() -> Iterator[Finding]:
+    """A system's library that the renderer is linked against, where the loader doesn't find it."""
+    spec = importlib.util.find_spec("drjit")
+    threads = Path(spec.origin or "").parent / "libnanothread.so" if spec else Path()
+    if not threads.is_file():
+        return
+    try:
+        ctypes.CDLL(str(threads))
+    except OSError as error:
+        advice = "install it (Debian: apt-get install libatomic1): nothing is rendered without"
+        yield Finding("renderer's libraries", str(error), False, advice)
 
 
 def _kernels() -> Finding:

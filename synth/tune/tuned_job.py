@@ -16,10 +16,12 @@ from synth.errors import UserError
 from synth.job import reader
 from synth.job.schema import Job
 from synth.system import foreign_yaml
+from synth.system.text_lines import hang
 from synth.tune.search import Joint, Row, Tuned, own
 
 _PATHS = ("anatomy.mesh", "appearance.photo", "render.calibration")
 _WIDTH = 98
+_TABLE = 78  # and a comment's sign: eighty columns
 
 
 def write_tuned(found: Tuned, source: str, overrides: Sequence[str], out: Path) -> Job:
@@ -109,18 +111,22 @@ def summary(found: Tuned) -> list[str]:
 
 
 def lines(found: Tuned) -> list[str]:
-    """Each level of each knob by itself, as a table."""
+    """Each level of each knob by itself, as a table; "was": what the job had."""
     mine = {knob.name: own(knob, found.job).words for knob in found.knobs}
     picked = {knob.name: level.words for knob, level in zip(found.knobs, found.chosen, strict=True)}
-    out = ["knob            level              error of force   of the budget   saves of a full frame"]
+    out = [
+        f"{'':14s} {'':17s} {'error':>12} {'of the':>12}   saves",
+        f"{'knob':14s} {'level':17s} {'of force':>12} {'budget':>12} a frame",
+    ]
     for row in found.rows:
         marks = [
-            word
-            for word, levels in (("chosen", picked), ("as it was", mine))
-            if levels[row.knob] == row.level
+            word for word, levels in (("chosen", picked), ("was", mine)) if levels[row.knob] == row.level
         ]
-        moves = f"{_grown(row.change):>14}   {_percent(row.error):>13}   {100 * row.saved:20.0f}%"
-        out.append(f"{row.knob:15s} {row.level:18s} {row.why[:60] or moves}  {', '.join(marks)}".rstrip())
+        front = f"{row.knob:14s} {row.level:17s} "
+        moves = f"{_grown(row.change):>12} {_percent(row.error):>12} {100 * row.saved:6.0f}%"
+        told = hang(front, row.why, _TABLE) if row.why else [front + moves]
+        told[-1] = f"{told[-1]}  {', '.join(marks)}".rstrip()
+        out += told
     return out
 
 

@@ -59,6 +59,7 @@ def write(
     family: str = "healthy",
     noise_px: float = 0.05,
     two_eyes: bool = False,
+    opening: str | None = None,
 ) -> Path:
     """One sequence: a contact somewhere, a direction, a ramp up to a peak; deterministic in `index`."""
     rng = np.random.default_rng([7, index])
@@ -116,4 +117,5 @@ def write(
         scale_mm_per_px=SCALE_MM_PER_PX,
         young_kpa=young,
         poisson=POISSON,
+        **({} if opening is None else {"anatomy_id": opening.partition(" at ")[0], "opening_id": opening}),
     )

@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shutil
 import subprocess
 import tomllib
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
+from packaging.specifiers import SpecifierSet
+from packaging.version import Version
 from sources import ROOT
+
+from synth.system import llvm_setup
 
 DOCKER = (ROOT / "Dockerfile").read_text("utf-8")
 APPTAINER = (ROOT / "apptainer.def").read_text("utf-8")
@@ -37,6 +43,21 @@ def sections() -> dict[str, list[str]]:
     return found
 
 
+def packages(text: str) -> set[str]:
+    """What is installed of Debian's."""
+    found = re.search(r"apt-get install -y --no-install-recommends ([\w ]+)", text)
+    return set(found[1].split()) if found else set()
+
+
+_PROVIDED = {
+    **dict.fromkeys((f"lib{name}.so.6" for name in ("c", "m", "stdc++")), "the image"),
+    **dict.fromkeys(
+        ("libpthread.so.0", "libdl.so.2", "librt.so.1", "libgcc_s.so.1", "libz.so.1"), "the image"
+    ),
+    "libatomic.so.1": "libatomic1",
+}
+
+
 def needed() -> set[str]:
     """What a build of the wheel reads."""
     project = PROJECT["project"]
@@ -59,6 +80,33 @@ def test_the_dockerfile_has_what_a_build_needs() -> None:
             assert "rm -rf /var/lib/apt/lists" in rest
 
 
+def test_the_image_has_the_python_that_the_constraints_are_of() -> None:
+    image = re.search(r"^FROM python:(\d+\.\d+)-", DOCKER, re.MULTILINE)
+    assert image
+    assert f"on Python {image[1]}" in (ROOT / "constraints.txt").read_text("utf-8").splitlines()[0]
+    assert Version(image[1]) in SpecifierSet(PROJECT["project"]["requires-python"])
+
+
+def test_what_the_renderer_is_linked_against_is_installed() -> None:
+    """By the loader's own word: neither wheel brings all that it needs."""
+    specs = [find_spec(name) for name in ("drjit", "mitsuba")]
+    homes = [Path(spec.origin).parent for spec in specs if spec is not None and spec.origin is not None]
+    files = [path for home in homes for path in home.glob("*.so*")]
+    told = subprocess.run(["ldd", *map(str, files)], capture_output=True, text=True).stdout
+    needed = {line.split()[0] for line in told.splitlines() if "=>" in line} - {path.name for path in files}
+    assert "libatomic.so.1" in needed
+    assert {_PROVIDED[name] for name in needed} <= packages(DOCKER) | {"the image"}
+
+
+def test_commands_in_comments_are_ours() -> None:
+    known = json.loads(Path(__file__).with_name("commands.json").read_text("utf-8"))
+    for text in (DOCKER, APPTAINER):
+        (told,) = re.findall(r"^# .* ((?:synth|learn|bench) \S+) .*$", text, re.MULTILINE)
+        assert told in known
+    run = next(rest for word, rest in instructions() if word == "CMD")
+    assert json.loads(run)[0] in PROJECT["project"]["scripts"]
+
+
 def test_what_docker_sends_is_what_is_copied() -> None:
     kept = {line[1:] for line in (ROOT / ".dockerignore").read_text("utf-8").splitlines() if line[:1] == "!"}
     assert kept == needed()
@@ -73,7 +121,9 @@ def test_the_apptainer_definition_has_what_a_build_needs() -> None:
     assert {line.split()[0] for line in told["files"]} == needed()
     assert all(line.split()[1] == f"/opt/sulcus/{line.split()[0]}" for line in told["files"])
     (argument,) = told["arguments"]
-    assert f"{{{{ {argument.rstrip('=')} }}}}" in APPTAINER
+    name, _, default = argument.partition("=")
+    assert f"{{{{ {name} }}}}" in APPTAINER
+    assert default, "Apptainer takes an empty default for none and stops at the name"
     assert {line.split()[0] for line in told["test"]} == set(PROJECT["project"]["scripts"])
 
 
@@ -81,8 +131,8 @@ def test_both_install_the_same_way() -> None:
     install = re.search(r"pip install .*?'\.\[\w+\]'", DOCKER)
     assert install
     assert install[0] in APPTAINER
-    assert "libllvm19" in DOCKER
-    assert "libllvm19" in APPTAINER
+    assert packages(DOCKER) == packages(APPTAINER)
+    assert llvm_setup._PACKAGE in packages(DOCKER)
     extra = install[0].split("[")[1].split("]")[0]
     assert extra in PROJECT["project"]["optional-dependencies"]
 

@@ -12,6 +12,8 @@ from pathlib import Path
 import pytest
 from sources import ROOT
 
+from bench.cli import _MEASURING
+
 pytestmark = pytest.mark.slow
 
 PRODUCT = ("synth", "learn", "bench")
@@ -63,8 +65,12 @@ def test_its_commands_work_without_the_evidence(installed: Path, tmp_path: Path)
     words = said.stdout.split()
     assert {"score", "check", "flow"} <= set(words)
     assert not {"pareto", "stability", "experiment"} & set(words)
+    for name in _MEASURING:
+        refused = typed(installed, tmp_path, "bench", name, "flow", "--out", "runs", "--help")
+        assert refused.returncode == 2
+        assert f"in a clone's folder it is python -m bench {name}" in refused.stderr
     from_checkout = typed(ROOT, tmp_path, "bench", "--help").stdout.split()
-    assert {"pareto", "stability", "experiment"} <= set(from_checkout), "the evidence would not be seen"
+    assert set(_MEASURING) <= set(from_checkout), "the evidence would not be seen"
 
 
 def test_its_jobs_and_templates_are_found(installed: Path, tmp_path: Path) -> None:

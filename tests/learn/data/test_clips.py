@@ -163,11 +163,17 @@ def test_anatomies_are_told_apart_by_what_a_sequence_says() -> None:
     assert name_anatomy({"content_hash": "h", "scenario": {}}) == "h"
 
 
+def test_too_few_procedural_sequences_are_to_be_more(clips: list[Clip]) -> None:
+    apart = {c.group: c for c in clips}
+    with pytest.raises(UserError, match=r"2 are there.*each sequence is one: render more of them"):
+        nested(list(apart.values())[:2], 2, 0, 0)
+
+
 def test_one_brain_is_split_only_when_asked_to(clips: list[Clip]) -> None:
     from dataclasses import replace
 
     one = [replace(c, group="mesh-5f") for c in clips]
-    with pytest.raises(UserError, match="share_anatomy=true"):
+    with pytest.raises(UserError, match=r"hold 1 anatomy.*share_anatomy=true"):
         nested(one, 3, 0, 0)
     with pytest.raises(UserError, match=r"`synth place` finds them, craniotomy\.also lists them"):
         nested(one, 3, 0, 0)

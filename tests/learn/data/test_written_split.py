@@ -15,10 +15,13 @@ from learn.checkpoint import read_card
 from learn.cli import app
 from learn.data.clips import Clip
 from learn.data.split import Split, folds, keep_written, nested
+from synth.cli import app as synth
 from synth.dataset import split
-from synth.dataset.index import written_sides
+from synth.dataset.folder import claim
+from synth.dataset.index import read_index, written_sides
 from synth.dataset.split import Rule
 from synth.errors import UserError
+from synth.job.schema import Job
 
 run = CliRunner().invoke
 TINY = ["--preset", "tiny", "--size", "32", "--width", "8", "--epochs", "1", "--json"]
@@ -86,6 +89,31 @@ def test_one_brain_is_split_within_it_where_the_dataset_says_so(tmp_path: Path) 
     used = train(tmp_path / "own", tmp_path / "m")
     assert {part: len(names) for part, names in used.items()} == {"fit": 3, "select": 1, "test": 1}
     assert read_card(tmp_path / "m").settings.share_anatomy
+
+
+@pytest.mark.parametrize(("by", "alike"), [("opening", True), ("sequence", False)])
+def test_openings_of_one_brain_are_on_one_side_only_where_the_rule_is_by_them(
+    tmp_path: Path, by: str, alike: bool
+) -> None:
+    own = tmp_path / "own"
+    with claim(own, Job(sequences=6)):
+        for index in range(6):
+            phantom.write(own, index, anatomy_seed=1, opening=f"mesh-5f at {index // 2}, 0, 0")
+    done = run(synth, ["split", str(own), "--by", by, "--shares", "0.4,0.3,0.3", "--share-anatomy"])
+    assert done.exit_code == 0, done.output
+    assert f"warning: 1 brain is on several sides: {by}s of one brain are no strangers" in done.stderr
+    used = train(own, tmp_path / "m")
+    opening = {row["content_hash"]: row["opening"] for row in read_index(own).to_pylist()}
+    assert len(set(opening.values())) == 3
+    seen = [opening[name] for part in ("fit", "select", "test") for name in used[part]]
+    assert len(seen) == 6
+    sides = [{opening[name] for name in used[part]} for part in ("fit", "select", "test")]
+    assert (sum(map(len, sides)) == 3) == alike
+    # The model is asked about none of its own openings, in a dataset of fewer of them as well.
+    other = tmp_path / "other"
+    phantom.write(other, 7, anatomy_seed=1, opening=opening[used["fit"][0]])
+    asked = run(app, ["eval", str(tmp_path / "m"), str(other), "--json"])
+    assert (asked.exit_code == 2 and "fitted or chosen on every sequence" in asked.stderr) == alike
 
 
 def test_a_sequence_that_comes_later_has_its_side_too(own: Path) -> None:

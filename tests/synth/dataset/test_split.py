@@ -109,6 +109,47 @@ def test_a_dataset_of_one_brain_is_split_within_it_only_when_told() -> None:
     assert split.leaks(given)[0].startswith("anatomy mesh-1 is in")
 
 
+def test_openings_of_one_brain_are_kept_apart_and_said_to_be_no_strangers() -> None:
+    brain = [{**row, "anatomy": "mesh-1", "opening": f"mesh-1 at {row['index'] % 5}"} for row in rows()]
+    # Beside it procedural brains, which have no opening of their own: those stay whole.
+    found = [*brain, *({**row, "index": 60 + row["index"], "opening": None} for row in rows())]
+    rule = split.parse_rule("opening", "0.6,0.2,0.2", [])
+    given = [{**row, "split": side} for row, side in zip(found, split.assign_sides(found, rule), strict=True)]
+    on: dict[str, set[str]] = {}
+    for row in given:
+        if row["status"] == "done":
+            on.setdefault(row["opening"] or row["anatomy"], set()).add(row["split"])
+    assert len(on) == 25
+    assert all(len(sides) == 1 for sides in on.values())
+    assert {next(iter(on[f"mesh-1 at {k}"])) for k in range(5)} == set(split.SIDES)
+    # The procedural rows have the same contents as the brain's: only that is a leak here.
+    assert not [line for line in split.leaks(given, rule) if not line.startswith("content_hash")]
+    warning = split.warn_of_strangers(given, rule)
+    assert warning is not None
+    assert warning.startswith("1 brain is on several sides: openings of one brain are no strangers")
+
+
+def test_an_opening_on_two_sides_is_a_leak() -> None:
+    found = [{**row, "anatomy": "mesh-1", "opening": "mesh-1 at 0"} for row in rows(6, 3)]
+    given = [{**row, "split": "train" if row["index"] < 3 else "test"} for row in found]
+    assert split.leaks(given, split.parse_rule("opening", "0.5,0,0.5", []))[0] == (
+        "opening mesh-1 at 0 is in test, train"
+    )
+
+
+def test_strangers_need_no_warning() -> None:
+    found = [{**row, "opening": f"{row['anatomy']} at 0"} for row in rows()]
+    rule = split.parse_rule("opening", "0.6,0.2,0.2", [])
+    given = [{**row, "split": side} for row, side in zip(found, split.assign_sides(found, rule), strict=True)]
+    assert split.warn_of_strangers(given, rule) is None
+
+
+def test_too_few_openings_are_said_so() -> None:
+    found = [{**row, "anatomy": "mesh-1", "opening": f"mesh-1 at {row['index'] % 2}"} for row in rows()]
+    with pytest.raises(UserError, match=r"2 groups by opening: too few .*craniotomy\.also"):
+        split.assign_sides(found, split.parse_rule("opening", "0.7,0.15,0.15", []))
+
+
 def test_groups_are_joined_by_any_key_and_through_others() -> None:
     anatomies, hashes = "abcadef", "1234562"
     # a: 0 and 3; the hash 2: 1 and 6; all others alone.

@@ -82,7 +82,7 @@ def test_without_the_extra_it_is_one_line(root: Path, monkeypatch: pytest.Monkey
     monkeypatch.setattr(builtins, "__import__", without)
     made = CliRunner().invoke(app, ["view", str(root), "--save", str(root / "a.rrd")])
     assert made.exit_code == 2
-    assert "pip install 'sulcus[view]'" in made.output
+    assert "pip install '.[view]' in the clone" in made.output
 
 
 @pytest.mark.slow
