@@ -108,8 +108,11 @@ def _thumbnails(root: Path, done: pa.Table) -> list[dict[str, str]]:
         except UserError:
             continue  # moved away or damaged: `synth verify` is for that
         gesture, family = row["gesture"] or "-", row["family"] or "-"
-        numbers = f"{row['peak_force_mn']:.3g} mN, {row['young_kpa']:.2g} kPa"
-        caption = f"{row['index']:06d} {gesture}, {family}, {numbers}"
+        numbers = (
+            "-" if row[name] is None else f"{row[name]:.3g} {unit}"
+            for name, unit in (("peak_force_mn", "mN"), ("young_kpa", "kPa"))
+        )
+        caption = f"{row['index']:06d} {gesture}, {family}, {', '.join(numbers)}"
         found.append({"path": place.name, "jpeg": jpeg, "caption": caption})
     return found
 

@@ -15,6 +15,7 @@ import pyarrow.parquet as pq
 import pytest
 from fake_run import in_process
 from hostile import Guard, assert_told, cases
+from hypothesis import example
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
@@ -342,6 +343,7 @@ def check_index(guard: Guard, pristine: Path, cells: list[tuple[int, str, Any]],
 
 
 @cases(cells=CELLS, reader=st.sampled_from(["report", "verify"]))
+@example(cells=[(0, "young_kpa", None)], reader="report")
 def test_an_index_of_any_kind(
     guard: Guard, pristine: Path, cells: list[tuple[int, str, Any]], reader: str
 ) -> None:
