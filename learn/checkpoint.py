@@ -7,7 +7,6 @@ config.json, holds a hash of the weights and one of itself, so that neither can 
 from __future__ import annotations
 
 import hashlib
-import importlib
 import io
 import json
 import os
@@ -20,6 +19,7 @@ from typing import Annotated, Any
 
 import torch
 from pydantic import ConfigDict, Field, FiniteFloat, TypeAdapter, ValidationError
+from safetensors import torch as safetensors
 from torch import Tensor, nn
 
 from learn.data.grid import Scales
@@ -87,7 +87,7 @@ def write_model(folder: Path, card: Card, state: Mapping[str, Tensor], *, safe: 
     `safe`: as weights.safetensors, into a folder that holds no model yet.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    data = _safetensors().save({k: v.contiguous() for k, v in state.items()}) if safe else _packed(state)
+    data = safetensors.save({k: v.contiguous() for k, v in state.items()}) if safe else _packed(state)
     card = replace(card, weights_hash=_hash(data))
     if safe:
         _write(folder / _SAFE, data)
@@ -143,10 +143,9 @@ def load_tensors(file: Path) -> dict[str, Any]:
     if not file.exists():
         raise UserError(f"{file}: missing")
     foreign_file.check_file(file, _LARGEST_WEIGHTS)
-    safe = _safetensors() if file.suffix == ".safetensors" else None
     try:
-        if safe is not None:
-            return dict(safe.load_file(file))
+        if file.suffix == ".safetensors":
+            return dict(safetensors.load_file(file))
         _check_archive(file)
         tree = torch.load(file, map_location="cpu", weights_only=True)
     except Exception as error:  # archive, unpickler and tensors have no common error for damage
@@ -223,13 +222,6 @@ def _check_archive(file: Path) -> None:
         damaged = archive.testzip()
     if damaged is not None:
         raise ValueError(f"a checksum of {damaged} does not match")
-
-
-def _safetensors() -> Any:
-    try:
-        return importlib.import_module("safetensors.torch")
-    except ImportError:
-        raise UserError("weights.safetensors needs a package: pip install safetensors") from None
 
 
 def _packed(tree: Mapping[str, Any]) -> bytes:

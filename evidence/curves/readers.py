@@ -24,7 +24,7 @@ from learn.data.grid import Grid
 from learn.data.split import Split
 from learn.evaluation.evaluate import evaluate
 from learn.evaluation.statistics import interval
-from learn.inference.predict import load_predictor
+from learn.inference.predict import Predictor, load_predictor
 from learn.loss import Objective
 from learn.network.d2fnet import Architecture
 from learn.settings import Settings
@@ -44,6 +44,8 @@ NETWORKS: dict[str, Architecture] = {
     LARGE: Architecture(width=32, stem=1, levels=4, output="vector", confidence=True, dropout=0.05),
 }
 GRID = Grid(64)
+SAME = "same world"
+"""What is asked about: sequences of the dataset that was fitted on, but none of those."""
 _SOURCES = {
     1: {"ideal": "ideal", "recovered": "recovered"},
     2: {"ideal": "motion-ideal", "recovered": "motion"},
@@ -98,12 +100,11 @@ class World:
 
     def generation_cpu_s(self) -> float:
         """Median over sequences: the first of a process compiles for all of them."""
-        timings = [one.attrs["timings"].values() for one in Dataset(self.data)]
-        return float(np.median([sum(t["cpu_s"] for t in spent if isinstance(t, dict)) for spent in timings]))
+        return _generation_cpu_s(self.data)
 
     def counts(self) -> dict[str, int]:
         """Sequences asked about."""
-        return {"same world": self.asked} | {root.name: len(Dataset(root)) for root in self.unseen}
+        return {SAME: self.asked} | {root.name: len(Dataset(root)) for root in self.unseen}
 
     def rows(self, one: Reader) -> list[dict[str, Any]]:
         """What the reader errs by in every world asked about."""
@@ -111,21 +112,21 @@ class World:
         clips = _load(self.data, self.work)
         fit, rest = clips[: one.size], clips[-self.asked - self.choosing :]
         choose = rest[: min(self.choosing, max(4, one.size // 5))]
-        tests = {"same world": rest[self.choosing :]}
+        tests = {SAME: rest[self.choosing :]}
         tests |= {root.name: _load(root, self.work) for root in self.unseen}
         used = [clip.content_hash for part in (fit, choose, *tests.values()) for clip in part]
         key = kept.word(__name__, asdict(one), self.steps, used)
 
         def compute() -> list[dict[str, Any]]:
             began = time.process_time()
-            answer, model = self._fitted(one, fit, choose, key)
+            answer, predictor = self._fitted(one, fit, choose, key)
             spent = time.process_time() - began
             hours = (spent + one.size * self.generation_cpu_s()) / 3600
             return [
                 asdict(one)
                 | {"asked": name, "fit_cpu_s": round(spent, 1), "cpu_h": round(hours, 3)}
                 | _figures(answer, part, self._bare(name), one)
-                | _map_figures(model, part, one)
+                | _map_figures(predictor, part, one)
                 for name, part in tests.items()
             ]
 
@@ -134,16 +135,17 @@ class World:
 
     def _bare(self, name: str) -> list[bool]:
         """Which of the sequences asked about have no membrane."""
-        if name == "same world":
+        if name == SAME:
             return _bare(self.data)[-self.asked :]
         return next(_bare(root) for root in self.unseen if root.name == name)
 
     def _fitted(
         self, one: Reader, fit: Sequence[Clip], choose: Sequence[Clip], key: str
-    ) -> tuple[Answer, Path | None]:
+    ) -> tuple[Answer, Predictor | None]:
         if one.model in NETWORKS:
             folder = self.work / "networks" / f"{one.slug}-{key}"
-            return _network(one, fit, choose, self.steps, folder), folder
+            predictor = _network(one, fit, choose, self.steps, folder)
+            return partial(models.read_force, predictor, source=one.source("recovered")), predictor
         source = one.source(one.input)
         if one.model == BOOSTING:
             rng = np.random.default_rng(one.seed)
@@ -165,6 +167,12 @@ def _by_frame(rule: baselines.Rule, source: str, clip: Clip) -> Floats:
 def _load(root: Path, work: Path) -> list[Clip]:
     wanted = [source for sources in _SOURCES.values() for source in sources.values()]
     return load_clips(root, GRID, wanted, cache=work / "clips")
+
+
+@cache
+def _generation_cpu_s(root: Path) -> float:
+    timings = [one.attrs["timings"].values() for one in Dataset(root)]
+    return float(np.median([sum(t["cpu_s"] for t in spent if isinstance(t, dict)) for spent in timings]))
 
 
 @cache
@@ -215,21 +223,14 @@ def network_settings(one: Reader, steps: int, frames: int) -> Settings:
     )
 
 
-def _network(one: Reader, fit: Sequence[Clip], choose: Sequence[Clip], steps: int, folder: Path) -> Answer:
+def _network(one: Reader, fit: Sequence[Clip], choose: Sequence[Clip], steps: int, folder: Path) -> Predictor:
     settings = network_settings(one, steps, sum(clip.frames for clip in fit))
     clips = [*fit, *choose]
     if one.input == "noise":
         clips = noisy(clips, len(fit), one.seed)
     split = Split(tuple(range(len(fit))), tuple(range(len(fit), len(clips))), ())
     train(clips, split, settings, folder)
-    predictor, source = load_predictor(folder), one.source("recovered")
-
-    def answer(clip: Clip) -> Floats:
-        moved = np.asarray(clip.displacement[source])
-        said, _ = predictor.answer(moved, clip.mask, clip.young_kpa, clip.sure(source))
-        return np.asarray(said.sum(axis=(2, 3)) * GRID.pitch_mm**2, np.float64)
-
-    return answer
+    return load_predictor(folder)
 
 
 def noisy(clips: Sequence[Clip], fitted: int, seed: int) -> list[Clip]:
@@ -280,9 +281,9 @@ def _figures(answer: Answer, part: Sequence[Clip], bare: Sequence[bool], one: Re
     return row
 
 
-def _map_figures(model: Path | None, part: Sequence[Clip], one: Reader) -> dict[str, Any]:
+def _map_figures(predictor: Predictor | None, part: Sequence[Clip], one: Reader) -> dict[str, Any]:
     """R² of the force map over all cells, and the share of contact-free area that says a force."""
-    if model is None:
+    if predictor is None:
         return {"map_r2": None, "ghosts": None}
-    known = evaluate(load_predictor(model), part, one.source("recovered")).summary()
+    known = evaluate(predictor, part, one.source("recovered")).summary()
     return {"map_r2": round(known["map_r2_pooled"], 4), "ghosts": round(known["ghost_relative"], 5)}

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +20,9 @@ from bench.methods.baselines import GRID
 from learn.data.clips import Clip
 from learn.settings import Settings, preset
 from learn.training import batches
+
+if TYPE_CHECKING:
+    from learn.inference.predict import Predictor
 
 Floats = NDArray[np.float64]
 Answer = Callable[[Clip], Floats]
@@ -114,12 +118,11 @@ def train_network(fit: Sequence[Clip], settings: Settings, folder: Path) -> Answ
 
     select = max(2, len(fit) // 5)
     train(fit, Split(tuple(range(select, len(fit))), tuple(range(select)), ()), settings, folder)
-    predictor = load_predictor(folder)
+    return partial(read_force, load_predictor(folder), source="recovered")
 
-    def answer(clip: Clip) -> Floats:
-        said, _ = predictor.answer(
-            np.asarray(clip.displacement["recovered"]), clip.mask, clip.young_kpa, clip.sure("recovered")
-        )
-        return np.asarray(said.sum(axis=(2, 3)) * settings.grid.pitch_mm**2, np.float64)
 
-    return answer
+def read_force(predictor: Predictor, clip: Clip, source: str) -> Floats:
+    """Force (T, 3) mN that a network of vectors says of a displacement: its map, summed."""
+    moved = np.asarray(clip.displacement[source])
+    said, _ = predictor.answer(moved, clip.mask, clip.young_kpa, clip.sure(source))
+    return np.asarray(said.astype(np.float64).sum(axis=(2, 3)) * predictor.grid.pitch_mm**2)

@@ -186,12 +186,7 @@ def _network(root: Path, way: str, epochs: int) -> list[Floats]:
         predictor = load_predictor(folder / "model")
     finally:
         shutil.rmtree(folder)
-    said = []
-    for clip in (clips[i] for i in asked):
-        moved = np.asarray(clip.displacement[source])
-        density, _ = predictor.answer(moved, clip.mask, clip.young_kpa, clip.sure(source))
-        said.append(density.astype(np.float64).sum(axis=(2, 3)) * predictor.grid.pitch_mm**2)
-    return said
+    return [models.read_force(predictor, clips[i], source) for i in asked]
 
 
 def drawn(found: Mapping[str, Any]) -> result_page.Page:

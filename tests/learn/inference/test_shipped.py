@@ -38,7 +38,6 @@ def make(tmp_path: Path) -> Maker:
 
 def pack(models: Path, name: str, *changes: str) -> Path:
     """A tiny one, as if it had come along."""
-    pytest.importorskip("safetensors")
     source = fake_model.write_model(models.parent / f"trained-{name}", *changes)
     shipped.pack_model(source, models / name, "c0ffee", {"error": "12% of the peak"}, ["It is for tests."])
     return models / name
