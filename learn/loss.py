@@ -65,6 +65,9 @@ class Objective(Section):
 GHOSTLESS = Objective(kind="hinge", r2_weight=0.5, r2_scope="frame", stray_weight=8.0)
 """What took the ghosts away at no cost in R² (docs/results/learn): its weights were chosen there."""
 
+FRAMEWISE = Objective(kind="hinge", r2_weight=0.5, r2_scope="frame", stray_weight=0.0)
+"""Squared error and every frame's own R², in equal parts, and no price of ghosts: for vectors."""
+
 
 def at(objective: Objective, progress: float) -> Objective:
     """The objective at a point 0..1 of the run."""
@@ -75,7 +78,7 @@ def at(objective: Objective, progress: float) -> Objective:
 
 def full(objective: Objective, progress: float) -> bool:
     """Whether nothing of the objective is still to come at a point 0..1 of the run."""
-    return objective.kind != "hinge" or progress >= objective.ramp[1]
+    return objective.kind != "hinge" or objective.stray_weight == 0 or progress >= objective.ramp[1]
 
 
 SHARES = ("error", "r2", "ghost", "total")

@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterable
 from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import Field, model_validator
+from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
 from learn.data.clips import Input, Target, has_depth
 from learn.data.grid import Grid
@@ -52,6 +52,9 @@ class Settings(Section):
     """Quarter turns and mirrors of the grid, vectors turned with it."""
     frames: Count = 0
     """Frames a sequence gives an epoch, drawn anew each epoch; 0 takes all."""
+    epoch_frames: Count = 0
+    """Most frames that an epoch has, drawn anew each epoch, so that more sequences take no longer; 0 sets no
+    limit."""
     precision: Literal["32-true", "bf16-mixed"] = "32-true"
     channels_last: bool = False
     resident: Literal["auto", "yes", "no"] = "auto"
@@ -84,6 +87,12 @@ class Settings(Section):
             )
         return self
 
+    @model_serializer(mode="wrap")
+    def _as_before(self, plain: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Without what came later and isn't used, so that models are written as they always were."""
+        tree: dict[str, Any] = plain(self)
+        return {key: value for key, value in tree.items() if key != "epoch_frames" or value}
+
     @property
     def grid(self) -> Grid:
         return Grid(self.size, self.extent_mm)
@@ -105,7 +114,7 @@ PRESETS: dict[str, Settings] = {
         channels_last=True,
         batch=8,
     ),
-    # At most 20 minutes on one core with a few dozen sequences: tells good choices from bad.
+    # At most 20 minutes on one core, with however many sequences: tells good choices from bad.
     "cpu": Settings(
         size=128,
         # A stem of 2 errs no less and takes twice the time, in training too (docs/results/learn/pareto).
@@ -118,6 +127,7 @@ PRESETS: dict[str, Settings] = {
         channels_last=True,
         batch=8,
         frames=12,
+        epoch_frames=4000,
     ),
     # d2fnet-s: 256², 10 ms a frame on one core (12 with a fourth halving).
     "live": Settings(
@@ -139,6 +149,7 @@ PRESETS: dict[str, Settings] = {
         channels_last=True,
         batch=8,
         frames=12,
+        epoch_frames=4000,
     ),
     "eyes-live": Settings(
         size=256,

@@ -1,7 +1,7 @@
 """`bench experiment curves`: what more sequences buy, by model, displacement and number of eyes.
 
-Every reader is fitted on the first 30, 100, 300, ... sequences of one dataset and asked about sequences of it
-that none was fitted on, and about whole datasets of other worlds. A row is kept as soon as it is there: an
+Every reader is fitted on 30, 100, 300, ... sequences of one dataset and asked about sequences of it that none
+was fitted on, and about whole datasets of other worlds. A row is kept as soon as it is there: an
 interrupted run goes on.
 """
 
@@ -31,7 +31,7 @@ from synth.errors import UserError
 )
 def experiment(
     data: Annotated[
-        Path, typer.Argument(help="Dataset to fit on; its last sequences choose epochs and are asked.")
+        Path, typer.Argument(help="Dataset to fit on; its first sequences are asked and choose epochs.")
     ],
     unseen: Annotated[
         list[Path] | None, typer.Option(help="Datasets that are only asked about; may be given again.")
@@ -43,7 +43,9 @@ def experiment(
     ),
     eyes: Annotated[str, typer.Option(help="Comma-separated: 1, 2.")] = "1,2",
     seeds: Annotated[int, typer.Option(min=1, help="Networks a point.")] = 1,
-    steps: Annotated[int, typer.Option(min=1, help="Batches that a network is trained with, about.")] = 8000,
+    steps: Annotated[
+        int, typer.Option(min=1, help="Batches of 16 that a network is trained with, about.")
+    ] = 4000,
     asked: Annotated[int, typer.Option(min=4, help="Sequences of `data` asked about.")] = 150,
     choosing: Annotated[int, typer.Option(min=2, help="Sequences of `data` that choose an epoch.")] = 60,
     work: Annotated[Path, typer.Option(help="Folder for packed sequences, networks and rows.")] = Path(
@@ -93,7 +95,7 @@ def _wanted(
     sizes: Sequence[int], models: Sequence[str], inputs: Sequence[str], eyes: Sequence[int], seeds: int
 ) -> Iterator[Reader]:
     """Smallest first: what a short run leaves is a whole curve's beginning."""
-    for known, given, word in ((readers.MODELS, models, "models"), (readers.INPUTS, inputs, "inputs")):
+    for known, given, word in ((readers.KNOWN, models, "models"), (readers.INPUTS, inputs, "inputs")):
         if unknown := set(given) - set(known):
             raise UserError(f"--{word}: {', '.join(sorted(unknown))}; there are {', '.join(known)}")
     for size in sorted(sizes):

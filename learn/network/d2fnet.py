@@ -56,6 +56,9 @@ class Architecture(Section):
     window: Literal[1, 3, 5] = 1
     """Frames whose displacement it is told: the present one and those before it, never a later one. Before
     the first is the rest frame."""
+    relative: bool = False
+    """Whether it is told displacement as a share of the frame's largest, and its answer multiplied by that:
+    twice the motion is then twice the force, as in linear elasticity, and need not be learnt."""
 
     @model_validator(mode="after")
     def _stem_is_possible(self) -> Architecture:
@@ -65,13 +68,15 @@ class Architecture(Section):
             raise ValueError("detail goes with a stem of 4")
         if self.prior != "none" and self.name == "monai-unet":
             raise ValueError("monai-unet has no prior")
+        if self.relative and self.name == "monai-unet":
+            raise ValueError("monai-unet isn't told relative displacement")
         return self
 
     @model_serializer(mode="wrap")
     def _as_before(self, plain: SerializerFunctionWrapHandler) -> dict[str, Any]:
         """Without what came later and isn't used, so that models are written as they always were."""
         tree: dict[str, Any] = plain(self)
-        unused = {"depth": False, "prior": "none", "window": 1}
+        unused = {"depth": False, "prior": "none", "window": 1, "relative": False}
         return {key: value for key, value in tree.items() if key not in unused or value != unused[key]}
 
     @property
@@ -199,6 +204,8 @@ class D2FNet(nn.Module):
     With `arch.total` a pair: the map and (B, 1|3) total force in units of `Scales.force`.
     """
 
+    linear: Tensor
+
     def __init__(self, arch: Architecture) -> None:
         super().__init__()
         self.arch = arch
@@ -206,6 +213,7 @@ class D2FNet(nn.Module):
         widths = [arch.width * 2**i for i in range(arch.levels + 1)]
         first = arch.seen
         self.prior = HalfSpace() if arch.prior != "none" else None
+        self.register_buffer("linear", _linear(arch), persistent=False)
         self.stem: nn.Module = nn.Identity()
         fine = arch.width // 2 if arch.detail else 0
         self.fine: nn.Module | None = None
@@ -229,8 +237,11 @@ class D2FNet(nn.Module):
         )
         self.merge = nn.ModuleList(Block(2 * b, b, arch.dropout, full) for b in widths[-2::-1])
         residual = arch.prior == "residual"
+        low, middle, high = arch.bounds
+        more = SMALL_CONTACTS if arch.relative else 1.0
+        bounds = (low * more, middle * more, high * more)
         self.heads: nn.Module = (
-            Heads(fine or arch.width, arch.components, arch.bounds, arch.components > 1 or residual)
+            Heads(fine or arch.width, arch.components, bounds, arch.components > 1 or residual)
             if full
             else nn.Conv2d(fine or arch.width, arch.components, 1)
         )
@@ -245,6 +256,10 @@ class D2FNet(nn.Module):
     def forward(self, x: Tensor, log_young: Tensor | None = None) -> Tensor | tuple[Tensor, Tensor]:
         """`log_young`: (B, 1) ln(E / 1 kPa), used only by a `film` network."""
         mask, physical = x[:, 3:4], None
+        largest = None
+        if self.arch.relative:
+            largest = largest_motion(x, self.arch)
+            x = torch.where(self.linear > 0, x / largest, x)
         if self.prior is not None:
             physical = self.prior(told_motion(x, self.arch), mask)
             x = torch.cat([x, physical], dim=1)
@@ -272,7 +287,30 @@ class D2FNet(nn.Module):
             y = F.interpolate(y, scale_factor=times, mode="bilinear", align_corners=False)
         if physical is not None and self.stiffness is not None:
             y = _corrected(physical * self.stiffness, y)
-        return y * mask if total is None else (y * mask, total)
+        y = y * mask
+        if largest is not None:
+            y, total = y * largest, None if total is None else total * largest[:, :, 0, 0]
+        return y if total is None else (y, total)
+
+
+SMALL_CONTACTS = 4.0
+"""By how much `relative` heads reach further: a contact half as wide moves the tissue half as far."""
+LEAST_MOTION = 0.01
+"""Of the training data's 99.9th percentile, some 0.02 mm: under it what moves is noise, and stays small."""
+
+
+def largest_motion(x: Tensor, arch: Architecture) -> Tensor:
+    """The frame's largest displacement, averaged over 3 × 3 cells, (B, 1, 1, 1), in the channels' unit."""
+    size = told_motion(x, arch).square().sum(1, keepdim=True)
+    peak = F.avg_pool2d(size, 3, 1, 1).flatten(1).amax(1)
+    return (peak + LEAST_MOTION**2).sqrt()[:, None, None, None]
+
+
+def _linear(arch: Architecture) -> Tensor:
+    """(1, C, 1, 1): 1 for channels in proportion to displacement, 0 for masks and confidences."""
+    found = torch.ones(arch.inputs)
+    found[[3, *([5] if arch.confidence else []), *([7] if arch.confidence and arch.depth else [])]] = 0
+    return found[None, :, None, None]
 
 
 def told_motion(x: Tensor, arch: Architecture) -> Tensor:

@@ -87,6 +87,9 @@ class Frames:
             if 0 < self.settings.frames < clip.frames:
                 frames = rng.choice(clip.frames, self.settings.frames, replace=False)
             items += [(c, int(t)) for t in frames]
+        if 0 < self.settings.epoch_frames < len(items):
+            kept = rng.choice(len(items), self.settings.epoch_frames, replace=False)
+            items = [items[i] for i in kept]
         source = [self.sources[0]] * len(items)
         if len(self.sources) == 2:
             source = [self.sources[int(u < share_recovered)] for u in rng.random(len(items))]

@@ -143,7 +143,7 @@ def test_batches_hold_the_frames_that_the_reader_would_tell(clips: list[Clip]) -
         assert torch.equal(value, vars(two)[name]), name
 
 
-@pytest.mark.parametrize("extra", [[], ["arch.confidence=true", "arch.prior=residual"]])
+@pytest.mark.parametrize("extra", [[], ["arch.confidence=true", "arch.prior=residual", "arch.relative=true"]])
 def test_exported(tmp_path: Path, extra: list[str]) -> None:
     model = fake_model.write_model(tmp_path / "model", "arch.output=vector", "arch.window=3", *extra)
     predictor = load_predictor(model)

@@ -144,3 +144,44 @@ def test_the_quick_network_says_the_same_in_any_batch(condition: str, total: boo
         for a, b in zip(expected, got, strict=True) if total else [(expected, got)]:
             assert a.abs().max() > 0
             torch.testing.assert_close(b, a, rtol=1e-3, atol=1e-5)
+
+
+@pytest.mark.parametrize("depth", [False, True])
+@pytest.mark.parametrize("prior", ["none", "residual"])
+def test_relative_twice_the_motion_is_twice_the_force(depth: bool, prior: str) -> None:
+    arch = Architecture(
+        width=4, levels=2, stem=2, confidence=True, depth=depth, total=True, prior=prior, relative=True
+    )
+    torch.manual_seed(0)
+    net = D2FNet(arch).eval()
+    for head in net.heads.ranges:
+        torch.nn.init.normal_(head.weight, std=0.5)
+    told = torch.randn(2, arch.inputs, 32, 32)
+    flags = [3, 5, 7] if depth else [3, 5]
+    told[:, flags] = (torch.rand(2, len(flags), 32, 32) > 0.3).float()
+    twice = told * 2
+    twice[:, flags] = told[:, flags]
+    with torch.no_grad():
+        (one, force), (two, more) = net(told), net(twice)
+    assert one.abs().max() > 0.1
+    torch.testing.assert_close(two, 2 * one, rtol=1e-3, atol=1e-4)
+    torch.testing.assert_close(more, 2 * force, rtol=1e-3, atol=1e-4)
+
+
+def test_relative_noise_at_rest_stays_small() -> None:
+    """What moves less than a hundredth of the largest motion is not blown up to it."""
+    torch.manual_seed(0)
+    net = D2FNet(Architecture(width=4, levels=2, stem=2, relative=True)).eval()
+    for head in net.heads.ranges:
+        torch.nn.init.normal_(head.weight, std=0.5)
+    told = torch.randn(1, 5, 32, 32) * 1e-4
+    told[:, 3] = 1
+    with torch.no_grad():
+        assert net(told).abs().max() < 0.06  # at most the largest bound times the least motion
+
+
+def test_relative_is_not_written_by_models_that_are_not() -> None:
+    assert "relative" not in Architecture().model_dump()
+    assert Architecture.model_validate(Architecture(relative=True).model_dump()).relative
+    with pytest.raises(ValidationError, match="relative"):
+        Architecture(name="monai-unet", relative=True)

@@ -282,6 +282,17 @@ def test_frames_held_by_the_device_are_the_same_frames(
         torch.testing.assert_close(getattr(b, name), value, rtol=0, atol=0, msg=name)
 
 
+def test_an_epoch_has_so_many_frames_drawn_anew(clips: list[Clip]) -> None:
+    every = Frames(clips, small()).order(np.random.default_rng(0), 1.0)
+    some = Frames(clips, small(epoch_frames=5))
+    first, second = (some.order(np.random.default_rng(seed), 1.0) for seed in (0, 1))
+    assert len(every) > len(first) == 5
+    assert len({item[:2] for item in first}) == 5
+    assert {item[:2] for item in first} != {item[:2] for item in second}
+    assert {item[:2] for item in first} < {item[:2] for item in every}
+    assert len(Frames(clips, small(epoch_frames=10_000)).order(np.random.default_rng(0), 1.0)) == len(every)
+
+
 def test_moments_of_tensors_are_those_of_arrays() -> None:
     true, said = np.random.default_rng(0).normal(size=(2, 500)).astype(np.float32)
     got, expected = moments(torch.from_numpy(true), torch.from_numpy(said)), Moments.of(true, said)
