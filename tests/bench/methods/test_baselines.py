@@ -144,7 +144,7 @@ def test_force_across_the_view_with_another_mesh_and_noise(
 
 @pytest.mark.slow
 def test_one_contact_finds_the_force_along_the_view(known: compliance.Compliance) -> None:
-    forces, fields = inverse_experiment.contacts(known, 3, 3.0, 2500, np.random.default_rng(3))
+    forces, fields, _ = inverse_experiment.contacts(known, 3, 3.0, 2500, np.random.default_rng(3))
     rng = np.random.default_rng(4)
     for force, field in zip(forces, fields, strict=True):
         noisy = field + 0.1 * rng.normal(size=field.shape)
@@ -154,7 +154,7 @@ def test_one_contact_finds_the_force_along_the_view(known: compliance.Compliance
 
 @pytest.mark.slow
 def test_corotational_contact_undoes_what_the_tissues_turn_looks_like(known: compliance.Compliance) -> None:
-    forces, fields = inverse_experiment.contacts(
+    forces, fields, _ = inverse_experiment.contacts(
         known, 3, 3.0, 2000, np.random.default_rng(5), "corotational"
     )
     everywhere = np.ones(len(known.points))
@@ -172,7 +172,7 @@ def test_corotational_contact_undoes_what_the_tissues_turn_looks_like(known: com
 
 @pytest.mark.slow
 def test_loads_past_the_laws_range_stay_with_the_linear_answer(known: compliance.Compliance) -> None:
-    _, fields = inverse_experiment.contacts(known, 1, 3.0, 2000, np.random.default_rng(6))
+    _, fields, _ = inverse_experiment.contacts(known, 1, 3.0, 2000, np.random.default_rng(6))
     field = 3 * fields[0]
     said = corotational.one_contact(known, field, np.ones(len(known.points)))
     assert said == pytest.approx(inverse.one_contact(known, field, np.ones(len(known.points))))
