@@ -10,7 +10,7 @@ from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, mod
 
 from learn.data.clips import Input, Target, has_depth
 from learn.data.grid import Grid
-from learn.loss import GHOSTLESS, Objective
+from learn.loss import FRAMEWISE, GHOSTLESS, Objective
 from learn.network.d2fnet import Architecture
 from synth.errors import UserError
 from synth.job import reader
@@ -137,13 +137,15 @@ PRESETS: dict[str, Settings] = {
         learning_rate=1e-3,
     ),
     # Two eyes: `cpu` and `live` told motion in three dimensions. Force is then seen along the view as well,
-    # so they answer with vectors, and squared error is what serves those.
+    # so they answer with vectors, and squared error, a frame's own too, is what serves those.
     "eyes": Settings(
         size=128,
-        arch=Architecture(width=16, stem=4, levels=4, confidence=True, depth=True, dropout=0.05),
+        arch=Architecture(
+            width=16, stem=4, levels=4, confidence=True, depth=True, dropout=0.05, relative=True
+        ),
         input="motion-mixed",
         epochs=24,
-        objective=Objective(kind="mse"),
+        objective=FRAMEWISE,
         learning_rate=1e-3,
         schedule="cosine",
         channels_last=True,
@@ -153,9 +155,11 @@ PRESETS: dict[str, Settings] = {
     ),
     "eyes-live": Settings(
         size=256,
-        arch=Architecture(width=16, stem=4, levels=3, confidence=True, depth=True, dropout=0.05),
+        arch=Architecture(
+            width=16, stem=4, levels=3, confidence=True, depth=True, dropout=0.05, relative=True
+        ),
         input="motion-mixed",
-        objective=Objective(kind="mse"),
+        objective=FRAMEWISE,
         learning_rate=1e-3,
     ),
     # The network, loss weights and schedule of Heraoui et al., on our targets.

@@ -25,7 +25,8 @@ def drawn(found: Mapping[str, Any]) -> result_page.Page:
             "Root mean square error of the force as a part of the force's own, mean over sequences with its "
             "95% interval: of the whole vector, of its parts across and along the line of sight, and of its "
             "size alone, which is all that boosting says. Everything is asked with recovered displacement, "
-            "whatever it was fitted on. *Bare*: the sequences without a membrane, whose force the surface "
+            "whatever it was fitted on. *Gain*: of said on true force, by size; *slope*: of true on said, 1 "
+            "where a gain under 1 is but the caution of who isn't sure. *Bare*: the sequences without a membrane, whose force the surface "
             "does show.",
             f"Generation takes {found['generation_cpu_s']:.1f} CPU-s a sequence; *CPU-h* is of generation "
             "and fitting together.",
@@ -78,5 +79,6 @@ def _told(row: Mapping[str, Any]) -> dict[str, Any]:
         "map R²": row["map_r2"],
         "ghosts": row["ghosts"],
         "gain": row["gain"],
+        "slope": row["slope"],
         "CPU-h": row["cpu_h"],
     }

@@ -319,7 +319,11 @@ def _figures(answer: Answer, part: Sequence[Clip], bare: Sequence[bool], one: Re
             f"{name}_high": mean and round(mean.high, 4),
         }
     all_said, all_true = np.concatenate(sizes), np.concatenate(own)
-    row["gain"] = round(float(all_said @ all_true / (all_true @ all_true)), 3)
+    # Whoever answers with the mean of what is possible says less than there is (a gain under 1), and what
+    # there is, is on average what he says (a slope of 1): a gain is a fault only where the slope isn't 1.
+    both = float(all_said @ all_true)
+    row["gain"] = round(both / float(all_true @ all_true), 3)
+    row["slope"] = round(both / max(float(all_said @ all_said), 1e-30), 3)
     return row
 
 

@@ -68,6 +68,7 @@ def test_what_is_fitted_on_true_motion_is_asked_with_recovered(world: World) -> 
     """Recovered motion is half of the true one: the answer is half of the force."""
     found = world.rows(Reader("ridge", "ideal", 2, 6, 0))[0]
     assert found["gain"] == pytest.approx(0.5, abs=0.02)
+    assert found["slope"] == pytest.approx(2, abs=0.08)
     assert found["whole"] == pytest.approx(0.5, abs=0.02)
 
 
@@ -145,7 +146,7 @@ def test_every_row_is_on_the_page() -> None:
     said = {f"{name}{end}": 0.3 for name in names for end in ("", "_low", "_high")}
     rows = [
         {"model": "ridge", "input": "recovered", "eyes": eye, "size": size, "seed": 0, "asked": asked}
-        | {"map_r2": None, "ghosts": None, "gain": 1.0, "cpu_h": 0.1, "fit_cpu_s": 1.0}
+        | {"map_r2": None, "ghosts": None, "gain": 1.0, "slope": 1.0, "cpu_h": 0.1, "fit_cpu_s": 1.0}
         | said
         for asked in ("same world", "mission-unseen")
         for eye in (1, 2)
