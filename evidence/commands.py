@@ -52,6 +52,7 @@ COMMANDS = {
     "experiment full-size": "evidence.learn.full_size:full_size",
     "experiment foreign": "evidence.foreign.recordings:foreign",
     "experiment curves": "evidence.curves.experiment:experiment",
+    "experiment shipped": "evidence.learn.shipped:experiment",
     "pareto learn": "evidence.learn.pareto:pareto",
     "experiment tune": "evidence.tune.experiment:experiment",
     "pareto end-to-end": "evidence.end_to_end.pareto:pareto",

@@ -59,11 +59,6 @@ def _panel(rows: Sequence[Mapping[str, Any]], title: str, asked: str, eye: int) 
 def _told(row: Mapping[str, Any]) -> dict[str, Any]:
     """A row of the table."""
 
-    def percent(key: str) -> str | None:
-        if row[key] is None:
-            return None
-        return f"{100 * row[key]:.0f}% [{100 * row[f'{key}_low']:.0f}, {100 * row[f'{key}_high']:.0f}]"
-
     return {
         "asked": row["asked"],
         "eyes": row["eyes"],
@@ -71,14 +66,23 @@ def _told(row: Mapping[str, Any]) -> dict[str, Any]:
         "fitted on": row["input"],
         "sequences": row["size"],
         "seed": row["seed"],
-        "whole": percent("whole"),
-        "across": percent("across"),
-        "along": percent("along"),
-        "size": percent("force_size"),
-        "bare": percent("bare"),
+        "whole": percent(row, "whole"),
+        "across": percent(row, "across"),
+        "along": percent(row, "along"),
+        "size": percent(row, "force_size"),
+        "bare": percent(row, "bare"),
         "map R²": row["map_r2"],
         "ghosts": row["ghosts"],
         "gain": row["gain"],
         "slope": row["slope"],
         "CPU-h": row["cpu_h"],
     }
+
+
+def percent(row: Mapping[str, Any], key: str) -> str | None:
+    """A share with its interval, as a cell of a table."""
+    if row[key] is None:
+        return None
+    if row[f"{key}_low"] is None:  # all alike, or too few to tell
+        return f"{100 * row[key]:.0f}%"
+    return f"{100 * row[key]:.0f}% [{100 * row[f'{key}_low']:.0f}, {100 * row[f'{key}_high']:.0f}]"

@@ -143,8 +143,12 @@ class World:
             return [
                 asdict(one)
                 | {"asked": name, "fit_cpu_s": round(spent, 1), "cpu_h": round(hours, 3)}
-                | _figures(answer, part, self._bare(name), one)
-                | _map_figures(predictor, part, one)
+                | figures(answer, part, self._bare(name), size_only=one.model == BOOSTING)
+                | (
+                    {"map_r2": None, "ghosts": None}
+                    if predictor is None
+                    else map_figures(predictor, part, one.source("recovered"))
+                )
                 for name, part in tests.items()
             ]
 
@@ -291,10 +295,17 @@ def noisy(clips: Sequence[Clip], fitted: int, seed: int) -> list[Clip]:
     return [spoilt(k, clip) for k, clip in enumerate(clips)]
 
 
-def _figures(answer: Answer, part: Sequence[Clip], bare: Sequence[bool], one: Reader) -> dict[str, Any]:
-    """Errors of the force as parts of it, means over sequences with their intervals, and the gain."""
+def figures(answer: Answer, part: Sequence[Clip], bare: Sequence[bool], *, size_only: bool) -> dict[str, Any]:
+    """Errors of the force as parts of it, means over sequences with their intervals, and the gain.
+
+    Args:
+        answer: who is asked.
+        part: what about.
+        bare: which of them have no membrane.
+        size_only: whether only the first component of an answer is one, and means the force's size.
+    """
     said, true = [answer(clip) for clip in part], [clip.force for clip in part]
-    sizes = [np.nan_to_num(s[:, 0]) if one.model == BOOSTING else np.linalg.norm(s, axis=1) for s in said]
+    sizes = [np.nan_to_num(s[:, 0]) if size_only else np.linalg.norm(s, axis=1) for s in said]
     own = [np.linalg.norm(force, axis=1) for force in true]
     found: dict[str, Sequence[float] | None] = {
         "force_size": [
@@ -306,7 +317,7 @@ def _figures(answer: Answer, part: Sequence[Clip], bare: Sequence[bool], one: Re
         "along": None,
         "bare": None,
     }
-    if one.model != BOOSTING:
+    if not size_only:
         off = errors(said, true)
         found |= {"whole": off["errors"], "across": off["across"], "along": off["along"]}
         found["bare"] = [e for e, alone in zip(off["errors"], bare, strict=True) if alone] or None
@@ -327,9 +338,7 @@ def _figures(answer: Answer, part: Sequence[Clip], bare: Sequence[bool], one: Re
     return row
 
 
-def _map_figures(predictor: Predictor | None, part: Sequence[Clip], one: Reader) -> dict[str, Any]:
+def map_figures(predictor: Predictor, part: Sequence[Clip], source: str) -> dict[str, Any]:
     """R² of the force map over all cells, and the share of contact-free area that says a force."""
-    if predictor is None:
-        return {"map_r2": None, "ghosts": None}
-    known = evaluate(predictor, part, one.source("recovered")).summary()
+    known = evaluate(predictor, part, source).summary()
     return {"map_r2": round(known["map_r2_pooled"], 4), "ghosts": round(known["ghost_relative"], 5)}
