@@ -50,6 +50,10 @@ class Settings(Section):
     """Largest norm of the gradient."""
     augment: bool = True
     """Quarter turns and mirrors of the grid, vectors turned with it."""
+    sway_mm: NonNegative = 0.0
+    """Standard deviation of a motion of the whole surface that half of the frames get on top, drawn anew:
+    along the view (with `arch.depth`), a third of it across. It is even, tilted and bulged, as breath,
+    heartbeat and a table that was pushed make it, and carries no force."""
     frames: Count = 0
     """Frames a sequence gives an epoch, drawn anew each epoch; 0 takes all."""
     epoch_frames: Count = 0
@@ -91,7 +95,7 @@ class Settings(Section):
     def _as_before(self, plain: SerializerFunctionWrapHandler) -> dict[str, Any]:
         """Without what came later and isn't used, so that models are written as they always were."""
         tree: dict[str, Any] = plain(self)
-        return {key: value for key, value in tree.items() if key != "epoch_frames" or value}
+        return {key: value for key, value in tree.items() if key not in ("epoch_frames", "sway_mm") or value}
 
     @property
     def grid(self) -> Grid:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -35,6 +35,24 @@ class Batch:
 
     def to(self, device: torch.device) -> Batch:
         return Batch(**{k: v.to(device, non_blocking=True) for k, v in vars(self).items()})
+
+
+def swayed(batch: Batch, settings: Settings, generator: torch.Generator) -> Batch:
+    """The batch with a motion of the whole surface on top of half of its frames, as `Settings.sway_mm` says.
+
+    `generator`: on the CPU, so that every device draws the same.
+    """
+    moved, parts = batch.displacement, settings.arch.displacements
+    count, planes, size = moved.shape[0], moved.shape[1], moved.shape[-1]
+    axis = torch.linspace(-1, 1, size)
+    x, y = axis.expand(size, size), axis[:, None].expand(size, size)
+    shapes = torch.stack([torch.ones_like(x), x, y, 1 - x**2 - y**2])
+    amount = torch.randn(count, planes, len(shapes), generator=generator)
+    along = torch.arange(planes) % parts == 2
+    amount *= settings.sway_mm * torch.where(along, 1.0, 1 / 3)[:, None] / len(shapes) ** 0.5
+    amount *= (torch.rand(count, generator=generator) < 0.5)[:, None, None]
+    whole = torch.einsum("bps,syx->bpyx", amount, shapes).to(moved)
+    return replace(batch, displacement=moved + whole * batch.mask)
 
 
 def inputs(batch: Batch, settings: Settings, scales: Scales) -> Tensor:

@@ -26,7 +26,7 @@ from learn.loss import SHARES, at, full, gradient_shares, loss
 from learn.network.d2fnet import D2FNet
 from learn.network.monai_unet import build
 from learn.settings import Settings, replace
-from learn.training.batches import Batch, Frames, inputs, measure_scales
+from learn.training.batches import Batch, Frames, inputs, measure_scales, swayed
 from learn.training.gpu_batches import held
 from learn.training.log import Log
 from learn.training.threads import make_fabric
@@ -192,6 +192,10 @@ def _epoch(
     for i in range(batches):
         batch = frames.batch(order[i * whole : (i + 1) * whole][fabric.global_rank :: fabric.world_size])
         batch = batch.to(fabric.device)
+        if settings.sway_mm > 0:
+            draws = np.random.SeedSequence([settings.seed, epoch, i, fabric.global_rank])
+            rng = torch.Generator().manual_seed(int(draws.generate_state(1)[0]))
+            batch = swayed(batch, settings, rng)
         said, total = forward(net, batch, settings, scales)
         terms = loss(
             said,

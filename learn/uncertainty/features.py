@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 
 MOTION = ("log motion", "divergence", "uniform share", "spread", "confidence", "tissue share")
-DEPTH = ("log depth motion", "confidence of depth")
+DEPTH = ("log depth motion", "confidence of depth", "uniform share of depth")
 """What a second eye adds."""
 ANSWER = ("log size", "log area")
 """Of the answer; the scale of an error is predicted from these too."""
@@ -64,7 +64,12 @@ def motion_features(
     ]
     if displacement.shape[1] == 3:
         depth = np.sqrt(np.square(u[..., 2]).mean(1))
-        columns += [np.log((depth + FLOOR_MM) / (motion + FLOOR_MM)), sure[:, 1]]
+        columns += [
+            np.log((depth + FLOOR_MM) / (motion + FLOOR_MM)),
+            sure[:, 1],
+            # A breath lifts everything, a tool only what is near.
+            np.abs(u[..., 2].mean(1)) / (depth + FLOOR_MM),
+        ]
     return np.stack(columns, axis=1)
 
 

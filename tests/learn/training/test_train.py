@@ -20,7 +20,7 @@ from learn.evaluation.metrics import Moments
 from learn.inference.predict import load_predictor
 from learn.loss import SHARES, Objective
 from learn.settings import Settings, preset, replace
-from learn.training.batches import Frames
+from learn.training.batches import Frames, swayed
 from learn.training.gpu_batches import Resident, held
 from learn.training.train import moments, train
 from synth.dataset.store import Dataset
@@ -291,6 +291,28 @@ def test_an_epoch_has_so_many_frames_drawn_anew(clips: list[Clip]) -> None:
     assert {item[:2] for item in first} != {item[:2] for item in second}
     assert {item[:2] for item in first} < {item[:2] for item in every}
     assert len(Frames(clips, small(epoch_frames=10_000)).order(np.random.default_rng(0), 1.0)) == len(every)
+
+
+@pytest.mark.parametrize("window", [1, 3])
+def test_sway_moves_the_whole_surface_of_half_of_the_frames_and_leaves_the_force(
+    clips: list[Clip], window: int
+) -> None:
+    settings = small(sway_mm=0.5)
+    settings = replace(settings, arch=replace(settings.arch, window=window))
+    frames = Frames(clips, settings)
+    items = [(c, t, "ideal", 0) for c in range(len(clips)) for t in range(clips[c].frames)]
+    still = frames.batch(items)
+    moved = swayed(still, settings, torch.Generator().manual_seed(0))
+    added = (moved.displacement - still.displacement).abs()
+    assert (added * (1 - still.mask)).max() == 0
+    touched = added.amax((1, 2, 3)) > 0
+    assert 0.2 < touched.float().mean() < 0.8
+    size = float((added[touched] ** 2).sum() / (still.mask.expand_as(added)[touched]).sum()) ** 0.5
+    assert 0.05 < size < 0.5  # a third of 0.5 mm across the view
+    for name in ("mask", "confidence", "target", "force"):
+        assert torch.equal(getattr(moved, name), getattr(still, name))
+    again = swayed(still, settings, torch.Generator().manual_seed(0))
+    assert torch.equal(again.displacement, moved.displacement)
 
 
 def test_moments_of_tensors_are_those_of_arrays() -> None:

@@ -64,9 +64,11 @@ def test_a_stretch_has_the_divergence_it_has(n: int) -> None:
 def test_a_second_eye_adds_depth() -> None:
     shift = np.concatenate([field(32, "moved"), np.full((1, 1, 32, 32), -0.5, np.float32)], axis=1)
     sure = np.ones((1, 2, 32, 32), np.float32) * np.array([1, 0.5], np.float32)[:, None, None]
-    found = motion_features(shift, np.ones((32, 32), np.float32), sure, EXTENT_MM)[0]
-    assert dict(zip(motion_names(True), found, strict=True))["log depth motion"] == pytest.approx(0, abs=1e-6)
-    assert found[-1] == 0.5
+    seen = motion_features(shift, np.ones((32, 32), np.float32), sure, EXTENT_MM)[0]
+    found = dict(zip(motion_names(True), seen, strict=True))
+    assert found["log depth motion"] == pytest.approx(0, abs=1e-6)
+    assert found["confidence of depth"] == 0.5
+    assert found["uniform share of depth"] == pytest.approx(1, abs=0.02)
 
 
 def test_stillness_is_no_motion_and_no_number_is_lost() -> None:
