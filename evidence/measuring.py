@@ -10,7 +10,7 @@ import inspect
 import json
 import shlex
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import EllipsisType
@@ -106,7 +106,7 @@ def _with_shared_options(function: Callable[..., Any], words: str) -> Callable[.
         if found is None:
             return
         if declared.file is not None:
-            found = {"command": _typed(ctx, words), "machine": machine.describe()} | found
+            found = shortened({"command": _typed(ctx, words), "machine": machine.describe()} | found)
         folder = values.get("out")
         if folder is not None:
             if declared.file is not None:
@@ -129,6 +129,15 @@ def _with_shared_options(function: Callable[..., Any], words: str) -> Callable[.
     command.__annotations__ = {one.name: one.annotation for one in (context, *keyword)}
     command.__doc__ = function.__doc__
     return command
+
+
+def shortened(value: Any) -> Any:
+    """A tree with its floats to six digits: what is behind them is noise, and takes half of a file."""
+    if isinstance(value, Mapping):
+        return {key: shortened(part) for key, part in value.items()}
+    if isinstance(value, list | tuple):
+        return [shortened(part) for part in value]
+    return float(f"{value:.6g}") if isinstance(value, float) else value
 
 
 def _named(file: str, values: dict[str, Any]) -> str:

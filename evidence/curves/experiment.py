@@ -76,8 +76,18 @@ def experiment(
     return {
         "generation_cpu_s": world.generation_cpu_s(),
         "asked": world.counts(),
-        "rows": [row for one in wanted for row in rows[one]],
+        "rows": [with_intervals(row) for one in wanted for row in rows[one]],
     }
+
+
+def with_intervals(row: dict[str, Any]) -> dict[str, Any]:
+    """A row with every error and the ends of its interval as one list of three."""
+    ends = {f"{name}_{end}" for name in row for end in ("low", "high")}
+    packed = {name: value for name, value in row.items() if name not in ends}
+    for name in row.keys() - ends:
+        if f"{name}_low" in row and row[name] is not None:
+            packed[name] = [row[name], row[f"{name}_low"], row[f"{name}_high"]]
+    return packed
 
 
 def _words(said: str) -> list[str]:

@@ -46,7 +46,7 @@ def _panel(rows: Sequence[Mapping[str, Any]], title: str, asked: str, eye: int) 
         line: dict[int, list[float]] = {}
         for row in mine:
             if (row["model"], row["input"]) == (model, given):
-                line.setdefault(row["size"], []).append(row["whole"])
+                line.setdefault(row["size"], []).append(row["whole"][0])
         x = tuple(sorted(line))
         curves.append(
             charts.Curve(
@@ -83,6 +83,7 @@ def percent(row: Mapping[str, Any], key: str) -> str | None:
     """A share with its interval, as a cell of a table."""
     if row[key] is None:
         return None
-    if row[f"{key}_low"] is None:  # all alike, or too few to tell
-        return f"{100 * row[key]:.0f}%"
-    return f"{100 * row[key]:.0f}% [{100 * row[f'{key}_low']:.0f}, {100 * row[f'{key}_high']:.0f}]"
+    mean, low, high = row[key]
+    if low is None:  # all alike, or too few to tell
+        return f"{100 * mean:.0f}%"
+    return f"{100 * mean:.0f}% [{100 * low:.0f}, {100 * high:.0f}]"

@@ -1,6 +1,7 @@
 """The runs of an experiment as two tables: a line a run (`runs.json`), one a sequence (`sequences.parquet`).
 
-What runs have in common of their settings stands once. A run's numbers have six digits, a sequence's seven.
+What runs have in common of their settings stands once. A run's numbers have six digits, a
+sequence's scores four, the moments of its map seven, for they are subtracted from one another.
 `pandas.read_parquet` shows the second to whoever wants to check.
 """
 
@@ -18,6 +19,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from bench.output.write import keep
+from evidence.measuring import shortened
 
 SCORES = (
     "map_r2",
@@ -36,7 +38,7 @@ MOMENTS = ("n", "t", "p", "tt", "pp", "tp")
 """Of force density true (t) and said (p) over the map's cells: count, sums, sums of products."""
 _OF_YOUNG = ("map_r2_pooled", "force_r2_pooled", "force_mae")
 _LEFT_OUT = ("sequences", "intervals", "scales", "definitions")
-_DIGITS = 6
+_BITS = 13
 _TYPES = ((("run", "sequence"), pa.string()), (SCORES + MOMENTS, pa.float32()))
 _SCHEMA = pa.schema([(name, kind) for names, kind in _TYPES for name in names])
 
@@ -54,11 +56,13 @@ def write(folder: Path, runs: Sequence[Mapping[str, Any]]) -> None:
         line["history"] = [run["history"][0], run["history"][-1]]
         line["columns"] = {known: run["columns"][known]}
         line["columns"] |= {young: {k: run["columns"][young][k] for k in _OF_YOUNG} for young in others}
-        lines.append(json.dumps(_short(line)))
+        lines.append(json.dumps(shortened(line)))
     text = f'{{"settings": {json.dumps(common)}, "runs": [\n' + ",\n".join(lines) + "\n]}\n"
     keep(folder, "runs.json", text)
     rows = [
-        {"run": run["name"], "sequence": s["name"]} | s | dict(zip(MOMENTS, s["map_moments"], strict=False))
+        {"run": run["name"], "sequence": s["name"]}
+        | {name: _four_digits(s[name]) for name in SCORES if s.get(name) is not None}
+        | dict(zip(MOMENTS, s["map_moments"], strict=False))
         for run in runs
         for s in run["sequences"]
     ]
@@ -93,9 +97,7 @@ def column(runs: Iterable[Mapping[str, Any]], key: str) -> NDArray[np.float64]:
     return np.array([s.get(key, math.nan) for run in runs for s in run["sequences"]], np.float64)
 
 
-def _short(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {key: _short(part) for key, part in value.items()}
-    if isinstance(value, list | tuple):
-        return [_short(part) for part in value]
-    return float(f"{value:.{_DIGITS}g}") if isinstance(value, float) else value
+def _four_digits(value: float) -> float:
+    """The nearest number with 13 bits after its first: those that follow can't be packed, and say nothing."""
+    part, power = math.frexp(value)
+    return math.ldexp(round(part * 2**_BITS), power - _BITS) if math.isfinite(value) else value

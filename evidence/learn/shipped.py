@@ -14,6 +14,7 @@ from typing import Annotated, Any
 import typer
 
 from bench.output import result_page
+from evidence.curves.experiment import with_intervals
 from evidence.curves.page import percent
 from evidence.curves.readers import figures, map_figures
 from evidence.end_to_end import models
@@ -99,7 +100,7 @@ def _row(predictor: Predictor, root: Path, cache: Path | None) -> dict[str, Any]
     for part in ("size", "x", "y", "z", "contact"):
         row |= {f"held_{part}": held[part]["mean"]}
         row |= {f"held_{part}_{end}": held[part][end] for end in ("low", "high")}
-    return row | {key: held[key] for key in _WIDTHS}
+    return with_intervals(row) | {key: held[key] for key in _WIDTHS}
 
 
 def _told(own: Sequence[Mapping[str, Any]]) -> dict[str, str]:

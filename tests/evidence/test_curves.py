@@ -143,7 +143,13 @@ def test_which_points_are_computed() -> None:
 
 def test_every_row_is_on_the_page() -> None:
     names = ("whole", "across", "along", "force_size", "bare")
-    said = {f"{name}{end}": 0.3 for name in names for end in ("", "_low", "_high")}
+    ends = {"": 0.3, "_low": 0.2, "_high": 0.4}
+    said = experiment.with_intervals({name + end: ends[end] for name in names for end in ends})
+    assert said == {name: [0.3, 0.2, 0.4] for name in names}
+    assert experiment.with_intervals({"whole": None, "whole_low": None, "gain": 1}) == {
+        "whole": None,
+        "gain": 1,
+    }
     rows = [
         {"model": "ridge", "input": "recovered", "eyes": eye, "size": size, "seed": 0, "asked": asked}
         | {"map_r2": None, "ghosts": None, "gain": 1.0, "slope": 1.0, "cpu_h": 0.1, "fit_cpu_s": 1.0}
