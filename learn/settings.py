@@ -142,6 +142,7 @@ PRESETS: dict[str, Settings] = {
     ),
     # Two eyes: `cpu` and `live` told motion in three dimensions. Force is then seen along the view as well,
     # so they answer with vectors, and squared error, a frame's own too, is what serves those.
+    # What lifts the whole surface they see as well: without sway a breath was read as a press.
     "eyes": Settings(
         size=128,
         arch=Architecture(
@@ -150,6 +151,7 @@ PRESETS: dict[str, Settings] = {
         input="motion-mixed",
         epochs=24,
         objective=FRAMEWISE,
+        sway_mm=0.5,
         learning_rate=1e-3,
         schedule="cosine",
         channels_last=True,
@@ -164,6 +166,7 @@ PRESETS: dict[str, Settings] = {
         ),
         input="motion-mixed",
         objective=FRAMEWISE,
+        sway_mm=0.5,
         learning_rate=1e-3,
     ),
     # The network, loss weights and schedule of Heraoui et al., on our targets.

@@ -94,12 +94,13 @@ def describe(card: Card) -> str:
 
 
 def _readme(name: str, card: Card, commit: str, metrics: Mapping[str, str], limits: Sequence[str]) -> str:
+    line = describe(card)
     rows = {"data (hash of its sequences)": hash_data(card), "commit": commit, **metrics}
     return "\n".join(
         [
             f"# {name}",
             "",
-            f"{describe(card).capitalize()}.",
+            f"{line[:1].upper()}{line[1:]}.",
             "",
             "| what | |",
             "| --- | --- |",

@@ -53,6 +53,12 @@ def test_every_world_is_asked_with_what_was_never_met(
     assert [len(section.rows) for section in page.sections] == [2, 2]
 
 
-def test_a_name_that_does_not_come_along(worlds: tuple[Path, Path]) -> None:
-    with pytest.raises(UserError, match="NAME one of mono, stereo"):
-        experiment.experiment(worlds[0], ["trio=model"], None, None, False)
+def test_only_mono_and_stereo_come_along(
+    model: Path, worlds: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(shipped, "MODELS", tmp_path / "models")
+    found = experiment.experiment(worlds[0], [f"another={model}"], None, None, True)
+    assert [row["model"] for row in found["rows"]] == ["another"]
+    assert shipped.shipped() == {}
+    with pytest.raises(UserError, match="--model mono: NAME=FOLDER"):
+        experiment.experiment(worlds[0], ["mono"], None, None, False)
