@@ -127,7 +127,9 @@ def test_bars_are_drawn_in_a_notebook_that_can(monkeypatch: pytest.MonkeyPatch) 
     assert not progress.Bars().disable
 
 
-def test_a_model_reads_a_film_and_the_bench_scores_it(out: Path, tmp_path: Path) -> None:
+def test_a_model_reads_a_film_and_the_bench_scores_it(
+    out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     folder = write_model(tmp_path / "model", "arch.output=vector")
     model = learn.load_model(str(folder))
     sequence = Dataset(out)[0]
@@ -148,6 +150,8 @@ def test_a_model_reads_a_film_and_the_bench_scores_it(out: Path, tmp_path: Path)
     assert {"D2FNet", "none"} <= set(result.methods)
     assert result.methods["none"].scores["mae_mn"] == pytest.approx(np.abs(result.sensor_mn).mean(), rel=0.2)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["model", "recording"], "nothing is written"
+    assert bench.score(recording, settings=every, baselines=False).main == "D2FNet", "one that comes along"
+    monkeypatch.setattr("learn.inference.shipped.MODELS", tmp_path / "none")
     with pytest.raises(synth.UserError, match="nothing to score"):
         bench.score(recording)
     with pytest.raises(synth.UserError, match="needs the model's folder"):
