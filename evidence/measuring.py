@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import inspect
 import json
+import re
 import shlex
 import sys
 from collections.abc import Callable, Mapping
@@ -170,14 +171,15 @@ def _in_checkout(ctx: typer.Context, name: str, value: Any) -> Any:
 
 
 def _typed(ctx: typer.Context, words: str) -> str:
-    """The command with every setting, folders left out: a path's name, `--out` and `--json` not at all."""
+    """The command with every setting, folders left out: a path's name, also behind `NAME=`; `--out` and
+    `--json` not at all."""
     typed = ["bench", *words.split()]
     for one in ctx.command.params:
         value = ctx.params.get(str(one.name))
         if one.name in ("out", "json", "help") or value is None or value is False:
             continue
         for part in value if isinstance(value, (list, tuple)) else [value]:
-            said = part.name if isinstance(part, Path) else str(part)
+            said = part.name if isinstance(part, Path) else _FOLDERS.sub(r"\1", str(part))
             if one.param_type_name == "argument":
                 typed.append(said)
             elif part is True:
@@ -185,6 +187,10 @@ def _typed(ctx: typer.Context, words: str) -> str:
             else:
                 typed += [f"{one.opts[0]}={said}"] if said.startswith("-") else [one.opts[0], said]
     return shlex.join(typed)
+
+
+_FOLDERS = re.compile(r"(^[^/=]+=)/?(?:[^/]+/)+")
+"""Of `NAME=PATH`: the name, and whatever stands before the path's last part."""
 
 
 def _say(found: Any, text: str | Callable[[Any], str], folder: Path | None, as_json: bool) -> None:

@@ -11,9 +11,10 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
 import typer
 
-from bench.output import result_page
+from bench.output import charts, result_page
 from evidence.curves.experiment import with_intervals
 from evidence.curves.page import percent
 from evidence.curves.readers import figures, map_figures
@@ -147,7 +148,7 @@ def drawn(found: Mapping[str, Any]) -> result_page.Page:
     return result_page.Page(
         "The networks that come along",
         found,
-        (),
+        [_chart(found["rows"], *which) for which in _CHARTS],
         [
             result_page.Section("Errors", tables, (_ERRORS_ARE,)),
             result_page.Section("What 90% intervals hold", held, (_HELD_IS,)),
@@ -157,6 +158,16 @@ def drawn(found: Mapping[str, Any]) -> result_page.Page:
     )
 
 
+def _chart(rows: Sequence[Mapping[str, Any]], title: str, key: str) -> charts.Chart:
+    lines = []
+    for row in rows:
+        if row[key] is not None:
+            mean, low, high = (np.nan if value is None else value for value in row[key])
+            lines.append(charts.Row(f"{row['model']}: {row['asked']}", mean, (low, high)))
+    return charts.Chart(title, "part of the force" if key == "force_size" else "share", tuple(lines))
+
+
+_CHARTS = (("Error of the force's size", "force_size"), ("Frames that a 90% interval holds", "held_size"))
 _WIDTHS = ("width_mn", "width_of_peak", "width_x_mn", "width_y_mn", "width_z_mn", "unseen", "distance")
 _ERRORS = {"whole": "whole", "across": "across", "along": "along", "size": "force_size", "bare": "bare"}
 _ERRORS_ARE = (

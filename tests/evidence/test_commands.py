@@ -60,15 +60,19 @@ def test_data_are_kept_with_command_and_machine_and_said(tmp_path: Path) -> None
         upto: Annotated[list[int] | None, typer.Option()] = None,
         low: Annotated[int, typer.Option()] = 0,
         fast: Annotated[bool, typer.Option("--fast")] = False,
+        model: Annotated[str, typer.Option()] = "",
     ) -> dict[str, Any]:
         """Counts."""
         return {"sum": low + sum(upto or ())}
 
     words = [str(tmp_path / "some where.csv"), "--upto", "3", "--upto", "4", "--low=-1", "--fast"]
+    words += ["--model", "small one=/some/where/small"]
     said = CliRunner().invoke(_app(count), [*words, "--out", str(tmp_path / "kept")])
     assert (said.exit_code, said.output) == (0, "sum 6\n")
     kept = json.loads((tmp_path / "kept/count-some where.json").read_text())
-    assert kept["command"] == "bench experiment count 'some where.csv' --upto 3 --upto 4 --low=-1 --fast"
+    assert kept["command"] == (
+        "bench experiment count 'some where.csv' --upto 3 --upto 4 --low=-1 --fast --model 'small one=small'"
+    )
     assert set(kept) == {"command", "machine", "sum"}
     assert (tmp_path / "kept/page.txt").read_text() == "6"
     loud = CliRunner().invoke(_app(count), [*words, "--json", "--upto", "9"])

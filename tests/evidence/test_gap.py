@@ -14,6 +14,7 @@ import pytest
 
 from evidence import kept
 from evidence.gap import experiment, gap, runs
+from evidence.measuring import shortened
 from learn.data.clips import Clip
 from learn.data.split import nested
 from learn.loss import Objective
@@ -71,7 +72,7 @@ def test_results_are_those_of_the_runs_beside_them() -> None:
         run = found.setdefault(training, {"noise": tree["flows"][row["flow"]]["noise"], "errors": {}})
         for key in runs.KEYS:
             run["errors"].setdefault(row["test"], {}).setdefault(key, []).append(row[key])
-    again = json.loads(json.dumps(experiment._plain(experiment.compared(found))))
+    again = shortened(json.loads(json.dumps(experiment._plain(experiment.compared(found)))))
     assert {name: tree[name] for name in again} == again
 
 
