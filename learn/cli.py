@@ -4,7 +4,7 @@ numbers, forces and a file."""
 from __future__ import annotations
 
 import json as json_
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from learn.evaluation.metrics import Metric
     from learn.evaluation.statistics import Paired
     from learn.settings import Settings
+    from synth.dataset.split import Rule
 
 app = typer.Typer(
     cls=Commands,
@@ -56,6 +57,9 @@ def train_command(
         typer.Argument(help="Any setting, as in a model's config.json: arch.confidence=true batch=16."),
     ] = None,
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the model.")] = Path("model"),
+    also: Annotated[
+        list[Path] | None, typer.Option(help="A dataset to train on with the first; may be given again.")
+    ] = None,
     preset: Annotated[
         str, typer.Option(help="tiny, cpu, live or paper; of two eyes eyes or eyes-live.")
     ] = "cpu",
@@ -116,7 +120,8 @@ def train_command(
     given = [f"{k}={v}" for k, v in options.items() if v is not None]
     settings = override(named(preset), [*given, *(changes or [])])
     with made_folder(out, room_needed(out, settings.arch)):
-        clips, split, settings = _divided(dataset, settings, named(preset), cache, fixed=folds is not None)
+        datasets, fixed = [dataset, *(also or [])], folds is not None
+        clips, split, settings = _divided(datasets, settings, named(preset), cache, fixed=fixed)
         card, first = _train(clips, split, settings, out, accelerator, devices, quiet=json)
     if first:
         _tell_trained(_bounded(card, clips, split, out), settings, out, json)
@@ -137,9 +142,9 @@ def _tell_trained(card: Card, settings: Settings, out: Path, json: bool) -> None
 
 
 def _divided(
-    dataset: Path, settings: Settings, base: Settings, cache: Path | None, *, fixed: bool
+    datasets: Sequence[Path], settings: Settings, base: Settings, cache: Path | None, *, fixed: bool
 ) -> tuple[list[Clip], Split, Settings]:
-    """The sequences, who of them is fitted, chooses and is kept, and the settings as that made them.
+    """All sequences, who of them is fitted, chooses and is kept, and the settings as that made them.
 
     `base`: the preset that was changed; `fixed`: whether the number of folds was asked for.
     """
@@ -147,28 +152,28 @@ def _divided(
     from learn.data.split import groups, keep_written, nested, ungrouped
     from learn.evaluation.interval_sides import keep_back
     from learn.settings import replace
-    from synth.dataset.index import written_sides
-    from synth.dataset.split import read_rule
 
-    with _bar("Reading sequences") as tell:
-        clips = load_clips(dataset, settings.grid, sources(settings.input), cache=cache, report=tell)
-    sides = written_sides(dataset)
-    if sides is not None:
+    clips = []
+    for one in datasets:
+        with _bar("Reading sequences") as tell:
+            clips += load_clips(one, settings.grid, sources(settings.input), cache=cache, report=tell)
+    sides, rule = _written(datasets)
+    if rule is not None:
         asked = [k for k in ("folds", "fold", "held_out_family") if getattr(settings, k) != getattr(base, k)]
         if asked:
+            names = ", ".join(asked)
             raise UserError(
-                f"{dataset}: is split already (split.json, by `synth split`): leave out {', '.join(asked)}"
+                f"{datasets[0]}: is split already (split.json, by `synth split`): leave out {names}"
             )
-        rule = read_rule(dataset)
         settings = replace(settings, share_anatomy=settings.share_anatomy or rule.share_anatomy)
     if settings.share_anatomy:
         # A written split that doesn't keep openings apart would have one on two sides.
-        clips = ungrouped(clips, by_opening=None if sides is None or rule.by == "opening" else False)
+        clips = ungrouped(clips, by_opening=None if rule is None or rule.by == "opening" else False)
         apart = "" if len(set(groups(clips))) == len(clips) else " Its openings are kept apart."
         _console.print(
             f"One brain may be on several sides of the split: scores say nothing of other brains.{apart}"
         )
-    if sides is not None:
+    if rule is not None:
         _console.print(
             "The dataset's own split: what `synth split` marks test is neither fitted nor chosen on."
         )
@@ -177,6 +182,24 @@ def _divided(
         settings = replace(settings, folds=min(settings.folds, len(set(groups(clips)))))
     split = nested(clips, settings.folds, settings.fold, settings.seed, settings.held_out_family)
     return clips, keep_back(clips, split, settings.seed), settings
+
+
+def _written(datasets: Sequence[Path]) -> tuple[dict[str, str], Rule | None]:
+    """The sides that `synth split` wrote, by content hash, and its rule; None if there is no split.
+
+    Raises UserError if some datasets are split and others aren't, or by another rule: nobody would know then
+    what is kept apart.
+    """
+    from synth.dataset.index import written_sides
+    from synth.dataset.split import read_rule
+
+    found = {one: written_sides(one) for one in datasets}
+    rules = {one: None if sides is None else read_rule(one) for one, sides in found.items()}
+    first = rules[datasets[0]]
+    for one, rule in rules.items():
+        if rule != first:
+            raise UserError(f"{one}: is not split as {datasets[0]} is: `synth split` both alike, or neither")
+    return {name: side for sides in found.values() for name, side in (sides or {}).items()}, first
 
 
 def _train(

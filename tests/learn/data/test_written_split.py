@@ -116,6 +116,36 @@ def test_openings_of_one_brain_are_on_one_side_only_where_the_rule_is_by_them(
     assert (asked.exit_code == 2 and "fitted or chosen on every sequence" in asked.stderr) == alike
 
 
+def test_two_datasets_are_trained_on_as_one(own: Path, tmp_path: Path) -> None:
+    other = tmp_path / "other"
+    for index in range(4):
+        phantom.write(other, index, anatomy_seed=50 + index)
+    given = ["--also", str(other), "--folds", "3", *TINY]
+    done = run(app, ["train", str(own), "-o", str(tmp_path / "m"), *given])
+    assert done.exit_code == 0, done.output
+    used = read_card(tmp_path / "m").split
+    assert sum(map(len, used.values())) == 12
+    # Nothing that is in both is on two sides: the same folder twice is a dataset once.
+    done = run(app, ["train", str(own), "--also", str(own), "-o", str(tmp_path / "n"), "--folds", "3", *TINY])
+    assert done.exit_code == 0, done.output
+    sides = [set(names) for names in read_card(tmp_path / "n").split.values()]
+    assert sum(map(len, sides)) == len(set.union(*sides)) == 8
+
+
+def test_datasets_that_are_split_by_different_rules_are_not_trained_on_together(
+    own: Path, tmp_path: Path
+) -> None:
+    other = Path(shutil.copytree(own, tmp_path / "other"))
+    split.keep_rule(own, Rule(shares=(0.5, 0.25, 0.25)))
+    for first, second in ((own, other), (other, own)):
+        done = run(app, ["train", str(first), "--also", str(second), "-o", str(tmp_path / "m"), *TINY])
+        assert done.exit_code == 2
+        assert f"{second}: is not split as {first} is" in " ".join(done.stderr.split())
+    split.keep_rule(other, Rule(shares=(0.5, 0.25, 0.25)))
+    used = train(own, tmp_path / "m", "--also", str(other))
+    assert set(used["test"]) == marked(own)["test"]
+
+
 def test_a_sequence_that_comes_later_has_its_side_too(own: Path) -> None:
     split.keep_rule(own, Rule())
     before = marked(own)

@@ -35,8 +35,8 @@ def test_each_is_what_it_is_called() -> None:
 
 
 def test_what_the_missions_ask_about_is_never_shown() -> None:
-    shown, look, mechanics = (
-        reader.load_job(name) for name in ("mission", "mission-unseen", "mission-mechanics")
+    shown, bench, look, mechanics = (
+        reader.load_job(name) for name in ("mission", "mission-bench", "mission-unseen", "mission-mechanics")
     )
     assert not set(look.appearance.families) & set(shown.appearance.families)
     assert look.anatomy.gyrus_mm[1] <= shown.anatomy.gyrus_mm[0]
@@ -45,4 +45,7 @@ def test_what_the_missions_ask_about_is_never_shown() -> None:
     assert (shown.fem.contact, mechanics.fem.contact) == ("traction", "rigid")
     assert shown.fem.pulse.heart_mm[1] == 0 < mechanics.fem.pulse.heart_mm[0]
     assert mechanics.appearance.families == shown.appearance.families
-    assert len({job.seed for job in (shown, look, mechanics)}) == 3
+    assert not set(look.appearance.families) & set(bench.appearance.families)
+    assert 2 * bench.anatomy.craniotomy.radius_mm > max(bench.render.field_mm)
+    assert bench.fem == shown.fem
+    assert len({job.seed for job in (shown, bench, look, mechanics)}) == 4
