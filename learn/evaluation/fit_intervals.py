@@ -71,18 +71,23 @@ def add_intervals(
     source: str | None = None,
     report: Report = lambda done, of: None,
 ) -> Card:
-    """Fits intervals and writes them, or why there are none, into the card of a model's folder; that card."""
+    """Fits intervals and writes them, or why there are none, into the card of a model's folder; that card.
+
+    Whoever of `split.select` did not choose the epoch counts as kept for intervals from then on.
+    """
     fitted, chosen, kept = ([clips[i] for i in part] for part in (split.fit, split.select, split.intervals))
     why, found = find_obstacle(chosen, kept), None
     if not why:
         found = fit_intervals(predictor, fitted, chosen, kept, source, report)
-    taken = {clip.content_hash for clip in kept}, {clip.group for clip in kept}
+    choosers = set(predictor.card.split.get("select", ()))
+    used = [*kept, *(clip for clip in chosen if kept and clip.content_hash not in choosers)]
+    taken = {clip.content_hash for clip in used}, {clip.group for clip in used}
     names, brains = (
         {part: [one for one in told if one not in gone] for part, told in parts.items()}
         for parts, gone in zip((predictor.card.split, predictor.card.groups), taken, strict=True)
     )
-    if kept:
-        names["intervals"] = [clip.content_hash for clip in kept]
+    if used:
+        names["intervals"] = [clip.content_hash for clip in used]
         brains["intervals"] = sorted(taken[1])
     card = replace(predictor.card, intervals=found, no_intervals=why, split=names, groups=brains)
     write_card(folder, card)

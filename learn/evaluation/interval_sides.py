@@ -45,7 +45,8 @@ def find_obstacle(chosen: Sequence[Clip], kept: Sequence[Clip]) -> str:
     for what, part, needed in parts:
         found = len(set(groups(part)))
         if found < needed:
-            return f"{found} brains are {what}; {LEVELS[0]:.0%} intervals need {needed}"
+            brains = "brain is" if found == 1 else "brains are"
+            return f"{found} {brains} {what}; {LEVELS[0]:.0%} intervals need {needed}"
     return ""
 
 
@@ -54,6 +55,7 @@ def find_sides(clips: Sequence[Clip], card: Card, test: Collection[str], from_te
 
     Kept for it is what was already; else every brain that the model has not met and that has no test
     sequence; with `from_test` half of the brains of the test instead, drawn, and the other half stays it.
+    Where too few brains chose the epoch, those that the scale of errors still lacks are drawn from the kept.
 
     Args:
         clips: of the dataset.
@@ -70,11 +72,16 @@ def find_sides(clips: Sequence[Clip], card: Card, test: Collection[str], from_te
     def of(chosen: Collection[int]) -> tuple[int, ...]:
         return tuple(i for i in range(len(clips)) if number[i] in chosen)
 
+    rng = np.random.default_rng(card.settings.seed)
     fitted, chosen = brains("fit"), brains("select")
     kept, tests = brains("intervals"), brains("test", test) - fitted - chosen
     if from_test:
-        drawn = np.random.default_rng(card.settings.seed).permutation(sorted(tests))
+        drawn = rng.permutation(sorted(tests))
         kept = {int(brain) for brain in drawn[: len(tests) // 2]}
     elif not kept:
         kept = set(number) - fitted - chosen - tests
-    return Split(of(fitted), of(chosen), of(tests - kept), of(kept))
+    left, lacking = tests - kept, max(LEAST_CHOSEN - len(chosen), 0)
+    if len(kept) >= conformal.least_units(LEVELS[0]) + lacking:
+        lent = {int(brain) for brain in rng.permutation(sorted(kept))[:lacking]}
+        chosen, kept = chosen | lent, kept - lent
+    return Split(of(fitted), of(chosen), of(left), of(kept))

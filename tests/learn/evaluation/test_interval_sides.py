@@ -93,3 +93,21 @@ def test_nothing_new_is_nothing_kept(clips: list[Clip], from_test: bool) -> None
     some = many(clips, 8)
     known = card(some, fit=of(range(4)), select=of(range(4, 8)))
     assert find_sides(some, known, (), from_test).intervals == ()
+
+
+def test_brains_never_met_lend_the_scale_what_choosing_left_it_short_of(clips: list[Clip]) -> None:
+    some = many(clips, 30)
+    known = card(some, fit=of(range(4)), select=of([4]))
+    found = find_sides(some, known, (), from_test=False)
+    brains = [{some[i].group for i in part} for part in (found.select, found.intervals)]
+    assert [len(one) for one in brains] == [3, 23]
+    assert "brain-4" in brains[0]
+    assert not brains[0] & brains[1]
+    assert find_obstacle([some[i] for i in found.select], [some[i] for i in found.intervals]) == ""
+    # Ten that it never met are one too few for both: nothing is moved, and the reason is said.
+    few = some[: 2 * 15]
+    left = find_sides(few, known, (), from_test=False)
+    assert (left.select, left.intervals) == (of([4]), of(range(5, 15)))
+    assert find_obstacle([few[i] for i in left.select], [few[i] for i in left.intervals]).startswith(
+        "1 brain"
+    )
