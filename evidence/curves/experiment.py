@@ -7,6 +7,7 @@ interrupted run goes on.
 
 from __future__ import annotations
 
+import json
 import multiprocessing
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -52,6 +53,10 @@ def experiment(
         "runs/curves"
     ),
     workers: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
+    add: Annotated[
+        list[Path] | None,
+        typer.Option(help="curves.json of another run on these data, to be shown with; may be given again."),
+    ] = None,
 ) -> dict[str, Any]:
     """Error of the force against fitted sequences and CPU-hours, by model, displacement and eyes."""
     world = World(data, tuple(unseen or ()), asked, choosing, steps, work)
@@ -61,6 +66,7 @@ def experiment(
         raise UserError(
             f"--sizes: at most {limit}; {data} leaves no more beside those that choose and are asked"
         )
+    others = [_read(file) for file in add or ()]
     world.pack()
     rows: dict[Reader, list[dict[str, Any]]] = {}
     # Without max_tasks_per_child: Python 3.11's pool stands still when it replaces a process.
@@ -73,11 +79,35 @@ def experiment(
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)  # what waits would be computed in vain
             raise
-    return {
-        "generation_cpu_s": world.generation_cpu_s(),
-        "asked": world.counts(),
-        "rows": [with_intervals(row) for one in wanted for row in rows[one]],
-    }
+    own, counts = [with_intervals(row) for one in wanted for row in rows[one]], world.counts()
+    found: dict[str, Any] = {"generation_cpu_s": world.generation_cpu_s(), "asked": counts}
+    found |= {"rows": joined(own, others, counts)}
+    # What is added may be of an earlier day's code; its commands say so.
+    return found | ({"added": [one["command"] for one in others]} if others else {})
+
+
+def joined(
+    own: Sequence[dict[str, Any]], others: Sequence[dict[str, Any]], asked: dict[str, int]
+) -> list[dict[str, Any]]:
+    """Rows of other runs, without those that this one has, and this one's. UserError if they asked others."""
+    fields = ("model", "input", "eyes", "size", "seed", "asked")
+    rows: dict[tuple[Any, ...], dict[str, Any]] = {}
+    for one in others:
+        if one["asked"] != asked:
+            raise UserError(f"--add: {one['command']!r} asked {one['asked']}, this run {asked}")
+        rows |= {tuple(row[name] for name in fields): row for row in one["rows"]}
+    rows |= {tuple(row[name] for name in fields): row for row in own}
+    return list(rows.values())
+
+
+def _read(file: Path) -> dict[str, Any]:
+    try:
+        found = json.loads(file.read_text("utf-8"))
+    except (OSError, ValueError) as error:
+        raise UserError(f"--add {file}: {error}") from None
+    if not isinstance(found, dict) or not {"command", "asked", "rows"} <= found.keys():
+        raise UserError(f"--add {file}: is no curves.json")
+    return found
 
 
 def with_intervals(row: dict[str, Any]) -> dict[str, Any]:

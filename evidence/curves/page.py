@@ -31,6 +31,7 @@ def drawn(found: Mapping[str, Any]) -> result_page.Page:
             f"Generation takes {found['generation_cpu_s']:.1f} CPU-s a sequence; *CPU-h* is of generation "
             "and fitting together.",
         ),
+        command="; ".join([*found.get("added", ()), str(found.get("command", ""))]),
         name="README.md",
     )
 

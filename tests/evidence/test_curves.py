@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -161,3 +161,21 @@ def test_every_row_is_on_the_page() -> None:
     shown = page.drawn({"rows": rows, "generation_cpu_s": 4.0, "asked": {"same world": 3}})
     assert len(shown.charts) == 4
     assert len(shown.sections[0].rows) == len(rows)
+
+
+def test_rows_of_another_run_are_shown_with_ones_own_if_they_asked_the_same(tmp_path: Path) -> None:
+    def row(model: str, whole: float) -> dict[str, object]:
+        return asdict(Reader(model, "recovered", 1, 30, 0)) | {"asked": "same world", "whole": whole}
+
+    other = {
+        "command": "bench one",
+        "asked": {"same world": 4},
+        "rows": [row("ridge", 0.5), row("k-NN", 0.6)],
+    }
+    rows = experiment.joined([row("ridge", 0.4)], [other], {"same world": 4})
+    assert {str(one["model"]): one["whole"] for one in rows} == {"ridge": 0.4, "k-NN": 0.6}
+    with pytest.raises(UserError, match="--add: 'bench one' asked"):
+        experiment.joined([], [other], {"same world": 5})
+    (tmp_path / "curves.json").write_text("[]")
+    with pytest.raises(UserError, match="is no curves"):
+        experiment._read(tmp_path / "curves.json")
