@@ -1,6 +1,7 @@
 """Renders a moving surface with Cycles. Run by `bench experiment foreign` in a Python that has bpy.
 
-It imports nothing of ours. Reads `pictures.npz` and `pictures.json`; writes `NNNNN.png`, 8 bits sRGB.
+It imports nothing of ours. Reads `pictures.npz` and `pictures.json`; writes `NNNNN.png` of the first camera
+and `right-NNNNN.png` of a second one, 8 bits sRGB.
 """
 
 from __future__ import annotations
@@ -25,15 +26,17 @@ def main(folder: Path) -> None:
     tool = _rod(told["tool_mm"])
     for k, at in enumerate(told["lamps_mm"]):
         _lamp(k, at, told)
-    _camera(told)
+    cameras = {name: _camera(name, told, matrix) for name, matrix in told["cameras"].items()}
     _settings(told)
     for k, moved in enumerate(given["moved"]):
         tissue.data.vertices.foreach_set("co", (given["rest"] + moved).astype(np.float32).ravel())
         tissue.data.update()
         _place(tool, given["tip"][k], given["shaft"][k])
-        bpy.context.scene.cycles.seed = k
-        bpy.context.scene.render.filepath = str(folder / f"{k:05d}.png")
-        bpy.ops.render.render(write_still=True)
+        for eye, (name, camera) in enumerate(cameras.items()):
+            bpy.context.scene.camera = camera
+            bpy.context.scene.cycles.seed = 2 * k + eye  # noise that eyes shared would be followed
+            bpy.context.scene.render.filepath = str(folder / f"{name}{k:05d}.png")
+            bpy.ops.render.render(write_still=True)
 
 
 def _sheet(rest: Any) -> Any:
@@ -112,14 +115,14 @@ def _lamp(k: int, at: list[float], told: dict[str, Any]) -> None:
     bpy.context.scene.collection.objects.link(lamp)
 
 
-def _camera(told: dict[str, Any]) -> None:
-    lens = bpy.data.cameras.new("lens")
+def _camera(name: str, told: dict[str, Any], matrix: list[list[float]]) -> Any:
+    lens = bpy.data.cameras.new(f"lens{name}")
     lens.sensor_width, lens.lens = 36.0, 36.0 * told["focal_px"] / told["size"][0]
     lens.clip_start, lens.clip_end = 1.0, 2000.0
-    camera = bpy.data.objects.new("lens", lens)
-    camera.matrix_world = mathutils.Matrix(told["camera"])
+    camera = bpy.data.objects.new(f"lens{name}", lens)
+    camera.matrix_world = mathutils.Matrix(matrix)
     bpy.context.scene.collection.objects.link(camera)
-    bpy.context.scene.camera = camera
+    return camera
 
 
 def _settings(told: dict[str, Any]) -> None:

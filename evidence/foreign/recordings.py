@@ -34,6 +34,9 @@ _BLOCK_MM, _ELEMENTS, _LEVELS = (90.0, 50.0), (12, 7), 3
 _FIELD_MM, _SIDE, _TEXELS = 46.0, 220, 1200
 _DISTANCE_MM, _SENSOR_HZ = 300.0, 100.0
 _STILL_S, _CONTACTS, _HOVER_MM = 2.0, 4, 45.0
+_BASE_MM = 24.0
+_EYES = ("", "right-")
+"""What the pictures of either camera are called."""
 _BEAT_HZ, _BREATH_HZ = 1.2, 0.25
 
 
@@ -60,6 +63,7 @@ def foreign(
     fps: Annotated[float, typer.Option(min=1.0, help="Frames a second.")] = 8.0,
     spp: Annotated[int, typer.Option(min=1, help="Light paths a pixel.")] = 24,
     seed: Annotated[int, typer.Option(min=0, help="Root of every draw.")] = 500,
+    eyes: Annotated[int, typer.Option(min=1, max=2, help="Cameras that look on.")] = 1,
 ) -> dict[str, Any]:
     """Makes recordings by felupe and Blender: plain, with a membrane, with a pulse."""
     wanted = [kind.strip() for kind in kinds.split(",")]
@@ -72,7 +76,7 @@ def foreign(
             if not folder.exists():
                 with writer.write_whole_folder(folder) as part:
                     rng = np.random.default_rng([seed, KINDS.index(kind), index])
-                    film, pythons = (seconds, fps, spp), (mechanics_python, pictures_python)
+                    film, pythons = (seconds, fps, spp, eyes), (mechanics_python, pictures_python)
                     _fill(part, folder.name, kind, rng, film, pythons)
             made.append(str(folder))
     return {"recordings": made}
@@ -83,10 +87,10 @@ def _fill(
     name: str,
     kind: str,
     rng: np.random.Generator,
-    film: tuple[float, float, int],
+    film: tuple[float, float, int, int],
     pythons: tuple[Path, Path],
 ) -> None:
-    seconds, fps, spp = film
+    seconds, fps, spp, eyes = film
     young = float(np.exp(rng.uniform(np.log(0.8), np.log(3.0))))
     contacts = [_contact(young, rng) for _ in range(_CONTACTS)]
     told = {
@@ -106,11 +110,11 @@ def _fill(
         times = np.arange(0, seconds, 1 / fps)
         shown = _shown(surface, hand, times, contacts, told, rng)
         camera, focal = _camera(rng)
-        size = (320, 240)
+        size, right = (320, 240), beside(camera)
         about = {
             "size": size,
             "focal_px": focal,
-            "camera": camera.tolist(),
+            "cameras": {_EYES[0]: camera.tolist()} | ({_EYES[1]: right.tolist()} if eyes == 2 else {}),
             "spp": spp,
             "threads": 1,
             "tool_mm": 0.6 * min(one["radius_mm"] for one in contacts),
@@ -119,15 +123,19 @@ def _fill(
         }
         _run(pythons[1], "cycles_worker.py", Path(scratch), "pictures", about, shown)
         noise = np.random.default_rng(rng.integers(2**31))
-        pictures = (_recorded(Path(scratch) / f"{k:05d}.png", noise) for k in range(len(times)))
-        writer.write_video(part / "video.mp4", pictures, times, crf=18)
+        for eye, file in list(zip(_EYES, ("video.mp4", "right.mp4"), strict=True))[:eyes]:
+            pictures = (_recorded(Path(scratch) / f"{eye}{k:05d}.png", noise) for k in range(len(times)))
+            writer.write_video(part / file, pictures, times, crf=18)
     whole = sum(hand.level[:, [k]] * np.array(one["force_mn"]) for k, one in enumerate(contacts))
     to_camera = np.diag([1.0, -1.0, -1.0]) @ camera[:3, :3].T
     seen = np.asarray(whole) @ to_camera.T + 0.02 * rng.normal(size=(len(hand.time_s), 3))
     writer.write_force(part, hand.time_s, seen / 1000)
+    if eyes == 2:
+        write_pair(part / "pair.yaml", camera, right, focal, size)
     writer.write_meta(
         part,
-        {
+        ({"stereo": {"calibration": "pair.yaml"}} if eyes == 2 else {})
+        | {
             "scale_mm_per_px": _DISTANCE_MM / focal,
             "young_kpa": young,
             "specimen": name,
@@ -292,6 +300,30 @@ def _camera(rng: np.random.Generator) -> tuple[Floats, float]:
     matrix[:3, :3] = np.stack([right, np.cross(back, right), back], axis=1)
     matrix[:3, 3] = _DISTANCE_MM * back
     return matrix, float(320 * _DISTANCE_MM / rng.uniform(31, 36))
+
+
+def beside(camera: Floats) -> Floats:
+    """Blender's matrix of a second camera to the right of the first, turned to look at the same middle."""
+    matrix = camera.copy()
+    matrix[:3, 3] += _BASE_MM * camera[:3, 0]
+    back = matrix[:3, 3] / np.linalg.norm(matrix[:3, 3])
+    right = camera[:3, 0] - (camera[:3, 0] @ back) * back
+    right /= np.linalg.norm(right)
+    matrix[:3, :3] = np.stack([right, np.cross(back, right), back], axis=1)
+    return matrix
+
+
+def write_pair(file: Path, left: Floats, right: Floats, focal_px: float, size: tuple[int, int]) -> None:
+    """Writes the two cameras, matrices of Blender, as OpenCV's `stereoCalibrate` would: K, D, R, T [mm]."""
+    # Blender looks along -z with y up, OpenCV along z with y down.
+    first, second = (np.diag([1.0, -1.0, -1.0]) @ one[:3, :3].T for one in (left, right))
+    K = np.array([[focal_px, 0, size[0] / 2 - 0.5], [0, focal_px, size[1] / 2 - 0.5], [0, 0, 1]])
+    told = {"K1": K, "D1": np.zeros((1, 5)), "K2": K, "D2": np.zeros((1, 5))}
+    told |= {"R": second @ first.T, "T": (second @ (left[:3, 3] - right[:3, 3]))[:, None]}
+    storage = cv2.FileStorage(str(file), cv2.FILE_STORAGE_WRITE)
+    for name, value in told.items():
+        storage.write(name, value)
+    storage.release()
 
 
 def _recorded(picture: Path, rng: np.random.Generator) -> NDArray[np.uint8]:

@@ -76,12 +76,14 @@ def test_a_recording_says_the_force_that_was_put_in(
             np.savez(folder / "mechanics.npz", **solved())
         else:
             rgb = np.uint8(255 * given["albedo"][::5, ::4][:240, :300])
-            for k in range(len(given["moved"])):
-                cv2.imwrite(str(folder / f"{k:05d}.png"), np.pad(rgb, ((0, 0), (0, 20), (0, 0)), mode="edge"))
+            shown = np.pad(rgb, ((0, 0), (0, 20), (0, 0)), mode="edge")
+            for eye in told["cameras"]:
+                for k in range(len(given["moved"])):
+                    cv2.imwrite(str(folder / f"{eye}{k:05d}.png"), shown)
         return folder / f"{name}.npz"
 
     monkeypatch.setattr(recordings, "_run", ran)
-    recordings.foreign(tmp_path, Path("a"), Path("b"), kind, 1, 10.0, 2.0, 1, 500)
+    recordings.foreign(tmp_path, Path("a"), Path("b"), kind, 1, 10.0, 2.0, 1, 500, 1 + (kind == "pulse"))
     opened = open_recording(tmp_path / f"{kind}-0")
     assert len(list(read_video(tmp_path / f"{kind}-0" / "video.mp4"))) == 20
     with (tmp_path / f"{kind}-0" / "force.csv").open() as file:
@@ -96,7 +98,30 @@ def test_a_recording_says_the_force_that_was_put_in(
     assert [bool(peak > 0) for peak in peaks] == down
     assert (asked["mechanics"]["pulse_mm"] > 0) == (kind == "pulse")
     assert opened.meta.specimen == f"{kind}-0"
+    assert (opened.meta.stereo is not None) == (kind == "pulse")
     assert opened.meta.young_kpa == pytest.approx(asked["mechanics"]["young_kpa"])
+
+
+def test_the_pair_that_is_written_sees_a_point_where_both_cameras_do(tmp_path: Path) -> None:
+    """Projected by Blender's matrices by hand, and by OpenCV with the file's K, R and T."""
+    left, focal = recordings._camera(np.random.default_rng(4))
+    right = recordings.beside(left)
+    recordings.write_pair(tmp_path / "pair.yaml", left, right, focal, (320, 240))
+    file = cv2.FileStorage(str(tmp_path / "pair.yaml"), cv2.FILE_STORAGE_READ)
+    K, R, T = (file.getNode(name).mat() for name in ("K2", "R", "T"))
+    point = np.array([4.0, -7.0, 1.5])
+
+    def seen(camera: np.ndarray) -> np.ndarray:
+        x, y, z = camera[:3, :3].T @ (point - camera[:3, 3])
+        return np.array([x, -y]) / -z * focal + np.array([159.5, 119.5])
+
+    in_left = np.diag([1.0, -1.0, -1.0]) @ left[:3, :3].T @ (point - left[:3, 3])
+    found, _ = cv2.projectPoints(in_left[None], cv2.Rodrigues(R)[0], T, K, None)
+    assert found.ravel() == pytest.approx(seen(right), abs=1e-6)
+    # Both look at the middle, from 24 mm apart.
+    assert np.linalg.norm(T) == pytest.approx(24.0)
+    point[:] = 0
+    assert seen(left) == pytest.approx(seen(right), abs=1e-9)
 
 
 def test_a_program_that_fails_says_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
