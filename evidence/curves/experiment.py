@@ -39,9 +39,9 @@ def experiment(
     ] = None,
     sizes: Annotated[str, typer.Option(help="Comma-separated numbers of fitted sequences.")] = "30,100,300",
     models: Annotated[str, typer.Option(help="Comma-separated readers.")] = ",".join(readers.MODELS),
-    inputs: Annotated[str, typer.Option(help="Comma-separated: ideal, noise, recovered, mixed.")] = (
-        "ideal,noise,recovered,mixed"
-    ),
+    inputs: Annotated[
+        str, typer.Option(help="Comma-separated: ideal, noise, recovered, mixed; exact is asked with, too.")
+    ] = ",".join(readers.INPUTS),
     eyes: Annotated[str, typer.Option(help="Comma-separated: 1, 2.")] = "1,2",
     seeds: Annotated[int, typer.Option(min=1, help="Networks a point.")] = 1,
     steps: Annotated[
@@ -95,7 +95,7 @@ def joined(
     for one in others:
         if one["asked"] != asked:
             raise UserError(f"--add: {one['command']!r} asked {one['asked']}, this run {asked}")
-        rows |= {tuple(row[name] for name in fields): row for row in one["rows"]}
+        rows |= {tuple(row[name] for name in fields): with_intervals(row) for row in one["rows"]}
     rows |= {tuple(row[name] for name in fields): row for row in own}
     return list(rows.values())
 

@@ -25,9 +25,10 @@ def drawn(found: Mapping[str, Any]) -> result_page.Page:
             "Root mean square error of the force as a part of the force's own, mean over sequences with its "
             "95% interval: of the whole vector, of its parts across and along the line of sight, and of its "
             "size alone, which is all that boosting says. Everything is asked with recovered displacement, "
-            "whatever it was fitted on. *Bare*: the sequences without a membrane, whose force the surface "
-            "does show. *Gain*: of said on true force, by size; *slope*: of true on said, 1 where a gain "
-            "under 1 is but the caution of who isn't sure.",
+            "whatever it was fitted on; only *exact* is fitted on true displacement and asked with it. "
+            "*Bare*: the sequences without a membrane, whose force the surface does show. *Gain*: of said on "
+            "true force, by size; *slope*: of true on said, 1 where a gain under 1 is but the caution of who "
+            "isn't sure.",
             f"Generation takes {found['generation_cpu_s']:.1f} CPU-s a sequence; *CPU-h* is of generation "
             "and fitting together.",
         ),

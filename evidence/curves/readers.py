@@ -43,7 +43,10 @@ PHYSICS, RIDGE, NEAREST, BOOSTING = "half-space", "ridge", "k-NN", "boosting"
 SMALL, LARGE = "d2fnet-s", "D2FNet"
 MODELS = (PHYSICS, RIDGE, NEAREST, BOOSTING, SMALL, LARGE)
 """What a run compares if it isn't told."""
-INPUTS = ("ideal", "noise", "recovered", "mixed")
+EXACT = "exact"
+INPUTS = ("ideal", "noise", "recovered", "mixed", EXACT)
+"""What is fitted on. Everything is asked with recovered motion, `exact` alone with true one: its error is of
+what the surface doesn't show, the others' of that and of the flow."""
 _SMALL = Architecture(
     width=16, stem=4, levels=3, output="vector", confidence=True, dropout=0.0, relative=True
 )
@@ -86,9 +89,15 @@ class Reader:
     def slug(self) -> str:
         return f"{self.model}-{self.input}-{self.eyes}-{self.size}-{self.seed}"
 
-    def source(self, what: str) -> str:
-        """The clips' name of a displacement."""
-        return _SOURCES[self.eyes][what]
+    @property
+    def fitted(self) -> str:
+        """The clips' name of the displacement that it is fitted on; raises KeyError of none, as noise is."""
+        return _SOURCES[self.eyes]["ideal" if self.input == EXACT else self.input]
+
+    @property
+    def asked(self) -> str:
+        """The clips' name of the displacement that it is asked with."""
+        return _SOURCES[self.eyes]["ideal" if self.input == EXACT else "recovered"]
 
 
 @dataclass(frozen=True)
@@ -147,7 +156,7 @@ class World:
                 | (
                     {"map_r2": None, "ghosts": None}
                     if predictor is None
-                    else map_figures(predictor, part, one.source("recovered"))
+                    else map_figures(predictor, part, one.asked)
                 )
                 for name, part in tests.items()
             ]
@@ -167,16 +176,15 @@ class World:
         if one.model in NETWORKS:
             folder = self.work / "networks" / f"{one.slug}-{key}"
             predictor = _network(one, fit, choose, self.steps, folder)
-            return partial(models.read_force, predictor, source=one.source("recovered")), predictor
-        source = one.source(one.input)
+            return partial(models.read_force, predictor, source=one.asked), predictor
+        source = one.fitted
         if one.model == PHYSICS:
             return _by_half_space(one, fit, source), None
         if one.model == BOOSTING:
             rng = np.random.default_rng(one.seed)
             small = [coarse(clip) for clip in fit]
             rule = baselines.boosting(small, source, rng, Grid(GRID.size // 2))
-            asked = one.source("recovered")
-            return partial(_by_frame, rule, asked), None
+            return partial(_by_frame, rule, one.asked), None
         return _by_components(one, fit, source), None
 
 
@@ -222,8 +230,7 @@ def _by_half_space(one: Reader, fit: Sequence[Clip], source: str) -> Answer:
         products.append(np.array([said * true, said * said]).sum(1) / np.square(true).sum())
     both, own = np.sum(products, axis=0)
     factor = both / np.where(own > 0, own, 1.0)
-    asked = one.source("recovered")
-    return lambda clip: clip.young_kpa * factor * solved(clip, asked)
+    return lambda clip: clip.young_kpa * factor * solved(clip, one.asked)
 
 
 def _by_components(one: Reader, fit: Sequence[Clip], source: str) -> Answer:
@@ -240,9 +247,8 @@ def _by_components(one: Reader, fit: Sequence[Clip], source: str) -> Answer:
         groups.append(group + start)
     x, force, group = np.concatenate(features), np.concatenate(forces), np.concatenate(groups)
     regressor: Any = models.fit_ridge(x, force, group) if one.model == RIDGE else baselines.nearest(x, force)
-    asked = one.source("recovered")
     return lambda clip: (
-        clip.young_kpa * np.asarray(regressor.predict(basis.transform(models.rows(coarse(clip), asked))))
+        clip.young_kpa * np.asarray(regressor.predict(basis.transform(models.rows(coarse(clip), one.asked))))
     )
 
 
@@ -251,7 +257,7 @@ def network_settings(one: Reader, steps: int, frames: int) -> Settings:
     batch = 16
     epochs = int(np.clip(round(steps * batch / frames), _LEAST, _MOST))
     depth = one.eyes == 2
-    given = "recovered" if one.input == "noise" else one.input
+    given = {"noise": "recovered", EXACT: "ideal"}.get(one.input, one.input)
     names = {"ideal": "motion-ideal", "recovered": "motion", "mixed": "motion-mixed"}
     return Settings.model_validate(
         {

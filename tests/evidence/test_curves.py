@@ -70,6 +70,7 @@ def test_what_is_fitted_on_true_motion_is_asked_with_recovered(world: World) -> 
     assert found["gain"] == pytest.approx(0.5, abs=0.02)
     assert found["slope"] == pytest.approx(2, abs=0.08)
     assert found["whole"] == pytest.approx(0.5, abs=0.02)
+    assert world.rows(Reader("ridge", "exact", 2, 6, 0))[0]["whole"] < 0.02
 
 
 def test_no_sequence_that_is_asked_was_fitted(
