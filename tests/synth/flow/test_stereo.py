@@ -206,6 +206,26 @@ def test_a_blocked_eye_is_doubted_and_forgotten() -> None:
     np.testing.assert_allclose(again.motion, sure.motion, atol=1e-3)
 
 
+def test_a_tool_that_no_mask_knows_is_no_depth_of_the_tissue() -> None:
+    """A bar comes between in both eyes, a little nearer than the tissue; the left eye's flow says so."""
+    picture, steel = (texture(np.random.default_rng(seed)) for seed in (6, 60))
+    every = np.ones(SIZE[::-1], bool)
+    rest_frame = seen(picture, COLUMNS, ROWS)
+    bar = (COLUMNS > 60) & (COLUMNS < 100) & (ROWS > 40)
+    covered = bar[..., None]
+    left = np.where(covered, seen(steel, COLUMNS, ROWS), rest_frame)
+    right = np.where(covered, seen(steel, COLUMNS - 1.5, ROWS), rest_frame)
+    flow, within = np.zeros((*every.shape, 2), np.float32), (slice(50, 115), slice(60, 100), 2)
+    off = []
+    for sure_of_the_bar in (1.0, 0.05):
+        tracker = StereoTracker(PARALLEL, rest_frame[None], rest_frame[None], ~every, ~every, every)
+        confidence = np.where(bar, sure_of_the_bar, 0.9).astype(np.float32)
+        moved = tracker.step(left, right, ~every, ~every, flow, confidence)
+        off.append(np.abs(moved.motion[within]).mean())
+    assert off[1] < off[0] / 2
+    assert off[1] < 0.015
+
+
 def test_a_right_eye_of_another_moment_is_found_out() -> None:
     rng = np.random.default_rng(7)
     picture = texture(rng)
