@@ -69,6 +69,8 @@ def preview(
 ) -> None:
     """Draws a contact sheet of a job's scenarios and says what the whole job will take."""
     import cv2
+    from rich.console import Console
+    from rich.progress import Progress
 
     from synth.dataset.size_forecast import amount
     from synth.errors import UserError
@@ -78,7 +80,11 @@ def preview(
     if out.suffix.lower() != ".png" or not out.parent.is_dir():
         raise UserError(f"{out}: cannot be written as PNG")
     read = reader.load_job(job, overrides or [])
-    made = contact_sheet.draw_sheet(read, count)
+    with Progress(console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task("Drawing, then measuring what a sequence costs", total=None)
+        made = contact_sheet.draw_sheet(
+            read, count, lambda done, of: bar.update(task, completed=done, total=of)
+        )
     if not cv2.imwrite(str(out), made.picture[..., ::-1]):
         raise UserError(f"{out}: cannot be written as PNG")
     if json:

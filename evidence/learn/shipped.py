@@ -37,8 +37,8 @@ _LIMITS = (
 )
 _ONE_EYE = (
     "Along the line of sight one eye sees next to nothing; the interval there is wide.",
-    "On one recording made with another finite-element code and another renderer it errs by 21.5% of the "
-    "peak, one contact by physics alone (`bench score` shows it beside) by 9.8%.",
+    "On recordings made with another finite-element code and another renderer it errs by more than the "
+    "physics beside it in `bench score` (docs/results/learn/foreign/one-eye).",
 )
 
 

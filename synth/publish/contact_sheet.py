@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
@@ -34,11 +36,11 @@ class Sheet:
     """The whole dataset."""
 
 
-def draw_sheet(job: Job, count: int) -> Sheet:
+def draw_sheet(job: Job, count: int, report: Callable[[int, int], None] = lambda done, of: None) -> Sheet:
     """Draws `count` scenarios spread over the job, each in the moment before its load.
 
     Nothing is deformed: the sheet shows anatomy, appearance, light, view and instrument. What the job costs
-    is measured on a few of its sequences, carried out in short.
+    is measured on a few of its sequences, carried out in short. `report`: parts done, of how many.
 
     Raises:
         UserError: the job cannot be carried out.
@@ -53,13 +55,21 @@ def draw_sheet(job: Job, count: int) -> Sheet:
             "anatomy": job.anatomy.model_copy(update={"vertices": min(job.anatomy.vertices, 20_000)}),
         }
     )
-    tiles = [_frame(quick, int(index)) for index in chosen]
+    steps = itertools.count(1)
+
+    def step() -> None:
+        report(next(steps), len(chosen) + cost_probe.PARTS)
+
+    tiles = []
+    for index in chosen:
+        tiles.append(_frame(quick, int(index)))
+        step()
     columns = int(np.ceil(np.sqrt(len(tiles))))
     tiles += [np.zeros_like(tiles[0])] * (-len(tiles) % columns)
     rows = [np.hstack(tiles[k : k + columns]) for k in range(0, len(tiles), columns)]
     return Sheet(
         picture=np.vstack(rows),
-        stages_cpu_s=cost_probe.measure_cost(job),
+        stages_cpu_s=cost_probe.measure_cost(job, step),
         disk_bytes=size_forecast.estimate(job) * job.sequences,
     )
 

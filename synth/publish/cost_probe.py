@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -12,20 +13,26 @@ from synth.dataset.store import open_sequence
 from synth.job.schema import Job
 from synth.sequence.pipeline import render_sequence
 
-_PROBES = 3
+PARTS = 4
+"""Sequences that are carried out: one for what is compiled once, and what is measured."""
 _SHORT, _LONG = 3, 9  # frames: the difference is what a further frame takes
 
 
-def measure_cost(job: Job) -> dict[str, float]:
+def measure_cost(job: Job, report: Callable[[], None] = lambda: None) -> dict[str, float]:
     """Processor time [s] of the whole job by stage, without what each worker takes to start.
 
     A sequence's gesture is the same however many frames it is cut into, so a frame of a shorter one is as
-    dear, but for the larger step to it. Raises UserError if the job cannot be carried out.
+    dear, but for the larger step to it. `report` is called `PARTS` times at most, after each part. Raises
+    UserError if the job cannot be carried out.
     """
-    chosen = np.unique(np.linspace(0, job.sequences - 1, _PROBES).round().astype(int))
+    chosen = np.unique(np.linspace(0, job.sequences - 1, PARTS - 1).round().astype(int))
+    found = []
     with tempfile.TemporaryDirectory() as folder:
         _stages(job, int(chosen[0]), 2, Path(folder))  # what is compiled once
-        found = [_cost(job, int(index), Path(folder)) for index in chosen]
+        report()
+        for index in chosen:
+            found.append(_cost(job, int(index), Path(folder)))
+            report()
     return {name: job.sequences * float(np.mean([one[name] for one in found])) for name in found[0]}
 
 
