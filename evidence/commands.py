@@ -211,7 +211,7 @@ def gap(
         held_out,
         flow or ["tvl1", "opencv-tvl1"],
         seeds,
-        shlex.join(["bench", *sys.argv[1:]]),
+        shlex.join(["bench", *(Path(word).name if "/" in word else word for word in sys.argv[1:])]),
         lambda line: Console(stderr=True).print(line, markup=False),
         unseen,
         fit,

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import inspect
 import json
+import math
 import re
 import shlex
 import sys
@@ -139,6 +140,15 @@ def shortened(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [shortened(part) for part in value]
     return float(f"{value:.6g}") if isinstance(value, float) else value
+
+
+def four_digits(value: float) -> float:
+    """The nearest number with 13 bits after its first: those that follow can't be packed, and say nothing."""
+    part, power = math.frexp(value)
+    return math.ldexp(round(part * 2**_BITS), power - _BITS) if math.isfinite(value) else value
+
+
+_BITS = 13
 
 
 def _named(file: str, values: dict[str, Any]) -> str:

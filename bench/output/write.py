@@ -21,4 +21,4 @@ def _json(what: Any, depth: int = 2) -> str:
         return "{\n" + ",\n".join(f"{json.dumps(k)}: {_json(v, depth - 1)}" for k, v in what.items()) + "\n}"
     if depth and isinstance(what, list | tuple) and any(isinstance(item, dict | list) for item in what):
         return "[\n" + ",\n".join(_json(item, 0) for item in what) + "\n]"
-    return json.dumps(what)
+    return json.dumps(what, separators=(",", ":"))

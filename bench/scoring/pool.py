@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -123,7 +122,7 @@ def _each(tree: dict[str, Any]) -> dict[str, Any]:
 def write(tree: dict[str, Any], out: Path, command: str) -> None:
     """pool.json, README.md, chart.svg and index.html in the folder `out`."""
     tree = tree | {"command": command, "machine": machine.describe()}
-    results.keep(out, "pool.json", json.dumps(tree, indent=1, allow_nan=False) + "\n")
+    results.keep(out, "pool.json", tree)
     for name in ("README.md", "index.html"):
         result_page.write(drawn(tree, name), out)
 

@@ -15,7 +15,7 @@ from bench.bootstrap import Interval
 from bench.output import charts, machine, result_page
 from bench.output import write as results
 from evidence.gap import gap
-from evidence.gap.runs import KEYS, Tests, Training, carry_out, kept_flow, write_table
+from evidence.gap.runs import KEYS, Tests, Training, carry_out, kept_flow, shortened, write_table
 from learn.data.clips import Clip, load_clips
 from learn.data.split import Split, folds, groups, nested
 from learn.evaluation.statistics import interval
@@ -57,7 +57,7 @@ def run(
         held_out: family that no training sees.
         flows: back ends of the recovered flow, each a whole experiment.
         seeds: networks a training; a sequence's error is the mean over them.
-        command: as typed, for the README.
+        command: as typed, folders by their names, for the README.
         say: told what is under way.
         unseen: a dataset that is the unseen world instead of a family of `dataset`.
         fit: of `dataset` only so many sequences, the first ones.
@@ -84,7 +84,7 @@ def run(
         for kind in ("I", *KINDS):
             for seed in range(seeds):
                 training = Training(kind, flow, seed)
-                runs[training] = carry_out(training, used, split, settings, tests, cache, say)
+                runs[training] = shortened(carry_out(training, used, split, settings, tests, cache, say))
     tree = {
         "command": command,
         "machine": machine.describe(),
@@ -252,8 +252,7 @@ def drawn(tree: Mapping[str, Any]) -> result_page.Page:
             f"{_counts(tree['sequences'])}; held out: {tree['held_out']}; {tree['seeds']} network(s) "
             "a training, errors averaged over them; 95% BCa intervals.",
         ),
-        f"synth render docs/results/gap/data.yaml -o DATA; {tree['command']}",
-        "README.md",
+        name="README.md",
     )
 
 

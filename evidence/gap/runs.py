@@ -15,6 +15,7 @@ import pyarrow.parquet as pq
 from evidence import kept
 from evidence.gap import gap
 from evidence.gap.recompute_flow import recover_flow
+from evidence.measuring import four_digits
 from learn.data.clips import Clip
 from learn.data.grid import Grid
 from learn.data.split import Split
@@ -29,6 +30,10 @@ KEYS = ("force_mae", "map_rmse")
 """Errors by sequence: total force [mN], density [mN/mm²]; the first decides."""
 Tests = Mapping[str, tuple[Sequence[Clip], str]]
 """By name: the clips asked and the displacement they are asked with."""
+_NUMBERS = {"seed": pa.int32(), "epoch": pa.int32()} | dict.fromkeys(
+    ("select_r2", "train_cpu_s", *KEYS), pa.float32()
+)
+"""Columns of the table that aren't text."""
 
 
 @dataclass(frozen=True)
@@ -144,4 +149,21 @@ def write_table(runs: Mapping[Training, Mapping[str, Any]], file: Path) -> None:
         for k, sequence in enumerate(asked)
     ]
     file.parent.mkdir(parents=True, exist_ok=True)
-    pq.write_table(pa.Table.from_pylist(rows), file, compression="zstd")
+    schema = pa.schema([(name, _NUMBERS.get(name, pa.string())) for name in rows[0]])
+    pq.write_table(
+        pa.Table.from_pylist(rows, schema),
+        file,
+        compression="zstd",
+        compression_level=19,
+        use_dictionary=[name for name in schema.names if name not in KEYS],
+        use_byte_stream_split=list(KEYS),
+    )
+
+
+def shortened(run: Mapping[str, Any]) -> dict[str, Any]:
+    """A training's run with its errors to four digits, as the table holds them."""
+    errors = {
+        test: {key: [four_digits(value) for value in values] for key, values in found.items()}
+        for test, found in run["errors"].items()
+    }
+    return {**run, "errors": errors}

@@ -19,7 +19,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from bench.output.write import keep
-from evidence.measuring import shortened
+from evidence.measuring import four_digits, shortened
 
 SCORES = (
     "map_r2",
@@ -38,7 +38,6 @@ MOMENTS = ("n", "t", "p", "tt", "pp", "tp")
 """Of force density true (t) and said (p) over the map's cells: count, sums, sums of products."""
 _OF_YOUNG = ("map_r2_pooled", "force_r2_pooled", "force_mae")
 _LEFT_OUT = ("sequences", "intervals", "scales", "definitions")
-_BITS = 13
 _TYPES = ((("run", "sequence"), pa.string()), (SCORES + MOMENTS, pa.float32()))
 _SCHEMA = pa.schema([(name, kind) for names, kind in _TYPES for name in names])
 
@@ -56,12 +55,12 @@ def write(folder: Path, runs: Sequence[Mapping[str, Any]]) -> None:
         line["history"] = [run["history"][0], run["history"][-1]]
         line["columns"] = {known: run["columns"][known]}
         line["columns"] |= {young: {k: run["columns"][young][k] for k in _OF_YOUNG} for young in others}
-        lines.append(json.dumps(shortened(line)))
+        lines.append(json.dumps(shortened(line), separators=(",", ":")))
     text = f'{{"settings": {json.dumps(common)}, "runs": [\n' + ",\n".join(lines) + "\n]}\n"
     keep(folder, "runs.json", text)
     rows = [
         {"run": run["name"], "sequence": s["name"]}
-        | {name: _four_digits(s[name]) for name in SCORES if s.get(name) is not None}
+        | {name: four_digits(s[name]) for name in SCORES if s.get(name) is not None}
         | dict(zip(MOMENTS, s["map_moments"], strict=False))
         for run in runs
         for s in run["sequences"]
@@ -95,9 +94,3 @@ def read(folder: Path) -> list[dict[str, Any]]:
 def column(runs: Iterable[Mapping[str, Any]], key: str) -> NDArray[np.float64]:
     """One score of every tested sequence of some runs, in order; NaN where it has none."""
     return np.array([s.get(key, math.nan) for run in runs for s in run["sequences"]], np.float64)
-
-
-def _four_digits(value: float) -> float:
-    """The nearest number with 13 bits after its first: those that follow can't be packed, and say nothing."""
-    part, power = math.frexp(value)
-    return math.ldexp(round(part * 2**_BITS), power - _BITS) if math.isfinite(value) else value
