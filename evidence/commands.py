@@ -17,7 +17,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from evidence.measuring import Json, hang_into, measuring
+from evidence.measuring import Json, hang_into, measuring, name_only
 from synth.errors import UserError
 
 COMMANDS = {
@@ -211,7 +211,7 @@ def gap(
         held_out,
         flow or ["tvl1", "opencv-tvl1"],
         seeds,
-        shlex.join(["bench", *(Path(word).name if "/" in word else word for word in sys.argv[1:])]),
+        shlex.join(["bench", *map(name_only, sys.argv[1:])]),
         lambda line: Console(stderr=True).print(line, markup=False),
         unseen,
         fit,

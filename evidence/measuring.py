@@ -189,7 +189,13 @@ def _typed(ctx: typer.Context, words: str) -> str:
         if one.name in ("out", "json", "help") or value is None or value is False:
             continue
         for part in value if isinstance(value, (list, tuple)) else [value]:
-            said = part.name if isinstance(part, Path) else _FOLDERS.sub(r"\1", str(part))
+            said = (
+                part.name
+                if isinstance(part, Path)
+                else name_only(str(part))
+                if "=" in str(part)
+                else str(part)
+            )
             if one.param_type_name == "argument":
                 typed.append(said)
             elif part is True:
@@ -199,8 +205,13 @@ def _typed(ctx: typer.Context, words: str) -> str:
     return shlex.join(typed)
 
 
-_FOLDERS = re.compile(r"(^[^/=]+=)/?(?:[^/]+/)+")
-"""Of `NAME=PATH`: the name, and whatever stands before the path's last part."""
+_FOLDERS = re.compile(r"^([^/=]+=|)/?(?:[^/]+/)*([^/]+)/*$")
+"""Of `NAME=PATH` or a path: the name, and the path's last part."""
+
+
+def name_only(word: str) -> str:
+    """A word of a command line with its path, also one behind `NAME=`, cut down to the last part."""
+    return _FOLDERS.sub(r"\1\2", word)
 
 
 def _say(found: Any, text: str | Callable[[Any], str], folder: Path | None, as_json: bool) -> None:

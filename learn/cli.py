@@ -177,6 +177,8 @@ def _divided(
         _console.print(
             "The dataset's own split: what `synth split` marks test is neither fitted nor chosen on."
         )
+        if len(datasets) > 1:
+            _check_apart(clips, sides)
         return clips, keep_back(clips, keep_written(clips, sides, settings.seed), settings.seed), settings
     if not fixed:
         settings = replace(settings, folds=min(settings.folds, len(set(groups(clips)))))
@@ -184,11 +186,24 @@ def _divided(
     return clips, keep_back(clips, split, settings.seed), settings
 
 
+def _check_apart(clips: Sequence[Clip], sides: Mapping[str, str]) -> None:
+    """Raises UserError if what must stay together is on one side in one dataset, on another in the next."""
+    from learn.data.split import groups
+
+    on: dict[int, set[str]] = {}
+    for clip, number in zip(clips, groups(clips), strict=True):
+        on.setdefault(number, set()).add(sides.get(clip.content_hash, ""))
+    if torn := sum(len(found - {""}) > 1 for found in on.values()):
+        raise UserError(
+            f"--also: {torn} of the anatomies are on two sides of the datasets' splits; split by their own "
+            "(leave out split.json of both), or train on one"
+        )
+
+
 def _written(datasets: Sequence[Path]) -> tuple[dict[str, str], Rule | None]:
     """The sides that `synth split` wrote, by content hash, and its rule; None if there is no split.
 
-    Raises UserError if some datasets are split and others aren't, or by another rule: nobody would know then
-    what is kept apart.
+    Raises UserError if some datasets are split and others aren't, or by another rule.
     """
     from synth.dataset.index import written_sides
     from synth.dataset.split import read_rule

@@ -67,6 +67,8 @@ def experiment(
             f"--sizes: at most {limit}; {data} leaves no more beside those that choose and are asked"
         )
     others = [_read(file) for file in add or ()]
+    for other in others:
+        _check_asked(other, world.counts())
     world.pack()
     rows: dict[Reader, list[dict[str, Any]]] = {}
     # Without max_tasks_per_child: Python 3.11's pool stands still when it replaces a process.
@@ -83,7 +85,8 @@ def experiment(
     found: dict[str, Any] = {"generation_cpu_s": world.generation_cpu_s(), "asked": counts}
     found |= {"rows": joined(own, others, counts)}
     # What is added may be of an earlier day's code; its commands say so.
-    return found | ({"added": [one["command"] for one in others]} if others else {})
+    added = [said for one in others for said in (*one.get("added", ()), one["command"])]
+    return found | ({"added": list(dict.fromkeys(added))} if added else {})
 
 
 def joined(
@@ -93,11 +96,15 @@ def joined(
     fields = ("model", "input", "eyes", "size", "seed", "asked")
     rows: dict[tuple[Any, ...], dict[str, Any]] = {}
     for one in others:
-        if one["asked"] != asked:
-            raise UserError(f"--add: {one['command']!r} asked {one['asked']}, this run {asked}")
+        _check_asked(one, asked)
         rows |= {tuple(row[name] for name in fields): with_intervals(row) for row in one["rows"]}
     rows |= {tuple(row[name] for name in fields): row for row in own}
     return list(rows.values())
+
+
+def _check_asked(other: dict[str, Any], asked: dict[str, int]) -> None:
+    if other["asked"] != asked:
+        raise UserError(f"--add: {other['command']!r} asked {other['asked']}, this run {asked}")
 
 
 def _read(file: Path) -> dict[str, Any]:

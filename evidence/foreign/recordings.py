@@ -78,6 +78,8 @@ def foreign(
                     rng = np.random.default_rng([seed, KINDS.index(kind), index])
                     film, pythons = (seconds, fps, spp, eyes), (mechanics_python, pictures_python)
                     _fill(part, folder.name, kind, rng, film, pythons)
+            elif eyes == 2 and not (folder / "right.mp4").is_file():
+                raise UserError(f"{folder}: is there already, of one eye")
             made.append(str(folder))
     return {"recordings": made}
 

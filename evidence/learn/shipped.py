@@ -37,7 +37,7 @@ _LIMITS = (
 )
 _ONE_EYE = (
     "Along the line of sight one eye sees next to nothing; the interval there is wide.",
-    "On recordings made with another finite-element code and another renderer it errs by more than the "
+    "On recordings made with another finite-element code and another renderer it errs by more than the best "
     "physics beside it in `bench score` (docs/results/learn/foreign/one-eye).",
 )
 

@@ -79,8 +79,8 @@ def add_intervals(
     why, found = find_obstacle(chosen, kept), None
     if not why:
         found = fit_intervals(predictor, fitted, chosen, kept, source, report)
-    choosers = set(predictor.card.split.get("select", ()))
-    used = [*kept, *(clip for clip in chosen if kept and clip.content_hash not in choosers)]
+    choosers = set(predictor.card.groups.get("select", ()))
+    used = [*kept, *(clip for clip in chosen if kept and clip.group not in choosers)]
     taken = {clip.content_hash for clip in used}, {clip.group for clip in used}
     names, brains = (
         {part: [one for one in told if one not in gone] for part, told in parts.items()}

@@ -74,7 +74,7 @@ def find_sides(clips: Sequence[Clip], card: Card, test: Collection[str], from_te
 
     rng = np.random.default_rng(card.settings.seed)
     fitted, chosen = brains("fit"), brains("select")
-    kept, tests = brains("intervals"), brains("test", test) - fitted - chosen
+    kept, tests = brains("intervals") - fitted - chosen, brains("test", test) - fitted - chosen
     if from_test:
         drawn = rng.permutation(sorted(tests))
         kept = {int(brain) for brain in drawn[: len(tests) // 2]}

@@ -125,7 +125,7 @@ def test_two_datasets_are_trained_on_as_one(own: Path, tmp_path: Path) -> None:
     assert done.exit_code == 0, done.output
     used = read_card(tmp_path / "m").split
     assert sum(map(len, used.values())) == 12
-    # Nothing that is in both is on two sides: the same folder twice is a dataset once.
+    # Nothing that is in both is on two sides.
     done = run(app, ["train", str(own), "--also", str(own), "-o", str(tmp_path / "n"), "--folds", "3", *TINY])
     assert done.exit_code == 0, done.output
     sides = [set(names) for names in read_card(tmp_path / "n").split.values()]
@@ -144,6 +144,22 @@ def test_datasets_that_are_split_by_different_rules_are_not_trained_on_together(
     split.keep_rule(other, Rule(shares=(0.5, 0.25, 0.25)))
     used = train(own, tmp_path / "m", "--also", str(other))
     assert set(used["test"]) == marked(own)["test"]
+
+
+def test_an_anatomy_that_two_splits_put_on_two_sides_is_refused(own: Path, tmp_path: Path) -> None:
+    rule = Rule(shares=(0.5, 0.25, 0.25))
+    split.keep_rule(own, rule)
+    # A brain of the first beside strangers is dealt anew there, until it is on another side.
+    for brain in range(1, 7):
+        other = tmp_path / f"other-{brain}"
+        for index, seed in enumerate((brain, *range(10 * brain, 10 * brain + 3))):
+            phantom.write(other, 20 + index, anatomy_seed=seed)
+        split.keep_rule(other, rule)
+        done = run(app, ["train", str(own), "--also", str(other), "-o", str(tmp_path / f"m{brain}"), *TINY])
+        if done.exit_code:
+            assert "1 of the anatomies are on two sides" in " ".join(done.stderr.split())
+            return
+    pytest.fail("no brain was dealt to two sides")
 
 
 def test_a_sequence_that_comes_later_has_its_side_too(own: Path) -> None:

@@ -95,6 +95,13 @@ def test_nothing_new_is_nothing_kept(clips: list[Clip], from_test: bool) -> None
     assert find_sides(some, known, (), from_test).intervals == ()
 
 
+def test_a_further_sequence_of_a_brain_that_chose_or_was_fitted_is_never_kept(clips: list[Clip]) -> None:
+    some = many(clips, 30)
+    known = card(some, fit=of(range(4)), select=of([4, 5, 6]), intervals=of([4, *range(8, 20)]))
+    found = find_sides(some, known, (), from_test=False)
+    assert {some[i].group for i in found.intervals} == {f"brain-{b}" for b in range(8, 20)}
+
+
 def test_brains_never_met_lend_the_scale_what_choosing_left_it_short_of(clips: list[Clip]) -> None:
     some = many(clips, 30)
     known = card(some, fit=of(range(4)), select=of([4]))
