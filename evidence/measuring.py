@@ -189,13 +189,8 @@ def _typed(ctx: typer.Context, words: str) -> str:
         if one.name in ("out", "json", "help") or value is None or value is False:
             continue
         for part in value if isinstance(value, (list, tuple)) else [value]:
-            said = (
-                part.name
-                if isinstance(part, Path)
-                else name_only(str(part))
-                if "=" in str(part)
-                else str(part)
-            )
+            said = part.name if isinstance(part, Path) else str(part)
+            said = name_only(said) if "=" in said else said
             if one.param_type_name == "argument":
                 typed.append(said)
             elif part is True:

@@ -122,7 +122,7 @@ def _each(tree: dict[str, Any]) -> dict[str, Any]:
 def write(tree: dict[str, Any], out: Path, command: str) -> None:
     """pool.json, README.md, chart.svg and index.html in the folder `out`."""
     tree = tree | {"command": command, "machine": machine.describe()}
-    results.keep(out, "pool.json", tree)
+    results.keep(out, "pool.json", tree, allow_nan=False)
     for name in ("README.md", "index.html"):
         result_page.write(drawn(tree, name), out)
 

@@ -67,8 +67,7 @@ def experiment(
             f"--sizes: at most {limit}; {data} leaves no more beside those that choose and are asked"
         )
     others = [_read(file) for file in add or ()]
-    for other in others:
-        _check_asked(other, world.counts())
+    joined((), others, world.counts())  # what can't be joined is refused before anything is fitted
     world.pack()
     rows: dict[Reader, list[dict[str, Any]]] = {}
     # Without max_tasks_per_child: Python 3.11's pool stands still when it replaces a process.
@@ -96,15 +95,11 @@ def joined(
     fields = ("model", "input", "eyes", "size", "seed", "asked")
     rows: dict[tuple[Any, ...], dict[str, Any]] = {}
     for one in others:
-        _check_asked(one, asked)
+        if one["asked"] != asked:
+            raise UserError(f"--add: {one['command']!r} asked {one['asked']}, this run {asked}")
         rows |= {tuple(row[name] for name in fields): with_intervals(row) for row in one["rows"]}
     rows |= {tuple(row[name] for name in fields): row for row in own}
     return list(rows.values())
-
-
-def _check_asked(other: dict[str, Any], asked: dict[str, int]) -> None:
-    if other["asked"] != asked:
-        raise UserError(f"--add: {other['command']!r} asked {other['asked']}, this run {asked}")
 
 
 def _read(file: Path) -> dict[str, Any]:

@@ -35,8 +35,8 @@ _FIELD_MM, _SIDE, _TEXELS = 46.0, 220, 1200
 _DISTANCE_MM, _SENSOR_HZ = 300.0, 100.0
 _STILL_S, _CONTACTS, _HOVER_MM = 2.0, 4, 45.0
 _BASE_MM = 24.0
-_EYES = ("", "right-")
-"""What the pictures of either camera are called."""
+_FILMS = {"": "video.mp4", "right-": "right.mp4"}
+"""What the pictures of either camera begin with, and its film."""
 _BEAT_HZ, _BREATH_HZ = 1.2, 0.25
 
 
@@ -112,11 +112,11 @@ def _fill(
         times = np.arange(0, seconds, 1 / fps)
         shown = _shown(surface, hand, times, contacts, told, rng)
         camera, focal = _camera(rng)
-        size, right = (320, 240), beside(camera)
+        size, cameras = (320, 240), dict(zip(_FILMS, (camera, beside(camera))[:eyes], strict=False))
         about = {
             "size": size,
             "focal_px": focal,
-            "cameras": {_EYES[0]: camera.tolist()} | ({_EYES[1]: right.tolist()} if eyes == 2 else {}),
+            "cameras": {eye: matrix.tolist() for eye, matrix in cameras.items()},
             "spp": spp,
             "threads": 1,
             "tool_mm": 0.6 * min(one["radius_mm"] for one in contacts),
@@ -125,18 +125,20 @@ def _fill(
         }
         _run(pythons[1], "cycles_worker.py", Path(scratch), "pictures", about, shown)
         noise = np.random.default_rng(rng.integers(2**31))
-        for eye, file in list(zip(_EYES, ("video.mp4", "right.mp4"), strict=True))[:eyes]:
+        for eye in cameras:
             pictures = (_recorded(Path(scratch) / f"{eye}{k:05d}.png", noise) for k in range(len(times)))
-            writer.write_video(part / file, pictures, times, crf=18)
+            writer.write_video(part / _FILMS[eye], pictures, times, crf=18)
     whole = sum(hand.level[:, [k]] * np.array(one["force_mn"]) for k, one in enumerate(contacts))
     to_camera = np.diag([1.0, -1.0, -1.0]) @ camera[:3, :3].T
     seen = np.asarray(whole) @ to_camera.T + 0.02 * rng.normal(size=(len(hand.time_s), 3))
     writer.write_force(part, hand.time_s, seen / 1000)
+    pair: dict[str, Any] = {}
     if eyes == 2:
-        write_pair(part / "pair.yaml", camera, right, focal, size)
+        write_pair(part / "pair.yaml", camera, cameras["right-"], focal, size)
+        pair = {"stereo": {"calibration": "pair.yaml"}}
     writer.write_meta(
         part,
-        ({"stereo": {"calibration": "pair.yaml"}} if eyes == 2 else {})
+        pair
         | {
             "scale_mm_per_px": _DISTANCE_MM / focal,
             "young_kpa": young,

@@ -15,7 +15,8 @@ from bench.bootstrap import Interval
 from bench.output import charts, machine, result_page
 from bench.output import write as results
 from evidence.gap import gap
-from evidence.gap.runs import KEYS, Tests, Training, carry_out, kept_flow, shortened, write_table
+from evidence.gap.runs import KEYS, Tests, Training, carry_out, kept_flow, rounded, write_table
+from evidence.measuring import shortened
 from learn.data.clips import Clip, load_clips
 from learn.data.split import Split, folds, groups, nested
 from learn.evaluation.statistics import interval
@@ -84,7 +85,7 @@ def run(
         for kind in ("I", *KINDS):
             for seed in range(seeds):
                 training = Training(kind, flow, seed)
-                runs[training] = shortened(carry_out(training, used, split, settings, tests, cache, say))
+                runs[training] = rounded(carry_out(training, used, split, settings, tests, cache, say))
     tree = {
         "command": command,
         "machine": machine.describe(),
@@ -205,8 +206,9 @@ def _errors(runs: Sequence[Mapping[str, Any]], test: str, key: str) -> Curve:
 
 def write(tree: dict[str, Any], out: Path) -> None:
     """results.json, README.md and chart.svg."""
-    results.keep(out, "results.json", _plain(tree))
-    result_page.write(drawn(_plain(tree)), out)
+    tree = shortened(_plain(tree))
+    results.keep(out, "results.json", tree)
+    result_page.write(drawn(tree), out)
 
 
 def drawn(tree: Mapping[str, Any]) -> result_page.Page:

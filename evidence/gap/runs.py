@@ -160,7 +160,7 @@ def write_table(runs: Mapping[Training, Mapping[str, Any]], file: Path) -> None:
     )
 
 
-def shortened(run: Mapping[str, Any]) -> dict[str, Any]:
+def rounded(run: Mapping[str, Any]) -> dict[str, Any]:
     """A training's run with its errors to four digits, as the table holds them."""
     errors = {
         test: {key: [four_digits(value) for value in values] for key, values in found.items()}

@@ -85,3 +85,9 @@ def test_command_reads_folders_and_refuses_the_same_twice(tmp_path: Path) -> Non
         pool.read([tmp_path / "a", tmp_path / "a"])
     with pytest.raises(UserError, match="no readable score"):
         pool.read([tmp_path])
+
+
+def test_a_pool_with_a_number_that_is_none_is_not_written(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        pool.write({"scores": {"r": float("nan")}}, tmp_path / "pooled", "bench pool a")
+    assert not (tmp_path / "pooled/pool.json").exists()
