@@ -60,8 +60,13 @@ def draw_crew(
     beside = f" beside the other {len(found)}" if found else ""
     raise UserError(
         f"fem.crew: instrument {k} has no room{beside} in an opening of {craniotomy.radius_mm:g} mm "
-        "radius; change its place, lower its footprint_mm, or widen anatomy.craniotomy.radius_mm"
+        f"radius{_within(fem)}; change its place, lower its footprint_mm, or widen "
+        "anatomy.craniotomy.radius_mm"
     )
+
+
+def _within(fem: schema.Fem) -> str:
+    return "" if fem.within_mm is None else f" and fem.within_mm of {fem.within_mm:g}"
 
 
 def fits(gesture: Gesture, craniotomy: schema.Craniotomy) -> bool:
@@ -98,8 +103,9 @@ def further(
                 break
         else:
             raise UserError(
-                f"fem.instruments: {count} have no room in an opening of {craniotomy.radius_mm:g} mm radius; "
-                "lower it or fem.footprint_mm, or widen anatomy.craniotomy.radius_mm"
+                f"fem.instruments: {count} have no room in an opening of {craniotomy.radius_mm:g} mm radius"
+                f"{_within(fem)}; lower it or fem.footprint_mm, or widen anatomy.craniotomy.radius_mm"
+                f"{' and fem.within_mm' if fem.within_mm else ''}"
             )
     return tuple(crew[1:])
 

@@ -74,7 +74,11 @@ class Gesture:
     ) -> Gesture:
         """Draws one gesture: contact uniformly in the opening, direction uniformly in its cone; or as asked.
 
+        With `fem.within_mm` all that it loads keeps to that radius of the opening's middle.
         Where it is asked for a place, what is drawn may reach beyond the opening: see `fits`.
+
+        Raises:
+            UserError: what is drawn has no room in `fem.within_mm`.
         """
         drawn, want = str(rng.choice(fem.gestures)), fem.demand(asked)
         kind = asked.gesture or drawn
@@ -89,7 +93,13 @@ class Gesture:
         path = float(rng.uniform(3, 8)) if kind == "slide" else 0.0
         azimuth = float(rng.uniform(0, 360))
         reach = footprint + 0.5 * (path if kind == "slide" else spread if kind == "grasp" else 0.0)
-        room = max(craniotomy.radius_mm - reach - CLEAR_MM, 0.0)
+        within = craniotomy.radius_mm if fem.within_mm is None else min(craniotomy.radius_mm, fem.within_mm)
+        if within < min(reach + CLEAR_MM, craniotomy.radius_mm) and asked.place is None:
+            raise UserError(
+                f"fem.within_mm: a {kind} of {footprint:.3g} mm footprint reaches {reach:.3g} mm, which "
+                f"{within:g} mm leave no room for; raise it or lower fem.footprint_mm"
+            )
+        room = max(within - reach - CLEAR_MM, 0.0)
         radius, angle = room * np.sqrt(rng.uniform()), rng.uniform(0, 2 * np.pi)
         point = radius * np.array([np.cos(angle), np.sin(angle)])
         if asked.place is not None:

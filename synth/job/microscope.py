@@ -24,7 +24,7 @@ class Light(Section):
     """The microscope's lamps."""
 
     glare: ShareRange = (0.0, 0.3)
-    """Wet highlights: 0 as few as lamps beside the lens leave (2% of the tissue), 1 four times as many."""
+    """Wet highlights: 0 as few as lamps beside the lens leave (0.5% of the tissue), 1 twenty times more."""
     tilt_deg: LightTilt | None = None
     """Angle between main lamp and optical axis, 0-40, to any side. Empty: at most 6.5, as `glare` asks."""
     main: ShareRange = (0.5, 0.68)

@@ -297,6 +297,9 @@ class Fem(Section):
     crew: Annotated[tuple[Instrument, ...], Field(max_length=3)] = ()
     """Instruments as asked, the first ones of `instruments` (there are at least so many): a list of {gesture,
     place, direction, load, force_mn, footprint_mm, timing}, each of them drawn where it is left out."""
+    within_mm: Positive | None = None
+    """What is loaded keeps within this radius of the opening's middle [mm], such as what the camera sees of a
+    wide opening; a `crew`'s places count as they are. Empty: anywhere in the opening."""
     ramp: PositiveRange = (0.25, 0.35)
     """Time in which the load grows to its peak, as a part of the sequence."""
     cone_deg: Annotated[FiniteFloat, Field(ge=0, le=80)] = 65.0

@@ -59,6 +59,28 @@ def test_an_opening_without_room_is_an_error() -> None:
         drawn(fem, 0)
 
 
+def test_what_is_loaded_keeps_within_what_is_asked() -> None:
+    wide = ANATOMY.craniotomy.model_copy(update={"radius_mm": 24.0})
+
+    def furthest(fem: schema.Fem) -> float:
+        ends = []
+        for seed in range(40):
+            rng = np.random.default_rng(seed)
+            first = Gesture.draw(fem, wide, TISSUE, rng)
+            for gesture in (first, *multi_instrument.further(first, fem, wide, TISSUE, rng)):
+                starts = np.array([contact.point_mm for contact in gesture.contacts])
+                places = np.concatenate([starts, starts + gesture.path_mm])
+                ends.append(np.hypot(*places.T).max() + gesture.footprint_mm)
+        return float(max(ends))
+
+    assert 10 < furthest(schema.Fem(instruments=(1, 2), within_mm=14.0)) <= 14
+    assert furthest(schema.Fem(instruments=(1, 2))) > 18
+    with pytest.raises(UserError, match=r"opening of 24 mm radius and fem.within_mm of 7"):
+        furthest(schema.Fem(instruments=2, within_mm=7.0, footprint_mm=3.0, gestures=("push",)))
+    with pytest.raises(UserError, match=r"fem.within_mm: a slide of .* which 4 mm leave no room for"):
+        furthest(schema.Fem(gestures=("slide",), within_mm=4.0))
+
+
 @pytest.mark.parametrize("law", ["linear", "neo-hookean"])
 def test_labels_of_two_instruments_add_up_and_both_touch(law: str) -> None:
     fem = schema.Fem(law=law, tets=400, load=(0.1, 0.15), instruments=2, gestures=("pull", "push"))

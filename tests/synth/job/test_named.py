@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from synth.job import reader
+from synth.job.instrument import CLEAR_MM
 from synth.sequence import scenario
 
 PAGE = (Path(__file__).resolve().parents[3] / "docs" / "recipes.md").read_text("utf-8")
@@ -47,5 +49,8 @@ def test_what_the_missions_ask_about_is_never_shown() -> None:
     assert mechanics.appearance.families == shown.appearance.families
     assert not set(look.appearance.families) & set(bench.appearance.families)
     assert 2 * bench.anatomy.craniotomy.radius_mm > max(bench.render.field_mm)
-    assert bench.fem == shown.fem
+    assert bench.fem.within_mm is not None
+    tall = bench.render.size[1] / bench.render.size[0] * np.mean(bench.render.field_mm)
+    assert bench.fem.within_mm - CLEAR_MM <= tall / 2 < bench.anatomy.craniotomy.radius_mm
+    assert bench.fem.model_copy(update={"within_mm": None}) == shown.fem
     assert len({job.seed for job in (shown, bench, look, mechanics)}) == 4
