@@ -56,7 +56,7 @@ def classifier(
     rows, alone, told = [], {}, []
     jobs = cutting.name_jobs(look)
     for name, file in jobs:
-        ours = cutting.kept_of_job(cutting.read_job(file, frames, seed), cutting.MM_PER_PX, cache)
+        ours = cutting.kept_of_job(cutting.read_job(file, frames, seed, width_mm), cutting.MM_PER_PX, cache)
         both = Split.of(theirs, ours, region)
         # What of it gives crops away is asked of the last look, the one that is fitted.
         asked = parts(both.pictures) if file is jobs[-1][1] else {"everything": both.pictures}

@@ -92,12 +92,18 @@ def name_jobs(look: list[Path] | None) -> list[tuple[str, Path | None]]:
     return [("default job", None), *((one.stem, one) for one in look or [])]
 
 
-def read_job(look: Path | None, frames: int, seed: int) -> Job:
-    """The job whose frames are compared: the default one, or what `synth fit` wrote."""
-    changes = [f"sequences={frames}", f"seed={seed}"]
-    if look is not None:
-        return reader.load_job(str(look), changes)
-    return Job.model_validate({"sequences": frames, "seed": seed})
+def read_job(look: Path | None, frames: int, seed: int, width_mm: float) -> Job:
+    """The job whose frames are compared: the default one, or what `synth fit` wrote.
+
+    The fitted loss of light towards the corners is the photograph's, `width_mm` wide. These frames are like a
+    piece of its middle, where there is less of it: by the square of the width.
+    """
+    if look is None:
+        return Job.model_validate({"sequences": frames, "seed": seed})
+    job = reader.load_job(str(look), [f"sequences={frames}", f"seed={seed}"])
+    share = min(1.0, job.render.size[0] * MM_PER_PX / width_mm)
+    sensor = job.sensor.model_copy(update={"vignette": job.sensor.vignette * share**2})
+    return job.model_copy(update={"sensor": sensor})
 
 
 def taken(rgb: Picture, seed: int) -> Picture:

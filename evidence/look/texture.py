@@ -47,7 +47,7 @@ def texture(
     limit = float(np.quantile(own, 0.9))
     rows = [_row("photograph, region left out", own, limit)]
     for name, file in cutting.name_jobs(look):
-        ours = cutting.kept_of_job(cutting.read_job(file, frames, seed), cutting.MM_PER_PX, cache)
+        ours = cutting.kept_of_job(cutting.read_job(file, frames, seed, width_mm), cutting.MM_PER_PX, cache)
         found = described(ours.pictures, python)
         rows.append(_row(name, distances(found, measured), limit))
     return {

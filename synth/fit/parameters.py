@@ -65,36 +65,54 @@ def _colour(name: str, channel: str) -> Parameter:
     return Parameter(f"{name} {channel}", {f"{name} {channel}": own, **also, **seen}, 0.01, 3.0, 0.6)
 
 
-# Slopes: two anatomies of the healthy family at 0.055 mm a pixel, each parameter turned up by 0.3 on its
+# Slopes: four anatomies of the healthy family at 0.055 mm a pixel, each parameter turned up by 0.3 on its
 # scale (blur by 0.5 px).
 PARAMETERS: tuple[Parameter, ...] = (
     *(_colour(name, channel) for name in _COLOURS for channel in "rgb"),
     Parameter(
         "arterial",
-        {"arterial": 0.27, "density": 0.15, "sharpness": 0.15, **_contrast(0.3, 0.23, 0.16, 0.08)},
+        {"arterial": 0.46, "density": 0.17, "sharpness": 0.15, **_contrast(0.47, 0.39, 0.31, 0.19)},
         0.15,
         4.0,
         0.4,
     ),
     Parameter(
         "density",
-        {"density": 0.8, "arterial": 0.14, "fineness": 0.12, **_contrast(0.42, 0.4, 0.3, 0.1)},
+        {"density": 0.84, "fineness": 0.22, **_contrast(0.38, 0.35, 0.22, 0.07)},
         0.35,
         2.8,
         0.4,
     ),
     Parameter(
         "calibre",
-        {"fineness": 0.4, "density": 0.2, "vein share": 0.9, **_contrast(0.29, 0.35, 0.36, 0.31)},
+        {
+            "fineness": 0.41,
+            "density": 0.1,
+            "arterial": 0.24,
+            "vein share": 1.1,
+            **_contrast(0.28, 0.38, 0.39, 0.34),
+        },
         0.3,
         3.0,
         0.4,
     ),
     Parameter(
-        "glare", {"highlight share": 1.7, "highlight area": 1.9, "noise": 0.2}, -1.0, 1.0, 0.8, "linear"
+        "glare",
+        {"highlight share": 2.5, "highlight area": 1.8, "noise": 0.1},
+        -1.0,
+        1.0,
+        0.8,
+        "linear",
     ),
-    Parameter("film_mm", {"highlight area": 0.44}, 0.01, 0.3, 0.5),
-    Parameter("vignette", {"vignette": 0.82}, 0.0, 0.95, 0.5, "linear"),
+    Parameter("film_mm", {"highlight area": 0.35}, 0.01, 0.3, 0.5),
+    Parameter(
+        "vignette",
+        {"vignette": 0.82},
+        0.0,
+        0.95,
+        0.5,
+        "linear",
+    ),
     Parameter(
         "blur",
         {

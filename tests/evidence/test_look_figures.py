@@ -195,6 +195,14 @@ def test_crops_of_a_job_are_tissue_without_its_tools_and_codec() -> None:
     assert red > 1.2 * blue
 
 
+def test_a_fitted_look_loses_the_light_of_its_own_piece_of_the_photograph(tmp_path: Path) -> None:
+    (tmp_path / "look.yaml").write_text("sensor: {vignette: 0.4}\nrender: {size: [640, 480]}\n")
+    wide = crops.read_job(tmp_path / "look.yaml", 3, 1, 110.0)
+    assert wide.sensor.vignette == pytest.approx(0.4 * (640 * 0.0547 / 110) ** 2)
+    assert crops.read_job(tmp_path / "look.yaml", 3, 1, 30.0).sensor.vignette == pytest.approx(0.4)
+    assert crops.read_job(None, 3, 1, 110.0).sensor.vignette == Job().sensor.vignette
+
+
 def test_errors_are_relative_but_for_what_may_be_nothing() -> None:
     known = parameters.start("pale") | {"blur": 1.0, "glare": 0.2}
     found = known | {"density": 1.1, "blur": 0.7, "glare": 0.25, "crown r": 1.2 * known["crown r"]}

@@ -22,7 +22,7 @@ Map = npt.NDArray[np.float32]
 _AROUND, _OUT, _INNER = 320, 42, 6  # at most: points around, rings outwards, rings of the cut edge
 _SEGMENT_PX = 4.0  # points around are no nearer than this in the picture: the mesh is built anew every frame
 _WIDTH_MM = 26.0  # beyond the opening; the picture ends before
-_LIP_MM = 0.3  # how far the cut edge reaches over the brain
+_LIP_MM = 0.5  # how far the cut edge reaches over the brain
 _LAID_MM = (-3.0, -1.5, -1.2, -0.95, -0.7, -0.3)
 _PATTY_MM = 0.55  # thickness of a cotton patty
 _THREAD_MM = 0.075  # half width of a stitch's thread
@@ -78,9 +78,9 @@ def build(surface: Surface, radius_mm: float, look: Look, mm_per_px: float) -> R
     edge = radius_mm * _outline(rng, angle)
     out = _WIDTH_MM * np.linspace(0, 1, rings) ** 1.6
     # The cut edge rises out of the brain's surface towards the lens, rounds, and goes on outwards.
-    away = np.concatenate([-_LIP_MM * np.array([1.0, 0.97, 0.88, 0.7, 0.4, 0.1]), out + 0.12])
+    away = np.concatenate([-_LIP_MM * np.array([1.0, 0.96, 0.72, 0.44, 0.2, 0.04]), out + 0.12])
     up = np.concatenate(
-        [[-1.8, -0.1, 0.12, 0.27, 0.39, 0.46], 0.5 + 1.5 * (1 - np.exp(-out / 3.5)) + 0.05 * out]
+        [[-1.8, -0.12, 0.10, 0.26, 0.38, 0.46], 0.5 + 1.5 * (1 - np.exp(-out / 3.5)) + 0.05 * out]
     )
     radius = edge[:, None] + away[None]
     xy = np.stack([radius * np.cos(angle)[:, None], radius * np.sin(angle)[:, None]], axis=-1)
@@ -91,6 +91,8 @@ def build(surface: Surface, radius_mm: float, look: Look, mm_per_px: float) -> R
     z = height + up[None] + lift * noise.sample(folds, xy.reshape(-1, 2), extent).reshape(radius.shape)
     patty = _patty(rng, edge) if look.cottonoid else None
     held = scenery.stitches(edge, rng)
+    if look.family == "calf":  # on the bench nobody sews
+        held = held[:0]
     z = z + _folded(angle[:, None], away[None], edge, held, rng)
     flap = _ragged(rng, angle, 2.9, 0.35) if "bone" in look.scenery else np.zeros(0)
     cloth = _ragged(rng, angle, 7.2, 0.8) if "drape" in look.scenery else np.zeros(0)
@@ -100,7 +102,7 @@ def build(surface: Surface, radius_mm: float, look: Look, mm_per_px: float) -> R
         # Cotton lies over folds rather than in them.
         z = z + over * (_PATTY_MM + 0.3)
     vertices = np.concatenate([xy, z[..., None]], axis=-1).reshape(-1, 3)
-    # The cut edge stands upright: on the maps it is laid flat inside the opening, or it had no width there.
+    # The cut edge is steep: on the maps it is laid flat inside the opening, or it had hardly a width there.
     flat = edge[:, None] + np.concatenate([_LAID_MM, away[len(_LAID_MM) :]])[None]
     laid = np.stack([flat * np.cos(angle)[:, None], flat * np.sin(angle)[:, None]], axis=-1).reshape(-1, 2)
     parts = [(vertices, _faces(around, _INNER + rings), laid)]
@@ -219,7 +221,7 @@ def _paint_rows(
     colour = colour * np.exp(-blood[..., None] * np.array([0.26, 2.4, 2.8], np.float32))
     # The lip is thin and pale; under it the light is lost.
     lip = np.exp(-(((away + 0.1) / 0.35) ** 2))[..., None]
-    under = np.clip(-away - 0.9, 0, 1)[..., None]
+    under = np.clip(-away - 1.5, 0, 1)[..., None]
     colour = colour * (1 + 0.12 * lip) * np.exp(-under * np.array([0.35, 0.9, 1.0], np.float32))
     # Behind the turned-over edge there is a crease, into which blood runs.
     crease = np.exp(-(((away - 2.1 - 0.3 * wide) / 0.3) ** 2))[..., None]

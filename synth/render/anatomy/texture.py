@@ -23,7 +23,7 @@ Map = npt.NDArray[np.float32]
 Floats = npt.NDArray[np.float64]
 
 # Light lost in a millimetre of vessel, red, green, blue: blood seen through its wall, by eye on photographs.
-_ARTERIAL = np.array([0.38, 8.0, 9.6], np.float32)
+_ARTERIAL = np.array([0.4, 5.6, 7.6], np.float32)
 _TEXELS_A_PIXEL = 2.2
 _BLEEDINGS = 3.5  # on a patch where the rim is soaked with blood
 _CLIMB = 0.16  # of a vessel's radius, which the film climbs beside it
@@ -164,7 +164,7 @@ def _blushed(
     albedo = albedo * (1 + look.grain * grain[..., None] * np.array([0.5, 1.0, 1.2], np.float32))
     blush = look.blush * (0.04 + 0.3 * sulci) + (0.32 + 1.1 * sulci) * beside
     blush = blush * np.clip(1 + 0.3 * mottle, 0.2, 2) + look.capillary * deep
-    albedo = albedo * np.exp(-blush[..., None] * np.array([0.16, 1.0, 1.0], np.float32))
+    albedo = albedo * np.exp(-blush[..., None] * np.array([0.16, 1.0, 1.3], np.float32))
     # Fluid stands in the clefts, and little light comes back out of them.
     cleft = look.shade * (0.7 * sulci + 1.8 * np.clip(sulci - 0.5, 0, 1))
     albedo = albedo * np.exp(-cleft[..., None] * np.array([0.5, 0.75, 0.62], np.float32))
@@ -208,10 +208,10 @@ def _arterial(look: Look, albedo: Map, wide: Map, distance: Map, radius: Map) ->
     fade = np.clip(0.95 + 0.25 * wide, 0.4, 1.2)
     red = albedo * np.exp(-(look.arterial * reach * fade)[..., None] * _ARTERIAL)
     # A wide one hides what is under it: its wall scatters light of its own, most along the crest.
-    thick = np.clip((radius - 0.1) / 0.2, 0, 1) * (distance < radius)
+    thick = np.clip((radius - 0.16) / 0.24, 0, 1) * (distance < radius)
     crest = np.exp(-((distance / np.maximum(0.7 * radius, 1e-3)) ** 2))
-    wall = np.array([0.56, 0.105, 0.075], np.float32) * (0.72 + 0.38 * crest)[..., None]
-    return (np.asarray(red + (0.75 * thick)[..., None] * (wall - red), np.float32),)
+    wall = np.array([0.7, 0.13, 0.075], np.float32) * (0.78 + 0.27 * crest)[..., None]
+    return (np.asarray(red + (0.55 * thick)[..., None] * (wall - red), np.float32),)
 
 
 def _veined(rng: np.random.Generator, albedo: Map, tube: tuple[Map, Map], look: Look, extent: float) -> Map:
@@ -270,12 +270,16 @@ def _film(
     def fine(image: Map) -> Map:
         return np.asarray(cv2.resize(image, (pixels, pixels), interpolation=cv2.INTER_CUBIC), np.float32)
 
-    relief = 0.22 * thickness(tubes["arteries"]) + _meniscus(tubes["arteries"]) + _meniscus(tubes["veins"])
+    relief = 0.14 * thickness(tubes["arteries"]) + _meniscus(tubes["arteries"]) + _meniscus(tubes["veins"])
     relief = noise.blur(relief, look.film_mm, extent)
     pools = noise.fractal(rng, coarse, extent, 5.0, 1.5)
-    dry = np.clip(0.5 + 0.45 * pools - 0.5 * cv2.resize(sulci, (coarse, coarse)), 0.05, 1.0)
-    swell = fine(noise.band(rng, coarse, extent, 2.2, 0.5) * 0.011)
-    rough = fine(noise.band(rng, coarse, extent, 0.6, 0.5) * 0.0014)
+    # It lies in pools, in sulci and beside vessels; what is left of it elsewhere mirrors next to nothing.
+    blood = thickness(tubes["arteries"]) + thickness(tubes["veins"])
+    beside = noise.blur(cv2.resize(blood, (coarse, coarse), interpolation=cv2.INTER_AREA), 0.25, extent)
+    wet = 0.9 * cv2.resize(sulci, (coarse, coarse)) + 3.2 * np.minimum(beside, 0.25) + 1.6 * look.light.glare
+    dry = np.clip(1.5 + 0.5 * pools - wet, 0.05, 1.0)
+    swell = fine(noise.band(rng, coarse, extent, 2.2, 0.5) * 0.004)
+    rough = fine(noise.band(rng, coarse, extent, 0.6, 0.5) * 0.0008)
     # The wall of a vein is taut and smooth: its crest mirrors the lamp in one line.
     distance, radius = tubes["veins"]
     on_vein = noise.blur((distance < radius).astype(np.float32), 0.1, extent)

@@ -14,6 +14,8 @@ Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 Map = npt.NDArray[np.float32]
 
+_STIFF_MM = 0.15  # radius of a vessel that winds half as far as the finest
+
 
 @dataclass(frozen=True)
 class Vessels:
@@ -45,7 +47,15 @@ def grow_all(sulci: Map, extent_mm: float, rng: np.random.Generator) -> Vessels:
     rich = 0.9 + 0.35 * noise.band(rng, 128, extent_mm, 9.0, 0.5)
     rich = np.clip(rich, 0.3, 1.0).astype(np.float32)
     arteries = _tree(
-        extent_mm, rng, trunks, radius, spacings=(4.6, 2.4, 1.3, 0.72), leaf=0.042, wander=0.25, density=rich
+        extent_mm,
+        rng,
+        trunks,
+        radius,
+        spacings=(5.2, 2.6, 1.3, 0.7, 0.46),
+        leaf=0.036,
+        wander=0.25,
+        density=rich,
+        winding=0.1,
     )
     return Vessels(veins, arteries, _deep(sulci, extent_mm, rng))
 
@@ -60,6 +70,7 @@ def _tree(
     leaf: float,
     wander: float,
     density: Map | None = None,
+    winding: float = 0.0,
 ) -> Tree:
     """Branches from the trunks of radii `own` (N,) mm, then finer ones from those: a round a spacing [mm]."""
     nodes, parent = trunks
@@ -77,16 +88,27 @@ def _tree(
             reach=9.0,
             kill=0.5 * spacing,
             wander=wander,
-            inertia=0.8,
+            inertia=1.2,
             rng=rng,
         )
         nodes, parent = pruned(nodes, parent, grown, shortest=int(0.55 * spacing / step))
     nodes = relaxed(nodes, parent, fixed, rounds=12)
     nodes = nodes + trunk.meander(rng, nodes, extent_mm, 0.3, 0.22)
-    radius = murray(parent, leaf) * taper(nodes, parent, 0.9)
+    radius = murray(parent, leaf) * taper(nodes, parent, 0.6)
     radius[:fixed] = np.maximum(np.minimum(radius[:fixed], 1.3 * own), own)
     radius[fixed:] = np.minimum(radius[fixed:], 0.8 * own.max())
+    if winding:
+        nodes = nodes + _wound(rng, nodes, radius, extent_mm, winding)
     return Tree(nodes, parent, radius)
+
+
+def _wound(
+    rng: np.random.Generator, nodes: Floats, radius: Floats, extent_mm: float, amplitude: float
+) -> Floats:
+    """Shift (N, 2) mm that makes vessels wind in bends of a millimetre or two, the wide ones less."""
+    bends = [noise.sample(noise.band(rng, 256, extent_mm, 1.7, 0.35), nodes, extent_mm) for _ in range(2)]
+    stiff = 1 / (1 + (radius / _STIFF_MM) ** 2)
+    return np.asarray(amplitude * stiff[:, None] * np.stack(bends, axis=1), np.float64)
 
 
 def _deep(sulci: Map, extent_mm: float, rng: np.random.Generator) -> Tree:

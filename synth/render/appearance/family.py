@@ -31,7 +31,7 @@ FAMILIES: dict[Family, Ranges] = {
     "healthy": Ranges(
         crown=(0.95, 0.79, 0.49),
         flush=(0.93, 0.57, 0.38),
-        vein=(0.4, 0.32, 0.42),
+        vein=(0.34, 0.24, 0.3),
         wine=(0.2, 0.045, 0.045),
         arterial=(1.1, 1.5),
         capillary=(1.4, 2.2),

@@ -9,9 +9,9 @@ import pytest
 import trimesh
 
 from synth.errors import UserError
-from synth.job.schema import Appearance, Family, Job, Light, Render
+from synth.job.schema import Anatomy, Appearance, Family, Job, Light, Render
 from synth.render.anatomy import surface as anatomy
-from synth.render.anatomy import texture
+from synth.render.anatomy import texture, tube
 from synth.render.anatomy.surface import Relief, Surface
 from synth.render.appearance import light
 from synth.render.appearance.light import Lighting
@@ -160,3 +160,19 @@ def test_a_volume_looks_about_like_the_blurred_albedo() -> None:
         shot = studio.frame(surface.vertices, TIPS, SHAFTS, 1)
         seen.append(np.median(shot.radiance[studio.still.tissue], axis=0))
     np.testing.assert_allclose(seen[1], seen[0], rtol=0.15)
+
+
+def test_the_film_is_on_few_of_the_crowns_and_on_more_where_highlights_are_many() -> None:
+    job = Job(anatomy=Anatomy(vertices=2500))
+    surface = anatomy.procedural(Relief.draw(job.anatomy, np.random.default_rng(4)), job.anatomy)
+    veins = tube.raster(surface.vessels.veins, 512, surface.extent_mm)
+    beside = np.abs(veins[0] - veins[1] - 0.1) < 0.1
+    crown = cv2.resize(surface.sulci, (512, 512)) < 0.1
+    wet = {}
+    for glare in (0.0, 0.5, 1.0):
+        lit = Job(light=Light(glare=(glare, glare)))
+        look = Look.draw(lit, "healthy", np.random.default_rng(4))
+        bare = texture.cortex(surface, look, 512, None).dry
+        wet[glare] = float((bare[crown] < 0.97).mean())
+        assert (bare[beside] < 0.97).mean() > wet[glare]
+    assert wet[0.0] < 0.35 < wet[0.5] < wet[1.0]

@@ -12,7 +12,7 @@ from fake_run import in_process
 from synth.checks import verify
 from synth.job.schema import Anatomy, Job, Render
 from synth.render import instrument
-from synth.render.anatomy import scenery
+from synth.render.anatomy import rim, scenery
 from synth.render.anatomy import surface as anatomy
 from synth.render.anatomy.surface import Relief
 from synth.render.appearance.look import Look
@@ -101,6 +101,30 @@ def test_each_part_is_in_three_of_four_sequences_and_changes_nothing_else() -> N
         shown += look.scenery
     for part in PARTS:
         assert shown.count(part) / 300 == pytest.approx(0.75, abs=0.1)
+
+
+def test_nobody_sews_on_a_bench() -> None:
+    job = Job(anatomy=Anatomy(vertices=2500))
+    surface = anatomy.procedural(Relief.draw(job.anatomy, np.random.default_rng(4)), job.anatomy)
+    held = {
+        family: len(rim.build(surface, 12.0, Look.draw(job, family, np.random.default_rng(4)), 0.05).stitches)
+        for family in ("healthy", "calf")
+    }
+    assert held["healthy"] >= 4
+    assert held["calf"] == 0
+
+
+def test_the_cut_edge_slopes_to_the_tissue() -> None:
+    """An upright wall is seen on edge: it would be a black line of one pixel around the opening."""
+    job = Job(anatomy=Anatomy(vertices=2500))
+    surface = anatomy.procedural(Relief.draw(job.anatomy, np.random.default_rng(4)), job.anatomy)
+    made = rim.build(surface, 12.0, Look.draw(job, "healthy", np.random.default_rng(4)), 0.05)
+    rings = made.vertices[: len(made.edge) * (len(made.vertices) // len(made.edge))].reshape(
+        len(made.edge), -1, 3
+    )
+    out = np.hypot(rings[..., 0], rings[..., 1])
+    rise, run = np.diff(rings[:, 1:5, 2], axis=1), np.diff(out[:, 1:5], axis=1)
+    assert np.degrees(np.arctan2(rise, run)).max() < 75  # from the tissue on; what is under it is upright
 
 
 def test_dural_vessels_keep_to_the_dura_and_branch() -> None:
