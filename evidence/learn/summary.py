@@ -179,23 +179,23 @@ def _tests(found: list[dict[str, Any]]) -> list[str]:
         tags = [{r["name"].split(n, 1)[1] for r in found if family(r["name"]) == n} for n in (a, b)]
         both = tags[0] & tags[1]
         groups = [[r for r in found if r["name"] in {n + t for t in both}] for n in (a, b)]
-        lines += _pooled_difference(a, b, groups)
+        said, count = _pooled_difference(groups), 0
         for key, label in COLUMNS:
             a_values, b_values = (_per_sequence(g, key) for g in groups)
             if not np.isfinite(b_values - a_values).any():
                 continue
             test = paired(a_values, b_values, np.random.default_rng(0))
             base = float(np.nanmean(a_values))
-            change = f"{test.difference.mean / base:+.0%}" if base > 0 else "-"
-            lines.append(
-                f"- {b} against {a}, {label}: {_text(test.difference)} ({change}), p = {test.p:.2g}, "
-                f"{test.difference.n} sequences, {len(both)} runs each"
-            )
+            change = f"{test.difference.mean / base:+.0%}, " if base > 0 else ""
+            said.append(f"{label} {_text(test.difference)} ({change}p {test.p:.2g})")
+            count = max(count, test.difference.n)
+        runs = "one run" if len(both) == 1 else f"{len(both)} runs"
+        lines.append(f"- **{b} against {a}**, {count} sequences, {runs} each: {'; '.join(said)}")
     return lines
 
 
-def _pooled_difference(a: str, b: str, groups: list[list[dict[str, Any]]]) -> list[str]:
-    """B's pooled R² less A's, where both tested every sequence in each of their runs."""
+def _pooled_difference(groups: list[list[dict[str, Any]]]) -> list[str]:
+    """The second group's pooled R² less the first's, where both tested every sequence in each run."""
     rows = [{s["name"]: s.get("map_moments") for s in r["sequences"]} for g in groups for r in g]
     names = sorted(rows[0])
     if any(sorted(row) != names or None in row.values() for row in rows):
@@ -205,8 +205,7 @@ def _pooled_difference(a: str, b: str, groups: list[list[dict[str, Any]]]) -> li
         for part in (rows[: len(groups[0])], rows[len(groups[0]) :])
     ]
     found = pooled_r2_difference(both[0], both[1], np.random.default_rng(0))
-    many = f"{len(names)} sequences, {len(groups[1])} runs each"
-    return [f"- {b} against {a}, pooled map R²: {_text(found)}, {many}"]
+    return [f"pooled map R² {_text(found)}"]
 
 
 _AGAINST = (
