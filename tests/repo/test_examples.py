@@ -51,13 +51,13 @@ def test_a_law_of_ones_own_stiffens() -> None:
     for name, b in (("example-stiff", 4.0), ("example-plain", 1e-4)):
         synth.add_law(name, own_law.Stiffening(b))
     soft, stiff = own_law.peak_mm("neo-hookean"), own_law.peak_mm("example-stiff")
-    assert soft == pytest.approx(0.7225, abs=0.002)
+    assert soft == pytest.approx(0.7194, abs=0.002)
     assert stiff == pytest.approx(0.6750, abs=0.002)
     assert own_law.peak_mm("example-plain") == pytest.approx(soft, rel=1e-3), "for small b it is neo-Hookean"
 
 
 def test_a_flow_back_end_of_ones_own(out: Path) -> None:
-    assert own_flow.error_px(Dataset(out)[0]) == pytest.approx(0.496, rel=0.1)
+    assert own_flow.error_px(Dataset(out)[0]) == pytest.approx(1.417, rel=0.1)
 
 
 def test_a_method_of_ones_own(out: Path, tmp_path: Path) -> None:
@@ -65,5 +65,5 @@ def test_a_method_of_ones_own(out: Path, tmp_path: Path) -> None:
 
     found = own_method.score_springs(export_recording(Dataset(out)[0], tmp_path / "recording")).methods
     assert found["spring"].scores["r"] == pytest.approx(0.99, abs=0.01)
-    assert found["spring"].scores["mae_mn"] == pytest.approx(0.847, rel=0.1)
+    assert found["spring"].scores["mae_mn"] == pytest.approx(0.966, rel=0.1)
     assert found["stiffer"].scores["r"] == pytest.approx(found["spring"].scores["r"], abs=1e-6)
