@@ -15,7 +15,7 @@ from bench.methods.protocol import InSpace, Method, Scene
 from bench.recording.folder import Recording
 from bench.recording.meta import Span
 from bench.recording.second_eye import SecondEye, Sight
-from learn.inference.pulse import Pulse, Surface
+from learn.inference.pulse import LEAST_FRAMES, Pulse, Surface
 from learn.inference.video_flow import Account, FlowHere, Footage, Settings, Step, VideoFlow
 from synth.errors import UserError
 from synth.flow.stereo.track import Moved
@@ -187,6 +187,11 @@ def _tell(
         out.timings["flow_peak_rss_mb"] = round(video.peak_bytes / 1e6, 1)
     if out.sight is not None:
         out.notes.append(out.sight.describe())
+    if video.surface is not None and len(video.surface.time_s) < LEAST_FRAMES:
+        out.notes.append(
+            f"{len(video.surface.time_s)} frames could be followed, heart and breath are looked for from "
+            f"{LEAST_FRAMES} on: if the tissue moves by itself, that is still in it"
+        )
     if pulse is None:
         return
     if recording.right or recording.depths:

@@ -28,7 +28,8 @@ _SEEN = 0.3  # share of a cell that must be seen for its motion to count
 _RATES_HZ = (0.08, 3.5)
 _PERIODS = 3.0  # that the frames without contact must span
 _HARMONICS = 3
-_LEAST_FRAMES = 30
+LEAST_FRAMES = 30
+"""That can be followed; of fewer no rhythm is told."""
 _MOST_RHYTHMS = 3  # heart, breath, and what is left of either
 _FOLDS = 6
 _PREDICTED = 0.3  # share of what moves that the fit must foresee in frames it has not seen
@@ -127,7 +128,7 @@ def find_pulse(surface: Surface, rest_s: float, free_s: Sequence[Span] = ()) -> 
         free_s: spans known to be without contact [s]; none: the frames that least depart from smooth and
             periodic motion are taken.
     """
-    if len(surface.time_s) < _LEAST_FRAMES:
+    if len(surface.time_s) < LEAST_FRAMES:
         return None
     time_s, seen = np.array(surface.time_s), np.stack(surface.seen).astype(np.float64)
     seen = seen.reshape(len(time_s), -1)
@@ -258,7 +259,7 @@ def _explained(
 
 def _rhythms(time_s: Floats, coefficients: Floats, free: Flags, basis: Floats) -> tuple[Rhythm, ...]:
     """One after the other, the strongest first, each in what those before it leave."""
-    if free.sum() < _LEAST_FRAMES:
+    if free.sum() < LEAST_FRAMES:
         return ()
     t = time_s[free]
     # In these coordinates a length is a length of motion over the cells.
