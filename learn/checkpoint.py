@@ -60,6 +60,9 @@ class Card:
     epoch: Annotated[int, Field(ge=0)] = 0
     score: FiniteFloat = 0.0
     """R² on the select sequences at the chosen epoch."""
+    gain: Positive = 1.0
+    """What the network's map is multiplied by: slope of the true on the said total force, on the select
+    sequences at the chosen epoch (Cox, Biometrika 45, 1958)."""
     weights_hash: str = ""
     """Of the file of weights; empty before an epoch is kept, and in folders from before there were hashes."""
     intervals: Intervals | None = None
@@ -76,7 +79,8 @@ def write_card(folder: Path, card: Card) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     tree = {"format": _FORMAT, "version": _VERSION, **_CARD.dump_python(card, mode="json")}
     # Where nobody tried, as before there were any.
-    tree = {k: v for k, v in tree.items() if k not in ("intervals", "no_intervals") or v}
+    unused = {"intervals": None, "no_intervals": "", "gain": 1.0}
+    tree = {k: v for k, v in tree.items() if k not in unused or v != unused[k]}
     tree["seal"] = _hash(identity.canonical(tree))
     _write(folder / "config.json", (json.dumps(tree, indent=1) + "\n").encode())
 

@@ -49,9 +49,10 @@ class Portable(nn.Module):
             earlier = displacement[:, arch.displacements :]
         x = channels(now, mask, self.card.settings.grid.pitch_mm, self.card.scales, confidence, earlier)
         said = self.model(x, log_young)
+        unit = self.card.scales.target * self.card.gain
         if arch.total:
-            return said[0] * self.card.scales.target, said[1] * self.card.scales.force
-        y: Tensor = said * self.card.scales.target
+            return said[0] * unit, said[1] * self.card.scales.force
+        y: Tensor = said * unit
         return y
 
 

@@ -35,6 +35,8 @@ from synth.errors import UserError
 
 LOOK = 16
 """Steps between two looks at the loss and its gradient: each makes a GPU wait."""
+_TELLING, _GAINS = 8, (0.67, 1.5)
+"""Sequences that tell a gain, and its limits: what is further off has not learnt."""
 
 Report = Callable[[int, int, dict[str, float]], None]
 """Told after every batch: batches done, batches there will be, latest numbers."""
@@ -100,7 +102,8 @@ def _go_on(
             if write is not None:
                 write(epoch, numbers)
                 if improved:
-                    best = dataclasses.replace(card, epoch=run.epoch, score=run.best)
+                    gain = numbers.get("select_gain", 1.0)
+                    best = dataclasses.replace(card, epoch=run.epoch, score=run.best, gain=gain)
                     checkpoint.write_model(out, best, _cpu(run.model.state_dict()))
                 checkpoint.save_tensors(out / "last.pt", run.as_dict())
             fabric.barrier()
@@ -257,17 +260,41 @@ def forward(
 
 @torch.no_grad()
 def select_score(net: Any, frames: Frames, scales: Scales, device: torch.device) -> dict[str, float]:
-    """R² and RMSE over all tissue cells and components, on the last (most real) source of the input kind."""
+    """R² and RMSE over all tissue cells and components, on the last (most real) source of the input kind.
+
+    And the gain by which the total force is missed there: a price on false force, and noise, teach a
+    network to say less than there is.
+    """
     net.eval()
-    sums = Moments()
+    sums, forces = Moments(), Moments()
     for c in range(len(frames.clips)):
         for batch in frames.sequential(c, frames.sources[-1]):
             here = batch.to(device)
             inside = here.mask.bool().expand_as(here.target)
             said, _ = forward(net, here, frames.settings, scales)
             sums = sums + moments(here.target[inside], said[inside])
+            forces = forces + moments(
+                *(_amount(one * inside, frames.settings) for one in (here.target, said))
+            )
     result = agreement(sums)
-    return {"select_r2": result.r2 if math.isfinite(result.r2) else -math.inf, "select_rmse": result.rmse}
+    return {
+        "select_r2": result.r2 if math.isfinite(result.r2) else -math.inf,
+        "select_rmse": result.rmse,
+        "select_gain": _gain(forces, len(frames.clips)),
+    }
+
+
+def _amount(maps: torch.Tensor, settings: Settings) -> torch.Tensor:
+    """(B C,) what `total_force` is of: the sum of a density, the peak of an intensity, of (B, C, N, N)."""
+    flat = maps.flatten(2)
+    return (flat.amax(2) if settings.target == "intensity" else flat.sum(2)).flatten()
+
+
+def _gain(forces: Moments, sequences: int) -> float:
+    """Slope through the origin of true on said force; 1 where too few sequences tell, `_GAINS` at most."""
+    if sequences < _TELLING or not forces.tp > 0:
+        return 1.0
+    return min(max(forces.tp / forces.pp, _GAINS[0]), _GAINS[1])
 
 
 def moments(true: torch.Tensor, said: torch.Tensor) -> Moments:

@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import av
 import cv2
 import numpy as np
+import onnxruntime
 import phantom
 import pytest
 import torch
 from typer.testing import CliRunner
 
-from learn.checkpoint import Card, write_model
+from learn.checkpoint import Card, read_card, write_card, write_model
 from learn.cli import app
 from learn.data.clips import Clip
 from learn.data.grid import Grid
@@ -74,6 +77,21 @@ def test_an_exported_model_says_the_same(model: Path, tmp_path: Path, kind: str)
     note = json.loads((tmp_path / "net.json").read_text())
     assert note["inputs"][:2] == ["displacement", "mask"]
     assert note["grid"]["pitch_mm"] == 36 / 32
+
+
+def test_the_gain_is_in_every_answer(model: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "model"
+    shutil.copytree(model, folder)
+    write_card(folder, replace(read_card(model), gain=1.25))
+    plain, gained = load_predictor(model), load_predictor(folder)
+    told = examples(plain.card, 1)
+    before, after = (one.density(told[0].numpy(), told[1][0, 0].numpy(), 1.0) for one in (plain, gained))
+    np.testing.assert_allclose(after, 1.25 * before, rtol=1e-5)
+    if len(told) == 2:  # the others are told more than `density` here
+        export(gained, tmp_path / "net", "onnx")
+        session = onnxruntime.InferenceSession(str(tmp_path / "net"))
+        named = {asked.name: one.numpy() for asked, one in zip(session.get_inputs(), told, strict=True)}
+        np.testing.assert_allclose(session.run(None, named)[0], after, rtol=1e-3, atol=1e-6)
 
 
 def test_an_unfaithful_export_is_refused_and_removed(

@@ -20,9 +20,9 @@ from learn.evaluation.metrics import Moments
 from learn.inference.predict import load_predictor
 from learn.loss import SHARES, Objective
 from learn.settings import Settings, preset, replace
-from learn.training.batches import Frames, swayed
+from learn.training.batches import Frames, measure_scales, swayed
 from learn.training.gpu_batches import Resident, held
-from learn.training.train import moments, train
+from learn.training.train import moments, select_score, train
 from synth.dataset.store import Dataset
 from synth.errors import UserError
 
@@ -360,3 +360,31 @@ def test_no_epoch_is_chosen_before_the_price_of_ghosts_is_whole(
     monkeypatch.setattr("learn.training.train.select_score", lambda *_: {"select_r2": next(scores)})
     objective = Objective(kind="hinge", ramp=(0.25, 0.75))
     assert train(clips, split, small(objective=objective), tmp_path / "m").epoch == 4
+
+
+@pytest.mark.parametrize(
+    ("share", "sequences", "gain"),
+    [(0.8, 8, 1.25), (0.8, 7, 1.0), (0.1, 8, 1.5), (2.0, 8, 0.67), (0.0, 8, 1.0)],
+)
+def test_what_a_network_says_too_little_of_the_force_is_its_gain(
+    clips: list[Clip], monkeypatch: pytest.MonkeyPatch, share: float, sequences: int, gain: float
+) -> None:
+    settings, scales = small(), measure_scales(clips, small())
+    monkeypatch.setattr(
+        "learn.training.train.forward", lambda net, batch, *_: (share * batch.target.clone(), None)
+    )
+    chosen = Frames([clips[i % len(clips)] for i in range(sequences)], settings)
+    found = select_score(torch.nn.Identity(), chosen, scales, torch.device("cpu"))
+    assert found["select_gain"] == pytest.approx(gain, rel=1e-6)
+
+
+def test_the_kept_epoch_has_its_own_gain(
+    clips: list[Clip], split: Split, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scores = iter(
+        [{"select_r2": r2, "select_gain": gain} for r2, gain in ((0.1, 1.4), (0.5, 1.2), (0.4, 1.3))]
+    )
+    monkeypatch.setattr("learn.training.train.select_score", lambda *_: next(scores))
+    assert train(clips, split, small(epochs=3), tmp_path / "m").gain == 1.2
+    assert checkpoint.read_card(tmp_path / "m").gain == 1.2
+    assert '"select_gain": 1.3' in (tmp_path / "m/history.jsonl").read_text()
