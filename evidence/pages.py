@@ -206,6 +206,7 @@ def _machine(found: Mapping[str, Tree]) -> dict[str, str]:
 _LEARNING = {
     "presets": ("--presets",),
     "fine": ("--fine",),
+    "large": ("--large",),
     "recovered": ("--rendered", "DATASET"),
 }
 """Folder of learn's results -> what else its command says."""

@@ -30,6 +30,10 @@ from synth.job.schema import Job
 RESULTS = Path("docs/results/learn")
 
 
+LARGE = 1500
+"""Sequences of `--large`: five times as many as the job says, its own the first of them."""
+
+
 def small() -> Settings:
     """The study's base run: about a core-minute, the same for every choice that is compared."""
     base = preset("tiny", epochs=8, folds=3, objective=Objective(kind="mse"))
@@ -96,6 +100,17 @@ def fine_runs() -> Iterator[Run]:
     yield Run("stem1-fold0-seed0", replace(base, arch=replace(base.arch, stem=1, levels=4)))
 
 
+def large_runs() -> Iterator[Run]:
+    """On five times the sequences, in every fold: what a network can do that has enough of them, and what a
+    price on ghosts costs it then."""
+    base = replace(small(), epochs=10)
+    for fold in range(base.folds):
+        for name in ("ghostless", "mse"):
+            settings = replace(base, fold=fold, objective=LOSSES[name])
+            yield Run(f"{name}-fold{fold}-seed0", settings, controlled=False)
+    yield Run("wide-fold0-seed0", replace(base, arch=replace(base.arch, width=32)), controlled=False)
+
+
 BESIDE: dict[str, tuple[tuple[int, int, int], ...]] = {
     "live": ((16, 4, 3), (8, 4, 4), (12, 4, 4), (16, 4, 4)),
     "cpu": ((16, 2, 4), (16, 4, 4), (16, 4, 3), (8, 2, 4), (8, 4, 4)),
@@ -153,17 +168,21 @@ def experiment(
     presets: Annotated[
         bool, typer.Option("--presets", help="The presets' networks and those beside them, each on its grid.")
     ] = False,
+    large: Annotated[bool, typer.Option("--large", help=f"Runs on {LARGE} sequences, every fold.")] = False,
 ) -> None:
     """Train and score learn's choices; done runs are kept, the summary is made anew."""
-    if (rendered is not None) + fine + presets > 1:
-        raise UserError("--rendered, --fine and --presets each have their own runs: give one of them")
+    if (rendered is not None) + fine + presets + large > 1:
+        raise UserError(
+            "--rendered, --fine, --presets and --large each have their own runs: give one of them"
+        )
     set_threads(1)
     say = Console(stderr=True).print
     packed: dict[int, list[Clip]] = {}
 
     @functools.cache
     def job() -> Job:
-        return reader.load_job(str(RESULTS / "data/labels.yaml"))
+        found = reader.load_job(str(RESULTS / "data/labels.yaml"))
+        return found.model_copy(update={"sequences": LARGE}) if large else found
 
     def sequences(grid: Grid) -> list[Clip]:
         if grid.size not in packed:
@@ -178,6 +197,8 @@ def experiment(
         name, runs = "recovered", list(recovered_runs())
     elif presets:
         name, runs = "presets", list(preset_runs())
+    elif large:
+        name, runs = "large", list(large_runs())
     else:
         name, runs = ("fine", list(fine_runs())) if fine else ("ideal", list(ideal_runs()))
     # What the code no longer asks for, or asks otherwise, leaves the table.
