@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TypeVar
@@ -107,25 +107,55 @@ def track_recording(
         UserError: unreadable video, no frame with a time, rest frame beyond the end, masks of another size.
     """
     watch = Stopwatch()
-    once = partial(_track, recording, methods, scale_mm_per_px, settings, pictured, flow, progress, watch)
-    out, found = once(None)
+    once = partial(_track, recording, scale_mm_per_px, settings, pictured, flow, progress, watch)
+    out, found = once(methods, None)
     if found is not None:
         # Contacts are answered for on the tissue as it would lie still: all over again, with that taken off.
-        out, _ = once(found)
+        # Off depth it can't be taken, so who reads nothing else is left at the first answer.
+        deep = [name for name, one in methods.items() if out.sight is not None and _needs_depth(one)]
+        still, _ = once({name: one for name, one in methods.items() if name not in deep}, found)
+        out = _joined(still, out, deep, list(methods), pictured)
     # Of both times through, for whoever asks what an answer costs.
     out.timings |= watch.report()
     return out
 
 
+def _needs_depth(method: Method) -> bool:
+    return bool(getattr(method, "needs_depth", False))
+
+
+def _joined(
+    still: Tracked, moving: Tracked, deep: Sequence[str], names: Sequence[str], pictured: str | None
+) -> Tracked:
+    """What was tracked with the tissue's own motion off, and of the methods `deep` with it in."""
+    if not deep:
+        return still
+    if still.frame != moving.frame:
+        raise AssertionError("both times through a film the same frames are asked about")
+    for name in names:
+        source = moving if name in deep else still
+        # In the order asked for.
+        still.force_mn[name] = source.force_mn.pop(name) if source is still else source.force_mn[name]
+        still.bounds[name] = source.bounds.pop(name) if source is still else source.bounds[name]
+    still.sight = moving.sight
+    if pictured in deep:
+        still.snapshots = moving.snapshots
+    if moving.sight is not None:
+        still.notes.append(moving.sight.describe())
+    still.notes += [note for note in moving.notes if note.startswith(tuple(f"{name}: " for name in deep))]
+    still.notes.append(f"{', '.join(deep)}: reads both eyes, so the tissue's own motion is in it")
+    return still
+
+
 def _track(
     recording: Recording,
-    methods: Mapping[str, Method],
     scale_mm_per_px: float,
     settings: Settings,
     pictured: str | None,
     flow: FlowHere | None,
     progress: Progress,
     watch: Stopwatch,
+    methods: Mapping[str, Method],
     pulse: Pulse | None,
 ) -> tuple[Tracked, Pulse | None]:
     """Once through the video; what was tracked, and the pulse that is still in it."""
@@ -197,7 +227,8 @@ def _tell(
     if recording.right or recording.depths:
         # Flow without the pulse and depth with it would be a motion that nothing made.
         out.notes.append(
-            "the tissue's own motion is off the flow, not off depth: the second eye was not used (--no-pulse)"
+            "the tissue's own motion is off the flow, not off depth: by who can read flow the second eye was "
+            "not used (--no-pulse)"
         )
     out.pulse = [
         {"rate_hz": rhythm.rate_hz, "amplitude_mm": mm_per_px * size}

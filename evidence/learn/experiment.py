@@ -109,6 +109,8 @@ def large_runs() -> Iterator[Run]:
             settings = replace(base, fold=fold, objective=LOSSES[name])
             yield Run(f"{name}-fold{fold}-seed0", settings, controlled=False)
     yield Run("wide-fold0-seed0", replace(base, arch=replace(base.arch, width=32)), controlled=False)
+    # What `learn train --preset cpu` takes: its epochs have so many frames, however many sequences there are.
+    yield Run("cpu-fold0-seed0", preset("cpu", folds=base.folds), controlled=False)
 
 
 BESIDE: dict[str, tuple[tuple[int, int, int], ...]] = {

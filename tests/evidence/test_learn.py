@@ -173,7 +173,7 @@ def test_runs_that_were_tested_on_other_sequences_are_not_averaged(tmp_path: Pat
 
 def test_runs_of_two_kinds_are_not_asked_for_at_once(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="one of them"):
-        experiment(tmp_path, fine=True, presets=True)
+        experiment(tmp_path, fine=True, large=True)
 
 
 def test_tables_give_back_what_runs_left(tmp_path: Path) -> None:

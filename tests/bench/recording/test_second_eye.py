@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -20,7 +21,8 @@ from bench.recording.pixel_scale import Scale
 from bench.scoring import report
 from bench.scoring.evaluate_recording import as_json, evaluate_recording
 from bench.tracking.tracking import track_recording
-from learn.inference.video_flow import Settings
+from learn.inference.pulse import Pulse, Rhythm
+from learn.inference.video_flow import Settings, VideoFlow
 from synth.errors import UserError
 from synth.flow.stereo.track import Moved
 
@@ -206,3 +208,38 @@ def test_sixteen_bit_depth_and_two_eyes_smaller(make: Make) -> None:
     assert method.told[2].motion.shape == (60, 80, 3)
     # So small a picture says little of depth, which the prior then flattens.
     assert method.told[2].motion[30, 40, 2] == pytest.approx(rise(0.6)[60, 80], rel=0.3)
+
+
+def test_who_needs_both_eyes_has_them_on_tissue_that_beats(
+    make: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Depth has the beat in it: who can read flow reads that without it, the others all that there is."""
+    pixels = (SIZE[1], SIZE[0])
+    beat = Rhythm(1.2, np.zeros(1), np.zeros(1), np.zeros((2, 1, 2)))
+    drift = np.full((*pixels, 2), 0.5, np.float32)
+    found = Pulse((beat,), np.zeros((*pixels, 1), np.float32), np.zeros((1, 2)), drift, (0.5,), 1.0)
+    monkeypatch.setattr(VideoFlow, "find_pulse", lambda *_: found)
+
+    class Deep(Looking):
+        needs_depth = True
+
+    class Flat:
+        def __call__(self, flow: np.ndarray, confidence: np.ndarray, scene: Scene, picture: bool) -> Answer:
+            return Answer(np.array([*flow.reshape(-1, 2).mean(0), 0.0]))
+
+    recording, settings = open_recording(make("right")), replace(SETTINGS, pulse=True)
+    deep = Deep()
+    both = track_recording(
+        recording, {"a": Flat(), "b": deep, "c": Flat()}, AWAY / FOCAL, settings, pictured="b"
+    )
+    assert list(both.force_mn) == ["a", "b", "c"] == list(both.bounds)
+    assert len(deep.told) == len(both.force_mn["b"]) == 3
+    monkeypatch.setattr(VideoFlow, "find_pulse", lambda *_: None)
+    still = track_recording(recording, {"a": Flat(), "b": Deep()}, AWAY / FOCAL, settings, pictured="b")
+    np.testing.assert_array_equal(both.force_mn["b"], still.force_mn["b"])
+    shifted = np.array(still.force_mn["a"][1:]) - [0.5, 0.5, 0]
+    np.testing.assert_allclose(both.force_mn["a"][1:], shifted, atol=1e-3)
+    np.testing.assert_array_equal(both.force_mn["c"], both.force_mn["a"])
+    assert any(note == "b: reads both eyes, so the tissue's own motion is in it" for note in both.notes)
+    assert both.sight is not None
+    assert both.snapshots[-1].depth is not None
