@@ -158,13 +158,16 @@ def make_exvivo(
     width: Annotated[int, typer.Option(min=64, help="Width of the picture; the height is 3/4 of it.")] = 320,
     photo: Annotated[Path | None, typer.Option(help="A photograph as texture of the surface.")] = None,
     seed: Annotated[int, typer.Option(help="Root of all draws.")] = 100,
+    eyes: Annotated[int, typer.Option(min=1, max=2, help="Cameras that look on.")] = 1,
     json: Json = False,
 ) -> None:
     """Renders pseudo ex vivo recordings, unlike any training data in every respect at once."""
     from bench.output.progress_bar import counting
     from evidence.scoring import exvivo
 
-    plan = exvivo.Plan(seed, seconds, fps, (width, width * 3 // 4), photo.resolve() if photo else None)
+    plan = exvivo.Plan(
+        seed, seconds, fps, (width, width * 3 // 4), photo.resolve() if photo else None, eyes=eyes
+    )
     written = []
     for index in range(first, first + count):
         with counting(f"recording {index}", int(seconds * fps)) as progress:

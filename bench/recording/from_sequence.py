@@ -81,7 +81,7 @@ def _footage(sequence: Sequence, part: Path, kind: Literal["png", "mp4"], time: 
 def _second_eye(
     sequence: Sequence, part: Path, kind: Literal["png", "mp4"], time: NDArray[np.float64]
 ) -> None:
-    """The right eye's film and the pair's calibration, as OpenCV's `stereoCalibrate` would have given it."""
+    """The right eye's film and the pair's calibration."""
     pictures = (np.asarray(sequence["rgb_right"][t], np.uint8) for t in range(sequence.frames))
     if kind == "mp4":
         writer.write_video(part / "right.mp4", pictures, time)
@@ -89,15 +89,7 @@ def _second_eye(
         (part / "right").mkdir()
         for t, rgb in enumerate(pictures):
             _write(part / "right" / f"{t:06d}.png", rgb[..., ::-1])
-    left, right = optics.camera_of(sequence), stereo.right_of(sequence)
-    away = (right.translation - left.translation)[:, None]
-    storage = cv2.FileStorage(str(part / _PAIR), cv2.FILE_STORAGE_WRITE)
-    for number, eye in (("1", left), ("2", right)):
-        storage.write(f"K{number}", eye.K)
-        storage.write(f"D{number}", np.atleast_2d(eye.distortion))
-    storage.write("R", right.rotation @ left.rotation.T)
-    storage.write("T", away)
-    storage.release()
+    writer.write_pair(part / _PAIR, optics.camera_of(sequence), stereo.right_of(sequence))
 
 
 def _anatomy(sequence: Sequence) -> str:

@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from fractions import Fraction
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import av
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from ruamel.yaml import YAML
@@ -14,7 +16,18 @@ from ruamel.yaml import YAML
 from synth.errors import UserError
 from synth.system.whole_file import folder_of as write_whole_folder
 
-__all__ = ["write_force", "write_frames", "write_meta", "write_tip", "write_video", "write_whole_folder"]
+if TYPE_CHECKING:
+    from synth.render.camera.camera import Camera
+
+__all__ = [
+    "write_force",
+    "write_frames",
+    "write_meta",
+    "write_pair",
+    "write_tip",
+    "write_video",
+    "write_whole_folder",
+]
 
 Floats = NDArray[np.float64]
 
@@ -39,6 +52,18 @@ def write_meta(folder: Path, said: Mapping[str, object]) -> None:
     """Writes meta.yaml."""
     with (folder / "meta.yaml").open("w", encoding="utf-8") as file:
         YAML().dump(dict(said), file)
+
+
+def write_pair(path: Path, left: Camera, right: Camera) -> None:
+    """Writes the pair's calibration, K1, D1, K2, D2, R, T, as OpenCV's `stereoCalibrate` gives it."""
+    turn = right.rotation @ left.rotation.T
+    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    for number, eye in (("1", left), ("2", right)):
+        storage.write(f"K{number}", eye.K)
+        storage.write(f"D{number}", np.atleast_2d(eye.distortion))
+    storage.write("R", turn)
+    storage.write("T", (right.translation - turn @ left.translation)[:, None])
+    storage.release()
 
 
 def write_video(path: Path, pictures: Iterator[NDArray[np.uint8]], times_s: Floats, crf: int = 12) -> None:

@@ -34,6 +34,7 @@ _GESTURES = 3
 _LEVELS = 9
 _SENSOR_HZ = 200.0
 _STILL_S = 1.5
+_STEREO_MM, _PAIR = 24.0, "pair.yaml"
 _SYNC_S = 9.0
 _PRESS_S = 13.0
 # Creep: the part of the response that comes late, and how late [s].
@@ -51,6 +52,7 @@ class Plan:
     photo: Path | None = None
     """A photograph as texture; else procedural, of the family no other default job draws."""
     variant: str = "auto"
+    eyes: int = 1
 
 
 @dataclass(frozen=True)
@@ -89,6 +91,7 @@ def job_of(plan: Plan) -> jobs.Job:
                 "size": plan.size, "spp": 4, "field_mm": [30.0, 40.0], "tilt_deg": [5.0, 25.0],
                 "working_distance_mm": [220.0, 380.0], "aperture_mm": 6.0,
                 "distortion": [-0.12, 0.03, 0.001, -0.001, 0.0], "variant": plan.variant,
+                "stereo_mm": _STEREO_MM if plan.eyes == 2 else 0.0,
             },
         }
     )  # fmt: skip
@@ -122,19 +125,26 @@ def _fill(plan: Plan, index: int, part: Path, progress: Progress) -> None:
     times = _frame_times(plan, rng)
     studio = Studio(surface, case.look, view, job)
     pictures: list[NDArray[np.uint8]] = []
+    beside: list[NDArray[np.uint8]] = []
     for k, time in enumerate(times):
         at = int(np.searchsorted(course.time_s, time).clip(0, len(course.time_s) - 1))
         motion, gesture = motions[course.gesture[at]], gestures[course.gesture[at]]
         vertices, tips, shafts = _pose(motion, gesture, course, at, rng)
         shot = studio.frame(vertices, tips, shafts, int(rng.integers(2**31)))
         pictures.append(shot.rgb)
+        if shot.rgb_right is not None:
+            beside.append(shot.rgb_right)
         cv2.imwrite(str(part / "masks" / f"{k:06d}.png"), shot.tool.astype(np.uint8) * 255)
         progress(k + 1)
-    writer.write_video(part / "video.mp4", iter(pictures), times, crf=int(rng.integers(18, 25)))
+    crf = int(rng.integers(18, 25))
+    writer.write_video(part / "video.mp4", iter(pictures), times, crf=crf)
+    if studio.right is not None:
+        writer.write_video(part / "right.mp4", iter(beside), times, crf=crf)
+        writer.write_pair(part / _PAIR, view, studio.right)
     cv2.imwrite(str(part / "tissue.png"), studio.still.tissue.astype(np.uint8) * 255)
     force = np.stack([g.force_mn * np.asarray(g.direction) for g in gestures])[course.gesture]
     lag = _write_sensor(part, course, force * course.level[:, None], rng)
-    about = {
+    about: dict[str, object] = {
         "scale_mm_per_px": float(studio.still.scale_mm_per_px * (1 + 0.02 * rng.normal())),
         "scale_uncertainty": 0.02,
         "young_kpa": case.tissue.young_kpa,
@@ -143,6 +153,8 @@ def _fill(plan: Plan, index: int, part: Path, progress: Progress) -> None:
         "sync": {"method": "correlate", "calibration_s": [0.0, _SYNC_S], "search_s": 0.7},
         "sensor": {"axes": "sensor", "low_pass_hz": 10.0, "free_s": _free_spans(plan, lag)},
     }
+    if studio.right is not None:
+        about["stereo"] = {"calibration": _PAIR}
     writer.write_meta(part, about)
 
 
