@@ -59,10 +59,10 @@ class Card:
     """The anatomies of each, so that a sequence of a seen anatomy is never taken for unseen."""
     epoch: Annotated[int, Field(ge=0)] = 0
     score: FiniteFloat = 0.0
-    """R² on the select sequences at the chosen epoch."""
-    gain: Positive = 1.0
-    """What the network's map is multiplied by: slope of the true on the said total force, on the select
-    sequences at the chosen epoch (Cox, Biometrika 45, 1958)."""
+    """R² on the select sequences at the chosen epoch, of the network's own map, before `force_gain`."""
+    force_gain: Positive = 1.0
+    """What the network's map is multiplied by (not what a total-force head says): the slope through the
+    origin of the true on the said total force, on the select sequences at the chosen epoch."""
     weights_hash: str = ""
     """Of the file of weights; empty before an epoch is kept, and in folders from before there were hashes."""
     intervals: Intervals | None = None
@@ -79,7 +79,7 @@ def write_card(folder: Path, card: Card) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     tree = {"format": _FORMAT, "version": _VERSION, **_CARD.dump_python(card, mode="json")}
     # Where nobody tried, as before there were any.
-    unused = {"intervals": None, "no_intervals": "", "gain": 1.0}
+    unused = {"intervals": None, "no_intervals": "", "force_gain": 1.0}
     tree = {k: v for k, v in tree.items() if k not in unused or v != unused[k]}
     tree["seal"] = _hash(identity.canonical(tree))
     _write(folder / "config.json", (json.dumps(tree, indent=1) + "\n").encode())

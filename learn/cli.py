@@ -136,7 +136,8 @@ def _tell_trained(card: Card, settings: Settings, out: Path, json: bool) -> None
     else:
         _console.print(
             f"Model in {out}: epoch {card.epoch} of {settings.epochs}, R² {card.score:.3f} on "
-            f"{result['select']} select sequences; fitted on {result['fit']}, "
+            f"{result['select']} select sequences (its force times {card.force_gain:.3g}); "
+            f"fitted on {result['fit']}, "
             f"{result['test']} kept for `learn eval`. {_told_of_intervals(card)}"
         )
 

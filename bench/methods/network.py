@@ -42,12 +42,18 @@ class Model:
             "stem": settings.arch.stem,
             "input": settings.input,
             "target": settings.target,
+            "force_gain": self.predictor.card.force_gain,
         }
 
     @property
     def needs_depth(self) -> bool:
         """See `Method`."""
         return self.predictor.card.settings.arch.depth
+
+    @property
+    def knows_sway(self) -> bool:
+        """See `Method`."""
+        return self.predictor.card.settings.sway_mm > 0
 
     @property
     def notes(self) -> list[str]:

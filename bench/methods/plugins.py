@@ -32,6 +32,11 @@ class Plugged:
         """See `Method`."""
         return bool(getattr(self._method, "needs_depth", False))
 
+    @property
+    def knows_sway(self) -> bool:
+        """See `Method`."""
+        return bool(getattr(self._method, "knows_sway", False))
+
     def __call__(
         self, flow: NDArray[np.float32], confidence: NDArray[np.float32], scene: Scene, picture: bool
     ) -> Answer:

@@ -67,11 +67,12 @@ class SecondEye:
         self._lags: list[float] = []
 
     @property
-    def sight(self) -> Sight:
-        """What it came to, once steps are through."""
+    def sight(self) -> Sight | None:
+        """What it came to, once steps are through; None where the rest frame showed nothing."""
         noise = float(np.median(self._noise)) if self._noise else float("nan")
         if self._stereo is None:
-            assert self._depth is not None
+            if self._depth is None:
+                return None
             away, focal = self._depth.distance_mm, float(self._depth.K[0, 0])
             scale = away / focal / self._video.shrink
             return Sight(float("nan"), float("nan"), scale, noise)

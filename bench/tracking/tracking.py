@@ -115,6 +115,12 @@ def track_recording(
         deep = [name for name, one in methods.items() if out.sight is not None and _needs_depth(one)]
         still, _ = once({name: one for name, one in methods.items() if name not in deep}, found)
         out = _joined(still, out, deep, list(methods), pictured)
+        for name in deep:
+            taught = getattr(methods[name], "knows_sway", False)
+            never = "" if taught else ", which it never met: a breath may count as a press (sway_mm)"
+            out.notes.append(
+                f"{name}: needs motion in depth, so it was asked with the tissue's own motion in it{never}"
+            )
     # Of both times through, for whoever asks what an answer costs.
     out.timings |= watch.report()
     return out
@@ -143,7 +149,6 @@ def _joined(
     if moving.sight is not None:
         still.notes.append(moving.sight.describe())
     still.notes += [note for note in moving.notes if note.startswith(tuple(f"{name}: " for name in deep))]
-    still.notes.append(f"{', '.join(deep)}: reads both eyes, so the tissue's own motion is in it")
     return still
 
 
@@ -217,7 +222,7 @@ def _tell(
         out.timings["flow_peak_rss_mb"] = round(video.peak_bytes / 1e6, 1)
     if out.sight is not None:
         out.notes.append(out.sight.describe())
-    if video.surface is not None and len(video.surface.time_s) < LEAST_FRAMES:
+    if video.surface is not None and not out.fault and len(video.surface.time_s) < LEAST_FRAMES:
         out.notes.append(
             f"{len(video.surface.time_s)} frames could be followed, heart and breath are looked for from "
             f"{LEAST_FRAMES} on: if the tissue moves by itself, that is still in it"
@@ -227,8 +232,8 @@ def _tell(
     if recording.right or recording.depths:
         # Flow without the pulse and depth with it would be a motion that nothing made.
         out.notes.append(
-            "the tissue's own motion is off the flow, not off depth: by who can read flow the second eye was "
-            "not used (--no-pulse)"
+            "the tissue's own motion is off the flow, not off depth: methods that can read flow were asked "
+            "without the second eye (--no-pulse asks them with it)"
         )
     out.pulse = [
         {"rate_hz": rhythm.rate_hz, "amplitude_mm": mm_per_px * size}

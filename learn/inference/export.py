@@ -49,7 +49,7 @@ class Portable(nn.Module):
             earlier = displacement[:, arch.displacements :]
         x = channels(now, mask, self.card.settings.grid.pitch_mm, self.card.scales, confidence, earlier)
         said = self.model(x, log_young)
-        unit = self.card.scales.target * self.card.gain
+        unit = self.card.scales.target * self.card.force_gain
         if arch.total:
             return said[0] * unit, said[1] * self.card.scales.force
         y: Tensor = said * unit

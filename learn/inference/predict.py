@@ -280,7 +280,7 @@ class Predictor:
                 totals.append(total.double().cpu().numpy())
             maps.append(said.float().cpu().numpy())
         with np.errstate(over="ignore", invalid="ignore"):  # said below
-            density = np.concatenate(maps) * np.float32(scales.target * self.card.gain * young_kpa)
+            density = np.concatenate(maps) * np.float32(scales.target * self.card.force_gain * young_kpa)
             total = np.concatenate(totals) * (scales.force * young_kpa) if totals else None
         if not (np.isfinite(density).all() and (total is None or np.isfinite(total).all())):
             raise UserError("the model answers NaN or infinity: its weights or scales can't be right")

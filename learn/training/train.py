@@ -36,7 +36,8 @@ from synth.errors import UserError
 LOOK = 16
 """Steps between two looks at the loss and its gradient: each makes a GPU wait."""
 _TELLING, _GAINS = 8, (0.67, 1.5)
-"""Sequences that tell a gain, and its limits: what is further off has not learnt."""
+"""Anatomies that a force gain is told by at least, and its limits: a network further off than that has not
+learnt, and stretching it would hide it."""
 
 Report = Callable[[int, int, dict[str, float]], None]
 """Told after every batch: batches done, batches there will be, latest numbers."""
@@ -102,8 +103,9 @@ def _go_on(
             if write is not None:
                 write(epoch, numbers)
                 if improved:
-                    gain = numbers.get("select_gain", 1.0)
-                    best = dataclasses.replace(card, epoch=run.epoch, score=run.best, gain=gain)
+                    best = dataclasses.replace(
+                        card, epoch=run.epoch, score=run.best, force_gain=numbers["select_gain"]
+                    )
                     checkpoint.write_model(out, best, _cpu(run.model.state_dict()))
                 checkpoint.save_tensors(out / "last.pt", run.as_dict())
             fabric.barrier()
@@ -280,7 +282,7 @@ def select_score(net: Any, frames: Frames, scales: Scales, device: torch.device)
     return {
         "select_r2": result.r2 if math.isfinite(result.r2) else -math.inf,
         "select_rmse": result.rmse,
-        "select_gain": _gain(forces, len(frames.clips)),
+        "select_gain": _gain(forces, len({clip.group for clip in frames.clips})),
     }
 
 
@@ -290,9 +292,9 @@ def _amount(maps: torch.Tensor, settings: Settings) -> torch.Tensor:
     return (flat.amax(2) if settings.target == "intensity" else flat.sum(2)).flatten()
 
 
-def _gain(forces: Moments, sequences: int) -> float:
-    """Slope through the origin of true on said force; 1 where too few sequences tell, `_GAINS` at most."""
-    if sequences < _TELLING or not forces.tp > 0:
+def _gain(forces: Moments, anatomies: int) -> float:
+    """Slope through the origin of true on said force, within `_GAINS`; 1 where too few anatomies tell it."""
+    if anatomies < _TELLING or not forces.tp > 0:
         return 1.0
     return min(max(forces.tp / forces.pp, _GAINS[0]), _GAINS[1])
 

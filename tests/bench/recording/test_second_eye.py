@@ -5,14 +5,18 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from dataclasses import replace
+from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from skimage import data
 
 from bench.methods import baselines
+from bench.methods.network import Model
+from bench.methods.plugins import Plugged
 from bench.methods.protocol import Answer, Scene
 from bench.recording import writer
 from bench.recording.check import check_recording
@@ -22,9 +26,12 @@ from bench.scoring import report
 from bench.scoring.evaluate_recording import as_json, evaluate_recording
 from bench.tracking.tracking import track_recording
 from learn.inference.pulse import Pulse, Rhythm
+from learn.inference.shipped import MODELS
 from learn.inference.video_flow import Settings, VideoFlow
 from synth.errors import UserError
+from synth.flow.stereo.calibration import read_rig
 from synth.flow.stereo.track import Moved
+from synth.render.camera.camera import Camera
 
 SIZE = (160, 120)
 FOCAL, BASE, AWAY = 1370.0, 24.0, 300.0
@@ -109,6 +116,12 @@ class Looking:
     ) -> Answer:
         self.told.append(moved)
         return Answer(moved.motion[50:70, 70:90].mean(axis=(0, 1)).astype(np.float64))
+
+
+class Deep(Looking):
+    """Reads nothing else."""
+
+    needs_depth = True
 
 
 @pytest.mark.parametrize("second", ["right", "depth"])
@@ -220,9 +233,6 @@ def test_who_needs_both_eyes_has_them_on_tissue_that_beats(
     found = Pulse((beat,), np.zeros((*pixels, 1), np.float32), np.zeros((1, 2)), drift, (0.5,), 1.0)
     monkeypatch.setattr(VideoFlow, "find_pulse", lambda *_: found)
 
-    class Deep(Looking):
-        needs_depth = True
-
     class Flat:
         def __call__(self, flow: np.ndarray, confidence: np.ndarray, scene: Scene, picture: bool) -> Answer:
             return Answer(np.array([*flow.reshape(-1, 2).mean(0), 0.0]))
@@ -240,6 +250,40 @@ def test_who_needs_both_eyes_has_them_on_tissue_that_beats(
     shifted = np.array(still.force_mn["a"][1:]) - [0.5, 0.5, 0]
     np.testing.assert_allclose(both.force_mn["a"][1:], shifted, atol=1e-3)
     np.testing.assert_array_equal(both.force_mn["c"], both.force_mn["a"])
-    assert any(note == "b: reads both eyes, so the tissue's own motion is in it" for note in both.notes)
+    (note,) = [note for note in both.notes if note.startswith("b: needs motion in depth")]
+    assert note.endswith("a breath may count as a press (sway_mm)"), "nobody taught it"
     assert both.sight is not None
     assert both.snapshots[-1].depth is not None
+
+
+@pytest.mark.parametrize("second", ["right", "depth"])
+def test_a_black_rest_frame_is_said_and_no_crash(make: Make, second: str) -> None:
+    folder = make(second)
+    cv2.imwrite(str(folder / "frames/0.png"), np.full((SIZE[1], SIZE[0], 3), 3, np.uint8))
+    done = track_recording(open_recording(folder), {}, AWAY / FOCAL, SETTINGS)
+    assert (done.fault, done.sight) == ("the rest frame is black", None)
+    assert any("black" in finding.said for finding in check_recording(folder))
+
+
+def test_who_needs_depth_says_so() -> None:
+    deep = Plugged("deep", EntryPoint("deep", "here:deep", "sulcus.method"), Deep())
+    assert deep.needs_depth
+    assert not deep.knows_sway
+    assert [baselines.Baseline(len, space).needs_depth for space in ("never", "always")] == [False, True]
+    assert (Model(MODELS / "stereo").needs_depth, Model(MODELS / "mono").needs_depth) == (True, False)
+    assert Model(MODELS / "stereo").knows_sway
+
+
+def test_a_written_pair_is_read_back(tmp_path: Path) -> None:
+    """Two cameras that turn inwards: x_right = R x_left + T."""
+    rng = np.random.default_rng(0)
+    lenses = [
+        Camera(K + 0, np.array([-0.1, 0.02, 0, 0, 0]), turn, rng.normal(0, 20, 3), SIZE, 0.0, 0.0, 0.2)
+        for turn in Rotation.random(2, random_state=1).as_matrix()
+    ]
+    writer.write_pair(tmp_path / "pair.yaml", *lenses)
+    found = read_rig(tmp_path / "pair.yaml", SIZE)
+    point = rng.normal(0, 10, 3)
+    left, right = (lens.rotation @ point + lens.translation for lens in lenses)
+    np.testing.assert_allclose(found.rotation @ left + found.translation, right, atol=1e-6)
+    np.testing.assert_allclose(found.right.distortion, lenses[1].distortion, atol=1e-12)

@@ -79,10 +79,10 @@ def test_an_exported_model_says_the_same(model: Path, tmp_path: Path, kind: str)
     assert note["grid"]["pitch_mm"] == 36 / 32
 
 
-def test_the_gain_is_in_every_answer(model: Path, tmp_path: Path) -> None:
+def test_the_gain_is_in_every_map(model: Path, tmp_path: Path) -> None:
     folder = tmp_path / "model"
     shutil.copytree(model, folder)
-    write_card(folder, replace(read_card(model), gain=1.25))
+    write_card(folder, replace(read_card(model), force_gain=1.25))
     plain, gained = load_predictor(model), load_predictor(folder)
     told = examples(plain.card, 1)
     before, after = (one.density(told[0].numpy(), told[1][0, 0].numpy(), 1.0) for one in (plain, gained))

@@ -20,7 +20,7 @@ from learn.evaluation.metrics import Moments
 from learn.inference.predict import load_predictor
 from learn.loss import SHARES, Objective
 from learn.settings import Settings, preset, replace
-from learn.training.batches import Frames, measure_scales, swayed
+from learn.training.batches import Batch, Frames, measure_scales, swayed
 from learn.training.gpu_batches import Resident, held
 from learn.training.train import moments, select_score, train
 from synth.dataset.store import Dataset
@@ -347,7 +347,9 @@ def test_training_stops_early(
     clips: list[Clip], split: Split, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     scores = iter([0.1, 0.5, 0.4, 0.3, 0.2])
-    monkeypatch.setattr("learn.training.train.select_score", lambda *_: {"select_r2": next(scores)})
+    monkeypatch.setattr(
+        "learn.training.train.select_score", lambda *_: {"select_r2": next(scores), "select_gain": 1.0}
+    )
     card = train(clips, split, small(epochs=9, stop=2), tmp_path / "m")
     assert (card.epoch, card.score) == (2, 0.5)
     assert len((tmp_path / "m/history.jsonl").read_text().splitlines()) == 4
@@ -357,25 +359,50 @@ def test_no_epoch_is_chosen_before_the_price_of_ghosts_is_whole(
     clips: list[Clip], split: Split, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     scores = iter([0.9, 0.8, 0.1, 0.2])
-    monkeypatch.setattr("learn.training.train.select_score", lambda *_: {"select_r2": next(scores)})
+    monkeypatch.setattr(
+        "learn.training.train.select_score", lambda *_: {"select_r2": next(scores), "select_gain": 1.0}
+    )
     objective = Objective(kind="hinge", ramp=(0.25, 0.75))
     assert train(clips, split, small(objective=objective), tmp_path / "m").epoch == 4
 
 
 @pytest.mark.parametrize(
-    ("share", "sequences", "gain"),
-    [(0.8, 8, 1.25), (0.8, 7, 1.0), (0.1, 8, 1.5), (2.0, 8, 0.67), (0.0, 8, 1.0)],
+    ("share", "anatomies", "limits"),
+    [
+        (0.8, 8, (1.0, 1.5)),
+        (0.8, 7, (1.0, 1.0)),
+        (0.1, 8, (1.5, 1.5)),
+        (2.0, 8, (0.67, 0.67)),
+        (0.0, 8, (1.0, 1.0)),
+    ],
 )
 def test_what_a_network_says_too_little_of_the_force_is_its_gain(
-    clips: list[Clip], monkeypatch: pytest.MonkeyPatch, share: float, sequences: int, gain: float
+    clips: list[Clip],
+    monkeypatch: pytest.MonkeyPatch,
+    share: float,
+    anatomies: int,
+    limits: tuple[float, float],
 ) -> None:
-    settings, scales = small(), measure_scales(clips, small())
-    monkeypatch.setattr(
-        "learn.training.train.forward", lambda net, batch, *_: (share * batch.target.clone(), None)
-    )
-    chosen = Frames([clips[i % len(clips)] for i in range(sequences)], settings)
-    found = select_score(torch.nn.Identity(), chosen, scales, torch.device("cpu"))
-    assert found["select_gain"] == pytest.approx(gain, rel=1e-6)
+    settings = small()
+    true, said = [], []
+
+    def forward(_: object, batch: Batch, *__: object) -> tuple[torch.Tensor, None]:
+        """Says more of one frame than of another, twice as much on one side, and junk where no tissue is."""
+        frames = torch.linspace(0.6, 1.4, len(batch.target))[:, None, None, None]
+        side = torch.linspace(1.5, 0.5, settings.size)
+        answer = share * frames * side * batch.target
+        true.extend((batch.target * batch.mask).sum((2, 3)).flatten().tolist())
+        said.extend((answer * batch.mask).sum((2, 3)).flatten().tolist())
+        return answer + 9 * (1 - batch.mask), None
+
+    monkeypatch.setattr("learn.training.train.forward", forward)
+    told = [dataclasses.replace(clips[i % len(clips)], group=str(i % anatomies)) for i in range(10)]
+    chosen = Frames(told, settings)
+    found = select_score(torch.nn.Identity(), chosen, measure_scales(clips, settings), torch.device("cpu"))
+    slope = np.dot(true, said) / max(np.dot(said, said), 1e-30)
+    assert found["select_gain"] == pytest.approx(np.clip(slope, *limits), rel=1e-6)
+    if limits == (1.0, 1.5):
+        assert 1.0 < slope < 1.5, "within the limits nothing else is tested"
 
 
 def test_the_kept_epoch_has_its_own_gain(
@@ -385,6 +412,6 @@ def test_the_kept_epoch_has_its_own_gain(
         [{"select_r2": r2, "select_gain": gain} for r2, gain in ((0.1, 1.4), (0.5, 1.2), (0.4, 1.3))]
     )
     monkeypatch.setattr("learn.training.train.select_score", lambda *_: next(scores))
-    assert train(clips, split, small(epochs=3), tmp_path / "m").gain == 1.2
-    assert checkpoint.read_card(tmp_path / "m").gain == 1.2
+    assert train(clips, split, small(epochs=3), tmp_path / "m").force_gain == 1.2
+    assert checkpoint.read_card(tmp_path / "m").force_gain == 1.2
     assert '"select_gain": 1.3' in (tmp_path / "m/history.jsonl").read_text()
