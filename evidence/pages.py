@@ -233,7 +233,8 @@ _ENGINE: tuple[tuple[str, str, Callable[[Tree], float]], ...] = (
 _BESIDE = "figures.html"
 """Where a README stands, which the site shows as the folder's page."""
 _FILES: Mapping[str, tuple[str, str | Callable[[Tree], Page]]] = {
-    "exvivo": ("pool.json", lambda found: pool.drawn(found, "README.md")),
+    "exvivo/one-eye": ("pool.json", lambda found: pool.drawn(found, "README.md")),
+    "exvivo/two-eyes": ("pool.json", lambda found: pool.drawn(found, "README.md")),
     "gap": ("results.json", "gap.experiment"),
     "inverse": ("results.json", "scoring.inverse"),
     "pulse": ("results.json", "scoring.pulse"),
