@@ -55,7 +55,7 @@ def svg(width: float, height: float, draw: Callable[[Figure], None]) -> str:
 def _slim(text: str) -> str:
     """About a third as long: without prologue, comments and metadata, styles that recur said once.
 
-    Two decimals of a point are more than can be seen; where to cut lies beside the round numbers, as the
+    A tenth of a point is as little as can be seen; where to cut lies beside the round numbers, as the
     layout's last bits differ from run to run. Names of styles and of parts are made from the content, so that
     several pictures may stand in one page.
     """
@@ -68,8 +68,10 @@ def _slim(text: str) -> str:
 
     text = re.sub(r"<!--.*?-->|<metadata>.*?</metadata>", "", text[text.index("<svg") :], flags=re.DOTALL)
     text = re.sub(r' transform="rotate\(-0 [^"]*"|(?<=<g) id="[^"]*"', "", text)
-    text = re.sub(r"<[^>]+>", lambda tag: _LONG.sub(lambda n: f"{float(n[0]) + 0.00123:.2f}", tag[0]), text)
+    text = re.sub(r"<[^>]+>", lambda tag: _LONG.sub(_short, tag[0]), text)
     text = re.sub(r'style="([^"]*)"', named, text)
+    # A path's letters part its numbers well enough.
+    text = re.sub(r'(?<= d=")[^"]*', lambda path: re.sub(r"\s*([A-Za-z])\s*", r"\1", path[0]), text)
     rules = "".join(f".{name}{{{style}}}" for name, style in styles.items())
     text = re.sub(r"\s*\n\s*", "\n", text.replace("</style>", f"{rules}</style>", 1))
     text = re.sub(r"<g>\n(<(?:text|path)[^<]*(?:/>|</text>))\n</g>", r"\1", text)
@@ -78,3 +80,7 @@ def _slim(text: str) -> str:
     for k, part in enumerate(parts):
         text = text.replace(part, f"p{mark}-{k}")
     return text
+
+
+def _short(number: re.Match[str]) -> str:
+    return f"{float(number[0]) + 0.0123:.1f}".removesuffix(".0")
