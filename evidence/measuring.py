@@ -142,13 +142,10 @@ def shortened(value: Any) -> Any:
     return float(f"{value:.6g}") if isinstance(value, float) else value
 
 
-def four_digits(value: float) -> float:
-    """The nearest number with 13 bits after its first: those that follow can't be packed, and say nothing."""
+def four_digits(value: float, bits: int = 13) -> float:
+    """The nearest number of so many bits: those that follow can't be packed, and say nothing."""
     part, power = math.frexp(value)
-    return math.ldexp(round(part * 2**_BITS), power - _BITS) if math.isfinite(value) else value
-
-
-_BITS = 13
+    return math.ldexp(round(part * 2**bits), power - bits) if math.isfinite(value) else value
 
 
 def _named(file: str, values: dict[str, Any]) -> str:

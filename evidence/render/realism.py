@@ -55,7 +55,7 @@ def realism_figures(
     ]
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
-        cv2.imwrite(str(out / "sheet.webp"), _sheet(pictures)[..., ::-1], [cv2.IMWRITE_WEBP_QUALITY, 30])
+        cv2.imwrite(str(out / "sheet.webp"), _sheet(pictures)[..., ::-1], [cv2.IMWRITE_WEBP_QUALITY, 24])
     if beside is not None:
         cv2.imwrite(str(beside), _beside(pictures, scaled_photograph(photo, width_mm / pixel))[..., ::-1])
     return {
