@@ -168,8 +168,9 @@ def _check_following(recording: Recording, found: _Findings) -> None:
             except UserError as error:
                 found.add("bad", "second eye", str(error))
                 second = None
-    if second is not None and second.sight is not None:  # without one the rest frame is at fault
-        _check_sight(second.sight, recording, found)
+    sight = None if second is None else second.sight
+    if sight is not None:  # without one the rest frame is at fault
+        _check_sight(sight, recording, found)
     if account.frames:
         found.add("odd" if account.is_odd else "ok", "following", account.describe())
 

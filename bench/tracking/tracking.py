@@ -138,11 +138,9 @@ def _joined(
         return still
     if still.frame != moving.frame:
         raise AssertionError("both times through a film the same frames are asked about")
-    for name in names:
-        source = moving if name in deep else still
-        # In the order asked for.
-        still.force_mn[name] = source.force_mn.pop(name) if source is still else source.force_mn[name]
-        still.bounds[name] = source.bounds.pop(name) if source is still else source.bounds[name]
+    source = {name: moving if name in deep else still for name in names}
+    still.force_mn = {name: source[name].force_mn[name] for name in names}
+    still.bounds = {name: source[name].bounds[name] for name in names}
     still.sight = moving.sight
     if pictured in deep:
         still.snapshots = moving.snapshots
