@@ -15,7 +15,7 @@ from bench.methods.protocol import InSpace, Method, Scene
 from bench.recording.folder import Recording
 from bench.recording.meta import Span
 from bench.recording.second_eye import SecondEye, Sight
-from learn.inference.pulse import LEAST_FRAMES, Pulse, Surface
+from learn.inference.pulse import Pulse, Surface
 from learn.inference.video_flow import Account, FlowHere, Footage, Settings, Step, VideoFlow
 from synth.errors import UserError
 from synth.flow.stereo.track import Moved
@@ -79,6 +79,8 @@ class Tracked:
     """How the tissue moved over `sensor.turn_s`; None without that span."""
     pulse: list[dict[str, float]] = field(default_factory=list)
     """rate_hz and amplitude_mm of each rhythm of the tissue's own that was taken off."""
+    pulse_left_in: tuple[str, ...] = ()
+    """Methods that were asked with that motion in it: they need depth, which it can't be taken off."""
 
 
 def track_recording(
@@ -140,6 +142,7 @@ def _joined(
         raise AssertionError("both times through a film the same frames are asked about")
     source = {name: moving if name in deep else still for name in names}
     still.force_mn = {name: source[name].force_mn[name] for name in names}
+    still.pulse_left_in = tuple(deep)
     still.bounds = {name: source[name].bounds[name] for name in names}
     still.sight = moving.sight
     if pictured in deep:
@@ -192,8 +195,9 @@ def _track(
         if video.seen <= meta.rest_frame:
             raise UserError(f"{recording.folder}: rest_frame {meta.rest_frame}, but {video.seen} frames")
         raise UserError(f"{recording.folder}: no frame has a time; give frames.csv, or fps in meta.yaml")
+    found = video.find_pulse(meta.pulse.free_s)
     _tell(out, video, recording, methods, pulse, scale_mm_per_px * video.shrink)
-    return out, video.find_pulse(meta.pulse.free_s)
+    return out, found
 
 
 def _tell(
@@ -220,11 +224,6 @@ def _tell(
         out.timings["flow_peak_rss_mb"] = round(video.peak_bytes / 1e6, 1)
     if out.sight is not None:
         out.notes.append(out.sight.describe())
-    if video.surface is not None and not out.fault and len(video.surface.time_s) < LEAST_FRAMES:
-        out.notes.append(
-            f"{len(video.surface.time_s)} frames could be followed, heart and breath are looked for from "
-            f"{LEAST_FRAMES} on: if the tissue moves by itself, that is still in it"
-        )
     if pulse is None:
         return
     if recording.right or recording.depths:

@@ -28,8 +28,8 @@ _SEEN = 0.3  # share of a cell that must be seen for its motion to count
 _RATES_HZ = (0.08, 3.5)
 _PERIODS = 3.0  # that the frames without contact must span
 _HARMONICS = 3
-LEAST_FRAMES = 30
-"""That can be followed; of fewer no rhythm is told."""
+_LEAST_FRAMES = 30  # without contact; of fewer no rhythm is told
+_ORDINARY_HZ = (0.2, 1.5)  # breath under anaesthesia, 12 a minute, to a quick heart, 90
 _MOST_RHYTHMS = 3  # heart, breath, and what is left of either
 _FOLDS = 6
 _PREDICTED = 0.3  # share of what moves that the fit must foresee in frames it has not seen
@@ -119,8 +119,40 @@ class Pulse:
         return f"the whole surface moves by itself, {' and '.join(parts)}: taken off"
 
 
-def find_pulse(surface: Surface, rest_s: float, free_s: Sequence[Span] = ()) -> Pulse | None:
-    """The surface's own rhythms; None where there is none, or where too little shows them.
+@dataclass(frozen=True)
+class Search:
+    """What was found of the surface's rhythms, and where they were looked for."""
+
+    pulse: Pulse | None
+    """None: there is none, or too little shows it."""
+    frames: int
+    """That could be followed and were taken for free of contact."""
+    span_s: float
+    """From the first of them to the last."""
+    rates_hz: tuple[float, float] | None
+    """That would have been found; None: the frames are too few for any."""
+
+    def describe(self) -> str:
+        """What heart or breath might have been missed, in words; empty if neither was."""
+        if self.pulse is not None:
+            return ""
+        seen = f"{self.frames} frames over {self.span_s:.3g} s could be followed without contact"
+        if self.rates_hz is None:
+            return (
+                f"heart and breath were not looked for: {seen}, too few. "
+                "If the tissue moves by itself, that is still in it"
+            )
+        low, high = self.rates_hz
+        if low <= _ORDINARY_HZ[0] and high >= _ORDINARY_HZ[1]:
+            return ""
+        return (
+            f"no heart or breath was found, but only from {low:.2g} to {high:.2g} Hz would one show: {seen}. "
+            "Slower or faster motion of the tissue's own is still in it"
+        )
+
+
+def find_pulse(surface: Surface, rest_s: float, free_s: Sequence[Span] = ()) -> Search:
+    """The surface's own rhythms, looked for in the frames without contact.
 
     Args:
         surface: of the whole recording.
@@ -128,8 +160,8 @@ def find_pulse(surface: Surface, rest_s: float, free_s: Sequence[Span] = ()) -> 
         free_s: spans known to be without contact [s]; none: the frames that least depart from smooth and
             periodic motion are taken.
     """
-    if len(surface.time_s) < LEAST_FRAMES:
-        return None
+    if len(surface.time_s) < _LEAST_FRAMES:
+        return _search(None, np.array(surface.time_s))
     time_s, seen = np.array(surface.time_s), np.stack(surface.seen).astype(np.float64)
     seen = seen.reshape(len(time_s), -1)
     moved = np.stack(surface.moved).reshape(*seen.shape, 2).astype(np.float64)
@@ -138,7 +170,7 @@ def find_pulse(surface: Surface, rest_s: float, free_s: Sequence[Span] = ()) -> 
     y, x = np.mgrid[:rows, :_COLUMNS] + 0.5
     at = np.column_stack([x.ravel() / _COLUMNS, y.ravel() / rows])[used]
     if used.sum() < 2 * _terms(_DEGREE):
-        return None
+        return _search(None, time_s[:0])
     basis = _polynomials(at)
     moved, seen = moved[:, used], np.where(seen[:, used] > _SEEN, seen[:, used], 0.0)
     known = (seen > 0).mean(axis=1) > 0.5
@@ -156,7 +188,7 @@ def find_pulse(surface: Surface, rest_s: float, free_s: Sequence[Span] = ()) -> 
         if (free == before).all():
             break
     if not rhythms or not _takes_off(time_s, rhythms, smooth, coefficients):
-        return None
+        return _search(None, time_s[free])
     sizes = tuple(float(np.median(_amplitude(rhythm, basis))) for rhythm in rhythms)
     own = sum((rhythm.at(time_s) for rhythm in rhythms), np.zeros(1))
     offset = _at_rest(time_s[free], (coefficients - own)[free], rest_s)
@@ -165,7 +197,14 @@ def find_pulse(surface: Surface, rest_s: float, free_s: Sequence[Span] = ()) -> 
     still = (
         cv2.resize(common.reshape(rows, _COLUMNS, 2), surface.tissue.shape[::-1]) * surface.tissue[..., None]
     )
-    return Pulse(rhythms, _at_pixels(surface.tissue), offset, still, sizes, float(free.mean()))
+    pulse = Pulse(rhythms, _at_pixels(surface.tissue), offset, still, sizes, float(free.mean()))
+    return _search(pulse, time_s[free])
+
+
+def _search(pulse: Pulse | None, free_s: Floats) -> Search:
+    """What came of frames without contact, at these times [s]."""
+    span = float(np.ptp(free_s)) if len(free_s) else 0.0
+    return Search(pulse, len(free_s), span, _rates(free_s) if len(free_s) >= _LEAST_FRAMES else None)
 
 
 def _in_common(basis: Floats, coefficients: Floats, moved: Floats, seen: Floats) -> Floats:
@@ -259,7 +298,7 @@ def _explained(
 
 def _rhythms(time_s: Floats, coefficients: Floats, free: Flags, basis: Floats) -> tuple[Rhythm, ...]:
     """One after the other, the strongest first, each in what those before it leave."""
-    if free.sum() < LEAST_FRAMES:
+    if free.sum() < _LEAST_FRAMES:
         return ()
     t = time_s[free]
     # In these coordinates a length is a length of motion over the cells.
@@ -319,13 +358,19 @@ def _left(design: Floats, y: Floats) -> Floats:
     return y - design @ np.linalg.lstsq(design, y, rcond=None)[0]
 
 
+def _rates(t: Floats) -> tuple[float, float] | None:
+    """Lowest and highest rate that frames at these times can show [Hz]; None: they show none."""
+    low = max(_RATES_HZ[0], _PERIODS / max(float(np.ptp(t)), 1e-9))
+    high = min(_RATES_HZ[1], 0.45 / float(np.median(np.diff(t))))
+    return (low, high) if low < high else None
+
+
 def _rate(t: Floats, y: Floats, found: Sequence[Candidate]) -> float | None:
     """The rate whose waves explain most of what the rhythms found so far leave (Lomb 1976; Scargle 1982)."""
-    span = float(np.ptp(t))
-    low = max(_RATES_HZ[0], _PERIODS / max(span, 1e-9))
-    high = min(_RATES_HZ[1], 0.45 / float(np.median(np.diff(t))))
-    if low >= high:
+    rates_hz = _rates(t)
+    if rates_hz is None:
         return None
+    (low, high), span = rates_hz, float(np.ptp(t))
     # A few components hold what moves together; the rest is noise.
     left = _left(_design(t, found), y)
     u, s, _ = np.linalg.svd(left, full_matrices=False)

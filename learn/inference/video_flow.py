@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from learn.inference.pulse import Pulse, Span, Surface, find_pulse
+from learn.inference.pulse import Pulse, Search, Span, Surface, find_pulse
 from learn.inference.quality import find_fault
 from learn.inference.video import Picture
 from synth.errors import UserError
@@ -264,6 +264,7 @@ class VideoFlow:
         self._period_s = 0.0 if settings.rate_hz is None else 1 / settings.rate_hz
         self._due_s = self._last_s = -math.inf
         self._rest_s: float | None = None
+        self._search: Search | None = None
         self._fault, self._rest_rgb = "", np.zeros((0, 0, 3), np.uint8)
         self._followed, self._still = 0, True
 
@@ -276,9 +277,12 @@ class VideoFlow:
 
     @property
     def notes(self) -> list[str]:
-        """What was done to the video that its user should know; complete when all frames are through."""
+        """What was done to the video that its user should know; complete when all frames are through, and
+        the pulse looked for."""
+        missed = "" if self._search is None or self.fault else self._search.describe()
         shrunk = [f"flow is computed on pictures {self.shrink} times smaller"] if self.shrink > 1 else []
-        return shrunk + [f"{n} of {self.seen} frames {why} left out" for why, n in self._left_out.items()]
+        left_out = [f"{n} of {self.seen} frames {why} left out" for why, n in self._left_out.items()]
+        return shrunk + left_out + ([missed] if missed else [])
 
     def steps(self, progress: Callable[[int], None] = lambda done: None) -> Iterator[Step]:
         """The frames that are followed, the rest frame first, holding a few at a time.
@@ -327,7 +331,8 @@ class VideoFlow:
         if self.surface is None or self._rest_s is None:
             return None
         with self.watch.stage("pulse"):
-            return find_pulse(self.surface, self._rest_s, free_s)
+            self._search = find_pulse(self.surface, self._rest_s, free_s)
+        return self._search.pulse
 
     def _is_wanted(self, index: int, time_s: float | None) -> bool:
         """Whether a frame is looked at; what isn't is counted."""

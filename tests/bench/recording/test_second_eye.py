@@ -244,6 +244,7 @@ def test_who_needs_both_eyes_has_them_on_tissue_that_beats(
     )
     assert list(both.force_mn) == ["a", "b", "c"] == list(both.bounds)
     assert len(deep.told) == len(both.force_mn["b"]) == 3
+    assert both.pulse_left_in == ("b",)
     monkeypatch.setattr(VideoFlow, "find_pulse", lambda *_: None)
     still = track_recording(recording, {"a": Flat(), "b": Deep()}, AWAY / FOCAL, settings, pictured="b")
     np.testing.assert_array_equal(both.force_mn["b"], still.force_mn["b"])

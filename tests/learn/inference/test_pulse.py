@@ -64,7 +64,7 @@ def left(pulse: Pulse, time: NDArray[np.float64], truth: list[NDArray[np.float64
 @pytest.mark.slow
 def test_heart_and_breath_between_contacts_are_found() -> None:
     surface, time, truth = film()
-    pulse = find_pulse(surface, time[0])
+    pulse = find_pulse(surface, time[0]).pulse
     assert pulse is not None
     assert [rhythm.rate_hz for rhythm in pulse.rhythms] == pytest.approx([1.2, 0.25], rel=0.01)
     assert left(pulse, time, truth) < 0.01
@@ -79,11 +79,11 @@ def test_heart_and_breath_between_contacts_are_found() -> None:
 @pytest.mark.slow
 def test_the_rest_frames_own_noise_is_taken_off_but_nothing_larger() -> None:
     surface, time, truth = film(rest_px=0.06)
-    pulse = find_pulse(surface, time[0])
+    pulse = find_pulse(surface, time[0]).pulse
     assert pulse is not None
     assert left(pulse, time, truth) < 0.7 * left(replace(pulse, still=0 * pulse.still), time, truth)
     surface, time, _ = film(rest_px=0.5)
-    pulse = find_pulse(surface, time[0])
+    pulse = find_pulse(surface, time[0]).pulse
     assert pulse is not None
     assert np.linalg.norm(pulse.still, axis=-1).max() == pytest.approx(0.15, abs=0.01)
 
@@ -91,7 +91,7 @@ def test_the_rest_frames_own_noise_is_taken_off_but_nothing_larger() -> None:
 @pytest.mark.slow
 def test_a_rate_that_wanders_is_followed() -> None:
     surface, time, truth = film(breath_mm=0.0, wander=0.7)
-    pulse = find_pulse(surface, time[0])
+    pulse = find_pulse(surface, time[0]).pulse
     assert pulse is not None
     assert left(pulse, time, truth) < 0.05
 
@@ -99,19 +99,34 @@ def test_a_rate_that_wanders_is_followed() -> None:
 @pytest.mark.parametrize("period_s", [None, 2.0, 0.9])
 def test_contacts_alone_are_no_pulse_periodic_ones_neither(period_s: float | None) -> None:
     surface, time, _ = film(heart_mm=0.0, breath_mm=0.0, period_s=period_s)
-    assert find_pulse(surface, float(time[0])) is None
+    assert find_pulse(surface, float(time[0])).pulse is None
 
 
 def test_noise_alone_and_a_short_film_are_no_pulse() -> None:
     surface, time, _ = film(heart_mm=0.0, breath_mm=0.0, contact_mm=0.0)
-    assert find_pulse(surface, float(time[0])) is None
+    assert find_pulse(surface, float(time[0])).pulse is None
+    assert find_pulse(surface, float(time[0])).describe() == "", (
+        "20 s at 10 a second show every ordinary rate"
+    )
     surface, time, _ = film(seconds=2.5)
-    assert find_pulse(surface, float(time[0])) is None
+    found = find_pulse(surface, float(time[0]))
+    assert (found.pulse, found.frames, found.rates_hz) == (None, 25, None)
+    assert found.describe().startswith("heart and breath were not looked for: 25 frames over 2.4 s")
+
+
+def test_rates_that_a_film_cant_show_are_said() -> None:
+    surface, time, _ = film(seconds=6, heart_mm=0.0, breath_mm=0.3, contact_mm=0.0)
+    found = find_pulse(surface, float(time[0]))
+    assert found.pulse is None, "a breath of 4 s, one and a half times"
+    low, _ = found.rates_hz or (0.0, 0.0)
+    assert found.span_s < 6
+    assert low == pytest.approx(3 / found.span_s)
+    assert f"only from {low:.2g} to 3.5 Hz would one show: {found.frames} frames" in found.describe()
 
 
 def test_a_given_span_without_contact_is_enough() -> None:
     surface, time, truth = film(seconds=16, breath_mm=0.0, period_s=6.0)
-    pulse = find_pulse(surface, float(time[0]), [(3.0, 6.0), (9.0, 12.0)])
+    pulse = find_pulse(surface, float(time[0]), [(3.0, 6.0), (9.0, 12.0)]).pulse
     assert pulse is not None
     assert pulse.free_share == pytest.approx(6 / 16, abs=0.02)
     assert left(pulse, time, truth) < 0.01
