@@ -63,7 +63,7 @@ def score(
         float, typer.Option(min=0.0, help="At most so many frames a second are looked at; 0: all.")
     ] = 10.0,
     pulse: Annotated[
-        bool, typer.Option(help="Take heart and breath off the flow, before any method that reads it.")
+        bool, typer.Option(help="Take heart and breath off the motion, before any method reads it.")
     ] = True,
     title: Annotated[str, typer.Option(help="Heading of the report.")] = "",
     train: Annotated[

@@ -64,7 +64,6 @@ class Baseline:
 
     def __init__(self, rule: Rule, space: Space = "never") -> None:
         self._rule, self._space = rule, space
-        self.needs_depth = space == "always"
 
     def __call__(
         self, flow: NDArray[np.float32], confidence: NDArray[np.float32], scene: Scene, picture: bool

@@ -46,16 +46,6 @@ class Model:
         }
 
     @property
-    def needs_depth(self) -> bool:
-        """See `Method`."""
-        return self.predictor.card.settings.arch.depth
-
-    @property
-    def knows_sway(self) -> bool:
-        """See `Method`."""
-        return self.predictor.card.settings.sway_mm > 0
-
-    @property
     def notes(self) -> list[str]:
         """What is to be known of how the last recording was read, once it is."""
         return [] if self._reader is None else self._reader[1].notes

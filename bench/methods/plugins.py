@@ -27,16 +27,6 @@ class Plugged:
         """What it says is to be known of how it read the recording."""
         return [str(note) for note in getattr(self._method, "notes", ())]
 
-    @property
-    def needs_depth(self) -> bool:
-        """See `Method`."""
-        return bool(getattr(self._method, "needs_depth", False))
-
-    @property
-    def knows_sway(self) -> bool:
-        """See `Method`."""
-        return bool(getattr(self._method, "knows_sway", False))
-
     def __call__(
         self, flow: NDArray[np.float32], confidence: NDArray[np.float32], scene: Scene, picture: bool
     ) -> Answer:

@@ -44,9 +44,7 @@ class Answer:
 
 class Method(Protocol):
     """Displacement to force, frame by frame. One that has `notes: list[str]` is asked for them at the end;
-    one that remembers frames has `forget_last()`, called after a frame that could not be followed; one that
-    reads nothing but motion in three dimensions says so by `needs_depth: bool`, and by `knows_sway: bool` if
-    it has learnt that a lift of the whole surface is no force."""
+    one that remembers frames has `forget_last()`, called after a frame that could not be followed."""
 
     def __call__(
         self, flow: NDArray[np.float32], confidence: NDArray[np.float32], scene: Scene, picture: bool

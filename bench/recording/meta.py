@@ -140,7 +140,7 @@ class Sync(_Section):
 
 
 class Pulse(_Section):
-    """The tissue's own motion by heart and breath, which is taken off the flow before any method reads it."""
+    """The tissue's own motion by heart and breath, which is taken off before any method reads the motion."""
 
     remove: bool = True
     """`false`: leave it in."""

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from bench.recording.folder import Recording
+from learn.inference.pulse import Pulse
 from learn.inference.video import Picture
 from learn.inference.video_flow import Step, VideoFlow, shrink_picture
 from synth.errors import UserError
@@ -54,12 +55,34 @@ class Sight:
         return f"a second eye {self.baseline_mm:.3g} mm to the right, {rows}; {noise}"
 
 
+@dataclass(frozen=True, eq=False)
+class OwnMotion:
+    """The tissue's own motion, heart and breath, as the flow and as both eyes have it."""
+
+    flow: Pulse
+    """[px]."""
+    space: Pulse | None
+    """[mm]; None without a second eye."""
+
+    def describe(self, mm_per_px: float) -> str:
+        """See `Pulse.describe`."""
+        return (self.space or self.flow).describe(mm_per_px)
+
+    def rhythms(self, mm_per_px: float) -> list[dict[str, float]]:
+        """rate_hz and amplitude_mm of each."""
+        seen = self.space or self.flow
+        return [
+            {"rate_hz": rhythm.rate_hz, "amplitude_mm": mm_per_px * size}
+            for rhythm, size in zip(seen.rhythms, seen.amplitudes_px, strict=True)
+        ]
+
+
 class SecondEye:
     """Follows the steps of a `VideoFlow`, each once and in order."""
 
-    def __init__(self, recording: Recording, video: VideoFlow) -> None:
-        """Nothing is read yet."""
-        self._recording, self._video = recording, video
+    def __init__(self, recording: Recording, video: VideoFlow, own: OwnMotion | None = None) -> None:
+        """Nothing is read yet. `own`: taken off, as its flow's part is in the video's flow."""
+        self._recording, self._video, self._own = recording, video, own
         self._stereo: StereoTracker | None = None
         self._depth: DepthTracker | None = None
         self._rights: Iterator[Picture] = iter(recording.right_frames()) if recording.right else iter(())
@@ -88,27 +111,33 @@ class SecondEye:
             UserError: the second eye has no such frame, or can't be read; a calibration that isn't its own.
         """
         found, tissue = step.found, self._video.tissue
-        if self._video.fault or not (found.trusted or found.is_rest):
+        if not found.trusted:
             # Nothing was followed: no method's answer counts there.
             return Moved(*np.zeros((2, *tissue.shape, 3), np.float32))
-        blocked = _or_none(found.blocked, tissue)
+        blocked, flow, time_s = _or_none(found.blocked, tissue), found.flow, step.picture.time_s
+        own = None if time_s is None or found.is_rest else self._own
+        if own is not None and time_s is not None:
+            # Where the tissue is now, not where it would be if it lay still, is where to look.
+            flow = flow + own.flow.at(time_s)
         if self._recording.right:
             right = self._right(step.picture.index)
             if self._stereo is None:
                 self._stereo = self._begin(step, right, blocked)
                 return self._stereo.rest_motion()
             moved = self._stereo.step(
-                step.picture.rgb, right, blocked, self._hidden(right, blocked), found.flow, found.confidence
+                step.picture.rgb, right, blocked, self._hidden(right, blocked), flow, found.confidence
             )
-            if np.percentile(np.abs(found.flow[tissue]), 98) > _MOVED_PX:
+            if np.percentile(np.abs(flow[tissue]), 98) > _MOVED_PX:
                 self._lags.append(abs(self._stereo.lag))
         else:
             depth = self._depths(step.picture.index)
             if self._depth is None:
                 self._depth = DepthTracker(self._K(), depth, blocked, tissue)
                 return self._depth.rest_motion()
-            moved = self._depth.step(depth, blocked, found.flow, found.confidence)
+            moved = self._depth.step(depth, blocked, flow, found.confidence)
         self._noise.append(float(np.median(moved.deviation[..., 2][tissue])))
+        if own is not None and own.space is not None and time_s is not None:
+            moved = replace(moved, motion=moved.motion - own.space.at(time_s))
         return moved
 
     def _begin(self, step: Step, right: NDArray[np.uint8], blocked: Flags) -> StereoTracker:

@@ -450,7 +450,6 @@ def as_json(result: Result) -> dict[str, Any]:
         "noise_floor_mn": result.noise_floor_mn,
         "fault": done.fault,
         "pulse": done.pulse,
-        "pulse_left_in": list(done.pulse_left_in),
         "second_eye": None if done.sight is None else asdict(done.sight),
         "aligned": result.aligned,
         "sync": None if result.sync is None else asdict(result.sync),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TypeVar
@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from bench.methods.protocol import InSpace, Method, Scene
 from bench.recording.folder import Recording
 from bench.recording.meta import Span
-from bench.recording.second_eye import SecondEye, Sight
-from learn.inference.pulse import Pulse, Surface
+from bench.recording.second_eye import OwnMotion, SecondEye, Sight
+from learn.inference.pulse import Surface
 from learn.inference.video_flow import Account, FlowHere, Footage, Settings, Step, VideoFlow
 from synth.errors import UserError
 from synth.flow.stereo.track import Moved
@@ -79,8 +79,6 @@ class Tracked:
     """How the tissue moved over `sensor.turn_s`; None without that span."""
     pulse: list[dict[str, float]] = field(default_factory=list)
     """rate_hz and amplitude_mm of each rhythm of the tissue's own that was taken off."""
-    pulse_left_in: tuple[str, ...] = ()
-    """Methods that were asked with that motion in it: they need depth, which it can't be taken off."""
 
 
 def track_recording(
@@ -109,70 +107,36 @@ def track_recording(
         UserError: unreadable video, no frame with a time, rest frame beyond the end, masks of another size.
     """
     watch = Stopwatch()
-    once = partial(_track, recording, scale_mm_per_px, settings, pictured, flow, progress, watch)
-    out, found = once(methods, None)
+    once = partial(_track, recording, methods, scale_mm_per_px, settings, pictured, flow, progress, watch)
+    out, found = once(None)
     if found is not None:
         # Contacts are answered for on the tissue as it would lie still: all over again, with that taken off.
-        # Off depth it can't be taken, so who reads nothing else is left at the first answer.
-        deep = [name for name, one in methods.items() if out.sight is not None and _needs_depth(one)]
-        still, _ = once({name: one for name, one in methods.items() if name not in deep}, found)
-        out = _joined(still, out, deep, list(methods), pictured)
-        for name in deep:
-            taught = getattr(methods[name], "knows_sway", False)
-            never = "" if taught else ", which it never met: a breath may count as a press (sway_mm)"
-            out.notes.append(
-                f"{name}: needs motion in depth, so it was asked with the tissue's own motion in it{never}"
-            )
+        out, _ = once(found)
     # Of both times through, for whoever asks what an answer costs.
     out.timings |= watch.report()
     return out
 
 
-def _needs_depth(method: Method) -> bool:
-    return bool(getattr(method, "needs_depth", False))
-
-
-def _joined(
-    still: Tracked, moving: Tracked, deep: Sequence[str], names: Sequence[str], pictured: str | None
-) -> Tracked:
-    """What was tracked with the tissue's own motion off, and of the methods `deep` with it in."""
-    if not deep:
-        return still
-    if still.frame != moving.frame:
-        raise AssertionError("both times through a film the same frames are asked about")
-    source = {name: moving if name in deep else still for name in names}
-    still.force_mn = {name: source[name].force_mn[name] for name in names}
-    still.pulse_left_in = tuple(deep)
-    still.bounds = {name: source[name].bounds[name] for name in names}
-    still.sight = moving.sight
-    if pictured in deep:
-        still.snapshots = moving.snapshots
-    if moving.sight is not None:
-        still.notes.append(moving.sight.describe())
-    still.notes += [note for note in moving.notes if note.startswith(tuple(f"{name}: " for name in deep))]
-    return still
-
-
 def _track(
     recording: Recording,
+    methods: Mapping[str, Method],
     scale_mm_per_px: float,
     settings: Settings,
     pictured: str | None,
     flow: FlowHere | None,
     progress: Progress,
     watch: Stopwatch,
-    methods: Mapping[str, Method],
-    pulse: Pulse | None,
-) -> tuple[Tracked, Pulse | None]:
-    """Once through the video; what was tracked, and the pulse that is still in it."""
+    own: OwnMotion | None,
+) -> tuple[Tracked, OwnMotion | None]:
+    """Once through the video; what was tracked, and the tissue's own motion that is still in it."""
     meta = recording.meta
     tool = recording.tool if recording.has_masks else None
     footage = Footage(recording.frames(), str(recording.folder), recording.tissue_mask, tool, meta.rest_frame)
     asked = replace(settings, pulse=settings.pulse and meta.pulse.remove)
-    video = VideoFlow(footage, asked, flow, pulse=pulse, watch=watch)
+    video = VideoFlow(footage, asked, flow, pulse=None if own is None else own.flow, watch=watch)
     asking = _Asking(methods, pictured, watch)
     two = bool(recording.right or recording.depths)
-    second = SecondEye(recording, video) if two and pulse is None else None
+    second, space = SecondEye(recording, video, own) if two else None, _InSpace()
     for step in video.steps(progress):
         asking.out.account.add(step.found, video.tissue)
         if asking.scene is None:
@@ -183,6 +147,8 @@ def _track(
         if second is not None:
             with watch.stage("second eye"):
                 moved = second.move(step)
+            if video.surface is not None:
+                space.add(step, moved, video.tissue, asking.scene.scale_mm_per_px)
         if step.picture.time_s is not None:
             asking.ask(step, step.picture.time_s, asking.scene, moved)
             if _is_within(meta.sensor.turn_s, step):
@@ -195,9 +161,11 @@ def _track(
         if video.seen <= meta.rest_frame:
             raise UserError(f"{recording.folder}: rest_frame {meta.rest_frame}, but {video.seen} frames")
         raise UserError(f"{recording.folder}: no frame has a time; give frames.csv, or fps in meta.yaml")
-    found = video.find_pulse(meta.pulse.free_s)
-    _tell(out, video, recording, methods, pulse, scale_mm_per_px * video.shrink)
-    return out, found
+    found = video.find_pulse(meta.pulse.free_s, space.surface)
+    _tell(out, video, recording, methods, own, scale_mm_per_px * video.shrink)
+    if found is None or video.search is None:
+        return out, None
+    return out, OwnMotion(found, None if space.surface is None else video.search.pulse)
 
 
 def _tell(
@@ -205,7 +173,7 @@ def _tell(
     video: VideoFlow,
     recording: Recording,
     methods: Mapping[str, Method],
-    pulse: Pulse | None,
+    own: OwnMotion | None,
     mm_per_px: float,
 ) -> None:
     """Says what was done to the video, which is through, and what somebody should know of it."""
@@ -224,25 +192,40 @@ def _tell(
         out.timings["flow_peak_rss_mb"] = round(video.peak_bytes / 1e6, 1)
     if out.sight is not None:
         out.notes.append(out.sight.describe())
-    if pulse is None:
-        return
-    if recording.right or recording.depths:
-        # Flow without the pulse and depth with it would be a motion that nothing made.
-        out.notes.append(
-            "the tissue's own motion is off the flow, not off depth: methods that can read flow were asked "
-            "without the second eye (--no-pulse asks them with it)"
-        )
-    out.pulse = [
-        {"rate_hz": rhythm.rate_hz, "amplitude_mm": mm_per_px * size}
-        for rhythm, size in zip(pulse.rhythms, pulse.amplitudes_px, strict=True)
-    ]
-    out.notes.append(pulse.describe(mm_per_px))
+    if own is not None:
+        out.pulse = own.rhythms(mm_per_px)
+        out.notes.append(own.describe(mm_per_px))
 
 
 def _is_within(span: Span | None, step: Step) -> bool:
     """Whether a frame that could be followed lies in a span of video time."""
     time_s = step.picture.time_s
     return span is not None and time_s is not None and span[0] <= time_s <= span[1] and step.found.trusted
+
+
+class _InSpace:
+    """What both eyes saw move, for the tissue's own motion to be looked for in."""
+
+    def __init__(self) -> None:
+        self._surface: Surface | None = None
+        self._sure: list[float] = []
+
+    def add(self, step: Step, moved: Moved, tissue: NDArray[np.bool_], mm_per_px: float) -> None:
+        """A frame; one that can't be followed, or is the rest frame, is left out as `VideoFlow` does."""
+        time_s, found = step.picture.time_s, step.found
+        if time_s is None or found.is_rest or not found.trusted:
+            return
+        self._surface = self._surface or Surface(tissue, mm_per_px)
+        self._surface.add(time_s, moved.motion, found.confidence)
+        across, along = (float(np.median(moved.deviation[..., k][tissue])) for k in (0, 2))
+        self._sure.append(across / max(along, 1e-9))
+
+    @property
+    def surface(self) -> Surface | None:
+        """Of all frames; None if there was none. Depth weighs as much less as it is less sure."""
+        if self._surface is not None:
+            self._surface.weight = (1.0, 1.0, min(1.0, float(np.median(self._sure))))
+        return self._surface
 
 
 class _Asking:

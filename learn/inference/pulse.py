@@ -6,6 +6,8 @@ rhythm is a motion of the surface (polynomials in the picture's x and y, for wha
 times harmonics of one phase, which may run faster and slower; it is fitted on the frames without contact, by
 least trimmed squares (Rousseeuw, J. Amer. Stat. Assoc. 79, 1984) where nobody says which these are, and must
 foresee frames that it was not fitted on. A rate that wanders by more than a radian or so of phase is lost.
+
+Motion is that of the picture, or in space where there is a second eye: a brain breathes along the view first.
 """
 
 from __future__ import annotations
@@ -42,23 +44,27 @@ _NOISE_PX = 0.15  # what the rest frame's noise may do to the flow of a cell; mo
 
 @dataclass
 class Surface:
-    """How the tissue moved, coarsely: what rhythms are looked for in."""
+    """How the tissue moved, coarsely: what rhythms are looked for in. Of C components, in any unit."""
 
     tissue: Flags
     """(h, w)."""
+    px: float = 1.0
+    """What a pixel is in the motion's unit."""
+    weight: tuple[float, ...] = ()
+    """(C,) of each component where rhythms are looked for, less for one that is less sure; (): all alike."""
     time_s: list[float] = field(default_factory=list)
     moved: list[NDArray[np.float32]] = field(default_factory=list)
-    """(r, c, 2) px each."""
+    """(r, c, C) each."""
     seen: list[NDArray[np.float32]] = field(default_factory=list)
     """(r, c) share of each cell that is seen."""
 
-    def add(self, time_s: float, flow: NDArray[np.float32], confidence: NDArray[np.float32]) -> None:
-        """One frame that could be followed: (h, w, 2) px and (h, w) in 0..1."""
+    def add(self, time_s: float, motion: NDArray[np.float32], confidence: NDArray[np.float32]) -> None:
+        """One frame that could be followed: (h, w, C) and (h, w) in 0..1."""
         height, width = self.tissue.shape
         size = (_COLUMNS, max(2, round(_COLUMNS * height / width)))
         weight = confidence * self.tissue
         share = cv2.resize(weight, size, interpolation=cv2.INTER_AREA)
-        moved = cv2.resize(flow * weight[..., None], size, interpolation=cv2.INTER_AREA)
+        moved = cv2.resize(motion * weight[..., None], size, interpolation=cv2.INTER_AREA)
         self.time_s.append(time_s)
         self.moved.append(np.asarray(moved / np.maximum(share, 1e-6)[..., None], np.float32))
         self.seen.append(np.asarray(share, np.float32))
@@ -74,7 +80,7 @@ class Rhythm:
     knots: Floats
     """(K,) by how much the phase runs ahead of the rate there [rad]."""
     modes: Floats
-    """(2 H, B, 2): coefficients of cosine and sine of each harmonic [px]."""
+    """(2 H, B, C): coefficients of cosine and sine of each harmonic."""
 
     def phase(self, time_s: Floats) -> Floats:
         """(T,) rad at (T,) s."""
@@ -83,7 +89,7 @@ class Rhythm:
         )
 
     def at(self, time_s: Floats) -> Floats:
-        """(T, B, 2) coefficients of the motion at (T,) s."""
+        """(T, B, C) coefficients of the motion at (T,) s."""
         return np.asarray(
             np.tensordot(_waves(self.phase(time_s), len(self.modes) // 2), self.modes, axes=1), np.float64
         )
@@ -91,22 +97,22 @@ class Rhythm:
 
 @dataclass(frozen=True, eq=False)
 class Pulse:
-    """All rhythms of one recording."""
+    """All rhythms of one recording, in the components and the unit of the surface they were fitted to."""
 
     rhythms: tuple[Rhythm, ...]
     basis: NDArray[np.float32]
     """(h, w, B) at the pixels, 0 outside the tissue."""
     offset: Floats
-    """(B, 2) coefficients of where the rest frame lay, from which motion is measured [px]."""
+    """(B, C) coefficients of where the rest frame lay, from which motion is measured."""
     still: NDArray[np.float32]
-    """(h, w, 2) what all frames without contact have in common besides: the rest frame's own noise [px]."""
+    """(h, w, C) what all frames without contact have in common besides: the rest frame's own noise."""
     amplitudes_px: tuple[float, ...]
     """Of each rhythm: half of the way from one end to the other, median over the tissue [px]."""
     free_share: float
     """Share of the frames that it was fitted on: those taken for free of contact."""
 
     def at(self, time_s: float) -> NDArray[np.float32]:
-        """(h, w, 2) px by which the surface has moved by itself since the rest frame, or seems to have."""
+        """(h, w, C) by which the surface has moved by itself since the rest frame, or seems to have."""
         now = sum((rhythm.at(np.array([time_s]))[0] for rhythm in self.rhythms), self.offset)
         return np.asarray(self.basis @ now.astype(np.float32) + self.still, np.float32)
 
@@ -125,10 +131,8 @@ class Search:
 
     pulse: Pulse | None
     """None: there is none, or too little shows it."""
-    frames: int
-    """That could be followed and were taken for free of contact."""
-    span_s: float
-    """From the first of them to the last."""
+    free_s: Floats
+    """Times of the frames that could be followed and were taken for free of contact."""
     rates_hz: tuple[float, float] | None
     """That would have been found; None: the frames are too few for any."""
 
@@ -136,7 +140,8 @@ class Search:
         """What heart or breath might have been missed, in words; empty if neither was."""
         if self.pulse is not None:
             return ""
-        seen = f"{self.frames} frames over {self.span_s:.3g} s could be followed without contact"
+        span = float(np.ptp(self.free_s)) if len(self.free_s) else 0.0
+        seen = f"{len(self.free_s)} frames over {span:.3g} s could be followed without contact"
         if self.rates_hz is None:
             return (
                 f"heart and breath were not looked for: {seen}, too few. "
@@ -162,17 +167,11 @@ def find_pulse(surface: Surface, rest_s: float, free_s: Sequence[Span] = ()) -> 
     """
     if len(surface.time_s) < _LEAST_FRAMES:
         return _search(None, np.array(surface.time_s))
-    time_s, seen = np.array(surface.time_s), np.stack(surface.seen).astype(np.float64)
-    seen = seen.reshape(len(time_s), -1)
-    moved = np.stack(surface.moved).reshape(*seen.shape, 2).astype(np.float64)
-    used = np.median(seen, axis=0) > _SEEN
-    rows = surface.moved[0].shape[0]
-    y, x = np.mgrid[:rows, :_COLUMNS] + 0.5
-    at = np.column_stack([x.ravel() / _COLUMNS, y.ravel() / rows])[used]
-    if used.sum() < 2 * _terms(_DEGREE):
+    cells = _laid_out(surface)
+    time_s, seen, basis = cells.time_s, cells.seen, cells.basis
+    if len(basis) < 2 * _terms(_DEGREE):
         return _search(None, time_s[:0])
-    basis = _polynomials(at)
-    moved, seen = moved[:, used], np.where(seen[:, used] > _SEEN, seen[:, used], 0.0)
+    moved = cells.moved * np.array(surface.weight or 1.0) / surface.px
     known = (seen > 0).mean(axis=1) > 0.5
     given = np.zeros(len(time_s), bool)
     for start, stop in free_s:
@@ -184,31 +183,81 @@ def find_pulse(surface: Surface, rest_s: float, free_s: Sequence[Span] = ()) -> 
         rhythms = _rhythms(time_s, coefficients, free, basis)
         if not rhythms or free_s:
             break
-        before, free = free, known & _explained(time_s, rhythms, free, basis, coefficients, moved, seen)
+        explained = _explained(time_s, rhythms, free, smooth, basis, coefficients, moved, seen)
+        before, free = free, known & explained
         if (free == before).all():
             break
     if not rhythms or not _takes_off(time_s, rhythms, smooth, coefficients):
         return _search(None, time_s[free])
-    sizes = tuple(float(np.median(_amplitude(rhythm, basis))) for rhythm in rhythms)
-    own = sum((rhythm.at(time_s) for rhythm in rhythms), np.zeros(1))
-    offset = _at_rest(time_s[free], (coefficients - own)[free], rest_s)
-    common = np.zeros((len(used), 2), np.float32)
-    common[used] = _in_common(basis, coefficients[free], moved[free], seen[free])
-    still = (
-        cv2.resize(common.reshape(rows, _COLUMNS, 2), surface.tissue.shape[::-1]) * surface.tissue[..., None]
+    return _search(_measured(surface, rhythms, free, rest_s), time_s[free])
+
+
+def carried_over(found: Search, surface: Surface, rest_s: float) -> Pulse:
+    """The pulse that was found, as other components of the same frames' motion have it.
+
+    Args:
+        found: what came of looking for it; it has a pulse.
+        surface: the same frames' motion in other components or another unit.
+        rest_s: time of the rest frame [s].
+    """
+    if found.pulse is None:
+        raise AssertionError("there is no pulse to carry over")
+    return _measured(surface, found.pulse.rhythms, np.isin(surface.time_s, found.free_s), rest_s)
+
+
+@dataclass(frozen=True)
+class _Cells:
+    """A surface's cells that are seen in most frames."""
+
+    time_s: Floats
+    moved: Floats
+    """(T, P, C)."""
+    seen: Floats
+    """(T, P), 0 where too little is seen to count."""
+    used: Flags
+    """(r c,) which of all cells they are."""
+    basis: Floats
+    """(P, B)."""
+
+
+def _laid_out(surface: Surface) -> _Cells:
+    time_s, seen = np.array(surface.time_s), np.stack(surface.seen).astype(np.float64)
+    seen = seen.reshape(len(time_s), -1)
+    moved = np.stack(surface.moved).reshape(*seen.shape, -1).astype(np.float64)
+    used = np.median(seen, axis=0) > _SEEN
+    rows = surface.moved[0].shape[0]
+    y, x = np.mgrid[:rows, :_COLUMNS] + 0.5
+    at = np.column_stack([x.ravel() / _COLUMNS, y.ravel() / rows])[used]
+    enough = np.where(seen[:, used] > _SEEN, seen[:, used], 0.0)
+    return _Cells(time_s, moved[:, used], enough, used, _polynomials(at))
+
+
+def _measured(surface: Surface, rhythms: Sequence[Rhythm], free: Flags, rest_s: float) -> Pulse:
+    """Rhythms of known phase, as the motion of the frames `free` has them."""
+    cells = _laid_out(surface)
+    coefficients, t = _projected(cells.basis, cells.moved, cells.seen), cells.time_s[free]
+    phases = [(one.rate_hz, one.knots_s, one.knots, len(one.modes) // 2) for one in rhythms]
+    rhythms = _fitted(t, coefficients[free].reshape(len(t), -1), phases, np.eye(coefficients.shape[1]))
+    sizes = tuple(float(np.median(_amplitude(rhythm, cells.basis))) / surface.px for rhythm in rhythms)
+    own = sum((rhythm.at(cells.time_s) for rhythm in rhythms), np.zeros(1))
+    offset = _at_rest(t, (coefficients - own)[free], rest_s)
+    shape, components = surface.moved[0].shape[:2], coefficients.shape[2]
+    common = np.zeros((len(cells.used), components), np.float32)
+    common[cells.used] = _in_common(
+        cells.basis, coefficients[free], cells.moved[free], cells.seen[free], _NOISE_PX * surface.px
     )
-    pulse = Pulse(rhythms, _at_pixels(surface.tissue), offset, still, sizes, float(free.mean()))
-    return _search(pulse, time_s[free])
+    large = cv2.resize(common.reshape(*shape, components), surface.tissue.shape[::-1])
+    still = large * surface.tissue[..., None]
+    return Pulse(tuple(rhythms), _at_pixels(surface.tissue), offset, still, sizes, float(free.mean()))
 
 
 def _search(pulse: Pulse | None, free_s: Floats) -> Search:
     """What came of frames without contact, at these times [s]."""
-    span = float(np.ptp(free_s)) if len(free_s) else 0.0
-    return Search(pulse, len(free_s), span, _rates(free_s) if len(free_s) >= _LEAST_FRAMES else None)
+    return Search(pulse, free_s, _rates(free_s) if len(free_s) >= _LEAST_FRAMES else None)
 
 
-def _in_common(basis: Floats, coefficients: Floats, moved: Floats, seen: Floats) -> Floats:
-    """(P, 2) median over frames without contact of what smooth motion leaves [px], `_NOISE_PX` at most.
+def _in_common(basis: Floats, coefficients: Floats, moved: Floats, seen: Floats, most: float) -> Floats:
+    """(P, C) median over frames without contact of what smooth motion leaves, `most` long at most.
 
     Every flow is measured from the rest frame, so its noise moves the same places in all frames alike.
     """
@@ -218,11 +267,11 @@ def _in_common(basis: Floats, coefficients: Floats, moved: Floats, seen: Floats)
     common = np.zeros(left.shape[1:])
     common[enough] = np.nanmedian(left[:, enough], axis=0)
     length = np.linalg.norm(common, axis=1, keepdims=True)
-    return np.asarray(common * np.minimum(1, _NOISE_PX / np.maximum(length, 1e-9)), np.float64)
+    return np.asarray(common * np.minimum(1, most / np.maximum(length, 1e-9)), np.float64)
 
 
 def _at_rest(time_s: Floats, left: Floats, rest_s: float) -> Floats:
-    """(B, 2) what the rhythms leave (T, B, 2), at the rest frame: where in its path the tissue lay then.
+    """(B, C) what the rhythms leave (T, B, C), at the rest frame: where in its path the tissue lay then.
 
     From all frames without contact: the phase at one moment alone would be less sure.
     """
@@ -258,7 +307,7 @@ def _at_pixels(tissue: Flags) -> NDArray[np.float32]:
 
 
 def _projected(basis: Floats, moved: Floats, seen: Floats) -> Floats:
-    """(T, B, 2) the polynomials that fit each frame best."""
+    """(T, B, C) the polynomials that fit each frame best."""
     gram = np.einsum("tp,pa,pb->tab", seen, basis, basis, optimize=True)
     gram += 1e-3 * np.trace(gram, axis1=1, axis2=2)[:, None, None] / len(gram[0]) * np.eye(len(gram[0]))
     return np.asarray(
@@ -284,16 +333,18 @@ def _explained(
     time_s: Floats,
     rhythms: Sequence[Rhythm],
     free: Flags,
+    smooth: Flags,
     basis: Floats,
     coefficients: Floats,
     moved: Floats,
     seen: Floats,
 ) -> Flags:
-    """(T,) frames that the rhythms leave as little of as of most of those they were fitted on."""
+    """(T,) frames that the rhythms leave as little of as of most smooth ones; of most of those they were
+    fitted on would let contacts in by and by."""
     own = sum((rhythm.at(time_s) for rhythm in rhythms), np.zeros(1))
     own = own + (coefficients - own)[free].mean(axis=0)
     off = _off(basis, own, moved, seen)
-    return np.asarray(off <= 2.5 * np.median(off[free]) + 1e-3, bool)
+    return np.asarray(off <= 2.5 * np.median(off[smooth]) + 1e-3, bool)
 
 
 def _rhythms(time_s: Floats, coefficients: Floats, free: Flags, basis: Floats) -> tuple[Rhythm, ...]:
@@ -305,13 +356,19 @@ def _rhythms(time_s: Floats, coefficients: Floats, free: Flags, basis: Floats) -
     metric = np.linalg.cholesky(basis.T @ basis / len(basis) + 1e-12 * np.eye(basis.shape[1])).T
     y = np.einsum("ab,tbc->tac", metric, coefficients[free]).reshape(len(t), -1)
     back = np.linalg.inv(metric)
-    found: list[tuple[float, Floats, Floats]] = []
+    found: list[Candidate] = []
     for _ in range(_MOST_RHYTHMS):
         rate = _rate(t, y, found)
         if rate is None:
             break
-        tried = _refined(t, y, [*found, (rate, *_knots(time_s, rate))])
-        if not _foresees(t, y, tried) or _too_alike(tried):
+        # Few frames can't tell three harmonics: as many as foresee what they weren't fitted on.
+        for count in range(_harmonics(t, rate), 0, -1):
+            tried = _refined(t, y, [*found, (rate, *_knots(time_s, rate), count)])
+            if _foresees(t, y, tried):
+                break
+        else:
+            break
+        if _too_alike(tried) or _runs_away(t, tried[-1]):
             break
         one = _fitted(t, y, tried, back)[-1]
         size = _amplitude(one, basis)
@@ -326,8 +383,8 @@ def _knots(time_s: Floats, rate_hz: float) -> tuple[Floats, Floats]:
     return np.linspace(time_s[0], time_s[-1], count), np.zeros(count)
 
 
-Candidate = tuple[float, Floats, Floats]
-"""Rate [Hz], and the phase's knots: times [s] and corrections [rad]."""
+Candidate = tuple[float, Floats, Floats, int]
+"""Rate [Hz], the phase's knots (times [s] and corrections [rad]), and how many harmonics."""
 
 
 def _waves(phase: Floats, harmonics: int) -> Floats:
@@ -350,7 +407,7 @@ def _design(t: Floats, candidates: Sequence[Candidate]) -> Floats:
     """A constant (the rest picture's own noise), a drift, and each rhythm's waves."""
     middle = (t - t.mean()) / max(float(np.ptp(t)), 1e-9)
     parts = [np.ones((len(t), 1)), middle[:, None]]
-    parts += [_waves(_phase(t, one), _harmonics(t, one[0])) for one in candidates]
+    parts += [_waves(_phase(t, one), one[3]) for one in candidates]
     return np.concatenate(parts, axis=1)
 
 
@@ -405,8 +462,7 @@ def _refined(t: Floats, y: Floats, candidates: Sequence[Candidate]) -> list[Cand
         design = _design(t, now)
         weights = np.linalg.lstsq(design, y, rcond=None)[0]
         left, at = y - design @ weights, 2
-        for k, (rate, times, ahead) in enumerate(now):
-            count = _harmonics(t, rate)
+        for k, (rate, times, ahead, count) in enumerate(now):
             waves = _waves(_phase(t, now[k]), count).reshape(len(t), count, 2)
             order = np.arange(1, count + 1)[:, None]
             slope = (np.stack([-waves[..., 1], waves[..., 0]], axis=2) * order).reshape(len(t), -1)
@@ -418,7 +474,7 @@ def _refined(t: Floats, y: Floats, candidates: Sequence[Candidate]) -> list[Cand
             weight = float(np.trace(normal)) / len(times)
             normal += weight * (0.3 * bend.T @ bend + 0.01 * np.eye(len(times)))
             pull = hats.T @ (turned * left).sum(axis=1) - weight * 0.3 * bend.T @ (bend @ ahead)
-            now[k] = (rate, times, ahead + np.linalg.solve(normal, pull))
+            now[k] = (rate, times, ahead + np.linalg.solve(normal, pull), count)
     return now
 
 
@@ -444,14 +500,21 @@ def _too_alike(candidates: Sequence[Candidate]) -> bool:
     )
 
 
+def _runs_away(t: Floats, one: Candidate) -> bool:
+    """Whether its phase, let run behind, made it a rate too slow for so short a time."""
+    turns = float(np.ptp(_phase(t, one))) / (2 * np.pi)
+    return turns < _PERIODS - 0.5
+
+
 def _fitted(t: Floats, y: Floats, candidates: Sequence[Candidate], back: Floats) -> list[Rhythm]:
-    weights = np.linalg.lstsq(_design(t, candidates), y, rcond=None)[0].reshape(-1, len(back), 2)
+    weights = np.linalg.lstsq(_design(t, candidates), y, rcond=None)[0].reshape(
+        -1, len(back), y.shape[1] // len(back)
+    )
     weights = np.einsum("ab,kbc->kac", back, weights)
     out, at = [], 2
-    for rate, times, ahead in candidates:
-        count = 2 * _harmonics(t, rate)
-        out.append(Rhythm(rate, times, ahead, weights[at : at + count]))
-        at += count
+    for rate, times, ahead, harmonics in candidates:
+        out.append(Rhythm(rate, times, ahead, weights[at : at + 2 * harmonics]))
+        at += 2 * harmonics
     return out
 
 

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from learn.inference.pulse import Pulse, Search, Span, Surface, find_pulse
+from learn.inference.pulse import Pulse, Search, Span, Surface, carried_over, find_pulse
 from learn.inference.quality import find_fault
 from learn.inference.video import Picture
 from synth.errors import UserError
@@ -264,7 +264,8 @@ class VideoFlow:
         self._period_s = 0.0 if settings.rate_hz is None else 1 / settings.rate_hz
         self._due_s = self._last_s = -math.inf
         self._rest_s: float | None = None
-        self._search: Search | None = None
+        self.search: Search | None = None
+        """What came of looking for a pulse; None before."""
         self._fault, self._rest_rgb = "", np.zeros((0, 0, 3), np.uint8)
         self._followed, self._still = 0, True
 
@@ -279,7 +280,7 @@ class VideoFlow:
     def notes(self) -> list[str]:
         """What was done to the video that its user should know; complete when all frames are through, and
         the pulse looked for."""
-        missed = "" if self._search is None or self.fault else self._search.describe()
+        missed = "" if self.search is None or self.fault else self.search.describe()
         shrunk = [f"flow is computed on pictures {self.shrink} times smaller"] if self.shrink > 1 else []
         left_out = [f"{n} of {self.seen} frames {why} left out" for why, n in self._left_out.items()]
         return shrunk + left_out + ([missed] if missed else [])
@@ -323,16 +324,22 @@ class VideoFlow:
         for waiting in under_way:
             yield self._step(*waiting)
 
-    def find_pulse(self, free_s: Sequence[Span] = ()) -> Pulse | None:
-        """The tissue's own motion, once all steps are through; None where none is seen or was asked for.
+    def find_pulse(self, free_s: Sequence[Span] = (), space: Surface | None = None) -> Pulse | None:
+        """The flow's part of the tissue's own motion, once all steps are through; None where none is seen or
+        was asked for.
 
-        `free_s`: spans without contact, if known [s].
+        Args:
+            free_s: spans without contact, if known [s].
+            space: the same frames' motion in space, if there is a second eye: rhythms are looked for there.
         """
         if self.surface is None or self._rest_s is None:
             return None
         with self.watch.stage("pulse"):
-            self._search = find_pulse(self.surface, self._rest_s, free_s)
-        return self._search.pulse
+            looked = self.surface if space is None else space
+            self.search = find_pulse(looked, self._rest_s, free_s)
+            if self.search.pulse is None or space is None:
+                return self.search.pulse
+            return carried_over(self.search, self.surface, self._rest_s)
 
     def _is_wanted(self, index: int, time_s: float | None) -> bool:
         """Whether a frame is looked at; what isn't is counted."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from dataclasses import replace
-from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import cv2
@@ -15,8 +14,6 @@ from scipy.spatial.transform import Rotation
 from skimage import data
 
 from bench.methods import baselines
-from bench.methods.network import Model
-from bench.methods.plugins import Plugged
 from bench.methods.protocol import Answer, Scene
 from bench.recording import writer
 from bench.recording.check import check_recording
@@ -25,9 +22,7 @@ from bench.recording.pixel_scale import Scale
 from bench.scoring import report
 from bench.scoring.evaluate_recording import as_json, evaluate_recording
 from bench.tracking.tracking import track_recording
-from learn.inference.pulse import Pulse, Rhythm
-from learn.inference.shipped import MODELS
-from learn.inference.video_flow import Settings, VideoFlow
+from learn.inference.video_flow import Settings
 from synth.errors import UserError
 from synth.flow.stereo.calibration import read_rig
 from synth.flow.stereo.track import Moved
@@ -62,6 +57,18 @@ def rise(amount: float) -> np.ndarray:
     return np.asarray(FOCAL * BASE / (FOCAL * BASE / AWAY - amount * DENT) - AWAY)
 
 
+def write_pair(folder: Path) -> dict[str, object]:
+    """Writes the calibration, and returns what meta.yaml says of it."""
+    storage = cv2.FileStorage(str(folder / "pair.yaml"), cv2.FILE_STORAGE_WRITE)
+    right = K + np.array([[0, 0, FOCAL * BASE / AWAY], [0, 0, 0], [0, 0, 0]])
+    for name, value in {"K1": K, "K2": right, "R": np.eye(3), "T": np.array([[-1.0], [0], [0]])}.items():
+        storage.write(name, value)
+    for name in ("D1", "D2"):
+        storage.write(name, np.zeros((1, 5)))
+    storage.release()
+    return {"calibration": "pair.yaml", "mm_per_unit": BASE}
+
+
 @pytest.fixture
 def make(tmp_path: Path) -> Make:
     """Three frames: rest, half a dent, a dent. Tissue lies where disparity is 0."""
@@ -81,19 +88,7 @@ def make(tmp_path: Path) -> Make:
                 np.save(folder / f"depth/{t}.npy", (points if t else now).astype(np.float32))
         about: dict[str, object] = {"scale_mm_per_px": AWAY / FOCAL, "young_kpa": 1.0, "fps": 10.0}
         if second == "right":
-            storage = cv2.FileStorage(str(folder / "pair.yaml"), cv2.FILE_STORAGE_WRITE)
-            right = K + np.array([[0, 0, FOCAL * BASE / AWAY], [0, 0, 0], [0, 0, 0]])
-            for name, value in {
-                "K1": K,
-                "K2": right,
-                "R": np.eye(3),
-                "T": np.array([[-1.0], [0], [0]]),
-            }.items():
-                storage.write(name, value)
-            for name in ("D1", "D2"):
-                storage.write(name, np.zeros((1, 5)))
-            storage.release()
-            about["stereo"] = {"calibration": "pair.yaml", "mm_per_unit": BASE}
+            about["stereo"] = write_pair(folder)
         else:
             about["depth"] = {"focal_px": FOCAL}
         writer.write_meta(folder, about)
@@ -116,12 +111,6 @@ class Looking:
     ) -> Answer:
         self.told.append(moved)
         return Answer(moved.motion[50:70, 70:90].mean(axis=(0, 1)).astype(np.float64))
-
-
-class Deep(Looking):
-    """Reads nothing else."""
-
-    needs_depth = True
 
 
 @pytest.mark.parametrize("second", ["right", "depth"])
@@ -223,38 +212,48 @@ def test_sixteen_bit_depth_and_two_eyes_smaller(make: Make) -> None:
     assert method.told[2].motion[30, 40, 2] == pytest.approx(rise(0.6)[60, 80], rel=0.3)
 
 
-def test_who_needs_both_eyes_has_them_on_tissue_that_beats(
-    make: Make, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Depth has the beat in it: who can read flow reads that without it, the others all that there is."""
-    pixels = (SIZE[1], SIZE[0])
-    beat = Rhythm(1.2, np.zeros(1), np.zeros(1), np.zeros((2, 1, 2)))
-    drift = np.full((*pixels, 2), 0.5, np.float32)
-    found = Pulse((beat,), np.zeros((*pixels, 1), np.float32), np.zeros((1, 2)), drift, (0.5,), 1.0)
-    monkeypatch.setattr(VideoFlow, "find_pulse", lambda *_: found)
-
-    class Flat:
-        def __call__(self, flow: np.ndarray, confidence: np.ndarray, scene: Scene, picture: bool) -> Answer:
-            return Answer(np.array([*flow.reshape(-1, 2).mean(0), 0.0]))
-
-    recording, settings = open_recording(make("right")), replace(SETTINGS, pulse=True)
-    deep = Deep()
-    both = track_recording(
-        recording, {"a": Flat(), "b": deep, "c": Flat()}, AWAY / FOCAL, settings, pictured="b"
-    )
-    assert list(both.force_mn) == ["a", "b", "c"] == list(both.bounds)
-    assert len(deep.told) == len(both.force_mn["b"]) == 3
-    assert both.pulse_left_in == ("b",)
-    monkeypatch.setattr(VideoFlow, "find_pulse", lambda *_: None)
-    still = track_recording(recording, {"a": Flat(), "b": Deep()}, AWAY / FOCAL, settings, pictured="b")
-    np.testing.assert_array_equal(both.force_mn["b"], still.force_mn["b"])
-    shifted = np.array(still.force_mn["a"][1:]) - [0.5, 0.5, 0]
-    np.testing.assert_allclose(both.force_mn["a"][1:], shifted, atol=1e-3)
-    np.testing.assert_array_equal(both.force_mn["c"], both.force_mn["a"])
-    (note,) = [note for note in both.notes if note.startswith("b: needs motion in depth")]
-    assert note.endswith("a breath may count as a press (sway_mm)"), "nobody taught it"
-    assert both.sight is not None
-    assert both.snapshots[-1].depth is not None
+@pytest.mark.slow
+@pytest.mark.parametrize("second", ["right", "depth"])
+def test_a_breath_along_the_view_is_taken_off_depth(tmp_path: Path, second: str) -> None:
+    """The picture hardly shows it: the whole surface comes and goes, and is pressed in between."""
+    rate_hz, lift_mm, fps, count = 0.4, 0.5, 6.0, 72
+    time = np.arange(count) / fps
+    load = 0.5 * np.clip(np.sin(np.pi * (time - 5) / 2.5), 0, None) * ((time > 5) & (time < 7.5))
+    breath = lift_mm * (np.cos(2 * np.pi * rate_hz * time) - 1)
+    for name in ("frames", second):
+        (tmp_path / name).mkdir()
+    for t, (amount, lift) in enumerate(zip(load, breath, strict=True)):
+        u, depth = 2.5 * amount * DENT, AWAY + lift + rise(amount)
+        cv2.imwrite(str(tmp_path / f"frames/{t:03d}.png"), seen(u)[..., ::-1])
+        if second == "right":
+            d = FOCAL * BASE * (1 / depth - 1 / AWAY)
+            cv2.imwrite(str(tmp_path / f"right/{t:03d}.png"), seen(u - d)[..., ::-1])
+        else:
+            now = cv2.remap(depth.astype(np.float32), *map(np.float32, (source(u), ROWS)), cv2.INTER_LINEAR)
+            np.save(tmp_path / f"depth/{t:03d}.npy", now)
+    about: dict[str, object] = {"scale_mm_per_px": AWAY / FOCAL, "young_kpa": 1.0, "fps": fps}
+    about |= {"stereo": write_pair(tmp_path)} if second == "right" else {"depth": {"focal_px": FOCAL}}
+    writer.write_meta(tmp_path, about)
+    told = {}
+    for pulse in (False, True):
+        method = Looking()
+        done = track_recording(
+            open_recording(tmp_path), {"it": method}, AWAY / FOCAL, replace(SETTINGS, pulse=pulse)
+        )
+        told[pulse] = np.stack([moved.motion for moved in method.told[-count:]])
+    ((rhythm,), note) = done.pulse, done.notes[-1]
+    assert rhythm["rate_hz"] == pytest.approx(rate_hz, rel=0.03)
+    assert rhythm["amplitude_mm"] == pytest.approx(lift_mm, rel=0.1)
+    assert "the whole surface moves by itself" in note
+    inner = (slice(1, None), slice(15, -15), slice(15, -15), 2)
+    truth = np.stack([rise(amount) for amount in load])
+    before, after = (np.sqrt(np.square(told[k][inner] - truth[inner[:3]]).mean()) for k in (False, True))
+    assert before > 0.5
+    assert after < 0.12
+    deepest = int(np.argmax(load))
+    assert told[True][deepest, 60, 80, 2] == pytest.approx(truth[deepest, 60, 80], rel=0.15)
+    assert done.sight is not None
+    assert len(method.told) == 2 * count
 
 
 @pytest.mark.parametrize("second", ["right", "depth"])
@@ -264,15 +263,6 @@ def test_a_black_rest_frame_is_said_and_no_crash(make: Make, second: str) -> Non
     done = track_recording(open_recording(folder), {}, AWAY / FOCAL, SETTINGS)
     assert (done.fault, done.sight) == ("the rest frame is black", None)
     assert any("black" in finding.said for finding in check_recording(folder))
-
-
-def test_who_needs_depth_says_so() -> None:
-    deep = Plugged("deep", EntryPoint("deep", "here:deep", "sulcus.method"), Deep())
-    assert deep.needs_depth
-    assert not deep.knows_sway
-    assert [baselines.Baseline(len, space).needs_depth for space in ("never", "always")] == [False, True]
-    assert (Model(MODELS / "stereo").needs_depth, Model(MODELS / "mono").needs_depth) == (True, False)
-    assert Model(MODELS / "stereo").knows_sway
 
 
 def test_a_written_pair_is_read_back(tmp_path: Path) -> None:

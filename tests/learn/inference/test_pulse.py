@@ -110,7 +110,7 @@ def test_noise_alone_and_a_short_film_are_no_pulse() -> None:
     )
     surface, time, _ = film(seconds=2.5)
     found = find_pulse(surface, float(time[0]))
-    assert (found.pulse, found.frames, found.rates_hz) == (None, 25, None)
+    assert (found.pulse, len(found.free_s), found.rates_hz) == (None, 25, None)
     assert found.describe().startswith("heart and breath were not looked for: 25 frames over 2.4 s")
 
 
@@ -119,9 +119,24 @@ def test_rates_that_a_film_cant_show_are_said() -> None:
     found = find_pulse(surface, float(time[0]))
     assert found.pulse is None, "a breath of 4 s, one and a half times"
     low, _ = found.rates_hz or (0.0, 0.0)
-    assert found.span_s < 6
-    assert low == pytest.approx(3 / found.span_s)
-    assert f"only from {low:.2g} to 3.5 Hz would one show: {found.frames} frames" in found.describe()
+    assert low == pytest.approx(3 / np.ptp(found.free_s))
+    assert low > 0.5
+    assert f"only from {low:.2g} to 3.5 Hz would one show: {len(found.free_s)} frames" in found.describe()
+
+
+def test_few_noisy_frames_have_as_many_harmonics_as_they_can_tell() -> None:
+    """Three, of a breath that is a plain sine, foresee nothing."""
+    whole, time, _ = film(seconds=14, heart_mm=0.0, breath_mm=0.1, contact_mm=0.0)
+    rng, few = np.random.default_rng(0), Surface(np.ones(SIZE, bool))
+    for k in (k for k in range(0, 140, 3) if not (30 < k < 50 or 70 < k < 95)):
+        few.time_s.append(whole.time_s[k])
+        few.moved.append(whole.moved[k] + rng.normal(0, 0.4, 2).astype(np.float32))
+        few.seen.append(whole.seen[k])
+    pulse = find_pulse(few, float(time[0])).pulse
+    assert pulse is not None
+    (breath,) = pulse.rhythms
+    assert breath.rate_hz == pytest.approx(0.25, rel=0.03)
+    assert len(breath.modes) < 6
 
 
 def test_a_given_span_without_contact_is_enough() -> None:
