@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.recording.folder import Recording
-from learn.inference.pulse import Pulse
+from learn.inference.pulse import Pulse, Search
 from learn.inference.video import Picture
 from learn.inference.video_flow import Step, VideoFlow, shrink_picture
 from synth.errors import UserError
@@ -63,6 +63,8 @@ class OwnMotion:
     """[px]."""
     space: Pulse | None
     """[mm]; None without a second eye."""
+    search: Search
+    """What came of looking for it."""
 
     def describe(self, mm_per_px: float) -> str:
         """See `Pulse.describe`."""

@@ -15,7 +15,7 @@ from bench.methods.protocol import InSpace, Method, Scene
 from bench.recording.folder import Recording
 from bench.recording.meta import Span
 from bench.recording.second_eye import OwnMotion, SecondEye, Sight
-from learn.inference.pulse import Surface
+from learn.inference.pulse import Surface, carried_over
 from learn.inference.video_flow import Account, FlowHere, Footage, Settings, Step, VideoFlow
 from synth.errors import UserError
 from synth.flow.stereo.track import Moved
@@ -133,7 +133,8 @@ def _track(
     tool = recording.tool if recording.has_masks else None
     footage = Footage(recording.frames(), str(recording.folder), recording.tissue_mask, tool, meta.rest_frame)
     asked = replace(settings, pulse=settings.pulse and meta.pulse.remove)
-    video = VideoFlow(footage, asked, flow, pulse=None if own is None else own.flow, watch=watch)
+    known = (None, None) if own is None else (own.flow, own.search)
+    video = VideoFlow(footage, asked, flow, pulse=known[0], search=known[1], watch=watch)
     asking = _Asking(methods, pictured, watch)
     two = bool(recording.right or recording.depths)
     second, space = SecondEye(recording, video, own) if two else None, _InSpace()
@@ -161,11 +162,12 @@ def _track(
         if video.seen <= meta.rest_frame:
             raise UserError(f"{recording.folder}: rest_frame {meta.rest_frame}, but {video.seen} frames")
         raise UserError(f"{recording.folder}: no frame has a time; give frames.csv, or fps in meta.yaml")
-    found = video.find_pulse(meta.pulse.free_s, space.surface)
+    found = video.find_pulse(meta.pulse.free_s, space.seen)
     _tell(out, video, recording, methods, own, scale_mm_per_px * video.shrink)
     if found is None or video.search is None:
         return out, None
-    return out, OwnMotion(found, None if space.surface is None else video.search.pulse)
+    deep = None if space.moved is None else carried_over(video.search, space.moved, video.rest_s)
+    return out, OwnMotion(found, deep, video.search)
 
 
 def _tell(
@@ -207,7 +209,9 @@ class _InSpace:
     """What both eyes saw move, for the tissue's own motion to be looked for in."""
 
     def __init__(self) -> None:
-        self._surface: Surface | None = None
+        self.moved: Surface | None = None
+        """[mm], to be taken off; None if there is no frame."""
+        self._seen: Surface | None = None
         self._sure: list[float] = []
 
     def add(self, step: Step, moved: Moved, tissue: NDArray[np.bool_], mm_per_px: float) -> None:
@@ -215,17 +219,21 @@ class _InSpace:
         time_s, found = step.picture.time_s, step.found
         if time_s is None or found.is_rest or not found.trusted:
             return
-        self._surface = self._surface or Surface(tissue, mm_per_px)
-        self._surface.add(time_s, moved.motion, found.confidence)
+        self.moved = self.moved or Surface(tissue, mm_per_px)
+        self._seen = self._seen or Surface(tissue)
+        self.moved.add(time_s, moved.motion, found.confidence)
+        # The flow itself, not x and y in millimetres, which have the noise of depth in them.
+        seen = np.dstack([found.flow, moved.motion[..., 2] / np.float32(mm_per_px)])
+        self._seen.add(time_s, seen, found.confidence)
         across, along = (float(np.median(moved.deviation[..., k][tissue])) for k in (0, 2))
         self._sure.append(across / max(along, 1e-9))
 
     @property
-    def surface(self) -> Surface | None:
-        """Of all frames; None if there was none. Depth weighs as much less as it is less sure."""
-        if self._surface is not None:
-            self._surface.weight = (1.0, 1.0, min(1.0, float(np.median(self._sure))))
-        return self._surface
+    def seen(self) -> Surface | None:
+        """[px], to be looked in. Depth weighs as much less as it is less sure."""
+        if self._seen is not None:
+            self._seen.weight = (1.0, 1.0, min(1.0, float(np.median(self._sure))))
+        return self._seen
 
 
 class _Asking:

@@ -19,7 +19,7 @@ from learn.inference.ends import Ends
 from learn.inference.force_reader import ForceReader
 from learn.inference.mask_files import MaskFiles
 from learn.inference.predict import Predictor, View
-from learn.inference.pulse import Pulse
+from learn.inference.pulse import Pulse, Search
 from learn.inference.scale import UNKNOWN_NOTE, StatedScale, take_scale
 from learn.inference.stiffness import stiffness
 from learn.inference.video_flow import Footage, Settings, VideoFlow, everywhere
@@ -146,7 +146,7 @@ def _stored(sequence: Sequence, source: str) -> Motion:
     )
 
 
-def _video(path: Path, filmed: Filmed, pulse: Pulse | None = None) -> Motion:
+def _video(path: Path, filmed: Filmed, pulse: Pulse | None = None, search: Search | None = None) -> Motion:
     if filmed.scale_mm_per_px is None:
         raise UserError(
             f"{path}: a video doesn't say how large it shows things; give --scale in mm a pixel, or unknown"
@@ -156,7 +156,7 @@ def _video(path: Path, filmed: Filmed, pulse: Pulse | None = None) -> Motion:
     tissue = everywhere if drawn is None else partial(video.read_mask, drawn)
     tool = filmed.tool.read if filmed.tool else None
     footage = Footage(video.read_video(path, video.FPS), str(path), tissue, tool)
-    following = VideoFlow(footage, filmed.settings, pulse=pulse)
+    following = VideoFlow(footage, filmed.settings, pulse=pulse, search=search)
     steps = (
         Step(
             step.found.flow,
@@ -172,7 +172,7 @@ def _video(path: Path, filmed: Filmed, pulse: Pulse | None = None) -> Motion:
 
     def again() -> Motion | None:
         found = following.find_pulse()
-        return None if found is None else _video(path, filmed, found)
+        return None if found is None else _video(path, filmed, found, following.search)
 
     def notes() -> list[str]:
         said = following.notes if scale_known else [UNKNOWN_NOTE, *following.notes]

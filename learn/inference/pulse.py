@@ -31,8 +31,9 @@ _RATES_HZ = (0.08, 3.5)
 _PERIODS = 3.0  # that the frames without contact must span
 _HARMONICS = 3
 _LEAST_FRAMES = 30  # without contact; of fewer no rhythm is told
-_ORDINARY_HZ = (0.2, 1.5)  # breath under anaesthesia, 12 a minute, to a quick heart, 90
+_ORDINARY_HZ = (0.21, 1.5)  # breath under anaesthesia, some 12 a minute, to a quick heart, 90
 _MOST_RHYTHMS = 3  # heart, breath, and what is left of either
+_MOST_BESIDES = 2  # that move all of the surface, aren't periodic, and would hide what is
 _FOLDS = 6
 _PREDICTED = 0.3  # share of what moves that the fit must foresee in frames it has not seen
 _LEFT = 0.5  # share of what moves without contact that may be left when all is taken off
@@ -125,7 +126,7 @@ class Pulse:
         return f"the whole surface moves by itself, {' and '.join(parts)}: taken off"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Search:
     """What was found of the surface's rhythms, and where they were looked for."""
 
@@ -134,26 +135,32 @@ class Search:
     free_s: Floats
     """Times of the frames that could be followed and were taken for free of contact."""
     rates_hz: tuple[float, float] | None
-    """That would have been found; None: the frames are too few for any."""
+    """Between which rhythms were looked for; None: they weren't."""
+    reason: str = ""
+    """Why they weren't."""
+    besides: tuple[Rhythm, ...] = ()
+    """What else moves the whole surface, but isn't periodic enough to be taken off: a drift."""
 
     def describe(self) -> str:
         """What heart or breath might have been missed, in words; empty if neither was."""
-        if self.pulse is not None:
-            return ""
-        span = float(np.ptp(self.free_s)) if len(self.free_s) else 0.0
-        seen = f"{len(self.free_s)} frames over {span:.3g} s could be followed without contact"
         if self.rates_hz is None:
             return (
-                f"heart and breath were not looked for: {seen}, too few. "
+                f"heart and breath were not looked for: {self.reason}. "
                 "If the tissue moves by itself, that is still in it"
             )
         low, high = self.rates_hz
         if low <= _ORDINARY_HZ[0] and high >= _ORDINARY_HZ[1]:
             return ""
+        none = "no heart or breath was found, but " if self.pulse is None else "of heart and breath, "
         return (
-            f"no heart or breath was found, but only from {low:.2g} to {high:.2g} Hz would one show: {seen}. "
+            f"{none}only rates from {low:.2g} to {high:.2g} Hz would show in {_told(self.free_s)}. "
             "Slower or faster motion of the tissue's own is still in it"
         )
+
+
+def _told(free_s: Floats) -> str:
+    span = float(np.ptp(free_s)) if len(free_s) else 0.0
+    return f"the {len(free_s)} frames over {span:.3g} s that could be followed without contact"
 
 
 def find_pulse(surface: Surface, rest_s: float, free_s: Sequence[Span] = ()) -> Search:
@@ -166,11 +173,11 @@ def find_pulse(surface: Surface, rest_s: float, free_s: Sequence[Span] = ()) -> 
             periodic motion are taken.
     """
     if len(surface.time_s) < _LEAST_FRAMES:
-        return _search(None, np.array(surface.time_s))
+        return _not_looked_for(np.array(surface.time_s))
     cells = _laid_out(surface)
     time_s, seen, basis = cells.time_s, cells.seen, cells.basis
     if len(basis) < 2 * _terms(_DEGREE):
-        return _search(None, time_s[:0])
+        return Search(None, time_s, None, "too little of the picture is tissue that could be followed")
     moved = cells.moved * np.array(surface.weight or 1.0) / surface.px
     known = (seen > 0).mean(axis=1) > 0.5
     given = np.zeros(len(time_s), bool)
@@ -178,18 +185,29 @@ def find_pulse(surface: Surface, rest_s: float, free_s: Sequence[Span] = ()) -> 
         given |= (time_s >= start) & (time_s <= stop)
     coefficients = _projected(basis, moved, seen)
     smooth = free = known & (given if free_s else _smooth_frames(basis, coefficients, moved, seen, known))
+    rates_hz = _rates(time_s[smooth]) if smooth.sum() >= _LEAST_FRAMES else None
+    if rates_hz is None:
+        return _not_looked_for(time_s[smooth])
     rhythms: tuple[Rhythm, ...] = ()
+    besides: tuple[Rhythm, ...] = ()
+    fitted = free
     for _ in range(1 if free_s else 4):
-        rhythms = _rhythms(time_s, coefficients, free, basis)
+        fitted = free
+        rhythms, besides = _rhythms(time_s, coefficients, fitted, basis)
         if not rhythms or free_s:
             break
-        explained = _explained(time_s, rhythms, free, smooth, basis, coefficients, moved, seen)
-        before, free = free, known & explained
-        if (free == before).all():
+        whole = (*rhythms, *besides)
+        free = known & _explained(time_s, whole, fitted, smooth, basis, coefficients, moved, seen)
+        if (free == fitted).all():
             break
-    if not rhythms or not _takes_off(time_s, rhythms, smooth, coefficients):
-        return _search(None, time_s[free])
-    return _search(_measured(surface, rhythms, free, rest_s), time_s[free])
+    if not rhythms or not _takes_off(time_s, rhythms, besides, smooth, coefficients):
+        return Search(None, time_s[smooth], rates_hz)
+    pulse = _measured(surface, rhythms, besides, fitted, rest_s, _at_pixels(surface.tissue))
+    return Search(pulse, time_s[fitted], rates_hz, besides=besides)
+
+
+def _not_looked_for(free_s: Floats) -> Search:
+    return Search(None, free_s, None, f"{_told(free_s)} are too few")
 
 
 def carried_over(found: Search, surface: Surface, rest_s: float) -> Pulse:
@@ -202,7 +220,8 @@ def carried_over(found: Search, surface: Surface, rest_s: float) -> Pulse:
     """
     if found.pulse is None:
         raise AssertionError("there is no pulse to carry over")
-    return _measured(surface, found.pulse.rhythms, np.isin(surface.time_s, found.free_s), rest_s)
+    free = np.isin(surface.time_s, found.free_s)
+    return _measured(surface, found.pulse.rhythms, found.besides, free, rest_s, found.pulse.basis)
 
 
 @dataclass(frozen=True)
@@ -232,15 +251,23 @@ def _laid_out(surface: Surface) -> _Cells:
     return _Cells(time_s, moved[:, used], enough, used, _polynomials(at))
 
 
-def _measured(surface: Surface, rhythms: Sequence[Rhythm], free: Flags, rest_s: float) -> Pulse:
-    """Rhythms of known phase, as the motion of the frames `free` has them."""
+def _measured(
+    surface: Surface,
+    rhythms: Sequence[Rhythm],
+    besides: Sequence[Rhythm],
+    free: Flags,
+    rest_s: float,
+    basis: NDArray[np.float32],
+) -> Pulse:
+    """Rhythms of known phase, as the motion of the frames `free` has them, fitted with what moves besides."""
     cells = _laid_out(surface)
     coefficients, t = _projected(cells.basis, cells.moved, cells.seen), cells.time_s[free]
-    phases = [(one.rate_hz, one.knots_s, one.knots, len(one.modes) // 2) for one in rhythms]
-    rhythms = _fitted(t, coefficients[free].reshape(len(t), -1), phases, np.eye(coefficients.shape[1]))
-    sizes = tuple(float(np.median(_amplitude(rhythm, cells.basis))) / surface.px for rhythm in rhythms)
-    own = sum((rhythm.at(cells.time_s) for rhythm in rhythms), np.zeros(1))
-    offset = _at_rest(t, (coefficients - own)[free], rest_s)
+    phases = [(one.rate_hz, one.knots_s, one.knots, len(one.modes) // 2) for one in (*rhythms, *besides)]
+    every = _fitted(t, coefficients[free].reshape(len(t), -1), phases, np.eye(coefficients.shape[1]))
+    own, others = every[: len(rhythms)], every[len(rhythms) :]
+    sizes = tuple(float(np.median(_amplitude(rhythm, cells.basis))) / surface.px for rhythm in own)
+    left = coefficients[free] - _sum(own, t) - (_sum(others, t) - _sum(others, np.array([rest_s])))
+    offset = _at_rest(t, left, rest_s)
     shape, components = surface.moved[0].shape[:2], coefficients.shape[2]
     common = np.zeros((len(cells.used), components), np.float32)
     common[cells.used] = _in_common(
@@ -248,16 +275,17 @@ def _measured(surface: Surface, rhythms: Sequence[Rhythm], free: Flags, rest_s: 
     )
     large = cv2.resize(common.reshape(*shape, components), surface.tissue.shape[::-1])
     still = large * surface.tissue[..., None]
-    return Pulse(tuple(rhythms), _at_pixels(surface.tissue), offset, still, sizes, float(free.mean()))
+    return Pulse(tuple(own), basis, offset, still, sizes, float(free.mean()))
 
 
-def _search(pulse: Pulse | None, free_s: Floats) -> Search:
-    """What came of frames without contact, at these times [s]."""
-    return Search(pulse, free_s, _rates(free_s) if len(free_s) >= _LEAST_FRAMES else None)
+def _sum(rhythms: Sequence[Rhythm], time_s: Floats) -> Floats:
+    """(T, B, C) coefficients of several rhythms together; 0 of none."""
+    return np.asarray(sum((one.at(time_s) for one in rhythms), np.zeros(1)), np.float64)
 
 
 def _in_common(basis: Floats, coefficients: Floats, moved: Floats, seen: Floats, most: float) -> Floats:
-    """(P, C) median over frames without contact of what smooth motion leaves, `most` long at most.
+    """(P, C) median over frames without contact of what smooth motion leaves, at most `most` in the picture
+    and along the view.
 
     Every flow is measured from the rest frame, so its noise moves the same places in all frames alike.
     """
@@ -266,8 +294,10 @@ def _in_common(basis: Floats, coefficients: Floats, moved: Floats, seen: Floats,
     enough = (seen > 0).mean(axis=0) > 0.5
     common = np.zeros(left.shape[1:])
     common[enough] = np.nanmedian(left[:, enough], axis=0)
-    length = np.linalg.norm(common, axis=1, keepdims=True)
-    return np.asarray(common * np.minimum(1, most / np.maximum(length, 1e-9)), np.float64)
+    for part in (common[:, :2], common[:, 2:]):
+        length = np.linalg.norm(part, axis=1, keepdims=True)
+        part *= np.minimum(1, most / np.maximum(length, 1e-9))
+    return common
 
 
 def _at_rest(time_s: Floats, left: Floats, rest_s: float) -> Floats:
@@ -280,11 +310,13 @@ def _at_rest(time_s: Floats, left: Floats, rest_s: float) -> Floats:
     return np.asarray(constant.reshape(left.shape[1:]), np.float64)
 
 
-def _takes_off(time_s: Floats, rhythms: Sequence[Rhythm], free: Flags, coefficients: Floats) -> bool:
+def _takes_off(
+    time_s: Floats, rhythms: Sequence[Rhythm], besides: Sequence[Rhythm], free: Flags, coefficients: Floats
+) -> bool:
     """Whether the rhythms explain most of how all smooth frames move, not only those they were fitted on."""
-    own = sum((rhythm.at(time_s[free]) for rhythm in rhythms), np.zeros(1))
-    before = float(coefficients[free].var(axis=0).sum())
-    after = float((coefficients[free] - own).var(axis=0).sum())
+    moving = coefficients[free] - _sum(besides, time_s[free])
+    before = float(moving.var(axis=0).sum())
+    after = float((moving - _sum(rhythms, time_s[free])).var(axis=0).sum())
     return after < _LEFT * before
 
 
@@ -341,41 +373,58 @@ def _explained(
 ) -> Flags:
     """(T,) frames that the rhythms leave as little of as of most smooth ones; of most of those they were
     fitted on would let contacts in by and by."""
-    own = sum((rhythm.at(time_s) for rhythm in rhythms), np.zeros(1))
+    own = _sum(rhythms, time_s)
     own = own + (coefficients - own)[free].mean(axis=0)
     off = _off(basis, own, moved, seen)
     return np.asarray(off <= 2.5 * np.median(off[smooth]) + 1e-3, bool)
 
 
-def _rhythms(time_s: Floats, coefficients: Floats, free: Flags, basis: Floats) -> tuple[Rhythm, ...]:
-    """One after the other, the strongest first, each in what those before it leave."""
+def _rhythms(
+    time_s: Floats, coefficients: Floats, free: Flags, basis: Floats
+) -> tuple[tuple[Rhythm, ...], tuple[Rhythm, ...]]:
+    """One after the other, the strongest first, each in what those before it leave; and what had to be left
+    aside on the way, for it foresees nothing, isn't repeated or isn't everywhere alike."""
     if free.sum() < _LEAST_FRAMES:
-        return ()
+        return (), ()
     t = time_s[free]
     # In these coordinates a length is a length of motion over the cells.
     metric = np.linalg.cholesky(basis.T @ basis / len(basis) + 1e-12 * np.eye(basis.shape[1])).T
     y = np.einsum("ab,tbc->tac", metric, coefficients[free]).reshape(len(t), -1)
     back = np.linalg.inv(metric)
     found: list[Candidate] = []
-    for _ in range(_MOST_RHYTHMS):
-        rate = _rate(t, y, found)
+    tried: list[Candidate] = []
+    kept: list[bool] = []
+    told: list[bool] = []
+    while sum(kept) < _MOST_RHYTHMS and len(kept) - sum(kept) <= _MOST_BESIDES:
+        rate = _rate(t, y, tried)
         if rate is None:
             break
-        # Few frames can't tell three harmonics: as many as foresee what they weren't fitted on.
-        for count in range(_harmonics(t, rate), 0, -1):
-            tried = _refined(t, y, [*found, (rate, *_knots(time_s, rate), count)])
-            if _foresees(t, y, tried):
-                break
-        else:
+        tried, periodic = _periodic(t, y, tried, rate)
+        if _too_alike(tried):
             break
-        if _too_alike(tried) or _runs_away(t, tried[-1]):
+        size = _amplitude(_fitted(t, y, tried, back)[-1], basis)
+        if np.median(size) < _LEAST_PX:
             break
-        one = _fitted(t, y, tried, back)[-1]
-        size = _amplitude(one, basis)
-        if np.median(size) < _LEAST_PX or np.percentile(size, 95) > _EVEN * np.median(size):
-            break
-        found = tried
-    return tuple(_fitted(t, y, found, back))
+        kept.append(periodic and bool(np.percentile(size, 95) <= _EVEN * np.median(size)))
+        # What hid no rhythm is noise, and fitting it would do harm.
+        if kept[-1]:
+            found, told = tried, list(kept)
+    every = _fitted(t, y, found, back)
+    own = tuple(one for one, is_own in zip(every, told, strict=True) if is_own)
+    return own, tuple(one for one, is_own in zip(every, told, strict=True) if not is_own)
+
+
+def _periodic(t: Floats, y: Floats, found: Sequence[Candidate], rate: float) -> tuple[list[Candidate], bool]:
+    """What was found and one more of that rate, and whether that one is periodic.
+
+    Few frames can't tell three harmonics: it has as many as foresee what they weren't fitted on.
+    """
+    tried = list(found)
+    for count in range(_harmonics(t, rate), 0, -1):
+        tried = _refined(t, y, [*found, (rate, *_knots(t, rate), count)])
+        if _foresees(t, y, tried):
+            return tried, not _runs_away(t, tried[-1])
+    return tried, False
 
 
 def _knots(time_s: Floats, rate_hz: float) -> tuple[Floats, Floats]:
@@ -501,7 +550,7 @@ def _too_alike(candidates: Sequence[Candidate]) -> bool:
 
 
 def _runs_away(t: Floats, one: Candidate) -> bool:
-    """Whether its phase, let run behind, made it a rate too slow for so short a time."""
+    """Whether its phase, let run behind, made it something too slow to be repeated in so short a time."""
     turns = float(np.ptp(_phase(t, one))) / (2 * np.pi)
     return turns < _PERIODS - 0.5
 

@@ -230,6 +230,7 @@ class VideoFlow:
         flow: FlowHere | None = None,
         is_due: Callable[[int, float], bool] = lambda index, time_s: True,
         pulse: Pulse | None = None,
+        search: Search | None = None,
         watch: Stopwatch | None = None,
         spare_s: Callable[[float], float] = lambda time_s: 0.0,
     ) -> None:
@@ -241,6 +242,7 @@ class VideoFlow:
             flow: where flow is computed, closed by the caller; None: here.
             is_due: whether a frame after the rest frame, at its time [s], is to be worked on.
             pulse: motion of the tissue's own that is taken off the flow of every frame.
+            search: what came of looking for that, the first time through.
             watch: what the time spent is added to; None: one of its own.
             spare_s: how long it is to a frame's arrival [s]: answers that are there until then come first.
 
@@ -264,7 +266,7 @@ class VideoFlow:
         self._period_s = 0.0 if settings.rate_hz is None else 1 / settings.rate_hz
         self._due_s = self._last_s = -math.inf
         self._rest_s: float | None = None
-        self.search: Search | None = None
+        self.search = search
         """What came of looking for a pulse; None before."""
         self._fault, self._rest_rgb = "", np.zeros((0, 0, 3), np.uint8)
         self._followed, self._still = 0, True
@@ -332,14 +334,21 @@ class VideoFlow:
             free_s: spans without contact, if known [s].
             space: the same frames' motion in space, if there is a second eye: rhythms are looked for there.
         """
-        if self.surface is None or self._rest_s is None:
+        if self.surface is None:
             return None
         with self.watch.stage("pulse"):
-            looked = self.surface if space is None else space
-            self.search = find_pulse(looked, self._rest_s, free_s)
+            looked, rest_s = self.surface if space is None else space, self.rest_s
+            self.search = find_pulse(looked, rest_s, free_s)
             if self.search.pulse is None or space is None:
                 return self.search.pulse
-            return carried_over(self.search, self.surface, self._rest_s)
+            return carried_over(self.search, self.surface, rest_s)
+
+    @property
+    def rest_s(self) -> float:
+        """Time of the rest frame [s]; if it has none, of the first frame that could be followed."""
+        if self._rest_s is not None:
+            return self._rest_s
+        return self.surface.time_s[0] if self.surface is not None and self.surface.time_s else 0.0
 
     def _is_wanted(self, index: int, time_s: float | None) -> bool:
         """Whether a frame is looked at; what isn't is counted."""

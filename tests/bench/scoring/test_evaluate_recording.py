@@ -54,7 +54,9 @@ def test_fast_footage_is_thinned_and_large_pictures_shrunk(make: Maker) -> None:
     assert result.followed.tissue is not None
     assert result.followed.tissue.shape == (48, 320)
     assert "9 of 13 frames beyond 10 a second left out" in result.notes
-    told = [note for note in result.notes if "heart and breath were not looked for: 3 frames over" in note]
+    told = [
+        note for note in result.notes if "heart and breath were not looked for: the 3 frames over" in note
+    ]
     assert len(told) == 1, "a beat may be in so short a film"
 
 

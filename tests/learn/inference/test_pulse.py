@@ -111,7 +111,7 @@ def test_noise_alone_and_a_short_film_are_no_pulse() -> None:
     surface, time, _ = film(seconds=2.5)
     found = find_pulse(surface, float(time[0]))
     assert (found.pulse, len(found.free_s), found.rates_hz) == (None, 25, None)
-    assert found.describe().startswith("heart and breath were not looked for: 25 frames over 2.4 s")
+    assert found.describe().startswith("heart and breath were not looked for: the 25 frames over 2.4 s")
 
 
 def test_rates_that_a_film_cant_show_are_said() -> None:
@@ -121,7 +121,32 @@ def test_rates_that_a_film_cant_show_are_said() -> None:
     low, _ = found.rates_hz or (0.0, 0.0)
     assert low == pytest.approx(3 / np.ptp(found.free_s))
     assert low > 0.5
-    assert f"only from {low:.2g} to 3.5 Hz would one show: {len(found.free_s)} frames" in found.describe()
+    assert (
+        f"only rates from {low:.2g} to 3.5 Hz would show in the {len(found.free_s)} frames"
+        in found.describe()
+    )
+
+
+def test_a_slow_motion_hides_no_heart_and_what_is_too_slow_is_said() -> None:
+    """Two and a half times in 20 s, and twice as much as the heart: no rhythm, but in the way of one."""
+    surface, time, _ = film(heart_mm=0.16, breath_mm=0.0, contact_mm=0.0)
+    for t, moved in zip(time, surface.moved, strict=True):
+        moved += np.float32(2 * np.sin(2 * np.pi * 0.12 * t))
+    found = find_pulse(surface, float(time[0]))
+    assert found.pulse is not None
+    assert [rhythm.rate_hz for rhythm in found.pulse.rhythms] == pytest.approx([1.2], rel=0.01)
+    assert [len(surface.time_s), found.describe()] == [200, ""], "20 s show every ordinary rate"
+    surface, time, _ = film(seconds=12, breath_mm=0.0, contact_mm=0.0)
+    found = find_pulse(surface, float(time[0]))
+    assert found.pulse is not None
+    assert found.describe().startswith("of heart and breath, only rates from 0.25 to 3.5 Hz would show")
+
+
+def test_a_little_tissue_is_no_lack_of_frames() -> None:
+    surface, time, _ = film(seconds=8)
+    for seen in surface.seen:
+        seen[:, 1:] = 0
+    assert "too little of the picture is tissue" in find_pulse(surface, float(time[0])).describe()
 
 
 def test_few_noisy_frames_have_as_many_harmonics_as_they_can_tell() -> None:
