@@ -6,7 +6,7 @@ import hashlib
 import json
 import tempfile
 import zlib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -14,6 +14,9 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, ValidationError
+from safetensors import SafetensorError
+from safetensors.numpy import save_file
+from safetensors.torch import load_file
 
 from learn.data.grid import Grid, Resampler, centre, certainty, settled
 from synth.dataset import provenance
@@ -46,7 +49,8 @@ _CURE = {
 }
 _ARRAYS = ("mask", "confidence", "density", "force")
 _SPATIAL = "motion_confidence"
-_FILES = {f"{name}.npy" for name in (*_ARRAYS, _SPATIAL, *(f"displacement-{source}" for source in FIELDS))}
+_PACKED = {*_ARRAYS, _SPATIAL, *(f"displacement-{source}" for source in FIELDS)}
+_FILE = "arrays.safetensors"
 _PLAIN = ("name", "content_hash", "group", "family", "gesture", "young_kpa", "opening")
 
 
@@ -236,8 +240,8 @@ def pack(clip: Clip, folder: Path) -> None:
         with tempfile.TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.parent) as beside:
             part = Path(beside) / folder.name
             part.mkdir()
-            for name, values in arrays.items():
-                np.save(part / f"{name}.npy", values)
+            # One file: a mapping each, of which a process has some ten thousands, for thousands of clips.
+            save_file({name: np.ascontiguousarray(values) for name, values in arrays.items()}, part / _FILE)
             (part / "clip.json").write_text(json.dumps(plain | {"checksums": sums}))
             try:
                 part.rename(folder)
@@ -267,9 +271,7 @@ def unpack(folder: Path) -> Clip:
     """A packed clip, memory-mapped. Raises UserError if the folder is not one, or damaged."""
     try:
         said = _Said.model_validate_json(foreign_file.read_bytes(folder / "clip.json", 1_000_000))
-        arrays: dict[str, Any] = {
-            name: _mapped(folder / f"{name}.npy", told) for name, told in said.checksums.items()
-        }
+        arrays: dict[str, Any] = _mapped(folder / _FILE, said.checksums)
         displacement = {s: arrays.pop(f"displacement-{s}") for s in FIELDS if f"displacement-{s}" in arrays}
         clip = Clip(**said.model_dump(exclude={"checksums"}), displacement=displacement, **arrays)
         frames, n = len(clip.density), clip.mask.shape[-1]
@@ -284,21 +286,26 @@ def unpack(folder: Path) -> Clip:
         return clip
     except ValidationError as error:
         why = ": ".join(first_problem(error))
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, UserError) as error:
+    except RuntimeError as error:  # of the mapping, when a process has too many: nothing is damaged
+        raise UserError(f"{folder}: cannot be mapped ({str(error).splitlines()[0][:200]})") from None
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, UserError, SafetensorError) as error:
         why = str(error).splitlines()[0][:200]
     raise UserError(f"{folder}: damaged packed sequence ({why}); remove it")
 
 
-def _mapped(file: Path, checksum: int) -> NDArray[Any]:
-    if file.name not in _FILES:
-        raise ValueError(f"{file.name}: is no array of ours")
+def _mapped(file: Path, checksums: Mapping[str, int]) -> dict[str, NDArray[Any]]:
+    """The arrays of a packed clip, mapped and held against their checksums; no file stays open."""
     foreign_file.check_file(file, 64 << 30)
-    array: NDArray[Any] = np.load(file, mmap_mode="r", allow_pickle=False)
-    if array.dtype != (np.float64 if file.stem == "force" else np.float32):
-        raise ValueError(f"{file.name}: is of another type")
-    if _checksum(array) != checksum:
-        raise ValueError(f"{file.name}: the checksum does not match")
-    return array
+    arrays: dict[str, NDArray[Any]] = {name: values.numpy() for name, values in load_file(file).items()}
+    if not arrays.keys() == checksums.keys() <= _PACKED:
+        raise ValueError(f"{file.name}: holds other arrays")
+    for name, array in arrays.items():
+        array.flags.writeable = False
+        if array.dtype != (np.float64 if name == "force" else np.float32):
+            raise ValueError(f"{name}: is of another type")
+        if _checksum(array) != checksums[name]:
+            raise ValueError(f"{name}: the checksum does not match")
+    return arrays
 
 
 def _checksum(values: NDArray[Any]) -> int:

@@ -77,7 +77,7 @@ def test_packed_motion_is_what_was_read(told: list[Clip], tmp_path: Path) -> Non
     again = reading.unpack(tmp_path / "clip")
     np.testing.assert_array_equal(again.displacement["motion"], told[0].displacement["motion"])
     np.testing.assert_array_equal(again.sure("motion"), told[0].sure("motion"))
-    (tmp_path / "clip/motion_confidence.npy").unlink()
+    (tmp_path / "clip/arrays.safetensors").unlink()
     with pytest.raises(UserError, match="damaged packed sequence"):
         reading.unpack(tmp_path / "clip")
 

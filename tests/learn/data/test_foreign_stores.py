@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import pickle
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -13,6 +14,7 @@ import numpy as np
 import phantom
 import pytest
 import zarr
+from safetensors.numpy import load_file, save_file
 from typer.testing import CliRunner
 
 from learn.cli import app
@@ -25,6 +27,7 @@ from synth.errors import UserError
 
 GRID = Grid(32)
 TINY = ["--preset", "tiny", "--size", "32", "--width", "8", "--epochs", "1", "--json"]
+ARRAYS = "arrays.safetensors"
 run = CliRunner().invoke
 
 
@@ -142,13 +145,21 @@ def test_keys_are_made_by_us(own: Path, tmp_path: Path) -> None:
     assert len(set(names)) == 8
 
 
-def flipped(name: str) -> Callable[[Path], None]:
+def flipped(at: int) -> Callable[[Path], None]:
     def flip(folder: Path) -> None:
-        data = bytearray((folder / name).read_bytes())
-        data[-5] ^= 4
-        (folder / name).write_bytes(data)
+        data = bytearray((folder / ARRAYS).read_bytes())
+        data[at] ^= 4
+        (folder / ARRAYS).write_bytes(data)
 
     return flip
+
+
+def replaced(**values: np.ndarray | None) -> Callable[[Path], None]:
+    def replace(folder: Path) -> None:
+        arrays = load_file(folder / ARRAYS) | values
+        save_file({name: array for name, array in arrays.items() if array is not None}, folder / ARRAYS)
+
+    return replace
 
 
 def said(**changes: Any) -> Callable[[Path], None]:
@@ -160,18 +171,27 @@ def said(**changes: Any) -> Callable[[Path], None]:
 
 
 def pickled(folder: Path) -> None:
-    np.save(folder / "mask.npy", np.array([print], object), allow_pickle=True)
+    (folder / ARRAYS).write_bytes(pickle.dumps(print))
+
+
+def cut(folder: Path) -> None:
+    (folder / ARRAYS).write_bytes((folder / ARRAYS).read_bytes()[:-100])
 
 
 @pytest.mark.parametrize(
     "harm",
     [
-        flipped("density.npy"),
-        flipped("force.npy"),
-        flipped("displacement-ideal.npy"),
+        flipped(-5),
+        flipped(4000),
+        flipped(3),
+        flipped(20),
         pickled,
-        lambda folder: (folder / "mask.npy").unlink(),
-        lambda folder: np.save(folder / "mask.npy", np.ones((16, 16), np.float32)),
+        cut,
+        lambda folder: (folder / ARRAYS).unlink(),
+        replaced(mask=None),
+        replaced(mask=np.ones((16, 16), np.float32)),
+        replaced(mask=np.ones((32, 32), np.float16)),
+        replaced(another=np.ones(3, np.float32)),
         lambda folder: (folder / "clip.json").write_text("[" * 10_000),
         said(young_kpa=0),
         said(checksums={"../../../mask": 1}),
