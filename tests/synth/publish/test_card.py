@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 from xml.etree import ElementTree
 
@@ -125,6 +126,19 @@ def test_the_command_writes_it_anew(root: Path) -> None:
     (root / "README.md").unlink()
     assert CliRunner().invoke(app, ["card", str(root)]).exit_code == 0
     assert text(root) == before
+
+
+def test_failed_sequences_have_a_line_each(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    before, real = text(root), index.read_index
+    rows = real(root).to_pylist()
+    rows += [rows[0] | {"index": 100 + k, "status": "failed", "reason": f"why {k}"} for k in range(22)]
+    monkeypatch.setattr(index, "read_index", lambda folder: SimpleNamespace(to_pylist=lambda: rows))
+    lines = card.write_card(Folder(root)).read_text("utf-8").splitlines()
+    (root / "README.md").write_text(before, "utf-8")
+    first = lines.index("- 000100: why 0")
+    assert lines[first - 2 : first] == ["22 of 3 sequences failed and are not in the dataset:", ""]
+    assert lines[first + 19 : first + 22] == ["- 000119: why 19", lines[first + 20], ""]
+    assert lines[first + 20].startswith("- and 2 more")
 
 
 def test_histogram_counts_what_it_is_given() -> None:
