@@ -1,7 +1,8 @@
 # `make demo` and `make test` are all the set-up there is: both make the virtual environment first.
 #
 #   make demo    dataset -> training -> scores -> runs/demo/report.html
-#   make test    lint, types, all tests: what has to pass before anything lands
+#   make test    lint, types, all tests but trials: six minutes on two cores
+#   make trials  kills, clusters, containers, the wheel, the site: what has to pass as well before anything lands
 #   make quick   lint, types, and the tests that take no more than seconds
 #   make docs    the pages in site/; open site/index.html
 #   make clean   removes what these made
@@ -14,7 +15,7 @@ BIN := .venv/bin
 DEMO := runs/demo
 PYTEST := $(BIN)/python -m pytest -n 2
 
-.PHONY: demo test quick docs setup lint types slurm clean
+.PHONY: demo test trials quick docs setup lint types slurm clean
 .DELETE_ON_ERROR:
 
 setup: .venv/installed .venv/llvm
@@ -42,16 +43,19 @@ demo: setup
 	$(BIN)/bench demo $(DEMO)/data --model $(DEMO)/model -o $(DEMO)
 	@echo "done: open $(DEMO)/report.html"
 
-test: setup lint types slurm
-	$(PYTEST)
+test: setup lint types
+	$(PYTEST) -m "not trial"
 
-# One test renders through a real SLURM. A CI's machine gets it where it may; a desk's owner decides.
+trials: setup slurm
+	$(PYTEST) -m trial
+
+# One trial renders through a real SLURM. A CI's machine gets it where it may; a desk's owner decides.
 slurm:
 	@if [ "$$CI" = true ] && ! command -v slurmctld >/dev/null && [ "$$(id -u)" = 0 ]; then \
 	  (apt-get -qq update && apt-get -qq install -y slurm-wlm) >/dev/null 2>&1 || echo "no SLURM: its test is skipped"; fi
 
 quick: setup lint types
-	$(PYTEST) -m "not slow"
+	$(PYTEST) -m "not slow and not trial"
 
 docs: setup
 	$(BIN)/python docs/generate.py

@@ -5,10 +5,8 @@ from __future__ import annotations
 import json as json_
 import shlex
 import sys
-from enum import StrEnum
-from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -34,13 +32,6 @@ Masks = Annotated[
     str, typer.Option(help="auto, none, glare, tool, both, or a folder of NNNNNN.png or mask.png: the tool.")
 ]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")]
-
-
-class Footage(StrEnum):
-    """How exported frames are kept."""
-
-    png = "png"
-    mp4 = "mp4"
 
 
 @app.command(epilog="Example: bench score recording --model model --also other=other-model")
@@ -80,10 +71,9 @@ def score(
     """Force from a recording's video, scored against its sensor: score.json and report.html."""
     from bench.scoring import commands
     from bench.scoring.evaluate_recording import Settings
-
-    others = {name: Path(folder) for name, folder in _pairs("--also", also, "NAME=FOLDER").items()}
     from learn.inference.mask_files import read_choice
 
+    others = {name: Path(folder) for name, folder in _pairs("--also", also, "NAME=FOLDER").items()}
     kind, files = read_choice(masks)
     settings = Settings(backend=flow, shrink=shrink, rate_hz=rate or None, pulse=pulse, masks=kind)
     seen = commands.Seen(files, _rectangle(region))
@@ -154,8 +144,8 @@ def import_(
 ) -> None:
     """Turns another system's recording into a recording folder."""
     from bench.importers import registry
-    from bench.output.progress_bar import counting
     from learn.inference.scale import read_scale
+    from synth.system.terminal import counting
 
     found = registry.read_source(source, _pairs("--use", use, "ROLE=NAME"))
     about: dict[str, object] = {"young_kpa": young if young is not None else "unknown"}
@@ -198,7 +188,7 @@ def from_dataset(
     dataset: Annotated[Path, typer.Argument(help="A rendered dataset.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder that gets one recording a sequence.")],
     sequence: Annotated[int | None, typer.Option(help="Only this sequence.")] = None,
-    footage: Annotated[Footage, typer.Option(help="Lossless pictures or H.264.")] = Footage.png,
+    footage: Annotated[Literal["png", "mp4"], typer.Option(help="Lossless pictures or H.264.")] = "png",
     json: Json = False,
 ) -> None:
     """Writes sealed sequences as recording folders, to be scored as real ones are."""
@@ -208,12 +198,43 @@ def from_dataset(
     chosen = [s for s in Dataset(dataset) if sequence is None or s.index == sequence]
     if not chosen:
         raise UserError(f"{dataset}: holds no finished sequence {sequence}")
-    written = [export_recording(s, out / f"{s.index:06d}", footage.value) for s in chosen]
-    if json:
-        print(json_.dumps({"recordings": [str(path) for path in written]}))
-    else:
-        for path in written:
-            print(path)
+    written = [export_recording(s, out / f"{s.index:06d}", footage) for s in chosen]
+    _print_paths(written, json)
+
+
+@app.command("make-exvivo", epilog="Example: bench make-exvivo --out recordings --count 2 --seconds 10")
+def make_exvivo(
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder that gets the recordings.")],
+    count: Annotated[int, typer.Option(min=1, help="How many recordings.")] = 6,
+    first: Annotated[
+        int, typer.Option(min=0, help="Number of the first; they don't depend on each other.")
+    ] = 0,
+    seconds: Annotated[float, typer.Option(help="Length of each.")] = 30.0,
+    fps: Annotated[float, typer.Option(min=1.0, help="Mean frames a second.")] = 10.0,
+    width: Annotated[int, typer.Option(min=64, help="Width of the picture; the height is 3/4 of it.")] = 320,
+    photo: Annotated[Path | None, typer.Option(help="A photograph as texture of the surface.")] = None,
+    seed: Annotated[int, typer.Option(help="Root of all draws.")] = 100,
+    eyes: Annotated[int, typer.Option(min=1, max=2, help="Cameras that look on.")] = 1,
+    json: Json = False,
+) -> None:
+    """Renders pseudo ex vivo recordings, unlike any training data in every respect at once."""
+    from bench.recording import exvivo
+    from synth.system.terminal import counting
+
+    plan = exvivo.Plan(
+        seed, seconds, fps, (width, width * 3 // 4), photo.resolve() if photo else None, eyes=eyes
+    )
+    written = []
+    for index in range(first, first + count):
+        with counting(f"recording {index}", int(seconds * fps)) as progress:
+            done = exvivo.make(plan, index, out / f"{index:03d}", progress)
+        written.append(done)
+    _print_paths(written, json)
+
+
+def _print_paths(recordings: list[Path], json: bool) -> None:
+    names = [str(path) for path in recordings]
+    print(json_.dumps({"recordings": names}) if json else "\n".join(names))
 
 
 def _pairs(option: str, words: list[str] | None, form: str) -> dict[str, str]:
@@ -249,40 +270,6 @@ def _say(result: Result, folder: Path, json: bool) -> None:
         console.print(f"note: {note}", style="yellow", markup=False, highlight=False)
     # A path is to be copied: never broken into lines.
     console.print(f"report: {folder / 'report.html'}", markup=False, highlight=False, soft_wrap=True)
-
-
-@app.command(epilog="Example: bench flow rest.png moved.png truth.flo --flow tvl1")
-def flow(
-    first: Annotated[Path, typer.Argument(help="Picture at rest.")],
-    second: Annotated[Path, typer.Argument(help="Picture after the motion.")],
-    truth: Annotated[
-        Path | None, typer.Argument(help="True flow: .flo, .png (KITTI) or .npz. Empty: not scored.")
-    ] = None,
-    flow: Backend = "tvl1",
-    glare: Annotated[bool, typer.Option("--glare/--no-glare", help="Mask highlights first.")] = False,
-    out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="File for the flow: .flo, .png, .npz.")
-    ] = None,
-    json: Json = False,
-) -> None:
-    """Flow between any two pictures, scored against a flow file."""
-    from bench.flow import pair
-    from synth.system.text_lines import hang
-
-    moved, found = pair.score_pair(first, second, truth, flow, glare, out)
-    if json:
-        typer.echo(json_.dumps(pair.as_dict(moved, found, out)))
-        return
-    lengths = f"mean |flow| {moved.mean_px:.3f} px, 98% within {moved.p98_px:.3f} px"
-    typer.echo(f"{lengths}, confidence {moved.confidence:.2f}")
-    if out is not None:
-        typer.echo(f"written to {out}")
-    if found is not None:
-        told = (
-            f"EPE {found.epe:.3f} px, 95% within {found.p95:.3f} px, outliers {found.outliers:.1%}; "
-            f"{found.trusted:.0%} trusted, EPE {found.trusted_epe:.3f} px there"
-        )
-        typer.echo("\n".join(hang("", told)))
 
 
 @app.command(epilog="Example: bench live video.mp4 --model model --scale 0.05 --young 1.5")
@@ -362,34 +349,7 @@ def _rectangle(text: str) -> tuple[int, int, int, int] | None:
     try:
         left, top, width, height = (int(part) for part in text.split(","))
     except ValueError:
-        raise UserError(f"--region {text}: give LEFT,TOP,WIDTH,HEIGHT in pixels") from None
+        left = top = width = height = -1
     if min(left, top) < 0 or min(width, height) < 1:
-        raise UserError(f"--region {text}: outside the picture")
+        raise UserError(f"--region {text}: give LEFT,TOP,WIDTH,HEIGHT in pixels, inside the picture")
     return left, top, width, height
-
-
-_MEASURING = ("experiment", "pareto", "stability", "pages", "gap", "make-exvivo")
-
-
-def _with_evidence() -> None:
-    """Adds the commands that measure this project itself, where their code is: in a checkout."""
-    checkout = Path(__file__).resolve().parents[1]
-    if (checkout / "evidence" / "commands.py").is_file():
-        if str(checkout) not in sys.path:
-            sys.path.append(str(checkout))
-        import_module("evidence.commands").add_to(app)
-        return
-    anything = {"ignore_unknown_options": True, "allow_extra_args": True}
-    for name in _MEASURING:
-        app.command(name, hidden=True, context_settings=anything, add_help_option=False)(_refuse_measuring)
-
-
-def _refuse_measuring(context: typer.Context) -> None:
-    name = context.info_name
-    raise UserError(
-        f"bench {name}: measures the program itself and is in no installation; in a clone's folder it is "
-        f"python -m bench {name}"
-    )
-
-
-_with_evidence()

@@ -10,34 +10,34 @@ import hashlib
 import io
 import json
 import os
-import warnings
 import zipfile
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
 
 import torch
 from pydantic import ConfigDict, Field, FiniteFloat, TypeAdapter, ValidationError
 from safetensors import torch as safetensors
-from torch import Tensor, nn
+from torch import Tensor
 
 from learn.data.grid import Scales
-from learn.network.d2fnet import Architecture
-from learn.network.monai_unet import build
-from learn.settings import Settings
+from learn.network.d2fnet import Architecture, D2FNet
+from learn.settings import Settings, upgraded
 from learn.uncertainty.intervals import Intervals
-from synth.errors import Caution, UserError
-from synth.job import identity
+from synth.errors import UserError
+from synth.job import identity, retired
 from synth.job.types import Positive, first_problem
-from synth.system import foreign_file
-from synth.system.whole_file import write_whole
+from synth.system import checked_file
+from synth.system.checked_file import write_whole
 
 _FORMAT, _VERSION = "sulcus-model", 1
 _LARGEST_BYTES = 100_000_000
 """Of config.json, which names the sequences that were trained on: a million of them."""
 _LARGEST_WEIGHTS = 64 << 30
 _WEIGHTS, _NEXT, _SAFE = "weights.pt", "weights.next.pt", "weights.safetensors"
+_OF_MAP = ("map", "contact", "map_unit")
+"""Blocks of intervals that older cards hold of the map's cells: no more used."""
 SEEN = ("fit", "select", "intervals")
 """Parts of `Card.split` that no score of the model may be of."""
 
@@ -61,14 +61,17 @@ class Card:
     score: FiniteFloat = 0.0
     """R² on the select sequences at the chosen epoch, of the network's own map, before `force_gain`."""
     force_gain: Positive = 1.0
-    """What the network's map is multiplied by (not what a total-force head says): the slope through the
-    origin of the true on the said total force, on the select sequences at the chosen epoch."""
+    """What the network's map is multiplied by: the slope through the origin of the true on the said total
+    force, on the select sequences at the chosen epoch."""
     weights_hash: str = ""
-    """Of the file of weights; empty before an epoch is kept, and in folders from before there were hashes."""
+    """Of the file of weights; empty before an epoch is kept."""
     intervals: Intervals | None = None
     """How far off its answers may be; None where nobody fitted that, or it could not be."""
     no_intervals: str = ""
     """Why it could not be; empty if it could, or nobody tried."""
+    retired: dict[str, Any] = field(default_factory=dict)
+    """Settings of the training that this version has no more, by dotted key: the model can be used, and not
+    trained further."""
 
 
 _CARD = TypeAdapter(Card)
@@ -78,9 +81,6 @@ def write_card(folder: Path, card: Card) -> None:
     """Writes config.json into a model's folder, whole or not at all."""
     folder.mkdir(parents=True, exist_ok=True)
     tree = {"format": _FORMAT, "version": _VERSION, **_CARD.dump_python(card, mode="json")}
-    # Where nobody tried, as before there were any.
-    unused = {"intervals": None, "no_intervals": "", "force_gain": 1.0}
-    tree = {k: v for k, v in tree.items() if k not in unused or v != unused[k]}
     tree["seal"] = _hash(identity.canonical(tree))
     _write(folder / "config.json", (json.dumps(tree, indent=1) + "\n").encode())
 
@@ -105,25 +105,20 @@ def write_model(folder: Path, card: Card, state: Mapping[str, Tensor], *, safe: 
 
 def read_card(folder: Path) -> Card:
     """Raises UserError if there is no model, or its config is damaged, edited or of another version."""
-    return _read(folder)[0]
-
-
-def _read(folder: Path) -> tuple[Card, bool]:
-    """The card, and whether it has a seal, which then holds."""
     file = folder / "config.json"
     if not file.exists():
         raise UserError(f"{folder}: no model here (config.json is missing)")
-    data = foreign_file.read_bytes(file, _LARGEST_BYTES)
+    data = checked_file.read_bytes(file, _LARGEST_BYTES)
     try:
         tree = json.loads(data)
         seal = tree.pop("seal", None)
         rest = {key: value for key, value in tree.items() if key not in ("format", "version")}
         if (tree["format"], tree["version"]) != (_FORMAT, _VERSION):
             raise UserError(f"{file}: not a model of this version")
-        card = _CARD.validate_json(json.dumps(rest), strict=True)
-        if seal is not None and seal != _hash(identity.canonical(tree)):
+        card = _CARD.validate_json(json.dumps(_upgraded(rest, file)), strict=True)
+        if seal != _hash(identity.canonical(tree)):
             raise UserError(f"{file}: is not as it was written: edited or damaged")
-        return card, seal is not None
+        return card
     except ValidationError as error:
         wrong = [(one["type"], ".".join(map(str, one["loc"]))) for one in error.errors()]
         unknown = [at for kind, at in wrong if kind in ("extra_forbidden", "unexpected_keyword_argument")]
@@ -137,6 +132,19 @@ def _read(folder: Path) -> tuple[Card, bool]:
         raise UserError(f"{file}: corrupt model configuration ({str(error)[:200]})") from None
 
 
+def _upgraded(tree: dict[str, Any], file: Path) -> dict[str, Any]:
+    """A card as this version writes it. Raises UserError for a network that it can't build."""
+    settings, gone = upgraded(tree["settings"])
+    lost = [retired.reason(key, value) for key, value in gone.items() if key.startswith("arch.")]
+    if lost:
+        raise UserError(f"{file}: {'; '.join(lost)}")
+    intervals = tree.get("intervals")
+    if isinstance(intervals, dict):
+        intervals = {key: value for key, value in intervals.items() if key not in _OF_MAP}
+    gone = tree.get("retired", {}) | gone
+    return tree | {"settings": settings, "intervals": intervals, "retired": gone}
+
+
 def save_tensors(file: Path, tree: Mapping[str, Any]) -> None:
     """Tensors and plain values, whole or not at all. Raises UserError if the file can't be written."""
     _write(file, _packed(tree))
@@ -146,7 +154,7 @@ def load_tensors(file: Path) -> dict[str, Any]:
     """Raises UserError if the file is missing or damaged, or holds anything but tensors and plain values."""
     if not file.exists():
         raise UserError(f"{file}: missing")
-    foreign_file.check_file(file, _LARGEST_WEIGHTS)
+    checked_file.check_file(file, _LARGEST_WEIGHTS)
     try:
         if file.suffix == ".safetensors":
             return dict(safetensors.load_file(file))
@@ -160,32 +168,28 @@ def load_tensors(file: Path) -> dict[str, Any]:
     return tree
 
 
-def load_model(folder: Path) -> tuple[nn.Module, Card]:
+def load_model(folder: Path) -> tuple[D2FNet, Card]:
     """The trained network, in evaluation mode on the CPU, and its card.
 
-    Raises UserError if card or weights are damaged, edited, or not each other's. A folder from before there
-    were hashes is read, with a `Caution`.
+    Raises UserError if card or weights are damaged, edited, or not each other's.
     """
-    card, sealed = _read(folder)
-    state = load_tensors(_find_weights(folder, card) if sealed else folder / _WEIGHTS)
+    card = read_card(folder)
+    state = load_tensors(_find_weights(folder, card))
     model = fit(state, card.settings.arch, folder)
     if not all(torch.isfinite(v).all() for v in state.values()):
         raise UserError(f"{folder}: the weights hold NaN or infinity")
-    if not sealed:
-        said = f"{folder}: was made before models had hashes: nothing shows whether its card was edited"
-        warnings.warn(said, Caution, stacklevel=2)
     return model.eval(), card
 
 
-def fit(state: Mapping[str, Any], arch: Architecture, where: Path) -> nn.Module:
+def fit(state: Mapping[str, Any], arch: Architecture, where: Path) -> D2FNet:
     """The network of `arch` with the weights of `state`. Raises UserError, before it takes memory for them,
     if they aren't its own."""
     with torch.device("meta"):
-        expected = {name: value.shape for name, value in build(arch).state_dict().items()}
+        expected = {name: value.shape for name, value in D2FNet(arch).state_dict().items()}
     found = {name: value.shape for name, value in state.items() if isinstance(value, Tensor)}
     if len(found) != len(state) or found != expected:
         raise UserError(f"{where}: the weights are not those of the network in config.json")
-    model = build(arch)
+    model = D2FNet(arch)
     try:
         model.load_state_dict(state)
     except RuntimeError as error:
@@ -196,7 +200,7 @@ def fit(state: Mapping[str, Any], arch: Architecture, where: Path) -> nn.Module:
 def room_needed(folder: Path, arch: Architecture) -> int:
     """Bytes that a training of `arch` still takes on the disk of `folder`, at most."""
     with torch.device("meta"):
-        numbers = sum(int(value.numel()) for value in build(arch).state_dict().values())
+        numbers = sum(int(value.numel()) for value in D2FNet(arch).state_dict().values())
     # Weights, and last.pt with two moments of each beside them; all twice while they are replaced. And logs.
     needed = 2 * 4 * 4 * numbers + 2_000_000
     written = (folder / name for name in (_WEIGHTS, "last.pt"))

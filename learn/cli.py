@@ -1,5 +1,5 @@
-"""`learn train | intervals | eval | predict | calibrate | export | models`: from a dataset to a model, honest
-numbers, forces and a file."""
+"""`learn train | eval | predict | calibrate | export | models`: from a dataset to a model, honest numbers,
+forces and a file."""
 
 from __future__ import annotations
 
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from learn.evaluation.metrics import Metric
     from learn.evaluation.statistics import Paired
     from learn.settings import Settings
+    from learn.uncertainty.intervals import Intervals
     from synth.dataset.split import Rule
 
 app = typer.Typer(
@@ -54,7 +55,7 @@ def train_command(
     dataset: Root,
     changes: Annotated[
         list[str] | None,
-        typer.Argument(help="Any setting, as in a model's config.json: arch.confidence=true batch=16."),
+        typer.Argument(help="Any setting, as in a model's config.json: loss=mse folds=10 arch.width=32."),
     ] = None,
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the model.")] = Path("model"),
     also: Annotated[
@@ -71,19 +72,6 @@ def train_command(
         ),
     ] = None,
     epochs: Annotated[int | None, typer.Option(help="Passes over the training frames.")] = None,
-    batch: Annotated[int | None, typer.Option(help="Frames a step.")] = None,
-    learning_rate: Annotated[float | None, typer.Option(help="AdamW's learning rate.")] = None,
-    loss: Annotated[str | None, typer.Option(help="mse, hinge, antighost, published, mae or huber.")] = None,
-    output: Annotated[str | None, typer.Option(help="magnitude, or vector (with --loss mse).")] = None,
-    target: Annotated[str | None, typer.Option(help="density or intensity (the paper's map).")] = None,
-    size: Annotated[int | None, typer.Option(help="Grid cells along an edge.")] = None,
-    width: Annotated[int | None, typer.Option(help="Channels of the first level.")] = None,
-    stem: Annotated[int | None, typer.Option(help="Stride of the first convolution: 1, 2 or 4.")] = None,
-    folds: Annotated[
-        int | None, typer.Option(help="Groups of sequences: one is test, one select. 5, or what there is.")
-    ] = None,
-    fold: Annotated[int | None, typer.Option(help="Which of them is the test.")] = None,
-    hold_out: Annotated[str | None, typer.Option(help="Appearance family kept for the test.")] = None,
     seed: Annotated[int | None, typer.Option(help="Root of all random draws.")] = None,
     accelerator: Annotated[str, typer.Option(help="cpu, cuda or auto.")] = "auto",
     devices: Annotated[int, typer.Option(help="GPUs; under torchrun the number of processes.")] = 1,
@@ -91,36 +79,25 @@ def train_command(
     cache: Cache = None,
     json: Json = False,
 ) -> None:
-    """Train D2FNet on a dataset. An interrupted run is continued by the same command."""
+    """Train D2FNet on a dataset. The same command continues an interrupted run."""
     from learn.checkpoint import room_needed
     from learn.data.clips import has_depth
     from learn.settings import override
     from learn.settings import preset as named
     from learn.training.threads import set_threads
-    from synth.system.whole_file import made_folder
+    from synth.system.checked_file import made_folder
 
     set_threads(threads)
     options = {
         "input": input,
         "arch.depth": None if input is None else has_depth(input),
         "epochs": epochs,
-        "batch": batch,
-        "learning_rate": learning_rate,
-        "target": target,
-        "size": size,
-        "objective.kind": loss,
-        "arch.output": output,
-        "arch.width": width,
-        "arch.stem": stem,
-        "held_out_family": hold_out,
-        "folds": folds,
-        "fold": fold,
         "seed": seed,
     }
-    given = [f"{k}={v}" for k, v in options.items() if v is not None]
-    settings = override(named(preset), [*given, *(changes or [])])
+    given = [f"{k}={v}" for k, v in options.items() if v is not None] + (changes or [])
+    settings, fixed = override(named(preset), given), any(one.startswith("folds=") for one in given)
     with made_folder(out, room_needed(out, settings.arch)):
-        datasets, fixed = [dataset, *(also or [])], folds is not None
+        datasets = [dataset, *(also or [])]
         clips, split, settings = _divided(datasets, settings, named(preset), cache, fixed=fixed)
         card, first = _train(clips, split, settings, out, accelerator, devices, quiet=json)
     if first:
@@ -131,6 +108,8 @@ def _tell_trained(card: Card, settings: Settings, out: Path, json: bool) -> None
     """The best epoch, on stdout or for a person."""
     result = {"model": str(out), "epoch": card.epoch, "select_r2": card.score}
     result |= {k: len(v) for k, v in card.split.items()}
+    no = f"No intervals: {card.no_intervals or 'no epoch was kept'}."
+    intervals = no if card.intervals is None else _told(card.intervals)
     if json:
         print(json_.dumps(result))
     else:
@@ -138,7 +117,7 @@ def _tell_trained(card: Card, settings: Settings, out: Path, json: bool) -> None
             f"Model in {out}: epoch {card.epoch} of {settings.epochs}, R² {card.score:.3f} on "
             f"{result['select']} select sequences (its force times {card.force_gain:.3g}); "
             f"fitted on {result['fit']}, "
-            f"{result['test']} kept for `learn eval`. {_told_of_intervals(card)}"
+            f"{result['test']} kept for `learn eval`. {intervals}"
         )
 
 
@@ -257,41 +236,22 @@ def _bounded(card: Card, clips: list[Clip], split: Split, out: Path) -> Card:
         return add_intervals(out, load_predictor(out), clips, split, report=tell)
 
 
-def _told_of_intervals(card: Card) -> str:
-    found = card.intervals
-    if found is None:
-        return f"No intervals: {card.no_intervals or 'no epoch was kept'}."
+def _told(found: Intervals) -> str:
     return f"Intervals from {found.sequences} sequences of {found.units} brains, for {found.source} motion."
 
 
-@app.command("intervals", epilog="Example: learn intervals model out")
-def intervals_command(
-    model: Annotated[Path, typer.Argument(help="Model folder; its card gets them.")],
-    datasets: Annotated[
-        list[Path], typer.Argument(help="The training data, and any with sequences that the model never met.")
-    ],
-    input: Annotated[str | None, typer.Option(help=_STORED.replace("what is recovered", "as scored"))] = None,
-    from_test: Annotated[
-        bool,
-        typer.Option(
-            "--from-test", help="Take half of the test's brains; `learn eval` leaves them out then."
-        ),
-    ] = False,
-    threads: Threads = None,
-    cache: Cache = None,
-    json: Json = False,
-) -> None:
-    """Fit how far off a trained model's answers may be, on sequences that it was not fitted or chosen on."""
+def _fit_intervals(
+    model: Path, datasets: list[Path], input: str | None, from_test: bool, cache: Path | None
+) -> Card:
+    """Fits how far off a trained model's answers may be, into its card; that card."""
     from learn.checkpoint import read_card
     from learn.data.clips import load_clips, scored
     from learn.data.split import are_openings, ungrouped
     from learn.evaluation.fit_intervals import add_intervals
     from learn.evaluation.interval_sides import find_obstacle, find_sides
     from learn.inference.predict import load_predictor
-    from learn.training.threads import set_threads
     from synth.dataset.index import written_sides
 
-    set_threads(threads)
     read_card(model)  # his own: what comes along is not changed
     predictor = load_predictor(model)
     source = predictor.readable(input or scored(predictor.card.settings.input))
@@ -312,13 +272,7 @@ def intervals_command(
         hint = "" if from_test else "; name a dataset that it never met, or say --from-test"
         raise UserError(f"{model}: {why}{hint}")
     with _bar("Fitting intervals") as tell:
-        card = add_intervals(model, predictor, clips, split, source, tell)
-    assert card.intervals is not None
-    if json:
-        found = {"units": card.intervals.units, "sequences": card.intervals.sequences, "input": source}
-        print(json_.dumps({"model": str(model), **found}))
-    else:
-        _console.print(_told_of_intervals(card))
+        return add_intervals(model, predictor, clips, split, source, tell)
 
 
 def _log(numbers: dict[str, float]) -> None:
@@ -507,27 +461,48 @@ def _say_peak(found: Mapping[str, Any], name: str, *, quiet: bool) -> float | No
 @app.command("calibrate", epilog="Example: learn calibrate model press.npz")
 def calibrate_command(
     model: Annotated[Path, typer.Argument(help="Model folder.")],
-    press: Annotated[
-        Path, typer.Argument(help="One press with known force: NNNNNN.zarr store, or .npz with force_mn.")
+    data: Annotated[
+        list[Path],
+        typer.Argument(
+            help="One press with known force (NNNNNN.zarr store, or .npz with force_mn), or datasets: the "
+            "training data, and any with sequences that the model never met."
+        ),
     ],
     input: Annotated[str | None, typer.Option(help=_STORED)] = None,
+    from_test: Annotated[
+        bool,
+        typer.Option(
+            "--from-test",
+            help="Of datasets: take half of the test's brains; `learn eval` leaves them out then.",
+        ),
+    ] = False,
     threads: Threads = None,
+    cache: Cache = None,
     json: Json = False,
 ) -> None:
-    """Estimate the tissue's stiffness from one press whose force is known."""
+    """From one press the tissue's stiffness; from datasets a model's intervals, into its card."""
     from learn.inference.apply import calibrate, motions
     from learn.inference.predict import load_predictor
     from learn.training.threads import set_threads
 
     set_threads(threads)
+    if any(one.suffix not in (".npz", ".zarr") for one in data):
+        intervals = _fit_intervals(model, data, input, from_test, cache).intervals
+        assert intervals is not None
+        found = {"units": intervals.units, "sequences": intervals.sequences, "input": intervals.source}
+        if json:
+            print(json_.dumps({"model": str(model), **found}))
+        else:
+            _console.print(_told(intervals))
+        return
     predictor = load_predictor(model)
-    stored = predictor.stored(input)
-    found = {motion.name: calibrate(predictor, motion) for motion in motions(press, stored)}
+    presses = [motion for one in data for motion in motions(one, predictor.stored(input))]
+    young = {press.name: calibrate(predictor, press) for press in presses}
     if json:
-        print(json_.dumps({"young_kpa": found}))
-    else:
-        for name, young in found.items():
-            Console().print(f"{name}: E = {young:.3g} kPa; give it to `learn predict` as --young {young:.3g}")
+        print(json_.dumps({"young_kpa": young}))
+        return
+    for name, kpa in young.items():
+        Console().print(f"{name}: E = {kpa:.3g} kPa; give it to `learn predict` as --young {kpa:.3g}")
 
 
 @app.command("export", epilog="Example: learn export model d2fnet.onnx --format onnx")
@@ -606,8 +581,6 @@ def _coverage(covered: list[Coverage]) -> Table:
         {
             "force within": one.size,
             **{f"{axis} within": share for axis, share in zip("xyz", one.axes, strict=True)},
-            "map within": one.map,
-            "map within, contact": one.contact,
         }
         for one in covered
     ]

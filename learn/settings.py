@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
+from pydantic import Field, model_validator
 
 from learn.data.clips import Input, Target, has_depth
 from learn.data.grid import Grid
-from learn.loss import FRAMEWISE, GHOSTLESS, Objective
+from learn.loss import Loss
 from learn.network.d2fnet import Architecture
 from synth.errors import UserError
-from synth.job import reader
+from synth.job import reader, retired
 from synth.job.types import NonNegative, Positive, Section
 
 Count = Annotated[int, Field(ge=0)]
@@ -29,7 +28,7 @@ class Settings(Section):
     extent_mm: Annotated[Positive, Field(le=1e4)] = 36.0
     """Width of the grid [mm]."""
     arch: Architecture = Architecture()
-    objective: Objective = Objective()
+    loss: Loss = "antighost"
     input: Input = "ideal"
     """Displacement to train on. `mixed`: each frame is ideal or recovered by a draw whose odds move from
     all ideal to all recovered over the first half of the run. `motion`, `motion-ideal`, `motion-mixed`: in
@@ -38,18 +37,9 @@ class Settings(Section):
     epochs: AtLeastOne = 50
     batch: AtLeastOne = 8
     learning_rate: Positive = 5e-4
-    weight_decay: NonNegative = 1e-5
     schedule: Literal["plateau", "cosine"] = "plateau"
     """`plateau`: halved when the score stalls (the paper's); `cosine`: a warm-up over a twentieth of the run,
     then down to zero by a half cosine, for runs too short to wait for a plateau."""
-    patience: Count = 5
-    """`plateau`: epochs without a better score after which the learning rate is halved."""
-    stop: Count = 0
-    """Epochs without a better score after which training ends; 0 never."""
-    clip: Positive = 1.0
-    """Largest norm of the gradient."""
-    augment: bool = True
-    """Quarter turns and mirrors of the grid, vectors turned with it."""
     sway_mm: NonNegative = 0.0
     """Standard deviation of a motion of the whole surface that half of the frames get on top, drawn anew:
     along the view (with `arch.depth`), a third of it across. It is even, tilted and bulged, as breath,
@@ -61,13 +51,8 @@ class Settings(Section):
     limit."""
     precision: Literal["32-true", "bf16-mixed"] = "32-true"
     channels_last: bool = False
-    resident: Literal["auto", "yes", "no"] = "auto"
-    """Whether all frames are held by the device and turned there: `auto` on a GPU whose memory is enough."""
     compile: bool = False
     """Whether torch.compile takes the network: worth its minute on a GPU; needs a C++ compiler on a CPU."""
-    deterministic: bool = False
-    """Whether operations without a deterministic form are refused. On one CPU the others give equal bits too;
-    on a GPU set CUBLAS_WORKSPACE_CONFIG=:4096:8 beside it."""
     folds: AtLeastOne = 5
     fold: Count = 0
     held_out_family: str | None = None
@@ -79,8 +64,6 @@ class Settings(Section):
     def _goes_together(self) -> Settings:
         if self.target == "intensity" and self.arch.output != "magnitude":
             raise ValueError("target 'intensity' has no direction: it needs output 'magnitude'")
-        if self.target == "intensity" and self.arch.prior != "none":
-            raise ValueError("arch.prior is a density: it goes with target 'density'")
         if self.arch.depth != has_depth(self.input):
             raise ValueError(f"input {self.input!r} goes with arch.depth {str(not self.arch.depth).lower()}")
         halved = self.arch.stem * 2**self.arch.levels
@@ -90,12 +73,6 @@ class Settings(Section):
                 f"(stem {self.arch.stem}, {self.arch.levels} levels)"
             )
         return self
-
-    @model_serializer(mode="wrap")
-    def _as_before(self, plain: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Without what came later and isn't used, so that models are written as they always were."""
-        tree: dict[str, Any] = plain(self)
-        return {key: value for key, value in tree.items() if key not in ("epoch_frames", "sway_mm") or value}
 
     @property
     def grid(self) -> Grid:
@@ -112,7 +89,7 @@ PRESETS: dict[str, Settings] = {
         arch=Architecture(width=16, stem=2, levels=3, dropout=0.0),
         epochs=20,
         # In a run this short the anti-ghost loss has only learnt to say little (docs/results/learn).
-        objective=Objective(kind="mse"),
+        loss="mse",
         learning_rate=2e-3,
         schedule="cosine",
         channels_last=True,
@@ -125,7 +102,7 @@ PRESETS: dict[str, Settings] = {
         # Magnitudes: on vectors this loss leaves 0.10 less of R² than squared error (docs/results/learn).
         arch=Architecture(width=16, stem=4, levels=4, output="magnitude", dropout=0.05),
         epochs=24,
-        objective=GHOSTLESS,
+        loss="ghostless",
         learning_rate=1e-3,
         schedule="cosine",
         channels_last=True,
@@ -137,7 +114,7 @@ PRESETS: dict[str, Settings] = {
     "live": Settings(
         size=256,
         arch=Architecture(width=16, stem=4, levels=3, output="magnitude", dropout=0.05),
-        objective=GHOSTLESS,
+        loss="ghostless",
         learning_rate=1e-3,
     ),
     # Two eyes: `cpu` and `live` told motion in three dimensions. Force is then seen along the view as well,
@@ -150,7 +127,7 @@ PRESETS: dict[str, Settings] = {
         ),
         input="motion-mixed",
         epochs=24,
-        objective=FRAMEWISE,
+        loss="mse-frame",
         sway_mm=0.5,
         learning_rate=1e-3,
         schedule="cosine",
@@ -165,7 +142,7 @@ PRESETS: dict[str, Settings] = {
             width=16, stem=4, levels=3, confidence=True, depth=True, dropout=0.05, relative=True
         ),
         input="motion-mixed",
-        objective=FRAMEWISE,
+        loss="mse-frame",
         sway_mm=0.5,
         learning_rate=1e-3,
     ),
@@ -175,15 +152,19 @@ PRESETS: dict[str, Settings] = {
 
 
 def override(settings: Settings, changes: Iterable[str]) -> Settings:
-    """Settings with `key=value` or `arch.key=value` replaced, values in YAML; a list also as `1,2,3`.
+    """Settings with `key=value` or `arch.key=value` replaced, values in YAML.
 
     Raises UserError: a line for each unknown key (with the nearest one) and each value that can't be.
     """
-    return reader.override(settings, [re.sub(r"=\(?([^][()]*,[^][()]*)\)?$", r"=[\1]", c) for c in changes])
+    changes = list(changes)
+    for key, _, value in (one.partition("=") for one in changes):
+        if key.strip() in retired.TRAINING:
+            raise UserError(retired.reason(key.strip(), value))
+    return reader.override(settings, changes)
 
 
 def replace(settings: S, **changes: Any) -> S:
-    """Settings, an architecture or an objective with some values replaced, and checked anew.
+    """Settings or an architecture with some values replaced, and checked anew.
 
     Raises pydantic's ValidationError for a value that can't be: these come from code, not from a person.
     """
@@ -195,3 +176,28 @@ def preset(name: str, **changes: Any) -> Settings:
     if name not in PRESETS:
         raise UserError(f"unknown preset {name!r}: one of {', '.join(PRESETS)}")
     return replace(PRESETS[name], **changes)
+
+
+_FRAMED = {"kind": "hinge", "r2_weight": 0.5, "r2_scope": "frame", "total_weight": 0.0}
+_OBJECTIVES: dict[str, dict[str, Any]] = {
+    "mse": {"kind": "mse", "total_weight": 0.0},
+    "mse-frame": {**_FRAMED, "stray_weight": 0.0},
+    "ghostless": {**_FRAMED, "stray_weight": 8.0, "stray_cap": 0.0, "ramp": [0.25, 0.75], "free": 0.01},
+    "antighost": {
+        **{"kind": "antighost", "r2_weight": 0.3, "r2_scope": "batch", "ghost_weight": 3.0},
+        **{"low": 0.05, "rule": "pixel", "total_weight": 0.0},
+    },
+}
+"""What of a block `objective`, as older cards have it, makes each loss."""
+
+
+def upgraded(tree: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Settings as an older version wrote them: `(settings, others)`, as this one has them, and by dotted key
+    what it has no more."""
+    settings, others = retired.drop(tree, retired.TRAINING)
+    objective = settings.pop("objective", None)
+    if objective is not None:
+        same = [k for k, v in _OBJECTIVES.items() if all(objective.get(key) == v[key] for key in v)]
+        settings["loss"] = same[0] if same else "mse"
+        others |= {} if same else {"objective": objective}
+    return settings, others

@@ -33,7 +33,7 @@ Mix = Annotated[
 Json = Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")]
 
 app.command(epilog='Example: synth tune demo --budget "force 3%" --out tuned.yaml')(tune)
-app.command(epilog="Example: synth fit photo.jpg --out look.yaml --width-mm 38 --sheet fit.jpg")(fit)
+app.command(epilog="Example: synth fit photo.jpg --out look.yaml --width-mm 38")(fit)
 
 
 @app.command(epilog="Example: synth new job.yaml")
@@ -52,33 +52,57 @@ def new(path: Annotated[Path, typer.Argument(help="The job file to write.")] = P
 
 
 @app.command(epilog="Example: synth schema > job.schema.json")
-def schema() -> None:
+def schema(
+    fields: Annotated[
+        bool, typer.Option("--fields", help="Instead: the fields of a sequence, with axes, type and unit.")
+    ] = False,
+) -> None:
     """Prints the JSON schema of job files, for editors."""
+    from synth.dataset import field_sizes
     from synth.job import writer
 
+    if fields:
+        print("\n".join(field_sizes.lines()))
+        return
     print(json_.dumps(writer.schema(), indent=2))
 
 
 @app.command(epilog="Example: synth preview demo --count 9 --out sheet.png")
 def preview(
-    job: Source,
+    job: Annotated[
+        str,
+        typer.Argument(help="A job file, a named job, or a brain (OBJ, STL, PLY, OFF, VTK) to be opened."),
+    ],
     overrides: Overrides = None,
     out: Annotated[Path, typer.Option("--out", "-o", help="The PNG to write.")] = Path("sheet.png"),
     count: Annotated[int, typer.Option("--count", "-n", min=1, max=100, help="Scenarios to show.")] = 9,
+    radius: Annotated[float, typer.Option(min=3, max=60, help="Of a brain's openings [mm].")] = 12.0,
     json: Json = False,
 ) -> None:
-    """Draws a contact sheet of a job's scenarios and says what the whole job will take."""
+    """Draws a contact sheet of a job's scenarios and says what the whole job will take.
+
+    Of a brain's surface: draws the places where it can best be opened, and prints them as a job's lines.
+    """
     import cv2
     from rich.console import Console
     from rich.progress import Progress
 
     from synth.dataset.size_forecast import amount
     from synth.errors import UserError
+    from synth.geometry.brain_surface import KINDS
     from synth.job import reader
-    from synth.publish import contact_sheet
+    from synth.publish import contact_sheet, openings
 
     if out.suffix.lower() != ".png" or not out.parent.is_dir():
         raise UserError(f"{out}: cannot be written as PNG")
+    if Path(job).suffix.lower().removeprefix(".") in KINDS:
+        chosen = openings.find_openings(Path(job), radius, count)
+        if not cv2.imwrite(str(out), openings.draw_openings(Path(job), chosen, radius)[..., ::-1]):
+            raise UserError(f"{out}: cannot be written as PNG")
+        told = [one.craniotomy(radius).model_dump(include={"point", "direction"}) for one in chosen]
+        lines = f"# {out} shows these openings, the best first\n{openings.as_job(Path(job), chosen, radius)}"
+        print(json_.dumps({"sheet": str(out), "openings": told}) if json else lines)
+        return
     read = reader.load_job(job, overrides or [])
     with Progress(console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task("Drawing, then measuring what a sequence costs", total=None)
@@ -99,23 +123,6 @@ def preview(
         f"{sum(made.stages_cpu_s.values()) / 60:.1f} CPU-minutes ({stages}), "
         f"{amount(made.disk_bytes)} of disk"
     )
-
-
-@app.command(epilog="Example: synth place brain.obj --radius 12 --out openings")
-def place(
-    brain: Annotated[Path, typer.Argument(help="A brain's surface: OBJ, STL, PLY, OFF or VTK, in mm.")],
-    radius: Annotated[float, typer.Option(min=3.0, max=60.0, help="Of the opening [mm].")] = 12.0,
-    count: Annotated[int, typer.Option("--count", "-n", min=1, max=20, help="Openings to rank.")] = 6,
-    out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Folder for openings.png, openings.html and job.yaml.")
-    ] = None,
-    json: Json = False,
-) -> None:
-    """Finds where a brain can be opened, ranks the best places, draws them and writes the job's lines."""
-    from synth.place import command
-
-    found = command.place(brain, radius, count, out or Path(f"{brain.stem}-openings"))
-    print(json_.dumps(found.as_dict()) if json else "\n".join(found.lines()))
 
 
 @app.command(epilog="Example: synth render demo --out out render.spp=8 sequences=100")
@@ -141,15 +148,21 @@ def render(
         float | None, typer.Option(help="Memory that a process may take [GB]; a share of what is free.")
     ] = None,
     mix_versions: Mix = False,
+    retry: Annotated[
+        bool, typer.Option("--retry", help="Take up again what failed in this folder before.")
+    ] = False,
     json: Json = False,
 ) -> None:
     """Renders the dataset of a job. Exit code 1 when some of its sequences failed."""
+    from synth.dataset.folder import Folder
     from synth.engine.progress import Bars
     from synth.engine.run import Options, run_job
     from synth.job.reader import load_job
 
     _end_on_terminate()
     read = load_job(job, overrides or [])
+    if retry:
+        Folder(out).forgive()
     options = Options(engine=engine, workers=workers, gpus=gpus, memory_gb=memory, mix_versions=mix_versions)
     with Bars() as bars:
         summary = run_job(read, out, options, bars)
@@ -166,32 +179,6 @@ def render(
 def _end_on_terminate() -> None:
     """SIGTERM, which clusters send, ends a run as Ctrl-C does: workers first, then in order."""
     signal.signal(signal.SIGTERM, signal.default_int_handler)
-
-
-@app.command(epilog="Example: synth retry out")
-def retry(
-    out: Out,
-    workers: Annotated[int | None, typer.Option(min=1, help="Processes at a time; one a core.")] = None,
-    mix_versions: Mix = False,
-    json: Json = False,
-) -> None:
-    """Takes up the sequences that failed, and all that are missing."""
-    from synth.dataset.folder import Folder
-    from synth.engine.progress import Bars
-    from synth.engine.run import Options, run_job
-
-    _end_on_terminate()
-    folder = Folder(out)
-    job = folder.job()
-    forgiven = folder.forgive()
-    with Bars() as bars:
-        summary = run_job(job, out, Options(workers=workers, mix_versions=mix_versions), bars)
-    if json:
-        print(json_.dumps({**vars(summary), "retried": forgiven, "out": str(out)}))
-    else:
-        print(f"{len(forgiven)} retried; {summary.already + summary.done} of {summary.total} are there")
-    if summary.failed:
-        raise typer.Exit(1)
 
 
 @app.command(epilog="Example: synth status out")
@@ -245,9 +232,24 @@ def report(
     out: Out,
     to: Annotated[Path | None, typer.Option("--to", help="The page; report.html in the dataset.")] = None,
 ) -> None:
-    """Writes a page with thumbnails, distributions and failures that opens in any browser."""
+    """Writes what describes a dataset anew: a page for browsers, its card README.md, and croissant.json."""
+    from synth.dataset.folder import Folder
+    from synth.dataset.index import write_index
+    from synth.publish import croissant
+    from synth.publish.card import write_card
     from synth.publish.report import write_report
 
+    folder = Folder(out)
+    folder.described()
+    write_index(folder)
+    print(write_card(folder))
+    print(croissant.write_croissant(folder))
+    unsaid = croissant.STATED.keys() - croissant.describe(folder).keys()
+    if unsaid:
+        print(
+            f"not said in the job's card, so not in the description: {', '.join(sorted(unsaid))}",
+            file=sys.stderr,
+        )
     print(write_report(out, to or out / "report.html"))
 
 
@@ -271,19 +273,16 @@ def export(
     ] = None,
 ) -> None:
     """Writes the dataset in a format of others, or as films to look at."""
-    from functools import partial
-
     from synth.errors import UserError
-    from synth.publish.export import formats, overlay_video
+    from synth.publish.export.formats import export_dataset
 
+    options = {}
     if to == "video":
         drawn = [name for name in overlay or ("flow", "force") if name != "none"]
-        write = partial(overlay_video.write_films, overlays=drawn, interval_s=_interval(interval))
-        print(f"{formats.write_export(out, target, write)} films in {target}")
+        options = {"overlays": drawn, "interval_s": _interval(interval)}
     elif overlay or interval:
         raise UserError("--overlay and --interval are of a video: say --to video")
-    else:
-        print(f"{formats.export_dataset(out, target, to)} sequences in {target}")
+    print(f"{export_dataset(out, target, to, **options)} sequences in {target}")
 
 
 def _interval(text: str | None) -> tuple[float, float] | None:
@@ -300,24 +299,6 @@ def _interval(text: str | None) -> tuple[float, float] | None:
     if not colon or not told[0] <= told[1]:
         raise UserError(f"--interval {text}: is not FIRST:LAST in seconds")
     return told
-
-
-@app.command(epilog="Example: synth card out")
-def card(out: Out) -> None:
-    """Writes the dataset's card anew: README.md with its pictures, and croissant.json for machines."""
-    from synth.dataset.folder import Folder
-    from synth.dataset.index import write_index
-    from synth.publish import croissant
-    from synth.publish.card import write_card
-
-    folder = Folder(out)
-    folder.described()
-    write_index(folder)
-    print(write_card(folder))
-    print(croissant.write_croissant(folder))
-    unsaid = croissant.missing(croissant.describe(folder))
-    if unsaid:
-        print(f"not said in the job's card, so not in the description: {', '.join(unsaid)}", file=sys.stderr)
 
 
 @app.command(epilog="Example: synth verify out --fast")
@@ -362,41 +343,10 @@ def picture(
     print(f"wrote {to}")
 
 
-@app.command(epilog="Example: synth fields --size 1280x960")
-def fields(
-    out: Annotated[
-        Path | None, typer.Argument(help="A dataset, for what its first sequence takes in fact.")
-    ] = None,
-    size: Annotated[str, typer.Option(help="Picture, WIDTHxHEIGHT in pixels.")] = "640x480",
-    page: Annotated[bool, typer.Option("--page", help="As the page docs/fields.md.")] = False,
-    json: Json = False,
-) -> None:
-    """Lists the fields of a sequence: axes, type, unit, when they are kept, and what they take."""
-    from synth.dataset import field_sizes
-    from synth.dataset.store import Dataset
-    from synth.errors import UserError
-
-    if page:
-        print(field_sizes.page(), end="")
-        return
-    first = Dataset(out)[0] if out else None
-    width, cross, height = size.partition("x")
-    if not (cross and width.isdigit() and height.isdigit() and int(width) and int(height)):
-        raise UserError(f"--size {size}: is not WIDTHxHEIGHT in pixels")
-    shape = first.size if first else (int(height), int(width))
-    if json:
-        print(json_.dumps([vars(row) for row in field_sizes.rows(shape, first)]))
-    else:
-        print("\n".join(field_sizes.lines(shape, first)))
-
-
 @app.command(epilog="Example: synth view out --sequence 0 --save scene.rrd")
 def view(
     out: Out,
-    sequence: Annotated[
-        list[int] | None,
-        typer.Option("--sequence", "-s", help="Which sequence, by its index; repeat for more."),
-    ] = None,
+    sequence: Annotated[int, typer.Option("--sequence", "-s", help="Which sequence, by its index.")] = 0,
     save: Annotated[
         Path | None, typer.Option("--save", help="Write a recording (.rrd) instead of opening the viewer.")
     ] = None,
@@ -404,15 +354,15 @@ def view(
         bool, typer.Option("--web", help="In a browser: for a machine without a window system.")
     ] = False,
 ) -> None:
-    """Opens sequences in rerun, on this machine only: surface, frame, flow, traction and force by time."""
+    """Opens a sequence in rerun, on this machine only: frame, depth, flow, traction and force by time."""
     from synth.dataset import location
-    from synth.dataset.store import Dataset, open_sequence
-    from synth.publish.rerun_view import save_recording, show_sequences
+    from synth.dataset.store import open_sequence
+    from synth.publish.rerun_view import save_recording, show_sequence
 
     _end_on_terminate()
-    chosen = [open_sequence(location.store(out, k)) for k in sequence] if sequence else [Dataset(out)[0]]
+    chosen = open_sequence(location.store(out, sequence))
     if save is None:
-        show_sequences(chosen, web=web)
+        show_sequence(chosen, web=web)
     else:
         save_recording(chosen, save)
         print(f"wrote {save}; open it with: rerun {save}")

@@ -6,14 +6,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal
 
-# When `flow_tvl1` became `flow_recovered` the version stayed: the field means what it meant, an older reader
-# finds no field of the name it knows and says so, and a higher number would have every reader refuse stores
-# whose values it reads right.
 FORMAT_VERSION = 1
 """Of the stores; raised when a reader of the older one would misread the newer."""
-
-FORMER_NAMES = {"flow_tvl1": "flow_recovered"}
-"""Names that older stores give to fields, and what those are called now. Both may be asked for."""
 
 TIME, ROW, COLUMN = "frame", "row", "column"
 
@@ -34,8 +28,8 @@ class Field:
     length: int = 0
     kept: Literal["always", "usually", "recovered", "stereo", "stereo recovered", "asked"] = "always"
     """`usually`: unless the job's `store.without` names it; `recovered`: with an estimator of flow (and as
-    before); `stereo`: with a second lens (and as before); `stereo recovered`: with both, unless `flow.stereo`
-    is none; `asked`: when `store.extra` names it."""
+    before); `stereo`: with a second lens (and as before); `stereo recovered`: with both;
+    `asked`: when `store.extra` names it."""
     half: bool = False
     """Whether `store.flow: float16` stores it in half the space."""
     packed: float = 0.1
@@ -326,11 +320,6 @@ EXTRA = tuple(name for name, field in FIELDS.items() if field.kept == "asked" or
 
 SPARED = ("depth", "flow_confidence", "flow_right", "visible_right", "depth_right")
 """What a job's `store.without` may name: nothing else can be computed without the rest."""
-
-
-def find_field(name: str) -> Field | None:
-    """The field of that name, present or former; None if there is none."""
-    return FIELDS.get(FORMER_NAMES.get(name, name))
 
 
 def kept(

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from bench.importers.registry import MOST_FRAMES, ROLES, Floats, Intake, as_rgb
+from bench.importers.registry import MOST_FRAMES, ROLES, Intake
 from synth.errors import UserError
-from synth.system.foreign_picture import refuse_large
+from synth.system.checked_file import refuse_large
 
 _LARGEST_CHUNK = 1 << 30
 
@@ -31,16 +29,11 @@ def read_source(source: Path, use: dict[str, str]) -> Intake:
     force as long as the frames takes theirs.
 
     Raises:
-        UserError: h5py missing, not HDF5, arrays missing, ambiguous or of the wrong shape.
+        UserError: arrays missing, ambiguous or of the wrong shape.
     """
-    try:
-        import h5py
-    except ImportError:
-        raise UserError("reading HDF5 needs h5py: pip install '.[readers]' in the clone") from None
-    try:
-        file = h5py.File(source, "r")
-    except OSError:
-        raise UserError(f"{source}: not a readable HDF5 file") from None
+    import h5py
+
+    file = h5py.File(source, "r")
     arrays: dict[str, Any] = {}
     file.visititems(
         lambda name, item: arrays.update({name: item}) if isinstance(item, h5py.Dataset) else None
@@ -69,43 +62,22 @@ def read_source(source: Path, use: dict[str, str]) -> Intake:
         force = force[:, :3]
         clock = chosen["force_time"]
         force_s = seconds if clock is None else np.asarray(clock[:], np.float64).ravel()
-        if len(force_s) != len(force):
-            raise UserError(
-                f"{source}: {len(force)} forces, {len(force_s)} times for them; say --use force_time="
-            )
-    tip = _tip(source, chosen["tip"], seconds)
+    tip = np.zeros((0, 4))
+    if chosen["tip"] is not None:
+        tip = np.column_stack([seconds, np.asarray(chosen["tip"][:], np.float64).reshape(-1, 3)])
 
-    def pictures() -> Iterator[NDArray[np.uint8]]:
-        for k in range(len(frames)):
-            yield as_rgb(np.asarray(frames[k]))
-
-    return Intake(seconds, pictures, force_s, force, tip)
-
-
-def _tip(source: Path, array: Any, seconds: Floats) -> Floats:
-    """(M, 4) time [s] and place; (0, 4) without one."""
-    if array is None:
-        return np.zeros((0, 4))
-    place = np.asarray(array[:], np.float64)
-    if place.shape != (len(seconds), 3):
-        raise UserError(f"{source}: tip of shape {place.shape}, expected ({len(seconds)}, 3)")
-    return np.column_stack([seconds, place])
+    return Intake(seconds, lambda: (np.asarray(frames[k]) for k in range(len(frames))), force_s, force, tip)
 
 
 def _refuse_odd(source: Path, role: str, array: Any) -> None:
     """UserError for an array that is elsewhere, holds no numbers or is too long; nothing of it is read."""
-    name, numbers = array.name, array.dtype.kind in "fiu"
     if array.external or array.is_virtual:
-        raise UserError(f"{source}: {name} lies in other files, which are not opened; write it into this one")
-    if not numbers or array.ndim == 0:
-        raise UserError(
-            f"{source}: {name} of type {array.dtype} and shape {array.shape} is no row of numbers"
-        )
-    if role != "frames" and array.size > 6 * MOST_FRAMES:
-        raise UserError(f"{source}: {name} has {array.size} numbers, too many for a {role}")
+        raise UserError(f"{source}: {array.name} lies in other files, which are not opened")
+    if array.dtype.kind not in "fiu" or array.ndim == 0:
+        raise UserError(f"{source}: {array.name}, {array.shape} {array.dtype}, is no row of numbers")
     chunk = int(np.prod(array.chunks or (1,), dtype=object)) * array.dtype.itemsize
-    if chunk > _LARGEST_CHUNK:
-        raise UserError(f"{source}: {name} is kept in pieces of {chunk / 1e9:.1f} GB, too large to be read")
+    if chunk > _LARGEST_CHUNK or (role != "frames" and array.size > 6 * MOST_FRAMES):
+        raise UserError(f"{source}: {array.name} is too large to be read")
 
 
 def _chosen(source: Path, role: str, use: dict[str, str], arrays: dict[str, Any]) -> Any:

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.importers.registry import MOST_FRAMES, Floats, Intake, as_rgb, one_of
+from bench.importers.registry import MOST_FRAMES, Floats, Intake, one_of
 from synth.errors import UserError
-from synth.system import foreign_file
-from synth.system.foreign_picture import refuse_large
+from synth.system import checked_file
+from synth.system.checked_file import refuse_large
 
 _LARGEST_BYTES = 1 << 42
 _LONGEST_LINE = 65536
@@ -31,27 +31,20 @@ def read_source(source: Path, use: dict[str, str]) -> Intake:
     `*TipToWorldTransform` the tip. Frames whose tracker says INVALID have no tip.
 
     Raises:
-        UserError: SimpleITK missing, not a MetaImage, or no times.
+        UserError: not a MetaImage, or no times.
     """
-    try:
-        import SimpleITK
-    except ImportError:
-        raise UserError("reading .mha needs SimpleITK: pip install '.[readers]' in the clone") from None
+    import SimpleITK
+
     _refuse_elsewhere(source)
     reader = SimpleITK.ImageFileReader()
     reader.SetFileName(str(source))
-    try:
-        reader.ReadImageInformation()
-    except RuntimeError:
-        raise UserError(f"{source}: not a readable MetaImage") from None
+    reader.ReadImageInformation()
     fields = _fields(reader)
     size = reader.GetSize()
-    if len(size) != 3:
-        raise UserError(f"{source}: a picture, not a sequence of pictures")
+    if len(size) != 3 or size[2] > MOST_FRAMES:
+        raise UserError(f"{source}: no sequence of pictures, or too long a one")
     count = size[2]
     refuse_large(size[0], size[1])
-    if count > MOST_FRAMES:
-        raise UserError(f"{source}: {count} frames are too many")
     stamp = use.get("frame_time", "Timestamp")
     if stamp not in fields:
         raise UserError(
@@ -70,10 +63,7 @@ def read_source(source: Path, use: dict[str, str]) -> Intake:
         for k in range(count):
             reader.SetExtractIndex([0, 0, k])
             reader.SetExtractSize([size[0], size[1], 0])
-            try:
-                yield as_rgb(SimpleITK.GetArrayFromImage(reader.Execute()))
-            except RuntimeError:
-                raise UserError(f"{source}: frame {k} can't be read; is the file whole?") from None
+            yield SimpleITK.GetArrayFromImage(reader.Execute())
 
     good = np.isfinite(force).all(axis=1) if len(force) else np.zeros(0, bool)
     return Intake(times, pictures, times[: len(force)][good], force[good], tip, tuple(notes))
@@ -81,7 +71,7 @@ def read_source(source: Path, use: dict[str, str]) -> Intake:
 
 def _refuse_elsewhere(source: Path) -> None:
     """UserError for a head that names another file for its pictures, or has none of a MetaImage's lines."""
-    with foreign_file.open_file(source, _LARGEST_BYTES) as file:
+    with checked_file.open_file(source, _LARGEST_BYTES) as file:
         while line := file.readline(_LONGEST_LINE):
             key, _, value = line.partition(b"=")
             if key.strip() == b"ElementDataFile":
@@ -136,10 +126,7 @@ def _column(source: Path, name: str, values: dict[int, str], count: int, widths:
         raise UserError(f"{source}: field {name} holds {width} numbers a frame, expected {widths[-1]}")
     out = np.full((count, width), np.nan)
     for k, row in rows.items():
-        try:
-            if len(row) != width:  # one number would be taken for all
-                raise ValueError
-            out[k] = [float(word) for word in row]
-        except ValueError:
-            raise UserError(f"{source}: field {name} of frame {k} is not {width} numbers") from None
+        if len(row) != width:  # one number would be taken for all
+            raise UserError(f"{source}: field {name} of frame {k} is not {width} numbers")
+        out[k] = [float(word) for word in row]
     return out

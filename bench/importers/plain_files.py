@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.importers.registry import Floats, Intake, as_rgb
+from bench.importers.registry import Floats, Intake
 from bench.recording import csv_table
 from bench.recording.folder import natural_order
 from learn.inference import video
@@ -78,14 +78,9 @@ def _times(source: Path, use: dict[str, str], count: int) -> Floats:
         if len(times) != count:
             raise UserError(f"{path}: {len(times)} times for {count} pictures of {source}")
         return times
-    try:
-        rate = float(use["fps"])
-    except (KeyError, ValueError):
-        raise UserError(
-            f"{source}: pictures without times; say --use frame_time=TABLE.csv or --use fps=RATE"
-        ) from None
+    rate = float(use.get("fps", "nan"))
     if not (np.isfinite(rate) and rate > 0):
-        raise UserError(f"--use fps={use['fps']}: must be positive")
+        raise UserError(f"{source}: pictures without times; say --use frame_time=TABLE.csv or --use fps=RATE")
     return np.arange(count) / rate
 
 
@@ -99,10 +94,7 @@ def _folder(folder: Path) -> tuple[_Pictures, int]:
 
 
 def _array(path: Path) -> tuple[_Pictures, int]:
-    try:
-        film = np.load(path, mmap_mode="r", allow_pickle=False)
-    except (OSError, ValueError, EOFError):
-        raise UserError(f"{path}: not a readable .npy array") from None
+    film = np.load(path, mmap_mode="r", allow_pickle=False)
     if film.ndim not in (3, 4):
         raise UserError(f"{path}: an array of shape {film.shape}, expected (T, H, W) or (T, H, W, C)")
-    return lambda: (as_rgb(np.asarray(picture)) for picture in film), len(film)
+    return lambda: (np.asarray(picture) for picture in film), len(film)

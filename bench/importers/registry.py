@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from bench.recording import clocks, writer
 from synth.errors import UserError
-from synth.system import foreign_file
-from synth.system.foreign_picture import refuse_large
+from synth.system import checked_file
+from synth.system.checked_file import refuse_large
 
 Floats = NDArray[np.float64]
 ROLES = ("frames", "frame_time", "force", "force_time", "tip")
@@ -50,8 +50,9 @@ class Intake:
 
     times_s: Floats
     """(T,) of the frames [s]."""
-    pictures: Callable[[], Iterator[NDArray[np.uint8]]]
-    """Gives the T frames in order, (H, W, 3) uint8 each."""
+    pictures: Callable[[], Iterator[NDArray[Any]]]
+    """Gives the T frames in order, grey (H, W) or RGB[A] (H, W, C) uint8 or uint16; of `read_source`
+    (H, W, 3) uint8."""
     force_s: Floats = field(default_factory=lambda: np.zeros(0))
     """(N,) [s]; empty if the source holds no force."""
     force: Floats = field(default_factory=lambda: np.zeros((0, 3)))
@@ -59,11 +60,6 @@ class Intake:
     tip: Floats = field(default_factory=lambda: np.zeros((0, 4)))
     """(M, 4) time [s] and the tool's tip [mm]."""
     notes: tuple[str, ...] = ()
-
-
-def supported(path: Path) -> bool:
-    """Whether the name is that of a source to import, and not of a recording folder."""
-    return _maker(path) is not None
 
 
 def _maker(path: Path) -> str | None:
@@ -86,10 +82,10 @@ def read_source(source: Path, use: Mapping[str, str] | None = None) -> Intake:
         UserError: another format, a library that is not installed, nothing usable, or an ambiguous choice.
     """
     if not source.is_dir():
-        foreign_file.check_file(source, _LARGEST_BYTES)
-    known = ", ".join(sorted(_MAKERS))
+        checked_file.check_file(source, _LARGEST_BYTES)
     maker = _maker(source)
     if maker is None:
+        known = ", ".join(sorted(_MAKERS))
         raise UserError(
             f"{source}: not a format that can be imported ({known}, a folder of pictures or of a ROS 2 bag)"
         )
@@ -103,12 +99,9 @@ def read_source(source: Path, use: Mapping[str, str] | None = None) -> Intake:
     def pictures() -> Iterator[NDArray[np.uint8]]:
         with _damage_told(source):
             size = None
-            for k, picture in enumerate(found.pictures()):
-                height, width = picture.shape[:2]
-                if (height, width) != (size := size or (height, width)):
-                    raise UserError(
-                        f"{source}: frame {k} is {width} x {height}, those before it {size[::-1]}"
-                    )
+            for k, picture in enumerate(map(_as_rgb, found.pictures())):
+                if picture.shape != (size := size or picture.shape):
+                    raise UserError(f"{source}: frame {k} is of another size than those before it")
                 yield picture
 
     return replace(found, pictures=pictures)
@@ -121,23 +114,21 @@ def _damage_told(source: Path) -> Iterator[None]:
         yield
     except (UserError, KeyboardInterrupt, GeneratorExit):
         raise
+    except ImportError as error:
+        raise UserError(f"{source}: needs {error.name}: pip install '.[readers]' in the clone") from None
     except Exception as error:
         said = (str(error).splitlines() or [""])[0][:200] or type(error).__name__
         raise UserError(f"{source}: damaged, or not what its name says ({said})") from error
 
 
 def _refuse_odd(source: Path, found: Intake) -> None:
-    """UserError for times that are none, or in another unit than seconds."""
+    """UserError for times that are none, or in another unit than seconds, or not as many as forces."""
     for what, times in (("frame", found.times_s), ("force", found.force_s), ("tip", found.tip[:, 0])):
-        if not (np.abs(times) < _LATEST_S).all():
-            k = int(np.argmin(np.abs(times) < _LATEST_S))
-            raise UserError(f"{source}: the time of {what} {k} is {times[k]:g}: are they in seconds?")
         step = float(np.median(np.abs(np.diff(times)))) if len(times) > 1 else 0.0
-        if step >= _LONGEST_STEP_S:
-            unit = next((name for name, size in clocks.UNITS.items() if step * size < 1), "another unit")
-            raise UserError(
-                f"{source}: {what}s are {step:g} s apart: their times look like {unit}, not seconds"
-            )
+        if not (np.abs(times) < _LATEST_S).all() or step >= _LONGEST_STEP_S:
+            raise UserError(f"{source}: the times of {what}s, {step:g} s apart: are they in seconds?")
+    if len(found.force_s) != len(found.force):
+        raise UserError(f"{source}: {len(found.force)} forces, {len(found.force_s)} times for them")
     other = clocks.find_other_unit(found.times_s, found.force_s)
     if other:
         raise UserError(f"{source}: {other}")
@@ -188,30 +179,20 @@ def one_of(role: str, wanted: str | None, names: list[str], what: str) -> str | 
     return names[0] if names else None
 
 
-def as_rgb(picture: NDArray[Any], order: str = "rgb") -> NDArray[np.uint8]:
-    """A grey or colour picture as (H, W, 3) uint8 sRGB; 16-bit grey levels are cut to 8.
-
-    Raises:
-        UserError: neither grey nor three or four channels, or of another type.
-    """
+def _as_rgb(picture: NDArray[Any]) -> NDArray[np.uint8]:
+    """Grey or colour as (H, W, 3) uint8 sRGB; 16-bit levels are cut to 8. UserError for others."""
     if picture.dtype == np.uint16:
         picture = (picture >> 8).astype(np.uint8)
-    if picture.dtype != np.uint8:
-        raise UserError(f"pictures of type {picture.dtype}: 8 or 16 bits a channel are read")
-    if picture.ndim == 3 and picture.shape[2] == 1:
-        picture = picture[..., 0]
-    if picture.ndim == 2:
-        picture = np.repeat(picture[..., None], 3, axis=2)
-    if picture.ndim != 3 or picture.shape[2] not in (3, 4):
-        raise UserError(f"pictures of shape {picture.shape}: grey, or 3 or 4 channels are read")
+    if picture.ndim == 2 or picture.shape[2] == 1:
+        picture = np.repeat(picture.reshape(*picture.shape[:2], 1), 3, axis=2)
+    if picture.dtype != np.uint8 or picture.ndim != 3 or picture.shape[2] not in (3, 4):
+        kind = f"{picture.shape} {picture.dtype}"
+        raise UserError(f"pictures of {kind}: grey, 3 or 4 channels of 8 or 16 bits are read")
     height, width = picture.shape[:2]
     if min(height, width) < _LEAST_PX:
-        raise UserError(
-            f"pictures of {width} x {height} pixels: at least {_LEAST_PX} x {_LEAST_PX} are needed"
-        )
+        raise UserError(f"pictures of {width} x {height} pixels: at least {_LEAST_PX} a side are needed")
     refuse_large(width, height)
-    colours = picture[..., :3]
-    return np.ascontiguousarray(colours[..., ::-1] if order == "bgr" else colours, np.uint8)
+    return np.ascontiguousarray(picture[..., :3])
 
 
 def _told(

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.importers.registry import Intake, as_rgb, one_of
+from bench.importers.registry import Intake, one_of
 from synth.errors import UserError
-from synth.system import foreign_file, foreign_picture, foreign_yaml
+from synth.system import checked_file
 
 _LARGEST_BYTES = 1 << 42
 _PICTURES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
@@ -31,13 +31,10 @@ def read_source(source: Path, use: dict[str, str]) -> Intake:
     in metres by the ROS convention, become mm.
 
     Raises:
-        UserError: rosbags missing, not a bag, no pictures, several topics of a kind, an unknown encoding.
+        UserError: no pictures, several topics of a kind, an unknown encoding.
     """
-    try:
-        from rosbags.highlevel import AnyReader, AnyReaderError
-        from rosbags.typesys import Stores, get_typestore
-    except ImportError:
-        raise UserError("reading bags needs rosbags: pip install '.[readers]' in the clone") from None
+    from rosbags.highlevel import AnyReader
+    from rosbags.typesys import Stores, get_typestore
 
     if source.is_dir():
         _refuse_elsewhere(source)
@@ -45,17 +42,16 @@ def read_source(source: Path, use: dict[str, str]) -> Intake:
     def opened() -> Any:
         return AnyReader([source], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
 
-    try:
-        with opened() as bag:
-            topics = {role: _topic(bag, role, kinds, use) for role, kinds in
-                      (("frames", _PICTURES), ("force", _FORCES), ("tip", _TIPS))}  # fmt: skip
-            if topics["frames"] is None:
-                raise UserError(f"{source}: holds no topic of pictures")
-            stamps = _table(bag, topics["frames"], lambda message: (), 0)[:, 0]
-            force = _table(bag, topics["force"], _vector, 3)
-            tip = _table(bag, topics["tip"], _place, 3) * [1.0, 1000.0, 1000.0, 1000.0]
-    except (AnyReaderError, OSError, ValueError, KeyError) as error:
-        raise UserError(f"{source}: not a readable bag ({str(error).splitlines()[0]})") from None
+    with opened() as bag:
+        topics = {
+            role: _topic(bag, role, kinds, use)
+            for role, kinds in (("frames", _PICTURES), ("force", _FORCES), ("tip", _TIPS))
+        }
+        if topics["frames"] is None:
+            raise UserError(f"{source}: holds no topic of pictures")
+        stamps = _table(bag, topics["frames"], lambda message: (), 0)[:, 0]
+        force = _table(bag, topics["force"], _vector, 3)
+        tip = _table(bag, topics["tip"], _place, 3) * [1.0, 1000.0, 1000.0, 1000.0]
 
     def pictures() -> Iterator[NDArray[np.uint8]]:
         with opened() as bag:
@@ -68,8 +64,7 @@ def read_source(source: Path, use: dict[str, str]) -> Intake:
 def _refuse_elsewhere(folder: Path) -> None:
     """UserError for a bag whose metadata.yaml is none, or names files that don't lie in its folder."""
     path = folder / "metadata.yaml"
-    text = foreign_file.read_text(path, foreign_yaml.LARGEST_BYTES)
-    told = foreign_yaml.plain(foreign_yaml.load(text, str(path)), str(path))
+    told = checked_file.read_yaml(path)
     about = told.get("rosbag2_bagfile_information") if isinstance(told, dict) else None
     names = about.get("relative_file_paths") if isinstance(about, dict) else None
     if not isinstance(names, list):
@@ -77,7 +72,7 @@ def _refuse_elsewhere(folder: Path) -> None:
     for name in map(str, names):
         if name != Path(name).name:
             raise UserError(f"{path}: names {name}, which is not in its folder")
-        foreign_file.check_file(folder / name, _LARGEST_BYTES)
+        checked_file.check_file(folder / name, _LARGEST_BYTES)
 
 
 def _topic(bag: Any, role: str, kinds: tuple[str, ...], use: dict[str, str]) -> str | None:
@@ -124,10 +119,12 @@ def _place(message: Any) -> tuple[float, float, float]:
 
 def _picture(source: Path, message: Any) -> NDArray[np.uint8]:
     if hasattr(message, "format"):
-        return as_rgb(foreign_picture.decode_picture(bytes(message.data)).astype(np.uint8), "bgr")
+        return checked_file.decode_picture(bytes(message.data)).astype(np.uint8)[..., ::-1]
     channels = _CHANNELS.get(message.encoding)
     if channels is None:
         raise UserError(f"{source}: pictures in encoding {message.encoding}; {', '.join(_CHANNELS)} are read")
     rows = np.asarray(message.data, np.uint8).reshape(message.height, message.step)
     picture = rows[:, : message.width * channels].reshape(message.height, message.width, channels)
-    return as_rgb(picture, "bgr" if message.encoding.startswith(("bgr", "8UC3")) else "rgb")
+    if message.encoding.startswith(("bgr", "8UC3")):
+        picture = picture[..., [2, 1, 0]]  # opacity is of no use
+    return picture

@@ -14,12 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 from sklearn.decomposition import TruncatedSVD
-from sklearn.ensemble import HistGradientBoostingRegressor
 from sklearn.linear_model import Ridge
 from sklearn.model_selection import PredefinedSplit, cross_val_predict
 from sklearn.neighbors import KNeighborsRegressor
 
-from bench.methods import compliance, corotational, inverse
+from bench.methods import compliance, inverse
 from bench.methods.protocol import Answer, Method, Scene
 from learn.data.clips import has_depth
 from learn.data.grid import Grid, certainty
@@ -38,19 +37,11 @@ only, in x. Of two eyes (3, N, N) mm and (2, N, N), across and along the view.""
 Space = Literal["never", "where seen", "always"]
 """Whether a rule reads motion in three dimensions."""
 
-FITTED = (
-    "mean",
-    "linear in |d|",
-    "power law in |d|",
-    "ridge on PCA of flow",
-    "k-NN on PCA of flow",
-    "boosting per pixel",
-)
+FITTED = ("mean", "linear in |d|", "ridge on PCA of flow", "k-NN on PCA of flow")
 """Names of those that need data."""
 GRID = Grid(48)
 _COMPONENTS = 20
 _NEIGHBOURS = 5
-_PIXELS = 60_000
 _SURE = 0.3
 
 
@@ -113,24 +104,22 @@ def physical_rules() -> dict[str, Rule]:
         "Tikhonov, FEM compliance": inverse.tikhonov,
         "Tikhonov near the contact": inverse.tikhonov_near,
         "one contact, FEM compliance": inverse.one_contact,
-        "one contact, co-rotational": corotational.one_contact,
     }
     return {name: _inverse(solve) for name, solve in solvers.items()}
 
 
-def fitted(clips: Sequence[Clip], source: str, seed: int = 0) -> dict[str, Method]:
+def fitted(clips: Sequence[Clip], source: str) -> dict[str, Method]:
     """Those fitted on sequences, behind the bench's protocol. Arguments as `fitted_rules`."""
     space: Space = "always" if has_depth(source) else "never"
-    return {name: Baseline(rule, space) for name, rule in fitted_rules(clips, source, seed).items()}
+    return {name: Baseline(rule, space) for name, rule in fitted_rules(clips, source).items()}
 
 
-def fitted_rules(clips: Sequence[Clip], source: str, seed: int = 0) -> dict[str, Rule]:
+def fitted_rules(clips: Sequence[Clip], source: str) -> dict[str, Rule]:
     """Those fitted on sequences: the network's own fit sequences, for a fair table.
 
     Args:
         clips: on `GRID`.
         source: which displacement, `recovered` or `ideal`, of two eyes `motion` or `motion-ideal`.
-        seed: of what is drawn (pixels for boosting).
     """
     moved = np.concatenate([clip.displacement[source] for clip in clips])
     mask = np.concatenate([np.broadcast_to(clip.mask, (clip.frames, *clip.mask.shape)) for clip in clips])
@@ -140,16 +129,14 @@ def fitted_rules(clips: Sequence[Clip], source: str, seed: int = 0) -> dict[str,
     rules: dict[str, Rule] = {
         "mean": _constant(float(size.mean())),
         "linear in |d|": _linear(peak, size),
-        "power law in |d|": _power(peak, size),
     }
     rows = _rows(moved, mask)
     # Not centred: no motion stays zero.
     basis = TruncatedSVD(min(_COMPONENTS, min(rows.shape) - 1), algorithm="arpack", random_state=0).fit(rows)
     features = basis.transform(rows)
     strengths, fold = np.geomspace(1e-4, 1e2, 13), _groups(clips) % 4
-    rules["ridge on PCA of flow"] = _by(basis, ridge(features, force, fold, strengths))
-    rules["k-NN on PCA of flow"] = _by(basis, nearest(features, force))
-    rules["boosting per pixel"] = boosting(clips, source, np.random.default_rng(seed))
+    rules["ridge on PCA of flow"] = partial(_say_regressed, basis, ridge(features, force, fold, strengths))
+    rules["k-NN on PCA of flow"] = partial(_say_regressed, basis, nearest(features, force))
     return rules
 
 
@@ -158,42 +145,27 @@ def _peak(moved: NDArray[np.float32], mask: NDArray[np.float32]) -> float:
     return float(np.percentile(np.linalg.norm(moved, axis=0)[mask > 0], 98)) if (mask > 0).any() else 0.0
 
 
-def _size_only(value: float) -> Floats:
-    return np.array([value, np.nan, np.nan])
-
-
 # Rules are parts of functions that have a name, so that what is fitted can be kept in a file.
 
 
 def _constant(value: float) -> Rule:
-    return partial(_say_power, value, 0.0)
+    return partial(_say_linear, 0.0, value)
 
 
 def _linear(peak: Floats, size: Floats) -> Rule:
-    return partial(_say_power, float(peak @ size) / max(float(peak @ peak), 1e-12), 1.0)
+    return partial(_say_linear, float(peak @ size) / max(float(peak @ peak), 1e-12), 0.0)
 
 
-def _power(peak: Floats, size: Floats) -> Rule:
-    """a d^b, least squares on logarithms over the frames with some load and some motion."""
-    used = (size > 0.05 * size.max()) & (peak > 0.05 * peak.max())
-    b, log_a = np.polyfit(np.log(peak[used]), np.log(size[used]), 1) if used.sum() > 2 else (1.0, 0.0)
-    return partial(_say_power, float(np.exp(log_a)), float(np.clip(b, 0.2, 4)))
-
-
-def _say_power(
+def _say_linear(
     a: float, b: float, moved: NDArray[np.float32], mask: NDArray[np.float32], sure: NDArray[np.float32]
 ) -> Floats:
-    """a d^b of the peak displacement d."""
-    return _size_only(a * _peak(moved, mask) ** b)
+    """a d + b of the peak displacement d, a magnitude alone."""
+    return np.array([a * _peak(moved, mask) + b, np.nan, np.nan])
 
 
 def _rows(moved: NDArray[np.float32], mask: NDArray[np.float32]) -> Floats:
     """(T, C, N, N) mm, (T, N, N) → masked displacement, (T, C N N)."""
     return (moved * mask[:, None]).reshape(len(moved), -1).astype(np.float64)
-
-
-def _by(basis: TruncatedSVD, regressor: Ridge | KNeighborsRegressor) -> Rule:
-    return partial(_say_regressed, basis, regressor)
 
 
 def _say_regressed(
@@ -237,48 +209,6 @@ def ridge(
 def nearest(x: Floats, y: Floats) -> KNeighborsRegressor:
     """Mean of the most alike samples."""
     return KNeighborsRegressor(min(_NEIGHBOURS, len(x)), algorithm="brute").fit(x, y)
-
-
-def boosting(clips: Sequence[Clip], source: str, rng: np.random.Generator, grid: Grid = GRID) -> Rule:
-    """Gradient-boosted trees from a pixel's own channels to the length of its force density.
-
-    Args:
-        clips: on `grid`.
-        source: which displacement.
-        rng: draws the pixels that are fitted on.
-        grid: of the clips, and of what the rule will be asked about.
-    """
-    features, target = [], []
-    most = -(-4 * _PIXELS // len(clips))  # a clip gives no more: thousands of them would fill the memory
-    for clip in clips:
-        frame, *at = np.nonzero(np.broadcast_to(clip.mask > 0, (clip.frames, *clip.mask.shape)))
-        taken = rng.permutation(len(frame))[:most]
-        for t in range(clip.frames):
-            cells = tuple(axis[taken[frame[taken] == t]] for axis in at)
-            features.append(_pixels(clip.displacement[source][t], grid)[cells])
-            target.append(np.linalg.norm(clip.density[t], axis=0)[cells])
-    x, y = np.concatenate(features), np.concatenate(target)
-    chosen = rng.permutation(len(x))[:_PIXELS]
-    trees = HistGradientBoostingRegressor(max_iter=120, learning_rate=0.1, max_leaf_nodes=31, random_state=0)
-    trees.fit(x[chosen], y[chosen])
-    return partial(_say_by_pixel, trees, grid)
-
-
-def _say_by_pixel(
-    trees: HistGradientBoostingRegressor,
-    grid: Grid,
-    moved: NDArray[np.float32],
-    mask: NDArray[np.float32],
-    sure: NDArray[np.float32],
-) -> Floats:
-    said = np.clip(trees.predict(_pixels(moved, grid)[mask > 0]), 0, None)
-    return _size_only(grid.pitch_mm**2 * float(said.sum()))
-
-
-def _pixels(moved: NDArray[np.float32], grid: Grid) -> Floats:
-    """Displacement, its length and its derivatives at every cell, (N, N, 7), of two eyes (N, N, 10)."""
-    slopes = [d / grid.pitch_mm for part in moved for d in np.gradient(part)]
-    return np.stack([*moved, np.linalg.norm(moved, axis=0), *slopes], axis=-1).astype(np.float64)
 
 
 def _groups(clips: Sequence[Clip]) -> NDArray[np.intp]:

@@ -53,10 +53,10 @@ class Block:
     system: System
 
     @classmethod
-    def build(cls, law: str, tets: int, order: int) -> Block:
-        """A block of about that many tetrahedra, with Poisson's ratio 0.4; elements as a job's are."""
-        volume = tetrahedra.block(_ANATOMY, tets, order)
-        return cls(volume, assemble(volume, law, 0.4, averaged=order == 2))
+    def build(cls, tets: int) -> Block:
+        """A linear block of about that many second-order tetrahedra, with Poisson's ratio 0.4."""
+        volume = tetrahedra.block(_ANATOMY, tets, 2)
+        return cls(volume, assemble(volume, "linear", 0.4))
 
     def carry(self, xy: Floats) -> Embedding:
         """How surface points (P, 2), camera x, y [mm], ride on the volume."""
@@ -80,7 +80,7 @@ def build(point_mm: float = 1.0, node_mm: float = 1.2, tets: int = 3000, compone
         tets: of the map's own mesh, second order.
         components: of the displacement that is seen: 2 by one eye, 3 by two.
     """
-    block = Block.build("linear", tets, 2)
+    block = Block.build(tets)
     radius_mm = _ANATOMY.craniotomy.radius_mm
     points, nodes = _disc(point_mm, radius_mm), _disc(node_mm, radius_mm - node_mm)
     seen, held = block.carry(points), block.carry(nodes)

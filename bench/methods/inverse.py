@@ -132,11 +132,6 @@ def contact(compliance: Compliance, displacement: Floats, weight: Floats) -> Con
     return _contact(compliance, displacement.shape[1], displacement.tobytes(), weight.tobytes())
 
 
-def forget() -> None:
-    """Forgets the last contact, so that the next method asked for it pays for it: for timings."""
-    _contact.cache_clear()
-
-
 @lru_cache(maxsize=1)
 def _contact(compliance: Compliance, components: int, moved: bytes, sure: bytes) -> Contact:
     displacement, weight = np.frombuffer(moved).reshape(-1, components), np.frombuffer(sure)
@@ -157,20 +152,13 @@ def _contact(compliance: Compliance, components: int, moved: bytes, sure: bytes)
             best, start = float(explained[k]), np.array([*compliance.nodes[k], np.log(radius)])
     if best <= 0:
         return Contact(np.zeros(3), np.zeros(3))
-    return settle(compliance, displacement, weight, start)
+    return _settle(compliance, displacement, weight, start)
 
 
-def settle(
-    compliance: Compliance, displacement: Floats, weight: Floats, start: Floats, step: float = 1.0
-) -> Contact:
+def _settle(compliance: Compliance, displacement: Floats, weight: Floats, start: Floats) -> Contact:
     """Moves place and radius of a contact to where it explains the displacement best, the force solved for.
 
-    Args:
-        compliance: for the points seen.
-        displacement: (P, C) mm.
-        weight: (P,) or (P, C) >= 0.
-        start: (3,) x, y [mm] and the logarithm of the radius.
-        step: of the search's first simplex [mm].
+    `start`: (3,) x, y [mm] and the logarithm of the radius.
     """
     root = np.sqrt(_by_row(weight, displacement))
     u = displacement.T.ravel() * root
@@ -198,17 +186,12 @@ def settle(
         force = np.linalg.solve(gram + 1e-12 * np.trace(gram) * np.eye(3), seen)
         return float(u @ u - force @ (2 * seen - gram @ force)), force
 
-    corners = start + step * np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 0.25]])
+    corners = start + np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 0.25]])
     found = minimize(
         lambda place: fit(place)[0],
         start,
         method="Nelder-Mead",
-        options={
-            "initial_simplex": corners,
-            "xatol": 1e-2,
-            "fatol": 1e-6 * float(u @ u),
-            "maxiter": 120,
-        },
+        options={"initial_simplex": corners, "xatol": 1e-2, "fatol": 1e-6 * float(u @ u), "maxiter": 120},
     )
     return Contact(found.x, fit(found.x)[1])
 

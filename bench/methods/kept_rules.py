@@ -12,7 +12,7 @@ import sklearn
 from bench.methods.baselines import Rule
 from synth.dataset import provenance
 from synth.system import cache
-from synth.system.whole_file import write_whole
+from synth.system.checked_file import write_whole
 
 _MOST = 8
 
@@ -25,7 +25,7 @@ def keep_rules(hashes: Sequence[str], source: str, fit: Callable[[], dict[str, R
         source: which displacement they are fitted on.
         fit: fits them.
     """
-    code = provenance.source(["bench.methods.baselines"], ("synth", "learn", "bench"))
+    code = provenance.source("synth", "learn", "bench/methods")
     said = "\n".join([code, sklearn.__version__, source, *hashes]).encode()
     folder = cache.folder("baselines")
     file = folder / f"{hashlib.sha256(said).hexdigest()[:32]}.pickle"

@@ -50,11 +50,6 @@ class Model:
         """What is to be known of how the last recording was read, once it is."""
         return [] if self._reader is None else self._reader[1].notes
 
-    def forget_last(self) -> None:
-        """See `Method`."""
-        if self._reader is not None:
-            self._reader[1].forget_last()
-
     def __call__(
         self, flow: NDArray[np.float32], confidence: NDArray[np.float32], scene: Scene, picture: bool
     ) -> Answer:

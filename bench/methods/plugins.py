@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
@@ -10,7 +11,6 @@ from numpy.typing import NDArray
 
 from bench.methods.protocol import Answer, InSpace, Method, Scene
 from synth.errors import UserError
-from synth.flow.stereo.track import Moved
 
 GROUP = "sulcus.method"
 """Entry-point group in which other packages offer methods: name -> a callable without arguments."""
@@ -21,6 +21,9 @@ class Plugged:
 
     def __init__(self, name: str, point: EntryPoint, method: Any) -> None:
         self._method, self._where = method, f"method {name} ({point.value})"
+        if isinstance(method, InSpace):
+            self.in_space = partial(self._asked, method.in_space)
+            """See `InSpace`."""
 
     @property
     def notes(self) -> list[str]:
@@ -48,21 +51,6 @@ class Plugged:
         return Answer(force, density)
 
 
-class PluggedInSpace(Plugged):
-    """One that reads motion in three dimensions too."""
-
-    def in_space(
-        self,
-        flow: NDArray[np.float32],
-        confidence: NDArray[np.float32],
-        moved: Moved,
-        scene: Scene,
-        picture: bool,
-    ) -> Answer:
-        """See `InSpace`."""
-        return self._asked(self._method.in_space, flow, confidence, moved, scene, picture)
-
-
 def installed() -> dict[str, Method]:
     """The methods that installed packages offer, made anew, by name.
 
@@ -87,5 +75,4 @@ def _made(point: EntryPoint) -> Method:
         raise UserError(f"{where}: cannot be made, {type(error).__name__}: {said}") from error
     if not callable(method):
         raise UserError(f"method {point.name} ({point.value}): is no method, it cannot be called")
-    kind = PluggedInSpace if isinstance(method, InSpace) else Plugged
-    return kind(point.name, point, method)
+    return Plugged(point.name, point, method)

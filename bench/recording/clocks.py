@@ -5,16 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-UNITS = {"milliseconds": 1e-3, "microseconds": 1e-6, "nanoseconds": 1e-9}
-"""Length of what a clock may count in by mistake [s]."""
+_UNITS = {"milliseconds": 1e-3, "microseconds": 1e-6, "nanoseconds": 1e-9}
 _TIMES_AS_LONG = 100.0
 _SLOW_SENSOR_S = 0.1
 _SLOW_VIDEO_S = 1.0
-
-
-def guess_unit(times_too_long: float) -> str:
-    """The unit whose numbers are about so many times those of seconds."""
-    return min(UNITS, key=lambda name: abs(np.log(times_too_long * UNITS[name])))
 
 
 def find_other_unit(frame_s: NDArray[np.float64], force_s: NDArray[np.float64]) -> str:
@@ -30,13 +24,16 @@ def find_other_unit(frame_s: NDArray[np.float64], force_s: NDArray[np.float64]) 
     if min(len(frame_s), len(force_s)) < 2 or min(np.ptp(frame_s), np.ptp(force_s)) <= 0:
         return ""
     ratio = float(np.ptp(force_s) / np.ptp(frame_s))
-    clocks = (("force", force_s, ratio, _SLOW_SENSOR_S), ("video", frame_s, 1 / ratio, _SLOW_VIDEO_S))
-    for name, times, longer, slow in clocks:
+    for name, times, longer, slow in (
+        ("force", force_s, ratio, _SLOW_SENSOR_S),
+        ("video", frame_s, 1 / ratio, _SLOW_VIDEO_S),
+    ):
         step = float(np.median(np.abs(np.diff(times))))
         if longer >= _TIMES_AS_LONG and step >= slow:
+            unit = min((abs(np.log(longer * size)), unit) for unit, size in _UNITS.items())[1]
             other = "video" if name == "force" else "force"
             return (
                 f"the {name}'s times span {longer:.3g} times those of the {other}, {step:.3g} s apart: "
-                f"they look like {guess_unit(longer)}, not seconds"
+                f"they look like {unit}, not seconds"
             )
     return ""

@@ -52,8 +52,8 @@ class Recording:
 
     folder: Path
     meta: Meta
-    video: Path | None
-    pictures: tuple[Path, ...]
+    footage: Path | tuple[Path, ...]
+    """Video, or pictures."""
     times_s: NDArray[np.float64] | None
     """(N,) from frames.csv [s]; NaN for frames it doesn't list. None without the file."""
     force: Force | None
@@ -81,7 +81,7 @@ class Recording:
 
     def expected_frames(self) -> int | None:
         """Frames as stated, undecoded; None if the video doesn't say. UserError if unreadable."""
-        return video.count_frames(self.video) if self.video else len(self.pictures)
+        return len(self.footage) if isinstance(self.footage, tuple) else video.count_frames(self.footage)
 
     def frames(self) -> Iterator[Picture]:
         """Upright frames in order, with times.
@@ -91,15 +91,12 @@ class Recording:
         Raises:
             UserError: unreadable video or picture.
         """
-        source = video.read_video(self.video) if self.video else video.read_pictures(self.pictures)
-        for picture in source:
+        for picture in _pictures(self.footage):
             yield self._timed(picture)
 
     def right_frames(self) -> Iterator[Picture]:
         """The second eye's frames in order; UserError: unreadable."""
-        return (
-            video.read_pictures(self.right) if isinstance(self.right, tuple) else video.read_video(self.right)
-        )
+        return _pictures(self.right)
 
     def tool(self, index: int, size: tuple[int, int]) -> NDArray[np.bool_] | None:
         """(H, W) tool mask of a frame, or None if there is none for it. UserError for one of another size."""
@@ -138,6 +135,10 @@ class Recording:
         return replace(picture, time_s=time_s)
 
 
+def _pictures(film: Path | tuple[Path, ...]) -> Iterator[Picture]:
+    return video.read_pictures(film) if isinstance(film, tuple) else video.read_video(film)
+
+
 def open_recording(folder: Path, phantom: bool = False) -> Recording:
     """Reads everything but the pictures. Times since 1970 are brought to the recording's start.
 
@@ -148,14 +149,14 @@ def open_recording(folder: Path, phantom: bool = False) -> Recording:
     Raises:
         UserError: no folder, bad meta.yaml, neither or both of video and frames, a CSV that can't be used.
     """
-    if folder.is_file():
-        raise UserError(f"{folder}: a file, not a recording folder; `bench import` makes one of it")
     if not folder.is_dir():
-        raise UserError(f"{folder}: no such recording folder")
+        raise UserError(f"{folder}: no recording folder; `bench import` makes one of other systems' files")
     about = meta.read_meta(folder / "meta.yaml")
     if phantom:
         about = about.model_copy(update={"tissue": "phantom"})
-    movie, pictures = _footage(folder)
+    footage = _film(folder, "video", "frames")
+    if not footage:
+        raise UserError(f"{folder}: holds neither video.mp4 nor frames/*.png")
     notes: list[str] = []
     if about.scale_mm_per_px == "unknown":
         about = about.model_copy(update={"young_kpa": None})
@@ -168,32 +169,34 @@ def open_recording(folder: Path, phantom: bool = False) -> Recording:
     tissue = still if os.path.lexists(still) else None
     right, depths = _second_eye(folder, about)
     return Recording(
-        folder, about, movie, pictures, times, force, tools.numbered, tissue, tuple(notes), tools.still,
+        folder, about, footage, times, force, tools.numbered, tissue, tuple(notes), tools.still,
         None, right, depths,
     )  # fmt: skip
 
 
 def _second_eye(folder: Path, about: Meta) -> tuple[Path | tuple[Path, ...], tuple[Path, ...]]:
     """Video or pictures of the right eye, and depth pictures; UserError if meta.yaml says otherwise."""
-    movies = sorted(path for path in folder.glob("right.*") if path.suffix.lower() in video.SUFFIXES)
-    pictures = tuple(sorted(folder.glob("right/*.png"), key=natural_order))
-    depths = tuple(
-        sorted(
-            (path for path in folder.glob("depth/*") if path.suffix in (".png", ".npy")), key=natural_order
-        )
-    )
-    if len(movies) + bool(pictures) > 1:
-        raise UserError(f"{folder}: holds {movies[0].name} and right/ or another right.*; keep one of them")
-    right = movies[0] if movies else pictures
-    for found, said, key, what in (
-        (right, about.stereo, "stereo", "right.mp4 or right/*.png"),
-        (depths, about.depth, "depth", "depth/*.png or depth/*.npy"),
-    ):
-        if found and said is None:
-            raise UserError(f"{folder}: holds {what}; meta.yaml must say how it is calibrated ({key}:)")
-        if said is not None and not found:
-            raise UserError(f"{folder}: meta.yaml says {key}, but there is no {what}")
-    return right, depths
+    right = _film(folder, "right", "right")
+    depths = [path for path in folder.glob("depth/*") if path.suffix in (".png", ".npy")]
+    for found, told, key in ((right, about.stereo, "stereo"), (depths, about.depth, "depth")):
+        if bool(found) != (told is not None):
+            raise UserError(
+                f"{folder}: right.mp4 or right/*.png goes with stereo: in meta.yaml, depth/ with depth:; "
+                f"{key}: or its pictures are missing"
+            )
+    return right, tuple(sorted(depths, key=natural_order))
+
+
+def _film(folder: Path, name: str, pictures: str) -> Path | tuple[Path, ...]:
+    """The video NAME.*, or the pictures of a folder in order; empty: neither. UserError for several."""
+    found: list[Path | tuple[Path, ...]] = [
+        path for path in sorted(folder.glob(f"{name}.*")) if path.suffix.lower() in video.SUFFIXES
+    ]
+    if stills := tuple(sorted(folder.glob(f"{pictures}/*.png"), key=natural_order)):
+        found.append(stills)
+    if len(found) > 1:
+        raise UserError(f"{folder}: holds several of {name}.mp4 and {pictures}/; keep one of them")
+    return found[0] if found else ()
 
 
 def _from_start(
@@ -234,17 +237,6 @@ def _spans_from(about: Meta, start: float) -> Meta:
     return about.model_copy(update=parts)
 
 
-def _footage(folder: Path) -> tuple[Path | None, tuple[Path, ...]]:
-    movies = sorted(path for path in folder.glob("video.*") if path.suffix.lower() in video.SUFFIXES)
-    pictures = tuple(sorted(folder.glob("frames/*.png"), key=natural_order))
-    if len(movies) + bool(pictures) > 1:
-        found = [path.name for path in movies] + ["frames/"] * bool(pictures)
-        raise UserError(f"{folder}: holds {' and '.join(found)}; keep one of them")
-    if not movies and not pictures:
-        raise UserError(f"{folder}: holds neither video.mp4 nor frames/*.png")
-    return (movies[0] if movies else None), pictures
-
-
 def natural_order(path: Path) -> list[tuple[int, str]]:
     """Key that sorts names by the numbers in them: a2 before a10."""
     parts = re.split("([0-9]+)", path.stem)  # every second is a number
@@ -256,20 +248,10 @@ def _frame_times(path: Path, notes: list[str]) -> NDArray[np.float64] | None:
         return None
     columns = csv_table.read_csv(path, ("frame", "t_s"))
     frame, time = columns["frame"], columns["t_s"]
-    if (
-        not np.isfinite(frame).all()
-        or (frame < 0).any()
-        or (frame != np.round(frame)).any()
-        or (frame > 1e8).any()
-    ):
-        raise UserError(f"{path}: column frame must hold whole numbers from 0")
-    number = frame.astype(np.int64)
-    if len(np.unique(number)) < len(number):
-        raise UserError(
-            f"{path}: frame {number[np.flatnonzero(np.diff(np.sort(number)) == 0)[0]]} is listed twice"
-        )
-    if number.max() > 10 * len(number) + 1000:
-        raise UserError(f"{path}: lists frame {number.max()} but has {len(number)} rows")
+    number = np.where((frame >= 0) & (frame < 1e8), frame, -1).astype(np.int64)
+    whole = (number == frame).all() and len(np.unique(number)) == len(number)
+    if not whole or number.max() > 10 * len(number) + 1000:
+        raise UserError(f"{path}: column frame must hold the frames' numbers from 0, each once")
     times = np.full(number.max() + 1, np.nan)
     times[number] = time
     known = times[np.isfinite(times)]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Literal
 
@@ -41,7 +40,7 @@ def export_recording(sequence: Sequence, folder: Path, frames: Literal["png", "m
 def _fill(sequence: Sequence, part: Path, frames: Literal["png", "mp4"]) -> None:
     (part / "masks").mkdir()
     time = np.asarray(sequence["time"][:], np.float64)
-    _footage(sequence, part, frames, time)
+    _film(sequence, "rgb", part, "video", frames)
     even = (slice(None), slice(None))
     if frames == "mp4":  # the codec wants even sizes; masks must fit the video
         even = tuple(slice(0, side // 2 * 2) for side in sequence.size)  # type: ignore[assignment]
@@ -61,35 +60,22 @@ def _fill(sequence: Sequence, part: Path, frames: Literal["png", "mp4"]) -> None
         "sensor": {"axes": "camera", "acts_on": "tissue", "low_pass_hz": None},
     }
     if "rgb_right" in sequence:
-        _second_eye(sequence, part, frames, time)
+        _film(sequence, "rgb_right", part, "right", frames)
+        writer.write_pair(part / _PAIR, optics.camera_of(sequence), stereo.right_of(sequence))
         about["stereo"] = {"calibration": _PAIR}
     writer.write_meta(part, about)
 
 
-def _footage(sequence: Sequence, part: Path, kind: Literal["png", "mp4"], time: NDArray[np.float64]) -> None:
-    pictures: Iterator[NDArray[np.uint8]] = (
-        np.asarray(sequence["rgb"][t], np.uint8) for t in range(sequence.frames)
-    )
+def _film(sequence: Sequence, field: str, part: Path, name: str, kind: Literal["png", "mp4"]) -> None:
+    """An eye's pictures, (H, W, 3) uint8 a frame, as NAME.mp4 or in a folder."""
+    pictures = (np.asarray(sequence[field][t], np.uint8) for t in range(sequence.frames))
     if kind == "mp4":
-        writer.write_video(part / "video.mp4", pictures, time)
+        writer.write_video(part / f"{name}.mp4", pictures, np.asarray(sequence["time"][:], np.float64))
         return
-    (part / "frames").mkdir()
+    folder = part / {"video": "frames"}.get(name, name)
+    folder.mkdir()
     for t, rgb in enumerate(pictures):
-        _write(part / "frames" / f"{t:06d}.png", rgb[..., ::-1])
-
-
-def _second_eye(
-    sequence: Sequence, part: Path, kind: Literal["png", "mp4"], time: NDArray[np.float64]
-) -> None:
-    """The right eye's film and the pair's calibration."""
-    pictures = (np.asarray(sequence["rgb_right"][t], np.uint8) for t in range(sequence.frames))
-    if kind == "mp4":
-        writer.write_video(part / "right.mp4", pictures, time)
-    else:
-        (part / "right").mkdir()
-        for t, rgb in enumerate(pictures):
-            _write(part / "right" / f"{t:06d}.png", rgb[..., ::-1])
-    writer.write_pair(part / _PAIR, optics.camera_of(sequence), stereo.right_of(sequence))
+        _write(folder / f"{t:06d}.png", rgb[..., ::-1])
 
 
 def _anatomy(sequence: Sequence) -> str:

@@ -19,19 +19,19 @@ from pydantic import (
 )
 
 from synth.errors import UserError
-from synth.system import foreign_file, foreign_yaml
-
-_MOST_MISTAKES = 10
+from synth.job.types import first_problem
+from synth.system import checked_file
 
 Positive = Annotated[FiniteFloat, Field(gt=0)]
 Share = Annotated[FiniteFloat, Field(ge=0, lt=1)]
 Point = tuple[FiniteFloat, FiniteFloat]
+Corners = Annotated[int, Field(ge=2)]
 Row = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
 
 
 def _must_run_forward(span: tuple[float, float]) -> tuple[float, float]:
     if span[0] >= span[1]:
-        raise ValueError(f"a span must end after its beginning, not run from {span[0]:g} to {span[1]:g} s")
+        raise ValueError("a span must end after its beginning")
     return span
 
 
@@ -62,7 +62,7 @@ class Calibration(_Section):
     """Its length [mm]."""
     checkerboard: Path | None = None
     """Picture of a checkerboard lying on the tissue plane, in the recording's folder."""
-    corners: tuple[int, int] | None = None
+    corners: tuple[Corners, Corners] | None = None
     """Inner corners of the board: columns, rows."""
     square_mm: Positive | None = None
     """Side of one of its squares [mm]."""
@@ -210,9 +210,7 @@ class Meta(_Section):
         if self.stereo is not None and self.depth is not None:
             raise ValueError("give stereo or depth, not both")
         if self.scale_mm_per_px == "unknown" and (self.stereo or self.depth) is not None:
-            raise ValueError(
-                "a second eye measures in millimetres: give the scale, which bench check compares"
-            )
+            raise ValueError("a second eye measures in millimetres: give the scale")
         if self.sync.method == "correlate" and self.sync.calibration_s is None:
             raise ValueError("sync.method correlate needs sync.calibration_s")
         return self
@@ -222,24 +220,15 @@ def read_meta(path: Path) -> Meta:
     """The recording's `meta.yaml`.
 
     Raises:
-        UserError: no such file, not YAML, or (all at once) every field that is wrong.
+        UserError: no such file, not YAML, or the first field that is wrong.
     """
     if not os.path.lexists(path):
         raise UserError(f"{path}: missing; a recording needs at least scale_mm_per_px there")
-    text = foreign_file.read_text(path, foreign_yaml.LARGEST_BYTES)
-    content = foreign_yaml.plain(foreign_yaml.load(text, str(path)), str(path))
+    content = checked_file.read_yaml(path)
     if not isinstance(content, dict):
         raise UserError(f"{path}: expected keys and values such as 'scale_mm_per_px: 0.05'")
     try:
         return Meta.model_validate(content)
     except ValidationError as error:
-        mistakes = [_line(path, detail) for detail in error.errors()[:_MOST_MISTAKES]]
-        raise UserError("; ".join(mistakes)) from None
-
-
-def _line(path: Path, detail: object) -> str:
-    assert isinstance(detail, dict)
-    keys = [part if isinstance(part, int) or part.isprintable() else repr(part) for part in detail["loc"]]
-    key = ".".join(str(part)[:40] for part in keys) or "recording"
-    message = str(detail["msg"]).removeprefix("Value error, ")
-    return f"{path}: {key}: {message[0].lower()}{message[1:200]}"
+        where, what = first_problem(error)
+        raise UserError(f"{path}: {where or 'recording'}: {what.removeprefix('Value error, ')}") from None

@@ -77,8 +77,6 @@ def _checkerboard(path: Path, corners: tuple[int, int], square_mm: float) -> Sca
     On a board that lies flat and square to the view all sides are equal; tilt and distortion show as spread.
     """
     columns, rows = corners
-    if columns < 2 or rows < 2:
-        raise UserError("calibration.corners: at least 2 by 2 inner corners")
     grey = np.ascontiguousarray(video.read_picture(path).mean(axis=2).astype(np.uint8))
     found, points = cv2.findChessboardCornersSB(grey, (columns, rows))
     if not found:

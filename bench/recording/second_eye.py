@@ -19,7 +19,7 @@ from synth.flow.stereo import calibration
 from synth.flow.stereo.depth_camera import DepthTracker
 from synth.flow.stereo.rig import Eye, Floats, Rig
 from synth.flow.stereo.track import Moved, StereoTracker
-from synth.system import foreign_file, foreign_picture
+from synth.system import checked_file
 
 Flags = NDArray[np.bool_]
 _LARGEST_BYTES = 1 << 30  # of an array of points
@@ -187,21 +187,17 @@ class SecondEye:
             raise UserError(f"{recording.folder}: depth/ has no frame {index}")
         path = recording.depths[index]
         if path.suffix == ".npy":
-            foreign_file.check_file(path, _LARGEST_BYTES)
+            checked_file.check_file(path, _LARGEST_BYTES)
             try:
                 found = np.load(path, allow_pickle=False)
-            except (OSError, ValueError, EOFError) as error:
-                raise UserError(f"{path}: not a readable array ({str(error)[:100]})") from None
+            except (OSError, ValueError, EOFError):
+                raise UserError(f"{path}: not a readable array") from None
         else:
-            found = foreign_picture.read_picture(path, cv2.IMREAD_UNCHANGED)
+            found = checked_file.read_picture(path, cv2.IMREAD_UNCHANGED)
         if found.ndim == 3 and found.shape[2] == 3 and found.dtype.kind == "f":
             found = found[..., 2]
         if found.ndim != 2 or found.shape != self._video.size or found.dtype.kind not in "uif":
-            height, width = self._video.size
-            raise UserError(
-                f"{path}: {found.shape} {found.dtype}; depth is ({height}, {width}) numbers, points are "
-                f"({height}, {width}, 3) of them with a point"
-            )
+            raise UserError(f"{path}: {found.shape} {found.dtype}, but the video is {self._video.size}")
         depth = found.astype(np.float32) * np.float32(about.mm_per_unit)
         known = np.isfinite(depth) & (depth > 0)
         share = _shrunk(known.astype(np.float32), self._video.shrink)

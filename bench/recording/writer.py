@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ruamel.yaml import YAML
 
 from synth.errors import UserError
-from synth.system.whole_file import folder_of as write_whole_folder
+from synth.system.checked_file import folder_of as write_whole_folder
 
 if TYPE_CHECKING:
     from synth.render.camera.camera import Camera

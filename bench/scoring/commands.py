@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Mapping
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -13,19 +13,21 @@ from threadpoolctl import threadpool_limits
 from bench.methods import plugins
 from bench.methods.network import Model
 from bench.methods.protocol import Method
-from bench.output.progress_bar import counting
 from bench.recording import pixel_scale
 from bench.recording.folder import Recording, open_recording
 from bench.recording.from_sequence import export_recording
 from bench.scoring import evaluate_recording, report
 from bench.scoring.evaluate_recording import Result, Settings
 from bench.tracking import flow_process
+from bench.tracking.tracking import Progress
 from learn.inference.mask_files import MaskFiles
 from learn.inference.predict import Predictor
 from learn.inference.shipped import NONE, choose_model, find_model, shipped
+from learn.inference.video_flow import FlowHere
 from synth.dataset.store import Dataset, Sequence
 from synth.errors import UserError
-from synth.system import whole_file
+from synth.system import checked_file
+from synth.system.terminal import counting
 
 MAIN = "D2FNet"
 """Name under which the given model stands in every table."""
@@ -87,30 +89,43 @@ def score(
     if train is not None and (model is None or isinstance(model, Predictor)):
         raise UserError("score: train needs the model's folder, which says what it was fitted on")
     opened = open_recording(Path(recording))
-    if not methods and not isinstance(model, Predictor):
-        model = _folder(model, opened)
-    network = None if model is None else Model(model if isinstance(model, Predictor) else Path(model))
-    chosen: dict[str, Method] = {MAIN: network} if network else {}
-    chosen |= methods or {}
+    folder = None
+    if not isinstance(model, Predictor) and (model is not None or not methods):
+        folder = _folder(model, opened)
+    network = Model(model) if isinstance(model, Predictor) else Model(folder) if folder else None
+    chosen = dict(methods or {})
     if baselines:
-        folder = Path(model) if isinstance(model, (str, Path)) else None
         simple = fit_baselines(Path(train) if train else None, folder, _two_eyes(opened))
-        chosen = {**chosen, **{name: one for name, one in simple.items() if name not in chosen}}
-    bar = counting(f"scoring {opened.name}", opened.expected_frames()) if progress else nullcontext(_untold)
+        chosen |= {name: one for name, one in simple.items() if name not in chosen}
+    bar: AbstractContextManager[Progress] = nullcontext(lambda done: None)
+    if progress:
+        bar = counting(f"scoring {opened.name}", opened.expected_frames())
     with bar as told:
-        result = evaluate_recording.evaluate_recording(
-            opened,
-            chosen,
-            MAIN if network else next(iter(chosen)),
-            pixel_scale.find_scale(opened.meta, opened.folder),
-            settings or Settings(),
-            {"model": network.described()} if network else {},
-            told,
-        )
+        result = _evaluate(opened, network, chosen, settings or Settings(), told)
     if out is not None:
-        with whole_file.made_folder(Path(out), _ROOM_BYTES):
-            write_result(result, Path(out), title)
+        checked_file.make_folder(Path(out), _ROOM_BYTES)
+        write_result(result, Path(out), title)
     return result
+
+
+def _evaluate(
+    opened: Recording,
+    network: Model | None,
+    methods: Mapping[str, Method],
+    settings: Settings,
+    progress: Progress,
+    flow: FlowHere | None = None,
+) -> Result:
+    """Of the network, if there is one, and the methods after it."""
+    described: dict[str, object] = {} if network is None else {"model": network.described()}
+    if sources := {name: where for name, where in plugins.sources().items() if name in methods}:
+        described["plug_ins"] = sources
+    scale = pixel_scale.find_scale(opened.meta, opened.folder)
+    chosen = {**({MAIN: network} if network else {}), **methods}
+    main = next(iter(chosen))
+    return evaluate_recording.evaluate_recording(
+        opened, chosen, main, scale, settings, described, progress, flow
+    )
 
 
 def _two_eyes(opened: Recording) -> bool:
@@ -125,15 +140,11 @@ def _folder(model: str | Path | None, opened: Recording) -> Path:
     return found
 
 
-def _untold(done: int) -> None:
-    """A progress that nobody is told of."""
-
-
 def write_result(result: Result, folder: Path, title: str) -> None:
     """Writes score.json and report.html: both are whole before either has its name."""
     with (
-        whole_file.part_of(folder / "score.json") as scores,
-        whole_file.part_of(folder / "report.html") as page,
+        checked_file.part_of(folder / "score.json") as scores,
+        checked_file.part_of(folder / "report.html") as page,
     ):
         evaluate_recording.write_json(result, scores)
         report.write_report(result, page, title)
@@ -173,40 +184,24 @@ def score_recording(
     opened = seen.within(open_recording(recording, phantom))
     chosen = _folder(model, opened)
     folder = out or Path(f"{opened.name}-score")
-    with whole_file.made_folder(folder, _ROOM_BYTES):
-        result = _score(opened, chosen, settings, train, also)
-        write_result(result, folder, title)
-    return result
-
-
-def _score(
-    opened: Recording, model: Path, settings: Settings, train: Path | None, also: Mapping[str, Path] | None
-) -> Result:
-    total = opened.expected_frames()
+    with checked_file.made_folder(folder, _ROOM_BYTES):
+        total = opened.expected_frames()
     # Started first, for it takes seconds to begin; the methods are fitted meanwhile.
     with flow_process.elsewhere() if (total or _LONG) >= _LONG else nullcontext() as flow:
         # Quick as in `learn predict`: to the last digit the same network.
-        network = Model(model, quick=True)
-        methods: dict[str, Method] = {MAIN: network}
-        methods |= {name: Model(folder, quick=True) for name, folder in (also or {}).items()}
-        methods |= fit_baselines(train, model, _two_eyes(opened))
-        found = pixel_scale.find_scale(opened.meta, opened.folder)
-        with counting(f"scoring {opened.name}", total) as progress:
-            about: dict[str, object] = {"model": network.described()}
-            if sources := plugins.sources():
-                about["plug_ins"] = sources
-            return evaluate_recording.evaluate_recording(
-                opened, methods, MAIN, found, settings, about, progress, flow
-            )
+        methods: dict[str, Method] = {name: Model(at, quick=True) for name, at in (also or {}).items()}
+        methods |= fit_baselines(train, chosen, _two_eyes(opened))
+        with counting(f"scoring {opened.name}", total) as told:
+            result = _evaluate(opened, Model(chosen, quick=True), methods, settings, told, flow)
+    write_result(result, folder, title)
+    return result
 
 
 def fit_baselines(train: Path | None, model: Path | None, two_eyes: bool = False) -> dict[str, Method]:
     """Those that need no data, those of installed packages, and, given the training data, the fitted ones.
 
-    These are fitted on the model's own fit sequences.
-
-    They are fitted once for a model, and kept for its next recording; for one with a second eye on motion in
-    three dimensions, if the data have it.
+    These are fitted on the model's own fit sequences, once for a model; for a recording with a second eye on
+    motion in three dimensions, if the data have it.
 
     Raises:
         UserError: none of the model's sequences is in `train`.
@@ -254,10 +249,8 @@ def score_demo(dataset: Path, model: Path, out: Path, settings: Settings) -> Res
     """
     chosen = find_unseen(dataset, model)
     folder = out / "recording"
-    if folder.is_symlink():
-        raise UserError(f"{folder}: is a link, which is not followed; remove it")
-    if folder.exists():
-        if not (folder / _MARK).is_file():
+    if folder.is_symlink() or folder.exists():
+        if folder.is_symlink() or not (folder / _MARK).is_file():
             raise UserError(f"{folder}: not from `bench demo`, so not replaced; remove it, or say --out")
         shutil.rmtree(folder)
     export_recording(chosen, folder)

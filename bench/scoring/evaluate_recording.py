@@ -19,7 +19,7 @@ from bench.methods.flow_size import FlowSize, flow_sizes
 from bench.methods.protocol import Method
 from bench.recording import clocks
 from bench.recording.folder import Force, Recording
-from bench.recording.meta import Meta, Sensor, Span
+from bench.recording.meta import Sensor, Span
 from bench.recording.pixel_scale import Scale
 from bench.scoring import metrics
 from bench.sensor import clock_sync, force_sensor
@@ -167,16 +167,18 @@ def evaluate_recording(
     forces, lost = _with_gaps(done, notes)
     bounds = _bounds(done, lost, notes)
     gains = _brought_to_newtons(forces, methods, truth, kept, _pressed(recording, time), main)
+    scored, absolute = {}, meta.young_kpa is not None
+    for name, force in forces.items():
+        one = _scored(time, force, None if name == main else forces[main], truth, kept, recording)
+        held = _held(bounds.get(name), truth.size_mn, kept, absolute)
+        scored[name] = replace(one, gain=gains.get(name), **held)
     return Result(
         recording=recording.name,
         main=main,
         time_s=time,
         sensor_mn=truth.size_mn,
         sensor_axes_mn=truth.axes_mn,
-        methods={
-            name: _bounded(replace(one, gain=gains.get(name)), bounds.get(name), truth.size_mn, kept, meta)
-            for name, one in _all_scored(time, forces, main, truth, kept, recording).items()
-        },
+        methods=scored,
         scale=scale,
         relative_uncertainty=math.hypot(2 * scale.uncertainty, meta.young_uncertainty),
         noise_floor_mn=truth.floor_mn,
@@ -189,7 +191,7 @@ def evaluate_recording(
         environment=environment(),
         followed=done,
         turn=truth.turn,
-        absolute=meta.young_kpa is not None,
+        absolute=absolute,
     )
 
 
@@ -216,34 +218,20 @@ def _bounds(done: Tracked, lost: NDArray[np.bool_], notes: list[str]) -> dict[st
     return found
 
 
-def _bounded(
-    one: Scored, ends: Curve | None, sensor_mn: Curve | None, kept: NDArray[np.bool_], meta: Meta
-) -> Scored:
-    """A method's scores with its intervals, (T, 2), and what they hold of the sensor's scored frames."""
+def _held(
+    ends: Curve | None, sensor_mn: Curve | None, kept: NDArray[np.bool_], absolute: bool
+) -> dict[str, Any]:
+    """Ends of a method's intervals, (T, 2), and what they hold of the sensor's scored frames."""
     if ends is None:
-        return one
+        return {}
     low, high = ends[:, 0], ends[:, 1]
     said = kept & np.isfinite(low)
     held = {"level": LEVEL, "width_mn": float((high - low)[said].mean()) if said.any() else math.nan}
-    if sensor_mn is not None and meta.young_kpa is not None:
+    if sensor_mn is not None and absolute:
         said &= np.isfinite(sensor_mn)
         within = (sensor_mn >= low) & (sensor_mn <= high)
         held["coverage"] = float(within[said].mean()) if said.any() else math.nan
-    return replace(one, low_mn=low, high_mn=high, held=held)
-
-
-def _all_scored(
-    time_s: Curve,
-    forces: Mapping[str, Curve],
-    main: str,
-    truth: _Truth,
-    kept: NDArray[np.bool_],
-    recording: Recording,
-) -> dict[str, Scored]:
-    return {
-        name: _scored(time_s, force, forces[main], truth, kept, recording, name == main)
-        for name, force in forces.items()
-    }
+    return {"low_mn": low, "high_mn": high, "held": held}
 
 
 def _pressed(recording: Recording, time: Curve) -> NDArray[np.bool_] | None:
@@ -383,12 +371,12 @@ def _words(span: Span) -> str:
 def _scored(
     time_s: Curve,
     force: Curve,
-    main: Curve,
+    main: Curve | None,
     truth: _Truth,
     kept: NDArray[np.bool_],
     recording: Recording,
-    is_main: bool,
 ) -> Scored:
+    """One method's scores; `main`: (T, 3) the force of the one it is compared with."""
     length, size, axes = _length(force), truth.size_mn, truth.axes_mn
     if size is None or axes is None:
         return Scored(force, length, {}, {}, [], {}, {}, None)
@@ -399,7 +387,7 @@ def _scored(
         components = {axis: metrics.agreement(axes[kept, k], force[kept, k]) for k, axis in enumerate("xyz")}
     rng = np.random.default_rng(_SEED)
     intervals = bootstrap.agreement(x, y, rng)
-    worse = None if is_main else bootstrap.difference(x, _length(main)[kept], y, rng)
+    worse = None if main is None else bootstrap.difference(x, _length(main)[kept], y, rng)
     absolute = recording.meta.young_kpa is not None
     if not absolute:
         scores, events = metrics.without_newtons(scores), metrics.without_prediction(events)

@@ -14,9 +14,6 @@ from learn.evaluation.metrics import Metric
 Curve = NDArray[np.float64]
 """(T,) float64."""
 
-SURGICAL_FORCE_MN = 300.0
-"""The 0.3 N below which 70% of tool-tissue forces in neurosurgery lie."""
-
 _LARGEST_LAG_S = 0.5
 
 
@@ -47,7 +44,6 @@ METRICS = {
     "threshold_mn": Metric("contact threshold", "mN", "From which the sensor says contact.", "", 2, True),
     "events": Metric("contacts", "", "Contacts that the sensor shows.", relative=True),
     "event_peak_mn": Metric("event peak", "mN", "Mean peak of the contacts.", "", 2, True),
-    "mae_of_surgical": Metric("MAE of 0.3 N", "%", "MAE over a usual surgical force.", "low"),
     "peak_mae": Metric("peak error", "%", "Mean relative error of peaks.", "low", column="peak err."),
     "impulse_mae": Metric("impulse error", "%", "The same of their impulses.", "low", column="impulse err."),
     "dropout": Metric("dropout", "%", "Samples without a prediction.", "low", 3, True, "dropout"),
@@ -266,7 +262,6 @@ def compute_all(
         "events": float(len(rows)),
         "event_peak_mn": peak,
         "mae_of_peak": ratio(scores["mae_mn"], peak),
-        "mae_of_surgical": scores["mae_mn"] / SURGICAL_FORCE_MN,
         "peak_mae": _mean_size(rows, "peak_error"),
         "impulse_mae": _mean_size(rows, "impulse_error"),
         "dropout": float(np.mean(~np.isfinite(predicted[kept]))) if kept.any() else float("nan"),

@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from bench.bootstrap import over_groups
-from bench.output import charts, machine, result_page
-from bench.output import write as results
 from bench.scoring.evaluate_recording import MOST_LOST
 from bench.scoring.metrics import METRICS
 from synth.errors import UserError
-from synth.system import foreign_file
+from synth.publish.svg import svg
+from synth.system import checked_file
+from synth.system.checked_file import write_whole
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 SCORES = tuple(
     (key, METRICS[key].heading)
@@ -38,7 +42,7 @@ def read(paths: Sequence[Path]) -> list[dict[str, Any]]:
     for path in paths:
         file = path / "score.json" if path.is_dir() else path
         try:
-            tree = foreign_file.read_json(file)
+            tree = checked_file.read_json(file)
         except UserError as error:
             raise UserError(f"{path}: holds no readable score.json ({error})") from None
         if not isinstance(tree, dict) or tree.get("format") != "sulcus-score":
@@ -120,46 +124,73 @@ def _each(tree: dict[str, Any]) -> dict[str, Any]:
 
 
 def write(tree: dict[str, Any], out: Path, command: str) -> None:
-    """pool.json, README.md, chart.svg and index.html in the folder `out`."""
-    tree = tree | {"command": command, "machine": machine.describe()}
-    results.keep(out, "pool.json", tree, allow_nan=False)
-    for name in ("README.md", "index.html"):
-        result_page.write(drawn(tree, name), out)
+    """pool.json, README.md and chart.svg in the folder `out`."""
+    tree = tree | {"command": command}
+    files = {
+        "pool.json": json.dumps(tree, indent=1, allow_nan=False) + "\n",
+        "README.md": page(tree),
+        "chart.svg": chart(tree),
+    }
+    out.mkdir(parents=True, exist_ok=True)
+    for name, text in files.items():
+        write_whole(out / name, text, durable=False)
 
 
-def drawn(tree: Mapping[str, Any], name: str = "index.html") -> result_page.Page:
-    """What `pool.json` says; methods that beat the main one are marked."""
-    first = tree["methods"][tree["main"]]["scores"]
+def page(tree: Mapping[str, Any]) -> str:
+    """Markdown; methods that beat the main one are marked."""
+    methods = tree["methods"]
+    first = methods[tree["main"]]["scores"]
     hidden = ("bias_mn", "impulse_mae", "dropout")
     shown = [(key, head) for key, head in SCORES if key not in hidden and key in first]
-    own = _number(tree["methods"][tree["main"]]["scores"]["mae_mn"]["mean"])
-    bars, rows = [], []
-    for method, found in tree["methods"].items():
-        scores, error = found["scores"], found["scores"]["mae_of_peak"]
-        ends = (_number(error["low"]), _number(error["high"]))
-        bars.append(charts.Row(method, _number(error["mean"]), ends, method == tree["main"]))
-        better = method != tree["main"] and _number(scores["mae_mn"]["mean"]) < own
+    own = _number(first["mae_mn"]["mean"])
+    rows = []
+    for method, found in methods.items():
+        better = method != tree["main"] and _number(found["scores"]["mae_mn"]["mean"]) < own
         rows.append(
             {"method": f"{method} (better)" if better else method}
-            | {head: _text(scores[key], METRICS[key].digits) for key, head in shown}
+            | {head: _text(found["scores"][key], METRICS[key].digits) for key, head in shown}
             | {head: _text(found["calibrated"][key], METRICS[key].digits) for key, head in _CALIBRATED}
         )
-    count = f"{len(tree['recordings'])} recordings"
-    chart = charts.Chart(count, "mean error as a share of the event peak", tuple(bars))
-    return result_page.Page(
-        f"{count}, {tree['specimens']} specimens, {tree['frames']} frames",
-        tree,
-        [chart],
-        (
-            result_page.Section("", rows),
-            result_page.Section(f"By recording, {tree['main']}", [_line(row) for row in tree["each"]]),
-        ),
-        (
-            "Means over recordings; in brackets 95% intervals, specimens resampled.",
-            *(f"Recording {lost} is left out: {why}." for lost, why in tree["left_out"].items()),
-        ),
-        name=name,
-    )
+    parts = [
+        f"# {_count(tree)}, {tree['specimens']} specimens, {tree['frames']} frames",
+        f"    {tree['command']}",
+        "Means over recordings; in brackets 95% intervals, specimens resampled.",
+        *(f"Recording {lost} is left out: {why}." for lost, why in tree["left_out"].items()),
+        f"![{_count(tree)}](chart.svg)",
+        _table(rows),
+        f"## By recording, {tree['main']}",
+        _table([_line(row) for row in tree["each"]]),
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+def chart(tree: Mapping[str, Any]) -> str:
+    """SVG of every method's mean error and its interval."""
+    errors = {name: found["scores"]["mae_of_peak"] for name, found in tree["methods"].items()}
+    at = np.arange(len(errors))
+    colours = ["#1f6feb" if name == tree["main"] else "#c2352b" for name in errors]
+    mean, low, high = ([_number(e[key]) for e in errors.values()] for key in ("mean", "low", "high"))
+
+    def draw(figure: Figure) -> None:
+        axes = figure.subplots()
+        axes.hlines(at, low, high, color=colours, linewidth=2)
+        axes.scatter(mean, at, 26, colours)
+        axes.set(title=_count(tree), xlabel="mean error as a share of the event peak")
+        axes.set_yticks(at, list(errors))
+        axes.set_ylim(len(errors) - 0.4, -0.6)
+        axes.set_xlim(left=0)
+
+    return svg(960, 70 + 19 * len(errors), draw)
+
+
+def _count(tree: Mapping[str, Any]) -> str:
+    return f"{len(tree['recordings'])} recordings"
+
+
+def _table(rows: Sequence[Mapping[str, str]]) -> str:
+    """Rows of the same columns in Markdown."""
+    lines = [list(rows[0]), ["---"] * len(rows[0]), *([*row.values()] for row in rows)]
+    return "\n".join(f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in line)} |" for line in lines)
 
 
 def _line(row: Mapping[str, Any]) -> dict[str, str]:

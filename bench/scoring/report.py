@@ -194,7 +194,7 @@ def pictures(result: Result) -> tuple[list[Panel], float, float]:
     panels = []
     for caption, snap in chosen:
         moved = picture.overlay(grey, picture.flow_colours(snap.flow, flow_px), 0.65 * tissue)
-        moved = picture.arrows(moved, snap.flow, done.tissue, max(grey.shape[1] // 22, 8), 1.0)
+        moved = picture.arrows(moved, snap.flow, done.tissue, 1.0)
         pushed = None
         if snap.density is not None:
             weight = tissue * np.clip(0.15 + snap.density / max(force_kpa, 1e-12), 0, 0.9)

@@ -6,6 +6,7 @@ dropped, as it would be beside the table. Mask, tracker and model are those that
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -15,12 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.methods.protocol import Method, Scene
-from bench.output import machine
-from bench.output import write as results
 from learn.inference.scale import StatedScale, take_scale
 from learn.inference.video_flow import Asked, Flags, FlowHere, Footage, Rgb, Settings, Step, VideoFlow
 from synth.errors import UserError
 from synth.flow.mask_choice import Proposal
+from synth.system.checked_file import write_whole
+from synth.system.packages import machine
 
 
 @dataclass(frozen=True)
@@ -176,5 +177,5 @@ class _Pace:
 def write_live(out: Path, summary: dict[str, float | int], **how: str | int | bool) -> None:
     """`live.json`: the summary, how the stream was run, and the machine."""
     out.mkdir(parents=True, exist_ok=True)
-    record = {"command": "bench live", **how, "machine": machine.describe(), **summary}
-    results.keep(out, "live.json", record)
+    record = {"command": "bench live", **how, "machine": machine(), **summary}
+    write_whole(out / "live.json", json.dumps(record, indent=1) + "\n", durable=False)

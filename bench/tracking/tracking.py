@@ -259,8 +259,6 @@ class _Asking:
                     answer = method.in_space(flow, confidence, moved, scene, shown)
                 else:
                     answer = method(flow, confidence, scene, shown)
-            if not step.found.trusted and hasattr(method, "forget_last"):
-                method.forget_last()
             out.force_mn[name].append(answer.force_mn)
             out.bounds[name].append((answer.low_mn, answer.high_mn, answer.distance))
             if name == self.pictured:

@@ -1,18 +1,18 @@
-"""`bench pareto end-to-end`: error of the force against cost, for whole pipelines from physics to model.
+"""Error of the force against cost, for whole pipelines: law, mesh, paths, flow and model.
 
-A pipeline makes sequences (law, mesh, paths), recovers their flow and fits a model on them; it is asked for
-the force of sequences that a finer pipeline made of scenes it has not seen, from the flow that its own
-estimator recovers there. Its cost is the CPU time of one frame of its data and of one answer.
+A pipeline makes sequences, recovers their flow and fits a model on them; it is asked for the force of
+sequences that a finer pipeline made of scenes it has not seen, from the flow that its own estimator recovers
+there. Its cost is the CPU time of one frame of its data and of one answer.
 
-What is asked is restricted to one instrument that pulls or pushes: flow shows the force along the line of
-sight only through the little that tissue spreads under a push, and a grasp's two jaws gather it as well. On
-recovered flow hardly anything of that part is learnt (`along` in the results): so the part across the line of
-sight is judged by itself besides.
+One instrument pulls or pushes: flow shows the force along the line of sight only through the little that
+tissue spreads under a push, so the part across the line of sight is judged by itself besides.
+
+Run: python -m evidence.end_to_end.pareto --fit 8 --test 6 --out runs/end-to-end
 """
 
 from __future__ import annotations
 
-import json as json_
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
@@ -20,92 +20,48 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from bench.output import machine, result_page, write
-from evidence.end_to_end import costs as end_to_end_costs
-from evidence.end_to_end import page
-from evidence.end_to_end.costs import Costs
-from evidence.end_to_end.pipelines import FINE, FRAMES, SIZE, Pipeline, Sequences, Trial, chosen, errors
-from evidence.measuring import measuring
+from evidence import report
+from evidence.end_to_end import models
+from evidence.end_to_end.pipelines import FINE, FRAMES, SIZE, Sequences, chosen, default_world, errors
 from learn.evaluation.statistics import interval, paired
-from synth.job.schema import Flow
 
 PARTS = {"": "errors", "across_": "across"}
 """What defaults are judged by: the whole force, and its part across the line of sight. Prefix of the names in
 a row, and the errors by sequence."""
+_WHAT = {"": "the force", "across_": "the force across the line of sight"}
 
 
-@measuring("--fit 8 --test 6 --out runs/end-to-end")
-def pareto(
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for results.")] = Path(
-        "docs/results/end-to-end"
+def main(
+    out: Annotated[Path, typer.Option(help="Folder for results.")] = report.RESULTS / "end-to-end",
+    work: Annotated[Path, typer.Option(help="Folder for sequences, flow and answers, to go on from.")] = Path(
+        "runs/end-to-end-work"
     ),
-    work: Annotated[
-        Path,
-        typer.Option(
-            help="Folder for sequences, flow and answers; what is there already is used, if the same job, "
-            "generator and estimator made it."
-        ),
-    ] = Path("runs/end-to-end-work"),
     fit: Annotated[int, typer.Option(min=4, help="Sequences that each pipeline makes to fit on.")] = 40,
     test: Annotated[int, typer.Option(min=3, help="Sequences that all are asked about.")] = 24,
     seed: Annotated[int, typer.Option(min=0, help="Root of every draw.")] = 31,
-    epochs: Annotated[int, typer.Option(min=1, help="Of the network.")] = 60,
-    rounds: Annotated[
-        int, typer.Option(min=2, help="How often everything is timed, in turn, once the answers are there.")
-    ] = 4,
-    json: Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")] = False,
 ) -> None:
-    """Error of the force against CPU time a frame, for whole pipelines: law, mesh, paths, flow and model."""
-
-    def say(line: str) -> None:
-        if not json:
-            typer.echo(line)
-
-    asked = Sequences(FINE, FINE.job(seed + 1, test), work)
-    pipelines, trial = chosen(), Trial(epochs, seed, work)
+    """Error of the force against CPU time a frame, for whole pipelines."""
+    asked, pipelines = Sequences(FINE, FINE.job(seed + 1, test), work), chosen()
     worlds = dict.fromkeys(one.world for one in pipelines)
     made = {world: Sequences(world, world.job(seed, fit), work) for world in worlds}
     rows: list[dict[str, Any]] = []
     for one in pipelines:
-        rows.append(one.words() | trial.errors(one, made[one.world], asked))
-        say(f"{len(rows)} of {len(pipelines)}: {one.name}, {100 * np.mean(rows[-1]['errors']):.0f}%")
-    costs = end_to_end_costs.measure(
-        {world.name: world.job(seed, fit) for world in made},
-        [flow for flow in dict.fromkeys(one.flow for one in pipelines) if flow != "ideal"],
-        {one.model: trial.fit(one, made[one.world]) for one in pipelines if one.default},
-        asked.clips(Flow().backend),
-        work,
-        rounds,
-        say,
-    )
-    priced = [row | price(one, costs) for one, row in zip(pipelines, rows, strict=True)]
+        row = one.as_row() | errors(one, made[one.world], asked, work)
+        costs = {"data_s": made[one.world].data_s(), "flow_s": made[default_world()].flow_s(one.flow)}
+        rows.append(row | costs | {"cpu_s": sum(costs.values()) + row["answer_s"]})
+        done = f"{len(rows)} of {len(pipelines)}: {one.name}, {100 * np.mean(row['errors']):.0f}%"
+        typer.echo(done, err=True)
     still = [clip.force for clip in asked.clips("ideal")]
-    nothing = {key: float(np.mean(v)) for key, v in errors([0 * f for f in still], still).items()}
+    nothing = models.errors([0 * force for force in still], still)
     found = {
-        "command": f"bench pareto end-to-end --fit {fit} --test {test} --seed {seed} --epochs {epochs} "
-        f"--rounds {rounds}",
-        "machine": machine.describe(),
-        "meaning": f"{SIZE[0]} x {SIZE[1]} px, {FRAMES} frames, one instrument that pulls or pushes; "
-        "cpu_s: of a frame of data (physics, scene, rendering, flow) and of one answer, the least of "
-        f"{rounds} rounds in which everything was timed in turn; errors: of the force's three components "
-        "together, root mean square over frames as a part of the force's own, by sequence; across, along: "
-        "the parts of it across and along the line of sight, whose squares add up in every sequence",
-        "asked": asdict(FINE),
-        "zero": nothing["errors"],
-        "across_zero": nothing["across"],
-        "rows": summarised(priced, seed),
-        "rounds": costs.rounds,
+        "asked": asdict(FINE) | {"size": SIZE, "frames": FRAMES, "sequences": test},
+        "seed": seed,
+        "zero": float(np.mean(nothing["errors"])),
+        "across_zero": float(np.mean(nothing["across"])),
+        "rows": summarised(rows, seed),
     }
-    write.keep(out, "pareto.json", found)
-    result_page.write(page.drawn(found), out)
-    typer.echo(json_.dumps(found) if json else str(out / "README.md"))
-
-
-def price(one: Pipeline, costs: Costs) -> dict[str, float]:
-    """CPU time [s] of a frame of a pipeline's data, of its flow, of its answer; and of all three."""
-    parts = {"data_s": costs.data[one.world.name], "flow_s": costs.flow[one.flow]}
-    parts["answer_s"] = costs.answer[one.model]
-    return parts | {"cpu_s": sum(parts.values())}
+    report.save(out, "pareto.json", found, page(found))
+    report.show({"rows": page(found).sections[0].rows})
 
 
 def summarised(rows: list[dict[str, Any]], seed: int) -> list[dict[str, Any]]:
@@ -131,3 +87,69 @@ def difference(usual: list[float], other: list[float], seed: int) -> list[float]
     """Mean, low and high of what `other` errs more than `usual` on the same sequences (BCa)."""
     found = paired(np.asarray(usual), np.asarray(other), np.random.default_rng(seed)).difference
     return [found.mean, found.low, found.high]
+
+
+def page(found: Mapping[str, Any]) -> report.Page:
+    """Error against cost, which pipelines differ from the defaults, and a table, the cheapest first."""
+    rows = sorted(found["rows"], key=lambda row: float(row["cpu_s"]))
+    return report.Page(
+        "End to end: error of the force against cost, whole pipelines",
+        found,
+        [_panel(found, part) for part in PARTS],
+        [report.Section("Pipelines", [_cells(row) for row in rows])],
+        (
+            "; ".join(
+                f"{row['model']}: {100 * row['across_rmse']:.0f}% off across the line of sight with the "
+                f"defaults ({_name(row)}), {100 * row['rmse']:.0f}% in all"
+                for row in rows
+                if row["default"]
+            ),
+            "Root mean square error over frames as a part of the force's own, mean over sequences (each "
+            "one's own ratio) with BCa intervals; *more*: paired with the defaults and the same model. No "
+            f"force at all errs by {100 * found['zero']:.0f}%, across the line of sight by "
+            f"{100 * found['across_zero']:.0f}%. CPU time is that of a frame of data, its flow and an "
+            "answer, the least that was measured.",
+        ),
+    )
+
+
+def _panel(found: Mapping[str, Any], part: str) -> report.Panel:
+    """A curve a model, a dot a pipeline; and what no force at all errs by."""
+    rows = found["rows"]
+    curves = []
+    for model in dict.fromkeys(row["model"] for row in rows):
+        own = [row for row in rows if row["model"] == model]
+        errs = tuple(100 * float(row[f"{part}rmse"]) for row in own)
+        ends = tuple((100 * float(row[f"{part}low"]), 100 * float(row[f"{part}high"])) for row in own)
+        ringed = tuple(k for k, row in enumerate(own) if row["default"])
+        cost, labels = tuple(float(row["cpu_s"]) for row in own), tuple(map(_name, own))
+        curves.append(report.Curve(model, cost, errs, labels, ringed, ends, named=False))
+    costs, level = [float(row["cpu_s"]) for row in rows], 100 * float(found[f"{part}zero"])
+    curves.append(report.Curve("no force at all", (min(costs), max(costs)), (level, level)))
+    title, unit = f"Error of {_WHAT[part]} (rings: defaults)", "RMSE [% of the whole force]"
+    return report.Panel(title, "CPU s a frame", unit, tuple(curves), log_y=True, front=True)
+
+
+def _cells(row: Mapping[str, Any]) -> dict[str, Any]:
+    def ends(values: Sequence[float] | None, form: str) -> str | None:
+        if values is None:
+            return None
+        mean, low, high = (f"{100 * value:{form}}" for value in values)
+        return f"{mean} [{low}, {high}]"
+
+    return {
+        "pipeline": _name(row),
+        "model": row["model"],
+        "CPU s": f"{row['cpu_s']:.3f}",
+        "error [%]": ends([row["rmse"], row["low"], row["high"]], ".0f"),
+        "across [%]": ends([row["across_rmse"], row["across_low"], row["across_high"]], ".0f"),
+        "more across": ends(row["across_difference"], "+.1f"),
+    }
+
+
+def _name(row: Mapping[str, Any]) -> str:
+    return f"{row['law']} {row['tets']}, {row['spp']} spp, {row['flow']}"
+
+
+if __name__ == "__main__":
+    typer.run(main)

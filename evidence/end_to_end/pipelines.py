@@ -1,10 +1,10 @@
-"""Whole pipelines from physics to model: what each makes, and what it errs by, kept by what made it."""
+"""Whole pipelines from physics to model: the sequences that each makes, and what it errs by."""
 
 from __future__ import annotations
 
 import functools
 import shutil
-from collections.abc import Sequence
+import time
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -13,23 +13,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.methods.baselines import GRID
-from evidence import kept
+from evidence import cache
 from evidence.end_to_end import models
-from evidence.end_to_end.models import Answer
-from evidence.gap.recompute_flow import recover_flow
 from learn.data import clips as data
 from learn.data.clips import Clip
-from synth.dataset import location, provenance
-from synth.dataset.store import open_sequence
+from learn.data.grid import Grid, Resampler, centre
+from synth.dataset import location
+from synth.dataset.folder import write_whole
+from synth.dataset.store import Sequence, open_sequence
 from synth.flow import mask
+from synth.flow.estimator import Estimator
+from synth.flow.track import track
 from synth.job import identity
 from synth.job.schema import Fem, Flow, Job, Render
 from synth.sequence import pipeline
 
-Floats = NDArray[np.float64]
-
 FRAMES, SIZE, VERTICES, LOAD, GESTURES = 8, (256, 192), 8000, (0.05, 0.2), ("pull", "push")
 _MODELS = (models.RIDGE, models.NEAREST, models.PHYSICS)
+_KEPT = ("peak_rss_mb", "store")
+"""Of a sequence's timings, what is no cost of making it."""
 
 
 @dataclass(frozen=True)
@@ -81,54 +83,39 @@ class Pipeline:
         return f"{self.world.name}, {self.flow}, {self.model}"
 
     @property
-    def slug(self) -> str:
-        """Its name in a file's."""
-        return self.name.replace(", ", "-").replace(" ", "-")
-
-    def words(self) -> dict[str, Any]:
-        """What names it in a row of results."""
-        return asdict(self.world) | {"flow": self.flow, "model": self.model, "default": self.default}
-
-    @property
     def default(self) -> bool:
         """Whether it is made of defaults alone; the model is none of a job's."""
         return self.world == default_world() and self.flow == Flow().backend
+
+    def as_row(self) -> dict[str, Any]:
+        """What names it in a row of results."""
+        return asdict(self.world) | {"flow": self.flow, "model": self.model, "default": self.default}
 
 
 def chosen() -> list[Pipeline]:
     """One thing changed at a time from the defaults, all at their cheapest, and as dear as what is asked."""
     usual, flow = default_world(), Flow().backend
     cheapest = World("linear", 400, 1)
-    worlds = [
-        usual,
-        replace(usual, law="linear"),
-        replace(usual, tets=400),
-        replace(usual, spp=1),
-        cheapest,
-        FINE,
-    ]
-    made = [Pipeline(world, flow, model) for world in dict.fromkeys(worlds) for model in _MODELS]
-    made += [Pipeline(usual, other, m) for other in ("dis", "opencv-tvl1", "ideal") for m in _MODELS]
-    made += [Pipeline(cheapest, "dis", model) for model in _MODELS]
-    made += [Pipeline(world, flow, models.NETWORK) for world in (usual, cheapest)]
-    made.append(Pipeline(usual, "ideal", models.NETWORK))
+    changed = [replace(usual, law="linear"), replace(usual, tets=400), replace(usual, spp=1)]
+    worlds = dict.fromkeys([usual, *changed, cheapest, FINE])
+    pairs = [(world, flow) for world in worlds]
+    pairs += [(usual, other) for other in ("dis", "opencv-tvl1", "ideal")] + [(cheapest, "dis")]
+    made = [Pipeline(world, flow, model) for world, flow in pairs for model in _MODELS]
     # Physics alone learns nothing from the sequences: it is one dot for every flow that it is asked with.
-    return [p for p in made if p.model not in models.UNLEARNT or (p.world == usual and p.flow != "ideal")]
-
-
-def folder_name(world: World, job: Job) -> str:
-    """Folder of a world's sequences: another one when the job's constants or the generator's code change."""
-    return f"{world.name}-{job.seed}-{identity.identify_job(job)[:10]}-{provenance.fingerprint()}"
+    return [p for p in made if p.model != models.PHYSICS or (p.world == usual and p.flow != "ideal")]
 
 
 class Sequences:
-    """Sequences of one world on the baselines' grid, with the flow that any estimator recovers from them."""
+    """Sequences of one world on the baselines' grid, with the flow that any estimator recovers from them.
+
+    Costs are the least CPU time a frame of all sequences: what else runs on a machine only ever adds, and
+    the first of a process compiles.
+    """
 
     def __init__(self, world: World, job: Job, work: Path) -> None:
         """Renders what is not there yet."""
         self._job = job
-        self.name = folder_name(world, job)
-        self._folder = work / self.name
+        self._folder = work / f"{world.name}-{job.seed}-{cache.key(identity.identify_job(job))}"
         self._folder.mkdir(parents=True, exist_ok=True)
         for index in range(job.sequences):
             target = location.store(self._folder, index)
@@ -138,68 +125,85 @@ class Sequences:
 
     def clips(self, flow: str) -> list[Clip]:
         """The clips with `recovered` displacement of an estimator; kept beside the sequences."""
-        settings = self._job.flow.model_copy(update={"backend": flow})
-        key = kept.word(recover_flow.__module__, settings.model_dump(mode="json"), GRID.size, GRID.extent_mm)
-        folder = self._folder / f"clips-{flow}-{key}"
         return [
-            kept.clip(folder / f"{index:06d}", functools.partial(self._recover, index, settings))
-            for index in range(self._job.sequences)
+            cache.clip(self._folder / f"clips-{flow}" / f"{k:06d}", functools.partial(self._recover, k, flow))
+            for k in range(self._job.sequences)
         ]
 
-    def _recover(self, index: int, flow: Flow) -> Clip:
+    def data_s(self) -> float:
+        """CPU time [s] of making a frame, without its flow."""
+        spent: list[float] = []
+        for k in range(self._job.sequences):
+            one = open_sequence(location.store(self._folder, k))
+            times = one.attrs["timings"].items()
+            spent.append(sum(t["cpu_s"] for stage, t in times if stage not in _KEPT) / one.frames)
+        return min(spent)
+
+    def flow_s(self, flow: str) -> float:
+        """CPU time [s] of a frame's masks and flow; 0 of ideal flow. Of clips that are there."""
+        if flow == "ideal":
+            return 0.0
+        return min(float(self._flow_cost(k, flow).read_text("utf-8")) for k in range(self._job.sequences))
+
+    def _flow_cost(self, index: int, flow: str) -> Path:
+        return self._folder / f"flow-{flow}-{index:06d}.cpu_s"
+
+    def _recover(self, index: int, flow: str) -> Clip:
         sequence = open_sequence(location.store(self._folder, index))
         clip = data.read_clip(sequence, GRID, ("ideal",))
-        if flow.backend == "ideal":
+        if flow == "ideal":
             return replace(clip, displacement=clip.displacement | {"recovered": clip.displacement["ideal"]})
+        began = time.process_time()
         hidden = mask.hidden(sequence["rgb"][...], sequence["tool"][...].astype(bool))
-        return recover_flow(sequence, clip, pipeline.estimator(flow), hidden, GRID)[0]
+        masks_s = time.process_time() - began
+        estimator = pipeline.estimator(self._job.flow.model_copy(update={"backend": flow}))
+        recovered, flow_s = recover_flow(sequence, clip, estimator, hidden, GRID)
+        spent = (masks_s + flow_s) / (clip.frames - 1)
+        write_whole(self._flow_cost(index, flow), str(spent), durable=False)
+        return recovered
 
 
-@dataclass(frozen=True)
-class Trial:
-    """How pipelines are fitted, and where what they learnt and said stays."""
+def errors(one: Pipeline, made: Sequences, asked: Sequences, work: Path) -> dict[str, Any]:
+    """What a pipeline errs by, and CPU time [s] of an answer; one fitted on ideal flow is asked with the
+    default's. Kept in `work`."""
+    fit = [] if one.model == models.PHYSICS else made.clips(one.flow)
+    tests = asked.clips(Flow().backend if one.flow == "ideal" else one.flow)
 
-    epochs: int
-    """Of the network."""
-    seed: int
-    work: Path
+    def compute() -> dict[str, Any]:
+        answer = models.build(one.model, fit)
+        given, spent = [], []
+        for clip in tests:
+            began = time.process_time()
+            given.append(answer(clip))
+            spent.append((time.process_time() - began) / clip.frames)
+        return models.errors(given, [clip.force for clip in tests]) | {"answer_s": min(spent)}
 
-    def fit(self, one: Pipeline, made: Sequences) -> Answer:
-        """The pipeline's model, fitted on its sequences."""
-        clips = _fitted_on(one, made)
-        folder = self.work / "networks" / f"{one.slug}-{self._key(one, clips)}"
-        return models.build(one.model, clips, folder, self.epochs, self.seed)
-
-    def errors(self, one: Pipeline, made: Sequences, asked: Sequences) -> dict[str, list[float]]:
-        """What the pipeline errs by; one fitted on ideal flow is asked with the default's."""
-        tests = asked.clips(Flow().backend if one.flow == "ideal" else one.flow)
-
-        def compute() -> dict[str, list[float]]:
-            answer = self.fit(one, made)
-            return errors([answer(clip) for clip in tests], [clip.force for clip in tests])
-
-        key = self._key(one, [*_fitted_on(one, made), *tests])
-        found: dict[str, list[float]] = kept.result(self.work / "answers", one.slug, key, compute)
-        return found
-
-    def _key(self, one: Pipeline, clips: Sequence[Clip]) -> str:
-        settings = models.network_settings(self.epochs, self.seed).as_dict()
-        return kept.word(__name__, one.name, settings, [clip.content_hash for clip in clips])
-
-
-def _fitted_on(one: Pipeline, made: Sequences) -> list[Clip]:
-    return [] if one.model in models.UNLEARNT else made.clips(one.flow)
-
-
-def errors(said: Sequence[Floats], true: Sequence[Floats]) -> dict[str, list[float]]:
-    """Root mean square error of the force as a part of the force's own, by sequence: (T, 3) mN, camera axes.
-
-    Whole, and its parts across and along the line of sight.
-    """
-    found: dict[str, list[float]] = {"errors": [], "across": [], "along": []}
-    for answer, force in zip(said, true, strict=True):
-        own = np.square(force).sum(axis=1).mean()
-        off = np.square(answer - force).mean(axis=0) / own
-        for name, parts in (("errors", off), ("across", off[:2]), ("along", off[2:])):
-            found[name].append(float(np.sqrt(parts.sum())))
+    key = cache.key(one.name, [clip.content_hash for clip in (*fit, *tests)])
+    found: dict[str, Any] = cache.result(work / "answers", one.name.replace(", ", "-"), key, compute)
     return found
+
+
+def recover_flow(
+    sequence: Sequence, clip: Clip, estimator: str | Estimator, blocked: NDArray[np.bool_], grid: Grid
+) -> tuple[Clip, float]:
+    """The clip with the flow that an estimator recovers, and the CPU time of the flow over all frames [s].
+
+    Args:
+        sequence: rendered, with `rgb` and `tissue`.
+        clip: of the sequence on `grid`.
+        estimator: or its name.
+        blocked: (T, H, W) what is masked: tool, glare.
+        grid: of the clip.
+    """
+    tissue = sequence["tissue"][:].astype(bool)
+    scale = float(sequence.attrs["scale_mm_per_px"])
+    resample = Resampler((tissue.shape[0], tissue.shape[1]), scale, centre(tissue), grid)
+    moved, confidence = np.zeros_like(clip.displacement["ideal"]), np.ones_like(clip.confidence)
+    rgb, began = sequence["rgb"][: clip.frames], time.process_time()
+    followed = track(estimator, rgb, blocked[: clip.frames], tissue)
+    spent = time.process_time() - began
+    for t in range(1, clip.frames):
+        moved[t] = resample.mean(followed.flow[t].transpose(2, 0, 1) * scale, tissue) * clip.mask
+        confidence[t] = resample.mean(followed.confidence[t], tissue) * clip.mask
+    found = {**clip.displacement, "recovered": moved}
+    return replace(clip, displacement=found, confidence=confidence), spent

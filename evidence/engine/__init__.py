@@ -1,1 +1,1 @@
-"""The engine measured: cost, kills, damage, faults, size."""
+"""The engine measured: what it costs over the bare stages."""

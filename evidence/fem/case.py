@@ -52,32 +52,30 @@ class Brain:
     """A mesh finest under one contact, its equations and the surface on it."""
 
     system: System
-    carry: Embedding
+    embedding: Embedding
     kernel: Floats
     """(V,) share of a unit force at every vertex."""
     radius_mm: float
 
     def load(self, load: float, way: str) -> Floats:
         """(N, 3) mN for E = 1 kPa at P = `load`."""
-        return self.carry.gather(np.outer(self.kernel, load * self.radius_mm**2 * np.array(WAYS[way])))
+        return self.embedding.gather(np.outer(self.kernel, load * self.radius_mm**2 * np.array(WAYS[way])))
 
 
-def brain(
-    on: Patch, law: str, order: int, tets: int, contact: tuple[float, float, float], poisson: float = 0.4
-) -> Brain:
-    """Meshes, assembles and embeds; elements are those that a job of this order gets."""
-    volume = tetrahedra.block(ANATOMY, tets, order, (contact,))
-    carry = surface_embedding.embed(volume, on.vertices)
+def brain(on: Patch, law: str, tets: int, contact: tuple[float, float, float], poisson: float = 0.4) -> Brain:
+    """Meshes, assembles and embeds."""
+    volume = tetrahedra.block(ANATOMY, tets, 2, (contact,))
+    embedding = surface_embedding.embed(volume, on.vertices)
     pressure = tool.footprint(np.array(contact[:2]), contact[2], on.vertices, on.area)
-    averaged = schema.Fem.model_validate({"order": order}).averages_volume
-    return Brain(assemble(volume, law, poisson, averaged=averaged), carry, on.area * pressure, contact[2])
+    system = assemble(volume, law, poisson)
+    return Brain(system, embedding, on.area * pressure, contact[2])
 
 
 def moved(case: Brain, load: float, way: str, steps: int = 3) -> Floats:
     """(V, 3) mm under a load that was raised in a few steps."""
     part = np.linspace(0, 1, steps + 1)
     path = equilibrium.solve_path(case.system, part[:, None, None] * case.load(load, way), load * part)
-    return case.carry.move(path.displacement[-1])
+    return case.embedding.move(path.displacement[-1])
 
 
 def error(u: Floats, exact: Floats, on: Patch) -> float:
@@ -87,15 +85,12 @@ def error(u: Floats, exact: Floats, on: Patch) -> float:
 
 def speed(case: Brain, load: float, way: str, frames: int = 60) -> float:
     """CPU milliseconds a frame of a pull with ramp, hold and release, moving the surface included."""
-    part = tool.course(_gesture(), frames).load
+    fem, tissue = schema.Fem(gestures=("pull",)), Tissue(1.0, 0.4, "linear")
+    gesture = tool.Gesture.draw(fem, ANATOMY.craniotomy, tissue, np.random.default_rng(0))
+    part = tool.course(gesture, frames).load
     loads = part[:, None, None] * case.load(load, way)
     start = time.process_time()
     path = equilibrium.solve_path(case.system, loads, load * part)
     for u in path.displacement:
-        case.carry.move(u)
+        case.embedding.move(u)
     return 1e3 * (time.process_time() - start) / frames
-
-
-def _gesture() -> tool.Gesture:
-    fem = schema.Fem(gestures=("pull",))
-    return tool.Gesture.draw(fem, ANATOMY.craniotomy, Tissue(1.0, 0.4, "linear"), np.random.default_rng(0))

@@ -1,18 +1,21 @@
-"""Discs on the half-space, bare against closed forms and under a membrane against Hankel integrals."""
+"""Discs on the half-space, bare against closed forms and under a membrane against Hankel integrals.
+
+Run: python -m evidence.fem.half_space
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, Any
+from itertools import product
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import typer
 from numpy.typing import NDArray
 from scipy.special import ellipe, ellipk, j0, j1
 
-from bench.output import charts
-from bench.output.result_page import Page
-from evidence.measuring import measuring
+from evidence import report
 from synth.fem import surface_embedding
 from synth.fem.membrane import Sheet
 from synth.fem.mesh import tetrahedra
@@ -29,45 +32,30 @@ _SHEETS = (0.0, 50.0)
 _WIDE_MM = (800.0, 800.0, 480.0)  # a membrane spreads the load: its far field is not the bare half-space's
 
 
-def _lines(found: Mapping[str, Any]) -> str:
-    """A line a row."""
-    return "\n".join(
-        f"{row['tets']:6d} nu {row['poisson']:4.2f} sheet {row['sheet_mm']:3g} "
-        f"{'averaged' if row['averaged'] else 'pointwise':9s} "
-        f"{row['disc']:10s} {row['part']:12s} {100 * row['error']:5.1f}%"
-        for row in found["rows"]
-    )
+def main(out: Path = report.RESULTS / "fem/half-space", tets: str = "1600,5000") -> None:
+    """Error of surface displacement under uniform, Hertz and tangential discs, bare and with a membrane.
+
+    `tets`: tetrahedra of the meshes.
+    """
+    settings = product((int(n) for n in tets.split(",")), _POISSONS, _SHEETS)
+    found = {"rows": [row for setting in settings for row in measure(*setting)]}
+    report.save(out, "half-space.json", found, page(found))
+    report.show(found)
 
 
-@measuring("--tets 800,1600", said="Folder for the data.", file="half-space.json", text=_lines)
-def half_space(
-    tets: Annotated[str, typer.Option(help="Tetrahedra of the meshes.")] = "1600,5000",
-) -> dict[str, Any]:
-    """Error of surface displacement under uniform, Hertz and tangential discs, bare and with a membrane."""
-    rows = [
-        row
-        for count in (int(n) for n in tets.split(","))
-        for poisson in _POISSONS
-        for sheet, averaged in ((0.0, False), *((sheet, True) for sheet in _SHEETS))
-        for row in measure(count, poisson, sheet, averaged)
-    ]
-    return {"rows": rows}
-
-
-def measure(count: int, poisson: float, sheet_mm: float = 0.0, averaged: bool = True) -> list[Row]:
+def measure(count: int, poisson: float, sheet_mm: float = 0.0) -> list[Row]:
     """Relative root mean squares inside the disc and outside, to twice its radius.
 
     Args:
         count: tetrahedra to aim for.
         poisson: of the half-space.
         sheet_mm: stiffness of the membrane over Young's modulus of the half-space.
-        averaged: of the elements, as in `system.assemble`.
     """
     a = _RADIUS_MM
-    anatomy = schema.Anatomy(dome_mm=1e6, block_mm=_WIDE_MM if sheet_mm else schema.Anatomy().block_mm)
-    tets = tetrahedra.block(anatomy, count, 2, ((0.0, 0.0, a),))
+    size = _WIDE_MM if sheet_mm else tetrahedra.BLOCK_MM
+    tets = tetrahedra.block(schema.Anatomy(dome_mm=1e6), count, 2, ((0.0, 0.0, a),), size_mm=size)
     free = Tets(tets.points, tets.cells, 2, tets.fixed, 0 * tets.hold)
-    system = assemble(free, "linear", poisson, Sheet(sheet_mm, 1.0) if sheet_mm else None, averaged=averaged)
+    system = assemble(free, "linear", poisson, Sheet(sheet_mm, 1.0) if sheet_mm else None)
     ring = a * np.sqrt((np.arange(_RINGS) + 0.5) / _RINGS)
     turn = 2 * np.pi * (np.arange(_SPOKES) + 0.5) / _SPOKES
     at = np.stack([np.outer(ring, np.cos(turn)), np.outer(ring, np.sin(turn))], axis=-1).reshape(-1, 2)
@@ -88,72 +76,47 @@ def measure(count: int, poisson: float, sheet_mm: float = 0.0, averaged: bool = 
             seen = surface_embedding.embed(free, np.column_stack([spots, np.zeros(len(spots))])).move(u)
             unit = spots / np.linalg.norm(spots, axis=1, keepdims=True)
             radial = np.einsum("nd,nd->n", seen[:, :2], unit)
-            if disc == "tangential":
-                exact = {"u_x": tangential_mean(radii, a, poisson)}
-                got = {"u_x": _mean(seen[:, 0], radii)}
-            else:
-                exact = dict(zip(("u_z", "u_r"), axial(radii, a, poisson, disc), strict=True))
-                got = {"u_z": -_mean(seen[:, 2], radii), "u_r": _mean(radial, radii)}
-            if sheet_mm:
-                exact = covered(radii, a, poisson, sheet_mm, disc)
-            for part, value in got.items():
-                rows.append(
-                    {
-                        "tets": count,
-                        "poisson": poisson,
-                        "averaged": averaged,
-                        "sheet_mm": sheet_mm,
-                        "disc": disc,
-                    }
-                    | {"part": f"{part} {place}", "error": round(_error(value, exact[part]), 4)}
-                )
+            got = {"u_z": -seen[:, 2], "u_r": radial, "u_x": seen[:, 0]}
+            exact = covered(radii, a, poisson, sheet_mm, disc) if sheet_mm else bare(radii, a, poisson, disc)
+            setting = {"tets": count, "poisson": poisson, "sheet_mm": sheet_mm, "disc": disc}
+            for part, value in exact.items():
+                mean = got[part].reshape(-1, len(radii)).mean(axis=0)
+                error = float(np.linalg.norm(mean - value) / np.linalg.norm(value))
+                rows.append(setting | {"part": f"{part} {place}", "error": round(error, 4)})
     return rows
 
 
-def _mean(values: Floats, radii: Floats) -> Floats:
-    return np.asarray(values.reshape(-1, len(radii)).mean(axis=0))
+def bare(r: Floats, a: float, poisson: float, disc: str) -> dict[str, Floats]:
+    """Motion of the surface under a unit force, E = 1 kPa (Johnson, Contact Mechanics, 3.4 and 3.6).
 
-
-def _error(got: Floats, exact: Floats) -> float:
-    return float(np.linalg.norm(got - exact) / np.linalg.norm(exact))
-
-
-def axial(r: Floats, a: float, poisson: float, disc: str) -> tuple[Floats, Floats]:
-    """Down and outward motion of the surface under a unit force, E = 1 kPa (Johnson, Contact Mechanics, 3.4).
+    Under a tangential load the kernel of point forces is [(1 - nu)/s + nu (x/s)^2/s] / (2 pi G). Its square
+    averages to a half on the ring, which leaves 1 - nu/2 of the potential of which a normal load has 1 - nu.
 
     Args:
         r: (n,) mm from the middle.
         a: radius of the disc, mm.
         poisson: its ratio.
-        disc: `uniform` or `hertz`.
+        disc: `uniform`, `hertz` or `tangential`.
+
+    Returns:
+        u_z down and u_r outward, or the ring's mean of u_x, (n,) mm.
     """
-    young, force = 1.0, 1.0
+    sideways = -(1 - 2 * poisson) * (1 + poisson)
+    if disc == "hertz":
+        p = 1.5 / (np.pi * a * a)
+        near = np.pi / (4 * a) * (2 * a * a - r**2)
+        reach = np.minimum(a / r, 1)
+        far = ((2 * a * a - r**2) * np.arcsin(reach) + r * a * np.sqrt(1 - reach**2)) / (2 * a)
+        swept = np.where(r < a, 1 - np.clip(1 - (r / a) ** 2, 0, 1) ** 1.5, 1.0)
+        down = (1 - poisson**2) * p * np.where(r < a, near, far)
+        return {"u_z": down, "u_r": sideways * p * a * a / (3 * r) * swept}
+    p = 1 / (np.pi * a * a)
     within = np.where(r < a, np.minimum(r / a, 1), np.minimum(a / r, 1)) ** 2
-    sideways = -(1 - 2 * poisson) * (1 + poisson) / young
-    if disc == "uniform":
-        p = force / (np.pi * a * a)
-        factor = 4 * (1 - poisson**2) * p / (np.pi * young)
-        far = r * (ellipe(within) - (1 - within) * ellipk(within))
-        return factor * np.where(r < a, a * ellipe(within), far), sideways * p / 2 * np.where(
-            r < a, r, a * a / r
-        )
-    p = 1.5 * force / (np.pi * a * a)
-    near = np.pi / (4 * a) * (2 * a * a - r**2)
-    reach = np.minimum(a / r, 1)
-    far = ((2 * a * a - r**2) * np.arcsin(reach) + r * a * np.sqrt(1 - reach**2)) / (2 * a)
-    down = (1 - poisson**2) * p / young * np.where(r < a, near, far)
-    swept = np.where(r < a, 1 - np.clip(1 - (r / a) ** 2, 0, 1) ** 1.5, 1.0)
-    return down, sideways * p * a * a / (3 * r) * swept
-
-
-def tangential_mean(r: Floats, a: float, poisson: float) -> Floats:
-    """u_x, averaged round the ring, under a uniform tangential unit force (Cerruti; Johnson 3.6).
-
-    The kernel of point forces is [(1 - nu)/s + nu (x/s)^2/s] / (2 pi G). The square averages to a half, which
-    leaves 1 - nu/2 of the potential of which a normal load has 1 - nu.
-    """
-    down, _ = axial(r, a, poisson, "uniform")
-    return np.asarray(down / (1 - poisson) * (1 - poisson / 2))
+    far = r * (ellipe(within) - (1 - within) * ellipk(within))
+    down = 4 * (1 - poisson**2) * p / np.pi * np.where(r < a, a * ellipe(within), far)
+    if disc == "tangential":
+        return {"u_x": down / (1 - poisson) * (1 - poisson / 2)}
+    return {"u_z": down, "u_r": sideways * p / 2 * np.where(r < a, r, a * a / r)}
 
 
 def covered(r: Floats, a: float, poisson: float, sheet_mm: float, disc: str) -> dict[str, Floats]:
@@ -168,10 +131,7 @@ def covered(r: Floats, a: float, poisson: float, sheet_mm: float, disc: str) -> 
         a: radius of the disc, mm.
         poisson: of the half-space.
         sheet_mm: S, thickness times Young's modulus of the membrane.
-        disc: `uniform`, `hertz` or `tangential`, of unit force.
-
-    Returns:
-        u_z and u_r as in `axial`, or u_x as in `tangential_mean`, (n,) mm.
+        disc: as in `bare`, whose keys come back.
     """
     shear = 1 / (2 * (1 + poisson))
     k = (np.arange(400_000) + 0.5) * 2e-3 / a
@@ -213,21 +173,22 @@ def point_loads(points: Floats, at: Floats, share: Floats, way: Floats, poisson:
     return out
 
 
-def drawn(found: Mapping[str, Any]) -> Page:
-    """What the data say of the bare half-space: the worst of the discs, inside and outside."""
-    rows = [row for row in found["rows"] if not row["sheet_mm"]]
+def page(found: Mapping[str, Any]) -> report.Page:
+    """The worst of the discs, inside and outside, with and without a membrane."""
+    rows = found["rows"]
     panels = []
     for part in ("u_z", "u_r", "u_x"):
-        curves = []
-        for poisson, averaged in dict.fromkeys((row["poisson"], row["averaged"]) for row in rows):
-            mine = [row for row in rows if (row["poisson"], row["averaged"]) == (poisson, averaged)]
-            mine = [row for row in mine if row["part"].startswith(part)]
-            worst = {n: max(100 * row["error"] for row in mine if row["tets"] == n) for n in _sizes(mine)}
-            name = f"nu {poisson}, {'averaged' if averaged else 'pointwise'}"
-            curves.append(charts.Curve(name, tuple(map(float, worst)), tuple(worst.values())))
-        panels.append(charts.Panel(f"{part}, worst", "tetrahedra", "error [%]", tuple(curves), log_y=True))
-    return Page("Discs on the half-space", found, panels)
+        worst: dict[str, dict[float, float]] = {}
+        for row in rows:
+            if row["part"].startswith(part):
+                errors = worst.setdefault(f"nu {row['poisson']}, membrane {row['sheet_mm']:g} mm", {})
+                errors[row["tets"]] = max(errors.get(row["tets"], 0.0), 100 * row["error"])
+        curves = tuple(
+            report.Curve(name, tuple(errors), tuple(errors.values())) for name, errors in worst.items()
+        )
+        panels.append(report.Panel(f"{part}, worst", "tetrahedra", "error [%]", curves, log_y=True))
+    return report.Page("Discs on the half-space", found, panels)
 
 
-def _sizes(rows: list[Row]) -> list[int]:
-    return sorted({int(row["tets"]) for row in rows})
+if __name__ == "__main__":
+    typer.run(main)

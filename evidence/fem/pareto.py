@@ -1,167 +1,186 @@
-"""The physics' error against its cost, for law, order and size; and what each law is worth at each load."""
+"""The physics' error against its cost by law and size, what each law is worth at each load, and what a
+sequence takes.
+
+Run: python -m evidence.fem.pareto
+"""
 
 from __future__ import annotations
 
+import multiprocessing
+import time
 from collections.abc import Mapping
-from typing import Annotated, Any
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import typer
+from numpy.typing import NDArray
 
-from bench.output import charts, result_page
+from evidence import report
 from evidence.fem import case as fem_case
-from evidence.fem import cost as fem_cost
-from evidence.measuring import measuring
+from synth.fem import solver, tool
 from synth.fem.equilibrium import InvertedElement, NoEquilibrium
 from synth.fem.laws import NUMBER
-from synth.job.schema import Fem
+from synth.fem.material import Tissue
+from synth.fem.mesh import tetrahedra
+from synth.job import schema
+
+Floats = NDArray[np.float64]
+Row = dict[str, Any]
 
 _LOADS = (0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.6, 0.8, 1.0)
 _SETTINGS = (
-    *((law, 2, 1600) for law in NUMBER),
-    *(("corotational", 1, n) for n in (1600, 4096)),
-    *((law, 1, 10_000) for law in ("linear", "neo-hookean")),
-    *((law, 2, n) for law in ("linear", "neo-hookean") for n in (700, 2500)),
+    *((law, 1600) for law in NUMBER),
+    *((law, tets) for law in ("linear", "neo-hookean") for tets in (700, 2500)),
 )
+_FRAMES = 60
 
 
-@measuring(
-    "--load 0.3 --out runs/fem",
-    said="Folder for data, picture and page.",
-    file="pareto.json",
-    page=lambda found, out: result_page.write(drawn(found), out),
-)
-def pareto(
-    load: Annotated[float, typer.Option(help="P = F/(E a^2) at which laws are compared.")] = 0.3,
-    refined: Annotated[int, typer.Option(help="Tetrahedra of the reference, quadratic.")] = 9000,
-    contacts: Annotated[int, typer.Option(help="How many of the four contacts.", min=1, max=4)] = 4,
-) -> dict[str, Any]:
-    """Error against CPU time a frame, for law, order and size; what gestures and a whole sequence cost."""
+def main(
+    out: Path = report.RESULTS / "fem/pareto",
+    load: float = 0.3,
+    refined: int = 9000,
+    contacts: int = 4,
+) -> None:
+    """Error against CPU time a frame by law and size, and costs.
+
+    `load`: P = F/(E a^2) at which laws are compared; `refined`: tetrahedra of the references; `contacts`: how
+    many of four; `brain`: a surface in mm, its opening outwards along `direction`.
+    """
     on = fem_case.patch()
-    return {
+    found: Row = {
         "meaning": "errors: relative root mean square of displacement in the opening; ms_a_frame: CPU, one "
         "core, 60 frames, 40,000 vertices moved",
         "rows": discretisation(on, refined, contacts, load),
         "laws": law_table(on),
-        "gestures": fem_cost.gestures(on, 0.15),
-        "sequence": [fem_cost.sequence("linear", 0.15), fem_cost.sequence("neo-hookean", 0.4)],
+        "sequence": [sequence(law, 0.15) for law in ("linear", "neo-hookean")],
     }
+    report.save(out, "pareto.json", found, page(found))
+    report.show(found)
 
 
-def discretisation(on: fem_case.Patch, refined: int, contacts: int, load: float) -> list[dict[str, Any]]:
-    """Rows of law, order and size: `mesh_error` against refined linear P2 at the same nu (linear law; 0.4 and
-    0.49), `error` against refined neo-Hookean P2 at the load."""
-    default = (Fem().order, Fem().tets)
-    total: dict[tuple[str, int, int], list[dict[str, float]]] = {s: [] for s in _SETTINGS}
+def discretisation(on: fem_case.Patch, refined: int, contacts: int, load: float) -> list[Row]:
+    """Rows of law and size: `mesh_error` against the refined mesh at the same nu (linear law; 0.4 and 0.49),
+    `error` against refined neo-Hookean at the load."""
+    default = ("neo-hookean", schema.Fem().tets)
+    total: dict[tuple[str, int], list[dict[str, float]]] = {setting: [] for setting in _SETTINGS}
     for contact in fem_case.CONTACTS[:contacts]:
-        ways = ("pull", "aside")
-        exact = {}
-        for poisson in (0.4, 0.49):
-            fine = fem_case.brain(on, "linear", 2, refined, contact, poisson)
-            exact[poisson] = {way: fem_case.moved(fine, 0.1, way, 1) for way in ways}
-        true = fem_case.brain(on, "neo-hookean", 2, refined, contact)
+        exact = {nu: _small(on, refined, contact, nu) for nu in (0.4, 0.49)}
+        true = fem_case.brain(on, "neo-hookean", refined, contact)
         whole = {way: fem_case.moved(true, load, way) for way in ("push", "aside")}
-        del fine, true
-        meshed: dict[tuple[int, int], dict[str, float]] = {}
-        for law, order, tets in _SETTINGS:
-            if (order, tets) not in meshed:
-                errors = {}
-                for poisson, name in ((0.4, "mesh_error"), (0.49, "mesh_error_049")):
-                    case = fem_case.brain(on, "linear", order, tets, contact, poisson)
-                    each = [
-                        fem_case.error(fem_case.moved(case, 0.1, way, 1), exact[poisson][way], on)
-                        for way in ways
-                    ]
-                    errors[name] = float(np.mean(each))
-                meshed[order, tets] = errors
-            case = fem_case.brain(on, law, order, tets, contact)
-            each = [fem_case.error(fem_case.moved(case, load, way), whole[way], on) for way in whole]
-            total[law, order, tets].append(
-                meshed[order, tets]
-                | {"error": float(np.mean(each)), "ms_a_frame": fem_case.speed(case, load, "push")}
-            )
+        meshed: dict[int, dict[str, float]] = {}
+        for law, tets in _SETTINGS:
+            if tets not in meshed:
+                meshed[tets] = {
+                    name: _mean_error(_small(on, tets, contact, nu), exact[nu], on)
+                    for nu, name in ((0.4, "mesh_error"), (0.49, "mesh_error_049"))
+                }
+            case = fem_case.brain(on, law, tets, contact)
+            error = speed = float("nan")  # past the law's range
+            with suppress(InvertedElement, NoEquilibrium):
+                error = _mean_error({way: fem_case.moved(case, load, way) for way in whole}, whole, on)
+                speed = fem_case.speed(case, load, "push")
+            total[law, tets].append(meshed[tets] | {"error": error, "ms_a_frame": speed})
     return [
-        {
-            "law": law,
-            "order": order,
-            "tets": tets,
-            "default": (order, tets) == default and law == "neo-hookean",
-        }
-        | {name: float(np.mean([r[name] for r in rows])) for name in rows[0]}
-        | {"mesh_error_worst": max(r["mesh_error"] for r in rows)}
-        for (law, order, tets), rows in total.items()
+        {"law": law, "tets": tets, "default": (law, tets) == default}
+        | {name: _mean([row[name] for row in rows]) for name in rows[0]}
+        | {"mesh_error_worst": max(row["mesh_error"] for row in rows)}
+        for (law, tets), rows in total.items()
     ]
 
 
-def law_table(on: fem_case.Patch) -> list[dict[str, Any]]:
+def _mean(values: list[float]) -> float | None:
+    """None where a value is none."""
+    return float(np.mean(values)) if np.isfinite(values).all() else None
+
+
+def _small(
+    on: fem_case.Patch, tets: int, contact: tuple[float, float, float], poisson: float
+) -> dict[str, Floats]:
+    """Displacement by direction under the linear law."""
+    case = fem_case.brain(on, "linear", tets, contact, poisson)
+    return {way: fem_case.moved(case, 0.1, way, 1) for way in ("pull", "aside")}
+
+
+def _mean_error(u: Mapping[str, Floats], exact: Mapping[str, Floats], on: fem_case.Patch) -> float:
+    return float(np.mean([fem_case.error(u[way], exact[way], on) for way in exact]))
+
+
+def law_table(on: fem_case.Patch) -> list[Row]:
     """Each law against neo-Hookean on the same mesh, for load and direction."""
-    contact, rows = fem_case.CONTACTS[0], []
-    cases = {law: fem_case.brain(on, law, 2, 1600, contact) for law in NUMBER}
+    cases = {law: fem_case.brain(on, law, 1600, fem_case.CONTACTS[0]) for law in NUMBER}
+    rows: list[Row] = []
     for load in _LOADS:
         for way in fem_case.WAYS:
-            laws = [law for law in NUMBER if law != "neo-hookean"]
-            try:
-                true = fem_case.moved(cases["neo-hookean"], load, way, 6)
-            except (InvertedElement, NoEquilibrium) as refusal:
-                outcome = f"no reference: {refusal}"
-                rows += [
-                    {"law": law, "load": load, "way": way, "error": None, "outcome": outcome} for law in laws
-                ]
-                continue
-            for law in laws:
-                row: dict[str, Any] = {"law": law, "load": load, "way": way, "error": None}
+            true: Floats | None = None
+            for law in sorted(NUMBER, key=lambda law: law != "neo-hookean"):
+                row: Row = {"law": law, "load": load, "way": way, "error": None}
                 try:
-                    row["error"] = fem_case.error(fem_case.moved(cases[law], load, way, 6), true, on)
-                    row["outcome"] = f"{100 * row['error']:.2f}%"
+                    u = fem_case.moved(cases[law], load, way, 6)
                 except (InvertedElement, NoEquilibrium) as refusal:
-                    row["outcome"] = f"{type(refusal).__name__}: {refusal}"
-                rows.append(row)
+                    rows.append(row | {"outcome": f"{type(refusal).__name__}: {refusal}"})
+                    continue
+                if law == "neo-hookean":
+                    true = u
+                elif true is None:
+                    rows.append(row | {"outcome": "no reference"})
+                else:
+                    error = fem_case.error(u, true, on)
+                    rows.append(row | {"error": error, "outcome": f"{100 * error:.2f}%"})
     return rows
 
 
-def drawn(found: Mapping[str, Any]) -> result_page.Page:
-    """What the data say."""
-    tables = [result_page.Section(name, found[name]) for name in ("rows", "gestures", "sequence")]
-    return result_page.Page("Physics: error against cost", found, panels(found), tables)
+def sequence(law: str, load: float) -> Row:
+    """Mesh and mechanics of 60 frames with 40,000 vertices in a process of its own: CPU time, peak memory."""
+    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
+        return pool.submit(_sequence, law, load).result()
 
 
-def panels(found: Mapping[str, Any]) -> list[charts.Panel]:
-    """Charts of `pareto.json`: the mesh and law's error against cost, and each law's over the load."""
+def _sequence(law: str, load: float) -> Row:
+    on, fem = fem_case.patch(), schema.Fem(gestures=("pull",), load=(load, load))
+    tissue = Tissue(1.0, 0.4, law)
+    gesture = tool.Gesture.draw(fem, fem_case.ANATOMY.craniotomy, tissue, np.random.default_rng(0))
+    start = time.process_time()
+    volume = tetrahedra.block(fem_case.ANATOMY, fem.tets, 2, tool.focus(gesture))
+    meshed = time.process_time()
+    solver.deform(fem, tissue, gesture, volume, on.vertices, on.faces, _FRAMES, 25.0)
+    spent = 1e3 * (time.process_time() - meshed) / _FRAMES
+    # The kernel's high-water mark: getrusage would count the parent's before exec.
+    status = Path("/proc/self/status").read_text("utf-8")
+    peak = next(int(line.split()[1]) for line in status.splitlines() if line.startswith("VmHWM"))
+    row: Row = {"law": law, "load": load, "mesh_s": meshed - start, "ms_a_frame": spent}
+    return row | {"peak_rss_mb": peak * 1024 / 1e6}
+
+
+def page(found: Mapping[str, Any]) -> report.Page:
+    """Error of mesh and law against cost, and each law's largest over the load."""
     rows, laws = found["rows"], found["laws"]
-    groups = sorted({(r["law"], r["order"]) for r in rows})
-    cost = tuple(
-        charts.Curve(
-            f"{law} P{order}",
-            tuple(r["ms_a_frame"] for r in mine),
-            tuple(100 * r["error"] for r in mine),
-            tuple(f"{law} P{order}, {r['tets']}" for r in mine),
-            ringed=tuple(k for k, r in enumerate(mine) if r["default"]),
+    cost, worth = [], []
+    for law in dict.fromkeys(row["law"] for row in rows):
+        mine = [row for row in rows if row["law"] == law and row["error"] is not None]
+        x, y = (
+            tuple(factor * row[key] for row in mine) for key, factor in (("ms_a_frame", 1), ("error", 100))
         )
-        for law, order in groups
-        if (mine := [r for r in rows if (r["law"], r["order"]) == (law, order)])
-    )
-    worth = tuple(
-        charts.Curve(
-            law,
-            tuple(load for load, _ in worst),
-            tuple(100 * error for _, error in worst),
-        )
-        for law in NUMBER
-        if (worst := _worst(laws, law))
-    )
-    return [
-        charts.Panel(
-            "Physics: error against cost", "CPU ms a frame", "error [%]", cost, True, True, front=True
+        labels = tuple(f"{law}, {row['tets']}" for row in mine)
+        ringed = tuple(k for k, row in enumerate(mine) if row["default"])
+        cost.append(report.Curve(law, x, y, labels, ringed))
+        errors = {load: [r["error"] for r in laws if (r["law"], r["load"]) == (law, load)] for load in _LOADS}
+        held = {load: 100 * max(each) for load, each in errors.items() if each and None not in each}
+        if held:
+            worth.append(report.Curve(law, tuple(held), tuple(held.values())))
+    unit = "CPU ms a frame"
+    title = "Physics: error against cost"
+    panels = [
+        report.Panel(title, unit, "error [%]", tuple(cost), True, True, front=True),
+        report.Panel(
+            "Laws against neo-Hookean, worst", "P = F/(E a2)", "error [%]", tuple(worth), True, True
         ),
-        charts.Panel("Physics: laws against neo-Hookean", "P = F/(E a2)", "error [%]", worth, True, True),
     ]
+    sections = [report.Section(name, found[name]) for name in ("rows", "sequence")]
+    return report.Page(title, found, panels, sections)
 
 
-def _worst(laws: list[dict[str, Any]], law: str) -> list[tuple[float, float]]:
-    """Loads at which a law holds in every direction, with its largest error."""
-    rows = []
-    for load in _LOADS:
-        errors = [r["error"] for r in laws if r["law"] == law and r["load"] == load]
-        if errors and None not in errors:
-            rows.append((load, max(errors)))
-    return rows
+if __name__ == "__main__":
+    typer.run(main)

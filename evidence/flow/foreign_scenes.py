@@ -1,4 +1,4 @@
-"""Recordings whose motion is known in closed form, on pictures that no renderer of ours made.
+"""Films whose motion is known in closed form, on pictures that no renderer of ours made.
 
 Photographs that scikit-image's wheel carries, and drawn phantoms, are warped by an analytic field; tools,
 lamps, highlights, endoscopes, compression and mishaps of the camera are drawn over them. Nothing is shared
@@ -8,15 +8,15 @@ with `synth.render`, nor with the scenes that trained the tool net.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
-from importlib.util import find_spec
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates, spline_filter
+from skimage import data as photographs  # type: ignore[import-not-found, unused-ignore]
 
-from evidence.flow.scenes import Flags, Floats, Rgb, noise_field
+from evidence.flow.scenes import Flags, Floats, Rgb, noise_field, pixels
 
 _FINE = 2  # samples of the source a pixel
 _MARGIN = 24  # px of the source beyond the picture, that motion may bring in
@@ -42,10 +42,9 @@ HALVES = ("tuning", "reporting")
 
 @dataclass(frozen=True)
 class Recipe:
-    """One recording. Lengths in px."""
+    """One film. Lengths in px."""
 
     index: int
-    half: str
     surface: str
     tool: str
     """Its colour; empty: none."""
@@ -82,30 +81,19 @@ class Shown:
     mishap: str
 
 
-def recipes(half: str, count: int, photographs: bool | None = None, first: int = 0) -> list[Recipe]:
-    """So many recordings of a half; each is drawn from its number alone.
-
-    Args:
-        half: one of `HALVES`.
-        count: how many.
-        photographs: use scikit-image's; None: if it is installed.
-        first: how many of the half's are passed over.
-    """
-    there = find_spec("skimage") is not None if photographs is None else photographs
+def recipes(half: str, count: int, first: int = 0) -> list[Recipe]:
+    """So many films of a half (one of `HALVES`) after the first ones; each is drawn from its number alone."""
     side = HALVES.index(half)
-    surfaces = [f"drawn {name}" for name in _DRAWN]
-    if there:
-        surfaces += list(_PHOTOGRAPHS[side::2])
-    return [_recipe(2 * k + side, half, surfaces) for k in range(first, first + count)]
+    surfaces = [*(f"drawn {name}" for name in _DRAWN), *_PHOTOGRAPHS[side::2]]
+    return [_recipe(2 * k + side, surfaces) for k in range(first, first + count)]
 
 
-def _recipe(index: int, half: str, surfaces: list[str]) -> Recipe:
+def _recipe(index: int, surfaces: list[str]) -> Recipe:
     rng = np.random.default_rng([1804, index])
     number = index // 2
     some = rng.random(8)
     return Recipe(
         index=index,
-        half=half,
         # In turn, so that few scenes hold all surfaces and tools; 3 shares no factor with 7.
         surface=surfaces[number % len(surfaces)],
         tool=["", *_TOOLS][(3 * number + number // 7) % 7],
@@ -122,32 +110,17 @@ def _recipe(index: int, half: str, surfaces: list[str]) -> Recipe:
     )
 
 
-@dataclass(frozen=True, eq=False)
-class _Surface:
-    coefficients: tuple[Floats, ...]
-    """Cubic-spline coefficients of each colour, `_FINE` samples a pixel."""
-
-    def sample(self, at: Floats) -> Floats:
-        """(H, W, 3) in 0..1 at (H, W, 2) pixels (x, y)."""
-        where = [(at[..., k] + _MARGIN + 0.5) * _FINE - 0.5 for k in (1, 0)]
-        planes = [
-            map_coordinates(c, where, order=3, mode="mirror", prefilter=False) for c in self.coefficients
-        ]
-        return np.asarray(np.stack(planes, -1), np.float32)
-
-
-def surface(name: str, size: int, rng: np.random.Generator) -> _Surface:
-    """A picture of (size + 2 margins) px, without what pixels can't show."""
+def _surface(name: str, size: int, rng: np.random.Generator) -> Floats:
+    """Cubic-spline coefficients (3, N, N), `_FINE` samples a pixel, of a picture without what pixels can't
+    show, (size + 2 margins) px a side."""
     fine = _FINE * (size + 2 * _MARGIN)
     picture = _drawn(name[6:], fine, rng) if name.startswith("drawn ") else _photograph(name, fine)
     picture = cv2.GaussianBlur(picture, (0, 0), 0.55 * _FINE)
-    return _Surface(tuple(spline_filter(picture[..., c], 3, np.float32, "mirror") for c in range(3)))
+    return np.stack([spline_filter(picture[..., c], 3, np.float32, "mirror") for c in range(3)])
 
 
 def _photograph(name: str, fine: int) -> Floats:
-    from skimage import data  # type: ignore[import-not-found, unused-ignore]
-
-    picture = np.asarray(getattr(data, name)())
+    picture = np.asarray(getattr(photographs, name)())
     picture = np.repeat(picture[..., None], 3, -1) if picture.ndim == 2 else picture[..., :3]
     side = min(picture.shape[:2])
     top, left = (picture.shape[0] - side) // 2, (picture.shape[1] - side) // 2
@@ -187,10 +160,9 @@ def _drawn(name: str, fine: int, rng: np.random.Generator) -> Floats:
 def _dots(fine: int, rng: np.random.Generator, apart: float, radius: float) -> Floats:
     """Cover in 0..1 by discs on a shaken grid, (fine, fine)."""
     cover = np.zeros((fine, fine), np.uint8)
-    for x, y in np.stack(np.meshgrid(np.arange(0, fine, apart), np.arange(0, fine, apart)), -1).reshape(
-        -1, 2
-    ):
-        centre = 16 * (np.array([x, y]) + rng.uniform(-0.3, 0.3, 2) * apart)
+    line = np.arange(0, fine, apart)
+    for corner in np.stack(np.meshgrid(line, line), -1).reshape(-1, 2):
+        centre = 16 * (corner + rng.uniform(-0.3, 0.3, 2) * apart)
         cv2.circle(cover, tuple(centre.astype(int).tolist()), int(16 * radius), 255, -1, cv2.LINE_AA, 4)
     return np.asarray(cover / 255, np.float32)
 
@@ -234,103 +206,70 @@ class Field:
 
     def steepest(self, size: int) -> float:
         """Largest derivative [1/px], at least a millionth."""
-        found = self.at(_grid(size))
-        return max(
-            1e-6, *(float(np.abs(np.gradient(found[..., c], axis=a)).max()) for c in (0, 1) for a in (0, 1))
-        )
-
-
-def _grid(size: int) -> Floats:
-    y, x = np.mgrid[:size, :size].astype(np.float32)
-    return np.stack([x, y], -1)
-
-
-def amplitudes(frames: int) -> NDArray[np.float64]:
-    """A press and a weaker one, (frames,) in 0..1; the first frame and one between are at rest."""
-    t = np.linspace(0, 1, frames)
-    return np.where(t < 0.55, np.sin(np.pi * t / 0.55) ** 2, 0.7 * np.sin(np.pi * (t - 0.55) / 0.45) ** 2)
+        slopes = np.gradient(self.at(pixels(size, size)), axis=(0, 1))
+        return max(1e-6, *(float(np.abs(slope).max()) for slope in slopes))
 
 
 def film(recipe: Recipe, size: int = 192, frames: int = 16) -> Iterator[Shown]:
-    """The recording's frames, the rest frame first."""
+    """The frames, the rest frame first."""
     rng = np.random.default_rng([1805, recipe.index])
-    stage = _Stage.build(recipe, size, rng)
-    plan = _plan(recipe, frames, rng)
-    for amplitude, mishap in plan:
+    stage = _Stage(recipe, size, rng)
+    for amplitude, mishap in _plan(recipe, frames, rng):
         yield stage.shoot(amplitude, mishap, rng)
 
 
 def _plan(recipe: Recipe, frames: int, rng: np.random.Generator) -> list[tuple[float, str]]:
-    """Amplitude and mishap of each frame."""
-    curve = amplitudes(frames).tolist()
-    plan = [(a, "") for a in curve]
+    """Amplitude and mishap of each frame: a press and a weaker one, the first and one between at rest."""
+    t = np.linspace(0, 1, frames)
+    curve = np.where(t < 0.55, np.sin(np.pi * t / 0.55) ** 2, 0.7 * np.sin(np.pi * (t - 0.55) / 0.45) ** 2)
+    plan = [(a, "") for a in curve.tolist()]
     places = rng.permutation(np.arange(2, frames))[: len(recipe.mishaps)]
     for place, name in zip(places.tolist(), recipe.mishaps, strict=False):
-        if name == "doubled":
-            plan[place] = (plan[place - 1][0], name)
-        elif name == "dropped":
+        if name == "dropped":
             plan[place:-1] = plan[place + 1 :]
-            plan[-1] = (curve[-1], "")
+            plan[-1] = (float(curve[-1]), "")
         else:
-            plan[place] = (plan[place][0], name)
+            plan[place] = (plan[place - (name == "doubled")][0], name)
     return plan
 
 
-@dataclass(frozen=True, eq=False)
 class _Stage:
     """What doesn't change from frame to frame."""
 
-    recipe: Recipe
-    size: int
-    skin: _Surface
-    move: Field
-    peak: float
-    """px."""
-    wet: Floats
-    """(H, W) whose high values shine."""
-    drift: Floats
-    """(H, W) by which they change with the surface's tilt."""
-    angle: float
-    """Of the shaft [rad]."""
-    rest_blocked: Flags
-    """(H, W): tool or highlight in the rest frame, or next to them."""
-
-    @classmethod
-    def build(cls, recipe: Recipe, size: int, rng: np.random.Generator) -> _Stage:
-        skin = surface(recipe.surface, size, rng)
-        move = Field.draw(recipe.motion, size, rng)
-        peak = min(recipe.peak_px, 0.5 / move.steepest(size)) * size / 192
-        shape = (size, size)
-        wet = noise_field(shape, size / 14, rng) + noise_field(shape, size / 4, rng)
-        drift, angle = noise_field(shape, size / 5, rng), rng.uniform(0, 2 * np.pi)
-        stage = cls(recipe, size, skin, move, peak, wet, drift, angle, np.zeros(shape, bool))
+    def __init__(self, recipe: Recipe, size: int, rng: np.random.Generator) -> None:
+        self.recipe, self.size, shape = recipe, size, (size, size)
+        self.skin = _surface(recipe.surface, size, rng)
+        self.field = Field.draw(recipe.motion, size, rng)
+        self.peak_px = min(recipe.peak_px, 0.5 / self.field.steepest(size)) * size / 192
+        # High values shine; `drift` is how they change with the surface's tilt.
+        self.wet = noise_field(shape, size / 14, rng) + noise_field(shape, size / 4, rng)
+        self.drift, self.angle = noise_field(shape, size / 5, rng), rng.uniform(0, 2 * np.pi)
         blank = np.zeros((*shape, 3), np.float32)
-        _, glare = stage._shine(blank, 0.0)
-        _, tool = stage._tool(blank, 0.0, np.zeros((*shape, 2), np.float32))
-        return replace(stage, rest_blocked=_near(glare | tool))
+        glare, tool = self._shine(blank, 0.0)[1], self._tool(blank, 0.0, blank[..., :2])[1]
+        self.rest_blocked = _near(glare | tool)
 
     def shoot(self, amplitude: float, mishap: str, rng: np.random.Generator) -> Shown:
         """One frame."""
-        size, recipe = self.size, self.recipe
-        grid = _grid(size)
+        size, recipe, lamp = self.size, self.recipe, np.array(_LAMPS[self.recipe.lamp])
+        grid = pixels(size, size)
         jump = np.array([18.0, -11.0]) * size / 192 if mishap == "jump" else np.zeros(2)
 
         def moved(at: Floats) -> Floats:
-            return np.asarray(amplitude * self.peak * self.move.at(at) + jump, np.float32)
+            return np.asarray(amplitude * self.peak_px * self.field.at(at) + jump, np.float32)
 
         source = grid
         for _ in range(40):  # s = y - u(s): a contraction, for |grad u| is at most 1/2
             source = grid - moved(source)
         flow = moved(grid)
-        bulge = 1 + 0.08 * amplitude * np.exp(-((grid - self.move.centre) ** 2).sum(-1) / (0.3 * size) ** 2)
-        picture = self.skin.sample(source) * bulge[..., None] * np.array(_LAMPS[recipe.lamp])
-        picture, glare = self._shine(picture, amplitude)
+        where = [(source[..., k] + _MARGIN + 0.5) * _FINE - 0.5 for k in (1, 0)]
+        skin = [map_coordinates(c, where, order=3, mode="mirror", prefilter=False) for c in self.skin]
+        bulge = 1 + 0.08 * amplitude * np.exp(-((grid - self.field.centre) ** 2).sum(-1) / (0.3 * size) ** 2)
+        picture, glare = self._shine(np.stack(skin, -1) * bulge[..., None] * lamp, amplitude)
         picture, tool = self._tool(picture, amplitude, flow)
-        scope = np.ones((size, size), bool)
+        scope, cover = np.ones((size, size), bool), np.zeros((size, size), bool)
         if recipe.scope:
             scope = np.linalg.norm(grid - size / 2, axis=-1) < 0.48 * size
             picture = np.where(scope[..., None], picture, 0.01)
-        cover = np.zeros((size, size), bool)
         if mishap == "covered":
             cover[:, : int(0.9 * size)] = True
             picture = np.where(cover[..., None], (0.7, 0.68, 0.66), picture)
@@ -339,11 +278,10 @@ class _Stage:
         if mishap == "defocus":
             picture = cv2.GaussianBlur(picture, (0, 0), 0.03 * size)
         rgb = self._sense(np.asarray(picture, np.float32), rng)
-        blocked = _near(glare | tool)
-        now_free = scope & ~blocked & ~cover
+        free = scope & ~_near(glare | tool) & ~cover
         at = grid + flow
-        seen = cv2.remap(now_free.astype(np.float32), at[..., 0], at[..., 1], cv2.INTER_LINEAR) > 0.99
-        return Shown(rgb, flow, seen & scope & ~self.rest_blocked, now_free, amplitude, mishap)
+        seen = cv2.remap(free.astype(np.float32), at[..., 0], at[..., 1], cv2.INTER_LINEAR) > 0.99
+        return Shown(rgb, flow, seen & scope & ~self.rest_blocked, free, amplitude, mishap)
 
     def _shine(self, picture: Floats, amplitude: float) -> tuple[Floats, Flags]:
         """Highlights that stay with the light."""
@@ -362,28 +300,26 @@ class _Stage:
         if not recipe.tool or (recipe.motion == "press from behind" and not recipe.tool_at_rest):
             return picture, mask.astype(bool)
         shaft = np.array([np.cos(self.angle), np.sin(self.angle)])
-        centre = self.move.centre
+        centre, near = self.field.centre, amplitude > 0.02
         row, column = np.clip(centre[::-1].round().astype(int), 0, size - 1)
-        near = 1.0 if amplitude > 0.02 else 0.0
-        back = (0.12 if recipe.tool_at_rest else 1.2) * (1 - near) * size
+        back = 0.0 if near else (0.12 if recipe.tool_at_rest else 1.2) * size
         if recipe.motion == "press from behind":
             back = 0.15 * size  # rests beside, at the same place all the time
         tip = centre + (flow[row, column] if near else 0) + back * shaft
         finger = recipe.tool == "gloved finger"
         width = size * (0.22 if finger else 0.09)
         end = tip + 2 * size * shaft
-        thick = round(width)
-        points = [tuple((16 * p).round().astype(int).tolist()) for p in (tip, end)]
         if finger:
-            cv2.line(mask, points[0], points[1], 1, thick, cv2.LINE_8, 4)
+            points = [tuple((16 * p).round().astype(int).tolist()) for p in (tip, end)]
+            cv2.line(mask, points[0], points[1], 1, round(width), cv2.LINE_8, 4)
         else:
             side = np.array([-shaft[1], shaft[0]])
             neck, half = tip + width * shaft, 0.5 * width * side
             outline = [tip - 0.24 * half, tip + 0.24 * half, neck + half, end + half, end - half, neck - half]
             cv2.fillConvexPoly(mask, np.round(16 * np.array(outline)).astype(np.int32), 1, cv2.LINE_8, 4)
-        y, x = np.mgrid[:size, :size].astype(np.float32)
-        across = ((x - tip[0]) * -shaft[1] + (y - tip[1]) * shaft[0]) / (width / 2)
-        along = (x - tip[0]) * shaft[0] + (y - tip[1]) * shaft[1]
+        from_tip = pixels(size, size) - tip.astype(np.float64)
+        across = (from_tip @ np.array([-shaft[1], shaft[0]])) / (width / 2)
+        along = from_tip @ shaft
         shade = 1 - 0.45 * np.clip(np.abs(across), 0, 1) ** 2
         if recipe.tool in ("steel", "gold", "black"):
             shade = shade + 0.35 * np.exp(-(((across - 0.3) / 0.12) ** 2))

@@ -1,10 +1,10 @@
-"""How wrong a flow is: endpoint error, magnitude, divergence; and the estimators under test by name."""
+"""How wrong a flow is: endpoint error, magnitude, divergence."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 
 import cv2
 import numpy as np
@@ -18,7 +18,7 @@ _SIGMA = 1.0  # px: divergence is compared after this Gaussian, on both sides
 
 @dataclass(frozen=True)
 class Error:
-    """One flow against the truth, or the mean over many. Lengths in px."""
+    """One flow against the truth, or the mean over many. Lengths in px; NaN where there is no such pixel."""
 
     mean: float
     """Endpoint error over what is seen."""
@@ -28,7 +28,9 @@ class Error:
     contact_seen: float
     """The same where it is seen."""
     hidden: float
-    """Endpoint error under the tool; NaN where nothing is hidden."""
+    """Endpoint error under the tool."""
+    glare: float
+    """Endpoint error over what is seen but masked in the rest frame."""
     magnitude: float
     """Mean error of |flow| as a share of the mean |flow|, over what is seen."""
     divergence: float
@@ -50,18 +52,19 @@ def divergence(flow: Floats) -> Floats:
     return np.asarray(np.gradient(smooth[..., 0], axis=1) + np.gradient(smooth[..., 1], axis=0), np.float32)
 
 
-def against(flow: Floats, truth: Floats, seen: Flags, contact: Flags, hidden: Flags, cpu_s: float) -> Error:
-    """Errors of one flow. seen, contact, hidden: (H, W)."""
-    error = epe(flow, truth)
-    size, real = np.linalg.norm(flow, axis=-1)[seen], np.linalg.norm(truth, axis=-1)[seen]
-    found, true = divergence(flow)[seen], divergence(truth)[seen]
+def against(flow: Floats, pair: Pair, cpu_s: float) -> Error:
+    """Errors of one flow, (H, W, 2) px."""
+    error, seen = epe(flow, pair.flow), pair.inside & ~pair.hidden
+    size, real = np.linalg.norm(flow, axis=-1)[seen], np.linalg.norm(pair.flow, axis=-1)[seen]
+    found, true = divergence(flow)[seen], divergence(pair.flow)[seen]
     spread = float(np.sqrt(np.mean(true**2)))
     return Error(
         mean=float(error[seen].mean()),
         p95=float(np.percentile(error[seen], 95)),
-        contact=_within(error, contact),
-        contact_seen=_within(error, contact & seen),
-        hidden=_within(error, hidden),
+        contact=_mean(error[pair.contact]),
+        contact_seen=_mean(error[pair.contact & seen]),
+        hidden=_mean(error[pair.hidden]),
+        glare=_mean(error[seen & ~pair.rest_usable]),
         magnitude=float(np.abs(size - real).mean() / max(float(real.mean()), 1e-9)),
         divergence=float(np.sqrt(np.mean((found - true) ** 2)) / max(spread, 1e-9)),
         divergence_r=float(np.corrcoef(found, true)[0, 1]) if spread > 0 and found.std() > 0 else 0.0,
@@ -69,21 +72,12 @@ def against(flow: Floats, truth: Floats, seen: Flags, contact: Flags, hidden: Fl
     )
 
 
-def _within(error: Floats, where: Flags) -> float:
-    return float(error[where].mean()) if where.any() else float("nan")
-
-
 Masks = Callable[[Rgb, Flags], Flags]
 """(picture, exact mask of what is usable) → the mask to use."""
 
 
-def exact(_: Rgb, usable: Flags) -> Flags:
-    """The mask as given."""
-    return usable
-
-
 def measure(
-    estimator: Estimator, pairs: Iterable[Pair], masks: Masks = exact, warm: float | None = None
+    estimator: Estimator, pairs: Iterable[Pair], masks: Masks | None = None, warm: float | None = None
 ) -> Error:
     """Mean errors over pairs.
 
@@ -95,45 +89,31 @@ def measure(
     """
     errors = []
     for pair in pairs:
+        rest, now = pair.rest_usable, pair.now_usable
+        if masks is not None:
+            rest, now = masks(pair.rest, rest), masks(pair.now, now)
         initial = None if warm is None else warm * pair.flow
-        rest, now = masks(pair.rest, pair.rest_usable), masks(pair.now, pair.now_usable)
         begin = time.process_time()
         flow, _ = estimator.flow(pair.rest, pair.now, rest, now, initial)
-        spent = time.process_time() - begin
-        seen = pair.inside & ~pair.hidden
-        errors.append(against(flow, pair.flow, seen, pair.contact, pair.hidden, spent))
-    return average(errors)
-
-
-def average(errors: Sequence[Error]) -> Error:
-    """Mean of each figure; of the time, the median, which other work on the machine disturbs least."""
+        errors.append(against(flow, pair, time.process_time() - begin))
     table = {name: [asdict(error)[name] for error in errors] for name in asdict(errors[0])}
-    means = {name: _mean(values) for name, values in table.items()}
-    return Error(**{**means, "cpu_s": float(np.median(table["cpu_s"]))})
+    # Of the time, the median, which other work on the machine disturbs least.
+    return Error(**{n: float(np.median(v)) if n == "cpu_s" else _mean(v) for n, v in table.items()})
 
 
-def _mean(values: Sequence[float]) -> float:
-    good = np.asarray(values, float)
+def _mean(values: Sequence[float] | NDArray[np.floating]) -> float:
+    good = np.asarray(values)
     good = good[np.isfinite(good)]
     return float(good.mean()) if len(good) else float("nan")
 
 
-class MeanInpainting:
-    """An estimator given pictures whose masked pixels hold the mean intensity, as the paper has it."""
-
-    def __init__(self, estimator: Estimator) -> None:
-        self.estimator = estimator
-
-    def flow(
-        self, rest: Rgb, now: Rgb, rest_usable: Flags, now_usable: Flags, initial: Floats | None = None
-    ) -> tuple[Floats, Floats]:
-        """See `Estimator.flow`; the estimator itself is told that everything is usable."""
-        every = np.ones_like(rest_usable)
-        return self.estimator.flow(
-            _inpaint(rest, rest_usable), _inpaint(now, now_usable), every, every, initial
-        )
+def inpainted(pair: Pair) -> Pair:
+    """The pair with the mean intensity in masked pixels, as the paper has it, and all of it usable."""
+    every = np.ones_like(pair.rest_usable)
+    rest, now = _filled(pair.rest, pair.rest_usable), _filled(pair.now, pair.now_usable)
+    return replace(pair, rest=rest, now=now, rest_usable=every, now_usable=every)
 
 
-def _inpaint(picture: Rgb, usable: Flags) -> Rgb:
+def _filled(picture: Rgb, usable: Flags) -> Rgb:
     mean: NDArray[np.float64] = picture[usable].mean(axis=0) if usable.any() else np.full(3, 128.0)
     return np.where(usable[..., None], picture, np.round(mean)).astype(np.uint8)

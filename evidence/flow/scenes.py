@@ -84,17 +84,10 @@ def noise_field(shape: tuple[int, int], period: float, rng: np.random.Generator)
 
 
 def cortex(size: int, rng: np.random.Generator) -> Floats:
-    """Albedo like an exposed cortex: parenchyma, arteries, fine vessels and a vein.
+    """Albedo like an exposed cortex: parenchyma, arteries, fine vessels and a vein; (size, size, 3) in 0..1.
 
     Vessels are the zero lines of smooth noise, which wander as pial vessels do; that isn't anatomy, but the
     picture has the gradients, the empty patches and the aperture problems that matter to flow.
-
-    Args:
-        size: samples a side.
-        rng: where the picture comes from.
-
-    Returns:
-        (size, size, 3) float32 in 0..1, RGB.
     """
     shape = (size, size)
     unit = size / 448.0
@@ -134,17 +127,17 @@ def pull_field(recipe: Recipe) -> Floats:
     pinch = -0.25 * hold * np.exp(-((radius / (1.3 * dimple)) ** 2)) / dimple
     u = along * np.cos(recipe.direction) + pinch * dx
     v = along * np.sin(recipe.direction) + pinch * dy
-    field = np.stack([u, v], -1)
-    largest = np.hypot(u, v).max()
-    return np.asarray(field * (recipe.pull / largest), np.float32)
+    return np.asarray(np.stack([u, v], -1) * (recipe.pull / np.hypot(u, v).max()), np.float32)
+
+
+def pixels(height: int, width: int) -> Floats:
+    """Coordinates (x, y) of pixel centres, (H, W, 2)."""
+    return np.stack(np.meshgrid(np.arange(width), np.arange(height)), -1).astype(np.float32)
 
 
 def inverse(flow: Floats) -> Floats:
     """Where each now pixel came from: x with x + u(x) = y, by fixed-point steps. (H, W, 2) px."""
-    height, width = flow.shape[:2]
-    y, x = np.mgrid[:height, :width].astype(np.float32)
-    grid = np.stack([x, y], -1)
-    source = grid
+    grid = source = pixels(*flow.shape[:2])
     for _ in range(60):
         before = source
         source = grid - np.stack([_at(flow[..., c], source, order=1) for c in range(2)], -1)
@@ -176,20 +169,14 @@ class Stage:
     """(H, W, 2) px: displacement at full pull."""
 
     @classmethod
-    def set(cls, recipe: Recipe, rng: np.random.Generator, photo: Rgb | None = None) -> Stage:
-        """Builds the stage; `photo` (RGB uint8, any size) takes the place of the procedural cortex."""
-        fine = _FINE * recipe.size
-        if photo is None:
-            albedo = cortex(fine, rng)
-        else:
-            albedo = cv2.resize(photo, (fine, fine), interpolation=cv2.INTER_AREA).astype(np.float32) / 255
+    def set(cls, recipe: Recipe, rng: np.random.Generator) -> Stage:
+        """Draws the surface and its highlights."""
+        albedo = cortex(_FINE * recipe.size, rng)
         mean = albedo.mean(axis=(0, 1))
         albedo = mean + recipe.contrast * (albedo - mean)
-        size = (recipe.size, recipe.size)
-        wet = noise_field(size, 14 * recipe.size / 224, rng) + 1.2 * noise_field(
-            size, 70 * recipe.size / 224, rng
-        )
-        return cls(recipe, albedo, wet, noise_field(size, 40 * recipe.size / 224, rng), pull_field(recipe))
+        size, unit = (recipe.size, recipe.size), recipe.size / 224
+        wet = noise_field(size, 14 * unit, rng) + 1.2 * noise_field(size, 70 * unit, rng)
+        return cls(recipe, albedo, wet, noise_field(size, 40 * unit, rng), pull_field(recipe))
 
     def pair(self, share: float, rng: np.random.Generator) -> Pair:
         """The rest frame and the frame at `share` of the full pull."""
@@ -197,9 +184,8 @@ class Stage:
 
     def rest(self, rng: np.random.Generator) -> tuple[Rgb, Flags]:
         """The rest frame and its glare: (H, W, 3) uint8, (H, W) bool."""
-        size = self.recipe.size
-        y, x = np.mgrid[:size, :size].astype(np.float32)
-        picture, glare = self._light(self._sample(np.stack([x, y], -1)), self.wet, 0.0)
+        grid = pixels(self.recipe.size, self.recipe.size)
+        picture, glare = self._light(self._sample(grid), self.wet, 0.0)
         return self._sense(picture, rng), glare
 
     def against(self, rest: tuple[Rgb, Flags], share: float, rng: np.random.Generator) -> Pair:
@@ -216,10 +202,8 @@ class Stage:
         soft = cv2.GaussianBlur(tool.astype(np.float32), (0, 0), 0.6)[..., None]
         picture = picture + np.where(tool[..., None], 0, soft * (0.1 - picture))
         tool = cv2.dilate(tool.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool)
-        size = recipe.size
-        y, x = np.mgrid[:size, :size].astype(np.float32)
-        at = np.stack([x, y], -1) + flow
-        inside = np.all((at >= 0) & (at <= size - 1), axis=-1)
+        at = pixels(recipe.size, recipe.size) + flow
+        inside = np.all((at >= 0) & (at <= recipe.size - 1), axis=-1)
         covered = cv2.remap(tool.astype(np.float32), at[..., 0], at[..., 1], cv2.INTER_LINEAR) > 0.5
         length = np.hypot(self.field[..., 0], self.field[..., 1])
         return Pair(
@@ -273,21 +257,11 @@ class Stage:
         return np.clip(np.round(noisy), 0, 255).astype(np.uint8)
 
 
-def pairs(recipe: Recipe, count: int, seed: int, photo: Rgb | None = None) -> Iterator[Pair]:
-    """`count` independent pairs: other surfaces, other directions of pull, `photo` cropped elsewhere."""
+def pairs(recipe: Recipe, count: int, seed: int) -> Iterator[Pair]:
+    """`count` independent pairs: other surfaces, other directions of pull."""
     for rng in (np.random.default_rng(child) for child in np.random.SeedSequence(seed).spawn(count)):
         turned = replace(recipe, direction=float(rng.uniform(0, 2 * np.pi)))
-        crop = None if photo is None else _crop(photo, rng)
-        yield Stage.set(turned, rng, crop).pair(1.0, rng)
-
-
-def _crop(photo: Rgb, rng: np.random.Generator) -> Rgb:
-    """A square of the photograph's middle, where the cortex is."""
-    height, width = photo.shape[:2]
-    side = int(0.36 * height)
-    top = int(rng.uniform(0.30, 0.84 - side / height) * height)
-    left = int(rng.uniform(0.30, 0.66 - side / width) * width)
-    return photo[top : top + side, left : left + side]
+        yield Stage.set(turned, rng).pair(1.0, rng)
 
 
 def _metal(shape: tuple[int, int]) -> Floats:

@@ -1,6 +1,6 @@
 """Trains the tool mask's U-Net on masks rendered for it (`evidence.flow.toolnet_scenes`).
 
-    python -m evidence.flow.toolnet_training --scenes 39 --steps 700 --seed 0 -o synth/flow
+Run: python -m evidence.flow.toolnet_training
 
 Writes `toolnet.pt` (half precision) and `toolnet.json` (command, seed, steps, overlap on scenes held
 out, beside that of the rule without weights).
@@ -8,8 +8,6 @@ out, beside that of the rule without weights).
 
 from __future__ import annotations
 
-import argparse
-import json
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
@@ -17,76 +15,59 @@ import cv2
 import numpy as np
 import torch
 import torch.nn.functional as F
+import typer
 from numpy.typing import NDArray
 from torch import Tensor
 
-from bench.output import write
+from evidence import report
 from evidence.flow import toolnet_scenes
 from evidence.flow.toolnet_scenes import Frame
 from synth.flow import mask, toolnet
 
 _HELD_OUT, _FIRST = range(13), 26  # scenes to test on, and the first to train on
-_BATCH = 8
-_RATE = 3e-3
+_BATCH, _RATE = 8, 3e-3
 
 Picture = NDArray[np.uint8]
 Flags = NDArray[np.bool_]
 
 
-def train(scenes: int, out: Path, steps: int, seed: int) -> dict[str, float | int | str]:
-    """Renders, trains, writes weights and card into `out`, and gives the card back.
-
-    Args:
-        scenes: to train on.
-        out: folder.
-        steps: of AdamW, batches of 8.
-        seed: of everything drawn.
-    """
+def main(out: Path = toolnet.WEIGHTS.parent, scenes: int = 39, steps: int = 700, seed: int = 0) -> None:
+    """Renders `scenes` scenes, trains for `steps` steps of AdamW, writes weights and card."""
     training = list(toolnet_scenes.frames(range(_FIRST, _FIRST + scenes), seed))
     net = fit(training, steps, seed)
     out.mkdir(parents=True, exist_ok=True)
-    save(net, out / "toolnet.pt")
+    state = {k: v.half() if v.is_floating_point() else v for k, v in net.state_dict().items()}
+    torch.save(state, out / "toolnet.pt")
     held = list(toolnet_scenes.frames(_HELD_OUT, seed))
-    card: dict[str, float | int | str] = {
-        "command": "python -m evidence.flow.toolnet_training "
-        f"--scenes {scenes} --steps {steps} --seed {seed}",
+    found = {
         "frames": len(training),
         "held_out_frames": len(held),
-        "held_out_iou": round(overlap(held, lambda rgb: toolnet.probability(net, rgb) > 0.5), 4),
-        "held_out_iou_with_the_rule": round(overlap(held, lambda rgb: mask.both(rgb, net)), 4),
-        "held_out_iou_of_the_rule": round(overlap(held, mask.grey_bodies), 4),
+        "held_out_iou": overlap(held, lambda rgb: toolnet.probability(net, rgb) > 0.5),
+        "held_out_iou_with_the_rule": overlap(held, lambda rgb: mask.both(rgb, net)),
+        "held_out_iou_of_the_rule": overlap(held, mask.grey_bodies),
         "parameters": sum(p.numel() for p in net.parameters()),
         "torch": torch.__version__,
     }
-    write.keep(out, "toolnet.json", card)
-    return card
+    report.save(out, "toolnet.json", found)
+    report.show(found)
 
 
 def fit(training: Sequence[Frame], steps: int, seed: int) -> toolnet.ToolNet:
     """A net trained from nothing; one-cycle rate, one thread."""
     torch.manual_seed(seed)
     torch.set_num_threads(1)
-    rng = np.random.default_rng(seed)
+    batches = _batches(training, np.random.default_rng(seed))
     net = toolnet.ToolNet()
     optimiser = torch.optim.AdamW(net.parameters(), _RATE, weight_decay=1e-3)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, _RATE, total_steps=steps)
     net.train()
-    for step, (pictures, masks) in zip(range(steps), _batches(training, rng), strict=False):
+    for _, (pictures, masks) in zip(range(steps), batches, strict=False):
         loss = _loss(net(pictures), masks)
         optimiser.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
         optimiser.step()
         schedule.step()
-        if step % 50 == 0:
-            print(f"step {step} loss {float(loss.detach()):.4f}", flush=True)
-    net.eval()
-    return net
-
-
-def save(net: toolnet.ToolNet, path: Path) -> None:
-    """Half-precision weights."""
-    state = {k: v.half() if v.is_floating_point() else v for k, v in net.state_dict().items()}
-    torch.save(state, path)
+    return net.eval()
 
 
 def overlap(frames: Sequence[Frame], find: Callable[[Picture], Flags]) -> float:
@@ -113,14 +94,14 @@ def _vary(picture: Picture, mask: Flags, rng: np.random.Generator) -> tuple[Pict
     """Turned, mirrored, zoomed and cropped square; other light, other steel, other colour of the field."""
     side = min(mask.shape)
     turn, zoom = rng.uniform(0, 360), rng.uniform(0.55, 1.3)
-    matrix = cv2.getRotationMatrix2D((mask.shape[1] / 2, mask.shape[0] / 2), turn, zoom)
-    matrix[:, 2] += np.array([side, side]) / 2 - np.array([mask.shape[1], mask.shape[0]]) / 2
+    middle = np.array([mask.shape[1], mask.shape[0]]) / 2
+    matrix = cv2.getRotationMatrix2D(tuple(middle.tolist()), turn, zoom)
+    matrix[:, 2] += side / 2 - middle
     matrix[:, 2] += rng.uniform(-0.2, 0.2, 2) * side
     border = cv2.BORDER_REFLECT_101
     turned = cv2.warpAffine(picture, matrix, (side, side), flags=cv2.INTER_LINEAR, borderMode=border)
-    inside = cv2.warpAffine(
-        mask.astype(np.uint8), matrix, (side, side), flags=cv2.INTER_NEAREST, borderMode=border
-    ).astype(bool)
+    tool = mask.astype(np.uint8)
+    inside = cv2.warpAffine(tool, matrix, (side, side), flags=cv2.INTER_NEAREST, borderMode=border) > 0
     field = turned.astype(np.float32)
     if rng.random() < 0.5:  # another steel
         steel = field.mean(axis=2, keepdims=True) * rng.uniform(0.3, 1.5) + rng.uniform(-25, 60)
@@ -140,16 +121,5 @@ def _loss(logits: Tensor, masks: Tensor) -> Tensor:
     return F.binary_cross_entropy_with_logits(logits, masks) + 1 - overlap
 
 
-def main() -> None:
-    """The command line."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("-o", "--out", type=Path, default=toolnet.WEIGHTS.parent, help="folder")
-    parser.add_argument("--scenes", type=int, default=39, help="scenes to render and train on")
-    parser.add_argument("--steps", type=int, default=700, help="of AdamW, batches of 8")
-    parser.add_argument("--seed", type=int, default=0, help="of everything drawn")
-    given = parser.parse_args()
-    print(json.dumps(train(given.scenes, given.out, given.steps, given.seed)))
-
-
 if __name__ == "__main__":
-    main()
+    typer.run(main)

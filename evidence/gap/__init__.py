@@ -1,1 +1,1 @@
-"""The sim-to-real gap, and what leakage does to a score."""
+"""The sim-to-real gap."""

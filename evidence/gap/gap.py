@@ -1,13 +1,8 @@
-"""`bench gap`: how much of the sim-to-real gap closes when a network trains on the flow a pipeline recovers.
-
-Four trainings on one split: ideal flow (I), recovered flow (R), ideal flow plus noise fitted to the recovered
-flow's error (N), and a mixture. Each is tested on ideal flow, on recovered flow, and on recovered flow of
-appearance families no training saw (R').
-"""
+"""The share of a gap that a training closes, and the noise fitted to an estimator's error."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,9 +24,6 @@ class Gap:
     """G = [e(I to R') - e(R to R')] / [e(I to R') - e(I to I)]; NaN when undefined."""
     interval: Interval
     """95%, sequences being resampled in pairs."""
-    denominator: float
-    """The gap itself, in the errors' unit."""
-    denominator_interval: Interval
     undefined: str
     """Why there is no share; empty when there is one."""
 
@@ -55,10 +47,10 @@ def closed(
     nan = float("nan")
     if low <= 0 <= high or gap <= 0:
         reason = f"the gap's interval {low:.3g} to {high:.3g} touches zero: there may be none to close"
-        return Gap(nan, (nan, nan), gap, (low, high), reason)
+        return Gap(nan, (nan, nan), reason)
     share = float((ideal_on_unseen - trained_on_unseen).mean()) / gap
     ends = np.quantile(above / below, [0.025, 0.975])
-    return Gap(share, (float(ends[0]), float(ends[1])), gap, (low, high), "")
+    return Gap(share, (float(ends[0]), float(ends[1])), "")
 
 
 @dataclass(frozen=True)
@@ -112,39 +104,3 @@ def fit_noise(
     rho = float(np.clip(neighbours / max(pairs, 1) / max(variance, 1e-12), 0.01, 0.999))
     # White noise blurred by a Gaussian of s cells has correlation exp(-1 / (4 s²)) between neighbours.
     return Noise(float(gain), float(np.sqrt(variance)), float(np.sqrt(-1 / (4 * np.log(rho)))))
-
-
-def verdict(gaps: Mapping[str, Gap], noise_less_real: Interval) -> str:
-    """In words, whether rendering was needed.
-
-    Args:
-        gaps: by training: R, N.
-        noise_less_real: interval of the error of N minus that of R, paired, in the unseen family.
-    """
-    real, noise = gaps["R"], gaps["N"]
-    if real.undefined:
-        return f"The share is undefined: {real.undefined}."
-    said = (
-        f"Training on recovered flow closes {_percent(real)} of the gap, on fitted noise {_percent(noise)}. "
-    )
-    low, high = noise_less_real
-    if low > 0:
-        return said + "Recovered flow closes more than fitted noise does."
-    if high < 0:
-        return said + "Fitted noise closes more: for this, rendering was not needed."
-    return said + (
-        f"The two can't be told apart (their errors differ by {low:.3g} to {high:.3g}): "
-        "that rendering was needed is not shown."
-    )
-
-
-def paired(more: Curve, less: Curve, rng: np.random.Generator) -> Interval:
-    """95% interval of the mean of `more` - `less`, (S,) each, sequences being resampled."""
-    picks = rng.integers(0, len(more), (_RESAMPLES, len(more)))
-    ends = np.quantile((more - less)[picks].mean(axis=1), [0.025, 0.975])
-    return (float(ends[0]), float(ends[1]))
-
-
-def _percent(gap: Gap) -> str:
-    low, high = gap.interval
-    return f"{100 * gap.share:.0f}% [{100 * low:.0f}, {100 * high:.0f}]"

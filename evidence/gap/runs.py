@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 
-from evidence import kept
+from evidence import cache
+from evidence.end_to_end.pipelines import recover_flow
 from evidence.gap import gap
-from evidence.gap.recompute_flow import recover_flow
-from evidence.measuring import four_digits
 from learn.data.clips import Clip
 from learn.data.grid import Grid
 from learn.data.split import Split
@@ -30,10 +26,6 @@ KEYS = ("force_mae", "map_rmse")
 """Errors by sequence: total force [mN], density [mN/mm²]; the first decides."""
 Tests = Mapping[str, tuple[Sequence[Clip], str]]
 """By name: the clips asked and the displacement they are asked with."""
-_NUMBERS = {"seed": pa.int32(), "epoch": pa.int32()} | dict.fromkeys(
-    ("select_r2", "train_cpu_s", *KEYS), pa.float32()
-)
-"""Columns of the table that aren't text."""
 
 
 @dataclass(frozen=True)
@@ -46,27 +38,23 @@ class Training:
     """Back end of the recovered flow it is trained or, for I, only tested on."""
     seed: int
 
-    @property
-    def name(self) -> str:
-        return f"{self.kind}-{self.flow}-seed{self.seed}"
 
-
-def kept_flow(sequence: Stored, clip: Clip, backend: str, grid: Grid, cache: Path) -> Clip:
-    """The clip with the flow that another back end recovers, as the paper's pipeline would run it; cached.
+def with_flow(sequence: Stored, clip: Clip, backend: str, grid: Grid, work: Path) -> Clip:
+    """The clip with the flow that another back end recovers, as the paper's pipeline would run it.
 
     Only the instrument is masked, not glare: whoever draws masks by hand draws the tool's.
 
     Args:
         sequence: rendered, with `rgb`, `tool` and `tissue`.
         clip: of the sequence on `grid`, with ideal and any recovered flow.
-        cache: folder of packed clips.
+        work: folder that keeps packed clips.
     """
-    key = kept.word(recover_flow.__module__, clip.content_hash, backend, grid.size, grid.extent_mm)
 
     def make() -> Clip:
         return recover_flow(sequence, clip, backend, sequence["tool"][...].astype(bool), grid)[0]
 
-    return kept.clip(cache / key, make)
+    key = cache.key(clip.content_hash, backend, grid.size, grid.extent_mm)
+    return cache.clip(work / "flow" / key, make)
 
 
 def with_fitted_noise(clips: Sequence[Clip], fit: Sequence[int], seed: int) -> tuple[list[Clip], gap.Noise]:
@@ -91,79 +79,38 @@ def carry_out(
     split: Split,
     settings: Settings,
     tests: Tests,
-    cache: Path,
-    say: Callable[[str], None],
+    work: Path,
 ) -> dict[str, Any]:
-    """The training's errors in every test, from `cache` if the same was done before on the same data.
+    """The training's errors in every test, from `work` if the same was done before on the same data.
 
     Args:
         clips: with ideal and recovered displacement; only fit and select of `split` are looked at.
         settings: `input` and `seed` are set by the training.
         tests: what the network is asked.
-        cache: gets results and trained networks; an unfinished one is continued.
-        say: told what is under way.
+        work: gets results and trained networks; an unfinished one is continued.
     """
     kind = {"I": "ideal", "R": "recovered", "N": "recovered", "mixed": "mixed"}[training.kind]
     chosen = changed(settings, input=kind, seed=training.seed)
     # Training on ideal flow is the same whatever flow the test recovers.
     flow = "" if training.kind == "I" else f"-{training.flow}"
-    seen = [clips[i].content_hash for i in (*split.fit, *split.select)]
-    trained = [training.kind, flow, chosen.as_dict(), len(split.fit), seen]
-    model = cache / "models" / f"{training.kind}{flow}-seed{training.seed}-{kept.word(__name__, *trained)}"
+    used = [clips[i].content_hash for i in (*split.fit, *split.select)]
+    trained = [training.kind, flow, chosen.as_dict(), len(split.fit), used]
+    model = work / "models" / f"{training.kind}{flow}-seed{training.seed}-{cache.key(*trained)}"
+    name = f"{training.kind}-{training.flow}-seed{training.seed}"
 
     def compute() -> dict[str, Any]:
-        say(f"training {training.name}")
-        used, noise = list(clips), None
+        fitted, noise = list(clips), None
         if training.kind == "N":
-            used, noise = with_fitted_noise(used, split.fit, training.seed)
-        began = time.process_time()
-        card = train(used, split, chosen, model)
-        spent = round(time.process_time() - began, 1)
-        found = {"epoch": card.epoch, "select_r2": card.score, "train_cpu_s": spent}
-        return found | {"noise": noise and vars(noise), "errors": _errors(model, tests)}
+            fitted, noise = with_fitted_noise(fitted, split.fit, training.seed)
+        train(fitted, split, chosen, model)
+        predictor = load_predictor(model)
+        errors = {
+            test: {key: [row[key] for row in evaluate(predictor, part, source).per_clip()] for key in KEYS}
+            for test, (part, source) in tests.items()
+        }
+        return {"noise": noise and vars(noise), "errors": errors}
 
-    asked = {name: [c.content_hash for c in part] for name, (part, _) in tests.items()}
-    key = kept.word(__name__, *trained, training.flow, asked)
-    done: dict[str, Any] = kept.result(cache / "runs", training.name, key, compute)
-    return done | {"asked": asked}
-
-
-def _errors(model: Path, tests: Tests) -> dict[str, dict[str, list[float]]]:
-    predictor = load_predictor(model)
-    found = {}
-    for name, (part, source) in tests.items():
-        rows = evaluate(predictor, part, source).per_clip()
-        found[name] = {key: [row[key] for row in rows] for key in KEYS}
-    return found
-
-
-def write_table(runs: Mapping[Training, Mapping[str, Any]], file: Path) -> None:
-    """Every sequence's errors in every test of every training, a row each; `sequence`: its content's hash."""
-    rows = [
-        vars(training)
-        | {name: run[name] for name in ("epoch", "select_r2", "train_cpu_s")}
-        | {"test": test, "sequence": sequence}
-        | {key: run["errors"][test][key][k] for key in KEYS}
-        for training, run in runs.items()
-        for test, asked in run["asked"].items()
-        for k, sequence in enumerate(asked)
-    ]
-    file.parent.mkdir(parents=True, exist_ok=True)
-    schema = pa.schema([(name, _NUMBERS.get(name, pa.string())) for name in rows[0]])
-    pq.write_table(
-        pa.Table.from_pylist(rows, schema),
-        file,
-        compression="zstd",
-        compression_level=19,
-        use_dictionary=[name for name in schema.names if name not in KEYS],
-        use_byte_stream_split=list(KEYS),
-    )
-
-
-def rounded(run: Mapping[str, Any]) -> dict[str, Any]:
-    """A training's run with its errors to four digits, as the table holds them."""
-    errors = {
-        test: {key: [four_digits(value) for value in values] for key, values in found.items()}
-        for test, found in run["errors"].items()
-    }
-    return {**run, "errors": errors}
+    asked = {test: [c.content_hash for c in part] for test, (part, _) in tests.items()}
+    key = cache.key(*trained, training.flow, asked)
+    done: dict[str, Any] = cache.result(work / "runs", name, key, compute)
+    return done

@@ -6,44 +6,32 @@ Whatever asks only for ideal flow needs no light. The motion, camera and label a
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from evidence import kept
+from evidence import cache as kept
 from learn.data.clips import Clip
 from learn.data.grid import Grid, Resampler, centre, settled
-from synth.fem.tool import Gesture
 from synth.geometry.triangles import Shape
 from synth.job.schema import Job
 from synth.render import truth
 from synth.render.anatomy import rim
 from synth.render.camera import camera
 from synth.sequence import pipeline, scenario
-from synth.sequence.scenario import Scenario
 
 FINE = 128
 """Cells along the edge of the grid that labels are made on, at least."""
-_PRESS = 0x9E55
-"""Told apart from every other draw of a sequence."""
 
 
-def clips(
-    job: Job, grid: Grid, cache: Path, report: Callable[[int, int], None] = lambda done, of: None
-) -> list[Clip]:
+def clips(job: Job, grid: Grid, cache: Path) -> list[Clip]:
     """All sequences of a job with ideal flow on a grid of 64², 128² or 256² cells, cached.
 
     Labels are made on 128² or finer; 64² is four cells of that in one.
     """
-    out = []
-    for index in range(job.sequences):
-        report(index, job.sequences)
-        out.append(_one(job, index, grid, cache))
-    report(job.sequences, job.sequences)
-    return out
+    return [_one(job, index, grid, cache) for index in range(job.sequences)]
 
 
 def _one(job: Job, index: int, grid: Grid, cache: Path) -> Clip:
@@ -86,32 +74,15 @@ def coarser(clip: Clip, grid: Grid, times: int) -> Clip:
     )
 
 
-def press(job: Job, index: int, grid: Grid, cache: Path) -> Clip:
-    """A push somewhere else on the tissue of a sequence: what calibrates E (`learn.inference.stiffness`)."""
-    fine = Grid(max(grid.size, FINE), grid.extent_mm)
-    name = f"{key(job, index, grid)}-press"
-
-    def make() -> Clip:
-        case = scenario.draw(job, index)
-        rng = np.random.default_rng([job.seed, index, _PRESS])
-        only = job.fem.model_copy(update={"gestures": ("push",)})
-        gesture = Gesture.draw(only, job.anatomy.craniotomy, case.tissue, rng)
-        made = clip(job, index, fine, name, replace(case, gesture=gesture))
-        times = fine.size // grid.size
-        return coarser(made, fine, times) if times > 1 else made
-
-    return kept.clip(cache / name, make)
-
-
 def key(job: Job, index: int, grid: Grid) -> str:
     """One word for all that labels depend on, the code that makes them too; flow estimators aren't asked."""
     parts = job.model_dump(mode="json", include={"seed", "frames", "fps", "anatomy", "fem", "render"})
-    return kept.word(__name__, parts, index, grid.size, grid.extent_mm)
+    return kept.key(parts, index, grid.size, grid.extent_mm)
 
 
-def clip(job: Job, index: int, grid: Grid, name: str, case: Scenario | None = None) -> Clip:
-    """One sequence of a job (or the one that `case` says): deformed, projected, put on the grid."""
-    case = case or scenario.draw(job, index)
+def clip(job: Job, index: int, grid: Grid, name: str) -> Clip:
+    """One sequence of a job: deformed, projected, put on the grid."""
+    case = scenario.draw(job, index)
     view = camera.place(case.view, job.render)
     surface, tets = pipeline.build(job, case)
     motion = pipeline.move(job, case, surface, tets)

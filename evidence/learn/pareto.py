@@ -1,331 +1,252 @@
-"""`bench pareto learn`: what a network costs a frame, beside what it gets wrong where it has been trained."""
+"""What a network costs a frame and what it gets wrong: each preset's beside others on its grid.
+
+Run: python -m evidence.learn.pareto --cache CACHE (an hour on a core); without a cache only times are taken.
+"""
 
 from __future__ import annotations
 
-import itertools
-import json as json_
+import math
 import time
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 import torch
 import typer
-from rich.console import Console
+from torch import Tensor, nn
 
-from bench.output import charts, result_page, write
-from bench.output.machine import describe
-from evidence.learn.cost import flops, parameters
-from evidence.learn.experiment import BESIDE
-from evidence.learn.preset_errors import GRIDS, Known, Shape, architecture, errors, shape
-from evidence.measuring import measuring
+from evidence import report, status
+from evidence.learn import labels
+from evidence.learn.runs import JOB, Run, by_sequence, carry_out, cell, ends, pictured, study
 from learn.data.grid import Grid, Scales, channels
-from learn.evaluation.statistics import Interval
-from learn.network.d2fnet import Architecture, fused
-from learn.network.monai_unet import build
+from learn.evaluation.statistics import interval, paired
+from learn.network.d2fnet import Architecture, D2FNet, fused
 from learn.network.traced import Quick
-from learn.settings import PRESETS
+from learn.settings import PRESETS, replace
 from learn.training.threads import set_threads
-from synth.errors import UserError
+from synth.job import reader
 
+BESIDE: Mapping[str, tuple[tuple[int, int, int], ...]] = {
+    "live": ((16, 4, 3), (8, 4, 4), (12, 4, 4), (16, 4, 4)),
+    "cpu": ((16, 2, 4), (16, 4, 4), (16, 4, 3), (8, 2, 4), (8, 4, 4)),
+    "tiny": ((16, 2, 3), (8, 2, 3), (16, 4, 2)),
+}
+"""Width, stem and levels of each preset's network and of those beside it that cost about as much or less."""
+HEAVY: tuple[tuple[int, int, int, int], ...] = (
+    (256, 32, 4, 4), (256, 16, 2, 4), (256, 16, 1, 4), (256, 32, 1, 4), (128, 32, 4, 4), (128, 32, 1, 4),
+)  # fmt: skip
+"""Grid, width, stem and levels of networks that are only timed, the published one among them."""
 TURNS = 4
 """Times that all networks are gone through."""
 LIGHT = 5e9
-"""FLOP a frame up to which a network is timed in every layout and precision, and `repeats` times."""
+"""FLOP a frame up to which a network is timed `repeats` times."""
 
 
-@dataclass(frozen=True)
-class Choice:
-    """One way to run one network."""
-
-    arch: Architecture
-    size: int
-    layout: str = "quick"
-    """`contiguous`, `channels_last`, or `quick` (`learn.network.traced`, as live use runs it)."""
-    precision: str = "fp32"
-
-    @property
-    def name(self) -> str:
-        stem = f"stem{self.arch.stem}{'+detail' if self.arch.detail else ''}"
-        return f"{self.arch.name} w{self.arch.width} {stem} depth{self.arch.levels} {self.size}"
-
-    @property
-    def preset(self) -> str:
-        # Those of two eyes have other channels: nothing of theirs was timed here.
-        one_eye = {k: v for k, v in PRESETS.items() if not v.arch.depth}
-        found = [k for k, v in one_eye.items() if v.size == self.size and shape(v.arch) == shape(self.arch)]
-        return ", ".join(found)
-
-
-@measuring("--out runs/learn --repeats 10")
-def pareto(
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for results.")] = Path(
-        "docs/results/learn/pareto"
-    ),
-    runs: Annotated[Path, typer.Option(help="Runs whose errors are shown.")] = Path("docs/results/learn"),
-    repeats: Annotated[int, typer.Option(help="Frames timed, at least.")] = 30,
-    device: Annotated[str, typer.Option(help="cpu or cuda.")] = "cpu",
-    only: Annotated[
-        str,
-        typer.Option(
-            help="Time only networks whose name and way hold one of these words, by commas (empty: all) "
-            "and keep the others' times. A word that none holds times nothing: pages and errors anew."
-        ),
-    ] = "",
-    json: Annotated[bool, typer.Option("--json", help="Print JSON on stdout.")] = False,
+def main(
+    cache: Path | None = None,
+    out: Path = report.RESULTS / "learn/pareto",
+    repeats: int = 30,
+    seeds: int = 2,
+    device: str = "cpu",
 ) -> None:
-    """Time every network a frame, channels included, on one core (or a GPU), beside its error."""
+    """Errors of networks trained in equal steps, and the time of one frame on one core or a GPU."""
     set_threads(1)
-    known = errors(runs)
-    file = out / f"data-{device}.json"
-    # A part that is timed anew takes the place of what was there; the rest stays.
-    rows: list[dict[str, Any]] = json_.loads(file.read_text())["rows"] if only and file.is_file() else []
-    result = {
-        "command": f"bench pareto learn --repeats {repeats} --device {device}",
-        "machine": describe() | {"device": device, "threads": 1, "torch": torch.__version__},
-        "rows": rows,
+    shapes = [(PRESETS[name].size, *shape) for name, group in BESIDE.items() for shape in group]
+    known = {} if cache is None else errors(cache, seeds)
+    rows = measure([*shapes, *HEAVY], repeats, device)
+    found = {
+        "device": device if device == "cpu" else torch.cuda.get_device_name(),
+        "torch": torch.__version__,
+        "data": status.data(JOB),
+        "trained": {name: PRESETS[name].loss for name in BESIDE if known},
+        "rows": [row | known.get(key(row), {}) for row in rows],
     }
-    choices = list(dict.fromkeys(_choices(device, known)))
-    asked = {(shape(c.arch), c.size, c.layout, c.precision) for c in choices}
-    chosen = [c for c in choices if any(word in _named(c) for word in only.split(","))]
-    if not chosen and not any(out.glob("data-*.json")):
-        raise UserError(f"--only {only}: no network's name or way holds that, and {out} has no times to show")
-    new = measure(chosen, repeats, device)
-    again = {_way(row) for row in new}
-    rows[:] = [r for r in rows if _way(r) in asked - again] + new
-    if new:
-        write.keep(out, file.name, result)
-    for row in () if json else new:
-        Console(stderr=True).print(
-            f"{row['name']} {row['layout']} {row['precision']}: p50 {row['ms_p50']:.1f} ms, "
-            f"p95 {row['ms_p95']:.1f} ms"
-        )
-    result_page.write(drawn(out, known), out)
-    if json:
-        print(json_.dumps(result))
+    report.save(out, f"pareto-{device}.json", found, page(found))
+    report.show(found)
 
 
-def measure(choices: Sequence[Choice], repeats: int, device: str = "cpu") -> list[dict[str, Any]]:
+def errors(cache: Path, seeds: int) -> dict[tuple[int, int, int, int], dict[str, Any]]:
+    """Errors of `BESIDE`, trained with their preset's loss and dropout, all else as the study's, fold 0.
+
+    Returns:
+        By grid, width, stem and levels: `map_rmse` [mN/mm²] and `force_mae` [mN], means over sequences with
+        intervals; `against`, the map's error more than the preset's, paired, as a share of that; `seeds`.
+    """
+    job, found = reader.load_job(str(JOB)), {}
+    for name, group in BESIDE.items():
+        preset = PRESETS[name]
+        clips = labels.clips(pictured(job, preset.size), Grid(preset.size), cache)
+        runs: dict[tuple[int, int, int], list[dict[str, Any]]] = {}
+        for shape in group:
+            for seed in range(seeds):
+                runs.setdefault(shape, []).append(carry_out(_run(name, shape, seed), clips, cache))
+        base = by_sequence(runs[_shape(preset.arch)], "map_rmse")
+        for shape, own in runs.items():
+            rmse, force = by_sequence(own, "map_rmse"), by_sequence(own, "force_mae")
+            more = paired(base, rmse, np.random.default_rng(0)).difference
+            found[(preset.size, *shape)] = {
+                "map_rmse": ends(interval(rmse, np.random.default_rng(0))),
+                "force_mae": ends(interval(force, np.random.default_rng(0))),
+                "against": [value / float(base.mean()) for value in ends(more)],
+                "seeds": seeds,
+            }
+    return found
+
+
+def _run(name: str, shape: tuple[int, int, int], seed: int) -> Run:
+    preset, base = PRESETS[name], study()
+    width, stem, levels = shape
+    arch = replace(base.arch, width=width, stem=stem, levels=levels, dropout=preset.arch.dropout)
+    settings = replace(base, size=preset.size, loss=preset.loss, arch=arch, seed=seed)
+    return Run(f"{preset.size}-w{width}-stem{stem}-depth{levels}-seed{seed}", settings)
+
+
+def key(row: Mapping[str, Any]) -> tuple[int, int, int, int]:
+    """What names a network."""
+    return row["size"], row["width"], row["stem"], row["levels"]
+
+
+def preset_of(row: Mapping[str, Any]) -> str:
+    """Presets of one eye whose network it is."""
+    one_eye = {name: one for name, one in PRESETS.items() if not one.arch.depth}
+    return ", ".join(name for name, one in one_eye.items() if key(row) == (one.size, *_shape(one.arch)))
+
+
+def _shape(arch: Architecture) -> tuple[int, int, int]:
+    return arch.width, arch.stem, arch.levels
+
+
+def measure(shapes: Sequence[tuple[int, int, int, int]], repeats: int, device: str) -> list[dict[str, Any]]:
     """Latency of one frame from displacement on the grid to the force map on it, batch norms folded.
 
     CPU time on the CPU (other processes take turns, they don't count), wall time on a GPU. Heavy networks are
     timed at least five times, light ones `repeats` times, all of them in turns: a machine that is faster at
     one time than at another then is so to all.
     """
-    frames = [_frame(choice, device) for choice in choices]
-    costs = [flops(choice.arch, choice.size) for choice in choices]
-    times: list[list[float]] = [[] for _ in choices]
+    archs = [(size, Architecture(width=w, stem=s, levels=n)) for size, w, s, n in shapes]
+    frames = [_frame(arch, size, device) for size, arch in archs]
+    costs = [flops(arch, size) for size, arch in archs]
+    times: list[list[float]] = [[] for _ in shapes]
     for _ in range(TURNS):
         for frame, cost, own in zip(frames, costs, times, strict=True):
             own += _timed(frame, -(-(repeats if cost < LIGHT else 5) // TURNS), device)
     return [
         {
-            "name": choice.name,
-            "preset": choice.preset,
-            "layout": choice.layout,
-            "precision": choice.precision,
-            "size": choice.size,
-            "parameters": parameters(build(choice.arch)),
-            "gflop": round(cost / 1e9, 3),
-            "ms_p50": round(float(np.quantile(own, 0.5)), 3),
-            "ms_p95": round(float(np.quantile(own, 0.95)), 3),
-            "ms_least": round(min(own), 3),
-            "frames": len(own),
-            "arch": choice.arch.model_dump(),
+            "size": size,
+            "width": arch.width,
+            "stem": arch.stem,
+            "levels": arch.levels,
+            "parameters": parameters(D2FNet(arch)),
+            "gflop": cost / 1e9,
+            "ms_p50": float(np.quantile(own, 0.5)),
+            "ms_p95": float(np.quantile(own, 0.95)),
         }
-        for choice, cost, own in zip(choices, costs, times, strict=True)
+        for (size, arch), cost, own in zip(archs, costs, times, strict=True)
     ]
 
 
-def _frame(choice: Choice, device: str) -> Callable[[], None]:
-    """What answers one frame, made ready."""
+def _frame(arch: Architecture, size: int, device: str) -> Callable[[], None]:
+    """What answers one frame as live use does, made ready."""
     torch.manual_seed(0)
-    arch, size = choice.arch, choice.size
-    model = build(arch).eval()
-    net: Callable[..., Any] = (
-        Quick(model, arch, size) if choice.layout == "quick" else fused(model).to(device)
-    )
-    if choice.layout == "channels_last":
-        net = net.to(memory_format=torch.channels_last)  # type: ignore[attr-defined]
+    model = D2FNet(arch).eval()
+    net: Callable[[Tensor], Any] = Quick(model, arch, size) if device == "cpu" else fused(model).to(device)
     grid, scales = Grid(size), Scales(0.2, 0.03, 0.07, 2.0, 0.003)
     displacement = torch.randn(1, 2, size, size, device=device) * 0.1
     mask = torch.ones(1, 1, size, size, device=device)
 
     @torch.inference_mode()
     def frame() -> None:
-        with torch.autocast(torch.device(device).type, torch.bfloat16, enabled=choice.precision == "bf16"):
-            x = channels(displacement, mask, grid.pitch_mm, scales)
-            if choice.layout == "channels_last":
-                x = x.contiguous(memory_format=torch.channels_last)
-            net(x)
+        net(channels(displacement, mask, grid.pitch_mm, scales))
 
     return frame
 
 
 def _timed(frame: Callable[[], None], repeats: int, device: str) -> Iterator[float]:
-    for _ in range(3):
+    """Milliseconds of every frame."""
+    clock = time.process_time if device == "cpu" else time.perf_counter
+    for k in range(3 + repeats):
+        start = clock()
         frame()
-    for _ in range(repeats):
-        if device == "cpu":
-            start = time.process_time()
-            frame()
-            yield 1e3 * (time.process_time() - start)
-        else:
+        if device != "cpu":
             torch.cuda.synchronize()
-            start = time.perf_counter()
-            frame()
-            torch.cuda.synchronize()
-            yield 1e3 * (time.perf_counter() - start)
+        if k >= 3:
+            yield 1e3 * (clock() - start)
 
 
-def _choices(device: str, trained: Known) -> Iterator[Choice]:
-    stems = [(8, 4), (16, 4), (32, 4), (16, 2), (16, 1), (32, 1)]
-    shapes = [(*s, 4, False) for s in stems] + [(16, 4, 3, False), (16, 4, 3, True)]
-    ways = [("contiguous", "fp32"), ("channels_last", "fp32"), ("channels_last", "bf16")]
-    ways = [("quick", "fp32"), *ways] if device == "cpu" else ways
-    for (width, stem, levels, detail), size in itertools.product(shapes, (256, 192, 128)):
-        if size % (stem * 2**levels):
-            continue
-        arch = Architecture(width=width, stem=stem, levels=levels, detail=detail)
-        for layout, precision in ways if flops(arch, size) < LIGHT else ways[:1]:
-            yield Choice(arch, size, layout, precision)
-    yield Choice(Architecture(name="unet"), 256, ways[0][0])
-    beside: list[tuple[Shape, int]] = [
-        (("d2fnet", *sizes, False), PRESETS[name].size) for name, group in BESIDE.items() for sizes in group
+def parameters(model: nn.Module) -> int:
+    """Number of trained parameters."""
+    return sum(p.numel() for p in model.parameters() if p.requires_grad)
+
+
+def flops(arch: Architecture, size: int) -> float:
+    """Floating-point operations (2 a multiply-add) of the convolutions for one N×N frame."""
+    total = 0
+
+    def count(module: nn.Module, _: tuple[Tensor, ...], out: Tensor) -> None:
+        nonlocal total
+        if isinstance(module, nn.ConvTranspose2d):
+            taps = module.in_channels * math.prod(module.kernel_size) / math.prod(module.stride)
+            total += int(2 * taps * out.numel())
+        elif isinstance(module, nn.Conv2d):
+            total += 2 * module.in_channels * math.prod(module.kernel_size) * out.numel()
+
+    with torch.device("meta"):
+        model = D2FNet(arch).eval()
+        for module in model.modules():
+            module.register_forward_hook(count)
+        model(torch.zeros(1, arch.inputs, size, size))
+    return float(total)
+
+
+def page(found: Mapping[str, Any]) -> report.Page:
+    """Fronts, a grid each, and the table."""
+    rows = found["rows"]
+    panels = [panel for name in BESIDE if (panel := _panel(rows, name)) is not None]
+    table = [
+        {"network": f"w{one['width']} stem{one['stem']} depth{one['levels']} {one['size']}²"}
+        | {"preset": preset_of(one) or None, "parameters [M]": one["parameters"] / 1e6, "GFLOP": one["gflop"]}
+        | {"p50 [ms]": one["ms_p50"], "p95 [ms]": one["ms_p95"], "seeds": one.get("seeds")}
+        | {"map RMSE [mN/mm²]": cell(one["map_rmse"]) if "map_rmse" in one else None}
+        | {"more than the preset": cell(one["against"]) if "against" in one else None}
+        | {"total force MAE [mN]": cell(one["force_mae"]) if "force_mae" in one else None}
+        for one in sorted(rows, key=lambda one: float(one["ms_p50"]))
     ]
-    for (name, width, stem, levels, detail), size in [*trained, *beside]:
-        arch = Architecture(name=name, width=width, stem=stem, levels=levels, detail=detail)
-        yield Choice(arch, size, ways[0][0])
+    words = (
+        "From displacement on the grid to the force map, one frame at a time; CPU time of one thread on a "
+        "CPU, wall time on a GPU.",
+        "Errors are of fold 0, with the loss and dropout of the grid's preset, in equal steps on the same "
+        "batches, all answering with magnitudes: mean over tested sequences (and seeds) with BCa interval, "
+        "and the difference from the preset, paired by sequences, as a share of its error. A front is of one "
+        "grid: a coarser one averages over more of a contact's rim, so the same answer errs less on it. The "
+        "published network (32, no stem, 256²) can't be trained on a CPU.",
+    )
+    sections = [report.Section(found["device"], table)]
+    return report.Page("Networks: time and error", found, panels, sections, words)
 
 
-def _named(choice: Choice) -> str:
-    return f"{choice.name} {choice.layout} {choice.precision}"
-
-
-def _way(row: dict[str, Any]) -> tuple[Any, ...]:
-    return shape(architecture(row["arch"])), row["size"], row["layout"], row["precision"]
-
-
-def _lines(rows: list[dict[str, Any]]) -> list[dict[str, object]]:
-    return [
-        {
-            "network": r["name"],
-            "preset": r["preset"] or None,
-            "way": f"{r['layout']}, {r['precision']}",
-            "parameters [M]": round(r["parameters"] / 1e6, 2),
-            "GFLOP": r["gflop"],
-            "p50 [ms]": r["ms_p50"],
-            "p95 [ms]": r["ms_p95"],
-            "frames": r["frames"],
-            "map RMSE [mN/mm²]": _text(r["map_rmse"]),
-            "against its grid's preset": _share(r["against"]),
-            "map RMSE over 0.56 mm": _text(r["wide_rmse"]),
-            "total force MAE [mN]": _text(r["force_mae"], 3),
-            "seeds": r["seeds"],
-        }
-        for r in sorted(rows, key=lambda r: float(r["ms_p50"]))
-    ]
-
-
-def _text(error: list[float] | None, digits: int = 4) -> str | None:
-    return None if error is None else "{:.{n}f} [{:.{n}f}, {:.{n}f}]".format(*error, n=digits)
-
-
-def _ends(i: Interval) -> list[float]:
-    return [i.mean, i.low, i.high]
-
-
-def _share(against: list[float] | None) -> str | None:
-    return None if against is None else "{:+.0%} [{:+.0%}, {:+.0%}]".format(*against)
-
-
-def drawn(out: Path, known: Known) -> result_page.Page:
-    """What every data file in `out` says, with the errors that are known."""
-    found = [json_.loads(file.read_text()) for file in sorted(out.glob("data-*.json"))]
-    panels, sections = [], []
-    for one in found:
-        device, rows = one["machine"]["device"], with_errors(one["rows"], known)
-        panels += chart(rows, device)
-        sections.append(result_page.Section(device, _lines(rows)))
-    title = "Learn: time a frame, and error where it was trained"
-    return result_page.Page(title, found[0], panels, sections, _WORDS, name="README.md")
-
-
-def with_errors(rows: list[dict[str, Any]], known: Known) -> list[dict[str, Any]]:
-    """The rows, each with what is known of its network (`learn_trained.Trained`), as lists of a mean and its
-    interval's ends; None where it was not trained.
-
-    Presets may have moved since the rows were timed: they are named anew.
-    """
-    for row in rows:
-        arch, size = architecture(row["arch"]), row["size"]
-        row["preset"] = Choice(arch, size).preset
-        found = known.get((shape(arch), size))
-        row["map_rmse"] = None if found is None else _ends(found.error)
-        row["wide_rmse"] = None if found is None else _ends(found.wide)
-        row["force_mae"] = None if found is None else _ends(found.force)
-        row["against"] = None if found is None or found.against is None else _ends(found.against)
-        row["seeds"] = None if found is None else found.seeds
-    return rows
-
-
-def chart(rows: list[dict[str, Any]], device: str) -> list[charts.Panel]:
-    """A chart for each preset's grid: one device's rows that have an error, as they are run live.
-
-    Errors are differences from the preset, paired: what sequences have in common would hide them.
-    """
-    panels, way = [], "quick" if device == "cpu" else "contiguous"
-    for size, name in sorted(GRIDS.items()):
-        scored = [
-            r
-            for r in rows
-            if r["size"] == size and r["layout"] == way and (r["against"] or r["preset"] == name)
-        ]
-        gaps = {id(r): [100 * v for v in r["against"] or (0.0, 0.0, 0.0)] for r in scored}
-        curves = [
-            charts.Curve(
+def _panel(rows: Sequence[Mapping[str, Any]], name: str) -> report.Panel | None:
+    """Differences from a preset, paired: what sequences have in common would hide them."""
+    own = [one for one in rows if one["size"] == PRESETS[name].size and "against" in one]
+    curves = []
+    for stem in sorted({one["stem"] for one in own}):
+        part = [one for one in own if one["stem"] == stem]
+        curves.append(
+            report.Curve(
                 f"stem of {stem}",
-                tuple(r["ms_p50"] for r in own),
-                tuple(gaps[id(r)][0] for r in own),
-                tuple(f"{_short(r)} ({r['preset']})" if r["preset"] else _short(r) for r in own),
-                ringed=tuple(k for k, r in enumerate(own) if r["preset"]),
-                ends=tuple((gaps[id(r)][1], gaps[id(r)][2]) for r in own),
+                tuple(one["ms_p50"] for one in part),
+                tuple(100 * one["against"][0] for one in part),
+                tuple(f"w{one['width']} depth{one['levels']} {preset_of(one)}" for one in part),
+                ringed=tuple(k for k, one in enumerate(part) if preset_of(one)),
+                ends=tuple((100 * one["against"][1], 100 * one["against"][2]) for one in part),
             )
-            for stem in (1, 2, 4)
-            if (own := [r for r in scored if r["arch"]["stem"] == stem])
-        ]
-        if curves:
-            title = f"Learn: networks on {size}² beside the preset {name} (on {device})"
-            panels.append(
-                charts.Panel(
-                    title,
-                    "median time a frame [ms]",
-                    "map RMSE, more than the preset's [%]",
-                    tuple(curves),
-                    front=True,
-                )
-            )
-    return panels
+        )
+    title = f"Networks on {PRESETS[name].size}² beside the preset {name}"
+    error = "map RMSE, more than the preset's [%]"
+    return (
+        report.Panel(title, "median time a frame [ms]", error, tuple(curves), front=True) if curves else None
+    )
 
 
-def _short(row: dict[str, Any]) -> str:
-    arch = architecture(row["arch"])
-    name = "" if arch.name == "d2fnet" else f"{arch.name} "
-    return f"{name}w{arch.width} stem{arch.stem}{'+detail' if arch.detail else ''} depth{arch.levels}"
-
-
-_WORDS = (
-    "From displacement on the grid to the force map, channels included, batch norms folded, one frame at a "
-    "time; CPU time of one thread on a CPU, wall time on a GPU. `cpu` is the preset of `learn train` where "
-    "none is named, `live` is `d2fnet-s`. Networks beyond 5 GFLOP are timed a few times only; of the "
-    "others, rows with fewer frames than `--repeats` were timed in an earlier run.",
-    "Errors are of `bench experiment learn --presets` and, on 64², of the study's own runs: fold 0, with "
-    "the loss and dropout of the grid's preset, in equal steps on the same batches, all saying magnitudes; "
-    "mean over tested sequences (and seeds) with BCa interval, and beside it the difference from the "
-    "preset, paired by sequences, as a share of the preset's error. A front is of one grid, as rendering "
-    "has one a picture's width. Between grids compare the errors over cells of 0.56 mm (64²), onto which "
-    "answer and truth are averaged, and those of the total force. `paper`, the published network (27.7 "
-    "GFLOP), and what is as large can't be trained on this machine and have no error.",
-)
+if __name__ == "__main__":
+    typer.run(main)

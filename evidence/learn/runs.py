@@ -1,156 +1,175 @@
-"""Training runs as data: (clips, split, settings) → scores a sequence, kept and reused."""
+"""Which loss: networks trained with each on labels-only sequences, over seeds and folds, paired by sequences.
+
+Run: python -m evidence.learn.runs CACHE (9 trainings of 80 to 100 core-seconds on 300 sequences);
+with --sequences 1500 --folds 3 --seeds 1 each anatomy is tested once (350 core-seconds a training).
+"""
 
 from __future__ import annotations
 
-import json
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import typer
+from numpy.typing import NDArray
 
-from evidence import kept
-from evidence.learn.coarse_rmse import CELLS, wide_rmse
-from evidence.learn.controls import beyond_mean_map, controls, mean_map
+from evidence import cache as kept
+from evidence import report, status
+from evidence.learn import labels
 from learn.data.clips import Clip
 from learn.data.split import Split, nested
 from learn.evaluation.evaluate import evaluate
+from learn.evaluation.metrics import METRICS
+from learn.evaluation.statistics import Interval, interval, paired
 from learn.inference.predict import Predictor, load_predictor
-from learn.inference.stiffness import stiffness
-from learn.settings import Settings
+from learn.loss import Loss
+from learn.settings import Settings, preset, replace
+from learn.training.threads import set_threads
 from learn.training.train import train
+from synth.job import reader
+from synth.job.schema import Job
 
-PRESSES = 30
-"""Tested sequences that get a calibration press: each costs as much as a sequence."""
+JOB = report.RESULTS / "learn/data/labels.yaml"
+LOSSES: tuple[Loss, ...] = ("mse", "antighost", "ghostless")
+SCORES = ("map_r2", "map_rmse", "force_mae", "ghost_relative", "stray_mn", "low_over_mn", "localisation_mm")
+"""Of a tested sequence; `learn.evaluation.metrics` says what they are."""
+
+
+def study() -> Settings:
+    """About a core-minute of training, the same for every choice that is compared."""
+    base = preset("tiny", epochs=8, folds=3, loss="mse")
+    return replace(base, arch=replace(base.arch, output="magnitude"))
 
 
 @dataclass(frozen=True)
 class Run:
-    """One training run and the question it is asked."""
+    """One training."""
 
     name: str
     settings: Settings
-    source: str = "ideal"
-    """Displacement it is tested on."""
-    control: str = ""
-    """`shuffled`: the fitted frames' targets are dealt out anew among them; empty: they are not."""
-    controlled: bool = True
-    """Whether controls are scored too: of a further network on the same sequences they say nothing new."""
 
 
-def carry_out(
-    run: Run,
-    clips: Sequence[Clip],
+def main(
     cache: Path,
-    say: Callable[[str], None],
-    presses: Callable[[int], Clip] | None = None,
-) -> dict[str, Any]:
-    """The run's scores on its test fold, from `cache` if the same run was done before on the same data.
+    out: Path = report.RESULTS / "learn/losses",
+    sequences: int = 300,
+    folds: int = 1,
+    seeds: int = 3,
+    epochs: int = 8,
+) -> None:
+    """Trains with every loss; `cache` gets packed sequences and networks, and done runs are not made anew."""
+    set_threads(1)
+    job = reader.load_job(str(JOB)).model_copy(update={"sequences": sequences})
+    clips = labels.clips(job, study().grid, cache)
+    runs: dict[str, list[dict[str, Any]]] = {}
+    for loss in LOSSES:
+        for fold in range(folds):
+            for seed in range(seeds):
+                settings = replace(study(), loss=loss, fold=fold, seed=seed, epochs=epochs)
+                one = carry_out(Run(f"{loss}-fold{fold}-seed{seed}", settings), clips, cache)
+                runs.setdefault(loss, []).append(one)
+    found = {"data": status.data(JOB), "rows": [row(name, own, runs["mse"]) for name, own in runs.items()]}
+    report.save(out, "losses.json", found, page(found))
+    report.show(found)
 
-    `cache`: where scores and trained models stay; a training that was stopped goes on from there.
-    `presses`: gives a calibration press on the tissue of a sequence, by its index.
+
+def page(found: Mapping[str, Any]) -> report.Page:
+    """Means over sequences, and differences from squared error."""
+    table = [
+        {"loss": one["loss"], "runs": one["runs"], "pooled map R²": one["map_r2_pooled"]}
+        | {METRICS[key].column: cell(one[key]) for key in SCORES}
+        for one in found["rows"]
+    ]
+    less = [
+        {"loss": one["loss"]} | {METRICS[key].column: cell(one["against_mse"][key]) for key in SCORES}
+        for one in found["rows"]
+        if one["against_mse"]
+    ]
+    sections = [
+        report.Section("Means over tested sequences, BCa intervals", table),
+        report.Section("Difference from squared error, paired by sequences", less),
+    ]
+    words = ("Networks of width 16 on a 64² grid, ideal flow, in equal steps on the same batches.",)
+    return report.Page("Losses", found, (), sections, words)
+
+
+def cell(value: Sequence[float]) -> str:
+    """A mean with its interval."""
+    mean, low, high = value
+    return f"{mean:.3g} [{low:.3g}, {high:.3g}]"
+
+
+def row(name: str, runs: Sequence[Mapping[str, Any]], base: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Means of a loss's runs over tested sequences, and the differences from another's of the same seeds."""
+    pooled = float(np.mean([run["map_r2_pooled"] for run in runs]))
+    found: dict[str, Any] = {"loss": name, "runs": len(runs), "map_r2_pooled": pooled, "against_mse": {}}
+    for key in SCORES:
+        own, other = by_sequence(runs, key), by_sequence(base, key)
+        found[key] = ends(interval(own, np.random.default_rng(0)))
+        if runs is not base:
+            found["against_mse"][key] = ends(paired(other, own, np.random.default_rng(0)).difference)
+    return found
+
+
+def ends(value: Interval) -> list[float]:
+    """Mean and interval as JSON has them."""
+    return [value.mean, value.low, value.high]
+
+
+def by_sequence(runs: Sequence[Mapping[str, Any]], key: str) -> NDArray[np.float64]:
+    """A score of every tested sequence, in order of their names; the mean over runs that tested it."""
+    values: dict[str, list[float]] = {}
+    for run in runs:
+        for one in run["sequences"]:
+            values.setdefault(one["name"], []).append(one.get(key, np.nan))
+    return np.array([np.mean(values[name]) for name in sorted(values)], np.float64)
+
+
+def carry_out(run: Run, clips: Sequence[Clip], cache: Path) -> dict[str, Any]:
+    """Scores of a run on its test fold: `sequences`, `map_r2_pooled`, `train_cpu_s`.
+
+    From `cache` if the same was done before on the same data; a training that was stopped goes on.
     """
-    split, key = _split(run, clips), _key(run, clips)
 
     def compute() -> dict[str, Any]:
-        trained = _train(run, clips, split, model_folder(run, clips, cache))
-        found = trained | _score(run, clips, split, model_folder(run, clips, cache), presses)
-        known, spent = found["columns"]["known"], found["train_cpu_s"]
-        took = "continued" if spent is None else f"{spent:.0f} CPU-s"
-        say(
-            f"{run.name}: {took}, map R² {known['map_r2_pooled']:.3f}, "
-            f"force R² {known['force_r2_pooled']:.3f}, ghosts {known['ghost_relative']:.4f}"
-        )
-        return found
+        began = time.process_time()
+        predictor = fit(run, clips, cache)
+        spent = time.process_time() - began
+        found = evaluate(predictor, [clips[i] for i in _split(run, clips).test], "ideal")
+        typer.echo(f"{run.name}: {spent:.0f} CPU-s", err=True)
+        pooled = found.summary()["map_r2_pooled"]
+        rows = [{"name": c.name} | one for c, one in zip(found.clips, found.per_clip(), strict=True)]
+        return {"sequences": rows, "map_r2_pooled": pooled, "train_cpu_s": spent}
 
-    folder, name = cache / "runs", run.name if presses is None else f"{run.name}-pressed"
-    done: dict[str, Any] = kept.result(folder, name, key, compute)
+    done: dict[str, Any] = kept.result(cache / "runs", run.name, _key(run, clips), compute)
     return done
 
 
-def model_folder(run: Run, clips: Sequence[Clip], cache: Path) -> Path:
-    """Where the trained model of a run is."""
-    return cache / "models" / f"{run.name}-{_key(run, clips)}"
+def fit(run: Run, clips: Sequence[Clip], cache: Path) -> Predictor:
+    """The run's network, trained if it isn't in `cache`."""
+    model = cache / "models" / f"{run.name}-{_key(run, clips)}"
+    train(clips, _split(run, clips), run.settings, model)
+    return load_predictor(model)
 
 
-def _key(run: Run, clips: Sequence[Clip]) -> str:
-    settings = run.settings.as_dict()
-    asked = [run.source, run.control, run.controlled, [clip.content_hash for clip in clips]]
-    return kept.word(__name__, settings, *asked)
+def pictured(job: Job, size: int) -> Job:
+    """The job with pictures of at least a pixel a cell of a grid of `size`: else a fine grid learns nothing
+    that a coarse one doesn't have."""
+    times = -(-size // job.render.size[0])
+    wider = job.render.model_copy(update={"size": tuple(times * edge for edge in job.render.size)})
+    return job.model_copy(update={"render": wider})
 
 
 def _split(run: Run, clips: Sequence[Clip]) -> Split:
     return nested(clips, run.settings.folds, run.settings.fold, 0, run.settings.held_out_family)
 
 
-def _train(run: Run, clips: Sequence[Clip], split: Split, model: Path) -> dict[str, Any]:
-    used = _dealt_out(list(clips), split.fit) if run.control == "shuffled" else clips
-    began, clock, whole = time.process_time(), model / "cpu_s", not model.exists()
-    card = train(used, split, run.settings, model)
-    if whole:
-        clock.write_text(f"{time.process_time() - began:.1f}")
-    return {
-        "name": run.name,
-        "source": run.source,
-        "control": run.control,
-        "settings": run.settings.as_dict(),
-        "sequences_fit": len(split.fit),
-        "sequences_select": len(split.select),
-        "epoch": card.epoch,
-        "select_r2": card.score,
-        # A run that was stopped and continued has no time to tell.
-        "train_cpu_s": float(clock.read_text()) if clock.is_file() else None,
-        "history": [json.loads(line) for line in (model / "history.jsonl").read_text().splitlines()],
-    }
+def _key(run: Run, clips: Sequence[Clip]) -> str:
+    return kept.key(run.settings.as_dict(), [clip.content_hash for clip in clips])
 
 
-def _score(
-    run: Run,
-    clips: Sequence[Clip],
-    split: Split,
-    model: Path,
-    presses: Callable[[int], Clip] | None,
-) -> dict[str, Any]:
-    predictor, pressed = load_predictor(model), None
-    if presses is not None:
-        pressed = {clips[i].content_hash: _pressed(predictor, presses(i)) for i in split.test[:PRESSES]}
-    fitted, tested = [clips[i] for i in split.fit], [clips[i] for i in split.test]
-    report = evaluate(predictor, tested, run.source, pressed=pressed)
-    found: dict[str, Any] = report.as_dict()
-    found["controls"] = controls(predictor, tested, run.source, fitted) if run.controlled else {}
-    if run.settings.size > CELLS:
-        wide = wide_rmse(predictor, tested, run.source)
-        for row, value in zip(found["sequences"], wide, strict=True):
-            row["map_rmse_wide"] = value
-    if run.control:
-        found["beyond_mean_map"] = beyond_mean_map(report, mean_map(tested, predictor.card, fitted))
-    if pressed is not None:
-        off = [abs(np.log(pressed[c.content_hash] / c.young_kpa)) for c in tested[:PRESSES]]
-        found["press_young_off"] = float(np.exp(np.median(off)) - 1)
-    return found
-
-
-def _pressed(predictor: Predictor, press: Clip) -> float:
-    force = np.linalg.norm(press.force, axis=1)
-    return stiffness(predictor, np.asarray(press.displacement["ideal"]), press.mask, force)
-
-
-def _dealt_out(clips: list[Clip], fit: Sequence[int]) -> list[Clip]:
-    """Each fitted frame gets the force of another, drawn from all of them: what is learnt then is nothing.
-
-    Dealing whole sequences isn't enough: they all rise and fall alike, so that much motion still goes with
-    much force (map R² 0.18, force R² 0.62 after four epochs).
-    """
-    frames = [(i, t) for i in fit for t in range(clips[i].frames)]
-    dealt = iter(np.random.default_rng(0).permutation(len(frames)))
-    out = list(clips)
-    for i in fit:
-        from_ = [frames[next(dealt)] for _ in range(clips[i].frames)]
-        out[i] = replace(
-            clips[i],
-            density=np.stack([clips[j].density[t] for j, t in from_]),
-            force=np.stack([clips[j].force[t] / clips[j].young_kpa for j, t in from_]) * clips[i].young_kpa,
-        )
-    return out
+if __name__ == "__main__":
+    typer.run(main)

@@ -1,1 +1,1 @@
-"""The look against a photograph: texture, a classifier of patches, and what a fit finds again."""
+"""The look against a photograph: a classifier of patches."""

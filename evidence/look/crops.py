@@ -5,23 +5,21 @@ Both are at the same scale; both get the same noise and go through the same code
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
-from evidence import kept
 from evidence.render.case import case
+from evidence.render.picture_statistics import Picture, corners
 from evidence.render.realism import outlined, scaled_photograph
 from synth.errors import UserError
 from synth.job import reader
-from synth.job.identity import identify_job
 from synth.job.schema import Job
 
-Picture = npt.NDArray[np.uint8]
+Places = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
 
 SIDE_PX = 128
 _NOISE, _QUALITY = 2.0, 90  # grey levels; of JPEG
@@ -29,67 +27,35 @@ MM_PER_PX = 0.0547
 """Of all crops."""
 
 
-@dataclass(frozen=True)
-class Crops:
-    """Crops of one source."""
-
-    pictures: Picture
-    """(N, 128, 128, 3) sRGB."""
-    places: npt.NDArray[np.float64]
-    """(N, 2) middles in the photograph [px]; of rendered ones the sequence, twice."""
-
-
-def of_photograph(photo: Path, outline: str, width_mm: float, mm_per_px: float, step: int = 56) -> Crops:
-    """Crops of the photograph that lie inside an outline.
+def of_photograph(photo: Path, outline: str, width_mm: float, step: int = 56) -> tuple[Picture, Places]:
+    """Crops (N, 128, 128, 3) of the photograph inside an outline, and their corners (N, 2) in it [px].
 
     Raises:
         UserError: it is no picture, or no crop fits.
     """
-    image = scaled_photograph(photo, width_mm / mm_per_px)
-    found = _cut(taken(image, 0), outlined(outline, image.shape[:2]), step)
+    image = scaled_photograph(photo, width_mm / MM_PER_PX)
+    found = corners(outlined(outline, image.shape[:2]), SIDE_PX, step)
     if not found:
         raise UserError(f"{photo}: no crop of {SIDE_PX} px fits inside the outline")
-    return Crops(np.stack([one for one, _ in found]), np.array([place for _, place in found], float))
+    return _cut(taken(image, 0), found), np.array(found, float)
 
 
-def of_job(job: Job, mm_per_px: float, step: int = 64) -> Crops:
-    """Crops of the tissue in the first frame of each of a job's sequences, without instruments."""
-    field = job.render.size[0] * mm_per_px
-    bare = Job.model_validate(
-        {
-            **job.model_dump(exclude={"render", "sensor"}),
-            "render": {**job.render.model_dump(), "tool": False, "field_mm": (field, field)},
-            # The codec is that of all crops.
-            "sensor": {**job.sensor.model_dump(), "bitrate_mbps": None},
-        }
-    )
-    pictures, places = [], []
+def of_job(job: Job, step: int = 64) -> tuple[Picture, Ints]:
+    """Crops of tissue in the first frame of each sequence, without instruments; (N,) their sequence."""
+    field = job.render.size[0] * MM_PER_PX
+    asked = job.model_dump()
+    asked["render"] |= {"tool": False, "field_mm": (field, field)}
+    asked["sensor"]["bitrate_mbps"] = None  # the codec is that of all crops
+    bare = Job.model_validate(asked)
+    pictures, of = [], []
     for index in range(job.sequences):
         one = case(bare, index)
         shot = one.studio.frame(one.vertices, one.tips, one.shafts, seed=index)
         inside = cv2.erode(one.studio.still.tissue.astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
-        for crop, _ in _cut(taken(shot.rgb, index + 1), inside, step):
-            pictures.append(crop)
-            places.append((index, index))
-    return Crops(np.stack(pictures), np.array(places, float))
-
-
-def kept_of_job(job: Job, mm_per_px: float, cache: Path | None) -> Crops:
-    """The same, kept in a folder by job and code, if there is one."""
-    if cache is None:
-        return of_job(job, mm_per_px)
-    file = cache / f"{kept.word(__name__, identify_job(job), job.sequences, mm_per_px)}.npz"
-    if not file.exists():
-        found = of_job(job, mm_per_px)
-        cache.mkdir(parents=True, exist_ok=True)
-        np.savez(file, pictures=found.pictures, places=found.places)
-    with np.load(file) as told:
-        return Crops(told["pictures"], told["places"])
-
-
-def name_jobs(look: list[Path] | None) -> list[tuple[str, Path | None]]:
-    """What is compared, by name: the default job, then files as `synth fit` writes them."""
-    return [("default job", None), *((one.stem, one) for one in look or [])]
+        found = corners(inside, SIDE_PX, step)
+        pictures.append(_cut(taken(shot.rgb, index + 1), found))
+        of += [index] * len(found)
+    return np.concatenate(pictures), np.array(of)
 
 
 def read_job(look: Path | None, frames: int, seed: int, width_mm: float) -> Job:
@@ -114,32 +80,11 @@ def taken(rgb: Picture, seed: int) -> Picture:
     return np.ascontiguousarray(np.asarray(cv2.imdecode(packed, cv2.IMREAD_COLOR), np.uint8)[..., ::-1])
 
 
-def regions(places: npt.NDArray[np.float64], count: int) -> npt.NDArray[np.int64]:
-    """The region (N,) of each place: sectors round the middle with equally many crops."""
-    away = places - places.mean(axis=0)
-    order = np.argsort(np.arctan2(away[:, 1], away[:, 0]), kind="stable")
-    sector = np.empty(len(places), np.int64)
-    sector[order] = np.arange(len(places)) * count // len(places)
-    return sector
-
-
-def overlapping(places: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
+def overlapping(places: Places) -> npt.NDArray[np.bool_]:
     """Which crops (N, N) of one picture show some of the same."""
     return np.asarray((np.abs(places[:, None] - places[None]) < SIDE_PX).all(axis=2))
 
 
-def _cut(rgb: Picture, inside: npt.NDArray[np.bool_], step: int) -> list[tuple[Picture, Any]]:
-    """Crops that lie wholly inside a mask, with their middles."""
-    summed = cv2.integral(inside.astype(np.uint8))
-    found = []
-    for y in range(0, rgb.shape[0] - SIDE_PX + 1, step):
-        for x in range(0, rgb.shape[1] - SIDE_PX + 1, step):
-            box = (
-                summed[y + SIDE_PX, x + SIDE_PX]
-                - summed[y, x + SIDE_PX]
-                - summed[y + SIDE_PX, x]
-                + summed[y, x]
-            )
-            if box == SIDE_PX**2:
-                found.append((rgb[y : y + SIDE_PX, x : x + SIDE_PX], (x + SIDE_PX / 2, y + SIDE_PX / 2)))
-    return found
+def _cut(rgb: Picture, found: list[tuple[int, int]]) -> Picture:
+    crops = [rgb[y : y + SIDE_PX, x : x + SIDE_PX] for x, y in found]
+    return np.asarray(crops, np.uint8).reshape(-1, SIDE_PX, SIDE_PX, 3)

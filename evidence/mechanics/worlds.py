@@ -1,4 +1,4 @@
-"""The worlds of `bench experiment mechanics`: the same anatomy, contact, load and look, other mechanics.
+"""The worlds of the mechanics experiment: the same anatomy, contact, load and look, other mechanics.
 
 Two sequences of one seed and index differ by their world alone: what is drawn for the one is drawn for the
 other, and a number that a world doesn't need is drawn nevertheless (`synth.fem.material`).
@@ -6,7 +6,6 @@ other, and a number that a world doesn't need is drawn nevertheless (`synth.fem.
 
 from __future__ import annotations
 
-import math
 import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -17,26 +16,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.methods.baselines import GRID
-from bench.output import write
-from evidence import kept
+from evidence import cache
 from learn.data import clips as data
 from learn.data.clips import Clip
-from learn.data.grid import Grid
-from synth.dataset import location, provenance
+from synth.dataset import location
+from synth.dataset.folder import write_whole
 from synth.dataset.store import open_sequence
 from synth.errors import UserError
 from synth.job import identity
-from synth.job.schema import Fem, Job
+from synth.job.schema import Job
 from synth.sequence import pipeline
-
-FINE = Grid(2 * GRID.size, GRID.extent_mm)
-"""The network's grid."""
 
 FRAMES, FPS, SIZE, VERTICES = 8, 8.0, (192, 144), 8000
 """A second, as a sequence of the default job: a heart beats once or twice in it."""
 
-PLAIN, STEEP = "plain", "traction, as steep"
-_STEEP_DEG = math.degrees(math.atan(Fem().friction))  # Coulomb's cone: no rigid tip pushes at a lesser slope
+PLAIN = "plain"
 _UNTOUCHED = 1e-6  # load of a tool that does nothing
 
 
@@ -46,8 +40,6 @@ class World:
 
     fem: Mapping[str, Any] = field(default_factory=dict)
     """What a job says of it, beside what all say."""
-    against: str = PLAIN
-    """The world that it is compared with: this one without what is asked about."""
     without: str = ""
     """The world whose motion is taken off every frame, as a perfect pulse removal would."""
     mixed: bool = True
@@ -55,7 +47,7 @@ class World:
 
 
 def _membrane(young_kpa: float, thickness_mm: float) -> dict[str, Any]:
-    return {"intact": 1.0, "young_kpa": young_kpa, "thickness_mm": thickness_mm, "stretch": 1.02}
+    return {"intact": 1.0, "young_kpa": young_kpa, "thickness_mm": thickness_mm}
 
 
 _PULSE = {"heart_mm": [0.1, 0.5], "breath_mm": [0.1, 1.0]}
@@ -67,12 +59,10 @@ WORLDS: dict[str, World] = {
     "membrane, 200 mN/mm": World({"membrane": _membrane(1000.0, 0.2)}),
     "pulse": World({"pulse": _PULSE}),
     "pulse, taken off": World({"pulse": _PULSE}, without="pulse alone", mixed=False),
-    "rigid tip": World({"contact": "rigid", "cone_deg": _STEEP_DEG}, against=STEEP),
     "Poisson 0.49": World({"poisson": 0.49}),
     "slip at the skull": World({"skull": "slip"}),
     "in vivo": World(_ALIVE, mixed=False),
     "in vivo, taken off": World(_ALIVE, without="in vivo, alone", mixed=False),
-    STEEP: World({"cone_deg": _STEEP_DEG}, mixed=False),
 }
 """All that are asked about. The membranes are the ends of the job's range of thickness times modulus;
 `in vivo` is the job of that name, membrane and pulse together, which the mixture doesn't hold."""
@@ -128,15 +118,15 @@ class Scenes:
         try:
             pipeline.render_sequence(asked, index, folder, lambda stage, done, of: None)
         except UserError as refusal:
-            write.keep(folder, _refusal(packed).name, str(refusal))
+            write_whole(_refusal(packed), str(refusal), durable=False)
             return str(refusal)
         flows = ("ideal",) if name in _ALONE else ("ideal", "recovered")
-        data.pack(data.read_clip(open_sequence(store), FINE, flows), packed)
+        data.pack(data.read_clip(open_sequence(store), GRID, flows), packed)
         shutil.rmtree(store)
         return ""
 
     def clip(self, name: str, index: int) -> Clip | None:
-        """A sequence of a world on `FINE`, with ideal and recovered displacement; None if it was refused.
+        """A sequence of a world, with ideal and recovered displacement; None if it was refused.
 
         Raises:
             UserError: it was not made.
@@ -152,9 +142,7 @@ class Scenes:
         return None if _refusal(folder).is_file() else data.unpack(folder)
 
     def _folder(self, name: str) -> Path:
-        asked = job(name, self.seed, self.count)
-        read = kept.word(data.__name__, FINE.size, FINE.extent_mm)
-        made = f"{identity.identify_job(asked)[:10]}-{provenance.fingerprint()}-{read}"
+        made = cache.key(identity.identify_job(job(name, self.seed, self.count)), GRID.size, GRID.extent_mm)
         return self.work / f"{name.replace(', ', '-').replace(' ', '-').replace('/', '-')}-{self.seed}-{made}"
 
 
@@ -186,10 +174,7 @@ def taken_off(clip: Clip, own: Clip) -> Clip:
 
 
 def coarse(clip: Clip) -> Clip:
-    """A clip on half as many cells each way: means over the tissue of four.
-
-    From `FINE`, once is the grid of the physics inverse; twice, cells of 1.5 mm, is enough for a linear rule.
-    """
+    """A clip on half as many cells each way: means over the tissue of four."""
     share = _quarter(np.asarray(clip.mask))
     mask = (share > 0.5).astype(np.float32)
 

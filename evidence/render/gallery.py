@@ -1,19 +1,21 @@
-"""The gallery: families, instruments, lights, cameras and scenery side by side, made anew by one command."""
+"""The gallery: families, instruments, lights, cameras and scenery side by side.
+
+Run: python -m evidence.render.gallery
+"""
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, get_args
+from typing import Any, get_args
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 import typer
 
-from evidence.measuring import CHECKOUT, measuring
+from evidence import report
 from synth.job.schema import Family, Job
 from synth.publish.contact_sheet import poised
 from synth.render import instrument
@@ -53,14 +55,11 @@ _SCENERY: dict[str, Kind] = {
 _CAPTION_PX = 15
 
 
-@measuring("-o docs", out="docs", said="Folder of the two pictures and their page.", text="gallery.md")
-def gallery(
-    seed: Annotated[int, typer.Option(min=0, help="Of the rendered jobs.")] = 7,
-    width: Annotated[int, typer.Option(min=64, help="Of a tile [px].")] = 144,
-    quality: Annotated[int, typer.Option(min=1, max=100, help="Of WebP.")] = 46,
-    out: Path = CHECKOUT / "docs",
-) -> dict[str, Any]:
-    """Draws families x instruments and lights x cameras as pictures, with a page around them."""
+def main(out: Path = report.CHECKOUT / "docs", seed: int = 7, width: int = 144, quality: int = 46) -> None:
+    """Draws families x instruments and lights x cameras as the pictures of docs/gallery.md.
+
+    `width`: of a tile [px]; `quality`: of WebP.
+    """
     size = (width, width * 3 // 4)
     looks = [
         [_tile({"appearance": {"families": (family,)}}, kind, size, seed + row, f"{family}, {kind}")
@@ -78,14 +77,9 @@ def gallery(
         _tile({"render": {"scenery": (part,)}}, kind, size, seed + 3, part) for part, kind in _SCENERY.items()
     ]
     out.mkdir(parents=True, exist_ok=True)
-    sizes = {}
     for name, rows in (("gallery-looks", looks), ("gallery-views", [*views, around])):
         picture = np.vstack([np.hstack(row) for row in rows])
-        file = out / f"{name}.webp"
-        cv2.imwrite(str(file), picture[..., ::-1], [cv2.IMWRITE_WEBP_QUALITY, quality])
-        sizes[file.name] = file.stat().st_size
-    (out / "gallery.md").write_text(_PAGE, "utf-8")
-    return {"bytes": sizes, "tiles": sum(len(row) for row in [*looks, *views, around])}
+        cv2.imwrite(str(out / f"{name}.webp"), picture[..., ::-1], [cv2.IMWRITE_WEBP_QUALITY, quality])
 
 
 def _tile(settings: Settings, kind: Kind, size: tuple[int, int], seed: int, caption: str) -> Picture:
@@ -125,33 +119,5 @@ def _merged(*parts: Settings) -> Settings:
     return whole
 
 
-def _listed(names: Sequence[str]) -> str:
-    return ", ".join(names[:-1]) + f" and {names[-1]}"
-
-
-_PAGE = f"""# Gallery
-
-All of it, pictures and page, is made by
-
-    bench experiment gallery
-
-Frames before their load, 16 light paths a pixel. What each key does: [the job file](reference/job.md).
-
-## Families and instruments
-
-`appearance.families`: {_listed(get_args(Family))}. Instruments follow from
-`fem.gestures`; four in ten have an end that is coated black.
-Every row has an anatomy of its own, every tile the hand that takes its instrument.
-
-![Five families in rows, five instruments in columns](gallery-looks.webp)
-
-## Lights, cameras, scenery
-
-Lights (`light.*`) in rows, cameras (`sensor.*`, `render.*`) in columns, the same sequence throughout: a lamp
-tilted by 30 degrees, a narrow spot of 3000 K; few photoelectrons and much sharpening, one chip with a hard
-contrast, a wide tilted lens with barrel distortion. In the last row what `render.scenery` may lay about the
-opening: {_listed(list(_SCENERY))}.
-Scenery hides tissue and is none: no label is under it.
-
-![Four lights in rows, four cameras in columns, scenery in the last row](gallery-views.webp)
-"""
+if __name__ == "__main__":
+    typer.run(main)

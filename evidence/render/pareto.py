@@ -1,4 +1,8 @@
-"""Noise and recovered flow against cost, over light paths, sampler, integrator and size."""
+"""Noise and recovered flow against cost, over light paths, sampler, integrator and size; what a whole frame
+takes.
+
+Run: python -m evidence.render.pareto
+"""
 
 from __future__ import annotations
 
@@ -6,60 +10,59 @@ import time
 from collections.abc import Mapping
 from inspect import signature
 from itertools import product
-from typing import Annotated, Any
+from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 import typer
 
-from bench.output import charts, result_page
-from evidence.measuring import measuring
+from evidence import report
 from evidence.render.case import Case, case
-from evidence.render.cycles import noises
 from synth.job.schema import Job, Render
 from synth.render import instrument
 from synth.render.scene import Studio
 
+Map = npt.NDArray[np.float32]
+
 _LIFT = 1.5
 _STAGE = signature(Studio.stage).parameters
 _DEFAULT = (Render().spp, _STAGE["sampler"].default, _STAGE["integrator"].default, Render().size[0])
+_SAMPLERS, _INTEGRATORS = ("multijitter", "ldsampler", "independent"), ("direct", "path3")
 
 
-@measuring(
-    "--spp 2 --spp 8 --out runs/render",
-    said="Folder for pareto.json and chart.",
-    file="pareto.json",
-    page=lambda found, out: result_page.write(drawn(found), out),
-)
-def pareto(
-    spp: Annotated[list[int], typer.Option(help="Light paths a pixel to try.")] = [1, 2, 4, 8, 16],  # noqa: B006
-    sampler: Annotated[list[str], typer.Option(help="Mitsuba samplers to try.")] = [  # noqa: B006
-        "multijitter",
-        "ldsampler",
-        "independent",
-    ],
-    integrator: Annotated[list[str], typer.Option(help="direct, or path and a depth.")] = ["direct", "path3"],  # noqa: B006
-    width: Annotated[list[int], typer.Option(help="Widths of the picture, 4:3.")] = [640, 320],  # noqa: B006
-    seed: Annotated[int, typer.Option(help="Of the job.")] = 11,
-) -> dict[str, Any]:
-    """Flow error and noise of rendered frames against the CPU time that they took."""
-    rows = []
-    for wide in width:
+def main(
+    out: Path = report.RESULTS / "render/pareto",
+    spp: str = "1,2,4,8,16",
+    width: str = "640,320",
+    frames: int = 12,
+    seed: int = 11,
+) -> None:
+    """Flow error and noise of rendered frames against the CPU time that they took.
+
+    `spp`: light paths a pixel; `width`: of the picture, 4:3; `frames`: that a whole frame's time is of.
+    """
+    rows: list[dict[str, Any]] = []
+    for wide in (int(part) for part in width.split(",")):
         ours = case(Job.model_validate({"seed": seed, "render": {"size": (wide, wide * 3 // 4)}}), 0)
-        settings = list(product(spp, sampler[:1], integrator[:1]))
-        settings += [(_DEFAULT[0], s, integrator[0]) for s in sampler[1:]]
-        settings += [(_DEFAULT[0], sampler[0], i) for i in integrator[1:]]
-        for paths, pattern, kind in settings:
-            row = {"spp": paths, "sampler": pattern, "integrator": kind, "width": wide}
-            row["default"] = (paths, pattern, kind, wide) == _DEFAULT
-            rows.append(row | measure(ours, paths, pattern, kind))
-    return {"seed": seed, "lift_mm": _LIFT, "rows": rows}
+        settings = list(product((int(part) for part in spp.split(",")), _SAMPLERS[:1], _INTEGRATORS[:1]))
+        settings += [(_DEFAULT[0], sampler, _INTEGRATORS[0]) for sampler in _SAMPLERS[1:]]
+        settings += [(_DEFAULT[0], _SAMPLERS[0], kind) for kind in _INTEGRATORS[1:]]
+        for paths, sampler, kind in settings:
+            row = {"spp": paths, "sampler": sampler, "integrator": kind, "width": wide}
+            row["default"] = (paths, sampler, kind, wide) == _DEFAULT
+            rows.append(row | measure(ours, paths, sampler, kind))
+    cost = frame_cost(case(Job(seed=seed), 0), frames)
+    found = {"seed": seed, "lift_mm": _LIFT, "rows": rows, "frame": cost}
+    report.save(out, "pareto.json", found, page(found))
+    report.show(found)
 
 
 def measure(ours: Case, spp: int, sampler: str, kind: str) -> dict[str, float]:
     """Seconds of CPU a picture, its noise, and what DIS flow makes of a pull of 1.5 mm.
 
-    Noise is that of two pictures over tissue (`cycles.noises`). Flow error is against the truth, over
+    Noise is that of two pictures over tissue (`noises`). Flow error is against the truth, over
     visible tissue away from the instrument.
     """
     studio = ours.studio
@@ -84,22 +87,38 @@ def measure(ours: Case, spp: int, sampler: str, kind: str) -> dict[str, float]:
     inside = tissue & truth.visible
     error = np.linalg.norm(flow - truth.flow, axis=-1)[inside]
     return {
-        "cpu_s": round(float(np.median(spent)), 3),
+        "cpu_s": float(np.median(spent)),
         **noises(one, two, tissue),
-        "flow_median_px": round(float(np.median(error)), 3),
-        "flow_p95_px": round(float(np.quantile(error, 0.95)), 3),
+        "flow_median_px": float(np.median(error)),
+        "flow_p95_px": float(np.quantile(error, 0.95)),
     }
 
 
-def drawn(found: Mapping[str, Any]) -> result_page.Page:
-    """What the data say."""
-    tables = [result_page.Section("All settings", found["rows"])]
-    return result_page.Page("Rendering: flow error and noise against time", found, panels(found), tables)
+def noises(one: Map, two: Map, inside: npt.NDArray[np.bool_], white: float = 1.0) -> dict[str, float]:
+    """Root mean square of a picture's noise over a mask, as a share of the mean: of all its light, where
+    mirrored lamps weigh most, and of what a camera keeps of it, whose full scale is a white surface's light.
+    """
+    kinds = {"noise": (one, two), "noise_clipped": (np.minimum(one, white), np.minimum(two, white))}
+    return {
+        kind: float(np.sqrt(((a - b)[inside] ** 2).mean() / 2) / a[inside].mean())
+        for kind, (a, b) in kinds.items()
+    }
 
 
-def panels(found: Mapping[str, Any]) -> list[charts.Panel]:
-    """Charts of `pareto.json`: what flow makes of the pictures, and their noise, against time."""
-    made = []
+def frame_cost(ours: Case, frames: int) -> dict[str, float]:
+    """CPU-seconds of a frame: update, picture, sensor and truth; the first one is warm-up."""
+    spent = []
+    for k in range(frames + 1):
+        start = time.process_time()
+        ours.studio.frame(ours.moved(0.1 * k), ours.held(0.1 * k), ours.shafts, k)
+        spent.append(time.process_time() - start)
+    low, middle, high = np.quantile(spent[1:], (0, 0.5, 1)).tolist()
+    return {"cpu_s_least": low, "cpu_s_median": middle, "cpu_s_most": high}
+
+
+def page(found: Mapping[str, Any]) -> report.Page:
+    """What flow makes of the pictures, and their noise, against time."""
+    panels = []
     for key, unit in (
         ("flow_median_px", "flow error, median [px]"),
         ("noise", "noise / mean"),
@@ -109,7 +128,7 @@ def panels(found: Mapping[str, Any]) -> list[charts.Panel]:
         for kind in dict.fromkeys((r["width"], r["sampler"], r["integrator"]) for r in found["rows"]):
             own = [r for r in found["rows"] if (r["width"], r["sampler"], r["integrator"]) == kind]
             curves.append(
-                charts.Curve(
+                report.Curve(
                     f"{kind[1]}, {kind[2]}, {kind[0]} px",
                     tuple(float(r["cpu_s"]) for r in own),
                     tuple(float(r[key]) for r in own),
@@ -117,7 +136,13 @@ def panels(found: Mapping[str, Any]) -> list[charts.Panel]:
                     ringed=tuple(k for k, r in enumerate(own) if r["default"]),
                 )
             )
-        made.append(
-            charts.Panel(f"Render: {unit}", "CPU s a picture", unit, tuple(curves), True, True, front=True)
+        panels.append(
+            report.Panel(f"Render: {unit}", "CPU s a picture", unit, tuple(curves), True, True, front=True)
         )
-    return made
+    tables = [report.Section("All settings", found["rows"])]
+    tables += [report.Section("A whole frame", [found["frame"]])] if "frame" in found else []
+    return report.Page("Rendering: flow error and noise against time", found, panels, tables)
+
+
+if __name__ == "__main__":
+    typer.run(main)

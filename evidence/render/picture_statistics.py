@@ -61,14 +61,14 @@ def spread(crops: list[Picture], pooled: Picture) -> dict[str, tuple[float, floa
 
 def tiles(rgb: Picture, inside: npt.NDArray[np.bool_], side: int, step: int) -> list[Picture]:
     """Square crops of `side` px that lie wholly inside a mask, every `step` px."""
+    return [rgb[y : y + side, x : x + side] for x, y in corners(inside, side, step)]
+
+
+def corners(inside: npt.NDArray[np.bool_], side: int, step: int) -> list[tuple[int, int]]:
+    """Where such crops begin, x and y."""
     summed = cv2.integral(inside.astype(np.uint8))
-    crops = []
-    for y in range(0, rgb.shape[0] - side + 1, step):
-        for x in range(0, rgb.shape[1] - side + 1, step):
-            covered = summed[y + side, x + side] - summed[y, x + side] - summed[y + side, x] + summed[y, x]
-            if covered == side * side:
-                crops.append(rgb[y : y + side, x : x + side])
-    return crops
+    covered = summed[side:, side:] - summed[:-side, side:] - summed[side:, :-side] + summed[:-side, :-side]
+    return [(int(x * step), int(y * step)) for y, x in np.argwhere(covered[::step, ::step] == side * side)]
 
 
 def _lab(rgb: Picture) -> npt.NDArray[np.float32]:

@@ -1,19 +1,24 @@
-"""How far a rendering is from a photograph, in figures; the photograph itself stays where it is."""
+"""How far a rendering is from a photograph, in figures; the photograph itself stays where it is.
+
+Run: python -m evidence.render.realism cortex.jpg
+"""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import cv2
 import numpy as np
 import typer
 
-from evidence.measuring import measuring
+from evidence import report, status
 from evidence.render import picture_statistics
 from evidence.render.case import case
+from evidence.render.picture_statistics import Picture
 from synth.errors import UserError
-from synth.job.schema import Family, Job
+from synth.job.schema import Job
 
 _SIDE, _STEP = 160, 40
 OUTLINE = (
@@ -23,25 +28,24 @@ OUTLINE = (
 """Of the cortex in the photograph that the figures here are of."""
 
 
-@measuring("cortex.jpg", said="Folder for figures and sheet.", file="realism.json")
-def realism_figures(
-    photo: Annotated[Path, typer.Argument(help="A photograph of an exposed cortex.")],
-    outline: Annotated[
-        str, typer.Option(help="Polygon of the cortex in it, as shares: x,y x,y x,y ...")
-    ] = OUTLINE,
-    width_mm: Annotated[float, typer.Option(help="What the photograph's width spans in the field.")] = 110.0,
-    frames: Annotated[int, typer.Option(min=1, help="Rendered sequences, one frame of each.")] = 12,
-    family: Annotated[str, typer.Option(help="Appearance family.")] = "healthy",
-    seed: Annotated[int, typer.Option(help="Of the rendered job.")] = 11,
-    out: Path | None = None,
-    beside: Annotated[
-        Path | None,
-        typer.Option(help="Also write the frames and the photograph, at equal scale, as this picture."),
-    ] = None,
-) -> dict[str, Any]:
-    """Colour, spectrum, gradients and highlights of rendered frames against crops of a photograph."""
-    pictures, crops, pixel = _rendered(frames, family, seed)
-    reference = _photographed(photo, outline, width_mm / pixel)
+def main(
+    photo: Path,
+    out: Path = report.RESULTS / "render/realism",
+    outline: str = OUTLINE,
+    width_mm: float = 110.0,
+    frames: int = 12,
+    family: str = "healthy",
+    seed: int = 11,
+) -> None:
+    """Colour, spectrum, gradients and highlights of rendered frames against crops of a photograph.
+
+    `outline`: polygon of the cortex in it, as shares "x,y x,y ..."; `width_mm`: what its width spans in the
+    field; `frames`: one of each rendered sequence.
+    """
+    crops, pixel = _rendered(frames, family, seed)
+    photograph = scaled_photograph(photo, width_mm / pixel)
+    inside = outlined(outline, photograph.shape[:2])
+    reference = picture_statistics.tiles(photograph, inside, _SIDE, _STEP)
     pooled = picture_statistics.pool(reference)
     theirs, ours = picture_statistics.spread(reference, pooled), picture_statistics.spread(crops, pooled)
     rows = [
@@ -53,49 +57,30 @@ def realism_figures(
         }
         for name in theirs
     ]
-    if out is not None:
-        out.mkdir(parents=True, exist_ok=True)
-        cv2.imwrite(str(out / "sheet.webp"), _sheet(pictures)[..., ::-1], [cv2.IMWRITE_WEBP_QUALITY, 24])
-    if beside is not None:
-        cv2.imwrite(str(beside), _beside(pictures, scaled_photograph(photo, width_mm / pixel))[..., ::-1])
-    return {
+    found = {
+        "data": status.data(photo),
         "family": family,
         "seed": seed,
         "crops": {"photograph": len(reference), "rendered": len(crops), "side_px": _SIDE},
         "photograph_width_mm_assumed": width_mm,
-        "mm_per_px": round(pixel, 4),
+        "mm_per_px": pixel,
         "statistics": rows,
     }
+    report.save(out, "realism.json", found, page(found))
+    report.show(found)
 
 
-def _rendered(
-    frames: int, family: str, seed: int
-) -> tuple[list[picture_statistics.Picture], list[picture_statistics.Picture], float]:
-    """Frames with the instrument, crops of the same without it, and the median mm of a pixel."""
-    families: tuple[Family, ...] = Job.model_validate(
-        {"appearance": {"families": [family]}}
-    ).appearance.families
-    shared = {"seed": seed, "sequences": frames, "appearance": {"families": families}}
-    pictures, crops, pixels = [], [], []
+def _rendered(frames: int, family: str, seed: int) -> tuple[list[Picture], float]:
+    """Crops of the tissue in frames without an instrument, and the median mm of a pixel."""
+    job = Job.model_validate({"seed": seed, "appearance": {"families": [family]}, "render": {"tool": False}})
+    crops, pixels = [], []
     for index in range(frames):
-        with_tool = case(Job.model_validate(shared), index)
-        shot = with_tool.studio.frame(with_tool.vertices, with_tool.tips, with_tool.shafts, seed + index)
-        pictures.append(shot.rgb)
-        bare = case(Job.model_validate({**shared, "render": {"tool": False}}), index)
-        plain = bare.studio.frame(bare.vertices, bare.tips, bare.shafts, seed + index).rgb
+        bare = case(job, index)
+        picture = bare.studio.frame(bare.vertices, bare.tips, bare.shafts, seed + index).rgb
         inside = cv2.erode(bare.studio.still.tissue.astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
-        crops += picture_statistics.tiles(plain, inside, _SIDE, _STEP)
+        crops += picture_statistics.tiles(picture, inside, _SIDE, _STEP)
         pixels.append(bare.studio.still.scale_mm_per_px)
-    return pictures, crops, float(np.median(pixels))
-
-
-def _photographed(photo: Path, outline: str, width_px: float) -> list[picture_statistics.Picture]:
-    """Crops of the photograph inside the outline, at the rendered frames' scale."""
-    image = scaled_photograph(photo, width_px)
-    crops = picture_statistics.tiles(image, outlined(outline, image.shape[:2]), _SIDE, _STEP)
-    if not crops:
-        raise UserError(f"{photo}: no crop of {_SIDE} px fits inside the outline")
-    return crops
+    return crops, float(np.median(pixels))
 
 
 def outlined(outline: str, shape: tuple[int, ...]) -> np.ndarray[Any, np.dtype[np.bool_]]:
@@ -106,7 +91,7 @@ def outlined(outline: str, shape: tuple[int, ...]) -> np.ndarray[Any, np.dtype[n
     return inside > 0
 
 
-def scaled_photograph(photo: Path, width_px: float) -> picture_statistics.Picture:
+def scaled_photograph(photo: Path, width_px: float) -> Picture:
     """The photograph (H, W, 3) sRGB, `width_px` wide."""
     image = cv2.imread(str(photo), cv2.IMREAD_COLOR)
     if image is None:
@@ -116,20 +101,18 @@ def scaled_photograph(photo: Path, width_px: float) -> picture_statistics.Pictur
     return np.ascontiguousarray(small[..., ::-1])
 
 
-def _beside(
-    pictures: list[picture_statistics.Picture], photo: picture_statistics.Picture
-) -> picture_statistics.Picture:
-    """Frames in a column of two beside the photograph, all at their own size."""
-    pictures = pictures + [np.zeros_like(pictures[0])] * (len(pictures) % 2)
-    left = np.vstack([np.hstack(pictures[k : k + 2]) for k in range(0, len(pictures), 2)])
-    tall = max(len(left), len(photo))
-    parts = [np.pad(part, ((0, tall - len(part)), (0, 0), (0, 0))) for part in (left, photo)]
-    return np.hstack(parts)
+def page(found: Mapping[str, Any]) -> report.Page:
+    """Statistics of renders in units of the photograph's spread."""
+    rows = []
+    for one in found["statistics"]:
+        (low, middle, high), rendered = one["photograph"], one["rendered"]
+        a, b, c = ((value - middle) / max(high - low, 1e-12) for value in rendered)
+        rows.append(report.Row(one["statistic"], b, (a, c)))
+    unit = "quantiles of renders less the photograph's median, over its own spread"
+    chart = report.Chart("Within half a unit or so: as the photograph's own crops differ", unit, tuple(rows))
+    sections = [report.Section("Statistics", found["statistics"])]
+    return report.Page("Against a photograph", found, [chart], sections)
 
 
-def _sheet(pictures: list[picture_statistics.Picture]) -> picture_statistics.Picture:
-    columns = int(np.ceil(np.sqrt(len(pictures) * 4 / 3)))
-    small = [cv2.resize(p, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA) for p in pictures]
-    small += [np.zeros_like(small[0])] * (-len(small) % columns)
-    rows = [np.hstack(small[k : k + columns]) for k in range(0, len(small), columns)]
-    return np.vstack(rows)
+if __name__ == "__main__":
+    typer.run(main)

@@ -1,197 +1,122 @@
-"""`bench experiment tune`: does `synth tune` keep its budget on fresh sequences, and what does it save?"""
+"""Does `synth tune` keep its budget on sequences that had no part in the choice, and what does it save?
+
+Run: python -m evidence.tune.experiment
+"""
 
 from __future__ import annotations
 
-import json
-import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 import typer
 
-from bench.output import charts, machine, result_page
-from bench.output import write as results
-from evidence.measuring import measuring
+from evidence import report
 from learn.evaluation.statistics import interval
-from synth.errors import UserError
 from synth.job import reader
-from synth.tune import search, tuned_job
+from synth.tune import search
+from synth.tune.measurements import Measurements
 
-_SCENES = ("easy", "middle", "hard")
-_HOW = (
-    "Seeds are in the jobs here; probe sequences are drawn from them, and the fresh ones had no part in the "
-    "choice. Costs are of physics, scene, rendering and flow, in CPU time; what two "
-    "budgets share is measured once."
-)
-_WHAT = (
+_WORDS = (
     "The force is read from the displacement of a frame by a fixed linear rule "
-    "(`synth/tune/force_reading.py`): the tangent of the physics at full fidelity, place, footprint and "
-    "direction of each contact being known. *Error* is how far the force read from recovered displacement "
-    "is off the truth of full fidelity: root mean square over frames as a part of the force, mean over "
-    "sequences. A setting *takes* of the budget by how much that is more than at full fidelity, or by how "
-    "much the label itself moves, whichever is more; a sequence that reads better than at full fidelity "
-    "takes nothing and pays for no other. *Apart* is how far the two readings are from each other, frame by "
-    "frame: grain that differs counts there, though neither picture is the better one. The intervals are "
-    "over the fresh sequences."
+    "(`synth/tune/force_reading.py`). *Error*: how far the force read from recovered displacement is off the "
+    "truth of full fidelity, root mean square over frames as a part of the force, mean over sequences. A "
+    "setting *takes* of the budget by how much that is more than at full fidelity, or by how much the label "
+    "itself moves, whichever is more. Intervals are over fresh sequences; costs are CPU time of physics, "
+    "scene, rendering and flow.",
 )
 
 
-@measuring(
-    "--only easy --fresh 3",
-    out="docs/results/tune",
-    said="Folder that holds the scenes' jobs and gets the results.",
-    text="README.md",
-)
-def experiment(
-    out: Path,
-    budget: Annotated[
-        list[str] | None, typer.Option(help="As in `synth tune`; 'force 5%' and 'force 3%' if not given.")
-    ] = None,
-    probes: Annotated[int, typer.Option(min=1, help="Sequences that every knob is measured on.")] = 3,
-    checks: Annotated[int, typer.Option(min=0, help="Further ones for whole settings.")] = 3,
+def main(
+    out: Annotated[Path, typer.Option(help="Has a job SCENE.yaml for each scene.")] = report.RESULTS / "tune",
+    scenes: str = "easy,middle,hard",
+    budgets: str = "force 5%,force 3%",
+    probes: Annotated[int, typer.Option(help="Sequences that every setting is measured on.")] = 2,
+    checks: Annotated[int, typer.Option(help="Further ones for whole settings.")] = 2,
     fresh: Annotated[int, typer.Option(min=3, help="Sequences that had no part in the choice.")] = 6,
-    only: Annotated[
-        list[str] | None, typer.Option(help="Scenes; easy, middle and hard if not given.")
-    ] = None,
-) -> list[dict[str, Any]]:
-    """Tunes three scenes of different difficulty and checks budget and cost on fresh sequences."""
-    budgets = budget or ["force 5%", "force 3%"]
-    asked = [search.Budget.parse(one) for one in budgets]
-    words = " ".join(f"--budget {one!r}" for one in budgets)
-    scenes = list(only or _SCENES)
-    if unknown := [name for name in scenes if name not in _SCENES]:
-        raise UserError(f"--only {unknown[0]}: no such scene; there are {', '.join(_SCENES)}")
-    jobs = {name: reader.load_job(str(out / f"{name}.yaml")) for name in scenes}
-    for name, job in jobs.items():
-        source, say = out / f"{name}.yaml", _said(name)
+) -> None:
+    """Tunes scenes of different difficulty and checks budget and cost on fresh sequences."""
+    rows = []
+    for scene in scenes.split(","):
+        job = reader.load_job(str(out / f"{scene}.yaml"))
+        journal = out / f"{scene}.part"
         # One budget after the other finds what was measured for the one before.
-        journals = out / f"{name}.part", out / f"{name}.fresh.part"
-        for one in asked:
-            found = search.tune_job(job, one, journals[0], probes, checks, say)
-            fresh_ones = search.measure_again(found, journals[1], probes + checks, fresh, say)
-            stem = f"{name}-{100 * one.share:g}"
-            (out / f"{stem}.tuned.yaml").unlink(missing_ok=True)
-            tuned_job.write_tuned(found, str(source), (), out / f"{stem}.tuned.yaml")
-            row = tuned_job.as_dict(found) | {
-                "scene": name,
-                "frames": job.frames,
-                "fresh": {
-                    kind: tuned_job.whole(found, whole)
-                    for kind, whole in zip(("full", "before", "after"), fresh_ones, strict=True)
-                },
-                "machine": machine.describe(),
-                "command": f"bench experiment tune --only {name} {words} --probes {probes} "
-                f"--checks {checks} --fresh {fresh}",
+        measurements = Measurements(job, journal)
+        for budget in map(search.parse_budget, budgets.split(",")):
+            tuned = search.tune(measurements, budget, probes, checks)
+            unseen = range(probes + checks, probes + checks + fresh)
+            whole = {"full": tuned.full, "own": tuned.own, "best": tuned.best}
+            again = {
+                kind: search.evaluate(measurements, kind, one.settings, unseen)
+                for kind, one in zip(("full", "before", "after"), whole.values(), strict=True)
             }
-            results.keep(out, f"{stem}.json", row)
-        for journal in journals:
-            journal.unlink(missing_ok=True)
-    return write_results(out)
+            rows.append(
+                {"scene": scene, "budget": budget, "changes": dict(tuned.changes)}
+                | {kind: _described(one) for kind, one in whole.items()}
+                | {"fresh": {kind: _described(one) for kind, one in again.items()}}
+            )
+        journal.unlink()
+    kept = {"rows": rows}
+    report.save(out, "tune.json", kept, page(kept))
+    report.show({"rows": table(rows)})
 
 
-def write_results(out: Path) -> list[dict[str, Any]]:
-    """Picture and README of the scenes whose data are in `out`; gives those back."""
-    result_page.write(drawn(out), out)
-    return read(out)
+def _described(one: search.Evaluation) -> dict[str, Any]:
+    """Ready for JSON; None where a sequence could not be carried out."""
+    errors, totals, (cost,) = (
+        [value if np.isfinite(value) else None for value in values]
+        for values in (one.errors, one.totals, [one.cost])
+    )
+    return {"settings": dict(one.settings), "errors": errors, "totals": totals, "cpu_s_a_frame": cost}
 
 
-def drawn(out: Path) -> result_page.Page:
-    """What the data in `out` say."""
-    rows = read(out)
-    sections = [result_page.Section("", table(rows))]
-    for row in rows:
-        knobs = [
-            {
-                "knob": one["knob"],
-                "level": one["level"],
-                "error of the force": _percent(one["change"], "+"),
-                "takes of the budget": _percent(one["error"]),
-                "saves of a full frame": f"{100 * one['saved']:.0f}%",
-            }
-            for one in row["knobs"]
-        ]
-        tried = [("as it was", row["own"]), *((f"try {k}", one) for k, one in enumerate(row["tried"], 1))]
-        whole = [
-            {
-                "measured as a whole": name,
-                "takes": _percent(one["error"]),
-                "promised": None if one["promised"] is None else f"{100 * one['promised']:.2g}%",
-                "CPU s a frame": f"{one['cpu_s_a_frame']:.2f}",
-                "setting": ", ".join(f"{key} {value}" for key, value in one["setting"].items()),
-            }
-            for name, one in tried
-        ]
-        title = f"{row['scene']}, {100 * row['budget']:g}%"
-        sections += [result_page.Section(title, knobs), result_page.Section("", whole)]
-    return result_page.Page(
-        "Tuning: what each knob does to the force, and what it costs",
-        rows[0] | {"command": "; ".join(dict.fromkeys(row["command"] for row in rows))},
-        panels(rows),
-        sections,
-        (_HOW, _WHAT),
-        name="README.md",
+def page(found: Mapping[str, Any]) -> report.Page:
+    """Draws `tune.json`: error of the force over cost of whole jobs."""
+    panels = []
+    for scene in dict.fromkeys(row["scene"] for row in found["rows"]):
+        curves = []
+        for row in found["rows"]:
+            if row["scene"] == scene:
+                whole = row["full"], row["own"], row["best"]
+                costs = tuple(one["cpu_s_a_frame"] for one in whole)
+                errors = tuple(100 * _mean(one["totals"]) for one in whole)
+                labels, name = ("full", "the job as it was", "tuned"), f"budget {100 * row['budget']:g}%"
+                curves.append(report.Curve(name, costs, errors, labels, ringed=(2,)))
+        panels.append(report.Panel(scene, "CPU s a frame", "error of the force [%]", tuple(curves)))
+    sections = [report.Section("", table(found["rows"]))]
+    words = [_verdict(found["rows"]), *found.get("notes", ()), *_WORDS]
+    title = "Tuning: budget and cost on fresh sequences"
+    return report.Page(title, found, panels, sections, words)
+
+
+def _verdict(rows: list[dict[str, Any]]) -> str:
+    kept = [_mean(row["fresh"]["after"]["errors"]) <= row["budget"] for row in rows]
+    costs = [row["fresh"][kind]["cpu_s_a_frame"] for row in rows for kind in ("after", "before")]
+    ratios = [after / before for after, before in zip(costs[::2], costs[1::2], strict=True)]
+    return (
+        f"The mean over fresh sequences is within the budget in {sum(kept)} of {len(kept)} cases, at "
+        f"{min(ratios):.2f} to {max(ratios):.2f} of the cost of the job as it was."
     )
 
 
-def read(out: Path) -> list[dict[str, Any]]:
-    """The data in `out`, scene by scene, the loosest budget first."""
-    files = [file for name in _SCENES for file in out.glob(f"{name}-*.json")]
-    rows = [json.loads(file.read_text("utf-8")) for file in files]
-    return sorted(rows, key=lambda row: (_SCENES.index(row["scene"]), -row["budget"]))
-
-
-def panels(rows: list[dict[str, Any]]) -> list[charts.Panel]:
-    """A chart a scene: error of the force over cost, each knob alone and whole settings."""
-    made = []
-    for row in rows:
-        curves, base = [], _mean(row["full"]["totals"])
-        for knob in dict.fromkeys(one["knob"] for one in row["knobs"]):
-            own = [one for one in row["knobs"] if one["knob"] == knob and one["error"] is not None]
-            curves.append(
-                charts.Curve(
-                    knob,
-                    tuple(row["full"]["cpu_s_a_frame"] * (1 - one["saved"]) for one in own),
-                    tuple(100 * (base + one["change"]) for one in own),
-                    tuple(f"{one['level']}" for one in own),
-                )
-            )
-        whole = [("full", row["full"]), ("the job as it was", row["own"]), ("tuned", row["best"])]
-        curves.append(
-            charts.Curve(
-                "whole job",
-                tuple(one["cpu_s_a_frame"] for _, one in whole),
-                tuple(100 * _mean(one["totals"]) for _, one in whole),
-                tuple(words for words, _ in whole),
-                ringed=(2,),
-            )
-        )
-        title = f"{row['scene']}, {100 * row['budget']:g}%: error of the force over cost"
-        made.append(charts.Panel(title, "CPU s a frame", "error of the force [%]", tuple(curves)))
-    return made
-
-
 def table(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """One line a scene."""
+    """One line a scene and budget."""
     lines = []
     for row in rows:
-        fresh, best = row["fresh"], row["best"]
+        full, before, after = (row["fresh"][kind] for kind in ("full", "before", "after"))
+        errors = (f"{100 * _mean(one['totals']):.1f}" for one in (full, before, after))
         lines.append(
             {
                 "scene": row["scene"],
                 "budget [%]": 100 * row["budget"],
-                "taken, probes [%]": f"{100 * best['error']:.1f}",
-                "taken, fresh [%]": _over(fresh["after"]["errors"]),
-                "as it was, fresh [%]": _over(fresh["before"]["errors"]),
-                "error, fresh: full, as it was, tuned [%]": ", ".join(
-                    f"{100 * _mean(fresh[name]['totals']):.1f}" for name in ("full", "before", "after")
-                ),
-                "apart, fresh: as it was, tuned [%]": ", ".join(
-                    f"{100 * _mean(fresh[name]['apart']):.1f}" for name in ("before", "after")
-                ),
-                "CPU s a frame, as it was": fresh["before"]["cpu_s_a_frame"],
-                "CPU s a frame, tuned": fresh["after"]["cpu_s_a_frame"],
-                "cost ratio": fresh["after"]["cpu_s_a_frame"] / fresh["before"]["cpu_s_a_frame"],
+                "taken, probes [%]": f"{100 * _mean(row['best']['errors']):.1f}",
+                "taken, fresh [%]": _over(after["errors"]),
+                "as it was, fresh [%]": _over(before["errors"]),
+                "error, fresh: full, as it was, tuned [%]": ", ".join(errors),
+                "CPU s a frame, as it was": before["cpu_s_a_frame"],
+                "CPU s a frame, tuned": after["cpu_s_a_frame"],
+                "cost ratio": after["cpu_s_a_frame"] / before["cpu_s_a_frame"],
                 "changes": ", ".join(f"{key} {value}" for key, value in row["changes"].items()),
             }
         )
@@ -212,12 +137,5 @@ def _over(values: list[float | None]) -> str:
     return f"{found.mean:.1f} [{found.low:.1f}, {found.high:.1f}]"
 
 
-def _percent(share: float | None, sign: str = "") -> str:
-    return "out of range" if share is None else f"{100 * share:{sign}.2g}%"
-
-
-def _said(scene: str) -> search.Report:
-    def say(done: int, total: int, words: str) -> None:
-        print(f"{scene} [{done}/{total}] {words}", file=sys.stderr, flush=True)
-
-    return say
+if __name__ == "__main__":
+    typer.run(main)

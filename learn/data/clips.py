@@ -13,7 +13,6 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, ValidationError
 from safetensors import SafetensorError
 from safetensors.numpy import save_file
 from safetensors.torch import load_file
@@ -24,8 +23,7 @@ from synth.dataset.split import name_anatomy
 from synth.dataset.store import Dataset, Sequence
 from synth.errors import UserError
 from synth.job import identity
-from synth.job.types import Positive, first_problem
-from synth.system import foreign_file
+from synth.system import checked_file
 
 Input = Literal["ideal", "recovered", "noisy", "mixed", "motion", "motion-ideal", "motion-mixed"]
 INPUTS = get_args(Input)
@@ -49,7 +47,6 @@ _CURE = {
 }
 _ARRAYS = ("mask", "confidence", "density", "force")
 _SPATIAL = "motion_confidence"
-_PACKED = {*_ARRAYS, _SPATIAL, *(f"displacement-{source}" for source in FIELDS)}
 _FILE = "arrays.safetensors"
 _PLAIN = ("name", "content_hash", "group", "family", "gesture", "young_kpa", "opening")
 
@@ -199,7 +196,7 @@ def load_clips(
     wanted = tuple(wanted)
     dataset = Dataset(root)
     clips = []
-    code = "" if cache is None else provenance.source([__name__], ("synth", "learn"))
+    code = "" if cache is None else provenance.source("synth", "learn/data")
     for i, sequence in enumerate(dataset):
         report(i, len(dataset))
         clips.append(
@@ -252,57 +249,30 @@ def pack(clip: Clip, folder: Path) -> None:
         raise UserError(f"{folder}: cannot be written ({error.strerror})") from None
 
 
-class _Said(BaseModel):
-    """clip.json of a packed clip."""
-
-    model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
-
-    name: str
-    content_hash: str
-    group: str
-    family: str
-    gesture: str
-    young_kpa: Positive
-    opening: str
-    checksums: dict[str, int]
-
-
 def unpack(folder: Path) -> Clip:
     """A packed clip, memory-mapped. Raises UserError if the folder is not one, or damaged."""
     try:
-        said = _Said.model_validate_json(foreign_file.read_bytes(folder / "clip.json", 1_000_000))
-        arrays: dict[str, Any] = _mapped(folder / _FILE, said.checksums)
+        plain = json.loads(checked_file.read_bytes(folder / "clip.json", 1_000_000))
+        arrays: dict[str, Any] = _mapped(folder / _FILE, plain.pop("checksums"))
         displacement = {s: arrays.pop(f"displacement-{s}") for s in FIELDS if f"displacement-{s}" in arrays}
-        clip = Clip(**said.model_dump(exclude={"checksums"}), displacement=displacement, **arrays)
-        frames, n = len(clip.density), clip.mask.shape[-1]
-        expected = {"mask": (n, n), "confidence": (frames, n, n), "density": (frames, 3, n, n)}
-        expected |= {"force": (frames, 3)} | {s: (frames, components(s), n, n) for s in displacement}
-        found = {name: getattr(clip, name).shape for name in _ARRAYS}
-        if "motion" in displacement:
-            expected[_SPATIAL], found[_SPATIAL] = (frames, 2, n, n), arrays[_SPATIAL].shape
-        found |= {s: values.shape for s, values in displacement.items()}
-        if found != expected:
-            raise ValueError("arrays of other shapes")
-        return clip
-    except ValidationError as error:
-        why = ": ".join(first_problem(error))
-    except RuntimeError as error:  # of the mapping, when a process has too many: nothing is damaged
-        raise UserError(f"{folder}: cannot be mapped ({str(error).splitlines()[0][:200]})") from None
+        return Clip(**plain, displacement=displacement, **arrays)
     except (OSError, ValueError, KeyError, TypeError, AttributeError, UserError, SafetensorError) as error:
-        why = str(error).splitlines()[0][:200]
-    raise UserError(f"{folder}: damaged packed sequence ({why}); remove it")
+        why = str(error)
+    except RuntimeError as error:
+        if not isinstance(error, RecursionError):  # a process has too many mappings: nothing is damaged
+            raise UserError(f"{folder}: cannot be mapped ({str(error).splitlines()[0][:200]})") from None
+        why = "nested too deeply"
+    raise UserError(f"{folder}: damaged packed sequence ({why.splitlines()[0][:200]}); remove it")
 
 
 def _mapped(file: Path, checksums: Mapping[str, int]) -> dict[str, NDArray[Any]]:
     """The arrays of a packed clip, mapped and held against their checksums; no file stays open."""
-    foreign_file.check_file(file, 64 << 30)
+    checked_file.check_file(file, 64 << 30)
     arrays: dict[str, NDArray[Any]] = {name: values.numpy() for name, values in load_file(file).items()}
-    if not arrays.keys() == checksums.keys() <= _PACKED:
+    if arrays.keys() != checksums.keys():
         raise ValueError(f"{file.name}: holds other arrays")
     for name, array in arrays.items():
         array.flags.writeable = False
-        if array.dtype != (np.float64 if name == "force" else np.float32):
-            raise ValueError(f"{name}: is of another type")
         if _checksum(array) != checksums[name]:
             raise ValueError(f"{name}: the checksum does not match")
     return arrays

@@ -248,13 +248,11 @@ def channels(
     pitch_mm: float,
     scales: Scales,
     confidence: Tensor | None = None,
-    earlier: Tensor | None = None,
 ) -> Tensor:
-    """The network's input: CHANNELS, then `confidence` if given, then DEPTH of a second eye, then `earlier`.
+    """The network's input: CHANNELS, then `confidence` if given, then DEPTH of a second eye.
 
     `displacement`: (B, 2, N, N) mm in picture axes, or (B, 3, N, N) mm in camera axes; `mask`: (B, 1, N, N)
-    0/1; `confidence`: (B, 1, N, N) in 0..1, with depth (B, 2, N, N); `earlier`: (B, K, N, N) mm, of
-    frames before this one. Returns (B, 5 to 8 and K, N, N) without unit.
+    0/1; `confidence`: (B, 1, N, N) in 0..1, with depth (B, 2, N, N). Returns (B, 5 to 8, N, N) without unit.
     Source: Heraoui et al., the five channels of D2FNet; here in mm and with one displacement scale.
     """
     moved = displacement * mask / scales.displacement_mm
@@ -266,26 +264,7 @@ def channels(
     parts.append(moved[:, 2:])
     if confidence is not None:
         parts.append(confidence[:, 1:] * mask)
-    if earlier is not None:
-        parts.append(earlier * mask / scales.displacement_mm)
     return torch.cat(parts, dim=1)
-
-
-def windowed(
-    displacement: NDArray[np.float32], window: int, before: NDArray[np.float32] | None = None
-) -> NDArray[np.float32]:
-    """Every frame with those before it: (T, C, N, N) of one film in order → (T, window C, N, N).
-
-    The latest comes first. `before`: (K, C, N, N), frames before the first of these, in order; before them is
-    the rest frame, zeros.
-    """
-    if window == 1:
-        return displacement
-    rest = np.zeros((window - 1, *displacement.shape[1:]), np.float32)
-    known = [rest, displacement] if before is None else [rest, before, displacement]
-    whole, frames = np.concatenate(known), len(displacement)
-    ends = [len(whole) - k for k in range(window)]
-    return np.concatenate([whole[end - frames : end] for end in ends], axis=1)
 
 
 def certainty(deviation_mm: NDArray[np.float32]) -> NDArray[np.float32]:

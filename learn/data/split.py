@@ -16,8 +16,8 @@ from synth.dataset.split import SIDES, join_groups
 from synth.errors import UserError
 
 _HINT = (
-    "; share_anatomy=true, or `synth split --by opening`, splits one brain by its openings (`synth place` "
-    "finds them, craniotomy.also lists them), or else by sequence, and says nothing of other brains"
+    "; share_anatomy=true, or `synth split --by opening`, splits one brain by its openings (`synth preview "
+    "MESH` finds them, craniotomy.also lists them), or else by sequence, and says nothing of other brains"
 )
 _OPENINGS = 3  # fit, select and test
 _SEQUENCE = "/"  # between the anatomy and the sequence in a group's name; in none of an anatomy or opening

@@ -10,28 +10,23 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from learn.checkpoint import Card
 from learn.data.clips import Clip
-from learn.evaluation.evaluate import FREE
-from learn.evaluation.fit_intervals import read_said, read_truth
+from learn.evaluation.fit_intervals import read_said
 from learn.evaluation.statistics import Interval, interval
 from learn.inference.predict import Predictor
 from learn.uncertainty.conformal import LEVELS
 from learn.uncertainty.features import is_moving
-from learn.uncertainty.intervals import Intervals, Said, Truth
+from learn.uncertainty.intervals import Intervals, Said
 from synth.errors import UserError
 
 
 @dataclass(frozen=True)
 class Coverage:
-    """Whether intervals of one level hold: shares of frames (or cells), means over sequences with 95% BCa."""
+    """Whether intervals of one level hold: shares of frames, means over sequences with 95% BCa."""
 
     level: float
     size: Interval
     axes: tuple[Interval, Interval, Interval]
-    map: Interval
-    contact: Interval
-    """Of cells of the map that carry force."""
     width_mn: float
     """Mean width of the interval of the force's size [mN]."""
     width_of_peak: float
@@ -45,7 +40,6 @@ class Coverage:
     def as_dict(self) -> dict[str, Any]:
         """JSON-ready; NaN as null."""
         shares = {"size": self.size, **dict(zip("xyz", self.axes, strict=True))}
-        shares |= {"map": self.map, "contact": self.contact}
         widths = {"width_mn": self.width_mn, "width_of_peak": self.width_of_peak}
         widths |= {f"width_{axis}_mn": w for axis, w in zip("xyz", self.axes_width_mn, strict=True)}
         rest = widths | {"unseen": self.unseen, "distance": self.distance}
@@ -62,29 +56,27 @@ def cover(predictor: Predictor, clips: Sequence[Clip], source: str) -> list[Cove
     """
     found = predictor.card.intervals
     if found is None:
-        raise UserError("the model has no intervals; `learn intervals` fits them")
+        raise UserError("the model has no intervals; `learn calibrate` fits them")
     rows: dict[float, list[list[float]]] = {level: [] for level in LEVELS}
     far = [np.zeros(0)]
     for clip in clips:
-        said, truth = read_said(predictor, clip, source), read_truth(clip, predictor.card)
+        said = read_said(predictor, clip, source)
         for level, held in rows.items():
-            held.append(_held(found, said, truth, clip, predictor.card, level))
+            held.append(_held(found, said, clip, level))
         far.append((found.world.distance(said.motion) / found.world.usual)[is_moving(said.motion)])
     moved = np.concatenate(far)
     return [_summed(level, np.array(held), moved) for level, held in rows.items()]
 
 
 def _summed(level: float, values: NDArray[np.float64], moved: NDArray[np.float64]) -> Coverage:
-    """`values`: (n, 11) of `_held`; `moved`: distances of the moving frames, as multiples of the usual."""
+    """`values`: (n, 9) of `_held`; `moved`: distances of the moving frames, as multiples of the usual."""
     rng, nan = np.random.default_rng(0), float("nan")
-    shares = [interval(values[:, k], rng) for k in range(6)]
-    means = [float(np.nanmean(v)) if np.isfinite(v).any() else nan for v in values[:, 6:].T]
+    shares = [interval(values[:, k], rng) for k in range(4)]
+    means = [float(np.nanmean(v)) if np.isfinite(v).any() else nan for v in values[:, 4:].T]
     return Coverage(
         level=level,
         size=shares[0],
         axes=(shares[1], shares[2], shares[3]),
-        map=shares[4],
-        contact=shares[5],
         width_mn=means[0],
         width_of_peak=means[1],
         axes_width_mn=(means[2], means[3], means[4]),
@@ -97,21 +89,16 @@ def _known(value: float) -> float | None:
     return value if math.isfinite(value) else None
 
 
-def _held(found: Intervals, said: Said, truth: Truth, clip: Clip, card: Card, level: float) -> list[float]:
-    """Shares held of size, x, y, z, map and contact, then widths [mN] and the first over the peak."""
+def _held(found: Intervals, said: Said, clip: Clip, level: float) -> list[float]:
+    """Shares held of size, x, y and z, then widths [mN] and the first over the peak."""
     band, young = found.bound(said, level), clip.young_kpa
-    size = np.linalg.norm(truth.force, axis=1)
-    axes = _within(truth.force, band.axes_low, band.axes_high).mean(0)
-    low, high = found.bound_map(said, level)
-    inside = np.broadcast_to(clip.mask > 0, low.shape)
-    kept = _within(truth.magnitude, low, high)
-    touched = inside & (truth.magnitude >= FREE * card.scales.target)
+    force = clip.force / young
+    size = np.linalg.norm(force, axis=1)
+    axes = _within(force, band.axes_low, band.axes_high).mean(0)
     width, peak = float((band.high - band.low).mean()), float(size.max())
     return [
         float(_within(size, band.low, band.high).mean()),
         *axes.tolist(),
-        float(kept[inside].mean()),
-        float(kept[touched].mean()) if touched.any() else float("nan"),
         young * width,
         width / peak if peak > 0 else float("nan"),
         *(young * (band.axes_high - band.axes_low).mean(0)).tolist(),

@@ -64,14 +64,10 @@ class ClipScore:
     """Median distance between true and said centre of the contact, over frames that aren't low [mm]."""
     low_over_mn: float
     """Mean over-prediction of the total force in low-force frames [mN]."""
-    head_error_mn: NDArray[np.float64] | None = None
-    """(T,) length of the error of the total-force head."""
 
 
-def score(
-    clip: Clip, said: NDArray[np.float32], card: Card, head: NDArray[np.float64] | None = None
-) -> ClipScore:
-    """Scores the answer to one sequence. `said`: (T, C, N, N), physical; `head`: (T, C) mN of such a head."""
+def score(clip: Clip, said: NDArray[np.float32], card: Card) -> ClipScore:
+    """Scores the answer to one sequence. `said`: (T, C, N, N), physical."""
     grid, kind, parts = card.settings.grid, card.settings.target, said.shape[1]
     young = clip.young_kpa
     true = np.stack([target(clip, t, kind, parts) for t in range(clip.frames)]) * np.float32(young)
@@ -109,7 +105,6 @@ def score(
         stray_mn=float((said_len * free).sum((1, 2)).mean() * _cell(kind, grid)),
         localisation_mm=float(np.median(distance)) if distance else math.nan,
         low_over_mn=float(np.maximum(said_mn - true_mn, 0)[low].mean()) if low.any() else math.nan,
-        head_error_mn=None if head is None else np.linalg.norm(head - whole, axis=1),
     )
 
 
@@ -218,8 +213,6 @@ def _row(c: ClipScore) -> dict[str, float]:
         row["vector_r2"] = agreement(c.vector).r2
     if c.vector_error_mn is not None:
         row["vector_error_mn"] = float(c.vector_error_mn.mean())
-    if c.head_error_mn is not None:
-        row["head_error_mn"] = float(c.head_error_mn.mean())
     peak = float(c.true_mn.max())
     row["peak_error_share"] = abs(float(c.said_mn.max()) - peak) / peak if peak > 0 else math.nan
     for name in ("ghost", "ghost_relative", "ghost_far", "stray_mn", "localisation_mm", "low_over_mn"):
@@ -264,31 +257,12 @@ def evaluate(
         young["unknown"] = predictor.card.typical_young_kpa
         if pressed is not None and clip.content_hash in pressed:
             young["press"] = pressed[clip.content_hash]
-        for name, (said, head) in _answers(predictor, clip, source, young).items():
-            columns.setdefault(name, []).append(score(clip, said, predictor.card, head))
+        # The answer is proportional to E: one pass does for all.
+        said = predictor.density(np.asarray(clip.displacement[source]), clip.mask, 1.0, clip.sure(source))
+        for name, given in young.items():
+            columns.setdefault(name, []).append(score(clip, said * np.float32(given), predictor.card))
     report(len(clips), len(clips))
     return Report(columns, predictor.card)
-
-
-Answer = tuple[NDArray[np.float32], NDArray[np.float64] | None]
-
-
-def _answers(predictor: Predictor, clip: Clip, source: str, young: Mapping[str, float]) -> dict[str, Answer]:
-    """What the model says for each E it may be given.
-
-    The answer is proportional to E, so one pass does for all, unless E also conditions the network.
-    """
-
-    def ask(given: float) -> Answer:
-        return predictor.answer(np.asarray(clip.displacement[source]), clip.mask, given, clip.sure(source))
-
-    if predictor.card.settings.arch.condition == "film":
-        return {name: ask(given) for name, given in young.items()}
-    said, head = ask(1.0)
-    return {
-        name: (said * np.float32(given), None if head is None else head * given)
-        for name, given in young.items()
-    }
 
 
 def compare(a: Report, b: Report) -> dict[str, Paired]:

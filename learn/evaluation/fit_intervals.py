@@ -10,13 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from learn.checkpoint import Card, write_card
-from learn.data.clips import Clip, scored, target
+from learn.data.clips import Clip, scored
 from learn.data.split import Split, groups
 from learn.evaluation.interval_sides import find_obstacle
 from learn.inference.force_reader import net_force
 from learn.inference.predict import Predictor, length
 from learn.uncertainty.features import motion_features, motion_names
-from learn.uncertainty.intervals import Example, Intervals, Said, Truth, fit, make_example
+from learn.uncertainty.intervals import Example, Intervals, Said, fit, make_example
 from learn.uncertainty.world import fit_world
 from synth.errors import UserError
 
@@ -44,13 +44,12 @@ def fit_intervals(
         raise UserError(why)
     card = predictor.card
     source = source or scored(card.settings.input)
-    units, rng = (card.scales.force, card.scales.target), np.random.default_rng(card.settings.seed)
+    unit, rng = card.scales.force, np.random.default_rng(card.settings.seed)
     of = len(chosen) + len(kept)
 
-    def see(clip: Clip, unit: int, done: int) -> Example:
+    def see(clip: Clip, brain: int, done: int) -> Example:
         report(done, of)
-        said, truth = read_said(predictor, clip, source), read_truth(clip, card)
-        return make_example(said, truth, clip.mask, unit, units, rng)
+        return make_example(read_said(predictor, clip, source), clip.force / clip.young_kpa, brain, unit)
 
     number = groups(kept)
     scale_on = [see(clip, 0, k) for k, clip in enumerate(chosen)]
@@ -60,7 +59,7 @@ def fit_intervals(
     world = fit_world([_motion(predictor, fitted[i], source) for i in some], [one.motion for one in scale_on])
     if world is None:
         raise UserError("nothing moves in the sequences that the intervals are to be fitted on")
-    return fit(scale_on, factors_on, world, motion_names(card.settings.arch.depth), units, source)
+    return fit(scale_on, factors_on, world, motion_names(card.settings.arch.depth), unit, source)
 
 
 def add_intervals(
@@ -99,21 +98,14 @@ def read_said(predictor: Predictor, clip: Clip, source: str) -> Said:
     shift, mask, grid = np.asarray(clip.displacement[source]), clip.mask, predictor.grid
     sure, young = clip.sure(source), clip.young_kpa
     kind = predictor.card.settings.target
-    density, _ = predictor.answer(shift, mask, young, sure)
-    still, _ = predictor.answer(np.zeros_like(shift[:1]), mask, young, np.ones_like(sure[:1]) * mask)
+    density = predictor.density(shift, mask, young, sure)
+    still = predictor.density(np.zeros_like(shift[:1]), mask, young, np.ones_like(sure[:1]) * mask)
     return Said(
         motion=motion_features(shift, mask, sure, grid.extent_mm),
         force=net_force(density, still[0], kind, grid) / young,
         magnitude=length(density) / np.float32(young),
         pitch_mm=grid.pitch_mm,
     )
-
-
-def read_truth(clip: Clip, card: Card) -> Truth:
-    """The force that a sensor would feel, and the map as the network should say it."""
-    kind, parts = card.settings.target, 3 if card.settings.arch.output == "vector" else 1
-    true = np.stack([target(clip, t, kind, parts) for t in range(clip.frames)])
-    return Truth(clip.force / clip.young_kpa, length(true))
 
 
 def _motion(predictor: Predictor, clip: Clip, source: str) -> NDArray[np.float64]:

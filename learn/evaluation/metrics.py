@@ -55,9 +55,6 @@ METRICS = {
     "force_r": Metric("total force: correlation", "", "Pearson's r over frames", "high"),
     "force_ccc": Metric("total force: concordance", "", "Lin's concordance over frames", "high"),
     "vector_error_mn": Metric("total force: error of the vector", "mN", "length of its error", "low"),
-    "head_error_mn": Metric(
-        "total force: error of the head", "mN", "error of the total-force head", "low", listed=False
-    ),
     "peak_error_share": Metric(
         "peak force: relative error", "", "share of the largest force", "low", column="peak force error"
     ),

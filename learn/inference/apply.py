@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from learn.data.clips import FIELDS, has_depth
 from learn.inference import video
-from learn.inference.ends import Ends
 from learn.inference.force_reader import ForceReader
 from learn.inference.mask_files import MaskFiles
 from learn.inference.predict import Predictor, View
@@ -23,10 +22,12 @@ from learn.inference.pulse import Pulse, Search
 from learn.inference.scale import UNKNOWN_NOTE, StatedScale, take_scale
 from learn.inference.stiffness import stiffness
 from learn.inference.video_flow import Footage, Settings, VideoFlow, everywhere
+from learn.uncertainty.conformal import LEVELS
+from learn.uncertainty.intervals import Band
 from synth.dataset.store import Dataset, Sequence, open_sequence
 from synth.errors import UserError
 from synth.flow.stereo.track import Moved
-from synth.system import foreign_arrays
+from synth.system import checked_file
 
 
 class Step(NamedTuple):
@@ -106,7 +107,7 @@ def has_second_eye(path: Path) -> bool:
     if path.suffix.lower() in video.SUFFIXES:
         return False
     if path.suffix == ".npz":
-        return "motion" in foreign_arrays.read_arrays(path)
+        return "motion" in checked_file.read_arrays(path)
     stored = path.name.endswith((".zarr", ".zarr.part"))
     first = open_sequence(path) if stored else next(iter(Dataset(path)), None)
     return first is not None and FIELDS["motion"] in first
@@ -193,7 +194,7 @@ def _video(path: Path, filmed: Filmed, pulse: Pulse | None = None, search: Searc
 
 
 def _arrays(path: Path) -> Motion:
-    found = foreign_arrays.read_arrays(path)
+    found = checked_file.read_arrays(path)
     told = {"motion", "deviation"} if "motion" in found else {"flow"}
     missing = (told | {"tissue", "scale_mm_per_px"}) - found.keys()
     if missing:
@@ -253,18 +254,17 @@ def apply(predictor: Predictor, motion: Motion, young_kpa: float | None = None) 
         young = None
     reader = ForceReader(predictor, motion.tissue, motion.scale_mm_per_px, young)
     frames, times, forces, maps, trusted = [], [], [], [], []
-    ends = Ends(reader)
+    bands = []
     for step in motion.steps:
         force, said = reader.read(step.flow, step.confidence, step.moved)
-        if not step.trusted:
-            reader.forget_last()
         frames.append(step.frame)
         times.append(step.time_s)
         forces.append(force if step.trusted else np.full(3, np.nan))
         trusted.append(step.trusted)
         maps.append(said)
         if motion.scale_known:
-            ends.add(force, said, step.trusted)
+            # What could not be followed shows no world.
+            bands.append(reader.bound(force, said, counted=step.trusted))
     still = motion.again()
     if still is not None:
         return apply(predictor, still, young_kpa)
@@ -297,11 +297,26 @@ def apply(predictor: Predictor, motion: Motion, young_kpa: float | None = None) 
         notes.append(
             f"{trusted.count(False)} of {len(trusted)} frames could not be followed: they have no force"
         )
-    out |= ends.stacked(np.array(trusted))
+    out |= _ends([one for one in bands if one is not None], np.array(trusted))
     out["notes"] = np.array(notes, dtype=str)
-    heads = [m.head_mn for m in maps if m.head_mn is not None]
-    if heads:
-        out["head_mn"] = np.stack(heads)
+    return out
+
+
+def _ends(bands: list[dict[float, Band]], trusted: NDArray[np.bool_]) -> dict[str, NDArray[np.float64]]:
+    """Ends of the intervals by field, (T,) or (T, 3) mN, NaN where `trusted` (T,) is False; none of none."""
+    if not bands:
+        return {}
+    wide, narrow = ([one[level] for one in bands] for level in LEVELS)
+    out = {
+        "low_mn": np.array([one.low[0] for one in wide]),
+        "high_mn": np.array([one.high[0] for one in wide]),
+        "low68_mn": np.array([one.low[0] for one in narrow]),
+        "high68_mn": np.array([one.high[0] for one in narrow]),
+        "force_low_mn": np.array([one.axes_low[0] for one in wide]),
+        "force_high_mn": np.array([one.axes_high[0] for one in wide]),
+    }
+    for values in out.values():
+        values[~trusted] = np.nan
     return out
 
 

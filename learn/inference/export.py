@@ -1,12 +1,10 @@
 """A trained model as one file for other programs: TorchScript or ONNX, channels and scales inside.
 
 The file's input is displacement in mm on the grid, not the channels, so that nobody has to rebuild them:
-`displacement` (B, 2, N, N) mm and `mask` (B, 1, N, N) 0/1 (for some models `confidence` (B, 1, N, N) 0..1 and
-`log_young` (B, 1) ln(E/kPa); of two eyes `displacement` (B, 3, N, N) and `confidence` (B, 2, N, N); with a
-window earlier frames' displacement behind the present one's, latest first). Its output is force density per
-unit stiffness (B, C, N, N) [mN/mm² at 1 kPa]. Times E in kPa it is mN/mm², times the cell's area and summed,
-mN. A network with a total-force head gives that too, (B, C) [mN at 1 kPa]. How a picture's flow comes onto
-the grid is written into the .json beside it.
+`displacement` (B, 2, N, N) mm and `mask` (B, 1, N, N) 0/1 (for some models `confidence` (B, 1, N, N) 0..1; of
+two eyes `displacement` (B, 3, N, N) and `confidence` (B, 2, N, N)). Its output is force density per unit
+stiffness (B, C, N, N) [mN/mm² at 1 kPa]. Times E in kPa it is mN/mm², times the cell's area and summed, mN.
+How a picture's flow comes onto the grid is written into the .json beside it.
 """
 
 from __future__ import annotations
@@ -24,7 +22,7 @@ from torch import Tensor, nn
 from learn.checkpoint import Card
 from learn.data.grid import HALF_SURE_MM, SMOOTHING_MM, channels
 from learn.inference.predict import Predictor
-from learn.network.d2fnet import Architecture, D2FNet
+from learn.network.d2fnet import Architecture
 from synth.errors import UserError
 
 TOLERANCE = 1e-4
@@ -37,30 +35,16 @@ class Portable(nn.Module):
     def __init__(self, model: nn.Module, card: Card) -> None:
         super().__init__()
         self.model, self.card = model, card
-        if isinstance(model, D2FNet) and model.prior is not None:
-            model.prior.hold(card.settings.size, card.settings.arch.displacements)
 
-    def forward(self, displacement: Tensor, mask: Tensor, *extra: Tensor) -> Tensor | tuple[Tensor, Tensor]:
-        arch, more = self.card.settings.arch, list(extra)
-        confidence = more.pop(0) if arch.confidence else None
-        log_young = more.pop(0) if arch.condition == "film" else None
-        now, earlier = displacement[:, : arch.displacements], None
-        if arch.window > 1:
-            earlier = displacement[:, arch.displacements :]
-        x = channels(now, mask, self.card.settings.grid.pitch_mm, self.card.scales, confidence, earlier)
-        said = self.model(x, log_young)
-        unit = self.card.scales.target * self.card.force_gain
-        if arch.total:
-            return said[0] * unit, said[1] * self.card.scales.force
-        y: Tensor = said * unit
+    def forward(self, displacement: Tensor, mask: Tensor, confidence: Tensor | None = None) -> Tensor:
+        x = channels(displacement, mask, self.card.settings.grid.pitch_mm, self.card.scales, confidence)
+        y: Tensor = self.model(x) * (self.card.scales.target * self.card.force_gain)
         return y
 
 
 def input_names(card: Card) -> list[str]:
     """The file's inputs, in order."""
-    arch = card.settings.arch
-    extra = ["confidence"] * arch.confidence + ["log_young"] * (arch.condition == "film")
-    return ["displacement", "mask", *extra]
+    return ["displacement", "mask", *["confidence"] * card.settings.arch.confidence]
 
 
 def examples(card: Card, batch: int, seed: int = 0) -> list[Tensor]:
@@ -69,7 +53,7 @@ def examples(card: Card, batch: int, seed: int = 0) -> list[Tensor]:
     rng = np.random.default_rng(seed)
     y, x = np.meshgrid(np.linspace(-1, 1, n), np.linspace(-1, 1, n), indexing="ij")
     parts = card.settings.arch.displacements
-    a = rng.normal(size=(batch, parts * card.settings.arch.window, 6))
+    a = rng.normal(size=(batch, parts, 6))
     basis = np.stack([np.ones_like(x), x, y, x * y, np.cos(3 * x), np.sin(3 * y)])
     moved = np.einsum("bck,kyx->bcyx", a, basis) * card.scales.displacement_mm / 3
     mask = np.broadcast_to(x**2 + y**2 < 0.7, (batch, 1, n, n))
@@ -77,7 +61,6 @@ def examples(card: Card, batch: int, seed: int = 0) -> list[Tensor]:
         "displacement": moved,
         "mask": mask,
         "confidence": rng.uniform(size=(batch, parts - 1, n, n)),
-        "log_young": rng.normal(size=(batch, 1)),
     }
     return [torch.from_numpy(np.array(found[name], np.float32)) for name in input_names(card)]
 
@@ -87,8 +70,8 @@ def export(predictor: Predictor, file: Path, kind: str) -> float:
     """Writes `file` and a description `file`.json, reads it back, and compares it with PyTorch.
 
     Returns the largest difference in units of the 99.9th percentile, or of the largest answer where that is
-    more. Raises UserError if it is above 1e-4
-    (the file is removed), or if ONNX is asked for and its packages are not installed.
+    more. Raises UserError if it is above 1e-4 (the file is removed), or if ONNX is asked for and its packages
+    are not installed.
     """
     card = predictor.card
     module = Portable(predictor.model.cpu(), card).eval()
@@ -100,7 +83,7 @@ def export(predictor: Predictor, file: Path, kind: str) -> float:
     worst = 0.0
     for batch in (1, 3):
         inputs = examples(card, batch, seed=batch)
-        worst = max(worst, _gap(_pair(run(inputs)), _pair(module(*inputs)), card))
+        worst = max(worst, _gap(run(inputs), module(*inputs), card.scales.target))
     if not worst <= TOLERANCE:
         file.unlink()
         raise UserError(f"{file}: differs from PyTorch by {worst:.1e} of full scale, at most {TOLERANCE:g}")
@@ -108,21 +91,8 @@ def export(predictor: Predictor, file: Path, kind: str) -> float:
     return worst
 
 
-def _pair(said: Tensor | tuple[Tensor, ...]) -> tuple[Tensor, ...]:
-    return (said,) if isinstance(said, Tensor) else said
-
-
-def _gap(said: tuple[Tensor, ...], expected: tuple[Tensor, ...], card: Card) -> float:
-    units = (card.scales.target, card.scales.force)
-    return max(
-        float((a - b).abs().max()) / max(unit, float(b.abs().max()))
-        for a, b, unit in zip(said, expected, units[: len(said)], strict=True)
-    )
-
-
-def output_names(card: Card) -> list[str]:
-    """The file's outputs, in order."""
-    return ["density", "total_force"] if card.settings.arch.total else ["density"]
+def _gap(said: Tensor, expected: Tensor, unit: float) -> float:
+    return float((said - expected).abs().max()) / max(unit, float(expected.abs().max()))
 
 
 def describe(card: Card, kind: str, difference: float) -> dict[str, Any]:
@@ -131,7 +101,7 @@ def describe(card: Card, kind: str, difference: float) -> dict[str, Any]:
     return {
         "format": kind,
         "inputs": input_names(card),
-        "outputs": output_names(card),
+        "outputs": ["density"],
         "output": "force density per unit stiffness [mN/mm2 at E = 1 kPa]; components x, y, z in camera axes"
         if card.settings.arch.components == 3
         else f"{card.settings.target} per unit stiffness, one component",
@@ -153,25 +123,14 @@ def describe(card: Card, kind: str, difference: float) -> dict[str, Any]:
 def _told(arch: Architecture) -> list[str]:
     """Where displacement, and the confidence of two eyes, come from."""
     if not arch.depth:
-        said = ["flow [px] times the picture's scale [mm/px] is displacement [mm]; x right, y down"]
-        return said + _windowed(arch)
+        return ["flow [px] times the picture's scale [mm/px] is displacement [mm]; x right, y down"]
     said = ["displacement [mm] is motion in camera axes, x right, y down, z away, as a second eye gives it"]
     if arch.confidence:
         said.append(
             "confidence, across and along the view: means over tissue of 1 / (1 + (s / s0)^2), "
             f"s0 = {HALF_SURE_MM} mm, s the motion's standard deviation [mm] (of dx and dy the rms)"
         )
-    return said + _windowed(arch)
-
-
-def _windowed(arch: Architecture) -> list[str]:
-    """In which order frames are told, to a network that is told several."""
-    if arch.window == 1:
-        return []
-    return [
-        f"displacement holds {arch.window} frames of {arch.displacements} components: the present one, then "
-        "those before it, the latest first; zeros stand for what was before the rest frame"
-    ]
+    return said
 
 
 def _torchscript(module: Portable, card: Card, file: Path) -> Any:
@@ -197,16 +156,16 @@ def _onnx(module: Portable, card: Card, file: Path) -> Any:
             tuple(examples(card, 2)),
             str(file),
             input_names=input_names(card),
-            output_names=output_names(card),
-            dynamic_axes={name: {0: "batch"} for name in [*input_names(card), *output_names(card)]},
+            output_names=["density"],
+            dynamic_axes={name: {0: "batch"} for name in [*input_names(card), "density"]},
             dynamo=False,
             opset_version=17,
         )
     session = runtime.InferenceSession(str(file), providers=["CPUExecutionProvider"])
     order = input_names(card)
 
-    def run(inputs: list[Tensor]) -> tuple[Tensor, ...]:
+    def run(inputs: list[Tensor]) -> Tensor:
         named = {name: value.numpy() for name, value in zip(order, inputs, strict=True)}
-        return tuple(torch.from_numpy(value) for value in session.run(None, named))
+        return torch.from_numpy(session.run(None, named)[0])
 
     return run

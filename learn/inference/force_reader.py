@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import copy
 import math
-from collections import deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
@@ -82,25 +80,17 @@ class ForceReader:
         """Where the network's grid lies."""
         self._at_border = self._in_all = 0.0
         self._bounded, self._far = False, list[float]()
-        # One more than is asked for, so that the last can be forgotten.
-        self._window = predictor.window
-        self._before = deque[tuple[NDArray[np.float32], Moved | None]](maxlen=self._window)
 
     def read(
         self, flow: NDArray[np.float32], confidence: NDArray[np.float32] | None, moved: Moved | None = None
     ) -> tuple[NDArray[np.float64], ForceMap]:
         """Total force of a frame, and the map as the model says it, nothing taken off; errors as `Predictor`.
 
-        A model with a window is told of the frames read before it, too.
-
         `flow`: (H, W, 2) px; `confidence`: (H, W); `moved`: of two eyes. The force: (3,) mN on the tissue in
         camera axes; of a model without direction the size in x, the rest NaN.
         """
         place = self.placing.place(flow, confidence)
-        said = self._say(flow, confidence, moved, place, [*self._before][1 - self._window :])
-        if self._window > 1:
-            # Copies: whose arrays these are may fill them anew.
-            self._before.append((flow.copy(), copy.deepcopy(moved)))
+        said = self._say(flow, confidence, moved, place)
         if place not in self._zero:
             sure = None if confidence is None else self._tissue.astype(np.float32)
             still = None if moved is None else Moved(0 * moved.motion, 0 * moved.deviation)
@@ -113,11 +103,6 @@ class ForceReader:
         if said.force_mn is None:
             force[0] = max(force[0], 0.0)
         return force, said
-
-    def forget_last(self) -> None:
-        """Takes back the frame read last: it could not be followed, so nothing is to be made of it later."""
-        if self._before:
-            self._before.pop()
 
     def bound(
         self, force: NDArray[np.float64], said: ForceMap, counted: bool = True
@@ -144,20 +129,6 @@ class ForceReader:
             return math.nan
         world = self._intervals().world
         return float(world.distance(said.motion[None])[0] / world.usual)
-
-    def bound_map(
-        self, force: NDArray[np.float64], said: ForceMap
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
-        """Ends of the 90% interval of each cell of `ForceMap.magnitude`, (N, N) twice; None as of `bound`.
-
-        Off the tissue both are the map itself.
-        """
-        if said.motion is None:
-            return None
-        low, high = self._intervals().bound_map(said_by(force, said))
-        young, inside = np.float32(said.young_kpa), said.view.mask > 0
-        off = said.magnitude
-        return np.where(inside, young * low[0], off), np.where(inside, young * high[0], off)
 
     @property
     def notes(self) -> list[str]:
@@ -194,24 +165,14 @@ class ForceReader:
         confidence: NDArray[np.float32] | None,
         moved: Moved | None,
         place: Point,
-        before: Sequence[tuple[NDArray[np.float32], Moved | None]] = (),
     ) -> ForceMap:
         said = self._predictor(
-            flow,
-            self._tissue,
-            self._scale,
-            self._young_kpa,
-            confidence,
-            moved,
-            centre_px=place,
-            before=before,
+            flow, self._tissue, self._scale, self._young_kpa, confidence, moved, centre_px=place
         )
         if said.young_known:
             return said
         part = assumed_young(None) / said.young_kpa
-        head = None if said.head_mn is None else part * said.head_mn
-        density = np.float32(part) * said.density
-        return replace(said, density=density, head_mn=head, young_kpa=assumed_young(None))
+        return replace(said, density=np.float32(part) * said.density, young_kpa=assumed_young(None))
 
 
 def describe_unseen(distance: NDArray[np.float64]) -> list[str]:

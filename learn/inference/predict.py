@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ from torch import nn
 from learn import checkpoint
 from learn.checkpoint import Card
 from learn.data.clips import FIELDS, has_depth
-from learn.data.grid import Grid, Resampler, centre, certainty, channels, windowed
+from learn.data.grid import Grid, Resampler, centre, certainty, channels
 from learn.inference.shipped import find_model
 from learn.network.d2fnet import fused
 from learn.network.traced import Quick
@@ -38,8 +38,6 @@ class ForceMap:
     """Young's modulus the numbers rest on: the one given, else the training data's typical one."""
     young_known: bool
     view: View
-    head_mn: NDArray[np.float64] | None = None
-    """(C,) total force [mN] of a network with a total-force head, forces beyond the grid included."""
     motion: NDArray[np.float64] | None = None
     """(F,) `motion_features` of the frame, by a model with intervals."""
 
@@ -115,8 +113,6 @@ class Predictor:
     ) -> None:
         """`quick`: spend a second on a graph that runs a fifth faster on a CPU, for live use and films."""
         self.card, self.grid = card, card.settings.grid
-        self.window = card.settings.arch.window
-        """Frames that it is told at a time."""
         self.device = torch.device(device)
         self.model = fused(model).to(self.device)
         self._say: Callable[..., Any] = self.model
@@ -167,17 +163,15 @@ class Predictor:
         moved: Moved | None = None,
         *,
         centre_px: tuple[float, float] | None = None,
-        before: Sequence[tuple[NDArray[np.float32], Moved | None]] = (),
     ) -> ForceMap:
         """Force map of one frame.
 
         `flow`: (H, W, 2) px, motion from the rest frame on the rest frame's pixels; `tissue`: (H, W) bool;
         `young_kpa`: None stands for the training data's typical value; `confidence`: (H, W) 0..1, used only
         by a model with that channel (1 if not given); `moved`: motion in three dimensions and its deviation,
-        which a model of two eyes is told instead of flow and confidence; `centre_px`: as of `View`; `before`:
-        flow and motion of the frames before this one, in order, for a model with a window: what is missing is
-        taken for the rest frame. Raises UserError for other shapes or values that aren't finite, and where
-        such a model is told of one eye alone.
+        which a model of two eyes is told instead of flow and confidence; `centre_px`: as of `View`. Raises
+        UserError for other shapes or values that aren't finite, and where such a model is told of one eye
+        alone.
         """
         if young_kpa is not None and not (np.isfinite(young_kpa) and young_kpa > 0):
             raise UserError(f"young_kpa {young_kpa}: must be positive")
@@ -185,15 +179,12 @@ class Predictor:
         displacement, sure = self.on_grid(view, flow, confidence, moved)
         young = young_kpa or self.card.typical_young_kpa
         known = None if sure is None else sure[None]
-        past = [self.on_grid(view, seen, None, space)[0] for seen, space in before]
-        history = np.stack(past) if past else None
-        density, total = self.answer(displacement[None], view.mask, young, known, history)
-        head = None if total is None else total[0]
+        density = self.density(displacement[None], view.mask, young, known)
         motion = None
         if self.card.intervals is not None:
             motion = motion_features(displacement[None], view.mask, known, self.grid.extent_mm)[0]
         return ForceMap(
-            density[0], self.grid, self.card.settings.target, young, young_kpa is not None, view, head, motion
+            density[0], self.grid, self.card.settings.target, young, young_kpa is not None, view, motion
         )
 
     def on_grid(
@@ -224,6 +215,7 @@ class Predictor:
         shift = mean(moved.motion.transpose(2, 0, 1), view.tissue)
         return shift, mean(certainty(moved.deviation), view.tissue)
 
+    @torch.inference_mode()
     def density(
         self,
         displacement: NDArray[np.float32],
@@ -231,25 +223,11 @@ class Predictor:
         young_kpa: float,
         confidence: NDArray[np.float32] | None = None,
     ) -> NDArray[np.float32]:
-        """The maps of `answer` alone."""
-        return self.answer(displacement, mask, young_kpa, confidence)[0]
-
-    @torch.inference_mode()
-    def answer(
-        self,
-        displacement: NDArray[np.float32],
-        mask: NDArray[np.float32],
-        young_kpa: float,
-        confidence: NDArray[np.float32] | None = None,
-        before: NDArray[np.float32] | None = None,
-    ) -> tuple[NDArray[np.float32], NDArray[np.float64] | None]:
-        """Force density of frames already on the grid, and their total force if the network has that head.
+        """Force density of frames already on the grid, (T, C, N, N) mN/mm² at `young_kpa`.
 
         `displacement`: (T, 2, N, N) mm, of a model of two eyes (T, 3, N, N); `mask`: (N, N) 0/1;
-        `confidence`: (T, 1, N, N), with depth (T, 2, N, N). To a model with a window the frames are one
-        film's, in order, and `before` (K, 2|3, N, N) mm those before it. Returns (T, C, N, N) mN/mm² at
-        `young_kpa` and (T, C) mN or None. Raises UserError for another grid or number of components, and for
-        displacement or an answer that isn't finite.
+        `confidence`: (T, 1, N, N), with depth (T, 2, N, N). Raises UserError for another grid or number of
+        components, and for displacement or an answer that isn't finite.
         """
         n, settings, scales = self.grid.size, self.card.settings, self.card.scales
         parts = settings.arch.displacements
@@ -258,12 +236,11 @@ class Predictor:
                 f"this model takes displacement of shape (T, {parts}, {n}, {n}) "
                 f"[{', '.join(('dx', 'dy', 'dz')[:parts])} in mm], got {displacement.shape}"
             )
-        if not np.isfinite(displacement).all() or not (before is None or np.isfinite(before).all()):
+        if not np.isfinite(displacement).all():
             raise UserError("displacement holds NaN or infinity")
-        told = windowed(displacement, settings.arch.window, before)
-        maps, totals = [], []
-        for start in range(0, len(told), settings.batch):
-            u = torch.from_numpy(np.array(told[start : start + settings.batch])).to(self.device)
+        maps = []
+        for start in range(0, len(displacement), settings.batch):
+            u = torch.from_numpy(np.array(displacement[start : start + settings.batch])).to(self.device)
             m = torch.from_numpy(np.array(mask)).to(self.device).expand(len(u), 1, n, n)
             sure = None
             if settings.arch.confidence:
@@ -271,20 +248,13 @@ class Predictor:
                 if confidence is not None:
                     part = np.array(confidence[start : start + settings.batch])
                     sure = torch.from_numpy(part).to(self.device)
-            log_young = torch.full((len(u), 1), float(np.log(young_kpa)), device=self.device)
-            earlier = u[:, parts:] if settings.arch.window > 1 else None
-            x = channels(u[:, :parts], m, self.grid.pitch_mm, scales, sure, earlier)
-            said = self._say(x, log_young)
-            if settings.arch.total:
-                said, total = said
-                totals.append(total.double().cpu().numpy())
+            said = self._say(channels(u, m, self.grid.pitch_mm, scales, sure))
             maps.append(said.float().cpu().numpy())
         with np.errstate(over="ignore", invalid="ignore"):  # said below
             density = np.concatenate(maps) * np.float32(scales.target * self.card.force_gain * young_kpa)
-            total = np.concatenate(totals) * (scales.force * young_kpa) if totals else None
-        if not (np.isfinite(density).all() and (total is None or np.isfinite(total).all())):
+        if not np.isfinite(density).all():
             raise UserError("the model answers NaN or infinity: its weights or scales can't be right")
-        return density, total
+        return density
 
 
 def load_model(name: Path | str, device: str = "cpu", *, quick: bool = False) -> Predictor:

@@ -15,10 +15,9 @@ from numpy.typing import NDArray
 from learn.inference import video
 from learn.inference.predict import length
 from synth.dataset.store import Sequence, open_sequence
-from synth.publish import film
-from synth.publish.preview_video import encode_video
-from synth.system import whole_file
-from synth.system.whole_file import write_whole
+from synth.publish import film, picture
+from synth.system import checked_file
+from synth.system.checked_file import write_whole
 
 Rgb = NDArray[np.uint8]
 
@@ -55,11 +54,6 @@ FIELDS: dict[str, PredictedField] = {
     "high68_mn": PredictedField("T", "mN", "upper end of it"),
     "force_low_mn": PredictedField("T, 3", "mN", "lower ends of the components' 90% intervals, camera axes"),
     "force_high_mn": PredictedField("T, 3", "mN", "upper ends of them"),
-    "density_low": PredictedField(
-        "T, N, N", "mN/mm²", "lower end of the 90% interval of the density's length"
-    ),
-    "density_high": PredictedField("T, N, N", "mN/mm²", "upper end of it"),
-    "head_mn": PredictedField("T, C", "mN", "what a network with a head for the total force says of it"),
     "mask": PredictedField("N, N", "-", "cells with tissue"),
     "pitch_mm": PredictedField("", "mm", "width of a cell"),
     "scale_mm_per_px": PredictedField("", "mm/px", "of the film's own pixels"),
@@ -79,7 +73,7 @@ COLUMNS = ("frame", "time_s", "trusted", "total_force_mn", "force_x_mn", "force_
 def write_prediction(found: dict[str, Any], stem: Path) -> None:
     """`stem`.npz and `stem`.force.csv, whole or not at all, of what `apply` returns."""
     stem.parent.mkdir(parents=True, exist_ok=True)
-    with whole_file.part_of(stem.with_name(f"{stem.name}.npz")) as part, part.open("wb") as file:
+    with checked_file.part_of(stem.with_name(f"{stem.name}.npz")) as part, part.open("wb") as file:
         np.savez_compressed(file, **{name: found[name] for name in FIELDS if name in found})
     write_whole(stem.with_name(f"{stem.name}.force.csv"), tabulate(found), durable=False)
 
@@ -114,7 +108,7 @@ def write_overlay(found: dict[str, Any], source: Path, stem: Path) -> Path | Non
     times = found.get("time_s", np.arange(len(found["frame"])) / video.FPS)
     step = float(np.median(np.diff(times))) if len(times) > 1 else 0.0
     fps = float(np.clip(1 / step, 1, 120)) if step > 0 else video.FPS
-    return encode_video(stem.with_name(f"{stem.name}.force.mp4"), _drawn(found, times, pictures), fps)
+    return film.encode_video(stem.with_name(f"{stem.name}.force.mp4"), _drawn(found, times, pictures), fps)
 
 
 def _number(value: float) -> str:
@@ -133,19 +127,19 @@ def _pictures(source: Path, wanted: set[int]) -> Iterator[Rgb] | None:
 def _drawn(found: dict[str, Any], times: NDArray[np.floating], pictures: Iterator[Rgb]) -> Iterator[Rgb]:
     force, size = found["total_force_mn"], length(found["density"])
     largest, curve = float(np.max(size, initial=0.0)), None
-    for t, picture in enumerate(pictures):
-        shrink = max(1, -(-picture.shape[1] // _WIDEST_PX))
-        small = cv2.resize(picture, None, fx=1 / shrink, fy=1 / shrink, interpolation=cv2.INTER_AREA)
-        small = film.legible(np.asarray(small, np.uint8))
-        values = on_picture(size[t], found, t, picture.shape[:2])
+    for t, rgb in enumerate(pictures):
+        shrink = max(1, -(-rgb.shape[1] // _WIDEST_PX))
+        small = cv2.resize(rgb, None, fx=1 / shrink, fy=1 / shrink, interpolation=cv2.INTER_AREA)
+        small = picture.legible(np.asarray(small, np.uint8))
+        values = on_picture(size[t], found, t, rgb.shape[:2])
         values = cv2.resize(values, (small.shape[1], small.shape[0]), interpolation=cv2.INTER_LINEAR)
         if curve is None:
-            curve = film.draw_curve(times, force, small.shape[1], "mN")
+            curve = film.draw_curve(times, force, small.shape[1])
         known = "" if found["young_known"] else f", if E is {found['young_kpa']:.3g} kPa"
         ends = f" [{found['low_mn'][t]:.1f}, {found['high_mn'][t]:.1f}]" if "low_mn" in found else ""
         said = f"{force[t]:.1f} mN{ends}{known}" if found["trusted"][t] else "could not be followed"
         shown = film.glow(small, values, largest) if found["trusted"][t] else small
-        shown = film.caption(shown, f"{times[t]:.2f} s  {said}")
+        shown = picture.caption(shown, f"{times[t]:.2f} s  {said}")
         yield np.vstack([shown, film.mark(curve, t, len(force))])
 
 

@@ -11,7 +11,7 @@ from learn import checkpoint
 from learn.checkpoint import Card
 from synth.errors import UserError
 from synth.job import identity
-from synth.system.whole_file import write_whole
+from synth.system.checked_file import write_whole
 
 MODELS = Path(__file__).parents[1] / "models"
 NAMES = ("mono", "stereo")

@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 from learn.inference.predict import Predictor, total_force
 from synth.errors import UserError
 
-_ROUNDS, _CLOSE = 12, 1e-3
-
 
 def stiffness(
     predictor: Predictor,
@@ -25,22 +23,17 @@ def stiffness(
     """Young's modulus [kPa] that makes the answer to a press fit its force best, in the least squares.
 
     `displacement`: (T, 2, N, N) mm on the model's grid, of a model of two eyes (T, 3, N, N); `mask`: (N, N);
-    `force_mn`: (T,) size of the known force; `confidence`: as `Predictor.answer`. A network conditioned on E
-    is asked again with each estimate until it stays within a thousandth. Raises UserError if the lengths
-    differ, or if there is no force or no answer to fit.
+    `force_mn`: (T,) size of the known force; `confidence`: as `Predictor.density`. Raises UserError if the
+    lengths differ, or if there is no force or no answer to fit.
     """
     if len(force_mn) != len(displacement):
         raise UserError(f"calibration press: {len(force_mn)} forces for {len(displacement)} frames")
     young = predictor.card.typical_young_kpa
-    for _ in range(_ROUNDS if predictor.card.settings.arch.condition == "film" else 1):
-        said = _sizes(predictor, displacement, mask, young, confidence)
-        fit = float(said @ force_mn), float(said @ said)
-        if not (np.isfinite(fit).all() and min(fit) > 0):
-            raise UserError("calibration press: no force was given, or the model sees none in the motion")
-        before, young = young, young * fit[0] / fit[1]
-        if abs(young / before - 1) < _CLOSE:
-            break
-    return young
+    said = _sizes(predictor, displacement, mask, young, confidence)
+    fit = float(said @ force_mn), float(said @ said)
+    if not (np.isfinite(fit).all() and min(fit) > 0):
+        raise UserError("calibration press: no force was given, or the model sees none in the motion")
+    return young * fit[0] / fit[1]
 
 
 def _sizes(

@@ -12,8 +12,8 @@ from av.container import InputContainer
 from numpy.typing import NDArray
 
 from synth.errors import UserError
-from synth.system import foreign_file, foreign_picture
-from synth.system.foreign_picture import LARGEST_PIXELS, refuse_large
+from synth.system import checked_file
+from synth.system.checked_file import LARGEST_PIXELS, refuse_large
 
 SUFFIXES = (".mp4", ".mov", ".mkv", ".avi", ".webm", ".m4v")
 
@@ -82,7 +82,7 @@ def count_frames(path: Path) -> int | None:
 
 
 def _open_video(path: Path) -> InputContainer:
-    foreign_file.check_file(path, _LARGEST_BYTES)
+    checked_file.check_file(path, _LARGEST_BYTES)
     try:
         # By "file:" a colon in the path is no protocol.
         container: InputContainer = av.open(f"file:{path}", options=_CONTAINERS)
@@ -116,7 +116,7 @@ def read_picture(path: Path) -> Rgb:
     Raises:
         UserError: unreadable.
     """
-    return np.ascontiguousarray(foreign_picture.read_picture(path)[..., ::-1]).astype(np.uint8)
+    return np.ascontiguousarray(checked_file.read_picture(path)[..., ::-1]).astype(np.uint8)
 
 
 def read_mask(path: Path, size: tuple[int, int]) -> NDArray[np.bool_]:

@@ -20,16 +20,13 @@ class Quick:
     """Says what the network says (to rounding), for any batch of its own grid."""
 
     def __init__(self, model: nn.Module, arch: Architecture, size: int) -> None:
-        self._film = arch.condition == "film"
         net: Any = fused(model).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         shown = torch.zeros(2, arch.inputs, size, size).contiguous(memory_format=torch.channels_last)
-        example = (shown, torch.zeros(2, 1)) if self._film else (shown,)
         jit: Any = torch.jit
         with warnings.catch_warnings(), torch.no_grad():
             # Tracing warns that the grid's size is taken as a constant: it is one.
             warnings.simplefilter("ignore")
-            self._net = jit.freeze(jit.trace(net, example, check_trace=False))
+            self._net = jit.freeze(jit.trace(net, (shown,), check_trace=False))
 
-    def __call__(self, x: Tensor, log_young: Tensor | None = None) -> Any:
-        x = x.contiguous(memory_format=torch.channels_last)
-        return self._net(x, log_young) if self._film else self._net(x)
+    def __call__(self, x: Tensor) -> Any:
+        return self._net(x.contiguous(memory_format=torch.channels_last))

@@ -7,11 +7,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from learn.data.clips import Clip, amount, sources, target
-from learn.data.grid import Scales, channels, divergence, windowed
+from learn.data.grid import Scales, channels, divergence
 from learn.settings import Settings
 from synth.errors import UserError
 
@@ -21,17 +20,13 @@ class Batch:
     """Frames on one device, in physical units."""
 
     displacement: Tensor
-    """(B, 2, N, N) mm, with depth (B, 3, N, N); with a window earlier frames' behind it, latest first."""
+    """(B, 2, N, N) mm, with depth (B, 3, N, N)."""
     mask: Tensor
     """(B, 1, N, N) 0/1."""
     confidence: Tensor
     """(B, 1, N, N) 0..1, with depth (B, 2, N, N)."""
     target: Tensor
     """(B, C, N, N) in the unit of `Scales.target`."""
-    force: Tensor
-    """(B, C) total force [mN at E = 1 kPa]."""
-    log_young: Tensor
-    """(B, 1) ln(E / 1 kPa)."""
 
     def to(self, device: torch.device) -> Batch:
         return Batch(**{k: v.to(device, non_blocking=True) for k, v in vars(self).items()})
@@ -42,13 +37,13 @@ def swayed(batch: Batch, settings: Settings, generator: torch.Generator) -> Batc
 
     `generator`: on the CPU, so that every device draws the same.
     """
-    moved, parts = batch.displacement, settings.arch.displacements
+    moved = batch.displacement
     count, planes, size = moved.shape[0], moved.shape[1], moved.shape[-1]
     axis = torch.linspace(-1, 1, size)
     x, y = axis.expand(size, size), axis[:, None].expand(size, size)
     shapes = torch.stack([torch.ones_like(x), x, y, 1 - x**2 - y**2])
     amount = torch.randn(count, planes, len(shapes), generator=generator)
-    along = torch.arange(planes) % parts == 2
+    along = torch.arange(planes) == 2
     amount *= settings.sway_mm * torch.where(along, 1.0, 1 / 3)[:, None] / len(shapes) ** 0.5
     amount *= (torch.rand(count, generator=generator) < 0.5)[:, None, None]
     whole = torch.einsum("bps,syx->bpyx", amount, shapes).to(moved)
@@ -58,27 +53,25 @@ def swayed(batch: Batch, settings: Settings, generator: torch.Generator) -> Batc
 def inputs(batch: Batch, settings: Settings, scales: Scales) -> Tensor:
     """The network's channels for a batch."""
     extra = batch.confidence if settings.arch.confidence else None
-    moved, parts = batch.displacement, settings.arch.displacements
-    earlier = moved[:, parts:] if settings.arch.window > 1 else None
-    return channels(moved[:, :parts], batch.mask, settings.grid.pitch_mm, scales, extra, earlier)
+    return channels(batch.displacement, batch.mask, settings.grid.pitch_mm, scales, extra)
 
 
-def turned(values: NDArray[np.float32], quarter: int, mirror: bool) -> NDArray[np.float32]:
-    """A field turned by `quarter` × 90° (counter-clockwise as seen) after an optional left-right mirror.
+def turned(values: Tensor, turn: int) -> Tensor:
+    """Fields (B, C, N, N) turned by `turn` % 4 × 90° (counter-clockwise as seen), from 4 on mirrored first.
 
-    `values`: (C, N, N). With two or three channels the first two are x, y components and turn with the
-    field; a single channel is a scalar. Divergence is computed after this, so it needs no rule of its own.
+    With two or three channels the first two are x, y components and turn with the field; a single channel is
+    a scalar. Divergence is computed after this, so it needs no rule of its own.
     """
-    vector = values.shape[0] > 1
-    if mirror:
-        values = values[:, :, ::-1]
+    vector = values.shape[1] > 1
+    sign = values.new_tensor([-1.0, 1.0, 1.0][: values.shape[1]]).view(1, -1, 1, 1)
+    if turn >= 4:
+        values = values.flip(-1)
+        values = values * sign if vector else values
+    for _ in range(turn % 4):
+        values = values.rot90(dims=(2, 3))
         if vector:
-            values = np.concatenate([-values[:1], values[1:]])
-    for _ in range(quarter % 4):
-        values = np.rot90(values, axes=(1, 2))
-        if vector:
-            values = np.concatenate([values[1:2], -values[:1], values[2:]])
-    return np.ascontiguousarray(values)
+            values = torch.cat([values[:, 1:2], -values[:, :1], values[:, 2:]], dim=1)
+    return values
 
 
 class Frames:
@@ -86,8 +79,6 @@ class Frames:
 
     def __init__(self, clips: Sequence[Clip], settings: Settings) -> None:
         self.clips, self.settings = list(clips), settings
-        parts, pitch = settings.arch.components, settings.grid.pitch_mm
-        self.force = [amount(c, settings.target, parts, pitch).astype(np.float32) for c in self.clips]
         self.sources = sources(settings.input)
         if not self.clips:
             raise UserError("no sequence to take frames from")
@@ -111,7 +102,7 @@ class Frames:
         source = [self.sources[0]] * len(items)
         if len(self.sources) == 2:
             source = [self.sources[int(u < share_recovered)] for u in rng.random(len(items))]
-        turn = rng.integers(0, 8, len(items)) if self.settings.augment else np.zeros(len(items), int)
+        turn = rng.integers(0, 8, len(items))
         return [(*items[i], source[i], int(turn[i])) for i in rng.permutation(len(items))]
 
     def sequential(self, clip: int, source: str) -> Iterator[Batch]:
@@ -123,30 +114,16 @@ class Frames:
 
     def batch(self, items: Sequence[tuple[int, int, str, int]]) -> Batch:
         """The frames named by `items`, as tensors."""
-        columns: dict[str, list[NDArray[np.float32]]] = {
-            "displacement": [],
-            "mask": [],
-            "confidence": [],
-            "target": [],
-            "force": [],
-        }
-        more = self.settings.arch.window - 1
+        columns: dict[str, list[Tensor]] = {name: [] for name in Batch.__dataclass_fields__}
         for c, t, source, turn in items:
-            clip, how = self.clips[c], (turn % 4, turn >= 4)
-            sure = [turned(plane[None], *how) for plane in clip.sure(source)[t]]
+            clip = self.clips[c]
+            sure = turned(torch.from_numpy(np.array(clip.sure(source)[t]))[:, None], turn)[:, 0]
             truth = target(clip, t, self.settings.target, self.settings.arch.components)
-            told = windowed(clip.displacement[source][max(t - more, 0) : t + 1], more + 1)[-1]
-            frames = np.split(np.asarray(told), more + 1)
-            columns["displacement"].append(np.concatenate([turned(one, *how) for one in frames]))
-            columns["mask"].append(turned(clip.mask[None], *how))
-            columns["confidence"].append(np.concatenate(sure))
-            columns["target"].append(turned(truth, *how))
-            columns["force"].append(turned(self.force[c][t][:, None, None], *how)[:, 0, 0])
-        young = [[np.log(self.clips[c].young_kpa)] for c, *_ in items]
-        return Batch(
-            **{k: torch.from_numpy(np.stack(v)) for k, v in columns.items()},
-            log_young=torch.tensor(young, dtype=torch.float32),
-        )
+            moved = clip.displacement[source][t]
+            for name, one in (("displacement", moved), ("mask", clip.mask[None]), ("target", truth)):
+                columns[name].append(turned(torch.from_numpy(np.array(one))[None], turn)[0])
+            columns["confidence"].append(sure)
+        return Batch(**{name: torch.stack(values) for name, values in columns.items()})
 
 
 def measure_scales(clips: Sequence[Clip], settings: Settings, frames: int = 16) -> Scales:

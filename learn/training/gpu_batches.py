@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal
 
 import numpy as np
 import torch
@@ -11,25 +10,10 @@ from torch import Tensor
 
 from learn.data.clips import Clip, sources, target
 from learn.settings import Settings
-from learn.training.batches import Batch, Frames
+from learn.training.batches import Batch, Frames, turned
 
 SHARE = 0.6
 """Part of the device's free memory that frames may take; the rest is the network's."""
-
-
-def turned(values: Tensor, turn: int) -> Tensor:
-    """`learn.training.batches.turned` for a batch (B, C, N, N) on a device: `turn` 0-7, from 4 on
-    with a mirror first."""
-    vector = values.shape[1] > 1
-    sign = values.new_tensor([-1.0, 1.0, 1.0][: values.shape[1]]).view(1, -1, 1, 1)
-    if turn >= 4:
-        values = values.flip(-1)
-        values = values * sign if vector else values
-    for _ in range(turn % 4):
-        values = values.rot90(dims=(2, 3))
-        if vector:
-            values = torch.cat([values[:, 1:2], -values[:, :1], values[:, 2:]], dim=1)
-    return values
 
 
 class Resident(Frames):
@@ -57,9 +41,7 @@ class Resident(Frames):
         self._true = whole(
             [np.stack([target(c, t, settings.target, parts) for t in range(c.frames)]) for c in self.clips]
         )
-        self._force = whole(self.force)
-        young = torch.tensor([np.log(c.young_kpa) for c in self.clips], dtype=torch.float32)
-        self._young, self._device = young[:, None].to(device), device
+        self._device = device
 
     def batch(self, items: Sequence[tuple[int, int, str, int]]) -> Batch:
         """As `Frames.batch`; within it frames of one turn stand together."""
@@ -80,32 +62,22 @@ class Resident(Frames):
         if self._sure is not None:
             planes = self._sure[source][at]
             sure = turned(planes.flatten(0, 1)[:, None], turn).reshape(planes.shape)
-        frame = torch.tensor([t for _, t, _, _ in items], device=self._device)
-        told = []
-        for k in range(self.settings.arch.window):
-            # Before the first frame of a sequence nothing has moved.
-            there = (frame >= k).view(-1, 1, 1, 1)
-            told.append(turned(self._moved[source][(at - k).clamp_min(0)] * there, turn))
         return {
-            "displacement": torch.cat(told, dim=1),
+            "displacement": turned(self._moved[source][at], turn),
             "mask": mask,
             "confidence": sure,
             "target": turned(self._true[at], turn),
-            "force": turned(self._force[at][..., None, None], turn)[..., 0, 0],
-            "log_young": self._young[clip],
         }
 
 
 def held(clips: Sequence[Clip], settings: Settings, device: torch.device) -> Frames:
-    """Frames on the device where the settings and its memory allow, else read as they are asked for."""
-    mode: Literal["auto", "yes", "no"] = settings.resident
-    if mode == "no" or (mode == "auto" and device.type != "cuda"):
+    """Frames on a GPU whose memory is enough, else read as they are asked for."""
+    if device.type != "cuda":
         return Frames(clips, settings)
-    if mode == "auto":
-        arch = settings.arch
-        told = arch.displacements + arch.confidence * (1 + arch.depth)
-        planes = told * len(sources(settings.input)) + arch.components
-        needed = sum(c.frames for c in clips) * planes * 4 * settings.size**2
-        if needed > SHARE * torch.cuda.mem_get_info(device)[0]:
-            return Frames(clips, settings)
+    arch = settings.arch
+    told = arch.displacements + arch.confidence * (1 + arch.depth)
+    planes = told * len(sources(settings.input)) + arch.components
+    needed = sum(c.frames for c in clips) * planes * 4 * settings.size**2
+    if needed > SHARE * torch.cuda.mem_get_info(device)[0]:
+        return Frames(clips, settings)
     return Resident(clips, settings, device)

@@ -18,13 +18,12 @@ from torchmetrics.aggregation import MeanMetric
 
 from learn import checkpoint
 from learn.checkpoint import Card
-from learn.data.clips import Clip, typical_young
+from learn.data.clips import Clip, sources, typical_young
 from learn.data.grid import Scales
 from learn.data.split import Split, groups
 from learn.evaluation.metrics import Moments, agreement
-from learn.loss import SHARES, at, full, gradient_shares, loss
+from learn.loss import SHARES, full, gradient_shares, loss
 from learn.network.d2fnet import D2FNet
-from learn.network.monai_unet import build
 from learn.settings import Settings, replace
 from learn.training.batches import Batch, Frames, inputs, measure_scales, swayed
 from learn.training.gpu_batches import held
@@ -32,7 +31,13 @@ from learn.training.log import Log
 from learn.training.threads import make_fabric
 from synth.dataset.split import find_crossings
 from synth.errors import UserError
+from synth.job import retired
 
+CLIP = 1.0
+"""Largest norm of the gradient."""
+WEIGHT_DECAY = 1e-5
+PATIENCE = 5
+"""`plateau`: epochs without a better score after which the learning rate is halved."""
 LOOK = 16
 """Steps between two looks at the loss and its gradient: each makes a GPU wait."""
 _TELLING, _GAINS = 8, (0.67, 1.5)
@@ -62,7 +67,6 @@ def train(
     """
     fabric = fabric or make_fabric(accelerator="cpu", devices=1, precision=settings.precision)
     fabric.launch()
-    torch.use_deterministic_algorithms(settings.deterministic)
     fit, select = [clips[i] for i in split.fit], [clips[i] for i in split.select]
     scales = measure_scales(fit, settings)
     card = Card(settings, scales, typical_young(fit), *_provenance(clips, split))
@@ -94,8 +98,6 @@ def _go_on(
 
     with Log(out, run.epoch) if fabric.is_global_zero else nullcontext() as write:
         for epoch in range(run.epoch, settings.epochs):
-            if settings.stop and run.waited >= settings.stop:
-                break
             numbers = _epoch(fabric, net, run.optimizer, frames, scales, epoch, report)
             numbers |= select_score(net, chooser, scales, fabric.device)
             improved = run.end_epoch(numbers["select_r2"], settings)
@@ -124,8 +126,6 @@ class _Run:
     """Epochs done."""
     best: float = -math.inf
     """R² on the select sequences of the epoch that is kept."""
-    waited: int = 0
-    """Epochs since then."""
 
     def end_epoch(self, score: float, settings: Settings) -> bool:
         """Takes an epoch's score into account; whether it is the best so far."""
@@ -133,41 +133,38 @@ class _Run:
         if settings.schedule == "plateau":
             self.plateau.step(score)
         # Before its price is whole no epoch has been asked to have no ghosts: none of those is chosen.
-        asked = full(settings.objective, self.epoch / settings.epochs)
-        improved = asked and score > self.best
-        self.best, self.waited = (score, 0) if improved else (self.best, self.waited + asked)
+        improved = full(settings.loss, self.epoch / settings.epochs) and score > self.best
+        self.best = score if improved else self.best
         return improved
 
     def as_dict(self) -> dict[str, Any]:
-        plain = {"epoch": self.epoch, "best": self.best, "waited": self.waited}
+        plain = {"epoch": self.epoch, "best": self.best}
         moving = {"optimizer": self.optimizer.state_dict(), "plateau": self.plateau.state_dict()}
         return plain | {"model": _cpu(self.model.state_dict())} | moving
 
 
 def _start(card: Card, state: dict[str, Any] | None) -> _Run:
     """A fresh run, or one that goes on from a state as `_Run.as_dict` gave it."""
-    settings, scales = card.settings, card.scales
+    settings = card.settings
     torch.manual_seed(settings.seed)
-    model = build(settings.arch)
-    if isinstance(model, D2FNet) and model.prior is not None:
-        model.prior.set_units(scales.displacement_mm, settings.extent_mm, scales.target)
+    model = D2FNet(settings.arch)
     if settings.channels_last:
         model = model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     optimizer = torch.optim.AdamW(
         # One pass over the weights, not a dozen: a fifth of a small network's training on a CPU.
         model.parameters(),
         lr=settings.learning_rate,
-        weight_decay=settings.weight_decay,
+        weight_decay=WEIGHT_DECAY,
         fused=True,
     )
-    plateau = ReduceLROnPlateau(optimizer, mode="max", factor=0.5, patience=settings.patience)
+    plateau = ReduceLROnPlateau(optimizer, mode="max", factor=0.5, patience=PATIENCE)
     run = _Run(model, optimizer, plateau)
     if state is not None:
         try:
             model.load_state_dict(state["model"])
             optimizer.load_state_dict(state["optimizer"])
             plateau.load_state_dict(state["plateau"])
-            run.epoch, run.best, run.waited = int(state["epoch"]), float(state["best"]), int(state["waited"])
+            run.epoch, run.best = int(state["epoch"]), float(state["best"])
         except (RuntimeError, ValueError, KeyError, TypeError, AttributeError) as error:
             why = (str(error).splitlines() or ["of another kind"])[0]
             raise UserError(f"last.pt: corrupt checkpoint ({why[:200]})") from None
@@ -201,17 +198,15 @@ def _epoch(
             draws = np.random.SeedSequence([settings.seed, epoch, i, fabric.global_rank])
             rng = torch.Generator().manual_seed(int(draws.generate_state(1)[0]))
             batch = swayed(batch, settings, rng)
-        said, total = forward(net, batch, settings, scales)
+        said = forward(net, batch, settings, scales)
         terms = loss(
             said,
             batch.target,
             batch.mask,
-            at(settings.objective, (epoch + i / batches) / settings.epochs),
+            settings.loss,
             scales.target,
             scales.spread,
-            settings.grid.pitch_mm**2,
-            scales.force,
-            None if total is None else (total, batch.force),
+            (epoch + i / batches) / settings.epochs,
         )
         if i % LOOK == 0:
             last = float(terms.sum.detach())
@@ -223,7 +218,7 @@ def _epoch(
                 group["lr"] = settings.learning_rate * cosine((epoch + i / batches) / settings.epochs)
         optimizer.zero_grad()
         fabric.backward(terms.sum)
-        fabric.clip_gradients(net, optimizer, max_norm=settings.clip)
+        fabric.clip_gradients(net, optimizer, max_norm=CLIP)
         optimizer.step()
         means["loss"].update(terms.sum.detach())
         report(epoch * batches + i + 1, settings.epochs * batches, {"loss": last})
@@ -234,7 +229,7 @@ def _epoch(
 
 def _finite(value: float, epoch: int) -> None:
     if not math.isfinite(value):
-        raise UserError(f"training diverged in epoch {epoch + 1}: lower --learning-rate")
+        raise UserError(f"training diverged in epoch {epoch + 1}: lower learning_rate")
 
 
 def cosine(progress: float, warm: float = 0.05) -> float:
@@ -244,20 +239,13 @@ def cosine(progress: float, warm: float = 0.05) -> float:
     return 0.5 * (1 + math.cos(math.pi * (progress - warm) / (1 - warm)))
 
 
-def forward(
-    net: Any, batch: Batch, settings: Settings, scales: Scales
-) -> tuple[torch.Tensor, torch.Tensor | None]:
-    """The network's answer in physical units per unit stiffness: the map (B, C, N, N), unit of
-    `Scales.target`,
-    and the total force (B, C) [mN at 1 kPa] of a network with that head."""
+def forward(net: Any, batch: Batch, settings: Settings, scales: Scales) -> torch.Tensor:
+    """The network's map in physical units per unit stiffness: (B, C, N, N), unit of `Scales.target`."""
     x = inputs(batch, settings, scales)
     if settings.channels_last:
         x = x.contiguous(memory_format=torch.channels_last)
-    young = batch.log_young if settings.arch.condition == "film" else None
-    said = net(x, young)
-    if settings.arch.total:
-        return said[0].float() * scales.target, said[1].float() * scales.force
-    return said.float() * scales.target, None
+    said: torch.Tensor = net(x)
+    return said.float() * scales.target
 
 
 @torch.no_grad()
@@ -273,7 +261,7 @@ def select_score(net: Any, frames: Frames, scales: Scales, device: torch.device)
         for batch in frames.sequential(c, frames.sources[-1]):
             here = batch.to(device)
             inside = here.mask.bool().expand_as(here.target)
-            said, _ = forward(net, here, frames.settings, scales)
+            said = forward(net, here, frames.settings, scales)
             sums = sums + moments(here.target[inside], said[inside])
             forces = forces + moments(
                 *(_amount(one * inside, frames.settings) for one in (here.target, said))
@@ -326,18 +314,21 @@ def _open(out: Path, card: Card) -> dict[str, Any] | None:
         checkpoint.write_card(out, card)
         return None
     there = checkpoint.read_card(out)
+    if there.retired:
+        gone = ", ".join(there.retired)
+        raise UserError(f"{out}: was trained with another {gone}; only commit {retired.LAST} goes on with it")
     if there.settings != replace(card.settings, epochs=there.settings.epochs):
         raise UserError(f"{out}: holds a model trained with other settings; choose another folder")
     if there.split != card.split or there.scales != card.scales:
         raise UserError(f"{out}: holds a model trained on other data; choose another folder")
-    planned = there.settings.input == "mixed" or there.settings.objective.kind == "hinge"
+    planned = len(sources(there.settings.input)) > 1 or there.settings.loss == "ghostless"
     bound = planned or there.settings.schedule == "cosine"
     if there.settings.epochs != card.settings.epochs and bound:
         raise UserError(f"{out}: its schedule was made for {there.settings.epochs} epochs; keep --epochs")
     if not (out / "last.pt").exists():
         return None
     state = checkpoint.load_tensors(out / "last.pt")
-    missing = {"model", "optimizer", "plateau", "epoch", "best", "waited"} - state.keys()
+    missing = {"model", "optimizer", "plateau", "epoch", "best"} - state.keys()
     if missing:
         raise UserError(f"{out / 'last.pt'}: corrupt checkpoint (lacks {', '.join(sorted(missing))})")
     return state

@@ -1,4 +1,4 @@
-"""Intervals beside what a network says: of the force, of its components, of the map.
+"""Intervals beside what a network says: of the force and of its components.
 
 Half of an interval's width is the expected size of the error (`Scale`), times how far beyond what was fitted
 the frame is (`World`, and an answer above all that the scale was fitted on), times a factor that makes the
@@ -14,7 +14,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import ConfigDict
-from scipy import ndimage
 
 from learn.uncertainty import conformal
 from learn.uncertainty.conformal import LEVELS
@@ -28,10 +27,7 @@ Floats = NDArray[np.float64]
 
 LEVEL = LEVELS[0]
 """What is given where only one is."""
-_AROUND_MM = 3.0  # how far aside a contact may be found
-_LOW_SHARE = 0.01  # of the training data's density: below it all densities are alike
-_NEAR = 0.02  # of the training data's density: a cell with so much nearby is at a contact
-_LEAST = 1e-3  # of the training data's force and density: no error is expected to be smaller
+_LEAST = 1e-3  # of the training data's force: no error is expected to be smaller
 
 
 @dataclass(frozen=True)
@@ -59,18 +55,8 @@ class Said:
 
 
 @dataclass(frozen=True)
-class Truth:
-    """What is so, per unit stiffness."""
-
-    force: Floats
-    """(T, 3)."""
-    magnitude: NDArray[np.float32]
-    """(T, N, N)."""
-
-
-@dataclass(frozen=True)
 class Example:
-    """One sequence whose truth is known, as intervals are fitted on it: its frames, and some of its cells."""
+    """One sequence whose truth is known, as intervals are fitted on it."""
 
     unit: int
     """Equal where sequences are not exchangeable: of one brain."""
@@ -80,12 +66,6 @@ class Example:
     """(T, G) of the frames' errors."""
     error: Floats
     """(T, 4) of the force's size and components, ≥ 0 [mN at 1 kPa]."""
-    cell_frame: NDArray[np.int64]
-    """(n,) which frame a cell is of."""
-    cell_features: Floats
-    """(n, G + 2)."""
-    cell_error: Floats
-    """(n,) ≥ 0."""
 
 
 @dataclass(frozen=True)
@@ -127,14 +107,8 @@ class Intervals:
     """Names of those of a frame that the scales go by."""
     force_unit: Positive
     """Training data's total force [mN at 1 kPa]."""
-    map_unit: Positive
-    """Training data's density [mN/mm² (or mN) at 1 kPa]."""
     size: Spread
     axes: tuple[Spread, Spread, Spread]
-    map: Spread
-    """Of cells near which the answer is as good as nothing."""
-    contact: Spread
-    """Of all others: they are few, and err more."""
     world: World
     source: str
     """Displacement that they hold for, as in `learn.data.clips.FIELDS`."""
@@ -145,15 +119,10 @@ class Intervals:
 
     def __post_init__(self) -> None:
         frame, count = len(self.features), len(self.features) - len(ANSWER)
-        for spread, wanted in (
-            (self.size, frame),
-            *((one, frame) for one in self.axes),
-            (self.map, frame + 2),
-            (self.contact, frame + 2),
-        ):
+        for spread in (self.size, *self.axes):
             rule = spread.scale
-            if not len(rule.slopes) == len(rule.low) == len(rule.high) == wanted:
-                raise ValueError(f"a scale is not of {wanted} features")
+            if not len(rule.slopes) == len(rule.low) == len(rule.high) == frame:
+                raise ValueError(f"a scale is not of {frame} features")
             if spread.factors.keys() != {str(level) for level in LEVELS}:
                 raise ValueError(f"levels are not {', '.join(map(str, LEVELS))}")
         if [len(row) for row in (self.world.middle, *self.world.precision)] != [count] * (count + 1):
@@ -161,31 +130,14 @@ class Intervals:
 
     def bound(self, said: Said, level: float = LEVEL) -> Band:
         """Intervals of the force of frames, per unit stiffness. UserError for another level."""
-        self._check(level)
+        if str(level) not in self.size.factors:
+            raise UserError(f"level {level:g}: the model has intervals of {', '.join(self.size.factors)}")
         features = frame_features(said, self.force_unit)
-        wide = self._widening(said.motion, features)
+        wide = _widen(self.world, self.size.scale, said.motion, features)
         half = wide * self.size.half(features, level)
         axes = np.stack([wide * one.half(features, level) for one in self.axes], axis=1)
         low = np.maximum(said.size - half, 0.0)
         return Band(low, said.size + half, said.centre - axes, said.centre + axes)
-
-    def bound_map(self, said: Said, level: float = LEVEL) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Ends of the interval of each cell of the map, (T, N, N) twice; unit and errors as `bound`."""
-        self._check(level)
-        features = frame_features(said, self.force_unit)
-        cells = cell_features(said, features, self.map_unit)
-        half = np.where(_at_contact(cells), self.contact.half(cells, level), self.map.half(cells, level))
-        half = half * self._widening(said.motion, features)[:, None, None]
-        low = np.maximum(said.magnitude - half, 0.0)
-        return low.astype(np.float32), (said.magnitude + half).astype(np.float32)
-
-    def _check(self, level: float) -> None:
-        if str(level) not in self.size.factors:
-            raise UserError(f"level {level:g}: the model has intervals of {', '.join(self.size.factors)}")
-
-    def _widening(self, motion: Floats, features: Floats) -> Floats:
-        """(T,) ≥ 1."""
-        return _widen(self.world, self.size.scale, motion, features)
 
 
 def frame_features(said: Said, force_unit: float) -> Floats:
@@ -194,38 +146,14 @@ def frame_features(said: Said, force_unit: float) -> Floats:
     return np.concatenate([said.motion, answer], axis=1)
 
 
-def cell_features(said: Said, frames: Floats, map_unit: float) -> Floats:
-    """(T, N, N, G + 2) the same of each cell: its frame's (T, G), the map there, and the most nearby."""
-    reach = 2 * max(1, round(_AROUND_MM / said.pitch_mm)) + 1
-    near = ndimage.maximum_filter(said.magnitude, size=(1, reach, reach), mode="constant")
-    own = np.log(np.stack([said.magnitude, near], axis=-1, dtype=np.float64) / map_unit + _LOW_SHARE)
-    whole = np.broadcast_to(frames[:, None, None], (*said.magnitude.shape, frames.shape[1]))
-    return np.concatenate([whole, own], axis=-1)
-
-
-def make_example(
-    said: Said,
-    truth: Truth,
-    mask: NDArray[np.float32],
-    unit: int,
-    units: tuple[float, float],
-    rng: np.random.Generator,
-    most_cells: int = 2000,
-) -> Example:
-    """A sequence's errors; `mask`: (N, N) tissue; `units`: `force_unit` and `map_unit` of `Intervals`."""
-    features = frame_features(said, units[0])
-    off = np.abs(np.linalg.norm(truth.force, axis=1) - said.size)
-    every = np.flatnonzero(np.broadcast_to(mask > 0, said.magnitude.shape))
-    chosen = rng.choice(every, min(most_cells, len(every)), replace=False)
-    cells = cell_features(said, features, units[1]).reshape(-1, features.shape[1] + 2)[chosen]
+def make_example(said: Said, true: Floats, unit: int, force_unit: float) -> Example:
+    """A sequence's errors; `true`: (T, 3) force per unit stiffness; `force_unit`: as of `Intervals`."""
+    off = np.abs(np.linalg.norm(true, axis=1) - said.size)
     return Example(
         unit=unit,
         motion=said.motion,
-        features=features,
-        error=np.column_stack([off, np.abs(truth.force - said.centre)]),
-        cell_frame=chosen // mask.size,
-        cell_features=cells,
-        cell_error=np.abs(truth.magnitude - said.magnitude).reshape(-1)[chosen].astype(np.float64),
+        features=frame_features(said, force_unit),
+        error=np.column_stack([off, np.abs(true - said.centre)]),
     )
 
 
@@ -234,7 +162,7 @@ def fit(
     kept: Sequence[Example],
     world: World,
     names: tuple[str, ...],
-    units: tuple[float, float],
+    force_unit: float,
     source: str,
 ) -> Intervals:
     """Scales from `chosen`, factors from `kept`; arguments else as the fields of `Intervals`.
@@ -247,7 +175,7 @@ def fit(
         raise UserError(f"{count} brains are kept for intervals; {LEVELS[0]:.0%} needs {least}")
     features, weight = _stacked(chosen, "features"), _weights([len(one.features) for one in chosen])
     error = _stacked(chosen, "error")
-    scales = [fit_scale(features, e, weight, _LEAST * units[0]) for e in error.T]
+    scales = [fit_scale(features, e, weight, _LEAST * force_unit) for e in error.T]
     wide = [_widen(world, scales[0], one.motion, one.features) for one in kept]
     both = list(zip(kept, wide, strict=True))
     spreads = [
@@ -256,51 +184,14 @@ def fit(
     ]
     return Intervals(
         features=(*names, *ANSWER),
-        force_unit=units[0],
-        map_unit=units[1],
+        force_unit=force_unit,
         size=spreads[0],
         axes=(spreads[1], spreads[2], spreads[3]),
-        map=_cell_spread(chosen, kept, wide, units[1], near=False),
-        contact=_cell_spread(chosen, kept, wide, units[1], near=True),
         world=world,
         source=source,
         units=count,
         sequences=len(kept),
     )
-
-
-def _cell_spread(
-    chosen: Sequence[Example], kept: Sequence[Example], wide: Sequence[Floats], unit: float, *, near: bool
-) -> Spread:
-    """Scale and factors of the cells at a contact or of the others (conformal by class: Vovk 2012).
-
-    Of all cells where too few units have any of that class.
-    """
-    least = conformal.least_units(LEVELS[0])
-    of_class = [_at_contact(one.cell_features) == near for one in (*chosen, *kept)]
-    seen = len({one.unit for one, part in zip(kept, of_class[len(chosen) :], strict=True) if part.any()})
-    if seen < least or not any(part.any() for part in of_class[: len(chosen)]):
-        of_class = [np.ones_like(part) for part in of_class]
-    first = [(one, part) for one, part in zip(chosen, of_class, strict=False) if part.any()]
-    last = [
-        (one, w, part) for one, w, part in zip(kept, wide, of_class[len(chosen) :], strict=True) if part.any()
-    ]
-    scale = fit_scale(
-        np.concatenate([one.cell_features[part] for one, part in first]),
-        np.concatenate([one.cell_error[part] for one, part in first]),
-        _weights([int(part.sum()) for _, part in first]),
-        _LEAST * unit,
-    )
-    scores = [
-        (one.cell_error / (w[one.cell_frame] * scale.predict(one.cell_features)))[part]
-        for one, w, part in last
-    ]
-    return _spread(scale, [one for one, _, _ in last], scores)
-
-
-def _at_contact(cells: Floats) -> NDArray[np.bool_]:
-    """(...,) whether the answer says something at or near a cell, of `cell_features` (..., G)."""
-    return np.asarray(cells[..., -1] > np.log(_NEAR + _LOW_SHARE))
 
 
 def _spread(scale: Scale, kept: Sequence[Example], scores: Sequence[Floats]) -> Spread:

@@ -35,8 +35,8 @@ def check_contents(
         UserError: a chunk cannot be read.
     """
     for name in sequence.fields:
-        field, column, stored = FIELDS[name], sequence[name], sequence.stored_name(name) or name
-        hasher = None if fast else store.field_hasher(stored, column.stored, column.shape)
+        field, column = FIELDS[name], sequence[name]
+        hasher = None if fast else store.field_hasher(name, column.stored, column.shape)
         low, high, finite = np.inf, -np.inf, True
         every: Any = (frames if fast else range(column.shape[0])) if field.framed else [...]
         for part in every:
@@ -51,7 +51,7 @@ def check_contents(
                 with watch.stage("range"):
                     low, high = min(low, float(values.min())), max(high, float(values.max()))
         if hasher is not None:
-            good = hasher.hexdigest() == sequence.attrs["field_hashes"][stored]
+            good = hasher.hexdigest() == sequence.attrs["field_hashes"][name]
             yield "checksum", truth(good, f"{name}: values are not those that were written")
         yield "finite", truth(finite, f"{name}: holds values that are no numbers")
         if finite and field.low is not None:

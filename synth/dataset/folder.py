@@ -18,11 +18,11 @@ from pydantic import BaseModel, ValidationError
 
 from synth.dataset import location, provenance
 from synth.errors import UserError
-from synth.job import identity, writer
+from synth.job import identity, retired, writer
 from synth.job.schema import Job
 from synth.job.types import first_problem
-from synth.system import foreign_file, whole_file
-from synth.system.whole_file import write_whole as write_whole
+from synth.system import checked_file
+from synth.system.checked_file import write_whole as write_whole
 
 _LOCK_WAIT_S = 5.0
 _NAME = "dataset.json"
@@ -53,7 +53,7 @@ class Folder:
         """`{"identity", "generators", "job"}` as first written. UserError if this is no dataset of ours."""
         if not os.path.lexists(self.root / _NAME):
             raise UserError(f"{self.root}: holds no dataset ({_NAME} is missing)")
-        found = foreign_file.read_json(self.root / _NAME)
+        found = checked_file.read_json(self.root / _NAME)
         try:
             return _Described.model_validate(found).model_dump(exclude_unset=True)
         except ValidationError as error:
@@ -61,9 +61,9 @@ class Folder:
             raise UserError(f"{self.root / _NAME}: is damaged ({at or 'all of it'}: {why})") from None
 
     def job(self) -> Job:
-        """The dataset's job."""
+        """The dataset's job, less retired keys: what is stored needs none of them to be read."""
         try:
-            return Job.model_validate(self.described()["job"])
+            return Job.model_validate(retired.drop(self.described()["job"], retired.JOB)[0])
         except ValidationError as error:
             at, why = first_problem(error)
             raise UserError(f"{self.root / _NAME}: is damaged or of another version ({at}: {why})") from None
@@ -80,13 +80,13 @@ class Folder:
         for path in sorted((self.state / "failed").glob("*.json")):
             # What is cut short by a power failure, or none of ours: it is tried again.
             with contextlib.suppress(UserError, ValueError):
-                failure = foreign_file.read_json(path)
+                failure = checked_file.read_json(path)
                 if isinstance(failure, dict) and isinstance(failure.get("reason"), str):
                     found[int(path.stem)] = failure
         return found
 
     def mark_failed(self, index: int, *, kind: str, reason: str, tries: int, log: str) -> None:
-        """Gives a sequence up; `synth retry` takes it back."""
+        """Gives a sequence up; `synth render --retry` takes it back."""
         record = {"index": index, "kind": kind, "reason": reason, "tries": tries, "log": log}
         write_whole(self.state / "failed" / f"{index:06d}.json", json.dumps(record, indent=1))
         self.sweep(index)
@@ -110,7 +110,8 @@ class Folder:
         for part in self.root.glob("*.zarr.part"):
             shutil.rmtree(part)
         for place in (self.root, self.state, self.state / "failed"):
-            whole_file.sweep(place)
+            for part in place.glob(f".*{checked_file.PART}"):
+                part.unlink()
         for log in self.logs.glob("worker-*.log"):
             log.unlink()
         for abandoned in self.scratch.glob("*"):
@@ -192,22 +193,21 @@ def _refuse_foreign(folder: Folder, job: Job, name: str) -> None:
     if not root.is_dir():
         raise UserError(f"{root}: is a file, a folder is needed")
     if not (root / _NAME).exists():
-        others = sorted(
-            entry.name
-            for entry in root.iterdir()
-            if entry.name != _STATE and not whole_file.is_part(entry.name, _NAME)
-        )
+        others = sorted(entry.name for entry in root.iterdir() if not entry.name.startswith("."))
         if others:
             raise UserError(f"{root}: holds other files ({others[0]}), choose an empty or new folder")
         return
     described = folder.described()
     if described["identity"] != name:
-        changes = _changes(described["job"], job.model_dump(mode="json"))
+        before, gone = retired.drop(described["job"], retired.JOB)
+        if gone:
+            raise UserError(f"{root}: {'; '.join(retired.reason(*one) for one in gone.items())}")
+        changes = _changes(before, job.model_dump(mode="json"))
         what = ", ".join(changes[:4]) or "another mesh or photograph"
         raise UserError(f"{root}: holds the dataset of another job ({what}), choose another folder")
-    before = folder.job().sequences
-    if before > job.sequences:
-        raise UserError(f"{root}: holds {before} sequences of this job, {job.sequences} are asked for")
+    count = folder.job().sequences
+    if count > job.sequences:
+        raise UserError(f"{root}: holds {count} sequences of this job, {job.sequences} are asked for")
 
 
 def _refuse_links(folder: Folder) -> None:

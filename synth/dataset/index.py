@@ -18,7 +18,7 @@ from synth.dataset.attributes import name_gestures
 from synth.dataset.folder import Folder, write_whole
 from synth.dataset.store import Dataset, Sequence, open_sequence
 from synth.errors import UserError
-from synth.system import foreign_file
+from synth.system import checked_file
 
 NAME = "index.parquet"
 
@@ -71,7 +71,7 @@ SCHEMA = pa.schema(
 _LARGEST_BYTES = 1 << 30
 _MOST_ROWS = 2_000_000
 _LONGEST_TEXT = 10_000
-_SPOILT = "; `synth card` writes it anew"
+_SPOILT = "; `synth report` writes it anew"
 
 
 def read_index(root: Path) -> pa.Table:
@@ -82,7 +82,7 @@ def read_index(root: Path) -> pa.Table:
     """
     path = root / NAME
     try:
-        foreign_file.check_file(path, _LARGEST_BYTES)
+        checked_file.check_file(path, _LARGEST_BYTES)
         about = pq.read_metadata(path)
         if about.num_rows > _MOST_ROWS:
             raise UserError(f"{path}: holds more than {_MOST_ROWS:,} rows")

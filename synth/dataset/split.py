@@ -15,7 +15,7 @@ from pydantic import FiniteFloat, TypeAdapter, ValidationError
 from synth.dataset.folder import write_whole
 from synth.errors import UserError
 from synth.job.types import first_problem
-from synth.system import foreign_file
+from synth.system import checked_file
 
 By = Literal["anatomy", "opening", "family", "gesture", "stiffness", "sequence"]
 """What must not be shared between the sides: `opening` is the place that a user's brain is opened at, else
@@ -46,7 +46,7 @@ def read_rule(root: Path) -> Rule:
     """The rule of the dataset in `root`; the default if none was given. UserError for what is none."""
     if not os.path.lexists(root / NAME):
         return Rule()
-    found = foreign_file.read_json(root / NAME)
+    found = checked_file.read_json(root / NAME)
     try:
         return TypeAdapter(Rule).validate_python(found)
     except ValidationError as error:

@@ -17,7 +17,7 @@ from zarr.codecs import BloscCodec, Crc32cCodec
 from synth.dataset import fast_read, location, provenance
 from synth.dataset.attributes import FORMAT, LARGEST_BYTES, check_attributes
 from synth.errors import NotFinite, UserError
-from synth.fields import FIELDS, FORMAT_VERSION, FORMER_NAMES, Field, find_field
+from synth.fields import FIELDS, FORMAT_VERSION, Field
 from synth.job import identity
 from synth.job.schema import Job
 from synth.system import packages
@@ -298,14 +298,8 @@ class Sequence:
         """Names of the fields it holds, in the table's order."""
         return [name for name in FIELDS if name in self]
 
-    def stored_name(self, name: str) -> str | None:
-        """What the store calls a field: an older one may use a former name. None if it lacks the field."""
-        now = FORMER_NAMES.get(name, name)
-        names = (now, *(former for former, present in FORMER_NAMES.items() if present == now))
-        return next((one for one in names if one in self.attrs["field_hashes"]), None)
-
     def __contains__(self, name: str) -> bool:
-        return self.stored_name(name) is not None
+        return name in self.attrs["field_hashes"]
 
     def is_sealed(self) -> bool:
         """Whether the attributes, and so the fields' hashes, are those that were sealed."""
@@ -327,25 +321,24 @@ class Sequence:
             UserError: a value is outside the table's limits or no number; or, after the last one, the values
                 are not those that were sealed.
         """
-        field, column, stored = _field(name), self[name], self.stored_name(name) or name
+        field, column = _field(name), self[name]
         where = f"{self._place.name}: {name}"
-        hasher = field_hasher(stored, column.stored, column.shape)
+        hasher = field_hasher(name, column.stored, column.shape)
         every: Any = range(len(column)) if field.framed else [...]
         for part in every:
             values = np.ascontiguousarray(column[part])
             _check_limits(field, values, where)
             hasher.update(values.astype(column.stored, copy=False).data)
             yield values
-        if hasher.hexdigest() != self.attrs["field_hashes"][stored]:
+        if hasher.hexdigest() != self.attrs["field_hashes"][name]:
             raise UserError(f"{where}: values are not those that were sealed; see `synth verify`")
 
     def __getitem__(self, name: str) -> Column:
         field, where = _field(name), f"{self._place.name}: {name}"
-        stored = self.stored_name(name)
-        if stored is None:
+        if name not in self:
             raise UserError(f"{where}: the sequence has no such field")
         try:
-            array = self._group[stored]
+            array = self._group[name]
         except Exception as error:  # as in Column
             raise UserError(f"{where}: cannot be opened, the store is damaged ({error})") from error
         expected, dtype = field.shape(self.frames, self.size), np.dtype(field.dtype)
@@ -359,9 +352,9 @@ class Sequence:
         rest = "/0" * (len(expected) - 1)
         for k in range(files):
             # Zarr reads a missing or empty file as zeros.
-            if not self._place.size(f"{stored}/c/{k}{rest}"):
+            if not self._place.size(f"{name}/c/{k}{rest}"):
                 raise UserError(f"{where}: file c/{k}{rest} is missing or empty, the store is damaged")
-        return Column(array, dtype, where, self._place.folder and self._place.folder / stored)
+        return Column(array, dtype, where, self._place.folder and self._place.folder / name)
 
 
 class Dataset:
@@ -437,10 +430,9 @@ def seal_hash(attrs: Mapping[str, Any]) -> str:
 
 
 def _field(name: str) -> Field:
-    field = find_field(name)
-    if field is None:
+    if name not in FIELDS:
         raise ValueError(f"{name}: is not in the field table")
-    return field
+    return FIELDS[name]
 
 
 def _check_limits(field: Field, values: NDArray[Any], where: str) -> None:

@@ -14,7 +14,7 @@ import numpy as np
 
 from synth.dataset.store import Dataset, Sequence
 from synth.errors import UserError
-from synth.fields import FIELDS, find_field
+from synth.fields import FIELDS
 
 # Open stores kept by one process; opening one costs some milliseconds.
 _KEPT = 64
@@ -40,7 +40,7 @@ class Frames:
         Raises:
             UserError: no dataset there, or a sequence lacks a field.
         """
-        strangers = [name for name in fields if find_field(name) is None]
+        strangers = [name for name in fields if name not in FIELDS]
         if strangers:
             raise UserError(f"{', '.join(strangers)}: no such field; there are {', '.join(FIELDS)}")
         self._dataset, self._fields = Dataset(root), tuple(fields)

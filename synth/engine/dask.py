@@ -8,7 +8,6 @@ from __future__ import annotations
 import os
 import sys
 import threading
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -21,12 +20,10 @@ from synth.engine.slots import LocalSlot, Slot, Slots
 from synth.engine.worker_process import Attempt, Setup
 from synth.errors import UserError
 from synth.job.schema import Job
-from synth.system import foreign_file, foreign_yaml
+from synth.system import checked_file
 from synth.system.stopwatch import Report
 
-_TOPIC = "sulcus-progress"
 _TICK_S = 0.5
-_REPORT_S = 1.0
 _WAIT_FOR_WORKERS_S = 600
 _CONNECT = "20s"
 _LACKING = "needs the extra `cluster`: pip install '.[cluster]' in the clone"
@@ -74,29 +71,20 @@ class DaskSlots:
 
     def __init__(self, client: Any, setup: Setup, count: int) -> None:
         self._client, self._setup, self._count = client, setup, count
-        self._reports: dict[int, Report] = {}
-        client.subscribe_topic(_TOPIC, self._hear)
 
     def count(self) -> int:
         return self._count
 
     def slot(self) -> Slot:
-        return _DaskSlot(self._client, self._setup, self._reports)
-
-    def _hear(self, event: Any) -> None:
-        index, stage, done, of = event[1]
-        report = self._reports.get(index)
-        if report is not None:
-            report(stage, done, of)
+        return _DaskSlot(self._client, self._setup)
 
 
 class _DaskSlot:
-    def __init__(self, client: Any, setup: Setup, reports: dict[int, Report]) -> None:
-        self._client, self._setup, self._reports = client, setup, reports
+    def __init__(self, client: Any, setup: Setup) -> None:
+        self._client, self._setup = client, setup
 
     def run(self, index: int, report: Report, stop: threading.Event) -> Attempt:
-        self._reports[index] = report
-        report("waiting", 0, 1)
+        report("on the cluster", 0, 1)
         future = self._client.submit(attempt, self._setup, index, pure=False)
         try:
             while not future.done():
@@ -107,7 +95,6 @@ class _DaskSlot:
                 return Attempt(index, "crash", f"the cluster lost it ({future.status}: {_why(future)})")
             return Attempt(**future.result())
         finally:
-            del self._reports[index]
             future.release()
 
     def close(self) -> None:
@@ -118,19 +105,12 @@ def attempt(setup: Setup, index: int) -> dict[str, Any]:
     """One attempt, on a Dask worker. Returns the Attempt's fields, which need no class of ours to be read."""
     from distributed import get_worker
 
-    worker, last = get_worker(), 0.0
-
-    def report(stage: str, done: int, of: int) -> None:
-        nonlocal last
-        if time.monotonic() - last > _REPORT_S:
-            last = time.monotonic()
-            worker.log_event(_TOPIC, (index, stage, done, of))
-
     stop, ended = threading.Event(), threading.Event()
     watch = threading.Thread(target=_stop_when_passed, args=(setup, stop, ended), daemon=True)
     watch.start()
     try:
-        return vars(_slot(setup, worker.state.nthreads).run(index, report, stop))
+        slot = _slot(setup, get_worker().state.nthreads)
+        return vars(slot.run(index, lambda stage, done, of: None, stop))
     finally:
         ended.set()
         watch.join()
@@ -228,8 +208,7 @@ def read_slurm(path: Path) -> dict[str, Any]:
     """`jobs` and the arguments of dask_jobqueue.SLURMCluster. UserError for a file that does not say so."""
     if not os.path.lexists(path):
         raise UserError(f"{path}: is neither local, dask://host:port, tls://host:port nor a file")
-    text = foreign_file.read_text(path, foreign_yaml.LARGEST_BYTES)
-    found = foreign_yaml.plain(foreign_yaml.load(text, str(path)), str(path))
+    found = checked_file.read_yaml(path)
     if not isinstance(found, dict) or not isinstance(found.get("jobs"), int) or found["jobs"] < 1:
         raise UserError(f"{path}: must say how many `jobs` to ask for")
     missing = {"cores", "memory"} - found.keys()

@@ -6,27 +6,14 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
-from synth.engine.journal import Account, Watcher
+from synth.engine.journal import Watcher
 from synth.engine.progress import Bars
 from synth.engine.run import Options, Summary, run_job
-from synth.engine.worker_process import Attempt
 from synth.job.schema import Job
 
 
-class Unwatched:
-    """A watcher that says nothing."""
-
-    def begin(self, total: int, already: int, failed: int) -> None:
-        """A run begins."""
-
-    def stage(self, index: int, stage: str, done: int, of: int) -> None:
-        """A sequence is at a stage."""
-
-    def end(self, attempt: Attempt, again: bool) -> None:
-        """An attempt at a sequence has ended."""
-
-    def account(self, account: Account) -> None:
-        """How the run stands."""
+class _Unwatched(Watcher):
+    """A watcher that does nothing."""
 
 
 def render(job: Job, out: str | Path, *, progress: bool | Watcher = False, **options: Any) -> Summary:
@@ -46,5 +33,5 @@ def render(job: Job, out: str | Path, *, progress: bool | Watcher = False, **opt
         UserError: the folder is not for this job, the disk is full, or the job cannot be carried out.
     """
     chosen = Options(**options)
-    with Bars() if progress is True else nullcontext(progress or Unwatched()) as watcher:
+    with Bars() if progress is True else nullcontext(progress or _Unwatched()) as watcher:
         return run_job(job, Path(out), chosen, watcher)

@@ -7,7 +7,7 @@ import queue
 import threading
 from collections import deque
 from collections.abc import Callable, Mapping
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -19,7 +19,7 @@ from synth.engine.slots import Slots
 from synth.engine.worker_process import Attempt, Setup
 from synth.errors import UserError
 from synth.job.schema import Job
-from synth.publish import card, croissant, preview_video
+from synth.publish import card, croissant, film
 from synth.render.camera import camera as cameras
 from synth.system.stopwatch import Report
 
@@ -85,7 +85,7 @@ def run_job(job: Job, root: Path, options: Options, watcher: Watcher) -> Summary
         size_forecast.refuse_if_too_large(
             size_forecast.forecast_rest(job, root, len(todo), sorted(finished)), root
         )
-        journal = Journal(folder, workers, job.frames, watcher)
+        journal = Journal(folder, workers, watcher)
         journal.begin(job.sequences, len(finished), len(failures))
         setup = Setup(
             job=job.model_dump(mode="json"),
@@ -107,8 +107,8 @@ def run_job(job: Job, root: Path, options: Options, watcher: Watcher) -> Summary
             index.write_index(folder)
             raise
         rows = index.write_index(folder)
-        if done or not preview_video.path(root).exists():
-            preview_video.write_preview(root)
+        if done or not (root / "preview.mp4").exists():
+            film.write_preview(root)
             card.write_card(folder)
             croissant.write_croissant(folder)
         return Summary(
@@ -230,7 +230,7 @@ def _slots(
     engine: str, setup: Setup, workers: int, gpus: tuple[str, ...] | None
 ) -> AbstractContextManager[Slots]:
     if engine == "local":
-        return slots.local(setup, workers, gpus)
+        return nullcontext(slots.LocalSlots(setup, workers, gpus))
     from synth.engine import dask
 
     return dask.open_slots(engine, setup)

@@ -6,7 +6,6 @@ import itertools
 import os
 import subprocess
 import threading
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Protocol
@@ -57,7 +56,7 @@ class LocalSlot:
 
 
 class LocalSlots:
-    """As many slots on this machine as asked for; each sees one GPU, in turn, or those that it finds."""
+    """As many slots on this machine as asked for; each sees one of `gpus` in turn, or those that it finds."""
 
     def __init__(self, setup: Setup, workers: int, gpus: tuple[str, ...] | None) -> None:
         self._setup, self._workers, self._gpus = setup, workers, gpus
@@ -72,11 +71,6 @@ class LocalSlots:
         mine = self._gpus[next(self._made) % len(self._gpus)] if self._gpus else ""
         seen = {**(self._setup.environment or {}), "CUDA_VISIBLE_DEVICES": mine}
         return LocalSlot(replace(self._setup, environment=seen))
-
-
-def local(setup: Setup, workers: int, gpus: tuple[str, ...] | None = None) -> AbstractContextManager[Slots]:
-    """Slots on this machine, for as long as the context lasts; `gpus` as from the function of that name."""
-    return nullcontext(LocalSlots(setup, workers, gpus))
 
 
 def gpus(asked: str, wanted: bool) -> tuple[str, ...] | None:

@@ -17,9 +17,9 @@ from synth.dataset.folder import Folder
 from synth.dataset.size_forecast import Forecast
 from synth.dataset.store import open_sequence
 from synth.engine.journal import Account
-from synth.engine.progress import clock, rates, remaining
+from synth.engine.progress import clock
 from synth.errors import UserError
-from synth.system import foreign_file
+from synth.system import checked_file
 
 
 @dataclass(frozen=True)
@@ -36,10 +36,6 @@ class Status:
     """Stage, steps done and steps in all of the sequences being computed."""
     left_s: float | None
     """Time to the end, at the rate of the run at work."""
-    left: str
-    """The same for a person."""
-    rates: str
-    """How fast the run at work goes, by stage, and the disk that it will take."""
     ahead: Forecast
     disk_free: int
     stages_cpu_s: dict[str, float]
@@ -62,10 +58,8 @@ def read_status(root: Path) -> Status:
         done=len(done),
         failed=dict(Counter(failure["reason"] for failure in failures.values()).most_common()),
         running=journal is not None,
-        in_flight=journal.in_flight if journal else {},
+        in_flight=(journal.in_flight if journal else None) or {},
         left_s=journal.left_s if journal else None,
-        left=remaining(journal) if journal else "",
-        rates=rates(journal) if journal else "",
         ahead=size_forecast.forecast_rest(job, root, todo, done, sum(stages.values()) if stages else None),
         disk_free=shutil.disk_usage(root).free,
         stages_cpu_s=stages,
@@ -78,11 +72,10 @@ def lines(status: Status) -> list[str]:
     found = [f"{status.done} of {status.total} sequences done, {count} failed"]
     found += [f"  {number} x {reason}" for reason, number in list(status.failed.items())[:10]]
     if count:
-        found.append("  `synth retry` takes the failed ones up again")
+        found.append("  `synth render --retry` takes the failed ones up again")
     if status.running:
-        found.append(f"a run is at work{status.left and ', '}{status.left}")
-        if status.rates:
-            found.append(f"  {status.rates}")
+        left = "" if status.left_s is None else f", {clock(status.left_s)} left"
+        found.append(f"a run is at work{left}")
         found += [
             f"  {int(key):06d} {stage} {step} of {of}" for key, (stage, step, of) in status.in_flight.items()
         ]
@@ -120,9 +113,9 @@ def _journal(folder: Folder) -> Account | None:
 
 def _account(folder: Folder) -> Account:
     try:
-        return TypeAdapter(Account).validate_python(foreign_file.read_json(folder.state / "progress.json"))
+        return TypeAdapter(Account).validate_python(checked_file.read_json(folder.state / "progress.json"))
     except (UserError, ValidationError):  # it has only just begun, or is of another version
-        return Account(0, 0.0, 0, None, True, {}, None, None, 0, {})
+        return Account()
 
 
 def _stages(root: Path, pilot: list[int]) -> dict[str, float]:

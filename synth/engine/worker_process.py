@@ -84,7 +84,6 @@ class Child:
         self._rest = b""
         self._ended = False
         self.finished = 0
-        self.peak_bytes = 0
         self._write(
             json.dumps(
                 {
@@ -119,7 +118,6 @@ class Child:
                 report(message["stage"], message["done"], message["of"])
             limit = self._setup.memory_bytes
             taken = self._memory()
-            self.peak_bytes = max(self.peak_bytes, taken)
             if limit is not None and taken > limit:
                 self.kill()
                 reason = f"took more than {limit / 1e9:.3g} GB of memory"

@@ -5,9 +5,6 @@ All agree with Hooke's law of mu and lambda at rest. With F = I + grad u, J = de
 linear          Hooke, small strain: mu e:e + lambda/2 (tr e)^2.
 corotational    mu |F - R|^2 + lambda/2 tr(R'F - I)^2, R the rotation of F (Muller & Gross, GI 2004); the law
                 of Heraoui et al.
-stable          mu'/2 (tr C - 3) + lambda'/2 (J - a)^2 - mu'/2 log(tr C + 1) with mu' = 4/3 mu,
-                lambda' = lambda + 5/6 mu, a = 1 + 3/4 mu'/lambda' (Smith, de Goes & Kim, "Stable neo-Hookean
-                flesh simulation", ACM Trans. Graph. 37, 2018): finite even where tissue is crushed flat.
 neo-hookean     mu/2 (tr C - 3) - mu log J + lambda/2 (log J)^2 (Bonet & Wood, Nonlinear Continuum Mechanics,
                 6.4.3): infinite energy at J = 0, so nothing turns inside out.
 """
@@ -21,7 +18,7 @@ from synth.system.jit import compiled
 
 Floats = NDArray[np.float64]
 
-NUMBER = {"linear": 0, "corotational": 1, "stable": 2, "neo-hookean": 3}
+NUMBER = {"linear": 0, "corotational": 1, "neo-hookean": 2}
 """What the compiled loops call each law."""
 
 
@@ -57,8 +54,6 @@ def stress(law: int, strain: Floats, mu: float, lam: float, out: Floats, energy:
             energy[n] = _linear(strain[n], mu, lam, out[n])
         elif law == 1:
             energy[n] = _corotational(f, r, mu, lam, out[n])
-        elif law == 2:
-            energy[n] = _stable(f, det, r, mu, lam, out[n])
         else:
             energy[n] = _neo_hookean(f, det, r, mu, lam, out[n])
     return least
@@ -68,7 +63,7 @@ def stress(law: int, strain: Floats, mu: float, lam: float, out: Floats, energy:
 def resist_swelling(law: int, strain: Floats, weight: Floats, lam: float, out: Floats) -> float:
     """Adds lam/2 times the square of each element's mean swelling, in place.
 
-    Swelling is what a law squares in its own last term: tr e, tr(R'F - I), J - 1 or log J.
+    Swelling is what a law squares in its own last term: tr e, tr(R'F - I) or log J.
 
     Args:
         law, strain: as in `stress`, Q points an element in turn.
@@ -114,13 +109,6 @@ def bend_swelling(law: int, strain: Floats, pressure: Floats, out: Floats) -> No
         if law == 1:
             _turning(f, g, p, a)
         elif law == 2:
-            for i in range(3):
-                for j in range(3):
-                    for k in range(3):
-                        for m in range(3):
-                            if i != k and j != m:
-                                a[i, j, k, m] += p * _turn(i, k) * _turn(j, m) * f[3 - i - k, 3 - j - m]
-        elif law == 3:
             _cofactor(f, g)
             g /= _det(f)
             for i in range(3):
@@ -150,8 +138,6 @@ def _swelling(law: int, h: Floats, slope: Floats) -> float:
         return total
     det = _det(f)
     _cofactor(f, slope)
-    if law == 2:
-        return det - 1
     if det <= 0:
         slope[:] = 0
         return np.inf
@@ -201,8 +187,6 @@ def tangent(law: int, strain: Floats, mu: float, lam: float, out: Floats) -> Non
                             ) * (k == m)
         elif law == 1:
             _corotational_tangent(f, r, mu, lam, a)
-        elif law == 2:
-            _stable_tangent(f, det, r, mu, lam, a)
         else:
             _neo_hookean_tangent(f, det, r, mu, lam, a)
 
@@ -231,20 +215,6 @@ def _corotational(f: Floats, r: Floats, mu: float, lam: float, p: Floats) -> flo
         for j in range(3):
             p[i, j] = 2 * mu * (f[i, j] - r[i, j]) + lam * trace * r[i, j]
     return mu * squares + 0.5 * lam * trace * trace
-
-
-@compiled
-def _stable(f: Floats, det: float, c: Floats, mu: float, lam: float, p: Floats) -> float:
-    mu, lam = 4 / 3 * mu, lam + 5 / 6 * mu
-    over = det - 1 - 0.75 * mu / lam
-    squares = _squares(f)
-    _cofactor(f, c)
-    soft, hard = mu * (1 - 1 / (squares + 1)), lam * over
-    for i in range(3):
-        for j in range(3):
-            p[i, j] = soft * f[i, j] + hard * c[i, j]
-    rest = 0.5 * lam * (0.75 * mu / lam) ** 2 - 0.5 * mu * np.log(4.0)  # so that the energy is 0 at rest
-    return 0.5 * mu * (squares - 3 - np.log(squares + 1)) + 0.5 * lam * over * over - rest  # type: ignore[no-any-return]
 
 
 @compiled
@@ -312,24 +282,6 @@ def _turning(f: Floats, r: Floats, part: float, a: Floats) -> None:
 
 
 @compiled
-def _stable_tangent(f: Floats, det: float, c: Floats, mu: float, lam: float, a: Floats) -> None:
-    mu, lam = 4 / 3 * mu, lam + 5 / 6 * mu
-    squares = _squares(f)
-    _cofactor(f, c)
-    soft, more = mu * (1 - 1 / (squares + 1)), 2 * mu / (squares + 1) ** 2
-    over = lam * (det - 1 - 0.75 * mu / lam)
-    for i in range(3):
-        for j in range(3):
-            for k in range(3):
-                for m in range(3):
-                    a[i, j, k, m] = (
-                        soft * ((i == k) * (j == m)) + more * f[i, j] * f[k, m] + lam * c[i, j] * c[k, m]
-                    )
-                    if i != k and j != m:
-                        a[i, j, k, m] += over * _turn(i, k) * _turn(j, m) * f[3 - i - k, 3 - j - m]
-
-
-@compiled
 def _neo_hookean_tangent(f: Floats, det: float, g: Floats, mu: float, lam: float, a: Floats) -> None:
     _cofactor(f, g)
     g /= det
@@ -341,12 +293,6 @@ def _neo_hookean_tangent(f: Floats, det: float, g: Floats, mu: float, lam: float
                     a[i, j, k, m] = (
                         mu * ((i == k) * (j == m)) + twist * g[i, m] * g[k, j] + lam * g[i, j] * g[k, m]
                     )
-
-
-@compiled
-def _turn(i: int, k: int) -> float:
-    """Sign of (i, k, the third) as a permutation, for i != k."""
-    return 1.0 if (k - i) % 3 == 1 else -1.0
 
 
 @compiled

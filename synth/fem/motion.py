@@ -101,8 +101,6 @@ def march_in_time(
     named: Floats,
     clock: Clock,
     sheet: Sheet | None = None,
-    *,
-    averaged: bool = False,
 ) -> Path:
     """Motion from rest under loads at even times; between them they change evenly.
 
@@ -115,7 +113,6 @@ def march_in_time(
         named: (T,) P = F/(E a^2) of each, for messages.
         clock: time.
         sheet: a membrane on the surface; it relaxes as the tissue does.
-        averaged: as in `system.assemble`.
 
     Raises:
         As `equilibrium.solve_path`.
@@ -125,7 +122,7 @@ def march_in_time(
     springs = (tets.hold + sp.diags_array(pull * mass)) / firm
     slip = None if tets.slip is None else sp.csr_array(tets.slip / firm)
     held = replace(tets, hold=sp.csr_array(springs), slip=slip)
-    system = assemble(held, law, poisson, sheet, averaged=averaged)
+    system = assemble(held, law, poisson, sheet)
     tissue = replace(system, hold=sp.csr_array(tets.hold.shape), slip=None)
     skull = replace(system, hold=tets.hold, slip=tets.slip)
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from synth.fem.mesh.tetrahedra import RIM_MM
 from synth.fem.surface_embedding import Embedding
 from synth.fem.system import System
 from synth.job import schema
@@ -76,7 +77,7 @@ def lift(
     outward = np.zeros_like(vertices)
     np.add.at(outward, faces.ravel(), np.repeat(facing, 3, axis=0))
     reach = np.hypot(vertices[:, 0], vertices[:, 1])
-    bare = np.clip(1 - (reach - at.radius_mm) / at.rim_mm, 0, 1)
+    bare = np.clip(1 - (reach - at.radius_mm) / RIM_MM, 0, 1)
     load = carry.gather((bare * bare * (3 - 2 * bare))[:, None] * outward)
     middle = reach <= max(_MIDDLE * at.radius_mm, float(reach.min()))
     return np.asarray(load / carry.move(system.solve(load))[middle, 2].mean())

@@ -38,8 +38,8 @@ POINTWISE = 1.0
 """Of mu: how much of lambda still acts at every point where the rest acts on elements' means (Nagtegaal,
 Parks & Rice, Comput. Meth. Appl. Mech. Eng. 4, 1974; this much steadies them). Chosen on discs on the
 half-space at nu 0.49, where radial motion beside a press is then a quarter off, at 1,600 to 5,000 tetrahedra;
-with all of lambda at points it is off by twice its own size, with none of it by 60% (`bench experiment
-half-space`). docs/results/fem has it on a block it was not chosen on."""
+with all of lambda at points it is off by twice its own size, with none of it by 60% (`python -m
+evidence.fem.half_space`). docs/results/fem has it on a block it was not chosen on."""
 
 
 @dataclass(frozen=True)
@@ -144,7 +144,7 @@ class System:
 
 
 def assemble(
-    tets: Tets, law: str, poisson: float, sheet: Sheet | None = None, *, averaged: bool = False
+    tets: Tets, law: str, poisson: float, sheet: Sheet | None = None, *, averaged: bool = True
 ) -> System:
     """Builds and factors the equations.
 
@@ -153,7 +153,8 @@ def assemble(
         law: a key of `laws.NUMBER`, or a plug-in's name.
         poisson: below 0.5.
         sheet: a membrane on the surface.
-        averaged: resist each element's mean swelling rather than that at every point, but for `POINTWISE`.
+        averaged: quadratic elements resist their mean swelling rather than that at every point, but for
+            `POINTWISE`; False is what that is measured against.
 
     Raises:
         UserError: the mesh holds a tetrahedron that is flat or inside out.
@@ -165,7 +166,7 @@ def assemble(
         )
     mesh = quadrature(tets.points, tets.cells, tets.order)
     mu, lam = lame(1.0, poisson)
-    mean = max(lam - POINTWISE * mu, 0.0) if averaged else 0.0
+    mean = max(lam - POINTWISE * mu, 0.0) if averaged and tets.order == 2 else 0.0
     along = None
     if mean:
         along, _ = average(mesh, "linear", np.zeros((mesh.weight.size, 3, 3)), mean)

@@ -11,13 +11,13 @@ from synth.errors import UserError
 from synth.fem.material import Tissue
 from synth.job import schema
 from synth.job.instrument import CLEAR_MM, Instrument
-from synth.job.law_limits import RIGID_GESTURES, load_of_depth
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 _PINCH = 0.5  # a grasp's tips press towards each other with this part of their pull
 _FRICTION = 0.4  # a sliding tip drags with this part of its push
+_RAMP = 0.25, 0.35  # time in which the load grows to its peak, as a part of the sequence
 
 
 @dataclass(frozen=True)
@@ -86,9 +86,6 @@ class Gesture:
         size = tissue.young_kpa * footprint**2
         given = want.load if want.force_mn is None else want.force_mn
         load = float(rng.uniform(*given)) / (1.0 if want.force_mn is None else size)
-        if want.depth_mm is not None and kind in RIGID_GESTURES:
-            depth = float(rng.uniform(*want.depth_mm))
-            load = load_of_depth(fem.tip, depth / footprint, tissue.poisson)
         spread = footprint * float(rng.uniform(1.2, 1.8) if kind == "grasp" else rng.uniform(0.1, 0.9))
         path = float(rng.uniform(3, 8)) if kind == "slide" else 0.0
         azimuth = float(rng.uniform(0, 360))
@@ -106,15 +103,12 @@ class Gesture:
             point = np.asarray(asked.place, np.float64)
         turn = rng.uniform(0, 2 * np.pi)
         along = np.array([np.cos(turn), np.sin(turn)])
-        cone, friction = np.cos(np.radians(fem.cone_deg)), _FRICTION
-        if fem.contact == "rigid" and kind in RIGID_GESTURES:
-            friction = fem.friction
-            cone = max(cone, 1 / np.hypot(1, friction))  # beyond Coulomb's cone a tip would slip off
+        cone = np.cos(np.radians(fem.cone_deg))
         rise = rng.uniform(cone, 1.0)
         if kind == "retract":  # sideways, as a spatula holds tissue away
             rise = rng.uniform(0.1, max(cone, 0.3))
         elif kind == "slide":
-            rise = 1 / np.hypot(1, friction)
+            rise = 1 / np.hypot(1, _FRICTION)
         if asked.direction is not None:
             whole = np.asarray(asked.direction) / np.linalg.norm(asked.direction)
             along = whole[:2] / (np.hypot(*whole[:2]) or 1.0)
@@ -132,8 +126,7 @@ class Gesture:
         force = load * size
         whole = force * np.sum(ways, axis=0)
         touch = float(rng.uniform(0.08, 0.15))
-        ramp = fem.ramp if kind != "tap" else (0.1, 0.2)
-        full = touch + float(rng.uniform(*ramp))
+        full = touch + float(rng.uniform(*((0.1, 0.2) if kind == "tap" else _RAMP)))
         release = float(rng.uniform(0.85, 0.92))
         hold = float(rng.uniform(0.5, 0.7) if kind in ("retract", "slide") else rng.uniform(0.15, 0.5))
         timing = (touch, full, full + hold * (release - full), release)
@@ -257,7 +250,8 @@ def anchors(
     gesture: Gesture, over: Course, vertices: Floats, faces: NDArray[np.integer]
 ) -> tuple[Ints, Floats]:
     """Where the tips touch: (T, K, 3) vertices of the surface and their weights (T, K, 3)."""
-    aside = 0.5 * gesture.spread_mm * across(gesture)[:2]
+    across = np.radians(gesture.azimuth_deg + 90)
+    aside = 0.5 * gesture.spread_mm * np.array([np.cos(across), np.sin(across)])
     start = np.asarray(gesture.point_mm) - 0.5 * np.asarray(gesture.path_mm)
     reach = np.abs(aside).max() + np.abs(gesture.path_mm).max() + 3 * gesture.footprint_mm
     near = faces[(np.abs(vertices[faces, :2] - start).max(axis=2) <= reach).any(axis=1)]
@@ -294,18 +288,8 @@ def pose(
     touched = np.stack(
         [np.einsum("kc,kcd->kd", w, at[c]) for w, c, at in zip(weights, corners, surface, strict=True)]
     )
-    return hover(gesture, over, touched), np.broadcast_to(shaft(gesture), touched.shape).copy()
-
-
-def hover(gesture: Gesture, over: Course, touched: Floats) -> Floats:
-    """Tips (T, 2, 3) mm, away from where they touch (T, 2, 3) mm while the instrument comes and goes."""
-    return np.asarray(touched + gesture.hover_mm * over.away[:, None, None] * shaft(gesture))
-
-
-def across(gesture: Gesture) -> Floats:
-    """Unit vector from the instrument's first tip to its second, (3,) world axes, level."""
-    turn = np.radians(gesture.azimuth_deg + 90)
-    return np.array([np.cos(turn), np.sin(turn), 0.0])
+    tips = touched + gesture.hover_mm * over.away[:, None, None] * shaft(gesture)
+    return tips, np.broadcast_to(shaft(gesture), touched.shape).copy()
 
 
 def shaft(gesture: Gesture) -> Floats:

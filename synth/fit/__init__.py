@@ -1,1 +1,1 @@
-"""Fitting a family of the job to one photograph, by the statistics of pictures."""
+"""The camera of one photograph, measured, and the family of the job that is nearest."""

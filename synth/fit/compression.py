@@ -16,7 +16,7 @@ from synth.render.camera import video
 _UNSEEN_DB = 46.0  # a loss below this is less than rounding to 8 bits of a noisy picture
 _BITRATES = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0)  # Mbit/s of a 640 x 480 video
 _VIDEO_PX = 640 * 480
-_SAMPLING = {0: "4:4:4", 1: "4:2:2", 2: "4:2:0"}
+_SAMPLING = ("4:4:4", "4:2:2", "4:2:0")
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class Compression:
     """JPEG's quantisation of light and colour, 64 steps each; empty: none."""
     chroma: str = "4:4:4"
     finer: float = 1.0
-    """Pixels of the file over those of the scale that is fitted at."""
+    """Pixels of the file over those of the scale that is measured at."""
 
     @classmethod
     def of_file(cls, data: bytes, finer: float) -> Compression:
@@ -35,9 +35,9 @@ class Compression:
         with Image.open(io.BytesIO(data)) as image:
             if not isinstance(image, JpegImagePlugin.JpegImageFile):
                 return cls(finer=finer)
-            sampling = JpegImagePlugin.get_sampling(image)
+            sampling = max(0, JpegImagePlugin.get_sampling(image))
             tables = tuple(tuple(int(v) for v in table) for table in image.quantization.values())
-            return cls(tables, _SAMPLING.get(sampling, "4:4:4"), finer)
+            return cls(tables, _SAMPLING[sampling], finer)
 
     def apply(self, rgb: Picture) -> Picture:
         """A picture (H, W, 3) packed so at the file's own size, and brought back."""
@@ -45,14 +45,11 @@ class Compression:
             return rgb
         height, width = rgb.shape[:2]
         size = (round(width * self.finer), round(height * self.finer))
-        large = rgb if size == (width, height) else cv2.resize(rgb, size, interpolation=cv2.INTER_CUBIC)
         packed = io.BytesIO()
-        sampling = {name: k for k, name in _SAMPLING.items()}[self.chroma]
+        large = Image.fromarray(cv2.resize(rgb, size, interpolation=cv2.INTER_CUBIC))
         tables = [list(table) for table in self.tables[:2]]
-        Image.fromarray(large).save(packed, "JPEG", qtables=tables, subsampling=sampling)
+        large.save(packed, "JPEG", qtables=tables, subsampling=_SAMPLING.index(self.chroma))
         back = np.asarray(Image.open(packed).convert("RGB"))
-        if size == (width, height):
-            return back
         return np.asarray(cv2.resize(back, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
 
     def bitrate_mbps(self, rgb: Picture) -> float | None:
@@ -61,20 +58,18 @@ class Compression:
         Args:
             rgb: (H, W, 3) a rendered frame that was not packed.
         """
-        if not self.tables:
-            return None
         lost = _ratio_db(rgb, self.apply(rgb))
         if lost > _UNSEEN_DB:
             return None
-        still = np.stack([rgb] * 5)
-        noise = np.random.default_rng(0).normal(0, 2, still.shape)
-        film = np.clip(still + noise, 0, 255).astype(np.uint8)
+        noise = np.random.default_rng(0).normal(0, 2, (5, *rgb.shape))
+        film = np.clip(rgb + noise, 0, 255).astype(np.uint8)
         share = rgb.shape[0] * rgb.shape[1] / _VIDEO_PX
         left = []
         for rate in _BITRATES:
             sensor = Sensor.model_validate({"bitrate_mbps": rate * share, "chroma": self.chroma})
             left.append(_ratio_db(film, video.recorded(film, sensor, 25.0)))
-        return float(np.exp(np.interp(lost, np.maximum.accumulate(left), np.log(_BITRATES))))
+        rate = float(np.exp(np.interp(lost, np.maximum.accumulate(left), np.log(_BITRATES))))
+        return float(f"{rate:.3g}")
 
 
 def _ratio_db(before: Picture, after: Picture) -> float:

@@ -1,133 +1,130 @@
-"""A photograph in, a family of the job out, with how near it came on anatomies that the fit has not seen."""
+"""A photograph in, a look out: the nearest family, and the camera that the photograph was taken with."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 
-from synth.fit import candidate, look_file, parameters
-from synth.fit.candidate import Setting
-from synth.fit.compression import Compression
-from synth.fit.photograph import read_photograph
-from synth.fit.search import Fitted, search
-from synth.fit.sheet import write_sheet
-from synth.fit.statistics import measure
-from synth.system.whole_file import write_whole
+from synth.fit.photograph import Photograph
+from synth.fit.statistics import Map, Mask, Picture, measure
+from synth.job.schema import Family, Job
+from synth.render.appearance.family import FAMILIES
+from synth.render.camera import camera, camera_sensor
+from synth.render.camera.camera_sensor import Sensor
+from synth.render.scene import Studio
+from synth.sequence import pipeline, scenario
 
-_UNSEEN = 1000  # first of the anatomies that distances are reported on
-_SHOWN = 2
+_LARGEST_MM, _SMALLEST_PX, _LARGEST_PX = 60.0, 160, 720
+_INSET_PX = 9  # from the opening's edge
+_ANATOMIES = 2
+# Green and blue over red in frames, against those of the reflectances they were rendered with.
+_SEEN_G, _SEEN_B = 0.825, 0.735
+_USUAL = Sensor()
+
+_TRIED: dict[str, tuple[tuple[float, ...], Callable[[float], dict[str, float]]]] = {
+    "vignette": ((0.0, 0.2, 0.4, 0.6, 0.8), lambda share: {"vignette": share}),
+    "noise": (
+        (0.3, 0.6, 1.0, 1.7, 3.0, 5.0, 8.0),
+        lambda k: {"full_well": _USUAL.full_well / k**2, "read_noise": _USUAL.read_noise / k},
+    ),
+    "sharpness": (
+        (-1.5, -0.7, 0.0, 0.5, 1.0, 2.0, 4.0),
+        lambda px: {"blur": max(px, 0.0), "sharpening": _USUAL.sharpening + max(-px, 0.0)},
+    ),
+}
+"""Of each figure: values that are tried, from less to more, and the sensor's keys that they stand for."""
 
 
 @dataclass(frozen=True)
-class Outcome:
-    """What a fit came to."""
+class Frame:
+    """A rendered frame before its sensor."""
 
-    fitted: Fitted
-    sections: dict[str, Any]
-    """Of the job."""
-    before: float
-    """Distance of a default job's frames from the photograph, on anatomies that the fit didn't see."""
-    after: float
-    photograph: dict[str, float]
-    """Its statistics."""
-    cortex_mm2: float
-    """That could be measured."""
+    radiance: Map
+    """(H, W, 3) linear."""
+    usable: Mask
+    """(H, W) tissue."""
+    sensor: Sensor
+    """Of its sequence."""
+
+    def record(self, keys: Mapping[str, Any]) -> Picture:
+        """The picture (H, W, 3) sRGB of the usual sensor with these keys, white-balanced as its own is."""
+        usual = replace(_USUAL, white=self.sensor.white, exposure=self.sensor.exposure)
+        return camera_sensor.record(self.radiance, replace(usual, **keys), np.random.default_rng(0))
 
 
-def fit_photograph(
-    photo: Path,
-    out: Path,
-    width_mm: float,
-    mask: Path | None,
-    sheet: Path | None,
-    rounds: int,
-    anatomies: int,
-    said: Callable[[int, float], None],
-) -> Outcome:
-    """Fits, and writes the job file and, if asked for, the picture before and after.
+def fit_camera(given: Photograph) -> dict[str, Any]:
+    """Sections of a job with the photograph's family and camera.
 
-    Args:
-        photo: the photograph.
-        out: the job file to write.
-        width_mm: what the photograph's width spans.
-        mask: of its cortex; found if not given.
-        sheet: picture to write.
-        rounds: of the search.
-        anatomies: rendered in each.
-        said: is told round and distance.
-
-    Raises:
-        UserError: the photograph or its mask can't be used, or a file can't be written.
+    Frames of a default job of that family are rendered as wide as the photograph, then recorded and packed
+    with rising vignette, noise and blur: those are taken with which they measure what the photograph does.
     """
-    given = read_photograph(photo, width_mm, mask)
-    theirs = measure(given.view)
-    scale = given.view.mm_per_px
-    fitted = search(theirs, Setting(scale, tuple(range(anatomies)), given.compression), rounds, said)
-    unseen = Setting(scale, tuple(range(_UNSEEN, _UNSEEN + anatomies)), Compression())
-    best = parameters.as_job(fitted.values, fitted.family)
-    before = [candidate.render({}, unseen, index, exact=False) for index in unseen.anatomies]
-    bare = [candidate.render(best, unseen, index) for index in unseen.anatomies]
-    after = [replace(view, rgb=given.compression.apply(view.rgb)) for view in bare]
-    made = look_file.sections(fitted, given.compression.chroma, given.compression.bitrate_mbps(bare[0].rgb))
-    found = Outcome(
-        fitted,
-        made,
-        parameters.distance(candidate.measured(before), theirs),
-        parameters.distance(candidate.measured(after), theirs),
-        theirs,
-        float(given.view.usable.sum()) * scale**2,
-    )
-    heading = [
-        f"Fitted to {photo.name} by synth fit, at {scale:.4f} mm a pixel, which blur and noise are of.",
-        f"Distance from it: {found.before:.2f} before, {found.after:.2f} after.",
-    ]
-    if sheet is not None:
-        write_sheet(sheet, given.view, before[:_SHOWN], after[:_SHOWN])
-    write_whole(out, look_file.text(fitted, made, heading))
-    return found
+    theirs = measure(given.rgb, given.usable, given.mm_per_px)
+    family = nearest_family(theirs)
+    widest = min(given.rgb.shape[1], _LARGEST_MM / given.mm_per_px)
+    width = int(np.clip(widest, _SMALLEST_PX, _LARGEST_PX)) // 4 * 4
+    frames = [render(family, width, given.mm_per_px, index) for index in range(_ANATOMIES)]
+    reach = width / given.rgb.shape[1]
+    keys: dict[str, float] = {}
 
+    def figure(name: str, tried: dict[str, float]) -> float:
+        camera_now = keys | tried
+        camera_now["vignette"] = camera_now.get("vignette", _USUAL.vignette) * reach**2
+        taken = [given.compression.apply(one.record(camera_now)) for one in frames]
+        told = [
+            measure(rgb, one.usable, given.mm_per_px, reach)[name]
+            for rgb, one in zip(taken, frames, strict=True)
+        ]
+        return float(np.mean(told))
 
-def summary(found: Outcome) -> list[str]:
-    """What a person is told."""
-    lines = [
-        f"{found.cortex_mm2:.0f} mm2 of cortex measured; nearest family {found.fitted.family}",
-        f"distance on anatomies that the fit didn't see: {found.before:.2f} before, {found.after:.2f} after",
-    ]
-    off = {
-        name: parameters.scaled(name, found.fitted.statistics[name]) - parameters.scaled(name, value)
-        for name, value in found.photograph.items()
-        if np.isfinite(value) and np.isfinite(found.fitted.statistics[name])
+    for name, (tried, as_keys) in _TRIED.items():
+        if np.isfinite(theirs[name]):
+            told = np.array([figure(name, as_keys(value)) for value in tried])
+            told = -told if name == "sharpness" else told
+            wanted = -theirs[name] if name == "sharpness" else theirs[name]
+            keys |= as_keys(float(np.interp(wanted, np.maximum.accumulate(told), tried)))
+    rate = given.compression.bitrate_mbps(frames[0].record(keys))
+    sensor: dict[str, Any] = {
+        {"blur": "blur_px"}.get(name, name): float(f"{value:.3g}") for name, value in keys.items()
     }
-    worst = sorted(off, key=lambda name: -abs(off[name]))[:4]
-    if found.fitted.undecided:
-        lines.append(
-            f"not decided by this picture, one standard deviation: {look_file.undecided(found.fitted)}"
+    for name in {"full_well", "read_noise", "sharpening"} & set(sensor):
+        sensor[name] = [sensor[name]] * 2
+    sensor |= {"chroma": given.compression.chroma} | ({} if rate is None else {"bitrate_mbps": rate})
+    sections = {"appearance": {"families": [family]}, "sensor": sensor}
+    Job.model_validate(sections)
+    return sections
+
+
+def nearest_family(theirs: dict[str, float]) -> Family:
+    """The family whose tissue has most nearly the photograph's ratios of colours."""
+
+    def off(family: Family) -> float:
+        r, g, b = np.add(FAMILIES[family].crown, FAMILIES[family].flush)
+        return float(
+            np.hypot(np.log(_SEEN_G * g / r / theirs["green"]), np.log(_SEEN_B * b / r / theirs["blue"]))
         )
-    lines.append("farthest off: " + ", ".join(f"{name} {off[name]:+.2f}" for name in worst))
-    return lines
+
+    return min(FAMILIES, key=off)
 
 
-def as_dict(found: Outcome) -> dict[str, Any]:
-    """The same for machines; what isn't known is null."""
-    return {
-        "family": found.fitted.family,
-        "before": found.before,
-        "after": found.after,
-        "cortex_mm2": found.cortex_mm2,
-        "parameters": found.fitted.values,
-        "not_seen": list(found.fitted.left),
-        "at_a_limit": list(found.fitted.bounded),
-        "standard_deviations": found.fitted.unsure,
-        "not_decided": list(found.fitted.undecided),
-        "photograph": _known(found.photograph),
-        "rendered": _known(found.fitted.statistics),
-        "job": found.sections,
-    }
-
-
-def _known(values: dict[str, float]) -> dict[str, float | None]:
-    return {name: value if np.isfinite(value) else None for name, value in values.items()}
+def render(family: Family, width: int, mm_per_px: float, index: int) -> Frame:
+    """A default frame without instruments: the anatomy, view and light of sequence `index`."""
+    field = width * mm_per_px
+    job = Job.model_validate(
+        {
+            "anatomy": {"vertices": 8000, "craniotomy": {"radius_mm": 0.56 * field}},
+            "appearance": {"families": [family]},
+            "render": {"size": [width, width * 3 // 4], "field_mm": field, "tilt_deg": [0, 8], "tool": False},
+        }
+    )
+    case = scenario.draw(job, index)
+    surface, _ = pipeline.cortex(job, case)
+    studio = Studio(surface, case.look, camera.place(case.view, job.render), job)
+    nowhere = np.zeros((2, 3))
+    radiance = studio.frame(surface.vertices, nowhere, nowhere, seed=index).radiance
+    tissue = studio.still.tissue.astype(np.uint8)
+    usable = cv2.erode(tissue, np.ones((_INSET_PX, _INSET_PX), np.uint8)) > 0
+    return Frame(radiance, usable, case.look.sensor)

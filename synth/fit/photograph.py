@@ -1,4 +1,4 @@
-"""A photograph of cortex at the scale that is fitted at, with what of it can be measured."""
+"""A photograph of cortex at the scale of a job's pictures, with what of it can be measured."""
 
 from __future__ import annotations
 
@@ -10,32 +10,40 @@ import numpy as np
 
 from synth.errors import UserError
 from synth.fit.compression import Compression
-from synth.fit.region import find_cortex
-from synth.fit.statistics import Mask, Picture, View
+from synth.fit.statistics import Mask, Picture
+from synth.flow import mask as found_mask
 from synth.job.schema import Render
-from synth.system import foreign_file, foreign_picture
+from synth.system import checked_file
 
 _SMALLEST_PX = 160
-_LEAST_MM2 = 60.0  # of cortex: less holds no web of vessels
+_LEAST_MM2 = 60.0  # of cortex
+_SIDE_PX = 240  # of the small picture that the outline is found in
+_MIDDLE = 0.6  # squared radius of the ellipse that is taken for cortex at first, half sides are 1
+_BLACK_L = 20.0
+_BLOODY = 0.42  # green over red (sRGB)
+_VESSEL_MM = 3.0  # no vessel is wider: what is bloody over more is something else
+_INSET = 0.008  # widths by which the outline is drawn in
 
 
 @dataclass(frozen=True)
 class Photograph:
-    """What a fit is made to."""
+    """What a look is measured in."""
 
-    view: View
-    """The part that holds cortex."""
+    rgb: Picture
+    """(H, W, 3) sRGB."""
+    usable: Mask
+    """(H, W) cortex, without instruments."""
+    mm_per_px: float
     compression: Compression
 
-
-def usual_mm_per_px() -> float:
-    """Scale of a default job's pictures at the craniotomy."""
-    usual = Render()
-    return sum(usual.field_mm) / 2 / usual.size[0]
+    @property
+    def cortex_mm2(self) -> float:
+        """Area that can be measured."""
+        return float(self.usable.sum()) * self.mm_per_px**2
 
 
 def read_photograph(path: Path, width_mm: float, mask: Path | None) -> Photograph:
-    """The photograph at the scale of a job's pictures, or at its own where that is coarser.
+    """The photograph at the scale of a default job's pictures, or at its own where that is coarser.
 
     Args:
         path: a picture file.
@@ -45,51 +53,68 @@ def read_photograph(path: Path, width_mm: float, mask: Path | None) -> Photograp
     Raises:
         UserError: it is no picture, too small, or shows too little cortex.
     """
-    rgb = _picture(path)
-    own = width_mm / rgb.shape[1]
+    rgb = np.ascontiguousarray(np.asarray(checked_file.read_picture(path), np.uint8)[..., ::-1])
     if min(rgb.shape[:2]) < _SMALLEST_PX:
-        raise UserError(
-            f"{path}: {rgb.shape[1]} x {rgb.shape[0]} pixels; at least {_SMALLEST_PX} each way are needed"
-        )
-    usable = find_cortex(rgb, own) if mask is None else _mask(mask, rgb)
-    finer = max(1.0, usual_mm_per_px() / own)
+        raise UserError(f"{path}: smaller than {_SMALLEST_PX} pixels")
+    own = width_mm / rgb.shape[1]
+    if mask is None:
+        usable = find_cortex(rgb, own)
+    else:
+        usable = np.asarray(checked_file.read_picture(mask, cv2.IMREAD_GRAYSCALE)) > 127
+        if usable.shape != rgb.shape[:2]:
+            raise UserError(f"{mask}: is of another size than the photograph")
+    usual = Render()
+    finer = max(1.0, sum(usual.field_mm) / 2 / usual.size[0] / own)
     if finer > 1.02:
-        rgb = np.asarray(
-            cv2.resize(rgb, None, fx=1 / finer, fy=1 / finer, interpolation=cv2.INTER_AREA), np.uint8
-        )
-        small = cv2.resize(usable.astype(np.float32), rgb.shape[1::-1], interpolation=cv2.INTER_AREA)
-        usable = np.asarray(small > 0.99)
+        small = {"dsize": None, "fx": 1 / finer, "fy": 1 / finer, "interpolation": cv2.INTER_AREA}
+        rgb = np.asarray(cv2.resize(rgb, **small), np.uint8)
+        usable = np.asarray(cv2.resize(usable.astype(np.float32), **small) > 0.99)
     else:
         finer = 1.0
-    scale = own * finer
-    area = float(usable.sum()) * scale**2
-    if area < _LEAST_MM2:
-        advice = "mark it with --mask" if mask is None else "the mask leaves too little"
+    data = checked_file.read_bytes(path, checked_file.LARGEST_PICTURE)
+    found = Photograph(rgb, usable, own * finer, Compression.of_file(data, finer))
+    if found.cortex_mm2 < _LEAST_MM2:
         raise UserError(
-            f"{path}: {area:.0f} mm2 of cortex in a width of {width_mm:g} mm, {_LEAST_MM2:g} are needed; "
-            f"{advice}, or say with --width-mm what the picture spans"
+            f"{path}: {found.cortex_mm2:.0f} mm2 of cortex in a width of {width_mm:g} mm, {_LEAST_MM2:g} are "
+            "needed; mark it with --mask, or say with --width-mm what the picture spans"
         )
-    data = foreign_file.read_bytes(path, foreign_file.LARGEST_PICTURE)
-    return Photograph(_cut(View.whole(rgb, usable, scale)), Compression.of_file(data, finer))
+    return found
 
 
-def _picture(path: Path) -> Picture:
-    """(H, W, 3) sRGB."""
-    return np.ascontiguousarray(np.asarray(foreign_picture.read_picture(path), np.uint8)[..., ::-1])
+def find_cortex(rgb: Picture, mm_per_px: float) -> Mask:
+    """(H, W): the exposed cortex, without instruments and dark border.
 
+    What is like the middle of the picture and not like its edge (C. Rother et al., "GrabCut", 2004), less
+    what is black, blue, soaked with blood or found to be an instrument.
 
-def _mask(path: Path, rgb: Picture) -> Mask:
-    drawn = np.asarray(foreign_picture.read_picture(path, cv2.IMREAD_GRAYSCALE))
-    if drawn.shape != rgb.shape[:2]:
-        raise UserError(
-            f"{path}: is {drawn.shape[1]} x {drawn.shape[0]} pixels, "
-            f"the photograph {rgb.shape[1]} x {rgb.shape[0]}"
-        )
-    return np.asarray(drawn > 127)
-
-
-def _cut(view: View) -> View:
-    """The view without what lies outside the cortex's box."""
-    rows, columns = (np.flatnonzero(view.usable.any(axis=axis)) for axis in (1, 0))
-    box = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
-    return View(view.rgb[box].copy(), view.usable[box].copy(), view.mm_per_px, view.corner2[box].copy())
+    Args:
+        rgb: (H, W, 3) sRGB.
+        mm_per_px: its scale.
+    """
+    height, width = rgb.shape[:2]
+    scale = min(1.0, _SIDE_PX / max(height, width))
+    small = cv2.medianBlur(cv2.resize(rgb, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), 5)
+    finer = min(1.0, 3 * scale)
+    larger = cv2.resize(rgb, None, fx=finer, fy=finer, interpolation=cv2.INTER_AREA)
+    tool = found_mask.tool(larger).astype(np.uint8)
+    side = 2 * max(1, round(_VESSEL_MM / mm_per_px * scale / 2)) + 1
+    wide = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
+    lab = cv2.cvtColor(small.astype(np.float32) / 255, cv2.COLOR_RGB2LAB)
+    red, green, blue = (small[..., k].astype(np.float32) for k in range(3))
+    bloody = cv2.morphologyEx((green < _BLOODY * red).astype(np.uint8), cv2.MORPH_OPEN, wide) > 0
+    never = (lab[..., 0] < _BLACK_L) | (blue > 1.1 * red) | bloody
+    never |= cv2.resize(tool, small.shape[1::-1]) > 0
+    y, x = np.mgrid[: small.shape[0], : small.shape[1]] / np.array(small.shape[:2])[:, None, None] * 2 - 1
+    middle = x**2 + y**2 < _MIDDLE
+    if not (middle & ~never).any():
+        return np.zeros((height, width), bool)
+    label = np.where(middle, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
+    label[never] = cv2.GC_BGD
+    cv2.setRNGSeed(1)  # of the colour clusters' first guess
+    models = np.zeros((1, 65)), np.zeros((1, 65))
+    cv2.grabCut(np.ascontiguousarray(small[..., ::-1]), label, None, *models, 6, cv2.GC_INIT_WITH_MASK)
+    found = ((label == cv2.GC_PR_FGD) & ~never).astype(np.uint8)
+    inset = 2 * max(1, round(_INSET * small.shape[1])) + 1
+    found = cv2.erode(found, np.ones((inset, inset), np.uint8), borderValue=1)
+    whole, off = (cv2.resize(one, (width, height)) > 0 for one in (found, tool))
+    return np.asarray(whole & ~off)

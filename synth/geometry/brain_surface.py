@@ -14,11 +14,12 @@ from synth.errors import UserError
 from synth.geometry import vtk
 from synth.job import identity
 from synth.job.schema import Attachment, Craniotomy
-from synth.system import foreign_file
+from synth.system import checked_file
 
 Floats = NDArray[np.float64]
 
-_KINDS = ("obj", "stl", "ply", "off", "vtk")
+KINDS = ("obj", "stl", "ply", "off", "vtk")
+"""Endings of the files that are read."""
 
 
 @dataclass(frozen=True)
@@ -110,10 +111,10 @@ def _heights(vertices: Floats, faces: NDArray[np.int64]) -> Floats:
 
 def _read(path: Path) -> tuple[Floats, NDArray[np.int64]]:
     kind = path.suffix.lower().removeprefix(".")
-    if kind not in _KINDS:
-        raise UserError(f"anatomy.mesh: {path.name} is none of {', '.join(_KINDS)}")
+    if kind not in KINDS:
+        raise UserError(f"anatomy.mesh: {path.name} is none of {', '.join(KINDS)}")
     try:
-        data = foreign_file.read_bytes(path, identity.FILES["anatomy", "mesh"])
+        data = checked_file.read_bytes(path, identity.FILES["anatomy", "mesh"])
     except UserError as error:
         raise UserError(f"anatomy.mesh: {error}") from None
     import trimesh  # here: a tenth of what a worker imports, and most jobs have no such file

@@ -7,12 +7,13 @@ import json
 from pathlib import Path
 from typing import Any
 
+from synth.job import retired
 from synth.job.schema import Job
-from synth.system import foreign_file
+from synth.system import checked_file
 
 FILES: dict[tuple[str | int, ...], int] = {
     ("anatomy", "mesh"): 1 << 30,
-    ("appearance", "photo"): foreign_file.LARGEST_PICTURE,
+    ("appearance", "photo"): checked_file.LARGEST_PICTURE,
     ("render", "calibration"): 1 << 20,
 }
 """Paths in a job, as places in it, and the bytes that such a file may have."""
@@ -29,7 +30,8 @@ def identify_job(job: Job) -> str:
     Files count by content and not by path, and what the card says does not count. Nor does the number of
     sequences: sequence 3 is the same in a dataset of 24 and of 48, so a dataset can be extended.
     """
-    described = job.model_dump(mode="json", exclude={"sequences", "card"})
+    described = retired.restore(job.model_dump(mode="json"), retired.JOB)
+    del described["sequences"], described["card"]
     if not job.render.stereo_mm:
         del described["flow"]["stereo"]  # says nothing of one eye's sequences
     if not job.fem.crew:
@@ -61,5 +63,5 @@ def identify_opening(job: Job, anatomy: int) -> str | None:
 def _digest(path: Path | None, largest: int) -> str | None:
     if path is None:
         return None
-    with foreign_file.open_file(path, largest) as file:
+    with checked_file.open_file(path, largest) as file:
         return hashlib.file_digest(file, lambda: hashlib.blake2b(digest_size=16)).hexdigest()

@@ -30,7 +30,7 @@ class Law(Protocol):
         Args:
             f: (n, 3, 3) deformation gradients; J = det F may be negative while a solution is searched.
             mu: Lame's mu [kPa]; at rest the law is Hooke's of mu and lam.
-            lam: Lame's lambda [kPa], or what of it acts at points: see `fem.volume`.
+            lam: Lame's lambda [kPa], or what of it acts at points: most acts on elements' means.
 
         Returns:
             (n,) kPa, infinite where the law has no value, and (n, 3, 3) kPa, its derivative by F.

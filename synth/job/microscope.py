@@ -29,14 +29,10 @@ class Light(Section):
     """Angle between main lamp and optical axis, 0-40, to any side. Empty: at most 6.5, as `glare` asks."""
     main: ShareRange = (0.5, 0.68)
     """Share of light from the main lamp; the rest comes from one across the lens."""
-    power: PositiveRange = (0.95, 1.1)
-    """Illumination, against one that just fills the sensor with white."""
     kelvin: LightKelvin = (4200.0, 5600.0)
     """Colour temperature [K], 2000-12000."""
     even: PositiveRange = (0.35, 0.5)
     """Radius of the evenly lit spot, in widths of the field; beyond it the light falls off."""
-    drift: ShareRange = (0.0, 0.03)
-    """Largest change of power over the sequence, as a share of it."""
 
 
 class Sensor(Section):
@@ -58,16 +54,12 @@ class Sensor(Section):
     """Unsharp mask, as a share of the detail."""
     bayer: bool = False
     """One colour a pixel (RGGB), the others interpolated; else three chips."""
-    depth: Literal[8, 10] = 8
-    """Bits of a channel in the H.264 stream; the stored picture has 8."""
     chroma: Literal["4:4:4", "4:2:2", "4:2:0"] = "4:4:4"
-    """Colour resolution on that way: full, half across, half across and down."""
+    """Colour resolution in the video stream: full, half across, half across and down."""
     bitrate_mbps: Positive | None = None
-    """H.264 on that way at so many megabits a second. Empty: not compressed."""
+    """H.264 on the way to the recorder at so many megabits a second. Empty: not compressed."""
     shutter: Share = 0.0
-    """Part of the time between frames in which light is gathered: motion blur."""
-    subframes: Annotated[int, Field(ge=2, le=32)] = 4
-    """Pictures that make up a blurred one; the cost of a frame grows with them."""
+    """Part of the time between frames in which light is gathered: motion blur, of four pictures each."""
 
 
 class Render(Section):
@@ -95,11 +87,9 @@ class Render(Section):
         0.0,
     )
     """Brown-Conrady k1, k2, p1, p2, k3."""
-    off_centre: ShareRange = (0.0, 0.0)
-    """How far the principal point is from the middle, in widths of the picture, to any side."""
     calibration: Path | None = None
     """Calibration of a camera as OpenCV writes it (YAML, XML, JSON), relative to the job file; it takes the
-    place of field_mm, distortion and off_centre."""
+    place of field_mm and distortion, and sets the principal point."""
     drift_mm: NonNegativeRange = (0.0, 0.0)
     """Slow drift of the microscope over some seconds [mm]; it is part of the flow."""
     vibration_mm: NonNegativeRange = (0.0, 0.0)
@@ -107,8 +97,6 @@ class Render(Section):
     stereo_mm: NonNegative = 0.0
     """Distance of a second lens to the right [mm], for a stereo dataset: its pictures, and motion in three
     dimensions, true and recovered; 0: there is none."""
-    subsurface: Literal["blur", "volume"] = "blur"
-    """How light spreads in tissue: by a blurred albedo, or followed through a volume (a reference: slow)."""
     exr: bool = False
     """Also write the linear radiance of every frame as EXR."""
     tool: bool = True

@@ -16,9 +16,9 @@ from pydantic import BaseModel, ValidationError
 from ruamel.yaml.comments import CommentedMap, CommentedSeq
 
 from synth.errors import UserError
-from synth.job import identity
+from synth.job import identity, retired
 from synth.job.schema import Job
-from synth.system import foreign_file, foreign_yaml
+from synth.system import checked_file
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -77,18 +77,23 @@ def read_source(source: str) -> tuple[str, str, Path]:
         close = difflib.get_close_matches(source[:_LONG], names(), 1)
         hint = f"did you mean '{close[0]}'?" if close else f"nor a job called so ({', '.join(names())})"
         raise UserError(f"{_cut(source)}: no such file; {hint}")
-    text = foreign_file.read_text(Path(source), foreign_yaml.LARGEST_BYTES)
+    text = checked_file.read_text(Path(source), checked_file.LARGEST_YAML)
     return text, source, Path(source).resolve().parent
 
 
 def parse_job(text: str, label: str, folder: Path, overrides: Sequence[str] = ()) -> Job:
     """The job in `text`; `label` names it in messages and its relative paths start at `folder`."""
-    written = foreign_yaml.load(text, label)
+    written = checked_file.load_yaml(text, label)
     if not isinstance(written, CommentedMap):
         raise UserError(f"{label}:1:1: a job is a block of `key: value` lines")
-    values = foreign_yaml.plain(written, label)
+    values = checked_file.plain_yaml(written, label)
     given = _apply(values, overrides)
+    values, gone = retired.drop(values, retired.JOB)
     problems = []
+    for key, value in gone.items():
+        problems.append(
+            (*_place(written, tuple(key.split(".")), label, given, key=True), retired.reason(key, value))
+        )
     for at, largest in identity.FILES.items():
         base = Path.cwd() if at in given else folder
         what = _resolve(values, at, base, largest)
@@ -150,7 +155,8 @@ def _apply(values: dict[Any, Any], overrides: Iterable[str]) -> dict[Loc, str]:
                 block[key] = {}
             block = block[key]
         label = _cut(text)
-        block[at[-1]] = foreign_yaml.plain(foreign_yaml.load(value, label), label) if value.strip() else None
+        tree = checked_file.load_yaml(value, label) if value.strip() else None
+        block[at[-1]] = checked_file.plain_yaml(tree, label)
         given[at] = text
     return given
 
@@ -164,7 +170,7 @@ def _resolve(values: dict[Any, Any], at: Loc, base: Path, largest: int) -> str:
         return ""
     try:
         path = (base / Path(block[at[-1]]).expanduser()).resolve()
-        foreign_file.check_file(path, largest)
+        checked_file.check_file(path, largest)
     except UserError as error:
         return str(error)
     except (RuntimeError, ValueError, OSError):  # nobody's home, a NUL, a circle of links, too long a name

@@ -15,15 +15,13 @@ from synth.flow.estimator import names
 from synth.job import law_plugins
 from synth.job.instrument import CLEAR_MM, Kind
 from synth.job.instrument import Instrument as Instrument
-from synth.job.law_limits import RIGID_GESTURES, choose, depth_of_load, load_of_depth
+from synth.job.law_limits import choose
 from synth.job.law_plugins import largest_load
 from synth.job.microscope import Light as Light
 from synth.job.microscope import Render as Render
 from synth.job.microscope import Sensor as Sensor
 from synth.job.types import (
-    Colour,
     InstrumentRange,
-    NonNegative,
     NonNegativeRange,
     PoissonRange,
     Positive,
@@ -31,7 +29,6 @@ from synth.job.types import (
     Section,
     Share,
     ShareRange,
-    StretchRange,
     Vector,
 )
 
@@ -60,8 +57,6 @@ class Craniotomy(Section):
     """Outward direction of the opening, in the mesh's own axes; normalised. Needed with `anatomy.mesh`."""
     radius_mm: Positive = 12.0
     """Radius of the opening [mm]."""
-    rim_mm: Positive = 3.0
-    """Width over which the rim's hold on the brain grows from none to firm [mm]."""
     also: Annotated[tuple[Place, ...], Field(max_length=100)] = ()
     """Further places on the same mesh, each with point and direction: anatomies take them in turn, the first
     being `point`. `learn train` can then tell openings apart, though not brains."""
@@ -98,11 +93,9 @@ class Anatomy(Section):
     """The brain: a procedural block, or a user's surface."""
 
     mesh: Path | None = None
-    """Surface of a brain (OBJ, STL, PLY or VTK, mm); relative to the job file. Empty: procedural block."""
+    """Surface of a brain (OBJ, STL, PLY or VTK, mm); relative to the job file. Empty: a procedural block."""
     variety: Annotated[int, Field(ge=1)] | None = None
     """Number of distinct anatomies in the dataset. Empty: every sequence has its own."""
-    block_mm: tuple[Positive, Positive, Positive] = (100.0, 100.0, 60.0)
-    """Procedural block: width, height, depth [mm]. Below 70 mm the fixed walls take 10-16% of the peak."""
     dome_mm: Positive = 70.0
     """Procedural block: radius of curvature of the brain surface [mm]."""
     gyrus_mm: PositiveRange = (10.0, 15.0)
@@ -111,10 +104,6 @@ class Anatomy(Section):
     """Procedural relief: depth of the sulci as seen from outside [mm]."""
     vertices: Annotated[int, Field(ge=400, le=400_000)] = 40_000
     """Vertices of the fine surface that is loaded, moved and rendered."""
-    vessel_density: Annotated[FiniteFloat, Field(ge=0.3, le=3)] = 1.0
-    """Length of the vessels on an area, against the usual."""
-    vessel_calibre: Annotated[FiniteFloat, Field(ge=0.2, le=4)] = 1.0
-    """Radii of the vessels, against the usual."""
     craniotomy: Craniotomy = Craniotomy()
     """Where the skull is open."""
     attachments: tuple[Attachment, ...] = ()
@@ -143,37 +132,11 @@ class Anatomy(Section):
 Family = Literal["healthy", "hyperaemic", "pale", "oedematous", "calf"]
 
 
-class Own(Section):
-    """A family of your own: each key that is given takes the place of the family's value. Default: none.
-
-    `synth fit` writes it from a photograph. Colours are linear RGB, and vary a little between sequences.
-    """
-
-    crown: Colour | None = None
-    """Reflectance of the gyri's crowns."""
-    flush: Colour | None = None
-    """Reflectance where more blood shines through."""
-    vein: Colour | None = None
-    """Reflectance of a thick vein along its crest."""
-    wine: Colour | None = None
-    """Reflectance of a thick vein at its sides."""
-    arterial: NonNegativeRange | None = None
-    """Strength of the arteries' red; healthy: 1.1-1.5."""
-    capillary: NonNegativeRange | None = None
-    """Strength of the vessels that shimmer through the tissue; healthy: 1.4-2.2."""
-    shade: NonNegativeRange | None = None
-    """Darkening of the sulci; healthy: 0.3-0.6."""
-    film_mm: PositiveRange | None = None
-    """Width of what the wet film evens out [mm]; healthy: 0.035-0.06."""
-
-
 class Appearance(Section):
     """How the surface looks."""
 
     families: tuple[Family, ...] = ("healthy",)
     """Appearance families that sequences are drawn from, in equal shares."""
-    own: Own = Own()
-    """A family of your own, on top of the named ones."""
     photo: Path | None = None
     """A photograph used as albedo, relative to the job file. Empty: procedural vessels and parenchyma."""
     cottonoid: Share = 0.2
@@ -200,9 +163,6 @@ class Membrane(Section):
     the toe of the curve it is thousands (ovine 7,700: Fluids Barriers CNS 17, 2020)."""
     thickness_mm: PositiveRange = (0.05, 0.2)
     """Its thickness [mm], drawn uniformly. What counts is thickness times modulus."""
-    stretch: StretchRange = (1.01, 1.03)
-    """How far it is stretched at rest, drawn uniformly. Not from a measurement: its pull then balances a
-    pressure of 3-350 Pa (at most 2.6 mmHg) under a dome of 70 mm radius, which a living head has."""
 
 
 class Pulse(Section):
@@ -236,9 +196,8 @@ class Demand:
     """How hard an instrument may load tissue: the ranges that count for it."""
 
     load: tuple[float, float]
-    """P = F/(E a^2), where neither force nor depth is given."""
+    """P = F/(E a^2), where no force is given."""
     force_mn: tuple[float, float] | None
-    depth_mm: tuple[float, float] | None
     footprint_mm: tuple[float, float]
 
 
@@ -246,21 +205,14 @@ class Fem(Section):
     """The physics of the tissue and of the load."""
 
     law: Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]+$", max_length=100), AfterValidator(_law)] = "auto"
-    """Material law: linear, corotational, stable, neo-hookean or an installed plug-in's; auto takes the
-    cheapest of ours whose error at the largest load is within `tolerance`."""
-    tolerance: Annotated[FiniteFloat, Field(gt=0, le=1)] = 0.05
-    """Error against neo-Hookean that `law: auto` accepts, as a part of the displacement."""
-    order: Literal[1, 2] = 2
-    """Polynomial order of the tetrahedra."""
+    """Material law: linear, corotational, neo-hookean or an installed plug-in's; auto takes the
+    cheapest of ours whose error against neo-Hookean at the largest load is within 5%."""
     tets: Annotated[int, Field(ge=100, le=200_000)] = 1600
-    """Number of tetrahedra to aim for; graded towards the craniotomy."""
+    """Number of quadratic tetrahedra to aim for; graded towards the craniotomy."""
     young_kpa: PositiveRange = (0.5, 3.0)
     """Young's modulus E [kPa], drawn log-uniformly."""
     poisson: PoissonRange = (0.4, 0.4)
     """Poisson's ratio, drawn uniformly. Brain within seconds: 0.45 to nearly 0.5; drained: less."""
-    volume: Literal["auto", "pointwise", "averaged"] = "auto"
-    """Where elements resist a change of volume: at every point, or in their mean, without which quadratic
-    ones move too little aside from a press; auto averages those and leaves linear ones as they are."""
     skull: Skulls = ("bonded",)
     """How tissue is held round the opening, one or both, in equal shares: bonded to the skull, or free to
     slip along it (subarachnoid fluid)."""
@@ -283,15 +235,6 @@ class Fem(Section):
         "tap",
     )
     """Kinds of gesture that sequences are drawn from, in equal shares."""
-    contact: Literal["traction", "rigid"] = "traction"
-    """What loads tissue: a given traction or, for push, slide and tap, a rigid tip that presses and rubs."""
-    tip: Literal["flat", "sphere"] = "flat"
-    """Rigid contact: a flat end of radius a, its edge rounded by a / 4, or a sphere of radius 2 a."""
-    friction: Annotated[FiniteFloat, Field(ge=0, le=1)] = 0.2
-    """Rigid contact: Coulomb's coefficient; 0.09-0.20, brain on metal (Rashid et al., J. Mech. Behav. Biomed.
-    Mater. 14, 2012)."""
-    depth_mm: PositiveRange | None = None
-    """Rigid contact: peak depth of the tip below first touch [mm]; given, it takes the place of `load`."""
     instruments: InstrumentRange = (1, 1)
     """How many instruments act at once, each with a gesture, load, direction and timing of its own."""
     crew: Annotated[tuple[Instrument, ...], Field(max_length=3)] = ()
@@ -300,20 +243,12 @@ class Fem(Section):
     within_mm: Positive | None = None
     """What is loaded keeps within this radius of the opening's middle [mm], such as what the camera sees of a
     wide opening; a `crew`'s places count as they are. Empty: anywhere in the opening."""
-    ramp: PositiveRange = (0.25, 0.35)
-    """Time in which the load grows to its peak, as a part of the sequence."""
     cone_deg: Annotated[FiniteFloat, Field(ge=0, le=80)] = 65.0
     """The load's direction is drawn uniformly within this angle of the surface normal."""
     time: Literal["quasi-static", "dynamic"] = "quasi-static"
     """Equilibrium in every frame, or motion with inertia (backward Euler)."""
-    dt_s: Annotated[FiniteFloat, Field(gt=0, le=1)] = 0.03
-    """Dynamic: longest time step [s]; a frame holds a whole number of steps."""
-    density_kg_m3: Positive = 1040.0
-    """Dynamic: density [kg/m3]; of grey and white matter by Barber et al., Acta Neurol. Scand. 46, 1970."""
     mass_kg: Positive | None = None
-    """Dynamic: mass of the whole volume [kg]; given, it takes the place of `density_kg_m3`."""
-    damping: NonNegative = 2.0
-    """Dynamic: damping by mass [1/s]."""
+    """Dynamic: mass of the whole volume [kg]. Empty: 1040 kg/m3."""
     relaxation: Annotated[
         tuple[tuple[Annotated[FiniteFloat, Field(gt=0, lt=1)], Positive], ...], Field(max_length=2)
     ] = ()
@@ -323,29 +258,6 @@ class Fem(Section):
     def _some_stiffness_stays(self) -> Fem:
         if sum(part for part, _ in self.relaxation) >= 1:
             raise ValueError("relaxation: the parts lost add up to the whole stiffness or more")
-        return self
-
-    @model_validator(mode="after")
-    def _rigid_contact_is_possible(self) -> Fem:
-        if self.contact == "traction":
-            if self.depth_mm is not None:
-                raise ValueError("depth_mm needs contact: rigid")
-            return self
-        if self.time != "quasi-static" or self.relaxation:
-            raise ValueError("contact: rigid is for quasi-static tissue without relaxation")
-        if not self.kinds & set(RIGID_GESTURES):
-            raise ValueError(f"contact: rigid is for {', '.join(RIGID_GESTURES)}; name one in gestures")
-        forced = self.force_mn is not None or any(one.force_mn for one in self.crew)
-        if self.depth_mm is not None and (forced or self.kinds - set(RIGID_GESTURES)):
-            raise ValueError(f"depth_mm is for {', '.join(RIGID_GESTURES)} alone, without force_mn")
-        for k, one in enumerate(self.crew):
-            if one.direction is None or one.gesture not in ("push", "tap"):
-                continue
-            if -one.direction[2] * math.hypot(1, self.friction) < math.hypot(*one.direction) * (1 - 1e-9):
-                raise ValueError(
-                    f"crew[{k}].direction: a rigid tip would slip off; at most "
-                    f"{math.degrees(math.atan(self.friction)):.3g} degrees from straight down"
-                )
         return self
 
     @model_validator(mode="after")
@@ -361,13 +273,6 @@ class Fem(Section):
     def _past_range(self, one: Demand, law: str, largest: float) -> str:
         """What is wrong with a demand, if it is past what the law holds for."""
         load = self._largest(one)
-        if one.depth_mm is not None and load > largest:
-            depth = depth_of_load(self.tip, largest, self.poisson[1]) * one.footprint_mm[0]
-            return (
-                f"depth_mm {one.depth_mm[1]:g} under the smallest contact ({one.footprint_mm[0]:g} mm) "
-                f"takes a load of {load:.3g}, past the range of the {law} law; the largest valid value is "
-                f"{depth:.3g}"
-            )
         if one.force_mn is None and load > largest:
             return f"load {load:g} is past the range of the {law} law; the largest valid value is {largest:g}"
         if one.force_mn is not None and load > largest * (1 + 1e-9):
@@ -383,8 +288,8 @@ class Fem(Section):
         """The ranges that count for an instrument: its own where it says so."""
         footprint = asked.footprint_mm or self.footprint_mm
         if asked.load or asked.force_mn:
-            return Demand(asked.load or self.load, asked.force_mn, None, footprint)
-        return Demand(self.load, self.force_mn, self.depth_mm, footprint)
+            return Demand(asked.load or self.load, asked.force_mn, footprint)
+        return Demand(self.load, self.force_mn, footprint)
 
     @property
     def _demands(self) -> list[tuple[str, Demand]]:
@@ -393,29 +298,16 @@ class Fem(Section):
         return drawn + [(f"crew[{k}]: ", self.demand(one)) for k, one in enumerate(self.crew)]
 
     def _largest(self, one: Demand) -> float:
-        if one.depth_mm is not None:
-            return load_of_depth(self.tip, one.depth_mm[1] / one.footprint_mm[0], self.poisson[1])
         if one.force_mn is None:
             return one.load[1]
         return one.force_mn[1] / (self.young_kpa[0] * one.footprint_mm[0] ** 2)
-
-    @property
-    def kinds(self) -> set[str]:
-        """Gestures that can occur."""
-        drawn = self.instruments[1] > len(self.crew) or any(one.gesture is None for one in self.crew)
-        return {one.gesture for one in self.crew if one.gesture} | (set(self.gestures) if drawn else set())
-
-    @property
-    def averages_volume(self) -> bool:
-        """Whether elements resist their mean change of volume."""
-        return self.volume == "averaged" or (self.volume == "auto" and self.order == 2)
 
     @property
     def chosen_law(self) -> tuple[str, str]:
         """The material law of every sequence, and why."""
         if self.law == "auto" and self.membrane.intact > 0:
             return "neo-hookean", "a membrane stretches as it bends, which the linear law leaves out"
-        return choose(self.law, self.largest_load, self.tolerance)
+        return choose(self.law, self.largest_load)
 
     @property
     def largest_load(self) -> float:
@@ -437,9 +329,6 @@ class Flow(Section):
     """Estimator: tvl1, opencv-tvl1, dis or an installed plug-in's; `ideal` computes no recovered flow."""
     warps: Annotated[int, Field(ge=1, le=12)] = 3
     """tvl1: linearisations a level of a frame that starts from the one before; twice as many from nothing."""
-    stereo: Literal["joint", "fused", "none"] = "joint"
-    """With `render.stereo_mm`: motion in three dimensions from both eyes' pictures at once (joint), from a
-    flow in each eye (fused), or not recovered."""
 
 
 def _known(names: tuple[str, ...], known: tuple[str, ...]) -> tuple[str, ...]:
@@ -452,7 +341,7 @@ def _known(names: tuple[str, ...], known: tuple[str, ...]) -> tuple[str, ...]:
 
 
 class Store(Section):
-    """What is kept of every sequence. `synth fields` lists the fields and what they take."""
+    """What is kept of every sequence. `synth schema --fields` lists the fields and what they take."""
 
     extra: Annotated[tuple[str, ...], AfterValidator(lambda names: _known(names, fields.EXTRA))] = ()
     """Fields to keep besides the usual ones."""
@@ -461,27 +350,6 @@ class Store(Section):
     flow_right, visible_right, depth_right."""
     flow: Literal["float32", "float16"] = "float32"
     """Type of both flows stored; float16 rounds motion below 16 px by at most 0.004 px, below 32 by 0.008."""
-
-
-class Labels(Section):
-    """Noise of the published method, in the fields `intensity` and `flow_noisy` alone; see `store.extra`."""
-
-    force_std_mn: NonNegative = 0.0
-    """First stage, on every label: standard deviation [mN] of its normal noise."""
-    force_share: NonNegative = 0.0
-    """The same as a part of the label's size, added to it."""
-    force_bias_mn: FiniteFloat = 0.0
-    """Added to every component of every label [mN]."""
-    outliers: Share = 0.0
-    """Part of the labels whose noise is `outlier_scale` times larger."""
-    outlier_scale: Positive = 10.0
-    """How much larger."""
-    noisy_frames: Share = 0.3
-    """Second stage: part of the frames that it disturbs."""
-    noisy_points: Share = 0.05
-    """Part of the tissue's pixels, away from the contact, that get displacement of their own and label 0."""
-    noisy_range: Share = 0.05
-    """That displacement's largest size, as a part of the frame's range of displacement."""
 
 
 class Card(Section):
@@ -522,7 +390,9 @@ class Job(Section):
     render: Render = Render()
     flow: Flow = Flow()
     store: Store = Store()
-    labels: Labels = Labels()
+    labels: Literal["published", "none"] = "none"
+    """Noise on the labels of the field `intensity`: the published method's first stage, or none, as its code
+    ships. Its second stage is in `intensity` and `flow_noisy` either way; see `store.extra`."""
     card: Card = Card()
 
     @model_validator(mode="after")
@@ -549,7 +419,7 @@ class Job(Section):
         """Names of the fields that its sequences hold."""
         recovered = self.flow.backend != "ideal"
         stereo = self.render.stereo_mm > 0
-        motion = stereo and recovered and self.flow.stereo != "none"
+        motion = stereo and recovered
         return fields.kept(
             self.store.extra, self.store.without, recovered=recovered, stereo=stereo, motion=motion
         )

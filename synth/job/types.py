@@ -42,12 +42,8 @@ _Tilt = Annotated[FiniteFloat, Field(ge=0, le=40)]
 LightTilt = Annotated[tuple[_Tilt, _Tilt], BeforeValidator(_pair), AfterValidator(_ordered)]
 _Kelvin = Annotated[FiniteFloat, Field(ge=2000, le=12_000)]
 LightKelvin = Annotated[tuple[_Kelvin, _Kelvin], BeforeValidator(_pair), AfterValidator(_ordered)]
-_Stretch = Annotated[FiniteFloat, Field(ge=1.005, le=1.2)]
-StretchRange = Annotated[tuple[_Stretch, _Stretch], BeforeValidator(_pair), AfterValidator(_ordered)]
 _Poisson = Annotated[FiniteFloat, Field(ge=0, lt=0.5)]
 PoissonRange = Annotated[tuple[_Poisson, _Poisson], BeforeValidator(_pair), AfterValidator(_ordered)]
-_Reflectance = Annotated[FiniteFloat, Field(ge=0.005, le=0.95)]
-Colour = tuple[_Reflectance, _Reflectance, _Reflectance]
 Vector = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
 
 

@@ -1,20 +1,23 @@
-"""A contact sheet of a job: one small frame of some of its scenarios, to judge it before paying for it."""
+"""A contact sheet of a job: some of its scenarios, and what the whole of it will cost."""
 
 from __future__ import annotations
 
 import itertools
+import shutil
+import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from synth.dataset import size_forecast
+from synth.dataset.store import open_sequence
 from synth.fem.tool import Gesture
 from synth.job.schema import Job
-from synth.publish import cost_probe
+from synth.publish.picture import Rgb, caption, tile
 from synth.render.anatomy.surface import Surface
 from synth.render.camera import camera
 from synth.render.scene import Studio
@@ -22,14 +25,15 @@ from synth.sequence import pipeline, scenario
 
 _TILE_PX = 320
 _OPENING_MM = 1.0  # two tips closer than this would be one
+_PROBES = 3  # sequences that are carried out in short, after one for what is compiled once
+_SHORT, _LONG = 3, 9  # frames: the difference is what a further frame takes
 
 
 @dataclass(frozen=True)
 class Sheet:
     """What a job looks like and what it will take."""
 
-    picture: NDArray[np.uint8]
-    """(H, W, 3)."""
+    picture: Rgb
     stages_cpu_s: dict[str, float]
     """Processor time of the whole job by stage, without what each worker takes to start."""
     disk_bytes: float
@@ -58,23 +62,20 @@ def draw_sheet(job: Job, count: int, report: Callable[[int, int], None] = lambda
     steps = itertools.count(1)
 
     def step() -> None:
-        report(next(steps), len(chosen) + cost_probe.PARTS)
+        report(next(steps), len(chosen) + _PROBES + 1)
 
     tiles = []
     for index in chosen:
         tiles.append(_frame(quick, int(index)))
         step()
-    columns = int(np.ceil(np.sqrt(len(tiles))))
-    tiles += [np.zeros_like(tiles[0])] * (-len(tiles) % columns)
-    rows = [np.hstack(tiles[k : k + columns]) for k in range(0, len(tiles), columns)]
     return Sheet(
-        picture=np.vstack(rows),
-        stages_cpu_s=cost_probe.measure_cost(job, step),
+        picture=tile(tiles),
+        stages_cpu_s=_measure_cost(job, step),
         disk_bytes=size_forecast.estimate(job) * job.sequences,
     )
 
 
-def _frame(job: Job, index: int) -> NDArray[np.uint8]:
+def _frame(job: Job, index: int) -> Rgb:
     """A scenario's picture (the left eye beside the right)."""
     case = scenario.draw(job, index)
     surface, _ = pipeline.cortex(job, case)
@@ -86,10 +87,7 @@ def _frame(job: Job, index: int) -> NDArray[np.uint8]:
     shot = studio.frame(surface.vertices, tips, shafts, seed)
     picture = shot.rgb if shot.rgb_right is None else np.hstack([shot.rgb, shot.rgb_right])
     label = f"{index}  {case.family}  {' + '.join(one.kind for one in gestures)}"
-    place, font = (6, job.render.size[1] - 8), cv2.FONT_HERSHEY_SIMPLEX
-    for colour, thick in (((0, 0, 0), 3), ((255, 255, 255), 1)):
-        cv2.putText(picture, label, place, font, 0.4, colour, thick, cv2.LINE_AA)
-    return picture
+    return caption(picture, label, job.render.size[1] - 8)
 
 
 def poised(gesture: Gesture, surface: Surface) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -100,3 +98,34 @@ def poised(gesture: Gesture, surface: Surface) -> tuple[NDArray[np.float64], NDA
     flat = np.asarray(gesture.point_mm) + np.stack([side, -side])
     height = surface.vertices[cKDTree(surface.vertices[:, :2]).query(flat)[1], 2]
     return np.concatenate([flat, height[:, None]], axis=1), np.stack([shaft, shaft])
+
+
+def _measure_cost(job: Job, step: Callable[[], None]) -> dict[str, float]:
+    """Processor time [s] of the whole job by stage, without what each worker takes to start.
+
+    A sequence's gesture is the same however many frames it is cut into, so a frame of a shorter one is as
+    dear, but for the larger step to it. `step` is called after each part.
+    """
+    chosen = np.unique(np.linspace(0, job.sequences - 1, _PROBES).round().astype(int)).tolist()
+    total: dict[str, float] = {}
+    with tempfile.TemporaryDirectory() as folder:
+        _stages(job, chosen[0], 2, folder)
+        step()
+        for index in chosen:
+            long = short = _stages(job, index, min(job.frames, _LONG), folder)
+            if job.frames > _LONG:
+                short = _stages(job, index, _SHORT, folder)
+            more = (job.frames - _LONG) / (_LONG - _SHORT)
+            for name, spent in long.items():
+                each = spent + max(more * (spent - short[name]), 0.0)
+                total[name] = total.get(name, 0.0) + job.sequences / len(chosen) * each
+            step()
+    return total
+
+
+def _stages(job: Job, index: int, frames: int, folder: str) -> dict[str, float]:
+    short = job.model_copy(update={"frames": frames})
+    path = pipeline.render_sequence(short, index, Path(folder), lambda stage, done, of: None)
+    timings = open_sequence(path).attrs["timings"]
+    shutil.rmtree(path)
+    return {name: stage["cpu_s"] for name, stage in timings.items() if isinstance(stage, dict)}

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -17,36 +16,14 @@ from synth.job.schema import Card, Job
 from synth.publish import card
 
 NAME = "croissant.json"
+_CONTEXT = (
+    Path(__file__).parent / "croissant_context.json"
+)  # as the specification gives it, and the prefix rai
 
-REQUIRED = (
-    "@context",
-    "@type",
-    "name",
-    "description",
-    "conformsTo",
-    "version",
-    "creator",
-    "license",
-    "url",
-    "datePublished",
-    "distribution",
-    "recordSet",
-    "rai:dataCollection",
-    "rai:dataCollectionType",
-    "rai:dataLimitations",
-    "rai:dataBiases",
-    "rai:dataUseCases",
-    "rai:personalSensitiveInformation",
-    "rai:dataAnnotationProtocol",
-    "rai:dataPreprocessingProtocol",
-)
-"""Keys that a description must have; public validators accept some of them missing."""
+STATED = {"creator": "authors", "license": "licence", "url": "url", "datePublished": "published"}
+"""What only a person can say, and the key of the job's `card` that says it."""
 
-_TYPES = {
-    pa.int64(): "sc:Integer",
-    pa.float64(): "sc:Float",
-    pa.string(): "sc:Text",
-}
+_TYPES = {pa.int64(): "sc:Integer", pa.float64(): "sc:Float", pa.string(): "sc:Text"}
 
 
 def write_croissant(folder: Folder) -> Path:
@@ -63,12 +40,9 @@ def describe(folder: Folder) -> dict[str, Any]:
     done = [row for row in rows if row["status"] == "done"]
     about = job.card
     return {
-        "@context": _CONTEXT,
+        "@context": json.loads(_CONTEXT.read_text("utf-8")),
         "@type": "sc:Dataset",
-        "conformsTo": [
-            "http://mlcommons.org/croissant/1.1",
-            "http://mlcommons.org/croissant/RAI/1.0",
-        ],
+        "conformsTo": ["http://mlcommons.org/croissant/1.1", "http://mlcommons.org/croissant/RAI/1.0"],
         "name": "".join(letter if letter.isalnum() else "-" for letter in about.title.lower()),
         "alternateName": about.title,
         "description": about.summary or _summary(job, len(done)),
@@ -93,20 +67,10 @@ def describe(folder: Folder) -> dict[str, Any]:
     }
 
 
-def missing(described: Mapping[str, Any]) -> list[str]:
-    """Required keys that are absent or empty."""
-    return [key for key in REQUIRED if not described.get(key)]
-
-
 def _stated(about: Card) -> dict[str, Any]:
-    """What only a person can say; what was not said is left out rather than made up."""
-    creators = [{"@type": "sc:Person", "name": name} for name in about.authors]
-    found = {
-        "creator": creators,
-        "license": about.licence,
-        "url": about.url,
-        "datePublished": about.published,
-    }
+    """What was not said is left out rather than made up."""
+    found = {key: getattr(about, name) for key, name in STATED.items()}
+    found["creator"] = [{"@type": "sc:Person", "name": name} for name in about.authors]
     return {key: value for key, value in found.items() if value}
 
 
@@ -147,20 +111,17 @@ def _distribution(folder: Folder) -> list[dict[str, Any]]:
 
 
 def _sequences() -> dict[str, Any]:
-    fields = []
-    for column in index.SCHEMA:
-        notes = {key.decode(): value.decode() for key, value in (column.metadata or {}).items()}
-        unit = f" [{notes['unit']}]" if "unit" in notes else ""
-        fields.append(
-            {
-                "@type": "cr:Field",
-                "@id": f"sequences/{column.name}",
-                "name": column.name,
-                "description": notes["meaning"] + unit,
-                "dataType": _TYPES[column.type],
-                "source": {"fileObject": {"@id": "index"}, "extract": {"column": column.name}},
-            }
-        )
+    fields = [
+        {
+            "@type": "cr:Field",
+            "@id": f"sequences/{column['name']}",
+            "name": column["name"],
+            "description": column["meaning"] + (f" [{column['unit']}]" if column["unit"] != "-" else ""),
+            "dataType": _TYPES[index.SCHEMA.field(column["name"]).type],
+            "source": {"fileObject": {"@id": "index"}, "extract": {"column": column["name"]}},
+        }
+        for column in card.columns()
+    ]
     return {
         "@type": "cr:RecordSet",
         "@id": "sequences",
@@ -169,44 +130,3 @@ def _sequences() -> dict[str, Any]:
         "key": {"@id": "sequences/index"},
         "field": fields,
     }
-
-
-# The context that the specification gives, with the prefix of its Responsible AI vocabulary.
-_CONTEXT: dict[str, Any] = {
-    "@language": "en",
-    "@vocab": "https://schema.org/",
-    "citeAs": "cr:citeAs",
-    "column": "cr:column",
-    "conformsTo": "dct:conformsTo",
-    "cr": "http://mlcommons.org/croissant/",
-    "rai": "http://mlcommons.org/croissant/RAI/",
-    "data": {"@id": "cr:data", "@type": "@json"},
-    "dataType": {"@id": "cr:dataType", "@type": "@vocab"},
-    "dct": "http://purl.org/dc/terms/",
-    "examples": {"@id": "cr:examples", "@type": "@json"},
-    "equivalentProperty": "cr:equivalentProperty",
-    "extract": "cr:extract",
-    "field": "cr:field",
-    "fileProperty": "cr:fileProperty",
-    "fileObject": "cr:fileObject",
-    "fileSet": "cr:fileSet",
-    "format": "cr:format",
-    "includes": "cr:includes",
-    "isLiveDataset": "cr:isLiveDataset",
-    "jsonPath": "cr:jsonPath",
-    "key": "cr:key",
-    "md5": "cr:md5",
-    "parentField": "cr:parentField",
-    "path": "cr:path",
-    "recordSet": "cr:recordSet",
-    "references": "cr:references",
-    "regex": "cr:regex",
-    "repeated": "cr:repeated",
-    "replace": "cr:replace",
-    "samplingRate": "cr:samplingRate",
-    "sc": "https://schema.org/",
-    "separator": "cr:separator",
-    "source": "cr:source",
-    "subField": "cr:subField",
-    "transform": "cr:transform",
-}

@@ -1,18 +1,144 @@
-"""What is drawn over the frames of a film: a glow where force acts, its curve below, a line of text."""
+"""Films: a dataset's preview, a sequence with force and flow drawn over it, and how they are encoded."""
 
 from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from collections.abc import Sequence as Several
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from synth.publish.picture import Rgb, heat, overlay
+from synth.dataset.store import Dataset, Sequence
+from synth.errors import UserError
+from synth.publish.picture import Rgb, arrow_gain, arrows, both_eyes, caption, heat, legible, overlay, tile
+from synth.system import checked_file
 
-_CURVE_PX = 64
-_WIDE_PX = 480
-_LEFT_PX = 4
+OVERLAYS = {"flow": "flow", "recovered": "flow_recovered", "force": "traction"}
+"""What can be drawn over a film, and the field that it is of."""
+
+_PREVIEW_PX, _PREVIEW_TILES = 1280, 9
+_QUALITY = 18
+_CURVE_PX, _LEFT_PX = 64, 4
 _TURNS = 5
 _INK, _LINE = (40, 40, 40), (200, 60, 20)
+
+
+def encode_video(
+    target: Path, film: Iterable[NDArray[np.uint8]], fps: float, *, quality: int = 23, group: int = 12
+) -> Path:
+    """Writes (H, W, 3) uint8 sRGB frames as an MP4 (H.264, 4:2:0, BT.601) that browsers play.
+
+    Args:
+        target: the file.
+        film: at least one frame, all of one size; an odd last row or column is left out, as the codec takes
+            even sizes only.
+        fps: frames a second.
+        quality: x264's constant rate factor: less is better and larger.
+        group: frames from one that can be decoded by itself to the next.
+    """
+    import av
+
+    # By "file:" a colon in the path is no protocol.
+    with checked_file.part_of(target) as part, av.open(f"file:{part}", "w", format="mp4") as container:
+        stream: Any = container.add_stream("h264", rate=Fraction(fps).limit_denominator(1000))
+        # Unsaid, players take large pictures for BT.709 and show other colours than were put in.
+        told = {"colorspace": "smpte170m", "color_primaries": "bt709", "color_trc": "iec61966-2-1"}
+        packing = {"crf": str(quality), "g": str(group), "threads": "1"}
+        stream.pix_fmt, stream.options = "yuv420p", {**packing, **told, "color_range": "tv"}
+        for k, picture in enumerate(film):
+            even = picture[: picture.shape[0] // 2 * 2, : picture.shape[1] // 2 * 2]
+            if k == 0:
+                stream.height, stream.width = even.shape[:2]
+            frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(even), format="rgb24")
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode(None))
+    return target
+
+
+def write_preview(root: Path) -> None:
+    """`preview.mp4` of up to nine sequences spread over a dataset, side by side; none if there is none."""
+    if not any(root.glob("[0-9]*.zarr")):
+        return
+    dataset = Dataset(root)
+    chosen = np.unique(np.linspace(0, len(dataset) - 1, _PREVIEW_TILES).round().astype(int))
+    sequences = [dataset[int(k)] for k in chosen]
+    width = both_eyes(sequences[0], 0).shape[1] * int(np.ceil(np.sqrt(len(sequences))))
+    step = max(1, -(-width // _PREVIEW_PX))
+
+    def still(t: int) -> Rgb:
+        return tile([both_eyes(one, min(t, one.frames - 1))[::step, ::step] for one in sequences])
+
+    frames = range(max(one.frames for one in sequences))
+    encode_video(root / "preview.mp4", map(still, frames), float(sequences[0].attrs["fps"]))
+
+
+def write_films(
+    dataset: Dataset,
+    target: Path,
+    overlays: Several[str] = ("flow", "force"),
+    interval_s: tuple[float, float] | None = None,
+) -> None:
+    """`NNNNNN.mp4` a sequence.
+
+    Args:
+        dataset: the sequences.
+        target: the folder.
+        overlays: of `OVERLAYS`; none: the film as it is.
+        interval_s: first and last time [s]; all if not given.
+
+    Raises:
+        UserError: no such overlay, no frame in that time, or a field that a sequence lacks.
+    """
+    unknown = [name for name in overlays if name not in OVERLAYS]
+    if unknown:
+        raise UserError(f"{unknown[0]}: is not one of {', '.join(OVERLAYS)}")
+    for sequence in dataset:
+        drawn = draw_film(sequence, overlays, interval_s)
+        file = target / f"{sequence.index:06d}.mp4"
+        encode_video(file, drawn, float(sequence.attrs["fps"]), quality=_QUALITY)
+
+
+def draw_film(
+    sequence: Sequence, overlays: Several[str], interval_s: tuple[float, float] | None = None
+) -> Iterator[Rgb]:
+    """The frames of that time, (h, w, 3) each; with `force` its curve is below. Raises as above."""
+    for name in overlays:
+        if OVERLAYS[name] not in sequence:
+            raise UserError(f"{sequence.path}: holds no {OVERLAYS[name]}")
+    time, force = sequence["time"][:], np.linalg.norm(sequence["force"][:], axis=1)
+    first, last = interval_s or (-np.inf, np.inf)
+    chosen = np.flatnonzero((time >= first) & (time <= last)).tolist()
+    if not chosen:
+        raise UserError(f"{sequence.path}: has no frame between {first:g} and {last:g} s")
+    largest = {
+        name: max(float(np.linalg.norm(sequence[OVERLAYS[name]][t], axis=-1).max()) for t in chosen)
+        for name in overlays
+    }
+    tissue, curve = sequence["tissue"][:], None
+    for k, t in enumerate(chosen):
+        picture = _overlaid(sequence, t, tissue, largest) if overlays else sequence["rgb"][t]
+        if "force" in overlays:
+            curve = draw_curve(time[chosen], force[chosen], picture.shape[1]) if curve is None else curve
+            picture = np.vstack([picture, mark(curve, k, len(chosen))])
+        yield picture
+
+
+def _overlaid(sequence: Sequence, t: int, tissue: NDArray[np.bool_], largest: dict[str, float]) -> Rgb:
+    picture, said = sequence["rgb"][t], [f"{sequence['time'][t]:.2f} s"]
+    if "force" in largest:
+        size = np.linalg.norm(sequence["traction"][t], axis=-1)
+        moved = carried(np.where(tissue, size, 0.0), sequence["flow"][t])
+        picture = glow(picture, moved, largest["force"])
+        said.append(f"{np.linalg.norm(sequence['force'][t]):.1f} mN (yellow: {largest['force']:.2g} kPa)")
+    for name in (name for name in largest if name != "force"):
+        gain = arrow_gain(sequence.size[1], largest[name])
+        picture = arrows(picture, sequence[OVERLAYS[name]][t], tissue, gain)
+        said.append(f"{OVERLAYS[name]} x{gain}")
+    return caption(legible(picture), "  ".join(said))
 
 
 def carried(values: NDArray[np.floating], flow: NDArray[np.floating]) -> NDArray[np.float32]:
@@ -40,17 +166,17 @@ def glow(picture: Rgb, values: NDArray[np.floating], largest: float) -> Rgb:
     return overlay(picture, heat(values, largest), np.where(share > 0.02, 0.2 + 0.6 * share, 0.0))
 
 
-def draw_curve(time_s: NDArray[np.floating], values: NDArray[np.floating], width_px: int, unit: str) -> Rgb:
-    """A strip (h, width_px, 3) with values over time, gaps where they are NaN. Both (T,)."""
+def draw_curve(time_s: NDArray[np.floating], force_mn: NDArray[np.floating], width_px: int) -> Rgb:
+    """A strip (h, width_px, 3) with force over time, gaps where it is NaN. Both (T,)."""
     strip = np.full((_CURVE_PX, width_px, 3), 255, np.uint8)
-    sure = np.isfinite(values)
-    top = max(float(values[sure].max()), 1e-9) if sure.any() else 1.0
-    level = np.clip(np.nan_to_num(values) / top, 0, 1)
+    sure = np.isfinite(force_mn)
+    top = max(float(force_mn[sure].max()), 1e-9) if sure.any() else 1.0
+    level = np.clip(np.nan_to_num(force_mn) / top, 0, 1)
     y = np.round((_CURVE_PX - 6) - level * (_CURVE_PX - 24)).astype(int)
-    places = [(int(column), int(row)) for column, row in zip(_columns(len(values), width_px), y, strict=True)]
+    places = np.stack([_columns(len(force_mn), width_px), y], axis=1).tolist()
     for k in np.flatnonzero(sure[1:] & sure[:-1]):
         cv2.line(strip, places[k], places[k + 1], _LINE, 1, cv2.LINE_AA)
-    text = f"0 to {top:.3g} {unit}, {time_s[0]:.2f} to {time_s[-1]:.2f} s"
+    text = f"0 to {top:.3g} mN, {time_s[0]:.2f} to {time_s[-1]:.2f} s"
     cv2.putText(strip, text, (_LEFT_PX, 12), cv2.FONT_HERSHEY_SIMPLEX, 0.4, _INK, 1, cv2.LINE_AA)
     return strip
 
@@ -60,20 +186,6 @@ def mark(curve: Rgb, k: int, count: int) -> Rgb:
     marked = curve.copy()
     marked[16:, _columns(count, curve.shape[1])[k]] = _INK
     return marked
-
-
-def legible(picture: Rgb) -> Rgb:
-    """The picture (H, W, 3), each pixel repeated so that a line of text has room on it."""
-    times = -(-_WIDE_PX // picture.shape[1])
-    return picture.repeat(times, axis=0).repeat(times, axis=1)
-
-
-def caption(picture: Rgb, text: str) -> Rgb:
-    """The picture (H, W, 3) with a line of text at its top, readable on any ground."""
-    canvas = np.ascontiguousarray(picture)
-    for colour, thick in (((0, 0, 0), 3), ((255, 255, 255), 1)):
-        cv2.putText(canvas, text, (_LEFT_PX, 14), cv2.FONT_HERSHEY_SIMPLEX, 0.4, colour, thick, cv2.LINE_AA)
-    return canvas
 
 
 def _columns(count: int, width_px: int) -> NDArray[np.int64]:

@@ -16,7 +16,7 @@ Rgb = NDArray[np.uint8]
 
 _CAPTION_PX = 26
 _GAP_PX = 6
-_BAR_PX = 12
+_WIDE_PX = 480
 
 
 def flow_colours(flow: NDArray[np.floating], largest_px: float) -> Rgb:
@@ -50,10 +50,11 @@ def overlay(base: Rgb, colours: Rgb, weight: NDArray[np.floating]) -> Rgb:
     return np.round(blend).astype(np.uint8)
 
 
-def arrows(base: Rgb, flow: NDArray[np.floating], where: NDArray[np.bool_], step_px: int, gain: float) -> Rgb:
-    """Flow as arrows on a grid of `step_px`, lengthened by `gain`. flow: (H, W, 2) px; where: (H, W)."""
+def arrows(base: Rgb, flow: NDArray[np.floating], where: NDArray[np.bool_], gain: float) -> Rgb:
+    """Flow as arrows on a grid, 24 across, lengthened by `gain`. flow: (H, W, 2) px; where: (H, W)."""
     picture = base.copy()
     height, width = where.shape
+    step_px = max(width // 24, 8)
     for row in range(step_px // 2, height, step_px):
         for column in range(step_px // 2, width, step_px):
             step = gain * flow[row, column]
@@ -68,72 +69,37 @@ def arrow_gain(width_px: int, largest_px: float) -> int:
     return max(1, int(width_px / 24 / max(largest_px, 1e-9))) if largest_px > 0.05 else 1
 
 
-def colour_bar(panel: Rgb, colours: Rgb, label: str) -> Rgb:
-    """The panel with a bar (a (1, N, 3) row of colours) and its label in the lower right corner."""
-    picture = panel.copy()
-    height, width = panel.shape[:2]
-    bar = cv2.resize(colours, (width // 3, _BAR_PX), interpolation=cv2.INTER_LINEAR)
-    top, left = height - _BAR_PX - 8, width - width // 3 - 8
-    picture[top : top + _BAR_PX, left : left + bar.shape[1]] = bar
-    return _text(picture, label, (left, top - 6), (255, 255, 255))
+def legible(picture: Rgb) -> Rgb:
+    """The picture (H, W, 3), each pixel repeated so that a line of text has room on it."""
+    times = -(-_WIDE_PX // picture.shape[1])
+    return picture.repeat(times, axis=0).repeat(times, axis=1)
 
 
-def side_by_side(panels: Sequence[Rgb], captions: Sequence[str]) -> Rgb:
-    """Panels (H, W, 3) of one size in a row, each under its caption, on white."""
-    height, width = panels[0].shape[:2]
-    row = np.full((height + _CAPTION_PX, len(panels) * (width + _GAP_PX) - _GAP_PX, 3), 255, np.uint8)
-    for k, (panel, caption) in enumerate(zip(panels, captions, strict=True)):
-        left = k * (width + _GAP_PX)
-        row[_CAPTION_PX:, left : left + width] = panel
-        row = _text(row, caption, (left + 4, 18), (40, 40, 40))
-    return row
+def caption(picture: Rgb, text: str, row: int = 14) -> Rgb:
+    """The picture (H, W, 3) with a line of text, readable on any ground, that stands on a row."""
+    canvas = np.ascontiguousarray(picture)
+    for colour, thick in (((0, 0, 0), 3), ((255, 255, 255), 1)):
+        cv2.putText(canvas, text, (4, row), cv2.FONT_HERSHEY_SIMPLEX, 0.4, colour, thick, cv2.LINE_AA)
+    return canvas
 
 
-def stack(rows: Sequence[Rgb]) -> Rgb:
-    """Rows (h, W, 3) of one width under one another."""
-    gap = np.full((_GAP_PX, rows[0].shape[1], 3), 255, np.uint8)
-    parts = [part for row in rows for part in (row, gap)]
-    return np.concatenate(parts[:-1])
+def tile(pictures: Sequence[Rgb]) -> Rgb:
+    """Pictures (H, W, 3) of one size in as square a grid as they make, the rest of it black."""
+    columns = int(np.ceil(np.sqrt(len(pictures))))
+    full = [*pictures, *[np.zeros_like(pictures[0])] * (-len(pictures) % columns)]
+    return np.vstack([np.hstack(full[k : k + columns]) for k in range(0, len(full), columns)])
 
 
-def frame_flow_force(
-    rgb: Rgb,
-    rest: Rgb,
-    flow: NDArray[np.floating],
-    traction: NDArray[np.floating],
-    tissue: NDArray[np.bool_],
-    *,
-    largest_px: float,
-    largest_kpa: float,
-    captions: Sequence[str],
-) -> Rgb:
-    """One row: the frame, its flow from the rest frame, and the traction that caused it.
-
-    Args:
-        rgb: the frame, (H, W, 3) uint8.
-        rest: frame 0, on whose pixels flow and traction lie, (H, W, 3) uint8.
-        flow: (H, W, 2) px.
-        traction: (H, W, 3) kPa.
-        tissue: (H, W).
-        largest_px: flow at full colour.
-        largest_kpa: traction at full colour.
-        captions: three lines, one a panel.
-    """
-    inside = tissue.astype(np.float32)
-    grey = np.repeat(rest.mean(axis=2, keepdims=True), 3, axis=2).astype(np.uint8)
-    moved = overlay(grey, flow_colours(flow, largest_px), 0.65 * inside)
-    step_px = max(rgb.shape[1] // 24, 8)
-    moved = arrows(moved, flow, tissue, step_px, arrow_gain(rgb.shape[1], largest_px))
-    ramp = np.linspace(0, 1, 256, dtype=np.float32)[None]
-    size = np.linalg.norm(traction, axis=-1)
-    weight = inside * np.clip(0.15 + size / max(largest_kpa, 1e-12), 0, 0.9)
-    pushed = overlay((0.6 * grey).astype(np.uint8), heat(size, largest_kpa), weight)
-    pushed = colour_bar(pushed, heat(ramp, 1.0), f"0 - {largest_kpa:.2g} kPa")
-    return side_by_side([rgb, moved, pushed], captions)
+def both_eyes(sequence: Sequence_, t: int) -> Rgb:
+    """Frame t (H, W, 3); of a stereo sequence (H, 2W, 3), the left eye beside the right."""
+    left = sequence["rgb"][t]
+    return np.hstack([left, sequence["rgb_right"][t]]) if "rgb_right" in sequence else left
 
 
 def draw_sequence(sequence: Sequence_, frames: Sequence[int]) -> Rgb:
-    """Frame, flow and force map of some frames of a sequence, a row each, on common scales: (h, w, 3).
+    """Some frames of a sequence on common scales, a row each under its captions: (h, w, 3).
+
+    A row is the frame, its flow from the rest frame, and the traction that caused it, both on the rest frame.
 
     Raises:
         UserError: a frame is not in the sequence.
@@ -141,31 +107,27 @@ def draw_sequence(sequence: Sequence_, frames: Sequence[int]) -> Rgb:
     for t in frames:
         if not 0 <= t < sequence.frames:
             raise UserError(f"frame {t}: the sequence has frames 0 to {sequence.frames - 1}")
-    flow = {t: sequence["flow"][t] for t in frames}
-    traction = {t: sequence["traction"][t] for t in frames}
-    largest_px = max(float(np.linalg.norm(f, axis=-1).max()) for f in flow.values())
-    largest_kpa = max(float(np.linalg.norm(s, axis=-1).max()) for s in traction.values())
-    force, time = sequence["force"][...], sequence["time"][...]
-    gain = arrow_gain(sequence.size[1], largest_px)
-    return stack(
-        [
-            frame_flow_force(
-                sequence["rgb"][t],
-                sequence["rgb"][0],
-                flow[t],
-                traction[t],
-                sequence["tissue"][...],
-                largest_px=largest_px,
-                largest_kpa=largest_kpa,
-                captions=[
-                    f"frame {t}, {time[t]:.2f} s",
-                    f"flow, {np.linalg.norm(flow[t], axis=-1).max():.1f} px at most (arrows x{gain})",
-                    f"traction, {np.linalg.norm(force[t]):.1f} mN in all",
-                ],
-            )
-            for t in frames
-        ]
-    )
+    flows = [sequence["flow"][t] for t in frames]
+    loads = [np.linalg.norm(sequence["traction"][t], axis=-1) for t in frames]
+    largest_px = max(float(np.linalg.norm(flow, axis=-1).max()) for flow in flows)
+    largest_kpa = max(float(load.max()) for load in loads)
+    force, time, tissue = sequence["force"][...], sequence["time"][...], sequence["tissue"][...]
+    grey = np.repeat(sequence["rgb"][0].mean(axis=2, keepdims=True), 3, axis=2).astype(np.uint8)
+    gain, rows = arrow_gain(sequence.size[1], largest_px), []
+    for t, flow, load in zip(frames, flows, loads, strict=True):
+        moved = overlay(grey, flow_colours(flow, largest_px), 0.65 * tissue)
+        weight = tissue * np.clip(0.15 + load / max(largest_kpa, 1e-12), 0, 0.9)
+        panels = {
+            f"frame {t}, {time[t]:.2f} s": sequence["rgb"][t],
+            f"flow, {np.linalg.norm(flow, axis=-1).max():.1f} px at most (arrows x{gain})": arrows(
+                moved, flow, tissue, gain
+            ),
+            f"traction, {np.linalg.norm(force[t]):.1f} mN in all (yellow: {largest_kpa:.2g} kPa)": overlay(
+                (0.6 * grey).astype(np.uint8), heat(load, largest_kpa), weight
+            ),
+        }
+        rows.append(np.hstack([_framed(panel, text) for text, panel in panels.items()]))
+    return np.vstack(rows)[:, _GAP_PX:]
 
 
 def strongest(sequence: Sequence_) -> int:
@@ -173,7 +135,8 @@ def strongest(sequence: Sequence_) -> int:
     return int(np.linalg.norm(sequence["force"][...], axis=-1).argmax())
 
 
-def _text(picture: Rgb, text: str, at: tuple[int, int], colour: tuple[int, int, int]) -> Rgb:
-    canvas = np.ascontiguousarray(picture)
-    cv2.putText(canvas, text, at, cv2.FONT_HERSHEY_SIMPLEX, 0.45, colour, 1, cv2.LINE_AA)
-    return canvas
+def _framed(panel: Rgb, text: str) -> Rgb:
+    """A panel (H, W, 3) with white above and to its left, and a line of text on that."""
+    canvas = cv2.copyMakeBorder(panel, _CAPTION_PX, 0, _GAP_PX, 0, cv2.BORDER_CONSTANT, value=(255,) * 3)
+    cv2.putText(canvas, text, (_GAP_PX + 4, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (40, 40, 40), 1, cv2.LINE_AA)
+    return np.asarray(canvas, np.uint8)

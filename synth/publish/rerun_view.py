@@ -1,4 +1,4 @@
-"""A sequence on one timeline in the viewer rerun: surface, frame, flows, traction and force. Extra `view`."""
+"""A sequence on one timeline in the viewer rerun: frame, depth, flows, traction and force. Extra `view`."""
 
 from __future__ import annotations
 
@@ -8,12 +8,10 @@ import signal
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from synth.checks import optics
 from synth.dataset.attributes import name_gestures
@@ -21,56 +19,42 @@ from synth.dataset.store import Sequence
 from synth.errors import UserError
 from synth.publish import picture
 
-Floats = NDArray[np.float64]
-
-_APPLICATION = "sulcus"
-# Columns of the mesh that stands for the surface: what a viewer turns smoothly.
-_MESH_COLUMNS = 200
 _JPEG_QUALITY = 90
 
 
-def save_recording(sequences: Iterable[Sequence], path: Path) -> None:
-    """Writes sequences as a rerun recording file, one recording each.
+def save_recording(sequence: Sequence, path: Path) -> None:
+    """Writes a sequence as a rerun recording file.
 
     Raises:
         UserError: rerun is not installed, the file cannot be written.
     """
     rerun = _rerun()
-    parts: list[Path] = []
     try:
         with tempfile.TemporaryDirectory(dir=path.parent) as scratch:
-            for sequence in sequences:
-                part = Path(scratch) / f"{sequence.index:06d}.rrd"
-                stream = rerun.RecordingStream(_APPLICATION, recording_id=f"{sequence.index:06d}")
-                stream.save(str(part))
-                _log(rerun, stream, sequence)
-                stream.disconnect()
-                parts.append(part)
-            if len(parts) > 1:
-                joined = Path(scratch) / "all.rrd"
-                words = [sys.executable, "-m", "rerun", "rrd", "merge", "-o", str(joined)]
-                subprocess.run([*words, *(str(part) for part in parts)], check=True, capture_output=True)
-                parts = [joined]
-            parts[0].replace(path)
+            part = Path(scratch) / "sequence.rrd"
+            stream = rerun.RecordingStream("sulcus", recording_id=f"{sequence.index:06d}")
+            stream.save(str(part))
+            _log(rerun, stream, sequence)
+            stream.disconnect()
+            part.replace(path)
     except OSError as error:
         raise UserError(f"{path}: cannot be written ({error.strerror})") from error
 
 
-def show_sequences(sequences: Iterable[Sequence], *, web: bool) -> None:
-    """Opens sequences in the viewer and returns when it is closed; it listens on this machine only.
+def show_sequence(sequence: Sequence, *, web: bool) -> None:
+    """Opens a sequence in the viewer and returns when it is closed; it listens on this machine only.
 
     Args:
-        sequences: what to show.
+        sequence: what to show.
         web: in a browser, for a machine without a window system.
 
     Raises:
         UserError: rerun is not installed or cannot start.
     """
-    _rerun()
     print("rerun sends its makers anonymous usage counts until `rerun analytics disable`", file=sys.stderr)
     with tempfile.TemporaryDirectory() as scratch:
-        path = Path(scratch) / "sequences.rrd"
-        save_recording(sequences, path)
+        path = Path(scratch) / "sequence.rrd"
+        save_recording(sequence, path)
         # A group of its own: the viewer starts a process in its turn, which must not stay when this one ends.
         viewer = subprocess.Popen(command(path, web=web), start_new_session=True)
         try:
@@ -90,79 +74,43 @@ def command(path: Path, *, web: bool) -> list[str]:
     return [*words, *(("--serve-web",) if web else ()), str(path)]
 
 
-def surface(sequence: Sequence, t: int, step: int) -> tuple[Floats, NDArray[np.int64]]:
-    """The tissue in frame `t` as seen: (V, 3) mm in camera axes, and the triangles (F, 3) whose corners are.
-
-    Every `step`-th rest pixel is a vertex, with its number in all frames; a vertex that is hidden in a frame
-    lies at its place of rest and has no triangle.
-    """
-    view = optics.camera_of(sequence)
-    rest = np.stack(np.meshgrid(*(np.arange(0, n, step) for n in sequence.size), indexing="ij"), axis=-1)
-    rows, columns = rest.reshape(-1, 2).T
-    width, height = view.size
-    flow, depth = sequence["flow"][t][rows, columns], sequence["depth"][t]
-    pixels = np.stack([columns, rows], axis=1).astype(np.float64) + flow
-    near = np.clip(pixels.round().astype(int), 0, [width - 1, height - 1])
-    seen = sequence["tissue"][:][rows, columns] & sequence["visible"][t][rows, columns]
-    seen &= depth[near[:, 1], near[:, 0]] > 0
-    points = (
-        optics.rays(view, pixels)
-        * np.where(seen, depth[near[:, 1], near[:, 0]], sequence["depth"][0][rows, columns])[:, None]
-    )
-    number = np.arange(len(rows)).reshape(rest.shape[:2])
-    a, b, c, d = (
-        part.ravel() for part in (number[:-1, :-1], number[:-1, 1:], number[1:, :-1], number[1:, 1:])
-    )
-    faces = np.concatenate([np.stack([a, c, b], axis=1), np.stack([b, c, d], axis=1)])
-    return points, faces[seen[faces].all(axis=1)]
-
-
 def _log(rerun: Any, stream: Any, sequence: Sequence) -> None:
-    attrs, (height, width) = sequence.attrs, sequence.size
-    needed = ("K", "distortion", "rotation", "translation", "scale_mm_per_px", "young_kpa")
-    lacking = [name for name in needed if sequence.attrs.get(name) is None]
-    peaks = ("peak_flow_px", "peak_traction_kpa")
-    lacking += [name for name in peaks if not isinstance(sequence.attrs.get("summary", {}).get(name), float)]
-    if lacking:
-        raise UserError(f"{sequence.path}: says nothing of {', '.join(lacking)}, which a view needs")
-    view, frames = optics.camera_of(sequence), range(sequence.frames)
-    force, time = sequence["force"][:], sequence["time"][:]
-    flows = [name for name in ("flow", "flow_recovered") if name in sequence]
-    longest = max(float(attrs["summary"]["peak_flow_px"]), 1e-6)
-    strongest = max(float(attrs["summary"]["peak_traction_kpa"]), 1e-9)
-    tissue, first, step = sequence["tissue"][:], sequence["rgb"][0], max(1, width // _MESH_COLUMNS)
-    grey = np.repeat(first.mean(axis=2, keepdims=True), 3, axis=2).astype(np.uint8)
+    def image(name: str, pixels: picture.Rgb) -> None:
+        stream.log(name, rerun.Image(pixels).compress(jpeg_quality=_JPEG_QUALITY))
+
+    try:
+        about, summary = _about(sequence), sequence.attrs["summary"]
+        longest, strongest = float(summary["peak_flow_px"]), float(summary["peak_traction_kpa"])
+        left = optics.camera_of(sequence)
+    except (KeyError, TypeError) as error:
+        raise UserError(f"{sequence.path}: says nothing of {error}, which a view needs") from error
+    force, time, tissue = sequence["force"][:], sequence["time"][:], sequence["tissue"][:]
+    grey = np.repeat(sequence["rgb"][0].mean(axis=2, keepdims=True), 3, axis=2).astype(np.uint8)
     stream.log("/", rerun.ViewCoordinates.RDF, static=True)
-    stream.log("camera", rerun.Pinhole(image_from_camera=view.K, resolution=[width, height]), static=True)
-    if "right" in attrs:
-        other = optics.camera_of(sequence, attrs["right"])
-        aside = other.rotation @ (other.centre - view.centre)
+    stream.log("camera", rerun.Pinhole(image_from_camera=left.K, resolution=left.size), static=True)
+    if "right" in sequence.attrs:
+        right = optics.camera_of(sequence, sequence.attrs["right"])
+        aside = right.rotation @ (right.centre - left.centre)
         stream.log("right", rerun.Transform3D(translation=aside), static=True)
-        stream.log("right", rerun.Pinhole(image_from_camera=other.K, resolution=[width, height]), static=True)
+        stream.log("right", rerun.Pinhole(image_from_camera=right.K, resolution=right.size), static=True)
     stream.log("force", rerun.SeriesLines(names=["x mN", "y mN", "z mN", "length mN"]), static=True)
-    stream.log("about", rerun.TextDocument(_about(sequence), media_type="text/markdown"), static=True)
-    for t in frames:
+    stream.log("about", rerun.TextDocument(about, media_type="text/markdown"), static=True)
+    for t in range(sequence.frames):
         stream.set_time("frame", sequence=t)
         stream.set_time("time", duration=float(time[t]))
-        rgb = sequence["rgb"][t]
-        stream.log("camera/frame", rerun.Image(rgb).compress(jpeg_quality=_JPEG_QUALITY))
+        image("camera/frame", sequence["rgb"][t])
         if "rgb_right" in sequence:
-            shown = rerun.Image(sequence["rgb_right"][t]).compress(jpeg_quality=_JPEG_QUALITY)
-            stream.log("right/frame", shown)
-        for name in flows:
-            colours = picture.flow_colours(sequence[name][t], longest)
-            shown = picture.overlay(grey, colours, 0.65 * tissue.astype(np.float32))
-            stream.log(name, rerun.Image(shown).compress(jpeg_quality=_JPEG_QUALITY))
-        load = np.linalg.norm(sequence["traction"][t], axis=-1)
-        shown = picture.overlay(grey, picture.heat(load, strongest), 0.8 * tissue.astype(np.float32))
-        stream.log("traction", rerun.Image(shown).compress(jpeg_quality=_JPEG_QUALITY))
-        stream.log("force", rerun.Scalars([*force[t], float(np.linalg.norm(force[t]))]))
+            image("right/frame", sequence["rgb_right"][t])
         if "depth" in sequence:
-            points, faces = surface(sequence, t, step)
-            colours = first[::step, ::step].reshape(-1, 3)
-            stream.log(
-                "tissue", rerun.Mesh3D(vertex_positions=points, triangle_indices=faces, vertex_colors=colours)
+            # Shown as a surface in space, for the camera is known; unit of space: mm.
+            stream.log("camera/depth", rerun.DepthImage(sequence["depth"][t], meter=1.0))
+        for name in (name for name in ("flow", "flow_recovered") if name in sequence):
+            image(
+                name, picture.overlay(grey, picture.flow_colours(sequence[name][t], longest), 0.65 * tissue)
             )
+        load = np.linalg.norm(sequence["traction"][t], axis=-1)
+        image("traction", picture.overlay(grey, picture.heat(load, strongest), 0.8 * tissue))
+        stream.log("force", rerun.Scalars([*force[t], float(np.linalg.norm(force[t]))]))
 
 
 def _about(sequence: Sequence) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import cv2
@@ -30,7 +30,6 @@ Map = npt.NDArray[np.float32]
 Mask = npt.NDArray[np.bool_]
 
 _RIM_ROUGHNESS, _RIM_DRY = 0.09, 0.35
-_VOLUME = "volume128"
 _MIRRORED_PX = 48  # of the wound that steel mirrors: its finish shows no more
 _SATIN = 0.10  # share of light that steel's finish scatters evenly
 _DULL = 0.8  # a retractor's finish, between steel (0) and black (1): it must not dazzle
@@ -184,13 +183,6 @@ class Studio:
             **extra,
         )
 
-    @property
-    def tissue_right(self) -> Mask:
-        """(H, W) brain in the second lens's rest frame. ValueError: there is no second lens."""
-        if self._right is None:
-            raise ValueError("there is no second lens")
-        return self._right.tissue
-
     def disparity(self) -> Map:
         """Rest disparity (H, W) px without distortion, see `synth.fields`; 0 off the tissue.
 
@@ -219,8 +211,6 @@ class Studio:
         sampler: str = "multijitter",
     ) -> Stage:
         """A Mitsuba stage with bodies `cortex`, `rim` and `tool`; vertices (V, 3), (T, 3) mm as given."""
-        if self._render.subsurface == "volume":
-            integrator = _VOLUME
         return Stage(
             self.variant,
             self.camera,
@@ -282,8 +272,6 @@ class Studio:
         r, g, b = (_AMBIENT * look.light.power * light.blackbody(look.light.kelvin)).tolist()
         ambient = (r, g, b)
         coat = self._coat.wet(look.roughness, look.dry_roughness, ambient, look.film_index)
-        if self._render.subsurface == "volume":
-            coat = replace(coat, volume=True)
         bodies = {
             "cortex": Body(
                 vertices,

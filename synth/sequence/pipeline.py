@@ -195,17 +195,12 @@ def _recover_motion(shooting: _Shooting, film: _Film, left: Track) -> None:
         still = stereo.still_frames(left.flow, studio.still.tissue)
         eyes = film.rgb[:still], film.rgb_right[:still]
         tracker = stereo.StereoTracker(pair, *eyes, blocked[0][0], blocked[1][0], studio.still.tissue)
-        right = None
-        if job.flow.stereo == "fused":
-            right = track.track(estimator(job.flow), film.rgb_right, blocked[1], studio.tissue_right)
     for t in range(job.frames):
         shooting.report("stereo", t, job.frames)
         with shooting.watch.stage("stereo"):
             seen = left.flow[t], left.confidence[t]
             if t == 0:
                 moved = tracker.rest_motion()
-            elif right is not None:
-                moved = tracker.fuse(*seen, right.flow[t], right.confidence[t])
             else:
                 eyes = film.rgb[t], film.rgb_right[t]
                 moved = tracker.step(*eyes, blocked[0][t], blocked[1][t], *seen)
@@ -262,9 +257,8 @@ def _mechanics(
     job: Job, case: Scenario, motion: Deformation, rotation: NDArray[np.float64]
 ) -> dict[str, Any]:
     timeless = job.fem.time == "quasi-static" and not job.fem.relaxation
-    special: dict[str, Any] = {} if job.fem.contact == "traction" else {"contact": job.fem.contact}
-    if law_from := law_plugins.source(case.tissue.law):
-        special["law_from"] = law_from
+    law_from = law_plugins.source(case.tissue.law)
+    special: dict[str, Any] = {"law_from": law_from} if law_from else {}
     if case.pulse is not None:
         special |= {"pulse_mm": case.pulse.height(motion.time).tolist()}
     if case.pulse is not None and timeless:

@@ -1,8 +1,9 @@
 """The published method's labels, noise and all, beside the truth: to train in its regime and compare.
 
 After D3MIA/SOFA-NeuroSim-Recorder (`simlib/recorders.py`, `modify_frames_with_noise.py`), whose points are a
-mesh's vertices and here are the pixels of tissue. First stage: every force label gets normal noise. Second
-stage: in a share of the frames, points away from the contact get a displacement of their own and the label 0.
+mesh's vertices and here are the pixels of tissue. First stage, with a job's `labels: published`: every force
+label gets normal noise. Second stage: in a share of the frames, points away from the contact get a
+displacement of their own and the label 0.
 """
 
 from __future__ import annotations
@@ -13,17 +14,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from synth.geometry.triangles import lengths
-from synth.job.schema import Labels
 
 Map = NDArray[np.float32]
 Mask = NDArray[np.bool_]
+Force = NDArray[np.float64]
 
+_FORCE_SHARE = 0.02  # of a label: deviation of the first stage's noise
+_FRAMES = 0.3  # of them: what the second stage disturbs
+_POINTS = 0.05  # of the tissue's pixels in such a frame
+_RANGE = 0.05  # of the frame's range of displacement: the largest that a disturbed point gets
 _ENDS, _MOST_FRAMES = 10, 50  # a tenth of the sequence, at most 50 frames, is left alone at either end
 _NEAR, _LEAST_REACH = 1.5, 0.05  # the contact's surroundings: 1.5 times its reach, at least 5% of the picture
 _LOW = 30  # percentile of force below which a point may be disturbed
 
 
-def intensity(traction: NDArray[np.floating], force_mn: float) -> NDArray[np.float64]:
+def intensity(traction: NDArray[np.floating], force_mn: float) -> Force:
     """The published label: the load scaled so that its largest value is the total force.
 
     Args:
@@ -37,38 +42,32 @@ def intensity(traction: NDArray[np.floating], force_mn: float) -> NDArray[np.flo
     return np.asarray(traction, np.float64) * (force_mn / peak if peak > 0 else 0.0)
 
 
-def with_noise(
-    label: NDArray[np.float64], tissue: Mask, noise: Labels, rng: np.random.Generator
-) -> NDArray[np.float64]:
-    """First stage: normal noise on the labels (H, W, 3) mN of the tissue (H, W)."""
+def with_noise(label: Force, tissue: Mask, share: float, rng: np.random.Generator) -> Force:
+    """First stage: normal noise, a `share` of each label (H, W, 3) mN, on those of the tissue (H, W)."""
     out = np.zeros_like(label)
     mine = label[tissue]
-    deviation = noise.force_std_mn + noise.force_share * lengths(mine)[:, None]
-    deviation = np.where(rng.random((len(mine), 1)) < noise.outliers, noise.outlier_scale, 1.0) * deviation
-    out[tissue] = mine + deviation * rng.normal(size=mine.shape) + noise.force_bias_mn
+    rng.random((len(mine), 1))  # the published code draws outliers too, of which its example has none
+    out[tissue] = mine + share * lengths(mine)[:, None] * rng.normal(size=mine.shape)
     return out
 
 
-def noisy_frames(frames: int, noise: Labels, rng: np.random.Generator) -> Mask:
+def noisy_frames(frames: int, rng: np.random.Generator) -> Mask:
     """Second stage: which frames it disturbs, (T,)."""
     ends = min(_MOST_FRAMES, frames // _ENDS)
     candidates = np.arange(ends, frames - ends)
-    count = min(int(frames * noise.noisy_frames), len(candidates))
+    count = min(int(frames * _FRAMES), len(candidates))
     chosen = np.zeros(frames, bool)
     chosen[rng.choice(candidates, count, replace=False)] = True
     return chosen
 
 
-def disturbed(
-    flow: Map, label: NDArray[np.float64], tissue: Mask, noise: Labels, rng: np.random.Generator
-) -> tuple[Map, NDArray[np.float64]]:
+def disturbed(flow: Map, label: Force, tissue: Mask, rng: np.random.Generator) -> tuple[Map, Force]:
     """Second stage, in one frame.
 
     Args:
         flow: (H, W, 2) px.
         label: (H, W) mN.
         tissue: (H, W).
-        noise: how many points, and how far as a part of the frame's range of displacement.
         rng: of this sequence's labels.
 
     Returns:
@@ -85,9 +84,9 @@ def disturbed(
         reach = max(reach, _LEAST_REACH * float(np.linalg.norm(np.ptp(place, axis=0))))
         free &= np.linalg.norm(place - centre, axis=1) > reach
     candidates = np.flatnonzero(free)
-    count = min(int(len(place) * noise.noisy_points), len(candidates))
+    count = min(int(len(place) * _POINTS), len(candidates))
     rows, columns = place[rng.choice(candidates, count, replace=False)].T if count else place[:0].T
-    span = noise.noisy_range * np.ptp(flow[tissue], axis=0) if len(place) else np.zeros(2)
+    span = _RANGE * np.ptp(flow[tissue], axis=0) if len(place) else np.zeros(2)
     flow[rows, columns] += (rng.uniform(-1, 1, (count, 2)) * span).astype(np.float32)
     label[rows, columns] = 0.0
     return flow, label
@@ -97,7 +96,8 @@ def disturbed(
 class Published:
     """Both stages for one sequence; frames are asked for in order."""
 
-    noise: Labels
+    share: float
+    """Deviation of the first stage's noise over the label."""
     tissue: Mask
     """(H, W)."""
     chosen: Mask
@@ -105,13 +105,12 @@ class Published:
     rng: np.random.Generator
 
     @classmethod
-    def begin(cls, noise: Labels, tissue: Mask, frames: int, rng: np.random.Generator) -> Published:
-        """Draws which frames will be disturbed; `tissue` is (H, W)."""
-        return cls(noise, tissue, noisy_frames(frames, noise, rng), rng)
+    def begin(cls, labels: str, tissue: Mask, frames: int, rng: np.random.Generator) -> Published:
+        """Draws which frames will be disturbed; `labels` is the job's, `tissue` (H, W)."""
+        share = _FORCE_SHARE if labels == "published" else 0.0
+        return cls(share, tissue, noisy_frames(frames, rng), rng)
 
-    def frame(
-        self, t: int, flow: Map, traction: NDArray[np.floating], force_mn: NDArray[np.float64]
-    ) -> dict[str, Map]:
+    def frame(self, t: int, flow: Map, traction: NDArray[np.floating], force_mn: Force) -> dict[str, Map]:
         """The fields `flow_noisy` (H, W, 2) px and `intensity` (H, W) mN of frame t.
 
         Args:
@@ -122,8 +121,8 @@ class Published:
         """
         label = intensity(traction, float(np.linalg.norm(force_mn)))
         if t > 0:
-            label = with_noise(label, self.tissue, self.noise, self.rng)
+            label = with_noise(label, self.tissue, self.share, self.rng)
         size = lengths(label)
         if self.chosen[t] and t > 0:
-            flow, size = disturbed(flow, size, self.tissue, self.noise, self.rng)
+            flow, size = disturbed(flow, size, self.tissue, self.rng)
         return {"flow_noisy": flow, "intensity": size.astype(np.float32)}

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
-from itertools import islice
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +22,6 @@ from synth.geometry import brain_surface
 from synth.geometry.brain_surface import Brain
 from synth.job.schema import Anatomy, Flow, Job
 from synth.render.anatomy import surface as anatomy
-from synth.render.anatomy import survey
 from synth.render.anatomy.surface import Relief, Surface
 from synth.render.camera import camera, video
 from synth.render.camera.camera import Camera
@@ -34,8 +32,6 @@ from synth.sequence.timeline import Timeline
 from synth.system.stopwatch import Report, Stopwatch
 
 Floats = NDArray[np.float64]
-
-_TRIES = 5  # of openings nearest to one that can't be
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -134,7 +130,7 @@ class Scene:
             raise UserError(f"frame {t}: the scene has frames 0 to {len(self) - 1}")
         job, line = self.job, self._timeline
         now = line.at(t)
-        lit = line.open(t, job.sensor.shutter, job.sensor.subframes)
+        lit = line.open(t, job.sensor.shutter)
         shot = self.studio.shoot(now, self._seeds[t], lit, line.at(t + 1))
         return Frame(
             **vars(shot),
@@ -206,7 +202,7 @@ def build(job: Job, case: Scenario) -> tuple[Surface, Tets]:
     """The fine surface of a scenario and the volume under it, finest where its contacts are."""
     focus = [place for gesture in case.gestures for place in tool.focus(gesture)]
     surface, whole = cortex(job, case)
-    mesh, slips = (job.fem.tets, job.fem.order, focus), case.tissue.skull == "slip"
+    mesh, slips = (job.fem.tets, 2, focus), case.tissue.skull == "slip"
     if whole is None:
         height = HeightMap(surface.pia, surface.extent_mm)
         return surface, tetrahedra.block(job.anatomy, *mesh, height, slips=slips)
@@ -236,7 +232,7 @@ def _cortex(section: Anatomy, relief: Relief, written: object) -> tuple[Surface,
         except UserError as error:
             if not str(error).startswith("anatomy.craniotomy"):
                 raise
-            raise UserError(f"{error}{_nearest_opening(section, relief)}") from None
+            raise UserError(f"{error}; `synth preview {section.mesh.name}` finds places that work") from None
     for shared in (surface, whole):
         for value in vars(shared).values() if shared else ():
             if isinstance(value, np.ndarray):
@@ -248,23 +244,6 @@ def _opened(section: Anatomy, relief: Relief) -> tuple[Surface, Brain]:
     assert section.mesh is not None
     whole = brain_surface.load_brain(section.mesh, section.craniotomy)
     return anatomy.from_brain(whole.vertices, whole.faces, relief, section), whole
-
-
-def _nearest_opening(section: Anatomy, relief: Relief) -> str:
-    """Where the nearest opening that works is, in words that end a message."""
-    assert section.mesh is not None
-    asked = np.asarray(section.craniotomy.point)
-    ground = survey.Ground(*brain_surface.read_brain(section.mesh))
-    for site in islice(survey.by_distance(ground, asked, section.craniotomy.radius_mm), _TRIES):
-        point, direction = np.round(site.point, 2).tolist(), np.round(site.direction, 3).tolist()
-        there = section.craniotomy.model_copy(update={"point": tuple(point), "direction": tuple(direction)})
-        try:
-            _opened(section.model_copy(update={"craniotomy": there}), relief)
-        except UserError:
-            continue
-        away = np.linalg.norm(site.point - asked)
-        return f"; {away:.3g} mm away it works: point: {point}, direction: {direction} (see `synth place`)"
-    return f"; nowhere on {section.mesh.name} an opening of that radius works (see `synth place`)"
 
 
 def move(job: Job, case: Scenario, surface: Surface, tets: Tets) -> Deformation:

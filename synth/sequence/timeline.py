@@ -12,6 +12,8 @@ from synth.render.camera.camera import Camera
 from synth.render.camera.sway import Sway
 from synth.render.scene import Moment
 
+_SUBFRAMES = 4  # pictures that make up a blurred one
+
 
 @dataclass(frozen=True)
 class Timeline:
@@ -45,15 +47,14 @@ class Timeline:
             power=self.light.gain(frame / max(last, 1)),
         )
 
-    def open(self, frame: int, shutter: float, subframes: int) -> list[Moment]:
+    def open(self, frame: int, shutter: float) -> list[Moment]:
         """Moments while the shutter is open, evenly about a frame; none if it only opens for an instant.
 
         Args:
             frame: which.
             shutter: part of the time between frames.
-            subframes: how many moments.
         """
         if shutter == 0:
             return []
-        offsets = shutter * ((np.arange(subframes) + 0.5) / subframes - 0.5)
+        offsets = shutter * ((np.arange(_SUBFRAMES) + 0.5) / _SUBFRAMES - 0.5)
         return [self.at(frame + offset) for offset in offsets]

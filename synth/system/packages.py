@@ -1,9 +1,12 @@
-"""Versions of the installed packages that shape a sequence."""
+"""Versions of the installed packages that shape a sequence, and the machine that they run on."""
 
 from __future__ import annotations
 
+import os
 import platform
+import re
 from importlib import metadata
+from pathlib import Path
 
 _SHAPING = (
     "sulcus",
@@ -28,3 +31,16 @@ def versions() -> dict[str, str]:
         except metadata.PackageNotFoundError:
             continue  # optional here, or run from a checkout that is not installed
     return found
+
+
+def machine() -> dict[str, str | int | float]:
+    """Processor, cores, memory [GB], system and Python; nothing that names the machine itself."""
+    info = Path("/proc/cpuinfo")
+    model = re.search(r"model name\s*:\s*(.+)", info.read_text() if info.exists() else "")
+    return {
+        "processor": model.group(1) if model else platform.processor() or platform.machine(),
+        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1,
+        "memory_gb": round(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") / 1e9, 1),
+        "system": platform.system(),
+        "python": platform.python_version(),
+    }

@@ -1,193 +1,114 @@
-"""One sequence of a job, computed at full fidelity then with knobs turned: error of the force, and cost."""
+"""One sequence of a job: by how much the force is off with some settings, and what they cost."""
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
-from synth.fem import tool
+from synth.errors import UserError
 from synth.fem.solver import Deformation
 from synth.flow import mask
 from synth.flow.track import Tracker
 from synth.job.schema import Job
-from synth.render import truth
-from synth.render.anatomy.surface import Surface
-from synth.render.camera import camera as cameras
-from synth.render.scene import Shot, Studio
-from synth.sequence import pipeline, scenario
-from synth.sequence.timeline import Timeline
+from synth.render.camera import camera
+from synth.sequence import scenario
+from synth.sequence.scene import Frame, Scene, estimator, simulate
 from synth.system.stopwatch import Stopwatch
-from synth.tune import force_reading
+from synth.tune.force_reading import cells, fit_reading
 
 Floats = NDArray[np.float64]
 
-LOADED = 3
-"""Frames with load that are looked at in a sequence, on the way up to its peak."""
+_LOADED = 3  # frames with load that are looked at in a sequence, on the way up to its peak
+_PHYSICS = {"seed", "sequences", "frames", "fps", "anatomy", "fem"}  # sections that it depends on
 
 
 @dataclass(frozen=True)
 class Measured:
-    """What a setting does to one sequence."""
+    """One sequence with some settings."""
 
     label: Floats
-    """(K, I) error of the force that the true displacement stands for, as a part of the force."""
-    seen: Floats | None
-    """(K, I) the same of the recovered displacement; None: no picture was made."""
-    cost: dict[str, float]
-    """CPU-s by stage: `physics`, `scene` a sequence; `render`, `flow` a frame."""
-
-
-@dataclass(frozen=True)
-class _Film:
-    rgb: NDArray[np.uint8]
-    blocked: NDArray[np.bool_]
-    shots: list[Shot]
-    studio: Studio
-    cost: dict[str, float]
+    """(K, I) error of the force that the true displacement stands for, as a part of the force, in K frames of
+    I instruments."""
+    read: Floats
+    """(K, I) the same of the recovered displacement; of the true one where none is recovered."""
+    cost: Floats
+    """(4,) CPU-s: physics and scene of the sequence, rendering and flow of a frame."""
 
 
 class Probe:
-    """One sequence. What `measure` was asked before is partly remembered."""
+    """The first sequence of a job at full fidelity, which other settings are measured against."""
 
-    def __init__(self, job: Job, index: int) -> None:
-        """Computes the sequence at full fidelity.
+    def __init__(self, job: Job) -> None:
+        """UserError if the sequence cannot be carried out."""
+        scene, _ = _simulate(job.model_dump_json(include=_PHYSICS))
+        self._numbers = loaded_frames(scene.motion)
+        scene, frames, _ = _render(job.model_dump_json(exclude={"flow"}), self._numbers)
+        self._reading = fit_reading(scene, frames[1:])
 
-        Args:
-            job: with every knob at its finest.
-            index: which sequence.
-
-        Raises:
-            UserError: the sequence cannot be carried out.
-        """
-        self._job, self._index = job, index
-        case = scenario.draw(job, index)
-        self._frames = loaded(job, index)
-        self._motions: dict[str, tuple[Surface, Deformation, float]] = {}
-        self._film: tuple[str, _Film] | None = None
-        surface, motion, _ = self._moved(job)
-        film = self._filmed(job)
-        still, lens = film.studio.still, film.studio.camera
-        self._still, self._lens = still, lens
-        true = np.stack([force_reading.cells(shot.flow, still.tissue) for shot in film.shots[1:]])
-        self._reading = force_reading.fit_reading(
-            job,
-            case,
-            surface,
-            motion,
-            self._frames[1:],
-            still,
-            lens,
-            lens.mm_per_px * true,
-            np.stack([force_reading.shown(shot.visible, still.tissue) for shot in film.shots[1:]]),
-        )
-
-    def measure(self, job: Job, pictures: bool = True) -> Measured:
-        """What the sequence is with knobs turned.
-
-        Args:
-            job: the setting.
-            pictures: whether frames are rendered and followed; without them the surface must be that of
-                full fidelity.
-
-        Raises:
-            UserError: the setting cannot carry the sequence out.
-        """
-        surface, motion, spent = self._moved(job)
-        if not pictures:
-            rest = cameras.project(self._lens, surface.vertices)
-            flows = [
-                truth.at_rest_pixels(
-                    self._still,
-                    surface.faces,
-                    cameras.project(self._lens, surface.vertices + motion.displacement[f]) - rest,
-                )
-                for f in self._frames[1:]
-            ]
-            return Measured(
-                self._error(flows, self._still.tissue, self._lens.mm_per_px), None, {"physics": spent}
-            )
-        film = self._filmed(job)
-        still, scale = film.studio.still, film.studio.camera.mm_per_px
-        label = self._error([shot.flow for shot in film.shots[1:]], still.tissue, scale)
+    def measure(self, job: Job) -> Measured:
+        """The sequence with the settings of `job`. UserError if they cannot carry it out."""
+        scene, frames, cost = _render(job.model_dump_json(exclude={"flow"}), self._numbers)
+        label = self._error(scene, [frame.flow for frame in frames[1:]])
         if job.flow.backend == "ideal":
-            return Measured(label, None, {"physics": spent, **film.cost})
-        tracker = Tracker(pipeline.estimator(job.flow), film.rgb[0], film.blocked[0], still.tissue)
-        flows, each = [], []
-        for frame, blocked in zip(film.rgb[1:], film.blocked[1:], strict=True):
-            with _timed() as cpu:
-                flows.append(tracker.step(frame, blocked)[0])
-            each.append(cpu[0])
-        # All frames but the first start from the one before.
-        cost = {"physics": spent, **film.cost, "flow": min(each[1:] or each)}
-        return Measured(label, self._error(flows, still.tissue, scale), cost)
+            return Measured(label, label, np.array([*cost, 0.0]))
+        flows, flow_s = _recover_flow(scene, frames, job)
+        return Measured(label, self._error(scene, flows), np.array([*cost, flow_s]))
 
-    def rest(self) -> None:
-        """Lets go of pictures until they are asked for again."""
-        self._film = None
-
-    def _error(self, flows: list[Any], tissue: NDArray[np.bool_], scale: float) -> Floats:
-        moved = scale * np.stack([force_reading.cells(flow, tissue) for flow in flows])
-        return self._reading.error(moved)
-
-    def _moved(self, job: Job) -> tuple[Surface, Deformation, float]:
-        key = job.fem.model_dump_json() + job.anatomy.model_dump_json()
-        if key not in self._motions:
-            case = scenario.draw(job, self._index)
-            with _timed() as cpu:
-                surface, tets = pipeline.build(job, case)
-                motion = pipeline.move(job, case, surface, tets)
-            if len(self._motions) > 1:  # full fidelity and the latest
-                del self._motions[list(self._motions)[1]]
-            self._motions[key] = (surface, motion, cpu[0])
-        return self._motions[key]
-
-    def _filmed(self, job: Job) -> _Film:
-        key = job.model_dump_json(exclude={"flow"})
-        if self._film is None or self._film[0] != key:
-            self._film = None  # of two studios the first forgets its scene
-            self._film = (key, self._filming(job))
-        return self._film[1]
-
-    def _filming(self, job: Job) -> _Film:
-        surface, motion, _ = self._moved(job)
-        case = scenario.draw(job, self._index)
-        lens = cameras.place(case.view, job.render)
-        with _timed() as scene:
-            studio = Studio(surface, case.look, lens, job, [gesture.kind for gesture in case.gestures])
-        line = Timeline(motion, lens, case.sway, case.look.light, job.fps)
-        seeds = scenario.frame_seeds(job, self._index)
-        shots, each = [], []
-        for f in self._frames:
-            with _timed() as cpu:
-                opened = line.open(f, job.sensor.shutter, job.sensor.subframes)
-                shots.append(studio.shoot(line.at(f), seeds[f], opened, line.at(f + 1)))
-            each.append(cpu[0])
-        frame = min(each[1:])  # what else the machine does only adds
-        rgb = np.stack([shot.rgb for shot in shots])
-        blocked = mask.hidden(rgb, np.stack([shot.tool for shot in shots]))
-        return _Film(rgb, blocked, shots, studio, {"scene": scene[0] + each[0] - frame, "render": frame})
+    def _error(self, scene: Scene, flows: list[NDArray[np.float32]]) -> Floats:
+        moved = np.stack([cells(flow, scene.tissue) for flow in flows])
+        return self._reading.error(scene.view.mm_per_px * moved)
 
 
-def loaded(job: Job, index: int) -> list[int]:
-    """The rest frame and up to `LOADED` frames on the way to the peak of a sequence's load."""
-    gestures = scenario.draw(job, index).gestures
-    load = np.sum([g.force_mn * tool.course(g, job.frames).load for g in gestures], axis=0)
+def loaded_frames(motion: Deformation) -> tuple[int, ...]:
+    """The rest frame and up to three others, evenly on the way to the largest load; UserError without any."""
+    load = np.linalg.norm(motion.traction, axis=2) @ motion.area
     if not load.any():
-        load[-1] = 1.0
-    begin, peak = int(np.flatnonzero(load)[0]), int(load.argmax())
-    steps = np.linspace(begin - 1, peak, LOADED + 1).round().astype(int)[1:]
-    return [0, *sorted({int(step) for step in steps if step > 0})]
+        raise UserError("a sequence of the job has no frame with a load; give it more frames")
+    first, peak = int(np.flatnonzero(load)[0]), int(load.argmax())
+    numbers = np.linspace(first - 1, peak, _LOADED + 1).round().astype(int)[1:]
+    return (0, *sorted({int(t) for t in numbers if t > 0}))
 
 
-@contextlib.contextmanager
-def _timed() -> Iterator[list[float]]:
-    """CPU-s of the block, as the list's only item once it has ended."""
-    watch, spent = Stopwatch(), [0.0]
-    with watch.stage("block"):
-        yield spent
-    spent[0] = watch.cpu_s("block")
+@lru_cache(maxsize=2)
+def _simulate(job_json: str) -> tuple[Scene, float]:
+    """The moved scene of a job's first sequence, and its CPU-s."""
+    watch = Stopwatch()
+    with watch.stage("physics"):
+        scene = simulate(Job.model_validate_json(job_json))
+    return scene, watch.cpu_s("physics")
+
+
+@lru_cache(maxsize=1)  # for settings of flow alone
+def _render(job_json: str, numbers: tuple[int, ...]) -> tuple[Scene, list[Frame], tuple[float, float, float]]:
+    """Frames of a job's first sequence; CPU-s of its physics and scene, and of a frame."""
+    job = Job.model_validate_json(job_json)
+    moved, physics_s = _simulate(job.model_dump_json(include=_PHYSICS))
+    case = scenario.draw(job, 0)
+    scene = replace(moved, job=job, scenario=case, view=camera.place(case.view, job.render))
+    watch = Stopwatch()
+    with watch.stage("scene"):
+        _ = scene.studio
+    frames = []
+    for t in numbers:
+        with watch.stage(f"frame {t}"):
+            frames.append(scene.frame(t))
+    first_s, *others_s = (watch.cpu_s(f"frame {t}") for t in numbers)
+    frame_s = min(others_s)  # what else the machine does only adds
+    # The first frame also prepares what all of them need.
+    return scene, frames, (physics_s, watch.cpu_s("scene") + first_s - frame_s, frame_s)
+
+
+def _recover_flow(scene: Scene, frames: list[Frame], job: Job) -> tuple[list[NDArray[np.float32]], float]:
+    """Flow (H, W, 2) px of all frames but the first, and the CPU-s of one."""
+    rgb = np.stack([frame.rgb for frame in frames])
+    blocked = mask.hidden(rgb, np.stack([frame.tool for frame in frames]))
+    tracker = Tracker(estimator(job.flow), rgb[0], blocked[0], scene.tissue)
+    watch, flows = Stopwatch(), []
+    for k in range(1, len(rgb)):
+        with watch.stage(f"flow {k}"):
+            flows.append(tracker.step(rgb[k], blocked[k])[0])
+    first_s, *others_s = (watch.cpu_s(f"flow {k}") for k in range(1, len(rgb)))
+    return flows, min(others_s or [first_s])  # in a video, all but one start from the one before

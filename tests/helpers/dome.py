@@ -21,4 +21,4 @@ def patch(n: int = 61, extent: float = 46.0) -> tuple[np.ndarray, np.ndarray]:
 
 
 def block(fem: schema.Fem) -> tetrahedra.Tets:
-    return tetrahedra.block(ANATOMY, fem.tets, fem.order)
+    return tetrahedra.block(ANATOMY, fem.tets, 2)

@@ -19,7 +19,6 @@ FACTORS = {"0.9": 2.0, "0.68": 1.0}
 def make(
     size: float = 5.0,
     axes: tuple[float, float, float] = (3.0, 4.0, 50.0),
-    density: float = 0.5,
     usual: float = 1e6,
     source: str = "recovered",
 ) -> Intervals:
@@ -37,9 +36,7 @@ def make(
     along = tuple(tuple(float(i == j == 0) for j in range(count)) for i in range(count))
     x, y, z = (spread(half, len(names)) for half in axes)
     return Intervals(
-        names, 100.0, 1.0, spread(size, len(names)), (x, y, z),
-        spread(density, len(names) + 2), spread(density, len(names) + 2),
-        World((0.0,) * count, along, usual), source, 19, 19,
+        names, 100.0, spread(size, len(names)), (x, y, z), World((0.0,) * count, along, usual), source, 19, 19
     )  # fmt: skip
 
 

@@ -10,7 +10,6 @@ from learn import checkpoint
 from learn.checkpoint import Card
 from learn.data.grid import Scales
 from learn.network.d2fnet import D2FNet
-from learn.network.monai_unet import build
 from learn.settings import override, preset
 
 
@@ -18,11 +17,10 @@ def write_model(folder: Path, *changes: str) -> Path:
     """The folder; `changes` as on the command line, e.g. `arch.output=vector`."""
     settings = override(preset("tiny"), ["size=32", "arch.levels=2", *changes])
     torch.manual_seed(0)
-    net = build(settings.arch).eval()
-    assert isinstance(net, D2FNet)
+    net = D2FNet(settings.arch).eval()
     with torch.no_grad():
-        for conv in net.heads.ranges:  # type: ignore[union-attr]
-            conv.weight.normal_(0, 200.0)  # type: ignore[union-attr,operator]
+        for conv in net.heads.ranges:
+            conv.weight.normal_(0, 200.0)
     card = Card(settings, Scales(1.0, 0.2, 1.0, 100.0, 0.3), 1.7, {}, {})
     checkpoint.write_model(folder, card, net.state_dict())
     return folder

@@ -11,11 +11,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.methods.protocol import Answer, Scene
-from bench.recording import writer
-from evidence.scoring import phantom
+from bench.methods.protocol import Answer, Method, Scene
+from bench.recording import pixel_scale, writer
+from bench.recording.folder import open_recording
+from bench.scoring.evaluate_recording import Result, Settings, evaluate_recording
+from evidence.scoring import cost as phantom
 
 GAIN_MN_PER_PX = 40.0
+SENSOR_HZ = 100.0
 
 
 def texture(height: int, width: int, seed: int = 0) -> NDArray[np.uint8]:
@@ -41,7 +44,6 @@ class Maker:
         frames: int = 30,
         fps: float = 10.0,
         size: tuple[int, int] = (96, 128),
-        sensor_hz: float = 100.0,
         meta: Mapping[str, Any] | None = None,
         footage: str = "png",
         force: bool = True,
@@ -59,7 +61,7 @@ class Maker:
             (folder / "frames").rmdir()
             writer.write_video(folder / "video.mp4", iter(pictures), time, crf=6)
         if force:
-            t = np.arange(0, time[-1] + 1e-9, 1 / sensor_hz)
+            t = np.arange(0, time[-1] + 1e-9, 1 / SENSOR_HZ)
             writer.write_force(folder, t, np.outer(force_curve(t) / 1000, [1.0, 0.0, 0.0]))
         about = {"scale_mm_per_px": 0.2, "young_kpa": 1.0, "sensor": {"axes": "camera", "low_pass_hz": None}}
         writer.write_meta(folder, {**about, **(meta or {})})
@@ -77,3 +79,13 @@ class Bump:
         middle = flow[height // 2 - 4 : height // 2 + 4, width // 2 - 4 : width // 2 + 4, 0]
         force = GAIN_MN_PER_PX * float(np.median(middle))
         return Answer(np.array([force, 0.0, 0.0]), length.astype(np.float32) if picture else None)
+
+
+def scored(folder: Path, methods: Mapping[str, Method] | None = None, **settings: Any) -> Result:
+    """What scoring a recording gives; by default `Bump` on every frame, without a second process."""
+    recording = open_recording(folder)
+    chosen = dict(methods or {"bump": Bump()})
+    flow = settings.pop("flow_here", None)
+    asked = Settings(**({"shrink": 1, "rate_hz": None} | settings))
+    scale = pixel_scale.find_scale(recording.meta, folder)
+    return evaluate_recording(recording, chosen, next(iter(chosen)), scale, asked, {}, flow=flow)

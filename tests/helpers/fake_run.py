@@ -40,7 +40,7 @@ class Silent:
 
 
 def options(work: str, **more: object) -> Options:
-    path = os.pathsep.join([str(HERE), str(HERE.parents[1])])
+    path = os.pathsep.join(filter(None, [os.environ.get("PYTHONPATH"), str(HERE), str(HERE.parents[1])]))
     return Options(
         work=f"fake_work:{work}",
         environment={"PYTHONPATH": path},
@@ -57,7 +57,7 @@ def in_process(job: Job, root: Path, work: Callable[..., None]) -> None:
         card.write_card(folder)
 
 
-def start(root: Path, job: Job, work: str) -> subprocess.Popen[bytes]:
+def start(root: Path, job: Job, work: str, **environment: str) -> subprocess.Popen[bytes]:
     """A run in a process of its own, which can be killed."""
     # A shell that runs tests in its background has them ignore SIGINT, and every child of theirs.
     program = (
@@ -66,7 +66,7 @@ def start(root: Path, job: Job, work: str) -> subprocess.Popen[bytes]:
         "fake_run.run_here(Path(sys.argv[1]), sys.argv[2], sys.argv[3])"
     )
     words = [str(root), job.model_dump_json(), work, str(HERE), str(HERE.parents[1])]
-    return subprocess.Popen([sys.executable, "-c", program, *words])
+    return subprocess.Popen([sys.executable, "-c", program, *words], env={**os.environ, **environment})
 
 
 def run_here(root: Path, job: str, work: str) -> None:

@@ -10,12 +10,43 @@ from typing import Any
 
 import numpy as np
 
-from evidence.engine.work import attributes, sequence
 from synth.dataset.store import Writer
 from synth.errors import UserError
 from synth.job.schema import Job
 
 Report = Callable[[str, int, int], None]
+
+
+def sequence(job: Job, index: int, folder: Path, report: Report) -> None:
+    """Every field random, from the job's seed and the index only."""
+    rng = np.random.default_rng((job.seed, index))
+    width, height = job.render.size
+    writer = Writer(folder, index, frames=job.frames, size=(height, width), job=job)
+    writer.put("time", np.arange(job.frames) / job.fps)
+    writer.put("force", rng.normal(size=(job.frames, 3)))
+    writer.put("tissue", rng.random((height, width)) > 0.2)
+    writer.put("area", rng.random((height, width)))
+    for t in range(job.frames):
+        report("render", t, job.frames)
+        writer.put_frame("rgb", t, rng.integers(0, 256, (height, width, 3)).astype(np.uint8))
+        for name in ("visible", "tool", "glare"):
+            writer.put_frame(name, t, rng.random((height, width)) > 0.5)
+        writer.put_frame("flow", t, rng.normal(size=(height, width, 2)))
+        writer.put_frame("depth", t, rng.random((height, width)) + 300)
+        writer.put_frame("traction", t, rng.normal(size=(height, width, 3)))
+    writer.seal(**attributes(index, rng))
+
+
+def attributes(index: int, rng: np.random.Generator) -> dict[str, Any]:
+    """What a stand-in's store says of itself."""
+    gesture = {"kind": "pull", "load": 0.1}
+    return {
+        "scenario": {"index": index, "anatomy": index, "family": "healthy", "gesture": gesture},
+        "scale_mm_per_px": 0.1,
+        "young_kpa": float(rng.uniform(0.5, 3)),
+        "poisson": 0.4,
+        "timings": {"render": {"cpu_s": time.process_time(), "wall_s": 0.0}},
+    }
 
 
 def troubled(job: Job, index: int, folder: Path, report: Report) -> None:
@@ -52,11 +83,6 @@ def seeing(job: Job, index: int, folder: Path, report: Report) -> None:
 def hanging(job: Job, index: int, folder: Path, report: Report) -> None:
     """It never comes back."""
     time.sleep(600)
-
-
-def refused(job: Job, index: int, folder: Path, report: Report) -> None:
-    """No sequence of this job can be carried out."""
-    raise UserError("no surface at the craniotomy")
 
 
 def trying(job: Job, index: int, folder: Path, report: Report) -> None:

@@ -18,6 +18,7 @@ POISSON = 0.4
 SIZE = (48, 64)
 SCALE_MM_PER_PX = 0.5
 RADIUS_MM = 4.0
+NOISE_PX = 0.05
 
 
 def density(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -57,7 +58,6 @@ def write(
     frames: int = 6,
     recovered: bool = True,
     family: str = "healthy",
-    noise_px: float = 0.05,
     two_eyes: bool = False,
     opening: str | None = None,
 ) -> Path:
@@ -100,7 +100,7 @@ def write(
         writer.put_frame("depth", t, np.full(SIZE, 300.0, np.float32))
         writer.put_frame("traction", t, (share[..., None] * level * peak).astype(np.float32))
         if recovered:
-            noisy = flow + noise_px * rng.normal(size=flow.shape) * tissue[..., None]
+            noisy = flow + NOISE_PX * rng.normal(size=flow.shape) * tissue[..., None]
             writer.put_frame("flow_recovered", t, noisy.astype(np.float32))
             writer.put_frame("flow_confidence", t, np.full(SIZE, 0.8, np.float32))
         if two_eyes:

@@ -1,4 +1,4 @@
-"""The pages say what the code says: tables are written by it, blocks run, commands and keys exist."""
+"""The pages say what the code says: tables are written by it, commands and keys exist, examples are whole."""
 
 from __future__ import annotations
 
@@ -29,6 +29,7 @@ PAGES = [
 ]
 GENERATED = generate.pages()
 SPOKEN = {spoken.words: spoken for spoken in generate.commands()}
+OURS = re.compile(r"(?<![\w./@-])(?:synth|learn|bench|evidence|tests|examples)/[\w/]+(?:\.[a-z0-9]+)*")
 
 
 def blocks(page: Path, language: str) -> Iterator[tuple[str, str]]:
@@ -38,94 +39,44 @@ def blocks(page: Path, language: str) -> Iterator[tuple[str, str]]:
         yield title[1] if title else "", found[2]
 
 
-def typed(page: Path) -> Iterator[str]:
-    """Command lines in indented blocks, continued lines joined and comments cut."""
-    for line in re.sub(r" *\\\n +", " ", page.read_text("utf-8")).splitlines():
-        if re.match(r"(    )+(\.venv/bin/)?(synth|learn|bench) ", line):
-            yield line.strip().removeprefix(".venv/bin/")
-
-
 @pytest.mark.parametrize("page", GENERATED, ids=lambda page: page.stem)
 def test_generated_pages_are_those_of_this_code(page: Path) -> None:
     assert page.read_text("utf-8") == GENERATED[page], "out of date: run `make docs`"
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
-def test_commands_on_the_pages_can_be_typed(page: Path) -> None:
-    for line in typed(page):
-        words = shlex.split(line, comments=True)
+def test_what_a_page_shows_can_be_used(page: Path) -> None:
+    text = page.read_text("utf-8")
+    for line in re.sub(r" *\\\n +", " ", text).splitlines():
+        if not re.match(r"(    )+(\.venv/bin/)?(synth|learn|bench) ", line):
+            continue
+        words = shlex.split(line.strip().removeprefix(".venv/bin/"), comments=True)
         depth = next((k for k in (3, 2) if len(words) >= k and tuple(words[:k]) in SPOKEN), 0)
         assert depth, f"{line}: there is no such command"
         spoken = SPOKEN[tuple(words[:depth])]
         if "--help" not in words and not spoken.group:
             spoken.command.make_context(words[depth - 1], words[depth:])
-
-
-def test_commands_of_a_page_are_found(tmp_path: Path) -> None:
-    page = tmp_path / "page.md"
-    lines = [
-        "Say synth render.",
-        "    .venv/bin/synth verify out \\",
-        "        --json",
-        "1. So:",
-        "        bench flow a",
-    ]
-    page.write_text("\n".join(lines))
-    assert list(typed(page)) == ["synth verify out --json", "bench flow a"]
-    whole_way = {tuple(line.split()[:2]) for line in typed(ROOT / "README.md")}
-    assert whole_way >= {("synth", "render"), ("synth", "verify"), ("learn", "train"), ("bench", "score")}
-
-
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
-def test_jobs_and_descriptions_on_the_pages_are_valid(page: Path) -> None:
-    for title, text in blocks(page, "yaml"):
-        content = YAML(typ="safe").load(text)
-        if title == "job.yaml":
-            Job.model_validate(content)
-        elif title == "meta.yaml":
-            Meta.model_validate(content)
-
-
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
-def test_what_is_said_to_be_of_an_example_is(page: Path) -> None:
-    for title, text in blocks(page, "python"):
+    for title, block in blocks(page, "yaml"):
+        if title in ("job.yaml", "meta.yaml"):
+            {"job.yaml": Job, "meta.yaml": Meta}[title].model_validate(YAML(typ="safe").load(block))
+    for title, block in blocks(page, "python"):
         if title.startswith("examples/"):
-            assert text.strip() in (ROOT / title).read_text("utf-8"), f"{page.name} and {title} differ"
+            assert block.strip() in (ROOT / title).read_text("utf-8"), f"{page.name} and {title} differ"
+    lost = [name for name in OURS.findall(text) if not (ROOT / name).exists()]
+    assert not lost, f"{page.name} names {lost}"
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["README.md", "docs/tutorial.md"])
-def test_python_on_the_pages_runs(
-    name: str, out: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_python_on_the_pages_runs(name: str, out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(out.parent)
     found = [text for title, text in blocks(ROOT / name, "python") if not title]
     assert found
     for text in found:
         exec(compile(text, name, "exec"), {})
-    said = capsys.readouterr().out.splitlines()
-    assert any(line.startswith("0.81") for line in said), "the stiffness of the dataset's first sequence"
 
 
-def build(folder: Path) -> subprocess.CompletedProcess[str]:
-    """Builds the site in a folder that holds mkdocs.yml and docs, as `make docs` does."""
-    command = [sys.executable, "-m", "zensical", "build", "--strict", "--clean"]
-    environment = {**os.environ, "PYTHONPATH": "docs"}
-    return subprocess.run(command, cwd=folder, capture_output=True, text=True, env=environment)
-
-
-@pytest.fixture(scope="module")
-def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The built site; from a copy, as a build writes beside its pages."""
-    folder = tmp_path_factory.mktemp("site")
-    shutil.copytree(DOCS, folder / "docs")
-    shutil.copy(ROOT / "mkdocs.yml", folder)
-    done = build(folder)
-    assert done.returncode == 0, done.stdout + done.stderr
-    return folder / "site"
-
-
-class _Links(HTMLParser):
+class Links(HTMLParser):
     """What a page fetches, what it links to, and the places in it that can be linked to."""
 
     def __init__(self, page: Path) -> None:
@@ -143,47 +94,27 @@ class _Links(HTMLParser):
                 (self.linked if tag == "a" else self.fetched).append(value)
 
 
-@pytest.mark.slow
-def test_equations_need_no_script(site: Path) -> None:
-    science = (site / "science.html").read_text("utf-8")
-    fences = len(list(blocks(DOCS / "science.md", "math")))
-    assert science.count("<math") == fences >= 20
-    assert not re.search(r"<math[^§]*?\\", science.split("</main>")[0]), "LaTeX that was not understood"
-
-
-def test_pages_load_nothing_from_elsewhere(site: Path) -> None:
-    for page in site.rglob("*.html"):
-        away = [one for one in _Links(page).fetched if re.match(r"(https?:)?//", one)]
-        assert not away, f"{page.relative_to(site)} loads {away}"
-
-
-def test_pages_open_from_disk_and_every_link_leads_somewhere(site: Path) -> None:
+@pytest.mark.trial
+def test_the_site_is_whole_and_loads_nothing_from_elsewhere(tmp_path: Path) -> None:
     """More than `--strict` asks, which passes over pictures, data files and the list of pages."""
-    pages = {page: _Links(page) for page in site.rglob("*.html") if page.name != "404.html"}
+    shutil.copytree(DOCS, tmp_path / "docs")
+    shutil.copy(ROOT / "mkdocs.yml", tmp_path)
+    command = [sys.executable, "-m", "zensical", "build", "--strict", "--clean"]
+    environment = {**os.environ, "PYTHONPATH": "docs"}
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, env=environment)
+    assert done.returncode == 0, done.stdout + done.stderr
+    site = tmp_path / "site"
+    fences = len(list(blocks(DOCS / "science.md", "math")))
+    assert (site / "science.html").read_text("utf-8").count("<math") == fences
+    pages = {page: Links(page) for page in site.rglob("*.html") if page.name != "404.html"}
     broken = []
     for page, links in pages.items():
+        broken += [f"{page.name} loads {one}" for one in links.fetched if re.match(r"(https?:)?//", one)]
         for link in {*links.fetched, *links.linked}:
             path, _, place = link.partition("#")
             if re.match(r"[a-z]+:", link):
                 continue
             target = (page.parent / unquote(path)).resolve() if path else page
-            found = target.is_file() and (target not in pages or not place or place in pages[target].places)
-            if not found:
+            if not (target.is_file() and (target not in pages or not place or place in pages[target].places)):
                 broken.append(f"{page.relative_to(site)}: {link}")
     assert not broken, "\n".join(broken)
-
-
-@pytest.mark.slow
-def test_a_broken_link_stops_the_build(tmp_path: Path) -> None:
-    (tmp_path / "docs").mkdir()
-    shutil.copy(DOCS / "equations.py", tmp_path / "docs")
-    head = (ROOT / "mkdocs.yml").read_text("utf-8").partition("nav:")[0]
-    (tmp_path / "mkdocs.yml").write_text(head)
-    page = tmp_path / "docs" / "index.md"
-    page.write_text("# One {#one}\n\nSee [itself](index.md#one).\n")
-    assert build(tmp_path).returncode == 0
-    for link in ("nowhere.md", "index.md#two"):
-        page.write_text(f"# One {{#one}}\n\nSee [itself]({link}).\n")
-        done = build(tmp_path)
-        assert done.returncode != 0
-        assert "does not exist" in done.stdout + done.stderr

@@ -13,8 +13,8 @@ from learn.inference.predict import load_predictor
 
 def test_two_processes_train_one_model(dataset: Path, tmp_path: Path) -> None:
     out = tmp_path / "model"
-    train = ["-m", "learn", "train", str(dataset), "-o", str(out), "--preset", "tiny", "--size", "32"]
-    train += ["--width", "8", "--epochs", "2", "--accelerator", "cpu", "--devices", "2", "--json"]
+    train = ["-m", "learn", "train", str(dataset), "-o", str(out), "--preset", "tiny", "size=32"]
+    train += ["arch.width=8", "--epochs", "2", "--accelerator", "cpu", "--devices", "2", "--json"]
     train += ["arch.levels=2"]
     torchrun = ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
     done = subprocess.run(

@@ -60,6 +60,7 @@ def test_pixels_carry_the_applied_force(undisturbed: Path) -> None:
         assert np.abs(total - force).max() <= 0.03 * np.linalg.norm(force, axis=1).max()
 
 
+@pytest.mark.trial
 def test_killed_and_resumed_equals_undisturbed(undisturbed: Path, tmp_path: Path) -> None:
     job, out = undisturbed.parent / "job.yaml", tmp_path / "out"
     process = start(job, out)

@@ -24,6 +24,10 @@ Ints = NDArray[np.int64]
 Contact = tuple[float, float, float]
 """World x, y of a contact's centre and its radius, mm."""
 
+BLOCK_MM = 100.0, 100.0, 60.0
+"""Width, height, depth of a procedural block; below 70 mm the fixed walls would take 10-16% of the peak."""
+RIM_MM = 3.0
+"""Width over which the skull's hold on the brain grows from none in the opening to firm."""
 _FIRM_PER_MM = (
     2.0  # skull and dura as springs of this times E a mm: 10 times stiffer than the tissue under a contact
 )
@@ -63,25 +67,27 @@ def block(
     height: HeightMap | None = None,
     *,
     slips: bool = False,
+    size_mm: tuple[float, float, float] = BLOCK_MM,
 ) -> Tets:
     """A domed block, fixed at its sides and bottom, held by the skull round the opening.
 
     Args:
-        anatomy: block_mm, dome_mm, craniotomy and attachments are used.
+        anatomy: dome_mm, craniotomy and attachments are used.
         tets: number of tetrahedra to aim for.
         order: 1 or 2.
         focus: where the load will be; finest there. Empty: finest in the whole opening.
         height: of the surface over the opening and its rim. Empty: the bare dome.
         slips: tissue slips along the skull round the opening, rather than being bonded to it.
+        size_mm: width, height, depth.
 
     Raises:
-        UserError: the block is too shallow for its dome, or an attachment holds nothing.
+        UserError: the dome is too round for the block, or an attachment holds nothing.
     """
-    size = np.asarray(anatomy.block_mm)
+    size = np.asarray(size_mm)
     fall = -dome(np.array([size[:2] / 2]), anatomy.dome_mm)[0]
     if fall > 0.8 * size[2]:
         raise UserError(
-            f"anatomy.block_mm: depth {size[2]:g} mm is too little under a dome that falls {fall:.0f} mm"
+            f"anatomy.dome_mm: the dome falls by {fall:.0f} mm, too much for a block of {size[2]:g} mm depth"
         )
     points, cells = _bricks(size, tets / 60)
     opening = anatomy.craniotomy.radius_mm
@@ -260,7 +266,7 @@ def _springs(
     area = 0.5 * np.linalg.norm(facing, axis=1)
     place = np.einsum("qc,fcd->fqd", TRI_POINTS, corner)
     out = np.hypot(place[..., 0], place[..., 1]) - at.radius_mm
-    firm = np.clip(out / at.rim_mm, 0, 1)
+    firm = np.clip(out / RIM_MM, 0, 1)
     # Deep below, it is the far side of the brain, which no opening bares.
     deep = place[..., 2] < -2 * at.radius_mm
     firm[deep] = 1

@@ -10,7 +10,7 @@ import numpy as np
 
 from synth.errors import UserError
 from synth.flow.stereo.rig import Eye, Floats, Rig
-from synth.system import foreign_file, foreign_storage
+from synth.system import checked_file
 
 _LEFT = ("K1", "M1", "cameraMatrix1", "camera_matrix_1", "CM1"), ("D1", "distCoeffs1", "dist_coeffs_1")
 _RIGHT = ("K2", "M2", "cameraMatrix2", "camera_matrix_2", "CM2"), ("D2", "distCoeffs2", "dist_coeffs_2")
@@ -29,7 +29,7 @@ def read_rig(path: Path, size: tuple[int, int], mm_per_unit: float = 1.0) -> Rig
     Raises:
         UserError: it cannot be read, or what it holds are no two cameras.
     """
-    held = foreign_storage.read_storage(str(path), foreign_file.read_text(path, foreign_storage.LARGEST))
+    held = checked_file.read_storage(str(path), checked_file.read_text(path, checked_file.LARGEST_STORAGE))
 
     def matrix(names: Sequence[str], what: str) -> Floats:
         first = next((held[name] for name in names if isinstance(held.get(name), np.ndarray)), None)

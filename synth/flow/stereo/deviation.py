@@ -3,13 +3,11 @@
 From the posterior of the depth solver: with precision a of the data and stiffness b of a thin plate, both by
 cell, the variance is 1 / (8 sqrt(a b)) (the plate's Green's function at 0). What else tells how far a motion
 is off (strain, what the eyes disagree on, the flow's confidence with its way back, how far it went)
-enters as powers, whose exponents were fitted to the errors on rendered sequences (`bench experiment stereo`
+enters as powers, whose exponents were fitted to the errors on rendered sequences (`evidence.flow.stereo`
 measures the z-scores on others).
 """
 
 from __future__ import annotations
-
-from typing import Literal
 
 import cv2
 import numpy as np
@@ -18,20 +16,13 @@ from numpy.typing import NDArray
 from synth.flow.stereo.depth_motion import Change
 
 Map = NDArray[np.float32]
-Tier = Literal["joint", "fused"]
 
 _AROUND = (5, 5)  # cells whose pictures a cell's depth rests on
 
 # Exponents of 1 (e), posterior deviation [px], strain, misfit, doubt, way [px].
-ALONG: dict[Tier, tuple[float, ...]] = {
-    "joint": (0.663, 1.039, -0.023, 0.328, 0.09, 0.029),
-    "fused": (-1.015, 0.77, -0.191, 0.139, -0.02, 0.232),
-}
+ALONG = (0.663, 1.039, -0.023, 0.328, 0.09, 0.029)
 """For the change of disparity, in px."""
-ACROSS: dict[Tier, tuple[float, ...]] = {
-    "joint": (0.709, 1.137, -0.505, 0.396, 0.325, 0.37),
-    "fused": (1.424, 1.46, -0.706, 0.31, 0.293, 0.276),
-}
+ACROSS = (0.709, 1.137, -0.505, 0.396, 0.325, 0.37)
 """For each component of the flow, in px."""
 
 

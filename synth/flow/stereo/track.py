@@ -129,29 +129,9 @@ class StereoTracker:
         change = self.solver.solve(pictures, straight, self.rest.disparity, self.px_per_mm, self._change)
         lost = float(change.seen.sum()) < _LOST * float(self._usable.sum())
         self._change = None if lost else change.px
-        return self._moved(change, straight, confidence, "joint")
+        return self._moved(change, straight, confidence)
 
-    def fuse(self, flow: Flow, confidence: Map, right_flow: Flow, right_confidence: Map) -> Moved:
-        """The cheap way: motion from two flows that know nothing of each other, each from its own rest frame.
-
-        Args:
-            flow: (H, W, 2) px, the left eye's.
-            confidence: (H, W) in 0..1.
-            right_flow: (H, W, 2) px, the right eye's, on its own rest pixels.
-            right_confidence: (H, W) in 0..1.
-        """
-        r = self.rectified
-        straight, other = r.flow(flow), r.flow(right_flow, 1)
-        aside = np.stack([-self.rest.disparity, np.zeros_like(self.rest.disparity)])
-        there, seen, trust = np.empty_like(aside[0]), np.empty_like(aside[0]), np.empty_like(aside[0])
-        every = np.ones_like(there)
-        fused.warp_into(r.picture(right_confidence, 1), every, aside, trust, seen)
-        fused.warp_into(other[0], every, aside, there, seen)
-        weight = np.clip(r.picture(confidence, 0) * trust, 0, 1) * seen * self._usable
-        change = self.solver.smooth(straight[0] - there, weight, straight, self.px_per_mm)
-        return self._moved(change, straight, confidence, "fused")
-
-    def _moved(self, change: Change, flow: Map, confidence: Map, tier: deviation.Tier) -> Moved:
+    def _moved(self, change: Change, flow: Map, confidence: Map) -> Moved:
         r, disparity = self.rectified, self.rest.disparity
         self.features = self._features(change, flow, confidence)
         """What the last frame's deviations were made from, (6, h, w): see `deviation.features`."""
@@ -161,8 +141,8 @@ class StereoTracker:
         late = np.sqrt(max(change.lag**2 - _IN_TIME**2, 0.0)) * self.solver.coarse(
             np.abs(flow[0]) + np.abs(change.px)
         )
-        along = np.hypot(deviation.deviation(self.features, deviation.ALONG[tier]), late) / self.px_per_mm
-        across = deviation.deviation(self.features, deviation.ACROSS[tier])
+        along = np.hypot(deviation.deviation(self.features, deviation.ALONG), late) / self.px_per_mm
+        across = deviation.deviation(self.features, deviation.ACROSS)
         across *= float(np.median(r.depth(disparity))) / r.focal
         motion = r.motion(disparity, change.px, flow)
         spread = [fine(part, self.solver.cell, disparity.shape) for part in (across, across, along)]

@@ -39,16 +39,7 @@ class _Maps(NamedTuple):
         return np.asarray(cv2.remap(picture, self.x, self.y, cv2.INTER_CUBIC))
 
     def nearest(self, picture: NDArray[Any], outside: float = 0) -> NDArray[Any]:
-        return np.asarray(
-            cv2.remap(
-                picture,
-                self.x,
-                self.y,
-                cv2.INTER_NEAREST,
-                borderMode=cv2.BORDER_CONSTANT,
-                borderValue=outside,
-            )
-        )
+        return np.asarray(cv2.remap(picture, self.x, self.y, cv2.INTER_NEAREST, borderValue=outside))
 
 
 def write_scenes(dataset: Dataset, target: Path) -> None:
@@ -80,7 +71,11 @@ def write_scenes(dataset: Dataset, target: Path) -> None:
             "young_kpa": sequence.attrs["young_kpa"],
         }
         if "rgb_right" in sequence:
-            _write_right(sequence, focal, here)
+            maps = _maps(sequence, sequence.attrs["right"], focal)
+            (here / "images_right").mkdir()
+            for t in range(sequence.frames):
+                picture = as_png(maps.smooth(sequence["rgb_right"][t]))
+                (here / "images_right" / f"{t:06d}.png").write_bytes(picture)
             about["baseline_mm"] = sequence.attrs["right"]["baseline_mm"]
         (here / "scene.json").write_text(json.dumps(about, indent=1), "utf-8")
 
@@ -111,13 +106,6 @@ def _write_pictures(sequence: Sequence, maps: _Maps, here: Path) -> Floats:
         seen = depth[~covered]
         bounds.append([seen.min(), seen.max()] if seen.size else [0.0, 0.0])
     return np.array(bounds)
-
-
-def _write_right(sequence: Sequence, focal: float, here: Path) -> None:
-    maps = _maps(sequence, sequence.attrs["right"], focal)
-    (here / "images_right").mkdir()
-    for t in range(sequence.frames):
-        (here / "images_right" / f"{t:06d}.png").write_bytes(as_png(maps.smooth(sequence["rgb_right"][t])))
 
 
 def _poses(sequence: Sequence) -> Iterator[Floats]:

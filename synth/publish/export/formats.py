@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from synth.dataset.store import Dataset
 from synth.errors import UserError
-from synth.publish.export import d2fnet, endonerf, hugging_face, lerobot, overlay_video, plain, webdataset
-from synth.system import whole_file
+from synth.publish import film
+from synth.publish.export import d2fnet, endonerf, hugging_face, lerobot, plain, webdataset
+from synth.system import checked_file
 
-FORMATS: dict[str, Callable[[Dataset, Path], None]] = {
+FORMATS: dict[str, Callable[..., None]] = {
     "folder": plain.write_folder,
     "hf": hugging_face.write_parquet,
     "webdataset": webdataset.write_shards,
@@ -18,30 +20,26 @@ FORMATS: dict[str, Callable[[Dataset, Path], None]] = {
     "endonerf": endonerf.write_scenes,
     "hdf5": plain.write_hdf5,
     "d2fnet-npz": d2fnet.write_npz,
-    "video": overlay_video.write_films,
+    "video": film.write_films,
 }
 """Every format by the name that `synth export --to` takes."""
 
 
-def export_dataset(root: Path, target: Path, to: str) -> int:
+def export_dataset(root: Path, target: Path, to: str, **options: Any) -> int:
     """Writes the finished sequences of `root` into the new folder `target`; returns how many.
 
     Args:
         root: the dataset.
         target: a folder that does not exist yet; it is there in full or not at all.
         to: one of `FORMATS`.
+        options: of the format: `overlays` and `interval_s` of a video.
 
     Raises:
         UserError: an unknown format, a folder that exists, a damaged store, a missing package.
     """
     if to not in FORMATS:
         raise UserError(f"{to}: is not one of {', '.join(FORMATS)}")
-    return write_export(root, target, FORMATS[to])
-
-
-def write_export(root: Path, target: Path, write: Callable[[Dataset, Path], None]) -> int:
-    """The same with a writer that has been told more."""
     dataset = Dataset(root)
-    with whole_file.folder_of(target) as part:
-        write(dataset, part)
+    with checked_file.folder_of(target) as part:
+        FORMATS[to](dataset, part, **options)
     return len(dataset)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import chain, islice
 from pathlib import Path
 from typing import Any
 
@@ -21,13 +22,12 @@ from numpy.typing import NDArray
 from synth.dataset import index
 from synth.dataset.folder import Folder
 from synth.dataset.store import Dataset, Sequence
-from synth.fields import FIELDS, TIME, Field
+from synth.fields import FIELDS, TIME
 from synth.publish import card
 from synth.publish.export.encoding import PICTURES, as_png
 
 # The viewer reads a group of rows at once, and refuses ones of more than some hundred megabytes.
-_GROUP_BYTES = 100 << 20
-_FILE_BYTES = 500 << 20
+_GROUP_BYTES, _GROUPS = 100 << 20, 5  # in a file
 
 _ROWS = {"sequence": ("int64", "index of the sequence"), "frame": ("int64", "number in the sequence")}
 _LEFT_OUT = ("status", "reason", "path", "split")  # of the index: nothing to say here
@@ -53,13 +53,13 @@ class _Column:
         return pa.field(self.name, self.type, metadata=about)
 
     def pack(self, values: list[Any]) -> pa.Array:
-        """Rows as that type; arrays of one shape are taken as they are."""
-        if pa.types.is_fixed_size_list(self.type):
-            flat = pa.array(np.concatenate(values), self.type.value_type)
-            return pa.FixedSizeListArray.from_arrays(flat, self.type.list_size)
-        if pa.types.is_list(self.type):
-            return _nested(np.stack(values), self.type)
-        return pa.array(values, self.type)
+        """Rows as that type; arrays of one shape without a Python object for each number."""
+        if not isinstance(values[0], np.ndarray):
+            return pa.array(values, self.type)
+        packed = pa.array(np.stack(values).astype(FIELDS[self.name].dtype, copy=False).reshape(-1))
+        for size in reversed(values[0].shape):
+            packed = pa.FixedSizeListArray.from_arrays(packed, size)
+        return packed.cast(self.type)
 
 
 def write_parquet(dataset: Dataset, target: Path) -> None:
@@ -91,7 +91,7 @@ def _field(sequence: Sequence, name: str) -> _Column:
     """A field's values in one row: a picture, a number, or an array of its shape."""
     field = FIELDS[name]
     shape = sequence[name].shape[field.dims[0] == TIME :]
-    if name in PICTURES or _is_mask(field):
+    if _is_picture(name):
         kind = pa.struct([("bytes", pa.binary()), ("path", pa.string())])
         return _Column(name, kind, {"_type": "Image"})
     value = pa.type_for_alias(field.dtype)
@@ -106,8 +106,8 @@ def _field(sequence: Sequence, name: str) -> _Column:
     return _Column(name, value, told)
 
 
-def _is_mask(field: Field) -> bool:
-    return field.dtype == "bool"
+def _is_picture(name: str) -> bool:
+    return name in PICTURES or FIELDS[name].dtype == "bool"
 
 
 def _frames(sequence: Sequence, names: list[str]) -> Iterator[dict[str, Any]]:
@@ -124,7 +124,7 @@ def _sequence(sequence: Sequence, still: list[str], told: list[str]) -> dict[str
 
 
 def _cell(name: str, values: NDArray[Any]) -> Any:
-    if name in PICTURES or _is_mask(FIELDS[name]):
+    if _is_picture(name):
         return {"bytes": as_png(values), "path": None}
     return values if values.ndim else values.item()
 
@@ -135,78 +135,35 @@ def _write(folder: Path, side: str, columns: list[_Column], rows: Iterator[dict[
     about = {"huggingface": json.dumps({"info": {"features": features}})}
     schema = pa.schema([column.describe() for column in columns], about)
     folder.mkdir(exist_ok=True)
-    held: list[dict[str, Any]] = []
-    part, used, size = 0, 0, 0
-    writer: pq.ParquetWriter | None = None
-    for row in rows:
-        held.append(row)
-        size += sum(_bytes(value) for value in row.values())
-        if size < _GROUP_BYTES:
-            continue
-        writer = writer or _open(folder / f"{side}-{part:05d}.parquet", schema)
-        writer.write_table(_table(held, columns, schema))
-        used, size, held = used + size, 0, []
-        if used >= _FILE_BYTES:
-            writer.close()
-            writer, used, part = None, 0, part + 1
-    if held:
-        writer = writer or _open(folder / f"{side}-{part:05d}.parquet", schema)
-        writer.write_table(_table(held, columns, schema))
-    if writer:
-        writer.close()
-
-
-def _open(path: Path, schema: pa.Schema) -> pq.ParquetWriter:
-    return pq.ParquetWriter(path, schema, compression="zstd", use_dictionary=False, write_page_checksum=True)
-
-
-def _table(rows: list[dict[str, Any]], columns: list[_Column], schema: pa.Schema) -> pa.Table:
-    packed = [column.pack([row[column.name] for row in rows]) for column in columns]
-    return pa.Table.from_arrays(packed, schema=schema)
+    first = next(rows)
+    rows, count = chain([first], rows), max(1, _GROUP_BYTES // sum(map(_bytes, first.values())))
+    groups = iter(lambda: list(islice(rows, count)), [])
+    for part, group in enumerate(groups):
+        path = folder / f"{side}-{part:05d}.parquet"
+        packing = {"compression": "zstd", "use_dictionary": False, "write_page_checksum": True}
+        with pq.ParquetWriter(path, schema, **packing) as writer:
+            for held in chain([group], islice(groups, _GROUPS - 1)):
+                packed = [column.pack([row[column.name] for row in held]) for column in columns]
+                writer.write_table(pa.Table.from_arrays(packed, schema=schema))
 
 
 def _bytes(value: Any) -> int:
     """About what a cell takes unpacked."""
     if isinstance(value, np.ndarray):
-        # Each innermost list has an offset beside its numbers.
-        return int(value.nbytes + 4 * value.size / max(value.shape[-1:] or (1,)))
+        return value.nbytes
     return len(value["bytes"]) if isinstance(value, dict) else 8
-
-
-def _nested(values: NDArray[Any], kind: pa.DataType) -> pa.Array:
-    """(N, ...) as N rows of lists of lists."""
-    depth, kinds = values.ndim - 1, [kind]
-    for _ in range(depth):
-        kinds.append(kinds[-1].value_type)
-    packed = pa.array(np.ascontiguousarray(values).reshape(-1), kinds[-1])
-    for level in range(depth, 0, -1):
-        count = int(np.prod(values.shape[:level]))
-        offsets = np.arange(count + 1, dtype=np.int32) * np.int32(values.shape[level])
-        packed = pa.ListArray.from_arrays(pa.array(offsets), packed)
-    return packed.cast(kind)
 
 
 def _card(dataset: Dataset, sides: list[str], framed: list[str], still: list[str]) -> str:
     """README.md: what the Hub and `datasets` read of it, and what a person does."""
     folder = Folder(dataset.root)
-    about, rows = folder.job().card, [index.row_of(sequence) for sequence in dataset]
-    frames = sum(row["frames"] for row in rows)
-    configs = [
-        {
-            "config_name": name,
-            "default": name == "frames",
-            "data_files": [{"split": side, "path": f"{name}/{side}-*.parquet"} for side in sides],
-        }
-        for name in ("frames", "sequences")
-    ]
+    rows = [index.row_of(sequence) for sequence in dataset]
     return str(
         card.template("export/hugging_face.md.jinja").render(
-            card=about,
-            configs=configs,
-            side=sides[0],
-            size_category=card.size_category(frames),
+            card=folder.job().card,
+            sides=sides,
             sequences=len(rows),
-            frames=frames,
+            frames=sum(row["frames"] for row in rows),
             row_columns=_ROWS,
             framed=[FIELDS[name] for name in framed],
             still=[FIELDS[name] for name in still],

@@ -6,7 +6,7 @@ The dense truth (flow, traction, depth) has no place in it; `--to hf` and `--to 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,12 +19,12 @@ from numpy.typing import NDArray
 from synth.dataset.index import group_by_side, row_of
 from synth.dataset.store import Dataset, Sequence
 from synth.publish.export.encoding import PICTURES
-from synth.publish.preview_video import encode_video
+from synth.publish.film import encode_video
 
 _VERSION = "v3.0"
 _FILES = 1000  # in a folder
 _FILE = "chunk-{chunk_index:03d}/file-{file_index:03d}"
-_QUANTILES = (0.01, 0.1, 0.5, 0.9, 0.99)
+_QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
 _QUALITY, _GROUP = 18, 2  # any frame is decoded from at most one before it
 _PROBED = 100  # frames of an episode that the statistics of its pictures come from
 _COUNTS = ("timestamp", "frame_index", "episode_index", "index", "task_index")
@@ -54,23 +54,25 @@ def write_episodes(dataset: Dataset, target: Path) -> None:
     axes, `young_kpa` and `scale_mm_per_px` (1,). There is no action: nobody steered a robot. The task says
     gesture and look. Sides of `synth split` are the ranges under `splits`.
     """
-    sides, tasks = group_by_side(dataset), list[str]()
-    about, rows, start = list[dict[str, Any]](), 0, 0
-    for position in (k for side in sides.values() for k in side):
-        sequence = dataset[position]
-        row = row_of(sequence)
-        episode = _Episode(
-            len(about), rows, sequence, f"{row['gesture']} the brain surface ({row['family']})"
-        )
-        tasks += [episode.task] if episode.task not in tasks else []
-        _write_videos(episode, target)
-        frames = _rows(episode, tasks.index(episode.task))
-        _write_rows(episode, frames, target)
-        about.append(_describe(episode, frames, len(frames["index"])))
-        rows += sequence.frames
-    ranges = {}
-    for side, positions in sides.items():
-        ranges[side], start = f"{start}:{start + len(positions)}", start + len(positions)
+    tasks, about, ranges, rows = list[str](), list[dict[str, Any]](), dict[str, str](), 0
+    for side, positions in group_by_side(dataset).items():
+        ranges[side] = f"{len(about)}:{len(about) + len(positions)}"
+        for sequence in map(dataset.__getitem__, positions):
+            row = row_of(sequence)
+            task = f"{row['gesture']} the brain surface ({row['family']})"
+            tasks += [task] if task not in tasks else []
+            episode = _Episode(len(about), rows, sequence, task)
+            _write_videos(episode, target)
+            frames = _rows(episode, tasks.index(task))
+            columns = {
+                name: pa.array(list(values), pa.list_(pa.float32(), 3))
+                if name == "force"
+                else pa.array(values)
+                for name, values in frames.items()
+            }
+            _write_table(pa.table(columns), target / "data" / f"{_FILE.format(**episode.place)}.parquet")
+            about.append(_describe(episode, frames))
+            rows += sequence.frames
     _write_meta(dataset[0], about, tasks, ranges, target)
 
 
@@ -92,12 +94,12 @@ def _write_videos(episode: _Episode, target: Path) -> None:
 
 def _rows(episode: _Episode, task: int) -> dict[str, Numbers]:
     """The columns of an episode's frames, (T,) or (T, 3)."""
-    sequence, frame = episode.sequence, np.arange(episode.sequence.frames)
-    constant = {name: float(sequence.attrs[name]) for name in ("young_kpa", "scale_mm_per_px")}
+    attrs, frame = episode.sequence.attrs, np.arange(episode.sequence.frames)
     return {
-        "force": sequence["force"][:].astype(np.float32),
-        **{name: np.full(len(frame), value, np.float32) for name, value in constant.items()},
-        "timestamp": (frame / float(sequence.attrs["fps"])).astype(np.float32),
+        "force": episode.sequence["force"][:].astype(np.float32),
+        "young_kpa": np.full(len(frame), attrs["young_kpa"], np.float32),
+        "scale_mm_per_px": np.full(len(frame), attrs["scale_mm_per_px"], np.float32),
+        "timestamp": (frame / float(attrs["fps"])).astype(np.float32),
         "frame_index": frame,
         "episode_index": np.full_like(frame, episode.number),
         "index": episode.start + frame,
@@ -105,17 +107,9 @@ def _rows(episode: _Episode, task: int) -> dict[str, Numbers]:
     }
 
 
-def _write_rows(episode: _Episode, columns: dict[str, Numbers], target: Path) -> None:
-    """An episode's rows as a file of their own, beside its videos."""
-    packed = {
-        name: pa.array(values) if values.ndim == 1 else pa.array(list(values), pa.list_(pa.float32(), 3))
-        for name, values in columns.items()
-    }
-    _write_table(pa.table(packed), target / "data" / f"{_FILE.format(**episode.place)}.parquet")
-
-
-def _describe(episode: _Episode, columns: dict[str, Numbers], frames: int) -> dict[str, Any]:
+def _describe(episode: _Episode, columns: dict[str, Numbers]) -> dict[str, Any]:
     """The row of an episode in `meta/episodes`."""
+    frames = episode.sequence.frames
     place: dict[str, Any] = {f"data/{name}": value for name, value in episode.place.items()}
     for name in _cameras(episode.sequence):
         video = f"videos/{_key(name)}"
@@ -156,27 +150,27 @@ def _summary(values: Numbers, beyond: tuple[int, ...]) -> dict[str, Any]:
         "max": values.max(0),
         "mean": values.mean(0),
         "std": values.std(0),
-        **{f"q{round(100 * q):02d}": np.quantile(values, q, axis=0) for q in _QUANTILES},
+        **{name: np.quantile(values, q, axis=0) for name, q in _QUANTILES.items()},
     }
     shaped = {name: np.asarray(one, float).reshape(-1, *beyond).tolist() for name, one in told.items()}
     return {**shaped, "count": [len(values)]}
 
 
-def _pooled(rows: Iterable[dict[str, Any]], key: str) -> dict[str, Any]:
+def _pooled(rows: list[dict[str, Any]], key: str) -> dict[str, Any]:
     """Statistics of all episodes from theirs; quantiles as LeRobot pools them, by a weighted mean."""
-    told = list(rows)
-    count = np.array([row[f"stats/{key}/count"][0] for row in told], float)
+    get = {
+        name: np.array([row[f"stats/{key}/{name}"] for row in rows])
+        for name in ("min", "max", "mean", "std", "count", *_QUANTILES)
+    }
+    count = get["count"][:, 0].astype(float)
 
     def mean(values: Numbers) -> Numbers:
         return np.asarray(np.average(values, axis=0, weights=count))
 
-    def get(name: str) -> Numbers:
-        return np.array([row[f"stats/{key}/{name}"] for row in told])
-
-    middle = mean(get("mean"))
-    spread = np.sqrt(mean(get("std") ** 2 + (get("mean") - middle) ** 2))
-    found = {"min": get("min").min(0), "max": get("max").max(0), "mean": middle, "std": spread}
-    found |= {f"q{round(100 * q):02d}": mean(get(f"q{round(100 * q):02d}")) for q in _QUANTILES}
+    middle = mean(get["mean"])
+    spread = np.sqrt(mean(get["std"] ** 2 + (get["mean"] - middle) ** 2))
+    found = {"min": get["min"].min(0), "max": get["max"].max(0), "mean": middle, "std": spread}
+    found |= {name: mean(get[name]) for name in _QUANTILES}
     return {**{name: value.tolist() for name, value in found.items()}, "count": [int(count.sum())]}
 
 
@@ -187,9 +181,19 @@ def _write_meta(
     height, width = (side // 2 * 2 for side in first.size)
     fps = float(first.attrs["fps"])
     features: dict[str, Any] = {}
+    video = {
+        "video.height": height,
+        "video.width": width,
+        "video.codec": "h264",
+        "video.pix_fmt": "yuv420p",
+        "video.is_depth_map": False,
+        "video.fps": int(fps),
+        "video.channels": 3,
+        "has_audio": False,
+    }
     for name in _cameras(first):
         picture = {"dtype": "video", "shape": [height, width, 3], "names": ["height", "width", "channels"]}
-        features[_key(name)] = {**picture, "info": _video_info(height, width, fps)}
+        features[_key(name)] = {**picture, "info": video}
     features["force"] = {"dtype": "float32", "shape": [3], "names": ["x_mn", "y_mn", "z_mn"]}
     for name in ("young_kpa", "scale_mm_per_px", *_COUNTS):
         kind = "int64" if name in _COUNTS[1:] else "float32"
@@ -215,19 +219,6 @@ def _write_meta(
     stats = {key: _pooled(about, key) for key in features}
     (meta / "stats.json").write_text(json.dumps(stats, indent=4), "utf-8")
     _write_table(_indexed(tasks), meta / "tasks.parquet")
-
-
-def _video_info(height: int, width: int, fps: float) -> dict[str, Any]:
-    return {
-        "video.height": height,
-        "video.width": width,
-        "video.codec": "h264",
-        "video.pix_fmt": "yuv420p",
-        "video.is_depth_map": False,
-        "video.fps": int(fps),
-        "video.channels": 3,
-        "has_audio": False,
-    }
 
 
 def _indexed(tasks: list[str]) -> pa.Table:

@@ -8,11 +8,9 @@ import tarfile
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-import numpy as np
-
 from synth.dataset.index import group_by_side
-from synth.dataset.store import Dataset, Sequence
-from synth.fields import FIELDS
+from synth.dataset.store import Dataset
+from synth.fields import FIELDS, TIME
 from synth.publish.export.encoding import PICTURES, as_npy, as_png
 
 _SHARD_BYTES = 1 << 30
@@ -44,16 +42,9 @@ def _samples(dataset: Dataset, positions: Iterable[int]) -> Iterator[tuple[str, 
     for sequence in map(dataset.__getitem__, positions):
         attributes = json.dumps(sequence.attrs).encode()
         for t in range(sequence.frames):
-            yield f"{sequence.index:06d}_{t:04d}", {**_frame(sequence, t), "json": attributes}
-
-
-def _frame(sequence: Sequence, t: int) -> dict[str, bytes]:
-    found = {}
-    for name in sequence.fields:
-        if name in PICTURES:
-            found[f"{name}.png"] = as_png(sequence[name][t])
-        elif FIELDS[name].dims[0] == "frame":
-            found[f"{name}.npy"] = as_npy(np.asarray(sequence[name][t]))
-        else:
-            found[f"{name}.npy"] = as_npy(sequence[name][:])
-    return found
+            files = {}
+            for name in sequence.fields:
+                values = sequence[name][t if FIELDS[name].dims[0] == TIME else slice(None)]
+                picture = name in PICTURES
+                files[f"{name}.png" if picture else f"{name}.npy"] = (as_png if picture else as_npy)(values)
+            yield f"{sequence.index:06d}_{t:04d}", {**files, "json": attributes}

@@ -7,7 +7,7 @@ what lies deeper is never seen.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -151,7 +151,7 @@ def _surface(
     extent: float,
 ) -> Surface:
     rng = np.random.default_rng([relief.seed, 1])
-    tree = _vessels(sulci, extent, rng, anatomy)
+    tree = vessels.grow_all(sulci, extent, rng)
     side = max(20, round(anatomy.vertices**0.5))
     axis = np.linspace(-extent / 2, extent / 2, side)
     x, y = np.meshgrid(axis, axis)
@@ -168,16 +168,6 @@ def _surface(
         vessels=tree,
         seed=relief.seed,
     )
-
-
-def _vessels(sulci: Map, extent: float, rng: np.random.Generator, anatomy: schema.Anatomy) -> Vessels:
-    """Vessels of the job's density and calibre: those of a larger patch, shrunk, are denser."""
-    dense, wide = anatomy.vessel_density, anatomy.vessel_calibre
-    grown = vessels.grow_all(sulci, extent * dense, rng)
-    if dense == wide == 1:
-        return grown
-    trees = (grown.veins, grown.arteries, grown.deep)
-    return Vessels(*(replace(one, nodes=one.nodes / dense, radius=one.radius * wide) for one in trees))
 
 
 def _grid_faces(side: int) -> npt.NDArray[np.int32]:

@@ -16,7 +16,7 @@ from synth.render.anatomy.surface import Surface
 from synth.render.appearance.family import Colour
 from synth.render.appearance.look import Look
 from synth.render.mitsuba.adapter import Wet
-from synth.system import foreign_picture
+from synth.system import checked_file
 from synth.system.jit import vectorised
 
 Map = npt.NDArray[np.float32]
@@ -299,7 +299,7 @@ def _meniscus(tube: tuple[Map, Map]) -> Map:
 def _photograph(path: Path, pixels: int) -> Map:
     """The middle square of a photograph as linear albedo."""
     try:
-        image = foreign_picture.read_picture(path)
+        image = checked_file.read_picture(path)
     except UserError as error:
         raise UserError(f"appearance.photo: {error}") from None
     side = min(image.shape[:2])

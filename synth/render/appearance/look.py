@@ -64,7 +64,7 @@ class Look:
         """A look of `family` under the job's light, seen by its sensor."""
         lighting = Lighting.draw(job.light, rng)
         glare = lighting.glare
-        ranges = FAMILIES[family]._replace(**job.appearance.own.model_dump(exclude_none=True))
+        ranges = FAMILIES[family]
         drawn = cls(
             family=family,
             crown=_near(ranges.crown, rng),

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from synth.errors import UserError
 from synth.job import identity
-from synth.system import foreign_file, foreign_storage
+from synth.system import checked_file
 
 Floats = npt.NDArray[np.float64]
 
@@ -70,9 +70,9 @@ def read(path: Path) -> Calibration:
         UserError: it cannot be read, or what it holds is no pinhole with Brown-Conrady distortion.
     """
     try:
-        text = foreign_file.read_text(path, identity.FILES["render", "calibration"])
+        text = checked_file.read_text(path, identity.FILES["render", "calibration"])
         is_json = path.suffix.lower() == ".json"
-        found = _json(path, text) if is_json else foreign_storage.read_storage(path.name, text)
+        found = _json(path, text) if is_json else checked_file.read_storage(path.name, text)
     except UserError as error:
         raise UserError(f"render.calibration: {error}") from None
     K = _array(path, found, _MATRIX, "camera matrix")

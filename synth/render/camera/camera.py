@@ -47,7 +47,7 @@ class View:
             azimuth_deg=float(rng.uniform(0.0, 360.0)),
             roll_deg=float(rng.uniform(0.0, 360.0)),
             focus_mm=float(rng.uniform(-0.5, 0.5)),
-            off_centre=_aside(render, rng),
+            off_centre=_middle(rng),
         )
         if render.calibration is None:
             return drawn
@@ -196,8 +196,9 @@ def undistort(flat: Floats, distortion: Floats) -> Floats:
     return guess
 
 
-def _aside(render: Render, rng: np.random.Generator) -> tuple[float, float]:
-    length, angle = rng.uniform(*render.off_centre), rng.uniform(0, 2 * np.pi)
+def _middle(rng: np.random.Generator) -> tuple[float, float]:
+    """No offset; drawn as when a job could ask for one, so that its zeros keep their signs."""
+    length, angle = rng.uniform(0, 0), rng.uniform(0, 2 * np.pi)
     return float(length * np.cos(angle)), float(length * np.sin(angle))
 
 

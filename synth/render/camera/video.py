@@ -29,7 +29,7 @@ def recorded(pictures: Pictures, section: schema.Sensor, fps: float) -> Pictures
         return pictures
     import av
 
-    kind = _FORMATS[section.chroma] + ("10le" if section.depth == 10 else "")
+    kind = _FORMATS[section.chroma]
     height, width = pictures.shape[1:3]
     # Codecs take even sizes only when they thin out chroma.
     padded = np.pad(pictures, ((0, 0), (0, height % 2), (0, width % 2), (0, 0)), mode="edge")

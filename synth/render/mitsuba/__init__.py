@@ -1,1 +1,1 @@
-"""All that knows Mitsuba: stage, lens and volume."""
+"""All that knows Mitsuba: stage and lens."""

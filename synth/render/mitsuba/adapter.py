@@ -22,7 +22,6 @@ import numpy.typing as npt
 from synth.errors import UserError
 from synth.geometry.triangles import Shape, normals
 from synth.render.camera.camera import Camera
-from synth.render.mitsuba import volume as mitsuba_volume
 from synth.render.mitsuba.glow import register_glow
 from synth.render.mitsuba.lens import Compiled, Scalar
 from synth.system import cache, llvm
@@ -51,8 +50,6 @@ class Wet:
     """Refractive index of the coat."""
     ambient: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Light from all around, as a white diffuser's radiance: what a wound throws into its own shadows."""
-    volume: bool = False
-    """Whether light is followed through the tissue under the coat."""
 
 
 @dataclass(frozen=True)
@@ -230,8 +227,6 @@ def _integrator(kind: str) -> dict[str, Any]:
     if kind == "direct":
         # Lamps are small: what a surface scatters towards by itself hardly ever meets one.
         return {"type": "direct", "emitter_samples": 1, "bsdf_samples": 0}
-    if kind.startswith("volume"):
-        return {"type": "volpath", "max_depth": int(kind.removeprefix("volume")), "rr_depth": 40}
     return {"type": "path", "max_depth": int(kind.removeprefix("path"))}
 
 
@@ -256,14 +251,10 @@ def _lamp(mi: Any, lamp: Lamp) -> dict[str, Any]:
 def _mesh(mi: Any, name: str, body: Body) -> Any:
     properties = mi.Properties()
     properties["bsdf"] = mi.load_dict(_material(mi, body.material))
-    if isinstance(body.material, Wet) and body.material.volume:
-        under = mitsuba_volume.medium(mi, body.material.albedo, body.vertices)
-        properties["interior"] = mi.load_dict(under)
-    else:
-        # Seen, but never chosen as a lamp: its weight is nothing.
-        kind = "area" if "scalar" in mi.variant() else "sulcus_glow"
-        glow = {"type": kind, "radiance": _glow(mi, body.material), "sampling_weight": 0.0}
-        properties["glow"] = mi.load_dict(glow)
+    # Seen, but never chosen as a lamp: its weight is nothing.
+    kind = "area" if "scalar" in mi.variant() else "sulcus_glow"
+    glow = {"type": kind, "radiance": _glow(mi, body.material), "sampling_weight": 0.0}
+    properties["glow"] = mi.load_dict(glow)
     mesh = mi.Mesh(
         name,
         vertex_count=len(body.vertices),
@@ -311,9 +302,6 @@ def _material(mi: Any, material: Wet | Metal) -> dict[str, Any]:
     if isinstance(material, Metal):
         scattered = {"type": "mesh_attribute", "name": "vertex_tint"}
         return {"type": "twosided", "satin": {"type": "diffuse", "reflectance": scattered}}
-    if material.volume:
-        bent = material.normal * np.float32(0.5) + np.float32(0.5)
-        return mitsuba_volume.boundary(_bitmap(mi, bent), material.roughness)
     encoded = material.normal * np.float32(0.5) + np.float32(0.5)
     albedo = mi.load_dict(_bitmap(mi, material.albedo))  # once, for both
 

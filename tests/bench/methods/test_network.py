@@ -2,21 +2,13 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
-import torch
 
 from bench.methods.network import Model
 from bench.methods.protocol import Scene
-from learn import checkpoint
-from learn.checkpoint import Card
-from learn.data.grid import Grid, Scales
+from learn.data.grid import Grid
 from learn.inference.predict import ForceMap, View
-from learn.network.d2fnet import Architecture
-from learn.network.monai_unet import build
-from learn.settings import preset
 
 
 @pytest.mark.parametrize("young_kpa", [2.0, None])
@@ -36,7 +28,7 @@ def test_the_rest_frame_is_the_zero_and_unknown_tissue_has_1_kpa(
         density[:, 8, 8] = (young or typical) * per_kpa / Grid(16).pitch_mm ** 2
         return ForceMap(density, Grid(16), "density", young or typical, young is not None, view)
 
-    predictor.grid, predictor.window = Grid(16), 1  # type: ignore[attr-defined]
+    predictor.grid = Grid(16)  # type: ignore[attr-defined]
     model = Model.__new__(Model)
     model.predictor, model._reader = predictor, None  # type: ignore[assignment]
     scene = Scene(tissue, 0.1, young_kpa)
@@ -47,22 +39,3 @@ def test_the_rest_frame_is_the_zero_and_unknown_tissue_has_1_kpa(
     assert model(moved, sure, scene, False).size_mn == pytest.approx(3 * young)
     moved[0, 0, 0] = -1
     assert model(moved, sure, scene, False).force_mn[0] == pytest.approx(-young if vector else 0)
-
-
-@pytest.mark.parametrize("output", ["magnitude", "vector"])
-def test_a_quick_network_answers_the_same(tmp_path: Path, output: str) -> None:
-    arch = Architecture(width=8, stem=2, levels=2, dropout=0.0, output=output)
-    settings = preset("tiny", arch=arch, size=32)
-    torch.manual_seed(0)
-    card = Card(settings, Scales(0.2, 0.03, 0.07, 2.0, 0.003), 1.0, {}, {})
-    checkpoint.write_model(tmp_path, card, build(arch).state_dict())
-    rng = np.random.default_rng(0)
-    scene = Scene(np.ones((40, 48), bool), 0.5, 2.0)
-    plain, quick = Model(tmp_path), Model(tmp_path, quick=True)
-    for _ in range(2):
-        flow = rng.normal(size=(40, 48, 2)).astype(np.float32)
-        sure = np.ones((40, 48), np.float32)
-        one, two = plain(flow, sure, scene, True), quick(flow, sure, scene, True)
-        assert two.force_mn == pytest.approx(one.force_mn, rel=1e-4, nan_ok=True)
-        assert one.density is not None
-        assert two.density == pytest.approx(one.density, rel=1e-3, abs=1e-6)

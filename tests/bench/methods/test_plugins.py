@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import ast
-import io
 import json
 from pathlib import Path
 
@@ -11,11 +9,10 @@ import pytest
 import tiny_package
 from fake_model import write_model
 from fake_recording import Maker
-from rich.console import Console
 
 import bench
-from bench.methods import baselines, plugins
-from bench.scoring import commands, report
+from bench.methods import plugins
+from bench.scoring import commands
 from synth.errors import UserError
 
 CODE = '''
@@ -25,8 +22,6 @@ import bench
 
 class Push:
     """The inverse of what the recording was made with, off by a tenth."""
-
-    notes = ("a note of the plug-in",)
 
     def __call__(self, flow, confidence, scene, picture):
         height, width = flow.shape[:2]
@@ -42,11 +37,6 @@ class Raises(Push):
 class Short(Push):
     def __call__(self, flow, confidence, scene, picture):
         return bench.Answer(np.zeros(2))
-
-
-class Wide(Push):
-    def __call__(self, flow, confidence, scene, picture):
-        return bench.Answer(np.zeros(3), np.zeros((2, 2)))
 
 
 def nothing():
@@ -76,53 +66,25 @@ def test_it_is_scored_and_shown_beside_the_network(
     own = result.methods["pushes"]
     assert own.scores["mae_mn"] < result.methods["zero"].scores["mae_mn"] / 3
     assert own.worse_by_mn is not None, "paired with the network on the same frames"
-    assert "a note of the plug-in" in " ".join(result.notes)
     told = json.loads((tmp_path / "score/score.json").read_text("utf-8"))
     assert told["methods"]["pushes"]["scores"]["mae_mn"] == pytest.approx(own.scores["mae_mn"])
     assert told["settings"]["plug_ins"] == {"pushes": "lab_methods 1.2"}
-    assert "pushes" in (tmp_path / "score/report.html").read_text("utf-8")
-    console = Console(file=io.StringIO(), width=200)
-    console.print(report.terminal_table(result))
-    assert "pushes" in console.file.getvalue()  # type: ignore[attr-defined]
     again = bench.score(recording, model, settings=settings)
     assert again.methods["pushes"].scores == pytest.approx(own.scores, nan_ok=True)
     assert "pushes" not in bench.score(recording, model, settings=settings, baselines=False).methods
 
 
-@pytest.mark.parametrize(
-    ("at", "words"),
-    [
-        ("Raises", r"method own \(lab_methods:Raises\): KeyError: 'nothing'"),
-        ("Short", r"gives force of shape \(2,\), expected \(3,\)"),
-        ("Wide", r"gives density of shape \(2, 2\)"),
-        ("nothing", "is no method, it cannot be called"),
-        ("Missing", "cannot be made, AttributeError"),
-    ],
-)
-def test_what_is_wrong_in_it_is_one_line(
-    at: str, words: str, recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("at", ["Raises", "Short", "nothing", "Missing"])
+def test_what_is_wrong_in_it_names_it(
+    at: str, recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     installed(tmp_path, monkeypatch, own=at)
     model = write_model(tmp_path / "model", "arch.output=vector")
-    with pytest.raises(UserError, match=words) as raised:
+    with pytest.raises(UserError, match=rf"method own \(lab_methods:{at}\)"):
         bench.score(recording, model, settings=bench.Settings(rate_hz=None, pulse=False))
-    assert len(str(raised.value).splitlines()) == 1
 
 
-@pytest.mark.parametrize("name", ["zero", "mean", "D2FNet"])
-def test_a_name_of_ours_is_not_taken(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    installed(tmp_path, monkeypatch, **{name: "Push"})
-    with pytest.raises(UserError, match=f"method {name}: a plug-in's name is taken by one of ours"):
+def test_a_name_of_ours_is_not_taken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    installed(tmp_path, monkeypatch, mean="Push")
+    with pytest.raises(UserError, match="mean"):
         commands.fit_baselines(None, None)
-
-
-def test_the_names_of_fitted_methods_are_all_told() -> None:
-    """The list that plug-ins' names are held against is what fitting gives."""
-    tree = ast.parse(Path(baselines.__file__).read_text("utf-8"))
-    (fit,) = (n for n in tree.body if isinstance(n, ast.FunctionDef) and n.name == "fitted_rules")
-    named = {
-        node.value
-        for node in ast.walk(fit)
-        if isinstance(node, ast.Constant) and isinstance(node.value, str) and node.value in baselines.FITTED
-    }
-    assert named == set(baselines.FITTED)

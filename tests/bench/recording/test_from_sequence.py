@@ -6,13 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-from bench.cli import app
 from bench.recording.folder import open_recording
 from bench.recording.from_sequence import export_recording
 from synth.dataset.store import Sequence, Writer, open_sequence
-from synth.errors import UserError
 from synth.job.schema import Job
 
 SIZE = (33, 48)
@@ -64,39 +61,3 @@ def test_nothing_of_the_truth_leaks(tmp_path: Path) -> None:
     folder = export_recording(sealed(tmp_path), tmp_path / "rec")
     names = {path.relative_to(folder).parts[0] for path in folder.rglob("*")}
     assert names == {"frames", "masks", "force.csv", "frames.csv", "meta.yaml", "tissue.png"}
-
-
-def test_mp4_has_the_size_its_masks_have(tmp_path: Path) -> None:
-    recording = open_recording(export_recording(sealed(tmp_path), tmp_path / "rec", "mp4"))
-    first = next(recording.frames()).rgb
-    assert first.shape == (32, 48, 3)
-    assert recording.tissue_mask((32, 48)).any()
-    assert recording.tool(2, (32, 48)) is not None
-
-
-def test_never_overwrites(tmp_path: Path) -> None:
-    sequence = sealed(tmp_path)
-    export_recording(sequence, tmp_path / "rec")
-    with pytest.raises(UserError, match="exists already"):
-        export_recording(sequence, tmp_path / "rec")
-
-
-def test_from_dataset_takes_one_or_all(tmp_path: Path) -> None:
-    for index in range(2):
-        sealed(tmp_path / "data", index)
-    run = CliRunner().invoke
-    assert (
-        run(
-            app, ["from-dataset", str(tmp_path / "data"), "-o", str(tmp_path / "one"), "--sequence", "1"]
-        ).exit_code
-        == 0
-    )
-    assert [path.name for path in (tmp_path / "one").iterdir()] == ["000001"]
-    assert run(app, ["from-dataset", str(tmp_path / "data"), "-o", str(tmp_path / "all")]).exit_code == 0
-    assert len(list((tmp_path / "all").iterdir())) == 2
-    assert (
-        run(
-            app, ["from-dataset", str(tmp_path / "data"), "-o", str(tmp_path / "x"), "--sequence", "9"]
-        ).exit_code
-        == 2
-    )

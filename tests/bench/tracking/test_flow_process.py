@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 
 from bench.tracking.flow_process import FlowProcess
-from learn.inference.video_flow import FlowHere
 from synth.errors import UserError
 
 
@@ -29,22 +28,6 @@ def pictures() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def elsewhere() -> Iterator[FlowProcess]:
     with closing(FlowProcess()) as flow:
         yield flow
-
-
-@pytest.mark.slow
-def test_the_same_flow_in_both_places(elsewhere: FlowProcess) -> None:
-    rest, moved, free = pictures()
-    found = []
-    for flow in (FlowHere(), elsewhere):
-        flow.begin("dis", rest, free, ~free)
-        asked = [flow.ask(picture, free) for picture in (moved, rest)]
-        found.append([answer() for answer in asked])
-    for here, there in zip(*found, strict=True):
-        np.testing.assert_array_equal(here.flow, there.flow)
-        np.testing.assert_array_equal(here.confidence, there.confidence)
-        assert here.trusted == there.trusted
-    assert np.abs(found[0][0].flow).max() > 1
-    assert found[1][0].peak_bytes > 1e7
 
 
 @pytest.mark.slow

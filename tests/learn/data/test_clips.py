@@ -1,9 +1,9 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from pathlib import Path
 
-import former_name
 import numpy as np
 import phantom
 import pytest
@@ -57,15 +57,8 @@ def test_a_packed_cache_gives_the_same_and_is_used(dataset: Path, clips: list[Cl
 def test_other_code_packs_anew(dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     load_clips(dataset, GRID, ("ideal",), cache=tmp_path)
     before = set(tmp_path.iterdir())
-    asked: list[list[str]] = []
-
-    def source(modules: list[str], ours: tuple[str, ...]) -> str:
-        asked.append(list(modules))
-        return "other code"
-
-    monkeypatch.setattr(provenance, "source", source)
+    monkeypatch.setattr(provenance, "source", lambda *folders: "other code")
     load_clips(dataset, GRID, ("ideal",), cache=tmp_path)
-    assert asked == [["learn.data.clips"]]  # which imports the grid
     assert len(set(tmp_path.iterdir()) - before) == len(before)
 
 
@@ -104,18 +97,9 @@ def test_a_packed_clip_holds_no_file_open_and_one_mapping(clips: list[Clip], tmp
 
 def test_a_store_without_recovered_flow(tmp_path: Path) -> None:
     phantom.write(tmp_path, 0, anatomy_seed=1, recovered=False)
-    with pytest.raises(UserError, match=r"000000.zarr: holds no recovered flow"):
+    with pytest.raises(UserError, match="flow_recovered"):
         load_clips(tmp_path, GRID, ("recovered",))
     assert len(load_clips(tmp_path, GRID, ("ideal",))) == 1
-
-
-def test_a_store_with_recovered_flow_under_its_former_name(tmp_path: Path) -> None:
-    former_name.rename_field(phantom.write(tmp_path, 0, anatomy_seed=1))
-    (found,) = load_clips(tmp_path, GRID, ("recovered",))
-    again = phantom.write(tmp_path / "again", 0, anatomy_seed=1)
-    (now,) = load_clips(again.parent, GRID, ("recovered",))
-    np.testing.assert_array_equal(found.displacement["recovered"], now.displacement["recovered"])
-    assert found.displacement["recovered"].any()
 
 
 def test_folds_share_no_anatomy_and_leave_nobody_out(clips: list[Clip]) -> None:
@@ -142,8 +126,6 @@ def test_nested_folds(clips: list[Clip]) -> None:
 
 
 def test_copies_of_a_sequence_are_one_group_whatever_their_anatomy_says(clips: list[Clip]) -> None:
-    from dataclasses import replace
-
     twin = replace(clips[0], group="another")
     other = replace(clips[5], group="another")
     number = groups([*clips, twin, other])
@@ -154,17 +136,8 @@ def test_a_held_out_family_is_the_test(clips: list[Clip]) -> None:
     split = nested(clips, 3, 0, seed=0, held_out_family="pale")
     assert [clips[i].family for i in split.test] == ["pale"]
     assert not set(split.test) & (set(split.fit) | set(split.select))
-    with pytest.raises(UserError, match=r"no sequence of family 'oedematous'.*healthy, pale"):
+    with pytest.raises(UserError, match="oedematous"):
         nested(clips, 3, 0, seed=0, held_out_family="oedematous")
-
-
-def test_impossible_folds(clips: list[Clip]) -> None:
-    with pytest.raises(UserError, match="7 folds: between 2 and 6 are possible, for 8 sequences"):
-        folds(clips, 7, 0)
-    with pytest.raises(UserError, match="fit, select and test need an anatomy each: 2 are there"):
-        nested(clips[:3], 2, 0, 0)
-    with pytest.raises(UserError, match="there are folds 0 to 2"):
-        nested(clips, 3, 3, 0)
 
 
 def test_anatomies_are_told_apart_by_what_a_sequence_says() -> None:
@@ -181,32 +154,13 @@ def test_anatomies_are_told_apart_by_what_a_sequence_says() -> None:
     assert name_anatomy({"content_hash": "h", "scenario": {}}) == "h"
 
 
-def test_too_few_procedural_sequences_are_to_be_more(clips: list[Clip]) -> None:
-    apart = {c.group: c for c in clips}
-    with pytest.raises(UserError, match=r"2 are there.*each sequence is one: render more of them"):
-        nested(list(apart.values())[:2], 2, 0, 0)
-
-
-def test_one_brain_is_split_only_when_asked_to(clips: list[Clip]) -> None:
-    from dataclasses import replace
-
-    one = [replace(c, group="mesh-5f") for c in clips]
-    with pytest.raises(UserError, match=r"hold 1 anatomy.*share_anatomy=true"):
-        nested(one, 3, 0, 0)
-    with pytest.raises(UserError, match=r"`synth place` finds them, craniotomy\.also lists them"):
-        nested(one, 3, 0, 0)
-    alone = ungrouped(one)
-    split = nested(alone, 3, 0, 0)
-    assert len(split.fit) + len(split.select) + len(split.test) == len(clips)
-
-
 def test_one_brains_openings_are_kept_apart(clips: list[Clip]) -> None:
-    from dataclasses import replace
-
     def opened(count: int) -> list[Clip]:
         return [replace(c, group="mesh-5f", opening=f"mesh-5f at {k % count}") for k, c in enumerate(clips)]
 
     assert len(clips) > 3
+    with pytest.raises(UserError, match="share_anatomy"):
+        nested(opened(3), 3, 0, 0)
     apart = ungrouped(opened(3))
     assert len(set(groups(apart))) == 3
     split = nested(apart, 3, 0, 0)

@@ -6,12 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from learn.data.grid import CHANNELS, Grid, Resampler, Scales, centre, channels, divergence, settled
+from learn.data.grid import CHANNELS, Grid, Resampler, Scales, channels, divergence, settled
 from learn.training.batches import turned
-from synth.errors import UserError
 
 GRID = Grid(64, 36.0)
-ONE = Scales(1.0, 1.0, 1.0, 1.0, 1.0)
 
 
 def resampler(shape: tuple[int, int], scale: float) -> Resampler:
@@ -45,11 +43,6 @@ def test_pixels_outside_the_mask_have_no_say() -> None:
     assert set(np.unique(carried)) <= {0.0, 1.0}
 
 
-def test_an_empty_mask_is_said_so() -> None:
-    with pytest.raises(UserError, match="tissue mask is empty"):
-        centre(np.zeros((4, 4), bool))
-
-
 def test_back_on_the_picture() -> None:
     field = np.indices((64, 64))[1].astype(np.float32) * GRID.pitch_mm
     back = resampler((72, 72), 0.5).to_image(field)
@@ -79,19 +72,6 @@ def test_a_rigid_shift_has_no_divergence_even_at_the_edge() -> None:
     assert got.abs().max() < 1e-5
 
 
-def test_divergence_does_not_depend_on_resolution() -> None:
-    def peak(size: int) -> float:
-        grid = Grid(size, 36.0)
-        node = (torch.arange(size) - (size - 1) / 2) * grid.pitch_mm
-        y, x = torch.meshgrid(node, node, indexing="ij")
-        bump = torch.exp(-(x**2 + y**2) / 18)
-        u = torch.stack([-x * bump, -y * bump])[None] * 0.1
-        return float(divergence(u, torch.ones(1, 1, size, size), grid.pitch_mm).min())
-
-    assert peak(64) == pytest.approx(peak(256), rel=0.04)
-    assert peak(256) == pytest.approx(-0.2, rel=0.06)
-
-
 def test_channel_order_and_units() -> None:
     mask = torch.ones(1, 1, 64, 64)
     u = torch.tensor([3.0, -4.0]).view(1, 2, 1, 1).expand(1, 2, 64, 64)
@@ -111,20 +91,20 @@ def test_turning_moves_vectors_with_the_field_and_keeps_divergence(quarter: int,
     u = u.astype(np.float32)
     mask = torch.ones(1, 1, 32, 32)
 
-    def div(v: np.ndarray) -> np.ndarray:
-        return divergence(torch.from_numpy(v)[None], mask, 1.125)[0].numpy()
+    def div(v: torch.Tensor) -> torch.Tensor:
+        return divergence(v, mask, 1.125)
 
-    np.testing.assert_allclose(div(turned(u, quarter, mirror)), turned(div(u), quarter, mirror), atol=1e-5)
+    turn, field = quarter + 4 * mirror, torch.from_numpy(u)[None]
+    torch.testing.assert_close(div(turned(field, turn)), turned(div(field), turn), atol=1e-5, rtol=0)
     # A field that points outwards everywhere still does.
-    out = turned(np.stack([x, y]).astype(np.float32), quarter, mirror)
-    np.testing.assert_allclose(out, np.stack([x, y]), atol=1e-6)
+    out = torch.from_numpy(np.stack([x, y]).astype(np.float32))[None]
+    torch.testing.assert_close(turned(out, turn), out, atol=1e-6, rtol=0)
 
 
 def test_a_turn_is_counter_clockwise_as_seen() -> None:
-    right = np.zeros((3, 4, 4), np.float32)
-    right[:, 1, 3] = (1.0, 0.0, 9.0)
-    up = turned(right, 1, False)
-    assert up[:, 0, 1].tolist() == [0.0, -1.0, 9.0]
+    right = torch.zeros(1, 3, 4, 4)
+    right[0, :, 1, 3] = torch.tensor([1.0, 0.0, 9.0])
+    assert turned(right, 1)[0, :, 0, 1].tolist() == [0.0, -1.0, 9.0]
 
 
 def test_force_in_border_cells_is_carried_inside_not_lost() -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 
 import numpy as np
 import pytest
@@ -12,12 +11,11 @@ import torchmetrics
 
 from learn.checkpoint import Card
 from learn.data.clips import Clip
-from learn.evaluation.evaluate import Report, evaluate, score
-from learn.evaluation.metrics import METRICS, Moments, agreement, contact_mm, ghost_share, line
+from learn.evaluation.evaluate import Report, score
+from learn.evaluation.metrics import Moments, agreement, contact_mm
 from learn.network.d2fnet import Architecture
-from learn.settings import Settings, replace
+from learn.settings import Settings
 from learn.training.batches import measure_scales
-from synth.errors import UserError
 
 
 @pytest.fixture
@@ -46,28 +44,12 @@ def test_against_torchmetrics(pairs: tuple[np.ndarray, np.ndarray]) -> None:
     assert got.bias == pytest.approx((said - true).mean())
 
 
-def test_a_constant_truth_has_no_r2() -> None:
-    assert math.isnan(agreement(Moments.of(np.ones(5), np.arange(5.0))).r2)
-    assert math.isnan(agreement(Moments()).mae)
-
-
-def test_calibration_line(pairs: tuple[np.ndarray, np.ndarray]) -> None:
-    true, _ = pairs
-    assert line(2 * true + 1, true) == pytest.approx((0.5, -0.5))
-
-
 def test_contact_centre() -> None:
     map_ = np.zeros((20, 20))
     map_[5:8, 10:13] = 1.0
     map_[0, 0] = 0.4  # under half the peak: a ghost doesn't drag the centre along
     assert contact_mm(map_, 0.5).tolist() == [5.5, 3.0]
     assert np.isnan(contact_mm(np.zeros((4, 4)), 1.0)).all()
-
-
-def test_ghost_share() -> None:
-    said = np.array([[[0.0, 6.0], [7.0, 4.0]]])
-    free = np.array([[[True, True], [False, True]]])
-    assert ghost_share(said, free, 5.0) == pytest.approx(1 / 3)
 
 
 def card(clips: list[Clip], output: str) -> Card:
@@ -113,70 +95,6 @@ def test_a_mirrored_answer_is_not_forgiven(clips: list[Clip]) -> None:
     assert got["vector_error_mn"] > 0
 
 
-def test_every_number_is_declared_once_and_the_truth_is_the_best_of_all_answers(clips: list[Clip]) -> None:
-    c = card(clips, "vector")
-    away = {
-        "low": lambda value: value,
-        "high": lambda value: -value,
-        "zero": abs,
-        "one": lambda value: abs(value - 1),
-    }
-
-    def summary(factor: float, more: float) -> dict[str, float]:
-        """Of the truth times a factor, and as much force again in the picture's corner."""
-        found = []
-        for clip in clips:
-            said = truth(clip, "vector") * np.float32(factor)
-            said[:, :, :12, :12] += np.float32(more * said.max())
-            said *= clip.mask
-            found.append(score(clip, said, c, head=factor * clip.force))
-        return Report({"known": found}, c).summary()
-
-    best, worse = summary(1, 0), summary(2, 1)
-    assert set(best) == set(METRICS)
-    for key, metric in METRICS.items():
-        assert away[metric.best](best[key]) < away[metric.best](worse[key]), key
-    assert len({metric.name for metric in METRICS.values()}) == len(METRICS)
-    listed = [metric.heading for metric in METRICS.values() if metric.listed]
-    assert listed[1:3] == ["total force: MAE [mN]", "total force: RMSE [mN]"]
-    assert "force map: MAE [mN/mm²]" in listed
-
-
-class Knowing:
-    """Answers a sequence with its truth per unit stiffness times the E it is given."""
-
-    def __init__(self, clip: Clip, c: Card) -> None:
-        self.clip, self.card, self.asked = clip, c, 0
-
-    def answer(self, moved: object, mask: object, young: float, sure: object) -> tuple[np.ndarray, None]:
-        self.asked += 1
-        return self.clip.density * np.float32(young), None
-
-
-@pytest.mark.parametrize(("condition", "passes"), [("none", 1), ("film", 5)])
-def test_columns_of_stiffness(clips: list[Clip], condition: str, passes: int) -> None:
-    c = card(clips, "vector")
-    arch = replace(c.settings.arch, condition=condition)
-    c = dataclasses.replace(c, settings=replace(c.settings, arch=arch))
-    clip = clips[2]
-    knowing = Knowing(clip, c)
-    pressed = {clip.content_hash: 1.1 * clip.young_kpa}
-    found = evaluate(knowing, [clip], "ideal", pressed=pressed)  # type: ignore[arg-type]
-    assert knowing.asked == passes, "only a network conditioned on E must be asked again"
-    peak = np.linalg.norm(clip.force, axis=1).max()
-    for column, factor in {
-        "known": 1.0,
-        "half": 0.5,
-        "double": 2.0,
-        "press": 1.1,
-        "unknown": 1.2 / clip.young_kpa,
-    }.items():
-        assert found.columns[column][0].said_mn.max() == pytest.approx(factor * peak, rel=0.01), column
-    assert found.summary("known")["unit_map_r2_pooled"] == pytest.approx(1)
-    with pytest.raises(UserError, match="unknown E column 'guess'"):
-        found.summary("guess")
-
-
 def test_two_jaws_that_cancel_are_held_to_what_each_output_can_say(clips: list[Clip]) -> None:
     """A grasp's jaws pull against each other: no net force, yet a map of lengths rightly adds them up."""
     density = np.zeros_like(clips[0].density)
@@ -206,9 +124,3 @@ def test_a_contact_found_a_cell_aside_is_no_ghost_far_away(clips: list[Clip]) ->
     assert got.ghost_far == 0
     everywhere = aside + np.float32(0.06 * c.scales.target * clip.young_kpa) * (clip.mask > 0)
     assert score(clip, everywhere, c).ghost_far == 1
-
-
-def test_bands_hold_every_frame_once(clips: list[Clip]) -> None:
-    c = card(clips, "vector")
-    whole = report(clips, [truth(clip, "vector") for clip in clips], c)
-    assert sum(b["frames"] for b in whole.bands()) == sum(clip.frames for clip in clips)

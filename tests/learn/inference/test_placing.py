@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from learn.data.grid import Grid
 from learn.inference.force_reader import ForceReader
-from learn.inference.placing import Placing, share_at_border
+from learn.inference.placing import Placing
 from learn.inference.predict import load_predictor
 
 _WIDE = np.ones((240, 480), bool)  # 48 x 96 mm
@@ -42,15 +42,6 @@ def test_grid_goes_to_what_moves_and_not_beyond_the_tissue() -> None:
     assert placing.moves == 2
 
 
-def test_of_two_places_the_stronger_and_none_that_is_lost() -> None:
-    placing = Placing(_WIDE, _MM_PER_PX, _GRID)
-    both = _bump(100, 120, 5.0) + _bump(380, 120, 3.0)
-    sure = np.ones(_WIDE.shape, np.float32)
-    sure[:, :240] = 0.1
-    assert placing.place(both, sure)[0] == pytest.approx(380, abs=10)
-    assert placing.place(both, None)[0] == pytest.approx(100, abs=10)
-
-
 def test_force_is_that_of_the_part_that_moves(tmp_path: Path) -> None:
     """The same contact, far off the middle of a wide picture and alone on a picture as wide as the grid."""
     predictor = load_predictor(write_model(tmp_path / "model", "arch.output=vector"))
@@ -67,12 +58,3 @@ def test_force_is_that_of_the_part_that_moves(tmp_path: Path) -> None:
     assert middle is not None
     assert float(np.linalg.norm(middle - said.force_mn)) > 0.2 * float(np.linalg.norm(alone))
     assert any("wider than the network's" in note for note in reader.notes)
-
-
-def test_share_at_the_border() -> None:
-    density, mask = np.zeros((32, 32), np.float32), np.ones((32, 32), np.float32)
-    assert np.isnan(share_at_border(density, mask))
-    density[16, 16], density[0, 5] = 3.0, 1.0
-    assert share_at_border(density, mask) == pytest.approx(0.25)
-    mask[0] = 0
-    assert share_at_border(density, mask) == 0

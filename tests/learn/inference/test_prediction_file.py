@@ -11,7 +11,6 @@ import numpy as np
 import phantom
 import pytest
 from fake_model import write_model
-from sources import ROOT
 from typer.testing import CliRunner
 
 from learn.cli import app
@@ -19,7 +18,6 @@ from learn.inference import prediction_file
 from learn.inference.apply import apply, motions
 from learn.inference.predict import View, load_predictor
 from synth.dataset.store import Dataset
-from synth.publish.preview_video import encode_video
 
 FILES = ["000000.force.csv", "000000.force.mp4", "000000.npz"]
 
@@ -48,11 +46,8 @@ def frames(path: Path) -> list[np.ndarray]:
         return [one.to_ndarray(format="rgb24") for one in container.decode(video=0)]
 
 
-@pytest.mark.parametrize("source", ["", "000000.zarr"])
-def test_a_dataset_and_a_store_give_the_three_files(
-    data: Path, model: Path, tmp_path: Path, source: str
-) -> None:
-    predict(model, data / source, "--out", tmp_path)
+def test_a_dataset_gives_the_three_files(data: Path, model: Path, tmp_path: Path) -> None:
+    predict(model, data, "--out", tmp_path)
     assert sorted(path.name for path in tmp_path.iterdir()) == FILES
     sequence = Dataset(data)[0]
     with np.load(tmp_path / "000000.npz") as found:
@@ -68,37 +63,6 @@ def test_a_dataset_and_a_store_give_the_three_files(
     film = frames(tmp_path / "000000.force.mp4")
     assert len(film) == sequence.frames
     assert film[0].shape[0] > sequence.size[0], "the curve lies below the picture"
-
-
-def test_a_video_keeps_its_own_file(data: Path, model: Path, tmp_path: Path) -> None:
-    """Predicting beside a film, its name and the prediction's don't meet."""
-    film = encode_video(tmp_path / "film.mp4", Dataset(data)[0]["rgb"][:], 10.0)
-    before = film.read_bytes()
-    predict(model, film, "--out", tmp_path, "--scale", "0.1", "--flow", "dis", "--rate", "5", "--no-pulse")
-    assert film.read_bytes() == before
-    with np.load(tmp_path / "film.npz") as found:
-        assert len(frames(tmp_path / "film.force.mp4")) == len(found["frame"])
-
-
-def test_no_overlay_and_arrays_of_flow_have_no_film(data: Path, model: Path, tmp_path: Path) -> None:
-    predict(model, data, "--out", tmp_path / "a", "--no-overlay")
-    sequence = Dataset(data)[0]
-    flow = {"flow": sequence["flow"][:], "tissue": sequence["tissue"][:]}
-    np.savez(tmp_path / "mine.npz", scale_mm_per_px=0.1, **flow)
-    predict(model, tmp_path / "mine.npz", "--out", tmp_path / "a")
-    names = {path.name for path in (tmp_path / "a").iterdir()}
-    assert names == {"000000.npz", "000000.force.csv", "mine.npz", "mine.force.csv"}
-    first = (tmp_path / "a/mine.force.csv").read_text().splitlines()[1].split(",")
-    assert first[1] == "", "an array of flow has no times"
-
-
-def test_untrusted_frames_are_empty_in_the_table() -> None:
-    found = {
-        "frame": np.arange(2),
-        "trusted": np.array([True, False]),
-        "total_force_mn": np.array([1.5, np.nan]),
-    }
-    assert prediction_file.tabulate(found).splitlines()[1:] == ["0,,1,1.5,,,,,", "1,,0,,,,,,"]
 
 
 def test_the_map_lies_where_the_network_saw_it(data: Path, model: Path) -> None:
@@ -118,11 +82,3 @@ def test_the_map_lies_where_the_network_saw_it(data: Path, model: Path) -> None:
     step = found["pitch_mm"] / found["scale_mm_per_px"]
     assert column == pytest.approx(x + (0.4 * n - (n - 1) / 2) * step, abs=1.0)
     assert row == pytest.approx(y + (0.6 * n - (n - 1) / 2) * step, abs=1.0)
-
-
-def test_every_field_and_column_is_documented() -> None:
-    page = (ROOT / "docs/reference/predictions.md").read_text("utf-8")
-    for name, field in prediction_file.FIELDS.items():
-        assert f"| `{name}` | {field.axes or '-'} | {field.unit} | {field.meaning} |" in page
-    for name in prediction_file.COLUMNS:
-        assert f"`{name}`" in page

@@ -6,11 +6,8 @@ import math
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from learn.uncertainty import conformal
-
-Floats = NDArray[np.float64]
 
 DRAWS = 2000
 
@@ -75,9 +72,3 @@ def test_too_few_units_have_no_finite_bound(level: float, least: int) -> None:
     scores = [np.array([1.0, 2.0])] * least
     assert conformal.quantile(scores, level) == 2.0
     assert math.isinf(conformal.quantile(scores[1:], level)) if least > 1 else True
-
-
-def test_the_plain_quantile_is_numpy_s_where_units_are_alike() -> None:
-    values = np.random.default_rng(4).normal(size=(50, 20))
-    found = conformal.share_quantile(list(values), 0.99)
-    assert found == np.quantile(values, 0.99, method="inverted_cdf")

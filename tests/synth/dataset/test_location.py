@@ -8,7 +8,6 @@ from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
-import fsspec
 import numpy as np
 import pytest
 from fake_work import sequence
@@ -38,11 +37,6 @@ def assert_same(address: str, root: Path) -> None:
     assert there[0].attrs == here[0].attrs
     with pytest.raises(UserError, match="no such sequence"):
         open_sequence(f"{address}/000009.zarr")
-
-
-def test_memory(root: Path) -> None:
-    fsspec.filesystem("memory").put(str(root), "/datasets/out", recursive=True)
-    assert_same("memory://datasets/out", root)
 
 
 class Handler(SimpleHTTPRequestHandler):
@@ -83,29 +77,3 @@ def server(root: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
 def test_http(root: Path, server: str) -> None:
     pytest.importorskip("aiohttp", reason="fsspec's HTTP needs aiohttp")
     assert_same(f"{server}/out", root)
-
-
-def test_a_server_that_gives_no_parts_of_files_is_said(server: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    pytest.importorskip("aiohttp", reason="fsspec's HTTP needs aiohttp")
-    monkeypatch.setattr(Handler, "parts", False)
-    with pytest.raises(UserError, match=r"or its server does not answer range requests"):
-        Dataset(f"{server}/out")[0]["flow"][1]
-
-
-def test_s3(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    pytest.importorskip("s3fs", reason="S3 needs the package s3fs")
-    moto = pytest.importorskip("moto.server", reason="the stand-in for S3 is moto[server]")
-    served = moto.ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
-    served.start()
-    try:
-        _, port = served.get_host_and_port()
-        for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
-            monkeypatch.setenv(name, "test")
-        monkeypatch.setenv("AWS_DEFAULT_REGION", "us-east-1")
-        monkeypatch.setenv("AWS_ENDPOINT_URL", f"http://127.0.0.1:{port}")
-        bucket = fsspec.filesystem("s3")
-        bucket.mkdir("bucket")
-        bucket.put(str(root), "bucket/out", recursive=True)
-        assert_same("s3://bucket/out", root)
-    finally:
-        served.stop()

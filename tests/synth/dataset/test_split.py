@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -10,8 +9,6 @@ import pytest
 from synth.dataset import split
 from synth.dataset.split import Rule
 from synth.errors import UserError
-from synth.job import identity
-from synth.job.schema import Job
 
 
 def rows(count: int = 60, anatomies: int = 20) -> list[dict[str, Any]]:
@@ -71,13 +68,6 @@ def test_other_groups_still_never_share_an_anatomy(by: str) -> None:
             assert len(on) == 1
 
 
-def test_leaks_are_named() -> None:
-    found = rows(6, 3)
-    for row in found:
-        row["split"] = "train" if row["index"] < 3 else "test"
-    assert "anatomy 0 is in test, train" in split.leaks(found)
-
-
 @pytest.mark.parametrize(
     ("rule", "message"),
     [
@@ -89,13 +79,6 @@ def test_leaks_are_named() -> None:
 def test_what_cannot_be_split_is_said_so(rule: Rule, message: str) -> None:
     with pytest.raises(UserError, match=message):
         split.assign_sides(rows(anatomies=60), rule)
-
-
-def test_words_of_a_command_line() -> None:
-    assert split.parse_rule("family", "0.8, 0, 0.2", ["calf"]) == Rule("family", (0.8, 0.0, 0.2), ("calf",))
-    for by, shares in (("colour", "1,0,0"), ("family", "1,0"), ("family", "a,b,c")):
-        with pytest.raises(UserError):
-            split.parse_rule(by, shares, [])
 
 
 def test_a_dataset_of_one_brain_is_split_within_it_only_when_told() -> None:
@@ -129,27 +112,6 @@ def test_openings_of_one_brain_are_kept_apart_and_said_to_be_no_strangers() -> N
     assert warning.startswith("1 brain is on several sides: openings of one brain are no strangers")
 
 
-def test_an_opening_on_two_sides_is_a_leak() -> None:
-    found = [{**row, "anatomy": "mesh-1", "opening": "mesh-1 at 0"} for row in rows(6, 3)]
-    given = [{**row, "split": "train" if row["index"] < 3 else "test"} for row in found]
-    assert split.leaks(given, split.parse_rule("opening", "0.5,0,0.5", []))[0] == (
-        "opening mesh-1 at 0 is in test, train"
-    )
-
-
-def test_strangers_need_no_warning() -> None:
-    found = [{**row, "opening": f"{row['anatomy']} at 0"} for row in rows()]
-    rule = split.parse_rule("opening", "0.6,0.2,0.2", [])
-    given = [{**row, "split": side} for row, side in zip(found, split.assign_sides(found, rule), strict=True)]
-    assert split.warn_of_strangers(given, rule) is None
-
-
-def test_too_few_openings_are_said_so() -> None:
-    found = [{**row, "anatomy": "mesh-1", "opening": f"mesh-1 at {row['index'] % 2}"} for row in rows()]
-    with pytest.raises(UserError, match=r"2 groups by opening: too few .*craniotomy\.also"):
-        split.assign_sides(found, split.parse_rule("opening", "0.7,0.15,0.15", []))
-
-
 def test_groups_are_joined_by_any_key_and_through_others() -> None:
     anatomies, hashes = "abcadef", "1234562"
     # a: 0 and 3; the hash 2: 1 and 6; all others alone.
@@ -157,21 +119,3 @@ def test_groups_are_joined_by_any_key_and_through_others() -> None:
     # 5 and 0 by the third key, and so 3.
     assert split.join_groups(anatomies, hashes, "xyzuvxw") == [0, 1, 2, 0, 4, 0, 1]
     assert split.find_crossings([0, 1, 0, 1], ["fit", "test", "test", "test"]) == {0: ["fit", "test"]}
-
-
-def test_a_held_out_family_in_training_is_a_leak() -> None:
-    found = [{**row, "split": "train"} for row in rows(anatomies=60)]
-    assert "family pale is held out and in train" in split.leaks(found, Rule(held_out=("pale",)))
-
-
-def test_sequences_on_one_users_brain_are_one_anatomy_in_every_dataset(tmp_path: Path) -> None:
-    brain, copy, other = (tmp_path / name for name in ("brain.obj", "copy.obj", "other.obj"))
-    for path, text in ((brain, "v 0 0 0"), (copy, "v 0 0 0"), (other, "v 0 0 1")):
-        path.write_text(text)
-
-    def name(mesh: Path, point: float, seed: int) -> str:
-        opening = {"point": (point, 0, 0), "direction": (0, 0, 1)}
-        return identity.identify_anatomy(Job(anatomy={"mesh": mesh, "craniotomy": opening}), seed)  # type: ignore[arg-type]
-
-    assert name(brain, 0, 1) == name(copy, 5, 2) != name(other, 0, 1)
-    assert identity.identify_anatomy(Job(), 1) != identity.identify_anatomy(Job(), 2)

@@ -2,44 +2,17 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import pytest
 from fake_run import Silent, options
 
-from synth.dataset.folder import Folder
 from synth.engine import run
-from synth.engine.dask import open_to, read_slurm, slurm
+from synth.engine.dask import open_to, read_slurm
 from synth.errors import UserError
 from synth.job.schema import Job
 
 JOB = Job(seed=2, sequences=6, frames=3, render={"size": (32, 24)}, flow={"backend": "ideal"})
-
-
-def test_the_jobs_script_holds_what_was_asked(tmp_path: Path) -> None:
-    pytest.importorskip("dask_jobqueue", reason="the extra `cluster` is not installed")
-    lines = ["jobs: 8", "cores: 1", "processes: 1", "memory: 8 GB", 'walltime: "12:00:00"']
-    (tmp_path / "slurm.yaml").write_text(
-        "\n".join([*lines, 'job_extra_directives: ["--gres=gpu:1"]', "queue: long"])
-    )
-    described = read_slurm(tmp_path / "slurm.yaml")
-    assert described.pop("jobs") == 8
-    with slurm({**described, "interface": "lo"}) as cluster:
-        script = cluster.job_script()
-    for asked in ("-p long", "--cpus-per-task=1", "--mem=8G", "-t 12:00:00", "--gres=gpu:1"):
-        assert f"#SBATCH {asked}\n" in script
-    started = script.splitlines()[-1]
-    assert started.startswith(sys.executable)
-    assert "--nthreads 1 " in started
-
-
-def test_an_earlier_runs_workers_see_that_its_turn_is_over(tmp_path: Path) -> None:
-    folder = Folder(tmp_path)
-    folder.state.mkdir()
-    for turn in (1, 2, 3):
-        folder.pass_turn()
-        assert (folder.turn, int(folder.turn_file.read_text())) == (turn, turn)
 
 
 def test_no_scheduler_is_one_line_and_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -82,17 +55,3 @@ def test_slurm_files_that_do_not_do(tmp_path: Path, text: str | None, message: s
 def test_who_could_run_code_is_said(cluster: str | dict[str, object], said: str) -> None:
     assert said in open_to(cluster)
     assert bool(said) == bool(open_to(cluster))
-
-
-@pytest.mark.parametrize("address", ["dask://", "dask://host", "tls://:1", "dask://host:x"])
-def test_an_address_needs_a_host_and_a_port(address: str) -> None:
-    with pytest.raises(UserError, match="host:port"):
-        open_to(address)
-
-
-def test_without_certificates_tls_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    pytest.importorskip("distributed", reason="the extra `cluster` is not installed")
-    monkeypatch.setattr("synth.engine.dask._CONNECT", "1s")
-    with pytest.raises(UserError, match=r"tls://127\.0\.0\.1:9: "):
-        run.run_job(JOB, tmp_path / "out", options("sequence", engine="tls://127.0.0.1:9"), Silent())
-    assert not (tmp_path / "out").exists()

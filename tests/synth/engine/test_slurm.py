@@ -13,7 +13,7 @@ from synth.dataset.folder import Folder
 from synth.engine import run
 from synth.job.schema import Job
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.trial
 
 JOB = Job.model_validate(
     {
@@ -32,7 +32,8 @@ cores: 1
 processes: 1
 memory: 2 GB
 walltime: "00:20:00"
-scheduler_options: {host: 127.0.0.1}
+# Another scheduler on this machine may hold the port that a dashboard has by default.
+scheduler_options: {host: 127.0.0.1, dashboard_address: "127.0.0.1:0"}
 log_directory: LOGS
 """
 

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
-from collections import namedtuple
 from pathlib import Path
 
 import pytest
@@ -12,10 +10,10 @@ from fake_run import Silent, options, start, wait_for
 from typer.testing import CliRunner
 
 from synth.cli import app
-from synth.dataset import size_forecast
+from synth.dataset.folder import Folder
 from synth.engine import run as engine
 from synth.engine import status
-from synth.errors import UserError
+from synth.engine.journal import Journal
 from synth.job.schema import Job
 
 JOB = Job(seed=2, sequences=6, frames=3, render={"size": (32, 24)}, flow={"backend": "ideal"})
@@ -43,40 +41,19 @@ def test_failures_are_counted_by_reason_and_retried(tmp_path: Path) -> None:
     engine.run_job(job, tmp_path / "out", options("trying"), Silent())
     seen = status.read_status(tmp_path / "out")
     assert (seen.done, seen.failed) == (5, {"the load is past the material's range": 2})
-    text = CliRunner().invoke(app, ["status", str(tmp_path / "out")]).stdout
-    assert "5 of 7 sequences done, 2 failed" in text
-    assert "2 x the load is past the material's range" in text
     shown = CliRunner().invoke(app, ["status", str(tmp_path / "out"), "--json"]).stdout
     assert json.loads(shown)["done"] == 5
 
 
-@pytest.mark.slow
-def test_forecast_rests_on_finished_sequences(tmp_path: Path) -> None:
-    root = tmp_path / "out"
-    engine.run_job(JOB, root, options("sequence"), Silent())
-    whole = sum(size_forecast.size(path) for path in root.glob("*.zarr"))
-    ahead = size_forecast.forecast_rest(JOB, root, 600, list(range(6)), 2.0)
-    assert ahead.bytes == pytest.approx(100 * whole, rel=1e-6)
-    assert (ahead.cpu_s, ahead.pilot) == (1200.0, 6)
+def test_what_is_left_goes_by_the_latest_sequences(tmp_path: Path) -> None:
+    def left(workers: int, todo: int, *ends: float) -> float | None:
+        journal = Journal(Folder(tmp_path), workers, Silent())
+        journal._left = todo
+        for at in ends:
+            journal.pace(at)
+        return journal.left_s()
 
-
-def test_estimate_without_any_is_no_wilder_than_twofold_on_rendered_pictures() -> None:
-    """Against a rendered demo sequence: 8 frames of 256 x 192 px took 4.16 MB."""
-    job = Job(frames=8, render={"size": (256, 192)})
-    assert 0.5 < size_forecast.estimate(job) / 4.16e6 < 2.0
-
-
-def test_a_disk_too_small_is_refused_before_anything_is_written(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    usage = namedtuple("usage", "total used free")
-    monkeypatch.setattr(shutil, "disk_usage", lambda path: usage(10**9, 10**9, 10**5))
-    with pytest.raises(UserError, match=r"6 sequences need .* the disk has 100 kB free"):
-        engine.run_job(JOB, tmp_path / "out", options("sequence"), Silent())
-    assert not (tmp_path / "out").exists()
-
-
-def test_no_dataset_is_one_line(tmp_path: Path) -> None:
-    done = CliRunner().invoke(app, ["status", str(tmp_path)])
-    assert done.exit_code == 2
-    assert "holds no dataset" in done.stderr
+    assert left(2, 10, 20.0, 21.0) is None, "the first of each worker also compile"
+    assert left(2, 10, 20.0, 21.0, 25.0, 26.0) == pytest.approx(10 * 2.5)
+    slow, fast = [10.0 * k for k in range(1, 101)], [1000.0 + 2.0 * k for k in range(1, 101)]
+    assert left(1, 50, *slow, *fast) == pytest.approx(100)

@@ -9,15 +9,12 @@ import pytest
 from dome import ANATOMY, patch
 from scipy.spatial.transform import Rotation
 
-from synth.fem import equilibrium, solver, surface_embedding, tool
+from synth.fem import solver, tool
 from synth.fem.material import Pia, Tissue
 from synth.fem.membrane import Membrane, Sheet, cover
 from synth.fem.mesh import tetrahedra
 from synth.fem.mesh.tetrahedra import Tets
-from synth.fem.system import assemble
 from synth.job import schema
-from synth.job.schema import Job
-from synth.sequence import scenario
 
 Floats = np.ndarray
 
@@ -65,44 +62,12 @@ def test_stretch_pull_and_wrinkles_are_those_of_the_textbook(tets: Tets) -> None
     assert pulled(sheet, flat.points @ turn.T - flat.points)[0] / area < 1e-12
 
 
-def test_small_stretch_of_the_nonlinear_sheet_is_that_of_the_linear_one() -> None:
-    flat = tetrahedra.block(schema.Anatomy(dome_mm=1e9), 250, 2)
-    u = 1e-4 * flat.points * [1.0, 0.8, 0.0]
-    exact = pulled(cover(flat, Sheet(6.0, 1.0), linear=True), u)[0]
-    assert pulled(cover(flat, Sheet(6.0, 1.0), linear=False), u)[0] == pytest.approx(exact, rel=1e-3)
-
-
-def test_a_stretch_at_rest_is_in_balance_and_takes_part_in_the_stiffness(tets: Tets) -> None:
-    sheet, rest = cover(tets, Sheet(20.0, 1.05), linear=False), np.zeros_like(tets.points)
-    energy, force = pulled(sheet, rest)
-    assert energy == pytest.approx(0, abs=1e-12)
-    assert np.abs(force).max() < 1e-12
-    up = np.zeros_like(rest)
-    faces = sheet.faces[(tets.points[sheet.faces, 2] > -1).all(axis=1)]
-    up[faces.ravel(), 2] = 1e-4 * np.cos(0.1 * tets.points[faces.ravel(), 0])
-    slack = pulled(cover(tets, Sheet(20.0, 1.0), linear=False), up)[0]
-    assert pulled(sheet, up)[0] > 2 * slack > 0
-
-
-def test_without_a_membrane_nothing_changes_but_what_was_drawn_for_it() -> None:
-    plain, other = Job(), Job.model_validate({"fem": {"membrane": {"young_kpa": 300}}})
-    assert scenario.draw(plain, 3) == scenario.draw(other, 3)
-    asked = Job.model_validate({"fem": {"membrane": {"intact": 0.5}}})
-    drawn = [scenario.draw(asked, k).tissue for k in range(40)]
-    assert 10 < sum(one.membrane is not None for one in drawn) < 30
-    assert all(scenario.draw(plain, k).tissue.young_kpa == one.young_kpa for k, one in enumerate(drawn))
-    assert all(100 <= one.membrane.young_kpa <= 1000 for one in drawn if one.membrane)
-
-
-@pytest.mark.parametrize("kind", ["pull", "push", "slide", "grasp", "retract", "tap"])
 @pytest.mark.slow
-def test_work_over_a_load_cycle_is_the_stored_energy(kind: str) -> None:
+def test_work_over_a_load_cycle_is_the_stored_energy() -> None:
     """The tools' work on the way up is what is stored at the top, and comes back whole."""
-    fem = schema.Fem(gestures=(kind,), load=(0.25, 0.25), membrane=schema.Membrane(intact=1))
+    fem = schema.Fem(gestures=("push",), load=(0.25, 0.25), membrane=schema.Membrane(intact=1))
     tissue = replace(Tissue.draw(fem, np.random.default_rng(1)), membrane=Pia(300.0, 0.1, 1.02))
     gesture = tool.Gesture.draw(fem, ANATOMY.craniotomy, tissue, np.random.default_rng(2))
-    if kind == "slide":  # its work is friction's while it moves; loaded in one place it has a potential
-        gesture = replace(gesture, path_mm=(0.0, 0.0))
     tets = tetrahedra.block(ANATOMY, 700, 2, tool.focus(gesture))
     vertices, faces = patch(121)
     frames = 97
@@ -113,21 +78,3 @@ def test_work_over_a_load_cycle_is_the_stored_energy(kind: str) -> None:
     assert found.energy.max() > 0
     assert np.abs(work - found.energy).max() <= 5e-3 * found.energy.max()
     assert abs(found.energy[-1]) <= 1e-6 * found.energy.max()
-
-
-def test_a_membrane_holds_what_is_dragged_along_the_surface() -> None:
-    anatomy = schema.Anatomy()
-    tets = tetrahedra.block(anatomy, 400, 2, ((0.0, 0.0, 4.0),))
-    vertices, faces = patch()
-    area = surface_embedding.vertex_area(vertices, faces)
-    kernel = tool.footprint(np.zeros(2), 4.0, vertices, area) * area
-    carry = surface_embedding.embed(tets, vertices)
-    moved = {}
-    for way in ((1.0, 0.0, 0.0), (0.0, 0.0, -1.0)):
-        load = carry.gather(np.outer(kernel, 16 * 0.1 * np.array(way)))
-        for sheet in (None, Sheet(50.0, 1.02)):
-            system = assemble(tets, "neo-hookean", 0.4, sheet)
-            path = equilibrium.solve_path(system, load[None], np.array([0.1]))
-            moved[way[2], sheet is None] = float(np.vdot(load, path.displacement[0]))
-    assert moved[0.0, False] < 0.3 * moved[0.0, True]
-    assert moved[-1.0, False] < 0.9 * moved[-1.0, True]

@@ -35,33 +35,16 @@ def gap(tets: Tets, height: HeightMap) -> float:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("order", "most"), [(1, 0.06), (2, 0.02)])
-def test_the_boundary_lies_on_the_relief(order: int, most: float) -> None:
+def test_the_boundary_lies_on_the_relief() -> None:
     height = sulci(1.4, 10.0)
-    tets = tetrahedra.block(ANATOMY, 1600, order, FOCUS, height)
-    assert gap(tets, height) < most
-    assert gap(tetrahedra.block(ANATOMY, 1600, order, FOCUS), height) > 0.4
+    assert gap(tetrahedra.block(ANATOMY, 1600, 2, FOCUS, height), height) < 0.02
+    assert gap(tetrahedra.block(ANATOMY, 1600, 2, FOCUS), height) > 0.4
 
 
-def test_what_is_thinner_than_a_face_averages_out() -> None:
-    bare = sulci(0.0, 10.0)
-    rough = bare.height + np.random.default_rng(0).choice([-0.5, 0.5], bare.height.shape)  # 0.2 mm wide
-    smooth, fine = (
-        tetrahedra.block(ANATOMY, 1600, 2, FOCUS, HeightMap(height, EXTENT))
-        for height in (bare.height, rough)
-    )
-    top = np.unique(tetrahedra.boundary(smooth.cells, 2))
-    top = top[np.linalg.norm(smooth.points[top] - [1.0, 2.0, 0.0], axis=1) < 4]
-    off = fine.points[top, 2] - smooth.points[top, 2]
-    assert len(off) > 50
-    assert np.sqrt(np.mean(off**2)) < 0.2
-
-
-@pytest.mark.parametrize("order", [1, 2])
-def test_a_wild_relief_leaves_the_elements_sound(order: int) -> None:
+def test_a_wild_relief_leaves_the_elements_sound() -> None:
     rough = HeightMap(np.random.default_rng(0).normal(0, 30.0, (SIDE, SIDE)), EXTENT)
-    for tets in (tetrahedra.block(ANATOMY, n, order, FOCUS, rough) for n in (400, 3000)):
-        plain = tetrahedra.block(ANATOMY, 400, order, FOCUS)
+    for tets in (tetrahedra.block(ANATOMY, n, 2, FOCUS, rough) for n in (400, 3000)):
+        plain = tetrahedra.block(ANATOMY, 400, 2, FOCUS)
         least = quality(plain.points[plain.cells[:, :4]]).min()
         assert quality(tets.points[tets.cells[:, :4]]).min() >= min(0.1, least) - 1e-9
         assert jacobians(tets.points, tets.cells).min() >= 0.3

@@ -10,8 +10,6 @@ from synth.fem.mesh import tetrahedra
 from synth.fem.mesh.tetrahedra import boundary
 from synth.fem.motion import Clock, march_in_time
 from synth.fem.system import assemble
-from synth.job.schema import Job
-from synth.sequence import pipeline, scenario
 
 
 def test_slip_holds_along_the_normal_as_firmly_and_along_the_surface_not_at_all() -> None:
@@ -48,30 +46,3 @@ def test_the_same_springs_in_motion_come_to_rest_where_equilibrium_is() -> None:
     still = assemble(tets, "linear", 0.4).solve(load)
     assert np.abs(found.displacement[-1] - still).max() <= 2e-3 * np.abs(still).max()
     assert found.energy[-1] == pytest.approx(0.5 * float(np.vdot(load, still)), rel=5e-3)
-
-
-def test_skull_and_poissons_ratio_are_drawn_for_each_sequence() -> None:
-    asked = {"tets": 200, "poisson": [0.4, 0.49], "skull": ["bonded", "slip"], "load": 0.1, "law": "linear"}
-    job = Job.model_validate({"anatomy": {"vertices": 2000}, "frames": 4, "fem": asked})
-    drawn = [scenario.draw(job, k) for k in range(20)]
-    assert {one.tissue.skull for one in drawn} == {"bonded", "slip"}
-    assert 0.4 <= min(one.tissue.poisson for one in drawn) < max(one.tissue.poisson for one in drawn) <= 0.49
-    slipping = next(one for one in drawn if one.tissue.skull == "slip")
-    surface, tets = pipeline.build(job, slipping)
-    assert tets.slip is not None
-    assert pipeline.move(job, slipping, surface, tets).residual.max() < 1e-9
-
-
-@pytest.mark.parametrize(
-    ("asked", "averaged"),
-    [
-        ({}, True),
-        ({"order": 1}, False),
-        ({"volume": "pointwise"}, False),
-        ({"order": 1, "volume": "averaged"}, True),
-    ],
-)
-def test_quadratic_elements_resist_their_mean_change_of_volume(
-    asked: dict[str, object], averaged: bool
-) -> None:
-    assert scenario.draw(Job.model_validate({"fem": asked}), 0).tissue.averaged == averaged

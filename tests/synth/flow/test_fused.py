@@ -31,8 +31,10 @@ def picture(rng: np.random.Generator, shape: tuple[int, int]) -> np.ndarray:
     return np.repeat(grey[..., None], 3, axis=-1)
 
 
-@pytest.mark.parametrize("shape", [(96, 128), (75, 101)])
-@pytest.mark.parametrize("settings", [Settings(), Settings(reweights=2, noise=0.0, median=False, erode=1)])
+@pytest.mark.parametrize(
+    ("shape", "settings"),
+    [((96, 128), Settings()), ((75, 101), Settings(reweights=2, noise=0.0, median=False, erode=1))],
+)
 def test_flow_is_that_of_the_tensor_code(
     shape: tuple[int, int], settings: Settings, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -43,14 +43,6 @@ def test_tissue_that_is_taken_for_a_tool_is_not_masked() -> None:
     assert np.abs(flow[30:66, 30:66] - [2.0, 0.0]).mean() < 0.05
 
 
-def test_mask_over_everything_is_dropped_and_the_flow_is_that_without() -> None:
-    wrong = Proposal(_NOTHING, ~_NOTHING, _NOTHING)
-    tracker = _tracker(_picture(_texture()), wrong)
-    flow, _ = tracker.step(_picture(_moved(2.0)), wrong)
-    assert tracker.trusted
-    assert np.abs(flow[8:-8, 8:-8] - [2.0, 0.0]).mean() < 0.05
-
-
 def test_tool_that_comes_between_is_masked() -> None:
     tracker = _tracker(_picture(_texture()), Proposal(_NOTHING, _NOTHING, _NOTHING))
     for by_px in (1.0, 2.0):
@@ -80,23 +72,6 @@ def _faint(by_px: float, noise: int, contrast: float = 0.3) -> NDArray[np.float6
     return 120 + contrast * (_moved(by_px) - 120) + grain
 
 
-@pytest.mark.parametrize("wrong_px", [0, 36])
-def test_highlights_over_faint_texture_do_not_vouch_for_stillness(wrong_px: int) -> None:
-    """Nor where so many columns of the picture are taken for a tool, too."""
-    spots = gaussian_filter(np.random.default_rng(1).standard_normal((_SIZE, _SIZE)), 3)
-    wet = spots > np.quantile(spots, 0.85)
-    wrong = np.zeros_like(wet)
-    wrong[:, :wrong_px] = True
-    found = Proposal(wet, wrong, _NOTHING)
-    errors = {}
-    for name, given in (("chosen", found), ("none", Proposal(_NOTHING, _NOTHING, _NOTHING))):
-        tracker = _tracker(_picture(np.where(wet, 250.0, _faint(0.0, 2))), given)
-        for k, by_px in enumerate((1.5, 3.0, 3.0)):
-            flow, _ = tracker.step(_picture(np.where(wet, 250.0, _faint(by_px, 3 + k))), given)
-        errors[name] = float(np.abs(flow - [3.0, 0.0])[8:-8, 40:-8].mean())
-    assert errors["chosen"] < 0.4 * errors["none"]
-
-
 @pytest.mark.parametrize(("contrast", "held"), [(0.06, True), (1.0, False)])
 def test_highlights_that_alone_say_that_nothing_moves_are_not_believed(contrast: float, held: bool) -> None:
     spots = gaussian_filter(np.random.default_rng(1).standard_normal((_SIZE, _SIZE)), 6)
@@ -109,53 +84,3 @@ def test_highlights_that_alone_say_that_nothing_moves_are_not_believed(contrast:
         assert (off > 1) == held, "what proves nothing if it is followed after all"
         assert ("highlights" in tracker.lost) == held
         assert (confidence.max() < 0.3) == held
-
-
-def test_tool_that_comes_back_is_masked_at_once() -> None:
-    tracker = _tracker(_picture(_texture()), Proposal(_NOTHING, _NOTHING, _NOTHING))
-    there, away = Proposal(_NOTHING, _MIDDLE, _NOTHING), Proposal(_NOTHING, _NOTHING, _NOTHING)
-    for by_px, found in ((3.0, there), (0.0, away)):
-        grey = np.where(_MIDDLE & found.tool, 60.0, _moved(by_px))
-        tracker.step(_picture(grey), found)
-    solved = tracker._extra
-    tracker.step(_picture(np.where(_MIDDLE, 60.0, _moved(1.0))), there)
-    assert tracker.blocked[36:60, 36:60].mean() > 0.9
-    assert tracker._extra == solved, "it was found out before"
-
-
-def test_what_is_known_to_be_a_tool_is_masked_without_being_asked() -> None:
-    known = Proposal(_NOTHING, _NOTHING, _MIDDLE)
-    tracker = _tracker(_picture(_texture()), known)
-    _, confidence = tracker.step(_picture(_moved(1.0)), known)
-    assert tracker.blocked[_MIDDLE].all()
-    assert not confidence[_MIDDLE].any()
-
-
-def test_nothing_is_learned_from_a_blank_frame() -> None:
-    spots = gaussian_filter(np.random.default_rng(1).standard_normal((_SIZE, _SIZE)), 3)
-    wet = spots > np.quantile(spots, 0.85)
-    shine = Proposal(wet, _NOTHING, _NOTHING)
-    tracker = _tracker(_picture(np.where(wet, 250.0, _texture())), shine)
-    for by_px in (1.5, 3.0):
-        tracker.step(_picture(np.where(wet, 250.0, _moved(by_px))), shine)
-    before = tracker.rest_blocked
-    tracker.step(np.zeros((_SIZE, _SIZE, 3), np.uint8), shine)
-    assert not tracker.trusted
-    assert tracker.lost
-    np.testing.assert_array_equal(tracker.rest_blocked, before)
-    tracker.step(_picture(np.where(wet, 250.0, _moved(3.0))), shine)
-    assert tracker.trusted
-    assert tracker.blocked[wet].mean() > 0.8
-
-
-@pytest.mark.parametrize("share", [0.0, 0.7])
-def test_whole_bodies_are_kept_of_which_most_earned_it(share: float) -> None:
-    pieces = Proposal(_NOTHING, _MIDDLE, _NOTHING).pieces()
-    earned = np.zeros(len(pieces.body), bool)
-    size = np.bincount(pieces.number.ravel())
-    for number in np.argsort(-size[1:]) + 1:
-        if size[earned].sum() <= share * size[1:].sum():
-            earned[number] = True
-    kept = pieces.whole(earned)
-    assert kept[1:].all() == (size[earned].sum() > 0.7 * size[1:].sum())
-    assert not kept[0]

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-
 from synth.job.schema import Job
 from synth.sequence.scenario import draw, frame_seeds
 
@@ -14,22 +12,18 @@ def test_same_job_and_index_draw_the_same_scenario_however_many_sequences_there_
     assert frame_seeds(few, 2) == frame_seeds(many, 2)
 
 
-def test_sequences_and_seeds_differ() -> None:
-    job = Job(seed=7)
-    assert draw(job, 0).gesture != draw(job, 1).gesture
-    assert draw(job, 0).relief != draw(job, 1).relief
-    assert draw(job, 0).gesture != draw(Job(seed=8), 0).gesture
-    assert len(set(frame_seeds(job, 0) + frame_seeds(job, 1))) == 2 * job.frames
-
-
-def test_variety_shares_anatomy_but_nothing_else() -> None:
-    job = Job(seed=7, anatomy={"variety": 2})
-    first, third = draw(job, 0), draw(job, 2)
-    assert (first.anatomy, first.relief) == (third.anatomy, third.relief)
-    assert first.tissue != third.tissue
-    assert first.view != third.view
-
-
-def test_scenario_is_json() -> None:
-    case = draw(Job(seed=7), 5)
-    assert json.loads(json.dumps(case.as_dict()))["index"] == 5
+def test_shares_are_drawn_and_what_is_not_asked_for_changes_no_draw() -> None:
+    plain = [draw(Job(sequences=40), k) for k in range(40)]
+    fem = {"membrane": {"intact": 0.5}, "pulse": {"heart_mm": [0.1, 0.5]}, "skull": ["bonded", "slip"]}
+    drawn = [
+        draw(Job.model_validate({"sequences": 40, "fem": fem | {"poisson": [0.4, 0.49]}}), k)
+        for k in range(40)
+    ]
+    assert 10 < sum(one.tissue.membrane is not None for one in drawn) < 30
+    assert {one.tissue.skull for one in drawn} == {"bonded", "slip"}
+    assert all(0.4 <= one.tissue.poisson <= 0.49 for one in drawn)
+    assert all(one.pulse is not None and 0.1 <= one.pulse.heart_mm <= 0.5 for one in drawn)
+    for one, usual in zip(drawn, plain, strict=True):
+        assert usual.pulse is usual.tissue.membrane is None
+        assert one.tissue.young_kpa == usual.tissue.young_kpa
+        assert (one.gesture, one.look) == (usual.gesture, usual.look)

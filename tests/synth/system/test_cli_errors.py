@@ -4,16 +4,12 @@ from __future__ import annotations
 
 import errno
 import os
-import tomllib
-from importlib import import_module
 
 import pytest
 import typer
-from sources import ROOT, imports, sources
 from typer.testing import CliRunner
 
 from synth.errors import UserError
-from synth.system import cli_errors
 from synth.system.cli_errors import Commands
 
 
@@ -44,23 +40,6 @@ def test_a_package_of_an_extra_is_named_with_it() -> None:
     assert "pip install '.[bench]'" in said
     _, _, trace = ended(ModuleNotFoundError("No module named 'synth.shop'", name="synth.shop"))
     assert isinstance(trace, ModuleNotFoundError), "a module of ours that is missing is our mistake"
-
-
-def test_extras_are_those_of_the_project_and_no_command_of_the_core_but_place_needs_them() -> None:
-    extras = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]["optional-dependencies"]
-    asked = {"sklearn": "scikit-learn", "plotly": "plotly"}
-    for package, extra in cli_errors._EXTRAS.items():
-        assert any(line.startswith(asked[package]) for line in extras[extra])
-    for path in sources("synth", "learn"):
-        used = {name.partition(".")[0] for name in imports(path)}
-        allowed = {"plotly"} if path.parent.name == "place" else set()
-        assert not used & set(cli_errors._EXTRAS) - allowed, path
-
-
-@pytest.mark.parametrize("room", ["synth", "learn", "bench"])
-def test_completion_can_be_installed(room: str) -> None:
-    said = CliRunner().invoke(import_module(f"{room}.cli").app, ["--help"]).output
-    assert "--install-completion" in said
 
 
 def test_too_little_memory_is_one_line() -> None:

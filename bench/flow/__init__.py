@@ -1,1 +1,0 @@
-"""Flow between any two pictures, and flow files."""

@@ -1,1 +1,0 @@
-"""What a command leaves: files, bars, intervals as pictures."""

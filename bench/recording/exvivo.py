@@ -1,0 +1,251 @@
+"""Pseudo ex vivo recordings: rendered, but unlike any training data in every respect at once.
+
+Another law in time (tissue creeps under load), another appearance family, lens, field and tilt, a compressed
+video, a hand that trembles, several presses at several places, and a sensor with its own axes, clock, zero,
+drift and noise. Written in the layout of a real recording, so that the same code scores both.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from bench.recording import writer
+from synth.errors import UserError
+from synth.fem import solver, tool
+from synth.fem.mesh import tetrahedra
+from synth.fem.mesh.relief import HeightMap
+from synth.fem.solver import Deformation
+from synth.job import schema as jobs
+from synth.render.anatomy import surface as anatomy
+from synth.render.camera import camera
+from synth.render.scene import Studio
+from synth.sequence import scenario
+
+Floats = NDArray[np.float64]
+
+_GESTURES = 3
+_LEVELS = 9
+_SENSOR_HZ = 200.0
+_STILL_S = 1.5
+_STEREO_MM, _PAIR = 24.0, "pair.yaml"
+_SYNC_S = 9.0
+_PRESS_S = 13.0
+# Creep: the part of the response that comes late, and how late [s].
+_LATE, _LATE_S = 0.2, 0.8
+
+
+@dataclass(frozen=True)
+class Plan:
+    """One set of recordings."""
+
+    seed: int = 100
+    seconds: float = 30.0
+    fps: float = 10.0
+    size: tuple[int, int] = (320, 240)
+    photo: Path | None = None
+    """A photograph as texture; else procedural, of the family no other default job draws."""
+    variant: str = "auto"
+    eyes: int = 1
+
+
+@dataclass(frozen=True)
+class _Course:
+    """What the hand does, on a fine clock."""
+
+    time_s: Floats
+    """(N,) at the sensor's rate."""
+    level: Floats
+    """(N,) force over its peak."""
+    strain: Floats
+    """(N,) the elastic level that gives the same displacement: what creep makes of `level`."""
+    gesture: NDArray[np.int64]
+    """(N,) which gesture is under way."""
+    away: Floats
+    """(N,) distance of the tips from the tissue over the hover height."""
+
+
+def job_of(plan: Plan) -> jobs.Job:
+    """The unusual job behind the recordings."""
+    return jobs.Job.model_validate(
+        {
+            "seed": plan.seed,
+            "sequences": 1000,
+            "frames": 2 * _LEVELS,
+            "fps": plan.fps,
+            "appearance": {"families": ["calf"], "photo": plan.photo},
+            "anatomy": {
+                "gyrus_mm": [8.0, 10.0], "sulcus_mm": [1.0, 2.0], "dome_mm": 60.0, "vertices": 20_000,
+            },
+            "fem": {
+                "law": "neo-hookean", "tets": 3000, "young_kpa": [1.5, 4.0], "poisson": 0.45,
+                "load": [0.15, 0.35], "footprint_mm": [4.0, 6.0],
+            },
+            "render": {
+                "size": plan.size, "spp": 4, "field_mm": [30.0, 40.0], "tilt_deg": [5.0, 25.0],
+                "working_distance_mm": [220.0, 380.0], "aperture_mm": 6.0,
+                "distortion": [-0.12, 0.03, 0.001, -0.001, 0.0], "variant": plan.variant,
+                "stereo_mm": _STEREO_MM if plan.eyes == 2 else 0.0,
+            },
+        }
+    )  # fmt: skip
+
+
+def make(plan: Plan, index: int, folder: Path, progress: Callable[[int], None] = lambda done: None) -> Path:
+    """Renders recording `index` of a plan into `folder`.
+
+    Raises:
+        UserError: the folder exists, the recording is shorter than its calibration, or as the rendering.
+    """
+    if plan.seconds < _PRESS_S + 5:
+        raise UserError(f"seconds: {plan.seconds:g}; calibration alone takes {_PRESS_S:g}, at least 5 more")
+    with writer.write_whole_folder(folder) as part:
+        _fill(plan, index, part, progress)
+    return folder
+
+
+def _fill(plan: Plan, index: int, part: Path, progress: Callable[[int], None]) -> None:
+    (part / "masks").mkdir()
+    job = job_of(plan)
+    case = scenario.draw(job, index)
+    view = camera.place(case.view, job.render)
+    rng = np.random.default_rng([plan.seed, index, 77])
+    surface = anatomy.procedural(case.relief, job.anatomy)
+    gestures = [
+        tool.Gesture.draw(job.fem, job.anatomy.craniotomy, case.tissue, rng) for _ in range(_GESTURES)
+    ]
+    motions = [_moved(job, case, gesture, surface) for gesture in gestures]
+    course = _course(plan, rng)
+    times = _frame_times(plan, rng)
+    studio = Studio(surface, case.look, view, job)
+    pictures: list[NDArray[np.uint8]] = []
+    beside: list[NDArray[np.uint8]] = []
+    for k, time in enumerate(times):
+        at = int(np.searchsorted(course.time_s, time).clip(0, len(course.time_s) - 1))
+        motion, gesture = motions[course.gesture[at]], gestures[course.gesture[at]]
+        vertices, tips, shafts = _pose(motion, gesture, course, at, rng)
+        shot = studio.frame(vertices, tips, shafts, int(rng.integers(2**31)))
+        pictures.append(shot.rgb)
+        if shot.rgb_right is not None:
+            beside.append(shot.rgb_right)
+        cv2.imwrite(str(part / "masks" / f"{k:06d}.png"), shot.tool.astype(np.uint8) * 255)
+        progress(k + 1)
+    crf = int(rng.integers(18, 25))
+    writer.write_video(part / "video.mp4", iter(pictures), times, crf=crf)
+    if studio.right is not None:
+        writer.write_video(part / "right.mp4", iter(beside), times, crf=crf)
+        writer.write_pair(part / _PAIR, view, studio.right)
+    cv2.imwrite(str(part / "tissue.png"), studio.still.tissue.astype(np.uint8) * 255)
+    force = np.stack([g.force_mn * np.asarray(g.direction) for g in gestures])[course.gesture]
+    lag = _write_sensor(part, course, force * course.level[:, None], rng)
+    about: dict[str, object] = {
+        "scale_mm_per_px": float(studio.still.scale_mm_per_px * (1 + 0.02 * rng.normal())),
+        "scale_uncertainty": 0.02,
+        "young_kpa": case.tissue.young_kpa,
+        "specimen": f"calf {index}",
+        "press_s": [_SYNC_S, _PRESS_S],
+        "sync": {"method": "correlate", "calibration_s": [0.0, _SYNC_S], "search_s": 0.7},
+        "sensor": {"axes": "sensor", "low_pass_hz": 10.0, "free_s": _free_spans(plan, lag)},
+    }
+    if studio.right is not None:
+        about["stereo"] = {"calibration": _PAIR}
+    writer.write_meta(part, about)
+
+
+def _moved(
+    job: jobs.Job, case: scenario.Scenario, gesture: tool.Gesture, surface: anatomy.Surface
+) -> Deformation:
+    """The path from no load to full: a gesture that only rises."""
+    rising = tool.Gesture(**{**vars(gesture), "timing": (0.02, 1.0, 2.0, 3.0)})
+    height = HeightMap(surface.pia, surface.extent_mm)
+    tets = tetrahedra.block(job.anatomy, job.fem.tets, 2, tool.focus(gesture), height)
+    return solver.deform(
+        job.fem, case.tissue, rising, tets, surface.vertices, surface.faces,
+        job.frames, job.fps,
+    )  # fmt: skip
+
+
+def _course(plan: Plan, rng: np.random.Generator) -> _Course:
+    """Presses of random height and pace; the first seconds are still, the last too."""
+    time = np.arange(0, plan.seconds + 1, 1 / _SENSOR_HZ)
+    level, gesture, away = np.zeros_like(time), np.zeros(len(time), np.int64), np.ones_like(time)
+    start = _STILL_S + 0.3
+    turn = 0
+    while start < plan.seconds - 3.5:
+        rise, hold, fall = rng.uniform(0.4, 0.9), rng.uniform(0.2, 0.9), rng.uniform(0.3, 0.8)
+        press = _ramp((time - start) / rise) * (1 - _ramp((time - start - rise - hold) / fall))
+        inside = (time > start - 0.4) & (time < start + rise + hold + fall + 0.4)
+        level = np.maximum(level, rng.uniform(0.4, 1.0) * press)
+        gesture[time > start - 0.4] = turn % _GESTURES
+        away[inside] = np.minimum(
+            1,
+            np.maximum(
+                _ramp((start - time[inside]) / 0.4), _ramp((time[inside] - start - rise - hold - fall) / 0.4)
+            ),
+        )
+        start += rise + hold + fall + rng.uniform(0.9, 1.6)
+        turn += 1
+    tremor = 0.03 * np.sin(2 * np.pi * rng.uniform(8, 11) * time + rng.uniform(0, 6)) * level
+    level = np.clip(level + tremor, 0, 1)
+    return _Course(time, level, _crept(time, level), gesture, away)
+
+
+def _crept(time_s: Floats, level: Floats) -> Floats:
+    """Quasi-linear creep with one time (Fung): part of the response comes late, by a first-order lag."""
+    late, step = np.zeros_like(level), time_s[1] - time_s[0]
+    for k in range(1, len(level)):
+        late[k] = late[k - 1] + step / _LATE_S * (level[k] - late[k - 1])
+    return np.asarray(np.clip((1 - _LATE) * level + _LATE * late, 0, 1), np.float64)
+
+
+def _frame_times(plan: Plan, rng: np.random.Generator) -> Floats:
+    """A camera whose exposure wanders: intervals vary by a tenth."""
+    steps = (1 + 0.1 * rng.uniform(-1, 1, int(plan.seconds * plan.fps))) / plan.fps
+    return np.concatenate([[0.0], np.cumsum(steps)[:-1]])
+
+
+def _pose(
+    motion: Deformation, gesture: tool.Gesture, course: _Course, at: int, rng: np.random.Generator
+) -> tuple[Floats, Floats, Floats]:
+    """Surface and instrument: between two levels of the path; the hand trembles by a tenth of a mm."""
+    levels = np.linalg.norm(motion.force, axis=1) / gesture.force_mn
+    strain = float(course.strain[at])
+    above = int(np.searchsorted(levels, strain).clip(1, len(levels) - 1))
+    width = max(levels[above] - levels[above - 1], 1e-9)
+    part = float(np.clip((strain - levels[above - 1]) / width, 0, 1))
+    moved = (1 - part) * motion.displacement[above - 1] + part * motion.displacement[above]
+    places = tool.anchors(gesture, tool.course(gesture, 2), motion.rest, motion.faces)
+    corners, weights = (of[0] for of in places)
+    touched = np.einsum("kc,kcd->kd", weights, (motion.rest + moved)[corners])
+    shafts = motion.shaft[-1]
+    tips = touched + gesture.hover_mm * course.away[at] * shafts + 0.1 * rng.normal(size=(1, 3))
+    return motion.rest + moved, tips, shafts
+
+
+def _write_sensor(part: Path, course: _Course, force: Floats, rng: np.random.Generator) -> float:
+    """Writes force.csv as a sensor of its own would; returns by how much its clock is behind [s]."""
+    lag = float(rng.uniform(-0.5, 0.5))
+    size = float(np.linalg.norm(force, axis=1).max())
+    turn = Rotation.from_quat(rng.normal(size=4)).as_matrix()  # uniform over rotations
+    drift = size * rng.normal(size=3) * 0.002 * course.time_s[:, None]
+    seen = force @ turn.T + size * rng.normal(0, 0.3, 3) + drift + 0.005 * size * rng.normal(size=force.shape)
+    clock = course.time_s - lag
+    writer.write_force(part, clock, seen / 1000)
+    return lag
+
+
+def _free_spans(plan: Plan, lag_s: float) -> list[list[float]]:
+    """Contact-free spans on the sensor's clock, as an operator would note them at both ends."""
+    return [[0.1 - lag_s, _STILL_S - 0.1 - lag_s], [plan.seconds - 0.2 - lag_s, plan.seconds + 0.8 - lag_s]]
+
+
+def _ramp(s: Floats) -> Floats:
+    """Smoothstep from 0 to 1."""
+    s = np.clip(s, 0, 1)
+    return np.asarray(s * s * (3 - 2 * s), np.float64)

@@ -1,0 +1,42 @@
+"""Results and packed clips kept in a folder under a key of all that made them: an interrupted run goes on."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from learn.data.clips import Clip, pack, unpack
+from synth.dataset import provenance
+from synth.dataset.folder import write_whole
+from synth.job import identity
+
+
+@cache
+def code() -> str:
+    """Hash of every source file of ours and of packages' versions: what other code computed isn't found."""
+    return provenance.source("synth", "learn", "bench", "evidence")
+
+
+def key(*parts: Any) -> str:
+    """Key of settings and content hashes, given as JSON could hold them, and of the code."""
+    return hashlib.blake2b(identity.canonical([code(), *parts]), digest_size=8).hexdigest()
+
+
+def result(folder: Path, name: str, key: str, compute: Callable[[], Any]) -> Any:
+    """What `compute` gives, as JSON holds it; computed only if the folder has none of this key."""
+    file = folder / f"{name}-{key}.json"
+    if not file.is_file():
+        folder.mkdir(parents=True, exist_ok=True)
+        write_whole(file, json.dumps(compute()), durable=False)
+    return json.loads(file.read_text("utf-8"))
+
+
+def clip(folder: Path, make: Callable[[], Clip]) -> Clip:
+    """The clip packed in a folder whose name has its key; made and packed if there is none."""
+    if not folder.is_dir():
+        pack(make(), folder)
+    return unpack(folder)

@@ -1,0 +1,248 @@
+"""Mechanics by felupe and pictures by Blender's Cycles, for `evidence.foreign.recordings`.
+
+    worker.py mechanics FOLDER   in a Python that has felupe and pypardiso
+    worker.py pictures FOLDER    in a Python that has bpy
+
+It imports nothing of ours. `mechanics` reads `mechanics.json` and writes `mechanics.npz`: where the surface's
+nodes are, how they move under every contact at rising shares of its force, and with the pulse at its largest.
+`pictures` reads `pictures.npz` and `pictures.json` and writes `NNNNN.png` and `right-NNNNN.png`, 8 bits sRGB.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+if "mechanics" in sys.argv:
+    import felupe as fem  # type: ignore[import-not-found]
+    from pypardiso import spsolve  # type: ignore[import-not-found]
+else:
+    import bpy  # type: ignore[import-not-found]
+    import mathutils  # type: ignore[import-not-found]
+
+_GROWTH = 2.5  # elements of the block's middle and top are so much finer
+
+
+def mechanics(folder: Path) -> None:
+    """One specimen."""
+    given = json.loads((folder / "mechanics.json").read_text("utf-8"))
+    wide, deep = given["block_mm"]
+    x, z = _lines(wide, deep, *given["elements"])
+    mesh = fem.mesh.Grid(x, x, z).convert(order=2, calc_points=True, calc_midfaces=True, calc_midvolumes=True)
+    field = fem.FieldContainer([fem.Field(fem.RegionTriQuadraticHexahedron(mesh), dim=3)])
+    young, poisson = given["young_kpa"], given["poisson"]
+    law = fem.NeoHookeCompressible(
+        mu=young / (2 * (1 + poisson)), lmbda=young * poisson / ((1 + poisson) * (1 - 2 * poisson))
+    )
+    items: list[Any] = [fem.SolidBody(law, field)]
+    top = np.flatnonzero(np.isclose(mesh.points[:, 2], 0.0))
+    top = top[np.lexsort(np.round(mesh.points[top, :2], 6).T)]  # row by row
+    if given["membrane_mn_per_mm"]:
+        items.append(_membrane(mesh, field, top, given["membrane_mn_per_mm"]))
+    held = _held(field, wide, deep)
+    moved = [_pressed(mesh, field, items, top, held, one, given["levels"]) for one in given["contacts"]]
+    pulse = _lifted(mesh, field, items, top, held, given["pulse_mm"], wide, deep)
+    np.savez(folder / "mechanics.npz", at=mesh.points[top, :2], moved=np.array(moved), pulse=pulse)
+
+
+def _lines(wide: float, deep: float, across: int, down: int) -> tuple[Any, Any]:
+    """Where element borders are: finer in the middle and at the top, z = 0."""
+    edge, depth = np.linspace(-1, 1, across + 1), np.linspace(0, 1, down + 1)
+    x = wide / 2 * np.sign(edge) * (np.abs(edge) + (_GROWTH - 1) * np.abs(edge) ** 3) / _GROWTH
+    z = -deep * (depth + (_GROWTH - 1) * depth**3) / _GROWTH
+    return x, z[::-1]
+
+
+def _held(field: Any, wide: float, deep: float) -> tuple[Any, Any]:
+    """Degrees of freedom of the sides and the ground, which don't move, and those that are free."""
+    walls = {"fx": (-wide / 2, wide / 2), "fy": (-wide / 2, wide / 2), "fz": (-deep,)}
+    bounds = {
+        f"{axis} {at}": fem.Boundary(field[0], **{axis: at}) for axis, ends in walls.items() for at in ends
+    }
+    held, free = fem.dof.partition(field, bounds)
+    return held, free
+
+
+def _membrane(mesh: Any, field: Any, top: Any, stiffness: float) -> Any:
+    """A net of trusses over the surface's nodes: stiffness of a strip times the strip's width."""
+    side = round(len(top) ** 0.5)
+    net = top.reshape(side, side)
+    gap = np.diff(mesh.points[net[0], 0])
+    wide = np.concatenate([gap[:1] / 2, (gap[1:] + gap[:-1]) / 2, gap[-1:] / 2])
+    rows = np.stack([net[:, :-1], net[:, 1:]], axis=-1)
+    columns = np.stack([net[:-1], net[1:]], axis=-1)
+    area = np.concatenate([np.repeat(wide, side - 1), np.broadcast_to(wide, (side - 1, side)).ravel()])
+    cells = np.concatenate([rows.reshape(-1, 2), columns.reshape(-1, 2)])
+    lines = fem.Mesh(mesh.points, cells, "line")
+    strung = fem.FieldContainer([fem.Field(fem.RegionTruss(lines), dim=3)])
+    strung[0].values = field[0].values  # the net moves with the block
+    return fem.TrussBody(fem.LinearElastic1D(E=stiffness), strung, area=area)
+
+
+def _pressed(mesh: Any, field: Any, items: list[Any], top: Any, held: Any, contact: Any, levels: int) -> Any:
+    """(levels, nodes, 3) mm at equal steps of a contact's force, by Hertz's pressure."""
+    field[0].values[:] = 0
+    at = mesh.points[top, :2]
+    away = np.linalg.norm(at - contact["at_mm"], axis=1) / contact["radius_mm"]
+    line = _simpson(at[: round(len(top) ** 0.5), 0])
+    share = np.outer(line, line).ravel() * np.sqrt(np.clip(1 - away**2, 0, None))
+    whole = np.outer(share / share.sum(), contact["force_mn"])
+    out = []
+    for level in np.linspace(0, 1, levels + 1)[1:]:
+        load = fem.PointLoad(field, top, values=level * whole)
+        _solve([*items, load], held, np.zeros(len(held[0])))
+        out.append(field[0].values[top].copy())
+    return out
+
+
+def _simpson(x: Any) -> Any:
+    """Weights of an integral over a line of nodes, two to an element and one in its middle."""
+    weight = np.zeros(len(x))
+    for start in range(0, len(x) - 2, 2):
+        weight[start : start + 3] += (x[start + 2] - x[start]) / 6 * np.array([1, 4, 1])
+    return weight
+
+
+def _lifted(
+    mesh: Any, field: Any, items: list[Any], top: Any, held: Any, lift_mm: float, wide: float, deep: float
+) -> Any:
+    """(nodes, 3) mm of the surface when the ground's middle is lifted until the surface rises so far."""
+    if not lift_mm:
+        return np.zeros((len(top), 3))
+    field[0].values[:] = 0
+    ground = np.isclose(mesh.points[:, 2], -deep)
+    away = np.linalg.norm(mesh.points[:, :2], axis=1) / (wide / 2)
+    fixed = np.zeros_like(mesh.points)
+    fixed[:, 2] = np.where(ground & (away < 1), lift_mm * np.cos(np.pi / 2 * np.clip(away, 0, 1)) ** 2, 0.0)
+    _solve(items, held, fixed.ravel()[held[0]])
+    moved = field[0].values[top].copy()
+    return moved * lift_mm / max(float(moved[:, 2].max()), 1e-9)
+
+
+def _solve(items: list[Any], held: tuple[Any, Any], fixed: Any) -> None:
+    """Newton's method with so much displacement of what is held."""
+    fem.newtonraphson(items=items, dof0=held[0], dof1=held[1], ext0=fixed, solver=spsolve, verbose=0)
+
+
+def pictures(folder: Path) -> None:
+    """One film."""
+    arrays = np.load(folder / "pictures.npz")
+    given = json.loads((folder / "pictures.json").read_text("utf-8"))
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    scene = bpy.context.scene
+    tissue = _sheet(arrays["rest"])
+    tissue.data.materials.append(_wet(arrays["albedo"], arrays["bumps"]))
+    tool = _rod(given["tool_mm"])
+    for k, at in enumerate(given["lamps_mm"]):
+        light = bpy.data.lights.new(f"lamp{k}", "AREA")
+        light.shape, light.size, light.energy = "DISK", 25.0, given["watts"]
+        lamp = _linked(f"lamp{k}", light)
+        lamp.location = at
+        lamp.rotation_euler = (-mathutils.Vector(at)).to_track_quat("-Z", "Y").to_euler()
+    cameras = {}
+    for name, matrix in given["cameras"].items():
+        lens = bpy.data.cameras.new(f"lens{name}")
+        lens.sensor_width, lens.lens = 36.0, 36.0 * given["focal_px"] / given["size"][0]
+        lens.clip_start, lens.clip_end = 1.0, 2000.0
+        cameras[name] = _linked(f"lens{name}", lens)
+        cameras[name].matrix_world = mathutils.Matrix(matrix)
+    _settings(scene, given)
+    for k, moved in enumerate(arrays["moved"]):
+        tissue.data.vertices.foreach_set("co", (arrays["rest"] + moved).astype(np.float32).ravel())
+        tissue.data.update()
+        shaft = mathutils.Vector(arrays["shaft"][k].tolist())
+        tool.location, tool.rotation_euler = (
+            arrays["tip"][k].tolist(),
+            shaft.to_track_quat("Z", "Y").to_euler(),
+        )
+        for eye, (name, camera) in enumerate(cameras.items()):
+            scene.camera = camera
+            scene.cycles.seed = 2 * k + eye  # noise that eyes shared would be followed
+            scene.render.filepath = str(folder / f"{name}{k:05d}.png")
+            bpy.ops.render.render(write_still=True)
+
+
+def _linked(name: str, what: Any) -> Any:
+    """An object in the scene."""
+    made = bpy.data.objects.new(name, what)
+    bpy.context.scene.collection.objects.link(made)
+    return made
+
+
+def _sheet(rest: Any) -> Any:
+    """A square grid of vertices (N, N, 3) as a smooth mesh, its map from 0 to 1 along both edges."""
+    side = rest.shape[0]
+    number = np.arange(side * side).reshape(side, side)
+    faces = np.stack([number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1]], -1).reshape(-1, 4)
+    mesh = bpy.data.meshes.new("tissue")
+    mesh.from_pydata(rest.reshape(-1, 3).tolist(), [], faces.tolist())
+    row, column = np.divmod(faces, side)
+    uv = np.stack([column, row], axis=-1) / (side - 1)
+    mesh.uv_layers.new(name="map").data.foreach_set("uv", uv.astype(np.float32).ravel())
+    mesh.polygons.foreach_set("use_smooth", np.ones(len(faces), bool))
+    return _linked("tissue", mesh)
+
+
+def _wet(albedo: Any, bumps: Any) -> Any:
+    material = bpy.data.materials.new("wet")
+    material.use_nodes = True
+    nodes, links = material.node_tree.nodes, material.node_tree.links
+    coat = nodes["Principled BSDF"]
+    coat.inputs["Roughness"].default_value, coat.inputs["IOR"].default_value = 0.3, 1.36
+    links.new(_image(nodes, "albedo", albedo).outputs["Color"], coat.inputs["Base Color"])
+    bump = nodes.new("ShaderNodeBump")
+    bump.inputs["Distance"].default_value = 0.15  # mm
+    height = _image(nodes, "bumps", np.repeat(bumps[..., None], 3, -1))
+    links.new(height.outputs["Color"], bump.inputs["Height"])
+    links.new(bump.outputs["Normal"], coat.inputs["Normal"])
+    return material
+
+
+def _image(nodes: Any, name: str, texels: Any) -> Any:
+    image = bpy.data.images.new(name, texels.shape[1], texels.shape[0], float_buffer=True)
+    image.colorspace_settings.name = "Non-Color"
+    image.pixels.foreach_set(np.dstack([texels, np.ones(texels.shape[:2])]).astype(np.float32).ravel())
+    node = nodes.new("ShaderNodeTexImage")
+    node.image = image
+    return node
+
+
+def _rod(radius_mm: float) -> Any:
+    """A steel rod with a round end at its origin, along +z."""
+    at = (0, 0, 40 + radius_mm)
+    bpy.ops.mesh.primitive_cylinder_add(radius=radius_mm, depth=80.0, location=at, vertices=48)
+    shaft = bpy.context.object
+    bpy.ops.mesh.primitive_uv_sphere_add(radius=radius_mm, location=(0, 0, radius_mm))
+    steel = bpy.data.materials.new("steel")
+    steel.use_nodes = True
+    coat = steel.node_tree.nodes["Principled BSDF"]
+    coat.inputs["Base Color"].default_value = (0.6, 0.6, 0.62, 1.0)
+    coat.inputs["Metallic"].default_value, coat.inputs["Roughness"].default_value = 1.0, 0.35
+    whole = _linked("tool", None)
+    for part in (shaft, bpy.context.object):
+        part.data.materials.append(steel)
+        part.parent = whole
+    return whole
+
+
+def _settings(scene: Any, given: dict[str, Any]) -> None:
+    scene.world = bpy.data.worlds.new("room")
+    scene.world.use_nodes = True
+    scene.world.node_tree.nodes["Background"].inputs[1].default_value = 0.05
+    scene.render.engine = "CYCLES"
+    scene.render.resolution_x, scene.render.resolution_y = given["size"]
+    scene.render.resolution_percentage = 100
+    scene.render.image_settings.file_format = "PNG"
+    scene.view_settings.view_transform = "Standard"
+    scene.render.use_persistent_data = True
+    scene.render.threads_mode, scene.render.threads = "FIXED", given["threads"]
+    scene.cycles.samples, scene.cycles.use_denoising = given["spp"], False
+    scene.cycles.max_bounces, scene.cycles.use_adaptive_sampling = 2, False
+
+
+if __name__ == "__main__":
+    {"mechanics": mechanics, "pictures": pictures}[sys.argv[1]](Path(sys.argv[2]))

@@ -1,0 +1,367 @@
+"""Results of a measurement: data as JSON with what made them, a page with charts, tables for the terminal.
+
+A script measures, gives its data to `save` and `show`, and draws a `Page` from the data alone.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+import os
+import shlex
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from synth.dataset.folder import write_whole
+from synth.publish.svg import svg
+from synth.system.packages import machine
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+CHECKOUT = Path(__file__).resolve().parents[1]
+RESULTS = CHECKOUT / "docs/results"
+
+_COLOURS = ("#1f6feb", "#c2352b", "#2b7a4b", "#8a6d00", "#a04f9c", "#00798c", "#3b3f46", "#b8562b", "#6b8e23")
+_WIDTH, _PANEL, _NAME, _ROW = 960, 310, 15, 19
+"""Of a picture; height of a panel, of a line of names below it, of a row of intervals [points]."""
+_PICTURES = ("chart.svg", "intervals.svg")
+
+
+@dataclass(frozen=True)
+class Curve:
+    """One series."""
+
+    name: str
+    x: tuple[float, ...]
+    y: tuple[float, ...]
+    labels: tuple[str, ...] = ()
+    """What the points are; empty: a line goes through them."""
+    ringed: tuple[int, ...] = ()
+    """Points to be looked at, as defaults: ringed, and their labels stand among the names."""
+    ends: tuple[tuple[float, float], ...] = ()
+    """Interval of every y; empty: none."""
+    named: bool = True
+    """Whether labels of ringed points stand among the names."""
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One chart of curves."""
+
+    title: str
+    x: str
+    y: str
+    curves: tuple[Curve, ...]
+    log_x: bool = False
+    log_y: bool = False
+    front: bool = False
+    """Whether a line joins the points that none beats in both x and y (less is better)."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """A mean and its interval."""
+
+    name: str
+    value: float
+    interval: tuple[float, float] = (math.nan, math.nan)
+    """NaN ends draw no bar."""
+    group: int = 0
+    """Which colour."""
+
+
+@dataclass(frozen=True)
+class Chart:
+    """One chart of intervals: a line a row."""
+
+    title: str
+    unit: str
+    rows: tuple[Row, ...]
+
+
+@dataclass(frozen=True)
+class Section:
+    """A heading, paragraphs and a table; any of them may be empty."""
+
+    heading: str
+    rows: Sequence[Mapping[str, Any]] = ()
+    words: Sequence[str] = ()
+    """Paragraphs; one that begins with "- " is an item of a list."""
+
+    @property
+    def columns(self) -> list[str]:
+        """Keys of all rows, but for those of trees, which are no cells."""
+        names = dict.fromkeys(name for row in self.rows for name in row)
+        return [name for name in names if not any(isinstance(row.get(name), Mapping) for row in self.rows)]
+
+
+@dataclass(frozen=True)
+class Page:
+    """Words, charts and tables."""
+
+    title: str
+    found: Mapping[str, Any]
+    """The data: command, commit and machine are said if they are in it."""
+    charts: Sequence[Chart | Panel] = ()
+    """Intervals and curves, a picture each kind."""
+    sections: Sequence[Section] = ()
+    words: Sequence[str] = ()
+    """Paragraphs at the top; may hold Markdown's `code` and *emphasis*."""
+
+    def text(self) -> str:
+        """The page in Markdown."""
+        made = [f"{key} {self.found[key]}" for key in ("commit", "seed") if key in self.found]
+        made += [f"{key} {value}" for key, value in self.found.get("machine", {}).items()]
+        parts = [f"# {self.title}", *([f"    {self.found['command']}"] if "command" in self.found else [])]
+        parts += [*([f"Made by {', '.join(made)}."] if made else []), *self.words]
+        pictures = _PICTURES[: len({type(one) for one in self.charts})]
+        parts += [f"![{self.title}]({picture})" for picture in pictures]
+        for section in self.sections:
+            parts += [f"## {section.heading}"] if section.heading else []
+            parts += [*section.words, *([markdown(section.rows)] if section.rows else [])]
+        return "\n\n".join(parts) + "\n"
+
+    def write(self, folder: Path) -> None:
+        """Writes README.md and the charts."""
+        panels = [one for one in self.charts if isinstance(one, Panel)]
+        rows = [one for one in self.charts if isinstance(one, Chart)]
+        drawn = ([curves(panels)] if panels else []) + ([intervals(rows)] if rows else [])
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, text in [("README.md", self.text()), *zip(_PICTURES, drawn, strict=False)]:
+            write_whole(folder / name, text, durable=False)
+
+
+def save(folder: Path, file: str, found: Mapping[str, Any], page: Page | None = None) -> None:
+    """Writes data and page into a folder.
+
+    Args:
+        found: data; floats are kept to six digits. `command`, `commit`, `machine` and `cpu_hours` (of this
+            process and its children: less than all where a cache held parts) are put before them; where the
+            data have such a key, theirs is kept.
+        page: drawn from the data.
+    """
+    times = os.times()
+    made = {
+        "command": command(),
+        "commit": commit(),
+        "machine": machine(),
+        "cpu_hours": float(f"{sum(times[:4]) / 3600:.2g}"),
+    }
+    found = shortened(made | dict(found))
+    folder.mkdir(parents=True, exist_ok=True)
+    write_whole(folder / file, _json(found) + "\n", durable=False)
+    if page is not None:
+        replace(page, found=found).write(folder)
+
+
+def command() -> str:
+    """This process's shell line: `python -m MODULE ARGUMENTS`, paths cut to their names, without --out."""
+    main = sys.modules["__main__"].__spec__
+    name = main.name.removesuffix(".__main__") if main else Path(sys.argv[0]).name
+    words = iter(sys.argv[1:])
+    kept = []
+    for word in words:
+        if word in ("--out", "-o"):
+            next(words, None)
+        elif not word.startswith("--out="):
+            option, equal, value = word.rpartition("=")
+            kept.append(f"{option}{equal}{Path(value).name or value}")
+    return shlex.join(["python", "-m", name, *kept])
+
+
+def commit() -> str:
+    """The checkout's commit, "+" behind it if files but results differ from it; empty outside of git."""
+
+    def git(*words: str) -> subprocess.CompletedProcess[str]:
+        return subprocess.run(["git", "-C", str(CHECKOUT), *words], capture_output=True, text=True)
+
+    name = git("rev-parse", "--short=7", "HEAD").stdout.strip()
+    changed = name and git("status", "--porcelain", "--", ".", ":!docs/results").stdout
+    return f"{name}+" if changed else name
+
+
+def shortened(value: Any) -> Any:
+    """A tree with its floats to six digits: what is behind them is noise, and takes half of a file."""
+    if isinstance(value, Mapping):
+        return {key: shortened(part) for key, part in value.items()}
+    if isinstance(value, list | tuple):
+        return [shortened(part) for part in value]
+    return float(f"{value:.6g}") if isinstance(value, float) else value
+
+
+def show(found: Mapping[str, Any]) -> None:
+    """Prints data: lists of rows as tables, all else line by line."""
+    console = Console(width=None if sys.stdout.isatty() else 140)
+    for name, value in found.items():
+        if isinstance(value, Mapping):
+            trees = all(isinstance(row, Mapping) for row in value.values())
+            value = [{name: key, **row} for key, row in value.items()] if trees else [value]
+        if isinstance(value, list) and value and all(isinstance(row, Mapping) for row in value):
+            columns = Section("", value).columns
+            table = Table(*map(escape, columns), title=escape(name), title_justify="left")
+            for row in value:
+                table.add_row(*(escape(_cell(row.get(key))) for key in columns))
+            console.print(table)
+        else:
+            console.print(f"{name}: {_cell(value)}", markup=False, highlight=False)
+
+
+def bars(
+    values: Mapping[str, float], ends: Mapping[str, tuple[float, float]] | None = None
+) -> tuple[Row, ...]:
+    """A row a value, with its interval where there is one."""
+    known, none = ends or {}, (math.nan, math.nan)
+    return tuple(Row(name, float(value), known.get(name, none)) for name, value in values.items())
+
+
+def front(points: Sequence[tuple[float, float]]) -> list[int]:
+    """Which points (cost, error) no other beats in both, cheapest first."""
+    kept: list[int] = []
+    least = math.inf
+    for k in sorted(range(len(points)), key=lambda k: points[k]):
+        if points[k][1] < least:
+            kept.append(k)
+            least = points[k][1]
+    return kept
+
+
+def curves(panels: Sequence[Panel]) -> str:
+    """Panels as one SVG, two a line; a name has one colour in all of them."""
+    names = dict.fromkeys(curve.name for panel in panels for curve in panel.curves)
+    colours = dict(zip(names, itertools.cycle(_COLOURS), strict=False))
+    across = min(2, len(panels))
+    lines = [panels[k : k + across] for k in range(0, len(panels), across)]
+    heights = [_PANEL + _NAME * max(math.ceil(len(_names(p)) / _across(p)) for p in line) for line in lines]
+
+    def draw(figure: Figure) -> None:
+        places = figure.subplots(len(lines), across, squeeze=False, height_ratios=heights).flat
+        for place, panel in itertools.zip_longest(places, panels):
+            if panel is None:
+                place.set_axis_off()
+            else:
+                _panel(place, panel, colours)
+
+    return svg(_WIDTH * across / 2, sum(heights), draw)
+
+
+def intervals(charts: Sequence[Chart]) -> str:
+    """Charts as one SVG, one below the other."""
+    heights = [70 + _ROW * len(chart.rows) for chart in charts]
+
+    def draw(figure: Figure) -> None:
+        places = figure.subplots(len(charts), 1, squeeze=False, height_ratios=heights).flat
+        for place, chart in zip(places, charts, strict=True):
+            _intervals(place, chart)
+
+    return svg(_WIDTH, sum(heights), draw)
+
+
+def _panel(axes: Axes, panel: Panel, colours: Mapping[str, str]) -> None:
+    axes.set(title=panel.title, xlabel=panel.x, ylabel=panel.y)
+    if panel.front:
+        points = [p for c in panel.curves for p in zip(c.x, c.y, strict=True) if math.isfinite(p[1])]
+        axes.plot(*zip(*(points[k] for k in front(points)), strict=True), "--", color="#9aa3ad", linewidth=1)
+    for curve in panel.curves:
+        _curve(axes, curve, colours[curve.name])
+    for axis, log in ((axes.xaxis, panel.log_x), (axes.yaxis, panel.log_y)):
+        _scale(axis, log)
+    axes.legend(loc="upper left", bbox_to_anchor=(0, -0.16), ncols=_across(panel), borderaxespad=0)
+
+
+def _names(panel: Panel) -> list[str]:
+    """Entries of the legend, which stands below a panel."""
+    ringed = [c.labels[k] for c in panel.curves if c.named for k in c.ringed]
+    return [*(c.name for c in panel.curves), *ringed]
+
+
+def _across(panel: Panel) -> int:
+    """How many of its names stand side by side: what 480 points hold."""
+    return max(1, min(3, 70 // (6 + max(len(name) for name in _names(panel)))))
+
+
+def _curve(axes: Axes, curve: Curve, colour: str) -> None:
+    good = [k for k, y in enumerate(curve.y) if math.isfinite(y)]
+    x, y = np.array(curve.x)[good], np.array(curve.y)[good]
+    axes.plot(x, y, " " if curve.labels else "-", color=colour, marker="o", label=curve.name)
+    if curve.ends:
+        axes.vlines(x, *np.array(curve.ends)[good].T, color=colour, alpha=0.55)
+    ringed = [k for k in good if k in curve.ringed]
+    if ringed:
+        at = ([values[k] for k in ringed] for values in (curve.x, curve.y))
+        name = " / ".join(curve.labels[k] for k in ringed) if curve.named else None
+        axes.plot(*at, "o", markersize=11, fillstyle="none", color=colour, markeredgewidth=1.8, label=name)
+
+
+def _scale(axis: Any, log: bool) -> None:
+    from matplotlib import ticker
+
+    if not log:
+        if axis.axis_name == "y":
+            low, high = axis.get_data_interval()
+            low, high = min(low, 0.0), max(high, 0.0)
+            pad = 0.05 * (high - low) or 1.0
+            axis.axes.set_ylim(low - pad, high + pad)
+        axis.set_major_locator(ticker.MaxNLocator(6, steps=[1, 2, 5, 10]))
+        return
+    getattr(axis.axes, f"set_{axis.axis_name}scale")("log")
+    low, high = axis.get_data_interval()
+    wide = math.log10(high / low) if low > 0 else 9.0
+    axis.set_major_locator(ticker.LogLocator(subs=(1, 2, 5) if wide < 1.7 else (1,), numticks=6))
+    axis.set_minor_locator(ticker.NullLocator())
+    axis.set_major_formatter("{x:.4g}")
+
+
+def _intervals(axes: Axes, chart: Chart) -> None:
+    rows = chart.rows
+    at = np.arange(len(rows))
+    colours = [_COLOURS[row.group % len(_COLOURS)] for row in rows]
+    low, high = np.array([row.interval for row in rows], float).reshape(-1, 2).T
+    axes.hlines(at, low, high, color=colours, linewidth=2)
+    axes.scatter(np.array([row.value for row in rows], float), at, 26, colours)
+    axes.axvline(0, color="#c9ced6", linewidth=0.8, zorder=0)
+    axes.set(title=chart.title, xlabel=chart.unit, ylim=(len(rows) - 0.4, -0.6))
+    axes.set_yticks(at, [f"{row.name}   {_figures(row)}" for row in rows])
+    axes.grid(visible=False, axis="y")
+
+
+def _figures(row: Row) -> str:
+    if not math.isfinite(row.interval[0]):
+        return f"{row.value:.4g}"
+    return f"{row.value:.4g} [{row.interval[0]:.4g}, {row.interval[1]:.4g}]"
+
+
+def markdown(rows: Sequence[Mapping[str, Any]]) -> str:
+    """A table in Markdown, columns being the keys of all rows."""
+    names = Section("", rows).columns
+    lines = [names, ["---"] * len(names), *([_cell(row.get(name)) for name in names] for row in rows)]
+    return "\n".join(f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in line)} |" for line in lines)
+
+
+def _cell(value: Any) -> str:
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if value is None:
+        return "–"
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def _json(what: Any, depth: int = 2) -> str:
+    """JSON with a line for each key, and for each row of a list under it: short, and rows can be compared."""
+    if depth and isinstance(what, dict) and what:
+        lines = (f"{json.dumps(k)}: {_json(v, depth - 1)}" for k, v in what.items())
+        return "{\n" + ",\n".join(lines) + "\n}"
+    if depth and isinstance(what, list) and any(isinstance(item, dict | list) for item in what):
+        return "[\n" + ",\n".join(_json(item, 0) for item in what) + "\n]"
+    return json.dumps(what, separators=(",", ":"))

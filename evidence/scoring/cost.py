@@ -1,0 +1,121 @@
+"""What scoring costs: a minute of video made for it, every method asked, the command's time and memory.
+
+Run: python -m evidence.scoring.cost MODEL --train DATASET
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any
+
+import cv2
+import numpy as np
+import typer
+from numpy.typing import NDArray
+
+from bench.recording import writer
+from evidence import report, status
+from synth.errors import UserError
+
+Rgb = NDArray[np.uint8]
+_PERIOD_S, _PEAK_PX, _PX_A_MN = 4.0, 9.0, 0.3
+_SENSOR_HZ = 200.0
+_FPS, _SIZE = 30.0, (680, 480)
+
+
+def main(
+    model: Annotated[Path, typer.Argument(help="Model folder of `learn train`.")],
+    train: Annotated[Path, typer.Option(help="Its training data: the simpler methods are asked too.")],
+    out: Annotated[Path, typer.Option(help="Folder for the results.")] = report.RESULTS / "scoring",
+    seconds: Annotated[float, typer.Option(min=2, help="Length of the recording.")] = 60.0,
+) -> None:
+    """Time and memory of `bench score` on a recording of a moved texture, all methods in the table."""
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = Path(scratch, "recording")
+        record(folder, seconds)
+        words = ["score", str(folder), "--model", str(model), "--train", str(train), "-o", scratch]
+        began = time.perf_counter()
+        done = subprocess.run([sys.executable, "-m", "bench", *words], capture_output=True, text=True)
+        wall = time.perf_counter() - began
+        if done.returncode:
+            raise UserError(f"the scoring failed: {done.stderr.strip().splitlines()[-1]}")
+        scored = json.loads(Path(scratch, "score.json").read_text())
+    found = {
+        "data": status.data(model, train),
+        "seconds": seconds,
+        "fps": _FPS,
+        "size": list(_SIZE),
+        "frames": scored["frames"],
+        "wall_s": wall,
+        "timings": scored["timings"],
+    }
+    report.save(out, "results.json", found, page(found))
+    report.show(found)
+
+
+def record(folder: Path, seconds: float) -> None:
+    """Writes a recording: a texture that a bump moves to and fro, without masks, force in proportion."""
+    folder.mkdir(parents=True)
+    times = np.arange(round(seconds * _FPS)) / _FPS
+    rest = texture(_SIZE[1], _SIZE[0], np.random.default_rng(0))
+    pictures = (pushed(rest, move) for move in _motion(times))
+    writer.write_video(folder / "video.mp4", pictures, times, crf=12)
+    clock = np.arange(0, seconds, 1 / _SENSOR_HZ)
+    newtons = np.zeros((len(clock), 3))
+    newtons[:, 0] = _motion(clock) / _PX_A_MN / 1000
+    writer.write_force(folder, clock, newtons)
+    sensor = {"axes": "camera", "low_pass_hz": None}
+    writer.write_meta(folder, {"scale_mm_per_px": 35.0 / _SIZE[0], "young_kpa": 2.0, "sensor": sensor})
+
+
+def _motion(time_s: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Pixels at the bump's middle: a press a period, the first half second still."""
+    return _PEAK_PX * np.clip(np.sin(2 * np.pi * (time_s - 0.5) / _PERIOD_S), 0, None) * (time_s > 0.5)
+
+
+def texture(height: int, width: int, rng: np.random.Generator) -> Rgb:
+    """Band-passed noise in tissue's colours, (H, W, 3) uint8."""
+    noise = rng.normal(size=(height, width)).astype(np.float32)
+    fine = cv2.GaussianBlur(noise, (0, 0), 1.5) - cv2.GaussianBlur(noise, (0, 0), 6)
+    grey = 110 + 45 * fine / fine.std()
+    rgb = np.stack([grey * 1.1, grey * 0.7, grey * 0.6], axis=-1)
+    return np.asarray(np.clip(rgb, 0, 210), np.uint8)
+
+
+def pushed(rest: Rgb, peak_px: float) -> Rgb:
+    """The texture (H, W, 3) moved right by a bump of `peak_px` in the middle."""
+    height, width = rest.shape[:2]
+    y, x = np.mgrid[:height, :width].astype(np.float32)
+    bump = np.exp(-((x - width / 2) ** 2 + (y - height / 2) ** 2) / (2 * (0.18 * height) ** 2))
+    source = (x - peak_px * bump).astype(np.float32)
+    return np.asarray(cv2.remap(rest, source, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT), np.uint8)
+
+
+def page(tree: Mapping[str, Any]) -> report.Page:
+    """Time by stage, and the whole."""
+    stages = {name: spent for name, spent in tree["timings"].items() if isinstance(spent, Mapping)}
+    memory = sum(value for name, value in tree["timings"].items() if name.endswith("peak_rss_mb"))
+    bars = report.bars({name: spent["wall_s"] for name, spent in stages.items()})
+    width, height = tree["size"]
+    return report.Page(
+        "What scoring costs",
+        tree,
+        [report.Chart("By stage, two processes side by side", "wall time [s]", bars)],
+        (report.Section("", [{"stage": name} | dict(spent) for name, spent in stages.items()]),),
+        (
+            f"*{tree['wall_s']:.0f} s, {tree['wall_s'] / tree['seconds']:.1f} times the recording's length, "
+            f"and {memory / 1000:.1f} GB* in two processes: a recording of {tree['seconds']:g} s, "
+            f"{width} x {height} at {tree['fps']:g} a second, no masks; {tree['frames']} frames looked at, "
+            "flow on pictures of at least 320 columns. At most twice the length and 2 GB were asked.",
+        ),
+    )
+
+
+if __name__ == "__main__":
+    typer.run(main)

@@ -1,0 +1,131 @@
+"""What every kept result was made by, whether that has changed since, and what making it again takes."""
+
+from __future__ import annotations
+
+import ast
+import hashlib
+import json
+import re
+import subprocess
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from evidence.report import CHECKOUT
+
+_OURS = re.compile(r"(synth|learn|bench|evidence)(\.\w+)+")
+_SCRIPT = re.compile(r"python -m (evidence(?:\.\w+)+)")
+
+
+@dataclass(frozen=True)
+class Status:
+    """One kept result."""
+
+    file: str
+    command: str
+    commit: str
+    changed: tuple[str, ...] | None
+    """Files that its script imports, and data of the checkout that it read, that differ from what made it;
+    None where script or commit are unknown."""
+    cpu_hours: float | None
+
+    def row(self) -> dict[str, Any]:
+        """Cells of a table."""
+        state = (
+            "current"
+            if self.changed == ()
+            else f"stale: {len(self.changed)} files"
+            if self.changed
+            else "unknown"
+        )
+        made = {"commit": self.commit, "CPU-hours": self.cpu_hours, "command": self.command}
+        return {"result": self.file, "state": state, **made}
+
+
+def gather(results: Path, home: Path = CHECKOUT) -> list[Status]:
+    """Every JSON file of a folder in the checkout `home`, by name."""
+    return [_status(file, home) for file in sorted(results.rglob("*.json"))]
+
+
+def closure(module: str, home: Path = CHECKOUT) -> set[Path]:
+    """Files of a module and of all modules of ours that these import, at whatever depth.
+
+    Names of modules in strings count too: work that other processes import. Flow estimators are found by
+    name, so whoever imports one of them depends on all.
+    """
+    found: set[Path] = set()
+    waiting = [module]
+    while waiting:
+        file = _file(waiting.pop(), home)
+        if file is None or file in found:
+            continue
+        found.add(file)
+        waiting += _imported(file, file.stat().st_mtime_ns)
+        if file.parent == home / "synth/flow":
+            waiting += [f"synth.flow.{other.stem}" for other in file.parent.glob("*.py")]
+    return found
+
+
+def content(path: Path) -> str:
+    """One word for a file's content; of a folder, of all its JSON and YAML, hashes of arrays among them."""
+    total = hashlib.blake2b(digest_size=8)
+    files = [path] if path.is_file() else [p for kind in ("json", "yaml") for p in path.rglob(f"*.{kind}")]
+    for file in sorted(files):
+        total.update(f"{file.relative_to(path)}\n".encode() + file.read_bytes())
+    return total.hexdigest()
+
+
+def data(*paths: Path, home: Path = CHECKOUT) -> dict[str, str]:
+    """What a result keeps as `data`: content by path in the checkout; of data elsewhere by name."""
+    found = {}
+    for path in map(Path.resolve, paths):
+        found[str(path.relative_to(home)) if path.is_relative_to(home) else path.name] = content(path)
+    return found
+
+
+def _status(file: Path, home: Path) -> Status:
+    found = json.loads(file.read_text("utf-8"))
+    found = found if isinstance(found, dict) else {}
+    name, command = str(file.relative_to(home)), str(found.get("command", ""))
+    commit = str(found.get("commit") or _git(home, "log", "-1", "--format=%h", "--", name)).strip()
+    changed = None
+    script = _SCRIPT.match(command)
+    if script and _file(script[1], home) and _git(home, "cat-file", "-t", commit.rstrip("+")):
+        ours = {str(one.relative_to(home)) for one in closure(script[1], home)}
+        read = {path: word for path, word in found.get("data", {}).items() if (home / path).exists()}
+        other = {path for path, word in read.items() if content(home / path) != word}
+        changed = tuple(sorted(ours & _differing(home, commit.rstrip("+")) | other))
+    return Status(name, command, commit, changed, found.get("cpu_hours"))
+
+
+@cache
+def _imported(file: Path, _changed_ns: int) -> list[str]:
+    return list(_names(ast.parse(file.read_text("utf-8"))))
+
+
+def _names(tree: ast.Module) -> Iterator[str]:
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            yield node.module
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+        elif isinstance(node, ast.Constant) and (known := _OURS.match(str(node.value))):
+            yield known[0]
+
+
+def _file(module: str, home: Path) -> Path | None:
+    at = home.joinpath(*module.split("."))
+    return next((one for one in (at.with_suffix(".py"), at / "__init__.py") if one.is_file()), None)
+
+
+def _differing(home: Path, commit: str) -> set[str]:
+    """Files that differ from a commit's, those not committed included."""
+    new = _git(home, "ls-files", "--others", "--exclude-standard")
+    return {*_git(home, "diff", "--name-only", commit).splitlines(), *new.splitlines()}
+
+
+def _git(home: Path, *words: str) -> str:
+    return subprocess.run(["git", "-C", str(home), *words], capture_output=True, text=True).stdout

@@ -1,1 +1,0 @@
-"""Where a user's brain can be opened: found, drawn, written as a job's lines."""

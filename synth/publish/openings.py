@@ -1,0 +1,183 @@
+"""Where a user's brain can be opened: the evenest places of its surface, drawn, and as lines of a job."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import ConvexHull, cKDTree
+
+from synth.errors import UserError
+from synth.geometry.brain_surface import axes, read_brain
+from synth.job import writer
+from synth.job.schema import Anatomy, Craniotomy, Fem, Job
+from synth.render.anatomy.surface import LEAST_FILLED, MARGIN_MM
+from synth.sequence import scenario, scene
+
+Floats = NDArray[np.float64]
+
+_PLACES = 250
+_PER_MM2, _MOST_SAMPLES = 1.5, 600_000  # every pixel of the surface then holds some
+_PIXEL_MM = 2.0
+_UNDER_SKULL_MM = 8.0  # how far below its convex hull the surface may lie and still be reached from outside
+_WHOLE = 0.97  # of the opening itself must be surface
+_STEEPEST_MM = 4.0  # rms departure from a dome; a cleft in the opening has more
+_FLAT = 0.01  # of the radius, median from the best plane: over a dome of 70 mm radius it is twice as much
+_APART = 1.5  # radii between two places
+_TILE_PX, _BLUE = 360, (11, 83, 148)
+
+
+@dataclass(frozen=True)
+class Opening:
+    """One place; coordinates are the file's [mm]."""
+
+    point: Floats
+    """(3,) on the surface."""
+    direction: Floats
+    """(3,) unit vector outwards: the normal of the surface's mean plane in the opening."""
+    relief_mm: float
+    """Departure of the surface from a smooth dome over the opening, rms: its gyri and sulci."""
+    flat: bool
+    """Most of it is: a wall that the surface was cut at."""
+
+    def craniotomy(self, radius_mm: float) -> Craniotomy:
+        """The job's section."""
+        x, y, z = np.round(self.point, 2).tolist()
+        u, v, w = np.round(self.direction, 3).tolist()
+        return Craniotomy(point=(x, y, z), direction=(u, v, w), radius_mm=radius_mm)
+
+
+def find_openings(mesh: Path, radius_mm: float, count: int) -> list[Opening]:
+    """At most `count` openings, the evenest first, apart from one another; each was tried as a job would.
+
+    Raises:
+        UserError: the file cannot be used, or nowhere on it an opening of that radius works.
+    """
+    chosen: list[Opening] = []
+    why = "the surface fills it nowhere"
+    for one in sorted(_judged(mesh, radius_mm), key=lambda one: (one.flat, one.relief_mm)):
+        if any(np.linalg.norm(one.point - other.point) < _APART * radius_mm for other in chosen):
+            continue
+        section = Anatomy(mesh=mesh.resolve(), vertices=2500, craniotomy=one.craniotomy(radius_mm))
+        job = Job(anatomy=section, fem=Fem(tets=400))  # whether it meshes, not how well
+        try:
+            scene.build(job, scenario.draw(job, 0))
+        except UserError as error:
+            why = str(error)
+            continue
+        chosen.append(one)
+        if len(chosen) == count:
+            break
+    if not chosen:
+        raise UserError(f"{mesh.name}: no opening of {radius_mm:g} mm radius works ({why}); lower --radius")
+    return chosen
+
+
+def as_job(mesh: Path, chosen: Sequence[Opening], radius_mm: float) -> str:
+    """Lines of a job with the first opening; the others are commented out under `also`."""
+    first, *others = (one.craniotomy(radius_mm).model_dump(mode="json") for one in chosen)
+    lines = ["anatomy:", f"  mesh: {writer.scalar(mesh)}", "  craniotomy:", f"    radius_mm: {radius_mm:g}"]
+    lines += [f"    point: {first['point']}", f"    direction: {first['direction']}"]
+    lines += ["    # also:  # the next best; sequences take them in turn"] if others else []
+    lines += [f"    #   - {{point: {one['point']}, direction: {one['direction']}}}" for one in others]
+    return "\n".join(lines)
+
+
+def draw_openings(mesh: Path, chosen: Sequence[Opening], radius_mm: float) -> NDArray[np.uint8]:
+    """(H, W, 3): the brain from six sides, with each opening's ring and its number from 1."""
+    vertices, faces = read_brain(mesh)
+    middle = (vertices.max(axis=0) + vertices.min(axis=0)) / 2
+    scale = 0.9 * _TILE_PX / np.ptp(vertices, axis=0).max()
+    sides = [*np.eye(3), *-np.eye(3)]
+    tiles = [_view(vertices[faces], side, chosen, middle, radius_mm, scale) for side in sides]
+    return np.vstack([np.hstack(tiles[:3]), np.hstack(tiles[3:])])
+
+
+def _judged(mesh: Path, radius_mm: float) -> Iterator[Opening]:
+    """Places under the skull, for which the convex hull stands, where a brain can be opened."""
+    import trimesh  # here: most jobs have no mesh
+
+    surface = trimesh.Trimesh(*read_brain(mesh), process=False)
+    count = int(np.clip(_PER_MM2 * surface.area, 2_000, _MOST_SAMPLES))
+    points = np.asarray(trimesh.sample.sample_surface(surface, count, seed=0)[0])  # in random order
+    planes = np.unique(np.round(ConvexHull(points).equations, 9), axis=0)
+    places = points[: 20 * _PLACES]
+    above = places @ planes[:, :3].T + planes[:, 3]
+    tree = cKDTree(points)
+    for k in np.flatnonzero(above.max(axis=1) > -_UNDER_SKULL_MM)[:_PLACES]:
+        found = _judge(points, tree, places[k], planes[above[k].argmax(), :3], radius_mm)
+        if found is not None:
+            yield found
+
+
+def _judge(points: Floats, tree: cKDTree, point: Floats, out: Floats, radius_mm: float) -> Opening | None:
+    """The opening at a point (3,), looked into from about `out` (3,); None where it can't be opened."""
+    half = radius_mm + MARGIN_MM
+    near = points[tree.query_ball_point(point, 2.5 * half)]
+    for turned in (True, True, False):
+        turn = axes(out)
+        x, y, height = _height_map((near - point) @ turn.T, half)
+        inside = np.hypot(x, y) < radius_mm
+        there = inside & np.isfinite(height)
+        if there.sum() < 12:
+            return None
+        x, y, z = x[there], y[there], height[there]
+        plane = np.stack([np.ones_like(x), x, y], axis=1)
+        fitted = np.linalg.lstsq(plane, z, rcond=None)[0]
+        if turned:
+            out = np.array([-fitted[1], -fitted[2], 1.0]) @ turn
+            out /= np.linalg.norm(out)
+    dome = np.concatenate([plane, np.stack([x**2, x * y, y**2], axis=1)], axis=1)
+    relief = float(np.std(z - dome @ np.linalg.lstsq(dome, z, rcond=None)[0]))
+    filled, whole = np.isfinite(height).mean(), there.sum() / inside.sum()
+    if filled < LEAST_FILLED or whole < _WHOLE or relief > _STEEPEST_MM:
+        return None
+    middle = point + z[np.hypot(x, y).argmin()] * turn[2]
+    off_plane = np.abs(z - plane @ fitted)
+    return Opening(middle, out, relief, bool(np.median(off_plane) < _FLAT * radius_mm))
+
+
+def _height_map(placed: Floats, half: float) -> tuple[Floats, Floats, Floats]:
+    """x, y and the highest point (n, n) mm of each pixel of a square; NaN where there is none.
+
+    As the renderer sees a brain: what lies deeper than three quarters of the square's side is its far side.
+    """
+    side = int(np.ceil(2 * half / _PIXEL_MM))
+    cell = np.floor((placed[:, :2] / half + 1) / 2 * side).astype(np.int64)
+    seen = ((cell >= 0) & (cell < side)).all(axis=1) & (placed[:, 2] > -1.5 * half)
+    height = np.full((side, side), -np.inf)
+    np.maximum.at(height, (cell[seen, 1], cell[seen, 0]), placed[seen, 2])
+    middles = (np.arange(side) + 0.5) / side * 2 * half - half
+    x, y = np.meshgrid(middles, middles)
+    return x, y, np.where(np.isfinite(height), height, np.nan)
+
+
+def _view(
+    corners: Floats, side: Floats, chosen: Sequence[Opening], middle: Floats, radius_mm: float, scale: float
+) -> NDArray[np.uint8]:
+    """One tile: triangles (F, 3, 3) mm as they face `side` (3,), the farthest drawn first."""
+    flat = axes(side)[:2].T * [scale, -scale]
+
+    def pixel(where: Floats) -> NDArray[np.int32]:
+        return np.rint((where - middle) @ flat + _TILE_PX / 2).astype(np.int32)
+
+    tile = np.zeros((_TILE_PX, _TILE_PX, 3), np.uint8)
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    shade = 60 + 170 * np.abs(normal @ side) / np.maximum(np.linalg.norm(normal, axis=1), 1e-12)
+    order = np.argsort(corners.mean(axis=1) @ side)
+    for triangle, grey in zip(pixel(corners[order]), shade[order].tolist(), strict=True):
+        cv2.fillConvexPoly(tile, triangle, (grey, 0.85 * grey, 0.8 * grey))
+    angle = np.linspace(0, 2 * np.pi, 49)
+    circle = radius_mm * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    for number, one in enumerate(chosen, 1):
+        if one.direction @ side > 0.15:  # else on the far side, or edge on
+            cv2.polylines(tile, [pixel(one.point + circle @ axes(one.direction)[:2])], True, _BLUE, 2)
+            x, y = pixel(one.point).tolist()
+            cv2.putText(tile, str(number), (x - 6, y + 6), cv2.FONT_HERSHEY_SIMPLEX, 0.6, _BLUE, 2)
+    name = f"from {'-' if side.min() < 0 else ''}{'xyz'[int(np.abs(side).argmax())]}"
+    cv2.putText(tile, name, (6, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (255, 255, 255))
+    return tile

@@ -1,0 +1,276 @@
+"""Files: others' are read within limits and run no code, ours are there whole or not at all."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import stat
+import tempfile
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from io import BufferedReader, BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from ruamel.yaml import YAML
+from ruamel.yaml.error import MarkedYAMLError
+from ruamel.yaml.events import AliasEvent, CollectionEndEvent, CollectionStartEvent
+
+from synth.errors import UserError
+
+LARGEST_JSON, LARGEST_PICTURE, LARGEST_YAML, LARGEST_STORAGE = 64 << 20, 512 << 20, 200_000, 1 << 20
+"""Bytes of a file of that kind that is read."""
+LARGEST_PIXELS = 40_000_000
+"""Of a still or of a frame of a video."""
+_LARGEST_ARRAYS = 64 << 30
+_DEEPEST = 32  # levels of a YAML file
+_NESTED = re.compile(r"[\[{]|<\w|[-?] +(?=[-?] )|\w: +(?=\w+: )")
+_MOST_NESTED = 1000  # values within values of an OpenCV file
+PART = ".part"
+"""How the names of files end that are being written, `.NAME.RANDOM.part`."""
+
+
+def open_file(path: Path, largest: int) -> BufferedReader:
+    """A regular file of at most `largest` bytes, open for reading. UserError for anything else."""
+    try:  # without waiting for a pipe's other end
+        file = os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb")
+    except (OSError, ValueError) as error:
+        why = str(getattr(error, "strerror", None) or error).lower()
+        raise UserError(f"{str(path)[:500]}: {why}") from None
+    about = os.fstat(file.fileno())
+    if stat.S_ISREG(about.st_mode) and about.st_size <= largest:
+        return file
+    file.close()
+    raise UserError(f"{path}: is no regular file of at most {largest / 1e6:.3g} MB")
+
+
+def check_file(path: Path, largest: int) -> None:
+    """`open_file`, for a library that opens it by its name."""
+    open_file(path, largest).close()
+
+
+def read_bytes(path: Path, largest: int) -> bytes:
+    """What is in a file. Raises as `open_file`."""
+    with open_file(path, largest) as file:
+        return file.read(largest)
+
+
+def read_text(path: Path, largest: int, encoding: str = "utf-8") -> str:
+    """The text of a file. UserError for what is none."""
+    try:
+        return read_bytes(path, largest).decode(encoding)
+    except UnicodeDecodeError as error:
+        raise UserError(f"{path}: unreadable, no UTF-8 text (byte {error.start})") from None
+
+
+def read_json(path: Path, largest: int = LARGEST_JSON) -> Any:
+    """What a JSON file holds. UserError for what is none."""
+    try:
+        return json.loads(read_text(path, largest))
+    except (ValueError, RecursionError) as error:
+        raise UserError(f"{path}: is damaged ({error})") from None
+
+
+def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
+    """The arrays of an .npz by name, of any shape (A, ...), numbers and truth values only. UserError else."""
+    try:
+        with open_file(path, _LARGEST_ARRAYS) as file, np.load(file, allow_pickle=False) as held:
+            found = {name: held[name] for name in held.files}
+        for name, array in found.items():
+            if array.dtype.kind not in "biuf":
+                raise ValueError(f"{name} is no array of numbers")
+        return found
+    except UserError:
+        raise
+    except Exception as error:  # zipfile, zlib and NumPy's own raise what they like
+        raise UserError(f"{path}: cannot be read as .npz ({_first_line(error)})") from None
+
+
+def read_picture(path: Path, flags: int = 1) -> NDArray[np.generic]:
+    """A still as OpenCV has it: (H, W, 3) uint8 BGR, upright, or as `flags` (cv2.IMREAD_...) ask.
+
+    Raises:
+        UserError: no regular file, no picture, or one beyond 40 megapixels.
+    """
+    try:
+        return decode_picture(read_bytes(path, LARGEST_PICTURE), flags)
+    except ValueError as error:
+        raise UserError(f"{path}: not a readable picture ({error})") from None
+
+
+def decode_picture(data: bytes, flags: int = 1) -> NDArray[np.generic]:
+    """The same (H, W, 3) from the bytes of a file; its size is read before it is decoded. ValueError."""
+    import cv2
+    from PIL import Image
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # Pillow's own limit is above ours
+            with Image.open(BytesIO(data)) as picture:
+                size = picture.size
+    except Exception as error:  # each format's reader raises what it likes: SyntaxError, struct.error, ...
+        raise ValueError("its head is none of a picture's") from error
+    refuse_large(*size)
+    try:
+        found = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    except cv2.error as error:
+        raise ValueError(f"it is damaged: {_first_line(error)}") from None
+    if found is None:
+        raise ValueError("it is damaged")
+    return np.asarray(found)
+
+
+def refuse_large(width: int, height: int) -> None:
+    """ValueError for a picture of no pixels, or of more than 40 million."""
+    if width < 1 or height < 1 or width * height > LARGEST_PIXELS:
+        raise ValueError(f"{width} x {height} pixels, at most {LARGEST_PIXELS // 10**6} million are read")
+
+
+def read_storage(name: str, text: str) -> dict[str, Any]:
+    """Matrices (float64 arrays) and numbers at the top of an OpenCV FileStorage: YAML, XML or JSON.
+
+    Raises:
+        UserError: it is none, or nested so deep that OpenCV's parser, which calls itself, ends the process.
+    """
+    import cv2
+
+    try:
+        if sum(1 for _ in _NESTED.finditer(text)) > _MOST_NESTED:
+            raise SystemError(f"more than {_MOST_NESTED} nested values")
+        storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
+        root = storage.root()  # it and its nodes live as long as the storage
+        nodes = {key: root.getNode(key) for key in root.keys()}  # noqa: SIM118 - a FileNode is no dictionary
+        return {
+            key: node.mat() if node.isMap() else node.real()
+            for key, node in nodes.items()
+            if node.isMap() or node.isInt() or node.isReal()
+        }
+    except (cv2.error, SystemError) as error:
+        raise UserError(f"{name}: is no OpenCV calibration ({_first_line(error)})") from error
+
+
+def read_yaml(path: Path) -> Any:
+    """The values of a YAML file. Raises as `read_text`, `load_yaml` and `plain_yaml`."""
+    return plain_yaml(load_yaml(read_text(path, LARGEST_YAML), str(path)), str(path))
+
+
+def load_yaml(text: str, label: str) -> Any:
+    """The tree of YAML 1.2 with places and comments (`ruamel.yaml`'s round trip); `plain_yaml` is its values.
+
+    Raises:
+        UserError: `label:line:column: ...`: no YAML, too long, nested too deep, or with aliases, by which a
+            kilobyte can stand for a billion values.
+    """
+    depth = 0
+    try:
+        for event in YAML(typ="rt").parse(text):  # before anything is built of it
+            depth += isinstance(event, CollectionStartEvent) - isinstance(event, CollectionEndEvent)
+            if depth > _DEEPEST or isinstance(event, AliasEvent):
+                what = f"aliases, and more than {_DEEPEST} levels, are not read"
+                raise MarkedYAMLError(problem=what, problem_mark=event.start_mark)
+        return YAML(typ="rt").load(text)
+    except MarkedYAMLError as error:
+        mark = error.problem_mark or error.context_mark
+        where = f"{label}:{mark.line + 1}:{mark.column + 1}" if mark else label
+        raise UserError(f"{where}: not YAML: {_first_line(error.problem or error.context)}") from None
+    except Exception as error:  # the reader raises bare ValueErrors and others for odd scalars and tags
+        raise UserError(f"{label}: not YAML: {_first_line(error)}") from error
+
+
+def plain_yaml(value: Any, label: str) -> Any:
+    """A tree of `load_yaml` as dictionaries with keys of text, lists, texts, numbers, booleans and None.
+
+    Dates are their text. UserError for an integer beyond 64 bits and for another kind (`!!binary`, a tag).
+    """
+    if isinstance(value, dict):
+        return {str(key)[:100]: plain_yaml(item, label) for key, item in value.items()}
+    if isinstance(value, list):
+        return [plain_yaml(item, label) for item in value]
+    if value is None or isinstance(value, bool):
+        return value
+    if isinstance(value, int) and abs(value) <= 1 << 64:
+        return int(value)
+    if isinstance(value, float):
+        return float(value)
+    if isinstance(value, str) or hasattr(value, "isoformat"):
+        return str(value)
+    raise UserError(f"{label}: a {type(value).__name__} of a kind or size that is not read")
+
+
+def write_whole(path: Path, text: str | bytes, *, durable: bool = True) -> None:
+    """Writes a small file so that it is there in full or not at all; `durable`: after a power failure too."""
+    with part_of(path) as part, part.open("wb") as file:
+        file.write(text.encode() if isinstance(text, str) else text)
+        if durable:
+            file.flush()
+            os.fsync(file.fileno())
+
+
+@contextmanager
+def part_of(path: Path) -> Iterator[Path]:
+    """A new file beside `path` to write, which takes its name when the block ends well and else is gone.
+
+    It is created exclusively: no link that lies there is followed. One that lies at `path` is replaced.
+    """
+    part = _part_name(path)
+    part.touch(exist_ok=False)
+    try:
+        yield part
+        part.replace(path)
+    except BaseException:
+        part.unlink(missing_ok=True)
+        raise
+
+
+@contextmanager
+def folder_of(path: Path) -> Iterator[Path]:
+    """The same for a new folder. UserError if something is at `path`, or its own folder can't be made."""
+    if os.path.lexists(path):
+        raise UserError(f"{path}: exists already")
+    make_folder(path.absolute().parent)
+    part = _part_name(path)
+    part.mkdir()
+    try:
+        yield part
+        part.rename(path)
+    except BaseException:
+        shutil.rmtree(part, ignore_errors=True)
+        raise
+
+
+def make_folder(path: Path, room_bytes: int = 0) -> None:
+    """Makes a folder. UserError if it can't be, can't be written, or its disk has not that much room."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=path) as file:
+            if room_bytes:
+                os.posix_fallocate(file.fileno(), 0, room_bytes)  # quotas count too
+    except OSError as error:
+        raise UserError(f"{path}: cannot be written ({error.strerror})") from None
+
+
+@contextmanager
+def made_folder(path: Path, room_bytes: int = 0) -> Iterator[None]:
+    """`make_folder`; what it made and the block left empty is gone again if the block fails."""
+    fresh = [one for one in (path, *path.parents) if not os.path.lexists(one)]
+    try:
+        make_folder(path, room_bytes)
+        yield
+    except BaseException:
+        with suppress(OSError):
+            for one in fresh:
+                one.rmdir()
+        raise
+
+
+def _part_name(path: Path) -> Path:
+    return path.with_name(f".{path.name}.{os.urandom(4).hex()}{PART}")
+
+
+def _first_line(error: object) -> str:
+    return (str(error).strip().splitlines() or [type(error).__name__])[0][:200]

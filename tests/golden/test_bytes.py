@@ -1,0 +1,58 @@
+"""Default runs give what commit f047e99 gave: bit for bit where packages and processor are the same."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from synth.dataset.store import open_sequence
+from synth.job import reader
+from synth.sequence import pipeline
+from synth.system import packages
+
+CAPABILITY = "AVX512"
+"""Of the processor that made the golden ones: another adds in another order."""
+
+
+@pytest.mark.slow
+def test_a_default_sequence_keeps_its_bytes(stored: Path, tmp_path: Path) -> None:
+    before = open_sequence(stored / "default" / "000000.zarr")
+    job = reader.load_job(str(stored / "default" / "job.yaml"))
+    pipeline.render_sequence(job, 0, tmp_path, lambda stage, done, of: None)
+    now = open_sequence(tmp_path / "000000.zarr")
+    assert now.attrs["field_hashes"].keys() == before.attrs["field_hashes"].keys()
+    assert now.attrs["job"] == before.attrs["job"]
+    theirs = {name: v for name, v in before.attrs["versions"].items() if name in packages.versions()}
+    same = theirs == {name: packages.versions()[name] for name in theirs}
+    if same and now.attrs["variant"] == before.attrs["variant"]:
+        changed = [
+            name
+            for name, value in before.attrs["field_hashes"].items()
+            if now.attrs["field_hashes"][name] != value
+        ]
+        assert not changed
+    for name in ("flow", "traction", "force", "depth"):
+        largest = float(np.abs(before[name]).max())
+        np.testing.assert_allclose(now[name], before[name], rtol=0, atol=1e-3 * largest)
+
+
+@pytest.mark.slow
+def test_an_epoch_keeps_its_weights(stored: Path, tmp_path: Path) -> None:
+    import torch
+    from typer.testing import CliRunner
+
+    from learn import checkpoint
+    from learn.cli import app
+
+    small = ["--preset", "tiny", "--epochs", "1", "size=16", "arch.width=4", "arch.levels=2"]
+    done = CliRunner().invoke(app, ["train", str(stored / "one"), "-o", str(tmp_path / "model"), *small])
+    assert done.exit_code == 0, done.output
+    now = checkpoint.load_tensors(tmp_path / "model" / "weights.pt")
+    then = checkpoint.load_tensors(stored / "models" / "epoch" / "weights.pt")
+    assert now.keys() == then.keys()
+    exact = torch.backends.cpu.get_cpu_capability() == CAPABILITY
+    for name, value in then.items():
+        assert not exact or torch.equal(now[name], value), name
+        np.testing.assert_allclose(now[name].numpy(), value.numpy(), rtol=1e-3, atol=1e-5)

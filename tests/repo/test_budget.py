@@ -1,0 +1,41 @@
+"""Lines of Python that each package may have: one in, one out.
+
+Who raises a number says why in the same commit.
+"""
+
+from __future__ import annotations
+
+import pytest
+from sources import ROOT, sources
+
+LINES = {
+    "synth": 22_500,
+    "learn": 7_150,
+    "bench": 6_750,
+    "evidence": 7_700,
+    "tests": 13_000,
+}
+COMMANDS = 28
+JOB_KEYS, TRAINING_KEYS = 98, 29
+
+
+@pytest.mark.parametrize("package", LINES)
+def test_a_package_keeps_to_its_budget(package: str) -> None:
+    assert (ROOT / package).is_dir()
+    lines = sum(len(path.read_text("utf-8").splitlines()) for path in sources(package))
+    assert lines <= LINES[package]
+
+
+def test_keys_keep_to_their_budget() -> None:
+    from learn.settings import Settings
+    from synth.job import reader
+
+    assert len(reader.places()) <= JOB_KEYS
+    assert len(reader.places(Settings)) <= TRAINING_KEYS
+
+
+def test_commands_keep_to_their_budget() -> None:
+    from importlib import import_module
+
+    apps = [import_module(f"{package}.cli").app for package in ("synth", "learn", "bench")]
+    assert sum(len(app.registered_commands) for app in apps) <= COMMANDS

@@ -1,0 +1,115 @@
+"""Stores damaged as disks, copies and people do it: verify finds what changes a value."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import fake_work
+import numpy as np
+import pytest
+import zarr
+from fake_run import in_process
+
+from synth.checks import verify
+from synth.dataset.folder import Folder
+from synth.dataset.store import Dataset
+from synth.job.schema import Job
+
+JOB = Job(seed=1, sequences=2, frames=5, render={"size": (64, 48)}, flow={"backend": "ideal"})
+KINDS = (
+    "bit", "bytes", "truncated", "emptied", "removed", "zeroed", "swapped", "rewritten", "edited", "key gone"
+)  # fmt: skip
+EACH = 5
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("damage") / "out"
+    in_process(JOB, folder, fake_work.sequence)
+    return folder
+
+
+def damage(store: Path, kind: str, rng: np.random.Generator) -> None:
+    """One damage of a kind; it may change no value, a bit of compression's slack."""
+    every = sorted(path for path in store.rglob("*") if path.is_file())
+    chunks = [path for path in every if "c" in path.relative_to(store).parts]
+    among = every if kind in ("bit", "emptied", "removed") else chunks
+    path = among[int(rng.integers(len(among)))]
+    data = bytearray(path.read_bytes())
+    at = int(rng.integers(len(data)))
+    if kind in ("bit", "bytes"):
+        for k in [at] if kind == "bit" else rng.integers(len(data), size=16):
+            data[k] ^= 1 << int(rng.integers(8))
+        path.write_bytes(data)
+    elif kind == "truncated":
+        path.write_bytes(data[:at])
+    elif kind == "emptied":
+        path.write_bytes(b"")
+    elif kind == "removed":
+        path.unlink()
+    elif kind == "zeroed":
+        path.write_bytes(data[:at] + bytes(len(data[at : at + 512])) + data[at + 512 :])
+    elif kind == "swapped":  # each is whole, and stands for other frames or another field
+        other = chunks[int(rng.integers(len(chunks)))]
+        path.write_bytes(other.read_bytes())
+        other.write_bytes(data)
+    elif kind == "rewritten":  # through Zarr itself, so that every chunk's own checksum is right
+        group = zarr.open_group(str(store), mode="r+")
+        array: Any = group[str(rng.choice(sorted(group.attrs["field_hashes"])))]
+        place = tuple(int(rng.integers(length)) for length in array.shape)
+        value = array[place]
+        array[place] = ~value if array.dtype.kind in "bu" else np.nextafter(value, np.inf, dtype=array.dtype)
+    else:
+        metadata = [one for one in every if one.name == "zarr.json"]
+        path = metadata[int(rng.integers(len(metadata)))]
+        document = json.loads(path.read_text())
+        leaves = [leaf for leaf in _leaves(document) if kind == "edited" or isinstance(leaf[0], dict)]
+        holder, key = leaves[int(rng.integers(len(leaves)))]
+        old = holder.pop(key) if kind == "key gone" else holder[key]
+        if kind == "edited":
+            plain = isinstance(old, (int, float)) and not isinstance(old, bool)
+            holder[key] = old + 1 if plain else f"{old}x" if isinstance(old, str) else not old
+        path.write_text(json.dumps(document))
+
+
+def _leaves(node: Any) -> Iterator[tuple[Any, Any]]:
+    for key, value in node.items() if isinstance(node, dict) else enumerate(node):
+        if isinstance(value, (dict, list)):
+            yield from _leaves(value)
+        else:
+            yield node, key
+
+
+def same(original: Path, copy: Path) -> bool:
+    """Whether plain Zarr reads the same values, attributes and axes from both."""
+    first = zarr.open_group(str(original), mode="r")
+    try:
+        second = zarr.open_group(str(copy), mode="r")
+        return dict(first.attrs) == dict(second.attrs) and all(
+            dict(one.attrs) == dict(two.attrs)
+            and one.dtype == two.dtype
+            and one.metadata.dimension_names == two.metadata.dimension_names
+            and np.array_equal(one[...], two[...])
+            for one, two in ((first[name], second[name]) for name in first.attrs["field_hashes"])
+        )
+    except Exception:  # whatever it is, a reader cannot read
+        return False
+
+
+def test_damage_that_changes_a_value_is_found(root: Path, tmp_path: Path) -> None:
+    rng, changed = np.random.default_rng(0), Counter[str]()
+    identity, paths = str(Folder(root).described()["identity"]), Dataset(root).paths
+    for k, kind in enumerate(KINDS * EACH):
+        copy = tmp_path / paths[k % 2].name
+        shutil.copytree(paths[k % 2], copy)
+        damage(copy, kind, rng)
+        if not same(paths[k % 2], copy):
+            changed[kind] += 1
+            assert not all(check.good for check in verify.verify_sequence(copy, identity)), f"{k}: {kind}"
+        shutil.rmtree(copy)
+    assert set(changed) == set(KINDS), "a kind that never changes a value"

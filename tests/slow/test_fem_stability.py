@@ -1,0 +1,84 @@
+"""Where the physics breaks and that it says so: past a law's range, odd steps, slivers, random scenes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from evidence.fem import case as fem_case
+from synth.errors import UserError
+from synth.fem.equilibrium import InvertedElement, NoEquilibrium
+from synth.fem.mesh import tetrahedra
+from synth.fem.mesh.element import quality
+from synth.fem.system import assemble
+from synth.job import schema
+from synth.job.law_limits import LARGEST_LOAD, LEAST_JACOBIAN
+from synth.sequence import pipeline, scenario
+
+CONTACT = fem_case.CONTACTS[0]
+LIVING = {
+    "membrane": {"intact": 0.7},
+    "pulse": {"heart_mm": (0.0, 0.5), "breath_mm": (0.0, 0.6)},
+    "poisson": (0.4, 0.49),
+    "skull": ("bonded", "slip"),
+    "instruments": (1, 2),
+}
+
+
+def random_scene(index: int, **fem: Any) -> None:
+    shared = {"seed": 0, "sequences": 10**6, "frames": 12, "anatomy": {"vertices": 10_000}}
+    job = schema.Job.model_validate({**shared, "fem": {"tets": 500, **fem}})
+    case = scenario.draw(job, index)
+    moved = pipeline.move(job, case, *pipeline.build(job, case))
+    for numbers in (moved.displacement, moved.traction, moved.tip, moved.energy):
+        assert np.isfinite(numbers).all()
+    assert moved.min_jacobian.min() > LEAST_JACOBIAN
+    force = np.einsum("v,tvd->td", moved.area, moved.traction)
+    assert np.abs(force - moved.force).max() <= 1e-9 * np.abs(moved.force).max()
+    if case.pulse is None:  # displacement per force, frame to frame, while the force is even
+        size, peak = np.linalg.norm(force, axis=1), np.linalg.norm(moved.displacement, axis=2).max(axis=1)
+        steps = np.abs(np.diff(np.log(np.maximum(peak, 1e-9) / np.maximum(size, 1e-9))))
+        even = (size[1:] > 0.05 * size.max()) & (np.abs(np.diff(size)) < 0.02 * size.max())
+        assert steps[even].max(initial=0.0) < np.log(1.25)
+
+
+@pytest.mark.parametrize("fem", [{}, {"gestures": ["slide"]}, LIVING], ids=["default", "slides", "living"])
+def test_random_scenes_are_whole_and_step_evenly(fem: dict[str, Any]) -> None:
+    for index in range(8):
+        random_scene(index, **fem)
+
+
+@pytest.mark.parametrize(("law", "broken"), [("corotational", 0.8), ("linear", 3.0), ("neo-hookean", 3.0)])
+def test_a_push_past_a_laws_range_is_refused(law: str, broken: float) -> None:
+    case = fem_case.brain(fem_case.patch(10_000), law, 500, CONTACT)
+    assert np.isfinite(fem_case.moved(case, LARGEST_LOAD[law], "push", 8)).all()
+    with pytest.raises((InvertedElement, NoEquilibrium)):
+        fem_case.moved(case, broken, "push", 8)
+
+
+def test_equilibrium_knows_nothing_of_the_steps_to_it() -> None:
+    on = fem_case.patch(10_000)
+    for law in ("corotational", "neo-hookean"):
+        case = fem_case.brain(on, law, 500, CONTACT)
+        slow = fem_case.moved(case, 0.15, "push", 40)
+        for steps in (1, 5):
+            assert fem_case.error(fem_case.moved(case, 0.15, "push", steps), slow, on) < 1e-3
+
+
+def test_quadratic_elements_hardly_lock_and_slivers_are_refused() -> None:
+    on = fem_case.patch(10_000)
+    for poisson in (0.4, 0.499):
+        fine, coarse = (fem_case.brain(on, "linear", tets, CONTACT, poisson) for tets in (2000, 500))
+        exact = fem_case.moved(fine, 0.1, "push", 1)
+        assert fem_case.error(fem_case.moved(coarse, 0.1, "push", 1), exact, on) < 0.15
+    mesh = tetrahedra.block(fem_case.ANATOMY, 500, 2, (CONTACT,))
+    # A corner of the tetrahedron nearest to 6 mm under the contact, pressed flat.
+    cell = np.linalg.norm(mesh.points[mesh.cells[:, :4]].mean(axis=1) - [0, 0, -6.0], axis=1).argmin()
+    points, corners = mesh.points.copy(), mesh.cells[cell, :4]
+    points[corners[0]] = points[corners[1:]].mean(axis=0)
+    assert quality(points[corners][None]).max() < 0.01
+    with pytest.raises(UserError):
+        assemble(replace(mesh, points=points), "linear", 0.4)

@@ -1,0 +1,126 @@
+"""Runs that are killed, here and on a cluster, end with the bytes of one that was left in peace."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fake_run import Silent, options, start, wait_for
+
+from synth.checks import verify
+from synth.dataset.folder import Folder
+from synth.engine import run as engine
+from synth.job.schema import Job
+
+pytestmark = pytest.mark.trial
+
+JOB = Job(seed=1, sequences=6, frames=5, render={"size": (64, 48)}, flow={"backend": "ideal"})
+KILLS = 6
+
+
+def children(pid: int) -> list[int]:
+    """Processes that `pid` started; only ever of a run that this test started itself."""
+    with suppress(FileNotFoundError):
+        tasks = list(Path(f"/proc/{pid}/task").iterdir())
+        return [int(child) for task in tasks for child in (task / "children").read_text().split()]
+    return []
+
+
+def kill(run: subprocess.Popen[bytes], kind: str, rng: np.random.Generator) -> bool:
+    """Kills a worker, the engine or both; whether there was something to kill."""
+    workers = children(run.pid)
+    if kind != "engine":
+        if not workers:
+            return False
+        with suppress(ProcessLookupError):
+            os.kill(int(rng.choice(workers)), signal.SIGKILL)
+    if kind != "worker":
+        if run.poll() is not None:
+            return False
+        run.kill()
+        run.wait()
+    return True
+
+
+def test_a_run_that_is_killed_again_and_again_makes_the_same_dataset(tmp_path: Path) -> None:
+    rng, root = np.random.default_rng(1), tmp_path / "killed"
+    killed, starts, run = 0, 0, None
+    while killed < KILLS:
+        if run is None or run.poll() is not None:
+            if root.exists():
+                Folder(root).forgive()
+            if len(list(root.glob("*.zarr"))) == JOB.sequences:  # all done before all kills
+                shutil.rmtree(root / "000002.zarr")
+            run, starts = start(root, JOB, "slow"), starts + 1
+            assert starts < 10 * KILLS, "runs end before anything can be killed"
+        time.sleep(float(rng.uniform(0.05, 1.5)))
+        killed += kill(run, str(rng.choice(["worker", "engine", "both"])), rng)
+    assert run is not None
+    run.wait()
+    assert starts > 1, "no engine was killed"
+    Folder(root).forgive()
+    resumed = engine.run_job(JOB, root, options("sequence"), Silent())
+    calm = engine.run_job(JOB, tmp_path / "calm", options("sequence"), Silent())
+    assert resumed.content_hash == calm.content_hash
+    assert not list(root.glob("*.part"))
+    good = {check.name: check.good for check in verify.verify_dataset(root).checks}
+    assert good["checksum"]
+    assert good["readable"]
+    assert good["seal"]
+
+
+@contextmanager
+def local_cluster(workers: int) -> Iterator[tuple[str, list[subprocess.Popen[bytes]]]]:
+    """A scheduler and `workers` worker processes on this machine: `host:port`, and the workers' processes."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = str(free.getsockname()[1])
+
+    def begin(module: str, *words: str) -> subprocess.Popen[bytes]:
+        program = [sys.executable, "-m", f"distributed.cli.{module}", "--host", "127.0.0.1", "--no-dashboard"]
+        quiet = subprocess.DEVNULL
+        return subprocess.Popen([*program, *words], stdout=quiet, stderr=quiet, start_new_session=True)
+
+    scheduler = begin("dask_scheduler", "--port", port)
+    processes = [
+        begin("dask_worker", f"tcp://127.0.0.1:{port}", "--nthreads", "1", "--no-nanny")
+        for _ in range(workers)
+    ]
+    try:
+        yield f"127.0.0.1:{port}", processes
+    finally:
+        for process in [*processes, scheduler]:
+            if process.poll() is None:
+                os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+
+
+def test_a_lost_dask_worker_costs_nothing_but_time(tmp_path: Path) -> None:
+    pytest.importorskip("distributed", reason="the extra `cluster` is not installed")
+    root = tmp_path / "cluster"
+    with local_cluster(2) as (address, processes):
+
+        def kill_half_way() -> None:
+            wait_for(lambda: len(list(root.glob("[0-9]*.zarr"))) >= 2)
+            os.killpg(processes[0].pid, signal.SIGKILL)
+
+        killer = threading.Thread(target=kill_half_way, daemon=True)
+        killer.start()
+        made = engine.run_job(JOB, root, options("slow", workers=None, engine=f"dask://{address}"), Silent())
+        killer.join(timeout=10)
+        assert processes[0].poll() is not None, "none was killed"
+    here = engine.run_job(JOB, tmp_path / "local", options("sequence"), Silent())
+    assert (made.done, made.failed) == (6, {})
+    assert made.content_hash == here.content_hash
+    assert not list(root.glob("*.part"))

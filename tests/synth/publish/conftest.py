@@ -1,0 +1,41 @@
+"""One dataset for all tests of this folder."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from fake_run import in_process
+from fake_work import consistent
+
+from synth.dataset import index, split
+from synth.dataset.folder import Folder
+from synth.job.schema import Job
+from synth.publish import croissant
+
+ABOUT = {
+    "title": "Pulls: a test",
+    "licence": "cc-by-4.0",
+    "summary": "Made to be read.",
+    "authors": ["A. Person"],
+    "url": "https://example.org/pulls",
+    "published": "2027-01-31",
+}
+
+
+@pytest.fixture(scope="session")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Six sequences of two eyes, with sides, card and description; not to be written to."""
+    out = tmp_path_factory.mktemp("publish") / "out"
+    job = Job(
+        sequences=6,
+        frames=3,
+        render={"size": (48, 36), "stereo_mm": 24.0},
+        flow={"backend": "ideal"},
+        card=ABOUT,
+    )
+    in_process(job, out, consistent)
+    split.keep_rule(out, split.parse_rule("anatomy", "0.5,0.25,0.25", [], False))
+    index.write_index(Folder(out))
+    croissant.write_croissant(Folder(out))
+    return out

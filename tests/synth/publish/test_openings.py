@@ -1,0 +1,75 @@
+"""Openings of a brain: found where they are and not where they can't be; their lines make a job."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from egg_brain import soup, written
+from typer.testing import CliRunner
+
+import synth
+from synth.cli import app
+from synth.job import identity, writer
+from synth.job.reader import parse_job
+from synth.publish import openings
+from synth.publish.openings import Opening
+from synth.sequence import scenario, scene
+
+pytestmark = pytest.mark.slow
+
+RADIUS = 8.0
+
+
+@pytest.fixture(scope="module")
+def egg(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return written(tmp_path_factory.mktemp("place") / "egg.stl", soup())
+
+
+@pytest.fixture(scope="module")
+def found(egg: Path) -> list[Opening]:
+    return openings.find_openings(egg, RADIUS, 3)
+
+
+def test_an_eggs_openings_look_straight_out_of_it(found: list[Opening]) -> None:
+    assert len(found) == 3
+    for one in found:
+        on = (one.point / [32.0, 26.0, 22.0]) @ (one.point / [32.0, 26.0, 22.0])
+        assert on == pytest.approx(1.0, abs=0.06), "it is on the surface"
+        normal = one.point / np.square([32.0, 26.0, 22.0])
+        assert one.direction @ normal / np.linalg.norm(normal) > np.cos(np.radians(6))
+        assert one.relief_mm < 0.4
+    for k, one in enumerate(found):
+        for other in found[:k]:
+            assert np.linalg.norm(one.point - other.point) >= 1.5 * RADIUS
+
+
+def test_the_command_draws_the_places_and_prints_a_job_that_works(egg: Path, tmp_path: Path) -> None:
+    words = ["preview", str(egg), "--radius", f"{RADIUS:g}", "--count", "2", "-o", str(tmp_path / "a.png")]
+    done = CliRunner().invoke(app, words)
+    assert done.exit_code == 0, done.output
+    assert (tmp_path / "a.png").stat().st_size > 10_000
+    (tmp_path / "job.yaml").write_text(done.stdout)
+    job = synth.load_job(str(tmp_path / "job.yaml"), ["anatomy.vertices=2500", "fem.tets=400"])
+    assert job.anatomy.mesh == egg
+    scene.build(job, scenario.draw(job, 0))
+    (tmp_path / "job.yaml").write_text(done.stdout.replace("    # ", "    "))
+    both = synth.load_job(str(tmp_path / "job.yaml")).anatomy.craniotomy
+    assert len(both.also) == 1
+    assert both.also[0].point != both.point
+
+
+def test_sequences_take_the_openings_of_a_brain_in_turn(egg: Path, found: list[Opening]) -> None:
+    first, *others = (one.craniotomy(RADIUS).model_dump() for one in found)
+    also = [{name: one[name] for name in ("point", "direction")} for one in others]
+    anatomy = {"mesh": egg, "vertices": 2500, "craniotomy": first | {"also": also}}
+    job = synth.Job.model_validate({"sequences": 6, "frames": 2, "anatomy": anatomy})
+    cases = [scenario.draw(job, index) for index in range(6)]
+    for index, case in enumerate(cases):
+        origin = scene.cortex(job, case)[1].origin  # type: ignore[union-attr]
+        assert np.linalg.norm(origin - found[index % 3].point) < 1.0
+    named = [identity.identify_opening(job, case.anatomy) for case in cases]
+    assert named[:3] == named[3:]
+    assert len(set(named)) == 3
+    assert parse_job(writer.commented(job), "job", Path()) == job
