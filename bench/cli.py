@@ -71,7 +71,7 @@ def score(
     """Force from a recording's video, scored against its sensor: score.json and report.html."""
     from bench.scoring import commands
     from bench.scoring.evaluate_recording import Settings
-    from learn.inference.mask_files import read_choice
+    from synth.video.mask_files import read_choice
 
     others = {name: Path(folder) for name, folder in _pairs("--also", also, "NAME=FOLDER").items()}
     kind, files = read_choice(masks)
@@ -144,8 +144,8 @@ def import_(
 ) -> None:
     """Turns another system's recording into a recording folder."""
     from bench.importers import registry
-    from learn.inference.scale import read_scale
     from synth.system.terminal import counting
+    from synth.video.pixel_scale import read_scale
 
     found = registry.read_source(source, _pairs("--use", use, "ROLE=NAME"))
     about: dict[str, object] = {"young_kpa": young if young is not None else "unknown"}
@@ -297,12 +297,12 @@ def live(
     from bench.methods.network import Model
     from bench.tracking import flow_process
     from bench.tracking import live as stream
-    from learn.inference.mask_files import read_choice
-    from learn.inference.scale import UNKNOWN_NOTE, read_scale
     from learn.inference.shipped import choose_model
-    from learn.inference.video import FPS, read_video
-    from learn.inference.video_flow import Footage
     from learn.training.threads import set_threads
+    from synth.recording_flow.video_flow import Footage
+    from synth.video.mask_files import read_choice
+    from synth.video.pixel_scale import UNKNOWN_NOTE, read_scale
+    from synth.video.read import FPS, read_video
 
     kind, files = read_choice(masks)
     # Without a scale there is no force: flow alone is what is asked for.

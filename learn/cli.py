@@ -413,13 +413,13 @@ def predict_command(
 ) -> None:
     """Write the force maps and force curves that a model sees in stores, videos or arrays of flow."""
     from learn.inference.apply import Filmed, apply, has_second_eye, motions
-    from learn.inference.mask_files import read_choice
     from learn.inference.predict import load_predictor
     from learn.inference.prediction_file import write_overlay, write_prediction
-    from learn.inference.scale import read_scale
     from learn.inference.shipped import NONE, choose_model, shipped
-    from learn.inference.video_flow import Settings
     from learn.training.threads import set_threads
+    from synth.recording_flow.video_flow import Settings
+    from synth.video.mask_files import read_choice
+    from synth.video.pixel_scale import read_scale
 
     set_threads(threads)
     if source is None:

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from bench.importers.registry import Floats, Intake
 from bench.recording import csv_table
 from bench.recording.folder import natural_order
-from learn.inference import video
 from synth.errors import UserError
+from synth.video import read as video
 
 STILLS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
 _SECONDS = ("t_s", "time", "timestamp", "t", "time_s", "%time", "__time")

@@ -12,9 +12,9 @@ from bench.recording import clocks, pixel_scale
 from bench.recording.folder import Recording, open_recording
 from bench.recording.meta import LEAST_INTERVALS, LEAST_TURNING
 from bench.recording.second_eye import LATE, SecondEye
-from learn.inference.quality import find_fault
-from learn.inference.video_flow import Account, Footage, Settings, VideoFlow
 from synth.errors import UserError
+from synth.recording_flow.quality import find_fault
+from synth.recording_flow.video_flow import Account, Footage, Settings, VideoFlow
 
 _WIDEST_MM, _NARROWEST_MM = 300.0, 3.0
 _SOFTEST_KPA, _STIFFEST_KPA = 0.05, 100.0

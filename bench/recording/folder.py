@@ -24,11 +24,11 @@ from numpy.typing import NDArray
 
 from bench.recording import csv_table, meta
 from bench.recording.meta import Meta, Span
-from learn.inference import video
-from learn.inference.mask_files import MaskFiles
-from learn.inference.scale import UNKNOWN_NOTE
-from learn.inference.video import Picture
 from synth.errors import UserError
+from synth.video import read as video
+from synth.video.mask_files import MaskFiles
+from synth.video.pixel_scale import UNKNOWN_NOTE
+from synth.video.read import Picture
 
 _LARGEST_FORCE_N = 50.0
 _EPOCH_S = 1e8  # three years: no recording is as long, so such a time counts from 1970

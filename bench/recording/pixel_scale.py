@@ -14,9 +14,9 @@ import numpy as np
 
 from bench.recording.folder import open_recording
 from bench.recording.meta import Calibration, Meta
-from learn.inference import video
-from learn.inference.scale import TAKEN_MM, take_scale
 from synth.errors import UserError
+from synth.video import read as video
+from synth.video.pixel_scale import TAKEN_MM, take_scale
 
 _UNKNOWN = 0.99  # relative: nothing is known
 _STATED = 0.02  # what a stated scale is trusted to without more

@@ -10,16 +10,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.recording.folder import Recording
-from learn.inference.pulse import Pulse, Search
-from learn.inference.video import Picture
-from learn.inference.video_flow import Step, VideoFlow, shrink_picture
 from synth.errors import UserError
 from synth.flow import mask
 from synth.flow.stereo import calibration
 from synth.flow.stereo.depth_camera import DepthTracker
 from synth.flow.stereo.rig import Eye, Floats, Rig
 from synth.flow.stereo.track import Moved, StereoTracker
+from synth.recording_flow.pulse import Pulse, Search
+from synth.recording_flow.video_flow import Step, VideoFlow, shrink_picture
 from synth.system import checked_file
+from synth.video.read import Picture
 
 Flags = NDArray[np.bool_]
 _LARGEST_BYTES = 1 << 30  # of an array of points

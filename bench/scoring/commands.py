@@ -20,14 +20,14 @@ from bench.scoring import evaluate_recording, report
 from bench.scoring.evaluate_recording import Result, Settings
 from bench.tracking import flow_process
 from bench.tracking.tracking import Progress
-from learn.inference.mask_files import MaskFiles
 from learn.inference.predict import Predictor
 from learn.inference.shipped import NONE, choose_model, find_model, shipped
-from learn.inference.video_flow import FlowHere
 from synth.dataset.store import Dataset, Sequence
 from synth.errors import UserError
+from synth.recording_flow.video_flow import FlowHere
 from synth.system import checked_file
 from synth.system.terminal import counting
+from synth.video.mask_files import MaskFiles
 
 MAIN = "D2FNet"
 """Name under which the given model stands in every table."""

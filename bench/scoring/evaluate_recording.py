@@ -27,10 +27,10 @@ from bench.sensor.clock_sync import Offset
 from bench.sensor.rotation import Turn, find_turn
 from bench.tracking.tracking import Progress, Tracked, track_recording
 from learn.inference.force_reader import describe_unseen
-from learn.inference.video_flow import FlowHere
-from learn.inference.video_flow import Settings as Settings
 from learn.uncertainty.intervals import LEVEL
 from synth.dataset.folder import write_whole
+from synth.recording_flow.video_flow import FlowHere
+from synth.recording_flow.video_flow import Settings as Settings
 from synth.system import packages
 
 Curve = NDArray[np.float64]

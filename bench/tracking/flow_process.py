@@ -18,9 +18,9 @@ from dataclasses import replace
 from multiprocessing import get_context, parent_process
 from typing import TypeVar
 
-from learn.inference.video_flow import Asked, Flags, FlowHere, Found, Rgb
 from synth.errors import UserError
 from synth.flow.mask_choice import Proposal
+from synth.recording_flow.video_flow import Asked, Flags, FlowHere, Found, Rgb
 
 T = TypeVar("T")
 

@@ -16,12 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.methods.protocol import Method, Scene
-from learn.inference.scale import StatedScale, take_scale
-from learn.inference.video_flow import Asked, Flags, FlowHere, Footage, Rgb, Settings, Step, VideoFlow
 from synth.errors import UserError
 from synth.flow.mask_choice import Proposal
+from synth.recording_flow.video_flow import Asked, Flags, FlowHere, Footage, Rgb, Settings, Step, VideoFlow
 from synth.system.checked_file import write_whole
 from synth.system.packages import machine
+from synth.video.pixel_scale import StatedScale, take_scale
 
 
 @dataclass(frozen=True)

@@ -15,10 +15,10 @@ from bench.methods.protocol import InSpace, Method, Scene
 from bench.recording.folder import Recording
 from bench.recording.meta import Span
 from bench.recording.second_eye import OwnMotion, SecondEye, Sight
-from learn.inference.pulse import Surface, carried_over
-from learn.inference.video_flow import Account, FlowHere, Footage, Settings, Step, VideoFlow
 from synth.errors import UserError
 from synth.flow.stereo.track import Moved
+from synth.recording_flow.pulse import Surface, carried_over
+from synth.recording_flow.video_flow import Account, FlowHere, Footage, Settings, Step, VideoFlow
 from synth.system.stopwatch import Stopwatch
 
 A = TypeVar("A", bound=np.generic)

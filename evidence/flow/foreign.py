@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 from evidence import report
 from evidence.flow.foreign_scenes import Recipe, Shown, film, recipes
 from evidence.flow.measure import epe
-from learn.inference.video import Picture
-from learn.inference.video_flow import Footage, Settings, VideoFlow
+from synth.recording_flow.video_flow import Footage, Settings, VideoFlow
+from synth.video.read import Picture
 
 _MASKS = ("auto", "both", "none")  # chosen, all that are found, none
 _SPOILT = ("black", "covered", "defocus", "jump")  # mishaps whose frames count for the flag alone

@@ -14,20 +14,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from learn.data.clips import FIELDS, has_depth
-from learn.inference import video
 from learn.inference.force_reader import ForceReader
-from learn.inference.mask_files import MaskFiles
 from learn.inference.predict import Predictor, View
-from learn.inference.pulse import Pulse, Search
-from learn.inference.scale import UNKNOWN_NOTE, StatedScale, take_scale
 from learn.inference.stiffness import stiffness
-from learn.inference.video_flow import Footage, Settings, VideoFlow, everywhere
 from learn.uncertainty.conformal import LEVELS
 from learn.uncertainty.intervals import Band
 from synth.dataset.store import Dataset, Sequence, open_sequence
 from synth.errors import UserError
 from synth.flow.stereo.track import Moved
+from synth.recording_flow.pulse import Pulse, Search
+from synth.recording_flow.video_flow import Footage, Settings, VideoFlow, everywhere
 from synth.system import checked_file
+from synth.video import read as video
+from synth.video.mask_files import MaskFiles
+from synth.video.pixel_scale import UNKNOWN_NOTE, StatedScale, take_scale
 
 
 class Step(NamedTuple):

@@ -12,12 +12,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from learn.inference import video
 from learn.inference.predict import length
 from synth.dataset.store import Sequence, open_sequence
 from synth.publish import film, picture
 from synth.system import checked_file
 from synth.system.checked_file import write_whole
+from synth.video import read as video
+from synth.video.write import encode_video
 
 Rgb = NDArray[np.uint8]
 
@@ -108,7 +109,7 @@ def write_overlay(found: dict[str, Any], source: Path, stem: Path) -> Path | Non
     times = found.get("time_s", np.arange(len(found["frame"])) / video.FPS)
     step = float(np.median(np.diff(times))) if len(times) > 1 else 0.0
     fps = float(np.clip(1 / step, 1, 120)) if step > 0 else video.FPS
-    return film.encode_video(stem.with_name(f"{stem.name}.force.mp4"), _drawn(found, times, pictures), fps)
+    return encode_video(stem.with_name(f"{stem.name}.force.mp4"), _drawn(found, times, pictures), fps)
 
 
 def _number(value: float) -> str:

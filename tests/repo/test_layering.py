@@ -17,6 +17,8 @@ ORDER = (
     "synth.flow",
     "synth.flow.stereo",
     "synth.job",
+    "synth.video",
+    "synth.recording_flow",
     "synth.geometry",
     "synth.fem.mesh",
     "synth.fem",

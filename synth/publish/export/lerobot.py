@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from synth.dataset.index import group_by_side, row_of
 from synth.dataset.store import Dataset, Sequence
 from synth.publish.export.encoding import PICTURES
-from synth.publish.film import encode_video
+from synth.video.write import encode_video
 
 _VERSION = "v3.0"
 _FILES = 1000  # in a folder

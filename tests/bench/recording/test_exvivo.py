@@ -10,7 +10,7 @@ import pytest
 from bench.recording import exvivo
 from bench.recording.folder import open_recording
 from bench.tracking.tracking import track_recording
-from learn.inference.video_flow import Settings
+from synth.recording_flow.video_flow import Settings
 
 
 @pytest.mark.slow

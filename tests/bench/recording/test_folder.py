@@ -12,7 +12,7 @@ from fake_recording import Maker, texture
 
 from bench.recording import csv_table, writer
 from bench.recording.folder import open_recording
-from learn.inference import video
+from synth.video import read as video
 
 
 def test_variable_frame_rate_keeps_its_times(tmp_path: Path) -> None:

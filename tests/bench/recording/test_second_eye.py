@@ -16,9 +16,9 @@ from bench.methods.protocol import Answer, Scene
 from bench.recording import writer
 from bench.recording.folder import open_recording
 from bench.tracking.tracking import track_recording
-from learn.inference.video_flow import Settings
 from synth.flow.stereo.calibration import read_rig
 from synth.flow.stereo.track import Moved
+from synth.recording_flow.video_flow import Settings
 from synth.render.camera.camera import Camera
 
 SIZE = (160, 120)

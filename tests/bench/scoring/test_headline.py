@@ -15,7 +15,7 @@ from bench.methods.protocol import Answer, Method, Scene
 from bench.scoring import charts, evaluate_recording
 from bench.scoring.evaluate_recording import Result
 from bench.scoring.headline import headline
-from learn.inference.video_flow import Flags, FlowHere, Found, Rgb
+from synth.recording_flow.video_flow import Flags, FlowHere, Found, Rgb
 
 SIZE = (96, 128)
 

@@ -9,9 +9,9 @@ import pytest
 
 from bench.tracking import live
 from bench.tracking.flow_process import FlowProcess
-from learn.inference.video import Picture
-from learn.inference.video_flow import Asked, Flags, FlowHere, Footage, Rgb, Settings, VideoFlow
 from synth.flow.mask_choice import Proposal
+from synth.recording_flow.video_flow import Asked, Flags, FlowHere, Footage, Rgb, Settings, VideoFlow
+from synth.video.read import Picture
 
 
 def film(frames: int) -> list[Picture]:

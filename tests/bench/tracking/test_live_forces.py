@@ -17,8 +17,8 @@ from bench.recording.writer import write_video
 from bench.tracking import live
 from bench.tracking.tracking import track_recording
 from evidence.flow.scenes import Recipe, Stage
-from learn.inference.video import read_video
-from learn.inference.video_flow import Footage, Settings
+from synth.recording_flow.video_flow import Footage, Settings
+from synth.video.read import read_video
 
 
 @pytest.mark.slow

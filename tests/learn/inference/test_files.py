@@ -21,14 +21,14 @@ from learn.data.clips import Clip
 from learn.data.grid import Grid
 from learn.inference.export import examples, export
 from learn.inference.predict import load_predictor
-from learn.inference.scale import UNKNOWN_NOTE
 from learn.inference.stiffness import stiffness
-from learn.inference.video import read_video
-from learn.inference.video_flow import Footage, Settings, VideoFlow
 from learn.settings import override, preset
 from learn.training.batches import measure_scales
 from synth.dataset.store import Dataset
 from synth.errors import UserError
+from synth.recording_flow.video_flow import Footage, Settings, VideoFlow
+from synth.video.pixel_scale import UNKNOWN_NOTE
+from synth.video.read import read_video
 
 run = CliRunner().invoke
 

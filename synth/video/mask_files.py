@@ -10,9 +10,17 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from learn.inference.video import read_mask
-from learn.inference.video_flow import MASKS
 from synth.errors import UserError
+from synth.video.read import read_mask
+
+MASKS = {
+    "auto": "what is found and proves useful",
+    "glare": "all highlights that are found",
+    "tool": "all that is taken for a tool",
+    "both": "both, whatever they do",
+    "none": "nothing",
+}
+"""What is masked; a tool whose outline is given is masked in any case but `glare` and `none`."""
 
 
 @dataclass(frozen=True)

@@ -16,14 +16,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from learn.inference.pulse import Pulse, Search, Span, Surface, carried_over, find_pulse
-from learn.inference.quality import find_fault
-from learn.inference.video import Picture
 from synth.errors import UserError
 from synth.flow import mask
 from synth.flow.mask_choice import ChoosingTracker, Proposal
 from synth.flow.track import Tracker
+from synth.recording_flow.pulse import Pulse, Search, Span, Surface, carried_over, find_pulse
+from synth.recording_flow.quality import find_fault
 from synth.system.stopwatch import Stopwatch
+from synth.video.mask_files import MASKS
+from synth.video.read import Picture
 
 Rgb = NDArray[np.uint8]
 Flags = NDArray[np.bool_]
@@ -36,15 +37,6 @@ WIDTH_KEPT = 320
 
 _MUCH = 0.2
 """Share of the tissue masked, or of the frames lost, that is worth a look."""
-
-MASKS = {
-    "auto": "what is found and proves useful",
-    "glare": "all highlights that are found",
-    "tool": "all that is taken for a tool",
-    "both": "both, whatever they do",
-    "none": "nothing",
-}
-"""What is masked; a tool whose outline is given is masked in any case but `glare` and `none`."""
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from learn.inference.pulse import Pulse, Surface, find_pulse
+from synth.recording_flow.pulse import Pulse, Surface, find_pulse
 
 SIZE = (120, 160)
 MM_PER_PX = 0.16

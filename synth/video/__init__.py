@@ -1,0 +1,1 @@
+"""Films of others: read, written, their masks and scale."""
