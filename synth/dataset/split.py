@@ -5,11 +5,13 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+from collections import Counter
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Literal, cast, get_args
+from typing import Any, Literal, TypeVar, cast, get_args
 
+import numpy as np
 from pydantic import FiniteFloat, TypeAdapter, ValidationError
 
 from synth.dataset.folder import write_whole
@@ -23,6 +25,7 @@ the anatomy; `stiffness` splits at quantiles of Young's modulus."""
 
 SIDES = ("train", "validation", "test")
 _CLASSES = 10
+Group = TypeVar("Group", int, str)
 NAME = "split.json"
 
 
@@ -85,38 +88,60 @@ def assign_sides(rows: Sequence[Mapping[str, Any]], chosen: Rule) -> list[str | 
     Raises:
         UserError: a family that is not there, shares that do not sum to 1, or fewer groups than sides.
     """
-    by, shares, held_out, share_anatomy = chosen.by, chosen.shares, chosen.held_out, chosen.share_anatomy
+    by, shares = chosen.by, chosen.shares
     if len(shares) != 3 or abs(sum(shares) - 1) > 1e-6 or min(shares) < 0:
         raise UserError(f"shares {shares}: must not be negative and must sum to 1")
     done = [row for row in rows if row["status"] == "done"]
-    strangers = set(held_out) - {str(row["family"]) for row in done}
-    if strangers:
-        raise UserError(f"family {', '.join(sorted(strangers))}: no sequence has it")
+    unknown = set(chosen.held_out) - {str(row["family"]) for row in done}
+    if unknown:
+        raise UserError(f"family {', '.join(sorted(unknown))}: no sequence has it")
     if by == "stiffness" and any(row["young_kpa"] is None for row in done):
         raise UserError("by stiffness: a sequence says nothing of its Young's modulus")
-    group = _groups(done, by, chosen.share_anatomy)
-    sealed = {group[row["index"]] for row in done if row["family"] in held_out}
-    sizes: dict[str, int] = {}
-    for row in done:
-        name = group[row["index"]]
-        sizes[name] = sizes.get(name, 0) + 1
-    side = dict.fromkeys(sealed, "test")
-    wanted = [share * len(done) for share in shares]
-    wanted[2] -= sum(sizes[name] for name in sealed)
-    free = sorted(sizes.keys() - sealed, key=lambda name: (-sizes[name], _shuffled(name)))
-    sides = [k for k in range(3) if shares[k] > 0]
-    if len(free) + bool(sealed) < len(sides):
+    groups = _groups(done, chosen)
+    held_out = {group for group, row in zip(groups, done, strict=True) if row["family"] in chosen.held_out}
+    needing = [side for side, share in zip(SIDES, shares, strict=True) if share > 0]
+    names = set(groups)
+    if len(names - held_out) + bool(held_out) < len(needing):
         hint = "; --share-anatomy splits within a brain, for a model of that brain alone"
-        if share_anatomy:
+        if chosen.share_anatomy:
             hint = "; craniotomy.also in the job lists further openings" if by == "opening" else ""
-        needing = ", ".join(SIDES[k] for k in sides)
-        raise UserError(f"{len(sizes)} groups by {by}: too few for {needing} to have one each{hint}")
-    for name in free:
-        # The side that lacks most, in proportion, gets the next group.
-        best = max(sides, key=lambda k: (wanted[k] / max(shares[k], 1e-9), -k))
-        side[name] = SIDES[best]
-        wanted[best] -= sizes[name]
-    return [side[group[row["index"]]] if row["status"] == "done" else None for row in rows]
+        few = f"{len(names)} groups by {by}: too few"
+        raise UserError(f"{few} for {', '.join(needing)} to have one each{hint}")
+    order = sorted(names, key=lambda name: hashlib.blake2b(name.encode(), digest_size=8).hexdigest())
+    part = draw_groups(groups, shares, order, fixed=dict.fromkeys(held_out, 2))
+    side = {row["index"]: SIDES[k] for row, k in zip(done, part, strict=True)}
+    return [side.get(row["index"]) for row in rows]
+
+
+def draw_groups(
+    groups: Sequence[Group],
+    shares: Sequence[float],
+    order: int | Sequence[Group],
+    fixed: Mapping[Group, int] | None = None,
+) -> list[int]:
+    """The part (0, 1, ...) of each member; no group is in two parts. Larger groups are dealt first.
+
+    Args:
+        groups: (N,) the group of each member.
+        shares: of each part, in any unit; a part of share 0 gets nothing.
+        order: of groups of one size: a seed, or the groups themselves.
+        fixed: parts of groups that aren't drawn.
+    """
+    size = Counter(groups)
+    if isinstance(order, int):
+        names = sorted(size)
+        order = [names[k] for k in np.random.default_rng(order).permutation(len(names))]
+    part = dict(fixed or {})
+    lacking = [
+        share * len(groups) - sum(size[group] for group in part if part[group] == k)
+        for k, share in enumerate(shares)
+    ]
+    open_parts = [k for k, share in enumerate(shares) if share > 0]
+    for group in sorted((one for one in order if one not in part), key=lambda one: -size[one]):
+        # The part that lacks most, in proportion, gets the next group.
+        part[group] = max(open_parts, key=lambda k: (lacking[k] / max(shares[k], 1e-9), -k))
+        lacking[part[group]] -= size[group]
+    return [part[group] for group in groups]
 
 
 def leaks(rows: Sequence[Mapping[str, Any]], chosen: Rule | None = None) -> list[str]:
@@ -189,31 +214,24 @@ def name_anatomy(attrs: Mapping[str, Any]) -> str:
     return str(attrs["content_hash"]) if seed is None else f"seed-{seed}"
 
 
-def _groups(rows: Sequence[Mapping[str, Any]], by: By, share_anatomy: bool) -> dict[int, str]:
-    """A group's name for every index; groups that share an anatomy are one unless the rule allows it."""
-    if by == "stiffness":
+def _groups(rows: Sequence[Mapping[str, Any]], chosen: Rule) -> list[str]:
+    """A group's name for every row; groups that share an anatomy are one unless the rule allows it."""
+    if chosen.by == "stiffness":
         ordered = sorted(float(row["young_kpa"]) for row in rows)
         edges = [ordered[k * len(ordered) // _CLASSES] for k in range(1, _CLASSES)]
-        named = {row["index"]: f"E{sum(row['young_kpa'] >= edge for edge in edges)}" for row in rows}
-    elif by == "sequence":
-        named = {row["index"]: str(row["content_hash"]) for row in rows}
-    elif by == "opening":
-        named = {row["index"]: _name_opening(row) for row in rows}
+        names = [f"E{sum(row['young_kpa'] >= edge for edge in edges)}" for row in rows]
+    elif chosen.by == "opening":
+        names = [_name_opening(row) for row in rows]
     else:
-        named = {row["index"]: str(row[by]) for row in rows}
-    if share_anatomy:
-        return named
-    names, least = list(named.values()), dict[int, str]()
-    number = join_groups(names, [row["anatomy"] for row in rows])
-    for group, name in zip(number, names, strict=True):
-        least[group] = min(name, least.get(group, name))
-    return {key: least[group] for key, group in zip(named, number, strict=True)}
+        names = [str(row["content_hash" if chosen.by == "sequence" else chosen.by]) for row in rows]
+    if chosen.share_anatomy:
+        return names
+    joined, first = join_groups(names, [row["anatomy"] for row in rows]), dict[int, str]()
+    for group, name in zip(joined, names, strict=True):
+        first[group] = min(name, first.get(group, name))
+    return [first[group] for group in joined]
 
 
 def _name_opening(row: Mapping[str, Any]) -> str:
     """A procedural brain, which is opened at one place, and stores that don't say where: the anatomy."""
     return str(row.get("opening") or row["anatomy"])
-
-
-def _shuffled(name: str) -> str:
-    return hashlib.blake2b(name.encode(), digest_size=8).hexdigest()
