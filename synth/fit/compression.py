@@ -11,7 +11,7 @@ from PIL import Image, JpegImagePlugin
 
 from synth.fit.statistics import Picture
 from synth.job.schema import Sensor
-from synth.video import link
+from synth.render.camera import video_link
 
 _UNSEEN_DB = 46.0  # a loss below this is less than rounding to 8 bits of a noisy picture
 _BITRATES = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0)  # Mbit/s of a 640 x 480 video
@@ -67,7 +67,7 @@ class Compression:
         left = []
         for rate in _BITRATES:
             sensor = Sensor.model_validate({"bitrate_mbps": rate * share, "chroma": self.chroma})
-            left.append(_ratio_db(film, link.recorded(film, sensor, 25.0)))
+            left.append(_ratio_db(film, video_link.recorded(film, sensor, 25.0)))
         rate = float(np.exp(np.interp(lost, np.maximum.accumulate(left), np.log(_BITRATES))))
         return float(f"{rate:.3g}")
 

@@ -24,6 +24,8 @@ QUANTITIES = {
     "load": ("Load F/(E a²)", "1"),
 }
 """Columns of the index that card and page draw: title and unit."""
+_FEWEST_DRAWN = 5
+"""Of less a histogram says nothing that the table of ranges doesn't, and drawing takes a second."""
 
 
 def write_card(folder: Folder) -> Path:
@@ -75,7 +77,7 @@ def facts(folder: Folder) -> dict[str, Any]:
         "gestures": share(done, "gesture"),
         "splits": share(done, "split"),
         "cpu_h": column(done, "cpu_s").sum() / 3600,
-        "charts": {name: svg.histogram(*one) for name, one in drawn.items() if len(one[0])},
+        "charts": {name: svg.histogram(*one) for name, one in drawn.items() if len(one[0]) >= _FEWEST_DRAWN},
         "quantities": QUANTITIES,
         "identity": folder.described()["identity"],
         "dataset_hash": index.dataset_hash(rows),

@@ -18,12 +18,12 @@ from synth.flow.stereo import track as stereo
 from synth.flow.track import Track
 from synth.job import identity, law_plugins
 from synth.job.schema import Job
+from synth.render.camera import video_link
 from synth.sequence import scenario
 from synth.sequence.published_labels import Published
 from synth.sequence.scenario import Scenario
 from synth.sequence.scene import Scene, build, cortex, estimator, move, simulate
 from synth.system.stopwatch import Report, Stopwatch
-from synth.video import link
 
 __all__ = ["build", "cortex", "estimator", "move", "render_sequence"]
 
@@ -147,10 +147,10 @@ def _write_video(shooting: _Shooting, film: _Film) -> _Film:
     with shooting.watch.stage("store"):
         writer.put("camera", film.poses)
         if _coded(job):
-            rgb = link.recorded(rgb, job.sensor, job.fps)
+            rgb = video_link.recorded(rgb, job.sensor, job.fps)
             writer.put("rgb", rgb)
             if rgb_right is not None:
-                rgb_right = link.recorded(rgb_right, job.sensor, job.fps)
+                rgb_right = video_link.recorded(rgb_right, job.sensor, job.fps)
                 writer.put("rgb_right", rgb_right)
     return replace(film, rgb=rgb, rgb_right=rgb_right)
 

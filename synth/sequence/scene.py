@@ -23,14 +23,13 @@ from synth.geometry.brain_surface import Brain
 from synth.job.schema import Anatomy, Flow, Job
 from synth.render.anatomy import surface as anatomy
 from synth.render.anatomy.surface import Relief, Surface
-from synth.render.camera import camera
+from synth.render.camera import camera, video_link
 from synth.render.camera.camera import Camera
 from synth.render.scene import Shot, Studio
 from synth.sequence import scenario
 from synth.sequence.scenario import Scenario
 from synth.sequence.timeline import Timeline
 from synth.system.stopwatch import Report, Stopwatch
-from synth.video import link
 
 Floats = NDArray[np.float64]
 
@@ -167,7 +166,7 @@ class Scene:
         found = estimator(self.job.flow) if backend is None else chosen
         rgb, tools = np.stack([one.rgb for one in frames]), np.stack([one.tool for one in frames])
         if self.job.sensor.bitrate_mbps is not None:
-            rgb = link.recorded(rgb, self.job.sensor, self.job.fps)
+            rgb = video_link.recorded(rgb, self.job.sensor, self.job.fps)
         return track.recover_flow(rgb, tools, self.tissue, found)
 
 

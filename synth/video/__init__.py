@@ -1,1 +1,1 @@
-"""Films of others: read, written, their masks and scale."""
+"""Films of others: read, written: pictures in and out, their masks and scale."""

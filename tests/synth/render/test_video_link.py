@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from synth.job.schema import Sensor as Section
-from synth.video import link
+from synth.render.camera import video_link
 
 
 @pytest.mark.parametrize("chroma", ["4:2:0", "4:4:4"])
@@ -17,9 +17,9 @@ def test_the_codec_loses_more_at_a_lower_bitrate_and_always_the_same(chroma: str
     errors = []
     for rate in (0.02, 5.0):
         section = Section.model_validate({"bitrate_mbps": rate, "chroma": chroma})
-        back = link.recorded(film, section, 25.0)
+        back = video_link.recorded(film, section, 25.0)
         assert back.shape == film.shape
-        assert (back == link.recorded(film, section, 25.0)).all()
+        assert (back == video_link.recorded(film, section, 25.0)).all()
         errors.append(np.abs(back.astype(int) - film).mean())
     assert errors[1] < 4
     assert errors[0] > 2 * errors[1]
@@ -28,5 +28,5 @@ def test_the_codec_loses_more_at_a_lower_bitrate_and_always_the_same(chroma: str
 def test_odd_sizes_and_no_codec() -> None:
     film = np.full((3, 33, 35, 3), 90, np.uint8)
     section = Section.model_validate({"bitrate_mbps": 1.0, "chroma": "4:2:0"})
-    assert np.abs(link.recorded(film, section, 25.0).astype(int) - 90).max() <= 4
-    assert link.recorded(film, Section(), 25.0) is film
+    assert np.abs(video_link.recorded(film, section, 25.0).astype(int) - 90).max() <= 4
+    assert video_link.recorded(film, Section(), 25.0) is film
