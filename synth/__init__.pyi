@@ -7,8 +7,8 @@ from synth.errors import UserError as UserError
 from synth.flow.estimator import Estimator as Estimator
 from synth.flow.track import Track as Track
 from synth.flow.track import recover_flow as recover_flow
-from synth.job.law_plugins import Law as Law
-from synth.job.law_plugins import add_law as add_law
+from synth.job.laws import Law as Law
+from synth.job.laws import add_law as add_law
 from synth.job.reader import load_job as load_job
 from synth.job.schema import Job as Job
 from synth.sequence.scene import Frame as Frame

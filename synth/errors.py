@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import difflib
+from collections.abc import Iterable
+
 
 class UserError(Exception):
     """Something in the job, the input or the machine that the user can put right.
@@ -17,3 +20,9 @@ class NotFinite(UserError):
 
 class Caution(UserWarning):
     """Something that the user should know, though nothing is refused; command lines print it to stderr."""
+
+
+def did_you_mean(word: str, known: Iterable[str]) -> str:
+    """`; did you mean 'x'?`, or nothing where no known word is near."""
+    close = difflib.get_close_matches(word[:80], list(known), 1)
+    return f"; did you mean '{close[0]}'?" if close else ""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from functools import partial
-from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
 import numpy as np
@@ -11,16 +10,17 @@ from numpy.typing import NDArray
 
 from bench.methods.protocol import Answer, InSpace, Method, Scene
 from synth.errors import UserError
+from synth.plugins import Registry, as_user_error
 
-GROUP = "sulcus.method"
-"""Entry-point group in which other packages offer methods: name -> a callable without arguments."""
+METHODS = Registry("sulcus.method", "method", "method", {})
+"""Methods of other packages: an entry point is a callable without arguments that gives a `Method`."""
 
 
 class Plugged:
     """A method of another package; what goes wrong in it is one line that names it."""
 
-    def __init__(self, name: str, point: EntryPoint, method: Any) -> None:
-        self._method, self._where = method, f"method {name} ({point.value})"
+    def __init__(self, method: Any, label: str) -> None:
+        self._method, self._label = method, label
         if isinstance(method, InSpace):
             self.in_space = partial(self._asked, method.in_space)
             """See `InSpace`."""
@@ -37,17 +37,14 @@ class Plugged:
         return self._asked(self._method, flow, confidence, scene, picture)
 
     def _asked(self, ask: Any, *told: Any) -> Answer:
-        try:
+        with as_user_error(self._label):
             answer = ask(*told)
             force = np.asarray(answer.force_mn, np.float64)
             density = None if answer.density is None else np.asarray(answer.density, np.float32)
-        except Exception as error:  # whatever a package of others raises
-            said = (str(error).splitlines() or [""])[0][:200]
-            raise UserError(f"{self._where}: {type(error).__name__}: {said}") from error
         if force.shape != (3,):
-            raise UserError(f"{self._where}: gives force of shape {force.shape}, expected (3,)")
+            raise UserError(f"{self._label}: gives force of shape {force.shape}, expected (3,)")
         if density is not None and density.shape != told[0].shape[:2]:
-            raise UserError(f"{self._where}: gives density of shape {density.shape}, not the picture's")
+            raise UserError(f"{self._label}: gives density of shape {density.shape}, not the picture's")
         return Answer(force, density)
 
 
@@ -57,22 +54,16 @@ def installed() -> dict[str, Method]:
     Raises:
         UserError: one does not load, or is no callable.
     """
-    return {point.name: _made(point) for point in sorted(entry_points(group=GROUP))}
+    return {name: _load(name) for name in METHODS.names()}
 
 
 def sources() -> dict[str, str]:
     """Package and version that each plug-in's method comes from."""
-    found = {point.name: point.dist for point in entry_points(group=GROUP)}
-    return {name: f"{dist.name} {dist.version}" if dist else "" for name, dist in sorted(found.items())}
+    return {name: METHODS.source(name) for name in METHODS.names()}
 
 
-def _made(point: EntryPoint) -> Method:
-    try:
-        method = point.load()()
-    except Exception as error:  # whatever a package of others raises
-        said = (str(error).splitlines() or [""])[0][:200]
-        where = f"method {point.name} ({point.value})"
-        raise UserError(f"{where}: cannot be made, {type(error).__name__}: {said}") from error
+def _load(name: str) -> Method:
+    method = METHODS.load(name)
     if not callable(method):
-        raise UserError(f"method {point.name} ({point.value}): is no method, it cannot be called")
-    return Plugged(point.name, point, method)
+        raise UserError(f"{METHODS.label(name)}: is no method, it cannot be called")
+    return Plugged(method, METHODS.label(name))

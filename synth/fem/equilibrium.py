@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from synth.errors import NotFinite, UserError
 from synth.fem.system import State, System
-from synth.job.law_limits import LEAST_JACOBIAN
+from synth.job.laws import LEAST_JACOBIAN
 
 Floats = NDArray[np.float64]
 

@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 
 from synth.errors import UserError
 from synth.fem.laws import lame, least_determinant
-from synth.job import law_plugins
-from synth.job.law_plugins import Law
+from synth.job.laws import Law, load_law
 
 Floats = NDArray[np.float64]
 
@@ -46,7 +45,7 @@ def tangent(name: str, strain: Floats, mu: float, lam: float, out: Floats) -> No
 @cache
 def checked(name: str) -> Law:
     """The law of that name, once it has passed `check_law`."""
-    law = law_plugins.load(name)
+    law = load_law(name)
     check_law(name, law)
     return law
 

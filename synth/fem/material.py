@@ -11,7 +11,7 @@ from synth.fem.membrane import Sheet
 from synth.fem.mesh.tetrahedra import Tets
 from synth.fem.system import System, assemble
 from synth.job import schema
-from synth.job.law_plugins import largest_load
+from synth.job.laws import largest_load
 
 _STRETCH = 1.01, 1.03
 """How far a membrane is stretched at rest. Not from a measurement: its pull then balances a pressure of 3-350

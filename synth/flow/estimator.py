@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from importlib import import_module
-from importlib.metadata import entry_points
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from synth.errors import UserError
+from synth.plugins import ESTIMATORS
 
 Rgb = NDArray[np.uint8]
 """(H, W, 3) uint8, sRGB."""
@@ -19,9 +17,6 @@ Flow = NDArray[np.float32]
 """(H, W, 2) float32, px: x right, y down."""
 Map = NDArray[np.float32]
 """(H, W) float32."""
-
-GROUP = "sulcus.flow"
-"""Entry-point group in which other packages offer estimators: name → a callable without arguments."""
 
 
 class Estimator(Protocol):
@@ -45,32 +40,11 @@ class Estimator(Protocol):
         ...
 
 
-_OWN = {
-    "tvl1": ("synth.flow.tvl1", "Tvl1"),
-    "opencv-tvl1": ("synth.flow.opencv", "OpenCvTvl1"),
-    "dis": ("synth.flow.opencv", "Dis"),
-}
-
-
-def names() -> tuple[str, ...]:
-    """The estimators that can be made here: our own, then the installed plug-ins'."""
-    return (*_OWN, *sorted(point.name for point in entry_points(group=GROUP) if point.name not in _OWN))
-
-
 def create(name: str) -> Estimator:
     """Makes the estimator called `name`: one of ours, or one from the entry-point group `sulcus.flow`.
 
     Raises:
-        UserError: no such estimator.
+        UserError: no such estimator, or a plug-in's package that does not load.
     """
-    maker: Any
-    if name in _OWN:
-        module, attribute = _OWN[name]
-        maker = getattr(import_module(module), attribute)
-    else:
-        found = {point.name: point for point in entry_points(group=GROUP)}
-        if name not in found:
-            raise UserError(f"flow.backend: no estimator {name!r}; there are {', '.join(names())}")
-        maker = found[name].load()
-    estimator: Estimator = maker()
+    estimator: Estimator = ESTIMATORS.load(name)
     return estimator

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,18 +10,16 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, BeforeValidator, Field, FiniteFloat, model_validator
 
 from synth import fields
-from synth.flow.estimator import names
-from synth.job import law_plugins
 from synth.job.instrument import CLEAR_MM, Kind
 from synth.job.instrument import Instrument as Instrument
-from synth.job.law_limits import choose
-from synth.job.law_plugins import largest_load
+from synth.job.laws import LAWS, choose_law, largest_load
 from synth.job.microscope import Light as Light
 from synth.job.microscope import Render as Render
 from synth.job.microscope import Sensor as Sensor
 from synth.job.types import (
     InstrumentRange,
     NonNegativeRange,
+    PlugInName,
     PoissonRange,
     Positive,
     PositiveRange,
@@ -31,6 +28,7 @@ from synth.job.types import (
     ShareRange,
     Vector,
 )
+from synth.plugins import ESTIMATORS
 
 
 class Place(Section):
@@ -182,15 +180,6 @@ class Pulse(Section):
     """Breaths a second."""
 
 
-def _law(name: str) -> str:
-    known = ("auto", *law_plugins.names())
-    if name not in known:
-        close = difflib.get_close_matches(name, known, 1)
-        hint = f"; did you mean '{close[0]}'?" if close else ""
-        raise ValueError(f"there is no law {name!r}; there are {', '.join(known)}{hint}")
-    return name
-
-
 @dataclass(frozen=True)
 class Demand:
     """How hard an instrument may load tissue: the ranges that count for it."""
@@ -204,7 +193,7 @@ class Demand:
 class Fem(Section):
     """The physics of the tissue and of the load."""
 
-    law: Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]+$", max_length=100), AfterValidator(_law)] = "auto"
+    law: Annotated[PlugInName, AfterValidator(lambda name: LAWS.check_name(name, "auto"))] = "auto"
     """Material law: linear, corotational, neo-hookean or an installed plug-in's; auto takes the
     cheapest of ours whose error against neo-Hookean at the largest load is within 5%."""
     tets: Annotated[int, Field(ge=100, le=200_000)] = 1600
@@ -307,7 +296,7 @@ class Fem(Section):
         """The material law of every sequence, and why."""
         if self.law == "auto" and self.membrane.intact > 0:
             return "neo-hookean", "a membrane stretches as it bends, which the linear law leaves out"
-        return choose(self.law, self.largest_load)
+        return choose_law(self.law, self.largest_load)
 
     @property
     def largest_load(self) -> float:
@@ -315,17 +304,10 @@ class Fem(Section):
         return max(self._largest(one) for _, one in self._demands)
 
 
-def _estimator(name: str) -> str:
-    known = ("ideal", *names())
-    if name not in known:
-        raise ValueError(f"there is no estimator {name!r}; there are {', '.join(known)}")
-    return name
-
-
 class Flow(Section):
     """Recovering displacement from the video."""
 
-    backend: Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]+$"), AfterValidator(_estimator)] = "tvl1"
+    backend: Annotated[PlugInName, AfterValidator(lambda name: ESTIMATORS.check_name(name, "ideal"))] = "tvl1"
     """Estimator: tvl1, opencv-tvl1, dis or an installed plug-in's; `ideal` computes no recovered flow."""
     warps: Annotated[int, Field(ge=1, le=12)] = 3
     """tvl1: linearisations a level of a frame that starts from the one before; twice as many from nothing."""

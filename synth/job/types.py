@@ -44,6 +44,7 @@ _Kelvin = Annotated[FiniteFloat, Field(ge=2000, le=12_000)]
 LightKelvin = Annotated[tuple[_Kelvin, _Kelvin], BeforeValidator(_pair), AfterValidator(_ordered)]
 _Poisson = Annotated[FiniteFloat, Field(ge=0, lt=0.5)]
 PoissonRange = Annotated[tuple[_Poisson, _Poisson], BeforeValidator(_pair), AfterValidator(_ordered)]
+PlugInName = Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]+$", max_length=100)]
 Vector = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
 
 

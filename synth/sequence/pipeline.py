@@ -16,7 +16,8 @@ from synth.flow import mask, track
 from synth.flow.stereo import rig
 from synth.flow.stereo import track as stereo
 from synth.flow.track import Track
-from synth.job import identity, law_plugins
+from synth.job import identity
+from synth.job.laws import LAWS
 from synth.job.schema import Job
 from synth.render.camera import video_link
 from synth.sequence import scenario
@@ -257,7 +258,7 @@ def _mechanics(
     job: Job, case: Scenario, motion: Deformation, rotation: NDArray[np.float64]
 ) -> dict[str, Any]:
     timeless = job.fem.time == "quasi-static" and not job.fem.relaxation
-    law_from = law_plugins.source(case.tissue.law)
+    law_from = LAWS.source(case.tissue.law)
     special: dict[str, Any] = {"law_from": law_from} if law_from else {}
     if case.pulse is not None:
         special |= {"pulse_mm": case.pulse.height(motion.time).tolist()}

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from synth.job import reader
-from synth.job.law_limits import CHEAPEST_FIRST, LARGEST_LOAD
+from synth.job.laws import CHEAPEST_FIRST, LARGEST_LOAD
 from synth.job.schema import Job
 
 Setting = str | int | tuple[int, int]

@@ -15,7 +15,7 @@ from synth.fem.mesh import tetrahedra
 from synth.fem.mesh.element import quality
 from synth.fem.system import assemble
 from synth.job import schema
-from synth.job.law_limits import LARGEST_LOAD, LEAST_JACOBIAN
+from synth.job.laws import LARGEST_LOAD, LEAST_JACOBIAN
 from synth.sequence import pipeline, scenario
 
 CONTACT = fem_case.CONTACTS[0]

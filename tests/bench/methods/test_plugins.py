@@ -50,7 +50,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, **named: str) -> None:
-    points = {plugins.GROUP: {name: f"lab_methods:{at}" for name, at in named.items()}}
+    points = {plugins.METHODS.group: {name: f"lab_methods:{at}" for name, at in named.items()}}
     tiny_package.install(tmp_path / "site", "lab_methods", CODE, points, monkeypatch)
 
 

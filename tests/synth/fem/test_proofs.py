@@ -22,7 +22,7 @@ from synth.fem.mesh.refine import refine
 from synth.fem.mesh.tetrahedra import Tets
 from synth.fem.system import System, assemble
 from synth.job import schema
-from synth.job.law_limits import LEAST_JACOBIAN
+from synth.job.laws import LEAST_JACOBIAN
 
 Floats = np.ndarray
 

@@ -12,6 +12,7 @@ from evidence.flow.scenes import Recipe, cortex, pairs
 from synth.errors import UserError
 from synth.flow import estimator, mask, toolnet, track
 from synth.job.schema import Job
+from synth.plugins import ESTIMATORS
 
 
 def _error(flow: np.ndarray, truth: np.ndarray) -> np.ndarray:
@@ -85,7 +86,7 @@ def test_another_packages_estimator_is_found_by_its_entry_point(
     with pytest.raises(UserError):
         estimator.create("my-net")
     monkeypatch.syspath_prepend(str(tmp_path))
-    assert "my-net" in estimator.names()
+    assert "my-net" in ESTIMATORS.names()
     assert Job.model_validate({"flow": {"backend": "my-net"}}).flow.backend == "my-net"
     frames = np.zeros((2, 24, 32, 3), np.uint8)
     found = track.track("my-net", frames, np.zeros((2, 24, 32), bool), np.ones((24, 32), bool))

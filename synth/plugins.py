@@ -1,0 +1,98 @@
+"""Plug-ins: what other packages offer under a name of their own, found by entry points."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any
+
+from synth.errors import UserError, did_you_mean
+
+
+class Registry:
+    """Everything of one kind by name: ours, what `add` was given, and what installed packages offer."""
+
+    def __init__(self, group: str, key: str, noun: str, own: Mapping[str, str]) -> None:
+        """`group`: of entry points; `key` and `noun`: what a job asks for it by, and what it is, in messages.
+
+        `own`: ours by name, `module:attribute` as an entry point has it, empty where nothing is to be loaded.
+        A plug-in doesn't take the name of one of ours.
+        """
+        self.group, self.own = group, own
+        self._key, self._noun = key, noun
+        self._added: dict[str, Any] = {}
+
+    def names(self) -> tuple[str, ...]:
+        """What can be named here: our own, then the others in order."""
+        return (*self.own, *sorted({*self._points(), *self._added} - set(self.own)))
+
+    def check_name(self, name: str, *further: str) -> str:
+        """`name`, if it or one of the `further` ones can be asked for. ValueError else, for a schema."""
+        known = (*further, *self.names())
+        if name not in known:
+            hint = did_you_mean(name, known)
+            raise ValueError(f"there is no {self._noun} {name!r}; there are {', '.join(known)}{hint}")
+        return name
+
+    def add(self, name: str, thing: Any) -> None:
+        """Gives a thing a name in this process. UserError if the name is taken."""
+        if name in self.names():
+            raise UserError(f"{self._key}: the name {name!r} is taken")
+        self._added[name] = thing
+
+    def source(self, name: str) -> str:
+        """Package and version that a plug-in comes from; empty for what no package brings."""
+        point = None if name in self.own else self._points().get(name)
+        return f"{point.dist.name} {point.dist.version}" if point and point.dist else ""
+
+    def label(self, name: str) -> str:
+        """How messages name it: `fem.law my-law (package.module:Law)`."""
+        at = "" if name in self._added else f" ({self._point(name).value})"
+        return f"{self._key} {name}{at}"
+
+    def load(self, name: str) -> Any:
+        """What stands under `name`: the entry point's object, called without arguments if it can be called.
+
+        Raises:
+            UserError: there is nothing of that name, or whatever a package raises in loading it.
+        """
+        if name in self._added:
+            return self._added[name]
+        with as_user_error(self.label(name)):
+            found = self._point(name).load()
+            return found() if callable(found) else found
+
+    def _points(self) -> dict[str, EntryPoint]:
+        return {point.name: point for point in entry_points(group=self.group)}
+
+    def _point(self, name: str) -> EntryPoint:
+        if name in self.own:
+            return EntryPoint(name, self.own[name], self.group)
+        found = self._points().get(name)
+        if found is None:
+            raise UserError(f"{self._key}: no {self._noun} {name!r}; there are {', '.join(self.names())}")
+        return found
+
+
+@contextmanager
+def as_user_error(label: str) -> Iterator[None]:
+    """Makes a UserError of whatever a package of others raises in the block: one line that names it."""
+    try:
+        yield
+    except Exception as error:
+        first = (str(error).splitlines() or [""])[0][:200]
+        raise UserError(f"{label}: {type(error).__name__}: {first}") from error
+
+
+ESTIMATORS = Registry(
+    "sulcus.flow",
+    "flow.backend",
+    "estimator",
+    {
+        "tvl1": "synth.flow.tvl1:Tvl1",
+        "opencv-tvl1": "synth.flow.opencv:OpenCvTvl1",
+        "dis": "synth.flow.opencv:Dis",
+    },
+)
+"""Estimators of flow: an entry point is a callable without arguments that gives a `synth.flow.Estimator`."""
