@@ -19,9 +19,8 @@ import typer
 from pydantic import BaseModel
 
 from bench.recording.meta import Meta
-from synth.dataset import field_sizes
-from synth.dataset.size_forecast import amount
-from synth.fields import TIME
+from synth.dataset.size_forecast import amount, field_bytes
+from synth.fields import FIELDS, KEPT, TIME
 from synth.job import reader, writer
 from synth.job.schema import Job
 
@@ -66,10 +65,11 @@ def fields_page() -> str:
     """docs/fields.md."""
     lines = ["| field | axes | type | unit | kept | in memory | on disk | meaning |"]
     lines.append("| --- | --- | --- | --- | --- | ---: | ---: | --- |")
-    for row in field_sizes.rows():
-        per = "" if TIME in row.axes else " a sequence"
-        sizes = " | ".join(f"{amount(size)}{per}" for size in (row.raw, row.stored))
-        words = (f"`{row.name}`", row.axes, row.dtype, row.unit, row.kept, sizes, row.meaning)
+    for field in FIELDS.values():
+        per = "" if TIME in field.dims else " a sequence"
+        sizes = " | ".join(f"{amount(size)}{per}" for size in field_bytes(field, 1, (480, 640)))
+        about = (", ".join(field.dims), field.dtype, field.unit, KEPT[field.kept])
+        words = (f"`{field.name}`", *about, sizes, field.meaning)
         lines.append(f"| {' | '.join(words)} |")
     return _FIELDS_HEAD + "\n".join(lines) + "\n"
 

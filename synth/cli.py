@@ -58,11 +58,11 @@ def schema(
     ] = False,
 ) -> None:
     """Prints the JSON schema of job files, for editors."""
-    from synth.dataset import field_sizes
+    from synth.dataset.size_forecast import describe_fields
     from synth.job import writer
 
     if fields:
-        print("\n".join(field_sizes.lines()))
+        print("\n".join(describe_fields()))
         return
     print(json_.dumps(writer.schema(), indent=2))
 

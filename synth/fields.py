@@ -27,9 +27,7 @@ class Field:
     meaning: str
     length: int = 0
     kept: Literal["always", "usually", "recovered", "stereo", "stereo recovered", "asked"] = "always"
-    """`usually`: unless the job's `store.without` names it; `recovered`: with an estimator of flow (and as
-    before); `stereo`: with a second lens (and as before); `stereo recovered`: with both;
-    `asked`: when `store.extra` names it."""
+    """When a sequence has it, see `KEPT`."""
     half: bool = False
     """Whether `store.flow: float16` stores it in half the space."""
     packed: float = 0.1
@@ -54,6 +52,16 @@ class Field:
         lengths = {TIME: frames, ROW: size[0], COLUMN: size[1]}
         return tuple(lengths.get(dim, self.length) for dim in self.dims)
 
+
+KEPT = {
+    "always": "always",
+    "usually": "unless in `store.without`",
+    "recovered": "with an estimator of flow",
+    "stereo": "with `render.stereo_mm`",
+    "stereo recovered": "with both of these",
+    "asked": "if in `store.extra`",
+}
+"""What each value of `Field.kept` means."""
 
 _STILL = (ROW, COLUMN)
 _VIDEO = (TIME, ROW, COLUMN)

@@ -1,9 +1,9 @@
-"""What a run will take: time and disk, from the finished sequences or from the field table; and memory."""
+"""What fields, sequences and a run take: disk and time, from finished sequences or the table; memory."""
 
 from __future__ import annotations
 
 import shutil
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,8 +11,9 @@ import numpy as np
 
 from synth.dataset import location
 from synth.errors import UserError
-from synth.fields import FIELDS
+from synth.fields import FIELDS, KEPT, Field
 from synth.job.schema import Job
+from synth.system.text_lines import hang
 
 # An estimate from the field table is this much too high, lest a run be started that cannot end.
 _MARGIN = 1.25
@@ -58,14 +59,37 @@ def pilot(done: Sequence[int]) -> list[int]:
     return [done[int(k)] for k in np.unique(np.linspace(0, len(done) - 1, 10).astype(int))] if done else []
 
 
+def field_bytes(
+    field: Field, frames: int, size: tuple[int, int], *, half: bool = False
+) -> tuple[float, float]:
+    """Bytes of a field in memory, and on disk by the ratio measured on rendered sequences.
+
+    Args:
+        field: of the table.
+        frames: how many.
+        size: (height, width) [px].
+        half: as `store.flow: float16`: stored in half floats if the field may be.
+    """
+    raw = float(np.prod(field.shape(frames, size))) * np.dtype(field.dtype).itemsize
+    return raw, field.packed * (raw / 2 if half and field.half else raw)
+
+
+def describe_fields() -> Iterator[str]:
+    """Every field for a terminal, two lines or more; sizes are of a frame of 640 x 480 px."""
+    for field in FIELDS.values():
+        stored = amount(field_bytes(field, 1, (480, 640))[1])
+        axes = ", ".join(field.dims)
+        yield f"{field.name}: {axes}, {field.dtype}, {field.unit}, {stored} on disk, {KEPT[field.kept]}"
+        yield from hang("    ", field.meaning)
+
+
 def estimate(job: Job) -> float:
-    """Bytes of one sequence of `job`, before any is made."""
+    """Bytes of one sequence of `job` on disk, before any is made."""
     width, height = job.render.size
-    total = 0.0
-    for name in job.kept_fields:
-        field = FIELDS[name]
-        each = 2 if field.half and job.store.flow == "float16" else np.dtype(field.dtype).itemsize
-        total += float(np.prod(field.shape(job.frames, (height, width)))) * each * field.packed
+    half = job.store.flow == "float16"
+    total = sum(
+        field_bytes(FIELDS[name], job.frames, (height, width), half=half)[1] for name in job.kept_fields
+    )
     radiance = 6.0 * width * height * job.frames if job.render.exr else 0.0
     return _MARGIN * (total + radiance)
 
