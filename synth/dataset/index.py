@@ -7,7 +7,7 @@ import io
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import pyarrow as pa
 import pyarrow.compute as pc
@@ -22,56 +22,63 @@ from synth.system import checked_file
 
 NAME = "index.parquet"
 
+
+class IndexColumn(NamedTuple):
+    """One column of the index."""
+
+    name: str
+    type: pa.DataType
+    meaning: str
+    unit: str = "-"
+
+
+_INT, _REAL, _TEXT = pa.int64(), pa.float64(), pa.string()
+
+COLUMNS = (
+    IndexColumn("index", _INT, "position in the dataset"),
+    IndexColumn("status", _TEXT, "done or failed"),
+    IndexColumn("reason", _TEXT, "why it failed"),
+    IndexColumn("path", _TEXT, "the store, relative to this file"),
+    IndexColumn("content_hash", _TEXT, "hash of fields and attributes"),
+    IndexColumn(
+        "anatomy",
+        _TEXT,
+        "the geometry: a user's brain or a procedural one's seed, the same in every dataset; sequences that "
+        "share it belong on one side of a split",
+    ),
+    IndexColumn("opening", _TEXT, "where a user's brain is opened: the same place, the same name everywhere"),
+    IndexColumn("family", _TEXT, "appearance family"),
+    IndexColumn("gesture", _TEXT, "kind of gesture, of every instrument"),
+    IndexColumn("young_kpa", _REAL, "Young's modulus", "kPa"),
+    IndexColumn("poisson", _REAL, "Poisson's ratio"),
+    IndexColumn("load", _REAL, "peak load F/(E a^2)"),
+    IndexColumn("peak_force_mn", _REAL, "largest force", "mN"),
+    IndexColumn("peak_flow_px", _REAL, "largest true motion", "px"),
+    IndexColumn("peak_motion_mm", _REAL, "the same at the craniotomy", "mm"),
+    IndexColumn("frames", _INT, "frames"),
+    IndexColumn("fps", _REAL, "frames a second"),
+    IndexColumn("width", _INT, "width of the picture", "px"),
+    IndexColumn("height", _INT, "height of the picture", "px"),
+    IndexColumn("scale_mm_per_px", _REAL, "scale at the craniotomy", "mm/px"),
+    IndexColumn("flow_backend", _TEXT, "estimator of the recovered flow"),
+    IndexColumn("split", _TEXT, "train, validation or test; by the rule in split.json"),
+    IndexColumn("cpu_s", _REAL, "processor time it took", "s"),
+)
+
 SCHEMA = pa.schema(
     [
-        pa.field("index", pa.int64(), metadata={"meaning": "position in the dataset"}),
-        pa.field("status", pa.string(), metadata={"meaning": "done or failed"}),
-        pa.field("reason", pa.string(), metadata={"meaning": "why it failed"}),
-        pa.field("path", pa.string(), metadata={"meaning": "the store, relative to this file"}),
-        pa.field("content_hash", pa.string(), metadata={"meaning": "hash of fields and attributes"}),
         pa.field(
-            "anatomy",
-            pa.string(),
-            metadata={
-                "meaning": "the geometry: a user's brain or a procedural one's seed, the same in every "
-                "dataset; sequences that share it belong on one side of a split"
-            },
-        ),
-        pa.field(
-            "opening",
-            pa.string(),
-            metadata={"meaning": "where a user's brain is opened: the same place, the same name everywhere"},
-        ),
-        pa.field("family", pa.string(), metadata={"meaning": "appearance family"}),
-        pa.field("gesture", pa.string(), metadata={"meaning": "kind of gesture, of every instrument"}),
-        pa.field("young_kpa", pa.float64(), metadata={"meaning": "Young's modulus", "unit": "kPa"}),
-        pa.field("poisson", pa.float64(), metadata={"meaning": "Poisson's ratio"}),
-        pa.field("load", pa.float64(), metadata={"meaning": "peak load F/(E a^2)"}),
-        pa.field("peak_force_mn", pa.float64(), metadata={"meaning": "largest force", "unit": "mN"}),
-        pa.field("peak_flow_px", pa.float64(), metadata={"meaning": "largest true motion", "unit": "px"}),
-        pa.field(
-            "peak_motion_mm", pa.float64(), metadata={"meaning": "the same at the craniotomy", "unit": "mm"}
-        ),
-        pa.field("frames", pa.int64(), metadata={"meaning": "frames"}),
-        pa.field("fps", pa.float64(), metadata={"meaning": "frames a second"}),
-        pa.field("width", pa.int64(), metadata={"meaning": "width of the picture", "unit": "px"}),
-        pa.field("height", pa.int64(), metadata={"meaning": "height of the picture", "unit": "px"}),
-        pa.field(
-            "scale_mm_per_px", pa.float64(), metadata={"meaning": "scale at the craniotomy", "unit": "mm/px"}
-        ),
-        pa.field("flow_backend", pa.string(), metadata={"meaning": "estimator of the recovered flow"}),
-        pa.field(
-            "split", pa.string(), metadata={"meaning": "train, validation or test; by the rule in split.json"}
-        ),
-        pa.field("cpu_s", pa.float64(), metadata={"meaning": "processor time it took", "unit": "s"}),
+            one.name,
+            one.type,
+            metadata={"meaning": one.meaning} | ({} if one.unit == "-" else {"unit": one.unit}),
+        )
+        for one in COLUMNS
     ]
 )
 
-
-_LARGEST_BYTES = 1 << 30
+_LARGEST_BYTES = 1 << 28
 _MOST_ROWS = 2_000_000
-_LONGEST_TEXT = 10_000
-_SPOILT = "; `synth report` writes it anew"
+_REMEDY = "; `synth report` writes it anew"
 
 
 def read_index(root: Path) -> pa.Table:
@@ -84,53 +91,33 @@ def read_index(root: Path) -> pa.Table:
     try:
         checked_file.check_file(path, _LARGEST_BYTES)
         about = pq.read_metadata(path)
-        if about.num_rows > _MOST_ROWS:
-            raise UserError(f"{path}: holds more than {_MOST_ROWS:,} rows")
-        if about.schema.names != SCHEMA.names:
-            raise UserError(f"{path}: is the index of another program or version{_SPOILT}")
-        texts = [field.name for field in SCHEMA if field.type == pa.string()]
-        # Texts stay dictionaries until their length is known: a small file can stand for endless ones.
-        table = pq.ParquetFile(
-            path, memory_map=False, read_dictionary=texts, page_checksum_verification=True
-        ).read(use_threads=False)
-        for name in texts:
-            table = table.set_column(table.schema.names.index(name), name, _plain(table[name]))
-        table = table.cast(SCHEMA)
+        if about.num_rows > _MOST_ROWS or about.schema.names != SCHEMA.names:
+            raise UserError(f"{path}: is the index of another program or version{_REMEDY}")
+        file = pq.ParquetFile(path, memory_map=False, page_checksum_verification=True)
+        table = file.read(use_threads=False).cast(SCHEMA)
         table.validate(full=True)
     except (OSError, pa.ArrowException, ValueError, LookupError, MemoryError) as error:
         why = (str(error).splitlines() or ["it takes too much memory"])[0]
-        raise UserError(f"{path}: is damaged ({why[:200]}){_SPOILT}") from error
+        raise UserError(f"{path}: is damaged ({why[:200]}){_REMEDY}") from error
     _check_rows(table, path)
     return table
 
 
-def _plain(column: pa.ChunkedArray) -> pa.ChunkedArray:
-    """Texts as such. ValueError if they are none, or one is too long."""
-    if not pa.types.is_dictionary(column.type) or column.type.value_type != pa.string():
-        raise ValueError("a text is none")
-    for chunk in column.chunks:
-        if (pc.max(pc.binary_length(chunk.dictionary)).as_py() or 0) > _LONGEST_TEXT:
-            raise ValueError("a text is too long")
-    return column.cast(pa.string())
-
-
 def _check_rows(table: pa.Table, path: Path) -> None:
     """UserError if rows say what no writer of ours does: readers take them at their word."""
-    number, done = table["index"], pc.equal(table["status"], "done")
-    told = table.filter(done)
-    named = [f"{key:06d}.zarr" for key in told["index"].to_pylist() if key is not None]
-    hashed = pc.match_substring_regex(told["content_hash"], "^[0-9a-f]{32}$")
+    number, done = table["index"], table.filter(pc.equal(table["status"], "done"))
+    hashed = pc.match_substring_regex(done["content_hash"], "^[0-9a-f]{32}$")
     right = {
         "index": number.null_count == 0 and (pc.min(number).as_py() or 0) >= 0,
         "index, twice": pc.count_distinct(number).as_py() == len(table),
-        "status": not len(table) or pc.all(pc.is_in(table["status"], pa.array(["done", "failed"]))).as_py(),
-        "path": told["path"].to_pylist() == named,
-        "content_hash": told["content_hash"].null_count == 0 and pc.all(hashed).as_py() is not False,
-        "split": pc.all(pc.is_in(table["split"], pa.array([*split.SIDES, None]))).as_py() is not False,
+        "status": set(table["status"].unique().to_pylist()) <= {"done", "failed"},
+        "path": done["path"].to_pylist() == [f"{key or 0:06d}.zarr" for key in done["index"].to_pylist()],
+        "content_hash": done["content_hash"].null_count == 0 and pc.all(hashed).as_py() is not False,
+        "split": set(table["split"].unique().to_pylist()) <= {*split.SIDES, None},
     }
     wrong = [name for name, good in right.items() if not good]
     if wrong:
-        raise UserError(f"{path}: rows can't be right ({wrong[0]}){_SPOILT}")
+        raise UserError(f"{path}: rows can't be right ({wrong[0]}){_REMEDY}")
 
 
 def collect(folder: Folder) -> list[dict[str, Any]]:

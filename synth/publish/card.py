@@ -50,7 +50,7 @@ def write_card(folder: Folder) -> Path:
         versions=attrs.get("versions", {}),
         ranges=[_range(done, name) for name in QUANTITIES],
         fields=_fields(sequence),
-        columns=columns(),
+        columns=index.COLUMNS,
         limits=limits(folder),
     )
     path = folder.root / "README.md"
@@ -106,15 +106,6 @@ def share(rows: Iterable[Mapping[str, Any]], name: str) -> str:
     """How often each value of a column occurs: "pull 12, push 9"."""
     counts = Counter(str(row[name]) for row in rows if row.get(name) is not None)
     return ", ".join(f"{value} {count}" for value, count in sorted(counts.items())) or "-"
-
-
-def columns() -> list[dict[str, str]]:
-    """Name, unit and meaning of each column of the index."""
-    described = []
-    for field in index.SCHEMA:
-        notes = {key.decode(): value.decode() for key, value in (field.metadata or {}).items()}
-        described.append({"name": field.name, "unit": notes.get("unit", "-"), "meaning": notes["meaning"]})
-    return described
 
 
 def template(name: str) -> Any:

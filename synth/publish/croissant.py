@@ -114,13 +114,13 @@ def _sequences() -> dict[str, Any]:
     fields = [
         {
             "@type": "cr:Field",
-            "@id": f"sequences/{column['name']}",
-            "name": column["name"],
-            "description": column["meaning"] + (f" [{column['unit']}]" if column["unit"] != "-" else ""),
-            "dataType": _TYPES[index.SCHEMA.field(column["name"]).type],
-            "source": {"fileObject": {"@id": "index"}, "extract": {"column": column["name"]}},
+            "@id": f"sequences/{column.name}",
+            "name": column.name,
+            "description": column.meaning + (f" [{column.unit}]" if column.unit != "-" else ""),
+            "dataType": _TYPES[column.type],
+            "source": {"fileObject": {"@id": "index"}, "extract": {"column": column.name}},
         }
-        for column in card.columns()
+        for column in index.COLUMNS
     ]
     return {
         "@type": "cr:RecordSet",

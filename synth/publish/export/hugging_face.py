@@ -72,7 +72,7 @@ def write_parquet(dataset: Dataset, target: Path) -> None:
     framed = [name for name in first.fields if FIELDS[name].dims[0] == TIME]
     still = [name for name in first.fields if FIELDS[name].dims[0] != TIME]
     frames = [*(_plain(name, kind) for name, (kind, _) in _ROWS.items()), *(_field(first, n) for n in framed)]
-    told = [field for field in index.SCHEMA if field.name not in _LEFT_OUT]
+    told = [column for column in index.COLUMNS if column.name not in _LEFT_OUT]
     each = [_plain(field.name, str(field.type).replace("double", "float64")) for field in told]
     each += [*(_field(first, name) for name in still), _plain("attributes", "string")]
     for side, positions in sides.items():
@@ -167,7 +167,7 @@ def _card(dataset: Dataset, sides: list[str], framed: list[str], still: list[str
             row_columns=_ROWS,
             framed=[FIELDS[name] for name in framed],
             still=[FIELDS[name] for name in still],
-            index=[column for column in card.columns() if column["name"] not in _LEFT_OUT],
+            index=[column for column in index.COLUMNS if column.name not in _LEFT_OUT],
             families=card.share(rows, "family"),
             gestures=card.share(rows, "gesture"),
             limits=card.limits(folder),
