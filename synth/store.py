@@ -1,6 +1,6 @@
-"""`from synth.store import Dataset, Frames`, the imports that readers of a dataset know."""
+"""`from synth.store import Dataset, TorchDataset`, the imports that readers of a dataset know."""
 
 from synth.dataset.store import Dataset, Sequence, open_sequence
-from synth.dataset.torch_dataset import Frames
+from synth.dataset.torch_dataset import TorchDataset
 
-__all__ = ["Dataset", "Frames", "Sequence", "open_sequence"]
+__all__ = ["Dataset", "Sequence", "TorchDataset", "open_sequence"]

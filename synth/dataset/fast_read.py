@@ -21,25 +21,25 @@ _CODECS = ["BytesCodec", "BloscCodec", "Crc32cCodec"]
 _MISSING = 2**64 - 1
 
 
-class Frames:
-    """Frames of one field; damage is a ValueError or an OSError."""
+class ShardReader:
+    """Frames of one field, `reader[t]`; damage is a ValueError or an OSError."""
 
-    def __init__(self, folder: Path, shape: tuple[int, ...], together: int, dtype: np.dtype[Any]) -> None:
+    def __init__(self, folder: Path, shape: tuple[int, ...], shard_frames: int, dtype: np.dtype[Any]) -> None:
         self._folder, self._shape, self._dtype = folder, shape[1:], dtype
-        self._together, self._length = together, shape[0]
+        self._shard_frames, self._length = shard_frames, shape[0]
         self._unpack = numcodecs.Blosc()
-        self._places: dict[int, NDArray[np.uint64]] = {}
+        self._entries: dict[int, NDArray[np.uint64]] = {}
 
     def __getitem__(self, t: int) -> NDArray[Any]:
         """Frame `t`, negative from the end. IndexError outside."""
         if not -self._length <= t < self._length:
             raise IndexError(t)
-        file, k = divmod(t % self._length, self._together)
+        file, k = divmod(t % self._length, self._shard_frames)
         name = self._folder / "c" / os.path.join(str(file), *("0" for _ in self._shape))
         with name.open("rb", buffering=0) as opened:
-            if file not in self._places:
-                self._places[file] = self._index(opened.fileno())
-            start, length = (int(number) for number in self._places[file][k])
+            if file not in self._entries:
+                self._entries[file] = self._index(opened.fileno())
+            start, length = (int(number) for number in self._entries[file][k])
             if _MISSING in (start, length):
                 raise ValueError(f"frame {t} was never written")
             packed = _checked(os.pread(opened.fileno(), length, start), length)
@@ -52,29 +52,28 @@ class Frames:
 
     def _index(self, descriptor: int) -> NDArray[np.uint64]:
         """(frames, 2): where each frame starts in the file, and its length."""
-        length = 16 * self._together + 4
+        length = 16 * self._shard_frames + 4
         end = os.fstat(descriptor).st_size
         if end < length:
             raise ValueError("the file is cut short")
-        return np.frombuffer(_checked(os.pread(descriptor, length, end - length), length), "<u8").reshape(
-            -1, 2
-        )
+        data = _checked(os.pread(descriptor, length, end - length), length)
+        return np.frombuffer(data, "<u8").reshape(-1, 2)
 
 
-def open_frames(array: zarr.Array[Any], folder: Path | None) -> Frames | None:
+def open_frames(array: zarr.Array[Any], folder: Path | None) -> ShardReader | None:
     """The fast way to the frames of `array`, stored in `folder`; None where there is none."""
     codecs = [type(codec).__name__ for codec in (*array.filters, array.serializer, *array.compressors)]  # type: ignore[list-item]
     if folder is None or array.shards is None or array.chunks != (1, *array.shape[1:]) or codecs != _CODECS:
         return None
     if array.shards[1:] != array.shape[1:] or np.dtype(array.dtype).byteorder == ">":
         return None
-    return Frames(folder, array.shape, array.shards[0], np.dtype(array.dtype))
+    return ShardReader(folder, array.shape, array.shards[0], np.dtype(array.dtype))
 
 
 def _checked(data: bytes, length: int) -> NDArray[np.uint8]:
     if len(data) != length or length < 4:
         raise ValueError("the file is cut short")
-    inner, told = np.frombuffer(data, np.uint8)[:-4], int.from_bytes(data[-4:], "little")
-    if google_crc32c.value(inner) != told:
+    inner, stated = np.frombuffer(data, np.uint8)[:-4], int.from_bytes(data[-4:], "little")
+    if google_crc32c.value(inner) != stated:
         raise ValueError("a checksum does not match")
     return inner

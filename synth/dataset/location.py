@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +13,8 @@ from synth.errors import UserError
 
 
 @dataclass(frozen=True)
-class Place:
-    """A folder somewhere."""
+class StoreLocation:
+    """The folder of one store, somewhere."""
 
     name: str
     """Its path or address, for messages."""
@@ -30,14 +32,13 @@ def store(root: Path, index: int) -> Path:
 
 
 def index_of(name: str) -> int | None:
-    """The index of the sequence whose sealed store is called so; None if none's is."""
-    number = name.removesuffix(".zarr")
-    known = number.isascii() and number.isdigit() and name == f"{int(number):06d}.zarr"
-    return int(number) if known else None
+    """The index of the sequence whose sealed store has that name; None if none's has."""
+    found = re.fullmatch(r"([0-9]{6}|[1-9][0-9]{6,})\.zarr", name)
+    return int(found[1]) if found else None
 
 
-def find_place(where: Path | str) -> Place:
-    """The place of a path or an address such as `s3://bucket/out/000000.zarr` or `zip://000000.zarr::out.zip`.
+def find_location(where: Path | str) -> StoreLocation:
+    """Of a path or an address such as `s3://bucket/out/000000.zarr` or `zip://000000.zarr::out.zip`.
 
     Raises:
         UserError: nothing is there, or the address cannot be opened.
@@ -46,7 +47,7 @@ def find_place(where: Path | str) -> Place:
         folder = Path(where)
         if not folder.is_dir():
             raise UserError(f"{folder}: no such sequence")
-        return Place(str(folder), str(folder), lambda key: _size(folder / key), folder)
+        return StoreLocation(str(folder), str(folder), partial(_size, folder), folder)
     fs, base = _open(where)
     if not fs.isdir(base):
         raise UserError(f"{where}: no such sequence")
@@ -59,20 +60,16 @@ def find_place(where: Path | str) -> Place:
 
     from zarr.storage import FsspecStore
 
-    return Place(where, FsspecStore.from_url(_absolute(where), read_only=True), size)
+    return StoreLocation(where, FsspecStore.from_url(_absolute(where), read_only=True), size)
 
 
 def stores(where: str) -> list[str]:
     """Addresses of the sealed stores in the dataset at an address, in order of their names."""
     fs, base = _open(where)
-    found = []
-    for entry in fs.ls(base, detail=False):
-        name = str(entry).rstrip("/").rsplit("/", 1)[-1]
-        if index_of(name) is not None:
-            first, chained, rest = where.partition("::")
-            slash = "" if first.endswith("/") else "/"
-            found.append(f"{first}{slash}{name}{chained}{rest}")
-    return sorted(found)
+    first, chained, rest = where.partition("::")
+    slash = "" if first.endswith("/") else "/"
+    names = (str(entry).rstrip("/").rsplit("/", 1)[-1] for entry in fs.ls(base, detail=False))
+    return sorted(f"{first}{slash}{name}{chained}{rest}" for name in names if index_of(name) is not None)
 
 
 def _open(where: str) -> tuple[Any, str]:
@@ -93,5 +90,5 @@ def _absolute(where: str) -> str:
     return "::".join([*chain, last])
 
 
-def _size(path: Path) -> int:
-    return path.stat().st_size if path.is_file() else 0
+def _size(folder: Path, key: str) -> int:
+    return (folder / key).stat().st_size if (folder / key).is_file() else 0

@@ -22,9 +22,7 @@ from synth.job import identity
 from synth.job.schema import Job
 from synth.system import packages
 
-__all__ = ["FIELDS", "Column", "Dataset", "Field", "Sequence", "Writer", "open_sequence"]
-
-# Raw bytes of one field that are held back and then written as one file: a shard, its chunks being frames.
+# Raw bytes of one field that are gathered and then written as one file: a shard, its chunks being frames.
 _SHARD_BYTES = 16 << 20
 
 # A chunk is unpacked at once: of a field without frames, or of small ones, no more values than these.
@@ -57,7 +55,7 @@ class Writer:
             if stale.exists():
                 shutil.rmtree(stale)
         self._group = zarr.create_group(str(self._part), zarr_format=3)
-        self._columns: dict[str, _Column] = {}
+        self._writers: dict[str, _FieldWriter] = {}
         self._wanted = job.kept_fields
         self._half = job.store.flow == "float16"
         self._exr_hash = hashlib.blake2b(digest_size=16)
@@ -85,20 +83,18 @@ class Writer:
             ValueError: another shape or type.
             NotFinite: a number is none.
         """
-        field = _field(name)
         if not self.wants(name):
             return
-        column = self._column(field)
-        if field.framed:
+        if _field(name).framed:
             for t, frame in enumerate(array):
-                column.append(t, frame)
+                self._writer(name).append(t, frame)
         else:
-            column.whole(array)
+            self._writer(name).write(array)
 
     def put_frame(self, name: str, t: int, array: NDArray[Any]) -> None:
         """Writes frame `t` of a field, without its first axis; frames come in order. Raises as `put`."""
         if self.wants(name):
-            self._column(_field(name)).append(t, array)
+            self._writer(name).append(t, array)
 
     def put_exr(self, t: int, radiance: NDArray[np.floating]) -> None:
         """Writes the linear picture of frame `t`, (H, W, 3), as `radiance/NNNNNN/TTTT.exr` in half floats."""
@@ -124,17 +120,17 @@ class Writer:
             The store's final path.
         """
         for name in self._wanted:
-            column = self._columns.get(name)
-            if column is None:
+            written = self._writers.get(name)
+            if written is None:
                 raise ValueError(f"{name}: was never written")
-            if column.filled != column.shape[0]:
-                raise ValueError(f"{name}: {column.filled} of {column.shape[0]} frames were written")
-        hashes = {name: self._columns[name].digest() for name in FIELDS if name in self._columns}
+            if written.filled != written.shape[0]:
+                raise ValueError(f"{name}: {written.filled} of {written.shape[0]} frames were written")
+        hashes = {name: self._writers[name].hash.hexdigest() for name in FIELDS if name in self._writers}
         if self._exr_frames:
             hashes["radiance"] = self._exr_hash.hexdigest()
-        summary: dict[str, Any] = {key: self._columns[name].largest for name, key in _PEAKS.items()}
+        summary: dict[str, Any] = {key: self._writers[name].largest for name, key in _PEAKS.items()}
         if self._half:
-            rounded = {name: one.rounding for name, one in self._columns.items() if FIELDS[name].half}
+            rounded = {name: one.rounding for name, one in self._writers.items() if FIELDS[name].half}
             summary["rounding_px"] = rounded
         attrs = {
             **self._own,
@@ -143,35 +139,36 @@ class Writer:
             "field_hashes": hashes,
             "versions": {**packages.versions(), "generator": provenance.fingerprint()},
         }
-        attrs = json.loads(identity.canonical(attrs))
+        attrs = json.loads(identity.canonical(attrs))  # as it is read back
         attrs["content_hash"] = content_hash(attrs)
         attrs["seal_hash"] = seal_hash(attrs)
         self._group.attrs.update(attrs)
         self._part.rename(self.path)
         return self.path
 
-    def _column(self, field: Field) -> _Column:
-        if field.name not in self._columns:
+    def _writer(self, name: str) -> _FieldWriter:
+        if name not in self._writers:
+            field = _field(name)
             shape = field.shape(self._frames, self._size)
-            self._columns[field.name] = _Column(self._group, field, shape, self._half and field.half)
-        return self._columns[field.name]
+            self._writers[name] = _FieldWriter(self._group, field, shape, self._half and field.half)
+        return self._writers[name]
 
 
-class _Column:
+class _FieldWriter:
     """One field being written: checked, hashed, and gathered into shards."""
 
     def __init__(self, group: zarr.Group, field: Field, shape: tuple[int, ...], half: bool) -> None:
         self._field, self.shape, self.filled = field, shape, 0
         self._dtype = dtype = np.dtype("float16" if half else field.dtype)
-        self._hash = field_hasher(field.name, dtype, shape)
-        self._held: list[NDArray[Any]] = []
+        self.hash = field_hasher(field.name, dtype, shape)
+        self._pending: list[NDArray[Any]] = []
         self.largest = self.rounding = 0.0
         chunk, shard = shape, None
         if field.framed:
             chunk = (1, *shape[1:])
             frame_bytes = int(np.prod(chunk)) * dtype.itemsize
-            self._together = int(np.clip(_SHARD_BYTES // frame_bytes, 1, shape[0]))
-            shard = (self._together, *shape[1:])
+            self._shard_frames = int(np.clip(_SHARD_BYTES // frame_bytes, 1, shape[0]))
+            shard = (self._shard_frames, *shape[1:])
         self._array = group.create_array(
             field.name,
             shape=shape,
@@ -196,24 +193,22 @@ class _Column:
         if t != self.filled:
             raise ValueError(f"{self._field.name}: frame {t} after {self.filled} frames")
         checked = self._checked(frame, self.shape[1:], f", frame {t}")
-        self._see(checked)
-        self._held.append(checked)
+        self._account(checked)
+        self._pending.append(checked)
         self.filled += 1
-        if len(self._held) == self._together or self.filled == self.shape[0]:
-            self._array[self.filled - len(self._held) : self.filled] = np.stack(self._held)
-            self._held.clear()
+        if len(self._pending) == self._shard_frames or self.filled == self.shape[0]:
+            self._array[self.filled - len(self._pending) : self.filled] = np.stack(self._pending)
+            self._pending.clear()
 
-    def whole(self, array: NDArray[Any]) -> None:
+    def write(self, array: NDArray[Any]) -> None:
         checked = self._checked(array, self.shape, "")
-        self._see(checked)
+        self._account(checked)
         self._array[...] = checked
         self.filled = self.shape[0]
 
-    def digest(self) -> str:
-        return self._hash.hexdigest()
-
-    def _see(self, values: NDArray[Any]) -> None:
-        self._hash.update(values.data)
+    def _account(self, values: NDArray[Any]) -> None:
+        """Hash and greatest length."""
+        self.hash.update(values.data)
         if self._field.name in _PEAKS:
             squared = np.einsum("...k,...k->...", values, values, dtype=np.result_type(values, np.float32))
             self.largest = max(self.largest, float(np.sqrt(squared.max())))
@@ -235,21 +230,19 @@ class _Column:
         return copy
 
 
-class Column:
+class FieldReader:
     """A field of a sealed sequence, read when indexed; damage is a UserError that names store and field."""
 
     def __init__(
         self, array: zarr.Array[Any], dtype: np.dtype[Any], where: str, folder: Path | None = None
     ) -> None:
         self._array, self._where = array, where
-        self._frames = fast_read.open_frames(array, folder)
+        self._shards = fast_read.open_frames(array, folder)
         self.shape: tuple[int, ...] = array.shape
         self.stored: np.dtype[Any] = array.dtype
         """Type on disk; values are given in the table's."""
         self.dtype: np.dtype[Any] = dtype
         self.ndim = len(self.shape)
-        self.together: int = (array.shards or array.chunks)[0] if self.shape else 1
-        """Frames in one file, where it has frames."""
         self.attrs: dict[str, Any] = dict(array.attrs)
         self.dims: tuple[str, ...] = tuple(array.metadata.dimension_names or ())
 
@@ -257,9 +250,9 @@ class Column:
         return self.shape[0]
 
     def __getitem__(self, selection: Any) -> NDArray[Any]:
-        single = self._frames is not None and isinstance(selection, (int, np.integer))
+        single = isinstance(selection, (int, np.integer))
         try:
-            values = self._frames[int(selection)] if single and self._frames else self._array[selection]
+            values = self._shards[int(selection)] if single and self._shards else self._array[selection]
             return np.asarray(values, self.dtype)
         except IndexError:
             raise
@@ -276,8 +269,10 @@ class Column:
 class Sequence:
     """One sealed sequence: `sequence["rgb"][t]`, `sequence.attrs["young_kpa"]`."""
 
-    def __init__(self, path: Path, group: zarr.Group, attrs: dict[str, Any], at: location.Place) -> None:
-        self.path, self._group, self.attrs, self._place = path, group, attrs, at
+    def __init__(
+        self, path: Path, group: zarr.Group, attrs: dict[str, Any], at: location.StoreLocation
+    ) -> None:
+        self.path, self._group, self.attrs, self._location = path, group, attrs, at
 
     @property
     def index(self) -> int:
@@ -302,10 +297,9 @@ class Sequence:
         return name in self.attrs["field_hashes"]
 
     def is_sealed(self) -> bool:
-        """Whether the attributes, and so the fields' hashes, are those that were sealed."""
+        """Whether the attributes, the fields' hashes among them, are those that were sealed."""
         try:
-            told = self.attrs["seal_hash"], self.attrs["content_hash"]
-            return told == (seal_hash(self.attrs), content_hash(self.attrs))
+            return bool(self.attrs["seal_hash"] == seal_hash(self.attrs))
         except (ValueError, RecursionError):  # a number that is none, where nobody looks; or without end
             return False
 
@@ -321,25 +315,25 @@ class Sequence:
             UserError: a value is outside the table's limits or no number; or, after the last one, the values
                 are not those that were sealed.
         """
-        field, column = _field(name), self[name]
-        where = f"{self._place.name}: {name}"
-        hasher = field_hasher(name, column.stored, column.shape)
-        every: Any = range(len(column)) if field.framed else [...]
+        field, found = _field(name), self[name]
+        where = f"{self._location.name}: {name}"
+        hasher = field_hasher(name, found.stored, found.shape)
+        every: Any = range(len(found)) if field.framed else [...]
         for part in every:
-            values = np.ascontiguousarray(column[part])
+            values = np.ascontiguousarray(found[part])
             _check_limits(field, values, where)
-            hasher.update(values.astype(column.stored, copy=False).data)
+            hasher.update(values.astype(found.stored, copy=False).data)
             yield values
         if hasher.hexdigest() != self.attrs["field_hashes"][name]:
             raise UserError(f"{where}: values are not those that were sealed; see `synth verify`")
 
-    def __getitem__(self, name: str) -> Column:
-        field, where = _field(name), f"{self._place.name}: {name}"
+    def __getitem__(self, name: str) -> FieldReader:
+        field, where = _field(name), f"{self._location.name}: {name}"
         if name not in self:
             raise UserError(f"{where}: the sequence has no such field")
         try:
             array = self._group[name]
-        except Exception as error:  # as in Column
+        except Exception as error:  # as in FieldReader
             raise UserError(f"{where}: cannot be opened, the store is damaged ({error})") from error
         expected, dtype = field.shape(self.frames, self.size), np.dtype(field.dtype)
         types = (dtype, np.dtype("float16")) if field.half else (dtype,)
@@ -352,9 +346,9 @@ class Sequence:
         rest = "/0" * (len(expected) - 1)
         for k in range(files):
             # Zarr reads a missing or empty file as zeros.
-            if not self._place.size(f"{name}/c/{k}{rest}"):
+            if not self._location.size(f"{name}/c/{k}{rest}"):
                 raise UserError(f"{where}: file c/{k}{rest} is missing or empty, the store is damaged")
-        return Column(array, dtype, where, self._place.folder and self._place.folder / name)
+        return FieldReader(array, dtype, where, self._location.folder and self._location.folder / name)
 
 
 class Dataset:
@@ -395,14 +389,14 @@ def open_sequence(path: Path | str, *, sealed: bool = True) -> Sequence:
     """
     if str(path).partition("::")[0].endswith(".part"):
         raise UserError(f"{path}: is an unfinished sequence")
-    at = location.find_place(path)
+    at = location.find_location(path)
     path = Path(str(path).partition("::")[0])
     if at.size("zarr.json") > LARGEST_BYTES:
         raise UserError(f"{path}: its metadata is larger than {LARGEST_BYTES:,} bytes")
     try:
         group = zarr.open_group(at.store, mode="r", zarr_format=3, use_consolidated=False)
         attrs = dict(group.attrs)
-    except Exception as error:  # as in Column
+    except Exception as error:  # as in FieldReader
         raise UserError(f"{path}: is not a Zarr v3 group, or its metadata is damaged") from error
     check_attributes(attrs, str(path))
     sequence = Sequence(path, group, attrs, at)

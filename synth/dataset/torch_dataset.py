@@ -14,19 +14,19 @@ import numpy as np
 
 from synth.dataset.store import Dataset, Sequence
 from synth.errors import UserError
-from synth.fields import FIELDS
+from synth.fields import FIELDS, TIME
 
 # Open stores kept by one process; opening one costs some milliseconds.
-_KEPT = 64
+_OPEN = 64
 
 
-class Frames:
+class TorchDataset:
     """Every frame of every sequence in `root`, as `{field: array}`.
 
     Fields without a frame axis come whole; `index` and `frame` say where an item is from. Safe in workers
     that are forked or spawned: a process opens its own stores.
 
-        frames = Frames("out", ["rgb", "flow", "traction"])  # from synth.store import Frames
+        frames = TorchDataset("out", ["rgb", "flow", "traction"])  # from synth.store import TorchDataset
         loader = torch.utils.data.DataLoader(frames, batch_size=8, num_workers=2)
     """
 
@@ -40,9 +40,9 @@ class Frames:
         Raises:
             UserError: no dataset there, or a sequence lacks a field.
         """
-        strangers = [name for name in fields if name not in FIELDS]
-        if strangers:
-            raise UserError(f"{', '.join(strangers)}: no such field; there are {', '.join(FIELDS)}")
+        unknown = [name for name in fields if name not in FIELDS]
+        if unknown:
+            raise UserError(f"{', '.join(unknown)}: no such field; there are {', '.join(FIELDS)}")
         self._dataset, self._fields = Dataset(root), tuple(fields)
         self._chosen = tuple(range(len(self._dataset)) if sequences is None else sequences)
         lengths = []
@@ -67,8 +67,7 @@ class Frames:
         sequence, columns = self._columns(self._chosen[which])
         found: dict[str, Any] = {"index": sequence.index, "frame": frame}
         for name, column in columns.items():
-            whole = column.dims[0] != "frame"
-            found[name] = np.asarray(column[:] if whole else column[frame])
+            found[name] = np.asarray(column[frame] if column.dims[0] == TIME else column[:])
         return found
 
     def _columns(self, position: int) -> tuple[Sequence, dict[str, Any]]:
@@ -77,7 +76,7 @@ class Frames:
         if position not in self._open:
             sequence = self._dataset[position]
             self._open[position] = (sequence, {name: sequence[name] for name in self._fields})
-            if len(self._open) > _KEPT:
+            if len(self._open) > _OPEN:
                 self._open.popitem(last=False)
         self._open.move_to_end(position)
         return self._open[position]

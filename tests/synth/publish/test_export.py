@@ -19,7 +19,7 @@ from typer.testing import CliRunner
 from synth.cli import app
 from synth.dataset import index, split
 from synth.dataset.store import Dataset, Sequence, Writer
-from synth.dataset.torch_dataset import Frames
+from synth.dataset.torch_dataset import TorchDataset
 from synth.errors import UserError
 from synth.fields import FIELDS
 from synth.job.schema import Job
@@ -76,19 +76,19 @@ def test_npz_of_the_published_code(root: Path, tmp_path: Path) -> None:
 
 
 def test_frames_are_those_of_the_store(root: Path) -> None:
-    frames = Frames(root, ["rgb", "flow", "area", "force"])
+    frames = TorchDataset(root, ["rgb", "flow", "area", "force"])
     assert len(frames) == 18
     item, sequence = frames[4], Dataset(root)[1]
     assert (item["index"], item["frame"]) == (1, 1)
     assert np.array_equal(item["flow"], sequence["flow"][1])
     assert np.array_equal(item["area"], sequence["area"][:])
     assert np.array_equal(item["force"], sequence["force"][1])
-    assert Frames(root, ["rgb"], sequences=[1])[0]["index"] == 1
+    assert TorchDataset(root, ["rgb"], sequences=[1])[0]["index"] == 1
     with pytest.raises(IndexError):
         frames[18]
     for name in ("colour", "motion_recovered"):
         with pytest.raises(UserError):
-            Frames(root, [name])
+            TorchDataset(root, [name])
 
 
 @pytest.mark.slow
