@@ -117,9 +117,8 @@ def _fill(plan: Plan, index: int, part: Path, progress: Callable[[int], None]) -
     view = camera.place(case.view, job.render)
     rng = np.random.default_rng([plan.seed, index, 77])
     surface = anatomy.procedural(case.relief, job.anatomy)
-    gestures = [
-        tool.Gesture.draw(job.fem, job.anatomy.craniotomy, case.tissue, rng) for _ in range(_GESTURES)
-    ]
+    opening, young = job.anatomy.craniotomy.radius_mm, case.tissue.young_kpa
+    gestures = [scenario.draw_gesture(job.fem, opening, young, rng) for _ in range(_GESTURES)]
     motions = [_moved(job, case, gesture, surface) for gesture in gestures]
     course = _course(plan, rng)
     times = _frame_times(plan, rng)

@@ -14,6 +14,7 @@ from synth.fem.mesh import tetrahedra
 from synth.fem.surface_embedding import Embedding
 from synth.fem.system import System, assemble
 from synth.job import schema
+from synth.sequence import scenario
 
 Floats = NDArray[np.float64]
 
@@ -86,7 +87,9 @@ def error(u: Floats, exact: Floats, on: Patch) -> float:
 def speed(case: Brain, load: float, way: str, frames: int = 60) -> float:
     """CPU milliseconds a frame of a pull with ramp, hold and release, moving the surface included."""
     fem, tissue = schema.Fem(gestures=("pull",)), Tissue(1.0, 0.4, "linear")
-    gesture = tool.Gesture.draw(fem, ANATOMY.craniotomy, tissue, np.random.default_rng(0))
+    gesture = scenario.draw_gesture(
+        fem, ANATOMY.craniotomy.radius_mm, tissue.young_kpa, np.random.default_rng(0)
+    )
     part = tool.course(gesture, frames).load
     loads = part[:, None, None] * case.load(load, way)
     start = time.process_time()

@@ -26,6 +26,7 @@ from synth.fem.laws import NUMBER
 from synth.fem.material import Tissue
 from synth.fem.mesh import tetrahedra
 from synth.job import schema
+from synth.sequence import scenario
 
 Floats = NDArray[np.float64]
 Row = dict[str, Any]
@@ -141,7 +142,9 @@ def sequence(law: str, load: float) -> Row:
 def _sequence(law: str, load: float) -> Row:
     on, fem = fem_case.patch(), schema.Fem(gestures=("pull",), load=(load, load))
     tissue = Tissue(1.0, 0.4, law)
-    gesture = tool.Gesture.draw(fem, fem_case.ANATOMY.craniotomy, tissue, np.random.default_rng(0))
+    gesture = scenario.draw_gesture(
+        fem, fem_case.ANATOMY.craniotomy.radius_mm, tissue.young_kpa, np.random.default_rng(0)
+    )
     start = time.process_time()
     volume = tetrahedra.block(fem_case.ANATOMY, fem.tets, 2, tool.focus(gesture))
     meshed = time.process_time()

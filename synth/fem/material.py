@@ -4,18 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-
 from synth.errors import UserError
 from synth.fem.membrane import Sheet
 from synth.fem.mesh.tetrahedra import Tets
 from synth.fem.system import System, assemble
-from synth.job import schema
 from synth.job.laws import largest_load
-
-_STRETCH = 1.01, 1.03
-"""How far a membrane is stretched at rest. Not from a measurement: its pull then balances a pressure of 3-350
-Pa (at most 2.6 mmHg) under a dome of 70 mm radius, which a living head has."""
 
 
 @dataclass(frozen=True)
@@ -46,22 +39,6 @@ class Tissue:
     skull: str = "bonded"
     """`bonded` or `slip`."""
 
-    @classmethod
-    def draw(cls, fem: schema.Fem, rng: np.random.Generator) -> Tissue:
-        """E log-uniformly: half as stiff and twice as stiff are as likely."""
-        law, why = fem.chosen_law
-        young = _draw_log_uniform(fem.young_kpa, rng)
-        # Drawn whether it counts or not, so that no number depends on whether another is asked for.
-        asked, intact = fem.membrane, rng.uniform()
-        stiff, thick, stretch = (
-            _draw_log_uniform(asked.young_kpa, rng),
-            float(rng.uniform(*asked.thickness_mm)),
-            float(rng.uniform(*_STRETCH)),
-        )
-        pia = Pia(stiff, thick, stretch)
-        poisson, skull = float(rng.uniform(*fem.poisson)), str(rng.choice(fem.skull))
-        return cls(young, poisson, law, why, pia if intact < asked.intact else None, skull)
-
     def equations(self, tets: Tets, law: str | None = None) -> System:
         """The equations of a volume of it, of its own law or another."""
         return assemble(tets, law or self.law, self.poisson, self.sheet)
@@ -73,10 +50,6 @@ class Tissue:
         if pia is None:
             return None
         return Sheet(pia.young_kpa * pia.thickness_mm / self.young_kpa, pia.stretch)
-
-
-def _draw_log_uniform(ends: tuple[float, float], rng: np.random.Generator) -> float:
-    return float(np.exp(rng.uniform(*np.log(ends))))
 
 
 def check_load(law: str, load: float) -> None:

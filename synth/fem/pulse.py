@@ -40,15 +40,6 @@ class Pulse:
     breath_hz: float
     breath_rad: float
 
-    @classmethod
-    def draw(cls, asked: schema.Pulse, rng: np.random.Generator) -> Pulse | None:
-        """Amplitudes, rates and phases uniformly; None where nothing moves."""
-        drawn = cls(
-            *(float(rng.uniform(*ends)) for ends in (asked.heart_mm, asked.heart_hz, (0, 2 * np.pi))),
-            *(float(rng.uniform(*ends)) for ends in (asked.breath_mm, asked.breath_hz, (0, 2 * np.pi))),
-        )
-        return drawn if drawn.heart_mm or drawn.breath_mm else None
-
     def height(self, time: Floats) -> Floats:
         """How far the middle of the opening is above where it is in frame 0, mm, at (T,) s from there."""
         heart, breath = (

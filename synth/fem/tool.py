@@ -8,16 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from synth.errors import UserError
-from synth.fem.material import Tissue
-from synth.job import schema
-from synth.job.instrument import CLEAR_MM, Instrument
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 _PINCH = 0.5  # a grasp's tips press towards each other with this part of their pull
-_FRICTION = 0.4  # a sliding tip drags with this part of its push
-_RAMP = 0.25, 0.35  # time in which the load grows to its peak, as a part of the sequence
+FRICTION = 0.4  # a sliding tip drags with this part of its push
+_OVERLAP = 0.6  # centres at least this part of both radii apart: the pressures' sum peaks 10% above one's
+_BLADE_MM, _SPREADING, _BODY_MM = 3.0, 0.3, 14.0  # room an instrument needs at its tip, growing up the shaft
+_LENGTH_MM, _STEPS = 110.0, 23
 
 
 @dataclass(frozen=True)
@@ -63,92 +62,12 @@ class Gesture:
     timing: tuple[float, float, float, float]
     """Parts of the sequence: touch, full load, load begins to fall, release."""
 
-    @classmethod
-    def draw(
-        cls,
-        fem: schema.Fem,
-        craniotomy: schema.Craniotomy,
-        tissue: Tissue,
-        rng: np.random.Generator,
-        asked: Instrument = Instrument(),
-    ) -> Gesture:
-        """Draws one gesture: contact uniformly in the opening, direction uniformly in its cone; or as asked.
-
-        With `fem.within_mm` all that it loads keeps to that radius of the opening's middle.
-        Where it is asked for a place, what is drawn may reach beyond the opening: see `fits`.
-
-        Raises:
-            UserError: what is drawn has no room in `fem.within_mm`.
-        """
-        drawn, want = str(rng.choice(fem.gestures)), fem.demand(asked)
-        kind = asked.gesture or drawn
-        footprint = float(rng.uniform(*want.footprint_mm))
-        size = tissue.young_kpa * footprint**2
-        given = want.load if want.force_mn is None else want.force_mn
-        load = float(rng.uniform(*given)) / (1.0 if want.force_mn is None else size)
-        spread = footprint * float(rng.uniform(1.2, 1.8) if kind == "grasp" else rng.uniform(0.1, 0.9))
-        path = float(rng.uniform(3, 8)) if kind == "slide" else 0.0
-        azimuth = float(rng.uniform(0, 360))
-        reach = footprint + 0.5 * (path if kind == "slide" else spread if kind == "grasp" else 0.0)
-        within = craniotomy.radius_mm if fem.within_mm is None else min(craniotomy.radius_mm, fem.within_mm)
-        if within < min(reach + CLEAR_MM, craniotomy.radius_mm) and asked.place is None:
-            raise UserError(
-                f"fem.within_mm: a {kind} of {footprint:.3g} mm footprint reaches {reach:.3g} mm, which "
-                f"{within:g} mm leave no room for; raise it or lower fem.footprint_mm"
-            )
-        room = max(within - reach - CLEAR_MM, 0.0)
-        radius, angle = room * np.sqrt(rng.uniform()), rng.uniform(0, 2 * np.pi)
-        point = radius * np.array([np.cos(angle), np.sin(angle)])
-        if asked.place is not None:
-            point = np.asarray(asked.place, np.float64)
-        turn = rng.uniform(0, 2 * np.pi)
-        along = np.array([np.cos(turn), np.sin(turn)])
-        cone = np.cos(np.radians(fem.cone_deg))
-        rise = rng.uniform(cone, 1.0)
-        if kind == "retract":  # sideways, as a spatula holds tissue away
-            rise = rng.uniform(0.1, max(cone, 0.3))
-        elif kind == "slide":
-            rise = 1 / np.hypot(1, _FRICTION)
-        if asked.direction is not None:
-            whole = np.asarray(asked.direction) / np.linalg.norm(asked.direction)
-            along = whole[:2] / (np.hypot(*whole[:2]) or 1.0)
-            rise = rise if kind == "slide" else abs(float(whole[2]))
-        up = rise if kind in ("pull", "grasp") else -rise
-        way = np.append(np.sqrt(1 - rise**2) * along, up)
-        across = np.radians(azimuth + 90)
-        aside = 0.5 * spread * np.array([np.cos(across), np.sin(across)])
-        places, ways = [point - 0.5 * path * along], [way]
-        if kind == "grasp":
-            places, ways = [point - aside, point + aside], []
-            for inward in (aside, -aside):
-                pinched = way + _PINCH * np.append(inward, 0) / np.linalg.norm(inward)
-                ways.append(pinched / np.linalg.norm(pinched))
-        force = load * size
-        whole = force * np.sum(ways, axis=0)
-        touch = float(rng.uniform(0.08, 0.15))
-        full = touch + float(rng.uniform(*((0.1, 0.2) if kind == "tap" else _RAMP)))
-        release = float(rng.uniform(0.85, 0.92))
-        hold = float(rng.uniform(0.5, 0.7) if kind in ("retract", "slide") else rng.uniform(0.15, 0.5))
-        timing = (touch, full, full + hold * (release - full), release)
-        return cls(
-            kind=kind,
-            contacts=tuple(
-                Contact((float(p[0]), float(p[1])), _vector(f))
-                for p, f in zip(places, force * np.array(ways), strict=True)
-            ),
-            footprint_mm=footprint,
-            load=load,
-            point_mm=(float(point[0]), float(point[1])),
-            direction=_vector(whole / np.linalg.norm(whole)),
-            force_mn=float(np.linalg.norm(whole)),
-            path_mm=(float(path * along[0]), float(path * along[1])),
-            azimuth_deg=azimuth,
-            elevation_deg=float(rng.uniform(35, 65)),
-            spread_mm=spread,
-            hover_mm=float(rng.uniform(6, 12)),
-            taps=int(rng.integers(2, 4)) if kind == "tap" else 1,
-            timing=asked.timing or timing,
-        )
+    @property
+    def reach_mm(self) -> float:
+        """How far from the opening's middle it loads the tissue."""
+        start = np.array([c.point_mm for c in self.contacts])
+        ends = np.concatenate([start, start + np.asarray(self.path_mm)])
+        return float(np.hypot(*ends.T).max()) + self.footprint_mm
 
 
 @dataclass(frozen=True)
@@ -161,6 +80,42 @@ class Course:
     """(T,) distance of the tips from the tissue, as a part of `hover_mm`."""
     shift: Floats
     """(T, 2) mm that the contacts have slid over the surface at rest."""
+
+
+def grip(
+    kind: str, point: Floats, direction: Floats, spread_mm: float, azimuth_deg: float
+) -> tuple[Floats, Floats]:
+    """Where the tips of an instrument load the tissue and which way: one contact, or a grasp's two.
+
+    Args:
+        kind: of the gesture.
+        point: (2,) mm, middle of the contacts.
+        direction: (3,) unit vector.
+        spread_mm, azimuth_deg: as in `Gesture`.
+
+    Returns:
+        Centres (C, 2) mm and unit vectors (C, 3).
+    """
+    if kind != "grasp":
+        return point[None], direction[None]
+    aside = _aside(spread_mm, azimuth_deg)
+    directions = []
+    for inward in (aside, -aside):
+        pinched = direction + _PINCH * np.append(inward, 0) / np.linalg.norm(inward)
+        directions.append(pinched / np.linalg.norm(pinched))
+    return np.stack([point - aside, point + aside]), np.stack(directions)
+
+
+def clearance(one: Gesture, other: Gesture) -> float:
+    """How far apart two gestures are beyond what they need, mm: their contacts and their shafts."""
+    here, there = np.array(focus(one)), np.array(focus(other))
+    apart = np.linalg.norm(here[:, None, :2] - there[None, :, :2], axis=2)
+    contacts = (apart - _OVERLAP * (here[:, None, 2] + there[None, :, 2])).min()
+    s = np.linspace(0, _LENGTH_MM, _STEPS)
+    lines = [np.append(g.point_mm, 0.0) + s[:, None] * shaft(g) for g in (one, other)]
+    gap = np.linalg.norm(lines[0][:, None] - lines[1][None], axis=2)
+    wide = np.minimum(_BLADE_MM + _SPREADING * np.maximum(s[:, None], s[None, :]), _BODY_MM)
+    return float(min(contacts, (gap - wide).min()))
 
 
 def course(gesture: Gesture, frames: int) -> Course:
@@ -250,8 +205,7 @@ def anchors(
     gesture: Gesture, over: Course, vertices: Floats, faces: NDArray[np.integer]
 ) -> tuple[Ints, Floats]:
     """Where the tips touch: (T, K, 3) vertices of the surface and their weights (T, K, 3)."""
-    across = np.radians(gesture.azimuth_deg + 90)
-    aside = 0.5 * gesture.spread_mm * np.array([np.cos(across), np.sin(across)])
+    aside = _aside(gesture.spread_mm, gesture.azimuth_deg)
     start = np.asarray(gesture.point_mm) - 0.5 * np.asarray(gesture.path_mm)
     reach = np.abs(aside).max() + np.abs(gesture.path_mm).max() + 3 * gesture.footprint_mm
     near = faces[(np.abs(vertices[faces, :2] - start).max(axis=2) <= reach).any(axis=1)]
@@ -298,6 +252,12 @@ def shaft(gesture: Gesture) -> Floats:
     return np.array([np.cos(turn) * np.cos(up), np.sin(turn) * np.cos(up), np.sin(up)])
 
 
+def _aside(spread_mm: float, azimuth_deg: float) -> Floats:
+    """From the middle of the tips to the second one, (2,) mm."""
+    across = np.radians(azimuth_deg + 90)
+    return np.asarray(0.5 * spread_mm * np.array([np.cos(across), np.sin(across)]))
+
+
 def _under(xy: Floats, vertices: Floats, faces: NDArray[np.integer]) -> tuple[Ints, Floats]:
     """The highest face above or below a point of the plane, and the point's barycentrics in it."""
     a, b, c = (vertices[faces[:, i], :2] - xy for i in range(3))
@@ -315,10 +275,6 @@ def _under(xy: Floats, vertices: Floats, faces: NDArray[np.integer]) -> tuple[In
 
 def _cross(a: Floats, b: Floats) -> Floats:
     return np.asarray(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
-
-
-def _vector(value: Floats) -> tuple[float, float, float]:
-    return float(value[0]), float(value[1]), float(value[2])
 
 
 def _smooth(s: Floats) -> Floats:

@@ -2,24 +2,46 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from synth.fem import multi_instrument
-from synth.fem.material import Tissue
+from synth.errors import UserError
+from synth.fem import tool
+from synth.fem.material import Pia, Tissue
 from synth.fem.pulse import Pulse
-from synth.fem.tool import Gesture
-from synth.job.schema import Job
+from synth.fem.tool import Contact, Gesture
+from synth.job import schema
+from synth.job.instrument import CLEAR_MM, Instrument
+from synth.job.schema import Family, Fem, Job, Light, Render
 from synth.render.anatomy.surface import Relief
+from synth.render.appearance.family import FAMILIES, Colour
+from synth.render.appearance.light import Lighting, balance
+from synth.render.appearance.look import Look
+from synth.render.camera import camera
 from synth.render.camera.camera import View
+from synth.render.camera.camera_sensor import Sensor
 from synth.render.camera.sway import Sway
-from synth.render.scene import Look
+
+Floats = NDArray[np.float64]
+Random = np.random.Generator
+Range = tuple[float, float]
 
 # First element of the spawn key: anatomies are shared between sequences, everything else is not.
 _ANATOMY, _SEQUENCE = 0, 1
 _TISSUE, _GESTURE, _LOOK, _VIEW, _NOISE, _FURTHER, _LABELS, _SWAY, _PULSE = range(9)
+
+_STRETCH = 1.01, 1.03
+"""How far a membrane is stretched at rest. Not from a measurement: its pull then balances a pressure of 3-350
+Pa (at most 2.6 mmHg) under a dome of 70 mm radius, which a living head has."""
+_RAMP = 0.25, 0.35  # time in which the load grows to its peak, as a part of the sequence
+_TRIES, _ROUNDS = 400, 8  # of a gesture until it has room, and of all gestures of a job's `fem.crew`
+_SPARSE_DEG = 17.0  # slope that mirrors the main lamp into the lens where highlights are fewest
+_POWER = 0.95, 1.1  # illumination, against one that just fills the sensor with white
+_DRIFT = 0.0, 0.03  # largest change of power over the sequence, as a share of it
+_SHOWN = 0.75  # share of the sequences that show a part of `render.scenery`
 
 
 @dataclass(frozen=True)
@@ -60,27 +82,25 @@ def draw(job: Job, index: int) -> Scenario:
     """Draws sequence `index` of `job`; independent of how many others there are and of their order."""
     anatomy = index % (job.anatomy.variety or job.sequences)
     family = job.appearance.families[index % len(job.appearance.families)]
-    opening = job.anatomy.craniotomy
-    tissue = Tissue.draw(job.fem, _generator(job, _SEQUENCE, index, _TISSUE))
-    gesture, *further = multi_instrument.draw_crew(
-        job.fem,
-        opening,
-        tissue,
-        _generator(job, _SEQUENCE, index, _GESTURE),
-        _generator(job, _SEQUENCE, index, _FURTHER),
-    )
+
+    def generator(part: int) -> Random:
+        return _generator(job, _SEQUENCE, index, part)
+
+    tissue = draw_tissue(job.fem, generator(_TISSUE))
+    opening_mm = job.anatomy.craniotomy.radius_mm
+    gestures = draw_gestures(job.fem, opening_mm, tissue.young_kpa, generator(_GESTURE), generator(_FURTHER))
     return Scenario(
         index=index,
         anatomy=anatomy,
         family=family,
-        relief=Relief.draw(job.anatomy, _generator(job, _ANATOMY, anatomy, 0)),
+        relief=draw_relief(job.anatomy, _generator(job, _ANATOMY, anatomy, 0)),
         tissue=tissue,
-        gesture=gesture,
-        further=tuple(further),
-        look=Look.draw(job, family, _generator(job, _SEQUENCE, index, _LOOK)),
-        view=View.draw(job.render, _generator(job, _SEQUENCE, index, _VIEW)),
-        sway=Sway.draw(job.render, _generator(job, _SEQUENCE, index, _SWAY)),
-        pulse=Pulse.draw(job.fem.pulse, _generator(job, _SEQUENCE, index, _PULSE)),
+        gesture=gestures[0],
+        further=gestures[1:],
+        look=draw_look(job, family, generator(_LOOK)),
+        view=draw_view(job.render, generator(_VIEW)),
+        sway=draw_sway(job.render, generator(_SWAY)),
+        pulse=draw_pulse(job.fem.pulse, generator(_PULSE)),
     )
 
 
@@ -90,14 +110,289 @@ def frame_seeds(job: Job, index: int) -> list[int]:
     return [int(seed) for seed in state]
 
 
-def label_rng(job: Job, index: int) -> np.random.Generator:
+def label_rng(job: Job, index: int) -> Random:
     """Random numbers for the noise of the published labels."""
     return _generator(job, _SEQUENCE, index, _LABELS)
+
+
+def draw_relief(anatomy: schema.Anatomy, rng: Random) -> Relief:
+    """Seed and shape of one anatomy."""
+    seed = int(rng.integers(2**31))
+    return Relief(seed, _uniform(rng, anatomy.gyrus_mm), _uniform(rng, anatomy.sulcus_mm))
+
+
+def draw_tissue(fem: Fem, rng: Random) -> Tissue:
+    """Stiffness, law and hold. E log-uniformly: half as stiff and twice as stiff are as likely."""
+    law, why = fem.chosen_law
+    young = _log_uniform(rng, fem.young_kpa)
+    # Drawn whether it counts or not, so that no number depends on whether another is asked for.
+    drawn, membrane = rng.uniform(), fem.membrane
+    pia = Pia(
+        _log_uniform(rng, membrane.young_kpa), _uniform(rng, membrane.thickness_mm), _uniform(rng, _STRETCH)
+    )
+    poisson, skull = _uniform(rng, fem.poisson), str(rng.choice(fem.skull))
+    return Tissue(young, poisson, law, why, pia if drawn < membrane.intact else None, skull)
+
+
+def draw_pulse(pulse: schema.Pulse, rng: Random) -> Pulse | None:
+    """Amplitudes, rates and phases uniformly; None where nothing moves."""
+    turn = 0, 2 * np.pi
+    heart, breath = (pulse.heart_mm, pulse.heart_hz, turn), (pulse.breath_mm, pulse.breath_hz, turn)
+    drawn = Pulse(*(_uniform(rng, ends) for ends in (*heart, *breath)))
+    return drawn if drawn.heart_mm or drawn.breath_mm else None
+
+
+def draw_gestures(
+    fem: Fem, opening_mm: float, young_kpa: float, rng: Random, others: Random
+) -> tuple[Gesture, ...]:
+    """Draws the gestures of all instruments, each redrawn until it has room beside the others.
+
+    Those of `fem.crew` are as they are asked, and those with a place come first, so that nothing that is
+    drawn stands where one is wanted.
+
+    Args:
+        fem: the job's section; their number is drawn from `fem.instruments`.
+        opening_mm: radius of the craniotomy.
+        young_kpa: E of the tissue.
+        rng: random numbers of this sequence's first gesture.
+        others: of its further ones.
+
+    Raises:
+        UserError: the opening has no room for so many, or not there.
+    """
+    count = max(int(others.integers(fem.instruments[0], fem.instruments[1] + 1)), len(fem.crew))
+    asked = [*fem.crew, *[Instrument()] * (count - len(fem.crew))]
+    order = sorted(range(count), key=lambda k: asked[k].place is None)
+    for _ in range(_ROUNDS if fem.crew else 1):  # the shaft of one may leave no room to the next: all anew
+        found: dict[int, Gesture] = {}
+        for k in order:
+            for _ in range(_TRIES):
+                trial = draw_gesture(fem, opening_mm, young_kpa, others if k else rng, asked[k])
+                fits = not fem.crew or trial.reach_mm <= max(opening_mm - CLEAR_MM, trial.footprint_mm) + 1e-9
+                if fits and all(tool.clearance(trial, other) >= 0 for other in found.values()):
+                    found[k] = trial
+                    break
+            else:
+                break
+        else:
+            return tuple(found[k] for k in range(count))
+    beside = f" beside the other {len(found)}" if found else ""
+    within = "" if fem.within_mm is None else f" and fem.within_mm of {fem.within_mm:g}"
+    raise UserError(
+        f"fem.{'crew' if fem.crew else 'instruments'}: instrument {k} of {count} has no room{beside} in an "
+        f"opening of {opening_mm:g} mm radius{within}; lower fem.instruments or footprint_mm, change its "
+        "place, or widen anatomy.craniotomy.radius_mm"
+    )
+
+
+def draw_gesture(
+    fem: Fem, opening_mm: float, young_kpa: float, rng: Random, asked: Instrument = Instrument()
+) -> Gesture:
+    """Draws one gesture: contact uniformly in the opening, direction uniformly in its cone; or as asked.
+
+    With `fem.within_mm` all that it loads keeps to that radius of the opening's middle. Where it is asked for
+    a place, what is drawn may reach beyond the opening.
+
+    Raises:
+        UserError: what is drawn has no room in `fem.within_mm`.
+    """
+    drawn, wanted = str(rng.choice(fem.gestures)), fem.demand(asked)
+    kind = asked.gesture or drawn
+    footprint = _uniform(rng, wanted.footprint_mm)
+    unit_mn = young_kpa * footprint**2  # the force of P = 1
+    load = _uniform(rng, wanted.load) if wanted.force_mn is None else _uniform(rng, wanted.force_mn) / unit_mn
+    spread = footprint * _uniform(rng, (1.2, 1.8) if kind == "grasp" else (0.1, 0.9))
+    path = _uniform(rng, (3, 8)) if kind == "slide" else 0.0
+    azimuth = _uniform(rng, (0, 360))
+    half = path if kind == "slide" else spread if kind == "grasp" else 0.0
+    point = _draw_point(fem, opening_mm, kind, footprint, footprint + 0.5 * half, rng, asked)
+    along, direction = _draw_direction(fem, kind, rng, asked)
+    places, directions = tool.grip(kind, point - 0.5 * path * along, direction, spread, azimuth)
+    whole = load * unit_mn * directions.sum(axis=0)
+    timing = _draw_timing(kind, rng)
+    return Gesture(
+        kind=kind,
+        contacts=tuple(
+            Contact((float(p[0]), float(p[1])), _vector(f))
+            for p, f in zip(places, load * unit_mn * directions, strict=True)
+        ),
+        footprint_mm=footprint,
+        load=load,
+        point_mm=(float(point[0]), float(point[1])),
+        direction=_vector(whole / np.linalg.norm(whole)),
+        force_mn=float(np.linalg.norm(whole)),
+        path_mm=(float(path * along[0]), float(path * along[1])),
+        azimuth_deg=azimuth,
+        elevation_deg=_uniform(rng, (35, 65)),
+        spread_mm=spread,
+        hover_mm=_uniform(rng, (6, 12)),
+        taps=int(rng.integers(2, 4)) if kind == "tap" else 1,
+        timing=asked.timing or timing,
+    )
+
+
+def _draw_point(
+    fem: Fem, opening_mm: float, kind: str, footprint: float, reach: float, rng: Random, asked: Instrument
+) -> Floats:
+    """Middle of the contacts (2,) mm; with `reach` mm round it all that is loaded is in the opening."""
+    within = opening_mm if fem.within_mm is None else min(opening_mm, fem.within_mm)
+    if within < min(reach + CLEAR_MM, opening_mm) and asked.place is None:
+        raise UserError(
+            f"fem.within_mm: a {kind} of {footprint:.3g} mm footprint reaches {reach:.3g} mm, which "
+            f"{within:g} mm leave no room for; raise it or lower fem.footprint_mm"
+        )
+    room = max(within - reach - CLEAR_MM, 0.0)
+    radius, angle = room * np.sqrt(rng.uniform()), rng.uniform(0, 2 * np.pi)
+    if asked.place is not None:
+        return np.asarray(asked.place, np.float64)
+    return np.asarray(radius * np.array([np.cos(angle), np.sin(angle)]))
+
+
+def _draw_direction(fem: Fem, kind: str, rng: Random, asked: Instrument) -> tuple[Floats, Floats]:
+    """Unit vectors: the load's component along the surface (2,), which is the way of a slide, and it (3,)."""
+    turn = rng.uniform(0, 2 * np.pi)
+    along = np.array([np.cos(turn), np.sin(turn)])
+    cone = np.cos(np.radians(fem.cone_deg))
+    rise = rng.uniform(cone, 1.0)
+    if kind == "retract":  # sideways, as a spatula holds tissue away
+        rise = rng.uniform(0.1, max(cone, 0.3))
+    elif kind == "slide":
+        rise = 1 / np.hypot(1, tool.FRICTION)
+    if asked.direction is not None:
+        whole = np.asarray(asked.direction) / np.linalg.norm(asked.direction)
+        along = whole[:2] / (np.hypot(*whole[:2]) or 1.0)
+        rise = rise if kind == "slide" else abs(float(whole[2]))
+    up = rise if kind in ("pull", "grasp") else -rise
+    return along, np.append(np.sqrt(1 - rise**2) * along, up)
+
+
+def _draw_timing(kind: str, rng: Random) -> tuple[float, float, float, float]:
+    """Touch, full load, load begins to fall, release, as parts of the sequence."""
+    touch = _uniform(rng, (0.08, 0.15))
+    full = touch + _uniform(rng, (0.1, 0.2) if kind == "tap" else _RAMP)
+    release = _uniform(rng, (0.85, 0.92))
+    hold = _uniform(rng, (0.5, 0.7) if kind in ("retract", "slide") else (0.15, 0.5))
+    return touch, full, full + hold * (release - full), release
+
+
+def draw_view(render: Render, rng: Random) -> View:
+    """Where the microscope stands; width of its field and principal point are a calibration's, if given."""
+    drawn = View(
+        field_mm=_uniform(rng, render.field_mm),
+        working_distance_mm=_uniform(rng, render.working_distance_mm),
+        tilt_deg=_uniform(rng, render.tilt_deg),
+        azimuth_deg=_uniform(rng, (0.0, 360.0)),
+        roll_deg=_uniform(rng, (0.0, 360.0)),
+        focus_mm=_uniform(rng, (-0.5, 0.5)),
+        off_centre=_draw_zero(rng),
+    )
+    return drawn if render.calibration is None else camera.calibrated(drawn, render)
+
+
+def _draw_zero(rng: Random) -> tuple[float, float]:
+    """No offset; drawn as when a job could ask for one, so that its zeros keep their signs."""
+    length, angle = rng.uniform(0, 0), rng.uniform(0, 2 * np.pi)
+    return float(length * np.cos(angle)), float(length * np.sin(angle))
+
+
+def draw_sway(render: Render, rng: Random) -> Sway:
+    """How far the microscope drifts and vibrates."""
+    drift, vibration = _uniform(rng, render.drift_mm), _uniform(rng, render.vibration_mm)
+    return Sway(drift, vibration, int(rng.integers(2**31)))
+
+
+def draw_look(job: Job, family: Family, rng: Random) -> Look:
+    """A look of `family` under the job's light, seen by its sensor."""
+    lighting = draw_light(job.light, rng)
+    glare = lighting.glare
+    ranges = FAMILIES[family]
+    look = Look(
+        family=family,
+        crown=_near(ranges.crown, rng),
+        flush=_near(ranges.flush, rng),
+        vein=_near(ranges.vein, rng),
+        wine=_near(ranges.wine, rng),
+        arterial=_uniform(rng, ranges.arterial),
+        capillary=_uniform(rng, ranges.capillary),
+        blush=_uniform(rng, ranges.blush),
+        shade=_uniform(rng, ranges.shade),
+        grain=_uniform(rng, (0.008, 0.02)),
+        film_mm=_uniform(rng, ranges.film_mm) + 0.14 * glare**2,
+        bump=_uniform(rng, ranges.bump) * (1 + 3 * glare**2),
+        roughness=_uniform(rng, (0.012, 0.02)) + 0.12 * glare**2,
+        dry_roughness=_uniform(rng, (0.22, 0.34)) * (1 - 0.6 * glare),
+        film_index=1.33 + 0.47 * glare**2,
+        blood=_uniform(rng, job.appearance.blood or ranges.blood),
+        dura=_near(ranges.dura, rng),
+        beyond=_near(ranges.beyond, rng),
+        cottonoid=bool(rng.uniform() < job.appearance.cottonoid),
+        scenery=(),
+        rim_seed=int(rng.integers(2**31)),
+        light=lighting,
+        sensor=draw_sensor(job.sensor, balance(lighting.kelvin + rng.uniform(-250, 350)), rng),
+    )
+    # From a seed of their own, so that nothing else changes.
+    parts = job.render.scenery
+    shown = np.random.default_rng([look.rim_seed, 4]).random(len(parts)) < _SHOWN
+    return replace(look, scenery=tuple(part for part, one in zip(parts, shown, strict=True) if one))
+
+
+def draw_light(light: Light, rng: Random) -> Lighting:
+    """Where the lamps are and how they shine."""
+    glare, azimuth, tilt = _uniform(rng, light.glare), _uniform(rng, (-1, 1)), light.tilt_deg
+    return Lighting(
+        glare=glare,
+        mirror_deg=_SPARSE_DEG * (1 - glare),
+        tilt_deg=None if tilt is None else _uniform(rng, tilt),
+        azimuth_deg=azimuth * (50.0 if tilt is None else 180.0),
+        main=_uniform(rng, light.main),
+        power=_uniform(rng, _POWER),
+        kelvin=_uniform(rng, light.kelvin),
+        even=_uniform(rng, light.even),
+        drift=_uniform(rng, _DRIFT),
+        phase=_uniform(rng, (0, 2 * np.pi)),
+    )
+
+
+def draw_sensor(section: schema.Sensor, white: Colour, rng: Random) -> Sensor:
+    """A chip within the job's ranges, with that white balance."""
+    return Sensor(
+        exposure=_uniform(rng, section.exposure),
+        white=white,
+        full_well=_uniform(rng, section.full_well),
+        read_noise=_uniform(rng, section.read_noise),
+        vignette=section.vignette,
+        blur=section.blur_px,
+        contrast=_uniform(rng, section.contrast),
+        sharpening=_uniform(rng, section.sharpening),
+        bayer=section.bayer,
+        chroma=section.chroma,
+        coded=section.bitrate_mbps is not None,
+    )
+
+
+def _near(colour: Colour, rng: Random) -> Colour:
+    """A colour a little brighter or darker, redder or bluer."""
+    value = np.asarray(colour) * rng.uniform(0.94, 1.05) * rng.uniform(0.96, 1.04, 3)
+    r, g, b = np.clip(value, 0.01, 0.95).tolist()
+    return r, g, b
+
+
+def _uniform(rng: Random, ends: Range) -> float:
+    return float(rng.uniform(*ends))
+
+
+def _log_uniform(rng: Random, ends: Range) -> float:
+    return float(np.exp(rng.uniform(*np.log(ends))))
+
+
+def _vector(value: Floats) -> tuple[float, float, float]:
+    return float(value[0]), float(value[1]), float(value[2])
 
 
 def _sequence(job: Job, *key: int) -> np.random.SeedSequence:
     return np.random.SeedSequence(job.seed, spawn_key=key)
 
 
-def _generator(job: Job, *key: int) -> np.random.Generator:
+def _generator(job: Job, *key: int) -> Random:
     return np.random.default_rng(_sequence(job, *key))

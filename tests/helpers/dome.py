@@ -8,6 +8,7 @@ from synth.fem.mesh import tetrahedra
 from synth.job import schema
 
 ANATOMY = schema.Anatomy()
+OPENING_MM = ANATOMY.craniotomy.radius_mm
 
 
 def patch(n: int = 61, extent: float = 46.0) -> tuple[np.ndarray, np.ndarray]:

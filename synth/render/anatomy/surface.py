@@ -42,14 +42,6 @@ class Relief:
     sulcus_mm: float
     """Depth of the sulci as seen from outside."""
 
-    @classmethod
-    def draw(cls, anatomy: schema.Anatomy, rng: np.random.Generator) -> Relief:
-        return cls(
-            seed=int(rng.integers(2**31)),
-            gyrus_mm=float(rng.uniform(*anatomy.gyrus_mm)),
-            sulcus_mm=float(rng.uniform(*anatomy.sulcus_mm)),
-        )
-
 
 @dataclass(frozen=True)
 class Surface:

@@ -8,7 +8,6 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from synth.job import schema
 from synth.render.camera.camera import Camera
 from synth.render.mitsuba.adapter import Lamp
 
@@ -16,11 +15,8 @@ Floats = npt.NDArray[np.float64]
 Map = npt.NDArray[np.float32]
 
 _APART = 2.2  # between the lamps, round the optical axis [rad]
-_SPARSE_DEG = 17.0  # slope that mirrors the main lamp into the lens where highlights are fewest
 _STEEPEST_DEG = 6.5
 _FADE = 0.6  # widths of the field over which the spot ends
-_POWER = 0.95, 1.1  # illumination, against one that just fills the sensor with white
-_DRIFT = 0.0, 0.03  # largest change of power over the sequence, as a share of it
 _RAYS = 65  # across a picture
 _WINDOW_DEG = 0.7  # radius of a lamp's window, seen from the tissue
 
@@ -48,23 +44,6 @@ class Lighting:
     """Largest change of power over the sequence."""
     phase: float
     """Where in its slow wave the drift begins [rad]."""
-
-    @classmethod
-    def draw(cls, light: schema.Light, rng: np.random.Generator) -> Lighting:
-        glare = float(rng.uniform(*light.glare))
-        azimuth = float(rng.uniform(-1, 1))
-        return cls(
-            glare=glare,
-            mirror_deg=_SPARSE_DEG * (1 - glare),
-            tilt_deg=None if light.tilt_deg is None else float(rng.uniform(*light.tilt_deg)),
-            azimuth_deg=azimuth * (180.0 if light.tilt_deg is not None else 50.0),
-            main=float(rng.uniform(*light.main)),
-            power=float(rng.uniform(*_POWER)),
-            kelvin=float(rng.uniform(*light.kelvin)),
-            even=float(rng.uniform(*light.even)),
-            drift=float(rng.uniform(*_DRIFT)),
-            phase=float(rng.uniform(0, 2 * np.pi)),
-        )
 
     def gain(self, part: float) -> float:
         """Power at a part (0 to 1) of the sequence, against that of the rest frame."""

@@ -1,17 +1,12 @@
-"""Appearance of one sequence: colours, wetness and rim, drawn within a named family."""
+"""Appearance of one sequence: colours, wetness and rim."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
-import numpy as np
-
-from synth.job.schema import Family, Job
-from synth.render.appearance.family import FAMILIES, Colour
-from synth.render.appearance.light import Lighting, balance
+from synth.render.appearance.family import Colour
+from synth.render.appearance.light import Lighting
 from synth.render.camera.camera_sensor import Sensor
-
-_SHOWN = 0.75  # share of the sequences that show a part of `render.scenery`
 
 
 @dataclass(frozen=True)
@@ -58,49 +53,3 @@ class Look:
     rim_seed: int
     light: Lighting
     sensor: Sensor
-
-    @classmethod
-    def draw(cls, job: Job, family: Family, rng: np.random.Generator) -> Look:
-        """A look of `family` under the job's light, seen by its sensor."""
-        lighting = Lighting.draw(job.light, rng)
-        glare = lighting.glare
-        ranges = FAMILIES[family]
-        drawn = cls(
-            family=family,
-            crown=_near(ranges.crown, rng),
-            flush=_near(ranges.flush, rng),
-            vein=_near(ranges.vein, rng),
-            wine=_near(ranges.wine, rng),
-            arterial=float(rng.uniform(*ranges.arterial)),
-            capillary=float(rng.uniform(*ranges.capillary)),
-            blush=float(rng.uniform(*ranges.blush)),
-            shade=float(rng.uniform(*ranges.shade)),
-            grain=float(rng.uniform(0.008, 0.02)),
-            film_mm=float(rng.uniform(*ranges.film_mm)) + 0.14 * glare**2,
-            bump=float(rng.uniform(*ranges.bump)) * (1 + 3 * glare**2),
-            roughness=float(rng.uniform(0.012, 0.02)) + 0.12 * glare**2,
-            dry_roughness=float(rng.uniform(0.22, 0.34)) * (1 - 0.6 * glare),
-            film_index=1.33 + 0.47 * glare**2,
-            blood=float(rng.uniform(*(job.appearance.blood or ranges.blood))),
-            dura=_near(ranges.dura, rng),
-            beyond=_near(ranges.beyond, rng),
-            cottonoid=bool(rng.uniform() < job.appearance.cottonoid),
-            scenery=(),
-            rim_seed=int(rng.integers(2**31)),
-            light=lighting,
-            sensor=Sensor.draw(job.sensor, balance(lighting.kelvin + rng.uniform(-250, 350)), rng),
-        )
-        return replace(drawn, scenery=_shown(job.render.scenery, drawn.rim_seed))
-
-
-def _shown(parts: tuple[str, ...], seed: int) -> tuple[str, ...]:
-    """Which of the parts that a job allows one sequence shows; from a seed, so that nothing else changes."""
-    seen = np.random.default_rng([seed, 4]).random(len(parts)) < _SHOWN
-    return tuple(part for part, shown in zip(parts, seen, strict=True) if shown)
-
-
-def _near(colour: Colour, rng: np.random.Generator) -> Colour:
-    """A colour a little brighter or darker, redder or bluer."""
-    value = np.asarray(colour) * rng.uniform(0.94, 1.05) * rng.uniform(0.96, 1.04, 3)
-    r, g, b = np.clip(value, 0.01, 0.95).tolist()
-    return r, g, b

@@ -38,24 +38,6 @@ class View:
     off_centre: tuple[float, float]
     """Principal point from the middle of the picture, in its widths; x, y. Likewise."""
 
-    @classmethod
-    def draw(cls, render: Render, rng: np.random.Generator) -> View:
-        drawn = cls(
-            field_mm=float(rng.uniform(*render.field_mm)),
-            working_distance_mm=float(rng.uniform(*render.working_distance_mm)),
-            tilt_deg=float(rng.uniform(*render.tilt_deg)),
-            azimuth_deg=float(rng.uniform(0.0, 360.0)),
-            roll_deg=float(rng.uniform(0.0, 360.0)),
-            focus_mm=float(rng.uniform(-0.5, 0.5)),
-            off_centre=_middle(rng),
-        )
-        if render.calibration is None:
-            return drawn
-        K, width = calibration.read(render.calibration).fitted(render.size), render.size[0]
-        x, y = (K[:2, 2] - (np.array(render.size) - 1) / 2) / width
-        field_mm = float(width * drawn.working_distance_mm / K[0, 0])
-        return replace(drawn, field_mm=field_mm, off_centre=(float(x), float(y)))
-
 
 @dataclass(frozen=True)
 class Camera:
@@ -82,6 +64,15 @@ class Camera:
     def centre(self) -> Floats:
         """(3,) mm: the lens, in world axes."""
         return -self.rotation.T @ self.translation
+
+
+def calibrated(view: View, render: Render) -> View:
+    """The view with a calibrated camera's field and principal point, as `render.calibration` has them."""
+    assert render.calibration is not None
+    K, width = calibration.read(render.calibration).fitted(render.size), render.size[0]
+    x, y = (K[:2, 2] - (np.array(render.size) - 1) / 2) / width
+    field_mm = float(width * view.working_distance_mm / K[0, 0])
+    return replace(view, field_mm=field_mm, off_centre=(float(x), float(y)))
 
 
 def place(view: View, render: Render) -> Camera:
@@ -194,12 +185,6 @@ def undistort(flat: Floats, distortion: Floats) -> Floats:
     if not np.abs(_distort(guess, distortion) - flat).max() < 1e-9:
         raise UserError("render.distortion: this distortion folds the picture over itself")
     return guess
-
-
-def _middle(rng: np.random.Generator) -> tuple[float, float]:
-    """No offset; drawn as when a job could ask for one, so that its zeros keep their signs."""
-    length, angle = rng.uniform(0, 0), rng.uniform(0, 2 * np.pi)
-    return float(length * np.cos(angle)), float(length * np.sin(angle))
 
 
 def _distort(flat: Floats, distortion: Floats) -> Floats:

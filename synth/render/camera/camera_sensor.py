@@ -8,7 +8,6 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from synth.job import schema
 from synth.system.jit import vectorised
 
 Map = npt.NDArray[np.float32]
@@ -49,25 +48,6 @@ class Sensor:
     """Colour resolution of the video: 4:4:4, 4:2:2 or 4:2:0."""
     coded: bool = False
     """Whether a codec follows, which thins the colours out itself."""
-
-    @classmethod
-    def draw(
-        cls, section: schema.Sensor, white: tuple[float, float, float], rng: np.random.Generator
-    ) -> Sensor:
-        """A sensor within the job's ranges, with that white balance."""
-        return cls(
-            exposure=float(rng.uniform(*section.exposure)),
-            white=white,
-            full_well=float(rng.uniform(*section.full_well)),
-            read_noise=float(rng.uniform(*section.read_noise)),
-            vignette=section.vignette,
-            blur=section.blur_px,
-            contrast=float(rng.uniform(*section.contrast)),
-            sharpening=float(rng.uniform(*section.sharpening)),
-            bayer=section.bayer,
-            chroma=section.chroma,
-            coded=section.bitrate_mbps is not None,
-        )
 
 
 def record(radiance: Map, sensor: Sensor, rng: np.random.Generator) -> npt.NDArray[np.uint8]:

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from synth.job.schema import Render
 from synth.render.camera.camera import Camera
 
 Floats = npt.NDArray[np.float64]
@@ -27,14 +26,6 @@ class Sway:
     vibration_mm: float
     """Standard deviation of the fast shift."""
     seed: int
-
-    @classmethod
-    def draw(cls, render: Render, rng: np.random.Generator) -> Sway:
-        return cls(
-            drift_mm=float(rng.uniform(*render.drift_mm)),
-            vibration_mm=float(rng.uniform(*render.vibration_mm)),
-            seed=int(rng.integers(2**31)),
-        )
 
     def at(self, camera: Camera, seconds: float) -> Camera:
         """The camera at a time, `camera` being that of time 0."""

@@ -6,15 +6,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from dome import ANATOMY, patch
+from dome import ANATOMY, OPENING_MM, patch
 from scipy.spatial.transform import Rotation
 
 from synth.fem import solver, tool
-from synth.fem.material import Pia, Tissue
+from synth.fem.material import Pia
 from synth.fem.membrane import Membrane, Sheet, cover
 from synth.fem.mesh import tetrahedra
 from synth.fem.mesh.tetrahedra import Tets
 from synth.job import schema
+from synth.sequence import scenario
 
 Floats = np.ndarray
 
@@ -66,8 +67,8 @@ def test_stretch_pull_and_wrinkles_are_those_of_the_textbook(tets: Tets) -> None
 def test_work_over_a_load_cycle_is_the_stored_energy() -> None:
     """The tools' work on the way up is what is stored at the top, and comes back whole."""
     fem = schema.Fem(gestures=("push",), load=(0.25, 0.25), membrane=schema.Membrane(intact=1))
-    tissue = replace(Tissue.draw(fem, np.random.default_rng(1)), membrane=Pia(300.0, 0.1, 1.02))
-    gesture = tool.Gesture.draw(fem, ANATOMY.craniotomy, tissue, np.random.default_rng(2))
+    tissue = replace(scenario.draw_tissue(fem, np.random.default_rng(1)), membrane=Pia(300.0, 0.1, 1.02))
+    gesture = scenario.draw_gesture(fem, OPENING_MM, tissue.young_kpa, np.random.default_rng(2))
     tets = tetrahedra.block(ANATOMY, 700, 2, tool.focus(gesture))
     vertices, faces = patch(121)
     frames = 97

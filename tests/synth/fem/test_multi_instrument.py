@@ -4,20 +4,20 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from dome import ANATOMY, block, patch
+from dome import OPENING_MM, block, patch
 
-from synth.fem import multi_instrument, solver
+from synth.fem import solver
 from synth.fem.material import Tissue
 from synth.fem.tool import Gesture
 from synth.job import schema
+from synth.sequence import scenario
 
 TISSUE = Tissue(1.0, 0.4, "neo-hookean")
 
 
 def drawn(fem: schema.Fem, seed: int) -> tuple[Gesture, ...]:
     rng = np.random.default_rng(seed)
-    first = Gesture.draw(fem, ANATOMY.craniotomy, TISSUE, rng)
-    return (first, *multi_instrument.further(first, fem, ANATOMY.craniotomy, TISSUE, rng))
+    return scenario.draw_gestures(fem, OPENING_MM, TISSUE.young_kpa, rng, rng)
 
 
 @pytest.mark.parametrize("law", ["linear", "neo-hookean"])
@@ -52,8 +52,8 @@ def test_a_force_takes_the_place_of_the_load() -> None:
     fem = schema.Fem(force_mn=(3.0, 5.0), young_kpa=(2.0, 3.0), footprint_mm=(3.0, 4.0))
     assert fem.largest_load == pytest.approx(5.0 / 18)
     for seed in range(20):
-        tissue = Tissue.draw(fem, np.random.default_rng(seed))
-        gesture = Gesture.draw(fem, ANATOMY.craniotomy, tissue, np.random.default_rng(seed))
+        tissue = scenario.draw_tissue(fem, np.random.default_rng(seed))
+        gesture = scenario.draw_gesture(fem, OPENING_MM, tissue.young_kpa, np.random.default_rng(seed))
         force = np.linalg.norm(gesture.contacts[0].force_mn)
         assert 3.0 <= force <= 5.0
         assert force == pytest.approx(gesture.load * tissue.young_kpa * gesture.footprint_mm**2)

@@ -4,21 +4,21 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from dome import ANATOMY, patch
+from dome import ANATOMY, OPENING_MM, patch
 
 from synth.fem import solver, tool
-from synth.fem.material import Tissue
 from synth.fem.mesh import tetrahedra
 from synth.fem.pulse import Pulse
 from synth.job import schema
+from synth.sequence import scenario
 
 RATE, FRAMES = 10.0, 61
 
 
 def moved(pulse: Pulse | None, law: str, **fem: object) -> solver.Deformation:
     asked = schema.Fem.model_validate({"gestures": ("pull",), "load": 0.1, "law": law} | fem)
-    tissue = Tissue.draw(asked, np.random.default_rng(1))
-    gesture = tool.Gesture.draw(asked, ANATOMY.craniotomy, tissue, np.random.default_rng(2))
+    tissue = scenario.draw_tissue(asked, np.random.default_rng(1))
+    gesture = scenario.draw_gesture(asked, OPENING_MM, tissue.young_kpa, np.random.default_rng(2))
     tets = tetrahedra.block(ANATOMY, 300, 2, tool.focus(gesture))
     return solver.deform(
         asked, tissue, gesture, tets, *patch(), FRAMES, RATE, pulse=pulse, opening=ANATOMY.craniotomy

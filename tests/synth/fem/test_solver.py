@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from dome import ANATOMY, block, patch
+from dome import ANATOMY, OPENING_MM, block, patch
 from pydantic import ValidationError
 
 from synth.errors import UserError
@@ -17,14 +17,15 @@ from synth.fem.mesh.refine import EDGES
 from synth.fem.solver import Deformation, InvertedElement, deform
 from synth.fem.tool import Gesture
 from synth.job import laws, schema
+from synth.sequence import scenario
 
 
 def drawn(fem: schema.Fem, tissue: Tissue, seed: int = 5) -> Gesture:
-    return Gesture.draw(fem, ANATOMY.craniotomy, tissue, np.random.default_rng(seed))
+    return scenario.draw_gesture(fem, OPENING_MM, tissue.young_kpa, np.random.default_rng(seed))
 
 
 def run(fem: schema.Fem, gesture: Gesture | None = None, seed: int = 5, frames: int = 12) -> Deformation:
-    tissue = Tissue.draw(fem, np.random.default_rng(seed))
+    tissue = scenario.draw_tissue(fem, np.random.default_rng(seed))
     gesture = gesture or drawn(fem, tissue, seed)
     return deform(fem, tissue, gesture, block(fem), *patch(), frames, 25.0)
 

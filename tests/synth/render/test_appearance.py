@@ -12,10 +12,8 @@ from synth.render.anatomy import surface as anatomy
 from synth.render.anatomy import texture
 from synth.render.anatomy.surface import Relief, Surface
 from synth.render.appearance import light
-from synth.render.appearance.light import Lighting
-from synth.render.appearance.look import Look
 from synth.render.camera import camera
-from synth.render.camera.camera import View
+from synth.sequence import scenario
 
 JOB = Job.model_validate(
     {"anatomy": {"vertices": 2500}, "render": {"size": (64, 48), "variant": "scalar_rgb"}}
@@ -47,7 +45,7 @@ def test_a_photograph_is_the_albedo(brain: Surface, tmp_path: Path) -> None:
     picture[:, :45], picture[:, 45:] = (30, 60, 200), (40, 180, 60)  # red left, green right, as BGR
     path = tmp_path / "photo.png"
     cv2.imwrite(str(path), picture)
-    look = Look.draw(JOB, "healthy", np.random.default_rng(0))
+    look = scenario.draw_look(JOB, "healthy", np.random.default_rng(0))
     coat = texture.cortex(brain, look, 128, path)
     assert coat.albedo[64, 20, 0] > 4 * coat.albedo[64, 20, 1]
     assert coat.albedo[64, 108, 1] > 4 * coat.albedo[64, 108, 0]
@@ -55,8 +53,8 @@ def test_a_photograph_is_the_albedo(brain: Surface, tmp_path: Path) -> None:
 
 def test_the_spot_moves_with_the_microscope_and_is_one_for_both_eyes() -> None:
     render = Render(stereo_mm=24.0)
-    lens = camera.place(View.draw(render, np.random.default_rng(2)), render)
-    drawn = Lighting.draw(Light(even=(0.3, 0.3)), np.random.default_rng(0))
+    lens = camera.place(scenario.draw_view(render, np.random.default_rng(2)), render)
+    drawn = scenario.draw_light(Light(even=(0.3, 0.3)), np.random.default_rng(0))
     right = camera.beside(lens, 24.0)
     field = lens.size[0] * lens.mm_per_px
     axis = lens.centre / np.linalg.norm(lens.centre)

@@ -9,7 +9,7 @@ import pytest
 from synth.errors import UserError
 from synth.job.schema import Render
 from synth.render.camera import calibration, camera
-from synth.render.camera.camera import View
+from synth.sequence import scenario
 
 K = np.array([[5200.0, 0.0, 331.5], [0.0, 5180.0, 244.25], [0.0, 0.0, 1.0]])
 LENS = np.array([[-0.21, 0.08, 0.001, -0.002, 0.03]])
@@ -35,7 +35,7 @@ def test_what_opencv_wrote_is_read(tmp_path: Path, name: str) -> None:
 
 def test_the_camera_projects_as_opencv_does(tmp_path: Path) -> None:
     render = Render(calibration=written(tmp_path / "c.yaml"), tilt_deg=(12.0, 12.0))
-    lens = camera.place(View.draw(render, np.random.default_rng(3)), render)
+    lens = camera.place(scenario.draw_view(render, np.random.default_rng(3)), render)
     points = np.random.default_rng(0).uniform(-10, 10, (50, 3))
     turn, _ = cv2.Rodrigues(lens.rotation)
     expected, _ = cv2.projectPoints(points, turn, lens.translation, K, LENS)

@@ -9,12 +9,10 @@ import pytest
 
 from synth.job.schema import Anatomy, Job, Render, Store
 from synth.render.anatomy import surface as anatomy
-from synth.render.anatomy.surface import Relief
-from synth.render.appearance.look import Look
 from synth.render.camera import camera
-from synth.render.camera.camera import View
 from synth.render.mitsuba.adapter import cuda
 from synth.render.scene import Moment, Studio
+from synth.sequence import scenario
 from synth.system import llvm
 
 VARIANTS = ["scalar_rgb", *(["llvm_ad_rgb"] if llvm.find() else []), *(["cuda_ad_rgb"] if cuda() else [])]
@@ -29,9 +27,9 @@ def studio(
     job = Job(
         anatomy=Anatomy(vertices=2500), render=Render.model_validate(settings), store=Store(extra=extra)
     )
-    surface = anatomy.procedural(Relief.draw(job.anatomy, np.random.default_rng(4)), job.anatomy)
-    view = View.draw(job.render, np.random.default_rng(4))
-    look = Look.draw(job, "healthy", np.random.default_rng(4))
+    surface = anatomy.procedural(scenario.draw_relief(job.anatomy, np.random.default_rng(4)), job.anatomy)
+    view = scenario.draw_view(job.render, np.random.default_rng(4))
+    look = scenario.draw_look(job, "healthy", np.random.default_rng(4))
     return Studio(surface, look, camera.place(view, job.render), job), surface.vertices
 
 

@@ -9,11 +9,9 @@ import pytest
 
 from synth.job.schema import Anatomy, Job, Render
 from synth.render.anatomy import surface as anatomy
-from synth.render.anatomy.surface import Relief
-from synth.render.appearance.look import Look
 from synth.render.camera import camera
-from synth.render.camera.camera import View
 from synth.render.scene import Studio
+from synth.sequence import scenario
 
 TIPS = np.array([[-1.0, 1.0, 0.2], [1.2, 1.4, 0.2]])
 SHAFTS = np.array([[0.6, 0.3, 0.74], [0.6, 0.3, 0.74]])
@@ -22,9 +20,9 @@ SHAFTS = np.array([[0.6, 0.3, 0.74], [0.6, 0.3, 0.74]])
 def studio(parts: tuple[str, ...], tool: bool = False) -> tuple[Studio, np.ndarray]:
     render = {"size": (96, 72), "variant": "scalar_rgb", "tool": tool, "scenery": parts}
     job = Job(anatomy=Anatomy(vertices=2500), render=Render.model_validate(render))
-    surface = anatomy.procedural(Relief.draw(job.anatomy, np.random.default_rng(4)), job.anatomy)
-    view = View.draw(job.render, np.random.default_rng(4))
-    look = replace(Look.draw(job, "healthy", np.random.default_rng(4)), scenery=parts)
+    surface = anatomy.procedural(scenario.draw_relief(job.anatomy, np.random.default_rng(4)), job.anatomy)
+    view = scenario.draw_view(job.render, np.random.default_rng(4))
+    look = replace(scenario.draw_look(job, "healthy", np.random.default_rng(4)), scenery=parts)
     return Studio(surface, look, camera.place(view, job.render), job), surface.vertices
 
 

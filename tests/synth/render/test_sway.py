@@ -7,15 +7,14 @@ import numpy as np
 
 from synth.job.schema import Render
 from synth.render.camera import camera
-from synth.render.camera.camera import View
-from synth.render.camera.sway import Sway
+from synth.sequence import scenario
 
 RENDER = Render(tilt_deg=(15.0, 15.0), drift_mm=(0.4, 0.4), vibration_mm=(0.02, 0.02))
-LENS = camera.place(View.draw(RENDER, np.random.default_rng(1)), RENDER)
+LENS = camera.place(scenario.draw_view(RENDER, np.random.default_rng(1)), RENDER)
 
 
 def test_vibration_has_the_deviation_asked_for() -> None:
-    sway = replace(Sway.draw(RENDER, np.random.default_rng(5)), drift_mm=0.0)
+    sway = replace(scenario.draw_sway(RENDER, np.random.default_rng(5)), drift_mm=0.0)
     x = [sway.at(LENS, t).translation for t in np.arange(0, 4, 0.005)]
     np.testing.assert_allclose(np.std(x, axis=0), 0.02, rtol=0.15)
 
