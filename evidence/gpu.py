@@ -23,7 +23,7 @@ from evidence.learn.runs import JOB
 from learn.data.grid import Grid
 from learn.data.split import nested
 from learn.evaluation.evaluate import evaluate
-from learn.inference.predict import load_predictor
+from learn.inference.predict import load_model
 from learn.settings import preset, replace
 from learn.training.threads import make_fabric, set_threads
 from learn.training.train import train
@@ -131,9 +131,7 @@ def full_size(
     train(clips, split, settings, out / "model", fabric=fabric)
     trained = time.perf_counter() - began
     tested = [clips[i] for i in split.test]
-    found: Mapping[str, float] = evaluate(
-        load_predictor(out / "model", fabric.device), tested, "ideal"
-    ).summary()
+    found: Mapping[str, float] = evaluate(load_model(out / "model", fabric.device), tested, "ideal").summary()
     count = sum(clips[i].frames for i in split.fit)
     result = {
         "device": torch.cuda.get_device_name() if gpu else "cpu",

@@ -23,7 +23,7 @@ from torch import Tensor
 
 from learn.data.grid import Scales
 from learn.network.d2fnet import Architecture, D2FNet
-from learn.settings import Settings, upgraded
+from learn.settings import TrainingSettings, upgraded
 from learn.uncertainty.intervals import Intervals
 from synth.errors import UserError
 from synth.job import identity, retired
@@ -39,16 +39,16 @@ _WEIGHTS, _NEXT, _SAFE = "weights.pt", "weights.next.pt", "weights.safetensors"
 _OF_MAP = ("map", "contact", "map_unit")
 """Blocks of intervals that older cards hold of the map's cells: no more used."""
 SEEN = ("fit", "select", "intervals")
-"""Parts of `Card.split` that no score of the model may be of."""
+"""Parts of `ModelCard.split` that no score of the model may be of."""
 
 
 @dataclass(frozen=True)
-class Card:
+class ModelCard:
     """What a model says of itself: enough to use it without the data it came from."""
 
     __pydantic_config__ = ConfigDict(extra="forbid")
 
-    settings: Settings
+    settings: TrainingSettings
     scales: Scales
     typical_young_kpa: Positive
     """Geometric mean of E in the training data: stands in where E is unknown."""
@@ -70,14 +70,13 @@ class Card:
     no_intervals: str = ""
     """Why it could not be; empty if it could, or nobody tried."""
     retired: dict[str, Any] = field(default_factory=dict)
-    """Settings of the training that this version has no more, by dotted key: the model can be used, and not
-    trained further."""
+    """Training settings that this version has no more, by dotted key: it can be used, not trained on."""
 
 
-_CARD = TypeAdapter(Card)
+_CARD = TypeAdapter(ModelCard)
 
 
-def write_card(folder: Path, card: Card) -> None:
+def write_card(folder: Path, card: ModelCard) -> None:
     """Writes config.json into a model's folder, whole or not at all."""
     folder.mkdir(parents=True, exist_ok=True)
     tree = {"format": _FORMAT, "version": _VERSION, **_CARD.dump_python(card, mode="json")}
@@ -85,7 +84,9 @@ def write_card(folder: Path, card: Card) -> None:
     _write(folder / "config.json", (json.dumps(tree, indent=1) + "\n").encode())
 
 
-def write_model(folder: Path, card: Card, state: Mapping[str, Tensor], *, safe: bool = False) -> Card:
+def write_model(
+    folder: Path, card: ModelCard, state: Mapping[str, Tensor], *, safe: bool = False
+) -> ModelCard:
     """Writes weights and card, so that a kill leaves the old ones or the new ones; the card as written.
 
     `safe`: as weights.safetensors, into a folder that holds no model yet.
@@ -103,7 +104,7 @@ def write_model(folder: Path, card: Card, state: Mapping[str, Tensor], *, safe: 
     return card
 
 
-def read_card(folder: Path) -> Card:
+def read_card(folder: Path) -> ModelCard:
     """Raises UserError if there is no model, or its config is damaged, edited or of another version."""
     file = folder / "config.json"
     if not file.exists():
@@ -168,7 +169,7 @@ def load_tensors(file: Path) -> dict[str, Any]:
     return tree
 
 
-def load_model(folder: Path) -> tuple[D2FNet, Card]:
+def read_model(folder: Path) -> tuple[D2FNet, ModelCard]:
     """The trained network, in evaluation mode on the CPU, and its card.
 
     Raises UserError if card or weights are damaged, edited, or not each other's.
@@ -207,7 +208,7 @@ def room_needed(folder: Path, arch: Architecture) -> int:
     return max(needed - sum(file.stat().st_size for file in written if file.is_file()), 1)
 
 
-def _find_weights(folder: Path, card: Card) -> Path:
+def _find_weights(folder: Path, card: ModelCard) -> Path:
     """The weights that the card was written for: under their next name if a kill came in between."""
     for file in (folder / _WEIGHTS, folder / _NEXT, folder / _SAFE):
         if file.is_file():

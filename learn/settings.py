@@ -20,7 +20,7 @@ AtLeastOne = Annotated[int, Field(ge=1)]
 S = TypeVar("S", bound=Section)
 
 
-class Settings(Section):
+class TrainingSettings(Section):
     """One training run: same settings, same data, same weights (bit for bit, on one CPU)."""
 
     size: Annotated[int, Field(ge=16, le=1024, multiple_of=16)] = 256
@@ -61,7 +61,7 @@ class Settings(Section):
     seed: Count = 0
 
     @model_validator(mode="after")
-    def _goes_together(self) -> Settings:
+    def _goes_together(self) -> TrainingSettings:
         if self.target == "intensity" and self.arch.output != "magnitude":
             raise ValueError("target 'intensity' has no direction: it needs output 'magnitude'")
         if self.arch.depth != has_depth(self.input):
@@ -78,90 +78,6 @@ class Settings(Section):
     def grid(self) -> Grid:
         return Grid(self.size, self.extent_mm)
 
-    def as_dict(self) -> dict[str, Any]:
-        return self.model_dump()
-
-
-PRESETS: dict[str, Settings] = {
-    # Seconds to minutes: shows that everything joins up, not how good it can be.
-    "tiny": Settings(
-        size=64,
-        arch=Architecture(width=16, stem=2, levels=3, dropout=0.0),
-        epochs=20,
-        # In a run this short the anti-ghost loss has only learnt to say little (docs/results/learn).
-        loss="mse",
-        learning_rate=2e-3,
-        schedule="cosine",
-        channels_last=True,
-        batch=8,
-    ),
-    # At most 20 minutes on one core, with however many sequences: tells good choices from bad.
-    "cpu": Settings(
-        size=128,
-        # A stem of 2 errs no less and takes twice the time, in training too (docs/results/learn/pareto).
-        # Magnitudes: on vectors this loss leaves 0.10 less of R² than squared error (docs/results/learn).
-        arch=Architecture(width=16, stem=4, levels=4, output="magnitude", dropout=0.05),
-        epochs=24,
-        loss="ghostless",
-        learning_rate=1e-3,
-        schedule="cosine",
-        channels_last=True,
-        batch=8,
-        frames=12,
-        epoch_frames=4000,
-    ),
-    # d2fnet-s: 256², 10 ms a frame on one core (12 with a fourth halving).
-    "live": Settings(
-        size=256,
-        arch=Architecture(width=16, stem=4, levels=3, output="magnitude", dropout=0.05),
-        loss="ghostless",
-        learning_rate=1e-3,
-    ),
-    # Two eyes: `cpu` and `live` told motion in three dimensions. Force is then seen along the view as well,
-    # so they answer with vectors, and squared error, a frame's own too, is what serves those.
-    # What lifts the whole surface they see as well: without sway a breath was read as a press.
-    "eyes": Settings(
-        size=128,
-        arch=Architecture(
-            width=16, stem=4, levels=4, confidence=True, depth=True, dropout=0.05, relative=True
-        ),
-        input="motion-mixed",
-        epochs=24,
-        loss="mse-frame",
-        sway_mm=0.5,
-        learning_rate=1e-3,
-        schedule="cosine",
-        channels_last=True,
-        batch=8,
-        frames=12,
-        epoch_frames=4000,
-    ),
-    "eyes-live": Settings(
-        size=256,
-        arch=Architecture(
-            width=16, stem=4, levels=3, confidence=True, depth=True, dropout=0.05, relative=True
-        ),
-        input="motion-mixed",
-        loss="mse-frame",
-        sway_mm=0.5,
-        learning_rate=1e-3,
-    ),
-    # The network, loss weights and schedule of Heraoui et al., on our targets.
-    "paper": Settings(arch=Architecture(width=32, stem=1, dropout=0.1)),
-}
-
-
-def override(settings: Settings, changes: Iterable[str]) -> Settings:
-    """Settings with `key=value` or `arch.key=value` replaced, values in YAML.
-
-    Raises UserError: a line for each unknown key (with the nearest one) and each value that can't be.
-    """
-    changes = list(changes)
-    for key, _, value in (one.partition("=") for one in changes):
-        if key.strip() in retired.TRAINING:
-            raise UserError(retired.reason(key.strip(), value))
-    return reader.override(settings, changes)
-
 
 def replace(settings: S, **changes: Any) -> S:
     """Settings or an architecture with some values replaced, and checked anew.
@@ -171,11 +87,90 @@ def replace(settings: S, **changes: Any) -> S:
     return type(settings).model_validate(dict(settings) | changes)
 
 
-def preset(name: str, **changes: Any) -> Settings:
+_SHORT: dict[str, Any] = {
+    "epochs": 24,
+    "schedule": "cosine",
+    "channels_last": True,
+    "frames": 12,
+    "epoch_frames": 4000,
+}
+# What lifts the whole surface a second eye sees as well: without sway a breath was read as a press.
+_STEREO: dict[str, Any] = {
+    "input": "motion-mixed",
+    "loss": "mse-frame",
+    "sway_mm": 0.5,
+    "learning_rate": 1e-3,
+}
+_STEREO_ARCH = Architecture(width=16, stem=4, confidence=True, depth=True, dropout=0.05, relative=True)
+PRESETS: dict[str, TrainingSettings] = {
+    # Seconds to minutes: shows that everything joins up, not how good it can be.
+    "tiny": TrainingSettings(
+        size=64,
+        arch=Architecture(width=16, stem=2, levels=3, dropout=0.0),
+        epochs=20,
+        # In a run this short the anti-ghost loss has only learnt to say little (docs/results/learn).
+        loss="mse",
+        learning_rate=2e-3,
+        schedule="cosine",
+        channels_last=True,
+    ),
+    # At most 20 minutes on one core, with however many sequences: tells good choices from bad.
+    "cpu": TrainingSettings(
+        size=128,
+        # A stem of 2 errs no less and takes twice the time, in training too (docs/results/learn/pareto).
+        # Magnitudes: on vectors this loss leaves 0.10 less of R² than squared error (docs/results/learn).
+        arch=Architecture(width=16, stem=4, output="magnitude", dropout=0.05),
+        loss="ghostless",
+        learning_rate=1e-3,
+        **_SHORT,
+    ),
+    # d2fnet-s: 256², 10 ms a frame on one core (12 with a fourth halving).
+    "live": TrainingSettings(
+        arch=Architecture(width=16, stem=4, levels=3, output="magnitude", dropout=0.05),
+        loss="ghostless",
+        learning_rate=1e-3,
+    ),
+    # `cpu` and `live` given motion in three dimensions. Force is then seen along the view as well, so they
+    # answer with vectors, and squared error, a frame's own too, is what serves those.
+    "stereo": TrainingSettings(size=128, arch=_STEREO_ARCH, **_SHORT, **_STEREO),
+    "stereo-live": TrainingSettings(arch=replace(_STEREO_ARCH, levels=3), **_STEREO),
+    # The network, loss weights and schedule of Heraoui et al., on our targets.
+    "paper": TrainingSettings(arch=Architecture(width=32, stem=1, dropout=0.1)),
+}
+
+
+def preset(name: str, **changes: Any) -> TrainingSettings:
     """A preset with some settings replaced. Raises UserError for an unknown name."""
+    name = retired.PRESETS.get(name, name)
     if name not in PRESETS:
         raise UserError(f"unknown preset {name!r}: one of {', '.join(PRESETS)}")
     return replace(PRESETS[name], **changes)
+
+
+def as_changes(words: Iterable[str]) -> dict[str, str]:
+    """A command line's `key=value`, `--key=value` and `--key value` as `{key: value}`, the last of a key.
+
+    An `input` brings the `arch.depth` that goes with it, unless that is given too.
+    """
+    changes, rest = dict[str, str](), iter(words)
+    for word in rest:
+        key, equals, value = word.removeprefix("--").partition("=")
+        changes[key.strip()] = value if equals or not word.startswith("--") else next(rest, "")
+    if "input" in changes:
+        changes.setdefault("arch.depth", str(has_depth(changes["input"])))
+    return changes
+
+
+def override(settings: TrainingSettings, changes: Iterable[str]) -> TrainingSettings:
+    """Settings with `key=value` or `arch.key=value` replaced, values in YAML.
+
+    Raises UserError: a line for each unknown key (with the nearest one) and each value that can't be.
+    """
+    changes = list(changes)
+    for key, _, value in (one.partition("=") for one in changes):
+        if key.strip() in retired.TRAINING:
+            raise UserError(retired.reason(key.strip(), value))
+    return reader.override(settings, changes)
 
 
 _FRAMED = {"kind": "hinge", "r2_weight": 0.5, "r2_scope": "frame", "total_weight": 0.0}
@@ -192,8 +187,8 @@ _OBJECTIVES: dict[str, dict[str, Any]] = {
 
 
 def upgraded(tree: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Settings as an older version wrote them: `(settings, others)`, as this one has them, and by dotted key
-    what it has no more."""
+    """Settings as an older version wrote them: `(settings, others)`, as this one has them, and what it has no
+    more, by dotted key."""
     settings, others = retired.drop(tree, retired.TRAINING)
     objective = settings.pop("objective", None)
     if objective is not None:

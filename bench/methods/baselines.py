@@ -23,7 +23,7 @@ from bench.methods.protocol import Answer, Method, Scene
 from learn.data.clips import has_depth
 from learn.data.grid import Grid, certainty
 from learn.inference.force_reader import assumed_young
-from learn.inference.predict import View
+from learn.inference.predict import GridView
 from synth.errors import UserError
 from synth.flow.stereo.track import Moved
 
@@ -51,7 +51,7 @@ class Baseline:
     _last: ClassVar[
         dict[int, tuple[NDArray[np.float32], Scene, NDArray[np.float32], NDArray[np.float32]]]
     ] = {}
-    _view: tuple[Scene, View] | None = None
+    _view: tuple[Scene, GridView] | None = None
 
     def __init__(self, rule: Rule, space: Space = "never") -> None:
         self._rule, self._space = rule, space
@@ -83,7 +83,7 @@ class Baseline:
         """Of displacement (H, W, C) mm and its confidence ([2,] H, W); equal where `key` is the same."""
         view = Baseline._view
         if view is None or view[0] is not scene:
-            Baseline._view = view = (scene, View(scene.tissue, scene.scale_mm_per_px, GRID))
+            Baseline._view = view = (scene, GridView(scene.tissue, scene.scale_mm_per_px, GRID))
         last = Baseline._last.get(shift.shape[-1])
         if last is None or last[0] is not key or last[1] is not scene:
             mean = view[1].resample.mean

@@ -27,9 +27,9 @@ class Model:
             model: its folder, or the model itself.
             quick: of a folder: spend half a second on a graph that takes a third less a frame.
         """
-        from learn.inference.predict import load_predictor
+        from learn.inference.predict import load_model
 
-        self.predictor: Predictor = load_predictor(model, quick=quick) if isinstance(model, Path) else model
+        self.predictor: Predictor = load_model(model, quick=quick) if isinstance(model, Path) else model
         self._reader: tuple[Scene, ForceReader] | None = None
 
     def described(self) -> dict[str, object]:

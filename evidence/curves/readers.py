@@ -22,7 +22,7 @@ from learn.data.grid import Grid
 from learn.evaluation.evaluate import evaluate
 from learn.evaluation.statistics import interval
 from learn.inference.predict import Predictor
-from learn.settings import Settings
+from learn.settings import TrainingSettings
 from learn.training.threads import set_threads
 from synth.dataset.store import Dataset
 from synth.errors import UserError
@@ -177,10 +177,10 @@ def _by_components(one: Reader, fit: Sequence[Clip]) -> Answer:
     )
 
 
-def network_settings(one: Reader, steps: int, frames: int) -> Settings:
+def network_settings(one: Reader, steps: int, frames: int) -> TrainingSettings:
     """Of a network's training: as many epochs as make up `steps` batches of the `frames` there are."""
     arch = NETWORKS[one.model] | {"output": "vector", "confidence": True, "relative": True}
-    return Settings.model_validate(
+    return TrainingSettings.model_validate(
         {
             "size": GRID.size,
             "arch": arch | {"depth": one.eyes == 2},

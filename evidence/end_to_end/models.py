@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from bench.methods import baselines
 from learn.data.clips import Clip
 from learn.data.split import Split
-from learn.inference.predict import Predictor, load_predictor
-from learn.settings import Settings
+from learn.inference.predict import Predictor, load_model
+from learn.settings import TrainingSettings
 from learn.training import batches
 from learn.training.train import train
 
@@ -94,12 +94,14 @@ def samples(fit: Sequence[Clip], source: str = "recovered") -> tuple[Floats, Flo
     return x, force, group
 
 
-def train_network(fit: Sequence[Clip], choose: Sequence[Clip], settings: Settings, folder: Path) -> Predictor:
+def train_network(
+    fit: Sequence[Clip], choose: Sequence[Clip], settings: TrainingSettings, folder: Path
+) -> Predictor:
     """A network of vectors; `choose` chooses the epoch. Kept in `folder`."""
     clips = [*fit, *choose]
     split = Split(tuple(range(len(fit))), tuple(range(len(fit), len(clips))), ())
     train(clips, split, settings, folder)
-    return load_predictor(folder)
+    return load_model(folder)
 
 
 def read_force(predictor: Predictor, clip: Clip, source: str) -> Floats:

@@ -25,7 +25,7 @@ from synth.engine import run, slots
 from synth.engine.progress import Bars
 from synth.job import reader
 from synth.job.schema import Job
-from synth.system.stopwatch import Report
+from synth.system.stopwatch import ProgressCallback
 
 _CPU_S = "STAND_IN_CPU_S"
 """Variable that tells workers how long a stand-in computes [s]."""
@@ -129,7 +129,7 @@ def workers(sequences: int, cpu_s: float) -> dict[str, float | int]:
     }
 
 
-def compute(job: Job, index: int, folder: Path, tell: Report) -> None:
+def compute(job: Job, index: int, folder: Path, tell: ProgressCallback) -> None:
     """A stand-in for rendering: so much arithmetic, then a store of random fields."""
     rng = np.random.default_rng((job.seed, index))
     matrix = rng.normal(size=(200, 200))

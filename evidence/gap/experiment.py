@@ -25,7 +25,7 @@ from evidence.gap.runs import KEYS, Training, carry_out, with_flow
 from learn.data.clips import Clip, load_clips
 from learn.data.split import Split, folds, groups, nested
 from learn.evaluation.statistics import interval, paired
-from learn.settings import Settings, preset, replace
+from learn.settings import TrainingSettings, preset, replace
 from learn.training.threads import set_threads
 from synth.dataset.store import Dataset
 from synth.errors import UserError
@@ -85,7 +85,7 @@ def main(
     sizes = (split.fit, split.select, seen, split.test)
     found: dict[str, Any] = {
         "data": status.data(dataset, unseen),
-        "settings": settings.as_dict(),
+        "settings": settings.model_dump(),
         "held_out": unseen.name,
         "sequences": dict(zip(("fit", "select", "test", "unseen"), map(len, sizes), strict=True)),
         "seeds": seeds,
@@ -103,7 +103,9 @@ def compared(runs: Mapping[Training, Mapping[str, Any]]) -> dict[str, Any]:
     return {flow: _plain(summary(trained)) for flow, trained in by.items()}
 
 
-def parts(clips: Sequence[Clip], unseen: Sequence[Clip], settings: Settings) -> tuple[Split, tuple[int, ...]]:
+def parts(
+    clips: Sequence[Clip], unseen: Sequence[Clip], settings: TrainingSettings
+) -> tuple[Split, tuple[int, ...]]:
     """Fit and select from `clips`, with all of `unseen`, which follow them, as test; and a test of `clips`.
 
     Raises:

@@ -16,8 +16,8 @@ from learn.data.clips import Clip
 from learn.data.grid import Grid
 from learn.data.split import Split
 from learn.evaluation.evaluate import evaluate
-from learn.inference.predict import load_predictor
-from learn.settings import Settings
+from learn.inference.predict import load_model
+from learn.settings import TrainingSettings
 from learn.settings import replace as changed
 from learn.training.train import train
 from synth.dataset.store import Sequence as Stored
@@ -77,7 +77,7 @@ def carry_out(
     training: Training,
     clips: Sequence[Clip],
     split: Split,
-    settings: Settings,
+    settings: TrainingSettings,
     tests: Tests,
     work: Path,
 ) -> dict[str, Any]:
@@ -94,7 +94,7 @@ def carry_out(
     # Training on ideal flow is the same whatever flow the test recovers.
     flow = "" if training.kind == "I" else f"-{training.flow}"
     used = [clips[i].content_hash for i in (*split.fit, *split.select)]
-    trained = [training.kind, flow, chosen.as_dict(), len(split.fit), used]
+    trained = [training.kind, flow, chosen.model_dump(), len(split.fit), used]
     model = work / "models" / f"{training.kind}{flow}-seed{training.seed}-{cache.key(*trained)}"
     name = f"{training.kind}-{training.flow}-seed{training.seed}"
 
@@ -103,7 +103,7 @@ def carry_out(
         if training.kind == "N":
             fitted, noise = with_fitted_noise(fitted, split.fit, training.seed)
         train(fitted, split, chosen, model)
-        predictor = load_predictor(model)
+        predictor = load_model(model)
         errors = {
             test: {key: [row[key] for row in evaluate(predictor, part, source).per_clip()] for key in KEYS}
             for test, (part, source) in tests.items()

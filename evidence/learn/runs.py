@@ -24,9 +24,9 @@ from learn.data.split import Split, nested
 from learn.evaluation.evaluate import evaluate
 from learn.evaluation.metrics import METRICS
 from learn.evaluation.statistics import Interval, interval, paired
-from learn.inference.predict import Predictor, load_predictor
+from learn.inference.predict import Predictor, load_model
 from learn.loss import Loss
-from learn.settings import Settings, preset, replace
+from learn.settings import TrainingSettings, preset, replace
 from learn.training.threads import set_threads
 from learn.training.train import train
 from synth.job import reader
@@ -38,7 +38,7 @@ SCORES = ("map_r2", "map_rmse", "force_mae", "ghost_relative", "stray_mn", "low_
 """Of a tested sequence; `learn.evaluation.metrics` says what they are."""
 
 
-def study() -> Settings:
+def study() -> TrainingSettings:
     """About a core-minute of training, the same for every choice that is compared."""
     base = preset("tiny", epochs=8, folds=3, loss="mse")
     return replace(base, arch=replace(base.arch, output="magnitude"))
@@ -49,7 +49,7 @@ class Run:
     """One training."""
 
     name: str
-    settings: Settings
+    settings: TrainingSettings
 
 
 def main(
@@ -152,7 +152,7 @@ def fit(run: Run, clips: Sequence[Clip], cache: Path) -> Predictor:
     """The run's network, trained if it isn't in `cache`."""
     model = cache / "models" / f"{run.name}-{_key(run, clips)}"
     train(clips, _split(run, clips), run.settings, model)
-    return load_predictor(model)
+    return load_model(model)
 
 
 def pictured(job: Job, size: int) -> Job:
@@ -168,7 +168,7 @@ def _split(run: Run, clips: Sequence[Clip]) -> Split:
 
 
 def _key(run: Run, clips: Sequence[Clip]) -> str:
-    return kept.key(run.settings.as_dict(), [clip.content_hash for clip in clips])
+    return kept.key(run.settings.model_dump(), [clip.content_hash for clip in clips])
 
 
 if __name__ == "__main__":

@@ -22,7 +22,7 @@ from learn.data.clips import load_clips, scored
 from learn.evaluation.coverage import cover
 from learn.evaluation.evaluate import unseen as never_met
 from learn.inference import shipped
-from learn.inference.predict import Predictor, load_predictor
+from learn.inference.predict import Predictor, load_model
 from learn.training.threads import set_threads
 from synth.dataset.store import Dataset
 from synth.errors import UserError
@@ -52,7 +52,7 @@ def main(
     set_threads(1)
     rows = []
     for name, folder in (word.split("=", 1) for word in model):
-        predictor = load_predictor(Path(folder))
+        predictor = load_model(Path(folder))
         own = [_row(predictor, root, cache) for root in (data, *unseen)]
         rows += [{"model": name} | row for row in own]
         if pack and name in shipped.NAMES:

@@ -20,7 +20,7 @@ from evidence.learn.runs import JOB, Run, carry_out, fit, study
 from learn.data.clips import Clip
 from learn.data.grid import Grid
 from learn.data.split import Split, nested
-from learn.evaluation.evaluate import Report, evaluate
+from learn.evaluation.evaluate import EvaluationReport, evaluate
 from learn.loss import Loss
 from learn.settings import replace
 from learn.training.threads import set_threads
@@ -104,7 +104,7 @@ def shown(clips: Sequence[Clip], split: Split, name: Loss, cache: Path) -> list[
     return [{"trained with": name, "shown": what} | row for what, row in rows.items()]
 
 
-def numbers(found: Report, young: str = "known") -> dict[str, float | None]:
+def numbers(found: EvaluationReport, young: str = "known") -> dict[str, float | None]:
     """What a row holds of a report."""
     one = found.summary(young)
     return {

@@ -6,7 +6,7 @@ import hashlib
 import json
 import tempfile
 import zlib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -24,6 +24,7 @@ from synth.dataset.store import Dataset, Sequence
 from synth.errors import UserError
 from synth.job import identity
 from synth.system import checked_file
+from synth.system.terminal import ProgressCallback
 
 Input = Literal["ideal", "recovered", "noisy", "mixed", "motion", "motion-ideal", "motion-mixed"]
 INPUTS = get_args(Input)
@@ -185,7 +186,7 @@ def load_clips(
     wanted: Iterable[str],
     *,
     cache: Path | None = None,
-    report: Callable[[int, int], None] = lambda done, of: None,
+    report: ProgressCallback = lambda done, of: None,
 ) -> list[Clip]:
     """All sealed sequences of a dataset, in order.
 

@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from learn.data.clips import Clip
-from learn.evaluation.fit_intervals import read_said
+from learn.evaluation.fit_intervals import predict_clip
 from learn.evaluation.statistics import Interval, interval
 from learn.inference.predict import Predictor
 from learn.uncertainty.conformal import LEVELS
 from learn.uncertainty.features import is_moving
-from learn.uncertainty.intervals import Intervals, Said
+from learn.uncertainty.intervals import Intervals, Prediction
 from synth.errors import UserError
 
 
@@ -60,7 +60,7 @@ def cover(predictor: Predictor, clips: Sequence[Clip], source: str) -> list[Cove
     rows: dict[float, list[list[float]]] = {level: [] for level in LEVELS}
     far = [np.zeros(0)]
     for clip in clips:
-        said = read_said(predictor, clip, source)
+        said = predict_clip(predictor, clip, source)
         for level, held in rows.items():
             held.append(_held(found, said, clip, level))
         far.append((found.world.distance(said.motion) / found.world.usual)[is_moving(said.motion)])
@@ -89,7 +89,7 @@ def _known(value: float) -> float | None:
     return value if math.isfinite(value) else None
 
 
-def _held(found: Intervals, said: Said, clip: Clip, level: float) -> list[float]:
+def _held(found: Intervals, said: Prediction, clip: Clip, level: float) -> list[float]:
     """Shares held of size, x, y and z, then widths [mN] and the first over the peak."""
     band, young = found.bound(said, level), clip.young_kpa
     force = clip.force / young

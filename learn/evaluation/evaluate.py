@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, astuple, dataclass
 from typing import Any
 
@@ -12,13 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from learn.checkpoint import SEEN, Card
+from learn.checkpoint import SEEN, ModelCard
 from learn.data.clips import Clip, amount, target
 from learn.data.grid import Grid
 from learn.evaluation.metrics import Moments, agreement, contact_mm, ghost_share, line
 from learn.evaluation.statistics import Interval, Paired, interval, paired, pooled_r2
 from learn.inference.predict import Predictor, length, total_force
 from synth.errors import UserError
+from synth.system.terminal import ProgressCallback
 
 GHOST_MN = 5.0
 """A ghost is where a contact-sized patch would seem to carry more than this [mN]."""
@@ -66,7 +67,7 @@ class ClipScore:
     """Mean over-prediction of the total force in low-force frames [mN]."""
 
 
-def score(clip: Clip, said: NDArray[np.float32], card: Card) -> ClipScore:
+def score(clip: Clip, said: NDArray[np.float32], card: ModelCard) -> ClipScore:
     """Scores the answer to one sequence. `said`: (T, C, N, N), physical."""
     grid, kind, parts = card.settings.grid, card.settings.target, said.shape[1]
     young = clip.young_kpa
@@ -121,11 +122,11 @@ def _cell(kind: str, grid: Grid) -> float:
 
 
 @dataclass(frozen=True)
-class Report:
+class EvaluationReport:
     """A model's scores over sequences, once for every state of knowledge of E."""
 
     columns: dict[str, list[ClipScore]]
-    card: Card
+    card: ModelCard
 
     @property
     def clips(self) -> list[ClipScore]:
@@ -237,9 +238,9 @@ def evaluate(
     predictor: Predictor,
     clips: Sequence[Clip],
     source: str,
-    report: Callable[[int, int], None] = lambda done, of: None,
+    report: ProgressCallback = lambda done, of: None,
     pressed: Mapping[str, float] | None = None,
-) -> Report:
+) -> EvaluationReport:
     """Scores a model on clips, with displacement from `source` (`ideal` or `recovered`).
 
     `pressed`: E [kPa] of clips by their content hash, as a calibration press found it: the column `press`
@@ -262,10 +263,10 @@ def evaluate(
         for name, given in young.items():
             columns.setdefault(name, []).append(score(clip, said * np.float32(given), predictor.card))
     report(len(clips), len(clips))
-    return Report(columns, predictor.card)
+    return EvaluationReport(columns, predictor.card)
 
 
-def compare(a: Report, b: Report) -> dict[str, Paired]:
+def compare(a: EvaluationReport, b: EvaluationReport) -> dict[str, Paired]:
     """B against A on the same sequences, number by number; numbers that no sequence has from both are left
     out."""
     rows, rng = (a.per_clip(), b.per_clip()), np.random.default_rng(0)
@@ -279,7 +280,7 @@ def compare(a: Report, b: Report) -> dict[str, Paired]:
     return out
 
 
-def unseen(clips: Sequence[Clip], card: Card) -> list[Clip]:
+def unseen(clips: Sequence[Clip], card: ModelCard) -> list[Clip]:
     """Clips of no sequence and no anatomy that the model was fitted or chosen on, or its intervals fitted."""
     hashes = {h for part in SEEN for h in card.split.get(part, [])}
     seen = {g for part in SEEN for g in card.groups.get(part, [])}

@@ -2,27 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from learn.checkpoint import Card, write_card
+from learn.checkpoint import ModelCard, write_card
 from learn.data.clips import Clip, scored
-from learn.data.split import Split, groups
-from learn.evaluation.interval_sides import find_obstacle
+from learn.data.split import Split, are_openings, groups, ungrouped
+from learn.evaluation.interval_sides import find_obstacle, find_sides
 from learn.inference.force_reader import net_force
 from learn.inference.predict import Predictor, length
 from learn.uncertainty.features import motion_features, motion_names
-from learn.uncertainty.intervals import Example, Intervals, Said, fit, make_example
-from learn.uncertainty.world import fit_world
+from learn.uncertainty.intervals import Example, Intervals, Prediction, fit, make_example
+from learn.uncertainty.out_of_distribution import fit_distribution
+from synth.dataset.index import written_sides
 from synth.errors import UserError
+from synth.system.terminal import ProgressCallback
 
 _MOST_FITTED = 500  # sequences that the distance is measured from
-
-Report = Callable[[int, int], None]
 
 
 def fit_intervals(
@@ -31,7 +31,7 @@ def fit_intervals(
     chosen: Sequence[Clip],
     kept: Sequence[Clip],
     source: str | None = None,
-    report: Report = lambda done, of: None,
+    report: ProgressCallback = lambda done, of: None,
 ) -> Intervals:
     """Intervals of a model, from sequences of known truth.
 
@@ -49,14 +49,16 @@ def fit_intervals(
 
     def see(clip: Clip, brain: int, done: int) -> Example:
         report(done, of)
-        return make_example(read_said(predictor, clip, source), clip.force / clip.young_kpa, brain, unit)
+        return make_example(predict_clip(predictor, clip, source), clip.force / clip.young_kpa, brain, unit)
 
     number = groups(kept)
     scale_on = [see(clip, 0, k) for k, clip in enumerate(chosen)]
     factors_on = [see(clip, number[k], len(chosen) + k) for k, clip in enumerate(kept)]
     report(of, of)
     some = rng.permutation(len(fitted))[:_MOST_FITTED]
-    world = fit_world([_motion(predictor, fitted[i], source) for i in some], [one.motion for one in scale_on])
+    world = fit_distribution(
+        [_motion(predictor, fitted[i], source) for i in some], [one.motion for one in scale_on]
+    )
     if world is None:
         raise UserError("nothing moves in the sequences that the intervals are to be fitted on")
     return fit(scale_on, factors_on, world, motion_names(card.settings.arch.depth), unit, source)
@@ -68,8 +70,8 @@ def add_intervals(
     clips: Sequence[Clip],
     split: Split,
     source: str | None = None,
-    report: Report = lambda done, of: None,
-) -> Card:
+    report: ProgressCallback = lambda done, of: None,
+) -> ModelCard:
     """Fits intervals and writes them, or why there are none, into the card of a model's folder; that card.
 
     Whoever of `split.select` did not choose the epoch counts as kept for intervals from then on.
@@ -93,14 +95,55 @@ def add_intervals(
     return card
 
 
-def read_said(predictor: Predictor, clip: Clip, source: str) -> Said:
+def fit_from_datasets(
+    folder: Path,
+    predictor: Predictor,
+    clips: Sequence[Clip],
+    datasets: Sequence[Path],
+    source: str,
+    from_test: bool,
+    report: ProgressCallback = lambda done, of: None,
+) -> Intervals:
+    """Fits intervals of a trained model on the sequences of some datasets, into its card.
+
+    Args:
+        folder: of the model.
+        predictor: the model.
+        clips: all sequences of the datasets.
+        datasets: where they came from: the training data, and any that the model never met.
+        source: displacement that the intervals hold for.
+        from_test: whether half of the test's brains may be taken.
+        report: told how many sequences are done, and how many there are.
+
+    Raises:
+        UserError: none of the sequences was fitted, or there are too few of others.
+    """
+    if predictor.card.settings.share_anatomy:
+        clips = ungrouped(clips, by_opening=are_openings(predictor.card.groups))
+    marked = [(written_sides(one) or {}).items() for one in datasets]
+    tests = [name for part in marked for name, side in part if side == "test"]
+    split = find_sides(clips, predictor.card, tests, from_test)
+    if not split.fit:
+        raise UserError(
+            f"{datasets[0]}: holds no sequence that {folder} was fitted on; name its training data"
+        )
+    why = find_obstacle([clips[i] for i in split.select], [clips[i] for i in split.intervals])
+    if why:
+        hint = "" if from_test else "; name a dataset that it never met, or say --from-test"
+        raise UserError(f"{folder}: {why}{hint}")
+    found = add_intervals(folder, predictor, clips, split, source, report).intervals
+    assert found is not None
+    return found
+
+
+def predict_clip(predictor: Predictor, clip: Clip, source: str) -> Prediction:
     """What the model says of a sequence, per unit stiffness; no motion is no force, as to `ForceReader`."""
     shift, mask, grid = np.asarray(clip.displacement[source]), clip.mask, predictor.grid
     sure, young = clip.sure(source), clip.young_kpa
     kind = predictor.card.settings.target
     density = predictor.density(shift, mask, young, sure)
     still = predictor.density(np.zeros_like(shift[:1]), mask, young, np.ones_like(sure[:1]) * mask)
-    return Said(
+    return Prediction(
         motion=motion_features(shift, mask, sure, grid.extent_mm),
         force=net_force(density, still[0], kind, grid) / young,
         magnitude=length(density) / np.float32(young),

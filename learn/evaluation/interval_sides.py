@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from learn.checkpoint import Card
+from learn.checkpoint import ModelCard
 from learn.data.clips import Clip
 from learn.data.split import Split, groups
 from learn.uncertainty import conformal
@@ -50,7 +50,7 @@ def find_obstacle(chosen: Sequence[Clip], kept: Sequence[Clip]) -> str:
     return ""
 
 
-def find_sides(clips: Sequence[Clip], card: Card, test: Collection[str], from_test: bool) -> Split:
+def find_sides(clips: Sequence[Clip], card: ModelCard, test: Collection[str], from_test: bool) -> Split:
     """Who of a dataset's sequences a trained model's intervals are fitted on, brain by brain.
 
     Kept for it is what was already; else every brain that the model has not met and that has no test

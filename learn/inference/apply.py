@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from learn.data.clips import FIELDS, has_depth
 from learn.inference.force_reader import ForceReader
-from learn.inference.predict import Predictor, View
+from learn.inference.predict import GridView, Predictor
 from learn.inference.stiffness import stiffness
 from learn.uncertainty.conformal import LEVELS
 from learn.uncertainty.intervals import Band
@@ -324,7 +324,7 @@ def calibrate(predictor: Predictor, press: Motion) -> float:
     """Young's modulus [kPa] from a film of one press whose force is known. Raises UserError if it isn't."""
     if press.force_mn is None:
         raise UserError(f"{press.name}: holds no force to calibrate on (force_mn in an .npz)")
-    view = View(press.tissue, press.scale_mm_per_px, predictor.grid)
+    view = GridView(press.tissue, press.scale_mm_per_px, predictor.grid)
     told = [predictor.on_grid(view, step.flow, step.confidence, step.moved) for step in press.steps]
     sure = [confidence for _, confidence in told if confidence is not None]
     given = np.stack(sure) if sure else None

@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from learn.checkpoint import Card
+from learn.checkpoint import ModelCard
 from learn.data.grid import HALF_SURE_MM, SMOOTHING_MM, channels
 from learn.inference.predict import Predictor
 from learn.network.d2fnet import Architecture
@@ -32,7 +32,7 @@ TOLERANCE = 1e-4
 class Portable(nn.Module):
     """From displacement to force density per unit stiffness, in one module."""
 
-    def __init__(self, model: nn.Module, card: Card) -> None:
+    def __init__(self, model: nn.Module, card: ModelCard) -> None:
         super().__init__()
         self.model, self.card = model, card
 
@@ -42,12 +42,12 @@ class Portable(nn.Module):
         return y
 
 
-def input_names(card: Card) -> list[str]:
+def input_names(card: ModelCard) -> list[str]:
     """The file's inputs, in order."""
     return ["displacement", "mask", *["confidence"] * card.settings.arch.confidence]
 
 
-def examples(card: Card, batch: int, seed: int = 0) -> list[Tensor]:
+def examples(card: ModelCard, batch: int, seed: int = 0) -> list[Tensor]:
     """Inputs of the right shapes and sizes, drawn from a seed: smooth motion over a round mask."""
     n = card.settings.size
     rng = np.random.default_rng(seed)
@@ -95,7 +95,7 @@ def _gap(said: Tensor, expected: Tensor, unit: float) -> float:
     return float((said - expected).abs().max()) / max(unit, float(expected.abs().max()))
 
 
-def describe(card: Card, kind: str, difference: float) -> dict[str, Any]:
+def describe(card: ModelCard, kind: str, difference: float) -> dict[str, Any]:
     """What a program must know to use the file."""
     grid = card.settings.grid
     return {
@@ -133,7 +133,7 @@ def _told(arch: Architecture) -> list[str]:
     return said
 
 
-def _torchscript(module: Portable, card: Card, file: Path) -> Any:
+def _torchscript(module: Portable, card: ModelCard, file: Path) -> Any:
     with warnings.catch_warnings():
         # Tracing warns that shapes are taken as constants: the grid's size is one.
         warnings.simplefilter("ignore")
@@ -143,7 +143,7 @@ def _torchscript(module: Portable, card: Card, file: Path) -> Any:
     return lambda inputs: loaded(*inputs)
 
 
-def _onnx(module: Portable, card: Card, file: Path) -> Any:
+def _onnx(module: Portable, card: ModelCard, file: Path) -> Any:
     try:
         importlib.import_module("onnx")
         runtime: Any = importlib.import_module("onnxruntime")

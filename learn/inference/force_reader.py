@@ -14,7 +14,7 @@ from learn.inference.placing import Placing, Point, share_at_border
 from learn.inference.predict import ForceMap, Predictor, total_force
 from learn.uncertainty.conformal import LEVELS
 from learn.uncertainty.features import is_moving
-from learn.uncertainty.intervals import Band, Intervals, Said
+from learn.uncertainty.intervals import Band, Intervals, Prediction
 from synth.flow.stereo.track import Moved
 
 _MUCH_AT_BORDER = 0.1  # share of the force; what is spread evenly has a quarter there
@@ -114,7 +114,7 @@ class ForceReader:
         """
         if said.motion is None:
             return None
-        found, one = self._intervals(), said_by(force, said)
+        found, one = self._intervals(), as_prediction(force, said)
         self._bounded = True
         if counted and is_moving(one.motion)[0]:
             self._far.append(self.distance(said))
@@ -190,12 +190,12 @@ def describe_unseen(distance: NDArray[np.float64]) -> list[str]:
     ]
 
 
-def said_by(force: NDArray[np.float64], said: ForceMap) -> Said:
+def as_prediction(force: NDArray[np.float64], said: ForceMap) -> Prediction:
     """One frame as intervals are asked for it; `force`: (3,) mN as `ForceReader.read` gave it."""
     assert said.motion is not None
     young = said.young_kpa
     map_ = said.magnitude[None] / np.float32(young)
-    return Said(said.motion[None], force[None] / young, map_, said.grid.pitch_mm)
+    return Prediction(said.motion[None], force[None] / young, map_, said.grid.pitch_mm)
 
 
 def net_force(

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torch import nn
 
 from learn import checkpoint
-from learn.checkpoint import Card
+from learn.checkpoint import ModelCard
 from learn.data.clips import FIELDS, has_depth
 from learn.data.grid import Grid, Resampler, centre, certainty, channels
 from learn.inference.shipped import find_model
@@ -37,7 +37,7 @@ class ForceMap:
     young_kpa: float
     """Young's modulus the numbers rest on: the one given, else the training data's typical one."""
     young_known: bool
-    view: View
+    view: GridView
     motion: NDArray[np.float64] | None = None
     """(F,) `motion_features` of the frame, by a model with intervals."""
 
@@ -85,7 +85,7 @@ def total_force(density: NDArray[np.float32], kind: str, grid: Grid) -> NDArray[
     return size
 
 
-class View:
+class GridView:
     """A still picture's geometry (tissue and scale), prepared once and used for each of its frames."""
 
     def __init__(
@@ -109,7 +109,7 @@ class Predictor:
     """A trained model, ready for pictures of any size and scale."""
 
     def __init__(
-        self, model: nn.Module, card: Card, device: torch.device | str = "cpu", quick: bool = False
+        self, model: nn.Module, card: ModelCard, device: torch.device | str = "cpu", quick: bool = False
     ) -> None:
         """`quick`: spend a second on a graph that runs a fifth faster on a CPU, for live use and films."""
         self.card, self.grid = card, card.settings.grid
@@ -118,7 +118,7 @@ class Predictor:
         self._say: Callable[..., Any] = self.model
         if quick and self.device.type == "cpu":
             self._say = Quick(model, card.settings.arch, card.settings.size)
-        self._view: View | None = None
+        self._view: GridView | None = None
 
     def readable(self, source: str) -> str:
         """The source of displacement as given, if this model can read it; else UserError."""
@@ -140,8 +140,8 @@ class Predictor:
         tissue: NDArray[np.bool_],
         scale_mm_per_px: float,
         centre_px: tuple[float, float] | None = None,
-    ) -> View:
-        """Prepares a picture's geometry, as `View`; the last one is kept."""
+    ) -> GridView:
+        """Prepares a picture's geometry, as `GridView`; the last one is kept."""
         last = self._view
         if (
             last is None
@@ -150,7 +150,7 @@ class Predictor:
             or last.tissue.shape != tissue.shape
             or not np.array_equal(last.tissue, tissue)
         ):
-            self._view = last = View(tissue, scale_mm_per_px, self.grid, centre_px)
+            self._view = last = GridView(tissue, scale_mm_per_px, self.grid, centre_px)
         return last
 
     def __call__(
@@ -169,9 +169,8 @@ class Predictor:
         `flow`: (H, W, 2) px, motion from the rest frame on the rest frame's pixels; `tissue`: (H, W) bool;
         `young_kpa`: None stands for the training data's typical value; `confidence`: (H, W) 0..1, used only
         by a model with that channel (1 if not given); `moved`: motion in three dimensions and its deviation,
-        which a model of two eyes is told instead of flow and confidence; `centre_px`: as of `View`. Raises
-        UserError for other shapes or values that aren't finite, and where such a model is told of one eye
-        alone.
+        which a model of two eyes is told instead of flow and confidence; `centre_px`: as of `GridView`.
+        Raises UserError for other shapes or values that aren't finite, and where such a model gets one eye.
         """
         if young_kpa is not None and not (np.isfinite(young_kpa) and young_kpa > 0):
             raise UserError(f"young_kpa {young_kpa}: must be positive")
@@ -189,7 +188,7 @@ class Predictor:
 
     def on_grid(
         self,
-        view: View,
+        view: GridView,
         flow: NDArray[np.float32],
         confidence: NDArray[np.float32] | None = None,
         moved: Moved | None = None,
@@ -257,7 +256,7 @@ class Predictor:
         return density
 
 
-def load_model(name: Path | str, device: str = "cpu", *, quick: bool = False) -> Predictor:
+def load_model(name: Path | str, device: torch.device | str = "cpu", *, quick: bool = False) -> Predictor:
     """A trained model, to be asked frame by frame (`Predictor`) or for a whole film (`predict_force`).
 
     Args:
@@ -268,13 +267,5 @@ def load_model(name: Path | str, device: str = "cpu", *, quick: bool = False) ->
     Raises:
         UserError: the folder is missing, damaged or edited.
     """
-    return load_predictor(name, device, quick)
-
-
-def load_predictor(
-    model_dir: Path | str, device: torch.device | str = "cpu", quick: bool = False
-) -> Predictor:
-    """A model folder as `learn train` writes it, or the name of one that comes along. UserError if it is
-    missing or corrupt."""
-    model, card = checkpoint.load_model(find_model(model_dir))
+    model, card = checkpoint.read_model(find_model(name))
     return Predictor(model, card, device, quick)

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from learn import checkpoint
-from learn.checkpoint import Card
+from learn.checkpoint import ModelCard
 from synth.errors import UserError
 from synth.job import identity
 from synth.system.checked_file import write_whole
@@ -43,7 +43,7 @@ def choose_model(two_eyes: bool) -> Path | None:
     return next((found[name] for name in ("stereo", "mono")[not two_eyes :] if name in found), None)
 
 
-def hash_data(card: Card) -> str:
+def hash_data(card: ModelCard) -> str:
     """Of all sequences that a model was fitted, chosen and to be tested on; their order doesn't count."""
     named = {part: sorted(hashes) for part, hashes in card.split.items()}
     return hashlib.blake2b(identity.canonical(named), digest_size=16).hexdigest()
@@ -51,7 +51,7 @@ def hash_data(card: Card) -> str:
 
 def pack_model(
     model: Path, folder: Path, commit: str, metrics: Mapping[str, str], limits: Sequence[str]
-) -> Card:
+) -> ModelCard:
     """Writes a trained model as one that comes along: weights.safetensors, config.json and a card, README.md.
 
     Args:
@@ -64,7 +64,7 @@ def pack_model(
     Raises:
         UserError: the model is damaged, or larger than `LARGEST_BYTES`; nothing is left then.
     """
-    net, card = checkpoint.load_model(model)
+    net, card = checkpoint.read_model(model)
     shutil.rmtree(folder, ignore_errors=True)
     card = checkpoint.write_model(folder, card, net.state_dict(), safe=True)
     write_whole(folder / "README.md", _readme(folder.name, card, commit, metrics, limits).encode())
@@ -83,7 +83,7 @@ def size_bytes(folder: Path) -> int:
     return sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
 
 
-def describe(card: Card) -> str:
+def describe(card: ModelCard) -> str:
     """A line for a person."""
     settings, arch = card.settings, card.settings.arch
     eyes = "two eyes" if arch.depth else "one eye"
@@ -93,7 +93,9 @@ def describe(card: Card) -> str:
     )
 
 
-def _readme(name: str, card: Card, commit: str, metrics: Mapping[str, str], limits: Sequence[str]) -> str:
+def _readme(
+    name: str, card: ModelCard, commit: str, metrics: Mapping[str, str], limits: Sequence[str]
+) -> str:
     line = describe(card)
     rows = {"data (hash of its sequences)": hash_data(card), "commit": commit, **metrics}
     return "\n".join(

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from learn.data.clips import Clip, amount, sources, target
 from learn.data.grid import Scales, channels, divergence
-from learn.settings import Settings
+from learn.settings import TrainingSettings
 from synth.errors import UserError
 
 
@@ -32,8 +32,8 @@ class Batch:
         return Batch(**{k: v.to(device, non_blocking=True) for k, v in vars(self).items()})
 
 
-def swayed(batch: Batch, settings: Settings, generator: torch.Generator) -> Batch:
-    """The batch with a motion of the whole surface on top of half of its frames, as `Settings.sway_mm` says.
+def swayed(batch: Batch, settings: TrainingSettings, generator: torch.Generator) -> Batch:
+    """The batch with a motion of the whole surface on top of half of its frames, as `sway_mm` says.
 
     `generator`: on the CPU, so that every device draws the same.
     """
@@ -50,7 +50,7 @@ def swayed(batch: Batch, settings: Settings, generator: torch.Generator) -> Batc
     return replace(batch, displacement=moved + whole * batch.mask)
 
 
-def inputs(batch: Batch, settings: Settings, scales: Scales) -> Tensor:
+def inputs(batch: Batch, settings: TrainingSettings, scales: Scales) -> Tensor:
     """The network's channels for a batch."""
     extra = batch.confidence if settings.arch.confidence else None
     return channels(batch.displacement, batch.mask, settings.grid.pitch_mm, scales, extra)
@@ -74,10 +74,10 @@ def turned(values: Tensor, turn: int) -> Tensor:
     return values
 
 
-class Frames:
+class FrameDataset:
     """All frames of some clips, given out in batches."""
 
-    def __init__(self, clips: Sequence[Clip], settings: Settings) -> None:
+    def __init__(self, clips: Sequence[Clip], settings: TrainingSettings) -> None:
         self.clips, self.settings = list(clips), settings
         self.sources = sources(settings.input)
         if not self.clips:
@@ -126,7 +126,7 @@ class Frames:
         return Batch(**{name: torch.stack(values) for name, values in columns.items()})
 
 
-def measure_scales(clips: Sequence[Clip], settings: Settings, frames: int = 16) -> Scales:
+def measure_scales(clips: Sequence[Clip], settings: TrainingSettings, frames: int = 16) -> Scales:
     """99.9th percentiles over tissue cells of up to `frames` evenly spaced frames of every clip.
 
     Raises UserError if nothing moves or nothing is loaded.

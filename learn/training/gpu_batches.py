@@ -9,17 +9,17 @@ import torch
 from torch import Tensor
 
 from learn.data.clips import Clip, sources, target
-from learn.settings import Settings
-from learn.training.batches import Batch, Frames, turned
+from learn.settings import TrainingSettings
+from learn.training.batches import Batch, FrameDataset, turned
 
 SHARE = 0.6
 """Part of the device's free memory that frames may take; the rest is the network's."""
 
 
-class Resident(Frames):
-    """The same frames as `Frames`, in the same order, held by the device."""
+class DeviceDataset(FrameDataset):
+    """The same frames as `FrameDataset`, in the same order, held by the device."""
 
-    def __init__(self, clips: Sequence[Clip], settings: Settings, device: torch.device) -> None:
+    def __init__(self, clips: Sequence[Clip], settings: TrainingSettings, device: torch.device) -> None:
         super().__init__(clips, settings)
         parts = settings.arch.components
         self._first = np.cumsum([0, *(c.frames for c in self.clips)])
@@ -44,7 +44,7 @@ class Resident(Frames):
         self._device = device
 
     def batch(self, items: Sequence[tuple[int, int, str, int]]) -> Batch:
-        """As `Frames.batch`; within it frames of one turn stand together."""
+        """As `FrameDataset.batch`; within it frames of one turn stand together."""
         items = sorted(items, key=lambda item: item[3])
         parts: list[dict[str, Tensor]] = []
         for turn in sorted({item[3] for item in items}):
@@ -70,14 +70,14 @@ class Resident(Frames):
         }
 
 
-def held(clips: Sequence[Clip], settings: Settings, device: torch.device) -> Frames:
+def held(clips: Sequence[Clip], settings: TrainingSettings, device: torch.device) -> FrameDataset:
     """Frames on a GPU whose memory is enough, else read as they are asked for."""
     if device.type != "cuda":
-        return Frames(clips, settings)
+        return FrameDataset(clips, settings)
     arch = settings.arch
     told = arch.displacements + arch.confidence * (1 + arch.depth)
     planes = told * len(sources(settings.input)) + arch.components
     needed = sum(c.frames for c in clips) * planes * 4 * settings.size**2
     if needed > SHARE * torch.cuda.mem_get_info(device)[0]:
-        return Frames(clips, settings)
-    return Resident(clips, settings, device)
+        return FrameDataset(clips, settings)
+    return DeviceDataset(clips, settings, device)

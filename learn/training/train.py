@@ -17,21 +17,22 @@ from torch.optim.lr_scheduler import ReduceLROnPlateau
 from torchmetrics.aggregation import MeanMetric
 
 from learn import checkpoint
-from learn.checkpoint import Card
+from learn.checkpoint import ModelCard
 from learn.data.clips import Clip, sources, typical_young
 from learn.data.grid import Scales
 from learn.data.split import Split, groups
 from learn.evaluation.metrics import Moments, agreement
 from learn.loss import SHARES, full, gradient_shares, loss
 from learn.network.d2fnet import D2FNet
-from learn.settings import Settings, replace
-from learn.training.batches import Batch, Frames, inputs, measure_scales, swayed
+from learn.settings import TrainingSettings, replace
+from learn.training.batches import Batch, FrameDataset, inputs, measure_scales, swayed
 from learn.training.gpu_batches import held
 from learn.training.log import Log
 from learn.training.threads import make_fabric
 from synth.dataset.split import find_crossings
 from synth.errors import UserError
 from synth.job import retired
+from synth.system.terminal import ProgressCallback
 
 CLIP = 1.0
 """Largest norm of the gradient."""
@@ -44,24 +45,22 @@ _TELLING, _GAINS = 8, (0.67, 1.5)
 """Anatomies that a force gain is told by at least, and its limits: a network further off than that has not
 learnt, and stretching it would hide it."""
 
-Report = Callable[[int, int, dict[str, float]], None]
-"""Told after every batch: batches done, batches there will be, latest numbers."""
-
 
 def train(
     clips: Sequence[Clip],
     split: Split,
-    settings: Settings,
+    settings: TrainingSettings,
     out: Path,
     *,
-    report: Report = lambda done, of, numbers: None,
+    report: ProgressCallback = lambda done, of: None,
     fabric: Fabric | None = None,
     log: Callable[[dict[str, float]], None] = lambda numbers: None,
-) -> Card:
+) -> ModelCard:
     """Trains on `split.fit`, chooses the epoch on `split.select`, never looks at `split.test`.
 
     A folder that holds an unfinished run of the same settings and data is continued; the result is the same,
-    bit for bit on one CPU, as that of an uninterrupted run. `log` gets each epoch's numbers.
+    bit for bit on one CPU, as that of an uninterrupted run. `report` is told after every batch, `log` gets
+    each epoch's numbers.
 
     Returns the card of the best epoch. Raises UserError if `out` holds another run, or on divergence.
     """
@@ -69,7 +68,7 @@ def train(
     fabric.launch()
     fit, select = [clips[i] for i in split.fit], [clips[i] for i in split.select]
     scales = measure_scales(fit, settings)
-    card = Card(settings, scales, typical_young(fit), *_provenance(clips, split))
+    card = ModelCard(settings, scales, typical_young(fit), *_provenance(clips, split))
     state = _open(out, card)
     try:
         return _go_on(_start(card, state), card, fit, select, out, report, fabric, log)
@@ -82,14 +81,14 @@ def train(
 
 def _go_on(
     run: _Run,
-    card: Card,
+    card: ModelCard,
     fit: list[Clip],
     select: list[Clip],
     out: Path,
-    report: Report,
+    report: ProgressCallback,
     fabric: Fabric,
     log: Callable[[dict[str, float]], None],
-) -> Card:
+) -> ModelCard:
     """Epoch after epoch to the end; arguments as `train`'s."""
     settings, scales = card.settings, card.scales
     net: Any = torch.compile(run.model) if settings.compile else run.model
@@ -127,7 +126,7 @@ class _Run:
     best: float = -math.inf
     """R² on the select sequences of the epoch that is kept."""
 
-    def end_epoch(self, score: float, settings: Settings) -> bool:
+    def end_epoch(self, score: float, settings: TrainingSettings) -> bool:
         """Takes an epoch's score into account; whether it is the best so far."""
         self.epoch += 1
         if settings.schedule == "plateau":
@@ -143,7 +142,7 @@ class _Run:
         return plain | {"model": _cpu(self.model.state_dict())} | moving
 
 
-def _start(card: Card, state: dict[str, Any] | None) -> _Run:
+def _start(card: ModelCard, state: dict[str, Any] | None) -> _Run:
     """A fresh run, or one that goes on from a state as `_Run.as_dict` gave it."""
     settings = card.settings
     torch.manual_seed(settings.seed)
@@ -175,10 +174,10 @@ def _epoch(
     fabric: Fabric,
     net: Any,
     optimizer: Any,
-    frames: Frames,
+    frames: FrameDataset,
     scales: Scales,
     epoch: int,
-    report: Report,
+    report: ProgressCallback,
 ) -> dict[str, float]:
     settings = frames.settings
     # Seeds from (seed, epoch) alone: nothing to store, so a resumed run draws what the first would have.
@@ -189,7 +188,6 @@ def _epoch(
     whole = settings.batch * fabric.world_size
     batches = max(len(order) // whole, 1)
     net.train()
-    last = 0.0
     means = {k: MeanMetric().to(fabric.device) for k in ("loss", *(f"share_{k}" for k in SHARES))}
     for i in range(batches):
         batch = frames.batch(order[i * whole : (i + 1) * whole][fabric.global_rank :: fabric.world_size])
@@ -209,8 +207,7 @@ def _epoch(
             (epoch + i / batches) / settings.epochs,
         )
         if i % LOOK == 0:
-            last = float(terms.sum.detach())
-            _finite(last, epoch)
+            _finite(float(terms.sum.detach()), epoch)
             for k, v in gradient_shares(terms, said).items():
                 means[f"share_{k}"].update(v)
         if settings.schedule == "cosine":
@@ -221,7 +218,7 @@ def _epoch(
         fabric.clip_gradients(net, optimizer, max_norm=CLIP)
         optimizer.step()
         means["loss"].update(terms.sum.detach())
-        report(epoch * batches + i + 1, settings.epochs * batches, {"loss": last})
+        report(epoch * batches + i + 1, settings.epochs * batches)
     numbers = {k: float(m.compute()) for k, m in means.items()}
     _finite(numbers["loss"], epoch)
     return numbers
@@ -239,7 +236,7 @@ def cosine(progress: float, warm: float = 0.05) -> float:
     return 0.5 * (1 + math.cos(math.pi * (progress - warm) / (1 - warm)))
 
 
-def forward(net: Any, batch: Batch, settings: Settings, scales: Scales) -> torch.Tensor:
+def forward(net: Any, batch: Batch, settings: TrainingSettings, scales: Scales) -> torch.Tensor:
     """The network's map in physical units per unit stiffness: (B, C, N, N), unit of `Scales.target`."""
     x = inputs(batch, settings, scales)
     if settings.channels_last:
@@ -249,7 +246,7 @@ def forward(net: Any, batch: Batch, settings: Settings, scales: Scales) -> torch
 
 
 @torch.no_grad()
-def select_score(net: Any, frames: Frames, scales: Scales, device: torch.device) -> dict[str, float]:
+def select_score(net: Any, frames: FrameDataset, scales: Scales, device: torch.device) -> dict[str, float]:
     """R² and RMSE over all tissue cells and components, on the last (most real) source of the input kind.
 
     And the gain by which the total force is missed there: a price on false force, and noise, teach a
@@ -274,7 +271,7 @@ def select_score(net: Any, frames: Frames, scales: Scales, device: torch.device)
     }
 
 
-def _amount(maps: torch.Tensor, settings: Settings) -> torch.Tensor:
+def _amount(maps: torch.Tensor, settings: TrainingSettings) -> torch.Tensor:
     """(B C,) what `total_force` is of: the sum of a density, the peak of an intensity, of (B, C, N, N)."""
     flat = maps.flatten(2)
     return (flat.amax(2) if settings.target == "intensity" else flat.sum(2)).flatten()
@@ -307,7 +304,7 @@ def _provenance(clips: Sequence[Clip], split: Split) -> tuple[dict[str, list[str
     )
 
 
-def _open(out: Path, card: Card) -> dict[str, Any] | None:
+def _open(out: Path, card: ModelCard) -> dict[str, Any] | None:
     """The state to go on from, or None for a fresh start in a fresh folder."""
     # What a kill left of a first card has a hidden name.
     if not out.exists() or (out.is_dir() and all(one.name.startswith(".") for one in out.iterdir())):

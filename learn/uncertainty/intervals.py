@@ -1,9 +1,9 @@
 """Intervals beside what a network says: of the force and of its components.
 
-Half of an interval's width is the expected size of the error (`Scale`), times how far beyond what was fitted
-the frame is (`World`, and an answer above all that the scale was fitted on), times a factor that makes the
-stated share of new sequences' frames lie within (`conformal.quantile`). All but the factor is fitted on other
-sequences than the factor is, and the answer itself on others again.
+Half of an interval's width is the expected size of the error (`ErrorModel`), times how far the frame is out
+of distribution (`OutOfDistribution`, and a prediction above all that the error model was fitted on), times a
+factor that makes the stated share of new sequences' frames lie within (`conformal.quantile`). All but the
+factor is fitted on other sequences than the factor is, and the network on others again.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from pydantic import ConfigDict
 
 from learn.uncertainty import conformal
 from learn.uncertainty.conformal import LEVELS
+from learn.uncertainty.error_model import ErrorModel, fit_error_model
 from learn.uncertainty.features import ANSWER, answer_features
-from learn.uncertainty.scale import Scale, fit_scale
-from learn.uncertainty.world import World
+from learn.uncertainty.out_of_distribution import OutOfDistribution
 from synth.errors import UserError
 from synth.job.types import Positive
 
@@ -31,7 +31,7 @@ _LEAST = 1e-3  # of the training data's force: no error is expected to be smalle
 
 
 @dataclass(frozen=True)
-class Said:
+class Prediction:
     """A network's answer to the frames of one film, per unit stiffness, and what is known of them."""
 
     motion: Floats
@@ -72,7 +72,7 @@ class Example:
 class Spread:
     """How large an error may be."""
 
-    scale: Scale
+    scale: ErrorModel
     factors: dict[str, Positive]
     """By level: what the scale is multiplied by."""
 
@@ -109,7 +109,7 @@ class Intervals:
     """Training data's total force [mN at 1 kPa]."""
     size: Spread
     axes: tuple[Spread, Spread, Spread]
-    world: World
+    world: OutOfDistribution
     source: str
     """Displacement that they hold for, as in `learn.data.clips.FIELDS`."""
     units: int
@@ -128,7 +128,7 @@ class Intervals:
         if [len(row) for row in (self.world.middle, *self.world.precision)] != [count] * (count + 1):
             raise ValueError(f"the world is not of {count} features")
 
-    def bound(self, said: Said, level: float = LEVEL) -> Band:
+    def bound(self, said: Prediction, level: float = LEVEL) -> Band:
         """Intervals of the force of frames, per unit stiffness. UserError for another level."""
         if str(level) not in self.size.factors:
             raise UserError(f"level {level:g}: the model has intervals of {', '.join(self.size.factors)}")
@@ -140,13 +140,13 @@ class Intervals:
         return Band(low, said.size + half, said.centre - axes, said.centre + axes)
 
 
-def frame_features(said: Said, force_unit: float) -> Floats:
+def frame_features(said: Prediction, force_unit: float) -> Floats:
     """(T, F + 2) what the errors of frames are predicted from: motion, size and area of the answer."""
     answer = answer_features(said.size / force_unit, said.magnitude, said.pitch_mm**2)
     return np.concatenate([said.motion, answer], axis=1)
 
 
-def make_example(said: Said, true: Floats, unit: int, force_unit: float) -> Example:
+def make_example(said: Prediction, true: Floats, unit: int, force_unit: float) -> Example:
     """A sequence's errors; `true`: (T, 3) force per unit stiffness; `force_unit`: as of `Intervals`."""
     off = np.abs(np.linalg.norm(true, axis=1) - said.size)
     return Example(
@@ -160,7 +160,7 @@ def make_example(said: Said, true: Floats, unit: int, force_unit: float) -> Exam
 def fit(
     chosen: Sequence[Example],
     kept: Sequence[Example],
-    world: World,
+    world: OutOfDistribution,
     names: tuple[str, ...],
     force_unit: float,
     source: str,
@@ -175,7 +175,7 @@ def fit(
         raise UserError(f"{count} brains are kept for intervals; {LEVELS[0]:.0%} needs {least}")
     features, weight = _stacked(chosen, "features"), _weights([len(one.features) for one in chosen])
     error = _stacked(chosen, "error")
-    scales = [fit_scale(features, e, weight, _LEAST * force_unit) for e in error.T]
+    scales = [fit_error_model(features, e, weight, _LEAST * force_unit) for e in error.T]
     wide = [_widen(world, scales[0], one.motion, one.features) for one in kept]
     both = list(zip(kept, wide, strict=True))
     spreads = [
@@ -194,7 +194,7 @@ def fit(
     )
 
 
-def _spread(scale: Scale, kept: Sequence[Example], scores: Sequence[Floats]) -> Spread:
+def _spread(scale: ErrorModel, kept: Sequence[Example], scores: Sequence[Floats]) -> Spread:
     """A scale with its factors; `scores`: of each sequence, (n,) errors as multiples of the scale."""
     by_unit: dict[int, list[Floats]] = {}
     for one, score in zip(kept, scores, strict=True):
@@ -204,7 +204,7 @@ def _spread(scale: Scale, kept: Sequence[Example], scores: Sequence[Floats]) -> 
     return Spread(scale, factors)
 
 
-def _widen(world: World, size: Scale, motion: Floats, features: Floats) -> Floats:
+def _widen(world: OutOfDistribution, size: ErrorModel, motion: Floats, features: Floats) -> Floats:
     """(T,) how far beyond usual a frame is, times how far its answer is above all of the scale's."""
     place = len(features[0]) - len(ANSWER)
     beyond = np.exp(np.maximum(features[:, place] - size.high[place], 0.0))

@@ -21,7 +21,7 @@ from synth.errors import UserError
 from synth.job.schema import Job
 from synth.publish import card, croissant, film
 from synth.render.camera import camera as cameras
-from synth.system.stopwatch import Report
+from synth.system.stopwatch import ProgressCallback
 
 _TRIES = 3
 # So many first sequences failing on the job's own account, and none succeeding, condemn the job.
@@ -219,7 +219,7 @@ class _Pool:
             reasons = sorted({refused.reason for refused in self._refused})
             raise UserError("\n".join(reasons))
 
-    def _reporter(self, key: int) -> Report:
+    def _reporter(self, key: int) -> ProgressCallback:
         def report(stage: str, done: int, of: int) -> None:
             self._events.put(lambda watcher: watcher.stage(key, stage, done, of))
 

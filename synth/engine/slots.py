@@ -14,7 +14,7 @@ from synth.engine.worker_process import Attempt, Child, Setup
 from synth.errors import UserError
 from synth.job.schema import Job
 from synth.system import llvm
-from synth.system.stopwatch import Report
+from synth.system.stopwatch import ProgressCallback
 
 # A process that has computed so many is replaced, should a library leak: none was seen to, over 16 sequences
 # (731 MB after the last, 736 after the second); starting anew costs what half a sequence does.
@@ -24,7 +24,7 @@ SEQUENCES_A_PROCESS = 128
 class Slot(Protocol):
     """Computes one sequence at a time; the engine has a thread for every slot."""
 
-    def run(self, index: int, report: Report, stop: threading.Event) -> Attempt: ...
+    def run(self, index: int, report: ProgressCallback, stop: threading.Event) -> Attempt: ...
     def close(self) -> None: ...
 
 
@@ -42,7 +42,7 @@ class LocalSlot:
         self._setup = setup
         self._child: Child | None = None
 
-    def run(self, index: int, report: Report, stop: threading.Event) -> Attempt:
+    def run(self, index: int, report: ProgressCallback, stop: threading.Event) -> Attempt:
         self._child = self._child or Child(self._setup)
         attempt = self._child.run(index, report, stop)
         if attempt.kind not in ("done", "input") or self._child.finished >= SEQUENCES_A_PROCESS:

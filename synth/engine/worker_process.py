@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import synth
-from synth.system.stopwatch import Report
+from synth.system.stopwatch import ProgressCallback
 
 Kind = Literal["done", "input", "error", "crash", "memory", "stalled", "disk", "stopped"]
 """How an attempt ended: only `done` is good; `input` would end the same way again."""
@@ -97,7 +97,7 @@ class Child:
             )
         )
 
-    def run(self, index: int, report: Report, stop: threading.Event) -> Attempt:
+    def run(self, index: int, report: ProgressCallback, stop: threading.Event) -> Attempt:
         """Computes one sequence; returns when it is sealed, has failed, or `stop` is set.
 
         After anything but "done" and "input" the process is gone.

@@ -89,6 +89,9 @@ TRAINING: dict[str, Retired] = {
 }
 """Of the settings in a model's config.json."""
 
+PRESETS = {"eyes": "stereo", "eyes-live": "stereo-live"}
+"""Names that presets of training had, and have."""
+
 
 def drop(values: Mapping[str, Any], table: Mapping[str, Retired]) -> tuple[dict[str, Any], dict[str, Any]]:
     """`values`, nested mappings, without retired keys; and those that were not at their default.

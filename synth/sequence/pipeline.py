@@ -24,7 +24,7 @@ from synth.sequence import scenario
 from synth.sequence.published_labels import Published
 from synth.sequence.scenario import Scenario
 from synth.sequence.scene import Scene, build, cortex, estimator, move, simulate
-from synth.system.stopwatch import Report, Stopwatch
+from synth.system.stopwatch import ProgressCallback, Stopwatch
 
 __all__ = ["build", "cortex", "estimator", "move", "render_sequence"]
 
@@ -42,7 +42,7 @@ class _Shooting:
     scene: Scene
     writer: Writer
     watch: Stopwatch
-    report: Report
+    report: ProgressCallback
 
     @property
     def job(self) -> Job:
@@ -65,7 +65,7 @@ class _Film:
     """(T, 4, 4) mm, world to camera axes."""
 
 
-def render_sequence(job: Job, index: int, folder: Path, report: Report) -> Path:
+def render_sequence(job: Job, index: int, folder: Path, report: ProgressCallback) -> Path:
     """Computes sequence `index` and writes `folder/NNNNNN.zarr`.
 
     Args:

@@ -29,7 +29,7 @@ from synth.render.scene import Shot, Studio
 from synth.sequence import scenario
 from synth.sequence.scenario import Scenario
 from synth.sequence.timeline import Timeline
-from synth.system.stopwatch import Report, Stopwatch
+from synth.system.stopwatch import ProgressCallback, Stopwatch
 
 Floats = NDArray[np.float64]
 
@@ -170,7 +170,9 @@ class Scene:
         return track.recover_flow(rgb, tools, self.tissue, found)
 
 
-def simulate(job: Job, index: int = 0, report: Report | None = None, watch: Stopwatch | None = None) -> Scene:
+def simulate(
+    job: Job, index: int = 0, report: ProgressCallback | None = None, watch: Stopwatch | None = None
+) -> Scene:
     """Builds sequence `index` of a job and carries out its gestures; nothing is rendered or written yet.
 
     The scene is the one that `synth render` computes for that job and index.

@@ -13,7 +13,7 @@ from evidence.learn.labels import coarser
 from evidence.learn.runs import Run
 from learn.data.clips import Clip, target
 from learn.data.grid import Grid
-from learn.evaluation.evaluate import Report, evaluate, score
+from learn.evaluation.evaluate import EvaluationReport, evaluate, score
 from learn.settings import replace
 
 GRID = Grid(32)
@@ -48,7 +48,7 @@ def test_a_run_is_made_once_for_its_settings_and_data(
     kind, parts = card.settings.target, card.settings.arch.components
     truth = [np.stack([target(c, t, kind, parts) for t in range(c.frames)]) * c.young_kpa for c in clips]
     scores = [score(c, one.astype(np.float32), card) for c, one in zip(clips, truth, strict=True)]
-    found = Report({"known": scores}, card).summary()
+    found = EvaluationReport({"known": scores}, card).summary()
     assert (found["map_rmse"], found["map_r2_pooled"]) == (0, 1)
 
 

@@ -81,7 +81,7 @@ def test_an_exported_network_says_what_its_model_says_today(stored: Path) -> Non
     from learn import checkpoint
     from learn.inference.export import Portable, examples
 
-    model, card = checkpoint.load_model(stored / "models" / "epoch")
+    model, card = checkpoint.read_model(stored / "models" / "epoch")
     given = examples(card, batch=2)
     session = onnxruntime.InferenceSession(str(stored / "network.onnx"))
     names = [one.name for one in session.get_inputs()]
@@ -157,7 +157,7 @@ def test_a_model_with_a_retired_prior_is_refused(stored: Path) -> None:
     from learn import checkpoint
 
     with pytest.raises(UserError, match=retired.LAST):
-        checkpoint.load_model(stored / "models" / "prior")
+        checkpoint.read_model(stored / "models" / "prior")
 
 
 def test_a_block_that_became_a_word_is_read_as_it() -> None:

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 
 from learn.checkpoint import read_card, write_card
+from learn.uncertainty.error_model import ErrorModel
 from learn.uncertainty.features import ANSWER, motion_names
 from learn.uncertainty.intervals import Intervals, Spread
-from learn.uncertainty.scale import Scale
-from learn.uncertainty.world import World
+from learn.uncertainty.out_of_distribution import OutOfDistribution
 
 FACTORS = {"0.9": 2.0, "0.68": 1.0}
 
@@ -29,15 +29,15 @@ def make(
     names = (*motion_names(False), *ANSWER)
 
     def spread(half: float, features: int) -> Spread:
-        scale = Scale(float(np.log(half)), (0.0,) * features, (-1e9,) * features, (1e9,) * features, 1e-9)
+        low, high = ((end,) * features for end in (-1e9, 1e9))
+        scale = ErrorModel(float(np.log(half)), (0.0,) * features, low, high, 1e-9)
         return Spread(scale, dict(FACTORS))
 
     count = len(names) - len(ANSWER)
     along = tuple(tuple(float(i == j == 0) for j in range(count)) for i in range(count))
     x, y, z = (spread(half, len(names)) for half in axes)
-    return Intervals(
-        names, 100.0, spread(size, len(names)), (x, y, z), World((0.0,) * count, along, usual), source, 19, 19
-    )  # fmt: skip
+    world = OutOfDistribution((0.0,) * count, along, usual)
+    return Intervals(names, 100.0, spread(size, len(names)), (x, y, z), world, source, 19, 19)
 
 
 def give(folder: Path, intervals: Intervals) -> Path:

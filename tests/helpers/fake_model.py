@@ -7,7 +7,7 @@ from pathlib import Path
 import torch
 
 from learn import checkpoint
-from learn.checkpoint import Card
+from learn.checkpoint import ModelCard
 from learn.data.grid import Scales
 from learn.network.d2fnet import D2FNet
 from learn.settings import override, preset
@@ -21,6 +21,6 @@ def write_model(folder: Path, *changes: str) -> Path:
     with torch.no_grad():
         for conv in net.heads.ranges:
             conv.weight.normal_(0, 200.0)
-    card = Card(settings, Scales(1.0, 0.2, 1.0, 100.0, 0.3), 1.7, {}, {})
+    card = ModelCard(settings, Scales(1.0, 0.2, 1.0, 100.0, 0.3), 1.7, {}, {})
     checkpoint.write_model(folder, card, net.state_dict())
     return folder

@@ -14,10 +14,10 @@ from synth.dataset.store import Writer
 from synth.errors import UserError
 from synth.job.schema import Job
 
-Report = Callable[[str, int, int], None]
+ProgressCallback = Callable[[str, int, int], None]
 
 
-def sequence(job: Job, index: int, folder: Path, report: Report) -> None:
+def sequence(job: Job, index: int, folder: Path, report: ProgressCallback) -> None:
     """Every field random, from the job's seed and the index only."""
     rng = np.random.default_rng((job.seed, index))
     width, height = job.render.size
@@ -49,7 +49,7 @@ def attributes(index: int, rng: np.random.Generator) -> dict[str, Any]:
     }
 
 
-def troubled(job: Job, index: int, folder: Path, report: Report) -> None:
+def troubled(job: Job, index: int, folder: Path, report: ProgressCallback) -> None:
     """1 aborts, 2 fills memory, 3 is NaN, 4 raises, 6 refuses, 7 works at the second try."""
     if index == 1:
         report("render", 0, 1)
@@ -74,32 +74,32 @@ def troubled(job: Job, index: int, folder: Path, report: Report) -> None:
     sequence(job, index, folder, report)
 
 
-def seeing(job: Job, index: int, folder: Path, report: Report) -> None:
+def seeing(job: Job, index: int, folder: Path, report: ProgressCallback) -> None:
     """Leaves word of the GPU that it sees, and takes long enough that every worker gets one."""
     (folder / ".run" / f"saw-{index}").write_text(os.environ.get("CUDA_VISIBLE_DEVICES", "whatever is there"))
     slow(job, index, folder, report)
 
 
-def hanging(job: Job, index: int, folder: Path, report: Report) -> None:
+def hanging(job: Job, index: int, folder: Path, report: ProgressCallback) -> None:
     """It never comes back."""
     time.sleep(600)
 
 
-def trying(job: Job, index: int, folder: Path, report: Report) -> None:
+def trying(job: Job, index: int, folder: Path, report: ProgressCallback) -> None:
     """Sequences 2 and 6 cannot be carried out."""
     if index in (2, 6):
         raise UserError("the load is past the material's range")
     sequence(job, index, folder, report)
 
 
-def full(job: Job, index: int, folder: Path, report: Report) -> None:
+def full(job: Job, index: int, folder: Path, report: ProgressCallback) -> None:
     """The disk is full at the third sequence."""
     if index >= 2:
         raise OSError(28, "No space left on device")
     sequence(job, index, folder, report)
 
 
-def slow(job: Job, index: int, folder: Path, report: Report) -> None:
+def slow(job: Job, index: int, folder: Path, report: ProgressCallback) -> None:
     """A sequence that takes its time, so that it can be interrupted."""
     for t in range(5):
         report("fem", t, 5)
@@ -107,7 +107,7 @@ def slow(job: Job, index: int, folder: Path, report: Report) -> None:
     sequence(job, index, folder, report)
 
 
-def stuck(job: Job, index: int, folder: Path, report: Report) -> None:
+def stuck(job: Job, index: int, folder: Path, report: ProgressCallback) -> None:
     """From the fourth sequence on without end: whoever interrupts it comes in time."""
     while index >= 3:
         report("fem", 0, 5)
@@ -115,7 +115,7 @@ def stuck(job: Job, index: int, folder: Path, report: Report) -> None:
     sequence(job, index, folder, report)
 
 
-def consistent(job: Job, index: int, folder: Path, report: Report, fault: str = "") -> None:
+def consistent(job: Job, index: int, folder: Path, report: ProgressCallback, fault: str = "") -> None:
     """A flat tissue seen squarely that slides to the right while a load rests on it: every invariant holds.
 
     `fault` names the field that is made wrong, for tests that must find it.
@@ -218,6 +218,6 @@ def _block(tool: Any, rows: Any, height: int) -> Any:
     return tool | (np.abs(rows - height / 2) < 8)
 
 
-def wrong(fault: str) -> Callable[[Job, int, Path, Report], None]:
+def wrong(fault: str) -> Callable[[Job, int, Path, ProgressCallback], None]:
     """`consistent` with one fault, sealed as if nothing were wrong."""
     return lambda job, index, folder, report: consistent(job, index, folder, report, fault)

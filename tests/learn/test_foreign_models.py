@@ -16,7 +16,7 @@ import torch
 from typer.testing import CliRunner
 
 from learn import checkpoint
-from learn.checkpoint import load_model, load_tensors, read_card, write_model
+from learn.checkpoint import load_tensors, read_card, read_model, write_model
 from learn.cli import app
 from synth.errors import UserError
 from synth.job import identity
@@ -75,7 +75,7 @@ def test_an_edited_or_unsealed_card_is_refused(model: Path, pristine: Path) -> N
         assert wrong != text
         file.write_text(wrong)
         with pytest.raises(UserError, match=r"config\.json"):
-            load_model(model)
+            read_model(model)
     done = run(app, ["calibrate", str(model), str(pristine / "000000.zarr")])
     assert (done.exit_code, len(done.stderr.splitlines())) == (2, 1)
 
@@ -88,10 +88,10 @@ def test_every_flipped_bit_of_the_weights_is_found(model: Path) -> None:
         data[at] ^= 1 << int(rng.integers(8))
         (model / "weights.pt").write_bytes(data)
         with pytest.raises(UserError, match=r"weights\.pt"):
-            load_model(model)
+            read_model(model)
     (model / "weights.pt").unlink()
     with pytest.raises(UserError, match=r"weights\.pt"):
-        load_model(model)
+        read_model(model)
 
 
 def test_a_damaged_state_of_training_is_found(model: Path) -> None:
@@ -110,7 +110,7 @@ def test_a_kill_between_card_and_weights_leaves_a_model(model: Path, monkeypatch
     state = {name: value * 2 for name, value in load_tensors(model / "weights.pt").items()}
     card = read_card(model)
     for dies_at in ("write_card", "os.replace"):
-        before = {name: value.clone() for name, value in load_model(model)[0].state_dict().items()}
+        before = {name: value.clone() for name, value in read_model(model)[0].state_dict().items()}
 
         def die(*_: object) -> None:
             raise KeyboardInterrupt
@@ -121,7 +121,7 @@ def test_a_kill_between_card_and_weights_leaves_a_model(model: Path, monkeypatch
                 patch.setattr("learn.checkpoint._write", lambda file, data: file.write_bytes(data))
             with pytest.raises(KeyboardInterrupt):
                 write_model(model, card, state)
-        there = load_model(model)[0].state_dict()
+        there = read_model(model)[0].state_dict()
         expected = before if dies_at == "write_card" else state
         assert all(torch.equal(there[name], value) for name, value in expected.items())
 
@@ -147,5 +147,5 @@ def test_weights_that_are_none(model: Path, make: Any, monkeypatch: pytest.Monke
     make(model / "weights.pt")
     reseal(model, "weights_hash", value=checkpoint._hash((model / "weights.pt").read_bytes()))
     with pytest.raises(UserError, match="weights"):
-        load_model(model)
+        read_model(model)
     assert not (model / "ran").exists()

@@ -1,4 +1,4 @@
-"""Settings as words and as files: presets changed from a command line, configurations read again."""
+"""TrainingSettings as words and as files: presets changed from a command line, configurations read again."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from typing import Any
 
 import pytest
 
-from learn.checkpoint import Card, _hash, read_card
+from learn.checkpoint import ModelCard, _hash, read_card
 from learn.data.grid import Scales
 from learn.network.d2fnet import Architecture
-from learn.settings import Settings, override, preset
+from learn.settings import TrainingSettings, override, preset
 from synth.errors import UserError
 from synth.job import identity, retired
 
@@ -24,7 +24,7 @@ FRAMED = {
 PUBLISHED = FRAMED | {"kind": "antighost", "r2_weight": 0.3, "r2_scope": "batch"}
 
 
-def old(folder: Path, objective: dict[str, Any], **changes: Any) -> Card:
+def old(folder: Path, objective: dict[str, Any], **changes: Any) -> ModelCard:
     """The card of a config.json as commit f047e99 wrote it, changed at dotted settings."""
     values = {**{key: one.default for key, one in retired.TRAINING.items()}, "arch.width": 16, **changes}
     settings: dict[str, Any] = {"size": 32, "objective": objective, "arch": {"levels": 2}}
@@ -49,7 +49,7 @@ def test_a_config_of_before_is_read_and_its_loss_has_a_name(
     tmp_path: Path, objective: dict[str, Any], loss: str
 ) -> None:
     card = old(tmp_path, objective)
-    assert card.settings == Settings(size=32, arch=Architecture(width=16, levels=2), loss=loss)  # type: ignore[arg-type]
+    assert card.settings == TrainingSettings(size=32, arch=Architecture(width=16, levels=2), loss=loss)  # type: ignore[arg-type]
     assert (card.scales, card.epoch, card.retired) == (Scales(**SCALES), 7, {})
 
 
@@ -57,7 +57,7 @@ def test_a_config_of_before_is_read_and_its_loss_has_a_name(
     ("change", "key"),
     [
         ("bacth=3", "'batch'"),
-        ("input=motion", "arch.depth"),
+        ("arch.depth=true", "arch.depth"),
         ("arch.prior=residual", retired.LAST),
     ],
 )

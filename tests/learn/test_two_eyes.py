@@ -17,18 +17,18 @@ from learn.data.clips import Clip, load_clips
 from learn.data.grid import Grid, Scales, channels
 from learn.data.split import nested
 from learn.inference.export import export
-from learn.inference.predict import load_predictor
-from learn.settings import Settings, preset, replace
-from learn.training.batches import Frames, inputs
-from learn.training.gpu_batches import Resident
+from learn.inference.predict import load_model
+from learn.settings import TrainingSettings, preset, replace
+from learn.training.batches import FrameDataset, inputs
+from learn.training.gpu_batches import DeviceDataset
 from learn.training.train import train
 
 run = CliRunner().invoke
 SCALES = Scales(0.5, 0.02, 0.3, 12.5, 0.07)
 
 
-def small(**changes: object) -> Settings:
-    base = preset("eyes")
+def small(**changes: object) -> TrainingSettings:
+    base = preset("stereo")
     return replace(base, size=32, epochs=4, arch=replace(base.arch, levels=2, stem=2), **changes)
 
 
@@ -74,7 +74,7 @@ def test_channels_of_two_eyes_are_those_of_one_and_two_more() -> None:
 
 
 def test_depth_stays_when_the_picture_turns(told: list[Clip]) -> None:
-    frames = Frames(told, small())
+    frames = FrameDataset(told, small())
     still = frames.batch([(0, 3, "motion", 0)])
     for turn in range(8):
         turned = frames.batch([(0, 3, "motion", turn)])
@@ -93,7 +93,7 @@ def test_frames_held_by_a_device_are_those_read_one_by_one(told: list[Clip], tmp
         reading.pack(clip, tmp_path / str(k))  # what was packed is what was read
     some = [reading.unpack(tmp_path / "0"), reading.unpack(tmp_path / "1"), *told[2:]]
     items = [(c, t, source, c) for c in range(8) for t in (1, 4) for source in ("motion", "motion-ideal")]
-    read, held = Frames(told, settings), Resident(some, settings, torch.device("cpu"))
+    read, held = FrameDataset(told, settings), DeviceDataset(some, settings, torch.device("cpu"))
     for item in items:
         one, other = read.batch([item]), held.batch([item])
         for name in vars(one):
@@ -111,6 +111,6 @@ def test_predict_eval_and_export(model: Path, data: Path, tmp_path: Path) -> Non
     assert scored.exit_code == 0, scored.output
     assert json.loads(scored.stdout)["input"] == "motion"
     assert run(app, ["eval", str(model), str(data), "--all", "--input", "recovered"]).exit_code != 0
-    assert export(load_predictor(model), tmp_path / "net.pt", "torchscript") < 1e-4
+    assert export(load_model(model), tmp_path / "net.pt", "torchscript") < 1e-4
     about = json.loads((tmp_path / "net.pt.json").read_text())
     assert "second eye" in about["preprocessing"][0]

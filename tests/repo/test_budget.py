@@ -27,11 +27,11 @@ def test_a_package_keeps_to_its_budget(package: str) -> None:
 
 
 def test_keys_keep_to_their_budget() -> None:
-    from learn.settings import Settings
+    from learn.settings import TrainingSettings
     from synth.job import reader
 
     assert len(reader.places()) <= JOB_KEYS
-    assert len(reader.places(Settings)) <= TRAINING_KEYS
+    assert len(reader.places(TrainingSettings)) <= TRAINING_KEYS
 
 
 def test_commands_keep_to_their_budget() -> None:

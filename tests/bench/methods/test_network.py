@@ -8,7 +8,7 @@ import pytest
 from bench.methods.network import Model
 from bench.methods.protocol import Scene
 from learn.data.grid import Grid
-from learn.inference.predict import ForceMap, View
+from learn.inference.predict import ForceMap, GridView
 
 
 @pytest.mark.parametrize("young_kpa", [2.0, None])
@@ -17,7 +17,7 @@ def test_the_rest_frame_is_the_zero_and_unknown_tissue_has_1_kpa(
     vector: bool, young_kpa: float | None
 ) -> None:
     tissue, typical = np.ones((4, 4), bool), 5.0
-    view = View(tissue, 0.1, Grid(16))
+    view = GridView(tissue, 0.1, Grid(16))
 
     def predictor(
         flow: np.ndarray, where: object, scale: float, young: float | None, *more: object, **place: object

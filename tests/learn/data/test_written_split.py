@@ -13,9 +13,10 @@ from typer.testing import CliRunner
 
 from learn import cli
 from learn.checkpoint import read_card
-from learn.data.clips import Clip
+from learn.data.clips import Clip, load_clips
 from learn.data.split import Split, folds, nested
-from learn.settings import Settings, preset, replace
+from learn.settings import TrainingSettings, preset, replace
+from learn.training.sides import divide
 from synth.cli import app as synth
 from synth.dataset import index, split
 from synth.dataset.folder import Folder, claim
@@ -35,10 +36,11 @@ def own(dataset: Path, tmp_path: Path) -> Path:
 
 
 def divided(
-    *datasets: Path, settings: Settings = BASE, fixed: bool = False
-) -> tuple[dict[str, set[str]], Settings]:
+    *datasets: Path, settings: TrainingSettings = BASE, fixed: bool = False
+) -> tuple[dict[str, set[str]], TrainingSettings]:
     """Content hashes of each part of what would be trained on, and the settings."""
-    clips, parts, settings = cli._divided(datasets, settings, BASE, None, fixed=fixed)
+    clips = [clip for one in datasets for clip in load_clips(one, settings.grid, ["ideal"])]
+    clips, parts, settings = divide(clips, datasets, settings, ["folds"] * fixed)
     named = {part: {clips[i].content_hash for i in which} for part, which in vars(parts).items()}
     return named, settings
 

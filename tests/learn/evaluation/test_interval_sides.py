@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterable
 
-from learn.checkpoint import Card
+from learn.checkpoint import ModelCard
 from learn.data.clips import Clip
 from learn.data.grid import Scales
 from learn.data.split import Split
@@ -27,10 +27,10 @@ def of(brains: Iterable[int], each: int = 2) -> tuple[int, ...]:
     return tuple(b * each + k for b in brains for k in range(each))
 
 
-def card(clips: list[Clip], **parts: tuple[int, ...]) -> Card:
+def card(clips: list[Clip], **parts: tuple[int, ...]) -> ModelCard:
     hashes = {part: [clips[i].content_hash for i in which] for part, which in parts.items()}
     groups = {part: sorted({clips[i].group for i in which}) for part, which in parts.items()}
-    return Card(preset("tiny"), Scales(1.0, 0.2, 1.0, 100.0, 0.3), 1.7, hashes, groups)
+    return ModelCard(preset("tiny"), Scales(1.0, 0.2, 1.0, 100.0, 0.3), 1.7, hashes, groups)
 
 
 def test_half_of_the_choosing_brains_are_kept_whole(clips: list[Clip]) -> None:

@@ -9,12 +9,12 @@ import pytest
 import torch
 import torchmetrics
 
-from learn.checkpoint import Card
+from learn.checkpoint import ModelCard
 from learn.data.clips import Clip
-from learn.evaluation.evaluate import Report, score
+from learn.evaluation.evaluate import EvaluationReport, score
 from learn.evaluation.metrics import Moments, agreement, contact_mm
 from learn.network.d2fnet import Architecture
-from learn.settings import Settings
+from learn.settings import TrainingSettings
 from learn.training.batches import measure_scales
 
 
@@ -52,9 +52,9 @@ def test_contact_centre() -> None:
     assert np.isnan(contact_mm(np.zeros((4, 4)), 1.0)).all()
 
 
-def card(clips: list[Clip], output: str) -> Card:
-    settings = Settings(size=32, arch=Architecture(width=8, levels=2, output=output))  # type: ignore[arg-type]
-    return Card(settings, measure_scales(clips, settings), 1.2, {}, {})
+def card(clips: list[Clip], output: str) -> ModelCard:
+    settings = TrainingSettings(size=32, arch=Architecture(width=8, levels=2, output=output))  # type: ignore[arg-type]
+    return ModelCard(settings, measure_scales(clips, settings), 1.2, {}, {})
 
 
 def truth(clip: Clip, output: str) -> np.ndarray:
@@ -62,8 +62,8 @@ def truth(clip: Clip, output: str) -> np.ndarray:
     return density if output == "vector" else np.linalg.norm(density, axis=1, keepdims=True)
 
 
-def report(clips: list[Clip], said: list[np.ndarray], c: Card) -> Report:
-    return Report({"known": [score(clip, s, c) for clip, s in zip(clips, said, strict=True)]}, c)
+def report(clips: list[Clip], said: list[np.ndarray], c: ModelCard) -> EvaluationReport:
+    return EvaluationReport({"known": [score(clip, s, c) for clip, s in zip(clips, said, strict=True)]}, c)
 
 
 @pytest.mark.parametrize("output", ["vector", "magnitude"])

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from learn.checkpoint import read_card
 from learn.inference.force_reader import ForceReader, net_force
-from learn.inference.predict import load_predictor
+from learn.inference.predict import load_model
 from learn.uncertainty.intervals import LEVEL
 from synth.errors import UserError
 
@@ -28,7 +28,7 @@ def flow(size_mm: float) -> NDArray[np.float32]:
 
 
 def reader(folder: Path, young_kpa: float | None = 2.0) -> ForceReader:
-    return ForceReader(load_predictor(folder), np.ones(SHAPE, bool), SCALE, young_kpa)
+    return ForceReader(load_model(folder), np.ones(SHAPE, bool), SCALE, young_kpa)
 
 
 @pytest.fixture

@@ -15,12 +15,12 @@ import pytest
 from fake_model import write_model
 from typer.testing import CliRunner
 
-from learn.checkpoint import Card, read_card, write_card
+from learn.checkpoint import ModelCard, read_card, write_card
 from learn.cli import app
 from learn.data.clips import Clip
 from learn.data.grid import Grid
 from learn.inference.export import examples, export
-from learn.inference.predict import load_predictor
+from learn.inference.predict import load_model
 from learn.inference.stiffness import stiffness
 from learn.settings import override, preset
 from learn.training.batches import measure_scales
@@ -44,7 +44,7 @@ def model(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureReque
 
 @pytest.mark.parametrize("kind", ["torchscript", "onnx"])
 def test_an_exported_model_says_the_same(model: Path, tmp_path: Path, kind: str) -> None:
-    predictor = load_predictor(model)
+    predictor = load_model(model)
     file = tmp_path / "net"
     worst = export(predictor, file, kind)
     said = predictor.density(
@@ -61,7 +61,7 @@ def test_the_gain_is_in_every_map(model: Path, tmp_path: Path) -> None:
     folder = tmp_path / "model"
     shutil.copytree(model, folder)
     write_card(folder, replace(read_card(model), force_gain=1.25))
-    plain, gained = load_predictor(model), load_predictor(folder)
+    plain, gained = load_model(model), load_model(folder)
     told = examples(plain.card, 1)
     before, after = (one.density(told[0].numpy(), told[1][0, 0].numpy(), 1.0) for one in (plain, gained))
     np.testing.assert_allclose(after, 1.25 * before, rtol=1e-5)
@@ -77,10 +77,10 @@ def test_an_unfaithful_export_is_refused_and_removed(
 ) -> None:
     monkeypatch.setattr("learn.inference.export.TOLERANCE", -1.0)
     with pytest.raises(UserError):
-        export(load_predictor(model), tmp_path / "net", "torchscript")
+        export(load_model(model), tmp_path / "net", "torchscript")
     assert not list(tmp_path.iterdir())
     with pytest.raises(UserError, match="tflite"):
-        export(load_predictor(model), tmp_path / "net", "tflite")
+        export(load_model(model), tmp_path / "net", "tflite")
 
 
 def test_predict_on_stores_and_on_arrays_agree(model: Path, dataset: Path, tmp_path: Path) -> None:
@@ -167,7 +167,7 @@ def test_stiffness_from_a_press(clips: list[Clip]) -> None:
 
     class Right:
         grid, settings = Grid(32), override(preset("tiny"), ["size=32", "arch.levels=2"])
-        card = Card(settings, measure_scales(clips, settings), 0.7, {}, {})
+        card = ModelCard(settings, measure_scales(clips, settings), 0.7, {}, {})
 
         def density(self, moved: np.ndarray, mask: object, young: float, sure: object) -> np.ndarray:
             said = clip.density if moved.any() else 0 * clip.density[: len(moved)]

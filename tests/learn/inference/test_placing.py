@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from learn.data.grid import Grid
 from learn.inference.force_reader import ForceReader
 from learn.inference.placing import Placing
-from learn.inference.predict import load_predictor
+from learn.inference.predict import load_model
 
 _WIDE = np.ones((240, 480), bool)  # 48 x 96 mm
 _MM_PER_PX = 0.2
@@ -44,7 +44,7 @@ def test_grid_goes_to_what_moves_and_not_beyond_the_tissue() -> None:
 
 def test_force_is_that_of_the_part_that_moves(tmp_path: Path) -> None:
     """The same contact, far off the middle of a wide picture and alone on a picture as wide as the grid."""
-    predictor = load_predictor(write_model(tmp_path / "model", "arch.output=vector"))
+    predictor = load_model(write_model(tmp_path / "model", "arch.output=vector"))
     reader = ForceReader(predictor, _WIDE, _MM_PER_PX, 1.0)
     moved = _bump(370, 120)
     force, said = reader.read(moved, None)

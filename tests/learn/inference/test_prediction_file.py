@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 from learn.cli import app
 from learn.inference import prediction_file
 from learn.inference.apply import apply, motions
-from learn.inference.predict import View, load_predictor
+from learn.inference.predict import GridView, load_model
 from synth.dataset.store import Dataset
 
 FILES = ["000000.force.csv", "000000.force.mp4", "000000.npz"]
@@ -68,9 +68,9 @@ def test_a_dataset_gives_the_three_files(data: Path, model: Path, tmp_path: Path
 def test_the_map_lies_where_the_network_saw_it(data: Path, model: Path) -> None:
     """Against the network's own way from the grid to the picture."""
     (motion,) = motions(data / "000000.zarr", "ideal")
-    predictor = load_predictor(model)
+    predictor = load_model(model)
     found = apply(predictor, motion)
-    view = View(motion.tissue, motion.scale_mm_per_px, predictor.grid)
+    view = GridView(motion.tissue, motion.scale_mm_per_px, predictor.grid)
     n = predictor.grid.size
     cells = np.exp(-((np.arange(n)[:, None] - 0.6 * n) ** 2 + (np.arange(n) - 0.4 * n) ** 2) / 20)
     there = prediction_file.on_picture(cells, found, 2, motion.tissue.shape)

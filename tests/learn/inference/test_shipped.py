@@ -42,7 +42,7 @@ def test_what_is_packed_is_the_model(models: Path) -> None:
         "weights.safetensors",
     ]
     both = (models.parent / "trained-mono", folder)
-    before, after = (checkpoint.load_model(one)[0].state_dict() for one in both)
+    before, after = (checkpoint.read_model(one)[0].state_dict() for one in both)
     assert before.keys() == after.keys()
     assert all(np.array_equal(before[name], after[name]) for name in before)
     (row,) = json.loads(run(app, ["models", "--json"]).stdout)

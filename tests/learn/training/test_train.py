@@ -12,16 +12,16 @@ from learn import checkpoint
 from learn.data.clips import Clip
 from learn.data.split import Split, nested
 from learn.evaluation.evaluate import unseen
-from learn.inference.predict import load_predictor
-from learn.settings import Settings, preset, replace
-from learn.training.batches import Batch, Frames, measure_scales, swayed
+from learn.inference.predict import load_model
+from learn.settings import TrainingSettings, preset, replace
+from learn.training.batches import Batch, FrameDataset, measure_scales, swayed
 from learn.training.train import select_score, train
 from synth.dataset.store import Dataset
 from synth.errors import UserError
 from synth.job.retired import LAST
 
 
-def small(**changes: object) -> Settings:
+def small(**changes: object) -> TrainingSettings:
     base = preset("tiny", size=32, epochs=4, loss="antighost")
     return replace(base, arch=replace(base.arch, levels=2, dropout=0.1), **changes)
 
@@ -70,8 +70,8 @@ def test_training_learns(clips: list[Clip], tmp_path: Path, monkeypatch: pytest.
     """A network that can't even come to remember what it is shown is broken; one that is stuck loses 0.9."""
     settings = small(epochs=8, batch=4, learning_rate=5e-3)
     settings = replace(settings, arch=replace(settings.arch, dropout=0.0))
-    draw = Frames.order
-    monkeypatch.setattr(Frames, "order", lambda *args: [(*item[:3], 0) for item in draw(*args)])
+    draw = FrameDataset.order
+    monkeypatch.setattr(FrameDataset, "order", lambda *args: [(*item[:3], 0) for item in draw(*args)])
     train(clips, Split((0, 1, 3, 4, 5, 6), (2,), ()), settings, tmp_path / "m")
     losses = [json.loads(line)["loss"] for line in (tmp_path / "m/history.jsonl").read_text().splitlines()]
     assert losses[-1] < 0.6 < 0.8 < losses[0]
@@ -85,7 +85,7 @@ def test_only_unseen_sequences_are_scored(clips: list[Clip], split: Split, model
 
 
 def test_prediction_on_a_picture_is_that_on_the_grid(model: Path, dataset: Path, clips: list[Clip]) -> None:
-    predictor = load_predictor(model)
+    predictor = load_model(model)
     sequence = Dataset(dataset)[4]
     map_ = predictor(
         sequence["flow"][3],
@@ -105,7 +105,7 @@ def test_prediction_on_a_picture_is_that_on_the_grid(model: Path, dataset: Path,
 
 
 def test_the_same_motion_filmed_at_another_resolution_is_the_same_force(model: Path) -> None:
-    predictor = load_predictor(model)
+    predictor = load_model(model)
 
     def force(size: int, scale: float) -> float:
         node = (np.arange(size) - (size - 1) / 2) * scale
@@ -139,7 +139,7 @@ def test_a_split_that_leaks_is_refused(clips: list[Clip], tmp_path: Path) -> Non
 
 def test_sway_moves_the_whole_surface_of_half_of_the_frames_and_leaves_the_force(clips: list[Clip]) -> None:
     settings = small(sway_mm=0.5)
-    frames = Frames(clips, settings)
+    frames = FrameDataset(clips, settings)
     items = [(c, t, "ideal", 0) for c in range(len(clips)) for t in range(clips[c].frames)]
     still = frames.batch(items)
     moved = swayed(still, settings, torch.Generator().manual_seed(0))
@@ -184,7 +184,7 @@ def test_what_a_network_says_too_little_of_the_force_is_its_gain(
 
     monkeypatch.setattr("learn.training.train.forward", forward)
     told = [dataclasses.replace(clips[i % len(clips)], group=str(i % anatomies)) for i in range(10)]
-    chosen = Frames(told, settings)
+    chosen = FrameDataset(told, settings)
     found = select_score(torch.nn.Identity(), chosen, measure_scales(clips, settings), torch.device("cpu"))
     slope = np.dot(true, said) / max(np.dot(said, said), 1e-30)
     assert found["select_gain"] == pytest.approx(np.clip(slope, *limits), rel=1e-6)

@@ -12,7 +12,7 @@ from learn.uncertainty.features import (
     MOTION,
     motion_features,
 )
-from learn.uncertainty.world import fit_world
+from learn.uncertainty.out_of_distribution import fit_distribution
 
 Floats = NDArray[np.float64]
 
@@ -65,7 +65,7 @@ def cloud(rng: np.random.Generator, sequences: int, frames: int = 10) -> list[Fl
 
 def test_distance_is_mahalanobis_and_its_99th_that_of_chi_squared() -> None:
     rng = np.random.default_rng(0)
-    world = fit_world(cloud(rng, 1000), cloud(rng, 1000))
+    world = fit_distribution(cloud(rng, 1000), cloud(rng, 1000))
     assert world is not None
     assert world.usual == pytest.approx(np.sqrt(chi2.ppf(0.99, 3)), rel=0.03)
     mix = np.array([[1.0, 0.0, 0.0], [0.5, 0.7, 0.0], [-0.2, 0.1, 0.4]])
@@ -77,9 +77,9 @@ def test_distance_is_mahalanobis_and_its_99th_that_of_chi_squared() -> None:
 
 def test_a_resting_frame_is_of_no_world() -> None:
     rng = np.random.default_rng(2)
-    world = fit_world(cloud(rng, 20), cloud(rng, 20))
+    world = fit_distribution(cloud(rng, 20), cloud(rng, 20))
     assert world is not None
     assert world.distance(np.array([[-5.0, 80.0, 80.0]]))[0] == 0
     resting = [np.full((4, 3), -5.0)]
-    assert fit_world(resting, cloud(rng, 3)) is None
-    assert fit_world(cloud(rng, 3), resting) is None
+    assert fit_distribution(resting, cloud(rng, 3)) is None
+    assert fit_distribution(cloud(rng, 3), resting) is None

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from learn.uncertainty.conformal import LEVELS
 from learn.uncertainty.features import MOTION
-from learn.uncertainty.intervals import Example, Intervals, Said, fit, make_example
-from learn.uncertainty.world import fit_world
+from learn.uncertainty.intervals import Example, Intervals, Prediction, fit, make_example
+from learn.uncertainty.out_of_distribution import fit_distribution
 from synth.errors import UserError
 
 Floats = NDArray[np.float64]
@@ -20,7 +20,7 @@ FRAMES, N, PITCH_MM = 5, 16, 2.0
 
 def draw(
     rng: np.random.Generator, directed: bool = True, noise: float = 0.2, moved: float = 0.0
-) -> tuple[Said, Floats]:
+) -> tuple[Prediction, Floats]:
     """One sequence: its answer, off by a share that is mostly the sequence's own, and the force (T, 3).
 
     `moved`: added to the logarithm of motion and to its divergence: another world.
@@ -40,10 +40,10 @@ def draw(
         told = np.column_stack([np.linalg.norm(told, axis=1), *np.full((2, FRAMES), np.nan)])
     bump = np.exp(-(((np.indices((N, N)) - rng.uniform(5, 11, (2, 1, 1))) / 2.5) ** 2).sum(0))
     true = (size[:, None, None] / 100 * bump).astype(np.float32)
-    return Said(motion, told, np.abs(share[..., None]).astype(np.float32) * true, PITCH_MM), force
+    return Prediction(motion, told, np.abs(share[..., None]).astype(np.float32) * true, PITCH_MM), force
 
 
-def example(drawn: tuple[Said, Floats], unit: int) -> Example:
+def example(drawn: tuple[Prediction, Floats], unit: int) -> Example:
     return make_example(*drawn, unit, UNIT_MN)
 
 
@@ -51,12 +51,12 @@ def fitted(rng: np.random.Generator, kept: int = 19, directed: bool = True, chos
     """Intervals of `kept` sequences, their scale from others and the distance from others again."""
     first = [example(draw(rng, directed), k) for k in range(chosen)]
     last = [example(draw(rng, directed), k) for k in range(kept)]
-    world = fit_world([draw(rng)[0].motion for _ in range(60)], [one.motion for one in first])
+    world = fit_distribution([draw(rng)[0].motion for _ in range(60)], [one.motion for one in first])
     assert world is not None
     return fit(first, last, world, MOTION, UNIT_MN, "recovered")
 
 
-def held(found: Intervals, said: Said, force: Floats, level: float) -> Floats:
+def held(found: Intervals, said: Prediction, force: Floats, level: float) -> Floats:
     """Shares within the interval: of size, x, y and z."""
     band = found.bound(said, level)
     size = np.linalg.norm(force, axis=1)
@@ -105,7 +105,7 @@ def test_sequences_of_one_brain_are_one_unit_and_too_few_are_refused() -> None:
         fitted(rng, kept=8)
     first = [example(draw(rng), k) for k in range(5)]
     last = [example(draw(rng), k // 3) for k in range(24)]
-    world = fit_world([one.motion for one in first], [one.motion for one in first])
+    world = fit_distribution([one.motion for one in first], [one.motion for one in first])
     assert world is not None
     with pytest.raises(UserError, match="8"):
         fit(first, last, world, MOTION, UNIT_MN, "recovered")

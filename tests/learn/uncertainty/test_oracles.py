@@ -7,8 +7,8 @@ import pytest
 from sklearn.covariance import LedoitWolf
 from sklearn.linear_model import Ridge
 
-from learn.uncertainty.scale import fit_scale
-from learn.uncertainty.world import shrunk_covariance
+from learn.uncertainty.error_model import fit_error_model
+from learn.uncertainty.out_of_distribution import shrunk_covariance
 
 
 @pytest.mark.parametrize("count", [12, 400])
@@ -22,7 +22,7 @@ def test_the_scale_is_a_ridges() -> None:
     rng = np.random.default_rng(4)
     features = rng.normal(size=(60, 3)) * [1, 10, 0.1] + [0, 5, 2]
     error, weight = np.exp(features[:, 0] + rng.normal(size=60)), rng.uniform(0.2, 2, 60)
-    rule = fit_scale(features, error, weight, 0.1)
+    rule = fit_error_model(features, error, weight, 0.1)
     spread = features.std(0)
     theirs = Ridge(alpha=1.0).fit(
         features / spread, np.log(error + 0.1), sample_weight=weight / weight.mean()

@@ -16,12 +16,12 @@ from synth.job.types import Positive
 Floats = NDArray[np.float64]
 
 USUAL = 0.99
-"""Share of held-out frames that are no further than `World.usual`."""
+"""Share of held-out frames that are no further than `OutOfDistribution.usual`."""
 _LEAST_SPREAD = 0.05  # of a feature: logarithms and shares tell no worlds apart by less
 
 
 @dataclass(frozen=True)
-class World:
+class OutOfDistribution:
     """The features of the fitted sequences, as one ellipsoid."""
 
     middle: tuple[FiniteFloat, ...]
@@ -41,7 +41,7 @@ class World:
         return np.maximum(self.distance(motion) / self.usual, 1.0)
 
 
-def fit_world(fitted: Sequence[Floats], held_out: Sequence[Floats]) -> World | None:
+def fit_distribution(fitted: Sequence[Floats], held_out: Sequence[Floats]) -> OutOfDistribution | None:
     """The ellipsoid of the moving frames of the fitted sequences; None if either hold none.
 
     Covariance with the shrinkage of Ledoit and Wolf (2004), on features of unit variance.
@@ -61,9 +61,9 @@ def fit_world(fitted: Sequence[Floats], held_out: Sequence[Floats]) -> World | N
     least = (_LEAST_SPREAD / spread) ** 2
     precision = np.linalg.inv(shrunk + np.diag(np.maximum(least - np.diag(shrunk), 0.0)))
     precision = precision / np.outer(spread, spread)
-    world = World(tuple(seen.mean(0).tolist()), tuple(map(tuple, precision.tolist())), 1.0)
+    world = OutOfDistribution(tuple(seen.mean(0).tolist()), tuple(map(tuple, precision.tolist())), 1.0)
     usual = share_quantile([world.distance(m)[is_moving(m)] for m in others], USUAL)
-    return World(world.middle, world.precision, max(usual, 1e-6))
+    return OutOfDistribution(world.middle, world.precision, max(usual, 1e-6))
 
 
 def shrunk_covariance(samples: Floats) -> Floats:

@@ -14,7 +14,7 @@ Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Scale:
+class ErrorModel:
     """A log-linear rule. Beyond the features it was fitted on it goes on as at their edge."""
 
     intercept: FiniteFloat
@@ -32,7 +32,7 @@ class Scale:
         return np.asarray(np.maximum(np.exp(self.intercept + held @ np.array(self.slopes)), self.least))
 
 
-def fit_scale(features: Floats, error: Floats, weight: Floats, least: float) -> Scale:
+def fit_error_model(features: Floats, error: Floats, weight: Floats, least: float) -> ErrorModel:
     """Least squares on the logarithm of the error, slightly held back (ridge).
 
     Args:
@@ -47,7 +47,7 @@ def fit_scale(features: Floats, error: Floats, weight: Floats, least: float) -> 
     told = (features - middle) / spread
     held = told.T @ (share[:, None] * told) + np.eye(told.shape[1])
     slopes = np.linalg.solve(held, told.T @ (share * (wanted - level))) / spread
-    return Scale(
+    return ErrorModel(
         intercept=level - float(middle @ slopes),
         slopes=tuple(slopes.tolist()),
         low=tuple(features.min(0).tolist()),

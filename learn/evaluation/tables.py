@@ -1,0 +1,69 @@
+"""Scores, coverage and paired tests as `learn eval` prints them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from rich.box import SIMPLE_HEAD
+from rich.table import Table
+
+from learn.checkpoint import ModelCard
+from learn.evaluation.coverage import Coverage
+from learn.evaluation.evaluate import YOUNG, EvaluationReport
+from learn.evaluation.metrics import METRICS, Metric
+from learn.evaluation.statistics import Paired
+
+
+def score_table(report: EvaluationReport, title: str) -> Table:
+    """Means over sequences, a column for each state of knowledge of E."""
+    table = _open_table(title, "E known [95%]", "E × ½", "E × 2", "E unknown")
+    columns, sure = [report.summary(y) for y in YOUNG], report.intervals()
+    for key, metric in METRICS.items():
+        if not metric.listed or key not in columns[0]:
+            continue
+        cells = [_cell(metric, c.get(key)) for c in columns]
+        if key in sure and sure[key].low == sure[key].low:
+            cells[0] += f" [{_cell(metric, sure[key].low)}, {_cell(metric, sure[key].high)}]"
+        table.add_row(_label(metric, report.card), *cells)
+    return table
+
+
+def coverage_table(covered: Sequence[Coverage]) -> Table:
+    """Whether the model's intervals hold, and how wide they are."""
+    table = _open_table("intervals", *(f"{one.level:.0%}" for one in covered))
+    for k, name in enumerate(("force", "x", "y", "z")):
+        shares = [(one.size, *one.axes)[k] for one in covered]
+        table.add_row(f"{name} within", *(f"{s.mean:.0%} [{s.low:.0%}, {s.high:.0%}]" for s in shares))
+    table.add_row("width of the force's [mN]", *(f"{one.width_mn:.3g}" for one in covered))
+    table.add_row("the same over the peak", *(f"{one.width_of_peak:.0%}" for one in covered))
+    table.add_row("moving frames out of distribution", *(f"{one.unseen:.0%}" for one in covered))
+    return table
+
+
+def paired_table(pairs: Mapping[str, Paired], title: str, card: ModelCard) -> Table:
+    """Differences, this model minus the other, sequence by sequence."""
+    table = _open_table(title, "difference [95%]", "p", "larger on")
+    for key, metric in METRICS.items():
+        if metric.listed and key in pairs:
+            d, pair = pairs[key].difference, pairs[key]
+            difference = f"{d.mean:+.3g} [{d.low:+.3g}, {d.high:+.3g}]"
+            table.add_row(_label(metric, card), difference, f"{pair.p:.2g}", f"{pair.wins:.0%}")
+    return table
+
+
+def _open_table(title: str, *heads: str) -> Table:
+    """A table that keeps its numbers whole in eighty columns: labels wrap, there are no upright lines."""
+    table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
+    table.add_column("", overflow="fold")
+    for head in heads:
+        table.add_column(head, justify="right", no_wrap=True)
+    return table
+
+
+def _label(metric: Metric, card: ModelCard) -> str:
+    """A score's heading, in the unit of the model's map."""
+    return metric.heading.replace("mN/mm²", "mN") if card.settings.target == "intensity" else metric.heading
+
+
+def _cell(metric: Metric, value: float | None) -> str:
+    return "-" if value is None or value != value else f"{value:.{metric.digits}g}"
