@@ -7,9 +7,9 @@ from typing import Any
 _WHERE = {
     "Answer": "bench.methods.protocol",
     "Method": "bench.methods.protocol",
-    "Result": "bench.scoring.evaluate_recording",
+    "Result": "bench.scoring.result",
     "Scene": "bench.methods.protocol",
-    "Settings": "bench.scoring.evaluate_recording",
+    "Settings": "synth.recording_flow.video_flow",
     "export_recording": "bench.recording.from_sequence",
     "score": "bench.scoring.commands",
 }

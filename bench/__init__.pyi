@@ -3,5 +3,5 @@ from bench.methods.protocol import Method as Method
 from bench.methods.protocol import Scene as Scene
 from bench.recording.from_sequence import export_recording as export_recording
 from bench.scoring.commands import score as score
-from bench.scoring.evaluate_recording import Result as Result
-from bench.scoring.evaluate_recording import Settings as Settings
+from bench.scoring.result import Result as Result
+from synth.recording_flow.video_flow import Settings as Settings

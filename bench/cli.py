@@ -14,7 +14,7 @@ from synth.errors import UserError
 from synth.system.cli_errors import Commands, printable
 
 if TYPE_CHECKING:
-    from bench.scoring.evaluate_recording import Result
+    from bench.scoring.result import Result
 
 app = typer.Typer(
     name="bench",
@@ -70,7 +70,7 @@ def score(
 ) -> None:
     """Force from a recording's video, scored against its sensor: score.json and report.html."""
     from bench.scoring import commands
-    from bench.scoring.evaluate_recording import Settings
+    from synth.recording_flow.video_flow import Settings
     from synth.video.mask_files import read_choice
 
     others = {name: Path(folder) for name, folder in _pairs("--also", also, "NAME=FOLDER").items()}
@@ -176,7 +176,7 @@ def demo(
 ) -> None:
     """Scores a model on a sequence of its dataset that it has not seen, by way of a recording."""
     from bench.scoring import commands
-    from bench.scoring.evaluate_recording import Settings
+    from synth.recording_flow.video_flow import Settings
 
     _say(commands.score_demo(dataset, model, out, Settings(backend=flow, rate_hz=None)), out, json)
 
@@ -256,10 +256,11 @@ def _typed() -> str:
 def _say(result: Result, folder: Path, json: bool) -> None:
     from rich.console import Console
 
-    from bench.scoring import evaluate_recording, headline, report
+    from bench.scoring import headline, report
+    from bench.scoring import result as results
 
     if json:
-        print(json_.dumps(evaluate_recording.as_json(result), allow_nan=False))
+        print(json_.dumps(results.as_json(result), allow_nan=False))
         return
     console = Console()
     first = headline.headline(result)

@@ -49,7 +49,7 @@ class _Section(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True, allow_inf_nan=False)
 
 
-class Calibration(_Section):
+class ScaleCalibration(_Section):
     """How to find the scale when it isn't stated. Give one of the ways."""
 
     focal_px: Positive | None = None
@@ -72,7 +72,7 @@ class Calibration(_Section):
     """Length of that move [mm]."""
 
     @model_validator(mode="after")
-    def _exactly_one_way(self) -> Calibration:
+    def _exactly_one_way(self) -> ScaleCalibration:
         ways = (
             (self.focal_px, self.distance_mm),
             (self.bar_px, self.bar_mm),
@@ -88,7 +88,7 @@ class Calibration(_Section):
         return self
 
 
-class Sensor(_Section):
+class SensorMeta(_Section):
     """The force sensor and how its file is to be read."""
 
     axes: Literal["camera", "sensor"] = "sensor"
@@ -110,7 +110,7 @@ class Sensor(_Section):
     vector along gravity in the sensor's axes."""
 
     @model_validator(mode="after")
-    def _has_one_rotation(self) -> Sensor:
+    def _has_one_rotation(self) -> SensorMeta:
         if self.to_camera is not None:
             rows = np.array(self.to_camera)
             if not np.allclose(rows @ rows.T, np.eye(3), atol=0.02) or np.linalg.det(rows) < 0:
@@ -139,7 +139,7 @@ class Sync(_Section):
     """Largest offset looked for, either way [s]."""
 
 
-class Pulse(_Section):
+class PulseMeta(_Section):
     """The tissue's own motion by heart and breath, which is taken off before any method reads the motion."""
 
     remove: bool = True
@@ -175,7 +175,7 @@ class Meta(_Section):
     scale_mm_per_px: Positive | Literal["unknown"] | None = None
     """Millimetres a pixel at the tissue, or `unknown`: then only relative force is known. This or
     `calibration`."""
-    calibration: Calibration | None = None
+    calibration: ScaleCalibration | None = None
     """How to find the scale."""
     scale_uncertainty: Share | None = None
     """Relative standard uncertainty of the scale, e.g. 0.05. Default: 0.02, or the calibration's."""
@@ -199,9 +199,9 @@ class Meta(_Section):
     """Of a recording with a second eye."""
     depth: Depth | None = None
     """Of a recording with a depth camera."""
-    sensor: Sensor = Sensor()
+    sensor: SensorMeta = SensorMeta()
     sync: Sync = Sync()
-    pulse: Pulse = Pulse()
+    pulse: PulseMeta = PulseMeta()
 
     @model_validator(mode="after")
     def _scale_is_known(self) -> Meta:

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from bench.recording.folder import open_recording
-from bench.recording.meta import Calibration, Meta
+from bench.recording.meta import Meta, ScaleCalibration
 from synth.errors import UserError
 from synth.video import read as video
 from synth.video.pixel_scale import TAKEN_MM, take_scale
@@ -25,7 +25,7 @@ _DISTANCE = 0.01  # relative standard error of a stated working distance
 
 
 @dataclass(frozen=True)
-class Scale:
+class PixelScale:
     """Scale at the tissue."""
 
     mm_per_px: float
@@ -34,7 +34,7 @@ class Scale:
     source: str
 
 
-def find_scale(meta: Meta, folder: Path) -> Scale:
+def find_scale(meta: Meta, folder: Path) -> PixelScale:
     """The recording's scale, from what `meta.yaml` offers.
 
     Raises:
@@ -43,17 +43,17 @@ def find_scale(meta: Meta, folder: Path) -> Scale:
     if meta.scale_mm_per_px == "unknown":
         wide = next(iter(open_recording(folder).frames())).rgb.shape[1]
         source = f"unknown: the picture is taken to be {TAKEN_MM:g} mm wide"
-        return Scale(take_scale("unknown", wide), _first(meta.scale_uncertainty, _UNKNOWN), source)
+        return PixelScale(take_scale("unknown", wide), _first(meta.scale_uncertainty, _UNKNOWN), source)
     if meta.scale_mm_per_px is not None:
-        return Scale(meta.scale_mm_per_px, _first(meta.scale_uncertainty, _STATED), "stated")
+        return PixelScale(meta.scale_mm_per_px, _first(meta.scale_uncertainty, _STATED), "stated")
     assert meta.calibration is not None
     found = _calibrated(meta.calibration, folder)
-    return Scale(found.mm_per_px, _first(meta.scale_uncertainty, found.uncertainty), found.source)
+    return PixelScale(found.mm_per_px, _first(meta.scale_uncertainty, found.uncertainty), found.source)
 
 
-def _calibrated(way: Calibration, folder: Path) -> Scale:
+def _calibrated(way: ScaleCalibration, folder: Path) -> PixelScale:
     if way.focal_px is not None and way.distance_mm is not None:
-        return Scale(way.distance_mm / way.focal_px, _DISTANCE, "focal length and working distance")
+        return PixelScale(way.distance_mm / way.focal_px, _DISTANCE, "focal length and working distance")
     if way.bar_px is not None and way.bar_mm is not None:
         return _bar(way.bar_px, way.bar_mm, "scale bar")
     if way.travel_px is not None and way.travel_mm is not None:
@@ -64,14 +64,14 @@ def _calibrated(way: Calibration, folder: Path) -> Scale:
     return _checkerboard(folder / way.checkerboard, way.corners, way.square_mm)
 
 
-def _bar(ends: tuple[tuple[float, float], tuple[float, float]], length_mm: float, source: str) -> Scale:
+def _bar(ends: tuple[tuple[float, float], tuple[float, float]], length_mm: float, source: str) -> PixelScale:
     length = float(np.hypot(ends[1][0] - ends[0][0], ends[1][1] - ends[0][1]))
     if length < 2:
         raise UserError(f"calibration: the ends of the {source} are {length:.1f} px apart")
-    return Scale(length_mm / length, float(np.sqrt(2)) * _POINT_PX / length, source)
+    return PixelScale(length_mm / length, float(np.sqrt(2)) * _POINT_PX / length, source)
 
 
-def _checkerboard(path: Path, corners: tuple[int, int], square_mm: float) -> Scale:
+def _checkerboard(path: Path, corners: tuple[int, int], square_mm: float) -> PixelScale:
     """Mean length of the squares' sides over the whole board; their spread is the error.
 
     On a board that lies flat and square to the view all sides are equal; tilt and distortion show as spread.
@@ -88,7 +88,7 @@ def _checkerboard(path: Path, corners: tuple[int, int], square_mm: float) -> Sca
     # Sides along rows and columns differ under tilt: half that difference can't be averaged away.
     tilt = abs(float(sides[0].mean() - sides[1].mean())) / 2
     error = float(np.hypot(lengths.std() / np.sqrt(len(lengths)), tilt)) / middle
-    return Scale(square_mm / middle, max(error, 1e-4), "checkerboard")
+    return PixelScale(square_mm / middle, max(error, 1e-4), "checkerboard")
 
 
 def _first(*values: float | None) -> float:

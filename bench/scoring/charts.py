@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.scoring import metrics
-from bench.scoring.evaluate_recording import Result
+from bench.scoring.result import Result
 from bench.sensor.clock_sync import Offset
 
 Figure = dict[str, Any]
@@ -29,7 +29,7 @@ def draw_force(result: Result) -> Figure:
     data: list[Figure] = []
     bound = result.methods[result.main]
     if result.absolute and bound.low_mn is not None and bound.high_mn is not None:
-        data += _band(time, bound.low_mn, bound.high_mn, f"{bound.held['level']:.0%} interval", INTERVAL)
+        data += _band(time, bound.low_mn, bound.high_mn, f"{bound.interval['level']:.0%} interval", INTERVAL)
     spread = 1.96 * result.relative_uncertainty
     if spread > 0:
         low, high = main * (1 - min(spread, 1.0)), main * (1 + spread)

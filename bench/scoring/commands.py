@@ -16,15 +16,16 @@ from bench.methods.protocol import Method
 from bench.recording import pixel_scale
 from bench.recording.folder import Recording, open_recording
 from bench.recording.from_sequence import export_recording
-from bench.scoring import evaluate_recording, report
-from bench.scoring.evaluate_recording import Result, Settings
+from bench.scoring import report
+from bench.scoring.evaluate_recording import evaluate_recording
+from bench.scoring.result import Result, write_json
 from bench.tracking import flow_process
 from bench.tracking.tracking import Progress
 from learn.inference.predict import Predictor
 from learn.inference.shipped import NONE, choose_model, find_model, shipped
 from synth.dataset.store import Dataset, Sequence
 from synth.errors import UserError
-from synth.recording_flow.video_flow import FlowHere
+from synth.recording_flow.video_flow import FlowHere, Settings
 from synth.system import checked_file
 from synth.system.terminal import counting
 from synth.video.mask_files import MaskFiles
@@ -123,9 +124,7 @@ def _evaluate(
     scale = pixel_scale.find_scale(opened.meta, opened.folder)
     chosen = {**({MAIN: network} if network else {}), **methods}
     main = next(iter(chosen))
-    return evaluate_recording.evaluate_recording(
-        opened, chosen, main, scale, settings, described, progress, flow
-    )
+    return evaluate_recording(opened, chosen, main, scale, settings, described, progress, flow)
 
 
 def _two_eyes(opened: Recording) -> bool:
@@ -146,7 +145,7 @@ def write_result(result: Result, folder: Path, title: str) -> None:
         checked_file.part_of(folder / "score.json") as scores,
         checked_file.part_of(folder / "report.html") as page,
     ):
-        evaluate_recording.write_json(result, scores)
+        write_json(result, scores)
         report.write_report(result, page, title)
 
 

@@ -6,8 +6,8 @@ import math
 from dataclasses import dataclass
 
 from bench.bootstrap import Interval
-from bench.scoring.evaluate_recording import MOST_LOST, Result
 from bench.scoring.metrics import METRICS
+from bench.scoring.result import MOST_LOST, Result
 
 _NEWTONS = ("mae_mn", "mae_of_peak", "r", "ccc", "r2", "ghost_rate")
 _SHAPE = ("r", "shape_error", "lag_s")

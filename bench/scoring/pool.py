@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bench.bootstrap import over_groups
-from bench.scoring.evaluate_recording import MOST_LOST
 from bench.scoring.metrics import METRICS
+from bench.scoring.result import MOST_LOST
 from synth.errors import UserError
 from synth.publish.svg import svg
 from synth.system import checked_file

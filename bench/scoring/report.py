@@ -21,9 +21,9 @@ from rich.markup import escape
 from rich.table import Table
 
 from bench.scoring import charts, metrics
-from bench.scoring.evaluate_recording import Result
 from bench.scoring.headline import headline
 from bench.scoring.metrics import METRICS
+from bench.scoring.result import Result
 from bench.tracking.tracking import Snapshot, Tracked, picture_masks
 from learn.evaluation.metrics import Metric
 from synth.dataset.folder import write_whole

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy import signal
 
 from bench.recording.folder import Force
-from bench.recording.meta import Sensor
+from bench.recording.meta import SensorMeta
 from synth.errors import UserError
 
 STANDARD_GRAVITY = 9.80665
@@ -37,7 +37,7 @@ class Processed:
     """What was done, in order, in words."""
 
 
-def process_force(force: Force, sensor: Sensor, offset_s: float, causal: bool = False) -> Processed:
+def process_force(force: Force, sensor: SensorMeta, offset_s: float, causal: bool = False) -> Processed:
     """Gravity, tare and drift, low-pass, clock; in this order.
 
     Args:
@@ -75,7 +75,7 @@ def force_at(processed: Processed, time_s: NDArray[np.float64]) -> NDArray[np.fl
     return out
 
 
-def _weightless(force: Force, sensor: Sensor, steps: list[str]) -> NDArray[np.float64]:
+def _weightless(force: Force, sensor: SensorMeta, steps: list[str]) -> NDArray[np.float64]:
     if sensor.mass_g == 0:
         return force.force_mn.copy()
     if force.gravity is None:
@@ -95,7 +95,7 @@ def _weightless(force: Force, sensor: Sensor, steps: list[str]) -> NDArray[np.fl
 
 
 def _tared(
-    time_s: NDArray[np.float64], values: NDArray[np.float64], sensor: Sensor, steps: list[str]
+    time_s: NDArray[np.float64], values: NDArray[np.float64], sensor: SensorMeta, steps: list[str]
 ) -> tuple[NDArray[np.float64], float]:
     """Subtracts the zero: a line through the medians of the contact-free spans, constant beyond them."""
     if not sensor.free_s:
@@ -170,7 +170,7 @@ def runs(time_s: NDArray[np.float64], good: NDArray[np.bool_], gap_s: float) -> 
     return list(np.split(where, np.flatnonzero(np.diff(time_s[where]) > gap_s) + 1))
 
 
-def _floor(time_s: NDArray[np.float64], values: NDArray[np.float64], sensor: Sensor) -> float:
+def _floor(time_s: NDArray[np.float64], values: NDArray[np.float64], sensor: SensorMeta) -> float:
     spreads = []
     for start, stop in sensor.free_s:
         inside = values[(time_s >= start) & (time_s <= stop)]

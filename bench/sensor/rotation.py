@@ -31,7 +31,7 @@ _STARTS = Rotation.create_group("O")
 
 
 @dataclass(frozen=True)
-class Turn:
+class SensorRotation:
     """What was found."""
 
     rows: tuple[tuple[float, ...], ...]
@@ -48,7 +48,7 @@ class Turn:
         return f"± {self.deviation_deg:.1f}°, {100 * self.explained:.0f}% of the motion explained"
 
 
-def find_turn(moved: Floats, seen: Floats, force_mn: Floats) -> Turn:
+def find_rotation(moved: Floats, seen: Floats, force_mn: Floats) -> SensorRotation:
     """The rotation at which the tissue's motion best follows the force.
 
     Args:
@@ -82,7 +82,7 @@ def find_turn(moved: Floats, seen: Floats, force_mn: Floats) -> Turn:
         refused = f"only {100 * explained:.0f}% of the motion follows the force"
     elif deviation > _SURE_DEG:
         refused = f"known to {deviation:.0f}° only"
-    return Turn(tuple(map(tuple, turn.as_matrix().tolist())), deviation, explained, refused)
+    return SensorRotation(tuple(map(tuple, turn.as_matrix().tolist())), deviation, explained, refused)
 
 
 def _shift(moved: Floats, seen: Floats) -> Floats:
@@ -119,5 +119,5 @@ def _fitted(force: Floats, shift: Floats, weights: Floats, starts: Rotation) -> 
     return Rotation.from_rotvec(best.x) * start, explained, float(misfit)
 
 
-def _none(reason: str) -> Turn:
-    return Turn((), float("nan"), float("nan"), reason)
+def _none(reason: str) -> SensorRotation:
+    return SensorRotation((), float("nan"), float("nan"), reason)

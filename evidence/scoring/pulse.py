@@ -20,11 +20,12 @@ from bench.methods.compliance import TO_CAMERA, Block, picture
 from bench.methods.protocol import Method
 from bench.recording import pixel_scale, writer
 from bench.recording.folder import open_recording
-from bench.scoring import evaluate_recording
-from bench.scoring.evaluate_recording import Result, Settings
+from bench.scoring.evaluate_recording import evaluate_recording
+from bench.scoring.result import Result
 from evidence import report
 from evidence.flow.scenes import inverse
 from evidence.scoring.cost import texture
+from synth.recording_flow.video_flow import Settings
 
 Floats = NDArray[np.float64]
 
@@ -148,7 +149,7 @@ def score(folder: Path, methods: Mapping[str, Method], backend: str) -> Result:
     opened = open_recording(folder)
     scale = pixel_scale.find_scale(opened.meta, folder)
     settings = Settings(backend, shrink=1, rate_hz=None)
-    return evaluate_recording.evaluate_recording(opened, methods, next(iter(methods)), scale, settings, {})
+    return evaluate_recording(opened, methods, next(iter(methods)), scale, settings, {})
 
 
 def page(tree: Mapping[str, Any]) -> report.Page:

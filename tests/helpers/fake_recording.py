@@ -14,8 +14,10 @@ from numpy.typing import NDArray
 from bench.methods.protocol import Answer, Method, Scene
 from bench.recording import pixel_scale, writer
 from bench.recording.folder import open_recording
-from bench.scoring.evaluate_recording import Result, Settings, evaluate_recording
+from bench.scoring.evaluate_recording import evaluate_recording
+from bench.scoring.result import Result
 from evidence.scoring import cost as phantom
+from synth.recording_flow.video_flow import Settings
 
 GAIN_MN_PER_PX = 40.0
 SENSOR_HZ = 100.0

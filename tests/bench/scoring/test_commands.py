@@ -6,8 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from bench.scoring import commands, evaluate_recording
+from bench.scoring import commands
 from synth.errors import UserError
+from synth.recording_flow.video_flow import Settings
 
 
 def test_the_demo_replaces_its_own_recording_and_nobody_elses(
@@ -22,7 +23,7 @@ def test_the_demo_replaces_its_own_recording_and_nobody_elses(
     monkeypatch.setattr(commands, "score_recording", lambda *asked: None)
 
     def demo() -> None:
-        commands.score_demo(tmp_path, tmp_path, tmp_path, evaluate_recording.Settings())
+        commands.score_demo(tmp_path, tmp_path, tmp_path, Settings())
 
     mine = tmp_path / "recording" / "operation.mp4"
     mine.parent.mkdir()

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from fake_recording import Maker, scored
 
-from bench.scoring import evaluate_recording, metrics, report
+from bench.scoring import metrics, report
+from bench.scoring.result import write_json
 
 
 @pytest.mark.parametrize("footage", ["png", "mp4"])
@@ -42,7 +43,7 @@ def test_sensor_gap_is_not_scored(make: Maker) -> None:
 
 def test_json_has_no_nan_and_the_page_stands_alone(make: Maker, tmp_path: Path) -> None:
     result = scored(make(frames=12))
-    evaluate_recording.write_json(result, tmp_path / "score.json")
+    write_json(result, tmp_path / "score.json")
     tree = json.loads((tmp_path / "score.json").read_text(), parse_constant=lambda name: pytest.fail(name))
     assert tree["scores"]["n"] == 12
     assert len(tree["curve"]["predicted_mn"]["bump"]) == 12

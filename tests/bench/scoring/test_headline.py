@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from bench.methods.flow_size import flow_sizes
 from bench.methods.protocol import Answer, Method, Scene
-from bench.scoring import charts, evaluate_recording
-from bench.scoring.evaluate_recording import Result
+from bench.scoring import charts
 from bench.scoring.headline import headline
+from bench.scoring.result import Result, as_json
 from synth.recording_flow.video_flow import Flags, FlowHere, Found, Rgb
 
 SIZE = (96, 128)
@@ -57,7 +57,7 @@ def test_lost_frames_are_out_of_the_scores_gaps_in_the_curves_and_counted(make: 
     line = next(trace for trace in charts.draw_force(some)["data"] if trace["name"] == "bump")
     assert [k for k, value in enumerate(line["y"]) if value is None] == [7, 8, 20]
     assert len(charts.draw_force(some)["layout"]["shapes"]) == 2
-    tree = evaluate_recording.as_json(some)
+    tree = as_json(some)
     assert tree["lost"] == {"frames": 3, "share": 0.1, "most": 0.2}
     assert tree["curve"]["predicted_mn"]["bump"][7] is None
     assert headline(some).refused == ""

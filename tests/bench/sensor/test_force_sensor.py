@@ -10,7 +10,7 @@ import pytest
 
 from bench.recording import pixel_scale
 from bench.recording.folder import Force
-from bench.recording.meta import Meta, Sensor
+from bench.recording.meta import Meta, SensorMeta
 from bench.sensor import force_sensor
 from synth.errors import UserError
 
@@ -23,7 +23,7 @@ def test_tare_and_drift_come_off() -> None:
     t = np.arange(0, 10, 0.01)
     press = 100 * np.exp(-((t - 5) ** 2))
     raw = Force(t, three(press + 30 + 2 * t))
-    about = Sensor(low_pass_hz=None, free_s=((0, 1), (9, 10)))
+    about = SensorMeta(low_pass_hz=None, free_s=((0, 1), (9, 10)))
     got = force_sensor.process_force(raw, about, 0.0)
     assert got.force_mn[:, 0] == pytest.approx(press, abs=1.1)  # constant beyond the spans' middles
     assert got.drift_mn == pytest.approx(18, abs=0.1)
@@ -33,7 +33,7 @@ def test_noise_floor_is_the_standard_deviation() -> None:
     rng = np.random.default_rng(0)
     t = np.arange(0, 20, 0.01)
     raw = Force(t, rng.normal(0, 3, (len(t), 3)))
-    got = force_sensor.process_force(raw, Sensor(low_pass_hz=None, free_s=((0, 20),)), 0.0)
+    got = force_sensor.process_force(raw, SensorMeta(low_pass_hz=None, free_s=((0, 20),)), 0.0)
     assert got.noise_floor_mn == pytest.approx(3 * np.sqrt(3), rel=0.03)
 
 
@@ -42,20 +42,20 @@ def test_gravity_of_what_hangs_on_a_turning_tool() -> None:
     down = np.stack([np.sin(t), np.zeros_like(t), np.cos(t)], axis=1)
     on_tool = -three(50 * np.exp(-((t - 2) ** 2))) + 20 * force_sensor.STANDARD_GRAVITY * down
     raw = Force(t, -on_tool, down)  # the reader has turned the sign: force on the tissue
-    got = force_sensor.process_force(raw, Sensor(acts_on="tool", mass_g=20, low_pass_hz=None), 0.0)
+    got = force_sensor.process_force(raw, SensorMeta(acts_on="tool", mass_g=20, low_pass_hz=None), 0.0)
     assert got.force_mn == pytest.approx(three(50 * np.exp(-((t - 2) ** 2))), abs=1e-9)
     with pytest.raises(UserError, match="gx, gy, gz"):
-        force_sensor.process_force(Force(t, -on_tool), Sensor(mass_g=20), 0.0)
+        force_sensor.process_force(Force(t, -on_tool), SensorMeta(mass_g=20), 0.0)
     # As an accelerometer gives it; the weight taken off would be ten times that of what hangs there.
     with pytest.raises(UserError, match="gx, gy, gz"):
-        force_sensor.process_force(Force(t, -on_tool, 9.80665 * down), Sensor(mass_g=20), 0.0)
+        force_sensor.process_force(Force(t, -on_tool, 9.80665 * down), SensorMeta(mass_g=20), 0.0)
 
 
 @pytest.mark.parametrize("causal", [False, True])
 def test_low_pass_delays_only_when_causal(causal: bool) -> None:
     t = np.arange(0, 20, 0.005)
     raw = Force(t, three(np.sin(2 * np.pi * t) + np.sin(2 * np.pi * 40 * t)))
-    got = force_sensor.process_force(raw, Sensor(low_pass_hz=8), 0.0, causal=causal).force_mn[:, 0]
+    got = force_sensor.process_force(raw, SensorMeta(low_pass_hz=8), 0.0, causal=causal).force_mn[:, 0]
     inner = slice(800, -800)
     shifts = np.arange(-40, 100)
     fit = [np.mean((got[inner] - np.sin(2 * np.pi * (t[inner] - s * 0.001))) ** 2) for s in shifts]
@@ -74,7 +74,7 @@ def test_stamps_in_bursts_are_filtered_or_said_not_to_be(burst: int, filtered: b
     n = np.arange(8000)
     t = 0.002 * burst * (n // burst) + 1e-5 * (n % burst)
     raw = Force(t, three(np.sin(2 * np.pi * 0.002 * n) + np.sin(2 * np.pi * 60 * 0.002 * n)))
-    got = force_sensor.process_force(raw, Sensor(low_pass_hz=8), 0.0)
+    got = force_sensor.process_force(raw, SensorMeta(low_pass_hz=8), 0.0)
     error = np.abs(got.force_mn[:, 0] - np.sin(2 * np.pi * 0.002 * n))[500:-500].max()
     if filtered:
         assert error < 0.1
@@ -84,14 +84,14 @@ def test_stamps_in_bursts_are_filtered_or_said_not_to_be(burst: int, filtered: b
 
 def test_a_hole_changes_no_sample_time() -> None:
     t = np.concatenate([np.arange(0, 5, 0.01), np.arange(2000, 2005, 0.01)])
-    got = force_sensor.process_force(Force(t, three(np.sin(2 * np.pi * 30 * t))), Sensor(), 0.0)
+    got = force_sensor.process_force(Force(t, three(np.sin(2 * np.pi * 30 * t))), SensorMeta(), 0.0)
     assert got.steps == ("zero-phase Butterworth low-pass, order 4, 10 Hz",)
     assert np.abs(got.force_mn[50:450]).max() < 0.05
 
 
 def test_frames_in_a_hole_have_no_truth() -> None:
     t = np.concatenate([np.arange(0, 1, 0.01), np.arange(2, 3, 0.01)])
-    got = force_sensor.process_force(Force(t, three(t)), Sensor(low_pass_hz=None), 0.5)
+    got = force_sensor.process_force(Force(t, three(t)), SensorMeta(low_pass_hz=None), 0.5)
     at = force_sensor.force_at(got, np.array([0.2, 0.75, 2.0, 2.75]))
     assert np.isnan(at[0]).all()  # before the sensor began: its clock is moved by 0.5 s
     assert at[1, 0] == pytest.approx(0.25)

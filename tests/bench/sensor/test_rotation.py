@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from phantom import displacement
 from scipy.spatial.transform import Rotation
 
-from bench.sensor.rotation import find_turn
+from bench.sensor.rotation import find_rotation
 
 Floats = NDArray[np.float64]
 
@@ -33,7 +33,7 @@ def test_rotation_is_found_and_its_error_known() -> None:
     errors, deviations = [], []
     for seed in range(12):
         moved, seen, force, turn = _pressed(seed)
-        found = find_turn(moved, seen, force)
+        found = find_rotation(moved, seen, force)
         assert found.refused == ""
         errors.append(np.degrees((Rotation.from_matrix(found.rows) * turn.inv()).magnitude()))
         deviations.append(found.deviation_deg)
@@ -44,8 +44,8 @@ def test_rotation_is_found_and_its_error_known() -> None:
 
 def test_what_determines_no_rotation_is_refused() -> None:
     moved, seen, force, _ = _pressed(1)
-    assert "needed" in find_turn(moved[:10], seen[:10], force[:10]).refused
-    assert "plane" in find_turn(moved, seen, force * [1, 1, 0]).refused
-    assert "nothing moves" in find_turn(0 * moved, seen, force).refused
+    assert "needed" in find_rotation(moved[:10], seen[:10], force[:10]).refused
+    assert "plane" in find_rotation(moved, seen, force * [1, 1, 0]).refused
+    assert "nothing moves" in find_rotation(0 * moved, seen, force).refused
     other = np.random.default_rng(5).normal(size=force.shape)
-    assert "follows the force" in find_turn(moved, seen, other).refused
+    assert "follows the force" in find_rotation(moved, seen, other).refused

@@ -1,0 +1,189 @@
+"""The result of scoring one recording, and its `score.json`."""
+
+from __future__ import annotations
+
+import json
+import math
+import platform
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, is_dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bench.bootstrap import Interval
+from bench.recording.pixel_scale import PixelScale
+from bench.sensor.clock_sync import Offset
+from bench.sensor.rotation import SensorRotation
+from bench.tracking.tracking import Tracked
+from synth.system import packages
+from synth.system.checked_file import write_whole
+
+Curve = NDArray[np.float64]
+_METHOD_KEYS = (
+    "interval", "scores", "intervals", "calibrated", "worse_by_mn", "gain", "components", "events",
+)  # fmt: skip
+MOST_LOST = 0.2
+"""Share of lost frames above which no number stands for a recording: the rest are the easy ones."""
+
+
+@dataclass(frozen=True)
+class Gain:
+    """The one factor that makes a force of a length of flow."""
+
+    mn_per_mm: float
+    """NaN where nothing determines it."""
+    source: str
+    """`press`: the separate one. `hindsight`: the scored frames themselves, the best there is. Without a
+    sensor the name of the method whose curve it was brought to."""
+
+
+@dataclass(frozen=True)
+class Scored:
+    """One method on one recording."""
+
+    force_mn: Curve
+    """(T, 3) camera axes [mN]."""
+    size_mn: Curve
+    """(T,) magnitude [mN]."""
+    scores: dict[str, float] = field(default_factory=dict)
+    """Empty without a sensor."""
+    components: dict[str, dict[str, float]] = field(default_factory=dict)
+    """Agreement by camera axis, when the sensor's axes are the camera's."""
+    events: list[dict[str, float]] = field(default_factory=list)
+    intervals: dict[str, Interval] = field(default_factory=dict)
+    """95% intervals of some scores, frames being resampled in blocks."""
+    calibrated: dict[str, float] = field(default_factory=dict)
+    """Scores after one gain found on the separate press, and that gain; empty without a press."""
+    worse_by_mn: Interval | None = None
+    """Interval of the main method's MAE minus this one's, paired; None for the main method."""
+    gain: Gain | None = None
+    """Of a baseline that has no newtons of its own; None for all others."""
+    low_mn: Curve | None = None
+    """(T,) lower end of the 90% interval of the size [mN]; None of a method that knows none."""
+    high_mn: Curve | None = None
+    """(T,) upper end."""
+    interval: dict[str, float] = field(default_factory=dict)
+    """What that interval came to: `level`, mean `width_mn` and, where the sensor says, `coverage`."""
+
+
+@dataclass(frozen=True)
+class Result:
+    """One run."""
+
+    recording: str
+    main: str
+    """Name of the method that the report is about."""
+    time_s: Curve
+    sensor_mn: Curve | None
+    """(T,) magnitude at the frames' times [mN]."""
+    sensor_axes_mn: Curve | None
+    """(T, 3)."""
+    methods: dict[str, Scored]
+    scale: PixelScale
+    relative_uncertainty: float
+    """One standard deviation of every force, from scale (whose square force goes with) and stiffness."""
+    noise_floor_mn: float
+    scored: NDArray[np.bool_]
+    """(T,) whether the frame counts: calibration spans don't."""
+    lost: NDArray[np.bool_]
+    """(T,) whether the frame could not be followed: no method has an answer there."""
+    sync: Offset | None
+    """What the search for the clocks' offset found; None if they weren't searched."""
+    notes: tuple[str, ...]
+    steps: tuple[str, ...]
+    settings: dict[str, Any]
+    followed: Tracked
+    turn: SensorRotation | None = None
+    """The sensor's rotation as found on `sensor.turn_s`; None if it was stated, or nobody asked."""
+    absolute: bool = True
+    """Whether E is known, so that forces are in newtons and not those of tissue of 1 kPa."""
+    environment: dict[str, str] = field(default_factory=lambda: _environment())
+
+    @property
+    def aligned(self) -> bool:
+        """Whether the clocks are as stated, or were found; not where the search had to be refused."""
+        return self.sync is None or not self.sync.refused
+
+    @property
+    def lost_share(self) -> float:
+        """Share of the frames to be scored that were lost."""
+        return float(self.lost[self.scored].mean()) if self.scored.any() else 0.0
+
+
+def write_json(result: Result, path: Path) -> None:
+    """Writes `score.json` whole or not at all."""
+    text = json.dumps(as_json(result), indent=1, allow_nan=False)
+    write_whole(path, text + "\n", durable=False)
+
+
+def as_json(result: Result) -> dict[str, Any]:
+    """The result as JSON-ready values; undefined numbers are null."""
+    done, methods = result.followed, result.methods
+    ends = {
+        end: {name: getattr(method, end) for name, method in methods.items() if method.interval}
+        for end in ("low_mn", "high_mn")
+    }
+    tree = {
+        "format": "sulcus-score",
+        "version": 1,
+        "recording": result.recording,
+        "main": result.main,
+        "frames": len(result.time_s),
+        "lost": {"frames": int(result.lost.sum()), "share": result.lost_share, "most": MOST_LOST},
+        "scores": methods[result.main].scores,
+        "methods": {
+            name: {key: getattr(method, key) for key in _METHOD_KEYS if key != "interval" or method.interval}
+            for name, method in methods.items()
+        },
+        "scale": result.scale,
+        "relative_uncertainty": result.relative_uncertainty,
+        "noise_floor_mn": result.noise_floor_mn,
+        "fault": done.fault,
+        "pulse": done.pulse,
+        "second_eye": done.sight,
+        "aligned": result.aligned,
+        "sync": result.sync,
+        "turn": result.turn,
+        "notes": result.notes,
+        "sensor_steps": result.steps,
+        "settings": result.settings,
+        "environment": result.environment,
+        "masks": {"kind": result.settings.get("masks"), "frames": done.account.frames, **done.account.shares},
+        "timings": done.timings,
+        "curve": {
+            "frame": done.frame,
+            "t_s": result.time_s,
+            "scored": result.scored,
+            "lost": result.lost,
+            "sensor_mn": result.sensor_mn,
+            "sensor_axes_mn": result.sensor_axes_mn,
+            "confidence": done.confidence,
+            "predicted_mn": {name: method.size_mn for name, method in methods.items()},
+            "predicted_axes_mn": {name: method.force_mn for name, method in methods.items()},
+            **{end: curves for end, curves in ends.items() if curves},
+        },
+    }
+    plain: dict[str, Any] = _plain(tree)
+    return plain
+
+
+def _environment() -> dict[str, str]:
+    """What the numbers were made with."""
+    return {"system": f"{platform.system()} {platform.machine()}", **packages.versions()}
+
+
+def _plain(value: Any) -> Any:
+    if is_dataclass(value) and not isinstance(value, type):
+        value = asdict(value)
+    if isinstance(value, Mapping):
+        return {str(key): _plain(part) for key, part in value.items()}
+    if isinstance(value, np.ndarray):
+        return _plain(value.tolist())
+    if isinstance(value, (list, tuple)):
+        return [_plain(part) for part in value]
+    if isinstance(value, (float, np.floating)):
+        return round(float(value), 9) if math.isfinite(value) else None
+    return int(value) if isinstance(value, np.integer) else value

@@ -1,0 +1,123 @@
+"""The force sensor at the frames' times: clock offset found and frozen, axes found, samples processed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bench.recording import clocks
+from bench.recording.folder import Force, Recording
+from bench.recording.meta import SensorMeta, Span, Sync
+from bench.sensor import clock_sync, force_sensor
+from bench.sensor.clock_sync import Offset
+from bench.sensor.rotation import SensorRotation, find_rotation
+from synth.recording_flow.pulse import Surface
+
+Curve = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class AlignedSensor:
+    """The sensor at the frames' times, on the video's clock."""
+
+    axes_mn: Curve | None = None
+    """(T, 3) mN, NaN where there are no samples; None if nothing can be scored."""
+    noise_floor_mn: float = 0.0
+    steps: tuple[str, ...] = ()
+    """What was done to the samples, in order, in words."""
+    offset: Offset | None = None
+    """What the search for the clocks' offset found; None if they weren't searched."""
+    rotation: SensorRotation | None = None
+    """As found on `sensor.turn_s`; None if it was stated, or nobody asked."""
+    in_camera_axes: bool = False
+
+    @property
+    def size_mn(self) -> Curve | None:
+        """(T,) magnitude [mN]."""
+        return None if self.axes_mn is None else np.linalg.norm(self.axes_mn, axis=1)
+
+
+def align_sensor(
+    recording: Recording, time_s: Curve, speed: Curve, surface: Surface | None, notes: list[str]
+) -> AlignedSensor:
+    """Finds the clocks' offset and the sensor's rotation, freezes both, and reads the sensor at the frames.
+
+    Args:
+        recording: its force and what meta.yaml says of it.
+        time_s: (T,) times of the frames [s].
+        speed: (T,) mean speed of the tissue since the frame before [mm/s]; NaN where it is not known.
+        surface: how the tissue moved over `sensor.turn_s`; None without that span.
+        notes: gets what a user should know.
+
+    Raises:
+        UserError: as `force_sensor.process_force`.
+    """
+    force, sensor = recording.force, recording.meta.sensor
+    if force is None:
+        notes.append("no force.csv: predictions only, nothing is scored")
+        return AlignedSensor()
+    offset_s, found = _find_offset(force, sensor, recording.meta.sync, time_s, speed, notes)
+    rotation = None
+    if sensor.turn_s is not None:
+        rotation = _find_rotation(force, sensor, offset_s, surface)
+        if rotation.refused:
+            notes.append(f"no rotation of the sensor found ({rotation.refused}): components are not scored")
+        else:
+            on = describe_span(sensor.turn_s)
+            notes.append(f"the sensor's rotation was found on {on}: {rotation.describe()}")
+            sensor = sensor.model_copy(update={"to_camera": rotation.rows})
+    processed = force_sensor.process_force(force, sensor, offset_s)
+    axes = force_sensor.force_at(processed, time_s)
+    covered = int(np.isfinite(axes).all(axis=1).sum())
+    if covered == 0:
+        notes.append("force.csv and the video share no time: predictions only; are both clocks in seconds?")
+        return AlignedSensor(steps=processed.steps, offset=found, rotation=rotation)
+    if other := clocks.find_other_unit(time_s, force.time_s):
+        notes.append(f"{other}: predictions only, nothing is scored")
+        return AlignedSensor()
+    if covered < len(time_s):
+        notes.append(f"the sensor covers {covered} of {len(time_s)} frames; only those are scored")
+    return AlignedSensor(
+        axes, processed.noise_floor_mn, processed.steps, found, rotation, sensor.in_camera_axes
+    )
+
+
+def describe_span(span: Span) -> str:
+    """A span [s] in words."""
+    return f"{span[0]:g} to {span[1]:g} s"
+
+
+def _find_offset(
+    force: Force, sensor: SensorMeta, sync: Sync, time_s: Curve, speed: Curve, notes: list[str]
+) -> tuple[float, Offset | None]:
+    """What to add to the sensor's times [s], and the search for it if there was one."""
+    if sync.method == "clock":
+        return 0.0, None
+    if sync.method == "offset" or sync.calibration_s is None:
+        return sync.offset_s, None
+    inside = (time_s >= sync.calibration_s[0]) & (time_s <= sync.calibration_s[1])
+    smooth = force_sensor.process_force(force, sensor, 0.0)
+    found = clock_sync.find_offset(
+        time_s[inside], speed[inside], smooth.time_s, smooth.force_mn, sync.search_s
+    )
+    if not found.refused:
+        return found.offset_s, found
+    notes.append(
+        f"clocks could not be aligned ({found.refused}): scored at the offset stated, {sync.offset_s:g} s"
+    )
+    return sync.offset_s, found
+
+
+def _find_rotation(
+    force: Force, sensor: SensorMeta, offset_s: float, surface: Surface | None
+) -> SensorRotation:
+    """The rotation to the camera's axes at which the tissue moves along the force."""
+    if surface is None:
+        return find_rotation(np.zeros((0, 1, 2)), np.zeros((0, 1)), np.zeros((0, 3)))
+    count = len(surface.time_s)
+    moved, seen = (np.stack(parts).astype(np.float64) for parts in (surface.moved, surface.seen))
+    processed = force_sensor.process_force(force, sensor, offset_s)
+    at = force_sensor.force_at(processed, np.array(surface.time_s))
+    return find_rotation(moved.reshape(count, -1, 2), seen.reshape(count, -1), at)
