@@ -21,8 +21,9 @@ from pydantic import BaseModel
 from bench.recording.meta import Meta
 from synth.dataset.size_forecast import amount, field_bytes
 from synth.fields import FIELDS, KEPT, TIME
-from synth.job import reader, writer
+from synth.job import writer
 from synth.job.schema import Job
+from synth.system.config_file import section_of
 
 DOCS = Path(__file__).resolve().parent
 ROOT = DOCS.parent
@@ -146,7 +147,7 @@ def _keys(section: BaseModel, at: str) -> list[str]:
     inner: list[str] = []
     for name, field in type(section).model_fields.items():
         default = field.get_default(call_default_factory=True)
-        below = reader.section(field.annotation)
+        below = section_of(field.annotation)
         if isinstance(default, BaseModel):
             inner += ["", f"## {at}{name}", "", _sentence(type(default).__doc__)]
             inner += _keys(default, f"{at}{name}.")

@@ -27,9 +27,10 @@ from learn.settings import TrainingSettings, upgraded
 from learn.uncertainty.intervals import Intervals
 from synth.errors import UserError
 from synth.job import identity, retired
-from synth.job.types import Positive, first_problem
+from synth.job.types import Positive
 from synth.system import checked_file
 from synth.system.checked_file import write_whole
+from synth.system.config_file import find_mistakes
 
 _FORMAT, _VERSION = "sulcus-model", 1
 _LARGEST_BYTES = 100_000_000
@@ -121,14 +122,10 @@ def read_card(folder: Path) -> ModelCard:
             raise UserError(f"{file}: is not as it was written: edited or damaged")
         return card
     except ValidationError as error:
-        wrong = [(one["type"], ".".join(map(str, one["loc"]))) for one in error.errors()]
-        unknown = [at for kind, at in wrong if kind in ("extra_forbidden", "unexpected_keyword_argument")]
-        if unknown:
-            raise UserError(
-                f"{file}: made by another version of this program (no '{unknown[0][:100]}' here)"
-            ) from None
-        at, why = first_problem(error)
-        raise UserError(f"{file}: corrupt model configuration ({at}: {why})") from None
+        mistakes = list(find_mistakes(error))
+        unknown = next((one for one in mistakes if one.of_key), None)
+        what = "made by another version of this program" if unknown else "corrupt model configuration"
+        raise UserError(f"{file}: {what} ({unknown or mistakes[0]})") from None
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise UserError(f"{file}: corrupt model configuration ({str(error)[:200]})") from None
 
@@ -136,7 +133,7 @@ def read_card(folder: Path) -> ModelCard:
 def _upgraded(tree: dict[str, Any], file: Path) -> dict[str, Any]:
     """A card as this version writes it. Raises UserError for a network that it can't build."""
     settings, gone = upgraded(tree["settings"])
-    lost = [retired.reason(key, value) for key, value in gone.items() if key.startswith("arch.")]
+    lost = [str(one) for one in retired.mistakes(gone) if one.at[0] == "arch"]
     if lost:
         raise UserError(f"{file}: {'; '.join(lost)}")
     intervals = tree.get("intervals")

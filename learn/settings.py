@@ -12,8 +12,9 @@ from learn.data.grid import Grid
 from learn.loss import Loss
 from learn.network.d2fnet import Architecture
 from synth.errors import UserError
-from synth.job import reader, retired
+from synth.job import retired
 from synth.job.types import NonNegative, Positive, Section
+from synth.system import config_file
 
 Count = Annotated[int, Field(ge=0)]
 AtLeastOne = Annotated[int, Field(ge=1)]
@@ -169,8 +170,8 @@ def override(settings: TrainingSettings, changes: Iterable[str]) -> TrainingSett
     changes = list(changes)
     for key, _, value in (one.partition("=") for one in changes):
         if key.strip() in retired.TRAINING:
-            raise UserError(retired.reason(key.strip(), value))
-    return reader.override(settings, changes)
+            raise UserError(str(*retired.mistakes({key.strip(): value})))
+    return config_file.override(settings, changes)
 
 
 _FRAMED = {"kind": "hinge", "r2_weight": 0.5, "r2_scope": "frame", "total_weight": 0.0}

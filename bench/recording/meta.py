@@ -14,13 +14,12 @@ from pydantic import (
     ConfigDict,
     Field,
     FiniteFloat,
-    ValidationError,
     model_validator,
 )
 
 from synth.errors import UserError
-from synth.job.types import first_problem
 from synth.system import checked_file
+from synth.system.config_file import ConfigFile
 
 Positive = Annotated[FiniteFloat, Field(gt=0)]
 Share = Annotated[FiniteFloat, Field(ge=0, lt=1)]
@@ -220,15 +219,9 @@ def read_meta(path: Path) -> Meta:
     """The recording's `meta.yaml`.
 
     Raises:
-        UserError: no such file, not YAML, or the first field that is wrong.
+        UserError: no such file, not YAML, or a line for each field that is wrong.
     """
     if not os.path.lexists(path):
         raise UserError(f"{path}: missing; a recording needs at least scale_mm_per_px there")
-    content = checked_file.read_yaml(path)
-    if not isinstance(content, dict):
-        raise UserError(f"{path}: expected keys and values such as 'scale_mm_per_px: 0.05'")
-    try:
-        return Meta.model_validate(content)
-    except ValidationError as error:
-        where, what = first_problem(error)
-        raise UserError(f"{path}: {where or 'recording'}: {what.removeprefix('Value error, ')}") from None
+    text = checked_file.read_text(path, checked_file.LARGEST_YAML)
+    return ConfigFile(text, str(path)).validate(Meta)

@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from synth.errors import UserError
 from synth.fields import FORMAT_VERSION
-from synth.job.types import first_problem
+from synth.system.config_file import first_mistake
 
 FORMAT = "sulcus-sequence"
 
@@ -102,8 +102,7 @@ def check_attributes(attrs: Mapping[str, Any], where: str) -> None:
     try:
         said = Attributes.model_validate(dict(attrs))
     except ValidationError as error:
-        at, why = first_problem(error)
-        raise UserError(f"{where}: the attribute {at} can't be right ({why})") from None
+        raise UserError(f"{where}: an attribute can't be right ({first_mistake(error)})") from None
     if said.size[0] * said.size[1] > LARGEST_PIXELS:
         raise UserError(f"{where}: {said.size[0]} x {said.size[1]} pixels a frame is too large")
 

@@ -20,9 +20,9 @@ from synth.dataset import location, provenance
 from synth.errors import UserError
 from synth.job import identity, retired, writer
 from synth.job.schema import Job
-from synth.job.types import first_problem
 from synth.system import checked_file
 from synth.system.checked_file import write_whole as write_whole
+from synth.system.config_file import first_mistake
 
 _LOCK_WAIT_S = 5.0
 _NAME = "dataset.json"
@@ -57,16 +57,15 @@ class Folder:
         try:
             return _Described.model_validate(found).model_dump(exclude_unset=True)
         except ValidationError as error:
-            at, why = first_problem(error)
-            raise UserError(f"{self.root / _NAME}: is damaged ({at or 'all of it'}: {why})") from None
+            raise UserError(f"{self.root / _NAME}: is damaged ({first_mistake(error)})") from None
 
     def job(self) -> Job:
         """The dataset's job, less retired keys: what is stored needs none of them to be read."""
         try:
             return Job.model_validate(retired.drop(self.described()["job"], retired.JOB)[0])
         except ValidationError as error:
-            at, why = first_problem(error)
-            raise UserError(f"{self.root / _NAME}: is damaged or of another version ({at}: {why})") from None
+            why = first_mistake(error)
+            raise UserError(f"{self.root / _NAME}: is damaged or of another version ({why})") from None
 
     def sealed(self) -> list[int]:
         """Indices of the finished sequences, in order."""
@@ -201,7 +200,7 @@ def _refuse_foreign(folder: Folder, job: Job, name: str) -> None:
     if described["identity"] != name:
         before, gone = retired.drop(described["job"], retired.JOB)
         if gone:
-            raise UserError(f"{root}: {'; '.join(retired.reason(*one) for one in gone.items())}")
+            raise UserError(f"{root}: {'; '.join(map(str, retired.mistakes(gone)))}")
         changes = _changes(before, job.model_dump(mode="json"))
         what = ", ".join(changes[:4]) or "another mesh or photograph"
         raise UserError(f"{root}: holds the dataset of another job ({what}), choose another folder")

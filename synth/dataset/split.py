@@ -16,8 +16,8 @@ from pydantic import FiniteFloat, TypeAdapter, ValidationError
 
 from synth.dataset.folder import write_whole
 from synth.errors import UserError
-from synth.job.types import first_problem
 from synth.system import checked_file
+from synth.system.config_file import first_mistake
 
 By = Literal["anatomy", "opening", "family", "gesture", "stiffness", "sequence"]
 """What must not be shared between the sides: `opening` is the place that a user's brain is opened at, else
@@ -53,8 +53,7 @@ def read_rule(root: Path) -> Rule:
     try:
         return TypeAdapter(Rule).validate_python(found)
     except ValidationError as error:
-        at, why = first_problem(error)
-        raise UserError(f"{root / NAME}: is damaged ({at or 'all of it'}: {why})") from None
+        raise UserError(f"{root / NAME}: is damaged ({first_mistake(error)})") from None
 
 
 def keep_rule(root: Path, chosen: Rule) -> None:

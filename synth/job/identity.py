@@ -11,7 +11,7 @@ from synth.job import retired
 from synth.job.schema import Job
 from synth.system import checked_file
 
-FILES: dict[tuple[str | int, ...], int] = {
+FILES: dict[tuple[str, str], int] = {
     ("anatomy", "mesh"): 1 << 30,
     ("appearance", "photo"): checked_file.LARGEST_PICTURE,
     ("render", "calibration"): 1 << 20,
@@ -39,7 +39,7 @@ def identify_job(job: Job) -> str:
     if not job.anatomy.craniotomy.also:
         del described["anatomy"]["craniotomy"]["also"]
     for (block, name), largest in FILES.items():
-        described[str(block)][str(name)] = _digest(getattr(getattr(job, str(block)), str(name)), largest)
+        described[block][name] = _digest(getattr(getattr(job, block), name), largest)
     return hashlib.blake2b(canonical(described), digest_size=16).hexdigest()
 
 

@@ -12,6 +12,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from synth.system.config_file import Mistake
+
 LAST = "f047e99"
 """The last commit that knew all of these keys."""
 
@@ -130,9 +132,16 @@ def restore(values: Mapping[str, Any], table: Mapping[str, Retired]) -> dict[str
     return tree
 
 
-def reason(key: str, value: Any) -> str:
-    """What to say of a retired key that asks for something."""
-    return f"{key}: {json.dumps(value, default=str)[:80]} is gone; commit {LAST} still has it"
+def mistakes(others: Mapping[str, Any]) -> list[Mistake]:
+    """What to say of retired keys that ask for something, `others` of `drop`."""
+    return [
+        Mistake(
+            tuple(key.split(".")),
+            f"{json.dumps(value, default=str)[:80]} is gone; commit {LAST} still has it",
+            of_key=True,
+        )
+        for key, value in others.items()
+    ]
 
 
 def _block(tree: Any, path: list[str]) -> dict[str, Any] | None:

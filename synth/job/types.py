@@ -11,7 +11,6 @@ from pydantic import (
     ConfigDict,
     Field,
     FiniteFloat,
-    ValidationError,
 )
 
 
@@ -46,12 +45,6 @@ _Poisson = Annotated[FiniteFloat, Field(ge=0, lt=0.5)]
 PoissonRange = Annotated[tuple[_Poisson, _Poisson], BeforeValidator(_pair), AfterValidator(_ordered)]
 PlugInName = Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]+$", max_length=100)]
 Vector = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
-
-
-def first_problem(error: ValidationError) -> tuple[str, str]:
-    """Where the first mistake is, keys joined by dots (empty: all of it), and what it is; both short."""
-    first = error.errors(include_input=False, include_url=False)[0]
-    return ".".join(str(step)[:40] for step in first["loc"])[:200], first["msg"].splitlines()[0][:200]
 
 
 class Section(BaseModel):

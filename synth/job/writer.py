@@ -12,8 +12,8 @@ from typing import Any, Literal
 from pydantic import BaseModel
 from ruamel.yaml import YAML
 
-from synth.job import reader
 from synth.job.schema import Job
+from synth.system.config_file import section_of
 
 _WIDTH = 100
 
@@ -57,7 +57,7 @@ def _section(section: BaseModel, indent: str) -> list[str]:
     lines: list[str] = []
     for name, field in type(section).model_fields.items():
         value = getattr(section, name)
-        inner = reader.section(field.annotation)
+        inner = section_of(field.annotation)
         text = field.description or (inner.__doc__ if inner else "") or ""
         allowed = "" if inner else limits(field.annotation, field.metadata)
         comment = " ".join([*text.split(), allowed]).strip()

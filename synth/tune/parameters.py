@@ -7,9 +7,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from synth.job import reader
 from synth.job.laws import CHEAPEST_FIRST, LARGEST_LOAD
 from synth.job.schema import Job
+from synth.system.config_file import override
 
 Setting = str | int | tuple[int, int]
 """The value of one parameter."""
@@ -84,7 +84,7 @@ def _falling(*values: int) -> tuple[int, ...]:
 
 def changed(job: Job, changes: Mapping[str, Any]) -> Job:
     """The job with the values of dotted keys changed. UserError where they don't go together."""
-    return reader.override(job, [f"{key}={json.dumps(value)}" for key, value in changes.items()])
+    return override(job, [f"{key}={json.dumps(value)}" for key, value in changes.items()])
 
 
 def show(setting: Setting) -> str:

@@ -35,7 +35,7 @@ def write(tuned: Tuned, source: str, overrides: Sequence[str], out: Path) -> Non
         _set(tree, key.strip(), checked_file.load_yaml(value, override))
     if folder != out.resolve().parent:  # from which relative paths will start
         job = reader.load_job(source, overrides).model_dump(mode="json")
-        for section, name in ((str(section), str(name)) for section, name in identity.FILES):
+        for section, name in identity.FILES:
             if job[section][name] is not None:
                 _set(tree, f"{section}.{name}", job[section][name])
     for key, setting in tuned.changes.items():

@@ -28,10 +28,11 @@ def test_a_package_keeps_to_its_budget(package: str) -> None:
 
 def test_keys_keep_to_their_budget() -> None:
     from learn.settings import TrainingSettings
-    from synth.job import reader
+    from synth.job.schema import Job
+    from synth.system.config_file import places
 
-    assert len(reader.places()) <= JOB_KEYS
-    assert len(reader.places(TrainingSettings)) <= TRAINING_KEYS
+    assert len(places(Job)) <= JOB_KEYS
+    assert len(places(TrainingSettings)) <= TRAINING_KEYS
 
 
 def test_commands_keep_to_their_budget() -> None:
