@@ -58,16 +58,16 @@ class Block:
         volume = tetrahedra.block(_ANATOMY, tets, 2)
         return cls(volume, assemble(volume, "linear", 0.4))
 
-    def carry(self, xy: Floats) -> Embedding:
+    def embed(self, xy: Floats) -> Embedding:
         """How surface points (P, 2), camera x, y [mm], ride on the volume."""
         world = xy * np.array([1.0, -1.0])
         on_dome = np.column_stack([world, tetrahedra.dome(world, _ANATOMY.dome_mm)])
         return surface_embedding.embed(self.volume, on_dome)
 
 
-def picture(carry: Embedding, moved: Floats, components: int = 2) -> Floats:
+def picture(embedding: Embedding, moved: Floats, components: int = 2) -> Floats:
     """What the camera sees, (P, C, ...) mm at points, of a volume's motion (N, 3, ...) mm in world axes."""
-    return np.asarray(np.einsum("ab,pb...->pa...", TO_CAMERA[:components], carry.move(moved)), np.float64)
+    return np.asarray(np.einsum("ab,pb...->pa...", TO_CAMERA[:components], embedding.move(moved)), np.float64)
 
 
 @lru_cache(maxsize=4)
@@ -83,7 +83,7 @@ def build(point_mm: float = 1.0, node_mm: float = 1.2, tets: int = 3000, compone
     block = Block.build(tets)
     radius_mm = _ANATOMY.craniotomy.radius_mm
     points, nodes = _disc(point_mm, radius_mm), _disc(node_mm, radius_mm - node_mm)
-    seen, held = block.carry(points), block.carry(nodes)
+    seen, held = block.embed(points), block.embed(nodes)
     columns = np.empty((len(nodes), 3, components, len(points)))
     for some in np.array_split(np.arange(len(nodes)), max(1, len(nodes) // _AT_ONCE)):
         for axis in range(3):

@@ -22,6 +22,7 @@ from synth.fem import solver, tool
 from synth.fem.mesh import tetrahedra
 from synth.fem.mesh.relief import HeightMap
 from synth.fem.solver import Deformation
+from synth.geometry.triangles import Shape
 from synth.job import schema as jobs
 from synth.render.anatomy import surface as anatomy
 from synth.render.camera import camera
@@ -163,11 +164,9 @@ def _moved(
     """The path from no load to full: a gesture that only rises."""
     rising = tool.Gesture(**{**vars(gesture), "timing": (0.02, 1.0, 2.0, 3.0)})
     height = HeightMap(surface.pia, surface.extent_mm)
-    tets = tetrahedra.block(job.anatomy, job.fem.tets, 2, tool.focus(gesture), height)
-    return solver.deform(
-        job.fem, case.tissue, rising, tets, surface.vertices, surface.faces,
-        job.frames, job.fps,
-    )  # fmt: skip
+    tets = tetrahedra.block(job.anatomy, job.fem.tets, 2, gesture.focus, height)
+    shape = Shape(surface.vertices, surface.faces)
+    return solver.deform(job.fem, case.tissue, [rising], tets, shape, job.frames, job.fps)
 
 
 def _course(plan: Plan, rng: np.random.Generator) -> _Course:
@@ -219,7 +218,7 @@ def _pose(
     width = max(levels[above] - levels[above - 1], 1e-9)
     part = float(np.clip((strain - levels[above - 1]) / width, 0, 1))
     moved = (1 - part) * motion.displacement[above - 1] + part * motion.displacement[above]
-    places = tool.anchors(gesture, tool.course(gesture, 2), motion.rest, motion.faces)
+    places = tool.anchors(gesture, tool.trajectory(gesture, 2), Shape(motion.rest, motion.faces))
     corners, weights = (of[0] for of in places)
     touched = np.einsum("kc,kcd->kd", weights, (motion.rest + moved)[corners])
     shafts = motion.shaft[-1]

@@ -90,7 +90,7 @@ def speed(case: Brain, load: float, way: str, frames: int = 60) -> float:
     gesture = scenario.draw_gesture(
         fem, ANATOMY.craniotomy.radius_mm, tissue.young_kpa, np.random.default_rng(0)
     )
-    part = tool.course(gesture, frames).load
+    part = tool.trajectory(gesture, frames).load
     loads = part[:, None, None] * case.load(load, way)
     start = time.process_time()
     path = equilibrium.solve_path(case.system, loads, load * part)

@@ -17,7 +17,7 @@ from scipy.special import ellipe, ellipk, j0, j1
 
 from evidence import report
 from synth.fem import surface_embedding
-from synth.fem.membrane import Sheet
+from synth.fem.membrane import MembraneSheet
 from synth.fem.mesh import tetrahedra
 from synth.fem.mesh.tetrahedra import Tets
 from synth.fem.system import assemble
@@ -55,7 +55,7 @@ def measure(count: int, poisson: float, sheet_mm: float = 0.0) -> list[Row]:
     size = _WIDE_MM if sheet_mm else tetrahedra.BLOCK_MM
     tets = tetrahedra.block(schema.Anatomy(dome_mm=1e6), count, 2, ((0.0, 0.0, a),), size_mm=size)
     free = Tets(tets.points, tets.cells, 2, tets.fixed, 0 * tets.hold)
-    system = assemble(free, "linear", poisson, Sheet(sheet_mm, 1.0) if sheet_mm else None)
+    system = assemble(free, "linear", poisson, MembraneSheet(sheet_mm, 1.0) if sheet_mm else None)
     ring = a * np.sqrt((np.arange(_RINGS) + 0.5) / _RINGS)
     turn = 2 * np.pi * (np.arange(_SPOKES) + 0.5) / _SPOKES
     at = np.stack([np.outer(ring, np.cos(turn)), np.outer(ring, np.sin(turn))], axis=-1).reshape(-1, 2)

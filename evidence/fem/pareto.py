@@ -20,11 +20,12 @@ from numpy.typing import NDArray
 
 from evidence import report
 from evidence.fem import case as fem_case
-from synth.fem import solver, tool
+from synth.fem import solver
 from synth.fem.equilibrium import InvertedElement, NoEquilibrium
 from synth.fem.laws import NUMBER
 from synth.fem.material import Tissue
 from synth.fem.mesh import tetrahedra
+from synth.geometry.triangles import Shape
 from synth.job import schema
 from synth.sequence import scenario
 
@@ -146,9 +147,9 @@ def _sequence(law: str, load: float) -> Row:
         fem, fem_case.ANATOMY.craniotomy.radius_mm, tissue.young_kpa, np.random.default_rng(0)
     )
     start = time.process_time()
-    volume = tetrahedra.block(fem_case.ANATOMY, fem.tets, 2, tool.focus(gesture))
+    volume = tetrahedra.block(fem_case.ANATOMY, fem.tets, 2, gesture.focus)
     meshed = time.process_time()
-    solver.deform(fem, tissue, gesture, volume, on.vertices, on.faces, _FRAMES, 25.0)
+    solver.deform(fem, tissue, [gesture], volume, Shape(on.vertices, on.faces), _FRAMES, 25.0)
     spent = 1e3 * (time.process_time() - meshed) / _FRAMES
     # The kernel's high-water mark: getrusage would count the parent's before exec.
     status = Path("/proc/self/status").read_text("utf-8")

@@ -48,12 +48,12 @@ def measure_scene(index: int, count: int) -> Row:
     surface, _ = pipeline.cortex(_JOB, case)
     gesture, height = case.gesture, HeightMap(surface.pia, surface.extent_mm)
     row: Row = {"index": index, "tets": count, "kind": gesture.kind, "load": gesture.load}
-    volume = tetrahedra.block(_JOB.anatomy, count, 2, tool.focus(gesture), height)
-    over = tool.course(gesture, _JOB.frames)
-    full = int(over.load.argmax())
-    over = tool.Course(np.ones(1), over.away[[full]], over.shift[[full]])
+    volume = tetrahedra.block(_JOB.anatomy, count, 2, gesture.focus, height)
+    moved = tool.trajectory(gesture, _JOB.frames)
+    full = int(moved.load.argmax())
+    moved = tool.ToolMotion(np.ones(1), moved.away[[full]], moved.shift[[full]])
     area = surface_embedding.vertex_area(surface.vertices, surface.faces)
-    traction = tool.tractions(gesture, over, surface.vertices, area)[0]
+    traction = tool.tractions(gesture, moved, surface.vertices, area)[0]
     force = area[:, None] * traction / case.tissue.young_kpa
     embedding = surface_embedding.embed(volume, surface.vertices)
     parts = np.array([0.5, 1.0])

@@ -76,13 +76,13 @@ def draw_contact(rng: np.random.Generator, seconds: float, size: int) -> dict[st
     place, steps = rng.uniform(-3, 3, 2), np.arange(-_CONTACT_MM, _CONTACT_MM + 0.1, 0.8)
     x, y = (axis.ravel() for axis in np.meshgrid(steps, steps))
     share = np.clip(1 - (x**2 + y**2) / _CONTACT_MM**2, 0, None) ** 2
-    held = block.carry(np.column_stack([x, y])[share > 0] + place)
+    held = block.embed(np.column_stack([x, y])[share > 0] + place)
     direction = rng.normal(size=3) * [1.0, 1.0, 0.5]
     direction /= np.linalg.norm(direction)
     load = held.gather(np.outer(share[share > 0] / share.sum(), TO_CAMERA.T @ direction))
     coarse = np.linspace(-_RADIUS_MM - 1, _RADIUS_MM + 1, 41)
     at = np.column_stack([axis.ravel() for axis in np.meshgrid(coarse, coarse)])
-    moved = picture(block.carry(at), block.system.solve(load)).reshape(41, 41, 2) / YOUNG_KPA
+    moved = picture(block.embed(at), block.system.solve(load)).reshape(41, 41, 2) / YOUNG_KPA
     where = ((np.arange(size) - (size - 1) / 2) * mm_per_px + _RADIUS_MM + 1) / (coarse[1] - coarse[0])
     across, down = np.meshgrid(where.astype(np.float32), where.astype(np.float32))
     field = cv2.remap(moved.astype(np.float32), across, down, cv2.INTER_CUBIC) / mm_per_px

@@ -1,7 +1,8 @@
-"""Quasi-static equilibrium along a load's course: one solve, or L-BFGS on the stiffness at rest."""
+"""Equilibrium along a path of loads: one solve, or L-BFGS on the stiffness at rest."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import combinations_with_replacement
 
@@ -33,8 +34,8 @@ class InvertedElement(UserError):
 
 
 @dataclass(frozen=True)
-class Path:
-    """States of the volume over T steps, for E = 1 kPa."""
+class LoadPath:
+    """States of the volume over T loads, for E = 1 kPa."""
 
     displacement: Floats
     """(T, N, 3) mm."""
@@ -46,64 +47,109 @@ class Path:
     """(T,) force out of balance over the load, in the norm of the inverse stiffness; 0 without load."""
 
 
-def solve_path(system: System, loads: Floats, named: Floats, *, lean: bool = False) -> Path:
+Step = Callable[[int, Floats, Floats], tuple[Floats, State, float]]
+"""From a step's number, its load (N, 3) mN and the displacement (N, 3) mm before it: the
+displacement under it, its state, and the force out of balance as a part of the largest load."""
+
+
+def solve_path(system: System, loads: Floats, load_parameter: Floats) -> LoadPath:
     """Equilibrium under each load in turn.
 
     Args:
         system: the equations.
         loads: (T, N, 3) mN for E = 1 kPa.
-        named: (T,) P = F/(E a^2) of each, for messages.
-        lean: one solve a step rather than two, and starts from all states found: the same answer within the
-            tolerance but not to the last bit, so that scenes without a need for it keep theirs.
+        load_parameter: (T,) P = F/(E a^2) of each, for messages.
 
     Raises:
         InvertedElement: names frame, load and element.
         NoEquilibrium: the iteration stalled; names frame and load.
         NotFinite: a number is none.
     """
-    path: list[tuple[Floats, State]] = []
-    residual, least = np.zeros(len(loads)), np.ones(len(loads))
-    peak = loads[np.abs(loads).max(axis=(1, 2)).argmax()]
-    linear = _LinearResponse(system)
-    at_peak = linear(peak)
-    peak_squared = float(np.vdot(peak, peak)) or 1.0
-    scale = float(np.sqrt(np.vdot(peak, at_peak))) or 1.0
-    known: list[tuple[float, Floats]] = [(0.0, np.zeros_like(peak))]
-    bends = _Bends(linear)
-    for step, load in enumerate(loads):
-        if system.law == "linear":
-            u = linear(load)
-            state = system.state(u)
-            residual[step] = np.linalg.norm(on_free(system, load - state.force)) / np.sqrt(peak_squared)
-        else:
-            factor = float(np.vdot(load, peak)) / peak_squared
-            proportional = float(np.abs(load - factor * peak).max()) <= 1e-9 * float(np.abs(peak).max())
-            last = path[-1][0] if path else np.zeros_like(load)
-            if proportional:
-                start = interpolate_states(known, factor, at_peak)
-            elif lean:
-                start = bends.guess(load)
-            else:
-                start = last + linear(load - loads[step - 1])
-            u, state, norm = minimise_energy(system, load, start, TOLERANCE * scale, last, lean=lean)
-            if lean:
-                bends.learn(load, u)
-            residual[step] = norm / scale
-            if proportional and all(abs(factor - k) > 1e-3 for k, _ in known):
-                known.append((factor, u))
-        least[step] = check_state(system, u, state, step, float(named[step]))
-        if residual[step] > TOLERANCE:
+    return follow_loads(system, loads, load_parameter, _QuasiStatic(system, loads))
+
+
+def solve_mixed_path(system: System, loads: Floats, load_parameter: Floats) -> LoadPath:
+    """As `solve_path`, for loads that mix a few directions and for membranes.
+
+    One solve an iteration rather than two, and starts from all states found: the same answer within the
+    tolerance but not to the last bit, so that scenes without a need for it keep theirs.
+    """
+    return follow_loads(system, loads, load_parameter, _QuasiStatic(system, loads, mixed=True))
+
+
+def follow_loads(
+    system: System,
+    loads: Floats,
+    load_parameter: Floats,
+    step: Step,
+    tolerance: float = TOLERANCE,
+    substeps: int = 1,
+) -> LoadPath:
+    """State after state under each load in turn, from rest; refuses what is no deformation or no balance.
+
+    Args:
+        system: the equations.
+        loads: (S, N, 3) mN for E = 1 kPa.
+        load_parameter: (T,) P = F/(E a^2) of each frame, for messages.
+        step: what finds the state under a load.
+        tolerance: force out of balance that is accepted, as a part of the largest load.
+        substeps: of a frame; the first one has only one.
+
+    Raises:
+        As `solve_path`.
+    """
+    u = np.zeros_like(loads[0])
+    path = []
+    for number, load in enumerate(loads):
+        frame = -(-number // substeps)
+        parameter = float(load_parameter[frame])
+        u, state, residual = step(number, load, u)
+        least = check_state(system, u, state, frame, parameter)
+        if residual > tolerance:
             raise NoEquilibrium(
-                f"frame {step}: no equilibrium at load {named[step]:.3g} "
-                f"(out of balance by {residual[step]:.1e}); lower the load"
+                f"frame {frame}: no equilibrium at load {parameter:.3g} "
+                f"(out of balance by {residual:.1e}); lower the load"
             )
-        path.append((u, state))
-    return Path(
-        np.stack([u for u, _ in path]),
-        least,
-        np.array([s.energy for _, s in path]),
-        residual,
-    )
+        path.append((u, least, state.energy, residual))
+    displacement, least_jacobian, energy, residuals = zip(*path[::substeps], strict=True)
+    return LoadPath(np.stack(displacement), np.array(least_jacobian), np.array(energy), np.array(residuals))
+
+
+class _QuasiStatic:
+    """Equilibrium under a load: one solve of a linear law; else L-BFGS from a prediction by states found."""
+
+    def __init__(self, system: System, loads: Floats, *, mixed: bool = False) -> None:
+        self._system, self._loads, self._mixed = system, loads, mixed
+        self._linear = _LinearResponse(system)
+        self._peak = loads[np.abs(loads).max(axis=(1, 2)).argmax()]
+        self._at_peak = self._linear(self._peak)
+        self._peak_squared = float(np.vdot(self._peak, self._peak)) or 1.0
+        self._scale = float(np.sqrt(np.vdot(self._peak, self._at_peak))) or 1.0
+        self._known = [(0.0, np.zeros_like(self._peak))]
+        self._bends = _Bends(self._linear)
+
+    def __call__(self, number: int, load: Floats, last: Floats) -> tuple[Floats, State, float]:
+        system, peak = self._system, self._peak
+        if system.law == "linear":
+            u = self._linear(load)
+            state = system.state(u)
+            out = np.linalg.norm(on_free(system, load - state.force)) / np.sqrt(self._peak_squared)
+            return u, state, float(out)
+        factor = float(np.vdot(load, peak)) / self._peak_squared
+        proportional = float(np.abs(load - factor * peak).max()) <= 1e-9 * float(np.abs(peak).max())
+        if proportional:
+            start = interpolate_states(self._known, factor, self._at_peak)
+        elif self._mixed:
+            start = self._bends.guess(load)
+        else:
+            start = last + self._linear(load - self._loads[number - 1])
+        tolerance = TOLERANCE * self._scale
+        u, state, norm = minimise_energy(system, load, start, tolerance, last, keep_solved=self._mixed)
+        if self._mixed:
+            self._bends.learn(load, u)
+        if proportional and all(abs(factor - k) > 1e-3 for k, _ in self._known):
+            self._known.append((factor, u))
+        return u, state, norm / self._scale
 
 
 class _LinearResponse:
@@ -194,7 +240,7 @@ def check_state(system: System, u: Floats, state: State, frame: int, load: float
 
 
 def minimise_energy(
-    system: System, load: Floats, start: Floats, tolerance: float, safe: Floats, *, lean: bool = False
+    system: System, load: Floats, start: Floats, tolerance: float, safe: Floats, *, keep_solved: bool = False
 ) -> tuple[Floats, State, float]:
     """Minimises stored energy less the load's work by L-BFGS on the factored rest stiffness.
 
@@ -207,7 +253,7 @@ def minimise_energy(
         start: (N, 3) mm.
         safe: (N, 3) mm, a state of finite energy, for when the guess `start` has none.
         tolerance: on the residual's norm sqrt(r' K^-1 r), in sqrt(mN mm).
-        lean: as in `solve_path`.
+        keep_solved: keep the rest stiffness's inverse on changes of the gradient, rather than solve anew.
 
     Returns:
         Displacement, its state and the residual's norm; the caller judges it.
@@ -246,7 +292,7 @@ def minimise_energy(
         curvature = float(np.vdot(s, y))
         then, preconditioned = preconditioned, system.solve(trial_gradient)
         if curvature > 1e-12 * float(np.sqrt(np.vdot(s, s) * np.vdot(y, y))):
-            history.append((s, y, curvature, preconditioned - then if lean else None))
+            history.append((s, y, curvature, preconditioned - then if keep_solved else None))
             del history[:-_HISTORY]
         u, state, gradient = trial, trial_state, trial_gradient
     return u, state, norm

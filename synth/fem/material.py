@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from synth.errors import UserError
-from synth.fem.membrane import Sheet
+from synth.fem.membrane import MembraneSheet
 from synth.fem.mesh.tetrahedra import Tets
 from synth.fem.system import System, assemble
 from synth.job.laws import largest_load
@@ -44,12 +44,12 @@ class Tissue:
         return assemble(tets, law or self.law, self.poisson, self.sheet)
 
     @property
-    def sheet(self) -> Sheet | None:
+    def sheet(self) -> MembraneSheet | None:
         """The membrane on tissue of E = 1 kPa."""
         pia = self.membrane
         if pia is None:
             return None
-        return Sheet(pia.young_kpa * pia.thickness_mm / self.young_kpa, pia.stretch)
+        return MembraneSheet(pia.young_kpa * pia.thickness_mm / self.young_kpa, pia.stretch)
 
 
 def check_load(law: str, load: float) -> None:

@@ -33,7 +33,7 @@ _POINTS = np.full((3, 3), 1 / 6) + 0.5 * np.eye(3)
 
 
 @dataclass(frozen=True)
-class Sheet:
+class MembraneSheet:
     """A membrane as it is given, on tissue of E = 1 kPa."""
 
     stiffness: float
@@ -106,7 +106,7 @@ class Membrane:
         return sp.coo_array((local.ravel(), (rows, cols)), shape=(u.size,) * 2).tocsr()
 
 
-def cover(tets: Tets, sheet: Sheet, *, linear: bool) -> Membrane:
+def cover(tets: Tets, sheet: MembraneSheet, *, linear: bool) -> Membrane:
     """A membrane over all of a volume's surface but the walls that it is cut out at.
 
     Args:

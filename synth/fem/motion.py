@@ -10,13 +10,14 @@ evenly in a step. Since nodal forces are linear in stress, the history is kept a
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
-from synth.fem.equilibrium import TOLERANCE, NoEquilibrium, Path, check_state, minimise_energy
-from synth.fem.membrane import Sheet
+from synth.fem.equilibrium import TOLERANCE, LoadPath, follow_loads, minimise_energy
+from synth.fem.membrane import MembraneSheet
 from synth.fem.mesh.element import quadrature
 from synth.fem.mesh.tetrahedra import Tets
 from synth.fem.system import State, assemble
@@ -45,7 +46,7 @@ class Clock:
         return self.step_s / self.substeps
 
     @property
-    def fade(self) -> list[tuple[float, float, float]]:
+    def prony_terms(self) -> list[tuple[float, float, float]]:
         """Of each Prony term, its part, what is left of it after a step, and the same in the mean of it."""
         return [
             (part, float(np.exp(-self.dt / tau)), float(tau / self.dt * -np.expm1(-self.dt / tau)))
@@ -53,42 +54,43 @@ class Clock:
         ]
 
     @property
-    def firmness(self) -> float:
-        """How stiff the tissue is to a change within a step, as a part of that to a sudden load."""
-        return 1 - sum(part for part, _, _ in self.fade) + sum(part * even for part, _, even in self.fade)
+    def relative_stiffness(self) -> float:
+        """Stiffness to a change within a step, as a part of that to a sudden load."""
+        terms = self.prony_terms
+        return 1 - sum(part for part, _, _ in terms) + sum(part * mean for part, _, mean in terms)
 
     @property
-    def pull(self) -> float:
+    def inertia_spring(self) -> float:
         """Backward Euler's mass and damping as a spring, 1/s^2; 0 without inertia."""
         return (1 / self.dt**2 + self.damping / self.dt) if self.mass_kg else 0.0
 
-    def ahead(self, u: Floats, before: Floats) -> Floats:
+    def inertia_target(self, u: Floats, before: Floats) -> Floats:
         """Where that spring has no force (N, 3) mm, after two states of a step's distance."""
-        kept = (2 * u - before) / self.dt**2 + self.damping / self.dt * u
-        return np.asarray(kept / self.pull)
+        momentum = (2 * u - before) / self.dt**2 + self.damping / self.dt * u
+        return np.asarray(momentum / self.inertia_spring)
 
 
-class _Memory:
+class _PronyHistory:
     """What relaxing tissue keeps of its past, as nodal forces."""
 
     def __init__(self, clock: Clock) -> None:
-        self._fade = clock.fade
+        self._terms = clock.prony_terms
         self._elastic: Floats | None = None
         self._history: list[Floats] = []
 
-    def add(self, load: Floats) -> Floats:
+    def add_to(self, load: Floats) -> Floats:
         """A step's load (N, 3) mN with the past in it."""
         if self._elastic is not None:
-            for (part, decay, even), past in zip(self._fade, self._history, strict=True):
-                load = load - decay * past + part * even * self._elastic
+            for (part, decay, mean), past in zip(self._terms, self._history, strict=True):
+                load = load - decay * past + part * mean * self._elastic
         return load
 
-    def keep(self, now: Floats) -> None:
+    def update(self, now: Floats) -> None:
         """Takes up the elastic forces (N, 3) mN at a step's end."""
         if self._elastic is None:
-            self._elastic, self._history = np.zeros_like(now), [np.zeros_like(now) for _ in self._fade]
-        for k, (part, decay, even) in enumerate(self._fade):
-            self._history[k] = decay * self._history[k] + part * even * (now - self._elastic)
+            self._elastic, self._history = np.zeros_like(now), [np.zeros_like(now) for _ in self._terms]
+        for k, (part, decay, mean) in enumerate(self._terms):
+            self._history[k] = decay * self._history[k] + part * mean * (now - self._elastic)
         self._elastic = now
 
 
@@ -98,10 +100,10 @@ def march_in_time(
     poisson: float,
     young_kpa: float,
     loads: Floats,
-    named: Floats,
+    load_parameter: Floats,
     clock: Clock,
-    sheet: Sheet | None = None,
-) -> Path:
+    membrane: MembraneSheet | None = None,
+) -> LoadPath:
     """Motion from rest under loads at even times; between them they change evenly.
 
     Args:
@@ -110,46 +112,42 @@ def march_in_time(
         poisson: below 0.5.
         young_kpa: E, which sets how much inertia counts.
         loads: (T, N, 3) mN for E = 1 kPa.
-        named: (T,) P = F/(E a^2) of each, for messages.
+        load_parameter: (T,) P = F/(E a^2) of each, for messages.
         clock: time.
-        sheet: a membrane on the surface; it relaxes as the tissue does.
+        membrane: on the surface; it relaxes as the tissue does.
 
     Raises:
         As `equilibrium.solve_path`.
     """
-    memory, firm, pull = _Memory(clock), clock.firmness, clock.pull
+    firm, spring, substeps = clock.relative_stiffness, clock.inertia_spring, clock.substeps
     mass = nodal_mass(tets, clock.mass_kg) / young_kpa
-    springs = (tets.hold + sp.diags_array(pull * mass)) / firm
+    springs = (tets.hold + sp.diags_array(spring * mass)) / firm
     slip = None if tets.slip is None else sp.csr_array(tets.slip / firm)
     held = replace(tets, hold=sp.csr_array(springs), slip=slip)
-    system = assemble(held, law, poisson, sheet)
+    system = assemble(held, law, poisson, membrane)
     tissue = replace(system, hold=sp.csr_array(tets.hold.shape), slip=None)
     skull = replace(system, hold=tets.hold, slip=tets.slip)
 
     peak = loads[np.abs(loads).max(axis=(1, 2)).argmax()]
     size = float(np.sqrt(np.vdot(peak, system.solve(peak)))) / firm
-    u = before = np.zeros_like(loads[0])
-    states: list[tuple[Floats, State, float, float]] = []
-    for t in range(len(loads)):
-        for sub in range(1, clock.substeps + 1 if t else 2):
-            share = sub / clock.substeps
-            load = loads[t] if t == 0 else (1 - share) * loads[t - 1] + share * loads[t]
-            load = memory.add(load)
-            if pull:
-                load = load + pull * mass[:, None] * clock.ahead(u, before)
-            new, state, norm = minimise_energy(system, load / firm, u + (u - before), TOLERANCE * size, u)
-            least = check_state(system, new, state, t, float(named[t]))
-            memory.keep(tissue.state(new).force)
-            before, u = u, new
-            if norm > 2 * TOLERANCE * size:
-                raise NoEquilibrium(f"frame {t}: no equilibrium at load {named[t]:.3g}; lower the load")
-        states.append((u, tissue.state(u), norm / size, least))
-    return Path(
-        np.stack([u for u, _, _, _ in states]),
-        np.array([least for _, _, _, least in states]),
-        np.array([s.energy + 0.5 * float(np.vdot(u, skull.springs(u))) for u, s, _, _ in states]),
-        np.array([r for _, _, r, _ in states]),
-    )
+    past, before = _PronyHistory(clock), np.zeros_like(peak)
+
+    def step(number: int, load: Floats, u: Floats) -> tuple[Floats, State, float]:
+        nonlocal before
+        load = past.add_to(load)
+        if spring:
+            load = load + spring * mass[:, None] * clock.inertia_target(u, before)
+        new, state, norm = minimise_energy(system, load / firm, u + (u - before), TOLERANCE * size, u)
+        past.update(tissue.state(new).force)
+        before = u
+        return new, state, norm / size
+
+    steps = [loads[0]]
+    for begin, end in pairwise(loads):
+        steps += [(1 - s / substeps) * begin + s / substeps * end for s in range(1, substeps + 1)]
+    path = follow_loads(system, np.array(steps), load_parameter, step, 2 * TOLERANCE, substeps)
+    energy = [tissue.state(u).energy + 0.5 * float(np.vdot(u, skull.springs(u))) for u in path.displacement]
+    return replace(path, energy=np.array(energy))
 
 
 def nodal_mass(tets: Tets, mass_kg: float) -> Floats:

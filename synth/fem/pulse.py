@@ -15,14 +15,12 @@ from numpy.typing import NDArray
 from synth.fem.mesh.tetrahedra import RIM_MM
 from synth.fem.surface_embedding import Embedding
 from synth.fem.system import System
-from synth.job import schema
+from synth.geometry.triangles import Shape
 
 Floats = NDArray[np.float64]
 
-_SECOND, _PEAK_TO_PEAK = (
-    0.4,
-    2.4293,
-)  # share of twice the heart's rate: a steep rise and a slow fall; what it spans
+_SECOND = 0.4  # share of twice the heart's rate: a steep rise and a slow fall
+_PEAK_TO_PEAK = 2.4293  # what that wave spans
 _MIDDLE = 0.25  # part of the opening's radius over which its motion is meant
 
 
@@ -51,24 +49,22 @@ class Pulse:
         return np.asarray(above[1:] - above[0])
 
 
-def lift(
-    system: System, carry: Embedding, vertices: Floats, faces: NDArray[np.integer], at: schema.Craniotomy
-) -> Floats:
+def lift(system: System, embedding: Embedding, surface: Shape, opening_mm: float) -> Floats:
     """The load that raises the middle of the opening by 1 mm under the linear law, (N, 3) mN for E = 1 kPa.
 
     Args:
         system: the volume.
-        carry: the surface on it.
-        vertices: (V, 3) mm.
-        faces: (F, 3), counter-clockwise seen from outside.
-        at: the opening; beyond its radius the pressure falls to none over the rim.
+        embedding: the surface on it.
+        surface: faces counter-clockwise seen from outside.
+        opening_mm: radius of the craniotomy; beyond it the pressure falls to none over the rim.
     """
+    vertices, faces = surface
     corner = vertices[faces]
-    facing = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]) / 6
+    normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]) / 6
     outward = np.zeros_like(vertices)
-    np.add.at(outward, faces.ravel(), np.repeat(facing, 3, axis=0))
+    np.add.at(outward, faces.ravel(), np.repeat(normal, 3, axis=0))
     reach = np.hypot(vertices[:, 0], vertices[:, 1])
-    bare = np.clip(1 - (reach - at.radius_mm) / RIM_MM, 0, 1)
-    load = carry.gather((bare * bare * (3 - 2 * bare))[:, None] * outward)
-    middle = reach <= max(_MIDDLE * at.radius_mm, float(reach.min()))
-    return np.asarray(load / carry.move(system.solve(load))[middle, 2].mean())
+    bare = np.clip(1 - (reach - opening_mm) / RIM_MM, 0, 1)
+    load = embedding.gather((bare * bare * (3 - 2 * bare))[:, None] * outward)
+    middle = reach <= max(_MIDDLE * opening_mm, float(reach.min()))
+    return np.asarray(load / embedding.move(system.solve(load))[middle, 2].mean())

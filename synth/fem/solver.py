@@ -8,12 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from synth.fem import equilibrium, motion, surface_embedding, tool
-from synth.fem.equilibrium import InvertedElement, Path
+from synth.fem import surface_embedding, tool
+from synth.fem.equilibrium import InvertedElement, solve_mixed_path, solve_path
 from synth.fem.material import Tissue, check_load
 from synth.fem.mesh.tetrahedra import Tets
+from synth.fem.motion import Clock, march_in_time, volume
 from synth.fem.pulse import Pulse, lift
 from synth.fem.tool import Gesture
+from synth.geometry.triangles import Shape
 from synth.job import schema
 
 __all__ = ["Deformation", "InvertedElement", "deform"]
@@ -73,66 +75,70 @@ class Deformation:
 def deform(
     fem: schema.Fem,
     tissue: Tissue,
-    gesture: Gesture,
+    gestures: Sequence[Gesture],
     tets: Tets,
-    skin_vertices: Floats,
-    skin_faces: Ints,
+    surface: Shape,
     frames: int,
     fps: float,
-    further: Sequence[Gesture] = (),
     pulse: Pulse | None = None,
-    opening: schema.Craniotomy | None = None,
+    opening_mm: float = schema.Craniotomy().radius_mm,
 ) -> Deformation:
     """Moves a brain as gestures ask.
 
     Args:
         fem: the job's section.
         tissue: stiffness and law.
-        gesture: the first instrument's.
+        gestures: one an instrument, all at the same time.
         tets: the volume.
-        skin_vertices: (V, 3) mm, the fine surface.
-        skin_faces: (F, 3), counter-clockwise seen from outside.
+        surface: the fine surface on it, faces counter-clockwise seen from outside.
         frames: T >= 2.
         fps: 1/s.
-        further: gestures of more instruments at the same time.
         pulse: of heart and breath; no part of force and traction.
-        opening: where the surface is exposed to it.
+        opening_mm: radius of the craniotomy, where the surface is exposed to the pulse.
 
     Raises:
         UserError: the load is past the law's range, or the contact is not on the surface.
         InvertedElement: names frame, load and element.
         NotFinite: a number is none.
     """
-    for one in (gesture, *further):
-        check_load(tissue.law, one.load)
-    played = [(one, tool.course(one, frames)) for one in (gesture, *further)]
-    area = surface_embedding.vertex_area(skin_vertices, skin_faces)
-    carry = surface_embedding.embed(tets, skin_vertices)
-    time = np.arange(frames) / fps
-    height = np.zeros(frames) if pulse is None else pulse.height(time)
-    traction = np.sum([tool.tractions(g, over, skin_vertices, area) for g, over in played], axis=0)
+    for gesture in gestures:
+        check_load(tissue.law, gesture.load)
+    tools = [(gesture, tool.trajectory(gesture, frames)) for gesture in gestures]
+    time, area = np.arange(frames) / fps, surface_embedding.vertex_area(*surface)
+    embedding = surface_embedding.embed(tets, surface.vertices)
+    traction = np.sum([tool.tractions(g, moved, surface.vertices, area) for g, moved in tools], axis=0)
     # One load per kPa of E; displacement depends on no more than that.
-    loads = np.stack([carry.gather(area[:, None] * t) for t in traction / tissue.young_kpa])
-    timeless = fem.time == "quasi-static" and not fem.relaxation
-    system = tissue.equations(tets) if timeless or pulse is not None else None
-    raised = np.zeros_like(skin_vertices)
-    if pulse is not None and system is not None:
-        raising = lift(system, carry, skin_vertices, skin_faces, opening or schema.Craniotomy())
+    loads = np.stack([embedding.gather(area[:, None] * t) for t in traction / tissue.young_kpa])
+    load_parameter = np.max([gesture.load * moved.load for gesture, moved in tools], axis=0)
+    system, pulse_work = tissue.equations(tets), np.zeros(frames)
+    if pulse is not None:
+        height, raising = pulse.height(time), lift(system, embedding, surface, opening_mm)
         loads += height[:, None, None] * raising
-        raised = carry.move(system.solve(raising))
-    named = np.max([g.load * over.load for g, over in played], axis=0)
-    if system is None or not timeless:
-        path = march_in_time(fem, tissue, tets, loads, named, fps)
+        raised = embedding.move(system.solve(raising))
+        pulse_work = 0.5 * height * np.einsum("v,tvd,vd->t", area, traction, raised, optimize=True)
+
+    if fem.time == "dynamic" or fem.relaxation:
+        path = march_in_time(
+            tets,
+            tissue.law,
+            tissue.poisson,
+            tissue.young_kpa,
+            loads,
+            load_parameter,
+            clock(fem, fps, tets),
+            tissue.sheet,
+        )
+    elif pulse is None and tissue.sheet is None:
+        path = solve_path(system, loads, load_parameter)
     else:
-        lean = pulse is not None or tissue.sheet is not None
-        path = equilibrium.solve_path(system, loads, named, lean=lean)
-    displacement = np.stack([carry.move(u) for u in path.displacement])
-    surface = skin_vertices + displacement
-    poses = [tool.pose(g, over, skin_vertices, skin_faces, surface) for g, over in played]
-    forces = [np.outer(over.load, np.sum([c.force_mn for c in g.contacts], axis=0)) for g, over in played]
+        path = solve_mixed_path(system, loads, load_parameter)
+
+    displacement = np.stack([embedding.move(u) for u in path.displacement])
+    poses = [tool.pose(g, moved, surface, surface.vertices + displacement) for g, moved in tools]
+    forces = [np.outer(m.load, np.sum([c.force_mn for c in g.contacts], axis=0)) for g, m in tools]
     return Deformation(
-        rest=skin_vertices,
-        faces=skin_faces,
+        rest=surface.vertices,
+        faces=surface.faces,
         displacement=displacement,
         traction=traction,
         area=area,
@@ -144,35 +150,14 @@ def deform(
         min_jacobian=path.jacobian,
         energy=path.energy * tissue.young_kpa,
         residual=path.residual,
-        pulse_work=0.5 * height * np.einsum("v,tvd,vd->t", area, traction, raised, optimize=True),
+        pulse_work=pulse_work,
     )
 
 
-def march_in_time(
-    fem: schema.Fem, tissue: Tissue, tets: Tets, loads: Floats, named: Floats, fps: float
-) -> Path:
-    """The volume in motion under (T, N, 3) mN for E = 1 kPa.
-
-    Raises:
-        As `equilibrium.solve_path`.
-    """
-    return motion.march_in_time(
-        tets,
-        tissue.law,
-        tissue.poisson,
-        tissue.young_kpa,
-        loads,
-        named,
-        clock(fem, fps, tets),
-        tissue.sheet,
-    )
-
-
-def clock(fem: schema.Fem, fps: float, tets: Tets) -> motion.Clock:
+def clock(fem: schema.Fem, fps: float, tets: Tets) -> Clock:
     """Steps no longer than `_STEP_S`, a whole number of them a frame."""
-    dynamic = fem.time == "dynamic"
-    substeps = int(np.ceil(1 / fps / _STEP_S - 1e-9)) if dynamic else 1
-    mass = fem.mass_kg or _DENSITY_KG_M3 * 1e-9 * motion.volume(tets).sum()
-    return motion.Clock(
-        1 / fps, substeps, float(mass) if dynamic else 0.0, _DAMPING if dynamic else 0.0, fem.relaxation
-    )
+    if fem.time != "dynamic":
+        return Clock(1 / fps, relaxation=fem.relaxation)
+    substeps = int(np.ceil(1 / fps / _STEP_S - 1e-9))
+    mass = fem.mass_kg or _DENSITY_KG_M3 * 1e-9 * volume(tets).sum()
+    return Clock(1 / fps, substeps, float(mass), _DAMPING, fem.relaxation)

@@ -23,7 +23,7 @@ from synth.fem.laws import (
     swellings,
     tangent,
 )
-from synth.fem.membrane import Membrane, Sheet, cover
+from synth.fem.membrane import Membrane, MembraneSheet, cover
 from synth.fem.mesh.element import Quadrature, quadrature, quality
 from synth.fem.mesh.tetrahedra import Tets
 
@@ -144,7 +144,7 @@ class System:
 
 
 def assemble(
-    tets: Tets, law: str, poisson: float, sheet: Sheet | None = None, *, averaged: bool = True
+    tets: Tets, law: str, poisson: float, sheet: MembraneSheet | None = None, *, averaged: bool = True
 ) -> System:
     """Builds and factors the equations.
 

@@ -1,4 +1,4 @@
-"""The gesture: what the instrument does to the tissue, and where it is in every frame."""
+"""The gesture: what an instrument does to the tissue, and where it is in every frame."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from synth.errors import UserError
+from synth.geometry.triangles import Shape
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -20,7 +21,7 @@ _LENGTH_MM, _STEPS = 110.0, 23
 
 
 @dataclass(frozen=True)
-class Contact:
+class ToolContact:
     """One place where a tip loads the tissue."""
 
     point_mm: tuple[float, float]
@@ -31,11 +32,11 @@ class Contact:
 
 @dataclass(frozen=True)
 class Gesture:
-    """What is drawn for the gesture of one sequence."""
+    """What one instrument does in a sequence."""
 
     kind: str
     """`pull`, `push`, `slide`, `grasp`, `retract` or `tap`."""
-    contacts: tuple[Contact, ...]
+    contacts: tuple[ToolContact, ...]
     """A grasp has two, the others one."""
     footprint_mm: float
     """Radius a of every contact."""
@@ -69,10 +70,24 @@ class Gesture:
         ends = np.concatenate([start, start + np.asarray(self.path_mm)])
         return float(np.hypot(*ends.T).max()) + self.footprint_mm
 
+    @property
+    def focus(self) -> tuple[tuple[float, float, float], ...]:
+        """Where the mesh should be finest: x, y and radius of what is loaded, mm."""
+        stops = (0.0, 0.5, 1.0) if any(self.path_mm) else (0.0,)
+        (dx, dy), radius = self.path_mm, self.footprint_mm
+        places = [(contact.point_mm, s) for contact in self.contacts for s in stops]
+        return tuple((x + s * dx, y + s * dy, radius) for (x, y), s in places)
+
+    @property
+    def shaft(self) -> Floats:
+        """Unit vector from the tips to the hand, (3,) world axes."""
+        turn, up = np.radians(self.azimuth_deg), np.radians(self.elevation_deg)
+        return np.array([np.cos(turn) * np.cos(up), np.sin(turn) * np.cos(up), np.sin(up)])
+
 
 @dataclass(frozen=True)
-class Course:
-    """The gesture over T frames. In frame 0 there is no load and the tips are whole `hover_mm` away."""
+class ToolMotion:
+    """The gesture over T frames. In frame 0 there is no load and the tips are `hover_mm` away."""
 
     load: Floats
     """(T,) as a part of the peak."""
@@ -108,17 +123,17 @@ def grip(
 
 def clearance(one: Gesture, other: Gesture) -> float:
     """How far apart two gestures are beyond what they need, mm: their contacts and their shafts."""
-    here, there = np.array(focus(one)), np.array(focus(other))
+    here, there = np.array(one.focus), np.array(other.focus)
     apart = np.linalg.norm(here[:, None, :2] - there[None, :, :2], axis=2)
     contacts = (apart - _OVERLAP * (here[:, None, 2] + there[None, :, 2])).min()
     s = np.linspace(0, _LENGTH_MM, _STEPS)
-    lines = [np.append(g.point_mm, 0.0) + s[:, None] * shaft(g) for g in (one, other)]
+    lines = [np.append(g.point_mm, 0.0) + s[:, None] * g.shaft for g in (one, other)]
     gap = np.linalg.norm(lines[0][:, None] - lines[1][None], axis=2)
     wide = np.minimum(_BLADE_MM + _SPREADING * np.maximum(s[:, None], s[None, :]), _BODY_MM)
     return float(min(contacts, (gap - wide).min()))
 
 
-def course(gesture: Gesture, frames: int) -> Course:
+def trajectory(gesture: Gesture, frames: int) -> ToolMotion:
     """When the load comes and goes, and where to."""
     t = np.linspace(0, 1, frames)
     touch, full, fall, leave = gesture.timing
@@ -133,42 +148,29 @@ def course(gesture: Gesture, frames: int) -> Course:
     slid = _smooth((t - full) / max(fall - full, 1e-9))
     # The rest frame is the first one, whatever the timing.
     load[0] = 0.0
-    return Course(load, np.maximum(away, lifted * (load < 1e-3)), slid[:, None] * np.asarray(gesture.path_mm))
+    shift = slid[:, None] * np.asarray(gesture.path_mm)
+    return ToolMotion(load, np.maximum(away, lifted * (load < 1e-3)), shift)
 
 
-def focus(gesture: Gesture) -> tuple[tuple[float, float, float], ...]:
-    """Where the mesh should be finest: x, y and radius of what is loaded, mm."""
-    stops = (0.0, 0.5, 1.0) if any(gesture.path_mm) else (0.0,)
-    return tuple(
-        (c.point_mm[0] + s * gesture.path_mm[0], c.point_mm[1] + s * gesture.path_mm[1], gesture.footprint_mm)
-        for c in gesture.contacts
-        for s in stops
-    )
-
-
-def tractions(gesture: Gesture, over: Course, vertices: Floats, area: Floats) -> Floats:
-    """Load on the surface at rest.
+def tractions(gesture: Gesture, motion: ToolMotion, vertices: Floats, area: Floats) -> Floats:
+    """Load (T, V, 3) kPa on the surface at rest: sum(area * result) is the force.
 
     Args:
-        gesture: contacts and forces.
-        over: its course.
+        gesture, motion: contacts and forces, and when they act.
         vertices: (V, 3) mm at rest.
         area: (V,) mm^2.
 
-    Returns:
-        (T, V, 3) kPa, with sum(area * result) = the force.
-
     Raises:
-        UserError: fewer than 3 vertices lie under a contact.
+        UserError: as `footprint`.
     """
-    out = np.zeros((len(over.load), len(vertices), 3))
+    out = np.zeros((len(motion.load), len(vertices), 3))
     for contact in gesture.contacts:
         start = np.asarray(contact.point_mm)
         kernel = footprint(start, gesture.footprint_mm, vertices, area)
-        for t, part in enumerate(over.load):
+        for t, part in enumerate(motion.load):
             if part > 0:
-                if over.shift[t].any():
-                    kernel = footprint(start + over.shift[t], gesture.footprint_mm, vertices, area)
+                if motion.shift[t].any():
+                    kernel = footprint(start + motion.shift[t], gesture.footprint_mm, vertices, area)
                 out[t] += np.outer(part * kernel, contact.force_mn)
     return out
 
@@ -201,36 +203,32 @@ def footprint(centre: Floats, radius_mm: float, vertices: Floats, area: Floats) 
     return np.asarray(kernel / total)
 
 
-def anchors(
-    gesture: Gesture, over: Course, vertices: Floats, faces: NDArray[np.integer]
-) -> tuple[Ints, Floats]:
-    """Where the tips touch: (T, K, 3) vertices of the surface and their weights (T, K, 3)."""
-    aside = _aside(gesture.spread_mm, gesture.azimuth_deg)
-    start = np.asarray(gesture.point_mm) - 0.5 * np.asarray(gesture.path_mm)
-    reach = np.abs(aside).max() + np.abs(gesture.path_mm).max() + 3 * gesture.footprint_mm
-    near = faces[(np.abs(vertices[faces, :2] - start).max(axis=2) <= reach).any(axis=1)]
-    found: dict[tuple[float, ...], tuple[Ints, Floats]] = {}
-    for shift in over.shift:
-        for side in (-1, 1):
-            place = tuple(start + shift + side * aside)
-            if place not in found:
-                found[place] = _under(np.asarray(place), vertices, near)
-    touched = [[found[tuple(start + s + side * aside)] for side in (-1, 1)] for s in over.shift]
-    return np.array([[p[0] for p in pair] for pair in touched]), np.array(
-        [[p[1] for p in pair] for pair in touched]
-    )
+def anchors(gesture: Gesture, motion: ToolMotion, surface: Shape) -> tuple[Ints, Floats]:
+    """Where the two tips touch in each frame: (T, 2, 3) vertices of the surface and their weights.
+
+    Raises:
+        UserError: beyond the edge of the surface.
+    """
+    aside, path = _aside(gesture.spread_mm, gesture.azimuth_deg), np.asarray(gesture.path_mm)
+    start = np.asarray(gesture.point_mm) - 0.5 * path
+    reach = np.abs(aside).max() + np.abs(path).max() + 3 * gesture.footprint_mm
+    corner = surface.vertices[surface.faces, :2]
+    near = surface.faces[(np.abs(corner - start).max(axis=2) <= reach).any(axis=1)]
+    places = (start + motion.shift)[:, None] + np.stack([-aside, aside])
+    once, which = np.unique(places.reshape(-1, 2), axis=0, return_inverse=True)
+    found = [_under(place, surface.vertices, near) for place in once]
+    shape = (*places.shape[:2], 3)
+    corners, weights = (np.array(of)[which.ravel()].reshape(shape) for of in zip(*found, strict=True))
+    return corners, weights
 
 
-def pose(
-    gesture: Gesture, over: Course, vertices: Floats, faces: NDArray[np.integer], surface: Floats
-) -> tuple[Floats, Floats]:
+def pose(gesture: Gesture, motion: ToolMotion, surface: Shape, moved: Floats) -> tuple[Floats, Floats]:
     """Where the instrument is: its tips rest on the tissue while they load it.
 
     Args:
-        gesture, over: what it does.
-        vertices: (V, 3) mm at rest.
-        faces: (F, 3).
-        surface: (T, V, 3) mm, the moved vertices.
+        gesture, motion: what it does.
+        surface: at rest.
+        moved: (T, V, 3) mm, its vertices over time.
 
     Returns:
         Tips (T, 2, 3) mm and unit vectors from tip to hand (T, 2, 3).
@@ -238,18 +236,12 @@ def pose(
     Raises:
         UserError: it touches beyond the edge of the surface.
     """
-    corners, weights = anchors(gesture, over, vertices, faces)
+    corners, weights = anchors(gesture, motion, surface)
     touched = np.stack(
-        [np.einsum("kc,kcd->kd", w, at[c]) for w, c, at in zip(weights, corners, surface, strict=True)]
+        [np.einsum("kc,kcd->kd", w, at[c]) for w, c, at in zip(weights, corners, moved, strict=True)]
     )
-    tips = touched + gesture.hover_mm * over.away[:, None, None] * shaft(gesture)
-    return tips, np.broadcast_to(shaft(gesture), touched.shape).copy()
-
-
-def shaft(gesture: Gesture) -> Floats:
-    """Unit vector from the tips to the hand, (3,) world axes."""
-    turn, up = np.radians(gesture.azimuth_deg), np.radians(gesture.elevation_deg)
-    return np.array([np.cos(turn) * np.cos(up), np.sin(turn) * np.cos(up), np.sin(up)])
+    tips = touched + gesture.hover_mm * motion.away[:, None, None] * gesture.shaft
+    return tips, np.broadcast_to(gesture.shaft, touched.shape).copy()
 
 
 def _aside(spread_mm: float, azimuth_deg: float) -> Floats:
@@ -262,10 +254,10 @@ def _under(xy: Floats, vertices: Floats, faces: NDArray[np.integer]) -> tuple[In
     """The highest face above or below a point of the plane, and the point's barycentrics in it."""
     a, b, c = (vertices[faces[:, i], :2] - xy for i in range(3))
     parts = np.stack([_cross(b, c), _cross(c, a), _cross(a, b)], axis=1)
-    whole = parts.sum(axis=1)
+    total = parts.sum(axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
-        bary = parts / whole[:, None]
-    hit = np.flatnonzero((np.abs(whole) > 1e-12) & (bary >= -1e-9).all(axis=1))
+        bary = parts / total[:, None]
+    hit = np.flatnonzero((np.abs(total) > 1e-12) & (bary >= -1e-9).all(axis=1))
     if len(hit) == 0:
         raise UserError("anatomy.craniotomy: the instrument touches beyond the edge of the surface")
     height = np.einsum("fc,fc->f", bary[hit], vertices[faces[hit], 2])

@@ -12,7 +12,7 @@ from synth.errors import UserError
 from synth.fem import tool
 from synth.fem.material import Pia, Tissue
 from synth.fem.pulse import Pulse
-from synth.fem.tool import Contact, Gesture
+from synth.fem.tool import Gesture, ToolContact
 from synth.job import schema
 from synth.job.instrument import CLEAR_MM, Instrument
 from synth.job.schema import Family, Fem, Job, Light, Render
@@ -213,7 +213,7 @@ def draw_gesture(
     return Gesture(
         kind=kind,
         contacts=tuple(
-            Contact((float(p[0]), float(p[1])), _vector(f))
+            ToolContact((float(p[0]), float(p[1])), _vector(f))
             for p, f in zip(places, load * unit_mn * directions, strict=True)
         ),
         footprint_mm=footprint,

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from synth.errors import UserError
-from synth.fem import solver, tool
+from synth.fem import solver
 from synth.fem.mesh import tetrahedra
 from synth.fem.mesh.relief import HeightMap
 from synth.fem.mesh.tetrahedra import Tets
@@ -20,6 +20,7 @@ from synth.flow.estimator import Estimator, create
 from synth.flow.track import Track
 from synth.geometry import brain_surface
 from synth.geometry.brain_surface import Brain
+from synth.geometry.triangles import Shape
 from synth.job.schema import Anatomy, Flow, Job
 from synth.render.anatomy import surface as anatomy
 from synth.render.anatomy.surface import Relief, Surface
@@ -202,7 +203,7 @@ def simulate(
 
 def build(job: Job, case: Scenario) -> tuple[Surface, Tets]:
     """The fine surface of a scenario and the volume under it, finest where its contacts are."""
-    focus = [place for gesture in case.gestures for place in tool.focus(gesture)]
+    focus = [place for gesture in case.gestures for place in gesture.focus]
     surface, whole = cortex(job, case)
     mesh, slips = (job.fem.tets, 2, focus), case.tissue.skull == "slip"
     if whole is None:
@@ -253,15 +254,13 @@ def move(job: Job, case: Scenario, surface: Surface, tets: Tets) -> Deformation:
     return solver.deform(
         job.fem,
         case.tissue,
-        case.gesture,
+        case.gestures,
         tets,
-        surface.vertices,
-        surface.faces,
+        Shape(surface.vertices, surface.faces),
         job.frames,
         job.fps,
-        case.further,
         case.pulse,
-        job.anatomy.craniotomy,
+        job.anatomy.craniotomy.radius_mm,
     )
 
 

@@ -55,13 +55,13 @@ def fit_reading(scene: Scene, frames: Sequence[Frame]) -> Reading:
     job = scene.job.model_copy(update={"fem": scene.job.fem.model_copy(update=plain)})
     tets = build(job, case)[1]
     system = case.tissue.equations(tets, "neo-hookean")
-    carry = surface_embedding.embed(tets, surface.vertices)
+    embedding = surface_embedding.embed(tets, surface.vertices)
     young = case.tissue.young_kpa
     numbers = [frame.index for frame in frames]
-    loads = np.stack([carry.gather(motion.area[:, None] * motion.traction[t]) for t in numbers]) / young
+    loads = np.stack([embedding.gather(motion.area[:, None] * motion.traction[t]) for t in numbers]) / young
     path = equilibrium.solve_path(system, loads, np.zeros(len(frames)))
     size_mn = float(np.sqrt(np.square(motion.by_instrument[numbers]).sum(axis=(1, 2)).mean()))
-    courses = [tool.course(gesture, job.frames) for gesture in case.gestures]
+    motions = [tool.trajectory(gesture, job.frames) for gesture in case.gestures]
     mm_per_px = scene.view.mm_per_px
     true_mm = np.stack([mm_per_px * cells(frame.flow, scene.tissue) for frame in frames])
     rules = []
@@ -72,17 +72,17 @@ def fit_reading(scene: Scene, frames: Sequence[Frame]) -> Reading:
         now = surface.vertices + motion.displacement[t]
         seen = camera.project(scene.view, now)
         columns = []
-        for gesture, course in zip(case.gestures, courses, strict=True):
+        for gesture, over_time in zip(case.gestures, motions, strict=True):
             # A load of the sequence's size along the instrument's direction: errors come out as parts of it.
             load = np.zeros_like(tets.points)
             for contact in gesture.contacts:
-                centre = np.asarray(contact.point_mm) + course.shift[t]
+                centre = np.asarray(contact.point_mm) + over_time.shift[t]
                 kernel = tool.footprint(centre, gesture.footprint_mm, surface.vertices, motion.area)
-                load += carry.gather(np.outer(motion.area * kernel, contact.force_mn))
+                load += embedding.gather(np.outer(motion.area * kernel, contact.force_mn))
             load *= size_mn / (young * gesture.force_mn)
             response = np.zeros(load.size)
             response[system.free] = factors.solve(load.ravel()[system.free])
-            shift = carry.move(response.reshape(-1, 3))
+            shift = embedding.move(response.reshape(-1, 3))
             step = _STEP_MM / np.abs(shift).max()
             pixels = (camera.project(scene.view, now + step * shift) - seen) / step
             flow = truth.at_rest_pixels(scene.studio.still, surface.faces, pixels)

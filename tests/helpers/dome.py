@@ -5,20 +5,21 @@ from __future__ import annotations
 import numpy as np
 
 from synth.fem.mesh import tetrahedra
+from synth.geometry.triangles import Shape
 from synth.job import schema
 
 ANATOMY = schema.Anatomy()
 OPENING_MM = ANATOMY.craniotomy.radius_mm
 
 
-def patch(n: int = 61, extent: float = 46.0) -> tuple[np.ndarray, np.ndarray]:
+def patch(n: int = 61, extent: float = 46.0) -> Shape:
     """The dome over the opening as a fine surface."""
     x = np.linspace(-extent / 2, extent / 2, n)
     xy = np.stack(np.meshgrid(x, x, indexing="ij"), axis=-1).reshape(-1, 2)
     i = np.arange(n * n).reshape(n, n)
     a, b, c, d = i[:-1, :-1].ravel(), i[1:, :-1].ravel(), i[1:, 1:].ravel(), i[:-1, 1:].ravel()
     faces = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
-    return np.column_stack([xy, tetrahedra.dome(xy, ANATOMY.dome_mm)]), faces.astype(np.int32)
+    return Shape(np.column_stack([xy, tetrahedra.dome(xy, ANATOMY.dome_mm)]), faces.astype(np.int32))
 
 
 def block(fem: schema.Fem) -> tetrahedra.Tets:

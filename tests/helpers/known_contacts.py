@@ -21,7 +21,7 @@ def contacts(
         (count, 3) forces [mN], camera axes; count fields (P, C) of displacement [mm], C as the compliance's.
     """
     block = Block.build(tets)
-    seen = block.carry(known.points)
+    seen = block.embed(known.points)
     steps = np.stack(np.meshgrid(np.linspace(-1, 1, 13), np.linspace(-1, 1, 13)), axis=-1).reshape(-1, 2)
     disc = steps[np.hypot(*steps.T) < 1]
     share = (1 - np.square(disc).sum(axis=1)) ** 2
@@ -34,7 +34,7 @@ def contacts(
         around = rng.uniform(0, 2 * np.pi)
         flat = np.sqrt(1 - up**2)
         way = np.array([flat * np.cos(around), flat * np.sin(around), up * rng.choice([-1, 1])])
-        load = block.carry(at + radius * disc).gather(np.outer(share, size * way)) / young_kpa
+        load = block.embed(at + radius * disc).gather(np.outer(share, size * way)) / young_kpa
         moved = block.system.solve(load)
         forces.append(np.asarray(TO_CAMERA @ (size * way)))
         fields.append(picture(seen, moved, len(known.matrix) // len(known.points)))

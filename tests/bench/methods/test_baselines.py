@@ -102,8 +102,8 @@ def known() -> compliance.Compliance:
 def moved(known: compliance.Compliance, load: list[float]) -> NDArray[np.float64]:
     """Displacement (P, 3) mm, camera axes, for four loads of (3,) mN, world axes, on another mesh."""
     block = compliance.Block.build(2500)
-    held = block.carry(np.array([[2.0, -3.0], [2.5, -3.0], [2.0, -2.5], [1.5, -3.0]]))
-    u = block.carry(known.points).move(block.system.solve(held.gather(np.tile(load, (4, 1)))))
+    held = block.embed(np.array([[2.0, -3.0], [2.5, -3.0], [2.0, -2.5], [1.5, -3.0]]))
+    u = block.embed(known.points).move(block.system.solve(held.gather(np.tile(load, (4, 1)))))
     return np.asarray(u * [1, -1, -1])
 
 

@@ -9,9 +9,9 @@ import pytest
 from dome import ANATOMY, OPENING_MM, patch
 from scipy.spatial.transform import Rotation
 
-from synth.fem import solver, tool
+from synth.fem import solver
 from synth.fem.material import Pia
-from synth.fem.membrane import Membrane, Sheet, cover
+from synth.fem.membrane import Membrane, MembraneSheet, cover
 from synth.fem.mesh import tetrahedra
 from synth.fem.mesh.tetrahedra import Tets
 from synth.job import schema
@@ -32,7 +32,7 @@ def pulled(sheet: Membrane, u: Floats) -> tuple[float, Floats]:
 
 @pytest.mark.parametrize("linear", [True, False])
 def test_force_is_the_slope_of_energy_and_stiffness_that_of_force(tets: Tets, linear: bool) -> None:
-    sheet = cover(tets, Sheet(20.0, 1.03), linear=linear)
+    sheet = cover(tets, MembraneSheet(20.0, 1.03), linear=linear)
     rng, h = np.random.default_rng(0), 1e-6
     u, way = rng.normal(0, 0.15, tets.points.shape), rng.normal(size=tets.points.shape)
     (more, ahead), (less, behind) = pulled(sheet, u + h * way), pulled(sheet, u - h * way)
@@ -45,7 +45,7 @@ def test_force_is_the_slope_of_energy_and_stiffness_that_of_force(tets: Tets, li
 def test_stretch_pull_and_wrinkles_are_those_of_the_textbook(tets: Tets) -> None:
     """Tension of an incompressible neo-Hookean sheet: even stretch, uniaxial tension, compression."""
     flat = tetrahedra.block(schema.Anatomy(dome_mm=1e9), 250, 2)
-    sheet = cover(flat, Sheet(6.0, 1.0), linear=False)
+    sheet = cover(flat, MembraneSheet(6.0, 1.0), linear=False)
     area = float(sheet.weight.sum())
     assert area == pytest.approx(1e4, rel=1e-9)
     at = flat.points * [1.0, 1.0, 0.0]
@@ -69,10 +69,8 @@ def test_work_over_a_load_cycle_is_the_stored_energy() -> None:
     fem = schema.Fem(gestures=("push",), load=(0.25, 0.25), membrane=schema.Membrane(intact=1))
     tissue = replace(scenario.draw_tissue(fem, np.random.default_rng(1)), membrane=Pia(300.0, 0.1, 1.02))
     gesture = scenario.draw_gesture(fem, OPENING_MM, tissue.young_kpa, np.random.default_rng(2))
-    tets = tetrahedra.block(ANATOMY, 700, 2, tool.focus(gesture))
-    vertices, faces = patch(121)
-    frames = 97
-    found = solver.deform(fem, tissue, gesture, tets, vertices, faces, frames, 25.0)
+    tets = tetrahedra.block(ANATOMY, 700, 2, gesture.focus)
+    found = solver.deform(fem, tissue, [gesture], tets, patch(121), 97, 25.0)
     force = found.area[:, None] * found.traction
     step = np.diff(found.displacement, axis=0)
     work = np.r_[0, np.cumsum(0.5 * np.einsum("tvd,tvd->t", force[1:] + force[:-1], step))]

@@ -26,7 +26,7 @@ def test_labels_of_two_instruments_add_up_and_both_touch(law: str) -> None:
     gestures, frames = drawn(fem, 3), 17
     tissue = Tissue(1.0, 0.4, law)
     tets, surface = block(fem), patch()
-    motion = solver.deform(fem, tissue, gestures[0], tets, *surface, frames, 25.0, gestures[1:])
+    motion = solver.deform(fem, tissue, gestures, tets, surface, frames, 25.0)
     np.testing.assert_allclose(motion.by_instrument.sum(axis=1), motion.force, atol=1e-12)
     moved = motion.rest + motion.displacement
     for k, gesture in enumerate(gestures):
@@ -44,7 +44,7 @@ def test_labels_of_two_instruments_add_up_and_both_touch(law: str) -> None:
         assert apart[pressed > 0.05 * pressed.max()].max() < 0.6  # half a vertex spacing
         assert apart[0].min() > 3
     if law == "linear":
-        alone = [solver.deform(fem, tissue, g, tets, *surface, frames, 25.0).displacement for g in gestures]
+        alone = [solver.deform(fem, tissue, [g], tets, surface, frames, 25.0).displacement for g in gestures]
         np.testing.assert_allclose(motion.displacement, sum(alone), atol=1e-8)
 
 

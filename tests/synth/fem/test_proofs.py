@@ -72,10 +72,10 @@ def test_kernel_on_a_half_space(poisson: float) -> None:
     vertices[:, 2] = 0
     area = surface_embedding.vertex_area(vertices, faces)
     kernel = tool.footprint(np.zeros(2), a, vertices, area)
-    carry = surface_embedding.embed(tets, vertices)
-    load = carry.gather(np.outer(area * kernel, [0, 0, -1.0]))
+    embedding = surface_embedding.embed(tets, vertices)
+    load = embedding.gather(np.outer(area * kernel, [0, 0, -1.0]))
     u = shell + system.solve(load - (system.stiffness @ shell.ravel()).reshape(-1, 3))
-    centre = -carry.move(u)[n * n // 2, 2]
+    centre = -embedding.move(u)[n * n // 2, 2]
     assert centre == pytest.approx(1.0186 * (1 - poisson**2) / a, rel=0.005 if poisson < 0.45 else 0.01)
 
 

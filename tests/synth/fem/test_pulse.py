@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from dome import ANATOMY, OPENING_MM, patch
 
-from synth.fem import solver, tool
+from synth.fem import solver
 from synth.fem.mesh import tetrahedra
 from synth.fem.pulse import Pulse
 from synth.job import schema
@@ -19,10 +19,8 @@ def moved(pulse: Pulse | None, law: str, **fem: object) -> solver.Deformation:
     asked = schema.Fem.model_validate({"gestures": ("pull",), "load": 0.1, "law": law} | fem)
     tissue = scenario.draw_tissue(asked, np.random.default_rng(1))
     gesture = scenario.draw_gesture(asked, OPENING_MM, tissue.young_kpa, np.random.default_rng(2))
-    tets = tetrahedra.block(ANATOMY, 300, 2, tool.focus(gesture))
-    return solver.deform(
-        asked, tissue, gesture, tets, *patch(), FRAMES, RATE, pulse=pulse, opening=ANATOMY.craniotomy
-    )
+    tets = tetrahedra.block(ANATOMY, 300, 2, gesture.focus)
+    return solver.deform(asked, tissue, [gesture], tets, patch(), FRAMES, RATE, pulse, OPENING_MM)
 
 
 @pytest.mark.parametrize(("law", "within"), [("linear", 1e-6), ("neo-hookean", 0.1)])

@@ -27,17 +27,17 @@ def drawn(fem: schema.Fem, tissue: Tissue, seed: int = 5) -> Gesture:
 def run(fem: schema.Fem, gesture: Gesture | None = None, seed: int = 5, frames: int = 12) -> Deformation:
     tissue = scenario.draw_tissue(fem, np.random.default_rng(seed))
     gesture = gesture or drawn(fem, tissue, seed)
-    return deform(fem, tissue, gesture, block(fem), *patch(), frames, 25.0)
+    return deform(fem, tissue, [gesture], block(fem), patch(), frames, 25.0)
 
 
 def test_transfer_keeps_force_and_moment() -> None:
     tets = tetrahedra.block(ANATOMY, 400, 2)
     vertices, _ = patch()
     vertices = vertices + np.random.default_rng(0).uniform(-0.7, 0.7, vertices.shape)  # off the surface
-    carry = surface_embedding.embed(tets, vertices)
+    embedding = surface_embedding.embed(tets, vertices)
     load = np.random.default_rng(1).normal(size=(len(vertices), 3))
-    volume = carry.gather(load)
-    assert np.abs(carry.value.sum(axis=1) - 1).max() <= 1e-12
+    volume = embedding.gather(load)
+    assert np.abs(embedding.value.sum(axis=1) - 1).max() <= 1e-12
     assert np.abs(volume.sum(axis=0) - load.sum(axis=0)).max() <= 1e-12 * np.abs(load).sum()
     moment = np.cross(vertices, load).sum(axis=0)
     assert np.abs(np.cross(tets.points, volume).sum(axis=0) - moment).max() <= 1e-9 * np.abs(moment).max()
@@ -85,7 +85,7 @@ def test_motion_depends_on_force_over_stiffness_alone() -> None:
     fem = schema.Fem(tets=400)
     soft, stiff = (Tissue(young_kpa=e, poisson=0.4, law="neo-hookean") for e in (1.0, 2.5))
     one, other = (
-        deform(fem, tissue, drawn(fem, tissue), block(fem), *patch(), 6, 25.0) for tissue in (soft, stiff)
+        deform(fem, tissue, [drawn(fem, tissue)], block(fem), patch(), 6, 25.0) for tissue in (soft, stiff)
     )
     np.testing.assert_allclose(one.displacement, other.displacement, rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(2.5 * one.traction, other.traction, rtol=1e-12, atol=1e-15)
