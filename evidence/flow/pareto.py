@@ -19,7 +19,7 @@ from evidence.flow.measure import measure
 from evidence.flow.scenes import Recipe, pairs
 from synth.flow.estimator import Estimator
 from synth.flow.opencv import Dis, OpenCvTvl1
-from synth.flow.tvl1 import Settings, Tvl1
+from synth.flow.tvl1 import Tvl1, TVL1Settings
 
 
 def main(out: Path = report.RESULTS / "flow/pareto", count: int = 4, seed: int = 2613) -> None:
@@ -52,7 +52,7 @@ def main(out: Path = report.RESULTS / "flow/pareto", count: int = 4, seed: int =
 
 def _candidates() -> list[tuple[str, str, Estimator, float | None]]:
     """(family, setting, estimator, share of the true flow to start from)."""
-    s = Settings()
+    s = TVL1Settings()
     ours = {
         "warps 2": replace(s, warps=2),
         "cold (default)": s,

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Protocol
-
 import torch
 from torch import Tensor
 
@@ -18,23 +16,7 @@ _LOOP = 1.0  # px: there and back again misses by this much in a doubtful flow .
 _LOOP_SHARE = 0.05  # ... and by this share of the way
 
 
-class Pictures(Protocol):
-    """The finest level of the pyramid: contrast-normalised pictures and masks, (B, 1, H, W)."""
-
-    @property
-    def rest(self) -> Tensor: ...
-
-    @property
-    def now(self) -> Tensor: ...
-
-    @property
-    def rest_usable(self) -> Tensor: ...
-
-    @property
-    def now_usable(self) -> Tensor: ...
-
-
-def judge(pictures: Pictures, flow: Tensor, back: Tensor | None) -> Tensor:
+def judge(pictures: image.Level, flow: Tensor, back: Tensor | None) -> Tensor:
     """Confidence: seen in both pictures, times agreement once aligned, times return of the way back.
 
     Agreement is the local correlation of the rest frame with the warped one (1 the same, 0 unrelated, so a

@@ -68,9 +68,13 @@ def warp_into(now: Map, usable: Map, flow: Map, warped: Map, seen: Map) -> None:
             seen[y, x] = _ONE if known > _SEEN else _ZERO
 
 
+def differentiate(field: Map, dx: Map, dy: Map) -> None:
+    """See `image.derivative`: derivatives of field (H, W) by x and by y, into dx and dy (H, W)."""
+    _differentiate(_padded(field), dx, dy)
+
+
 @vectorised
-def differentiate(padded: Map, dx: Map, dy: Map) -> None:
-    """See `image.derivative`: padded (H + 4, W + 4), its border repeated; writes dx and dy (H, W)."""
+def _differentiate(padded: Map, dx: Map, dy: Map) -> None:
     height, width = dx.shape
     for y in range(height):
         for x in range(width):
@@ -81,15 +85,17 @@ def differentiate(padded: Map, dx: Map, dy: Map) -> None:
 
 
 @vectorised
-def pad_into(field: Map, padded: Map) -> None:
-    """`field` (H, W) in the middle of `padded` (H + 4, W + 4), its border repeated."""
+def _padded(field: Map) -> Map:
+    """`field` (H, W) with two pixels of its border repeated around it, (H + 4, W + 4)."""
     height, width = field.shape
+    padded = np.empty((height + 4, width + 4), np.float32)
     for y in range(height + 4):
         row = min(max(y - 2, 0), height - 1)
         for x in range(width):
             padded[y, x + 2] = field[row, x]
         padded[y, 0] = padded[y, 1] = field[row, 0]
         padded[y, width + 2] = padded[y, width + 3] = field[row, width - 1]
+    return padded
 
 
 @vectorised
@@ -113,32 +119,29 @@ def linearise(
     mask: Map,
     weight: Map,
     flow: Map,
-    start: Map,
     tau: np.float32,
     epsilon: np.float32,
     prox: Map,
 ) -> None:
-    """The data term's prox as an affine map, of weights taken at `flow`, linearised at `start`.
+    """The data term's prox as an affine map, linearised at `flow`.
 
     Args:
         residual, rows, columns: (3, H, W), r and its derivatives by u and v.
         mask, weight: (H, W), m and lambda.
-        flow, start: (2, H, W) px.
-        tau, epsilon: of `Settings`.
+        flow: (2, H, W) px.
+        tau, epsilon: of `TVL1Settings`.
         prox: (5, H, W), written: straight (2), cross (1), shift (2).
     """
     height, width = mask.shape
     square = epsilon * epsilon
     for y in range(height):
         for x in range(width):
-            u, v = start[0, y, x], start[1, y, x]
-            du, dv = flow[0, y, x] - u, flow[1, y, x] - v
+            u, v = flow[0, y, x], flow[1, y, x]
             norm = square
             xx, xy, yy, gx, gy = _ZERO, _ZERO, _ZERO, _ZERO, _ZERO
             for k in range(3):
                 r, a, b = residual[k, y, x], rows[k, y, x], columns[k, y, x]
-                here = r + a * du + b * dv
-                norm += here * here
+                norm += r * r
                 xx += a * a
                 xy += a * b
                 yy += b * b
@@ -276,89 +279,8 @@ def median_into(field: Map, out: Map) -> None:
             out[y, x] = max(min(top, middle), min(max(top, middle), bottom))
 
 
-class Pair:
-    """One pair of pictures at one level, with the scratch that its warps share."""
-
-    def __init__(self, rest: Map, now: Map, rest_usable: Map, now_usable: Map) -> None:
-        """Takes the pictures and their masks, each (H, W)."""
-        self.now, self.rest_usable, self.now_usable = now, rest_usable, now_usable
-        height, width = rest.shape
-        self._padded = np.empty((height + 4, width + 4), np.float32)
-        self._rest = np.empty((3, height, width), np.float32)
-        self._warped, self._residual = np.empty_like(self._rest), np.empty_like(self._rest)
-        self._mean, self._rows = np.empty_like(self._rest), np.empty_like(self._rest)
-        self._columns = np.empty_like(self._rest)
-        self._prox = np.empty((5, height, width), np.float32)
-        self._mask = np.empty((height, width), np.float32)
-        self._ahead = np.empty((2, height, width), np.float32)
-        self._rest[0] = rest
-        self._differentiate(self._rest[0], self._rest[1], self._rest[2])
-
-    def step(
-        self,
-        flow: Map,
-        dual: Map,
-        weight: Map,
-        *,
-        gamma: float,
-        noise: float,
-        limits: tuple[float, float],
-        huber: float,
-        hidden_huber: float,
-        epsilon: float,
-        tau: float,
-        reweights: int,
-        steps: int,
-        median: bool,
-    ) -> None:
-        """One warp, in place; see `tvl1.step`.
-
-        Args:
-            flow: (2, H, W) px.
-            dual: (2, 2, H, W), its x and y parts.
-            weight: (H, W) or (1, 1), lambda.
-            gamma, noise, huber, hidden_huber, epsilon, tau, reweights, steps, median: of `tvl1.Settings`.
-            limits: least and most that noise may change lambda by.
-        """
-        warp_into(self.now, self.now_usable, flow, self._warped[0], self._mask)
-        self._mask *= self.rest_usable
-        self._differentiate(self._warped[0], self._warped[1], self._warped[2])
-        compare(self._rest, self._warped, np.float32(gamma), self._residual, self._mean)
-        for k in range(3):
-            self._differentiate(self._mean[k], self._rows[k], self._columns[k])
-        if noise > 0:
-            weight = weight * np.float32(calm(self._residual, self._mask, noise, *limits))
-        weight = np.ascontiguousarray(np.broadcast_to(weight, self._mask.shape), np.float32)
-        h = huber + hidden_huber * (1 - self._mask)
-        shrink = (1 / (1 + h / (8 * tau))).astype(np.float32)
-        start = flow.copy() if reweights > 1 else flow
-        for _ in range(reweights):
-            linearise(
-                self._residual,
-                self._rows,
-                self._columns,
-                self._mask,
-                weight,
-                flow,
-                start,
-                np.float32(tau),
-                np.float32(epsilon),
-                self._prox,
-            )
-            self._ahead[:] = flow
-            primal_dual(flow, self._ahead, dual[0], dual[1], self._prox, shrink, np.float32(tau), steps)
-        if median:
-            for k in range(2):
-                median_into(flow[k], self._ahead[k])
-            flow[:] = self._ahead
-
-    def _differentiate(self, field: Map, dx: Map, dy: Map) -> None:
-        pad_into(field, self._padded)
-        differentiate(self._padded, dx, dy)
-
-
-def calm(residual: Map, mask: Map, noise: float, least: float, most: float) -> float:
-    """See `tvl1.calm`; residual (3, H, W), mask (H, W)."""
+def noise_weight(residual: Map, mask: Map, noise: float, least: float, most: float) -> float:
+    """See `tvl1.noise_weight`; residual (3, H, W), mask (H, W)."""
     some = residual[:, ::2, ::2]
     square = (some * some).sum(axis=0)[mask[::2, ::2] > 0]
     if not len(square):

@@ -5,6 +5,8 @@ Tensors are (B, C, H, W) float32; `usable` is (B, 1, H, W) float32 in 0..1. CPU 
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import torch
 import torch.nn.functional as F
@@ -15,6 +17,20 @@ from synth.flow import fused
 
 _GREY = (0.2, 0.6, 0.2)  # vessels stand out in green, noise falls by averaging
 _FLOOR = 3.0  # grey levels: contrast below this is noise and isn't stretched to full contrast
+
+
+@dataclass(frozen=True)
+class Level:
+    """One level of the pyramid: contrast-normalised pictures and their masks, each (B, 1, H, W)."""
+
+    rest: Tensor
+    now: Tensor
+    rest_usable: Tensor
+    now_usable: Tensor
+
+    def swapped(self) -> Level:
+        """For the flow back from now to rest."""
+        return Level(self.now, self.rest, self.now_usable, self.rest_usable)
 
 
 def tensor(picture: NDArray[np.uint8], device: str = "cpu") -> Tensor:

@@ -1,4 +1,4 @@
-"""Masked TV-L1 optical flow: one batched solver for CPU and CUDA.
+"""Masked TV-L1 optical flow: one solver for CPU and CUDA.
 
 Minimises over the flow w = (u, v), with I_0 the rest frame and I_1 the frame now, both contrast-normalised,
 
@@ -24,18 +24,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 import torch.nn.functional as F
-from numpy.typing import NDArray
 from torch import Tensor
 
 from synth.flow import confidence, fused, image
 from synth.flow.estimator import Flags, Flow, Map, Rgb
+from synth.flow.image import Level
 
-_BETTER = 1.025  # the bold first guess must fit this much better than the calm one
-_NOISIEST, _CALMEST = 0.45, 1.5  # pictures of much noise, or none, would be smoothed to nothing or not at all
+_BETTER = 1.025  # the guess for large motion must fit this much better than the one for small motion
+_WEIGHT_LIMITS = 0.45, 1.5  # pictures of much noise, or none, would be smoothed to nothing or not at all
 
 
 @dataclass(frozen=True)
-class Settings:
+class TVL1Settings:
     """The energy, and how far it is minimised."""
 
     weight: float = 0.36
@@ -55,12 +55,8 @@ class Settings:
     """The pyramid goes down to about this many pixels on the short side."""
     warps: int = 6
     """Linearisations a level."""
-    reweights: int = 1
-    """Updates of the robust weights a warp."""
     steps: int = 16
-    """Primal-dual steps a reweighting."""
-    erode: int = 0
-    """Growth of what is masked [px]: derivatives reach into it."""
+    """Primal-dual steps a warp."""
     tau: float = 3.5
     """Primal step; the dual step is 1/(8 tau)."""
     median: bool = True
@@ -74,23 +70,23 @@ class Settings:
     """Where the first guess's gradient [px/px] is this large, lambda doubles: smoothness costs most there."""
     fine_levels: int = 2
     """Levels that the second stage of a cold start, or a warm start, works on."""
-    bold_weight: float = 2.5
+    large_motion_weight: float = 2.5
     """lambda of the first stage of a cold start: far pulls are steep, and smoothness would hold them back."""
-    calm_weight: float = 1.0
-    """lambda of its other try, which has the say unless the bold one fits clearly better."""
-    bold_tau: float = 1.0
+    small_motion_weight: float = 1.0
+    """lambda of its other try, which is taken unless the first fits clearly better."""
+    coarse_tau: float = 1.0
     """Primal step of that stage: small, for the coarsest levels have few pixels and must not run away."""
-    bold_warps: int = 6
+    coarse_warps: int = 6
     """Linearisations a level of that stage, which leaves out the finest level."""
 
-    def calm(self) -> Settings:
+    def small_motion(self) -> TVL1Settings:
         """A first stage of a cold start, for what moves little."""
-        weight, tau, warps = self.calm_weight, self.bold_tau, self.bold_warps
+        weight, tau, warps = self.small_motion_weight, self.coarse_tau, self.coarse_warps
         return replace(self, weight=weight, noise=0.0, hidden_huber=0.0, tau=tau, warps=warps)
 
-    def bold(self) -> Settings:
+    def large_motion(self) -> TVL1Settings:
         """A first stage of a cold start, for what moves far."""
-        return replace(self.calm(), weight=self.bold_weight)
+        return replace(self.small_motion(), weight=self.large_motion_weight)
 
 
 class Tvl1:
@@ -98,7 +94,7 @@ class Tvl1:
 
     def __init__(
         self,
-        settings: Settings | None = None,
+        settings: TVL1Settings | None = None,
         device: str | None = None,
         *,
         checked: bool = True,
@@ -110,7 +106,7 @@ class Tvl1:
             device: torch device; None: CUDA where there is one.
             checked: also compute the backward flow for the confidence (about a fifth of the time).
         """
-        self.settings = settings or Settings()
+        self.settings = settings or TVL1Settings()
         self.device = device or ("cuda" if torch.cuda.is_available() else "cpu")
         self.checked = checked
 
@@ -118,36 +114,12 @@ class Tvl1:
         self, rest: Rgb, now: Rgb, rest_usable: Flags, now_usable: Flags, initial: Flow | None = None
     ) -> tuple[Flow, Map]:
         """See `Estimator.flow`."""
-        start = None if initial is None else initial[None]
-        flow, trust = self.flows(rest[None], now[None], rest_usable[None], now_usable[None], start)
-        return flow[0], trust[0]
-
-    def flows(
-        self,
-        rest: NDArray[np.uint8],
-        now: NDArray[np.uint8],
-        rest_usable: NDArray[np.bool_],
-        now_usable: NDArray[np.bool_],
-        initial: NDArray[np.float32] | None = None,
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """As `flow`, for B pairs at once; each comes out as it would alone.
-
-        Args:
-            rest: (B, H, W, 3) uint8.
-            now: (B, H, W, 3) uint8.
-            rest_usable: (B, H, W).
-            now_usable: (B, H, W).
-            initial: (B, H, W, 2) px.
-
-        Returns:
-            Flow (B, H, W, 2) float32 px and confidence (B, H, W) float32.
-        """
         with torch.inference_mode(), one_thread():
             start = None
             if initial is not None:
                 # Planes, not interleaved: sums over neighbours took five times as long on the latter.
-                start = torch.from_numpy(np.ascontiguousarray(initial)).to(self.device)
-                start = start.movedim(-1, 1).contiguous()
+                planes = np.ascontiguousarray(np.moveaxis(initial, -1, 0))
+                start = torch.from_numpy(planes)[None].to(self.device)
             found, trust = self.tensors(
                 image.tensor(rest, self.device),
                 image.tensor(now, self.device),
@@ -155,7 +127,7 @@ class Tvl1:
                 image.flags(now_usable, self.device),
                 start,
             )
-            return found.movedim(1, -1).cpu().numpy(), trust[:, 0].cpu().numpy()
+            return found[0].movedim(0, -1).cpu().numpy(), trust[0, 0].cpu().numpy()
 
     def tensors(
         self,
@@ -165,7 +137,7 @@ class Tvl1:
         now_usable: Tensor,
         initial: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
-        """As `flows`, on the device: greys, masks and confidence (B, 1, H, W), flows (B, 2, H, W)."""
+        """As `flow`, on the device: greys, masks and confidence (1, 1, H, W), flows (1, 2, H, W)."""
         s = self.settings
         levels = pyramid(rest, now, rest_usable, now_usable, s)
         if initial is None:
@@ -177,7 +149,7 @@ class Tvl1:
         back = None
         if self.checked and len(levels) > 1:
             back = solve(
-                [level.swapped() for level in levels[1:]], None, replace(s.calm(), warps=s.warm_warps)
+                [level.swapped() for level in levels[1:]], None, replace(s.small_motion(), warps=s.warm_warps)
             )
         return found, confidence.judge(levels[0], found, back)
 
@@ -193,34 +165,17 @@ def one_thread() -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-@dataclass(frozen=True)
-class Level:
-    """One level of the pyramid: contrast-normalised pictures and their masks, each (B, 1, H, W)."""
-
-    rest: Tensor
-    now: Tensor
-    rest_usable: Tensor
-    now_usable: Tensor
-
-    def swapped(self) -> Level:
-        """For the flow back from now to rest."""
-        return Level(self.now, self.rest, self.now_usable, self.rest_usable)
-
-
-def pyramid(rest: Tensor, now: Tensor, rest_usable: Tensor, now_usable: Tensor, s: Settings) -> list[Level]:
+def pyramid(
+    rest: Tensor, now: Tensor, rest_usable: Tensor, now_usable: Tensor, s: TVL1Settings
+) -> list[Level]:
     """Levels, fine to coarse, of tensors as in `Level`; pixel x of a level is (x - 1/2)/2 of the next."""
     levels = []
-    batch = now.shape[0]
-    grey = torch.cat([rest, now])
-    known = torch.cat([rest_usable, now_usable])
+    grey, known = torch.cat([rest, now]), torch.cat([rest_usable, now_usable])
     while True:
-        contrast = image.normalise(grey, known)
-        seen = (known > 0.5).to(grey.dtype)
-        if s.erode:
-            seen = 1 - F.max_pool2d(1 - seen, 2 * s.erode + 1, 1, s.erode)
-        split = [rest.shape[0], batch]
-        (first, second), (seen_first, seen_second) = torch.split(contrast, split), torch.split(seen, split)
-        levels.append(Level(first, second, seen_first, seen_second))
+        (before, after), (seen_before, seen_after) = (
+            both.chunk(2) for both in (image.normalise(grey, known), (known > 0.5).to(grey.dtype))
+        )
+        levels.append(Level(before, after, seen_before, seen_after))
         if min(grey.shape[-2:]) < 2 * s.coarsest_px:
             return levels
         pooled = image.halved(torch.cat([grey * known, known], 1))
@@ -228,17 +183,17 @@ def pyramid(rest: Tensor, now: Tensor, rest_usable: Tensor, now_usable: Tensor, 
         grey = pooled[:, :1] / known.clamp_min(1e-6)
 
 
-def guess(levels: list[Level], s: Settings) -> Tensor:
+def guess(levels: list[Level], s: TVL1Settings) -> Tensor:
     """The first stage of a cold start, twice: the picture's better answer, (B, 2, H, W) px.
 
     Little smoothness follows far pulls but loses islands between the tines, much smoothness the reverse.
     """
-    calm, bold = solve(levels, None, s.calm()), solve(levels, None, s.bold())
-    trust = [confidence.judge(levels[0], flow, None).mean((1, 2, 3), keepdim=True) for flow in (calm, bold)]
-    return torch.where(trust[1] > _BETTER * trust[0], bold, calm)
+    small, large = solve(levels, None, s.small_motion()), solve(levels, None, s.large_motion())
+    trust = [confidence.judge(levels[0], flow, None).mean((1, 2, 3), keepdim=True) for flow in (small, large)]
+    return torch.where(trust[1] > _BETTER * trust[0], large, small)
 
 
-def solve(levels: list[Level], initial: Tensor | None, s: Settings) -> Tensor:
+def solve(levels: list[Level], initial: Tensor | None, s: TVL1Settings) -> Tensor:
     """Flow (B, 2, H, W) px of the finest level.
 
     Args:
@@ -262,7 +217,7 @@ def solve(levels: list[Level], initial: Tensor | None, s: Settings) -> Tensor:
         if weight.shape[-1] > 1:
             here = F.interpolate(weight, size=flow.shape[-2:], mode="bilinear", align_corners=False)
         if flow.device.type == "cpu":
-            flow = _fused(level, flow, here, s)
+            flow = _solve_level(level, flow, here, s)
             continue
         dual = flow.new_zeros(2, *flow.shape)
         for _ in range(s.warps):
@@ -270,30 +225,41 @@ def solve(levels: list[Level], initial: Tensor | None, s: Settings) -> Tensor:
     return flow
 
 
-def _fused(level: Level, flow: Tensor, weight: Tensor, s: Settings) -> Tensor:
-    """All warps of a level on the CPU, in compiled loops; as `step`, pair by pair."""
-    found = flow.contiguous().numpy().copy()
-    for k, one in enumerate(found):
-        pictures = (level.rest, level.now, level.rest_usable, level.now_usable)
-        pair = fused.Pair(*(np.ascontiguousarray(picture[k, 0].numpy()) for picture in pictures))
-        dual = np.zeros((2, *one.shape), np.float32)
-        for _ in range(s.warps):
-            pair.step(
-                one,
-                dual,
-                weight[k, 0].numpy(),
-                gamma=s.gradient,
-                noise=s.noise,
-                limits=(_NOISIEST, _CALMEST),
-                huber=s.huber,
-                hidden_huber=s.hidden_huber,
-                epsilon=s.epsilon,
-                tau=s.tau,
-                reweights=s.reweights,
-                steps=s.steps,
-                median=s.median,
-            )
-    return torch.from_numpy(found)
+def _solve_level(level: Level, flow: Tensor, weight: Tensor, s: TVL1Settings) -> Tensor:
+    """All warps of a level on the CPU, in compiled loops that compute what `step` does."""
+    rest, now, rest_usable, now_usable = (
+        np.ascontiguousarray(field[0, 0].numpy())
+        for field in (level.rest, level.now, level.rest_usable, level.now_usable)
+    )
+    found, lambda_ = flow[0].contiguous().numpy().copy(), weight[0, 0].numpy()
+    tau, epsilon = np.float32(s.tau), np.float32(s.epsilon)
+    dual = np.zeros((2, *found.shape), np.float32)
+    shape, planes = rest.shape, (3, *rest.shape)
+    before, after, residual, mean, rows, columns = (np.empty(planes, np.float32) for _ in range(6))
+    prox, ahead, mask = np.empty((5, *shape), np.float32), np.empty_like(found), np.empty_like(rest)
+    before[0] = rest
+    fused.differentiate(before[0], before[1], before[2])
+    for _ in range(s.warps):
+        fused.warp_into(now, now_usable, found, after[0], mask)
+        mask *= rest_usable
+        fused.differentiate(after[0], after[1], after[2])
+        fused.compare(before, after, np.float32(s.gradient), residual, mean)
+        for k in range(3):
+            fused.differentiate(mean[k], rows[k], columns[k])
+        here = lambda_
+        if s.noise > 0:
+            here = lambda_ * np.float32(fused.noise_weight(residual, mask, s.noise, *_WEIGHT_LIMITS))
+        here = np.ascontiguousarray(np.broadcast_to(here, shape), np.float32)
+        huber = s.huber + s.hidden_huber * (1 - mask)
+        shrink = (1 / (1 + huber / (8 * s.tau))).astype(np.float32)
+        fused.linearise(residual, rows, columns, mask, here, found, tau, epsilon, prox)
+        ahead[:] = found
+        fused.primal_dual(found, ahead, dual[0], dual[1], prox, shrink, tau, s.steps)
+        if s.median:
+            for k in range(2):
+                fused.median_into(found[k], ahead[k])
+            found[:] = ahead
+    return torch.from_numpy(found)[None]
 
 
 def steadied(flow: Tensor, within_px: float) -> Tensor:
@@ -312,8 +278,8 @@ def finer(flow: Tensor, level: Level) -> Tensor:
     return 2 * image.doubled(flow, level.now)
 
 
-def step(level: Level, flow: Tensor, dual: Tensor, weight: Tensor, s: Settings) -> tuple[Tensor, Tensor]:
-    """One warp: linearise r about `flow`, reweight, minimise. dual: (2, B, 2, H, W), its x and y parts."""
+def step(level: Level, flow: Tensor, dual: Tensor, weight: Tensor, s: TVL1Settings) -> tuple[Tensor, Tensor]:
+    """One warp: linearise r about `flow`, weigh it, minimise. dual: (2, B, 2, H, W), its x and y parts."""
     warped, seen = image.warp(level.now, level.now_usable, flow)
     mask = level.rest_usable * seen
     # The gradient of the *warped* picture is what the rest frame's must equal: it turns and stretches with w.
@@ -323,34 +289,30 @@ def step(level: Level, flow: Tensor, dual: Tensor, weight: Tensor, s: Settings) 
     slope = image.derivative(0.5 * (after + before))  # (B, 6, H, W): x of the 3, then y of the 3
     rows, columns = slope[:, :3], slope[:, 3:]
     if s.noise > 0:
-        weight = weight * calm(residual, mask, s.noise)
-    start = flow
-    for _ in range(s.reweights):
-        moved = flow - start
-        now = residual + rows * moved[:, :1] + columns * moved[:, 1:]
-        c = s.tau * weight * mask / torch.sqrt((now * now).sum(1, keepdim=True) + s.epsilon**2)
-        # (1 + c J^T J) w = v - c J^T (r - J w_0), 2x2 by Cramer.
-        xx = 1 + c * (rows * rows).sum(1, keepdim=True)
-        xy = c * (rows * columns).sum(1, keepdim=True)
-        yy = 1 + c * (columns * columns).sum(1, keepdim=True)
-        offset = residual - rows * start[:, :1] - columns * start[:, 1:]
-        gx, gy = c * (rows * offset).sum(1, keepdim=True), c * (columns * offset).sum(1, keepdim=True)
-        scale = 1 / (xx * yy - xy * xy)
-        straight = torch.cat([yy, xx], 1) * scale
-        cross = -xy * scale
-        shift = straight * torch.cat([gx, gy], 1) + cross * torch.cat([gy, gx], 1)
-        flow, dual = primal_dual(flow, dual, straight, cross, shift, s.huber + s.hidden_huber * (1 - mask), s)
+        weight = weight * noise_weight(residual, mask, s.noise)
+    c = s.tau * weight * mask / torch.sqrt((residual * residual).sum(1, keepdim=True) + s.epsilon**2)
+    # (1 + c J^T J) w = v - c J^T (r - J w_0), 2x2 by Cramer.
+    xx = 1 + c * (rows * rows).sum(1, keepdim=True)
+    xy = c * (rows * columns).sum(1, keepdim=True)
+    yy = 1 + c * (columns * columns).sum(1, keepdim=True)
+    offset = residual - rows * flow[:, :1] - columns * flow[:, 1:]
+    gx, gy = c * (rows * offset).sum(1, keepdim=True), c * (columns * offset).sum(1, keepdim=True)
+    scale = 1 / (xx * yy - xy * xy)
+    straight = torch.cat([yy, xx], 1) * scale
+    cross = -xy * scale
+    shift = straight * torch.cat([gx, gy], 1) + cross * torch.cat([gy, gx], 1)
+    flow, dual = primal_dual(flow, dual, straight, cross, shift, s.huber + s.hidden_huber * (1 - mask), s)
     if s.median:
         flow = image.median3(flow)
     return flow, dual
 
 
-def calm(residual: Tensor, mask: Tensor, noise: float) -> Tensor:
+def noise_weight(residual: Tensor, mask: Tensor, noise: float) -> Tensor:
     """(noise / median of |r| in the mask) squared, within limits; 1 if nothing is seen. (B, 1, 1, 1)."""
     some = residual[..., ::2, ::2]
     square = torch.where(mask[..., ::2, ::2] > 0, (some * some).sum(1, keepdim=True), torch.nan)
     found = torch.nan_to_num(square.flatten(1).nanmedian(dim=1).values, nan=noise**2)
-    return (noise**2 / found.clamp_min(1e-12)).clamp(_NOISIEST, _CALMEST).view(-1, 1, 1, 1)
+    return (noise**2 / found.clamp_min(1e-12)).clamp(*_WEIGHT_LIMITS).view(-1, 1, 1, 1)
 
 
 def steepness(flow: Tensor) -> Tensor:
@@ -363,7 +325,7 @@ def steepness(flow: Tensor) -> Tensor:
 
 
 def primal_dual(
-    flow: Tensor, dual: Tensor, straight: Tensor, cross: Tensor, shift: Tensor, huber: Tensor, s: Settings
+    flow: Tensor, dual: Tensor, straight: Tensor, cross: Tensor, shift: Tensor, huber: Tensor, s: TVL1Settings
 ) -> tuple[Tensor, Tensor]:
     """`steps` of: dual ascent on grad w with the Huber prox, primal descent with the data term's 2x2 prox.
 

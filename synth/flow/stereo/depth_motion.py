@@ -106,7 +106,6 @@ class Solver:
         self.cell = max(1, round(width / self.settings.columns))
         self.shape = (-(-height // self.cell), -(-width // self.cell))
         self._bends = second_differences(self.shape)
-        self._padded = np.empty((height + 4, width + 4), np.float32)
 
     def solve(
         self,
@@ -198,8 +197,7 @@ class Solver:
         """(3, H, W): the picture and its derivatives by x and y."""
         found = np.empty((3, *picture.shape), np.float32)
         found[0] = picture
-        fused.pad_into(picture, self._padded)
-        fused.differentiate(self._padded, found[1], found[2])
+        fused.differentiate(picture, found[1], found[2])
         return found
 
     def steepness(self, flow: Map) -> Map:

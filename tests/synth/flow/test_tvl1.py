@@ -49,16 +49,10 @@ def test_pull_with_tool_highlights_and_light() -> None:
     assert np.mean(hidden) < 0.5
 
 
-def test_batch_is_single_and_cpu_is_deterministic() -> None:
-    three = list(pairs(Recipe(size=96, pull=5), 3, 4))
-    solver = Tvl1(device="cpu")
-    stacks = [np.stack([getattr(p, k) for p in three]) for k in ("rest", "now", "rest_usable", "now_usable")]
-    flow, trust = solver.flows(*stacks)
-    for k, pair in enumerate(three):
-        alone, sure = solver.flow(pair.rest, pair.now, pair.rest_usable, pair.now_usable)
-        np.testing.assert_allclose(flow[k], alone, atol=1e-4)
-        np.testing.assert_allclose(trust[k], sure, atol=1e-3)
-    again, _ = solver.flows(*stacks)
+def test_cpu_is_deterministic() -> None:
+    (pair,) = pairs(Recipe(size=96, pull=5), 1, 4)
+    pictures = pair.rest, pair.now, pair.rest_usable, pair.now_usable
+    flow, again = (Tvl1(device="cpu").flow(*pictures)[0] for _ in range(2))
     np.testing.assert_array_equal(flow, again)
 
 
