@@ -14,7 +14,7 @@ from synth.errors import UserError
 from synth.flow import mask
 from synth.flow.stereo import calibration
 from synth.flow.stereo.depth_camera import DepthTracker
-from synth.flow.stereo.rig import Eye, Floats, Rig
+from synth.flow.stereo.rig import Eye, Floats, StereoRig
 from synth.flow.stereo.track import Moved, StereoTracker
 from synth.recording_flow.pulse import Pulse, Search
 from synth.recording_flow.video_flow import Step, VideoFlow, shrink_picture
@@ -115,7 +115,7 @@ class SecondEye:
         found, tissue = step.found, self._video.tissue
         if not found.trusted:
             # Nothing was followed: no method's answer counts there.
-            return Moved(*np.zeros((2, *tissue.shape, 3), np.float32))
+            return Moved.nothing(tissue.shape)
         blocked, flow, time_s = _or_none(found.blocked, tissue), found.flow, step.picture.time_s
         own = None if time_s is None or found.is_rest else self._own
         if own is not None and time_s is not None:
@@ -125,7 +125,7 @@ class SecondEye:
             right = self._right(step.picture.index)
             if self._stereo is None:
                 self._stereo = self._begin(step, right, blocked)
-                return self._stereo.rest_motion()
+                return Moved.nothing(tissue.shape)
             moved = self._stereo.step(
                 step.picture.rgb, right, blocked, self._hidden(right, blocked), flow, found.confidence
             )
@@ -135,7 +135,7 @@ class SecondEye:
             depth = self._depths(step.picture.index)
             if self._depth is None:
                 self._depth = DepthTracker(self._K(), depth, blocked, tissue)
-                return self._depth.rest_motion()
+                return Moved.nothing(tissue.shape)
             moved = self._depth.step(depth, blocked, flow, found.confidence)
         self._noise.append(float(np.median(moved.deviation[..., 2][tissue])))
         if own is not None and own.space is not None and time_s is not None:
@@ -205,11 +205,11 @@ class SecondEye:
         return np.where(share > 0.5, total / np.maximum(share, 1e-6), 0).astype(np.float32)
 
 
-def shrunk(rig: Rig, shrink: int) -> Rig:
+def shrunk(rig: StereoRig, shrink: int) -> StereoRig:
     """The same pair with pictures `shrink` times smaller, cut as `shrink_picture` cuts them."""
     left, right = (Eye(_smaller(eye.K, shrink), eye.distortion) for eye in (rig.left, rig.right))
     size = (rig.size[0] // shrink, rig.size[1] // shrink)
-    return Rig(left, right, rig.rotation, rig.translation, size)
+    return StereoRig(left, right, rig.rotation, rig.translation, size)
 
 
 def _smaller(K: Floats, shrink: int) -> Floats:

@@ -21,7 +21,7 @@ from synth.checks import optics, stereo
 from synth.dataset.store import Dataset, Sequence
 from synth.flow import mask
 from synth.flow.stereo import rest
-from synth.flow.stereo.rig import Eye, Rig
+from synth.flow.stereo.rig import Eye, StereoRig
 from synth.flow.stereo.track import StereoTracker, still_frames
 from synth.flow.track import track
 from synth.system.checked_file import read_picture
@@ -114,11 +114,11 @@ def _measured(sequence: Sequence) -> tuple[list[Sample], float, float, float]:
     return samples, both_s, flow_s, tracker.rest.epipolar_px
 
 
-def _rig(sequence: Sequence) -> Rig:
+def _rig(sequence: Sequence) -> StereoRig:
     """The pair of lenses that took a stereo sequence."""
     left, right = optics.camera_of(sequence), stereo.right_of(sequence)
     eyes = Eye(left.K, left.distortion), Eye(right.K, right.distortion)
-    return Rig(*eyes, np.eye(3), right.translation - left.translation, left.size)
+    return StereoRig(*eyes, np.eye(3), right.translation - left.translation, left.size)
 
 
 def real_pair(folder: Path) -> list[dict[str, Any]]:

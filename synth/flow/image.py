@@ -15,7 +15,8 @@ from torch import Tensor
 
 from synth.flow import fused
 
-_GREY = (0.2, 0.6, 0.2)  # vessels stand out in green, noise falls by averaging
+GREY = np.array([0.2, 0.6, 0.2], np.float32)
+"""Luminance from red, green, blue: vessels stand out in green, noise falls by averaging."""
 _FLOOR = 3.0  # grey levels: contrast below this is noise and isn't stretched to full contrast
 
 
@@ -36,7 +37,7 @@ class Level:
 def tensor(picture: NDArray[np.uint8], device: str = "cpu") -> Tensor:
     """Luminance of (H, W, 3) or (B, H, W, 3) uint8 RGB in grey levels: (B, 1, H, W)."""
     rgb = torch.from_numpy(np.ascontiguousarray(picture)).to(device).float()
-    grey = rgb @ torch.tensor(_GREY, device=device)
+    grey = rgb @ torch.from_numpy(GREY).to(device)
     return grey.reshape(-1, 1, *grey.shape[-2:])
 
 

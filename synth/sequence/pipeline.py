@@ -186,7 +186,7 @@ def _recover_motion(shooting: _Shooting, film: _Film, left: Track) -> None:
         raise ValueError("there is no second lens")
     blocked = mask.hidden(film.rgb, film.tools), mask.hidden(film.rgb_right, film.tools_right)
     with shooting.watch.stage("stereo"):
-        pair = rig.Rig(
+        pair = rig.StereoRig(
             left=rig.Eye(scene.view.K, scene.view.distortion),
             right=rig.Eye(studio.right.K, studio.right.distortion),
             rotation=np.eye(3),
@@ -201,7 +201,7 @@ def _recover_motion(shooting: _Shooting, film: _Film, left: Track) -> None:
         with shooting.watch.stage("stereo"):
             seen = left.flow[t], left.confidence[t]
             if t == 0:
-                moved = tracker.rest_motion()
+                moved = stereo.Moved.nothing(scene.tissue.shape)
             else:
                 eyes = film.rgb[t], film.rgb_right[t]
                 moved = tracker.step(*eyes, blocked[0][t], blocked[1][t], *seen)

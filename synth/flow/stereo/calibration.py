@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from synth.errors import UserError
-from synth.flow.stereo.rig import Eye, Floats, Rig
+from synth.flow.stereo.rig import Eye, Floats, StereoRig
 from synth.system import checked_file
 
 _LEFT = ("K1", "M1", "cameraMatrix1", "camera_matrix_1", "CM1"), ("D1", "distCoeffs1", "dist_coeffs_1")
@@ -18,7 +18,7 @@ _TERMS = (4, 5, 8, 12, 14)
 _ORTHOGONAL = 1e-3
 
 
-def read_rig(path: Path, size: tuple[int, int], mm_per_unit: float = 1.0) -> Rig:
+def read_rig(path: Path, size: tuple[int, int], mm_per_unit: float = 1.0) -> StereoRig:
     """The pair of cameras in a file: K1, D1, K2, D2, R and T, or OpenCV's samples' names for them.
 
     Args:
@@ -52,4 +52,4 @@ def read_rig(path: Path, size: tuple[int, int], mm_per_unit: float = 1.0) -> Rig
     straight = rotation.shape == (3, 3) and np.abs(rotation @ rotation.T - np.eye(3)).max() < _ORTHOGONAL
     if not straight or np.linalg.det(rotation) < 0 or translation.shape != (3,) or not translation.any():
         raise UserError(f"{path}: R is no rotation or T no translation")
-    return Rig(eyes[0], eyes[1], rotation, mm_per_unit * translation, size)
+    return StereoRig(eyes[0], eyes[1], rotation, mm_per_unit * translation, size)

@@ -7,11 +7,11 @@ import numpy as np
 
 from synth.errors import UserError
 from synth.flow.estimator import Flags, Flow, Map
-from synth.flow.stereo.depth_motion import Change, Settings, Solver, fine
+from synth.flow.stereo.depth_motion import Change, DepthMotionSettings, Solver, fine
+from synth.flow.stereo.deviation import inverse_posterior
 from synth.flow.stereo.rig import Floats
 from synth.flow.stereo.track import Moved
 
-_AROUND = (5, 5)  # cells whose depth a cell's rests on
 _CAUTION = 1.5  # the plate's own deviation knows nothing of depth that errs alike over many pixels
 
 
@@ -23,7 +23,7 @@ class DepthTracker:
     """
 
     def __init__(
-        self, K: Floats, rest: Map, blocked: Flags, tissue: Flags, settings: Settings | None = None
+        self, K: Floats, rest: Map, blocked: Flags, tissue: Flags, settings: DepthMotionSettings | None = None
     ) -> None:
         """Starts at rest.
 
@@ -49,11 +49,6 @@ class DepthTracker:
         self.solver = Solver((tissue.shape[0], tissue.shape[1]), settings)
         self.noise_mm = float("nan")
         """Median deviation of depth motion over the tissue in the last frame."""
-
-    def rest_motion(self) -> Moved:
-        """Of the rest frame itself: no motion, and that for certain."""
-        nothing = np.zeros((*self.tissue.shape, 3), np.float32)
-        return Moved(nothing, nothing.copy())
 
     def step(self, depth: Map, blocked: Flags, flow: Flow, confidence: Map) -> Moved:
         """Motion since rest in the next frame.
@@ -82,8 +77,7 @@ class DepthTracker:
 
     def _deviation(self, change: Change) -> Map:
         """(H, W) mm, of the depth motion: the plate's posterior, as in `deviation`."""
-        precision = cv2.blur(change.precision, _AROUND, borderType=cv2.BORDER_REPLICATE) + 1e-3
-        spread = _CAUTION / np.sqrt(8 * np.sqrt(precision * change.stiffness))
+        spread = _CAUTION / inverse_posterior(change)
         return np.maximum(fine(np.asarray(spread, np.float32), self.solver.cell, self.tissue.shape), 1e-4)
 
     def _moved(self, rise: Map, spread: Map, flow: Map, confidence: Map) -> Moved:

@@ -44,7 +44,7 @@ _ONE, _EIGHT, _TWELFTH, _HALF = np.float32(1), np.float32(8), np.float32(1 / 12)
 
 
 @dataclass(frozen=True)
-class Settings:
+class DepthMotionSettings:
     """The prior and the effort."""
 
     columns: int = 40
@@ -60,7 +60,7 @@ class Settings:
 
 
 @dataclass(frozen=True)
-class Pictures:
+class StereoPictures:
     """The four contrast-normalised pictures, on rectified pixels, and where each is usable; all (H, W)."""
 
     left_rest: Map
@@ -95,13 +95,13 @@ class Change:
 class Solver:
     """The depth solver of one size of picture, with what all frames share."""
 
-    def __init__(self, size: tuple[int, int], settings: Settings | None = None) -> None:
+    def __init__(self, size: tuple[int, int], settings: DepthMotionSettings | None = None) -> None:
         """
         Args:
             size: (height, width) [px].
             settings: None: the default.
         """
-        self.settings = settings or Settings()
+        self.settings = settings or DepthMotionSettings()
         height, width = size
         self.cell = max(1, round(width / self.settings.columns))
         self.shape = (-(-height // self.cell), -(-width // self.cell))
@@ -109,7 +109,7 @@ class Solver:
 
     def solve(
         self,
-        pictures: Pictures,
+        pictures: StereoPictures,
         flow: Map,
         disparity: Map,
         px_per_mm: float,

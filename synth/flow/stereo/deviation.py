@@ -20,14 +20,14 @@ Map = NDArray[np.float32]
 _AROUND = (5, 5)  # cells whose pictures a cell's depth rests on
 
 # Exponents of 1 (e), posterior deviation [px], strain, misfit, doubt, way [px].
-ALONG = (0.663, 1.039, -0.023, 0.328, 0.09, 0.029)
+_ALONG = (0.663, 1.039, -0.023, 0.328, 0.09, 0.029)
 """For the change of disparity, in px."""
-ACROSS = (0.709, 1.137, -0.505, 0.396, 0.325, 0.37)
+_ACROSS = (0.709, 1.137, -0.505, 0.396, 0.325, 0.37)
 """For each component of the flow, in px."""
 
 
-def features(change: Change, steepness: Map, doubt: Map, way: Map) -> NDArray[np.float64]:
-    """What a deviation depends on, as logarithms, (6, h, w) by cell.
+def deviations(change: Change, steepness: Map, doubt: Map, way: Map) -> tuple[Map, Map]:
+    """Standard deviations by cell, each (h, w) px: of the change of disparity, and of the flow's components.
 
     Args:
         change: of the solver.
@@ -35,13 +35,11 @@ def features(change: Change, steepness: Map, doubt: Map, way: Map) -> NDArray[np
         doubt: (h, w) in 0..1, one less the flow's confidence.
         way: (h, w) px, length of the flow.
     """
-    precision = cv2.blur(change.precision, _AROUND, borderType=cv2.BORDER_REPLICATE) + 1e-3
-    posterior = 1 / np.sqrt(8 * np.sqrt(precision * change.stiffness))
-    return np.log(
+    logarithms = np.log(
         np.stack(
             [
                 np.full(doubt.shape, np.e),
-                posterior,
+                1 / inverse_posterior(change),
                 steepness + 0.002,
                 np.clip(cv2.blur(change.misfit, (3, 3)), 0.2, 20),
                 np.clip(doubt, 0, 1) + 0.05,
@@ -49,8 +47,11 @@ def features(change: Change, steepness: Map, doubt: Map, way: Map) -> NDArray[np
             ]
         ).astype(np.float64)
     )
+    along, across = (np.exp(np.tensordot(powers, logarithms, 1)) for powers in (_ALONG, _ACROSS))
+    return along.astype(np.float32), across.astype(np.float32)
 
 
-def deviation(found: NDArray[np.float64], exponents: tuple[float, ...]) -> Map:
-    """Standard deviation [px] by cell, (h, w), of `features`."""
-    return np.asarray(np.exp(np.tensordot(exponents, found, 1)), np.float32)
+def inverse_posterior(change: Change) -> Map:
+    """One over the posterior deviation of a change by cell, (h, w) in 1/px."""
+    precision = cv2.blur(change.precision, _AROUND, borderType=cv2.BORDER_REPLICATE) + 1e-3
+    return np.asarray(np.sqrt(8 * np.sqrt(precision * change.stiffness)))

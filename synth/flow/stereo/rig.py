@@ -33,7 +33,7 @@ class Eye:
 
 
 @dataclass(frozen=True)
-class Rig:
+class StereoRig:
     """A calibrated stereo pair."""
 
     left: Eye
@@ -54,7 +54,7 @@ class Rig:
 class Rectified:
     """Maps between a rig's pictures and the rectified ones, whose rows are epipolar lines."""
 
-    def __init__(self, rig: Rig) -> None:
+    def __init__(self, rig: StereoRig) -> None:
         """
         Args:
             rig: the pair.
@@ -62,24 +62,21 @@ class Rectified:
         Raises:
             UserError: the right camera is not to the right of the left one.
         """
-        self.rig = rig
-        turn_left, turn_right = _turns(rig)
+        self.size, turns = rig.size, _turns(rig)
         # Where the turned right lens sits, seen from the turned left one.
-        across = turn_right @ rig.translation
+        across = turns[1] @ rig.translation
         if across[0] >= 0 or abs(across[0]) < 0.9 * rig.baseline_mm:
             raise UserError(f"stereo: the second camera is not to the right of the first ({across} mm)")
         self.baseline_mm = float(-across[0])
-        focal = float(rig.left.K[0, 0])
-        left, right = (_middle(eye, turn, rig.size, focal) for eye, turn in _eyes(rig, turn_left, turn_right))
-        self.K_left, self.K_right = left, right.copy()
-        self.K_right[1, 2] = left[1, 2]
-        self.focal, self.shift = focal, float(self.K_right[0, 2] - left[0, 2])
-        self._turns = turn_left, turn_right
+        self.focal = float(rig.left.K[0, 0])
+        eyes = tuple(zip((rig.left, rig.right), turns, strict=True))
+        self.K_left, K_right = (_middle(eye, turn, rig.size, self.focal) for eye, turn in eyes)
+        K_right[1, 2] = self.K_left[1, 2]
+        self.shift = float(K_right[0, 2] - self.K_left[0, 2])
+        self._views = tuple((*one, K) for one, K in zip(eyes, (self.K_left, K_right), strict=True))
         self._maps = tuple(
             cv2.initUndistortRectifyMap(eye.K, eye.distortion, turn, K, rig.size, cv2.CV_32FC1)
-            for (eye, turn), K in zip(
-                _eyes(rig, turn_left, turn_right), (self.K_left, self.K_right), strict=True
-            )
+            for eye, turn, K in self._views
         )
 
     def picture(self, grey: Map, eye: int) -> Map:
@@ -95,22 +92,11 @@ class Rectified:
     def flow(self, flow: Map, eye: int = 0) -> Map:
         """An eye's flow (H, W, 2) px, in rectified pixels: (2, H, W)."""
         x, y = self._maps[eye]
-        width, height = self.rig.size
-        offset = [
-            part - grid
-            for part, grid in zip(
-                self._inverse[eye],
-                (np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32)[:, None]),
-                strict=True,
-            )
-        ]
         u, v = (cv2.remap(np.ascontiguousarray(flow[..., k]), x, y, cv2.INTER_LINEAR) for k in range(2))
-        ahead = [
-            cv2.remap(part, x + u, y + v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-            for part in offset
-        ]
-        here = [cv2.remap(part, x, y, cv2.INTER_LINEAR) for part in offset]
-        return np.stack([u + ahead[0] - here[0], v + ahead[1] - here[1]])
+        (along, down), (along_here, down_here) = self._offsets[eye]
+        there = x + u, y + v, cv2.INTER_LINEAR
+        ahead = (cv2.remap(part, *there, borderMode=cv2.BORDER_REPLICATE) for part in (along, down))
+        return np.stack([u + next(ahead) - along_here, v + next(ahead) - down_here])
 
     def back(self, field: Map) -> Map:
         """A field (H, W) on the rectified left pixels, on the left eye's own: (H, W)."""
@@ -136,25 +122,32 @@ class Rectified:
         rise = after - before
         # The difference as a sum of small parts: two large ones would lose digits.
         found = np.stack([flow[0] * after + x * rise, flow[1] * after + y * rise, self.focal * rise], axis=-1)
-        return (found / self.focal @ self._turns[0]).astype(np.float32)
+        return (found / self.focal @ self._views[0][1]).astype(np.float32)
 
     @cached_property
     def _inverse(self) -> tuple[tuple[Map, Map], ...]:
         """For every pixel of an eye, where it lies in its rectified picture: x, y, each (H, W)."""
-        width, height = self.rig.size
+        width, height = self.size
         grid = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).astype(np.float64)
         found = []
-        for (eye, turn), K in zip(_eyes(self.rig, *self._turns), (self.K_left, self.K_right), strict=True):
+        for eye, turn, K in self._views:
             there = cv2.undistortPoints(grid.reshape(-1, 1, 2), eye.K, eye.distortion, R=turn, P=K)
             found.append(tuple(there[:, 0].T.reshape(2, height, width).astype(np.float32)))
         return tuple(found)
 
+    @cached_property
+    def _offsets(self) -> list[tuple[list[Map], list[Map]]]:
+        """By eye, how far its pixels lie from their rectified place; and both at rectified pixels."""
+        width, height = self.size
+        grid = np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32)[:, None]
+        found = []
+        for inverse, maps in zip(self._inverse, self._maps, strict=True):
+            offset = [part - own for part, own in zip(inverse, grid, strict=True)]
+            found.append((offset, [cv2.remap(part, *maps, cv2.INTER_LINEAR) for part in offset]))
+        return found
 
-def _eyes(rig: Rig, left: Floats, right: Floats) -> tuple[tuple[Eye, Floats], tuple[Eye, Floats]]:
-    return (rig.left, left), (rig.right, right)
 
-
-def _turns(rig: Rig) -> tuple[Floats, Floats]:
+def _turns(rig: StereoRig) -> tuple[Floats, Floats]:
     """Rotations of the left and right camera's axes onto the rectified ones (Bouguet's, as in OpenCV)."""
     parallel = np.abs(rig.rotation - np.eye(3)).max() < _PARALLEL
     if parallel and np.abs(rig.translation[1:]).max() < _PARALLEL:

@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 from synth.errors import UserError
 from synth.flow import fused, image
 from synth.flow.estimator import Flags, Flow, Map, Rgb
-from synth.flow.stereo import deviation, rest
-from synth.flow.stereo.depth_motion import Change, Pictures, Settings, Solver, fine
-from synth.flow.stereo.rig import Rectified, Rig
+from synth.flow.stereo import rest
+from synth.flow.stereo.depth_motion import Change, DepthMotionSettings, Solver, StereoPictures, fine
+from synth.flow.stereo.deviation import deviations
+from synth.flow.stereo.rig import Rectified, StereoRig
 
-_GREY = np.array([0.2, 0.6, 0.2], np.float32)  # as `image.tensor`
 _STILL_PX = 0.3  # frames whose flow is nearly everywhere below this are at rest
 _RESTS = 4
 _IN_TIME = 0.12  # share of the motion that eyes of one moment may seem to differ by
@@ -32,6 +32,11 @@ class Moved:
     deviation: NDArray[np.float32]
     """(H, W, 3) mm, standard deviation of each component; 0 outside the tissue."""
 
+    @classmethod
+    def nothing(cls, size: tuple[int, ...]) -> Moved:
+        """Of the rest frame itself, (H, W): no motion, and that for certain."""
+        return cls(*np.zeros((2, *size, 3), np.float32))
+
 
 class StereoTracker:
     """The right eye beside a flow of the left one: frames and flow in, motion in three dimensions out.
@@ -41,13 +46,13 @@ class StereoTracker:
 
     def __init__(
         self,
-        rig: Rig,
+        rig: StereoRig,
         lefts: NDArray[np.uint8],
         rights: NDArray[np.uint8],
         left_blocked: Flags,
         right_blocked: Flags,
         tissue: Flags,
-        settings: Settings | None = None,
+        settings: DepthMotionSettings | None = None,
     ) -> None:
         """Starts at rest.
 
@@ -76,11 +81,11 @@ class StereoTracker:
         self.rectified, self.tissue = Rectified(rig), tissue
         r = self.rectified
         usable = (r.flags(tissue & ~left_blocked, 0), r.flags(~right_blocked, 1))
-        self.rest = rest.match(
-            np.stack([r.picture(picture @ _GREY, 0) for picture in lefts]),
-            np.stack([r.picture(picture @ _GREY, 1) for picture in rights]),
-            *usable,
-        )
+        greys = [
+            np.stack([r.picture(picture @ image.GREY, eye) for picture in pictures])
+            for eye, pictures in enumerate((lefts, rights))
+        ]
+        self.rest = rest.match(greys[0], greys[1], *usable)
         """Rest disparity, and how far off the calibration is."""
         self.solver = Solver((height, width), settings)
         self._left, _ = self._normalised(lefts[0], usable[0], 0)
@@ -93,12 +98,8 @@ class StereoTracker:
         """Median of the tissue's, at rest."""
         self.px_per_mm = r.focal * r.baseline_mm / self.distance_mm**2
         """Change of disparity of tissue that moves 1 mm along the line of sight."""
+        self._mm_per_px = float(np.median(r.depth(self.rest.disparity))) / r.focal
         self._change: Map | None = None
-
-    def rest_motion(self) -> Moved:
-        """Of the rest frame itself: no motion, and that for certain."""
-        nothing = np.zeros((*self.tissue.shape, 3), np.float32)
-        return Moved(nothing, nothing.copy())
 
     def step(
         self,
@@ -124,7 +125,7 @@ class StereoTracker:
         other, other_usable = self._normalised(right, r.flags(~right_blocked, 1), 1)
         # Where the left eye lost the tissue, what both eyes see there is what came between.
         followed = self._usable * (r.picture(confidence, 0) > _FOLLOWED)
-        pictures = Pictures(self._left, self._right, followed, now, other, now_usable, other_usable)
+        pictures = StereoPictures(self._left, self._right, followed, now, other, now_usable, other_usable)
         straight = r.flow(flow)
         change = self.solver.solve(pictures, straight, self.rest.disparity, self.px_per_mm, self._change)
         lost = float(change.seen.sum()) < _LOST * float(self._usable.sum())
@@ -132,18 +133,16 @@ class StereoTracker:
         return self._moved(change, straight, confidence)
 
     def _moved(self, change: Change, flow: Map, confidence: Map) -> Moved:
-        r, disparity = self.rectified, self.rest.disparity
-        self.features = self._features(change, flow, confidence)
-        """What the last frame's deviations were made from, (6, h, w): see `deviation.features`."""
+        r, disparity, coarse = self.rectified, self.rest.disparity, self.solver.coarse
         self.lag = change.lag
         """Share of the last frame's motion that the right eye didn't show: 0 for eyes of one moment."""
+        doubt = 1 - coarse(r.picture(confidence, 0))
+        way = coarse(np.hypot(flow[0], flow[1]))
+        along, across = deviations(change, self.solver.steepness(flow), doubt, way)
         # What of another moment's motion passes for depth.
-        late = np.sqrt(max(change.lag**2 - _IN_TIME**2, 0.0)) * self.solver.coarse(
-            np.abs(flow[0]) + np.abs(change.px)
-        )
-        along = np.hypot(deviation.deviation(self.features, deviation.ALONG), late) / self.px_per_mm
-        across = deviation.deviation(self.features, deviation.ACROSS)
-        across *= float(np.median(r.depth(disparity))) / r.focal
+        late = np.sqrt(max(change.lag**2 - _IN_TIME**2, 0.0)) * coarse(np.abs(flow[0]) + np.abs(change.px))
+        along = np.hypot(along, late) / self.px_per_mm
+        across *= self._mm_per_px
         motion = r.motion(disparity, change.px, flow)
         spread = [fine(part, self.solver.cell, disparity.shape) for part in (across, across, along)]
         planes = [r.back(np.ascontiguousarray(motion[..., k])) for k in range(3)]
@@ -153,17 +152,10 @@ class StereoTracker:
             np.stack([np.maximum(r.back(part), 1e-4) for part in spread], axis=-1) * inside,
         )
 
-    def _features(self, change: Change, flow: Map, confidence: Map) -> NDArray[np.float64]:
-        coarse = self.solver.coarse
-        doubt = 1 - coarse(self.rectified.picture(confidence, 0))
-        return deviation.features(
-            change, self.solver.steepness(flow), doubt, coarse(np.hypot(flow[0], flow[1]))
-        )
-
     def _normalised(self, rgb: Rgb, usable: Flags, eye: int) -> tuple[Map, Map]:
         """The rectified picture in local deviations and where it is usable, both (H, W) float32."""
         known = usable.astype(np.float32)
-        grey = torch.from_numpy(self.rectified.picture(rgb @ _GREY, eye))[None, None]
+        grey = torch.from_numpy(self.rectified.picture(rgb @ image.GREY, eye))[None, None]
         return image.normalise(grey, torch.from_numpy(known)[None, None])[0, 0].numpy(), known
 
 

@@ -11,16 +11,18 @@ from scipy.ndimage import gaussian_filter
 
 from synth.errors import UserError
 from synth.flow.stereo import calibration, depth_motion, rest
-from synth.flow.stereo.rig import Eye, Rectified, Rig
+from synth.flow.stereo.rig import Eye, Rectified, StereoRig
 from synth.flow.stereo.track import StereoTracker
 
 SIZE = (160, 120)
 FOCAL, BASE, AWAY = 1370.0, 24.0, 300.0
 K = np.array([[FOCAL, 0, 79.5], [0, FOCAL, 59.5], [0, 0, 1.0]])
 K_RIGHT = K + np.array([[0, 0, FOCAL * BASE / AWAY], [0, 0, 0], [0, 0, 0]])
-PARALLEL = Rig(Eye(K, np.zeros(5)), Eye(K_RIGHT, np.zeros(5)), np.eye(3), np.array([-BASE, 0.0, 0.0]), SIZE)
+PARALLEL = StereoRig(
+    Eye(K, np.zeros(5)), Eye(K_RIGHT, np.zeros(5)), np.eye(3), np.array([-BASE, 0.0, 0.0]), SIZE
+)
 TURN = cv2.Rodrigues(np.array([0.004, 0.08, 0.01]))[0]
-TURNED = Rig(
+TURNED = StereoRig(
     Eye(K, np.array([-0.2, 0.1, 0.002, -0.001, 0.0])),
     Eye(np.diag([1.01, 1.01, 1.0]) @ K, np.array([-0.1, 0.0, 0.0, 0.001, 0.0])),
     TURN,
@@ -49,7 +51,7 @@ def dent(amount: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize("rig", [PARALLEL, TURNED])
-def test_rectified_rows_and_depths_are_opencvs_projections(rig: Rig) -> None:
+def test_rectified_rows_and_depths_are_opencvs_projections(rig: StereoRig) -> None:
     rng = np.random.default_rng(3)
     points = np.stack([rng.uniform(-8, 8, 50), rng.uniform(-6, 6, 50), rng.uniform(290, 310, 50)], axis=1)
     moved = points + rng.normal(scale=1.0, size=points.shape)
@@ -77,7 +79,7 @@ def test_rectified_rows_and_depths_are_opencvs_projections(rig: Rig) -> None:
     np.testing.assert_allclose(left[inside, 1], right[inside, 1], atol=0.02)
     disparity = np.float32(left[:, 0] - right[:, 0])
     depth = rectified.depth(disparity)
-    turned = points @ rectified._turns[0].T
+    turned = points @ rectified._views[0][1].T
     np.testing.assert_allclose(depth[inside], turned[inside, 2], rtol=1e-3)
     after_left, after_right = straight(moved)
     flow, change = after_left - left, (after_left - after_right)[:, 0] - disparity
