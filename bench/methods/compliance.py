@@ -26,7 +26,7 @@ Floats = NDArray[np.float64]
 TO_CAMERA = np.diag([1.0, -1.0, -1.0])
 
 # A recording doesn't tell the brain's shape: the default job's.
-_ANATOMY = schema.Anatomy()
+_ANATOMY = schema.AnatomySection()
 _AT_ONCE = 32
 
 

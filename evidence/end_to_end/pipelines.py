@@ -25,7 +25,7 @@ from synth.flow import mask
 from synth.flow.estimator import Estimator
 from synth.flow.track import track
 from synth.job import identity
-from synth.job.schema import Fem, Flow, Job, Render
+from synth.job.schema import FemSection, FlowSection, Job, RenderSection
 from synth.sequence import pipeline
 
 FRAMES, SIZE, VERTICES, LOAD, GESTURES = 8, (256, 192), 8000, (0.05, 0.2), ("pull", "push")
@@ -62,8 +62,8 @@ class World:
 
 def default_world() -> World:
     """What a job without these keys gets at this load."""
-    fem = Fem(load=LOAD)
-    return World(fem.chosen_law[0], fem.tets, Render().spp)
+    fem = FemSection(load=LOAD)
+    return World(fem.chosen_law[0], fem.tets, RenderSection().spp)
 
 
 FINE = World("neo-hookean", 3000, 8)
@@ -85,7 +85,7 @@ class Pipeline:
     @property
     def default(self) -> bool:
         """Whether it is made of defaults alone; the model is none of a job's."""
-        return self.world == default_world() and self.flow == Flow().backend
+        return self.world == default_world() and self.flow == FlowSection().backend
 
     def as_row(self) -> dict[str, Any]:
         """What names it in a row of results."""
@@ -94,7 +94,7 @@ class Pipeline:
 
 def chosen() -> list[Pipeline]:
     """One thing changed at a time from the defaults, all at their cheapest, and as dear as what is asked."""
-    usual, flow = default_world(), Flow().backend
+    usual, flow = default_world(), FlowSection().backend
     cheapest = World("linear", 400, 1)
     changed = [replace(usual, law="linear"), replace(usual, tets=400), replace(usual, spp=1)]
     worlds = dict.fromkeys([usual, *changed, cheapest, FINE])
@@ -167,7 +167,7 @@ def errors(one: Pipeline, made: Sequences, asked: Sequences, work: Path) -> dict
     """What a pipeline errs by, and CPU time [s] of an answer; one fitted on ideal flow is asked with the
     default's. Kept in `work`."""
     fit = [] if one.model == models.PHYSICS else made.clips(one.flow)
-    tests = asked.clips(Flow().backend if one.flow == "ideal" else one.flow)
+    tests = asked.clips(FlowSection().backend if one.flow == "ideal" else one.flow)
 
     def compute() -> dict[str, Any]:
         answer = models.build(one.model, fit)

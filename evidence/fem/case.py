@@ -18,7 +18,7 @@ from synth.sequence import scenario
 
 Floats = NDArray[np.float64]
 
-ANATOMY = schema.Anatomy()
+ANATOMY = schema.AnatomySection()
 WAYS = {"push": (0.0, 0.0, -1.0), "pull": (0.0, 0.0, 1.0), "aside": (0.87, 0.0, 0.5)}
 CONTACTS = ((0.0, 0.0, 4.5), (5.0, 2.0, 3.0), (-3.0, -5.0, 6.0), (-2.0, 6.0, 3.5))
 """World x, y and radius, mm: the default range of radii, near the centre and near the rim."""
@@ -86,7 +86,7 @@ def error(u: Floats, exact: Floats, on: Patch) -> float:
 
 def speed(case: Brain, load: float, way: str, frames: int = 60) -> float:
     """CPU milliseconds a frame of a pull with ramp, hold and release, moving the surface included."""
-    fem, tissue = schema.Fem(gestures=("pull",)), Tissue(1.0, 0.4, "linear")
+    fem, tissue = schema.FemSection(gestures=("pull",)), Tissue(1.0, 0.4, "linear")
     gesture = scenario.draw_gesture(
         fem, ANATOMY.craniotomy.radius_mm, tissue.young_kpa, np.random.default_rng(0)
     )

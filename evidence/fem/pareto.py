@@ -66,7 +66,7 @@ def main(
 def discretisation(on: fem_case.Patch, refined: int, contacts: int, load: float) -> list[Row]:
     """Rows of law and size: `mesh_error` against the refined mesh at the same nu (linear law; 0.4 and 0.49),
     `error` against refined neo-Hookean at the load."""
-    default = ("neo-hookean", schema.Fem().tets)
+    default = ("neo-hookean", schema.FemSection().tets)
     total: dict[tuple[str, int], list[dict[str, float]]] = {setting: [] for setting in _SETTINGS}
     for contact in fem_case.CONTACTS[:contacts]:
         exact = {nu: _small(on, refined, contact, nu) for nu in (0.4, 0.49)}
@@ -141,7 +141,7 @@ def sequence(law: str, load: float) -> Row:
 
 
 def _sequence(law: str, load: float) -> Row:
-    on, fem = fem_case.patch(), schema.Fem(gestures=("pull",), load=(load, load))
+    on, fem = fem_case.patch(), schema.FemSection(gestures=("pull",), load=(load, load))
     tissue = Tissue(1.0, 0.4, law)
     gesture = scenario.draw_gesture(
         fem, fem_case.ANATOMY.craniotomy.radius_mm, tissue.young_kpa, np.random.default_rng(0)

@@ -20,7 +20,7 @@ import typer
 
 from evidence import report
 from evidence.render.case import Case, case
-from synth.job.schema import Job, Render
+from synth.job.schema import Job, RenderSection
 from synth.render import instrument
 from synth.render.scene import Studio
 
@@ -28,7 +28,12 @@ Map = npt.NDArray[np.float32]
 
 _LIFT = 1.5
 _STAGE = signature(Studio.stage).parameters
-_DEFAULT = (Render().spp, _STAGE["sampler"].default, _STAGE["integrator"].default, Render().size[0])
+_DEFAULT = (
+    RenderSection().spp,
+    _STAGE["sampler"].default,
+    _STAGE["integrator"].default,
+    RenderSection().size[0],
+)
 _SAMPLERS, _INTEGRATORS = ("multijitter", "ldsampler", "independent"), ("direct", "path3")
 
 

@@ -73,7 +73,7 @@ class Deformation:
 
 
 def deform(
-    fem: schema.Fem,
+    fem: schema.FemSection,
     tissue: Tissue,
     gestures: Sequence[Gesture],
     tets: Tets,
@@ -81,7 +81,7 @@ def deform(
     frames: int,
     fps: float,
     pulse: Pulse | None = None,
-    opening_mm: float = schema.Craniotomy().radius_mm,
+    opening_mm: float = schema.CraniotomySection().radius_mm,
 ) -> Deformation:
     """Moves a brain as gestures ask.
 
@@ -154,7 +154,7 @@ def deform(
     )
 
 
-def clock(fem: schema.Fem, fps: float, tets: Tets) -> Clock:
+def clock(fem: schema.FemSection, fps: float, tets: Tets) -> Clock:
     """Steps no longer than `_STEP_S`, a whole number of them a frame."""
     if fem.time != "dynamic":
         return Clock(1 / fps, relaxation=fem.relaxation)

@@ -10,7 +10,7 @@ import numpy as np
 from PIL import Image, JpegImagePlugin
 
 from synth.fit.statistics import Picture
-from synth.job.schema import Sensor
+from synth.job.schema import SensorSection
 from synth.render.camera import video_link
 
 _UNSEEN_DB = 46.0  # a loss below this is less than rounding to 8 bits of a noisy picture
@@ -66,7 +66,7 @@ class Compression:
         share = rgb.shape[0] * rgb.shape[1] / _VIDEO_PX
         left = []
         for rate in _BITRATES:
-            sensor = Sensor.model_validate({"bitrate_mbps": rate * share, "chroma": self.chroma})
+            sensor = SensorSection.model_validate({"bitrate_mbps": rate * share, "chroma": self.chroma})
             left.append(_ratio_db(film, video_link.recorded(film, sensor, 25.0)))
         rate = float(np.exp(np.interp(lost, np.maximum.accumulate(left), np.log(_BITRATES))))
         return float(f"{rate:.3g}")

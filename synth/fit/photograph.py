@@ -12,7 +12,7 @@ from synth.errors import UserError
 from synth.fit.compression import Compression
 from synth.fit.statistics import Mask, Picture
 from synth.flow import mask as found_mask
-from synth.job.schema import Render
+from synth.job.schema import RenderSection
 from synth.system import checked_file
 
 _SMALLEST_PX = 160
@@ -63,7 +63,7 @@ def read_photograph(path: Path, width_mm: float, mask: Path | None) -> Photograp
         usable = np.asarray(checked_file.read_picture(mask, cv2.IMREAD_GRAYSCALE)) > 127
         if usable.shape != rgb.shape[:2]:
             raise UserError(f"{mask}: is of another size than the photograph")
-    usual = Render()
+    usual = RenderSection()
     finer = max(1.0, sum(usual.field_mm) / 2 / usual.size[0] / own)
     if finer > 1.02:
         small = {"dsize": None, "fx": 1 / finer, "fy": 1 / finer, "interpolation": cv2.INTER_AREA}

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from synth.errors import UserError
 from synth.geometry import vtk
 from synth.job import identity
-from synth.job.schema import Attachment, Craniotomy
+from synth.job.schema import AttachmentSection, CraniotomySection
 from synth.system import checked_file
 
 Floats = NDArray[np.float64]
@@ -35,7 +35,7 @@ class Brain:
     turn: Floats
     """(3, 3) rows: world axes in the file's."""
 
-    def placed(self, attachments: Sequence[Attachment]) -> tuple[Attachment, ...]:
+    def placed(self, attachments: Sequence[AttachmentSection]) -> tuple[AttachmentSection, ...]:
         """Attachments given in the file's axes, in world axes."""
         return tuple(
             a.model_copy(
@@ -48,7 +48,7 @@ class Brain:
         )
 
 
-def load_brain(path: Path, craniotomy: Craniotomy) -> Brain:
+def load_brain(path: Path, craniotomy: CraniotomySection) -> Brain:
     """Reads a surface (OBJ, STL, PLY, OFF or legacy VTK), merges what belongs together, and places it.
 
     Args:

@@ -16,7 +16,7 @@ CLEAR_MM = 1.0
 _Part = Annotated[FiniteFloat, Field(gt=0, lt=1)]
 
 
-class Instrument(Section):
+class InstrumentSection(Section):
     """One instrument as asked; what is left out is drawn as for the others."""
 
     gesture: Kind | None = None
@@ -37,7 +37,7 @@ class Instrument(Section):
     the last count."""
 
     @model_validator(mode="after")
-    def _goes_together(self) -> Instrument:
+    def _goes_together(self) -> InstrumentSection:
         if self.load is not None and self.force_mn is not None:
             raise ValueError("either load or force_mn, not both")
         if self.timing is not None:

@@ -20,7 +20,7 @@ from synth.job.types import (
 )
 
 
-class Light(Section):
+class LightSection(Section):
     """The microscope's lamps."""
 
     glare: ShareRange = (0.0, 0.3)
@@ -35,7 +35,7 @@ class Light(Section):
     """Radius of the evenly lit spot, in widths of the field; beyond it the light falls off."""
 
 
-class Sensor(Section):
+class SensorSection(Section):
     """The camera's chip and what its video processor makes of it."""
 
     exposure: PositiveRange = (0.98, 1.12)
@@ -62,7 +62,7 @@ class Sensor(Section):
     """Part of the time between frames in which light is gathered: motion blur, of four pictures each."""
 
 
-class Render(Section):
+class RenderSection(Section):
     """The microscope and its picture."""
 
     size: tuple[Annotated[int, Field(ge=16, le=4096)], Annotated[int, Field(ge=16, le=4096)]] = (640, 480)

@@ -11,11 +11,11 @@ from pydantic import AfterValidator, BeforeValidator, Field, FiniteFloat, model_
 
 from synth import fields
 from synth.job.instrument import CLEAR_MM, Kind
-from synth.job.instrument import Instrument as Instrument
+from synth.job.instrument import InstrumentSection as InstrumentSection
 from synth.job.laws import LAWS, choose_law, largest_load
-from synth.job.microscope import Light as Light
-from synth.job.microscope import Render as Render
-from synth.job.microscope import Sensor as Sensor
+from synth.job.microscope import LightSection as LightSection
+from synth.job.microscope import RenderSection as RenderSection
+from synth.job.microscope import SensorSection as SensorSection
 from synth.job.types import (
     InstrumentRange,
     NonNegativeRange,
@@ -31,7 +31,7 @@ from synth.job.types import (
 from synth.plugins import ESTIMATORS
 
 
-class Place(Section):
+class PlaceSection(Section):
     """A place on the brain's surface."""
 
     point: Vector
@@ -40,13 +40,13 @@ class Place(Section):
     """Outward direction there, in the mesh's own axes; normalised."""
 
     @model_validator(mode="after")
-    def _direction_has_length(self) -> Place:
+    def _direction_has_length(self) -> PlaceSection:
         if not any(self.direction):
             raise ValueError("direction has no length")
         return self
 
 
-class Craniotomy(Section):
+class CraniotomySection(Section):
     """Where the skull is open."""
 
     point: Vector | None = None
@@ -55,18 +55,18 @@ class Craniotomy(Section):
     """Outward direction of the opening, in the mesh's own axes; normalised. Needed with `anatomy.mesh`."""
     radius_mm: Positive = 12.0
     """Radius of the opening [mm]."""
-    also: Annotated[tuple[Place, ...], Field(max_length=100)] = ()
+    also: Annotated[tuple[PlaceSection, ...], Field(max_length=100)] = ()
     """Further places on the same mesh, each with point and direction: anatomies take them in turn, the first
     being `point`. `learn train` can then tell openings apart, though not brains."""
 
     @model_validator(mode="after")
-    def _direction_has_length(self) -> Craniotomy:
+    def _direction_has_length(self) -> CraniotomySection:
         if self.direction is not None and not any(self.direction):
             raise ValueError("direction has no length")
         return self
 
 
-class Attachment(Section):
+class AttachmentSection(Section):
     """A region in which tissue is held: falx, tentorium, an adhesion. The skull holds it in any case."""
 
     point: Vector
@@ -81,13 +81,13 @@ class Attachment(Section):
     """Traction per displacement as a multiple of E, per mm; the skull's is 2."""
 
     @model_validator(mode="after")
-    def _normal_has_length(self) -> Attachment:
+    def _normal_has_length(self) -> AttachmentSection:
         if self.normal is not None and not any(self.normal):
             raise ValueError("normal has no length")
         return self
 
 
-class Anatomy(Section):
+class AnatomySection(Section):
     """The brain: a procedural block, or a user's surface."""
 
     mesh: Path | None = None
@@ -102,21 +102,21 @@ class Anatomy(Section):
     """Procedural relief: depth of the sulci as seen from outside [mm]."""
     vertices: Annotated[int, Field(ge=400, le=400_000)] = 40_000
     """Vertices of the fine surface that is loaded, moved and rendered."""
-    craniotomy: Craniotomy = Craniotomy()
+    craniotomy: CraniotomySection = CraniotomySection()
     """Where the skull is open."""
-    attachments: tuple[Attachment, ...] = ()
+    attachments: tuple[AttachmentSection, ...] = ()
     """Regions in which the tissue is held inside, such as the falx: a list of {point, radius_mm, normal,
     thickness_mm, firm_per_mm}, normal for a sheet. Empty: the skull alone holds it."""
 
     @model_validator(mode="after")
-    def _mesh_is_placed(self) -> Anatomy:
+    def _mesh_is_placed(self) -> AnatomySection:
         if self.mesh is not None and (self.craniotomy.point is None or self.craniotomy.direction is None):
             raise ValueError("a mesh needs craniotomy.point and craniotomy.direction")
         if self.mesh is None and self.craniotomy.also:
             raise ValueError("craniotomy.also is for a mesh; a procedural block is opened in its middle")
         return self
 
-    def opened(self, number: int) -> Anatomy:
+    def opened(self, number: int) -> AnatomySection:
         """The section with the place that anatomy `number` is opened at as its only one."""
         where = self.craniotomy
         if not where.also:
@@ -130,7 +130,7 @@ class Anatomy(Section):
 Family = Literal["healthy", "hyperaemic", "pale", "oedematous", "calf"]
 
 
-class Appearance(Section):
+class AppearanceSection(Section):
     """How the surface looks."""
 
     families: tuple[Family, ...] = ("healthy",)
@@ -150,7 +150,7 @@ Skulls = Annotated[
 ]
 
 
-class Membrane(Section):
+class MembraneSection(Section):
     """The pia-arachnoid, a thin stiff sheet on the surface that wrinkles under compression. Default: none."""
 
     intact: Share = 0.0
@@ -163,7 +163,7 @@ class Membrane(Section):
     """Its thickness [mm], drawn uniformly. What counts is thickness times modulus."""
 
 
-class Pulse(Section):
+class PulseSection(Section):
     """Heart and breath: the exposed surface rises and falls, by a pressure from below. Default: it is still.
 
     Amplitudes are of the middle of the opening, peak to peak, drawn uniformly as the rates are. In a patient
@@ -190,7 +190,7 @@ class Demand:
     footprint_mm: tuple[float, float]
 
 
-class Fem(Section):
+class FemSection(Section):
     """The physics of the tissue and of the load."""
 
     law: Annotated[PlugInName, AfterValidator(lambda name: LAWS.check_name(name, "auto"))] = "auto"
@@ -205,9 +205,9 @@ class Fem(Section):
     skull: Skulls = ("bonded",)
     """How tissue is held round the opening, one or both, in equal shares: bonded to the skull, or free to
     slip along it (subarachnoid fluid)."""
-    membrane: Membrane = Membrane()
+    membrane: MembraneSection = MembraneSection()
     """The pia-arachnoid on the surface."""
-    pulse: Pulse = Pulse()
+    pulse: PulseSection = PulseSection()
     """Motion of the exposed surface that no tool makes."""
     load: PositiveRange = (0.05, 0.4)
     """Peak load as P = F/(E a^2), dimensionless, so that one range suits every stiffness."""
@@ -226,7 +226,7 @@ class Fem(Section):
     """Kinds of gesture that sequences are drawn from, in equal shares."""
     instruments: InstrumentRange = (1, 1)
     """How many instruments act at once, each with a gesture, load, direction and timing of its own."""
-    crew: Annotated[tuple[Instrument, ...], Field(max_length=3)] = ()
+    crew: Annotated[tuple[InstrumentSection, ...], Field(max_length=3)] = ()
     """Instruments as asked, the first ones of `instruments` (there are at least so many): a list of {gesture,
     place, direction, load, force_mn, footprint_mm, timing}, each of them drawn where it is left out."""
     within_mm: Positive | None = None
@@ -244,13 +244,13 @@ class Fem(Section):
     """Prony terms [part of the stiffness lost, time in s], one or two: E is then that of a sudden load."""
 
     @model_validator(mode="after")
-    def _some_stiffness_stays(self) -> Fem:
+    def _some_stiffness_stays(self) -> FemSection:
         if sum(part for part, _ in self.relaxation) >= 1:
             raise ValueError("relaxation: the parts lost add up to the whole stiffness or more")
         return self
 
     @model_validator(mode="after")
-    def _load_is_in_the_laws_range(self) -> Fem:
+    def _load_is_in_the_laws_range(self) -> FemSection:
         law, _ = self.chosen_law
         largest = largest_load(law)
         for where, one in self._demands:
@@ -273,7 +273,7 @@ class Fem(Section):
             )
         return ""
 
-    def demand(self, asked: Instrument) -> Demand:
+    def demand(self, asked: InstrumentSection) -> Demand:
         """The ranges that count for an instrument: its own where it says so."""
         footprint = asked.footprint_mm or self.footprint_mm
         if asked.load or asked.force_mn:
@@ -283,7 +283,7 @@ class Fem(Section):
     @property
     def _demands(self) -> list[tuple[str, Demand]]:
         """What can be drawn: of each instrument that is asked for, and of those that aren't."""
-        drawn = [("", self.demand(Instrument()))] if self.instruments[1] > len(self.crew) else []
+        drawn = [("", self.demand(InstrumentSection()))] if self.instruments[1] > len(self.crew) else []
         return drawn + [(f"crew[{k}]: ", self.demand(one)) for k, one in enumerate(self.crew)]
 
     def _largest(self, one: Demand) -> float:
@@ -304,7 +304,7 @@ class Fem(Section):
         return max(self._largest(one) for _, one in self._demands)
 
 
-class Flow(Section):
+class FlowSection(Section):
     """Recovering displacement from the video."""
 
     backend: Annotated[PlugInName, AfterValidator(lambda name: ESTIMATORS.check_name(name, "ideal"))] = "tvl1"
@@ -322,7 +322,7 @@ def _known(names: tuple[str, ...], known: tuple[str, ...]) -> tuple[str, ...]:
     return names
 
 
-class Store(Section):
+class StoreSection(Section):
     """What is kept of every sequence. `synth schema --fields` lists the fields and what they take."""
 
     extra: Annotated[tuple[str, ...], AfterValidator(lambda names: _known(names, fields.EXTRA))] = ()
@@ -334,7 +334,7 @@ class Store(Section):
     """Type of both flows stored; float16 rounds motion below 16 px by at most 0.004 px, below 32 by 0.008."""
 
 
-class Card(Section):
+class CardSection(Section):
     """What a person says of the dataset, for its card. Changes no sequence."""
 
     title: str = "Synthetic neurosurgical sequences with ground-truth force"
@@ -364,18 +364,18 @@ class Job(Section):
     """Frames a sequence; frame 0 is the rest frame."""
     fps: Positive = 25.0
     """Frames a second of the recorded video."""
-    anatomy: Anatomy = Anatomy()
-    appearance: Appearance = Appearance()
-    light: Light = Light()
-    sensor: Sensor = Sensor()
-    fem: Fem = Fem()
-    render: Render = Render()
-    flow: Flow = Flow()
-    store: Store = Store()
+    anatomy: AnatomySection = AnatomySection()
+    appearance: AppearanceSection = AppearanceSection()
+    light: LightSection = LightSection()
+    sensor: SensorSection = SensorSection()
+    fem: FemSection = FemSection()
+    render: RenderSection = RenderSection()
+    flow: FlowSection = FlowSection()
+    store: StoreSection = StoreSection()
     labels: Literal["published", "none"] = "none"
     """Noise on the labels of the field `intensity`: the published method's first stage, or none, as its code
     ships. Its second stage is in `intensity` and `flow_noisy` either way; see `store.extra`."""
-    card: Card = Card()
+    card: CardSection = CardSection()
 
     @model_validator(mode="after")
     def _second_lens_exists(self) -> Job:

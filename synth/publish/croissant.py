@@ -12,7 +12,7 @@ import pyarrow as pa
 from synth.dataset import index
 from synth.dataset.folder import Folder, write_whole
 from synth.fields import FIELDS
-from synth.job.schema import Card, Job
+from synth.job.schema import CardSection, Job
 from synth.publish import card
 
 NAME = "croissant.json"
@@ -67,7 +67,7 @@ def describe(folder: Folder) -> dict[str, Any]:
     }
 
 
-def _stated(about: Card) -> dict[str, Any]:
+def _stated(about: CardSection) -> dict[str, Any]:
     """What was not said is left out rather than made up."""
     found = {key: getattr(about, name) for key, name in STATED.items()}
     found["creator"] = [{"@type": "sc:Person", "name": name} for name in about.authors]

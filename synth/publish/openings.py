@@ -14,7 +14,7 @@ from scipy.spatial import ConvexHull, cKDTree
 from synth.errors import UserError
 from synth.geometry.brain_surface import axes, read_brain
 from synth.job import writer
-from synth.job.schema import Anatomy, Craniotomy, Fem, Job
+from synth.job.schema import AnatomySection, CraniotomySection, FemSection, Job
 from synth.render.anatomy.surface import LEAST_FILLED, MARGIN_MM
 from synth.sequence import scenario, scene
 
@@ -44,11 +44,11 @@ class Opening:
     flat: bool
     """Most of it is: a wall that the surface was cut at."""
 
-    def craniotomy(self, radius_mm: float) -> Craniotomy:
+    def craniotomy(self, radius_mm: float) -> CraniotomySection:
         """The job's section."""
         x, y, z = np.round(self.point, 2).tolist()
         u, v, w = np.round(self.direction, 3).tolist()
-        return Craniotomy(point=(x, y, z), direction=(u, v, w), radius_mm=radius_mm)
+        return CraniotomySection(point=(x, y, z), direction=(u, v, w), radius_mm=radius_mm)
 
 
 def find_openings(mesh: Path, radius_mm: float, count: int) -> list[Opening]:
@@ -62,8 +62,8 @@ def find_openings(mesh: Path, radius_mm: float, count: int) -> list[Opening]:
     for one in sorted(_judged(mesh, radius_mm), key=lambda one: (one.flat, one.relief_mm)):
         if any(np.linalg.norm(one.point - other.point) < _APART * radius_mm for other in chosen):
             continue
-        section = Anatomy(mesh=mesh.resolve(), vertices=2500, craniotomy=one.craniotomy(radius_mm))
-        job = Job(anatomy=section, fem=Fem(tets=400))  # whether it meshes, not how well
+        section = AnatomySection(mesh=mesh.resolve(), vertices=2500, craniotomy=one.craniotomy(radius_mm))
+        job = Job(anatomy=section, fem=FemSection(tets=400))  # whether it meshes, not how well
         try:
             scene.build(job, scenario.draw(job, 0))
         except UserError as error:

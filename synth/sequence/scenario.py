@@ -14,8 +14,8 @@ from synth.fem.material import Pia, Tissue
 from synth.fem.pulse import Pulse
 from synth.fem.tool import Gesture, ToolContact
 from synth.job import schema
-from synth.job.instrument import CLEAR_MM, Instrument
-from synth.job.schema import Family, Fem, Job, Light, Render
+from synth.job.instrument import CLEAR_MM, InstrumentSection
+from synth.job.schema import Family, FemSection, Job, LightSection, RenderSection
 from synth.render.anatomy.surface import Relief
 from synth.render.appearance.family import FAMILIES, Colour
 from synth.render.appearance.light import Lighting, balance
@@ -115,13 +115,13 @@ def label_rng(job: Job, index: int) -> Random:
     return _generator(job, _SEQUENCE, index, _LABELS)
 
 
-def draw_relief(anatomy: schema.Anatomy, rng: Random) -> Relief:
+def draw_relief(anatomy: schema.AnatomySection, rng: Random) -> Relief:
     """Seed and shape of one anatomy."""
     seed = int(rng.integers(2**31))
     return Relief(seed, _uniform(rng, anatomy.gyrus_mm), _uniform(rng, anatomy.sulcus_mm))
 
 
-def draw_tissue(fem: Fem, rng: Random) -> Tissue:
+def draw_tissue(fem: FemSection, rng: Random) -> Tissue:
     """Stiffness, law and hold. E log-uniformly: half as stiff and twice as stiff are as likely."""
     law, why = fem.chosen_law
     young = _log_uniform(rng, fem.young_kpa)
@@ -134,7 +134,7 @@ def draw_tissue(fem: Fem, rng: Random) -> Tissue:
     return Tissue(young, poisson, law, why, pia if drawn < membrane.intact else None, skull)
 
 
-def draw_pulse(pulse: schema.Pulse, rng: Random) -> Pulse | None:
+def draw_pulse(pulse: schema.PulseSection, rng: Random) -> Pulse | None:
     """Amplitudes, rates and phases uniformly; None where nothing moves."""
     turn = 0, 2 * np.pi
     heart, breath = (pulse.heart_mm, pulse.heart_hz, turn), (pulse.breath_mm, pulse.breath_hz, turn)
@@ -143,7 +143,7 @@ def draw_pulse(pulse: schema.Pulse, rng: Random) -> Pulse | None:
 
 
 def draw_gestures(
-    fem: Fem, opening_mm: float, young_kpa: float, rng: Random, others: Random
+    fem: FemSection, opening_mm: float, young_kpa: float, rng: Random, others: Random
 ) -> tuple[Gesture, ...]:
     """Draws the gestures of all instruments, each redrawn until it has room beside the others.
 
@@ -161,7 +161,7 @@ def draw_gestures(
         UserError: the opening has no room for so many, or not there.
     """
     count = max(int(others.integers(fem.instruments[0], fem.instruments[1] + 1)), len(fem.crew))
-    asked = [*fem.crew, *[Instrument()] * (count - len(fem.crew))]
+    asked = [*fem.crew, *[InstrumentSection()] * (count - len(fem.crew))]
     order = sorted(range(count), key=lambda k: asked[k].place is None)
     for _ in range(_ROUNDS if fem.crew else 1):  # the shaft of one may leave no room to the next: all anew
         found: dict[int, Gesture] = {}
@@ -186,7 +186,11 @@ def draw_gestures(
 
 
 def draw_gesture(
-    fem: Fem, opening_mm: float, young_kpa: float, rng: Random, asked: Instrument = Instrument()
+    fem: FemSection,
+    opening_mm: float,
+    young_kpa: float,
+    rng: Random,
+    asked: InstrumentSection = InstrumentSection(),
 ) -> Gesture:
     """Draws one gesture: contact uniformly in the opening, direction uniformly in its cone; or as asked.
 
@@ -232,7 +236,13 @@ def draw_gesture(
 
 
 def _draw_point(
-    fem: Fem, opening_mm: float, kind: str, footprint: float, reach: float, rng: Random, asked: Instrument
+    fem: FemSection,
+    opening_mm: float,
+    kind: str,
+    footprint: float,
+    reach: float,
+    rng: Random,
+    asked: InstrumentSection,
 ) -> Floats:
     """Middle of the contacts (2,) mm; with `reach` mm round it all that is loaded is in the opening."""
     within = opening_mm if fem.within_mm is None else min(opening_mm, fem.within_mm)
@@ -248,7 +258,9 @@ def _draw_point(
     return np.asarray(radius * np.array([np.cos(angle), np.sin(angle)]))
 
 
-def _draw_direction(fem: Fem, kind: str, rng: Random, asked: Instrument) -> tuple[Floats, Floats]:
+def _draw_direction(
+    fem: FemSection, kind: str, rng: Random, asked: InstrumentSection
+) -> tuple[Floats, Floats]:
     """Unit vectors: the load's component along the surface (2,), which is the way of a slide, and it (3,)."""
     turn = rng.uniform(0, 2 * np.pi)
     along = np.array([np.cos(turn), np.sin(turn)])
@@ -275,7 +287,7 @@ def _draw_timing(kind: str, rng: Random) -> tuple[float, float, float, float]:
     return touch, full, full + hold * (release - full), release
 
 
-def draw_view(render: Render, rng: Random) -> View:
+def draw_view(render: RenderSection, rng: Random) -> View:
     """Where the microscope stands; width of its field and principal point are a calibration's, if given."""
     drawn = View(
         field_mm=_uniform(rng, render.field_mm),
@@ -295,7 +307,7 @@ def _draw_zero(rng: Random) -> tuple[float, float]:
     return float(length * np.cos(angle)), float(length * np.sin(angle))
 
 
-def draw_sway(render: Render, rng: Random) -> Sway:
+def draw_sway(render: RenderSection, rng: Random) -> Sway:
     """How far the microscope drifts and vibrates."""
     drift, vibration = _uniform(rng, render.drift_mm), _uniform(rng, render.vibration_mm)
     return Sway(drift, vibration, int(rng.integers(2**31)))
@@ -337,7 +349,7 @@ def draw_look(job: Job, family: Family, rng: Random) -> Look:
     return replace(look, scenery=tuple(part for part, one in zip(parts, shown, strict=True) if one))
 
 
-def draw_light(light: Light, rng: Random) -> Lighting:
+def draw_light(light: LightSection, rng: Random) -> Lighting:
     """Where the lamps are and how they shine."""
     glare, azimuth, tilt = _uniform(rng, light.glare), _uniform(rng, (-1, 1)), light.tilt_deg
     return Lighting(
@@ -354,7 +366,7 @@ def draw_light(light: Light, rng: Random) -> Lighting:
     )
 
 
-def draw_sensor(section: schema.Sensor, white: Colour, rng: Random) -> Sensor:
+def draw_sensor(section: schema.SensorSection, white: Colour, rng: Random) -> Sensor:
     """A chip within the job's ranges, with that white balance."""
     return Sensor(
         exposure=_uniform(rng, section.exposure),

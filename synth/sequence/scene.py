@@ -21,7 +21,7 @@ from synth.flow.track import Track
 from synth.geometry import brain_surface
 from synth.geometry.brain_surface import Brain
 from synth.geometry.triangles import Shape
-from synth.job.schema import Anatomy, Flow, Job
+from synth.job.schema import AnatomySection, FlowSection, Job
 from synth.render.anatomy import surface as anatomy
 from synth.render.anatomy.surface import Relief, Surface
 from synth.render.camera import camera, video_link
@@ -224,7 +224,7 @@ def cortex(job: Job, case: Scenario) -> tuple[Surface, Brain | None]:
 
 
 @lru_cache(maxsize=4)
-def _cortex(section: Anatomy, relief: Relief, written: object) -> tuple[Surface, Brain | None]:
+def _cortex(section: AnatomySection, relief: Relief, written: object) -> tuple[Surface, Brain | None]:
     """As `cortex`; `written` tells a mesh from one that replaced it."""
     whole = None
     if section.mesh is None:
@@ -243,7 +243,7 @@ def _cortex(section: Anatomy, relief: Relief, written: object) -> tuple[Surface,
     return surface, whole
 
 
-def _opened(section: Anatomy, relief: Relief) -> tuple[Surface, Brain]:
+def _opened(section: AnatomySection, relief: Relief) -> tuple[Surface, Brain]:
     assert section.mesh is not None
     whole = brain_surface.load_brain(section.mesh, section.craniotomy)
     return anatomy.from_brain(whole.vertices, whole.faces, relief, section), whole
@@ -264,7 +264,7 @@ def move(job: Job, case: Scenario, surface: Surface, tets: Tets) -> Deformation:
     )
 
 
-def estimator(flow: Flow) -> Estimator:
+def estimator(flow: FlowSection) -> Estimator:
     """The estimator that a job asks for."""
     if flow.backend != "tvl1":
         return create(flow.backend)

@@ -8,7 +8,7 @@ from synth.fem.mesh import tetrahedra
 from synth.geometry.triangles import Shape
 from synth.job import schema
 
-ANATOMY = schema.Anatomy()
+ANATOMY = schema.AnatomySection()
 OPENING_MM = ANATOMY.craniotomy.radius_mm
 
 
@@ -22,5 +22,5 @@ def patch(n: int = 61, extent: float = 46.0) -> Shape:
     return Shape(np.column_stack([xy, tetrahedra.dome(xy, ANATOMY.dome_mm)]), faces.astype(np.int32))
 
 
-def block(fem: schema.Fem) -> tetrahedra.Tets:
+def block(fem: schema.FemSection) -> tetrahedra.Tets:
     return tetrahedra.block(ANATOMY, fem.tets, 2)

@@ -9,7 +9,7 @@ import trimesh
 
 from synth.job import schema
 
-OPENING = schema.Craniotomy(point=(31.0, 0.0, 0.0), direction=(1.0, 0.0, 0.0))
+OPENING = schema.CraniotomySection(point=(31.0, 0.0, 0.0), direction=(1.0, 0.0, 0.0))
 
 
 def soup() -> np.ndarray:

@@ -23,7 +23,7 @@ _SAMPLES = (_GRID + 0.25) / _FINE
 
 
 def springs(
-    points: Floats, cells: Ints, order: int, attachments: Sequence[schema.Attachment]
+    points: Floats, cells: Ints, order: int, attachments: Sequence[schema.AttachmentSection]
 ) -> sp.csr_array:
     """Springs of all attachments.
 
@@ -62,7 +62,7 @@ def springs(
     return sp.csr_array(total)
 
 
-def within(attachment: schema.Attachment, at: Floats) -> NDArray[np.bool_]:
+def within(attachment: schema.AttachmentSection, at: Floats) -> NDArray[np.bool_]:
     """Which of the places (..., 3) mm an attachment holds, (...)."""
     away = at - np.asarray(attachment.point)
     inside = np.linalg.norm(away, axis=-1) <= attachment.radius_mm

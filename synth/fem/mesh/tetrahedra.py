@@ -60,7 +60,7 @@ class Tets:
 
 
 def block(
-    anatomy: schema.Anatomy,
+    anatomy: schema.AnatomySection,
     tets: int,
     order: int,
     focus: Sequence[Contact] = (),
@@ -112,7 +112,7 @@ def block(
 
 def from_brain(
     brain: Brain,
-    anatomy: schema.Anatomy,
+    anatomy: schema.AnatomySection,
     tets: int,
     order: int,
     focus: Sequence[Contact] = (),
@@ -239,8 +239,8 @@ def _finished(
     cells: Ints,
     order: int,
     wall: NDArray[np.bool_],
-    at: schema.Craniotomy,
-    held: Sequence[schema.Attachment],
+    at: schema.CraniotomySection,
+    held: Sequence[schema.AttachmentSection],
     slips: bool,
 ) -> Tets:
     faces = boundary(cells, order)
@@ -253,7 +253,7 @@ def _finished(
 
 
 def _springs(
-    points: Floats, faces: Ints, order: int, at: schema.Craniotomy, slips: bool
+    points: Floats, faces: Ints, order: int, at: schema.CraniotomySection, slips: bool
 ) -> tuple[sp.csr_array, sp.csr_array]:
     """The skull: springs on the surface that grow, over the rim's width, from none in the opening to firm.
 

@@ -64,7 +64,7 @@ class Surface:
     """Seed of everything else that belongs to this anatomy."""
 
 
-def procedural(relief: Relief, anatomy: schema.Anatomy) -> Surface:
+def procedural(relief: Relief, anatomy: schema.AnatomySection) -> Surface:
     """A cortex of winding gyri on a dome, with veins that stand out of it."""
     extent = _extent(anatomy)
     sulci = _folds(relief, extent)
@@ -78,7 +78,7 @@ def procedural(relief: Relief, anatomy: schema.Anatomy) -> Surface:
 
 
 def from_brain(
-    vertices: Floats, faces: npt.NDArray[np.int32], relief: Relief, anatomy: schema.Anatomy
+    vertices: Floats, faces: npt.NDArray[np.int32], relief: Relief, anatomy: schema.AnatomySection
 ) -> Surface:
     """The part of a user's brain under the opening, seen from outside.
 
@@ -113,7 +113,7 @@ def bulge(tree: Tree, extent_mm: float) -> Map:
     return noise.blur(inside.astype(np.float32), 0.14, extent_mm)
 
 
-def _extent(anatomy: schema.Anatomy) -> float:
+def _extent(anatomy: schema.AnatomySection) -> float:
     return 2 * (anatomy.craniotomy.radius_mm + MARGIN_MM)
 
 
@@ -139,7 +139,7 @@ def _surface(
     height: Callable[[Floats], npt.NDArray[np.floating]],
     sulci: Map,
     relief: Relief,
-    anatomy: schema.Anatomy,
+    anatomy: schema.AnatomySection,
     extent: float,
 ) -> Surface:
     rng = np.random.default_rng([relief.seed, 1])

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from synth.errors import UserError
-from synth.job.schema import Render
+from synth.job.schema import RenderSection
 from synth.render.camera import calibration
 
 Floats = npt.NDArray[np.float64]
@@ -66,7 +66,7 @@ class Camera:
         return -self.rotation.T @ self.translation
 
 
-def calibrated(view: View, render: Render) -> View:
+def calibrated(view: View, render: RenderSection) -> View:
     """The view with a calibrated camera's field and principal point, as `render.calibration` has them."""
     assert render.calibration is not None
     K, width = calibration.read(render.calibration).fitted(render.size), render.size[0]
@@ -75,7 +75,7 @@ def calibrated(view: View, render: Render) -> View:
     return replace(view, field_mm=field_mm, off_centre=(float(x), float(y)))
 
 
-def place(view: View, render: Render) -> Camera:
+def place(view: View, render: RenderSection) -> Camera:
     """The camera of `view`, looking at the world's origin from its working distance."""
     width, height = render.size
     tilt, azimuth, roll = np.deg2rad([view.tilt_deg, view.azimuth_deg, view.roll_deg])
@@ -109,7 +109,7 @@ def place(view: View, render: Render) -> Camera:
     )
 
 
-def refuse_unfit(render: Render) -> None:
+def refuse_unfit(render: RenderSection) -> None:
     """UserError for a calibration that can't be read, or was made from pictures of another shape."""
     if render.calibration is not None:
         calibration.read(render.calibration).fitted(render.size)

@@ -17,7 +17,7 @@ Pictures = npt.NDArray[np.uint8]
 _FORMATS = {"4:4:4": "yuv444p", "4:2:2": "yuv422p", "4:2:0": "yuv420p"}
 
 
-def recorded(pictures: Pictures, section: schema.Sensor, fps: float) -> Pictures:
+def recorded(pictures: Pictures, section: schema.SensorSection, fps: float) -> Pictures:
     """What a recorder gives back of pictures (T, H, W, 3) sRGB; the same pictures without a bitrate.
 
     One thread and no look at the clock: the same bytes every time.

@@ -21,8 +21,8 @@ def test_a_messy_surface_of_every_format_is_meshed_and_moved(suffix: str, tmp_pa
     path = written(tmp_path / f"egg.{suffix}", soup())
     case = schema.Job(
         frames=5,
-        anatomy=schema.Anatomy(mesh=path, vertices=2500, craniotomy=OPENING),
-        fem=schema.Fem(tets=600, load=0.1, gestures=("pull",)),
+        anatomy=schema.AnatomySection(mesh=path, vertices=2500, craniotomy=OPENING),
+        fem=schema.FemSection(tets=600, load=0.1, gestures=("pull",)),
     )
     drawn = scenario.draw(case, 0)
     surface, tets = pipeline.build(case, drawn)
@@ -43,7 +43,7 @@ def test_what_is_no_closed_surface_at_the_craniotomy_is_refused(tmp_path: Path) 
     trimesh.creation.box((50, 50, 0)).export(sheet)
     torn.write_text("ply\nformat ascii 1.0\nelement vertex 3\n")
     bad.write_text("# vtk DataFile Version 3.0\n\nASCII\nDATASET POLYDATA\nPOINTS 2 float\n0 0 0\n")
-    beside = schema.Craniotomy(point=(90.0, 0.0, 0.0), direction=(1.0, 0.0, 0.0))
+    beside = schema.CraniotomySection(point=(90.0, 0.0, 0.0), direction=(1.0, 0.0, 0.0))
     for path, opening in ((sheet, OPENING), (torn, OPENING), (bad, OPENING), (egg, beside)):
         with pytest.raises(UserError):
             brain_surface.load_brain(path, opening)

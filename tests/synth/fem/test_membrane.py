@@ -44,7 +44,7 @@ def test_force_is_the_slope_of_energy_and_stiffness_that_of_force(tets: Tets, li
 
 def test_stretch_pull_and_wrinkles_are_those_of_the_textbook(tets: Tets) -> None:
     """Tension of an incompressible neo-Hookean sheet: even stretch, uniaxial tension, compression."""
-    flat = tetrahedra.block(schema.Anatomy(dome_mm=1e9), 250, 2)
+    flat = tetrahedra.block(schema.AnatomySection(dome_mm=1e9), 250, 2)
     sheet = cover(flat, MembraneSheet(6.0, 1.0), linear=False)
     area = float(sheet.weight.sum())
     assert area == pytest.approx(1e4, rel=1e-9)
@@ -66,7 +66,7 @@ def test_stretch_pull_and_wrinkles_are_those_of_the_textbook(tets: Tets) -> None
 @pytest.mark.slow
 def test_work_over_a_load_cycle_is_the_stored_energy() -> None:
     """The tools' work on the way up is what is stored at the top, and comes back whole."""
-    fem = schema.Fem(gestures=("push",), load=(0.25, 0.25), membrane=schema.Membrane(intact=1))
+    fem = schema.FemSection(gestures=("push",), load=(0.25, 0.25), membrane=schema.MembraneSection(intact=1))
     tissue = replace(scenario.draw_tissue(fem, np.random.default_rng(1)), membrane=Pia(300.0, 0.1, 1.02))
     gesture = scenario.draw_gesture(fem, OPENING_MM, tissue.young_kpa, np.random.default_rng(2))
     tets = tetrahedra.block(ANATOMY, 700, 2, gesture.focus)

@@ -15,14 +15,14 @@ from synth.sequence import scenario
 TISSUE = Tissue(1.0, 0.4, "neo-hookean")
 
 
-def drawn(fem: schema.Fem, seed: int) -> tuple[Gesture, ...]:
+def drawn(fem: schema.FemSection, seed: int) -> tuple[Gesture, ...]:
     rng = np.random.default_rng(seed)
     return scenario.draw_gestures(fem, OPENING_MM, TISSUE.young_kpa, rng, rng)
 
 
 @pytest.mark.parametrize("law", ["linear", "neo-hookean"])
 def test_labels_of_two_instruments_add_up_and_both_touch(law: str) -> None:
-    fem = schema.Fem(law=law, tets=400, load=(0.1, 0.15), instruments=2, gestures=("pull", "push"))
+    fem = schema.FemSection(law=law, tets=400, load=(0.1, 0.15), instruments=2, gestures=("pull", "push"))
     gestures, frames = drawn(fem, 3), 17
     tissue = Tissue(1.0, 0.4, law)
     tets, surface = block(fem), patch()
@@ -49,7 +49,7 @@ def test_labels_of_two_instruments_add_up_and_both_touch(law: str) -> None:
 
 
 def test_a_force_takes_the_place_of_the_load() -> None:
-    fem = schema.Fem(force_mn=(3.0, 5.0), young_kpa=(2.0, 3.0), footprint_mm=(3.0, 4.0))
+    fem = schema.FemSection(force_mn=(3.0, 5.0), young_kpa=(2.0, 3.0), footprint_mm=(3.0, 4.0))
     assert fem.largest_load == pytest.approx(5.0 / 18)
     for seed in range(20):
         tissue = scenario.draw_tissue(fem, np.random.default_rng(seed))
@@ -57,4 +57,4 @@ def test_a_force_takes_the_place_of_the_load() -> None:
         force = np.linalg.norm(gesture.contacts[0].force_mn)
         assert 3.0 <= force <= 5.0
         assert force == pytest.approx(gesture.load * tissue.young_kpa * gesture.footprint_mm**2)
-    assert schema.Fem(force_mn=0.2).chosen_law[0] == "linear"
+    assert schema.FemSection(force_mn=0.2).chosen_law[0] == "linear"

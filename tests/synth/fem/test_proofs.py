@@ -143,7 +143,7 @@ def _manufactured(n: int, order: int) -> float:
 
 def loaded(law: str, load: float, kind: str) -> tuple[System, Floats]:
     """A block under one contact, and the load for E = 1 kPa."""
-    anatomy = schema.Anatomy()
+    anatomy = schema.AnatomySection()
     tets = tetrahedra.block(anatomy, 700, 2, ((2.0, 1.0, 4.0),))
     vertices, faces = patch()
     area = surface_embedding.vertex_area(vertices, faces)

@@ -16,7 +16,7 @@ RATE, FRAMES = 10.0, 61
 
 
 def moved(pulse: Pulse | None, law: str, **fem: object) -> solver.Deformation:
-    asked = schema.Fem.model_validate({"gestures": ("pull",), "load": 0.1, "law": law} | fem)
+    asked = schema.FemSection.model_validate({"gestures": ("pull",), "load": 0.1, "law": law} | fem)
     tissue = scenario.draw_tissue(asked, np.random.default_rng(1))
     gesture = scenario.draw_gesture(asked, OPENING_MM, tissue.young_kpa, np.random.default_rng(2))
     tets = tetrahedra.block(ANATOMY, 300, 2, gesture.focus)

@@ -20,11 +20,13 @@ from synth.job import laws, schema
 from synth.sequence import scenario
 
 
-def drawn(fem: schema.Fem, tissue: Tissue, seed: int = 5) -> Gesture:
+def drawn(fem: schema.FemSection, tissue: Tissue, seed: int = 5) -> Gesture:
     return scenario.draw_gesture(fem, OPENING_MM, tissue.young_kpa, np.random.default_rng(seed))
 
 
-def run(fem: schema.Fem, gesture: Gesture | None = None, seed: int = 5, frames: int = 12) -> Deformation:
+def run(
+    fem: schema.FemSection, gesture: Gesture | None = None, seed: int = 5, frames: int = 12
+) -> Deformation:
     tissue = scenario.draw_tissue(fem, np.random.default_rng(seed))
     gesture = gesture or drawn(fem, tissue, seed)
     return deform(fem, tissue, [gesture], block(fem), patch(), frames, 25.0)
@@ -59,7 +61,7 @@ def test_embedding_reproduces_what_the_elements_can_hold(order: int) -> None:
 
 @pytest.mark.parametrize("kind", ["pull", "slide", "tap"])
 def test_rest_frame_is_at_rest_and_the_tool_comes_touches_and_leaves(kind: str) -> None:
-    fem = schema.Fem(tets=400, gestures=(kind,), load=(0.1, 0.1))
+    fem = schema.FemSection(tets=400, gestures=(kind,), load=(0.1, 0.1))
     motion = run(fem, frames=25)
     assert not motion.displacement[0].any()
     assert not motion.force[0].any()
@@ -82,7 +84,7 @@ def test_rest_frame_is_at_rest_and_the_tool_comes_touches_and_leaves(kind: str) 
 
 
 def test_motion_depends_on_force_over_stiffness_alone() -> None:
-    fem = schema.Fem(tets=400)
+    fem = schema.FemSection(tets=400)
     soft, stiff = (Tissue(young_kpa=e, poisson=0.4, law="neo-hookean") for e in (1.0, 2.5))
     one, other = (
         deform(fem, tissue, [drawn(fem, tissue)], block(fem), patch(), 6, 25.0) for tissue in (soft, stiff)
@@ -92,14 +94,14 @@ def test_motion_depends_on_force_over_stiffness_alone() -> None:
 
 
 def test_auto_takes_the_cheapest_law_within_the_tolerance() -> None:
-    assert [schema.Fem(load=load).chosen_law[0] for load in (0.05, 0.4)] == ["linear", "neo-hookean"]
+    assert [schema.FemSection(load=load).chosen_law[0] for load in (0.05, 0.4)] == ["linear", "neo-hookean"]
 
 
 def test_what_no_law_or_surface_holds_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    fem = schema.Fem(tets=400)
+    fem = schema.FemSection(tets=400)
     gesture = drawn(fem, Tissue(1.0, 0.4, "neo-hookean"))
     with pytest.raises(ValidationError):
-        schema.Fem(law="linear", load=(3.0, 3.0))
+        schema.FemSection(law="linear", load=(3.0, 3.0))
     with pytest.raises(UserError):
         run(fem, replace(gesture, load=3.0))
     away = replace(gesture.contacts[0], point_mm=(200.0, 0.0))
@@ -107,4 +109,4 @@ def test_what_no_law_or_surface_holds_is_refused(monkeypatch: pytest.MonkeyPatch
         run(fem, replace(gesture, contacts=(away,)))
     monkeypatch.setitem(laws.LARGEST_LOAD, "corotational", 10.0)
     with pytest.raises(InvertedElement):
-        run(schema.Fem(law="corotational", load=(8.0, 8.0), gestures=("push",), tets=400))
+        run(schema.FemSection(law="corotational", load=(8.0, 8.0), gestures=("push",), tets=400))

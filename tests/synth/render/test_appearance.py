@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from synth.job.schema import Job, Light, Render
+from synth.job.schema import Job, LightSection, RenderSection
 from synth.render.anatomy import surface as anatomy
 from synth.render.anatomy import texture
 from synth.render.anatomy.surface import Relief, Surface
@@ -52,9 +52,9 @@ def test_a_photograph_is_the_albedo(brain: Surface, tmp_path: Path) -> None:
 
 
 def test_the_spot_moves_with_the_microscope_and_is_one_for_both_eyes() -> None:
-    render = Render(stereo_mm=24.0)
+    render = RenderSection(stereo_mm=24.0)
     lens = camera.place(scenario.draw_view(render, np.random.default_rng(2)), render)
-    drawn = scenario.draw_light(Light(even=(0.3, 0.3)), np.random.default_rng(0))
+    drawn = scenario.draw_light(LightSection(even=(0.3, 0.3)), np.random.default_rng(0))
     right = camera.beside(lens, 24.0)
     field = lens.size[0] * lens.mm_per_px
     axis = lens.centre / np.linalg.norm(lens.centre)

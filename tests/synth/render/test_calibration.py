@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from synth.errors import UserError
-from synth.job.schema import Render
+from synth.job.schema import RenderSection
 from synth.render.camera import calibration, camera
 from synth.sequence import scenario
 
@@ -34,7 +34,7 @@ def test_what_opencv_wrote_is_read(tmp_path: Path, name: str) -> None:
 
 
 def test_the_camera_projects_as_opencv_does(tmp_path: Path) -> None:
-    render = Render(calibration=written(tmp_path / "c.yaml"), tilt_deg=(12.0, 12.0))
+    render = RenderSection(calibration=written(tmp_path / "c.yaml"), tilt_deg=(12.0, 12.0))
     lens = camera.place(scenario.draw_view(render, np.random.default_rng(3)), render)
     points = np.random.default_rng(0).uniform(-10, 10, (50, 3))
     turn, _ = cv2.Rodrigues(lens.rotation)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from synth.errors import UserError
-from synth.job.schema import Render
+from synth.job.schema import RenderSection
 from synth.render.camera import camera
 from synth.sequence import scenario
 
@@ -13,7 +13,7 @@ STRONG = (-0.3, 0.2, 0.01, -0.02, 0.1)
 
 
 def seen(distortion: tuple[float, ...], seed: int = 3) -> camera.Camera:
-    render = Render(size=(160, 120), distortion=distortion, field_mm=(150.0, 150.0))
+    render = RenderSection(size=(160, 120), distortion=distortion, field_mm=(150.0, 150.0))
     return camera.place(scenario.draw_view(render, np.random.default_rng(seed)), render)
 
 
@@ -35,7 +35,7 @@ def test_a_ray_comes_back_to_its_pixel(distortion: tuple[float, ...]) -> None:
 
 
 def test_it_looks_at_the_craniotomy_from_its_distance_and_tilt() -> None:
-    render = Render(tilt_deg=(15.0, 15.0), working_distance_mm=(300.0, 300.0), field_mm=(35.0, 35.0))
+    render = RenderSection(tilt_deg=(15.0, 15.0), working_distance_mm=(300.0, 300.0), field_mm=(35.0, 35.0))
     lens = camera.place(scenario.draw_view(render, np.random.default_rng(1)), render)
     np.testing.assert_allclose(camera.project(lens, np.zeros((1, 3)))[0], [319.5, 239.5])
     assert np.linalg.norm(lens.centre) == pytest.approx(300)

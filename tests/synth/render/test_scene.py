@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from synth.job.schema import Anatomy, Job, Render, Store
+from synth.job.schema import AnatomySection, Job, RenderSection, StoreSection
 from synth.render.anatomy import surface as anatomy
 from synth.render.camera import camera
 from synth.render.mitsuba.adapter import cuda
@@ -25,7 +25,9 @@ def studio(
 ) -> tuple[Studio, np.ndarray]:
     settings = {"size": (96, 72), "spp": spp, "variant": variant, **render}
     job = Job(
-        anatomy=Anatomy(vertices=2500), render=Render.model_validate(settings), store=Store(extra=extra)
+        anatomy=AnatomySection(vertices=2500),
+        render=RenderSection.model_validate(settings),
+        store=StoreSection(extra=extra),
     )
     surface = anatomy.procedural(scenario.draw_relief(job.anatomy, np.random.default_rng(4)), job.anatomy)
     view = scenario.draw_view(job.render, np.random.default_rng(4))

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from synth.job.schema import Anatomy, Job, Render
+from synth.job.schema import AnatomySection, Job, RenderSection
 from synth.render.anatomy import surface as anatomy
 from synth.render.camera import camera
 from synth.render.scene import Studio
@@ -19,7 +19,7 @@ SHAFTS = np.array([[0.6, 0.3, 0.74], [0.6, 0.3, 0.74]])
 
 def studio(parts: tuple[str, ...], tool: bool = False) -> tuple[Studio, np.ndarray]:
     render = {"size": (96, 72), "variant": "scalar_rgb", "tool": tool, "scenery": parts}
-    job = Job(anatomy=Anatomy(vertices=2500), render=Render.model_validate(render))
+    job = Job(anatomy=AnatomySection(vertices=2500), render=RenderSection.model_validate(render))
     surface = anatomy.procedural(scenario.draw_relief(job.anatomy, np.random.default_rng(4)), job.anatomy)
     view = scenario.draw_view(job.render, np.random.default_rng(4))
     look = replace(scenario.draw_look(job, "healthy", np.random.default_rng(4)), scenery=parts)

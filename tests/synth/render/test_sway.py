@@ -5,11 +5,11 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from synth.job.schema import Render
+from synth.job.schema import RenderSection
 from synth.render.camera import camera
 from synth.sequence import scenario
 
-RENDER = Render(tilt_deg=(15.0, 15.0), drift_mm=(0.4, 0.4), vibration_mm=(0.02, 0.02))
+RENDER = RenderSection(tilt_deg=(15.0, 15.0), drift_mm=(0.4, 0.4), vibration_mm=(0.02, 0.02))
 LENS = camera.place(scenario.draw_view(RENDER, np.random.default_rng(1)), RENDER)
 
 

@@ -8,7 +8,7 @@ import pytest
 import trimesh
 
 from synth.geometry.triangles import Shape
-from synth.job.schema import Anatomy, Render
+from synth.job.schema import AnatomySection, RenderSection
 from synth.render import truth
 from synth.render.anatomy import surface as anatomy
 from synth.render.anatomy.surface import Surface
@@ -21,13 +21,13 @@ NOTHING = Shape(np.array([[0.0, 0.0, -900.0]] * 3), np.array([[0, 1, 2]], np.int
 
 @pytest.fixture(scope="module")
 def surface() -> Surface:
-    section = Anatomy(vertices=2500)
+    section = AnatomySection(vertices=2500)
     return anatomy.procedural(scenario.draw_relief(section, np.random.default_rng(5)), section)
 
 
 @pytest.fixture(scope="module")
 def lens() -> Camera:
-    render = Render(size=(96, 72), tilt_deg=(20.0, 20.0), distortion=(-0.3, 0.1, 0.004, -0.003, 0.0))
+    render = RenderSection(size=(96, 72), tilt_deg=(20.0, 20.0), distortion=(-0.3, 0.1, 0.004, -0.003, 0.0))
     return camera.place(scenario.draw_view(render, np.random.default_rng(2)), render)
 
 
@@ -40,10 +40,10 @@ def bump(surface: Surface) -> np.ndarray:
 
 def test_rays_meet_what_trimesh_meets_even_where_triangles_bow() -> None:
     """Faces of up to some 20 px through a lens 60 mm away that shortens the corner by a tenth."""
-    section = Anatomy(vertices=400)
+    section = AnatomySection(vertices=400)
     coarse = anatomy.procedural(scenario.draw_relief(section, np.random.default_rng(5)), section)
     bent = (-0.9, 0.8, 0.01, -0.01, 0.0)
-    render = Render(size=(320, 240), working_distance_mm=(60.0, 60.0), distortion=bent)
+    render = RenderSection(size=(320, 240), working_distance_mm=(60.0, 60.0), distortion=bent)
     near = camera.place(scenario.draw_view(render, np.random.default_rng(2)), render)
     rest = truth.still(near, Shape(coarse.vertices, coarse.faces), NOTHING)
     pixels = camera.pixel_grid(near.size)[::11]
@@ -115,7 +115,7 @@ def test_a_triangle_with_a_corner_behind_the_lens_is_dropped(lens: Camera, turn:
 
 
 def test_areas_of_pixels_add_up_to_the_surfaces(surface: Surface) -> None:
-    render = Render(size=(320, 240), field_mm=(60.0, 60.0), tilt_deg=(20.0, 20.0))
+    render = RenderSection(size=(320, 240), field_mm=(60.0, 60.0), tilt_deg=(20.0, 20.0))
     lens = camera.place(scenario.draw_view(render, np.random.default_rng(2)), render)
     rest = truth.still(lens, Shape(surface.vertices, surface.faces), NOTHING)
     mesh = trimesh.Trimesh(surface.vertices, surface.faces, process=False)

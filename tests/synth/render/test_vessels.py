@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from synth.job.schema import Anatomy
+from synth.job.schema import AnatomySection
 from synth.render.anatomy import surface
 from synth.render.anatomy.tree import murray
 from synth.sequence import scenario
@@ -20,14 +20,14 @@ def test_cubes_of_radii_add_up() -> None:
 @pytest.mark.parametrize("radius_mm", [4.0, 30.0])
 def test_every_anatomy_grows(radius_mm: float) -> None:
     """Small openings have trunks so short that none of their nodes may be drawn to sprout."""
-    section = Anatomy.model_validate({"craniotomy": {"radius_mm": radius_mm}, "vertices": 900})
+    section = AnatomySection.model_validate({"craniotomy": {"radius_mm": radius_mm}, "vertices": 900})
     for seed in range(1 if radius_mm > 5 else 4):
         made = surface.procedural(scenario.draw_relief(section, np.random.default_rng(seed)), section)
         assert np.isfinite(made.vertices).all()
 
 
 def test_every_twig_has_a_parent() -> None:
-    section = Anatomy()
+    section = AnatomySection()
     made = surface.procedural(scenario.draw_relief(section, np.random.default_rng(3)), section)
     for tree in (made.vessels.arteries, made.vessels.veins, made.vessels.deep):
         child = np.flatnonzero(tree.parent >= 0)

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from synth.job.schema import Sensor as Section
+from synth.job.schema import SensorSection as Section
 from synth.render.camera import video_link
 
 
