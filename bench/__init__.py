@@ -11,7 +11,7 @@ _WHERE = {
     "Scene": "bench.methods.protocol",
     "Settings": "synth.recording_flow.video_flow",
     "export_recording": "bench.recording.from_sequence",
-    "score": "bench.scoring.commands",
+    "score": "bench.scoring.score",
 }
 
 __all__ = [*_WHERE]

@@ -6,7 +6,7 @@ import json as json_
 import shlex
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -14,7 +14,8 @@ from synth.errors import UserError
 from synth.system.cli_errors import Commands, printable
 
 if TYPE_CHECKING:
-    from bench.scoring.result import Result
+    from bench.recording.folder import Recording
+    from synth.recording_flow.video_flow import Settings
 
 app = typer.Typer(
     name="bench",
@@ -69,16 +70,17 @@ def score(
     json: Json = False,
 ) -> None:
     """Force from a recording's video, scored against its sensor: score.json and report.html."""
-    from bench.scoring import commands
+    from bench.methods.network import Model
+    from bench.recording.folder import open_recording
     from synth.recording_flow.video_flow import Settings
     from synth.video.mask_files import read_choice
 
-    others = {name: Path(folder) for name, folder in _pairs("--also", also, "NAME=FOLDER").items()}
+    others = {name: Model(Path(at)) for name, at in _pairs("--also", also, "NAME=FOLDER").items()}
     kind, files = read_choice(masks)
+    opened = open_recording(recording, phantom).within(files, _rectangle(region))
     settings = Settings(backend=flow, shrink=shrink, rate_hz=rate or None, pulse=pulse, masks=kind)
-    seen = commands.Seen(files, _rectangle(region))
-    result = commands.score_recording(recording, model, out, settings, title, train, others, phantom, seen)
-    _say(result, out or Path(f"{result.recording}-score"), json)
+    folder = out or Path(f"{opened.name}-score")
+    _score(opened, model, folder, settings, title, json, methods=others, train=train)
 
 
 @app.command(epilog="Example: bench pool a-score b-score --out pooled")
@@ -175,10 +177,13 @@ def demo(
     json: Json = False,
 ) -> None:
     """Scores a model on a sequence of its dataset that it has not seen, by way of a recording."""
-    from bench.scoring import commands
+    from bench.recording.folder import open_recording
+    from bench.scoring.demo import export_unseen
     from synth.recording_flow.video_flow import Settings
 
-    _say(commands.score_demo(dataset, model, out, Settings(backend=flow, rate_hz=None)), out, json)
+    index = export_unseen(dataset, model, out / "recording")
+    title = f"Force from video: sequence {index}, unseen in training"
+    _score(open_recording(out / "recording"), model, out, Settings(backend=flow, rate_hz=None), title, json)
 
 
 @app.command(
@@ -253,14 +258,39 @@ def _typed() -> str:
     return shlex.join(["bench", *sys.argv[1:]])
 
 
-def _say(result: Result, folder: Path, json: bool) -> None:
+def _score(
+    opened: Recording,
+    model: Path | None,
+    folder: Path,
+    settings: Settings,
+    title: str,
+    json: bool,
+    **more: Any,
+) -> None:
+    """Scores a recording, writes into `folder`, and prints; `more`: of `bench.score`."""
     from rich.console import Console
+    from threadpoolctl import threadpool_limits
 
     from bench.scoring import headline, report
-    from bench.scoring import result as results
+    from bench.scoring.result import as_json
+    from bench.scoring.score import score
+    from learn.inference.shipped import choose_model
+    from learn.training.threads import set_threads
 
+    # NumPy's BLAS too: a second thread of its own waits for a core that the flow has.
+    threadpool_limits(set_threads(None))
+    result = score(
+        opened,
+        model or choose_model(opened.has_two_eyes),
+        settings=settings,
+        out=folder,
+        title=title,
+        progress=True,
+        own_process=True,
+        **more,
+    )
     if json:
-        print(json_.dumps(results.as_json(result), allow_nan=False))
+        print(json_.dumps(as_json(result), allow_nan=False))
         return
     console = Console()
     first = headline.headline(result)
@@ -308,7 +338,7 @@ def live(
     kind, files = read_choice(masks)
     # Without a scale there is no force: flow alone is what is asked for.
     model = model or (choose_model(two_eyes=False) if scale else None)
-    method = None if model is None else Model(model, quick=True)
+    method = None if model is None else Model(model)
 
     def tell(frame: stream.Frame) -> None:
         force = "" if frame.force_mn is None else f"  {frame.force_mn:8.2f} mN"

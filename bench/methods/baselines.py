@@ -6,7 +6,7 @@ for a linear solid, force over E is a function of displacement.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, ClassVar, Literal
 
@@ -108,10 +108,10 @@ def physical_rules() -> dict[str, Rule]:
     return {name: _inverse(solve) for name, solve in solvers.items()}
 
 
-def fitted(clips: Sequence[Clip], source: str) -> dict[str, Method]:
-    """Those fitted on sequences, behind the bench's protocol. Arguments as `fitted_rules`."""
+def as_methods(rules: Mapping[str, Rule], source: str) -> dict[str, Method]:
+    """Rules fitted on a displacement `source`, behind the bench's protocol."""
     space: Space = "always" if has_depth(source) else "never"
-    return {name: Baseline(rule, space) for name, rule in fitted_rules(clips, source).items()}
+    return {name: Baseline(rule, space) for name, rule in rules.items()}
 
 
 def fitted_rules(clips: Sequence[Clip], source: str) -> dict[str, Rule]:

@@ -20,16 +20,11 @@ if TYPE_CHECKING:
 class Model:
     """A model of `learn train`. Without a known E it answers for tissue of 1 kPa."""
 
-    def __init__(self, model: Path | Predictor, quick: bool = False) -> None:
-        """Loads the network; UserError if it can't be read.
-
-        Args:
-            model: its folder, or the model itself.
-            quick: of a folder: spend half a second on a graph that takes a third less a frame.
-        """
+    def __init__(self, model: Path | Predictor) -> None:
+        """`model`: the model itself, or its folder, made into a quick graph. UserError if unreadable."""
         from learn.inference.predict import load_model
 
-        self.predictor: Predictor = load_model(model, quick=quick) if isinstance(model, Path) else model
+        self.predictor: Predictor = load_model(model, quick=True) if isinstance(model, Path) else model
         self._reader: tuple[Scene, ForceReader] | None = None
 
     def described(self) -> dict[str, object]:

@@ -170,7 +170,7 @@ def _check_following(recording: Recording, found: _Checked) -> None:
     pictures = (picture for picture in recording.frames() if picture.index in wanted)
     footage = Footage(pictures, str(recording.folder), recording.tissue_mask, tool, first)
     video, account = VideoFlow(footage, Settings(rate_hz=None, pulse=False)), Account()
-    second = SecondEye(recording, video) if recording.right or recording.depths else None
+    second = SecondEye(recording, video) if recording.has_two_eyes else None
     for step in video.steps():
         account.add(step.found, video.tissue)
         if second is not None:

@@ -76,6 +76,11 @@ class Recording:
         return bool(self.masks) or self.mask is not None
 
     @property
+    def has_two_eyes(self) -> bool:
+        """Whether a second eye or a depth camera saw it too."""
+        return bool(self.right or self.depths)
+
+    @property
     def name(self) -> str:
         return self.folder.resolve().name
 
@@ -121,9 +126,11 @@ class Recording:
             tissue &= inside
         return tissue
 
-    def with_masks(self, files: MaskFiles) -> Recording:
-        """Its tool as other files have it."""
-        return replace(self, masks=files.numbered, mask=files.still)
+    def within(self, masks: MaskFiles | None, region: tuple[int, int, int, int] | None) -> Recording:
+        """The same with the tool as other files have it, and looked at in a region (see `region`) only."""
+        if masks is None:
+            return replace(self, region=region)
+        return replace(self, masks=masks.numbered, mask=masks.still, region=region)
 
     def _timed(self, picture: Picture) -> Picture:
         time_s, fps = picture.time_s, self.meta.fps

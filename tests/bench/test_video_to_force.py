@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 import bench.cli
 import learn.cli
-from bench.scoring import commands
+from bench.methods import comparison
 
 FPS, SIZE = 25.0, (96, 704)
 
@@ -32,7 +32,7 @@ def test_predict_and_score_agree_at_every_frame(
     marked[8:-8, 40:-90] = 255
     cv2.imwrite(str(folder / "tissue.png"), marked)
     # The other methods are slow, and no part of the question.
-    monkeypatch.setattr(commands, "fit_baselines", lambda train, model, two_eyes=False: {})
+    monkeypatch.setattr(comparison, "simpler_methods", lambda train, model, two_eyes=False: {})
 
     words = [str(model), str(folder / "video.mp4"), "--scale", "0.2", "--tissue", str(folder / "tissue.png")]
     words += [] if young is None else ["--young", str(young)]

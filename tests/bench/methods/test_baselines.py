@@ -44,7 +44,7 @@ def clips(count: int = 12, frames: int = 5) -> list[Clip]:
 
 @pytest.fixture(scope="module")
 def methods() -> dict[str, Method]:
-    return baselines.fitted(clips(), "recovered")
+    return baselines.as_methods(baselines.fitted_rules(clips(), "recovered"), "recovered")
 
 
 def ask(method: Method, force: NDArray[np.float64], young: float) -> float:
@@ -146,7 +146,7 @@ def test_fitted_on_two_eyes_asks_for_two() -> None:
         told.append(
             replace(clip, displacement={"motion": np.concatenate([moved, 0.5 * moved[:, :1]], axis=1)})
         )
-    method = baselines.fitted(told, "motion")["ridge on PCA of flow"]
+    method = baselines.as_methods(baselines.fitted_rules(told, "motion"), "motion")["ridge on PCA of flow"]
     force = np.array([6.0, 0, 0])
     scene = Scene(np.ones((96, 96), bool), 36 / 96, 1.0)
     axis = (np.arange(96) - 47.5) * 36 / 96

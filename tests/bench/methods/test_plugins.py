@@ -11,8 +11,7 @@ from fake_model import write_model
 from fake_recording import Maker
 
 import bench
-from bench.methods import plugins
-from bench.scoring import commands
+from bench.methods import comparison, plugins
 from synth.errors import UserError
 
 CODE = '''
@@ -61,7 +60,7 @@ def test_it_is_scored_and_shown_beside_the_network(
     installed(tmp_path, monkeypatch, pushes="Push")
     model = write_model(tmp_path / "model", "arch.output=vector")
     settings = bench.Settings(rate_hz=None, pulse=False)
-    result = commands.score_recording(recording, model, tmp_path / "score", settings)
+    result = bench.score(recording, model, settings=settings, out=tmp_path / "score")
     assert next(iter(result.methods)) == "D2FNet"
     own = result.methods["pushes"]
     assert own.scores["mae_mn"] < result.methods["zero"].scores["mae_mn"] / 3
@@ -87,4 +86,4 @@ def test_what_is_wrong_in_it_names_it(
 def test_a_name_of_ours_is_not_taken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     installed(tmp_path, monkeypatch, mean="Push")
     with pytest.raises(UserError, match="mean"):
-        commands.fit_baselines(None, None)
+        comparison.simpler_methods(None, None)

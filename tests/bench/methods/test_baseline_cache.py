@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from made_clip import made_clip
 
-from bench.methods import baselines, kept_rules
+from bench.methods import baseline_cache, baselines
 from bench.methods.baselines import Rule
 from synth.dataset import provenance
 from synth.system import cache
@@ -27,7 +27,7 @@ def test_rules_are_fitted_once_for_a_model(tmp_path: Path, monkeypatch: pytest.M
             times.append(1)
             return baselines.fitted_rules(clips, "recovered")
 
-        return kept_rules.keep_rules(list(hashes), source, fit)
+        return baseline_cache.cached_rules(list(hashes), source, fit)
 
     first, again = kept("ab"), kept("ab")
     assert len(times) == 1

@@ -6,9 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from bench.scoring import commands
+from bench.scoring import demo as demos
 from synth.errors import UserError
-from synth.recording_flow.video_flow import Settings
 
 
 def test_the_demo_replaces_its_own_recording_and_nobody_elses(
@@ -18,12 +17,11 @@ def test_the_demo_replaces_its_own_recording_and_nobody_elses(
         folder.mkdir()
         (folder / "meta.yaml").touch()
 
-    monkeypatch.setattr(commands, "find_unseen", lambda dataset, model: type("", (), {"index": 0}))
-    monkeypatch.setattr(commands, "export_recording", export)
-    monkeypatch.setattr(commands, "score_recording", lambda *asked: None)
+    monkeypatch.setattr(demos, "find_unseen", lambda dataset, model: type("", (), {"index": 0}))
+    monkeypatch.setattr(demos, "export_recording", export)
 
     def demo() -> None:
-        commands.score_demo(tmp_path, tmp_path, tmp_path, Settings())
+        demos.export_unseen(tmp_path, tmp_path, tmp_path / "recording")
 
     mine = tmp_path / "recording" / "operation.mp4"
     mine.parent.mkdir()

@@ -17,7 +17,7 @@ from synth.system.checked_file import write_whole
 _MOST = 8
 
 
-def keep_rules(hashes: Sequence[str], source: str, fit: Callable[[], dict[str, Rule]]) -> dict[str, Rule]:
+def cached_rules(hashes: Sequence[str], source: str, fit: Callable[[], dict[str, Rule]]) -> dict[str, Rule]:
     """The fitted rules of a set of sequences, from this user's cache if they were fitted before.
 
     Args:
@@ -26,9 +26,9 @@ def keep_rules(hashes: Sequence[str], source: str, fit: Callable[[], dict[str, R
         fit: fits them.
     """
     code = provenance.source("synth", "learn", "bench/methods")
-    said = "\n".join([code, sklearn.__version__, source, *hashes]).encode()
+    key = "\n".join([code, sklearn.__version__, source, *hashes]).encode()
     folder = cache.folder("baselines")
-    file = folder / f"{hashlib.sha256(said).hexdigest()[:32]}.pickle"
+    file = folder / f"{hashlib.sha256(key).hexdigest()[:32]}.pickle"
     # Half a file, of a disk that was full, is no fit; nor is one of another Python.
     with contextlib.suppress(OSError, EOFError, pickle.UnpicklingError, AttributeError, ImportError):
         rules: dict[str, Rule] = pickle.loads(file.read_bytes())

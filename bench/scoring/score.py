@@ -1,0 +1,115 @@
+"""`bench.score` and `bench score`: a folder or opened recording in, score.json and report.html out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from contextlib import AbstractContextManager, nullcontext
+from pathlib import Path
+from typing import Any
+
+from bench.methods import comparison, plugins
+from bench.methods.comparison import MAIN
+from bench.methods.network import Model
+from bench.methods.protocol import Method
+from bench.recording import pixel_scale
+from bench.recording.folder import Recording, open_recording
+from bench.scoring import report
+from bench.scoring.evaluate_recording import evaluate_recording
+from bench.scoring.result import Result, write_json
+from bench.tracking import flow_process
+from bench.tracking.tracking import Progress
+from learn.inference.predict import Predictor
+from learn.inference.shipped import NONE, choose_model, find_model
+from synth.errors import UserError
+from synth.recording_flow.video_flow import FlowHere, Settings
+from synth.system import checked_file
+from synth.system.terminal import counting
+
+_ROOM_BYTES = 32 << 20  # score.json and report.html, with the charts' program in it
+_LONG = 100
+"""Frames from which a second process is worth the seconds that it takes to start."""
+
+
+def score(
+    recording: str | Path | Recording,
+    model: str | Path | Predictor | None = None,
+    *,
+    methods: Mapping[str, Method] | None = None,
+    baselines: bool = True,
+    train: str | Path | None = None,
+    settings: Settings | None = None,
+    out: str | Path | None = None,
+    title: str = "",
+    progress: bool = False,
+    own_process: bool = False,
+) -> Result:
+    """Scores a model, methods of one's own, or both, on a recording; writes only where `out` says.
+
+    Args:
+        recording: its folder, or what `open_recording` made of it.
+        model: of `learn.load_model`, its folder, mono or stereo; it is called D2FNet in the tables. Where
+            neither it nor methods are given, what comes with this version.
+        methods: further ones by name; the first is what the result is about where there is no model.
+        baselines: whether the simpler methods are scored beside.
+        train: the dataset the model was trained on; those that need data are fitted on the same sequences.
+        settings: flow back end, rate, masks; as the command's if None.
+        out: folder for score.json and report.html, both whole or not at all.
+        title: heading of the report.
+        progress: whether a bar is drawn, in a terminal or a notebook.
+        own_process: whether the flow of a long recording is computed in a process of its own, which imports
+            the main module again.
+
+    Returns:
+        `Result.methods[name].scores` has the numbers, `Result.time_s` and `.size_mn` of each the curves.
+
+    Raises:
+        UserError: recording, model or settings that can't be used, or nothing to score; nothing is written.
+    """
+    if train is not None and (isinstance(model, Predictor) or (model is None and methods)):
+        raise UserError("score: train needs the model's folder, which says what it was fitted on")
+    opened = recording if isinstance(recording, Recording) else open_recording(Path(recording))
+    if model is None and not methods:
+        model = choose_model(opened.has_two_eyes)
+        if model is None:
+            raise UserError(f"nothing to score, say a model or methods: {NONE}")
+    elif isinstance(model, (str, Path)):
+        model = find_model(model)
+    folder = model if isinstance(model, Path) else None
+    frames = opened.expected_frames()
+    flow: AbstractContextManager[FlowHere | None] = nullcontext()
+    if own_process and (frames or _LONG) >= _LONG:
+        flow = flow_process.elsewhere()
+    written: AbstractContextManager[None] = nullcontext()
+    if out is not None:
+        written = checked_file.made_folder(Path(out), _ROOM_BYTES)
+    bar: AbstractContextManager[Progress] = nullcontext(lambda done: None)
+    if progress:
+        bar = counting(f"scoring {opened.name}", frames)
+    # The process is started first, for it takes seconds to begin; the methods are fitted meanwhile.
+    with written, flow as elsewhere:
+        network = None if model is None else Model(model)
+        chosen: dict[str, Method] = {**({MAIN: network} if network else {}), **(methods or {})}
+        if baselines:
+            simple = comparison.simpler_methods(Path(train) if train else None, folder, opened.has_two_eyes)
+            chosen |= {name: one for name, one in simple.items() if name not in chosen}
+        described: dict[str, Any] = {} if network is None else {"model": network.described()}
+        if sources := {name: where for name, where in plugins.sources().items() if name in chosen}:
+            described["plug_ins"] = sources
+        scale = pixel_scale.find_scale(opened.meta, opened.folder)
+        with bar as told:
+            result = evaluate_recording(
+                opened, chosen, next(iter(chosen)), scale, settings or Settings(), described, told, elsewhere
+            )
+        if out is not None:
+            write_result(result, Path(out), title)
+    return result
+
+
+def write_result(result: Result, folder: Path, title: str) -> None:
+    """Writes score.json and report.html: both are whole before either has its name."""
+    with (
+        checked_file.part_of(folder / "score.json") as scores,
+        checked_file.part_of(folder / "report.html") as page,
+    ):
+        write_json(result, scores)
+        report.write_report(result, page, title)
