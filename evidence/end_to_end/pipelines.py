@@ -26,7 +26,7 @@ from synth.flow.estimator import Estimator
 from synth.flow.track import track
 from synth.job import identity
 from synth.job.schema import FemSection, FlowSection, Job, RenderSection
-from synth.sequence import pipeline
+from synth.sequence import pipeline, scene
 
 FRAMES, SIZE, VERTICES, LOAD, GESTURES = 8, (256, 192), 8000, (0.05, 0.2), ("pull", "push")
 _MODELS = (models.RIDGE, models.NEAREST, models.PHYSICS)
@@ -156,7 +156,7 @@ class Sequences:
         began = time.process_time()
         hidden = mask.hidden(sequence["rgb"][...], sequence["tool"][...].astype(bool))
         masks_s = time.process_time() - began
-        estimator = pipeline.estimator(self._job.flow.model_copy(update={"backend": flow}))
+        estimator = scene.estimator(self._job.flow.model_copy(update={"backend": flow}))
         recovered, flow_s = recover_flow(sequence, clip, estimator, hidden, GRID)
         spent = (masks_s + flow_s) / (clip.frames - 1)
         write_whole(self._flow_cost(index, flow), str(spent), durable=False)

@@ -18,7 +18,7 @@ from synth.fem import equilibrium, surface_embedding, tool
 from synth.fem.mesh import tetrahedra
 from synth.fem.mesh.relief import HeightMap
 from synth.job.schema import Job
-from synth.sequence import pipeline, scenario
+from synth.sequence import mechanics, scenario
 
 Row = dict[str, Any]
 _JOB = Job(sequences=1000)
@@ -45,7 +45,7 @@ def measure_scene(index: int, count: int) -> Row:
     Half of the load is taken first.
     """
     case = scenario.draw(_JOB, index)
-    surface, _ = pipeline.cortex(_JOB, case)
+    surface, _ = mechanics.cortex(_JOB, case)
     gesture, height = case.gesture, HeightMap(surface.pia, surface.extent_mm)
     row: Row = {"index": index, "tets": count, "kind": gesture.kind, "load": gesture.load}
     volume = tetrahedra.block(_JOB.anatomy, count, 2, gesture.focus, height)

@@ -20,7 +20,7 @@ from synth.job.schema import Job
 from synth.render import truth
 from synth.render.anatomy import rim
 from synth.render.camera import camera
-from synth.sequence import pipeline, scenario
+from synth.sequence import mechanics, scenario
 
 FINE = 128
 """Cells along the edge of the grid that labels are made on, at least."""
@@ -84,8 +84,8 @@ def clip(job: Job, index: int, grid: Grid, name: str) -> Clip:
     """One sequence of a job: deformed, projected, put on the grid."""
     case = scenario.draw(job, index)
     view = camera.place(case.view, job.render)
-    surface, tets = pipeline.build(job, case)
-    motion = pipeline.move(job, case, surface, tets)
+    surface, tets = mechanics.build(job, case)
+    motion = mechanics.move(job, case, surface, tets)
     frame = rim.build(surface, job.anatomy.craniotomy.radius_mm, case.look, view.mm_per_px).shape
     still = truth.still(view, Shape(surface.vertices, surface.faces), frame)
     resample = Resampler(

@@ -22,7 +22,7 @@ from synth.render import instrument
 from synth.render.camera import camera
 from synth.render.instrument import Kind
 from synth.render.scene import Studio
-from synth.sequence import pipeline, scenario
+from synth.sequence import mechanics, scenario
 
 Picture = npt.NDArray[np.uint8]
 Settings = dict[str, Any]
@@ -96,7 +96,7 @@ def _tile(settings: Settings, kind: Kind, size: tuple[int, int], seed: int, capt
         )
     )
     case = scenario.draw(job, 0)
-    surface, _ = pipeline.cortex(job, case)
+    surface, _ = mechanics.cortex(job, case)
     look = replace(case.look, rim_seed=_seed_of(kind, case.gesture.kind), scenery=job.render.scenery)
     studio = Studio(surface, look, camera.place(case.view, job.render), job, [case.gesture.kind])
     shot = studio.frame(surface.vertices, *poised(case.gesture, surface), scenario.frame_seeds(job, 0)[0])

@@ -16,7 +16,7 @@ from synth.render.appearance.family import FAMILIES
 from synth.render.camera import camera, camera_sensor
 from synth.render.camera.camera_sensor import Sensor
 from synth.render.scene import Studio
-from synth.sequence import pipeline, scenario
+from synth.sequence import mechanics, scenario
 
 _LARGEST_MM, _SMALLEST_PX, _LARGEST_PX = 60.0, 160, 720
 _INSET_PX = 9  # from the opening's edge
@@ -121,7 +121,7 @@ def render(family: Family, width: int, mm_per_px: float, index: int) -> Frame:
         }
     )
     case = scenario.draw(job, index)
-    surface, _ = pipeline.cortex(job, case)
+    surface, _ = mechanics.cortex(job, case)
     studio = Studio(surface, case.look, camera.place(case.view, job.render), job)
     nowhere = np.zeros((2, 3))
     radiance = studio.frame(surface.vertices, nowhere, nowhere, seed=index).radiance

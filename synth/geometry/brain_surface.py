@@ -69,7 +69,7 @@ def load_brain(path: Path, craniotomy: CraniotomySection) -> Brain:
     if len(heights) == 0:
         raise UserError(
             f"anatomy.craniotomy: {path.name} has no surface within {craniotomy.radius_mm:g} mm of the "
-            "point, looking along the direction"
+            f"point, looking along the direction; `synth preview {path.name}` finds places that work"
         )
     placed[:, 2] -= heights.max()
     origin = origin + heights.max() * turn[2]

@@ -21,7 +21,7 @@ from synth.publish.picture import Rgb, caption, tile
 from synth.render.anatomy.surface import Surface
 from synth.render.camera import camera
 from synth.render.scene import Studio
-from synth.sequence import pipeline, scenario
+from synth.sequence import mechanics, pipeline, scenario
 
 _TILE_PX = 320
 _OPENING_MM = 1.0  # two tips closer than this would be one
@@ -78,7 +78,7 @@ def draw_sheet(job: Job, count: int, report: Callable[[int, int], None] = lambda
 def _frame(job: Job, index: int) -> Rgb:
     """A scenario's picture (the left eye beside the right)."""
     case = scenario.draw(job, index)
-    surface, _ = pipeline.cortex(job, case)
+    surface, _ = mechanics.cortex(job, case)
     view, gestures = camera.place(case.view, job.render), case.gestures
     studio = Studio(surface, case.look, view, job, [gesture.kind for gesture in gestures])
     ready = [poised(gesture, surface) for gesture in gestures]

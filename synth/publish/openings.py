@@ -16,7 +16,7 @@ from synth.geometry.brain_surface import axes, read_brain
 from synth.job import writer
 from synth.job.schema import AnatomySection, CraniotomySection, FemSection, Job
 from synth.render.anatomy.surface import LEAST_FILLED, MARGIN_MM
-from synth.sequence import scenario, scene
+from synth.sequence import mechanics, scenario
 
 Floats = NDArray[np.float64]
 
@@ -65,7 +65,7 @@ def find_openings(mesh: Path, radius_mm: float, count: int) -> list[Opening]:
         section = AnatomySection(mesh=mesh.resolve(), vertices=2500, craniotomy=one.craniotomy(radius_mm))
         job = Job(anatomy=section, fem=FemSection(tets=400))  # whether it meshes, not how well
         try:
-            scene.build(job, scenario.draw(job, 0))
+            mechanics.build(job, scenario.draw(job, 0))
         except UserError as error:
             why = str(error)
             continue

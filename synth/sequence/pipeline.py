@@ -10,23 +10,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from synth.dataset.store import Writer
-from synth.fem.solver import Deformation
 from synth.fields import FIELDS
 from synth.flow import mask, track
 from synth.flow.stereo import rig
 from synth.flow.stereo import track as stereo
 from synth.flow.track import Track
 from synth.job import identity
-from synth.job.laws import LAWS
 from synth.job.schema import Job
 from synth.render.camera import video_link
-from synth.sequence import scenario
+from synth.sequence import mechanics, scenario
 from synth.sequence.published_labels import Published
 from synth.sequence.scenario import Scenario
-from synth.sequence.scene import Scene, build, cortex, estimator, move, simulate
+from synth.sequence.scene import Scene, estimator, simulate
 from synth.system.stopwatch import ProgressCallback, Stopwatch
-
-__all__ = ["build", "cortex", "estimator", "move", "render_sequence"]
 
 # Fields that the renderer gives by frame, and of a second lens; those of `store.extra` are attributes of its
 # `Shot` as well, but for the published method's.
@@ -225,7 +221,7 @@ def _seal(shooting: _Shooting) -> Path:
         scale_mm_per_px=scene.scale_mm_per_px,
         young_kpa=case.tissue.young_kpa,
         poisson=case.tissue.poisson,
-        mechanics=_mechanics(shooting.job, case, scene.motion, view.rotation),
+        mechanics=mechanics.describe(shooting.job, case, scene.motion, view.rotation),
         variant=scene.studio.variant,
         timings=shooting.watch.report(),
         **_second_lens(shooting),
@@ -251,36 +247,4 @@ def _second_lens(shooting: _Shooting) -> dict[str, Any]:
             "rotation": lens.rotation.tolist(),
             "translation": lens.translation.tolist(),
         }
-    }
-
-
-def _mechanics(
-    job: Job, case: Scenario, motion: Deformation, rotation: NDArray[np.float64]
-) -> dict[str, Any]:
-    timeless = job.fem.time == "quasi-static" and not job.fem.relaxation
-    law_from = LAWS.source(case.tissue.law)
-    special: dict[str, Any] = {"law_from": law_from} if law_from else {}
-    if case.pulse is not None:
-        special |= {"pulse_mm": case.pulse.height(motion.time).tolist()}
-    if case.pulse is not None and timeless:
-        special |= {
-            "tool_work_mn_mm": motion.tool_work.tolist(),
-            "pulse_work_mn_mm": motion.pulse_work.tolist(),
-        }
-    return special | {
-        "law": case.tissue.law,
-        # Whether the tools' forces alone say what is stored.
-        "elastic": timeless and case.pulse is None,
-        "min_jacobian": motion.min_jacobian.tolist(),
-        "energy_mn_mm": motion.energy.tolist(),
-        "residual": motion.residual.tolist(),
-        "instruments": [
-            {
-                "kind": gesture.kind,
-                "force_mn": (motion.by_instrument[:, k] @ rotation.T).tolist(),
-                "tip_mm": motion.tip[:, 2 * k : 2 * k + 2].tolist(),
-                "shaft": motion.shaft[:, 2 * k].tolist(),
-            }
-            for k, gesture in enumerate(case.gestures)
-        ],
     }

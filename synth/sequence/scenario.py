@@ -86,21 +86,17 @@ def draw(job: Job, index: int) -> Scenario:
     def generator(part: int) -> Random:
         return _generator(job, _SEQUENCE, index, part)
 
+    relief = draw_relief(job.anatomy, _generator(job, _ANATOMY, anatomy, 0))
     tissue = draw_tissue(job.fem, generator(_TISSUE))
+    pulse = draw_pulse(job.fem.pulse, generator(_PULSE))
+    view = draw_view(job.render, generator(_VIEW))
+    sway = draw_sway(job.render, generator(_SWAY))
     opening_mm = job.anatomy.craniotomy.radius_mm
     gestures = draw_gestures(job.fem, opening_mm, tissue.young_kpa, generator(_GESTURE), generator(_FURTHER))
+    look = draw_look(job, family, generator(_LOOK))
+    view = camera.calibrated(view, job.render)
     return Scenario(
-        index=index,
-        anatomy=anatomy,
-        family=family,
-        relief=draw_relief(job.anatomy, _generator(job, _ANATOMY, anatomy, 0)),
-        tissue=tissue,
-        gesture=gestures[0],
-        further=gestures[1:],
-        look=draw_look(job, family, generator(_LOOK)),
-        view=draw_view(job.render, generator(_VIEW)),
-        sway=draw_sway(job.render, generator(_SWAY)),
-        pulse=draw_pulse(job.fem.pulse, generator(_PULSE)),
+        index, anatomy, family, relief, tissue, gestures[0], gestures[1:], look, view, sway, pulse
     )
 
 
@@ -288,8 +284,8 @@ def _draw_timing(kind: str, rng: Random) -> tuple[float, float, float, float]:
 
 
 def draw_view(render: RenderSection, rng: Random) -> View:
-    """Where the microscope stands; width of its field and principal point are a calibration's, if given."""
-    drawn = View(
+    """Where the microscope stands; a calibration is left to `camera.calibrated`."""
+    return View(
         field_mm=_uniform(rng, render.field_mm),
         working_distance_mm=_uniform(rng, render.working_distance_mm),
         tilt_deg=_uniform(rng, render.tilt_deg),
@@ -298,7 +294,6 @@ def draw_view(render: RenderSection, rng: Random) -> View:
         focus_mm=_uniform(rng, (-0.5, 0.5)),
         off_centre=_draw_zero(rng),
     )
-    return drawn if render.calibration is None else camera.calibrated(drawn, render)
 
 
 def _draw_zero(rng: Random) -> tuple[float, float]:

@@ -4,30 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from synth.errors import UserError
-from synth.fem import solver
-from synth.fem.mesh import tetrahedra
-from synth.fem.mesh.relief import HeightMap
-from synth.fem.mesh.tetrahedra import Tets
 from synth.fem.solver import Deformation
 from synth.flow import track, tvl1
 from synth.flow.estimator import Estimator, create
 from synth.flow.track import Track
-from synth.geometry import brain_surface
-from synth.geometry.brain_surface import Brain
-from synth.geometry.triangles import Shape
-from synth.job.schema import AnatomySection, FlowSection, Job
-from synth.render.anatomy import surface as anatomy
-from synth.render.anatomy.surface import Relief, Surface
+from synth.job.schema import FlowSection, Job
+from synth.render.anatomy.surface import Surface
 from synth.render.camera import camera, video_link
 from synth.render.camera.camera import Camera
 from synth.render.scene import Shot, Studio
-from synth.sequence import scenario
+from synth.sequence import mechanics, scenario
 from synth.sequence.scenario import Scenario
 from synth.sequence.timeline import Timeline
 from synth.system.stopwatch import ProgressCallback, Stopwatch
@@ -194,74 +186,11 @@ def simulate(
     view = camera.place(case.view, job.render)
     report("mesh", 0, 1)
     with watch.stage("mesh"):
-        surface, tets = build(job, case)
+        surface, tets = mechanics.build(job, case)
     report("fem", 0, 1)
     with watch.stage("fem"):
-        motion = move(job, case, surface, tets)
+        motion = mechanics.move(job, case, surface, tets)
     return Scene(job, index, case, surface, motion, view)
-
-
-def build(job: Job, case: Scenario) -> tuple[Surface, Tets]:
-    """The fine surface of a scenario and the volume under it, finest where its contacts are."""
-    focus = [place for gesture in case.gestures for place in gesture.focus]
-    surface, whole = cortex(job, case)
-    mesh, slips = (job.fem.tets, 2, focus), case.tissue.skull == "slip"
-    if whole is None:
-        height = HeightMap(surface.pia, surface.extent_mm)
-        return surface, tetrahedra.block(job.anatomy, *mesh, height, slips=slips)
-    return surface, tetrahedra.from_brain(whole, job.anatomy, *mesh, slips=slips)
-
-
-def cortex(job: Job, case: Scenario) -> tuple[Surface, Brain | None]:
-    """The fine surface of a scenario, and the user's brain that it is a part of, if it is.
-
-    Sequences that share an anatomy (`anatomy.variety`) share these: their arrays are read-only.
-    """
-    written = job.anatomy.mesh.stat() if job.anatomy.mesh and job.anatomy.mesh.is_file() else None
-    return _cortex(
-        job.anatomy.opened(case.anatomy), case.relief, written and (written.st_mtime_ns, written.st_size)
-    )
-
-
-@lru_cache(maxsize=4)
-def _cortex(section: AnatomySection, relief: Relief, written: object) -> tuple[Surface, Brain | None]:
-    """As `cortex`; `written` tells a mesh from one that replaced it."""
-    whole = None
-    if section.mesh is None:
-        surface = anatomy.procedural(relief, section)
-    else:
-        try:
-            surface, whole = _opened(section, relief)
-        except UserError as error:
-            if not str(error).startswith("anatomy.craniotomy"):
-                raise
-            raise UserError(f"{error}; `synth preview {section.mesh.name}` finds places that work") from None
-    for shared in (surface, whole):
-        for value in vars(shared).values() if shared else ():
-            if isinstance(value, np.ndarray):
-                value.flags.writeable = False
-    return surface, whole
-
-
-def _opened(section: AnatomySection, relief: Relief) -> tuple[Surface, Brain]:
-    assert section.mesh is not None
-    whole = brain_surface.load_brain(section.mesh, section.craniotomy)
-    return anatomy.from_brain(whole.vertices, whole.faces, relief, section), whole
-
-
-def move(job: Job, case: Scenario, surface: Surface, tets: Tets) -> Deformation:
-    """The scenario's gestures, carried out on that surface and volume."""
-    return solver.deform(
-        job.fem,
-        case.tissue,
-        case.gestures,
-        tets,
-        Shape(surface.vertices, surface.faces),
-        job.frames,
-        job.fps,
-        case.pulse,
-        job.anatomy.craniotomy.radius_mm,
-    )
 
 
 def estimator(flow: FlowSection) -> Estimator:

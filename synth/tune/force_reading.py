@@ -20,7 +20,8 @@ from scipy.sparse.linalg import splu
 from synth.fem import equilibrium, surface_embedding, tool
 from synth.render import truth
 from synth.render.camera import camera
-from synth.sequence.scene import Frame, Scene, build
+from synth.sequence.mechanics import build
+from synth.sequence.scene import Frame, Scene
 
 Floats = NDArray[np.float64]
 

@@ -16,7 +16,7 @@ from synth.fem.mesh.element import quality
 from synth.fem.system import assemble
 from synth.job import schema
 from synth.job.laws import LARGEST_LOAD, LEAST_JACOBIAN
-from synth.sequence import pipeline, scenario
+from synth.sequence import mechanics, scenario
 
 CONTACT = fem_case.CONTACTS[0]
 LIVING = {
@@ -32,7 +32,7 @@ def random_scene(index: int, **fem: Any) -> None:
     shared = {"seed": 0, "sequences": 10**6, "frames": 12, "anatomy": {"vertices": 10_000}}
     job = schema.Job.model_validate({**shared, "fem": {"tets": 500, **fem}})
     case = scenario.draw(job, index)
-    moved = pipeline.move(job, case, *pipeline.build(job, case))
+    moved = mechanics.move(job, case, *mechanics.build(job, case))
     for numbers in (moved.displacement, moved.traction, moved.tip, moved.energy):
         assert np.isfinite(numbers).all()
     assert moved.min_jacobian.min() > LEAST_JACOBIAN

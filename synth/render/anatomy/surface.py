@@ -94,7 +94,10 @@ def from_brain(
     extent = _extent(anatomy)
     height = _height_map(vertices, faces, extent, _RELIEF_PX // 2)
     if np.isnan(height).mean() > 1 - LEAST_FILLED:
-        raise UserError("anatomy.craniotomy: the brain's surface does not fill the opening there")
+        raise UserError(
+            "anatomy.craniotomy: the brain's surface does not fill the opening there; `synth preview` of the "
+            "mesh finds places that work"
+        )
     height = _filled(height)
     # The arachnoid bridges what is narrower than itself: a closing, then a smoothing.
     pixel = extent / len(height)

@@ -67,8 +67,9 @@ class Camera:
 
 
 def calibrated(view: View, render: RenderSection) -> View:
-    """The view with a calibrated camera's field and principal point, as `render.calibration` has them."""
-    assert render.calibration is not None
+    """The view with the field and principal point of `render.calibration`, if there is one."""
+    if render.calibration is None:
+        return view
     K, width = calibration.read(render.calibration).fitted(render.size), render.size[0]
     x, y = (K[:2, 2] - (np.array(render.size) - 1) / 2) / width
     field_mm = float(width * view.working_distance_mm / K[0, 0])

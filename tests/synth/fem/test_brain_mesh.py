@@ -13,7 +13,7 @@ from synth.errors import UserError
 from synth.fem.mesh.element import bary_slope
 from synth.geometry import brain_surface
 from synth.job import schema
-from synth.sequence import pipeline, scenario
+from synth.sequence import mechanics, scenario
 
 
 @pytest.mark.parametrize("suffix", ["obj", "vtk"])
@@ -25,11 +25,11 @@ def test_a_messy_surface_of_every_format_is_meshed_and_moved(suffix: str, tmp_pa
         fem=schema.FemSection(tets=600, load=0.1, gestures=("pull",)),
     )
     drawn = scenario.draw(case, 0)
-    surface, tets = pipeline.build(case, drawn)
+    surface, tets = mechanics.build(case, drawn)
     volume = bary_slope(tets.points[tets.cells[:, :4]])[1]
     assert volume.min() > 0
     assert volume.sum() == pytest.approx(4 / 3 * np.pi * 32 * 26 * 22, rel=0.03)
-    motion = pipeline.move(case, drawn, surface, tets)
+    motion = mechanics.move(case, drawn, surface, tets)
     peak = int(np.linalg.norm(motion.force, axis=1).argmax())
     total = np.einsum("v,vd->d", motion.area, motion.traction[peak])
     np.testing.assert_allclose(total, motion.force[peak], rtol=1e-9)

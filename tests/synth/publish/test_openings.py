@@ -15,7 +15,7 @@ from synth.job import identity, writer
 from synth.job.reader import parse_job
 from synth.publish import openings
 from synth.publish.openings import Opening
-from synth.sequence import scenario, scene
+from synth.sequence import mechanics, scenario
 
 pytestmark = pytest.mark.slow
 
@@ -53,7 +53,7 @@ def test_the_command_draws_the_places_and_prints_a_job_that_works(egg: Path, tmp
     (tmp_path / "job.yaml").write_text(done.stdout)
     job = synth.load_job(str(tmp_path / "job.yaml"), ["anatomy.vertices=2500", "fem.tets=400"])
     assert job.anatomy.mesh == egg
-    scene.build(job, scenario.draw(job, 0))
+    mechanics.build(job, scenario.draw(job, 0))
     (tmp_path / "job.yaml").write_text(done.stdout.replace("    # ", "    "))
     both = synth.load_job(str(tmp_path / "job.yaml")).anatomy.craniotomy
     assert len(both.also) == 1
@@ -67,7 +67,7 @@ def test_sequences_take_the_openings_of_a_brain_in_turn(egg: Path, found: list[O
     job = synth.Job.model_validate({"sequences": 6, "frames": 2, "anatomy": anatomy})
     cases = [scenario.draw(job, index) for index in range(6)]
     for index, case in enumerate(cases):
-        origin = scene.cortex(job, case)[1].origin  # type: ignore[union-attr]
+        origin = mechanics.cortex(job, case)[1].origin  # type: ignore[union-attr]
         assert np.linalg.norm(origin - found[index % 3].point) < 1.0
     named = [identity.identify_opening(job, case.anatomy) for case in cases]
     assert named[:3] == named[3:]

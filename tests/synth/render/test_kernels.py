@@ -9,7 +9,7 @@ from synth.job import reader
 from synth.render.camera import camera
 from synth.render.mitsuba.adapter import pick
 from synth.render.scene import Moment, Studio
-from synth.sequence import pipeline, scenario
+from synth.sequence import mechanics, scenario
 
 SMALL = ["render.size=[64, 48]", "sequences=4", "anatomy.vertices=2500", "render.spp=4"]
 _LARGE = 500  # operations: a kernel that traces light; the rest fill and copy arrays
@@ -32,7 +32,7 @@ def test_scenes_share_their_kernels_with_scenery_and_without() -> None:
     try:
         for index, job in enumerate((bare, dressed)):
             case = scenario.draw(job, index)
-            surface, _ = pipeline.cortex(job, case)
+            surface, _ = mechanics.cortex(job, case)
             kinds = [gesture.kind for gesture in case.gestures]
             studio = Studio(surface, case.look, camera.place(case.view, job.render), job, kinds)
             for frame in range(2):

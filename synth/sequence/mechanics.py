@@ -1,0 +1,105 @@
+"""The mechanics of one sequence: its cortex and the volume under it, loaded and moved."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from synth.fem import solver
+from synth.fem.mesh import tetrahedra
+from synth.fem.mesh.relief import HeightMap
+from synth.fem.mesh.tetrahedra import Tets
+from synth.fem.solver import Deformation
+from synth.geometry.brain_surface import Brain, load_brain
+from synth.geometry.triangles import Shape
+from synth.job.laws import LAWS
+from synth.job.schema import AnatomySection, Job
+from synth.render.anatomy import surface as anatomy
+from synth.render.anatomy.surface import Relief, Surface
+from synth.sequence.scenario import Scenario
+
+
+def build(job: Job, case: Scenario) -> tuple[Surface, Tets]:
+    """The fine surface of a scenario and the volume under it, finest where its contacts are."""
+    surface, brain = cortex(job, case)
+    focus = [place for gesture in case.gestures for place in gesture.focus]
+    mesh, slips = (job.fem.tets, 2, focus), case.tissue.skull == "slip"
+    if brain is not None:
+        return surface, tetrahedra.from_brain(brain, job.anatomy, *mesh, slips=slips)
+    height = HeightMap(surface.pia, surface.extent_mm)
+    return surface, tetrahedra.block(job.anatomy, *mesh, height, slips=slips)
+
+
+def cortex(job: Job, case: Scenario) -> tuple[Surface, Brain | None]:
+    """The fine surface of a scenario, and the user's brain that it is a part of, if it is.
+
+    Sequences that share an anatomy (`anatomy.variety`) share these: their arrays are read-only.
+    """
+    written = job.anatomy.mesh.stat() if job.anatomy.mesh and job.anatomy.mesh.is_file() else None
+    return _cortex(
+        job.anatomy.opened(case.anatomy), case.relief, written and (written.st_mtime_ns, written.st_size)
+    )
+
+
+@lru_cache(maxsize=4)
+def _cortex(section: AnatomySection, relief: Relief, written: object) -> tuple[Surface, Brain | None]:
+    """As `cortex`; `written` tells a mesh from one that replaced it."""
+    brain = None if section.mesh is None else load_brain(section.mesh, section.craniotomy)
+    if brain is None:
+        surface = anatomy.procedural(relief, section)
+    else:
+        surface = anatomy.from_brain(brain.vertices, brain.faces, relief, section)
+    for shared in (surface, brain):
+        for value in vars(shared).values() if shared else ():
+            if isinstance(value, np.ndarray):
+                value.flags.writeable = False
+    return surface, brain
+
+
+def move(job: Job, case: Scenario, surface: Surface, tets: Tets) -> Deformation:
+    """The scenario's gestures, carried out on that surface and volume."""
+    return solver.deform(
+        job.fem,
+        case.tissue,
+        case.gestures,
+        tets,
+        Shape(surface.vertices, surface.faces),
+        job.frames,
+        job.fps,
+        case.pulse,
+        job.anatomy.craniotomy.radius_mm,
+    )
+
+
+def describe(job: Job, case: Scenario, motion: Deformation, rotation: NDArray[np.float64]) -> dict[str, Any]:
+    """The attribute `mechanics` of a sequence; `rotation` (3, 3): world to camera axes."""
+    timeless = job.fem.time == "quasi-static" and not job.fem.relaxation
+    law_from = LAWS.source(case.tissue.law)
+    special: dict[str, Any] = {"law_from": law_from} if law_from else {}
+    if case.pulse is not None:
+        special |= {"pulse_mm": case.pulse.height(motion.time).tolist()}
+    if case.pulse is not None and timeless:
+        special |= {
+            "tool_work_mn_mm": motion.tool_work.tolist(),
+            "pulse_work_mn_mm": motion.pulse_work.tolist(),
+        }
+    return special | {
+        "law": case.tissue.law,
+        # Whether the tools' forces alone say what is stored.
+        "elastic": timeless and case.pulse is None,
+        "min_jacobian": motion.min_jacobian.tolist(),
+        "energy_mn_mm": motion.energy.tolist(),
+        "residual": motion.residual.tolist(),
+        "instruments": [
+            {
+                "kind": gesture.kind,
+                "force_mn": (motion.by_instrument[:, k] @ rotation.T).tolist(),
+                "tip_mm": motion.tip[:, 2 * k : 2 * k + 2].tolist(),
+                "shaft": motion.shaft[:, 2 * k].tolist(),
+            }
+            for k, gesture in enumerate(case.gestures)
+        ],
+    }
