@@ -269,10 +269,9 @@ class FieldReader:
 class Sequence:
     """One sealed sequence: `sequence["rgb"][t]`, `sequence.attrs["young_kpa"]`."""
 
-    def __init__(
-        self, path: Path, group: zarr.Group, attrs: dict[str, Any], at: location.StoreLocation
-    ) -> None:
-        self.path, self._group, self.attrs, self._location = path, group, attrs, at
+    def __init__(self, path: Path, group: zarr.Group, where: location.StoreLocation) -> None:
+        self.path, self._group, self._location = path, group, where
+        self.attrs = dict(group.attrs)
 
     @property
     def index(self) -> int:
@@ -395,11 +394,10 @@ def open_sequence(path: Path | str, *, sealed: bool = True) -> Sequence:
         raise UserError(f"{path}: its metadata is larger than {LARGEST_BYTES:,} bytes")
     try:
         group = zarr.open_group(at.store, mode="r", zarr_format=3, use_consolidated=False)
-        attrs = dict(group.attrs)
+        sequence = Sequence(path, group, at)
     except Exception as error:  # as in FieldReader
         raise UserError(f"{path}: is not a Zarr v3 group, or its metadata is damaged") from error
-    check_attributes(attrs, str(path))
-    sequence = Sequence(path, group, attrs, at)
+    check_attributes(sequence.attrs, str(path))
     if sealed and not sequence.is_sealed():
         raise UserError(f"{path}: its attributes are not those that were sealed; see `synth verify`")
     return sequence

@@ -42,7 +42,7 @@ def test_rooms_that_a_sequence_is_made_with_are_counted_or_decide_no_value() -> 
         for name in imports(path)
         if name.startswith("synth.")
     }
-    deciding_none = {f"synth/{name}" for name in ("errors", "fields", "system", "dataset")}
+    deciding_none = {f"synth/{name}" for name in ("errors", "fields", "plugins", "system", "dataset")}
     assert made - deciding_none == set(provenance._MAKING)
 
 
