@@ -51,12 +51,7 @@ def write_page(written: str) -> str:
         lines += ["", f"## {name}", "", what]
         package = import_module(name)
         for public in sorted(package.__all__, key=lambda one: (one[0].isupper(), one.lower())):
-            value = (
-                import_module("synth.engine.render").render
-                if public == "render"
-                else getattr(package, public)
-            )
-            lines += _described(f"{name}.{public}", value)
+            lines += _described(f"{name}.{public}", getattr(package, public))
     return "\n".join(lines) + "\n"
 
 

@@ -21,14 +21,13 @@ _WHERE = {
     "open_sequence": "synth.dataset.store",
     "simulate": "synth.sequence.scene",
     "recover_flow": "synth.flow.track",
+    "render_job": "synth.engine.run",
 }
 
-__all__ = ["render", *_WHERE]
+__all__ = list(_WHERE)
 
 
 def __getattr__(name: str) -> Any:
-    if name == "render":  # the room of that name, which can be called: see there
-        return import_module("synth.render")
     if name not in _WHERE:
         raise AttributeError(f"module 'synth' has no attribute {name!r}")
     value = globals()[name] = getattr(import_module(_WHERE[name]), name)

@@ -1,8 +1,8 @@
 from synth.dataset.store import Dataset as Dataset
 from synth.dataset.store import Sequence as Sequence
 from synth.dataset.store import open_sequence as open_sequence
-from synth.engine.render import render as render
 from synth.engine.run import Summary as Summary
+from synth.engine.run import render_job as render_job
 from synth.errors import UserError as UserError
 from synth.flow.estimator import Estimator as Estimator
 from synth.flow.track import Track as Track

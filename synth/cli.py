@@ -184,10 +184,12 @@ def _end_on_terminate() -> None:
 @app.command(epilog="Example: synth status out")
 def status(out: Out, json: Json = False) -> None:
     """Says what is done, running and failed, and what is still to come in time and disk."""
+    from dataclasses import asdict
+
     from synth.engine.status import lines, read_status
 
     found = read_status(out)
-    print(json_.dumps(found.as_dict()) if json else "\n".join(lines(found)))
+    print(json_.dumps(asdict(found)) if json else "\n".join(lines(found)))
 
 
 @app.command("split", epilog="Example: synth split out --by anatomy --hold-out calf")

@@ -21,7 +21,7 @@ import typer
 
 from evidence import report
 from synth.dataset.store import Dataset, Writer
-from synth.engine import run, slots
+from synth.engine import machine, run
 from synth.engine.progress import Bars
 from synth.job import reader
 from synth.job.schema import Job
@@ -66,7 +66,7 @@ def overhead(name: str, count: int) -> dict[str, float | int]:
     alone = {
         **os.environ,
         **_path(),
-        **slots.machine(job, 1),
+        **machine.environment(job, 1),
         "OMP_NUM_THREADS": "1",
         "NUMBA_NUM_THREADS": "1",
     }

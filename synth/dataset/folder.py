@@ -9,7 +9,7 @@ import json
 import os
 import shutil
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -90,9 +90,9 @@ class Folder:
         write_whole(self.state / "failed" / f"{index:06d}.json", json.dumps(record, indent=1))
         self.sweep(index)
 
-    def forgive(self) -> list[int]:
-        """Forgets every failure; returns which."""
-        indices = sorted(self.failures())
+    def forgive(self, indices: Sequence[int] | None = None) -> list[int]:
+        """Forgets failures, all if not said which; returns which."""
+        indices = sorted(self.failures()) if indices is None else list(indices)
         for index in indices:
             (self.state / "failed" / f"{index:06d}.json").unlink(missing_ok=True)
         return indices

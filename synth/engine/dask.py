@@ -9,15 +9,14 @@ import os
 import sys
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from synth.dataset import provenance
-from synth.engine import slots
-from synth.engine.slots import LocalSlot, Slot, Slots
-from synth.engine.worker_process import Attempt, Setup
+from synth.engine import machine
+from synth.engine.child import Attempt, Child, Setup, Slot
 from synth.errors import UserError
 from synth.job.schema import Job
 from synth.system import checked_file
@@ -28,12 +27,12 @@ _WAIT_FOR_WORKERS_S = 600
 _CONNECT = "20s"
 _LACKING = "needs the extra `cluster`: pip install '.[cluster]' in the clone"
 
-# On a Dask worker: the slot of each of its threads, kept from sequence to sequence.
-_kept = threading.local()
+# On a Dask worker: the setup and the child of each of its threads, from sequence to sequence.
+_thread = threading.local()
 
 
 @contextmanager
-def open_slots(engine: str, setup: Setup) -> Iterator[Slots]:
+def open_slots(engine: str, setup: Setup) -> Iterator[list[Slot]]:
     """The slots of `dask://host:port`, `tls://host:port`, or of a SLURM cluster described in a YAML file.
 
     Whoever reaches a scheduler can run code on it, so a note on stderr says where one is reached unencrypted
@@ -49,7 +48,7 @@ def open_slots(engine: str, setup: Setup) -> Iterator[Slots]:
     # The lock cannot travel; a worker sees by the turn that its run is over.
     own = {key: value for key, value in (setup.environment or {}).items() if not key.startswith("SULCUS_")}
     travelling = replace(
-        setup, keep_open=(), environment=own, memory_bytes=None, generator=provenance.fingerprint()
+        setup, lock_fd=None, environment=own, memory_bytes=None, generator=provenance.fingerprint()
     )
     with _cluster(engine) as (address, expected, security):
         try:
@@ -63,45 +62,36 @@ def open_slots(engine: str, setup: Setup) -> Iterator[Slots]:
                 client.wait_for_workers(1, timeout=_WAIT_FOR_WORKERS_S)
             except TimeoutError:
                 raise UserError(f"{engine}: no worker has joined") from None
-            yield DaskSlots(client, travelling, max(sum(client.nthreads().values()), expected))
-
-
-class DaskSlots:
-    """A slot for every thread of the cluster's workers."""
-
-    def __init__(self, client: Any, setup: Setup, count: int) -> None:
-        self._client, self._setup, self._count = client, setup, count
-
-    def count(self) -> int:
-        return self._count
-
-    def slot(self) -> Slot:
-        return _DaskSlot(self._client, self._setup)
+            yield [_DaskSlot(client, travelling)] * max(sum(client.nthreads().values()), expected)
 
 
 class _DaskSlot:
+    """A thread of the cluster's workers."""
+
     def __init__(self, client: Any, setup: Setup) -> None:
         self._client, self._setup = client, setup
 
     def run(self, index: int, report: ProgressCallback, stop: threading.Event) -> Attempt:
         report("on the cluster", 0, 1)
-        future = self._client.submit(attempt, self._setup, index, pure=False)
+        future = self._client.submit(_attempt, self._setup, index, pure=False)
         try:
             while not future.done():
                 if stop.wait(_TICK_S):
                     future.cancel()
                     return Attempt(index, "stopped")
-            if future.status != "finished":
-                return Attempt(index, "crash", f"the cluster lost it ({future.status}: {_why(future)})")
-            return Attempt(**future.result())
+            if future.status == "finished":
+                return Attempt(**future.result())
+            error = str(future.exception() if future.status == "error" else "") or "no reason given"
+            why = f"{future.status}: {error.splitlines()[0]}"
+            return Attempt(index, "crash", f"the cluster lost it ({why})")
         finally:
             future.release()
 
     def close(self) -> None:
-        """What is kept on the cluster ends by itself, when the turn has passed on."""
+        """The processes on the cluster end by themselves, when the turn has passed on."""
 
 
-def attempt(setup: Setup, index: int) -> dict[str, Any]:
+def _attempt(setup: Setup, index: int) -> dict[str, Any]:
     """One attempt, on a Dask worker. Returns the Attempt's fields, which need no class of ours to be read."""
     from distributed import get_worker
 
@@ -109,41 +99,33 @@ def attempt(setup: Setup, index: int) -> dict[str, Any]:
     watch = threading.Thread(target=_stop_when_passed, args=(setup, stop, ended), daemon=True)
     watch.start()
     try:
-        slot = _slot(setup, get_worker().state.nthreads)
-        return vars(slot.run(index, lambda stage, done, of: None, stop))
+        child = _child(setup, get_worker().state.nthreads)
+        return vars(child.run(index, lambda stage, done, of: None, stop))
     finally:
         ended.set()
         watch.join()
 
 
-def _slot(setup: Setup, threads: int) -> LocalSlot:
-    if getattr(_kept, "setup", None) != setup:
-        if getattr(_kept, "slot", None) is not None:
-            _kept.slot.close()
-        here = slots.machine(Job.model_validate(setup.job), threads)
-        memory = slots.share_of_memory(threads)
-        _kept.setup = setup
-        environment = {**here, **(setup.environment or {})}
-        _kept.slot = LocalSlot(replace(setup, environment=environment, memory_bytes=memory))
-    slot: LocalSlot = _kept.slot
-    return slot
+def _child(setup: Setup, threads: int) -> Child:
+    """This thread's child; a new one for another run."""
+    if getattr(_thread, "setup", None) != setup:
+        if hasattr(_thread, "child"):
+            _thread.child.close()
+        here = machine.environment(Job.model_validate(setup.job), threads)
+        here.update(setup.environment or {})
+        local = replace(setup, environment=here, memory_bytes=machine.share_of_memory(threads))
+        _thread.setup, _thread.child = setup, Child(local)
+    child: Child = _thread.child
+    return child
 
 
 def _stop_when_passed(setup: Setup, stop: threading.Event, ended: threading.Event) -> None:
     """Sets `stop` when another run has its turn at the dataset: this one's engine is gone."""
     while not ended.wait(_TICK_S):
-        try:
-            passed = int(setup.turn_file.read_text()) != setup.turn
-        except (OSError, ValueError):  # being rewritten, or the file system is away for a moment
-            continue
-        if passed:
-            stop.set()
-            return
-
-
-def _why(future: Any) -> str:
-    error = future.exception() if future.status == "error" else None
-    return str(error).splitlines()[0] if error else "no reason given"
+        with suppress(OSError, ValueError):  # being rewritten, or the file system is away for a moment
+            if int(setup.turn_file.read_text()) != setup.turn:
+                stop.set()
+                return
 
 
 @contextmanager
@@ -156,7 +138,15 @@ def _cluster(engine: str) -> Iterator[tuple[str, int, Any]]:
     described = read_slurm(Path(engine))
     _note(open_to(described))
     jobs = int(described.pop("jobs"))
-    with slurm(described) as cluster:
+    try:
+        from dask_jobqueue import SLURMCluster
+    except ImportError:
+        raise UserError(f"a SLURM engine {_LACKING}") from None
+    try:
+        cluster = SLURMCluster(**described)  # no job is submitted yet
+    except (TypeError, ValueError) as error:
+        raise UserError(f"{engine}: is not what dask-jobqueue takes ({error})") from error
+    with cluster:
         cluster.scale(jobs=jobs)
         yield cluster.scheduler_address, jobs * int(described["cores"]), cluster.security
 
@@ -186,22 +176,6 @@ def open_to(cluster: str | dict[str, Any]) -> str:
 def _note(who: str) -> None:
     if who:
         print(f"note: {who}: whoever is in that network can run code there", file=sys.stderr)
-
-
-def slurm(described: dict[str, Any]) -> Any:
-    """The cluster of a file as `read_slurm` gives it, less `jobs`, with no job submitted yet.
-
-    Raises:
-        UserError: the extra is not installed, or dask-jobqueue does not take an argument.
-    """
-    try:
-        from dask_jobqueue import SLURMCluster
-    except ImportError:
-        raise UserError(f"a SLURM engine {_LACKING}") from None
-    try:
-        return SLURMCluster(**described)
-    except (TypeError, ValueError) as error:
-        raise UserError(f"the SLURM file is not what dask-jobqueue takes ({error})") from error
 
 
 def read_slurm(path: Path) -> dict[str, Any]:

@@ -1,58 +1,53 @@
-"""A run's own account of itself, told to the watcher and kept for `synth status`."""
+"""How a run stands: kept in a file for `synth status`, and reported to whoever watches."""
 
 from __future__ import annotations
 
 import json
 import time
 from collections import deque
-from dataclasses import asdict, dataclass
-from typing import Any, Protocol
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from typing import Any
 
 from synth.dataset.folder import Folder, write_whole
-from synth.engine.worker_process import Attempt
+from synth.engine.child import Attempt
 
+FILE = "progress.json"
 _EVERY_S = 2.0
 _LATEST = 32  # sequences that say how fast it goes
 
 
 @dataclass(frozen=True)
-class Account:
+class RunProgress:
     """A run at one moment."""
 
     left_s: float | None = None
     """To the end, at the latest sequences' rate; None until enough are finished."""
-    in_flight: dict[str, list[Any]] | None = None
+    in_flight: dict[str, list[Any]] = field(default_factory=dict)
     """Stage, steps done and steps in all of the sequences being computed."""
 
 
-class Watcher(Protocol):
-    """Told what happens in a run, from the main thread only; by itself it does nothing."""
+class Watcher:
+    """Called with what happens in a run, from the main thread only; by itself it does nothing."""
 
     def begin(self, total: int, already: int, failed: int) -> None:
         """A run begins."""
-        return
 
     def stage(self, index: int, stage: str, done: int, of: int) -> None:
         """A sequence is at a stage."""
-        return
 
     def end(self, attempt: Attempt, again: bool) -> None:
         """An attempt at a sequence has ended."""
-        return
 
-    def account(self, account: Account) -> None:
-        """How the run stands."""
-        return
+    def account(self, progress: RunProgress) -> None:
+        """How the run stands, every two seconds at most; before the event that it follows from."""
 
 
-class Journal:
-    """Told what happens in a run; passes it on to a watcher, with an account every two seconds at most.
+class Journal(Watcher):
+    """Writes down how the run stands, and reports it."""
 
-    The account comes first: what is said of the run is then said with what has just ended.
-    """
-
-    def __init__(self, folder: Folder, workers: int, watcher: Watcher) -> None:
-        self._path, self._watcher = folder.state / "progress.json", watcher
+    def __init__(self, folder: Folder, workers: int, report: Callable[[RunProgress], None]) -> None:
+        self._path, self._report = folder.state / FILE, report
         self._cold = workers
         self._ends: deque[float] = deque(maxlen=_LATEST + 1)
         self._left = 0
@@ -61,21 +56,18 @@ class Journal:
 
     def begin(self, total: int, already: int, failed: int) -> None:
         self._left = total - already - failed
-        self._tell()
-        self._watcher.begin(total, already, failed)
+        self._write()
 
     def stage(self, index: int, stage: str, done: int, of: int) -> None:
         self._in_flight[index] = [stage, done, of]
-        self._tell()
-        self._watcher.stage(index, stage, done, of)
+        self._write()
 
     def end(self, attempt: Attempt, again: bool) -> None:
         self._in_flight.pop(attempt.index, None)
         if not again and attempt.kind != "stopped":
             self._left -= 1
             self.pace(time.monotonic())
-        self._tell()
-        self._watcher.end(attempt, again)
+        self._write()
 
     def pace(self, at_s: float) -> None:
         """A sequence ended. The first of each worker only start the clock, as they also compile."""
@@ -88,11 +80,11 @@ class Journal:
         count = len(self._ends) - 1
         return (self._ends[-1] - self._ends[0]) / count * self._left if count > 0 else None
 
-    def _tell(self) -> None:
+    def _write(self) -> None:
         now = time.monotonic()
         if self._left and now - self._written < _EVERY_S:
             return
         self._written = now
-        made = Account(self.left_s(), {str(key): value for key, value in sorted(self._in_flight.items())})
-        write_whole(self._path, json.dumps(asdict(made)), durable=False)
-        self._watcher.account(made)
+        progress = RunProgress(self.left_s(), {str(k): at for k, at in sorted(self._in_flight.items())})
+        write_whole(self._path, json.dumps(asdict(progress)), durable=False)
+        self._report(progress)

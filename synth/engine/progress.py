@@ -7,15 +7,16 @@ import time
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
-from synth.engine.journal import Account
-from synth.engine.worker_process import Attempt
+from synth.engine.child import Attempt
+from synth.engine.journal import RunProgress, Watcher
+from synth.engine.status import clock
 from synth.system.terminal import draws_bars
 
 # Without a terminal a line is printed at most so often.
 _QUIET_S = 10.0
 
 
-class Bars(Progress):
+class Bars(Progress, Watcher):
     """A bar for the dataset and one for every sequence in work; plain lines where nothing can be drawn.
 
     What is left is the run's own estimate: rich knows nothing of workers whose first sequences also compile.
@@ -28,13 +29,13 @@ class Bars(Progress):
         super().__init__(*columns, left, console=console, disable=not draws_bars(console))
         self._bars: dict[int, TaskID] = {}
         self._dataset = self.add_task("sequences", total=None, left="")
-        self._said = time.monotonic()
+        self._printed = time.monotonic()
 
     def begin(self, total: int, already: int, failed: int) -> None:
         self.reset(self._dataset, total=total, completed=already + failed)
         if already or failed:
             hint = f", {failed} failed (`--retry` takes them up again)" if failed else ""
-            self._say(f"{already} of {total} sequences are there already{hint}")
+            self._print(f"{already} of {total} sequences are there already{hint}")
 
     def stage(self, index: int, stage: str, done: int, of: int) -> None:
         if index not in self._bars:
@@ -48,32 +49,20 @@ class Bars(Progress):
             return
         if attempt.kind != "done":
             what = "is tried again" if again else "failed"
-            self._say(f"sequence {attempt.index:06d} {what}: {attempt.reason}")
+            self._print(f"sequence {attempt.index:06d} {what}: {attempt.reason}")
         if again:
             return
         self.advance(self._dataset)
         whole = next(task for task in self.tasks if task.id == self._dataset)
-        quiet = time.monotonic() - self._said < _QUIET_S and not whole.finished
+        quiet = time.monotonic() - self._printed < _QUIET_S and not whole.finished
         if self.disable and not quiet:
-            self._said = time.monotonic()
-            said = ", ".join(filter(None, (f"{clock(whole.elapsed or 0.0)} spent", whole.fields["left"])))
-            self._say(f"{whole.completed:.0f} of {whole.total:.0f} sequences, {said}")
+            self._printed = time.monotonic()
+            spent = ", ".join(filter(None, (f"{clock(whole.elapsed or 0.0)} spent", whole.fields["left"])))
+            self._print(f"{whole.completed:.0f} of {whole.total:.0f} sequences, {spent}")
 
-    def account(self, account: Account) -> None:
-        left = "" if account.left_s is None else f"{clock(account.left_s)} left"
+    def account(self, progress: RunProgress) -> None:
+        left = "" if progress.left_s is None else f"{clock(progress.left_s)} left"
         self.update(self._dataset, left=left)
 
-    def _say(self, text: str) -> None:
+    def _print(self, text: str) -> None:
         self.console.print(text, highlight=False, markup=False, soft_wrap=True)
-
-
-def clock(seconds: float) -> str:
-    """9 s, 2:05 min, 3:20 h, 4.2 days."""
-    whole = round(seconds)
-    if whole < 60:
-        return f"{whole} s"
-    if whole < 3600:
-        return f"{whole // 60}:{whole % 60:02d} min"
-    if whole < 86400:
-        return f"{whole // 3600}:{whole % 3600 // 60:02d} h"
-    return f"{seconds / 86400:.1f} days"

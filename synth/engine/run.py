@@ -6,26 +6,27 @@ import os
 import queue
 import threading
 from collections import deque
-from collections.abc import Callable, Mapping
-from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 from synth.dataset import index, size_forecast
 from synth.dataset.folder import Folder, claim
-from synth.engine import slots
+from synth.engine import machine
+from synth.engine.child import Attempt, Child, Setup, Slot
 from synth.engine.journal import Journal, Watcher
-from synth.engine.slots import Slots
-from synth.engine.worker_process import Attempt, Setup
 from synth.errors import UserError
 from synth.job.schema import Job
 from synth.publish import card, croissant, film
 from synth.render.camera import camera as cameras
-from synth.system.stopwatch import ProgressCallback
 
 _TRIES = 3
 # So many first sequences failing on the job's own account, and none succeeding, condemn the job.
 _VERDICT = 5
+
+_Event = Callable[[Watcher], None]
 
 
 @dataclass(frozen=True)
@@ -65,6 +66,29 @@ class Summary:
     """Hash of the content hashes of all finished sequences in order."""
 
 
+def render_job(job: Job, out: str | Path, *, progress: bool | Watcher = False, **options: Any) -> Summary:
+    """Renders the dataset of a job into a folder; one that is there for the same job is continued.
+
+    Sequences are computed in processes of their own, so this works from a notebook too. A sequence that fails
+    doesn't end the run: `Summary.failed` has its reason.
+
+    Args:
+        job: the job; `load_job` reads one.
+        out: the folder.
+        progress: True draws bars, in a terminal or a notebook; a `Watcher` is called with what happens.
+        options: as the command's: `workers`, `engine`, `gpus`, `memory_gb`, `mix_versions`.
+
+    Raises:
+        UserError: the folder is not for this job, the disk is full, or the job cannot be carried out.
+    """
+    if progress is True:
+        from synth.engine.progress import Bars
+
+        with Bars() as bars:
+            return run_job(job, Path(out), Options(**options), bars)
+    return run_job(job, Path(out), Options(**options), progress or Watcher())
+
+
 def run_job(job: Job, root: Path, options: Options, watcher: Watcher) -> Summary:
     """Computes the sequences of `job` that `root` lacks.
 
@@ -74,19 +98,18 @@ def run_job(job: Job, root: Path, options: Options, watcher: Watcher) -> Summary
         KeyboardInterrupt: after the workers are ended; what is sealed stays, the next run goes on.
     """
     workers, memory = options.workers or len(os.sched_getaffinity(0)), options.memory_gb
-    share = slots.share_of_memory(workers) if memory is None else int(memory * 1e9)
+    share = machine.share_of_memory(workers) if memory is None else int(memory * 1e9)
     if options.engine == "local" and options.work == Options.work:  # a stand-in takes what it takes
         size_forecast.refuse_if_too_long(job, share, workers)
     cameras.refuse_unfit(job.render)
-    gpus = slots.gpus(options.gpus, job.render.variant == "cuda_ad_rgb")
+    gpus = machine.gpus(options.gpus, job.render.variant == "cuda_ad_rgb")
     with claim(root, job, mix_versions=options.mix_versions) as folder:
-        finished, failures = set(folder.sealed()), folder.failures()
-        todo = [k for k in range(job.sequences) if k not in finished and k not in failures]
-        size_forecast.refuse_if_too_large(
-            size_forecast.forecast_rest(job, root, len(todo), sorted(finished)), root
-        )
-        journal = Journal(folder, workers, watcher)
-        journal.begin(job.sequences, len(finished), len(failures))
+        finished, failures = folder.sealed(), folder.failures()
+        todo = sorted(set(range(job.sequences)) - set(finished) - set(failures))
+        size_forecast.refuse_if_too_large(size_forecast.forecast_rest(job, root, len(todo), finished), root)
+        watchers = (Journal(folder, workers, watcher.account), watcher)
+        for one in watchers:
+            one.begin(job.sequences, len(finished), len(failures))
         setup = Setup(
             job=job.model_dump(mode="json"),
             folder=root.resolve(),
@@ -95,18 +118,16 @@ def run_job(job: Job, root: Path, options: Options, watcher: Watcher) -> Summary
             work=options.work,
             memory_bytes=share,
             stall_s=options.stall_s,
-            keep_open=(folder.lock_fd,),
-            environment={**slots.machine(job, workers), **options.environment},
+            lock_fd=folder.lock_fd,
+            environment={**machine.environment(job, workers), **options.environment},
             turn=folder.turn,
             turn_file=folder.turn_file.resolve(),
         )
         try:
-            with _slots(options.engine, setup, workers, gpus) as made:
-                done = _Pool(folder, made, todo).work(journal)
-        except BaseException:
-            index.write_index(folder)
-            raise
-        rows = index.write_index(folder)
+            with _slots(options.engine, setup, workers, gpus) as slots:
+                done = _Pool(folder, slots[: max(1, len(todo))], todo).work(watchers)
+        finally:
+            rows = index.write_index(folder)
         if done or not (root / "preview.mp4").exists():
             film.write_preview(root)
             card.write_card(folder)
@@ -123,34 +144,33 @@ def run_job(job: Job, root: Path, options: Options, watcher: Watcher) -> Summary
 class _Pool:
     """Threads, each with a slot of its own, and the queue that they take sequences from."""
 
-    def __init__(self, folder: Folder, slots: Slots, todo: list[int]) -> None:
+    def __init__(self, folder: Folder, slots: Sequence[Slot], todo: list[int]) -> None:
         self._folder, self._slots = folder, slots
-        self._workers = max(1, min(slots.count(), len(todo)))
         self._todo = deque((k, 1) for k in todo)
         self._busy = 0
         self._change = threading.Condition()
         self._stop = threading.Event()
-        self._events: queue.SimpleQueue[Callable[[Journal], None] | BaseException | None] = (
-            queue.SimpleQueue()
-        )
+        # For the main thread: what watchers are called with, an error, or None when a thread ends.
+        self._events: queue.SimpleQueue[_Event | BaseException | None] = queue.SimpleQueue()
         self._done = 0
         self._refused: list[Attempt] = []
 
-    def work(self, journal: Journal) -> int:
+    def work(self, watchers: Iterable[Watcher]) -> int:
         """Runs until nothing is left to do; returns how many were finished."""
-        threads = [threading.Thread(target=self._thread, daemon=True) for _ in range(self._workers)]
+        threads = [threading.Thread(target=self._serve, args=(slot,), daemon=True) for slot in self._slots]
         for thread in threads:
             thread.start()
         try:
             alive = len(threads)
             while alive:
                 event = self._events.get()
+                if isinstance(event, BaseException):
+                    raise event
                 if event is None:
                     alive -= 1
-                elif isinstance(event, BaseException):
-                    raise event
-                else:
-                    event(journal)
+                    continue
+                for watcher in watchers:
+                    event(watcher)
         finally:
             self._stop.set()
             with self._change:
@@ -160,11 +180,15 @@ class _Pool:
             self._folder.sweep_all()
         return self._done
 
-    def _thread(self) -> None:
-        slot = self._slots.slot()
+    def _serve(self, slot: Slot) -> None:
         try:
             while (task := self._take()) is not None:
-                self._settle(slot.run(task[0], self._reporter(task[0]), self._stop), task[1])
+                index, tries = task
+
+                def report(stage: str, done: int, of: int, index: int = index) -> None:
+                    self._events.put(lambda watcher: watcher.stage(index, stage, done, of))
+
+                self._settle(slot.run(index, report, self._stop), tries)
         except BaseException as error:
             self._events.put(error)
         finally:
@@ -174,14 +198,11 @@ class _Pool:
     def _take(self) -> tuple[int, int] | None:
         """The next (sequence, try); waits while others may still give one back; None at the end."""
         with self._change:
-            while not self._stop.is_set():
-                if self._todo:
-                    self._busy += 1
-                    return self._todo.popleft()
-                if not self._busy:
-                    return None
-                self._change.wait()
-            return None
+            self._change.wait_for(lambda: self._stop.is_set() or self._todo or not self._busy)
+            if self._stop.is_set() or not self._todo:
+                return None
+            self._busy += 1
+            return self._todo.popleft()
 
     def _settle(self, attempt: Attempt, tries: int) -> None:
         again = False
@@ -213,24 +234,22 @@ class _Pool:
             left = self._done + len(self._todo) + self._busy - 1
             hopeless = not self._done and (len(self._refused) >= _VERDICT or not left)
         if hopeless and not self._folder.sealed():
-            # The job itself is at fault: nothing of it is kept.
-            for refused in self._refused:
-                (self._folder.state / "failed" / f"{refused.index:06d}.json").unlink(missing_ok=True)
-            reasons = sorted({refused.reason for refused in self._refused})
-            raise UserError("\n".join(reasons))
-
-    def _reporter(self, key: int) -> ProgressCallback:
-        def report(stage: str, done: int, of: int) -> None:
-            self._events.put(lambda watcher: watcher.stage(key, stage, done, of))
-
-        return report
+            # The job itself is at fault: nothing of it stays.
+            self._folder.forgive([refused.index for refused in self._refused])
+            raise UserError("\n".join(sorted({refused.reason for refused in self._refused})))
 
 
-def _slots(
-    engine: str, setup: Setup, workers: int, gpus: tuple[str, ...] | None
-) -> AbstractContextManager[Slots]:
+@contextmanager
+def _slots(engine: str, setup: Setup, workers: int, gpus: tuple[str, ...] | None) -> Iterator[Sequence[Slot]]:
+    """Where sequences are computed; each of this machine's slots sees one of `gpus` in turn, or all."""
     if engine == "local":
-        return nullcontext(slots.LocalSlots(setup, workers, gpus))
+        setups = [setup] * workers
+        if gpus is not None:
+            seen = [{"CUDA_VISIBLE_DEVICES": gpus[k % len(gpus)] if gpus else ""} for k in range(workers)]
+            setups = [replace(setup, environment={**(setup.environment or {}), **one}) for one in seen]
+        yield [Child(one) for one in setups]
+        return
     from synth.engine import dask
 
-    return dask.open_slots(engine, setup)
+    with dask.open_slots(engine, setup) as slots:
+        yield slots

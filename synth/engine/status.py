@@ -6,7 +6,8 @@ import fcntl
 import os
 import shutil
 from collections import Counter
-from dataclasses import asdict, dataclass
+from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +17,7 @@ from synth.dataset import location, size_forecast
 from synth.dataset.folder import Folder
 from synth.dataset.size_forecast import Forecast
 from synth.dataset.store import open_sequence
-from synth.engine.journal import Account
-from synth.engine.progress import clock
+from synth.engine.journal import FILE, RunProgress
 from synth.errors import UserError
 from synth.system import checked_file
 
@@ -41,9 +41,6 @@ class Status:
     stages_cpu_s: dict[str, float]
     """CPU-seconds a sequence by stage, mean of up to ten finished ones."""
 
-    def as_dict(self) -> dict[str, Any]:
-        return asdict(self)
-
 
 def read_status(root: Path) -> Status:
     """The status of the dataset in `root`. UserError if there is none."""
@@ -51,15 +48,15 @@ def read_status(root: Path) -> Status:
     job, done = folder.job(), folder.sealed()
     failures = folder.failures()
     todo = max(0, job.sequences - len(done) - len(set(failures) - set(done)))
-    journal = _journal(folder)
+    progress = _progress(folder)
     stages = _stages(root, size_forecast.pilot(done))
     return Status(
         total=job.sequences,
         done=len(done),
         failed=dict(Counter(failure["reason"] for failure in failures.values()).most_common()),
-        running=journal is not None,
-        in_flight=(journal.in_flight if journal else None) or {},
-        left_s=journal.left_s if journal else None,
+        running=progress is not None,
+        in_flight=progress.in_flight if progress else {},
+        left_s=progress.left_s if progress else None,
         ahead=size_forecast.forecast_rest(job, root, todo, done, sum(stages.values()) if stages else None),
         disk_free=shutil.disk_usage(root).free,
         stages_cpu_s=stages,
@@ -96,7 +93,7 @@ def lines(status: Status) -> list[str]:
     return found
 
 
-def _journal(folder: Folder) -> Account | None:
+def _progress(folder: Folder) -> RunProgress | None:
     """What the run at work says of itself; None when none is at work."""
     try:
         descriptor = os.open(folder.state / "lock", os.O_RDONLY | os.O_NONBLOCK)
@@ -104,28 +101,34 @@ def _journal(folder: Folder) -> Account | None:
         return None
     try:
         fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        return None
     except BlockingIOError:
-        return _account(folder)
+        try:
+            return TypeAdapter(RunProgress).validate_python(checked_file.read_json(folder.state / FILE))
+        except (UserError, ValidationError):  # it has only just begun, or is of another version
+            return RunProgress()
     finally:
         os.close(descriptor)
-    return None
 
 
-def _account(folder: Folder) -> Account:
-    try:
-        return TypeAdapter(Account).validate_python(checked_file.read_json(folder.state / "progress.json"))
-    except (UserError, ValidationError):  # it has only just begun, or is of another version
-        return Account()
+def clock(seconds: float) -> str:
+    """9 s, 2:05 min, 3:20 h, 4.2 days."""
+    whole = round(seconds)
+    if whole < 60:
+        return f"{whole} s"
+    if whole < 3600:
+        return f"{whole // 60}:{whole % 60:02d} min"
+    if whole < 86400:
+        return f"{whole // 3600}:{whole % 3600 // 60:02d} h"
+    return f"{seconds / 86400:.1f} days"
 
 
 def _stages(root: Path, pilot: list[int]) -> dict[str, float]:
     total: Counter[str] = Counter()
     read = 0
     for key in pilot:
-        try:
+        with suppress(UserError):  # `synth verify` is for damage
             timings = open_sequence(location.store(root, key)).attrs.get("timings", {})
-        except UserError:
-            continue  # `synth verify` is for damage
-        read += 1
-        total.update({name: stage["cpu_s"] for name, stage in timings.items() if isinstance(stage, dict)})
-    return {name: seconds / read for name, seconds in total.items()} if read else {}
+            total.update({name: stage["cpu_s"] for name, stage in timings.items() if isinstance(stage, dict)})
+            read += 1
+    return {name: seconds / read for name, seconds in total.items()}

@@ -18,6 +18,7 @@ import sys
 import tempfile
 import traceback
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -32,80 +33,57 @@ def main(pipe: int) -> None:
     """Serves until standard input ends."""
     _die_with_parent()
     setup = json.loads(sys.stdin.readline())
-    logs = Path(setup["logs"])
     # Libraries that drop files where they stand must not meet one another's, nor litter the user's folder.
     with tempfile.TemporaryDirectory(dir=setup["scratch"]) as scratch:
         os.chdir(scratch)
-        _log_to(logs / f"worker-{os.getpid()}.log")
-        _serve(pipe, setup, logs)
+        _log_to(Path(setup["logs"]) / f"worker-{os.getpid()}.log")
+        _serve(pipe, setup)
 
 
-def _serve(pipe: int, setup: dict[str, Any], logs: Path) -> None:
-    work = job = None
+def _serve(pipe: int, setup: dict[str, Any]) -> None:
+    folder, render = Path(setup["folder"]), None
     settled = False
     for line in sys.stdin:
         index = int(line)
-        log = logs / f"{index:06d}.log"
+        log = Path(setup["logs"]) / f"{index:06d}.log"
         _log_to(log)
         try:
-            if location.store(Path(setup["folder"]), index).exists():
-                # An attempt that a cluster lost sight of had just sealed it.
-                log.unlink(missing_ok=True)
-                _send(pipe, sealed=index)
-                continue
-            if work is None or job is None:
-                _send(pipe, stage="start", done=0, of=1)
-                _refuse_other_version(setup["generator"])
-                work, job = _work(setup["work"]), _job(setup["job"])
-            work(job, index, Path(setup["folder"]), _reporter(pipe))
+            # It is there already if a cluster lost sight of an attempt that had just sealed it.
+            if not location.store(folder, index).exists():
+                if render is None:
+                    _send(pipe, stage="start", done=0, of=1)
+                    render = _prepare(setup)
+                render(index, folder, lambda stage, done, of: _send(pipe, stage=stage, done=done, of=of))
         except UserError as error:
             _send(pipe, failed="input", reason=str(error))
-        except OSError as error:
-            traceback.print_exc()
-            full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
-            _send(pipe, failed="disk" if full else "error", reason=f"{type(error).__name__}: {error}")
-        except MemoryError:
-            traceback.print_exc()
-            _send(pipe, failed="memory", reason="out of memory")
         except Exception as error:  # whatever it is, it costs this sequence and not the run
             traceback.print_exc()
-            first = (str(error).splitlines() or [""])[0]
-            _send(pipe, failed="error", reason=f"{type(error).__name__}: {first}")
+            kind, first = "error", (str(error).splitlines() or [""])[0]
+            if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EROFS):
+                kind = "disk"
+            elif isinstance(error, MemoryError):
+                kind, first = "memory", "out of memory"
+            _send(pipe, failed=kind, reason=f"{type(error).__name__}: {first}")
         else:
             log.unlink(missing_ok=True)
             _send(pipe, sealed=index)
         gc.collect()
-        if work is not None and not settled:
+        if render is not None and not settled:
             # Libraries hold a million objects that never go: walking over them three times a sequence, in
             # search of what a scene left, took 0.7 s of it.
             gc.freeze()
             settled = True
 
 
-def _refuse_other_version(expected: str) -> None:
+def _prepare(setup: dict[str, Any]) -> Callable[..., None]:
+    """What computes a sequence, given its job. UserError if the engine is of another version."""
     from synth.dataset import provenance
-
-    if expected and provenance.fingerprint() != expected:
-        raise UserError("the worker has another version of this program or its libraries than the engine")
-
-
-def _job(described: dict[str, Any]) -> Any:
     from synth.job.schema import Job
 
-    return Job.model_validate(described)
-
-
-def _work(name: str) -> Callable[..., Any]:
-    module, _, function = name.partition(":")
-    work: Callable[..., Any] = getattr(importlib.import_module(module), function)
-    return work
-
-
-def _reporter(pipe: int) -> Callable[[str, int, int], None]:
-    def report(stage: str, done: int, of: int) -> None:
-        _send(pipe, stage=stage, done=done, of=of)
-
-    return report
+    if setup["generator"] and provenance.fingerprint() != setup["generator"]:
+        raise UserError("the worker has another version of this program or its libraries than the engine")
+    module, _, function = setup["work"].partition(":")
+    return partial(getattr(importlib.import_module(module), function), Job.model_validate(setup["job"]))
 
 
 def _send(pipe: int, **message: Any) -> None:

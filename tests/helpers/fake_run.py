@@ -11,16 +11,16 @@ from pathlib import Path
 
 from synth.dataset.folder import claim
 from synth.dataset.index import write_index
-from synth.engine.journal import Account
+from synth.engine.child import Attempt
+from synth.engine.journal import RunProgress, Watcher
 from synth.engine.run import Options, run_job
-from synth.engine.worker_process import Attempt
 from synth.job.schema import Job
 from synth.publish import card
 
 HERE = Path(__file__).resolve().parent
 
 
-class Silent:
+class Silent(Watcher):
     """A watcher that remembers the attempts."""
 
     def __init__(self) -> None:
@@ -35,8 +35,8 @@ class Silent:
     def end(self, attempt: Attempt, again: bool) -> None:
         self.attempts.append((attempt, again))
 
-    def account(self, account: Account) -> None:
-        self.last = account
+    def account(self, progress: RunProgress) -> None:
+        self.last = progress
 
 
 def options(work: str, **more: object) -> Options:

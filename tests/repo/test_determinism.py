@@ -11,7 +11,7 @@ from sources import PACKAGES, ROOT, imports, sources
 MAY_READ_CLOCKS = {
     "synth/system/stopwatch.py",
     "synth/engine/progress.py",
-    "synth/engine/worker_process.py",
+    "synth/engine/child.py",
     "synth/engine/journal.py",
     "synth/dataset/folder.py",
 }

@@ -11,10 +11,10 @@ from fake_run import Silent, options, start, wait_for
 
 from synth.dataset import index, provenance
 from synth.dataset.folder import Folder
+from synth.engine import machine
 from synth.engine import run as engine
-from synth.engine import slots
+from synth.engine.child import Child, Setup
 from synth.engine.run import Summary
-from synth.engine.worker_process import Child, Setup
 from synth.errors import UserError
 from synth.job.schema import Job
 
@@ -96,13 +96,13 @@ def test_workers_take_gpus_in_turn(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 
 def test_which_gpus_there_are(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "0,1")
-    assert slots.gpus("auto", True) == ("0", "1")
-    assert slots.gpus("auto", False) is None
+    assert machine.gpus("auto", True) == ("0", "1")
+    assert machine.gpus("auto", False) is None
     with pytest.raises(UserError, match="2"):
-        slots.gpus("0,2", True)
+        machine.gpus("0,2", True)
     monkeypatch.delenv("CUDA_VISIBLE_DEVICES")
     monkeypatch.setenv("PATH", "")
-    assert slots.gpus("auto", True) is None, "no driver"
+    assert machine.gpus("auto", True) is None, "no driver"
 
 
 @pytest.mark.slow

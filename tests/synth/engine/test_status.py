@@ -47,7 +47,7 @@ def test_failures_are_counted_by_reason_and_retried(tmp_path: Path) -> None:
 
 def test_what_is_left_goes_by_the_latest_sequences(tmp_path: Path) -> None:
     def left(workers: int, todo: int, *ends: float) -> float | None:
-        journal = Journal(Folder(tmp_path), workers, Silent())
+        journal = Journal(Folder(tmp_path), workers, Silent().account)
         journal._left = todo
         for at in ends:
             journal.pace(at)

@@ -1,0 +1,201 @@
+"""One worker process seen from the engine: starts it, gives it sequences, watches it, survives it."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import select
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal, Protocol
+
+import synth
+from synth.system.stopwatch import ProgressCallback
+
+Kind = Literal["done", "input", "error", "crash", "memory", "stalled", "disk", "stopped"]
+"""How an attempt ended: only `done` is good; `input` would end the same way again."""
+
+_TICK_S = 0.2
+_LOG_TAIL = 4000
+# A process that has computed so many is replaced, should a library leak: none was seen to, over 16 sequences
+# (731 MB after the last, 736 after the second); starting anew costs what half a sequence does.
+_SEQUENCES_A_PROCESS = 128
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """The end of one attempt at one sequence."""
+
+    index: int
+    kind: Kind
+    reason: str = ""
+    log: str = ""
+    """Last lines that the process printed."""
+
+
+@dataclass(frozen=True)
+class Setup:
+    """What every worker process of a run is started with."""
+
+    job: Mapping[str, Any]
+    """The job, JSON-ready, paths resolved."""
+    folder: Path
+    """The dataset; like all paths here absolute, for a worker stands elsewhere."""
+    logs: Path
+    scratch: Path
+    """Where a process may leave what it likes."""
+    work: str
+    """`module:function` that computes a sequence: `(job, index, folder, report)`."""
+    memory_bytes: int | None = None
+    """A process that takes more is ended."""
+    stall_s: float = 1800.0
+    """A process that reports nothing for so long is ended."""
+    lock_fd: int | None = None
+    """The lock of the dataset, which lives as long as any worker does."""
+    environment: Mapping[str, str] | None = None
+    """Added to that of the engine."""
+    generator: str = ""
+    """Version of the program that the engine has; a machine of a cluster with another one refuses."""
+    turn: int = 0
+    """Which run of the dataset this is; another number in `turn_file` says that it is over."""
+    turn_file: Path = Path()
+
+
+class Slot(Protocol):
+    """Where one sequence at a time is computed; the engine has a thread for every slot."""
+
+    def run(self, index: int, report: ProgressCallback, stop: threading.Event) -> Attempt:
+        """Computes one sequence; returns when it is sealed, has failed, or `stop` is set."""
+        ...
+
+    def close(self) -> None:
+        """Ends what the slot holds."""
+        ...
+
+
+class Child:
+    """A slot on this machine: a worker process, started at need and replaced when it is worn or gone."""
+
+    def __init__(self, setup: Setup) -> None:
+        self._setup = setup
+        self._process: subprocess.Popen[bytes] | None = None
+
+    def run(self, index: int, report: ProgressCallback, stop: threading.Event) -> Attempt:
+        """Computes one sequence, see `Slot`. After anything but "done" and "input" the process is gone."""
+        if self._process is None:
+            self._process = self._start()
+        attempt = self._attempt(self._process, index, report, stop)
+        self._finished += attempt.kind == "done"
+        if attempt.kind not in ("done", "input") or self._finished >= _SEQUENCES_A_PROCESS:
+            self.close()
+        return attempt
+
+    def close(self) -> None:
+        """Ends the process and what it started, at once, and lets go of its pipes."""
+        if self._process is None:
+            return
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(self._process.pid, signal.SIGKILL)
+        self._process.wait()
+        with contextlib.suppress(BrokenPipeError):
+            if self._process.stdin is not None:
+                self._process.stdin.close()
+        os.close(self._pipe)
+        self._process = None
+
+    def _start(self) -> subprocess.Popen[bytes]:
+        self._pipe, theirs = os.pipe()
+        lock = self._setup.lock_fd
+        process = subprocess.Popen(
+            [sys.executable, "-m", "synth.engine.worker", str(theirs)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            pass_fds=(theirs,) if lock is None else (theirs, lock),
+            env=_environment(self._setup.environment or {}),
+            # Ctrl-C in the terminal is for the engine, which then ends its workers in order.
+            start_new_session=True,
+        )
+        os.close(theirs)
+        self._unread, self._finished = b"", 0
+        _write(process, json.dumps(asdict(self._setup), default=str))
+        return process
+
+    def _attempt(
+        self, process: subprocess.Popen[bytes], index: int, report: ProgressCallback, stop: threading.Event
+    ) -> Attempt:
+        _write(process, str(index))
+        last = time.monotonic()
+        limit, stall_s = self._setup.memory_bytes, self._setup.stall_s
+        while not stop.is_set():
+            messages = self._read()
+            for message in messages or ():
+                last = time.monotonic()
+                if "sealed" in message:
+                    return Attempt(index, "done")
+                if "failed" in message:
+                    return Attempt(index, message["failed"], message["reason"], self._log(index))
+                report(message["stage"], message["done"], message["of"])
+            if messages is None:
+                return Attempt(index, "crash", _ending(process.wait()), self._log(index))
+            if limit is not None and _memory(process.pid) > limit:
+                reason = f"took more than {limit / 1e9:.3g} GB of memory"
+                return Attempt(index, "memory", reason, self._log(index))
+            if time.monotonic() - last > stall_s:
+                return Attempt(index, "stalled", f"reported nothing for {stall_s:.0f} s", self._log(index))
+        return Attempt(index, "stopped")
+
+    def _read(self) -> list[dict[str, Any]] | None:
+        """What the process says within a tick; None when it has ended."""
+        if not select.select([self._pipe], [], [], _TICK_S)[0]:
+            return []
+        text = os.read(self._pipe, 1 << 16)
+        *lines, self._unread = (self._unread + text).split(b"\n")
+        return [json.loads(line) for line in lines] if text else None
+
+    def _log(self, index: int) -> str:
+        try:
+            text = (self._setup.logs / f"{index:06d}.log").read_text("utf-8", errors="replace")
+        except FileNotFoundError:
+            return ""
+        return text[-_LOG_TAIL:]
+
+
+def _write(process: subprocess.Popen[bytes], line: str) -> None:
+    assert process.stdin is not None
+    # A process that is gone is noticed, with its reason, by `run`.
+    with contextlib.suppress(BrokenPipeError):
+        process.stdin.write(line.encode() + b"\n")
+        process.stdin.flush()
+
+
+def _memory(pid: int) -> int:
+    try:
+        pages = Path(f"/proc/{pid}/statm").read_text().split()
+    except OSError:  # gone, or a system without /proc
+        return 0
+    return int(pages[1]) * os.sysconf("SC_PAGE_SIZE")
+
+
+def _environment(more: Mapping[str, str]) -> dict[str, str]:
+    """One thread a numerical library: two slow each other down, and their number must not change a sum."""
+    threads = ("OMP", "OPENBLAS", "MKL", "NUMEXPR", "NUMBA", "BLOSC")
+    found = {**os.environ, **{f"{name}_NUM_THREADS": "1" for name in threads}, "PYTHONHASHSEED": "0"}
+    home = str(Path(synth.__file__).resolve().parents[1])
+    found["PYTHONPATH"] = os.pathsep.join(filter(None, [home, found.get("PYTHONPATH", "")]))
+    return {**found, **more}
+
+
+def _ending(code: int) -> str:
+    if code >= 0:
+        return f"the process ended itself with code {code}"
+    name = signal.Signals(-code).name
+    hint = " (the system may have run out of memory)" if name == "SIGKILL" else ""
+    return f"the process died of {name}{hint}"
