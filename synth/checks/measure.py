@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from synth.dataset.store import Sequence
 
@@ -39,3 +41,10 @@ Invariant = Callable[[Sequence, list[int]], Iterator[Measure]]
 def truth(good: bool, where: str) -> Measure:
     """A measure of what either holds or not."""
     return Measure(0.0 if good else 1.0, 0.0, where)
+
+
+def inner(mask: NDArray[np.bool_], pixels: int) -> NDArray[np.bool_]:
+    """The mask (H, W) without the `pixels` next to its edge and the picture's."""
+    side = 2 * pixels + 1
+    core = cv2.erode(mask.astype(np.uint8), np.ones((side, side), np.uint8), borderValue=0)
+    return np.asarray(core, bool)

@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from synth.checks.measure import Measure, truth
+from synth.checks.measure import Measure, inner, truth
 from synth.dataset.store import Sequence
 from synth.render.camera import camera as cameras
 from synth.render.camera.sway import Sway
@@ -24,20 +23,19 @@ def camera(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
     view, (height, width) = camera_of(sequence), sequence.size
     depth = sequence["depth"][0].astype(np.float64)
     on = sequence["tissue"][:] & ~sequence["tool"][0] & (depth > 0)
-    inner = cv2.erode(on.astype(np.uint8), np.ones((9, 9), np.uint8), borderValue=0).astype(bool)
-    yield truth(bool(inner.any()), "no tissue in view")
-    if not inner.any():
+    core = inner(on, 4)
+    yield truth(bool(core.any()), "no tissue in view")
+    if not core.any():
         return
-    pixels = cameras.pixel_grid(view.size)
-    points = rays(view, pixels).reshape(height, width, 3) * depth[..., None]
+    points = rays(view, cameras.pixel_grid(view.size)).reshape(height, width, 3) * depth[..., None]
     across, down = 0.5 * (points[1:-1, 2:] - points[1:-1, :-2]), 0.5 * (points[2:, 1:-1] - points[:-2, 1:-1])
     spanned = np.linalg.norm(np.cross(across, down), axis=-1)
-    inside = inner[1:-1, 1:-1]
+    inside = core[1:-1, 1:-1]
     area = np.maximum(sequence["area"][:][1:-1, 1:-1][inside], 1e-12)
     off = np.abs(spanned[inside] / area - 1)
     yield Measure(float(np.median(off)), 0.02, "area of the middle pixel")
     yield Measure(float(np.quantile(off, 0.9)), 0.3, "area of all but a tenth of the pixels")
-    scale = float(np.median(depth[inner])) / float(np.sqrt(view.K[0, 0] * view.K[1, 1]))
+    scale = float(np.median(depth[core])) / float(np.sqrt(view.K[0, 0] * view.K[1, 1]))
     yield Measure(abs(scale / view.mm_per_px - 1), 0.08, "scale")
 
 
@@ -52,9 +50,8 @@ def contact(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
     # Over the relief a rigid tip's load may be anywhere under it.
     spread = 1.0 if sequence.attrs["mechanics"].get("contact") == "rigid" else 0.1
     sway = Sway(**scenario["sway"]) if "sway" in scenario else None
-    area, tissue = sequence["area"][:], sequence["tissue"][:]
-    inside = cv2.erode(tissue.astype(np.uint8), np.ones((5, 5), np.uint8), borderValue=0).astype(bool)
-    rows, columns = np.indices(tissue.shape)
+    area, inside = sequence["area"][:], inner(sequence["tissue"][:], 2)
+    rows, columns = np.indices(sequence.size)
     peak = float(np.linalg.norm(sequence["force"][:], axis=1).max())
     for t in frames:
         size = np.linalg.norm(sequence["traction"][t], axis=-1)

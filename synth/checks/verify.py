@@ -9,9 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from synth.checks import contents
-from synth.checks.measure import Measure, truth
-from synth.checks.physics import INVARIANTS
+from synth.checks import contents, optics, physics, stereo
+from synth.checks.measure import Invariant, Measure, truth
 from synth.dataset import index, location, provenance, split
 from synth.dataset.folder import Folder
 from synth.dataset.store import Sequence, open_sequence
@@ -20,8 +19,35 @@ from synth.job import identity
 from synth.system.stopwatch import Stopwatch
 from synth.system.text_lines import hang
 
-_FAST_FRAMES = 2
+_FAST_FRAMES, _FRAMES = 2, 8
 _FAST_SEQUENCES = 20
+
+INVARIANTS: dict[str, Invariant] = {
+    function.__name__: function
+    for function in (
+        contents.seal,
+        contents.schema,
+        physics.rest,
+        physics.force,
+        physics.compliance,
+        physics.visibility,
+        physics.warp,
+        physics.forward_backward,
+        optics.camera,
+        optics.contact,
+        stereo.stereo,
+    )
+}
+"""Every invariant of a sequence by name, in the order in which they are checked; docstrings are meanings."""
+
+MEANINGS = {
+    "dataset": "the job, the index and the sequences agree",
+    "splits": "no anatomy, copy or held-out family is on a side where it may not be",
+    "readable": "every store opens and every chunk decodes",
+    **contents.VALUES,
+    **{name: (function.__doc__ or "").split("\n")[0] for name, function in INVARIANTS.items()},
+}
+"""What each check says when it holds."""
 
 
 @dataclass
@@ -51,15 +77,13 @@ class Check:
         if not measure.good:
             self.bad += 1
             self.failures.append(where)
-        if measure.severity > 0 and (
-            not self.offender or measure.severity > Measure(self.worst, self.limit, "").severity
-        ):
+        if measure.severity > (Measure(self.worst, self.limit, "").severity if self.offender else 0):
             self.worst, self.limit, self.offender = measure.value, measure.limit, where
             self.unit = measure.unit
 
 
 @dataclass(frozen=True)
-class Report:
+class VerifyReport:
     """The outcome for one dataset."""
 
     root: str
@@ -76,23 +100,21 @@ class Report:
 
     def lines(self) -> list[str]:
         """For a person: each check and where its worst measure is, wrapped, then every failure in a line."""
-        head = ("check", "count", "bad", "worst", "limit", "unit", "CPU s", "where")
-        rows = [head, *(_row(check) for check in self.checks)]
-        widths = [max(len(row[k]) for row in rows) for k in range(len(head) - 1)]
+        rows = [("check", "count", "bad", "worst", "limit", "unit", "CPU s", "where")]
+        for check in self.checks:
+            worst = (f"{check.worst:.3g}", f"{check.limit:.3g}", check.unit) if check.offender else ("",) * 3
+            counts = (check.name, str(check.count), str(check.bad))
+            rows.append((*counts, *worst, f"{check.cpu_s:.2f}", check.offender))
+        widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
         table = []
         for *cells, where in rows:
-            front = "".join(f"{cell:<{wide}}  " for cell, wide in zip(cells, widths, strict=True))
+            front = "".join(f"{cell:<{wide}}  " for cell, wide in zip(cells, widths, strict=False))
             table += hang(front, where)
         failures = [f"{check.name}: {failure}" for check in self.checks for failure in check.failures]
         return [*table, *failures, "good" if self.good else "not good"]
 
 
-def _row(check: Check) -> tuple[str, ...]:
-    numbers = (f"{check.worst:.3g}", f"{check.limit:.3g}", check.unit) if check.offender else ("", "", "")
-    return (check.name, str(check.count), str(check.bad), *numbers, f"{check.cpu_s:.2f}", check.offender)
-
-
-def verify_dataset(root: Path, *, fast: bool = False) -> Report:
+def verify_dataset(root: Path, *, fast: bool = False) -> VerifyReport:
     """Checks every sequence and the dataset around them.
 
     Fast: some frames of some sequences, and no checksums.
@@ -102,137 +124,105 @@ def verify_dataset(root: Path, *, fast: bool = False) -> Report:
     """
     folder = Folder(root)
     described, sealed = folder.described(), folder.sealed()
-    checks = _checks()
+    checks = {name: Check(name, meaning) for name, meaning in MEANINGS.items()}
     watch = Stopwatch()
     with watch.stage("dataset"):
-        for name, measure, who in _dataset(folder, described, sealed):
-            checks[name].add(measure, who)
-    checks["dataset"].cpu_s += watch.cpu_s("dataset")
-    chosen = sealed
+        for name, who, good, where in _dataset(folder, described, sealed):
+            checks[name].add(truth(good, where), who)
     if fast and len(sealed) > _FAST_SEQUENCES:
-        chosen = [sealed[k] for k in np.linspace(0, len(sealed) - 1, _FAST_SEQUENCES).astype(int)]
-    for key in chosen:
-        _sequence(location.store(folder.root, key), described["identity"], checks, fast)
-    return Report(str(root), len(chosen), fast, list(checks.values()))
+        sealed = [sealed[k] for k in np.linspace(0, len(sealed) - 1, _FAST_SEQUENCES).astype(int)]
+    for key in sealed:
+        path = location.store(folder.root, key)
+        for name, measure in check_sequence(path, described["identity"], watch, fast=fast):
+            checks[name].add(measure, path.name)
+    for name, check in checks.items():
+        check.cpu_s = watch.cpu_s(name)
+    return VerifyReport(str(root), len(sealed), fast, list(checks.values()))
 
 
-def verify_sequence(path: Path, job: str) -> list[Check]:
-    """Checks one store, which belongs to the job of that identity."""
-    checks = _checks()
-    _sequence(path, job, checks, fast=False)
-    return list(checks.values())
+def check_sequence(
+    path: Path, job: str, watch: Stopwatch, *, fast: bool = False
+) -> Iterator[tuple[str, Measure]]:
+    """Measures of one store, which belongs to the job of that identity, by name of check.
 
+    Args:
+        path: the store.
+        job: the identity.
+        watch: takes the time of each check.
+        fast: some frames, and no checksums.
+    """
 
-def _checks() -> dict[str, Check]:
-    checks = {
-        "dataset": Check("dataset", "the job, the index and the sequences agree"),
-        "splits": Check("splits", "no anatomy, copy or held-out family is on a side where it may not be"),
-        "readable": Check("readable", "every store opens and every chunk decodes"),
-    }
-    checks.update({name: Check(name, meaning) for name, meaning in contents.CHECKS.items()})
-    for name, invariant in INVARIANTS.items():
-        checks[name] = Check(name, (invariant.__doc__ or "").split("\n")[0])
-    return checks
+    def without_path(error: UserError) -> str:
+        return str(error).removeprefix(f"{path}: ").removeprefix(f"{path}")
 
-
-def _sequence(path: Path, name: str, checks: dict[str, Check], fast: bool) -> None:
     try:
         sequence = open_sequence(path, sealed=False)
         frames = _frames(sequence, fast)
     except UserError as error:
-        checks["readable"].add(Measure(1.0, 0.0, _without(path, str(error))), path.name)
+        yield "readable", truth(False, without_path(error))
         return
-    own = sequence.attrs.get("job") == name
-    checks["dataset"].add(truth(own, "belongs to another job"), path.name)
-    broken, watch = "", Stopwatch()
+    yield "dataset", truth(sequence.attrs.get("job") == job, "belongs to another job")
+    broken = ""
     try:
-        for key, measure in contents.check_contents(sequence, frames, fast, watch):
-            checks[key].add(measure, path.name)
+        yield from contents.check_values(sequence, frames, fast, watch)
     except UserError as error:
-        broken = _without(path, str(error))
-    for key, invariant in INVARIANTS.items():
+        broken = without_path(error)
+    for name, invariant in INVARIANTS.items():
         try:
-            with watch.stage(key):
+            with watch.stage(name):
                 measures = list(invariant(sequence, frames))
         except UserError as error:
-            broken = broken or _without(path, str(error))
+            broken = broken or without_path(error)
             continue
         except (KeyError, IndexError, TypeError, ValueError) as error:
-            measures = [Measure(1.0, 0.0, f"attributes are missing or odd ({error!r})")]
-        for measure in measures:
-            checks[key].add(measure, path.name)
-    for key, check in checks.items():
-        check.cpu_s += watch.cpu_s(key)
-    checks["readable"].add(truth(not broken, broken or "reads"), path.name)
+            measures = [truth(False, f"attributes are missing or odd ({error!r})")]
+        yield from ((name, measure) for measure in measures)
+    yield "readable", truth(not broken, broken or "reads")
 
 
 def _frames(sequence: Sequence, fast: bool) -> list[int]:
     """The frames to look at closely: where the load is greatest, and some between."""
     force = np.linalg.norm(sequence["force"][:], axis=1)
-    count = _FAST_FRAMES if fast else 8
-    spread = np.linspace(0, sequence.frames - 1, count).round().astype(int)
-    return sorted({int(np.argmax(force)), *(int(t) for t in spread)})
+    spread = np.linspace(0, sequence.frames - 1, _FAST_FRAMES if fast else _FRAMES).round().astype(int)
+    return sorted({int(np.argmax(force)), *spread.tolist()})
 
 
 def _dataset(
     folder: Folder, described: dict[str, Any], sealed: list[int]
-) -> Iterator[tuple[str, Measure, str]]:
-    """(check, measure, whose)."""
+) -> Iterator[tuple[str, str, bool, str]]:
+    """Check, whose, whether it holds, and what is wrong if it doesn't."""
     job = folder.job()
     makers = {provenance.word(one) for one in described.get("generators", [])}
     try:
         same = identity.identify_job(job) == described["identity"] or provenance.fingerprint() not in makers
     except UserError:
         same = True  # the mesh or the photograph need not travel with the dataset
-    yield "dataset", truth(same, "the job is not the one that was rendered"), "dataset.json"
-    failed = set(folder.failures())
-    missing = sorted(set(range(job.sequences)) - set(sealed) - failed)
-    yield (
-        "dataset",
-        truth(not missing, f"{len(missing)} sequences are missing, first {missing[:1]}"),
-        "dataset",
-    )
-    strangers = [key for key in sealed if key >= job.sequences]
-    yield "dataset", truth(not strangers, f"sequences that the job does not have: {strangers[:3]}"), "dataset"
+    yield "dataset", "dataset.json", same, "the job is not the one that was rendered"
+    missing = sorted(set(range(job.sequences)) - set(sealed) - set(folder.failures()))
+    yield "dataset", "dataset", not missing, f"{len(missing)} sequences are missing, first {missing[:1]}"
+    surplus = [key for key in sealed if key >= job.sequences]
+    yield "dataset", "dataset", not surplus, f"sequences that the job does not have: {surplus[:3]}"
     try:
         rows = {row["index"]: row for row in index.read_index(folder.root).to_pylist()}
     except UserError as error:
-        yield "dataset", truth(False, str(error)), index.NAME
+        yield "dataset", index.NAME, False, str(error)
         return
     for key in sealed:
         try:
             found = open_sequence(location.store(folder.root, key), sealed=False)
         except UserError:
             continue  # found and named by the check of that sequence
-        now, row = index.row_of(found), rows.get(key, {})
-        differing = [name for name, value in now.items() if row.get(name) != value]
-        yield "dataset", truth(not differing, f"row {key} differs in {', '.join(differing)}"), index.NAME
-        maker = found.attrs.get("versions", {}).get("generator")
-        known = maker in makers
-        yield "dataset", truth(known, "made by a version that dataset.json does not name"), found.path.name
-    surplus = sorted(key for key, row in rows.items() if row["status"] == "done" and key not in sealed)
-    yield "dataset", truth(not surplus, f"rows without a sequence: {surplus[:3]}"), index.NAME
+        row = rows.get(key, {})
+        differing = [name for name, value in index.row_of(found).items() if row.get(name) != value]
+        yield "dataset", index.NAME, not differing, f"row {key} differs in {', '.join(differing)}"
+        known = found.attrs.get("versions", {}).get("generator") in makers
+        yield "dataset", found.path.name, known, "made by a version that dataset.json does not name"
+    lost = sorted(key for key, row in rows.items() if row["status"] == "done" and key not in sealed)
+    yield "dataset", index.NAME, not lost, f"rows without a sequence: {lost[:3]}"
     try:
         rule = split.read_rule(folder.root)
     except UserError as error:
-        yield "splits", truth(False, str(error)), split.NAME
+        yield "splits", split.NAME, False, str(error)
         return
-    leaking = split.leaks(list(rows.values()), rule) or _misplaced(list(rows.values()), rule)
-    yield "splits", truth(not leaking, "; ".join(leaking[:3]) or "none"), index.NAME
-
-
-def _misplaced(rows: list[dict[str, Any]], rule: split.Rule) -> list[str]:
-    """Sequences that the index puts on another side than the rule does."""
-    try:
-        sides = split.assign_sides(rows, rule)
-    except UserError:  # too few groups to have some on every side
-        sides = [None] * len(rows)
-    return [
-        f"sequence {row['index']} is in {row['split']}, by the rule in {side}"
-        for row, side in zip(rows, sides, strict=True)
-        if row["split"] != side
-    ]
-
-
-def _without(path: Path, text: str) -> str:
-    return text.removeprefix(f"{path}: ").removeprefix(f"{path}")
+    leaking = split.leaks(list(rows.values()), rule) or split.misplaced(list(rows.values()), rule)
+    yield "splits", index.NAME, not leaking, "; ".join(leaking[:3]) or "none"

@@ -164,10 +164,7 @@ def group_by_side(dataset: Dataset) -> dict[str, list[int]]:
 def write_index(folder: Folder) -> list[dict[str, Any]]:
     """Brings the index up to date with the folder. Returns all rows."""
     ordered = collect(folder)
-    try:
-        sides = split.assign_sides(ordered, split.read_rule(folder.root))
-    except UserError:  # too few groups to have some on every side
-        sides = [None] * len(ordered)
+    sides = split.assign_if_possible(ordered, split.read_rule(folder.root))
     for row, side in zip(ordered, sides, strict=True):
         row["split"] = side
     save_rows(folder.root, ordered)

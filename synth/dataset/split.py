@@ -143,6 +143,23 @@ def draw_groups(
     return [part[group] for group in groups]
 
 
+def assign_if_possible(rows: Sequence[Mapping[str, Any]], chosen: Rule) -> list[str | None]:
+    """`assign_sides`; no sides where there are too few groups to have some on each."""
+    try:
+        return assign_sides(rows, chosen)
+    except UserError:
+        return [None] * len(rows)
+
+
+def misplaced(rows: Sequence[Mapping[str, Any]], chosen: Rule) -> list[str]:
+    """Sequences that the index puts on another side than the rule does."""
+    return [
+        f"sequence {row['index']} is in {row['split']}, by the rule in {side}"
+        for row, side in zip(rows, assign_if_possible(rows, chosen), strict=True)
+        if row["split"] != side
+    ]
+
+
 def leaks(rows: Sequence[Mapping[str, Any]], chosen: Rule | None = None) -> list[str]:
     """Anatomies and contents that are on more than one side, and held-out families that are trained on."""
     chosen, found = chosen or Rule(), []

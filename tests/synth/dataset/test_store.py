@@ -119,7 +119,7 @@ def test_half_floats_are_read_as_floats_within_the_stated_error(root: Path, tmp_
     assert 0 < worst <= stated * (1 + 1e-3)
     assert stated < 0.004, "motion here is below 16 px"
     assert "rounding_px" not in exact.attrs["summary"]
-    assert all(measure.good for _, measure in contents.check_contents(half, [0], False, Stopwatch()))
+    assert all(measure.good for _, measure in contents.check_values(half, [0], False, Stopwatch()))
 
 
 def test_a_job_says_which_fields_are_kept(tmp_path: Path) -> None:
