@@ -5,6 +5,7 @@ Plain numbers and plug-ins, so that reading a job needs no compiler; our laws th
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import cache
 from typing import Protocol
 
@@ -69,6 +70,39 @@ def add_law(name: str, law: Law) -> None:
         UserError: the name is taken.
     """
     LAWS.add(name, law)
+
+
+@dataclass(frozen=True)
+class LoadRange:
+    """What the peak load of an instrument is drawn from."""
+
+    load: tuple[float, float]
+    """P = F/(E a^2), where no force is given."""
+    force_mn: tuple[float, float] | None
+    footprint_mm: tuple[float, float]
+    """Radius a of the contact."""
+
+    def largest(self, young_kpa: float) -> float:
+        """Largest P on tissue of at least that modulus."""
+        if self.force_mn is None:
+            return self.load[1]
+        return self.force_mn[1] / (young_kpa * self.footprint_mm[0] ** 2)
+
+
+def check_load_range(law: str, loads: LoadRange, young_kpa: float, label: str) -> None:
+    """ValueError, after `label`, for loads past what a law is known to describe on the softest tissue."""
+    load, largest = loads.largest(young_kpa), largest_load(law)
+    if load <= largest * (1 + 1e-9):  # a force turned into a load may be off by rounding
+        return
+    what, valid = f"load {load:g} is", largest
+    if loads.force_mn is not None:
+        radius = loads.footprint_mm[0]
+        what = (
+            f"force_mn {loads.force_mn[1]:g} on the softest tissue ({young_kpa:g} kPa) under the smallest "
+            f"contact ({radius:g} mm) is a load of {load:.3g},"
+        )
+        valid = largest * young_kpa * radius**2
+    raise ValueError(f"{label}{what} past the range of the {law} law; the largest valid value is {valid:.4g}")
 
 
 @cache

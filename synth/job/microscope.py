@@ -7,50 +7,40 @@ from typing import Annotated, Literal
 
 from pydantic import Field, FiniteFloat
 
-from synth.job.types import (
-    LightKelvin,
-    LightTilt,
-    NonNegative,
-    NonNegativeRange,
-    Positive,
-    PositiveRange,
-    Section,
-    Share,
-    ShareRange,
-)
+from synth.job.types import NonNegative, Positive, Range, Section, Share
 
 
 class LightSection(Section):
     """The microscope's lamps."""
 
-    glare: ShareRange = (0.0, 0.3)
+    glare: Range[Share] = (0.0, 0.3)
     """Wet highlights: 0 as few as lamps beside the lens leave (0.5% of the tissue), 1 twenty times more."""
-    tilt_deg: LightTilt | None = None
+    tilt_deg: Range[Annotated[FiniteFloat, Field(ge=0, le=40)]] | None = None
     """Angle between main lamp and optical axis, 0-40, to any side. Empty: at most 6.5, as `glare` asks."""
-    main: ShareRange = (0.5, 0.68)
+    main: Range[Share] = (0.5, 0.68)
     """Share of light from the main lamp; the rest comes from one across the lens."""
-    kelvin: LightKelvin = (4200.0, 5600.0)
+    kelvin: Range[Annotated[FiniteFloat, Field(ge=2000, le=12_000)]] = (4200.0, 5600.0)
     """Colour temperature [K], 2000-12000."""
-    even: PositiveRange = (0.35, 0.5)
+    even: Range[Positive] = (0.35, 0.5)
     """Radius of the evenly lit spot, in widths of the field; beyond it the light falls off."""
 
 
 class SensorSection(Section):
     """The camera's chip and what its video processor makes of it."""
 
-    exposure: PositiveRange = (0.98, 1.12)
+    exposure: Range[Positive] = (0.98, 1.12)
     """Share of full scale that a white surface at the craniotomy fills."""
-    full_well: PositiveRange = (8_000.0, 20_000.0)
+    full_well: Range[Positive] = (8_000.0, 20_000.0)
     """Photoelectrons at full scale: photon noise is the root of what is counted."""
-    read_noise: NonNegativeRange = (8.0, 14.0)
+    read_noise: Range[NonNegative] = (8.0, 14.0)
     """Noise of the readout, standard deviation [electrons]."""
     vignette: Share = 0.15
     """Share of light lost in the picture's corners."""
     blur_px: Annotated[FiniteFloat, Field(ge=0, le=8)] = 0.0
     """Blur of the optics beyond the aperture's: standard deviation of a Gaussian [px]."""
-    contrast: ShareRange = (0.25, 0.55)
+    contrast: Range[Share] = (0.25, 0.55)
     """Tone curve: weight of an S over plain sRGB."""
-    sharpening: NonNegativeRange = (0.15, 0.4)
+    sharpening: Range[NonNegative] = (0.15, 0.4)
     """Unsharp mask, as a share of the detail."""
     bayer: bool = False
     """One colour a pixel (RGGB), the others interpolated; else three chips."""
@@ -71,11 +61,11 @@ class RenderSection(Section):
     """Light paths a pixel. Flow stops improving at 4-8."""
     variant: Literal["auto", "llvm_ad_rgb", "scalar_rgb", "cuda_ad_rgb"] = "auto"
     """Mitsuba variant; auto takes llvm_ad_rgb where an LLVM works, else scalar_rgb."""
-    field_mm: PositiveRange = (32.0, 38.0)
+    field_mm: Range[Positive] = (32.0, 38.0)
     """Width of the field of view at the craniotomy [mm]."""
-    working_distance_mm: PositiveRange = (280.0, 320.0)
+    working_distance_mm: Range[Positive] = (280.0, 320.0)
     """Distance from the front lens to the craniotomy [mm]."""
-    tilt_deg: NonNegativeRange = (0.0, 20.0)
+    tilt_deg: Range[NonNegative] = (0.0, 20.0)
     """Angle between the optical axis and the craniotomy's normal."""
     aperture_mm: NonNegative = 4.0
     """Radius of the lens aperture [mm]; 0 is a pinhole."""
@@ -90,9 +80,9 @@ class RenderSection(Section):
     calibration: Path | None = None
     """Calibration of a camera as OpenCV writes it (YAML, XML, JSON), relative to the job file; it takes the
     place of field_mm and distortion, and sets the principal point."""
-    drift_mm: NonNegativeRange = (0.0, 0.0)
+    drift_mm: Range[NonNegative] = (0.0, 0.0)
     """Slow drift of the microscope over some seconds [mm]; it is part of the flow."""
-    vibration_mm: NonNegativeRange = (0.0, 0.0)
+    vibration_mm: Range[NonNegative] = (0.0, 0.0)
     """Vibration of the microscope at 4-14 Hz, standard deviation [mm]; it is part of the flow."""
     stereo_mm: NonNegative = 0.0
     """Distance of a second lens to the right [mm], for a stereo dataset: its pictures, and motion in three

@@ -1,17 +1,18 @@
-"""What the job's sections are made of: their base class, and numbers and ranges with their limits."""
+"""What the job's sections are made of: a base class, and numbers, ranges and directions with their limits."""
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
-from pydantic import (
-    AfterValidator,
-    BaseModel,
-    BeforeValidator,
-    ConfigDict,
-    Field,
-    FiniteFloat,
-)
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat
+
+Number = TypeVar("Number")
+
+
+class Section(BaseModel):
+    """One block of the job file. Unknown keys are errors; text under a field is its documentation."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True, allow_inf_nan=False)
 
 
 def _pair(value: Any) -> Any:
@@ -25,29 +26,17 @@ def _ordered(value: tuple[float, float]) -> tuple[float, float]:
     return value
 
 
+def _long(value: tuple[float, float, float]) -> tuple[float, float, float]:
+    if not any(value):
+        raise ValueError("a direction of no length")
+    return value
+
+
+Range = Annotated[tuple[Number, Number], BeforeValidator(_pair), AfterValidator(_ordered)]
+"""From the lower to the upper end; a single number is both."""
 Positive = Annotated[FiniteFloat, Field(gt=0)]
 NonNegative = Annotated[FiniteFloat, Field(ge=0)]
-PositiveRange = Annotated[tuple[Positive, Positive], BeforeValidator(_pair), AfterValidator(_ordered)]
-NonNegativeRange = Annotated[
-    tuple[NonNegative, NonNegative], BeforeValidator(_pair), AfterValidator(_ordered)
-]
-_Instruments = Annotated[int, Field(ge=1, le=3)]
-InstrumentRange = Annotated[
-    tuple[_Instruments, _Instruments], BeforeValidator(_pair), AfterValidator(_ordered)
-]
 Share = Annotated[FiniteFloat, Field(ge=0, le=1)]
-ShareRange = Annotated[tuple[Share, Share], BeforeValidator(_pair), AfterValidator(_ordered)]
-_Tilt = Annotated[FiniteFloat, Field(ge=0, le=40)]
-LightTilt = Annotated[tuple[_Tilt, _Tilt], BeforeValidator(_pair), AfterValidator(_ordered)]
-_Kelvin = Annotated[FiniteFloat, Field(ge=2000, le=12_000)]
-LightKelvin = Annotated[tuple[_Kelvin, _Kelvin], BeforeValidator(_pair), AfterValidator(_ordered)]
-_Poisson = Annotated[FiniteFloat, Field(ge=0, lt=0.5)]
-PoissonRange = Annotated[tuple[_Poisson, _Poisson], BeforeValidator(_pair), AfterValidator(_ordered)]
-PlugInName = Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]+$", max_length=100)]
 Vector = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
-
-
-class Section(BaseModel):
-    """One block of the job file. Unknown keys are errors; text under a field is its documentation."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True, allow_inf_nan=False)
+Direction = Annotated[Vector, AfterValidator(_long)]
+PlugInName = Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]+$", max_length=100)]

@@ -14,7 +14,7 @@ from synth.fem.material import Pia, Tissue
 from synth.fem.pulse import Pulse
 from synth.fem.tool import Gesture, ToolContact
 from synth.job import schema
-from synth.job.instrument import CLEAR_MM, InstrumentSection
+from synth.job.mechanics import CLEAR_MM, InstrumentSection
 from synth.job.schema import Family, FemSection, Job, LightSection, RenderSection
 from synth.render.anatomy.surface import Relief
 from synth.render.appearance.family import FAMILIES, Colour
@@ -196,7 +196,7 @@ def draw_gesture(
     Raises:
         UserError: what is drawn has no room in `fem.within_mm`.
     """
-    drawn, wanted = str(rng.choice(fem.gestures)), fem.demand(asked)
+    drawn, wanted = str(rng.choice(fem.gestures)), fem.load_range(asked)
     kind = asked.gesture or drawn
     footprint = _uniform(rng, wanted.footprint_mm)
     unit_mn = young_kpa * footprint**2  # the force of P = 1

@@ -1,0 +1,191 @@
+"""The job's sections on tissue and load: what is deformed, how it is held, and what instruments do to it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Annotated, Literal
+
+from pydantic import AfterValidator, BeforeValidator, Field, FiniteFloat, model_validator
+
+from synth.job.laws import LAWS, LoadRange, check_load_range, choose_law
+from synth.job.types import Direction, NonNegative, PlugInName, Positive, Range, Section, Share
+
+Kind = Literal["pull", "push", "slide", "grasp", "retract", "tap"]
+
+CLEAR_MM = 1.0
+"""How far a contact stays clear of the rim."""
+
+_DIRECTIONS: dict[Kind, tuple[str, Callable[[float, float, float], bool]]] = {
+    "pull": ("points out of the brain, z above 0", lambda x, y, z: z > 0),
+    "grasp": ("points out of the brain, z above 0", lambda x, y, z: z > 0),
+    "push": ("points into the brain, z below 0", lambda x, y, z: z < 0),
+    "tap": ("points into the brain, z below 0", lambda x, y, z: z < 0),
+    "retract": ("goes aside, z not above 0 and x or y not 0", lambda x, y, z: z <= 0 and not x == y == 0),
+    "slide": ("needs x or y, the way it goes", lambda x, y, z: not x == y == 0),
+}
+"""Which way a gesture can load the tissue: z is out of the brain."""
+
+_Part = Annotated[FiniteFloat, Field(gt=0, lt=1)]
+
+
+class InstrumentSection(Section):
+    """One instrument as asked; what is left out is drawn as for the others."""
+
+    gesture: Kind | None = None
+    """What it does. Empty: drawn from `fem.gestures`."""
+    place: tuple[FiniteFloat, FiniteFloat] | None = None
+    """Middle of its contact at rest [mm]: x and y in world axes, from the middle of the opening."""
+    direction: Direction | None = None
+    """Which way it loads the tissue, in world axes with z out of the brain; normalised. Of a slide x and y
+    count: the way it goes. Needs `gesture`."""
+    load: Range[Positive] | None = None
+    """Peak load as P = F/(E a^2)."""
+    force_mn: Range[Positive] | None = None
+    """Peak force of a contact [mN], instead of `load`."""
+    footprint_mm: Range[Positive] | None = None
+    """Radius a of its contact [mm]."""
+    timing: tuple[_Part, _Part, _Part, _Part] | None = None
+    """Touch, full load, load begins to fall, release: rising parts of the sequence. Of a tap the first and
+    the last count."""
+
+    @model_validator(mode="after")
+    def _goes_together(self) -> InstrumentSection:
+        if self.load is not None and self.force_mn is not None:
+            raise ValueError("either load or force_mn, not both")
+        if self.timing is not None:
+            touch, full, fall, release = self.timing
+            if not touch < full <= fall < release:
+                raise ValueError("timing: touch, full load, fall and release must follow one another")
+        if self.direction is not None and self.gesture is None:
+            raise ValueError("direction needs gesture: a push points inwards, a pull outwards")
+        if self.direction is not None and self.gesture is not None:
+            rule, holds = _DIRECTIONS[self.gesture]
+            if not holds(*self.direction):
+                raise ValueError(f"direction: a {self.gesture} {rule}")
+        return self
+
+
+class MembraneSection(Section):
+    """The pia-arachnoid, a thin stiff sheet on the surface that wrinkles under compression. Default: none."""
+
+    intact: Share = 0.0
+    """Part of the sequences that have it; from the others it is stripped, as from many ex vivo specimens."""
+    young_kpa: Range[Positive] = (100.0, 1000.0)
+    """Its Young's modulus at small strain [kPa], drawn log-uniformly. Human: about 900 (3 times a shear
+    modulus of 300: Vandemaele et al., Acta Biomater. 2025); less where it is slack or partly stripped. Past
+    the toe of the curve it is thousands (ovine 7,700: Fluids Barriers CNS 17, 2020)."""
+    thickness_mm: Range[Positive] = (0.05, 0.2)
+    """Its thickness [mm], drawn uniformly. What counts is thickness times modulus."""
+
+
+class PulseSection(Section):
+    """Heart and breath: the exposed surface rises and falls, by a pressure from below. Default: it is still.
+
+    Amplitudes are of the middle of the opening, peak to peak, drawn uniformly as the rates are. In a patient
+    below 0.8 mm, with peaks at 0.2 and 1 Hz (Faria et al., Med. Phys. 41, 2014).
+    """
+
+    heart_mm: Range[NonNegative] = (0.0, 0.0)
+    """Motion with the heart [mm]."""
+    heart_hz: Range[Positive] = (1.0, 1.7)
+    """Heart beats a second."""
+    breath_mm: Range[NonNegative] = (0.0, 0.0)
+    """Motion with the breath [mm]."""
+    breath_hz: Range[Positive] = (0.2, 0.35)
+    """Breaths a second."""
+
+
+Skulls = Annotated[
+    tuple[Literal["bonded", "slip"], ...],
+    Field(min_length=1),
+    BeforeValidator(lambda value: (value,) if isinstance(value, str) else value),
+]
+
+
+class FemSection(Section):
+    """The physics of the tissue and of the load."""
+
+    law: Annotated[PlugInName, AfterValidator(lambda name: LAWS.check_name(name, "auto"))] = "auto"
+    """Material law: linear, corotational, neo-hookean or an installed plug-in's; auto takes the
+    cheapest of ours whose error against neo-Hookean at the largest load is within 5%."""
+    tets: Annotated[int, Field(ge=100, le=200_000)] = 1600
+    """Number of quadratic tetrahedra to aim for; graded towards the craniotomy."""
+    young_kpa: Range[Positive] = (0.5, 3.0)
+    """Young's modulus E [kPa], drawn log-uniformly."""
+    poisson: Range[Annotated[FiniteFloat, Field(ge=0, lt=0.5)]] = (0.4, 0.4)
+    """Poisson's ratio, drawn uniformly. Brain within seconds: 0.45 to nearly 0.5; drained: less."""
+    skull: Skulls = ("bonded",)
+    """How tissue is held round the opening, one or both, in equal shares: bonded to the skull, or free to
+    slip along it (subarachnoid fluid)."""
+    membrane: MembraneSection = MembraneSection()
+    """The pia-arachnoid on the surface."""
+    pulse: PulseSection = PulseSection()
+    """Motion of the exposed surface that no tool makes."""
+    load: Range[Positive] = (0.05, 0.4)
+    """Peak load as P = F/(E a^2), dimensionless, so that one range suits every stiffness."""
+    force_mn: Range[Positive] | None = None
+    """Peak force of a contact [mN]; given, it takes the place of `load`."""
+    footprint_mm: Range[Positive] = (3.0, 6.0)
+    """Radius a of the contact [mm]."""
+    gestures: Annotated[tuple[Kind, ...], Field(min_length=1)] = (
+        "pull",
+        "push",
+        "slide",
+        "grasp",
+        "retract",
+        "tap",
+    )
+    """Kinds of gesture that sequences are drawn from, in equal shares."""
+    instruments: Range[Annotated[int, Field(ge=1, le=3)]] = (1, 1)
+    """How many instruments act at once, each with a gesture, load, direction and timing of its own."""
+    crew: Annotated[tuple[InstrumentSection, ...], Field(max_length=3)] = ()
+    """Instruments as asked, the first ones of `instruments` (there are at least so many): a list of {gesture,
+    place, direction, load, force_mn, footprint_mm, timing}, each of them drawn where it is left out."""
+    within_mm: Positive | None = None
+    """What is loaded keeps within this radius of the opening's middle [mm], such as what the camera sees of a
+    wide opening; a `crew`'s places count as they are. Empty: anywhere in the opening."""
+    cone_deg: Annotated[FiniteFloat, Field(ge=0, le=80)] = 65.0
+    """The load's direction is drawn uniformly within this angle of the surface normal."""
+    time: Literal["quasi-static", "dynamic"] = "quasi-static"
+    """Equilibrium in every frame, or motion with inertia (backward Euler)."""
+    mass_kg: Positive | None = None
+    """Dynamic: mass of the whole volume [kg]. Empty: 1040 kg/m3."""
+    relaxation: Annotated[
+        tuple[tuple[Annotated[FiniteFloat, Field(gt=0, lt=1)], Positive], ...], Field(max_length=2)
+    ] = ()
+    """Prony terms [part of the stiffness lost, time in s], one or two: E is then that of a sudden load."""
+
+    @model_validator(mode="after")
+    def _some_stiffness_stays(self) -> FemSection:
+        if sum(part for part, _ in self.relaxation) >= 1:
+            raise ValueError("relaxation: the parts lost add up to the whole stiffness or more")
+        return self
+
+    @model_validator(mode="after")
+    def _loads_are_in_the_laws_range(self) -> FemSection:
+        for name, loads in self._load_ranges:
+            check_load_range(self.chosen_law[0], loads, self.young_kpa[0], name)
+        return self
+
+    def load_range(self, instrument: InstrumentSection) -> LoadRange:
+        """The ranges that count for an instrument: its own where it has some."""
+        own = instrument if instrument.load or instrument.force_mn else self
+        return LoadRange(own.load or self.load, own.force_mn, instrument.footprint_mm or self.footprint_mm)
+
+    @property
+    def _load_ranges(self) -> list[tuple[str, LoadRange]]:
+        """What can be drawn: of each instrument that is asked for, and of those that aren't."""
+        drawn = [("", self.load_range(InstrumentSection()))] if self.instruments[1] > len(self.crew) else []
+        return drawn + [(f"crew[{k}]: ", self.load_range(one)) for k, one in enumerate(self.crew)]
+
+    @property
+    def chosen_law(self) -> tuple[str, str]:
+        """The material law of every sequence, and why."""
+        if self.law == "auto" and self.membrane.intact > 0:
+            return "neo-hookean", "a membrane stretches as it bends, which the linear law leaves out"
+        return choose_law(self.law, self.largest_load)
+
+    @property
+    def largest_load(self) -> float:
+        """Largest P = F/(E a^2) that can be drawn."""
+        return max(loads.largest(self.young_kpa[0]) for _, loads in self._load_ranges)
