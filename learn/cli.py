@@ -260,7 +260,8 @@ def predict_command(
     json: Json = False,
 ) -> None:
     """Write the force maps and force curves that a model sees in stores, videos or arrays of flow."""
-    from learn.inference.apply import Filmed, apply, has_second_eye, motions
+    from learn.inference.apply import apply
+    from learn.inference.motion import VideoOptions, has_second_eye, motions
     from learn.inference.predict import load_model
     from learn.inference.prediction_file import write_overlay, write_prediction
     from learn.inference.shipped import NONE, choose_model, shipped
@@ -278,9 +279,11 @@ def predict_command(
         model = chosen
     predictor = load_model(model, quick=True)
     kind, files = read_choice(masks)
-    filmed = Filmed(read_scale(scale), tissue, Settings(flow, shrink, rate or None, pulse, kind), files)
+    options = VideoOptions(
+        read_scale(scale), tissue, Settings(flow, shrink, rate or None, pulse, kind), files
+    )
     peaks: dict[str, float | None] = {}
-    for motion in motions(source, predictor.stored(input), filmed):
+    for motion in motions(source, predictor.stored(input), options):
         written = out / f"{motion.name}.npz"
         if written.exists() and written.samefile(source):
             raise UserError(f"{written}: is what is read, and would be overwritten; say another --out")
@@ -332,7 +335,8 @@ def calibrate_command(
     from learn.checkpoint import read_card
     from learn.data.clips import scored
     from learn.evaluation.fit_intervals import fit_from_datasets
-    from learn.inference.apply import calibrate, motions
+    from learn.inference.apply import calibrate
+    from learn.inference.motion import motions
     from learn.inference.predict import load_model
     from learn.training.threads import set_threads
 

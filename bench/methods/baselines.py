@@ -20,10 +20,8 @@ from sklearn.neighbors import KNeighborsRegressor
 
 from bench.methods import compliance, inverse
 from bench.methods.protocol import Answer, Method, Scene
-from learn.data.clips import has_depth
-from learn.data.grid import Grid, certainty
-from learn.inference.force_reader import assumed_young
-from learn.inference.predict import GridView
+from learn.data.clips import assumed_young, has_depth
+from learn.data.grid import Grid, GridView, certainty
 from synth.errors import UserError
 from synth.flow.stereo.track import Moved
 

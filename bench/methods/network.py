@@ -4,17 +4,16 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bench.methods.protocol import Answer, Scene
+from learn.inference.force_reader import ForceReader, describe_intervals
+from learn.inference.motion import MotionFrame
+from learn.inference.predict import Predictor, load_model
+from learn.uncertainty.intervals import LEVEL
 from synth.flow.stereo.track import Moved
-
-if TYPE_CHECKING:
-    from learn.inference.force_reader import ForceReader
-    from learn.inference.predict import Predictor
 
 
 class Model:
@@ -22,8 +21,6 @@ class Model:
 
     def __init__(self, model: Path | Predictor) -> None:
         """`model`: the model itself, or its folder, made into a quick graph. UserError if unreadable."""
-        from learn.inference.predict import load_model
-
         self.predictor: Predictor = load_model(model, quick=True) if isinstance(model, Path) else model
         self._reader: tuple[Scene, ForceReader] | None = None
 
@@ -43,7 +40,7 @@ class Model:
     @property
     def notes(self) -> list[str]:
         """What is to be known of how the last recording was read, once it is."""
-        return [] if self._reader is None else self._reader[1].notes
+        return [] if self._reader is None else self._reader[1].notes + describe_intervals(self.predictor.card)
 
     def __call__(
         self, flow: NDArray[np.float32], confidence: NDArray[np.float32], scene: Scene, picture: bool
@@ -70,20 +67,12 @@ class Model:
         scene: Scene,
         picture: bool,
     ) -> Answer:
-        from learn.inference.force_reader import ForceReader
-        from learn.uncertainty.intervals import LEVEL
-
         if self._reader is None or self._reader[0] is not scene:
             reader = ForceReader(self.predictor, scene.tissue, scene.scale_mm_per_px, scene.young_kpa)
             self._reader = scene, reader
-        reader = self._reader[1]
-        force, said = reader.read(flow, confidence, moved)
-        answer = Answer(force, said.to_image() if picture else None)
-        # Which frames are lost, and show no world, is known to who asks.
-        bounds = reader.bound(force, said, counted=False)
-        if bounds is None:
+        found = self._reader[1].read(MotionFrame(flow, confidence, moved))
+        answer = Answer(found.force_mn, found.map.to_image() if picture else None, distance=found.distance)
+        if not found.bands:
             return answer
-        band = bounds[LEVEL]
-        return replace(
-            answer, low_mn=float(band.low[0]), high_mn=float(band.high[0]), distance=reader.distance(said)
-        )
+        band = found.bands[LEVEL]
+        return replace(answer, low_mn=float(band.low[0]), high_mn=float(band.high[0]))

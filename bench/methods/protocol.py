@@ -35,7 +35,7 @@ class Answer:
     high_mn: float = math.nan
     """Upper end."""
     distance: float = math.nan
-    """Of the frame from what the method was fitted on, as of `ForceReader.distance`; NaN as that."""
+    """Of the frame from what the method was fitted on, as of `FrameForce.distance`; NaN as that."""
 
     @property
     def size_mn(self) -> float:

@@ -24,8 +24,8 @@ from bench.scoring import metrics
 from bench.scoring.result import Curve, Gain, Result, Scored
 from bench.sensor.alignment import AlignedSensor, align_sensor, describe_span
 from bench.tracking.tracking import Progress, Tracked, track_recording
-from learn.inference.force_reader import describe_unseen
 from learn.uncertainty.intervals import LEVEL
+from learn.uncertainty.out_of_distribution import describe_unseen
 from synth.recording_flow.video_flow import FlowHere, Settings
 
 Flags = NDArray[np.bool_]

@@ -38,6 +38,8 @@ FIELDS = {
 }
 """Field of a store that holds each displacement. `noisy` is the published regime: true flow with its
 noise. `motion` has three components, as two eyes recover them; `motion-ideal` is the truth."""
+UNKNOWN_YOUNG_KPA = 1.0
+"""Tissue whose E nobody knows is answered for as if it were of this: forces are then right up to a factor."""
 _MIXED = {"mixed": ("ideal", "recovered"), "motion-mixed": ("motion-ideal", "motion")}
 _CURE = {
     "ideal": "render it anew",
@@ -323,3 +325,8 @@ def amount(clip: Clip, kind: Target, components: int, pitch_mm: float) -> NDArra
 def typical_young(clips: Iterable[Clip]) -> float:
     """Geometric mean of E over sequences [kPa]: the best guess when a recording's E is unknown."""
     return float(np.exp(np.mean([np.log(c.young_kpa) for c in clips])))
+
+
+def assumed_young(young_kpa: float | None) -> float:
+    """E to answer for [kPa]: the one known, else `UNKNOWN_YOUNG_KPA`; for every method, learnt or not."""
+    return UNKNOWN_YOUNG_KPA if young_kpa is None else young_kpa

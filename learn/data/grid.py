@@ -146,6 +146,34 @@ class Resampler:
         return np.where(inside, top * (1 - fy) + low * fy, 0).astype(np.float32)
 
 
+class GridView:
+    """A still picture's geometry (tissue and scale), prepared once and used for each of its frames."""
+
+    def __init__(
+        self,
+        tissue: NDArray[np.bool_],
+        scale_mm_per_px: float,
+        grid: Grid,
+        centre_px: tuple[float, float] | None = None,
+    ) -> None:
+        """`centre_px`: (x, y) on which the grid is centred; None: the middle of the tissue."""
+        if tissue.ndim != 2:
+            raise UserError(f"tissue mask: expected (H, W), got {tissue.shape}")
+        self.tissue = tissue.astype(bool)
+        self._centred_on = centre_px
+        self.resample = Resampler(
+            (tissue.shape[0], tissue.shape[1]), scale_mm_per_px, centre_px or centre(self.tissue), grid
+        )
+        self.mask = (self.resample.cover(self.tissue) > 0.5).astype(np.float32)
+
+    def is_of(
+        self, tissue: NDArray[np.bool_], scale_mm_per_px: float, centre_px: tuple[float, float] | None
+    ) -> bool:
+        """Whether it was made of these, on the same grid."""
+        same = (centre_px, float(scale_mm_per_px)) == (self._centred_on, self.resample.scale_mm_per_px)
+        return same and np.array_equal(self.tissue, tissue)
+
+
 def settled(amount: NDArray[np.float32], mask: NDArray[np.float32]) -> NDArray[np.float32]:
     """Amounts outside the mask carried to the nearest cell inside, so that the total is kept.
 

@@ -63,7 +63,7 @@ def cover(predictor: Predictor, clips: Sequence[Clip], source: str) -> list[Cove
         said = predict_clip(predictor, clip, source)
         for level, held in rows.items():
             held.append(_held(found, said, clip, level))
-        far.append((found.world.distance(said.motion) / found.world.usual)[is_moving(said.motion)])
+        far.append(found.world.relative_distance(said.motion)[is_moving(said.motion)])
     moved = np.concatenate(far)
     return [_summed(level, np.array(held), moved) for level, held in rows.items()]
 

@@ -17,7 +17,7 @@ from learn.data.clips import Clip, amount, target
 from learn.data.grid import Grid
 from learn.evaluation.metrics import Moments, agreement, contact_mm, ghost_share, line
 from learn.evaluation.statistics import Interval, Paired, interval, paired, pooled_r2
-from learn.inference.predict import Predictor, length, total_force
+from learn.inference.predict import Predictor, force_size, length, total_force
 from synth.errors import UserError
 from synth.system.terminal import ProgressCallback
 
@@ -76,7 +76,7 @@ def score(clip: Clip, said: NDArray[np.float32], card: ModelCard) -> ClipScore:
     said_len, true_len = length(said), length(true)
     unit = card.scales.target * young
     free = inside & (true_len < FREE * unit)
-    said_mn = total_force(said, kind, grid)
+    total = total_force(said, kind, grid)
     whole = amount(clip, kind, parts, grid.pitch_mm) * young
     true_mn: NDArray[np.float64] = np.linalg.norm(whole, axis=1)
     low = true_mn < LOW * card.scales.force * young
@@ -85,7 +85,6 @@ def score(clip: Clip, said: NDArray[np.float32], card: ModelCard) -> ClipScore:
     if parts == 3:
         components = np.broadcast_to(inside[:, None], said.shape)
         vector = Moments.of(true[components], said[components])
-        total = said.astype(np.float64).sum((2, 3)) * grid.pitch_mm**2
         vector_error = np.linalg.norm(total - clip.force, axis=1)
     distance = [
         float(np.linalg.norm(contact_mm(said_len[t], grid.pitch_mm) - contact_mm(true_len[t], grid.pitch_mm)))
@@ -98,14 +97,14 @@ def score(clip: Clip, said: NDArray[np.float32], card: ModelCard) -> ClipScore:
         map=Moments.of(true_len[inside], said_len[inside]),
         vector=vector,
         true_mn=true_mn,
-        said_mn=said_mn,
+        said_mn=force_size(total),
         vector_error_mn=vector_error,
         ghost=ghost_share(said_len * as_force, free, GHOST_MN),
         ghost_relative=ghost_share(said_len, free, LOW * unit),
         ghost_far=ghost_share(said_len, inside & _away(true_len >= FREE * unit, grid), LOW * unit),
         stray_mn=float((said_len * free).sum((1, 2)).mean() * _cell(kind, grid)),
         localisation_mm=float(np.median(distance)) if distance else math.nan,
-        low_over_mn=float(np.maximum(said_mn - true_mn, 0)[low].mean()) if low.any() else math.nan,
+        low_over_mn=float(np.maximum(force_size(total) - true_mn, 0)[low].mean()) if low.any() else math.nan,
     )
 
 

@@ -13,8 +13,7 @@ from learn.checkpoint import ModelCard, write_card
 from learn.data.clips import Clip, scored
 from learn.data.split import Split, are_openings, groups, ungrouped
 from learn.evaluation.interval_sides import find_obstacle, find_sides
-from learn.inference.force_reader import net_force
-from learn.inference.predict import Predictor, length
+from learn.inference.predict import Predictor, length, net_force
 from learn.uncertainty.features import motion_features, motion_names
 from learn.uncertainty.intervals import Example, Intervals, Prediction, fit, make_example
 from learn.uncertainty.out_of_distribution import fit_distribution
@@ -142,10 +141,10 @@ def predict_clip(predictor: Predictor, clip: Clip, source: str) -> Prediction:
     sure, young = clip.sure(source), clip.young_kpa
     kind = predictor.card.settings.target
     density = predictor.density(shift, mask, young, sure)
-    still = predictor.density(np.zeros_like(shift[:1]), mask, young, np.ones_like(sure[:1]) * mask)
+    at_rest = predictor.density(np.zeros_like(shift[:1]), mask, young)
     return Prediction(
         motion=motion_features(shift, mask, sure, grid.extent_mm),
-        force=net_force(density, still[0], kind, grid) / young,
+        force=net_force(density, at_rest, kind, grid) / young,
         magnitude=length(density) / np.float32(young),
         pitch_mm=grid.pitch_mm,
     )

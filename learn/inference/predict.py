@@ -1,4 +1,4 @@
-"""From displacement to force with a trained model: what bench, scripts and `learn predict` call."""
+"""A trained model from its folder, and the force map that it predicts of one frame's motion."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from torch import nn
 from learn import checkpoint
 from learn.checkpoint import ModelCard
 from learn.data.clips import FIELDS, has_depth
-from learn.data.grid import Grid, Resampler, centre, certainty, channels
+from learn.data.grid import Grid, GridView, certainty, channels
 from learn.inference.shipped import find_model
 from learn.network.d2fnet import fused
 from learn.network.traced import Quick
@@ -24,134 +24,47 @@ from synth.errors import UserError
 from synth.flow.stereo.track import Moved
 
 
-@dataclass(frozen=True)
-class ForceMap:
-    """What the model says of one frame."""
+def load_model(name: Path | str, device: torch.device | str = "cpu", *, quick: bool = False) -> Predictor:
+    """A trained model, to be asked frame by frame (`Predictor`) or for a whole film (`predict_force`).
 
-    density: NDArray[np.float32]
-    """(C, N, N): force density [mN per mm² of the picture plane], C = 1 its length or 3 its x, y, z in
-    camera axes; for a model of the paper's target the intensity [mN], C = 1."""
-    grid: Grid
-    kind: str
-    """`density` or `intensity`."""
-    young_kpa: float
-    """Young's modulus the numbers rest on: the one given, else the training data's typical one."""
-    young_known: bool
-    view: GridView
-    motion: NDArray[np.float64] | None = None
-    """(F,) `motion_features` of the frame, by a model with intervals."""
+    Args:
+        name: the folder that `learn train` wrote, or `mono` or `stereo`, if they come with this version.
+        device: PyTorch's name of where it runs.
+        quick: spend a second on a graph that runs a fifth faster on a CPU.
 
-    @property
-    def magnitude(self) -> NDArray[np.float32]:
-        """(N, N), ≥ 0, in the unit of `density`."""
-        return length(self.density)
-
-    @property
-    def force_mn(self) -> NDArray[np.float64] | None:
-        """(3,) total force on the tissue in camera axes [mN]; None if the model gives no direction."""
-        if self.density.shape[0] != 3:
-            return None
-        total: NDArray[np.float64] = self.density.astype(np.float64).sum((1, 2)) * self.grid.pitch_mm**2
-        return total
-
-    @property
-    def total_force_mn(self) -> float:
-        """Size of the total force [mN]."""
-        return float(total_force(self.density[None], self.kind, self.grid)[0])
-
-    def to_image(self) -> NDArray[np.float32]:
-        """Magnitude on the picture's pixels, (H, W), 0 outside the grid."""
-        return self.view.resample.to_image(self.magnitude)
-
-
-def length(density: NDArray[np.float32], axis: int = -3) -> NDArray[np.float32]:
-    """Length over the component axis; the value itself if there is one component."""
-    if density.shape[axis] == 1:
-        return density.squeeze(axis)
-    out: NDArray[np.float32] = np.sqrt(np.square(density).sum(axis))
-    return out
-
-
-def total_force(density: NDArray[np.float32], kind: str, grid: Grid) -> NDArray[np.float64]:
-    """Size of the total force of each frame [mN]: the integral of a density, the peak of an intensity.
-
-    `density`: (T, C, N, N). Returns (T,) float64.
+    Raises:
+        UserError: the folder is missing, damaged or edited.
     """
-    if kind == "intensity":
-        peak: NDArray[np.float64] = density[:, 0].max((1, 2)).astype(np.float64)
-        return peak
-    whole = density.astype(np.float64).sum((2, 3)) * grid.pitch_mm**2
-    size: NDArray[np.float64] = np.linalg.norm(whole, axis=1)
-    return size
-
-
-class GridView:
-    """A still picture's geometry (tissue and scale), prepared once and used for each of its frames."""
-
-    def __init__(
-        self,
-        tissue: NDArray[np.bool_],
-        scale_mm_per_px: float,
-        grid: Grid,
-        centre_px: tuple[float, float] | None = None,
-    ) -> None:
-        """`centre_px`: (x, y) on which the grid is centred; None: the middle of the tissue."""
-        if tissue.ndim != 2:
-            raise UserError(f"tissue mask: expected (H, W), got {tissue.shape}")
-        self.tissue = tissue.astype(bool)
-        self.resample = Resampler(
-            (tissue.shape[0], tissue.shape[1]), scale_mm_per_px, centre_px or centre(self.tissue), grid
-        )
-        self.mask = (self.resample.cover(self.tissue) > 0.5).astype(np.float32)
+    network, card = checkpoint.read_model(find_model(name))
+    return Predictor(network, card, device, quick)
 
 
 class Predictor:
     """A trained model, ready for pictures of any size and scale."""
 
     def __init__(
-        self, model: nn.Module, card: ModelCard, device: torch.device | str = "cpu", quick: bool = False
+        self, network: nn.Module, card: ModelCard, device: torch.device | str = "cpu", quick: bool = False
     ) -> None:
-        """`quick`: spend a second on a graph that runs a fifth faster on a CPU, for live use and films."""
+        """`quick`: as of `load_model`."""
         self.card, self.grid = card, card.settings.grid
         self.device = torch.device(device)
-        self.model = fused(model).to(self.device)
-        self._say: Callable[..., Any] = self.model
+        self.model = fused(network).to(self.device)
+        self._network: Callable[..., Any] = self.model
         if quick and self.device.type == "cpu":
-            self._say = Quick(model, card.settings.arch, card.settings.size)
+            self._network = Quick(network, card.settings.arch, card.settings.size)
         self._view: GridView | None = None
 
     def readable(self, source: str) -> str:
         """The source of displacement as given, if this model can read it; else UserError."""
         fit = [name for name in FIELDS if has_depth(name) == self.card.settings.arch.depth]
         if source not in fit:
-            raise UserError(
-                f"this model can't read input {source!r}: it takes {', '.join(fit)}"
-                if source in FIELDS
-                else f"unknown input {source!r}: one of {', '.join(fit)}"
-            )
+            what = "this model can't read" if source in FIELDS else "unknown"
+            raise UserError(f"{what} input {source!r}: one of {', '.join(fit)}")
         return source
 
     def stored(self, source: str | None) -> str:
         """The same, of a store: what a real pipeline recovers if none is given."""
         return self.readable(source or ("motion" if self.card.settings.arch.depth else "recovered"))
-
-    def view(
-        self,
-        tissue: NDArray[np.bool_],
-        scale_mm_per_px: float,
-        centre_px: tuple[float, float] | None = None,
-    ) -> GridView:
-        """Prepares a picture's geometry, as `GridView`; the last one is kept."""
-        last = self._view
-        if (
-            last is None
-            or (centre_px or centre(last.tissue)) != last.resample.centre_px
-            or last.resample.scale_mm_per_px != float(scale_mm_per_px)
-            or last.tissue.shape != tissue.shape
-            or not np.array_equal(last.tissue, tissue)
-        ):
-            self._view = last = GridView(tissue, scale_mm_per_px, self.grid, centre_px)
-        return last
 
     def __call__(
         self,
@@ -166,15 +79,24 @@ class Predictor:
     ) -> ForceMap:
         """Force map of one frame.
 
-        `flow`: (H, W, 2) px, motion from the rest frame on the rest frame's pixels; `tissue`: (H, W) bool;
-        `young_kpa`: None stands for the training data's typical value; `confidence`: (H, W) 0..1, used only
-        by a model with that channel (1 if not given); `moved`: motion in three dimensions and its deviation,
-        which a model of two eyes is told instead of flow and confidence; `centre_px`: as of `GridView`.
-        Raises UserError for other shapes or values that aren't finite, and where such a model gets one eye.
+        Args:
+            flow: (H, W, 2) px, motion from the rest frame on the rest frame's pixels.
+            tissue: (H, W) bool.
+            scale_mm_per_px: of the picture.
+            young_kpa: of the tissue; None stands for the training data's typical value.
+            confidence: (H, W) 0..1, used only by a model with that channel; None: 1.
+            moved: motion in three dimensions and its deviation, which a model of two eyes reads instead of
+                flow and confidence.
+            centre_px: as of `GridView`.
+
+        Raises:
+            UserError: other shapes, values that aren't finite, or such a model without `moved`.
         """
         if young_kpa is not None and not (np.isfinite(young_kpa) and young_kpa > 0):
             raise UserError(f"young_kpa {young_kpa}: must be positive")
-        view = self.view(tissue, scale_mm_per_px, centre_px)
+        if self._view is None or not self._view.is_of(tissue, scale_mm_per_px, centre_px):
+            self._view = GridView(tissue, scale_mm_per_px, self.grid, centre_px)
+        view = self._view
         displacement, sure = self.on_grid(view, flow, confidence, moved)
         young = young_kpa or self.card.typical_young_kpa
         known = None if sure is None else sure[None]
@@ -182,9 +104,8 @@ class Predictor:
         motion = None
         if self.card.intervals is not None:
             motion = motion_features(displacement[None], view.mask, known, self.grid.extent_mm)[0]
-        return ForceMap(
-            density[0], self.grid, self.card.settings.target, young, young_kpa is not None, view, motion
-        )
+        kind = self.card.settings.target
+        return ForceMap(density[0], self.grid, kind, young, young_kpa is not None, view, motion)
 
     def on_grid(
         self,
@@ -193,7 +114,7 @@ class Predictor:
         confidence: NDArray[np.float32] | None = None,
         moved: Moved | None = None,
     ) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
-        """What the network is told of a frame: displacement (C, N, N) mm and its confidence (C - 1, N, N).
+        """The network's input of a frame: displacement (C, N, N) mm and its confidence (C - 1, N, N).
 
         Arguments and errors as `__call__`.
         """
@@ -224,9 +145,14 @@ class Predictor:
     ) -> NDArray[np.float32]:
         """Force density of frames already on the grid, (T, C, N, N) mN/mm² at `young_kpa`.
 
-        `displacement`: (T, 2, N, N) mm, of a model of two eyes (T, 3, N, N); `mask`: (N, N) 0/1;
-        `confidence`: (T, 1, N, N), with depth (T, 2, N, N). Raises UserError for another grid or number of
-        components, and for displacement or an answer that isn't finite.
+        Args:
+            displacement: (T, 2, N, N) mm, of a model of two eyes (T, 3, N, N).
+            mask: (N, N) 0/1.
+            young_kpa: of the tissue.
+            confidence: (T, 1, N, N), with depth (T, 2, N, N); None: 1.
+
+        Raises:
+            UserError: another grid or number of components, or values or a prediction that aren't finite.
         """
         n, settings, scales = self.grid.size, self.card.settings, self.card.scales
         parts = settings.arch.displacements
@@ -239,33 +165,88 @@ class Predictor:
             raise UserError("displacement holds NaN or infinity")
         maps = []
         for start in range(0, len(displacement), settings.batch):
-            u = torch.from_numpy(np.array(displacement[start : start + settings.batch])).to(self.device)
+            frames = slice(start, start + settings.batch)
+            u = torch.from_numpy(np.array(displacement[frames])).to(self.device)
             m = torch.from_numpy(np.array(mask)).to(self.device).expand(len(u), 1, n, n)
             sure = None
             if settings.arch.confidence:
                 sure = torch.ones_like(m).expand(-1, parts - 1, -1, -1)
                 if confidence is not None:
-                    part = np.array(confidence[start : start + settings.batch])
-                    sure = torch.from_numpy(part).to(self.device)
-            said = self._say(channels(u, m, self.grid.pitch_mm, scales, sure))
-            maps.append(said.float().cpu().numpy())
-        with np.errstate(over="ignore", invalid="ignore"):  # said below
+                    sure = torch.from_numpy(np.array(confidence[frames])).to(self.device)
+            predicted = self._network(channels(u, m, self.grid.pitch_mm, scales, sure))
+            maps.append(predicted.float().cpu().numpy())
+        with np.errstate(over="ignore", invalid="ignore"):  # refused below
             density = np.concatenate(maps) * np.float32(scales.target * self.card.force_gain * young_kpa)
         if not np.isfinite(density).all():
             raise UserError("the model answers NaN or infinity: its weights or scales can't be right")
         return density
 
 
-def load_model(name: Path | str, device: torch.device | str = "cpu", *, quick: bool = False) -> Predictor:
-    """A trained model, to be asked frame by frame (`Predictor`) or for a whole film (`predict_force`).
+@dataclass(frozen=True)
+class ForceMap:
+    """What the model predicts of one frame."""
 
-    Args:
-        name: the folder that `learn train` wrote, or `mono` or `stereo`, if they come with this version.
-        device: PyTorch's name of where it runs.
-        quick: spend a second on a graph that runs a fifth faster on a CPU.
+    density: NDArray[np.float32]
+    """(C, N, N): force density [mN per mm² of the picture plane], C = 1 its length or 3 its x, y, z in
+    camera axes; for a model of the paper's target the intensity [mN], C = 1."""
+    grid: Grid
+    kind: str
+    """`density` or `intensity`."""
+    young_kpa: float
+    """Young's modulus the numbers rest on: the one given, else the training data's typical one."""
+    young_known: bool
+    view: GridView
+    motion: NDArray[np.float64] | None = None
+    """(F,) `motion_features` of the frame, by a model with intervals."""
 
-    Raises:
-        UserError: the folder is missing, damaged or edited.
+    @property
+    def magnitude(self) -> NDArray[np.float32]:
+        """(N, N), ≥ 0, in the unit of `density`."""
+        return length(self.density)
+
+    @property
+    def force_mn(self) -> NDArray[np.float64] | None:
+        """(3,) total force on the tissue in camera axes [mN]; None if the model gives no direction."""
+        return total_force(self.density[None], self.kind, self.grid)[0] if len(self.density) == 3 else None
+
+    @property
+    def total_force_mn(self) -> float:
+        """Size of the total force [mN]."""
+        return float(force_size(total_force(self.density[None], self.kind, self.grid))[0])
+
+    def to_image(self) -> NDArray[np.float32]:
+        """Magnitude on the picture's pixels, (H, W), 0 outside the grid."""
+        return self.view.resample.to_image(self.magnitude)
+
+
+def length(density: NDArray[np.float32], axis: int = -3) -> NDArray[np.float32]:
+    """Length over the component axis; the value itself if there is one component."""
+    if density.shape[axis] == 1:
+        return density.squeeze(axis)
+    out: NDArray[np.float32] = np.sqrt(np.square(density).sum(axis))
+    return out
+
+
+def total_force(density: NDArray[np.float32], kind: str, grid: Grid) -> NDArray[np.float64]:
+    """Total force of frames (T, C, N, N), (T, 3) mN in camera axes; of sizes alone in x, the rest NaN.
+
+    The integral of a density; the peak of an intensity (`kind`).
     """
-    model, card = checkpoint.read_model(find_model(name))
-    return Predictor(model, card, device, quick)
+    if kind == "intensity":
+        total = density.max((2, 3)).astype(np.float64)
+    else:
+        total = density.astype(np.float64).sum((2, 3)) * grid.pitch_mm**2
+    return total if total.shape[1] == 3 else np.pad(total, ((0, 0), (0, 2)), constant_values=np.nan)
+
+
+def net_force(
+    density: NDArray[np.float32], at_rest: NDArray[np.float32], kind: str, grid: Grid
+) -> NDArray[np.float64]:
+    """`total_force` less that of `at_rest` (1, C, N, N), the prediction for no motion; a size ≥ 0."""
+    net = total_force(density, kind, grid) - total_force(at_rest, kind, grid)
+    return net if density.shape[1] == 3 else np.maximum(net, 0.0)
+
+
+def force_size(force_mn: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(T,) size of forces (T, 3) as of `total_force`."""
+    return np.asarray(np.sqrt(np.nansum(force_mn**2, axis=-1)))

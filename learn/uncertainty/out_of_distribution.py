@@ -17,6 +17,7 @@ Floats = NDArray[np.float64]
 
 USUAL = 0.99
 """Share of held-out frames that are no further than `OutOfDistribution.usual`."""
+_MANY_UNSEEN = 0.05  # share of the moving frames; of held-out ones it is a hundredth
 _LEAST_SPREAD = 0.05  # of a feature: logarithms and shares tell no worlds apart by less
 
 
@@ -36,9 +37,13 @@ class OutOfDistribution:
         squared = np.einsum("ti,ij,tj->t", off, np.array(self.precision), off)
         return np.where(is_moving(motion), np.sqrt(np.maximum(squared, 0)), 0.0)
 
+    def relative_distance(self, motion: Floats) -> Floats:
+        """(T,) `distance` over what 99% of held-out frames stay within."""
+        return self.distance(motion) / self.usual
+
     def widening(self, motion: Floats) -> Floats:
         """(T,) what intervals are multiplied by: how many times further than usual a frame is, 1 at least."""
-        return np.maximum(self.distance(motion) / self.usual, 1.0)
+        return np.maximum(self.relative_distance(motion), 1.0)
 
 
 def fit_distribution(fitted: Sequence[Floats], held_out: Sequence[Floats]) -> OutOfDistribution | None:
@@ -80,3 +85,18 @@ def shrunk_covariance(samples: Floats) -> Floats:
     noise = float(((centred**2).sum(1) ** 2).mean() - (plain**2).sum()) / count
     share = min(noise / away, 1.0) if away > 0 else 0.0
     return np.asarray((1 - share) * plain + share * mean * np.eye(parts))
+
+
+def describe_unseen(distance: NDArray[np.float64]) -> list[str]:
+    """A line for a person if too many frames are further from what was fitted than they should be.
+
+    `distance`: (n,) of the frames that moved, as of `FrameForce.distance`.
+    """
+    far = distance[distance > 1]
+    if len(far) <= _MANY_UNSEEN * len(distance):
+        return []
+    return [
+        f"unseen world: {100 * len(far) / len(distance):.0f}% of the frames that moved do so unlike anything "
+        f"that it was trained on (distance {np.median(far):.2g} times what 99% of held-out frames stay in); "
+        "intervals are widened by as much, and may still be too narrow"
+    ]

@@ -101,7 +101,8 @@ def test_an_exported_network_says_what_its_model_says_today(stored: Path) -> Non
 def test_the_networks_that_come_along_answer_as_they_did(
     stored: Path, model: str, store: str, force_mn: list[list[float]]
 ) -> None:
-    from learn.inference.apply import apply, motions
+    from learn.inference.apply import apply
+    from learn.inference.motion import motions
     from learn.inference.predict import load_model
 
     source = "recovered" if store == "one" else "motion"

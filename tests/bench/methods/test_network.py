@@ -7,8 +7,8 @@ import pytest
 
 from bench.methods.network import Model
 from bench.methods.protocol import Scene
-from learn.data.grid import Grid
-from learn.inference.predict import ForceMap, GridView
+from learn.data.grid import Grid, GridView
+from learn.inference.predict import ForceMap
 
 
 @pytest.mark.parametrize("young_kpa", [2.0, None])

@@ -12,8 +12,9 @@ import pytest
 from numpy.typing import NDArray
 
 from learn.checkpoint import read_card
-from learn.inference.force_reader import ForceReader, net_force
-from learn.inference.predict import load_model
+from learn.inference.force_reader import ForceReader, FrameForce, describe_intervals
+from learn.inference.motion import MotionFrame
+from learn.inference.predict import load_model, net_force
 from learn.uncertainty.intervals import LEVEL
 from synth.errors import UserError
 
@@ -27,8 +28,9 @@ def flow(size_mm: float) -> NDArray[np.float32]:
     return out
 
 
-def reader(folder: Path, young_kpa: float | None = 2.0) -> ForceReader:
-    return ForceReader(load_model(folder), np.ones(SHAPE, bool), SCALE, young_kpa)
+def read(folder: Path, size_mm: float = 0.4, young_kpa: float | None = 2.0) -> FrameForce:
+    reader = ForceReader(load_model(folder), np.ones(SHAPE, bool), SCALE, young_kpa)
+    return reader.read(MotionFrame(flow(size_mm)))
 
 
 @pytest.fixture
@@ -43,45 +45,38 @@ def sizes(tmp_path: Path) -> Path:
 
 @pytest.mark.parametrize("young_kpa", [2.0, None])
 def test_bounds_are_those_of_the_card_in_newtons(vector: Path, young_kpa: float | None) -> None:
-    reading = reader(fake_intervals.give(vector, fake_intervals.make()), young_kpa)
-    force, said = reading.read(flow(0.4), None)
-    bounds, young = reading.bound(force, said), young_kpa or 1.0
-    assert bounds is not None
+    found = read(fake_intervals.give(vector, fake_intervals.make()), young_kpa=young_kpa)
+    force, young = found.force_mn, young_kpa or 1.0
     size = np.linalg.norm(force)
     for level, factor in fake_intervals.FACTORS.items():
-        band = bounds[float(level)]
+        band = found.bands[float(level)]
         assert band.high[0] == pytest.approx(size + 5 * young * factor)
         assert band.low[0] == pytest.approx(max(size - 5 * young * factor, 0))
         assert band.axes_high[0] - force == pytest.approx(factor * young * np.array([3, 4, 50]))
         assert force - band.axes_low[0] == pytest.approx(factor * young * np.array([3, 4, 50]))
-    assert reading.notes == []
+    assert describe_intervals(read_card(vector), [found.distance]) == []
 
 
 def test_of_a_network_of_sizes_components_are_around_zero(sizes: Path) -> None:
-    reading = reader(fake_intervals.give(sizes, fake_intervals.make()))
-    force, said = reading.read(flow(0.4), None)
-    bounds = reading.bound(force, said)
-    assert bounds is not None
-    assert bounds[LEVEL].axes_high[0] == pytest.approx([12, 16, 200])
-    assert bounds[LEVEL].axes_low[0] == pytest.approx([-12, -16, -200])
+    band = read(fake_intervals.give(sizes, fake_intervals.make())).bands[LEVEL]
+    assert band.axes_high[0] == pytest.approx([12, 16, 200])
+    assert band.axes_low[0] == pytest.approx([-12, -16, -200])
 
 
 def test_an_unseen_world_is_said_with_its_distance_and_widens(vector: Path) -> None:
     usual = 0.1
-    reading = reader(fake_intervals.give(vector, fake_intervals.make(usual=usual)))
-    force, said = reading.read(flow(0.4), None)
-    bounds = reading.bound(force, said)
-    assert bounds is not None
-    assert said.motion is not None
-    distance = abs(said.motion[0])
+    found = read(fake_intervals.give(vector, fake_intervals.make(usual=usual)))
+    assert found.map.motion is not None
+    distance = abs(found.map.motion[0])
     # From 1 mm; half of the tissue moved.
     assert distance == pytest.approx(abs(np.log(0.4 * np.sqrt(0.5) + 0.005)), rel=0.03)
-    assert bounds[0.68].high[0] - np.linalg.norm(force) == pytest.approx(10 * distance / usual)
-    assert "unseen world" in reading.notes[0]
+    assert found.distance == pytest.approx(distance / usual)
+    assert found.bands[0.68].high[0] - np.linalg.norm(found.force_mn) == pytest.approx(10 * found.distance)
+    assert "unseen world" in describe_intervals(read_card(vector), [found.distance])[0]
     # Stillness is no world.
-    resting = reader(vector)
-    assert resting.bound(*resting.read(flow(0.0), None)) is not None
-    assert resting.notes == []
+    at_rest = read(vector, 0.0)
+    assert at_rest.bands
+    assert describe_intervals(read_card(vector), [at_rest.distance]) == []
 
 
 @pytest.mark.parametrize("kind", ["vector", "sizes"])
@@ -89,10 +84,9 @@ def test_the_force_that_is_fitted_on_is_the_one_that_is_read(
     kind: str, request: pytest.FixtureRequest
 ) -> None:
     folder = request.getfixturevalue(kind)
-    force, said = reader(folder).read(flow(0.4), None)
-    _, still = reader(folder).read(flow(0.0), None)
-    found = net_force(said.density[None], still.density, said.kind, said.grid)
-    assert found[0] == pytest.approx(force, nan_ok=True, rel=1e-5, abs=1e-5)
+    moved, still = read(folder), read(folder, 0.0)
+    found = net_force(moved.map.density[None], still.map.density[None], moved.map.kind, moved.map.grid)
+    assert found[0] == pytest.approx(moved.force_mn, nan_ok=True, rel=1e-5, abs=1e-5)
 
 
 @pytest.mark.parametrize(

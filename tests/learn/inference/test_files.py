@@ -19,9 +19,9 @@ from learn.checkpoint import ModelCard, read_card, write_card
 from learn.cli import app
 from learn.data.clips import Clip
 from learn.data.grid import Grid
+from learn.inference.apply import stiffness
 from learn.inference.export import examples, export
 from learn.inference.predict import load_model
-from learn.inference.stiffness import stiffness
 from learn.settings import override, preset
 from learn.training.batches import measure_scales
 from synth.dataset.store import Dataset

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from learn.data.grid import Grid
 from learn.inference.force_reader import ForceReader
+from learn.inference.motion import MotionFrame
 from learn.inference.placing import Placing
 from learn.inference.predict import load_model
 
@@ -47,14 +48,15 @@ def test_force_is_that_of_the_part_that_moves(tmp_path: Path) -> None:
     predictor = load_model(write_model(tmp_path / "model", "arch.output=vector"))
     reader = ForceReader(predictor, _WIDE, _MM_PER_PX, 1.0)
     moved = _bump(370, 120)
-    force, said = reader.read(moved, None)
+    found = reader.read(MotionFrame(moved))
+    force = found.force_mn
     x, y = (round(2 * value) / 2 for value in reader.placing.centre_px)
     half = round(predictor.grid.extent_mm / _MM_PER_PX / 2)
     top, left = round(y + 0.5) - half, round(x + 0.5) - half
     cut = slice(top, top + 2 * half), slice(left, left + 2 * half)
-    alone, _ = ForceReader(predictor, _WIDE[cut], _MM_PER_PX, 1.0).read(moved[cut], None)
+    alone = ForceReader(predictor, _WIDE[cut], _MM_PER_PX, 1.0).read(MotionFrame(moved[cut])).force_mn
     assert force == pytest.approx(alone, rel=0.05, abs=0.02 * float(np.abs(alone).max()))
     middle = predictor(moved, _WIDE, _MM_PER_PX, 1.0).force_mn
     assert middle is not None
-    assert float(np.linalg.norm(middle - said.force_mn)) > 0.2 * float(np.linalg.norm(alone))
+    assert float(np.linalg.norm(middle - found.map.force_mn)) > 0.2 * float(np.linalg.norm(alone))
     assert any("wider than the network's" in note for note in reader.notes)

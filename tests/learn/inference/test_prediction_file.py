@@ -14,9 +14,11 @@ from fake_model import write_model
 from typer.testing import CliRunner
 
 from learn.cli import app
+from learn.data.grid import GridView
 from learn.inference import prediction_file
-from learn.inference.apply import apply, motions
-from learn.inference.predict import GridView, load_model
+from learn.inference.apply import apply
+from learn.inference.motion import motions
+from learn.inference.predict import load_model
 from synth.dataset.store import Dataset
 
 FILES = ["000000.force.csv", "000000.force.mp4", "000000.npz"]

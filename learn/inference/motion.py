@@ -1,0 +1,233 @@
+"""Motion of a film, wherever it comes from: sequence stores, datasets, videos, and arrays of flow."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from functools import partial
+from itertools import chain, repeat
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from learn.data.clips import FIELDS, has_depth
+from synth.dataset.store import Dataset, Sequence, open_sequence
+from synth.errors import UserError
+from synth.flow.stereo.track import Moved
+from synth.recording_flow.pulse import Pulse, Search
+from synth.recording_flow.video_flow import Footage, Settings, VideoFlow, everywhere
+from synth.system import checked_file
+from synth.video import read as video
+from synth.video.mask_files import MaskFiles
+from synth.video.pixel_scale import UNKNOWN_NOTE, StatedScale, take_scale
+
+
+class MotionFrame(NamedTuple):
+    """One frame's motion from the rest frame, on the rest frame's pixels."""
+
+    flow: NDArray[np.float32]
+    """(H, W, 2) px."""
+    confidence: NDArray[np.float32] | None = None
+    """(H, W) in 0..1, if there is one."""
+    moved: Moved | None = None
+    """In three dimensions, where two eyes saw it."""
+    number: int = 0
+    """In the film."""
+    time_s: float = math.nan
+    trusted: bool = True
+    """Whether the frame could be followed."""
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Motion of one film."""
+
+    name: str
+    frames: Iterator[MotionFrame]
+    """In order; once."""
+    tissue: NDArray[np.bool_]
+    scale_mm_per_px: float
+    young_kpa: float | None
+    force_mn: NDArray[np.float64] | None = None
+    """(T,) size of the true force, where it is known."""
+    shrink: int = 1
+    """How many times smaller than the film's own pictures those are that flow is on."""
+    notes: Callable[[], list[str]] = list
+    """What was done to the film that its user should know, once its frames are through."""
+    fault: Callable[[], str] = str
+    """Why nothing of it is a measurement, once its frames are through; empty if something may be."""
+    scale_known: bool = True
+    """False: a width was taken for the picture's, so E is of no use, and forces are right up to a factor."""
+    again: Callable[[], Motion | None] = lambda: None
+    """The same film with the tissue's own motion taken off, if its frames, once through, showed any."""
+
+
+@dataclass(frozen=True)
+class VideoOptions:
+    """What a video doesn't say of itself."""
+
+    scale_mm_per_px: StatedScale | None = None
+    tissue: Path | None = None
+    """A picture, white where there is tissue; everywhere if not given."""
+    settings: Settings = field(default_factory=Settings)
+    """How it is followed."""
+    tool: MaskFiles | None = None
+    """Where the tool is; looked for in the pictures if not given."""
+
+
+def motions(path: Path, source: str, options: VideoOptions | None = None) -> Iterator[Motion]:
+    """What `path` holds: a dataset folder, one NNNNNN.zarr store, an .npz of arrays, or a video.
+
+    An .npz holds `flow` (T, H, W, 2) px, `tissue` (H, W), `scale_mm_per_px`, and if known `young_kpa`,
+    `confidence` (T, H, W) and `force_mn` (T,); or, of two eyes, `motion` and `deviation` (T, H, W, 3) mm
+    instead of flow and confidence. A video's first frame is its rest frame. Raises UserError for
+    anything else, and for a video without a scale.
+    """
+    if path.suffix.lower() in video.SUFFIXES:
+        yield _video(path, options or VideoOptions())
+    elif path.suffix == ".npz":
+        yield _arrays(path)
+    else:
+        for sequence in _sequences(path):
+            yield _stored(sequence, source)
+
+
+def has_second_eye(path: Path) -> bool:
+    """Whether what `motions` reads holds motion in three dimensions; of a dataset its first sequence."""
+    if path.suffix.lower() in video.SUFFIXES:
+        return False
+    if path.suffix == ".npz":
+        return "motion" in checked_file.read_arrays(path)
+    first = next(_sequences(path), None)
+    return first is not None and FIELDS["motion"] in first
+
+
+def _sequences(path: Path) -> Iterator[Sequence]:
+    one = path.name.endswith((".zarr", ".zarr.part"))
+    yield from [open_sequence(path)] if one else Dataset(path)
+
+
+def _stored(sequence: Sequence, source: str) -> Motion:
+    if source not in FIELDS:
+        raise UserError(f"unknown input {source!r}: {', '.join(FIELDS)}")
+    if FIELDS[source] not in sequence:
+        what = "motion of two eyes" if has_depth(source) else f"{source} flow"
+        raise UserError(f"{sequence.path}: holds no {what} (field {FIELDS[source]})")
+    scale, young = (sequence.attrs.get(name) for name in ("scale_mm_per_px", "young_kpa"))
+    if scale is None or young is None:
+        raise UserError(f"{sequence.path}: lacks the attribute young_kpa or scale_mm_per_px")
+    time_s, tissue, force = (sequence.read_whole(name) for name in ("time", "tissue", "force"))
+
+    def beside(name: str, belongs: bool) -> Any:
+        """Each frame's value of a field that goes with the source, else None."""
+        return sequence.read_sealed(name) if belongs else repeat(None, sequence.frames)
+
+    sure = beside("flow_confidence", source == "recovered" and "flow_confidence" in sequence)
+    spread = beside("motion_deviation", source == "motion")
+    arrays = zip(sequence.read_sealed(FIELDS[source]), sure, spread, time_s, strict=True)
+
+    def frames() -> Iterator[MotionFrame]:
+        for t, (values, confidence, deviation, at) in enumerate(arrays):
+            moved = None
+            if has_depth(source):
+                moved = Moved(values, np.zeros_like(values) if deviation is None else deviation)
+                values = np.asarray(values[..., :2] / scale, np.float32)
+            yield MotionFrame(values, confidence, moved, t, float(at))
+
+    return Motion(
+        name=sequence.path.stem,
+        frames=frames(),
+        tissue=tissue.astype(bool),
+        scale_mm_per_px=float(scale),
+        young_kpa=float(young),
+        force_mn=np.linalg.norm(force, axis=1),
+    )
+
+
+def _video(
+    path: Path, options: VideoOptions, pulse: Pulse | None = None, search: Search | None = None
+) -> Motion:
+    if options.scale_mm_per_px is None:
+        raise UserError(
+            f"{path}: a video doesn't say how large it shows things; give --scale in mm a pixel, or unknown"
+        )
+    scale_known = options.scale_mm_per_px != "unknown"
+    tissue = everywhere if options.tissue is None else partial(video.read_mask, options.tissue)
+    tool = options.tool.read if options.tool else None
+    footage = Footage(video.read_video(path, video.FPS), str(path), tissue, tool)
+    following = VideoFlow(footage, options.settings, pulse=pulse, search=search)
+    frames = (
+        MotionFrame(
+            step.found.flow,
+            step.found.confidence,
+            number=step.picture.index,
+            time_s=step.picture.time_s or 0.0,
+            trusted=step.found.trusted,
+        )
+        for step in following.steps()
+    )
+    rest = next(frames)
+    mm_per_px = take_scale(options.scale_mm_per_px, following.size[1]) * following.shrink
+
+    def again() -> Motion | None:
+        found = following.find_pulse()
+        return None if found is None else _video(path, options, found, following.search)
+
+    def notes() -> list[str]:
+        found = following.notes if scale_known else [UNKNOWN_NOTE, *following.notes]
+        return found if pulse is None else [*found, pulse.describe(mm_per_px)]
+
+    return Motion(
+        name=path.stem,
+        frames=chain([rest], frames),
+        tissue=following.tissue,
+        scale_mm_per_px=mm_per_px,
+        young_kpa=None,
+        shrink=following.shrink,
+        notes=notes,
+        fault=lambda: following.fault,
+        scale_known=scale_known,
+        again=again,
+    )
+
+
+def _arrays(path: Path) -> Motion:
+    found = checked_file.read_arrays(path)
+    names = ("motion", "deviation") if "motion" in found else ("flow",)
+    if missing := {*names, "tissue", "scale_mm_per_px"} - found.keys():
+        raise UserError(f"{path}: lacks {', '.join(sorted(missing))}")
+    tissue, count = found["tissue"].astype(bool), found[names[0]].shape[:1]
+    if tissue.ndim != 2:
+        raise UserError(f"{path}: tissue is {tissue.shape}, expected (H, W)")
+    wanted = {name: (*count, *tissue.shape, len(names) + 1) for name in names}
+    wanted |= {"confidence": (*count, *tissue.shape), "force_mn": count}
+    for name, shape in wanted.items():
+        if name in found and (found[name].shape != shape or not count[0]):
+            raise UserError(f"{path}: {name} is {found[name].shape}, expected {shape} like the tissue")
+    scale, force = _positive(path, found, "scale_mm_per_px"), found.get("force_mn")
+
+    def frames() -> Iterator[MotionFrame]:
+        for t in range(count[0]):
+            first, *rest = (found[name][t].astype(np.float32) for name in names)
+            sure = found["confidence"][t].astype(np.float32) if "confidence" in found else None
+            moved = Moved(first, rest[0]) if rest else None
+            yield MotionFrame(first[..., :2] / scale if rest else first, sure, moved, t)
+
+    return Motion(
+        name=path.stem,
+        frames=frames(),
+        tissue=tissue,
+        scale_mm_per_px=scale,
+        young_kpa=_positive(path, found, "young_kpa") if "young_kpa" in found else None,
+        force_mn=None if force is None else force.astype(np.float64),
+    )
+
+
+def _positive(path: Path, found: dict[str, NDArray[Any]], name: str) -> float:
+    """The one number under a name. UserError if it is another number of them, or not positive."""
+    if found[name].size != 1 or not 0 < found[name].item() < math.inf:
+        raise UserError(f"{path}: {name} must be one positive number")
+    return float(found[name].item())
