@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import html
-import json
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -15,7 +14,6 @@ import cv2
 import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 from numpy.typing import NDArray
-from plotly.offline import get_plotlyjs
 from rich import box
 from rich.markup import escape
 from rich.table import Table
@@ -91,18 +89,13 @@ def render_report(result: Result, title: str) -> str:
         beaten_by=beaten_by(result),
         losses=[_described(result, name) for name in beaten_by(result)],
         surely=[n for n in beaten_by(result) if (w := result.methods[n].worse_by_mn) and w[0] > 0],
-        agreement="scatter" in figures,
-        correlogram="correlogram" in figures,
-        components="components" in figures,
+        figures=figures,
         depth_mm=_largest_depth(result.followed),
         panels=panels,
         flow_px=flow_px,
         masks=None if (masked := picture_masks(result.followed)) is None else _jpeg(masked),
         masked=result.followed.account.describe(),
         force_kpa=force_kpa,
-        # "</" would end the script element early.
-        figures=json.dumps(figures, allow_nan=False).replace("</", "<\\/"),
-        plotly=get_plotlyjs(),
         settings=_flat(result.settings),
         cost=_cost(result),
     )

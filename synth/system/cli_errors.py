@@ -21,7 +21,7 @@ _MACHINE = {
     errno.EISDIR, errno.EEXIST, errno.ENAMETOOLONG, errno.ELOOP, errno.EMFILE, errno.ENFILE,
 }  # fmt: skip
 
-_EXTRAS = {"plotly": "bench", "sklearn": "bench"}
+_EXTRAS = {"sklearn": "bench"}
 """Packages that commands import and a plain installation lacks, and the extra that brings them."""
 
 
