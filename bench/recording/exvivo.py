@@ -24,10 +24,10 @@ from synth.fem.mesh.relief import HeightMap
 from synth.fem.solver import Deformation
 from synth.geometry.triangles import Shape
 from synth.job import schema as jobs
-from synth.render.anatomy import surface as anatomy
-from synth.render.camera import camera
-from synth.render.scene import Studio
+from synth.render.anatomy.surface import CortexSurface
+from synth.render.scene import SceneState
 from synth.sequence import scenario
+from synth.sequence.scene import at_rest
 
 Floats = NDArray[np.float64]
 
@@ -114,23 +114,22 @@ def make(plan: Plan, index: int, folder: Path, progress: Callable[[int], None] =
 def _fill(plan: Plan, index: int, part: Path, progress: Callable[[int], None]) -> None:
     (part / "masks").mkdir()
     job = job_of(plan)
-    case = scenario.draw(job, index)
-    view = camera.place(case.view, job.render)
+    scene = at_rest(job, index, ["pull"])
+    case, surface = scene.scenario, scene.surface
     rng = np.random.default_rng([plan.seed, index, 77])
-    surface = anatomy.procedural(case.relief, job.anatomy)
     opening, young = job.anatomy.craniotomy.radius_mm, case.tissue.young_kpa
     gestures = [scenario.draw_gesture(job.fem, opening, young, rng) for _ in range(_GESTURES)]
     motions = [_moved(job, case, gesture, surface) for gesture in gestures]
     course = _course(plan, rng)
     times = _frame_times(plan, rng)
-    studio = Studio(surface, case.look, view, job)
+    renderer = scene.renderer
     pictures: list[NDArray[np.uint8]] = []
     beside: list[NDArray[np.uint8]] = []
     for k, time in enumerate(times):
         at = int(np.searchsorted(course.time_s, time).clip(0, len(course.time_s) - 1))
         motion, gesture = motions[course.gesture[at]], gestures[course.gesture[at]]
         vertices, tips, shafts = _pose(motion, gesture, course, at, rng)
-        shot = studio.frame(vertices, tips, shafts, int(rng.integers(2**31)))
+        shot = renderer.render(SceneState(vertices, tips, shafts), int(rng.integers(2**31)))
         pictures.append(shot.rgb)
         if shot.rgb_right is not None:
             beside.append(shot.rgb_right)
@@ -138,14 +137,14 @@ def _fill(plan: Plan, index: int, part: Path, progress: Callable[[int], None]) -
         progress(k + 1)
     crf = int(rng.integers(18, 25))
     writer.write_video(part / "video.mp4", iter(pictures), times, crf=crf)
-    if studio.right is not None:
+    if renderer.right is not None:
         writer.write_video(part / "right.mp4", iter(beside), times, crf=crf)
-        writer.write_pair(part / _PAIR, view, studio.right)
-    cv2.imwrite(str(part / "tissue.png"), studio.still.tissue.astype(np.uint8) * 255)
+        writer.write_pair(part / _PAIR, scene.view, renderer.right)
+    cv2.imwrite(str(part / "tissue.png"), scene.tissue.astype(np.uint8) * 255)
     force = np.stack([g.force_mn * np.asarray(g.direction) for g in gestures])[course.gesture]
     lag = _write_sensor(part, course, force * course.level[:, None], rng)
     about: dict[str, object] = {
-        "scale_mm_per_px": float(studio.still.scale_mm_per_px * (1 + 0.02 * rng.normal())),
+        "scale_mm_per_px": float(scene.scale_mm_per_px * (1 + 0.02 * rng.normal())),
         "scale_uncertainty": 0.02,
         "young_kpa": case.tissue.young_kpa,
         "specimen": f"calf {index}",
@@ -153,13 +152,13 @@ def _fill(plan: Plan, index: int, part: Path, progress: Callable[[int], None]) -
         "sync": {"method": "correlate", "calibration_s": [0.0, _SYNC_S], "search_s": 0.7},
         "sensor": {"axes": "sensor", "low_pass_hz": 10.0, "free_s": _free_spans(plan, lag)},
     }
-    if studio.right is not None:
+    if renderer.right is not None:
         about["stereo"] = {"calibration": _PAIR}
     writer.write_meta(part, about)
 
 
 def _moved(
-    job: jobs.Job, case: scenario.Scenario, gesture: tool.Gesture, surface: anatomy.Surface
+    job: jobs.Job, case: scenario.Scenario, gesture: tool.Gesture, surface: CortexSurface
 ) -> Deformation:
     """The path from no load to full: a gesture that only rises."""
     rising = tool.Gesture(**{**vars(gesture), "timing": (0.02, 1.0, 2.0, 3.0)})

@@ -24,10 +24,9 @@ from synth.flow import mask
 from synth.flow.estimator import create
 from synth.flow.track import Tracker
 from synth.job.schema import Job
-from synth.render.anatomy import surface as anatomy
-from synth.render.camera import camera
-from synth.render.scene import Studio
+from synth.render.scene import SceneState
 from synth.sequence import scenario
+from synth.sequence.scene import at_rest
 
 Row = dict[str, Any]
 _WET = {"glare": 0.75}  # of a job's light: the automatic mask then takes about 30% of the tissue
@@ -154,11 +153,9 @@ def rendered(
 
 
 def _pair(job: Job, index: int, peak_px: float) -> Pair:
-    case = scenario.draw(job, index)
-    view = camera.place(case.view, job.render)
+    scene = at_rest(job, index, ["pull"])
     rng = np.random.default_rng([job.seed, index])
-    surface = anatomy.procedural(case.relief, job.anatomy)
-    rest = surface.vertices
+    rest = scene.surface.vertices
     dimple = _dimple(rest, rng, job.anatomy.craniotomy.radius_mm)
     held = int(np.argmax(np.linalg.norm(dimple, axis=1)))
     azimuth = rng.uniform(0, 2 * np.pi)
@@ -166,18 +163,17 @@ def _pair(job: Job, index: int, peak_px: float) -> Pair:
     side = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
     tips, shafts = rest[held] + np.stack([side, -side]), np.stack([shaft, shaft])
     seeds = scenario.frame_seeds(job, index)
-    studio = Studio(surface, case.look, view, job)
 
     def shoot(amount: float, away_mm: float, seed: int) -> Any:
         at = tips + amount * dimple[held] + away_mm * shafts
-        return studio.frame(rest + amount * dimple, at, shafts, seed)
+        return scene.renderer.render(SceneState(rest + amount * dimple, at, shafts), seed)
 
     before = shoot(0.0, 60.0, seeds[0])
-    amount = peak_px * view.mm_per_px
+    amount = peak_px * scene.view.mm_per_px
     # Perspective and tilt: the picture's peak is not the world's.
     seen = shoot(amount, 60.0, seeds[1]).flow
     now = shoot(amount * peak_px / float(np.hypot(seen[..., 0], seen[..., 1]).max()), 0.0, seeds[1])
-    tissue, length = studio.still.tissue, np.hypot(now.flow[..., 0], now.flow[..., 1])
+    tissue, length = scene.tissue, np.hypot(now.flow[..., 0], now.flow[..., 1])
     glare = mask.glare(now.rgb)
     return Pair(
         rest=before.rgb,

@@ -13,10 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from synth.job.schema import Job
-from synth.render.anatomy import surface as anatomy
-from synth.render.camera import camera
-from synth.render.scene import Studio
+from synth.render.scene import SceneState
 from synth.sequence import scenario
+from synth.sequence.scene import at_rest
 
 FRAMES = 6
 """Frames a scene; the last shows no instrument."""
@@ -54,18 +53,16 @@ def frames(scenes: range, seed: int) -> Iterator[Frame]:
 
 
 def _scene(job: Job, index: int) -> Iterator[Frame]:
-    case = scenario.draw(job, index)
-    view = camera.place(case.view, job.render)
-    surface = anatomy.procedural(case.relief, job.anatomy)
     rng = np.random.default_rng([job.seed, index])
     hands = [str(kind) for kind in rng.choice(_GESTURES, size=1 + (rng.random() < 0.2))]
-    studio = Studio(surface, case.look, view, job, hands)
+    scene = at_rest(job, index, hands)
+    vertices = scene.surface.vertices
     for k, seed in enumerate(scenario.frame_seeds(job, index)):
-        poses = [_pose(surface.vertices, job.anatomy.craniotomy.radius_mm, rng) for _ in hands]
+        poses = [_pose(vertices, job.anatomy.craniotomy.radius_mm, rng) for _ in hands]
         tips, shafts = np.concatenate([p[0] for p in poses]), np.concatenate([p[1] for p in poses])
         if k == FRAMES - 1:
             tips = tips + np.array([0.0, 0.0, _AWAY_MM])
-        shot = studio.frame(surface.vertices, tips, shafts, seed)
+        shot = scene.renderer.render(SceneState(vertices, tips, shafts), seed)
         yield Frame(index, shot.rgb, shot.tool)
 
 

@@ -50,8 +50,8 @@ def of_job(job: Job, step: int = 64) -> tuple[Picture, Ints]:
     pictures, of = [], []
     for index in range(job.sequences):
         one = case(bare, index)
-        shot = one.studio.frame(one.vertices, one.tips, one.shafts, seed=index)
-        inside = cv2.erode(one.studio.still.tissue.astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
+        shot = one.renderer.render(one.state(), seed=index)
+        inside = cv2.erode(one.renderer.rest.tissue.astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
         found = corners(inside, SIDE_PX, step)
         pictures.append(_cut(taken(shot.rgb, index + 1), found))
         of += [index] * len(found)

@@ -1,27 +1,25 @@
-"""One drawn sequence for measuring the renderer alone: its studio and a plain pull, without the physics."""
+"""One drawn sequence for measuring the renderer alone: its renderer and a plain pull, without the physics."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from synth.job.schema import Job
-from synth.render.anatomy import surface as anatomy
-from synth.render.camera import camera
-from synth.render.scene import Studio
-from synth.sequence import scenario
+from synth.render.scene import Renderer, SceneState
+from synth.sequence.scene import at_rest
 
 Floats = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Case:
-    """A studio and how its surface and instrument move."""
+    """A renderer and how its surface and instrument move."""
 
-    studio: Studio
+    renderer: Renderer
     vertices: Floats
     """(V, 3) mm at rest."""
     tips: Floats
@@ -41,13 +39,16 @@ class Case:
         """The tips, moving with the tissue they hold."""
         return self.tips + lift_mm * np.array([0.3, 0.15, 1.0])
 
+    def state(self, lift_mm: float = 0.0) -> SceneState:
+        """Both."""
+        return SceneState(self.moved(lift_mm), self.held(lift_mm), self.shafts)
+
 
 def case(job: Job, index: int) -> Case:
     """Sequence `index` of a job, its load replaced by a plain pull at the gesture's own point."""
-    drawn = scenario.draw(job, index)
-    surface = anatomy.procedural(drawn.relief, job.anatomy)
-    lens = camera.place(drawn.view, job.render)
-    studio = Studio(surface, drawn.look, lens, job)
+    scene = at_rest(job, index, ["pull"])
+    surface = replace(scene.surface, uv=scene.surface.uv.copy())  # `stability` writes into it
+    scene = replace(scene, surface=surface)
     rng = np.random.default_rng([job.seed, index])
     centre = rng.uniform(-4, 4, 2)
     azimuth, lift = rng.uniform(0, 2 * np.pi), np.deg2rad(rng.uniform(35, 55))
@@ -56,4 +57,4 @@ def case(job: Job, index: int) -> Case:
     flat = np.stack([centre + side, centre - side])
     height = surface.vertices[cKDTree(surface.vertices[:, :2]).query(flat)[1], 2]
     tips = np.concatenate([flat, height[:, None]], axis=1)
-    return Case(studio, surface.vertices, tips, np.stack([shaft, shaft]), centre)
+    return Case(scene.renderer, surface.vertices, tips, np.stack([shaft, shaft]), centre)

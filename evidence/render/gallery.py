@@ -19,10 +19,10 @@ from evidence import report
 from synth.job.schema import Family, Job
 from synth.publish.contact_sheet import poised
 from synth.render import instrument
-from synth.render.camera import camera
 from synth.render.instrument import Kind
-from synth.render.scene import Studio
-from synth.sequence import mechanics, scenario
+from synth.render.scene import SceneState
+from synth.sequence import scenario
+from synth.sequence.scene import at_rest
 
 Picture = npt.NDArray[np.uint8]
 Settings = dict[str, Any]
@@ -95,11 +95,12 @@ def _tile(settings: Settings, kind: Kind, size: tuple[int, int], seed: int, capt
             settings,
         )
     )
-    case = scenario.draw(job, 0)
-    surface, _ = mechanics.cortex(job, case)
+    rest = at_rest(job)
+    case = rest.scenario
     look = replace(case.look, rim_seed=_seed_of(kind, case.gesture.kind), scenery=job.render.scenery)
-    studio = Studio(surface, look, camera.place(case.view, job.render), job, [case.gesture.kind])
-    shot = studio.frame(surface.vertices, *poised(case.gesture, surface), scenario.frame_seeds(job, 0)[0])
+    scene = replace(rest, scenario=replace(case, look=look, further=()))
+    state = SceneState(rest.surface.vertices, *poised(case.gesture, rest.surface))
+    shot = scene.renderer.render(state, scenario.frame_seeds(job, 0)[0])
     band = np.full((_CAPTION_PX, size[0], 3), 255, np.uint8)
     cv2.putText(band, caption, (3, 11), cv2.FONT_HERSHEY_SIMPLEX, 0.34, (40, 40, 40), 1, cv2.LINE_AA)
     return np.vstack([band, shot.rgb])

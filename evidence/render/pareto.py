@@ -21,13 +21,12 @@ import typer
 from evidence import report
 from evidence.render.case import Case, case
 from synth.job.schema import Job, RenderSection
-from synth.render import instrument
-from synth.render.scene import Studio
+from synth.render.scene import Renderer
 
 Map = npt.NDArray[np.float32]
 
 _LIFT = 1.5
-_STAGE = signature(Studio.stage).parameters
+_STAGE = signature(Renderer.stage).parameters
 _DEFAULT = (
     RenderSection().spp,
     _STAGE["sampler"].default,
@@ -70,22 +69,19 @@ def measure(ours: Case, spp: int, sampler: str, kind: str) -> dict[str, float]:
     Noise is that of two pictures over tissue (`noises`). Flow error is against the truth, over
     visible tissue away from the instrument.
     """
-    studio = ours.studio
-    forceps = instrument.build(("forceps",))
-    tool = instrument.pose(forceps, ours.tips, ours.shafts)
-    stage = studio.stage(ours.vertices, tool, spp=spp, integrator=kind, sampler=sampler)
+    renderer = ours.renderer
+    stage = renderer.stage(ours.state(), spp=spp, integrator=kind, sampler=sampler)
     stage.render(0)
     spent, pictures = [], []
     for seed, lift in ((1, 0.0), (2, 0.0), (3, _LIFT)):
         start = time.process_time()
-        stage.move("cortex", ours.moved(lift))
-        stage.move("tool", instrument.pose(forceps, ours.held(lift), ours.shafts))
+        renderer.move(stage, ours.state(lift))
         pictures.append(stage.render(seed))
         spent.append(time.process_time() - start)
     one, two, three = pictures
-    tissue = studio.still.tissue & ~studio.frame(ours.vertices, ours.tips, ours.shafts, 0).tool
-    truth = studio.frame(ours.moved(_LIFT), ours.held(_LIFT), ours.shafts, 4)
-    rest, now = (studio.develop(picture, 9 + k) for k, picture in enumerate((one, three)))
+    tissue = renderer.rest.tissue & ~renderer.render(ours.state(), 0).tool
+    truth = renderer.render(ours.state(_LIFT), 4)
+    rest, now = (renderer.develop(picture, 9 + k) for k, picture in enumerate((one, three)))
     estimator = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     grey = [cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY) for rgb in (rest, now)]
     flow = estimator.calc(grey[0], grey[1], np.zeros((*grey[0].shape, 2), np.float32))
@@ -115,7 +111,7 @@ def frame_cost(ours: Case, frames: int) -> dict[str, float]:
     spent = []
     for k in range(frames + 1):
         start = time.process_time()
-        ours.studio.frame(ours.moved(0.1 * k), ours.held(0.1 * k), ours.shafts, k)
+        ours.renderer.render(ours.state(0.1 * k), k)
         spent.append(time.process_time() - start)
     low, middle, high = np.quantile(spent[1:], (0, 0.5, 1)).tolist()
     return {"cpu_s_least": low, "cpu_s_median": middle, "cpu_s_most": high}

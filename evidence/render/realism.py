@@ -76,10 +76,10 @@ def _rendered(frames: int, family: str, seed: int) -> tuple[list[Picture], float
     crops, pixels = [], []
     for index in range(frames):
         bare = case(job, index)
-        picture = bare.studio.frame(bare.vertices, bare.tips, bare.shafts, seed + index).rgb
-        inside = cv2.erode(bare.studio.still.tissue.astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
+        picture = bare.renderer.render(bare.state(), seed + index).rgb
+        inside = cv2.erode(bare.renderer.rest.tissue.astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
         crops += picture_statistics.tiles(picture, inside, _SIDE, _STEP)
-        pixels.append(bare.studio.still.scale_mm_per_px)
+        pixels.append(bare.renderer.rest.scale_mm_per_px)
     return crops, float(np.median(pixels))
 
 

@@ -17,6 +17,7 @@ from evidence import report
 from evidence.render.case import Case, case
 from synth.errors import UserError
 from synth.job.schema import Job
+from synth.render.scene import SceneState
 
 Changes = dict[str, Any]
 
@@ -43,13 +44,13 @@ def main(out: Path = report.RESULTS / "render/stability", seed: int = 11) -> Non
 def checked(ours: Case, changes: Changes) -> dict[str, Any]:
     """Renders one frame and holds its labels against OpenCV's projection of the same material points."""
     posed = {"vertices": ours.moved(2.0), "tips": ours.held(2.0), "shafts": ours.shafts} | changes
-    rest, lens = ours.studio.still, ours.studio.camera
-    shot = ours.studio.frame(**posed, seed=3)
+    rest, lens = ours.renderer.rest, ours.renderer.camera
+    shot = ours.renderer.render(SceneState(posed["vertices"], posed["tips"], posed["shafts"]), seed=3)
     for array in (shot.radiance, shot.flow, shot.depth, rest.area):
         assert np.isfinite(array).all()
     assert not (shot.visible & ~rest.tissue).any()
     assert not (shot.glare & shot.tool).any()
-    faces = ours.studio.surface.faces[rest.face[rest.tissue]]
+    faces = ours.renderer.surface.faces[rest.face[rest.tissue]]
     points = np.einsum("nk,nkc->nc", rest.bary[rest.tissue], posed["vertices"][faces])
     turn, _ = cv2.Rodrigues(lens.rotation)
     there, _ = cv2.projectPoints(points, turn, lens.translation, lens.K, lens.distortion)
@@ -69,7 +70,7 @@ def _steep(ours: Case) -> Changes:
 
 def _degenerate(ours: Case) -> Changes:
     """Faces of no area, and all vertices in one place of the maps."""
-    ours.studio.surface.uv[:] = 0.5
+    ours.renderer.surface.uv[:] = 0.5
     vertices = ours.vertices.copy()
     vertices[5000:5400] = vertices[5000]
     return {"vertices": vertices}
@@ -77,7 +78,7 @@ def _degenerate(ours: Case) -> Changes:
 
 def _filled_view(ours: Case) -> Changes:
     """An instrument right before the lens."""
-    towards = ours.studio.camera.centre / np.linalg.norm(ours.studio.camera.centre)
+    towards = ours.renderer.camera.centre / np.linalg.norm(ours.renderer.camera.centre)
     close = 240 * towards + np.array([[0.5, 0, 0], [-0.5, 0, 0]])
     return {"tips": close, "shafts": np.array([[1.0, 0, 0.05], [-1.0, 0, 0.05]])}
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from synth.checks.measure import Measure, inner, truth
 from synth.dataset.store import Sequence
 from synth.render.camera import camera as cameras
-from synth.render.camera.sway import Sway
+from synth.render.camera.camera_motion import CameraMotion
 
 Floats = NDArray[np.float64]
 
@@ -49,7 +49,7 @@ def contact(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
     footprint = float(scenario["gesture"]["footprint_mm"])
     # Over the relief a rigid tip's load may be anywhere under it.
     spread = 1.0 if sequence.attrs["mechanics"].get("contact") == "rigid" else 0.1
-    sway = Sway(**scenario["sway"]) if "sway" in scenario else None
+    sway = CameraMotion(**scenario["sway"]) if "sway" in scenario else None
     area, inside = sequence["area"][:], inner(sequence["tissue"][:], 2)
     rows, columns = np.indices(sequence.size)
     peak = float(np.linalg.norm(sequence["force"][:], axis=1).max())

@@ -13,17 +13,17 @@ from synth.fit.photograph import Photograph
 from synth.fit.statistics import Map, Mask, Picture, measure
 from synth.job.schema import Family, Job
 from synth.render.appearance.family import FAMILIES
-from synth.render.camera import camera, camera_sensor
-from synth.render.camera.camera_sensor import Sensor
-from synth.render.scene import Studio
-from synth.sequence import mechanics, scenario
+from synth.render.camera import camera_sensor
+from synth.render.camera.camera_sensor import CameraSensor
+from synth.render.scene import SceneState
+from synth.sequence.scene import at_rest
 
 _LARGEST_MM, _SMALLEST_PX, _LARGEST_PX = 60.0, 160, 720
 _INSET_PX = 9  # from the opening's edge
 _ANATOMIES = 2
 # Green and blue over red in frames, against those of the reflectances they were rendered with.
 _SEEN_G, _SEEN_B = 0.825, 0.735
-_USUAL = Sensor()
+_USUAL = CameraSensor()
 
 _TRIED: dict[str, tuple[tuple[float, ...], Callable[[float], dict[str, float]]]] = {
     "vignette": ((0.0, 0.2, 0.4, 0.6, 0.8), lambda share: {"vignette": share}),
@@ -47,7 +47,7 @@ class Frame:
     """(H, W, 3) linear."""
     usable: Mask
     """(H, W) tissue."""
-    sensor: Sensor
+    sensor: CameraSensor
     """Of its sequence."""
 
     def record(self, keys: Mapping[str, Any]) -> Picture:
@@ -120,11 +120,9 @@ def render(family: Family, width: int, mm_per_px: float, index: int) -> Frame:
             "render": {"size": [width, width * 3 // 4], "field_mm": field, "tilt_deg": [0, 8], "tool": False},
         }
     )
-    case = scenario.draw(job, index)
-    surface, _ = mechanics.cortex(job, case)
-    studio = Studio(surface, case.look, camera.place(case.view, job.render), job)
+    scene = at_rest(job, index)
     nowhere = np.zeros((2, 3))
-    radiance = studio.frame(surface.vertices, nowhere, nowhere, seed=index).radiance
-    tissue = studio.still.tissue.astype(np.uint8)
-    usable = cv2.erode(tissue, np.ones((_INSET_PX, _INSET_PX), np.uint8)) > 0
-    return Frame(radiance, usable, case.look.sensor)
+    state = SceneState(scene.surface.vertices, nowhere, nowhere)
+    radiance = scene.renderer.render(state, seed=index).radiance
+    usable = cv2.erode(scene.tissue.astype(np.uint8), np.ones((_INSET_PX, _INSET_PX), np.uint8)) > 0
+    return Frame(radiance, usable, scene.scenario.look.sensor)

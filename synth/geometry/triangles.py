@@ -21,6 +21,14 @@ class Shape(NamedTuple):
     """(F, 3)."""
 
 
+def joined(*shapes: Shape) -> Shape:
+    """Several meshes as one, in their order."""
+    first = np.cumsum([0] + [len(shape.vertices) for shape in shapes])
+    faces = [shape.faces + at for shape, at in zip(shapes, first, strict=False)]
+    vertices = np.concatenate([shape.vertices for shape in shapes])
+    return Shape(vertices, np.concatenate(faces).astype(np.int32))
+
+
 def lengths(vectors: npt.NDArray[Any]) -> npt.NDArray[Any]:
     """Length (...) of short vectors (..., C): the bytes of `norm`, which takes ten times as long."""
     total = vectors[..., 0] * vectors[..., 0]

@@ -18,10 +18,10 @@ from synth.dataset.store import open_sequence
 from synth.fem.tool import Gesture
 from synth.job.schema import Job
 from synth.publish.picture import Rgb, caption, tile
-from synth.render.anatomy.surface import Surface
-from synth.render.camera import camera
-from synth.render.scene import Studio
-from synth.sequence import mechanics, pipeline, scenario
+from synth.render.anatomy.surface import CortexSurface
+from synth.render.scene import SceneState
+from synth.sequence import pipeline, scenario
+from synth.sequence.scene import at_rest
 
 _TILE_PX = 320
 _OPENING_MM = 1.0  # two tips closer than this would be one
@@ -77,20 +77,18 @@ def draw_sheet(job: Job, count: int, report: Callable[[int, int], None] = lambda
 
 def _frame(job: Job, index: int) -> Rgb:
     """A scenario's picture (the left eye beside the right)."""
-    case = scenario.draw(job, index)
-    surface, _ = mechanics.cortex(job, case)
-    view, gestures = camera.place(case.view, job.render), case.gestures
-    studio = Studio(surface, case.look, view, job, [gesture.kind for gesture in gestures])
-    ready = [poised(gesture, surface) for gesture in gestures]
+    scene = at_rest(job, index)
+    gestures = scene.scenario.gestures
+    ready = [poised(gesture, scene.surface) for gesture in gestures]
     tips, shafts = (np.concatenate(part) for part in zip(*ready, strict=True))
-    seed = scenario.frame_seeds(job, index)[0]
-    shot = studio.frame(surface.vertices, tips, shafts, seed)
-    picture = shot.rgb if shot.rgb_right is None else np.hstack([shot.rgb, shot.rgb_right])
-    label = f"{index}  {case.family}  {' + '.join(one.kind for one in gestures)}"
+    state, seed = SceneState(scene.surface.vertices, tips, shafts), scenario.frame_seeds(job, index)[0]
+    frame = scene.renderer.render(state, seed)
+    picture = frame.rgb if frame.rgb_right is None else np.hstack([frame.rgb, frame.rgb_right])
+    label = f"{index}  {scene.scenario.family}  {' + '.join(one.kind for one in gestures)}"
     return caption(picture, label, job.render.size[1] - 8)
 
 
-def poised(gesture: Gesture, surface: Surface) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def poised(gesture: Gesture, surface: CortexSurface) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Tips (2, 3) mm on the surface where the gesture begins, and shafts (2, 3)."""
     azimuth, rise = np.deg2rad([gesture.azimuth_deg, gesture.elevation_deg])
     shaft = np.array([np.cos(azimuth) * np.cos(rise), np.sin(azimuth) * np.cos(rise), np.sin(rise)])

@@ -51,7 +51,7 @@ class Part:
 
 
 @dataclass(frozen=True)
-class Instrument:
+class InstrumentMesh:
     """All instruments of a scene as one mesh."""
 
     kinds: tuple[Kind, ...]
@@ -59,8 +59,6 @@ class Instrument:
     """The parts of each."""
     faces: npt.NDArray[np.int32]
     """(F, 3) over all parts."""
-    uv: npt.NDArray[np.float32]
-    """(V, 2): round the bar, along it."""
     coat: npt.NDArray[np.float32]
     """(V,) 0 bare steel to 1 under a black coating."""
 
@@ -79,29 +77,25 @@ def finish(kinds: Sequence[Kind], rng: np.random.Generator) -> tuple[bool, ...]:
     return tuple(bool(drawn) for drawn in rng.random(len(kinds)) < _COATED)
 
 
-def build(kinds: Sequence[Kind], coated: Sequence[bool] | None = None) -> Instrument:
-    """The mesh of some instruments, to be placed by `pose`; the `coated` have black ends, by default none."""
+def build(kinds: Sequence[Kind], coated: Sequence[bool]) -> InstrumentMesh:
+    """The mesh of some instruments, perhaps none, to be placed by `pose`; the `coated` have black ends."""
     parts = tuple(_PARTS[kind]() for kind in kinds)
-    black = coated if coated is not None else [False] * len(parts)
-    faces, uv, coat, total = [], [], [], 0
-    for own, ends in zip(parts, black, strict=True):
+    faces, coat, total = [np.zeros((0, 3), np.int64)], [np.zeros(0)], 0
+    for own, ends in zip(parts, coated, strict=True):
         for part in own:
-            skin, flat = _skin(len(part.profile) // (_AROUND + 1))
-            faces.append(skin + total)
-            uv.append(flat)
+            faces.append(_faces(len(part.profile) // (_AROUND + 1)) + total)
             # The coating ends in a sharp ring.
             coat.append(ends / (1 + np.exp(np.clip((part.profile[:, 2] - _COAT_MM) / 0.12, -40, 40))))
             total += len(part.profile)
-    return Instrument(
+    return InstrumentMesh(
         kinds=tuple(kinds),
         parts=parts,
         faces=np.concatenate(faces).astype(np.int32),
-        uv=np.concatenate(uv).astype(np.float32),
         coat=np.concatenate(coat).astype(np.float32),
     )
 
 
-def pose(instrument: Instrument, tips: Floats, shafts: Floats) -> Floats:
+def pose(instrument: InstrumentMesh, tips: Floats, shafts: Floats) -> Floats:
     """World vertices (V, 3) mm of the instruments.
 
     Args:
@@ -112,9 +106,9 @@ def pose(instrument: Instrument, tips: Floats, shafts: Floats) -> Floats:
     Raises:
         UserError: another number of tips than two an instrument.
     """
-    if len(tips) != 2 * len(instrument.parts):
+    if instrument.parts and len(tips) != 2 * len(instrument.parts):
         raise UserError(f"{len(tips)} tips for {len(instrument.parts)} instruments; two each are needed")
-    placed = []
+    placed = [np.zeros((0, 3))]
     for k, parts in enumerate(instrument.parts):
         ends, ways = tips[2 * k : 2 * k + 2], shafts[2 * k : 2 * k + 2]
         for part in parts:
@@ -127,7 +121,7 @@ def pose(instrument: Instrument, tips: Floats, shafts: Floats) -> Floats:
     return np.concatenate(placed)
 
 
-def film(instrument: Instrument, tips: Floats, surface: Floats) -> Floats:
+def film(instrument: InstrumentMesh, tips: Floats, surface: Floats) -> Floats:
     """Height (V,) mm that the wet film of a surface (V, 3) mm climbs at tips (2n, 3) mm that touch it."""
     height = np.zeros(len(surface))
     for k, kind in enumerate(instrument.kinds):
@@ -235,12 +229,10 @@ _PARTS = {
 }
 
 
-def _skin(rings: int) -> tuple[npt.NDArray[np.int64], Floats]:
-    """Faces and uv of a swept bar."""
+def _faces(rings: int) -> npt.NDArray[np.int64]:
+    """Faces (F, 3) of a swept bar."""
     around = _AROUND + 1
     row, column = np.meshgrid(np.arange(rings - 1), np.arange(_AROUND), indexing="ij")
     a = (row * around + column).ravel()
     b, c, d = a + 1, a + around, a + around + 1
-    faces = np.concatenate([np.stack([a, b, d], 1), np.stack([a, d, c], 1)])
-    v, u = np.meshgrid(np.linspace(0, 1, rings), np.linspace(0, 1, around), indexing="ij")
-    return faces, np.stack([u.ravel(), v.ravel()], axis=1)
+    return np.concatenate([np.stack([a, b, d], 1), np.stack([a, d, c], 1)])

@@ -1,4 +1,4 @@
-"""The studio: one surface under the microscope, moved frame by frame; pictures and their truth."""
+"""The renderer of one surface under the microscope, moved frame by frame: pictures and their truth."""
 
 from __future__ import annotations
 
@@ -10,20 +10,18 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from synth.geometry.triangles import Shape, normals
+from synth.geometry.triangles import Shape, joined, normals
 from synth.job.schema import Job
 from synth.render import instrument, truth
 from synth.render.anatomy import noise, rim, scenery, texture
-from synth.render.anatomy.surface import Surface
+from synth.render.anatomy.surface import CortexSurface
 from synth.render.appearance import light, reflection
 from synth.render.appearance.look import Look
 from synth.render.camera import camera_sensor
-from synth.render.camera.camera import Camera, beside, blur_radius
+from synth.render.camera.camera import Camera, blur_radius, right_camera
 from synth.render.mitsuba.adapter import Body, Metal, Stage, forget, pick
-from synth.render.truth import Still
+from synth.render.truth import RestFrame
 from synth.system.jit import vectorised
-
-__all__ = ["Look", "Moment", "Shot", "Still", "Studio"]
 
 Floats = npt.NDArray[np.float64]
 Map = npt.NDArray[np.float32]
@@ -38,7 +36,7 @@ _GLARE = 0.35  # specular radiance, as a share of full scale, that hides what is
 
 
 @dataclass(frozen=True)
-class Moment:
+class SceneState:
     """Where everything is at one time."""
 
     vertices: Floats
@@ -54,7 +52,7 @@ class Moment:
 
 
 @dataclass(frozen=True)
-class Shot:
+class RenderedFrame:
     """One frame and its truth. What the job does not ask for (`store.extra`) is None."""
 
     rgb: npt.NDArray[np.uint8]
@@ -87,7 +85,7 @@ class Shot:
     """(H, W) the second lens's pixels of this frame; with one."""
 
 
-class Studio:
+class Renderer:
     """One scene. Every frame is a function of its arguments alone.
 
     Args:
@@ -102,84 +100,90 @@ class Studio:
     """
 
     def __init__(
-        self, surface: Surface, look: Look, camera: Camera, job: Job, gestures: Sequence[str] = ("pull",)
+        self,
+        surface: CortexSurface,
+        look: Look,
+        camera: Camera,
+        job: Job,
+        gestures: Sequence[str] = ("pull",),
     ) -> None:
-        forget()  # of a studio before this one
+        forget()  # of a renderer before this one
         self.variant = pick(job.render.variant)
         self.surface, self.camera = surface, camera
         self._look, self._render, self._extra = look, job.render, job.store.extra
-        self.rim = rim.build(surface, job.anatomy.craniotomy.radius_mm, look, camera.mm_per_px)
+        self._rim = rim.build(surface, job.anatomy.craniotomy.radius_mm, look, camera.mm_per_px)
         self._coat = texture.cortex(
             surface,
             look,
             texture.resolution(surface.extent_mm, camera.mm_per_px),
             job.appearance.photo,
-            rim.shade(self.rim, surface.extent_mm),
+            rim.shade(self._rim, surface.extent_mm),
         )
+        hand = np.random.default_rng([look.rim_seed, 2])
+        kinds = instrument.choose(gestures if job.render.tool else (), hand)
+        self._tool = instrument.build(kinds, instrument.finish(kinds, hand))
+        """Without a vertex where the job shows no instruments."""
         self._blade = self._retractor()
         rest = Shape(surface.vertices, surface.faces)
-        self.frame_of_opening = rim.joined(self.rim.shape, self._blade)
+        self._static = joined(self._rim.shape, self._blade)
         """Rim and scenery, which never move."""
-        self.still = truth.still(camera, rest, self.frame_of_opening)
-        self._right: Still | None = None
+        self.rest = truth.trace_rest(camera, rest, self._static)
         self.right: Camera | None = None
         """The second lens at rest, where the job has one."""
+        self._right_rest: RestFrame | None = None
         if job.render.stereo_mm:
-            self.right = beside(camera, job.render.stereo_mm)
-            self._right = truth.still(self.right, rest, self.frame_of_opening)
+            self.right = right_camera(camera, job.render.stereo_mm)
+            self._right_rest = truth.trace_rest(self.right, rest, self._static)
         self.lamps = light.lamps(camera, look.light)
-        hand = np.random.default_rng([look.rim_seed, 2])
-        kinds = instrument.choose(gestures, hand)
-        self._tool = instrument.build(kinds, instrument.finish(kinds, hand)) if job.render.tool else None
+        dull = np.full(len(self._blade.vertices), _DULL, np.float32)
+        self._coating = np.concatenate([self._tool.coat, dull])
+        """(V,) of `_steel`: 1 where it is coated black, and between where it is dull."""
         self._theatre = self._surroundings()
         self._stage: Stage | None = None
 
-    def frame(self, vertices: Floats, tips: Floats, shafts: Floats, seed: int) -> Shot:
-        """Picture and truth of one frame with the microscope at rest; arrays as in `Moment`."""
-        return self.shoot(Moment(vertices, tips, shafts), seed)
-
-    def shoot(
-        self, now: Moment, seed: int, shutter: Sequence[Moment] = (), after: Moment | None = None
-    ) -> Shot:
+    def render(
+        self,
+        state: SceneState,
+        seed: int,
+        shutter: Sequence[SceneState] = (),
+        after: SceneState | None = None,
+    ) -> RenderedFrame:
         """Picture and truth of one frame.
 
         Args:
-            now: the frame's time, which its truth is of.
+            state: the scene at the frame's time, which its truth is of.
             seed: of light paths and sensor noise.
-            shutter: times while the shutter is open, whose light adds up in the picture; `now` if none.
-            after: the next frame's time, for the flow to it.
+            shutter: states while the shutter is open, whose light adds up in the picture; `state` if none.
+            after: the next frame's state, for the flow to it.
         """
-        camera = now.camera or self.camera
-        tool = self._posed(now)
-        moments = shutter or (now,)
-        radiance, light_right = self._gathered(moments, seed)
-        shapes = (Shape(now.vertices, self.surface.faces), self.frame_of_opening, tool)
-        seen = truth.now(camera, self.still, *shapes)
+        camera = state.camera or self.camera
+        radiance, radiance_right = self._gathered(shutter or (state,), seed)
+        shapes = (Shape(state.vertices, self.surface.faces), self._static, self._posed(state))
+        seen = truth.trace_frame(camera, self.rest, *shapes)
         extra: dict[str, Any] = {}
         if "flow_next" in self._extra:
-            there = after or now
-            extra["flow_next"] = truth.onwards(
+            there = after or state
+            extra["flow_next"] = truth.forward_flow(
                 seen.hits, self.surface.faces, there.vertices, there.camera or self.camera
             )
         if "normals" in self._extra:
-            extra["normals"] = truth.facing(camera, seen.hits, shapes)
+            extra["normals"] = truth.normal_map(camera, seen.hits, shapes)
         if "blur" in self._extra:
             extra["blur"] = blur_radius(camera, seen.depth)
-        if self._right is not None:
-            baseline = self._render.stereo_mm
-            other = truth.now(beside(camera, baseline), self._right, *shapes)
-            picture = self.develop(light_right, seed + 1)
-            extra |= {"rgb_right": picture, "flow_right": other.flow}
-            extra |= {"visible_right": other.visible, "depth_right": other.depth}
-            extra |= {"motion": seen.motion, "tool_right": other.tool}
-        return Shot(
+        if self._right_rest is not None:
+            lens = right_camera(camera, self._render.stereo_mm)
+            other = truth.trace_frame(lens, self._right_rest, *shapes)
+            picture = self.develop(radiance_right, seed + 1)
+            extra |= {"rgb_right": picture, "flow_right": other.flow, "visible_right": other.visible}
+            extra |= {"depth_right": other.depth, "tool_right": other.tool, "motion": seen.motion}
+        return RenderedFrame(
             rgb=self.develop(radiance, seed),
             radiance=radiance,
             flow=seen.flow,
             visible=seen.visible,
             depth=seen.depth,
             tool=seen.tool,
-            glare=self._glare(radiance, seen, now),
+            glare=self._glare(radiance, seen, state),
             **extra,
         )
 
@@ -192,152 +196,127 @@ class Studio:
         if self.right is None:
             raise ValueError("there is no second lens")
         width, height = self.camera.size
-        depth = self.still.points[:, 2].reshape(height, width)
+        depth = self.rest.points[:, 2].reshape(height, width)
         shift = self.right.K[0, 2] - self.camera.K[0, 2]
-        away = np.where(self.still.tissue, depth, 1.0)
+        away = np.where(self.rest.tissue, depth, 1.0)
         wide = self.camera.K[0, 0] * self._render.stereo_mm / away - shift
-        return np.where(self.still.tissue, wide, 0.0).astype(np.float32)
+        return np.where(self.rest.tissue, wide, 0.0).astype(np.float32)
 
     def traction(self, nodal: Floats) -> Map:
         """Traction (V, 3) kPa, world axes, at rest pixels: (H, W, 3) kPa, camera axes; 0 off tissue."""
-        return truth.at_rest_pixels(self.still, self.surface.faces, nodal @ self.camera.rotation.T)
+        return truth.at_rest_pixels(self.rest, self.surface.faces, nodal @ self.camera.rotation.T)
 
     def stage(
         self,
-        vertices: Floats,
-        tool: Floats,
+        state: SceneState,
         spp: int,
         integrator: str = "direct",
         sampler: str = "multijitter",
     ) -> Stage:
-        """A Mitsuba stage with bodies `cortex`, `rim` and `tool`; vertices (V, 3), (T, 3) mm as given."""
-        return Stage(
-            self.variant,
-            self.camera,
-            self.bodies(vertices, tool),
-            self.lamps,
-            spp,
-            integrator,
-            sampler,
-        )
+        """A Mitsuba stage of a state, with bodies `cortex`, `rim` and `tool`."""
+        return Stage(self.variant, self.camera, self._bodies(state), self.lamps, spp, integrator, sampler)
+
+    def move(self, stage: Stage, state: SceneState) -> None:
+        """Puts everything in a stage where it is in another state."""
+        stage.move("cortex", state.vertices, self._film(state))
+        if self._tool.parts:
+            steel = self._steel(state)
+            stage.move("tool", steel.vertices)
+            stage.mirror("tool", self._mirrored(steel))
 
     def develop(self, radiance: Map, seed: int) -> npt.NDArray[np.uint8]:
         """The recorded picture (H, W, 3) of a radiance (H, W, 3)."""
         return camera_sensor.record(radiance, self._look.sensor, np.random.default_rng([seed, 1]))
 
-    def _posed(self, now: Moment) -> Shape | None:
-        if self._tool is None:
-            return None
-        return Shape(instrument.pose(self._tool, now.tips, now.shafts), self._tool.faces)
+    def _posed(self, state: SceneState) -> Shape:
+        return Shape(instrument.pose(self._tool, state.tips, state.shafts), self._tool.faces)
 
-    def _gathered(self, moments: Sequence[Moment], seed: int) -> tuple[Map, Map]:
-        """Mean light of some moments in the lens and in the second one; zeros where there is none."""
+    def _film(self, state: SceneState) -> Floats:
+        return instrument.film(self._tool, state.tips, state.vertices)
+
+    def _gathered(self, states: Sequence[SceneState], seed: int) -> tuple[Map, Map]:
+        """Mean light of some states in the lens and in the second one; zeros where there is none."""
         left: list[Map] = []
         right: list[Map] = []
-        for k, moment in enumerate(moments):
-            camera = moment.camera or self.camera
-            power = np.float32(moment.power)
-            stage = self._staged(moment)
-            left.append(power * self._expose(stage, camera, seed + 7919 * k))
-            if self._right is not None:
-                second = beside(camera, self._render.stereo_mm)
-                right.append(power * self._expose(stage, second, seed + 1 + 7919 * k))
+        for k, state in enumerate(states):
+            camera = state.camera or self.camera
+            power = np.float32(state.power)
+            if self._stage is None:
+                self._stage = self.stage(state, self._render.spp)
+            else:
+                self.move(self._stage, state)
+            left.append(power * self._expose(self._stage, camera, seed + 7919 * k))
+            if self.right is not None:
+                second = right_camera(camera, self._render.stereo_mm)
+                right.append(power * self._expose(self._stage, second, seed + 1 + 7919 * k))
         return (
             np.asarray(np.mean(left, axis=0), np.float32),
             np.asarray(np.mean(right or np.zeros_like(left), axis=0), np.float32),
         )
 
-    def _staged(self, moment: Moment) -> Stage:
-        """The stage with everything where it is at that moment."""
-        tool = self._posed(moment)
-        if self._stage is None:
-            points = np.zeros((0, 3)) if tool is None else tool.vertices
-            self._stage = self.stage(moment.vertices, points, self._render.spp)
-        film = None if self._tool is None else instrument.film(self._tool, moment.tips, moment.vertices)
-        self._stage.move("cortex", moment.vertices, film)
-        if tool:
-            steel = self._steel(tool.vertices)
-            self._stage.move("tool", steel.vertices)
-            self._stage.mirror("tool", self._mirrored(steel))
-        return self._stage
-
     def _expose(self, stage: Stage, camera: Camera, seed: int) -> Map:
         spot = light.spot(camera, self.camera, self._look.light)
         return stage.render(seed % 2**32, camera) * spot[..., None]
 
-    def bodies(self, vertices: Floats, tool: Floats) -> dict[str, Body]:
-        """Everything in the scene with its material; vertices (V, 3) and (T, 3) mm as given."""
+    def _bodies(self, state: SceneState) -> dict[str, Body]:
+        """Everything in the scene with its material."""
         surface, look = self.surface, self._look
-        frame = rim.paint(self.rim, look, texture.resolution(self.rim.extent_mm, 2.2 * self.camera.mm_per_px))
+        pixels = texture.resolution(self._rim.extent_mm, 2.2 * self.camera.mm_per_px)
+        frame = rim.paint(self._rim, look, pixels)
         r, g, b = (_AMBIENT * look.light.power * light.blackbody(look.light.kelvin)).tolist()
-        ambient = (r, g, b)
-        coat = self._coat.wet(look.roughness, look.dry_roughness, ambient, look.film_index)
+        wet = self._coat.wet(look.roughness, look.dry_roughness, (r, g, b), look.film_index)
+        dura = frame.wet(_RIM_ROUGHNESS, _RIM_DRY, (r, g, b))
         bodies = {
-            "cortex": Body(
-                vertices,
-                surface.faces,
-                surface.uv,
-                coat,
-            ),
-            "rim": Body(
-                self.rim.vertices,
-                self.rim.faces,
-                self.rim.uv,
-                frame.wet(_RIM_ROUGHNESS, _RIM_DRY, ambient),
-            ),
+            "cortex": Body(state.vertices, surface.faces, surface.uv, wet, self._film(state)),
+            "rim": Body(self._rim.vertices, self._rim.faces, self._rim.uv, dura),
         }
-        if self._tool or "retractor" in self._render.scenery:
-            steel = self._steel(tool)
-            metal = Metal(reflection.tint(self._coating(), _SATIN), glow=self._mirrored(steel))
+        if self._tool.parts or "retractor" in self._render.scenery:
+            steel = self._steel(state)
+            metal = Metal(reflection.tint(self._coating, _SATIN), glow=self._mirrored(steel))
             uv = np.zeros((len(steel.vertices), 2), np.float32)
             bodies["tool"] = Body(steel.vertices, steel.faces, uv, metal)
         return bodies
 
     def _retractor(self) -> Shape:
-        """The blade over the rim; empty where there is none."""
-        if "retractor" not in self._look.scenery:
+        """The blade over the rim; without one, where there is no instrument either, a face that nobody sees.
+
+        One mesh of steel, and never without a face: scenes with a retractor and without share their kernel.
+        """
+        if "retractor" in self._look.scenery:
+            points = np.concatenate([self.surface.vertices, self._rim.vertices])
+            return scenery.retractor(self._rim.edge, points, np.random.default_rng([self._look.rim_seed, 5]))
+        if self._tool.parts:
             return Shape(np.zeros((0, 3)), np.zeros((0, 3), np.int32))
-        points = np.concatenate([self.surface.vertices, self.rim.vertices])
-        return scenery.retractor(self.rim.edge, points, np.random.default_rng([self._look.rim_seed, 5]))
+        return Shape(np.full((3, 3), -1e3), np.array([[0, 1, 2]], np.int32))
 
-    def _steel(self, tool: Floats) -> Shape:
-        """All steel as one mesh, instruments at (T, 3) mm first: one kernel with a retractor and without."""
-        faces = np.zeros((0, 3), np.int32) if self._tool is None else self._tool.faces
-        steel = rim.joined(Shape(tool, faces), self._blade)
-        # The renderer takes no mesh without faces.
-        return steel if len(steel.faces) else Shape(np.full((3, 3), -1e3), np.array([[0, 1, 2]], np.int32))
-
-    def _coating(self) -> Map:
-        """(V,) of `_steel`: 1 where it is coated black, and between where it is dull."""
-        if self._tool is None and not len(self._blade.vertices):
-            return np.zeros(3, np.float32)
-        dull = np.full(len(self._blade.vertices), _DULL, np.float32)
-        return dull if self._tool is None else np.concatenate([self._tool.coat, dull])
+    def _steel(self, state: SceneState) -> Shape:
+        """All steel as one mesh, instruments first."""
+        return joined(self._posed(state), self._blade)
 
     def _surroundings(self) -> reflection.Theatre:
         """What steel mirrors: the cortex with the rim around it, coarse, and the lamps."""
         extent = self.surface.extent_mm
         small = cv2.resize(self._coat.albedo, (_MIRRORED_PX, _MIRRORED_PX), interpolation=cv2.INTER_AREA)
         axis = noise.centres(_MIRRORED_PX, extent)
-        inside = rim.inside(self.rim, *np.meshgrid(axis, axis))[..., None]
+        inside = rim.inside(self._rim, *np.meshgrid(axis, axis))[..., None]
         around = 0.5 * (np.asarray(self._look.dura) + np.asarray(self._look.beyond))
         wound = (small * inside + around.astype(np.float32) * (1 - inside)).astype(np.float32)
         r, g, b = (self._look.light.power * light.blackbody(self._look.light.kelvin)).tolist()
         return reflection.Theatre(wound, extent, tuple(self.lamps), (r, g, b), self._look.rim_seed)
 
     def _mirrored(self, steel: Shape) -> Floats:
-        return reflection.glow(steel, self._coating(), self.camera.centre, self._theatre)
+        return reflection.glow(steel, self._coating, self.camera.centre, self._theatre)
 
-    def _glare(self, radiance: Map, now: truth.Now, moment: Moment) -> Mask:
+    def _glare(self, radiance: Map, seen: truth.FrameTruth, state: SceneState) -> Mask:
         """Tissue whose radiance exceeds what its diffuse part could send."""
         height, width = radiance.shape[:2]
         faces = self.surface.faces
-        on = (now.hits.face >= 0) & (now.hits.face < len(faces))
-        face, bary = now.hits.face[on], now.hits.bary[on]
+        on = (seen.hits.face >= 0) & (seen.hits.face < len(faces))
+        face, bary = seen.hits.face[on], seen.hits.bary[on]
         uv = truth.blend(faces, face, bary, self.surface.uv)
         albedo = noise.sample(self._coat.albedo, uv - 0.5, 1.0)
-        light_in = truth.blend(faces, face, bary, moment.power * self._irradiance(moment.vertices))
-        spot = light.spot(moment.camera or self.camera, self.camera, self._look.light).ravel()[on]
+        light_in = truth.blend(faces, face, bary, state.power * self._irradiance(state.vertices))
+        spot = light.spot(state.camera or self.camera, self.camera, self._look.light).ravel()[on]
         diffuse = spot * _mean(albedo * light_in)
         excess = _mean(radiance.reshape(-1, 3))[on] - 1.05 * diffuse
         glare = np.zeros(height * width, bool)

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from synth.geometry.triangles import Shape, lengths, normals
+from synth.geometry.triangles import Shape, joined, lengths, normals
 from synth.render.camera import camera as cameras
 from synth.render.camera.camera import Camera
 from synth.system.jit import compiled
@@ -44,7 +44,7 @@ class Hits:
 
 
 @dataclass(frozen=True)
-class Still:
+class RestFrame:
     """Truth of the rest frame."""
 
     tissue: Mask
@@ -64,7 +64,7 @@ class Still:
 
 
 @dataclass(frozen=True)
-class Now:
+class FrameTruth:
     """Truth of one frame, at the rest frame's pixels (material points) or at the frame's own."""
 
     flow: npt.NDArray[np.float32]
@@ -81,22 +81,22 @@ class Now:
     """This frame's pixels, over tissue, rim and tool, in this order."""
 
 
-def cast(camera: Camera, shapes: Sequence[Shape], pixels: Floats | None, directions: Floats) -> Hits:
-    """First triangle that each ray from the lens meets; faces are numbered through all shapes.
+def cast(camera: Camera, scene: Shape, pixels: Floats | None, directions: Floats) -> Hits:
+    """First triangle that each ray from the lens meets.
 
     Args:
         camera: the camera.
-        shapes: what is there, world axes.
+        scene: what is there, world axes.
         pixels: (N, 2) px where the rays pierce the picture; those outside it meet nothing. None: all
             pixels' centres, row by row.
         directions: (N, 3) in camera axes, of any length, each through its pixel.
     """
-    return _meet(camera, _Scene.seen(camera, shapes), pixels, directions)
+    return _Projected.by(camera, scene).cast(pixels, directions)
 
 
 @dataclass(frozen=True)
-class _Scene:
-    """All shapes as one camera sees them."""
+class _Projected:
+    """A scene as one camera sees it."""
 
     points: Floats
     """(V, 3) mm, camera axes; NaN behind the lens or at it, so that faces keep their numbers."""
@@ -104,40 +104,38 @@ class _Scene:
     """(V, 2) px."""
     faces: Indices
     """(F, 3)."""
+    size: tuple[int, int]
+    """Width, height [px]."""
 
     @classmethod
-    def seen(cls, camera: Camera, shapes: Sequence[Shape]) -> _Scene:
-        world = np.concatenate([shape.vertices for shape in shapes])
-        first = np.cumsum([0] + [len(shape.vertices) for shape in shapes])
-        faces = np.concatenate([shape.faces + at for shape, at in zip(shapes, first, strict=False)])
-        points = cameras.to_camera(camera, world)
+    def by(cls, camera: Camera, scene: Shape) -> _Projected:
+        points = cameras.to_camera(camera, scene.vertices)
         points[points[:, 2] < _NEAR_MM] = np.nan
-        return cls(points, cameras.to_pixels(camera, points), faces)
+        return cls(points, cameras.to_pixels(camera, points), scene.faces, camera.size)
+
+    def cast(self, pixels: Floats | None, directions: Floats) -> Hits:
+        """See `cast`."""
+        width, height = self.size
+        if pixels is None:
+            order, start = np.arange(width * height), np.arange(width * height + 1)
+        else:
+            order, start = _sort(pixels, width, height)
+        directions = np.ascontiguousarray(directions)
+        return Hits(*_cast(self.points, self.flat, self.faces, directions, order, start, width, height))
 
 
-def _meet(camera: Camera, scene: _Scene, pixels: Floats | None, directions: Floats) -> Hits:
-    """See `cast`."""
-    width, height = camera.size
-    if pixels is None:
-        order, start = np.arange(width * height), np.arange(width * height + 1)
-    else:
-        order, start = _bins(pixels, width, height)
-    directions = np.ascontiguousarray(directions)
-    return Hits(*_cast(scene.points, scene.flat, scene.faces, directions, order, start, width, height))
-
-
-def still(camera: Camera, surface: Shape, rim: Shape) -> Still:
+def trace_rest(camera: Camera, surface: Shape, rim: Shape) -> RestFrame:
     """Truth of the rest frame: the fine surface at rest, and what frames the opening."""
     width, height = camera.size
     pixels = cameras.pixel_grid(camera.size)
     directions = _forward(camera, pixels)
-    hits = cast(camera, [surface, rim], None, directions)
+    hits = cast(camera, joined(surface, rim), None, directions)
     on_tissue = (hits.face >= 0) & (hits.face < len(surface.faces))
     face = np.where(on_tissue, hits.face, -1).astype(np.int32)
     corners = cameras.to_camera(camera, surface.vertices)[surface.faces[face[on_tissue]]]
     area = np.zeros(len(pixels), np.float32)
     area[on_tissue] = _footprint(camera, corners, directions, on_tissue, hits.along)
-    return Still(
+    return RestFrame(
         tissue=on_tissue.reshape(height, width),
         area=area.reshape(height, width),
         scale_mm_per_px=camera.mm_per_px,
@@ -148,7 +146,7 @@ def still(camera: Camera, surface: Shape, rim: Shape) -> Still:
     )
 
 
-def now(camera: Camera, rest: Still, surface: Shape, rim: Shape, tool: Shape | None) -> Now:
+def trace_frame(camera: Camera, rest: RestFrame, surface: Shape, rim: Shape, tool: Shape) -> FrameTruth:
     """Truth of one frame.
 
     Args:
@@ -156,13 +154,12 @@ def now(camera: Camera, rest: Still, surface: Shape, rim: Shape, tool: Shape | N
         rest: truth of the rest frame.
         surface: the fine surface in this frame.
         rim: what frames the opening.
-        tool: the instrument in this frame.
+        tool: the instruments in this frame.
     """
     width, height = camera.size
-    shapes = [surface, rim] if tool is None else [surface, rim, tool]
     pixels = cameras.pixel_grid(camera.size)
-    scene = _Scene.seen(camera, shapes)
-    hits = _meet(camera, scene, None, rest.directions)
+    scene = _Projected.by(camera, joined(surface, rim, tool))
+    hits = scene.cast(None, rest.directions)
     seen = hits.face >= 0
     depth = np.where(seen, hits.along, 0.0)  # directions have unit z
 
@@ -170,7 +167,7 @@ def now(camera: Camera, rest: Still, surface: Shape, rim: Shape, tool: Shape | N
     carried = blend(surface.faces, rest.face.ravel()[on], rest.bary.reshape(-1, 3)[on], surface.vertices)
     local = cameras.to_camera(camera, carried)
     pierced = cameras.to_pixels(camera, local)
-    blocked = _meet(camera, scene, pierced, local)
+    blocked = scene.cast(pierced, local)
     clear = (1 - blocked.along) * lengths(local) < _HIDDEN_MM
     inside = ((pierced >= -0.5) & (pierced < np.array([width, height]) - 0.5)).all(axis=1)
     flow = np.zeros((len(pixels), 2), np.float32)
@@ -179,7 +176,7 @@ def now(camera: Camera, rest: Still, surface: Shape, rim: Shape, tool: Shape | N
     motion[on] = local - rest.points[on]
     visible = np.zeros(len(pixels), bool)
     visible[on] = clear & inside
-    return Now(
+    return FrameTruth(
         flow=flow.reshape(height, width, 2),
         motion=motion.reshape(height, width, 3),
         visible=visible.reshape(height, width),
@@ -189,7 +186,7 @@ def now(camera: Camera, rest: Still, surface: Shape, rim: Shape, tool: Shape | N
     )
 
 
-def onwards(hits: Hits, faces: Indices, vertices: Floats, camera: Camera) -> npt.NDArray[np.float32]:
+def forward_flow(hits: Hits, faces: Indices, vertices: Floats, camera: Camera) -> npt.NDArray[np.float32]:
     """Flow (H, W, 2) px of what each pixel of one frame sees to another frame; 0 off the tissue.
 
     Args:
@@ -206,21 +203,21 @@ def onwards(hits: Hits, faces: Indices, vertices: Floats, camera: Camera) -> npt
     return flow.reshape(height, width, 2)
 
 
-def facing(camera: Camera, hits: Hits, shapes: Sequence[Shape | None]) -> npt.NDArray[np.float32]:
-    """Smoothed unit normals (H, W, 3), camera axes, of what each pixel sees; 0 where there is nothing."""
+def normal_map(camera: Camera, hits: Hits, shapes: Sequence[Shape]) -> npt.NDArray[np.float32]:
+    """Smoothed unit normals (H, W, 3), camera axes, of what each pixel sees; 0 where there is nothing.
+
+    `shapes`: those that `hits` are of, in their order.
+    """
     width, height = camera.size
-    there = [shape for shape in shapes if shape is not None]
-    first = np.cumsum([0] + [len(shape.vertices) for shape in there])
-    faces = np.concatenate([shape.faces + at for shape, at in zip(there, first, strict=False)])
-    vertex = np.concatenate([normals(shape) for shape in there]) @ camera.rotation.T
+    vertex = np.concatenate([normals(shape) for shape in shapes]) @ camera.rotation.T
     on = hits.face >= 0
-    smooth = blend(faces, hits.face[on], hits.bary[on], vertex)
+    smooth = blend(joined(*shapes).faces, hits.face[on], hits.bary[on], vertex)
     found = np.zeros((len(on), 3), np.float32)
     found[on] = smooth / np.maximum(np.linalg.norm(smooth, axis=1, keepdims=True), 1e-12)
     return found.reshape(height, width, 3)
 
 
-def at_rest_pixels(rest: Still, faces: Indices, nodal: Floats) -> npt.NDArray[np.float32]:
+def at_rest_pixels(rest: RestFrame, faces: Indices, nodal: Floats) -> npt.NDArray[np.float32]:
     """A quantity of the fine surface's vertices (V, C) at rest pixels (H, W, C); 0 off the tissue."""
     values = blend(faces, rest.face.ravel(), rest.bary.reshape(-1, 3), nodal)
     return values.reshape(*rest.face.shape, -1).astype(np.float32)
@@ -257,13 +254,8 @@ def _footprint(camera: Camera, corners: Floats, directions: Floats, on: Mask, al
     return np.asarray(np.linalg.norm(np.cross(*spread), axis=1))
 
 
-def _bins(pixels: Floats, width: int, height: int) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-    """Rays sorted by the pixel they pierce: order (M,) and where each pixel's rays start (H*W + 1,)."""
-    found: tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]] = _sort(pixels, width, height)
-    return found
-
-
 def _sort_loop(pixels, width, height):  # type: ignore[no-untyped-def]
+    """Rays sorted by the pixel they pierce: order (M,) and where each pixel's rays start (H*W + 1,)."""
     key = np.full(len(pixels), -1, np.int64)
     start = np.zeros(width * height + 1, np.int64)
     for n in range(len(pixels)):

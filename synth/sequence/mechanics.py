@@ -18,11 +18,11 @@ from synth.geometry.triangles import Shape
 from synth.job.laws import LAWS
 from synth.job.schema import AnatomySection, Job
 from synth.render.anatomy import surface as anatomy
-from synth.render.anatomy.surface import Relief, Surface
+from synth.render.anatomy.surface import CortexSurface, Relief
 from synth.sequence.scenario import Scenario
 
 
-def build(job: Job, case: Scenario) -> tuple[Surface, Tets]:
+def build(job: Job, case: Scenario) -> tuple[CortexSurface, Tets]:
     """The fine surface of a scenario and the volume under it, finest where its contacts are."""
     surface, brain = cortex(job, case)
     focus = [place for gesture in case.gestures for place in gesture.focus]
@@ -33,7 +33,7 @@ def build(job: Job, case: Scenario) -> tuple[Surface, Tets]:
     return surface, tetrahedra.block(job.anatomy, *mesh, height, slips=slips)
 
 
-def cortex(job: Job, case: Scenario) -> tuple[Surface, Brain | None]:
+def cortex(job: Job, case: Scenario) -> tuple[CortexSurface, Brain | None]:
     """The fine surface of a scenario, and the user's brain that it is a part of, if it is.
 
     Sequences that share an anatomy (`anatomy.variety`) share these: their arrays are read-only.
@@ -45,7 +45,7 @@ def cortex(job: Job, case: Scenario) -> tuple[Surface, Brain | None]:
 
 
 @lru_cache(maxsize=4)
-def _cortex(section: AnatomySection, relief: Relief, written: object) -> tuple[Surface, Brain | None]:
+def _cortex(section: AnatomySection, relief: Relief, written: object) -> tuple[CortexSurface, Brain | None]:
     """As `cortex`; `written` tells a mesh from one that replaced it."""
     brain = None if section.mesh is None else load_brain(section.mesh, section.craniotomy)
     if brain is None:
@@ -59,7 +59,7 @@ def _cortex(section: AnatomySection, relief: Relief, written: object) -> tuple[S
     return surface, brain
 
 
-def move(job: Job, case: Scenario, surface: Surface, tets: Tets) -> Deformation:
+def move(job: Job, case: Scenario, surface: CortexSurface, tets: Tets) -> Deformation:
     """The scenario's gestures, carried out on that surface and volume."""
     return solver.deform(
         job.fem,

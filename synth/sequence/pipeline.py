@@ -25,7 +25,7 @@ from synth.sequence.scene import Scene, estimator, simulate
 from synth.system.stopwatch import ProgressCallback, Stopwatch
 
 # Fields that the renderer gives by frame, and of a second lens; those of `store.extra` are attributes of its
-# `Shot` as well, but for the published method's.
+# `RenderedFrame` as well, but for the published method's.
 _SHOT = ("rgb", "flow", "visible", "tool", "glare", "depth")
 _STEREO = ("rgb_right", "flow_right", "visible_right", "depth_right", "motion")
 _PUBLISHED = ("flow_noisy", "intensity")
@@ -79,7 +79,7 @@ def render_sequence(job: Job, index: int, folder: Path, report: ProgressCallback
     watch = Stopwatch()
     scene = simulate(job, index, report, watch)
     with watch.stage("scene"):
-        studio = scene.studio
+        studio = scene.renderer
 
     width, height = job.render.size
     writer = Writer(folder, index, frames=job.frames, size=(height, width), job=job)
@@ -177,7 +177,7 @@ def _recover_flow(shooting: _Shooting, film: _Film) -> Track:
 def _recover_motion(shooting: _Shooting, film: _Film, left: Track) -> None:
     """Adds the right eye to the left one's flow and writes motion in three dimensions, frame by frame."""
     job, writer, scene = shooting.job, shooting.writer, shooting.scene
-    studio = scene.studio
+    studio = scene.renderer
     if film.rgb_right is None or film.tools_right is None or studio.right is None:
         raise ValueError("there is no second lens")
     blocked = mask.hidden(film.rgb, film.tools), mask.hidden(film.rgb_right, film.tools_right)
@@ -189,9 +189,9 @@ def _recover_motion(shooting: _Shooting, film: _Film, left: Track) -> None:
             translation=np.array([-job.render.stereo_mm, 0.0, 0.0]),
             size=job.render.size,
         )
-        still = stereo.still_frames(left.flow, studio.still.tissue)
+        still = stereo.still_frames(left.flow, studio.rest.tissue)
         eyes = film.rgb[:still], film.rgb_right[:still]
-        tracker = stereo.StereoTracker(pair, *eyes, blocked[0][0], blocked[1][0], studio.still.tissue)
+        tracker = stereo.StereoTracker(pair, *eyes, blocked[0][0], blocked[1][0], studio.rest.tissue)
     for t in range(job.frames):
         shooting.report("stereo", t, job.frames)
         with shooting.watch.stage("stereo"):
@@ -222,7 +222,7 @@ def _seal(shooting: _Shooting) -> Path:
         young_kpa=case.tissue.young_kpa,
         poisson=case.tissue.poisson,
         mechanics=mechanics.describe(shooting.job, case, scene.motion, view.rotation),
-        variant=scene.studio.variant,
+        variant=scene.renderer.variant,
         timings=shooting.watch.report(),
         **_second_lens(shooting),
     )
@@ -236,7 +236,7 @@ def _opening(job: Job, case: Scenario) -> dict[str, Any]:
 
 def _second_lens(shooting: _Shooting) -> dict[str, Any]:
     """The attribute `right` of a stereo sequence: K, distortion and pose of the second lens at rest."""
-    lens = shooting.scene.studio.right
+    lens = shooting.scene.renderer.right
     if lens is None:
         return {}
     return {

@@ -21,9 +21,9 @@ from synth.render.appearance.family import FAMILIES, Colour
 from synth.render.appearance.light import Lighting, balance
 from synth.render.appearance.look import Look
 from synth.render.camera import camera
-from synth.render.camera.camera import View
-from synth.render.camera.camera_sensor import Sensor
-from synth.render.camera.sway import Sway
+from synth.render.camera.camera import CameraView
+from synth.render.camera.camera_motion import CameraMotion
+from synth.render.camera.camera_sensor import CameraSensor
 
 Floats = NDArray[np.float64]
 Random = np.random.Generator
@@ -62,8 +62,8 @@ class Scenario:
     further: tuple[Gesture, ...]
     """What the other instruments do at the same time."""
     look: Look
-    view: View
-    sway: Sway
+    view: CameraView
+    sway: CameraMotion
     pulse: Pulse | None
     """None where only tools move the tissue."""
 
@@ -283,9 +283,9 @@ def _draw_timing(kind: str, rng: Random) -> tuple[float, float, float, float]:
     return touch, full, full + hold * (release - full), release
 
 
-def draw_view(render: RenderSection, rng: Random) -> View:
+def draw_view(render: RenderSection, rng: Random) -> CameraView:
     """Where the microscope stands; a calibration is left to `camera.calibrated`."""
-    return View(
+    return CameraView(
         field_mm=_uniform(rng, render.field_mm),
         working_distance_mm=_uniform(rng, render.working_distance_mm),
         tilt_deg=_uniform(rng, render.tilt_deg),
@@ -302,10 +302,10 @@ def _draw_zero(rng: Random) -> tuple[float, float]:
     return float(length * np.cos(angle)), float(length * np.sin(angle))
 
 
-def draw_sway(render: RenderSection, rng: Random) -> Sway:
+def draw_sway(render: RenderSection, rng: Random) -> CameraMotion:
     """How far the microscope drifts and vibrates."""
     drift, vibration = _uniform(rng, render.drift_mm), _uniform(rng, render.vibration_mm)
-    return Sway(drift, vibration, int(rng.integers(2**31)))
+    return CameraMotion(drift, vibration, int(rng.integers(2**31)))
 
 
 def draw_look(job: Job, family: Family, rng: Random) -> Look:
@@ -361,9 +361,9 @@ def draw_light(light: LightSection, rng: Random) -> Lighting:
     )
 
 
-def draw_sensor(section: schema.SensorSection, white: Colour, rng: Random) -> Sensor:
+def draw_sensor(section: schema.SensorSection, white: Colour, rng: Random) -> CameraSensor:
     """A chip within the job's ranges, with that white balance."""
-    return Sensor(
+    return CameraSensor(
         exposure=_uniform(rng, section.exposure),
         white=white,
         full_well=_uniform(rng, section.full_well),

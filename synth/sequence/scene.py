@@ -15,10 +15,10 @@ from synth.flow import track, tvl1
 from synth.flow.estimator import Estimator, create
 from synth.flow.track import Track
 from synth.job.schema import FlowSection, Job
-from synth.render.anatomy.surface import Surface
+from synth.render.anatomy.surface import CortexSurface
 from synth.render.camera import camera, video_link
 from synth.render.camera.camera import Camera
-from synth.render.scene import Shot, Studio
+from synth.render.scene import RenderedFrame, Renderer
 from synth.sequence import mechanics, scenario
 from synth.sequence.scenario import Scenario
 from synth.sequence.timeline import Timeline
@@ -28,11 +28,11 @@ Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Frame(Shot):
+class Frame(RenderedFrame):
     """One frame of a scene: the picture, what is true of it, and the force that made it.
 
-    Everything of a `Shot` (`rgb`, `flow`, `visible`, `depth`, `tool`, `glare`, ...; None what the job doesn't
-    keep), in the units and axes of a dataset's fields, and:
+    Everything of a `RenderedFrame` (`rgb`, `flow`, `visible`, `depth`, `tool`, `glare`, ...; None what the
+    job doesn't keep), in the units and axes of a dataset's fields, and:
     """
 
     index: int
@@ -47,29 +47,50 @@ class Frame(Shot):
 
 
 @dataclass(frozen=True)
-class Scene:
-    """One sequence of a job, built and moved; nothing is written. `simulate` makes it.
-
-    What a frame needs is computed when it is asked for: light and pictures cost nothing until then.
-    """
+class RestScene:
+    """One sequence of a job, drawn and built, before anything moves. `at_rest` makes it."""
 
     job: Job
     index: int
     """Which sequence of the job."""
     scenario: Scenario
     """Everything drawn for it."""
-    surface: Surface
-    """The fine surface at rest, world axes."""
-    motion: Deformation
-    """Surface, loads and instruments over T frames, world axes: `displacement` (T, V, 3) mm."""
+    surface: CortexSurface
+    """The fine surface at rest, world axes; shared between sequences of one anatomy, hence read-only."""
     view: Camera
     """The microscope at rest."""
 
     @cached_property
-    def studio(self) -> Studio:
-        """The renderer with this scene in it."""
+    def renderer(self) -> Renderer:
+        """What renders this scene, its surface and instruments wherever they are said to be."""
         kinds = [gesture.kind for gesture in self.scenario.gestures]
-        return Studio(self.surface, self.scenario.look, self.view, self.job, kinds)
+        return Renderer(self.surface, self.scenario.look, self.view, self.job, kinds)
+
+    @property
+    def tissue(self) -> NDArray[np.bool_]:
+        """(H, W) brain in the rest frame."""
+        return self.renderer.rest.tissue
+
+    @property
+    def area(self) -> NDArray[np.float32]:
+        """(H, W) mm^2 of rest surface that each pixel of the rest frame sees."""
+        return self.renderer.rest.area
+
+    @property
+    def scale_mm_per_px(self) -> float:
+        """Scale at the craniotomy."""
+        return float(self.renderer.rest.scale_mm_per_px)
+
+
+@dataclass(frozen=True)
+class Scene(RestScene):
+    """One sequence of a job, built and moved; nothing is written. `simulate` makes it.
+
+    What a frame needs is computed when it is asked for: light and pictures cost nothing until then.
+    """
+
+    motion: Deformation
+    """Surface, loads and instruments over T frames, world axes: `displacement` (T, V, 3) mm."""
 
     @cached_property
     def _timeline(self) -> Timeline:
@@ -98,21 +119,6 @@ class Scene:
         """Young's modulus of the tissue."""
         return self.scenario.tissue.young_kpa
 
-    @property
-    def tissue(self) -> NDArray[np.bool_]:
-        """(H, W) brain in the rest frame."""
-        return self.studio.still.tissue
-
-    @property
-    def area(self) -> NDArray[np.float32]:
-        """(H, W) mm^2 of rest surface that each pixel of the rest frame sees."""
-        return self.studio.still.area
-
-    @property
-    def scale_mm_per_px(self) -> float:
-        """Scale at the craniotomy."""
-        return float(self.studio.still.scale_mm_per_px)
-
     def frame(self, t: int) -> Frame:
         """Renders frame `t`, 0 <= t < T: the same whatever was rendered before it.
 
@@ -123,13 +129,13 @@ class Scene:
             raise UserError(f"frame {t}: the scene has frames 0 to {len(self) - 1}")
         job, line = self.job, self._timeline
         now = line.at(t)
-        lit = line.open(t, job.sensor.shutter)
-        shot = self.studio.shoot(now, self._seeds[t], lit, line.at(t + 1))
+        lit = line.exposure(t, job.sensor.shutter)
+        rendered = self.renderer.render(now, self._seeds[t], lit, line.at(t + 1))
         return Frame(
-            **vars(shot),
+            **vars(rendered),
             index=t,
             time_s=float(self.motion.time[t]),
-            traction=self.studio.traction(self.motion.traction[t]),
+            traction=self.renderer.traction(self.motion.traction[t]),
             force=self.force[t],
             camera=now.camera or self.view,
         )
@@ -163,6 +169,26 @@ class Scene:
         return track.recover_flow(rgb, tools, self.tissue, found)
 
 
+def at_rest(job: Job, index: int = 0, gestures: Sequence[str] | None = None) -> RestScene:
+    """Draws sequence `index` of a job and builds its surface: the one way to a renderer.
+
+    Its renderer takes any state: `scene.renderer.render(SceneState(vertices, tips, shafts), seed)`.
+
+    Args:
+        job: the job.
+        index: which of its sequences.
+        gestures: kinds of gesture whose instruments are shown instead of the drawn ones.
+
+    Raises:
+        UserError: the job's surface or calibration cannot be used.
+    """
+    case = scenario.draw(job, index)
+    if gestures is not None:
+        first, *further = (replace(case.gesture, kind=kind) for kind in gestures)
+        case = replace(case, gesture=first, further=tuple(further))
+    return RestScene(job, index, case, mechanics.cortex(job, case)[0], camera.place(case.view, job.render))
+
+
 def simulate(
     job: Job, index: int = 0, report: ProgressCallback | None = None, watch: Stopwatch | None = None
 ) -> Scene:
@@ -190,7 +216,7 @@ def simulate(
     report("fem", 0, 1)
     with watch.stage("fem"):
         motion = mechanics.move(job, case, surface, tets)
-    return Scene(job, index, case, surface, motion, view)
+    return Scene(job, index, case, surface, view, motion)
 
 
 def estimator(flow: FlowSection) -> Estimator:

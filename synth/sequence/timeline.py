@@ -9,8 +9,8 @@ import numpy as np
 from synth.fem.solver import Deformation
 from synth.render.appearance.light import Lighting
 from synth.render.camera.camera import Camera
-from synth.render.camera.sway import Sway
-from synth.render.scene import Moment
+from synth.render.camera.camera_motion import CameraMotion
+from synth.render.scene import SceneState
 
 _SUBFRAMES = 4  # pictures that make up a blurred one
 
@@ -22,12 +22,12 @@ class Timeline:
     motion: Deformation
     camera: Camera
     """At rest."""
-    sway: Sway
+    sway: CameraMotion
     light: Lighting
     fps: float
 
-    def at(self, frame: float) -> Moment:
-        """The moment of a frame, or of a time between two, where all moves straight from one to the next."""
+    def at(self, frame: float) -> SceneState:
+        """The state at a frame, or of a time between two, where all moves straight from one to the next."""
         last = len(self.motion.displacement) - 1
         frame = float(np.clip(frame, 0, last))
         before = int(frame)
@@ -39,7 +39,7 @@ class Timeline:
                 values[before] if part == 0 else (1 - part) * values[before] + part * values[after]
             )
 
-        return Moment(
+        return SceneState(
             vertices=self.motion.rest + between(self.motion.displacement),
             tips=between(self.motion.tip),
             shafts=between(self.motion.shaft),
@@ -47,8 +47,8 @@ class Timeline:
             power=self.light.gain(frame / max(last, 1)),
         )
 
-    def open(self, frame: int, shutter: float) -> list[Moment]:
-        """Moments while the shutter is open, evenly about a frame; none if it only opens for an instant.
+    def exposure(self, frame: int, shutter: float) -> list[SceneState]:
+        """States while the shutter is open, evenly about a frame; none if it only opens for an instant.
 
         Args:
             frame: which.

@@ -86,7 +86,7 @@ def fit_reading(scene: Scene, frames: Sequence[Frame]) -> Reading:
             shift = embedding.move(response.reshape(-1, 3))
             step = _STEP_MM / np.abs(shift).max()
             pixels = (camera.project(scene.view, now + step * shift) - seen) / step
-            flow = truth.at_rest_pixels(scene.studio.still, surface.faces, pixels)
+            flow = truth.at_rest_pixels(scene.renderer.rest, surface.faces, pixels)
             columns.append(mm_per_px * cells(flow, scene.tissue).ravel())
         shown_mm = np.stack(columns, axis=1)
         variance = _FLOOR_MM**2 + _SHARE**2 * np.square(true_mm[k]).sum(axis=1)

@@ -90,7 +90,7 @@ def _render(job_json: str, numbers: tuple[int, ...]) -> tuple[Scene, list[Frame]
     scene = replace(moved, job=job, scenario=case, view=camera.place(case.view, job.render))
     watch = Stopwatch()
     with watch.stage("scene"):
-        _ = scene.studio
+        _ = scene.renderer
     frames = []
     for t in numbers:
         with watch.stage(f"frame {t}"):

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from synth.geometry.triangles import Shape
 from synth.render.anatomy import noise, scenery, tube
-from synth.render.anatomy.surface import Surface
+from synth.render.anatomy.surface import CortexSurface
 from synth.render.anatomy.texture import Coat, normals
 from synth.render.appearance.look import Look
 
@@ -69,7 +69,7 @@ class Rim:
         return Shape(self.vertices, self.faces)
 
 
-def build(surface: Surface, radius_mm: float, look: Look, mm_per_px: float) -> Rim:
+def build(surface: CortexSurface, radius_mm: float, look: Look, mm_per_px: float) -> Rim:
     """The rim around an opening of `radius_mm` in the surface, as fine as pixels of `mm_per_px` show."""
     rng = np.random.default_rng([look.rim_seed, 0])
     around = int(np.clip(2 * np.pi * radius_mm / (_SEGMENT_PX * mm_per_px), 96, _AROUND))
@@ -304,12 +304,6 @@ def shade(rim: Rim, extent_mm: float) -> Map:
     return np.asarray(1 - 0.35 * np.exp(-inside / 0.6) - 0.14 * np.exp(-inside / 2.0), np.float32)
 
 
-def joined(one: Shape, other: Shape) -> Shape:
-    """Two meshes as one, the first's vertices first."""
-    faces = np.concatenate([one.faces, other.faces + len(one.vertices)]).astype(np.int32)
-    return Shape(np.concatenate([one.vertices, other.vertices]), faces)
-
-
 def inside(rim: Rim, x: Map, y: Map) -> Map:
     """Share of the opening at x, y mm (...): 1 in it, 0 under the rim, soft over a millimetre."""
     return _step((_edge_at(rim, np.arctan2(y, x)) - np.hypot(x, y)) / 1.0)
@@ -395,7 +389,7 @@ def _outline(rng: np.random.Generator, angle: Floats) -> Floats:
     return np.asarray(shape)
 
 
-def _under(surface: Surface, xy: Floats) -> Floats:
+def _under(surface: CortexSurface, xy: Floats) -> Floats:
     """Height of the smoothed surface below points; beyond the patch it goes on falling as at its border."""
     half = surface.extent_mm / 2
     inner = np.clip(xy, -half, half)

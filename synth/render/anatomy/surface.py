@@ -44,7 +44,7 @@ class Relief:
 
 
 @dataclass(frozen=True)
-class Surface:
+class CortexSurface:
     """The fine surface at rest, in world axes, and what is on it."""
 
     vertices: Floats
@@ -64,7 +64,7 @@ class Surface:
     """Seed of everything else that belongs to this anatomy."""
 
 
-def procedural(relief: Relief, anatomy: schema.AnatomySection) -> Surface:
+def procedural(relief: Relief, anatomy: schema.AnatomySection) -> CortexSurface:
     """A cortex of winding gyri on a dome, with veins that stand out of it."""
     extent = _extent(anatomy)
     sulci = _folds(relief, extent)
@@ -79,7 +79,7 @@ def procedural(relief: Relief, anatomy: schema.AnatomySection) -> Surface:
 
 def from_brain(
     vertices: Floats, faces: npt.NDArray[np.int32], relief: Relief, anatomy: schema.AnatomySection
-) -> Surface:
+) -> CortexSurface:
     """The part of a user's brain under the opening, seen from outside.
 
     Args:
@@ -144,7 +144,7 @@ def _surface(
     relief: Relief,
     anatomy: schema.AnatomySection,
     extent: float,
-) -> Surface:
+) -> CortexSurface:
     rng = np.random.default_rng([relief.seed, 1])
     tree = vessels.grow_all(sulci, extent, rng)
     side = max(20, round(anatomy.vertices**0.5))
@@ -153,7 +153,7 @@ def _surface(
     xy = np.stack([x.ravel(), y.ravel()], axis=1)
     pia = height(xy).astype(np.float64)
     z = pia + noise.sample(bulge(tree.veins, extent), xy, extent)
-    return Surface(
+    return CortexSurface(
         vertices=np.concatenate([xy, z[:, None]], axis=1),
         faces=_grid_faces(side),
         pia=pia.reshape(side, side),

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from synth.errors import UserError
 from synth.render.anatomy import noise, tube
-from synth.render.anatomy.surface import Surface
+from synth.render.anatomy.surface import CortexSurface
 from synth.render.appearance.family import Colour
 from synth.render.appearance.look import Look
 from synth.render.mitsuba.adapter import Wet
@@ -51,7 +51,9 @@ def resolution(extent_mm: float, mm_per_px: float) -> int:
     return int(np.clip(64 * round(extent_mm / mm_per_px * _TEXELS_A_PIXEL / 64), 128, 4096))
 
 
-def cortex(surface: Surface, look: Look, pixels: int, photo: Path | None, shade: Map | None = None) -> Coat:
+def cortex(
+    surface: CortexSurface, look: Look, pixels: int, photo: Path | None, shade: Map | None = None
+) -> Coat:
     """Parenchyma, vessels and wet film over the surface's patch.
 
     Args:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from synth.render.appearance.family import Colour
 from synth.render.appearance.light import Lighting
-from synth.render.camera.camera_sensor import Sensor
+from synth.render.camera.camera_sensor import CameraSensor
 
 
 @dataclass(frozen=True)
@@ -52,4 +52,4 @@ class Look:
     """What else lies about the opening, of what the job allows."""
     rim_seed: int
     light: Lighting
-    sensor: Sensor
+    sensor: CameraSensor

@@ -32,7 +32,7 @@ _SIZE = (("image_width", "image_height"), ("image_Width", "image_Height"), ("wid
 
 
 @dataclass(frozen=True)
-class Calibration:
+class CameraCalibration:
     """What a calibrated camera is, for pictures of one size."""
 
     K: Floats
@@ -63,7 +63,7 @@ class Calibration:
         return K
 
 
-def read(path: Path) -> Calibration:
+def read(path: Path) -> CameraCalibration:
     """The calibration in a file.
 
     Raises:
@@ -102,7 +102,7 @@ def read(path: Path) -> Calibration:
                 raise UserError(
                     f"render.calibration: {path.name}: {wide} and {tall} are no size of a picture"
                 )
-    return Calibration(K, np.resize(np.append(lens, np.zeros(5)), 5), size)
+    return CameraCalibration(K, np.resize(np.append(lens, np.zeros(5)), 5), size)
 
 
 def _json(path: Path, text: str) -> dict[str, Any]:

@@ -21,7 +21,7 @@ _NEWTON = 20
 
 
 @dataclass(frozen=True)
-class View:
+class CameraView:
     """How the microscope looks at the craniotomy in one sequence."""
 
     field_mm: float
@@ -66,7 +66,7 @@ class Camera:
         return -self.rotation.T @ self.translation
 
 
-def calibrated(view: View, render: RenderSection) -> View:
+def calibrated(view: CameraView, render: RenderSection) -> CameraView:
     """The view with the field and principal point of `render.calibration`, if there is one."""
     if render.calibration is None:
         return view
@@ -76,7 +76,7 @@ def calibrated(view: View, render: RenderSection) -> View:
     return replace(view, field_mm=field_mm, off_centre=(float(x), float(y)))
 
 
-def place(view: View, render: RenderSection) -> Camera:
+def place(view: CameraView, render: RenderSection) -> Camera:
     """The camera of `view`, looking at the world's origin from its working distance."""
     width, height = render.size
     tilt, azimuth, roll = np.deg2rad([view.tilt_deg, view.azimuth_deg, view.roll_deg])
@@ -116,7 +116,7 @@ def refuse_unfit(render: RenderSection) -> None:
         calibration.read(render.calibration).fitted(render.size)
 
 
-def beside(camera: Camera, baseline_mm: float) -> Camera:
+def right_camera(camera: Camera, baseline_mm: float) -> Camera:
     """The second lens of a stereo pair, to the right; its picture is shifted to show the same field."""
     K = camera.K.copy()
     K[0, 2] += K[0, 0] * baseline_mm / camera.translation[2]

@@ -17,7 +17,7 @@ _STEPS = 4096  # of the tone curve, over full scale
 
 
 @dataclass(frozen=True)
-class Sensor:
+class CameraSensor:
     """A colour camera on the microscope."""
 
     exposure: float = 1.0
@@ -50,7 +50,7 @@ class Sensor:
     """Whether a codec follows, which thins the colours out itself."""
 
 
-def record(radiance: Map, sensor: Sensor, rng: np.random.Generator) -> npt.NDArray[np.uint8]:
+def record(radiance: Map, sensor: CameraSensor, rng: np.random.Generator) -> npt.NDArray[np.uint8]:
     """The 8-bit sRGB picture of a linear one.
 
     Args:

@@ -71,6 +71,8 @@ class Body:
     faces: npt.NDArray[np.int32]
     uv: npt.NDArray[np.float32]
     material: Wet | Metal
+    film: Floats | None = None
+    """(V,) mm: heights of a film that light sees the vertices under."""
 
 
 @dataclass(frozen=True)
@@ -162,11 +164,7 @@ class Stage:
 
     def move(self, name: str, vertices: Floats, film: Floats | None = None) -> None:
         """New positions (V, 3) mm of a body's vertices; light sees them under a `film` of heights (V,) mm."""
-        wet = vertices
-        if film is not None:
-            wet = vertices.copy()
-            wet[:, 2] += film
-        bent = normals(Shape(wet, self._faces[name]))
+        bent = _bent(vertices, self._faces[name], film)
         for key, values in (("vertex_positions", vertices), ("vertex_normals", bent)):
             flat = _aligned(values, np.float32)
             self._parameters[f"{name}.{key}"] = self._mi.Float(flat) if self._jit else flat
@@ -268,12 +266,19 @@ def _mesh(mi: Any, name: str, body: Body) -> Any:
         mesh.add_attribute("vertex_tint", 3, _aligned(body.material.tint, np.float32))
     parameters = mi.traverse(mesh)
     parameters["vertex_positions"] = _aligned(body.vertices, np.float32)
-    bent = normals(Shape(body.vertices, body.faces))
-    parameters["vertex_normals"] = _aligned(bent, np.float32)
+    parameters["vertex_normals"] = _aligned(_bent(body.vertices, body.faces, body.film), np.float32)
     parameters["faces"] = _aligned(body.faces, np.uint32)
     parameters["vertex_texcoords"] = _aligned(body.uv, np.float32)
     parameters.update()
     return mesh
+
+
+def _bent(vertices: Floats, faces: npt.NDArray[np.int32], film: Floats | None) -> Floats:
+    """Unit normals (V, 3) of a mesh under a film of heights (V,) mm."""
+    if film is not None:
+        vertices = vertices.copy()
+        vertices[:, 2] += film
+    return normals(Shape(vertices, faces))
 
 
 def _aligned(values: npt.NDArray[Any], kind: type[np.generic]) -> npt.NDArray[Any]:

@@ -10,7 +10,7 @@ import trimesh
 from synth.job.schema import Job, LightSection, RenderSection
 from synth.render.anatomy import surface as anatomy
 from synth.render.anatomy import texture
-from synth.render.anatomy.surface import Relief, Surface
+from synth.render.anatomy.surface import CortexSurface, Relief
 from synth.render.appearance import light
 from synth.render.camera import camera
 from synth.sequence import scenario
@@ -21,7 +21,7 @@ JOB = Job.model_validate(
 
 
 @pytest.fixture(scope="module")
-def brain() -> Surface:
+def brain() -> CortexSurface:
     """An ellipsoid with folds, opened at its top; faces unmerged and wound at random, as users have them."""
     ball = trimesh.creation.icosphere(subdivisions=5)
     folds = 1 + 0.02 * np.cos(9 * ball.vertices[:, 0]) * np.cos(9 * ball.vertices[:, 1])
@@ -32,7 +32,7 @@ def brain() -> Surface:
     return anatomy.from_brain(corners, faces, Relief(3, 12.0, 1.0), JOB.anatomy)
 
 
-def test_a_users_brain_keeps_its_shape(brain: Surface) -> None:
+def test_a_users_brain_keeps_its_shape(brain: CortexSurface) -> None:
     x, y, z = brain.vertices.T
     expected = 40 * np.sqrt(1 - (x / 45) ** 2 - (y / 50) ** 2) - 40
     # Folds of 2% and veins of up to a millimetre stand on the ellipsoid.
@@ -40,7 +40,7 @@ def test_a_users_brain_keeps_its_shape(brain: Surface) -> None:
     assert 0 <= brain.uv.min() < brain.uv.max() <= 1
 
 
-def test_a_photograph_is_the_albedo(brain: Surface, tmp_path: Path) -> None:
+def test_a_photograph_is_the_albedo(brain: CortexSurface, tmp_path: Path) -> None:
     picture = np.zeros((60, 90, 3), np.uint8)
     picture[:, :45], picture[:, 45:] = (30, 60, 200), (40, 180, 60)  # red left, green right, as BGR
     path = tmp_path / "photo.png"
@@ -55,7 +55,7 @@ def test_the_spot_moves_with_the_microscope_and_is_one_for_both_eyes() -> None:
     render = RenderSection(stereo_mm=24.0)
     lens = camera.place(scenario.draw_view(render, np.random.default_rng(2)), render)
     drawn = scenario.draw_light(LightSection(even=(0.3, 0.3)), np.random.default_rng(0))
-    right = camera.beside(lens, 24.0)
+    right = camera.right_camera(lens, 24.0)
     field = lens.size[0] * lens.mm_per_px
     axis = lens.centre / np.linalg.norm(lens.centre)
     across = lens.rotation[0]

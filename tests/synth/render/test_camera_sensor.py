@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from synth.render.camera.camera_sensor import Sensor, record
+from synth.render.camera.camera_sensor import CameraSensor, record
 
-PLAIN = Sensor(vignette=0.0, bloom=0.0, knee=1.0, contrast=0.0, sharpening=0.0)
+PLAIN = CameraSensor(vignette=0.0, bloom=0.0, knee=1.0, contrast=0.0, sharpening=0.0)
 
 
 def flat(level: float, side: int = 200) -> np.ndarray:

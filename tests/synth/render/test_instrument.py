@@ -14,7 +14,7 @@ SHAFTS = np.array([[0.3, 0.2, 0.9], [0.3, 0.2, 0.9]])
 
 @pytest.mark.parametrize("kind", get_args(instrument.Kind))
 def test_an_instrument_ends_at_its_tips(kind: instrument.Kind) -> None:
-    made = instrument.build([kind])
+    made = instrument.build([kind], [False])
     points = instrument.pose(made, TIPS, SHAFTS)
     assert np.isfinite(points).all()
     assert made.faces.max() == len(points) - 1

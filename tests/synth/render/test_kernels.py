@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 from synth.job import reader
-from synth.render.camera import camera
 from synth.render.mitsuba.adapter import pick
-from synth.render.scene import Moment, Studio
-from synth.sequence import mechanics, scenario
+from synth.render.scene import SceneState
+from synth.sequence.scene import at_rest
 
 SMALL = ["render.size=[64, 48]", "sequences=4", "anatomy.vertices=2500", "render.spp=4"]
 _LARGE = 500  # operations: a kernel that traces light; the rest fill and copy arrays
@@ -31,13 +30,10 @@ def test_scenes_share_their_kernels_with_scenery_and_without() -> None:
     dr.set_flag(dr.JitFlag.KernelHistory, True)
     try:
         for index, job in enumerate((bare, dressed)):
-            case = scenario.draw(job, index)
-            surface, _ = mechanics.cortex(job, case)
-            kinds = [gesture.kind for gesture in case.gestures]
-            studio = Studio(surface, case.look, camera.place(case.view, job.render), job, kinds)
+            scene = at_rest(job, index)
             for frame in range(2):
-                moment = Moment(surface.vertices + 0.1 * frame, tips, shafts)
-                studio.shoot(moment, seed=frame)
+                state = SceneState(scene.surface.vertices + 0.1 * frame, tips, shafts)
+                scene.renderer.render(state, seed=frame)
             found = [one for one in dr.kernel_history() if one.get("operation_count", 0) > _LARGE]
             large.append({one["hash"] for one in found})
     finally:

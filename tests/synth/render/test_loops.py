@@ -6,7 +6,7 @@ import pytest
 
 from synth.geometry.triangles import lengths
 from synth.render.camera import camera_sensor
-from synth.render.camera.camera_sensor import Sensor, record
+from synth.render.camera.camera_sensor import CameraSensor, record
 
 RNG = np.random.default_rng(4)
 
@@ -20,7 +20,7 @@ def test_lengths_are_those_of_norm(kind: type) -> None:
 
 def test_the_sensor_is_the_chain_of_its_parts() -> None:
     radiance = (1.3 * RNG.random((60, 80, 3)) ** 2).astype(np.float32)
-    sensor = Sensor(white=(1.1, 1.0, 0.8), bloom=0.0, vignette=0.0)
+    sensor = CameraSensor(white=(1.1, 1.0, 0.8), bloom=0.0, vignette=0.0)
     least = np.float32(0.8)
     electrons = radiance * (least * np.float32(sensor.exposure)) * np.float32(sensor.full_well)
     drawn = np.random.default_rng(1).standard_normal(electrons.shape, dtype=np.float32)

@@ -11,7 +11,7 @@ from synth.job.schema import AnatomySection, Job, RenderSection, StoreSection
 from synth.render.anatomy import surface as anatomy
 from synth.render.camera import camera
 from synth.render.mitsuba.adapter import cuda
-from synth.render.scene import Moment, Studio
+from synth.render.scene import Renderer, SceneState
 from synth.sequence import scenario
 from synth.system import llvm
 
@@ -20,9 +20,9 @@ TIPS = np.array([[-1.0, 1.0, 0.2], [1.2, 1.4, 0.2]])
 SHAFTS = np.array([[0.6, 0.3, 0.74], [0.6, 0.3, 0.74]])
 
 
-def studio(
+def made(
     variant: str, spp: int = 4, extra: tuple[str, ...] = (), **render: object
-) -> tuple[Studio, np.ndarray]:
+) -> tuple[Renderer, np.ndarray]:
     settings = {"size": (96, 72), "spp": spp, "variant": variant, **render}
     job = Job(
         anatomy=AnatomySection(vertices=2500),
@@ -32,31 +32,31 @@ def studio(
     surface = anatomy.procedural(scenario.draw_relief(job.anatomy, np.random.default_rng(4)), job.anatomy)
     view = scenario.draw_view(job.render, np.random.default_rng(4))
     look = scenario.draw_look(job, "healthy", np.random.default_rng(4))
-    return Studio(surface, look, camera.place(view, job.render), job), surface.vertices
+    return Renderer(surface, look, camera.place(view, job.render), job), surface.vertices
 
 
 @pytest.mark.slow
 def test_same_seed_same_bytes() -> None:
-    ours, vertices = studio(VARIANTS[-1])
-    shots = [ours.frame(vertices, TIPS, SHAFTS, seed) for seed in (7, 8, 7)]
+    ours, vertices = made(VARIANTS[-1])
+    shots = [ours.render(SceneState(vertices, TIPS, SHAFTS), seed) for seed in (7, 8, 7)]
     assert (shots[0].rgb == shots[2].rgb).all()
     assert (shots[0].radiance == shots[2].radiance).all()
     assert (shots[0].rgb != shots[1].rgb).any()
     assert np.isfinite(shots[0].radiance).all()
-    again, _ = studio(VARIANTS[-1])
-    assert (again.frame(vertices, TIPS, SHAFTS, 7).rgb == shots[0].rgb).all()
+    again, _ = made(VARIANTS[-1])
+    assert (again.render(SceneState(vertices, TIPS, SHAFTS), 7).rgb == shots[0].rgb).all()
 
 
 @pytest.mark.slow
 def test_the_picture_moves_with_the_truth() -> None:
     """A sideways shift of the cortex shows in the picture where flow says, and nowhere else."""
-    ours, vertices = studio(VARIANTS[-1], spp=64, tool=False)
-    rest = ours.frame(vertices, TIPS, SHAFTS, 1)
-    pixel = ours.still.scale_mm_per_px
-    moved = ours.frame(vertices + ours.camera.rotation[0] * 3 * pixel, TIPS, SHAFTS, 2)
-    inside = np.zeros_like(ours.still.tissue)
+    ours, vertices = made(VARIANTS[-1], spp=64, tool=False)
+    rest = ours.render(SceneState(vertices, TIPS, SHAFTS), 1)
+    pixel = ours.rest.scale_mm_per_px
+    moved = ours.render(SceneState(vertices + ours.camera.rotation[0] * 3 * pixel, TIPS, SHAFTS), 2)
+    inside = np.zeros_like(ours.rest.tissue)
     inside[20:-20, 30:-30] = True
-    inside &= ours.still.tissue & ~rest.glare & ~np.roll(moved.glare, -3, axis=1)
+    inside &= ours.rest.tissue & ~rest.glare & ~np.roll(moved.glare, -3, axis=1)
     np.testing.assert_allclose(np.median(moved.flow[inside], axis=0), [3, 0], atol=0.1)
     green = [shot.rgb[..., 1].astype(float) for shot in (rest, moved)]
     errors = {d: np.abs(np.roll(green[1], -d, axis=1) - green[0])[inside].mean() for d in range(7)}
@@ -73,8 +73,8 @@ def test_variants_agree_pixel_by_pixel(variant: str) -> None:
     frames = 8
     stacks = []
     for name, seed in (("scalar_rgb", 50), (variant, 90)):
-        ours, vertices = studio(name, spp=16, size=(64, 48), distortion=(0.0,) * 5)
-        shots = [ours.frame(vertices, TIPS, SHAFTS, seed + k) for k in range(frames)]
+        ours, vertices = made(name, spp=16, size=(64, 48), distortion=(0.0,) * 5)
+        shots = [ours.render(SceneState(vertices, TIPS, SHAFTS), seed + k) for k in range(frames)]
         stacks.append(np.stack([shot.radiance.mean(axis=2) for shot in shots]))
     one, other = stacks
     error = np.sqrt((one.var(axis=0, ddof=1) + other.var(axis=0, ddof=1)) / frames)
@@ -86,13 +86,13 @@ def test_variants_agree_pixel_by_pixel(variant: str) -> None:
 
 @pytest.mark.slow
 def test_traction_is_in_camera_axes() -> None:
-    ours, vertices = studio(VARIANTS[-1])
+    ours, vertices = made(VARIANTS[-1])
     nodal = np.zeros_like(vertices)
     nodal[:, 2] = 2.0  # pulled out of the brain, towards the lens
-    seen = ours.traction(nodal)[ours.still.tissue]
+    seen = ours.traction(nodal)[ours.rest.tissue]
     np.testing.assert_allclose(np.linalg.norm(seen, axis=1), 2.0, rtol=1e-5)
     assert (seen[:, 2] < -1.8).all()
-    assert (ours.traction(nodal)[~ours.still.tissue] == 0).all()
+    assert (ours.traction(nodal)[~ours.rest.tissue] == 0).all()
 
 
 @pytest.mark.slow
@@ -105,10 +105,10 @@ def test_without_llvm_the_scalar_variant_is_taken() -> None:
 
 @pytest.mark.slow
 def test_an_open_shutter_adds_up_light() -> None:
-    ours, vertices = studio(VARIANTS[-1], spp=4, tool=False)
-    moments = [Moment(vertices, TIPS, SHAFTS, None, power) for power in (0.5, 1.5)]
-    sharp = ours.shoot(Moment(vertices, TIPS, SHAFTS), 1)
-    both = ours.shoot(Moment(vertices, TIPS, SHAFTS), 1, moments)
+    ours, vertices = made(VARIANTS[-1], spp=4, tool=False)
+    moments = [SceneState(vertices, TIPS, SHAFTS, None, power) for power in (0.5, 1.5)]
+    sharp = ours.render(SceneState(vertices, TIPS, SHAFTS), 1)
+    both = ours.render(SceneState(vertices, TIPS, SHAFTS), 1, moments)
     assert both.radiance.mean() == pytest.approx(sharp.radiance.mean(), rel=0.01)
     assert (both.flow == sharp.flow).all()
 
@@ -117,38 +117,38 @@ def test_an_open_shutter_adds_up_light() -> None:
 def test_truth_on_request() -> None:
     """Flow to the next frame chains with flow from rest; normals face the lens."""
     extra = ("flow_next", "normals")
-    ours, vertices = studio(VARIANTS[-1], spp=1, tool=False, extra=extra)
+    ours, vertices = made(VARIANTS[-1], spp=1, tool=False, extra=extra)
     push = np.exp(-(vertices[:, :2] ** 2).sum(axis=1) / 30)[:, None] * np.array([0.6, 0.2, 0.5])
-    moments = [Moment(vertices + k * push, TIPS, SHAFTS) for k in range(3)]
-    shots = [ours.shoot(moments[k], k, (), moments[min(k + 1, 2)]) for k in range(3)]
+    moments = [SceneState(vertices + k * push, TIPS, SHAFTS) for k in range(3)]
+    shots = [ours.render(moments[k], k, (), moments[min(k + 1, 2)]) for k in range(3)]
     first, second = shots[0], shots[1]
     assert first.flow_next is not None
     assert second.flow_next is not None
     assert first.normals is not None
     # In the rest frame a pixel's point is the same for both.
     np.testing.assert_allclose(first.flow_next, second.flow, atol=1e-4)
-    rows, columns = np.nonzero(ours.still.tissue & second.visible & shots[2].visible)
+    rows, columns = np.nonzero(ours.rest.tissue & second.visible & shots[2].visible)
     goal = np.stack([columns, rows], 1) + second.flow[rows, columns]
     near = np.rint(goal).astype(int)
     kept = np.abs(goal - near).max(axis=1) < 0.1
     there = second.flow_next[near[kept, 1], near[kept, 0]]
     both = second.flow[rows, columns][kept] + there
     assert np.median(np.abs(both - shots[2].flow[rows, columns][kept])) < 0.02
-    assert first.normals[ours.still.tissue][:, 2].max() < 0
-    np.testing.assert_allclose(np.linalg.norm(first.normals[ours.still.tissue], axis=1), 1, atol=1e-5)
+    assert first.normals[ours.rest.tissue][:, 2].max() < 0
+    np.testing.assert_allclose(np.linalg.norm(first.normals[ours.rest.tissue], axis=1), 1, atol=1e-5)
     assert (shots[2].flow_next == 0).sum() > 0
 
 
 @pytest.mark.slow
 def test_rest_disparity_triangulates_to_the_rest_points() -> None:
-    ours, _ = studio(VARIANTS[-1], spp=1, tool=False, stereo_mm=20.0)
+    ours, _ = made(VARIANTS[-1], spp=1, tool=False, stereo_mm=20.0)
     assert ours.right is not None
-    rows, columns = (at[::50] for at in np.nonzero(ours.still.tissue))
+    rows, columns = (at[::50] for at in np.nonzero(ours.rest.tissue))
     pixels = np.stack([columns, rows], 1).astype(np.float64)
     left, right = ours.camera, ours.right
     straight = cv2.undistortPoints(pixels[:, None], left.K, left.distortion, P=left.K)[:, 0]
     across = straight - np.stack([ours.disparity()[rows, columns], np.zeros(len(rows))], 1)
     poses = [np.eye(3, 4), np.concatenate([np.eye(3), [[-20.0], [0.0], [0.0]]], axis=1)]
     there = cv2.triangulatePoints(left.K @ poses[0], right.K @ poses[1], straight.T, across.T)
-    expected = ours.still.points.reshape(*ours.still.tissue.shape, 3)[rows, columns]
+    expected = ours.rest.points.reshape(*ours.rest.tissue.shape, 3)[rows, columns]
     np.testing.assert_allclose((there[:3] / there[3]).T, expected, atol=0.05)

@@ -11,7 +11,7 @@ from synth.geometry.triangles import Shape
 from synth.job.schema import AnatomySection, RenderSection
 from synth.render import truth
 from synth.render.anatomy import surface as anatomy
-from synth.render.anatomy.surface import Surface
+from synth.render.anatomy.surface import CortexSurface
 from synth.render.camera import camera
 from synth.render.camera.camera import Camera
 from synth.sequence import scenario
@@ -20,7 +20,7 @@ NOTHING = Shape(np.array([[0.0, 0.0, -900.0]] * 3), np.array([[0, 1, 2]], np.int
 
 
 @pytest.fixture(scope="module")
-def surface() -> Surface:
+def surface() -> CortexSurface:
     section = AnatomySection(vertices=2500)
     return anatomy.procedural(scenario.draw_relief(section, np.random.default_rng(5)), section)
 
@@ -31,7 +31,7 @@ def lens() -> Camera:
     return camera.place(scenario.draw_view(render, np.random.default_rng(2)), render)
 
 
-def bump(surface: Surface) -> np.ndarray:
+def bump(surface: CortexSurface) -> np.ndarray:
     """A smooth pull of 2 mm with some sideways motion."""
     x, y = surface.vertices[:, 0], surface.vertices[:, 1]
     pull = 2.0 * np.exp(-((x - 1) ** 2 + (y + 2) ** 2) / 18)
@@ -45,7 +45,7 @@ def test_rays_meet_what_trimesh_meets_even_where_triangles_bow() -> None:
     bent = (-0.9, 0.8, 0.01, -0.01, 0.0)
     render = RenderSection(size=(320, 240), working_distance_mm=(60.0, 60.0), distortion=bent)
     near = camera.place(scenario.draw_view(render, np.random.default_rng(2)), render)
-    rest = truth.still(near, Shape(coarse.vertices, coarse.faces), NOTHING)
+    rest = truth.trace_rest(near, Shape(coarse.vertices, coarse.faces), NOTHING)
     pixels = camera.pixel_grid(near.size)[::11]
     origins, directions = camera.rays(near, pixels)
     straight = (pixels - near.K[:2, 2]) / np.diag(near.K)[:2]
@@ -64,11 +64,11 @@ def test_rays_meet_what_trimesh_meets_even_where_triangles_bow() -> None:
     np.testing.assert_allclose(ours, expected, atol=1e-6)
 
 
-def test_flow_warps_the_moved_surface_back_to_rest(surface: Surface, lens: Camera) -> None:
+def test_flow_warps_the_moved_surface_back_to_rest(surface: CortexSurface, lens: Camera) -> None:
     """What a pixel sees at rest is what is seen at the flow's end in the moved frame."""
     shape, moved = Shape(surface.vertices, surface.faces), Shape(bump(surface), surface.faces)
-    rest = truth.still(lens, shape, NOTHING)
-    now = truth.now(lens, rest, moved, NOTHING, None)
+    rest = truth.trace_rest(lens, shape, NOTHING)
+    now = truth.trace_frame(lens, rest, moved, NOTHING, NOTHING)
     seen = now.visible & rest.tissue
     assert seen.mean() > 0.5
     assert np.linalg.norm(now.flow[seen], axis=1).max() > 3
@@ -84,14 +84,14 @@ def test_flow_warps_the_moved_surface_back_to_rest(surface: Surface, lens: Camer
     assert np.quantile(error, 0.999) < 1e-3
 
 
-def test_what_hides_a_point_makes_it_invisible(surface: Surface, lens: Camera) -> None:
+def test_what_hides_a_point_makes_it_invisible(surface: CortexSurface, lens: Camera) -> None:
     shape = Shape(surface.vertices, surface.faces)
-    rest = truth.still(lens, shape, NOTHING)
+    rest = truth.trace_rest(lens, shape, NOTHING)
     plate = Shape(
         np.array([[-4.0, -4.0, 6.0], [4.0, -4.0, 6.0], [4.0, 4.0, 6.0], [-4.0, 4.0, 6.0]]),
         np.array([[0, 1, 2], [0, 2, 3]], np.int32),
     )
-    now = truth.now(lens, rest, shape, NOTHING, plate)
+    now = truth.trace_frame(lens, rest, shape, NOTHING, plate)
     assert 0.02 < now.tool.mean() < 0.3
     # Nothing moved, so a rest pixel is seen just where the plate is not.
     np.testing.assert_array_equal(now.visible, rest.tissue & ~now.tool)
@@ -109,32 +109,32 @@ def test_a_triangle_with_a_corner_behind_the_lens_is_dropped(lens: Camera, turn:
     shape = Shape(
         (corners - lens.translation) @ lens.rotation, np.array([np.roll([0, 1, 2], turn)], np.int32)
     )
-    hits = truth.cast(lens, [shape], None, directions)
+    hits = truth.cast(lens, shape, None, directions)
     assert (hits.face < 0).all()
     assert np.isinf(hits.along).all()
 
 
-def test_areas_of_pixels_add_up_to_the_surfaces(surface: Surface) -> None:
+def test_areas_of_pixels_add_up_to_the_surfaces(surface: CortexSurface) -> None:
     render = RenderSection(size=(320, 240), field_mm=(60.0, 60.0), tilt_deg=(20.0, 20.0))
     lens = camera.place(scenario.draw_view(render, np.random.default_rng(2)), render)
-    rest = truth.still(lens, Shape(surface.vertices, surface.faces), NOTHING)
+    rest = truth.trace_rest(lens, Shape(surface.vertices, surface.faces), NOTHING)
     mesh = trimesh.Trimesh(surface.vertices, surface.faces, process=False)
     assert rest.area.sum() == pytest.approx(mesh.area, rel=5e-3)
 
 
-def test_a_camera_that_moves_is_part_of_the_flow(surface: Surface, lens: Camera) -> None:
+def test_a_camera_that_moves_is_part_of_the_flow(surface: CortexSurface, lens: Camera) -> None:
     shape = Shape(surface.vertices, surface.faces)
-    rest = truth.still(lens, shape, NOTHING)
+    rest = truth.trace_rest(lens, shape, NOTHING)
     later = replace(lens, translation=lens.translation + np.array([0.5, 0.0, 0.0]))
-    now = truth.now(later, rest, shape, NOTHING, None)
+    now = truth.trace_frame(later, rest, shape, NOTHING, NOTHING)
     expected = 0.5 * lens.K[0, 0] / lens.translation[2]
     assert np.median(now.flow[rest.tissue][:, 0]) == pytest.approx(expected, rel=0.02)
 
 
-def test_motion_lands_where_opencv_projects_it(surface: Surface, lens: Camera) -> None:
-    rest = truth.still(lens, Shape(surface.vertices, surface.faces), NOTHING)
+def test_motion_lands_where_opencv_projects_it(surface: CortexSurface, lens: Camera) -> None:
+    rest = truth.trace_rest(lens, Shape(surface.vertices, surface.faces), NOTHING)
     moved = Shape(bump(surface), surface.faces)
-    now = truth.now(lens, rest, moved, NOTHING, None)
+    now = truth.trace_frame(lens, rest, moved, NOTHING, NOTHING)
     on = rest.tissue
     points = rest.points.reshape(*on.shape, 3)[on] + now.motion[on]
     seen = cv2.projectPoints(points, np.zeros(3), np.zeros(3), lens.K, lens.distortion)[0][:, 0]

@@ -20,7 +20,7 @@ def test_vibration_has_the_deviation_asked_for() -> None:
 
 
 def test_the_second_lens_sees_the_disparity_of_a_rectified_pair() -> None:
-    right = camera.beside(LENS, 20.0)
+    right = camera.right_camera(LENS, 20.0)
     points = np.random.default_rng(0).uniform(-8, 8, (30, 3))
     plain = replace(LENS, distortion=np.zeros(5)), replace(right, distortion=np.zeros(5))
     left_px, right_px = (camera.project(lens, points) for lens in plain)

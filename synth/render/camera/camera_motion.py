@@ -18,7 +18,7 @@ _TURN = 0.002  # rad of turn about each axis that go with a shift of 1 mm
 
 
 @dataclass(frozen=True)
-class Sway:
+class CameraMotion:
     """How the microscope moves in one sequence; it is in its place in the rest frame."""
 
     drift_mm: float
