@@ -153,7 +153,7 @@ def _keys(section: BaseModel, at: str) -> list[str]:
             inner += _keys(default, f"{at}{name}.")
             continue
         meaning = _sentence(field.description or (below.__doc__ if below else ""))
-        limits = writer.limits(field.annotation, field.metadata)
+        limits = writer.limits(type(section), name)
         if limits:
             meaning += f" {limits}"
         value = "" if field.is_required() else writer.scalar(default)

@@ -5,9 +5,8 @@ from __future__ import annotations
 import io
 import json
 import textwrap
-import typing
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from pydantic import BaseModel
 from ruamel.yaml import YAML
@@ -59,7 +58,7 @@ def _section(section: BaseModel, indent: str) -> list[str]:
         value = getattr(section, name)
         inner = section_of(field.annotation)
         text = field.description or (inner.__doc__ if inner else "") or ""
-        allowed = "" if inner else limits(field.annotation, field.metadata)
+        allowed = "" if inner else limits(type(section), name)
         comment = " ".join([*text.split(), allowed]).strip()
         if inner is not None and lines and lines[-1]:
             lines.append("")
@@ -71,39 +70,18 @@ def _section(section: BaseModel, indent: str) -> list[str]:
     return lines
 
 
-def limits(annotation: Any, metadata: list[Any]) -> str:
+def limits(model: type[BaseModel], key: str) -> str:
     """What a key may hold, in words: "(> 0)", "(linear | stable)"; empty where anything goes."""
-    choices = _choices(annotation)
-    if choices:
-        return f"({' | '.join(choices)})"
-    bounds = {}
-    for one in _metadata(annotation, metadata):
-        for name, sign in (("gt", ">"), ("ge", ">="), ("lt", "<"), ("le", "<=")):
-            limit = getattr(one, name, None)
-            if limit is not None and abs(limit) < 1e9:
-                bounds[name] = f"{sign} {limit:.12g}"
-    return f"({', '.join(bounds.values())})" if bounds else ""
-
-
-def _choices(annotation: Any) -> list[str]:
-    if typing.get_origin(annotation) is Literal:
-        return [str(choice) for choice in typing.get_args(annotation)]
-    return [choice for inner in typing.get_args(annotation)[:1] for choice in _choices(inner)]
-
-
-def _metadata(annotation: Any, metadata: list[Any]) -> list[Any]:
-    found = list(metadata)
-    for one in metadata:
-        found += list(getattr(one, "metadata", []))
-    if typing.get_origin(annotation) is tuple:
-        inner = typing.get_args(annotation)[0]
-        found += list(getattr(inner, "__metadata__", ()))
-        for one in getattr(inner, "__metadata__", ()):
-            found += list(getattr(one, "metadata", []))
-    elif annotation is not None:
-        for inner in typing.get_args(annotation):
-            found += list(getattr(inner, "__metadata__", ()))
-    return found
+    described = model.model_json_schema()["properties"][key]
+    signs = {"exclusiveMinimum": ">", "minimum": ">=", "exclusiveMaximum": "<", "maximum": "<="}
+    if "anyOf" in described:  # it may be empty: only its choices are listed
+        described, signs = described["anyOf"][0], {}
+    described = (described.get("prefixItems") or [described.get("items", described)])[0]
+    if "enum" in described:
+        return f"({' | '.join(map(str, described['enum']))})"
+    bounds = [(sign, described[name]) for name, sign in signs.items() if name in described]
+    shown = ", ".join(f"{sign} {bound:.12g}" for sign, bound in bounds if abs(bound) < 1e9)
+    return shown and f"({shown})"
 
 
 def scalar(value: Any) -> str:
