@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 
 
 class UserError(Exception):
@@ -26,3 +27,17 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
     """`; did you mean 'x'?`, or nothing where no known word is near."""
     close = difflib.get_close_matches(word[:80], list(known), 1)
     return f"; did you mean '{close[0]}'?" if close else ""
+
+
+@contextmanager
+def as_user_error(label: str) -> Iterator[None]:
+    """Makes one line after `label` of whatever the block raises: for code and formats of others."""
+    try:
+        yield
+    except Exception as error:
+        raise UserError(f"{label}: {type(error).__name__}: {first_line(error)}") from error
+
+
+def first_line(error: object) -> str:
+    """What an error says in its first line; its name where it says nothing."""
+    return (str(error).strip().splitlines() or [type(error).__name__])[0][:200]

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
-from synth.errors import UserError, did_you_mean
+from synth.errors import UserError, as_user_error, did_you_mean
 
 
 class Registry:
@@ -73,16 +72,6 @@ class Registry:
         if found is None:
             raise UserError(f"{self._key}: no {self._noun} {name!r}; there are {', '.join(self.names())}")
         return found
-
-
-@contextmanager
-def as_user_error(label: str) -> Iterator[None]:
-    """Makes a UserError of whatever a package of others raises in the block: one line that names it."""
-    try:
-        yield
-    except Exception as error:
-        first = (str(error).splitlines() or [""])[0][:200]
-        raise UserError(f"{label}: {type(error).__name__}: {first}") from error
 
 
 ESTIMATORS = Registry(

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.methods.protocol import Answer, InSpace, Method, Scene
-from synth.errors import UserError
-from synth.plugins import Registry, as_user_error
+from synth.errors import UserError, as_user_error
+from synth.plugins import Registry
 
 METHODS = Registry("sulcus.method", "method", "method", {})
 """Methods of other packages: an entry point is a callable without arguments that gives a `Method`."""

@@ -12,8 +12,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from synth.errors import UserError
-from synth.plugins import Registry, as_user_error
+from synth.errors import UserError, as_user_error
+from synth.plugins import Registry
 
 Floats = NDArray[np.float64]
 

@@ -21,7 +21,7 @@ from ruamel.yaml import YAML
 from ruamel.yaml.error import MarkedYAMLError
 from ruamel.yaml.events import AliasEvent, CollectionEndEvent, CollectionStartEvent
 
-from synth.errors import UserError
+from synth.errors import UserError, as_user_error, first_line
 
 LARGEST_JSON, LARGEST_PICTURE, LARGEST_YAML, LARGEST_STORAGE = 64 << 20, 512 << 20, 200_000, 1 << 20
 """Bytes of a file of that kind that is read."""
@@ -62,33 +62,27 @@ def read_bytes(path: Path, largest: int) -> bytes:
 
 def read_text(path: Path, largest: int, encoding: str = "utf-8") -> str:
     """The text of a file. UserError for what is none."""
-    try:
-        return read_bytes(path, largest).decode(encoding)
-    except UnicodeDecodeError as error:
-        raise UserError(f"{path}: unreadable, no UTF-8 text (byte {error.start})") from None
+    data = read_bytes(path, largest)
+    with as_user_error(f"{path}: is no text"):
+        return data.decode(encoding)
 
 
 def read_json(path: Path, largest: int = LARGEST_JSON) -> Any:
     """What a JSON file holds. UserError for what is none."""
-    try:
-        return json.loads(read_text(path, largest))
-    except (ValueError, RecursionError) as error:
-        raise UserError(f"{path}: is damaged ({error})") from None
+    text = read_text(path, largest)
+    with as_user_error(f"{path}: is no JSON"):
+        return json.loads(text)
 
 
 def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
     """The arrays of an .npz by name, of any shape (A, ...), numbers and truth values only. UserError else."""
-    try:
-        with open_file(path, _LARGEST_ARRAYS) as file, np.load(file, allow_pickle=False) as held:
+    with open_file(path, _LARGEST_ARRAYS) as file, as_user_error(f"{path}: cannot be read as .npz"):
+        with np.load(file, allow_pickle=False) as held:
             found = {name: held[name] for name in held.files}
         for name, array in found.items():
             if array.dtype.kind not in "biuf":
                 raise ValueError(f"{name} is no array of numbers")
         return found
-    except UserError:
-        raise
-    except Exception as error:  # zipfile, zlib and NumPy's own raise what they like
-        raise UserError(f"{path}: cannot be read as .npz ({_first_line(error)})") from None
 
 
 def read_picture(path: Path, flags: int = 1) -> NDArray[np.generic]:
@@ -97,10 +91,9 @@ def read_picture(path: Path, flags: int = 1) -> NDArray[np.generic]:
     Raises:
         UserError: no regular file, no picture, or one beyond 40 megapixels.
     """
-    try:
-        return decode_picture(read_bytes(path, LARGEST_PICTURE), flags)
-    except ValueError as error:
-        raise UserError(f"{path}: not a readable picture ({error})") from None
+    data = read_bytes(path, LARGEST_PICTURE)
+    with as_user_error(f"{path}: not a readable picture"):
+        return decode_picture(data, flags)
 
 
 def decode_picture(data: bytes, flags: int = 1) -> NDArray[np.generic]:
@@ -112,14 +105,10 @@ def decode_picture(data: bytes, flags: int = 1) -> NDArray[np.generic]:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # Pillow's own limit is above ours
             with Image.open(BytesIO(data)) as picture:
-                size = picture.size
-    except Exception as error:  # each format's reader raises what it likes: SyntaxError, struct.error, ...
-        raise ValueError("its head is none of a picture's") from error
-    refuse_large(*size)
-    try:
+                refuse_large(*picture.size)
         found = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
-    except cv2.error as error:
-        raise ValueError(f"it is damaged: {_first_line(error)}") from None
+    except Exception as error:  # each format's reader raises what it likes: SyntaxError, struct.error, ...
+        raise ValueError(f"no picture that is read: {first_line(error)}") from error
     if found is None:
         raise ValueError("it is damaged")
     return np.asarray(found)
@@ -139,9 +128,9 @@ def read_storage(name: str, text: str) -> dict[str, Any]:
     """
     import cv2
 
-    try:
+    with as_user_error(f"{name}: is no OpenCV calibration"):
         if sum(1 for _ in _NESTED.finditer(text)) > _MOST_NESTED:
-            raise SystemError(f"more than {_MOST_NESTED} nested values")
+            raise ValueError(f"more than {_MOST_NESTED} nested values")
         storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
         root = storage.root()  # it and its nodes live as long as the storage
         nodes = {key: root.getNode(key) for key in root.keys()}  # noqa: SIM118 - a FileNode is no dictionary
@@ -150,8 +139,6 @@ def read_storage(name: str, text: str) -> dict[str, Any]:
             for key, node in nodes.items()
             if node.isMap() or node.isInt() or node.isReal()
         }
-    except (cv2.error, SystemError) as error:
-        raise UserError(f"{name}: is no OpenCV calibration ({_first_line(error)})") from error
 
 
 def read_yaml(path: Path) -> Any:
@@ -177,9 +164,9 @@ def load_yaml(text: str, label: str) -> Any:
     except MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         where = f"{label}:{mark.line + 1}:{mark.column + 1}" if mark else label
-        raise UserError(f"{where}: not YAML: {_first_line(error.problem or error.context)}") from None
+        raise UserError(f"{where}: not YAML: {first_line(error.problem or error.context)}") from None
     except Exception as error:  # the reader raises bare ValueErrors and others for odd scalars and tags
-        raise UserError(f"{label}: not YAML: {_first_line(error)}") from error
+        raise UserError(f"{label}: not YAML: {first_line(error)}") from error
 
 
 def plain_yaml(value: Any, label: str) -> Any:
@@ -219,12 +206,8 @@ def part_of(path: Path) -> Iterator[Path]:
     """
     part = _part_name(path)
     part.touch(exist_ok=False)
-    try:
+    with _replacing(path, part):
         yield part
-        part.replace(path)
-    except BaseException:
-        part.unlink(missing_ok=True)
-        raise
 
 
 @contextmanager
@@ -235,11 +218,20 @@ def folder_of(path: Path) -> Iterator[Path]:
     make_folder(path.absolute().parent)
     part = _part_name(path)
     part.mkdir()
-    try:
+    with _replacing(path, part):
         yield part
-        part.rename(path)
+
+
+@contextmanager
+def _replacing(path: Path, part: Path) -> Iterator[None]:
+    try:
+        yield
+        part.replace(path)
     except BaseException:
-        shutil.rmtree(part, ignore_errors=True)
+        if part.is_dir():
+            shutil.rmtree(part, ignore_errors=True)
+        else:
+            part.unlink(missing_ok=True)
         raise
 
 
@@ -270,7 +262,3 @@ def made_folder(path: Path, room_bytes: int = 0) -> Iterator[None]:
 
 def _part_name(path: Path) -> Path:
     return path.with_name(f".{path.name}.{os.urandom(4).hex()}{PART}")
-
-
-def _first_line(error: object) -> str:
-    return (str(error).strip().splitlines() or [type(error).__name__])[0][:200]
