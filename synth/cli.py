@@ -84,14 +84,13 @@ def preview(
     Of a brain's surface: draws the places where it can best be opened, and prints them as a job's lines.
     """
     import cv2
-    from rich.console import Console
-    from rich.progress import Progress
 
     from synth.dataset.size_forecast import amount
     from synth.errors import UserError
     from synth.geometry.brain_surface import KINDS
     from synth.job import reader
     from synth.publish import contact_sheet, openings
+    from synth.system.terminal import counting
 
     if out.suffix.lower() != ".png" or not out.parent.is_dir():
         raise UserError(f"{out}: cannot be written as PNG")
@@ -104,11 +103,8 @@ def preview(
         print(json_.dumps({"sheet": str(out), "openings": told}) if json else lines)
         return
     read = reader.load_job(job, overrides or [])
-    with Progress(console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task("Drawing, then measuring what a sequence costs", total=None)
-        made = contact_sheet.draw_sheet(
-            read, count, lambda done, of: bar.update(task, completed=done, total=of)
-        )
+    with counting("Drawing, then measuring what a sequence costs") as progress:
+        made = contact_sheet.draw_sheet(read, count, progress)
     if not cv2.imwrite(str(out), made.picture[..., ::-1]):
         raise UserError(f"{out}: cannot be written as PNG")
     if json:
@@ -155,7 +151,7 @@ def render(
 ) -> None:
     """Renders the dataset of a job. Exit code 1 when some of its sequences failed."""
     from synth.dataset.folder import Folder
-    from synth.engine.progress import Bars
+    from synth.engine.progress import RunBars
     from synth.engine.run import Options, run_job
     from synth.job.reader import load_job
 
@@ -164,7 +160,7 @@ def render(
     if retry:
         Folder(out).forgive()
     options = Options(engine=engine, workers=workers, gpus=gpus, memory_gb=memory, mix_versions=mix_versions)
-    with Bars() as bars:
+    with RunBars() as bars:
         summary = run_job(read, out, options, bars)
     if json:
         print(json_.dumps({**vars(summary), "out": str(out)}))

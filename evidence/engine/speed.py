@@ -22,10 +22,10 @@ import typer
 from evidence import report
 from synth.dataset.store import Dataset, Writer
 from synth.engine import machine, run
-from synth.engine.progress import Bars
+from synth.engine.progress import RunBars
 from synth.job import reader
 from synth.job.schema import Job
-from synth.system.stopwatch import ProgressCallback
+from synth.system.stopwatch import StageCallback
 
 _CPU_S = "STAND_IN_CPU_S"
 """Variable that tells workers how long a stand-in computes [s]."""
@@ -71,7 +71,7 @@ def overhead(name: str, count: int) -> dict[str, float | int]:
         "NUMBA_NUM_THREADS": "1",
     }
     program = "import sys; from evidence.engine.speed import render_bare; render_bare(sys.argv[1])"
-    with tempfile.TemporaryDirectory() as scratch, Bars() as bars:
+    with tempfile.TemporaryDirectory() as scratch, RunBars() as bars:
         before = _cpu()
         words = [sys.executable, "-c", program, job.model_dump_json()]
         subprocess.run(words, env=alone, cwd=scratch, check=True, stdout=subprocess.DEVNULL)
@@ -116,7 +116,7 @@ def workers(sequences: int, cpu_s: float) -> dict[str, float | int]:
     for count in (1, 2):
         environment = {**_path(), _CPU_S: str(cpu_s)}
         options = run.Options(workers=count, work="evidence.engine.speed:compute", environment=environment)
-        with tempfile.TemporaryDirectory() as scratch, Bars() as bars:
+        with tempfile.TemporaryDirectory() as scratch, RunBars() as bars:
             began = time.perf_counter()
             run.run_job(job, Path(scratch) / "out", options, bars)
             seconds[count] = time.perf_counter() - began
@@ -129,7 +129,7 @@ def workers(sequences: int, cpu_s: float) -> dict[str, float | int]:
     }
 
 
-def compute(job: Job, index: int, folder: Path, tell: ProgressCallback) -> None:
+def compute(job: Job, index: int, folder: Path, tell: StageCallback) -> None:
     """A stand-in for rendering: so much arithmetic, then a store of random fields."""
     rng = np.random.default_rng((job.seed, index))
     matrix = rng.normal(size=(200, 200))

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, Literal, Protocol
 
 import synth
-from synth.system.stopwatch import ProgressCallback
+from synth.system.stopwatch import StageCallback
 
 Kind = Literal["done", "input", "error", "crash", "memory", "stalled", "disk", "stopped"]
 """How an attempt ended: only `done` is good; `input` would end the same way again."""
@@ -71,7 +71,7 @@ class Setup:
 class Slot(Protocol):
     """Where one sequence at a time is computed; the engine has a thread for every slot."""
 
-    def run(self, index: int, report: ProgressCallback, stop: threading.Event) -> Attempt:
+    def run(self, index: int, report: StageCallback, stop: threading.Event) -> Attempt:
         """Computes one sequence; returns when it is sealed, has failed, or `stop` is set."""
         ...
 
@@ -87,7 +87,7 @@ class Child:
         self._setup = setup
         self._process: subprocess.Popen[bytes] | None = None
 
-    def run(self, index: int, report: ProgressCallback, stop: threading.Event) -> Attempt:
+    def run(self, index: int, report: StageCallback, stop: threading.Event) -> Attempt:
         """Computes one sequence, see `Slot`. After anything but "done" and "input" the process is gone."""
         if self._process is None:
             self._process = self._start()
@@ -129,7 +129,7 @@ class Child:
         return process
 
     def _attempt(
-        self, process: subprocess.Popen[bytes], index: int, report: ProgressCallback, stop: threading.Event
+        self, process: subprocess.Popen[bytes], index: int, report: StageCallback, stop: threading.Event
     ) -> Attempt:
         _write(process, str(index))
         last = time.monotonic()

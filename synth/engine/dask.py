@@ -20,7 +20,7 @@ from synth.engine.child import Attempt, Child, Setup, Slot
 from synth.errors import UserError
 from synth.job.schema import Job
 from synth.system import checked_file
-from synth.system.stopwatch import ProgressCallback
+from synth.system.stopwatch import StageCallback
 
 _TICK_S = 0.5
 _WAIT_FOR_WORKERS_S = 600
@@ -71,7 +71,7 @@ class _DaskSlot:
     def __init__(self, client: Any, setup: Setup) -> None:
         self._client, self._setup = client, setup
 
-    def run(self, index: int, report: ProgressCallback, stop: threading.Event) -> Attempt:
+    def run(self, index: int, report: StageCallback, stop: threading.Event) -> Attempt:
         report("on the cluster", 0, 1)
         future = self._client.submit(_attempt, self._setup, index, pure=False)
         try:

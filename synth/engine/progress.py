@@ -4,29 +4,25 @@ from __future__ import annotations
 
 import time
 
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+from rich.progress import TaskID, TextColumn, TimeElapsedColumn
 
 from synth.engine.child import Attempt
 from synth.engine.journal import RunProgress, Watcher
 from synth.engine.status import clock
-from synth.system.terminal import draws_bars
+from synth.system.terminal import ProgressBars
 
 # Without a terminal a line is printed at most so often.
 _QUIET_S = 10.0
 
 
-class Bars(Progress, Watcher):
+class RunBars(ProgressBars, Watcher):
     """A bar for the dataset and one for every sequence in work; plain lines where nothing can be drawn.
 
     What is left is the run's own estimate: rich knows nothing of workers whose first sequences also compile.
     """
 
     def __init__(self) -> None:
-        console = Console(stderr=True)
-        columns = [TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()]
-        left = TextColumn("{task.fields[left]}", style="cyan")
-        super().__init__(*columns, left, console=console, disable=not draws_bars(console))
+        super().__init__(TimeElapsedColumn(), TextColumn("{task.fields[left]}", style="cyan"))
         self._bars: dict[int, TaskID] = {}
         self._dataset = self.add_task("sequences", total=None, left="")
         self._printed = time.monotonic()

@@ -82,9 +82,9 @@ def render_job(job: Job, out: str | Path, *, progress: bool | Watcher = False, *
         UserError: the folder is not for this job, the disk is full, or the job cannot be carried out.
     """
     if progress is True:
-        from synth.engine.progress import Bars
+        from synth.engine.progress import RunBars
 
-        with Bars() as bars:
+        with RunBars() as bars:
             return run_job(job, Path(out), Options(**options), bars)
     return run_job(job, Path(out), Options(**options), progress or Watcher())
 

@@ -22,7 +22,7 @@ from synth.sequence import mechanics, scenario
 from synth.sequence.published_labels import Published
 from synth.sequence.scenario import Scenario
 from synth.sequence.scene import Scene, estimator, simulate
-from synth.system.stopwatch import ProgressCallback, Stopwatch
+from synth.system.stopwatch import StageCallback, Stopwatch
 
 # Fields that the renderer gives by frame, and of a second lens; those of `store.extra` are attributes of its
 # `RenderedFrame` as well, but for the published method's.
@@ -38,7 +38,7 @@ class _Shooting:
     scene: Scene
     writer: Writer
     watch: Stopwatch
-    report: ProgressCallback
+    report: StageCallback
 
     @property
     def job(self) -> Job:
@@ -61,7 +61,7 @@ class _Film:
     """(T, 4, 4) mm, world to camera axes."""
 
 
-def render_sequence(job: Job, index: int, folder: Path, report: ProgressCallback) -> Path:
+def render_sequence(job: Job, index: int, folder: Path, report: StageCallback) -> Path:
     """Computes sequence `index` and writes `folder/NNNNNN.zarr`.
 
     Args:

@@ -22,7 +22,7 @@ from synth.render.scene import RenderedFrame, Renderer
 from synth.sequence import mechanics, scenario
 from synth.sequence.scenario import Scenario
 from synth.sequence.timeline import Timeline
-from synth.system.stopwatch import ProgressCallback, Stopwatch
+from synth.system.stopwatch import StageCallback, Stopwatch
 
 Floats = NDArray[np.float64]
 
@@ -190,7 +190,7 @@ def at_rest(job: Job, index: int = 0, gestures: Sequence[str] | None = None) -> 
 
 
 def simulate(
-    job: Job, index: int = 0, report: ProgressCallback | None = None, watch: Stopwatch | None = None
+    job: Job, index: int = 0, report: StageCallback | None = None, watch: Stopwatch | None = None
 ) -> Scene:
     """Builds sequence `index` of a job and carries out its gestures; nothing is rendered or written yet.
 

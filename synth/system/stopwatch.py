@@ -8,7 +8,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-ProgressCallback = Callable[[str, int, int], None]
+StageCallback = Callable[[str, int, int], None]
 """Told which stage a sequence is in, how many of its steps are done, and how many there are."""
 
 

@@ -7,22 +7,32 @@ from contextlib import contextmanager
 from importlib.util import find_spec
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    ProgressColumn,
+    TextColumn,
+    TimeRemainingColumn,
+)
 
 ProgressCallback = Callable[[int, int], None]
 """Told how many are done, and how many there are."""
 
 
-def draws_bars(console: Console) -> bool:
-    """Whether bars can move there: in a terminal, or in a notebook that has ipywidgets, which rich needs."""
-    return console.is_terminal or (console.is_jupyter and find_spec("ipywidgets") is not None)
+class ProgressBars(Progress):
+    """RunBars on stderr, where they can move: in a terminal, or in a notebook that has ipywidgets."""
+
+    def __init__(self, *further: ProgressColumn, transient: bool = False) -> None:
+        console = Console(stderr=True)
+        drawn = console.is_terminal or (console.is_jupyter and find_spec("ipywidgets") is not None)
+        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), *further)
+        super().__init__(*columns, console=console, transient=transient, disable=not drawn)
 
 
 @contextmanager
 def counting(what: str, total: int | None = None) -> Iterator[Callable[..., None]]:
-    """A bar on stderr; gives a function of how many are done and, where `total` says nothing, of how many."""
-    console = Console(stderr=True)
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=console, transient=True, disable=not draws_bars(console)) as progress:
-        task = progress.add_task(what, total=total)
-        yield lambda done, of=None: progress.update(task, completed=done, total=of)
+    """A bar; gives a function of how many are done and, where `total` says nothing, of how many."""
+    with ProgressBars(TimeRemainingColumn(), transient=True) as bars:
+        task = bars.add_task(what, total=total)
+        yield lambda done, of=None: bars.update(task, completed=done, total=of)
