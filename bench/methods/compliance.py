@@ -55,7 +55,7 @@ class Block:
     @classmethod
     def build(cls, tets: int) -> Block:
         """A linear block of about that many second-order tetrahedra, with Poisson's ratio 0.4."""
-        volume = tetrahedra.block(_ANATOMY, tets, 2)
+        volume = tetrahedra.block(_ANATOMY, tets)
         return cls(volume, assemble(volume, "linear", 0.4))
 
     def embed(self, xy: Floats) -> Embedding:

@@ -163,7 +163,7 @@ def _moved(
     """The path from no load to full: a gesture that only rises."""
     rising = tool.Gesture(**{**vars(gesture), "timing": (0.02, 1.0, 2.0, 3.0)})
     height = HeightMap(surface.pia, surface.extent_mm)
-    tets = tetrahedra.block(job.anatomy, job.fem.tets, 2, gesture.focus, height)
+    tets = tetrahedra.block(job.anatomy, job.fem.tets, gesture.focus, height)
     shape = Shape(surface.vertices, surface.faces)
     return solver.deform(job.fem, case.tissue, [rising], tets, shape, job.frames, job.fps)
 

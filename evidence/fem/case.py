@@ -65,7 +65,7 @@ class Brain:
 
 def brain(on: Patch, law: str, tets: int, contact: tuple[float, float, float], poisson: float = 0.4) -> Brain:
     """Meshes, assembles and embeds."""
-    volume = tetrahedra.block(ANATOMY, tets, 2, (contact,))
+    volume = tetrahedra.block(ANATOMY, tets, (contact,))
     embedding = surface_embedding.embed(volume, on.vertices)
     pressure = tool.footprint(np.array(contact[:2]), contact[2], on.vertices, on.area)
     system = assemble(volume, law, poisson)

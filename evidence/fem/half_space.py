@@ -53,8 +53,8 @@ def measure(count: int, poisson: float, sheet_mm: float = 0.0) -> list[Row]:
     """
     a = _RADIUS_MM
     size = _WIDE_MM if sheet_mm else tetrahedra.BLOCK_MM
-    tets = tetrahedra.block(schema.AnatomySection(dome_mm=1e6), count, 2, ((0.0, 0.0, a),), size_mm=size)
-    free = Tets(tets.points, tets.cells, 2, tets.fixed, 0 * tets.hold)
+    tets = tetrahedra.block(schema.AnatomySection(dome_mm=1e6), count, ((0.0, 0.0, a),), size_mm=size)
+    free = Tets(tets.points, tets.cells, tets.fixed, 0 * tets.hold)
     system = assemble(free, "linear", poisson, MembraneSheet(sheet_mm, 1.0) if sheet_mm else None)
     ring = a * np.sqrt((np.arange(_RINGS) + 0.5) / _RINGS)
     turn = 2 * np.pi * (np.arange(_SPOKES) + 0.5) / _SPOKES

@@ -147,7 +147,7 @@ def _sequence(law: str, load: float) -> Row:
         fem, fem_case.ANATOMY.craniotomy.radius_mm, tissue.young_kpa, np.random.default_rng(0)
     )
     start = time.process_time()
-    volume = tetrahedra.block(fem_case.ANATOMY, fem.tets, 2, gesture.focus)
+    volume = tetrahedra.block(fem_case.ANATOMY, fem.tets, gesture.focus)
     meshed = time.process_time()
     solver.deform(fem, tissue, [gesture], volume, Shape(on.vertices, on.faces), _FRAMES, 25.0)
     spent = 1e3 * (time.process_time() - meshed) / _FRAMES

@@ -48,7 +48,7 @@ def measure_scene(index: int, count: int) -> Row:
     surface, _ = mechanics.cortex(_JOB, case)
     gesture, height = case.gesture, HeightMap(surface.pia, surface.extent_mm)
     row: Row = {"index": index, "tets": count, "kind": gesture.kind, "load": gesture.load}
-    volume = tetrahedra.block(_JOB.anatomy, count, 2, gesture.focus, height)
+    volume = tetrahedra.block(_JOB.anatomy, count, gesture.focus, height)
     moved = tool.trajectory(gesture, _JOB.frames)
     full = int(moved.load.argmax())
     moved = tool.ToolMotion(np.ones(1), moved.away[[full]], moved.shift[[full]])

@@ -6,7 +6,7 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
-from synth.fem.mesh.element import Quadrature
+from synth.fem.mesh.element import Quadrature, scatter
 from synth.system.jit import compiled
 
 Floats = NDArray[np.float64]
@@ -101,5 +101,4 @@ def stiffness(mesh: Quadrature, moduli: Floats, along: Floats | None = None) -> 
     if along is not None:
         local += along[:, :, :, None, None] * along[:, None, None]
     dof = (3 * mesh.cells[:, :, None] + np.arange(3, dtype=np.int32)).reshape(elements, 3 * n)
-    rows, cols = np.repeat(dof, 3 * n, axis=1).ravel(), np.tile(dof, (1, 3 * n)).ravel()
-    return sp.coo_array((local.ravel(), (rows, cols)), shape=(3 * mesh.nodes,) * 2).tocsr()
+    return scatter(local, dof, 3 * mesh.nodes)

@@ -31,17 +31,6 @@ def stress(name: str, strain: Floats, mu: float, lam: float, out: Floats, energy
     return least
 
 
-def tangent(name: str, strain: Floats, mu: float, lam: float, out: Floats) -> None:
-    """As `laws.tangent`, (n, 3, 3, 3, 3), by central differences: the solver itself needs none."""
-    law, f = checked(name), strain + np.eye(3)
-    for k in range(3):
-        for m in range(3):
-            step = np.zeros((3, 3))
-            step[k, m] = _STEP
-            up, down = (law.stress(f + sign * step, mu, lam)[1] for sign in (1, -1))
-            out[:, :, :, k, m] = (up - down) / (2 * _STEP)
-
-
 @cache
 def checked(name: str) -> Law:
     """The law of that name, once it has passed `check_law`."""

@@ -1,4 +1,4 @@
-"""Material laws: energy, first Piola-Kirchhoff stress and its exact tangent at quadrature points.
+"""Material laws: energy and first Piola-Kirchhoff stress at quadrature points.
 
 All agree with Hooke's law of mu and lambda at rest. With F = I + grad u, J = det F, C = F'F:
 
@@ -98,27 +98,6 @@ def swellings(law: int, strain: Floats, value: Floats, slope: Floats) -> None:
 
 
 @compiled
-def bend_swelling(law: int, strain: Floats, pressure: Floats, out: Floats) -> None:
-    """Adds pressure (n,) times the second derivative of swelling to (n, 3, 3, 3, 3), in place."""
-    f, g = np.empty((3, 3)), np.empty((3, 3))
-    for n in range(len(strain)):
-        p, a = pressure[n], out[n]
-        f[:] = strain[n]
-        for i in range(3):
-            f[i, i] += 1
-        if law == 1:
-            _turning(f, g, p, a)
-        elif law == 2:
-            _cofactor(f, g)
-            g /= _det(f)
-            for i in range(3):
-                for j in range(3):
-                    for k in range(3):
-                        for m in range(3):
-                            a[i, j, k, m] -= p * g[i, m] * g[k, j]
-
-
-@compiled
 def _swelling(law: int, h: Floats, slope: Floats) -> float:
     """Of one displacement gradient; `slope` becomes its derivative. Infinite where a law has no value."""
     f = h.copy()
@@ -162,36 +141,6 @@ def least_determinant(strain: Floats) -> tuple[float, int]:
 
 
 @compiled
-def tangent(law: int, strain: Floats, mu: float, lam: float, out: Floats) -> None:
-    """Derivative of the stress, in place.
-
-    Args:
-        law, strain, mu, lam: as in `stress`.
-        out: (n, 3, 3, 3, 3) kPa, overwritten by dP_ij/dF_kl.
-    """
-    f, r = np.empty((3, 3)), np.empty((3, 3))
-    for n in range(len(strain)):
-        for i in range(3):
-            for j in range(3):
-                f[i, j] = strain[n, i, j]
-            f[i, i] += 1
-        det = _det(f)
-        a = out[n]
-        if law == 0:
-            for i in range(3):
-                for j in range(3):
-                    for k in range(3):
-                        for m in range(3):
-                            a[i, j, k, m] = mu * ((i == k) * (j == m) + (i == m) * (j == k)) + lam * (
-                                i == j
-                            ) * (k == m)
-        elif law == 1:
-            _corotational_tangent(f, r, mu, lam, a)
-        else:
-            _neo_hookean_tangent(f, det, r, mu, lam, a)
-
-
-@compiled
 def _linear(h: Floats, mu: float, lam: float, p: Floats) -> float:
     trace, squares = h[0, 0] + h[1, 1] + h[2, 2], 0.0
     for i in range(3):
@@ -229,70 +178,6 @@ def _neo_hookean(f: Floats, det: float, c: Floats, mu: float, lam: float, p: Flo
         for j in range(3):
             p[i, j] = mu * f[i, j] + out * c[i, j]
     return 0.5 * mu * (_squares(f) - 3) - mu * log + 0.5 * lam * log * log  # type: ignore[no-any-return]
-
-
-@compiled
-def _corotational_tangent(f: Floats, r: Floats, mu: float, lam: float, a: Floats) -> None:
-    _rotation(f, r)
-    trace = 0.0
-    for i in range(3):
-        for j in range(3):
-            trace += r[i, j] * f[i, j]
-    for i in range(3):
-        for j in range(3):
-            for k in range(3):
-                for m in range(3):
-                    a[i, j, k, m] = 2 * mu * ((i == k) * (j == m)) + lam * r[k, m] * r[i, j]
-    _turning(f, r, lam * (trace - 3) - 2 * mu, a)
-
-
-@compiled
-def _turning(f: Floats, r: Floats, part: float, a: Floats) -> None:
-    """Adds `part` of the rotation's derivative.
-
-    With R'F = S and R'dF = G: dR = R W, where W is skew and its axis w = (tr S - S)^-1 axis(G - G').
-    """
-    _rotation(f, r)
-    s, b, inverse = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
-    for i in range(3):
-        for j in range(3):
-            s[i, j] = r[0, i] * f[0, j] + r[1, i] * f[1, j] + r[2, i] * f[2, j]
-    trace = s[0, 0] + s[1, 1] + s[2, 2]
-    for i in range(3):
-        for j in range(3):
-            b[i, j] = trace * (i == j) - s[i, j]
-    _cofactor(b, inverse)
-    inverse /= _det(b)
-    axis, w, turned = np.empty(3), np.empty(3), np.empty((3, 3))
-    for k in range(3):
-        for m in range(3):
-            # dF is one at (k, m): G = R' dF has the row R[k, :]' in column m.
-            for i in range(3):
-                x, y = (i + 1) % 3, (i + 2) % 3
-                axis[i] = r[k, y] * (m == x) - r[k, x] * (m == y)
-            for i in range(3):
-                w[i] = inverse[0, i] * axis[0] + inverse[1, i] * axis[1] + inverse[2, i] * axis[2]
-            for i in range(3):
-                turned[i, 0] = r[i, 1] * w[2] - r[i, 2] * w[1]
-                turned[i, 1] = r[i, 2] * w[0] - r[i, 0] * w[2]
-                turned[i, 2] = r[i, 0] * w[1] - r[i, 1] * w[0]
-            for i in range(3):
-                for j in range(3):
-                    a[i, j, k, m] += part * turned[i, j]
-
-
-@compiled
-def _neo_hookean_tangent(f: Floats, det: float, g: Floats, mu: float, lam: float, a: Floats) -> None:
-    _cofactor(f, g)
-    g /= det
-    twist = mu - lam * np.log(det)
-    for i in range(3):
-        for j in range(3):
-            for k in range(3):
-                for m in range(3):
-                    a[i, j, k, m] = (
-                        mu * ((i == k) * (j == m)) + twist * g[i, m] * g[k, j] + lam * g[i, j] * g[k, m]
-                    )
 
 
 @compiled

@@ -22,7 +22,7 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
-from synth.fem.mesh.element import face_shape_slope
+from synth.fem.mesh.element import face_shape_slope, scatter
 from synth.fem.mesh.tetrahedra import Tets, boundary
 from synth.system.jit import compiled
 
@@ -102,8 +102,7 @@ class Membrane:
         local += np.einsum("fnm,ij->fnimj", held, np.eye(3))
         faces, n = len(self.faces), 3 * self.faces.shape[1]
         dof = (3 * self.faces[:, :, None] + np.arange(3, dtype=np.int32)).reshape(faces, n)
-        rows, cols = np.repeat(dof, n, axis=1).ravel(), np.tile(dof, (1, n)).ravel()
-        return sp.coo_array((local.ravel(), (rows, cols)), shape=(u.size,) * 2).tocsr()
+        return scatter(local, dof, u.size)
 
 
 def cover(tets: Tets, sheet: MembraneSheet, *, linear: bool) -> Membrane:
@@ -114,9 +113,9 @@ def cover(tets: Tets, sheet: MembraneSheet, *, linear: bool) -> Membrane:
         sheet: its stiffness and stretch.
         linear: for small strain, whatever the stretch at rest.
     """
-    faces = boundary(tets.cells, tets.order)
+    faces = boundary(tets.cells)
     faces = faces[~tets.fixed[faces].all(axis=1)]
-    local = face_shape_slope(_POINTS, tets.order)
+    local = face_shape_slope(_POINTS)
     side = np.einsum("qnk,fni->fqik", local, tets.points[faces])
     first = side[..., 0] / np.linalg.norm(side[..., 0], axis=-1, keepdims=True)
     normal = np.cross(side[..., 0], side[..., 1])

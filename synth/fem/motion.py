@@ -155,11 +155,11 @@ def nodal_mass(tets: Tets, mass_kg: float) -> Floats:
 
     Hinton, Rock & Zienkiewicz, Earthq. Eng. Struct. Dyn. 4, 1976.
     """
-    shares = np.full(4, 0.25) if tets.order == 1 else np.repeat([1 / 36, 4 / 27], [4, 6])
+    shares = np.repeat([1 / 36, 4 / 27], [4, 6])
     spread = np.bincount(tets.cells.ravel(), np.outer(volume(tets), shares).ravel(), len(tets.points))
     return np.asarray(mass_kg * spread / spread.sum())
 
 
 def volume(tets: Tets) -> Floats:
     """(M,) mm^3 of the elements."""
-    return np.asarray(quadrature(tets.points, tets.cells, tets.order).weight.sum(axis=1))
+    return np.asarray(quadrature(tets.points, tets.cells).weight.sum(axis=1))

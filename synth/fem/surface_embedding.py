@@ -74,7 +74,7 @@ def embed(tets: Tets, vertices: Floats) -> Embedding:
     face, on_face = _nearest(np.ascontiguousarray(tets.points[nodes]), np.ascontiguousarray(vertices))
     bary = np.zeros((len(vertices), 4))
     np.put_along_axis(bary, faces[face], on_face, axis=1)
-    value = _sparse(shape(bary, tets.order), tets.cells[owner[face]], len(tets.points))
+    value = _sparse(shape(bary), tets.cells[owner[face]], len(tets.points))
     used = np.unique(face)
     corners, local = np.unique(nodes[used], return_inverse=True)
     local = local.reshape(-1, 3)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
+from itertools import product
 
 import numpy as np
 import scipy.sparse as sp
@@ -15,13 +16,11 @@ from synth.fem import foreign_law
 from synth.fem.assembly import divergence, gradient, stiffness
 from synth.fem.laws import (
     NUMBER,
-    bend_swelling,
     lame,
     least_determinant,
     resist_swelling,
     stress,
     swellings,
-    tangent,
 )
 from synth.fem.membrane import Membrane, MembraneSheet, cover
 from synth.fem.mesh.element import Quadrature, quadrature, quality
@@ -32,7 +31,7 @@ Floats = NDArray[np.float64]
 _FLATTEST = (
     0.01  # mean ratio; measured: a sliver of 0.002 under a contact alone costs a quarter of the answer
 )
-
+_STEP = 1e-5  # of a displacement gradient, for differences
 
 POINTWISE = 1.0
 """Of mu: how much of lambda still acts at every point where the rest acts on elements' means (Nagtegaal,
@@ -87,13 +86,9 @@ class System:
 
     def state(self, u: Floats) -> State:
         """Energy, forces and smallest Jacobian at (N, 3) mm."""
-        count = self.mesh.weight.size
-        strain, answer, density = np.empty((count, 3, 3)), np.empty((count, 3, 3)), np.empty(count)
-        gradient(self.mesh.cells, self.mesh.slope, u, strain)
-        mu, lam = lame(1.0, self.poisson)
-        own = self.law in NUMBER
-        act = partial(stress, NUMBER[self.law]) if own else partial(foreign_law.stress, self.law)
-        least = act(strain, mu, lam - self.averaged, answer, density)
+        strain = self._strain(u)
+        answer, density = np.empty_like(strain), np.empty(len(strain))
+        least = self._law(strain, answer, density)
         energy = float(density @ self.mesh.weight.ravel())
         if self.averaged:
             energy += resist_swelling(_swelling(self.law), strain, self.mesh.weight, self.averaged, answer)
@@ -104,25 +99,45 @@ class System:
         force += spring
         if self.membrane is not None:
             energy += self.membrane.pull(u, force)
-        return State(energy, force, float(least))
+        return State(energy, force, least)
 
     def tangent(self, u: Floats) -> sp.csr_array:
-        """Stiffness at (N, 3) mm, (3N, 3N) mN/mm, springs and membrane included."""
-        strain = np.empty((self.mesh.weight.size, 3, 3))
-        gradient(self.mesh.cells, self.mesh.slope, u, strain)
-        moduli = np.empty((len(strain), 3, 3, 3, 3))
-        mu, lam = lame(1.0, self.poisson)
-        own = self.law in NUMBER
-        bend = partial(tangent, NUMBER[self.law]) if own else partial(foreign_law.tangent, self.law)
-        bend(strain, mu, lam - self.averaged, moduli)
-        along = None
+        """Stiffness at (N, 3) mm, (3N, 3N) mN/mm, springs and membrane included; moduli by differences."""
+        strain, along, pressure = self._strain(u), None, None
         if self.averaged:
             along, pressure = average(self.mesh, self.law, strain, self.averaged)
-            bend_swelling(_swelling(self.law), strain, pressure, moduli)
+        moduli = np.empty((len(strain), 3, 3, 3, 3))
+        for k, m in product(range(3), repeat=2):
+            step = np.zeros((3, 3))
+            step[k, m] = _STEP
+            ahead, behind = (self._stress(strain + way * step, pressure) for way in (1, -1))
+            moduli[..., k, m] = (ahead - behind) / (2 * _STEP)
         whole = stiffness(self.mesh, moduli, along) + _springs(self.hold, self.slip)
         if self.membrane is not None:
             whole = whole + self.membrane.stiffness_at(u)
         return whole.tocsr()
+
+    def _strain(self, u: Floats) -> Floats:
+        """(M * Q, 3, 3) displacement gradients at the quadrature points."""
+        strain = np.empty((self.mesh.weight.size, 3, 3))
+        gradient(self.mesh.cells, self.mesh.slope, u, strain)
+        return strain
+
+    def _stress(self, strain: Floats, pressure: Floats | None) -> Floats:
+        """(n, 3, 3) kPa; `pressure` (n,) kPa acts on the swelling, held as it is."""
+        first, density = np.empty_like(strain), np.empty(len(strain))
+        self._law(strain, first, density)
+        if pressure is not None:
+            swellings(_swelling(self.law), strain, density, slope := np.empty_like(strain))
+            first += pressure[:, None, None] * slope
+        return first
+
+    def _law(self, strain: Floats, stress_kpa: Floats, density: Floats) -> float:
+        """The law, but for what acts on elements' means, in place; returns the smallest det F."""
+        mu, lam = lame(1.0, self.poisson)
+        own = self.law in NUMBER
+        law = partial(stress, NUMBER[self.law]) if own else partial(foreign_law.stress, self.law)
+        return float(law(strain, mu, lam - self.averaged, stress_kpa, density))
 
     def springs(self, u: Floats) -> Floats:
         """What the springs put up at (N, 3) mm, (N, 3) mN."""
@@ -143,9 +158,7 @@ class System:
         return min(found)
 
 
-def assemble(
-    tets: Tets, law: str, poisson: float, sheet: MembraneSheet | None = None, *, averaged: bool = True
-) -> System:
+def assemble(tets: Tets, law: str, poisson: float, sheet: MembraneSheet | None = None) -> System:
     """Builds and factors the equations.
 
     Args:
@@ -153,8 +166,6 @@ def assemble(
         law: a key of `laws.NUMBER`, or a plug-in's name.
         poisson: below 0.5.
         sheet: a membrane on the surface.
-        averaged: quadratic elements resist their mean swelling rather than that at every point, but for
-            `POINTWISE`; False is what that is measured against.
 
     Raises:
         UserError: the mesh holds a tetrahedron that is flat or inside out.
@@ -164,9 +175,9 @@ def assemble(
         raise UserError(
             f"the mesh's element {shape.argmin()} is flat or inside out (mean ratio {shape.min():.1e})"
         )
-    mesh = quadrature(tets.points, tets.cells, tets.order)
+    mesh = quadrature(tets.points, tets.cells)
     mu, lam = lame(1.0, poisson)
-    mean = max(lam - POINTWISE * mu, 0.0) if averaged and tets.order == 2 else 0.0
+    mean = max(lam - POINTWISE * mu, 0.0)
     along = None
     if mean:
         along, _ = average(mesh, "linear", np.zeros((mesh.weight.size, 3, 3)), mean)
@@ -184,7 +195,7 @@ def assemble(
         diag_pivot_thresh=0.0,
         options={"SymmetricMode": True},
     )
-    corners = quadrature(tets.points, tets.cells, tets.order, np.eye(4))
+    corners = quadrature(tets.points, tets.cells, np.eye(4))
     return System(mesh, law, poisson, free, tets.hold, whole, factor, corners, membrane, mean, tets.slip)
 
 
@@ -206,9 +217,9 @@ def average(mesh: Quadrature, law: str, strain: Floats, lam: float) -> tuple[Flo
 
 def hooke(young: float, poisson: float) -> Floats:
     """Moduli of Hooke's law, (1, 3, 3, 3, 3) in the unit of `young`: the tangent of every law at rest."""
-    moduli = np.empty((1, 3, 3, 3, 3))
-    tangent(NUMBER["linear"], np.zeros((1, 3, 3)), *lame(young, poisson), moduli)
-    return moduli
+    (mu, lam), one = lame(young, poisson), np.eye(3)
+    alike = np.einsum("ik,jm->ijkm", one, one) + np.einsum("im,jk->ijkm", one, one)
+    return np.asarray(mu * alike + lam * np.einsum("ij,km->ijkm", one, one))[None]
 
 
 def _swelling(law: str) -> int:

@@ -26,7 +26,7 @@ def build(job: Job, case: Scenario) -> tuple[CortexSurface, Tets]:
     """The fine surface of a scenario and the volume under it, finest where its contacts are."""
     surface, brain = cortex(job, case)
     focus = [place for gesture in case.gestures for place in gesture.focus]
-    mesh, slips = (job.fem.tets, 2, focus), case.tissue.skull == "slip"
+    mesh, slips = (job.fem.tets, focus), case.tissue.skull == "slip"
     if brain is not None:
         return surface, tetrahedra.from_brain(brain, job.anatomy, *mesh, slips=slips)
     height = HeightMap(surface.pia, surface.extent_mm)

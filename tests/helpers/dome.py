@@ -23,4 +23,4 @@ def patch(n: int = 61, extent: float = 46.0) -> Shape:
 
 
 def block(fem: schema.FemSection) -> tetrahedra.Tets:
-    return tetrahedra.block(ANATOMY, fem.tets, 2)
+    return tetrahedra.block(ANATOMY, fem.tets)

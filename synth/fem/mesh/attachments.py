@@ -10,7 +10,7 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from synth.errors import UserError
-from synth.fem.mesh.element import bary_slope, shape
+from synth.fem.mesh.element import bary_slope, scatter, shape
 from synth.job import schema
 
 Floats = NDArray[np.float64]
@@ -22,15 +22,12 @@ _SAMPLES = (_GRID + 0.25) / _FINE
 """(165, 4) even barycentric places: a sheet may be much thinner than the elements that it passes."""
 
 
-def springs(
-    points: Floats, cells: Ints, order: int, attachments: Sequence[schema.AttachmentSection]
-) -> sp.csr_array:
+def springs(points: Floats, cells: Ints, attachments: Sequence[schema.AttachmentSection]) -> sp.csr_array:
     """Springs of all attachments.
 
     Args:
         points: (N, 3) mm, all nodes.
-        cells: (M, 4 or 10).
-        order: 1 or 2.
+        cells: (M, 10).
         attachments: in the axes of `points`.
 
     Returns:
@@ -43,7 +40,7 @@ def springs(
     if not attachments:
         return total
     corner = points[cells[:, :4]]
-    value, share = shape(_SAMPLES, order), bary_slope(corner)[1] / len(_SAMPLES)
+    value, share = shape(_SAMPLES), bary_slope(corner)[1] / len(_SAMPLES)
     for k, attachment in enumerate(attachments):
         near = np.linalg.norm(corner - attachment.point, axis=2).min(axis=1)
         reach = np.ptp(corner, axis=1).max(axis=1) * np.sqrt(3) + attachment.radius_mm
@@ -56,9 +53,7 @@ def springs(
         across = attachment.radius_mm if attachment.normal is None else attachment.thickness_mm
         weight = held * (attachment.firm_per_mm / across * share[chosen[touched]])[:, None]
         local = np.einsum("mq,qi,qj->mij", weight, value, value, optimize=True)
-        n = mine.shape[1]
-        rows, columns = np.repeat(mine, n, axis=1).ravel(), np.tile(mine, (1, n)).ravel()
-        total = total + sp.coo_array((local.ravel(), (rows, columns)), shape=total.shape).tocsr()
+        total = total + scatter(local, mine, len(points))
     return sp.csr_array(total)
 
 

@@ -1,10 +1,12 @@
-"""Tetrahedra of order 1 and 2: shape functions, quadrature, and what the volume integrals need of a mesh."""
+"""Quadratic tetrahedra: shape functions, quadrature, and what the volume integrals need of a mesh."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from synth.fem.mesh.refine import EDGES
@@ -13,12 +15,9 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 _A, _B = (5 + 3 * np.sqrt(5)) / 20, (5 - np.sqrt(5)) / 20
-TET_POINTS = {
-    1: np.full((1, 4), 0.25),
-    2: np.full((4, 4), _B) + (_A - _B) * np.eye(4),
-}
-"""Barycentric quadrature points by element order, all of weight 1/Q: exact for the rest stiffness of straight
-tetrahedra (degree 0 and 2; Keast, Comput. Meth. Appl. Mech. Eng. 55, 1986)."""
+TET_POINTS = np.full((4, 4), _B) + (_A - _B) * np.eye(4)
+"""Barycentric quadrature points, all of weight 1/4, of degree 2: exact for the rest stiffness of straight
+tetrahedra (Keast, Comput. Meth. Appl. Mech. Eng. 55, 1986)."""
 
 _C, _D = 0.445948490915965, 0.091576213509771
 TRI_POINTS = np.array(
@@ -27,54 +26,42 @@ TRI_POINTS = np.array(
 """(6, 3) barycentric points of degree 4 on a triangle (Dunavant, Int. J. Numer. Meth. Eng. 21, 1985)."""
 TRI_WEIGHTS = np.repeat([0.223381589678011, 0.109951743655322], 3)
 """(6,) their weights, summing to 1."""
+_SIDES = ((0, 1), (0, 2), (1, 2))  # of a face, in the order of its midsides
 
 
-def shape(bary: Floats, order: int) -> Floats:
-    """Values of the shape functions.
-
-    Args:
-        bary: (..., 4) barycentric coordinates.
-        order: 1 or 2.
-
-    Returns:
-        (..., 4 or 10): corners, then midsides in the order of `EDGES`.
-    """
-    if order == 1:
-        return bary.copy()
+def shape(bary: Floats) -> Floats:
+    """Shape functions (..., 10) at (..., 4) barycentric coordinates: corners, then midsides as in `EDGES`."""
     corners = bary * (2 * bary - 1)
     return np.concatenate([corners, 4 * bary[..., EDGES[:, 0]] * bary[..., EDGES[:, 1]]], axis=-1)
 
 
-def shape_slope(bary: Floats, order: int) -> Floats:
-    """Derivatives of the shape functions by the barycentric coordinates, (..., 4 or 10, 4)."""
-    eye = np.broadcast_to(np.eye(4), (*bary.shape[:-1], 4, 4))
-    if order == 1:
-        return eye.copy()
-    corners = eye * (4 * bary - 1)[..., None, :]
+def shape_slope(bary: Floats) -> Floats:
+    """Derivatives of the shape functions by the barycentric coordinates, (..., 10, 4)."""
+    corners = np.broadcast_to(np.eye(4), (*bary.shape[:-1], 4, 4)) * (4 * bary - 1)[..., None, :]
     left, right = EDGES[:, 0], EDGES[:, 1]
     sides = 4 * (bary[..., left, None] * np.eye(4)[right] + bary[..., right, None] * np.eye(4)[left])
     return np.concatenate([corners, sides], axis=-2)
 
 
-def face_shape(bary: Floats, order: int) -> Floats:
-    """Shape functions on a face, (..., 3 or 6): corners, then midsides 01, 02, 12."""
-    if order == 1:
-        return bary.copy()
-    sides = np.stack([4 * bary[..., i] * bary[..., j] for i, j in ((0, 1), (0, 2), (1, 2))], axis=-1)
+def face_shape(bary: Floats) -> Floats:
+    """Shape functions on a face, (..., 6): corners, then midsides 01, 02, 12."""
+    sides = np.stack([4 * bary[..., i] * bary[..., j] for i, j in _SIDES], axis=-1)
     return np.concatenate([bary * (2 * bary - 1), sides], axis=-1)
 
 
-def face_shape_slope(bary: Floats, order: int) -> Floats:
-    """Derivatives of `face_shape` by the second and third barycentric coordinate, (Q, 3 or 6, 2)."""
-    eye = np.broadcast_to(np.eye(3), (len(bary), 3, 3))
-    slope = eye
-    if order == 2:
-        sides = [
-            bary[:, [i], None] * np.eye(3)[j] + bary[:, [j], None] * np.eye(3)[i]
-            for i, j in ((0, 1), (0, 2), (1, 2))
-        ]
-        slope = np.concatenate([eye * (4 * bary - 1)[:, None, :], 4 * np.concatenate(sides, axis=1)], axis=1)
+def face_shape_slope(bary: Floats) -> Floats:
+    """Derivatives of `face_shape` by the second and third barycentric coordinate, (Q, 6, 2)."""
+    corners = np.broadcast_to(np.eye(3), (len(bary), 3, 3)) * (4 * bary - 1)[:, None, :]
+    sides = [bary[:, [i], None] * np.eye(3)[j] + bary[:, [j], None] * np.eye(3)[i] for i, j in _SIDES]
+    slope = np.concatenate([corners, 4 * np.concatenate(sides, axis=1)], axis=1)
     return np.asarray(slope[..., 1:] - slope[..., :1])
+
+
+def scatter(local: Floats, nodes: NDArray[Any], size: int) -> sp.csr_array:
+    """Sums element matrices (E, n, n) over their nodes (E, n) into (size, size)."""
+    n = nodes.shape[1]
+    rows, columns = np.repeat(nodes, n, axis=1).ravel(), np.tile(nodes, (1, n)).ravel()
+    return sp.coo_array((local.ravel(), (rows, columns)), shape=(size, size)).tocsr()
 
 
 def bary_slope(corners: Floats) -> tuple[Floats, Floats]:
@@ -118,16 +105,14 @@ class Quadrature:
     """N, number of nodes."""
 
 
-def quadrature(points: Floats, cells: Ints, order: int, at: Floats | None = None) -> Quadrature:
+def quadrature(points: Floats, cells: Ints, at: Floats = TET_POINTS) -> Quadrature:
     """Prepares a mesh.
 
     Args:
-        points: (N, 3) mm, all nodes; sides of quadratic elements may be curved.
-        cells: (M, 4 or 10).
-        order: 1 or 2.
-        at: (Q, 4) barycentric places in every element. Empty: `TET_POINTS`.
+        points: (N, 3) mm, all nodes; sides may be curved.
+        cells: (M, 10).
+        at: (Q, 4) barycentric places in every element, of equal weight.
     """
-    at = TET_POINTS[order] if at is None else at
     gradient, determinant = gradients(points[cells], at)
     return Quadrature(
         cells.astype(np.int32), np.ascontiguousarray(gradient), determinant / (6 * len(at)), len(points)
@@ -138,19 +123,19 @@ def gradients(nodes: Floats, bary: Floats) -> tuple[Floats, Floats]:
     """Gradients of the shape functions of isoparametric elements.
 
     Args:
-        nodes: (M, 4 or 10, 3) mm.
+        nodes: (M, 10, 3) mm.
         bary: (Q, 4).
 
     Returns:
-        (M, Q, n, 3) 1/mm, and (M, Q) mm^3: 6 times the volume of a straight element, negative inside out.
+        (M, Q, 10, 3) 1/mm, and (M, Q) mm^3: 6 times the volume of a straight element, negative inside out.
     """
     local, jacobian = _mapping(nodes, bary)
     return np.einsum("qnk,mqdk->mqnd", local, np.linalg.inv(jacobian)), np.linalg.det(jacobian)
 
 
 def _mapping(nodes: Floats, bary: Floats) -> tuple[Floats, Floats]:
-    """Derivatives by three local coordinates, of the shape functions (Q, n, 3) and of place (M, Q, 3, 3)."""
-    local = shape_slope(bary, 1 if nodes.shape[1] == 4 else 2)
+    """Derivatives by three local coordinates, of the shape functions (Q, 10, 3) and of place (M, Q, 3, 3)."""
+    local = shape_slope(bary)
     local = local[..., 1:] - local[..., :1]  # the first coordinate is what the others leave of 1
     flat = np.ascontiguousarray(local.transpose(0, 2, 1).reshape(-1, local.shape[1]))
     return local, (flat @ nodes).reshape(len(nodes), len(bary), 3, 3)
@@ -158,7 +143,6 @@ def _mapping(nodes: Floats, bary: Floats) -> tuple[Floats, Floats]:
 
 def jacobians(points: Floats, cells: Ints) -> Floats:
     """Jacobian at the corners and quadrature points over that of the straight element, (M, 4 + Q)."""
-    order = 1 if cells.shape[1] == 4 else 2
-    determinant = np.linalg.det(_mapping(points[cells], np.vstack([np.eye(4), TET_POINTS[order]]))[1])
+    determinant = np.linalg.det(_mapping(points[cells], np.vstack([np.eye(4), TET_POINTS]))[1])
     straight = np.linalg.det(points[cells[:, 1:4]] - points[cells[:, :1]])
     return np.asarray(determinant / straight[:, None])

@@ -13,7 +13,7 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 from scipy.sparse.linalg import spsolve
 
-from synth.fem.mesh.element import TRI_POINTS, TRI_WEIGHTS, quality
+from synth.fem.mesh.element import TRI_POINTS, TRI_WEIGHTS, quality, scatter
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -60,10 +60,8 @@ def _once(points: Floats, cells: Ints, faces: Ints, inside: Callable[[Floats], F
     weight = 0.5 * double[:, None] * TRI_WEIGHTS
     value = TRI_POINTS[None] * tilt[:, None, :]
     matrix = np.einsum("fq,fqi,fqj->fij", weight, value, value)
-    size = (len(used), len(used))
-    rows, columns = np.repeat(local, 3, axis=1).ravel(), np.tile(local, (1, 3)).ravel()
-    whole = sp.coo_array((matrix.ravel(), (rows, columns)), shape=size).tocsc()
-    whole = whole + 1e-6 * float(whole.diagonal().mean()) * sp.eye_array(size[0], format="csc")
+    whole = scatter(matrix, local, len(used)).tocsc()
+    whole = whole + 1e-6 * float(whole.diagonal().mean()) * sp.eye_array(len(used), format="csc")
     asked = np.bincount(local.ravel(), np.einsum("fq,fqi,fq->fi", weight, value, height).ravel(), len(used))
     shortest = np.full(len(used), np.inf)
     np.minimum.at(shortest, local, sides.min(axis=1)[:, None])

@@ -1,7 +1,7 @@
 """The upper boundary of a block follows gyri and sulci, as well as its faces can.
 
 The heights of its nodes are those whose faces lie on the surface in the mean (least squares over the faces):
-what is thinner than a face averages out, not hit or missed by a corner. Quadratic faces are curved.
+what is thinner than a face averages out, not hit or missed by a corner. Faces are curved.
 """
 
 from __future__ import annotations
@@ -10,13 +10,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.sparse as sp
 from numpy.typing import NDArray
 from scipy.interpolate import LinearNDInterpolator
 from scipy.ndimage import map_coordinates
 from scipy.sparse.linalg import spsolve
 
-from synth.fem.mesh.element import face_shape, jacobians, quality
+from synth.fem.mesh.element import face_shape, jacobians, quality, scatter
 from synth.fem.mesh.refine import EDGES
 
 Floats = NDArray[np.float64]
@@ -62,13 +61,13 @@ def raise_top(points: Floats, cells: Ints, faces: Ints, ground: Field, height: F
 
     Args:
         points: (N, 3) mm, z from -depth to 0; midsides in the middle of their sides.
-        cells: (M, 4 or 10).
-        faces: (F, 3 or 6) of the upper side.
+        cells: (M, 10).
+        faces: (F, 6) of the upper side.
         ground: smooth; the box is bent after it as a whole.
         height: what the upper side is to be; where elements would get bad, it is only partly.
 
     Returns:
-        (N, 3) mm. Sides are straight but for those of quadratic elements on the upper side.
+        (N, 3) mm. Sides are straight but for those on the upper side.
     """
     corners = int(cells[:, :4].max()) + 1
     sinking = 1 + points[:, 2] / -points[:, 2].min()
@@ -81,11 +80,9 @@ def raise_top(points: Floats, cells: Ints, faces: Ints, ground: Field, height: F
     below = np.setdiff1d(np.arange(corners), first)
     rise[below] = sinking[below] * LinearNDInterpolator(points[first, :2], rise[first])(points[below, :2])
 
-    quadratic = cells.shape[1] == 10
     ends = np.zeros((len(points), 2), np.int64)
     ends[:corners] = np.arange(corners)[:, None]
-    if quadratic:
-        ends[cells[:, 4:]] = cells[:, EDGES]
+    ends[cells[:, 4:]] = cells[:, EDGES]
     whole = base[:, 2] + rise
     bulge = np.where(np.isin(np.arange(len(points)), top), whole - whole[ends].mean(axis=1), 0.0)
     share, raised = np.ones(len(points)), base.copy()
@@ -105,11 +102,10 @@ def _fit_heights(points: Floats, faces: Ints, wanted: Floats) -> tuple[Ints, Flo
     corner = points[faces[:, :3], :2]
     side, other = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
     area = 0.5 * np.abs(side[:, 0] * other[:, 1] - side[:, 1] * other[:, 0])
-    value = face_shape(_PLACES, 1 if faces.shape[1] == 3 else 2)
+    value = face_shape(_PLACES)
     local = np.einsum("f,qi,qj->fij", area, value, value)
     used, at = np.unique(faces, return_inverse=True)
-    at, n = at.reshape(faces.shape), faces.shape[1]
-    rows, columns = np.repeat(at, n, axis=1).ravel(), np.tile(at, (1, n)).ravel()
-    matrix = sp.coo_array((local.ravel(), (rows, columns)), shape=(len(used),) * 2).tocsc()
+    at = at.reshape(faces.shape)
+    matrix = scatter(local, at, len(used)).tocsc()
     asked = np.bincount(at.ravel(), np.einsum("f,qi,fq->fi", area, value, wanted).ravel(), len(used))
     return used, np.asarray(spsolve(matrix, asked))

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from synth.errors import UserError
 from synth.fem.mesh import attachments, winding
-from synth.fem.mesh.element import TRI_POINTS, TRI_WEIGHTS, bary_slope, face_shape
+from synth.fem.mesh.element import TRI_POINTS, TRI_WEIGHTS, bary_slope, face_shape, scatter
 from synth.fem.mesh.fit import fit
 from synth.fem.mesh.lattice_stuffing import stuff
 from synth.fem.mesh.refine import edges_of, refine
@@ -41,16 +41,17 @@ _KUHN = np.array([[0, 1, 3, 7], [0, 5, 1, 7], [0, 3, 2, 7], [0, 2, 6, 7], [0, 4,
 FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])
 """Corners of the four faces of a tetrahedron, each opposite its corner, counter-clockwise from outside."""
 
+_MIDSIDES = np.array([[7, 8, 9], [6, 5, 9], [4, 6, 8], [5, 4, 7]])
+
 
 @dataclass(frozen=True)
 class Tets:
     """A meshed brain, in world axes."""
 
     points: Floats
-    """(N, 3) mm: corners first, then (order 2) nodes on the edges, in their middle but for curved ones."""
+    """(N, 3) mm: corners first, then nodes on the edges, in their middle but for curved ones."""
     cells: Ints
-    """(M, 4) or (M, 10), positively oriented; midsides in the order of `refine.EDGES`."""
-    order: int
+    """(M, 10), positively oriented; midsides in the order of `refine.EDGES`."""
     fixed: NDArray[np.bool_]
     """(N,) nodes that cannot move: the walls a block is cut out at."""
     hold: sp.csr_array
@@ -62,7 +63,6 @@ class Tets:
 def block(
     anatomy: schema.AnatomySection,
     tets: int,
-    order: int,
     focus: Sequence[Contact] = (),
     height: HeightMap | None = None,
     *,
@@ -74,7 +74,6 @@ def block(
     Args:
         anatomy: dome_mm, craniotomy and attachments are used.
         tets: number of tetrahedra to aim for.
-        order: 1 or 2.
         focus: where the load will be; finest there. Empty: finest in the whole opening.
         height: of the surface over the opening and its rim. Empty: the bare dome.
         slips: tissue slips along the skull round the opening, rather than being bonded to it.
@@ -93,8 +92,8 @@ def block(
     opening = anatomy.craniotomy.radius_mm
     points, cells = refine(points, cells, _grading(opening, focus), tets)
     wall = (np.abs(np.abs(points[:, :2]) - size[:2] / 2) < 1e-9).any(axis=1) | (points[:, 2] < 1e-9 - size[2])
-    points, cells = lengthened(points, cells, order)
-    faces = boundary(cells, order)
+    points, cells = with_midsides(points, cells)
+    faces = boundary(cells)
 
     def ground(xy: Floats) -> Floats:
         return dome(xy, anatomy.dome_mm)
@@ -107,14 +106,13 @@ def block(
         ground if height is None else height.over(ground),
     )
     # A face is on a wall if its three corners are; the upper edge of the walls belongs to both.
-    return _finished(points, cells, order, wall, anatomy.craniotomy, anatomy.attachments, slips)
+    return _finished(points, cells, wall, anatomy.craniotomy, anatomy.attachments, slips)
 
 
 def from_brain(
     brain: Brain,
     anatomy: schema.AnatomySection,
     tets: int,
-    order: int,
     focus: Sequence[Contact] = (),
     *,
     slips: bool = False,
@@ -134,8 +132,8 @@ def from_brain(
     if top < -anatomy.craniotomy.radius_mm:
         raise UserError("anatomy.craniotomy: there is no volume under the opening")
     held = brain.placed(anatomy.attachments)
-    points, cells = lengthened(points, cells, order)
-    return _finished(points, cells, order, np.zeros(len(points), bool), anatomy.craniotomy, held, slips)
+    points, cells = with_midsides(points, cells)
+    return _finished(points, cells, np.zeros(len(points), bool), anatomy.craniotomy, held, slips)
 
 
 def dome(xy: Floats, radius_mm: float) -> Floats:
@@ -144,18 +142,19 @@ def dome(xy: Floats, radius_mm: float) -> Floats:
     return np.asarray(np.sqrt(radius_mm**2 - reach) - radius_mm)
 
 
-def lengthened(points: Floats, cells: Ints, order: int) -> tuple[Floats, Ints]:
-    """Adds the midside nodes of order 2: cells (M, 4) become (M, 10); those of order 1 stay as they are."""
-    if order == 1:
-        return points, cells
+def with_midsides(points: Floats, cells: Ints) -> tuple[Floats, Ints]:
+    """Adds the midside nodes: cells (M, 4) become (M, 10)."""
     pairs, of = edges_of(cells)
     return np.vstack([points, points[pairs].mean(axis=1)]), np.hstack([cells, len(points) + of])
 
 
-def boundary(cells: Ints, order: int) -> Ints:
-    """Faces with one tetrahedron, (F, 3 or 6), counter-clockwise seen from outside; midsides 01, 02, 12."""
+def boundary(cells: Ints) -> Ints:
+    """Faces with one tetrahedron, counter-clockwise seen from outside.
+
+    (F, 3) corners of cells (M, 4); of cells (M, 10) also midsides 01, 02, 12, (F, 6).
+    """
     owner, off = outer_faces(cells)
-    local = FACES if order == 1 else np.hstack([FACES, [[7, 8, 9], [6, 5, 9], [4, 6, 8], [5, 4, 7]]])
+    local = FACES if cells.shape[1] == 4 else np.hstack([FACES, _MIDSIDES])
     return np.asarray(cells[owner[:, None], local[off]])
 
 
@@ -230,30 +229,29 @@ def _filled(brain: Brain, grading: Callable[[Floats], Floats], tets: int) -> tup
             break
         lattice = int(lattice * tets / len(cells))
     if len(cells):
-        points = fit(points, cells, boundary(cells, 1), lambda at: turns(at) - 0.5)
+        points = fit(points, cells, boundary(cells), lambda at: turns(at) - 0.5)
     return points, cells
 
 
 def _finished(
     points: Floats,
     cells: Ints,
-    order: int,
     wall: NDArray[np.bool_],
     at: schema.CraniotomySection,
     held: Sequence[schema.AttachmentSection],
     slips: bool,
 ) -> Tets:
-    faces = boundary(cells, order)
+    faces = boundary(cells)
     on_wall = wall[faces[:, :3]].all(axis=1)
     fixed = np.zeros(len(points), bool)
     fixed[faces[on_wall]] = True
-    bonded, slip = _springs(points, faces[~on_wall], order, at, slips)
-    hold = bonded + attachments.springs(points, cells, order, held)
-    return Tets(points, cells, order, fixed, sp.csr_array(hold), slip if slips else None)
+    bonded, slip = _springs(points, faces[~on_wall], at, slips)
+    hold = bonded + attachments.springs(points, cells, held)
+    return Tets(points, cells, fixed, sp.csr_array(hold), slip if slips else None)
 
 
 def _springs(
-    points: Floats, faces: Ints, order: int, at: schema.CraniotomySection, slips: bool
+    points: Floats, faces: Ints, at: schema.CraniotomySection, slips: bool
 ) -> tuple[sp.csr_array, sp.csr_array]:
     """The skull: springs on the surface that grow, over the rim's width, from none in the opening to firm.
 
@@ -270,17 +268,14 @@ def _springs(
     # Deep below, it is the far side of the brain, which no opening bares.
     deep = place[..., 2] < -2 * at.radius_mm
     firm[deep] = 1
-    value = face_shape(TRI_POINTS, order)
+    value = face_shape(TRI_POINTS)
     pressed = _FIRM_PER_MM * firm * firm * (3 - 2 * firm) * area[:, None] * TRI_WEIGHTS
-    n = faces.shape[1]
 
-    def gathered(part: Floats) -> sp.coo_array:
-        local = np.einsum("fq,qi,qj->fij", part, value, value)
-        rows, cols = np.repeat(faces, n, axis=1).ravel(), np.tile(faces, (1, n)).ravel()
-        return sp.coo_array((local.ravel(), (rows, cols)), shape=(len(points),) * 2)
+    def gathered(part: Floats) -> sp.csr_array:
+        return scatter(np.einsum("fq,qi,qj->fij", part, value, value), faces, len(points))
 
     if not slips:
-        return gathered(pressed).tocsr(), sp.csr_array((3 * len(points),) * 2)
+        return gathered(pressed), sp.csr_array((3 * len(points),) * 2)
     normal = facing / (2 * area)[:, None]
     slip = sp.csr_array((3 * len(points),) * 2)
     for i in range(3):
@@ -289,4 +284,4 @@ def _springs(
             one[i, j] = 1
             part = np.where(deep, 0, pressed) * (normal[:, i] * normal[:, j])[:, None]
             slip = slip + sp.kron(gathered(part), one, format="csr")
-    return gathered(np.where(deep, pressed, 0)).tocsr(), sp.csr_array(slip)
+    return gathered(np.where(deep, pressed, 0)), sp.csr_array(slip)

@@ -24,7 +24,7 @@ FALX = {
 def moved(tets: Tets) -> np.ndarray:
     """(N, 3) mm under an even pull on the opening, upwards and aside."""
     near = np.linalg.norm(tets.points, axis=1) < 7
-    outer = np.isin(np.arange(len(near)), tetrahedra.boundary(tets.cells[:, :4], 1))
+    outer = np.isin(np.arange(len(near)), tetrahedra.boundary(tets.cells[:, :4]))
     return assemble(tets, "linear", 0.4).solve(np.outer(near & outer, (0.5, 0.0, 1.0)))
 
 
@@ -42,8 +42,8 @@ def compared(free: Tets, held: Tets, region: schema.AttachmentSection, edge_mm: 
 @pytest.mark.slow
 def test_a_region_of_the_block_is_held_and_the_rest_is_not() -> None:
     region = schema.AttachmentSection.model_validate(FALX)
-    free = tetrahedra.block(schema.AnatomySection(), 2500, 2)
-    held = tetrahedra.block(schema.AnatomySection(attachments=(region,)), 2500, 2)
+    free = tetrahedra.block(schema.AnatomySection(), 2500)
+    held = tetrahedra.block(schema.AnatomySection(attachments=(region,)), 2500)
     inside, beyond = compared(free, held, region, 8.0)
     assert inside < 0.1
     assert beyond > 0.6
@@ -51,17 +51,17 @@ def test_a_region_of_the_block_is_held_and_the_rest_is_not() -> None:
 
 def test_the_springs_are_the_regions_volume() -> None:
     """A rigid shift by 1 mm costs firm/thickness times the volume of the sheet."""
-    tets = tetrahedra.block(schema.AnatomySection(), 1500, 2)
+    tets = tetrahedra.block(schema.AnatomySection(), 1500)
     disc = schema.AttachmentSection(point=(0, 0, -25), normal=(0, 0.6, 0.8), radius_mm=15, thickness_mm=4)
     ones = np.ones(len(tets.points))
-    total = ones @ (attachments.springs(tets.points, tets.cells, 2, (disc,)) @ ones)
+    total = ones @ (attachments.springs(tets.points, tets.cells, (disc,)) @ ones)
     assert total == pytest.approx(disc.firm_per_mm * np.pi * 15**2, rel=0.05)
 
 
 def test_an_attachment_without_tissue_or_direction_is_refused() -> None:
     nowhere = schema.AttachmentSection(point=(0, 0, 40), radius_mm=5)
     with pytest.raises(UserError, match="attachments"):
-        tetrahedra.block(schema.AnatomySection(attachments=(nowhere,)), 300, 1)
+        tetrahedra.block(schema.AnatomySection(attachments=(nowhere,)), 300)
     for wrong in ({"normal": (0, 0, 0)}, {"radius_mm": -1}):
         with pytest.raises(ValidationError):
             schema.AttachmentSection.model_validate({"point": (0, 0, -20), "radius_mm": 5} | wrong)

@@ -33,18 +33,14 @@ def own() -> str:
     return "test-neo-hookean"
 
 
-@pytest.mark.parametrize("averaged", [False, True])
-def test_the_same_law_gives_the_same_equations(own: str, averaged: bool) -> None:
-    tets = tetrahedra.block(ANATOMY, 400, 2)
-    theirs, ours = (assemble(tets, law, 0.45, averaged=averaged) for law in (own, "neo-hookean"))
-    assert (ours.averaged > 0) == averaged
+def test_the_same_law_gives_the_same_equations(own: str) -> None:
+    tets = tetrahedra.block(ANATOMY, 400)
+    theirs, ours = (assemble(tets, law, 0.45) for law in (own, "neo-hookean"))
     u = 0.2 * np.random.default_rng(0).normal(size=tets.points.shape)
     one, other = theirs.state(u), ours.state(u)
     assert one.energy == pytest.approx(other.energy, rel=1e-10)
     assert one.jacobian == pytest.approx(other.jacobian, rel=1e-10)
     np.testing.assert_allclose(one.force, other.force, atol=1e-9 * np.abs(other.force).max())
-    apart = abs(theirs.tangent(u) - ours.tangent(u)).max()
-    assert apart < 1e-6 * abs(ours.tangent(u)).max(), "by differences, so not to rounding"
 
 
 def spoilt(change: str) -> type[NeoHookean]:

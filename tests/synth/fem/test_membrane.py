@@ -22,7 +22,7 @@ Floats = np.ndarray
 
 @pytest.fixture(scope="module")
 def tets() -> Tets:
-    return tetrahedra.block(ANATOMY, 250, 2, ((2.0, 1.0, 4.0),))
+    return tetrahedra.block(ANATOMY, 250, ((2.0, 1.0, 4.0),))
 
 
 def pulled(sheet: Membrane, u: Floats) -> tuple[float, Floats]:
@@ -44,7 +44,7 @@ def test_force_is_the_slope_of_energy_and_stiffness_that_of_force(tets: Tets, li
 
 def test_stretch_pull_and_wrinkles_are_those_of_the_textbook(tets: Tets) -> None:
     """Tension of an incompressible neo-Hookean sheet: even stretch, uniaxial tension, compression."""
-    flat = tetrahedra.block(schema.AnatomySection(dome_mm=1e9), 250, 2)
+    flat = tetrahedra.block(schema.AnatomySection(dome_mm=1e9), 250)
     sheet = cover(flat, MembraneSheet(6.0, 1.0), linear=False)
     area = float(sheet.weight.sum())
     assert area == pytest.approx(1e4, rel=1e-9)
@@ -69,7 +69,7 @@ def test_work_over_a_load_cycle_is_the_stored_energy() -> None:
     fem = schema.FemSection(gestures=("push",), load=(0.25, 0.25), membrane=schema.MembraneSection(intact=1))
     tissue = replace(scenario.draw_tissue(fem, np.random.default_rng(1)), membrane=Pia(300.0, 0.1, 1.02))
     gesture = scenario.draw_gesture(fem, OPENING_MM, tissue.young_kpa, np.random.default_rng(2))
-    tets = tetrahedra.block(ANATOMY, 700, 2, gesture.focus)
+    tets = tetrahedra.block(ANATOMY, 700, gesture.focus)
     found = solver.deform(fem, tissue, [gesture], tets, patch(121), 97, 25.0)
     force = found.area[:, None] * found.traction
     step = np.diff(found.displacement, axis=0)

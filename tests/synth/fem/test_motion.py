@@ -12,11 +12,11 @@ from synth.fem.motion import Clock, march_in_time, nodal_mass
 from synth.fem.system import assemble
 
 
-def cube(order: int = 2) -> Tets:
+def cube() -> Tets:
     """A cube of 10 mm on a fixed floor."""
     points, cells = tetrahedra._bricks(np.array([10.0, 10.0, 10.0]), 8)
-    points, cells = tetrahedra.lengthened(points, cells, order)
-    return Tets(points, cells, order, points[:, 2] < -10 + 1e-9, sp.csr_array((len(points),) * 2))
+    points, cells = tetrahedra.with_midsides(points, cells)
+    return Tets(points, cells, points[:, 2] < -10 + 1e-9, sp.csr_array((len(points),) * 2))
 
 
 def pulled(tets: Tets, load: float) -> np.ndarray:

@@ -19,7 +19,7 @@ def moved(pulse: Pulse | None, law: str, **fem: object) -> solver.Deformation:
     asked = schema.FemSection.model_validate({"gestures": ("pull",), "load": 0.1, "law": law} | fem)
     tissue = scenario.draw_tissue(asked, np.random.default_rng(1))
     gesture = scenario.draw_gesture(asked, OPENING_MM, tissue.young_kpa, np.random.default_rng(2))
-    tets = tetrahedra.block(ANATOMY, 300, 2, gesture.focus)
+    tets = tetrahedra.block(ANATOMY, 300, gesture.focus)
     return solver.deform(asked, tissue, [gesture], tets, patch(), FRAMES, RATE, pulse, OPENING_MM)
 
 

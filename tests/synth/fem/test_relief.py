@@ -25,11 +25,11 @@ def sulci(depth: float, spacing: float) -> HeightMap:
 
 def gap(tets: Tets, height: HeightMap) -> float:
     """Root mean square height between the mesh and the map under the contact, mm."""
-    faces = tetrahedra.boundary(tets.cells, tets.order)
+    faces = tetrahedra.boundary(tets.cells)
     middle = tets.points[faces[:, :3]].mean(axis=1)
     near = faces[np.hypot(middle[:, 0] - 1.0, middle[:, 1] - 2.0) < 4.0]
     bary = np.random.default_rng(0).dirichlet(np.ones(3), 40)
-    at = np.einsum("qn,fnd->fqd", face_shape(bary, tets.order), tets.points[near]).reshape(-1, 3)
+    at = np.einsum("qn,fnd->fqd", face_shape(bary), tets.points[near]).reshape(-1, 3)
     wanted = height.over(lambda xy: tetrahedra.dome(xy, ANATOMY.dome_mm))(at[:, :2])
     return float(np.sqrt(np.mean((at[:, 2] - wanted) ** 2)))
 
@@ -37,14 +37,14 @@ def gap(tets: Tets, height: HeightMap) -> float:
 @pytest.mark.slow
 def test_the_boundary_lies_on_the_relief() -> None:
     height = sulci(1.4, 10.0)
-    assert gap(tetrahedra.block(ANATOMY, 1600, 2, FOCUS, height), height) < 0.02
-    assert gap(tetrahedra.block(ANATOMY, 1600, 2, FOCUS), height) > 0.4
+    assert gap(tetrahedra.block(ANATOMY, 1600, FOCUS, height), height) < 0.02
+    assert gap(tetrahedra.block(ANATOMY, 1600, FOCUS), height) > 0.4
 
 
 def test_a_wild_relief_leaves_the_elements_sound() -> None:
     rough = HeightMap(np.random.default_rng(0).normal(0, 30.0, (SIDE, SIDE)), EXTENT)
-    for tets in (tetrahedra.block(ANATOMY, n, 2, FOCUS, rough) for n in (400, 3000)):
-        plain = tetrahedra.block(ANATOMY, 400, 2, FOCUS)
+    for tets in (tetrahedra.block(ANATOMY, n, FOCUS, rough) for n in (400, 3000)):
+        plain = tetrahedra.block(ANATOMY, 400, FOCUS)
         least = quality(plain.points[plain.cells[:, :4]]).min()
         assert quality(tets.points[tets.cells[:, :4]]).min() >= min(0.1, least) - 1e-9
         assert jacobians(tets.points, tets.cells).min() >= 0.3

@@ -13,12 +13,12 @@ from synth.fem.system import assemble
 
 
 def test_slip_holds_along_the_normal_as_firmly_and_along_the_surface_not_at_all() -> None:
-    bonded = tetrahedra.block(ANATOMY, 300, 2)
-    slipping = tetrahedra.block(ANATOMY, 300, 2, slips=True)
+    bonded = tetrahedra.block(ANATOMY, 300)
+    slipping = tetrahedra.block(ANATOMY, 300, slips=True)
     assert bonded.slip is None
     assert slipping.slip is not None
     soft, firm = assemble(slipping, "linear", 0.4), assemble(bonded, "linear", 0.4)
-    top = boundary(bonded.cells, 2)
+    top = boundary(bonded.cells)
     top = np.unique(top[~bonded.fixed[top].all(axis=1)])
     normal = np.zeros_like(bonded.points)
     normal[top] = bonded.points[top] + [0, 0, ANATOMY.dome_mm]  # the dome's centre
@@ -37,7 +37,7 @@ def test_slip_holds_along_the_normal_as_firmly_and_along_the_surface_not_at_all(
 
 
 def test_the_same_springs_in_motion_come_to_rest_where_equilibrium_is() -> None:
-    tets = tetrahedra.block(ANATOMY, 300, 2, slips=True)
+    tets = tetrahedra.block(ANATOMY, 300, slips=True)
     load = np.zeros_like(tets.points)
     load[np.hypot(*tets.points[:, :2].T) < 15] = [0.05, 0.0, -0.02]
     frames = 40
