@@ -211,9 +211,9 @@ class Job(Section):
     @property
     def kept_fields(self) -> tuple[str, ...]:
         """Names of the fields that its sequences hold."""
-        recovered = self.flow.backend != "ideal"
-        stereo = self.render.stereo_mm > 0
-        motion = stereo and recovered
         return fields.kept(
-            self.store.extra, self.store.without, recovered=recovered, stereo=stereo, motion=motion
+            self.store.extra,
+            self.store.without,
+            recovered=self.flow.backend != "ideal",
+            stereo=self.render.stereo_mm > 0,
         )
