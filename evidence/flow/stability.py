@@ -72,7 +72,7 @@ def _troubles(
 def _point(estimator: Estimator, pair: Pair, start: Floats | None) -> dict[str, float]:
     """Errors [px]; whether the frame is lost, flagged, and both ("hits")."""
     tracker = Tracker(estimator, pair.rest, ~pair.rest_usable, np.ones_like(pair.inside))
-    tracker.start(start)
+    tracker.initial = start
     flow, trust = tracker.step(pair.now, ~pair.now_usable)
     # Judged where the picture shows the point: what is masked is no question of tracking.
     seen = pair.inside & ~pair.hidden & pair.rest_usable

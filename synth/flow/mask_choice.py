@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from synth.flow import image
 from synth.flow.estimator import Estimator, Flags, Flow, Map, Rgb
-from synth.flow.track import Solved, Tracker
+from synth.flow.track import Solution, Tracker
 
 _LARGEST = 0.4  # of the tissue: proposals that take more are no instrument and no highlight
 _UNEXPLAINED = 0.12  # local deviations by which a piece's residual exceeds that of what isn't proposed ...
@@ -234,10 +234,10 @@ class ChoosingTracker:
         frame: Rgb,
         found: Proposal,
         pieces: Pieces,
-        first: Solved,
+        first: Solution,
         masked: Flags,
         known: Flags,
-    ) -> tuple[Solved, Flags]:
+    ) -> tuple[Solution, Flags]:
         """Tries all proposals and none, keeps those that earn it, and gives the answer and its masks."""
         tracker, still = self.tracker, self.rest_found
         tries, self._vouching = _Tries(self, frame, first, masked), False
@@ -279,12 +279,12 @@ class ChoosingTracker:
         tracker.usable = tracker.tissue & ~rest
         return chosen, now
 
-    def _is_better(self, one: Solved, other: Solved, where: Flags, by: float = 1.0) -> bool:
+    def _is_better(self, one: Solution, other: Solution, where: Flags, by: float = 1.0) -> bool:
         """Whether an answer has more than `by` times the other's confidence, (H, W) where."""
         levels = [self.tracker.judge(each.flow, each.confidence, where).level for each in (one, other)]
         return levels[0] > by * levels[1]
 
-    def solve(self, frame: Rgb, rest: Flags, now: Flags, initial: Flow | None) -> Solved:
+    def solve(self, frame: Rgb, rest: Flags, now: Flags, initial: Flow | None) -> Solution:
         """A frame's answer with other masks, (H, W) of the rest frame and of it; it is counted."""
         before, self.tracker.usable = self.tracker.usable, self.tracker.tissue & ~rest
         try:
@@ -330,14 +330,14 @@ class ChoosingTracker:
 class _Tries:
     """Answers for one frame with one mask and another, each solved once."""
 
-    def __init__(self, tracker: ChoosingTracker, frame: Rgb, first: Solved, masked: Flags) -> None:
+    def __init__(self, tracker: ChoosingTracker, frame: Rgb, first: Solution, masked: Flags) -> None:
         """`first`: the answer with what is masked, (H, W), so far."""
         self._tracker, self._frame = tracker, frame
         is_warm = tracker.trusted and tracker.tested
         self._initial = first.flow if is_warm else None
         self._solved = [(tracker.rest_blocked, masked, first)]
 
-    def solve(self, rest: Flags, now: Flags) -> Solved:
+    def solve(self, rest: Flags, now: Flags) -> Solution:
         """With those masks, (H, W) of the rest frame and of this one."""
         for one, other, solved in self._solved:
             if np.array_equal(one, rest) and np.array_equal(other, now):

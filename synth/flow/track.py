@@ -12,10 +12,10 @@ from synth.flow import mask
 from synth.flow.confidence import DOUBTFUL
 from synth.flow.estimator import Estimator, Flags, Flow, Map, Rgb, create
 
-_DOUBTED = 0.5  # mean confidence of what is seen; frames below it are tried again from nothing
-_MATCHED = 0.4  # share of what is seen that is no lost pixel; frames below it are lost
-_LEAST = 0.02  # of the tissue must be free of masks for anything to be said
-_DROP = 0.85  # a fall below this share of the last good frame's confidence is looked into
+_DOUBTED = 0.5  # mean confidence of what is visible; frames below it are tried again from nothing
+_MATCHED = 0.4  # share of what is visible that is no lost pixel; frames below it are lost
+_LEAST = 0.02  # of the tissue must be free of masks for anything to be concluded
+_DROP = 0.85  # a fall below this share of the last trusted frame's confidence is looked into
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class Track:
 
 
 @dataclass(frozen=True, eq=False)
-class Solved:
+class Solution:
     """One answer for a frame."""
 
     flow: Flow
@@ -42,12 +42,12 @@ class Solved:
     """Mean confidence over what is not masked."""
     matched: float
     """Share of that whose confidence says that it is not lost."""
-    seen: float
+    visible: float
     """Share of the tissue that is not masked."""
 
     @property
     def is_matched(self) -> bool:
-        """Whether enough of what is seen is found again."""
+        """Whether enough of what is visible is found again."""
         return self.matched >= _MATCHED
 
 
@@ -84,15 +84,12 @@ class Tracker:
         """Why the last frame could not be followed; empty if it could."""
         self.resets = 0
         """How often a frame was solved again from nothing, and better."""
-        self.last: Solved | None = None
+        self.last: Solution | None = None
         """The last frame's answer as it was found."""
-        self._good: Flow | None = None
+        self.initial: Flow | None = None
+        """(H, W, 2) px, what the next frame starts from; None: from nothing."""
         self._level = 1.0
         self._before: tuple[Flow | None, float] = None, 1.0  # both as they were a frame ago
-
-    def start(self, initial: Flow | None) -> None:
-        """Sets what the next frame starts from, (H, W, 2) px; None: from nothing."""
-        self._good = initial
 
     def step(self, frame: Rgb, blocked: Flags) -> tuple[Flow, Map]:
         """Flow (H, W, 2) px and confidence (H, W) of the next frame; `trusted` says whether it was followed.
@@ -103,57 +100,57 @@ class Tracker:
         """
         if frame.shape != self.rest.shape or blocked.shape != self.tissue.shape:
             raise UserError(f"flow: frame {frame.shape} does not fit the rest frame {self.rest.shape}")
-        self._before = self._good, self._level
-        found = self.solve(frame, blocked, self._good)
-        if self._good is not None and self.is_doubtful(found):
+        self._before = self.initial, self._level
+        found = self.solve(frame, blocked, self.initial)
+        if self.initial is not None and self.is_doubtful(found):
             again = self.solve(frame, blocked, None)
             if again.level > found.level:
                 found, self.resets = again, self.resets + 1
         return self.accept(found)
 
-    def solve(self, frame: Rgb, blocked: Flags, initial: Flow | None) -> Solved:
-        """One answer for a frame; nothing is remembered of it. Arguments as `step` and `start`."""
+    def solve(self, frame: Rgb, blocked: Flags, initial: Flow | None) -> Solution:
+        """One answer for a frame; nothing is remembered of it. Arguments as `step` and `initial`."""
         flow, confidence = self.estimator.flow(self.rest, frame, self.usable, ~blocked, initial)
         confidence = confidence * self.tissue
         return self.judge(flow, confidence, self.usable & ~blocked)
 
-    def judge(self, flow: Flow, confidence: Map, where: Flags) -> Solved:
-        """An answer as it is where one looks, (H, W)."""
-        seen = int(np.count_nonzero(where))
+    def judge(self, flow: Flow, confidence: Map, where: Flags) -> Solution:
+        """A flow and its confidence as an answer, its shares taken over (H, W) `where`."""
+        visible = int(np.count_nonzero(where))
         inside = confidence * where
-        return Solved(
+        return Solution(
             flow,
             confidence,
-            level=float(inside.sum(dtype=np.float64)) / max(1, seen),
-            matched=float(np.count_nonzero(inside >= DOUBTFUL)) / max(1, seen),
-            seen=seen / max(1, int(np.count_nonzero(self.tissue))),
+            level=float(inside.sum(dtype=np.float64)) / max(1, visible),
+            matched=float(np.count_nonzero(inside >= DOUBTFUL)) / max(1, visible),
+            visible=visible / max(1, int(np.count_nonzero(self.tissue))),
         )
 
-    def is_doubtful(self, found: Solved) -> bool:
+    def is_doubtful(self, found: Solution) -> bool:
         """Whether an answer is so much worse than the last good one's that others are tried."""
         return found.level < max(_DOUBTED, _DROP * self._level)
 
-    def accept(self, found: Solved) -> tuple[Flow, Map]:
+    def accept(self, found: Solution) -> tuple[Flow, Map]:
         """Makes it the frame's answer; the next one starts from it if it can be trusted."""
         self.last = found
         self.lost = ""
-        if found.seen < _LEAST:
-            self.lost = f"masks leave {100 * found.seen:.2g}% of the tissue"
+        if found.visible < _LEAST:
+            self.lost = f"masks leave {100 * found.visible:.2g}% of the tissue"
         elif not found.is_matched:
-            self.lost = f"only {100 * found.matched:.0f}% of what is seen matches the rest frame"
+            self.lost = f"only {100 * found.matched:.0f}% of what is visible matches the rest frame"
         self.trusted = not self.lost
         if self.trusted:
-            self._good, self._level = found.flow, found.level
-        return self._said(found)
+            self.initial, self._level = found.flow, found.level
+        return self._answer(found)
 
     def doubt(self, reason: str) -> tuple[Flow, Map]:
-        """Takes back that the frame could be followed, once it is accepted; what is said of it then."""
+        """Takes back that the accepted frame could be followed; flow and confidence as `step`."""
         assert self.last is not None
         self.lost, self.trusted = reason, False
-        self._good, self._level = self._before
-        return self._said(self.last)
+        self.initial, self._level = self._before
+        return self._answer(self.last)
 
-    def _said(self, found: Solved) -> tuple[Flow, Map]:
+    def _answer(self, found: Solution) -> tuple[Flow, Map]:
         sure = found.confidence if self.trusted else np.minimum(found.confidence, 0.5 * DOUBTFUL)
         return found.flow * self.tissue[..., None], sure
 
@@ -181,17 +178,7 @@ def recover_flow(
 def track(
     backend: str | Estimator, frames: NDArray[np.uint8], blocked: NDArray[np.bool_], tissue: Flags
 ) -> Track:
-    """Displacement of a recorded sequence; frame 0 is the rest frame.
-
-    Args:
-        backend: an estimator or its name; `ideal` computes nothing and is no estimator.
-        frames: (T, H, W, 3) uint8.
-        blocked: (T, H, W), tool and glare.
-        tissue: (H, W).
-
-    Raises:
-        UserError: no such estimator, no frames, or shapes that don't fit.
-    """
+    """As `recover_flow`, with all that is masked, (T, H, W), given."""
     if len(frames) == 0 or len(frames) != len(blocked):
         raise UserError(f"flow: {len(frames)} frames with {len(blocked)} masks")
     tracker = Tracker(backend, frames[0], blocked[0], tissue)
