@@ -65,7 +65,7 @@ class TVL1Settings:
     """Linearisations a level with an initial flow."""
     steady_px: float = 0.1
     """The last flow is averaged over its neighbours where that changes it by less than about this: what goes
-    there is noise, and a step in the flow stays. 0: not at all."""
+    there is noise, and a step in the flow stays."""
     steep: float = 0.1
     """Where the first guess's gradient [px/px] is this large, lambda doubles: smoothness costs most there."""
     fine_levels: int = 2
@@ -264,8 +264,6 @@ def _solve_level(level: Level, flow: Tensor, weight: Tensor, s: TVL1Settings) ->
 
 def steadied(flow: Tensor, within_px: float) -> Tensor:
     """Flow (B, 2, H, W) px, averaged about as by a Gaussian of 1.4 px where that changes it little."""
-    if within_px <= 0:
-        return flow
     smooth = flow
     for _ in range(3):
         smooth = image.box(smooth, 1)
@@ -337,24 +335,19 @@ def primal_dual(
         s: settings.
     """
     sigma = 1 / (8 * s.tau)
-    dual, flow, ahead = dual.clone(), flow.clone(), flow.clone()
+    dual, ahead = dual.clone(), flow
     px, py = dual[0], dual[1]
     shrink = 1 / (1 + sigma * huber)
-    # Scratch is kept: on the CPU, fresh memory for each product costs more than the product.
-    v, new, norm = torch.empty_like(flow), torch.empty_like(flow), torch.empty_like(flow)
-    dx, dy = torch.empty_like(flow[..., 1:]), torch.empty_like(flow[..., 1:, :])
     for _ in range(s.steps):
-        px[..., :-1].add_(torch.sub(ahead[..., 1:], ahead[..., :-1], out=dx), alpha=sigma)
-        py[..., :-1, :].add_(torch.sub(ahead[..., 1:, :], ahead[..., :-1, :], out=dy), alpha=sigma)
+        px[..., :-1].add_(ahead[..., 1:] - ahead[..., :-1], alpha=sigma)
+        py[..., :-1, :].add_(ahead[..., 1:, :] - ahead[..., :-1, :], alpha=sigma)
         dual.mul_(shrink)
-        torch.mul(px, px, out=norm).addcmul_(py, py).clamp_min_(1).rsqrt_()
-        dual.mul_(norm)  # p / max(1, |p|)
-        torch.add(flow, px, alpha=s.tau, out=v).add_(py, alpha=s.tau)  # v = w + tau div p
+        dual.mul_((px * px).addcmul_(py, py).clamp_min_(1).rsqrt_())  # p / max(1, |p|)
+        v = torch.add(flow, px, alpha=s.tau).add_(py, alpha=s.tau)  # v = w + tau div p
         v[..., 1:].sub_(px[..., :-1], alpha=s.tau)
         v[..., 1:, :].sub_(py[..., :-1, :], alpha=s.tau)
-        torch.mul(straight, v, out=new).sub_(shift)
+        new = (straight * v).sub_(shift)
         new[:, :1].addcmul_(cross, v[:, 1:])
         new[:, 1:].addcmul_(cross, v[:, :1])
-        torch.lerp(flow, new, 2.0, out=ahead)  # 2 new - old
-        flow, new = new, flow
+        flow, ahead = new, torch.lerp(flow, new, 2.0)  # 2 new - old
     return flow, dual

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +22,7 @@ from synth.system.stopwatch import Stopwatch
 from synth.tune.force_reading import cells, fit_reading
 
 Floats = NDArray[np.float64]
+Found = TypeVar("Found")
 
 _LOADED = 3  # frames with load that are looked at in a sequence, on the way up to its peak
 _PHYSICS = {"seed", "sequences", "frames", "fps", "anatomy", "fem"}  # sections that it depends on
@@ -51,11 +54,12 @@ class Probe:
     def measure(self, job: Job) -> Measured:
         """The sequence with the settings of `job`. UserError if they cannot carry it out."""
         scene, frames, cost = _render(job.model_dump_json(exclude={"flow"}), self._numbers)
-        label = self._error(scene, [frame.flow for frame in frames[1:]])
-        if job.flow.backend == "ideal":
-            return Measured(label, label, np.array([*cost, 0.0]))
-        flows, flow_s = _recover_flow(scene, frames, job)
-        return Measured(label, self._error(scene, flows), np.array([*cost, flow_s]))
+        label = read = self._error(scene, [frame.flow for frame in frames[1:]])
+        flow_s = 0.0
+        if job.flow.backend != "ideal":
+            flows, flow_s = _recover_flow(scene, frames, job)
+            read = self._error(scene, flows)
+        return Measured(label, read, np.array([*cost, flow_s]))
 
     def _error(self, scene: Scene, flows: list[NDArray[np.float32]]) -> Floats:
         moved = np.stack([cells(flow, scene.tissue) for flow in flows])
@@ -75,10 +79,7 @@ def loaded_frames(motion: Deformation) -> tuple[int, ...]:
 @lru_cache(maxsize=2)
 def _simulate(job_json: str) -> tuple[Scene, float]:
     """The moved scene of a job's first sequence, and its CPU-s."""
-    watch = Stopwatch()
-    with watch.stage("physics"):
-        scene = simulate(Job.model_validate_json(job_json))
-    return scene, watch.cpu_s("physics")
+    return _timed(lambda: simulate(Job.model_validate_json(job_json)))
 
 
 @lru_cache(maxsize=1)  # for settings of flow alone
@@ -88,17 +89,12 @@ def _render(job_json: str, numbers: tuple[int, ...]) -> tuple[Scene, list[Frame]
     moved, physics_s = _simulate(job.model_dump_json(include=_PHYSICS))
     case = scenario.draw(job, 0)
     scene = replace(moved, job=job, scenario=case, view=camera.place(case.view, job.render))
-    watch = Stopwatch()
-    with watch.stage("scene"):
-        _ = scene.renderer
-    frames = []
-    for t in numbers:
-        with watch.stage(f"frame {t}"):
-            frames.append(scene.frame(t))
-    first_s, *others_s = (watch.cpu_s(f"frame {t}") for t in numbers)
+    _, scene_s = _timed(lambda: scene.renderer)
+    rendered = [_timed(partial(scene.frame, t)) for t in numbers]
+    first_s, *others_s = (spent for _, spent in rendered)
     frame_s = min(others_s)  # what else the machine does only adds
     # The first frame also prepares what all of them need.
-    return scene, frames, (physics_s, watch.cpu_s("scene") + first_s - frame_s, frame_s)
+    return scene, [frame for frame, _ in rendered], (physics_s, scene_s + first_s - frame_s, frame_s)
 
 
 def _recover_flow(scene: Scene, frames: list[Frame], job: Job) -> tuple[list[NDArray[np.float32]], float]:
@@ -106,9 +102,14 @@ def _recover_flow(scene: Scene, frames: list[Frame], job: Job) -> tuple[list[NDA
     rgb = np.stack([frame.rgb for frame in frames])
     blocked = mask.hidden(rgb, np.stack([frame.tool for frame in frames]))
     tracker = Tracker(estimator(job.flow), rgb[0], blocked[0], scene.tissue)
-    watch, flows = Stopwatch(), []
-    for k in range(1, len(rgb)):
-        with watch.stage(f"flow {k}"):
-            flows.append(tracker.step(rgb[k], blocked[k])[0])
-    first_s, *others_s = (watch.cpu_s(f"flow {k}") for k in range(1, len(rgb)))
-    return flows, min(others_s or [first_s])  # in a video, all but one start from the one before
+    steps = [_timed(partial(tracker.step, *one)) for one in zip(rgb[1:], blocked[1:], strict=True)]
+    first_s, *others_s = (spent for _, spent in steps)
+    return [flow for (flow, _), _ in steps], min(others_s or [first_s])  # in a video, most start warm
+
+
+def _timed(compute: Callable[[], Found]) -> tuple[Found, float]:
+    """What is computed, and the CPU-s that it took."""
+    watch = Stopwatch()
+    with watch.stage("all"):
+        found = compute()
+    return found, watch.cpu_s("all")
