@@ -9,7 +9,7 @@ _WHERE = {
     "Method": "bench.methods.protocol",
     "Result": "bench.scoring.result",
     "Scene": "bench.methods.protocol",
-    "Settings": "synth.recording_flow.video_flow",
+    "Settings": "synth.recording_flow.video_flow:RecordingFlowSettings",
     "export_recording": "bench.recording.from_sequence",
     "score": "bench.scoring.score",
 }
@@ -20,7 +20,8 @@ __all__ = [*_WHERE]
 def __getattr__(name: str) -> Any:
     if name not in _WHERE:
         raise AttributeError(f"module 'bench' has no attribute {name!r}")
-    value = globals()[name] = getattr(import_module(_WHERE[name]), name)
+    place, _, other_name = _WHERE[name].partition(":")
+    value = globals()[name] = getattr(import_module(place), other_name or name)
     return value
 
 

@@ -4,4 +4,3 @@ from bench.methods.protocol import Scene as Scene
 from bench.recording.from_sequence import export_recording as export_recording
 from bench.scoring.result import Result as Result
 from bench.scoring.score import score as score
-from synth.recording_flow.video_flow import Settings as Settings

@@ -15,7 +15,7 @@ from synth.system.cli_errors import Commands, printable
 
 if TYPE_CHECKING:
     from bench.recording.folder import Recording
-    from synth.recording_flow.video_flow import Settings
+    from synth.recording_flow.video_flow import RecordingFlowSettings
 
 app = typer.Typer(
     name="bench",
@@ -72,13 +72,13 @@ def score(
     """Force from a recording's video, scored against its sensor: score.json and report.html."""
     from bench.methods.network import Model
     from bench.recording.folder import open_recording
-    from synth.recording_flow.video_flow import Settings
+    from synth.recording_flow.video_flow import RecordingFlowSettings
     from synth.video.mask_files import read_choice
 
     others = {name: Model(Path(at)) for name, at in _pairs("--also", also, "NAME=FOLDER").items()}
     kind, files = read_choice(masks)
     opened = open_recording(recording, phantom).within(files, _rectangle(region))
-    settings = Settings(backend=flow, shrink=shrink, rate_hz=rate or None, pulse=pulse, masks=kind)
+    settings = RecordingFlowSettings(flow, shrink, rate or None, pulse, kind)
     folder = out or Path(f"{opened.name}-score")
     _score(opened, model, folder, settings, title, json, methods=others, train=train)
 
@@ -179,11 +179,12 @@ def demo(
     """Scores a model on a sequence of its dataset that it has not seen, by way of a recording."""
     from bench.recording.folder import open_recording
     from bench.scoring.demo import export_unseen
-    from synth.recording_flow.video_flow import Settings
+    from synth.recording_flow.video_flow import RecordingFlowSettings
 
     index = export_unseen(dataset, model, out / "recording")
     title = f"Force from video: sequence {index}, unseen in training"
-    _score(open_recording(out / "recording"), model, out, Settings(backend=flow, rate_hz=None), title, json)
+    settings = RecordingFlowSettings(flow, rate_hz=None)
+    _score(open_recording(out / "recording"), model, out, settings, title, json)
 
 
 @app.command(
@@ -262,7 +263,7 @@ def _score(
     opened: Recording,
     model: Path | None,
     folder: Path,
-    settings: Settings,
+    settings: RecordingFlowSettings,
     title: str,
     json: bool,
     **more: Any,
@@ -326,11 +327,10 @@ def live(
     from threadpoolctl import threadpool_limits
 
     from bench.methods.network import Model
-    from bench.tracking import flow_process
-    from bench.tracking import live as stream
+    from bench.tracking import flow_process, live
     from learn.inference.shipped import choose_model
     from learn.training.threads import set_threads
-    from synth.recording_flow.video_flow import Footage
+    from synth.recording_flow.video_flow import Footage, RecordingFlowSettings
     from synth.video.mask_files import read_choice
     from synth.video.pixel_scale import UNKNOWN_NOTE, read_scale
     from synth.video.read import FPS, read_video
@@ -340,7 +340,7 @@ def live(
     model = model or (choose_model(two_eyes=False) if scale else None)
     method = None if model is None else Model(model)
 
-    def tell(frame: stream.Frame) -> None:
+    def show(frame: live.LiveFrame) -> None:
         force = "" if frame.force_mn is None else f"  {frame.force_mn:8.2f} mN"
         mark = "" if frame.trusted else "  not trusted"
         typer.echo(
@@ -348,25 +348,23 @@ def live(
         )
 
     threadpool_limits(set_threads(None))
-    with flow_process.elsewhere() as process:
-        account = stream.watch_video(
+    with flow_process.open_flow_process() as process:
+        stream = live.stream_video(
             Footage(read_video(video, FPS), str(video), tool=files.read if files else None),
-            backend=flow,
-            masks=kind,
+            RecordingFlowSettings(flow, shrink, rate_hz=None, pulse=False, masks=kind),
             method=method,
             scale_mm_per_px=read_scale(scale),
             young_kpa=young,
-            shrink=shrink,
             paced=not every,
-            told=(lambda frame: None) if json else tell,
+            report=(lambda frame: None) if json else show,
             flow=process,
         )
-    summary = account.summary()
+    summary = stream.summary()
     if scale == "unknown":
         typer.echo(f"note: {UNKNOWN_NOTE}", err=True)
     if out is not None:
         how: dict[str, str | int | bool] = {"backend": flow, "shrink": shrink, "masks": masks}
-        stream.write_live(out, summary, **how, paced=not every, model=model is not None)
+        live.write_live(out, summary, **how, paced=not every, model=model is not None)
     if json:
         typer.echo(json_.dumps(summary))
     else:

@@ -266,7 +266,7 @@ def predict_command(
     from learn.inference.prediction_file import write_overlay, write_prediction
     from learn.inference.shipped import NONE, choose_model, shipped
     from learn.training.threads import set_threads
-    from synth.recording_flow.video_flow import Settings
+    from synth.recording_flow.video_flow import RecordingFlowSettings
     from synth.video.mask_files import read_choice
     from synth.video.pixel_scale import read_scale
 
@@ -279,9 +279,8 @@ def predict_command(
         model = chosen
     predictor = load_model(model, quick=True)
     kind, files = read_choice(masks)
-    options = VideoOptions(
-        read_scale(scale), tissue, Settings(flow, shrink, rate or None, pulse, kind), files
-    )
+    settings = RecordingFlowSettings(flow, shrink, rate or None, pulse, kind)
+    options = VideoOptions(read_scale(scale), tissue, settings, files)
     peaks: dict[str, float | None] = {}
     for motion in motions(source, predictor.stored(input), options):
         written = out / f"{motion.name}.npz"

@@ -14,7 +14,7 @@ from bench.recording.meta import LEAST_INTERVALS, LEAST_TURNING
 from bench.recording.second_eye import LATE, SecondEye
 from synth.errors import UserError
 from synth.recording_flow.quality import find_fault
-from synth.recording_flow.video_flow import Account, Footage, Settings, VideoFlow
+from synth.recording_flow.video_flow import RecordingFlowSettings, VideoFlow
 
 _WIDEST_MM, _NARROWEST_MM = 300.0, 3.0
 _SOFTEST_KPA, _STIFFEST_KPA = 0.05, 100.0
@@ -168,23 +168,21 @@ def _check_following(recording: Recording, found: _Checked) -> None:
     last = max((recording.expected_frames() or _LOOKED_AT) - 1, first)
     wanted = {first, *np.linspace(first, last, _LOOKED_AT).astype(int).tolist()}
     pictures = (picture for picture in recording.frames() if picture.index in wanted)
-    footage = Footage(pictures, str(recording.folder), recording.tissue_mask, tool, first)
-    video, account = VideoFlow(footage, Settings(rate_hz=None, pulse=False)), Account()
-    second = SecondEye(recording, video) if recording.has_two_eyes else None
-    for step in video.steps():
-        account.add(step.found, video.tissue)
-        if second is not None:
-            second.move(step)
-    if account.frames:
-        found.judge(not account.is_odd, "following", account.describe())
-    sight = None if second is None else second.sight
-    if sight is None:  # one eye; of two, the rest frame is at fault
+    second = SecondEye(recording, found.mm_per_px or 1.0) if recording.has_two_eyes else None
+    settings = RecordingFlowSettings(rate_hz=None, pulse=False)
+    video = VideoFlow(recording.film(pictures), settings, second=second)
+    for _ in video.frames():
+        pass
+    if video.summary.frames:
+        found.judge(not video.summary.is_odd, "following", video.summary.describe())
+    stereo = None if second is None else second.quality
+    if stereo is None:  # one eye; of two, the rest frame is at fault
         return
-    odd = sight.epipolar_px > _OFF_ROWS_PX or not sight.noise_mm < _NOISY_MM or sight.lag > LATE
-    found.judge(not odd, "second eye", sight.describe())
+    odd = stereo.epipolar_px > _OFF_ROWS_PX or not stereo.noise_mm < _NOISY_MM or stereo.lag > LATE
+    found.judge(not odd, "second eye", stereo.describe())
     stated = found.mm_per_px
-    if stated and abs(sight.mm_per_px / stated - 1) > _OTHER_SCALE:
-        found.add("odd", "scale", f"{stated:.4g} mm/px, but the second eye finds {sight.mm_per_px:.4g}")
+    if stated and abs(stereo.mm_per_px / stated - 1) > _OTHER_SCALE:
+        found.add("odd", "scale", f"{stated:.4g} mm/px, but the second eye finds {stereo.mm_per_px:.4g}")
 
 
 def _check_sensor(recording: Recording, found: _Checked) -> None:

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from bench.recording import csv_table, meta
 from bench.recording.meta import Meta, Span
 from synth.errors import UserError
+from synth.recording_flow.video_flow import Footage
 from synth.video import read as video
 from synth.video.mask_files import MaskFiles
 from synth.video.pixel_scale import UNKNOWN_NOTE
@@ -98,6 +99,12 @@ class Recording:
         """
         for picture in _pictures(self.footage):
             yield self._timed(picture)
+
+    def film(self, pictures: Iterable[Picture] | None = None) -> Footage:
+        """The recording for a `VideoFlow`. `pictures`: some of its frames; None: all."""
+        tool = self.tool if self.has_masks else None
+        frames = self.frames() if pictures is None else pictures
+        return Footage(frames, str(self.folder), self.tissue_mask, tool, self.meta.rest_frame)
 
     def right_frames(self) -> Iterator[Picture]:
         """The second eye's frames in order; UserError: unreadable."""

@@ -16,7 +16,7 @@ from bench.recording.folder import open_recording
 from bench.recording.meta import Meta, ScaleCalibration
 from synth.errors import UserError
 from synth.video import read as video
-from synth.video.pixel_scale import TAKEN_MM, take_scale
+from synth.video.pixel_scale import ASSUMED_WIDTH_MM, pixel_mm
 
 _UNKNOWN = 0.99  # relative: nothing is known
 _STATED = 0.02  # what a stated scale is trusted to without more
@@ -42,8 +42,8 @@ def find_scale(meta: Meta, folder: Path) -> PixelScale:
     """
     if meta.scale_mm_per_px == "unknown":
         wide = next(iter(open_recording(folder).frames())).rgb.shape[1]
-        source = f"unknown: the picture is taken to be {TAKEN_MM:g} mm wide"
-        return PixelScale(take_scale("unknown", wide), _first(meta.scale_uncertainty, _UNKNOWN), source)
+        source = f"unknown: the picture is taken to be {ASSUMED_WIDTH_MM:g} mm wide"
+        return PixelScale(pixel_mm("unknown", wide), _first(meta.scale_uncertainty, _UNKNOWN), source)
     if meta.scale_mm_per_px is not None:
         return PixelScale(meta.scale_mm_per_px, _first(meta.scale_uncertainty, _STATED), "stated")
     assert meta.calibration is not None

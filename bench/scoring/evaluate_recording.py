@@ -23,10 +23,11 @@ from bench.recording.pixel_scale import PixelScale
 from bench.scoring import metrics
 from bench.scoring.result import Curve, Gain, Result, Scored
 from bench.sensor.alignment import AlignedSensor, align_sensor, describe_span
-from bench.tracking.tracking import Progress, Tracked, track_recording
+from bench.tracking.tracking import Progress, TrackedRecording, track_recording
 from learn.uncertainty.intervals import LEVEL
 from learn.uncertainty.out_of_distribution import describe_unseen
-from synth.recording_flow.video_flow import FlowHere, Settings
+from synth.recording_flow.local_flow import LocalFlow
+from synth.recording_flow.video_flow import RecordingFlowSettings
 
 Flags = NDArray[np.bool_]
 _SEED = 0  # of the bootstrap: the same recording gives the same intervals
@@ -41,10 +42,10 @@ def evaluate_recording(
     methods: Mapping[str, Method],
     main: str,
     scale: PixelScale,
-    settings: Settings,
+    settings: RecordingFlowSettings,
     described: Mapping[str, Any],
     progress: Progress = lambda done: None,
-    flow: FlowHere | None = None,
+    flow: LocalFlow | None = None,
 ) -> Result:
     """Tracks the recording and scores every method against its sensor.
 
@@ -124,7 +125,7 @@ class _Reference:
     """Whether E is known."""
 
 
-def _speed(tracked: Tracked, lost: Flags) -> Curve:
+def _speed(tracked: TrackedRecording, lost: Flags) -> Curve:
     """(T,) mm/s; of two frames each, so that it is unknown where either is lost."""
     return np.where(lost | np.append(False, lost[:-1]), np.nan, tracked.speed)
 

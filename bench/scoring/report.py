@@ -22,7 +22,7 @@ from bench.scoring import charts, metrics
 from bench.scoring.headline import headline
 from bench.scoring.metrics import METRICS
 from bench.scoring.result import Result
-from bench.tracking.tracking import Snapshot, Tracked, picture_masks
+from bench.tracking.tracking import Snapshot, TrackedRecording, picture_masks
 from learn.evaluation.metrics import Metric
 from synth.dataset.folder import write_whole
 from synth.publish import picture
@@ -94,7 +94,7 @@ def render_report(result: Result, title: str) -> str:
         panels=panels,
         flow_px=flow_px,
         masks=None if (masked := picture_masks(result.followed)) is None else _jpeg(masked),
-        masked=result.followed.account.describe(),
+        masked=result.followed.summary.describe(),
         force_kpa=force_kpa,
         settings=_flat(result.settings),
         cost=_cost(result),
@@ -200,7 +200,7 @@ def pictures(result: Result) -> tuple[list[Panel], float, float]:
     return panels, flow_px, force_kpa
 
 
-def _largest_depth(done: Tracked) -> float:
+def _largest_depth(done: TrackedRecording) -> float:
     """Motion along the view [mm] at full colour; 0 without a second eye."""
     seen = [np.abs(snap.depth) for snap in done.snapshots if snap.depth is not None]
     return max(float(np.percentile(np.stack(seen), 99.8)), 1e-3) if seen else 0.0

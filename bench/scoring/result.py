@@ -17,7 +17,7 @@ from bench.bootstrap import Interval
 from bench.recording.pixel_scale import PixelScale
 from bench.sensor.clock_sync import Offset
 from bench.sensor.rotation import SensorRotation
-from bench.tracking.tracking import Tracked
+from bench.tracking.tracking import TrackedRecording
 from synth.system import packages
 from synth.system.checked_file import write_whole
 
@@ -95,7 +95,7 @@ class Result:
     notes: tuple[str, ...]
     steps: tuple[str, ...]
     settings: dict[str, Any]
-    followed: Tracked
+    followed: TrackedRecording
     turn: SensorRotation | None = None
     """The sensor's rotation as found on `sensor.turn_s`; None if it was stated, or nobody asked."""
     absolute: bool = True
@@ -143,7 +143,7 @@ def as_json(result: Result) -> dict[str, Any]:
         "noise_floor_mn": result.noise_floor_mn,
         "fault": done.fault,
         "pulse": done.pulse,
-        "second_eye": done.sight,
+        "second_eye": done.stereo,
         "aligned": result.aligned,
         "sync": result.sync,
         "turn": result.turn,
@@ -151,7 +151,7 @@ def as_json(result: Result) -> dict[str, Any]:
         "sensor_steps": result.steps,
         "settings": result.settings,
         "environment": result.environment,
-        "masks": {"kind": result.settings.get("masks"), "frames": done.account.frames, **done.account.shares},
+        "masks": {"kind": result.settings.get("masks"), "frames": done.summary.frames, **done.summary.shares},
         "timings": done.timings,
         "curve": {
             "frame": done.frame,

@@ -21,7 +21,8 @@ from bench.tracking.tracking import Progress
 from learn.inference.predict import Predictor
 from learn.inference.shipped import NONE, choose_model, find_model
 from synth.errors import UserError
-from synth.recording_flow.video_flow import FlowHere, Settings
+from synth.recording_flow.local_flow import LocalFlow
+from synth.recording_flow.video_flow import RecordingFlowSettings
 from synth.system import checked_file
 from synth.system.terminal import counting
 
@@ -37,7 +38,7 @@ def score(
     methods: Mapping[str, Method] | None = None,
     baselines: bool = True,
     train: str | Path | None = None,
-    settings: Settings | None = None,
+    settings: RecordingFlowSettings | None = None,
     out: str | Path | None = None,
     title: str = "",
     progress: bool = False,
@@ -76,9 +77,9 @@ def score(
         model = find_model(model)
     folder = model if isinstance(model, Path) else None
     frames = opened.expected_frames()
-    flow: AbstractContextManager[FlowHere | None] = nullcontext()
+    flow: AbstractContextManager[LocalFlow | None] = nullcontext()
     if own_process and (frames or _LONG) >= _LONG:
-        flow = flow_process.elsewhere()
+        flow = flow_process.open_flow_process()
     written: AbstractContextManager[None] = nullcontext()
     if out is not None:
         written = checked_file.made_folder(Path(out), _ROOM_BYTES)
@@ -98,7 +99,14 @@ def score(
         scale = pixel_scale.find_scale(opened.meta, opened.folder)
         with bar as told:
             result = evaluate_recording(
-                opened, chosen, next(iter(chosen)), scale, settings or Settings(), described, told, elsewhere
+                opened,
+                chosen,
+                next(iter(chosen)),
+                scale,
+                settings or RecordingFlowSettings(),
+                described,
+                told,
+                elsewhere,
             )
         if out is not None:
             write_result(result, Path(out), title)

@@ -13,7 +13,7 @@ from bench.recording.meta import SensorMeta, Span, Sync
 from bench.sensor import clock_sync, force_sensor
 from bench.sensor.clock_sync import Offset
 from bench.sensor.rotation import SensorRotation, find_rotation
-from synth.recording_flow.pulse import Surface
+from synth.recording_flow.pulse import SurfaceMotion
 
 Curve = NDArray[np.float64]
 
@@ -40,7 +40,7 @@ class AlignedSensor:
 
 
 def align_sensor(
-    recording: Recording, time_s: Curve, speed: Curve, surface: Surface | None, notes: list[str]
+    recording: Recording, time_s: Curve, speed: Curve, surface: SurfaceMotion | None, notes: list[str]
 ) -> AlignedSensor:
     """Finds the clocks' offset and the sensor's rotation, freezes both, and reads the sensor at the frames.
 
@@ -111,13 +111,13 @@ def _find_offset(
 
 
 def _find_rotation(
-    force: Force, sensor: SensorMeta, offset_s: float, surface: Surface | None
+    force: Force, sensor: SensorMeta, offset_s: float, surface: SurfaceMotion | None
 ) -> SensorRotation:
     """The rotation to the camera's axes at which the tissue moves along the force."""
     if surface is None:
         return find_rotation(np.zeros((0, 1, 2)), np.zeros((0, 1)), np.zeros((0, 3)))
     count = len(surface.time_s)
-    moved, seen = (np.stack(parts).astype(np.float64) for parts in (surface.moved, surface.seen))
+    moved, seen = (np.stack(parts).astype(np.float64) for parts in (surface.motion, surface.visible))
     processed = force_sensor.process_force(force, sensor, offset_s)
     at = force_sensor.force_at(processed, np.array(surface.time_s))
     return find_rotation(moved.reshape(count, -1, 2), seen.reshape(count, -1), at)

@@ -1,4 +1,4 @@
-"""Flow in a process of its own: what is asked of a frame's flow runs while the next frame's is computed.
+"""Flow in a process of its own: forces are computed from a frame's flow while the next frame's is.
 
 A thread wouldn't do: the flow makes thousands of short calls a frame and would wait for the interpreter after
 each (measured: two threads took longer than one).
@@ -11,21 +11,18 @@ import os
 import resource
 import signal
 import threading
-from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
+from collections.abc import Iterator
+from concurrent.futures import Future, ProcessPoolExecutor
 from dataclasses import replace
 from multiprocessing import get_context, parent_process
-from typing import TypeVar
 
-from synth.errors import UserError
+from synth.flow.estimator import Flags, Rgb
 from synth.flow.mask_choice import Proposal
-from synth.recording_flow.video_flow import Asked, Flags, FlowHere, Found, Rgb
+from synth.recording_flow.frame_motion import FrameMotion
+from synth.recording_flow.local_flow import LocalFlow
 
-T = TypeVar("T")
 
-
-class FlowProcess(FlowHere):
+class FlowProcess(LocalFlow):
     """Flow in one other process, which starts at once and ends with this one."""
 
     ahead = 1
@@ -39,28 +36,21 @@ class FlowProcess(FlowHere):
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
-    def begin(self, backend: str, rest: Rgb, blocked: Flags | Proposal, tissue: Flags) -> None:
-        """See `FlowHere`."""
-        _result(self._submit(_begin, backend, rest, blocked, tissue))
+    def begin(self, backend: str, rest: Rgb, masked: Flags | Proposal, tissue: Flags) -> None:
+        """See `LocalFlow`."""
+        self._pool.submit(_begin, backend, rest, masked, tissue).result()
 
-    def ask(self, rgb: Rgb, blocked: Flags | Proposal) -> Asked:
-        """See `FlowHere`."""
-        future = self._submit(_step, rgb, blocked)
-        return Asked(lambda: _result(future), lambda within_s: bool(wait([future], within_s).done))
+    def submit(self, rgb: Rgb, masked: Flags | Proposal) -> Future[FrameMotion]:
+        """See `LocalFlow`."""
+        return self._pool.submit(_step, rgb, masked)
 
     def close(self) -> None:
         """Ends it, after the frame that it is at."""
         self._pool.shutdown(cancel_futures=True)
 
-    def _submit(self, task: Callable[..., T], *given: object) -> Future[T]:
-        try:
-            return self._pool.submit(task, *given)
-        except BrokenProcessPool:
-            raise _gone() from None
-
 
 @contextlib.contextmanager
-def elsewhere() -> Iterator[FlowProcess | None]:
+def open_flow_process() -> Iterator[FlowProcess | None]:
     """Another process for the flow, closed at the end; None where there is but one core."""
     if len(os.sched_getaffinity(0)) < 2:
         yield None
@@ -69,18 +59,7 @@ def elsewhere() -> Iterator[FlowProcess | None]:
         yield process
 
 
-def _result(future: Future[T]) -> T:
-    try:
-        return future.result()
-    except BrokenProcessPool:
-        raise _gone() from None
-
-
-def _gone() -> UserError:
-    return UserError("the process that computes the flow ended; out of memory?")
-
-
-_flow = FlowHere()
+_flow = LocalFlow()
 """The other process's: it has one video at a time."""
 
 
@@ -99,10 +78,10 @@ def _end_with_parent() -> None:
         os._exit(1)
 
 
-def _begin(backend: str, rest: Rgb, blocked: Flags | Proposal, tissue: Flags) -> None:
-    _flow.begin(backend, rest, blocked, tissue)
+def _begin(backend: str, rest: Rgb, masked: Flags | Proposal, tissue: Flags) -> None:
+    _flow.begin(backend, rest, masked, tissue)
 
 
-def _step(rgb: Rgb, blocked: Flags | Proposal) -> Found:
-    found = _flow.ask(rgb, blocked)()
-    return replace(found, peak_bytes=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024)
+def _step(rgb: Rgb, masked: Flags | Proposal) -> FrameMotion:
+    frame = _flow.submit(rgb, masked).result()
+    return replace(frame, peak_bytes=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024)

@@ -1,7 +1,7 @@
 """`bench live`: a video as a stream: decode, mask, flow, force, frame by frame, and what each costs.
 
 The stream is paced by the video's own clock: a frame that arrives while another is still worked on is
-dropped, as it would be beside the table. Mask, tracker and model are those that score recordings.
+dropped, as it would be at the table. Masks, flow and model are those that score recordings.
 """
 
 from __future__ import annotations
@@ -13,19 +13,18 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bench.methods.protocol import Method, Scene
 from synth.errors import UserError
-from synth.flow.mask_choice import Proposal
-from synth.recording_flow.video_flow import Asked, Flags, FlowHere, Footage, Rgb, Settings, Step, VideoFlow
+from synth.recording_flow.local_flow import LocalFlow
+from synth.recording_flow.video_flow import Footage, RecordingFlowSettings, VideoFlow
 from synth.system.checked_file import write_whole
 from synth.system.packages import machine
-from synth.video.pixel_scale import StatedScale, take_scale
+from synth.video.pixel_scale import StatedScale, pixel_mm
 
 
 @dataclass(frozen=True)
-class Frame:
+class LiveFrame:
     """One frame that was worked on."""
 
     index: int
@@ -34,7 +33,7 @@ class Frame:
     stages_s: dict[str, float]
     """mask, flow, force: time in each."""
     confidence: float
-    """Mean over the tissue that is seen."""
+    """Mean over the tissue that is visible."""
     trusted: bool
     largest_px: float
     force_mn: float | None
@@ -42,10 +41,10 @@ class Frame:
 
 
 @dataclass
-class Watched:
-    """A stream's account."""
+class Stream:
+    """What a stream came to."""
 
-    frames: list[Frame] = field(default_factory=list)
+    frames: list[LiveFrame] = field(default_factory=list)
     dropped: int = 0
     size: tuple[int, int] = (0, 0)
     """Height, width of what is worked on [px]."""
@@ -62,99 +61,76 @@ class Watched:
         return result
 
 
-def watch_video(
+def stream_video(
     footage: Footage,
+    settings: RecordingFlowSettings,
     *,
-    backend: str = "tvl1",
     method: Method | None = None,
     scale_mm_per_px: StatedScale | None = None,
     young_kpa: float | None = None,
-    shrink: int = 1,
-    masks: str = "auto",
     paced: bool = True,
-    told: Callable[[Frame], None] = lambda frame: None,
-    flow: FlowHere | None = None,
-) -> Watched:
+    report: Callable[[LiveFrame], None] = lambda frame: None,
+    flow: LocalFlow | None = None,
+) -> Stream:
     """Follows the video from its first frame on, which is taken as the rest frame.
 
     Args:
         footage: the video.
-        backend: flow estimator.
+        settings: how; a rate, or a pulse to be found over the whole video, is not for a stream.
         method: a model that makes force of flow; needs the scale.
         scale_mm_per_px: of the video's own pixels; unknown: forces are right up to a factor, whatever E is.
         young_kpa: of the tissue, if known.
-        shrink: pictures are made this many times smaller first.
-        masks: as of `Settings`.
         paced: drop what arrives meanwhile; False: work on every frame.
-        told: of every frame's answer.
+        report: given every frame's answer.
         flow: where it is computed, closed by the caller; None: here. In another process a frame's flow runs
-            while the next is masked and the one before is asked for its force.
+            while the next is masked and the force of the one before is computed.
 
     Raises:
         UserError: unreadable video, fewer than two frames, or a model without a scale.
     """
     if method is not None and scale_mm_per_px is None:
         raise UserError("a model needs --scale (mm a pixel, or unknown): forces have no meaning without it")
-    account, pace = Watched(), _Pace(paced)
-    settings = Settings(backend, shrink, rate_hz=None, pulse=False, masks=masks)
-    video = VideoFlow(footage, settings, _Warm(flow or FlowHere()), pace.is_due, spare_s=pace.spare_s)
+    stream, pace = Stream(), _VideoClock(paced)
+    video = VideoFlow(footage, settings, flow, pace=pace)
     scene: Scene | None = None
-    for step in video.steps():
+    for found in video.frames():
         if scene is None:
-            account.size = video.tissue.shape
-            mm_per_px = take_scale(scale_mm_per_px or 1.0, video.size[1]) * video.shrink
+            stream.size = video.tissue.shape
+            mm_per_px = pixel_mm(scale_mm_per_px or 1.0, video.size[1]) * video.shrink
             scene = Scene(video.tissue, mm_per_px, None if scale_mm_per_px == "unknown" else young_kpa)
-            pace.start(step)
             continue
-        began, found, force = time.perf_counter(), step.found, None
+        began, force = time.perf_counter(), None
         if method is not None and found.trusted:
             force = method(found.flow, found.confidence, scene, False).size_mn
-        end = time.perf_counter()
-        seen: NDArray[np.bool_] = found.confidence > 0
-        frame = Frame(
-            index=step.picture.index,
-            latency_s=end - pace.arrivals_s.pop(step.picture.index),
-            stages_s={"mask": step.masking_s, "flow": found.wall_s, "force": end - began},
-            confidence=float(found.confidence[seen].mean()) if seen.any() else 0.0,
+        end, visible = time.perf_counter(), found.confidence > 0
+        frame = LiveFrame(
+            index=found.index,
+            latency_s=end - pace.arrivals_s.pop(found.index),
+            stages_s={"mask": found.masking_s, "flow": found.wall_s, "force": end - began},
+            confidence=float(found.confidence[visible].mean()) if visible.any() else 0.0,
             trusted=found.trusted,
-            largest_px=float(np.hypot(*found.flow[seen].T).max()) if seen.any() else 0.0,
+            largest_px=float(np.hypot(*found.flow[visible].T).max()) if visible.any() else 0.0,
             force_mn=force,
         )
-        account.frames.append(frame)
-        told(frame)
-    account.dropped = pace.dropped
-    if not account.frames:
+        stream.frames.append(frame)
+        report(frame)
+    stream.dropped = pace.dropped
+    if not stream.frames:
         raise UserError(f"{footage.name}: fewer than two frames")
-    return account
+    return stream
 
 
-class _Warm(FlowHere):
-    """Flow that has run once before the clock starts: loading isn't latency."""
-
-    def __init__(self, flow: FlowHere) -> None:
-        self._flow, self.ahead = flow, flow.ahead
-
-    def begin(self, backend: str, rest: Rgb, blocked: Flags | Proposal, tissue: Flags) -> None:
-        """See `FlowHere`."""
-        self._flow.begin(backend, rest, blocked, tissue)
-        self._flow.ask(rest, blocked).take()
-
-    def ask(self, rgb: Rgb, blocked: Flags | Proposal) -> Asked:
-        """See `FlowHere`."""
-        return self._flow.ask(rgb, blocked)
-
-
-class _Pace:
-    """Lets frames arrive as the video's own clock has them."""
+class _VideoClock:
+    """A `Pace`: frames arrive as the video's own clock has them."""
 
     def __init__(self, paced: bool) -> None:
         self.paced, self.dropped = paced, 0
         self.arrivals_s: dict[int, float] = {}
         """Of frames that are worked on, by index."""
 
-    def start(self, rest: Step) -> None:
-        """The clock starts with the rest frame."""
-        self.first_s, self.began_s = rest.picture.time_s or 0.0, time.perf_counter()
+    def start(self, time_s: float) -> None:
+        """See `Pace`."""
+        self.first_s, self.began_s = time_s, time.perf_counter()
 
     def is_due(self, index: int, time_s: float) -> bool:
         """Waits until a frame arrives; False if it has a successor already."""
@@ -168,7 +144,7 @@ class _Pace:
         return True
 
     def spare_s(self, time_s: float) -> float:
-        """How long it is to the arrival of a frame [s]."""
+        """See `Pace`."""
         if not self.paced:
             return 0.0
         return max(0.0, self.began_s + time_s - self.first_s - time.perf_counter())

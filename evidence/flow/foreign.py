@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from evidence import report
 from evidence.flow.foreign_scenes import Recipe, Shown, film, recipes
 from evidence.flow.measure import epe
-from synth.recording_flow.video_flow import Footage, Settings, VideoFlow
+from synth.recording_flow.video_flow import Footage, RecordingFlowSettings, VideoFlow
 from synth.video.read import Picture
 
 _MASKS = ("auto", "both", "none")  # chosen, all that are found, none
@@ -83,12 +83,11 @@ def _follow(shown: Sequence[Shown], masks: str) -> tuple[NDArray[Any], ...]:
         (T - 1,) each, NaN where there is no such tissue.
     """
     pictures = (Picture(k, k / _FPS, one.rgb) for k, one in enumerate(shown))
-    video = VideoFlow(Footage(pictures, "film"), Settings(rate_hz=None, masks=masks))
+    video = VideoFlow(Footage(pictures, "film"), RecordingFlowSettings(rate_hz=None, masks=masks))
     rows = []
-    for one, step in zip(shown, video.steps(), strict=True):
-        found = step.found
+    for one, found in zip(shown, video.frames(), strict=True):
         if not found.is_rest:
-            blocked = np.zeros_like(one.free) if found.blocked is None else found.blocked
+            blocked = np.zeros_like(one.free) if found.masked is None else found.masked
             error, covered = _mean(epe(found.flow, one.flow), one.seen), _mean(1.0 * blocked, one.free)
             rows.append((error, found.trusted, covered))
     return tuple(np.array(column) for column in zip(*rows, strict=True))

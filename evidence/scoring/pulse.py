@@ -25,7 +25,7 @@ from bench.scoring.result import Result
 from evidence import report
 from evidence.flow.scenes import inverse
 from evidence.scoring.cost import texture
-from synth.recording_flow.video_flow import Settings
+from synth.recording_flow.video_flow import RecordingFlowSettings
 
 Floats = NDArray[np.float64]
 
@@ -148,7 +148,7 @@ def score(folder: Path, methods: Mapping[str, Method], backend: str) -> Result:
     """The recording scored, all of its frames."""
     opened = open_recording(folder)
     scale = pixel_scale.find_scale(opened.meta, folder)
-    settings = Settings(backend, shrink=1, rate_hz=None)
+    settings = RecordingFlowSettings(backend, shrink=1, rate_hz=None)
     return evaluate_recording(opened, methods, next(iter(methods)), scale, settings, {})
 
 

@@ -17,12 +17,12 @@ from learn.data.clips import FIELDS, has_depth
 from synth.dataset.store import Dataset, Sequence, open_sequence
 from synth.errors import UserError
 from synth.flow.stereo.track import Moved
-from synth.recording_flow.pulse import Pulse, Search
-from synth.recording_flow.video_flow import Footage, Settings, VideoFlow, everywhere
+from synth.recording_flow.pulse import PulseSearch
+from synth.recording_flow.video_flow import Footage, RecordingFlowSettings, VideoFlow, everywhere
 from synth.system import checked_file
 from synth.video import read as video
 from synth.video.mask_files import MaskFiles
-from synth.video.pixel_scale import UNKNOWN_NOTE, StatedScale, take_scale
+from synth.video.pixel_scale import UNKNOWN_NOTE, StatedScale, pixel_mm
 
 
 class MotionFrame(NamedTuple):
@@ -72,7 +72,7 @@ class VideoOptions:
     scale_mm_per_px: StatedScale | None = None
     tissue: Path | None = None
     """A picture, white where there is tissue; everywhere if not given."""
-    settings: Settings = field(default_factory=Settings)
+    settings: RecordingFlowSettings = field(default_factory=RecordingFlowSettings)
     """How it is followed."""
     tool: MaskFiles | None = None
     """Where the tool is; looked for in the pictures if not given."""
@@ -147,9 +147,7 @@ def _stored(sequence: Sequence, source: str) -> Motion:
     )
 
 
-def _video(
-    path: Path, options: VideoOptions, pulse: Pulse | None = None, search: Search | None = None
-) -> Motion:
+def _video(path: Path, options: VideoOptions, pulse: PulseSearch | None = None) -> Motion:
     if options.scale_mm_per_px is None:
         raise UserError(
             f"{path}: a video doesn't say how large it shows things; give --scale in mm a pixel, or unknown"
@@ -158,27 +156,21 @@ def _video(
     tissue = everywhere if options.tissue is None else partial(video.read_mask, options.tissue)
     tool = options.tool.read if options.tool else None
     footage = Footage(video.read_video(path, video.FPS), str(path), tissue, tool)
-    following = VideoFlow(footage, options.settings, pulse=pulse, search=search)
+    following = VideoFlow(footage, options.settings, pulse=pulse)
     frames = (
-        MotionFrame(
-            step.found.flow,
-            step.found.confidence,
-            number=step.picture.index,
-            time_s=step.picture.time_s or 0.0,
-            trusted=step.found.trusted,
-        )
-        for step in following.steps()
+        MotionFrame(one.flow, one.confidence, None, one.index, one.time_s or 0.0, one.trusted)
+        for one in following.frames()
     )
     rest = next(frames)
-    mm_per_px = take_scale(options.scale_mm_per_px, following.size[1]) * following.shrink
+    mm_per_px = pixel_mm(options.scale_mm_per_px, following.size[1]) * following.shrink
 
     def again() -> Motion | None:
         found = following.find_pulse()
-        return None if found is None else _video(path, options, found, following.search)
+        return None if found is None else _video(path, options, found)
 
     def notes() -> list[str]:
         found = following.notes if scale_known else [UNKNOWN_NOTE, *following.notes]
-        return found if pulse is None else [*found, pulse.describe(mm_per_px)]
+        return found if following.removed is None else [*found, following.removed.describe(mm_per_px)]
 
     return Motion(
         name=path.stem,

@@ -1,7 +1,6 @@
-"""Video to displacement: decode, shrink, mask, track.
+"""A film's motion: frames are decoded, shrunk, masked and followed from the rest frame, pulse taken off.
 
-The one loop of `learn predict`, `bench score` and `bench live`. Displacement is that of the tissue from the
-rest frame, on the rest frame's pixels.
+The one way of a film, for `learn predict`, `bench score`, `bench check` and `bench live`.
 """
 
 from __future__ import annotations
@@ -10,7 +9,9 @@ import math
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import BrokenExecutor, Future
 from dataclasses import dataclass, replace
+from typing import Protocol, TypeVar
 
 import cv2
 import numpy as np
@@ -18,35 +19,34 @@ from numpy.typing import NDArray
 
 from synth.errors import UserError
 from synth.flow import mask
-from synth.flow.mask_choice import ChoosingTracker, Proposal
-from synth.flow.track import Tracker
-from synth.recording_flow.pulse import Pulse, Search, Span, Surface, carried_over, find_pulse
+from synth.flow.estimator import Flags, Rgb
+from synth.flow.mask_choice import Proposal
+from synth.flow.stereo.track import Moved
+from synth.recording_flow.frame_motion import FrameMotion, TrackingSummary
+from synth.recording_flow.harmonic_fit import Span
+from synth.recording_flow.local_flow import LocalFlow
+from synth.recording_flow.pulse import PulseSearch, SurfaceMotion, find_pulse
 from synth.recording_flow.quality import find_fault
 from synth.system.stopwatch import Stopwatch
 from synth.video.mask_files import MASKS
 from synth.video.read import Picture
 
-Rgb = NDArray[np.uint8]
-Flags = NDArray[np.bool_]
+A = TypeVar("A", bound=np.generic)
 Size = tuple[int, int]
 """Height, width [px]."""
 
-WIDTH_KEPT = 320
-"""Columns that `shrink` 0 leaves a picture at least: the networks' grids are no finer."""
-
-
-_MUCH = 0.2
-"""Share of the tissue masked, or of the frames lost, that is worth a look."""
+LEAST_COLUMNS = 320
+"""That `shrink` 0 leaves a picture: the networks' grids are no finer."""
 
 
 @dataclass(frozen=True)
-class Settings:
-    """How a video is followed."""
+class RecordingFlowSettings:
+    """How a film is followed."""
 
     backend: str = "tvl1"
     """Flow estimator."""
     shrink: int = 0
-    """Flow is computed on pictures this many times smaller; 0: the most that leaves `WIDTH_KEPT` columns."""
+    """Flow is computed on pictures so many times smaller; 0: the most that leaves `LEAST_COLUMNS`."""
     rate_hz: float | None = 10.0
     """At most so many frames a second are looked at; None: all."""
     pulse: bool = True
@@ -75,168 +75,57 @@ class Footage:
     rest_frame: int = 0
 
 
-@dataclass(frozen=True, eq=False)
-class Found:
-    """The flow of one frame."""
+class SecondView(Protocol):
+    """A second eye or a depth camera."""
 
-    flow: NDArray[np.float32]
-    """(h, w, 2) px from the rest frame."""
-    confidence: NDArray[np.float32]
-    """(h, w) in 0..1."""
-    trusted: bool = True
-    """Whether the frame could be followed."""
-    lost: str = ""
-    """Why not; empty if it could."""
-    regained: bool = False
-    """It could, but only from nothing or with other masks."""
-    is_rest: bool = False
-    """It is the rest frame itself."""
-    blocked: Flags | None = None
-    """(h, w) what was masked in the picture; None: nothing."""
-    rest_blocked: Flags | None = None
-    """(h, w) what was masked in the rest frame for it; None: nothing."""
-    cpu_s: float = 0.0
-    wall_s: float = 0.0
-    peak_bytes: int = 0
-    """Memory of the process that computed it, if it was another."""
+    scale_mm_per_px: float
+    """Of the film's own pixels."""
+
+    def follow(self, frame: FrameMotion, video: VideoFlow) -> Moved:
+        """Motion in space of a frame that could be followed; the first is the rest frame."""
+        ...
 
 
-@dataclass(eq=False)
-class Account:
-    """What masks and trust came to over a video, without its rest frame."""
+class Pace(Protocol):
+    """When the frames of a stream arrive."""
 
-    frames: int = 0
-    lost: int = 0
-    regained: int = 0
-    masked: float = 0.0
-    """Sum over frames of the share of tissue that was masked."""
-    where: NDArray[np.float32] | None = None
-    """(h, w) in how many frames a pixel of the picture was masked."""
-    rest_blocked: Flags | None = None
-    """(h, w) what of the rest frame was masked at last."""
+    def start(self, time_s: float) -> None:
+        """The rest frame, of that time on the film's clock, has been worked on."""
+        ...
 
-    def add(self, found: Found, tissue: Flags) -> None:
-        """Counts a frame; the rest frame starts it anew."""
-        if found.is_rest:
-            self.frames, self.where = 0, np.zeros(tissue.shape, np.float32)
-            return
-        assert self.where is not None
-        self.frames += 1
-        self.lost += not found.trusted
-        self.regained += found.regained
-        self.rest_blocked = found.rest_blocked
-        if found.blocked is not None:
-            self.masked += np.count_nonzero(found.blocked & tissue) / np.count_nonzero(tissue)
-            self.where += found.blocked
+    def is_due(self, index: int, time_s: float) -> bool:
+        """Whether a frame is worked on: waits until it arrives."""
+        ...
 
-    @property
-    def shares(self) -> dict[str, float]:
-        """Shares of the tissue masked, and of the frames lost and regained."""
-        n = max(self.frames, 1)
-        return {"masked": self.masked / n, "lost": self.lost / n, "regained": self.regained / n}
-
-    @property
-    def is_odd(self) -> bool:
-        """Whether somebody should look at it."""
-        return self.shares["masked"] > _MUCH or self.shares["lost"] > _MUCH
-
-    def describe(self) -> str:
-        """A line for a person."""
-        said = f"{100 * self.shares['masked']:.2g}% of the tissue is masked on average; "
-        lost = f"{self.lost} of {self.frames} frames looked at could not be followed"
-        return said + lost + (f", {self.regained} only at a second try" if self.regained else "")
-
-
-@dataclass(frozen=True)
-class Asked:
-    """The flow of a frame that is on its way."""
-
-    take: Callable[[], Found]
-    """Waits for it; errors as `Tracker`."""
-    is_there: Callable[[float], bool] = lambda within_s: True
-    """Whether it is there, or will be within so many seconds, which it waits for."""
-
-    def __call__(self) -> Found:
-        return self.take()
-
-
-class FlowHere:
-    """Where flow is computed: in this process, at once."""
-
-    ahead = 0
-    """How many frames may be asked before the first is waited for."""
-
-    def begin(self, backend: str, rest: Rgb, blocked: Flags | Proposal, tissue: Flags) -> None:
-        """The rest frame; arguments and errors as `Tracker`, or, of a proposal, as `ChoosingTracker`."""
-        self.tracker: Tracker | ChoosingTracker = (
-            ChoosingTracker(backend, rest, blocked, tissue)
-            if isinstance(blocked, Proposal)
-            else Tracker(backend, rest, blocked, tissue)
-        )
-
-    def ask(self, rgb: Rgb, blocked: Flags | Proposal) -> Asked:
-        """Gives a frame, (h, w, 3) and (h, w); what comes back waits for its flow, errors as `Tracker`."""
-        cpu, wall, tracker = time.process_time(), time.perf_counter(), self.tracker
-        if isinstance(tracker, ChoosingTracker):
-            assert isinstance(blocked, Proposal)
-            flow, confidence = tracker.step(rgb, blocked)
-            masked, rest_masked, regained = tracker.blocked, tracker.rest_blocked, tracker.regained
-        else:
-            assert not isinstance(blocked, Proposal)
-            resets = tracker.resets
-            flow, confidence = tracker.step(rgb, blocked)
-            masked, rest_masked = blocked, tracker.tissue & ~tracker.usable
-            regained = tracker.trusted and tracker.resets > resets
-        found = Found(
-            flow,
-            confidence,
-            tracker.trusted,
-            tracker.lost,
-            regained,
-            blocked=masked if masked.any() else None,
-            rest_blocked=rest_masked if rest_masked.any() else None,
-            cpu_s=time.process_time() - cpu,
-            wall_s=time.perf_counter() - wall,
-        )
-        return Asked(lambda: found)
-
-
-@dataclass(frozen=True, eq=False)
-class Step:
-    """One frame that was followed."""
-
-    picture: Picture
-    """(h, w, 3), as small as the flow was computed; only the rest frame may be without a time."""
-    found: Found
-    masking_s: float
-    """Time that shrinking and masking took [s]."""
+    def spare_s(self, time_s: float) -> float:
+        """How long it is to a frame's arrival [s]."""
+        ...
 
 
 class VideoFlow:
-    """Follows one video, once; what it learns on the way stands in its attributes."""
+    """Follows one film, once; what it finds out on the way stands in its attributes."""
 
     def __init__(
         self,
         footage: Footage,
-        settings: Settings,
-        flow: FlowHere | None = None,
-        is_due: Callable[[int, float], bool] = lambda index, time_s: True,
-        pulse: Pulse | None = None,
-        search: Search | None = None,
+        settings: RecordingFlowSettings,
+        flow: LocalFlow | None = None,
+        pulse: PulseSearch | None = None,
+        second: SecondView | None = None,
+        pace: Pace | None = None,
         watch: Stopwatch | None = None,
-        spare_s: Callable[[float], float] = lambda time_s: 0.0,
     ) -> None:
         """Nothing is decoded yet.
 
         Args:
             footage: what is followed.
             settings: how.
-            flow: where flow is computed, closed by the caller; None: here.
-            is_due: whether a frame after the rest frame, at its time [s], is to be worked on.
-            pulse: motion of the tissue's own that is taken off the flow of every frame.
-            search: what came of looking for that, the first time through.
+            flow: where flow is computed, closed by the caller; None: in this process.
+            pulse: what a first pass found; taken off the motion of every frame.
+            second: what shows motion in space, if there is something.
+            pace: of a stream; None: every frame has its turn. Flow runs once before its start, for loading is
+                no latency.
             watch: what the time spent is added to; None: one of its own.
-            spare_s: how long it is to a frame's arrival [s]: answers that are there until then come first.
 
         Raises:
             UserError: no such masks.
@@ -244,42 +133,25 @@ class VideoFlow:
         if settings.masks not in MASKS:
             raise UserError(f"masks: no kind {settings.masks!r}; there are {', '.join(MASKS)}")
         self.footage, self.settings, self.watch = footage, settings, watch or Stopwatch()
+        self.pulse, self.second, self.summary = pulse, second, TrackingSummary()
+        self.removed = None if pulse is None else pulse.pulse
+        """What is taken off the motion of every frame."""
         self.tissue = np.zeros((0, 0), bool)
         """(h, w), shrunk as the pictures are; empty before the rest frame."""
         self.shrink, self.size = settings.shrink, (0, 0)
-        """How many times smaller than `size`, height and width of the video's own pictures, these are."""
-        self.seen = self.peak_bytes = 0
-        """Frames decoded, and memory of the flow's own process."""
-        self.surface: Surface | None = None
-        """How the tissue moved by and large; kept while `settings.pulse` asks for it and none is off."""
-        self._flow, self._is_due, self._pulse = flow or FlowHere(), is_due, pulse
-        self._spare_s = spare_s
-        self._left_out: Counter[str] = Counter()
+        """How many times smaller than `size`, height and width of the film's own pictures, these are."""
+        self.decoded = self.peak_bytes = 0
+        """Frames, and memory of the flow's own process."""
+        self._flow, self._pace = flow or LocalFlow(), pace
+        self._surface: SurfaceMotion | None = None  # only where a pulse is to be found
+        self._depth_weights: list[float] = []
+        self._rest_s: float | None = None
         self._period_s = 0.0 if settings.rate_hz is None else 1 / settings.rate_hz
         self._due_s = self._last_s = -math.inf
-        self._rest_s: float | None = None
-        self.search = search
-        """What came of looking for a pulse; None before."""
-        self._fault, self._rest_rgb = "", np.zeros((0, 0, 3), np.uint8)
-        self._followed, self._still = 0, True
+        self._left_out: Counter[str] = Counter()
+        self._fault, self._rest_rgb, self._changes = "", np.zeros((0, 0, 3), np.uint8), False
 
-    @property
-    def fault(self) -> str:
-        """Why nothing of this video is a measurement, said once it is through; empty if something may be."""
-        if self._fault:
-            return f"the rest frame is {self._fault}"
-        return "the picture never changes" if self._followed and self._still else ""
-
-    @property
-    def notes(self) -> list[str]:
-        """What was done to the video that its user should know; complete when all frames are through, and
-        the pulse looked for."""
-        missed = "" if self.search is None or self.fault else self.search.describe()
-        shrunk = [f"flow is computed on pictures {self.shrink} times smaller"] if self.shrink > 1 else []
-        left_out = [f"{n} of {self.seen} frames {why} left out" for why, n in self._left_out.items()]
-        return shrunk + left_out + ([missed] if missed else [])
-
-    def steps(self, progress: Callable[[int], None] = lambda done: None) -> Iterator[Step]:
+    def frames(self, progress: Callable[[int], None] = lambda done: None) -> Iterator[FrameMotion]:
         """The frames that are followed, the rest frame first, holding a few at a time.
 
         With flow elsewhere, the caller has its turn while the flow of the next frame is on its way.
@@ -288,59 +160,77 @@ class VideoFlow:
             progress: told after every decoded frame how many there were.
 
         Raises:
-            UserError: unreadable video, no tissue, masks or frames of another size, no such estimator.
+            UserError: unreadable film, no tissue, masks or frames of another size, no such estimator.
         """
+        try:
+            yield from self._frames(progress)
+        except BrokenExecutor:
+            raise UserError("the process that computes the flow ended; out of memory?") from None
+
+    def _frames(self, progress: Callable[[int], None]) -> Iterator[FrameMotion]:
         pictures = iter(self.footage.pictures)
-        under_way: deque[tuple[Picture, float, Asked]] = deque()
+        waiting: deque[tuple[Picture, float, Future[FrameMotion]]] = deque()
         while True:
             with self.watch.stage("decode"):
                 picture = next(pictures, None)
             if picture is None:
                 break
-            self.seen += 1
-            while under_way and under_way[0][2].is_there(self._spare_s(picture.time_s or 0.0)):
-                yield self._step(*under_way.popleft())
+            self.decoded += 1
+            while waiting and self._is_there(waiting[0][2], picture.time_s):
+                yield self._finish(*waiting.popleft())
             if self._is_wanted(picture.index, picture.time_s):
-                resting = self.tissue.size == 0
-                if resting:
-                    self._see(picture)
-                small, blocked, masking_s = self._prepare(picture)
-                if resting:
-                    found = self._rest(small.rgb, blocked)
-                    yield Step(small, found, masking_s)
+                is_rest = self.tissue.size == 0
+                if is_rest:
+                    self._measure(picture)
+                small, masked, masking_s = self._prepare(picture)
+                if is_rest:
+                    yield self._begin(small, masked, masking_s)
+                    if self._pace is not None:
+                        self._pace.start(picture.time_s or 0.0)
                 elif self._fault:
-                    yield Step(small, self._nothing(), masking_s)
+                    nothing = FrameMotion.none(self.tissue.shape, trusted=False)
+                    self.summary.add(nothing, self.tissue)
+                    yield self._in_space(self._pictured(nothing, small, masking_s))
                 else:
-                    under_way.append((small, masking_s, self._flow.ask(small.rgb, blocked)))
-                if len(under_way) > self._flow.ahead:
-                    yield self._step(*under_way.popleft())
-            progress(self.seen)
-        for waiting in under_way:
-            yield self._step(*waiting)
+                    waiting.append((small, masking_s, self._flow.submit(small.rgb, masked)))
+                if len(waiting) > self._flow.ahead:
+                    yield self._finish(*waiting.popleft())
+            progress(self.decoded)
+        for one in waiting:
+            yield self._finish(*one)
 
-    def find_pulse(self, free_s: Sequence[Span] = (), space: Surface | None = None) -> Pulse | None:
-        """The flow's part of the tissue's own motion, once all steps are through; None where none is seen or
-        was asked for.
+    def find_pulse(self, free_s: Sequence[Span] = ()) -> PulseSearch | None:
+        """The tissue's own motion, once all frames are through; None where there is none, or it is off.
 
         Args:
             free_s: spans without contact, if known [s].
-            space: the same frames' motion in space, if there is a second eye: rhythms are looked for there.
         """
-        if self.surface is None:
+        if self._surface is None:
             return None
+        if self._depth_weights:
+            self._surface.depth_weight = min(1.0, float(np.median(self._depth_weights)))
+        rest_s = self._rest_s
+        if rest_s is None:
+            rest_s = self._surface.time_s[0] if self._surface.time_s else 0.0
         with self.watch.stage("pulse"):
-            looked, rest_s = self.surface if space is None else space, self.rest_s
-            self.search = find_pulse(looked, rest_s, free_s)
-            if self.search.pulse is None or space is None:
-                return self.search.pulse
-            return carried_over(self.search, self.surface, rest_s)
+            self.pulse = find_pulse(self._surface, rest_s, free_s)
+        return None if self.pulse.pulse is None else self.pulse
 
     @property
-    def rest_s(self) -> float:
-        """Time of the rest frame [s]; if it has none, of the first frame that could be followed."""
-        if self._rest_s is not None:
-            return self._rest_s
-        return self.surface.time_s[0] if self.surface is not None and self.surface.time_s else 0.0
+    def fault(self) -> str:
+        """Why nothing of this film is a measurement, once it is through; empty if something may be."""
+        if self._fault:
+            return f"the rest frame is {self._fault}"
+        return "the picture never changes" if self.summary.frames and not self._changes else ""
+
+    @property
+    def notes(self) -> list[str]:
+        """What was done to the film that its user should know; complete when all frames are through, and
+        the pulse looked for."""
+        missed = "" if self.pulse is None or self.fault else self.pulse.describe()
+        shrunk = [f"flow is computed on pictures {self.shrink} times smaller"] if self.shrink > 1 else []
+        left_out = [f"{n} of {self.decoded} frames {why} left out" for why, n in self._left_out.items()]
+        return shrunk + left_out + ([missed] if missed else [])
 
     def _is_wanted(self, index: int, time_s: float | None) -> bool:
         """Whether a frame is looked at; what isn't is counted."""
@@ -357,20 +247,20 @@ class VideoFlow:
             first = self._due_s == -math.inf
             due_s = time_s if first else max(self._due_s, time_s - 0.2 * self._period_s)
             self._due_s, self._last_s = due_s + self._period_s, time_s
-            return self.tissue.size == 0 or self._is_due(index, time_s)
+            return self.tissue.size == 0 or self._pace is None or self._pace.is_due(index, time_s)
         self._left_out[reason] += 1
         return time_s is None and index == self.footage.rest_frame
 
-    def _see(self, picture: Picture) -> None:
+    def _measure(self, rest: Picture) -> None:
         """Sizes and tissue, from the rest frame."""
-        self.size = (picture.rgb.shape[0], picture.rgb.shape[1])
-        self.shrink = self.settings.shrink or max(1, self.size[1] // WIDTH_KEPT)
+        self.size = (rest.rgb.shape[0], rest.rgb.shape[1])
+        self.shrink = self.settings.shrink or max(1, self.size[1] // LEAST_COLUMNS)
         self.tissue = shrink_mask(self.footage.tissue(self.size), self.shrink, 127)
         if not self.tissue.any():
             raise UserError(f"{self.footage.name}: the picture of the tissue marks no tissue")
-        self._rest_s = picture.time_s
-        if self.settings.pulse and self._pulse is None:
-            self.surface = Surface(self.tissue)
+        self._rest_s = rest.time_s
+        if self.settings.pulse and self.pulse is None:
+            self._surface = SurfaceMotion(self.tissue)
 
     def _prepare(self, picture: Picture) -> tuple[Picture, Flags | Proposal, float]:
         """A frame shrunk, what of it is no tissue (h, w), and the time that took [s]."""
@@ -380,10 +270,10 @@ class VideoFlow:
         began = time.perf_counter()
         with self.watch.stage("mask"):
             rgb = shrink_picture(picture.rgb, self.shrink)
-            blocked = self._masks(picture.index, rgb)
-        return replace(picture, rgb=rgb), blocked, time.perf_counter() - began
+            masked = self._mask(picture.index, rgb)
+        return replace(picture, rgb=rgb), masked, time.perf_counter() - began
 
-    def _masks(self, index: int, rgb: Rgb) -> Flags | Proposal:
+    def _mask(self, index: int, rgb: Rgb) -> Flags | Proposal:
         """What of a frame is no tissue, (h, w), or may be none."""
         kind, nothing = self.settings.masks, np.zeros(rgb.shape[:2], bool)
         glare = nothing if kind in ("none", "tool") else mask.glare(rgb)
@@ -395,44 +285,78 @@ class VideoFlow:
                 known = shrink_mask(given, self.shrink, 0)
         return Proposal(glare, tool, known) if kind == "auto" else glare | tool | known
 
-    def _rest(self, rgb: Rgb, blocked: Flags | Proposal) -> Found:
+    def _begin(self, small: Picture, masked: Flags | Proposal, masking_s: float) -> FrameMotion:
         """Starts the flow: nothing has moved."""
-        self._fault, self._rest_rgb = find_fault(rgb, self.tissue), rgb
-        if self._fault:
-            return replace(self._nothing(), is_rest=True)
-        self._flow.begin(self.settings.backend, rgb, blocked, self.tissue)
-        still = np.zeros((*self.tissue.shape, 2), np.float32)
-        sure = blocked.known if isinstance(blocked, Proposal) else blocked
-        return Found(still, (self.tissue & ~sure).astype(np.float32), is_rest=True)
+        self._fault, self._rest_rgb = find_fault(small.rgb, self.tissue), small.rgb
+        frame = FrameMotion.none(self.tissue.shape, trusted=not self._fault)
+        if not self._fault:
+            self._flow.begin(self.settings.backend, small.rgb, masked, self.tissue)
+            if self._pace is not None:
+                self._flow.submit(small.rgb, masked).result()
+            known = masked.known if isinstance(masked, Proposal) else masked
+            frame = replace(frame, confidence=(self.tissue & ~known).astype(np.float32))
+        return self._in_space(self._pictured(replace(frame, is_rest=True), small, masking_s))
 
-    def _nothing(self) -> Found:
-        """Of a frame in which nothing can be followed."""
-        none = np.zeros(self.tissue.shape, np.float32)
-        return Found(np.stack([none, none], axis=-1), none, trusted=False)
+    def _is_there(self, flow: Future[FrameMotion], time_s: float | None) -> bool:
+        """Whether a flow is there, or will be before a frame of that time arrives, which is waited for."""
+        try:
+            flow.result(0.0 if self._pace is None else self._pace.spare_s(time_s or 0.0))
+        except TimeoutError:
+            return False
+        return True
 
-    def _step(self, small: Picture, masking_s: float, answer: Asked) -> Step:
-        found = answer()
-        self._followed += 1
-        self._still = self._still and np.array_equal(small.rgb, self._rest_rgb)
-        if found.trusted and find_fault(small.rgb, self.tissue):
-            found = replace(found, trusted=False)
-        self.watch.add("flow", found.cpu_s, found.wall_s)
-        self.peak_bytes = max(self.peak_bytes, found.peak_bytes)
-        if self._pulse is not None and small.time_s is not None:
-            found = replace(found, flow=found.flow - self._pulse.at(small.time_s))
-        elif self.surface is not None and small.time_s is not None and found.trusted:
-            self.surface.add(small.time_s, found.flow, found.confidence)
-        return Step(small, found, masking_s)
+    def _finish(self, small: Picture, masking_s: float, flow: Future[FrameMotion]) -> FrameMotion:
+        """The motion of a frame whose flow was submitted, in space too, and without the pulse."""
+        frame = self._pictured(flow.result(), small, masking_s)
+        self._changes = self._changes or not np.array_equal(small.rgb, self._rest_rgb)
+        if frame.trusted and find_fault(small.rgb, self.tissue):
+            frame = replace(frame, trusted=False)
+        self.watch.add("flow", frame.cpu_s, frame.wall_s)
+        self.peak_bytes = max(self.peak_bytes, frame.peak_bytes)
+        self.summary.add(frame, self.tissue)
+        return self._without_pulse(self._in_space(frame))
+
+    def _pictured(self, frame: FrameMotion, small: Picture, masking_s: float) -> FrameMotion:
+        return replace(frame, index=small.index, time_s=small.time_s, rgb=small.rgb, masking_s=masking_s)
+
+    def _in_space(self, frame: FrameMotion) -> FrameMotion:
+        """The same with what the second eye shows of it; nothing of a frame that was not followed."""
+        if self.second is None:
+            return frame
+        with self.watch.stage("second eye"):
+            if not frame.trusted:
+                return replace(frame, motion=Moved.nothing(self.tissue.shape))
+            return replace(frame, motion=self.second.follow(frame, self))
+
+    def _without_pulse(self, frame: FrameMotion) -> FrameMotion:
+        """The same with the pulse taken off; before it is known, the frame is one to find it in."""
+        moved, time_s = frame.motion, frame.time_s
+        assert time_s is not None
+        px_mm = np.float32(1.0 if self.second is None else self.second.scale_mm_per_px * self.shrink)
+        if self._surface is not None and frame.trusted:
+            parts = [frame.flow]
+            if moved is not None:
+                # The flow itself is looked in, not x and y in space, which have the noise of depth in them.
+                parts += [moved.motion[..., 2:] / px_mm, moved.motion[..., :2] / px_mm]
+                across, along = (float(np.median(moved.deviation[..., k][self.tissue])) for k in (0, 2))
+                self._depth_weights.append(across / max(along, 1e-9))
+            self._surface.add(time_s, np.dstack(parts), frame.confidence)
+        if self.removed is None:
+            return frame
+        own = self.removed.at(time_s)
+        if moved is not None and frame.trusted:
+            moved = replace(moved, motion=moved.motion - own[..., [3, 4, 2]] * px_mm)
+        return replace(frame, flow=frame.flow - own[..., :2], motion=moved)
 
 
-def shrink_picture(picture: Rgb, shrink: int) -> Rgb:
-    """A picture `shrink` times smaller, (H, W[, C]) uint8; what doesn't fill a pixel is cut off."""
+def shrink_picture(picture: NDArray[A], shrink: int) -> NDArray[A]:
+    """An array (H, W[, C]) `shrink` times smaller; what doesn't fill a pixel is cut off."""
     if shrink == 1:
         return picture
     size = (max(1, picture.shape[1] // shrink), max(1, picture.shape[0] // shrink))
     # Cut to a multiple, so that a pixel of the small picture is exactly shrink x shrink of the large one.
     cut = picture[: size[1] * shrink, : size[0] * shrink]
-    return np.asarray(cv2.resize(cut, size, interpolation=cv2.INTER_AREA), np.uint8)
+    return np.asarray(cv2.resize(cut, size, interpolation=cv2.INTER_AREA), picture.dtype)
 
 
 def shrink_mask(mask: Flags, shrink: int, above: int) -> Flags:

@@ -14,12 +14,12 @@ from synth.errors import UserError
 StatedScale = float | Literal["unknown"]
 """mm a pixel."""
 
-TAKEN_MM = 32.0
+ASSUMED_WIDTH_MM = 32.0
 """Width that a picture of unknown scale is taken to have [mm]: about what a microscope shows of a cortex."""
 
 UNKNOWN_NOTE = (
-    f"scale unknown: answers are per pixel, on a picture taken to be {TAKEN_MM:g} mm wide, and right up to a "
-    "factor"
+    f"scale unknown: answers are per pixel, on a picture taken to be {ASSUMED_WIDTH_MM:g} mm wide, "
+    "and right up to a factor"
 )
 
 
@@ -38,6 +38,6 @@ def read_scale(text: str | None) -> StatedScale | None:
     return scale
 
 
-def take_scale(stated: StatedScale, width: int) -> float:
+def pixel_mm(stated: StatedScale, width: int) -> float:
     """mm a pixel of a picture so wide [px]: as stated, or as taken."""
-    return TAKEN_MM / width if stated == "unknown" else stated
+    return ASSUMED_WIDTH_MM / width if stated == "unknown" else stated

@@ -17,7 +17,7 @@ from bench.recording.folder import open_recording
 from bench.scoring.evaluate_recording import evaluate_recording
 from bench.scoring.result import Result
 from evidence.scoring import cost as phantom
-from synth.recording_flow.video_flow import Settings
+from synth.recording_flow.video_flow import RecordingFlowSettings
 
 GAIN_MN_PER_PX = 40.0
 SENSOR_HZ = 100.0
@@ -88,6 +88,6 @@ def scored(folder: Path, methods: Mapping[str, Method] | None = None, **settings
     recording = open_recording(folder)
     chosen = dict(methods or {"bump": Bump()})
     flow = settings.pop("flow_here", None)
-    asked = Settings(**({"shrink": 1, "rate_hz": None} | settings))
+    asked = RecordingFlowSettings(**({"shrink": 1, "rate_hz": None} | settings))
     scale = pixel_scale.find_scale(recording.meta, folder)
     return evaluate_recording(recording, chosen, next(iter(chosen)), scale, asked, {}, flow=flow)

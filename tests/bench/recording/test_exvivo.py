@@ -10,7 +10,7 @@ import pytest
 from bench.recording import exvivo
 from bench.recording.folder import open_recording
 from bench.tracking.tracking import track_recording
-from synth.recording_flow.video_flow import Settings
+from synth.recording_flow.video_flow import RecordingFlowSettings
 
 
 @pytest.mark.slow
@@ -19,8 +19,10 @@ def test_a_stand_in_has_a_second_eye_where_asked(tmp_path: Path) -> None:
     recording = open_recording(exvivo.make(plan, 0, tmp_path / "000"))
     left, right = list(recording.frames()), list(recording.right_frames())
     assert len(left) == len(right) == 9
-    done = track_recording(recording, {}, 35 / 96, Settings("dis", shrink=1, rate_hz=None, pulse=False))
-    assert done.sight is not None
-    assert done.sight.baseline_mm == pytest.approx(24.0, abs=1e-6)
-    assert done.sight.epipolar_px < 0.3, "the calibration is that of the pictures"
+    done = track_recording(
+        recording, {}, 35 / 96, RecordingFlowSettings("dis", shrink=1, rate_hz=None, pulse=False)
+    )
+    assert done.stereo is not None
+    assert done.stereo.baseline_mm == pytest.approx(24.0, abs=1e-6)
+    assert done.stereo.epipolar_px < 0.3, "the calibration is that of the pictures"
     assert np.abs(left[0].rgb.astype(int) - right[0].rgb.astype(int)).mean() > 4, "two places"

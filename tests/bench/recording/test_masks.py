@@ -12,7 +12,7 @@ from fake_recording import Bump, Maker
 
 from bench.recording.folder import open_recording
 from bench.tracking.tracking import picture_masks, track_recording
-from synth.recording_flow.video_flow import Settings
+from synth.recording_flow.video_flow import RecordingFlowSettings
 
 _SIZE = (96, 128)
 
@@ -44,8 +44,8 @@ def test_only_the_region_is_tissue(tmp_path: Path) -> None:
 def test_given_mask_is_masked_and_pictured(tmp_path: Path) -> None:
     folder = Maker(tmp_path)(frames=4)
     _write(folder / "mask.png", 32)
-    found = track_recording(open_recording(folder), {"bump": Bump()}, 0.2, Settings())
-    assert found.account.shares["masked"] == pytest.approx(0.25, abs=0.05)
+    found = track_recording(open_recording(folder), {"bump": Bump()}, 0.2, RecordingFlowSettings())
+    assert found.summary.shares["masked"] == pytest.approx(0.25, abs=0.05)
     assert found.trusted == [True] * 4
     picture = picture_masks(found)
     assert picture is not None

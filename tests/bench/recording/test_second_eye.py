@@ -18,7 +18,7 @@ from bench.recording.folder import open_recording
 from bench.tracking.tracking import track_recording
 from synth.flow.stereo.calibration import read_rig
 from synth.flow.stereo.track import Moved
-from synth.recording_flow.video_flow import Settings
+from synth.recording_flow.video_flow import RecordingFlowSettings
 from synth.render.camera.camera import Camera
 
 SIZE = (160, 120)
@@ -26,7 +26,7 @@ FOCAL, BASE, AWAY = 1370.0, 24.0, 300.0
 K = np.array([[FOCAL, 0, 79.5], [0, FOCAL, 59.5], [0, 0, 1.0]])
 COLUMNS, ROWS = np.meshgrid(np.arange(SIZE[0]), np.arange(SIZE[1]))
 DENT = np.exp(-((COLUMNS - 80) ** 2 + (ROWS - 60) ** 2) / (2 * 22.0**2))
-SETTINGS = Settings(rate_hz=None, pulse=False, masks="none")
+SETTINGS = RecordingFlowSettings(rate_hz=None, pulse=False, masks="none")
 Make = Callable[..., Path]
 
 
@@ -120,13 +120,13 @@ def test_motion_in_space_is_what_was_put_in(make: Make, second: str) -> None:
         assert moved.motion[60, 80, 2] == pytest.approx(rise(amount)[60, 80], rel=0.15)
         assert moved.motion[60, 80, 0] == pytest.approx(2.5 * amount * AWAY / FOCAL, abs=0.05)
         assert (moved.deviation[inner] > 0).all()
-    assert done.sight is not None
+    assert done.stereo is not None
     if second == "right":
-        assert done.sight.baseline_mm == pytest.approx(BASE, rel=1e-3)
-        assert done.sight.epipolar_px < 0.1
+        assert done.stereo.baseline_mm == pytest.approx(BASE, rel=1e-3)
+        assert done.stereo.epipolar_px < 0.1
     else:
-        assert np.isnan(done.sight.baseline_mm)
-    assert done.sight.noise_mm > 0
+        assert np.isnan(done.stereo.baseline_mm)
+    assert done.stereo.noise_mm > 0
 
 
 @pytest.mark.slow
@@ -168,7 +168,7 @@ def test_a_breath_along_the_view_is_taken_off_depth(tmp_path: Path, second: str)
     assert after < 0.12
     deepest = int(np.argmax(load))
     assert told[True][deepest, 60, 80, 2] == pytest.approx(truth[deepest, 60, 80], rel=0.15)
-    assert done.sight is not None
+    assert done.stereo is not None
     assert len(method.told) == 2 * count
 
 

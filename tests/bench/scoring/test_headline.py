@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from concurrent.futures import Future
 from pathlib import Path
 
 import numpy as np
@@ -15,21 +16,23 @@ from bench.methods.protocol import Answer, Method, Scene
 from bench.scoring import charts
 from bench.scoring.headline import headline
 from bench.scoring.result import Result, as_json
-from synth.recording_flow.video_flow import Flags, FlowHere, Found, Rgb
+from synth.flow.estimator import Flags, Rgb
+from synth.recording_flow.frame_motion import FrameMotion
+from synth.recording_flow.local_flow import LocalFlow
 
 SIZE = (96, 128)
 
 
-class Known(FlowHere):
+class Known(LocalFlow):
     """A flow that is in proportion to the force, and that loses the frames it is told to."""
 
     def __init__(self, lost: set[int], fps: float = 10.0) -> None:
         self.lost, self.fps, self.frame = lost, fps, 0
 
-    def begin(self, backend: str, rest: Rgb, blocked: Flags, tissue: Flags) -> None:
+    def begin(self, backend: str, rest: Rgb, masked: object, tissue: Flags) -> None:
         self.shape = tissue.shape
 
-    def ask(self, rgb: Rgb, blocked: Flags) -> object:  # type: ignore[override]
+    def submit(self, rgb: Rgb, masked: object) -> Future[FrameMotion]:
         self.frame += 1
         y, x = np.mgrid[: self.shape[0], : self.shape[1]]
         bump = np.exp(-((x - 64) ** 2 + (y - 48) ** 2) / (2 * 17.0**2))
@@ -37,7 +40,9 @@ class Known(FlowHere):
         lost = self.frame in self.lost
         flow = np.zeros((*self.shape, 2), np.float32)
         flow[..., 0] = 50 * bump if lost else peak * bump
-        return lambda: Found(flow, np.full(self.shape, 0.1 if lost else 1.0, np.float32), not lost)
+        done: Future[FrameMotion] = Future()
+        done.set_result(FrameMotion(flow, np.full(self.shape, 0.1 if lost else 1.0, np.float32), not lost))
+        return done
 
 
 def run(folder: Path, lost: set[int] | None = None, **methods: Method) -> Result:

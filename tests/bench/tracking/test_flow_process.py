@@ -15,6 +15,8 @@ import pytest
 
 from bench.tracking.flow_process import FlowProcess
 from synth.errors import UserError
+from synth.recording_flow.video_flow import Footage, RecordingFlowSettings, VideoFlow
+from synth.video.read import Picture
 
 
 def pictures() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -37,13 +39,16 @@ def test_errors_of_the_flow_arrive_and_its_end_is_said(elsewhere: FlowProcess) -
         elsewhere.begin("nonesuch", rest, free, ~free)
     elsewhere.begin("dis", rest, free, ~free)
     with pytest.raises(UserError, match="does not fit"):
-        elsewhere.ask(moved[:-1], free)()
+        elsewhere.submit(moved[:-1], free).result()
     worker = elsewhere._pool.submit(os.getpid).result()
     os.kill(worker, signal.SIGINT)  # a terminal's Ctrl-C reaches every process; this one is closed instead
-    assert np.abs(elsewhere.ask(moved, free)().flow).max() > 1
+    assert np.abs(elsewhere.submit(moved, free).result().flow).max() > 1
+    footage = Footage([Picture(k, k / 25, one) for k, one in enumerate((rest, moved))], "film")
+    frames = VideoFlow(footage, RecordingFlowSettings("dis", 1, None, masks="none"), elsewhere).frames()
+    assert next(frames).is_rest
     os.kill(worker, signal.SIGKILL)
     with pytest.raises(UserError, match="ended"):
-        elsewhere.ask(moved, free)()
+        next(frames)
 
 
 @pytest.mark.slow

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import Future
 from contextlib import closing
 
 import numpy as np
@@ -9,8 +10,11 @@ import pytest
 
 from bench.tracking import live
 from bench.tracking.flow_process import FlowProcess
+from synth.flow.estimator import Flags, Rgb
 from synth.flow.mask_choice import Proposal
-from synth.recording_flow.video_flow import Asked, Flags, FlowHere, Footage, Rgb, Settings, VideoFlow
+from synth.recording_flow.frame_motion import FrameMotion
+from synth.recording_flow.local_flow import LocalFlow
+from synth.recording_flow.video_flow import Footage, RecordingFlowSettings, VideoFlow
 from synth.video.read import Picture
 
 
@@ -22,11 +26,11 @@ def film(frames: int) -> list[Picture]:
 
 @pytest.mark.slow
 def test_flow_elsewhere_gives_the_same_answers_in_order() -> None:
-    def watched(flow: FlowHere | None) -> list[live.Frame]:
-        told: list[live.Frame] = []
-        footage = Footage(film(5), "test")
-        live.watch_video(footage, backend="dis", masks="none", paced=False, told=told.append, flow=flow)
-        return told
+    def watched(flow: LocalFlow | None) -> list[live.LiveFrame]:
+        answered: list[live.LiveFrame] = []
+        footage, settings = Footage(film(5), "test"), RecordingFlowSettings("dis", 1, None, False, "none")
+        live.stream_video(footage, settings, paced=False, report=answered.append, flow=flow)
+        return answered
 
     here = watched(None)
     with closing(FlowProcess()) as process:
@@ -47,22 +51,37 @@ def test_flow_elsewhere_gives_the_same_answers_in_order() -> None:
 def test_an_answer_comes_as_soon_as_it_is_there(needs_s: float, expected: list[str]) -> None:
     log: list[str] = []
 
-    class Later(FlowHere):
+    class Slow(Future[FrameMotion]):
+        def result(self, timeout: float | None = None) -> FrameMotion:
+            if timeout is not None and timeout < needs_s:
+                raise TimeoutError
+            return super().result()
+
+    class Later(LocalFlow):
         ahead = 1
-        asked = 0
+        asked = -1  # once before the stream's start
 
-        def ask(self, rgb: Rgb, blocked: Flags | Proposal) -> Asked:
+        def submit(self, rgb: Rgb, masked: Flags | Proposal) -> Future[FrameMotion]:
             self.asked += 1
-            log.append(f"asked {self.asked}")
-            return Asked(super().ask(rgb, blocked).take, lambda within_s: needs_s <= within_s)
+            if self.asked:
+                log.append(f"asked {self.asked}")
+            slow = Slow()
+            slow.set_result(super().submit(rgb, masked).result())
+            return slow
 
-    def is_due(index: int, time_s: float) -> bool:
-        log.append(f"due {index}")
-        return True
+    class Clock:
+        def start(self, time_s: float) -> None:
+            pass
 
-    settings = Settings("dis", 1, rate_hz=None, pulse=False, masks="none")
-    video = VideoFlow(Footage(film(4), "test"), settings, Later(), is_due, spare_s=lambda time_s: 0.04)
-    for step in video.steps():
-        if not step.found.is_rest:
-            log.append(f"told {step.picture.index}")
+        def is_due(self, index: int, time_s: float) -> bool:
+            log.append(f"due {index}")
+            return True
+
+        def spare_s(self, time_s: float) -> float:
+            return 0.04
+
+    settings = RecordingFlowSettings("dis", 1, rate_hz=None, pulse=False, masks="none")
+    for frame in VideoFlow(Footage(film(4), "test"), settings, Later(), pace=Clock()).frames():
+        if not frame.is_rest:
+            log.append(f"told {frame.index}")
     assert log == expected

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,7 @@ from bench.recording.writer import write_video
 from bench.tracking import live
 from bench.tracking.tracking import track_recording
 from evidence.flow.scenes import Recipe, Stage
-from synth.recording_flow.video_flow import Footage, Settings
+from synth.recording_flow.video_flow import Footage, RecordingFlowSettings
 from synth.video.read import read_video
 
 
@@ -36,19 +37,21 @@ def test_live_answers_with_the_forces_that_scoring_finds(tmp_path: Path) -> None
     summary = json.loads(CliRunner().invoke(app, [*words, "--every", "--json"]).output)
     assert (summary["frames"], summary["dropped"]) == (3, 0)
 
+    settings = RecordingFlowSettings(shrink=1, rate_hz=None)
+
     def streamed(scale: float | str, young: float | None) -> list[float | None]:
-        frames: list[live.Frame] = []
-        live.watch_video(
+        frames: list[live.LiveFrame] = []
+        live.stream_video(
             Footage(read_video(folder / "video.mp4"), "video"),
+            replace(settings, pulse=False),
             method=Model(model),
             scale_mm_per_px=scale,  # type: ignore[arg-type]
             young_kpa=young,
             paced=False,
-            told=frames.append,
+            report=frames.append,
         )
         return [frame.force_mn for frame in frames]
 
-    settings = Settings(shrink=1, rate_hz=None)
     followed = track_recording(open_recording(folder), {"model": Model(model)}, 0.3, settings)
     scored = [float(np.linalg.norm(force)) for force in followed.force_mn["model"][1:]]
     assert min(scored) > 0

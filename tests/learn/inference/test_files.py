@@ -26,7 +26,7 @@ from learn.settings import override, preset
 from learn.training.batches import measure_scales
 from synth.dataset.store import Dataset
 from synth.errors import UserError
-from synth.recording_flow.video_flow import Footage, Settings, VideoFlow
+from synth.recording_flow.video_flow import Footage, RecordingFlowSettings, VideoFlow
 from synth.video.pixel_scale import UNKNOWN_NOTE
 from synth.video.read import read_video
 
@@ -137,7 +137,7 @@ def test_a_video_is_followed_and_predicted(model: Path, tmp_path: Path) -> None:
         assert found["young_known"]
         assert found["trusted"].all()
     footage = Footage(read_video(tmp_path / "film.mp4"), "film", lambda size: marked > 0)
-    seen = [step.found.flow for step in VideoFlow(footage, Settings("dis", rate_hz=None)).steps()]
+    seen = [frame.flow for frame in VideoFlow(footage, RecordingFlowSettings("dis", rate_hz=None)).frames()]
     assert np.abs(seen[0]).max() == 0
     np.testing.assert_allclose(seen[2][16:32, 16:48].mean((0, 1)), [2, 0], atol=0.3)
 

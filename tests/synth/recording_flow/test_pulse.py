@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from synth.recording_flow.pulse import Pulse, Surface, find_pulse
+from synth.recording_flow.pulse import PulseEstimate, SurfaceMotion, find_pulse
 
 SIZE = (120, 160)
 MM_PER_PX = 0.16
@@ -27,7 +27,7 @@ def film(
     period_s: float | None = None,
     wander: float = 0.0,
     rest_px: float = 0.0,
-) -> tuple[Surface, NDArray[np.float64], list[NDArray[np.float64]]]:
+) -> tuple[SurfaceMotion, NDArray[np.float64], list[NDArray[np.float64]]]:
     """What is tracked, its times, and the tissue's own motion and the rest frame's noise [px]."""
     rng = np.random.default_rng(0)
     time = np.arange(0, seconds, 0.1) + rng.uniform(-0.02, 0.02, round(10 * seconds))
@@ -41,7 +41,7 @@ def film(
             inside = (time > begin) & (time < begin + long)
             load += inside * rng.uniform(0.5, 1) * np.sin(np.pi * (time - begin) / long)
             begin += long + rng.uniform(0.8, 2.5)
-    surface, lay = Surface(np.ones(SIZE, bool)), []
+    surface, lay = SurfaceMotion(np.ones(SIZE, bool)), []
     at_rest = rng.normal(0, rest_px, (SIZE[0] // 8, SIZE[1] // 8, 2)).repeat(8, 0).repeat(8, 1)
     for t, force in zip(time, load, strict=True):
         turn = 2 * np.pi * 1.2 * t + wander * np.sin(2 * np.pi * t / seconds)
@@ -54,7 +54,7 @@ def film(
     return surface, time, [own - lay[0] + at_rest for own in lay]
 
 
-def left(pulse: Pulse, time: NDArray[np.float64], truth: list[NDArray[np.float64]]) -> float:
+def left(pulse: PulseEstimate, time: NDArray[np.float64], truth: list[NDArray[np.float64]]) -> float:
     """Root mean square of what is wrongly left in or taken off [mm]."""
     return MM_PER_PX * float(
         np.sqrt(np.mean([np.square(pulse.at(t) - own).mean() for t, own in zip(time, truth, strict=True)]))
@@ -80,11 +80,11 @@ def test_the_rest_frames_own_noise_is_taken_off_but_nothing_larger() -> None:
     surface, time, truth = film(rest_px=0.06)
     pulse = find_pulse(surface, time[0]).pulse
     assert pulse is not None
-    assert left(pulse, time, truth) < 0.7 * left(replace(pulse, still=0 * pulse.still), time, truth)
+    assert left(pulse, time, truth) < 0.7 * left(replace(pulse, rest_noise=0 * pulse.rest_noise), time, truth)
     surface, time, _ = film(rest_px=0.5)
     pulse = find_pulse(surface, time[0]).pulse
     assert pulse is not None
-    assert np.linalg.norm(pulse.still, axis=-1).max() == pytest.approx(0.15, abs=0.01)
+    assert np.linalg.norm(pulse.rest_noise, axis=-1).max() == pytest.approx(0.15, abs=0.01)
 
 
 @pytest.mark.parametrize("period_s", [None, 2.0, 0.9])
