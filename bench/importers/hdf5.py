@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from bench.importers.registry import MOST_FRAMES, ROLES, Intake
+from bench.importers.registry import MOST_FRAMES, ROLES, Intake, one_of
 from synth.errors import UserError
 from synth.system.checked_file import refuse_large
 
@@ -38,7 +39,7 @@ def read_source(source: Path, use: dict[str, str]) -> Intake:
     file.visititems(
         lambda name, item: arrays.update({name: item}) if isinstance(item, h5py.Dataset) else None
     )
-    chosen = {role: _chosen(source, role, use, arrays) for role in ROLES}
+    chosen = {role: _choose(role, use, arrays) for role in ROLES}
     frames, times = chosen["frames"], chosen["frame_time"]
     if frames is None or times is None:
         raise UserError(
@@ -54,19 +55,18 @@ def read_source(source: Path, use: dict[str, str]) -> Intake:
     seconds = np.asarray(times[:], np.float64).ravel()
     if len(seconds) != len(frames):
         raise UserError(f"{source}: {len(frames)} frames, {len(seconds)} frame times")
-    force, force_s = np.zeros((0, 3)), np.zeros(0)
+    found = Intake(seconds, lambda: (np.asarray(frames[k]) for k in range(len(frames))))
     if chosen["force"] is not None:
         force = np.asarray(chosen["force"][:], np.float64)
         if force.ndim != 2 or force.shape[1] not in (3, 6):
             raise UserError(f"{source}: force of shape {force.shape}, expected (N, 3) or (N, 6)")
-        force = force[:, :3]
         clock = chosen["force_time"]
         force_s = seconds if clock is None else np.asarray(clock[:], np.float64).ravel()
-    tip = np.zeros((0, 4))
+        found = replace(found, force_s=force_s, force=force[:, :3])
     if chosen["tip"] is not None:
-        tip = np.column_stack([seconds, np.asarray(chosen["tip"][:], np.float64).reshape(-1, 3)])
-
-    return Intake(seconds, lambda: (np.asarray(frames[k]) for k in range(len(frames))), force_s, force, tip)
+        place = np.asarray(chosen["tip"][:], np.float64).reshape(-1, 3)
+        found = replace(found, tip=np.column_stack([seconds, place]))
+    return found
 
 
 def _refuse_odd(source: Path, role: str, array: Any) -> None:
@@ -80,16 +80,11 @@ def _refuse_odd(source: Path, role: str, array: Any) -> None:
         raise UserError(f"{source}: {array.name} is too large to be read")
 
 
-def _chosen(source: Path, role: str, use: dict[str, str], arrays: dict[str, Any]) -> Any:
+def _choose(role: str, use: dict[str, str], arrays: dict[str, Any]) -> Any:
+    """The array for a role: the one named, else that of the first of its usual names; None without."""
     if role in use:
-        name = use[role].strip("/")
-        if name not in arrays:
-            raise UserError(f"{source}: --use {role}={use[role]}: there are {', '.join(sorted(arrays))}")
-        return arrays[name]
-    for usual in _USUAL[role]:
-        named = [name for name in arrays if name.rsplit("/", 1)[-1].lower() == usual]
-        if len(named) > 1:
-            raise UserError(f"{source}: {' and '.join(named)} could be the {role}: say --use {role}=NAME")
-        if named:
-            return arrays[named[0]]
-    return None
+        return arrays[one_of(role, use[role].strip("/"), sorted(arrays), "array") or ""]
+    by_name = [
+        [name for name in arrays if name.rsplit("/", 1)[-1].lower() == usual] for usual in _USUAL[role]
+    ]
+    return arrays.get(one_of(role, None, next(filter(None, by_name), []), "array") or "")

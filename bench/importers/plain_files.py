@@ -8,13 +8,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.importers.registry import Floats, Intake
+from bench.importers.registry import Floats, Intake, picture_files
 from bench.recording import csv_table
-from bench.recording.folder import natural_order
 from synth.errors import UserError
 from synth.video import read as video
 
-STILLS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
 _SECONDS = ("t_s", "time", "timestamp", "t", "time_s", "%time", "__time")
 _FORCES = (
     ("fx_n", "fy_n", "fz_n"),
@@ -28,11 +26,6 @@ _Pictures = Callable[[], Iterator[NDArray[np.uint8]]]
 _NANOSECONDS = 1e15  # larger numbers are no seconds of any clock: `rostopic echo -p` writes nanoseconds
 
 
-def is_picture_folder(path: Path) -> bool:
-    """Whether a folder holds pictures and is no recording already."""
-    return path.is_dir() and not (path / "meta.yaml").is_file() and bool(_pictures(path))
-
-
 def read_source(source: Path, use: dict[str, str]) -> Intake:
     """A folder of pictures, in the order of their numbers, or an .npy of (T, H, W[, C]).
 
@@ -44,13 +37,10 @@ def read_source(source: Path, use: dict[str, str]) -> Intake:
     """
     pictures, count = _array(source) if source.is_file() else _folder(source)
     times = _times(source, use, count)
-    force_s, force = np.zeros(0), np.zeros((0, 3))
-    if "force" in use:
-        force_s, force = read_forces(Path(use["force"]))
-    return Intake(times, pictures, force_s, force)
+    return Intake(times, pictures, *(_read_forces(Path(use["force"])) if "force" in use else ()))
 
 
-def read_forces(path: Path) -> tuple[Floats, Floats]:
+def _read_forces(path: Path) -> tuple[Floats, Floats]:
     """Times (N,) s and forces (N, 3) in the table's unit. UserError if it has no such columns."""
     header = csv_table.read_header(path)
     names = next((names for names in _FORCES if set(names) <= set(header)), None)
@@ -84,12 +74,8 @@ def _times(source: Path, use: dict[str, str], count: int) -> Floats:
     return np.arange(count) / rate
 
 
-def _pictures(folder: Path) -> list[Path]:
-    return sorted((p for p in folder.iterdir() if p.suffix.lower() in STILLS), key=natural_order)
-
-
 def _folder(folder: Path) -> tuple[_Pictures, int]:
-    paths = tuple(_pictures(folder))
+    paths = tuple(picture_files(folder))
     return lambda: (picture.rgb for picture in video.read_pictures(paths)), len(paths)
 
 

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.recording import clocks, writer
+from bench.recording.folder import natural_order
 from synth.errors import UserError
 from synth.system import checked_file
 from synth.system.checked_file import refuse_large
@@ -24,6 +25,7 @@ from synth.system.checked_file import refuse_large
 Floats = NDArray[np.float64]
 ROLES = ("frames", "frame_time", "force", "force_time", "tip")
 """What a source may hold; `--use ROLE=NAME` says under which name; `--use fps=RATE` times bare pictures."""
+_STILLS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
 _PLAIN = "bench.importers.plain_files"
 _MAKERS = {
     ".mha": "bench.importers.igsio",
@@ -34,7 +36,6 @@ _MAKERS = {
     ".db3": "bench.importers.rosbag",
     ".npy": _PLAIN,
 }
-_CRF_LOSSLESS = 0
 _LARGEST_BYTES = 1 << 42
 _LEAST_PX = 8
 _LATEST_S = 1e11
@@ -62,15 +63,6 @@ class Intake:
     notes: tuple[str, ...] = ()
 
 
-def _maker(path: Path) -> str | None:
-    """The module that reads it; None if none does."""
-    if not path.is_dir():
-        return _MAKERS.get(path.suffix.lower())
-    if (path / "metadata.yaml").is_file():
-        return "bench.importers.rosbag"
-    return _PLAIN if import_module(_PLAIN).is_picture_folder(path) else None
-
-
 def read_source(source: Path, use: Mapping[str, str] | None = None) -> Intake:
     """Opens a source.
 
@@ -83,7 +75,10 @@ def read_source(source: Path, use: Mapping[str, str] | None = None) -> Intake:
     """
     if not source.is_dir():
         checked_file.check_file(source, _LARGEST_BYTES)
-    maker = _maker(source)
+    maker = _MAKERS.get(source.suffix.lower())
+    if source.is_dir():
+        bag = (source / "metadata.yaml").is_file()
+        maker = "bench.importers.rosbag" if bag else _PLAIN if _holds_bare_pictures(source) else None
     if maker is None:
         known = ", ".join(sorted(_MAKERS))
         raise UserError(
@@ -123,17 +118,16 @@ def _damage_told(source: Path) -> Iterator[None]:
 
 def _refuse_odd(source: Path, found: Intake) -> None:
     """UserError for times that are none, or in another unit than seconds, or not as many as forces."""
+    if len(found.times_s) == 0:
+        raise UserError(f"{source}: holds no frames")
     for what, times in (("frame", found.times_s), ("force", found.force_s), ("tip", found.tip[:, 0])):
         step = float(np.median(np.abs(np.diff(times)))) if len(times) > 1 else 0.0
         if not (np.abs(times) < _LATEST_S).all() or step >= _LONGEST_STEP_S:
             raise UserError(f"{source}: the times of {what}s, {step:g} s apart: are they in seconds?")
     if len(found.force_s) != len(found.force):
         raise UserError(f"{source}: {len(found.force)} forces, {len(found.force_s)} times for them")
-    other = clocks.find_other_unit(found.times_s, found.force_s)
-    if other:
+    if other := clocks.find_other_unit(found.times_s, found.force_s):
         raise UserError(f"{source}: {other}")
-    if len(found.times_s) == 0:
-        raise UserError(f"{source}: holds no frames")
 
 
 def write_recording(
@@ -152,9 +146,10 @@ def write_recording(
         UserError: the folder exists, or a picture can't be decoded.
     """
     with writer.write_whole_folder(out) as part:
-        writer.write_video(
-            part / "video.mp4", _told(found.pictures(), progress), _rising(found.times_s), crf=_CRF_LOSSLESS
-        )
+        # Lossless, and at times that rise, as the container needs them; frames.csv keeps the true ones.
+        steps = np.maximum(np.diff(found.times_s), 1e-3)
+        rising = found.times_s[0] + np.cumsum([0.0, *steps])
+        writer.write_video(part / "video.mp4", found.pictures(), rising, crf=0, progress=progress)
         writer.write_frames(part, found.times_s)
         if len(found.force):
             writer.write_force(part, found.force_s, newtons * found.force)
@@ -162,6 +157,11 @@ def write_recording(
             writer.write_tip(part, found.tip)
         writer.write_meta(part, about)
     return out
+
+
+def picture_files(folder: Path) -> list[Path]:
+    """The pictures in a folder, in the order of the numbers in their names."""
+    return sorted((p for p in folder.iterdir() if p.suffix.lower() in _STILLS), key=natural_order)
 
 
 def one_of(role: str, wanted: str | None, names: list[str], what: str) -> str | None:
@@ -179,6 +179,11 @@ def one_of(role: str, wanted: str | None, names: list[str], what: str) -> str | 
     return names[0] if names else None
 
 
+def _holds_bare_pictures(folder: Path) -> bool:
+    """Whether there are pictures, and the folder is no recording already."""
+    return not (folder / "meta.yaml").is_file() and bool(picture_files(folder))
+
+
 def _as_rgb(picture: NDArray[Any]) -> NDArray[np.uint8]:
     """Grey or colour as (H, W, 3) uint8 sRGB; 16-bit levels are cut to 8. UserError for others."""
     if picture.dtype == np.uint16:
@@ -193,18 +198,3 @@ def _as_rgb(picture: NDArray[Any]) -> NDArray[np.uint8]:
         raise UserError(f"pictures of {width} x {height} pixels: at least {_LEAST_PX} a side are needed")
     refuse_large(width, height)
     return np.ascontiguousarray(picture[..., :3])
-
-
-def _told(
-    pictures: Iterator[NDArray[np.uint8]], progress: Callable[[int], None]
-) -> Iterator[NDArray[np.uint8]]:
-    for k, picture in enumerate(pictures):
-        yield picture
-        progress(k + 1)
-
-
-def _rising(times_s: Floats) -> Floats:
-    """The container needs times that rise; frames.csv keeps the true ones."""
-    steps = np.maximum(np.diff(times_s, prepend=times_s[:1]), 0)
-    steps[1:] = np.maximum(steps[1:], 1e-3)
-    return np.asarray(times_s[0] + np.cumsum(steps), np.float64)

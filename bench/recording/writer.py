@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -66,19 +66,24 @@ def write_pair(path: Path, left: Camera, right: Camera) -> None:
     storage.release()
 
 
-def write_video(path: Path, pictures: Iterator[NDArray[np.uint8]], times_s: Floats, crf: int = 12) -> None:
+def write_video(
+    path: Path,
+    pictures: Iterator[NDArray[np.uint8]],
+    times_s: Floats,
+    crf: int = 12,
+    progress: Callable[[int], None] = lambda done: None,
+) -> None:
     """H.264 MP4 with each frame at its own time, in milliseconds; odd sizes lose their last row or column.
 
     Args:
         pictures: (H, W, 3) uint8 each, as many as `times_s`.
         times_s: (T,) rising [s].
         crf: x264's quality, 0 is lossless (4:4:4 colour).
+        progress: told how many frames are written.
     """
     # By "file:" a colon in the path is no protocol.
     with av.open(f"file:{path}", "w", format="mp4") as container:
-        rate = (
-            max(1, round((len(times_s) - 1) / max(times_s[-1] - times_s[0], 1e-3))) if len(times_s) > 1 else 1
-        )
+        rate = max(1, round((len(times_s) - 1) / max(times_s[-1] - times_s[0], 1e-3)))
         stream = container.add_stream("libx264", rate=rate, options={"crf": str(crf), "threads": "1"})
         stream.codec_context.time_base = stream.time_base = Fraction(1, 90_000)
         stream.pix_fmt = "yuv444p" if crf == 0 else "yuv420p"
@@ -92,6 +97,7 @@ def write_video(path: Path, pictures: Iterator[NDArray[np.uint8]], times_s: Floa
             frame.pts = round(float(time - times_s[0]) * 90_000)
             frame.time_base = Fraction(1, 90_000)
             container.mux(stream.encode(frame))
+            progress(k + 1)
         container.mux(stream.encode())
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +15,8 @@ Curve = NDArray[np.float64]
 """(T,) float64."""
 
 _LARGEST_LAG_S = 0.5
-
+_LEAST_CONTACT_MN = 1e-3
+_SHAPE_ERROR = "MAE after the one gain that fits best, over the contacts' mean peak."
 
 METRICS = {
     "n": Metric("samples", "", "Samples where both are finite.", relative=True),
@@ -27,20 +28,12 @@ METRICS = {
     "ccc": Metric("CCC", "", "Lin's concordance correlation.", "high", column="CCC"),
     "r2": Metric("R²", "", "1 − SSE/SST about the sensor's mean: bias and gain count.", "high", column="R²"),
     "gain": Metric("gain", "", "Least-squares slope of predicted on sensor.", "one", column="gain"),
-    "shape_error": Metric(
-        "shape error",
-        "%",
-        "MAE after the one gain that fits best, over the contacts' mean peak.",
-        "low",
-        3,
-        True,
-        "shape err.",
-    ),
+    "shape_error": Metric("shape error", "%", _SHAPE_ERROR, "low", 3, True, "shape err."),
     "lag_s": Metric("lag", "ms", "How late predicted is, at the best correlation.", "zero", 3, True, "lag"),
     "r_at_lag": Metric("r at that lag", "", "Correlation with the lag taken out.", "high", relative=True),
     "contact_f1": Metric("contact F1", "", "F1 of contact, by sample.", "high", column="contact F1"),
-    "ghost_rate": Metric("ghosts", "%", "Free samples with contact predicted.", "low", column="ghosts"),
-    "ghost_mn": Metric("ghost force", "mN", "Mean predicted force without contact.", "low", 2),
+    "ghost_rate": Metric("false positives", "%", "Free samples with contact.", "low", column="FPR"),
+    "ghost_mn": Metric("background force", "mN", "Mean predicted force without contact.", "low", 2),
     "threshold_mn": Metric("contact threshold", "mN", "From which the sensor says contact.", "", 2, True),
     "events": Metric("contacts", "", "Contacts that the sensor shows.", relative=True),
     "event_peak_mn": Metric("event peak", "mN", "Mean peak of the contacts.", "", 2, True),
@@ -52,14 +45,6 @@ METRICS = {
 
 RELATIVE = tuple(key for key, metric in METRICS.items() if metric.relative)
 """Scores that a prediction of unknown stiffness has."""
-
-
-@dataclass(frozen=True)
-class Event:
-    """One contact: a span of samples, end exclusive."""
-
-    start: int
-    stop: int
 
 
 def agreement(sensor: Curve, predicted: Curve) -> dict[str, float]:
@@ -77,22 +62,22 @@ def agreement(sensor: Curve, predicted: Curve) -> dict[str, float]:
     """
     both = np.isfinite(sensor) & np.isfinite(predicted)
     x, y = sensor[both], predicted[both]
-    n, nan = len(x), float("nan")
-    if n == 0:
-        keys = ("mae_mn", "rmse_mn", "bias_mn", "r", "ccc", "r2", "gain")
-        return {"n": 0.0, **dict.fromkeys(keys, nan)}
+    if len(x) == 0:
+        return {"n": 0.0} | dict.fromkeys(
+            ("mae_mn", "rmse_mn", "bias_mn", "r", "ccc", "r2", "gain"), math.nan
+        )
     bias, moving = float((y - x).mean()), np.ptp(x) > 0
     fit = linregress(x, y) if moving else None
     covariance = float(np.cov(x, y, ddof=0)[0, 1]) if moving else 0.0
     return {
-        "n": float(n),
+        "n": float(len(x)),
         "mae_mn": float(mean_absolute_error(x, y)),
         "rmse_mn": float(root_mean_squared_error(x, y)),
         "bias_mn": bias,
-        "r": float(fit.rvalue) if fit and np.ptp(y) > 0 else nan,
+        "r": float(fit.rvalue) if fit and np.ptp(y) > 0 else math.nan,
         "ccc": ratio(2 * covariance, float(x.var() + y.var() + bias**2)),
-        "r2": float(r2_score(x, y)) if moving else nan,
-        "gain": float(fit.slope) if fit else nan,
+        "r2": float(r2_score(x, y)) if moving else math.nan,
+        "gain": float(fit.slope) if fit else math.nan,
     }
 
 
@@ -118,7 +103,7 @@ def lag(time_s: Curve, sensor: Curve, predicted: Curve) -> dict[str, float]:
     """
     both = np.isfinite(sensor) & np.isfinite(predicted) & np.isfinite(time_s)
     t, x, y = time_s[both], sensor[both], predicted[both]
-    nothing = {"lag_s": float("nan"), "r_at_lag": float("nan")}
+    nothing = {"lag_s": math.nan, "r_at_lag": math.nan}
     if len(t) < 8 or np.ptp(x) == 0 or np.ptp(y) == 0:
         return nothing
     step = float(np.median(np.diff(t))) / 4
@@ -134,9 +119,6 @@ def lag(time_s: Curve, sensor: Curve, predicted: Curve) -> dict[str, float]:
         return nothing
     best = int(np.nanargmax(r))
     return {"lag_s": float(lags[best]), "r_at_lag": float(r[best])}
-
-
-_LEAST_CONTACT_MN = 1e-3
 
 
 def contact_threshold(sensor: Curve, noise_floor_mn: float) -> float:
@@ -158,29 +140,25 @@ def in_contact(curve: Curve, threshold_mn: float) -> NDArray[np.bool_]:
     return out
 
 
-def events(time_s: Curve, contact: NDArray[np.bool_], shortest_s: float = 0.15) -> list[Event]:
+def events(time_s: Curve, contact: NDArray[np.bool_], shortest_s: float = 0.15) -> list[slice]:
     """Contacts of at least `shortest_s` (a sample lasts a median step); shorter gaps are closed first."""
     step = float(np.median(np.diff(time_s))) if len(time_s) > 1 else 0.0
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], contact, [False]]).astype(int)))
-    spans = [Event(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
-    joined: list[Event] = []
-    for span in spans:
-        if joined and time_s[span.start] - time_s[joined[-1].stop - 1] - step < shortest_s:
-            joined[-1] = Event(joined[-1].start, span.stop)
-        else:
-            joined.append(span)
-    return [span for span in joined if time_s[span.stop - 1] - time_s[span.start] + step >= shortest_s]
+    edges = np.flatnonzero(np.diff(contact, prepend=False, append=False))
+    first, last = edges[::2], edges[1::2] - 1
+    apart = time_s[first[1:]] - time_s[last[:-1]] - step >= shortest_s
+    first, last = first[np.append(True, apart)[: len(first)]], last[np.append(apart, True)[: len(last)]]
+    long = time_s[last] - time_s[first] + step >= shortest_s
+    return [slice(int(a), int(b) + 1) for a, b in zip(first[long], last[long], strict=True)]
 
 
-def per_event(time_s: Curve, sensor: Curve, predicted: Curve, spans: list[Event]) -> list[dict[str, float]]:
+def per_event(time_s: Curve, sensor: Curve, predicted: Curve, spans: list[slice]) -> list[dict[str, float]]:
     """One row a contact: peaks [mN], impulses [mN s] (trapezoidal) and their errors.
 
     Times, peak and impulse are the sensor's alone. Errors are over the samples that have a prediction, and
     NaN where fewer than two have.
     """
     rows = []
-    for span in spans:
-        part = slice(span.start, span.stop)
+    for part in spans:
         felt = np.isfinite(sensor[part])
         if felt.sum() < 2:
             continue
@@ -201,7 +179,7 @@ def _event_errors(t: Curve, x: Curve, y: Curve) -> dict[str, float]:
     """What a contact's prediction `y` makes of the sensor's `x` where there is one."""
     said = np.isfinite(y)
     if said.sum() < 2:
-        return dict.fromkeys(("predicted_peak_mn", "peak_error", "impulse_error", "mae_mn"), float("nan"))
+        return dict.fromkeys(("predicted_peak_mn", "peak_error", "impulse_error", "mae_mn"), math.nan)
     t, x, y = t[said], x[said], y[said]
     peak, impulse = float(x.max()), float(np.trapezoid(x, t))
     return {
@@ -216,18 +194,16 @@ def contact_scores(sensor: Curve, predicted: Curve, threshold_mn: float) -> dict
     """How well contact is told from none.
 
     Returns:
-        contact_f1; ghost_rate: share of contact-free samples where contact is predicted; ghost_mn: mean
-        predicted force there.
+        contact_f1; ghost_rate, the false-positive rate: share of contact-free samples where contact is
+        predicted; ghost_mn, the background force: mean predicted force there.
     """
     both = np.isfinite(sensor) & np.isfinite(predicted)
-    truth = in_contact(sensor, threshold_mn)[both]
-    said = in_contact(predicted, threshold_mn)[both]
-    free = ~truth
-    ghosts = predicted[both][free]
+    truth, found = (in_contact(curve, threshold_mn)[both] for curve in (sensor, predicted))
+    free, background = ~truth, np.abs(predicted[both][~truth])
     return {
-        "contact_f1": float(f1_score(truth, said)) if (truth | said).any() else float("nan"),
-        "ghost_rate": float(said[free].mean()) if free.any() else float("nan"),
-        "ghost_mn": float(np.abs(ghosts).mean()) if free.any() else float("nan"),
+        "contact_f1": float(f1_score(truth, found)) if (truth | found).any() else math.nan,
+        "ghost_rate": float(found[free].mean()) if free.any() else math.nan,
+        "ghost_mn": float(background.mean()) if free.any() else math.nan,
     }
 
 
@@ -252,9 +228,10 @@ def compute_all(
     threshold = contact_threshold(sensor, noise_floor_mn)
     rows = per_event(time_s, sensor, predicted, events(time_s, in_contact(sensor, threshold) & kept))
     scores = agreement(sensor, predicted)
-    peaks = np.array([row["peak_mn"] for row in rows])
-    peak = float(peaks.mean()) if len(peaks) else float("nan")
-    scores["shape_error"] = ratio(_after_gain(sensor, predicted)["mae_mn"], peak)
+    peak = _mean_size(rows, "peak_mn")
+    # After the one best gain, known in hindsight, what is left is the error of the curve's shape.
+    best = gain(sensor, predicted, np.isfinite(sensor)) * predicted
+    scores["shape_error"] = ratio(agreement(sensor, best)["mae_mn"], peak)
     scores |= lag(time_s, sensor, predicted)
     scores |= contact_scores(sensor, predicted, threshold)
     scores |= {
@@ -264,25 +241,20 @@ def compute_all(
         "mae_of_peak": ratio(scores["mae_mn"], peak),
         "peak_mae": _mean_size(rows, "peak_error"),
         "impulse_mae": _mean_size(rows, "impulse_error"),
-        "dropout": float(np.mean(~np.isfinite(predicted[kept]))) if kept.any() else float("nan"),
+        "dropout": float(np.mean(~np.isfinite(predicted[kept]))) if kept.any() else math.nan,
     }
     return scores, rows
 
 
-def _after_gain(sensor: Curve, predicted: Curve) -> dict[str, float]:
-    """Agreement of what the one best gain, known in hindsight, leaves of the prediction: its shape."""
-    return agreement(sensor, gain(sensor, predicted, np.isfinite(sensor)) * predicted)
-
-
 def without_newtons(scores: dict[str, float]) -> dict[str, float]:
     """The scores with those that need forces in newtons made NaN: for predictions of unknown stiffness."""
-    return {key: value if key in RELATIVE else float("nan") for key, value in scores.items()}
+    return {key: value if key in RELATIVE else math.nan for key, value in scores.items()}
 
 
 def without_prediction(rows: list[dict[str, float]]) -> list[dict[str, float]]:
     """Contacts as the sensor alone has them: what needs predicted newtons made NaN."""
     own = ("from_s", "to_s", "peak_mn", "impulse_mns")
-    return [{key: value if key in own else float("nan") for key, value in row.items()} for row in rows]
+    return [{key: value if key in own else math.nan for key, value in row.items()} for row in rows]
 
 
 def limits_of_agreement(difference: Curve, group: NDArray[np.integer]) -> dict[str, float]:
@@ -302,10 +274,9 @@ def limits_of_agreement(difference: Curve, group: NDArray[np.integer]) -> dict[s
     d, names = difference[good], np.unique(group[good], return_inverse=True)[1]
     n, size = len(d), np.bincount(names).astype(float) if good.any() else np.zeros(0)
     k = len(size)
-    nan = float("nan")
+    bias = float(d.mean()) if n else math.nan
     if n < 2:
-        return {"bias_mn": float(d.mean()) if n else nan, "low_mn": nan, "high_mn": nan}
-    bias = float(d.mean())
+        return {"bias_mn": bias, "low_mn": math.nan, "high_mn": math.nan}
     means = np.bincount(names, d) / size
     variance = float(d.var(ddof=1))
     if 1 < k < n:
@@ -319,9 +290,9 @@ def limits_of_agreement(difference: Curve, group: NDArray[np.integer]) -> dict[s
 
 def _mean_size(rows: list[dict[str, float]], key: str) -> float:
     sizes = [abs(row[key]) for row in rows if np.isfinite(row[key])]
-    return float(np.mean(sizes)) if sizes else float("nan")
+    return float(np.mean(sizes)) if sizes else math.nan
 
 
 def ratio(above: float, below: float) -> float:
     """above / below; NaN unless `below` is positive."""
-    return above / below if below > 0 else float("nan")
+    return above / below if below > 0 else math.nan

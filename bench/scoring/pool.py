@@ -21,15 +21,14 @@ from synth.system.checked_file import write_whole
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-SCORES = tuple(
-    (key, METRICS[key].heading)
-    for key in ("mae_mn", "mae_of_peak", "r", "shape_error", "ccc", "r2", "bias_mn", "contact_f1",
-                "ghost_rate", "peak_mae", "impulse_mae", "dropout")
-)  # fmt: skip
-_CALIBRATED = (
-    *((key, f"{METRICS[key].heading}, gain set") for key in ("mae_of_peak", "r2")),
-    ("gain", METRICS["gain"].heading),
-)
+_SHOWN = ("mae_mn", "mae_of_peak", "r", "shape_error", "ccc", "r2", "contact_f1", "ghost_rate", "peak_mae")
+"""Of the scores, what the page has."""
+SCORES = (*_SHOWN, "bias_mn", "impulse_mae", "dropout")
+_CALIBRATED = {
+    "mae_of_peak": f"{METRICS['mae_of_peak'].heading}, gain set",
+    "r2": f"{METRICS['r2'].heading}, gain set",
+    "gain": METRICS["gain"].heading,
+}
 
 
 def read(paths: Sequence[Path]) -> list[dict[str, Any]]:
@@ -40,9 +39,8 @@ def read(paths: Sequence[Path]) -> list[dict[str, Any]]:
     """
     found = []
     for path in paths:
-        file = path / "score.json" if path.is_dir() else path
         try:
-            tree = checked_file.read_json(file)
+            tree = checked_file.read_json(path / "score.json" if path.is_dir() else path)
         except UserError as error:
             raise UserError(f"{path}: holds no readable score.json ({error})") from None
         if not isinstance(tree, dict) or tree.get("format") != "sulcus-score":
@@ -51,11 +49,10 @@ def read(paths: Sequence[Path]) -> list[dict[str, Any]]:
     if not found:
         raise UserError("no scores to pool")
     names = [tree["recording"] for tree in found]
-    twice = {name for name in names if names.count(name) > 1}
-    if twice:
+    if twice := {name for name in names if names.count(name) > 1}:
         raise UserError(f"recording {min(twice)} is given twice")
-    if not any(_reason(tree) == "" for tree in found):
-        why = "; ".join(f"{tree['recording']}: {_reason(tree)}" for tree in found)
+    if all(_fault(tree) for tree in found):
+        why = "; ".join(f"{tree['recording']}: {_fault(tree)}" for tree in found)
         raise UserError(f"no recording that can be pooled ({why})")
     if len({tree["main"] for tree in found}) > 1:
         raise UserError("the scores are of different main methods")
@@ -67,37 +64,35 @@ def pool(found: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
     Recordings that were not scored (no sensor, clocks not aligned, too much lost) are left out and named.
     """
-    every, found = found, [tree for tree in found if not _reason(tree)]
-    methods = [m for m in found[0]["methods"] if all(m in tree["methods"] for tree in found)]
+    every, found = found, [tree for tree in found if not _fault(tree)]
     specimens = [tree["settings"]["meta"].get("specimen") or tree["recording"] for tree in found]
     main = found[0]["main"]
-    out: dict[str, Any] = {}
-    for method in methods:
-        rows = [tree["methods"][method] for tree in found]
-        out[method] = {
-            "scores": {key: _mean([row["scores"].get(key) for row in rows], specimens) for key, _ in SCORES},
-            "calibrated": {
-                key: _mean([row["calibrated"].get(key) for row in rows], specimens) for key, _ in _CALIBRATED
-            },
+
+    def values(method: str, part: str, key: str) -> list[float]:
+        return [_number(tree["methods"][method][part].get(key)) for tree in found]
+
+    methods: dict[str, Any] = {}
+    for name in (name for name in found[0]["methods"] if all(name in tree["methods"] for tree in found)):
+        pairs = zip(values(main, "scores", "mae_mn"), values(name, "scores", "mae_mn"), strict=True)
+        methods[name] = {
+            "scores": {key: _mean(values(name, "scores", key), specimens) for key in SCORES},
+            "calibrated": {key: _mean(values(name, "calibrated", key), specimens) for key in _CALIBRATED},
+            "main_worse_by_mn": None if name == main else _mean([a - b for a, b in pairs], specimens),
         }
-        own = [tree["methods"][main]["scores"]["mae_mn"] for tree in found]
-        other = [row["scores"]["mae_mn"] for row in rows]
-        apart = [a - b for a, b in zip(_numbers(own), _numbers(other), strict=True)]
-        out[method]["main_worse_by_mn"] = None if method == main else _mean(apart, specimens)
     return {
         "format": "sulcus-pool",
         "version": 1,
         "main": main,
         "recordings": [tree["recording"] for tree in found],
-        "left_out": {tree["recording"]: _reason(tree) for tree in every if _reason(tree)},
-        "each": [_each(tree) for tree in found],
+        "left_out": {tree["recording"]: fault for tree in every if (fault := _fault(tree))},
+        "each": [_one_recording(tree) for tree in found],
         "specimens": len(set(specimens)),
         "frames": sum(tree["frames"] for tree in found),
-        "methods": out,
+        "methods": methods,
     }
 
 
-def _reason(tree: dict[str, Any]) -> str:
+def _fault(tree: dict[str, Any]) -> str:
     """Why a recording is left out, as its own report gives no number; empty if it isn't."""
     if tree.get("fault"):
         return f"nothing can be measured: {tree['fault']}"
@@ -110,8 +105,8 @@ def _reason(tree: dict[str, Any]) -> str:
     return "" if tree["scores"] else "no sensor"
 
 
-def _each(tree: dict[str, Any]) -> dict[str, Any]:
-    """What is said of one recording: its main method's scores and how its clocks were aligned."""
+def _one_recording(tree: dict[str, Any]) -> dict[str, Any]:
+    """One recording's main scores and how its clocks were aligned."""
     found = tree.get("sync") or {}
     return {
         "recording": tree["recording"],
@@ -123,45 +118,84 @@ def _each(tree: dict[str, Any]) -> dict[str, Any]:
     }
 
 
+def _mean(values: Sequence[float], specimens: Sequence[str]) -> dict[str, float | None]:
+    """Mean of the finite values and its interval; None for what is undefined."""
+    good = [value for value in values if math.isfinite(value)]
+    low, high = over_groups(values, list(specimens), np.random.default_rng(0))
+    ends = {"low": low if math.isfinite(low) else None, "high": high if math.isfinite(high) else None}
+    return {"mean": float(np.mean(good)) if good else None, **ends, "n": len(good)}
+
+
+def _number(value: float | None) -> float:
+    return math.nan if value is None else value
+
+
 def write(tree: dict[str, Any], out: Path, command: str) -> None:
     """pool.json, README.md and chart.svg in the folder `out`."""
     tree = tree | {"command": command}
-    files = {
-        "pool.json": json.dumps(tree, indent=1, allow_nan=False) + "\n",
-        "README.md": page(tree),
-        "chart.svg": chart(tree),
-    }
     out.mkdir(parents=True, exist_ok=True)
-    for name, text in files.items():
-        write_whole(out / name, text, durable=False)
+    write_whole(out / "pool.json", json.dumps(tree, indent=1, allow_nan=False) + "\n", durable=False)
+    write_whole(out / "README.md", page(tree), durable=False)
+    write_whole(out / "chart.svg", chart(tree), durable=False)
 
 
 def page(tree: Mapping[str, Any]) -> str:
     """Markdown; methods that beat the main one are marked."""
-    methods = tree["methods"]
-    first = methods[tree["main"]]["scores"]
-    hidden = ("bias_mn", "impulse_mae", "dropout")
-    shown = [(key, head) for key, head in SCORES if key not in hidden and key in first]
-    own = _number(first["mae_mn"]["mean"])
+    methods, count = tree["methods"], f"{len(tree['recordings'])} recordings"
+    own = methods[tree["main"]]["scores"]
     rows = []
-    for method, found in methods.items():
-        better = method != tree["main"] and _number(found["scores"]["mae_mn"]["mean"]) < own
+    for name, found in methods.items():
+        scores = {key: found["scores"][key] for key in _SHOWN if key in own}
+        better = name != tree["main"] and _number(scores["mae_mn"]["mean"]) < _number(own["mae_mn"]["mean"])
         rows.append(
-            {"method": f"{method} (better)" if better else method}
-            | {head: _text(found["scores"][key], METRICS[key].digits) for key, head in shown}
-            | {head: _text(found["calibrated"][key], METRICS[key].digits) for key, head in _CALIBRATED}
+            {"method": f"{name} (better)" if better else name}
+            | {METRICS[key].heading: _text(value, METRICS[key].digits) for key, value in scores.items()}
+            | {
+                head: _text(found["calibrated"][key], METRICS[key].digits)
+                for key, head in _CALIBRATED.items()
+            }
         )
     parts = [
-        f"# {_count(tree)}, {tree['specimens']} specimens, {tree['frames']} frames",
+        f"# {count}, {tree['specimens']} specimens, {tree['frames']} frames",
         f"    {tree['command']}",
         "Means over recordings; in brackets 95% intervals, specimens resampled.",
         *(f"Recording {lost} is left out: {why}." for lost, why in tree["left_out"].items()),
-        f"![{_count(tree)}](chart.svg)",
+        f"![{count}](chart.svg)",
         _table(rows),
         f"## By recording, {tree['main']}",
-        _table([_line(row) for row in tree["each"]]),
+        _table([_row(one) for one in tree["each"]]),
     ]
     return "\n\n".join(parts) + "\n"
+
+
+def _table(rows: Sequence[Mapping[str, str]]) -> str:
+    """Rows of the same columns in Markdown."""
+    lines = [list(rows[0]), ["---"] * len(rows[0]), *([*row.values()] for row in rows)]
+    return "\n".join(f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in line)} |" for line in lines)
+
+
+def _row(one: Mapping[str, Any]) -> dict[str, str]:
+    """One recording for the table."""
+    offset = "–"
+    if one["offset_s"] is not None:
+        offset = f"{1e3 * one['offset_s']:.0f} ± {1e3 * _number(one['offset_deviation_s']):.0f}"
+    return {
+        "recording": one["recording"],
+        "frames": str(one["frames"]),
+        "event peak [mN]": f"{_number(one['event_peak_mn']):.2f}",
+        "MAE of it": f"{_number(one['mae_of_peak']):.1%}",
+        "r": f"{_number(one['r']):.3f}",
+        "clocks' offset [ms]": offset,
+    } | ({"lost": f"{one['lost']:.0%}"} if one.get("lost") is not None else {})
+
+
+def _text(value: Mapping[str, float | None], digits: int) -> str:
+    mean, low, high = (value[key] for key in ("mean", "low", "high"))
+    if mean is None:
+        return "–"
+    return f"{mean:.{digits}f}" + (
+        "" if low is None or high is None else f" [{low:.{digits}f}, {high:.{digits}f}]"
+    )
 
 
 def chart(tree: Mapping[str, Any]) -> str:
@@ -175,59 +209,10 @@ def chart(tree: Mapping[str, Any]) -> str:
         axes = figure.subplots()
         axes.hlines(at, low, high, color=colours, linewidth=2)
         axes.scatter(mean, at, 26, colours)
-        axes.set(title=_count(tree), xlabel="mean error as a share of the event peak")
+        title = f"{len(tree['recordings'])} recordings"
+        axes.set(title=title, xlabel="mean error as a share of the event peak")
         axes.set_yticks(at, list(errors))
         axes.set_ylim(len(errors) - 0.4, -0.6)
         axes.set_xlim(left=0)
 
     return svg(960, 70 + 19 * len(errors), draw)
-
-
-def _count(tree: Mapping[str, Any]) -> str:
-    return f"{len(tree['recordings'])} recordings"
-
-
-def _table(rows: Sequence[Mapping[str, str]]) -> str:
-    """Rows of the same columns in Markdown."""
-    lines = [list(rows[0]), ["---"] * len(rows[0]), *([*row.values()] for row in rows)]
-    return "\n".join(f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in line)} |" for line in lines)
-
-
-def _line(row: Mapping[str, Any]) -> dict[str, str]:
-    """One recording for the table."""
-    offset = "–"
-    if row["offset_s"] is not None:
-        offset = f"{1e3 * row['offset_s']:.0f} ± {1e3 * _number(row['offset_deviation_s']):.0f}"
-    return {
-        "recording": row["recording"],
-        "frames": str(row["frames"]),
-        "event peak [mN]": f"{_number(row['event_peak_mn']):.2f}",
-        "MAE of it": f"{_number(row['mae_of_peak']):.1%}",
-        "r": f"{_number(row['r']):.3f}",
-        "clocks' offset [ms]": offset,
-    } | ({"lost": f"{row['lost']:.0%}"} if row.get("lost") is not None else {})
-
-
-def _mean(values: Sequence[float | None], specimens: Sequence[str]) -> dict[str, float | None]:
-    numbers = _numbers(values)
-    good = [v for v in numbers if math.isfinite(v)]
-    low, high = over_groups(numbers, list(specimens), np.random.default_rng(0))
-    plain = [v if math.isfinite(v) else None for v in (low, high)]
-    return {"mean": float(np.mean(good)) if good else None, "low": plain[0], "high": plain[1], "n": len(good)}
-
-
-def _numbers(values: Sequence[float | None]) -> list[float]:
-    return [_number(value) for value in values]
-
-
-def _number(value: float | None) -> float:
-    return math.nan if value is None else value
-
-
-def _text(value: dict[str, float | None], digits: int) -> str:
-    if value["mean"] is None:
-        return "–"
-    text = f"{value['mean']:.{digits}f}"
-    if value["low"] is None or value["high"] is None:
-        return text
-    return f"{text} [{value['low']:.{digits}f}, {value['high']:.{digits}f}]"

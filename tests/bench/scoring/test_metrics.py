@@ -59,7 +59,7 @@ def test_events_close_short_gaps_and_drop_short_contacts() -> None:
     contact = np.zeros(100, bool)
     contact[10:20] = contact[21:30] = True  # one contact with a gap of one sample
     contact[50] = True  # too short
-    assert metrics.events(t, contact, 0.25) == [metrics.Event(10, 30)]
+    assert metrics.events(t, contact, 0.25) == [slice(10, 30)]
 
 
 def test_what_the_sensor_felt_is_no_matter_of_the_prediction() -> None:

@@ -17,7 +17,7 @@ from synth.errors import UserError
 def score(name: str, mae: float, specimen: str = "") -> dict[str, Any]:
     def method(value: float) -> dict[str, Any]:
         return {
-            "scores": dict.fromkeys([key for key, _ in pool.SCORES], None) | {"mae_mn": value, "r": 0.9},
+            "scores": dict.fromkeys(pool.SCORES) | {"mae_mn": value, "r": 0.9},
             "calibrated": {},
         }
 
