@@ -13,6 +13,7 @@ import os
 import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -39,6 +40,7 @@ _LARGEST_WEIGHTS = 64 << 30
 _WEIGHTS, _NEXT, _SAFE = "weights.pt", "weights.next.pt", "weights.safetensors"
 _OF_MAP = ("map", "contact", "map_unit")
 """Blocks of intervals that older cards hold of the map's cells: no more used."""
+_digest: Any = partial(hashlib.blake2b, digest_size=16)
 SEEN = ("fit", "select", "intervals")
 """Parts of `ModelCard.split` that no score of the model may be of."""
 
@@ -95,13 +97,10 @@ def write_model(
     folder.mkdir(parents=True, exist_ok=True)
     data = safetensors.save({k: v.contiguous() for k, v in state.items()}) if safe else _packed(state)
     card = replace(card, weights_hash=_hash(data))
-    if safe:
-        _write(folder / _SAFE, data)
-        write_card(folder, card)
-        return card
-    _write(folder / _NEXT, data)
+    _write(folder / (_SAFE if safe else _NEXT), data)
     write_card(folder, card)
-    os.replace(folder / _NEXT, folder / _WEIGHTS)
+    if not safe:
+        os.replace(folder / _NEXT, folder / _WEIGHTS)
     return card
 
 
@@ -210,7 +209,7 @@ def _find_weights(folder: Path, card: ModelCard) -> Path:
     for file in (folder / _WEIGHTS, folder / _NEXT, folder / _SAFE):
         if file.is_file():
             with file.open("rb") as opened:
-                if hashlib.file_digest(opened, _hasher).hexdigest() == card.weights_hash:
+                if hashlib.file_digest(opened, _digest).hexdigest() == card.weights_hash:
                     return file
     file = folder / (_SAFE if (folder / _SAFE).exists() else _WEIGHTS)
     load_tensors(file)  # may say more of what is wrong
@@ -244,9 +243,5 @@ def _write(file: Path, data: bytes) -> None:
         raise UserError(f"{file}: cannot be written ({error.strerror})") from None
 
 
-def _hasher() -> Any:
-    return hashlib.blake2b(digest_size=16)
-
-
 def _hash(data: bytes) -> str:
-    return hashlib.blake2b(data, digest_size=16).hexdigest()
+    return str(_digest(data).hexdigest())

@@ -1,4 +1,4 @@
-"""What training minimises: squared error, R², and a price of force where there is none.
+"""What training minimises: squared error, R², and a price of background force.
 
 Everything here is in physical units. Prediction and target are force density at a reference stiffness of
 1 kPa [mN/mm²], and so are the two numbers of the training data that come along: `unit`, the target's 99.9th
@@ -6,18 +6,17 @@ percentile, says what a low force is; `spread`, its root mean square over tissue
 divided by. The squared-error and the R² term then are of one size and their weights mean what they say. (In
 the published code the squared error is in (3 N)², about 1e-4, and R² takes nearly all of the gradient.)
 
-Why another loss against ghosts (`ghostless`): a squared price, times three or not, fades with the ghost
-itself, so it moves large ghosts a little and small ones not at all. A linear price does: where the best guess
-in the mean would be q (in `spread`s) on tissue that is free with probability p, it says q − p·STRAY/2, or
-nothing. Cells that are surely in contact (p = 0) aren't touched. What it costs in R² falls on weak presses,
-whose whole map is of the size of that price; R² by frame gives it back: each frame's error is then measured
-against the frame's own force, so a weak press weighs as much as a strong one.
+Why another loss against false background force, the "ghosts" (`ghostless`): a squared price, times three or
+not, fades with the ghost itself, so it moves large ones a little and small ones not at all. A linear price
+does: where the best guess in the mean would be q (in `spread`s) on tissue that is free with probability p, it
+says q − p·BACKGROUND/2, or nothing. Cells that are surely in contact (p = 0) aren't touched. What it costs in
+R² falls on weak presses, whose whole map is of the size of that price; R² by frame gives it back: an error is
+then measured against its frame's own force, so a weak press weighs as much as a strong one.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -32,11 +31,11 @@ cost in R² (docs/results/learn): its numbers were chosen there."""
 
 R2_SHARE = {"mse": 0.0, "mse-frame": 0.5, "antighost": 0.3, "ghostless": 0.5}
 """Share of the R² term; the rest is the squared error. (Heraoui et al.: 0.3.)"""
-GHOST = 3.0
+FALSE_POSITIVE = 3.0
 """`antighost`: price of a squared over-prediction where the true force is low. (Heraoui et al.: 3.)"""
 LOW = 0.05
 """`antighost`: a cell's force is low under this share of `unit`. (Heraoui et al. ask the frame's mean.)"""
-STRAY = 8.0
+BACKGROUND = 8.0
 """`ghostless`: price of the mean force density on contact-free tissue [mN/mm²], in units of `spread`."""
 FREE = 0.01
 """`ghostless`: tissue is contact-free where its true density is under this share of `unit`."""
@@ -51,20 +50,19 @@ def full(kind: Loss, progress: float) -> bool:
 
 
 SHARES = ("error", "r2", "ghost")
-"""The terms of the loss."""
+"""Names of the terms of the loss, as in history.jsonl."""
 
 
-@dataclass(frozen=True)
-class Terms:
+class Terms(NamedTuple):
     """The parts of the loss, dimensionless, already weighted; they add up to it."""
 
     error: Tensor
     r2: Tensor
-    ghost: Tensor
+    background: Tensor
 
     @property
     def sum(self) -> Tensor:
-        return self.error + self.r2 + self.ghost
+        return self.error + self.r2 + self.background
 
 
 def loss(
@@ -86,19 +84,19 @@ def loss(
         raise UserError("a batch without a single tissue cell has no loss")
     squared = ((prediction - target) / spread * mask).square().sum(1, keepdim=True)
     if kind == "antighost":
-        squared = squared * ghost_weights(prediction, target, unit)
+        squared = squared * false_positive_weights(prediction, target, unit)
     fit, share = squared.sum() / (cells * prediction.shape[1]), R2_SHARE[kind]
-    r2 = ghost = squared.new_zeros(())
+    r2 = background = squared.new_zeros(())
     if share > 0:
         r2 = unexplained(prediction, target, mask, spread, by_frame=kind != "antighost")
     if kind == "ghostless":
-        price = STRAY * min(max((progress - RAMP[0]) / (RAMP[1] - RAMP[0]), 0.0), 1.0)
-        ghost = price * stray(prediction, target, mask, FREE * unit) / spread
-    return Terms((1 - share) * fit, share * r2, ghost)
+        price = BACKGROUND * min(max((progress - RAMP[0]) / (RAMP[1] - RAMP[0]), 0.0), 1.0)
+        background = price * background_force(prediction, target, mask, FREE * unit) / spread
+    return Terms((1 - share) * fit, share * r2, background)
 
 
-def stray(prediction: Tensor, target: Tensor, mask: Tensor, free: float) -> Tensor:
-    """Mean over tissue of the force density said where the true one is under `free`.
+def background_force(prediction: Tensor, target: Tensor, mask: Tensor, free: float) -> Tensor:
+    """Mean over tissue of the force density predicted where the true one is under `free`.
 
     `prediction`, `target`: (B, C, N, N), `free` in their unit, as is what is returned; `mask`: (B, 1, N, N)
     0/1. Times the tissue's area it is the force [mN at 1 kPa] that the answer puts where nothing touches.
@@ -107,13 +105,13 @@ def stray(prediction: Tensor, target: Tensor, mask: Tensor, free: float) -> Tens
     return (_length(prediction).abs() * loose).sum() / mask.sum()
 
 
-def ghost_weights(prediction: Tensor, target: Tensor, unit: float) -> Tensor:
-    """(B, 1, N, N): `GHOST` where force is over-predicted and low, 1 elsewhere.
+def false_positive_weights(prediction: Tensor, target: Tensor, unit: float) -> Tensor:
+    """(B, 1, N, N): `FALSE_POSITIVE` where force is over-predicted and low, 1 elsewhere.
 
     A vector is over-predicted where it is longer than the true one.
     """
-    said, true = _length(prediction.detach()), _length(target)
-    return torch.where((true < LOW * unit) & (said > true), GHOST, 1.0)
+    predicted, true = _length(prediction.detach()), _length(target)
+    return torch.where((true < LOW * unit) & (predicted > true), FALSE_POSITIVE, 1.0)
 
 
 def unexplained(
@@ -139,16 +137,13 @@ def gradient_shares(terms: Terms, prediction: Tensor) -> dict[str, float]:
 
     Must be called before `backward` frees the graph.
     """
-    norms: dict[str, float] = {}
-    for name in SHARES:
-        term = getattr(terms, name)
+    norms = dict.fromkeys(SHARES, 0.0)
+    for name, term in zip(SHARES, terms, strict=True):
         if term.requires_grad:
             (g,) = torch.autograd.grad(term, prediction, retain_graph=True, allow_unused=True)
             norms[name] = 0.0 if g is None else float(g.norm())
-        else:
-            norms[name] = 0.0
-    whole = sum(norms.values()) or 1.0
-    return {k: v / whole for k, v in norms.items()}
+    total = sum(norms.values()) or 1.0
+    return {name: norm / total for name, norm in norms.items()}
 
 
 def _length(values: Tensor) -> Tensor:

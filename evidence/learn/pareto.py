@@ -124,7 +124,7 @@ def measure(shapes: Sequence[tuple[int, int, int, int]], repeats: int, device: s
     timed at least five times, light ones `repeats` times, all of them in turns: a machine that is faster at
     one time than at another then is so to all.
     """
-    archs = [(size, Architecture(width=w, stem=s, levels=n)) for size, w, s, n in shapes]
+    archs = [(size, Architecture(width=w, stem=s, levels=n)) for size, w, s, n in shapes]  # type: ignore[arg-type]
     frames = [_frame(arch, size, device) for size, arch in archs]
     costs = [flops(arch, size) for size, arch in archs]
     times: list[list[float]] = [[] for _ in shapes]
@@ -195,7 +195,7 @@ def flops(arch: Architecture, size: int) -> float:
         model = D2FNet(arch).eval()
         for module in model.modules():
             module.register_forward_hook(count)
-        model(torch.zeros(1, arch.inputs, size, size))
+        model(torch.zeros(1, len(arch.channels), size, size))
     return float(total)
 
 

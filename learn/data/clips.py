@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import tempfile
 import zlib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
@@ -225,31 +224,25 @@ def _packed(sequence: Sequence, grid: Grid, wanted: tuple[str, ...], cache: Path
 
 
 def pack(clip: Clip, folder: Path) -> None:
-    """Writes a clip as plain arrays, beside and renamed; a folder that is there already stays.
+    """Writes a clip as plain arrays into a new folder, whole or not at all; one that is there already stays.
 
-    Raises UserError, and leaves nothing, if it can't be written.
+    Raises UserError if it can't be written.
     """
     arrays = {name: getattr(clip, name) for name in _ARRAYS}
     arrays |= {f"displacement-{source}": values for source, values in clip.displacement.items()}
     if clip.motion_confidence is not None:
         arrays[_SPATIAL] = clip.motion_confidence
     plain = {name: getattr(clip, name) for name in _PLAIN}
-    sums = {name: _checksum(values) for name, values in arrays.items()}
+    plain["checksums"] = {name: _checksum(values) for name, values in arrays.items()}
     try:
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.parent) as beside:
-            part = Path(beside) / folder.name
-            part.mkdir()
+        with checked_file.folder_of(folder) as part:
             # One file: a mapping each, of which a process has some ten thousands, for thousands of clips.
             save_file({name: np.ascontiguousarray(values) for name, values in arrays.items()}, part / _FILE)
-            (part / "clip.json").write_text(json.dumps(plain | {"checksums": sums}))
-            try:
-                part.rename(folder)
-            except OSError:
-                if not folder.is_dir():  # else another run was faster
-                    raise
-    except OSError as error:
-        raise UserError(f"{folder}: cannot be written ({error.strerror})") from None
+            (part / "clip.json").write_text(json.dumps(plain))
+    except (OSError, UserError) as error:
+        if not folder.is_dir():  # else another run was faster
+            why = getattr(error, "strerror", error)
+            raise UserError(f"{folder}: cannot be written ({why})") from None
 
 
 def unpack(folder: Path) -> Clip:

@@ -19,9 +19,6 @@ from synth.errors import UserError
 from synth.job.types import Positive
 
 CHANNELS = ("dx", "dy", "magnitude", "mask", "divergence")
-CONFIDENCE = "confidence"
-DEPTH = ("dz", "confidence of dz")
-"""What a second eye adds, after all others; the last for a network that is told confidence."""
 SMOOTHING_MM = 0.5
 """Standard deviation of the Gaussian under the derivative [mm]; physical, so that resolutions agree."""
 HALF_SURE_MM = 0.04
@@ -270,6 +267,12 @@ def _smoother(size: int, sigma_px: float) -> Tensor:
     return weight / weight[size // 2].sum()
 
 
+def channel_names(confidence: bool, depth: bool) -> tuple[str, ...]:
+    """Of the network's input, with the confidence of the motion, with what a second eye adds."""
+    along = ("dz", "confidence of dz") if confidence else ("dz",)
+    return (*CHANNELS, *["confidence"] * confidence, *along[: 2 * depth])
+
+
 def channels(
     displacement: Tensor,
     mask: Tensor,
@@ -277,7 +280,7 @@ def channels(
     scales: Scales,
     confidence: Tensor | None = None,
 ) -> Tensor:
-    """The network's input: CHANNELS, then `confidence` if given, then DEPTH of a second eye.
+    """The network's input, in the order of `channel_names`.
 
     `displacement`: (B, 2, N, N) mm in picture axes, or (B, 3, N, N) mm in camera axes; `mask`: (B, 1, N, N)
     0/1; `confidence`: (B, 1, N, N) in 0..1, with depth (B, 2, N, N). Returns (B, 5 to 8, N, N) without unit.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, astuple, dataclass
 from typing import Any
 
@@ -15,14 +15,14 @@ from scipy import ndimage
 from learn.checkpoint import SEEN, ModelCard
 from learn.data.clips import Clip, amount, target
 from learn.data.grid import Grid
-from learn.evaluation.metrics import Moments, agreement, contact_mm, ghost_share, line
+from learn.evaluation.metrics import Moments, agreement, contact_mm, false_positive_share, line
 from learn.evaluation.statistics import Interval, Paired, interval, paired, pooled_r2
 from learn.inference.predict import Predictor, force_size, length, total_force
 from synth.errors import UserError
 from synth.system.terminal import ProgressCallback
 
 GHOST_MN = 5.0
-"""A ghost is where a contact-sized patch would seem to carry more than this [mN]."""
+"""A false positive is where a contact-sized patch would seem to carry more than this [mN]."""
 PATCH_MM2 = math.pi * 4.0**2
 """Area of that patch: a contact of the jobs' mean radius, 4 mm."""
 FREE = 0.01
@@ -30,82 +30,67 @@ FREE = 0.01
 RIM_MM = 2.0
 """Width of the rim around a contact that `ghost_far` leaves out."""
 LOW = 0.05
-"""A frame is of low force, and an answer above this is a ghost by the relative rule, at this share."""
+"""A frame is of low force, and a prediction above this a false positive by the relative rule, at this share."""
 YOUNG = ("known", "half", "double", "unknown")
-"""Columns: E as it is, taken ×½, taken ×2, and not known at all (the training data's typical value). A
-further
-column, `press`, is there where E was estimated from a calibration press (`learn.inference.stiffness`)."""
+"""Columns: E as it is, taken ×½, taken ×2, and not known at all (the training data's typical value)."""
 
 
 @dataclass(frozen=True)
 class ClipScore:
-    """One sequence's numbers. Forces in mN, densities in mN/mm² (intensity in mN), lengths in mm."""
+    """One sequence's numbers. Forces in mN, densities in mN/mm² (intensity in mN)."""
 
     name: str
     young_kpa: float
     map: Moments
     """Over tissue cells of all frames, of the density's length."""
-    vector: Moments | None
-    """Over tissue cells and components, for a model that gives direction."""
     true_mn: NDArray[np.float64]
     """(T,) size of the total force; for a map of lengths the sum of lengths (`learn.data.clips.amount`)."""
-    said_mn: NDArray[np.float64]
-    vector_error_mn: NDArray[np.float64] | None
-    """(T,) length of the total force's error."""
-    ghost: float
-    """Share of the contact-free area where a contact-sized patch would carry over 5 mN."""
-    ghost_relative: float
-    """Share of the contact-free area above 5% of the training data's 99.9th percentile."""
-    ghost_far: float
-    """The same beyond 2 mm of any contact: without the rim, where a contact found a cell aside shows up
-    too."""
-    stray_mn: float
-    """Force the answer puts on the contact-free area, mean over frames [mN]."""
-    localisation_mm: float
-    """Median distance between true and said centre of the contact, over frames that aren't low [mm]."""
-    low_over_mn: float
-    """Mean over-prediction of the total force in low-force frames [mN]."""
+    predicted_mn: NDArray[np.float64]
+    others: dict[str, float]
+    """Further scores by key of `METRICS`."""
+
+    def as_row(self) -> dict[str, float]:
+        """All scores by key of `METRICS`."""
+        force = agreement(Moments.of(self.true_mn, self.predicted_mn))
+        row = {f"map_{name}": value for name, value in asdict(agreement(self.map)).items()}
+        return row | {f"force_{name}": value for name, value in asdict(force).items()} | self.others
 
 
-def score(clip: Clip, said: NDArray[np.float32], card: ModelCard) -> ClipScore:
-    """Scores the answer to one sequence. `said`: (T, C, N, N), physical."""
-    grid, kind, parts = card.settings.grid, card.settings.target, said.shape[1]
-    young = clip.young_kpa
+def score(clip: Clip, predicted: NDArray[np.float32], card: ModelCard) -> ClipScore:
+    """Scores the prediction of one sequence. `predicted`: (T, C, N, N), physical."""
+    grid, kind, parts = card.settings.grid, card.settings.target, predicted.shape[1]
+    young, pitch = clip.young_kpa, grid.pitch_mm
     true = np.stack([target(clip, t, kind, parts) for t in range(clip.frames)]) * np.float32(young)
     inside = np.broadcast_to(np.asarray(clip.mask) > 0, (clip.frames, *clip.mask.shape))
-    said_len, true_len = length(said), length(true)
+    size, true_size = length(predicted), length(true)
     unit = card.scales.target * young
-    free = inside & (true_len < FREE * unit)
-    total = total_force(said, kind, grid)
-    whole = amount(clip, kind, parts, grid.pitch_mm) * young
-    true_mn: NDArray[np.float64] = np.linalg.norm(whole, axis=1)
+    contact = true_size >= FREE * unit
+    free = inside & ~contact
+    total = total_force(predicted, kind, grid)
+    predicted_mn = force_size(total)
+    true_mn: NDArray[np.float64] = np.linalg.norm(amount(clip, kind, parts, pitch) * young, axis=1)
     low = true_mn < LOW * card.scales.force * young
-    as_force = 1.0 if kind == "intensity" else PATCH_MM2
-    vector, vector_error = None, None
+    patch = size * (1.0 if kind == "intensity" else PATCH_MM2)
+    cell = 1.0 / grid.size**2 if kind == "intensity" else pitch**2
+    centres = [contact_mm(size[t], pitch) - contact_mm(true_size[t], pitch) for t in np.flatnonzero(~low)]
+    off = [d for d in (float(np.linalg.norm(one)) for one in centres) if math.isfinite(d)]
+    peak = float(true_mn.max())
+    others = {}
     if parts == 3:
-        components = np.broadcast_to(inside[:, None], said.shape)
-        vector = Moments.of(true[components], said[components])
-        vector_error = np.linalg.norm(total - clip.force, axis=1)
-    distance = [
-        float(np.linalg.norm(contact_mm(said_len[t], grid.pitch_mm) - contact_mm(true_len[t], grid.pitch_mm)))
-        for t in np.flatnonzero(~low)
-    ]
-    distance = [d for d in distance if math.isfinite(d)]
-    return ClipScore(
-        name=clip.name,
-        young_kpa=young,
-        map=Moments.of(true_len[inside], said_len[inside]),
-        vector=vector,
-        true_mn=true_mn,
-        said_mn=force_size(total),
-        vector_error_mn=vector_error,
-        ghost=ghost_share(said_len * as_force, free, GHOST_MN),
-        ghost_relative=ghost_share(said_len, free, LOW * unit),
-        ghost_far=ghost_share(said_len, inside & _away(true_len >= FREE * unit, grid), LOW * unit),
-        stray_mn=float((said_len * free).sum((1, 2)).mean() * _cell(kind, grid)),
-        localisation_mm=float(np.median(distance)) if distance else math.nan,
-        low_over_mn=float(np.maximum(force_size(total) - true_mn, 0)[low].mean()) if low.any() else math.nan,
-    )
+        components = np.broadcast_to(inside[:, None], predicted.shape)
+        others["vector_r2"] = agreement(Moments.of(true[components], predicted[components])).r2
+        others["vector_error_mn"] = float(np.linalg.norm(total - clip.force, axis=1).mean())
+    others |= {
+        "peak_error_share": abs(float(predicted_mn.max()) - peak) / peak if peak > 0 else math.nan,
+        "ghost": false_positive_share(patch, free, GHOST_MN),
+        "ghost_relative": false_positive_share(size, free, LOW * unit),
+        "ghost_far": false_positive_share(size, inside & _away(contact, grid), LOW * unit),
+        "stray_mn": float((size * free).sum((1, 2)).mean() * cell),
+        "localisation_mm": float(np.median(off)) if off else math.nan,
+        "low_over_mn": float(np.maximum(predicted_mn - true_mn, 0)[low].mean()) if low.any() else math.nan,
+    }
+    agreed = Moments.of(true_size[inside], size[inside])
+    return ClipScore(clip.name, young, agreed, true_mn, predicted_mn, others)
 
 
 def _away(contact: NDArray[np.bool_], grid: Grid) -> NDArray[np.bool_]:
@@ -114,10 +99,6 @@ def _away(contact: NDArray[np.bool_], grid: Grid) -> NDArray[np.bool_]:
     for t in np.flatnonzero(contact.any((1, 2))):
         out[t] = ndimage.distance_transform_edt(~contact[t]) * grid.pitch_mm > RIM_MM
     return out
-
-
-def _cell(kind: str, grid: Grid) -> float:
-    return grid.pitch_mm**2 if kind == "density" else 1.0 / grid.size**2
 
 
 @dataclass(frozen=True)
@@ -136,7 +117,7 @@ class EvaluationReport:
         """One row a sequence, plain numbers."""
         if young not in self.columns:
             raise UserError(f"unknown E column {young!r}: one of {', '.join(self.columns)}")
-        return [_row(c) for c in self.columns[young]]
+        return [c.as_row() for c in self.columns[young]]
 
     def summary(self, young: str = "known") -> dict[str, float]:
         """Mean over sequences of every per-sequence number, and pooled R² (`*_pooled`), in one E column."""
@@ -145,9 +126,9 @@ class EvaluationReport:
         out["map_r2_pooled"] = agreement(sum((c.map for c in clips), Moments())).r2
         out["unit_map_r2_pooled"] = agreement(sum((c.map.over(c.young_kpa) for c in clips), Moments())).r2
         true = np.concatenate([c.true_mn for c in clips])
-        said = np.concatenate([c.said_mn for c in clips])
-        out["force_r2_pooled"] = agreement(Moments.of(true, said)).r2
-        out["calibration_slope"], out["calibration_offset_mn"] = line(said, true)
+        predicted = np.concatenate([c.predicted_mn for c in clips])
+        out["force_r2_pooled"] = agreement(Moments.of(true, predicted)).r2
+        out["calibration_slope"], out["calibration_offset_mn"] = line(predicted, true)
         return out
 
     def intervals(self) -> dict[str, Interval]:
@@ -155,7 +136,7 @@ class EvaluationReport:
         rows, rng = self.per_clip(), np.random.default_rng(0)
         out = {k: interval(np.array([r[k] for r in rows]), rng) for k in rows[0]}
         out["map_r2_pooled"] = pooled_r2(_sums(c.map for c in self.clips), rng)
-        forces = (Moments.of(c.true_mn, c.said_mn) for c in self.clips)
+        forces = (Moments.of(c.true_mn, c.predicted_mn) for c in self.clips)
         return out | {"force_r2_pooled": pooled_r2(_sums(forces), rng)}
 
     def bands(self) -> list[dict[str, float]]:
@@ -163,32 +144,22 @@ class EvaluationReport:
         edges = [0.0, LOW, 1 / 3, 2 / 3, math.inf]
         share = np.concatenate([c.true_mn / (self.card.scales.force * c.young_kpa) for c in self.clips])
         true = np.concatenate([c.true_mn for c in self.clips])
-        said = np.concatenate([c.said_mn for c in self.clips])
+        gap = np.concatenate([c.predicted_mn for c in self.clips]) - true
         out = []
         for a, b in itertools.pairwise(edges):
             here = (share >= a) & (share < b)
-            gap = said[here] - true[here]
-            out.append(
-                {
-                    "from": a,
-                    "to": b if math.isfinite(b) else float(share.max(initial=a)),
-                    "frames": float(here.sum()),
-                    "mae_mn": float(np.abs(gap).mean()) if here.any() else math.nan,
-                    "bias_mn": float(gap.mean()) if here.any() else math.nan,
-                }
-            )
+            mae, bias = (one[here].mean() if here.any() else math.nan for one in (np.abs(gap), gap))
+            ends = {"from": a, "to": b if math.isfinite(b) else float(share.max(initial=a))}
+            out.append(ends | {"frames": float(here.sum()), "mae_mn": float(mae), "bias_mn": float(bias)})
         return out
 
     def as_dict(self) -> dict[str, object]:
         """JSON-ready; NaN as null."""
         return {
             "sequences": [
-                {
-                    "name": c.name,
-                    "young_kpa": c.young_kpa,
-                    **_plain(_row(c)),
-                    "map_moments": list(astuple(c.map)),
-                }
+                {"name": c.name, "young_kpa": c.young_kpa}
+                | _plain(c.as_row())
+                | {"map_moments": list(astuple(c.map))}
                 for c in self.clips
             ],
             "columns": {young: _plain(self.summary(young)) for young in self.columns},
@@ -204,20 +175,6 @@ class EvaluationReport:
                 "target": self.card.settings.target,
             },
         }
-
-
-def _row(c: ClipScore) -> dict[str, float]:
-    row = {f"map_{k}": v for k, v in asdict(agreement(c.map)).items()}
-    row |= {f"force_{k}": v for k, v in asdict(agreement(Moments.of(c.true_mn, c.said_mn))).items()}
-    if c.vector is not None:
-        row["vector_r2"] = agreement(c.vector).r2
-    if c.vector_error_mn is not None:
-        row["vector_error_mn"] = float(c.vector_error_mn.mean())
-    peak = float(c.true_mn.max())
-    row["peak_error_share"] = abs(float(c.said_mn.max()) - peak) / peak if peak > 0 else math.nan
-    for name in ("ghost", "ghost_relative", "ghost_far", "stray_mn", "localisation_mm", "low_over_mn"):
-        row[name] = getattr(c, name)
-    return row
 
 
 def _sums(moments: Iterable[Moments]) -> NDArray[np.float64]:
@@ -238,13 +195,8 @@ def evaluate(
     clips: Sequence[Clip],
     source: str,
     report: ProgressCallback = lambda done, of: None,
-    pressed: Mapping[str, float] | None = None,
 ) -> EvaluationReport:
-    """Scores a model on clips, with displacement from `source` (`ideal` or `recovered`).
-
-    `pressed`: E [kPa] of clips by their content hash, as a calibration press found it: the column `press`
-    holds those that have one.
-    """
+    """Scores a model on clips, with displacement from `source` (`ideal` or `recovered`)."""
     if not clips:
         raise UserError("no sequence to evaluate on")
     columns: dict[str, list[ClipScore]] = {}
@@ -255,12 +207,11 @@ def evaluate(
         taken = {"known": 1.0, "half": 0.5, "double": 2.0}
         young = {name: clip.young_kpa * factor for name, factor in taken.items()}
         young["unknown"] = predictor.card.typical_young_kpa
-        if pressed is not None and clip.content_hash in pressed:
-            young["press"] = pressed[clip.content_hash]
-        # The answer is proportional to E: one pass does for all.
-        said = predictor.density(np.asarray(clip.displacement[source]), clip.mask, 1.0, clip.sure(source))
+        # The prediction is proportional to E: one pass does for all.
+        shift = np.asarray(clip.displacement[source])
+        per_kpa = predictor.density(shift, clip.mask, 1.0, clip.sure(source))
         for name, given in young.items():
-            columns.setdefault(name, []).append(score(clip, said * np.float32(given), predictor.card))
+            columns.setdefault(name, []).append(score(clip, per_kpa * np.float32(given), predictor.card))
     report(len(clips), len(clips))
     return EvaluationReport(columns, predictor.card)
 

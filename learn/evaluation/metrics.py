@@ -16,9 +16,9 @@ class Metric:
     """One score: what it is called and how it is shown, wherever it is shown."""
 
     name: str
-    unit: str
+    unit: str = ""
     """As shown: ms and % are made of s and shares; empty for a number."""
-    about: str
+    about: str = ""
     best: Literal["low", "high", "zero", "one", ""] = ""
     """Which value is the best; empty for what is no merit."""
     digits: int = 3
@@ -43,79 +43,56 @@ class Metric:
 
 _DENSITY = "mN/mm²"
 METRICS = {
-    "force_r2_pooled": Metric(
-        "total force: R², all frames", "", "R² over the frames of all sequences", "high", column="force R²"
-    ),
-    "force_r2": Metric("total force: R²", "", "1 − SSE/SST over frames", "high", listed=False),
-    "force_mae": Metric(
-        "total force: MAE", "mN", "mean error of the total force", "low", column="total force MAE [mN]"
-    ),
-    "force_rmse": Metric("total force: RMSE", "mN", "RMSE of the total force", "low"),
-    "force_bias": Metric("total force: bias", "mN", "mean of answer minus truth", "zero"),
-    "force_r": Metric("total force: correlation", "", "Pearson's r over frames", "high"),
-    "force_ccc": Metric("total force: concordance", "", "Lin's concordance over frames", "high"),
-    "vector_error_mn": Metric("total force: error of the vector", "mN", "length of its error", "low"),
-    "peak_error_share": Metric(
-        "peak force: relative error", "", "share of the largest force", "low", column="peak force error"
-    ),
-    "map_r2_pooled": Metric(
-        "force map: R², all cells", "", "R² over the cells of all sequences", "high", column="map R²"
-    ),
-    "unit_map_r2_pooled": Metric(
-        "force map: R², all cells, at E = 1 kPa", "", "the same of maps over E", "high", listed=False
-    ),
-    "map_r2": Metric(
-        "force map: R²", "", "1 − SSE/SST over tissue cells", "high", column="map R²", listed=False
-    ),
-    "map_mae": Metric("force map: MAE", _DENSITY, "mean error of the force map", "low"),
-    "map_rmse": Metric(
-        "force map: RMSE", _DENSITY, "RMSE of the force map", "low", column="map RMSE [mN/mm²]"
-    ),
-    "map_bias": Metric("force map: bias", _DENSITY, "mean of answer minus truth", "zero", listed=False),
-    "map_r": Metric("force map: correlation", "", "Pearson's r over tissue cells", "high"),
-    "map_ccc": Metric("force map: concordance", "", "Lin's concordance over cells", "high", listed=False),
-    "vector_r2": Metric("force map: R² of components", "", "1 − SSE/SST of x, y and z", "high"),
+    "force_r2_pooled": Metric("total force: R², all frames", column="force R²"),
+    "force_r2": Metric("total force: R²", listed=False),
+    "force_mae": Metric("total force: MAE", "mN", column="total force MAE [mN]"),
+    "force_rmse": Metric("total force: RMSE", "mN"),
+    "force_bias": Metric("total force: bias", "mN", "Mean of prediction minus truth."),
+    "force_r": Metric("total force: correlation", about="Pearson's r over frames."),
+    "force_ccc": Metric("total force: concordance", about="Lin's concordance over frames."),
+    "vector_error_mn": Metric("total force: error of the vector", "mN", "Mean length of its error."),
+    "peak_error_share": Metric("peak force: relative error", column="peak force error"),
+    "map_r2_pooled": Metric("force map: R², all cells", column="map R²"),
+    "unit_map_r2_pooled": Metric("force map: R², all cells, at E = 1 kPa", listed=False),
+    "map_r2": Metric("force map: R²", about="Over tissue cells.", column="map R²", listed=False),
+    "map_mae": Metric("force map: MAE", _DENSITY),
+    "map_rmse": Metric("force map: RMSE", _DENSITY, column="map RMSE [mN/mm²]"),
+    "map_bias": Metric("force map: bias", _DENSITY, "Mean of prediction minus truth.", listed=False),
+    "map_r": Metric("force map: correlation", about="Pearson's r over tissue cells."),
+    "map_ccc": Metric("force map: concordance", about="Lin's concordance over cells.", listed=False),
+    "vector_r2": Metric("force map: R² of components", about="1 − SSE/SST of x, y and z."),
     "ghost": Metric(
-        "ghosts: contact-free area above 5 mN", "", "share where a contact-sized patch would carry it", "low"
+        "false positives: contact-free area above 5 mN",
+        about="Share of it where a contact-sized patch would carry more.",
     ),
     "ghost_relative": Metric(
-        "ghosts: contact-free area above 5% of scale", "", "share of the area", "low", column="ghost area"
+        "false positives: contact-free area above 5% of scale",
+        about="Share of it; the scale is the training data's 99.9th percentile.",
+        column="ghost area",
     ),
     "ghost_far": Metric(
-        "ghosts: the same beyond 2 mm of a contact",
-        "",
-        "the rim left out",
-        "low",
+        "false positives: the same beyond 2 mm of a contact",
+        about="Without the rim, where a contact found a cell aside shows up too.",
         column="ghost area beyond 2 mm",
     ),
     "stray_mn": Metric(
-        "ghosts: force on contact-free area", "mN", "mean over frames", "low", column="force off contact [mN]"
+        "background force: on contact-free area", "mN", "Mean over frames.", column="force off contact [mN]"
     ),
     "low_over_mn": Metric(
-        "over-prediction in low-force frames",
-        "mN",
-        "of the total force",
-        "low",
-        column="over in low frames [mN]",
+        "over-prediction in low-force frames", "mN", "Of the total force.", column="over in low frames [mN]"
     ),
     "localisation_mm": Metric(
-        "contact centre: median error",
-        "mm",
-        "distance of said from true",
-        "low",
-        column="contact centre [mm]",
+        "contact centre: median error", "mm", "Over frames that aren't low.", column="contact centre [mm]"
     ),
-    "calibration_slope": Metric("calibration: slope of truth on answer", "", "by least squares", "one"),
-    "calibration_offset_mn": Metric(
-        "calibration: offset of truth on answer", "mN", "by least squares", "zero", listed=False
-    ),
+    "calibration_slope": Metric("calibration: slope of truth on prediction", about="By least squares."),
+    "calibration_offset_mn": Metric("calibration: offset of truth on prediction", "mN", listed=False),
 }
 """By key of `learn eval --json`: the only place that says what a score is."""
 
 
 @dataclass(frozen=True)
 class Moments:
-    """Sums over pairs of (true, said), from which every agreement metric follows; moments of parts add up."""
+    """Sums over pairs of (true, predicted), from which every agreement metric follows; moments of parts add up."""
 
     n: float = 0.0
     t: float = 0.0
@@ -126,17 +103,10 @@ class Moments:
     absolute: float = 0.0
 
     @staticmethod
-    def of(true: Floats, said: Floats) -> Moments:
-        t, p = np.asarray(true, np.float64).ravel(), np.asarray(said, np.float64).ravel()
-        return Moments(
-            float(t.size),
-            float(t.sum()),
-            float(p.sum()),
-            float(t @ t),
-            float(p @ p),
-            float(t @ p),
-            float(np.abs(p - t).sum()),
-        )
+    def of(true: Floats, predicted: Floats) -> Moments:
+        t, p = (np.asarray(values, np.float64).ravel() for values in (true, predicted))
+        sums = t.size, t.sum(), p.sum(), t @ t, p @ p, t @ p, np.abs(p - t).sum()
+        return Moments(*map(float, sums))
 
     def __add__(self, other: Moments) -> Moments:
         return Moments(*(getattr(self, f.name) + getattr(other, f.name) for f in fields(self)))
@@ -182,12 +152,12 @@ def agreement(m: Moments) -> Agreement:
     )
 
 
-def ghost_share(said: Floats, free: NDArray[np.bool_], threshold: float) -> float:
-    """Share of the contact-free cells in which the answer is above `threshold`; NaN if none is free.
+def false_positive_share(predicted: Floats, free: NDArray[np.bool_], threshold: float) -> float:
+    """Share of the contact-free cells in which the prediction is above `threshold`; NaN if none is free.
 
-    `said`, `free`: (T, N, N); `threshold` in the unit of `said`.
+    `predicted`, `free`: (T, N, N); `threshold` in the unit of `predicted`.
     """
-    return float((said[free] > threshold).mean()) if free.any() else float("nan")
+    return float((predicted[free] > threshold).mean()) if free.any() else float("nan")
 
 
 def contact_mm(map_: Floats, pitch_mm: float) -> NDArray[np.float64]:
@@ -204,9 +174,9 @@ def contact_mm(map_: Floats, pitch_mm: float) -> NDArray[np.float64]:
     return centre * pitch_mm
 
 
-def line(said: Floats, true: Floats) -> tuple[float, float]:
-    """Calibration: slope and intercept of truth on answer by least squares; (1, 0) is calibrated."""
-    x, y = np.asarray(said, np.float64), np.asarray(true, np.float64)
+def line(predicted: Floats, true: Floats) -> tuple[float, float]:
+    """Calibration: slope and intercept of truth on prediction by least squares; (1, 0) is calibrated."""
+    x, y = np.asarray(predicted, np.float64), np.asarray(true, np.float64)
     spread = float(np.var(x))
     if spread == 0:
         return float("nan"), float("nan")

@@ -6,7 +6,6 @@ ten times too narrow.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -54,49 +53,17 @@ def pooled_r2(moments: Floats, rng: np.random.Generator, draws: int = _DRAWS) ->
     `moments`: (n, 6), the first six of each sequence's `learn.evaluation.metrics.Moments`: count, sums of
     t, p, tt, pp and tp. With fewer than three sequences there is no interval (NaN).
     """
-    return _pooled(moments, _r2, rng, draws)
-
-
-def pooled_r2_difference(a: Floats, b: Floats, rng: np.random.Generator) -> Interval:
-    """Pooled R² of B less that of A, each the mean over its runs, and its BCa interval over sequences.
-
-    `a`, `b`: (n, runs, 6) moments as for `pooled_r2`, of the same n sequences in the same order.
-    """
-    split = a.shape[1]
-
-    def difference(flat: Floats) -> Floats:
-        found = _r2(flat.reshape(*flat.shape[:-1], -1, 6))
-        return np.asarray(found[..., split:].mean(-1) - found[..., :split].mean(-1))
-
-    both = np.concatenate([a, b], axis=1).reshape(len(a), -1)
-    return _pooled(both, difference, rng)
+    m = np.asarray(moments, np.float64)
+    total, count = m.sum(axis=0), len(m)
+    if count < 3:
+        return Interval(float(_r2(total)), float("nan"), float("nan"), count)
+    times = rng.multinomial(count, np.full(count, 1 / count), draws)
+    return _bca(float(_r2(total)), _r2(times @ m), _r2(total - m))
 
 
 def _r2(moments: Floats) -> Floats:
     n, t, _, tt, pp, tp = np.moveaxis(moments, -1, 0)
     return np.asarray(1 - (pp - 2 * tp + tt) / (tt - t**2 / n), np.float64)
-
-
-def skill(error: Floats, base: Floats, rng: np.random.Generator) -> Interval:
-    """1 − Σ error / Σ base over sequences: how much of the base's squared error an answer takes away.
-
-    `error`, `base`: (n,) sums of squares of each sequence, same unit. BCa interval over sequences.
-    """
-    sums = np.stack([error, base], axis=-1)
-    return _pooled(sums, lambda m: np.asarray(1 - m[..., 0] / m[..., 1]), rng)
-
-
-def _pooled(
-    sums: Floats, statistic: Callable[[Floats], Floats], rng: np.random.Generator, draws: int = _DRAWS
-) -> Interval:
-    """A statistic of sums over sequences; with fewer than three sequences there is no interval (NaN)."""
-    m = np.asarray(sums, np.float64)
-    whole = m.sum(axis=0)
-    if len(m) < 3:
-        return Interval(float(statistic(whole)), float("nan"), float("nan"), len(m))
-    times = rng.multinomial(len(m), np.full(len(m), 1 / len(m)), draws)
-    out = _bca(float(statistic(whole)), statistic(times @ m), statistic(whole - m))
-    return Interval(out.mean, out.low, out.high, len(m))
 
 
 def _bca(value: float, boot: Floats, left_out: Floats) -> Interval:

@@ -21,7 +21,7 @@ class Quick:
 
     def __init__(self, model: nn.Module, arch: Architecture, size: int) -> None:
         net: Any = fused(model).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-        shown = torch.zeros(2, arch.inputs, size, size).contiguous(memory_format=torch.channels_last)
+        shown = torch.zeros(2, len(arch.channels), size, size).contiguous(memory_format=torch.channels_last)
         jit: Any = torch.jit
         with warnings.catch_warnings(), torch.no_grad():
             # Tracing warns that the grid's size is taken as a constant: it is one.

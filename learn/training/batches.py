@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -15,8 +15,7 @@ from learn.settings import TrainingSettings
 from synth.errors import UserError
 
 
-@dataclass(frozen=True)
-class Batch:
+class Batch(NamedTuple):
     """Frames on one device, in physical units."""
 
     displacement: Tensor
@@ -29,7 +28,28 @@ class Batch:
     """(B, C, N, N) in the unit of `Scales.target`."""
 
     def to(self, device: torch.device) -> Batch:
-        return Batch(**{k: v.to(device, non_blocking=True) for k, v in vars(self).items()})
+        return Batch(*(values.to(device, non_blocking=True) for values in self))
+
+    def turned(self, turn: int) -> Batch:
+        """All of it turned as `turned` says; confidences are scalars each."""
+        planes = turned(self.confidence.flatten(0, 1)[:, None], turn)
+        return Batch(
+            turned(self.displacement, turn),
+            turned(self.mask, turn),
+            planes.reshape(self.confidence.shape),
+            turned(self.target, turn),
+        )
+
+
+class FrameItem(NamedTuple):
+    """One frame to be given out."""
+
+    clip: int
+    frame: int
+    source: str
+    """Which displacement, as in `learn.data.clips.FIELDS`."""
+    turn: int = 0
+    """0-7, as of `turned`."""
 
 
 def swayed(batch: Batch, settings: TrainingSettings, generator: torch.Generator) -> Batch:
@@ -47,7 +67,7 @@ def swayed(batch: Batch, settings: TrainingSettings, generator: torch.Generator)
     amount *= settings.sway_mm * torch.where(along, 1.0, 1 / 3)[:, None] / len(shapes) ** 0.5
     amount *= (torch.rand(count, generator=generator) < 0.5)[:, None, None]
     whole = torch.einsum("bps,syx->bpyx", amount, shapes).to(moved)
-    return replace(batch, displacement=moved + whole * batch.mask)
+    return batch._replace(displacement=moved + whole * batch.mask)
 
 
 def inputs(batch: Batch, settings: TrainingSettings, scales: Scales) -> Tensor:
@@ -88,9 +108,9 @@ class FrameDataset:
                     f"{clip.name}: on a {clip.mask.shape[0]}² grid, the model takes {settings.size}²"
                 )
 
-    def order(self, rng: np.random.Generator, share_recovered: float) -> list[tuple[int, int, str, int]]:
-        """One epoch: (clip, frame, source, turn 0-7) in random order."""
-        items = []
+    def order(self, rng: np.random.Generator, share_recovered: float) -> list[FrameItem]:
+        """The frames of one epoch, turned at random, in random order."""
+        items: list[tuple[int, int]] = []
         for c, clip in enumerate(self.clips):
             frames = np.arange(clip.frames)
             if 0 < self.settings.frames < clip.frames:
@@ -103,27 +123,27 @@ class FrameDataset:
         if len(self.sources) == 2:
             source = [self.sources[int(u < share_recovered)] for u in rng.random(len(items))]
         turn = rng.integers(0, 8, len(items))
-        return [(*items[i], source[i], int(turn[i])) for i in rng.permutation(len(items))]
+        return [
+            FrameItem(*items[i], source=source[i], turn=int(turn[i])) for i in rng.permutation(len(items))
+        ]
 
     def sequential(self, clip: int, source: str) -> Iterator[Batch]:
         """All frames of one clip, in order, as they are."""
         step = self.settings.batch
         for start in range(0, self.clips[clip].frames, step):
             stop = min(start + step, self.clips[clip].frames)
-            yield self.batch([(clip, t, source, 0) for t in range(start, stop)])
+            yield self.batch([FrameItem(clip, t, source) for t in range(start, stop)])
 
-    def batch(self, items: Sequence[tuple[int, int, str, int]]) -> Batch:
+    def batch(self, items: Sequence[FrameItem]) -> Batch:
         """The frames named by `items`, as tensors."""
-        columns: dict[str, list[Tensor]] = {name: [] for name in Batch.__dataclass_fields__}
+        frames = []
         for c, t, source, turn in items:
             clip = self.clips[c]
-            sure = turned(torch.from_numpy(np.array(clip.sure(source)[t]))[:, None], turn)[:, 0]
             truth = target(clip, t, self.settings.target, self.settings.arch.components)
-            moved = clip.displacement[source][t]
-            for name, one in (("displacement", moved), ("mask", clip.mask[None]), ("target", truth)):
-                columns[name].append(turned(torch.from_numpy(np.array(one))[None], turn)[0])
-            columns["confidence"].append(sure)
-        return Batch(**{name: torch.stack(values) for name, values in columns.items()})
+            arrays = clip.displacement[source][t], clip.mask[None], clip.sure(source)[t], truth
+            one = Batch(*(torch.from_numpy(np.array(values))[None] for values in arrays))
+            frames.append(one.turned(turn))
+        return Batch(*map(torch.cat, zip(*frames, strict=True)))
 
 
 def measure_scales(clips: Sequence[Clip], settings: TrainingSettings, frames: int = 16) -> Scales:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from learn.data.clips import Clip, sources, target
 from learn.settings import TrainingSettings
-from learn.training.batches import Batch, FrameDataset, turned
+from learn.training.batches import Batch, FrameDataset, FrameItem
 
 SHARE = 0.6
 """Part of the device's free memory that frames may take; the rest is the network's."""
@@ -43,40 +43,27 @@ class DeviceDataset(FrameDataset):
         )
         self._device = device
 
-    def batch(self, items: Sequence[tuple[int, int, str, int]]) -> Batch:
+    def batch(self, items: Sequence[FrameItem]) -> Batch:
         """As `FrameDataset.batch`; within it frames of one turn stand together."""
-        items = sorted(items, key=lambda item: item[3])
-        parts: list[dict[str, Tensor]] = []
-        for turn in sorted({item[3] for item in items}):
-            for source in self.sources:
-                some = [item for item in items if item[3] == turn and item[2] == source]
-                if some:
-                    parts.append(self._cut(some, source, turn))
-        return Batch(**{k: torch.cat([p[k] for p in parts]) for k in parts[0]})
-
-    def _cut(self, items: list[tuple[int, int, str, int]], source: str, turn: int) -> dict[str, Tensor]:
-        at = torch.tensor([int(self._first[c]) + t for c, t, _, _ in items], device=self._device)
-        clip = torch.tensor([c for c, *_ in items], device=self._device)
-        mask = turned(self._mask[clip], turn)
-        sure = torch.ones_like(mask)
-        if self._sure is not None:
-            planes = self._sure[source][at]
-            sure = turned(planes.flatten(0, 1)[:, None], turn).reshape(planes.shape)
-        return {
-            "displacement": turned(self._moved[source][at], turn),
-            "mask": mask,
-            "confidence": sure,
-            "target": turned(self._true[at], turn),
-        }
+        alike = {(item.turn, self.sources.index(item.source)) for item in items}
+        parts = []
+        for turn, k in sorted(alike):
+            some = [one for one in items if (one.turn, one.source) == (turn, self.sources[k])]
+            at = torch.tensor([int(self._first[one.clip]) + one.frame for one in some], device=self._device)
+            clip = torch.tensor([one.clip for one in some], device=self._device)
+            mask = self._mask[clip]
+            sure = torch.ones_like(mask) if self._sure is None else self._sure[self.sources[k]][at]
+            parts.append(Batch(self._moved[self.sources[k]][at], mask, sure, self._true[at]).turned(turn))
+        return Batch(*map(torch.cat, zip(*parts, strict=True)))
 
 
-def held(clips: Sequence[Clip], settings: TrainingSettings, device: torch.device) -> FrameDataset:
+def place_frames(clips: Sequence[Clip], settings: TrainingSettings, device: torch.device) -> FrameDataset:
     """Frames on a GPU whose memory is enough, else read as they are asked for."""
     if device.type != "cuda":
         return FrameDataset(clips, settings)
     arch = settings.arch
-    told = arch.displacements + arch.confidence * (1 + arch.depth)
-    planes = told * len(sources(settings.input)) + arch.components
+    inputs = arch.displacements + arch.confidence * (1 + arch.depth)
+    planes = inputs * len(sources(settings.input)) + arch.components
     needed = sum(c.frames for c in clips) * planes * 4 * settings.size**2
     if needed > SHARE * torch.cuda.mem_get_info(device)[0]:
         return FrameDataset(clips, settings)

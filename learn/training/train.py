@@ -26,7 +26,7 @@ from learn.loss import SHARES, full, gradient_shares, loss
 from learn.network.d2fnet import D2FNet
 from learn.settings import TrainingSettings, replace
 from learn.training.batches import Batch, FrameDataset, inputs, measure_scales, swayed
-from learn.training.gpu_batches import held
+from learn.training.gpu_batches import place_frames
 from learn.training.log import Log
 from learn.training.threads import make_fabric
 from synth.dataset.split import find_crossings
@@ -93,7 +93,7 @@ def _go_on(
     settings, scales = card.settings, card.scales
     net: Any = torch.compile(run.model) if settings.compile else run.model
     net, run.optimizer = fabric.setup(net, run.optimizer)
-    frames, chooser = held(fit, settings, fabric.device), held(select, settings, fabric.device)
+    frames, chooser = (place_frames(part, settings, fabric.device) for part in (fit, select))
 
     with Log(out, run.epoch) if fabric.is_global_zero else nullcontext() as write:
         for epoch in range(run.epoch, settings.epochs):

@@ -19,7 +19,7 @@ from learn.data.split import nested
 from learn.inference.export import export
 from learn.inference.predict import load_model
 from learn.settings import TrainingSettings, preset, replace
-from learn.training.batches import FrameDataset, inputs
+from learn.training.batches import FrameDataset, FrameItem, inputs
 from learn.training.gpu_batches import DeviceDataset
 from learn.training.train import train
 
@@ -75,9 +75,9 @@ def test_channels_of_two_eyes_are_those_of_one_and_two_more() -> None:
 
 def test_depth_stays_when_the_picture_turns(told: list[Clip]) -> None:
     frames = FrameDataset(told, small())
-    still = frames.batch([(0, 3, "motion", 0)])
+    still = frames.batch([FrameItem(0, 3, "motion")])
     for turn in range(8):
-        turned = frames.batch([(0, 3, "motion", turn)])
+        turned = frames.batch([FrameItem(0, 3, "motion", turn)])
         for name in ("displacement", "confidence", "target"):
             sizes = [getattr(one, name)[:, -1].flatten().sort().values for one in (still, turned)]
             assert torch.equal(*sizes), (turn, name)
@@ -92,11 +92,11 @@ def test_frames_held_by_a_device_are_those_read_one_by_one(told: list[Clip], tmp
     for k, clip in enumerate(told[:2]):
         reading.pack(clip, tmp_path / str(k))  # what was packed is what was read
     some = [reading.unpack(tmp_path / "0"), reading.unpack(tmp_path / "1"), *told[2:]]
-    items = [(c, t, source, c) for c in range(8) for t in (1, 4) for source in ("motion", "motion-ideal")]
+    items = [FrameItem(c, t, s, c) for c in range(8) for t in (1, 4) for s in ("motion", "motion-ideal")]
     read, held = FrameDataset(told, settings), DeviceDataset(some, settings, torch.device("cpu"))
     for item in items:
         one, other = read.batch([item]), held.batch([item])
-        for name in vars(one):
+        for name in one._fields:
             assert torch.equal(getattr(one, name), getattr(other, name)), (item, name)
     assert inputs(read.batch(items), settings, SCALES).shape[1] == 8
 

@@ -103,7 +103,7 @@ def test_two_jaws_that_cancel_are_held_to_what_each_output_can_say(clips: list[C
     for output in ("magnitude", "vector"):
         c = card(clips, output)
         got = score(clip, truth(clip, output), c)
-        np.testing.assert_allclose(got.said_mn, got.true_mn, atol=1e-6)
+        np.testing.assert_allclose(got.predicted_mn, got.true_mn, atol=1e-6)
         assert (got.true_mn[3] > 0.1) == (output == "magnitude")
 
 
@@ -111,16 +111,16 @@ def test_ghosts_are_counted_in_mn_over_a_contact_sized_patch(clips: list[Clip]) 
     c = card(clips, "magnitude")
     ghosts = truth(clips[0], "magnitude") + np.float32(5.1 / (np.pi * 16)) * (clips[0].mask > 0)
     faint = truth(clips[0], "magnitude") + np.float32(4.9 / (np.pi * 16)) * (clips[0].mask > 0)
-    assert score(clips[0], ghosts, c).ghost == 1
-    assert score(clips[0], faint, c).ghost < 0.05
-    assert score(clips[0], ghosts, c).stray_mn > 1
+    assert score(clips[0], ghosts, c).others["ghost"] == 1
+    assert score(clips[0], faint, c).others["ghost"] < 0.05
+    assert score(clips[0], ghosts, c).others["stray_mn"] > 1
 
 
 def test_a_contact_found_a_cell_aside_is_no_ghost_far_away(clips: list[Clip]) -> None:
     c, clip = card(clips, "magnitude"), clips[2]
     aside = np.roll(truth(clip, "magnitude"), 1, axis=3)
     got = score(clip, aside, c)
-    assert got.ghost_relative > 0
-    assert got.ghost_far == 0
+    assert got.others["ghost_relative"] > 0
+    assert got.others["ghost_far"] == 0
     everywhere = aside + np.float32(0.06 * c.scales.target * clip.young_kpa) * (clip.mask > 0)
-    assert score(clip, everywhere, c).ghost_far == 1
+    assert score(clip, everywhere, c).others["ghost_far"] == 1

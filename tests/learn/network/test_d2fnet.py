@@ -65,7 +65,7 @@ def test_relative_twice_the_motion_is_twice_the_force(depth: bool) -> None:
     net = D2FNet(arch).eval()
     for head in net.heads.ranges:
         torch.nn.init.normal_(head.weight, std=0.5)
-    told = torch.randn(2, arch.inputs, 32, 32)
+    told = torch.randn(2, len(arch.channels), 32, 32)
     flags = [3, 5, 7] if depth else [3, 5]
     told[:, flags] = (torch.rand(2, len(flags), 32, 32) > 0.3).float()
     twice = told * 2

@@ -34,13 +34,15 @@ SQUARED, R2 = 0.2925 / 3, 0.2925 / 0.635
 )
 def test_by_hand(kind: Loss, error: float, r2: float, ghost: float) -> None:
     terms = loss(SAID, TRUE, MASK, kind, unit=4.0, spread=2.0)
-    found = [float(one) for one in (terms.error, terms.r2, terms.ghost, terms.sum)]
+    found = [float(one) for one in (terms.error, terms.r2, terms.background, terms.sum)]
     assert found == pytest.approx([error, r2, ghost, error + r2 + ghost], rel=1e-5)
     assert torch.isfinite(loss(SAID, 0 * TRUE, MASK, kind, 4.0, 2.0).sum), "a batch at rest"
 
 
 def test_the_price_of_ghosts_grows_from_a_quarter_to_three_quarters_of_the_run() -> None:
-    ghost = [float(loss(SAID, TRUE, MASK, "ghostless", 4.0, 2.0, at).ghost) for at in (0.2, 0.5, 0.75, 1.0)]
+    ghost = [
+        float(loss(SAID, TRUE, MASK, "ghostless", 4.0, 2.0, at).background) for at in (0.2, 0.5, 0.75, 1.0)
+    ]
     assert ghost == pytest.approx([0, ghost[3] / 2, ghost[3], ghost[3]])
 
 

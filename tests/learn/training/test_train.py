@@ -14,7 +14,7 @@ from learn.data.split import Split, nested
 from learn.evaluation.evaluate import unseen
 from learn.inference.predict import load_model
 from learn.settings import TrainingSettings, preset, replace
-from learn.training.batches import Batch, FrameDataset, measure_scales, swayed
+from learn.training.batches import Batch, FrameDataset, FrameItem, measure_scales, swayed
 from learn.training.train import select_score, train
 from synth.dataset.store import Dataset
 from synth.errors import UserError
@@ -71,7 +71,7 @@ def test_training_learns(clips: list[Clip], tmp_path: Path, monkeypatch: pytest.
     settings = small(epochs=8, batch=4, learning_rate=5e-3)
     settings = replace(settings, arch=replace(settings.arch, dropout=0.0))
     draw = FrameDataset.order
-    monkeypatch.setattr(FrameDataset, "order", lambda *args: [(*item[:3], 0) for item in draw(*args)])
+    monkeypatch.setattr(FrameDataset, "order", lambda *args: [item._replace(turn=0) for item in draw(*args)])
     train(clips, Split((0, 1, 3, 4, 5, 6), (2,), ()), settings, tmp_path / "m")
     losses = [json.loads(line)["loss"] for line in (tmp_path / "m/history.jsonl").read_text().splitlines()]
     assert losses[-1] < 0.6 < 0.8 < losses[0]
@@ -140,7 +140,7 @@ def test_a_split_that_leaks_is_refused(clips: list[Clip], tmp_path: Path) -> Non
 def test_sway_moves_the_whole_surface_of_half_of_the_frames_and_leaves_the_force(clips: list[Clip]) -> None:
     settings = small(sway_mm=0.5)
     frames = FrameDataset(clips, settings)
-    items = [(c, t, "ideal", 0) for c in range(len(clips)) for t in range(clips[c].frames)]
+    items = [FrameItem(c, t, "ideal") for c in range(len(clips)) for t in range(clips[c].frames)]
     still = frames.batch(items)
     moved = swayed(still, settings, torch.Generator().manual_seed(0))
     added = (moved.displacement - still.displacement).abs()
