@@ -30,7 +30,7 @@ FREE = 0.01
 RIM_MM = 2.0
 """Width of the rim around a contact that `ghost_far` leaves out."""
 LOW = 0.05
-"""A frame is of low force, and a prediction above this a false positive by the relative rule, at this share."""
+"""A frame is of low force, and a prediction above it a relative false positive, at this share."""
 YOUNG = ("known", "half", "double", "unknown")
 """Columns: E as it is, taken ×½, taken ×2, and not known at all (the training data's typical value)."""
 

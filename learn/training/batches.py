@@ -123,9 +123,8 @@ class FrameDataset:
         if len(self.sources) == 2:
             source = [self.sources[int(u < share_recovered)] for u in rng.random(len(items))]
         turn = rng.integers(0, 8, len(items))
-        return [
-            FrameItem(*items[i], source=source[i], turn=int(turn[i])) for i in rng.permutation(len(items))
-        ]
+        order = rng.permutation(len(items))
+        return [FrameItem._make((*items[i], source[i], int(turn[i]))) for i in order]
 
     def sequential(self, clip: int, source: str) -> Iterator[Batch]:
         """All frames of one clip, in order, as they are."""
