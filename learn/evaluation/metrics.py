@@ -92,7 +92,7 @@ METRICS = {
 
 @dataclass(frozen=True)
 class Moments:
-    """Sums over pairs of (true, predicted), from which every agreement metric follows; those of parts add up."""
+    """Sums over pairs (true, predicted), from which every agreement metric follows; those of parts add up."""
 
     n: float = 0.0
     t: float = 0.0
