@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,12 @@ def as_png(picture: NDArray[Any]) -> bytes:
     values = 255 * picture.astype(np.uint8) if picture.dtype == bool else picture
     Image.fromarray(values).save(file, "PNG", compress_level=3)
     return file.getvalue()
+
+
+def write_png(path: Path, picture: NDArray[Any]) -> None:
+    """`as_png` of a picture (H, W) or (H, W, 3) as a file; its folder is made."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(as_png(picture))
 
 
 def as_npy(values: NDArray[Any]) -> bytes:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from synth.dataset.store import Dataset, Sequence
 from synth.errors import UserError
-from synth.publish.export.encoding import as_png
+from synth.publish.export.encoding import write_png
 
 UNIT_MM = 0.01
 """One step of a depth picture, and so the unit of lengths: 16 bits reach to 655 mm."""
@@ -30,7 +30,7 @@ Floats = NDArray[np.float64]
 
 
 class _Maps(NamedTuple):
-    """Where a pixel of the pinhole's picture lies in the recorded one, for cv2.remap."""
+    """Where a pixel of the pinhole's picture lies in the recorded one (cv2.remap), each (H, W)."""
 
     x: NDArray[np.float32]
     y: NDArray[np.float32]
@@ -55,13 +55,10 @@ def write_scenes(dataset: Dataset, target: Path) -> None:
         if "depth" not in sequence:
             raise UserError(f"{sequence.path}: holds no depth: the job's store.without left it out")
         here = target / f"{sequence.index:06d}"
-        focal = float(np.asarray(sequence.attrs["K"])[0, 0])
-        maps = _maps(sequence, sequence.attrs, focal)
-        bounds = _write_pictures(sequence, maps, here)
-        poses = [
-            np.concatenate([_pose(pose), [[sequence.size[0]], [sequence.size[1]], [focal]]], axis=1).ravel()
-            for pose in _poses(sequence)
-        ]
+        focal = float(sequence.attrs["K"][0][0])
+        bounds = _write_pictures(sequence, _maps(sequence, sequence.attrs, focal), here)
+        lens = np.array([[*sequence.size, focal]]).T
+        poses = [np.concatenate([_pose(pose), lens], axis=1).ravel() for pose in _poses(sequence)]
         np.save(here / "poses_bounds.npy", np.concatenate([poses, bounds], axis=1))
         about: dict[str, Any] = {
             "unit_mm": UNIT_MM,
@@ -72,10 +69,8 @@ def write_scenes(dataset: Dataset, target: Path) -> None:
         }
         if "rgb_right" in sequence:
             maps = _maps(sequence, sequence.attrs["right"], focal)
-            (here / "images_right").mkdir()
             for t in range(sequence.frames):
-                picture = as_png(maps.smooth(sequence["rgb_right"][t]))
-                (here / "images_right" / f"{t:06d}.png").write_bytes(picture)
+                write_png(here / "images_right" / f"{t:06d}.png", maps.smooth(sequence["rgb_right"][t]))
             about["baseline_mm"] = sequence.attrs["right"]["baseline_mm"]
         (here / "scene.json").write_text(json.dumps(about, indent=1), "utf-8")
 
@@ -91,20 +86,18 @@ def _maps(sequence: Sequence, lens: dict[str, Any], focal: float) -> _Maps:
 
 def _write_pictures(sequence: Sequence, maps: _Maps, here: Path) -> Floats:
     """Images, depth and masks; returns nearest and farthest depth by frame, (T, 2)."""
-    for name in ("images", "depth", "masks"):
-        (here / name).mkdir(parents=True, exist_ok=True)
     bounds = []
     for t in range(sequence.frames):
         depth = np.round(maps.nearest(sequence["depth"][t]) / UNIT_MM)
         if depth.max() > np.iinfo(np.uint16).max:
             raise UserError(f"{sequence.path}: is deeper than 16 bits hold at {UNIT_MM:g} mm")
         covered = maps.nearest(sequence["tool"][t].astype(np.uint8), outside=1).astype(bool) | (depth == 0)
-        name = f"{t:06d}.png"
-        (here / "images" / name).write_bytes(as_png(maps.smooth(sequence["rgb"][t])))
-        (here / "depth" / name).write_bytes(as_png(depth.astype(np.uint16)))
-        (here / "masks" / name).write_bytes(as_png(covered))
-        seen = depth[~covered]
-        bounds.append([seen.min(), seen.max()] if seen.size else [0.0, 0.0])
+        picture = maps.smooth(sequence["rgb"][t])
+        drawn = {"images": picture, "depth": depth.astype(np.uint16), "masks": covered}
+        for name, picture in drawn.items():
+            write_png(here / name / f"{t:06d}.png", picture)
+        free = depth[~covered]
+        bounds.append([free.min(), free.max()] if free.size else [0.0, 0.0])
     return np.array(bounds)
 
 

@@ -6,8 +6,6 @@ The dense truth (flow, traction, depth) has no place in it; `--to hf` and `--to 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +16,6 @@ from numpy.typing import NDArray
 
 from synth.dataset.index import group_by_side, row_of
 from synth.dataset.store import Dataset, Sequence
-from synth.publish.export.encoding import PICTURES
 from synth.video.write import encode_video
 
 _VERSION = "v3.0"
@@ -32,21 +29,6 @@ _COUNTS = ("timestamp", "frame_index", "episode_index", "index", "task_index")
 Numbers = NDArray[Any]
 
 
-@dataclass(frozen=True)
-class _Episode:
-    """One sequence as an episode."""
-
-    number: int
-    start: int
-    """Rows before it."""
-    sequence: Sequence
-    task: str
-
-    @property
-    def place(self) -> dict[str, int]:
-        return {"chunk_index": self.number // _FILES, "file_index": self.number % _FILES}
-
-
 def write_episodes(dataset: Dataset, target: Path) -> None:
     """`meta/`, `data/chunk-000/file-000.parquet` and `videos/KEY/chunk-000/file-NNN.mp4`, one an episode.
 
@@ -54,124 +36,95 @@ def write_episodes(dataset: Dataset, target: Path) -> None:
     axes, `young_kpa` and `scale_mm_per_px` (1,). There is no action: nobody steered a robot. The task says
     gesture and look. Sides of `synth split` are the ranges under `splits`.
     """
-    tasks, about, ranges, rows = list[str](), list[dict[str, Any]](), dict[str, str](), 0
+    tasks, episodes, ranges = list[str](), list[dict[str, Any]](), dict[str, str]()
     for side, positions in group_by_side(dataset).items():
-        ranges[side] = f"{len(about)}:{len(about) + len(positions)}"
+        ranges[side] = f"{len(episodes)}:{len(episodes) + len(positions)}"
         for sequence in map(dataset.__getitem__, positions):
-            row = row_of(sequence)
-            task = f"{row['gesture']} the brain surface ({row['family']})"
-            tasks += [task] if task not in tasks else []
-            episode = _Episode(len(about), rows, sequence, task)
-            _write_videos(episode, target)
-            frames = _rows(episode, tasks.index(task))
-            columns = {
-                name: pa.array(list(values), pa.list_(pa.float32(), 3))
-                if name == "force"
-                else pa.array(values)
-                for name, values in frames.items()
-            }
-            _write_table(pa.table(columns), target / "data" / f"{_FILE.format(**episode.place)}.parquet")
-            about.append(_describe(episode, frames))
-            rows += sequence.frames
-    _write_meta(dataset[0], about, tasks, ranges, target)
+            before = episodes[-1]["dataset_to_index"] if episodes else 0
+            episodes.append(_write_episode(sequence, len(episodes), before, tasks, target))
+    _write_meta(dataset[0], episodes, tasks, ranges, target)
 
 
-def _key(name: str) -> str:
-    return f"observation.images.{'right' if name == 'rgb_right' else 'left'}"
+def _cameras(sequence: Sequence) -> dict[str, str]:
+    """Features that are video, and the fields that they are of."""
+    names = {"left": "rgb", "right": "rgb_right"}
+    return {f"observation.images.{key}": name for key, name in names.items() if name in sequence}
 
 
-def _cameras(sequence: Sequence) -> Iterator[str]:
-    return (name for name in PICTURES if name in sequence)
-
-
-def _write_videos(episode: _Episode, target: Path) -> None:
-    for name in _cameras(episode.sequence):
-        file = target / "videos" / _key(name) / f"{_FILE.format(**episode.place)}.mp4"
-        file.parent.mkdir(parents=True, exist_ok=True)
-        fps = float(episode.sequence.attrs["fps"])
-        encode_video(file, episode.sequence[name][:], fps, quality=_QUALITY, group=_GROUP)
-
-
-def _rows(episode: _Episode, task: int) -> dict[str, Numbers]:
-    """The columns of an episode's frames, (T,) or (T, 3)."""
-    attrs, frame = episode.sequence.attrs, np.arange(episode.sequence.frames)
-    return {
-        "force": episode.sequence["force"][:].astype(np.float32),
-        "young_kpa": np.full(len(frame), attrs["young_kpa"], np.float32),
-        "scale_mm_per_px": np.full(len(frame), attrs["scale_mm_per_px"], np.float32),
-        "timestamp": (frame / float(attrs["fps"])).astype(np.float32),
+def _write_episode(
+    sequence: Sequence, number: int, before: int, tasks: list[str], target: Path
+) -> dict[str, Any]:
+    """Frames and videos of an episode with `before` rows before it; its row in `meta/episodes`."""
+    about = row_of(sequence)
+    task = f"{about['gesture']} the brain surface ({about['family']})"
+    tasks += [task] if task not in tasks else []
+    frames, fps = sequence.frames, float(sequence.attrs["fps"])
+    frame = np.arange(frames)
+    columns: dict[str, Numbers] = {
+        "force": sequence["force"][:].astype(np.float32),
+        "young_kpa": np.full(frames, sequence.attrs["young_kpa"], np.float32),
+        "scale_mm_per_px": np.full(frames, sequence.attrs["scale_mm_per_px"], np.float32),
+        "timestamp": (frame / fps).astype(np.float32),
         "frame_index": frame,
-        "episode_index": np.full_like(frame, episode.number),
-        "index": episode.start + frame,
-        "task_index": np.full_like(frame, task),
+        "episode_index": np.full_like(frame, number),
+        "index": before + frame,
+        "task_index": np.full_like(frame, tasks.index(task)),
     }
-
-
-def _describe(episode: _Episode, columns: dict[str, Numbers]) -> dict[str, Any]:
-    """The row of an episode in `meta/episodes`."""
-    frames = episode.sequence.frames
-    place: dict[str, Any] = {f"data/{name}": value for name, value in episode.place.items()}
-    for name in _cameras(episode.sequence):
-        video = f"videos/{_key(name)}"
-        place |= {f"{video}/{what}": value for what, value in episode.place.items()}
-        end = frames / float(episode.sequence.attrs["fps"])
-        place |= {f"{video}/from_timestamp": 0.0, f"{video}/to_timestamp": end}
-    return {
-        "episode_index": episode.number,
-        "tasks": [episode.task],
+    stats = {name: _statistics(values.reshape(frames, -1), ()) for name, values in columns.items()}
+    place = {"chunk_index": number // _FILES, "file_index": number % _FILES}
+    file = _FILE.format(**place)
+    vector = pa.list_(pa.float32(), 3)
+    arrays = {
+        name: pa.array(list(values), vector) if values.ndim == 2 else pa.array(values)
+        for name, values in columns.items()
+    }
+    _write_table(pa.table(arrays), target / "data" / f"{file}.parquet")
+    row: dict[str, Any] = {
+        "episode_index": number,
+        "tasks": [task],
         "length": frames,
-        "dataset_from_index": episode.start,
-        "dataset_to_index": episode.start + frames,
+        "dataset_from_index": before,
+        "dataset_to_index": before + frames,
         "meta/episodes/chunk_index": 0,
         "meta/episodes/file_index": 0,
-        **place,
-        **{
-            f"stats/{key}/{name}": value
-            for key, stats in _statistics(episode.sequence, columns).items()
-            for name, value in stats.items()
-        },
+        **{f"data/{name}": value for name, value in place.items()},
     }
+    probed = np.unique(np.linspace(0, frames - 1, _PROBED).round().astype(int)).tolist()
+    for key, name in _cameras(sequence).items():
+        video = target / "videos" / key / f"{file}.mp4"
+        video.parent.mkdir(parents=True, exist_ok=True)
+        encode_video(video, sequence[name][:], fps, quality=_QUALITY, group=_GROUP)
+        row |= {f"videos/{key}/{what}": value for what, value in place.items()}
+        row |= {f"videos/{key}/from_timestamp": 0.0, f"videos/{key}/to_timestamp": frames / fps}
+        pixels = np.concatenate([sequence[name][t][::4, ::4].reshape(-1, 3) for t in probed])
+        stats[key] = _statistics(pixels / 255, (1, 1)) | {"count": [len(probed)]}
+    return row | {f"stats/{key}/{name}": value for key, one in stats.items() for name, value in one.items()}
 
 
-def _statistics(sequence: Sequence, columns: dict[str, Numbers]) -> dict[str, dict[str, Any]]:
-    """Of every feature over an episode's frames; of pictures in 0..1 by channel, from some of them."""
-    found = {name: _summary(values.reshape(len(values), -1), ()) for name, values in columns.items()}
-    for name in _cameras(sequence):
-        chosen = np.unique(np.linspace(0, sequence.frames - 1, _PROBED).round().astype(int))
-        pixels = np.concatenate([sequence[name][int(t)][::4, ::4].reshape(-1, 3) for t in chosen])
-        found[_key(name)] = _summary(pixels / 255, (1, 1)) | {"count": [len(chosen)]}
-    return found
-
-
-def _summary(values: Numbers, beyond: tuple[int, ...]) -> dict[str, Any]:
+def _statistics(values: Numbers, beyond: tuple[int, ...]) -> dict[str, Any]:
     """Statistics over the rows of (N, K), each (K, *beyond)."""
-    told = {
+    found = {
         "min": values.min(0),
         "max": values.max(0),
         "mean": values.mean(0),
         "std": values.std(0),
         **{name: np.quantile(values, q, axis=0) for name, q in _QUANTILES.items()},
     }
-    shaped = {name: np.asarray(one, float).reshape(-1, *beyond).tolist() for name, one in told.items()}
+    shaped = {name: np.asarray(one, float).reshape(-1, *beyond).tolist() for name, one in found.items()}
     return {**shaped, "count": [len(values)]}
 
 
 def _pooled(rows: list[dict[str, Any]], key: str) -> dict[str, Any]:
     """Statistics of all episodes from theirs; quantiles as LeRobot pools them, by a weighted mean."""
-    get = {
-        name: np.array([row[f"stats/{key}/{name}"] for row in rows])
-        for name in ("min", "max", "mean", "std", "count", *_QUANTILES)
-    }
+    names = ("min", "max", "mean", "std", "count", *_QUANTILES)
+    get = {name: np.array([row[f"stats/{key}/{name}"] for row in rows]) for name in names}
     count = get["count"][:, 0].astype(float)
-
-    def mean(values: Numbers) -> Numbers:
-        return np.asarray(np.average(values, axis=0, weights=count))
-
-    middle = mean(get["mean"])
-    spread = np.sqrt(mean(get["std"] ** 2 + (get["mean"] - middle) ** 2))
-    found = {"min": get["min"].min(0), "max": get["max"].max(0), "mean": middle, "std": spread}
-    found |= {name: mean(get[name]) for name in _QUANTILES}
-    return {**{name: value.tolist() for name, value in found.items()}, "count": [int(count.sum())]}
+    found = {name: np.average(get[name], axis=0, weights=count) for name in ("mean", *_QUANTILES)}
+    squares = get["std"] ** 2 + (get["mean"] - found["mean"]) ** 2
+    spread = np.sqrt(np.average(squares, axis=0, weights=count))
+    ends = {"min": get["min"].min(0), "max": get["max"].max(0), "mean": found.pop("mean"), "std": spread}
+    pooled = {name: value.tolist() for name, value in {**ends, **found}.items()}
+    return {**pooled, "count": [int(count.sum())]}
 
 
 def _write_meta(
@@ -191,9 +144,9 @@ def _write_meta(
         "video.channels": 3,
         "has_audio": False,
     }
-    for name in _cameras(first):
+    for key in _cameras(first):
         picture = {"dtype": "video", "shape": [height, width, 3], "names": ["height", "width", "channels"]}
-        features[_key(name)] = {**picture, "info": video}
+        features[key] = {**picture, "info": video}
     features["force"] = {"dtype": "float32", "shape": [3], "names": ["x_mn", "y_mn", "z_mn"]}
     for name in ("young_kpa", "scale_mm_per_px", *_COUNTS):
         kind = "int64" if name in _COUNTS[1:] else "float32"

@@ -10,7 +10,7 @@ import numpy as np
 from synth.dataset.store import Dataset
 from synth.errors import UserError
 from synth.fields import FIELDS
-from synth.publish.export.encoding import PICTURES, as_png
+from synth.publish.export.encoding import PICTURES, write_png
 
 
 def write_folder(dataset: Dataset, target: Path) -> None:
@@ -20,12 +20,13 @@ def write_folder(dataset: Dataset, target: Path) -> None:
     """
     for sequence in dataset:
         here = target / f"{sequence.index:06d}"
+        here.mkdir()
         for name in sequence.fields:
-            (here / name if name in PICTURES else here).mkdir(parents=True, exist_ok=True)
-            for t in range(sequence.frames if name in PICTURES else 0):
-                (here / name / f"{t:04d}.png").write_bytes(as_png(sequence[name][t]))
             if name not in PICTURES:
                 np.save(here / f"{name}.npy", sequence[name][:])
+                continue
+            for t in range(sequence.frames):
+                write_png(here / name / f"{t:04d}.png", sequence[name][t])
         (here / "attributes.json").write_text(json.dumps(sequence.attrs, indent=1), "utf-8")
 
 

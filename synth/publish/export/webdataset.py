@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import itertools
 import json
 import tarfile
 from collections.abc import Iterable, Iterator
@@ -22,29 +23,30 @@ def write_shards(dataset: Dataset, target: Path) -> None:
     A second lens's pictures are `.rgb_right.png`. Shards are `SIDE-NNNNN.tar`, sides as `synth split` said.
     """
     for side, positions in group_by_side(dataset).items():
-        samples, shard = _samples(dataset, positions), 0
+        samples = _samples(dataset, positions)
         pending = next(samples, None)
-        while pending is not None:
-            used = 0
+        for shard in itertools.count():
+            if pending is None:
+                break
             with tarfile.open(target / f"{side}-{shard:05d}.tar", "w") as archive:
+                used = 0
                 while pending is not None and used <= _SHARD_BYTES:
-                    key, files = pending
-                    for name, data in files.items():
-                        entry = tarfile.TarInfo(f"{key}.{name}")
+                    for name, data in pending.items():
+                        entry = tarfile.TarInfo(name)
                         entry.size = len(data)
                         archive.addfile(entry, io.BytesIO(data))
                         used += len(data)
                     pending = next(samples, None)
-            shard += 1
 
 
-def _samples(dataset: Dataset, positions: Iterable[int]) -> Iterator[tuple[str, dict[str, bytes]]]:
+def _samples(dataset: Dataset, positions: Iterable[int]) -> Iterator[dict[str, bytes]]:
+    """The files of each sample."""
     for sequence in map(dataset.__getitem__, positions):
         attributes = json.dumps(sequence.attrs).encode()
         for t in range(sequence.frames):
-            files = {}
+            key, files = f"{sequence.index:06d}_{t:04d}", {}
             for name in sequence.fields:
                 values = sequence[name][t if FIELDS[name].dims[0] == TIME else slice(None)]
-                picture = name in PICTURES
-                files[f"{name}.png" if picture else f"{name}.npy"] = (as_png if picture else as_npy)(values)
-            yield f"{sequence.index:06d}_{t:04d}", {**files, "json": attributes}
+                encoded, ending = (as_png, "png") if name in PICTURES else (as_npy, "npy")
+                files[f"{key}.{name}.{ending}"] = encoded(values)
+            yield {**files, f"{key}.json": attributes}
