@@ -234,8 +234,7 @@ def report(
     from synth.dataset.folder import Folder
     from synth.dataset.index import write_index
     from synth.publish import croissant
-    from synth.publish.card import write_card
-    from synth.publish.report import write_report
+    from synth.publish.card import write_card, write_page
 
     folder = Folder(out)
     folder.described()
@@ -248,7 +247,7 @@ def report(
             f"not said in the job's card, so not in the description: {', '.join(sorted(unsaid))}",
             file=sys.stderr,
         )
-    print(write_report(out, to or out / "report.html"))
+    print(write_page(out, to or out / "report.html"))
 
 
 @app.command(epilog="Example: synth export out out-hf --to hf")

@@ -1,7 +1,9 @@
-"""The dataset's card: README.md, its pictures, and nothing in it that is not taken from the dataset."""
+"""What describes a dataset to a person: its card README.md with pictures, and a page for browsers."""
 
 from __future__ import annotations
 
+import base64
+import io
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -12,7 +14,8 @@ from numpy.typing import NDArray
 
 from synth.dataset import index, location, split
 from synth.dataset.folder import Folder, write_whole
-from synth.dataset.store import Sequence, open_sequence
+from synth.dataset.store import open_sequence
+from synth.errors import UserError
 from synth.fields import FIELDS
 from synth.job import retired
 from synth.publish import picture, svg
@@ -24,6 +27,9 @@ QUANTITIES = {
     "load": ("Load F/(E a²)", "1"),
 }
 """Columns of the index that card and page draw: title and unit."""
+
+_THUMBNAILS, _THUMBNAIL_PX = 24, 320
+_FILES = ("README.md", "preview.mp4", "job.yaml", index.NAME)
 _FEWEST_DRAWN = 5
 """Of less a histogram says nothing that the table of ranges doesn't, and drawing takes a second."""
 
@@ -36,26 +42,41 @@ def write_card(folder: Folder) -> Path:
     for name, chart in about["charts"].items():
         write_whole(pictures / f"{name}.svg", chart)
     best = max(done, key=lambda row: row["peak_flow_px"] or 0.0, default=None)
-    sequence = None if best is None else open_sequence(location.store(folder.root, best["index"]))
-    if sequence is not None:
+    attrs, fields = dict[str, Any](), list(FIELDS)
+    if best is not None:
         from PIL import Image
 
+        sequence = open_sequence(location.store(folder.root, best["index"]))
+        attrs, fields = sequence.attrs, sequence.fields
         drawn = picture.draw_sequence(sequence, [picture.strongest(sequence)])
         Image.fromarray(drawn).save(pictures / "example.png")
-    attrs = {} if sequence is None else sequence.attrs
     text = template("card.md.jinja").render(
         **about,
         example=best,
         variant=attrs.get("variant", "-"),
         versions=attrs.get("versions", {}),
         ranges=[_range(done, name) for name in QUANTITIES],
-        fields=_fields(sequence),
+        fields=[FIELDS[name] for name in fields],
         columns=index.COLUMNS,
         limits=limits(folder),
     )
     path = folder.root / "README.md"
     write_whole(path, text)
     return path
+
+
+def write_page(root: Path, target: Path) -> Path:
+    """Writes a page about the dataset in `root` that any browser opens; all that it shows is inside it."""
+    about = facts(Folder(root))
+    done = about["done"]
+    chosen = np.unique(np.linspace(0, max(len(done) - 1, 0), _THUMBNAILS).astype(int))[: len(done)]
+    page = template("report.html.jinja").render(
+        **about,
+        thumbnails=[found for k in chosen if (found := _thumbnail(root, done[k])) is not None],
+        links=[name for name in _FILES if (root / name).exists()],
+    )
+    write_whole(target, page)
+    return target
 
 
 def facts(folder: Folder) -> dict[str, Any]:
@@ -122,19 +143,24 @@ def template(name: str) -> Any:
 def _range(rows: list[dict[str, Any]], name: str) -> list[str]:
     """Name, least, median and greatest."""
     values, (title, unit) = column(rows, name), QUANTITIES[name]
-    said = [f"{value:.3g}" for value in np.quantile(values, (0, 0.5, 1))] if len(values) else ["-"] * 3
-    return [f"{title} [{unit}]", *said]
+    ends = np.quantile(values, (0, 0.5, 1)).tolist() if len(values) else []
+    return [f"{title} [{unit}]", *([f"{value:.3g}" for value in ends] or ["-"] * 3)]
 
 
-def _fields(sequence: Sequence | None) -> list[dict[str, str]]:
-    present = list(FIELDS) if sequence is None else sequence.fields
-    return [
-        {
-            "name": name,
-            "axes": ", ".join(FIELDS[name].dims),
-            "dtype": FIELDS[name].dtype if sequence is None else str(sequence[name].dtype),
-            "unit": FIELDS[name].unit,
-            "meaning": FIELDS[name].meaning,
-        }
-        for name in present
-    ]
+def _thumbnail(root: Path, row: dict[str, Any]) -> dict[str, str] | None:
+    """A sequence at its greatest load; None of one that was moved away or is damaged."""
+    from PIL import Image
+
+    # Not by the path in the table, which may lead anywhere.
+    path = location.store(root, int(row["index"]))
+    try:
+        sequence = open_sequence(path)
+        image = Image.fromarray(sequence["rgb"][picture.strongest(sequence)])
+    except UserError:
+        return None  # `synth verify` is for that
+    image.thumbnail((_THUMBNAIL_PX, _THUMBNAIL_PX))
+    file = io.BytesIO()
+    image.save(file, "JPEG", quality=80)
+    numbers = [f"{row[name]:.3g} {unit}" for name, (_, unit) in QUANTITIES.items() if row[name] is not None]
+    caption = ", ".join([f"{row['index']:06d} {row['gesture'] or '-'}", row["family"] or "-", *numbers[:2]])
+    return {"path": path.name, "jpeg": base64.b64encode(file.getvalue()).decode(), "caption": caption}

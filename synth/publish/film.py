@@ -12,7 +12,19 @@ from numpy.typing import NDArray
 
 from synth.dataset.store import Dataset, Sequence
 from synth.errors import UserError
-from synth.publish.picture import Rgb, arrow_gain, arrows, both_eyes, caption, heat, legible, overlay, tile
+from synth.publish.picture import (
+    INK,
+    Rgb,
+    arrow_gain,
+    arrows,
+    both_eyes,
+    caption,
+    heat,
+    legible,
+    overlay,
+    tile,
+    write_text,
+)
 from synth.video.write import encode_video
 
 OVERLAYS = {"flow": "flow", "recovered": "flow_recovered", "force": "traction"}
@@ -22,7 +34,7 @@ _PREVIEW_PX, _PREVIEW_TILES = 1280, 9
 _QUALITY = 18
 _CURVE_PX, _LEFT_PX = 64, 4
 _TURNS = 5
-_INK, _LINE = (40, 40, 40), (200, 60, 20)
+_LINE = (200, 60, 20)
 
 
 def write_preview(root: Path) -> None:
@@ -94,20 +106,20 @@ def draw_film(
 
 
 def _overlaid(sequence: Sequence, t: int, tissue: NDArray[np.bool_], largest: dict[str, float]) -> Rgb:
-    picture, said = sequence["rgb"][t], [f"{sequence['time'][t]:.2f} s"]
+    picture, words = sequence["rgb"][t], [f"{sequence['time'][t]:.2f} s"]
     if "force" in largest:
         size = np.linalg.norm(sequence["traction"][t], axis=-1)
-        moved = carried(np.where(tissue, size, 0.0), sequence["flow"][t])
+        moved = warp_to_frame(np.where(tissue, size, 0.0), sequence["flow"][t])
         picture = glow(picture, moved, largest["force"])
-        said.append(f"{np.linalg.norm(sequence['force'][t]):.1f} mN (yellow: {largest['force']:.2g} kPa)")
+        words.append(f"{np.linalg.norm(sequence['force'][t]):.1f} mN (yellow: {largest['force']:.2g} kPa)")
     for name in (name for name in largest if name != "force"):
         gain = arrow_gain(sequence.size[1], largest[name])
         picture = arrows(picture, sequence[OVERLAYS[name]][t], tissue, gain)
-        said.append(f"{OVERLAYS[name]} x{gain}")
-    return caption(legible(picture), "  ".join(said))
+        words.append(f"{OVERLAYS[name]} x{gain}")
+    return caption(legible(picture), "  ".join(words))
 
 
-def carried(values: NDArray[np.floating], flow: NDArray[np.floating]) -> NDArray[np.float32]:
+def warp_to_frame(values: NDArray[np.floating], flow: NDArray[np.floating]) -> NDArray[np.float32]:
     """Values on the rest frame's pixels, drawn where their points are now.
 
     The way back is found by iteration, which is enough for motion that is smooth over its own length.
@@ -142,15 +154,14 @@ def draw_curve(time_s: NDArray[np.floating], force_mn: NDArray[np.floating], wid
     places = np.stack([_columns(len(force_mn), width_px), y], axis=1).tolist()
     for k in np.flatnonzero(sure[1:] & sure[:-1]):
         cv2.line(strip, places[k], places[k + 1], _LINE, 1, cv2.LINE_AA)
-    text = f"0 to {top:.3g} mN, {time_s[0]:.2f} to {time_s[-1]:.2f} s"
-    cv2.putText(strip, text, (_LEFT_PX, 12), cv2.FONT_HERSHEY_SIMPLEX, 0.4, _INK, 1, cv2.LINE_AA)
+    write_text(strip, f"0 to {top:.3g} mN, {time_s[0]:.2f} to {time_s[-1]:.2f} s", (_LEFT_PX, 12))
     return strip
 
 
 def mark(curve: Rgb, k: int, count: int) -> Rgb:
     """The strip (h, w, 3) with a line at the k-th of `count` values."""
     marked = curve.copy()
-    marked[16:, _columns(count, curve.shape[1])[k]] = _INK
+    marked[16:, _columns(count, curve.shape[1])[k]] = INK
     return marked
 
 

@@ -14,6 +14,9 @@ from synth.errors import UserError
 Rgb = NDArray[np.uint8]
 """(H, W, 3) uint8, sRGB."""
 
+INK = (40, 40, 40)
+"""Colour of text and lines on white."""
+
 _CAPTION_PX = 26
 _GAP_PX = 6
 _WIDE_PX = 480
@@ -75,11 +78,23 @@ def legible(picture: Rgb) -> Rgb:
     return picture.repeat(times, axis=0).repeat(times, axis=1)
 
 
+def write_text(
+    picture: Rgb,
+    text: str,
+    at: tuple[int, int],
+    size: float = 0.4,
+    colour: tuple[int, int, int] = INK,
+    thick: int = 1,
+) -> None:
+    """Draws a line of text on a picture (H, W, 3); its baseline begins at `at`, (column, row) px."""
+    cv2.putText(picture, text, at, cv2.FONT_HERSHEY_SIMPLEX, size, colour, thick, cv2.LINE_AA)
+
+
 def caption(picture: Rgb, text: str, row: int = 14) -> Rgb:
     """The picture (H, W, 3) with a line of text, readable on any ground, that stands on a row."""
     canvas = np.ascontiguousarray(picture)
     for colour, thick in (((0, 0, 0), 3), ((255, 255, 255), 1)):
-        cv2.putText(canvas, text, (4, row), cv2.FONT_HERSHEY_SIMPLEX, 0.4, colour, thick, cv2.LINE_AA)
+        write_text(canvas, text, (4, row), colour=colour, thick=thick)
     return canvas
 
 
@@ -112,22 +127,25 @@ def draw_sequence(sequence: Sequence_, frames: Sequence[int]) -> Rgb:
     largest_px = max(float(np.linalg.norm(flow, axis=-1).max()) for flow in flows)
     largest_kpa = max(float(load.max()) for load in loads)
     force, time, tissue = sequence["force"][...], sequence["time"][...], sequence["tissue"][...]
-    grey = np.repeat(sequence["rgb"][0].mean(axis=2, keepdims=True), 3, axis=2).astype(np.uint8)
+    grey = in_grey(sequence["rgb"][0])
     gain, rows = arrow_gain(sequence.size[1], largest_px), []
     for t, flow, load in zip(frames, flows, loads, strict=True):
-        moved = overlay(grey, flow_colours(flow, largest_px), 0.65 * tissue)
+        moved = arrows(overlay(grey, flow_colours(flow, largest_px), 0.65 * tissue), flow, tissue, gain)
         weight = tissue * np.clip(0.15 + load / max(largest_kpa, 1e-12), 0, 0.9)
+        loaded = overlay((0.6 * grey).astype(np.uint8), heat(load, largest_kpa), weight)
+        most_px, total_mn = np.linalg.norm(flow, axis=-1).max(), np.linalg.norm(force[t])
         panels = {
             f"frame {t}, {time[t]:.2f} s": sequence["rgb"][t],
-            f"flow, {np.linalg.norm(flow, axis=-1).max():.1f} px at most (arrows x{gain})": arrows(
-                moved, flow, tissue, gain
-            ),
-            f"traction, {np.linalg.norm(force[t]):.1f} mN in all (yellow: {largest_kpa:.2g} kPa)": overlay(
-                (0.6 * grey).astype(np.uint8), heat(load, largest_kpa), weight
-            ),
+            f"flow, {most_px:.1f} px at most (arrows x{gain})": moved,
+            f"traction, {total_mn:.1f} mN in all (yellow: {largest_kpa:.2g} kPa)": loaded,
         }
         rows.append(np.hstack([_framed(panel, text) for text, panel in panels.items()]))
     return np.vstack(rows)[:, _GAP_PX:]
+
+
+def in_grey(picture: Rgb) -> Rgb:
+    """The picture (H, W, 3) without its colours."""
+    return np.repeat(picture.mean(axis=2, keepdims=True), 3, axis=2).astype(np.uint8)
 
 
 def strongest(sequence: Sequence_) -> int:
@@ -138,5 +156,5 @@ def strongest(sequence: Sequence_) -> int:
 def _framed(panel: Rgb, text: str) -> Rgb:
     """A panel (H, W, 3) with white above and to its left, and a line of text on that."""
     canvas = cv2.copyMakeBorder(panel, _CAPTION_PX, 0, _GAP_PX, 0, cv2.BORDER_CONSTANT, value=(255,) * 3)
-    cv2.putText(canvas, text, (_GAP_PX + 4, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (40, 40, 40), 1, cv2.LINE_AA)
+    write_text(np.asarray(canvas, np.uint8), text, (_GAP_PX + 4, 18), size=0.45)
     return np.asarray(canvas, np.uint8)

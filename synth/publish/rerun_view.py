@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from synth.checks import optics
+from synth.checks import optics, stereo
 from synth.dataset.attributes import name_gestures
 from synth.dataset.store import Sequence
 from synth.errors import UserError
@@ -55,8 +55,9 @@ def show_sequence(sequence: Sequence, *, web: bool) -> None:
     with tempfile.TemporaryDirectory() as scratch:
         path = Path(scratch) / "sequence.rrd"
         save_recording(sequence, path)
-        # A group of its own: the viewer starts a process in its turn, which must not stay when this one ends.
-        viewer = subprocess.Popen(command(path, web=web), start_new_session=True)
+        # Bound to localhost, in a group of its own: it starts a process in its turn, which must not stay.
+        words = [sys.executable, "-m", "rerun", "--bind", "127.0.0.1", "--port", "auto"]
+        viewer = subprocess.Popen([*words, *["--serve-web"] * web, str(path)], start_new_session=True)
         try:
             code = viewer.wait()
         finally:
@@ -66,12 +67,6 @@ def show_sequence(sequence: Sequence, *, web: bool) -> None:
     if code:
         hint = "" if web else "; without a window system use --web, or --save and open the file elsewhere"
         raise UserError(f"the viewer ended with code {code}{hint}")
-
-
-def command(path: Path, *, web: bool) -> list[str]:
-    """The viewer's command line for a recording: bound to localhost."""
-    words = [sys.executable, "-m", "rerun", "--bind", "127.0.0.1", "--port", "auto"]
-    return [*words, *(("--serve-web",) if web else ()), str(path)]
 
 
 def _log(rerun: Any, stream: Any, sequence: Sequence) -> None:
@@ -85,11 +80,11 @@ def _log(rerun: Any, stream: Any, sequence: Sequence) -> None:
     except (KeyError, TypeError) as error:
         raise UserError(f"{sequence.path}: says nothing of {error}, which a view needs") from error
     force, time, tissue = sequence["force"][:], sequence["time"][:], sequence["tissue"][:]
-    grey = np.repeat(sequence["rgb"][0].mean(axis=2, keepdims=True), 3, axis=2).astype(np.uint8)
+    grey = picture.in_grey(sequence["rgb"][0])
     stream.log("/", rerun.ViewCoordinates.RDF, static=True)
     stream.log("camera", rerun.Pinhole(image_from_camera=left.K, resolution=left.size), static=True)
     if "right" in sequence.attrs:
-        right = optics.camera_of(sequence, sequence.attrs["right"])
+        right = stereo.right_of(sequence)
         aside = right.rotation @ (right.centre - left.centre)
         stream.log("right", rerun.Transform3D(translation=aside), static=True)
         stream.log("right", rerun.Pinhole(image_from_camera=right.K, resolution=right.size), static=True)
@@ -104,10 +99,9 @@ def _log(rerun: Any, stream: Any, sequence: Sequence) -> None:
         if "depth" in sequence:
             # Shown as a surface in space, for the camera is known; unit of space: mm.
             stream.log("camera/depth", rerun.DepthImage(sequence["depth"][t], meter=1.0))
-        for name in (name for name in ("flow", "flow_recovered") if name in sequence):
-            image(
-                name, picture.overlay(grey, picture.flow_colours(sequence[name][t], longest), 0.65 * tissue)
-            )
+        for name in {"flow", "flow_recovered"} & set(sequence.fields):
+            colours = picture.flow_colours(sequence[name][t], longest)
+            image(name, picture.overlay(grey, colours, 0.65 * tissue))
         load = np.linalg.norm(sequence["traction"][t], axis=-1)
         image("traction", picture.overlay(grey, picture.heat(load, strongest), 0.8 * tissue))
         stream.log("force", rerun.Scalars([*force[t], float(np.linalg.norm(force[t]))]))
@@ -115,12 +109,11 @@ def _log(rerun: Any, stream: Any, sequence: Sequence) -> None:
 
 def _about(sequence: Sequence) -> str:
     attrs = sequence.attrs
-    gestures = name_gestures(attrs.get("scenario") or {})
+    gestures, summary = name_gestures(attrs.get("scenario") or {}), attrs["summary"]
     return (
         f"# Sequence {sequence.index}\n\n{gestures}, E = {attrs['young_kpa']:.3g} kPa, "
         f"{attrs['scale_mm_per_px']:.3g} mm/px\n\nflow: hue is direction; full colour is "
-        f"{attrs['summary']['peak_flow_px']:.3g} px\n\ntraction: brightest is "
-        f"{attrs['summary']['peak_traction_kpa']:.3g} kPa\n"
+        f"{summary['peak_flow_px']:.3g} px\n\ntraction: brightest is {summary['peak_traction_kpa']:.3g} kPa\n"
     )
 
 

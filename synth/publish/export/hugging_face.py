@@ -34,7 +34,7 @@ _LEFT_OUT = ("status", "reason", "path", "split")  # of the index: nothing to sa
 
 
 @dataclass(frozen=True)
-class _Column:
+class ParquetColumn:
     """One column: its type in Parquet, and what `datasets` makes of it."""
 
     name: str
@@ -71,39 +71,39 @@ def write_parquet(dataset: Dataset, target: Path) -> None:
     first, sides = dataset[0], index.group_by_side(dataset)
     framed = [name for name in first.fields if FIELDS[name].dims[0] == TIME]
     still = [name for name in first.fields if FIELDS[name].dims[0] != TIME]
+    about = [column for column in index.COLUMNS if column.name not in _LEFT_OUT]
     frames = [*(_plain(name, kind) for name, (kind, _) in _ROWS.items()), *(_field(first, n) for n in framed)]
-    told = [column for column in index.COLUMNS if column.name not in _LEFT_OUT]
-    each = [_plain(field.name, str(field.type).replace("double", "float64")) for field in told]
+    each = [_plain(column.name, str(column.type).replace("double", "float64")) for column in about]
     each += [*(_field(first, name) for name in still), _plain("attributes", "string")]
     for side, positions in sides.items():
-        rows = (row for k in positions for row in _frames(dataset[k], framed))
-        _write(target / "frames", side, frames, rows)
-        about = (_sequence(dataset[k], still, [field.name for field in told]) for k in positions)
-        _write(target / "sequences", side, each, about)
+        _write(
+            target / "frames", side, frames, (row for k in positions for row in _frames(dataset[k], framed))
+        )
+        names = [column.name for column in about]
+        _write(target / "sequences", side, each, (_sequence(dataset[k], still, names) for k in positions))
     (target / "README.md").write_text(_card(dataset, list(sides), framed, still), "utf-8")
 
 
-def _plain(name: str, kind: str) -> _Column:
-    return _Column(name, pa.type_for_alias(kind), {"dtype": kind, "_type": "Value"})
+def _plain(name: str, kind: str) -> ParquetColumn:
+    return ParquetColumn(name, pa.type_for_alias(kind), {"dtype": kind, "_type": "Value"})
 
 
-def _field(sequence: Sequence, name: str) -> _Column:
+def _field(sequence: Sequence, name: str) -> ParquetColumn:
     """A field's values in one row: a picture, a number, or an array of its shape."""
-    field = FIELDS[name]
-    shape = sequence[name].shape[field.dims[0] == TIME :]
+    dtype, shape = FIELDS[name].dtype, sequence[name].shape[FIELDS[name].dims[0] == TIME :]
     if _is_picture(name):
         kind = pa.struct([("bytes", pa.binary()), ("path", pa.string())])
-        return _Column(name, kind, {"_type": "Image"})
-    value = pa.type_for_alias(field.dtype)
+        return ParquetColumn(name, kind, {"_type": "Image"})
     if not shape:
-        return _plain(name, field.dtype)
+        return _plain(name, dtype)
+    value = pa.type_for_alias(dtype)
     if len(shape) == 1:
-        told = {"feature": {"dtype": field.dtype, "_type": "Value"}, "length": shape[0], "_type": "Sequence"}
-        return _Column(name, pa.list_(value, shape[0]), told)
+        feature = {"feature": {"dtype": dtype, "_type": "Value"}, "length": shape[0], "_type": "Sequence"}
+        return ParquetColumn(name, pa.list_(value, shape[0]), feature)
     for _ in shape:
         value = pa.list_(value)
-    told = {"shape": list(shape), "dtype": field.dtype, "_type": f"Array{len(shape)}D"}
-    return _Column(name, value, told)
+    feature = {"shape": list(shape), "dtype": dtype, "_type": f"Array{len(shape)}D"}
+    return ParquetColumn(name, value, feature)
 
 
 def _is_picture(name: str) -> bool:
@@ -112,15 +112,14 @@ def _is_picture(name: str) -> bool:
 
 def _frames(sequence: Sequence, names: list[str]) -> Iterator[dict[str, Any]]:
     for t in range(sequence.frames):
-        row: dict[str, Any] = {"sequence": sequence.index, "frame": t}
-        yield row | {name: _cell(name, sequence[name][t]) for name in names}
+        cells = {name: _cell(name, sequence[name][t]) for name in names}
+        yield {"sequence": sequence.index, "frame": t, **cells}
 
 
-def _sequence(sequence: Sequence, still: list[str], told: list[str]) -> dict[str, Any]:
-    about = index.row_of(sequence)
-    row = {name: about[name] for name in told}
-    row |= {name: _cell(name, sequence[name][:]) for name in still}
-    return row | {"attributes": json.dumps(sequence.attrs)}
+def _sequence(sequence: Sequence, still: list[str], columns: list[str]) -> dict[str, Any]:
+    row = index.row_of(sequence)
+    cells = {name: _cell(name, sequence[name][:]) for name in still}
+    return {**{name: row[name] for name in columns}, **cells, "attributes": json.dumps(sequence.attrs)}
 
 
 def _cell(name: str, values: NDArray[Any]) -> Any:
@@ -129,7 +128,7 @@ def _cell(name: str, values: NDArray[Any]) -> Any:
     return values if values.ndim else values.item()
 
 
-def _write(folder: Path, side: str, columns: list[_Column], rows: Iterator[dict[str, Any]]) -> None:
+def _write(folder: Path, side: str, columns: list[ParquetColumn], rows: Iterator[dict[str, Any]]) -> None:
     """`SIDE-NNNNN.parquet` in `folder`, each of several groups of rows."""
     features = {column.name: column.feature for column in columns}
     about = {"huggingface": json.dumps({"info": {"features": features}})}
@@ -142,8 +141,8 @@ def _write(folder: Path, side: str, columns: list[_Column], rows: Iterator[dict[
         path = folder / f"{side}-{part:05d}.parquet"
         packing = {"compression": "zstd", "use_dictionary": False, "write_page_checksum": True}
         with pq.ParquetWriter(path, schema, **packing) as writer:
-            for held in chain([group], islice(groups, _GROUPS - 1)):
-                packed = [column.pack([row[column.name] for row in held]) for column in columns]
+            for some in chain([group], islice(groups, _GROUPS - 1)):
+                packed = [column.pack([row[column.name] for row in some]) for column in columns]
                 writer.write_table(pa.Table.from_arrays(packed, schema=schema))
 
 

@@ -12,7 +12,7 @@ from ruamel.yaml import YAML
 
 from synth.dataset import index
 from synth.dataset.store import Dataset
-from synth.publish import croissant, picture, report
+from synth.publish import card, croissant, picture
 
 
 def test_the_card_is_of_this_dataset(root: Path) -> None:
@@ -32,7 +32,7 @@ def test_the_card_is_of_this_dataset(root: Path) -> None:
 
 
 def test_the_page_holds_all_that_it_shows(root: Path, tmp_path: Path) -> None:
-    text = report.write_report(root, tmp_path / "page.html").read_text("utf-8")
+    text = card.write_page(root, tmp_path / "page.html").read_text("utf-8")
     assert text.count("data:image/jpeg") == 6
     assert text.count("<svg") == len(list((root / "card").glob("*.svg"))) > 0
     ids = re.findall(r' id="(\w+-\w+)"', text)
