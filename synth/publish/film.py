@@ -12,19 +12,8 @@ from numpy.typing import NDArray
 
 from synth.dataset.store import Dataset, Sequence
 from synth.errors import UserError
-from synth.publish.picture import (
-    INK,
-    Rgb,
-    arrow_gain,
-    arrows,
-    both_eyes,
-    caption,
-    heat,
-    legible,
-    overlay,
-    tile,
-    write_text,
-)
+from synth.publish import picture as drawing
+from synth.publish.picture import Rgb
 from synth.video.write import encode_video
 
 OVERLAYS = {"flow": "flow", "recovered": "flow_recovered", "force": "traction"}
@@ -44,11 +33,13 @@ def write_preview(root: Path) -> None:
     dataset = Dataset(root)
     chosen = np.unique(np.linspace(0, len(dataset) - 1, _PREVIEW_TILES).round().astype(int))
     sequences = [dataset[int(k)] for k in chosen]
-    width = both_eyes(sequences[0], 0).shape[1] * int(np.ceil(np.sqrt(len(sequences))))
+    width = drawing.both_eyes(sequences[0], 0).shape[1] * int(np.ceil(np.sqrt(len(sequences))))
     step = max(1, -(-width // _PREVIEW_PX))
 
     def still(t: int) -> Rgb:
-        return tile([both_eyes(one, min(t, one.frames - 1))[::step, ::step] for one in sequences])
+        return drawing.tile(
+            [drawing.both_eyes(one, min(t, one.frames - 1))[::step, ::step] for one in sequences]
+        )
 
     frames = range(max(one.frames for one in sequences))
     encode_video(root / "preview.mp4", map(still, frames), float(sequences[0].attrs["fps"]))
@@ -113,10 +104,10 @@ def _overlaid(sequence: Sequence, t: int, tissue: NDArray[np.bool_], largest: di
         picture = glow(picture, moved, largest["force"])
         words.append(f"{np.linalg.norm(sequence['force'][t]):.1f} mN (yellow: {largest['force']:.2g} kPa)")
     for name in (name for name in largest if name != "force"):
-        gain = arrow_gain(sequence.size[1], largest[name])
-        picture = arrows(picture, sequence[OVERLAYS[name]][t], tissue, gain)
+        gain = drawing.arrow_gain(sequence.size[1], largest[name])
+        picture = drawing.arrows(picture, sequence[OVERLAYS[name]][t], tissue, gain)
         words.append(f"{OVERLAYS[name]} x{gain}")
-    return caption(legible(picture), "  ".join(words))
+    return drawing.caption(drawing.legible(picture), "  ".join(words))
 
 
 def warp_to_frame(values: NDArray[np.floating], flow: NDArray[np.floating]) -> NDArray[np.float32]:
@@ -141,7 +132,9 @@ def warp_to_frame(values: NDArray[np.floating], flow: NDArray[np.floating]) -> N
 def glow(picture: Rgb, values: NDArray[np.floating], largest: float) -> Rgb:
     """The picture with values over it, from clear (0) to yellow (`largest`). values: (H, W), not negative."""
     share = np.clip(values / max(largest, 1e-12), 0, 1)
-    return overlay(picture, heat(values, largest), np.where(share > 0.02, 0.2 + 0.6 * share, 0.0))
+    return drawing.overlay(
+        picture, drawing.heat(values, largest), np.where(share > 0.02, 0.2 + 0.6 * share, 0.0)
+    )
 
 
 def draw_curve(time_s: NDArray[np.floating], force_mn: NDArray[np.floating], width_px: int) -> Rgb:
@@ -154,14 +147,15 @@ def draw_curve(time_s: NDArray[np.floating], force_mn: NDArray[np.floating], wid
     places = np.stack([_columns(len(force_mn), width_px), y], axis=1).tolist()
     for k in np.flatnonzero(sure[1:] & sure[:-1]):
         cv2.line(strip, places[k], places[k + 1], _LINE, 1, cv2.LINE_AA)
-    write_text(strip, f"0 to {top:.3g} mN, {time_s[0]:.2f} to {time_s[-1]:.2f} s", (_LEFT_PX, 12))
+    text = f"0 to {top:.3g} mN, {time_s[0]:.2f} to {time_s[-1]:.2f} s"
+    cv2.putText(strip, text, (_LEFT_PX, 12), cv2.FONT_HERSHEY_SIMPLEX, 0.4, drawing.INK, 1, cv2.LINE_AA)
     return strip
 
 
 def mark(curve: Rgb, k: int, count: int) -> Rgb:
     """The strip (h, w, 3) with a line at the k-th of `count` values."""
     marked = curve.copy()
-    marked[16:, _columns(count, curve.shape[1])[k]] = INK
+    marked[16:, _columns(count, curve.shape[1])[k]] = drawing.INK
     return marked
 
 

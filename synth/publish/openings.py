@@ -24,7 +24,7 @@ _PLACES = 250
 _PER_MM2, _MOST_SAMPLES = 1.5, 600_000  # every pixel of the surface then holds some
 _PIXEL_MM = 2.0
 _UNDER_SKULL_MM = 8.0  # how far below its convex hull the surface may lie and still be reached from outside
-_WHOLE = 0.97  # of the opening itself must be surface
+_LEAST_SURFACE = 0.97  # of the opening itself must be surface
 _STEEPEST_MM = 4.0  # rms departure from a dome; a cleft in the opening has more
 _FLAT = 0.01  # of the radius, median from the best plane: over a dome of 70 mm radius it is twice as much
 _APART = 1.5  # radii between two places
@@ -90,10 +90,32 @@ def as_job(mesh: Path, chosen: Sequence[Opening], radius_mm: float) -> str:
 def draw_openings(mesh: Path, chosen: Sequence[Opening], radius_mm: float) -> NDArray[np.uint8]:
     """(H, W, 3): the brain from six sides, with each opening's ring and its number from 1."""
     vertices, faces = read_brain(mesh)
-    middle = (vertices.max(axis=0) + vertices.min(axis=0)) / 2
+    corners, middle = vertices[faces], (vertices.max(axis=0) + vertices.min(axis=0)) / 2
     scale = 0.9 * _TILE_PX / np.ptp(vertices, axis=0).max()
-    sides = [*np.eye(3), *-np.eye(3)]
-    tiles = [_view(vertices[faces], side, chosen, middle, radius_mm, scale) for side in sides]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
+    angle = np.linspace(0, 2 * np.pi, 49)
+    circle = radius_mm * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    tiles = []
+    for side in (*np.eye(3), *-np.eye(3)):
+        flat = axes(side)[:2].T * [scale, -scale]
+
+        def pixel(where: Floats, flat: Floats = flat) -> NDArray[np.int32]:
+            return np.rint((where - middle) @ flat + _TILE_PX / 2).astype(np.int32)
+
+        tile = np.zeros((_TILE_PX, _TILE_PX, 3), np.uint8)
+        order = np.argsort(corners.mean(axis=1) @ side)  # the farthest is drawn first
+        shade = 60 + 170 * np.abs(normal @ side)[order]
+        for triangle, grey in zip(pixel(corners[order]), shade.tolist(), strict=True):
+            cv2.fillConvexPoly(tile, triangle, (grey, 0.85 * grey, 0.8 * grey))
+        for number, one in enumerate(chosen, 1):
+            if one.direction @ side > 0.15:  # else on the far side, or edge on
+                cv2.polylines(tile, [pixel(one.point + circle @ axes(one.direction)[:2])], True, _BLUE, 2)
+                x, y = pixel(one.point).tolist()
+                cv2.putText(tile, str(number), (x - 6, y + 6), cv2.FONT_HERSHEY_SIMPLEX, 0.6, _BLUE, 2)
+        name = f"from {'-' if side.min() < 0 else ''}{'xyz'[int(np.abs(side).argmax())]}"
+        cv2.putText(tile, name, (6, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (255, 255, 255))
+        tiles.append(tile)
     return np.vstack([np.hstack(tiles[:3]), np.hstack(tiles[3:])])
 
 
@@ -133,51 +155,23 @@ def _judge(points: Floats, tree: cKDTree, point: Floats, out: Floats, radius_mm:
             out /= np.linalg.norm(out)
     dome = np.concatenate([plane, np.stack([x**2, x * y, y**2], axis=1)], axis=1)
     relief = float(np.std(z - dome @ np.linalg.lstsq(dome, z, rcond=None)[0]))
-    filled, whole = np.isfinite(height).mean(), there.sum() / inside.sum()
-    if filled < LEAST_FILLED or whole < _WHOLE or relief > _STEEPEST_MM:
+    filled, share = np.isfinite(height).mean(), there.sum() / inside.sum()
+    if filled < LEAST_FILLED or share < _LEAST_SURFACE or relief > _STEEPEST_MM:
         return None
     middle = point + z[np.hypot(x, y).argmin()] * turn[2]
-    off_plane = np.abs(z - plane @ fitted)
-    return Opening(middle, out, relief, bool(np.median(off_plane) < _FLAT * radius_mm))
+    return Opening(middle, out, relief, bool(np.median(np.abs(z - plane @ fitted)) < _FLAT * radius_mm))
 
 
 def _height_map(placed: Floats, half: float) -> tuple[Floats, Floats, Floats]:
     """x, y and the highest point (n, n) mm of each pixel of a square; NaN where there is none.
 
-    As the renderer sees a brain: what lies deeper than three quarters of the square's side is its far side.
+    As the renderer takes a brain: what lies deeper than three quarters of the square's side is its far side.
     """
-    side = int(np.ceil(2 * half / _PIXEL_MM))
-    cell = np.floor((placed[:, :2] / half + 1) / 2 * side).astype(np.int64)
-    seen = ((cell >= 0) & (cell < side)).all(axis=1) & (placed[:, 2] > -1.5 * half)
-    height = np.full((side, side), -np.inf)
-    np.maximum.at(height, (cell[seen, 1], cell[seen, 0]), placed[seen, 2])
-    middles = (np.arange(side) + 0.5) / side * 2 * half - half
+    count = int(np.ceil(2 * half / _PIXEL_MM))
+    cell = np.floor((placed[:, :2] / half + 1) / 2 * count).astype(np.int64)
+    within = ((cell >= 0) & (cell < count)).all(axis=1) & (placed[:, 2] > -1.5 * half)
+    height = np.full((count, count), -np.inf)
+    np.maximum.at(height, (cell[within, 1], cell[within, 0]), placed[within, 2])
+    middles = (np.arange(count) + 0.5) / count * 2 * half - half
     x, y = np.meshgrid(middles, middles)
     return x, y, np.where(np.isfinite(height), height, np.nan)
-
-
-def _view(
-    corners: Floats, side: Floats, chosen: Sequence[Opening], middle: Floats, radius_mm: float, scale: float
-) -> NDArray[np.uint8]:
-    """One tile: triangles (F, 3, 3) mm as they face `side` (3,), the farthest drawn first."""
-    flat = axes(side)[:2].T * [scale, -scale]
-
-    def pixel(where: Floats) -> NDArray[np.int32]:
-        return np.rint((where - middle) @ flat + _TILE_PX / 2).astype(np.int32)
-
-    tile = np.zeros((_TILE_PX, _TILE_PX, 3), np.uint8)
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    shade = 60 + 170 * np.abs(normal @ side) / np.maximum(np.linalg.norm(normal, axis=1), 1e-12)
-    order = np.argsort(corners.mean(axis=1) @ side)
-    for triangle, grey in zip(pixel(corners[order]), shade[order].tolist(), strict=True):
-        cv2.fillConvexPoly(tile, triangle, (grey, 0.85 * grey, 0.8 * grey))
-    angle = np.linspace(0, 2 * np.pi, 49)
-    circle = radius_mm * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    for number, one in enumerate(chosen, 1):
-        if one.direction @ side > 0.15:  # else on the far side, or edge on
-            cv2.polylines(tile, [pixel(one.point + circle @ axes(one.direction)[:2])], True, _BLUE, 2)
-            x, y = pixel(one.point).tolist()
-            cv2.putText(tile, str(number), (x - 6, y + 6), cv2.FONT_HERSHEY_SIMPLEX, 0.6, _BLUE, 2)
-    name = f"from {'-' if side.min() < 0 else ''}{'xyz'[int(np.abs(side).argmax())]}"
-    cv2.putText(tile, name, (6, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (255, 255, 255))
-    return tile

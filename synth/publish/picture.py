@@ -15,8 +15,6 @@ Rgb = NDArray[np.uint8]
 """(H, W, 3) uint8, sRGB."""
 
 INK = (40, 40, 40)
-"""Colour of text and lines on white."""
-
 _CAPTION_PX = 26
 _GAP_PX = 6
 _WIDE_PX = 480
@@ -78,23 +76,11 @@ def legible(picture: Rgb) -> Rgb:
     return picture.repeat(times, axis=0).repeat(times, axis=1)
 
 
-def write_text(
-    picture: Rgb,
-    text: str,
-    at: tuple[int, int],
-    size: float = 0.4,
-    colour: tuple[int, int, int] = INK,
-    thick: int = 1,
-) -> None:
-    """Draws a line of text on a picture (H, W, 3); its baseline begins at `at`, (column, row) px."""
-    cv2.putText(picture, text, at, cv2.FONT_HERSHEY_SIMPLEX, size, colour, thick, cv2.LINE_AA)
-
-
 def caption(picture: Rgb, text: str, row: int = 14) -> Rgb:
     """The picture (H, W, 3) with a line of text, readable on any ground, that stands on a row."""
     canvas = np.ascontiguousarray(picture)
     for colour, thick in (((0, 0, 0), 3), ((255, 255, 255), 1)):
-        write_text(canvas, text, (4, row), colour=colour, thick=thick)
+        cv2.putText(canvas, text, (4, row), cv2.FONT_HERSHEY_SIMPLEX, 0.4, colour, thick, cv2.LINE_AA)
     return canvas
 
 
@@ -156,5 +142,5 @@ def strongest(sequence: Sequence_) -> int:
 def _framed(panel: Rgb, text: str) -> Rgb:
     """A panel (H, W, 3) with white above and to its left, and a line of text on that."""
     canvas = cv2.copyMakeBorder(panel, _CAPTION_PX, 0, _GAP_PX, 0, cv2.BORDER_CONSTANT, value=(255,) * 3)
-    write_text(np.asarray(canvas, np.uint8), text, (_GAP_PX + 4, 18), size=0.45)
+    cv2.putText(canvas, text, (_GAP_PX + 4, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.45, INK, 1, cv2.LINE_AA)
     return np.asarray(canvas, np.uint8)

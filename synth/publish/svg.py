@@ -37,7 +37,6 @@ _STYLE: Any = {
     "legend.fontsize": 9,
 }
 _LONG = re.compile(r"\d+\.\d{3,}")
-_NO_METADATA = dict.fromkeys(("Creator", "Date", "Format", "Type"))
 
 
 def svg(width: float, height: float, draw: Callable[[Figure], None]) -> str:
@@ -50,8 +49,8 @@ def svg(width: float, height: float, draw: Callable[[Figure], None]) -> str:
         matplotlib.rcParams.update(_STYLE)
         figure = Figure(figsize=(width / 72, height / 72), layout="constrained")
         draw(figure)
-        file = io.StringIO()
-        figure.savefig(file, format="svg", metadata=_NO_METADATA)
+        file, nothing = io.StringIO(), dict.fromkeys(("Creator", "Date", "Format", "Type"))
+        figure.savefig(file, format="svg", metadata=nothing)
     return _slim(file.getvalue())
 
 
