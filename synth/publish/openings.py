@@ -101,7 +101,7 @@ def draw_openings(mesh: Path, chosen: Sequence[Opening], radius_mm: float) -> ND
         flat = axes(side)[:2].T * [scale, -scale]
 
         def pixel(where: Floats, flat: Floats = flat) -> NDArray[np.int32]:
-            return np.rint((where - middle) @ flat + _TILE_PX / 2).astype(np.int32)
+            return np.asarray(np.rint((where - middle) @ flat + _TILE_PX / 2), np.int32)
 
         tile = np.zeros((_TILE_PX, _TILE_PX, 3), np.uint8)
         order = np.argsort(corners.mean(axis=1) @ side)  # the farthest is drawn first
