@@ -10,6 +10,7 @@ from typing import Annotated
 
 import typer
 
+from synth.errors import UserError, as_user_error
 from synth.fit.command import fit
 from synth.system.cli_errors import Commands
 from synth.tune.command import tune
@@ -26,10 +27,7 @@ app = typer.Typer(
 Source = Annotated[str, typer.Argument(help="A job file, or a named job: tiny, demo, paper.")]
 Overrides = Annotated[list[str] | None, typer.Argument(help="Changes to the job, as section.key=value.")]
 Out = Annotated[Path, typer.Argument(help="A dataset's folder.")]
-Mix = Annotated[
-    bool,
-    typer.Option("--mix-versions", help="Continue a dataset that another version of this program began."),
-]
+Index = Annotated[int, typer.Option("--sequence", "-s", help="Which sequence, by its index.")]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")]
 
 app.command(epilog='Example: synth tune demo --budget "force 3%" --out tuned.yaml')(tune)
@@ -39,7 +37,6 @@ app.command(epilog="Example: synth fit photo.jpg --out look.yaml --width-mm 38")
 @app.command(epilog="Example: synth new job.yaml")
 def new(path: Annotated[Path, typer.Argument(help="The job file to write.")] = Path("job.yaml")) -> None:
     """Writes a job file in which every key is explained."""
-    from synth.errors import UserError
     from synth.job import writer
 
     if path.exists():
@@ -83,41 +80,35 @@ def preview(
 
     Of a brain's surface: draws the places where it can best be opened, and prints them as a job's lines.
     """
-    import cv2
-
     from synth.dataset.size_forecast import amount
-    from synth.errors import UserError
     from synth.geometry.brain_surface import KINDS
     from synth.job import reader
     from synth.publish import contact_sheet, openings
+    from synth.system.checked_file import write_picture
     from synth.system.terminal import counting
 
     if out.suffix.lower() != ".png" or not out.parent.is_dir():
         raise UserError(f"{out}: cannot be written as PNG")
     if Path(job).suffix.lower().removeprefix(".") in KINDS:
         chosen = openings.find_openings(Path(job), radius, count)
-        if not cv2.imwrite(str(out), openings.draw_openings(Path(job), chosen, radius)[..., ::-1]):
-            raise UserError(f"{out}: cannot be written as PNG")
-        told = [one.craniotomy(radius).model_dump(include={"point", "direction"}) for one in chosen]
+        write_picture(out, openings.draw_openings(Path(job), chosen, radius))
+        places = [one.craniotomy(radius).model_dump(include={"point", "direction"}) for one in chosen]
         lines = f"# {out} shows these openings, the best first\n{openings.as_job(Path(job), chosen, radius)}"
-        print(json_.dumps({"sheet": str(out), "openings": told}) if json else lines)
+        print(json_.dumps({"sheet": str(out), "openings": places}) if json else lines)
         return
     read = reader.load_job(job, overrides or [])
     with counting("Drawing, then measuring what a sequence costs") as progress:
         made = contact_sheet.draw_sheet(read, count, progress)
-    if not cv2.imwrite(str(out), made.picture[..., ::-1]):
-        raise UserError(f"{out}: cannot be written as PNG")
+    write_picture(out, made.picture)
+    spent_s, cpu_s = made.stages_cpu_s, sum(made.stages_cpu_s.values())
     if json:
-        cpu_s = sum(made.stages_cpu_s.values())
-        about = {"cpu_s": cpu_s, "stages_cpu_s": made.stages_cpu_s, "disk_bytes": made.disk_bytes}
-        print(json_.dumps({"sheet": str(out), "render_cpu_s": made.stages_cpu_s["render"], **about}))
+        about = {"cpu_s": cpu_s, "stages_cpu_s": spent_s, "disk_bytes": made.disk_bytes}
+        print(json_.dumps({"sheet": str(out), "render_cpu_s": spent_s["render"], **about}))
         return
-    print(f"wrote {out}")
-    stages = ", ".join(f"{name} {spent / 60:.1f}" for name, spent in made.stages_cpu_s.items())
+    stages = ", ".join(f"{name} {seconds / 60:.1f}" for name, seconds in spent_s.items())
     print(
-        f"the whole job: {read.sequences} sequences of {read.frames} frames, about "
-        f"{sum(made.stages_cpu_s.values()) / 60:.1f} CPU-minutes ({stages}), "
-        f"{amount(made.disk_bytes)} of disk"
+        f"wrote {out}\nthe whole job: {read.sequences} sequences of {read.frames} frames, about "
+        f"{cpu_s / 60:.1f} CPU-minutes ({stages}), {amount(made.disk_bytes)} of disk"
     )
 
 
@@ -143,7 +134,10 @@ def render(
     memory: Annotated[
         float | None, typer.Option(help="Memory that a process may take [GB]; a share of what is free.")
     ] = None,
-    mix_versions: Mix = False,
+    mix_versions: Annotated[
+        bool,
+        typer.Option("--mix-versions", help="Continue a dataset that another version of this program began."),
+    ] = False,
     retry: Annotated[
         bool, typer.Option("--retry", help="Take up again what failed in this folder before.")
     ] = False,
@@ -207,7 +201,6 @@ def split_command(
     """Says who may be trained on, in the index: no anatomy and no held-out family on both sides."""
     from synth.dataset import index, split
     from synth.dataset.folder import Folder
-    from synth.errors import UserError
 
     folder = Folder(out)
     folder.described()
@@ -270,7 +263,6 @@ def export(
     ] = None,
 ) -> None:
     """Writes the dataset in a format of others, or as films to look at."""
-    from synth.errors import UserError
     from synth.publish.export.formats import export_dataset
 
     options = {}
@@ -284,18 +276,15 @@ def export(
 
 def _interval(text: str | None) -> tuple[float, float] | None:
     """FIRST:LAST in seconds; either may be left out."""
-    from synth.errors import UserError
 
     if text is None:
         return None
     first, colon, last = text.partition(":")
-    try:
-        told = (float(first or "-inf"), float(last or "inf"))
-    except ValueError:
-        told = (1.0, 0.0)
-    if not colon or not told[0] <= told[1]:
-        raise UserError(f"--interval {text}: is not FIRST:LAST in seconds")
-    return told
+    with as_user_error(f"--interval {text}: is not FIRST:LAST in seconds"):
+        start, end = float(first or "-inf"), float(last or "inf")
+        if not colon or not start <= end:
+            raise ValueError("the first is above the last" if colon else "no colon")
+    return start, end
 
 
 @app.command(epilog="Example: synth verify out --fast")
@@ -318,32 +307,29 @@ def verify(
 @app.command(epilog="Example: synth picture out --sequence 1 -f 0 -f 5 --to picture.jpg")
 def picture(
     out: Out,
-    sequence: Annotated[int, typer.Option("--sequence", "-s", help="Which sequence, by its index.")] = 0,
+    sequence: Index = 0,
     frame: Annotated[
         list[int] | None, typer.Option("--frame", "-f", help="Which frame; repeat for more. [the strongest]")
     ] = None,
     to: Annotated[Path, typer.Option("--to", help="The PNG or JPEG to write.")] = Path("picture.png"),
 ) -> None:
     """Draws frames with their flow and force map side by side, as in the README."""
-    import cv2
-
     from synth.dataset import location
     from synth.dataset.store import open_sequence
-    from synth.errors import UserError
     from synth.publish.picture import draw_sequence, strongest
+    from synth.system.checked_file import write_picture
 
     chosen = open_sequence(location.store(out, sequence))
     rows = draw_sequence(chosen, frame or [strongest(chosen)])
     to.parent.mkdir(parents=True, exist_ok=True)
-    if to.suffix.lower() not in (".png", ".jpg") or not cv2.imwrite(str(to), rows[..., ::-1]):
-        raise UserError(f"{to}: cannot be written as a picture (.png or .jpg)")
+    write_picture(to, rows)
     print(f"wrote {to}")
 
 
 @app.command(epilog="Example: synth view out --sequence 0 --save scene.rrd")
 def view(
     out: Out,
-    sequence: Annotated[int, typer.Option("--sequence", "-s", help="Which sequence, by its index.")] = 0,
+    sequence: Index = 0,
     save: Annotated[
         Path | None, typer.Option("--save", help="Write a recording (.rrd) instead of opening the viewer.")
     ] = None,
@@ -371,16 +357,7 @@ def doctor(
     json: Json = False,
 ) -> None:
     """Says what this machine offers, and what to do about what it lacks."""
-    from synth.system.doctor import findings
-    from synth.system.text_lines import hang
+    from synth.system.doctor import diagnose, lines
 
-    found = findings(folder)
-    if json:
-        print(json_.dumps([vars(finding) for finding in found]))
-        return
-    width = max(len(finding.what) for finding in found)
-    for finding in found:
-        said = hang(f"{'ok  ' if finding.good else 'LACK'} {finding.what:<{width}}  ", finding.found)
-        if not finding.good:
-            said += hang(f"     {'':<{width}}  -> ", finding.advice)
-        print("\n".join(said))
+    found = diagnose(folder)
+    print(json_.dumps([vars(one) for one in found]) if json else "\n".join(lines(found)))

@@ -198,6 +198,15 @@ def write_whole(path: Path, text: str | bytes, *, durable: bool = True) -> None:
             os.fsync(file.fileno())
 
 
+def write_picture(path: Path, picture: NDArray[np.uint8]) -> None:
+    """Writes (H, W, 3) sRGB in the format that the name ends with. UserError where that can't be."""
+    import cv2
+
+    with as_user_error(f"{path}: cannot be written as a picture"):
+        _, data = cv2.imencode(path.suffix, picture[..., ::-1])
+        write_whole(path, data.tobytes(), durable=False)
+
+
 @contextmanager
 def part_of(path: Path) -> Iterator[Path]:
     """A new file beside `path` to write, which takes its name when the block ends well and else is gone.
