@@ -27,7 +27,7 @@ def camera(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
     yield truth(bool(core.any()), "no tissue in view")
     if not core.any():
         return
-    points = rays(view, cameras.pixel_grid(view.size)).reshape(height, width, 3) * depth[..., None]
+    points = cameras.rays(view, cameras.pixel_grid(view.size)).reshape(height, width, 3) * depth[..., None]
     across, down = 0.5 * (points[1:-1, 2:] - points[1:-1, :-2]), 0.5 * (points[2:, 1:-1] - points[:-2, 1:-1])
     spanned = np.linalg.norm(np.cross(across, down), axis=-1)
     inside = core[1:-1, 1:-1]
@@ -66,12 +66,6 @@ def contact(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
         seen = cameras.to_pixels(view, cameras.to_camera(view, tips[t].reshape(-1, 3))).mean(axis=0)
         off = float(np.hypot(x - seen[0], y - seen[1])) * view.mm_per_px
         yield Measure(off, spread * footprint + view.mm_per_px, f"frame {t}", "mm")
-
-
-def rays(view: cameras.Camera, pixels: Floats) -> Floats:
-    """Directions (N, 3) of the centre rays of pixels (N, 2), camera axes, z = 1."""
-    flat = cameras.undistort((pixels - view.K[:2, 2]) / np.diag(view.K)[:2], view.distortion)
-    return np.concatenate([flat, np.ones((len(flat), 1))], axis=1)
 
 
 def camera_of(sequence: Sequence, lens: Mapping[str, Any] | None = None) -> cameras.Camera:

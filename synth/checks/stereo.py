@@ -30,7 +30,7 @@ def stereo(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
     core = inner(sequence["tissue"][:] & ~sequence["tool"][0], 2)
     rows, columns = (at[::_EVERY] for at in np.nonzero(core & (rest_depth > 0)))
     pixels = np.stack([columns, rows], axis=1).astype(np.float64)
-    points = optics.rays(left, pixels) * rest_depth[rows, columns][:, None]
+    points = cameras.rays(left, pixels) * rest_depth[rows, columns][:, None]
     baseline, shift = left.translation[0] - right.translation[0], right.K[0, 2] - left.K[0, 2]
     expected = left.K[0, 0] * baseline / points[:, 2] - shift
     found = sequence["disparity"][:][rows, columns]

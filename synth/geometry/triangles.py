@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -27,6 +27,18 @@ def joined(*shapes: Shape) -> Shape:
     faces = [shape.faces + at for shape, at in zip(shapes, first, strict=False)]
     vertices = np.concatenate([shape.vertices for shape in shapes])
     return Shape(vertices, np.concatenate(faces).astype(np.int32))
+
+
+def grid_faces(rows: int, columns: int, closed: Literal["", "rows", "columns"] = "") -> npt.NDArray[np.int32]:
+    """Faces of a grid of vertices, row by row: both halves of its cells, (2, cells, 3).
+
+    `closed`: the last of these is joined to the first.
+    """
+    cells = np.arange(rows - (closed != "rows")), np.arange(columns - (closed != "columns"))
+    row, column = (index.ravel() for index in np.meshgrid(*cells, indexing="ij"))
+    below, right = (row + 1) % rows * columns, (column + 1) % columns
+    a, b, c, d = row * columns + column, row * columns + right, below + column, below + right
+    return np.stack([np.stack([a, b, d], 1), np.stack([a, d, c], 1)]).astype(np.int32)
 
 
 def lengths(vectors: npt.NDArray[Any]) -> npt.NDArray[Any]:

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from synth.errors import UserError
-from synth.geometry.triangles import lengths
+from synth.geometry.triangles import grid_faces, lengths
 
 Floats = npt.NDArray[np.float64]
 Kind = Literal["forceps", "bayonet", "dissector", "suction", "spatula"]
@@ -80,10 +80,11 @@ def finish(kinds: Sequence[Kind], rng: np.random.Generator) -> tuple[bool, ...]:
 def build(kinds: Sequence[Kind], coated: Sequence[bool]) -> InstrumentMesh:
     """The mesh of some instruments, perhaps none, to be placed by `pose`; the `coated` have black ends."""
     parts = tuple(_PARTS[kind]() for kind in kinds)
-    faces, coat, total = [np.zeros((0, 3), np.int64)], [np.zeros(0)], 0
+    faces, coat, total = [np.zeros((0, 3), np.int32)], [np.zeros(0)], 0
     for own, ends in zip(parts, coated, strict=True):
         for part in own:
-            faces.append(_faces(len(part.profile) // (_AROUND + 1)) + total)
+            rings = len(part.profile) // (_AROUND + 1)
+            faces.append(grid_faces(rings, _AROUND + 1).reshape(-1, 3) + total)
             # The coating ends in a sharp ring.
             coat.append(ends / (1 + np.exp(np.clip((part.profile[:, 2] - _COAT_MM) / 0.12, -40, 40))))
             total += len(part.profile)
@@ -227,12 +228,3 @@ _PARTS = {
     "suction": _suction,
     "spatula": _spatula,
 }
-
-
-def _faces(rings: int) -> npt.NDArray[np.int64]:
-    """Faces (F, 3) of a swept bar."""
-    around = _AROUND + 1
-    row, column = np.meshgrid(np.arange(rings - 1), np.arange(_AROUND), indexing="ij")
-    a = (row * around + column).ravel()
-    b, c, d = a + 1, a + around, a + around + 1
-    return np.concatenate([np.stack([a, b, d], 1), np.stack([a, d, c], 1)])

@@ -19,7 +19,7 @@ from synth.render.appearance import light, reflection
 from synth.render.appearance.look import Look
 from synth.render.camera import camera_sensor
 from synth.render.camera.camera import Camera, blur_radius, right_camera
-from synth.render.mitsuba.adapter import Body, Metal, Stage, forget, pick
+from synth.render.mitsuba.adapter import Body, Metal, Stage, Wet, forget, pick
 from synth.render.truth import RestFrame
 from synth.system.jit import vectorised
 
@@ -263,12 +263,12 @@ class Renderer:
         surface, look = self.surface, self._look
         pixels = texture.resolution(self._rim.extent_mm, 2.2 * self.camera.mm_per_px)
         frame = rim.paint(self._rim, look, pixels)
-        r, g, b = (_AMBIENT * look.light.power * light.blackbody(look.light.kelvin)).tolist()
-        wet = self._coat.wet(look.roughness, look.dry_roughness, (r, g, b), look.film_index)
-        dura = frame.wet(_RIM_ROUGHNESS, _RIM_DRY, (r, g, b))
+        ambient = _AMBIENT * look.light.power * light.blackbody(look.light.kelvin)
+        wet = Wet(self._coat, look.roughness, look.dry_roughness, ambient, look.film_index)
+        dura = Wet(frame, _RIM_ROUGHNESS, _RIM_DRY, ambient)
         bodies = {
             "cortex": Body(state.vertices, surface.faces, surface.uv, wet, self._film(state)),
-            "rim": Body(self._rim.vertices, self._rim.faces, self._rim.uv, dura),
+            "rim": Body(*self._rim.shape, self._rim.uv, dura),
         }
         if self._tool.parts or "retractor" in self._render.scenery:
             steel = self._steel(state)
@@ -283,7 +283,7 @@ class Renderer:
         One mesh of steel, and never without a face: scenes with a retractor and without share their kernel.
         """
         if "retractor" in self._look.scenery:
-            points = np.concatenate([self.surface.vertices, self._rim.vertices])
+            points = np.concatenate([self.surface.vertices, self._rim.shape.vertices])
             return scenery.retractor(self._rim.edge, points, np.random.default_rng([self._look.rim_seed, 5]))
         if self._tool.parts:
             return Shape(np.zeros((0, 3)), np.zeros((0, 3), np.int32))

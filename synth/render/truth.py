@@ -128,7 +128,7 @@ def trace_rest(camera: Camera, surface: Shape, rim: Shape) -> RestFrame:
     """Truth of the rest frame: the fine surface at rest, and what frames the opening."""
     width, height = camera.size
     pixels = cameras.pixel_grid(camera.size)
-    directions = _forward(camera, pixels)
+    directions = cameras.rays(camera, pixels)
     hits = cast(camera, joined(surface, rim), None, directions)
     on_tissue = (hits.face >= 0) & (hits.face < len(surface.faces))
     face = np.where(on_tissue, hits.face, -1).astype(np.int32)
@@ -232,17 +232,11 @@ def blend(faces: Indices, face: Indices, bary: Floats, nodal: npt.NDArray[np.flo
     return found
 
 
-def _forward(camera: Camera, pixels: Floats) -> Floats:
-    """Directions (N, 3) of centre rays in camera axes with unit z, so that distance along them is depth."""
-    flat = cameras.undistort((pixels - camera.K[:2, 2]) / np.diag(camera.K)[:2], camera.distortion)
-    return np.concatenate([flat, np.ones((len(flat), 1))], axis=1)
-
-
 def _footprint(camera: Camera, corners: Floats, directions: Floats, on: Mask, along: Floats) -> Floats:
     """Area (M,) mm2 of the faces' planes that each pixel in `on` covers, from how the rays spread over it."""
     width, height = camera.size
     grid = cameras.pixel_grid((width + 1, height + 1)) - 0.5
-    corner = _forward(camera, grid).reshape(height + 1, width + 1, 3)
+    corner = cameras.rays(camera, grid).reshape(height + 1, width + 1, 3)
     across = 0.5 * ((corner[:-1, 1:] - corner[:-1, :-1]) + (corner[1:, 1:] - corner[1:, :-1]))
     down = 0.5 * ((corner[1:, :-1] - corner[:-1, :-1]) + (corner[1:, 1:] - corner[:-1, 1:]))
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])

@@ -10,11 +10,12 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from synth.geometry.triangles import Shape
+from synth.geometry.triangles import Shape, grid_faces, joined
 from synth.render.anatomy import noise, scenery, tube
 from synth.render.anatomy.surface import CortexSurface
-from synth.render.anatomy.texture import Coat, normals
+from synth.render.anatomy.texture import normals
 from synth.render.appearance.look import Look
+from synth.render.mitsuba.adapter import Coat
 
 Floats = npt.NDArray[np.float64]
 Map = npt.NDArray[np.float32]
@@ -45,28 +46,21 @@ class Patty:
 class Rim:
     """The frame of the opening as a mesh."""
 
-    vertices: Floats
-    """(V, 3) mm, world axes."""
-    faces: npt.NDArray[np.int32]
+    shape: Shape
     uv: npt.NDArray[np.float32]
+    """(V, 2)."""
     extent_mm: float
     """Side of the square that uv spans."""
     edge: Floats
     """(A,) mm: radius of the opening's edge at even angles."""
-    patty: Patty | None
+    cotton: tuple[Patty, ...]
+    """What the maps show of it; the patties over the opening's edge take theirs from one in the middle."""
     stitches: Floats
     """(n,) rad: where threads hold the dura."""
     flap: Floats
     """(A,) mm beyond the edge where bone begins; empty: there is none in view."""
     cloth: Floats
     """(A,) mm beyond the edge where drapes begin; empty: there are none in view."""
-    patties: int
-    """How many lie over the opening's edge."""
-
-    @property
-    def shape(self) -> Shape:
-        """For casting rays at it."""
-        return Shape(self.vertices, self.faces)
 
 
 def build(surface: CortexSurface, radius_mm: float, look: Look, mm_per_px: float) -> Rim:
@@ -98,30 +92,22 @@ def build(surface: CortexSurface, radius_mm: float, look: Look, mm_per_px: float
     cloth = _ragged(rng, angle, 7.2, 0.8) if "drape" in look.scenery else np.zeros(0)
     z = z + _raised(away[None], flap, cloth, noise.band(rng, 128, extent, 7.0, 0.5), xy, extent)
     if patty:
-        over = _step((0.3 - _outside(patty, xy[..., 0], xy[..., 1])) / 0.6)
+        over = _step((0.3 - _outside(patty, *_along(patty, xy[..., 0], xy[..., 1]))) / 0.6)
         # Cotton lies over folds rather than in them.
         z = z + over * (_PATTY_MM + 0.3)
     vertices = np.concatenate([xy, z[..., None]], axis=-1).reshape(-1, 3)
     # The cut edge is steep: on the maps it is laid flat inside the opening, or it had hardly a width there.
     flat = edge[:, None] + np.concatenate([_LAID_MM, away[len(_LAID_MM) :]])[None]
     laid = np.stack([flat * np.cos(angle)[:, None], flat * np.sin(angle)[:, None]], axis=-1).reshape(-1, 2)
-    parts = [(vertices, _faces(around, _INNER + rings), laid)]
+    felt: tuple[Patty, ...] = () if patty is None else (patty,)
+    parts = [(vertices, grid_faces(around, _INNER + rings, "rows").reshape(-1, 3), laid)]
     if "cottonoid" in look.scenery:
         # Their felt is painted in the middle of the maps, where the opening is.
+        felt += (Patty((0.0, 0.0), 0.0, scenery.PATTY_MM),)
         parts += scenery.patties(edge, np.concatenate([surface.vertices, vertices]), rng)
-    first = np.cumsum([0] + [len(part[0]) for part in parts])
-    return Rim(
-        np.concatenate([part[0] for part in parts]),
-        np.concatenate([part[1] + at for part, at in zip(parts, first, strict=False)]).astype(np.int32),
-        (np.concatenate([part[2] for part in parts]) / extent + 0.5).astype(np.float32),
-        extent,
-        edge,
-        patty,
-        held,
-        flap,
-        cloth,
-        len(parts) - 1,
-    )
+    uv = (np.concatenate([place for *_, place in parts]) / extent + 0.5).astype(np.float32)
+    mesh = joined(*(Shape(vertices, faces) for vertices, faces, _ in parts))
+    return Rim(mesh, uv, extent, edge, felt, held, flap, cloth)
 
 
 def _folded(angle: Floats, away: Floats, edge: Floats, held: Floats, rng: np.random.Generator) -> Floats:
@@ -168,7 +154,7 @@ def paint(rim: Rim, look: Look, pixels: int) -> Coat:
     x, y = np.broadcast_to(axis, (pixels, pixels)), np.broadcast_to(axis[:, None], (pixels, pixels))
     vessels = tube.raster(scenery.dural_vessels(rim.edge, rng), pixels, extent)
     maps = [x, y, wide, mid, fine, swell, *vessels]
-    if rim.patty or rim.patties:
+    if rim.cotton:
         ragged = noise.fractal(rng, pixels, 60.0, 1.5, 1.5)
         weave = noise.band(rng, pixels, 60.0, 0.5, 0.5)
         maps += [ragged, weave, noise.fractal(rng, pixels, 60.0, 4.0, 2.0)]
@@ -194,7 +180,8 @@ def _paint_rows(
     *cotton: Map,
 ) -> tuple[Map, Map, Map]:
     """Colour (r, n, 3), bumps mm and share without a film (r, n) of some rows at x, y mm, of noise (r, n)."""
-    angle, away = _polar(rim, x, y)
+    angle = np.arctan2(y, x)
+    away = (np.hypot(x, y) - _round(rim.edge, angle)).astype(np.float32)
     fibres = _streaks(across, angle, away, float(rim.edge.mean()))
     dura = np.asarray(look.dura, np.float32) * (1 + 0.05 * fibres + 0.05 * mid + 0.02 * fine)[..., None]
     # Its own vessels shimmer through its outer layer.
@@ -247,11 +234,8 @@ def _topped(
     thread, ridge = _threads(rim, *polar)
     colour = colour + thread[..., None] * (np.array([0.025, 0.025, 0.035], np.float32) - colour)
     bumps = bumps + ridge
-    if rim.patty:
-        colour, bumps = _cotton(cotton, rim.patty, colour, bumps, *place, look.blood)
-    if rim.patties:
-        middle = Patty((0.0, 0.0), 0.0, scenery.PATTY_MM)
-        colour, bumps = _cotton(cotton, middle, colour, bumps, *place, look.blood)
+    for patty in rim.cotton:
+        colour, bumps = _cotton(cotton, patty, colour, bumps, *place, look.blood)
     return colour, bumps
 
 
@@ -300,22 +284,13 @@ def shade(rim: Rim, extent_mm: float) -> Map:
     """Share (512, 512) of light that reaches the surface's patch of that extent past the lip."""
     axis = noise.centres(512, extent_mm)
     x, y = np.meshgrid(axis, axis)
-    inside = np.maximum(_edge_at(rim, np.arctan2(y, x)) - _LIP_MM - np.hypot(x, y), 0)
+    inside = np.maximum(_round(rim.edge, np.arctan2(y, x)) - _LIP_MM - np.hypot(x, y), 0)
     return np.asarray(1 - 0.35 * np.exp(-inside / 0.6) - 0.14 * np.exp(-inside / 2.0), np.float32)
 
 
 def inside(rim: Rim, x: Map, y: Map) -> Map:
     """Share of the opening at x, y mm (...): 1 in it, 0 under the rim, soft over a millimetre."""
-    return _step((_edge_at(rim, np.arctan2(y, x)) - np.hypot(x, y)) / 1.0)
-
-
-def _polar(rim: Rim, x: Map, y: Map) -> tuple[Map, Map]:
-    angle = np.arctan2(y, x)
-    return angle, (np.hypot(x, y) - _edge_at(rim, angle)).astype(np.float32)
-
-
-def _edge_at(rim: Rim, angle: Map) -> Map:
-    return _round(rim.edge, angle)
+    return _step((_round(rim.edge, np.arctan2(y, x)) - np.hypot(x, y)) / 1.0)
 
 
 def _round(values: Floats, angle: Map) -> Map:
@@ -335,20 +310,21 @@ def _streaks(across: Map, angle: Map, away: Map, radius: float) -> Map:
 def _patty(rng: np.random.Generator, edge: Floats) -> Patty:
     around = float(rng.uniform(0, 2 * np.pi))
     half = (float(rng.uniform(4.0, 8.0)), float(rng.uniform(2.0, 3.2)))
-    radius = (
-        float(edge[int(around / (2 * np.pi) * len(edge)) % len(edge)])
-        + half[1]
-        + float(rng.uniform(0.5, 2.0))
-    )
+    radius = scenery.edge_at(edge, around) + half[1] + float(rng.uniform(0.5, 2.0))
     turn = around + np.pi / 2 + float(rng.uniform(-0.35, 0.35))
     return Patty((radius * float(np.cos(around)), radius * float(np.sin(around))), turn, half)
 
 
-def _outside(patty: Patty, x: Floats | Map, y: Floats | Map) -> Map:
-    """Distance to the patty's outline, negative inside [mm]."""
+def _along(patty: Patty, x: Floats | Map, y: Floats | Map) -> tuple[Floats, Floats]:
+    """Places x, y mm in a patty's own axes: along its length and across it [mm]."""
     c, s = np.cos(patty.turn), np.sin(patty.turn)
     dx, dy = x - patty.middle[0], y - patty.middle[1]
-    far = np.maximum(np.abs(c * dx + s * dy) - patty.half[0], np.abs(c * dy - s * dx) - patty.half[1])
+    return c * dx + s * dy, c * dy - s * dx
+
+
+def _outside(patty: Patty, along: Floats, across: Floats) -> Map:
+    """Distance to the patty's outline, negative inside [mm], of places in its axes."""
+    far = np.maximum(np.abs(along) - patty.half[0], np.abs(across) - patty.half[1])
     return np.asarray(far, np.float32)
 
 
@@ -357,16 +333,12 @@ def _cotton(
 ) -> tuple[Map, Map]:
     """White felt with a blue thread, a little soaked at its edges."""
     ragged, weave, stains = drawn
-    far = _outside(patty, x, y) + 0.12 * ragged
+    along, across = _along(patty, x, y)
+    far = _outside(patty, along, across) + 0.12 * ragged
     cover = _step(0.5 - far / 0.25)[..., None]
     felt = np.array([0.86, 0.82, 0.76], np.float32) * (1 + 0.06 * weave)[..., None]
     soaked = blood * np.clip(1.2 + far / 1.2 + 0.5 * stains, 0, 1.5)
     felt = felt * np.exp(-soaked[..., None] * np.array([0.15, 1.3, 1.4], np.float32))
-    c, s = np.cos(patty.turn), np.sin(patty.turn)
-    along, across = (
-        c * (x - patty.middle[0]) + s * (y - patty.middle[1]),
-        c * (y - patty.middle[1]) - s * (x - patty.middle[0]),
-    )
     thread = (np.exp(-((across / 0.25) ** 4)) * (along > -patty.half[0] + 1))[..., None]
     felt = felt * (1 - 0.8 * thread) + np.array([0.05, 0.12, 0.30], np.float32) * 0.8 * thread
     near = np.exp(-np.maximum(far, 0) / 0.5)[..., None]
@@ -406,12 +378,3 @@ def _under(surface: CortexSurface, xy: Floats) -> Floats:
 def _step(x: Map | Floats) -> Map:
     t = np.clip(x + 0.5, 0, 1)
     return np.asarray(t * t * (3 - 2 * t), np.float32)
-
-
-def _faces(around: int, rings: int) -> npt.NDArray[np.int32]:
-    row, column = np.meshgrid(np.arange(around), np.arange(rings - 1), indexing="ij")
-    a = (row * rings + column).ravel()
-    b = a + 1
-    c = (((row + 1) % around) * rings + column).ravel()
-    d = c + 1
-    return np.concatenate([np.stack([a, b, d], 1), np.stack([a, d, c], 1)]).astype(np.int32)

@@ -10,7 +10,7 @@ import numpy.typing as npt
 from scipy.ndimage import gaussian_filter, maximum_filter1d
 from scipy.spatial import cKDTree
 
-from synth.geometry.triangles import Shape
+from synth.geometry.triangles import Shape, grid_faces
 from synth.render.anatomy.tree import Tree
 
 Floats = npt.NDArray[np.float64]
@@ -79,9 +79,10 @@ def patties(edge: Floats, points: Floats, rng: np.random.Generator) -> list[tupl
         Vertices (V, 3) mm, faces (F, 3), and where each vertex is on its patty (V, 2) mm, of each.
     """
     tree = cKDTree(points[:, :2])
+    faces = grid_faces(*_PATTY_GRID)[::-1, :, [0, 2, 1]].reshape(-1, 3)
     laid = []
     for around in rng.uniform(0, 2 * np.pi) + np.pi * np.arange(int(rng.integers(1, 3))):
-        at = _edge(edge, around) + rng.uniform(-0.6, 1.2)
+        at = edge_at(edge, around) + rng.uniform(-0.6, 1.2)
         turn = around + np.pi / 2 + rng.uniform(-0.6, 0.6)
         rows, columns = _PATTY_GRID
         u, v = np.meshgrid(
@@ -99,7 +100,7 @@ def patties(edge: Floats, points: Floats, rng: np.random.Generator) -> list[tupl
         z[[0, -1]] -= _COTTON_MM + 0.25
         z[:, [0, -1]] -= _COTTON_MM + 0.25
         vertices = np.stack([x, y, z], -1).reshape(-1, 3)
-        laid.append((vertices, _grid(rows, columns), np.stack([u.ravel(), v.ravel()], 1)))
+        laid.append((vertices, faces, np.stack([u.ravel(), v.ravel()], 1)))
     return laid
 
 
@@ -114,7 +115,7 @@ def retractor(edge: Floats, points: Floats, rng: np.random.Generator) -> Shape:
     across = np.array([-outwards[1], outwards[0]])
     along = points[:, :2] @ outwards
     beside = np.abs(points[:, :2] @ across) < wide
-    start = _edge(edge, around) - float(rng.uniform(0.8, 2.0))
+    start = edge_at(edge, around) - float(rng.uniform(0.8, 2.0))
     s = np.linspace(0, 1, _BLADE_RINGS) ** 1.3 * 34.0
     slot = np.floor((along[beside] - start) / 0.5).astype(int)
     highest = np.full(int(s[-1] / 0.5) + 2, -np.inf)
@@ -132,22 +133,9 @@ def retractor(edge: Floats, points: Floats, rng: np.random.Generator) -> Shape:
     middle = (start + s)[:, None, None] * outwards
     xy = middle + (close[:, None] * flat)[..., None] * across
     vertices = np.concatenate([xy, (z[:, None] + close[:, None] * tall)[..., None]], -1).reshape(-1, 3)
-    return Shape(vertices, _tube(_BLADE_RINGS, _BLADE_AROUND))
+    return Shape(vertices, grid_faces(_BLADE_RINGS, _BLADE_AROUND, "columns")[::-1].reshape(-1, 3))
 
 
-def _edge(edge: Floats, angle: float) -> float:
+def edge_at(edge: Floats, angle: float) -> float:
+    """Radius mm at an angle [rad] of an opening's edge (A,) mm, which is given at even angles."""
     return float(edge[int(angle / (2 * np.pi) * len(edge)) % len(edge)])
-
-
-def _grid(rows: int, columns: int) -> Ints:
-    corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)[None]).ravel()
-    down, right = corner + columns, corner + 1
-    faces = [np.stack([corner, down, down + 1], 1), np.stack([corner, down + 1, right], 1)]
-    return np.concatenate(faces).astype(np.int32)
-
-
-def _tube(rings: int, around: int) -> Ints:
-    row, column = np.meshgrid(np.arange(rings - 1), np.arange(around), indexing="ij")
-    a, b = (row * around + column).ravel(), (row * around + (column + 1) % around).ravel()
-    c, d = a + around, b + around
-    return np.concatenate([np.stack([a, d, c], 1), np.stack([a, b, d], 1)]).astype(np.int32)

@@ -15,6 +15,7 @@ import numpy.typing as npt
 from scipy.ndimage import distance_transform_edt
 
 from synth.errors import UserError
+from synth.geometry.triangles import grid_faces
 from synth.job import schema
 from synth.render.anatomy import noise, tube, vessels
 from synth.render.anatomy.tree import Tree
@@ -155,7 +156,7 @@ def _surface(
     z = pia + noise.sample(bulge(tree.veins, extent), xy, extent)
     return CortexSurface(
         vertices=np.concatenate([xy, z[:, None]], axis=1),
-        faces=_grid_faces(side),
+        faces=grid_faces(side, side).reshape(-1, 3),
         pia=pia.reshape(side, side),
         uv=(xy / extent + 0.5).astype(np.float32),
         extent_mm=extent,
@@ -163,13 +164,6 @@ def _surface(
         vessels=tree,
         seed=relief.seed,
     )
-
-
-def _grid_faces(side: int) -> npt.NDArray[np.int32]:
-    corner = (np.arange(side - 1)[:, None] * side + np.arange(side - 1)[None]).ravel()
-    right, below, across = corner + 1, corner + side, corner + side + 1
-    faces = np.concatenate([np.stack([corner, right, across], 1), np.stack([corner, across, below], 1)])
-    return faces.astype(np.int32)
 
 
 def _height_map(vertices: Floats, faces: npt.NDArray[np.int32], extent: float, pixels: int) -> Map:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -13,9 +12,8 @@ import numpy.typing as npt
 from synth.errors import UserError
 from synth.render.anatomy import noise, tube
 from synth.render.anatomy.surface import CortexSurface
-from synth.render.appearance.family import Colour
 from synth.render.appearance.look import Look
-from synth.render.mitsuba.adapter import Wet
+from synth.render.mitsuba.adapter import Coat
 from synth.system import checked_file
 from synth.system.jit import vectorised
 
@@ -28,22 +26,6 @@ _TEXELS_A_PIXEL = 2.2
 _BLEEDINGS = 3.5  # on a patch where the rim is soaked with blood
 _CLIMB = 0.16  # of a vessel's radius, which the film climbs beside it
 _CLIMB_MM = 0.16  # over which that falls off
-
-
-@dataclass(frozen=True)
-class Coat:
-    """What one body of wet tissue looks like."""
-
-    albedo: Map
-    """(n, n, 3) linear."""
-    normal: Map
-    """(n, n, 3)."""
-    dry: Map
-    """(m, m) share of the surface that has no film."""
-
-    def wet(self, roughness: float, dry_roughness: float, ambient: Colour, index: float = 1.33) -> Wet:
-        """As a material."""
-        return Wet(self.albedo, self.normal, self.dry, roughness, dry_roughness, index, ambient)
 
 
 def resolution(extent_mm: float, mm_per_px: float) -> int:

@@ -146,20 +146,14 @@ def to_pixels(camera: Camera, local: Floats) -> Floats:
     return flat * np.diag(camera.K)[:2] + camera.K[:2, 2]
 
 
-def rays(camera: Camera, pixels: Floats) -> tuple[Floats, Floats]:
-    """Centre rays of pixels (N, 2).
-
-    Returns:
-        Origins (N, 3) mm and unit directions (N, 3), world axes.
+def rays(camera: Camera, pixels: Floats) -> Floats:
+    """Centre rays (N, 3) of pixels (N, 2): camera axes, z = 1, so that distance along them is depth.
 
     Raises:
         UserError: the distortion folds the picture over itself, so that a pixel has no ray.
     """
     flat = undistort((pixels - camera.K[:2, 2]) / np.diag(camera.K)[:2], camera.distortion)
-    local = np.concatenate([flat, np.ones((len(flat), 1))], axis=1)
-    directions = local @ camera.rotation
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    return np.broadcast_to(camera.centre, directions.shape).copy(), directions
+    return np.concatenate([flat, np.ones((len(flat), 1))], axis=1)
 
 
 def pixel_grid(size: tuple[int, int]) -> Floats:

@@ -33,8 +33,8 @@ _REGISTER = 64  # bytes
 
 
 @dataclass(frozen=True)
-class Wet:
-    """A diffuse body under a wet coat."""
+class Coat:
+    """Maps of what one body of wet tissue looks like."""
 
     albedo: Map
     """(n, n, 3) linear reflectance."""
@@ -42,14 +42,21 @@ class Wet:
     """(n, n, 3) unit normals in the surface's own frame."""
     dry: Map
     """(m, m) share of the surface whose film is too thin to be smooth."""
+
+
+@dataclass(frozen=True)
+class Wet:
+    """A diffuse body under a wet coat."""
+
+    coat: Coat
     roughness: float
     """GGX alpha of the coat under film."""
     dry_roughness: float
     """GGX alpha where there is none."""
+    ambient: Floats
+    """(3,) light from all around, as a white diffuser's radiance: what a wound throws into its shadows."""
     index: float = 1.33
     """Refractive index of the coat."""
-    ambient: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Light from all around, as a white diffuser's radiance: what a wound throws into its own shadows."""
 
 
 @dataclass(frozen=True)
@@ -299,7 +306,7 @@ def _glow(mi: Any, material: Wet | Metal) -> dict[str, Any]:
     """Radiance that a body shows of light which no lamp stands for."""
     if isinstance(material, Metal):
         return {"type": "mesh_attribute", "name": "vertex_glow"}
-    half = cv2.resize(material.albedo, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+    half = cv2.resize(material.coat.albedo, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
     return _bitmap(mi, half * np.asarray(material.ambient, np.float32))
 
 
@@ -307,8 +314,8 @@ def _material(mi: Any, material: Wet | Metal) -> dict[str, Any]:
     if isinstance(material, Metal):
         scattered = {"type": "mesh_attribute", "name": "vertex_tint"}
         return {"type": "twosided", "satin": {"type": "diffuse", "reflectance": scattered}}
-    encoded = material.normal * np.float32(0.5) + np.float32(0.5)
-    albedo = mi.load_dict(_bitmap(mi, material.albedo))  # once, for both
+    encoded = material.coat.normal * np.float32(0.5) + np.float32(0.5)
+    albedo = mi.load_dict(_bitmap(mi, material.coat.albedo))  # once, for both
 
     def coat(roughness: float) -> dict[str, Any]:
         return {
@@ -327,7 +334,7 @@ def _material(mi: Any, material: Wet | Metal) -> dict[str, Any]:
             "normalmap": _bitmap(mi, encoded),
             "film": {
                 "type": "blendbsdf",
-                "weight": _bitmap(mi, material.dry),
+                "weight": _bitmap(mi, material.coat.dry),
                 "smooth": coat(material.roughness),
                 "rough": coat(material.dry_roughness),
             },

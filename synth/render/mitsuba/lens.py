@@ -28,7 +28,17 @@ class Compiled:
 
         _register(mi.variant())
         self.spp = spp
-        self.sensor = mi.load_dict(_plugin(camera, spp, sampler))
+        (fx, _, _), (_, fy, _), _ = camera.K.tolist()
+        names = ("k1", "k2", "p1", "p2", "k3")
+        self.sensor = mi.load_dict(
+            {
+                "type": "sulcus_lens",
+                "film": _film(*camera.size),
+                "sampler": {"type": sampler, "sample_count": spp},
+                **{"aperture": camera.aperture_mm, "focus": camera.focus_mm, "fx": fx, "fy": fy},
+                **dict(zip(names, camera.distortion.tolist(), strict=True)),
+            }
+        )
         self.place(camera)
 
     def place(self, camera: Camera) -> None:
@@ -101,21 +111,6 @@ class Scalar:
         fine = cv2.remap(image, self._at, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         size = (fine.shape[1] // self._fine, fine.shape[0] // self._fine)
         return np.asarray(cv2.resize(fine, size, interpolation=cv2.INTER_AREA), np.float32)
-
-
-def _plugin(camera: Camera, spp: int, sampler: str) -> dict[str, Any]:
-    width, height = camera.size
-    lens: dict[str, Any] = {
-        "type": "sulcus_lens",
-        "film": _film(width, height),
-        "sampler": {"type": sampler, "sample_count": spp},
-        "aperture": camera.aperture_mm,
-        "focus": camera.focus_mm,
-    }
-    for name, value in zip(("k1", "k2", "p1", "p2", "k3"), camera.distortion, strict=True):
-        lens[name] = float(value)
-    lens |= {"fx": float(camera.K[0, 0]), "fy": float(camera.K[1, 1])}
-    return lens
 
 
 def _film(width: int, height: int) -> dict[str, Any]:

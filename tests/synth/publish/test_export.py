@@ -197,8 +197,8 @@ def moving(out: Path, job: Job) -> list[Camera]:
     pixels = np.stack([columns, rows], axis=-1).reshape(-1, 2).astype(float)
     poses = np.tile(np.eye(4), (job.frames, 1, 1))
     for t, camera in enumerate(cameras):
-        start, way = rays(camera, pixels)
-        hit = start - way * (start[..., 2] / way[..., 2])[:, None]  # the plane z = 0
+        start, way = camera.centre, rays(camera, pixels) @ camera.rotation
+        hit = start - way * (start[2] / way[:, 2])[:, None]  # the plane z = 0
         local = hit @ camera.rotation.T + camera.translation
         poses[t, :3, :3], poses[t, :3, 3] = camera.rotation, camera.translation
         shade = np.clip(128 + 40 * np.sin(hit[:, 0]) + 40 * np.cos(1.3 * hit[:, 1]), 0, 255)

@@ -47,9 +47,9 @@ def test_rays_meet_what_trimesh_meets_even_where_triangles_bow() -> None:
     near = camera.place(scenario.draw_view(render, np.random.default_rng(2)), render)
     rest = truth.trace_rest(near, Shape(coarse.vertices, coarse.faces), NOTHING)
     pixels = camera.pixel_grid(near.size)[::11]
-    origins, directions = camera.rays(near, pixels)
+    seen = camera.rays(near, pixels)
+    origins, directions = np.tile(near.centre, (len(pixels), 1)), seen @ near.rotation
     straight = (pixels - near.K[:2, 2]) / np.diag(near.K)[:2]
-    seen = directions @ near.rotation.T
     shift = np.linalg.norm(seen[:, :2] / seen[:, 2:] - straight, axis=1) * near.K[0, 0]
     assert shift.max() > 5, "a lens that bends nothing proves nothing"
     mesh = trimesh.Trimesh(coarse.vertices, coarse.faces, process=False)
@@ -74,7 +74,8 @@ def test_flow_warps_the_moved_surface_back_to_rest(surface: CortexSurface, lens:
     assert np.linalg.norm(now.flow[seen], axis=1).max() > 3
     pixels = camera.pixel_grid(lens.size).reshape(72, 96, 2)
     ends = pixels[seen] + now.flow[seen]
-    origins, directions = camera.rays(lens, ends)
+    directions = camera.rays(lens, ends) @ lens.rotation
+    origins = np.tile(lens.centre, (len(ends), 1))
     mesh = trimesh.Trimesh(moved.vertices, moved.faces, process=False)
     where, ray, triangle = mesh.ray.intersects_location(origins, directions, multiple_hits=False)
     bary = trimesh.triangles.points_to_barycentric(moved.vertices[moved.faces[triangle]], where)
@@ -102,8 +103,7 @@ def test_what_hides_a_point_makes_it_invisible(surface: CortexSurface, lens: Cam
 @pytest.mark.parametrize("turn", range(3))
 def test_a_triangle_with_a_corner_behind_the_lens_is_dropped(lens: Camera, turn: int) -> None:
     """Whichever of the three it is; the other two are in the picture, where rays would meet NaN."""
-    _, directions = camera.rays(lens, camera.pixel_grid(lens.size))
-    directions = directions @ lens.rotation.T
+    directions = camera.rays(lens, camera.pixel_grid(lens.size))
     seen = directions.reshape(72, 96, 3)[[10, 60], [12, 80]]
     corners = np.concatenate([80.0 * seen / seen[:, 2:], [[0.0, 6.0, -3.0]]])
     shape = Shape(
