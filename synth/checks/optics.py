@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -49,7 +50,7 @@ def contact(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
     footprint = float(scenario["gesture"]["footprint_mm"])
     # Over the relief a rigid tip's load may be anywhere under it.
     spread = 1.0 if sequence.attrs["mechanics"].get("contact") == "rigid" else 0.1
-    sway = CameraMotion(**scenario["sway"]) if "sway" in scenario else None
+    poses = _poses(sequence, still, time)
     area, inside = sequence["area"][:], inner(sequence["tissue"][:], 2)
     rows, columns = np.indices(sequence.size)
     peak = float(np.linalg.norm(sequence["force"][:], axis=1).max())
@@ -62,10 +63,22 @@ def contact(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
         share = share / share.sum()
         flow = sequence["flow"][t]
         x, y = ((share * (base + flow[..., k])).sum() for k, base in enumerate((columns, rows)))
-        view = sway.at(still, float(time[t])) if sway else still
+        view = replace(still, rotation=poses[t, :3, :3], translation=poses[t, :3, 3])
         seen = cameras.to_pixels(view, cameras.to_camera(view, tips[t].reshape(-1, 3))).mean(axis=0)
         off = float(np.hypot(x - seen[0], y - seen[1])) * view.mm_per_px
         yield Measure(off, spread * footprint + view.mm_per_px, f"frame {t}", "mm")
+
+
+def _poses(sequence: Sequence, still: cameras.Camera, time: Floats) -> Floats:
+    """World to camera axes in every frame, (T, 4, 4) mm: as stored, else as the scenario moves the camera."""
+    if "camera" in sequence.fields:
+        return np.asarray(sequence["camera"][:])
+    sway = sequence.attrs["scenario"].get("sway")
+    views = [CameraMotion(**sway).at(still, float(t)) if sway else still for t in time]
+    poses = np.tile(np.eye(4), (len(views), 1, 1))
+    for pose, view in zip(poses, views, strict=True):
+        pose[:3, :3], pose[:3, 3] = view.rotation, view.translation
+    return poses
 
 
 def camera_of(sequence: Sequence, lens: Mapping[str, Any] | None = None) -> cameras.Camera:

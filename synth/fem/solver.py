@@ -14,7 +14,7 @@ from synth.fem.material import Tissue, check_load
 from synth.fem.mesh.tetrahedra import Tets
 from synth.fem.motion import Clock, march_in_time, volume
 from synth.fem.pulse import Pulse, lift
-from synth.fem.tool import Gesture
+from synth.fem.tool import Gesture, ToolMotion
 from synth.geometry.triangles import Shape
 from synth.job import schema
 
@@ -82,6 +82,7 @@ def deform(
     fps: float,
     pulse: Pulse | None = None,
     opening_mm: float = schema.CraniotomySection().radius_mm,
+    motions: Sequence[ToolMotion] = (),
 ) -> Deformation:
     """Moves a brain as gestures ask.
 
@@ -95,6 +96,7 @@ def deform(
         fps: 1/s.
         pulse: of heart and breath; no part of force and traction.
         opening_mm: radius of the craniotomy, where the surface is exposed to the pulse.
+        motions: of the gestures, over T frames each; their own trajectories if there are none.
 
     Raises:
         UserError: the load is past the law's range, or the contact is not on the surface.
@@ -103,7 +105,8 @@ def deform(
     """
     for gesture in gestures:
         check_load(tissue.law, gesture.load)
-    tools = [(gesture, tool.trajectory(gesture, frames)) for gesture in gestures]
+    motions = motions or [tool.trajectory(gesture, frames) for gesture in gestures]
+    tools = list(zip(gestures, motions, strict=True))
     time, area = np.arange(frames) / fps, surface_embedding.vertex_area(*surface)
     embedding = surface_embedding.embed(tets, surface.vertices)
     traction = np.sum([tool.tractions(g, moved, surface.vertices, area) for g, moved in tools], axis=0)

@@ -209,9 +209,9 @@ def anchors(gesture: Gesture, motion: ToolMotion, surface: Shape) -> tuple[Ints,
     Raises:
         UserError: beyond the edge of the surface.
     """
-    aside, path = _aside(gesture.spread_mm, gesture.azimuth_deg), np.asarray(gesture.path_mm)
-    start = np.asarray(gesture.point_mm) - 0.5 * path
-    reach = np.abs(aside).max() + np.abs(path).max() + 3 * gesture.footprint_mm
+    aside = _aside(gesture.spread_mm, gesture.azimuth_deg)
+    start = np.asarray(gesture.point_mm) - 0.5 * np.asarray(gesture.path_mm)
+    reach = np.abs(aside).max() + np.abs(motion.shift).max() + 3 * gesture.footprint_mm
     corner = surface.vertices[surface.faces, :2]
     near = surface.faces[(np.abs(corner - start).max(axis=2) <= reach).any(axis=1)]
     places = (start + motion.shift)[:, None] + np.stack([-aside, aside])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import Any
 
@@ -13,6 +14,7 @@ from synth.fem.mesh import tetrahedra
 from synth.fem.mesh.relief import HeightMap
 from synth.fem.mesh.tetrahedra import Tets
 from synth.fem.solver import Deformation
+from synth.fem.tool import ToolMotion
 from synth.geometry.brain_surface import Brain, load_brain
 from synth.geometry.triangles import Shape
 from synth.job.laws import LAWS
@@ -59,8 +61,10 @@ def _cortex(section: AnatomySection, relief: Relief, written: object) -> tuple[C
     return surface, brain
 
 
-def move(job: Job, case: Scenario, surface: CortexSurface, tets: Tets) -> Deformation:
-    """The scenario's gestures, carried out on that surface and volume."""
+def move(
+    job: Job, case: Scenario, surface: CortexSurface, tets: Tets, motions: Sequence[ToolMotion] = ()
+) -> Deformation:
+    """The scenario's gestures, carried out on that surface and volume; `motions` as in `solver.deform`."""
     return solver.deform(
         job.fem,
         case.tissue,
@@ -71,6 +75,7 @@ def move(job: Job, case: Scenario, surface: CortexSurface, tets: Tets) -> Deform
         job.fps,
         case.pulse,
         job.anatomy.craniotomy.radius_mm,
+        motions,
     )
 
 

@@ -77,12 +77,19 @@ def render_sequence(job: Job, index: int, folder: Path, report: StageCallback) -
         UserError: the job cannot be carried out (surface, load, inverted element), in one line.
     """
     watch = Stopwatch()
-    scene = simulate(job, index, report, watch)
+    return write_scene(simulate(job, index, report, watch), folder, report, watch)
+
+
+def write_scene(
+    scene: Scene, folder: Path, report: StageCallback | None = None, watch: Stopwatch | None = None
+) -> Path:
+    """Renders a scene, recovers its flow and writes `folder/NNNNNN.zarr`; else as `render_sequence`."""
+    job, report, watch = scene.job, report or (lambda stage, done, of: None), watch or Stopwatch()
     with watch.stage("scene"):
         studio = scene.renderer
 
     width, height = job.render.size
-    writer = Writer(folder, index, frames=job.frames, size=(height, width), job=job)
+    writer = Writer(folder, scene.index, frames=job.frames, size=(height, width), job=job)
     writer.put("time", scene.motion.time)
     writer.put("force", scene.force)  # labels are in camera axes
     writer.put("tissue", scene.tissue)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from synth.errors import UserError
 from synth.fem.solver import Deformation
+from synth.fem.tool import ToolMotion
 from synth.flow import track, tvl1
 from synth.flow.estimator import Estimator, create
 from synth.flow.track import Track
@@ -190,17 +191,26 @@ def at_rest(job: Job, index: int = 0, gestures: Sequence[str] | None = None) -> 
 
 
 def simulate(
-    job: Job, index: int = 0, report: StageCallback | None = None, watch: Stopwatch | None = None
+    job: Job,
+    index: int = 0,
+    report: StageCallback | None = None,
+    watch: Stopwatch | None = None,
+    *,
+    case: Scenario | None = None,
+    motions: Sequence[ToolMotion] = (),
 ) -> Scene:
     """Builds sequence `index` of a job and carries out its gestures; nothing is rendered or written yet.
 
-    The scene is the one that `synth render` computes for that job and index.
+    The scene is the one that `synth render` computes for that job and index, unless told otherwise.
 
     Args:
         job: the job; it may ask for more sequences than are ever made.
         index: which of its sequences, 0 <= index < job.sequences.
         report: told of progress, stage by stage.
         watch: adds up the time of each stage.
+        case: instead of the scenario that is drawn; its camera motion may be any dataclass with a method `at`
+            as `CameraMotion` has.
+        motions: of its instruments, over T frames each, instead of the gestures' own trajectories.
 
     Raises:
         UserError: no such sequence, or a job that cannot be carried out (surface, load, inverted element).
@@ -208,14 +218,14 @@ def simulate(
     if not 0 <= index < job.sequences:
         raise UserError(f"sequence {index}: the job has sequences 0 to {job.sequences - 1}")
     report, watch = report or (lambda stage, done, of: None), watch or Stopwatch()
-    case = scenario.draw(job, index)
+    case = case or scenario.draw(job, index)
     view = camera.place(case.view, job.render)
     report("mesh", 0, 1)
     with watch.stage("mesh"):
         surface, tets = mechanics.build(job, case)
     report("fem", 0, 1)
     with watch.stage("fem"):
-        motion = mechanics.move(job, case, surface, tets)
+        motion = mechanics.move(job, case, surface, tets, motions)
     return Scene(job, index, case, surface, view, motion)
 
 

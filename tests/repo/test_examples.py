@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import dataset as dataset_recipe
 import numpy as np
 import own_flow
 import own_law
@@ -13,6 +14,7 @@ import read_dataset
 import render_frame
 
 import synth
+from synth.checks.verify import verify_dataset
 from synth.dataset.store import Dataset
 
 pytestmark = pytest.mark.slow
@@ -25,6 +27,18 @@ def test_reading_a_dataset(out: Path) -> None:
     assert found["labelled_force_mn"] == pytest.approx(found["peak_force_mn"], rel=0.02)
     assert found["largest_motion_px"] == pytest.approx(4.569, abs=0.01)
     assert found["median_flow_error_px"] < 0.2
+
+
+def test_a_dataset_of_own_motion_camera_and_look(tmp_path: Path) -> None:
+    dataset_recipe.main(tmp_path / "stirred", 1)
+    assert verify_dataset(tmp_path / "stirred").good
+    sequence = Dataset(tmp_path / "stirred")[0]
+    pose, tip = sequence["camera"][:], np.array(sequence.attrs["mechanics"]["instruments"][0]["tip_mm"])[:, 0]
+    swung = np.degrees(np.arccos((np.trace(pose[0, :3, :3].T @ pose[-1, :3, :3]) - 1) / 2))
+    assert 4 * 0.44 < swung < 10 * 0.44  # degrees in eleven frames of 25 a second
+    loaded = np.linalg.norm(sequence["force"][:], axis=1) > 0.1
+    across = np.linalg.norm(tip[loaded, None, :2] - tip[None, loaded, :2], axis=-1).max()
+    assert 2.0 * 0.8 < across < 4.0 * 1.1  # mm, the circle's diameter less what the tissue gives
 
 
 def test_rendering_a_frame() -> None:

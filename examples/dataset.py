@@ -1,0 +1,89 @@
+"""A dataset that no job key asks for: a tip that stirs in circles, a microscope on an arc, a pale look.
+
+Copy it and change what you like: every choice is a plain value; what is drawn may be replaced by your own.
+
+python examples/dataset.py stirred 4
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+import synth
+from synth.dataset import folder, index
+from synth.fem.tool import ToolMotion
+from synth.publish import card
+from synth.render.camera.camera import Camera
+from synth.sequence import scenario
+from synth.sequence.pipeline import write_scene
+
+FPS, FRAMES = 25.0, 12
+
+
+@dataclass(frozen=True)
+class Arc:
+    """A microscope that swings about the craniotomy's middle, in its place at time 0."""
+
+    deg_per_s: float
+
+    def at(self, camera: Camera, seconds: float) -> Camera:
+        """The camera at a time, `camera` being that of time 0."""
+        angle = np.radians(self.deg_per_s * seconds)
+        turn = np.array([[1, 0, 0], [0, np.cos(angle), -np.sin(angle)], [0, np.sin(angle), np.cos(angle)]])
+        return replace(camera, rotation=camera.rotation @ turn)  # x -> R x + t: the origin stays where it was
+
+
+def stir(radius_mm: float, turns: float, frames: int) -> ToolMotion:
+    """Comes down, presses harder, runs round a circle and leaves; frame 0 is at rest."""
+    t = np.linspace(0, 1, frames)
+    load = np.sin(np.pi * np.clip((t - 0.1) / 0.8, 0, 1)) ** 2  # touches at 10% of the time, leaves at 90%
+    away = np.clip(1 - t / 0.1, 0, 1) + np.clip((t - 0.9) / 0.1, 0, 1)
+    phase = 2 * np.pi * turns * t
+    circle = radius_mm * np.stack([np.cos(phase) - 1, np.sin(phase)], axis=1)
+    return ToolMotion(load, away, circle)
+
+
+def main(root: Path, sequences: int) -> None:
+    # What all sequences share: picture, frame rate, fidelity. No key says how tools, camera or look are.
+    job = synth.Job.model_validate(
+        {
+            "seed": 11,
+            "sequences": sequences,
+            "frames": FRAMES,
+            "fps": FPS,
+            "anatomy": {"vertices": 6000},
+            "fem": {"gestures": ["push"], "load": [0.05, 0.15], "tets": 1000},
+            "render": {"size": [192, 144], "spp": 4},
+            "store": {"extra": ["camera"]},  # poses, as no drawn motion of the camera says them
+            "card": {"title": "Stirred cortex"},
+        }
+    )
+    rng = np.random.default_rng(job.seed)
+    with folder.claim(root, job) as out:
+        for k in range(sequences):
+            # A plausible patient, instrument and microscope, drawn by the generator ...
+            case = scenario.draw(job, k)
+            # ... and the look, the camera's path and the tool's path, which are ours.
+            look = replace(
+                case.look,
+                crown=(0.80, 0.62, 0.55),
+                blush=0.2 * case.look.blush,
+                sensor=replace(case.look.sensor, exposure=0.8 * case.look.sensor.exposure),
+            )
+            case = replace(case, look=look, sway=Arc(rng.uniform(4, 10)))
+            motion = stir(radius_mm=rng.uniform(1, 2), turns=rng.choice([-1.0, 1.0]), frames=FRAMES)
+            # Mechanics, pictures, truth and recovered flow follow; the store is sealed as any other.
+            scene = synth.simulate(job, k, case=case, motions=[motion])
+            path = write_scene(scene, root)
+            peak = np.linalg.norm(scene.force, axis=1).max()
+            print(f"{path.name}: {peak:.2f} mN at most, {case.look.family}")
+        index.write_index(out)
+        card.write_card(out)
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]), int(sys.argv[2]))
