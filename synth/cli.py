@@ -39,12 +39,8 @@ def new(path: Annotated[Path, typer.Argument(help="The job file to write.")] = P
     """Writes a job file in which every key is explained."""
     from synth.job import writer
 
-    if path.exists():
-        raise UserError(f"{path}: exists already")
-    try:
-        path.write_text(writer.commented(), "utf-8")
-    except OSError as error:
-        raise UserError(f"{path}: cannot be written ({error.strerror})") from error
+    with as_user_error(f"{path}: cannot be written"), path.open("x", encoding="utf-8") as file:
+        file.write(writer.commented())
     print(f"wrote {path}; render it with: synth render {path} -o out")
 
 
@@ -58,10 +54,7 @@ def schema(
     from synth.dataset.size_forecast import describe_fields
     from synth.job import writer
 
-    if fields:
-        print("\n".join(describe_fields()))
-        return
-    print(json_.dumps(writer.schema(), indent=2))
+    print("\n".join(describe_fields()) if fields else json_.dumps(writer.schema(), indent=2))
 
 
 @app.command(epilog="Example: synth preview demo --count 9 --out sheet.png")
@@ -234,12 +227,9 @@ def report(
     write_index(folder)
     print(write_card(folder))
     print(croissant.write_croissant(folder))
-    unsaid = croissant.STATED.keys() - croissant.describe(folder).keys()
-    if unsaid:
-        print(
-            f"not said in the job's card, so not in the description: {', '.join(sorted(unsaid))}",
-            file=sys.stderr,
-        )
+    missing = ", ".join(sorted(croissant.STATED.keys() - croissant.describe(folder).keys()))
+    if missing:
+        print(f"not in the job's card, so not in the description: {missing}", file=sys.stderr)
     print(write_page(out, to or out / "report.html"))
 
 

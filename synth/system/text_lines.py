@@ -5,19 +5,11 @@ from __future__ import annotations
 import shutil
 import textwrap
 
-_LEAST = 16
+_LEAST = 16  # columns
 
 
-def columns() -> int:
-    """How wide the terminal is, or what COLUMNS says; 80 where there is none."""
-    return shutil.get_terminal_size().columns
-
-
-def hang(head: str, text: str, width: int | None = None) -> list[str]:
-    """`text` after `head`, wrapped at spaces, its further lines below its first.
-
-    `width`: columns in all, the terminal's if not given. A word that is longer stays whole.
-    """
-    room = max(_LEAST, (columns() if width is None else width) - len(head))
+def hang(head: str, text: str) -> list[str]:
+    """`text` after `head`, wrapped to the terminal at spaces, its further lines below its first."""
+    room = max(_LEAST, shutil.get_terminal_size().columns - len(head))
     words = textwrap.wrap(text, room, break_long_words=False, break_on_hyphens=False) or [""]
     return [f"{' ' * len(head) if k else head}{line}".rstrip() for k, line in enumerate(words)]
