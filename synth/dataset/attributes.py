@@ -9,65 +9,46 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from synth.errors import UserError
 from synth.fields import FORMAT_VERSION
+from synth.system.checked_file import LARGEST_PIXELS
 from synth.system.config_file import first_mistake
 
 FORMAT = "sulcus-sequence"
 
-LARGEST_PIXELS = 40_000_000
-"""Of one picture, as of a recording's."""
-
 LARGEST_BYTES = 32_000_000
-"""Of the file that holds them: some 50,000 frames."""
+"""Of the file that holds the attributes: some 50,000 frames."""
 
 _Hash = Annotated[str, Field(pattern=r"^[0-9a-f]{32}$")]
-_Text = Annotated[str, Field(max_length=1000)]
 _Number = Annotated[float, Field(ge=-1e12, le=1e12)]
 _Triple = Annotated[list[_Number], Field(min_length=3, max_length=3)]
 _Square = Annotated[list[_Triple], Field(min_length=3, max_length=3)]
 _Edge = Annotated[int, Field(ge=1, le=LARGEST_PIXELS)]
 
 
-class _Block(BaseModel):
-    """Numbers are numbers, not text or flags; what is not named here is nobody's business yet."""
-
-    model_config = ConfigDict(extra="allow", strict=True, allow_inf_nan=False)
-
-
-class _Gesture(_Block):
-    kind: _Text | None = None
+class _Gesture(BaseModel):
+    kind: str | None = None
     load: _Number | None = None
 
 
-class _Relief(_Block):
-    seed: int | None = None
-
-
-class _Scenario(_Block):
-    family: _Text | None = None
+class _Scenario(BaseModel):
+    family: str | None = None
     gesture: _Gesture | None = None
-    further: Annotated[list[_Gesture], Field(max_length=100)] | None = None
-    relief: _Relief | None = None
+    further: list[_Gesture] | None = None
+    relief: dict[str, Any] | None = None
 
 
-class _Spent(_Block):
-    cpu_s: _Number = 0.0
+class Attributes(BaseModel):
+    """Of the root of a store. What only some readers need may be missing; others may be there."""
 
-
-class Attributes(_Block):
-    """Of the root of a store. What only some readers need may be missing."""
+    # Numbers are numbers, not text or flags.
+    model_config = ConfigDict(extra="allow", strict=True, allow_inf_nan=False)
 
     index: Annotated[int, Field(ge=0, lt=10**12)]
     frames: Annotated[int, Field(ge=1, le=1_000_000)]
     size: Annotated[list[_Edge], Field(min_length=2, max_length=2)]
     content_hash: _Hash
     seal_hash: _Hash
-    field_hashes: dict[_Text, _Hash]
+    field_hashes: dict[str, _Hash]
     fps: Annotated[float, Field(gt=0, le=1e6)] | None = None
-    flow_backend: _Text | None = None
-    job: _Text | None = None
-    anatomy_id: _Text | None = None
-    opening_id: _Text | None = None
-    variant: _Text | None = None
     young_kpa: Annotated[float, Field(gt=0, le=1e6)] | None = None
     poisson: Annotated[float, Field(ge=0, lt=0.5)] | None = None
     scale_mm_per_px: Annotated[float, Field(gt=0, le=1e3)] | None = None
@@ -78,8 +59,8 @@ class Attributes(_Block):
     scenario: _Scenario | None = None
     mechanics: dict[str, Any] | None = None
     summary: dict[str, _Number | dict[str, _Number]] = {}
-    timings: dict[str, _Number | _Spent] = {}
-    versions: dict[str, _Text] = {}
+    timings: dict[str, _Number | dict[str, _Number]] = {}
+    versions: dict[str, str] = {}
 
 
 def check_attributes(attrs: Mapping[str, Any], where: str) -> None:
@@ -94,17 +75,12 @@ def check_attributes(attrs: Mapping[str, Any], where: str) -> None:
     if attrs.get("format_version") != FORMAT_VERSION:
         found = str(attrs.get("format_version"))[:40]
         raise UserError(f"{where}: has format version {found}; this program reads version {FORMAT_VERSION}")
-    lacking = [
-        name for name, one in Attributes.model_fields.items() if one.is_required() and name not in attrs
-    ]
-    if lacking:
-        raise UserError(f"{where}: lacks the attributes {', '.join(sorted(lacking))}")
     try:
-        said = Attributes.model_validate(dict(attrs))
+        width, height = Attributes.model_validate(dict(attrs)).size
     except ValidationError as error:
         raise UserError(f"{where}: an attribute can't be right ({first_mistake(error)})") from None
-    if said.size[0] * said.size[1] > LARGEST_PIXELS:
-        raise UserError(f"{where}: {said.size[0]} x {said.size[1]} pixels a frame is too large")
+    if width * height > LARGEST_PIXELS:
+        raise UserError(f"{where}: {width} x {height} pixels a frame is too large")
 
 
 def name_gestures(scenario: Mapping[str, Any]) -> str:

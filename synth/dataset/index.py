@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import pyarrow as pa
-import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from synth.dataset import location, split
@@ -30,6 +29,11 @@ class IndexColumn(NamedTuple):
     type: pa.DataType
     meaning: str
     unit: str = "-"
+
+    def field(self) -> pa.Field:
+        """As Parquet's schema has it."""
+        about = {"meaning": self.meaning} | ({} if self.unit == "-" else {"unit": self.unit})
+        return pa.field(self.name, self.type, metadata=about)
 
 
 _INT, _REAL, _TEXT = pa.int64(), pa.float64(), pa.string()
@@ -65,16 +69,7 @@ COLUMNS = (
     IndexColumn("cpu_s", _REAL, "processor time it took", "s"),
 )
 
-SCHEMA = pa.schema(
-    [
-        pa.field(
-            one.name,
-            one.type,
-            metadata={"meaning": one.meaning} | ({} if one.unit == "-" else {"unit": one.unit}),
-        )
-        for one in COLUMNS
-    ]
-)
+SCHEMA = pa.schema([one.field() for one in COLUMNS])
 
 _LARGEST_BYTES = 1 << 28
 _MOST_ROWS = 2_000_000
@@ -82,10 +77,10 @@ _REMEDY = "; `synth report` writes it anew"
 
 
 def read_index(root: Path) -> pa.Table:
-    """The index as it was last written.
+    """The index as it was last written; `synth verify` compares its rows with the stores.
 
     Raises:
-        UserError: missing, damaged, of another program or version, or with rows that no dataset has.
+        UserError: missing, damaged, or of another program or version.
     """
     path = root / NAME
     try:
@@ -99,40 +94,7 @@ def read_index(root: Path) -> pa.Table:
     except (OSError, pa.ArrowException, ValueError, LookupError, MemoryError) as error:
         why = (str(error).splitlines() or ["it takes too much memory"])[0]
         raise UserError(f"{path}: is damaged ({why[:200]}){_REMEDY}") from error
-    _check_rows(table, path)
     return table
-
-
-def _check_rows(table: pa.Table, path: Path) -> None:
-    """UserError if rows say what no writer of ours does: readers take them at their word."""
-    number, done = table["index"], table.filter(pc.equal(table["status"], "done"))
-    hashed = pc.match_substring_regex(done["content_hash"], "^[0-9a-f]{32}$")
-    right = {
-        "index": number.null_count == 0 and (pc.min(number).as_py() or 0) >= 0,
-        "index, twice": pc.count_distinct(number).as_py() == len(table),
-        "status": set(table["status"].unique().to_pylist()) <= {"done", "failed"},
-        "path": done["path"].to_pylist() == [f"{key or 0:06d}.zarr" for key in done["index"].to_pylist()],
-        "content_hash": done["content_hash"].null_count == 0 and pc.all(hashed).as_py() is not False,
-        "split": set(table["split"].unique().to_pylist()) <= {*split.SIDES, None},
-    }
-    wrong = [name for name, good in right.items() if not good]
-    if wrong:
-        raise UserError(f"{path}: rows can't be right ({wrong[0]}){_REMEDY}")
-
-
-def collect(folder: Folder) -> list[dict[str, Any]]:
-    """All rows but for their sides, as the folder is now; those that the index has already are kept.
-
-    An index that can't be read is made anew: all that it says is in the stores.
-    """
-    known: dict[int, dict[str, Any]] = {}
-    with suppress(UserError):
-        known = {row["index"]: row for row in read_index(folder.root).to_pylist() if row["status"] == "done"}
-    rows = {key: known.get(key) or row_of(_open(folder, key)) for key in folder.sealed()}
-    for key, failure in folder.failures().items():
-        if key not in rows:
-            rows[key] = {"index": key, "status": "failed", "reason": failure["reason"]}
-    return [rows[key] for key in sorted(rows)]
 
 
 def written_sides(root: Path) -> dict[str, str] | None:
@@ -156,14 +118,23 @@ def group_by_side(dataset: Dataset) -> dict[str, list[int]]:
     sides = written_sides(dataset.root)
     if sides is None:
         return {"train": list(range(len(dataset)))}
-    told = [sides.get(sequence.attrs["content_hash"]) for sequence in dataset]
-    groups = {side: [k for k, one in enumerate(told) if one == side] for side in split.SIDES}
+    found = [sides.get(sequence.attrs["content_hash"]) for sequence in dataset]
+    groups = {side: [k for k, one in enumerate(found) if one == side] for side in split.SIDES}
     return {side: chosen for side, chosen in groups.items() if chosen}
 
 
 def write_index(folder: Folder) -> list[dict[str, Any]]:
-    """Brings the index up to date with the folder. Returns all rows."""
-    ordered = collect(folder)
+    """Brings the index up to date with the folder; rows that it has already stay. Returns all rows.
+
+    An index that can't be read is made anew: all that it says is in the stores.
+    """
+    known: dict[int, dict[str, Any]] = {}
+    with suppress(UserError):
+        known = {row["index"]: row for row in read_index(folder.root).to_pylist() if row["status"] == "done"}
+    failures = folder.failures().items()
+    rows = {k: {"index": k, "status": "failed", "reason": failure["reason"]} for k, failure in failures}
+    rows |= {key: known.get(key) or row_of(_open(folder, key)) for key in folder.sealed()}
+    ordered = [rows[key] for key in sorted(rows)]
     sides = split.assign_if_possible(ordered, split.read_rule(folder.root))
     for row, side in zip(ordered, sides, strict=True):
         row["split"] = side
@@ -183,10 +154,11 @@ def row_of(sequence: Sequence) -> dict[str, Any]:
     """The row of a finished sequence, from its attributes."""
     attrs = sequence.attrs
     scenario, summary = attrs.get("scenario", {}), attrs.get("summary", {})
-    gesture = scenario.get("gesture") or {}
+    height, width = sequence.size
     scale, flow = attrs.get("scale_mm_per_px"), summary.get("peak_flow_px")
     stages = [stage for stage in attrs.get("timings", {}).values() if isinstance(stage, dict)]
     return {
+        **{name: attrs.get(name) for name in ("young_kpa", "poisson", "fps", "flow_backend")},
         "index": sequence.index,
         "status": "done",
         "path": sequence.path.name,
@@ -195,18 +167,14 @@ def row_of(sequence: Sequence) -> dict[str, Any]:
         "opening": attrs.get("opening_id"),
         "family": scenario.get("family"),
         "gesture": name_gestures(scenario) or None,
-        "young_kpa": attrs.get("young_kpa"),
-        "poisson": attrs.get("poisson"),
-        "load": gesture.get("load"),
+        "load": (scenario.get("gesture") or {}).get("load"),
         "peak_force_mn": summary.get("peak_force_mn"),
         "peak_flow_px": flow,
         "peak_motion_mm": None if scale is None or flow is None else scale * flow,
         "frames": sequence.frames,
-        "fps": attrs.get("fps"),
-        "width": sequence.size[1],
-        "height": sequence.size[0],
+        "width": width,
+        "height": height,
         "scale_mm_per_px": scale,
-        "flow_backend": attrs.get("flow_backend"),
         "cpu_s": sum(stage.get("cpu_s", 0.0) for stage in stages),
     }
 

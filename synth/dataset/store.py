@@ -25,9 +25,6 @@ from synth.system import packages
 # Raw bytes of one field that are gathered and then written as one file: a shard, its chunks being frames.
 _SHARD_BYTES = 16 << 20
 
-# A chunk is unpacked at once: of a field without frames, or of small ones, no more values than these.
-_CHUNK_VALUES = 1 << 24
-
 # Vector fields whose greatest length is kept as an attribute, in `summary`.
 _PEAKS = {"flow": "peak_flow_px", "traction": "peak_traction_kpa", "force": "peak_force_mn"}
 
@@ -338,8 +335,6 @@ class Sequence:
         types = (dtype, np.dtype("float16")) if field.half else (dtype,)
         if not isinstance(array, zarr.Array) or array.shape != expected or array.dtype not in types:
             raise UserError(f"{where}: is not {field.dtype} {expected}, the store is damaged")
-        if np.prod(array.chunks) > max(np.prod(expected[1:]), _CHUNK_VALUES):
-            raise UserError(f"{where}: is not packed frame by frame, the store is damaged")
         shard = array.shards or array.chunks
         files = -(-expected[0] // shard[0])
         rest = "/0" * (len(expected) - 1)
