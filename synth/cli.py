@@ -205,7 +205,7 @@ def split_command(
     counts = split.count(rows)
     if not counts:
         raise UserError(f"{out}: holds no finished sequence")
-    warning = split.warn_of_strangers(rows, chosen)
+    warning = split.warn_of_shared_brains(rows, chosen)
     if warning:
         print(f"warning: {warning}", file=sys.stderr)
     print(json_.dumps(counts) if json else ", ".join(f"{side} {n}" for side, n in counts.items()))

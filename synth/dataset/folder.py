@@ -106,15 +106,12 @@ class Folder:
 
     def sweep_all(self) -> None:
         """Removes every leftover of interrupted attempts."""
-        for part in self.root.glob("*.zarr.part"):
-            shutil.rmtree(part)
-        for place in (self.root, self.state, self.state / "failed"):
-            for part in place.glob(f".*{checked_file.PART}"):
-                part.unlink()
-        for log in self.logs.glob("worker-*.log"):
-            log.unlink()
-        for abandoned in self.scratch.glob("*"):
-            shutil.rmtree(abandoned)
+        for folder in (*self.root.glob("*.zarr.part"), *self.scratch.glob("*")):
+            shutil.rmtree(folder)
+        places = (self.root, self.state, self.state / "failed")
+        parts = (part for place in places for part in place.glob(f".*{checked_file.PART}"))
+        for file in (*parts, *self.logs.glob("worker-*.log")):
+            file.unlink()
         for radiance in self.root.glob("radiance/[0-9]*"):
             if radiance.name.isascii() and radiance.name.isdigit():
                 self.sweep(int(radiance.name))
@@ -161,14 +158,12 @@ def claim(root: Path, job: Job, *, mix_versions: bool = False) -> Iterator[Folde
         folder.state.mkdir(parents=True, exist_ok=True)
         with _locked(folder.state / "lock") as folder.lock_fd:
             _refuse_foreign(folder, job, name)
-            (folder.state / "failed").mkdir(exist_ok=True)
-            folder.logs.mkdir(exist_ok=True)
-            folder.scratch.mkdir(exist_ok=True)
+            for own in (folder.state / "failed", folder.logs, folder.scratch):
+                own.mkdir(exist_ok=True)
             described = {"identity": name, "generators": makers, "job": job.model_dump(mode="json")}
             write_whole(root / _NAME, json.dumps(described, indent=1) + "\n")
-            write_whole(
-                root / "job.yaml", "# The job of this dataset, every value said.\n" + writer.dump_job(job)
-            )
+            head = "# The job of this dataset, every value said.\n"
+            write_whole(root / "job.yaml", head + writer.dump_job(job))
             folder.pass_turn()
             folder.sweep_all()
             try:
@@ -225,22 +220,22 @@ def _makers(folder: Folder, mix: bool) -> list[dict[str, str]]:
     before: list[dict[str, str]] = folder.described().get("generators", [])
     if now in before and (mix or len(before) == 1):
         return before
-    if not mix:
-        last = before[-1] if before else {}
-        changes = [
-            f"{key} {last.get(key, 'unknown')}, now {now[key]}" for key in now if last.get(key) != now[key]
-        ]
-        what = "; ".join(changes) or "several versions"
-        raise UserError(
-            f"{folder.root}: its {count} sequences were made by another version of this program ({what}): "
-            "choose another folder, or --mix-versions to continue it all the same"
-        )
-    return [*before, now]
+    if mix:
+        return [*before, now]
+    last = before[-1] if before else {}
+    changes = [
+        f"{key} {last.get(key, 'unknown')}, now {now[key]}" for key in now if last.get(key) != now[key]
+    ]
+    raise UserError(
+        f"{folder.root}: its {count} sequences were made by another version of this program "
+        f"({'; '.join(changes) or 'several versions'}): choose another folder, or --mix-versions to continue it "
+        "all the same"
+    )
 
 
 def _changes(before: dict[str, Any], now: dict[str, Any], at: str = "") -> list[str]:
     found = []
-    for key in sorted({**before, **now}.keys() - {"card"}):
+    for key in sorted((before.keys() | now.keys()) - {"card"}):
         old, new = before.get(key), now.get(key)
         if isinstance(old, dict) and isinstance(new, dict):
             found += _changes(old, new, f"{at}{key}.")
@@ -253,16 +248,17 @@ def _changes(before: dict[str, Any], now: dict[str, Any], at: str = "") -> list[
 def _locked(path: Path) -> Iterator[int]:
     """Holds the lock file; its descriptor goes to the workers, so it is held until the last one is gone."""
     descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+    until = time.monotonic() + _LOCK_WAIT_S
     try:
-        until = time.monotonic() + _LOCK_WAIT_S
         while True:
             try:
                 fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                break
             except BlockingIOError:
                 if time.monotonic() > until:
                     raise UserError(f"{path.parents[1]}: another run is writing to it") from None
                 time.sleep(0.1)
+            else:
+                break
         yield descriptor
     finally:
         os.close(descriptor)

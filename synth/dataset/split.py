@@ -162,23 +162,25 @@ def misplaced(rows: Sequence[Mapping[str, Any]], chosen: Rule) -> list[str]:
 
 def leaks(rows: Sequence[Mapping[str, Any]], chosen: Rule | None = None) -> list[str]:
     """Anatomies and contents that are on more than one side, and held-out families that are trained on."""
-    chosen, found = chosen or Rule(), []
-    for row in rows:
-        if row["status"] == "done" and row.get("split") in SIDES[:2] and row["family"] in chosen.held_out:
-            found.append(f"family {row['family']} is held out and in {row['split']}")
+    chosen = chosen or Rule()
     done = [row for row in rows if row["status"] == "done" and row.get("split")]
-    told = {"content_hash": [row["content_hash"] for row in done]}
+    found = [
+        f"family {row['family']} is held out and in {row['split']}"
+        for row in done
+        if row["split"] in SIDES[:2] and row["family"] in chosen.held_out
+    ]
+    keys = {"content_hash": [row["content_hash"] for row in done]}
     if not chosen.share_anatomy:
-        told = {"anatomy": [row["anatomy"] for row in done], **told}
+        keys = {"anatomy": [row["anatomy"] for row in done], **keys}
     elif chosen.by == "opening":
-        told = {"opening": [_name_opening(row) for row in done], **told}
-    for name, keys in told.items():
-        crossing = find_crossings(keys, [row["split"] for row in done])
+        keys = {"opening": [_name_opening(row) for row in done], **keys}
+    for name, values in keys.items():
+        crossing = find_crossings(values, [row["split"] for row in done])
         found += [f"{name} {key} is in {', '.join(on)}" for key, on in crossing.items()]
     return found
 
 
-def warn_of_strangers(rows: Sequence[Mapping[str, Any]], chosen: Rule) -> str | None:
+def warn_of_shared_brains(rows: Sequence[Mapping[str, Any]], chosen: Rule) -> str | None:
     """What to say of brains that are on several sides; None if there are none."""
     done = [row for row in rows if row["status"] == "done" and row.get("split")]
     count = len(find_crossings([row["anatomy"] for row in done], [row["split"] for row in done]))

@@ -335,10 +335,8 @@ class Sequence:
         types = (dtype, np.dtype("float16")) if field.half else (dtype,)
         if not isinstance(array, zarr.Array) or array.shape != expected or array.dtype not in types:
             raise UserError(f"{where}: is not {field.dtype} {expected}, the store is damaged")
-        shard = array.shards or array.chunks
-        files = -(-expected[0] // shard[0])
         rest = "/0" * (len(expected) - 1)
-        for k in range(files):
+        for k in range(-(-expected[0] // (array.shards or array.chunks)[0])):
             # Zarr reads a missing or empty file as zeros.
             if not self._location.size(f"{name}/c/{k}{rest}"):
                 raise UserError(f"{where}: file c/{k}{rest} is missing or empty, the store is damaged")
@@ -405,15 +403,17 @@ def field_hasher(name: str, stored: np.dtype[Any], shape: tuple[int, ...]) -> ha
 
 
 def content_hash(attrs: Mapping[str, Any]) -> str:
-    """Hash of all that a sequence says: field hashes and attributes, without timings and versions."""
-    content = {key: value for key, value in attrs.items() if key not in _NOT_CONTENT}
-    return hashlib.blake2b(identity.canonical(content), digest_size=16).hexdigest()
+    """What names a sequence: hash of field hashes and attributes, without timings and versions."""
+    return _hash({key: value for key, value in attrs.items() if key not in _NOT_CONTENT})
 
 
 def seal_hash(attrs: Mapping[str, Any]) -> str:
     """Hash of all root attributes besides itself: what tells an edited attribute, timings included."""
-    sealed = {key: value for key, value in attrs.items() if key != "seal_hash"}
-    return hashlib.blake2b(identity.canonical(sealed), digest_size=16).hexdigest()
+    return _hash({key: value for key, value in attrs.items() if key != "seal_hash"})
+
+
+def _hash(values: Mapping[str, Any]) -> str:
+    return hashlib.blake2b(identity.canonical(values), digest_size=16).hexdigest()
 
 
 def _field(name: str) -> Field:
@@ -429,7 +429,5 @@ def _check_limits(field: Field, values: NDArray[Any], where: str) -> None:
     low, high = float(values.min()), float(values.max())  # both are NaN where one value is
     if not np.isfinite(low + high):
         raise UserError(f"{where}: holds values that are no numbers")
-    least = -np.inf if field.low is None else field.low
-    most = np.inf if field.high is None else field.high
-    if low < least or high > most:
+    if (field.low is not None and low < field.low) or (field.high is not None and high > field.high):
         raise UserError(f"{where}: values from {low:g} to {high:g} {field.unit} can't be right")

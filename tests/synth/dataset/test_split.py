@@ -107,7 +107,7 @@ def test_openings_of_one_brain_are_kept_apart_and_said_to_be_no_strangers() -> N
     assert {next(iter(on[f"mesh-1 at {k}"])) for k in range(5)} == set(split.SIDES)
     # The procedural rows have the same contents as the brain's: only that is a leak here.
     assert not [line for line in split.leaks(given, rule) if not line.startswith("content_hash")]
-    warning = split.warn_of_strangers(given, rule)
+    warning = split.warn_of_shared_brains(given, rule)
     assert warning is not None
     assert warning.startswith("1 brain is on several sides: openings of one brain are no strangers")
 
