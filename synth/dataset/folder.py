@@ -226,10 +226,10 @@ def _makers(folder: Folder, mix: bool) -> list[dict[str, str]]:
     changes = [
         f"{key} {last.get(key, 'unknown')}, now {now[key]}" for key in now if last.get(key) != now[key]
     ]
+    what = "; ".join(changes) or "several versions"
     raise UserError(
-        f"{folder.root}: its {count} sequences were made by another version of this program "
-        f"({'; '.join(changes) or 'several versions'}): choose another folder, or --mix-versions to continue it "
-        "all the same"
+        f"{folder.root}: its {count} sequences were made by another version of this program ({what}): "
+        "choose another folder, or --mix-versions to continue it all the same"
     )
 
 
