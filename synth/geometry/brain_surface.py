@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from synth.errors import UserError
-from synth.geometry import vtk
+from synth.geometry.triangles import Shape
+from synth.geometry.vtk import read_vtk
 from synth.job import identity
 from synth.job.schema import AttachmentSection, CraniotomySection
 from synth.system import checked_file
@@ -26,10 +27,7 @@ KINDS = ("obj", "stl", "ply", "off", "vtk")
 class Brain:
     """A surface in world axes: z out of the brain, origin at the craniotomy's centre. It may have holes."""
 
-    vertices: Floats
-    """(V, 3) mm."""
-    faces: NDArray[np.int32]
-    """(F, 3)."""
+    shape: Shape
     origin: Floats
     """(3,) mm, the craniotomy's centre in the file's axes."""
     turn: Floats
@@ -73,7 +71,7 @@ def load_brain(path: Path, craniotomy: CraniotomySection) -> Brain:
         )
     placed[:, 2] -= heights.max()
     origin = origin + heights.max() * turn[2]
-    return Brain(np.ascontiguousarray(placed), faces.astype(np.int32), origin, turn)
+    return Brain(Shape(np.ascontiguousarray(placed), faces.astype(np.int32)), origin, turn)
 
 
 def read_brain(path: Path) -> tuple[Floats, NDArray[np.int64]]:
@@ -121,7 +119,7 @@ def _read(path: Path) -> tuple[Floats, NDArray[np.int64]]:
 
     try:
         if kind == "vtk":
-            return _merged(*vtk.read_vtk(data))
+            return _merged(*read_vtk(data))
         # Given bytes, trimesh has no folder in which to look for further files that this one names.
         mesh = trimesh.load(io.BytesIO(data), file_type=kind, force="mesh", process=False)
     except Exception as error:  # each format's reader raises what it likes

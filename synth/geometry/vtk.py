@@ -20,93 +20,81 @@ def read_vtk(data: bytes) -> tuple[Floats, Ints]:
     """Vertices (V, 3) and triangles (F, 3) of a file's bytes; polygons are cut into fans.
 
     Raises:
-        ValueError: no legacy VTK file of polygons.
+        ValueError: no legacy VTK file of polygons. Others: it is damaged.
     """
-    return _Reader(data).surface()
+    file = _Reader(data)
+    points, cells, kinds = np.zeros((0, 3)), None, None
+    while (cells is None or kinds is None) and (words := file.words()):
+        key = words[0].upper()
+        if key == "DATASET" and words[1].upper() not in ("POLYDATA", "UNSTRUCTURED_GRID"):
+            raise ValueError(f"it holds {words[1]}, no polygons")
+        if key == "POINTS":
+            points = file.numbers(3 * int(words[1]), words[2]).reshape(-1, 3).astype(np.float64)
+        elif key in ("POLYGONS", "CELLS", "VERTICES", "LINES"):
+            found = file.cells(int(words[1]), int(words[2]))
+            if key in ("POLYGONS", "CELLS"):
+                cells, kinds = found, np.full(len(found), _POLYGON) if key == "POLYGONS" else None
+        elif key == "TRIANGLE_STRIPS":
+            raise ValueError("it holds triangle strips; write triangles")
+        elif key == "CELL_TYPES":
+            kinds = file.numbers(int(words[1]), "int")
+    if cells is None or kinds is None:
+        raise ValueError("it holds no polygons")
+    flat = [c for c, kind in zip(cells, kinds, strict=True) if kind in (_TRIANGLE, _POLYGON, _QUAD)]
+    fans = [(cell[0], cell[k], cell[k + 1]) for cell in flat for k in range(1, len(cell) - 1)]
+    faces = np.array(fans, np.int64).reshape(-1, 3)
+    if len(faces) and not 0 <= faces.min() <= faces.max() < len(points):
+        raise ValueError("a polygon names a point that is not there")
+    return points, faces
 
 
 class _Reader:
     """The file's bytes, and how far they have been read."""
 
     def __init__(self, data: bytes) -> None:
-        self._data, self._at = data, 0
-        if not self._line().startswith("# vtk DataFile"):
+        head = data.split(b"\n", 3)
+        kind = head[2].strip().upper() if len(head) == 4 else b""  # head[1] is the title
+        if not head[0].startswith(b"# vtk DataFile") or kind not in (b"ASCII", b"BINARY"):
             raise ValueError("no legacy VTK file")
-        self._line(empty=True)  # the title
-        kind = self._line().strip().upper()
-        if kind not in ("ASCII", "BINARY"):
-            raise ValueError(f"{kind[:20]!r} is neither ASCII nor BINARY")
-        self._binary = kind == "BINARY"
+        self._data, self._at, self._binary = data, len(data) - len(head[3]), kind == b"BINARY"
 
-    def surface(self) -> tuple[Floats, Ints]:
-        points, cells, kinds = np.zeros((0, 3)), None, None
-        while self._at < len(self._data) and (cells is None or kinds is None):
-            words = self._line().split()
-            key = words[0].upper() if words else ""
-            if key == "DATASET" and words[1].upper() not in ("POLYDATA", "UNSTRUCTURED_GRID"):
-                raise ValueError(f"it holds {words[1]}, no polygons")
-            if key == "POINTS":
-                points = self._numbers(3 * int(words[1]), words[2]).reshape(-1, 3).astype(np.float64)
-            elif key in ("POLYGONS", "CELLS"):
-                cells = self._cells(int(words[1]), int(words[2]))
-                kinds = np.full(len(cells), _POLYGON) if key == "POLYGONS" else None
-            elif key in ("VERTICES", "LINES"):
-                self._cells(int(words[1]), int(words[2]))
-            elif key == "TRIANGLE_STRIPS":
-                raise ValueError("it holds triangle strips; write triangles")
-            elif key == "CELL_TYPES":
-                kinds = self._numbers(int(words[1]), "int")
-        if cells is None or kinds is None:
-            raise ValueError("it holds no polygons")
-        flat = [
-            cell
-            for cell, kind in zip(cells, kinds, strict=True)
-            if kind in (_TRIANGLE, _POLYGON, _QUAD) and len(cell) >= 3
-        ]
-        faces = [(cell[0], cell[k], cell[k + 1]) for cell in flat for k in range(1, len(cell) - 1)]
-        found = np.array(faces, np.int64).reshape(-1, 3)
-        if len(found) and not 0 <= found.min() <= found.max() < len(points):
-            raise ValueError("a polygon names a point that is not there")
-        return points, found
-
-    def _cells(self, count: int, size: int) -> list[Ints]:
-        """Point numbers of each cell."""
-        start = self._at
-        words = self._line().split()
-        if words and words[0].upper() == "OFFSETS":  # since 5.1: `count` offsets, then `size` point numbers
-            offsets = self._numbers(count, words[1])
-            words = self._line().split()
-            return np.split(self._numbers(size, words[1]).astype(np.int64), offsets[1:-1])
-        self._at = start
-        numbers, cells, at = self._numbers(size, "int").astype(np.int64), [], 0
-        for _ in range(count):
-            cells.append(numbers[at + 1 : at + 1 + int(numbers[at])])
-            at += 1 + int(numbers[at])
-        return cells
-
-    def _line(self, empty: bool = False) -> str:
-        """The next line; one that is empty only if asked for."""
+    def words(self) -> list[str]:
+        """Of the next line that has any; none at the end."""
         while self._at < len(self._data):
             end = self._data.find(b"\n", self._at)
             end = len(self._data) if end < 0 else end
-            line = self._data[self._at : end].decode("latin-1").strip()
+            found = self._data[self._at : end].decode("latin-1").split()
             self._at = end + 1
-            if line or empty:
-                return line
-        return ""
+            if found:
+                return found
+        return []
 
-    def _numbers(self, count: int, kind: str) -> NDArray[np.number]:
-        try:
-            dtype = np.dtype(_TYPES[kind.lower()])
-        except KeyError:
-            raise ValueError(f"numbers of the type {kind!r}") from None
+    def numbers(self, count: int, kind: str) -> NDArray[np.number]:
+        """The next `count` numbers of a type."""
+        if kind.lower() not in _TYPES:
+            raise ValueError(f"numbers of the type {kind!r}")
+        dtype = np.dtype(_TYPES[kind.lower()])
         if self._binary:
             found = np.frombuffer(self._data, dtype, count, self._at)
             self._at += found.nbytes
             return found.astype(dtype.newbyteorder("="))
-        words: list[bytes] = []
-        while len(words) < count and self._at < len(self._data):
-            words += self._line().encode().split()
+        words: list[str] = []
+        while len(words) < count and (more := self.words()):
+            words += more
         if len(words) != count:
             raise ValueError("it ends early")
         return np.array(words).astype(dtype.newbyteorder("="))
+
+    def cells(self, count: int, size: int) -> list[Ints]:
+        """Point numbers of each cell."""
+        start = self._at
+        words = self.words()
+        if words[:1] == ["OFFSETS"]:  # since 5.1: `count` offsets, then `size` point numbers
+            offsets = self.numbers(count, words[1])
+            return np.split(self.numbers(size, self.words()[1]).astype(np.int64), offsets[1:-1])
+        self._at = start
+        numbers, cells, at = self.numbers(size, "int").astype(np.int64), [], 0
+        for _ in range(count):
+            cells.append(numbers[at + 1 : at + 1 + int(numbers[at])])
+            at += 1 + int(numbers[at])
+        return cells

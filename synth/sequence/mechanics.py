@@ -50,14 +50,10 @@ def cortex(job: Job, case: Scenario) -> tuple[CortexSurface, Brain | None]:
 def _cortex(section: AnatomySection, relief: Relief, written: object) -> tuple[CortexSurface, Brain | None]:
     """As `cortex`; `written` tells a mesh from one that replaced it."""
     brain = None if section.mesh is None else load_brain(section.mesh, section.craniotomy)
-    if brain is None:
-        surface = anatomy.procedural(relief, section)
-    else:
-        surface = anatomy.from_brain(brain.vertices, brain.faces, relief, section)
-    for shared in (surface, brain):
-        for value in vars(shared).values() if shared else ():
-            if isinstance(value, np.ndarray):
-                value.flags.writeable = False
+    surface = anatomy.grow(relief, section, brain.shape if brain else None)
+    for value in (*vars(surface).values(), *(brain.shape if brain else ())):
+        if isinstance(value, np.ndarray):
+            value.flags.writeable = False
     return surface, brain
 
 

@@ -20,7 +20,6 @@ from synth.render.anatomy.surface import Relief
 from synth.render.appearance.family import FAMILIES, Colour
 from synth.render.appearance.light import Lighting, balance
 from synth.render.appearance.look import Look
-from synth.render.camera import camera
 from synth.render.camera.camera import CameraView
 from synth.render.camera.camera_motion import CameraMotion
 from synth.render.camera.camera_sensor import CameraSensor
@@ -94,7 +93,6 @@ def draw(job: Job, index: int) -> Scenario:
     opening_mm = job.anatomy.craniotomy.radius_mm
     gestures = draw_gestures(job.fem, opening_mm, tissue.young_kpa, generator(_GESTURE), generator(_FURTHER))
     look = draw_look(job, family, generator(_LOOK))
-    view = camera.calibrated(view, job.render)
     return Scenario(
         index, anatomy, family, relief, tissue, gestures[0], gestures[1:], look, view, sway, pulse
     )
@@ -284,7 +282,7 @@ def _draw_timing(kind: str, rng: Random) -> tuple[float, float, float, float]:
 
 
 def draw_view(render: RenderSection, rng: Random) -> CameraView:
-    """Where the microscope stands; a calibration is left to `camera.calibrated`."""
+    """Where the microscope stands; of a calibrated one the lens is known better, see `camera.calibrated`."""
     return CameraView(
         field_mm=_uniform(rng, render.field_mm),
         working_distance_mm=_uniform(rng, render.working_distance_mm),

@@ -220,6 +220,8 @@ def simulate(
     report, watch = report or (lambda stage, done, of: None), watch or Stopwatch()
     case = case or scenario.draw(job, index)
     view = camera.place(case.view, job.render)
+    if job.render.calibration is not None:
+        case = replace(case, view=camera.calibrated(case.view, view))
     report("mesh", 0, 1)
     with watch.stage("mesh"):
         surface, tets = mechanics.build(job, case)

@@ -120,7 +120,7 @@ def refuse_large(width: int, height: int) -> None:
         raise ValueError(f"{width} x {height} pixels, at most {LARGEST_PIXELS // 10**6} million are read")
 
 
-def read_storage(name: str, text: str) -> dict[str, Any]:
+def read_storage(path: Path, largest: int = LARGEST_STORAGE) -> dict[str, Any]:
     """Matrices (float64 arrays) and numbers at the top of an OpenCV FileStorage: YAML, XML or JSON.
 
     Raises:
@@ -128,7 +128,8 @@ def read_storage(name: str, text: str) -> dict[str, Any]:
     """
     import cv2
 
-    with as_user_error(f"{name}: is no OpenCV calibration"):
+    text = read_text(path, largest)
+    with as_user_error(f"{path}: is no OpenCV calibration"):
         if sum(1 for _ in _NESTED.finditer(text)) > _MOST_NESTED:
             raise ValueError(f"more than {_MOST_NESTED} nested values")
         storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)

@@ -209,8 +209,8 @@ def _bricks(size: Floats, count: float) -> tuple[Floats, Ints]:
 
 def _filled(brain: Brain, grading: Callable[[Floats], Floats], tets: int) -> tuple[Floats, Ints]:
     """Graded tetrahedra inside a surface: about as many as wanted, after a few tries."""
-    turns = winding.prepare(brain.vertices, brain.faces)
-    low, high = brain.vertices.min(axis=0), brain.vertices.max(axis=0)
+    turns = winding.prepare(*brain.shape)
+    low, high = brain.shape.vertices.min(axis=0), brain.shape.vertices.max(axis=0)
     size = 1.1 * (high - low)
 
     def wanted(at: Floats) -> Floats:

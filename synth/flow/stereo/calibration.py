@@ -29,7 +29,7 @@ def read_rig(path: Path, size: tuple[int, int], mm_per_unit: float = 1.0) -> Ste
     Raises:
         UserError: it cannot be read, or what it holds are no two cameras.
     """
-    held = checked_file.read_storage(str(path), checked_file.read_text(path, checked_file.LARGEST_STORAGE))
+    held = checked_file.read_storage(path)
 
     def matrix(names: Sequence[str], what: str) -> Floats:
         first = next((held[name] for name in names if isinstance(held.get(name), np.ndarray)), None)

@@ -6,7 +6,6 @@ what lies deeper is never seen.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
@@ -15,7 +14,7 @@ import numpy.typing as npt
 from scipy.ndimage import distance_transform_edt
 
 from synth.errors import UserError
-from synth.geometry.triangles import grid_faces
+from synth.geometry.triangles import Shape, grid_faces
 from synth.job import schema
 from synth.render.anatomy import noise, tube, vessels
 from synth.render.anatomy.tree import Tree
@@ -65,49 +64,41 @@ class CortexSurface:
     """Seed of everything else that belongs to this anatomy."""
 
 
-def procedural(relief: Relief, anatomy: schema.AnatomySection) -> CortexSurface:
-    """A cortex of winding gyri on a dome, with veins that stand out of it."""
-    extent = _extent(anatomy)
-    sulci = _folds(relief, extent)
-    return _surface(
-        lambda xy: _dome(xy, anatomy.dome_mm) - relief.sulcus_mm * noise.sample(sulci, xy, extent),
-        sulci,
-        relief,
-        anatomy,
-        extent,
-    )
-
-
-def from_brain(
-    vertices: Floats, faces: npt.NDArray[np.int32], relief: Relief, anatomy: schema.AnatomySection
-) -> CortexSurface:
-    """The part of a user's brain under the opening, seen from outside.
+def grow(relief: Relief, anatomy: schema.AnatomySection, brain: Shape | None = None) -> CortexSurface:
+    """A cortex under the opening, with veins that stand out of it.
 
     Args:
-        vertices: (V, 3) mm, world axes (z out of the brain, origin at the craniotomy's centre).
-        faces: (F, 3); any winding, holes and duplicates allowed.
-        relief: what the job drew; the user's own folds stand in for its relief.
+        relief: what the job drew; a user's own folds stand in for its relief.
         anatomy: the job's section.
+        brain: a user's, z out of it, origin at the craniotomy's centre; any winding, holes and duplicates
+            allowed. None: winding gyri on a dome.
 
     Raises:
         UserError: there is no surface under the opening.
     """
     extent = _extent(anatomy)
-    height = _height_map(vertices, faces, extent, _RELIEF_PX // 2)
-    if np.isnan(height).mean() > 1 - LEAST_FILLED:
-        raise UserError(
-            "anatomy.craniotomy: the brain's surface does not fill the opening there; `synth preview` of the "
-            "mesh finds places that work"
-        )
-    height = _filled(height)
-    # The arachnoid bridges what is narrower than itself: a closing, then a smoothing.
-    pixel = extent / len(height)
-    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * int(2.0 / pixel) + 1,) * 2)
-    bridged = cv2.morphologyEx(height, cv2.MORPH_CLOSE, disc)
-    outer = noise.blur(np.maximum(height, bridged - relief.sulcus_mm), 0.7, extent)
-    depth = noise.blur(outer, 4.0, extent) - outer
-    sulci = np.clip(depth / max(float(np.quantile(depth, 0.98)), 1e-6), 0, 1).astype(np.float32)
-    return _surface(lambda xy: noise.sample(outer, xy, extent), sulci, relief, anatomy, extent)
+    side = max(20, round(anatomy.vertices**0.5))
+    axis = np.linspace(-extent / 2, extent / 2, side)
+    x, y = np.meshgrid(axis, axis)
+    xy = np.stack([x.ravel(), y.ravel()], axis=1)
+    if brain is None:
+        sulci = _folds(relief, extent)
+        pia = _dome(xy, anatomy.dome_mm) - relief.sulcus_mm * noise.sample(sulci, xy, extent)
+    else:
+        outer, sulci = _under_opening(brain, relief, extent)
+        pia = noise.sample(outer, xy, extent).astype(np.float64)
+    tree = vessels.grow_all(sulci, extent, np.random.default_rng([relief.seed, 1]))
+    z = pia + noise.sample(bulge(tree.veins, extent), xy, extent)
+    return CortexSurface(
+        vertices=np.concatenate([xy, z[:, None]], axis=1),
+        faces=grid_faces(side, side).reshape(-1, 3),
+        pia=pia.reshape(side, side),
+        uv=(xy / extent + 0.5).astype(np.float32),
+        extent_mm=extent,
+        sulci=sulci,
+        vessels=tree,
+        seed=relief.seed,
+    )
 
 
 def bulge(tree: Tree, extent_mm: float) -> Map:
@@ -139,35 +130,28 @@ def _folds(relief: Relief, extent_mm: float) -> Map:
     return noise.blur((valley * fade).astype(np.float32), 0.25, extent_mm)
 
 
-def _surface(
-    height: Callable[[Floats], npt.NDArray[np.floating]],
-    sulci: Map,
-    relief: Relief,
-    anatomy: schema.AnatomySection,
-    extent: float,
-) -> CortexSurface:
-    rng = np.random.default_rng([relief.seed, 1])
-    tree = vessels.grow_all(sulci, extent, rng)
-    side = max(20, round(anatomy.vertices**0.5))
-    axis = np.linspace(-extent / 2, extent / 2, side)
-    x, y = np.meshgrid(axis, axis)
-    xy = np.stack([x.ravel(), y.ravel()], axis=1)
-    pia = height(xy).astype(np.float64)
-    z = pia + noise.sample(bulge(tree.veins, extent), xy, extent)
-    return CortexSurface(
-        vertices=np.concatenate([xy, z[:, None]], axis=1),
-        faces=grid_faces(side, side).reshape(-1, 3),
-        pia=pia.reshape(side, side),
-        uv=(xy / extent + 0.5).astype(np.float32),
-        extent_mm=extent,
-        sulci=sulci,
-        vessels=tree,
-        seed=relief.seed,
-    )
+def _under_opening(brain: Shape, relief: Relief, extent: float) -> tuple[Map, Map]:
+    """Height (n, n) mm of a brain as the arachnoid bridges it, and its sulci (n, n) from 0 to 1."""
+    height = _height_map(brain, extent, _RELIEF_PX // 2)
+    if np.isnan(height).mean() > 1 - LEAST_FILLED:
+        raise UserError(
+            "anatomy.craniotomy: the brain's surface does not fill the opening there; `synth preview` of the "
+            "mesh finds places that work"
+        )
+    height = _filled(height)
+    # The arachnoid bridges what is narrower than itself: a closing, then a smoothing.
+    pixel = extent / len(height)
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * int(2.0 / pixel) + 1,) * 2)
+    bridged = cv2.morphologyEx(height, cv2.MORPH_CLOSE, disc)
+    outer = noise.blur(np.maximum(height, bridged - relief.sulcus_mm), 0.7, extent)
+    depth = noise.blur(outer, 4.0, extent) - outer
+    sulci = np.clip(depth / max(float(np.quantile(depth, 0.98)), 1e-6), 0, 1).astype(np.float32)
+    return outer, sulci
 
 
-def _height_map(vertices: Floats, faces: npt.NDArray[np.int32], extent: float, pixels: int) -> Map:
+def _height_map(surface: Shape, extent: float, pixels: int) -> Map:
     """Highest point of the surface over each pixel, (n, n) mm; NaN where there is none."""
+    vertices, faces = surface
     scale = pixels / extent
     flat = (vertices[:, :2] / extent + 0.5) * pixels - 0.5
     corners = flat[faces]

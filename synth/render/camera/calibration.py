@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -69,12 +68,13 @@ def read(path: Path) -> CameraCalibration:
     Raises:
         UserError: it cannot be read, or what it holds is no pinhole with Brown-Conrady distortion.
     """
+    largest, is_json = identity.FILES["render", "calibration"], path.suffix.lower() == ".json"
     try:
-        text = checked_file.read_text(path, identity.FILES["render", "calibration"])
-        is_json = path.suffix.lower() == ".json"
-        found = _json(path, text) if is_json else checked_file.read_storage(path.name, text)
+        found = checked_file.read_json(path, largest) if is_json else checked_file.read_storage(path, largest)
     except UserError as error:
         raise UserError(f"render.calibration: {error}") from None
+    if not isinstance(found, dict):
+        raise UserError(f"render.calibration: {path.name}: holds no named values")
     K = _array(path, found, _MATRIX, "camera matrix")
     if K.shape != (3, 3):
         raise UserError(f"render.calibration: {path.name}: the camera matrix is {K.shape}, not 3 x 3")
@@ -103,16 +103,6 @@ def read(path: Path) -> CameraCalibration:
                     f"render.calibration: {path.name}: {wide} and {tall} are no size of a picture"
                 )
     return CameraCalibration(K, np.resize(np.append(lens, np.zeros(5)), 5), size)
-
-
-def _json(path: Path, text: str) -> dict[str, Any]:
-    try:
-        found = json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise UserError(f"{path.name}: is no JSON ({error})") from error
-    if not isinstance(found, dict):
-        raise UserError(f"{path.name}: holds no named values")
-    return found
 
 
 def _array(path: Path, found: dict[str, Any], names: tuple[str, ...], what: str) -> Floats:

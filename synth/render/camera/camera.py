@@ -66,16 +66,6 @@ class Camera:
         return -self.rotation.T @ self.translation
 
 
-def calibrated(view: CameraView, render: RenderSection) -> CameraView:
-    """The view with the field and principal point of `render.calibration`, if there is one."""
-    if render.calibration is None:
-        return view
-    K, width = calibration.read(render.calibration).fitted(render.size), render.size[0]
-    x, y = (K[:2, 2] - (np.array(render.size) - 1) / 2) / width
-    field_mm = float(width * view.working_distance_mm / K[0, 0])
-    return replace(view, field_mm=field_mm, off_centre=(float(x), float(y)))
-
-
 def place(view: CameraView, render: RenderSection) -> Camera:
     """The camera of `view`, looking at the world's origin from its working distance."""
     width, height = render.size
@@ -108,6 +98,14 @@ def place(view: CameraView, render: RenderSection) -> Camera:
         focus_mm=view.working_distance_mm + view.focus_mm,
         mm_per_px=float(view.working_distance_mm / K[0, 0]),
     )
+
+
+def calibrated(view: CameraView, lens: Camera) -> CameraView:
+    """The view with the field and principal point of a calibrated lens that `place` put there."""
+    width, _ = lens.size
+    x, y = (lens.K[:2, 2] - (np.array(lens.size) - 1) / 2) / width
+    field_mm = float(width * view.working_distance_mm / lens.K[0, 0])
+    return replace(view, field_mm=field_mm, off_centre=(float(x), float(y)))
 
 
 def refuse_unfit(render: RenderSection) -> None:

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from synth.geometry.triangles import Shape
 from synth.job.schema import Job, LightSection, RenderSection
 from synth.render.anatomy import surface as anatomy
 from synth.render.anatomy import texture
@@ -29,7 +30,7 @@ def brain() -> CortexSurface:
     corners = points[ball.faces].reshape(-1, 3)
     faces = np.arange(len(corners)).reshape(-1, 3).astype(np.int32)
     faces[::2] = faces[::2, ::-1]
-    return anatomy.from_brain(corners, faces, Relief(3, 12.0, 1.0), JOB.anatomy)
+    return anatomy.grow(Relief(3, 12.0, 1.0), JOB.anatomy, Shape(corners, faces))
 
 
 def test_a_users_brain_keeps_its_shape(brain: CortexSurface) -> None:

@@ -29,7 +29,7 @@ def made(
         render=RenderSection.model_validate(settings),
         store=StoreSection(extra=extra),
     )
-    surface = anatomy.procedural(scenario.draw_relief(job.anatomy, np.random.default_rng(4)), job.anatomy)
+    surface = anatomy.grow(scenario.draw_relief(job.anatomy, np.random.default_rng(4)), job.anatomy)
     view = scenario.draw_view(job.render, np.random.default_rng(4))
     look = scenario.draw_look(job, "healthy", np.random.default_rng(4))
     return Renderer(surface, look, camera.place(view, job.render), job), surface.vertices

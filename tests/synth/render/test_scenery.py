@@ -20,7 +20,7 @@ SHAFTS = np.array([[0.6, 0.3, 0.74], [0.6, 0.3, 0.74]])
 def made(parts: tuple[str, ...], tool: bool = False) -> tuple[Renderer, np.ndarray]:
     render = {"size": (96, 72), "variant": "scalar_rgb", "tool": tool, "scenery": parts}
     job = Job(anatomy=AnatomySection(vertices=2500), render=RenderSection.model_validate(render))
-    surface = anatomy.procedural(scenario.draw_relief(job.anatomy, np.random.default_rng(4)), job.anatomy)
+    surface = anatomy.grow(scenario.draw_relief(job.anatomy, np.random.default_rng(4)), job.anatomy)
     view = scenario.draw_view(job.render, np.random.default_rng(4))
     look = replace(scenario.draw_look(job, "healthy", np.random.default_rng(4)), scenery=parts)
     return Renderer(surface, look, camera.place(view, job.render), job), surface.vertices

@@ -22,7 +22,7 @@ NOTHING = Shape(np.array([[0.0, 0.0, -900.0]] * 3), np.array([[0, 1, 2]], np.int
 @pytest.fixture(scope="module")
 def surface() -> CortexSurface:
     section = AnatomySection(vertices=2500)
-    return anatomy.procedural(scenario.draw_relief(section, np.random.default_rng(5)), section)
+    return anatomy.grow(scenario.draw_relief(section, np.random.default_rng(5)), section)
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +41,7 @@ def bump(surface: CortexSurface) -> np.ndarray:
 def test_rays_meet_what_trimesh_meets_even_where_triangles_bow() -> None:
     """Faces of up to some 20 px through a lens 60 mm away that shortens the corner by a tenth."""
     section = AnatomySection(vertices=400)
-    coarse = anatomy.procedural(scenario.draw_relief(section, np.random.default_rng(5)), section)
+    coarse = anatomy.grow(scenario.draw_relief(section, np.random.default_rng(5)), section)
     bent = (-0.9, 0.8, 0.01, -0.01, 0.0)
     render = RenderSection(size=(320, 240), working_distance_mm=(60.0, 60.0), distortion=bent)
     near = camera.place(scenario.draw_view(render, np.random.default_rng(2)), render)

@@ -22,13 +22,13 @@ def test_every_anatomy_grows(radius_mm: float) -> None:
     """Small openings have trunks so short that none of their nodes may be drawn to sprout."""
     section = AnatomySection.model_validate({"craniotomy": {"radius_mm": radius_mm}, "vertices": 900})
     for seed in range(1 if radius_mm > 5 else 4):
-        made = surface.procedural(scenario.draw_relief(section, np.random.default_rng(seed)), section)
+        made = surface.grow(scenario.draw_relief(section, np.random.default_rng(seed)), section)
         assert np.isfinite(made.vertices).all()
 
 
 def test_every_twig_has_a_parent() -> None:
     section = AnatomySection()
-    made = surface.procedural(scenario.draw_relief(section, np.random.default_rng(3)), section)
+    made = surface.grow(scenario.draw_relief(section, np.random.default_rng(3)), section)
     for tree in (made.vessels.arteries, made.vessels.veins, made.vessels.deep):
         child = np.flatnonzero(tree.parent >= 0)
         assert (tree.parent[child] < child).all()

@@ -110,11 +110,13 @@ def test_pictures_are_bounded_before_they_are_decoded(tmp_path: Path) -> None:
             checked_file.read_picture(tmp_path / name)
 
 
-def test_a_storage_of_opencv_is_bounded() -> None:
+def test_a_storage_of_opencv_is_bounded(tmp_path: Path) -> None:
+    path = tmp_path / "a"
     matrix = (
         "%YAML:1.0\n---\nK: !!opencv-matrix\n  rows: 1\n  cols: 2\n  dt: d\n  data: [ 1., 2. ]\nwidth: 5\n"
     )
-    held = checked_file.read_storage("a", matrix)
+    path.write_text(matrix)
+    held = checked_file.read_storage(path)
     assert held["K"].tolist() == [[1, 2]]
     assert held["width"] == 5
     head, deep = "%YAML:1.0\n---\nK: ", 100_000
@@ -127,8 +129,9 @@ def test_a_storage_of_opencv_is_bounded() -> None:
         matrix.replace("rows: 1", "rows: 99999"),
         "",
     ):
+        path.write_text(text)
         with pytest.raises(UserError):
-            checked_file.read_storage("a", text)
+            checked_file.read_storage(path)
 
 
 @pytest.mark.parametrize("data", [b"[" * 100_000, b"{", b"\xff\xfe", b"9" * 10_000], ids=range(4))
