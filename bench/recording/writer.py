@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from ruamel.yaml import YAML
 
-from synth.errors import UserError
 from synth.system.checked_file import folder_of as write_whole_folder
+from synth.video.write import encode
 
 if TYPE_CHECKING:
     from synth.render.camera.camera import Camera
@@ -81,24 +80,17 @@ def write_video(
         crf: x264's quality, 0 is lossless (4:4:4 colour).
         progress: told how many frames are written.
     """
+    options = {"crf": str(crf), "threads": "1"}
+    rate = max(1, round((len(times_s) - 1) / max(times_s[-1] - times_s[0], 1e-3)))
+
+    def even() -> Iterator[NDArray[np.uint8]]:
+        for k, rgb in enumerate(pictures):
+            yield rgb[: rgb.shape[0] // 2 * 2, : rgb.shape[1] // 2 * 2]
+            progress(k + 1)
+
     # By "file:" a colon in the path is no protocol.
     with av.open(f"file:{path}", "w", format="mp4") as container:
-        rate = max(1, round((len(times_s) - 1) / max(times_s[-1] - times_s[0], 1e-3)))
-        stream = container.add_stream("libx264", rate=rate, options={"crf": str(crf), "threads": "1"})
-        stream.codec_context.time_base = stream.time_base = Fraction(1, 90_000)
-        stream.pix_fmt = "yuv444p" if crf == 0 else "yuv420p"
-        for k, (rgb, time) in enumerate(zip(pictures, times_s, strict=True)):
-            even = rgb[: rgb.shape[0] // 2 * 2, : rgb.shape[1] // 2 * 2]
-            if k == 0:
-                stream.height, stream.width = even.shape[:2]
-            if even.shape[:2] != (stream.height, stream.width) or not even.size:
-                raise UserError(f"{path}: frame {k} of {rgb.shape[1]} x {rgb.shape[0]} px doesn't fit")
-            frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(even), format="rgb24")
-            frame.pts = round(float(time - times_s[0]) * 90_000)
-            frame.time_base = Fraction(1, 90_000)
-            container.mux(stream.encode(frame))
-            progress(k + 1)
-        container.mux(stream.encode())
+        encode(container, even(), rate, "yuv444p" if crf == 0 else "yuv420p", options, times_s=times_s)
 
 
 def _csv(path: Path, head: str, line: str, rows: Floats) -> None:

@@ -1,16 +1,23 @@
-"""Films written so that browsers play them."""
+"""Films written: the one H.264 encoder."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from fractions import Fraction
+from itertools import repeat
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from synth.errors import UserError
 from synth.system import checked_file
+
+if TYPE_CHECKING:
+    from av.container import OutputContainer
+
+_TICKS = 90_000  # a second
 
 
 def encode_video(
@@ -28,18 +35,56 @@ def encode_video(
     """
     import av
 
+    # Without these, players take large pictures for BT.709 and show other colours than were put in.
+    colours = {"colorspace": "smpte170m", "color_primaries": "bt709", "color_trc": "iec61966-2-1"}
+    options = {"crf": str(quality), "g": str(group), "threads": "1", **colours, "color_range": "tv"}
     # By "file:" a colon in the path is no protocol.
     with checked_file.part_of(target) as part, av.open(f"file:{part}", "w", format="mp4") as container:
-        stream: Any = container.add_stream("h264", rate=Fraction(fps).limit_denominator(1000))
-        # Unsaid, players take large pictures for BT.709 and show other colours than were put in.
-        told = {"colorspace": "smpte170m", "color_primaries": "bt709", "color_trc": "iec61966-2-1"}
-        packing = {"crf": str(quality), "g": str(group), "threads": "1"}
-        stream.pix_fmt, stream.options = "yuv420p", {**packing, **told, "color_range": "tv"}
-        for k, picture in enumerate(film):
-            even = picture[: picture.shape[0] // 2 * 2, : picture.shape[1] // 2 * 2]
-            if k == 0:
-                stream.height, stream.width = even.shape[:2]
-            frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(even), format="rgb24")
-            container.mux(stream.encode(frame))
-        container.mux(stream.encode(None))
+        even = (picture[: picture.shape[0] // 2 * 2, : picture.shape[1] // 2 * 2] for picture in film)
+        encode(container, even, Fraction(fps).limit_denominator(1000), "yuv420p", options)
     return target
+
+
+def encode(
+    container: OutputContainer,
+    film: Iterable[NDArray[np.uint8]],
+    rate: Fraction | int,
+    pixels: str,
+    options: Mapping[str, str],
+    *,
+    bits_per_s: int | None = None,
+    times_s: NDArray[np.float64] | None = None,
+) -> None:
+    """Encodes frames as the one stream of an open file, with H.264.
+
+    Args:
+        container: the file.
+        film: (H, W, 3) uint8 sRGB each; H and W even where chroma is thinned out.
+        rate: frames a second.
+        pixels: FFmpeg's name of the pixel format.
+        options: x264's.
+        bits_per_s: bitrate to keep to; None: as `options` say.
+        times_s: (T,) rising, of each frame; None: by the rate.
+
+    Raises:
+        UserError: frames of several sizes, or of none.
+    """
+    import av
+
+    stream = container.add_stream("libx264", rate=rate, options=dict(options))
+    stream.pix_fmt = pixels
+    if bits_per_s is not None:
+        stream.bit_rate = bits_per_s
+    if times_s is not None:
+        stream.codec_context.time_base = stream.time_base = Fraction(1, _TICKS)
+    times = repeat(None) if times_s is None else times_s - times_s[0]
+    for k, (rgb, time_s) in enumerate(zip(film, times, strict=times_s is not None)):
+        if k == 0:
+            stream.height, stream.width = rgb.shape[:2]
+        if rgb.shape[:2] != (stream.height, stream.width) or not rgb.size:
+            raise UserError(f"{container.name}: frame {k} of {rgb.shape[1]} x {rgb.shape[0]} px doesn't fit")
+        frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(rgb), format="rgb24")
+        if time_s is not None:
+            frame.pts, frame.time_base = round(float(time_s) * _TICKS), Fraction(1, _TICKS)
+        container.mux(stream.encode(frame))
+    container.mux(stream.encode(None))

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import io
 from fractions import Fraction
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from synth.errors import UserError
 from synth.job import schema
+from synth.video.write import encode
 
 Pictures = npt.NDArray[np.uint8]
 
@@ -29,21 +29,15 @@ def recorded(pictures: Pictures, section: schema.SensorSection, fps: float) -> P
         return pictures
     import av
 
-    kind = _FORMATS[section.chroma]
     height, width = pictures.shape[1:3]
     # Codecs take even sizes only when they thin out chroma.
     padded = np.pad(pictures, ((0, 0), (0, height % 2), (0, width % 2), (0, 0)), mode="edge")
     buffer = io.BytesIO()
     try:
         with av.open(buffer, "w", format="matroska") as container:
-            stream: Any = container.add_stream("libx264", rate=Fraction(fps).limit_denominator(1000))
-            stream.height, stream.width = padded.shape[1:3]
-            stream.pix_fmt, stream.bit_rate = kind, round(section.bitrate_mbps * 1e6)
-            stream.options = {"threads": "1", "preset": "medium", "tune": "zerolatency"}
-            for picture in padded:
-                frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="rgb24")
-                container.mux(stream.encode(frame))
-            container.mux(stream.encode(None))
+            options = {"threads": "1", "preset": "medium", "tune": "zerolatency"}
+            rate, bits_per_s = Fraction(fps).limit_denominator(1000), round(section.bitrate_mbps * 1e6)
+            encode(container, padded, rate, _FORMATS[section.chroma], options, bits_per_s=bits_per_s)
         buffer.seek(0)
         with av.open(buffer) as container:
             # Bilinear from subsampled chroma, as players do; the default of nearest leaves blocks.
