@@ -160,10 +160,9 @@ def _check_following(recording: Recording, found: _Checked) -> None:
         found.add("lack", "tissue", "no tissue.png: the whole picture is taken for tissue")
     elif not recording.tissue_mask(found.size).any():
         found.add("bad", "tissue", "tissue.png marks nothing")
-    tool = recording.tool if recording.has_masks else None
-    if tool is not None:
-        tool(next(iter(recording.masks), 0), found.size)
-    found.add("lack" if tool is None else "ok", "tool", recording.describe_tool(found.frames))
+    if recording.masks:
+        recording.masks.read(next(iter(recording.masks.by_frame), 0), found.size)
+    found.add("ok" if recording.masks else "lack", "tool", recording.describe_tool(found.frames))
     first = recording.meta.rest_frame
     last = max((recording.expected_frames() or _LOOKED_AT) - 1, first)
     wanted = {first, *np.linspace(first, last, _LOOKED_AT).astype(int).tolist()}

@@ -58,23 +58,17 @@ class Recording:
     times_s: NDArray[np.float64] | None
     """(N,) from frames.csv [s]; NaN for frames it doesn't list. None without the file."""
     force: Force | None
-    masks: dict[int, Path]
+    masks: MaskFiles
+    """Of the tool; there may be none."""
     tissue: Path | None
     notes: tuple[str, ...]
     """What was found odd and how it was taken; every one goes into the report."""
-    mask: Path | None = None
-    """For frames that have none in `masks`."""
     region: tuple[int, int, int, int] | None = None
     """Left, top, width and height [px] of the part of the picture that is looked at."""
     right: Path | tuple[Path, ...] = ()
     """Video or pictures of the second eye; empty: none."""
     depths: tuple[Path, ...] = ()
     """Depth pictures; empty: none."""
-
-    @property
-    def has_masks(self) -> bool:
-        """Whether somebody said where the tool is."""
-        return bool(self.masks) or self.mask is not None
 
     @property
     def has_two_eyes(self) -> bool:
@@ -102,7 +96,7 @@ class Recording:
 
     def film(self, pictures: Iterable[Picture] | None = None) -> Footage:
         """The recording for a `VideoFlow`. `pictures`: some of its frames; None: all."""
-        tool = self.tool if self.has_masks else None
+        tool = self.masks.read if self.masks else None
         frames = self.frames() if pictures is None else pictures
         return Footage(frames, str(self.folder), self.tissue_mask, tool, self.meta.rest_frame)
 
@@ -110,18 +104,15 @@ class Recording:
         """The second eye's frames in order; UserError: unreadable."""
         return _pictures(self.right)
 
-    def tool(self, index: int, size: tuple[int, int]) -> NDArray[np.bool_] | None:
-        """(H, W) tool mask of a frame, or None if there is none for it. UserError for one of another size."""
-        return MaskFiles(self.masks, self.mask).read(index, size)
-
     def describe_tool(self, frames: int) -> str:
         """What is taken for the tool in how many frames, for `bench check` and `bench score` alike."""
-        if not self.has_masks:
+        if not self.masks:
             return "no masks/, no mask.png: the tool is looked for in each picture"
-        if len(self.masks) >= frames:
+        count = len(self.masks.by_frame)
+        if count >= frames:
             return f"masks/ has all {frames} frames"
-        others = "mask.png stands for" if self.mask else "no tool is taken to be in"
-        return f"masks/ has {len(self.masks)} of {frames} frames; {others} the others"
+        others = "mask.png stands for" if self.masks.default else "no tool is taken to be in"
+        return f"masks/ has {count} of {frames} frames; {others} the others"
 
     def tissue_mask(self, size: tuple[int, int]) -> NDArray[np.bool_]:
         """(H, W) where tissue may be tracked in the rest frame: `tissue.png`, else everywhere."""
@@ -135,9 +126,7 @@ class Recording:
 
     def within(self, masks: MaskFiles | None, region: tuple[int, int, int, int] | None) -> Recording:
         """The same with the tool as other files have it, and looked at in a region (see `region`) only."""
-        if masks is None:
-            return replace(self, region=region)
-        return replace(self, masks=masks.numbered, mask=masks.still, region=region)
+        return replace(self, masks=masks or self.masks, region=region)
 
     def _timed(self, picture: Picture) -> Picture:
         time_s, fps = picture.time_s, self.meta.fps
@@ -178,12 +167,12 @@ def open_recording(folder: Path, phantom: bool = False) -> Recording:
     times = _frame_times(folder / "frames.csv", notes)
     force = _force(folder / "force.csv", about, notes)
     about, times, force = _from_start(about, times, force, notes)
-    tools = MaskFiles.find(folder / "masks", folder)
+    masks = MaskFiles.find(folder / "masks", folder)
     still = folder / "tissue.png"
     tissue = still if os.path.lexists(still) else None
     right, depths = _second_eye(folder, about)
     return Recording(
-        folder, about, footage, times, force, tools.numbered, tissue, tuple(notes), tools.still,
+        folder, about, footage, times, force, masks, tissue, tuple(notes),
         None, right, depths,
     )  # fmt: skip
 

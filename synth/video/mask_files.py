@@ -27,36 +27,31 @@ MASKS = {
 class MaskFiles:
     """Pictures, white where the tool is."""
 
-    numbered: dict[int, Path]
-    """By frame."""
-    still: Path | None
+    by_frame: dict[int, Path]
+    default: Path | None
     """For frames that have none of their own."""
 
     @classmethod
-    def find(cls, folder: Path, beside: Path) -> MaskFiles:
-        """NNNNNN.png in a folder, and mask.png in another; there may be none."""
-        numbered = [path for path in sorted(folder.glob("*.png")) if re.fullmatch("[0-9]{1,9}", path.stem)]
-        still = beside / "mask.png"
-        by_frame = {int(path.stem): path for path in numbered}
-        return cls(by_frame, still if os.path.lexists(still) else None)
-
-    @classmethod
-    def of_folder(cls, folder: Path) -> MaskFiles:
-        """Both in one folder. UserError if it holds neither."""
-        found = cls.find(folder, folder)
-        if not found:
-            raise UserError(f"{folder}: holds neither masks NNNNNN.png nor mask.png")
-        return found
+    def find(cls, numbered: Path, folder: Path) -> MaskFiles:
+        """NNNNNN.png in the folder `numbered`, and mask.png in `folder`; there may be none."""
+        files = [path for path in sorted(numbered.glob("*.png")) if re.fullmatch("[0-9]{1,9}", path.stem)]
+        default = folder / "mask.png"
+        return cls({int(path.stem): path for path in files}, default if os.path.lexists(default) else None)
 
     def __bool__(self) -> bool:
-        return bool(self.numbered) or self.still is not None
+        return bool(self.by_frame) or self.default is not None
 
     def read(self, index: int, size: tuple[int, int]) -> NDArray[np.bool_] | None:
         """(H, W) of a frame, None if there is none for it. UserError for one of another size."""
-        path = self.numbered.get(index, self.still)
+        path = self.by_frame.get(index, self.default)
         return None if path is None else read_mask(path, size)
 
 
 def read_choice(text: str) -> tuple[str, MaskFiles | None]:
-    """What `--masks` says: one of `MASKS`, or a folder. UserError for a folder without masks."""
-    return (text, None) if text in MASKS else ("auto", MaskFiles.of_folder(Path(text)))
+    """What `--masks` gives: one of `MASKS`, or a folder. UserError for a folder without masks."""
+    if text in MASKS:
+        return text, None
+    files = MaskFiles.find(Path(text), Path(text))
+    if not files:
+        raise UserError(f"{text}: holds neither masks NNNNNN.png nor mask.png")
+    return "auto", files

@@ -51,8 +51,8 @@ def test_pictures_forces_and_masks_come_back(tmp_path: Path) -> None:
     assert recording.meta.young_kpa == pytest.approx(1.4)
     assert recording.meta.specimen == "anatomy 7"
     assert np.array_equal(recording.tissue_mask(SIZE), sequence["tissue"][:])
-    assert recording.tool(0, SIZE) is None
-    mask = recording.tool(2, SIZE)
+    assert recording.masks.read(0, SIZE) is None
+    mask = recording.masks.read(2, SIZE)
     assert mask is not None
     assert np.array_equal(mask, sequence["tool"][2])
 

@@ -29,9 +29,8 @@ def test_one_mask_serves_all_frames_that_have_none(tmp_path: Path) -> None:
     _write(folder / "mask.png", 10)
     _write(folder / "masks" / "000002.png", 30)
     opened = open_recording(folder)
-    widths = [int(found[0].sum()) for k in range(4) if (found := opened.tool(k, _SIZE)) is not None]
+    widths = [int(found[0].sum()) for k in range(4) if (found := opened.masks.read(k, _SIZE)) is not None]
     assert widths == [10, 10, 30, 10]
-    assert opened.has_masks
 
 
 def test_only_the_region_is_tissue(tmp_path: Path) -> None:
