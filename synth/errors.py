@@ -15,6 +15,10 @@ class UserError(Exception):
     """
 
 
+class InvalidValue(UserError, ValueError):
+    """A value that can't be: of a key, it is reported where the key stands."""
+
+
 class NotFinite(UserError):
     """A computed value is NaN or infinite: the sequence is stopped and marked failed."""
 
@@ -35,7 +39,8 @@ def as_user_error(label: str) -> Iterator[None]:
     try:
         yield
     except Exception as error:
-        raise UserError(f"{label}: {type(error).__name__}: {first_line(error)}") from error
+        why = getattr(error, "strerror", None) or f"{type(error).__name__}: {first_line(error)}"
+        raise UserError(f"{label}: {why}") from error
 
 
 def first_line(error: object) -> str:

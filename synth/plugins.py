@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
-from synth.errors import UserError, as_user_error, did_you_mean
+from synth.errors import InvalidValue, UserError, as_user_error, did_you_mean
 
 
 class Registry:
@@ -27,11 +27,11 @@ class Registry:
         return (*self.own, *sorted({*self._points(), *self._added} - set(self.own)))
 
     def check_name(self, name: str, *further: str) -> str:
-        """`name`, if it or one of the `further` ones can be asked for. ValueError else, for a schema."""
+        """`name`, if it or one of the `further` ones can be asked for. InvalidValue else."""
         known = (*further, *self.names())
         if name not in known:
             hint = did_you_mean(name, known)
-            raise ValueError(f"there is no {self._noun} {name!r}; there are {', '.join(known)}{hint}")
+            raise InvalidValue(f"there is no {self._noun} {name!r}; there are {', '.join(known)}{hint}")
         return name
 
     def add(self, name: str, thing: Any) -> None:
@@ -68,10 +68,9 @@ class Registry:
     def _point(self, name: str) -> EntryPoint:
         if name in self.own:
             return EntryPoint(name, self.own[name], self.group)
-        found = self._points().get(name)
-        if found is None:
+        if name not in (points := self._points()):
             raise UserError(f"{self._key}: no {self._noun} {name!r}; there are {', '.join(self.names())}")
-        return found
+        return points[name]
 
 
 ESTIMATORS = Registry(

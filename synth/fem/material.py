@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from synth.errors import UserError
 from synth.fem.membrane import MembraneSheet
 from synth.fem.mesh.tetrahedra import Tets
 from synth.fem.system import System, assemble
-from synth.job.laws import largest_load
 
 
 @dataclass(frozen=True)
@@ -50,20 +48,3 @@ class Tissue:
         if pia is None:
             return None
         return MembraneSheet(pia.young_kpa * pia.thickness_mm / self.young_kpa, pia.stretch)
-
-
-def check_load(law: str, load: float) -> None:
-    """Refuses a load past what a law is known to describe.
-
-    Args:
-        law: its name.
-        load: P = F/(E a^2).
-
-    Raises:
-        UserError: names the largest valid value.
-    """
-    largest = largest_load(law)
-    if load > largest * (1 + 1e-9):  # a force turned into a load may be off by rounding
-        raise UserError(
-            f"fem.load: {load:g} is past the range of the {law} law; the largest valid value is {largest:g}"
-        )

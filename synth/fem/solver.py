@@ -10,13 +10,14 @@ from numpy.typing import NDArray
 
 from synth.fem import surface_embedding, tool
 from synth.fem.equilibrium import InvertedElement, solve_mixed_path, solve_path
-from synth.fem.material import Tissue, check_load
+from synth.fem.material import Tissue
 from synth.fem.mesh.tetrahedra import Tets
 from synth.fem.motion import Clock, march_in_time, volume
 from synth.fem.pulse import Pulse, lift
 from synth.fem.tool import Gesture, ToolMotion
 from synth.geometry.triangles import Shape
 from synth.job import schema
+from synth.job.laws import check_load
 
 __all__ = ["Deformation", "InvertedElement", "deform"]
 
@@ -104,7 +105,7 @@ def deform(
         NotFinite: a number is none.
     """
     for gesture in gestures:
-        check_load(tissue.law, gesture.load)
+        check_load(tissue.law, gesture.load, f"fem.load: {gesture.load:g} is")
     motions = motions or [tool.trajectory(gesture, frames) for gesture in gestures]
     tools = list(zip(gestures, motions, strict=True))
     time, area = np.arange(frames) / fps, surface_embedding.vertex_area(*surface)

@@ -12,7 +12,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from synth.errors import UserError, as_user_error
+from synth.errors import InvalidValue, UserError, as_user_error
 from synth.plugins import Registry
 
 Floats = NDArray[np.float64]
@@ -90,19 +90,34 @@ class LoadRange:
 
 
 def check_load_range(law: str, loads: LoadRange, young_kpa: float, label: str) -> None:
-    """ValueError, after `label`, for loads past what a law is known to describe on the softest tissue."""
-    load, largest = loads.largest(young_kpa), largest_load(law)
-    if load <= largest * (1 + 1e-9):  # a force turned into a load may be off by rounding
+    """`check_load` of the largest load on the softest tissue; `label` comes before what it says."""
+    load, radius = loads.largest(young_kpa), loads.footprint_mm[0]
+    if loads.force_mn is None:
+        check_load(law, load, f"{label}load {load:g} is")
         return
-    what, valid = f"load {load:g} is", largest
-    if loads.force_mn is not None:
-        radius = loads.footprint_mm[0]
-        what = (
-            f"force_mn {loads.force_mn[1]:g} on the softest tissue ({young_kpa:g} kPa) under the smallest "
-            f"contact ({radius:g} mm) is a load of {load:.3g},"
-        )
-        valid = largest * young_kpa * radius**2
-    raise ValueError(f"{label}{what} past the range of the {law} law; the largest valid value is {valid:.4g}")
+    what = (
+        f"{label}force_mn {loads.force_mn[1]:g} on the softest tissue ({young_kpa:g} kPa) under the smallest "
+        f"contact ({radius:g} mm) is a load of {load:.3g},"
+    )
+    check_load(law, load, what, young_kpa * radius**2)
+
+
+def check_load(law: str, load: float, what: str, per_load: float = 1.0) -> None:
+    """Refuses a load past what a law is known to describe.
+
+    Args:
+        law: its name.
+        load: P = F/(E a^2).
+        what: beginning of the message.
+        per_load: what the largest valid load is multiplied by in the message.
+
+    Raises:
+        InvalidValue: it is.
+    """
+    largest = largest_load(law)
+    if load > largest * (1 + 1e-9):  # a force turned into a load may be off by rounding
+        valid = f"the largest valid value is {largest * per_load:.4g}"
+        raise InvalidValue(f"{what} past the range of the {law} law; {valid}")
 
 
 @cache
