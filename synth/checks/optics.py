@@ -45,12 +45,12 @@ def contact(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
     instruments = (sequence.attrs.get("mechanics") or {}).get("instruments", [])
     if len(instruments) != 1:
         return
-    still, tips = camera_of(sequence), np.asarray(instruments[0]["tip_mm"], np.float64)
+    at_rest, tips = camera_of(sequence), np.asarray(instruments[0]["tip_mm"], np.float64)
     scenario, time = sequence.attrs["scenario"], sequence["time"][:]
     footprint = float(scenario["gesture"]["footprint_mm"])
     # Over the relief a rigid tip's load may be anywhere under it.
     spread = 1.0 if sequence.attrs["mechanics"].get("contact") == "rigid" else 0.1
-    poses = _poses(sequence, still, time)
+    poses = _poses(sequence, at_rest, time)
     area, inside = sequence["area"][:], inner(sequence["tissue"][:], 2)
     rows, columns = np.indices(sequence.size)
     peak = float(np.linalg.norm(sequence["force"][:], axis=1).max())
@@ -63,18 +63,18 @@ def contact(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
         share = share / share.sum()
         flow = sequence["flow"][t]
         x, y = ((share * (base + flow[..., k])).sum() for k, base in enumerate((columns, rows)))
-        view = replace(still, rotation=poses[t, :3, :3], translation=poses[t, :3, 3])
-        seen = cameras.to_pixels(view, cameras.to_camera(view, tips[t].reshape(-1, 3))).mean(axis=0)
-        off = float(np.hypot(x - seen[0], y - seen[1])) * view.mm_per_px
+        view = replace(at_rest, rotation=poses[t, :3, :3], translation=poses[t, :3, 3])
+        tip = cameras.to_pixels(view, cameras.to_camera(view, tips[t].reshape(-1, 3))).mean(axis=0)
+        off = float(np.hypot(x - tip[0], y - tip[1])) * view.mm_per_px
         yield Measure(off, spread * footprint + view.mm_per_px, f"frame {t}", "mm")
 
 
-def _poses(sequence: Sequence, still: cameras.Camera, time: Floats) -> Floats:
+def _poses(sequence: Sequence, at_rest: cameras.Camera, time: Floats) -> Floats:
     """World to camera axes in every frame, (T, 4, 4) mm: as stored, else as the scenario moves the camera."""
     if "camera" in sequence.fields:
         return np.asarray(sequence["camera"][:])
     sway = sequence.attrs["scenario"].get("sway")
-    views = [CameraMotion(**sway).at(still, float(t)) if sway else still for t in time]
+    views = [CameraMotion(**sway).at(at_rest, float(t)) if sway else at_rest for t in time]
     poses = np.tile(np.eye(4), (len(views), 1, 1))
     for pose, view in zip(poses, views, strict=True):
         pose[:3, :3], pose[:3, 3] = view.rotation, view.translation
@@ -82,7 +82,7 @@ def _poses(sequence: Sequence, still: cameras.Camera, time: Floats) -> Floats:
 
 
 def camera_of(sequence: Sequence, lens: Mapping[str, Any] | None = None) -> cameras.Camera:
-    """The camera of a sequence, or another `lens` of its attributes; aperture and focus aren't kept."""
+    """The camera of a sequence, or another `lens` of its attributes; aperture and focus aren't stored."""
     lens, (height, width) = lens or sequence.attrs, sequence.size
     return cameras.Camera(
         K=np.asarray(lens["K"], np.float64),

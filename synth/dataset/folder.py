@@ -38,7 +38,7 @@ class _Described(BaseModel):
 
 
 class Folder:
-    """A dataset's folder. Everything here is told by what is on disk, so it survives any death."""
+    """A dataset's folder. Everything here is read from the disk, so it survives any death."""
 
     def __init__(self, root: Path) -> None:
         self.root = root
@@ -91,7 +91,7 @@ class Folder:
         self.sweep(index)
 
     def forgive(self, indices: Sequence[int] | None = None) -> list[int]:
-        """Forgets failures, all if not said which; returns which."""
+        """Forgets failures, all if `indices` is None; returns which."""
         indices = sorted(self.failures()) if indices is None else list(indices)
         for index in indices:
             (self.state / "failed" / f"{index:06d}.json").unlink(missing_ok=True)
@@ -201,7 +201,7 @@ def _refuse_foreign(folder: Folder, job: Job, name: str) -> None:
         raise UserError(f"{root}: holds the dataset of another job ({what}), choose another folder")
     count = folder.job().sequences
     if count > job.sequences:
-        raise UserError(f"{root}: holds {count} sequences of this job, {job.sequences} are asked for")
+        raise UserError(f"{root}: holds {count} sequences of this job, {job.sequences} are wanted")
 
 
 def _refuse_links(folder: Folder) -> None:

@@ -31,7 +31,7 @@ NAME = "split.json"
 
 @dataclass(frozen=True)
 class Rule:
-    """How a dataset is split; kept beside it, so that one that grows is split as before."""
+    """How a dataset is split; stored in it, so that one that grows is split as before."""
 
     by: By = "anatomy"
     shares: tuple[FiniteFloat, FiniteFloat, FiniteFloat] = (0.7, 0.15, 0.15)

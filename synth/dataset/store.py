@@ -25,7 +25,7 @@ from synth.system import packages
 # Raw bytes of one field that are gathered and then written as one file: a shard, its chunks being frames.
 _SHARD_BYTES = 16 << 20
 
-# Vector fields whose greatest length is kept as an attribute, in `summary`.
+# Vector fields whose greatest length is an attribute, in `summary`.
 _PEAKS = {"flow": "peak_flow_px", "traction": "peak_traction_kpa", "force": "peak_force_mn"}
 
 # What may differ between two runs that gave the same sequence.
@@ -397,7 +397,7 @@ def open_sequence(path: Path | str, *, sealed: bool = True) -> Sequence:
 
 
 def field_hasher(name: str, stored: np.dtype[Any], shape: tuple[int, ...]) -> hashlib.blake2b:
-    """A hasher that has seen the name in the store, type and shape; then give it the values in C order."""
+    """A hasher, begun with the stored name, type and shape; it then takes the values in C order."""
     described = identity.canonical([name, str(stored), list(shape)])
     return hashlib.blake2b(described, digest_size=16)
 

@@ -16,7 +16,7 @@ from synth.dataset.store import Dataset, Sequence
 from synth.errors import UserError
 from synth.fields import FIELDS, TIME
 
-# Open stores kept by one process; opening one costs some milliseconds.
+# Stores that one process holds open; opening one costs some milliseconds.
 _OPEN = 64
 
 

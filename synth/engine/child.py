@@ -1,4 +1,4 @@
-"""One worker process seen from the engine: starts it, gives it sequences, watches it, survives it."""
+"""The engine's side of a worker process: starts it, gives it sequences, watches it, survives it."""
 
 from __future__ import annotations
 

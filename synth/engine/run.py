@@ -243,11 +243,9 @@ class _Pool:
 def _slots(engine: str, setup: Setup, workers: int, gpus: tuple[str, ...] | None) -> Iterator[Sequence[Slot]]:
     """Where sequences are computed; each of this machine's slots sees one of `gpus` in turn, or all."""
     if engine == "local":
-        setups = [setup] * workers
-        if gpus is not None:
-            seen = [{"CUDA_VISIBLE_DEVICES": gpus[k % len(gpus)] if gpus else ""} for k in range(workers)]
-            setups = [replace(setup, environment={**(setup.environment or {}), **one}) for one in seen]
-        yield [Child(one) for one in setups]
+        names = ["" if not gpus else gpus[k % len(gpus)] for k in range(workers)]
+        own = [{} if gpus is None else {"CUDA_VISIBLE_DEVICES": name} for name in names]
+        yield [Child(replace(setup, environment={**(setup.environment or {}), **one})) for one in own]
         return
     from synth.engine import dask
 

@@ -30,7 +30,7 @@ _SHORT, _LONG = 3, 9  # frames: the difference is what a further frame takes
 
 
 @dataclass(frozen=True)
-class Sheet:
+class ContactSheet:
     """What a job looks like and what it will take."""
 
     picture: Rgb
@@ -40,7 +40,9 @@ class Sheet:
     """The whole dataset."""
 
 
-def draw_sheet(job: Job, count: int, report: Callable[[int, int], None] = lambda done, of: None) -> Sheet:
+def draw_sheet(
+    job: Job, count: int, report: Callable[[int, int], None] = lambda done, of: None
+) -> ContactSheet:
     """Draws `count` scenarios spread over the job, each in the moment before its load.
 
     Nothing is deformed: the sheet shows anatomy, appearance, light, view and instrument. What the job costs
@@ -59,30 +61,27 @@ def draw_sheet(job: Job, count: int, report: Callable[[int, int], None] = lambda
             "anatomy": job.anatomy.model_copy(update={"vertices": min(job.anatomy.vertices, 20_000)}),
         }
     )
-    steps = itertools.count(1)
+    parts = itertools.count(1)
 
     def step() -> None:
-        report(next(steps), len(chosen) + _PROBES + 1)
+        report(next(parts), len(chosen) + _PROBES + 1)
 
     tiles = []
-    for index in chosen:
-        tiles.append(_frame(quick, int(index)))
+    for index in chosen.tolist():
+        tiles.append(_draw_scenario(quick, index))
         step()
-    return Sheet(
-        picture=tile(tiles),
-        stages_cpu_s=_measure_cost(job, step),
-        disk_bytes=size_forecast.estimate(job) * job.sequences,
-    )
+    cost = _measure_cost(job, step)
+    return ContactSheet(tile(tiles), cost, size_forecast.estimate(job) * job.sequences)
 
 
-def _frame(job: Job, index: int) -> Rgb:
-    """A scenario's picture (the left eye beside the right)."""
+def _draw_scenario(job: Job, index: int) -> Rgb:
+    """A scenario's picture, (H, W, 3); of a stereo job the left eye's, then the right's."""
     scene = at_rest(job, index)
     gestures = scene.scenario.gestures
     ready = [poised(gesture, scene.surface) for gesture in gestures]
     tips, shafts = (np.concatenate(part) for part in zip(*ready, strict=True))
-    state, seed = SceneState(scene.surface.vertices, tips, shafts), scenario.frame_seeds(job, index)[0]
-    frame = scene.renderer.render(state, seed)
+    state = SceneState(scene.surface.vertices, tips, shafts)
+    frame = scene.renderer.render(state, scenario.frame_seeds(job, index)[0])
     picture = frame.rgb if frame.rgb_right is None else np.hstack([frame.rgb, frame.rgb_right])
     label = f"{index}  {scene.scenario.family}  {' + '.join(one.kind for one in gestures)}"
     return caption(picture, label, job.render.size[1] - 8)
@@ -106,14 +105,13 @@ def _measure_cost(job: Job, step: Callable[[], None]) -> dict[str, float]:
     """
     chosen = np.unique(np.linspace(0, job.sequences - 1, _PROBES).round().astype(int)).tolist()
     total: dict[str, float] = {}
+    more = max(job.frames - _LONG, 0) / (_LONG - _SHORT)
     with tempfile.TemporaryDirectory() as folder:
         _stages(job, chosen[0], 2, folder)
         step()
         for index in chosen:
-            long = short = _stages(job, index, min(job.frames, _LONG), folder)
-            if job.frames > _LONG:
-                short = _stages(job, index, _SHORT, folder)
-            more = (job.frames - _LONG) / (_LONG - _SHORT)
+            long = _stages(job, index, min(job.frames, _LONG), folder)
+            short = _stages(job, index, _SHORT, folder) if more else long
             for name, spent in long.items():
                 each = spent + max(more * (spent - short[name]), 0.0)
                 total[name] = total.get(name, 0.0) + job.sequences / len(chosen) * each
@@ -122,6 +120,7 @@ def _measure_cost(job: Job, step: Callable[[], None]) -> dict[str, float]:
 
 
 def _stages(job: Job, index: int, frames: int, folder: str) -> dict[str, float]:
+    """Processor time [s] of a sequence with so many frames, by stage."""
     short = job.model_copy(update={"frames": frames})
     path = pipeline.render_sequence(short, index, Path(folder), lambda stage, done, of: None)
     timings = open_sequence(path).attrs["timings"]

@@ -36,13 +36,13 @@ def write_preview(root: Path) -> None:
     width = drawing.both_eyes(sequences[0], 0).shape[1] * int(np.ceil(np.sqrt(len(sequences))))
     step = max(1, -(-width // _PREVIEW_PX))
 
-    def still(t: int) -> Rgb:
+    def compose(t: int) -> Rgb:
         return drawing.tile(
             [drawing.both_eyes(one, min(t, one.frames - 1))[::step, ::step] for one in sequences]
         )
 
     frames = range(max(one.frames for one in sequences))
-    encode_video(root / "preview.mp4", map(still, frames), float(sequences[0].attrs["fps"]))
+    encode_video(root / "preview.mp4", map(compose, frames), float(sequences[0].attrs["fps"]))
 
 
 def write_films(

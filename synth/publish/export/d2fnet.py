@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,37 +23,35 @@ def write_npz(dataset: Dataset, target: Path) -> None:
     is in the picture's plane and not the world's, and `force_mag` is their "intensity" (peak = total force)
     made from the true traction; README.txt in the export says so.
     """
-    count = min(int(sequence["tissue"][:].sum()) for sequence in dataset)
-    count = min(count, _NODES)
+    count = min(_NODES, *(int(sequence["tissue"][:].sum()) for sequence in dataset))
     if not count:
         raise UserError(f"{dataset.root}: a sequence shows no tissue")
     for sequence in dataset:
         name = f"{sequence.index:06d}"
         (target / f"run_{name}").mkdir()
         path = target / f"run_{name}" / f"brain_surface_{name}_auto_projected_{name}_2d.npz"
-        moved, pressed, seen = _arrays(sequence, count)
-        np.savez_compressed(path, disp2d=moved, force_mag=pressed, projected_pixels=seen)
+        np.savez_compressed(path, **_arrays(sequence, count))
     (target / "README.txt").write_text(_NOTE, "utf-8")
 
 
-def _arrays(sequence: Sequence, count: int) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
-    pixels = np.argwhere(sequence["tissue"][:])
-    rows, columns = pixels[np.linspace(0, len(pixels) - 1, count).round().astype(int)].T
+def _arrays(sequence: Sequence, count: int) -> dict[str, NDArray[np.float32]]:
+    tissue = np.argwhere(sequence["tissue"][:])
+    rows, columns = tissue[np.linspace(0, len(tissue) - 1, count).round().astype(int)].T
     scale = float(sequence.attrs["scale_mm_per_px"])
     shrink = min(1.0, _LARGEST_X / sequence.size[1])
     force = np.linalg.norm(sequence["force"][:], axis=1)
     moved = np.empty((sequence.frames, count, 2), np.float32)
-    pressed = np.zeros((sequence.frames, count), np.float32)
-    seen = np.empty_like(moved)
+    intensity = np.zeros((sequence.frames, count), np.float32)
+    pixels = np.empty_like(moved)
     rest = np.stack([columns, rows], axis=-1)
     for t in range(sequence.frames):
         flow = sequence["flow"][t][rows, columns]
         size = np.linalg.norm(sequence["traction"][t], axis=-1)
         moved[t] = scale * flow
-        seen[t] = shrink * (rest + flow)
+        pixels[t] = shrink * (rest + flow)
         if size.max() > 0:
-            pressed[t] = size[rows, columns] / size.max() * force[t] / 1000
-    return moved, pressed, seen
+            intensity[t] = size[rows, columns] / size.max() * force[t] / 1000
+    return {"disp2d": moved, "force_mag": intensity, "projected_pixels": pixels}
 
 
 _NOTE = """\

@@ -70,18 +70,18 @@ def write_parquet(dataset: Dataset, target: Path) -> None:
     """
     first, sides = dataset[0], index.group_by_side(dataset)
     framed = [name for name in first.fields if FIELDS[name].dims[0] == TIME]
-    still = [name for name in first.fields if FIELDS[name].dims[0] != TIME]
+    frameless = [name for name in first.fields if FIELDS[name].dims[0] != TIME]
     about = [column for column in index.COLUMNS if column.name not in _LEFT_OUT]
     frames = [*(_plain(name, kind) for name, (kind, _) in _ROWS.items()), *(_field(first, n) for n in framed)]
     each = [_plain(column.name, str(column.type).replace("double", "float64")) for column in about]
-    each += [*(_field(first, name) for name in still), _plain("attributes", "string")]
+    each += [*(_field(first, name) for name in frameless), _plain("attributes", "string")]
     for side, positions in sides.items():
         _write(
             target / "frames", side, frames, (row for k in positions for row in _frames(dataset[k], framed))
         )
         names = [column.name for column in about]
-        _write(target / "sequences", side, each, (_sequence(dataset[k], still, names) for k in positions))
-    (target / "README.md").write_text(_card(dataset, list(sides), framed, still), "utf-8")
+        _write(target / "sequences", side, each, (_sequence(dataset[k], frameless, names) for k in positions))
+    (target / "README.md").write_text(_card(dataset, list(sides), framed, frameless), "utf-8")
 
 
 def _plain(name: str, kind: str) -> ParquetColumn:
@@ -116,9 +116,9 @@ def _frames(sequence: Sequence, names: list[str]) -> Iterator[dict[str, Any]]:
         yield {"sequence": sequence.index, "frame": t, **cells}
 
 
-def _sequence(sequence: Sequence, still: list[str], columns: list[str]) -> dict[str, Any]:
+def _sequence(sequence: Sequence, frameless: list[str], columns: list[str]) -> dict[str, Any]:
     row = index.row_of(sequence)
-    cells = {name: _cell(name, sequence[name][:]) for name in still}
+    cells = {name: _cell(name, sequence[name][:]) for name in frameless}
     return {**{name: row[name] for name in columns}, **cells, "attributes": json.dumps(sequence.attrs)}
 
 
@@ -153,7 +153,7 @@ def _bytes(value: Any) -> int:
     return len(value["bytes"]) if isinstance(value, dict) else 8
 
 
-def _card(dataset: Dataset, sides: list[str], framed: list[str], still: list[str]) -> str:
+def _card(dataset: Dataset, sides: list[str], framed: list[str], frameless: list[str]) -> str:
     """README.md: what the Hub and `datasets` read of it, and what a person does."""
     folder = Folder(dataset.root)
     rows = [index.row_of(sequence) for sequence in dataset]
@@ -165,7 +165,7 @@ def _card(dataset: Dataset, sides: list[str], framed: list[str], still: list[str
             frames=sum(row["frames"] for row in rows),
             row_columns=_ROWS,
             framed=[FIELDS[name] for name in framed],
-            still=[FIELDS[name] for name in still],
+            still=[FIELDS[name] for name in frameless],
             index=[column for column in index.COLUMNS if column.name not in _LEFT_OUT],
             families=card.share(rows, "family"),
             gestures=card.share(rows, "gesture"),
