@@ -14,6 +14,8 @@ from synth.errors import UserError
 _LARGEST_X = 1400.0
 _NODES = 20_000
 
+Floats = NDArray[np.float32]
+
 
 def write_npz(dataset: Dataset, target: Path) -> None:
     """What the published training code globs: `run_NNNNNN/brain_surface_NNNNNN_auto_projected_NNNNNN_2d.npz`.
@@ -30,11 +32,13 @@ def write_npz(dataset: Dataset, target: Path) -> None:
         name = f"{sequence.index:06d}"
         (target / f"run_{name}").mkdir()
         path = target / f"run_{name}" / f"brain_surface_{name}_auto_projected_{name}_2d.npz"
-        np.savez_compressed(path, **_arrays(sequence, count))
+        moved, intensity, pixels = _arrays(sequence, count)
+        np.savez_compressed(path, disp2d=moved, force_mag=intensity, projected_pixels=pixels)
     (target / "README.txt").write_text(_NOTE, "utf-8")
 
 
-def _arrays(sequence: Sequence, count: int) -> dict[str, NDArray[np.float32]]:
+def _arrays(sequence: Sequence, count: int) -> tuple[Floats, Floats, Floats]:
+    """Motion (T, N, 2) mm, intensity (T, N) N and place (T, N, 2) px of `count` points of the tissue."""
     tissue = np.argwhere(sequence["tissue"][:])
     rows, columns = tissue[np.linspace(0, len(tissue) - 1, count).round().astype(int)].T
     scale = float(sequence.attrs["scale_mm_per_px"])
@@ -51,7 +55,7 @@ def _arrays(sequence: Sequence, count: int) -> dict[str, NDArray[np.float32]]:
         pixels[t] = shrink * (rest + flow)
         if size.max() > 0:
             intensity[t] = size[rows, columns] / size.max() * force[t] / 1000
-    return {"disp2d": moved, "force_mag": intensity, "projected_pixels": pixels}
+    return moved, intensity, pixels
 
 
 _NOTE = """\
