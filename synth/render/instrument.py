@@ -136,7 +136,8 @@ def film(instrument: InstrumentMesh, tips: Floats, surface: Floats) -> Floats:
 def _axes(shaft: Floats, across: Floats) -> Floats:
     """Rows x, y, z of an orthonormal frame: z along the shaft, x as near to `across` as it can be."""
     z = shaft / np.linalg.norm(shaft)
-    for side in (across, np.cross(z, [0.0, 0.0, 1.0]), np.cross(z, [1.0, 0.0, 0.0])):
+    for level in (None, [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]):
+        side = across if level is None else np.cross(z, level)
         x = side - (side @ z) * z
         if np.linalg.norm(x) > 1e-9:
             x = x / np.linalg.norm(x)

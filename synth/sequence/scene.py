@@ -170,7 +170,9 @@ class Scene(RestScene):
         return track.recover_flow(rgb, tools, self.tissue, found)
 
 
-def at_rest(job: Job, index: int = 0, gestures: Sequence[str] | None = None) -> RestScene:
+def at_rest(
+    job: Job, index: int = 0, gestures: Sequence[str] | None = None, *, case: Scenario | None = None
+) -> RestScene:
     """Draws sequence `index` of a job and builds its surface: the one way to a renderer.
 
     Its renderer takes any state: `scene.renderer.render(SceneState(vertices, tips, shafts), seed)`.
@@ -179,15 +181,19 @@ def at_rest(job: Job, index: int = 0, gestures: Sequence[str] | None = None) -> 
         job: the job.
         index: which of its sequences.
         gestures: kinds of gesture whose instruments are shown instead of the drawn ones.
+        case: instead of the scenario that is drawn.
 
     Raises:
         UserError: the job's surface or calibration cannot be used.
     """
-    case = scenario.draw(job, index)
+    case = case or scenario.draw(job, index)
     if gestures is not None:
         first, *further = (replace(case.gesture, kind=kind) for kind in gestures)
         case = replace(case, gesture=first, further=tuple(further))
-    return RestScene(job, index, case, mechanics.cortex(job, case)[0], camera.place(case.view, job.render))
+    view = camera.place(case.view, job.render)
+    if job.render.calibration is not None:
+        case = replace(case, view=camera.calibrated(case.view, view))
+    return RestScene(job, index, case, mechanics.cortex(job, case)[0], view)
 
 
 def simulate(
@@ -218,17 +224,14 @@ def simulate(
     if not 0 <= index < job.sequences:
         raise UserError(f"sequence {index}: the job has sequences 0 to {job.sequences - 1}")
     report, watch = report or (lambda stage, done, of: None), watch or Stopwatch()
-    case = case or scenario.draw(job, index)
-    view = camera.place(case.view, job.render)
-    if job.render.calibration is not None:
-        case = replace(case, view=camera.calibrated(case.view, view))
     report("mesh", 0, 1)
     with watch.stage("mesh"):
-        surface, tets = mechanics.build(job, case)
+        rest = at_rest(job, index, case=case)
+        surface, tets = mechanics.build(job, rest.scenario)
     report("fem", 0, 1)
     with watch.stage("fem"):
-        motion = mechanics.move(job, case, surface, tets, motions)
-    return Scene(job, index, case, surface, view, motion)
+        motion = mechanics.move(job, rest.scenario, surface, tets, motions)
+    return Scene(**vars(rest), motion=motion)
 
 
 def estimator(flow: FlowSection) -> Estimator:
