@@ -1,5 +1,5 @@
-"""Noise and recovered flow against cost, over light paths, sampler, integrator and size; what a whole frame
-takes.
+"""Noise and recovered flow against cost, over light paths, sampler, integrator, vertices and size; what a
+whole frame takes.
 
 Run: python -m evidence.render.pareto
 """
@@ -40,23 +40,31 @@ def main(
     out: Path = report.RESULTS / "render/pareto",
     spp: str = "1,2,4,8,16",
     width: str = "640,320",
+    vertices: str = "6000,12000,40000",
     frames: int = 12,
     seed: int = 11,
 ) -> None:
     """Flow error and noise of rendered frames against the CPU time that they took.
 
-    `spp`: light paths a pixel; `width`: of the picture, 4:3; `frames`: that a whole frame's time is of.
+    `spp`: light paths a pixel; `width`: of the picture, 4:3; `vertices`: of the surface, beside as many as
+    that size has by default; `frames`: that a whole frame's time is of.
     """
     rows: list[dict[str, Any]] = []
     for wide in (int(part) for part in width.split(",")):
-        ours = case(Job.model_validate({"seed": seed, "render": {"size": (wide, wide * 3 // 4)}}), 0)
+        sections: dict[str, Any] = {"seed": seed, "render": {"size": (wide, wide * 3 // 4)}}
+        ours = case(Job.model_validate(sections), 0)
         settings = list(product((int(part) for part in spp.split(",")), _SAMPLERS[:1], _INTEGRATORS[:1]))
         settings += [(_DEFAULT[0], sampler, _INTEGRATORS[0]) for sampler in _SAMPLERS[1:]]
         settings += [(_DEFAULT[0], _SAMPLERS[0], kind) for kind in _INTEGRATORS[1:]]
         for paths, sampler, kind in settings:
             row = {"spp": paths, "sampler": sampler, "integrator": kind, "width": wide}
             row["default"] = (paths, sampler, kind, wide) == _DEFAULT
-            rows.append(row | measure(ours, paths, sampler, kind))
+            rows.append(row | {"vertices": len(ours.vertices)} | measure(ours, paths, sampler, kind))
+        for count in (int(part) for part in vertices.split(",")):
+            other = case(Job.model_validate(sections | {"anatomy": {"vertices": count}}), 0)
+            row = dict(zip(("spp", "sampler", "integrator", "width"), (*_DEFAULT[:3], wide), strict=True))
+            row |= {"default": False, "vertices": len(other.vertices)}
+            rows.append(row | measure(other, *_DEFAULT[:3]))
     cost = frame_cost(case(Job(seed=seed), 0), frames)
     found = {"seed": seed, "lift_mm": _LIFT, "rows": rows, "frame": cost}
     report.save(out, "pareto.json", found, page(found))
@@ -117,6 +125,10 @@ def frame_cost(ours: Case, frames: int) -> dict[str, float]:
     return {"cpu_s_least": low, "cpu_s_median": middle, "cpu_s_most": high}
 
 
+def _curve_of(row: Mapping[str, Any]) -> tuple[Any, ...]:
+    return row["width"], row["sampler"], row["integrator"], row["vertices"]
+
+
 def page(found: Mapping[str, Any]) -> report.Page:
     """What flow makes of the pictures, and their noise, against time."""
     panels = []
@@ -126,11 +138,11 @@ def page(found: Mapping[str, Any]) -> report.Page:
         ("noise_clipped", "noise / mean, clipped"),
     ):
         curves = []
-        for kind in dict.fromkeys((r["width"], r["sampler"], r["integrator"]) for r in found["rows"]):
-            own = [r for r in found["rows"] if (r["width"], r["sampler"], r["integrator"]) == kind]
+        for kind in dict.fromkeys(_curve_of(r) for r in found["rows"]):
+            own = [r for r in found["rows"] if _curve_of(r) == kind]
             curves.append(
                 report.Curve(
-                    f"{kind[1]}, {kind[2]}, {kind[0]} px",
+                    f"{kind[1]}, {kind[2]}, {kind[0]} px, {kind[3]} vertices",
                     tuple(float(r["cpu_s"]) for r in own),
                     tuple(float(r[key]) for r in own),
                     tuple(f"{r['spp']} spp" for r in own),

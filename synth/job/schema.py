@@ -73,7 +73,8 @@ class AnatomySection(Section):
     sulcus_mm: Range[NonNegative] = (0.6, 1.4)
     """Procedural relief: depth of the sulci as seen from outside [mm]."""
     vertices: Annotated[int, Field(ge=400, le=400_000)] = 40_000
-    """Vertices of the fine surface that is loaded, moved and rendered."""
+    """Vertices of the fine surface that is loaded, moved and rendered. Not given: one for four pixels of the
+    picture, at least 6000 and at most 40,000."""
     craniotomy: CraniotomySection = CraniotomySection()
     """Where the skull is open."""
     attachments: tuple[AttachmentSection, ...] = ()
@@ -188,6 +189,14 @@ class Job(Section):
     """Noise on the labels of the field `intensity`: the published method's first stage, or none, as its code
     ships. Its second stage is in `intensity` and `flow_noisy` either way; see `store.extra`."""
     card: CardSection = CardSection()
+
+    @model_validator(mode="after")
+    def _surface_is_as_fine_as_the_picture(self) -> Job:
+        if "vertices" not in self.anatomy.model_fields_set:
+            width, height = self.render.size
+            fine = min(max(width * height // 4, 6000), self.anatomy.vertices)
+            object.__setattr__(self, "anatomy", self.anatomy.model_copy(update={"vertices": fine}))
+        return self
 
     @model_validator(mode="after")
     def _second_lens_exists(self) -> Job:
