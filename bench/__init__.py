@@ -5,19 +5,23 @@ from typing import Any
 
 # Name -> where it is, looked up when first asked for; as in `synth`.
 _WHERE = {
-    "Answer": "bench.methods.protocol",
+    "ForceEstimate": "bench.methods.protocol",
     "Method": "bench.methods.protocol",
+    "MethodContext": "bench.methods.protocol",
     "Result": "bench.scoring.result",
-    "Scene": "bench.methods.protocol",
     "Settings": "synth.recording_flow.video_flow:RecordingFlowSettings",
     "export_recording": "bench.recording.from_sequence",
     "score": "bench.scoring.score",
 }
+_OLD = {"Answer": "ForceEstimate", "Scene": "MethodContext"}
+"""What plug-ins may still call them."""
 
 __all__ = [*_WHERE]
 
 
 def __getattr__(name: str) -> Any:
+    if name in _OLD:
+        return __getattr__(_OLD[name])
     if name not in _WHERE:
         raise AttributeError(f"module 'bench' has no attribute {name!r}")
     place, _, other_name = _WHERE[name].partition(":")

@@ -22,13 +22,13 @@ class Spring:
         """Mean displacement of 1 mm is what E times this much squared, in mN, would do."""
 
     def __call__(
-        self, flow: np.ndarray, confidence: np.ndarray, scene: bench.Scene, picture: bool
-    ) -> bench.Answer:
+        self, flow: np.ndarray, confidence: np.ndarray, scene: bench.MethodContext, picture: bool
+    ) -> bench.ForceEstimate:
         """Force from flow (H, W, 2) px and its confidence (H, W), the bench's `Method`."""
         moved_mm = np.linalg.norm(flow, axis=2) * scene.scale_mm_per_px
         young = scene.young_kpa or 1.0  # unknown: the bench then scores shapes only
         size = young * self.mm * np.average(moved_mm, weights=confidence * scene.tissue + 1e-9)
-        return bench.Answer(np.array([size, np.nan, np.nan]))  # a magnitude: no direction
+        return bench.ForceEstimate(np.array([size, np.nan, np.nan]))  # a magnitude: no direction
 
 
 def score_springs(recording: Path) -> bench.Result:

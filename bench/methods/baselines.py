@@ -19,7 +19,7 @@ from sklearn.model_selection import PredefinedSplit, cross_val_predict
 from sklearn.neighbors import KNeighborsRegressor
 
 from bench.methods import compliance, inverse
-from bench.methods.protocol import Answer, Method, Scene
+from bench.methods.protocol import Field, ForceEstimate, Method, MethodContext
 from learn.data.clips import assumed_young, has_depth
 from learn.data.grid import Grid, GridView, certainty
 from synth.errors import UserError
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from learn.data.clips import Clip
 
 Floats = NDArray[np.float64]
-Rule = Callable[[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]], Floats]
+Rule = Callable[[Field, Field, Field], Floats]
 """Displacement (2, N, N) mm, mask (N, N) 0/1, confidence (N, N) → force over E, (3,) mN/kPa; NaN: magnitude
 only, in x. Of two eyes (3, N, N) mm and (2, N, N), across and along the view."""
 Space = Literal["never", "where seen", "always"]
@@ -46,38 +46,27 @@ _SURE = 0.3
 class Baseline:
     """A rule behind the bench's protocol. The last frame put on the grid is shared between baselines."""
 
-    _last: ClassVar[
-        dict[int, tuple[NDArray[np.float32], Scene, NDArray[np.float32], NDArray[np.float32]]]
-    ] = {}
-    _view: tuple[Scene, GridView] | None = None
+    _last: ClassVar[dict[int, tuple[Field, MethodContext, Field, Field]]] = {}
+    _view: tuple[MethodContext, GridView] | None = None
 
     def __init__(self, rule: Rule, space: Space = "never") -> None:
         self._rule, self._space = rule, space
 
-    def __call__(
-        self, flow: NDArray[np.float32], confidence: NDArray[np.float32], scene: Scene, picture: bool
-    ) -> Answer:
+    def __call__(self, flow: Field, confidence: Field, scene: MethodContext, picture: bool) -> ForceEstimate:
         """See `Method`."""
         if self._space == "always":
             raise UserError("fitted on motion in three dimensions: it needs a second eye or depth pictures")
         return self._answer(flow, flow * np.float32(scene.scale_mm_per_px), confidence, scene)
 
     def in_space(
-        self,
-        flow: NDArray[np.float32],
-        confidence: NDArray[np.float32],
-        moved: Moved,
-        scene: Scene,
-        picture: bool,
-    ) -> Answer:
+        self, flow: Field, confidence: Field, moved: Moved, scene: MethodContext, picture: bool
+    ) -> ForceEstimate:
         """See `InSpace`."""
         if self._space == "never":
             return self(flow, confidence, scene, picture)
         return self._answer(moved.motion, moved.motion, certainty(moved.deviation), scene)
 
-    def _answer(
-        self, key: NDArray[np.float32], shift: NDArray[np.float32], sure: NDArray[np.float32], scene: Scene
-    ) -> Answer:
+    def _answer(self, key: Field, shift: Field, sure: Field, scene: MethodContext) -> ForceEstimate:
         """Of displacement (H, W, C) mm and its confidence ([2,] H, W); equal where `key` is the same."""
         view = Baseline._view
         if view is None or view[0] is not scene:
@@ -87,7 +76,7 @@ class Baseline:
             mean = view[1].resample.mean
             last = (key, scene, mean(shift.transpose(2, 0, 1), scene.tissue), mean(sure, scene.tissue))
             Baseline._last[shift.shape[-1]] = last
-        return Answer(assumed_young(scene.young_kpa) * self._rule(last[2], view[1].mask, last[3]))
+        return ForceEstimate(assumed_young(scene.young_kpa) * self._rule(last[2], view[1].mask, last[3]))
 
 
 def physical() -> dict[str, Method]:
@@ -138,7 +127,7 @@ def fitted_rules(clips: Sequence[Clip], source: str) -> dict[str, Rule]:
     return rules
 
 
-def _peak(moved: NDArray[np.float32], mask: NDArray[np.float32]) -> float:
+def _peak(moved: Field, mask: Field) -> float:
     """Displacement that 2% of the tissue exceeds [mm]: the largest, but for outliers."""
     return float(np.percentile(np.linalg.norm(moved, axis=0)[mask > 0], 98)) if (mask > 0).any() else 0.0
 
@@ -154,14 +143,12 @@ def _linear(peak: Floats, size: Floats) -> Rule:
     return partial(_say_linear, float(peak @ size) / max(float(peak @ peak), 1e-12), 0.0)
 
 
-def _say_linear(
-    a: float, b: float, moved: NDArray[np.float32], mask: NDArray[np.float32], sure: NDArray[np.float32]
-) -> Floats:
+def _say_linear(a: float, b: float, moved: Field, mask: Field, sure: Field) -> Floats:
     """a d + b of the peak displacement d, a magnitude alone."""
     return np.array([a * _peak(moved, mask) + b, np.nan, np.nan])
 
 
-def _rows(moved: NDArray[np.float32], mask: NDArray[np.float32]) -> Floats:
+def _rows(moved: Field, mask: Field) -> Floats:
     """(T, C, N, N) mm, (T, N, N) → masked displacement, (T, C N N)."""
     return (moved * mask[:, None]).reshape(len(moved), -1).astype(np.float64)
 
@@ -169,9 +156,9 @@ def _rows(moved: NDArray[np.float32], mask: NDArray[np.float32]) -> Floats:
 def _say_regressed(
     basis: TruncatedSVD,
     regressor: Ridge | KNeighborsRegressor,
-    moved: NDArray[np.float32],
-    mask: NDArray[np.float32],
-    sure: NDArray[np.float32],
+    moved: Field,
+    mask: Field,
+    sure: Field,
 ) -> Floats:
     said = regressor.predict(basis.transform(_rows(moved[None], mask[None])))
     return np.asarray(said[0], np.float64)
@@ -217,7 +204,7 @@ def _groups(clips: Sequence[Clip]) -> NDArray[np.intp]:
 def _inverse(solve: Callable[[compliance.Compliance, Floats, Floats], Floats]) -> Rule:
     """Displacement at the compliance's points, from the grid, weighted by confidence."""
 
-    def rule(moved: NDArray[np.float32], mask: NDArray[np.float32], sure: NDArray[np.float32]) -> Floats:
+    def rule(moved: Field, mask: Field, sure: Field) -> Floats:
         known = compliance.build(components=len(moved))
         at = known.points.T[::-1] / GRID.pitch_mm + (GRID.size - 1) / 2
         seen = np.stack([map_coordinates(part, at, order=1, mode="nearest") for part in moved], axis=1)

@@ -46,14 +46,14 @@ class Compliance:
 
 
 @dataclass(frozen=True, eq=False)
-class Block:
+class ElasticBlock:
     """A procedural block seen from straight above, E = 1 kPa."""
 
     volume: Tets
     system: System
 
     @classmethod
-    def build(cls, tets: int) -> Block:
+    def build(cls, tets: int) -> ElasticBlock:
         """A linear block of about that many second-order tetrahedra, with Poisson's ratio 0.4."""
         volume = tetrahedra.block(_ANATOMY, tets)
         return cls(volume, assemble(volume, "linear", 0.4))
@@ -80,7 +80,7 @@ def build(point_mm: float = 1.0, node_mm: float = 1.2, tets: int = 3000, compone
         tets: of the map's own mesh, second order.
         components: of the displacement that is seen: 2 by one eye, 3 by two.
     """
-    block = Block.build(tets)
+    block = ElasticBlock.build(tets)
     radius_mm = _ANATOMY.craniotomy.radius_mm
     points, nodes = _disc(point_mm, radius_mm), _disc(node_mm, radius_mm - node_mm)
     seen, held = block.embed(points), block.embed(nodes)

@@ -11,7 +11,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.methods.protocol import Answer, Scene
+from bench.methods.protocol import Field, ForceEstimate, MethodContext
 
 PEAK_PERCENTILE = 98.0
 """What 2% of the tissue exceeds: the largest displacement, but for outliers."""
@@ -28,13 +28,11 @@ class FlowSize:
         """`measure`: lengths (P,) mm, at least one, to a number [mm]."""
         self._measure = measure
 
-    def __call__(
-        self, flow: NDArray[np.float32], confidence: NDArray[np.float32], scene: Scene, picture: bool
-    ) -> Answer:
+    def __call__(self, flow: Field, confidence: Field, scene: MethodContext, picture: bool) -> ForceEstimate:
         """See `Method`; NaN where nothing of the tissue is seen."""
         lengths = np.linalg.norm(flow[scene.tissue].astype(np.float64), axis=1) * scene.scale_mm_per_px
         seen = bool((confidence[scene.tissue] > 0).any())
-        return Answer(np.array([self._measure(lengths) if seen else np.nan, np.nan, np.nan]))
+        return ForceEstimate(np.array([self._measure(lengths) if seen else np.nan, np.nan, np.nan]))
 
 
 def flow_sizes() -> dict[str, FlowSize]:

@@ -114,7 +114,7 @@ def one_contact(compliance: Compliance, displacement: Floats, weight: Floats) ->
 
 
 @dataclass(frozen=True, eq=False)
-class Contact:
+class ContactFit:
     """A contact that explains a displacement."""
 
     place: Floats
@@ -123,7 +123,7 @@ class Contact:
     """(3,) mN for E = 1 kPa, camera axes."""
 
 
-def contact(compliance: Compliance, displacement: Floats, weight: Floats) -> Contact:
+def contact(compliance: Compliance, displacement: Floats, weight: Floats) -> ContactFit:
     """The contact of `one_contact`.
 
     Without any motion it stands in the middle and carries nothing. The last answer is remembered: two of the
@@ -133,7 +133,7 @@ def contact(compliance: Compliance, displacement: Floats, weight: Floats) -> Con
 
 
 @lru_cache(maxsize=1)
-def _contact(compliance: Compliance, components: int, moved: bytes, sure: bytes) -> Contact:
+def _contact(compliance: Compliance, components: int, moved: bytes, sure: bytes) -> ContactFit:
     displacement, weight = np.frombuffer(moved).reshape(-1, components), np.frombuffer(sure)
     if len(weight) != len(displacement):
         weight = weight.reshape(displacement.shape)
@@ -151,11 +151,11 @@ def _contact(compliance: Compliance, components: int, moved: bytes, sure: bytes)
         if explained[k] > best:
             best, start = float(explained[k]), np.array([*compliance.nodes[k], np.log(radius)])
     if best <= 0:
-        return Contact(np.zeros(3), np.zeros(3))
+        return ContactFit(np.zeros(3), np.zeros(3))
     return _settle(compliance, displacement, weight, start)
 
 
-def _settle(compliance: Compliance, displacement: Floats, weight: Floats, start: Floats) -> Contact:
+def _settle(compliance: Compliance, displacement: Floats, weight: Floats, start: Floats) -> ContactFit:
     """Moves place and radius of a contact to where it explains the displacement best, the force solved for.
 
     `start`: (3,) x, y [mm] and the logarithm of the radius.
@@ -193,7 +193,7 @@ def _settle(compliance: Compliance, displacement: Floats, weight: Floats, start:
         method="Nelder-Mead",
         options={"initial_simplex": corners, "xatol": 1e-2, "fatol": 1e-6 * float(u @ u), "maxiter": 120},
     )
-    return Contact(found.x, fit(found.x)[1])
+    return ContactFit(found.x, fit(found.x)[1])
 
 
 def kernel(compliance: Compliance, place: Floats) -> Floats:

@@ -5,10 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
-from bench.methods.protocol import Answer, Scene
+from bench.methods.protocol import Field, ForceEstimate, MethodContext
 from learn.inference.force_reader import ForceReader, describe_intervals
 from learn.inference.motion import MotionFrame
 from learn.inference.predict import Predictor, load_model
@@ -22,7 +19,7 @@ class Model:
     def __init__(self, model: Path | Predictor) -> None:
         """`model`: the model itself, or its folder, made into a quick graph. UserError if unreadable."""
         self.predictor: Predictor = load_model(model, quick=True) if isinstance(model, Path) else model
-        self._reader: tuple[Scene, ForceReader] | None = None
+        self._reader: tuple[MethodContext, ForceReader] | None = None
 
     def described(self) -> dict[str, object]:
         """What the model is, for the report."""
@@ -42,36 +39,26 @@ class Model:
         """What is to be known of how the last recording was read, once it is."""
         return [] if self._reader is None else self._reader[1].notes + describe_intervals(self.predictor.card)
 
-    def __call__(
-        self, flow: NDArray[np.float32], confidence: NDArray[np.float32], scene: Scene, picture: bool
-    ) -> Answer:
+    def __call__(self, flow: Field, confidence: Field, scene: MethodContext, picture: bool) -> ForceEstimate:
         """See `Method`."""
         return self._answer(flow, confidence, None, scene, picture)
 
     def in_space(
-        self,
-        flow: NDArray[np.float32],
-        confidence: NDArray[np.float32],
-        moved: Moved,
-        scene: Scene,
-        picture: bool,
-    ) -> Answer:
+        self, flow: Field, confidence: Field, moved: Moved, scene: MethodContext, picture: bool
+    ) -> ForceEstimate:
         """See `InSpace`; a network of one eye reads flow all the same."""
         return self._answer(flow, confidence, moved, scene, picture)
 
     def _answer(
-        self,
-        flow: NDArray[np.float32],
-        confidence: NDArray[np.float32],
-        moved: Moved | None,
-        scene: Scene,
-        picture: bool,
-    ) -> Answer:
+        self, flow: Field, confidence: Field, moved: Moved | None, scene: MethodContext, picture: bool
+    ) -> ForceEstimate:
         if self._reader is None or self._reader[0] is not scene:
             reader = ForceReader(self.predictor, scene.tissue, scene.scale_mm_per_px, scene.young_kpa)
             self._reader = scene, reader
         found = self._reader[1].read(MotionFrame(flow, confidence, moved))
-        answer = Answer(found.force_mn, found.map.to_image() if picture else None, distance=found.distance)
+        answer = ForceEstimate(
+            found.force_mn, found.map.to_image() if picture else None, distance=found.distance
+        )
         if not found.bands:
             return answer
         band = found.bands[LEVEL]

@@ -6,9 +6,8 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from bench.methods.protocol import Answer, InSpace, Method, Scene
+from bench.methods.protocol import Field, ForceEstimate, InSpace, Method, MethodContext
 from synth.errors import UserError, as_user_error
 from synth.plugins import Registry
 
@@ -30,13 +29,11 @@ class Plugged:
         """What it says is to be known of how it read the recording."""
         return [str(note) for note in getattr(self._method, "notes", ())]
 
-    def __call__(
-        self, flow: NDArray[np.float32], confidence: NDArray[np.float32], scene: Scene, picture: bool
-    ) -> Answer:
+    def __call__(self, flow: Field, confidence: Field, scene: MethodContext, picture: bool) -> ForceEstimate:
         """See `Method`."""
         return self._asked(self._method, flow, confidence, scene, picture)
 
-    def _asked(self, ask: Any, *told: Any) -> Answer:
+    def _asked(self, ask: Any, *told: Any) -> ForceEstimate:
         with as_user_error(self._label):
             answer = ask(*told)
             force = np.asarray(answer.force_mn, np.float64)
@@ -45,7 +42,7 @@ class Plugged:
             raise UserError(f"{self._label}: gives force of shape {force.shape}, expected (3,)")
         if density is not None and density.shape != told[0].shape[:2]:
             raise UserError(f"{self._label}: gives density of shape {density.shape}, not the picture's")
-        return Answer(force, density)
+        return ForceEstimate(force, density)
 
 
 def installed() -> dict[str, Method]:

@@ -11,9 +11,12 @@ from numpy.typing import NDArray
 
 from synth.flow.stereo.track import Moved
 
+Field = NDArray[np.float32]
+"""(H, W, ...) on the pixels that flow is computed on."""
+
 
 @dataclass(frozen=True)
-class Scene:
+class MethodContext:
     """What stays the same over a recording, on the pixels flow is computed on."""
 
     tissue: NDArray[np.bool_]
@@ -23,12 +26,12 @@ class Scene:
 
 
 @dataclass(frozen=True)
-class Answer:
+class ForceEstimate:
     """What a method says of one frame."""
 
     force_mn: NDArray[np.float64]
     """(3,) force on the tissue in camera axes [mN]; a method of magnitudes only puts it into x, rest NaN."""
-    density: NDArray[np.float32] | None = None
+    density: Field | None = None
     """(H, W) size of the force density on the rest frame's pixels [kPa], for the pictures."""
     low_mn: float = math.nan
     """Lower end of the 90% interval of the force's size; NaN of a method that knows none."""
@@ -45,9 +48,7 @@ class Answer:
 class Method(Protocol):
     """Displacement to force, frame by frame. One that has `notes: list[str]` is asked for them at the end."""
 
-    def __call__(
-        self, flow: NDArray[np.float32], confidence: NDArray[np.float32], scene: Scene, picture: bool
-    ) -> Answer:
+    def __call__(self, flow: Field, confidence: Field, scene: MethodContext, picture: bool) -> ForceEstimate:
         """Force of one frame.
 
         Args:
@@ -64,12 +65,7 @@ class InSpace(Protocol):
     """A method that can also read motion in three dimensions, where a recording has a second eye or depth."""
 
     def in_space(
-        self,
-        flow: NDArray[np.float32],
-        confidence: NDArray[np.float32],
-        moved: Moved,
-        scene: Scene,
-        picture: bool,
-    ) -> Answer:
+        self, flow: Field, confidence: Field, moved: Moved, scene: MethodContext, picture: bool
+    ) -> ForceEstimate:
         """As a `Method`; `moved`: motion [mm] in camera axes and its standard deviation, (H, W, 3) each."""
         ...

@@ -29,7 +29,7 @@ _LOOKED_AT = 12  # frames that are followed to see whether they can be
 
 
 @dataclass(frozen=True)
-class Finding:
+class RecordingFinding:
     """One line of the answer."""
 
     state: str
@@ -44,7 +44,7 @@ class Finding:
 class _Checked:
     """What the checks before have found."""
 
-    findings: list[Finding] = field(default_factory=list)
+    findings: list[RecordingFinding] = field(default_factory=list)
     mm_per_px: float | None = None
     time_s: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
     """Of the usable frames."""
@@ -53,14 +53,14 @@ class _Checked:
     frames: int = 0
 
     def add(self, state: str, what: str, said: str) -> None:
-        self.findings.append(Finding(state, what, said))
+        self.findings.append(RecordingFinding(state, what, said))
 
     def judge(self, fine: bool, what: str, said: str) -> None:
         """`ok` or `odd`."""
         self.add("ok" if fine else "odd", what, said)
 
 
-def check_recording(folder: Path, phantom: bool = False) -> list[Finding]:
+def check_recording(folder: Path, phantom: bool = False) -> list[RecordingFinding]:
     """Opens a recording, decodes its pictures and compares what its files say. Raises no UserError.
 
     `phantom`: as of `open_recording`.
@@ -69,7 +69,7 @@ def check_recording(folder: Path, phantom: bool = False) -> list[Finding]:
     try:
         recording = open_recording(folder, phantom)
     except UserError as error:
-        return [Finding("bad", "recording", str(error))]
+        return [RecordingFinding("bad", "recording", str(error))]
     for note in recording.notes:
         found.add("odd", "files", note)
     for what, check in (
@@ -86,7 +86,7 @@ def check_recording(folder: Path, phantom: bool = False) -> list[Finding]:
     return found.findings
 
 
-def is_usable(found: list[Finding]) -> bool:
+def is_usable(found: list[RecordingFinding]) -> bool:
     """Whether anything can be predicted from it."""
     return all(finding.state != "bad" for finding in found)
 

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.methods.protocol import Method, Scene
+from bench.methods.protocol import Method, MethodContext
 from synth.errors import UserError
 from synth.recording_flow.local_flow import LocalFlow
 from synth.recording_flow.video_flow import Footage, RecordingFlowSettings, VideoFlow
@@ -92,12 +92,14 @@ def stream_video(
         raise UserError("a model needs --scale (mm a pixel, or unknown): forces have no meaning without it")
     stream, pace = Stream(), _VideoClock(paced)
     video = VideoFlow(footage, settings, flow, pace=pace)
-    scene: Scene | None = None
+    scene: MethodContext | None = None
     for found in video.frames():
         if scene is None:
             stream.size = video.tissue.shape
             mm_per_px = pixel_mm(scale_mm_per_px or 1.0, video.size[1]) * video.shrink
-            scene = Scene(video.tissue, mm_per_px, None if scale_mm_per_px == "unknown" else young_kpa)
+            scene = MethodContext(
+                video.tissue, mm_per_px, None if scale_mm_per_px == "unknown" else young_kpa
+            )
             continue
         began, force = time.perf_counter(), None
         if method is not None and found.trusted:

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.methods.protocol import InSpace, Method, Scene
+from bench.methods.protocol import InSpace, Method, MethodContext
 from bench.recording.folder import Recording
 from bench.recording.second_eye import SecondEye, StereoQuality
 from synth.errors import UserError
@@ -53,7 +53,7 @@ class TrackedRecording:
     force_mn: dict[str, list[NDArray[np.float64]]] = field(default_factory=dict)
     """By method: (3,) each."""
     bounds: dict[str, list[tuple[float, float, float]]] = field(default_factory=dict)
-    """By method: `low_mn`, `high_mn` and `distance` of each `Answer`."""
+    """By method: `low_mn`, `high_mn` and `distance` of each `ForceEstimate`."""
     speed: list[float] = field(default_factory=list)
     """Mean speed of the tissue since the frame before [mm/s]; what is lined up with the sensor."""
     confidence: list[float] = field(default_factory=list)
@@ -115,7 +115,7 @@ def track_recording(
         for frame in video.frames(progress):
             if frame.is_rest:
                 mm_per_px = scale_mm_per_px * video.shrink
-                forces.begin(frame.rgb, Scene(video.tissue, mm_per_px, about.young_kpa))
+                forces.begin(frame.rgb, MethodContext(video.tissue, mm_per_px, about.young_kpa))
             if frame.time_s is not None:
                 forces.add(frame, frame.time_s)
                 span = about.sensor.turn_s
@@ -183,7 +183,7 @@ class _Forces:
         self.last: NDArray[np.float32] | None = None
         self.stride = 1
 
-    def begin(self, rest: NDArray[np.uint8], scene: Scene) -> None:
+    def begin(self, rest: NDArray[np.uint8], scene: MethodContext) -> None:
         """The rest frame's picture, (h, w, 3), and what stays the same over the recording."""
         self.scene, self.out.rest = scene, _shrunk(rest)
         self.out.tissue = _shrunk(scene.tissue.astype(np.uint8) * 255) > 127

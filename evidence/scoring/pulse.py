@@ -16,7 +16,7 @@ import typer
 from numpy.typing import NDArray
 
 from bench.methods import baselines
-from bench.methods.compliance import TO_CAMERA, Block, picture
+from bench.methods.compliance import TO_CAMERA, ElasticBlock, picture
 from bench.methods.protocol import Method
 from bench.recording import pixel_scale, writer
 from bench.recording.folder import open_recording
@@ -72,7 +72,7 @@ def draw_contact(rng: np.random.Generator, seconds: float, size: int) -> dict[st
         time_s (T,), force_mn (T, 3), field (size, size, 2) px a mN of its own direction, mm_per_px.
     """
     mm_per_px = 2 * _RADIUS_MM / size
-    block = Block.build(2500)
+    block = ElasticBlock.build(2500)
     place, steps = rng.uniform(-3, 3, 2), np.arange(-_CONTACT_MM, _CONTACT_MM + 0.1, 0.8)
     x, y = (axis.ravel() for axis in np.meshgrid(steps, steps))
     share = np.clip(1 - (x**2 + y**2) / _CONTACT_MM**2, 0, None) ** 2

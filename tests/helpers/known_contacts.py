@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.methods.compliance import TO_CAMERA, Block, Compliance, picture
+from bench.methods.compliance import TO_CAMERA, Compliance, ElasticBlock, picture
 
 Floats = NDArray[np.float64]
 
@@ -20,7 +20,7 @@ def contacts(
     Returns:
         (count, 3) forces [mN], camera axes; count fields (P, C) of displacement [mm], C as the compliance's.
     """
-    block = Block.build(tets)
+    block = ElasticBlock.build(tets)
     seen = block.embed(known.points)
     steps = np.stack(np.meshgrid(np.linspace(-1, 1, 13), np.linspace(-1, 1, 13)), axis=-1).reshape(-1, 2)
     disc = steps[np.hypot(*steps.T) < 1]

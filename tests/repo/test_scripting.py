@@ -73,7 +73,7 @@ def test_a_model_reads_a_film_and_the_bench_scores_it(out: Path, tmp_path: Path)
     np.testing.assert_allclose(unknown * about[2], force, rtol=1e-4, atol=1e-4), "then it is of 1 kPa"
 
     recording = bench.export_recording(sequence, tmp_path / "recording")
-    own = {"none": lambda flow, confidence, scene, picture: bench.Answer(np.zeros(3))}
+    own = {"none": lambda flow, confidence, scene, picture: bench.ForceEstimate(np.zeros(3))}
     every = bench.Settings(rate_hz=None)
     result = bench.score(recording, model, methods=own, settings=every, baselines=False)
     assert result.main == "D2FNet"

@@ -12,7 +12,7 @@ from made_clip import made_clip
 from numpy.typing import NDArray
 
 from bench.methods import baselines, compliance, inverse
-from bench.methods.protocol import InSpace, Method, Scene
+from bench.methods.protocol import InSpace, Method, MethodContext
 from learn.data.clips import Clip
 from synth.errors import UserError
 from synth.flow.stereo.track import Moved
@@ -48,7 +48,7 @@ def methods() -> dict[str, Method]:
 
 
 def ask(method: Method, force: NDArray[np.float64], young: float) -> float:
-    scene = Scene(np.ones((96, 96), bool), 36 / 96, young)
+    scene = MethodContext(np.ones((96, 96), bool), 36 / 96, young)
     axis = (np.arange(96) - 47.5) * 36 / 96
     bump = np.exp(-(axis[None] ** 2 + axis[:, None] ** 2) / 50)
     flow = (0.05 * force[:2] * bump[..., None] / scene.scale_mm_per_px).astype(np.float32)
@@ -101,7 +101,7 @@ def known() -> compliance.Compliance:
 
 def moved(known: compliance.Compliance, load: list[float]) -> NDArray[np.float64]:
     """Displacement (P, 3) mm, camera axes, for four loads of (3,) mN, world axes, on another mesh."""
-    block = compliance.Block.build(2500)
+    block = compliance.ElasticBlock.build(2500)
     held = block.embed(np.array([[2.0, -3.0], [2.5, -3.0], [2.0, -2.5], [1.5, -3.0]]))
     u = block.embed(known.points).move(block.system.solve(held.gather(np.tile(load, (4, 1)))))
     return np.asarray(u * [1, -1, -1])
@@ -148,7 +148,7 @@ def test_fitted_on_two_eyes_asks_for_two() -> None:
         )
     method = baselines.as_methods(baselines.fitted_rules(told, "motion"), "motion")["ridge on PCA of flow"]
     force = np.array([6.0, 0, 0])
-    scene = Scene(np.ones((96, 96), bool), 36 / 96, 1.0)
+    scene = MethodContext(np.ones((96, 96), bool), 36 / 96, 1.0)
     axis = (np.arange(96) - 47.5) * 36 / 96
     bump = np.exp(-(axis[None] ** 2 + axis[:, None] ** 2) / 50)[..., None]
     seen = (0.05 * np.array([*force[:2], 0.5 * force[0]]) * bump).astype(np.float32)

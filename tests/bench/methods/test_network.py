@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bench.methods.network import Model
-from bench.methods.protocol import Scene
+from bench.methods.protocol import MethodContext
 from learn.data.grid import Grid, GridView
 from learn.inference.predict import ForceMap
 
@@ -31,7 +31,7 @@ def test_the_rest_frame_is_the_zero_and_unknown_tissue_has_1_kpa(
     predictor.grid = Grid(16)  # type: ignore[attr-defined]
     model = Model.__new__(Model)
     model.predictor, model._reader = predictor, None  # type: ignore[assignment]
-    scene = Scene(tissue, 0.1, young_kpa)
+    scene = MethodContext(tissue, 0.1, young_kpa)
     moved, sure = np.zeros((4, 4, 2), np.float32), np.ones((4, 4), np.float32)
     young = young_kpa or 1.0
     assert model(moved, sure, scene, False).size_mn == 0

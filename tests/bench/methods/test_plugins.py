@@ -25,7 +25,7 @@ class Push:
     def __call__(self, flow, confidence, scene, picture):
         height, width = flow.shape[:2]
         middle = flow[height // 2 - 4 : height // 2 + 4, width // 2 - 4 : width // 2 + 4, 0]
-        return bench.Answer(np.array([44.0 * float(np.median(middle)), 0.0, 0.0]))
+        return bench.ForceEstimate(np.array([44.0 * float(np.median(middle)), 0.0, 0.0]))
 
 
 class Raises(Push):
@@ -35,7 +35,7 @@ class Raises(Push):
 
 class Short(Push):
     def __call__(self, flow, confidence, scene, picture):
-        return bench.Answer(np.zeros(2))
+        return bench.ForceEstimate(np.zeros(2))
 
 
 def nothing():

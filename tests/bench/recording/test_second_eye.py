@@ -12,7 +12,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from skimage import data
 
-from bench.methods.protocol import Answer, Scene
+from bench.methods.protocol import ForceEstimate, MethodContext
 from bench.recording import writer
 from bench.recording.folder import open_recording
 from bench.tracking.tracking import track_recording
@@ -96,14 +96,16 @@ class Looking:
     def __init__(self) -> None:
         self.told: list[Moved] = []
 
-    def __call__(self, flow: np.ndarray, confidence: np.ndarray, scene: Scene, picture: bool) -> Answer:
+    def __call__(
+        self, flow: np.ndarray, confidence: np.ndarray, scene: MethodContext, picture: bool
+    ) -> ForceEstimate:
         raise AssertionError("there is a second eye")
 
     def in_space(
-        self, flow: np.ndarray, confidence: np.ndarray, moved: Moved, scene: Scene, picture: bool
-    ) -> Answer:
+        self, flow: np.ndarray, confidence: np.ndarray, moved: Moved, scene: MethodContext, picture: bool
+    ) -> ForceEstimate:
         self.told.append(moved)
-        return Answer(moved.motion[50:70, 70:90].mean(axis=(0, 1)).astype(np.float64))
+        return ForceEstimate(moved.motion[50:70, 70:90].mean(axis=(0, 1)).astype(np.float64))
 
 
 @pytest.mark.parametrize("second", ["right", "depth"])

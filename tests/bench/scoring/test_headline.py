@@ -9,10 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from fake_recording import GAIN_MN_PER_PX, Bump, Maker, force_curve, scored
-from numpy.typing import NDArray
 
 from bench.methods.flow_size import flow_sizes
-from bench.methods.protocol import Answer, Method, Scene
+from bench.methods.protocol import Field, ForceEstimate, Method, MethodContext
 from bench.scoring import charts
 from bench.scoring.headline import headline
 from bench.scoring.result import Result, as_json
@@ -83,7 +82,7 @@ def test_mean_and_peak_of_a_flow_by_hand() -> None:
     flow[..., 0] = np.arange(200).reshape(10, 20)
     seen = np.ones((10, 20), np.float32)
     seen[5:] = 0
-    scene = Scene(np.ones((10, 20), bool), 0.5, None)
+    scene = MethodContext(np.ones((10, 20), bool), 0.5, None)
     sizes = {name: method(flow, seen, scene, False).force_mn[0] for name, method in flow_sizes().items()}
     lengths = 0.5 * np.arange(200)  # what is hidden counts as it is filled in
     assert sizes == pytest.approx({"mean |flow|": lengths.mean(), "peak |flow|": np.percentile(lengths, 98)})
@@ -96,9 +95,13 @@ def test_a_shape_that_is_wrong_shows(make: Maker) -> None:
         """The bump, but square-rooted: another shape."""
 
         def __call__(
-            self, flow: NDArray[np.float32], confidence: NDArray[np.float32], scene: Scene, picture: bool
-        ) -> Answer:
-            return Answer(np.sqrt(Bump()(flow, confidence, scene, picture).force_mn))
+            self,
+            flow: Field,
+            confidence: Field,
+            scene: MethodContext,
+            picture: bool,
+        ) -> ForceEstimate:
+            return ForceEstimate(np.sqrt(Bump()(flow, confidence, scene, picture).force_mn))
 
     result = run(make(), late=Late())
     # min over g of mean |g sqrt(x) - x| / mean peak, x being the half-waves: by hand.
