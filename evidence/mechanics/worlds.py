@@ -47,11 +47,11 @@ class World:
 
 
 def _membrane(young_kpa: float, thickness_mm: float) -> dict[str, Any]:
-    return {"intact": 1.0, "young_kpa": young_kpa, "thickness_mm": thickness_mm}
+    return {"probability": 1.0, "young_kpa": young_kpa, "thickness_mm": thickness_mm}
 
 
 _PULSE = {"heart_mm": [0.1, 0.5], "breath_mm": [0.1, 1.0]}
-_ALIVE = {"pulse": _PULSE, "membrane": {"intact": 1.0}}
+_ALIVE = {"pulse": _PULSE, "membrane": {"probability": 1.0}}
 
 WORLDS: dict[str, World] = {
     PLAIN: World(),

@@ -34,7 +34,7 @@ def identify_job(job: Job) -> str:
     del described["sequences"], described["card"]
     if not job.render.stereo_mm:
         del described["flow"]["stereo"]  # says nothing of one eye's sequences
-    if not job.fem.crew:
+    if not job.fem.instrument_list:
         del described["fem"]["crew"]  # so that jobs without one are what they were
     if not job.anatomy.craniotomy.also:
         del described["anatomy"]["craniotomy"]["also"]

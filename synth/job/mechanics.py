@@ -68,7 +68,7 @@ class InstrumentSection(Section):
 class MembraneSection(Section):
     """The pia-arachnoid, a thin stiff sheet on the surface that wrinkles under compression. Default: none."""
 
-    intact: Share = 0.0
+    probability: Share = 0.0
     """Part of the sequences that have it; from the others it is stripped, as from many ex vivo specimens."""
     young_kpa: Range[Positive] = (100.0, 1000.0)
     """Its Young's modulus at small strain [kPa], drawn log-uniformly. Human: about 900 (3 times a shear
@@ -138,13 +138,13 @@ class FemSection(Section):
     """Kinds of gesture that sequences are drawn from, in equal shares."""
     instruments: Range[Annotated[int, Field(ge=1, le=3)]] = (1, 1)
     """How many instruments act at once, each with a gesture, load, direction and timing of its own."""
-    crew: Annotated[tuple[InstrumentSection, ...], Field(max_length=3)] = ()
+    instrument_list: Annotated[tuple[InstrumentSection, ...], Field(max_length=3)] = ()
     """Instruments as asked, the first ones of `instruments` (there are at least so many): a list of {gesture,
     place, direction, load, force_mn, footprint_mm, timing}, each of them drawn where it is left out."""
-    within_mm: Positive | None = None
+    contact_region_radius_mm: Positive | None = None
     """What is loaded keeps within this radius of the opening's middle [mm], such as what the camera sees of a
-    wide opening; a `crew`'s places count as they are. Empty: anywhere in the opening."""
-    cone_deg: Annotated[FiniteFloat, Field(ge=0, le=80)] = 65.0
+    wide opening; places of an `instrument_list` count as they are. Empty: anywhere in the opening."""
+    max_tilt_deg: Annotated[FiniteFloat, Field(ge=0, le=80)] = 65.0
     """The load's direction is drawn uniformly within this angle of the surface normal."""
     time: Literal["quasi-static", "dynamic"] = "quasi-static"
     """Equilibrium in every frame, or motion with inertia (backward Euler)."""
@@ -175,13 +175,14 @@ class FemSection(Section):
     @property
     def _load_ranges(self) -> list[tuple[str, LoadRange]]:
         """What can be drawn: of each instrument that is asked for, and of those that aren't."""
-        drawn = [("", self.load_range(InstrumentSection()))] if self.instruments[1] > len(self.crew) else []
-        return drawn + [(f"crew[{k}]: ", self.load_range(one)) for k, one in enumerate(self.crew)]
+        given = self.instrument_list
+        drawn = [("", self.load_range(InstrumentSection()))] if self.instruments[1] > len(given) else []
+        return drawn + [(f"instrument_list[{k}]: ", self.load_range(one)) for k, one in enumerate(given)]
 
     @property
     def chosen_law(self) -> tuple[str, str]:
         """The material law of every sequence, and why."""
-        if self.law == "auto" and self.membrane.intact > 0:
+        if self.law == "auto" and self.membrane.probability > 0:
             return "neo-hookean", "a membrane stretches as it bends, which the linear law leaves out"
         return choose_law(self.law, self.largest_load)
 

@@ -1,4 +1,4 @@
-"""Keys that jobs and trainings once had, so that what older versions wrote is still read.
+"""Keys that jobs and trainings once had, or had under another name: what older versions wrote is still read.
 
 A key stands here with the value it had by default. At that value it is dropped without a word; at another one
 what is stored can still be read, and only commit `LAST` makes more of it.
@@ -28,6 +28,8 @@ class Retired:
     """Of a key that stays: the values that went; where one stood, `default` is read."""
     words: Mapping[str, Any] = field(default_factory=dict)
     """Of a section that is one word now: what each word stands for, `default` included."""
+    renamed: str = ""
+    """Of a key that stays: its name now."""
 
 
 _LABELS = {
@@ -69,6 +71,10 @@ JOB: dict[str, Retired] = {
     "sensor.depth": Retired(8),
     "sensor.subframes": Retired(4),
     "render.off_centre": Retired([0.0, 0.0]),
+    "fem.crew": Retired([], renamed="instrument_list"),
+    "fem.within_mm": Retired(None, renamed="contact_region_radius_mm"),
+    "fem.cone_deg": Retired(65.0, renamed="max_tilt_deg"),
+    "fem.membrane.intact": Retired(0.0, renamed="probability"),
     "labels": Retired(_LABELS, words={"none": _LABELS, "published": {**_LABELS, "force_share": 0.02}}),
 }
 """Of a job: a dotted key each."""
@@ -109,6 +115,10 @@ def drop(values: Mapping[str, Any], table: Mapping[str, Retired]) -> tuple[dict[
             continue
         if one.words and not isinstance(block[name], dict | None):
             continue
+        if one.renamed:
+            if one.renamed not in block:  # else it is refused, as any key that isn't known
+                block[one.renamed] = block.pop(name)
+            continue
         value = block.pop(name)
         word = next((word for word, stood in one.words.items() if _same(value, stood, one.default)), None)
         if one.gone or word:
@@ -128,6 +138,9 @@ def restore(values: Mapping[str, Any], table: Mapping[str, Retired]) -> dict[str
         block = tree
         for step in blocks:
             block = block.setdefault(step, {})
+        if one.renamed in block:
+            block[name] = block.pop(one.renamed)
+            continue
         block[name] = copy.deepcopy(one.words.get(block.get(name, ""), one.default))
     return tree
 

@@ -206,14 +206,14 @@ class Job(Section):
         return self
 
     @model_validator(mode="after")
-    def _crew_is_in_the_opening(self) -> Job:
+    def _instruments_are_in_the_opening(self) -> Job:
         radius = self.anatomy.craniotomy.radius_mm
-        for k, one in enumerate(self.fem.crew):
+        for k, one in enumerate(self.fem.instrument_list):
             least = self.fem.load_range(one).footprint_mm[0]
             if one.place is not None and math.hypot(*one.place) + least + CLEAR_MM > radius:
                 raise ValueError(
-                    f"fem.crew[{k}].place: {math.hypot(*one.place):.3g} mm from the middle, a contact of "
-                    f"{least:g} mm radius reaches under the rim of an opening of {radius:g} mm radius"
+                    f"fem.instrument_list[{k}].place: {math.hypot(*one.place):.3g} mm from the middle, a "
+                    f"contact of {least:g} mm radius reaches under the rim of an opening of {radius:g} mm"
                 )
         return self
 

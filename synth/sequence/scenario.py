@@ -36,7 +36,7 @@ _STRETCH = 1.01, 1.03
 """How far a membrane is stretched at rest. Not from a measurement: its pull then balances a pressure of 3-350
 Pa (at most 2.6 mmHg) under a dome of 70 mm radius, which a living head has."""
 _RAMP = 0.25, 0.35  # time in which the load grows to its peak, as a part of the sequence
-_TRIES, _ROUNDS = 400, 8  # of a gesture until it has room, and of all gestures of a job's `fem.crew`
+_TRIES, _ROUNDS = 400, 8  # of a gesture until it has room, and of all of `fem.instrument_list`
 _SPARSE_DEG = 17.0  # slope that mirrors the main lamp into the lens where highlights are fewest
 _POWER = 0.95, 1.1  # illumination, against one that just fills the sensor with white
 _DRIFT = 0.0, 0.03  # largest change of power over the sequence, as a share of it
@@ -125,7 +125,7 @@ def draw_tissue(fem: FemSection, rng: Random) -> Tissue:
         _log_uniform(rng, membrane.young_kpa), _uniform(rng, membrane.thickness_mm), _uniform(rng, _STRETCH)
     )
     poisson, skull = _uniform(rng, fem.poisson), str(rng.choice(fem.skull))
-    return Tissue(young, poisson, law, why, pia if drawn < membrane.intact else None, skull)
+    return Tissue(young, poisson, law, why, pia if drawn < membrane.probability else None, skull)
 
 
 def draw_pulse(pulse: schema.PulseSection, rng: Random) -> Pulse | None:
@@ -141,8 +141,8 @@ def draw_gestures(
 ) -> tuple[Gesture, ...]:
     """Draws the gestures of all instruments, each redrawn until it has room beside the others.
 
-    Those of `fem.crew` are as they are asked, and those with a place come first, so that nothing that is
-    drawn stands where one is wanted.
+    Those of `fem.instrument_list` are as they are asked; those with a place come first, so that nothing that
+    is drawn stands where one is wanted.
 
     Args:
         fem: the job's section; their number is drawn from `fem.instruments`.
@@ -154,15 +154,16 @@ def draw_gestures(
     Raises:
         UserError: the opening has no room for so many, or not there.
     """
-    count = max(int(others.integers(fem.instruments[0], fem.instruments[1] + 1)), len(fem.crew))
-    asked = [*fem.crew, *[InstrumentSection()] * (count - len(fem.crew))]
+    given, (fewest, most) = fem.instrument_list, fem.instruments
+    count = max(int(others.integers(fewest, most + 1)), len(given))
+    asked = [*given, *[InstrumentSection()] * (count - len(given))]
     order = sorted(range(count), key=lambda k: asked[k].place is None)
-    for _ in range(_ROUNDS if fem.crew else 1):  # the shaft of one may leave no room to the next: all anew
+    for _ in range(_ROUNDS if given else 1):  # the shaft of one may leave no room to the next: all anew
         found: dict[int, Gesture] = {}
         for k in order:
             for _ in range(_TRIES):
                 trial = draw_gesture(fem, opening_mm, young_kpa, others if k else rng, asked[k])
-                fits = not fem.crew or trial.reach_mm <= max(opening_mm - CLEAR_MM, trial.footprint_mm) + 1e-9
+                fits = not given or trial.reach_mm <= max(opening_mm - CLEAR_MM, trial.footprint_mm) + 1e-9
                 if fits and all(tool.clearance(trial, other) >= 0 for other in found.values()):
                     found[k] = trial
                     break
@@ -171,11 +172,12 @@ def draw_gestures(
         else:
             return tuple(found[k] for k in range(count))
     beside = f" beside the other {len(found)}" if found else ""
-    within = "" if fem.within_mm is None else f" and fem.within_mm of {fem.within_mm:g}"
+    region = fem.contact_region_radius_mm
+    within = "" if region is None else f" and fem.contact_region_radius_mm of {region:g}"
     raise UserError(
-        f"fem.{'crew' if fem.crew else 'instruments'}: instrument {k} of {count} has no room{beside} in an "
-        f"opening of {opening_mm:g} mm radius{within}; lower fem.instruments or footprint_mm, change its "
-        "place, or widen anatomy.craniotomy.radius_mm"
+        f"fem.{'instrument_list' if given else 'instruments'}: instrument {k} of {count} has no room{beside} "
+        f"in an opening of {opening_mm:g} mm radius{within}; lower fem.instruments or footprint_mm, change "
+        "its place, or widen anatomy.craniotomy.radius_mm"
     )
 
 
@@ -188,11 +190,11 @@ def draw_gesture(
 ) -> Gesture:
     """Draws one gesture: contact uniformly in the opening, direction uniformly in its cone; or as asked.
 
-    With `fem.within_mm` all that it loads keeps to that radius of the opening's middle. Where it is asked for
-    a place, what is drawn may reach beyond the opening.
+    With `fem.contact_region_radius_mm` all that it loads keeps to that radius of the opening's middle. Where
+    it is asked for a place, what is drawn may reach beyond the opening.
 
     Raises:
-        UserError: what is drawn has no room in `fem.within_mm`.
+        UserError: what is drawn has no room in `fem.contact_region_radius_mm`.
     """
     drawn, wanted = str(rng.choice(fem.gestures)), fem.load_range(asked)
     kind = asked.gesture or drawn
@@ -239,11 +241,11 @@ def _draw_point(
     asked: InstrumentSection,
 ) -> Floats:
     """Middle of the contacts (2,) mm; with `reach` mm round it all that is loaded is in the opening."""
-    within = opening_mm if fem.within_mm is None else min(opening_mm, fem.within_mm)
+    within = min(opening_mm, fem.contact_region_radius_mm or opening_mm)
     if within < min(reach + CLEAR_MM, opening_mm) and asked.place is None:
         raise UserError(
-            f"fem.within_mm: a {kind} of {footprint:.3g} mm footprint reaches {reach:.3g} mm, which "
-            f"{within:g} mm leave no room for; raise it or lower fem.footprint_mm"
+            f"fem.contact_region_radius_mm: a {kind} of {footprint:.3g} mm footprint reaches {reach:.3g} mm, "
+            f"which {within:g} mm leave no room for; raise it or lower fem.footprint_mm"
         )
     room = max(within - reach - CLEAR_MM, 0.0)
     radius, angle = room * np.sqrt(rng.uniform()), rng.uniform(0, 2 * np.pi)
@@ -258,7 +260,7 @@ def _draw_direction(
     """Unit vectors: the load's component along the surface (2,), which is the way of a slide, and it (3,)."""
     turn = rng.uniform(0, 2 * np.pi)
     along = np.array([np.cos(turn), np.sin(turn)])
-    cone = np.cos(np.radians(fem.cone_deg))
+    cone = np.cos(np.radians(fem.max_tilt_deg))
     rise = rng.uniform(cone, 1.0)
     if kind == "retract":  # sideways, as a spatula holds tissue away
         rise = rng.uniform(0.1, max(cone, 0.3))

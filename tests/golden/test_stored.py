@@ -168,6 +168,8 @@ def test_a_block_that_became_a_word_is_read_as_it() -> None:
         assert (values, others) == ({"labels": word}, {})
         assert retired.restore(values, retired.JOB)["labels"]["force_share"] == (0.02 * (word != "none"))
     assert retired.drop({"labels": {"outliers": 0.1}}, retired.JOB)[1] == {"labels": {"outliers": 0.1}}
+    assert retired.drop({"fem": {"crew": [1]}}, retired.JOB) == ({"fem": {"instrument_list": [1]}}, {})
+    assert retired.restore({"fem": {"instrument_list": [1]}}, retired.JOB)["fem"]["crew"] == [1]
     assert retired.drop({"fem": {"law": "stable"}}, retired.JOB) == (
         {"fem": {"law": "neo-hookean"}},
         {"fem.law": "stable"},

@@ -20,7 +20,7 @@ from synth.sequence import mechanics, scenario
 
 CONTACT = fem_case.CONTACTS[0]
 LIVING = {
-    "membrane": {"intact": 0.7},
+    "membrane": {"probability": 0.7},
     "pulse": {"heart_mm": (0.0, 0.5), "breath_mm": (0.0, 0.6)},
     "poisson": (0.4, 0.49),
     "skull": ("bonded", "slip"),

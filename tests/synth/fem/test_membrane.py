@@ -66,7 +66,9 @@ def test_stretch_pull_and_wrinkles_are_those_of_the_textbook(tets: Tets) -> None
 @pytest.mark.slow
 def test_work_over_a_load_cycle_is_the_stored_energy() -> None:
     """The tools' work on the way up is what is stored at the top, and comes back whole."""
-    fem = schema.FemSection(gestures=("push",), load=(0.25, 0.25), membrane=schema.MembraneSection(intact=1))
+    fem = schema.FemSection(
+        gestures=("push",), load=(0.25, 0.25), membrane=schema.MembraneSection(probability=1)
+    )
     tissue = replace(scenario.draw_tissue(fem, np.random.default_rng(1)), membrane=Pia(300.0, 0.1, 1.02))
     gesture = scenario.draw_gesture(fem, OPENING_MM, tissue.young_kpa, np.random.default_rng(2))
     tets = tetrahedra.block(ANATOMY, 700, gesture.focus)

@@ -14,7 +14,7 @@ def test_same_job_and_index_draw_the_same_scenario_however_many_sequences_there_
 
 def test_shares_are_drawn_and_what_is_not_asked_for_changes_no_draw() -> None:
     plain = [draw(Job(sequences=40), k) for k in range(40)]
-    fem = {"membrane": {"intact": 0.5}, "pulse": {"heart_mm": [0.1, 0.5]}, "skull": ["bonded", "slip"]}
+    fem = {"membrane": {"probability": 0.5}, "pulse": {"heart_mm": [0.1, 0.5]}, "skull": ["bonded", "slip"]}
     drawn = [
         draw(Job.model_validate({"sequences": 40, "fem": fem | {"poisson": [0.4, 0.49]}}), k)
         for k in range(40)

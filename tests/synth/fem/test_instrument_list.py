@@ -23,7 +23,7 @@ PULL = {"gesture": "pull", "place": [-5.0, 1.0], "force_mn": 1.5, "direction": [
 
 
 def job(*crew: dict[str, Any], **fem: Any) -> synth.Job:
-    return synth.Job.model_validate({"seed": 3, "sequences": 20, "fem": {"crew": crew, **fem}})
+    return synth.Job.model_validate({"seed": 3, "sequences": 20, "fem": {"instrument_list": crew, **fem}})
 
 
 def test_what_is_asked_is_done_and_the_rest_is_drawn() -> None:
@@ -53,5 +53,5 @@ def test_what_is_asked_is_done_and_the_rest_is_drawn() -> None:
     ],
 )
 def test_what_cannot_be_is_refused(wrong: dict[str, Any]) -> None:
-    with pytest.raises(ValidationError, match="crew"):
+    with pytest.raises(ValidationError, match="instrument_list"):
         job(wrong)
