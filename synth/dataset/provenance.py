@@ -7,20 +7,13 @@ import json
 from functools import cache
 from pathlib import Path
 
+from synth.fields import FORMAT_VERSION
 from synth.system import packages
 
 HOME = Path(__file__).parents[2]
 _MAKING = tuple(f"synth/{room}" for room in ("job", "geometry", "fem", "render", "flow", "sequence"))
-_COMPUTING = (
-    "mitsuba",
-    "drjit",
-    "numpy",
-    "scipy",
-    "opencv-contrib-python-headless",
-    "torch",
-    "numba",
-    "llvmlite",
-)
+_OPENCV = "opencv-contrib-python-headless"
+_COMPUTING = ("mitsuba", "drjit", "numpy", "scipy", _OPENCV, "torch", "numba", "llvmlite")
 
 
 @cache
@@ -29,8 +22,6 @@ def generator() -> dict[str, str]:
 
     `code` is a hash of the files of the rooms that make a sequence, comments included.
     """
-    from synth.fields import FORMAT_VERSION
-
     return {"format": str(FORMAT_VERSION), "code": code(*_MAKING), **_computing()}
 
 

@@ -6,13 +6,10 @@ import os
 from bisect import bisect_right
 from collections import OrderedDict
 from collections.abc import Sequence as Several
-from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from synth.dataset.store import Dataset, Sequence
+from synth.dataset.store import Dataset, FieldReader, Sequence
 from synth.errors import UserError
 from synth.fields import FIELDS, TIME
 
@@ -45,16 +42,14 @@ class TorchDataset:
             raise UserError(f"{', '.join(unknown)}: no such field; there are {', '.join(FIELDS)}")
         self._dataset, self._fields = Dataset(root), tuple(fields)
         self._chosen = tuple(range(len(self._dataset)) if sequences is None else sequences)
-        lengths = []
-        for position in self._chosen:
-            sequence = self._dataset[position]
-            lacking = [name for name in fields if name not in sequence]
-            if lacking:
-                raise UserError(f"{sequence.path}: has no {', '.join(lacking)}")
-            lengths.append(sequence.frames)
-        self._ends = list(accumulate(lengths))
+        self._ends: list[int] = []
+        for sequence in map(self._dataset.__getitem__, self._chosen):
+            missing = [name for name in fields if name not in sequence]
+            if missing:
+                raise UserError(f"{sequence.path}: has no {', '.join(missing)}")
+            self._ends.append(len(self) + sequence.frames)
         self._owner = os.getpid()
-        self._open: OrderedDict[int, tuple[Sequence, dict[str, Any]]] = OrderedDict()
+        self._open: OrderedDict[int, tuple[Sequence, dict[str, FieldReader]]] = OrderedDict()
 
     def __len__(self) -> int:
         return self._ends[-1] if self._ends else 0
@@ -64,13 +59,11 @@ class TorchDataset:
             raise IndexError(item)
         which = bisect_right(self._ends, item)
         frame = item - (self._ends[which - 1] if which else 0)
-        sequence, columns = self._columns(self._chosen[which])
-        found: dict[str, Any] = {"index": sequence.index, "frame": frame}
-        for name, column in columns.items():
-            found[name] = np.asarray(column[frame] if column.dims[0] == TIME else column[:])
-        return found
+        sequence, readers = self._readers(self._chosen[which])
+        values = {name: one[frame] if one.dims[0] == TIME else one[:] for name, one in readers.items()}
+        return {"index": sequence.index, "frame": frame, **values}
 
-    def _columns(self, position: int) -> tuple[Sequence, dict[str, Any]]:
+    def _readers(self, position: int) -> tuple[Sequence, dict[str, FieldReader]]:
         if self._owner != os.getpid():  # forked: the parent's handles are the parent's
             self._owner, self._open = os.getpid(), OrderedDict()
         if position not in self._open:

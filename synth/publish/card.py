@@ -70,11 +70,9 @@ def write_page(root: Path, target: Path) -> Path:
     about = facts(Folder(root))
     done = about["done"]
     chosen = np.unique(np.linspace(0, max(len(done) - 1, 0), _THUMBNAILS).astype(int))[: len(done)]
-    page = template("report.html.jinja").render(
-        **about,
-        thumbnails=[found for k in chosen if (found := _thumbnail(root, done[k])) is not None],
-        links=[name for name in _FILES if (root / name).exists()],
-    )
+    thumbnails = [found for k in chosen if (found := _thumbnail(root, done[k])) is not None]
+    links = [name for name in _FILES if (root / name).exists()]
+    page = template("report.html.jinja").render(**about, thumbnails=thumbnails, links=links)
     write_whole(target, page)
     return target
 

@@ -12,7 +12,7 @@ import pyarrow as pa
 from synth.dataset import index
 from synth.dataset.folder import Folder, write_whole
 from synth.fields import FIELDS
-from synth.job.schema import CardSection, Job
+from synth.job.schema import CardSection
 from synth.publish import card
 
 NAME = "croissant.json"
@@ -29,8 +29,7 @@ _TYPES = {pa.int64(): "sc:Integer", pa.float64(): "sc:Float", pa.string(): "sc:T
 def write_croissant(folder: Folder) -> Path:
     """Writes `croissant.json` beside the index. Returns its path."""
     path = folder.root / NAME
-    text = json.dumps(describe(folder), indent=1, ensure_ascii=False) + "\n"
-    write_whole(path, text)
+    write_whole(path, json.dumps(describe(folder), indent=1, ensure_ascii=False) + "\n")
     return path
 
 
@@ -38,14 +37,19 @@ def describe(folder: Folder) -> dict[str, Any]:
     """The description, JSON-LD. Everything is taken from the dataset; prose is what its job's card says."""
     job, rows = folder.job(), index.read_index(folder.root).to_pylist()
     done = [row for row in rows if row["status"] == "done"]
-    about = job.card
+    about, (width, height) = job.card, job.render.size
+    summary = (
+        f"{len(done)} rendered sequences of {job.frames} frames ({width} x {height} px) of a brain surface "
+        "under load, with true motion, traction, force, depth and visibility."
+    )
+    fields = "; ".join(f"{field.name} [{field.unit}]: {field.meaning}" for field in FIELDS.values())
     return {
         "@context": json.loads(_CONTEXT.read_text("utf-8")),
         "@type": "sc:Dataset",
         "conformsTo": ["http://mlcommons.org/croissant/1.1", "http://mlcommons.org/croissant/RAI/1.0"],
         "name": "".join(letter if letter.isalnum() else "-" for letter in about.title.lower()),
         "alternateName": about.title,
-        "description": about.summary or _summary(job, len(done)),
+        "description": about.summary or summary,
         "version": "1.0.0",
         **_stated(about),
         "keywords": ["synthetic", "neurosurgery", "optical flow", "force estimation", "finite elements"],
@@ -55,7 +59,7 @@ def describe(folder: Folder) -> dict[str, Any]:
         "recordSet": [_sequences()],
         "rai:dataCollection": "Simulated and rendered from a job file; nothing was recorded.",
         "rai:dataCollectionType": ["Software Collection"],
-        "rai:dataAnnotationProtocol": "Labels are the simulation's own state. Fields: " + _fields(),
+        "rai:dataAnnotationProtocol": f"Labels are the simulation's own state. Fields: {fields}",
         "rai:dataPreprocessingProtocol": ["None: sensor noise and 8-bit sRGB are part of the rendering."],
         "rai:dataLimitations": card.limits(folder),
         "rai:dataBiases": [
@@ -68,22 +72,10 @@ def describe(folder: Folder) -> dict[str, Any]:
 
 
 def _stated(about: CardSection) -> dict[str, Any]:
-    """What was not said is left out rather than made up."""
+    """What was not stated is left out rather than made up."""
     found = {key: getattr(about, name) for key, name in STATED.items()}
     found["creator"] = [{"@type": "sc:Person", "name": name} for name in about.authors]
     return {key: value for key, value in found.items() if value}
-
-
-def _summary(job: Job, count: int) -> str:
-    width, height = job.render.size
-    return (
-        f"{count} rendered sequences of {job.frames} frames ({width} x {height} px) of a brain surface under "
-        "load, with true motion, traction, force, depth and visibility."
-    )
-
-
-def _fields() -> str:
-    return "; ".join(f"{field.name} [{field.unit}]: {field.meaning}" for field in FIELDS.values())
 
 
 def _distribution(folder: Folder) -> list[dict[str, Any]]:
