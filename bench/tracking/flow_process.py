@@ -36,13 +36,13 @@ class FlowProcess(LocalFlow):
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
-    def begin(self, backend: str, rest: Rgb, masked: Flags | Proposal, tissue: Flags) -> None:
+    def begin(self, backend: str, rest: Rgb, proposal: Proposal, tissue: Flags) -> None:
         """See `LocalFlow`."""
-        self._pool.submit(_begin, backend, rest, masked, tissue).result()
+        self._pool.submit(_begin, backend, rest, proposal, tissue).result()
 
-    def submit(self, rgb: Rgb, masked: Flags | Proposal) -> Future[FrameMotion]:
+    def submit(self, rgb: Rgb, proposal: Proposal) -> Future[FrameMotion]:
         """See `LocalFlow`."""
-        return self._pool.submit(_step, rgb, masked)
+        return self._pool.submit(_step, rgb, proposal)
 
     def close(self) -> None:
         """Ends it, after the frame that it is at."""
@@ -78,10 +78,10 @@ def _end_with_parent() -> None:
         os._exit(1)
 
 
-def _begin(backend: str, rest: Rgb, masked: Flags | Proposal, tissue: Flags) -> None:
-    _flow.begin(backend, rest, masked, tissue)
+def _begin(backend: str, rest: Rgb, proposal: Proposal, tissue: Flags) -> None:
+    _flow.begin(backend, rest, proposal, tissue)
 
 
-def _step(rgb: Rgb, masked: Flags | Proposal) -> FrameMotion:
-    frame = _flow.submit(rgb, masked).result()
+def _step(rgb: Rgb, proposal: Proposal) -> FrameMotion:
+    frame = _flow.submit(rgb, proposal).result()
     return replace(frame, peak_bytes=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024)

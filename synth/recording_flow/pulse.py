@@ -75,8 +75,6 @@ class PulseEstimate:
     """(h, w, C) what all frames without contact have in common besides: the rest frame's noise."""
     amplitudes_px: tuple[float, ...]
     """Of each rhythm, in space if known: half of the way from end to end, median over the tissue."""
-    free_share: float
-    """Share of the frames that were taken for free of contact."""
 
     def at(self, time_s: float) -> NDArray[np.float32]:
         """(h, w, C) by which the surface has moved by itself since the rest frame, or seems to have."""
@@ -262,7 +260,6 @@ def _estimate(
         np.asarray(offset, np.float64),
         cv2.resize(noise.reshape(rows, columns, components), (width, height)) * inside,
         tuple(float(np.median(size)) for size in sizes),
-        float(free.mean()),
     )
 
 

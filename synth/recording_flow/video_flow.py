@@ -182,9 +182,9 @@ class VideoFlow:
                 is_rest = self.tissue.size == 0
                 if is_rest:
                     self._measure(picture)
-                small, masked, masking_s = self._prepare(picture)
+                small, proposal, masking_s = self._prepare(picture)
                 if is_rest:
-                    yield self._begin(small, masked, masking_s)
+                    yield self._begin(small, proposal, masking_s)
                     if self._pace is not None:
                         self._pace.start(picture.time_s or 0.0)
                 elif self._fault:
@@ -192,7 +192,7 @@ class VideoFlow:
                     self.summary.add(nothing, self.tissue)
                     yield self._in_space(self._pictured(nothing, small, masking_s))
                 else:
-                    waiting.append((small, masking_s, self._flow.submit(small.rgb, masked)))
+                    waiting.append((small, masking_s, self._flow.submit(small.rgb, proposal)))
                 if len(waiting) > self._flow.ahead:
                     yield self._finish(*waiting.popleft())
             progress(self.decoded)
@@ -262,19 +262,19 @@ class VideoFlow:
         if self.settings.pulse and self.pulse is None:
             self._surface = SurfaceMotion(self.tissue)
 
-    def _prepare(self, picture: Picture) -> tuple[Picture, Flags | Proposal, float]:
-        """A frame shrunk, what of it is no tissue (h, w), and the time that took [s]."""
+    def _prepare(self, picture: Picture) -> tuple[Picture, Proposal, float]:
+        """A frame shrunk, what of it may be no tissue, and the time that took [s]."""
         height, width = picture.rgb.shape[:2]
         if (height, width) != self.size:
             raise UserError(f"frame {picture.index}: {width} x {height}, the rest frame is another size")
         began = time.perf_counter()
         with self.watch.stage("mask"):
             rgb = shrink_picture(picture.rgb, self.shrink)
-            masked = self._mask(picture.index, rgb)
-        return replace(picture, rgb=rgb), masked, time.perf_counter() - began
+            proposal = self._mask(picture.index, rgb)
+        return replace(picture, rgb=rgb), proposal, time.perf_counter() - began
 
-    def _mask(self, index: int, rgb: Rgb) -> Flags | Proposal:
-        """What of a frame is no tissue, (h, w), or may be none."""
+    def _mask(self, index: int, rgb: Rgb) -> Proposal:
+        """What of a frame is no tissue, or may be none."""
         kind, nothing = self.settings.masks, np.zeros(rgb.shape[:2], bool)
         glare = nothing if kind in ("none", "tool") else mask.glare(rgb)
         tool = known = nothing
@@ -283,18 +283,21 @@ class VideoFlow:
                 tool = mask.tool(rgb)
             elif (given := self.footage.tool(index, self.size)) is not None:
                 known = shrink_mask(given, self.shrink, 0)
-        return Proposal(glare, tool, known) if kind == "auto" else glare | tool | known
+        return (
+            Proposal(glare, tool, known)
+            if kind == "auto"
+            else Proposal(nothing, nothing, glare | tool | known)
+        )
 
-    def _begin(self, small: Picture, masked: Flags | Proposal, masking_s: float) -> FrameMotion:
+    def _begin(self, small: Picture, proposal: Proposal, masking_s: float) -> FrameMotion:
         """Starts the flow: nothing has moved."""
         self._fault, self._rest_rgb = find_fault(small.rgb, self.tissue), small.rgb
         frame = FrameMotion.none(self.tissue.shape, trusted=not self._fault)
         if not self._fault:
-            self._flow.begin(self.settings.backend, small.rgb, masked, self.tissue)
+            self._flow.begin(self.settings.backend, small.rgb, proposal, self.tissue)
             if self._pace is not None:
-                self._flow.submit(small.rgb, masked).result()
-            known = masked.known if isinstance(masked, Proposal) else masked
-            frame = replace(frame, confidence=(self.tissue & ~known).astype(np.float32))
+                self._flow.submit(small.rgb, proposal).result()
+            frame = replace(frame, confidence=(self.tissue & ~proposal.known).astype(np.float32))
         return self._in_space(self._pictured(replace(frame, is_rest=True), small, masking_s))
 
     def _is_there(self, flow: Future[FrameMotion], time_s: float | None) -> bool:

@@ -15,15 +15,16 @@ import pytest
 
 from bench.tracking.flow_process import FlowProcess
 from synth.errors import UserError
+from synth.flow.mask_choice import Proposal
 from synth.recording_flow.video_flow import Footage, RecordingFlowSettings, VideoFlow
 from synth.video.read import Picture
 
 
-def pictures() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def pictures() -> tuple[np.ndarray, np.ndarray, Proposal]:
     rng = np.random.default_rng(3)
     rest = np.kron(rng.integers(40, 220, (16, 20)), np.ones((4, 4)))[..., None].repeat(3, 2).astype(np.uint8)
-    free = np.zeros(rest.shape[:2], bool)
-    return rest, np.roll(rest, 2, axis=1), free
+    nothing = np.zeros(rest.shape[:2], bool)
+    return rest, np.roll(rest, 2, axis=1), Proposal(nothing, nothing, nothing)
 
 
 @pytest.fixture
@@ -36,8 +37,8 @@ def elsewhere() -> Iterator[FlowProcess]:
 def test_errors_of_the_flow_arrive_and_its_end_is_said(elsewhere: FlowProcess) -> None:
     rest, moved, free = pictures()
     with pytest.raises(UserError, match="no estimator"):
-        elsewhere.begin("nonesuch", rest, free, ~free)
-    elsewhere.begin("dis", rest, free, ~free)
+        elsewhere.begin("nonesuch", rest, free, ~free.known)
+    elsewhere.begin("dis", rest, free, ~free.known)
     with pytest.raises(UserError, match="does not fit"):
         elsewhere.submit(moved[:-1], free).result()
     worker = elsewhere._pool.submit(os.getpid).result()

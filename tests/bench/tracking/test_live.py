@@ -10,7 +10,7 @@ import pytest
 
 from bench.tracking import live
 from bench.tracking.flow_process import FlowProcess
-from synth.flow.estimator import Flags, Rgb
+from synth.flow.estimator import Rgb
 from synth.flow.mask_choice import Proposal
 from synth.recording_flow.frame_motion import FrameMotion
 from synth.recording_flow.local_flow import LocalFlow
@@ -61,12 +61,12 @@ def test_an_answer_comes_as_soon_as_it_is_there(needs_s: float, expected: list[s
         ahead = 1
         asked = -1  # once before the stream's start
 
-        def submit(self, rgb: Rgb, masked: Flags | Proposal) -> Future[FrameMotion]:
+        def submit(self, rgb: Rgb, proposal: Proposal) -> Future[FrameMotion]:
             self.asked += 1
             if self.asked:
                 log.append(f"asked {self.asked}")
             slow = Slow()
-            slow.set_result(super().submit(rgb, masked).result())
+            slow.set_result(super().submit(rgb, proposal).result())
             return slow
 
     class Clock:
