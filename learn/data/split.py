@@ -9,10 +9,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-import numpy as np
-
 from learn.data.clips import Clip
-from synth.dataset.split import SIDES, join_groups
+from synth.dataset.split import SIDES, draw_groups, join_groups
 from synth.errors import UserError
 
 _HINT = (
@@ -60,22 +58,15 @@ def folds(clips: Sequence[Clip], count: int, seed: int) -> list[tuple[int, ...]]
 
     Raises UserError if there are more folds than groups.
     """
-    group = np.array(groups(clips))
-    names = np.random.default_rng(seed).permutation(np.unique(group))
-    if len(names) < 2:
-        held = f"{len(clips)} sequences hold {len(names)} anatomy, and a split needs two at least"
-        raise UserError(held + _advise(clips))
-    if not 2 <= count <= len(names):
+    number = groups(clips)
+    anatomies = len(set(number))
+    if not 2 <= count <= anatomies:
         raise UserError(
-            f"{count} folds: between 2 and {len(names)} are possible, for {len(clips)} sequences hold "
-            f"{len(names)} different anatomies" + _advise(clips) * (len(names) < 3)
+            f"{count} folds: 2 or more are needed, at most one for each anatomy, and {len(clips)} sequences "
+            f"hold {anatomies} of them" + _advise(clips) * (anatomies < 3)
         )
-    size = {int(g): int((group == g).sum()) for g in names}
-    bins: list[list[int]] = [[] for _ in range(count)]
-    for g in sorted(size, key=lambda g: -size[g]):
-        fewest = min(bins, key=len)
-        fewest.extend(int(i) for i in np.flatnonzero(group == g))
-    return [tuple(sorted(b)) for b in bins]
+    part = draw_groups(number, [1.0] * count, seed)
+    return [tuple(i for i, k in enumerate(part) if k == fold) for fold in range(count)]
 
 
 def nested(

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from learn.data.clips import Clip
 from learn.evaluation.fit_intervals import predict_clip
@@ -22,90 +21,67 @@ from synth.errors import UserError
 
 @dataclass(frozen=True)
 class Coverage:
-    """Whether intervals of one level hold: shares of frames, means over sequences with 95% BCa."""
+    """Whether intervals of one level hold, on sequences that weigh alike."""
 
     level: float
-    size: Interval
-    axes: tuple[Interval, Interval, Interval]
-    width_mn: float
-    """Mean width of the interval of the force's size [mN]."""
-    width_of_peak: float
-    """The same as a share of the sequence's largest force."""
-    axes_width_mn: tuple[float, float, float]
-    unseen: float
-    """Share of moving frames that are further from what was fitted than 99% of held-out frames."""
-    distance: float
-    """Median distance of moving frames, as a multiple of that."""
+    shares: dict[str, Interval]
+    """Frames whose force's `size`, `x`, `y` and `z` lie within: means over sequences with 95% BCa."""
+    values: dict[str, float]
+    """`width_mn`: mean width of the interval of the force's size [mN]; `width_of_peak`: the same over the
+    sequence's largest force; `width_x_mn` and its like. `unseen`: share of moving frames that are further
+    from what was fitted than 99% of held-out frames; `distance`: median of theirs, as a multiple of that."""
 
     def as_dict(self) -> dict[str, Any]:
         """JSON-ready; NaN as null."""
-        shares = {"size": self.size, **dict(zip("xyz", self.axes, strict=True))}
-        widths = {"width_mn": self.width_mn, "width_of_peak": self.width_of_peak}
-        widths |= {f"width_{axis}_mn": w for axis, w in zip("xyz", self.axes_width_mn, strict=True)}
-        rest = widths | {"unseen": self.unseen, "distance": self.distance}
-        told: dict[str, Any] = {"level": self.level}
-        for name, share in shares.items():
-            told[name] = {"mean": _known(share.mean), "low": _known(share.low), "high": _known(share.high)}
-        return told | {name: _known(value) for name, value in rest.items()}
+        ends = {name: {"mean": s.mean, "low": s.low, "high": s.high} for name, s in self.shares.items()}
+        known = {name: _known(one) for name, one in ends.items()}
+        return {"level": self.level, **known, **_known(self.values)}
 
 
 def cover(predictor: Predictor, clips: Sequence[Clip], source: str) -> list[Coverage]:
-    """Holds a model's intervals, at every level, against sequences of known truth.
+    """Compares a model's intervals, at every level, with sequences of known truth.
 
     Raises UserError if it has none.
     """
     found = predictor.card.intervals
     if found is None:
         raise UserError("the model has no intervals; `learn calibrate` fits them")
-    rows: dict[float, list[list[float]]] = {level: [] for level in LEVELS}
+    rows: dict[float, list[dict[str, float]]] = {level: [] for level in LEVELS}
     far = [np.zeros(0)]
     for clip in clips:
-        said = predict_clip(predictor, clip, source)
+        predicted = predict_clip(predictor, clip, source)
         for level, held in rows.items():
-            held.append(_held(found, said, clip, level))
-        far.append(found.world.relative_distance(said.motion)[is_moving(said.motion)])
+            held.append(_held(found, predicted, clip, level))
+        far.append(found.world.relative_distance(predicted.motion)[is_moving(predicted.motion)])
     moved = np.concatenate(far)
-    return [_summed(level, np.array(held), moved) for level, held in rows.items()]
+    nan, out = float("nan"), []
+    for level, held in rows.items():
+        rng = np.random.default_rng(0)
+        columns = {name: np.array([row[name] for row in held]) for name in held[0]}
+        shares = {name: interval(columns.pop(name), rng) for name in ("size", *"xyz")}
+        values = {k: float(np.nanmean(v)) if np.isfinite(v).any() else nan for k, v in columns.items()}
+        values["unseen"] = float((moved > 1).mean()) if len(moved) else nan
+        values["distance"] = float(np.median(moved)) if len(moved) else nan
+        out.append(Coverage(level, shares, values))
+    return out
 
 
-def _summed(level: float, values: NDArray[np.float64], moved: NDArray[np.float64]) -> Coverage:
-    """`values`: (n, 9) of `_held`; `moved`: distances of the moving frames, as multiples of the usual."""
-    rng, nan = np.random.default_rng(0), float("nan")
-    shares = [interval(values[:, k], rng) for k in range(4)]
-    means = [float(np.nanmean(v)) if np.isfinite(v).any() else nan for v in values[:, 4:].T]
-    return Coverage(
-        level=level,
-        size=shares[0],
-        axes=(shares[1], shares[2], shares[3]),
-        width_mn=means[0],
-        width_of_peak=means[1],
-        axes_width_mn=(means[2], means[3], means[4]),
-        unseen=float((moved > 1).mean()) if len(moved) else nan,
-        distance=float(np.median(moved)) if len(moved) else nan,
-    )
+def _known(values: dict[str, float]) -> dict[str, float | None]:
+    return {name: value if math.isfinite(value) else None for name, value in values.items()}
 
 
-def _known(value: float) -> float | None:
-    return value if math.isfinite(value) else None
-
-
-def _held(found: Intervals, said: Prediction, clip: Clip, level: float) -> list[float]:
-    """Shares held of size, x, y and z, then widths [mN] and the first over the peak."""
-    band, young = found.bound(said, level), clip.young_kpa
+def _held(found: Intervals, predicted: Prediction, clip: Clip, level: float) -> dict[str, float]:
+    """One sequence's shares of frames held, and widths, by the names of `Coverage`."""
+    band, young = found.bound(predicted, level), clip.young_kpa
     force = clip.force / young
     size = np.linalg.norm(force, axis=1)
-    axes = _within(force, band.axes_low, band.axes_high).mean(0)
+    axes = ((force >= band.axes_low) & (force <= band.axes_high)).mean(0)
     width, peak = float((band.high - band.low).mean()), float(size.max())
-    return [
-        float(_within(size, band.low, band.high).mean()),
-        *axes.tolist(),
-        young * width,
-        width / peak if peak > 0 else float("nan"),
-        *(young * (band.axes_high - band.axes_low).mean(0)).tolist(),
-    ]
-
-
-def _within(
-    true: NDArray[np.floating], low: NDArray[np.floating], high: NDArray[np.floating]
-) -> NDArray[np.bool_]:
-    return np.asarray((true >= low) & (true <= high))
+    widths = young * (band.axes_high - band.axes_low).mean(0)
+    return {
+        "size": float(((size >= band.low) & (size <= band.high)).mean()),
+        **dict(zip("xyz", axes.tolist(), strict=True)),
+        "width_mn": young * width,
+        "width_of_peak": width / peak if peak > 0 else math.nan,
+        **{f"width_{axis}_mn": value for axis, value in zip("xyz", widths.tolist(), strict=True)},
+    }

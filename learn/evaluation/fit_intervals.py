@@ -7,7 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from learn.checkpoint import ModelCard, write_card
 from learn.data.clips import Clip, scored
@@ -15,52 +14,13 @@ from learn.data.split import Split, are_openings, groups, ungrouped
 from learn.evaluation.interval_sides import find_obstacle, find_sides
 from learn.inference.predict import Predictor, length, net_force
 from learn.uncertainty.features import motion_features, motion_names
-from learn.uncertainty.intervals import Example, Intervals, Prediction, fit, make_example
+from learn.uncertainty.intervals import Intervals, Prediction, fit, make_example
 from learn.uncertainty.out_of_distribution import fit_distribution
 from synth.dataset.index import written_sides
 from synth.errors import UserError
 from synth.system.terminal import ProgressCallback
 
 _MOST_FITTED = 500  # sequences that the distance is measured from
-
-
-def fit_intervals(
-    predictor: Predictor,
-    fitted: Sequence[Clip],
-    chosen: Sequence[Clip],
-    kept: Sequence[Clip],
-    source: str | None = None,
-    report: ProgressCallback = lambda done, of: None,
-) -> Intervals:
-    """Intervals of a model, from sequences of known truth.
-
-    `fitted`: what the network was fitted on, from which a frame's distance is measured; `chosen` and `kept`
-    as of `find_obstacle`, none of them fitted; `source`: displacement that the intervals hold for, None: the
-    one that the model is scored on. Raises UserError with the obstacle, or if nothing moves.
-    """
-    why = find_obstacle(chosen, kept)
-    if why:
-        raise UserError(why)
-    card = predictor.card
-    source = source or scored(card.settings.input)
-    unit, rng = card.scales.force, np.random.default_rng(card.settings.seed)
-    of = len(chosen) + len(kept)
-
-    def see(clip: Clip, brain: int, done: int) -> Example:
-        report(done, of)
-        return make_example(predict_clip(predictor, clip, source), clip.force / clip.young_kpa, brain, unit)
-
-    number = groups(kept)
-    scale_on = [see(clip, 0, k) for k, clip in enumerate(chosen)]
-    factors_on = [see(clip, number[k], len(chosen) + k) for k, clip in enumerate(kept)]
-    report(of, of)
-    some = rng.permutation(len(fitted))[:_MOST_FITTED]
-    world = fit_distribution(
-        [_motion(predictor, fitted[i], source) for i in some], [one.motion for one in scale_on]
-    )
-    if world is None:
-        raise UserError("nothing moves in the sequences that the intervals are to be fitted on")
-    return fit(scale_on, factors_on, world, motion_names(card.settings.arch.depth), unit, source)
 
 
 def add_intervals(
@@ -74,11 +34,24 @@ def add_intervals(
     """Fits intervals and writes them, or why there are none, into the card of a model's folder; that card.
 
     Whoever of `split.select` did not choose the epoch counts as kept for intervals from then on.
+
+    Args:
+        folder: of the model.
+        predictor: the model.
+        clips: sequences of known truth.
+        split: `fit`: what the network was fitted on, from which a frame's distance is measured; `select` and
+            `intervals`: what the error model and the factors are fitted on.
+        source: displacement that the intervals hold for; None: the one that the model is scored on.
+        report: told how many sequences are done, and how many there are.
+
+    Raises:
+        UserError: nothing moves in the sequences.
     """
     fitted, chosen, kept = ([clips[i] for i in part] for part in (split.fit, split.select, split.intervals))
     why, found = find_obstacle(chosen, kept), None
     if not why:
-        found = fit_intervals(predictor, fitted, chosen, kept, source, report)
+        source = source or scored(predictor.card.settings.input)
+        found = _fit(predictor, fitted, chosen, kept, source, report)
     choosers = set(predictor.card.groups.get("select", ()))
     used = [*kept, *(clip for clip in chosen if kept and clip.group not in choosers)]
     taken = {clip.content_hash for clip in used}, {clip.group for clip in used}
@@ -135,6 +108,35 @@ def fit_from_datasets(
     return found
 
 
+def _fit(
+    predictor: Predictor,
+    fitted: Sequence[Clip],
+    chosen: Sequence[Clip],
+    kept: Sequence[Clip],
+    source: str,
+    report: ProgressCallback,
+) -> Intervals:
+    """Intervals from the parts of `add_intervals`' split."""
+    card = predictor.card
+    unit, rng = card.scales.force, np.random.default_rng(card.settings.seed)
+    brains, examples = [0] * len(chosen) + groups(kept), []
+    for k, (clip, brain) in enumerate(zip([*chosen, *kept], brains, strict=True)):
+        report(k, len(brains))
+        true = clip.force / clip.young_kpa
+        examples.append(make_example(predict_clip(predictor, clip, source), true, brain, unit))
+    report(len(brains), len(brains))
+    some = [fitted[i] for i in rng.permutation(len(fitted))[:_MOST_FITTED]]
+    motion = [
+        motion_features(np.asarray(c.displacement[source]), c.mask, c.sure(source), card.settings.extent_mm)
+        for c in some
+    ]
+    first, second = examples[: len(chosen)], examples[len(chosen) :]
+    world = fit_distribution(motion, [one.motion for one in first])
+    if world is None:
+        raise UserError("nothing moves in the sequences that the intervals are to be fitted on")
+    return fit(first, second, world, motion_names(card.settings.arch.depth), unit, source)
+
+
 def predict_clip(predictor: Predictor, clip: Clip, source: str) -> Prediction:
     """What the model says of a sequence, per unit stiffness; no motion is no force, as to `ForceReader`."""
     shift, mask, grid = np.asarray(clip.displacement[source]), clip.mask, predictor.grid
@@ -148,8 +150,3 @@ def predict_clip(predictor: Predictor, clip: Clip, source: str) -> Prediction:
         magnitude=length(density) / np.float32(young),
         pitch_mm=grid.pitch_mm,
     )
-
-
-def _motion(predictor: Predictor, clip: Clip, source: str) -> NDArray[np.float64]:
-    shift = np.asarray(clip.displacement[source])
-    return motion_features(shift, clip.mask, clip.sure(source), predictor.grid.extent_mm)

@@ -31,12 +31,12 @@ def score_table(report: EvaluationReport, title: str) -> Table:
 def coverage_table(covered: Sequence[Coverage]) -> Table:
     """Whether the model's intervals hold, and how wide they are."""
     table = _open_table("intervals", *(f"{one.level:.0%}" for one in covered))
-    for k, name in enumerate(("force", "x", "y", "z")):
-        shares = [(one.size, *one.axes)[k] for one in covered]
+    for name, key in (("force", "size"), ("x", "x"), ("y", "y"), ("z", "z")):
+        shares = [one.shares[key] for one in covered]
         table.add_row(f"{name} within", *(f"{s.mean:.0%} [{s.low:.0%}, {s.high:.0%}]" for s in shares))
-    table.add_row("width of the force's [mN]", *(f"{one.width_mn:.3g}" for one in covered))
-    table.add_row("the same over the peak", *(f"{one.width_of_peak:.0%}" for one in covered))
-    table.add_row("moving frames out of distribution", *(f"{one.unseen:.0%}" for one in covered))
+    table.add_row("width of the force's [mN]", *(f"{one.values['width_mn']:.3g}" for one in covered))
+    table.add_row("the same over the peak", *(f"{one.values['width_of_peak']:.0%}" for one in covered))
+    table.add_row("moving frames out of distribution", *(f"{one.values['unseen']:.0%}" for one in covered))
     return table
 
 

@@ -22,7 +22,6 @@ from torch import Tensor, nn
 from learn.checkpoint import ModelCard
 from learn.data.grid import HALF_SURE_MM, SMOOTHING_MM, channels
 from learn.inference.predict import Predictor
-from learn.network.d2fnet import Architecture
 from synth.errors import UserError
 
 TOLERANCE = 1e-4
@@ -83,7 +82,9 @@ def export(predictor: Predictor, file: Path, kind: str) -> float:
     worst = 0.0
     for batch in (1, 3):
         inputs = examples(card, batch, seed=batch)
-        worst = max(worst, _gap(run(inputs), module(*inputs), card.scales.target))
+        expected = module(*inputs)
+        largest = max(card.scales.target, float(expected.abs().max()))
+        worst = max(worst, float((run(inputs) - expected).abs().max()) / largest)
     if not worst <= TOLERANCE:
         file.unlink()
         raise UserError(f"{file}: differs from PyTorch by {worst:.1e} of full scale, at most {TOLERANCE:g}")
@@ -91,23 +92,30 @@ def export(predictor: Predictor, file: Path, kind: str) -> float:
     return worst
 
 
-def _gap(said: Tensor, expected: Tensor, unit: float) -> float:
-    return float((said - expected).abs().max()) / max(unit, float(expected.abs().max()))
-
-
 def describe(card: ModelCard, kind: str, difference: float) -> dict[str, Any]:
     """What a program must know to use the file."""
-    grid = card.settings.grid
+    grid, arch = card.settings.grid, card.settings.arch
+    output = f"{card.settings.target} per unit stiffness, one component"
+    if arch.components == 3:
+        output = "force density per unit stiffness [mN/mm2 at E = 1 kPa]; components x, y, z in camera axes"
+    inputs = ["flow [px] times the picture's scale [mm/px] is displacement [mm]; x right, y down"]
+    if arch.depth:
+        inputs = [
+            "displacement [mm] is motion in camera axes, x right, y down, z away, as a second eye gives it"
+        ]
+    if arch.depth and arch.confidence:
+        inputs.append(
+            "confidence, across and along the view: means over tissue of 1 / (1 + (s / s0)^2), "
+            f"s0 = {HALF_SURE_MM} mm, s the motion's standard deviation [mm] (of dx and dy the rms)"
+        )
     return {
         "format": kind,
         "inputs": input_names(card),
         "outputs": ["density"],
-        "output": "force density per unit stiffness [mN/mm2 at E = 1 kPa]; components x, y, z in camera axes"
-        if card.settings.arch.components == 3
-        else f"{card.settings.target} per unit stiffness, one component",
+        "output": output,
         "grid": {"size": grid.size, "pitch_mm": grid.pitch_mm, "extent_mm": grid.extent_mm},
         "preprocessing": [
-            *_told(card.settings.arch),
+            *inputs,
             "the grid's centre lies on the centroid of the tissue mask in the rest picture",
             "displacement: mean over tissue pixels under hat functions as wide as the coarser of cell and "
             "pixel",
@@ -118,19 +126,6 @@ def describe(card: ModelCard, kind: str, difference: float) -> dict[str, Any]:
         "typical_young_kpa": card.typical_young_kpa,
         "largest_difference_from_pytorch": difference,
     }
-
-
-def _told(arch: Architecture) -> list[str]:
-    """Where displacement, and the confidence of two eyes, come from."""
-    if not arch.depth:
-        return ["flow [px] times the picture's scale [mm/px] is displacement [mm]; x right, y down"]
-    said = ["displacement [mm] is motion in camera axes, x right, y down, z away, as a second eye gives it"]
-    if arch.confidence:
-        said.append(
-            "confidence, across and along the view: means over tissue of 1 / (1 + (s / s0)^2), "
-            f"s0 = {HALF_SURE_MM} mm, s the motion's standard deviation [mm] (of dx and dy the rms)"
-        )
-    return said
 
 
 def _torchscript(module: Portable, card: ModelCard, file: Path) -> Any:

@@ -98,19 +98,7 @@ def _readme(
 ) -> str:
     line = describe(card)
     rows = {"data (hash of its sequences)": hash_data(card), "commit": commit, **metrics}
-    return "\n".join(
-        [
-            f"# {name}",
-            "",
-            f"{line[:1].upper()}{line[1:]}.",
-            "",
-            "| what | |",
-            "| --- | --- |",
-            *(f"| {what} | {value} |" for what, value in rows.items()),
-            "",
-            "Limits:",
-            "",
-            *(f"- {one}" for one in limits),
-            "",
-        ]
-    )
+    table = "\n".join(f"| {what} | {value} |" for what, value in rows.items())
+    listed = "\n".join(f"- {one}" for one in limits)
+    head = f"# {name}\n\n{line[:1].upper()}{line[1:]}.\n\n| what | |\n| --- | --- |\n"
+    return f"{head}{table}\n\nLimits:\n\n{listed}\n"

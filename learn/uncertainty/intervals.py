@@ -32,7 +32,7 @@ _LEAST = 1e-3  # of the training data's force: no error is expected to be smalle
 
 @dataclass(frozen=True)
 class Prediction:
-    """A network's answer to the frames of one film, per unit stiffness, and what is known of them."""
+    """A network's prediction for the frames of one film, per unit stiffness, and what is known of them."""
 
     motion: Floats
     """(T, F) `motion_features`."""
@@ -128,32 +128,32 @@ class Intervals:
         if [len(row) for row in (self.world.middle, *self.world.precision)] != [count] * (count + 1):
             raise ValueError(f"the world is not of {count} features")
 
-    def bound(self, said: Prediction, level: float = LEVEL) -> Band:
+    def bound(self, predicted: Prediction, level: float = LEVEL) -> Band:
         """Intervals of the force of frames, per unit stiffness. UserError for another level."""
         if str(level) not in self.size.factors:
             raise UserError(f"level {level:g}: the model has intervals of {', '.join(self.size.factors)}")
-        features = frame_features(said, self.force_unit)
-        wide = _widen(self.world, self.size.scale, said.motion, features)
+        features = frame_features(predicted, self.force_unit)
+        wide = _widen(self.world, self.size.scale, predicted.motion, features)
         half = wide * self.size.half(features, level)
         axes = np.stack([wide * one.half(features, level) for one in self.axes], axis=1)
-        low = np.maximum(said.size - half, 0.0)
-        return Band(low, said.size + half, said.centre - axes, said.centre + axes)
+        low = np.maximum(predicted.size - half, 0.0)
+        return Band(low, predicted.size + half, predicted.centre - axes, predicted.centre + axes)
 
 
-def frame_features(said: Prediction, force_unit: float) -> Floats:
+def frame_features(predicted: Prediction, force_unit: float) -> Floats:
     """(T, F + 2) what the errors of frames are predicted from: motion, size and area of the answer."""
-    answer = answer_features(said.size / force_unit, said.magnitude, said.pitch_mm**2)
-    return np.concatenate([said.motion, answer], axis=1)
+    answer = answer_features(predicted.size / force_unit, predicted.magnitude, predicted.pitch_mm**2)
+    return np.concatenate([predicted.motion, answer], axis=1)
 
 
-def make_example(said: Prediction, true: Floats, unit: int, force_unit: float) -> Example:
+def make_example(predicted: Prediction, true: Floats, unit: int, force_unit: float) -> Example:
     """A sequence's errors; `true`: (T, 3) force per unit stiffness; `force_unit`: as of `Intervals`."""
-    off = np.abs(np.linalg.norm(true, axis=1) - said.size)
+    off = np.abs(np.linalg.norm(true, axis=1) - predicted.size)
     return Example(
         unit=unit,
-        motion=said.motion,
-        features=frame_features(said, force_unit),
-        error=np.column_stack([off, np.abs(true - said.centre)]),
+        motion=predicted.motion,
+        features=frame_features(predicted, force_unit),
+        error=np.column_stack([off, np.abs(true - predicted.centre)]),
     )
 
 
@@ -173,8 +173,9 @@ def fit(
     count, least = len({one.unit for one in kept}), conformal.least_units(LEVELS[0])
     if count < least:
         raise UserError(f"{count} brains are kept for intervals; {LEVELS[0]:.0%} needs {least}")
-    features, weight = _stacked(chosen, "features"), _weights([len(one.features) for one in chosen])
-    error = _stacked(chosen, "error")
+    features = np.concatenate([one.features for one in chosen])
+    error = np.concatenate([one.error for one in chosen])
+    weight = np.concatenate([np.full(n, 1 / n) for n in (len(one.features) for one in chosen)])
     scales = [fit_error_model(features, e, weight, _LEAST * force_unit) for e in error.T]
     wide = [_widen(world, scales[0], one.motion, one.features) for one in kept]
     both = list(zip(kept, wide, strict=True))
@@ -209,12 +210,3 @@ def _widen(world: OutOfDistribution, size: ErrorModel, motion: Floats, features:
     place = len(features[0]) - len(ANSWER)
     beyond = np.exp(np.maximum(features[:, place] - size.high[place], 0.0))
     return world.widening(motion) * beyond
-
-
-def _stacked(examples: Sequence[Example], name: str) -> Floats:
-    return np.concatenate([getattr(one, name) for one in examples])
-
-
-def _weights(counts: Sequence[int]) -> Floats:
-    """Every sequence weighs alike."""
-    return np.concatenate([np.full(n, 1 / n) for n in counts])
