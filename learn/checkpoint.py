@@ -26,7 +26,7 @@ from learn.data.grid import Scales
 from learn.network.d2fnet import Architecture, D2FNet
 from learn.settings import TrainingSettings, upgraded
 from learn.uncertainty.intervals import Intervals
-from synth.errors import UserError
+from synth.errors import UserError, as_user_error
 from synth.job import identity, retired
 from synth.job.types import Positive
 from synth.system import checked_file
@@ -149,20 +149,15 @@ def save_tensors(file: Path, tree: Mapping[str, Any]) -> None:
 
 def load_tensors(file: Path) -> dict[str, Any]:
     """Raises UserError if the file is missing or damaged, or holds anything but tensors and plain values."""
-    if not file.exists():
-        raise UserError(f"{file}: missing")
     checked_file.check_file(file, _LARGEST_WEIGHTS)
-    try:
+    with as_user_error(f"{file}: corrupt checkpoint"):
         if file.suffix == ".safetensors":
             return dict(safetensors.load_file(file))
         _check_archive(file)
         tree = torch.load(file, map_location="cpu", weights_only=True)
-    except Exception as error:  # archive, unpickler and tensors have no common error for damage
-        why = (str(error).splitlines() or [type(error).__name__])[0].split(". ")[0]
-        raise UserError(f"{file}: corrupt checkpoint ({why[:200]})") from None
-    if not isinstance(tree, dict):
-        raise UserError(f"{file}: corrupt checkpoint (holds no state)")
-    return tree
+        if not isinstance(tree, dict):
+            raise TypeError("holds no state")
+        return tree
 
 
 def read_model(folder: Path) -> tuple[D2FNet, ModelCard]:
@@ -187,10 +182,8 @@ def fit(state: Mapping[str, Any], arch: Architecture, where: Path) -> D2FNet:
     if len(found) != len(state) or found != expected:
         raise UserError(f"{where}: the weights are not those of the network in config.json")
     model = D2FNet(arch)
-    try:
+    with as_user_error(f"{where}: the weights can't be used"):
         model.load_state_dict(state)
-    except RuntimeError as error:
-        raise UserError(f"{where}: the weights can't be used ({str(error).splitlines()[0]})") from None
     return model
 
 

@@ -6,7 +6,7 @@ import json as json_
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
@@ -291,21 +291,16 @@ def predict_command(
         if overlay:
             one = source.is_file() or source.suffix == ".zarr"
             write_overlay(found, source if one else source / f"{motion.name}.zarr", out / motion.name)
-        peaks[motion.name] = _say_peak(found, motion.name, quiet=json)
-    if json:
-        print(json_.dumps({"out": str(out), "peak_force_mn": peaks}))
-
-
-def _say_peak(found: Mapping[str, Any], name: str, *, quiet: bool) -> float | None:
-    """The peak [mN] of what `apply` found, None where no frame could be followed; prints it and the notes."""
-    size = found["total_force_mn"][found["trusted"]]
-    peak = float(size.max()) if len(size) else None
-    if not quiet:
-        said = "no force: no frame could be followed" if peak is None else f"peak force {peak:.3g} mN"
-        _console.print(f"{name}: {len(found['trusted'])} frames, {said}")
+        size = found["total_force_mn"][found["trusted"]]
+        peak = peaks[motion.name] = float(size.max()) if len(size) else None
+        if json:
+            continue
+        what = "no force: no frame could be followed" if peak is None else f"peak force {peak:.3g} mN"
+        _console.print(f"{motion.name}: {len(found['trusted'])} frames, {what}")
         for note in found["notes"]:
             _console.print(f"note: {note}", style="yellow", markup=False, highlight=False)
-    return peak
+    if json:
+        print(json_.dumps({"out": str(out), "peak_force_mn": peaks}))
 
 
 @app.command("calibrate", epilog="Example: learn calibrate model press.npz")
@@ -385,14 +380,8 @@ def models_command(json: Json = False) -> None:
     found = {name: (folder, read_card(folder)) for name, folder in shipped().items()}
     if json:
         rows = [
-            {
-                "name": name,
-                "folder": str(folder),
-                "bytes": size_bytes(folder),
-                "data": hash_data(card),
-                "eyes": 2 if card.settings.arch.depth else 1,
-                "select_r2": card.score,
-            }
+            {"name": name, "folder": str(folder), "bytes": size_bytes(folder), "data": hash_data(card)}
+            | {"eyes": 2 if card.settings.arch.depth else 1, "select_r2": card.score}
             for name, (folder, card) in found.items()
         ]
         print(json_.dumps(rows))

@@ -5,22 +5,21 @@ from __future__ import annotations
 import hashlib
 import json
 import zlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
-from safetensors import SafetensorError
 from safetensors.numpy import save_file
 from safetensors.torch import load_file
 
-from learn.data.grid import Grid, Resampler, centre, certainty, settled
+from learn.data.grid import Grid, GridView, certainty, settled
 from synth.dataset import provenance
 from synth.dataset.split import name_anatomy
 from synth.dataset.store import Dataset, Sequence
-from synth.errors import UserError
+from synth.errors import UserError, as_user_error
 from synth.job import identity
 from synth.system import checked_file
 from synth.system.terminal import ProgressCallback
@@ -123,48 +122,52 @@ def read_clip(sequence: Sequence, grid: Grid, wanted: Iterable[str]) -> Clip:
     `wanted`: any of `FIELDS`. Raises UserError if the store lacks the flow (or the second eye) or has no
     tissue, or values are not those that were sealed.
     """
-    attrs = sequence.attrs
-    where = sequence.path.name
     wanted = tuple(wanted)
-    for source in wanted:
-        if FIELDS[source] not in sequence:
-            what = "motion of two eyes" if has_depth(source) else f"{source} flow"
-            raise UserError(
-                f"{where}: holds no {what} (field {FIELDS[source]}); {_CURE[source]}, or use --input ideal"
-            )
-    if attrs.get("young_kpa") is None or attrs.get("scale_mm_per_px") is None:
-        raise UserError(f"{where}: lacks the attribute young_kpa or scale_mm_per_px")
-    young, scale = float(attrs["young_kpa"]), float(attrs["scale_mm_per_px"])
+    check_readable(sequence, wanted)
+    young, scale = (float(sequence.attrs[name]) for name in ("young_kpa", "scale_mm_per_px"))
     tissue, area, force = (sequence.read_whole(name) for name in ("tissue", "area", "force"))
-    resample = Resampler((tissue.shape[0], tissue.shape[1]), scale, centre(tissue), grid)
-    mask = (resample.cover(tissue) > 0.5).astype(np.float32)
-    n, frames = grid.size, sequence.frames
-    displacement = {s: np.empty((frames, components(s), n, n), np.float32) for s in wanted}
-    confidence = np.ones((frames, n, n), np.float32)
-    density = np.empty((frames, 3, n, n), np.float32)
-    for source in wanted:
-        mm = 1.0 if has_depth(source) else scale
-        for t, flow in enumerate(sequence.read_sealed(FIELDS[source])):
-            displacement[source][t] = resample.mean(flow.transpose(2, 0, 1) * mm, tissue) * mask
+    view = GridView(tissue, scale, grid)
+
+    def on_grid(field: str, prepare: Callable[[Any], Any]) -> NDArray[np.float32]:
+        """Means over the tissue of each frame of a field."""
+        frames = (prepare(values) for values in sequence.read_sealed(field))
+        return np.stack([view.resample.mean(frame, tissue) * view.mask for frame in frames])
+
+    confidence, spatial = np.ones((sequence.frames, grid.size, grid.size), np.float32), None
     if "recovered" in wanted and "flow_confidence" in sequence:
-        for t, sure in enumerate(sequence.read_sealed("flow_confidence")):
-            confidence[t] = resample.mean(sure, tissue) * mask
-    spatial = None
+        confidence = on_grid("flow_confidence", np.asarray)
     if "motion" in wanted:
-        spread = sequence.read_sealed("motion_deviation")
-        spatial = np.stack([resample.mean(certainty(deviation), tissue) * mask for deviation in spread])
-    for t, traction in enumerate(sequence.read_sealed("traction")):
-        load = traction.transpose(2, 0, 1) * area
-        density[t] = settled(resample.sum(load), mask) / np.float32(grid.pitch_mm**2 * young)
+        spatial = on_grid("motion_deviation", certainty)
+    loads = (traction.transpose(2, 0, 1) * area for traction in sequence.read_sealed("traction"))
+    density = np.stack([settled(view.resample.sum(load), view.mask) for load in loads])
+    density /= np.float32(grid.pitch_mm**2 * young)
     return Clip(
         **_plain(sequence),
-        mask=mask,
-        displacement=displacement,
+        mask=view.mask,
+        displacement={
+            source: on_grid(FIELDS[source], lambda values: values.transpose(2, 0, 1))
+            if has_depth(source)
+            else on_grid(FIELDS[source], lambda values: values.transpose(2, 0, 1) * scale)
+            for source in wanted
+        },
         confidence=confidence,
         density=density,
         force=force,
         motion_confidence=spatial,
     )
+
+
+def check_readable(sequence: Sequence, wanted: Iterable[str]) -> None:
+    """Raises UserError if a store lacks a displacement of `FIELDS`, its scale or its stiffness."""
+    for source in wanted:
+        if source not in FIELDS:
+            raise UserError(f"unknown input {source!r}: {', '.join(FIELDS)}")
+        if FIELDS[source] not in sequence:
+            what = "motion of two eyes" if has_depth(source) else f"{source} flow"
+            hint = f"{_CURE[source]}, or use --input ideal"
+            raise UserError(f"{sequence.path}: holds no {what} (field {FIELDS[source]}); {hint}")
+    if any(sequence.attrs.get(name) is None for name in ("young_kpa", "scale_mm_per_px")):
+        raise UserError(f"{sequence.path}: lacks the attribute young_kpa or scale_mm_per_px")
 
 
 def _plain(sequence: Sequence) -> dict[str, Any]:
@@ -213,8 +216,8 @@ def load_clips(
 def _packed(sequence: Sequence, grid: Grid, wanted: tuple[str, ...], cache: Path, code: str) -> Clip:
     # The content hash is no word of the store's own: opening it has checked that it is its attributes', and
     # reading a field that it is the hash there. What is packed under it is what it stands for.
-    said = [sequence.attrs["content_hash"], grid.size, grid.extent_mm, *wanted, code]
-    folder = cache / hashlib.blake2b(identity.canonical(said), digest_size=16).hexdigest()
+    key = [sequence.attrs["content_hash"], grid.size, grid.extent_mm, *wanted, code]
+    folder = cache / hashlib.blake2b(identity.canonical(key), digest_size=16).hexdigest()
     if not folder.is_dir():
         pack(read_clip(sequence, grid, wanted), folder)
     found = unpack(folder)
@@ -247,18 +250,11 @@ def pack(clip: Clip, folder: Path) -> None:
 
 def unpack(folder: Path) -> Clip:
     """A packed clip, memory-mapped. Raises UserError if the folder is not one, or damaged."""
-    try:
+    with as_user_error(f"{folder}: not a packed sequence, or damaged: remove it"):
         plain = json.loads(checked_file.read_bytes(folder / "clip.json", 1_000_000))
         arrays: dict[str, Any] = _mapped(folder / _FILE, plain.pop("checksums"))
         displacement = {s: arrays.pop(f"displacement-{s}") for s in FIELDS if f"displacement-{s}" in arrays}
         return Clip(**plain, displacement=displacement, **arrays)
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, UserError, SafetensorError) as error:
-        why = str(error)
-    except RuntimeError as error:
-        if not isinstance(error, RecursionError):  # a process has too many mappings: nothing is damaged
-            raise UserError(f"{folder}: cannot be mapped ({str(error).splitlines()[0][:200]})") from None
-        why = "nested too deeply"
-    raise UserError(f"{folder}: damaged packed sequence ({why.splitlines()[0][:200]}); remove it")
 
 
 def _mapped(file: Path, checksums: Mapping[str, int]) -> dict[str, NDArray[Any]]:

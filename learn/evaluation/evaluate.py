@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, astuple, dataclass
 from typing import Any
 
@@ -135,9 +135,10 @@ class EvaluationReport:
         """Mean and BCa interval over sequences of every per-sequence number, and of the pooled R²."""
         rows, rng = self.per_clip(), np.random.default_rng(0)
         out = {k: interval(np.array([r[k] for r in rows]), rng) for k in rows[0]}
-        out["map_r2_pooled"] = pooled_r2(_sums(c.map for c in self.clips), rng)
-        forces = (Moments.of(c.true_mn, c.predicted_mn) for c in self.clips)
-        return out | {"force_r2_pooled": pooled_r2(_sums(forces), rng)}
+        forces = [Moments.of(c.true_mn, c.predicted_mn) for c in self.clips]
+        for name, parts in (("map_r2_pooled", [c.map for c in self.clips]), ("force_r2_pooled", forces)):
+            out[name] = pooled_r2(np.array([astuple(m)[:6] for m in parts]), rng)
+        return out
 
     def bands(self) -> list[dict[str, float]]:
         """Errors of the total force in four bands of true force, as shares of the training data's largest."""
@@ -175,10 +176,6 @@ class EvaluationReport:
                 "target": self.card.settings.target,
             },
         }
-
-
-def _sums(moments: Iterable[Moments]) -> NDArray[np.float64]:
-    return np.array([astuple(m)[:6] for m in moments])
 
 
 def _mean(values: Sequence[float]) -> float:

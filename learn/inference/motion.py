@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from learn.data.clips import FIELDS, has_depth
+from learn.data.clips import FIELDS, check_readable, has_depth
 from synth.dataset.store import Dataset, Sequence, open_sequence
 from synth.errors import UserError
 from synth.flow.stereo.track import Moved
@@ -111,14 +111,8 @@ def _sequences(path: Path) -> Iterator[Sequence]:
 
 
 def _stored(sequence: Sequence, source: str) -> Motion:
-    if source not in FIELDS:
-        raise UserError(f"unknown input {source!r}: {', '.join(FIELDS)}")
-    if FIELDS[source] not in sequence:
-        what = "motion of two eyes" if has_depth(source) else f"{source} flow"
-        raise UserError(f"{sequence.path}: holds no {what} (field {FIELDS[source]})")
-    scale, young = (sequence.attrs.get(name) for name in ("scale_mm_per_px", "young_kpa"))
-    if scale is None or young is None:
-        raise UserError(f"{sequence.path}: lacks the attribute young_kpa or scale_mm_per_px")
+    check_readable(sequence, [source])
+    scale, young = (float(sequence.attrs[name]) for name in ("scale_mm_per_px", "young_kpa"))
     time_s, tissue, force = (sequence.read_whole(name) for name in ("time", "tissue", "force"))
 
     def beside(name: str, belongs: bool) -> Any:
@@ -141,8 +135,8 @@ def _stored(sequence: Sequence, source: str) -> Motion:
         name=sequence.path.stem,
         frames=frames(),
         tissue=tissue.astype(bool),
-        scale_mm_per_px=float(scale),
-        young_kpa=float(young),
+        scale_mm_per_px=scale,
+        young_kpa=young,
         force_mn=np.linalg.norm(force, axis=1),
     )
 

@@ -30,7 +30,7 @@ from learn.training.gpu_batches import place_frames
 from learn.training.log import Log
 from learn.training.threads import make_fabric
 from synth.dataset.split import find_crossings
-from synth.errors import UserError
+from synth.errors import UserError, as_user_error
 from synth.job import retired
 from synth.system.terminal import ProgressCallback
 
@@ -71,46 +71,30 @@ def train(
     card = ModelCard(settings, scales, typical_young(fit), *_provenance(clips, split))
     state = _open(out, card)
     try:
-        return _go_on(_start(card, state), card, fit, select, out, report, fabric, log)
+        run = _start(card, state)
+        net: Any = torch.compile(run.model) if settings.compile else run.model
+        net, run.optimizer = fabric.setup(net, run.optimizer)
+        frames, chooser = (place_frames(part, settings, fabric.device) for part in (fit, select))
+        with Log(out, run.epoch) if fabric.is_global_zero else nullcontext() as write:
+            for epoch in range(run.epoch, settings.epochs):
+                numbers = _epoch(fabric, net, run.optimizer, frames, scales, epoch, report)
+                numbers |= select_score(net, chooser, scales, fabric.device)
+                improved = run.end_epoch(numbers["select_r2"], settings)
+                numbers |= {"epoch": epoch + 1.0, "lr": run.optimizer.param_groups[0]["lr"]}
+                if write is not None:
+                    write(epoch, numbers)
+                    if improved:
+                        gain = numbers["select_gain"]
+                        best = dataclasses.replace(card, epoch=run.epoch, score=run.best, force_gain=gain)
+                        checkpoint.write_model(out, best, _cpu(run.model.state_dict()))
+                    checkpoint.save_tensors(out / "last.pt", run.as_dict())
+                fabric.barrier()
+                log(numbers)
     except (UserError, OSError):
         # Nothing to go on from: a full disk, say, leaves nothing.
         if state is None and fabric.is_global_zero and not (out / "last.pt").exists():
             shutil.rmtree(out)
         raise
-
-
-def _go_on(
-    run: _Run,
-    card: ModelCard,
-    fit: list[Clip],
-    select: list[Clip],
-    out: Path,
-    report: ProgressCallback,
-    fabric: Fabric,
-    log: Callable[[dict[str, float]], None],
-) -> ModelCard:
-    """Epoch after epoch to the end; arguments as `train`'s."""
-    settings, scales = card.settings, card.scales
-    net: Any = torch.compile(run.model) if settings.compile else run.model
-    net, run.optimizer = fabric.setup(net, run.optimizer)
-    frames, chooser = (place_frames(part, settings, fabric.device) for part in (fit, select))
-
-    with Log(out, run.epoch) if fabric.is_global_zero else nullcontext() as write:
-        for epoch in range(run.epoch, settings.epochs):
-            numbers = _epoch(fabric, net, run.optimizer, frames, scales, epoch, report)
-            numbers |= select_score(net, chooser, scales, fabric.device)
-            improved = run.end_epoch(numbers["select_r2"], settings)
-            numbers |= {"epoch": epoch + 1.0, "lr": run.optimizer.param_groups[0]["lr"]}
-            if write is not None:
-                write(epoch, numbers)
-                if improved:
-                    best = dataclasses.replace(
-                        card, epoch=run.epoch, score=run.best, force_gain=numbers["select_gain"]
-                    )
-                    checkpoint.write_model(out, best, _cpu(run.model.state_dict()))
-                checkpoint.save_tensors(out / "last.pt", run.as_dict())
-            fabric.barrier()
-            log(numbers)
     return checkpoint.read_card(out)
 
 
@@ -159,14 +143,11 @@ def _start(card: ModelCard, state: dict[str, Any] | None) -> _Run:
     plateau = ReduceLROnPlateau(optimizer, mode="max", factor=0.5, patience=PATIENCE)
     run = _Run(model, optimizer, plateau)
     if state is not None:
-        try:
+        with as_user_error("last.pt: corrupt checkpoint"):
             model.load_state_dict(state["model"])
             optimizer.load_state_dict(state["optimizer"])
             plateau.load_state_dict(state["plateau"])
             run.epoch, run.best = int(state["epoch"]), float(state["best"])
-        except (RuntimeError, ValueError, KeyError, TypeError, AttributeError) as error:
-            why = (str(error).splitlines() or ["of another kind"])[0]
-            raise UserError(f"last.pt: corrupt checkpoint ({why[:200]})") from None
     return run
 
 
@@ -183,8 +164,7 @@ def _epoch(
     # Seeds from (seed, epoch) alone: nothing to store, so a resumed run draws what the first would have.
     seed = np.random.SeedSequence([settings.seed, epoch])
     torch.manual_seed(int(seed.generate_state(1)[0]) + fabric.global_rank)
-    share = min(1.0, epoch / max(settings.epochs // 2, 1))
-    order = frames.order(np.random.default_rng(seed), share)
+    order = frames.order(np.random.default_rng(seed), min(1.0, epoch / max(settings.epochs // 2, 1)))
     whole = settings.batch * fabric.world_size
     batches = max(len(order) // whole, 1)
     net.train()
@@ -196,23 +176,17 @@ def _epoch(
             draws = np.random.SeedSequence([settings.seed, epoch, i, fabric.global_rank])
             rng = torch.Generator().manual_seed(int(draws.generate_state(1)[0]))
             batch = swayed(batch, settings, rng)
-        said = forward(net, batch, settings, scales)
-        terms = loss(
-            said,
-            batch.target,
-            batch.mask,
-            settings.loss,
-            scales.target,
-            scales.spread,
-            (epoch + i / batches) / settings.epochs,
-        )
+        predicted = forward(net, batch, settings, scales)
+        progress = (epoch + i / batches) / settings.epochs
+        unit, spread = scales.target, scales.spread
+        terms = loss(predicted, batch.target, batch.mask, settings.loss, unit, spread, progress)
         if i % LOOK == 0:
             _finite(float(terms.sum.detach()), epoch)
-            for k, v in gradient_shares(terms, said).items():
+            for k, v in gradient_shares(terms, predicted).items():
                 means[f"share_{k}"].update(v)
         if settings.schedule == "cosine":
             for group in optimizer.param_groups:
-                group["lr"] = settings.learning_rate * cosine((epoch + i / batches) / settings.epochs)
+                group["lr"] = settings.learning_rate * cosine(progress)
         optimizer.zero_grad()
         fabric.backward(terms.sum)
         fabric.clip_gradients(net, optimizer, max_norm=CLIP)
@@ -241,8 +215,8 @@ def forward(net: Any, batch: Batch, settings: TrainingSettings, scales: Scales) 
     x = inputs(batch, settings, scales)
     if settings.channels_last:
         x = x.contiguous(memory_format=torch.channels_last)
-    said: torch.Tensor = net(x)
-    return said.float() * scales.target
+    predicted: torch.Tensor = net(x)
+    return predicted.float() * scales.target
 
 
 @torch.no_grad()
@@ -258,10 +232,10 @@ def select_score(net: Any, frames: FrameDataset, scales: Scales, device: torch.d
         for batch in frames.sequential(c, frames.sources[-1]):
             here = batch.to(device)
             inside = here.mask.bool().expand_as(here.target)
-            said = forward(net, here, frames.settings, scales)
-            sums = sums + moments(here.target[inside], said[inside])
+            predicted = forward(net, here, frames.settings, scales)
+            sums = sums + moments(here.target[inside], predicted[inside])
             forces = forces + moments(
-                *(_amount(one * inside, frames.settings) for one in (here.target, said))
+                *(_amount(one * inside, frames.settings) for one in (here.target, predicted))
             )
     result = agreement(sums)
     return {
@@ -278,15 +252,15 @@ def _amount(maps: torch.Tensor, settings: TrainingSettings) -> torch.Tensor:
 
 
 def _gain(forces: Moments, anatomies: int) -> float:
-    """Slope through the origin of true on said force, within `_GAINS`; 1 where too few anatomies tell it."""
+    """Slope through the origin of true on predicted force, within `_GAINS`; 1 if too few anatomies tell."""
     if anatomies < _TELLING or not forces.tp > 0:
         return 1.0
     return min(max(forces.tp / forces.pp, _GAINS[0]), _GAINS[1])
 
 
-def moments(true: torch.Tensor, said: torch.Tensor) -> Moments:
+def moments(true: torch.Tensor, predicted: torch.Tensor) -> Moments:
     """`Moments.of`, summed on the tensors' own device: six numbers come back."""
-    t, p = true.double(), said.double()
+    t, p = true.double(), predicted.double()
     sums = torch.stack([t.sum(), p.sum(), t @ t, p @ p, t @ p, (p - t).abs().sum()])
     return Moments(float(t.numel()), *sums.tolist())
 
@@ -322,13 +296,7 @@ def _open(out: Path, card: ModelCard) -> dict[str, Any] | None:
     bound = planned or there.settings.schedule == "cosine"
     if there.settings.epochs != card.settings.epochs and bound:
         raise UserError(f"{out}: its schedule was made for {there.settings.epochs} epochs; keep --epochs")
-    if not (out / "last.pt").exists():
-        return None
-    state = checkpoint.load_tensors(out / "last.pt")
-    missing = {"model", "optimizer", "plateau", "epoch", "best"} - state.keys()
-    if missing:
-        raise UserError(f"{out / 'last.pt'}: corrupt checkpoint (lacks {', '.join(sorted(missing))})")
-    return state
+    return checkpoint.load_tensors(out / "last.pt") if (out / "last.pt").exists() else None
 
 
 def _cpu(state: dict[str, Any]) -> dict[str, Any]:

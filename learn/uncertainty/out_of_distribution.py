@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,9 +66,9 @@ def fit_distribution(fitted: Sequence[Floats], held_out: Sequence[Floats]) -> Ou
     least = (_LEAST_SPREAD / spread) ** 2
     precision = np.linalg.inv(shrunk + np.diag(np.maximum(least - np.diag(shrunk), 0.0)))
     precision = precision / np.outer(spread, spread)
-    world = OutOfDistribution(tuple(seen.mean(0).tolist()), tuple(map(tuple, precision.tolist())), 1.0)
-    usual = share_quantile([world.distance(m)[is_moving(m)] for m in others], USUAL)
-    return OutOfDistribution(world.middle, world.precision, max(usual, 1e-6))
+    fitted_to = OutOfDistribution(tuple(seen.mean(0).tolist()), tuple(map(tuple, precision.tolist())), 1.0)
+    usual = share_quantile([fitted_to.distance(m)[is_moving(m)] for m in others], USUAL)
+    return replace(fitted_to, usual=max(usual, 1e-6))
 
 
 def shrunk_covariance(samples: Floats) -> Floats:
