@@ -64,8 +64,8 @@ class ModelCard:
     score: FiniteFloat = 0.0
     """R² on the select sequences at the chosen epoch, of the network's own map, before `force_gain`."""
     force_gain: Positive = 1.0
-    """What the network's map is multiplied by: the slope through the origin of the true on the said total
-    force, on the select sequences at the chosen epoch."""
+    """What the network's map is multiplied by: the slope through the origin of the true on the predicted
+    total force, on the select sequences at the chosen epoch."""
     weights_hash: str = ""
     """Of the file of weights; empty before an epoch is kept."""
     intervals: Intervals | None = None

@@ -47,22 +47,23 @@ def add_intervals(
     Raises:
         UserError: nothing moves in the sequences.
     """
-    fitted, chosen, kept = ([clips[i] for i in part] for part in (split.fit, split.select, split.intervals))
-    why, found = find_obstacle(chosen, kept), None
+    parts = split.fit, split.select, split.intervals
+    fitted, selection, calibration = ([clips[i] for i in part] for part in parts)
+    why, found = find_obstacle(selection, calibration), None
     if not why:
         source = source or scored(predictor.card.settings.input)
-        found = _fit(predictor, fitted, chosen, kept, source, report)
+        found = _fit(predictor, fitted, selection, calibration, source, report)
     choosers = set(predictor.card.groups.get("select", ()))
-    used = [*kept, *(clip for clip in chosen if kept and clip.group not in choosers)]
+    used = [*calibration, *(clip for clip in selection if calibration and clip.group not in choosers)]
     taken = {clip.content_hash for clip in used}, {clip.group for clip in used}
-    names, brains = (
-        {part: [one for one in told if one not in gone] for part, told in parts.items()}
+    hashes, brains = (
+        {part: [one for one in names if one not in gone] for part, names in parts.items()}
         for parts, gone in zip((predictor.card.split, predictor.card.groups), taken, strict=True)
     )
     if used:
-        names["intervals"] = [clip.content_hash for clip in used]
+        hashes["intervals"] = [clip.content_hash for clip in used]
         brains["intervals"] = sorted(taken[1])
-    card = replace(predictor.card, intervals=found, no_intervals=why, split=names, groups=brains)
+    card = replace(predictor.card, intervals=found, no_intervals=why, split=hashes, groups=brains)
     write_card(folder, card)
     return card
 
@@ -111,16 +112,16 @@ def fit_from_datasets(
 def _fit(
     predictor: Predictor,
     fitted: Sequence[Clip],
-    chosen: Sequence[Clip],
-    kept: Sequence[Clip],
+    selection: Sequence[Clip],
+    calibration: Sequence[Clip],
     source: str,
     report: ProgressCallback,
 ) -> Intervals:
     """Intervals from the parts of `add_intervals`' split."""
     card = predictor.card
     unit, rng = card.scales.force, np.random.default_rng(card.settings.seed)
-    brains, examples = [0] * len(chosen) + groups(kept), []
-    for k, (clip, brain) in enumerate(zip([*chosen, *kept], brains, strict=True)):
+    brains, examples = [0] * len(selection) + groups(calibration), []
+    for k, (clip, brain) in enumerate(zip([*selection, *calibration], brains, strict=True)):
         report(k, len(brains))
         true = clip.force / clip.young_kpa
         examples.append(make_example(predict_clip(predictor, clip, source), true, brain, unit))
@@ -130,7 +131,7 @@ def _fit(
         motion_features(np.asarray(c.displacement[source]), c.mask, c.sure(source), card.settings.extent_mm)
         for c in some
     ]
-    first, second = examples[: len(chosen)], examples[len(chosen) :]
+    first, second = examples[: len(selection)], examples[len(selection) :]
     world = fit_distribution(motion, [one.motion for one in first])
     if world is None:
         raise UserError("nothing moves in the sequences that the intervals are to be fitted on")

@@ -28,19 +28,20 @@ def keep_back(clips: Sequence[Clip], split: Split, seed: int) -> Split:
     if len(names) < 2 * conformal.least_units(LEVELS[0]):
         return split
     drawn = np.random.default_rng([seed, 0x1E7]).permutation(names)[: len(names) // 2]
-    kept = tuple(i for i in split.select if number[i] in drawn)
-    return replace(split, select=tuple(i for i in split.select if i not in kept), intervals=kept)
+    calibration = tuple(i for i in split.select if number[i] in drawn)
+    select = tuple(i for i in split.select if i not in calibration)
+    return replace(split, select=select, intervals=calibration)
 
 
-def find_obstacle(chosen: Sequence[Clip], kept: Sequence[Clip]) -> str:
+def find_obstacle(selection: Sequence[Clip], calibration: Sequence[Clip]) -> str:
     """Why there can be no intervals; empty if there can be.
 
-    `chosen`: sequences that the scale is fitted on; `kept`: those that the factors come from.
+    `selection`: sequences that the scale is fitted on; `calibration`: those that the factors come from.
     """
     least = conformal.least_units(LEVELS[0])
     parts = (
-        ("kept for intervals", kept, least),
-        ("left to choose the epoch, on which the scale of errors is fitted", chosen, LEAST_CHOSEN),
+        ("kept for intervals", calibration, least),
+        ("left to choose the epoch, on which the scale of errors is fitted", selection, LEAST_CHOSEN),
     )
     for what, part, needed in parts:
         found = len(set(groups(part)))
@@ -55,7 +56,7 @@ def find_sides(clips: Sequence[Clip], card: ModelCard, test: Collection[str], fr
 
     Kept for it is what was already; else every brain that the model has not met and that has no test
     sequence; with `from_test` half of the brains of the test instead, drawn, and the other half stays it.
-    Where too few brains chose the epoch, those that the scale of errors still lacks are drawn from the kept.
+    Where too few brains chose the epoch, those that the error model still lacks are drawn from these.
 
     Args:
         clips: of the dataset.
@@ -74,14 +75,14 @@ def find_sides(clips: Sequence[Clip], card: ModelCard, test: Collection[str], fr
 
     rng = np.random.default_rng(card.settings.seed)
     fitted, chosen = brains("fit"), brains("select")
-    kept, tests = brains("intervals") - fitted - chosen, brains("test", test) - fitted - chosen
+    calibration, tests = brains("intervals") - fitted - chosen, brains("test", test) - fitted - chosen
     if from_test:
         drawn = rng.permutation(sorted(tests))
-        kept = {int(brain) for brain in drawn[: len(tests) // 2]}
-    elif not kept:
-        kept = set(number) - fitted - chosen - tests
-    left, lacking = tests - kept, max(LEAST_CHOSEN - len(chosen), 0)
-    if len(kept) >= conformal.least_units(LEVELS[0]) + lacking:
-        lent = {int(brain) for brain in rng.permutation(sorted(kept))[:lacking]}
-        chosen, kept = chosen | lent, kept - lent
-    return Split(of(fitted), of(chosen), of(left), of(kept))
+        calibration = {int(brain) for brain in drawn[: len(tests) // 2]}
+    elif not calibration:
+        calibration = set(number) - fitted - chosen - tests
+    left, lacking = tests - calibration, max(LEAST_CHOSEN - len(chosen), 0)
+    if len(calibration) >= conformal.least_units(LEVELS[0]) + lacking:
+        lent = {int(brain) for brain in rng.permutation(sorted(calibration))[:lacking]}
+        chosen, calibration = chosen | lent, calibration - lent
+    return Split(of(fitted), of(chosen), of(left), of(calibration))

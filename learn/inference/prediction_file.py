@@ -138,9 +138,9 @@ def _drawn(found: dict[str, Any], times: NDArray[np.floating], pictures: Iterato
             curve = film.draw_curve(times, force, small.shape[1])
         known = "" if found["young_known"] else f", if E is {found['young_kpa']:.3g} kPa"
         ends = f" [{found['low_mn'][t]:.1f}, {found['high_mn'][t]:.1f}]" if "low_mn" in found else ""
-        said = f"{force[t]:.1f} mN{ends}{known}" if found["trusted"][t] else "could not be followed"
+        text = f"{force[t]:.1f} mN{ends}{known}" if found["trusted"][t] else "could not be followed"
         shown = film.glow(small, values, largest) if found["trusted"][t] else small
-        shown = picture.caption(shown, f"{times[t]:.2f} s  {said}")
+        shown = picture.caption(shown, f"{times[t]:.2f} s  {text}")
         yield np.vstack([shown, film.mark(curve, t, len(force))])
 
 

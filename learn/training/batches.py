@@ -66,8 +66,8 @@ def swayed(batch: Batch, settings: TrainingSettings, generator: torch.Generator)
     along = torch.arange(planes) == 2
     amount *= settings.sway_mm * torch.where(along, 1.0, 1 / 3)[:, None] / len(shapes) ** 0.5
     amount *= (torch.rand(count, generator=generator) < 0.5)[:, None, None]
-    whole = torch.einsum("bps,syx->bpyx", amount, shapes).to(moved)
-    return batch._replace(displacement=moved + whole * batch.mask)
+    sway = torch.einsum("bps,syx->bpyx", amount, shapes).to(moved)
+    return batch._replace(displacement=moved + sway * batch.mask)
 
 
 def inputs(batch: Batch, settings: TrainingSettings, scales: Scales) -> Tensor:

@@ -165,12 +165,12 @@ def _epoch(
     seed = np.random.SeedSequence([settings.seed, epoch])
     torch.manual_seed(int(seed.generate_state(1)[0]) + fabric.global_rank)
     order = frames.order(np.random.default_rng(seed), min(1.0, epoch / max(settings.epochs // 2, 1)))
-    whole = settings.batch * fabric.world_size
-    batches = max(len(order) // whole, 1)
+    step = settings.batch * fabric.world_size
+    batches = max(len(order) // step, 1)
     net.train()
     means = {k: MeanMetric().to(fabric.device) for k in ("loss", *(f"share_{k}" for k in SHARES))}
     for i in range(batches):
-        batch = frames.batch(order[i * whole : (i + 1) * whole][fabric.global_rank :: fabric.world_size])
+        batch = frames.batch(order[i * step : (i + 1) * step][fabric.global_rank :: fabric.world_size])
         batch = batch.to(fabric.device)
         if settings.sway_mm > 0:
             draws = np.random.SeedSequence([settings.seed, epoch, i, fabric.global_rank])

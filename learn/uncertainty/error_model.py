@@ -28,12 +28,12 @@ class ErrorModel:
 
     def predict(self, features: Floats) -> Floats:
         """(...,) > 0 for features (..., F)."""
-        held = np.clip(features, self.low, self.high)
-        return np.asarray(np.maximum(np.exp(self.intercept + held @ np.array(self.slopes)), self.least))
+        clipped = np.clip(features, self.low, self.high)
+        return np.asarray(np.maximum(np.exp(self.intercept + clipped @ np.array(self.slopes)), self.least))
 
 
 def fit_error_model(features: Floats, error: Floats, weight: Floats, least: float) -> ErrorModel:
-    """Least squares on the logarithm of the error, slightly held back (ridge).
+    """Least squares on the logarithm of the error, slightly regularised (ridge).
 
     Args:
         features: (n, F).
@@ -44,9 +44,9 @@ def fit_error_model(features: Floats, error: Floats, weight: Floats, least: floa
     spread = np.maximum(features.std(0), 1e-6)
     wanted, share = np.log(error + least), weight / weight.mean()
     middle, level = np.average(features, 0, share), float(np.average(wanted, weights=share))
-    told = (features - middle) / spread
-    held = told.T @ (share[:, None] * told) + np.eye(told.shape[1])
-    slopes = np.linalg.solve(held, told.T @ (share * (wanted - level))) / spread
+    scaled = (features - middle) / spread
+    normal = scaled.T @ (share[:, None] * scaled) + np.eye(scaled.shape[1])
+    slopes = np.linalg.solve(normal, scaled.T @ (share * (wanted - level))) / spread
     return ErrorModel(
         intercept=level - float(middle @ slopes),
         slopes=tuple(slopes.tolist()),

@@ -158,51 +158,47 @@ def make_example(predicted: Prediction, true: Floats, unit: int, force_unit: flo
 
 
 def fit(
-    chosen: Sequence[Example],
-    kept: Sequence[Example],
+    selection: Sequence[Example],
+    calibration: Sequence[Example],
     world: OutOfDistribution,
     names: tuple[str, ...],
     force_unit: float,
     source: str,
 ) -> Intervals:
-    """Scales from `chosen`, factors from `kept`; arguments else as the fields of `Intervals`.
+    """Scales from `selection`, factors from `calibration`; arguments else as the fields of `Intervals`.
 
-    The two share no unit, and neither one with what the network was fitted on. Raises UserError if `kept`
-    has fewer units than the highest level needs.
+    The two share no unit, and neither one with what the network was fitted on. Raises UserError if
+    `calibration` has fewer units than the highest level needs.
     """
-    count, least = len({one.unit for one in kept}), conformal.least_units(LEVELS[0])
+    count, least = len({one.unit for one in calibration}), conformal.least_units(LEVELS[0])
     if count < least:
         raise UserError(f"{count} brains are kept for intervals; {LEVELS[0]:.0%} needs {least}")
-    features = np.concatenate([one.features for one in chosen])
-    error = np.concatenate([one.error for one in chosen])
-    weight = np.concatenate([np.full(n, 1 / n) for n in (len(one.features) for one in chosen)])
-    scales = [fit_error_model(features, e, weight, _LEAST * force_unit) for e in error.T]
-    wide = [_widen(world, scales[0], one.motion, one.features) for one in kept]
-    both = list(zip(kept, wide, strict=True))
-    spreads = [
-        _spread(scale, kept, [one.error[:, k] / (w * scale.predict(one.features)) for one, w in both])
-        for k, scale in enumerate(scales)
-    ]
+    features = np.concatenate([one.features for one in selection])
+    error = np.concatenate([one.error for one in selection])
+    weight = np.concatenate([np.full(n, 1 / n) for n in (len(one.features) for one in selection)])
+    models = [fit_error_model(features, e, weight, _LEAST * force_unit) for e in error.T]
+    wide = [_widen(world, models[0], one.motion, one.features) for one in calibration]
+
+    def spread(k: int) -> Spread:
+        """The error model of the size (0) or a component, with its factors."""
+        by_unit: dict[int, list[Floats]] = {}
+        for one, w in zip(calibration, wide, strict=True):
+            error = one.error[:, k] / (w * models[k].predict(one.features))
+            by_unit.setdefault(one.unit, []).append(error)
+        together = [np.concatenate(errors) for errors in by_unit.values()]
+        factors = {str(level): max(conformal.quantile(together, level), 1e-9) for level in LEVELS}
+        return Spread(models[k], factors)
+
     return Intervals(
         features=(*names, *ANSWER),
         force_unit=force_unit,
-        size=spreads[0],
-        axes=(spreads[1], spreads[2], spreads[3]),
+        size=spread(0),
+        axes=(spread(1), spread(2), spread(3)),
         world=world,
         source=source,
         units=count,
-        sequences=len(kept),
+        sequences=len(calibration),
     )
-
-
-def _spread(scale: ErrorModel, kept: Sequence[Example], scores: Sequence[Floats]) -> Spread:
-    """A scale with its factors; `scores`: of each sequence, (n,) errors as multiples of the scale."""
-    by_unit: dict[int, list[Floats]] = {}
-    for one, score in zip(kept, scores, strict=True):
-        by_unit.setdefault(one.unit, []).append(score)
-    together = [np.concatenate(one) for one in by_unit.values()]
-    factors = {str(level): max(conformal.quantile(together, level), 1e-9) for level in LEVELS}
-    return Spread(scale, factors)
 
 
 def _widen(world: OutOfDistribution, size: ErrorModel, motion: Floats, features: Floats) -> Floats:
