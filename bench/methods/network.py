@@ -6,11 +6,11 @@ from dataclasses import replace
 from pathlib import Path
 
 from bench.methods.protocol import Field, ForceEstimate, MethodContext
+from learn import Predictor, load_model
 from learn.inference.force_reader import ForceReader, describe_intervals
-from learn.inference.motion import MotionFrame
-from learn.inference.predict import Predictor, load_model
 from learn.uncertainty.intervals import LEVEL
 from synth.flow.stereo.track import Moved
+from synth.recording_flow.frame_motion import FrameMotion
 
 
 class Model:
@@ -55,7 +55,7 @@ class Model:
         if self._reader is None or self._reader[0] is not scene:
             reader = ForceReader(self.predictor, scene.tissue, scene.scale_mm_per_px, scene.young_kpa)
             self._reader = scene, reader
-        found = self._reader[1].read(MotionFrame(flow, confidence, moved))
+        found = self._reader[1].read(FrameMotion(flow, confidence, motion=moved))
         answer = ForceEstimate(
             found.force_mn, found.map.to_image() if picture else None, distance=found.distance
         )

@@ -18,7 +18,7 @@ from bench.scoring.evaluate_recording import evaluate_recording
 from bench.scoring.result import Result, write_json
 from bench.tracking import flow_process
 from bench.tracking.tracking import Progress
-from learn.inference.predict import Predictor
+from learn import Predictor
 from learn.inference.shipped import NONE, choose_model, find_model
 from synth.errors import UserError
 from synth.recording_flow.local_flow import LocalFlow

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -29,8 +30,8 @@ def apply(predictor: Predictor, motion: Motion, young_kpa: float | None = None) 
     reader = ForceReader(predictor, motion.tissue, motion.scale_mm_per_px, young)
     numbers, times, followed, found = [], [], list[bool](), list[FrameForce]()
     for frame in motion.frames:
-        numbers.append(frame.number)
-        times.append(frame.time_s)
+        numbers.append(frame.index)
+        times.append(math.nan if frame.time_s is None else frame.time_s)
         followed.append(frame.trusted)
         found.append(reader.read(frame))
     without_pulse = motion.again()
@@ -96,7 +97,7 @@ def calibrate(predictor: Predictor, press: Motion) -> float:
     if press.force_mn is None:
         raise UserError(f"{press.name}: holds no force to calibrate on (force_mn in an .npz)")
     view = GridView(press.tissue, press.scale_mm_per_px, predictor.grid)
-    inputs = [predictor.on_grid(view, one.flow, one.confidence, one.moved) for one in press.frames]
+    inputs = [predictor.on_grid(view, one.flow, one.confidence, one.motion) for one in press.frames]
     sure = [confidence for _, confidence in inputs if confidence is not None]
     displacement, confidence = np.stack([shift for shift, _ in inputs]), np.stack(sure) if sure else None
     return stiffness(predictor, displacement, view.mask, press.force_mn, confidence)

@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from itertools import repeat
 
 import numpy as np
 from numpy.typing import NDArray
 
 from learn.checkpoint import ModelCard
 from learn.data.clips import UNKNOWN_YOUNG_KPA
-from learn.inference.motion import MotionFrame
 from learn.inference.placing import Placing, Point, share_at_border
 from learn.inference.predict import ForceMap, Predictor, force_size, net_force
 from learn.uncertainty.conformal import LEVELS
@@ -19,6 +19,7 @@ from learn.uncertainty.features import is_moving
 from learn.uncertainty.intervals import Band, Prediction
 from learn.uncertainty.out_of_distribution import describe_unseen
 from synth.flow.stereo.track import Moved
+from synth.recording_flow.frame_motion import FrameMotion
 
 _MUCH_AT_BORDER = 0.1  # share of the force; what is spread evenly has a quarter there
 
@@ -47,8 +48,9 @@ def predict_force(
         UserError: shapes that don't fit, values that aren't finite, or a model of two eyes.
     """
     reader = ForceReader(model, np.asarray(tissue, bool), scale_mm_per_px, young_kpa)
-    pairs = ((one, None) for one in flow) if confidence is None else zip(flow, confidence, strict=True)
-    return np.array([reader.read(MotionFrame(*pair)).force_mn for pair in pairs]).reshape(-1, 3)
+    sure = repeat(np.ones(np.shape(tissue), np.float32)) if confidence is None else confidence
+    pairs = zip(flow, sure, strict=confidence is not None)
+    return np.array([reader.read(FrameMotion(*pair)).force_mn for pair in pairs]).reshape(-1, 3)
 
 
 @dataclass(frozen=True)
@@ -90,13 +92,14 @@ class ForceReader:
         """Where the network's grid lies."""
         self._at_border = self._in_all = 0.0
 
-    def read(self, frame: MotionFrame) -> FrameForce:
+    def read(self, frame: FrameMotion) -> FrameForce:
         """The force of a frame; errors as `Predictor`."""
         place = self.placing.place(frame.flow, frame.confidence)
         found = self._predict(frame, place)
         if place not in self._at_rest:
-            moved = frame.moved and Moved(0 * frame.moved.motion, 0 * frame.moved.deviation)
-            self._at_rest[place] = self._predict(MotionFrame(np.zeros_like(frame.flow), moved=moved), place)
+            motion = frame.motion and Moved(0 * frame.motion.motion, 0 * frame.motion.deviation)
+            still = FrameMotion(np.zeros_like(frame.flow), self._tissue.astype(np.float32), motion=motion)
+            self._at_rest[place] = self._predict(still, place)
         density, at_rest = found.density[None], self._at_rest[place].density[None]
         force = net_force(density, at_rest, found.kind, found.grid)[0]
         share = share_at_border(found.magnitude, found.view.mask)
@@ -118,10 +121,10 @@ class ForceReader:
             note += f"; {100 * share:.0f}% of the force lies at the border of that, what is beyond is lost"
         return [note]
 
-    def _predict(self, frame: MotionFrame, place: Point) -> ForceMap:
+    def _predict(self, frame: FrameMotion, place: Point) -> ForceMap:
         young = self._young_kpa
         found = self._predictor(
-            frame.flow, self._tissue, self._scale, young, frame.confidence, frame.moved, centre_px=place
+            frame.flow, self._tissue, self._scale, young, frame.confidence, frame.motion, centre_px=place
         )
         if found.young_known:
             return found

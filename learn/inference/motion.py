@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import chain, repeat
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,7 @@ from learn.data.clips import FIELDS, check_readable, has_depth
 from synth.dataset.store import Dataset, Sequence, open_sequence
 from synth.errors import UserError
 from synth.flow.stereo.track import Moved
+from synth.recording_flow.frame_motion import FrameMotion
 from synth.recording_flow.pulse import PulseSearch
 from synth.recording_flow.video_flow import Footage, RecordingFlowSettings, VideoFlow, everywhere
 from synth.system import checked_file
@@ -25,28 +26,12 @@ from synth.video.mask_files import MaskFiles
 from synth.video.pixel_scale import UNKNOWN_NOTE, StatedScale, pixel_mm
 
 
-class MotionFrame(NamedTuple):
-    """One frame's motion from the rest frame, on the rest frame's pixels."""
-
-    flow: NDArray[np.float32]
-    """(H, W, 2) px."""
-    confidence: NDArray[np.float32] | None = None
-    """(H, W) in 0..1, if there is one."""
-    moved: Moved | None = None
-    """In three dimensions, where two eyes saw it."""
-    number: int = 0
-    """In the film."""
-    time_s: float = math.nan
-    trusted: bool = True
-    """Whether the frame could be followed."""
-
-
 @dataclass(frozen=True)
 class Motion:
     """Motion of one film."""
 
     name: str
-    frames: Iterator[MotionFrame]
+    frames: Iterator[FrameMotion]
     """In order; once."""
     tissue: NDArray[np.bool_]
     scale_mm_per_px: float
@@ -115,21 +100,17 @@ def _stored(sequence: Sequence, source: str) -> Motion:
     scale, young = (float(sequence.attrs[name]) for name in ("scale_mm_per_px", "young_kpa"))
     time_s, tissue, force = (sequence.read_whole(name) for name in ("time", "tissue", "force"))
 
-    def beside(name: str, belongs: bool) -> Any:
-        """Each frame's value of a field that goes with the source, else None."""
-        return sequence.read_sealed(name) if belongs else repeat(None, sequence.frames)
-
-    sure = beside("flow_confidence", source == "recovered" and "flow_confidence" in sequence)
-    spread = beside("motion_deviation", source == "motion")
-    arrays = zip(sequence.read_sealed(FIELDS[source]), sure, spread, time_s, strict=True)
-
-    def frames() -> Iterator[MotionFrame]:
-        for t, (values, confidence, deviation, at) in enumerate(arrays):
-            moved = None
-            if has_depth(source):
-                moved = Moved(values, np.zeros_like(values) if deviation is None else deviation)
-                values = np.asarray(values[..., :2] / scale, np.float32)
-            yield MotionFrame(values, confidence, moved, t, float(at))
+    def frames() -> Iterator[FrameMotion]:
+        certain = repeat(np.ones(tissue.shape, np.float32), sequence.frames)
+        sure = source == "recovered" and "flow_confidence" in sequence
+        confidence = sequence.read_sealed("flow_confidence") if sure else certain
+        exact = repeat(np.zeros((*tissue.shape, 3), np.float32), sequence.frames)
+        spread = sequence.read_sealed("motion_deviation") if source == "motion" else exact
+        arrays = zip(sequence.read_sealed(FIELDS[source]), confidence, spread, time_s, strict=True)
+        for t, (values, one, deviation, at) in enumerate(arrays):
+            motion = Moved(values, deviation) if has_depth(source) else None
+            flow = values if motion is None else np.asarray(values[..., :2] / scale, np.float32)
+            yield FrameMotion(flow, one, motion=motion, index=t, time_s=float(at))
 
     return Motion(
         name=sequence.path.stem,
@@ -151,10 +132,7 @@ def _video(path: Path, options: VideoOptions, pulse: PulseSearch | None = None) 
     tool = options.tool.read if options.tool else None
     footage = Footage(video.read_video(path, video.FPS), str(path), tissue, tool)
     following = VideoFlow(footage, options.settings, pulse=pulse)
-    frames = (
-        MotionFrame(one.flow, one.confidence, None, one.index, one.time_s or 0.0, one.trusted)
-        for one in following.frames()
-    )
+    frames = (replace(one, time_s=one.time_s or 0.0) for one in following.frames())
     rest = next(frames)
     mm_per_px = pixel_mm(options.scale_mm_per_px, following.size[1]) * following.shrink
 
@@ -195,12 +173,13 @@ def _arrays(path: Path) -> Motion:
             raise UserError(f"{path}: {name} is {found[name].shape}, expected {shape} like the tissue")
     scale, force = _positive(path, found, "scale_mm_per_px"), found.get("force_mn")
 
-    def frames() -> Iterator[MotionFrame]:
+    def frames() -> Iterator[FrameMotion]:
+        sure = found.get("confidence", np.broadcast_to(np.float32(1), (*count, *tissue.shape)))
         for t in range(count[0]):
             first, *rest = (found[name][t].astype(np.float32) for name in names)
-            sure = found["confidence"][t].astype(np.float32) if "confidence" in found else None
-            moved = Moved(first, rest[0]) if rest else None
-            yield MotionFrame(first[..., :2] / scale if rest else first, sure, moved, t)
+            motion = Moved(first, rest[0]) if rest else None
+            flow = first[..., :2] / scale if rest else first
+            yield FrameMotion(flow, sure[t].astype(np.float32), motion=motion, index=t)
 
     return Motion(
         name=path.stem,

@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 
 from learn.checkpoint import read_card
 from learn.inference.force_reader import ForceReader, FrameForce, describe_intervals
-from learn.inference.motion import MotionFrame
 from learn.inference.predict import load_model, net_force
 from learn.uncertainty.intervals import LEVEL
 from synth.errors import UserError
+from synth.recording_flow.frame_motion import FrameMotion
 
 SHAPE, SCALE = (48, 64), 0.5
 
@@ -30,7 +30,7 @@ def flow(size_mm: float) -> NDArray[np.float32]:
 
 def read(folder: Path, size_mm: float = 0.4, young_kpa: float | None = 2.0) -> FrameForce:
     reader = ForceReader(load_model(folder), np.ones(SHAPE, bool), SCALE, young_kpa)
-    return reader.read(MotionFrame(flow(size_mm)))
+    return reader.read(FrameMotion(flow(size_mm), np.ones(SHAPE, np.float32)))
 
 
 @pytest.fixture

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from learn.data.grid import Grid
 from learn.inference.force_reader import ForceReader
-from learn.inference.motion import MotionFrame
 from learn.inference.placing import Placing
 from learn.inference.predict import load_model
+from synth.recording_flow.frame_motion import FrameMotion
 
 _WIDE = np.ones((240, 480), bool)  # 48 x 96 mm
 _MM_PER_PX = 0.2
@@ -48,13 +48,14 @@ def test_force_is_that_of_the_part_that_moves(tmp_path: Path) -> None:
     predictor = load_model(write_model(tmp_path / "model", "arch.output=vector"))
     reader = ForceReader(predictor, _WIDE, _MM_PER_PX, 1.0)
     moved = _bump(370, 120)
-    found = reader.read(MotionFrame(moved))
+    found = reader.read(FrameMotion(moved, np.ones(_WIDE.shape, np.float32)))
     force = found.force_mn
     x, y = (round(2 * value) / 2 for value in reader.placing.centre_px)
     half = round(predictor.grid.extent_mm / _MM_PER_PX / 2)
     top, left = round(y + 0.5) - half, round(x + 0.5) - half
     cut = slice(top, top + 2 * half), slice(left, left + 2 * half)
-    alone = ForceReader(predictor, _WIDE[cut], _MM_PER_PX, 1.0).read(MotionFrame(moved[cut])).force_mn
+    part = FrameMotion(moved[cut], np.ones(moved[cut].shape[:2], np.float32))
+    alone = ForceReader(predictor, _WIDE[cut], _MM_PER_PX, 1.0).read(part).force_mn
     assert force == pytest.approx(alone, rel=0.05, abs=0.02 * float(np.abs(alone).max()))
     middle = predictor(moved, _WIDE, _MM_PER_PX, 1.0).force_mn
     assert middle is not None
