@@ -375,7 +375,8 @@ def export_command(
 def models_command(json: Json = False) -> None:
     """List the networks that come with this version."""
     from learn.checkpoint import read_card
-    from learn.inference.shipped import NONE, describe, hash_data, shipped, size_bytes
+    from learn.inference.shipped import NONE, describe, hash_data, shipped
+    from synth.system.cache import size_bytes
 
     found = {name: (folder, read_card(folder)) for name, folder in shipped().items()}
     if json:

@@ -11,6 +11,7 @@ from learn import checkpoint
 from learn.checkpoint import ModelCard
 from synth.errors import UserError
 from synth.job import identity
+from synth.system.cache import size_bytes
 from synth.system.checked_file import write_whole
 
 MODELS = Path(__file__).parents[1] / "models"
@@ -76,11 +77,6 @@ def pack_model(
             "train it with a smaller arch.width"
         )
     return card
-
-
-def size_bytes(folder: Path) -> int:
-    """Of all files in a model's folder."""
-    return sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
 
 
 def describe(card: ModelCard) -> str:

@@ -37,17 +37,18 @@ def quantile(scores: Sequence[Floats], level: float) -> float:
     Returns:
         The quantile; infinity where K is under `least_units`.
     """
-    values = np.concatenate(scores)
-    weight = np.concatenate([np.full(len(s), 1 / (len(scores) + 1) / len(s)) for s in scores])
-    order = np.argsort(values, kind="stable")
-    reached = np.cumsum(weight[order]) >= level - 1e-9
-    return float(values[order[np.argmax(reached)]]) if reached.any() else math.inf
+    return _weighted_quantile(scores, 1 / (len(scores) + 1), level)
 
 
 def share_quantile(values: Sequence[Floats], level: float) -> float:
     """Plain quantile of what the units hold, (n,) each, every unit weighing alike: an estimate, no bound."""
-    together = np.concatenate(values)
-    weight = np.concatenate([np.full(len(v), 1 / len(v)) for v in values])
-    order = np.argsort(together, kind="stable")
-    reached = np.cumsum(weight[order]) >= level * len(values) - 1e-9
-    return float(together[order[np.argmax(reached)]])
+    return _weighted_quantile(values, 1.0, level * len(values))
+
+
+def _weighted_quantile(units: Sequence[Floats], weight: float, share: float) -> float:
+    """Up to which value the weights, `weight` a unit, come to `share`; infinity if they don't."""
+    values = np.concatenate(units)
+    each = np.concatenate([np.full(len(unit), weight / len(unit)) for unit in units])
+    order = np.argsort(values, kind="stable")
+    reached = np.cumsum(each[order]) >= share - 1e-9
+    return float(values[order[np.argmax(reached)]]) if reached.any() else math.inf
