@@ -96,7 +96,7 @@ def pool(
     from bench.scoring import pool as pooling
 
     tree = pooling.pool(pooling.read(scores))
-    pooling.write(tree, out, by or _typed())
+    pooling.write(tree, out, by or shlex.join(["bench", *sys.argv[1:]]))
     print(json_.dumps(tree) if json else out / "README.md")
 
 
@@ -204,8 +204,7 @@ def from_dataset(
     chosen = [s for s in Dataset(dataset) if sequence is None or s.index == sequence]
     if not chosen:
         raise UserError(f"{dataset}: holds no finished sequence {sequence}")
-    written = [export_recording(s, out / f"{s.index:06d}", footage) for s in chosen]
-    _print_paths(written, json)
+    _print_paths([export_recording(s, out / f"{s.index:06d}", footage) for s in chosen], json)
 
 
 @app.command("make-exvivo", epilog="Example: bench make-exvivo --out recordings --count 2 --seconds 10")
@@ -230,11 +229,10 @@ def make_exvivo(
     plan = exvivo.Plan(
         seed, seconds, fps, (width, width * 3 // 4), photo.resolve() if photo else None, eyes=eyes
     )
-    written = []
+    written: list[Path] = []
     for index in range(first, first + count):
         with counting(f"recording {index}", int(seconds * fps)) as progress:
-            done = exvivo.make(plan, index, out / f"{index:03d}", progress)
-        written.append(done)
+            written.append(exvivo.make(plan, index, out / f"{index:03d}", progress))
     _print_paths(written, json)
 
 
@@ -252,11 +250,6 @@ def _pairs(option: str, words: list[str] | None, form: str) -> dict[str, str]:
             raise UserError(f"{option} {word}: expected {form}")
         named[name] = value
     return named
-
-
-def _typed() -> str:
-    """The command as it was typed, for a README."""
-    return shlex.join(["bench", *sys.argv[1:]])
 
 
 def _score(

@@ -114,8 +114,8 @@ def fitted_rules(clips: Sequence[Clip], source: str) -> dict[str, Rule]:
     size = np.linalg.norm(force, axis=1)
     peak = np.array([_peak(m, k) for m, k in zip(moved, mask, strict=True)])
     rules: dict[str, Rule] = {
-        "mean": _constant(float(size.mean())),
-        "linear in |d|": _linear(peak, size),
+        "mean": partial(_say_linear, 0.0, float(size.mean())),
+        "linear in |d|": partial(_say_linear, float(peak @ size) / max(float(peak @ peak), 1e-12), 0.0),
     }
     rows = _rows(moved, mask)
     # Not centred: no motion stays zero.
@@ -133,14 +133,6 @@ def _peak(moved: Field, mask: Field) -> float:
 
 
 # Rules are parts of functions that have a name, so that what is fitted can be kept in a file.
-
-
-def _constant(value: float) -> Rule:
-    return partial(_say_linear, 0.0, value)
-
-
-def _linear(peak: Floats, size: Floats) -> Rule:
-    return partial(_say_linear, float(peak @ size) / max(float(peak @ peak), 1e-12), 0.0)
 
 
 def _say_linear(a: float, b: float, moved: Field, mask: Field, sure: Field) -> Floats:

@@ -52,7 +52,6 @@ class Plan:
     size: tuple[int, int] = (320, 240)
     photo: Path | None = None
     """A photograph as texture; else procedural, of the family no other default job draws."""
-    variant: str = "auto"
     eyes: int = 1
 
 
@@ -91,7 +90,7 @@ def job_of(plan: Plan) -> jobs.Job:
             "render": {
                 "size": plan.size, "spp": 4, "field_mm": [30.0, 40.0], "tilt_deg": [5.0, 25.0],
                 "working_distance_mm": [220.0, 380.0], "aperture_mm": 6.0,
-                "distortion": [-0.12, 0.03, 0.001, -0.001, 0.0], "variant": plan.variant,
+                "distortion": [-0.12, 0.03, 0.001, -0.001, 0.0],
                 "stereo_mm": _STEREO_MM if plan.eyes == 2 else 0.0,
             },
         }

@@ -7,7 +7,6 @@ import html
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import cv2
@@ -24,7 +23,6 @@ from bench.scoring.metrics import METRICS
 from bench.scoring.result import Result
 from bench.tracking.tracking import Snapshot, TrackedRecording, picture_masks
 from learn.evaluation.metrics import Metric
-from synth.dataset.folder import write_whole
 from synth.publish import picture
 
 _PEAKS, _WORST = 4, 2
@@ -46,20 +44,8 @@ class Panel:
     """Motion along the view."""
 
 
-def write_report(result: Result, path: Path, title: str = "") -> None:
-    """Writes the report whole or not at all.
-
-    Args:
-        result: of `evaluate_recording`.
-        path: the HTML file.
-        title: heading; the recording's name if empty.
-    """
-    page = render_report(result, title or f"Force from video: {result.recording}")
-    write_whole(path, page, durable=False)
-
-
-def render_report(result: Result, title: str) -> str:
-    """The page as text."""
+def render_report(result: Result, title: str = "") -> str:
+    """The page as text; `title`: its heading, the recording's name if empty."""
     environment = Environment(
         loader=PackageLoader("bench.scoring", "."),
         autoescape=select_autoescape(default_for_string=True, default=True),
@@ -78,17 +64,19 @@ def render_report(result: Result, title: str) -> str:
     if result.sync is not None and result.sync.correlogram:
         figures["correlogram"] = charts.draw_correlogram(result.sync)
     panels, flow_px, force_kpa = pictures(result)
+    columns, better = _columns(result), beaten_by(result)
+    flattered = {n for n, one in result.methods.items() if one.gain and one.gain.source == "hindsight"}
     return environment.get_template("report.html.jinja").render(
-        title=title,
+        title=title or f"Force from video: {result.recording}",
         result=result,
         main=main,
-        first={key: metric for key, metric in _columns(result).items() if key in _NARROW},
-        more={key: metric for key, metric in _columns(result).items() if key not in _NARROW},
+        first={key: metric for key, metric in columns.items() if key in _NARROW},
+        more={key: metric for key, metric in columns.items() if key not in _NARROW},
         headline=headline(result),
         best=_best(result),
-        beaten_by=beaten_by(result),
-        losses=[_described(result, name) for name in beaten_by(result)],
-        surely=[n for n in beaten_by(result) if (w := result.methods[n].worse_by_mn) and w[0] > 0],
+        beaten_by=better,
+        losses=[f"{n} (its gain set in hindsight)" if n in flattered else n for n in better],
+        surely=[n for n in better if (w := result.methods[n].worse_by_mn) and w[0] > 0],
         figures=figures,
         depth_mm=_largest_depth(result.followed),
         panels=panels,
@@ -152,11 +140,6 @@ def beaten_by(result: Result) -> list[str]:
         for name, method in result.methods.items()
         if name != result.main and method.scores.get("mae_mn", math.inf) < own
     ]
-
-
-def _described(result: Result, name: str) -> str:
-    gain = result.methods[name].gain
-    return f"{name} (its gain set in hindsight)" if gain and gain.source == "hindsight" else name
 
 
 def shown(value: float | None, unit: str = "") -> str:

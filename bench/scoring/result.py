@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import json
 import math
 import platform
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, is_dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,7 +17,6 @@ from bench.sensor.clock_sync import Offset
 from bench.sensor.rotation import SensorRotation
 from bench.tracking.tracking import TrackedRecording
 from synth.system import packages
-from synth.system.checked_file import write_whole
 
 Curve = NDArray[np.float64]
 _METHOD_KEYS = (
@@ -111,12 +108,6 @@ class Result:
     def lost_share(self) -> float:
         """Share of the frames to be scored that were lost."""
         return float(self.lost[self.scored].mean()) if self.scored.any() else 0.0
-
-
-def write_json(result: Result, path: Path) -> None:
-    """Writes `score.json` whole or not at all."""
-    text = json.dumps(as_json(result), indent=1, allow_nan=False)
-    write_whole(path, text + "\n", durable=False)
 
 
 def as_json(result: Result) -> dict[str, Any]:

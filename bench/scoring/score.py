@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
@@ -15,7 +16,7 @@ from bench.recording import pixel_scale
 from bench.recording.folder import Recording, open_recording
 from bench.scoring import report
 from bench.scoring.evaluate_recording import evaluate_recording
-from bench.scoring.result import Result, write_json
+from bench.scoring.result import Result, as_json
 from bench.tracking import flow_process
 from bench.tracking.tracking import Progress
 from learn import Predictor
@@ -119,5 +120,5 @@ def write_result(result: Result, folder: Path, title: str) -> None:
         checked_file.part_of(folder / "score.json") as scores,
         checked_file.part_of(folder / "report.html") as page,
     ):
-        write_json(result, scores)
-        report.write_report(result, page, title)
+        scores.write_text(json.dumps(as_json(result), indent=1, allow_nan=False) + "\n", "utf-8")
+        page.write_text(report.render_report(result, title), "utf-8")

@@ -12,6 +12,7 @@ from bench.recording.folder import Force
 from bench.recording.meta import SensorMeta
 from synth.errors import UserError
 
+Curve = NDArray[np.float64]
 STANDARD_GRAVITY = 9.80665
 """m/s² = mN/g."""
 
@@ -25,9 +26,9 @@ _NO_UNIT = 0.1  # how far from 1 the length of gravity's direction may be
 class Processed:
     """Force on the tissue, on the video's clock."""
 
-    time_s: NDArray[np.float64]
+    time_s: Curve
     """(N,) rising [s]."""
-    force_mn: NDArray[np.float64]
+    force_mn: Curve
     """(N, 3) [mN]; NaN in gaps."""
     noise_floor_mn: float
     """Standard deviation without contact, all components together, after filtering [mN]; 0 if unknown."""
@@ -37,14 +38,13 @@ class Processed:
     """What was done, in order, in words."""
 
 
-def process_force(force: Force, sensor: SensorMeta, offset_s: float, causal: bool = False) -> Processed:
+def process_force(force: Force, sensor: SensorMeta, offset_s: float) -> Processed:
     """Gravity, tare and drift, low-pass, clock; in this order.
 
     Args:
         force: raw samples.
         sensor: how to read them.
         offset_s: added to the sensor's times [s].
-        causal: the low-pass runs forward only, as a live system's must (its delay is then in the curve).
 
     Raises:
         UserError: a contact-free span without samples, a mass without gravity columns, or with columns
@@ -56,14 +56,14 @@ def process_force(force: Force, sensor: SensorMeta, offset_s: float, causal: boo
         values = values @ np.array(sensor.to_camera).T
         steps.append("turned to the camera's axes")
     values, drift = _tared(force.time_s, values, sensor, steps)
-    values = _smooth(force.time_s, values, sensor.low_pass_hz, causal, steps)
+    values = _smooth(force.time_s, values, sensor.low_pass_hz, steps)
     floor = _floor(force.time_s, values, sensor)
     if offset_s:
         steps.append(f"clock moved by {offset_s * 1000:+.1f} ms")
     return Processed(force.time_s + offset_s, values, floor, drift, tuple(steps))
 
 
-def force_at(processed: Processed, time_s: NDArray[np.float64]) -> NDArray[np.float64]:
+def force_at(processed: Processed, time_s: Curve) -> Curve:
     """Force at the given times by linear interpolation, (T, 3) mN; NaN in gaps and outside the samples."""
     t, values = processed.time_s, processed.force_mn
     out = np.stack([np.interp(time_s, t, column, left=np.nan, right=np.nan) for column in values.T], axis=1)
@@ -75,7 +75,7 @@ def force_at(processed: Processed, time_s: NDArray[np.float64]) -> NDArray[np.fl
     return out
 
 
-def _weightless(force: Force, sensor: SensorMeta, steps: list[str]) -> NDArray[np.float64]:
+def _weightless(force: Force, sensor: SensorMeta, steps: list[str]) -> Curve:
     if sensor.mass_g == 0:
         return force.force_mn.copy()
     if force.gravity is None:
@@ -94,9 +94,7 @@ def _weightless(force: Force, sensor: SensorMeta, steps: list[str]) -> NDArray[n
     return np.asarray(force.force_mn - sign * sensor.mass_g * STANDARD_GRAVITY * force.gravity, np.float64)
 
 
-def _tared(
-    time_s: NDArray[np.float64], values: NDArray[np.float64], sensor: SensorMeta, steps: list[str]
-) -> tuple[NDArray[np.float64], float]:
+def _tared(time_s: Curve, values: Curve, sensor: SensorMeta, steps: list[str]) -> tuple[Curve, float]:
     """Subtracts the zero: a line through the medians of the contact-free spans, constant beyond them."""
     if not sensor.free_s:
         return values, 0.0
@@ -115,13 +113,7 @@ def _tared(
     return values - zero, drift
 
 
-def _smooth(
-    time_s: NDArray[np.float64],
-    values: NDArray[np.float64],
-    cut_hz: float | None,
-    causal: bool,
-    steps: list[str],
-) -> NDArray[np.float64]:
+def _smooth(time_s: Curve, values: Curve, cut_hz: float | None, steps: list[str]) -> Curve:
     """Butterworth on each unbroken run of samples, brought to a uniform clock and back."""
     if cut_hz is None:
         return values
@@ -142,27 +134,21 @@ def _smooth(
             continue
         for k in range(values.shape[1]):
             x = np.interp(even, t, values[run, k])
-            if causal:
-                state = signal.sosfilt_zi(sos) * x[0]
-                y = signal.sosfilt(sos, x, zi=state)[0]
-            else:
-                y = signal.sosfiltfilt(sos, x)
-            out[run, k] = np.interp(t, even, y)
-    way = "causal" if causal else "zero-phase"
-    steps.append(f"{way} Butterworth low-pass, order {_ORDER}, {cut_hz:g} Hz")
+            out[run, k] = np.interp(t, even, signal.sosfiltfilt(sos, x))
+    steps.append(f"zero-phase Butterworth low-pass, order {_ORDER}, {cut_hz:g} Hz")
     if short:
         steps.append(f"not filtered: {sum(short)} samples in {len(short)} runs too short for it")
     return out
 
 
-def _step(time_s: NDArray[np.float64]) -> float:
+def _step(time_s: Curve) -> float:
     """Time from sample to sample [s]: the mean over a few dozen, so that it is true of stamps that come in
     bursts, and the median of those means, so that holes in the record don't count."""
     across = min(_ACROSS, max(len(time_s) // 4, 1))
     return float(np.median(time_s[across:] - time_s[:-across])) / across
 
 
-def runs(time_s: NDArray[np.float64], good: NDArray[np.bool_], gap_s: float) -> list[NDArray[np.intp]]:
+def runs(time_s: Curve, good: NDArray[np.bool_], gap_s: float) -> list[NDArray[np.intp]]:
     """Indices of good samples, split where more than `gap_s` lies between neighbours."""
     where = np.flatnonzero(good)
     if len(where) == 0:
@@ -170,7 +156,7 @@ def runs(time_s: NDArray[np.float64], good: NDArray[np.bool_], gap_s: float) -> 
     return list(np.split(where, np.flatnonzero(np.diff(time_s[where]) > gap_s) + 1))
 
 
-def _floor(time_s: NDArray[np.float64], values: NDArray[np.float64], sensor: SensorMeta) -> float:
+def _floor(time_s: Curve, values: Curve, sensor: SensorMeta) -> float:
     spreads = []
     for start, stop in sensor.free_s:
         inside = values[(time_s >= start) & (time_s <= stop)]

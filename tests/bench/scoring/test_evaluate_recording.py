@@ -10,7 +10,7 @@ import pytest
 from fake_recording import Maker, scored
 
 from bench.scoring import metrics, report
-from bench.scoring.result import write_json
+from bench.scoring.score import write_result
 
 
 @pytest.mark.parametrize("footage", ["png", "mp4"])
@@ -43,11 +43,10 @@ def test_sensor_gap_is_not_scored(make: Maker) -> None:
 
 def test_json_has_no_nan_and_the_page_stands_alone(make: Maker, tmp_path: Path) -> None:
     result = scored(make(frames=12))
-    write_json(result, tmp_path / "score.json")
+    write_result(result, tmp_path, "")
     tree = json.loads((tmp_path / "score.json").read_text(), parse_constant=lambda name: pytest.fail(name))
     assert tree["scores"]["n"] == 12
     assert len(tree["curve"]["predicted_mn"]["bump"]) == 12
-    report.write_report(result, tmp_path / "report.html")
     page = (tmp_path / "report.html").read_text()
     assert page.count("<svg") == 4
     for outside in ('src="http', "src='http", 'href="http', "@import"):
