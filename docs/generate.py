@@ -20,7 +20,7 @@ from pydantic import BaseModel
 
 from bench.recording.meta import Meta
 from synth.dataset.size_forecast import amount, field_bytes
-from synth.fields import FIELDS, KEPT, TIME
+from synth.fields import FIELDS, STORED_WHEN, TIME
 from synth.job import writer
 from synth.job.schema import Job
 from synth.system.config_file import section_of
@@ -69,7 +69,7 @@ def fields_page() -> str:
     for field in FIELDS.values():
         per = "" if TIME in field.dims else " a sequence"
         sizes = " | ".join(f"{amount(size)}{per}" for size in field_bytes(field, 1, (480, 640)))
-        about = (", ".join(field.dims), field.dtype, field.unit, KEPT[field.kept])
+        about = (", ".join(field.dims), field.dtype, field.unit, STORED_WHEN[field.stored])
         words = (f"`{field.name}`", *about, sizes, field.meaning)
         lines.append(f"| {' | '.join(words)} |")
     return _FIELDS_HEAD + "\n".join(lines) + "\n"

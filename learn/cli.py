@@ -376,18 +376,18 @@ def models_command(json: Json = False) -> None:
     """List the networks that come with this version."""
     from learn.checkpoint import read_card
     from learn.inference.shipped import NONE, describe, hash_data, shipped
-    from synth.system.cache import size_bytes
+    from synth.system.checked_file import folder_bytes
 
     found = {name: (folder, read_card(folder)) for name, folder in shipped().items()}
     if json:
         rows = [
-            {"name": name, "folder": str(folder), "bytes": size_bytes(folder), "data": hash_data(card)}
+            {"name": name, "folder": str(folder), "bytes": folder_bytes(folder), "data": hash_data(card)}
             | {"eyes": 2 if card.settings.arch.depth else 1, "select_r2": card.score}
             for name, (folder, card) in found.items()
         ]
         print(json_.dumps(rows))
         return
     for name, (folder, card) in found.items():
-        print(f"{name}: {describe(card)}, {size_bytes(folder) / 1e6:.1f} MB ({folder / 'README.md'})")
+        print(f"{name}: {describe(card)}, {folder_bytes(folder) / 1e6:.1f} MB ({folder / 'README.md'})")
     if not found:
         print(NONE)

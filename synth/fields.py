@@ -26,8 +26,8 @@ class Field:
     unit: str
     meaning: str
     length: int = 0
-    kept: Literal["always", "usually", "recovered", "stereo", "stereo recovered", "asked"] = "always"
-    """When a sequence has it, see `KEPT`."""
+    stored: Literal["always", "usually", "recovered", "stereo", "stereo recovered", "asked"] = "always"
+    """When a sequence has it, see `STORED_WHEN`."""
     half: bool = False
     """Whether `store.flow: float16` stores it in half the space."""
     packed: float = 0.1
@@ -45,7 +45,7 @@ class Field:
     @property
     def optional(self) -> bool:
         """Whether a sequence of the default job may lack it."""
-        return self.kept not in ("always", "usually")
+        return self.stored not in ("always", "usually")
 
     def shape(self, frames: int, size: tuple[int, int]) -> tuple[int, ...]:
         """Shape for `frames` frames of `size` = (height, width) [px]."""
@@ -53,7 +53,7 @@ class Field:
         return tuple(lengths.get(dim, self.length) for dim in self.dims)
 
 
-KEPT = {
+STORED_WHEN = {
     "always": "always",
     "usually": "unless in `store.without`",
     "recovered": "with an estimator of flow",
@@ -61,7 +61,7 @@ KEPT = {
     "stereo recovered": "with both of these",
     "asked": "if in `store.extra`",
 }
-"""What each value of `Field.kept` means."""
+"""What each value of `Field.stored` means."""
 
 _STILL = (ROW, COLUMN)
 _VIDEO = (TIME, ROW, COLUMN)
@@ -92,7 +92,7 @@ _TABLE = (
           packed=0.01),
     Field("depth", _VIDEO, "float32", "mm",
           "distance along the optical axis; 0 where nothing is hit",
-          kept="usually", packed=0.44, low=0.0),
+          stored="usually", packed=0.44, low=0.0),
     Field("traction", (*_VIDEO, "xyz"), "float32", "kPa",
           "load on the tissue per rest area, camera axes, on the rest frame's pixels",
           length=3, packed=0.025, low=-1e4, high=1e4),
@@ -104,57 +104,57 @@ _TABLE = (
           length=3, packed=3.5, low=-1e6, high=1e6),
     Field("flow_recovered", (*_VIDEO, "xy"), "float32", "px",
           "flow recovered from the video by the estimator in the attribute flow_backend",
-          length=2, kept="recovered", half=True, packed=0.33, low=-1e4, high=1e4),
+          length=2, stored="recovered", half=True, packed=0.33, low=-1e4, high=1e4),
     Field("flow_confidence", _VIDEO, "float32", "-",
           "the estimator's confidence in the recovered flow, 0..1",
-          kept="recovered", packed=0.24, low=0.0, high=1.0),
+          stored="recovered", packed=0.24, low=0.0, high=1.0),
     Field("flow_noisy", (*_VIDEO, "xy"), "float32", "px",
           "the true motion with the published method's noise, as the job's labels ask",
-          length=2, kept="asked", packed=0.45, low=-1e4, high=1e4),
+          length=2, stored="asked", packed=0.45, low=-1e4, high=1e4),
     Field("intensity", _VIDEO, "float32", "mN",
           "the published method's label: size of the load, scaled to peak at the total force, with "
           "noise as the job's labels ask; on the rest frame's pixels",
-          kept="asked", packed=0.1, low=0.0),
+          stored="asked", packed=0.1, low=0.0),
     Field("flow_next", (*_VIDEO, "xy"), "float32", "px",
           "true motion from this frame to the next, on this frame's pixels; 0 off tissue, and at the "
           "end",
-          length=2, kept="asked", half=True, packed=0.4, low=-1e4, high=1e4),
+          length=2, stored="asked", half=True, packed=0.4, low=-1e4, high=1e4),
     Field("normals", (*_VIDEO, "xyz"), "float32", "-",
           "unit normal of what this frame's pixel sees, camera axes; 0 where nothing is hit",
-          length=3, kept="asked", packed=0.6, low=-1.001, high=1.001),
+          length=3, stored="asked", packed=0.6, low=-1.001, high=1.001),
     Field("blur", _VIDEO, "float32", "px",
           "radius of the circle of confusion of what this frame's pixel sees; 0 where nothing is hit",
-          kept="asked", packed=0.5, low=0.0),
+          stored="asked", packed=0.5, low=0.0),
     Field("camera", (TIME, "to", "from"), "float64", "mm",
           "world axes (homogeneous) to this frame's camera axes",
-          length=4, kept="asked"),
+          length=4, stored="asked"),
     Field("rgb_right", (*_VIDEO, "rgb"), "uint8", "sRGB",
           "picture of the second lens of a stereo pair, render.stereo_mm to the right",
-          length=3, kept="stereo", packed=1.0),
+          length=3, stored="stereo", packed=1.0),
     Field("flow_right", (*_VIDEO, "xy"), "float32", "px",
           "as flow, in the second lens's pictures; 0 outside tissue",
-          length=2, kept="stereo", half=True, packed=0.4, low=-1e4, high=1e4),
+          length=2, stored="stereo", half=True, packed=0.4, low=-1e4, high=1e4),
     Field("visible_right", _VIDEO, "bool", "-",
           "as visible, in those pictures",
-          kept="stereo"),
+          stored="stereo"),
     Field("depth_right", _VIDEO, "float32", "mm",
           "as depth, in the second lens's pictures",
-          kept="stereo", packed=0.6, low=0.0),
+          stored="stereo", packed=0.6, low=0.0),
     Field("motion", (*_VIDEO, "xyz"), "float32", "mm",
           "true motion of the material points from the rest frame to this one, camera axes (each "
           "frame's own), on the rest frame's pixels; 0 outside tissue",
-          length=3, kept="stereo", packed=0.25, low=-1e4, high=1e4),
+          length=3, stored="stereo", packed=0.25, low=-1e4, high=1e4),
     Field("disparity", _STILL, "float32", "px",
           "column of a rest pixel's point in the left eye less that in the right, without distortion: "
           "K[0,0] B / depth - (K_right[0,2] - K[0,2]); 0 outside tissue",
-          kept="stereo", packed=0.6, low=-1e4, high=1e4),
+          stored="stereo", packed=0.6, low=-1e4, high=1e4),
     Field("motion_recovered", (*_VIDEO, "xyz"), "float32", "mm",
           "motion recovered from both eyes' videos as the job's flow.stereo says, camera axes",
-          length=3, kept="stereo recovered", packed=0.7, low=-1e4, high=1e4),
+          length=3, stored="stereo recovered", packed=0.7, low=-1e4, high=1e4),
     Field("motion_deviation", (*_VIDEO, "xyz"), "float32", "mm",
           "standard deviation of each component of motion_recovered, estimated with it; 0 outside "
           "tissue",
-          length=3, kept="stereo recovered", packed=0.7, low=0.0),
+          length=3, stored="stereo recovered", packed=0.7, low=0.0),
 )
 # fmt: on
 
@@ -163,14 +163,14 @@ FIELDS: dict[str, Field] = {field.name: field for field in _TABLE}
 
 _RIGHT = ("rgb_right", "flow_right", "visible_right", "depth_right")
 
-EXTRA = tuple(name for name, field in FIELDS.items() if field.kept == "asked" or name in _RIGHT)
+EXTRA = tuple(name for name, field in FIELDS.items() if field.stored == "asked" or name in _RIGHT)
 """What a job's `store.extra` may name; the second lens's, once asked for one by one, come with it."""
 
 SPARED = ("depth", "flow_confidence", "flow_right", "visible_right", "depth_right")
 """What a job's `store.without` may name: nothing else can be computed without the rest."""
 
 
-def kept(
+def stored_fields(
     extra: Iterable[str], without: Iterable[str], *, recovered: bool, stereo: bool = False
 ) -> tuple[str, ...]:
     """Names of the fields that a sequence holds, in the table's order.
@@ -183,5 +183,5 @@ def kept(
     """
     conditions = {"recovered": recovered, "stereo": stereo, "stereo recovered": stereo and recovered}
     kinds = {"always", "usually", *(kind for kind, holds in conditions.items() if holds)}
-    chosen = {name for name, field in FIELDS.items() if field.kept in kinds} | set(extra)
+    chosen = {name for name, field in FIELDS.items() if field.stored in kinds} | set(extra)
     return tuple(name for name in FIELDS if name in chosen - set(without))

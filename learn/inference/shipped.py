@@ -11,8 +11,7 @@ from learn import checkpoint
 from learn.checkpoint import ModelCard
 from synth.errors import UserError
 from synth.job import identity
-from synth.system.cache import size_bytes
-from synth.system.checked_file import write_whole
+from synth.system.checked_file import folder_bytes, write_whole
 
 MODELS = Path(__file__).parents[1] / "models"
 NAMES = ("mono", "stereo")
@@ -69,7 +68,7 @@ def pack_model(
     shutil.rmtree(folder, ignore_errors=True)
     card = checkpoint.write_model(folder, card, net.state_dict(), safe=True)
     write_whole(folder / "README.md", _readme(folder.name, card, commit, metrics, limits).encode())
-    size = size_bytes(folder)
+    size = folder_bytes(folder)
     if size > LARGEST_BYTES:
         shutil.rmtree(folder)
         raise UserError(

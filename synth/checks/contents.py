@@ -36,7 +36,7 @@ def schema(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
             yield truth(found.attrs == known, f"{field.name}: unit or meaning was edited")
             yield truth(found.dims == field.dims, f"{field.name}: axes were edited")
         else:
-            yield truth(field.kept != "always", f"{field.name} is missing")
+            yield truth(field.stored != "always", f"{field.name} is missing")
 
 
 def check_values(

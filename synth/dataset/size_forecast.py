@@ -11,8 +11,9 @@ import numpy as np
 
 from synth.dataset import location
 from synth.errors import UserError
-from synth.fields import FIELDS, KEPT, Field
+from synth.fields import FIELDS, STORED_WHEN, Field
 from synth.job.schema import Job
+from synth.system.checked_file import folder_bytes
 from synth.system.text_lines import hang
 
 # An estimate from the field table is this much too high, lest a run be started that cannot end.
@@ -50,7 +51,7 @@ def forecast_rest(
         cpu_s: processor time of one [s], if it is known.
     """
     some = pilot(done)
-    each = np.mean([size(location.store(root, key)) for key in some]) if some else estimate(job)
+    each = np.mean([folder_bytes(location.store(root, key)) for key in some]) if some else estimate(job)
     return Forecast(todo, float(each) * todo, None if cpu_s is None else cpu_s * todo, len(some))
 
 
@@ -79,7 +80,8 @@ def describe_fields() -> Iterator[str]:
     for field in FIELDS.values():
         stored = amount(field_bytes(field, 1, (480, 640))[1])
         axes = ", ".join(field.dims)
-        yield f"{field.name}: {axes}, {field.dtype}, {field.unit}, {stored} on disk, {KEPT[field.kept]}"
+        when = STORED_WHEN[field.stored]
+        yield f"{field.name}: {axes}, {field.dtype}, {field.unit}, {stored} on disk, {when}"
         yield from hang("    ", field.meaning)
 
 
@@ -88,7 +90,7 @@ def estimate(job: Job) -> float:
     width, height = job.render.size
     half = job.store.flow == "float16"
     total = sum(
-        field_bytes(FIELDS[name], job.frames, (height, width), half=half)[1] for name in job.kept_fields
+        field_bytes(FIELDS[name], job.frames, (height, width), half=half)[1] for name in job.stored_fields
     )
     radiance = 6.0 * width * height * job.frames if job.render.exr else 0.0
     return _MARGIN * (total + radiance)
@@ -116,11 +118,6 @@ def refuse_if_too_long(job: Job, worker_bytes: int | None, workers: int) -> None
             f"a sequence of {job.frames} frames takes about {amount(needed)} of memory and each of {workers} "
             f"workers has {amount(worker_bytes)}: fewer frames (frames=), a smaller render.size{fewer}"
         )
-
-
-def size(path: Path) -> int:
-    """Bytes of all files under `path`."""
-    return sum(file.stat().st_size for file in path.rglob("*") if file.is_file())
 
 
 def refuse_if_too_large(forecast: Forecast, root: Path) -> None:

@@ -53,7 +53,7 @@ class Writer:
                 shutil.rmtree(stale)
         self._group = zarr.create_group(str(self._part), zarr_format=3)
         self._writers: dict[str, _FieldWriter] = {}
-        self._wanted = job.kept_fields
+        self._wanted = job.stored_fields
         self._half = job.store.flow == "float16"
         self._exr_hash = hashlib.blake2b(digest_size=16)
         self._exr_frames = 0

@@ -200,9 +200,9 @@ class Job(Section):
 
     @model_validator(mode="after")
     def _second_lens_exists(self) -> Job:
-        asked = [name for name in self.store.extra if name.endswith("_right")]
-        if asked and self.render.stereo_mm == 0:
-            raise ValueError(f"store.extra: {asked[0]} needs a second lens; set render.stereo_mm")
+        right = [name for name in self.store.extra if name.endswith("_right")]
+        if right and self.render.stereo_mm == 0:
+            raise ValueError(f"store.extra: {right[0]} needs a second lens; set render.stereo_mm")
         return self
 
     @model_validator(mode="after")
@@ -218,9 +218,9 @@ class Job(Section):
         return self
 
     @property
-    def kept_fields(self) -> tuple[str, ...]:
+    def stored_fields(self) -> tuple[str, ...]:
         """Names of the fields that its sequences hold."""
-        return fields.kept(
+        return fields.stored_fields(
             self.store.extra,
             self.store.without,
             recovered=self.flow.backend != "ideal",

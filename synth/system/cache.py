@@ -23,10 +23,10 @@ def folder(name: str) -> Path:
         OSError: nothing can be written, or the temporary folder is one that others made or may write to: what
             is kept here is code that will be run.
     """
-    told, home = os.environ.get("XDG_CACHE_HOME"), os.environ.get("HOME")
+    user, home = os.environ.get("XDG_CACHE_HOME"), os.environ.get("HOME")
     places = [
         Path(os.environ["SULCUS_CACHE"]) if "SULCUS_CACHE" in os.environ else None,
-        Path(told) / "sulcus" if told else Path(home) / ".cache" / "sulcus" if home else None,
+        Path(user) / "sulcus" if user else Path(home) / ".cache" / "sulcus" if home else None,
     ]
     for place in filter(None, places):
         try:
@@ -42,8 +42,3 @@ def folder(name: str) -> Path:
         raise PermissionError(f"{mine}: is not this user's alone")
     (mine / name).mkdir(exist_ok=True)
     return mine / name
-
-
-def size_bytes(place: Path) -> int:
-    """What the files in a folder take on disk."""
-    return sum(file.stat().st_size for file in place.rglob("*") if file.is_file())

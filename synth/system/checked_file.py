@@ -190,6 +190,11 @@ def plain_yaml(value: Any, label: str) -> Any:
     raise UserError(f"{label}: a {type(value).__name__} of a kind or size that is not read")
 
 
+def folder_bytes(path: Path) -> int:
+    """What the files under a folder take on disk."""
+    return sum(file.stat().st_size for file in path.rglob("*") if file.is_file())
+
+
 def write_whole(path: Path, text: str | bytes, *, durable: bool = True) -> None:
     """Writes a small file so that it is there in full or not at all; `durable`: after a power failure too."""
     with part_of(path) as part, part.open("wb") as file:

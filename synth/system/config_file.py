@@ -200,8 +200,8 @@ def dotted(at: Loc) -> str:
 
 def _trimmed(loc: Loc) -> Loc:
     """The place without the names that pydantic adds for validators and unions."""
-    kept = tuple(step for step in loc if isinstance(step, int) or not re.fullmatch(r"[\w-]+\[.*\]", step))
-    return kept or loc  # a key may look so too
+    own = tuple(step for step in loc if isinstance(step, int) or not re.fullmatch(r"[\w-]+\[.*\]", step))
+    return own or loc  # a key may look so too
 
 
 def _short(value: Any) -> str:

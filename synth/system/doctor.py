@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from synth.system import cache, llvm, packages
+from synth.system.checked_file import folder_bytes
 from synth.system.text_lines import hang
 
 _LEAST_FREE_GB = 5.0
@@ -94,7 +95,7 @@ def _kernels() -> Diagnosis:
         place = cache.folder("kernels")
     except OSError as error:
         return Diagnosis("compiled kernels", f"not kept ({error})", False, "set SULCUS_CACHE to a folder")
-    size_mb, limit_mb = cache.size_bytes(place) / 1e6, cache.LIMIT_BYTES / 1e6
+    size_mb, limit_mb = folder_bytes(place) / 1e6, cache.LIMIT_BYTES / 1e6
     return Diagnosis("compiled kernels", f"{size_mb:.0f} MB of at most {limit_mb:.0f} in {place}")
 
 

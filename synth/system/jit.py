@@ -36,11 +36,11 @@ def _compile(function: F, **how: str) -> F:
     try:
         return numba.njit(cache=True, nogil=True, **how)(function)  # type: ignore[no-any-return]
     except RuntimeError:  # no folder to write to: read-only installation without a home
-        told = numba.config.CACHE_DIR
+        before = numba.config.CACHE_DIR
     try:
         numba.config.CACHE_DIR = str(cache.folder("loops"))
         return numba.njit(cache=True, nogil=True, **how)(function)  # type: ignore[no-any-return]
     except (RuntimeError, OSError):  # nor a temporary one, or a disk that is full
         return numba.njit(nogil=True, **how)(function)  # type: ignore[no-any-return]
     finally:
-        numba.config.CACHE_DIR = told
+        numba.config.CACHE_DIR = before

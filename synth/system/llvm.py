@@ -29,12 +29,12 @@ def find() -> str | None:
     """Path of a libLLVM that the fast renderer works with here, or None.
 
     `DRJIT_LIBLLVM_PATH` is tried first and alone if it is set; then what the linker knows and the usual
-    folders, newest version first. Each is probed in a subprocess, and the answer kept for the process.
+    folders, newest version first. Each is probed in a subprocess, and the answer remembered for the process.
     `SULCUS_LLVM` (a path, or empty for none) hands a worker what its parent found.
     """
-    told = os.environ.get("SULCUS_LLVM")
-    if told is not None:  # a parent process has looked already
-        return told or None
+    given = os.environ.get("SULCUS_LLVM")
+    if given is not None:  # a parent process has looked already
+        return given or None
     named = os.environ.get("DRJIT_LIBLLVM_PATH")
     tried = [named] if named else candidates()
     return next((path for path in tried if probe(path)), None)

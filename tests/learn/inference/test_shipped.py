@@ -15,7 +15,7 @@ from learn import checkpoint
 from learn.cli import app
 from learn.inference import shipped
 from synth.errors import UserError
-from synth.system.cache import size_bytes
+from synth.system.checked_file import folder_bytes
 
 run = CliRunner().invoke
 
@@ -47,7 +47,7 @@ def test_what_is_packed_is_the_model(models: Path) -> None:
     assert before.keys() == after.keys()
     assert all(np.array_equal(before[name], after[name]) for name in before)
     (row,) = json.loads(run(app, ["models", "--json"]).stdout)
-    assert (row["name"], row["eyes"], row["bytes"]) == ("mono", 1, size_bytes(folder))
+    assert (row["name"], row["eyes"], row["bytes"]) == ("mono", 1, folder_bytes(folder))
 
 
 def test_damage_is_found(models: Path) -> None:
@@ -64,7 +64,7 @@ def test_what_lies_there_is_small_whole_and_told_of(name: str) -> None:
     if name not in shipped.shipped():
         pytest.skip("none comes with this version")
     folder = shipped.MODELS / name
-    assert size_bytes(folder) <= shipped.LARGEST_BYTES == 4_000_000
+    assert folder_bytes(folder) <= shipped.LARGEST_BYTES == 4_000_000
     card = learn.load_model(name).card
     assert card.settings.arch.depth == (name == "stereo")
     page = (folder / "README.md").read_text()
