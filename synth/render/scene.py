@@ -218,11 +218,10 @@ class Renderer:
 
     def move(self, stage: Stage, state: SceneState) -> None:
         """Puts everything in a stage where it is in another state."""
-        stage.move("cortex", state.vertices, self._film(state))
+        stage.move("cortex", state.vertices, film=self._film(state))
         if self._tool.parts:
             steel = self._steel(state)
-            stage.move("tool", steel.vertices)
-            stage.mirror("tool", self._mirrored(steel))
+            stage.move("tool", steel.vertices, glow=self._mirrored(steel))
 
     def develop(self, radiance: Map, seed: int) -> npt.NDArray[np.uint8]:
         """The recorded picture (H, W, 3) of a radiance (H, W, 3)."""

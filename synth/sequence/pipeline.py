@@ -26,14 +26,14 @@ from synth.system.stopwatch import StageCallback, Stopwatch
 
 # Fields that the renderer gives by frame, and of a second lens; those of `store.extra` are attributes of its
 # `RenderedFrame` as well, but for the published method's.
-_SHOT = ("rgb", "flow", "visible", "tool", "glare", "depth")
+_RENDERED = ("rgb", "flow", "visible", "tool", "glare", "depth")
 _STEREO = ("rgb_right", "flow_right", "visible_right", "depth_right", "motion")
 _PUBLISHED = ("flow_noisy", "intensity")
 
 
 @dataclass(frozen=True)
-class _Shooting:
-    """A sequence about to be rendered: what all later stages share."""
+class _Task:
+    """A sequence that is being rendered: what all stages share."""
 
     scene: Scene
     writer: Writer
@@ -97,19 +97,19 @@ def write_scene(
     if studio.right is not None:
         writer.put("disparity", studio.disparity())
 
-    shooting = _Shooting(scene, writer, watch, report)
-    film = _render_frames(shooting)
-    film = _write_video(shooting, film)
+    task = _Task(scene, writer, watch, report)
+    film = _render_frames(task)
+    film = _write_video(task, film)
     if job.flow.backend != "ideal":
-        recovered = _recover_flow(shooting, film)
+        recovered = _recover_flow(task, film)
         if writer.wants("motion_recovered"):
-            _recover_motion(shooting, film, recovered)
-    return _seal(shooting)
+            _recover_motion(task, film, recovered)
+    return _seal(task)
 
 
-def _render_frames(shooting: _Shooting) -> _Film:
+def _render_frames(task: _Task) -> _Film:
     """Renders every frame and writes its fields, but for video that a codec must see whole."""
-    job, scene, writer = shooting.job, shooting.scene, shooting.writer
+    job, scene, writer = task.job, task.scene, task.writer
     width, height = job.render.size
     labels = None
     if set(_PUBLISHED) & set(job.store.extra):
@@ -117,7 +117,7 @@ def _render_frames(shooting: _Shooting) -> _Film:
         labels = Published.begin(job.labels, scene.tissue, job.frames, rng)
     names = [
         name
-        for name in dict.fromkeys((*_SHOT, *(_STEREO if job.render.stereo_mm else ()), *job.store.extra))
+        for name in dict.fromkeys((*_RENDERED, *(_STEREO if job.render.stereo_mm else ()), *job.store.extra))
         if FIELDS[name].framed and not (_coded(job) and name.startswith("rgb"))
     ]
     rgb = np.empty((job.frames, height, width, 3), np.uint8)
@@ -126,29 +126,29 @@ def _render_frames(shooting: _Shooting) -> _Film:
     tools_right = None if rgb_right is None else np.empty_like(tools)
     poses = np.tile(np.eye(4), (job.frames, 1, 1))
     for t in range(job.frames):
-        shooting.report("render", t, job.frames)
-        with shooting.watch.stage("render"):
-            shot = scene.frame(t)
-        with shooting.watch.stage("store"):
-            made = labels.frame(t, shot.flow, shot.traction, scene.motion.force[t]) if labels else {}
+        task.report("render", t, job.frames)
+        with task.watch.stage("render"):
+            frame = scene.frame(t)
+        with task.watch.stage("store"):
+            made = labels.frame(t, frame.flow, frame.traction, scene.motion.force[t]) if labels else {}
             for name in names:
-                writer.put_frame(name, t, made[name] if name in made else getattr(shot, name))
-            writer.put_frame("traction", t, shot.traction)
+                writer.put_frame(name, t, made[name] if name in made else getattr(frame, name))
+            writer.put_frame("traction", t, frame.traction)
             if job.render.exr:
-                writer.put_exr(t, shot.radiance)
-        rgb[t], tools[t] = shot.rgb, shot.tool
-        if rgb_right is not None and shot.rgb_right is not None:
-            rgb_right[t] = shot.rgb_right
-        if tools_right is not None and shot.tool_right is not None:
-            tools_right[t] = shot.tool_right
-        poses[t, :3, :3], poses[t, :3, 3] = shot.camera.rotation, shot.camera.translation
+                writer.put_exr(t, frame.radiance)
+        rgb[t], tools[t] = frame.rgb, frame.tool
+        if rgb_right is not None and frame.rgb_right is not None:
+            rgb_right[t] = frame.rgb_right
+        if tools_right is not None and frame.tool_right is not None:
+            tools_right[t] = frame.tool_right
+        poses[t, :3, :3], poses[t, :3, 3] = frame.camera.rotation, frame.camera.translation
     return _Film(rgb, rgb_right, tools, tools_right, poses)
 
 
-def _write_video(shooting: _Shooting, film: _Film) -> _Film:
+def _write_video(task: _Task, film: _Film) -> _Film:
     """Writes the cameras' poses, and video through its codec if it has one; returns the film as kept."""
-    job, writer, rgb, rgb_right = shooting.job, shooting.writer, film.rgb, film.rgb_right
-    with shooting.watch.stage("store"):
+    job, writer, rgb, rgb_right = task.job, task.writer, film.rgb, film.rgb_right
+    with task.watch.stage("store"):
         writer.put("camera", film.poses)
         if _coded(job):
             rgb = video_link.recorded(rgb, job.sensor, job.fps)
@@ -164,31 +164,31 @@ def _coded(job: Job) -> bool:
     return job.sensor.bitrate_mbps is not None
 
 
-def _recover_flow(shooting: _Shooting, film: _Film) -> Track:
+def _recover_flow(task: _Task, film: _Film) -> Track:
     """Follows the video with the job's estimator and writes what it finds.
 
     It has what a real pipeline has: the tool's outline, and glare as the picture shows it.
     """
-    job, writer = shooting.job, shooting.writer
-    shooting.report("flow", 0, job.frames)
-    with shooting.watch.stage("flow"):
-        tissue = shooting.scene.tissue
+    job, writer = task.job, task.writer
+    task.report("flow", 0, job.frames)
+    with task.watch.stage("flow"):
+        tissue = task.scene.tissue
         recovered = track.recover_flow(film.rgb, film.tools, tissue, estimator(job.flow))
-    with shooting.watch.stage("store"):
+    with task.watch.stage("store"):
         for t in range(job.frames):
             writer.put_frame("flow_recovered", t, recovered.flow[t])
             writer.put_frame("flow_confidence", t, recovered.confidence[t])
     return recovered
 
 
-def _recover_motion(shooting: _Shooting, film: _Film, left: Track) -> None:
+def _recover_motion(task: _Task, film: _Film, left: Track) -> None:
     """Adds the right eye to the left one's flow and writes motion in three dimensions, frame by frame."""
-    job, writer, scene = shooting.job, shooting.writer, shooting.scene
+    job, writer, scene = task.job, task.writer, task.scene
     studio = scene.renderer
     if film.rgb_right is None or film.tools_right is None or studio.right is None:
         raise ValueError("there is no second lens")
     blocked = mask.hidden(film.rgb, film.tools), mask.hidden(film.rgb_right, film.tools_right)
-    with shooting.watch.stage("stereo"):
+    with task.watch.stage("stereo"):
         pair = rig.StereoRig(
             left=rig.Eye(scene.view.K, scene.view.distortion),
             right=rig.Eye(studio.right.K, studio.right.distortion),
@@ -200,27 +200,27 @@ def _recover_motion(shooting: _Shooting, film: _Film, left: Track) -> None:
         eyes = film.rgb[:still], film.rgb_right[:still]
         tracker = stereo.StereoTracker(pair, *eyes, blocked[0][0], blocked[1][0], studio.rest.tissue)
     for t in range(job.frames):
-        shooting.report("stereo", t, job.frames)
-        with shooting.watch.stage("stereo"):
+        task.report("stereo", t, job.frames)
+        with task.watch.stage("stereo"):
             seen = left.flow[t], left.confidence[t]
             if t == 0:
                 moved = stereo.Moved.nothing(scene.tissue.shape)
             else:
                 eyes = film.rgb[t], film.rgb_right[t]
                 moved = tracker.step(*eyes, blocked[0][t], blocked[1][t], *seen)
-        with shooting.watch.stage("store"):
+        with task.watch.stage("store"):
             writer.put_frame("motion_recovered", t, moved.motion)
             writer.put_frame("motion_deviation", t, moved.deviation)
 
 
-def _seal(shooting: _Shooting) -> Path:
+def _seal(task: _Task) -> Path:
     """Seals the store with what was drawn and measured as its attributes; returns its path."""
-    scene = shooting.scene
+    scene = task.scene
     case, view = scene.scenario, scene.view
-    return shooting.writer.seal(
+    return task.writer.seal(
         scenario=case.as_dict(),
-        anatomy_id=identity.identify_anatomy(shooting.job, case.relief.seed),
-        **_opening(shooting.job, case),
+        anatomy_id=identity.identify_anatomy(task.job, case.relief.seed),
+        **_opening(task.job, case),
         K=view.K.tolist(),
         distortion=view.distortion.tolist(),
         rotation=view.rotation.tolist(),
@@ -228,10 +228,10 @@ def _seal(shooting: _Shooting) -> Path:
         scale_mm_per_px=scene.scale_mm_per_px,
         young_kpa=case.tissue.young_kpa,
         poisson=case.tissue.poisson,
-        mechanics=mechanics.describe(shooting.job, case, scene.motion, view.rotation),
+        mechanics=mechanics.describe(task.job, case, scene.motion, view.rotation),
         variant=scene.renderer.variant,
-        timings=shooting.watch.report(),
-        **_second_lens(shooting),
+        timings=task.watch.report(),
+        **_second_lens(task),
     )
 
 
@@ -241,14 +241,14 @@ def _opening(job: Job, case: Scenario) -> dict[str, Any]:
     return {} if named is None else {"opening_id": named}
 
 
-def _second_lens(shooting: _Shooting) -> dict[str, Any]:
+def _second_lens(task: _Task) -> dict[str, Any]:
     """The attribute `right` of a stereo sequence: K, distortion and pose of the second lens at rest."""
-    lens = shooting.scene.renderer.right
+    lens = task.scene.renderer.right
     if lens is None:
         return {}
     return {
         "right": {
-            "baseline_mm": shooting.job.render.stereo_mm,
+            "baseline_mm": task.job.render.stereo_mm,
             "K": lens.K.tolist(),
             "distortion": lens.distortion.tolist(),
             "rotation": lens.rotation.tolist(),

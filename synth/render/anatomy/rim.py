@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -165,21 +166,9 @@ def paint(rim: Rim, look: Look, pixels: int) -> Coat:
     )
 
 
-def _paint_rows(
-    rim: Rim,
-    look: Look,
-    across: Map,
-    x: Map,
-    y: Map,
-    wide: Map,
-    mid: Map,
-    fine: Map,
-    swell: Map,
-    distance: Map,
-    radius: Map,
-    *cotton: Map,
-) -> tuple[Map, Map, Map]:
+def _paint_rows(rim: Rim, look: Look, across: Map, *maps: Map) -> tuple[Map, Map, Map]:
     """Colour (r, n, 3), bumps mm and share without a film (r, n) of some rows at x, y mm, of noise (r, n)."""
+    x, y, wide, mid, fine, swell, distance, radius, *cotton = maps
     angle = np.arctan2(y, x)
     away = (np.hypot(x, y) - _round(rim.edge, angle)).astype(np.float32)
     fibres = _streaks(across, angle, away, float(rim.edge.mean()))
@@ -216,27 +205,13 @@ def _paint_rows(
     dry = np.clip(0.55 + 0.3 * wide - 0.8 * blood, 0.02, 1)
     if len(rim.cloth):
         colour, bumps, dry = _draped(look, away - _round(rim.cloth, angle), mid, fine, colour, bumps, dry)
-    colour, bumps = _topped(rim, look, cotton, (x, y), (angle, away), colour, bumps)
+    threads = _threads(rim, angle, away)
+    colour = colour + threads[..., None] * (np.array([0.025, 0.025, 0.035], np.float32) - colour)
+    bumps = bumps + np.float32(0.08) * threads
+    for patty in rim.cotton:
+        colour, bumps = _cotton(cotton, patty, colour, bumps, x, y, look.blood)
     colour = np.clip(colour, 0.006, 0.92).astype(np.float32)
     return colour, np.asarray(bumps, np.float32), np.asarray(dry, np.float32)
-
-
-def _topped(
-    rim: Rim,
-    look: Look,
-    cotton: tuple[Map, ...],
-    place: tuple[Map, Map],
-    polar: tuple[Map, Map],
-    colour: Map,
-    bumps: Map,
-) -> tuple[Map, Map]:
-    """Colour and bumps with stitches and patties on top, at x, y mm and angle, mm from the edge."""
-    thread, ridge = _threads(rim, *polar)
-    colour = colour + thread[..., None] * (np.array([0.025, 0.025, 0.035], np.float32) - colour)
-    bumps = bumps + ridge
-    for patty in rim.cotton:
-        colour, bumps = _cotton(cotton, patty, colour, bumps, *place, look.blood)
-    return colour, bumps
 
 
 def _bone(beyond: Map, past: Map, mid: Map, fine: Map) -> Map:
@@ -267,8 +242,8 @@ def _draped(
     )
 
 
-def _threads(rim: Rim, angle: Map, away: Map) -> tuple[Map, Map]:
-    """Share covered by the stitches' threads, and their height mm: two strands from each, meeting far out."""
+def _threads(rim: Rim, angle: Map, away: Map) -> Map:
+    """Share covered by the stitches' threads: two strands from each, meeting far out."""
     covered = np.zeros_like(away)
     mean = float(rim.edge.mean())
     for stitch in rim.stitches:
@@ -277,7 +252,7 @@ def _threads(rim: Rim, angle: Map, away: Map) -> tuple[Map, Map]:
         apart = 0.42 * np.sqrt(np.clip((away - 0.9) / 0.7, 0, 1)) * np.clip(1 - (away - 1.0) / 12.0, 0, 1)
         line = np.where(away > 0.9, np.abs(np.abs(aside) - apart), 9.0)
         covered = np.maximum(covered, _step((_THREAD_MM - line) / 0.06 + 0.2))
-    return np.asarray(covered, np.float32), np.asarray(0.08 * covered, np.float32)
+    return np.asarray(covered, np.float32)
 
 
 def shade(rim: Rim, extent_mm: float) -> Map:
@@ -329,7 +304,7 @@ def _outside(patty: Patty, along: Floats, across: Floats) -> Map:
 
 
 def _cotton(
-    drawn: tuple[Map, ...], patty: Patty, colour: Map, bumps: Map, x: Map, y: Map, blood: float
+    drawn: Sequence[Map], patty: Patty, colour: Map, bumps: Map, x: Map, y: Map, blood: float
 ) -> tuple[Map, Map]:
     """White felt with a blue thread, a little soaked at its edges."""
     ragged, weave, stains = drawn

@@ -109,41 +109,29 @@ def _painted(
     beside = noise.blur(thickness(tubes["arteries"]), 0.7, extent)
     beside = beside + noise.blur(thickness(tubes["veins"]), 1.1, extent)
     spots = _bleedings(rng, look, pixels, extent)
-    (albedo,) = noise.in_rows(
-        partial(_blushed, look),
-        share,
-        grain,
-        sulci,
-        beside,
-        cv2.resize(mottle, (pixels, pixels)),
-        noise.blur(thickness(tubes["deep"]), 0.16, extent),
-        _strands(rng, sulci, extent),
-        spots,
-    )
-    albedo = _veined(rng, albedo, tubes["veins"], look, extent)
-    shown = cv2.resize(wide, (pixels, pixels))
-    (albedo,) = noise.in_rows(partial(_arterial, look), albedo, shown, *tubes["arteries"])
+    even = cv2.resize(mottle, (pixels, pixels))
+    deep = noise.blur(thickness(tubes["deep"]), 0.16, extent)
+    tissue = [share, grain, sulci, beside, even, deep, _strands(rng, sulci, extent), spots]
+    veins = _vein_maps(rng, tubes["veins"], extent)
+    arteries = [cv2.resize(wide, (pixels, pixels)), *tubes["arteries"]]
+    (albedo,) = noise.in_rows(partial(_paint_rows, look), *tissue, *veins, *arteries)
     # Light that enters tissue leaves it nearby, red farthest: a blur stands in for the volume.
     for channel, width in enumerate((0.055, 0.032, 0.026)):
         albedo[..., channel] = noise.blur(np.ascontiguousarray(albedo[..., channel]), width, extent)
     return np.asarray(np.clip(albedo, 0.01, 0.95, out=albedo), np.float32)
 
 
-def _blushed(
-    look: Look,
-    share: Map,
-    grain: Map,
-    sulci: Map,
-    beside: Map,
-    mottle: Map,
-    deep: Map,
-    strands: Map,
-    spots: Map,
-) -> tuple[Map]:
+def _paint_rows(look: Look, *maps: Map) -> tuple[Map]:
+    """Albedo (r, n, 3) of some rows, of the 8 maps of `_blushed`, 7 of `_veined` and 3 of `_arterial`."""
+    return (_arterial(look, _veined(look, _blushed(look, *maps[:8]), *maps[8:15]), *maps[15:]),)
+
+
+def _blushed(look: Look, *maps: Map) -> Map:
     """Albedo (r, n, 3) of some rows without the vessels of the pia.
 
     `deep`: blood that lies under it [mm]; `strands`: share of arachnoid that bridges; `spots`: spilt blood.
     """
+    share, grain, sulci, beside, mottle, deep, strands, spots = maps
     albedo = np.asarray(look.crown, np.float32) * share + np.asarray(look.flush, np.float32) * (1 - share)
     albedo = albedo * (1 + look.grain * grain[..., None] * np.array([0.5, 1.0, 1.2], np.float32))
     blush = look.blush * (0.04 + 0.3 * sulci) + (0.32 + 1.1 * sulci) * beside
@@ -157,7 +145,7 @@ def _blushed(
     fluid = np.array(look.crown, np.float32) * np.array([0.50, 0.50, 0.72], np.float32)
     milk = fluid + strands[..., None] * (np.array([0.62, 0.52, 0.48], np.float32) - fluid)
     albedo = albedo + haze * look.shade * (milk - albedo)
-    return (albedo * np.exp(-spots[..., None] * np.array([0.12, 1.5, 2.3], np.float32)),)
+    return np.asarray(albedo * np.exp(-spots[..., None] * np.array([0.12, 1.5, 2.3], np.float32)))
 
 
 def _strands(rng: np.random.Generator, sulci: Map, extent: float) -> Map:
@@ -184,7 +172,7 @@ def _bleedings(rng: np.random.Generator, look: Look, pixels: int, extent: float)
     return np.asarray(cv2.resize(total, (pixels, pixels), interpolation=cv2.INTER_CUBIC), np.float32)
 
 
-def _arterial(look: Look, albedo: Map, wide: Map, distance: Map, radius: Map) -> tuple[Map]:
+def _arterial(look: Look, albedo: Map, wide: Map, distance: Map, radius: Map) -> Map:
     """Albedo (r, n, 3) of some rows with their arteries."""
     arterial = thickness((distance, radius))
     # Even the finest stop much of the green: blood is nearly opaque to it within a tenth of a millimetre.
@@ -195,38 +183,30 @@ def _arterial(look: Look, albedo: Map, wide: Map, distance: Map, radius: Map) ->
     thick = np.clip((radius - 0.16) / 0.24, 0, 1) * (distance < radius)
     crest = np.exp(-((distance / np.maximum(0.7 * radius, 1e-3)) ** 2))
     wall = np.array([0.7, 0.13, 0.075], np.float32) * (0.78 + 0.27 * crest)[..., None]
-    return (np.asarray(red + (0.55 * thick)[..., None] * (wall - red), np.float32),)
+    return np.asarray(red + (0.55 * thick)[..., None] * (wall - red), np.float32)
 
 
-def _veined(rng: np.random.Generator, albedo: Map, tube: tuple[Map, Map], look: Look, extent: float) -> Map:
-    """Veins: wine red where thin or seen at their sides, slate along the crest, here more and there less."""
+def _vein_maps(rng: np.random.Generator, tube: tuple[Map, Map], extent: float) -> list[Map]:
+    """What `_veined` paints by, each (n, n)."""
     distance, radius = tube
-    pixels = len(albedo)
+    size = distance.shape
     across = np.asarray(np.clip(distance / np.maximum(radius, 1e-3), 0, 1), np.float32)
     thick = np.clip((radius - 0.12) / 0.3, 0, 1)
-    along = cv2.resize(noise.band(rng, 256, extent, 9.0, 0.6), (pixels, pixels))
-    streak = cv2.resize(noise.fractal(rng, 1024, extent, 1.5, 1.0), (pixels, pixels))
+    along = cv2.resize(noise.band(rng, 256, extent, 9.0, 0.6), size)
+    streak = cv2.resize(noise.fractal(rng, 1024, extent, 1.5, 1.0), size)
     cover = noise.blur(np.clip((1 - across**2) * 2.2, 0, 1).astype(np.float32), 0.05, extent)
     halo = noise.blur(((across < 1) * thick).astype(np.float32), 0.45, extent)
     # Not every stretch lies on the surface: some shimmer through the arachnoid.
-    depth = cv2.resize(noise.band(rng, 256, extent, 7.0, 0.6), (pixels, pixels))
-    return noise.in_rows(partial(_overlaid, look), albedo, across, thick, along, streak, cover, halo, depth)[
-        0
-    ]
+    depth = cv2.resize(noise.band(rng, 256, extent, 7.0, 0.6), size)
+    return [across, thick, along, streak, cover, halo, depth]
 
 
-def _overlaid(
-    look: Look,
-    albedo: Map,
-    across: Map,
-    thick: Map,
-    along: Map,
-    streak: Map,
-    cover: Map,
-    halo: Map,
-    depth: Map,
-) -> tuple[Map]:
-    """Some rows of `_veined`."""
+def _veined(look: Look, albedo: Map, *maps: Map) -> Map:
+    """Albedo (r, n, 3) of some rows with their veins.
+
+    Wine red where thin or seen at their sides, slate along the crest, here more and there less.
+    """
+    across, thick, along, streak, cover, halo, depth = maps
     slate = np.clip(0.55 + 0.4 * along, 0.08, 1) * thick * np.exp(-((across / 0.55) ** 2))
     slate = np.clip(slate * (1 + 0.12 * streak), 0, 1)[..., None]
     thin = np.array([0.50, 0.13, 0.15], np.float32) + 0.06 * along[..., None]
@@ -234,7 +214,7 @@ def _overlaid(
     wall = np.asarray(look.vein, np.float32) * slate + wine * (1 - slate)
     soft = albedo * np.exp(-0.8 * halo[..., None] * np.array([0.45, 1.0, 0.75], np.float32))
     cover = cover[..., None] * np.clip(0.9 + 0.15 * depth, 0.5, 0.97)[..., None]
-    return (np.asarray(soft * (1 - cover) + wall * cover, np.float32),)
+    return np.asarray(soft * (1 - cover) + wall * cover, np.float32)
 
 
 def _film(

@@ -18,6 +18,9 @@ Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 Map = npt.NDArray[np.float32]
 
+_REACH_MM = 9.0  # the farthest attractor that pulls
+_INERTIA = 1.2  # part that a twig keeps of its direction: it bends, and does not turn on the spot
+
 
 @dataclass(frozen=True)
 class Tree:
@@ -38,10 +41,8 @@ def grow(
     *,
     buds: npt.NDArray[np.bool_],
     step: float,
-    reach: float,
     kill: float,
     wander: float,
-    inertia: float = 0.0,
     rng: np.random.Generator,
 ) -> tuple[Floats, Ints]:
     """Space colonisation: nodes step towards the attractors nearest to them until none is left in reach.
@@ -52,10 +53,8 @@ def grow(
         attractors: (A, 2) mm.
         buds: (N,) which of the given nodes may sprout; everything grown may.
         step: length of a segment [mm].
-        reach: farthest attractor that pulls [mm].
         kill: an attractor this near is used up [mm].
         wander: random part of a step's direction, as a share.
-        inertia: part that a twig keeps of its direction, as a share: it bends, and does not turn on the spot.
         rng: where the wandering comes from.
 
     Returns:
@@ -69,10 +68,10 @@ def grow(
     total = len(nodes)
     children = np.bincount(parent[parent >= 0], minlength=total)
     heading = np.zeros((total, 2))  # of what is grown here; a given node sprouts to any side
-    for _ in range(int(4 * reach / step) + 400):
+    for _ in range(int(4 * _REACH_MM / step) + 400):
         keep = distance > kill
         attractors, distance, nearest = attractors[keep], distance[keep], nearest[keep]
-        pulls = distance < reach
+        pulls = distance < _REACH_MM
         if not pulls.any():
             break
         positions = np.concatenate(all_nodes)
@@ -83,7 +82,7 @@ def grow(
             [np.bincount(index, toward[:, axis]).astype(np.float64) for axis in (0, 1)], axis=1
         )
         direction /= np.maximum(np.linalg.norm(direction, axis=1, keepdims=True), 1e-9)
-        direction += inertia * heading[pulled] + wander * rng.standard_normal(direction.shape)
+        direction += _INERTIA * heading[pulled] + wander * rng.standard_normal(direction.shape)
         direction /= np.linalg.norm(direction, axis=1, keepdims=True)
         # A node pulled evenly from two sides would sprout the same twig for ever.
         free = children[pulled] < 3

@@ -85,10 +85,8 @@ def _tree(
             scattered(extent_mm, spacing, rng, density),
             buds=_sprouting(len(nodes), float(between) / (0.9 * spacing), rng),
             step=step,
-            reach=9.0,
             kill=0.5 * spacing,
             wander=wander,
-            inertia=1.2,
             rng=rng,
         )
         nodes, parent = pruned(nodes, parent, grown, shortest=int(0.55 * spacing / step))

@@ -66,7 +66,7 @@ class Metal:
     tint: Floats
     """(V, 3) share of light that the finish scatters evenly at vertices."""
     glow: Floats
-    """(V, 3) radiance that vertices mirror; `Stage.mirror` renews it."""
+    """(V, 3) radiance that vertices mirror; `Stage.move` renews it."""
 
 
 @dataclass(frozen=True)
@@ -169,17 +169,22 @@ class Stage:
         self._scene = mi.load_dict(scene)
         self._parameters = mi.traverse(self._scene)
 
-    def move(self, name: str, vertices: Floats, film: Floats | None = None) -> None:
-        """New positions (V, 3) mm of a body's vertices; light sees them under a `film` of heights (V,) mm."""
-        bent = _bent(vertices, self._faces[name], film)
-        for key, values in (("vertex_positions", vertices), ("vertex_normals", bent)):
-            flat = _aligned(values, np.float32)
-            self._parameters[f"{name}.{key}"] = self._mi.Float(flat) if self._jit else flat
+    def move(
+        self, name: str, vertices: Floats, *, film: Floats | None = None, glow: Floats | None = None
+    ) -> None:
+        """New positions (V, 3) mm of a body's vertices.
 
-    def mirror(self, name: str, glow: Floats) -> None:
-        """New mirrored radiance (V, 3) of a metal body's vertices."""
-        flat = _aligned(glow, np.float32)
-        self._parameters[f"{name}.vertex_glow"] = self._mi.Float(flat) if self._jit else flat
+        Args:
+            name: the body.
+            vertices: (V, 3) mm.
+            film: (V,) mm of film under which light sees them.
+            glow: (V, 3) radiance that they mirror, of metal.
+        """
+        new = {"positions": vertices, "normals": _bent(vertices, self._faces[name], film), "glow": glow}
+        for key, values in new.items():
+            if values is not None:
+                flat = _aligned(values, np.float32)
+                self._parameters[f"{name}.vertex_{key}"] = self._mi.Float(flat) if self._jit else flat
 
     def render(self, seed: int, camera: Camera | None = None) -> Map:
         """Linear radiance (H, W, 3) float32 of the stage as it stands, from a camera with the same lens."""
@@ -216,14 +221,9 @@ def _leave_modules_out() -> None:
 
 def _trim() -> None:
     """Gives free pages back to the system: glibc would keep what maps needed while they were made."""
-    trim = getattr(_libc(), "malloc_trim", None)
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
     if trim is not None:
         trim(0)
-
-
-@functools.cache
-def _libc() -> ctypes.CDLL:
-    return ctypes.CDLL(None)
 
 
 def _limit_threads() -> None:
