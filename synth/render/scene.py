@@ -300,8 +300,8 @@ class Renderer:
         inside = rim.inside(self._rim, *np.meshgrid(axis, axis))[..., None]
         around = 0.5 * (np.asarray(self._look.dura) + np.asarray(self._look.beyond))
         wound = (small * inside + around.astype(np.float32) * (1 - inside)).astype(np.float32)
-        r, g, b = (self._look.light.power * light.blackbody(self._look.light.kelvin)).tolist()
-        return reflection.Theatre(wound, extent, tuple(self.lamps), (r, g, b), self._look.rim_seed)
+        lit = self._look.light.power * light.blackbody(self._look.light.kelvin)
+        return reflection.Theatre(wound, extent, tuple(self.lamps), lit, self._look.rim_seed)
 
     def _mirrored(self, steel: Shape) -> Floats:
         return reflection.glow(steel, self._coating, self.camera.centre, self._theatre)
@@ -327,7 +327,7 @@ class Renderer:
         normal = normals(Shape(vertices, self.surface.faces))
         total = np.zeros((len(vertices), 3))
         for lamp in self.lamps:
-            _add_light(vertices, normal, lamp.position, np.asarray(lamp.intensity), total)
+            _add_light(vertices, normal, lamp.position, lamp.intensity, total)
         return total
 
 

@@ -81,21 +81,8 @@ class FrameTruth:
     """This frame's pixels, over tissue, rim and tool, in this order."""
 
 
-def cast(camera: Camera, scene: Shape, pixels: Floats | None, directions: Floats) -> Hits:
-    """First triangle that each ray from the lens meets.
-
-    Args:
-        camera: the camera.
-        scene: what is there, world axes.
-        pixels: (N, 2) px where the rays pierce the picture; those outside it meet nothing. None: all
-            pixels' centres, row by row.
-        directions: (N, 3) in camera axes, of any length, each through its pixel.
-    """
-    return _Projected.by(camera, scene).cast(pixels, directions)
-
-
 @dataclass(frozen=True)
-class _Projected:
+class ProjectedScene:
     """A scene as one camera sees it."""
 
     points: Floats
@@ -108,13 +95,19 @@ class _Projected:
     """Width, height [px]."""
 
     @classmethod
-    def by(cls, camera: Camera, scene: Shape) -> _Projected:
+    def of(cls, camera: Camera, scene: Shape) -> ProjectedScene:
         points = cameras.to_camera(camera, scene.vertices)
         points[points[:, 2] < _NEAR_MM] = np.nan
         return cls(points, cameras.to_pixels(camera, points), scene.faces, camera.size)
 
     def cast(self, pixels: Floats | None, directions: Floats) -> Hits:
-        """See `cast`."""
+        """First triangle that each ray from the lens meets.
+
+        Args:
+            pixels: (N, 2) px where the rays pierce the picture; those outside it meet nothing. None: all
+                pixels' centres, row by row.
+            directions: (N, 3) in camera axes, of any length, each through its pixel.
+        """
         width, height = self.size
         if pixels is None:
             order, start = np.arange(width * height), np.arange(width * height + 1)
@@ -129,15 +122,13 @@ def trace_rest(camera: Camera, surface: Shape, rim: Shape) -> RestFrame:
     width, height = camera.size
     pixels = cameras.pixel_grid(camera.size)
     directions = cameras.rays(camera, pixels)
-    hits = cast(camera, joined(surface, rim), None, directions)
+    hits = ProjectedScene.of(camera, joined(surface, rim)).cast(None, directions)
     on_tissue = (hits.face >= 0) & (hits.face < len(surface.faces))
     face = np.where(on_tissue, hits.face, -1).astype(np.int32)
     corners = cameras.to_camera(camera, surface.vertices)[surface.faces[face[on_tissue]]]
-    area = np.zeros(len(pixels), np.float32)
-    area[on_tissue] = _footprint(camera, corners, directions, on_tissue, hits.along)
     return RestFrame(
         tissue=on_tissue.reshape(height, width),
-        area=area.reshape(height, width),
+        area=_picture(on_tissue, _footprint(camera, corners, directions, on_tissue, hits.along), camera),
         scale_mm_per_px=camera.mm_per_px,
         face=face.reshape(height, width),
         bary=np.where(on_tissue[:, None], hits.bary, 0.0).reshape(height, width, 3),
@@ -158,7 +149,7 @@ def trace_frame(camera: Camera, rest: RestFrame, surface: Shape, rim: Shape, too
     """
     width, height = camera.size
     pixels = cameras.pixel_grid(camera.size)
-    scene = _Projected.by(camera, joined(surface, rim, tool))
+    scene = ProjectedScene.of(camera, joined(surface, rim, tool))
     hits = scene.cast(None, rest.directions)
     seen = hits.face >= 0
     depth = np.where(seen, hits.along, 0.0)  # directions have unit z
@@ -170,16 +161,10 @@ def trace_frame(camera: Camera, rest: RestFrame, surface: Shape, rim: Shape, too
     blocked = scene.cast(pierced, local)
     clear = (1 - blocked.along) * lengths(local) < _HIDDEN_MM
     inside = ((pierced >= -0.5) & (pierced < np.array([width, height]) - 0.5)).all(axis=1)
-    flow = np.zeros((len(pixels), 2), np.float32)
-    flow[on] = pierced - pixels[on]
-    motion = np.zeros((len(pixels), 3), np.float32)
-    motion[on] = local - rest.points[on]
-    visible = np.zeros(len(pixels), bool)
-    visible[on] = clear & inside
     return FrameTruth(
-        flow=flow.reshape(height, width, 2),
-        motion=motion.reshape(height, width, 3),
-        visible=visible.reshape(height, width),
+        flow=_picture(on, pierced - pixels[on], camera),
+        motion=_picture(on, local - rest.points[on], camera),
+        visible=_picture(on, clear & inside, camera, bool),
         depth=depth.reshape(height, width).astype(np.float32),
         tool=(hits.face >= len(surface.faces) + len(rim.faces)).reshape(height, width),
         hits=hits,
@@ -195,12 +180,9 @@ def forward_flow(hits: Hits, faces: Indices, vertices: Floats, camera: Camera) -
         vertices: (V, 3) mm, the surface in the other frame.
         camera: of the other frame.
     """
-    width, height = camera.size
     on = (hits.face >= 0) & (hits.face < len(faces))
     points = blend(faces, hits.face[on], hits.bary[on], vertices)
-    flow = np.zeros((len(on), 2), np.float32)
-    flow[on] = cameras.project(camera, points) - cameras.pixel_grid(camera.size)[on]
-    return flow.reshape(height, width, 2)
+    return _picture(on, cameras.project(camera, points) - cameras.pixel_grid(camera.size)[on], camera)
 
 
 def normal_map(camera: Camera, hits: Hits, shapes: Sequence[Shape]) -> npt.NDArray[np.float32]:
@@ -208,13 +190,10 @@ def normal_map(camera: Camera, hits: Hits, shapes: Sequence[Shape]) -> npt.NDArr
 
     `shapes`: those that `hits` are of, in their order.
     """
-    width, height = camera.size
     vertex = np.concatenate([normals(shape) for shape in shapes]) @ camera.rotation.T
     on = hits.face >= 0
     smooth = blend(joined(*shapes).faces, hits.face[on], hits.bary[on], vertex)
-    found = np.zeros((len(on), 3), np.float32)
-    found[on] = smooth / np.maximum(np.linalg.norm(smooth, axis=1, keepdims=True), 1e-12)
-    return found.reshape(height, width, 3)
+    return _picture(on, smooth / np.maximum(np.linalg.norm(smooth, axis=1, keepdims=True), 1e-12), camera)
 
 
 def at_rest_pixels(rest: RestFrame, faces: Indices, nodal: Floats) -> npt.NDArray[np.float32]:
@@ -230,6 +209,13 @@ def blend(faces: Indices, face: Indices, bary: Floats, nodal: npt.NDArray[np.flo
     """
     found: Floats = _blend(faces, face, bary, np.ascontiguousarray(nodal, np.float64))
     return found
+
+
+def _picture(on: Mask, values: npt.NDArray[Any], camera: Camera, kind: type = np.float32) -> npt.NDArray[Any]:
+    """Values (M, ...) of the pixels that are `on` (H*W,) as a picture (H, W, ...); 0 elsewhere."""
+    found = np.zeros((len(on), *values.shape[1:]), kind)
+    found[on] = values
+    return found.reshape(*camera.size[::-1], *values.shape[1:])
 
 
 def _footprint(camera: Camera, corners: Floats, directions: Floats, on: Mask, along: Floats) -> Floats:

@@ -31,21 +31,15 @@ def band(rng: np.random.Generator, pixels: int, extent_mm: float, wavelength_mm:
     Returns:
         (pixels, pixels) float32.
     """
-    rows = np.fft.fftfreq(pixels, extent_mm / pixels)
-    columns = np.fft.rfftfreq(pixels, extent_mm / pixels)
-    frequency = np.hypot(rows[:, None], columns[None])
+    frequency = _frequencies(pixels, extent_mm)
     gain = np.exp(-0.5 * ((frequency * wavelength_mm - 1) / width) ** 2)
-    gain[0, 0] = 0.0
     return _filtered(rng, pixels, gain)
 
 
 def fractal(rng: np.random.Generator, pixels: int, extent_mm: float, longest_mm: float, slope: float) -> Map:
     """Noise (n, n) of amplitude ~ 1/f^slope for waves below `longest_mm`; zero mean, unit variance."""
-    rows = np.fft.fftfreq(pixels, extent_mm / pixels)
-    columns = np.fft.rfftfreq(pixels, extent_mm / pixels)
-    frequency = np.hypot(rows[:, None], columns[None])
+    frequency = _frequencies(pixels, extent_mm)
     gain = (frequency**2 + longest_mm**-2) ** (-0.5 * slope)
-    gain[0, 0] = 0.0
     return _filtered(rng, pixels, gain)
 
 
@@ -83,9 +77,16 @@ def centres(pixels: int, extent_mm: float) -> npt.NDArray[np.float32]:
     return (((np.arange(pixels) + 0.5) / pixels - 0.5) * extent_mm).astype(np.float32)
 
 
+def _frequencies(pixels: int, extent_mm: float) -> Floats:
+    """Waves a millimetre of each coefficient of a real transform."""
+    step = extent_mm / pixels
+    return np.asarray(np.hypot(np.fft.fftfreq(pixels, step)[:, None], np.fft.rfftfreq(pixels, step)[None]))
+
+
 def _filtered(rng: np.random.Generator, pixels: int, gain: Floats) -> Map:
     white = rng.standard_normal((pixels, pixels), dtype=np.float32)
     spectrum = np.fft.rfft2(white)
+    gain[0, 0] = 0.0
     spectrum *= gain.astype(np.float32)
     noise = np.fft.irfft2(spectrum, s=(pixels, pixels))
     mean, deviation = noise.mean(), noise.std()

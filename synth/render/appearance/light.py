@@ -58,11 +58,10 @@ def lamps(camera: Camera, lighting: Lighting) -> list[Lamp]:
     total = lighting.power * np.pi * distance**2
     window = distance * float(np.tan(np.deg2rad(_WINDOW_DEG)))
     made = []
-    # Of equal weight: each has half of a multijittered pixel's strata, and the choice makes no noise.
     for side, share in ((0.0, lighting.main), (1.0, 1 - lighting.main)):
         towards = _towards(camera, lighting, side)
-        r, g, b = (share * total * colour / max(float(towards[2]), 0.3)).tolist()
-        made.append(Lamp(distance * towards, np.zeros(3), window, (r, g, b), 1.0))
+        intensity = share * total * colour / max(float(towards[2]), 0.3)
+        made.append(Lamp(distance * towards, np.zeros(3), window, intensity))
     return made
 
 

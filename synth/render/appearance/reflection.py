@@ -38,8 +38,8 @@ class Theatre:
     """Side of the square that it covers."""
     lamps: tuple[Lamp, ...]
     """The microscope's."""
-    light: tuple[float, float, float]
-    """Colour and power of what lights the wound and the theatre; 1 is white that just fills the sensor."""
+    light: Floats
+    """(3,) colour and power of what lights wound and theatre; 1 is white that just fills the sensor."""
     seed: int
     """Of the lamps on the ceiling."""
 
@@ -67,7 +67,7 @@ def glow(tool: Shape, coat: npt.NDArray[np.floating], eye: Floats, theatre: Thea
     straight = _STEEL * _TINT + coat[:, None] * (_BLACK - _STEEL * _TINT)
     # Schlick, An inexpensive BRDF model for physically-based rendering, 1994.
     share = straight + (1 - straight) * np.clip(1 - facing, 0, 1) ** 5
-    seen = _surroundings(tool.vertices, mirrored, theatre) * np.asarray(theatre.light)
+    seen = _surroundings(tool.vertices, mirrored, theatre) * theatre.light
     for lamp in theatre.lamps:
         seen += _window(tool.vertices, normal, towards, lamp)
     return np.asarray(share * seen)
@@ -118,4 +118,4 @@ def _window(place: Floats, normal: Floats, towards: Floats, lamp: Lamp) -> Float
     in_line = np.clip(np.einsum("nc,nc->n", normal, half), 0, 1) ** 2
     lobe = _FINISH**2 / (np.pi * (in_line * (_FINISH**2 - 1) + 1) ** 2)
     lit = np.einsum("nc,nc->n", normal, way) > 0
-    return np.asarray((lit * lobe / (4 * away2))[:, None] * np.asarray(lamp.intensity))
+    return np.asarray((lit * lobe / (4 * away2))[:, None] * lamp.intensity)

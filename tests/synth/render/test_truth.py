@@ -109,7 +109,7 @@ def test_a_triangle_with_a_corner_behind_the_lens_is_dropped(lens: Camera, turn:
     shape = Shape(
         (corners - lens.translation) @ lens.rotation, np.array([np.roll([0, 1, 2], turn)], np.int32)
     )
-    hits = truth.cast(lens, shape, None, directions)
+    hits = truth.ProjectedScene.of(lens, shape).cast(None, directions)
     assert (hits.face < 0).all()
     assert np.isinf(hits.along).all()
 
