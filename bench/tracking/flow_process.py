@@ -17,7 +17,7 @@ from dataclasses import replace
 from multiprocessing import get_context, parent_process
 
 from synth.flow.estimator import Flags, Rgb
-from synth.flow.mask_choice import Proposal
+from synth.flow.mask_selection import Proposal
 from synth.recording_flow.frame_motion import FrameMotion
 from synth.recording_flow.local_flow import LocalFlow
 

@@ -6,7 +6,7 @@ import time
 from concurrent.futures import Future
 
 from synth.flow.estimator import Flags, Rgb
-from synth.flow.mask_choice import ChoosingTracker, Proposal
+from synth.flow.mask_selection import Proposal, SelectingTracker
 from synth.recording_flow.frame_motion import FrameMotion
 
 
@@ -17,11 +17,11 @@ class LocalFlow:
     """How many frames may be submitted before the first is waited for."""
 
     def begin(self, backend: str, rest: Rgb, proposal: Proposal, tissue: Flags) -> None:
-        """The rest frame; arguments and errors as `ChoosingTracker`."""
-        self._tracker = ChoosingTracker(backend, rest, proposal, tissue)
+        """The rest frame; arguments and errors as `SelectingTracker`."""
+        self._tracker = SelectingTracker(backend, rest, proposal, tissue)
 
     def submit(self, rgb: Rgb, proposal: Proposal) -> Future[FrameMotion]:
-        """The motion of a frame (h, w, 3); errors as `ChoosingTracker.step`."""
+        """The motion of a frame (h, w, 3); errors as `SelectingTracker.step`."""
         cpu, wall, tracker = time.process_time(), time.perf_counter(), self._tracker
         flow, confidence = tracker.step(rgb, proposal)
         done: Future[FrameMotion] = Future()

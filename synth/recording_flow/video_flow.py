@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from synth.errors import UserError
 from synth.flow import mask
 from synth.flow.estimator import Flags, Rgb
-from synth.flow.mask_choice import Proposal
+from synth.flow.mask_selection import Proposal
 from synth.flow.stereo.track import Moved
 from synth.recording_flow.frame_motion import FrameMotion, TrackingSummary
 from synth.recording_flow.harmonic_fit import Span

@@ -15,7 +15,7 @@ import pytest
 
 from bench.tracking.flow_process import FlowProcess
 from synth.errors import UserError
-from synth.flow.mask_choice import Proposal
+from synth.flow.mask_selection import Proposal
 from synth.recording_flow.video_flow import Footage, RecordingFlowSettings, VideoFlow
 from synth.video.read import Picture
 

@@ -11,7 +11,7 @@ import pytest
 from bench.tracking import live
 from bench.tracking.flow_process import FlowProcess
 from synth.flow.estimator import Rgb
-from synth.flow.mask_choice import Proposal
+from synth.flow.mask_selection import Proposal
 from synth.recording_flow.frame_motion import FrameMotion
 from synth.recording_flow.local_flow import LocalFlow
 from synth.recording_flow.video_flow import Footage, RecordingFlowSettings, VideoFlow

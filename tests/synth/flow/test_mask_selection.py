@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, shift
 
-from synth.flow.mask_choice import ChoosingTracker, Proposal
+from synth.flow.mask_selection import Proposal, SelectingTracker
 
 _SIZE = 96
 _NOTHING = np.zeros((_SIZE, _SIZE), bool)
@@ -29,8 +29,8 @@ def _moved(by_px: float) -> NDArray[np.float64]:
     return shift(_texture(), (0, by_px), order=5, mode="mirror")
 
 
-def _tracker(rest: NDArray[np.uint8], found: Proposal) -> ChoosingTracker:
-    return ChoosingTracker("tvl1", rest, found, ~_NOTHING)
+def _tracker(rest: NDArray[np.uint8], found: Proposal) -> SelectingTracker:
+    return SelectingTracker("tvl1", rest, found, ~_NOTHING)
 
 
 def test_tissue_that_is_taken_for_a_tool_is_not_masked() -> None:
