@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -150,19 +150,16 @@ def _strongest_rate(t: Floats, y: Floats, rhythms: Sequence[Rhythm]) -> float | 
         return -float((right * np.linalg.solve(gram, right)).sum())
 
     step = 1 / (6 * float(np.ptp(t)))
-    best = _least(loss, np.arange(*rates_hz, step))
+    best: float = min(np.arange(*rates_hz, step).tolist(), key=loss)
     # A half or a third of the rate has the same waves among its own: the fastest that does as well is meant.
     for order in (3, 2):
         if order * best < rates_hz[1]:
-            faster = _least(loss, np.linspace(order * best - 2 * step, order * best + 2 * step, 17))
+            around = np.linspace(order * best - 2 * step, order * best + 2 * step, 17)
+            faster: float = min(around.tolist(), key=loss)
             if loss(faster) < 0.95 * loss(best):
                 best = faster
                 break
     return float(minimize_scalar(loss, bounds=(best - step, best + step), method="bounded").x)
-
-
-def _least(loss: Callable[[float], float], rates: Floats) -> float:
-    return float(min(rates.tolist(), key=loss))
 
 
 def _add_rhythm(t: Floats, y: Floats, rhythms: Sequence[Rhythm], rate: float) -> tuple[list[Rhythm], bool]:
