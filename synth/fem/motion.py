@@ -17,10 +17,10 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from synth.fem.equilibrium import TOLERANCE, LoadPath, follow_loads, minimise_energy
-from synth.fem.membrane import MembraneSheet
+from synth.fem.material import Tissue
 from synth.fem.mesh.element import quadrature
 from synth.fem.mesh.tetrahedra import Tets
-from synth.fem.system import State, assemble
+from synth.fem.system import State
 
 Floats = NDArray[np.float64]
 
@@ -95,37 +95,26 @@ class _PronyHistory:
 
 
 def march_in_time(
-    tets: Tets,
-    law: str,
-    poisson: float,
-    young_kpa: float,
-    loads: Floats,
-    load_parameter: Floats,
-    clock: Clock,
-    membrane: MembraneSheet | None = None,
+    tets: Tets, tissue: Tissue, loads: Floats, load_parameter: Floats, clock: Clock
 ) -> LoadPath:
     """Motion from rest under loads at even times; between them they change evenly.
 
     Args:
         tets: the mesh.
-        law: a key of `laws.NUMBER`; its stiffness is that of a sudden load.
-        poisson: below 0.5.
-        young_kpa: E, which sets how much inertia counts.
+        tissue: its stiffness is that to a sudden load; a membrane relaxes as the tissue under it does.
         loads: (T, N, 3) mN for E = 1 kPa.
         load_parameter: (T,) P = F/(E a^2) of each, for messages.
         clock: time.
-        membrane: on the surface; it relaxes as the tissue does.
 
     Raises:
         As `equilibrium.solve_path`.
     """
     firm, spring, substeps = clock.relative_stiffness, clock.inertia_spring, clock.substeps
-    mass = nodal_mass(tets, clock.mass_kg) / young_kpa
+    mass = nodal_mass(tets, clock.mass_kg) / tissue.young_kpa
     springs = (tets.hold + sp.diags_array(spring * mass)) / firm
     slip = None if tets.slip is None else sp.csr_array(tets.slip / firm)
-    held = replace(tets, hold=sp.csr_array(springs), slip=slip)
-    system = assemble(held, law, poisson, membrane)
-    tissue = replace(system, hold=sp.csr_array(tets.hold.shape), slip=None)
+    system = tissue.equations(replace(tets, hold=sp.csr_array(springs), slip=slip))
+    elastic = replace(system, hold=sp.csr_array(tets.hold.shape), slip=None)
     skull = replace(system, hold=tets.hold, slip=tets.slip)
 
     peak = loads[np.abs(loads).max(axis=(1, 2)).argmax()]
@@ -138,7 +127,7 @@ def march_in_time(
         if spring:
             load = load + spring * mass[:, None] * clock.inertia_target(u, before)
         new, state, norm = minimise_energy(system, load / firm, u + (u - before), TOLERANCE * size, u)
-        past.update(tissue.state(new).force)
+        past.update(elastic.state(new).force)
         before = u
         return new, state, norm / size
 
@@ -146,7 +135,7 @@ def march_in_time(
     for begin, end in pairwise(loads):
         steps += [(1 - s / substeps) * begin + s / substeps * end for s in range(1, substeps + 1)]
     path = follow_loads(system, np.array(steps), load_parameter, step, 2 * TOLERANCE, substeps)
-    energy = [tissue.state(u).energy + 0.5 * float(np.vdot(u, skull.springs(u))) for u in path.displacement]
+    energy = [elastic.state(u).energy + 0.5 * float(np.vdot(u, skull.springs(u))) for u in path.displacement]
     return replace(path, energy=np.array(energy))
 
 

@@ -122,21 +122,11 @@ def deform(
         pulse_work = 0.5 * height * np.einsum("v,tvd,vd->t", area, traction, raised, optimize=True)
 
     if fem.time == "dynamic" or fem.relaxation:
-        path = march_in_time(
-            tets,
-            tissue.law,
-            tissue.poisson,
-            tissue.young_kpa,
-            loads,
-            load_parameter,
-            clock(fem, fps, tets),
-            tissue.sheet,
-        )
+        path = march_in_time(tets, tissue, loads, load_parameter, clock(fem, fps, tets))
     elif pulse is None and tissue.sheet is None:
         path = solve_path(system, loads, load_parameter)
     else:
         path = solve_mixed_path(system, loads, load_parameter)
-
     displacement = np.stack([embedding.move(u) for u in path.displacement])
     poses = [tool.pose(g, moved, surface, surface.vertices + displacement) for g, moved in tools]
     forces = [np.outer(m.load, np.sum([c.force_mn for c in g.contacts], axis=0)) for g, m in tools]

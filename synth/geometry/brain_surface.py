@@ -56,8 +56,8 @@ def load_brain(path: Path, craniotomy: CraniotomySection) -> Brain:
     Raises:
         UserError: the file cannot be read, encloses no volume, or has no surface at the craniotomy.
     """
-    if craniotomy.point is None or craniotomy.direction is None:
-        raise UserError("anatomy.mesh needs craniotomy.point and craniotomy.direction")
+    assert craniotomy.point is not None  # with a mesh a job needs both
+    assert craniotomy.direction is not None
     vertices, faces = read_brain(path)
     out = np.asarray(craniotomy.direction) / np.linalg.norm(craniotomy.direction)
     turn, origin = axes(out), np.asarray(craniotomy.point)

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy.sparse.linalg import spsolve
 
 from synth.fem.mesh.element import TRI_POINTS, TRI_WEIGHTS, quality, scatter
+from synth.fem.mesh.lattice_stuffing import halve
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -101,9 +102,6 @@ def _heights(at: Floats, normal: Floats, longest: Floats, inside: Callable[[Floa
         high[here[crossed]] = k / _STEPS
         low[here] = (k - 1) / _STEPS
         open_[here[crossed]] = False
-    for _ in range(_HALVINGS):
-        middle = 0.5 * (low + high)
-        before = (inside(start + middle[:, None] * way) > 0) == begins
-        low, high = np.where(before, middle, low), np.where(before, high, middle)
-    found = np.where(open_, 1.0, 0.5 * (low + high)) * np.where(begins, 1.0, -1.0)
+    crossed = halve(inside, start, way, begins, low, high, _HALVINGS)
+    found = np.where(open_, 1.0, crossed) * np.where(begins, 1.0, -1.0)
     return (found * np.repeat(longest * _REACH, count)).reshape(faces, count)

@@ -59,13 +59,28 @@ def stuff(points: Floats, cells: Ints, inside: Callable[[Floats], Floats]) -> tu
 
 
 def _crossing(points: Floats, pairs: Ints, value: Ints, inside: Callable[[Floats], Floats]) -> Floats:
-    """Where each edge passes the surface, (E,) from 0 at its first corner to 1, by halving."""
-    low, high = np.zeros(len(pairs)), np.ones(len(pairs))
+    """Where each edge passes the surface, (E,) from 0 at its first corner to 1."""
     first, side = points[pairs[:, 0]], points[pairs[:, 1]] - points[pairs[:, 0]]
-    begins_inside = value[pairs[:, 0]] > 0
-    for _ in range(_HALVINGS):
+    ends = np.zeros(len(pairs)), np.ones(len(pairs))
+    return halve(inside, first, side, value[pairs[:, 0]] > 0, *ends, _HALVINGS)
+
+
+def halve(
+    inside: Callable[[Floats], Floats],
+    start: Floats,
+    way: Floats,
+    begins: NDArray[np.bool_],
+    low: Floats,
+    high: Floats,
+    times: int,
+) -> Floats:
+    """Where `start` + share times `way`, (n, 3) mm each, passes the surface: share (n,), by halving.
+
+    It is between `low` and `high` (n,); `begins`: (n,) whether it is inside at `low`.
+    """
+    for _ in range(times):
         middle = 0.5 * (low + high)
-        before = (inside(first + middle[:, None] * side) > 0) == begins_inside
+        before = (inside(start + middle[:, None] * way) > 0) == begins
         low, high = np.where(before, middle, low), np.where(before, high, middle)
     return 0.5 * (low + high)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 import scipy.sparse as sp
@@ -247,12 +248,12 @@ def _finished(
     fixed[faces[on_wall]] = True
     bonded, slip = _springs(points, faces[~on_wall], at, slips)
     hold = bonded + attachments.springs(points, cells, held)
-    return Tets(points, cells, fixed, sp.csr_array(hold), slip if slips else None)
+    return Tets(points, cells, fixed, sp.csr_array(hold), slip)
 
 
 def _springs(
     points: Floats, faces: Ints, at: schema.CraniotomySection, slips: bool
-) -> tuple[sp.csr_array, sp.csr_array]:
+) -> tuple[sp.csr_array, sp.csr_array | None]:
     """The skull: springs on the surface that grow, over the rim's width, from none in the opening to firm.
 
     Returns:
@@ -275,13 +276,12 @@ def _springs(
         return scatter(np.einsum("fq,qi,qj->fij", part, value, value), faces, len(points))
 
     if not slips:
-        return gathered(pressed), sp.csr_array((3 * len(points),) * 2)
+        return gathered(pressed), None
     normal = facing / (2 * area)[:, None]
     slip = sp.csr_array((3 * len(points),) * 2)
-    for i in range(3):
-        for j in range(3):
-            one = np.zeros((3, 3))
-            one[i, j] = 1
-            part = np.where(deep, 0, pressed) * (normal[:, i] * normal[:, j])[:, None]
-            slip = slip + sp.kron(gathered(part), one, format="csr")
+    for i, j in product(range(3), repeat=2):
+        one = np.zeros((3, 3))
+        one[i, j] = 1
+        part = np.where(deep, 0, pressed) * (normal[:, i] * normal[:, j])[:, None]
+        slip = slip + sp.kron(gathered(part), one, format="csr")
     return gathered(np.where(deep, pressed, 0)), sp.csr_array(slip)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 
+from synth.fem.material import Tissue
 from synth.fem.mesh import tetrahedra
 from synth.fem.mesh.tetrahedra import Tets
 from synth.fem.motion import Clock, march_in_time, nodal_mass
@@ -32,7 +33,7 @@ def test_creep_under_a_held_load_is_the_closed_form() -> None:
     loads = np.repeat(load[None], frames, axis=0)
     loads[0] = 0
     clock = Clock(step_s=0.02, relaxation=((lost, tau),))
-    path = march_in_time(tets, "linear", 0.4, 1.0, loads, np.full(frames, 0.1), clock)
+    path = march_in_time(tets, Tissue(1.0, 0.4, "linear"), loads, np.full(frames, 0.1), clock)
     sudden = assemble(tets, "linear", 0.4).solve(load)
     grown = np.einsum("tnd,nd->t", path.displacement, sudden) / np.vdot(sudden, sudden)
     since = 0.02 * np.arange(frames) - 0.01  # the load comes on evenly within the first step
@@ -45,7 +46,7 @@ def test_a_step_keeps_the_balance_of_momentum(law: str) -> None:
     tets, frames, dt, damping = cube(), 8, 0.02, 2.0
     loads = np.linspace(0, 1, frames)[:, None, None] * pulled(tets, 3.0)
     clock = Clock(step_s=dt, mass_kg=0.2, damping=damping)
-    u = march_in_time(tets, law, 0.4, 2.0, loads, np.linspace(0, 0.1, frames), clock).displacement
+    u = march_in_time(tets, Tissue(2.0, 0.4, law), loads, np.linspace(0, 0.1, frames), clock).displacement
     mass = nodal_mass(tets, 0.2)[:, None]
     system = assemble(tets, law, 0.4)
     for t in range(2, frames):

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from dome import ANATOMY
 
+from synth.fem.material import Tissue
 from synth.fem.mesh import tetrahedra
 from synth.fem.mesh.tetrahedra import boundary
 from synth.fem.motion import Clock, march_in_time
@@ -42,7 +43,9 @@ def test_the_same_springs_in_motion_come_to_rest_where_equilibrium_is() -> None:
     load[np.hypot(*tets.points[:, :2].T) < 15] = [0.05, 0.0, -0.02]
     frames = 40
     clock = Clock(0.5, 1, 1.0, 20.0)
-    found = march_in_time(tets, "linear", 0.4, 1.0, np.stack([load] * frames), np.full(frames, 0.1), clock)
+    found = march_in_time(
+        tets, Tissue(1.0, 0.4, "linear"), np.stack([load] * frames), np.full(frames, 0.1), clock
+    )
     still = assemble(tets, "linear", 0.4).solve(load)
     assert np.abs(found.displacement[-1] - still).max() <= 2e-3 * np.abs(still).max()
     assert found.energy[-1] == pytest.approx(0.5 * float(np.vdot(load, still)), rel=5e-3)
