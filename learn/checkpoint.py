@@ -167,13 +167,13 @@ def read_model(folder: Path) -> tuple[D2FNet, ModelCard]:
     """
     card = read_card(folder)
     state = load_tensors(_find_weights(folder, card))
-    model = fit(state, card.settings.arch, folder)
+    model = build_network(state, card.settings.arch, folder)
     if not all(torch.isfinite(v).all() for v in state.values()):
         raise UserError(f"{folder}: the weights hold NaN or infinity")
     return model.eval(), card
 
 
-def fit(state: Mapping[str, Any], arch: Architecture, where: Path) -> D2FNet:
+def build_network(state: Mapping[str, Any], arch: Architecture, where: Path) -> D2FNet:
     """The network of `arch` with the weights of `state`. Raises UserError, before it takes memory for them,
     if they aren't its own."""
     with torch.device("meta"):

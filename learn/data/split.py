@@ -126,6 +126,5 @@ def _choosers(
             "them beside the test" + _advise(clips)
         )
     parts = folds([clips[i] for i in rest], min(5, left), seed)
-    chosen = part % len(parts)
-    select = tuple(rest[i] for i in parts[chosen])
-    return select, tuple(sorted(rest[i] for k, fold in enumerate(parts) if k != chosen for i in fold))
+    select = tuple(rest[i] for i in parts[part % len(parts)])
+    return select, tuple(i for i in rest if i not in select)
