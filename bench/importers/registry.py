@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from bench.recording import clocks, writer
 from bench.recording.folder import natural_order
-from synth.errors import UserError
+from synth.errors import UserError, first_line
 from synth.system import checked_file
 from synth.system.checked_file import refuse_large
 
@@ -87,12 +87,12 @@ def read_source(source: Path, use: Mapping[str, str] | None = None) -> Intake:
     unknown = sorted(set(use or {}) - {*ROLES, "fps"})
     if unknown:
         raise UserError(f"--use {unknown[0]}=...: one of {', '.join(ROLES)}")
-    with _damage_told(source):
+    with _damage_as_user_error(source):
         found: Intake = import_module(maker).read_source(source, dict(use or {}))
     _refuse_odd(source, found)
 
     def pictures() -> Iterator[NDArray[np.uint8]]:
-        with _damage_told(source):
+        with _damage_as_user_error(source):
             size = None
             for k, picture in enumerate(map(_as_rgb, found.pictures())):
                 if picture.shape != (size := size or picture.shape):
@@ -103,7 +103,7 @@ def read_source(source: Path, use: Mapping[str, str] | None = None) -> Intake:
 
 
 @contextmanager
-def _damage_told(source: Path) -> Iterator[None]:
+def _damage_as_user_error(source: Path) -> Iterator[None]:
     """What the libraries raise over a damaged file, and that is nearly anything, as one line."""
     try:
         yield
@@ -112,8 +112,8 @@ def _damage_told(source: Path) -> Iterator[None]:
     except ImportError as error:
         raise UserError(f"{source}: needs {error.name}: pip install '.[readers]' in the clone") from None
     except Exception as error:
-        said = (str(error).splitlines() or [""])[0][:200] or type(error).__name__
-        raise UserError(f"{source}: damaged, or not what its name says ({said})") from error
+        what = first_line(error)
+        raise UserError(f"{source}: damaged, or not what its name says ({what})") from error
 
 
 def _refuse_odd(source: Path, found: Intake) -> None:

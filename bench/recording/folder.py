@@ -168,13 +168,11 @@ def open_recording(folder: Path, phantom: bool = False) -> Recording:
     force = _force(folder / "force.csv", about, notes)
     about, times, force = _from_start(about, times, force, notes)
     masks = MaskFiles.find(folder / "masks", folder)
-    still = folder / "tissue.png"
-    tissue = still if os.path.lexists(still) else None
+    tissue = folder / "tissue.png" if os.path.lexists(folder / "tissue.png") else None
     right, depths = _second_eye(folder, about)
     return Recording(
-        folder, about, footage, times, force, masks, tissue, tuple(notes),
-        None, right, depths,
-    )  # fmt: skip
+        folder, about, footage, times, force, masks, tissue, tuple(notes), right=right, depths=depths
+    )
 
 
 def _second_eye(folder: Path, about: Meta) -> tuple[Path | tuple[Path, ...], tuple[Path, ...]]:
@@ -270,26 +268,22 @@ def _rising(time: NDArray[np.float64]) -> NDArray[np.bool_]:
     """
     if len(time) == 0:
         return np.zeros(0, bool)
-    onwards = np.append(True, time[1:] > np.maximum.accumulate(time)[:-1])
-    back = time[::-1]
-    backwards = np.append(True, back[1:] < np.minimum.accumulate(back)[:-1])[::-1]
-    return np.asarray(onwards if onwards.sum() >= backwards.sum() else backwards, bool)
+    forward = np.append(True, time[1:] > np.maximum.accumulate(time)[:-1])
+    reverse = time[::-1]
+    backward = np.append(True, reverse[1:] < np.minimum.accumulate(reverse)[:-1])[::-1]
+    return np.asarray(forward if forward.sum() >= backward.sum() else backward, bool)
 
 
 def _force(path: Path, about: Meta, notes: list[str]) -> Force | None:
     if not os.path.lexists(path):
         return None
     columns = csv_table.read_csv(path, ("t_s", "fx_n", "fy_n", "fz_n"), ("gx", "gy", "gz"))
-    time = columns["t_s"]
+    for fault, check in (("without a time", np.isfinite), ("whose time stands still or runs back", _rising)):
+        good = check(columns["t_s"])
+        if not good.all():
+            notes.append(f"{path.name}: {np.sum(~good)} rows {fault} left out")
+        columns = {name: column[good] for name, column in columns.items()}
     newtons = np.stack([columns[name] for name in ("fx_n", "fy_n", "fz_n")], axis=1)
-    kept = np.isfinite(time)
-    if not kept.all():
-        notes.append(f"{path.name}: {np.sum(~kept)} rows without a time left out")
-    time, newtons = time[kept], newtons[kept]
-    new = _rising(time)
-    if not new.all():
-        notes.append(f"{path.name}: {np.sum(~new)} rows whose time stands still or runs back left out")
-    time, newtons = time[new], newtons[new]
     usable = np.isfinite(newtons).all(axis=1)
     if usable.sum() < 2:
         raise UserError(f"{path}: fewer than two rows with a time and three forces")
@@ -306,6 +300,6 @@ def _force(path: Path, about: Meta, notes: list[str]) -> Force | None:
         )
     gravity = None
     if all(name in columns for name in ("gx", "gy", "gz")):
-        gravity = np.stack([columns[name][kept][new] for name in ("gx", "gy", "gz")], axis=1)
+        gravity = np.stack([columns[name] for name in ("gx", "gy", "gz")], axis=1)
     sign = 1.0 if about.sensor.acts_on == "tissue" else -1.0
-    return Force(time, sign * 1000.0 * newtons, gravity)
+    return Force(columns["t_s"], sign * 1000.0 * newtons, gravity)
