@@ -78,8 +78,8 @@ def agreement(sensor: Curve, predicted: Curve, rng: np.random.Generator) -> dict
     x, y = sensor[good], predicted[good]
     if len(x) < 8:
         return {}
-    weights = _weights(x, y, rng)
-    values = _scores(weights, x, y)
+    block = max(block_length(x), block_length(y), block_length(y - x))
+    values = _scores(counts(len(x), block, RESAMPLES, rng), x, y)
     return {name: _interval(value) for name, value in values.items()}
 
 
@@ -111,11 +111,6 @@ def over_groups(values: Sequence[float], groups: Sequence[str], rng: np.random.G
     sizes = np.array([float(len(v)) for v in by.values()])
     picks = rng.integers(0, len(sums), (RESAMPLES, len(sums)))
     return _interval(sums[picks].sum(axis=1) / sizes[picks].sum(axis=1))
-
-
-def _weights(x: Curve, y: Curve, rng: np.random.Generator) -> NDArray[np.float64]:
-    block = max(block_length(x), block_length(y), block_length(y - x))
-    return counts(len(x), block, RESAMPLES, rng)
 
 
 def _scores(weights: NDArray[np.float64], x: Curve, y: Curve) -> dict[str, Curve]:

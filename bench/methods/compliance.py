@@ -91,7 +91,8 @@ def build(point_mm: float = 1.0, node_mm: float = 1.2, tets: int = 3000, compone
             u = block.system.solve(held.gather(unit))
             columns[some, axis] = picture(seen, u, components).transpose(2, 1, 0)
     matrix = columns.transpose(2, 3, 0, 1).reshape(components * len(points), 3 * len(nodes))
-    return Compliance(matrix, points, nodes, _areas(nodes))
+    flat = np.column_stack([nodes, np.zeros(len(nodes))])
+    return Compliance(matrix, points, nodes, surface_embedding.vertex_area(flat, Delaunay(nodes).simplices))
 
 
 def _disc(spacing_mm: float, radius_mm: float) -> Floats:
@@ -99,9 +100,3 @@ def _disc(spacing_mm: float, radius_mm: float) -> Floats:
     steps = np.arange(-np.floor(radius_mm / spacing_mm), np.floor(radius_mm / spacing_mm) + 1) * spacing_mm
     x, y = np.meshgrid(steps, steps)
     return np.stack([x, y], axis=-1)[np.hypot(x, y) <= radius_mm]
-
-
-def _areas(nodes: Floats) -> Floats:
-    """A third of the triangles round each node, mm^2."""
-    flat = np.column_stack([nodes, np.zeros(len(nodes))])
-    return surface_embedding.vertex_area(flat, Delaunay(nodes).simplices)

@@ -6,7 +6,7 @@ F = E a² g(u/a), so force goes with the scale's square: 5% of scale is 10% of f
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -43,12 +43,13 @@ def find_scale(meta: Meta, folder: Path) -> PixelScale:
     if meta.scale_mm_per_px == "unknown":
         wide = next(iter(open_recording(folder).frames())).rgb.shape[1]
         source = f"unknown: the picture is taken to be {ASSUMED_WIDTH_MM:g} mm wide"
-        return PixelScale(pixel_mm("unknown", wide), _first(meta.scale_uncertainty, _UNKNOWN), source)
-    if meta.scale_mm_per_px is not None:
-        return PixelScale(meta.scale_mm_per_px, _first(meta.scale_uncertainty, _STATED), "stated")
-    assert meta.calibration is not None
-    found = _calibrated(meta.calibration, folder)
-    return PixelScale(found.mm_per_px, _first(meta.scale_uncertainty, found.uncertainty), found.source)
+        found = PixelScale(pixel_mm("unknown", wide), _UNKNOWN, source)
+    elif meta.scale_mm_per_px is not None:
+        found = PixelScale(meta.scale_mm_per_px, _STATED, "stated")
+    else:
+        assert meta.calibration is not None
+        found = _calibrated(meta.calibration, folder)
+    return found if meta.scale_uncertainty is None else replace(found, uncertainty=meta.scale_uncertainty)
 
 
 def _calibrated(way: ScaleCalibration, folder: Path) -> PixelScale:
@@ -89,7 +90,3 @@ def _checkerboard(path: Path, corners: tuple[int, int], square_mm: float) -> Pix
     tilt = abs(float(sides[0].mean() - sides[1].mean())) / 2
     error = float(np.hypot(lengths.std() / np.sqrt(len(lengths)), tilt)) / middle
     return PixelScale(square_mm / middle, max(error, 1e-4), "checkerboard")
-
-
-def _first(*values: float | None) -> float:
-    return next(value for value in values if value is not None)
