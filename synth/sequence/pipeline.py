@@ -18,6 +18,7 @@ from synth.flow.track import Track
 from synth.job import identity
 from synth.job.schema import Job
 from synth.render.camera import video_link
+from synth.render.camera.camera import Camera
 from synth.sequence import mechanics, scenario
 from synth.sequence.published_labels import Published
 from synth.sequence.scenario import Scenario
@@ -29,6 +30,8 @@ from synth.system.stopwatch import StageCallback, Stopwatch
 _RENDERED = ("rgb", "flow", "visible", "tool", "glare", "depth")
 _STEREO = ("rgb_right", "flow_right", "visible_right", "depth_right", "motion")
 _PUBLISHED = ("flow_noisy", "intensity")
+_LENSES = (("rgb", "tool"), ("rgb_right", "tool_right"))
+"""What each lens sees of a frame: picture and instruments."""
 
 
 @dataclass(frozen=True)
@@ -46,19 +49,13 @@ class _Task:
 
 
 @dataclass(frozen=True)
-class _Film:
-    """What the cameras recorded, before a codec."""
+class _Video:
+    """What one lens records."""
 
     rgb: NDArray[np.uint8]
     """(T, H, W, 3)."""
-    rgb_right: NDArray[np.uint8] | None
-    """The same of the second lens; None where the job keeps none."""
     tools: NDArray[np.bool_]
     """(T, H, W) pixels of the instruments."""
-    tools_right: NDArray[np.bool_] | None
-    """The same of the second lens."""
-    poses: NDArray[np.float64]
-    """(T, 4, 4) mm, world to camera axes."""
 
 
 def render_sequence(job: Job, index: int, folder: Path, report: StageCallback) -> Path:
@@ -86,7 +83,7 @@ def write_scene(
     """Renders a scene, recovers its flow and writes `folder/NNNNNN.zarr`; else as `render_sequence`."""
     job, report, watch = scene.job, report or (lambda stage, done, of: None), watch or Stopwatch()
     with watch.stage("scene"):
-        studio = scene.renderer
+        renderer = scene.renderer
 
     width, height = job.render.size
     writer = Writer(folder, scene.index, frames=job.frames, size=(height, width), job=job)
@@ -94,21 +91,22 @@ def write_scene(
     writer.put("force", scene.force)  # labels are in camera axes
     writer.put("tissue", scene.tissue)
     writer.put("area", scene.area)
-    if studio.right is not None:
-        writer.put("disparity", studio.disparity())
+    if renderer.right is not None:
+        writer.put("disparity", renderer.disparity())
 
     task = _Task(scene, writer, watch, report)
-    film = _render_frames(task)
-    film = _write_video(task, film)
+    videos = _render_frames(task)
+    if _coded(job):
+        videos = _encode(task, videos)
     if job.flow.backend != "ideal":
-        recovered = _recover_flow(task, film)
+        recovered = _recover_flow(task, videos[0])
         if writer.wants("motion_recovered"):
-            _recover_motion(task, film, recovered)
+            _recover_motion(task, videos[0], videos[1], recovered)
     return _seal(task)
 
 
-def _render_frames(task: _Task) -> _Film:
-    """Renders every frame and writes its fields, but for video that a codec must see whole."""
+def _render_frames(task: _Task) -> list[_Video]:
+    """Renders every frame and writes its fields, but for what a codec must see whole; a video a lens."""
     job, scene, writer = task.job, task.scene, task.writer
     width, height = job.render.size
     labels = None
@@ -120,10 +118,9 @@ def _render_frames(task: _Task) -> _Film:
         for name in dict.fromkeys((*_RENDERED, *(_STEREO if job.render.stereo_mm else ()), *job.store.extra))
         if FIELDS[name].framed and not (_coded(job) and name.startswith("rgb"))
     ]
-    rgb = np.empty((job.frames, height, width, 3), np.uint8)
-    rgb_right = np.empty_like(rgb) if writer.wants("rgb_right") else None
-    tools = np.empty((job.frames, height, width), bool)
-    tools_right = None if rgb_right is None else np.empty_like(tools)
+    shape = (job.frames, height, width)
+    lenses = _LENSES if writer.wants("rgb_right") else _LENSES[:1]
+    videos = [_Video(np.empty((*shape, 3), np.uint8), np.empty(shape, bool)) for _ in lenses]
     poses = np.tile(np.eye(4), (job.frames, 1, 1))
     for t in range(job.frames):
         task.report("render", t, job.frames)
@@ -136,27 +133,21 @@ def _render_frames(task: _Task) -> _Film:
             writer.put_frame("traction", t, frame.traction)
             if job.render.exr:
                 writer.put_exr(t, frame.radiance)
-        rgb[t], tools[t] = frame.rgb, frame.tool
-        if rgb_right is not None and frame.rgb_right is not None:
-            rgb_right[t] = frame.rgb_right
-        if tools_right is not None and frame.tool_right is not None:
-            tools_right[t] = frame.tool_right
+        for video, (rgb, tool) in zip(videos, lenses, strict=True):
+            video.rgb[t], video.tools[t] = getattr(frame, rgb), getattr(frame, tool)
         poses[t, :3, :3], poses[t, :3, 3] = frame.camera.rotation, frame.camera.translation
-    return _Film(rgb, rgb_right, tools, tools_right, poses)
-
-
-def _write_video(task: _Task, film: _Film) -> _Film:
-    """Writes the cameras' poses, and video through its codec if it has one; returns the film as kept."""
-    job, writer, rgb, rgb_right = task.job, task.writer, film.rgb, film.rgb_right
     with task.watch.stage("store"):
-        writer.put("camera", film.poses)
-        if _coded(job):
-            rgb = video_link.recorded(rgb, job.sensor, job.fps)
-            writer.put("rgb", rgb)
-            if rgb_right is not None:
-                rgb_right = video_link.recorded(rgb_right, job.sensor, job.fps)
-                writer.put("rgb_right", rgb_right)
-    return replace(film, rgb=rgb, rgb_right=rgb_right)
+        writer.put("camera", poses)
+    return videos
+
+
+def _encode(task: _Task, videos: list[_Video]) -> list[_Video]:
+    """Writes the videos as the job's codec leaves them, and returns them so."""
+    with task.watch.stage("store"):
+        coded = [video_link.recorded(video.rgb, task.job.sensor, task.job.fps) for video in videos]
+        for rgb, (name, _) in zip(coded, _LENSES, strict=False):
+            task.writer.put(name, rgb)
+    return [replace(video, rgb=rgb) for video, rgb in zip(videos, coded, strict=True)]
 
 
 def _coded(job: Job) -> bool:
@@ -164,7 +155,7 @@ def _coded(job: Job) -> bool:
     return job.sensor.bitrate_mbps is not None
 
 
-def _recover_flow(task: _Task, film: _Film) -> Track:
+def _recover_flow(task: _Task, video: _Video) -> Track:
     """Follows the video with the job's estimator and writes what it finds.
 
     It has what a real pipeline has: the tool's outline, and glare as the picture shows it.
@@ -173,7 +164,7 @@ def _recover_flow(task: _Task, film: _Film) -> Track:
     task.report("flow", 0, job.frames)
     with task.watch.stage("flow"):
         tissue = task.scene.tissue
-        recovered = track.recover_flow(film.rgb, film.tools, tissue, estimator(job.flow))
+        recovered = track.recover_flow(video.rgb, video.tools, tissue, estimator(job.flow))
     with task.watch.stage("store"):
         for t in range(job.frames):
             writer.put_frame("flow_recovered", t, recovered.flow[t])
@@ -181,32 +172,32 @@ def _recover_flow(task: _Task, film: _Film) -> Track:
     return recovered
 
 
-def _recover_motion(task: _Task, film: _Film, left: Track) -> None:
+def _recover_motion(task: _Task, left: _Video, right: _Video, flow: Track) -> None:
     """Adds the right eye to the left one's flow and writes motion in three dimensions, frame by frame."""
     job, writer, scene = task.job, task.writer, task.scene
-    studio = scene.renderer
-    if film.rgb_right is None or film.tools_right is None or studio.right is None:
+    lens = scene.renderer.right
+    if lens is None:
         raise ValueError("there is no second lens")
-    blocked = mask.hidden(film.rgb, film.tools), mask.hidden(film.rgb_right, film.tools_right)
+    blocked = mask.hidden(left.rgb, left.tools), mask.hidden(right.rgb, right.tools)
     with task.watch.stage("stereo"):
         pair = rig.StereoRig(
             left=rig.Eye(scene.view.K, scene.view.distortion),
-            right=rig.Eye(studio.right.K, studio.right.distortion),
+            right=rig.Eye(lens.K, lens.distortion),
             rotation=np.eye(3),
             translation=np.array([-job.render.stereo_mm, 0.0, 0.0]),
             size=job.render.size,
         )
-        still = stereo.still_frames(left.flow, studio.rest.tissue)
-        eyes = film.rgb[:still], film.rgb_right[:still]
-        tracker = stereo.StereoTracker(pair, *eyes, blocked[0][0], blocked[1][0], studio.rest.tissue)
+        still = stereo.still_frames(flow.flow, scene.tissue)
+        eyes = left.rgb[:still], right.rgb[:still]
+        tracker = stereo.StereoTracker(pair, *eyes, blocked[0][0], blocked[1][0], scene.tissue)
     for t in range(job.frames):
         task.report("stereo", t, job.frames)
         with task.watch.stage("stereo"):
-            seen = left.flow[t], left.confidence[t]
+            seen = flow.flow[t], flow.confidence[t]
             if t == 0:
                 moved = stereo.Moved.nothing(scene.tissue.shape)
             else:
-                eyes = film.rgb[t], film.rgb_right[t]
+                eyes = left.rgb[t], right.rgb[t]
                 moved = tracker.step(*eyes, blocked[0][t], blocked[1][t], *seen)
         with task.watch.stage("store"):
             writer.put_frame("motion_recovered", t, moved.motion)
@@ -221,10 +212,7 @@ def _seal(task: _Task) -> Path:
         scenario=case.as_dict(),
         anatomy_id=identity.identify_anatomy(task.job, case.relief.seed),
         **_opening(task.job, case),
-        K=view.K.tolist(),
-        distortion=view.distortion.tolist(),
-        rotation=view.rotation.tolist(),
-        translation=view.translation.tolist(),
+        **_lens(view),
         scale_mm_per_px=scene.scale_mm_per_px,
         young_kpa=case.tissue.young_kpa,
         poisson=case.tissue.poisson,
@@ -242,16 +230,11 @@ def _opening(job: Job, case: Scenario) -> dict[str, Any]:
 
 
 def _second_lens(task: _Task) -> dict[str, Any]:
-    """The attribute `right` of a stereo sequence: K, distortion and pose of the second lens at rest."""
-    lens = task.scene.renderer.right
-    if lens is None:
-        return {}
-    return {
-        "right": {
-            "baseline_mm": task.job.render.stereo_mm,
-            "K": lens.K.tolist(),
-            "distortion": lens.distortion.tolist(),
-            "rotation": lens.rotation.tolist(),
-            "translation": lens.translation.tolist(),
-        }
-    }
+    """The attribute `right` of a stereo sequence: the second lens at rest."""
+    right = task.scene.renderer.right
+    return {} if right is None else {"right": {"baseline_mm": task.job.render.stereo_mm, **_lens(right)}}
+
+
+def _lens(camera: Camera) -> dict[str, Any]:
+    """Attributes of a lens: what it is, and its pose at rest."""
+    return {name: getattr(camera, name).tolist() for name in ("K", "distortion", "rotation", "translation")}

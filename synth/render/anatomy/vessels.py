@@ -57,7 +57,12 @@ def grow_all(sulci: Map, extent_mm: float, rng: np.random.Generator) -> Vessels:
         density=rich,
         winding=0.1,
     )
-    return Vessels(veins, arteries, _deep(sulci, extent_mm, rng))
+    # What shimmers through the tissue is coarser than the finest of the pia.
+    trunks, radius = trunk.trunks(
+        sulci, extent_mm, rng, round(3 * extent_mm / 34.0), (0.1, 0.2), smooth=18, wiggle=0.2
+    )
+    deep = _tree(extent_mm, rng, trunks, radius, spacings=(3.6, 1.9), leaf=0.05, wander=0.35)
+    return Vessels(veins, arteries, deep)
 
 
 def _tree(
@@ -107,14 +112,6 @@ def _wound(
     bends = [noise.sample(noise.band(rng, 256, extent_mm, 1.7, 0.35), nodes, extent_mm) for _ in range(2)]
     stiff = 1 / (1 + (radius / _STIFF_MM) ** 2)
     return np.asarray(amplitude * stiff[:, None] * np.stack(bends, axis=1), np.float64)
-
-
-def _deep(sulci: Map, extent_mm: float, rng: np.random.Generator) -> Tree:
-    """Vessels that shimmer through the tissue: another tree, coarser than the finest of the pia."""
-    trunks, radius = trunk.trunks(
-        sulci, extent_mm, rng, round(3 * extent_mm / 34.0), (0.1, 0.2), smooth=18, wiggle=0.2
-    )
-    return _tree(extent_mm, rng, trunks, radius, spacings=(3.6, 1.9), leaf=0.05, wander=0.35)
 
 
 def _sprouting(count: int, share: float, rng: np.random.Generator) -> npt.NDArray[np.bool_]:
