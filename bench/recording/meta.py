@@ -18,10 +18,10 @@ from pydantic import (
 )
 
 from synth.errors import UserError
+from synth.job.types import Positive
 from synth.system import checked_file
 from synth.system.config_file import ConfigFile
 
-Positive = Annotated[FiniteFloat, Field(gt=0)]
 Share = Annotated[FiniteFloat, Field(ge=0, lt=1)]
 Point = tuple[FiniteFloat, FiniteFloat]
 Corners = Annotated[int, Field(ge=2)]

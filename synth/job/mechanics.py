@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Annotated, Literal
+from typing import Annotated, Literal, get_args
 
 from pydantic import AfterValidator, BeforeValidator, Field, FiniteFloat, model_validator
 
@@ -127,14 +127,7 @@ class FemSection(Section):
     """Peak force of a contact [mN]; given, it takes the place of `load`."""
     footprint_mm: Range[Positive] = (3.0, 6.0)
     """Radius a of the contact [mm]."""
-    gestures: Annotated[tuple[Kind, ...], Field(min_length=1)] = (
-        "pull",
-        "push",
-        "slide",
-        "grasp",
-        "retract",
-        "tap",
-    )
+    gestures: Annotated[tuple[Kind, ...], Field(min_length=1)] = get_args(Kind)
     """Kinds of gesture that sequences are drawn from, in equal shares."""
     instruments: Range[Annotated[int, Field(ge=1, le=3)]] = (1, 1)
     """How many instruments act at once, each with a gesture, load, direction and timing of its own."""
