@@ -22,7 +22,7 @@ _LARGEST_MM, _SMALLEST_PX, _LARGEST_PX = 60.0, 160, 720
 _INSET_PX = 9  # from the opening's edge
 _ANATOMIES = 2
 # Green and blue over red in frames, against those of the reflectances they were rendered with.
-_SEEN_G, _SEEN_B = 0.825, 0.735
+_GREEN, _BLUE = 0.825, 0.735
 _USUAL = CameraSensor()
 
 _TRIED: dict[str, tuple[tuple[float, ...], Callable[[float], dict[str, float]]]] = {
@@ -32,15 +32,15 @@ _TRIED: dict[str, tuple[tuple[float, ...], Callable[[float], dict[str, float]]]]
         lambda k: {"full_well": _USUAL.full_well / k**2, "read_noise": _USUAL.read_noise / k},
     ),
     "sharpness": (
-        (-1.5, -0.7, 0.0, 0.5, 1.0, 2.0, 4.0),
+        (4.0, 2.0, 1.0, 0.5, 0.0, -0.7, -1.5),
         lambda px: {"blur": max(px, 0.0), "sharpening": _USUAL.sharpening + max(-px, 0.0)},
     ),
 }
-"""Of each figure: values that are tried, from less to more, and the sensor's keys that they stand for."""
+"""Of each figure: values that are tried, in the order in which it rises, and the sensor's keys for them."""
 
 
 @dataclass(frozen=True)
-class Frame:
+class TissueFrame:
     """A rendered frame before its sensor."""
 
     radiance: Map
@@ -74,18 +74,14 @@ def fit_camera(given: Photograph) -> dict[str, Any]:
         camera_now = keys | tried
         camera_now["vignette"] = camera_now.get("vignette", _USUAL.vignette) * reach**2
         taken = [given.compression.apply(one.record(camera_now)) for one in frames]
-        told = [
-            measure(rgb, one.usable, given.mm_per_px, reach)[name]
-            for rgb, one in zip(taken, frames, strict=True)
-        ]
-        return float(np.mean(told))
+        scale = given.mm_per_px, reach
+        figures = [measure(rgb, one.usable, *scale) for rgb, one in zip(taken, frames, strict=True)]
+        return float(np.mean([one[name] for one in figures]))
 
     for name, (tried, as_keys) in _TRIED.items():
         if np.isfinite(theirs[name]):
-            told = np.array([figure(name, as_keys(value)) for value in tried])
-            told = -told if name == "sharpness" else told
-            wanted = -theirs[name] if name == "sharpness" else theirs[name]
-            keys |= as_keys(float(np.interp(wanted, np.maximum.accumulate(told), tried)))
+            measured = np.maximum.accumulate([figure(name, as_keys(value)) for value in tried])
+            keys |= as_keys(float(np.interp(theirs[name], measured, tried)))
     rate = given.compression.bitrate_mbps(frames[0].record(keys))
     sensor: dict[str, Any] = {
         {"blur": "blur_px"}.get(name, name): float(f"{value:.3g}") for name, value in keys.items()
@@ -103,14 +99,13 @@ def nearest_family(theirs: dict[str, float]) -> Family:
 
     def off(family: Family) -> float:
         r, g, b = np.add(FAMILIES[family].crown, FAMILIES[family].flush)
-        return float(
-            np.hypot(np.log(_SEEN_G * g / r / theirs["green"]), np.log(_SEEN_B * b / r / theirs["blue"]))
-        )
+        green, blue = _GREEN * g / r / theirs["green"], _BLUE * b / r / theirs["blue"]
+        return float(np.hypot(np.log(green), np.log(blue)))
 
     return min(FAMILIES, key=off)
 
 
-def render(family: Family, width: int, mm_per_px: float, index: int) -> Frame:
+def render(family: Family, width: int, mm_per_px: float, index: int) -> TissueFrame:
     """A default frame without instruments: the anatomy, view and light of sequence `index`."""
     field = width * mm_per_px
     job = Job.model_validate(
@@ -125,4 +120,4 @@ def render(family: Family, width: int, mm_per_px: float, index: int) -> Frame:
     state = SceneState(scene.surface.vertices, nowhere, nowhere)
     radiance = scene.renderer.render(state, seed=index).radiance
     usable = cv2.erode(scene.tissue.astype(np.uint8), np.ones((_INSET_PX, _INSET_PX), np.uint8)) > 0
-    return Frame(radiance, usable, scene.scenario.look.sensor)
+    return TissueFrame(radiance, usable, scene.scenario.look.sensor)

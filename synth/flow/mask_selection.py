@@ -189,7 +189,7 @@ class SelectingTracker:
 
         `first`: the answer with what is `masked` so far; `known`: what of it was judged before.
         """
-        tracker, still = self.tracker, self.rest_found
+        tracker, at_rest = self.tracker, self.rest_found
         initial = first.flow if tracker.trusted and self._tested_px > 0 else None
         solved = [(self.rest_blocked, masked, first)]
 
@@ -203,10 +203,10 @@ class SelectingTracker:
             tracker.usable = tracker.tissue & ~self.rest_blocked
             return solved[-1][2]
 
-        bare = solve(still.known, found.known)
-        full = solve(still.known | still.either, found.known | found.either)
+        bare = solve(at_rest.known, found.known)
+        full = solve(at_rest.known | at_rest.either, found.known | found.either)
         rest, now = self._judge(frame, pieces, bare.flow, full.flow)
-        rest, now = rest | still.known, now | found.known
+        rest, now = rest | at_rest.known, now | found.known
         motion = _motion(bare.flow, tracker.tissue)
         if tracker.trusted and motion < self._tested_px:
             # What was found out at more motion stands: a highlight pulls at nothing while nothing moves.
@@ -215,10 +215,10 @@ class SelectingTracker:
         if tracker.is_doubtful(chosen) and not chosen.is_matched:
             return first, masked, False  # nothing is learned from a frame that can't be followed
         # Near a proposal the confidence speaks of the proposal, too.
-        beyond = tracker.tissue & ~(now | rest) & ~_grown(found.either | still.either)
+        beyond = tracker.tissue & ~(now | rest) & ~_grown(found.either | at_rest.either)
         without, level = (tracker.judge(one.flow, one.confidence, beyond).level for one in (bare, chosen))
         if without > level:
-            rest, now, chosen = still.known, found.known, bare
+            rest, now, chosen = at_rest.known, found.known, bare
         self._tested_px = max(motion, self._tested_px)
         self.rest_blocked = rest
         tracker.usable = tracker.tissue & ~rest
@@ -238,8 +238,8 @@ class SelectingTracker:
         common = inside & (np.concatenate([self._rest_pieces, moved, others]) <= 0).all(0)
         usual = float(residual[common].mean() if common.any() else np.median(residual))
 
-        def selected(layers: NDArray[np.int32], beside: bool) -> list[int]:
-            """Numbers of pieces, judged against what lies beside them or against all tissue."""
+        def selected(layers: NDArray[np.int32], local: bool) -> list[int]:
+            """Numbers of pieces, judged against what lies around them or against all tissue."""
             numbers = []
             for layer in layers:
                 for number in np.unique(layer[layer > 0]).tolist():
@@ -248,14 +248,14 @@ class SelectingTracker:
                         continue
                     ring = _grown(piece) & common
                     enough = np.count_nonzero(ring) >= _SMALLEST_PX
-                    around = float(residual[ring].mean()) if beside and enough else usual
+                    around = float(residual[ring].mean()) if local and enough else usual
                     came_between = float(residual[piece].mean()) > max(around + _UNEXPLAINED, _TIMES * around)
                     if came_between or (enough and float(gain[ring].mean()) > _GAIN):
                         numbers.append(number)
             return numbers
 
         # What something covers now is no worse at rest: there the neighbours are as little explained.
-        rest, now = selected(self._rest_pieces, beside=True), selected(moved, beside=False)
+        rest, now = selected(self._rest_pieces, local=True), selected(moved, local=False)
         return np.any(np.isin(self._rest_pieces, rest), axis=0), np.any(np.isin(pieces, now), axis=0)
 
 

@@ -34,14 +34,14 @@ class ToolNet(nn.Module):
         self.head = nn.Conv2d(a, 1, 1)
 
     def forward(self, picture: Tensor) -> Tensor:
-        kept = [self.stem(picture)]
+        skips = [self.stem(picture)]
         for layer in self.down:
-            kept.append(layer(kept[-1]))
-        field = kept.pop()
+            skips.append(layer(skips[-1]))
+        field = skips.pop()
         for layer in self.up:
-            beside = kept.pop()
-            field = F.interpolate(field, size=beside.shape[-2:], mode="bilinear", align_corners=False)
-            field = layer(torch.cat([field, beside], 1))
+            skip = skips.pop()
+            field = F.interpolate(field, size=skip.shape[-2:], mode="bilinear", align_corners=False)
+            field = layer(torch.cat([field, skip], 1))
         logits: Tensor = self.head(field)
         return logits
 

@@ -86,7 +86,7 @@ class Change:
     """(h, w) by cell: 1 / k^2, in 1/px^2."""
     misfit: Map
     """(h, w) by cell: mean square of the residuals left, in their median's; 1 where nothing is seen."""
-    seen: Map
+    visible: Map
     """(H, W) 0 or 1: in all four pictures."""
     lag: float = 0.0
     """Share of the left eye's motion that the right one doesn't show: of eyes that aren't of one moment."""

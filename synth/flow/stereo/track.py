@@ -20,7 +20,7 @@ _STILL_PX = 0.3  # frames whose flow is nearly everywhere below this are at rest
 _RESTS = 4
 _IN_TIME = 0.12  # share of the motion that eyes of one moment may seem to differ by
 _FOLLOWED = 0.3  # confidence of the flow: some 0.05 under a tool that no mask knows, 0.9 on tissue
-_LOST = 0.05  # of what is seen at rest: a frame that shows less is no place to start from
+_LOST = 0.05  # of what is visible at rest: a frame that shows less is no place to start from
 
 
 @dataclass(frozen=True)
@@ -128,7 +128,7 @@ class StereoTracker:
         pictures = StereoPictures(self._left, self._right, followed, now, other, now_usable, other_usable)
         straight = r.flow(flow)
         change = self.solver.solve(pictures, straight, self.rest.disparity, self.px_per_mm, self._change)
-        lost = float(change.seen.sum()) < _LOST * float(self._usable.sum())
+        lost = float(change.visible.sum()) < _LOST * float(self._usable.sum())
         self._change = None if lost else change.px
         return self._moved(change, straight, confidence)
 
