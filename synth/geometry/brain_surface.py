@@ -30,28 +30,19 @@ class Brain:
     shape: Shape
     origin: Floats
     """(3,) mm, the craniotomy's centre in the file's axes."""
-    turn: Floats
-    """(3, 3) rows: world axes in the file's."""
-
-    def placed(self, attachments: Sequence[AttachmentSection]) -> tuple[AttachmentSection, ...]:
-        """Attachments given in the file's axes, in world axes."""
-        return tuple(
-            a.model_copy(
-                update={
-                    "point": tuple(self.turn @ (np.asarray(a.point) - self.origin)),
-                    "normal": None if a.normal is None else tuple(self.turn @ np.asarray(a.normal)),
-                }
-            )
-            for a in attachments
-        )
+    attachments: tuple[AttachmentSection, ...]
+    """Where it is held inside, in world axes."""
 
 
-def load_brain(path: Path, craniotomy: CraniotomySection) -> Brain:
+def load_brain(
+    path: Path, craniotomy: CraniotomySection, attachments: Sequence[AttachmentSection] = ()
+) -> Brain:
     """Reads a surface (OBJ, STL, PLY, OFF or legacy VTK), merges what belongs together, and places it.
 
     Args:
         path: the file, coordinates in mm.
         craniotomy: point and direction in the file's axes.
+        attachments: in the file's axes.
 
     Raises:
         UserError: the file cannot be read, encloses no volume, or has no surface at the craniotomy.
@@ -71,7 +62,16 @@ def load_brain(path: Path, craniotomy: CraniotomySection) -> Brain:
         )
     placed[:, 2] -= heights.max()
     origin = origin + heights.max() * turn[2]
-    return Brain(Shape(np.ascontiguousarray(placed), faces.astype(np.int32)), origin, turn)
+    held = tuple(
+        a.model_copy(
+            update={
+                "point": tuple(turn @ (np.asarray(a.point) - origin)),
+                "normal": None if a.normal is None else tuple(turn @ np.asarray(a.normal)),
+            }
+        )
+        for a in attachments
+    )
+    return Brain(Shape(np.ascontiguousarray(placed), faces.astype(np.int32)), origin, held)
 
 
 def read_brain(path: Path) -> tuple[Floats, NDArray[np.int64]]:

@@ -132,9 +132,8 @@ def from_brain(
     top = points[np.hypot(points[:, 0], points[:, 1]) < anatomy.craniotomy.radius_mm, 2].max(initial=-np.inf)
     if top < -anatomy.craniotomy.radius_mm:
         raise UserError("anatomy.craniotomy: there is no volume under the opening")
-    held = brain.placed(anatomy.attachments)
     points, cells = with_midsides(points, cells)
-    return _finished(points, cells, np.zeros(len(points), bool), anatomy.craniotomy, held, slips)
+    return _finished(points, cells, np.zeros(len(points), bool), anatomy.craniotomy, brain.attachments, slips)
 
 
 def dome(xy: Floats, radius_mm: float) -> Floats:
