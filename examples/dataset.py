@@ -14,12 +14,6 @@ from pathlib import Path
 import numpy as np
 
 import synth
-from synth.dataset import folder, index
-from synth.fem.tool import ToolMotion
-from synth.publish import card
-from synth.render.camera.camera import Camera
-from synth.sequence import scenario
-from synth.sequence.pipeline import write_scene
 
 FPS, FRAMES = 25.0, 12
 
@@ -30,21 +24,21 @@ class Arc:
 
     deg_per_s: float
 
-    def at(self, camera: Camera, seconds: float) -> Camera:
+    def at(self, camera: synth.Camera, seconds: float) -> synth.Camera:
         """The camera at a time, `camera` being that of time 0."""
         angle = np.radians(self.deg_per_s * seconds)
         turn = np.array([[1, 0, 0], [0, np.cos(angle), -np.sin(angle)], [0, np.sin(angle), np.cos(angle)]])
         return replace(camera, rotation=camera.rotation @ turn)  # x -> R x + t: the origin stays where it was
 
 
-def stir(radius_mm: float, turns: float, frames: int) -> ToolMotion:
+def stir(radius_mm: float, turns: float, frames: int) -> synth.ToolMotion:
     """Comes down, presses harder, runs round a circle and leaves; frame 0 is at rest."""
     t = np.linspace(0, 1, frames)
     load = np.sin(np.pi * np.clip((t - 0.1) / 0.8, 0, 1)) ** 2  # touches at 10% of the time, leaves at 90%
     away = np.clip(1 - t / 0.1, 0, 1) + np.clip((t - 0.9) / 0.1, 0, 1)
     phase = 2 * np.pi * turns * t
     circle = radius_mm * np.stack([np.cos(phase) - 1, np.sin(phase)], axis=1)
-    return ToolMotion(load, away, circle)
+    return synth.ToolMotion(load, away, circle)
 
 
 def main(root: Path, sequences: int) -> None:
@@ -63,10 +57,10 @@ def main(root: Path, sequences: int) -> None:
         }
     )
     rng = np.random.default_rng(job.seed)
-    with folder.claim(root, job) as out:
+    with synth.open_dataset(root, job) as folder:
         for k in range(sequences):
             # A plausible patient, instrument and microscope, drawn by the generator ...
-            case = scenario.draw(job, k)
+            case = synth.draw_scenario(job, k)
             # ... and the look, the camera's path and the tool's path, which are ours.
             look = replace(
                 case.look,
@@ -78,11 +72,9 @@ def main(root: Path, sequences: int) -> None:
             motion = stir(radius_mm=rng.uniform(1, 2), turns=rng.choice([-1.0, 1.0]), frames=FRAMES)
             # Mechanics, pictures, truth and recovered flow follow; the store is sealed as any other.
             scene = synth.simulate(job, k, case=case, motions=[motion])
-            path = write_scene(scene, root)
+            path = synth.write_scene(scene, folder)
             peak = np.linalg.norm(scene.force, axis=1).max()
             print(f"{path.name}: {peak:.2f} mN at most, {case.look.family}")
-        index.write_index(out)
-        card.write_card(out)
 
 
 if __name__ == "__main__":

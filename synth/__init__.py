@@ -21,6 +21,12 @@ _WHERE = {
     "open_sequence": "synth.dataset.store",
     "simulate": "synth.sequence.scene",
     "recover_flow": "synth.flow.track",
+    "Camera": "synth.render.camera.camera",
+    "Scenario": "synth.sequence.scenario",
+    "ToolMotion": "synth.fem.tool",
+    "draw_scenario": "synth.sequence.scenario",
+    "open_dataset": "synth.engine.run",
+    "write_scene": "synth.sequence.pipeline",
     "render_job": "synth.engine.run",
 }
 

@@ -2,8 +2,10 @@ from synth.dataset.store import Dataset as Dataset
 from synth.dataset.store import Sequence as Sequence
 from synth.dataset.store import open_sequence as open_sequence
 from synth.engine.run import Summary as Summary
+from synth.engine.run import open_dataset as open_dataset
 from synth.engine.run import render_job as render_job
 from synth.errors import UserError as UserError
+from synth.fem.tool import ToolMotion as ToolMotion
 from synth.flow.estimator import Estimator as Estimator
 from synth.flow.track import Track as Track
 from synth.flow.track import recover_flow as recover_flow
@@ -11,6 +13,10 @@ from synth.job.laws import Law as Law
 from synth.job.laws import add_law as add_law
 from synth.job.reader import load_job as load_job
 from synth.job.schema import Job as Job
+from synth.render.camera.camera import Camera as Camera
+from synth.sequence.pipeline import write_scene as write_scene
+from synth.sequence.scenario import Scenario as Scenario
+from synth.sequence.scenario import draw_scenario as draw_scenario
 from synth.sequence.scene import Frame as Frame
 from synth.sequence.scene import Scene as Scene
 from synth.sequence.scene import simulate as simulate

@@ -44,7 +44,7 @@ def measure_scene(index: int, count: int) -> Row:
 
     Half of the load is taken first.
     """
-    case = scenario.draw(_JOB, index)
+    case = scenario.draw_scenario(_JOB, index)
     surface, _ = mechanics.cortex(_JOB, case)
     gesture, height = case.gesture, HeightMap(surface.pia, surface.extent_mm)
     row: Row = {"index": index, "tets": count, "kind": gesture.kind, "load": gesture.load}

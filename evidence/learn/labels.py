@@ -82,7 +82,7 @@ def key(job: Job, index: int, grid: Grid) -> str:
 
 def clip(job: Job, index: int, grid: Grid, name: str) -> Clip:
     """One sequence of a job: deformed, projected, put on the grid."""
-    case = scenario.draw(job, index)
+    case = scenario.draw_scenario(job, index)
     view = camera.place(case.view, job.render)
     surface, tets = mechanics.build(job, case)
     motion = mechanics.move(job, case, surface, tets)

@@ -129,9 +129,7 @@ def run_job(job: Job, root: Path, options: Options, watcher: Watcher) -> Summary
         finally:
             rows = index.write_index(folder)
         if done or not (root / "preview.mp4").exists():
-            film.write_preview(root)
-            card.write_card(folder)
-            croissant.write_croissant(folder)
+            _publish(folder)
         return Summary(
             total=job.sequences,
             already=len(finished),
@@ -139,6 +137,31 @@ def run_job(job: Job, root: Path, options: Options, watcher: Watcher) -> Summary
             failed={key: failure["reason"] for key, failure in folder.failures().items()},
             content_hash=index.dataset_hash(rows),
         )
+
+
+@contextmanager
+def open_dataset(root: str | Path, job: Job) -> Iterator[Path]:
+    """A folder for scenes of one's own, written by `write_scene`; index, preview and card follow at the end.
+
+    Example:
+        with synth.open_dataset("out", job) as folder:
+            synth.write_scene(synth.simulate(job, 0, motions=[circle]), folder)
+
+    Raises:
+        UserError: the folder is not for this job.
+    """
+    with claim(Path(root), job) as folder:
+        try:
+            yield folder.root
+        finally:
+            index.write_index(folder)
+        _publish(folder)
+
+
+def _publish(folder: Folder) -> None:
+    film.write_preview(folder.root)
+    card.write_card(folder)
+    croissant.write_croissant(folder)
 
 
 class _Pool:

@@ -65,7 +65,7 @@ def find_openings(mesh: Path, radius_mm: float, count: int) -> list[Opening]:
         section = AnatomySection(mesh=mesh.resolve(), vertices=2500, craniotomy=one.craniotomy(radius_mm))
         job = Job(anatomy=section, fem=FemSection(tets=400))  # whether it meshes, not how well
         try:
-            mechanics.build(job, scenario.draw(job, 0))
+            mechanics.build(job, scenario.draw_scenario(job, 0))
         except UserError as error:
             why = str(error)
             continue

@@ -77,7 +77,7 @@ class Scenario:
         return described
 
 
-def draw(job: Job, index: int) -> Scenario:
+def draw_scenario(job: Job, index: int) -> Scenario:
     """Draws sequence `index` of `job`; independent of how many others there are and of their order."""
     anatomy = index % (job.anatomy.variety or job.sequences)
     family = job.appearance.families[index % len(job.appearance.families)]

@@ -186,7 +186,7 @@ def at_rest(
     Raises:
         UserError: the job's surface or calibration cannot be used.
     """
-    case = case or scenario.draw(job, index)
+    case = case or scenario.draw_scenario(job, index)
     if gestures is not None:
         first, *further = (replace(case.gesture, kind=kind) for kind in gestures)
         case = replace(case, gesture=first, further=tuple(further))

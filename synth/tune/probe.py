@@ -87,7 +87,7 @@ def _render(job_json: str, numbers: tuple[int, ...]) -> tuple[Scene, list[Frame]
     """Frames of a job's first sequence; CPU-s of its physics and scene, and of a frame."""
     job = Job.model_validate_json(job_json)
     moved, physics_s = _simulate(job.model_dump_json(include=_PHYSICS))
-    case = scenario.draw(job, 0)
+    case = scenario.draw_scenario(job, 0)
     scene = replace(moved, job=job, scenario=case, view=camera.place(case.view, job.render))
     _, scene_s = _timed(lambda: scene.renderer)
     rendered = [_timed(partial(scene.frame, t)) for t in numbers]

@@ -31,7 +31,7 @@ LIVING = {
 def random_scene(index: int, **fem: Any) -> None:
     shared = {"seed": 0, "sequences": 10**6, "frames": 12, "anatomy": {"vertices": 10_000}}
     job = schema.Job.model_validate({**shared, "fem": {"tets": 500, **fem}})
-    case = scenario.draw(job, index)
+    case = scenario.draw_scenario(job, index)
     moved = mechanics.move(job, case, *mechanics.build(job, case))
     for numbers in (moved.displacement, moved.traction, moved.tip, moved.energy):
         assert np.isfinite(numbers).all()

@@ -145,7 +145,8 @@ def test_anatomies_are_told_apart_by_what_a_sequence_says() -> None:
     from synth.sequence import scenario
 
     job = Job.model_validate({"sequences": 6, "anatomy": {"variety": 3}})
-    cases = [{"scenario": scenario.draw(job, i).as_dict(), "content_hash": f"hash{i}"} for i in range(6)]
+    drawn = [scenario.draw_scenario(job, i).as_dict() for i in range(6)]
+    cases = [{"scenario": one, "content_hash": f"hash{i}"} for i, one in enumerate(drawn)]
     names = [name_anatomy(case) for case in cases]
     assert names[:3] == names[3:]
     assert len(set(names)) == 3

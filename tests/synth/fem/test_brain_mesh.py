@@ -24,7 +24,7 @@ def test_a_messy_surface_of_every_format_is_meshed_and_moved(suffix: str, tmp_pa
         anatomy=schema.AnatomySection(mesh=path, vertices=2500, craniotomy=OPENING),
         fem=schema.FemSection(tets=600, load=0.1, gestures=("pull",)),
     )
-    drawn = scenario.draw(case, 0)
+    drawn = scenario.draw_scenario(case, 0)
     surface, tets = mechanics.build(case, drawn)
     volume = bary_slope(tets.points[tets.cells[:, :4]])[1]
     assert volume.min() > 0

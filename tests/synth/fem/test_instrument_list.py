@@ -28,7 +28,7 @@ def job(*crew: dict[str, Any], **fem: Any) -> synth.Job:
 
 def test_what_is_asked_is_done_and_the_rest_is_drawn() -> None:
     asked = job(PUSH, PULL)
-    cases = [scenario.draw(asked, index) for index in range(20)]
+    cases = [scenario.draw_scenario(asked, index) for index in range(20)]
     for case in cases:
         push, pull = case.gestures
         assert (push.kind, push.point_mm, push.load, push.footprint_mm) == ("push", (4.0, 0.0), 0.1, 3.5)

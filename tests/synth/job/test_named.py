@@ -18,7 +18,7 @@ CURVES = HOME / "evidence" / "curves"
 def test_it_is_read_drawn_and_on_the_page(name: str) -> None:
     job = reader.load_job(name)
     for index in range(min(job.sequences, 5)):
-        assert scenario.draw(job, index).gestures
+        assert scenario.draw_scenario(job, index).gestures
     assert f"| `{name}` |" in PAGE
 
 

@@ -53,7 +53,7 @@ def test_the_command_draws_the_places_and_prints_a_job_that_works(egg: Path, tmp
     (tmp_path / "job.yaml").write_text(done.stdout)
     job = synth.load_job(str(tmp_path / "job.yaml"), ["anatomy.vertices=2500", "fem.tets=400"])
     assert job.anatomy.mesh == egg
-    mechanics.build(job, scenario.draw(job, 0))
+    mechanics.build(job, scenario.draw_scenario(job, 0))
     (tmp_path / "job.yaml").write_text(done.stdout.replace("    # ", "    "))
     both = synth.load_job(str(tmp_path / "job.yaml")).anatomy.craniotomy
     assert len(both.also) == 1
@@ -65,7 +65,7 @@ def test_sequences_take_the_openings_of_a_brain_in_turn(egg: Path, found: list[O
     also = [{name: one[name] for name in ("point", "direction")} for one in others]
     anatomy = {"mesh": egg, "vertices": 2500, "craniotomy": first | {"also": also}}
     job = synth.Job.model_validate({"sequences": 6, "frames": 2, "anatomy": anatomy})
-    cases = [scenario.draw(job, index) for index in range(6)]
+    cases = [scenario.draw_scenario(job, index) for index in range(6)]
     for index, case in enumerate(cases):
         origin = mechanics.cortex(job, case)[1].origin  # type: ignore[union-attr]
         assert np.linalg.norm(origin - found[index % 3].point) < 1.0

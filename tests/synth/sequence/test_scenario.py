@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 from synth.job.schema import Job
-from synth.sequence.scenario import draw, frame_seeds
+from synth.sequence.scenario import draw_scenario, frame_seeds
 
 
 def test_same_job_and_index_draw_the_same_scenario_however_many_sequences_there_are() -> None:
     few, many = Job(seed=7, sequences=3), Job(seed=7, sequences=300)
-    assert draw(few, 2) == draw(many, 2)
+    assert draw_scenario(few, 2) == draw_scenario(many, 2)
     assert frame_seeds(few, 2) == frame_seeds(many, 2)
 
 
 def test_shares_are_drawn_and_what_is_not_asked_for_changes_no_draw() -> None:
-    plain = [draw(Job(sequences=40), k) for k in range(40)]
+    plain = [draw_scenario(Job(sequences=40), k) for k in range(40)]
     fem = {"membrane": {"probability": 0.5}, "pulse": {"heart_mm": [0.1, 0.5]}, "skull": ["bonded", "slip"]}
     drawn = [
-        draw(Job.model_validate({"sequences": 40, "fem": fem | {"poisson": [0.4, 0.49]}}), k)
+        draw_scenario(Job.model_validate({"sequences": 40, "fem": fem | {"poisson": [0.4, 0.49]}}), k)
         for k in range(40)
     ]
     assert 10 < sum(one.tissue.membrane is not None for one in drawn) < 30
