@@ -9,11 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from synth.fem import surface_embedding, tool
-from synth.fem.equilibrium import InvertedElement, solve_mixed_path, solve_path
+from synth.fem.equilibrium import InvertedElement, LoadPath, solve_mixed_path, solve_path
 from synth.fem.material import Tissue
 from synth.fem.mesh.tetrahedra import Tets
 from synth.fem.motion import Clock, march_in_time, volume
 from synth.fem.pulse import Pulse, lift
+from synth.fem.surface_embedding import Embedding
 from synth.fem.tool import Gesture, ToolMotion
 from synth.geometry.triangles import Shape
 from synth.job import schema
@@ -120,13 +121,26 @@ def deform(
         loads += height[:, None, None] * raising
         raised = embedding.move(system.solve(raising))
         pulse_work = 0.5 * height * np.einsum("v,tvd,vd->t", area, traction, raised, optimize=True)
-
     if fem.time == "dynamic" or fem.relaxation:
         path = march_in_time(tets, tissue, loads, load_parameter, clock(fem, fps, tets))
-    elif pulse is None and tissue.sheet is None:
-        path = solve_path(system, loads, load_parameter)
     else:
-        path = solve_mixed_path(system, loads, load_parameter)
+        mixed = pulse is not None or tissue.sheet is not None
+        path = (solve_mixed_path if mixed else solve_path)(system, loads, load_parameter)
+    return _on_surface(path, tissue, tools, traction, area, embedding, surface, time, pulse_work)
+
+
+def _on_surface(
+    path: LoadPath,
+    tissue: Tissue,
+    tools: Sequence[tuple[Gesture, ToolMotion]],
+    traction: Floats,
+    area: Floats,
+    embedding: Embedding,
+    surface: Shape,
+    time: Floats,
+    pulse_work: Floats,
+) -> Deformation:
+    """What states of the volume are on the surface, and the instruments on it."""
     displacement = np.stack([embedding.move(u) for u in path.displacement])
     poses = [tool.pose(g, moved, surface, surface.vertices + displacement) for g, moved in tools]
     forces = [np.outer(m.load, np.sum([c.force_mn for c in g.contacts], axis=0)) for g, m in tools]
