@@ -1,1 +1,1 @@
-"""Films of others: read, written: pictures in and out, their masks and scale."""
+"""Films as files: frames read and written, masks of the tool, millimetres a pixel."""
