@@ -195,7 +195,9 @@ class Job(Section):
         if "vertices" not in self.anatomy.model_fields_set:
             width, height = self.render.size
             fine = min(max(width * height // 4, 6000), self.anatomy.vertices)
-            object.__setattr__(self, "anatomy", self.anatomy.model_copy(update={"vertices": fine}))
+            anatomy = self.anatomy.model_copy(update={"vertices": fine})
+            anatomy.model_fields_set.discard("vertices")  # another size of the picture asks for others
+            object.__setattr__(self, "anatomy", anatomy)
         return self
 
     @model_validator(mode="after")

@@ -116,7 +116,7 @@ def override(settings: Model, changes: Iterable[str]) -> Model:
     Raises UserError: one line for every mistake, `'batch=many': batch: 'many' should be ...`.
     """
     config = ConfigFile("{}", "")
-    config.values = settings.model_dump()
+    config.values = settings.model_dump(exclude_unset=True)
     config.change(changes)
     return config.validate(type(settings))
 
