@@ -1,4 +1,4 @@
-"""The studio on every variant that runs here."""
+"""The renderer on every variant that runs here."""
 
 import subprocess
 import sys
