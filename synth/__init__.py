@@ -23,7 +23,7 @@ _WHERE = {
     "recover_flow": "synth.flow.track",
     "Camera": "synth.render.camera.camera",
     "Scenario": "synth.sequence.scenario",
-    "ToolMotion": "synth.fem.tool",
+    "ToolMotion": "synth.fem.tool_gesture",
     "draw_scenario": "synth.sequence.scenario",
     "open_dataset": "synth.engine.run",
     "write_scene": "synth.sequence.pipeline",

@@ -5,7 +5,7 @@ from synth.engine.run import Summary as Summary
 from synth.engine.run import open_dataset as open_dataset
 from synth.engine.run import render_job as render_job
 from synth.errors import UserError as UserError
-from synth.fem.tool import ToolMotion as ToolMotion
+from synth.fem.tool_gesture import ToolMotion as ToolMotion
 from synth.flow.estimator import Estimator as Estimator
 from synth.flow.track import Track as Track
 from synth.flow.track import recover_flow as recover_flow

@@ -253,7 +253,7 @@ def export(
     ] = None,
 ) -> None:
     """Writes the dataset in a format of others, or as films to look at."""
-    from synth.publish.export.formats import export_dataset
+    from synth.publish.export.registry import export_dataset
 
     options = {}
     if to == "video":

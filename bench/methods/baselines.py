@@ -18,7 +18,7 @@ from sklearn.linear_model import Ridge
 from sklearn.model_selection import PredefinedSplit, cross_val_predict
 from sklearn.neighbors import KNeighborsRegressor
 
-from bench.methods import compliance, inverse
+from bench.methods import compliance, elastic_inverse
 from bench.methods.protocol import Field, ForceEstimate, Method, MethodContext
 from learn.data.clips import assumed_young, has_depth
 from learn.data.grid import Grid, GridView, certainty
@@ -88,9 +88,9 @@ def physical() -> dict[str, Method]:
 def physical_rules() -> dict[str, Rule]:
     """The inverses of the physics."""
     solvers = {
-        "Tikhonov, FEM compliance": inverse.tikhonov,
-        "Tikhonov near the contact": inverse.tikhonov_near,
-        "one contact, FEM compliance": inverse.one_contact,
+        "Tikhonov, FEM compliance": elastic_inverse.tikhonov,
+        "Tikhonov near the contact": elastic_inverse.tikhonov_near,
+        "one contact, FEM compliance": elastic_inverse.one_contact,
     }
     return {name: _inverse(solve) for name, solve in solvers.items()}
 

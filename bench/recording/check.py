@@ -13,7 +13,7 @@ from bench.recording.folder import Recording, open_recording
 from bench.recording.meta import LEAST_INTERVALS, LEAST_TURNING
 from bench.recording.second_eye import LATE, SecondEye
 from synth.errors import UserError
-from synth.recording_flow.quality import find_fault
+from synth.recording_flow.frame_faults import find_fault
 from synth.recording_flow.video_flow import RecordingFlowSettings, VideoFlow
 
 _WIDEST_MM, _NARROWEST_MM = 300.0, 3.0

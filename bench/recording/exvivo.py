@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from bench.recording import writer
 from synth.errors import UserError
-from synth.fem import solver, tool
+from synth.fem import solver, tool_gesture
 from synth.fem.mesh import tetrahedra
 from synth.fem.mesh.relief import HeightMap
 from synth.fem.solver import Deformation
@@ -157,10 +157,10 @@ def _fill(plan: Plan, index: int, part: Path, progress: Callable[[int], None]) -
 
 
 def _moved(
-    job: jobs.Job, case: scenario.Scenario, gesture: tool.Gesture, surface: CortexSurface
+    job: jobs.Job, case: scenario.Scenario, gesture: tool_gesture.Gesture, surface: CortexSurface
 ) -> Deformation:
     """The path from no load to full: a gesture that only rises."""
-    rising = tool.Gesture(**{**vars(gesture), "timing": (0.02, 1.0, 2.0, 3.0)})
+    rising = tool_gesture.Gesture(**{**vars(gesture), "timing": (0.02, 1.0, 2.0, 3.0)})
     height = HeightMap(surface.pia, surface.extent_mm)
     tets = tetrahedra.block(job.anatomy, job.fem.tets, gesture.focus, height)
     shape = Shape(surface.vertices, surface.faces)
@@ -207,7 +207,7 @@ def _frame_times(plan: Plan, rng: np.random.Generator) -> Floats:
 
 
 def _pose(
-    motion: Deformation, gesture: tool.Gesture, course: _Course, at: int, rng: np.random.Generator
+    motion: Deformation, gesture: tool_gesture.Gesture, course: _Course, at: int, rng: np.random.Generator
 ) -> tuple[Floats, Floats, Floats]:
     """Surface and instrument: between two levels of the path; the hand trembles by a tenth of a mm."""
     levels = np.linalg.norm(motion.force, axis=1) / gesture.force_mn
@@ -216,7 +216,9 @@ def _pose(
     width = max(levels[above] - levels[above - 1], 1e-9)
     part = float(np.clip((strain - levels[above - 1]) / width, 0, 1))
     moved = (1 - part) * motion.displacement[above - 1] + part * motion.displacement[above]
-    places = tool.anchors(gesture, tool.trajectory(gesture, 2), Shape(motion.rest, motion.faces))
+    places = tool_gesture.anchors(
+        gesture, tool_gesture.trajectory(gesture, 2), Shape(motion.rest, motion.faces)
+    )
     corners, weights = (of[0] for of in places)
     touched = np.einsum("kc,kcd->kd", weights, (motion.rest + moved)[corners])
     shafts = motion.shaft[-1]

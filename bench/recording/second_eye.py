@@ -10,7 +10,7 @@ import numpy as np
 
 from bench.recording.folder import Recording
 from synth.errors import UserError
-from synth.flow import mask
+from synth.flow import mask_detection
 from synth.flow.estimator import Flags, Map, Rgb
 from synth.flow.stereo import calibration
 from synth.flow.stereo.depth_camera import DepthTracker
@@ -177,5 +177,5 @@ def _mask_right(rgb: Rgb, kind: str, left: Flags) -> Flags:
     nothing = np.zeros(rgb.shape[:2], bool)
     if kind == "none" or (kind == "auto" and not left.any()):
         return nothing
-    glare = nothing if kind == "tool" else mask.glare(rgb)
-    return glare if kind == "glare" else glare | mask.tool(rgb)
+    glare = nothing if kind == "tool" else mask_detection.glare(rgb)
+    return glare if kind == "glare" else glare | mask_detection.tool(rgb)

@@ -21,7 +21,7 @@ from learn.data.grid import Grid, Resampler, centre
 from synth.dataset import location
 from synth.dataset.folder import write_whole
 from synth.dataset.store import Sequence, open_sequence
-from synth.flow import mask
+from synth.flow import mask_detection
 from synth.flow.estimator import Estimator
 from synth.flow.track import track
 from synth.job import identity
@@ -154,7 +154,7 @@ class Sequences:
         if flow == "ideal":
             return replace(clip, displacement=clip.displacement | {"recovered": clip.displacement["ideal"]})
         began = time.process_time()
-        hidden = mask.hidden(sequence["rgb"][...], sequence["tool"][...].astype(bool))
+        hidden = mask_detection.hidden(sequence["rgb"][...], sequence["tool"][...].astype(bool))
         masks_s = time.process_time() - began
         estimator = scene.estimator(self._job.flow.model_copy(update={"backend": flow}))
         recovered, flow_s = recover_flow(sequence, clip, estimator, hidden, GRID)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from synth.fem import equilibrium, surface_embedding, tool
+from synth.fem import equilibrium, surface_embedding, tool_gesture
 from synth.fem.material import Tissue
 from synth.fem.mesh import tetrahedra
 from synth.fem.surface_embedding import Embedding
@@ -67,7 +67,7 @@ def brain(on: Patch, law: str, tets: int, contact: tuple[float, float, float], p
     """Meshes, assembles and embeds."""
     volume = tetrahedra.block(ANATOMY, tets, (contact,))
     embedding = surface_embedding.embed(volume, on.vertices)
-    pressure = tool.footprint(np.array(contact[:2]), contact[2], on.vertices, on.area)
+    pressure = tool_gesture.footprint(np.array(contact[:2]), contact[2], on.vertices, on.area)
     system = assemble(volume, law, poisson)
     return Brain(system, embedding, on.area * pressure, contact[2])
 
@@ -90,7 +90,7 @@ def speed(case: Brain, load: float, way: str, frames: int = 60) -> float:
     gesture = scenario.draw_gesture(
         fem, ANATOMY.craniotomy.radius_mm, tissue.young_kpa, np.random.default_rng(0)
     )
-    part = tool.trajectory(gesture, frames).load
+    part = tool_gesture.trajectory(gesture, frames).load
     loads = part[:, None, None] * case.load(load, way)
     start = time.process_time()
     path = equilibrium.solve_path(case.system, loads, load * part)

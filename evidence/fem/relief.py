@@ -14,7 +14,7 @@ import typer
 
 from evidence import report
 from synth.errors import UserError
-from synth.fem import equilibrium, surface_embedding, tool
+from synth.fem import equilibrium, surface_embedding, tool_gesture
 from synth.fem.mesh import tetrahedra
 from synth.fem.mesh.relief import HeightMap
 from synth.job.schema import Job
@@ -49,11 +49,11 @@ def measure_scene(index: int, count: int) -> Row:
     gesture, height = case.gesture, HeightMap(surface.pia, surface.extent_mm)
     row: Row = {"index": index, "tets": count, "kind": gesture.kind, "load": gesture.load}
     volume = tetrahedra.block(_JOB.anatomy, count, gesture.focus, height)
-    moved = tool.trajectory(gesture, _JOB.frames)
+    moved = tool_gesture.trajectory(gesture, _JOB.frames)
     full = int(moved.load.argmax())
-    moved = tool.ToolMotion(np.ones(1), moved.away[[full]], moved.shift[[full]])
+    moved = tool_gesture.ToolMotion(np.ones(1), moved.away[[full]], moved.shift[[full]])
     area = surface_embedding.vertex_area(surface.vertices, surface.faces)
-    traction = tool.tractions(gesture, moved, surface.vertices, area)[0]
+    traction = tool_gesture.tractions(gesture, moved, surface.vertices, area)[0]
     force = area[:, None] * traction / case.tissue.young_kpa
     embedding = surface_embedding.embed(volume, surface.vertices)
     parts = np.array([0.5, 1.0])

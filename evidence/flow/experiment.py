@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from evidence import report
 from evidence.flow.measure import Error, epe, inpainted, measure
 from evidence.flow.scenes import CLEAN, Flags, Pair, Recipe, Rgb, Stage, pairs
-from synth.flow import mask
+from synth.flow import mask_detection
 from synth.flow.estimator import create
 from synth.flow.track import Tracker
 from synth.job.schema import Job
@@ -84,7 +84,7 @@ def _asked(on: str, ours: Error) -> Iterator[Row]:
 
 def _automatic(picture: Rgb, _: Flags) -> Flags:
     """Masks without hand work."""
-    return ~mask.blocked(picture)
+    return ~mask_detection.blocked(picture)
 
 
 def _warped(count: int, seed: int) -> Iterator[Row]:
@@ -174,12 +174,12 @@ def _pair(job: Job, index: int, peak_px: float) -> Pair:
     seen = shoot(amount, 60.0, seeds[1]).flow
     now = shoot(amount * peak_px / float(np.hypot(seen[..., 0], seen[..., 1]).max()), 0.0, seeds[1])
     tissue, length = scene.tissue, np.hypot(now.flow[..., 0], now.flow[..., 1])
-    glare = mask.glare(now.rgb)
+    glare = mask_detection.glare(now.rgb)
     return Pair(
         rest=before.rgb,
         now=now.rgb,
         flow=now.flow,
-        rest_usable=tissue & ~mask.glare(before.rgb),
+        rest_usable=tissue & ~mask_detection.glare(before.rgb),
         now_usable=~(glare | now.tool),
         tool=now.tool,
         glare=glare,

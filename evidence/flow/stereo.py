@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from evidence import report, status
 from synth.checks import optics, stereo
 from synth.dataset.store import Dataset, Sequence
-from synth.flow import mask
+from synth.flow import mask_detection
 from synth.flow.stereo import rest
 from synth.flow.stereo.rig import Eye, StereoRig
 from synth.flow.stereo.track import StereoTracker, still_frames
@@ -92,8 +92,8 @@ def _measured(sequence: Sequence) -> tuple[list[Sample], float, float, float]:
     left, right = sequence["rgb"][:], sequence["rgb_right"][:]
     tissue, tools = sequence["tissue"][:], sequence["tool"][:]
     # Under the tool nothing is known of the right eye but its picture: masks as the picture gives them.
-    blocked = mask.hidden(left, tools)
-    other = mask.hidden(right, np.stack([mask.tool(picture) for picture in right]))
+    blocked = mask_detection.hidden(left, tools)
+    other = mask_detection.hidden(right, np.stack([mask_detection.tool(picture) for picture in right]))
     begun = time.process_time()
     seen = track("tvl1", left, blocked, tissue)
     flow_s = time.process_time() - begun

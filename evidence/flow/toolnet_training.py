@@ -22,7 +22,7 @@ from torch import Tensor
 from evidence import report
 from evidence.flow import toolnet_scenes
 from evidence.flow.toolnet_scenes import Frame
-from synth.flow import mask, toolnet
+from synth.flow import mask_detection, toolnet
 
 _HELD_OUT, _FIRST = range(13), 26  # scenes to test on, and the first to train on
 _BATCH, _RATE = 8, 3e-3
@@ -43,8 +43,8 @@ def main(out: Path = toolnet.WEIGHTS.parent, scenes: int = 39, steps: int = 700,
         "frames": len(training),
         "held_out_frames": len(held),
         "held_out_iou": overlap(held, lambda rgb: toolnet.probability(net, rgb) > 0.5),
-        "held_out_iou_with_the_rule": overlap(held, lambda rgb: mask.both(rgb, net)),
-        "held_out_iou_of_the_rule": overlap(held, mask.grey_bodies),
+        "held_out_iou_with_the_rule": overlap(held, lambda rgb: mask_detection.both(rgb, net)),
+        "held_out_iou_of_the_rule": overlap(held, mask_detection.grey_bodies),
         "parameters": sum(p.numel() for p in net.parameters()),
         "torch": torch.__version__,
     }

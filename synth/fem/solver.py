@@ -8,14 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from synth.fem import surface_embedding, tool
+from synth.fem import surface_embedding, tool_gesture
 from synth.fem.equilibrium import InvertedElement, LoadPath, solve_mixed_path, solve_path
 from synth.fem.material import Tissue
 from synth.fem.mesh.tetrahedra import Tets
 from synth.fem.motion import Clock, march_in_time, volume
 from synth.fem.pulse import Pulse, lift
 from synth.fem.surface_embedding import Embedding
-from synth.fem.tool import Gesture, ToolMotion
+from synth.fem.tool_gesture import Gesture, ToolMotion
 from synth.geometry.triangles import Shape
 from synth.job import schema
 from synth.job.laws import check_load
@@ -107,11 +107,13 @@ def deform(
     """
     for gesture in gestures:
         check_load(tissue.law, gesture.load, f"fem.load: {gesture.load:g} is")
-    motions = motions or [tool.trajectory(gesture, frames) for gesture in gestures]
+    motions = motions or [tool_gesture.trajectory(gesture, frames) for gesture in gestures]
     tools = list(zip(gestures, motions, strict=True))
     time, area = np.arange(frames) / fps, surface_embedding.vertex_area(*surface)
     embedding = surface_embedding.embed(tets, surface.vertices)
-    traction = np.sum([tool.tractions(g, moved, surface.vertices, area) for g, moved in tools], axis=0)
+    traction = np.sum(
+        [tool_gesture.tractions(g, moved, surface.vertices, area) for g, moved in tools], axis=0
+    )
     # One load per kPa of E; displacement depends on no more than that.
     loads = np.stack([embedding.gather(area[:, None] * t) for t in traction / tissue.young_kpa])
     load_parameter = np.max([gesture.load * moved.load for gesture, moved in tools], axis=0)
@@ -142,7 +144,7 @@ def _on_surface(
 ) -> Deformation:
     """What states of the volume are on the surface, and the instruments on it."""
     displacement = np.stack([embedding.move(u) for u in path.displacement])
-    poses = [tool.pose(g, moved, surface, surface.vertices + displacement) for g, moved in tools]
+    poses = [tool_gesture.pose(g, moved, surface, surface.vertices + displacement) for g, moved in tools]
     forces = [np.outer(m.load, np.sum([c.force_mn for c in g.contacts], axis=0)) for g, m in tools]
     return Deformation(
         rest=surface.vertices,

@@ -11,7 +11,7 @@ import numpy as np
 from synth.errors import UserError
 from synth.fit.compression import Compression
 from synth.fit.statistics import Mask, Picture
-from synth.flow import mask as found_mask
+from synth.flow import mask_detection
 from synth.job.schema import RenderSection
 from synth.system import checked_file
 
@@ -96,7 +96,7 @@ def find_cortex(rgb: Picture, mm_per_px: float) -> Mask:
     small = cv2.medianBlur(cv2.resize(rgb, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), 5)
     finer = min(1.0, 3 * scale)
     larger = cv2.resize(rgb, None, fx=finer, fy=finer, interpolation=cv2.INTER_AREA)
-    tool = found_mask.tool(larger).astype(np.uint8)
+    tool = mask_detection.tool(larger).astype(np.uint8)
     side = 2 * max(1, round(_VESSEL_MM / mm_per_px * scale / 2)) + 1
     wide = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
     lab = cv2.cvtColor(small.astype(np.float32) / 255, cv2.COLOR_RGB2LAB)

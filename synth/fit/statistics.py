@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from synth.flow import mask
+from synth.flow import mask_detection
 
 Picture = npt.NDArray[np.uint8]
 Map = npt.NDArray[np.float32]
@@ -40,7 +40,7 @@ def measure(rgb: Picture, usable: Mask, mm_per_px: float, reach: float = 1.0) ->
         reach: share of the whole photograph's width that this picture, of its middle, is.
     """
     linear = decode(rgb)
-    tissue = _between_vessels(linear, usable & ~mask.glare(rgb, 2), mm_per_px)
+    tissue = _between_vessels(linear, usable & ~mask_detection.glare(rgb, 2), mm_per_px)
     red = _smooth(linear, tissue, _TISSUE_MM / mm_per_px)[..., 0]
     grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.float32)
     noise = _noise(grey, tissue)
@@ -48,7 +48,7 @@ def measure(rgb: Picture, usable: Mask, mm_per_px: float, reach: float = 1.0) ->
     return {
         "vignette": _vignette(red, tissue, reach),
         "noise": noise,
-        "sharpness": _sharpness(grey, usable & ~mask.glare(rgb, 4), noise),
+        "sharpness": _sharpness(grey, usable & ~mask_detection.glare(rgb, 4), noise),
         "green": float(colour[1] / colour[0]),
         "blue": float(colour[2] / colour[0]),
     }

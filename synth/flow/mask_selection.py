@@ -1,7 +1,7 @@
 """Which of the tools and highlights found in pictures are masked: those that the video itself rules out.
 
 A mask that is wrong hides tissue, and a detector trained elsewhere can be wrong about a whole recording. So
-what `synth.flow.mask` finds is a proposal. Two flows are computed, without masks and with every proposal
+what `mask_detection` finds is a proposal. Two flows are computed, without masks and with every proposal
 masked. A connected piece is masked if the flow without masks leaves more of the picture unexplained in it
 than around it (something came between), or if masking lowers what is left around it (it pulls at its
 neighbours). All is taken back if away from proposals the flow without masks is the surer one.

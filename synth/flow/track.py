@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from synth.errors import UserError
-from synth.flow import mask
+from synth.flow import mask_detection
 from synth.flow.confidence import DOUBTFUL
 from synth.flow.estimator import Estimator, Flags, Flow, Map, Rgb, create
 
@@ -172,7 +172,7 @@ def recover_flow(
     Raises:
         UserError: no such estimator, no frames, or shapes that don't fit.
     """
-    return track(backend, frames, mask.hidden(frames, tool), tissue)
+    return track(backend, frames, mask_detection.hidden(frames, tool), tissue)
 
 
 def track(

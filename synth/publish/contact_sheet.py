@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 
 from synth.dataset import size_forecast
 from synth.dataset.store import open_sequence
-from synth.fem.tool import Gesture
+from synth.fem.tool_gesture import Gesture
 from synth.job.schema import Job
 from synth.publish.picture import Rgb, caption, tile
 from synth.render.anatomy.surface import CortexSurface

@@ -18,15 +18,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from synth.errors import UserError
-from synth.flow import mask
+from synth.flow import mask_detection
 from synth.flow.estimator import Flags, Rgb
 from synth.flow.mask_selection import Proposal
 from synth.flow.stereo.track import Moved
+from synth.recording_flow.frame_faults import find_fault
 from synth.recording_flow.frame_motion import FrameMotion, TrackingSummary
 from synth.recording_flow.harmonic_fit import Span
 from synth.recording_flow.local_flow import LocalFlow
 from synth.recording_flow.pulse import PulseSearch, SurfaceMotion, find_pulse
-from synth.recording_flow.quality import find_fault
 from synth.system.stopwatch import Stopwatch
 from synth.video.mask_files import MASKS
 from synth.video.read import Picture
@@ -276,11 +276,11 @@ class VideoFlow:
     def _mask(self, index: int, rgb: Rgb) -> Proposal:
         """What of a frame is no tissue, or may be none."""
         kind, nothing = self.settings.masks, np.zeros(rgb.shape[:2], bool)
-        glare = nothing if kind in ("none", "tool") else mask.glare(rgb)
+        glare = nothing if kind in ("none", "tool") else mask_detection.glare(rgb)
         tool = known = nothing
         if kind not in ("none", "glare"):
             if self.footage.tool is None:
-                tool = mask.tool(rgb)
+                tool = mask_detection.tool(rgb)
             elif (given := self.footage.tool(index, self.size)) is not None:
                 known = shrink_mask(given, self.shrink, 0)
         return (

@@ -14,7 +14,7 @@ from synth.fem.mesh import tetrahedra
 from synth.fem.mesh.relief import HeightMap
 from synth.fem.mesh.tetrahedra import Tets
 from synth.fem.solver import Deformation
-from synth.fem.tool import ToolMotion
+from synth.fem.tool_gesture import ToolMotion
 from synth.geometry.brain_surface import Brain, load_brain
 from synth.geometry.triangles import Shape
 from synth.job.laws import LAWS

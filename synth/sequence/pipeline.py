@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from synth.dataset.store import Writer
 from synth.fields import FIELDS
-from synth.flow import mask, track
+from synth.flow import mask_detection, track
 from synth.flow.stereo import rig
 from synth.flow.stereo import track as stereo
 from synth.flow.track import Track
@@ -178,7 +178,7 @@ def _recover_motion(task: _Task, left: _Video, right: _Video, flow: Track) -> No
     lens = scene.renderer.right
     if lens is None:
         raise ValueError("there is no second lens")
-    blocked = mask.hidden(left.rgb, left.tools), mask.hidden(right.rgb, right.tools)
+    blocked = mask_detection.hidden(left.rgb, left.tools), mask_detection.hidden(right.rgb, right.tools)
     with task.watch.stage("stereo"):
         pair = rig.StereoRig(
             left=rig.Eye(scene.view.K, scene.view.distortion),

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from synth.errors import UserError
-from synth.fem import tool
+from synth.fem import tool_gesture
 from synth.fem.material import Pia, Tissue
 from synth.fem.pulse import Pulse
-from synth.fem.tool import Gesture, ToolContact
+from synth.fem.tool_gesture import Gesture, ToolContact
 from synth.job import schema
 from synth.job.mechanics import CLEAR_MM, InstrumentSection
 from synth.job.schema import Family, FemSection, Job, LightSection, RenderSection
@@ -164,7 +164,7 @@ def draw_gestures(
             for _ in range(_TRIES):
                 trial = draw_gesture(fem, opening_mm, young_kpa, others if k else rng, asked[k])
                 fits = not given or trial.reach_mm <= max(opening_mm - CLEAR_MM, trial.footprint_mm) + 1e-9
-                if fits and all(tool.clearance(trial, other) >= 0 for other in found.values()):
+                if fits and all(tool_gesture.clearance(trial, other) >= 0 for other in found.values()):
                     found[k] = trial
                     break
             else:
@@ -207,7 +207,7 @@ def draw_gesture(
     half = path if kind == "slide" else spread if kind == "grasp" else 0.0
     point = _draw_point(fem, opening_mm, kind, footprint, footprint + 0.5 * half, rng, asked)
     along, direction = _draw_direction(fem, kind, rng, asked)
-    places, directions = tool.grip(kind, point - 0.5 * path * along, direction, spread, azimuth)
+    places, directions = tool_gesture.grip(kind, point - 0.5 * path * along, direction, spread, azimuth)
     whole = load * unit_mn * directions.sum(axis=0)
     timing = _draw_timing(kind, rng)
     return Gesture(
@@ -265,7 +265,7 @@ def _draw_direction(
     if kind == "retract":  # sideways, as a spatula holds tissue away
         rise = rng.uniform(0.1, max(cone, 0.3))
     elif kind == "slide":
-        rise = 1 / np.hypot(1, tool.FRICTION)
+        rise = 1 / np.hypot(1, tool_gesture.FRICTION)
     if asked.direction is not None:
         whole = np.asarray(asked.direction) / np.linalg.norm(asked.direction)
         along = whole[:2] / (np.hypot(*whole[:2]) or 1.0)

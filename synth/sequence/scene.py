@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from synth.errors import UserError
 from synth.fem.solver import Deformation
-from synth.fem.tool import ToolMotion
+from synth.fem.tool_gesture import ToolMotion
 from synth.flow import track, tvl1
 from synth.flow.estimator import Estimator, create
 from synth.flow.track import Track

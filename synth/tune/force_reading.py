@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse.linalg import splu
 
-from synth.fem import equilibrium, surface_embedding, tool
+from synth.fem import equilibrium, surface_embedding, tool_gesture
 from synth.render import truth
 from synth.render.camera import camera
 from synth.sequence.mechanics import build
@@ -62,7 +62,7 @@ def fit_reading(scene: Scene, frames: Sequence[Frame]) -> Reading:
     loads = np.stack([embedding.gather(motion.area[:, None] * motion.traction[t]) for t in numbers]) / young
     path = equilibrium.solve_path(system, loads, np.zeros(len(frames)))
     size_mn = float(np.sqrt(np.square(motion.by_instrument[numbers]).sum(axis=(1, 2)).mean()))
-    motions = [tool.trajectory(gesture, job.frames) for gesture in case.gestures]
+    motions = [tool_gesture.trajectory(gesture, job.frames) for gesture in case.gestures]
     mm_per_px = scene.view.mm_per_px
     true_mm = np.stack([mm_per_px * cells(frame.flow, scene.tissue) for frame in frames])
     rules = []
@@ -78,7 +78,7 @@ def fit_reading(scene: Scene, frames: Sequence[Frame]) -> Reading:
             load = np.zeros_like(tets.points)
             for contact in gesture.contacts:
                 centre = np.asarray(contact.point_mm) + over_time.shift[t]
-                kernel = tool.footprint(centre, gesture.footprint_mm, surface.vertices, motion.area)
+                kernel = tool_gesture.footprint(centre, gesture.footprint_mm, surface.vertices, motion.area)
                 load += embedding.gather(np.outer(motion.area * kernel, contact.force_mn))
             load *= size_mn / (young * gesture.force_mn)
             response = np.zeros(load.size)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from synth.errors import UserError
 from synth.fem.solver import Deformation
-from synth.flow import mask
+from synth.flow import mask_detection
 from synth.flow.track import Tracker
 from synth.job.schema import Job
 from synth.render.camera import camera
@@ -100,7 +100,7 @@ def _render(job_json: str, numbers: tuple[int, ...]) -> tuple[Scene, list[Frame]
 def _recover_flow(scene: Scene, frames: list[Frame], job: Job) -> tuple[list[NDArray[np.float32]], float]:
     """Flow (H, W, 2) px of all frames but the first, and the CPU-s of one."""
     rgb = np.stack([frame.rgb for frame in frames])
-    blocked = mask.hidden(rgb, np.stack([frame.tool for frame in frames]))
+    blocked = mask_detection.hidden(rgb, np.stack([frame.tool for frame in frames]))
     tracker = Tracker(estimator(job.flow), rgb[0], blocked[0], scene.tissue)
     steps = [_timed(partial(tracker.step, *one)) for one in zip(rgb[1:], blocked[1:], strict=True)]
     first_s, *others_s = (spent for _, spent in steps)

@@ -11,7 +11,7 @@ from known_contacts import contacts
 from made_clip import made_clip
 from numpy.typing import NDArray
 
-from bench.methods import baselines, compliance, inverse
+from bench.methods import baselines, compliance, elastic_inverse
 from bench.methods.protocol import InSpace, Method, MethodContext
 from learn.data.clips import Clip
 from synth.errors import UserError
@@ -107,7 +107,7 @@ def moved(known: compliance.Compliance, load: list[float]) -> NDArray[np.float64
     return np.asarray(u * [1, -1, -1])
 
 
-SOLVERS = [inverse.tikhonov, inverse.tikhonov_near, inverse.one_contact]
+SOLVERS = [elastic_inverse.tikhonov, elastic_inverse.tikhonov_near, elastic_inverse.one_contact]
 
 
 @pytest.mark.slow
@@ -125,7 +125,7 @@ def test_one_contact_finds_the_force_along_the_view(known: compliance.Compliance
     rng = np.random.default_rng(4)
     for force, field in zip(forces, fields, strict=True):
         noisy = field + 0.1 * rng.normal(size=field.shape)
-        said = 3.0 * inverse.one_contact(known, noisy, np.ones(len(field)))
+        said = 3.0 * elastic_inverse.one_contact(known, noisy, np.ones(len(field)))
         assert said == pytest.approx(force, abs=0.12 * np.linalg.norm(force) + 4)
 
 
@@ -133,10 +133,10 @@ def test_noise_at_the_edge_leads_nowhere_outside(known: compliance.Compliance) -
     rng = np.random.default_rng(1)
     for seen in (np.ones(len(known.points)), (known.points[:, 0] > 9).astype(float)):
         noise = 0.05 * rng.normal(size=(len(known.points), 2))
-        found = inverse.contact(known, noise, seen)
+        found = elastic_inverse.contact(known, noise, seen)
         assert np.hypot(*found.place[:2]) <= 12
         assert np.isfinite(found.force).all()
-        assert np.isfinite(inverse.tikhonov_near(known, noise, seen)).all()
+        assert np.isfinite(elastic_inverse.tikhonov_near(known, noise, seen)).all()
 
 
 def test_fitted_on_two_eyes_asks_for_two() -> None:

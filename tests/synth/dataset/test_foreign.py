@@ -23,7 +23,7 @@ from synth.dataset.folder import claim
 from synth.dataset.store import open_sequence
 from synth.errors import UserError
 from synth.job.schema import Job
-from synth.publish.export.formats import export_dataset
+from synth.publish.export.registry import export_dataset
 
 JOB = Job(seed=1, sequences=3, frames=3, render={"size": (64, 48)}, flow={"backend": "ideal"})
 FIRST = "000000.zarr"

@@ -8,7 +8,7 @@ import pytest
 from pydantic import ValidationError
 
 import synth
-from synth.fem import tool
+from synth.fem import tool_gesture
 from synth.sequence import scenario
 
 PUSH = {
@@ -38,7 +38,7 @@ def test_what_is_asked_is_done_and_the_rest_is_drawn() -> None:
         assert (pull.kind, pull.point_mm, pull.direction) == ("pull", (-5.0, 1.0), pytest.approx((0, 0, 1)))
         assert pull.force_mn == pytest.approx(1.5)
         assert 3 <= pull.footprint_mm <= 6
-        assert tool.clearance(push, pull) >= 0
+        assert tool_gesture.clearance(push, pull) >= 0
     for drawn in ("azimuth_deg", "hover_mm"):
         assert len({getattr(case.gesture, drawn) for case in cases}) == 20
     assert len({case.further[0].timing for case in cases}) == 20

@@ -8,7 +8,7 @@ from dome import OPENING_MM, block, patch
 
 from synth.fem import solver
 from synth.fem.material import Tissue
-from synth.fem.tool import Gesture
+from synth.fem.tool_gesture import Gesture
 from synth.job import schema
 from synth.sequence import scenario
 

@@ -14,7 +14,7 @@ from scipy.sparse.linalg import splu
 from skfem.quadrature import get_quadrature
 from skfem.refdom import RefTet
 
-from synth.fem import equilibrium, surface_embedding, tool
+from synth.fem import equilibrium, surface_embedding, tool_gesture
 from synth.fem.laws import lame
 from synth.fem.mesh import tetrahedra
 from synth.fem.mesh.element import bary_slope, shape
@@ -71,7 +71,7 @@ def test_kernel_on_a_half_space(poisson: float) -> None:
     vertices, faces = patch(n, 2.4)
     vertices[:, 2] = 0
     area = surface_embedding.vertex_area(vertices, faces)
-    kernel = tool.footprint(np.zeros(2), a, vertices, area)
+    kernel = tool_gesture.footprint(np.zeros(2), a, vertices, area)
     embedding = surface_embedding.embed(tets, vertices)
     load = embedding.gather(np.outer(area * kernel, [0, 0, -1.0]))
     u = shell + system.solve(load - (system.stiffness @ shell.ravel()).reshape(-1, 3))
@@ -146,7 +146,7 @@ def loaded(law: str, load: float, kind: str) -> tuple[System, Floats]:
     tets = tetrahedra.block(anatomy, 700, ((2.0, 1.0, 4.0),))
     vertices, faces = patch()
     area = surface_embedding.vertex_area(vertices, faces)
-    kernel = tool.footprint(np.array([2.0, 1.0]), 4.0, vertices, area) * area
+    kernel = tool_gesture.footprint(np.array([2.0, 1.0]), 4.0, vertices, area) * area
     way = np.array([0.5, 0.0, 0.87 if kind == "pull" else -0.87])
     force = surface_embedding.embed(tets, vertices).gather(np.outer(kernel, 16.0 * load * way))
     return assemble(tets, law, 0.4), force

@@ -15,7 +15,7 @@ from synth.fem.material import Tissue
 from synth.fem.mesh import tetrahedra
 from synth.fem.mesh.refine import EDGES
 from synth.fem.solver import Deformation, InvertedElement, deform
-from synth.fem.tool import Gesture
+from synth.fem.tool_gesture import Gesture
 from synth.job import laws, schema
 from synth.sequence import scenario
 

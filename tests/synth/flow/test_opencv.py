@@ -10,7 +10,7 @@ import pytest
 
 from evidence.flow.scenes import Recipe, cortex, pairs
 from synth.errors import UserError
-from synth.flow import estimator, mask, toolnet, track
+from synth.flow import estimator, mask_detection, toolnet, track
 from synth.job.schema import Job
 from synth.plugins import ESTIMATORS
 
@@ -35,11 +35,11 @@ def test_glare_is_found() -> None:
     """A bright, soft spot on tissue is glare; pale tissue and a global change of brightness are not."""
     tissue = np.broadcast_to(np.array([200, 150, 120], np.uint8), (120, 160, 3)).copy()
     for gain in (0.7, 1.0, 1.15):
-        assert not mask.glare(np.clip(gain * tissue.astype(float), 0, 255).astype(np.uint8)).any()
+        assert not mask_detection.glare(np.clip(gain * tissue.astype(float), 0, 255).astype(np.uint8)).any()
     y, x = np.mgrid[:120, :160]
     spot = np.exp(-((x - 70) ** 2 + (y - 50) ** 2) / (2 * 4.0**2))[..., None]
     wet = np.clip(tissue + 200 * spot, 0, 255).astype(np.uint8)
-    found = mask.glare(wet)
+    found = mask_detection.glare(wet)
     assert found[50, 70]
     assert found[spot[..., 0] > 0.3].all()
     assert found.mean() < 0.03
@@ -47,10 +47,10 @@ def test_glare_is_found() -> None:
 
 def test_tool_is_found_without_weights() -> None:
     (pair,) = pairs(Recipe(highlights=0.0), 1, 2)
-    found = mask.grey_bodies(pair.now)
+    found = mask_detection.grey_bodies(pair.now)
     assert np.count_nonzero(found & pair.tool) / np.count_nonzero(found | pair.tool) > 0.6
-    assert not mask.grey_bodies(pair.rest).any()
-    blocked = mask.blocked(pair.now)
+    assert not mask_detection.grey_bodies(pair.rest).any()
+    blocked = mask_detection.blocked(pair.now)
     assert blocked[pair.tool].mean() > 0.8
     assert blocked.mean() < 0.2
 

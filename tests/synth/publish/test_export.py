@@ -25,7 +25,7 @@ from synth.fields import FIELDS
 from synth.job.schema import Job
 from synth.publish import film
 from synth.publish.export import endonerf, hugging_face
-from synth.publish.export.formats import export_dataset
+from synth.publish.export.registry import export_dataset
 from synth.render.camera.camera import Camera, project, rays
 
 
