@@ -163,7 +163,8 @@ def _band(axes: Axes, x: Curve, low: Curve, high: Curve, name: str, colour: str)
 
 
 def _dots(axes: Axes, x: Curve, y: Curve) -> None:
-    axes.scatter(x, y, 12, _MAIN, alpha=0.45 if len(x) > 100 else 0.8, linewidths=0)
+    many = len(x) > 100
+    axes.scatter(x, y, 12 if many else 28, _MAIN, alpha=0.45 if many else 0.8, linewidths=0)
 
 
 def _finish(axes: Axes, x: str, y: str, columns: int = 2) -> None:
