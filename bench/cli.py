@@ -70,17 +70,16 @@ def score(
     json: Json = False,
 ) -> None:
     """Force from a recording's video, scored against its sensor: score.json and report.html."""
-    from bench.methods.network import Model
     from bench.recording.folder import open_recording
     from synth.recording_flow.video_flow import RecordingFlowSettings
     from synth.video.mask_files import read_choice
 
-    others = {name: Model(Path(at)) for name, at in _pairs("--also", also, "NAME=FOLDER").items()}
+    others = _pairs("--also", also, "NAME=FOLDER")
     kind, files = read_choice(masks)
     opened = open_recording(recording, phantom).within(files, _rectangle(region))
     settings = RecordingFlowSettings(flow, shrink, rate or None, pulse, kind)
     folder = out or Path(f"{opened.name}-score")
-    _score(opened, model, folder, settings, title, json, methods=others, train=train)
+    _score(opened, model, folder, settings, title, json, others, train=train)
 
 
 @app.command(epilog="Example: bench pool a-score b-score --out pooled")
@@ -259,23 +258,29 @@ def _score(
     settings: RecordingFlowSettings,
     title: str,
     json: bool,
+    also: dict[str, str] | None = None,
     **more: Any,
 ) -> None:
-    """Scores a recording, writes into `folder`, and prints; `more`: of `bench.score`."""
+    """Scores a recording, writes into `folder`, prints; `also`: further models; `more`: of `bench.score`."""
     from rich.console import Console
     from threadpoolctl import threadpool_limits
 
+    from bench.methods.network import Model
     from bench.scoring import headline, report
     from bench.scoring.result import as_json
     from bench.scoring.score import score
-    from learn.inference.shipped import choose_model
+    from learn.inference.shipped import NONE, choose_model
     from learn.training.threads import set_threads
 
     # NumPy's BLAS too: a second thread of its own waits for a core that the flow has.
     threadpool_limits(set_threads(None))
+    chosen = model or choose_model(opened.has_two_eyes)
+    if chosen is None:
+        raise UserError(f"say --model: {NONE}")
     result = score(
         opened,
-        model or choose_model(opened.has_two_eyes),
+        chosen,
+        methods={name: Model(Path(at)) for name, at in (also or {}).items()},
         settings=settings,
         out=folder,
         title=title,

@@ -83,7 +83,15 @@ def train_command(
     from synth.system.checked_file import made_folder
 
     set_threads(threads)
-    given = as_changes(changes or [])
+    words = changes or []
+    if str(dataset).startswith("--"):  # settings may stand before the dataset
+        given, found = as_changes([str(dataset), *words])
+    else:
+        given, others = as_changes(words)
+        found = [str(dataset), *others]
+    if len(found) != 1:
+        raise UserError(f"one DATASET, and settings as KEY=VALUE or --KEY VALUE; given {' '.join(found)}")
+    dataset = Path(found[0])
     settings = override(named(preset), [f"{key}={value}" for key, value in given.items()])
     with made_folder(out, room_needed(out, settings.arch)):
         datasets = [dataset, *(also or [])]

@@ -148,18 +148,26 @@ def preset(name: str, **changes: Any) -> TrainingSettings:
     return replace(PRESETS[name], **changes)
 
 
-def as_changes(words: Iterable[str]) -> dict[str, str]:
-    """A command line's `key=value`, `--key=value` and `--key value` as `{key: value}`, the last of a key.
+def as_changes(words: Iterable[str]) -> tuple[dict[str, str], list[str]]:
+    """A command line's `key=value`, `--key=value` and `--key value` as `{key: value}`, and its other words.
 
-    An `input` brings the `arch.depth` that goes with it, unless that is given too.
+    The last of a key counts. An `input` brings the `arch.depth` that goes with it, unless that is given too.
+
+    Raises:
+        UserError: a `--key` without a value.
     """
-    changes, rest = dict[str, str](), iter(words)
+    changes, others, rest = dict[str, str](), list[str](), iter(words)
     for word in rest:
         key, equals, value = word.removeprefix("--").partition("=")
-        changes[key.strip()] = value if equals or not word.startswith("--") else next(rest, "")
+        if not equals and not word.startswith("--"):
+            others.append(word)
+            continue
+        if not equals and (value := next(rest, "--")).startswith("--"):
+            raise UserError(f"{word}: needs a value")
+        changes[key.strip()] = value
     if "input" in changes:
         changes.setdefault("arch.depth", str(has_depth(changes["input"])))
-    return changes
+    return changes, others
 
 
 def override(settings: TrainingSettings, changes: Iterable[str]) -> TrainingSettings:

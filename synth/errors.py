@@ -38,6 +38,8 @@ def as_user_error(label: str) -> Iterator[None]:
     """Makes one line after `label` of whatever the block raises: for code and formats of others."""
     try:
         yield
+    except UserError as error:
+        raise UserError(f"{label}: {error}") from error
     except Exception as error:
         why = getattr(error, "strerror", None) or f"{type(error).__name__}: {first_line(error)}"
         raise UserError(f"{label}: {why}") from error

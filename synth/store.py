@@ -3,4 +3,7 @@
 from synth.dataset.store import Dataset, Sequence, open_sequence
 from synth.dataset.torch_dataset import TorchDataset
 
-__all__ = ["Dataset", "Sequence", "TorchDataset", "open_sequence"]
+Frames = TorchDataset
+"""Its former name."""
+
+__all__ = ["Dataset", "Frames", "Sequence", "TorchDataset", "open_sequence"]

@@ -19,7 +19,7 @@ from learn.data.grid import Grid, GridView, certainty, settled
 from synth.dataset import provenance
 from synth.dataset.split import name_anatomy
 from synth.dataset.store import Dataset, Sequence
-from synth.errors import UserError, as_user_error
+from synth.errors import UserError, as_user_error, first_line
 from synth.job import identity
 from synth.system import checked_file
 from synth.system.terminal import ProgressCallback
@@ -250,11 +250,19 @@ def pack(clip: Clip, folder: Path) -> None:
 
 def unpack(folder: Path) -> Clip:
     """A packed clip, memory-mapped. Raises UserError if the folder is not one, or damaged."""
-    with as_user_error(f"{folder}: not a packed sequence, or damaged: remove it"):
-        plain = json.loads(checked_file.read_bytes(folder / "clip.json", 1_000_000))
-        arrays: dict[str, Any] = _mapped(folder / _FILE, plain.pop("checksums"))
-        displacement = {s: arrays.pop(f"displacement-{s}") for s in FIELDS if f"displacement-{s}" in arrays}
-        return Clip(**plain, displacement=displacement, **arrays)
+    try:
+        with as_user_error(f"{folder}: not a packed sequence, or damaged: remove it"):
+            plain = json.loads(checked_file.read_bytes(folder / "clip.json", 1_000_000))
+            arrays: dict[str, Any] = _mapped(folder / _FILE, plain.pop("checksums"))
+            stored = [s for s in FIELDS if f"displacement-{s}" in arrays]
+            displacement = {s: arrays.pop(f"displacement-{s}") for s in stored}
+            return Clip(**plain, displacement=displacement, **arrays)
+    except UserError as error:
+        why = error.__cause__
+        if isinstance(why, RuntimeError) and not isinstance(why, RecursionError | NotImplementedError):
+            # A process has too many mappings: nothing is damaged.
+            raise UserError(f"{folder}: cannot be mapped ({first_line(why)})") from None
+        raise
 
 
 def _mapped(file: Path, checksums: Mapping[str, int]) -> dict[str, NDArray[Any]]:

@@ -164,12 +164,14 @@ def _arrays(path: Path) -> Motion:
     if missing := {*names, "tissue", "scale_mm_per_px"} - found.keys():
         raise UserError(f"{path}: lacks {', '.join(sorted(missing))}")
     tissue, count = found["tissue"].astype(bool), found[names[0]].shape[:1]
+    if not count or not count[0]:
+        raise UserError(f"{path}: {names[0]} holds no frames")
     if tissue.ndim != 2:
         raise UserError(f"{path}: tissue is {tissue.shape}, expected (H, W)")
     wanted = {name: (*count, *tissue.shape, len(names) + 1) for name in names}
     wanted |= {"confidence": (*count, *tissue.shape), "force_mn": count}
     for name, shape in wanted.items():
-        if name in found and (found[name].shape != shape or not count[0]):
+        if name in found and found[name].shape != shape:
             raise UserError(f"{path}: {name} is {found[name].shape}, expected {shape} like the tissue")
     scale, force = _positive(path, found, "scale_mm_per_px"), found.get("force_mn")
 

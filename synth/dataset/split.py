@@ -88,7 +88,7 @@ def assign_sides(rows: Sequence[Mapping[str, Any]], chosen: Rule) -> list[str | 
         UserError: a family that is not there, shares that do not sum to 1, or fewer groups than sides.
     """
     by, shares = chosen.by, chosen.shares
-    if len(shares) != 3 or abs(sum(shares) - 1) > 1e-6 or min(shares) < 0:
+    if len(shares) != 3 or not (abs(sum(shares) - 1) <= 1e-6 and min(shares) >= 0):  # NaN is neither
         raise UserError(f"shares {shares}: must not be negative and must sum to 1")
     done = [row for row in rows if row["status"] == "done"]
     unknown = set(chosen.held_out) - {str(row["family"]) for row in done}

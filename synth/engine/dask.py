@@ -62,7 +62,8 @@ def open_slots(engine: str, setup: Setup) -> Iterator[list[Slot]]:
                 client.wait_for_workers(1, timeout=_WAIT_FOR_WORKERS_S)
             except TimeoutError:
                 raise UserError(f"{engine}: no worker has joined") from None
-            yield [_DaskSlot(client, travelling)] * max(sum(client.nthreads().values()), expected)
+            # One waits even where the last worker has just left.
+            yield [_DaskSlot(client, travelling)] * max(sum(client.nthreads().values()), expected, 1)
 
 
 class _DaskSlot:

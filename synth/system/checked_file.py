@@ -208,6 +208,8 @@ def write_picture(path: Path, picture: NDArray[np.uint8]) -> None:
     """Writes (H, W, 3) sRGB in the format that the name ends with. UserError where that can't be."""
     import cv2
 
+    if not cv2.haveImageWriter(path.name):
+        raise UserError(f"{path}: cannot be written as a picture (.png or .jpg)")
     with as_user_error(f"{path}: cannot be written as a picture"):
         _, data = cv2.imencode(path.suffix, picture[..., ::-1])
         write_whole(path, data.tobytes(), durable=False)

@@ -11,7 +11,7 @@ import pytest
 from learn.checkpoint import ModelCard, _hash, read_card
 from learn.data.grid import Scales
 from learn.network.d2fnet import Architecture
-from learn.settings import TrainingSettings, override, preset
+from learn.settings import TrainingSettings, as_changes, override, preset
 from synth.errors import UserError
 from synth.job import identity, retired
 
@@ -64,3 +64,11 @@ def test_a_config_of_before_is_read_and_its_loss_has_a_name(
 def test_settings_that_cannot_be(change: str, key: str) -> None:
     with pytest.raises(UserError, match=key):
         override(preset("live"), [change])
+
+
+def test_settings_of_a_command_line_stand_anywhere_and_need_a_value() -> None:
+    words = ["--epochs", "3", "data", "--seed=1", "loss=mse", "seed=2"]
+    assert as_changes(words) == ({"epochs": "3", "seed": "2", "loss": "mse"}, ["data"])
+    for broken in (["--compile", "--epochs", "3"], ["data", "--epochs"]):
+        with pytest.raises(UserError):
+            as_changes(broken)

@@ -72,6 +72,7 @@ def test_other_groups_still_never_share_an_anatomy(by: str) -> None:
     ("rule", "message"),
     [
         (Rule(shares=(0.5, 0.1, 0.1)), "must sum to 1"),
+        (Rule(shares=(float("nan"), 0.5, 0.5)), "must sum to 1"),
         (Rule(held_out=("blue",)), "family blue: no sequence has it"),
         (Rule(by="gesture"), "too few"),
     ],
