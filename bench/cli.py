@@ -269,17 +269,14 @@ def _score(
     from bench.scoring import headline, report
     from bench.scoring.result import as_json
     from bench.scoring.score import score
-    from learn.inference.shipped import NONE, choose_model
+    from learn.inference.shipped import require_model
     from learn.training.threads import set_threads
 
     # NumPy's BLAS too: a second thread of its own waits for a core that the flow has.
     threadpool_limits(set_threads(None))
-    chosen = model or choose_model(opened.has_two_eyes)
-    if chosen is None:
-        raise UserError(f"say --model: {NONE}")
     result = score(
         opened,
-        chosen,
+        model or require_model(opened.has_two_eyes),
         methods={name: Model(Path(at)) for name, at in (also or {}).items()},
         settings=settings,
         out=folder,

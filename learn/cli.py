@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json as json_
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -75,7 +75,7 @@ def train_command(
     from learn.data.clips import sources
     from learn.evaluation.fit_intervals import add_intervals
     from learn.inference.predict import load_model
-    from learn.settings import as_changes, override
+    from learn.settings import override
     from learn.settings import preset as named
     from learn.training.sides import divide
     from learn.training.threads import make_fabric, set_threads
@@ -83,15 +83,7 @@ def train_command(
     from synth.system.checked_file import made_folder
 
     set_threads(threads)
-    words = changes or []
-    if str(dataset).startswith("--"):  # settings may stand before the dataset
-        given, found = as_changes([str(dataset), *words])
-    else:
-        given, others = as_changes(words)
-        found = [str(dataset), *others]
-    if len(found) != 1:
-        raise UserError(f"one DATASET, and settings as KEY=VALUE or --KEY VALUE; given {' '.join(found)}")
-    dataset = Path(found[0])
+    dataset, given = _sorted_out(str(dataset), changes or [])
     settings = override(named(preset), [f"{key}={value}" for key, value in given.items()])
     with made_folder(out, room_needed(out, settings.arch)):
         datasets = [dataset, *(also or [])]
@@ -117,6 +109,18 @@ def train_command(
         f"select sequences (its force times {card.force_gain:.3g}); fitted on {result['fit']}, "
         f"{result['test']} kept for `learn eval`. {_describe(card.intervals) if card.intervals else why}"
     )
+
+
+def _sorted_out(first: str, words: Sequence[str]) -> tuple[Path, dict[str, str]]:
+    """Dataset and settings, which may stand before it. UserError unless there is one dataset."""
+    from learn.settings import as_changes
+
+    # A dataset that comes first may have = in its name.
+    settings, others = as_changes([first, *words] if first.startswith("--") else words)
+    datasets = others if first.startswith("--") else [first, *others]
+    if len(datasets) != 1:
+        raise UserError(f"one DATASET, and settings as KEY=VALUE or --KEY VALUE; given {' '.join(datasets)}")
+    return Path(datasets[0]), settings
 
 
 def _read(datasets: Iterable[Path], grid: Grid, wanted: Iterable[str], cache: Path | None) -> list[Clip]:

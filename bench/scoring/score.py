@@ -20,7 +20,7 @@ from bench.scoring.result import Result, as_json
 from bench.tracking import flow_process
 from bench.tracking.tracking import Progress
 from learn import Predictor
-from learn.inference.shipped import NONE, choose_model, find_model
+from learn.inference.shipped import find_model, require_model
 from synth.errors import UserError
 from synth.recording_flow.local_flow import LocalFlow
 from synth.recording_flow.video_flow import RecordingFlowSettings
@@ -71,9 +71,7 @@ def score(
         raise UserError("score: train needs the model's folder, which says what it was fitted on")
     opened = recording if isinstance(recording, Recording) else open_recording(Path(recording))
     if model is None and not methods:
-        model = choose_model(opened.has_two_eyes)
-        if model is None:
-            raise UserError(f"nothing to score, say a model or methods: {NONE}")
+        model = require_model(opened.has_two_eyes)
     elif isinstance(model, (str, Path)):
         model = find_model(model)
     folder = model if isinstance(model, Path) else None

@@ -43,6 +43,14 @@ def choose_model(two_eyes: bool) -> Path | None:
     return next((found[name] for name in ("stereo", "mono")[not two_eyes :] if name in found), None)
 
 
+def require_model(two_eyes: bool) -> Path:
+    """As `choose_model`. UserError if none comes along."""
+    found = choose_model(two_eyes)
+    if found is None:
+        raise UserError(f"say a model (--model): {NONE}")
+    return found
+
+
 def hash_data(card: ModelCard) -> str:
     """Of all sequences that a model was fitted, chosen and to be tested on; their order doesn't count."""
     named = {part: sorted(hashes) for part, hashes in card.split.items()}

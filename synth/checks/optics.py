@@ -75,10 +75,7 @@ def _poses(sequence: Sequence, at_rest: cameras.Camera, time: Floats) -> Floats:
         return np.asarray(sequence["camera"][:])
     sway = sequence.attrs["scenario"].get("sway")
     views = [CameraMotion(**sway).at(at_rest, float(t)) if sway else at_rest for t in time]
-    poses = np.tile(np.eye(4), (len(views), 1, 1))
-    for pose, view in zip(poses, views, strict=True):
-        pose[:3, :3], pose[:3, 3] = view.rotation, view.translation
-    return poses
+    return np.stack([view.pose for view in views])
 
 
 def camera_of(sequence: Sequence, lens: Mapping[str, Any] | None = None) -> cameras.Camera:

@@ -121,7 +121,7 @@ def _render_frames(task: _Task) -> list[_Video]:
     shape = (job.frames, height, width)
     lenses = _LENSES if writer.wants("rgb_right") else _LENSES[:1]
     videos = [_Video(np.empty((*shape, 3), np.uint8), np.empty(shape, bool)) for _ in lenses]
-    poses = np.tile(np.eye(4), (job.frames, 1, 1))
+    poses = np.empty((job.frames, 4, 4))
     for t in range(job.frames):
         task.report("render", t, job.frames)
         with task.watch.stage("render"):
@@ -135,7 +135,7 @@ def _render_frames(task: _Task) -> list[_Video]:
                 writer.put_exr(t, frame.radiance)
         for video, (rgb, tool) in zip(videos, lenses, strict=True):
             video.rgb[t], video.tools[t] = getattr(frame, rgb), getattr(frame, tool)
-        poses[t, :3, :3], poses[t, :3, 3] = frame.camera.rotation, frame.camera.translation
+        poses[t] = frame.camera.pose
     with task.watch.stage("store"):
         writer.put("camera", poses)
     return videos

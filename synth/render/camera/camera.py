@@ -65,6 +65,11 @@ class Camera:
         """(3,) mm: the lens, in world axes."""
         return -self.rotation.T @ self.translation
 
+    @property
+    def pose(self) -> Floats:
+        """(4, 4) mm: world to camera axes, homogeneous."""
+        return np.block([[self.rotation, self.translation[:, None]], [np.zeros((1, 3)), np.ones((1, 1))]])
+
 
 def place(view: CameraView, render: RenderSection) -> Camera:
     """The camera of `view`, looking at the world's origin from its working distance."""
