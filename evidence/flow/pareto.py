@@ -66,8 +66,7 @@ def _candidates() -> list[tuple[str, str, Estimator, float | None]]:
         "no membrane": replace(s, hidden_huber=0.0),
     }
     warm = {
-        "warm 1 warp": replace(s, warm_warps=1),
-        "warm 2 warps": replace(s, warm_warps=2),
+        "warm 3 warps": replace(s, warps=3),
         "warm (default)": s,
     }
     theirs = {f"lambda {w:g}, {n} warps": OpenCvTvl1(w, n) for w in (0.06, 0.1, 0.2) for n in (2, 3, 6)}
