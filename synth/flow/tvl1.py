@@ -90,8 +90,10 @@ class TVL1Settings:
 
 
 class Tvl1:
-    """The estimator `tvl1`: masked TV-L1, cold in two stages, warm in one, with as many warps: with half of
-    them, smoothness has not yet come as far, and the mean error of warm frames is 1.2 times that of cold ones."""
+    """The estimator `tvl1`: masked TV-L1, cold in two stages, warm in one.
+
+    Both with as many warps: half of them smooth less, and the error of warm frames was 1.12 times as large.
+    """
 
     def __init__(
         self,
