@@ -51,8 +51,8 @@ def box(field: Tensor, radius: int) -> Tensor:
     """Mean of (B, C, H, W) over squares of 2 radius + 1 pixels, smaller at the border. Separable."""
     if field.device.type == "cpu":
         planes = field.contiguous().numpy().reshape(-1, *field.shape[-2:])
-        between, out = np.empty_like(planes), np.empty_like(planes)
-        fused.box_into(planes, radius, between, out)
+        out = np.empty_like(planes)
+        fused.box_into(planes, (0,) * (2 * radius + 1), out)
         return torch.from_numpy(out).view_as(field)
     wide = 2 * radius + 1
     rows = F.avg_pool2d(field, (1, wide), 1, (0, radius), count_include_pad=False)
@@ -79,6 +79,11 @@ def window(field: Tensor, sigma: float) -> Tensor:
 
 def doubled(field: Tensor, like: Tensor) -> Tensor:
     """`field` (B, C, h, w) at twice its size, cut to the height and width of `like`. Bilinear."""
+    if field.device.type == "cpu":
+        planes = field.contiguous().numpy().reshape(-1, *field.shape[-2:])
+        out = np.empty((len(planes), *like.shape[-2:]), np.float32)
+        fused.double_into(planes, out)
+        return torch.from_numpy(out).view(*field.shape[:2], *out.shape[1:])
     wide = F.interpolate(field, scale_factor=2, mode="bilinear", align_corners=False)
     return wide[..., : like.shape[-2], : like.shape[-1]]
 
@@ -136,6 +141,11 @@ def warp(now: Tensor, usable: Tensor, flow: Tensor) -> tuple[Tensor, Tensor]:
         flow: w, (B, 2, H, W) px.
     """
     height, width = now.shape[-2:]
+    if now.shape[:2] == (1, 1) and now.device.type == "cpu":
+        out = np.empty((2, 1, 1, height, width), np.float32)
+        one, known, by = (field.contiguous().numpy() for field in (now[0, 0], usable[0, 0], flow[0]))
+        fused.warp_into(one, known, by, out[0, 0, 0], out[1, 0, 0])
+        return torch.from_numpy(out[0]), torch.from_numpy(out[1])
     x = torch.arange(width, device=now.device, dtype=now.dtype)
     y = torch.arange(height, device=now.device, dtype=now.dtype)[:, None]
     at = torch.stack([(2 * (x + flow[:, 0]) + 1) / width - 1, (2 * (y + flow[:, 1]) + 1) / height - 1], -1)

@@ -112,6 +112,8 @@ class Tvl1:
         self.settings = settings or TVL1Settings()
         self.device = device or ("cuda" if torch.cuda.is_available() else "cpu")
         self.checked = checked
+        self._rest: tuple[Tensor, Tensor, list[tuple[Tensor, Tensor]]] | None = None
+        """The last rest frame, where it was usable, and its pyramid: a video has one."""
 
     def flow(
         self, rest: Rgb, now: Rgb, rest_usable: Flags, now_usable: Flags, initial: Flow | None = None
@@ -142,7 +144,11 @@ class Tvl1:
     ) -> tuple[Tensor, Tensor]:
         """As `flow`, on the device: greys, masks and confidence (1, 1, H, W), flows (1, 2, H, W)."""
         s = self.settings
-        levels = pyramid(rest, now, rest_usable, now_usable, s)
+        last = self._rest
+        if last is None or not (torch.equal(rest, last[0]) and torch.equal(rest_usable, last[1])):
+            self._rest = last = rest, rest_usable, pyramid(rest, rest_usable, s)
+        both = zip(last[2], pyramid(now, now_usable, s), strict=True)
+        levels = [Level(before, after, seen, still) for (before, seen), (after, still) in both]
         fine = levels
         if initial is None and len(levels) > 1:
             initial, fine = finer(guess(levels[1:], s), levels[0]), levels[: s.fine_levels]
@@ -166,22 +172,16 @@ def one_thread() -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-def pyramid(
-    rest: Tensor, now: Tensor, rest_usable: Tensor, now_usable: Tensor, s: TVL1Settings
-) -> list[Level]:
-    """Levels, fine to coarse, of tensors as in `Level`; pixel x of a level is (x - 1/2)/2 of the next."""
+def pyramid(grey: Tensor, usable: Tensor, s: TVL1Settings) -> list[tuple[Tensor, Tensor]]:
+    """Half of every `Level`, fine to coarse, of one picture; pixel x of one is (x - 1/2)/2 of the next."""
     levels = []
-    grey, known = torch.cat([rest, now]), torch.cat([rest_usable, now_usable])
     while True:
-        (before, after), (seen_before, seen_after) = (
-            both.chunk(2) for both in (image.normalise(grey, known), (known > 0.5).to(grey.dtype))
-        )
-        levels.append(Level(before, after, seen_before, seen_after))
+        levels.append((image.normalise(grey, usable), (usable > 0.5).to(grey.dtype)))
         if min(grey.shape[-2:]) < 2 * s.coarsest_px:
             return levels
-        pooled = image.halved(torch.cat([grey * known, known], 1))
-        known = pooled[:, 1:]
-        grey = pooled[:, :1] / known.clamp_min(1e-6)
+        pooled = image.halved(torch.cat([grey * usable, usable], 1))
+        usable = pooled[:, 1:]
+        grey = pooled[:, :1] / usable.clamp_min(1e-6)
 
 
 def guess(levels: list[Level], s: TVL1Settings) -> Tensor:
@@ -232,34 +232,34 @@ def _solve_level(level: Level, flow: Tensor, weight: Tensor, s: TVL1Settings) ->
         np.ascontiguousarray(field[0, 0].numpy())
         for field in (level.rest, level.now, level.rest_usable, level.now_usable)
     )
-    found, lambda_ = flow[0].contiguous().numpy().copy(), weight[0, 0].numpy()
-    tau, epsilon = np.float32(s.tau), np.float32(s.epsilon)
-    dual = np.zeros((2, *found.shape), np.float32)
-    shape, planes = rest.shape, (3, *rest.shape)
-    before, after, residual, mean, rows, columns = (np.empty(planes, np.float32) for _ in range(6))
-    prox, ahead, mask = np.empty((5, *shape), np.float32), np.empty_like(found), np.empty_like(rest)
+    found = flow[0].contiguous().numpy().copy()
+    numbers = np.array([s.tau, s.gradient, s.epsilon, s.huber, s.hidden_huber], np.float32)
+    before, after = np.empty((2, 6, *rest.shape), np.float32)
+    mask, spare = np.empty((2, *rest.shape), np.float32)
+    lambda_ = here = np.ascontiguousarray(np.broadcast_to(weight[0, 0].numpy(), rest.shape))
+    state = fused.new_state(*rest.shape)
+
+    def differentiate(planes: Map) -> None:
+        """d_x, d_y, d_xx, d_xy, d_yy of the first plane into the others."""
+        fused.differentiate(planes[0], planes[1], planes[2])
+        fused.differentiate(planes[1], planes[3], planes[4])
+        fused.differentiate(planes[2], spare, planes[5])
+
     before[0] = rest
-    fused.differentiate(before[0], before[1], before[2])
+    differentiate(before)
     for _ in range(s.warps):
         fused.warp_into(now, now_usable, found, after[0], mask)
         mask *= rest_usable
-        fused.differentiate(after[0], after[1], after[2])
-        fused.compare(before, after, np.float32(s.gradient), residual, mean)
-        for k in range(3):
-            fused.differentiate(mean[k], rows[k], columns[k])
-        here = lambda_
+        differentiate(after)
         if s.noise > 0:
-            here = lambda_ * np.float32(fused.noise_weight(residual, mask, s.noise, *_WEIGHT_LIMITS))
-        here = np.ascontiguousarray(np.broadcast_to(here, shape), np.float32)
-        huber = s.huber + s.hidden_huber * (1 - mask)
-        shrink = (1 / (1 + huber / (8 * s.tau))).astype(np.float32)
-        fused.linearise(residual, rows, columns, mask, here, found, tau, epsilon, prox)
-        ahead[:] = found
-        fused.primal_dual(found, ahead, dual[0], dual[1], prox, shrink, tau, s.steps)
+            share = fused.noise_weight(before, after, mask, s.gradient, s.noise)
+            here = lambda_ * np.float32(np.clip(share, *_WEIGHT_LIMITS))
+        fused.linearise(before, after, mask, here, found, numbers, state)
+        fused.primal_dual(found, state, np.float32(s.tau), s.steps)
         if s.median:
-            for k in range(2):
-                fused.median_into(found[k], ahead[k])
-            found[:] = ahead
+            for plane in found:
+                fused.median_into(plane, spare)
+                plane[:] = spare
     return torch.from_numpy(found)[None]
 
 
