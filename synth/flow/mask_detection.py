@@ -80,9 +80,10 @@ def hidden(film: NDArray[np.uint8], tools: NDArray[np.bool_]) -> NDArray[np.bool
 
 def grey_bodies(rgb: NDArray[np.uint8]) -> NDArray[np.bool_]:
     """(H, W): connected pixels of little colour that touch the border and are more than specks."""
-    values = rgb.astype(np.float32)
-    top = values.max(axis=2)
-    grey = ((top - values.min(axis=2)) < 0.22 * top + 4).astype(np.uint8)
+    red, green, blue = cv2.split(rgb)
+    top = np.maximum(np.maximum(red, green), blue)
+    colour = top - np.minimum(np.minimum(red, green), blue)
+    grey = (colour < (0.22 * np.arange(256) + 4).astype(np.float32)[top]).astype(np.uint8)
     grey = cv2.morphologyEx(grey, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     _, label, stats, _ = cv2.connectedComponentsWithStats(grey)
     height, width = grey.shape

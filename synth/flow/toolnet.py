@@ -63,11 +63,8 @@ def load(path: Path = WEIGHTS) -> ToolNet | None:
     if not path.is_file():
         return None
     net = ToolNet()
-    state = torch.load(path, map_location="cpu", weights_only=True)
-    net.load_state_dict({name: value.float() if value.is_floating_point() else value
-                         for name, value in state.items()})  # fmt: skip
-    net.eval()
-    return net
+    net.load_state_dict(torch.load(path, map_location="cpu", weights_only=True))  # half precision, widened
+    return net.eval().to(memory_format=torch.channels_last)  # type: ignore[call-overload,no-any-return]
 
 
 def probability(net: ToolNet, rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
@@ -75,7 +72,7 @@ def probability(net: ToolNet, rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
     height, width = rgb.shape[:2]
     share = SIDE / max(height, width)
     with torch.inference_mode():
-        logits = net(torch.from_numpy(prepare(rgb))[None])
+        logits = net(torch.from_numpy(prepare(rgb))[None].contiguous(memory_format=torch.channels_last))
         wide = F.interpolate(logits, scale_factor=2, mode="bilinear", align_corners=False)
         found = torch.sigmoid(wide)[0, 0, : max(1, round(height * share)), : max(1, round(width * share))]
     return np.asarray(cv2.resize(found.numpy(), (width, height), interpolation=cv2.INTER_LINEAR), np.float32)
