@@ -53,8 +53,8 @@ def judge(recipe: Recipe, size: int, frames: int) -> dict[str, Any]:
 
     Returns:
         `auto`, `both`, `none`: mean endpoint error with these masks over frames that show the tissue
-        [px]; `covered`: share of free tissue masked; numbers of frames that are lost (off by over 1 px and a
-        fifth of the motion, or showing less than a fifth of the tissue), flagged, and both.
+        [px]; `covered`: share of free tissue masked; numbers of frames that are lost (off by over 1 px and by
+        more than if nothing moved, or showing less than a fifth of the tissue), flagged, and both.
     """
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
@@ -65,7 +65,7 @@ def judge(recipe: Recipe, size: int, frames: int) -> dict[str, Any]:
     motion = np.array([_mean(np.linalg.norm(one.flow, axis=-1), one.seen) for one in later])
     tissue = np.count_nonzero(shown[0].seen)
     shows = np.array([one.mishap != "black" and one.seen.sum() > 0.2 * tissue for one in later])
-    lost = ~shows | ((error > 1) & (error > 0.2 * motion))
+    lost = ~shows | ((error > 1) & (error > motion))
     return {
         "covered": float(np.nanmean(covered)),
         **{name: float(np.nanmean(way[0][good])) for name, way in ways.items()},

@@ -13,7 +13,7 @@ from synth.flow.confidence import DOUBTFUL
 from synth.flow.estimator import Estimator, Flags, Flow, Map, Rgb, create
 
 _DOUBTED = 0.5  # mean confidence of what is visible; frames below it are tried again from nothing
-_MATCHED = 0.4  # share of what is visible that is no lost pixel; frames below it are lost
+_MATCHED = 0.1  # share of what is visible that is no lost pixel; below it motion is no better than a guess
 _LEAST = 0.02  # of the tissue must be free of masks for anything to be concluded
 _DROP = 0.85  # a fall below this share of the last trusted frame's confidence is looked into
 
@@ -88,8 +88,9 @@ class Tracker:
         """The last frame's answer as it was found."""
         self.initial: Flow | None = None
         """(H, W, 2) px, what the next frame starts from; None: from nothing."""
+        self.unsure: Flags = np.zeros_like(tissue)
+        """(H, W) where confidence says nothing about the frame, and is no larger than elsewhere."""
         self._level = 1.0
-        self._before: tuple[Flow | None, float] = None, 1.0  # both as they were a frame ago
 
     def step(self, frame: Rgb, blocked: Flags) -> tuple[Flow, Map]:
         """Flow (H, W, 2) px and confidence (H, W) of the next frame; `trusted` says whether it was followed.
@@ -100,7 +101,6 @@ class Tracker:
         """
         if frame.shape != self.rest.shape or blocked.shape != self.tissue.shape:
             raise UserError(f"flow: frame {frame.shape} does not fit the rest frame {self.rest.shape}")
-        self._before = self.initial, self._level
         found = self.solve(frame, blocked, self.initial)
         if self.initial is not None and self.is_doubtful(found):
             again = self.solve(frame, blocked, None)
@@ -112,18 +112,18 @@ class Tracker:
         """One answer for a frame; nothing is remembered of it. Arguments as `step` and `initial`."""
         flow, confidence = self.estimator.flow(self.rest, frame, self.usable, ~blocked, initial)
         confidence = confidence * self.tissue
-        return self.judge(flow, confidence, self.usable & ~blocked)
-
-    def judge(self, flow: Flow, confidence: Map, where: Flags) -> Solution:
-        """A flow and its confidence as an answer, its shares taken over (H, W) `where`."""
-        visible = int(np.count_nonzero(where))
-        inside = confidence * where
+        seen = self.usable & ~blocked
+        where, tissue = seen & ~self.unsure, np.count_nonzero(self.tissue)
+        if np.count_nonzero(where) < _LEAST * tissue:
+            where = seen
+        inside = confidence[where] if where.any() else np.zeros(1, np.float32)
+        level = float(inside.mean(dtype=np.float64))
         return Solution(
             flow,
-            confidence,
-            level=float(inside.sum(dtype=np.float64)) / max(1, visible),
-            matched=float(np.count_nonzero(inside >= DOUBTFUL)) / max(1, visible),
-            visible=visible / max(1, int(np.count_nonzero(self.tissue))),
+            np.where(self.unsure, np.minimum(confidence, np.float32(level)), confidence),
+            level,
+            matched=float(np.mean(inside >= DOUBTFUL)),
+            visible=np.count_nonzero(seen) / max(1, tissue),
         )
 
     def is_doubtful(self, found: Solution) -> bool:
@@ -141,16 +141,6 @@ class Tracker:
         self.trusted = not self.lost
         if self.trusted:
             self.initial, self._level = found.flow, found.level
-        return self._answer(found)
-
-    def doubt(self, reason: str) -> tuple[Flow, Map]:
-        """Takes back that the accepted frame could be followed; flow and confidence as `step`."""
-        assert self.last is not None
-        self.lost, self.trusted = reason, False
-        self.initial, self._level = self._before
-        return self._answer(self.last)
-
-    def _answer(self, found: Solution) -> tuple[Flow, Map]:
         sure = found.confidence if self.trusted else np.minimum(found.confidence, 0.5 * DOUBTFUL)
         return found.flow * self.tissue[..., None], sure
 
