@@ -72,7 +72,7 @@ def _candidates() -> list[tuple[str, str, Estimator, float | None]]:
     theirs = {f"lambda {w:g}, {n} warps": OpenCvTvl1(w, n) for w in (0.06, 0.1, 0.2) for n in (2, 3, 6)}
     return [
         *(("tvl1", label, Tvl1(setting), None) for label, setting in ours.items()),
-        ("tvl1", "unchecked", Tvl1(s, checked=False), None),
+        ("tvl1", "uncorrected", Tvl1(s, corrected=False), None),
         *(("tvl1 warm", label, Tvl1(setting), 0.9) for label, setting in warm.items()),
         *(("opencv-tvl1", label, estimator, None) for label, estimator in theirs.items()),
         ("dis", "medium", Dis(), None),

@@ -140,13 +140,13 @@ def inverse(flow: Floats) -> Floats:
     grid = source = pixels(*flow.shape[:2])
     for _ in range(60):
         before = source
-        source = grid - np.stack([_at(flow[..., c], source, order=1) for c in range(2)], -1)
+        source = grid - np.stack([sample(flow[..., c], source, order=1) for c in range(2)], -1)
         if np.abs(source - before).max() < 1e-3:
             break
     return source
 
 
-def _at(field: Floats, where: Floats, order: int = 3) -> Floats:
+def sample(field: Floats, where: Floats, order: int = 3) -> Floats:
     """(H, W) field at (..., 2) points (x, y), by cubic splines: OpenCV's remap rounds to 1/32 px and its
     bicubic kernel misplaces a ramp by up to 0.05 px, both too much for a truth."""
     return np.asarray(
@@ -221,7 +221,7 @@ class Stage:
 
     def _sample(self, at: Floats) -> Floats:
         fine = self.albedo.shape[0] / self.recipe.size
-        return np.stack([_at(self.albedo[..., c], (at + 0.5) * fine - 0.5) for c in range(3)], -1)
+        return np.stack([sample(self.albedo[..., c], (at + 0.5) * fine - 0.5) for c in range(3)], -1)
 
     def _light(self, albedo: Floats, wet: Floats, share: float) -> tuple[Floats, Flags]:
         recipe = self.recipe

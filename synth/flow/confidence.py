@@ -1,31 +1,41 @@
-"""How far a flow can be trusted, pixel by pixel."""
+"""How far a flow can be trusted, pixel by pixel: confidence stands for a standard deviation."""
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from synth.flow import image
+from synth.flow.estimator import Map
 
 DOUBTFUL = 0.3
-"""A visible pixel of less confidence counts as lost: the best F1 for errors over 1 px, on the tuning set."""
+"""A visible pixel of less confidence counts as lost: its deviation is above 0.76 px."""
 
 _WINDOW = 4.0  # px: the neighbours that vouch for a pixel
 _NOISE = 0.02  # local deviations squared: agreement of less contrast than this says nothing
-_LOOP = 1.0  # px: there and back again misses by this much in a doubtful flow ...
-_LOOP_SHARE = 0.05  # ... and by this share of the way
+_HALF_PX = 0.5  # deviation of a component whose confidence is a half
 
 
-def judge(pictures: image.Level, flow: Tensor, back: Tensor | None) -> Tensor:
-    """Confidence: seen in both pictures, times agreement once aligned, times return of the way back.
+def of_deviation(deviation_px: Map) -> Map:
+    """Confidence 1 / (1 + (s / 0.5 px)^2) in 0..1 of a component's standard deviation s, both (H, W)."""
+    return np.asarray(1 / (1 + (deviation_px / np.float32(_HALF_PX)) ** 2), np.float32)
 
-    Agreement is the local correlation of the rest frame with the warped one (1 the same, 0 unrelated, so a
-    blank picture gives 0); the way back is w(x) + b(x + w(x)) (Sundaram, Brox and Keutzer, ECCV 2010, eq. 5).
+
+def deviation(confidence: Map) -> Map:
+    """The other way round, px; what is masked or lost counts as 3.5 px off, nothing as less than 0.016 px."""
+    sure = np.clip(confidence, 0.02, 0.999)
+    return np.asarray(_HALF_PX * np.sqrt(1 / sure - 1), np.float32)
+
+
+def agreement(pictures: image.Level, flow: Tensor) -> Tensor:
+    """Seen in both pictures, times the local correlation of the rest frame with the warped one.
+
+    1 is the same, 0 unrelated; a blank picture gives 0.
 
     Args:
         pictures: the finest level.
         flow: (B, 2, H, W) px.
-        back: (B, 2, h, w) px of half the size, flow from now to rest; None: not checked.
 
     Returns:
         (B, 1, H, W) in 0..1.
@@ -38,15 +48,4 @@ def judge(pictures: image.Level, flow: Tensor, back: Tensor | None) -> Tensor:
     product, power, power_now = (around[:, 1:] / around[:, :1].clamp_min(1e-4)).unbind(1)
     agreement = product / torch.sqrt((power + _NOISE) * (power_now + _NOISE))
     vouched = agreement[:, None].clamp(0, 1)
-    if back is not None:
-        small = 0.5 * image.halved(flow)
-        there, _ = image.warp(back, back[:, :1], small)
-        miss = 2 * _length(small + there)
-        allowed = _LOOP + _LOOP_SHARE * 2 * _length(small)
-        vouched = vouched * torch.exp(-((miss / allowed) ** 2))
     return mask * image.doubled(vouched, mask)
-
-
-def _length(field: Tensor) -> Tensor:
-    """(B, 2, H, W) to (B, 1, H, W); `norm` over so short an axis takes many times as long."""
-    return torch.hypot(field[:, :1], field[:, 1:])

@@ -29,10 +29,6 @@ class Level:
     rest_usable: Tensor
     now_usable: Tensor
 
-    def swapped(self) -> Level:
-        """For the flow back from now to rest."""
-        return Level(self.now, self.rest, self.now_usable, self.rest_usable)
-
 
 def tensor(picture: NDArray[np.uint8], device: str = "cpu") -> Tensor:
     """Luminance of (H, W, 3) or (B, H, W, 3) uint8 RGB in grey levels: (B, 1, H, W)."""

@@ -26,11 +26,12 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from synth.flow import confidence, fused, image
+from synth.flow import confidence, correction, fused, image
 from synth.flow.estimator import Flags, Flow, Map, Rgb
 from synth.flow.image import Level
 
 _BETTER = 1.025  # the guess for large motion must fit this much better than the one for small motion
+_AGREED = 0.6  # agreement below which the network is believed less, and noise not at all
 _WEIGHT_LIMITS = 0.45, 1.5  # pictures of much noise, or none, would be smoothed to nothing or not at all
 
 
@@ -61,8 +62,6 @@ class TVL1Settings:
     """Primal step; the dual step is 1/(8 tau)."""
     median: bool = True
     """3x3 median of the flow after each warp (Wedel et al., An improved algorithm for TV-L1, 2009)."""
-    back_warps: int = 3
-    """Linearisations a level of the way back."""
     steady_px: float = 0.1
     """The last flow is averaged over its neighbours where that changes it by less than about this: what goes
     there is noise, and a step in the flow stays."""
@@ -100,18 +99,19 @@ class Tvl1:
         settings: TVL1Settings | None = None,
         device: str | None = None,
         *,
-        checked: bool = True,
+        corrected: bool = True,
     ) -> None:
         """Sets up.
 
         Args:
             settings: the energy and the effort; None: the default, a measured point.
             device: torch device; None: CUDA where there is one.
-            checked: also compute the backward flow for the confidence (about a fifth of the time).
+            corrected: add what a network says is missing, and take its deviation for the confidence, which is
+                the pictures' agreement otherwise; see `synth.flow.correction`.
         """
         self.settings = settings or TVL1Settings()
         self.device = device or ("cuda" if torch.cuda.is_available() else "cpu")
-        self.checked = checked
+        self.correction = correction.load() if corrected else None
         self._rest: tuple[Tensor, Tensor, list[tuple[Tensor, Tensor]]] | None = None
         """The last rest frame, where it was usable, and its pyramid: a video has one."""
 
@@ -125,14 +125,21 @@ class Tvl1:
                 # Planes, not interleaved: sums over neighbours took five times as long on the latter.
                 planes = np.ascontiguousarray(np.moveaxis(initial, -1, 0))
                 start = torch.from_numpy(planes)[None].to(self.device)
-            found, trust = self.tensors(
+            found, agreed, finest = self.tensors(
                 image.tensor(rest, self.device),
                 image.tensor(now, self.device),
                 image.flags(rest_usable, self.device),
                 image.flags(now_usable, self.device),
                 start,
             )
-            return found[0].movedim(0, -1).cpu().numpy(), trust[0, 0].cpu().numpy()
+            flow, sure = found[0].movedim(0, -1).cpu().numpy(), agreed[0, 0].cpu().numpy()
+            if self.correction is None:
+                return flow, sure
+            greys = finest.rest[0, 0].cpu().numpy(), finest.now[0, 0].cpu().numpy()
+            seen = correction.describe(rest, now, rest_usable, now_usable, greys, flow, sure)
+            flow, deviation = correction.correct(self.correction, seen, flow)
+            # Where pictures hardly agree, as under a tool that no mask knows, the network has learnt nothing.
+            return flow, np.minimum(sure / _AGREED, 1) ** 2 * confidence.of_deviation(deviation)
 
     def tensors(
         self,
@@ -141,8 +148,11 @@ class Tvl1:
         rest_usable: Tensor,
         now_usable: Tensor,
         initial: Tensor | None = None,
-    ) -> tuple[Tensor, Tensor]:
-        """As `flow`, on the device: greys, masks and confidence (1, 1, H, W), flows (1, 2, H, W)."""
+    ) -> tuple[Tensor, Tensor, Level]:
+        """As `flow`, uncorrected, on the device: greys, masks, agreement (1, 1, H, W), flow (1, 2, H, W).
+
+        The level is the finest, of both pictures contrast-normalised.
+        """
         s = self.settings
         last = self._rest
         if last is None or not (torch.equal(rest, last[0]) and torch.equal(rest_usable, last[1])):
@@ -153,12 +163,7 @@ class Tvl1:
         if initial is None and len(levels) > 1:
             initial, fine = finer(guess(levels[1:], s), levels[0]), levels[: s.fine_levels]
         found = steadied(solve(fine, initial, s), s.steady_px)
-        back = None
-        if self.checked and len(levels) > 1:
-            back = solve(
-                [level.swapped() for level in levels[1:]], None, replace(s.small_motion(), warps=s.back_warps)
-            )
-        return found, confidence.judge(levels[0], found, back)
+        return found, confidence.agreement(levels[0], found), levels[0]
 
 
 @contextmanager
@@ -190,7 +195,7 @@ def guess(levels: list[Level], s: TVL1Settings) -> Tensor:
     Little smoothness follows far pulls but loses islands between the tines, much smoothness the reverse.
     """
     small, large = solve(levels, None, s.small_motion()), solve(levels, None, s.large_motion())
-    trust = [confidence.judge(levels[0], flow, None).mean((1, 2, 3), keepdim=True) for flow in (small, large)]
+    trust = [confidence.agreement(levels[0], flow).mean((1, 2, 3), keepdim=True) for flow in (small, large)]
     return torch.where(trust[1] > _BETTER * trust[0], large, small)
 
 

@@ -122,7 +122,7 @@ class FlowSection(Section):
     backend: Annotated[PlugInName, AfterValidator(lambda name: ESTIMATORS.check_name(name, "ideal"))] = "tvl1"
     """Estimator: tvl1, opencv-tvl1, dis or an installed plug-in's; `ideal` computes no recovered flow."""
     warps: Annotated[int, Field(ge=1, le=12)] = 3
-    """tvl1: linearisations a level of the way back, for confidence; the way there has twice as many."""
+    """tvl1: half the linearisations a level."""
 
 
 def _among(known: tuple[str, ...]) -> AfterValidator:

@@ -238,4 +238,4 @@ def estimator(flow: FlowSection) -> Estimator:
     """The estimator that a job asks for."""
     if flow.backend != "tvl1":
         return create(flow.backend)
-    return tvl1.Tvl1(replace(tvl1.TVL1Settings(), warps=2 * flow.warps, back_warps=flow.warps))
+    return tvl1.Tvl1(replace(tvl1.TVL1Settings(), warps=2 * flow.warps))

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 
 from synth.errors import UserError
+from synth.flow.confidence import deviation
 from synth.flow.estimator import Flags, Flow, Map
 from synth.flow.stereo.depth_motion import Change, DepthMotionSettings, Solver, fine
 from synth.flow.stereo.deviation import inverse_posterior
@@ -86,8 +87,7 @@ class DepthTracker:
         y = np.arange(height, dtype=np.float32)[:, None] - np.float32(self.K[1, 2])
         after = self._rest + rise
         across = [(flow[k] * after + at * rise) / np.float32(self.K[k, k]) for k, at in enumerate((x, y))]
-        # Flow that is sure errs by a tenth of a pixel, flow that isn't by one.
-        off = self._rest / np.float32(self.K[0, 0]) * (0.1 + 0.9 * (1 - np.clip(confidence, 0, 1)))
+        off = self._rest / np.float32(self.K[0, 0]) * deviation(confidence)
         inside = self.tissue[..., None]
         return Moved(
             (np.stack([*across, rise], axis=-1) * inside).astype(np.float32),

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from synth.errors import UserError
 from synth.flow import fused, image
+from synth.flow.confidence import deviation
 from synth.flow.estimator import Flags, Flow, Map, Rgb
 from synth.flow.stereo import rest
 from synth.flow.stereo.depth_motion import Change, DepthMotionSettings, Solver, StereoPictures, fine
@@ -136,20 +137,23 @@ class StereoTracker:
         r, disparity, coarse = self.rectified, self.rest.disparity, self.solver.coarse
         self.lag = change.lag
         """Share of the last frame's motion that the right eye didn't show: 0 for eyes of one moment."""
-        doubt = 1 - coarse(r.picture(confidence, 0))
-        way = coarse(np.hypot(flow[0], flow[1]))
-        along, across = deviations(change, self.solver.steepness(flow), doubt, way)
+        seen = r.flags(confidence > 0, 0).astype(np.float32)
+        share = coarse(seen)
+        sure = coarse(r.picture(confidence, 0) * seen) / np.maximum(share, 0.1)
+        spread = deviation(_filled(np.asarray(sure, np.float32), share > 0.1))
+        along, across = deviations(change, self.solver.steepness(flow), spread)
         # What of another moment's motion passes for depth.
         late = np.sqrt(max(change.lag**2 - _IN_TIME**2, 0.0)) * coarse(np.abs(flow[0]) + np.abs(change.px))
         along = np.hypot(along, late) / self.px_per_mm
         across *= self._mm_per_px
         motion = r.motion(disparity, change.px, flow)
-        spread = [fine(part, self.solver.cell, disparity.shape) for part in (across, across, along)]
+        # Logarithms: a deviation that falls steeply would be interpolated to below 0.
+        logs = [fine(np.log(part), self.solver.cell, disparity.shape) for part in (across, across, along)]
         planes = [r.back(np.ascontiguousarray(motion[..., k])) for k in range(3)]
         inside = self.tissue[..., None]
         return Moved(
             np.stack(planes, axis=-1) * inside,
-            np.stack([np.maximum(r.back(part), 1e-4) for part in spread], axis=-1) * inside,
+            np.stack([np.exp(r.back(part)) for part in logs], axis=-1) * inside,
         )
 
     def _normalised(self, rgb: Rgb, usable: Flags, eye: int) -> tuple[Map, Map]:
@@ -157,6 +161,12 @@ class StereoTracker:
         known = usable.astype(np.float32)
         grey = torch.from_numpy(self.rectified.picture(rgb @ image.GREY, eye))[None, None]
         return image.normalise(grey, torch.from_numpy(known)[None, None])[0, 0].numpy(), known
+
+
+def _filled(field: Map, known: Flags) -> Map:
+    """(h, w) what is masked has the deviation of what lies around it."""
+    both = (torch.from_numpy(np.asarray(one, np.float32))[None, None] for one in (field, known))
+    return np.asarray(image.fill(*both)[0, 0], np.float32)
 
 
 def still_frames(flow: NDArray[np.float32], tissue: Flags) -> int:

@@ -82,4 +82,4 @@ def test_highlights_that_alone_say_that_nothing_moves_are_not_believed(contrast:
         flow, confidence = tracker.step(_picture(np.where(wet, 250.0, _faint(by_px, 3 + k, contrast))), found)
         off = float(np.linalg.norm(flow - [by_px, 0.0], axis=-1)[~wet].mean())
         assert (off > 1) == held, "what proves nothing if it is followed after all"
-        assert (confidence[wet].max() < 0.3) == held
+        assert (confidence[wet].max() < 0.4) == held
