@@ -113,7 +113,7 @@ class Tracker:
         flow, confidence = self.estimator.flow(self.rest, frame, self.usable, ~blocked, initial)
         confidence = confidence * self.tissue
         seen = self.usable & ~blocked
-        where, tissue = seen & ~self.unsure, np.count_nonzero(self.tissue)
+        where, tissue = seen & ~self.unsure, int(np.count_nonzero(self.tissue))
         if np.count_nonzero(where) < _LEAST * tissue:
             where = seen
         inside = confidence[where] if where.any() else np.zeros(1, np.float32)
@@ -123,7 +123,7 @@ class Tracker:
             np.where(self.unsure, np.minimum(confidence, np.float32(level)), confidence),
             level,
             matched=float(np.mean(inside >= DOUBTFUL)),
-            visible=np.count_nonzero(seen) / max(1, tissue),
+            visible=int(np.count_nonzero(seen)) / max(1, tissue),
         )
 
     def is_doubtful(self, found: Solution) -> bool:
