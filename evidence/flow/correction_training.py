@@ -1,6 +1,6 @@
 """Trains the flow's correction on rendered truth, and on closed forms that no renderer drew.
 
-Run: python -m evidence.flow.correction_training EXAMPLES [--scenes 400 --minutes 30]
+Run: python -m evidence.flow.correction_training EXAMPLES [--scenes 477 --minutes 30]
 
 Sequences of `mission`, each as rendered and once more as another camera might show it (size, gain, colour,
 contrast, noise, blur, JPEG; now and then a frame that can't be followed), the warped pairs of

@@ -35,7 +35,7 @@ def main(out: Path = report.RESULTS / "flow/pareto", count: int = 4, seed: int =
             "setting": label,
             "estimator": "tvl1" if isinstance(estimator, Tvl1) else family,
             "settings": asdict(estimator.settings) if isinstance(estimator, Tvl1) else None,
-            "checked": label != "unchecked",
+            "corrected": isinstance(estimator, Tvl1) and estimator.correction is not None,
             "warm": warm is not None,
             "default": "(default)" in label,
         }

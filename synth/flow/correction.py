@@ -24,6 +24,7 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from synth.errors import UserError
 from synth.flow import fused
 from synth.flow.estimator import Flags, Flow, Map, Rgb
 from synth.flow.image import GREY
@@ -75,10 +76,10 @@ class CorrectionNet(nn.Module):
 
 
 @cache
-def load(path: Path = WEIGHTS) -> CorrectionNet | None:
-    """The network with its weights; None if they aren't there."""
+def load(path: Path = WEIGHTS) -> CorrectionNet:
+    """The network with its weights. Raises UserError if they aren't there."""
     if not path.is_file():
-        return None
+        raise UserError(f"{path.name}: the flow's correction is missing from this installation")
     net = CorrectionNet()
     state = torch.load(path, map_location="cpu", weights_only=True)
     net.load_state_dict({name: value.float() for name, value in state.items()})
@@ -100,7 +101,8 @@ def correct(net: CorrectionNet, features: NDArray[np.float32], flow: Flow) -> tu
         found = net(cells.to(memory_format=torch.channels_last))
         wide = F.interpolate(found, scale_factor=CELL, mode="bilinear", align_corners=False)
         planes = wide[0, :, :height, :width].numpy()
-    spread = np.exp(0.25 * (planes[2] + planes[3]))  # the geometric mean of both components'
+    # The geometric mean of both components', within what was trained.
+    spread = np.exp(0.25 * (planes[2].clip(-8, 5) + planes[3].clip(-8, 5)))
     return flow + planes[:2].transpose(1, 2, 0), spread
 
 

@@ -20,7 +20,7 @@ from synth.flow.stereo.rig import Rectified, StereoRig
 _STILL_PX = 0.3  # frames whose flow is nearly everywhere below this are at rest
 _RESTS = 4
 _IN_TIME = 0.12  # share of the motion that eyes of one moment may seem to differ by
-_FOLLOWED = 0.3  # confidence of the flow: some 0.05 under a tool that no mask knows, 0.9 on tissue
+_FOLLOWED = 0.3  # confidence of the flow: less under a tool that no mask knows, 0.9 and more on tissue
 _LOST = 0.05  # of what is visible at rest: a frame that shows less is no place to start from
 
 
