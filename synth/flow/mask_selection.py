@@ -57,7 +57,7 @@ class Proposal:
     def blocks(self) -> NDArray[np.int32]:
         """(2, H, W) numbers from 1 on of the squares of glare and of those of tool; 0: neither."""
         height, width = self.glare.shape
-        side = max(_SMALLEST_PX, max(height, width) // _CELLS)
+        side = max(1, max(height, width) // _CELLS)
         rows, columns = -(-height // side), -(-width // side)
         square = 1 + np.arange(height)[:, None] // side * columns + np.arange(width) // side
         return np.stack([self.glare * square, self.tool * (square + rows * columns)]).astype(np.int32)
@@ -105,8 +105,7 @@ class SelectingTracker:
         verdict = self._verdict[found.blocks()]
         self.blocked = found.known | (verdict > 0).any(0)
         new = np.count_nonzero(found.either & (verdict == 0).all(0)) >= _SMALLEST_PX
-        # Near a proposal the confidence speaks of the proposal, too: highlights stay with the light, and
-        # over faint tissue nothing contradicts them.
+        # Near a proposal the confidence speaks of the proposal, too.
         tracker.unsure = _grown(found.either | self.rest_found.either)
         resets = tracker.resets
         flow, confidence = tracker.step(frame, self.blocked)
@@ -121,7 +120,10 @@ class SelectingTracker:
             if better is not first:
                 flow, confidence = tracker.accept(better)
         self.regained = tracker.trusted and (doubted or tracker.resets > resets)
-        return flow, confidence
+        assert tracker.last is not None
+        # Over faint tissue nothing but highlights, which stay with the light, says that nothing moves.
+        stay = self.rest_found.glare & found.glare
+        return flow, np.where(stay, np.minimum(confidence, np.float32(tracker.last.level)), confidence)
 
     def _select(self, frame: Rgb, found: Proposal, first: Solution) -> Solution:
         """The answer; its masks are remembered if it is one."""

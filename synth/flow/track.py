@@ -89,7 +89,7 @@ class Tracker:
         self.initial: Flow | None = None
         """(H, W, 2) px, what the next frame starts from; None: from nothing."""
         self.unsure: Flags = np.zeros_like(tissue)
-        """(H, W) where confidence says nothing about the frame, and is no larger than elsewhere."""
+        """(H, W) where confidence says nothing about the frame."""
         self._level = 1.0
 
     def step(self, frame: Rgb, blocked: Flags) -> tuple[Flow, Map]:
@@ -120,7 +120,7 @@ class Tracker:
         level = float(inside.mean(dtype=np.float64))
         return Solution(
             flow,
-            np.where(self.unsure, np.minimum(confidence, np.float32(level)), confidence),
+            confidence,
             level,
             matched=float(np.mean(inside >= DOUBTFUL)),
             visible=int(np.count_nonzero(seen)) / max(1, tissue),
