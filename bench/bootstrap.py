@@ -12,6 +12,8 @@ Interval = tuple[float, float]
 
 RESAMPLES = 1000
 LEVEL = 0.95
+LEAST_GROUPS = 5
+"""Of fewer, a 95% interval is little more than the two that are furthest apart."""
 
 
 def block_length(x: Curve) -> float:
@@ -100,12 +102,15 @@ def over_groups(values: Sequence[float], groups: Sequence[str], rng: np.random.G
         values: one a recording; NaN are left out.
         groups: the specimen of each.
         rng: source of the resamples.
+
+    Returns:
+        The interval; NaN of fewer than `LEAST_GROUPS`.
     """
     by: dict[str, list[float]] = {}
     for value, group in zip(values, groups, strict=True):
         if np.isfinite(value):
             by.setdefault(group, []).append(value)
-    if len(by) < 2:
+    if len(by) < LEAST_GROUPS:
         return (float("nan"), float("nan"))
     sums = np.array([float(np.sum(v)) for v in by.values()])
     sizes = np.array([float(len(v)) for v in by.values()])

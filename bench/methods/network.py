@@ -8,6 +8,7 @@ from pathlib import Path
 from bench.methods.protocol import Field, ForceEstimate, MethodContext
 from learn import Predictor, load_model
 from learn.inference.force_reader import ForceReader, describe_intervals
+from learn.inference.shipped import find_name
 from learn.uncertainty.intervals import LEVEL
 from synth.flow.stereo.track import Moved
 from synth.recording_flow.frame_motion import FrameMotion
@@ -20,6 +21,19 @@ class Model:
         """`model`: the model itself, or its folder, made into a quick graph. UserError if unreadable."""
         self.predictor: Predictor = load_model(model, quick=True) if isinstance(model, Path) else model
         self._reader: tuple[MethodContext, ForceReader] | None = None
+
+    @property
+    def identity(self) -> str:
+        """Equal of networks that answer alike: the hash of the weights, and the gain they are used with."""
+        card = self.predictor.card
+        return f"{card.weights_hash} x {card.force_gain:g}"
+
+    @property
+    def origin(self) -> str:
+        """Where it is from, for a person."""
+        card = self.predictor.card
+        name = find_name(card)
+        return f"{name}, comes along" if name else f"trained on {len(card.split.get('fit', []))} sequences"
 
     def described(self) -> dict[str, object]:
         """What the model is, for the report."""

@@ -1,4 +1,8 @@
-"""Several scored recordings as one answer: means over recordings, intervals over specimens."""
+"""Several scored recordings as one answer: means over recordings, intervals over specimens.
+
+A method is what its hash says: networks of one name and different weights are different methods, and networks
+of the same weights one, whatever they were called.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from bench.bootstrap import over_groups
+from bench.bootstrap import LEAST_GROUPS, over_groups
 from bench.scoring.metrics import METRICS
 from bench.scoring.result import MOST_LOST
 from synth.errors import UserError
@@ -35,7 +39,7 @@ def read(paths: Sequence[Path]) -> list[dict[str, Any]]:
     """The score.json of each path (a file, or a folder of `bench score`), in the order given.
 
     Raises:
-        UserError: none given, one that is no score, recordings twice, or different main methods.
+        UserError: none given, one that is no score, recordings twice, or main methods that differ.
     """
     found = []
     for path in paths:
@@ -54,8 +58,11 @@ def read(paths: Sequence[Path]) -> list[dict[str, Any]]:
     if all(_fault(tree) for tree in found):
         why = "; ".join(f"{tree['recording']}: {_fault(tree)}" for tree in found)
         raise UserError(f"no recording that can be pooled ({why})")
-    if len({tree["main"] for tree in found}) > 1:
-        raise UserError("the scores are of different main methods")
+    mains = {_identity(tree, tree["main"]): f"{tree['main']} of {tree['recording']}" for tree in found}
+    if len(mains) > 1:
+        raise UserError(
+            f"the scores are of different main methods ({', '.join(mains.values())}): pool those of one"
+        )
     return found
 
 
@@ -67,16 +74,24 @@ def pool(found: Sequence[dict[str, Any]]) -> dict[str, Any]:
     every, found = found, [tree for tree in found if not _fault(tree)]
     specimens = [tree["settings"]["meta"].get("specimen") or tree["recording"] for tree in found]
     main = found[0]["main"]
+    names = [{_identity(tree, name): name for name in tree["methods"]} for tree in found]
+    scored = [
+        {i: tree["methods"][name] for i, name in one.items()} for tree, one in zip(found, names, strict=True)
+    ]
+    common = [identity for identity in scored[0] if all(identity in one for one in scored)]
+    first = _identity(found[0], main)
 
     def values(method: str, part: str, key: str) -> list[float]:
-        return [_number(tree["methods"][method][part].get(key)) for tree in found]
+        return [_number(one[method][part].get(key)) for one in scored]
 
     methods: dict[str, Any] = {}
-    for name in (name for name in found[0]["methods"] if all(name in tree["methods"] for tree in found)):
-        pairs = zip(values(main, "scores", "mae_mn"), values(name, "scores", "mae_mn"), strict=True)
+    for identity in common:
+        name = names[0][identity]
+        pairs = zip(values(first, "scores", "mae_mn"), values(identity, "scores", "mae_mn"), strict=True)
         methods[name] = {
-            "scores": {key: _mean(values(name, "scores", key), specimens) for key in SCORES},
-            "calibrated": {key: _mean(values(name, "calibrated", key), specimens) for key in _CALIBRATED},
+            "identity": identity,
+            "scores": {key: _mean(values(identity, "scores", key), specimens) for key in SCORES},
+            "calibrated": {key: _mean(values(identity, "calibrated", key), specimens) for key in _CALIBRATED},
             "main_worse_by_mn": None if name == main else _mean([a - b for a, b in pairs], specimens),
         }
     return {
@@ -86,10 +101,23 @@ def pool(found: Sequence[dict[str, Any]]) -> dict[str, Any]:
         "recordings": [tree["recording"] for tree in found],
         "left_out": {tree["recording"]: fault for tree in every if (fault := _fault(tree))},
         "each": [_one_recording(tree) for tree in found],
+        "of_some": sorted({name for one in names for i, name in one.items() if i not in common}),
         "specimens": len(set(specimens)),
         "frames": sum(tree["frames"] for tree in found),
         "methods": methods,
     }
+
+
+def _identity(tree: dict[str, Any], name: str) -> str:
+    """What tells a method from others: of a network its hash, of a plug-in its version too, else the name.
+
+    Scores of before networks had a hash are told apart by what they say of their network.
+    """
+    about = tree["settings"]
+    if network := about.get("networks", {}).get(name):
+        return str(network["hash"])
+    old = about.get("model", "") if name == tree["main"] else ""
+    return f"{name} {about.get('plug_ins', {}).get(name, '')} {old}"
 
 
 def _fault(tree: dict[str, Any]) -> str:
@@ -119,7 +147,7 @@ def _one_recording(tree: dict[str, Any]) -> dict[str, Any]:
 
 
 def _mean(values: Sequence[float], specimens: Sequence[str]) -> dict[str, float | None]:
-    """Mean of the finite values and its interval; None for what is undefined."""
+    """Mean of the finite values and its interval; None for what is undefined, or of too few specimens."""
     good = [value for value in values if math.isfinite(value)]
     low, high = over_groups(values, list(specimens), np.random.default_rng(0))
     ends = {"low": low if math.isfinite(low) else None, "high": high if math.isfinite(high) else None}
@@ -158,7 +186,10 @@ def page(tree: Mapping[str, Any]) -> str:
     parts = [
         f"# {count}, {tree['specimens']} specimens, {tree['frames']} frames",
         f"    {tree['command']}",
-        "Means over recordings; in brackets 95% intervals, specimens resampled.",
+        "Means over recordings; in brackets 95% intervals, specimens resampled."
+        if tree["specimens"] >= LEAST_GROUPS
+        else f"Means over recordings, without intervals: those need {LEAST_GROUPS} specimens at least.",
+        *(f"{name}  is left out: not every recording was scored by the same." for name in tree["of_some"]),
         *(f"Recording {lost} is left out: {why}." for lost, why in tree["left_out"].items()),
         f"![{count}](chart.svg)",
         _table(rows),

@@ -93,6 +93,10 @@ def score(
             simple = comparison.simpler_methods(Path(train) if train else None, folder, opened.has_two_eyes)
             chosen |= {name: one for name, one in simple.items() if name not in chosen}
         described: dict[str, Any] = {} if network is None else {"model": network.described()}
+        networks = {name: one for name, one in chosen.items() if isinstance(one, Model)}
+        described["networks"] = {
+            name: {"hash": one.identity, "origin": one.origin} for name, one in networks.items()
+        }
         if sources := {name: where for name, where in plugins.sources().items() if name in chosen}:
             described["plug_ins"] = sources
         scale = pixel_scale.find_scale(opened.meta, opened.folder)

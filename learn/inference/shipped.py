@@ -51,6 +51,12 @@ def require_model(two_eyes: bool) -> Path:
     return found
 
 
+def find_name(card: ModelCard) -> str:
+    """The name of the network that comes along with these very weights; empty if it is none of them."""
+    found = {checkpoint.read_card(folder).weights_hash: name for name, folder in shipped().items()}
+    return found.get(card.weights_hash, "")
+
+
 def hash_data(card: ModelCard) -> str:
     """Of all sequences that a model was fitted, chosen and to be tested on; their order doesn't count."""
     named = {part: sorted(hashes) for part, hashes in card.split.items()}

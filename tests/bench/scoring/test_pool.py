@@ -14,7 +14,7 @@ from bench.scoring import pool
 from synth.errors import UserError
 
 
-def score(name: str, mae: float, specimen: str = "") -> dict[str, Any]:
+def score(name: str, mae: float, specimen: str = "", **networks: str) -> dict[str, Any]:
     def method(value: float) -> dict[str, Any]:
         return {
             "scores": dict.fromkeys(pool.SCORES) | {"mae_mn": value, "r": 0.9},
@@ -23,8 +23,12 @@ def score(name: str, mae: float, specimen: str = "") -> dict[str, Any]:
 
     return {
         "format": "sulcus-score", "recording": name, "main": "net", "frames": 10,
-        "scores": {"mae_mn": mae}, "methods": {"net": method(mae), "zero": method(4.0)},
-        "settings": {"meta": {"specimen": specimen}},
+        "scores": {"mae_mn": mae}, "methods": {"net": method(mae), "zero": method(4.0)} | {
+            name: method(mae) for name in networks
+        },
+        "settings": {"meta": {"specimen": specimen}, "networks": {
+            name: {"hash": one} for name, one in networks.items()
+        }},
     }  # fmt: skip
 
 
@@ -32,10 +36,26 @@ def test_means_and_intervals_over_specimens() -> None:
     tree = pool.pool([score("a", 1.0, "x"), score("b", 3.0, "x"), score("c", 5.0, "y")])
     net = tree["methods"]["net"]["scores"]["mae_mn"]
     assert net["mean"] == pytest.approx(3.0)
-    assert (net["low"], net["high"]) == (2.0, 5.0)  # two specimens: either alone, or both
+    assert (net["low"], net["high"]) == (None, None)  # of two specimens it would be their two values
+    five = pool.pool([score(name, 1.0 + (name == "e"), name) for name in "abcde"])["methods"]["net"]["scores"]
+    assert five["mae_mn"]["low"] < five["mae_mn"]["mean"] < five["mae_mn"]["high"]
     assert tree["methods"]["zero"]["main_worse_by_mn"]["mean"] == pytest.approx(-1.0)
     assert tree["methods"]["net"]["scores"]["ccc"]["mean"] is None
     assert tree["specimens"] == 2
+
+
+def test_methods_are_what_their_hash_says(tmp_path: Path) -> None:
+    tree = pool.pool(
+        [score("a", 1.0, net="x", one="y", two="z"), score("b", 3.0, net="x", other="y", two="w")]
+    )
+    assert list(tree["methods"]) == ["net", "zero", "one"]  # called otherwise in b
+    assert tree["methods"]["one"]["scores"]["mae_mn"]["mean"] == 2.0
+    assert tree["of_some"] == ["two"]
+    for name, network in ("a", "x"), ("b", "y"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "score.json").write_text(json.dumps(score(name, 1.0, net=network)))
+    with pytest.raises(UserError, match=r"net of a.*net of b"):
+        pool.read([tmp_path / "a", tmp_path / "b"])
 
 
 @pytest.mark.parametrize(
