@@ -5,6 +5,7 @@ from __future__ import annotations
 import json as json_
 import shlex
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -170,20 +171,21 @@ def import_(
 @app.command(epilog="Example: bench demo out --model model --out runs/demo")
 def demo(
     dataset: Annotated[Path, typer.Argument(help="A rendered dataset.")],
-    model: Annotated[Path, typer.Option("--model", "-m", help="Model trained on it.")],
+    model: Annotated[Path, typer.Option("--model", "-m", help="Model trained on it, to stand beside.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for recording, score and report.")],
     flow: Backend = "tvl1",
     json: Json = False,
 ) -> None:
-    """Scores a model on a sequence of its dataset that it has not seen, by way of a recording."""
+    """Scores the network that comes along on a sequence that it has not seen, the given model beside it."""
     from bench.recording.folder import open_recording
-    from bench.scoring.demo import export_unseen
+    from bench.scoring.demo import choose_networks, export_unseen
     from synth.recording_flow.video_flow import RecordingFlowSettings
 
-    index = export_unseen(dataset, model, out / "recording")
+    main, others = choose_networks(dataset, model)
+    index = export_unseen(dataset, [main, *others.values()], out / "recording")
     title = f"Force from video: sequence {index}, unseen in training"
     settings = RecordingFlowSettings(flow, rate_hz=None)
-    _score(open_recording(out / "recording"), model, out, settings, title, json)
+    _score(open_recording(out / "recording"), main, out, settings, title, json, others)
 
 
 @app.command(
@@ -258,7 +260,7 @@ def _score(
     settings: RecordingFlowSettings,
     title: str,
     json: bool,
-    also: dict[str, str] | None = None,
+    also: Mapping[str, str | Path] | None = None,
     **more: Any,
 ) -> None:
     """Scores a recording, writes into `folder`, prints; `also`: further models; `more`: of `bench.score`."""

@@ -23,10 +23,10 @@ _WIDE, _HALF, _HIGH = 1150, 560, 300  # points
 
 
 def draw_force(result: Result) -> str:
-    """Force over time: the sensor, the main method with its bands of uncertainty, the others thin.
+    """Force over time: the sensor, the main method with its bands of uncertainty, the others thinner.
 
     Lost frames are gaps, shaded. Without a known E all curves are brought to one height. The axis holds the
-    sensor and what has a line of its own weight; a thin curve may leave it.
+    sensor, networks and lengths of flow, which are dotted; other curves may leave it.
     """
     time_s, (sensor, curves, label) = result.time_s, scale_curves(result)
     main, method = curves[result.main], result.methods[result.main]
@@ -44,13 +44,14 @@ def draw_force(result: Result) -> str:
             axes.plot(time_s, sensor, color=_SENSOR, linewidth=1.8, label="sensor", zorder=4)
         axes.plot(time_s, main, color=_MAIN, linewidth=1.8, label=result.main, zorder=5)
         others = {name: curve for name, curve in curves.items() if name != result.main}
-        sizes = {name: curve for name, curve in others.items() if result.methods[name].gain}
+        networks = result.settings.get("networks", {})
+        sizes = {name for name in others if result.methods[name].gain}
         for k, (name, curve) in enumerate(others.items()):
-            width, alpha = (1.1, 1.0) if name in sizes else (0.6, 0.6)
-            axes.plot(
-                time_s, curve, color=_OTHERS[k % len(_OTHERS)], linewidth=width, alpha=alpha, label=name
-            )
-        shown = np.concatenate([main, *sizes.values(), *([] if sensor is None else [sensor])])
+            # A length of flow has its gain from what is drawn here already.
+            line, colour = ":" if name in sizes else "-", _OTHERS[k % len(_OTHERS)]
+            axes.plot(time_s, curve, line, color=colour, linewidth=1.1, label=name)
+        held = [curve for name, curve in others.items() if name in sizes or name in networks]
+        shown = np.concatenate([main, *held, *([] if sensor is None else [sensor])])
         if np.isfinite(shown).any():
             low, high = min(np.nanmin(shown), 0.0), _largest(shown)
             axes.set_ylim(low - 0.04 * (high - low), high + 0.08 * (high - low))

@@ -64,8 +64,9 @@ def render_report(result: Result, title: str = "") -> str:
     if result.sync is not None and result.sync.correlogram:
         figures["correlogram"] = charts.draw_correlogram(result.sync)
     panels, flow_px, force_kpa = pictures(result)
-    columns, better = _columns(result), beaten_by(result)
-    flattered = {n for n, one in result.methods.items() if one.gain and one.gain.source == "hindsight"}
+    columns, lower = _columns(result), beaten_by(result)
+    flattered = [n for n in lower if (gain := result.methods[n].gain) and gain.source == "hindsight"]
+    better = [n for n in lower if n not in flattered]
     return environment.get_template("report.html.jinja").render(
         title=title or f"Force from video: {result.recording}",
         result=result,
@@ -75,7 +76,8 @@ def render_report(result: Result, title: str = "") -> str:
         headline=headline(result),
         best=_best(result),
         beaten_by=better,
-        losses=[f"{n} (its gain set in hindsight)" if n in flattered else n for n in better],
+        flattered=flattered,
+        origin=result.settings.get("networks", {}).get(result.main, {}).get("origin", ""),
         surely=[n for n in better if (w := result.methods[n].worse_by_mn) and w[0] > 0],
         figures=figures,
         depth_mm=_largest_depth(result.followed),
