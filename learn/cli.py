@@ -294,6 +294,7 @@ def predict_command(
     settings = RecordingFlowSettings(flow, shrink, rate or None, pulse, kind)
     options = VideoOptions(read_scale(scale), tissue, settings, files)
     peaks: dict[str, float | None] = {}
+    said: dict[str, list[str]] = {}
     for motion in motions(source, predictor.stored(input), options):
         written = out / f"{motion.name}.npz"
         if written.exists() and written.samefile(source):
@@ -305,6 +306,7 @@ def predict_command(
             write_overlay(found, source if one else source / f"{motion.name}.zarr", out / motion.name)
         size = found["total_force_mn"][found["trusted"]]
         peak = peaks[motion.name] = float(size.max()) if len(size) else None
+        said[motion.name] = found["notes"].tolist()
         if json:
             continue
         what = "no force: no frame could be followed" if peak is None else f"peak force {peak:.3g} mN"
@@ -312,7 +314,7 @@ def predict_command(
         for note in found["notes"]:
             _console.print(f"note: {note}", style="yellow", markup=False, highlight=False)
     if json:
-        print(json_.dumps({"out": str(out), "peak_force_mn": peaks}))
+        print(json_.dumps({"out": str(out), "notes": said, "peak_force_mn": peaks}))
 
 
 @app.command("calibrate", epilog="Example: learn calibrate model press.npz")

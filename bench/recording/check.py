@@ -1,8 +1,9 @@
-"""`bench check`: what of a recording is usable, what is missing and what looks wrong."""
+"""What of a recording is usable, missing, or looks wrong: for `bench check` and `bench score`."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -11,56 +12,51 @@ from numpy.typing import NDArray
 from bench.recording import clocks, pixel_scale
 from bench.recording.folder import Recording, open_recording
 from bench.recording.meta import LEAST_INTERVALS, LEAST_TURNING
-from bench.recording.second_eye import LATE, SecondEye
+from bench.recording.second_eye import LATE, SecondEye, StereoQuality
 from synth.errors import UserError
-from synth.recording_flow.frame_faults import find_fault
+from synth.recording_flow.finding import Finding, judge_scale, judge_young, worth_saying
 from synth.recording_flow.video_flow import RecordingFlowSettings, VideoFlow
+from synth.video.read import Picture
 
-_WIDEST_MM, _NARROWEST_MM = 300.0, 3.0
-_SOFTEST_KPA, _STIFFEST_KPA = 0.05, 100.0
 _JUMP = 3.0  # median intervals
 _SURGICAL_N = 5.0
 _RATE_HZ = 10.0  # frames a second that are looked at unless more are asked for
 _LEAST_PRESS = 5  # frames of a press that settle its gain
 _OFF_ROWS_PX = 0.5  # of small pictures: the calibration is not this pair's, or no longer
 _NOISY_MM = 0.16  # depth motion from which on force is no better than with one eye
-_OTHER_SCALE = 0.1  # by more than that the scale and the second eye's calibration contradict each other
+# Logarithm of the stated scale over the second eye's: beyond these they contradict each other, and beyond the
+# second, which of them is wrong decides what the force is.
+_OTHER_SCALE, _ANOTHER_SCALE = 0.1, 0.3
 _LOOKED_AT = 12  # frames that are followed to see whether they can be
-
-
-@dataclass(frozen=True)
-class RecordingFinding:
-    """One line of the answer."""
-
-    state: str
-    """`ok`, `odd` (usable, but look at it), `lack` (optional, not there) or `bad` (can't be scored)."""
-    what: str
-    """Which part of the recording."""
-    said: str
-    """What was found."""
 
 
 @dataclass
 class _Checked:
     """What the checks before have found."""
 
-    findings: list[RecordingFinding] = field(default_factory=list)
+    findings: list[Finding] = field(default_factory=list)
     mm_per_px: float | None = None
-    time_s: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
-    """Of the usable frames."""
+    times: list[float] = field(default_factory=list)
+    """Of the usable frames [s]."""
+    timeless: int = 0
+    back: int = 0
     size: tuple[int, int] = (0, 0)
     """Height, width [px]."""
     frames: int = 0
 
+    @property
+    def time_s(self) -> NDArray[np.float64]:
+        return np.array(self.times)
+
     def add(self, state: str, what: str, said: str) -> None:
-        self.findings.append(RecordingFinding(state, what, said))
+        self.findings.append(Finding(state, what, said))
 
     def judge(self, fine: bool, what: str, said: str) -> None:
         """`ok` or `odd`."""
         self.add("ok" if fine else "odd", what, said)
 
 
-def check_recording(folder: Path, phantom: bool = False) -> list[RecordingFinding]:
+def check_recording(folder: Path, phantom: bool = False) -> list[Finding]:
     """Opens a recording, decodes its pictures and compares what its files say. Raises no UserError.
 
     `phantom`: as of `open_recording`.
@@ -69,13 +65,13 @@ def check_recording(folder: Path, phantom: bool = False) -> list[RecordingFindin
     try:
         recording = open_recording(folder, phantom)
     except UserError as error:
-        return [RecordingFinding("bad", "recording", str(error))]
+        return [Finding("bad", "recording", str(error))]
     for note in recording.notes:
         found.add("odd", "files", note)
     for what, check in (
         ("scale", _check_scale),
-        ("pictures", _check_pictures),
-        ("following", _check_following),
+        ("pictures", _check_film),
+        ("times", _check_times),
         ("sensor", _check_sensor),
         ("spans", _check_spans),
     ):
@@ -83,10 +79,44 @@ def check_recording(folder: Path, phantom: bool = False) -> list[RecordingFindin
             check(recording, found)
         except UserError as error:
             found.add("bad", what, str(error))
-    return found.findings
+    first = worth_saying(found.findings)
+    return [*first, *(one for one in found.findings if one not in first)]
 
 
-def is_usable(found: list[RecordingFinding]) -> bool:
+def judge(
+    recording: Recording,
+    mm_per_px: float,
+    size: tuple[int, int],
+    film: Sequence[Finding],
+    stereo: StereoQuality | None,
+) -> list[Finding]:
+    """What is wrong with a recording whose film was followed: `bench check` and `bench score` say the same.
+
+    Args:
+        recording: the opened recording.
+        mm_per_px: of its own pixels.
+        size: height, width of its pictures [px].
+        film: what its `VideoFlow` found.
+        stereo: what its second eye came to, if it has one.
+    """
+    meta = recording.meta
+    found = [*judge_young(meta.young_kpa, meta.tissue == "phantom"), *judge_scale(mm_per_px, size[1])]
+    return [*found, *film, *([] if stereo is None else judge_eyes(stereo, mm_per_px))]
+
+
+def judge_eyes(stereo: StereoQuality, mm_per_px: float) -> list[Finding]:
+    """Whether a second eye is of this film, at this scale."""
+    found = []
+    if stereo.epipolar_px > _OFF_ROWS_PX or not stereo.noise_mm < _NOISY_MM or stereo.lag > LATE:
+        found.append(Finding("odd", "second eye", stereo.describe()))
+    off = abs(np.log(stereo.mm_per_px / mm_per_px))
+    if off > _OTHER_SCALE:
+        said = f"{mm_per_px:.4g} mm/px, but the second eye finds {stereo.mm_per_px:.4g}"
+        found.append(Finding("bad" if off > _ANOTHER_SCALE else "odd", "scale", said))
+    return found
+
+
+def is_usable(found: list[Finding]) -> bool:
     """Whether anything can be predicted from it."""
     return all(finding.state != "bad" for finding in found)
 
@@ -96,47 +126,64 @@ def _check_scale(recording: Recording, found: _Checked) -> None:
     young = recording.meta.young_kpa
     if young is None:
         found.add("lack", "stiffness", "young_kpa unknown: only relative force can be had")
-    else:
-        usual = _SOFTEST_KPA <= young <= _STIFFEST_KPA
-        said = f"± {100 * recording.meta.young_uncertainty:.2g}%" if usual else "is odd: is it in kPa?"
-        found.judge(usual, "stiffness", f"E = {young:g} kPa {said}")
+    elif not judge_young(young):
+        found.add("ok", "stiffness", f"E = {young:g} kPa ± {100 * recording.meta.young_uncertainty:.2g}%")
     scale = pixel_scale.find_scale(recording.meta, recording.folder)
     found.mm_per_px = scale.mm_per_px
     said = f"{scale.mm_per_px:.4g} mm/px ± {100 * scale.uncertainty:.2g}% ({scale.source})"
     found.add("ok", "scale", said)
 
 
-def _check_pictures(recording: Recording, found: _Checked) -> None:
-    """Decodes every picture: how many there are, how large, and when."""
-    times: list[float] = []
-    timeless = back = 0
-    fault = broken = ""
+def _check_film(recording: Recording, found: _Checked) -> None:
+    """Decodes every picture once, and follows a few as `bench score` would."""
+    first = recording.meta.rest_frame
+    last = max((recording.expected_frames() or _LOOKED_AT) - 1, first)
+    only = frozenset({first, *np.linspace(first, last, _LOOKED_AT).astype(int).tolist()})
+    second = SecondEye(recording, found.mm_per_px or 1.0) if recording.has_two_eyes else None
+    pictures = _counted(recording, found)
+    film = replace(recording.film(pictures), only=only)
+    video = VideoFlow(film, RecordingFlowSettings(rate_hz=None, pulse=False), second=second)
+    try:
+        for _ in video.frames():
+            pass
+    except UserError as error:
+        found.add("bad", "following", str(error))
+    for _ in pictures:
+        pass  # those that nobody followed count too
+    if not found.frames:
+        return
+    found.add("ok", "pictures", f"{found.frames} of {found.size[1]} x {found.size[0]} px")
+    if first >= found.frames:
+        found.add("bad", "rest frame", f"rest_frame is {first} of {found.frames} frames")
+    if recording.tissue is None:
+        found.add("lack", "tissue", "no tissue.png: the whole picture is taken for tissue")
+    found.add("ok" if recording.masks else "lack", "tool", recording.describe_tool(found.frames))
+    if video.summary.frames:
+        found.judge(not video.summary.is_odd, "following", video.summary.describe())
+    stereo = None if second is None else second.quality
+    if stereo is not None and not judge_eyes(stereo, found.mm_per_px or stereo.mm_per_px):
+        found.add("ok", "second eye", stereo.describe())
+    found.findings += judge(recording, found.mm_per_px or 0.0, found.size, video.findings, stereo)
+
+
+def _counted(recording: Recording, found: _Checked) -> Iterator[Picture]:
+    """The pictures, counted on the way; those up to where the film can't be read."""
     try:
         for picture in recording.frames():
-            found.size = (picture.rgb.shape[0], picture.rgb.shape[1])
-            found.frames += 1
-            if picture.index == recording.meta.rest_frame:
-                fault = find_fault(picture.rgb, recording.tissue_mask(found.size))
+            found.size, found.frames = (picture.rgb.shape[0], picture.rgb.shape[1]), found.frames + 1
             if picture.time_s is None:
-                timeless += 1
-            elif times and picture.time_s <= times[-1]:
-                back += 1
+                found.timeless += 1
+            elif found.times and picture.time_s <= found.times[-1]:
+                found.back += 1
             else:
-                times.append(picture.time_s)
+                found.times.append(picture.time_s)
+            yield picture
     except UserError as error:
-        broken = str(error)
-    if not found.frames:
-        raise UserError(broken)
-    t = found.time_s = np.array(times)
-    width = found.size[1]
-    found.judge(not broken, "pictures", broken or f"{found.frames} of {width} x {found.size[0]} px")
-    if fault:
-        found.add("bad", "pictures", f"nothing can be measured: the rest frame is {fault}")
-    if recording.meta.rest_frame >= found.frames:
-        found.add("bad", "rest frame", f"rest_frame is {recording.meta.rest_frame} of {found.frames} frames")
-    if found.mm_per_px and not _NARROWEST_MM <= found.mm_per_px * width <= _WIDEST_MM:
-        wide = f"{found.mm_per_px * width:.3g} mm"
-        found.add("odd", "scale", f"the picture would be {wide} wide: is the scale in mm/px?")
+        found.add("bad", "pictures", str(error))
+
+
+def _check_times(recording: Recording, found: _Checked) -> None:
+    t = found.time_s
     if len(t) < 2:
         found.add("bad", "times", "fewer than two frames have a time")
         return
@@ -144,44 +191,13 @@ def _check_pictures(recording: Recording, found: _Checked) -> None:
     rate = (len(t) - 1) / (t[-1] - t[0])
     jumps = np.diff(t) > _JUMP * np.median(np.diff(t))
     found.add("ok", "times", f"{t[-1] - t[0]:.2f} s at {rate:.4g} frames a second")
-    if timeless or back:
-        found.add("odd", "times", f"{timeless} frames without a time, {back} whose time runs back")
+    if found.timeless or found.back:
+        said = f"{found.timeless} frames without a time, {found.back} whose time runs back"
+        found.add("odd", "times", said)
     if jumps.any():
         found.add("odd", "times", f"{jumps.sum()} gaps, the longest {np.diff(t).max():.3g} s")
     if not 0.5 <= rate <= 1000:
         found.add("odd", "times", f"{rate:.3g} frames a second: are the times in seconds?")
-
-
-def _check_following(recording: Recording, found: _Checked) -> None:
-    """Follows a few frames as `bench score` would: what is masked, and whether the tissue can be followed."""
-    if not found.frames:
-        return
-    if recording.tissue is None:
-        found.add("lack", "tissue", "no tissue.png: the whole picture is taken for tissue")
-    elif not recording.tissue_mask(found.size).any():
-        found.add("bad", "tissue", "tissue.png marks nothing")
-    if recording.masks:
-        recording.masks.read(next(iter(recording.masks.by_frame), 0), found.size)
-    found.add("ok" if recording.masks else "lack", "tool", recording.describe_tool(found.frames))
-    first = recording.meta.rest_frame
-    last = max((recording.expected_frames() or _LOOKED_AT) - 1, first)
-    wanted = {first, *np.linspace(first, last, _LOOKED_AT).astype(int).tolist()}
-    pictures = (picture for picture in recording.frames() if picture.index in wanted)
-    second = SecondEye(recording, found.mm_per_px or 1.0) if recording.has_two_eyes else None
-    settings = RecordingFlowSettings(rate_hz=None, pulse=False)
-    video = VideoFlow(recording.film(pictures), settings, second=second)
-    for _ in video.frames():
-        pass
-    if video.summary.frames:
-        found.judge(not video.summary.is_odd, "following", video.summary.describe())
-    stereo = None if second is None else second.quality
-    if stereo is None:  # one eye; of two, the rest frame is at fault
-        return
-    odd = stereo.epipolar_px > _OFF_ROWS_PX or not stereo.noise_mm < _NOISY_MM or stereo.lag > LATE
-    found.judge(not odd, "second eye", stereo.describe())
-    stated = found.mm_per_px
-    if stated and abs(stereo.mm_per_px / stated - 1) > _OTHER_SCALE:
-        found.add("odd", "scale", f"{stated:.4g} mm/px, but the second eye finds {stereo.mm_per_px:.4g}")
 
 
 def _check_sensor(recording: Recording, found: _Checked) -> None:

@@ -26,6 +26,7 @@ from bench.sensor.alignment import AlignedSensor, align_sensor, describe_span
 from bench.tracking.tracking import Progress, TrackedRecording, track_recording
 from learn.uncertainty.intervals import LEVEL
 from learn.uncertainty.out_of_distribution import describe_unseen
+from synth.recording_flow.finding import worth_saying
 from synth.recording_flow.local_flow import LocalFlow
 from synth.recording_flow.video_flow import RecordingFlowSettings
 
@@ -107,6 +108,7 @@ def evaluate_recording(
         settings={**asdict(settings), **described, "meta": meta.model_dump(mode="json", exclude_none=True)},
         followed=tracked,
         turn=sensor.rotation,
+        findings=worth_saying(tracked.findings),
         absolute=against.absolute,
     )
 

@@ -42,17 +42,18 @@ def headline(result: Result) -> Headline:
     With a separate press those after its gain come first. Without a known E, or with the press alone, the
     curve's shape follows: what no gain changes. Nothing of it where too many frames were lost.
     """
-    if result.followed.fault:
-        return Headline(f"Nothing can be measured: {result.followed.fault}", ())
+    odd = tuple(one.said for one in result.findings if one.state == "odd")
+    if result.fault:
+        return Headline(f"Nothing can be measured: {result.fault}", (), odd)
     if result.lost.any() and result.lost_share > MOST_LOST:
         share = f"{100 * result.lost_share:.0f}%"
         return Headline(
-            f"{share} of the frames to be scored were lost: no number stands for this recording", ()
+            f"{share} of the frames to be scored were lost: no number stands for this recording", (), odd
         )
     main = result.methods[result.main]
     if not main.scores:
-        return Headline("No usable force sensor: these are predictions only, nothing is scored", ())
-    warnings = []
+        return Headline("No usable force sensor: these are predictions only, nothing is scored", (), odd)
+    warnings = list(odd)
     if result.sync is not None and not result.aligned:
         warnings.append(
             f"The clocks could not be aligned ({result.sync.refused}): scored at the offset stated, "

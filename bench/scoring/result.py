@@ -16,6 +16,7 @@ from bench.recording.pixel_scale import PixelScale
 from bench.sensor.clock_sync import Offset
 from bench.sensor.rotation import SensorRotation
 from bench.tracking.tracking import TrackedRecording
+from synth.recording_flow.finding import Finding, first_fault
 from synth.system import packages
 
 Curve = NDArray[np.float64]
@@ -95,9 +96,16 @@ class Result:
     followed: TrackedRecording
     turn: SensorRotation | None = None
     """The sensor's rotation as found on `sensor.turn_s`; None if it was stated, or nobody asked."""
+    findings: tuple[Finding, ...] = ()
+    """What is wrong or odd, the worst first."""
     absolute: bool = True
     """Whether E is known, so that forces are in newtons and not those of tissue of 1 kPa."""
     environment: dict[str, str] = field(default_factory=lambda: _environment())
+
+    @property
+    def fault(self) -> str:
+        """Why no number stands; empty if one may."""
+        return first_fault(self.findings)
 
     @property
     def aligned(self) -> bool:
@@ -121,6 +129,8 @@ def as_json(result: Result) -> dict[str, Any]:
         "format": "sulcus-score",
         "version": 1,
         "recording": result.recording,
+        "findings": result.findings,
+        "fault": result.fault,
         "main": result.main,
         "frames": len(result.time_s),
         "lost": {"frames": int(result.lost.sum()), "share": result.lost_share, "most": MOST_LOST},
@@ -132,7 +142,6 @@ def as_json(result: Result) -> dict[str, Any]:
         "scale": result.scale,
         "relative_uncertainty": result.relative_uncertainty,
         "noise_floor_mn": result.noise_floor_mn,
-        "fault": done.fault,
         "pulse": done.pulse,
         "second_eye": done.stereo,
         "aligned": result.aligned,

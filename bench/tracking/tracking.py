@@ -11,9 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.methods.protocol import InSpace, Method, MethodContext
+from bench.recording import check
 from bench.recording.folder import Recording
 from bench.recording.second_eye import SecondEye, StereoQuality
 from synth.errors import UserError
+from synth.recording_flow.finding import Finding, first_fault
 from synth.recording_flow.frame_motion import FrameMotion, TrackingSummary
 from synth.recording_flow.local_flow import LocalFlow
 from synth.recording_flow.pulse import PulseSearch, SurfaceMotion
@@ -70,14 +72,19 @@ class TrackedRecording:
     """Height, width of the recording [px]."""
     notes: list[str] = field(default_factory=list)
     timings: dict[str, dict[str, float] | float] = field(default_factory=dict)
-    fault: str = ""
-    """Why nothing of the video is a measurement; empty if something may be."""
+    findings: list[Finding] = field(default_factory=list)
+    """What is wrong with the video, and with what is stated of it."""
     stereo: StereoQuality | None = None
     """What the second eye or the depth camera is good for; None: there is none, or it was not used."""
     turning: SurfaceMotion | None = None
     """How the tissue moved over `sensor.turn_s`; None without that span."""
     pulse: list[dict[str, float]] = field(default_factory=list)
     """rate_hz and amplitude_mm of each rhythm of the tissue's own that was taken off."""
+
+    @property
+    def fault(self) -> str:
+        """Why nothing of the video is a measurement; empty if something may be."""
+        return first_fault(self.findings)
 
 
 def track_recording(
@@ -151,7 +158,9 @@ def _describe(
     mm_per_px: float,
 ) -> None:
     """What was done to the video, which is through, and what somebody should know of it."""
-    out.summary, out.fault, out.size, out.notes = video.summary, video.fault, video.size, video.notes
+    out.summary, out.size, out.notes = video.summary, video.size, video.notes
+    scale = mm_per_px / video.shrink
+    out.findings = check.judge(recording, scale, video.size, video.findings, out.stereo)
     if out.fault:
         out.trusted = [False] * len(out.time_s)
         out.notes.append(f"nothing can be measured: {out.fault}")

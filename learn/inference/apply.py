@@ -15,6 +15,7 @@ from learn.inference.motion import Motion
 from learn.inference.predict import Predictor, force_size, net_force
 from learn.uncertainty.conformal import LEVELS
 from synth.errors import UserError
+from synth.recording_flow.finding import first_fault, judge_young, worth_saying
 
 
 def apply(predictor: Predictor, motion: Motion, young_kpa: float | None = None) -> dict[str, Any]:
@@ -37,7 +38,8 @@ def apply(predictor: Predictor, motion: Motion, young_kpa: float | None = None) 
     without_pulse = motion.again()
     if without_pulse is not None:
         return apply(predictor, without_pulse, young_kpa)
-    fault = motion.fault()
+    findings = worth_saying([*judge_young(young), *motion.findings()])
+    fault = first_fault(findings)
     trusted = np.array(followed) & (not fault)
     force = np.where(trusted[:, None], [one.force_mn for one in found], np.nan)
     last = found[-1].map
@@ -60,14 +62,14 @@ def apply(predictor: Predictor, motion: Motion, young_kpa: float | None = None) 
         out["time_s"] = np.array(times)
     if last.force_mn is not None:
         out["force_mn"] = force
-    notes = motion.notes() + reader.notes
+    notes = [one.said for one in findings if one.state == "odd"] + motion.notes() + reader.notes
     if motion.scale_known:
         # A frame that could not be followed shows nothing of the tissue.
         distances = [one.distance for one, sure in zip(found, followed, strict=True) if sure]
         notes += describe_intervals(predictor.card, distances)
         out |= _ends(found, trusted)
     if fault:
-        notes.append(f"nothing can be measured: {fault}")
+        notes.insert(0, f"nothing can be measured: {fault}")
     elif not trusted.all():
         notes.append(f"{(~trusted).sum()} of {len(trusted)} frames could not be followed: they have no force")
     out["notes"] = np.array(notes, dtype=str)

@@ -17,6 +17,7 @@ from learn.data.clips import FIELDS, check_readable, has_depth
 from synth.dataset.store import Dataset, Sequence, open_sequence
 from synth.errors import UserError
 from synth.flow.stereo.track import Moved
+from synth.recording_flow.finding import Finding, judge_scale
 from synth.recording_flow.frame_motion import FrameMotion
 from synth.recording_flow.pulse import PulseSearch
 from synth.recording_flow.video_flow import Footage, RecordingFlowSettings, VideoFlow, everywhere
@@ -42,8 +43,8 @@ class Motion:
     """How many times smaller than the film's own pictures those are that flow is on."""
     notes: Callable[[], list[str]] = list
     """What was done to the film that its user should know, once its frames are through."""
-    fault: Callable[[], str] = str
-    """Why nothing of it is a measurement, once its frames are through; empty if something may be."""
+    findings: Callable[[], list[Finding]] = list
+    """What is wrong with it, once its frames are through."""
     scale_known: bool = True
     """False: a width was taken for the picture's, so E is of no use, and forces are right up to a factor."""
     again: Callable[[], Motion | None] = lambda: None
@@ -152,7 +153,7 @@ def _video(path: Path, options: VideoOptions, pulse: PulseSearch | None = None) 
         young_kpa=None,
         shrink=following.shrink,
         notes=notes,
-        fault=lambda: following.fault,
+        findings=lambda: [*judge_scale(mm_per_px / following.shrink, following.size[1]), *following.findings],
         scale_known=scale_known,
         again=again,
     )

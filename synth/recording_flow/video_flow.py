@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor, Future
 from dataclasses import dataclass, replace
 from typing import Protocol, TypeVar
@@ -22,6 +22,7 @@ from synth.flow import mask_detection
 from synth.flow.estimator import Flags, Rgb
 from synth.flow.mask_selection import Proposal
 from synth.flow.stereo.track import Moved
+from synth.recording_flow.finding import Finding, first_fault
 from synth.recording_flow.frame_faults import find_fault
 from synth.recording_flow.frame_motion import FrameMotion, TrackingSummary
 from synth.recording_flow.harmonic_fit import Span
@@ -73,6 +74,8 @@ class Footage:
     tool: Callable[[int, Size], Flags | None] | None = None
     """(H, W) where the tool is in a frame, None for nowhere; if not given it is found in the pictures."""
     rest_frame: int = 0
+    only: Container[int] | None = None
+    """Numbers of the frames that are followed, the rest frame's among them; None: all."""
 
 
 class SecondView(Protocol):
@@ -142,6 +145,8 @@ class VideoFlow:
         """How many times smaller than `size`, height and width of the film's own pictures, these are."""
         self.decoded = self.peak_bytes = 0
         """Frames, and memory of the flow's own process."""
+        self.found: list[Finding] = []
+        """What was found wrong on the way; see `findings`."""
         self._flow, self._pace = flow or LocalFlow(), pace
         self._surface: SurfaceMotion | None = None  # only where a pulse is to be found
         self._depth_weights: list[float] = []
@@ -217,11 +222,19 @@ class VideoFlow:
         return None if self.pulse.pulse is None else self.pulse
 
     @property
+    def findings(self) -> list[Finding]:
+        """What is wrong with this film, once it is through."""
+        fault = ""
+        if self._fault:
+            fault = f"the rest frame is {self._fault}"
+        elif self.summary.frames and not self._changes:
+            fault = "the picture never changes"
+        return ([Finding("bad", "pictures", fault)] if fault else []) + self.found
+
+    @property
     def fault(self) -> str:
         """Why nothing of this film is a measurement, once it is through; empty if something may be."""
-        if self._fault:
-            return f"the rest frame is {self._fault}"
-        return "the picture never changes" if self.summary.frames and not self._changes else ""
+        return first_fault(self.findings)
 
     @property
     def notes(self) -> list[str]:
@@ -238,6 +251,8 @@ class VideoFlow:
             reason = "before the rest frame"
         elif time_s is None:
             reason = "without a time"
+        elif self.footage.only is not None and index not in self.footage.only:
+            reason = "not looked at"
         elif time_s <= self._last_s:
             reason = "whose time stands still or runs back"
         # A fifth of the period early is in time.

@@ -1,0 +1,33 @@
+"""One judgement of a recording: `bench check` and `bench score` find the same, and no number stands on it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from fake_recording import Maker, scored
+
+from bench.recording import check
+from bench.scoring.headline import headline
+from bench.scoring.result import as_json
+
+STATED = {
+    "E in Pa": ({"young_kpa": 1500.0}, "stiffness"),
+    "E in MPa": ({"young_kpa": 0.0015}, "stiffness"),
+    "scale in metres": ({"scale_mm_per_px": 2.5e-4}, "scale"),
+    "a pixel is a millimetre wide": ({"scale_mm_per_px": 3.0}, "scale"),
+}
+
+
+@pytest.mark.parametrize("case", STATED)
+def test_what_is_stated_in_another_unit_is_found_by_check_and_score_and_no_number_given(
+    make: Maker, case: str
+) -> None:
+    meta, what = STATED[case]
+    folder = make(frames=6, meta=meta)
+    result = scored(folder, backend="dis")
+    wrong = [one for one in result.findings if one.state == "bad"]
+    assert [one.what for one in wrong] == [what]
+    assert wrong == [one for one in check.check_recording(folder) if one.state == "bad"]
+    assert np.isnan(result.methods["bump"].size_mn).all()
+    assert headline(result).tiles == ()
+    assert next(iter(as_json(result)["findings"]))["what"] == what
