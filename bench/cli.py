@@ -208,35 +208,6 @@ def from_dataset(
     _print_paths([export_recording(s, out / f"{s.index:06d}", footage) for s in chosen], json)
 
 
-@app.command("make-exvivo", epilog="Example: bench make-exvivo --out recordings --count 2 --seconds 10")
-def make_exvivo(
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder that gets the recordings.")],
-    count: Annotated[int, typer.Option(min=1, help="How many recordings.")] = 6,
-    first: Annotated[
-        int, typer.Option(min=0, help="Number of the first; they don't depend on each other.")
-    ] = 0,
-    seconds: Annotated[float, typer.Option(help="Length of each.")] = 30.0,
-    fps: Annotated[float, typer.Option(min=1.0, help="Mean frames a second.")] = 10.0,
-    width: Annotated[int, typer.Option(min=64, help="Width of the picture; the height is 3/4 of it.")] = 320,
-    photo: Annotated[Path | None, typer.Option(help="A photograph as texture of the surface.")] = None,
-    seed: Annotated[int, typer.Option(help="Root of all draws.")] = 100,
-    eyes: Annotated[int, typer.Option(min=1, max=2, help="Cameras that look on.")] = 1,
-    json: Json = False,
-) -> None:
-    """Renders pseudo ex vivo recordings, unlike any training data in every respect at once."""
-    from bench.recording import exvivo
-    from synth.system.terminal import counting
-
-    plan = exvivo.Plan(
-        seed, seconds, fps, (width, width * 3 // 4), photo.resolve() if photo else None, eyes=eyes
-    )
-    written: list[Path] = []
-    for index in range(first, first + count):
-        with counting(f"recording {index}", int(seconds * fps)) as progress:
-            written.append(exvivo.make(plan, index, out / f"{index:03d}", progress))
-    _print_paths(written, json)
-
-
 def _print_paths(recordings: list[Path], json: bool) -> None:
     names = [str(path) for path in recordings]
     print(json_.dumps({"recordings": names}) if json else "\n".join(names))

@@ -35,12 +35,17 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
 
 @contextmanager
 def as_user_error(label: str) -> Iterator[None]:
-    """Makes one line after `label` of whatever the block raises: for code and formats of others."""
+    """Makes one line after `label` of whatever the block raises: for code and formats of others.
+
+    Their `sys.exit` too; what is too little memory stays that.
+    """
     try:
         yield
     except UserError as error:
         raise UserError(f"{label}: {error}") from error
-    except Exception as error:
+    except MemoryError:
+        raise
+    except (Exception, SystemExit) as error:
         why = getattr(error, "strerror", None) or f"{type(error).__name__}: {first_line(error)}"
         raise UserError(f"{label}: {why}") from error
 

@@ -6,30 +6,53 @@ from collections.abc import Mapping
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from synth.errors import InvalidValue, UserError, as_user_error, did_you_mean
+
+STORED = object()
+"""Context in which the job of a dataset is validated: reading it needs none of the plug-ins that made it."""
+
+
+def check_answer(
+    label: str, what: str, found: Any, shape: tuple[int, ...], limits: tuple[float, float] = (-3e38, 3e38)
+) -> NDArray[np.float32]:
+    """An array that a plug-in gave (`Registry.label`), (...) float32 of that shape and within finite limits.
+
+    UserError that names the plug-in and `what` of its answer for anything else.
+    """
+    with as_user_error(f"{label}: {what}"):
+        array = np.asarray(found, np.float32)
+        if array.shape != shape:
+            raise InvalidValue(f"shape {array.shape}, expected {shape}")
+        low, high = float(array.min(initial=0)), float(array.max(initial=0))
+        if not (limits[0] <= low and high <= limits[1]):  # NaN is none either
+            raise InvalidValue(f"from {low:g} to {high:g}, expected {limits[0]:g} to {limits[1]:g}")
+    return array
 
 
 class Registry:
     """Everything of one kind by name: ours, what `add` was given, and what installed packages offer."""
 
-    def __init__(self, group: str, key: str, noun: str, own: Mapping[str, str]) -> None:
+    def __init__(self, group: str, key: str, noun: str, own: Mapping[str, str], *further: str) -> None:
         """`group`: of entry points; `key` and `noun`: what a job asks for it by, and what it is, in messages.
 
         `own`: ours by name, `module:attribute` as an entry point has it, empty where nothing is to be loaded.
-        A plug-in doesn't take the name of one of ours.
+        A plug-in doesn't take the name of one of ours. `further`: what else a job may say there.
         """
         self.group, self.own = group, own
-        self._key, self._noun = key, noun
+        self._key, self._noun, self._further = key, noun, further
         self._added: dict[str, Any] = {}
 
     def names(self) -> tuple[str, ...]:
         """What can be named here: our own, then the others in order."""
         return (*self.own, *sorted({*self._points(), *self._added} - set(self.own)))
 
-    def check_name(self, name: str, *further: str) -> str:
-        """`name`, if it or one of the `further` ones can be asked for. InvalidValue else."""
-        known = (*further, *self.names())
-        if name not in known:
+    def check_name(self, name: str, info: Any) -> str:
+        """`name`, if it can be asked for, or `info.context` is STORED. InvalidValue else."""
+        known = (*self._further, *self.names())
+        if name not in known and info.context is not STORED:
             hint = did_you_mean(name, known)
             raise InvalidValue(f"there is no {self._noun} {name!r}; there are {', '.join(known)}{hint}")
         return name
@@ -82,5 +105,6 @@ ESTIMATORS = Registry(
         "opencv-tvl1": "synth.flow.opencv:OpenCvTvl1",
         "dis": "synth.flow.opencv:Dis",
     },
+    "ideal",
 )
 """Estimators of flow: an entry point is a callable without arguments that gives a `synth.flow.Estimator`."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -9,14 +11,14 @@ import numpy as np
 
 from bench.methods.protocol import Field, ForceEstimate, InSpace, Method, MethodContext
 from synth.errors import UserError, as_user_error
-from synth.plugins import Registry
+from synth.plugins import Registry, check_answer
 
 METHODS = Registry("sulcus.method", "method", "method", {})
 """Methods of other packages: an entry point is a callable without arguments that gives a `Method`."""
 
 
 class Plugged:
-    """A method of another package; what goes wrong in it is one line that names it."""
+    """A method of somebody else's; what goes wrong in it is one line that names it."""
 
     def __init__(self, method: Any, label: str) -> None:
         self._method, self._label = method, label
@@ -27,22 +29,25 @@ class Plugged:
     @property
     def notes(self) -> list[str]:
         """What it says is to be known of how it read the recording."""
-        return [str(note) for note in getattr(self._method, "notes", ())]
+        with as_user_error(self._label):
+            return [str(note) for note in getattr(self._method, "notes", ())]
 
     def __call__(self, flow: Field, confidence: Field, scene: MethodContext, picture: bool) -> ForceEstimate:
         """See `Method`."""
         return self._asked(self._method, flow, confidence, scene, picture)
 
     def _asked(self, ask: Any, *told: Any) -> ForceEstimate:
+        size, density = told[0].shape[:2], None
         with as_user_error(self._label):
-            answer = ask(*told)
+            answer = ask(*copy.deepcopy(told[:-2]), *told[-2:])  # the next method sees what it saw
+            if not isinstance(answer, ForceEstimate):
+                raise TypeError(f"answers {type(answer).__name__}, expected ForceEstimate")
             force = np.asarray(answer.force_mn, np.float64)
-            density = None if answer.density is None else np.asarray(answer.density, np.float32)
         if force.shape != (3,):
             raise UserError(f"{self._label}: gives force of shape {force.shape}, expected (3,)")
-        if density is not None and density.shape != told[0].shape[:2]:
-            raise UserError(f"{self._label}: gives density of shape {density.shape}, not the picture's")
-        return ForceEstimate(force, density)
+        if answer.density is not None:
+            density = check_answer(self._label, "density", answer.density, size)
+        return replace(answer, force_mn=force, density=density)
 
 
 def installed() -> dict[str, Method]:

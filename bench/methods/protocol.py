@@ -24,6 +24,11 @@ class MethodContext:
     scale_mm_per_px: float
     young_kpa: float | None
 
+    def __post_init__(self) -> None:
+        """One method can't change what the others are told."""
+        object.__setattr__(self, "tissue", self.tissue.view())
+        self.tissue.flags.writeable = False
+
 
 @dataclass(frozen=True)
 class ForceEstimate:

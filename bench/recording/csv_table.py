@@ -23,7 +23,7 @@ def read_csv(
     """Columns by name, float64, in the file's order of rows; empty cells and `nan` are NaN.
 
     Args:
-        path: the CSV; comma or semicolon, UTF-8 with or without BOM.
+        path: the CSV; comma, or semicolon and then decimal commas too; UTF-8 with or without BOM.
         required: columns that must be there, each once.
         optional: columns returned when there.
 
@@ -40,9 +40,11 @@ def read_csv(
     try:
         for row in rows:
             if "".join(row).strip():
-                if len(row) <= max(columns):
-                    raise ValueError(f"{len(row)} cells, {max(columns) + 1} expected (cut off?)")
-                values.extend(float(row[k].strip() or "nan") for k in columns)
+                over = "." not in "".join(row) and "".join(row[len(header) :]).strip()
+                if over or len(row) <= max(columns):
+                    why = "decimal commas? write points" if over else "cut off?"
+                    raise ValueError(f"{len(row)} cells, {len(header)} expected ({why})")
+                values.extend(float(row[k].strip().replace(",", ".") or "nan") for k in columns)
     except (ValueError, csv.Error) as error:
         raise UserError(f"{path}:{rows.line_num}: {str(error)[:100]}") from None
     if not values:

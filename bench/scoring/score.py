@@ -88,7 +88,9 @@ def score(
     # The process is started first, for it takes seconds to begin; the methods are fitted meanwhile.
     with written, flow as elsewhere:
         network = None if model is None else Model(model)
-        chosen: dict[str, Method] = {**({MAIN: network} if network else {}), **(methods or {})}
+        chosen: dict[str, Method] = {MAIN: network} if network else {}
+        for name, own in (methods or {}).items():
+            chosen[name] = own if isinstance(own, Model) else plugins.Plugged(own, f"method {name}")
         if baselines:
             simple = comparison.simpler_methods(Path(train) if train else None, folder, opened.has_two_eyes)
             chosen |= {name: one for name, one in simple.items() if name not in chosen}

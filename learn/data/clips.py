@@ -259,8 +259,8 @@ def unpack(folder: Path) -> Clip:
             return Clip(**plain, displacement=displacement, **arrays)
     except UserError as error:
         why = error.__cause__
-        if isinstance(why, RuntimeError) and not isinstance(why, RecursionError):
-            # A process has too many mappings: nothing is damaged.
+        if isinstance(why, (OSError, RuntimeError)) and not isinstance(why, RecursionError):
+            # A process has too many mappings or open files: nothing is damaged.
             raise UserError(f"{folder}: cannot be mapped ({first_line(why)})") from None
         raise
 

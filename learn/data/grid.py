@@ -68,6 +68,13 @@ def centre(tissue: NDArray[np.bool_]) -> tuple[float, float]:
     return float(cols.mean()), float(rows.mean())
 
 
+def check_scale(scale_mm_per_px: float) -> float:
+    """The scale of a picture. UserError if it isn't positive, or above 100: what it costs grows with it."""
+    if not 0 < scale_mm_per_px <= 100:
+        raise UserError(f"scale {scale_mm_per_px} mm/px: must be positive and at most 100")
+    return float(scale_mm_per_px)
+
+
 class Resampler:
     """Carries pixel arrays of one picture to the grid, with hat functions as wide as the coarser of both.
 
@@ -79,11 +86,9 @@ class Resampler:
         self, shape: tuple[int, int], scale_mm_per_px: float, centre_px: tuple[float, float], grid: Grid
     ) -> None:
         """`shape`: (H, W) of the picture; `centre_px`: the (x, y) px that lands on the grid's centre."""
-        if not (np.isfinite(scale_mm_per_px) and scale_mm_per_px > 0):
-            raise UserError(f"scale {scale_mm_per_px} mm/px: must be positive")
         self.grid = grid
         self.shape = shape
-        self.scale_mm_per_px = float(scale_mm_per_px)
+        self.scale_mm_per_px = check_scale(scale_mm_per_px)
         self.centre_px = centre_px
         self._rows = _hats(shape[0], centre_px[1], self.scale_mm_per_px, grid)
         self._cols = _hats(shape[1], centre_px[0], self.scale_mm_per_px, grid)
@@ -162,6 +167,8 @@ class GridView:
             (tissue.shape[0], tissue.shape[1]), scale_mm_per_px, centre_px or centre(self.tissue), grid
         )
         self.mask = (self.resample.cover(self.tissue) > 0.5).astype(np.float32)
+        if not self.mask.any():
+            raise UserError(f"at {scale_mm_per_px:g} mm/px the tissue fills no cell of the network's grid")
 
     def is_of(
         self, tissue: NDArray[np.bool_], scale_mm_per_px: float, centre_px: tuple[float, float] | None

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from learn.data.grid import Grid, centre
+from learn.data.grid import Grid, centre, check_scale
 from synth.flow.confidence import DOUBTFUL
 
 Point = tuple[float, float]
@@ -25,13 +25,13 @@ class Placing:
     """Places the grid frame by frame; it stays as long as what moves is in its middle."""
 
     def __init__(self, tissue: NDArray[np.bool_], scale_mm_per_px: float, grid: Grid) -> None:
-        """`tissue`: (H, W). UserError if it is empty."""
+        """`tissue`: (H, W). UserError if it is empty, or for a scale that can't be."""
         self.centre_px = centre(tissue)
         """Where the grid's centre lies now."""
         self.moves = 0
         """How often it was moved."""
         rows, columns = np.nonzero(tissue)
-        self._half = 0.5 * grid.extent_mm / scale_mm_per_px
+        self._half = 0.5 * grid.extent_mm / check_scale(scale_mm_per_px)
         away = np.maximum(abs(columns - self.centre_px[0]), abs(rows - self.centre_px[1]))
         self.fits = float(np.mean(away > self._half + 0.5)) <= _CUT_OFF
         """Whether the grid covers all of the tissue, so that it needn't be placed."""

@@ -20,6 +20,7 @@ from synth.dataset import location, provenance
 from synth.errors import UserError
 from synth.job import identity, retired, writer
 from synth.job.schema import Job
+from synth.plugins import STORED
 from synth.system import checked_file
 from synth.system.checked_file import write_whole as write_whole
 from synth.system.config_file import first_mistake
@@ -60,9 +61,10 @@ class Folder:
             raise UserError(f"{self.root / _NAME}: is damaged ({first_mistake(error)})") from None
 
     def job(self) -> Job:
-        """The dataset's job, less retired keys: what is stored needs none of them to be read."""
+        """The dataset's job, less retired keys: what is stored needs neither them nor plug-ins to be read."""
         try:
-            return Job.model_validate(retired.drop(self.described()["job"], retired.JOB)[0])
+            values = retired.drop(self.described()["job"], retired.JOB)[0]
+            return Job.model_validate(values, context=STORED)
         except ValidationError as error:
             why = first_mistake(error)
             raise UserError(f"{self.root / _NAME}: is damaged or of another version ({why})") from None

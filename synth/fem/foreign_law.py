@@ -7,9 +7,9 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from synth.errors import UserError
+from synth.errors import UserError, as_user_error
 from synth.fem.laws import lame, least_determinant
-from synth.job.laws import Law, load_law
+from synth.job.laws import LAWS, Law, load_law
 
 Floats = NDArray[np.float64]
 
@@ -22,9 +22,11 @@ def stress(name: str, strain: Floats, mu: float, lam: float, out: Floats, energy
     Raises:
         UserError: the law is not what it must be; see `check_law`.
     """
-    law = checked(name)
-    with np.errstate(all="ignore"):  # where it has no value it says so, below
-        found, first = law.stress(strain + np.eye(3), mu, lam)
+    law, label = checked(name)
+    with np.errstate(all="ignore"), as_user_error(label):  # where it has no value it says so, below
+        found, first = map(np.asarray, law.stress(strain + np.eye(3), mu, lam))
+    if found.shape != energy.shape or first.shape != out.shape:
+        raise UserError(f"{label}: stress gives {found.shape}, {first.shape}, not {out.shape}")
     least = float(least_determinant(strain)[0])
     energy[:] = np.where(np.isfinite(found), found, np.inf)
     out[:] = np.where(np.isfinite(first), first, 0.0)
@@ -32,14 +34,15 @@ def stress(name: str, strain: Floats, mu: float, lam: float, out: Floats, energy
 
 
 @cache
-def checked(name: str) -> Law:
-    """The law of that name, once it has passed `check_law`."""
-    law = load_law(name)
-    check_law(name, law)
-    return law
+def checked(name: str) -> tuple[Law, str]:
+    """The law of that name, once it has passed `check_law`, and what messages call it."""
+    law, label = load_law(name), LAWS.label(name)
+    with as_user_error(label):
+        check_law(law)
+    return law, label
 
 
-def check_law(name: str, law: Law) -> None:
+def check_law(law: Law) -> None:
     """Refuses a law whose answers would be wrong without a sign.
 
     Raises:
@@ -51,29 +54,23 @@ def check_law(name: str, law: Law) -> None:
     f = np.eye(3) + 0.15 * rng.uniform(-1, 1, (8, 3, 3))
     energy, first = (np.asarray(one, np.float64) for one in law.stress(f, mu, lam))
     if energy.shape != (8,) or first.shape != (8, 3, 3):
-        raise UserError(
-            f"fem.law: {name}: stress must give (n,) and (n, 3, 3), not {energy.shape}, {first.shape}"
-        )
+        raise UserError(f"stress must give (n,) and (n, 3, 3), not {energy.shape}, {first.shape}")
     way = rng.normal(size=(8, 3, 3))
     up, down = (law.stress(f + sign * _STEP * way, mu, lam)[0] for sign in (1, -1))
-    _agree(
-        name, (up - down) / (2 * _STEP), np.einsum("nij,nij->n", first, way), "is not the slope of its energy"
-    )
+    _agree((up - down) / (2 * _STEP), np.einsum("nij,nij->n", first, way), "is not the slope of its energy")
     still = np.eye(3)[None]
-    _agree(name, law.stress(still, mu, lam)[1], np.zeros((1, 3, 3)), "is not zero at rest")
+    _agree(law.stress(still, mu, lam)[1], np.zeros((1, 3, 3)), "is not zero at rest")
     small = 1e-6 * (way + way.transpose(0, 2, 1))
     hooke = 2 * mu * small + lam * np.trace(small, axis1=1, axis2=2)[:, None, None] * np.eye(3)
-    _agree(name, law.stress(np.eye(3) + small, mu, lam)[1] / 1e-6, hooke / 1e-6, "is not Hooke's near rest")
+    _agree(law.stress(np.eye(3) + small, mu, lam)[1] / 1e-6, hooke / 1e-6, "is not Hooke's near rest")
     turn, _ = np.linalg.qr(rng.normal(size=(3, 3)))
     turn *= np.sign(np.linalg.det(turn))
-    _agree(name, law.stress(turn @ f, mu, lam)[0], energy, "depends on how the whole is turned")
+    _agree(law.stress(turn @ f, mu, lam)[0], energy, "depends on how the whole is turned")
     more = law.stress(f, mu, lam + 1.0)[0] - energy
-    _agree(
-        name, more, 0.5 * np.log(np.linalg.det(f)) ** 2, "takes lambda otherwise than as lambda/2 (log J)^2"
-    )
+    _agree(more, 0.5 * np.log(np.linalg.det(f)) ** 2, "takes lambda otherwise than as lambda/2 (log J)^2")
 
 
-def _agree(name: str, found: Floats, expected: Floats, fault: str) -> None:
+def _agree(found: Floats, expected: Floats, fault: str) -> None:
     size = float(np.abs(expected).max()) or 1.0
     if not np.abs(found - expected).max() <= _CLOSE * size:  # NaN is none either
-        raise UserError(f"fem.law: {name}: its stress {fault}")
+        raise UserError(f"its stress {fault}")

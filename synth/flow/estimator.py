@@ -7,7 +7,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from synth.plugins import ESTIMATORS
+from synth.errors import as_user_error
+from synth.plugins import ESTIMATORS, check_answer
 
 Rgb = NDArray[np.uint8]
 """(H, W, 3) uint8, sRGB."""
@@ -40,11 +41,32 @@ class Estimator(Protocol):
         ...
 
 
-def create(name: str) -> Estimator:
-    """Makes the estimator called `name`: one of ours, or one from the entry-point group `sulcus.flow`.
+class CheckedEstimator:
+    """An estimator of somebody else's: what goes wrong in it, or in its answer, is one line that names it."""
+
+    def __init__(self, estimator: Estimator, label: str) -> None:
+        self._estimator, self._label = estimator, label
+
+    def flow(
+        self, rest: Rgb, now: Rgb, rest_usable: Flags, now_usable: Flags, initial: Flow | None = None
+    ) -> tuple[Flow, Map]:
+        """See `Estimator`."""
+        with as_user_error(self._label):
+            flow, confidence = self._estimator.flow(rest, now, rest_usable, now_usable, initial)
+        size = rest.shape[:2]
+        sure = check_answer(self._label, "confidence", confidence, size, (0, 1))
+        return check_answer(self._label, "flow", flow, (*size, 2)), sure
+
+
+def create(backend: str | Estimator) -> Estimator:
+    """The estimator of that name, ours or from the entry-point group `sulcus.flow`, or the one given.
 
     Raises:
         UserError: no such estimator, or a plug-in's package that does not load.
     """
-    estimator: Estimator = ESTIMATORS.load(name)
-    return estimator
+    if not isinstance(backend, str):
+        kind = type(backend)
+        ours = kind.__module__.startswith("synth.")
+        return backend if ours else CheckedEstimator(backend, f"flow.backend {kind.__qualname__}")
+    estimator: Estimator = ESTIMATORS.load(backend)
+    return estimator if backend in ESTIMATORS.own else CheckedEstimator(estimator, ESTIMATORS.label(backend))

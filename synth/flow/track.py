@@ -75,7 +75,7 @@ class Tracker:
             raise UserError(
                 f"flow: rest frame {rest.shape[:2]}, masks {rest_blocked.shape}, {tissue.shape} differ"
             )
-        self.estimator = create(backend) if isinstance(backend, str) else backend
+        self.estimator = create(backend)
         self.rest, self.tissue = rest, tissue
         self.usable = tissue & ~rest_blocked
         self.trusted = True

@@ -37,7 +37,7 @@ LEAST_JACOBIAN = 0.2
 _TOLERANCE = 0.05
 """Error against neo-Hookean that `law: auto` accepts, as a part of the displacement."""
 
-LAWS = Registry("sulcus.law", "fem.law", "law", dict.fromkeys(LARGEST_LOAD, ""))
+LAWS = Registry("sulcus.law", "fem.law", "law", dict.fromkeys(LARGEST_LOAD, ""), "auto")
 """Laws by name: an entry point is a `Law`, or a callable without arguments that makes one."""
 
 

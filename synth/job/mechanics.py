@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Annotated, Literal, get_args
 
-from pydantic import AfterValidator, BeforeValidator, Field, FiniteFloat, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, FiniteFloat, ValidationInfo, model_validator
 
 from synth.job.laws import LAWS, LoadRange, check_load_range, choose_law
 from synth.job.types import Direction, NonNegative, PlugInName, Positive, Range, Section, Share
+from synth.plugins import STORED
 
 Kind = Literal["pull", "push", "slide", "grasp", "retract", "tap"]
 
@@ -102,15 +103,23 @@ Skulls = Annotated[
 ]
 
 
+def _of_tissue(young_kpa: tuple[float, float], info: ValidationInfo) -> tuple[float, float]:
+    for value in young_kpa if info.context is not STORED else ():
+        if not 0.01 <= value <= 300:
+            unit, factor = ("Pa", 1e-3) if value > 1 else ("MPa", 1e3)
+            raise ValueError(f"{value:g} kPa is no tissue's; was {unit} meant, {value * factor:g} kPa?")
+    return young_kpa
+
+
 class FemSection(Section):
     """The physics of the tissue and of the load."""
 
-    law: Annotated[PlugInName, AfterValidator(lambda name: LAWS.check_name(name, "auto"))] = "auto"
+    law: Annotated[PlugInName, AfterValidator(LAWS.check_name)] = "auto"
     """Material law: linear, corotational, neo-hookean or an installed plug-in's; auto takes the
     cheapest of ours whose error against neo-Hookean at the largest load is within 5%."""
     tets: Annotated[int, Field(ge=100, le=200_000)] = 1600
     """Number of quadratic tetrahedra to aim for; graded towards the craniotomy."""
-    young_kpa: Range[Positive] = (0.5, 3.0)
+    young_kpa: Annotated[Range[Positive], AfterValidator(_of_tissue)] = (0.5, 3.0)
     """Young's modulus E [kPa], drawn log-uniformly."""
     poisson: Range[Annotated[FiniteFloat, Field(ge=0, lt=0.5)]] = (0.4, 0.4)
     """Poisson's ratio, drawn uniformly. Brain within seconds: 0.45 to nearly 0.5; drained: less."""
@@ -155,8 +164,8 @@ class FemSection(Section):
         return self
 
     @model_validator(mode="after")
-    def _loads_are_in_the_laws_range(self) -> FemSection:
-        for name, loads in self._load_ranges:
+    def _loads_are_in_the_laws_range(self, info: ValidationInfo) -> FemSection:
+        for name, loads in () if info.context is STORED else self._load_ranges:
             check_load_range(self.chosen_law[0], loads, self.young_kpa[0], name)
         return self
 

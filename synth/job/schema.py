@@ -119,7 +119,7 @@ class AppearanceSection(Section):
 class FlowSection(Section):
     """Recovering displacement from the video."""
 
-    backend: Annotated[PlugInName, AfterValidator(lambda name: ESTIMATORS.check_name(name, "ideal"))] = "tvl1"
+    backend: Annotated[PlugInName, AfterValidator(ESTIMATORS.check_name)] = "tvl1"
     """Estimator: tvl1, opencv-tvl1, dis or an installed plug-in's; `ideal` computes no recovered flow."""
     warps: Annotated[int, Field(ge=1, le=12)] = 3
     """tvl1: half the linearisations a level."""

@@ -55,6 +55,13 @@ class RecordingFlowSettings:
     masks: str = "auto"
     """What of tools and highlights is masked, one of `MASKS`."""
 
+    def __post_init__(self) -> None:
+        """Raises UserError for a rate or a shrinking that can't be."""
+        if self.rate_hz is not None and not 0 < self.rate_hz < math.inf:
+            raise UserError(f"rate_hz {self.rate_hz}: above 0, or None for every frame")
+        if self.shrink not in range(65):
+            raise UserError(f"shrink {self.shrink}: a whole number from 0 to 64")
+
 
 def everywhere(size: Size) -> Flags:
     """(H, W) True: all of the picture is tissue."""

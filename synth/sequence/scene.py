@@ -15,6 +15,7 @@ from synth.fem.tool_gesture import ToolMotion
 from synth.flow import track, tvl1
 from synth.flow.estimator import Estimator, create
 from synth.flow.track import Track
+from synth.job.reader import load_job
 from synth.job.schema import FlowSection, Job
 from synth.render.anatomy.surface import CortexSurface
 from synth.render.camera import camera, video_link
@@ -197,7 +198,7 @@ def at_rest(
 
 
 def simulate(
-    job: Job,
+    job: Job | str,
     index: int = 0,
     report: StageCallback | None = None,
     watch: Stopwatch | None = None,
@@ -210,7 +211,7 @@ def simulate(
     The scene is the one that `synth render` computes for that job and index, unless told otherwise.
 
     Args:
-        job: the job; it may ask for more sequences than are ever made.
+        job: the job, or what `load_job` knows it by; it may ask for more sequences than are ever made.
         index: which of its sequences, 0 <= index < job.sequences.
         report: told of progress, stage by stage.
         watch: adds up the time of each stage.
@@ -221,6 +222,8 @@ def simulate(
     Raises:
         UserError: no such sequence, or a job that cannot be carried out (surface, load, inverted element).
     """
+    if isinstance(job, str):
+        job = load_job(job)
     if not 0 <= index < job.sequences:
         raise UserError(f"sequence {index}: the job has sequences 0 to {job.sequences - 1}")
     report, watch = report or (lambda stage, done, of: None), watch or Stopwatch()

@@ -25,6 +25,7 @@ _MOST_MISTAKES = 20
 _DEEPEST = 8  # keys of a change, one in another
 _LONG = 80  # characters of a value in a message
 
+_ADDED = re.compile(r"[\w-]+\[.*\]|constrained-\w+")
 _UNKNOWN_KEY = ("extra_forbidden", "unexpected_keyword_argument")
 
 
@@ -130,11 +131,16 @@ def find_mistakes(error: ValidationError, model: type[BaseModel] | None = None) 
     """What is wrong, in words for the person who wrote it; `model` knows the keys that were meant."""
     found = error.errors(include_url=False)[:_MOST_MISTAKES]
     blocks = {_trimmed(one["loc"])[:-1] for one in found}
+    said: dict[Loc, Mistake] = {}
     for one in found:
         at = _trimmed(one["loc"])
         if one["type"] == "too_short" and at in blocks:  # only right items count: the wrong ones are named
             continue
-        yield Mistake(at, _reword(one, at, model), of_key=one["type"] in _UNKNOWN_KEY)
+        what = _reword(one, at, model)
+        if at in said:  # what else might stand there
+            what = f"{said[at].what}, or {what.partition(' ')[2]}"
+        said[at] = Mistake(at, what, of_key=one["type"] in _UNKNOWN_KEY)
+    yield from said.values()
 
 
 def _reword(error: Mapping[str, Any], at: Loc, model: type[BaseModel] | None) -> str:
@@ -150,6 +156,8 @@ def _reword(error: Mapping[str, Any], at: Loc, model: type[BaseModel] | None) ->
     hint = ""
     if kind == "literal_error":
         hint = did_you_mean(str(error["input"]), str(context["expected"]).split("'")[1::2])
+    elif re.fullmatch(r"-?\d*,\d+", str(error["input"])):
+        hint = f"; did you mean {error['input'].replace(',', '.')}?"
     return f"{_short(error['input'])} {what}{hint}"
 
 
@@ -200,7 +208,7 @@ def dotted(at: Loc) -> str:
 
 def _trimmed(loc: Loc) -> Loc:
     """The place without the names that pydantic adds for validators and unions."""
-    own = tuple(step for step in loc if isinstance(step, int) or not re.fullmatch(r"[\w-]+\[.*\]", step))
+    own = tuple(step for step in loc if isinstance(step, int) or not _ADDED.fullmatch(step))
     return own or loc  # a key may look so too
 
 

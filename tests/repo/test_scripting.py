@@ -8,6 +8,7 @@ import json
 import re
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,8 @@ from fake_model import write_model
 
 import bench
 import learn
+import synth
+from learn.data.grid import check_scale
 from synth.dataset.store import Dataset
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -56,6 +59,23 @@ def test_what_is_promised_is_there_and_types_say_the_same(name: str) -> None:
         assert public in dir(package)
         assert found is getattr(importlib.import_module(str(module)), real)
         assert (found.__doc__ or "").strip(), public
+
+
+@pytest.mark.parametrize(
+    ("named", "call"),
+    [
+        ("fraims", lambda: synth.Job(fraims=3)),  # type: ignore[call-arg]
+        (r"render\.sppp", lambda: synth.Job(render={"sppp": 3})),
+        ("tiyn", lambda: synth.simulate("tiyn")),
+        ("rate_hz", lambda: bench.Settings(rate_hz=0)),
+        ("shrink", lambda: bench.Settings(shrink=-1)),
+        ("scale", lambda: check_scale(0.0)),
+        ("scale", lambda: check_scale(1e9)),
+    ],
+)
+def test_what_cannot_be_is_refused_by_name(named: str, call: Callable[[], object]) -> None:
+    with pytest.raises(synth.UserError, match=named):
+        call()
 
 
 @pytest.mark.slow

@@ -5,7 +5,7 @@ set -e
 photo=$1 work=$2
 for eyes in one-eye:1:mono two-eyes:2:stereo; do
   IFS=: read -r name number model <<< "$eyes"
-  bench make-exvivo -o "$work/$name" --count 6 --seconds 30 --fps 10 --eyes "$number" --photo "$photo" --seed 100
+  python -m evidence.scoring.exvivo --out "$work/$name" --count 6 --seconds 30 --fps 10 --eyes "$number" --photo "$photo" --seed 100
   for recording in "$work/$name"/*; do
     bench score "$recording" --model "$model" -o "$work/scores-$name/$(basename "$recording")"
   done

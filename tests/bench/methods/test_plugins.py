@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 import tiny_package
 from fake_model import write_model
@@ -28,18 +30,11 @@ class Push:
         return bench.ForceEstimate(np.array([44.0 * float(np.median(middle)), 0.0, 0.0]))
 
 
-class Raises(Push):
-    def __call__(self, flow, confidence, scene, picture):
-        raise KeyError("nothing")
-
-
-class Short(Push):
-    def __call__(self, flow, confidence, scene, picture):
-        return bench.ForceEstimate(np.zeros(2))
-
-
-def nothing():
-    return None
+raises = lambda: lambda *asked: {}["nothing"]
+exits = lambda: lambda *asked: exit(0)
+silent = lambda: lambda *asked: None
+short = lambda: lambda *asked: bench.ForceEstimate(np.zeros(2))
+nothing = lambda: None
 '''
 
 
@@ -73,7 +68,7 @@ def test_it_is_scored_and_shown_beside_the_network(
     assert "pushes" not in bench.score(recording, model, settings=settings, baselines=False).methods
 
 
-@pytest.mark.parametrize("at", ["Raises", "Short", "nothing", "Missing"])
+@pytest.mark.parametrize("at", ["raises", "exits", "silent", "short", "nothing", "Missing"])
 def test_what_is_wrong_in_it_names_it(
     at: str, recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -81,6 +76,19 @@ def test_what_is_wrong_in_it_names_it(
     model = write_model(tmp_path / "model", "arch.output=vector")
     with pytest.raises(UserError, match=rf"method own \(lab_methods:{at}\)"):
         bench.score(recording, model, settings=bench.Settings(rate_hz=None, pulse=False))
+
+
+def test_a_method_cannot_change_what_the_others_see(recording: Path) -> None:
+    def wipe(flow: Any, confidence: Any, scene: Any, picture: bool) -> bench.ForceEstimate:
+        force = bench.ForceEstimate(np.array([np.abs(flow).max(), 0.0, 0.0]))
+        flow[:] = confidence[:] = 0
+        assert not scene.tissue.flags.writeable
+        return force
+
+    settings = bench.Settings(rate_hz=None, pulse=False)
+    both = bench.score(recording, methods={"a": wipe, "b": wipe}, settings=settings, baselines=False).methods
+    np.testing.assert_array_equal(both["a"].size_mn, both["b"].size_mn)
+    assert np.nanmax(both["b"].size_mn) > 0
 
 
 def test_a_name_of_ours_is_not_taken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

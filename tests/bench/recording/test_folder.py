@@ -12,6 +12,7 @@ from fake_recording import Maker, texture
 
 from bench.recording import csv_table, writer
 from bench.recording.folder import open_recording
+from synth.errors import UserError
 from synth.video import read as video
 
 
@@ -74,6 +75,15 @@ def test_a_quoted_cell_is_one_cell_in_every_row(tmp_path: Path) -> None:
     got = csv_table.read_csv(file, ("t_s", "fx_n"))
     assert got["t_s"].tolist() == [1, 3, 5]
     assert got["fx_n"].tolist() == [2, 4, 6]
+
+
+def test_decimal_commas_are_read_where_they_can_be_told(tmp_path: Path) -> None:
+    file = tmp_path / "t.csv"
+    file.write_text("t_s;fx_n\n0,5;-1,25\n")
+    assert [float(one[0]) for one in csv_table.read_csv(file, ("t_s", "fx_n")).values()] == [0.5, -1.25]
+    file.write_text("t_s,fx_n\n0,5,-1,25\n")
+    with pytest.raises(UserError, match=r"t\.csv:2"):
+        csv_table.read_csv(file, ("t_s", "fx_n"))
 
 
 @pytest.mark.parametrize("footage", ["png", "mp4"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from contextlib import suppress
 from pathlib import Path
@@ -19,9 +20,10 @@ from typer.testing import CliRunner
 from synth.checks import verify
 from synth.cli import app
 from synth.dataset import index, split
-from synth.dataset.folder import claim
+from synth.dataset.folder import Folder, claim
 from synth.dataset.store import open_sequence
 from synth.errors import UserError
+from synth.job.reader import parse_job
 from synth.job.schema import Job
 from synth.publish.export.registry import export_dataset
 
@@ -142,3 +144,12 @@ def test_no_run_follows_a_link(dataset: Path, tmp_path: Path, name: str) -> None
     with pytest.raises(UserError), claim(dataset, JOB):
         pass
     assert sorted(path.name for path in elsewhere.rglob("*")) == ["scratch", "worker-1.log"]
+
+
+def test_a_dataset_is_read_without_the_plug_ins_that_made_it(tmp_path: Path) -> None:
+    job = {"flow": {"backend": "gone"}, "fem": {"law": "gone"}}
+    (tmp_path / "dataset.json").write_text(json.dumps({"identity": "", "job": job}))
+    read = Folder(tmp_path).job()
+    assert (read.flow.backend, read.fem.law) == ("gone", "gone")
+    with pytest.raises(UserError, match=r"flow\.backend"):
+        parse_job(json.dumps(job), "job.yaml", tmp_path)

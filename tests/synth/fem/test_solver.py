@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from dome import ANATOMY, OPENING_MM, block, patch
-from pydantic import ValidationError
 
 from synth.errors import UserError
 from synth.fem import surface_embedding
@@ -98,8 +97,10 @@ def test_auto_takes_the_cheapest_law_within_the_tolerance() -> None:
 def test_what_no_law_or_surface_holds_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     fem = schema.FemSection(tets=400)
     gesture = drawn(fem, Tissue(1.0, 0.4, "neo-hookean"))
-    with pytest.raises(ValidationError):
+    with pytest.raises(UserError, match="linear"):
         schema.FemSection(law="linear", load=(3.0, 3.0))
+    with pytest.raises(UserError, match=r"young_kpa.*Pa"):
+        schema.FemSection(young_kpa=3000)
     with pytest.raises(UserError):
         run(fem, replace(gesture, load=3.0))
     away = replace(gesture.contacts[0], point_mm=(200.0, 0.0))

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import tiny_package
 
 from evidence.flow.scenes import Recipe, cortex, pairs
 from synth.errors import UserError
@@ -78,20 +80,27 @@ class Learned:
 def test_another_packages_estimator_is_found_by_its_entry_point(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    (tmp_path / "learned_flow.py").write_text(_PLUGIN)
-    about = tmp_path / "learned_flow-1.0.dist-info"
-    about.mkdir()
-    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: learned-flow\nVersion: 1.0\n")
-    (about / "entry_points.txt").write_text("[sulcus.flow]\nmy-net = learned_flow:Learned\n")
     with pytest.raises(UserError):
         estimator.create("my-net")
-    monkeypatch.syspath_prepend(str(tmp_path))
+    points = {ESTIMATORS.group: {"my-net": "learned_flow:Learned"}}
+    tiny_package.install(tmp_path, "learned_flow", _PLUGIN, points, monkeypatch)
     assert "my-net" in ESTIMATORS.names()
     assert Job.model_validate({"flow": {"backend": "my-net"}}).flow.backend == "my-net"
     frames = np.zeros((2, 24, 32, 3), np.uint8)
     found = track.track("my-net", frames, np.zeros((2, 24, 32), bool), np.ones((24, 32), bool))
     np.testing.assert_array_equal(found.flow[1], np.broadcast_to([1.0, -2.0], (24, 32, 2)))
     assert found.trusted.all()
+
+
+@pytest.mark.parametrize("wrong", ["f, 1.5 * c", "f, c - 1.5", "np.nan * f, c", "f[1:], c", "f", "exit(0)"])
+def test_an_estimator_that_answers_wrongly_is_named(wrong: str) -> None:
+    class Wrong:
+        def flow(self, rest: Any, *others: Any) -> Any:
+            return eval(wrong, {"np": np, "f": np.zeros((24, 32, 2)), "c": np.ones((24, 32))})
+
+    frames = np.zeros((2, 24, 32, 3), np.uint8)
+    with pytest.raises(UserError, match="Wrong"):
+        track.track(Wrong(), frames, np.zeros((2, 24, 32), bool), np.ones((24, 32), bool))
 
 
 def test_opencv_gives_one_answer_to_one_input() -> None:

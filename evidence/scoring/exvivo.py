@@ -3,6 +3,8 @@
 Another law in time (tissue creeps under load), another appearance family, lens, field and tilt, a compressed
 video, a hand that trembles, several presses at several places, and a sensor with its own axes, clock, zero,
 drift and noise. Written in the layout of a real recording, so that the same code scores both.
+
+Run: python -m evidence.scoring.exvivo --out recordings --count 2 --seconds 10
 """
 
 from __future__ import annotations
@@ -10,9 +12,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import cv2
 import numpy as np
+import typer
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
@@ -28,6 +32,7 @@ from synth.render.anatomy.surface import CortexSurface
 from synth.render.scene import SceneState
 from synth.sequence import scenario
 from synth.sequence.scene import at_rest
+from synth.system.terminal import counting
 
 Floats = NDArray[np.float64]
 
@@ -40,6 +45,24 @@ _SYNC_S = 9.0
 _PRESS_S = 13.0
 # Creep: the part of the response that comes late, and how late [s].
 _LATE, _LATE_S = 0.2, 0.8
+
+
+def main(
+    out: Annotated[Path, typer.Option(help="Folder that gets the recordings.")],
+    count: Annotated[int, typer.Option(min=1, help="How many recordings.")] = 6,
+    seconds: Annotated[float, typer.Option(help="Length of each.")] = 30.0,
+    fps: Annotated[float, typer.Option(min=1.0, help="Mean frames a second.")] = 10.0,
+    width: Annotated[int, typer.Option(min=64, help="Width of the picture; the height is 3/4 of it.")] = 320,
+    photo: Annotated[Path | None, typer.Option(help="A photograph as texture of the surface.")] = None,
+    seed: Annotated[int, typer.Option(help="Root of all draws.")] = 100,
+    eyes: Annotated[int, typer.Option(min=1, max=2, help="Cameras that look on.")] = 1,
+) -> None:
+    """Renders pseudo ex vivo recordings, unlike any training data in every respect at once."""
+    texture = photo.resolve() if photo else None
+    plan = Plan(seed, seconds, fps, (width, width * 3 // 4), texture, eyes=eyes)
+    for index in range(count):
+        with counting(f"recording {index}", int(seconds * fps)) as progress:
+            print(make(plan, index, out / f"{index:03d}", progress))
 
 
 @dataclass(frozen=True)
@@ -247,3 +270,7 @@ def _ramp(s: Floats) -> Floats:
     """Smoothstep from 0 to 1."""
     s = np.clip(s, 0, 1)
     return np.asarray(s * s * (3 - 2 * s), np.float64)
+
+
+if __name__ == "__main__":
+    typer.run(main)

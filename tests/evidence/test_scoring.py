@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bench.recording import exvivo
 from bench.recording.folder import open_recording
 from bench.tracking.tracking import track_recording
+from evidence.scoring import exvivo
 from synth.recording_flow.video_flow import RecordingFlowSettings
 
 
