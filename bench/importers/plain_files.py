@@ -76,7 +76,7 @@ def _times(source: Path, use: dict[str, str], count: int) -> Floats:
 
 def _folder(folder: Path) -> tuple[_Pictures, int]:
     paths = tuple(picture_files(folder))
-    return lambda: (picture.rgb for picture in video.read_pictures(paths)), len(paths)
+    return lambda: (picture.rgb for picture in video.read_pictures(dict(enumerate(paths)))), len(paths)
 
 
 def _array(path: Path) -> tuple[_Pictures, int]:

@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.recording import clocks, writer
-from bench.recording.folder import natural_order
 from synth.errors import UserError, first_line
 from synth.system import checked_file
 from synth.system.checked_file import refuse_large
+from synth.video.file_numbers import natural_order
 
 Floats = NDArray[np.float64]
 ROLES = ("frames", "frame_time", "force", "force_time", "tip")

@@ -43,6 +43,8 @@ class _Checked:
     size: tuple[int, int] = (0, 0)
     """Height, width [px]."""
     frames: int = 0
+    last: int = -1
+    """Number of the last frame."""
 
     @property
     def time_s(self) -> NDArray[np.float64]:
@@ -137,8 +139,8 @@ def _check_scale(recording: Recording, found: _Checked) -> None:
 def _check_film(recording: Recording, found: _Checked) -> None:
     """Decodes every picture once, and follows a few as `bench score` would."""
     first = recording.meta.rest_frame
-    last = max((recording.expected_frames() or _LOOKED_AT) - 1, first)
-    only = frozenset({first, *np.linspace(first, last, _LOOKED_AT).astype(int).tolist()})
+    numbers = [number for number in recording.numbers() or range(_LOOKED_AT) if number >= first] or [first]
+    only = frozenset(numbers[k] for k in np.linspace(0, len(numbers) - 1, _LOOKED_AT).astype(int))
     second = SecondEye(recording, found.mm_per_px or 1.0) if recording.has_two_eyes else None
     pictures = _counted(recording, found)
     film = replace(recording.film(pictures), only=only)
@@ -153,8 +155,8 @@ def _check_film(recording: Recording, found: _Checked) -> None:
     if not found.frames:
         return
     found.add("ok", "pictures", f"{found.frames} of {found.size[1]} x {found.size[0]} px")
-    if first >= found.frames:
-        found.add("bad", "rest frame", f"rest_frame is {first} of {found.frames} frames")
+    if found.last < first:
+        found.add("bad", "rest frame", f"rest_frame is {first}, the last frame {found.last}")
     if recording.tissue is None:
         found.add("lack", "tissue", "no tissue.png: the whole picture is taken for tissue")
     found.add("ok" if recording.masks else "lack", "tool", recording.describe_tool(found.frames))
@@ -171,6 +173,7 @@ def _counted(recording: Recording, found: _Checked) -> Iterator[Picture]:
     try:
         for picture in recording.frames():
             found.size, found.frames = (picture.rgb.shape[0], picture.rgb.shape[1]), found.frames + 1
+            found.last = picture.index
             if picture.time_s is None:
                 found.timeless += 1
             elif found.times and picture.time_s <= found.times[-1]:

@@ -9,14 +9,15 @@ mask.png               optional: the same for all frames that have none of their
 tissue.png             optional: white where tissue may be tracked, in the rest frame
 right.mp4 or right/*.png   optional: the second eye, frame by frame, with `stereo` in meta.yaml
 depth/*.png or *.npy   optional: depth (H, W) or points (H, W, 3), frame by frame, with `depth` in meta.yaml
+
+What is of one moment has the same number, in a picture's name and in frames.csv; a video counts from 0.
 """
 
 from __future__ import annotations
 
 import os
-import re
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -26,10 +27,14 @@ from bench.recording import csv_table, meta
 from bench.recording.meta import Meta, Span
 from synth.errors import UserError
 from synth.recording_flow.video_flow import Footage
+from synth.video import file_numbers
 from synth.video import read as video
 from synth.video.mask_files import MaskFiles
 from synth.video.pixel_scale import UNKNOWN_NOTE
 from synth.video.read import Picture
+
+Film = Path | dict[int, Path]
+"""A video, or pictures by the numbers in their names, in order."""
 
 _LARGEST_FORCE_N = 50.0
 _EPOCH_S = 1e8  # three years: no recording is as long, so such a time counts from 1970
@@ -53,10 +58,9 @@ class Recording:
 
     folder: Path
     meta: Meta
-    footage: Path | tuple[Path, ...]
-    """Video, or pictures."""
-    times_s: NDArray[np.float64] | None
-    """(N,) from frames.csv [s]; NaN for frames it doesn't list. None without the file."""
+    footage: Film
+    times_s: Mapping[int, float] | None
+    """From frames.csv [s], by the frame's number. None without the file."""
     force: Force | None
     masks: MaskFiles
     """Of the tool; there may be none."""
@@ -65,10 +69,12 @@ class Recording:
     """What was found odd and how it was taken; every one goes into the report."""
     region: tuple[int, int, int, int] | None = None
     """Left, top, width and height [px] of the part of the picture that is looked at."""
-    right: Path | tuple[Path, ...] = ()
-    """Video or pictures of the second eye; empty: none."""
-    depths: tuple[Path, ...] = ()
-    """Depth pictures; empty: none."""
+    right: Film = field(default_factory=dict)
+    """Of the second eye; empty: none."""
+    right_frame: Mapping[int, int] = field(default_factory=dict)
+    """Which frame each of them belongs to, where that is known."""
+    depths: Mapping[int, Path] = field(default_factory=dict)
+    """Depth pictures by the frame; empty: none."""
 
     @property
     def has_two_eyes(self) -> bool:
@@ -79,9 +85,9 @@ class Recording:
     def name(self) -> str:
         return self.folder.resolve().name
 
-    def expected_frames(self) -> int | None:
-        """Frames as stated, undecoded; None if the video doesn't say. UserError if unreadable."""
-        return len(self.footage) if isinstance(self.footage, tuple) else video.count_frames(self.footage)
+    def numbers(self) -> Collection[int]:
+        """Of the frames, in order; empty for a video that doesn't say how many. UserError: unreadable."""
+        return _numbers(self.footage)
 
     def frames(self) -> Iterator[Picture]:
         """Upright frames in order, with times.
@@ -91,8 +97,9 @@ class Recording:
         Raises:
             UserError: unreadable video or picture.
         """
+        first = next(iter(self.numbers()), 0)
         for picture in _pictures(self.footage):
-            yield self._timed(picture)
+            yield self._timed(picture, first)
 
     def film(self, pictures: Iterable[Picture] | None = None) -> Footage:
         """The recording for a `VideoFlow`. `pictures`: some of its frames; None: all."""
@@ -101,14 +108,15 @@ class Recording:
         return Footage(frames, str(self.folder), self.tissue_mask, tool, self.meta.rest_frame)
 
     def right_frames(self) -> Iterator[Picture]:
-        """The second eye's frames in order; UserError: unreadable."""
-        return _pictures(self.right)
+        """The second eye's frames in order, with the numbers of the film's; UserError: unreadable."""
+        for picture in _pictures(self.right):
+            yield replace(picture, index=self.right_frame.get(picture.index, picture.index))
 
     def describe_tool(self, frames: int) -> str:
         """What is taken for the tool in how many frames, for `bench check` and `bench score` alike."""
         if not self.masks:
             return "no masks/, no mask.png: the tool is looked for in each picture"
-        count = len(self.masks.by_frame)
+        count = len(self.masks.by_frame.keys() & set(self.numbers() or self.masks.by_frame))
         if count >= frames:
             return f"masks/ has all {frames} frames"
         others = "mask.png stands for" if self.masks.default else "no tool is taken to be in"
@@ -126,20 +134,27 @@ class Recording:
 
     def within(self, masks: MaskFiles | None, region: tuple[int, int, int, int] | None) -> Recording:
         """The same with the tool as other files have it, and looked at in a region (see `region`) only."""
-        return replace(self, masks=masks or self.masks, region=region)
+        if masks is None:
+            return replace(self, region=region)
+        notes = list(self.notes)
+        masks = masks.of_frames(self.numbers(), notes)
+        return replace(self, masks=masks, region=region, notes=tuple(notes))
 
-    def _timed(self, picture: Picture) -> Picture:
+    def _timed(self, picture: Picture, first: int) -> Picture:
         time_s, fps = picture.time_s, self.meta.fps
         if self.times_s is not None:
-            known = picture.index < len(self.times_s) and np.isfinite(self.times_s[picture.index])
-            time_s = float(self.times_s[picture.index]) if known else None
+            time_s = self.times_s.get(picture.index)
         elif time_s is None and fps is not None:
-            time_s = picture.index / fps
+            time_s = (picture.index - first) / fps
         return replace(picture, time_s=time_s)
 
 
-def _pictures(film: Path | tuple[Path, ...]) -> Iterator[Picture]:
-    return video.read_pictures(film) if isinstance(film, tuple) else video.read_video(film)
+def _pictures(film: Film) -> Iterator[Picture]:
+    return video.read_video(film) if isinstance(film, Path) else video.read_pictures(film)
+
+
+def _numbers(film: Film) -> Collection[int]:
+    return range(video.count_frames(film) or 0) if isinstance(film, Path) else film.keys()
 
 
 def open_recording(folder: Path, phantom: bool = False) -> Recording:
@@ -164,18 +179,36 @@ def open_recording(folder: Path, phantom: bool = False) -> Recording:
     if about.scale_mm_per_px == "unknown":
         about = about.model_copy(update={"young_kpa": None})
         notes.append(UNKNOWN_NOTE)
-    times = _frame_times(folder / "frames.csv", notes)
+    frames = _numbers(footage)
+    if not isinstance(footage, Path):
+        notes += file_numbers.describe_gaps(list(frames), "frames/")
+    elif (aspect := video.pixel_aspect(footage)) != 1:
+        how = f"pixels {aspect:.3g} times as wide as high were made square, in width"
+        notes.append(f"the video: {how}; scale and calibration are taken to be of the square ones")
+    times = _frame_times(folder / "frames.csv", frames, notes)
     force = _force(folder / "force.csv", about, notes)
     about, times, force = _from_start(about, times, force, notes)
-    masks = MaskFiles.find(folder / "masks", folder)
     tissue = folder / "tissue.png" if os.path.lexists(folder / "tissue.png") else None
     right, depths = _second_eye(folder, about)
-    return Recording(
-        folder, about, footage, times, force, masks, tissue, tuple(notes), right=right, depths=depths
+    right_frame = file_numbers.match_numbers(_numbers(right), frames, "right", notes)
+    depth_frame = file_numbers.match_numbers(depths, frames, "depth/", notes)
+    found = Recording(
+        folder,
+        about,
+        footage,
+        times,
+        force,
+        MaskFiles({}, None),
+        tissue,
+        tuple(notes),
+        right=right,
+        right_frame=right_frame,
+        depths={depth_frame[number]: path for number, path in depths.items()},
     )
+    return found.within(MaskFiles.find(folder / "masks", folder), None)
 
 
-def _second_eye(folder: Path, about: Meta) -> tuple[Path | tuple[Path, ...], tuple[Path, ...]]:
+def _second_eye(folder: Path, about: Meta) -> tuple[Film, dict[int, Path]]:
     """Video or pictures of the right eye, and depth pictures; UserError if meta.yaml says otherwise."""
     right = _film(folder, "right", "right")
     depths = [path for path in folder.glob("depth/*") if path.suffix in (".png", ".npy")]
@@ -185,27 +218,27 @@ def _second_eye(folder: Path, about: Meta) -> tuple[Path | tuple[Path, ...], tup
                 f"{folder}: right.mp4 or right/*.png goes with stereo: in meta.yaml, depth/ with depth:; "
                 f"{key}: or its pictures are missing"
             )
-    return right, tuple(sorted(depths, key=natural_order))
+    return right, file_numbers.number_files(depths)
 
 
-def _film(folder: Path, name: str, pictures: str) -> Path | tuple[Path, ...]:
-    """The video NAME.*, or the pictures of a folder in order; empty: neither. UserError for several."""
-    found: list[Path | tuple[Path, ...]] = [
+def _film(folder: Path, name: str, pictures: str) -> Film:
+    """The video NAME.*, or the pictures of a folder; empty: neither. UserError for several."""
+    found: list[Film] = [
         path for path in sorted(folder.glob(f"{name}.*")) if path.suffix.lower() in video.SUFFIXES
     ]
-    if stills := tuple(sorted(folder.glob(f"{pictures}/*.png"), key=natural_order)):
+    if stills := file_numbers.number_files(list(folder.glob(f"{pictures}/*.png"))):
         found.append(stills)
     if len(found) > 1:
         raise UserError(f"{folder}: holds several of {name}.mp4 and {pictures}/; keep one of them")
-    return found[0] if found else ()
+    return found[0] if found else {}
 
 
 def _from_start(
-    about: Meta, times: NDArray[np.float64] | None, force: Force | None, notes: list[str]
-) -> tuple[Meta, NDArray[np.float64] | None, Force | None]:
+    about: Meta, times: dict[int, float] | None, force: Force | None, notes: list[str]
+) -> tuple[Meta, dict[int, float] | None, Force | None]:
     """Times since 1970 counted from the first frame instead, those of meta.yaml's spans among them."""
-    known = np.zeros(0) if times is None else times[np.isfinite(times)]
-    start = float(known[0]) if len(known) and known[0] > _EPOCH_S else 0.0
+    first = next(iter((times or {}).values()), 0.0)
+    start = first if first > _EPOCH_S else 0.0
     felt = force is not None and bool(force.time_s[0] > _EPOCH_S)
     if force is not None and felt != bool(start):
         one, other = ("force.csv", "the video") if felt else ("frames.csv", "force.csv")
@@ -215,7 +248,7 @@ def _from_start(
         return about, times, force
     notes.append(f"times since 1970 are counted from {start:.3f} s on")
     if times is not None:
-        times = times - start
+        times = {number: time - start for number, time in times.items()}
     if force is not None:
         force = replace(force, time_s=force.time_s - start)
     return _spans_from(about, start), times, force
@@ -238,13 +271,8 @@ def _spans_from(about: Meta, start: float) -> Meta:
     return about.model_copy(update=parts)
 
 
-def natural_order(path: Path) -> list[tuple[int, str]]:
-    """Key that sorts names by the numbers in them: a2 before a10."""
-    parts = re.split("([0-9]+)", path.stem)  # every second is a number
-    return [(int(part), "") if k % 2 else (-1, part) for k, part in enumerate(parts)]
-
-
-def _frame_times(path: Path, notes: list[str]) -> NDArray[np.float64] | None:
+def _frame_times(path: Path, frames: Collection[int], notes: list[str]) -> dict[int, float] | None:
+    """Seconds by the frame's number, rising; `frames`: the film's. UserError: no numbers, or of another."""
     if not os.path.lexists(path):
         return None
     columns = csv_table.read_csv(path, ("frame", "t_s"))
@@ -252,11 +280,10 @@ def _frame_times(path: Path, notes: list[str]) -> NDArray[np.float64] | None:
     number = np.where((frame >= 0) & (frame < 1e8), frame, -1).astype(np.int64)
     whole = (number == frame).all() and len(np.unique(number)) == len(number)
     if not whole or number.max() > 10 * len(number) + 1000:
-        raise UserError(f"{path}: column frame must hold the frames' numbers from 0, each once")
-    times = np.full(number.max() + 1, np.nan)
-    times[number] = time
-    known = times[np.isfinite(times)]
-    if len(known) and (np.diff(known) <= 0).any():
+        raise UserError(f"{path}: column frame must hold the frames' numbers, each once")
+    frame_of = file_numbers.match_numbers(number.tolist(), frames, path.name, notes)
+    times = {frame_of[n]: t for n, t in sorted(zip(number.tolist(), time.tolist(), strict=True)) if t == t}
+    if (np.diff(list(times.values())) <= 0).any():
         notes.append(f"{path.name}: times stand still or run back; those frames are left out")
     return times
 

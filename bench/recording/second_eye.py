@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import chain
 
 import cv2
 import numpy as np
@@ -81,16 +82,19 @@ class SecondEye:
         scale = self._stereo.distance_mm / r.focal / self._shrink
         return StereoQuality(r.baseline_mm, rest.epipolar_px, scale, noise, lag)
 
-    def follow(self, frame: FrameMotion, video: VideoFlow) -> Moved:
-        """Motion in space of a frame since rest; the first is the rest frame.
+    def follow(self, frame: FrameMotion, video: VideoFlow) -> Moved | None:
+        """Motion in space of a frame since rest, None where the second eye's picture is missing.
+
+        The first is the rest frame.
 
         Raises:
-            UserError: the second eye has no such frame, or can't be read; a calibration that isn't its own.
+            UserError: the second eye lacks the rest frame, ends early or can't be read; not its calibration.
         """
         self._shrink, tissue = video.shrink, video.tissue
         masked = np.zeros_like(tissue) if frame.masked is None else frame.masked
         if self._recording.right:
-            right = self._right(frame.index, video)
+            if (right := self._right(frame, video)) is None:
+                return None
             hidden = _mask_right(right, video.settings.masks, masked)
             if self._stereo is None:
                 rig = self._rig(video)
@@ -100,7 +104,8 @@ class SecondEye:
             if np.percentile(np.abs(frame.flow[tissue]), 98) > _MOVED_PX:
                 self._lags.append(abs(self._stereo.lag))
         else:
-            depth = self._depths(frame.index, video)
+            if (depth := self._depths(frame, video)) is None:
+                return None
             if self._depth is None:
                 self._depth = DepthTracker(self._K(video), depth, masked, tissue)
                 return Moved.nothing(tissue.shape)
@@ -118,9 +123,13 @@ class SecondEye:
         size = (width // video.shrink, height // video.shrink)
         return StereoRig(left, right, rig.rotation, rig.translation, size)
 
-    def _right(self, index: int, video: VideoFlow) -> Rgb:
-        """The second eye's frame of that number, shrunk as the film's."""
+    def _right(self, frame: FrameMotion, video: VideoFlow) -> Rgb | None:
+        """The second eye's picture of that number, shrunk as the film's; None: it is missing."""
+        index = frame.index
         for picture in self._rights:
+            if picture.index > index and not frame.is_rest:
+                self._rights = chain([picture], self._rights)
+                return None
             if picture.index == index:
                 if picture.rgb.shape[:2] != video.size:
                     raise UserError(
@@ -135,13 +144,15 @@ class SecondEye:
         x, y = about.centre_px or ((width - 1) / 2, (height - 1) / 2)
         return _smaller(np.array([[about.focal_px, 0, x], [0, about.focal_px, y], [0, 0, 1.0]]), video.shrink)
 
-    def _depths(self, index: int, video: VideoFlow) -> Map:
-        """Depth (h, w) mm of a frame; of points their third coordinate."""
+    def _depths(self, frame: FrameMotion, video: VideoFlow) -> Map | None:
+        """Depth (h, w) mm of a frame, of points their third coordinate; None: it is missing."""
         recording, about = self._recording, self._recording.meta.depth
         assert about is not None
-        if index >= len(recording.depths):
-            raise UserError(f"{recording.folder}: depth/ has no frame {index}")
-        path = recording.depths[index]
+        if frame.index not in recording.depths:
+            if not frame.is_rest and frame.index < max(recording.depths):
+                return None
+            raise UserError(f"{recording.folder}: depth/ has no frame {frame.index}")
+        path = recording.depths[frame.index]
         if path.suffix == ".npy":
             checked_file.check_file(path, _LARGEST_BYTES)
             try:

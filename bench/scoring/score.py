@@ -75,7 +75,7 @@ def score(
     elif isinstance(model, (str, Path)):
         model = find_model(model)
     folder = model if isinstance(model, Path) else None
-    frames = opened.expected_frames()
+    frames = len(opened.numbers()) or None
     flow: AbstractContextManager[LocalFlow | None] = nullcontext()
     if own_process and (frames or _LONG) >= _LONG:
         flow = flow_process.open_flow_process()

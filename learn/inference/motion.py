@@ -130,7 +130,9 @@ def _video(path: Path, options: VideoOptions, pulse: PulseSearch | None = None) 
         )
     scale_known = options.scale_mm_per_px != "unknown"
     tissue = everywhere if options.tissue is None else partial(video.read_mask, options.tissue)
-    tool = options.tool.read if options.tool else None
+    taken: list[str] = []
+    frames_there = range(video.count_frames(path) or 0)
+    tool = options.tool.of_frames(frames_there, taken).read if options.tool else None
     footage = Footage(video.read_video(path, video.FPS), str(path), tissue, tool)
     following = VideoFlow(footage, options.settings, pulse=pulse)
     frames = (replace(one, time_s=one.time_s or 0.0) for one in following.frames())
@@ -142,7 +144,7 @@ def _video(path: Path, options: VideoOptions, pulse: PulseSearch | None = None) 
         return None if found is None else _video(path, options, found)
 
     def notes() -> list[str]:
-        found = following.notes if scale_known else [UNKNOWN_NOTE, *following.notes]
+        found = [*taken, *([] if scale_known else [UNKNOWN_NOTE]), *following.notes]
         return found if following.removed is None else [*found, following.removed.describe(mm_per_px)]
 
     return Motion(

@@ -91,8 +91,8 @@ class SecondView(Protocol):
     scale_mm_per_px: float
     """Of the film's own pixels."""
 
-    def follow(self, frame: FrameMotion, video: VideoFlow) -> Moved:
-        """Motion in space of a frame that could be followed; the first is the rest frame."""
+    def follow(self, frame: FrameMotion, video: VideoFlow) -> Moved | None:
+        """Motion in space of a frame that could be followed, None if it lacks it; first of the rest frame."""
         ...
 
 
@@ -338,8 +338,9 @@ class VideoFlow:
             frame = replace(frame, trusted=False)
         self.watch.add("flow", frame.cpu_s, frame.wall_s)
         self.peak_bytes = max(self.peak_bytes, frame.peak_bytes)
+        frame = self._in_space(frame)
         self.summary.add(frame, self.tissue)
-        return self._without_pulse(self._in_space(frame))
+        return self._without_pulse(frame)
 
     def _pictured(self, frame: FrameMotion, small: Picture, masking_s: float) -> FrameMotion:
         return replace(frame, index=small.index, time_s=small.time_s, rgb=small.rgb, masking_s=masking_s)
@@ -349,9 +350,10 @@ class VideoFlow:
         if self.second is None:
             return frame
         with self.watch.stage("second eye"):
-            if not frame.trusted:
-                return replace(frame, motion=Moved.nothing(self.tissue.shape))
-            return replace(frame, motion=self.second.follow(frame, self))
+            moved = self.second.follow(frame, self) if frame.trusted else None
+            if moved is None:
+                return replace(frame, trusted=False, motion=Moved.nothing(self.tissue.shape))
+            return replace(frame, motion=moved)
 
     def _without_pulse(self, frame: FrameMotion) -> FrameMotion:
         """The same with the pulse taken off; before it is known, the frame is one to find it in."""

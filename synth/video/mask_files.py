@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import os
 import re
-from dataclasses import dataclass
+from collections.abc import Collection
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from synth.errors import UserError
+from synth.video.file_numbers import match_numbers, number_files
 from synth.video.read import read_mask
 
 MASKS = {
@@ -33,10 +35,15 @@ class MaskFiles:
 
     @classmethod
     def find(cls, numbered: Path, folder: Path) -> MaskFiles:
-        """NNNNNN.png in the folder `numbered`, and mask.png in `folder`; there may be none."""
-        files = [path for path in sorted(numbered.glob("*.png")) if re.fullmatch("[0-9]{1,9}", path.stem)]
+        """Pictures with a frame's number in their names in `numbered`, and mask.png in `folder`, if any."""
+        files = [path for path in numbered.glob("*.png") if re.search("[0-9]", path.stem)]
         default = folder / "mask.png"
-        return cls({int(path.stem): path for path in files}, default if os.path.lexists(default) else None)
+        return cls(number_files(files), default if os.path.lexists(default) else None)
+
+    def of_frames(self, frames: Collection[int], notes: list[str]) -> MaskFiles:
+        """The same with a film's numbers; arguments and errors as of `match_numbers`."""
+        frame_of = match_numbers(self.by_frame, frames, "masks/", notes)
+        return replace(self, by_frame={frame_of[number]: path for number, path in self.by_frame.items()})
 
     def __bool__(self) -> bool:
         return bool(self.by_frame) or self.default is not None

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from fractions import Fraction
 from pathlib import Path
 
 import av
+import cv2
 import numpy as np
 from av.container import InputContainer
 from numpy.typing import NDArray
@@ -23,6 +25,8 @@ FPS = 25.0
 Rgb = NDArray[np.uint8]
 
 _LARGEST_BYTES = 1 << 40
+_WIDEST = 4.0  # times as wide as high: more is no pixel but a damaged header
+_LABELS = 8  # levels of a mask that holds numbers, not a soft edge
 
 # What FFmpeg may open: by its content a file could also be a list of other files and addresses.
 _CONTAINERS = {
@@ -37,7 +41,7 @@ class Picture:
     """One frame as it is to be looked at: upright, sRGB."""
 
     index: int
-    """Position among the decoded frames."""
+    """Number of the frame: its place in a video, the number in the name of a still."""
     time_s: float | None
     """Presentation time on the video's clock [s]; None if the file states none."""
     rgb: Rgb
@@ -47,7 +51,8 @@ class Picture:
 def read_video(path: Path, fps: float | None = None) -> Iterator[Picture]:
     """Decodes frame by frame; times are the container's presentation times, else frames over `fps`.
 
-    A rotation stated in the file is applied. A file cut off in the middle gives the frames before the cut.
+    A rotation stated in the file is applied, and pixels that it says are not square are made so: wider or
+    narrower, as high as they were. A file cut off in the middle gives the frames before the cut.
 
     Raises:
         UserError: not a video, no video stream, or pictures beyond 40 megapixels.
@@ -62,8 +67,12 @@ def read_video(path: Path, fps: float | None = None) -> Iterator[Picture]:
         index = 0
         try:
             for frame in container.decode(stream):
-                refuse_large(frame.width, frame.height)
-                rgb = np.rot90(frame.to_ndarray(format="rgb24"), frame.rotation // 90)
+                width = _square_width(frame.width, stream.sample_aspect_ratio)
+                refuse_large(max(width, frame.width), frame.height)
+                rgb = frame.to_ndarray(format="rgb24")
+                if width != frame.width:
+                    rgb = np.asarray(cv2.resize(rgb, (width, frame.height), interpolation=cv2.INTER_AREA))
+                rgb = np.rot90(rgb, frame.rotation // 90)
                 unstated = None if fps is None else index / fps
                 time_s = unstated if frame.pts is None else float(frame.time)
                 yield Picture(index, time_s, np.ascontiguousarray(rgb))
@@ -81,6 +90,19 @@ def count_frames(path: Path) -> int | None:
         return int(container.streams.video[0].frames) or None if container.streams.video else None
 
 
+def pixel_aspect(path: Path) -> float:
+    """Width over height of a video's pixels, 1 if it states none. UserError if it is no video."""
+    with _open_video(path) as container:
+        stream = next(iter(container.streams.video), None)
+        return 1.0 if stream is None else _square_width(1 << 20, stream.sample_aspect_ratio) / (1 << 20)
+
+
+def _square_width(width: int, aspect: Fraction | None) -> int:
+    """Columns that square pixels have where these, of that aspect, are `width`."""
+    stated = float(aspect) if aspect else 1.0
+    return round(width * stated) if 1 / _WIDEST <= stated <= _WIDEST else width
+
+
 def _open_video(path: Path) -> InputContainer:
     checked_file.check_file(path, _LARGEST_BYTES)
     try:
@@ -93,14 +115,14 @@ def _open_video(path: Path) -> InputContainer:
         raise UserError(f"{path}: not a readable video ({_reason(error)})") from None
 
 
-def read_pictures(paths: tuple[Path, ...]) -> Iterator[Picture]:
-    """PNG (or any still OpenCV reads) files in the given order, without times.
+def read_pictures(paths: Mapping[int, Path]) -> Iterator[Picture]:
+    """PNG (or any still OpenCV reads) files by their numbers, in the given order, without times.
 
     Raises:
         UserError: one can't be read, or its size differs from the first's.
     """
     size: tuple[int, ...] | None = None
-    for index, path in enumerate(paths):
+    for index, path in paths.items():
         rgb = read_picture(path)
         if size is not None and rgb.shape != size:
             raise UserError(
@@ -120,8 +142,20 @@ def read_picture(path: Path) -> Rgb:
 
 
 def read_mask(path: Path, size: tuple[int, int]) -> NDArray[np.bool_]:
-    """(H, W) where the picture is white. UserError if it is unreadable or not of that height and width."""
-    mask = read_picture(path)[..., 0] > 127
+    """(H, W) where the picture is white: over half its brightest, or not 0 where it holds numbers.
+
+    Of a picture of one colour its opacity is the mask. UserError: unreadable, or of another height and width.
+    """
+    picture = checked_file.read_picture(path, cv2.IMREAD_UNCHANGED)
+    levels = np.atleast_3d(picture)
+    if levels.shape[2] == 4:
+        colour, opaque = levels[..., :3], levels[..., 3]
+        seen = colour[opaque > 0]
+        plain = np.ptp(opaque) > 0 and (seen == seen[:1]).all()
+        levels = opaque[..., None] if plain else colour * (opaque > 0)[..., None]
+    brightest = levels.max(axis=2)
+    few = np.count_nonzero(np.bincount(brightest.ravel())) <= _LABELS
+    mask = brightest > (0 if few else brightest.max() / 2)
     if mask.shape != size:
         raise UserError(f"{path}: {mask.shape[1]} x {mask.shape[0]}, the video is {size[1]} x {size[0]}")
     return np.asarray(mask, bool)

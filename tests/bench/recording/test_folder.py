@@ -6,12 +6,15 @@ from fractions import Fraction
 from pathlib import Path
 
 import av
+import cv2
 import numpy as np
 import pytest
 from fake_recording import Maker, texture
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
 from bench.recording import csv_table, writer
-from bench.recording.folder import open_recording
+from bench.recording.folder import Recording, open_recording
 from synth.errors import UserError
 from synth.video import read as video
 
@@ -95,3 +98,56 @@ def test_frames_that_the_table_lacks_have_no_time(make: Maker, footage: str) -> 
     if footage == "png":
         times = [frame.time_s for frame in open_recording(folder).frames()]
         assert times == pytest.approx([0, 0.1, 0.2, 0.3])
+
+
+def _numbered(folder: Path, count: int, first: int, lost: int) -> Recording:
+    """Pictures of which all but one are there, counted from `first`; masks and times of all, from 0."""
+    for name in ("frames", "masks"):
+        (folder / name).mkdir()
+    for k in range(count):
+        mark = np.full((4, 6), k, np.uint8)
+        assert cv2.imwrite(str(folder / f"masks/{k:06d}.png"), 255 * (np.arange(24).reshape(4, 6) <= k))
+        if k != lost:
+            assert cv2.imwrite(str(folder / f"frames/f2_{k + first}.png"), mark)
+    writer.write_frames(folder, 0.5 * np.arange(count))
+    writer.write_meta(folder, {"scale_mm_per_px": 0.1, "young_kpa": 1.0})
+    return open_recording(folder)
+
+
+@given(count=st.integers(3, 14), first=st.integers(0, 1), lost=st.integers(0, 14))
+@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_what_is_of_one_moment_has_the_same_number(
+    tmp_path_factory: pytest.TempPathFactory, count: int, first: int, lost: int
+) -> None:
+    """One lost picture is a gap; counting from 1 is found out, or refused where a loss may hide it."""
+    folder = tmp_path_factory.mktemp("numbered")
+    if lost < count and (first or lost == 0):
+        with pytest.raises(UserError, match=r"frames\.csv"):
+            _numbered(folder, count, first, lost)
+        return
+    opened = _numbered(folder, count, first, lost)
+    pictures = list(opened.frames())
+    assert len(pictures) == count - (lost < count)
+    for picture in pictures:
+        moment = int(picture.rgb[0, 0, 0])
+        assert picture.time_s == 0.5 * moment
+        mask = opened.masks.read(picture.index, (4, 6))
+        assert mask is not None
+        assert mask.sum() == min(moment + 1, 24)
+
+
+def test_pixels_of_a_video_are_made_square(tmp_path: Path) -> None:
+    """A disc that a 4:3 sensor wrote three quarters as wide is round."""
+    x, y = np.meshgrid(np.arange(96), np.arange(96))
+    disc = (((x - 47.5) * 4 / 3) ** 2 + (y - 47.5) ** 2 < 30**2).astype(np.uint8)
+    with av.open(str(tmp_path / "v.mp4"), "w") as out:
+        stream = out.add_stream("libx264", rate=10)
+        stream.width, stream.height, stream.pix_fmt = 96, 96, "yuv420p"
+        stream.codec_context.sample_aspect_ratio = Fraction(4, 3)
+        frame = av.VideoFrame.from_ndarray(np.dstack([255 * disc] * 3), format="rgb24")
+        for packet in [*stream.encode(frame), *stream.encode()]:
+            out.mux(packet)
+    (picture,) = video.read_video(tmp_path / "v.mp4")
+    seen = picture.rgb[..., 0] > 127
+    assert seen.shape == (96, 128)
+    assert seen.any(0).sum() == pytest.approx(seen.any(1).sum(), abs=3)

@@ -13,6 +13,7 @@ from fake_recording import Bump, Maker
 from bench.recording.folder import open_recording
 from bench.tracking.tracking import picture_masks, track_recording
 from synth.recording_flow.video_flow import RecordingFlowSettings
+from synth.video import read as video
 
 _SIZE = (96, 128)
 
@@ -31,6 +32,23 @@ def test_one_mask_serves_all_frames_that_have_none(tmp_path: Path) -> None:
     opened = open_recording(folder)
     widths = [int(found[0].sum()) for k in range(4) if (found := opened.masks.read(k, _SIZE)) is not None]
     assert widths == [10, 10, 30, 10]
+
+
+@pytest.mark.parametrize("kind", ["0 and 1", "alpha", "white", "soft", "16 bits"])
+def test_a_mask_is_read_however_it_was_saved(tmp_path: Path, kind: str) -> None:
+    tool = np.zeros(_SIZE, np.uint8)
+    tool[20:60, 30:90] = 1
+    alpha = np.dstack([np.full((*_SIZE, 3), 255, np.uint8), 255 * tool])
+    soft = cv2.GaussianBlur(200 * tool, (0, 0), 1)
+    saved = {
+        "0 and 1": tool,
+        "alpha": alpha,
+        "white": 255 * tool,
+        "soft": soft,
+        "16 bits": tool.astype(np.uint16),
+    }
+    assert cv2.imwrite(str(tmp_path / "m.png"), saved[kind])
+    assert np.sum(video.read_mask(tmp_path / "m.png", _SIZE) != tool) < 8
 
 
 def test_only_the_region_is_tissue(tmp_path: Path) -> None:

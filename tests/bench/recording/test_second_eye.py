@@ -131,6 +131,14 @@ def test_motion_in_space_is_what_was_put_in(make: Make, second: str) -> None:
     assert done.stereo.noise_mm > 0
 
 
+@pytest.mark.parametrize(("second", "lost"), [("right", "1.png"), ("depth", "1.npy")])
+def test_a_picture_that_the_second_eye_lacks_is_a_gap(make: Make, second: str, lost: str) -> None:
+    folder = make(second)
+    (folder / second / lost).unlink()
+    done = track_recording(open_recording(folder), {"it": Looking()}, AWAY / FOCAL, SETTINGS)
+    assert done.trusted == [True, False, True]
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("second", ["right", "depth"])
 def test_a_breath_along_the_view_is_taken_off_depth(tmp_path: Path, second: str) -> None:
