@@ -200,12 +200,13 @@ def example(film: Film) -> Film:
     hidden = film["hidden"] if "hidden" in film else mask_detection.hidden(rgb, film["tool"])
     found = track(Tvl1(corrected=False), rgb, hidden, tissue)
     rows = []
-    usable = tissue & ~hidden[0]
+    usable, share = tissue & ~hidden[0], correction.means(1.0 * tissue)
     rest = _normalised(rgb[0], usable)
     for t in range(1, len(rgb)):
-        seen, flow, share = ~hidden[t], found.flow[t], correction.means(1.0 * tissue)
-        greys = rest, _normalised(rgb[t], seen)
-        x = correction.describe(rgb[0], rgb[t], usable, seen, greys, flow, found.confidence[t])
+        now, along = _normalised(rgb[t], ~hidden[t]), torch.from_numpy(found.flow[t]).movedim(-1, 0)[None]
+        warped, seen = (one[0, 0].numpy() for one in image.warp(now, image.flags(~hidden[t]), along))
+        flow, greys = found.flow[t], (rest[0, 0].numpy(), warped)
+        x = correction.describe(rgb[0], rgb[t], usable, greys, seen, flow, found.confidence[t])
         missing = ((film["flow"][t] - flow) * tissue[..., None]).transpose(2, 0, 1)
         y = correction.means(*missing) / np.maximum(share, 0.05)
         visible, pressed = film["visible"][t] & tissue, film["pressed"][t] & tissue
@@ -214,8 +215,8 @@ def example(film: Film) -> Film:
     return {name: np.stack(column) for name, column in zip("xyw", zip(*rows, strict=True), strict=True)}
 
 
-def _normalised(rgb: NDArray[np.uint8], usable: NDArray[np.bool_]) -> NDArray[np.float32]:
-    return np.asarray(image.normalise(image.tensor(rgb), image.flags(usable))[0, 0], np.float32)
+def _normalised(rgb: NDArray[np.uint8], usable: NDArray[np.bool_]) -> Tensor:
+    return image.normalise(image.tensor(rgb), image.flags(usable))
 
 
 def _varied(film: Film, rng: np.random.Generator, again: int) -> Film:

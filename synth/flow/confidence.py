@@ -31,19 +31,18 @@ def deviation(confidence: Map) -> Map:
     return np.asarray(_HALF_PX * np.sqrt(1 / sure - 1), np.float32)
 
 
-def agreement(pictures: image.Level, flow: Tensor) -> Tensor:
+def agreement(pictures: image.Level, warped: Tensor, seen: Tensor) -> Tensor:
     """Seen in both pictures, times the local correlation of the rest frame with the warped one.
 
     1 is the same, 0 unrelated; a blank picture gives 0.
 
     Args:
         pictures: the finest level.
-        flow: (B, 2, H, W) px.
+        warped, seen: (B, 1, H, W), see `image.warp`.
 
     Returns:
         (B, 1, H, W) in 0..1.
     """
-    warped, seen = image.warp(pictures.now, pictures.now_usable, flow)
     mask = pictures.rest_usable * seen
     first, second = pictures.rest * mask, warped * mask
     sums = torch.cat([mask, first * second, first * first, second * second], 1)

@@ -41,7 +41,8 @@ _WINDOWS = 3, 7  # cells a side
 _WIDTHS = 20, 32, 48
 _LEAST = 0.02  # squared gradients a pixel: windows of less contrast say nothing
 _FARTHEST_PX = 2.0  # no step of a linear equation is believed beyond
-_OFFSET = 8.0  # grey levels added before ratios: sensors' black is none
+_OFFSET = np.float32(8)  # grey levels added before ratios: sensors' black is none
+_TWELVE, _QUARTER = np.float32(12), np.float32(0.25)
 
 
 class CorrectionNet(nn.Module):
@@ -99,11 +100,12 @@ def correct(net: CorrectionNet, features: NDArray[np.float32], flow: Flow) -> tu
     with torch.inference_mode():
         cells = torch.from_numpy(padded(features))[None]
         found = net(cells.to(memory_format=torch.channels_last))
-        wide = F.interpolate(found, scale_factor=CELL, mode="bilinear", align_corners=False)
-        planes = wide[0, :, :height, :width].numpy()
+        small = found[0].permute(1, 2, 0).numpy()
+    size = CELL * small.shape[1], CELL * small.shape[0]
+    missing, spread = (cv2.resize(part, size)[:height, :width] for part in (small[..., :2], small[..., 2:]))
     # The geometric mean of both components', within what was trained.
-    spread = np.exp(0.25 * (planes[2].clip(-8, 5) + planes[3].clip(-8, 5)))
-    return flow + planes[:2].transpose(1, 2, 0), spread
+    spread = np.clip(spread, -8, 5, out=spread)
+    return flow + missing, np.exp(0.25 * (spread[..., 0] + spread[..., 1]))
 
 
 def padded(cells: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -113,13 +115,7 @@ def padded(cells: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def describe(
-    rest: Rgb,
-    now: Rgb,
-    rest_usable: Flags,
-    now_usable: Flags,
-    greys: tuple[Map, Map],
-    flow: Flow,
-    agreed: Map,
+    rest: Rgb, now: Rgb, rest_usable: Flags, greys: tuple[Map, Map], seen: Map, flow: Flow, agreed: Map
 ) -> NDArray[np.float32]:
     """What the network sees of a frame and its flow: (24, h, w) float32 on cells of 4 x 4 px.
 
@@ -127,39 +123,32 @@ def describe(
         rest: (H, W, 3) uint8.
         now: (H, W, 3) uint8.
         rest_usable: (H, W), tissue that nothing hides in the rest frame.
-        now_usable: (H, W), what nothing hides in the frame.
-        greys: (H, W) both contrast-normalised.
+        greys: (H, W) both contrast-normalised, that of the frame warped back along the flow.
+        seen: (H, W) 1 where what it was warped from is hidden by nothing, else 0; see `image.warp`.
         flow: (H, W, 2) px.
         agreed: (H, W) how well both agree along it, in 0..1.
     """
     height, width = agreed.shape
-    x = np.arange(width, dtype=np.float32) + flow[..., 0]
-    y = np.arange(height, dtype=np.float32)[:, None] + flow[..., 1]
+    u, v = cv2.split(flow)
+    x = u + np.arange(width, dtype=np.float32)
+    y = v + np.arange(height, dtype=np.float32)[:, None]
     there = cv2.remap(now, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-    warped, seen = np.empty((2, height, width), np.float32)
-    planes = np.ascontiguousarray(flow.transpose(2, 0, 1))
-    fused.warp_into(np.ascontiguousarray(greys[1]), now_usable.astype(np.float32), planes, warped, seen)
     mask = seen * rest_usable
-    sums = np.zeros((2, 10, -(-height // CELL), -(-width // CELL)), np.float32)
-    sum_products(greys[0], warped, mask, CELL, sums[0])
-    sum_products(_colour(rest), _colour(there), mask, CELL, sums[1])
-    m, seen, usable, agreed, u, v = means(mask, seen, rest_usable, agreed, flow[..., 0], flow[..., 1])
+    sums = np.empty((28, -(-height // CELL), -(-width // CELL)), np.float32)
+    colours = np.stack([cv2.split(picture) for picture in (rest, there)])
+    sum_cells(colours, np.stack(greys), mask, sums)
+    products, lights = sums[:20], sums[20:].reshape(2, 4, *sums.shape[1:]) / (CELL * CELL)
+    m, seen, usable, agreed, u, v = means(mask, seen, rest_usable, agreed, u, v)
     area = np.maximum(m, 0.05)
-    lights = [means(*(picture * mask[..., None]).transpose(2, 0, 1)) / area for picture in (rest, there)]
-    change = (m > 0) * np.log((lights[1] + _OFFSET) / (lights[0] + _OFFSET))
+    before, after = lights[:, :3] / area + _OFFSET
+    change = (m > 0) * np.log(after / before)
     common = np.median(change[:, m > 0.5], axis=1) if (m > 0.5).any() else np.zeros(3)
     change = 3 * np.clip(change - common[:, None, None] * (m > 0), -1, 1)
-    light = [0.5 * np.log1p(means(picture @ GREY)[0]) - 2 for picture in (rest, there)]
-    steps = [_step(kind, side) for kind in sums for side in _WINDOWS]
-    left = np.minimum(sums[0, 9] / (CELL * CELL * area), 4)
-    rows = [m, seen, usable, left, *np.concatenate(steps), *change, *light, agreed, 0.25 * u, 0.25 * v]
+    light = 0.5 * np.log1p(lights[:, 3]) - 2
+    steps = np.stack([_steps(products, side) for side in _WINDOWS], 1).reshape(12, *m.shape)
+    left = np.minimum(products[9] / (CELL * CELL * area), 4)
+    rows = [m, seen, usable, left, *steps, *change, *light, agreed, 0.25 * u, 0.25 * v]
     return np.stack(rows).astype(np.float32)
-
-
-def _colour(rgb: NDArray[np.uint8]) -> Map:
-    """(H, W) green against red, which shading leaves alone; about as large as a contrast-normalised grey."""
-    red, green = rgb[..., 0].astype(np.float32), rgb[..., 1].astype(np.float32)
-    return np.asarray(12 * (green - red) / (green + red + 2 * np.float32(_OFFSET)), np.float32)
 
 
 def means(*planes: NDArray[Any]) -> NDArray[np.float32]:
@@ -173,53 +162,79 @@ def means(*planes: NDArray[Any]) -> NDArray[np.float32]:
     return np.stack(small)
 
 
-def _step(sums: NDArray[np.float32], side: int) -> NDArray[np.float32]:
-    """Lucas and Kanade's step x, y [px] over windows of `side` cells, and how well it is known; (3, h, w)."""
-    n, gx, gy, r, xx, xy, yy, xr, yr, _ = (
-        cv2.boxFilter(one, -1, (side, side), borderType=cv2.BORDER_CONSTANT) for one in sums
-    )
-    n = np.maximum(n, 1)
-    xx, xy, yy = xx / n - (gx / n) ** 2 + _LEAST, xy / n - gx * gy / n**2, yy / n - (gy / n) ** 2 + _LEAST
-    xr, yr = xr / n - gx * r / n**2, yr / n - gy * r / n**2
+def _steps(products: NDArray[np.float32], side: int) -> NDArray[np.float32]:
+    """Lucas and Kanade's steps x, y [px] over windows of `side` cells, and how well they are known.
+
+    Of products (20, h, w), those of `sum_cells`; (2, 3, h, w), by greys and by colours.
+    """
+    around = np.empty_like(products)
+    fused.box_into(products, (0,) * side, around)
+    around = around.reshape(2, 10, *products.shape[1:]).swapaxes(0, 1)
+    inside = cv2.boxFilter(np.ones_like(products[0]), -1, (side, side), borderType=cv2.BORDER_CONSTANT)
+    # Windows that see less than a pixel a cell say less.
+    gx, gy, r, xx, xy, xr, yy, yr = around[1:9] * (inside / np.maximum(around[0] * inside, 1))
+    xx, xy, yy = xx - gx * gx + _LEAST, xy - gx * gy, yy - gy * gy + _LEAST
+    xr, yr = xr - gx * r, yr - gy * r
     scale = 1 / (xx * yy - xy * xy)
-    step = np.stack([xy * yr - yy * xr, xy * xr - xx * yr]) * scale
+    step = np.stack([xy * yr - yy * xr, xy * xr - xx * yr], 1) * scale[:, None]
     least = 0.5 * (xx + yy) - np.hypot(0.5 * (xx - yy), xy)
     known = 0.5 * np.clip(np.log(np.maximum(least, _LEAST) / _LEAST), 0, 5)
-    return np.stack([*(_FARTHEST_PX * np.tanh(step / _FARTHEST_PX)), known])
+    return np.concatenate([_FARTHEST_PX * np.tanh(step / _FARTHEST_PX), known[:, None]], 1)
 
 
 @vectorised
-def sum_products(rest: Map, now: Map, mask: Map, cell: int, sums: NDArray[np.float32]) -> None:
-    """Sums over cells of 1, g_x, g_y, r, g_x², g_x g_y, g_y², g_x r, g_y r, r² where `mask` is: (10, h, w).
+def sum_cells(colours: NDArray[np.uint8], greys: Map, mask: Map, sums: NDArray[np.float32]) -> None:
+    """Sums over cells of two aligned pictures (2, 3, H, W) and their greys (2, H, W) into `sums` (28, h, w).
 
-    g is the gradient of the mean of both aligned pictures (H, W), r their difference, now - rest.
+    Of the greys, then of green against red, which shading leaves alone: 1, g_x, g_y, r, g_x², g_x g_y, g_x r,
+    g_y², g_y r, r² where the mask (H, W) is, g being the gradient of both pictures' mean, r their difference.
+    Of rest, then of now: red, green, blue where the mask is, and luminance; a cell repeats the border.
     """
-    height, width = rest.shape
-    half = np.float32(0.25)
-    part = np.empty(10, np.float32)
+    height, width = mask.shape
+    total, left = np.empty((2, height, width + 2), np.float32), np.empty((2, height, width), np.float32)
+    line, lines = np.empty((2, width), np.float32), np.empty((28, sums.shape[2] * CELL), np.float32)
+    one, weighed = np.ones((4, width), np.float32), np.empty(width, np.float32)
+    for y in range(height):
+        for tone in range(2):
+            for k in range(2):
+                for x in range(width):
+                    red, green = np.float32(colours[k, 0, y, x]), np.float32(colours[k, 1, y, x])
+                    # About as large as a contrast-normalised grey.
+                    colour = _TWELVE * (green - red) / (green + red + _OFFSET + _OFFSET)
+                    line[k, x] = colour if tone else greys[k, y, x]
+            for x in range(width):
+                total[tone, y, x + 1], left[tone, y, x] = line[0, x] + line[1, x], line[1, x] - line[0, x]
+            total[tone, y, 0], total[tone, y, width + 1] = total[tone, y, 1], total[tone, y, width]
     for row in range(sums.shape[1]):
-        for column in range(sums.shape[2]):
-            part[:] = 0
-            for y in range(row * cell, min(row * cell + cell, height)):
-                above, below = max(y - 1, 0), min(y + 1, height - 1)
-                for x in range(column * cell, min(column * cell + cell, width)):
-                    if mask[y, x] <= 0:
-                        continue
-                    left, right = max(x - 1, 0), min(x + 1, width - 1)
-                    gx = half * (rest[y, right] - rest[y, left] + now[y, right] - now[y, left])
-                    gy = half * (rest[below, x] - rest[above, x] + now[below, x] - now[above, x])
-                    r = now[y, x] - rest[y, x]
-                    part[0] += np.float32(1)
-                    part[1] += gx
-                    part[2] += gy
-                    part[3] += r
-                    part[4] += gx * gx
-                    part[5] += gx * gy
-                    part[6] += gy * gy
-                    part[7] += gx * r
-                    part[8] += gy * r
-                    part[9] += r * r
-            sums[:, row, column] = part
+        lines[:] = 0
+        for y in range(row * CELL, row * CELL + CELL):
+            at = min(y, height - 1)
+            above, below = max(at - 1, 0), min(at + 1, height - 1)
+            for tone in range(2 if y < height else 0):
+                for x in range(width):
+                    one[1, x] = _QUARTER * (total[tone, at, x + 2] - total[tone, at, x])
+                    one[2, x] = _QUARTER * (total[tone, below, x + 1] - total[tone, above, x + 1])
+                    one[3, x] = left[tone, at, x]
+                k = 10 * tone
+                for i in range(4):
+                    for x in range(width):
+                        weighed[x] = mask[at, x] * one[i, x]
+                    for j in range(i, 4):
+                        for x in range(width):
+                            lines[k, x] += weighed[x] * one[j, x]
+                        k += 1
+            for k in range(2):
+                for i in range(3):
+                    for x in range(width):
+                        lines[20 + 4 * k + i, x] += mask[at, x] * colours[k, i, at, x]
+                        lines[23 + 4 * k, x] += GREY[i] * colours[k, i, at, x]
+        for k in range(28):
+            if k >= 20:
+                lines[k, width:] = lines[k, width - 1]
+            for column in range(sums.shape[2]):
+                sums[k, row, column] = lines[k, column * CELL]
+                for x in range(column * CELL + 1, column * CELL + CELL):
+                    sums[k, row, column] += lines[k, x]
 
 
 def _block(inside: int, outside: int, stride: int = 1) -> nn.Sequential:

@@ -205,24 +205,6 @@ def box_into(field: Map, across: tuple[int, ...], out: Map) -> None:
 
 
 @vectorised
-def double_into(field: Map, out: Map) -> None:
-    """See `image.doubled`: field (N, h, w) at twice its size into `out` (N, H, W), which may cut it."""
-    count, height, width = field.shape
-    near, far = np.float32(0.75), np.float32(0.25)
-    line, wide = np.empty(width + 2, np.float32), np.empty((width, 2), np.float32)
-    for n in range(count):
-        for y in range(out.shape[1]):
-            here, other = y // 2, min(max(y // 2 + 2 * (y % 2) - 1, 0), height - 1)
-            for x in range(width):
-                line[x + 1] = near * field[n, here, x] + far * field[n, other, x]
-            line[0], line[width + 1] = line[1], line[width]
-            for x in range(width):
-                wide[x, 0] = near * line[x + 1] + far * line[x]
-                wide[x, 1] = near * line[x + 1] + far * line[x + 2]
-            out[n, y] = wide.ravel()[: out.shape[2]]
-
-
-@vectorised
 def halve_into(field: Map, out: Map) -> None:
     """See `image.halved`: means of field (N, H, W) over 2 x 2 pixels, fewer at an odd border, into `out`."""
     count, height, width = field.shape
@@ -235,28 +217,6 @@ def halve_into(field: Map, out: Map) -> None:
                 out[n, y, x] = (upper + lower) * np.float32(0.25)
             if width % 2:
                 out[n, y, width // 2] = (field[n, top, width - 1] + field[n, below, width - 1]) * _HALF
-
-
-@vectorised
-def median_into(field: Map, out: Map) -> None:
-    """See `image.median3`: 3x3 median of `field` (H, W), its border repeated, into `out` (H, W)."""
-    height, width = field.shape
-    low, mid, high = np.empty((3, width + 2), np.float32)
-    for y in range(height):
-        above, below = max(y - 1, 0), min(y + 1, height - 1)
-        for x in range(width):
-            a, b, c = field[above, x], field[y, x], field[below, x]
-            least, most = min(a, b), max(a, b)
-            middle, most = min(most, c), max(most, c)
-            low[x + 1], mid[x + 1], high[x + 1] = min(least, middle), max(least, middle), most
-        for column in (low, mid, high):
-            column[0], column[width + 1] = column[1], column[width]
-        for x in range(width):
-            top = max(max(low[x], low[x + 1]), low[x + 2])
-            bottom = min(min(high[x], high[x + 1]), high[x + 2])
-            m0, m1, m2 = mid[x], mid[x + 1], mid[x + 2]
-            middle = max(min(m0, m1), min(max(m0, m1), m2))
-            out[y, x] = max(min(top, middle), min(max(top, middle), bottom))
 
 
 def noise_weight(before: Map, after: Map, mask: Map, gamma: float, noise: float) -> float:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 import torch
 import torch.nn.functional as F
@@ -76,10 +77,10 @@ def window(field: Tensor, sigma: float) -> Tensor:
 def doubled(field: Tensor, like: Tensor) -> Tensor:
     """`field` (B, C, h, w) at twice its size, cut to the height and width of `like`. Bilinear."""
     if field.device.type == "cpu":
-        planes = field.contiguous().numpy().reshape(-1, *field.shape[-2:])
-        out = np.empty((len(planes), *like.shape[-2:]), np.float32)
-        fused.double_into(planes, out)
-        return torch.from_numpy(out).view(*field.shape[:2], *out.shape[1:])
+        planes, (height, width) = field.numpy().reshape(-1, *field.shape[-2:]), like.shape[-2:]
+        size = 2 * planes.shape[2], 2 * planes.shape[1]
+        found = np.stack([cv2.resize(plane, size)[:height, :width] for plane in planes])
+        return torch.from_numpy(found).view(*field.shape[:2], height, width)
     wide = F.interpolate(field, scale_factor=2, mode="bilinear", align_corners=False)
     return wide[..., : like.shape[-2], : like.shape[-1]]
 

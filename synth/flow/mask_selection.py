@@ -54,13 +54,13 @@ class Proposal:
         """(H, W) both kinds."""
         return self.glare | self.tool
 
-    def blocks(self) -> NDArray[np.int32]:
+    def blocks(self) -> NDArray[np.int16]:
         """(2, H, W) numbers from 1 on of the squares of glare and of those of tool; 0: neither."""
         height, width = self.glare.shape
         side = max(1, max(height, width) // _CELLS)
-        rows, columns = -(-height // side), -(-width // side)
-        square = 1 + np.arange(height)[:, None] // side * columns + np.arange(width) // side
-        return np.stack([self.glare * square, self.tool * (square + rows * columns)]).astype(np.int32)
+        row, column = np.arange(height, dtype=np.int16) // side, np.arange(width, dtype=np.int16) // side
+        square = 1 + row[:, None] * (column[-1] + 1) + column
+        return np.stack([self.glare * square, self.tool * (square + square[-1, -1])])
 
 
 class SelectingTracker:
@@ -84,7 +84,9 @@ class SelectingTracker:
         self.regained = False
         """Whether the last frame can be trusted only for other masks, or for a start from nothing."""
         self._rest_picture = _normalised(rest)
-        self._verdict = np.zeros(1 + 2 * tissue.size, np.int8)  # of blocks: 1 masked, -1 not, 0 not known
+        last = Proposal(tissue, np.ones_like(tissue), tissue).blocks().max()
+        self._verdict = np.zeros(1 + last, np.int8)  # of blocks: 1 masked, -1 not, 0 not known
+        self._some = np.flatnonzero(tissue)[::7]  # pixels by which motion is judged
         self._tested_px = 0.0  # largest motion at which masks were selected
         self._frames = self._selections = 0
 
@@ -112,7 +114,7 @@ class SelectingTracker:
         first, doubted = tracker.last, not tracker.trusted
         assert first is not None
         self._frames += 1
-        due = new or doubted or _motion(flow, tracker.tissue) > self._tested_px + _GROWN_PX
+        due = new or doubted or self._motion(flow) > self._tested_px + _GROWN_PX
         proposed = (found.either | self.rest_found.either).any()
         if due and proposed and self._selections < _FIRST + self._frames / _EVERY:
             self._selections += 1
@@ -129,14 +131,19 @@ class SelectingTracker:
         """The answer; its masks are remembered if it is one."""
         tracker, at_rest = self.tracker, self.rest_found
         initial = first.flow if tracker.trusted and self._tested_px > 0 else None
+        solved = [(self.rest_blocked, self.blocked, first)]
 
         def solve(rest: Flags, now: Flags) -> Solution:
+            for *masks, answer in solved:
+                if np.array_equal([rest, now], masks):
+                    return answer
             tracker.usable = tracker.tissue & ~rest
-            return tracker.solve(frame, now, initial)
+            solved.append((rest, now, tracker.solve(frame, now, initial)))
+            return solved[-1][2]
 
         rest, now = at_rest.known, found.known
         bare, full = solve(rest, now), solve(rest | at_rest.either, now | found.either)
-        motion = _motion(bare.flow, tracker.tissue)
+        motion = self._motion(bare.flow)
         blocks, (selected, masked) = found.blocks(), self._judge(frame, found, bare.flow, full.flow)
         tried = rest | selected[at_rest.blocks()].any(0)
         if tracker.trusted and motion < self._tested_px:
@@ -155,6 +162,10 @@ class SelectingTracker:
         tracker.usable = tracker.tissue & ~self.rest_blocked
         return chosen
 
+    def _motion(self, flow: Flow) -> float:
+        """What a tenth of the tissue exceeds [px]."""
+        return float(np.quantile(np.hypot(*flow.reshape(-1, 2)[self._some].T), 0.9))
+
     def _judge(self, frame: Rgb, found: Proposal, bare: Flow, full: Flow) -> tuple[Flags, Flags]:
         """Whether each block has to be masked at rest and in the frame, (number of blocks + 1,) each.
 
@@ -169,11 +180,11 @@ class SelectingTracker:
         usual = float(residual[common].mean() if common.any() else np.median(residual))
         count = self._verdict.size
 
-        def mean(field: Map, number: NDArray[np.int32], where: Flags) -> tuple[NDArray[np.float64], Flags]:
+        def mean(field: Map, number: NDArray[np.int16], where: Flags) -> tuple[NDArray[np.float64], Flags]:
             many = np.bincount(number[where], minlength=count)
             return np.bincount(number[where], field[where], count) / np.maximum(many, 1), many >= _SMALLEST_PX
 
-        def selected(layers: NDArray[np.int32], local: bool) -> Flags:
+        def selected(layers: NDArray[np.int16], local: bool) -> Flags:
             chosen = np.zeros(count, bool)
             for layer in layers:
                 near = _widened(np.maximum(layer, 0))
@@ -196,29 +207,24 @@ def _residual(rest: torch.Tensor, now: torch.Tensor, flow: Flow) -> Map:
     return np.asarray((warped - rest).abs().clamp(max=_CAPPED)[0, 0].numpy(), np.float32)
 
 
-def _at_rest(blocks: NDArray[np.int32], flow: Flow) -> NDArray[np.int32]:
+def _at_rest(blocks: NDArray[np.int16], flow: Flow) -> NDArray[np.int16]:
     """The now frame's numbers (2, H, W) on the rest frame's pixels; -1 for what left the picture."""
     height, width = flow.shape[:2]
     x = np.arange(width, dtype=np.float32) + flow[..., 0]
     y = np.arange(height, dtype=np.float32)[:, None] + flow[..., 1]
     moved = [cv2.remap(one.astype(np.float32), x, y, cv2.INTER_NEAREST, borderValue=-1) for one in blocks]
-    return np.stack(moved).astype(np.int32)
+    return np.stack(moved).astype(np.int16)
 
 
-def _widened(number: NDArray[np.int32]) -> NDArray[np.int32]:
+def _widened(number: NDArray[np.int16]) -> NDArray[np.int16]:
     """(H, W) numbers with `_RING_PX` around each, the larger number first."""
     wide = 2 * _RING_PX + 1
-    return np.asarray(cv2.dilate(number.astype(np.float32), np.ones((wide, wide), np.uint8)), np.int32)
+    return np.asarray(cv2.dilate(number, np.ones((wide, wide), np.uint8)), np.int16)
 
 
 def _grown(piece: Flags) -> Flags:
     """(H, W) with `_RING_PX` around it."""
-    return _widened(piece.astype(np.int32)) > 0
-
-
-def _motion(flow: Flow, tissue: Flags) -> float:
-    """What a tenth of the tissue exceeds [px]."""
-    return float(np.quantile(np.hypot(flow[..., 0], flow[..., 1])[tissue][::7], 0.9))
+    return _widened(piece.astype(np.int16)) > 0
 
 
 def _normalised(picture: Rgb) -> torch.Tensor:

@@ -21,6 +21,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 import torch
 import torch.nn.functional as F
@@ -125,7 +126,7 @@ class Tvl1:
                 # Planes, not interleaved: sums over neighbours took five times as long on the latter.
                 planes = np.ascontiguousarray(np.moveaxis(initial, -1, 0))
                 start = torch.from_numpy(planes)[None].to(self.device)
-            found, agreed, finest = self.tensors(
+            found, agreed, aligned = self.tensors(
                 image.tensor(rest, self.device),
                 image.tensor(now, self.device),
                 image.flags(rest_usable, self.device),
@@ -135,9 +136,9 @@ class Tvl1:
             flow, sure = found[0].movedim(0, -1).cpu().numpy(), agreed[0, 0].cpu().numpy()
             if self.correction is None:
                 return flow, sure
-            greys = finest.rest[0, 0].cpu().numpy(), finest.now[0, 0].cpu().numpy()
-            seen = correction.describe(rest, now, rest_usable, now_usable, greys, flow, sure)
-            flow, deviation = correction.correct(self.correction, seen, flow)
+            *greys, seen = (plane[0, 0].cpu().numpy() for plane in aligned)
+            described = correction.describe(rest, now, rest_usable, (greys[0], greys[1]), seen, flow, sure)
+            flow, deviation = correction.correct(self.correction, described, flow)
             # Where pictures hardly agree, as under a tool that no mask knows, the network has learnt nothing.
             return flow, np.minimum(sure / _AGREED, 1) ** 2 * confidence.of_deviation(deviation)
 
@@ -148,10 +149,10 @@ class Tvl1:
         rest_usable: Tensor,
         now_usable: Tensor,
         initial: Tensor | None = None,
-    ) -> tuple[Tensor, Tensor, Level]:
+    ) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor, Tensor]]:
         """As `flow`, uncorrected, on the device: greys, masks, agreement (1, 1, H, W), flow (1, 2, H, W).
 
-        The level is the finest, of both pictures contrast-normalised.
+        The last are the rest frame, the one warped back, both contrast-normalised, and what is seen of it.
         """
         s = self.settings
         last = self._rest
@@ -163,7 +164,8 @@ class Tvl1:
         if initial is None and len(levels) > 1:
             initial, fine = finer(guess(levels[1:], s), levels[0]), levels[: s.fine_levels]
         found = steadied(solve(fine, initial, s), s.steady_px)
-        return found, confidence.agreement(levels[0], found), levels[0]
+        warped, seen = image.warp(levels[0].now, levels[0].now_usable, found)
+        return found, confidence.agreement(levels[0], warped, seen), (levels[0].rest, warped, seen)
 
 
 @contextmanager
@@ -195,7 +197,8 @@ def guess(levels: list[Level], s: TVL1Settings) -> Tensor:
     Little smoothness follows far pulls but loses islands between the tines, much smoothness the reverse.
     """
     small, large = solve(levels, None, s.small_motion()), solve(levels, None, s.large_motion())
-    trust = [confidence.agreement(levels[0], flow).mean((1, 2, 3), keepdim=True) for flow in (small, large)]
+    warped = [image.warp(levels[0].now, levels[0].now_usable, flow) for flow in (small, large)]
+    trust = [confidence.agreement(levels[0], *one).mean((1, 2, 3), keepdim=True) for one in warped]
     return torch.where(trust[1] > _BETTER * trust[0], large, small)
 
 
@@ -262,9 +265,7 @@ def _solve_level(level: Level, flow: Tensor, weight: Tensor, s: TVL1Settings) ->
         fused.linearise(before, after, mask, here, found, numbers, state)
         fused.primal_dual(found, state, np.float32(s.tau), s.steps)
         if s.median:
-            for plane in found:
-                fused.median_into(plane, spare)
-                plane[:] = spare
+            found = np.stack([cv2.medianBlur(plane, 3) for plane in found])
     return torch.from_numpy(found)[None]
 
 

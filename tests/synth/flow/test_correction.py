@@ -22,7 +22,7 @@ def _described(mirrored: bool) -> np.ndarray:
     rest, now = (np.ascontiguousarray(one) for one in pictures)
     greys = rest[..., 1] / np.float32(12), now[..., 1] / np.float32(12)
     every, flow = np.ones((104, 88), bool), np.zeros((104, 88, 2), np.float32)
-    return correction.describe(rest, now, every, every, greys, flow, np.ones((104, 88), np.float32))
+    return correction.describe(rest, now, every, greys, np.float32(every), flow, np.float32(every))
 
 
 def test_what_is_left_to_go_is_seen_in_grey_and_in_colour() -> None:
