@@ -7,7 +7,7 @@ from pathlib import Path
 
 from bench.methods.protocol import Field, ForceEstimate, MethodContext
 from learn import Predictor, load_model
-from learn.inference.force_reader import ForceReader, describe_intervals
+from learn.inference.force_reader import ForceReader
 from learn.inference.shipped import find_name
 from learn.uncertainty.intervals import LEVEL
 from synth.flow.stereo.track import Moved
@@ -51,7 +51,7 @@ class Model:
     @property
     def notes(self) -> list[str]:
         """What is to be known of how the last recording was read, once it is."""
-        return [] if self._reader is None else self._reader[1].notes + describe_intervals(self.predictor.card)
+        return [] if self._reader is None else self._reader[1].notes + self._reader[1].interval_notes
 
     def __call__(self, flow: Field, confidence: Field, scene: MethodContext, picture: bool) -> ForceEstimate:
         """See `Method`."""
@@ -70,9 +70,7 @@ class Model:
             reader = ForceReader(self.predictor, scene.tissue, scene.scale_mm_per_px, scene.young_kpa)
             self._reader = scene, reader
         found = self._reader[1].read(FrameMotion(flow, confidence, motion=moved))
-        answer = ForceEstimate(
-            found.force_mn, found.map.to_image() if picture else None, distance=found.distance
-        )
+        answer = ForceEstimate(found.force_mn, found.map.to_image() if picture else None)
         if not found.bands:
             return answer
         band = found.bands[LEVEL]

@@ -42,8 +42,6 @@ class ForceEstimate:
     """Lower end of the 90% interval of the force's size; NaN of a method that knows none."""
     high_mn: float = math.nan
     """Upper end."""
-    distance: float = math.nan
-    """Of the frame from what the method was fitted on, as of `FrameForce.distance`; NaN as that."""
 
     @property
     def size_mn(self) -> float:

@@ -25,7 +25,6 @@ from bench.scoring.result import Curve, Gain, Result, Scored
 from bench.sensor.alignment import AlignedSensor, align_sensor, describe_span
 from bench.tracking.tracking import Progress, TrackedRecording, track_recording
 from learn.uncertainty.intervals import LEVEL
-from learn.uncertainty.out_of_distribution import describe_unseen
 from synth.recording_flow.finding import worth_saying
 from synth.recording_flow.local_flow import LocalFlow
 from synth.recording_flow.video_flow import RecordingFlowSettings
@@ -89,7 +88,7 @@ def evaluate_recording(
             gain = _fit_gain(_magnitude(force), main, first, against)
             force *= gain.mn_per_mm
         one = replace(_score(force, first, against), gain=gain)
-        scored[name] = _with_interval(one, name, tracked.bounds[name], lost, against, notes)
+        scored[name] = _with_interval(one, tracked.bounds[name], lost, against)
     return Result(
         recording=recording.name,
         main=main,
@@ -196,18 +195,15 @@ def _score(force: Curve, first: Scored | None, against: _Reference) -> Scored:
 
 def _with_interval(
     scored: Scored,
-    name: str,
-    bounds: Sequence[tuple[float, float, float]],
+    bounds: Sequence[tuple[float, float]],
     lost: Flags,
     against: _Reference,
-    notes: list[str],
 ) -> Scored:
     """The same with the intervals that the method gave of its force, and what of the sensor they hold."""
-    low, high, distance = np.where(lost, np.nan, np.array(bounds, np.float64).T)
+    low, high = np.where(lost, np.nan, np.array(bounds, np.float64).T)
     known = np.isfinite(low)
     if not known.any():
         return scored
-    notes += [f"{name}: {note}" for note in describe_unseen(distance[np.isfinite(distance)])]
     known &= against.scored
     interval = {"level": LEVEL, "width_mn": _mean((high - low)[known])}
     sensor = against.sensor.size_mn

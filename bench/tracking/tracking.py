@@ -54,8 +54,8 @@ class TrackedRecording:
     time_s: list[float] = field(default_factory=list)
     force_mn: dict[str, list[NDArray[np.float64]]] = field(default_factory=dict)
     """By method: (3,) each."""
-    bounds: dict[str, list[tuple[float, float, float]]] = field(default_factory=dict)
-    """By method: `low_mn`, `high_mn` and `distance` of each `ForceEstimate`."""
+    bounds: dict[str, list[tuple[float, float]]] = field(default_factory=dict)
+    """By method: `low_mn` and `high_mn` of each `ForceEstimate`."""
     speed: list[float] = field(default_factory=list)
     """Mean speed of the tissue since the frame before [mm/s]; what is lined up with the sensor."""
     confidence: list[float] = field(default_factory=list)
@@ -211,7 +211,7 @@ class _Forces:
                 else:
                     answer = method(frame.flow, frame.confidence, scene, shown)
             out.force_mn[name].append(answer.force_mn)
-            out.bounds[name].append((answer.low_mn, answer.high_mn, answer.distance))
+            out.bounds[name].append((answer.low_mn, answer.high_mn))
             if name == self.pictured:
                 density = answer.density
         speed = 0.0

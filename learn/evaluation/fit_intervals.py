@@ -135,6 +135,8 @@ def _fit(
     world = fit_distribution(motion, [one.motion for one in first])
     if world is None:
         raise UserError("nothing moves in the sequences that the intervals are to be fitted on")
+    # No error says how far a recording is: all that were not fitted count.
+    world = world.calibrated([one.motion for one in examples])
     return fit(first, second, world, motion_names(card.settings.arch.depth), unit, source)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from learn.data.grid import GridView
-from learn.inference.force_reader import ForceReader, FrameForce, describe_intervals
+from learn.inference.force_reader import ForceReader, FrameForce
 from learn.inference.motion import Motion
 from learn.inference.predict import Predictor, force_size, net_force
 from learn.uncertainty.conformal import LEVELS
@@ -64,9 +64,7 @@ def apply(predictor: Predictor, motion: Motion, young_kpa: float | None = None) 
         out["force_mn"] = force
     notes = [one.said for one in findings if one.state == "odd"] + motion.notes() + reader.notes
     if motion.scale_known:
-        # A frame that could not be followed shows nothing of the tissue.
-        distances = [one.distance for one, sure in zip(found, followed, strict=True) if sure]
-        notes += describe_intervals(predictor.card, distances)
+        notes += reader.interval_notes
         out |= _ends(found, trusted)
     if fault:
         notes.insert(0, f"nothing can be measured: {fault}")

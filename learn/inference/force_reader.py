@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from itertools import repeat
 
 import numpy as np
 from numpy.typing import NDArray
 
-from learn.checkpoint import ModelCard
 from learn.data.clips import UNKNOWN_YOUNG_KPA
 from learn.inference.placing import Placing, Point, share_at_border
 from learn.inference.predict import ForceMap, Predictor, force_size, net_force
 from learn.uncertainty.conformal import LEVELS
-from learn.uncertainty.features import is_moving
 from learn.uncertainty.intervals import Band, Prediction
 from learn.uncertainty.out_of_distribution import describe_unseen
+from synth.flow.confidence import DOUBTFUL
 from synth.flow.stereo.track import Moved
 from synth.recording_flow.frame_motion import FrameMotion
 
@@ -64,9 +63,6 @@ class FrameForce:
     """As the network predicts it, nothing taken off."""
     bands: dict[float, Band]
     """By level, the intervals of the force, T = 1 [mN]; empty of a model without intervals."""
-    distance: float
-    """Of the frame from what was fitted, over what 99% of held-out frames stay under; NaN where nothing
-    moved, and of a model without intervals."""
 
 
 class ForceReader:
@@ -91,6 +87,7 @@ class ForceReader:
         self.placing = Placing(tissue, scale_mm_per_px, predictor.grid)
         """Where the network's grid lies."""
         self._at_border = self._in_all = 0.0
+        self._seen: list[NDArray[np.float64]] = []  # (F,) `motion_features` of each frame that was followed
 
     def read(self, frame: FrameMotion) -> FrameForce:
         """The force of a frame; errors as `Predictor`."""
@@ -100,13 +97,16 @@ class ForceReader:
             motion = frame.motion and Moved(0 * frame.motion.motion, 0 * frame.motion.deviation)
             still = FrameMotion(np.zeros_like(frame.flow), self._tissue.astype(np.float32), motion=motion)
             self._at_rest[place] = self._predict(still, place)
+        # Of a frame that is lost nothing has the confidence of what is found again.
+        if found.motion is not None and frame.confidence.max() >= DOUBTFUL:
+            self._seen.append(found.motion)
         density, at_rest = found.density[None], self._at_rest[place].density[None]
         force = net_force(density, at_rest, found.kind, found.grid)[0]
         share = share_at_border(found.magnitude, found.view.mask)
         if not self.placing.fits and math.isfinite(share):
             size = float(force_size(force))
             self._at_border, self._in_all = self._at_border + share * size, self._in_all + size
-        return FrameForce(force, found, *self._bound(force, found))
+        return FrameForce(force, found, self._bound(force, found))
 
     @property
     def notes(self) -> list[str]:
@@ -121,6 +121,18 @@ class ForceReader:
             note += f"; {100 * share:.0f}% of the force lies at the border of that, what is beyond is lost"
         return [note]
 
+    @property
+    def interval_notes(self) -> list[str]:
+        """What the user of the model's intervals should know, once the frames are read."""
+        found = self._predictor.card.intervals
+        if found is None:
+            return []
+        ideal = ["intervals are of true motion: of recovered motion they are too narrow"]
+        notes = ideal if found.source in ("ideal", "motion-ideal") else []
+        return notes + (
+            describe_unseen(found.world, found.features, np.stack(self._seen)) if self._seen else []
+        )
+
     def _predict(self, frame: FrameMotion, place: Point) -> ForceMap:
         young = self._young_kpa
         found = self._predictor(
@@ -131,23 +143,12 @@ class ForceReader:
         part = np.float32(UNKNOWN_YOUNG_KPA / found.young_kpa)
         return replace(found, density=part * found.density, young_kpa=UNKNOWN_YOUNG_KPA)
 
-    def _bound(self, force: NDArray[np.float64], found: ForceMap) -> tuple[dict[float, Band], float]:
-        """Intervals of a frame's force by level, and its distance, as of `FrameForce`."""
+    def _bound(self, force: NDArray[np.float64], found: ForceMap) -> dict[float, Band]:
+        """Intervals of a frame's force by level, as of `FrameForce`."""
         if found.motion is None:
-            return {}, math.nan
+            return {}
         intervals, young, motion = self._predictor.card.intervals, found.young_kpa, found.motion[None]
         assert intervals is not None, "a map has its motion from a model with intervals only"
         magnitude = found.magnitude[None] / np.float32(young)
         predicted = Prediction(motion, force[None] / young, magnitude, found.grid.pitch_mm)
-        distance = float(intervals.world.relative_distance(motion)[0]) if is_moving(motion)[0] else math.nan
-        return {level: intervals.bound(predicted, level).times(young) for level in LEVELS}, distance
-
-
-def describe_intervals(card: ModelCard, distance: Sequence[float] = ()) -> list[str]:
-    """What the user of a model's intervals should know; `distance`: of frames, as of `FrameForce`."""
-    found = card.intervals
-    if found is None:
-        return []
-    ideal = ["intervals are of true motion: of recovered motion they are too narrow"]
-    notes = ideal if found.source in ("ideal", "motion-ideal") else []
-    return notes + describe_unseen(np.array([one for one in distance if math.isfinite(one)]))
+        return {level: intervals.bound(predicted, level).times(young) for level in LEVELS}

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import FiniteFloat
 
-from learn.uncertainty.conformal import share_quantile
+from learn.uncertainty.conformal import quantile, share_quantile
 from learn.uncertainty.features import is_moving
 from synth.job.types import Positive
 
@@ -17,7 +17,7 @@ Floats = NDArray[np.float64]
 
 USUAL = 0.99
 """Share of held-out frames that are no further than `OutOfDistribution.usual`."""
-_MANY_UNSEEN = 0.05  # share of the moving frames; of held-out ones it is a hundredth
+_MOST, _FRAMES = 0.95, 0.9  # share of recordings that are no unseen world, and of the frames that say how far
 _LEAST_SPREAD = 0.05  # of a feature: logarithms and shares tell no worlds apart by less
 
 
@@ -30,6 +30,8 @@ class OutOfDistribution:
     """(F, F), inverse covariance."""
     usual: Positive
     """Distance that 99% of held-out frames stay within, every sequence weighing alike."""
+    limit: Positive = 1.0
+    """`recording_distance` that 95% of held-out recordings stay within."""
 
     def distance(self, motion: Floats) -> Floats:
         """(T,) Mahalanobis distance of frames (T, F) of `motion_features`; 0 of those that hardly moved."""
@@ -40,6 +42,20 @@ class OutOfDistribution:
     def relative_distance(self, motion: Floats) -> Floats:
         """(T,) `distance` over what 99% of held-out frames stay within."""
         return self.distance(motion) / self.usual
+
+    def recording_distance(self, motion: Floats) -> float:
+        """`relative_distance` that a tenth of a recording's frames (T, F) exceed; 0 if nothing moved."""
+        moved = self.relative_distance(motion)[is_moving(motion)]
+        return float(np.quantile(moved, _FRAMES)) if len(moved) else 0.0
+
+    def calibrated(self, recordings: Sequence[Floats]) -> OutOfDistribution:
+        """The same with its `limit`, from `motion_features` (T, F) of recordings that were not fitted.
+
+        Of fewer than 19 that moved no bound is known: it is the furthest of them.
+        """
+        far = [np.array([self.recording_distance(one)]) for one in recordings if is_moving(one).any()]
+        limit = quantile(far, _MOST)
+        return replace(self, limit=max(limit if np.isfinite(limit) else np.max(far), 1e-6))
 
     def widening(self, motion: Floats) -> Floats:
         """(T,) what intervals are multiplied by: how many times further than usual a frame is, 1 at least."""
@@ -87,16 +103,24 @@ def shrunk_covariance(samples: Floats) -> Floats:
     return np.asarray((1 - share) * plain + share * mean * np.eye(parts))
 
 
-def describe_unseen(distance: NDArray[np.float64]) -> list[str]:
-    """A line for a person if too many frames are further from what was fitted than they should be.
+def describe_unseen(world: OutOfDistribution, names: Sequence[str], motion: Floats) -> list[str]:
+    """A line for a person if a recording is further from what was fitted than 95% of held-out ones.
 
-    `distance`: (n,) of the frames that moved, as of `FrameForce.distance`.
+    Args:
+        names: of the features.
+        motion: (T, F) `motion_features` of the frames that could be followed.
     """
-    far = distance[distance > 1]
-    if len(far) <= _MANY_UNSEEN * len(distance):
+    far = world.recording_distance(motion)
+    if not far > world.limit:
         return []
+    off = motion[world.relative_distance(motion) >= far] - np.array(world.middle)
+    parts = (off * (off @ np.array(world.precision))).mean(0)
+    # Those that make up half of it; a square form has no better way to be shared out.
+    order = np.argsort(-parts)
+    most = order[: 1 + int(np.argmax(np.cumsum(parts[order]) >= parts.sum() / 2))]
+    named = " and ".join(f"{names[k]} ({'high' if off[:, k].mean() > 0 else 'low'})" for k in most)
     return [
-        f"unseen world: {100 * len(far) / len(distance):.0f}% of the frames that moved do so unlike anything "
-        f"that it was trained on (distance {np.median(far):.2g} times what 99% of held-out frames stay in); "
-        "intervals are widened by as much, and may still be too narrow"
+        f"unseen world: it moves unlike anything that the network was trained on, most of all in {named}: "
+        f"{far / world.limit:.2g} times as far away as 95% of recordings are at most; intervals are widened, "
+        "and may still be too narrow"
     ]

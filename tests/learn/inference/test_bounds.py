@@ -12,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 from learn.checkpoint import read_card
-from learn.inference.force_reader import ForceReader, FrameForce, describe_intervals
+from learn.inference.force_reader import ForceReader, FrameForce
 from learn.inference.predict import load_model, net_force
 from learn.uncertainty.intervals import LEVEL
 from synth.errors import UserError
@@ -28,9 +28,14 @@ def flow(size_mm: float) -> NDArray[np.float32]:
     return out
 
 
-def read(folder: Path, size_mm: float = 0.4, young_kpa: float | None = 2.0) -> FrameForce:
+def read(
+    folder: Path, size_mm: float = 0.4, young_kpa: float | None = 2.0, notes: list[str] | None = None
+) -> FrameForce:
     reader = ForceReader(load_model(folder), np.ones(SHAPE, bool), SCALE, young_kpa)
-    return reader.read(FrameMotion(flow(size_mm), np.ones(SHAPE, np.float32)))
+    found = reader.read(FrameMotion(flow(size_mm), np.ones(SHAPE, np.float32)))
+    if notes is not None:
+        notes += reader.interval_notes
+    return found
 
 
 @pytest.fixture
@@ -45,7 +50,8 @@ def sizes(tmp_path: Path) -> Path:
 
 @pytest.mark.parametrize("young_kpa", [2.0, None])
 def test_bounds_are_those_of_the_card_in_newtons(vector: Path, young_kpa: float | None) -> None:
-    found = read(fake_intervals.give(vector, fake_intervals.make()), young_kpa=young_kpa)
+    notes: list[str] = []
+    found = read(fake_intervals.give(vector, fake_intervals.make()), young_kpa=young_kpa, notes=notes)
     force, young = found.force_mn, young_kpa or 1.0
     size = np.linalg.norm(force)
     for level, factor in fake_intervals.FACTORS.items():
@@ -54,7 +60,7 @@ def test_bounds_are_those_of_the_card_in_newtons(vector: Path, young_kpa: float 
         assert band.low[0] == pytest.approx(max(size - 5 * young * factor, 0))
         assert band.axes_high[0] - force == pytest.approx(factor * young * np.array([3, 4, 50]))
         assert force - band.axes_low[0] == pytest.approx(factor * young * np.array([3, 4, 50]))
-    assert describe_intervals(read_card(vector), [found.distance]) == []
+    assert notes == []
 
 
 def test_of_a_network_of_sizes_components_are_around_zero(sizes: Path) -> None:
@@ -65,18 +71,20 @@ def test_of_a_network_of_sizes_components_are_around_zero(sizes: Path) -> None:
 
 def test_an_unseen_world_is_said_with_its_distance_and_widens(vector: Path) -> None:
     usual = 0.1
-    found = read(fake_intervals.give(vector, fake_intervals.make(usual=usual)))
+    notes: list[str] = []
+    found = read(fake_intervals.give(vector, fake_intervals.make(usual=usual)), notes=notes)
     assert found.map.motion is not None
     distance = abs(found.map.motion[0])
     # From 1 mm; half of the tissue moved.
     assert distance == pytest.approx(abs(np.log(0.4 * np.sqrt(0.5) + 0.005)), rel=0.03)
-    assert found.distance == pytest.approx(distance / usual)
-    assert found.bands[0.68].high[0] - np.linalg.norm(found.force_mn) == pytest.approx(10 * found.distance)
-    assert "unseen world" in describe_intervals(read_card(vector), [found.distance])[0]
+    wider = found.bands[0.68].high[0] - np.linalg.norm(found.force_mn)
+    assert wider == pytest.approx(10 * distance / usual)
+    assert len(notes) == 1
+    assert "log motion (low)" in notes[0]
     # Stillness is no world.
-    at_rest = read(vector, 0.0)
-    assert at_rest.bands
-    assert describe_intervals(read_card(vector), [at_rest.distance]) == []
+    at_rest: list[str] = []
+    assert read(vector, 0.0, notes=at_rest).bands
+    assert at_rest == []
 
 
 @pytest.mark.parametrize("kind", ["vector", "sizes"])

@@ -12,7 +12,7 @@ from learn.uncertainty.features import (
     MOTION,
     motion_features,
 )
-from learn.uncertainty.out_of_distribution import fit_distribution
+from learn.uncertainty.out_of_distribution import describe_unseen, fit_distribution
 
 Floats = NDArray[np.float64]
 
@@ -73,6 +73,20 @@ def test_distance_is_mahalanobis_and_its_99th_that_of_chi_squared() -> None:
     assert world.distance(far)[0] == pytest.approx(9.0, rel=0.03)
     assert world.widening(far)[0] == pytest.approx(9.0 / world.usual, rel=0.03)
     assert world.widening(np.array([[3.0, 1.0, -2.0]]))[0] == 1
+
+
+def test_of_recordings_like_those_it_was_calibrated_on_one_in_twenty_is_an_unseen_world() -> None:
+    rng = np.random.default_rng(1)
+    world = fit_distribution(cloud(rng, 300), cloud(rng, 300))
+    assert world is not None
+    world = world.calibrated(cloud(rng, 400, frames=6))
+    said = [bool(describe_unseen(world, "abc", one)) for one in cloud(rng, 2000, frames=6)]
+    assert np.mean(said) == pytest.approx(0.05, abs=0.025)
+    # The feature that is far is named, though all three go together.
+    off = cloud(rng, 1)[0] + np.array([0.0, 0.0, -9.0])
+    (line,) = describe_unseen(world, ("one", "two", "three"), off)
+    assert "three (low)" in line
+    assert "one (" not in line
 
 
 def test_a_resting_frame_is_of_no_world() -> None:
