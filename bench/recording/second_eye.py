@@ -11,10 +11,11 @@ import numpy as np
 
 from bench.recording.folder import Recording
 from synth.errors import UserError
-from synth.flow import mask_detection
+from synth.flow import image, mask_detection
 from synth.flow.estimator import Flags, Map, Rgb
 from synth.flow.stereo import calibration
 from synth.flow.stereo.depth_camera import DepthTracker
+from synth.flow.stereo.rest import match
 from synth.flow.stereo.rig import Eye, Floats, StereoRig
 from synth.flow.stereo.track import Moved, StereoTracker
 from synth.recording_flow.frame_motion import FrameMotion
@@ -67,6 +68,8 @@ class SecondEye:
         self._shrink = 1
         self._noise: list[float] = []
         self._lags: list[float] = []
+        self._pair: tuple[Rgb, Rgb] | None = None  # of the frame last followed, or
+        self._seen: Map | None = None  # its depth
 
     @property
     def quality(self) -> StereoQuality | None:
@@ -95,6 +98,7 @@ class SecondEye:
         if self._recording.right:
             if (right := self._right(frame, video)) is None:
                 return None
+            self._pair = frame.rgb, right
             hidden = _mask_right(right, video.settings.masks, masked)
             if self._stereo is None:
                 rig = self._rig(video)
@@ -106,12 +110,25 @@ class SecondEye:
         else:
             if (depth := self._depths(frame, video)) is None:
                 return None
+            self._seen = np.where(depth > 0, depth, np.nan).astype(np.float32)
             if self._depth is None:
                 self._depth = DepthTracker(self._K(video), depth, masked, tissue)
                 return Moved.nothing(tissue.shape)
             moved = self._depth.step(depth, masked, frame.flow, frame.confidence)
         self._noise.append(float(np.median(moved.deviation[..., 2][tissue])))
         return moved
+
+    def depth_mm(self) -> Map | None:
+        """See `SecondView`: of two eyes by matching the frame's own pictures."""
+        if self._stereo is None or self._pair is None:
+            return self._seen
+        r, anywhere = self._stereo.rectified, np.ones(self._pair[0].shape[:2], bool)
+        left, right = (r.picture(rgb @ image.GREY, eye) for eye, rgb in enumerate(self._pair))
+        try:
+            found = match(left, right, anywhere, anywhere, refine=False)
+        except UserError:
+            return None
+        return r.back(np.where(found.found, r.depth(found.disparity), np.nan).astype(np.float32))
 
     def _rig(self, video: VideoFlow) -> StereoRig:
         """The pair, with pictures as small as the film's, cut as `shrink_picture` cuts them."""

@@ -19,10 +19,11 @@ from numpy.typing import NDArray
 
 from synth.errors import UserError
 from synth.flow import mask_detection
-from synth.flow.estimator import Flags, Rgb
+from synth.flow.estimator import Flags, Map, Rgb
 from synth.flow.mask_selection import Proposal
 from synth.flow.stereo.track import Moved
 from synth.recording_flow.finding import Finding, first_fault
+from synth.recording_flow.foreground import ForegroundSearch
 from synth.recording_flow.frame_faults import find_fault
 from synth.recording_flow.frame_motion import FrameMotion, TrackingSummary
 from synth.recording_flow.harmonic_fit import Span
@@ -36,6 +37,7 @@ A = TypeVar("A", bound=np.generic)
 Size = tuple[int, int]
 """Height, width [px]."""
 
+_SEARCHED = 12  # frames, and one in so many, that are searched for what is no tissue
 LEAST_COLUMNS = 320
 """That `shrink` 0 leaves a picture: the networks' grids are no finer."""
 
@@ -93,6 +95,10 @@ class SecondView(Protocol):
 
     def follow(self, frame: FrameMotion, video: VideoFlow) -> Moved | None:
         """Motion in space of a frame that could be followed, None if it lacks it; first of the rest frame."""
+        ...
+
+    def depth_mm(self) -> Map | None:
+        """(h, w) along the view in the frame last followed, NaN where it is not known; None: nowhere."""
         ...
 
 
@@ -155,6 +161,7 @@ class VideoFlow:
         self.found: list[Finding] = []
         """What was found wrong on the way; see `findings`."""
         self._flow, self._pace = flow or LocalFlow(), pace
+        self._foreground: ForegroundSearch | None = None  # not of a stream
         self._surface: SurfaceMotion | None = None  # only where a pulse is to be found
         self._depth_weights: list[float] = []
         self._rest_s: float | None = None
@@ -236,7 +243,8 @@ class VideoFlow:
             fault = f"the rest frame is {self._fault}"
         elif self.summary.frames and not self._changes:
             fault = "the picture never changes"
-        return ([Finding("bad", "pictures", fault)] if fault else []) + self.found
+        between = [] if self._foreground is None else self._foreground.findings
+        return ([Finding("bad", "pictures", fault)] if fault else []) + self.found + between
 
     @property
     def fault(self) -> str:
@@ -320,7 +328,9 @@ class VideoFlow:
             if self._pace is not None:
                 self._flow.submit(small.rgb, proposal).result()
             frame = replace(frame, confidence=(self.tissue & ~proposal.known).astype(np.float32))
-        return self._in_space(self._pictured(replace(frame, is_rest=True), small, masking_s))
+            if self._pace is None:
+                self._foreground = ForegroundSearch(self.tissue, self.shrink)
+        return self._looked_at(self._in_space(self._pictured(replace(frame, is_rest=True), small, masking_s)))
 
     def _is_there(self, flow: Future[FrameMotion], time_s: float | None) -> bool:
         """Whether a flow is there, or will be before a frame of that time arrives, which is waited for."""
@@ -340,7 +350,7 @@ class VideoFlow:
         self.peak_bytes = max(self.peak_bytes, frame.peak_bytes)
         frame = self._in_space(frame)
         self.summary.add(frame, self.tissue)
-        return self._without_pulse(frame)
+        return self._without_pulse(self._looked_at(frame))
 
     def _pictured(self, frame: FrameMotion, small: Picture, masking_s: float) -> FrameMotion:
         return replace(frame, index=small.index, time_s=small.time_s, rgb=small.rgb, masking_s=masking_s)
@@ -354,6 +364,15 @@ class VideoFlow:
             if moved is None:
                 return replace(frame, trusted=False, motion=Moved.nothing(self.tissue.shape))
             return replace(frame, motion=moved)
+
+    def _looked_at(self, frame: FrameMotion) -> FrameMotion:
+        """The same, which was searched for what is no tissue if it is one of the first, or each twelfth."""
+        count = self.summary.frames
+        if self._foreground is not None and (count <= _SEARCHED or count % _SEARCHED == 0):
+            with self.watch.stage("mask"):
+                depth = self.second.depth_mm() if self.second is not None and frame.trusted else None
+                self._foreground.add(frame, depth)
+        return frame
 
     def _without_pulse(self, frame: FrameMotion) -> FrameMotion:
         """The same with the pulse taken off; before it is known, the frame is one to find it in."""

@@ -1,0 +1,57 @@
+"""Things in front of tissue whose motion and depth are formulas."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from synth.recording_flow.foreground import ForegroundSearch, fit_surface, flow_jump
+from synth.recording_flow.frame_motion import FrameMotion
+
+SHAPE = (120, 160)
+Y, X = np.mgrid[: SHAPE[0], : SHAPE[1]].astype(np.float32)
+ROD = (np.abs(Y - 60) < 8) & (X < 90)
+
+
+def load(peak_px: float) -> NDArray[np.float32]:
+    """Motion of a half-space beside a load at (90, 60), which falls as 1 / r (Cerruti)."""
+    x, y = X - 90, Y - 60
+    r = np.sqrt(x**2 + y**2 + 17.0**2)
+    return peak_px * 17 * np.stack([(0.55 / r + 0.45 * x * x / r**3), 0.45 * x * y / r**3], -1)
+
+
+def found(motion: NDArray[np.float32], depth: NDArray[np.float32] | None, masked: bool = False) -> list[str]:
+    search = ForegroundSearch(np.ones(SHAPE, bool), 1)
+    for k in range(4):
+        sure = np.ones(SHAPE, np.float32)
+        mask = ROD if masked else None
+        search.add(FrameMotion(k / 3 * motion, sure, is_rest=k == 0, index=k, masked=mask), depth)
+    return [one.said for one in search.findings]
+
+
+@pytest.mark.parametrize("peak_px", [0.5, 2.0, 8.0, 30.0])
+def test_a_rod_is_found_by_its_motion_or_its_depth_and_elastic_tissue_is_not(peak_px: float) -> None:
+    tissue, flat = load(peak_px), (300 + X / 50 + Y**2 / 9000).astype(np.float32)
+    rigid = np.where(ROD[..., None], tissue[60, 90], tissue)
+    assert found(tissue, flat) == []
+    moved = found(rigid, None)
+    assert len(moved) == (peak_px > 1)
+    high = found(tissue, np.where(ROD, flat - 6, flat))
+    assert len(high) == 1
+    for said in moved + high:
+        x, y = map(int, re.findall(r"\d+", said)[:2])
+        assert ROD[max(y - 10, 0) : y + 10, x].any()
+    assert found(rigid, np.where(ROD, flat - 6, flat), masked=True) == []
+
+
+def test_the_surface_is_the_tissues_and_a_slope_no_jump() -> None:
+    flat = (300 + X / 50 + X * Y / 9000).astype(np.float32)
+    surface, deviation = fit_surface(np.where(ROD, flat - 6, flat), np.ones(SHAPE, bool))
+    assert np.abs(surface - flat).max() < 1e-3
+    assert deviation < 1e-3
+    step = np.stack([0 * X, 5.0 * (X > 80)], -1).astype(np.float32)
+    assert flow_jump(step)[20:-20, 60:100].max() == pytest.approx(5.0)
+    assert flow_jump(np.stack([X / 9, Y / 7], -1))[20:-20, 20:-20].max() < 1e-3
