@@ -18,6 +18,7 @@ from synth.flow.stereo.depth_camera import DepthTracker
 from synth.flow.stereo.rest import match
 from synth.flow.stereo.rig import Eye, Floats, StereoRig
 from synth.flow.stereo.track import Moved, StereoTracker
+from synth.recording_flow.camera_motion import CameraTracker
 from synth.recording_flow.frame_motion import FrameMotion
 from synth.recording_flow.video_flow import VideoFlow, shrink_picture
 from synth.system import checked_file
@@ -63,6 +64,7 @@ class SecondEye:
         """Nothing is read yet. `scale_mm_per_px`: of the recording's own pixels."""
         self.scale_mm_per_px, self._recording = scale_mm_per_px, recording
         self._stereo: StereoTracker | None = None
+        self._camera: CameraTracker | None = None  # of the second eye
         self._depth: DepthTracker | None = None
         self._rights: Iterator[Picture] = iter(recording.right_frames()) if recording.right else iter(())
         self._shrink = 1
@@ -98,12 +100,22 @@ class SecondEye:
         if self._recording.right:
             if (right := self._right(frame, video)) is None:
                 return None
-            self._pair = frame.rgb, right
-            hidden = _mask_right(right, video.settings.masks, masked)
-            if self._stereo is None:
+            if self._stereo is None or self._camera is None:
+                self._pair = frame.rgb, right
+                hidden = _mask_right(right, video.settings.masks, masked)
                 rig = self._rig(video)
                 self._stereo = StereoTracker(rig, frame.rgb[None], right[None], masked, hidden, tissue)
+                # A breath moves all tissue to and from both eyes, across in this one: that is no camera's.
+                inside = self._stereo.right_tissue()
+                self._camera = CameraTracker(right, inside, inside | mask_detection.blocked(right))
                 return Moved.nothing(tissue.shape)
+            # Both eyes' surroundings are brought back to rest: with them the rig, as far as the tissue shows.
+            view = self._camera.find(right, frame.time_s) or frame.camera
+            right = right if view is None else view.undo(right)
+            self._pair = frame.rgb, right
+            hidden = _mask_right(right, video.settings.masks, masked)
+            if view is not None:
+                hidden |= view.outside(tissue.shape)
             moved = self._stereo.step(frame.rgb, right, masked, hidden, frame.flow, frame.confidence)
             if np.percentile(np.abs(frame.flow[tissue]), 98) > _MOVED_PX:
                 self._lags.append(abs(self._stereo.lag))

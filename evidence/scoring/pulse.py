@@ -125,15 +125,16 @@ def record(
     rest = texture(size, size, rng)
     y, x = np.mgrid[:size, :size].astype(np.float32)
     times, force = contact["time_s"], contact["force_mn"]
+    inside = np.hypot(x - (size - 1) / 2, y - (size - 1) / 2) < 0.46 * size
     for k, time in enumerate(times):
         moved = float(np.linalg.norm(force[k])) * contact["field"]
         own = beat(time, contact["phase"], size) - beat(float(times[0]), contact["phase"], size)
         moved = moved + beats * own / contact["mm_per_px"]
         source = inverse(moved.astype(np.float32))
         rgb = cv2.remap(rest, source[..., 0], source[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
+        rgb[~inside] = 90  # surroundings that beat along would show a camera that moves
         noisy = np.clip(rgb + rng.normal(0, 1.5, rgb.shape), 0, 255).astype(np.uint8)
         cv2.imwrite(str(folder / "frames" / f"{k:04d}.png"), noisy[..., ::-1])
-    inside = np.hypot(x - (size - 1) / 2, y - (size - 1) / 2) < 0.46 * size
     cv2.imwrite(str(folder / "tissue.png"), inside.astype(np.uint8) * 255)
     (folder / "masks").mkdir()  # no instrument is seen
     cv2.imwrite(str(folder / "masks" / "000000.png"), np.zeros((size, size), np.uint8))

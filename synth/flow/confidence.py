@@ -31,6 +31,11 @@ def deviation(confidence: Map) -> Map:
     return np.asarray(_HALF_PX * np.sqrt(1 / sure - 1), np.float32)
 
 
+def doubted(confidence: Map, deviation_px: float) -> Map:
+    """(H, W) the confidence of what has a further, independent error of this standard deviation."""
+    return np.asarray(confidence / (1 + confidence * np.float32(deviation_px / _HALF_PX) ** 2), np.float32)
+
+
 def agreement(pictures: image.Level, warped: Tensor, seen: Tensor) -> Tensor:
     """Seen in both pictures, times the local correlation of the rest frame with the warped one.
 

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from synth.flow.estimator import Flags, Rgb
 from synth.flow.stereo.track import Moved
+from synth.recording_flow.camera_motion import Similarity
 
 _ODD = 0.2
 """Share of the tissue masked, or of the frames lost, that is worth a look."""
@@ -32,6 +33,8 @@ class FrameMotion:
     """(h, w) what was masked in the picture; None: nothing."""
     rest_masked: Flags | None = None
     """(h, w) what was masked in the rest frame for it; None: nothing."""
+    camera: Similarity | None = None
+    """The camera's motion, undone before anything was followed; None: it stood still."""
     motion: Moved | None = None
     """In three dimensions; None without a second eye or a depth camera."""
     index: int = 0
@@ -39,12 +42,12 @@ class FrameMotion:
     time_s: float | None = None
     """On the film's clock; only the rest frame may be without."""
     rgb: Rgb = field(default_factory=lambda: np.zeros((0, 0, 3), np.uint8))
-    """(h, w, 3) the picture, as small as the flow was computed."""
+    """(h, w, 3) the picture, as small as the flow was computed, and as a camera at rest had taken it."""
     cpu_s: float = 0.0
     wall_s: float = 0.0
     """Time that the flow took."""
     masking_s: float = 0.0
-    """Time that shrinking and masking took."""
+    """Time that shrinking, masking and the camera's motion took."""
     peak_bytes: int = 0
     """Memory of the process that computed it, if it was another."""
 

@@ -19,9 +19,11 @@ from numpy.typing import NDArray
 
 from synth.errors import UserError
 from synth.flow import mask_detection
+from synth.flow.confidence import doubted
 from synth.flow.estimator import Flags, Map, Rgb
 from synth.flow.mask_selection import Proposal
 from synth.flow.stereo.track import Moved
+from synth.recording_flow.camera_motion import CameraTracker, Similarity
 from synth.recording_flow.finding import Finding, first_fault
 from synth.recording_flow.foreground import ForegroundSearch
 from synth.recording_flow.frame_faults import find_fault
@@ -118,6 +120,13 @@ class Pace(Protocol):
         ...
 
 
+@dataclass(frozen=True)
+class _Steadied(Picture):
+    """A frame shrunk, as a camera at rest would have taken it."""
+
+    camera: Similarity | None = None
+
+
 class VideoFlow:
     """Follows one film, once; what it finds out on the way stands in its attributes."""
 
@@ -161,6 +170,8 @@ class VideoFlow:
         self.found: list[Finding] = []
         """What was found wrong on the way; see `findings`."""
         self._flow, self._pace = flow or LocalFlow(), pace
+        self._camera: CameraTracker | None = None  # from the rest frame on
+        self._may_share = self.removed is None and (settings.pulse or pace is not None)
         self._foreground: ForegroundSearch | None = None  # not of a stream
         self._surface: SurfaceMotion | None = None  # only where a pulse is to be found
         self._depth_weights: list[float] = []
@@ -188,7 +199,7 @@ class VideoFlow:
 
     def _frames(self, progress: Callable[[int], None]) -> Iterator[FrameMotion]:
         pictures = iter(self.footage.pictures)
-        waiting: deque[tuple[Picture, float, Future[FrameMotion]]] = deque()
+        waiting: deque[tuple[_Steadied, float, Future[FrameMotion]]] = deque()
         while True:
             with self.watch.stage("decode"):
                 picture = next(pictures, None)
@@ -244,7 +255,9 @@ class VideoFlow:
         elif self.summary.frames and not self._changes:
             fault = "the picture never changes"
         between = [] if self._foreground is None else self._foreground.findings
-        return ([Finding("bad", "pictures", fault)] if fault else []) + self.found + between
+        moved = [] if self._camera is None else self._camera.describe(self.shrink)
+        bad = [Finding("bad", "pictures", fault)] if fault else []
+        return [*bad, *self.found, *between, *(Finding("odd", "camera", one) for one in moved)]
 
     @property
     def fault(self) -> str:
@@ -292,18 +305,22 @@ class VideoFlow:
         if self.settings.pulse and self.pulse is None:
             self._surface = SurfaceMotion(self.tissue)
 
-    def _prepare(self, picture: Picture) -> tuple[Picture, Proposal, float]:
-        """A frame shrunk, what of it may be no tissue, and the time that took [s]."""
+    def _prepare(self, picture: Picture) -> tuple[_Steadied, Proposal, float]:
+        """A frame shrunk, its camera's motion undone, what of it may be no tissue, and the time [s]."""
         height, width = picture.rgb.shape[:2]
         if (height, width) != self.size:
             raise UserError(f"frame {picture.index}: {width} x {height}, the rest frame is another size")
         began = time.perf_counter()
+        rgb, view = shrink_picture(picture.rgb, self.shrink), None
+        if self._camera is not None:
+            with self.watch.stage("camera"):
+                view = self._camera.find(rgb, picture.time_s)
+                rgb = rgb if view is None else view.undo(rgb)
         with self.watch.stage("mask"):
-            rgb = shrink_picture(picture.rgb, self.shrink)
-            proposal = self._mask(picture.index, rgb)
-        return replace(picture, rgb=rgb), proposal, time.perf_counter() - began
+            proposal = self._mask(picture.index, rgb, view)
+        return _Steadied(picture.index, picture.time_s, rgb, view), proposal, time.perf_counter() - began
 
-    def _mask(self, index: int, rgb: Rgb) -> Proposal:
+    def _mask(self, index: int, rgb: Rgb, view: Similarity | None) -> Proposal:
         """What of a frame is no tissue, or may be none."""
         kind, nothing = self.settings.masks, np.zeros(rgb.shape[:2], bool)
         glare = nothing if kind in ("none", "tool") else mask_detection.glare(rgb)
@@ -313,18 +330,24 @@ class VideoFlow:
                 tool = mask_detection.tool(rgb)
             elif (given := self.footage.tool(index, self.size)) is not None:
                 known = shrink_mask(given, self.shrink, 0)
+                known = known if view is None else view.undo(known.astype(np.uint8) * 255) > 127
+        if view is not None:
+            known = known | view.outside(known.shape)
         return (
             Proposal(glare, tool, known)
             if kind == "auto"
             else Proposal(nothing, nothing, glare | tool | known)
         )
 
-    def _begin(self, small: Picture, proposal: Proposal, masking_s: float) -> FrameMotion:
+    def _begin(self, small: _Steadied, proposal: Proposal, masking_s: float) -> FrameMotion:
         """Starts the flow: nothing has moved."""
         self._fault, self._rest_rgb = find_fault(small.rgb, self.tissue), small.rgb
         frame = FrameMotion.none(self.tissue.shape, trusted=not self._fault)
         if not self._fault:
             self._flow.begin(self.settings.backend, small.rgb, proposal, self.tissue)
+            # Of what all of the tissue shares, that is left to the pulse which is the tissue's own.
+            blocked = proposal.either | proposal.known | (self.tissue & (not self._may_share))
+            self._camera = CameraTracker(small.rgb, self.tissue, blocked)
             if self._pace is not None:
                 self._flow.submit(small.rgb, proposal).result()
             frame = replace(frame, confidence=(self.tissue & ~proposal.known).astype(np.float32))
@@ -340,9 +363,11 @@ class VideoFlow:
             return False
         return True
 
-    def _finish(self, small: Picture, masking_s: float, flow: Future[FrameMotion]) -> FrameMotion:
+    def _finish(self, small: _Steadied, masking_s: float, flow: Future[FrameMotion]) -> FrameMotion:
         """The motion of a frame whose flow was submitted, in space too, and without the pulse."""
         frame = self._pictured(flow.result(), small, masking_s)
+        if small.camera is not None:
+            frame = replace(frame, confidence=doubted(frame.confidence, small.camera.deviation_px))
         self._changes = self._changes or not np.array_equal(small.rgb, self._rest_rgb)
         if frame.trusted and find_fault(small.rgb, self.tissue):
             frame = replace(frame, trusted=False)
@@ -352,8 +377,9 @@ class VideoFlow:
         self.summary.add(frame, self.tissue)
         return self._without_pulse(self._looked_at(frame))
 
-    def _pictured(self, frame: FrameMotion, small: Picture, masking_s: float) -> FrameMotion:
-        return replace(frame, index=small.index, time_s=small.time_s, rgb=small.rgb, masking_s=masking_s)
+    def _pictured(self, frame: FrameMotion, small: _Steadied, masking_s: float) -> FrameMotion:
+        frame = replace(frame, index=small.index, time_s=small.time_s, rgb=small.rgb)
+        return replace(frame, camera=small.camera, masking_s=masking_s)
 
     def _in_space(self, frame: FrameMotion) -> FrameMotion:
         """The same with what the second eye shows of it; nothing of a frame that was not followed."""
@@ -380,10 +406,13 @@ class VideoFlow:
         assert time_s is not None
         px_mm = np.float32(1.0 if self.second is None else self.second.scale_mm_per_px * self.shrink)
         if self._surface is not None and frame.trusted:
-            parts = [frame.flow]
+            # What was taken for a camera's by the tissue alone may have been a pulse.
+            view = frame.camera
+            shared = view.shift(self.tissue.shape) if view is not None and view.by_tissue else 0
+            parts = [frame.flow + shared]
             if moved is not None:
                 # The flow itself is looked in, not x and y in space, which have the noise of depth in them.
-                parts += [moved.motion[..., 2:] / px_mm, moved.motion[..., :2] / px_mm]
+                parts += [moved.motion[..., 2:] / px_mm, moved.motion[..., :2] / px_mm + shared]
                 across, along = (float(np.median(moved.deviation[..., k][self.tissue])) for k in (0, 2))
                 self._depth_weights.append(across / max(along, 1e-9))
             self._surface.add(time_s, np.dstack(parts), frame.confidence)

@@ -98,9 +98,9 @@ class Rectified:
         ahead = (cv2.remap(part, *there, borderMode=cv2.BORDER_REPLICATE) for part in (along, down))
         return np.stack([u + next(ahead) - along_here, v + next(ahead) - down_here])
 
-    def back(self, field: Map) -> Map:
-        """A field (H, W) on the rectified left pixels, on the left eye's own: (H, W)."""
-        x, y = self._inverse[0]
+    def back(self, field: Map, eye: int = 0) -> Map:
+        """A field (H, W) on an eye's rectified pixels, on its own: (H, W)."""
+        x, y = self._inverse[eye]
         return np.asarray(cv2.remap(field, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
 
     def depth(self, disparity: Map) -> Map:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -101,6 +102,17 @@ class StereoTracker:
         """Change of disparity of tissue that moves 1 mm along the line of sight."""
         self._mm_per_px = float(np.median(r.depth(self.rest.disparity))) / r.focal
         self._change: Map | None = None
+
+    def right_tissue(self) -> Flags:
+        """(H, W) where the tissue is in the right eye's rest picture."""
+        r = self.rectified
+        rows, columns = np.nonzero(r.flags(self.tissue, 0))
+        there = np.rint(columns - self.rest.disparity[rows, columns]).astype(int)
+        inside = (there >= 0) & (there < self.tissue.shape[1])
+        found = np.zeros(self.tissue.shape, np.float32)
+        found[rows[inside], there[inside]] = 1
+        # Where the tissue is steep, columns stay empty.
+        return r.back(cv2.dilate(found, np.ones((3, 5), np.uint8)), 1) > 0
 
     def step(
         self,

@@ -1,0 +1,87 @@
+"""The camera's own motion: found on surroundings and on tissue; a contact's motion is none."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from synth.flow.confidence import deviation, doubted, of_deviation
+from synth.recording_flow.camera_motion import CameraTracker
+from synth.recording_flow.video_flow import Footage, RecordingFlowSettings, VideoFlow
+from synth.video.read import Picture
+
+HEIGHT, WIDTH = 120, 160
+Y, X = np.mgrid[:HEIGHT, :WIDTH].astype(np.float64)
+OPENING = np.hypot(X - 80, Y - 60) < 40
+EVERYWHERE = np.ones((HEIGHT, WIDTH), bool)
+Places = tuple[NDArray[np.float64], NDArray[np.float64]]
+
+
+def texture(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.uint8]:
+    """(H, W, 3) a picture that is known between its pixels: waves of 6 to 25 px."""
+    rng = np.random.default_rng(0)
+    waves = [rng.uniform(6, 25) for _ in range(40)]
+    turns, phases = rng.uniform(0, 2 * np.pi, (2, 40))
+    grey = sum(
+        np.cos(2 * np.pi * (np.cos(a) * x + np.sin(a) * y) / long + p)
+        for long, a, p in zip(waves, turns, phases, strict=True)
+    )
+    return np.clip(128 + 12 * np.asarray(grey), 0, 255).astype(np.uint8)[..., None].repeat(3, -1)
+
+
+def moved(dx: float, dy: float, scale: float = 1.0, degrees: float = 0.0) -> Places:
+    """What of the picture at rest a moved camera's pixels show."""
+    c, s = np.cos(np.radians(degrees)) / scale, np.sin(np.radians(degrees)) / scale
+    x, y = X - 80 - dx, Y - 60 - dy
+    return c * x + s * y + 80, -s * x + c * y + 60
+
+
+def pressed(x: NDArray[np.float64], y: NDArray[np.float64], px: float) -> Places:
+    """The same with tissue dragged by a contact at (80, 60) whose motion falls with distance."""
+    pull = px / np.maximum(np.hypot(x - 80, y - 60) / 8, 1)
+    return x - pull, y
+
+
+@pytest.mark.parametrize("tissue", [OPENING, EVERYWHERE], ids=["opening", "tissue everywhere"])
+@pytest.mark.parametrize("motion", [(3, 4), (0.4, -0.3), (0, 0, 1.03), (0, 0, 1, 2), (18, -11, 1.02, -1)])
+def test_a_similarity_is_found_and_undone(motion: tuple[float, ...], tissue: NDArray[np.bool_]) -> None:
+    rest, now = texture(X, Y), texture(*moved(*motion))
+    found = CameraTracker(rest, tissue, ~EVERYWHERE).find(now, 1.0)
+    assert found is not None
+    there = np.stack(moved(*motion))
+    back = np.einsum("ij,jhw->ihw", found.matrix[:, :2], there) + found.matrix[:, 2, None, None]
+    assert np.hypot(*(back - np.stack([X, Y])))[OPENING].max() < 0.06
+    inside = ~found.outside(EVERYWHERE.shape)
+    assert np.abs(found.undo(now).astype(int) - rest)[inside].mean() < 1
+    assert found.deviation_px < 0.05
+
+
+@pytest.mark.parametrize("px", [0.3, 2.0, 8.0])
+def test_what_a_contact_moves_is_not_the_cameras(px: float) -> None:
+    tracker = CameraTracker(texture(X, Y), EVERYWHERE, ~EVERYWHERE)
+    assert tracker.find(texture(*pressed(X, Y, px)), 0.1) is None
+    assert tracker.describe(1) == []
+    both = tracker.find(texture(*pressed(*moved(5, 0), px / 2)), 0.2)
+    assert both is None or abs(both.matrix[0, 2] - 5) < 0.5 * px
+
+
+def test_a_bump_is_no_motion_of_the_tissue_and_is_named() -> None:
+    pictures = [Picture(t, t / 8, texture(*moved(0, 5 * (t > 2)))) for t in range(6)]
+    film = VideoFlow(
+        Footage(pictures, "film", lambda size: OPENING), RecordingFlowSettings("dis", 1, None, False, "none")
+    )
+    frames = list(film.frames())
+    assert all(np.array_equal(one.rgb, two.rgb) for one, two in zip(frames[:3], pictures[:3], strict=True))
+    assert max(np.median(np.abs(one.flow[OPENING])) for one in frames) < 0.05
+    assert all(one.trusted for one in frames)
+    (finding,) = film.findings
+    assert (finding.state, finding.what) == ("odd", "camera")
+    assert all(said in finding.said for said in ("5 px", "0.375 s"))
+
+
+def test_confidence_stands_for_the_cameras_deviation_too() -> None:
+    own = np.array([[0.1, 0.3, 1.0]], np.float32)
+    both = deviation(doubted(of_deviation(own), 0.4))
+    assert both == pytest.approx(np.hypot(own, 0.4), rel=1e-4)
+    assert not doubted(np.zeros((1, 1), np.float32), 0.4).any()
