@@ -48,13 +48,6 @@ class Similarity:
     """Standard deviation of the shift that it gives the tissue."""
     length_px: float = 0.0
     """Root mean square of that shift."""
-    by_tissue: bool = False
-    """Whether the tissue itself showed it."""
-
-    def shift(self, size: tuple[int, ...]) -> NDArray[np.float32]:
-        """(H, W, 2) px by which the rest frame's pixels are shifted."""
-        x, y = np.arange(size[1], dtype=np.float32), np.arange(size[0], dtype=np.float32)[:, None]
-        return np.dstack([there - at for there, at in zip(self._places(size), (x, y), strict=True)])
 
     def undo(self, picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """A picture (H, W[, C]) uint8 as a camera at rest would have taken it."""
@@ -183,7 +176,7 @@ class CameraTracker:
         if variance > _UNCERTAIN_PX**2 or length < least or most > _LEFT_OVER * max(length, near_px):
             return None
         # The half of what is left may be a contact's, and in it.
-        return Similarity(matrix, float(np.sqrt(variance + most**2 / 4)), length, shared)
+        return Similarity(matrix, float(np.sqrt(variance + most**2 / 4)), length)
 
     def _length(self, matrix: Floats) -> float:
         """Root mean square over the tissue of a shift (2, 3) [px]."""

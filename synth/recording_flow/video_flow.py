@@ -171,7 +171,6 @@ class VideoFlow:
         """What was found wrong on the way; see `findings`."""
         self._flow, self._pace = flow or LocalFlow(), pace
         self._camera: CameraTracker | None = None  # from the rest frame on
-        self._may_share = self.removed is None and (settings.pulse or pace is not None)
         self._foreground: ForegroundSearch | None = None  # not of a stream
         self._surface: SurfaceMotion | None = None  # only where a pulse is to be found
         self._depth_weights: list[float] = []
@@ -345,8 +344,8 @@ class VideoFlow:
         frame = FrameMotion.none(self.tissue.shape, trusted=not self._fault)
         if not self._fault:
             self._flow.begin(self.settings.backend, small.rgb, proposal, self.tissue)
-            # Of what all of the tissue shares, that is left to the pulse which is the tissue's own.
-            blocked = proposal.either | proposal.known | (self.tissue & (not self._may_share))
+            # What all tissue shares may be its pulse, which is looked for in recordings, not in streams.
+            blocked = proposal.either | proposal.known | (self.tissue & (self._pace is None))
             self._camera = CameraTracker(small.rgb, self.tissue, blocked)
             if self._pace is not None:
                 self._flow.submit(small.rgb, proposal).result()
@@ -406,13 +405,10 @@ class VideoFlow:
         assert time_s is not None
         px_mm = np.float32(1.0 if self.second is None else self.second.scale_mm_per_px * self.shrink)
         if self._surface is not None and frame.trusted:
-            # What was taken for a camera's by the tissue alone may have been a pulse.
-            view = frame.camera
-            shared = view.shift(self.tissue.shape) if view is not None and view.by_tissue else 0
-            parts = [frame.flow + shared]
+            parts = [frame.flow]
             if moved is not None:
                 # The flow itself is looked in, not x and y in space, which have the noise of depth in them.
-                parts += [moved.motion[..., 2:] / px_mm, moved.motion[..., :2] / px_mm + shared]
+                parts += [moved.motion[..., 2:] / px_mm, moved.motion[..., :2] / px_mm]
                 across, along = (float(np.median(moved.deviation[..., k][self.tissue])) for k in (0, 2))
                 self._depth_weights.append(across / max(along, 1e-9))
             self._surface.add(time_s, np.dstack(parts), frame.confidence)
