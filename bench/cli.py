@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from synth.errors import UserError
+from synth.errors import UserError, as_user_error
 from synth.system.cli_errors import Commands, printable
 
 if TYPE_CHECKING:
@@ -98,6 +98,19 @@ def pool(
     tree = pooling.pool(pooling.read(scores))
     pooling.write(tree, out, by or shlex.join(["bench", *sys.argv[1:]]))
     print(json_.dumps(tree) if json else out / "README.md")
+
+
+@app.command(epilog="Example: bench init recording")
+def init(recording: Annotated[Path, typer.Argument(help="Recording folder; it may be there.")]) -> None:
+    """Writes a recording's meta.yaml in which every key is explained."""
+    from bench.recording.meta import commented
+
+    path = recording / "meta.yaml"
+    with as_user_error(f"{path}: cannot be written"):
+        recording.mkdir(parents=True, exist_ok=True)
+        with path.open("x", encoding="utf-8") as file:
+            file.write(commented())
+    print(f"wrote {path}; fill in its scale, then: bench check {recording}")
 
 
 @app.command(epilog="Example: bench check recording")

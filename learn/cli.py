@@ -232,7 +232,9 @@ def predict_command(
     ],
     source: Annotated[
         Path | None,
-        typer.Argument(help="Dataset, NNNNNN.zarr store, video, or .npz of flow.", show_default=False),
+        typer.Argument(
+            help="Dataset, .zarr store, video, folder of PNGs, or .npz of flow.", show_default=False
+        ),
     ] = None,
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for NAME.npz and .force.csv.")] = Path(
         "forces"
@@ -281,6 +283,7 @@ def predict_command(
     from synth.recording_flow.video_flow import RecordingFlowSettings
     from synth.video.mask_files import read_choice
     from synth.video.pixel_scale import read_scale
+    from synth.video.read import is_film
 
     set_threads(threads)
     if source is None:
@@ -302,7 +305,7 @@ def predict_command(
         found = apply(predictor, motion, young)
         write_prediction(found, out / motion.name)
         if overlay:
-            one = source.is_file() or source.suffix == ".zarr"
+            one = source.is_file() or source.suffix == ".zarr" or is_film(source)
             write_overlay(found, source if one else source / f"{motion.name}.zarr", out / motion.name)
         size = found["total_force_mn"][found["trusted"]]
         peak = peaks[motion.name] = float(size.max()) if len(size) else None

@@ -90,7 +90,7 @@ def preview(
         print(json_.dumps({"sheet": str(out), "openings": places}) if json else lines)
         return
     read = reader.load_job(job, overrides or [])
-    with counting("Drawing, then measuring what a sequence costs") as progress:
+    with counting("Compiling the first time, drawing, then measuring what a sequence costs") as progress:
         made = contact_sheet.draw_sheet(read, count, progress)
     write_picture(out, made.picture)
     spent_s, cpu_s = made.stages_cpu_s, sum(made.stages_cpu_s.values())

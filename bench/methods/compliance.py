@@ -22,7 +22,7 @@ from synth.job import schema
 
 Floats = NDArray[np.float64]
 
-# World (z out of the brain) to camera (x right, y down, z forward) for a camera straight above.
+# World (z out of the brain) to camera (x right, y down, z away) for a camera straight above.
 TO_CAMERA = np.diag([1.0, -1.0, -1.0])
 
 # A recording doesn't tell the brain's shape: the default job's.

@@ -27,6 +27,7 @@ _NOISY_MM = 0.16  # depth motion from which on force is no better than with one 
 # Logarithm of the stated scale over the second eye's: beyond these they contradict each other, and beyond the
 # second, which of them is wrong decides what the force is.
 _OTHER_SCALE, _ANOTHER_SCALE = 0.1, 0.3
+_UNITS_MM = {"metres": 1000.0, "centimetres": 10.0, "micrometres": 0.001}
 _LOOKED_AT = 12  # frames that are followed to see whether they can be
 
 
@@ -114,6 +115,9 @@ def judge_eyes(stereo: StereoQuality, mm_per_px: float) -> list[Finding]:
     off = abs(np.log(stereo.mm_per_px / mm_per_px))
     if off > _OTHER_SCALE:
         said = f"{mm_per_px:.4g} mm/px, but the second eye finds {stereo.mm_per_px:.4g}"
+        for unit, times in _UNITS_MM.items():
+            if abs(np.log(times * stereo.mm_per_px / mm_per_px)) < _ANOTHER_SCALE:
+                said += f": in {unit}? then mm_per_unit is {times:g} times what it is"
         found.append(Finding("bad" if off > _ANOTHER_SCALE else "odd", "scale", said))
     return found
 

@@ -19,6 +19,7 @@ from pydantic import (
 
 from synth.errors import UserError
 from synth.job.types import Positive
+from synth.job.writer import section_lines
 from synth.system import checked_file
 from synth.system.config_file import ConfigFile
 
@@ -91,7 +92,7 @@ class SensorMeta(_Section):
     """The force sensor and how its file is to be read."""
 
     axes: Literal["camera", "sensor"] = "sensor"
-    """`camera`: fx, fy, fz are along the camera's x (right), y (down), z (forward), so that components are
+    """`camera`: fx, fy, fz are along the camera's x (right), y (down), z (away), so that components are
     scored too. `sensor`: only the magnitude is."""
     to_camera: tuple[Row, Row, Row] | None = None
     """Rows of the rotation from the sensor's axes to the camera's; with it components are scored too."""
@@ -213,6 +214,11 @@ class Meta(_Section):
         if self.sync.method == "correlate" and self.sync.calibration_s is None:
             raise ValueError("sync.method correlate needs sync.calibration_s")
         return self
+
+
+def commented() -> str:
+    """A meta.yaml with every key, its meaning and its default; the scale, which has none, is unknown."""
+    return "\n".join(section_lines(Meta(scale_mm_per_px="unknown"))).rstrip() + "\n"
 
 
 def read_meta(path: Path) -> Meta:

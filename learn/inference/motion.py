@@ -65,14 +65,14 @@ class VideoOptions:
 
 
 def motions(path: Path, source: str, options: VideoOptions | None = None) -> Iterator[Motion]:
-    """What `path` holds: a dataset folder, one NNNNNN.zarr store, an .npz of arrays, or a video.
+    """What `path` holds: a dataset folder, one NNNNNN.zarr store, an .npz of arrays, a video or its PNGs.
 
     An .npz holds `flow` (T, H, W, 2) px, `tissue` (H, W), `scale_mm_per_px`, and if known `young_kpa`,
     `confidence` (T, H, W) and `force_mn` (T,); or, of two eyes, `motion` and `deviation` (T, H, W, 3) mm
     instead of flow and confidence. A video's first frame is its rest frame. Raises UserError for
     anything else, and for a video without a scale.
     """
-    if path.suffix.lower() in video.SUFFIXES:
+    if video.is_film(path):
         yield _video(path, options or VideoOptions())
     elif path.suffix == ".npz":
         yield _arrays(path)
@@ -83,7 +83,7 @@ def motions(path: Path, source: str, options: VideoOptions | None = None) -> Ite
 
 def has_second_eye(path: Path) -> bool:
     """Whether what `motions` reads holds motion in three dimensions; of a dataset its first sequence."""
-    if path.suffix.lower() in video.SUFFIXES:
+    if video.is_film(path):
         return False
     if path.suffix == ".npz":
         return "motion" in checked_file.read_arrays(path)
@@ -131,9 +131,9 @@ def _video(path: Path, options: VideoOptions, pulse: PulseSearch | None = None) 
     scale_known = options.scale_mm_per_px != "unknown"
     tissue = everywhere if options.tissue is None else partial(video.read_mask, options.tissue)
     taken: list[str] = []
-    frames_there = range(video.count_frames(path) or 0)
+    frames_there = range(0 if path.is_dir() else video.count_frames(path) or 0)
     tool = options.tool.of_frames(frames_there, taken).read if options.tool else None
-    footage = Footage(video.read_video(path, video.FPS), str(path), tissue, tool)
+    footage = Footage(video.read_film(path, video.FPS), str(path), tissue, tool)
     following = VideoFlow(footage, options.settings, pulse=pulse)
     frames = (replace(one, time_s=one.time_s or 0.0) for one in following.frames())
     rest = next(frames)
@@ -145,6 +145,8 @@ def _video(path: Path, options: VideoOptions, pulse: PulseSearch | None = None) 
 
     def notes() -> list[str]:
         found = [*taken, *([] if scale_known else [UNKNOWN_NOTE]), *following.notes]
+        if path.is_dir():
+            found = [f"nobody knows the pictures' times: {video.FPS:g} a second are taken", *found]
         return found if following.removed is None else [*found, following.removed.describe(mm_per_px)]
 
     return Motion(

@@ -117,8 +117,8 @@ def _number(value: float) -> str:
 
 
 def _pictures(source: Path, wanted: set[int]) -> Iterator[Rgb] | None:
-    if source.suffix.lower() in video.SUFFIXES:
-        return (one.rgb for one in video.read_video(source, video.FPS) if one.index in wanted)
+    if video.is_film(source):
+        return (one.rgb for one in video.read_film(source, video.FPS) if one.index in wanted)
     if source.suffix != ".zarr":
         return None
     sequence: Sequence = open_sequence(source)

@@ -41,7 +41,8 @@ def read_source(source: str) -> tuple[str, str, Path]:
         text = checked_file.read_text(Path(source), checked_file.LARGEST_YAML)
         return text, source, Path(source).resolve().parent
     if source not in names():
-        hint = did_you_mean(source, names()) or f"; nor a job called so ({', '.join(names())})"
+        shown = [name for name in names() if name != "mission"]  # made the networks that come along
+        hint = did_you_mean(source, names()) or f"; nor a job called so ({', '.join(shown)})"
         raise UserError(f"{source[:80]}: no such file{hint}")
     text = (resources.files("synth.job") / "named" / f"{source}.yaml").read_text("utf-8")
     return text, f"{source} (a named job)", Path.cwd()

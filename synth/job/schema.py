@@ -154,9 +154,9 @@ class CardSection(Section):
     """Name of the dataset."""
     summary: str | None = None
     """What it was made for, in your words."""
-    licence: str | None = None
-    """Licence under which you share it, as an SPDX name (cc-by-4.0). Empty: none is given."""
-    authors: tuple[str, ...] = ()
+    licence: str | None = "cc-by-4.0"
+    """Licence under which you share it, as an SPDX name. Empty: none is given."""
+    authors: tuple[str, ...] = ("made with Sulcus, maker not named",)
     """Who made it."""
     contact: str | None = None
     """Where questions go."""

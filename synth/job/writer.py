@@ -31,7 +31,7 @@ def commented(job: Job | None = None) -> str:
         "# yaml-language-server: $schema=job.schema.json",
         "",
     ]
-    lines += _section(job, "")
+    lines += section_lines(job)
     return "\n".join(lines).rstrip() + "\n"
 
 
@@ -52,19 +52,22 @@ def dump_job(job: Job) -> str:
     return out.getvalue()
 
 
-def _section(section: BaseModel, indent: str) -> list[str]:
+def section_lines(section: BaseModel, indent: str = "") -> list[str]:
+    """Every key of a section with its meaning, its range and its value, as lines of YAML."""
     lines: list[str] = []
     for name, field in type(section).model_fields.items():
         value = getattr(section, name)
         inner = section_of(field.annotation)
         text = field.description or (inner.__doc__ if inner else "") or ""
         allowed = "" if inner else limits(type(section), name)
+        if inner is not None and value is None:
+            allowed = f"Its keys: {', '.join(inner.model_fields)}."
         comment = " ".join([*text.split(), allowed]).strip()
         if inner is not None and lines and lines[-1]:
             lines.append("")
         lines += textwrap.wrap(comment, _WIDTH, initial_indent=f"{indent}# ", subsequent_indent=f"{indent}# ")
         if isinstance(value, BaseModel):
-            lines += [f"{indent}{name}:", *_section(value, indent + "  ")]
+            lines += [f"{indent}{name}:", *section_lines(value, indent + "  ")]
         else:
             lines.append(f"{indent}{name}: {scalar(value)}".rstrip())
     return lines

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
 
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from synth.errors import UserError
 from synth.system import checked_file
 from synth.system.checked_file import LARGEST_PIXELS, refuse_large
+from synth.video.file_numbers import number_files
 
 SUFFIXES = (".mp4", ".mov", ".mkv", ".avi", ".webm", ".m4v")
 
@@ -82,6 +83,22 @@ def read_video(path: Path, fps: float | None = None) -> Iterator[Picture]:
                 raise UserError(f"{path}: not a readable video ({_reason(error)})") from None
         if index == 0:
             raise UserError(f"{path}: holds no frames")
+
+
+def is_film(path: Path) -> bool:
+    """Whether it is a video by its name, or a folder of PNGs beside no sequences."""
+    if path.is_dir():
+        return any(path.glob("*.png")) and not any(path.glob("*.zarr"))
+    return path.suffix.lower() in SUFFIXES
+
+
+def read_film(path: Path, fps: float) -> Iterator[Picture]:
+    """As `read_video`, of a folder its pictures by the numbers in their names, `fps` a second."""
+    if not path.is_dir():
+        return read_video(path, fps)
+    stills = number_files([*path.glob("*.png")])
+    first = min(stills)
+    return (replace(one, time_s=(one.index - first) / fps) for one in read_pictures(stills))
 
 
 def count_frames(path: Path) -> int | None:

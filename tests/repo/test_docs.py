@@ -8,7 +8,7 @@ import shlex
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from html.parser import HTMLParser
 from pathlib import Path
 from urllib.parse import unquote
@@ -17,7 +17,9 @@ import generate
 import pytest
 from ruamel.yaml import YAML
 
+from bench.recording.from_sequence import export_recording
 from bench.recording.meta import Meta
+from synth.dataset.store import Dataset
 from synth.job.schema import Job
 
 DOCS = generate.DOCS
@@ -29,6 +31,7 @@ PAGES = [
 ]
 GENERATED = generate.pages()
 SPOKEN = {spoken.words: spoken for spoken in generate.commands()}
+PLUG_INS = ("flow", "law", "method")
 OURS = re.compile(r"(?<![\w./@-])(?:synth|learn|bench|evidence|tests|examples)/[\w/]+(?:\.[a-z0-9]+)*")
 
 
@@ -67,13 +70,30 @@ def test_what_a_page_shows_can_be_used(page: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["README.md", "docs/tutorial.md"])
-def test_python_on_the_pages_runs(name: str, out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(out.parent)
-    found = [text for title, text in blocks(ROOT / name, "python") if not title]
-    assert found
-    for text in found:
-        exec(compile(text, name, "exec"), {})
+@pytest.mark.parametrize(
+    "name", ["README", "docs/tutorial", "docs/howto/instruments", *(f"docs/howto/{one}" for one in PLUG_INS)]
+)
+def test_what_a_page_shows_runs_in_a_folder_as_it_makes_it(name: str, out: Path, tmp_path: Path) -> None:
+    """Its files are written, its scripts run, its package is installed and offers what it says."""
+    page = ROOT / f"{name}.md"
+    pip = "-m pip install -q --no-build-isolation --no-deps --no-index --target site ."
+    (tmp_path / "out").symlink_to(out)
+    export_recording(Dataset(out)[0], tmp_path / "recordings/000000")
+
+    def run(words: Sequence[str], path: str = "") -> None:
+        environment = {**os.environ, "PYTHONPATH": f"{ROOT}:{path}"}
+        done = subprocess.run([sys.executable, *words], cwd=tmp_path, stderr=-1, text=True, env=environment)
+        assert done.returncode == 0, f"{page.stem}: {words}: {done.stderr[-2000:]}"
+
+    for title, text in blocks(page, "python"):
+        script = tmp_path / Path(title or "block.py").name
+        script.write_text(text)
+        run([script.name])
+    for title, text in blocks(page, "toml"):
+        (tmp_path / title).write_text(text)
+        run(pip.split())
+        found = f"(p,) = importlib.metadata.entry_points(group='sulcus.{page.stem}'); p.load()()"
+        run(["-c", f"import importlib.metadata; {found}"], "site")
 
 
 class Links(HTMLParser):

@@ -1,6 +1,6 @@
 """The microscope camera: one model for rays, truth, flow and bench.
 
-OpenCV axes (x right, y down, z forward), `K` 3x3, Brown-Conrady distortion (k1, k2, p1, p2, k3), the centre
+OpenCV axes (x right, y down, z away), `K` 3x3, Brown-Conrady distortion (k1, k2, p1, p2, k3), the centre
 of the top-left pixel at (0, 0). D. C. Brown, "Close-range camera calibration", 1971.
 """
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from fractions import Fraction
 from pathlib import Path
 
@@ -13,7 +14,7 @@ from fake_recording import Maker, texture
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from bench.recording import csv_table, writer
+from bench.recording import csv_table, meta, writer
 from bench.recording.folder import Recording, open_recording
 from synth.errors import UserError
 from synth.video import read as video
@@ -151,3 +152,11 @@ def test_pixels_of_a_video_are_made_square(tmp_path: Path) -> None:
     seen = picture.rgb[..., 0] > 127
     assert seen.shape == (96, 128)
     assert seen.any(0).sum() == pytest.approx(seen.any(1).sum(), abs=3)
+
+
+def test_a_written_meta_is_read_as_what_it_stands_for(tmp_path: Path) -> None:
+    (tmp_path / "meta.yaml").write_text(meta.commented())
+    assert meta.read_meta(tmp_path / "meta.yaml") == meta.Meta(scale_mm_per_px="unknown")
+    assert set(meta.Stereo.model_fields) <= set(re.findall(r"\w+", meta.commented()))
+    stills = Maker(tmp_path)(frames=4) / "frames"
+    assert [one.time_s for one in video.read_film(stills, 10.0)] == pytest.approx([0, 0.1, 0.2, 0.3])

@@ -14,7 +14,9 @@ from skimage import data
 
 from bench.methods.protocol import ForceEstimate, MethodContext
 from bench.recording import writer
+from bench.recording.check import judge_eyes
 from bench.recording.folder import open_recording
+from bench.recording.second_eye import StereoQuality
 from bench.tracking.tracking import track_recording
 from synth.flow.stereo.calibration import read_rig
 from synth.flow.stereo.track import Moved
@@ -195,3 +197,10 @@ def test_a_written_pair_is_read_back(tmp_path: Path) -> None:
     left, right = (lens.rotation @ point + lens.translation for lens in lenses)
     np.testing.assert_allclose(found.rotation @ left + found.translation, right, atol=1e-6)
     np.testing.assert_allclose(found.right.distortion, lenses[1].distortion, atol=1e-12)
+
+
+def test_a_baseline_in_metres_is_named() -> None:
+    (found,) = judge_eyes(StereoQuality(0.024, 0.1, 0.05e-3, 0.01), 0.05)
+    assert found.state == "bad"
+    assert "metres" in found.said
+    assert "1000" in found.said
