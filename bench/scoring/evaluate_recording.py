@@ -30,6 +30,7 @@ from synth.recording_flow.local_flow import LocalFlow
 from synth.recording_flow.video_flow import RecordingFlowSettings
 
 Flags = NDArray[np.bool_]
+_MOVED = 0.1  # of the sensor's peak while pictures stand still: they are frozen
 _SEED = 0  # of the bootstrap: the same recording gives the same intervals
 _NO_YOUNG = (
     "Young's modulus unknown: forces are those of tissue of 1 kPa, so only scores that no factor changes are "
@@ -74,7 +75,11 @@ def evaluate_recording(
         notes.append(_NO_YOUNG)
     press = None if meta.press_s is None else _within(time_s, meta.press_s)
     against = _Reference(
-        time_s, sensor, _scored_frames(meta, time_s, notes), press, meta.young_kpa is not None
+        time_s,
+        sensor,
+        _scored_frames(meta, time_s, notes) & ~_repeated(tracked, sensor.size_mn, notes),
+        press,
+        meta.young_kpa is not None,
     )
     if lost.any():
         notes.append(f"{lost.sum()} of {len(lost)} frames could not be followed: gaps, not scored")
@@ -148,6 +153,19 @@ def _scored_frames(meta: Meta, time_s: Curve, notes: list[str]) -> Flags:
             scored &= ~inside
             notes.append(f"{inside.sum()} frames of the {what} ({describe_span(span)}) are not scored")
     return scored
+
+
+def _repeated(tracked: TrackedRecording, sensor_mn: Curve | None, notes: list[str]) -> Flags:
+    """(T,) frames that show an earlier one again: surely, or while the sensor moved."""
+    surely, maybe = (np.isin(tracked.frame, list(frames)) for frames in tracked.repeats)
+    if sensor_mn is not None and maybe.any():
+        peak = float(np.nanmax(np.abs(sensor_mn), initial=0.0))
+        for run in np.split(np.arange(len(maybe)), np.flatnonzero(np.diff(maybe)) + 1):
+            if maybe[run[0]] and np.ptp(sensor_mn[max(run[0] - 1, 0) : run[-1] + 1]) > _MOVED * peak:
+                surely[run] = True
+    if surely.any():
+        notes.append(f"{surely.sum()} frames show an earlier one again, frozen or doubled: not scored")
+    return np.asarray(surely, bool)
 
 
 def _fit_gain(size: Curve, main: str, first: Scored | None, against: _Reference) -> Gain:

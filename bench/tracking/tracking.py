@@ -64,6 +64,8 @@ class TrackedRecording:
     """Whether the frame could be followed; the forces of one that couldn't are none."""
     summary: TrackingSummary = field(default_factory=TrackingSummary)
     """What was masked, lost and regained."""
+    repeats: tuple[set[int], set[int]] = field(default_factory=lambda: (set(), set()))
+    """Frames that show the one before again, as of `FilmFaults.repeats`."""
     snapshots: list[Snapshot] = field(default_factory=list)
     rest: NDArray[np.uint8] | None = None
     tissue: NDArray[np.bool_] | None = None
@@ -161,6 +163,8 @@ def _describe(
     out.summary, out.size, out.notes = video.summary, video.size, video.notes
     scale = mm_per_px / video.shrink
     out.findings = check.judge(recording, scale, video.size, video.findings, out.stereo)
+    if video.faults is not None:
+        out.repeats = video.faults.repeats()
     if out.fault:
         out.trusted = [False] * len(out.time_s)
         out.notes.append(f"nothing can be measured: {out.fault}")

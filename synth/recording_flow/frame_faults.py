@@ -1,4 +1,7 @@
-"""Pictures that show nothing to follow: an estimator answers zero motion there, which is no measurement."""
+"""Pictures that show nothing to follow, and films whose pictures were spoilt on their way from the camera.
+
+Thresholds lie between 50 films of the renderer as they are and the same films spoilt.
+"""
 
 from __future__ import annotations
 
@@ -6,10 +9,26 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from synth.recording_flow.finding import Finding
+
 _LEAST_SIDE = 24  # px of the picture; below it no window of any estimator fits
 _LEAST_TISSUE = 400  # px
 _DARK = 12.0  # grey levels that 95% of the tissue stay below
 _FLAT = 0.5  # grey levels of detail; a camera's own noise is more
+_DIM = 60.0  # as `_DARK`; 196 and more in films that are well lit
+_NOISY = 12.0  # grey levels, one standard deviation; below 5
+_SOFT = 0.34  # detail finer than 1 px over that of 1 to 4 px; 0.6 and more, 0.4 after strong compression
+_GRID = 3.0  # steps at every eighth pixel over those between; 1.1, and 2.5 of JPEG at quality 10
+_BLURRED = 0.5  # of the rest frame's finest detail; 0.87 and more
+_COMBED = 1.4  # squared steps to the next row over those to the one after it; 1.1, and 1.2 of noise
+_BAR = 0.14  # of the picture's level, that a black bar stays below: 16 of 255 may be black
+_EVEN = 4.0  # grey levels, spread within a row of it
+_SAME = 0.1  # of the usual change from picture to picture
+_STILL = 0.2  # grey levels by which even the quietest part of a camera's picture changes
+_CAUGHT_UP = 1.6  # usual changes after pictures that stood still
+_LEAPT = 3.0  # times as much change as from the pictures on either side
+_SOME = 5  # of a list that are named
+_STRIDE = 4  # every such pixel is compared, unsmoothed: noise tells two pictures apart
 
 
 def find_fault(rgb: NDArray[np.uint8], tissue: NDArray[np.bool_]) -> str:
@@ -32,3 +51,121 @@ def find_fault(rgb: NDArray[np.uint8], tissue: NDArray[np.bool_]) -> str:
     if float(detail[tissue].std()) < _FLAT:
         return "of one colour, without any detail"
     return ""
+
+
+def find_bars(rgb: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    """(H, W) True on the black bars along the borders of a picture (H, W, 3)."""
+    grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
+    bars, least = np.zeros(grey.shape, bool), _BAR * float(np.percentile(grey, 95))
+    for lines, across in ((grey, bars), (grey.T, bars.T)):
+        dark = (np.percentile(lines, 98, axis=1) < least) & (lines.std(axis=1) < _EVEN)
+        across |= (np.minimum.accumulate(dark) | np.minimum.accumulate(dark[::-1])[::-1])[:, None]
+    return bars & ~bars.all()
+
+
+def is_inside_out(tissue: NDArray[np.bool_]) -> bool:
+    """Whether a mask (H, W) of tissue marks the border of the picture and leaves out its middle."""
+    height, width = tissue.shape
+    border = np.concatenate([tissue[0], tissue[-1], tissue[:, 0], tissue[:, -1]])
+    middle = tissue[height // 3 : -(height // 3), width // 3 : -(width // 3)]
+    return bool(border.mean() > 0.5 and middle.mean() < 0.5)
+
+
+class FilmFaults:
+    """What a film's pictures suffer from, gathered as they go by."""
+
+    def __init__(self, rgb: NDArray[np.uint8], small: NDArray[np.uint8], tissue: NDArray[np.bool_]) -> None:
+        """The rest frame (H, W, 3), the same as flow is computed on, (h, w, 3), and (h, w) its tissue."""
+        self._tissue, self._last = tissue, rgb[::_STRIDE, ::_STRIDE]
+        grey = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY).astype(np.float32)
+        self._fine = _detail(grey, 0, 1)[tissue].std()
+        self._numbers: list[int] = []
+        self._times: list[float] = []
+        self._changes: list[tuple[float, float]] = []  # mean, and of the quietest part, since the one before
+        self._blurred: list[float] = []
+        self._combed: list[float] = []
+        level = float(np.percentile(grey[tissue], 95))
+        corners = cv2.filter2D(grey, -1, np.outer([1, -2, 1], [1, -2, 1]).astype(np.float32))
+        noise = float(np.median(np.abs(corners[tissue]))) / 6 / 0.6745  # Immerkaer 1996, by the median
+        soft = self._fine / max(float(_detail(grey, 1, 4)[tissue].std()), 1e-6)
+        steps = [_grid(lines) for lines in (rgb[..., 1].astype(np.float32), rgb[..., 1].T.astype(np.float32))]
+        self._rest = [
+            said
+            for wrong, said in (
+                (level < _DIM, f"the film is dim: 95% of the tissue is below grey level {level:.0f} of 255"),
+                (noise > _NOISY, f"the film is noisy: {noise:.0f} grey levels"),
+                (soft < _SOFT, "the rest frame has no fine detail: out of focus, or strongly compressed?"),
+                (min(steps) > _GRID, "the pictures fall into blocks of 8 px: strongly compressed"),
+            )
+            if wrong
+        ]
+
+    def see(self, index: int, time_s: float, rgb: NDArray[np.uint8]) -> None:
+        """A picture (H, W, 3) of the film, each in order."""
+        one = rgb[::_STRIDE, ::_STRIDE]
+        if one.shape == self._last.shape:
+            change = cv2.absdiff(one, self._last).mean(axis=2)
+            parts = cv2.resize(change, (8, 6), interpolation=cv2.INTER_AREA)
+            self._numbers.append(index)
+            self._times.append(time_s)
+            self._changes.append((float(change.mean()), float(parts.min())))
+        self._last = one
+
+    def look(self, time_s: float, rgb: NDArray[np.uint8], small: NDArray[np.uint8]) -> None:
+        """A picture that is followed, and the same as flow is computed on."""
+        fine = _detail(cv2.cvtColor(small, cv2.COLOR_RGB2GRAY).astype(np.float32), 0, 1)[self._tissue].std()
+        if fine < _BLURRED * self._fine:
+            self._blurred.append(time_s)
+        green = rgb[:, ::2, 1].astype(np.float32)
+        near, far = (cv2.blur((green[:-2] - green[k : len(green) - 2 + k]) ** 2, (8, 16)) for k in (1, 2))
+        # The most torn blocks: elsewhere the picture may be at rest.
+        if np.percentile((near / (far + 1))[8::16, 4::8], 98) > _COMBED:
+            self._combed.append(time_s)
+
+    def repeats(self) -> tuple[set[int], set[int]]:
+        """Numbers of the frames that show the one before again: surely, and unless the tissue was still."""
+        change, quiet = np.array(self._changes).reshape(-1, 2).T
+        surely, maybe = set[int](), set[int]()
+        if not change.any():
+            return surely, maybe
+        usual = float(np.median(change[change > 0]))
+        noisy = float(np.median(quiet[change > 0])) > _STILL
+        same = np.concatenate([[False], change < _SAME * usual, [False]]).astype(int)
+        for first, stop in zip(*(np.flatnonzero(np.diff(same) == k) for k in (1, -1)), strict=True):
+            caught_up = stop < len(change) and change[stop] > _CAUGHT_UP * usual
+            (surely if noisy or caught_up else maybe).update(self._numbers[first:stop])
+        return surely, maybe
+
+    def findings(self) -> list[Finding]:
+        """What is odd, once the film is through."""
+        again, change = self.repeats()[0], [mean for mean, _ in self._changes]
+        beside = [max(pair) for pair in zip(change[:-2], change[2:], strict=True)]
+        leaps = [k for k, other in enumerate(beside, 1) if change[k] > _LEAPT * other]
+        at = dict(zip(self._numbers, self._times, strict=True))
+        found = [Finding("odd", "pictures", said) for said in self._rest]
+        for times, said in (
+            (self._combed, "interlaced: rows are of two moments; deinterlace the film"),
+            (self._blurred, "far less sharp than the rest frame: out of focus?"),
+            ([at[k] for k in sorted(again)], "the one before again: frozen or doubled, not scored"),
+            (
+                [self._times[k] for k in leaps if not again & set(self._numbers[k - 1 : k + 2])],
+                "far from those beside: frames missing, a cut or a bump?",
+            ),
+        ):
+            if times:
+                some = ", ".join(f"{t:.2f}" for t in times[:_SOME]) + (", ..." if len(times) > _SOME else "")
+                found.append(Finding("odd", "pictures", f"{len(times)} pictures ({some} s) are {said}"))
+        return found
+
+
+def _detail(grey: NDArray[np.float32], finer: float, coarser: float) -> NDArray[np.float32]:
+    """What of a picture (H, W) lies between two widths of Gaussians [px]; 0: the picture itself."""
+    top = cv2.GaussianBlur(grey, (0, 0), finer) if finer else grey
+    return np.asarray(top - cv2.GaussianBlur(grey, (0, 0), coarser), np.float32)
+
+
+def _grid(lines: NDArray[np.float32]) -> float:
+    """Mean step at the columns (H, W) of a grid of 8 px over the median of others."""
+    steps = np.abs(np.diff(lines, axis=1)).mean(axis=0)
+    each = [float(steps[k::8].mean()) for k in range(8)]
+    return max(each) / max(float(np.median(each)), 1e-6)

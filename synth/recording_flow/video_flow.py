@@ -26,7 +26,7 @@ from synth.flow.stereo.track import Moved
 from synth.recording_flow.camera_motion import CameraTracker, Similarity
 from synth.recording_flow.finding import Finding, first_fault
 from synth.recording_flow.foreground import ForegroundSearch
-from synth.recording_flow.frame_faults import find_fault
+from synth.recording_flow.frame_faults import FilmFaults, find_bars, find_fault, is_inside_out
 from synth.recording_flow.frame_motion import FrameMotion, TrackingSummary
 from synth.recording_flow.harmonic_fit import Span
 from synth.recording_flow.local_flow import LocalFlow
@@ -169,6 +169,8 @@ class VideoFlow:
         """Frames, and memory of the flow's own process."""
         self.found: list[Finding] = []
         """What was found wrong on the way; see `findings`."""
+        self.faults: FilmFaults | None = None
+        """What its pictures suffer from; None before the rest frame."""
         self._flow, self._pace = flow or LocalFlow(), pace
         self._camera: CameraTracker | None = None  # from the rest frame on
         self._foreground: ForegroundSearch | None = None  # not of a stream
@@ -205,6 +207,8 @@ class VideoFlow:
             if picture is None:
                 break
             self.decoded += 1
+            if self.faults is not None and picture.time_s is not None:
+                self.faults.see(picture.index, picture.time_s, picture.rgb)
             while waiting and self._is_there(waiting[0][2], picture.time_s):
                 yield self._finish(*waiting.popleft())
             if self._is_wanted(picture.index, picture.time_s):
@@ -255,8 +259,9 @@ class VideoFlow:
             fault = "the picture never changes"
         between = [] if self._foreground is None else self._foreground.findings
         moved = [] if self._camera is None else self._camera.describe(self.shrink)
+        faults = [] if self.faults is None or fault else self.faults.findings()
         bad = [Finding("bad", "pictures", fault)] if fault else []
-        return [*bad, *self.found, *between, *(Finding("odd", "camera", one) for one in moved)]
+        return [*bad, *self.found, *between, *faults, *(Finding("odd", "camera", one) for one in moved)]
 
     @property
     def fault(self) -> str:
@@ -297,9 +302,16 @@ class VideoFlow:
         """Sizes and tissue, from the rest frame."""
         self.size = (rest.rgb.shape[0], rest.rgb.shape[1])
         self.shrink = self.settings.shrink or max(1, self.size[1] // LEAST_COLUMNS)
-        self.tissue = shrink_mask(self.footage.tissue(self.size), self.shrink, 127)
+        tissue, bars = self.footage.tissue(self.size), find_bars(rest.rgb)
+        if is_inside_out(tissue):
+            self._odd("tissue", "tissue.png marks the picture's border and not its middle: is it inverted?")
+        if (tissue & bars).any():
+            share = f"{100 * bars.mean():.0f}% of the picture are black bars, not taken for tissue"
+            self._odd("pictures", share)
+        self.tissue = shrink_mask(tissue & ~bars, self.shrink, 127)
         if not self.tissue.any():
             raise UserError(f"{self.footage.name}: the picture of the tissue marks no tissue")
+        self.faults = FilmFaults(rest.rgb, shrink_picture(rest.rgb, self.shrink), self.tissue)
         self._rest_s = rest.time_s
         if self.settings.pulse and self.pulse is None:
             self._surface = SurfaceMotion(self.tissue)
@@ -311,6 +323,8 @@ class VideoFlow:
             raise UserError(f"frame {picture.index}: {width} x {height}, the rest frame is another size")
         began = time.perf_counter()
         rgb, view = shrink_picture(picture.rgb, self.shrink), None
+        if self.faults is not None and picture.time_s is not None:
+            self.faults.look(picture.time_s, picture.rgb, rgb)
         if self._camera is not None:
             with self.watch.stage("camera"):
                 view = self._camera.find(rgb, picture.time_s)
@@ -318,6 +332,9 @@ class VideoFlow:
         with self.watch.stage("mask"):
             proposal = self._mask(picture.index, rgb, view)
         return _Steadied(picture.index, picture.time_s, rgb, view), proposal, time.perf_counter() - began
+
+    def _odd(self, what: str, said: str) -> None:
+        self.found.append(Finding("odd", what, said))
 
     def _mask(self, index: int, rgb: Rgb, view: Similarity | None) -> Proposal:
         """What of a frame is no tissue, or may be none."""
