@@ -376,15 +376,20 @@ def calibrate_command(
 
 @app.command("export", epilog="Example: learn export model d2fnet.onnx --format onnx")
 def export_command(
-    model: Annotated[Path, typer.Argument(help="Model folder.")],
+    model: Annotated[
+        Path, typer.Argument(help="Model; flow-correction, depth-correction: of the motion it reads.")
+    ],
     file: Annotated[Path, typer.Argument(help="File to write; NAME.json beside it says how to use it.")],
     format: Annotated[str, typer.Option(help="torchscript or onnx.")] = "torchscript",
 ) -> None:
     """Write a model for other programs, checked against PyTorch to 1e-4."""
-    from learn.inference.export import export
+    from learn.inference.export import CORRECTIONS, export, export_correction
     from learn.inference.predict import load_model
 
-    worst = export(load_model(model), file, format)
+    if str(model) in CORRECTIONS:
+        worst = export_correction(str(model), file, format)
+    else:
+        worst = export(load_model(model), file, format)
     _console.print(f"{file}: differs from PyTorch by at most {worst:.1e} of full scale")
 
 

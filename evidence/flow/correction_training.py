@@ -1,11 +1,13 @@
-"""Trains the flow's correction on rendered truth, and on closed forms that no renderer drew.
+"""Trains the corrections of flow and of depth on rendered truth, and on closed forms that no renderer drew.
 
-Run: python -m evidence.flow.correction_training EXAMPLES [--scenes 477 --minutes 30]
+Run: python -m evidence.flow.correction_training EXAMPLES [--scenes 480 --depth]
 
-Sequences of `mission`, each as rendered and once more as another camera might show it (size, gain, colour,
-contrast, noise, blur, JPEG; now and then a frame that can't be followed), the warped pairs of
-`evidence.flow.scenes`, and drawn textures in motion. EXAMPLES keeps what was made, so that a run that was
-stopped goes on. Writes `correction.pt` and `correction.json` beside `synth.flow.correction`.
+Sequences of `mission` from the 2,000th on (no reader learns from those), each as rendered and once more as
+another camera might show it (gain, colour, contrast, noise, blur, JPEG; for one eye also its size, and now
+and then a frame that can't be followed). Flow also learns from the warped pairs of `evidence.flow.scenes` and
+from drawn textures in motion. EXAMPLES keeps what was made, so that a run that was stopped goes on. Depth is
+corrected after flow, hence learnt by a second run with `--depth`. Writes weights and card beside
+`synth.flow.correction` or `synth.flow.stereo.depth_correction`.
 """
 
 from __future__ import annotations
@@ -13,6 +15,7 @@ from __future__ import annotations
 import copy
 import time
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -25,14 +28,25 @@ from torch import Tensor
 
 from evidence import report
 from evidence.flow.scenes import Recipe, cortex, inverse, noise_field, pairs, pixels, pull_field, sample
+from synth.errors import UserError
 from synth.flow import correction, image, mask_detection
-from synth.flow.track import track
+from synth.flow.stereo import depth_correction
+from synth.flow.stereo.depth_motion import Change
+from synth.flow.stereo.rig import Eye, StereoRig
+from synth.flow.stereo.track import Moved, StereoTracker, still_frames
+from synth.flow.track import Tracker, track
 from synth.flow.tvl1 import Tvl1
 from synth.job import reader
 from synth.sequence.scene import simulate
 
+Pairs = tuple[tuple[int, int], ...]
 Film = dict[str, Any]
 """Arrays by name."""
+_FIRST = 2000
+_EYES, _TOOLS = ("rgb", "rgb_right"), ("tool", "tool_right")
+_KEPT = (*_EYES, *_TOOLS, "flow", "visible", "motion")
+_BASELINES_MM = 24, 24, 24, 14, 34
+_PRESSED = 2.5  # times the weight of contacts' depth
 _SHORT = 0.06  # of frames are such as can't be followed
 _FREEDOM, _PLAIN = 5.0, 4.0  # of Student's distribution; weight of the error itself beside its likelihood
 _BATCH, _RATE = 8, 2e-3
@@ -40,56 +54,70 @@ _BATCH, _RATE = 8, 2e-3
 
 def main(
     examples: Path,
-    scenes: int = 477,
+    scenes: int = 480,
     closed: int = 160,
     drawn: int = 600,
     minutes: float = 30.0,
     seed: int = 0,
+    depth: bool = False,
 ) -> None:
     """Follows sequences, pulls and drawn pairs, as many as asked, and trains for so many CPU-minutes."""
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
     examples.mkdir(parents=True, exist_ok=True)
-    films = _films(scenes, closed, drawn)
-    for name, make in films:
-        if not (examples / f"{name}.npz").exists():
-            np.savez(examples / "part.npz", allow_pickle=False, **example(make()))
-            (examples / "part.npz").rename(examples / f"{name}.npz")
-    found = {name: dict(np.load(examples / f"{name}.npz")) for name, _ in films}
-    net, steps = fit([found[name] for name, _ in films], minutes, seed)
-    torch.save({k: v.half() for k, v in net.state_dict().items()}, correction.WEIGHTS)
+    films = _films(scenes, closed, drawn, depth)
+    describe, before = (depth_example, "depth_") if depth else (example, "")
+    files = [examples / f"{before}{name}.npz" for name, _ in films]
+    for file, (_, make) in zip(files, films, strict=True):
+        if not file.exists():
+            np.savez(examples / "part.npz", allow_pickle=False, **describe(make()))
+            (examples / "part.npz").rename(file)
+    found = [dict(np.load(file)) for file in files]
+    weights = depth_correction.WEIGHTS if depth else correction.WEIGHTS
+    net, steps = fit(found, depth, minutes, seed)
+    torch.save({k: v.half() for k, v in net.state_dict().items()}, weights)
+    drawings = f"{drawn} drawn pairs" if depth else f"{closed} pulls, {drawn} drawn pairs"
     card = {
-        "trained_on": f"sequences 0 to {scenes - 1} of mission, {closed} pulls, {drawn} drawn pairs",
-        "frames": sum(len(one["x"]) for one in found.values()),
+        "trained_on": f"sequences {_FIRST} to {_FIRST + scenes - 1} of mission, {drawings}",
+        "frames": sum(len(one["x"]) for one in found),
         "cpu_minutes": minutes,
         "steps": steps,
         "parameters": sum(p.numel() for p in net.parameters()),
         "torch": torch.__version__,
     }
-    report.save(correction.WEIGHTS.parent, "correction.json", card)
+    report.save(weights.parent, f"{weights.stem}.json", card)
     report.show(card)
 
 
-def _films(scenes: int, closed: int, drawn: int) -> list[tuple[str, Any]]:
+def _films(scenes: int, closed: int, drawn: int, depth: bool) -> list[tuple[str, Any]]:
     """Names of examples, and what makes their films."""
-    job = reader.load_job("mission")
     rendered = [
-        (f"{i:05d}_{k}", lambda i=i, k=k: _varied(_rendered(job, i), np.random.default_rng([i, k]), k))
-        for i in range(scenes)
+        (f"{i:05d}_{k}", lambda i=i, k=k: _varied(_rendered(i), np.random.default_rng([i, k]), k, depth))
+        for i in range(_FIRST, _FIRST + scenes)
         for k in range(2)
     ]
+    if depth:
+        return rendered + [(f"g{i:04d}", lambda i=i: _drawn_depth(i)) for i in range(drawn)]
     warped = [(f"p{i:04d}", lambda i=i: _warped(i)) for i in range(closed)]
     return rendered + warped + 3 * [(f"g{i:04d}", lambda i=i: _drawn(i)) for i in range(drawn)]
 
 
-def _rendered(job: Any, index: int) -> Film:
-    """Pictures `rgb`, `hidden` places, `tissue`, and the truth: `flow`, `visible`, and where `pressed`."""
-    scene = simulate(job, index)
+@lru_cache(1)
+def _rendered(index: int) -> Film:
+    """Both eyes' pictures and tools, `tissue`, lenses; true `flow`, `visible`, `motion`, where `pressed`."""
+    job = reader.load_job("mission")
+    baseline_mm = float(np.random.default_rng([55, index]).choice(_BASELINES_MM))
+    scene = simulate(
+        job.model_copy(update={"render": job.render.model_copy(update={"stereo_mm": baseline_mm})}), index
+    )
     frames = list(scene.frames())
-    film = {name: np.stack([getattr(f, name) for f in frames]) for name in ("rgb", "tool", "flow", "visible")}
+    film = {name: np.stack([getattr(f, name) for f in frames]) for name in _KEPT}
     size = np.linalg.norm(np.stack([f.traction for f in frames]), axis=-1)
     pressed = size > 0.05 * np.maximum(size.max((1, 2), keepdims=True), 1e-6)
-    return film | {"pressed": pressed, "tissue": scene.tissue}
+    left, right = scene.view, scene.renderer.right
+    assert right is not None
+    lenses = {"K": left.K, "dist": left.distortion, "Kr": right.K, "distr": right.distortion}
+    return film | lenses | {"baseline": baseline_mm, "pressed": pressed, "tissue": scene.tissue}
 
 
 def _warped(index: int) -> Film:
@@ -140,6 +168,44 @@ def _drawn(index: int) -> Film:
     there = (at + flow).astype(np.float32)
     covered = cv2.remap(hidden[1].astype(np.float32), there[..., 0], there[..., 1], cv2.INTER_LINEAR) > 0.5
     return _pair(rgb, hidden, flow, inside, covered, inside if rng.random() < 0.5 else np.ones_like(inside))
+
+
+def _drawn_depth(index: int) -> Film:
+    """Both eyes' view of drawn textures on a slope, in any motion, away from the lenses too and by itself."""
+    rng = np.random.default_rng([8642, index])
+    size = int(rng.choice([160, 192, 224]))
+    texture, flow = _texture(2 * size, rng), _motion(size, rng)
+    away, baseline, wide = rng.uniform(150, 400), rng.uniform(8, 40), np.exp(rng.uniform(2.3, 4.1))
+    focal, at = size * away / wide, pixels(size, size) - size / 2
+    rest = away * (1 + (at @ rng.normal(0, 0.2, 2)) / focal)
+    own = noise_field((size, size), float(rng.uniform(0.1, 1) * size), rng)
+    length = np.linalg.norm(flow, axis=-1)
+    depth = own * rng.uniform(0, 0.7) * (rng.random() < 0.7) + length * away / focal * rng.uniform(-1, 1)
+    middle = focal * baseline / away
+    aside, moved = (focal * baseline / z - middle for z in (rest, rest + depth))
+    eyes, noise, nothing = {}, rng.choice([0.3, 1, 2, 4]), np.zeros_like(aside)
+    for eye, side in zip(_EYES, (0, 1), strict=True):
+        shifts = -side * np.stack([aside, nothing], -1), flow - side * np.stack([moved, nothing], -1)
+        places = [(inverse(shift) + 0.5) * 2 - 0.5 for shift in shifts]
+        shown = [np.stack([sample(texture[..., c], one) for c in range(3)], -1) for one in places]
+        noisy = np.stack(shown) + rng.normal(0, noise, (2, size, size, 3))
+        eyes[eye] = np.clip(np.round(noisy), 0, 255).astype(np.uint8)
+    K, other = (np.array([[focal, 0, size / 2 + c], [0, focal, size / 2], [0, 0, 1]]) for c in (0, middle))
+    inside = np.all((pixels(size, size) + flow >= 0) & (pixels(size, size) + flow <= size - 1), axis=-1)
+    free = np.zeros((2, size, size), bool)
+    return eyes | {
+        "tool": free,
+        "tool_right": free,
+        "tissue": np.ones((size, size), bool),
+        "visible": np.stack([inside, inside]),
+        "pressed": free,
+        "motion": np.stack([np.zeros_like(depth), depth])[..., None] * [0, 0, 1],
+        "K": K,
+        "Kr": other,
+        "dist": np.zeros(5),
+        "distr": np.zeros(5),
+        "baseline": baseline,
+    }
 
 
 def _pair(rgb: list[Any], hidden: Any, flow: Any, inside: Any, covered: Any, tissue: Any) -> Film:
@@ -198,49 +264,104 @@ def example(film: Film) -> Film:
     """What the network sees of a film, what its flow misses, and weights: (T - 1, C, h, w) x, y, w."""
     rgb, tissue = film["rgb"], film["tissue"]
     hidden = film["hidden"] if "hidden" in film else mask_detection.hidden(rgb, film["tool"])
-    found = track(Tvl1(corrected=False), rgb, hidden, tissue)
+    tracker = Tracker(Tvl1(corrected=False), rgb[0], hidden[0], tissue)
     rows = []
-    usable, share = tissue & ~hidden[0], correction.means(1.0 * tissue)
-    rest = _normalised(rgb[0], usable)
+    rest = _normalised(rgb[0], tracker.usable)[0, 0].numpy()
     for t in range(1, len(rgb)):
-        now, along = _normalised(rgb[t], ~hidden[t]), torch.from_numpy(found.flow[t]).movedim(-1, 0)[None]
+        tracker.step(rgb[t], hidden[t])
+        assert tracker.last is not None
+        flow, agreed = tracker.last.flow, tracker.last.confidence
+        now, along = _normalised(rgb[t], ~hidden[t]), torch.from_numpy(flow).movedim(-1, 0)[None]
         warped, seen = (one[0, 0].numpy() for one in image.warp(now, image.flags(~hidden[t]), along))
-        flow, greys = found.flow[t], (rest[0, 0].numpy(), warped)
-        x = correction.describe(rgb[0], rgb[t], usable, greys, seen, flow, found.confidence[t])
+        x = correction.describe(rgb[0], rgb[t], tracker.usable, (rest, warped), seen, flow, agreed)
         missing = ((film["flow"][t] - flow) * tissue[..., None]).transpose(2, 0, 1)
+        share = correction.means(1.0 * tissue)
         y = correction.means(*missing) / np.maximum(share, 0.05)
         visible, pressed = film["visible"][t] & tissue, film["pressed"][t] & tissue
-        w = share * (0.2 + 0.8 * correction.means(visible)) * (1 + 3 * correction.means(pressed))
-        rows.append([correction.padded(np.asarray(one, np.float32)) for one in (x, y, w)])
-    return {name: np.stack(column) for name, column in zip("xyw", zip(*rows, strict=True), strict=True)}
+        rows.append((x, y, _weight(share, *correction.means(visible, pressed))))
+    return _example(rows)
+
+
+def _weight(share: Any, visible: Any, pressed: Any) -> Any:
+    """(1, h, w) of cells: what is hidden counts little, contacts much."""
+    return (share * (0.2 + 0.8 * visible) * (1 + 3 * pressed)).reshape(1, *visible.shape)
+
+
+def _example(rows: list[Any]) -> Film:
+    kept = [[correction.padded(np.asarray(one, np.float32)) for one in row] for row in rows]
+    return {name: np.stack(column) for name, column in zip("xyw", zip(*kept, strict=True), strict=True)}
+
+
+class _Observed(StereoTracker):
+    """Keeps what the network sees of the last frame, and the depth motion (H, W) mm without correction."""
+
+    def _moved(self, change: Change, flow: Any, confidence: Any, lost: bool) -> Moved:
+        r = self.rectified
+        self.features, _ = self.describe(change, flow, confidence)
+        self.depth = r.depth(self.rest.disparity + change.px) - r.depth(self.rest.disparity)
+        return Moved.nothing(self.tissue.shape)
+
+
+def depth_example(film: Film) -> Film:
+    """As `example`, of the depth solver: y in units of `depth_correction`."""
+    tissue = film["tissue"]
+    hidden = [mask_detection.hidden(film[rgb], film[tool]) for rgb, tool in zip(_EYES, _TOOLS, strict=True)]
+    found = track(Tvl1(), film["rgb"], hidden[0], tissue)
+    eyes = Eye(film["K"], film["dist"]), Eye(film["Kr"], film["distr"])
+    pair = StereoRig(*eyes, np.eye(3), np.array([-float(film["baseline"]), 0, 0]), tissue.shape[::-1])
+    still = still_frames(found.flow, tissue)
+    left, right = (film[rgb] for rgb in _EYES)
+    try:
+        tracker = _Observed(pair, left[:still], right[:still], hidden[0][0], hidden[1][0], tissue)
+    except UserError:  # so blurred or noisy that the eyes don't match: nothing is learnt from it
+        return _example([_empty(depth_correction.CHANNELS)])
+    rows, r, coarse = [], tracker.rectified, tracker.solver.coarse
+    inside = r.flags(tissue, 0).astype(np.float32)
+    for t in range(1, len(film["rgb"])):
+        tracker.step(left[t], right[t], hidden[0][t], hidden[1][t], found.flow[t], found.confidence[t])
+        there = film["visible"][t] & tissue
+        true, visible, pressed = (
+            r.picture(np.ascontiguousarray(one, np.float32), 0)
+            for one in (film["motion"][t][..., 2], there, there & film["pressed"][t])
+        )
+        share = coarse(inside)
+        missing = coarse((true - tracker.depth) * inside) / np.maximum(share, 0.05) / depth_correction.UNIT_MM
+        weight = _weight(share, coarse(visible).clip(0, 1), coarse(pressed).clip(0, 1))
+        weight[weight > 1] *= _PRESSED
+        rows.append((tracker.features, missing[None], weight))
+    return _example(rows)
+
+
+def _empty(channels: int) -> Any:
+    return [np.zeros((n, 30, 40), np.float32) for n in (channels, 1, 1)]
 
 
 def _normalised(rgb: NDArray[np.uint8], usable: NDArray[np.bool_]) -> Tensor:
     return image.normalise(image.tensor(rgb), image.flags(usable))
 
 
-def _varied(film: Film, rng: np.random.Generator, again: int) -> Film:
-    """A film as another camera might show it; as it is the first time."""
+def _varied(film: Film, rng: np.random.Generator, again: int, depth: bool) -> Film:
+    """A film as another camera might show it, its right eye too if depth is asked for; as it is at first."""
     if not again:
         return film
-    film = (
-        _resized(film, float(np.exp(rng.uniform(np.log(0.7), np.log(1.35))))) if rng.random() < 0.5 else film
-    )
+    if not depth and rng.random() < 0.5:
+        film = _resized(film, float(np.exp(rng.uniform(np.log(0.7), np.log(1.35)))))
     gain, gamma, white = rng.uniform(0.6, 1.3), np.exp(rng.normal(0, 0.15)), np.exp(rng.normal(0, 0.08, 3))
     contrast = rng.uniform(0.5, 1.1) if rng.random() < 0.4 else 1.0
     noise, blur, drift = rng.choice([0, 1, 2, 4]), rng.choice([0, 0, 0.5, 0.9]), rng.normal(0, 0.05)
     quality = int(rng.choice([0, 95, 85, 70, 50]))
-    shown = []
-    for t, picture in enumerate(film["rgb"]):
-        one = picture / 255.0
-        one = cv2.GaussianBlur(one, (0, 0), float(blur)) if blur else one
-        one = np.clip(one.mean((0, 1)) + contrast * (one - one.mean((0, 1))), 0, 1)
-        one = 255 * np.clip(gain * (1 + drift * t / 7) * white * one**gamma, 0, 1)
-        one = np.clip(np.round(one + noise * rng.standard_normal(one.shape)), 0, 255).astype(np.uint8)
-        shown.append(
-            _spoilt(_jpeg(one, quality), rng) if t and rng.random() < _SHORT else _jpeg(one, quality)
-        )
-    return film | {"rgb": np.stack(shown)}
+    shown: dict[str, list[Any]] = {name: [] for name in (_EYES if depth else _EYES[:1])}
+    for name in shown:
+        balance = white * np.exp(rng.normal(0, 0.03, 3))
+        for t, picture in enumerate(film[name]):
+            one = picture / 255.0
+            one = cv2.GaussianBlur(one, (0, 0), float(blur)) if blur else one
+            one = np.clip(one.mean((0, 1)) + contrast * (one - one.mean((0, 1))), 0, 1)
+            one = 255 * np.clip(gain * (1 + drift * t / 7) * balance * one**gamma, 0, 1)
+            one = np.clip(np.round(one + noise * rng.standard_normal(one.shape)), 0, 255).astype(np.uint8)
+            spoilt = not depth and t and rng.random() < _SHORT
+            shown[name].append(_spoilt(_jpeg(one, quality), rng) if spoilt else _jpeg(one, quality))
+    return film | {name: np.stack(pictures) for name, pictures in shown.items()}
 
 
 def _resized(film: Film, share: float) -> Film:
@@ -279,11 +400,12 @@ def _spoilt(picture: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.
     return np.ascontiguousarray(ways[int(rng.integers(4))]())
 
 
-def fit(examples: list[Film], minutes: float, seed: int) -> tuple[correction.CorrectionNet, int]:
+def fit(examples: list[Film], depth: bool, minutes: float, seed: int) -> tuple[correction.CorrectionNet, int]:
     """The network after so many minutes of one core, its weights averaged over the last steps."""
     torch.manual_seed(seed)
-    rng, net = np.random.default_rng(seed), correction.CorrectionNet()
-    _standardise(net, examples)
+    rng, kind = np.random.default_rng(seed), depth_correction if depth else correction
+    net = correction.CorrectionNet(kind.CHANNELS, 1 if depth else 2)
+    _standardise(net, examples, kind.VECTORS)
     average, optimiser = copy.deepcopy(net), torch.optim.AdamW(net.parameters(), _RATE, weight_decay=1e-3)
     groups: dict[tuple[int, ...], list[tuple[int, int]]] = {}
     for i, one in enumerate(examples):
@@ -296,7 +418,8 @@ def fit(examples: list[Film], minutes: float, seed: int) -> tuple[correction.Cor
         group = list(groups.values())[rng.choice(len(groups), p=chances / chances.sum())]
         drawn = [group[k] for k in rng.integers(len(group), size=_BATCH)]
         x, y, w = (torch.from_numpy(np.stack([examples[i][n][t] for i, t in drawn])).float() for n in "xyw")
-        x, y, w = _turned(x, y, w, int(rng.integers(8)))
+        # Depth knows where the second eye is: its pictures aren't turned.
+        x, y, w = _turned(x, y, w, int(rng.integers(4 if depth else 8)), kind.VECTORS)
         optimiser.zero_grad()
         _loss(net(x), y, w).backward()  # type: ignore[no-untyped-call]
         torch.nn.utils.clip_grad_norm_(net.parameters(), 1.0)
@@ -308,34 +431,36 @@ def fit(examples: list[Film], minutes: float, seed: int) -> tuple[correction.Cor
     return average.eval(), steps
 
 
-def _standardise(net: correction.CorrectionNet, examples: list[Film]) -> None:
+def _standardise(net: correction.CorrectionNet, examples: list[Film], vectors: Pairs) -> None:
     """Every channel to about mean 0 and deviation 1; vectors keep their direction."""
     some = np.concatenate(
-        [one["x"].transpose(0, 2, 3, 1).reshape(-1, correction.CHANNELS)[::60] for one in examples]
+        [np.moveaxis(one["x"], 1, -1).reshape(-1, one["x"].shape[1])[::60] for one in examples]
     )
     mean, deviation = some.mean(0, dtype=np.float64), some.std(0, dtype=np.float64)
-    for pair in map(list, correction.VECTORS):
+    for pair in map(list, vectors):
         mean[pair], deviation[pair] = 0, deviation[pair].mean()
     net.mean[0, :, 0, 0], net.deviation[0, :, 0, 0] = torch.from_numpy(mean), torch.from_numpy(deviation)
 
 
-def _turned(x: Tensor, y: Tensor, w: Tensor, turn: int) -> tuple[Tensor, Tensor, Tensor]:
-    """One of the eight turned and mirrored views of the same."""
+def _turned(x: Tensor, y: Tensor, w: Tensor, turn: int, vectors: Pairs) -> tuple[Tensor, Tensor, Tensor]:
+    """One of the eight turned and mirrored views of the same; of y, two parts are a vector and one is not."""
     for bit, side, axis in ((1, -1, 0), (2, -2, 1)):
         if turn & bit:
             x, y, w = x.flip(side).clone(), y.flip(side).clone(), w.flip(side)
-            x[:, [pair[axis] for pair in correction.VECTORS]] *= -1
-            y[:, axis] *= -1
+            x[:, [pair[axis] for pair in vectors]] *= -1
+            if y.shape[1] == 2:
+                y[:, axis] *= -1
     if turn & 4:
-        order = list(range(correction.CHANNELS))
-        for i, j in correction.VECTORS:
+        order = list(range(x.shape[1]))
+        for i, j in vectors:
             order[i], order[j] = j, i
         x, y, w = x[:, order].mT.contiguous(), y.flip(1).mT, w.mT
     return x, y, w
 
 
 def _loss(found: Tensor, missing: Tensor, weight: Tensor) -> Tensor:
-    error, log_variance = missing - found[:, :2], found[:, 2:].clamp(-8, 5)
+    added, log_variance = found.chunk(2, 1)
+    error, log_variance = missing - added, log_variance.clamp(-8, 5)
     surprise = torch.log1p(error**2 / (_FREEDOM * torch.exp(log_variance)))
     likely = 0.5 * log_variance + 0.5 * (_FREEDOM + 1) * surprise
     return (weight * (likely + _PLAIN * torch.sqrt(error**2 + 1e-4))).sum() / weight.sum()

@@ -12,6 +12,7 @@ from __future__ import annotations
 import importlib
 import json
 import warnings
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,19 @@ from learn.checkpoint import ModelCard
 from learn.data.grid import HALF_SURE_MM, SMOOTHING_MM, channels
 from learn.inference.predict import Predictor
 from synth.errors import UserError
+from synth.flow import correction
+from synth.flow.stereo import depth_correction
 
+CORRECTIONS = {
+    "flow-correction": (correction.WEIGHTS, correction.CHANNELS, 2, "see synth.flow.correction.describe"),
+    "depth-correction": (
+        depth_correction.WEIGHTS,
+        depth_correction.CHANNELS,
+        1,
+        "see synth.flow.stereo.depth_correction.describe",
+    ),
+}
+"""Networks that correct motion before it is read: weights, channels, parts, input."""
 TOLERANCE = 1e-4
 """Largest difference from PyTorch allowed, in units of the training data's 99.9th percentile."""
 
@@ -74,21 +87,56 @@ def export(predictor: Predictor, file: Path, kind: str) -> float:
     """
     card = predictor.card
     module = Portable(predictor.model.cpu(), card).eval()
+    cases = [examples(card, batch, seed=batch) for batch in (1, 3)]
+    worst = _export(module, cases, Axes(input_names(card), {0: "batch"}), file, kind, card.scales.target)
+    _describe(file, describe(card, kind, worst))
+    return worst
+
+
+@torch.no_grad()
+def export_correction(name: str, file: Path, kind: str) -> float:
+    """As `export`, of the network that corrects recovered motion (`CORRECTIONS`); any size of picture."""
+    weights, channels, parts, sees = CORRECTIONS[name]
+    net = correction.load(weights, channels, parts)
+    cases = [torch.randn(1, channels, *size) for size in ((32, 40), (48, 64))]
+    axes = Axes(["features"], {2: "height", 3: "width"}, "correction")
+    worst = _export(net, [[one * net.deviation + net.mean] for one in cases], axes, file, kind, 1.0)
+    said = "what is to be added, then the logarithm of its variance, a channel for each part"
+    sizes = "height and width are multiples of 8 cells"
+    _describe(file, {"format": kind, "input": f"{sees}; {sizes}", "output": said, "parts": parts})
+    return worst
+
+
+@dataclass(frozen=True)
+class Axes:
+    """What a file's inputs and output are called, and which of their axes may have any length."""
+
+    inputs: list[str]
+    free: dict[int, str]
+    output: str = "density"
+
+
+def _describe(file: Path, said: dict[str, Any]) -> None:
+    file.with_suffix(file.suffix + ".json").write_text(json.dumps(said, indent=1))
+
+
+def _export(
+    module: nn.Module, cases: list[list[Tensor]], axes: Axes, file: Path, kind: str, least: float
+) -> float:
+    """Writes `file` and compares; differences in units of the largest answer, at least `least`."""
     file.parent.mkdir(parents=True, exist_ok=True)
     write = {"torchscript": _torchscript, "onnx": _onnx}.get(kind)
     if write is None:
         raise UserError(f"unknown format {kind!r}: torchscript or onnx")
-    run = write(module, card, file)
+    run = write(module, cases[-1], axes, file)
     worst = 0.0
-    for batch in (1, 3):
-        inputs = examples(card, batch, seed=batch)
+    for inputs in cases:
         expected = module(*inputs)
-        largest = max(card.scales.target, float(expected.abs().max()))
+        largest = max(least, float(expected.abs().max()))
         worst = max(worst, float((run(inputs) - expected).abs().max()) / largest)
     if not worst <= TOLERANCE:
         file.unlink()
         raise UserError(f"{file}: differs from PyTorch by {worst:.1e} of full scale, at most {TOLERANCE:g}")
-    file.with_suffix(file.suffix + ".json").write_text(json.dumps(describe(card, kind, worst), indent=1))
     return worst
 
 
@@ -128,17 +176,17 @@ def describe(card: ModelCard, kind: str, difference: float) -> dict[str, Any]:
     }
 
 
-def _torchscript(module: Portable, card: ModelCard, file: Path) -> Any:
+def _torchscript(module: nn.Module, inputs: list[Tensor], axes: Axes, file: Path) -> Any:
     with warnings.catch_warnings():
         # Tracing warns that shapes are taken as constants: the grid's size is one.
         warnings.simplefilter("ignore")
         jit: Any = torch.jit
-        jit.trace(module, tuple(examples(card, 2)), check_trace=False).save(str(file))
+        jit.trace(module, tuple(inputs), check_trace=False).save(str(file))
         loaded = jit.load(str(file))
     return lambda inputs: loaded(*inputs)
 
 
-def _onnx(module: Portable, card: ModelCard, file: Path) -> Any:
+def _onnx(module: nn.Module, inputs: list[Tensor], axes: Axes, file: Path) -> Any:
     try:
         importlib.import_module("onnx")
         runtime: Any = importlib.import_module("onnxruntime")
@@ -148,19 +196,18 @@ def _onnx(module: Portable, card: ModelCard, file: Path) -> Any:
         warnings.simplefilter("ignore")
         torch.onnx.export(
             module,
-            tuple(examples(card, 2)),
+            tuple(inputs),
             str(file),
-            input_names=input_names(card),
-            output_names=["density"],
-            dynamic_axes={name: {0: "batch"} for name in [*input_names(card), "density"]},
+            input_names=axes.inputs,
+            output_names=[axes.output],
+            dynamic_axes={name: axes.free for name in [*axes.inputs, axes.output]},
             dynamo=False,
             opset_version=17,
         )
     session = runtime.InferenceSession(str(file), providers=["CPUExecutionProvider"])
-    order = input_names(card)
 
     def run(inputs: list[Tensor]) -> Tensor:
-        named = {name: value.numpy() for name, value in zip(order, inputs, strict=True)}
+        named = {name: value.numpy() for name, value in zip(axes.inputs, inputs, strict=True)}
         return torch.from_numpy(session.run(None, named)[0])
 
     return run

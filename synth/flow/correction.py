@@ -46,21 +46,22 @@ _TWELVE, _QUARTER = np.float32(12), np.float32(0.25)
 
 
 class CorrectionNet(nn.Module):
-    """Features in, x, y [px] to be added and their log-variances out: (B, 24, h, w) → (B, 4, h, w)."""
+    """Features in, what is to be added and its log-variance out: (B, channels, h, w) → (B, 2 parts, h, w)."""
 
     mean: Tensor
     deviation: Tensor
 
-    def __init__(self) -> None:
+    def __init__(self, channels: int = CHANNELS, parts: int = 2) -> None:
         super().__init__()
         a, b, c = _WIDTHS
-        self.register_buffer("mean", torch.zeros(1, CHANNELS, 1, 1))
-        self.register_buffer("deviation", torch.ones(1, CHANNELS, 1, 1))
-        self.stem = nn.Sequential(nn.Conv2d(CHANNELS, a, 1), nn.ReLU(), nn.Conv2d(a, a, 3, 1, 1), nn.ReLU())
+        self.parts = parts
+        self.register_buffer("mean", torch.zeros(1, channels, 1, 1))
+        self.register_buffer("deviation", torch.ones(1, channels, 1, 1))
+        self.stem = nn.Sequential(nn.Conv2d(channels, a, 1), nn.ReLU(), nn.Conv2d(a, a, 3, 1, 1), nn.ReLU())
         self.down = nn.ModuleList([_block(a, b, 2), _block(b, c, 2), _block(c, c, 2)])
         self.up = nn.ModuleList([_block(c + c, c), _block(c + b, b), _block(b + a, a)])
-        self.head = nn.Conv2d(a, 4, 1)
-        self.straight = nn.Conv2d(CHANNELS, 2, 1, bias=False)
+        self.head = nn.Conv2d(a, 2 * parts, 1)
+        self.straight = nn.Conv2d(channels, parts, 1, bias=False)
         nn.init.zeros_(self.head.weight)
         nn.init.zeros_(self.straight.weight)
 
@@ -73,15 +74,16 @@ class CorrectionNet(nn.Module):
             wide = F.interpolate(field, scale_factor=2, mode="bilinear", align_corners=False)
             field = layer(torch.cat([wide, skips.pop()], 1))
         found = self.head(field)
-        return torch.cat([found[:, :2] + self.straight(features), found[:, 2:]], 1)
+        added, log_variance = found.split(self.parts, 1)
+        return torch.cat([added + self.straight(features), log_variance], 1)
 
 
 @cache
-def load(path: Path = WEIGHTS) -> CorrectionNet:
-    """The network with its weights. Raises UserError if they aren't there."""
+def load(path: Path = WEIGHTS, channels: int = CHANNELS, parts: int = 2) -> CorrectionNet:
+    """A network with its weights. Raises UserError if they aren't there."""
     if not path.is_file():
-        raise UserError(f"{path.name}: the flow's correction is missing from this installation")
-    net = CorrectionNet()
+        raise UserError(f"{path.name}: the correction of motion is missing from this installation")
+    net = CorrectionNet(channels, parts)
     state = torch.load(path, map_location="cpu", weights_only=True)
     net.load_state_dict({name: value.float() for name, value in state.items()})
     # As the processor's convolutions like it: two thirds of the time.
@@ -97,15 +99,19 @@ def correct(net: CorrectionNet, features: NDArray[np.float32], flow: Flow) -> tu
         flow: (H, W, 2) px, the one described.
     """
     height, width = flow.shape[:2]
-    with torch.inference_mode():
-        cells = torch.from_numpy(padded(features))[None]
-        found = net(cells.to(memory_format=torch.channels_last))
-        small = found[0].permute(1, 2, 0).numpy()
+    small = answer(net, features).transpose(1, 2, 0)
     size = CELL * small.shape[1], CELL * small.shape[0]
     missing, spread = (cv2.resize(part, size)[:height, :width] for part in (small[..., :2], small[..., 2:]))
     # The geometric mean of both components', within what was trained.
     spread = np.clip(spread, -8, 5, out=spread)
     return flow + missing, np.exp(0.25 * (spread[..., 0] + spread[..., 1]))
+
+
+def answer(net: CorrectionNet, features: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(2 parts, h', w') what it says of features (channels, h, w), with the cells that its levels add."""
+    with torch.inference_mode():
+        cells = torch.from_numpy(padded(features))[None]
+        return np.asarray(net(cells.to(memory_format=torch.channels_last))[0])
 
 
 def padded(cells: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -9,7 +9,6 @@ from synth.errors import UserError
 from synth.flow.confidence import deviation
 from synth.flow.estimator import Flags, Flow, Map
 from synth.flow.stereo.depth_motion import Change, DepthMotionSettings, Solver, fine
-from synth.flow.stereo.deviation import inverse_posterior
 from synth.flow.stereo.rig import Floats
 from synth.flow.stereo.track import Moved
 
@@ -77,9 +76,8 @@ class DepthTracker:
         return self._moved(change.px, spread, straight, confidence)
 
     def _deviation(self, change: Change) -> Map:
-        """(H, W) mm, of the depth motion: the plate's posterior, as in `deviation`."""
-        spread = _CAUTION / inverse_posterior(change)
-        return np.maximum(fine(np.asarray(spread, np.float32), self.solver.cell, self.tissue.shape), 1e-4)
+        """(H, W) mm, of the depth motion: the plate's posterior."""
+        return np.maximum(fine(_CAUTION * change.deviation, self.solver.cell, self.tissue.shape), 1e-4)
 
     def _moved(self, rise: Map, spread: Map, flow: Map, confidence: Map) -> Moved:
         height, width = self.tissue.shape

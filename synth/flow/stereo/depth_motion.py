@@ -38,6 +38,7 @@ Map = NDArray[np.float32]
 
 _FREEDOM = np.float32(4.0)  # of Student's distribution
 _CHANNELS = np.float32(3.0)
+_AROUND = (5, 5)  # cells whose pictures a cell's depth rests on
 _ALIKE_PX = 40.0  # errors of a flow are alike over so many pixels
 _MEDIAN = 0.4549  # of the square of a standard normal
 _ONE, _EIGHT, _TWELFTH, _HALF = np.float32(1), np.float32(8), np.float32(1 / 12), np.float32(0.5)
@@ -82,6 +83,8 @@ class Change:
     """(H, W) change of disparity."""
     precision: Map
     """(h, w) by cell: how much the pictures say, in 1/px^2; 0 where nothing is seen."""
+    pull: Map
+    """(h, w) by cell: precision times the change that the pictures alone would have, in 1/px."""
     stiffness: Map
     """(h, w) by cell: 1 / k^2, in 1/px^2."""
     misfit: Map
@@ -90,6 +93,12 @@ class Change:
     """(H, W) 0 or 1: in all four pictures."""
     lag: float = 0.0
     """Share of the left eye's motion that the right one doesn't show: of eyes that aren't of one moment."""
+
+    @property
+    def deviation(self) -> Map:
+        """(h, w) px by cell: the plate's posterior, which knows nothing of errors alike over many pixels."""
+        precision = cv2.blur(self.precision, _AROUND, borderType=cv2.BORDER_REPLICATE) + 1e-3
+        return np.asarray(1 / np.sqrt(8 * np.sqrt(precision * self.stiffness)), np.float32)
 
 
 class Solver:
@@ -149,7 +158,8 @@ class Solver:
             change = fine(self._settled(prior, sums[0], sums[1]), self.cell, disparity.shape)
         misfit = np.where(sums[3] > 0, sums[2] / np.maximum(sums[3], 1), 1)
         lag = _lag(right_now[0] - less[0], right_now[2], flow[1], both, noise[0])
-        return Change(change, sums[0].astype(np.float32), stiffness, misfit.astype(np.float32), both, lag)
+        precision, pull = sums[:2].astype(np.float32)
+        return Change(change, precision, pull, stiffness, misfit.astype(np.float32), both, lag)
 
     def smooth(self, samples: Map, weight: Map, flow: Map, px_per_mm: float) -> Change:
         """The same prior on changes of disparity found elsewhere, pixel by pixel; Student's weights as well.
@@ -164,7 +174,7 @@ class Solver:
         prior = self._prior(stiffness)
         change = np.zeros_like(samples)
         misfit = np.ones(self.shape, np.float32)
-        information = np.zeros(self.shape, np.float32)
+        information, pull = np.zeros((2, *self.shape), np.float32)
         for _ in range(self.settings.cold):
             off = samples - change
             known = weight > 0
@@ -177,9 +187,8 @@ class Solver:
             change = fine(self._settled(prior, information, pull), self.cell, samples.shape)
             seen = self.coarse(known.astype(np.float32))
             misfit = np.where(seen > 0, self.coarse((known * square).astype(np.float32)) / (seen + 1e-6), 1)
-        return Change(
-            change, information, stiffness, misfit.astype(np.float32), (weight > 0).astype(np.float32)
-        )
+        visible = (weight > 0).astype(np.float32)
+        return Change(change, information, pull, stiffness, misfit.astype(np.float32), visible)
 
     def _settled(self, prior: sparse.csr_matrix, information: NDArray[Any], pull: NDArray[Any]) -> Map:
         """The cells' changes (h, w) px: data and prior in balance."""

@@ -13,15 +13,16 @@ from synth.errors import UserError
 from synth.flow import fused, image
 from synth.flow.confidence import deviation
 from synth.flow.estimator import Flags, Flow, Map, Rgb
-from synth.flow.stereo import rest
+from synth.flow.stereo import depth_correction, rest
 from synth.flow.stereo.depth_motion import Change, DepthMotionSettings, Solver, StereoPictures, fine
-from synth.flow.stereo.deviation import deviations
 from synth.flow.stereo.rig import Rectified, StereoRig
 
 _STILL_PX = 0.3  # frames whose flow is nearly everywhere below this are at rest
 _RESTS = 4
 _IN_TIME = 0.12  # share of the motion that eyes of one moment may seem to differ by
 _FOLLOWED = 0.3  # confidence of the flow: less under a tool that no mask knows, 0.9 and more on tissue
+_ACROSS, _ALONG = 1.15, 1.3  # multiples of the networks' deviations, by the coverage at contacts
+_ADDED = 0.4  # share of what the depth's correction adds that may be wrong
 _LOST = 0.05  # of what is visible at rest: a frame that shows less is no place to start from
 
 
@@ -143,30 +144,53 @@ class StereoTracker:
         change = self.solver.solve(pictures, straight, self.rest.disparity, self.px_per_mm, self._change)
         lost = float(change.visible.sum()) < _LOST * float(self._usable.sum())
         self._change = None if lost else change.px
-        return self._moved(change, straight, confidence)
+        return self._moved(change, straight, confidence, lost)
 
-    def _moved(self, change: Change, flow: Map, confidence: Map) -> Moved:
-        r, disparity, coarse = self.rectified, self.rest.disparity, self.solver.coarse
+    def _moved(self, change: Change, flow: Map, confidence: Map, lost: bool) -> Moved:
+        r, disparity, solver = self.rectified, self.rest.disparity, self.solver
         self.lag = change.lag
         """Share of the last frame's motion that the right eye didn't show: 0 for eyes of one moment."""
-        seen = r.flags(confidence > 0, 0).astype(np.float32)
-        share = coarse(seen)
-        sure = coarse(r.picture(confidence, 0) * seen) / np.maximum(share, 0.1)
-        spread = deviation(_filled(np.asarray(sure, np.float32), share > 0.1))
-        along, across = deviations(change, self.solver.steepness(flow), spread)
+        features, spread = self.describe(change, flow, confidence)
+        added, off = depth_correction.correct(features)
+        if lost:  # of a second eye that shows nothing there is nothing to correct
+            added = np.zeros_like(added)
+        # What the second eye doesn't see is known by the plate alone.
+        off = np.maximum(np.hypot(_ALONG * off, _ADDED * added), change.deviation / self.px_per_mm)
         # What of another moment's motion passes for depth.
-        late = np.sqrt(max(change.lag**2 - _IN_TIME**2, 0.0)) * coarse(np.abs(flow[0]) + np.abs(change.px))
-        along = np.hypot(along, late) / self.px_per_mm
-        across *= self._mm_per_px
-        motion = r.motion(disparity, change.px, flow)
+        late = np.sqrt(max(change.lag**2 - _IN_TIME**2, 0.0)) * solver.coarse(
+            np.abs(flow[0]) + np.abs(change.px)
+        )
+        off = np.hypot(off, late / self.px_per_mm)
+        # A change of disparity for the millimetres to be added, at the depth that was found.
+        here = r.depth(disparity + change.px)
+        nearer = here / (here + fine(added, solver.cell, disparity.shape))
+        px = (disparity + change.px + r.shift) * nearer - r.shift - disparity
+        motion = r.motion(disparity, px, flow)
+        across = _ACROSS * self._mm_per_px * spread
         # Logarithms: a deviation that falls steeply would be interpolated to below 0.
-        logs = [fine(np.log(part), self.solver.cell, disparity.shape) for part in (across, across, along)]
+        logs = [fine(np.log(part), solver.cell, disparity.shape) for part in (across, across, off)]
         planes = [r.back(np.ascontiguousarray(motion[..., k])) for k in range(3)]
         inside = self.tissue[..., None]
         return Moved(
             np.stack(planes, axis=-1) * inside,
             np.stack([np.exp(r.back(part)) for part in logs], axis=-1) * inside,
         )
+
+    def describe(self, change: Change, flow: Map, confidence: Map) -> tuple[NDArray[np.float32], Map]:
+        """What `depth_correction` sees of a frame, and the deviation (h, w) px of the flow's components.
+
+        Args:
+            change: of the solver.
+            flow: (2, H, W) px, rectified.
+            confidence: (H, W) in 0..1, of that flow, on the left eye's own pixels.
+        """
+        r, coarse = self.rectified, self.solver.coarse
+        seen = r.flags(confidence > 0, 0).astype(np.float32)
+        share = coarse(seen)
+        sure = coarse(r.picture(confidence, 0) * seen) / np.maximum(share, 0.1)
+        spread = deviation(_filled(np.asarray(sure, np.float32), share > 0.1))
+        sizes = self.px_per_mm, self._mm_per_px
+        return depth_correction.describe(change, self.solver, flow, share, spread, *sizes), spread
 
     def _normalised(self, rgb: Rgb, usable: Flags, eye: int) -> tuple[Map, Map]:
         """The rectified picture in local deviations and where it is usable, both (H, W) float32."""

@@ -20,7 +20,7 @@ from learn.cli import app
 from learn.data.clips import Clip
 from learn.data.grid import Grid
 from learn.inference.apply import stiffness
-from learn.inference.export import examples, export
+from learn.inference.export import CORRECTIONS, examples, export, export_correction
 from learn.inference.predict import load_model
 from learn.settings import override, preset
 from learn.training.batches import measure_scales
@@ -55,6 +55,17 @@ def test_an_exported_model_says_the_same(model: Path, tmp_path: Path, kind: str)
     note = json.loads((tmp_path / "net.json").read_text())
     assert note["inputs"][:2] == ["displacement", "mask"]
     assert note["grid"]["pitch_mm"] == 36 / 32
+
+
+@pytest.mark.parametrize("name", sorted(CORRECTIONS))
+def test_an_exported_correction_takes_any_size(name: str, tmp_path: Path) -> None:
+    file = tmp_path / "net.onnx"
+    assert export_correction(name, file, "onnx") <= 1e-4
+    channels = CORRECTIONS[name][1]
+    found = onnxruntime.InferenceSession(str(file)).run(
+        None, {"features": np.zeros((1, channels, 16, 24), "f4")}
+    )
+    assert found[0].shape[2:] == (16, 24)
 
 
 def test_the_gain_is_in_every_map(model: Path, tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from synth.errors import UserError
-from synth.flow.stereo import calibration, depth_motion, rest
+from synth.flow.stereo import calibration, depth_correction, depth_motion, rest
 from synth.flow.stereo.rig import Eye, Rectified, StereoRig
 from synth.flow.stereo.track import StereoTracker
 
@@ -199,6 +199,19 @@ def test_a_right_eye_of_another_moment_is_found_out() -> None:
     assert lags[1] == pytest.approx(0.5, abs=0.2)
     assert errors[1] > 10 * errors[0], "half of the motion passes for depth"
     assert spreads[1] > 0.5 * errors[1]
+
+
+def test_the_depth_that_pictures_would_still_have_is_seen_in_millimetres() -> None:
+    solver = depth_motion.Solver(SIZE[::-1])
+    nothing, one = np.zeros(SIZE[::-1], np.float32), np.ones(solver.shape, np.float32)
+    # A tenth of a pixel nearer: at 5 px/mm the tissue is 0.02 mm less far away.
+    change = depth_motion.Change(nothing, 1e4 * one, 1e3 * one, one, one, nothing)
+    flow = np.stack([nothing, nothing])
+    seen = depth_correction.describe(change, solver, flow, one, 0.5 * one, px_per_mm=5.0, mm_per_px=0.2)
+    assert seen.shape == (depth_correction.CHANNELS, *solver.shape)
+    np.testing.assert_allclose(seen[[5, 7]], -0.02, rtol=1e-2)
+    np.testing.assert_allclose(np.exp(seen[6]), 1 / (100 * 5), rtol=1e-3)
+    np.testing.assert_allclose(np.exp(seen[11]), 0.1, rtol=1e-5)
 
 
 def _source(along: np.ndarray) -> np.ndarray:
