@@ -23,10 +23,10 @@ from synth.flow.track import Solution, Tracker
 _LARGEST = 0.4  # of the tissue: more is no instrument and no highlight
 _UNEXPLAINED = 0.12  # local deviations by which the residual exceeds that elsewhere
 _GAIN = 0.01  # local deviations by which masking lowers the residual around a block
+_SURE = 3.0  # standard errors by which a block has to show it: small pictures' blocks hold few pixels
 _RING_PX = 6  # what is "around" a block
-_SMALLEST_PX = 20  # smaller ones are not judged
+_SMALLEST_PX = 20  # so much that was not judged is something new
 _CELLS = 6  # blocks on the longer side
-_CAPPED = 1.5  # local deviations: one wrong pixel counts no more
 _GROWN_PX = 0.5  # masks are selected anew as motion grows by so much, or when something new turns up ...
 _FIRST, _EVERY = 4, 60  # ... so often at first, and once in so many frames
 
@@ -180,19 +180,23 @@ class SelectingTracker:
         usual = float(residual[common].mean() if common.any() else np.median(residual))
         count = self._verdict.size
 
-        def mean(field: Map, number: NDArray[np.int16], where: Flags) -> tuple[NDArray[np.float64], Flags]:
+        def mean(field: Map, number: NDArray[np.int16], where: Flags) -> NDArray[np.float64]:
+            """(2, count): each block's mean and its standard error, infinite below two pixels."""
             many = np.bincount(number[where], minlength=count)
-            return np.bincount(number[where], field[where], count) / np.maximum(many, 1), many >= _SMALLEST_PX
+            first, second = (np.bincount(number[where], field[where] ** k, count) for k in (1, 2))
+            average = first / np.maximum(many, 1)
+            variance = np.maximum(second / np.maximum(many, 1) - average**2, 0) / np.maximum(many - 1, 1)
+            return np.stack([average, np.where(many > 1, np.sqrt(variance), np.inf)])
 
         def selected(layers: NDArray[np.int16], local: bool) -> Flags:
             chosen = np.zeros(count, bool)
             for layer in layers:
                 near = _widened(np.maximum(layer, 0))
-                covered, large = mean(residual, layer, inside)
-                around, enough = mean(residual, near, common)
-                gain, _ = mean(residual - left, near, common)
-                between = covered > np.where(enough & local, around, usual) + _UNEXPLAINED
-                chosen |= large & (between | (enough & (gain > _GAIN)))
+                covered, around = mean(residual, layer, inside), mean(residual, near, common)
+                gain = mean(residual - left, near, common)
+                usually = np.where(np.isfinite(around[1]) & local, around, [[usual], [0.0]])
+                margin = _UNEXPLAINED + _SURE * np.hypot(covered[1], usually[1])
+                chosen |= (covered[0] > usually[0] + margin) | (gain[0] > _GAIN + _SURE * gain[1])
             chosen[0] = False
             return chosen
 
@@ -201,10 +205,10 @@ class SelectingTracker:
 
 
 def _residual(rest: torch.Tensor, now: torch.Tensor, flow: Flow) -> Map:
-    """(H, W) difference of the aligned pictures, capped [local deviations]."""
+    """(H, W) difference of the aligned pictures [local deviations]."""
     planes = torch.from_numpy(np.ascontiguousarray(flow.transpose(2, 0, 1)))[None]
     warped, _ = image.warp(now, torch.ones_like(now), planes)
-    return np.asarray((warped - rest).abs().clamp(max=_CAPPED)[0, 0].numpy(), np.float32)
+    return np.asarray((warped - rest).abs()[0, 0].numpy(), np.float32)
 
 
 def _at_rest(blocks: NDArray[np.int16], flow: Flow) -> NDArray[np.int16]:
