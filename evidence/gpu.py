@@ -18,10 +18,10 @@ import torch
 import typer
 
 from evidence import report
+from evidence.folds import nested
 from evidence.learn.labels import whole
 from evidence.learn.runs import JOB
 from learn.data.grid import Grid
-from learn.data.split import nested
 from learn.evaluation.evaluate import evaluate
 from learn.inference.predict import load_model
 from learn.settings import preset, replace
@@ -109,7 +109,7 @@ def full_size(
     """Makes labels in parallel, trains as the paper does, scores the fold that was kept; all of it timed."""
     set_threads(1)
     job = reader.load_job(str(JOB)).model_copy(update={"sequences": sequences, "frames": frames})
-    base = preset("paper", size=size, epochs=epochs, batch=batch, folds=10)
+    base = preset("paper", size=size, epochs=epochs, batch=batch)
     began = time.perf_counter()
     with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
         list(pool.map(_make, [(job, index, base.grid, cache) for index in range(sequences)]))
@@ -125,7 +125,7 @@ def full_size(
         channels_last=True,
         compile=gpu,
     )
-    split = nested(clips, settings.folds, settings.fold, settings.seed)
+    split = nested(clips, 10, 0, settings.seed)
     fabric = make_fabric(accelerator=accelerator, devices=1, precision=settings.precision)
     began = time.perf_counter()
     train(clips, split, settings, out / "model", fabric=fabric)

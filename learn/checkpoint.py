@@ -60,6 +60,8 @@ class ModelCard:
     left (`test`), and, if any, that were kept for intervals (`intervals`)."""
     groups: dict[str, list[str]]
     """The anatomies of each, so that a sequence of a seen anatomy is never taken for unseen."""
+    dataset_splits: list[str] = field(default_factory=list)
+    """Hash of the split of each dataset that it was trained on; older cards have none."""
     epoch: Annotated[int, Field(ge=0)] = 0
     score: FiniteFloat = 0.0
     """R² on the select sequences at the chosen epoch, of the network's own map, before `force_gain`."""
@@ -112,14 +114,12 @@ def read_card(folder: Path) -> ModelCard:
     data = checked_file.read_bytes(file, _LARGEST_BYTES)
     try:
         tree = json.loads(data)
-        seal = tree.pop("seal", None)
+        if tree.pop("seal", None) != _hash(identity.canonical(tree)):
+            raise UserError(f"{file}: is not as it was written: edited or damaged")
         rest = {key: value for key, value in tree.items() if key not in ("format", "version")}
         if (tree["format"], tree["version"]) != (_FORMAT, _VERSION):
             raise UserError(f"{file}: not a model of this version")
-        card = _CARD.validate_json(json.dumps(_upgraded(rest, file)), strict=True)
-        if seal != _hash(identity.canonical(tree)):
-            raise UserError(f"{file}: is not as it was written: edited or damaged")
-        return card
+        return _CARD.validate_json(json.dumps(_upgraded(rest, file)), strict=True)
     except ValidationError as error:
         mistakes = list(find_mistakes(error))
         unknown = next((one for one in mistakes if one.of_key), None)

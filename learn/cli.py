@@ -88,7 +88,7 @@ def train_command(
     with made_folder(out, room_needed(out, settings.arch)):
         datasets = [dataset, *(also or [])]
         clips = _read(datasets, settings.grid, sources(settings.input), cache)
-        clips, split, settings = divide(clips, datasets, settings, given, _console.print)
+        clips, split = divide(clips, datasets, settings.seed, _console.print)
         fabric = make_fabric(accelerator=accelerator, devices=devices, precision=settings.precision)
         log = _log if fabric.is_global_zero and not json else lambda numbers: None
         with counting("Training") as progress:
@@ -154,14 +154,14 @@ def eval_command(
     against: Annotated[
         Path | None, typer.Option(help="A second model: paired tests on the sequences neither has seen.")
     ] = None,
-    all: Annotated[bool, typer.Option("--all", help="Also sequences the model was fitted on.")] = False,
+    all: Annotated[bool, typer.Option("--all", help="Print every score, not just four.")] = False,
     threads: Threads = None,
     cache: Cache = None,
     json: Json = False,
 ) -> None:
     """Score a model on the sequences it has not seen; forces in mN."""
     from learn.data.clips import scored
-    from learn.data.split import are_openings, ungrouped
+    from learn.data.split import find_unit
     from learn.evaluation.coverage import cover
     from learn.evaluation.evaluate import compare, evaluate
     from learn.evaluation.tables import coverage_table, paired_table, score_table
@@ -172,8 +172,7 @@ def eval_command(
     predictor = load_model(model)
     source = predictor.readable(input or scored(predictor.card.settings.input))
     clips = _read([dataset], predictor.grid, (source,), cache)
-    if predictor.card.settings.share_anatomy:
-        clips = ungrouped(clips, by_opening=are_openings(predictor.card.groups))
+    if find_unit(predictor.card.groups) != "anatomy":
         _console.print("The model was chosen on brains it is scored on: this says nothing of other brains.")
     other = None if against is None else load_model(against)
     if other is not None:
@@ -183,12 +182,12 @@ def eval_command(
                 f"{against}: is of another grid or target than {model}; their maps can't be paired"
             )
     cards = [one.card for one in (predictor, other) if one is not None]
-    chosen = clips if all else _unseen(clips, dataset, cards)
+    chosen = _unseen(clips, dataset, cards)
     with counting("Evaluating") as progress:
         report = evaluate(predictor, chosen, source, progress)
         second = None if other is None else evaluate(other, chosen, source, progress)
     pairs = {} if second is None else compare(second, report)
-    covered = [] if predictor.card.intervals is None else cover(predictor, chosen, source)
+    covered = cover(predictor, chosen, source) if predictor.card.intervals and (all or json) else []
     if json:
         found = {"model": str(model), "input": source, **report.as_dict()}
         if covered:
@@ -198,30 +197,33 @@ def eval_command(
         print(json_.dumps(found))
         return
     screen = Console(markup=False)  # "[mN]" is a unit
-    which = "sequences, seen ones too" if all else "unseen sequences"
-    screen.print(score_table(report, f"{len(chosen)} {which}, {source} flow; mean over sequences"))
-    if covered:
+    title = f"{len(chosen)} unseen sequences, {source} flow; mean over sequences"
+    screen.print(score_table(report, title, all))
+    if covered and all:
         screen.print(coverage_table(covered))
     if second is not None:
-        screen.print(paired_table(pairs, f"against {against}, paired by sequence", predictor.card))
+        screen.print(paired_table(pairs, f"against {against}, paired by sequence", predictor.card, all))
 
 
 def _unseen(clips: list[Clip], dataset: Path, cards: list[ModelCard]) -> list[Clip]:
-    """Those that no model has seen, of a split dataset the test side; UserError if there are none."""
+    """Those that no model has seen; of a dataset that one has met, of its test side. UserError if none is."""
     from learn.evaluation.evaluate import unseen
-    from synth.dataset.index import written_sides
+    from synth.dataset.index import read_split
 
-    chosen = clips
+    split, asked = read_split(dataset, required=False), clips
+    met = {name for card in cards for part in card.split.values() for name in part}
+    if split.sides and any(clip.content_hash in met for clip in clips):
+        asked = [clip for clip in clips if split.sides.get(clip.content_hash) == "test"]
+    chosen = asked
     for card in cards:
         chosen = unseen(chosen, card)
-    sides = written_sides(dataset)
-    if sides is not None and "test" in sides.values():
-        chosen = [c for c in chosen if sides.get(c.content_hash) == "test"]
-        _console.print("The dataset's own split: only what `synth split` marks test is scored.")
     if not chosen:
         raise UserError(
-            f"{dataset}: the model was fitted or chosen on every sequence here; --all scores them anyway"
+            f"{dataset}: the model was fitted or chosen on the brains of all {len(asked)} sequences that are "
+            "for testing; `synth split` says which are"
         )
+    if left := len(asked) - len(chosen):
+        _console.print(f"{left} of {len(asked)} left out: the model was fitted or chosen on their brains.")
     return chosen
 
 

@@ -54,11 +54,6 @@ class TrainingSettings(Section):
     channels_last: bool = False
     compile: bool = False
     """Whether torch.compile takes the network: worth its minute on a GPU; needs a C++ compiler on a CPU."""
-    folds: AtLeastOne = 5
-    fold: Count = 0
-    held_out_family: str | None = None
-    share_anatomy: bool = False
-    """Whether one brain's sequences may be on several sides of the split, for a dataset of a single brain."""
     seed: Count = 0
 
     @model_validator(mode="after")
@@ -177,6 +172,8 @@ def override(settings: TrainingSettings, changes: Iterable[str]) -> TrainingSett
     """
     changes = list(changes)
     for key, _, value in (one.partition("=") for one in changes):
+        if key.strip() in _SPLIT:
+            raise UserError(f"{key}: is gone: a dataset has one split, and `synth split` makes another")
         if key.strip() in retired.TRAINING:
             raise UserError(str(*retired.mistakes({key.strip(): value})))
     return config_file.override(settings, changes)
@@ -193,12 +190,16 @@ _OBJECTIVES: dict[str, dict[str, Any]] = {
     },
 }
 """What of a block `objective`, as older cards have it, makes each loss."""
+_SPLIT = ("folds", "fold", "held_out_family", "share_anatomy")
+"""Settings that once decided who is fitted: a card's `split` says who was."""
 
 
 def upgraded(tree: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
     """Settings as an older version wrote them: `(settings, others)`, as this one has them, and what it has no
     more, by dotted key."""
     settings, others = retired.drop(tree, retired.TRAINING)
+    for key in _SPLIT:
+        settings.pop(key, None)
     objective = settings.pop("objective", None)
     if objective is not None:
         same = [k for k, v in _OBJECTIVES.items() if all(objective.get(key) == v[key] for key in v)]

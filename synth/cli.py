@@ -191,23 +191,23 @@ def split_command(
     ] = False,
     json: Json = False,
 ) -> None:
-    """Says who may be trained on, in the index: no anatomy and no held-out family on both sides."""
+    """Splits a dataset anew, instead of as it was made: no anatomy and no held-out family on both sides."""
     from synth.dataset import index, split
     from synth.dataset.folder import Folder
+    from synth.publish.card import write_card, write_page
+    from synth.publish.croissant import write_croissant
 
     folder = Folder(out)
-    folder.described()
-    chosen = split.parse_rule(by, shares, hold_out or [], share_anatomy)
-    rows = index.write_index(folder)
-    split.assign_sides(rows, chosen)
-    split.keep_rule(out, chosen)
-    rows = index.write_index(folder)
+    radius_mm = folder.job().anatomy.craniotomy.radius_mm
+    chosen = split.parse_rule(by, shares, hold_out or [], share_anatomy, 2 * radius_mm * (by == "opening"))
+    rows = index.split_anew(folder, chosen)
+    write_card(folder)
+    write_croissant(folder)
+    if (page := out / "report.html").exists():
+        write_page(out, page)
     counts = split.count(rows)
-    if not counts:
-        raise UserError(f"{out}: holds no finished sequence")
-    warning = split.warn_of_shared_brains(rows, chosen)
-    if warning:
-        print(f"warning: {warning}", file=sys.stderr)
+    if chosen.share_anatomy:
+        print("warning: one brain may be on several sides: scores say nothing of others", file=sys.stderr)
     print(json_.dumps(counts) if json else ", ".join(f"{side} {n}" for side, n in counts.items()))
 
 

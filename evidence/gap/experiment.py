@@ -20,12 +20,13 @@ import typer
 from numpy.typing import NDArray
 
 from evidence import report, status
+from evidence.folds import folds, nested
 from evidence.gap import gap
 from evidence.gap.runs import KEYS, Training, carry_out, with_flow
 from learn.data.clips import Clip, load_clips
-from learn.data.split import Split, folds, groups, nested
+from learn.data.split import Split, groups
 from learn.evaluation.statistics import interval, paired
-from learn.settings import TrainingSettings, preset, replace
+from learn.settings import preset, replace
 from learn.training.threads import set_threads
 from synth.dataset.store import Dataset
 from synth.errors import UserError
@@ -62,7 +63,7 @@ def main(
     )
     known = load_clips(dataset, settings.grid, ("ideal", "recovered"), cache=work)[:fit]
     others = load_clips(unseen, settings.grid, ("ideal", "recovered"), cache=work)
-    split, seen = parts(known, others, settings)
+    split, seen = parts(known, others)
     stored, clips = [*list(Dataset(dataset))[:fit], *Dataset(unseen)], [*known, *others]
     runs: dict[Training, dict[str, Any]] = {}
     for backend in flow or ["tvl1", "opencv-tvl1"]:
@@ -103,9 +104,7 @@ def compared(runs: Mapping[Training, Mapping[str, Any]]) -> dict[str, Any]:
     return {flow: _plain(summary(trained)) for flow, trained in by.items()}
 
 
-def parts(
-    clips: Sequence[Clip], unseen: Sequence[Clip], settings: TrainingSettings
-) -> tuple[Split, tuple[int, ...]]:
+def parts(clips: Sequence[Clip], unseen: Sequence[Clip]) -> tuple[Split, tuple[int, ...]]:
     """Fit and select from `clips`, with all of `unseen`, which follow them, as test; and a test of `clips`.
 
     Raises:
@@ -113,7 +112,7 @@ def parts(
     """
     aside = folds(clips, 5, 1)[0]
     rest = [i for i in range(len(clips)) if i not in set(aside)]
-    inner = nested([clips[i] for i in rest], settings.folds, settings.fold, 0)
+    inner = nested([clips[i] for i in rest], 5, 0, 0)
     fit, select = (tuple(rest[i] for i in part) for part in ((*inner.fit, *inner.test), inner.select))
     number = groups([*clips, *unseen])
     if set(number[: len(clips)]) & set(number[len(clips) :]):

@@ -15,11 +15,12 @@ import typer
 from scipy import ndimage
 
 from evidence import report, status
+from evidence.folds import nested
 from evidence.learn import labels
 from evidence.learn.runs import JOB, Run, carry_out, fit, study
 from learn.data.clips import Clip
 from learn.data.grid import Grid
-from learn.data.split import Split, nested
+from learn.data.split import Split
 from learn.evaluation.evaluate import EvaluationReport, evaluate
 from learn.loss import Loss
 from learn.settings import replace

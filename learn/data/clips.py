@@ -164,7 +164,9 @@ def check_readable(sequence: Sequence, wanted: Iterable[str]) -> None:
             raise UserError(f"unknown input {source!r}: {', '.join(FIELDS)}")
         if FIELDS[source] not in sequence:
             what = "motion of two eyes" if has_depth(source) else f"{source} flow"
-            hint = f"{_CURE[source]}, or use --input ideal"
+            alike = (one for one in FIELDS if has_depth(one) is has_depth(source))
+            others = [f"use --input {one}" for one in alike if FIELDS[one] in sequence]
+            hint = ", or ".join([_CURE[source], *others[:1]])
             raise UserError(f"{sequence.path}: holds no {what} (field {FIELDS[source]}); {hint}")
     if any(sequence.attrs.get(name) is None for name in ("young_kpa", "scale_mm_per_px")):
         raise UserError(f"{sequence.path}: lacks the attribute young_kpa or scale_mm_per_px")

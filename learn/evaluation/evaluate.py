@@ -15,6 +15,7 @@ from scipy import ndimage
 from learn.checkpoint import SEEN, ModelCard
 from learn.data.clips import Clip, amount, target
 from learn.data.grid import Grid
+from learn.data.split import find_unit, regroup
 from learn.evaluation.metrics import Moments, agreement, contact_mm, false_positive_share, line
 from learn.evaluation.statistics import Interval, Paired, interval, paired, pooled_r2
 from learn.inference.predict import Predictor, force_size, length, total_force
@@ -231,4 +232,5 @@ def unseen(clips: Sequence[Clip], card: ModelCard) -> list[Clip]:
     """Clips of no sequence and no anatomy that the model was fitted or chosen on, or its intervals fitted."""
     hashes = {h for part in SEEN for h in card.split.get(part, [])}
     seen = {g for part in SEEN for g in card.groups.get(part, [])}
-    return [c for c in clips if c.content_hash not in hashes and c.group not in seen]
+    named = zip(clips, regroup(clips, find_unit(card.groups)), strict=True)
+    return [c for c, one in named if c.content_hash not in hashes and one.group not in seen]

@@ -10,13 +10,13 @@ import numpy as np
 
 from learn.checkpoint import ModelCard, write_card
 from learn.data.clips import Clip, scored
-from learn.data.split import Split, are_openings, groups, ungrouped
+from learn.data.split import Split, find_unit, groups, regroup
 from learn.evaluation.interval_sides import find_obstacle, find_sides
 from learn.inference.predict import Predictor, length, net_force
 from learn.uncertainty.features import motion_features, motion_names
 from learn.uncertainty.intervals import Intervals, Prediction, fit, make_example
 from learn.uncertainty.out_of_distribution import fit_distribution
-from synth.dataset.index import written_sides
+from synth.dataset.index import read_split
 from synth.errors import UserError
 from synth.system.terminal import ProgressCallback
 
@@ -91,9 +91,8 @@ def fit_from_datasets(
     Raises:
         UserError: none of the sequences was fitted, or there are too few of others.
     """
-    if predictor.card.settings.share_anatomy:
-        clips = ungrouped(clips, by_opening=are_openings(predictor.card.groups))
-    marked = [(written_sides(one) or {}).items() for one in datasets]
+    clips = regroup(clips, find_unit(predictor.card.groups))
+    marked = [read_split(one, required=False).sides.items() for one in datasets]
     tests = [name for part in marked for name, side in part if side == "test"]
     split = find_sides(clips, predictor.card, tests, from_test)
     if not split.fit:

@@ -47,7 +47,10 @@ def find_obstacle(selection: Sequence[Clip], calibration: Sequence[Clip]) -> str
         found = len(set(groups(part)))
         if found < needed:
             brains = "brain is" if found == 1 else "brains are"
-            return f"{found} {brains} {what}; {LEVELS[0]:.0%} intervals need {needed}"
+            return (
+                f"{found} {brains} {what}; {LEVELS[0]:.0%} intervals need {needed}: of {2 * least} or more "
+                "on the validation side half are kept (more sequences, or `synth split --shares`)"
+            )
     return ""
 
 

@@ -63,7 +63,9 @@ def pooled_r2(moments: Floats, rng: np.random.Generator, draws: int = _DRAWS) ->
 
 def _r2(moments: Floats) -> Floats:
     n, t, _, tt, pp, tp = np.moveaxis(moments, -1, 0)
-    return np.asarray(1 - (pp - 2 * tp + tt) / (tt - t**2 / n), np.float64)
+    spread = tt - t**2 / n
+    varies = spread > 1e-12 * np.maximum(tt, 1e-300)  # else there is none, as in `agreement`
+    return np.where(varies, 1 - (pp - 2 * tp + tt) / np.where(varies, spread, 1), np.nan)
 
 
 def _bca(value: float, boot: Floats, left_out: Floats) -> Interval:

@@ -13,13 +13,17 @@ from learn.evaluation.evaluate import YOUNG, EvaluationReport
 from learn.evaluation.metrics import METRICS, Metric
 from learn.evaluation.statistics import Paired
 
+FIRST = ("force_mae", "force_r2_pooled", "peak_error_share", "map_r2_pooled")
+"""What `learn eval` prints without --all."""
 
-def score_table(report: EvaluationReport, title: str) -> Table:
-    """Means over sequences, a column for each state of knowledge of E."""
-    table = _open_table(title, "E known [95%]", "E × ½", "E × 2", "E unknown")
-    columns, sure = [report.summary(y) for y in YOUNG], report.intervals()
+
+def score_table(report: EvaluationReport, title: str, all: bool) -> Table:
+    """Means over sequences; `all`: not only `FIRST`, and a column for each state of knowledge of E."""
+    heads = ("E known [95%]", "E × ½", "E × 2", "E unknown")[: 4 if all else 1]
+    table = _open_table(title, *heads)
+    columns, sure = [report.summary(y) for y in YOUNG[: len(heads)]], report.intervals()
     for key, metric in METRICS.items():
-        if not metric.listed or key not in columns[0]:
+        if not (metric.listed if all else key in FIRST) or key not in columns[0]:
             continue
         cells = [_cell(metric, c.get(key)) for c in columns]
         if key in sure and sure[key].low == sure[key].low:
@@ -40,11 +44,11 @@ def coverage_table(covered: Sequence[Coverage]) -> Table:
     return table
 
 
-def paired_table(pairs: Mapping[str, Paired], title: str, card: ModelCard) -> Table:
+def paired_table(pairs: Mapping[str, Paired], title: str, card: ModelCard, all: bool) -> Table:
     """Differences, this model minus the other, sequence by sequence."""
     table = _open_table(title, "difference [95%]", "p", "larger on")
     for key, metric in METRICS.items():
-        if metric.listed and key in pairs:
+        if (metric.listed if all else key in FIRST) and key in pairs:
             d, pair = pairs[key].difference, pairs[key]
             difference = f"{d.mean:+.3g} [{d.low:+.3g}, {d.high:+.3g}]"
             table.add_row(_label(metric, card), difference, f"{pair.p:.2g}", f"{pair.wins:.0%}")

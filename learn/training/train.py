@@ -68,7 +68,7 @@ def train(
     fabric.launch()
     fit, select = [clips[i] for i in split.fit], [clips[i] for i in split.select]
     scales = measure_scales(fit, settings)
-    card = ModelCard(settings, scales, typical_young(fit), *_provenance(clips, split))
+    card = ModelCard(settings, scales, typical_young(fit), *_provenance(clips, split), [*split.hashes])
     state = _open(out, card)
     try:
         run = _start(card, state)

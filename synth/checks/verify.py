@@ -220,9 +220,9 @@ def _dataset(
     lost = sorted(key for key, row in rows.items() if row["status"] == "done" and key not in sealed)
     yield "dataset", index.NAME, not lost, f"rows without a sequence: {lost[:3]}"
     try:
-        rule = split.read_rule(folder.root)
+        stored = split.read_stored(folder.root)
     except UserError as error:
         yield "splits", split.NAME, False, str(error)
         return
-    leaking = split.leaks(list(rows.values()), rule) or split.misplaced(list(rows.values()), rule)
+    leaking = split.leaks(list(rows.values()), stored) or split.misplaced(list(rows.values()), stored)
     yield "splits", index.NAME, not leaking, "; ".join(leaking[:3]) or "none"

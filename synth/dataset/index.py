@@ -6,6 +6,7 @@ import hashlib
 import io
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,6 +16,7 @@ import pyarrow.parquet as pq
 from synth.dataset import location, split
 from synth.dataset.attributes import name_gestures
 from synth.dataset.folder import Folder, write_whole
+from synth.dataset.split import DatasetSplit, Side
 from synth.dataset.store import Dataset, Sequence, open_sequence
 from synth.errors import UserError
 from synth.system import checked_file
@@ -65,7 +67,7 @@ COLUMNS = (
     IndexColumn("height", _INT, "height of the picture", "px"),
     IndexColumn("scale_mm_per_px", _REAL, "scale at the craniotomy", "mm/px"),
     IndexColumn("flow_backend", _TEXT, "estimator of the recovered flow"),
-    IndexColumn("split", _TEXT, "train, validation or test; by the rule in split.json"),
+    IndexColumn("split", _TEXT, "train, validation or test; null where there are too few anatomies to split"),
     IndexColumn("cpu_s", _REAL, "processor time it took", "s"),
 )
 
@@ -97,36 +99,40 @@ def read_index(root: Path) -> pa.Table:
     return table
 
 
-def written_sides(root: Path) -> dict[str, str] | None:
-    """The side of every sequence by its content hash, as `synth split` decided; None where nobody did.
+def read_split(root: Path, *, required: bool = True) -> DatasetSplit:
+    """The one split of the dataset in `root`, as stored; of an older one, the split that its index shows.
 
-    From what the sealed stores say, not the index: that may be edited. UserError if the dataset has too few
-    groups for its rule.
+    That is derived from what the sealed stores say, not from the index, which may be edited.
+
+    Raises:
+        UserError: `required`, and there are too few groups to split.
     """
-    if not split.is_written(root):
-        return None
-    folder = Folder(root)
-    rows = [row_of(_open(folder, key)) for key in folder.sealed()]
-    sides = split.assign_sides(rows, split.read_rule(root))
-    return {row["content_hash"]: side for row, side in zip(rows, sides, strict=True) if side is not None}
+    stored = split.read_stored(root)
+    if stored.sides:
+        return stored
+    rows = [row_of(_open(Folder(root), key)) for key in Folder(root).sealed()]
+    try:
+        assign = split.assign_sides if required else split.assign_if_possible
+        return _dealt(rows, assign(rows, stored), stored)
+    except UserError as error:
+        raise UserError(f"{root}: {error}") from None
 
 
 def group_by_side(dataset: Dataset) -> dict[str, list[int]]:
     """Positions of a dataset's sequences by side, in the order train, validation, test; sides without any
-    are left out. All are "train" where nobody decided. UserError as `written_sides`.
+    are left out. All are "train" where there are too few to split. UserError if one has no side.
     """
-    sides = written_sides(dataset.root)
-    if sides is None:
-        return {"train": list(range(len(dataset)))}
-    found = [sides.get(sequence.attrs["content_hash"]) for sequence in dataset]
+    names, chosen = [one.attrs["content_hash"] for one in dataset], read_split(dataset.root, required=False)
+    found = chosen.find(names, dataset.root) if chosen.sides else ["train"] * len(names)
     groups = {side: [k for k, one in enumerate(found) if one == side] for side in split.SIDES}
-    return {side: chosen for side, chosen in groups.items() if chosen}
+    return {side: positions for side, positions in groups.items() if positions}
 
 
 def write_index(folder: Folder) -> list[dict[str, Any]]:
     """Brings the index up to date with the folder; rows that it has already stay. Returns all rows.
 
-    An index that can't be read is made anew: all that it says is in the stores.
+    An index that can't be read is made anew: all that it says is in the stores. The split is stored beside
+    it; sequences that came since get a side, and the others keep theirs.
     """
     known: dict[int, dict[str, Any]] = {}
     with suppress(UserError):
@@ -135,11 +141,32 @@ def write_index(folder: Folder) -> list[dict[str, Any]]:
     rows = {k: {"index": k, "status": "failed", "reason": failure["reason"]} for k, failure in failures}
     rows |= {key: known.get(key) or row_of(_open(folder, key)) for key in folder.sealed()}
     ordered = [rows[key] for key in sorted(rows)]
-    sides = split.assign_if_possible(ordered, split.read_rule(folder.root))
+    stored = split.read_stored(folder.root)
+    if not stored.sides:  # an older version stored them here alone
+        stored = _dealt(known.values(), [row["split"] for row in known.values()], stored)
+    sides = split.assign_if_possible(ordered, stored)
     for row, side in zip(ordered, sides, strict=True):
         row["split"] = side
+    if any(sides):
+        split.store(folder.root, _dealt(ordered, sides, stored))
     save_rows(folder.root, ordered)
     return ordered
+
+
+def split_anew(folder: Folder, chosen: DatasetSplit) -> list[dict[str, Any]]:
+    """Splits a dataset by the rule of `chosen`, which has no sides yet, whatever its split was. Returns all
+    rows of the index. UserError as `assign_sides`."""
+    rows = write_index(folder)
+    split.store(folder.root, _dealt(rows, split.assign_sides(rows, chosen), chosen))
+    return write_index(folder)
+
+
+def _dealt(
+    rows: Iterable[Mapping[str, Any]], sides: Iterable[Side | None], chosen: DatasetSplit
+) -> DatasetSplit:
+    """The split with the sides of some rows added."""
+    added = {row["content_hash"]: side for row, side in zip(rows, sides, strict=True) if side}
+    return replace(chosen, sides={**chosen.sides, **added})
 
 
 def save_rows(root: Path, rows: Iterable[Mapping[str, Any]]) -> None:

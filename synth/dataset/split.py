@@ -1,4 +1,4 @@
-"""Who may be trained on: a split of the sequences in which no group is on both sides."""
+"""Who may be trained on: the one split of a dataset, in which no group is on both sides."""
 
 from __future__ import annotations
 
@@ -6,16 +6,19 @@ import hashlib
 import json
 import os
 from collections import Counter
-from collections.abc import Hashable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Hashable, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal, TypeVar, cast, get_args
 
 import numpy as np
 from pydantic import FiniteFloat, TypeAdapter, ValidationError
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial.distance import cdist
 
 from synth.dataset.folder import write_whole
 from synth.errors import UserError
+from synth.job import identity
 from synth.system import checked_file
 from synth.system.config_file import first_mistake
 
@@ -23,53 +26,76 @@ By = Literal["anatomy", "opening", "family", "gesture", "stiffness", "sequence"]
 """What must not be shared between the sides: `opening` is the place that a user's brain is opened at, else
 the anatomy; `stiffness` splits at quantiles of Young's modulus."""
 
-SIDES = ("train", "validation", "test")
+Side = Literal["train", "validation", "test"]
+SIDES: tuple[Side, ...] = get_args(Side)
 _CLASSES = 10
 Group = TypeVar("Group", int, str)
 NAME = "split.json"
 
 
 @dataclass(frozen=True)
-class Rule:
-    """How a dataset is split; stored in it, so that one that grows is split as before."""
+class DatasetSplit:
+    """How a dataset is split, and the side of every sequence: all of `split.json`."""
 
     by: By = "anatomy"
     shares: tuple[FiniteFloat, FiniteFloat, FiniteFloat] = (0.7, 0.15, 0.15)
     held_out: tuple[str, ...] = ()
     share_anatomy: bool = False
     """Whether one brain may be on several sides: scores then say nothing of other brains."""
+    apart_mm: FiniteFloat = 0.0
+    """By opening: those of one brain that are nearer to each other show the same tissue, and are one."""
+    sides: Mapping[str, Side] = field(default_factory=dict)
+    """By content hash. Older versions stored none: `synth.dataset.index.read_split` derives them."""
+
+    @property
+    def hash(self) -> str:
+        """Of who is on which side."""
+        return hashlib.blake2b(identity.canonical(dict(self.sides)), digest_size=16).hexdigest()
+
+    def find(self, names: Iterable[str], where: Path | str) -> list[Side]:
+        """The sides of the sequences of a dataset by content hash; UserError if one has none."""
+        found = [self.sides.get(name) for name in names]
+        if lost := found.count(None):
+            raise UserError(
+                f"{where}: {lost} of its {len(found)} sequences have no side in {NAME}: `synth report` "
+                "places those that came since, `synth split` splits all anew"
+            )
+        return [side for side in found if side]
 
 
-def is_written(root: Path) -> bool:
-    """Whether the dataset in `root` was given a rule of its own (`synth split`)."""
-    return (root / NAME).exists()
+def read_stored(root: Path) -> DatasetSplit:
+    """What `split.json` of the dataset in `root` says; the default without sides if there is none.
 
-
-def read_rule(root: Path) -> Rule:
-    """The rule of the dataset in `root`; the default if none was given. UserError for what is none."""
+    Raises:
+        UserError: it is no split.
+    """
     if not os.path.lexists(root / NAME):
-        return Rule()
+        return DatasetSplit()
     found = checked_file.read_json(root / NAME)
     try:
-        return TypeAdapter(Rule).validate_python(found)
+        return TypeAdapter(DatasetSplit).validate_python(found)
     except ValidationError as error:
         raise UserError(f"{root / NAME}: is damaged ({first_mistake(error)})") from None
 
 
-def keep_rule(root: Path, chosen: Rule) -> None:
-    """Makes `chosen` the rule of the dataset in `root`."""
+def store(root: Path, chosen: DatasetSplit) -> None:
+    """Makes `chosen` the split of the dataset in `root`."""
     write_whole(root / NAME, json.dumps(asdict(chosen), indent=1) + "\n")
 
 
-def parse_rule(by: str, shares: str, held_out: Sequence[str], share_anatomy: bool = False) -> Rule:
-    """A rule from the words of a command line, UserError for what is none; by opening, a brain is shared."""
+def parse_rule(
+    by: str, shares: str, held_out: Sequence[str], share_anatomy: bool = False, apart_mm: float = 0.0
+) -> DatasetSplit:
+    """A split without sides from the words of a command line, UserError for what is none; by opening, a brain
+    is shared."""
     if by not in get_args(By):
         raise UserError(f"by {by}: is not one of {', '.join(get_args(By))}")
     try:
         train, validation, test = (float(word) for word in shares.split(","))
     except ValueError:
         raise UserError(f"shares {shares}: three numbers are needed, as 0.7,0.15,0.15") from None
-    return Rule(cast(By, by), (train, validation, test), tuple(held_out), share_anatomy or by == "opening")
+    shared = share_anatomy or by == "opening"
+    return DatasetSplit(cast(By, by), (train, validation, test), tuple(held_out), shared, apart_mm)
 
 
 def count(rows: Sequence[Mapping[str, Any]]) -> dict[str, int]:
@@ -78,11 +104,13 @@ def count(rows: Sequence[Mapping[str, Any]]) -> dict[str, int]:
     return {side: sides.count(side) for side in SIDES if side in sides}
 
 
-def assign_sides(rows: Sequence[Mapping[str, Any]], chosen: Rule) -> list[str | None]:
+def assign_sides(rows: Sequence[Mapping[str, Any]], chosen: DatasetSplit) -> list[Side | None]:
     """The side of every row of the index; None for a sequence that failed.
 
-    A group's side depends on the group's name and on which groups there are, not on the order of rows.
-    Sequences of a family that is held out are always for testing; any group that they share goes with them.
+    Who has a side keeps it, and a group that has one gives it to who joins it; the groups that are left are
+    dealt so that shares come near. Their sides depend on their names and on which groups there are, not on
+    the order of rows. Sequences of a family that is held out are always for testing; any group that they
+    share goes with them. Who would join groups of two sides has none.
 
     Raises:
         UserError: a family that is not there, shares that do not sum to 1, or fewer groups than sides.
@@ -92,30 +120,34 @@ def assign_sides(rows: Sequence[Mapping[str, Any]], chosen: Rule) -> list[str | 
         raise UserError(f"shares {shares}: must not be negative and must sum to 1")
     done = [row for row in rows if row["status"] == "done"]
     unknown = set(chosen.held_out) - {str(row["family"]) for row in done}
-    if unknown:
+    if unknown and not chosen.sides:
         raise UserError(f"family {', '.join(sorted(unknown))}: no sequence has it")
     if by == "stiffness" and any(row["young_kpa"] is None for row in done):
         raise UserError("by stiffness: a sequence says nothing of its Young's modulus")
-    groups = _groups(done, chosen)
-    held_out = {group for group, row in zip(groups, done, strict=True) if row["family"] in chosen.held_out}
-    needing = [side for side, share in zip(SIDES, shares, strict=True) if share > 0]
-    names = set(groups)
-    if len(names - held_out) + bool(held_out) < len(needing):
-        hint = "; --share-anatomy splits within a brain, for a model of that brain alone"
+    groups, kept = _groups(done, chosen), [chosen.sides.get(row["content_hash"]) for row in done]
+    on: dict[str, set[int]] = {}
+    for group, side, row in zip(groups, kept, done, strict=True):
+        on.setdefault(group, set()).update([SIDES.index(side)] if side else [])
+        on[group] |= {2} if row["family"] in chosen.held_out else set()
+    fixed = {group: max(sides) for group, sides in on.items() if sides}
+    needing = {k for k, share in enumerate(shares) if share > 0} - set(fixed.values())
+    if len(on) - len(fixed) < len(needing) and not chosen.sides:
+        hint = "; `synth split --by opening`, or with --share-anatomy, splits within a brain"
         if chosen.share_anatomy:
             hint = "; craniotomy.also in the job lists further openings" if by == "opening" else ""
-        few = f"{len(names)} groups by {by}: too few"
-        raise UserError(f"{few} for {', '.join(needing)} to have one each{hint}")
-    order = sorted(names, key=lambda name: hashlib.blake2b(name.encode(), digest_size=8).hexdigest())
-    part = draw_groups(groups, shares, order, fixed=dict.fromkeys(held_out, 2))
-    side = {row["index"]: SIDES[k] for row, k in zip(done, part, strict=True)}
-    return [side.get(row["index"]) for row in rows]
+        few = f"{len(on)} groups by {by}: too few"
+        raise UserError(f"{few} for {', '.join(SIDES[k] for k in sorted(needing))} to have one each{hint}")
+    order = sorted(on, key=lambda name: hashlib.blake2b(name.encode(), digest_size=8).hexdigest())
+    part = draw_groups(groups, shares, order, fixed)
+    dealt = [SIDES[k] if len(on[group]) < 2 else None for group, k in zip(groups, part, strict=True)]
+    sides = {row["index"]: old or new for row, old, new in zip(done, kept, dealt, strict=True)}
+    return [sides.get(row["index"]) for row in rows]
 
 
 def draw_groups(
     groups: Sequence[Group],
     shares: Sequence[float],
-    order: int | Sequence[Group],
+    order: Sequence[Group],
     fixed: Mapping[Group, int] | None = None,
 ) -> list[int]:
     """The part (0, 1, ...) of each member; no group is in two parts. Larger groups are dealt first.
@@ -123,13 +155,10 @@ def draw_groups(
     Args:
         groups: (N,) the group of each member.
         shares: of each part, in any unit; a part of share 0 gets nothing.
-        order: of groups of one size: a seed, or the groups themselves.
+        order: of groups of one size.
         fixed: parts of groups that aren't drawn.
     """
     size = Counter(groups)
-    if isinstance(order, int):
-        names = sorted(size)
-        order = [names[k] for k in np.random.default_rng(order).permutation(len(names))]
     part = dict(fixed or {})
     lacking = [
         share * len(groups) - sum(size[group] for group in part if part[group] == k)
@@ -143,7 +172,7 @@ def draw_groups(
     return [part[group] for group in groups]
 
 
-def assign_if_possible(rows: Sequence[Mapping[str, Any]], chosen: Rule) -> list[str | None]:
+def assign_if_possible(rows: Sequence[Mapping[str, Any]], chosen: DatasetSplit) -> list[Side | None]:
     """`assign_sides`; no sides where there are too few groups to have some on each."""
     try:
         return assign_sides(rows, chosen)
@@ -151,18 +180,18 @@ def assign_if_possible(rows: Sequence[Mapping[str, Any]], chosen: Rule) -> list[
         return [None] * len(rows)
 
 
-def misplaced(rows: Sequence[Mapping[str, Any]], chosen: Rule) -> list[str]:
-    """Sequences that the index puts on another side than the rule does."""
+def misplaced(rows: Sequence[Mapping[str, Any]], chosen: DatasetSplit) -> list[str]:
+    """Sequences that the index puts on another side than the split does, or on none beside others."""
     return [
-        f"sequence {row['index']} is in {row['split']}, by the rule in {side}"
+        f"sequence {row['index']} is in {row['split']}, by the split in {side}"
         for row, side in zip(rows, assign_if_possible(rows, chosen), strict=True)
-        if row["split"] != side
+        if row["split"] != side or (chosen.sides and row["status"] == "done" and side is None)
     ]
 
 
-def leaks(rows: Sequence[Mapping[str, Any]], chosen: Rule | None = None) -> list[str]:
+def leaks(rows: Sequence[Mapping[str, Any]], chosen: DatasetSplit | None = None) -> list[str]:
     """Anatomies and contents that are on more than one side, and held-out families that are trained on."""
-    chosen = chosen or Rule()
+    chosen = chosen or DatasetSplit()
     done = [row for row in rows if row["status"] == "done" and row.get("split")]
     found = [
         f"family {row['family']} is held out and in {row['split']}"
@@ -173,23 +202,11 @@ def leaks(rows: Sequence[Mapping[str, Any]], chosen: Rule | None = None) -> list
     if not chosen.share_anatomy:
         keys = {"anatomy": [row["anatomy"] for row in done], **keys}
     elif chosen.by == "opening":
-        keys = {"opening": [_name_opening(row) for row in done], **keys}
+        keys = {"opening": _groups(done, chosen), **keys}
     for name, values in keys.items():
         crossing = find_crossings(values, [row["split"] for row in done])
         found += [f"{name} {key} is in {', '.join(on)}" for key, on in crossing.items()]
     return found
-
-
-def warn_of_shared_brains(rows: Sequence[Mapping[str, Any]], chosen: Rule) -> str | None:
-    """What to say of brains that are on several sides; None if there are none."""
-    done = [row for row in rows if row["status"] == "done" and row.get("split")]
-    count = len(find_crossings([row["anatomy"] for row in done], [row["split"] for row in done]))
-    if not count:
-        return None
-    parts = "openings" if chosen.by == "opening" else "sequences"
-    brains = "1 brain is" if count == 1 else f"{count} brains are"
-    nothing = "scores say nothing of other brains"
-    return f"{brains} on several sides: {parts} of one brain are no strangers, and {nothing}"
 
 
 def find_crossings(groups: Sequence[Hashable], sides: Sequence[str]) -> dict[Hashable, list[str]]:
@@ -232,14 +249,14 @@ def name_anatomy(attrs: Mapping[str, Any]) -> str:
     return str(attrs["content_hash"]) if seed is None else f"seed-{seed}"
 
 
-def _groups(rows: Sequence[Mapping[str, Any]], chosen: Rule) -> list[str]:
+def _groups(rows: Sequence[Mapping[str, Any]], chosen: DatasetSplit) -> list[str]:
     """A group's name for every row; groups that share an anatomy are one unless the rule allows it."""
     if chosen.by == "stiffness":
         ordered = sorted(float(row["young_kpa"]) for row in rows)
         edges = [ordered[k * len(ordered) // _CLASSES] for k in range(1, _CLASSES)]
         names = [f"E{sum(row['young_kpa'] >= edge for edge in edges)}" for row in rows]
     elif chosen.by == "opening":
-        names = [_name_opening(row) for row in rows]
+        names = _join_openings([str(row.get("opening") or row["anatomy"]) for row in rows], chosen.apart_mm)
     else:
         names = [str(row["content_hash" if chosen.by == "sequence" else chosen.by]) for row in rows]
     if chosen.share_anatomy:
@@ -250,6 +267,17 @@ def _groups(rows: Sequence[Mapping[str, Any]], chosen: Rule) -> list[str]:
     return [first[group] for group in joined]
 
 
-def _name_opening(row: Mapping[str, Any]) -> str:
-    """A procedural brain, which is opened at one place, and stores that don't say where: the anatomy."""
-    return str(row.get("opening") or row["anatomy"])
+def _join_openings(names: Sequence[str], apart_mm: float) -> list[str]:
+    """The openings of a brain that overlap under one name; `names`: as `synth.job.identity` makes them.
+
+    A procedural brain, which is opened at one place, and stores that don't say where, come as an anatomy.
+    """
+    placed = sorted({name for name in names if " at " in name})
+    if not placed:
+        return list(names)
+    brains, places = zip(*(name.split(" at ") for name in placed), strict=True)
+    apart = cdist(*[np.array([place.split(",") for place in places], float)] * 2)
+    same = np.array(brains)[:, None] == np.array(brains)
+    part = connected_components(same & (apart < apart_mm))[1].tolist()
+    joined = {name: placed[part.index(k)] for name, k in zip(placed, part, strict=True)}
+    return [joined.get(name, name) for name in names]

@@ -53,7 +53,10 @@ def parse_job(text: str, label: str, folder: Path, overrides: Sequence[str] = ()
     config = ConfigFile(text, label)
     config.change(overrides)
     config.values, gone = retired.drop(config.values, retired.JOB)
-    return config.validate(Job, [*retired.mistakes(gone), *_find_files(config, folder)])
+    found = [*retired.mistakes(gone), *_find_files(config, folder)]
+    if config.values.get("frames") == 2:  # that older datasets may have
+        found.append(Mistake(("frames",), "2 are at rest and released: no force; 3 or more are needed"))
+    return config.validate(Job, found)
 
 
 def _find_files(config: ConfigFile, folder: Path) -> Iterator[Mistake]:

@@ -41,7 +41,7 @@ class CraniotomySection(Section):
     """Radius of the opening [mm]."""
     also: Annotated[tuple[PlaceSection, ...], Field(max_length=100)] = ()
     """Further places on the same mesh, each with point and direction: anatomies take them in turn, the first
-    being `point`. `learn train` can then tell openings apart, though not brains."""
+    being `point`. `synth split --by opening` then tells openings apart, though not brains."""
 
 
 class AttachmentSection(Section):

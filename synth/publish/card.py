@@ -53,6 +53,7 @@ def write_card(folder: Folder) -> Path:
     text = template("card.md.jinja").render(
         **about,
         example=best,
+        preview=(folder.root / "preview.mp4").exists(),
         variant=attrs.get("variant", "-"),
         versions=attrs.get("versions", {}),
         ranges=[_range(done, name) for name in QUANTITIES],
@@ -95,6 +96,7 @@ def facts(folder: Folder) -> dict[str, Any]:
         "families": share(done, "family"),
         "gestures": share(done, "gesture"),
         "splits": share(done, "split"),
+        "split_hash": split.read_stored(folder.root).hash,
         "cpu_h": column(done, "cpu_s").sum() / 3600,
         "charts": {name: svg.histogram(*one) for name, one in drawn.items() if len(one[0]) >= _FEWEST_DRAWN},
         "quantities": QUANTITIES,
@@ -111,7 +113,7 @@ def limits(folder: Folder) -> list[str]:
         job=job,
         gone=gone,
         versions=len(described.get("generators", [])),
-        shared=split.read_rule(folder.root).share_anatomy,
+        shared=split.read_stored(folder.root).share_anatomy,
     )
     return [line for line in text.splitlines() if line]
 

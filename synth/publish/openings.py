@@ -27,7 +27,7 @@ _UNDER_SKULL_MM = 8.0  # how far below its convex hull the surface may lie and s
 _LEAST_SURFACE = 0.97  # of the opening itself must be surface
 _STEEPEST_MM = 4.0  # rms departure from a dome; a cleft in the opening has more
 _FLAT = 0.01  # of the radius, median from the best plane: over a dome of 70 mm radius it is twice as much
-_APART = 1.5  # radii between two places
+_APART = 2.0  # radii between two places: nearer ones would show the same tissue
 _TILE_PX, _BLUE = 360, (11, 83, 148)
 
 

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from evidence.gap import experiment, gap
-from learn.settings import preset
 from synth.errors import UserError
 
 
@@ -43,11 +42,11 @@ def test_the_unseen_world_shares_no_anatomy() -> None:
         return [SimpleNamespace(group=f"{name}{k // 2}", content_hash=f"{name}{k}") for k in range(count)]
 
     ours, theirs = made("a", 60), made("b", 8)
-    split, seen = experiment.parts(ours, theirs, preset("tiny"))
+    split, seen = experiment.parts(ours, theirs)
     assert split.test == tuple(range(60, 68))
     parts = [set(split.fit), set(split.select), set(seen)]
     assert set.union(*parts) == set(range(60))
     anatomies = [{i // 2 for i in part} for part in parts]
     assert sum(map(len, anatomies)) == len(set.union(*anatomies))
     with pytest.raises(UserError):
-        experiment.parts(ours, made("a", 4), preset("tiny"))
+        experiment.parts(ours, made("a", 4))

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from older_split import split_as
 
 from synth.dataset.store import open_sequence
 from synth.job import reader
@@ -49,7 +50,8 @@ def test_an_epoch_keeps_its_weights(stored: Path, tmp_path: Path) -> None:
     from learn.cli import app
 
     small = ["--preset", "tiny", "--epochs", "1", "size=16", "arch.width=4", "arch.levels=2"]
-    done = CliRunner().invoke(app, ["train", str(stored / "one"), "-o", str(tmp_path / "model"), *small])
+    data = split_as(stored / "one", stored / "models" / "epoch", tmp_path / "one")
+    done = CliRunner().invoke(app, ["train", str(data), "-o", str(tmp_path / "model"), *small])
     assert done.exit_code == 0, done.output
     now = checkpoint.load_tensors(tmp_path / "model" / "weights.pt")
     then = checkpoint.load_tensors(stored / "models" / "epoch" / "weights.pt")

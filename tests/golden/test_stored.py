@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from older_split import split_as
 from typer.testing import CliRunner
 
 from synth.errors import UserError
@@ -44,6 +45,14 @@ def test_a_dataset_is_verified(stored: Path, name: str) -> None:
     command("synth", ["verify", stored / name])
 
 
+def test_a_dataset_without_a_split_has_the_one_that_its_index_shows(stored: Path) -> None:
+    from synth.dataset import index, split
+
+    rows = index.read_index(stored / "one").to_pylist()
+    assert not (stored / "one" / split.NAME).exists()
+    assert index.read_split(stored / "one").sides == {row["content_hash"]: row["split"] for row in rows}
+
+
 def test_a_dataset_is_still_the_same_job(stored: Path) -> None:
     from synth.dataset.folder import Folder
 
@@ -68,7 +77,8 @@ def test_a_training_is_continued_as_if_it_had_not_stopped(stored: Path, tmp_path
     from learn import checkpoint
 
     folder = shutil.copytree(stored / "models" / "interrupted", tmp_path / "model")
-    command("learn", ["train", stored / "one", "-o", folder, "--preset", "tiny", "--epochs", "3", *SMALL])
+    data = split_as(stored / "one", folder, tmp_path / "one")
+    command("learn", ["train", data, "-o", folder, "--preset", "tiny", "--epochs", "3", *SMALL])
     now = checkpoint.load_tensors(folder / "weights.pt")
     then = checkpoint.load_tensors(stored / "models" / "whole" / "weights.pt")
     assert now.keys() == then.keys()

@@ -71,11 +71,13 @@ def test_an_edited_or_unsealed_card_is_refused(model: Path, pristine: Path) -> N
     file, text = model / "config.json", (model / "config.json").read_text()
     edited = text.replace('"typical_young_kpa": 1.7', '"typical_young_kpa": 17')
     tree = json.loads(text)
-    for wrong in (edited, json.dumps({key: value for key, value in tree.items() if key != "seal"})):
+    unsealed = json.dumps({key: value for key, value in tree.items() if key != "seal"})
+    for wrong in (edited, unsealed, text.replace('"scales"', '"rcales"'), text.replace("sulcus-", "rulcus-")):
         assert wrong != text
         file.write_text(wrong)
-        with pytest.raises(UserError, match=r"config\.json"):
+        with pytest.raises(UserError, match=r"config\.json") as caught:
             read_model(model)
+        assert "version" not in str(caught.value)
     done = run(app, ["calibrate", str(model), str(pristine / "000000.zarr")])
     assert (done.exit_code, len(done.stderr.splitlines())) == (2, 1)
 

@@ -15,12 +15,12 @@ from learn.cli import app
 from learn.data import clips as reading
 from learn.data.clips import Clip, load_clips
 from learn.data.grid import Grid, Scales, channels
-from learn.data.split import nested
 from learn.inference.export import export
 from learn.inference.predict import load_model
 from learn.settings import TrainingSettings, preset, replace
 from learn.training.batches import FrameDataset, FrameItem, inputs
 from learn.training.gpu_batches import DeviceDataset
+from learn.training.sides import divide
 from learn.training.train import train
 
 run = CliRunner().invoke
@@ -46,9 +46,9 @@ def told(data: Path) -> list[Clip]:
 
 
 @pytest.fixture(scope="module")
-def model(told: list[Clip], tmp_path_factory: pytest.TempPathFactory) -> Path:
+def model(told: list[Clip], data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("trained") / "model"
-    train(told, nested(told, 3, 0, seed=0), small(), out)
+    train(*divide(told, [data], seed=0), small(), out)
     return out
 
 

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 from learn.checkpoint import read_card
 from learn.cli import app
 from synth.dataset import split
-from synth.dataset.split import Rule
+from synth.dataset.split import DatasetSplit
 
 BRAINS = 90
 TINY = ["--preset", "tiny", "size=32", "arch.width=8", "--json"]
@@ -30,7 +30,7 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("many")
     for index in range(BRAINS):
         phantom.write(folder, index, anatomy_seed=index)
-    split.keep_rule(folder, Rule(shares=(0.4, 0.3, 0.3)))
+    split.store(folder, DatasetSplit(shares=(0.4, 0.3, 0.3)))
     return folder
 
 

@@ -34,7 +34,7 @@ def write_episodes(dataset: Dataset, target: Path) -> None:
 
     Features: `observation.images.left` (and `.right`: the second lens) as video, `force` (3,) mN in camera
     axes, `young_kpa` and `scale_mm_per_px` (1,). There is no action: nobody steered a robot. The task says
-    gesture and look. Sides of `synth split` are the ranges under `splits`.
+    gesture and look. Sides of the split are the ranges under `splits`.
     """
     tasks, episodes, ranges = list[str](), list[dict[str, Any]](), dict[str, str]()
     for side, positions in group_by_side(dataset).items():

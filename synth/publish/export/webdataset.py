@@ -20,7 +20,7 @@ _SHARD_BYTES = 1 << 30
 def write_shards(dataset: Dataset, target: Path) -> None:
     """Tar shards with a sample a frame: `NNNNNN_TTTT.rgb.png`, `.FIELD.npy` and `.json` (the attributes).
 
-    A second lens's pictures are `.rgb_right.png`. Shards are `SIDE-NNNNN.tar`, sides as `synth split` said.
+    A second lens's pictures are `.rgb_right.png`. Shards are `SIDE-NNNNN.tar`, sides as the dataset is split.
     """
     for side, positions in group_by_side(dataset).items():
         samples = _samples(dataset, positions)

@@ -68,3 +68,5 @@ def test_pooled_r2_is_that_of_everything_together_and_its_interval_that_of_scipy
     assert got.low == pytest.approx(theirs.confidence_interval.low, abs=0.02)
     assert got.high == pytest.approx(theirs.confidence_interval.high, abs=0.02)
     assert np.isnan(pooled_r2(sums[:2], rng()).low)
+    still = np.array([dataclasses.astuple(Moments.of(np.zeros(4), np.ones(4)))[:6]] * 4)
+    assert np.isnan(pooled_r2(still, rng()).mean), "no force, nothing to explain"

@@ -11,11 +11,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from learn.checkpoint import read_card
+from learn.checkpoint import _hash, read_card
 from learn.inference.force_reader import ForceReader, FrameForce
 from learn.inference.predict import load_model, net_force
 from learn.uncertainty.intervals import LEVEL
 from synth.errors import UserError
+from synth.job import identity
 from synth.recording_flow.frame_motion import FrameMotion
 
 SHAPE, SCALE = (48, 64), 0.5
@@ -112,6 +113,7 @@ def test_intervals_that_can_not_be_are_refused(vector: Path, at: tuple[str, ...]
     for key in at[:-1]:
         place = place[key]
     place[at[-1]] = value
-    file.write_text(json.dumps(tree))
-    with pytest.raises(UserError, match="intervals"):
+    del tree["seal"]
+    file.write_text(json.dumps(tree | {"seal": _hash(identity.canonical(tree))}))
+    with pytest.raises(UserError, match=r"config\.json.*intervals"):
         read_card(vector)

@@ -10,7 +10,7 @@ import torch
 
 from learn import checkpoint
 from learn.data.clips import Clip
-from learn.data.split import Split, nested
+from learn.data.split import Split
 from learn.evaluation.evaluate import unseen
 from learn.inference.predict import load_model
 from learn.settings import TrainingSettings, preset, replace
@@ -28,7 +28,7 @@ def small(**changes: object) -> TrainingSettings:
 
 @pytest.fixture(scope="module")
 def split(clips: list[Clip]) -> Split:
-    return nested(clips, 3, 0, seed=0)
+    return Split((2, 5, 7), (0, 1), (3, 4, 6))
 
 
 @pytest.fixture(scope="module")
@@ -123,7 +123,7 @@ def test_a_folder_with_another_run_is_not_overwritten(clips: list[Clip], split: 
         train(clips, split, small(input="mixed", learning_rate=0.1), model)
     card = checkpoint.read_card(model)
     with pytest.raises(UserError):
-        train(clips[:-1], nested(clips[:-1], 3, 0, 0), small(input="mixed"), model)
+        train(clips[:-1], Split((2, 5), (0, 1), (3, 4, 6)), small(input="mixed"), model)
     checkpoint.write_card(model, dataclasses.replace(card, retired={"clip": 0.5}))
     with pytest.raises(UserError, match=LAST):
         train(clips, split, small(input="mixed"), model)

@@ -126,7 +126,7 @@ def test_a_side_edited_in_the_index_is_found(dataset: Path) -> None:
 def test_a_split_that_is_none(dataset: Path, text: str) -> None:
     (dataset / "split.json").write_text(text)
     with pytest.raises(UserError, match="split"):
-        split.read_rule(dataset)
+        split.read_stored(dataset)
 
 
 @pytest.mark.parametrize(

@@ -52,7 +52,7 @@ def test_overrides_win_and_name_themselves_when_wrong() -> None:
     overrides = ["render.spp=8", "render.size=[64, 48]", "fem.load=0.1"]
     job = reader.parse_job("render: {spp: 2}", "job.yaml", Path(), overrides)
     assert (job.render.spp, job.render.size, job.fem.load) == (8, (64, 48), (0.1, 0.1))
-    for wrong in ("render.spp=0", "rendr.spp=1", "render.spp"):
+    for wrong in ("render.spp=0", "rendr.spp=1", "render.spp", "frames=2"):
         with pytest.raises(UserError, match=wrong):
             reader.parse_job("seed: 1", "job.yaml", Path(), [wrong])
 

@@ -35,7 +35,6 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
         card=ABOUT,
     )
     in_process(job, out, consistent)
-    split.keep_rule(out, split.parse_rule("anatomy", "0.5,0.25,0.25", [], False))
-    index.write_index(Folder(out))
+    index.split_anew(Folder(out), split.parse_rule("anatomy", "0.5,0.25,0.25", [], False))
     croissant.write_croissant(Folder(out))
     return out

@@ -1,0 +1,175 @@
+"""One split a dataset: what it says is what is published, fitted, chosen on, scored and calibrated with."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import tarfile
+from pathlib import Path
+
+import numpy as np
+import phantom
+import pyarrow.parquet as pq
+import pytest
+from typer.testing import CliRunner
+
+from learn import cli
+from learn.checkpoint import ModelCard, read_card
+from learn.data.clips import load_clips
+from learn.data.grid import Scales
+from learn.data.split import Split, find_unit, regroup
+from learn.evaluation.interval_sides import find_sides
+from learn.settings import preset
+from learn.training.sides import divide
+from synth.cli import app as synth
+from synth.dataset import index, split
+from synth.dataset.folder import claim
+from synth.dataset.split import DatasetSplit
+from synth.errors import UserError
+from synth.job.schema import Job
+from synth.publish.export.registry import export_dataset
+
+run = CliRunner().invoke
+BASE = preset("tiny", size=32)
+
+
+def make(folder: Path, anatomies: list[int], first: int = 0, opening: list[str] | None = None) -> Path:
+    """A dataset of phantoms of these anatomies, or more of one that is there."""
+    with claim(folder, Job(sequences=first + len(anatomies)), mix_versions=True) as claimed:
+        for k, seed in enumerate(anatomies):
+            place = opening and opening[k]
+            phantom.write(folder, first + k, anatomy_seed=seed, frames=3, opening=place or None)
+        index.write_index(claimed)
+    return folder
+
+
+def divided(*datasets: Path) -> tuple[ModelCard, Split]:
+    """The card of a model that would be trained on them, and the parts."""
+    clips = [clip for one in datasets for clip in load_clips(one, BASE.grid, ["ideal"])]
+    clips, parts = divide(clips, datasets, seed=0)
+    named = {part: getattr(parts, part) for part in ("fit", "select", "test", "intervals")}
+    hashes = {part: [clips[i].content_hash for i in which] for part, which in named.items()}
+    groups = {part: sorted({clips[i].group for i in which}) for part, which in named.items()}
+    return ModelCard(BASE, Scales(1.0, 0.2, 1.0, 100.0, 0.3), 1.7, hashes, groups, [*parts.hashes]), parts
+
+
+def exported(dataset: Path, target: Path) -> dict[str, dict[int, str]]:
+    """The side of every sequence by its index, in each export that has sides."""
+    for to in ("hf", "webdataset", "lerobot"):
+        export_dataset(dataset, target / to, to)
+    files = {one: one.name.split("-")[0] for one in (target / "hf/sequences").iterdir()}
+    hf = {k: side for one, side in files.items() for k in pq.read_table(one)["index"].to_pylist()}
+    shards = {}
+    for one in (target / "webdataset").iterdir():
+        with tarfile.open(one) as archive:
+            shards |= {int(name[:6]): one.name.split("-")[0] for name in archive.getnames()}
+    ranges = json.loads((target / "lerobot/meta/info.json").read_text())["splits"]
+    for side, (first, last) in ((side, text.split(":")) for side, text in ranges.items()):
+        assert int(last) - int(first) == list(hf.values()).count(side)
+    return {"hf": hf, "webdataset": shards}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("draw", range(4))
+def test_no_sequence_is_on_two_sides_in_any_artefact(tmp_path: Path, draw: int) -> None:
+    rng = np.random.default_rng([35, draw])
+    own = make(tmp_path / "own", rng.integers(0, 9, 9 + draw).tolist())
+    if draw % 2:
+        words = ["--shares", "0.5,0.2,0.3", *(["--by", "sequence", "--share-anatomy"] if draw == 3 else [])]
+        done = run(synth, ["split", str(own), *words])
+        assert done.exit_code == 0, done.output
+    assert run(synth, ["report", str(own)]).exit_code == 0
+    before = index.read_split(own)
+    make(own, rng.integers(0, 14, 4).tolist(), first=len(before.sides))
+    assert run(synth, ["report", str(own)]).exit_code == 0
+    stored = index.read_split(own)
+    assert before.sides.items() <= stored.sides.items(), "growth moves nobody"
+    rows = index.read_index(own).to_pylist()
+    on = {row["index"]: stored.sides[row["content_hash"]] for row in rows}
+    # What is published.
+    assert {row["index"]: row["split"] for row in rows} == on
+    assert not split.leaks(rows, stored)
+    text = (own / "README.md").read_text()
+    assert f"hash `{stored.hash}`" in text
+    counts = split.count(rows)
+    assert (
+        f"Splits: test {counts['test']}, train {counts['train']}, validation {counts['validation']}" in text
+    )
+    (named, _) = json.loads((own / "croissant.json").read_text())["distribution"]
+    assert named["sha256"] == hashlib.sha256((own / named["contentUrl"]).read_bytes()).hexdigest()
+    assert f"test {counts['test']}" in (own / "report.html").read_text()
+    for found in exported(own, tmp_path).values():
+        assert found == on
+    # What is learnt from.
+    card, _ = divided(own)
+    assert card.dataset_splits == [stored.hash]
+    sides = {part: {stored.sides[name] for name in names} for part, names in card.split.items()}
+    assert sides == {"fit": {"train"}, "select": {"validation"}, "test": {"test"}, "intervals": set()}
+    assert sum(map(len, card.split.values())) == len(on)
+    clips = load_clips(own, BASE.grid, ["ideal"])
+    assert {clip.content_hash for clip in cli._unseen(clips, own, [card])} == set(card.split["test"])
+    grouped = regroup(clips, find_unit(card.groups))
+    used = find_sides(grouped, card, set(card.split["test"]), from_test=False)
+    assert {clips[i].content_hash for i in used.test} == set(card.split["test"])
+    assert not set(used.test) & {*used.fit, *used.select, *used.intervals}
+
+
+def test_what_another_split_calls_test_is_not_scored_if_it_was_fitted_on(tmp_path: Path) -> None:
+    own = make(tmp_path / "own", [*range(9)])
+    card, _ = divided(own)
+    fitted = card.split["fit"][0]
+    sides = dict.fromkeys(index.read_split(own).sides, "train") | {fitted: "test"}
+    split.store(own, DatasetSplit(sides=sides))  # type: ignore[arg-type]
+    clips = load_clips(own, BASE.grid, ["ideal"])
+    with pytest.raises(UserError):
+        cli._unseen(clips, own, [card])
+    # A dataset that it never met has no side that it was fitted on.
+    strangers = make(tmp_path / "strangers", [*range(20, 26)], first=30)
+    assert len(cli._unseen(load_clips(strangers, BASE.grid, ["ideal"]), strangers, [card])) == 6
+
+
+def test_several_datasets_are_divided_as_each_says_and_no_brain_is_on_two_sides(tmp_path: Path) -> None:
+    for draw in range(6):
+        rng = np.random.default_rng([36, draw])
+        both = [make(tmp_path / f"{draw}-{k}", rng.permutation(12)[:9].tolist(), 20 * k) for k in range(2)]
+        card, _ = divided(*both)
+        sides = dict[str, str]()
+        for one in both:
+            sides |= index.read_split(one).sides
+        for part, side in (("fit", "train"), ("select", "validation"), ("test", "test")):
+            assert {sides[name] for name in card.split[part]} <= {side}
+        on = [set(card.groups[part]) for part in ("fit", "select", "test")]
+        assert sum(map(len, on)) == len(set.union(*on))
+
+
+def test_openings_that_overlap_are_one_group_and_the_others_are_kept_apart(tmp_path: Path) -> None:
+    at = [(0, 0, 0), (19, 0, 0), (60, 0, 0), (0, 60, 0), (0, 60, 20), (0, 0, 90)]
+    names = [f"mesh-5f at {x}, {y}, {z}" for x, y, z in at for _ in range(2)]
+    own = make(tmp_path / "own", [1] * 12, opening=names)
+    with pytest.raises(UserError):
+        divided(own)  # one brain
+    done = run(synth, ["split", str(own), "--by", "opening", "--shares", "0.4,0.3,0.3"])
+    assert done.exit_code == 0, done.output
+    on = {row["opening"]: set[str]() for row in index.read_index(own).to_pylist()}
+    for row in index.read_index(own).to_pylist():
+        on[row["opening"]].add(row["split"])
+    assert all(len(sides) == 1 for sides in on.values())
+    assert on[names[0]] == on[names[2]], "19 mm apart at 12 mm radius"
+    assert on[names[6]] == on[names[8]]
+    card, _ = divided(own)
+    assert find_unit(card.groups) == "opening"
+    assert all(card.split[part] for part in ("fit", "select", "test"))
+
+
+@pytest.mark.slow
+def test_train_and_eval_keep_to_it(tmp_path: Path) -> None:
+    own = make(tmp_path / "own", [*range(8)])
+    words = ["--preset", "tiny", "--epochs", "1", "--json", "size=32", "arch.width=8"]
+    done = run(cli.app, ["train", str(own), "-o", str(tmp_path / "model"), *words])
+    assert done.exit_code == 0, done.output
+    card, chosen = read_card(tmp_path / "model"), index.read_split(own)
+    assert card.dataset_splits == [chosen.hash]
+    assert {chosen.sides[name] for name in card.split["test"]} == {"test"}
+    done = run(cli.app, ["eval", str(tmp_path / "model"), str(own), "--json"])
+    assert len(json.loads(done.stdout)["sequences"]) == len(card.split["test"])
+    assert run(cli.app, ["train", str(own), "-o", str(tmp_path / "b"), "folds=3"]).exit_code == 2
