@@ -15,6 +15,8 @@ from synth.flow.estimator import Estimator, Flags, Flow, Map, Rgb, create
 _DOUBTED = 0.5  # mean confidence of what is visible; frames below it are tried again from nothing
 _MATCHED = 0.1  # share of what is visible that is no lost pixel; below it motion is no better than a guess
 _LEAST = 0.02  # of the tissue must be free of masks for anything to be concluded
+_WIDER = 0.2  # mean confidence that the surroundings must add to be followed with the tissue
+_TRIES = 3  # frames that are asked whether they do
 _DROP = 0.85  # a fall below this share of the last trusted frame's confidence is looked into
 
 
@@ -91,6 +93,9 @@ class Tracker:
         self.unsure: Flags = np.zeros_like(tissue)
         """(H, W) where confidence says nothing about the frame."""
         self._level = 1.0
+        self._around, self._tries = ~tissue & ~rest_blocked, 0
+        self.widened = False
+        """Whether the surroundings are followed with the tissue."""
 
     def step(self, frame: Rgb, blocked: Flags) -> tuple[Flow, Map]:
         """Flow (H, W, 2) px and confidence (H, W) of the next frame; `trusted` says whether it was followed.
@@ -102,15 +107,30 @@ class Tracker:
         if frame.shape != self.rest.shape or blocked.shape != self.tissue.shape:
             raise UserError(f"flow: frame {frame.shape} does not fit the rest frame {self.rest.shape}")
         found = self.solve(frame, blocked, self.initial)
-        if self.initial is not None and self.is_doubtful(found):
-            again = self.solve(frame, blocked, None)
-            if again.level > found.level:
-                found, self.resets = again, self.resets + 1
+        if self.is_doubtful(found):
+            if self.initial is not None:
+                again = self.solve(frame, blocked, None)
+                if again.level > found.level:
+                    found, self.resets = again, self.resets + 1
+            found = self._wider(frame, blocked, found)
         return self.accept(found)
+
+    def _wider(self, frame: Rgb, blocked: Flags, found: Solution) -> Solution:
+        """The answer with the surroundings, if it is so much surer in the tissue; then in all later frames.
+
+        Where tissue is faint, what lies still around it holds the flow; elsewhere it pulls at the rim.
+        """
+        if self.widened or self._tries >= _TRIES:
+            return found
+        self.widened, self._tries = True, self._tries + 1
+        wider = self.solve(frame, blocked, None)
+        self.widened = wider.level > found.level + _WIDER
+        return wider if self.widened else found
 
     def solve(self, frame: Rgb, blocked: Flags, initial: Flow | None) -> Solution:
         """One answer for a frame; nothing is remembered of it. Arguments as `step` and `initial`."""
-        flow, confidence = self.estimator.flow(self.rest, frame, self.usable, ~blocked, initial)
+        domain = self.usable | self._around if self.widened else self.usable
+        flow, confidence = self.estimator.flow(self.rest, frame, domain, ~blocked, initial)
         confidence = confidence * self.tissue
         seen = self.usable & ~blocked
         where, tissue = seen & ~self.unsure, int(np.count_nonzero(self.tissue))

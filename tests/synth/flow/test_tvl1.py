@@ -108,3 +108,34 @@ def test_flow_from_rest_to_now_does_not_drift() -> None:
         flow, _ = tracker.step(shot.now, ~shot.now_usable)
         errors.append(_error(flow, shot.flow).mean())
     assert np.mean(errors[24:]) < 1.3 * np.mean(errors[:12])
+
+
+class _Given:
+    """An estimator that is as sure as it is told, by whether it may see the surroundings."""
+
+    def __init__(self, alone: float, around: float) -> None:
+        self.sure, self.shown = (alone, around), []
+
+    def flow(self, rest, now, rest_usable, now_usable, initial=None):  # type: ignore[no-untyped-def]
+        self.shown.append(bool(rest_usable[0, 0]))
+        return np.zeros((*rest_usable.shape, 2), "f4"), np.full(
+            rest_usable.shape, self.sure[self.shown[-1]], "f4"
+        )
+
+
+@pytest.mark.parametrize(
+    ("alone", "around", "widened"), [(0.3, 0.9, True), (0.3, 0.4, False), (0.8, 1.0, False)]
+)
+def test_surroundings_are_followed_where_tissue_alone_says_little(
+    alone: float, around: float, widened: bool
+) -> None:
+    tissue = np.zeros((32, 32), bool)
+    tissue[8:24, 8:24] = True
+    picture, given = np.zeros((32, 32, 3), np.uint8), _Given(alone, around)
+    tracker = track.Tracker(given, picture, ~tissue & False, tissue)
+    for _ in range(6):
+        _, confidence = tracker.step(picture, ~tissue & False)
+    assert tracker.widened == widened == given.shown[-1]
+    assert confidence[16, 16] == pytest.approx(around if widened else alone)
+    assert not confidence[~tissue].any()
+    assert sum(given.shown) <= (6 if widened else 3), "a film of faint tissue isn't asked for ever"
