@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.recording import clocks, pixel_scale
-from bench.recording.folder import Recording, open_recording
-from bench.recording.meta import LEAST_INTERVALS, LEAST_TURNING
+from bench.recording.folder import Force, Recording, open_recording
+from bench.recording.meta import LEAST_INTERVALS, LEAST_TURNING, Meta
 from bench.recording.second_eye import LATE, SecondEye, StereoQuality
 from synth.errors import UserError
 from synth.recording_flow.finding import Finding, judge_scale, judge_young, worth_saying
@@ -20,9 +20,10 @@ from synth.video.read import Picture
 
 _JUMP = 3.0  # median intervals
 _SURGICAL_N = 5.0
+_LOADED = 0.25  # share of the range of force: more is no rest
 _RATE_HZ = 10.0  # frames a second that are looked at unless more are asked for
 _LEAST_PRESS = 5  # frames of a press that settle its gain
-_OFF_ROWS_PX = 0.5  # of small pictures: the calibration is not this pair's, or no longer
+_OFF_ROWS_PX, _OTHER_ROWS_PX = 0.5, 2.0  # of small pictures: the calibration isn't this pair's, or no longer
 _NOISY_MM = 0.16  # depth motion from which on force is no better than with one eye
 # Logarithm of the stated scale over the second eye's: beyond these they contradict each other, and beyond the
 # second, which of them is wrong decides what the force is.
@@ -87,30 +88,59 @@ def check_recording(folder: Path, phantom: bool = False) -> list[Finding]:
 
 
 def judge(
-    recording: Recording,
-    mm_per_px: float,
-    size: tuple[int, int],
-    film: Sequence[Finding],
-    stereo: StereoQuality | None,
+    recording: Recording, mm_per_px: float, video: VideoFlow, stereo: StereoQuality | None
 ) -> list[Finding]:
     """What is wrong with a recording whose film was followed: `bench check` and `bench score` say the same.
 
     Args:
         recording: the opened recording.
         mm_per_px: of its own pixels.
-        size: height, width of its pictures [px].
-        film: what its `VideoFlow` found.
+        video: its film, once it is through.
         stereo: what its second eye came to, if it has one.
     """
     meta = recording.meta
-    found = [*judge_young(meta.young_kpa, meta.tissue == "phantom"), *judge_scale(mm_per_px, size[1])]
-    return [*found, *film, *([] if stereo is None else judge_eyes(stereo, mm_per_px))]
+    found = [*judge_young(meta.young_kpa, meta.tissue == "phantom"), *judge_scale(mm_per_px, video.size[1])]
+    found += video.findings if stereo is None else [*video.findings, *judge_eyes(stereo, mm_per_px)]
+    return found if recording.force is None else [*found, *judge_zero(recording.force, meta, video.rest_s)]
+
+
+def judge_zero(force: Force, meta: Meta, rest_s: float | None) -> list[Finding]:
+    """Whether the sensor shows load where there should be none: in `sensor.free_s`, or at the rest frame.
+
+    Its samples are taken as they stand, for a tare would hide it.
+    """
+    known = np.isfinite(force.force_mn).all(axis=1)
+    t, newtons = force.time_s[known], force.force_mn[known]
+    size = np.linalg.norm(newtons, axis=1)
+    least, most = float(size.min()), float(size.max())
+    found = []
+    if most > 1000 * _SURGICAL_N and meta.tissue == "brain":
+        said = f"{most / 1000:.3g} N is much for a brain: is force.csv in newtons?"
+        found.append(Finding("odd", "sensor", said))
+    offset = {"clock": 0.0, "offset": meta.sync.offset_s}.get(meta.sync.method)
+    if rest_s is not None and offset is not None and t[0] <= rest_s - offset <= t[-1]:
+        there = float(np.interp(rest_s, t + offset, size))
+        if there - least > _LOADED * (most - least):
+            best = float(t[size.argmin()] + offset)
+            said = f"the sensor shows {there:.3g} mN at the rest frame; least is {least:.3g} at {best:.3g} s"
+            found.append(Finding("odd", "rest frame", said))
+    for start, stop in meta.sensor.free_s:
+        inside = newtons[(t >= start) & (t <= stop)]
+        if len(inside) > 2:
+            low, high = np.percentile(inside, (5, 95), axis=0)
+            change = float(np.linalg.norm(high - low))
+            if change > _LOADED * np.linalg.norm(np.ptp(newtons, axis=0)):
+                said = f"sensor.free_s: force changes by {change:.3g} mN between {start:g} and {stop:g} s"
+                found.append(Finding("odd", "sensor", said))
+    return found
 
 
 def judge_eyes(stereo: StereoQuality, mm_per_px: float) -> list[Finding]:
     """Whether a second eye is of this film, at this scale."""
     found = []
-    if stereo.epipolar_px > _OFF_ROWS_PX or not stereo.noise_mm < _NOISY_MM or stereo.lag > LATE:
+    if stereo.epipolar_px > _OTHER_ROWS_PX:
+        found.append(Finding("bad", "second eye", f"its rows are {stereo.epipolar_px:.2g} px off"))
+    elif stereo.epipolar_px > _OFF_ROWS_PX or not stereo.noise_mm < _NOISY_MM or stereo.lag > LATE:
         found.append(Finding("odd", "second eye", stereo.describe()))
     off = abs(np.log(stereo.mm_per_px / mm_per_px))
     if off > _OTHER_SCALE:
@@ -169,7 +199,7 @@ def _check_film(recording: Recording, found: _Checked) -> None:
     stereo = None if second is None else second.quality
     if stereo is not None and not judge_eyes(stereo, found.mm_per_px or stereo.mm_per_px):
         found.add("ok", "second eye", stereo.describe())
-    found.findings += judge(recording, found.mm_per_px or 0.0, found.size, video.findings, stereo)
+    found.findings += judge(recording, found.mm_per_px or 0.0, video, stereo)
 
 
 def _counted(recording: Recording, found: _Checked) -> Iterator[Picture]:
@@ -216,8 +246,6 @@ def _check_sensor(recording: Recording, found: _Checked) -> None:
     peak = float(np.nanmax(np.linalg.norm(force.force_mn, axis=1)))
     rate = (len(t) - 1) / (t[-1] - t[0])
     found.add("ok", "sensor", f"{len(t)} rows at {rate:.4g} a second, up to {peak:.3g} mN")
-    if peak > 1000 * _SURGICAL_N and meta.tissue == "brain":
-        found.add("odd", "sensor", f"{peak / 1000:.3g} N is much for a brain: is force.csv in newtons?")
     if not meta.sensor.free_s:
         found.add("lack", "sensor", "no sensor.free_s: no tare, no drift, no noise floor")
     for start, stop in meta.sensor.free_s:

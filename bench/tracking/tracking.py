@@ -162,7 +162,7 @@ def _describe(
     """What was done to the video, which is through, and what somebody should know of it."""
     out.summary, out.size, out.notes = video.summary, video.size, video.notes
     scale = mm_per_px / video.shrink
-    out.findings = check.judge(recording, scale, video.size, video.findings, out.stereo)
+    out.findings = check.judge(recording, scale, video, out.stereo)
     if video.faults is not None:
         out.repeats = video.faults.repeats()
     if out.fault:

@@ -165,6 +165,8 @@ class VideoFlow:
         """(h, w), shrunk as the pictures are; empty before the rest frame."""
         self.shrink, self.size = settings.shrink, (0, 0)
         """How many times smaller than `size`, height and width of the film's own pictures, these are."""
+        self.rest_s: float | None = None
+        """Time of the rest frame, if it has one."""
         self.decoded = self.peak_bytes = 0
         """Frames, and memory of the flow's own process."""
         self.found: list[Finding] = []
@@ -176,7 +178,6 @@ class VideoFlow:
         self._foreground: ForegroundSearch | None = None  # not of a stream
         self._surface: SurfaceMotion | None = None  # only where a pulse is to be found
         self._depth_weights: list[float] = []
-        self._rest_s: float | None = None
         self._period_s = 0.0 if settings.rate_hz is None else 1 / settings.rate_hz
         self._due_s = self._last_s = -math.inf
         self._left_out: Counter[str] = Counter()
@@ -242,7 +243,7 @@ class VideoFlow:
             return None
         if self._depth_weights:
             self._surface.depth_weight = min(1.0, float(np.median(self._depth_weights)))
-        rest_s = self._rest_s
+        rest_s = self.rest_s
         if rest_s is None:
             rest_s = self._surface.time_s[0] if self._surface.time_s else 0.0
         with self.watch.stage("pulse"):
@@ -312,7 +313,7 @@ class VideoFlow:
         if not self.tissue.any():
             raise UserError(f"{self.footage.name}: the picture of the tissue marks no tissue")
         self.faults = FilmFaults(rest.rgb, shrink_picture(rest.rgb, self.shrink), self.tissue)
-        self._rest_s = rest.time_s
+        self.rest_s = rest.time_s
         if self.settings.pulse and self.pulse is None:
             self._surface = SurfaceMotion(self.tissue)
 

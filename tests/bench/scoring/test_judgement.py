@@ -31,3 +31,14 @@ def test_what_is_stated_in_another_unit_is_found_by_check_and_score_and_no_numbe
     assert np.isnan(result.methods["bump"].size_mn).all()
     assert headline(result).tiles == ()
     assert next(iter(as_json(result)["findings"]))["what"] == what
+
+
+@pytest.mark.parametrize(("rest", "free"), [(6, [[0.0, 0.05]]), (0, [[0.2, 0.8]])])
+def test_load_at_the_rest_frame_or_in_a_free_span_is_found_by_check_and_score(
+    make: Maker, rest: int, free: list[list[float]]
+) -> None:
+    sensor = {"axes": "camera", "low_pass_hz": None, "free_s": free}
+    folder = make(frames=12, meta={"rest_frame": rest, "sensor": sensor})
+    odd = [one for one in scored(folder, backend="dis").findings if one.state == "odd"]
+    assert {"rest frame" if rest else "sensor"} <= {one.what for one in odd}
+    assert {one for one in odd if one.what == "rest frame"} <= set(check.check_recording(folder))
