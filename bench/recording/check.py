@@ -10,9 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.recording import clocks, pixel_scale
+from bench.recording.eye_pairing import LATE
 from bench.recording.folder import Force, Recording, open_recording
 from bench.recording.meta import LEAST_INTERVALS, LEAST_TURNING, Meta
-from bench.recording.second_eye import LATE, SecondEye, StereoQuality
+from bench.recording.second_eye import SecondEye, StereoQuality
 from synth.errors import UserError
 from synth.recording_flow.finding import Finding, judge_scale, judge_young, worth_saying
 from synth.recording_flow.video_flow import RecordingFlowSettings, VideoFlow
@@ -137,7 +138,7 @@ def judge_zero(force: Force, meta: Meta, rest_s: float | None) -> list[Finding]:
 
 def judge_eyes(stereo: StereoQuality, mm_per_px: float) -> list[Finding]:
     """Whether a second eye is of this film, at this scale."""
-    found = []
+    found = [Finding("bad", "second eye", f"the second eye {stereo.fault}")] if stereo.fault else []
     if stereo.epipolar_px > _OTHER_ROWS_PX:
         found.append(Finding("bad", "second eye", f"its rows are {stereo.epipolar_px:.2g} px off"))
     elif stereo.epipolar_px > _OFF_ROWS_PX or not stereo.noise_mm < _NOISY_MM or stereo.lag > LATE:

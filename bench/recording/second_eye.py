@@ -9,6 +9,7 @@ from itertools import chain
 import cv2
 import numpy as np
 
+from bench.recording.eye_pairing import LATE, EyePairing
 from bench.recording.folder import Recording
 from synth.errors import UserError
 from synth.flow import image, mask_detection
@@ -25,9 +26,6 @@ from synth.system import checked_file
 from synth.video.read import Picture
 
 _LARGEST_BYTES = 1 << 30  # of an array of points
-LATE = 0.22
-"""Share of the motion that the second eye doesn't show from which on it is of another moment."""
-_MOVED_PX = 0.5  # less says nothing of when
 
 
 @dataclass(frozen=True)
@@ -45,6 +43,8 @@ class StereoQuality:
     lag: float = 0.0
     """Share of the motion that the second eye doesn't show, exceeded in a tenth of the frames that moved: its
     pictures are of another moment. 0 for a depth camera, which can't tell."""
+    fault: str = ""
+    """Why its pictures aren't the second eye's, of these moments; empty if nothing is wrong."""
 
     def describe(self) -> str:
         """A line for a person."""
@@ -69,7 +69,7 @@ class SecondEye:
         self._rights: Iterator[Picture] = iter(recording.right_frames()) if recording.right else iter(())
         self._shrink = 1
         self._noise: list[float] = []
-        self._lags: list[float] = []
+        self._pairing = EyePairing()
         self._pair: tuple[Rgb, Rgb] | None = None  # of the frame last followed, or
         self._seen: Map | None = None  # its depth
 
@@ -82,10 +82,10 @@ class SecondEye:
                 return None
             away, focal = self._depth.distance_mm, float(self._depth.K[0, 0])
             return StereoQuality(float("nan"), float("nan"), away / focal / self._shrink, noise)
-        lag = float(np.percentile(self._lags, 90)) if self._lags else 0.0
         r, rest = self._stereo.rectified, self._stereo.rest
         scale = self._stereo.distance_mm / r.focal / self._shrink
-        return StereoQuality(r.baseline_mm, rest.epipolar_px, scale, noise, lag)
+        lag, fault = self._pairing.lag, self._pairing.fault(r)
+        return StereoQuality(r.baseline_mm, rest.epipolar_px, scale, noise, lag, fault)
 
     def follow(self, frame: FrameMotion, video: VideoFlow) -> Moved | None:
         """Motion in space of a frame since rest, None where the second eye's picture is missing.
@@ -103,8 +103,8 @@ class SecondEye:
             if self._stereo is None or self._camera is None:
                 self._pair = frame.rgb, right
                 hidden = _mask_right(right, video.settings.masks, masked)
-                rig = self._rig(video)
-                self._stereo = StereoTracker(rig, frame.rgb[None], right[None], masked, hidden, tissue)
+                self._stereo = self._begun(self._rig(video), frame.rgb, right, masked, hidden, tissue)
+                self._pairing.add(frame.rgb, right, masked, frame.flow, tissue, 0.0)
                 # A breath moves all tissue to and from both eyes, across in this one: that is no camera's.
                 inside = self._stereo.right_tissue()
                 self._camera = CameraTracker(right, inside, inside | mask_detection.blocked(right))
@@ -117,8 +117,7 @@ class SecondEye:
             if view is not None:
                 hidden |= view.outside(tissue.shape)
             moved = self._stereo.step(frame.rgb, right, masked, hidden, frame.flow, frame.confidence)
-            if np.percentile(np.abs(frame.flow[tissue]), 98) > _MOVED_PX:
-                self._lags.append(abs(self._stereo.lag))
+            self._pairing.add(frame.rgb, right, masked, frame.flow, tissue, self._stereo.lag)
         else:
             if (depth := self._depths(frame, video)) is None:
                 return None
@@ -141,6 +140,21 @@ class SecondEye:
         except UserError:
             return None
         return r.back(np.where(found.found, r.depth(found.disparity), np.nan).astype(np.float32))
+
+    def _begun(
+        self, rig: StereoRig, left: Rgb, right: Rgb, masked: Flags, hidden: Flags, tissue: Flags
+    ) -> StereoTracker:
+        """From the rest pictures; UserError if they don't match, which says how they would."""
+        try:
+            return StereoTracker(rig, left[None], right[None], masked, hidden, tissue)
+        except UserError as error:
+            for how, turned in (("mirrored", right[:, ::-1]), ("upside down", right[::-1, ::-1])):
+                try:
+                    StereoTracker(rig, left[None], np.ascontiguousarray(turned)[None], masked, hidden, tissue)
+                except UserError:
+                    continue
+                raise UserError(f"{self._recording.folder}: the right eye's pictures are {how}") from None
+            raise error
 
     def _rig(self, video: VideoFlow) -> StereoRig:
         """The pair, with pictures as small as the film's, cut as `shrink_picture` cuts them."""

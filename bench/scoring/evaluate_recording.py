@@ -23,9 +23,10 @@ from bench.recording.pixel_scale import PixelScale
 from bench.scoring import metrics
 from bench.scoring.result import Curve, Gain, Result, Scored
 from bench.sensor.alignment import AlignedSensor, align_sensor, describe_span
+from bench.sensor.plausibility import judge_sensor
 from bench.tracking.tracking import Progress, TrackedRecording, track_recording
 from learn.uncertainty.intervals import LEVEL
-from synth.recording_flow.finding import worth_saying
+from synth.recording_flow.finding import Finding, first_fault, worth_saying
 from synth.recording_flow.local_flow import LocalFlow
 from synth.recording_flow.video_flow import RecordingFlowSettings
 
@@ -71,6 +72,9 @@ def evaluate_recording(
     meta, notes = recording.meta, [*recording.notes, *tracked.notes]
     time_s, lost = np.array(tracked.time_s), ~np.array(tracked.trusted)
     sensor = align_sensor(recording, time_s, _speed(tracked, lost), tracked.turning, notes)
+    findings = [*tracked.findings, *_against_sensor(recording, tracked, methods, sensor, ~lost)]
+    if first_fault(findings):
+        lost[:] = True
     if meta.young_kpa is None:
         notes.append(_NO_YOUNG)
     press = None if meta.press_s is None else _within(time_s, meta.press_s)
@@ -81,7 +85,7 @@ def evaluate_recording(
         press,
         meta.young_kpa is not None,
     )
-    if lost.any():
+    if lost.any() and not first_fault(findings):
         notes.append(f"{lost.sum()} of {len(lost)} frames could not be followed: gaps, not scored")
     scored: dict[str, Scored] = {}
     for name, method in methods.items():
@@ -112,7 +116,7 @@ def evaluate_recording(
         settings={**asdict(settings), **described, "meta": meta.model_dump(mode="json", exclude_none=True)},
         followed=tracked,
         turn=sensor.rotation,
-        findings=worth_saying(tracked.findings),
+        findings=worth_saying(findings),
         absolute=against.absolute,
     )
 
@@ -129,6 +133,27 @@ class _Reference:
     """(T,) the frames of the calibrating press; None if there is none."""
     absolute: bool
     """Whether E is known."""
+
+
+def _against_sensor(
+    recording: Recording,
+    tracked: TrackedRecording,
+    methods: Mapping[str, Method],
+    sensor: AlignedSensor,
+    followed: Flags,
+) -> list[Finding]:
+    """What the film says of the sensor, on the frames that were followed."""
+    moved = next((name for name, one in methods.items() if isinstance(one, FlowSize)), None)
+    if sensor.axes_mn is None or moved is None:
+        return []
+    forces = []
+    if recording.meta.young_kpa is not None:
+        every = [np.array(tracked.force_mn[n]) for n, one in methods.items() if not isinstance(one, FlowSize)]
+        seen = np.array([1.0, 1.0, 1.0 if recording.has_two_eyes else np.nan])
+        forces = [force[followed] * seen for force in every if np.nan_to_num(force).any()]
+    size = np.array(tracked.force_mn[moved])[followed, 0]
+    time_s = np.array(tracked.time_s)[followed]
+    return judge_sensor(time_s, sensor.axes_mn[followed], size, forces, sensor.in_camera_axes)
 
 
 def _speed(tracked: TrackedRecording, lost: Flags) -> Curve:

@@ -9,6 +9,7 @@ from fake_recording import Maker, scored
 from bench.recording import check
 from bench.scoring.headline import headline
 from bench.scoring.result import as_json
+from bench.sensor.plausibility import judge_sensor
 
 STATED = {
     "E in Pa": ({"young_kpa": 1500.0}, "stiffness"),
@@ -42,3 +43,24 @@ def test_load_at_the_rest_frame_or_in_a_free_span_is_found_by_check_and_score(
     odd = [one for one in scored(folder, backend="dis").findings if one.state == "odd"]
     assert {"rest frame" if rest else "sensor"} <= {one.what for one in odd}
     assert {one for one in odd if one.what == "rest frame"} <= set(check.check_recording(folder))
+
+
+TIME = np.arange(60) / 10
+PRESS = np.sin(TIME * 1.3)[:, None] ** 2 * [1.0, -2.0, 4.0] + np.sin(TIME)[:, None] ** 4 * [3.0, 1.0, 0.0]
+SENSORS = {
+    "mN for N": (1000 * PRESS, "bad"),
+    "on the tool": (-PRESS, "odd"),
+    "axes permuted": (PRESS[:, [1, 2, 0]], "odd"),
+    "constant": (0 * PRESS + 2.0, "bad"),
+    "saturated": (PRESS.clip(-9, 2.0), "odd"),
+    "0.6 s late": (np.roll(PRESS, 6, axis=0), "odd"),
+    "backwards": (PRESS[::-1], "odd"),
+}
+
+
+@pytest.mark.parametrize("case", SENSORS)
+def test_a_sensor_that_the_film_contradicts_is_found(case: str) -> None:
+    moved, methods = np.linalg.norm(PRESS, axis=1) ** 0.9, [0.6 * PRESS, 1.5 * PRESS]
+    assert judge_sensor(TIME, PRESS, moved, methods, True) == []
+    wrong, state = SENSORS[case]
+    assert state in {one.state for one in judge_sensor(TIME, wrong, moved, methods, True)}

@@ -1,0 +1,96 @@
+"""Whether the right eye's pictures are those of the right eye, and of the left eye's moments."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from synth.flow import image, mask_detection
+from synth.flow.estimator import Flags, Map, Rgb
+from synth.flow.stereo import rest
+from synth.flow.stereo.rig import Rectified
+
+LATE = 0.22
+"""Share of the motion that the second eye doesn't show from which on it is of another moment."""
+_MOVED_PX = 0.5  # less says nothing of when
+_SAME = 0.2  # of the change of the left eye's picture: less is the same picture again
+_COPY = 0.03  # of the picture's own detail: two cameras' noise alone differs by more
+_FROZEN = 3  # frames
+_LEAST_TOOL = 300  # px
+_BEHIND_PX = 1.0  # of disparity: what hides tissue is nearer than it
+_FOLLOWS = 0.7  # correlation of what is missing with the motion from frame to frame
+_NEAR = np.ones((25, 25), np.uint8)
+
+
+class EyePairing:
+    """Gathers, frame by frame, what tells."""
+
+    def __init__(self) -> None:
+        self._last: tuple[Rgb, Rgb, Map] | None = None
+        self._copied, self._frozen, self._largest = True, 0, 0
+        self._tool: tuple[Flags, Rgb, Rgb] | None = None
+        self._lags: list[tuple[float, float, float]] = []
+
+    @property
+    def lag(self) -> float:
+        """Share of the motion that the right eye lacks, exceeded in a tenth of the frames that moved."""
+        return float(np.percentile(np.abs(self._lags), 90, axis=0)[0]) if self._lags else 0.0
+
+    def add(self, left: Rgb, right: Rgb, masked: Flags, flow: Map, tissue: Flags, lag: float) -> None:
+        """A frame's pictures (H, W, 3), its mask, and flow (H, W, 2) px since the rest frame, which is first.
+
+        `lag`: of `StereoTracker`.
+        """
+        down = flow[..., 1][tissue]
+        # A flat surface may look alike to both eyes, but not in every frame.
+        self._copied &= _change(left, right) < _COPY * _change(left[:, 1:], left[:, :-1])
+        if self._last is not None:
+            before_left, before_right, before = self._last
+            self._frozen += _change(right, before_right) < _SAME * _change(left, before_left)
+            if self._lags and np.isnan(self._lags[-1][2]):
+                self._lags[-1] = (*self._lags[-1][:2], _share(before, down))
+            if np.percentile(np.abs(flow[tissue]), 98) > _MOVED_PX:
+                self._lags.append((lag, _share(down, before), np.nan))
+        self._last = left, right, down
+        tool = masked & ~mask_detection.glare(left, 3)
+        if tool.sum() > max(_LEAST_TOOL, self._largest):
+            self._largest, self._tool = int(tool.sum()), (tool, left, right)
+
+    def fault(self, rectified: Rectified) -> str:
+        """What is wrong with the right eye's pictures; empty if nothing is."""
+        if self._copied:
+            return "shows the left eye's own pictures"
+        if self._frozen >= _FROZEN:
+            return f"stands still in {self._frozen} frames in which the left eye's picture changes"
+        if self._behind_px(rectified) > _BEHIND_PX:
+            return "sees the tool behind the tissue that it hides: the eyes are swapped"
+        share, *frames = np.nan_to_num(self._lags).reshape(-1, 3).T
+        if self.lag > LATE and len(share) > 3:
+            late, early = (np.corrcoef(share, np.clip(one, -2, 2))[0, 1] for one in frames)
+            if max(late, early) > _FOLLOWS:
+                return f"is about a frame {'late' if late > early else 'early'}"
+        return ""
+
+    def _behind_px(self, rectified: Rectified) -> float:
+        """How much less disparity the tool has than the tissue around it [px]; 0: unknown."""
+        if self._tool is None:
+            return 0.0
+        tool, *pair = self._tool
+        left, right = (rectified.picture(rgb @ image.GREY, eye) for eye, rgb in enumerate(pair))
+        everywhere = np.ones(tool.shape, bool)
+        found = rest.match(left, right, everywhere, everywhere, refine=False)
+        inner = found.found & rectified.flags(cv2.erode(tool.astype(np.uint8), np.ones((3, 3))) > 0, 0)
+        around = found.found & ~rectified.flags(tool, 0) & (cv2.dilate(inner.astype(np.uint8), _NEAR) > 0)
+        if min(inner.sum(), around.sum()) < _LEAST_TOOL / 2:
+            return 0.0
+        return float(np.median(found.disparity[around]) - np.median(found.disparity[inner]))
+
+
+def _change(one: Rgb, other: Rgb) -> float:
+    """Mean difference of two pictures [grey levels]."""
+    return float(cv2.absdiff(np.ascontiguousarray(one), np.ascontiguousarray(other)).mean())
+
+
+def _share(now: Map, other: Map) -> float:
+    """Share of a motion (N,) px that one of another moment lacks."""
+    return 1 - float(now @ other) / max(float(now @ now), 1e-9)

@@ -1,0 +1,121 @@
+"""Whether a force sensor's record can be that of the film: unit, sign, axes, clock, and whether it measures.
+
+No method is trusted for this; but what all of them contradict alike is the sensor's, or what they share.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from synth.recording_flow.finding import Finding
+
+Curve = NDArray[np.float64]
+
+_ANOTHER_UNIT = 12.0  # factor that all methods are off by, to the same side
+_LITTLE, _MUCH, _APART = 0.2, 0.7, 0.5  # cosine of what doesn't agree, of what does, and between them
+_LATE_S, _DRIFTS = 1.5, (0.9, 0.92, 0.94, 0.96, 0.98, 1.0, 1.02, 1.04, 1.06, 1.08, 1.1)
+_COMMON = 0.6  # share of the frames that another clock must leave
+_STANDS_FRAMES, _MOVES = 3, 0.25  # share of the largest motion
+_LEAST_FRAMES = 8
+
+
+def judge_sensor(
+    time_s: Curve, axes_mn: Curve, moved: Curve, forces: Sequence[Curve], in_camera_axes: bool
+) -> list[Finding]:
+    """What is wrong with a sensor, seen from the film.
+
+    Args:
+        time_s: (T,) of the frames that were followed [s].
+        axes_mn: (T, 3) the sensor there; NaN where it has nothing.
+        moved: (T,) mean motion of the tissue since the rest frame, any unit.
+        forces: by each method, (T, 3) mN in the camera's axes, NaN: not known; none where E is unknown.
+        in_camera_axes: whether the sensor's are the same.
+    """
+    known = np.isfinite(axes_mn).all(axis=1) & np.isfinite(moved)
+    t, axes, moved = time_s[known], axes_mn[known], moved[known]
+    size = np.linalg.norm(axes, axis=1)
+    if len(t) < _LEAST_FRAMES or not np.ptp(moved) > 0:
+        return []
+    if not np.ptp(axes, axis=0).any():
+        said = f"force.csv says {size[0]:.3g} mN all the time, while the tissue moves"
+        return [Finding("bad", "sensor", said)]
+    told = [np.nan_to_num(force[known]) for force in forces]
+    found = [*_unit(size, told), *(_axes(axes, told) if in_camera_axes else [])]
+    return [*found, *_clock(t, size, moved), *_stands(t, axes, moved)]
+
+
+def _unit(size: Curve, forces: Sequence[Curve]) -> list[Finding]:
+    gains = [float(np.log(size.max() / max(np.linalg.norm(f, axis=1).max(), 1e-9))) for f in forces]
+    least = min(map(abs, gains), default=0.0)
+    if least < np.log(_ANOTHER_UNIT) or not (min(gains) > 0 or max(gains) < 0):
+        return []
+    factor, more = np.exp(abs(np.median(gains))), "larger" if gains[0] > 0 else "smaller"
+    said = (
+        f"the sensor's force is {factor:.2g} times {more} than every method's: a unit is wrong "
+        "(mN for N, and Pa or MPa for kPa, make 1000, grams 102, cm for mm 100)"
+    )
+    return [Finding("bad", "sensor", said)]
+
+
+def _axes(axes: Curve, forces: Sequence[Curve]) -> list[Finding]:
+    """The signed permutation of the axes at which the methods' force lies along the sensor's."""
+    every = [force / max(float(np.linalg.norm(force)), 1e-12) for force in forces]
+    if not every:
+        return []
+    # One eye doesn't see along the view.
+    n = 3 if all(force[:, 2].any() for force in every) else 2
+    one, other = np.sum(every, axis=0)[:, :n], axes[:, :n]
+    both = one.T @ other / max(float(np.linalg.norm(one) * np.linalg.norm(other)), 1e-12)
+    found = {
+        (order, signs): sum(sign * both[k, j] for k, (j, sign) in enumerate(zip(order, signs, strict=True)))
+        for order in itertools.permutations(range(n))
+        for signs in itertools.product((1, -1), repeat=n)
+    }
+    best, now = max(found, key=lambda key: found[key]), float(np.trace(both))
+    if now > _LITTLE or found[best] < max(_MUCH, now + _APART):
+        return []
+    names = ", ".join(f"{'-' * (sign < 0)}f{'xyz'[j]}_n" for j, sign in zip(*best, strict=True))
+    said = f"the tissue moves as if the force along the camera's axes were {names} of force.csv"
+    if best[1] == (-1,) * n and best[0] == tuple(range(n)):
+        said += ": is it the force on the tool (sensor.acts_on)?"
+    return [Finding("odd", "sensor", said)]
+
+
+def _clock(time_s: Curve, size: Curve, moved: Curve) -> list[Finding]:
+    """Whether force and motion agree much better at another clock, or backwards."""
+    start, now, frame = time_s[0], _correlation(size, moved), float(np.median(np.diff(time_s)))
+    found = {"the film runs backwards": _correlation(size, moved[::-1])}
+    for lag in np.arange(-_LATE_S, _LATE_S, frame / 2):
+        for drift in _DRIFTS:
+            at = start + (time_s - start) * drift - lag
+            inside = (at >= start) & (at <= time_s[-1])
+            if inside.sum() >= max(_COMMON * len(at), _LEAST_FRAMES):
+                said = f"the sensor's clock is moved by {lag:+.2f} s"
+                said += f" and runs {1 / drift:.2f} times as fast" if drift != 1 else ""
+                found[said] = _correlation(np.interp(at[inside], time_s, size), moved[inside])
+    best = max(found, key=lambda said: found[said])
+    if now > 1 - _LITTLE or found[best] < max(_MUCH + _LITTLE, now + _LITTLE):
+        return []
+    said = f"force and motion correlate by {now:.2f}, but by {found[best]:.2f} if {best}"
+    return [Finding("odd", "clocks", said)]
+
+
+def _stands(time_s: Curve, axes: Curve, moved: Curve) -> list[Finding]:
+    """Saturated or stuck: a component that keeps one value while the tissue goes on moving."""
+    for k, values in enumerate(axes.T):
+        for run in np.split(np.arange(len(values)), np.flatnonzero(np.diff(values)) + 1):
+            if len(run) > _STANDS_FRAMES and values[run[0]] and np.ptp(moved[run]) > _MOVES * np.ptp(moved):
+                span = f"{time_s[run[0]]:.3g} to {time_s[run[-1]]:.3g} s"
+                said = f"f{'xyz'[k]}_n stands at {values[run[0]]:.3g} mN from {span} while the tissue moves"
+                return [Finding("odd", "sensor", said + ": saturated, or stuck?")]
+    return []
+
+
+def _correlation(one: Curve, other: Curve) -> float:
+    if not (np.ptp(one) > 0 and np.ptp(other) > 0):
+        return 0.0
+    return float(np.corrcoef(one, other)[0, 1])
