@@ -15,7 +15,8 @@ from synth.recording_flow.finding import Finding
 
 Curve = NDArray[np.float64]
 
-_ANOTHER_UNIT = 12.0  # factor that all methods are off by, to the same side
+_ODD_UNIT, _ANOTHER_UNIT = 12.0, 50.0  # factors that all methods are off by, to the same side
+_METHODS = 2  # fewer may be what is wrong themselves
 _LITTLE, _MUCH, _APART = 0.2, 0.7, 0.5  # cosine of what doesn't agree, of what does, and between them
 _LATE_S, _DRIFTS = 1.5, (0.9, 0.92, 0.94, 0.96, 0.98, 1.0, 1.02, 1.04, 1.06, 1.08, 1.1)
 _COMMON = 0.6  # share of the frames that another clock must leave
@@ -51,14 +52,14 @@ def judge_sensor(
 def _unit(size: Curve, forces: Sequence[Curve]) -> list[Finding]:
     gains = [float(np.log(size.max() / max(np.linalg.norm(f, axis=1).max(), 1e-9))) for f in forces]
     least = min(map(abs, gains), default=0.0)
-    if least < np.log(_ANOTHER_UNIT) or not (min(gains) > 0 or max(gains) < 0):
+    if len(gains) < _METHODS or least < np.log(_ODD_UNIT) or not (min(gains) > 0 or max(gains) < 0):
         return []
     factor, more = np.exp(abs(np.median(gains))), "larger" if gains[0] > 0 else "smaller"
     said = (
         f"the sensor's force is {factor:.2g} times {more} than every method's: a unit is wrong "
         "(mN for N, and Pa or MPa for kPa, make 1000, grams 102, cm for mm 100)"
     )
-    return [Finding("bad", "sensor", said)]
+    return [Finding("odd" if least < np.log(_ANOTHER_UNIT) else "bad", "sensor", said)]
 
 
 def _axes(axes: Curve, forces: Sequence[Curve]) -> list[Finding]:

@@ -62,5 +62,6 @@ SENSORS = {
 def test_a_sensor_that_the_film_contradicts_is_found(case: str) -> None:
     moved, methods = np.linalg.norm(PRESS, axis=1) ** 0.9, [0.6 * PRESS, 1.5 * PRESS]
     assert judge_sensor(TIME, PRESS, moved, methods, True) == []
+    assert judge_sensor(TIME, PRESS, moved, [60 * PRESS], True) == [], "one method may be wrong itself"
     wrong, state = SENSORS[case]
     assert state in {one.state for one in judge_sensor(TIME, wrong, moved, methods, True)}
