@@ -117,15 +117,21 @@ def init(recording: Annotated[Path, typer.Argument(help="Recording folder; it ma
 def check(
     recording: Annotated[Path, typer.Argument(help="Recording folder.")],
     phantom: Phantom = False,
+    picture: Annotated[
+        Path | None, typer.Option(help="PNG to write: tissue, masks and flow on five of its frames.")
+    ] = None,
     json: Json = False,
 ) -> None:
     """Says what of a recording is usable and what is missing. Exit code 2 if nothing is."""
     from dataclasses import asdict
 
     from bench.recording import check as checking
+    from synth.system.checked_file import make_folder
     from synth.system.text_lines import hang
 
-    found = checking.check_recording(recording, phantom)
+    if picture is not None:
+        make_folder(picture.parent)  # before the film is looked at
+    found = checking.check_recording(recording, phantom, picture)
     if json:
         print(json_.dumps({"usable": checking.is_usable(found), "findings": [asdict(f) for f in found]}))
     else:

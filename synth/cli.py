@@ -83,10 +83,12 @@ def preview(
     if out.suffix.lower() != ".png" or not out.parent.is_dir():
         raise UserError(f"{out}: cannot be written as PNG")
     if Path(job).suffix.lower().removeprefix(".") in KINDS:
-        chosen = openings.find_openings(Path(job), radius, count)
-        write_picture(out, openings.draw_openings(Path(job), chosen, radius))
+        fill_holes = reader.load_job("demo", overrides or []).anatomy.fill_holes
+        chosen = openings.find_openings(Path(job), radius, count, fill_holes)
+        write_picture(out, openings.draw_openings(Path(job), chosen, radius, fill_holes))
         places = [one.craniotomy(radius).model_dump(include={"point", "direction"}) for one in chosen]
-        lines = f"# {out} shows these openings, the best first\n{openings.as_job(Path(job), chosen, radius)}"
+        lines = openings.as_job(Path(job), chosen, radius, fill_holes)
+        lines = f"# {out} shows these openings, the best first\n{lines}"
         print(json_.dumps({"sheet": str(out), "openings": places}) if json else lines)
         return
     read = reader.load_job(job, overrides or [])

@@ -14,9 +14,11 @@ from bench.recording.eye_pairing import LATE
 from bench.recording.folder import Force, Recording, open_recording
 from bench.recording.meta import LEAST_INTERVALS, LEAST_TURNING, Meta
 from bench.recording.second_eye import SecondEye, StereoQuality
+from bench.recording.tracking_picture import draw_tracking
 from synth.errors import UserError
 from synth.recording_flow.finding import Finding, judge_scale, judge_young, worth_saying
 from synth.recording_flow.video_flow import RecordingFlowSettings, VideoFlow
+from synth.system.checked_file import write_picture
 from synth.video.read import Picture
 
 _JUMP = 3.0  # median intervals
@@ -48,6 +50,8 @@ class _Checked:
     frames: int = 0
     last: int = -1
     """Number of the last frame."""
+    picture: Path | None = None
+    """Where what is tracked is drawn."""
 
     @property
     def time_s(self) -> NDArray[np.float64]:
@@ -61,12 +65,13 @@ class _Checked:
         self.add("ok" if fine else "odd", what, said)
 
 
-def check_recording(folder: Path, phantom: bool = False) -> list[Finding]:
+def check_recording(folder: Path, phantom: bool = False, picture: Path | None = None) -> list[Finding]:
     """Opens a recording, decodes its pictures and compares what its files say. Raises no UserError.
 
-    `phantom`: as of `open_recording`.
+    `phantom`: as of `open_recording`. `picture`: where what is tracked is drawn; of no film that can't be
+    followed.
     """
-    found = _Checked()
+    found = _Checked(picture=picture)
     try:
         recording = open_recording(folder, phantom)
     except UserError as error:
@@ -181,8 +186,9 @@ def _check_film(recording: Recording, found: _Checked) -> None:
     film = replace(recording.film(pictures), only=only)
     video = VideoFlow(film, RecordingFlowSettings(rate_hz=None, pulse=False), second=second)
     try:
-        for _ in video.frames():
-            pass
+        followed = list(video.frames())
+        if found.picture is not None and followed:
+            write_picture(found.picture, draw_tracking(followed, video.tissue, video.shrink))
     except UserError as error:
         found.add("bad", "following", str(error))
     for _ in pictures:

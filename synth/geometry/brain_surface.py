@@ -35,7 +35,10 @@ class Brain:
 
 
 def load_brain(
-    path: Path, craniotomy: CraniotomySection, attachments: Sequence[AttachmentSection] = ()
+    path: Path,
+    craniotomy: CraniotomySection,
+    attachments: Sequence[AttachmentSection] = (),
+    fill_holes: bool = False,
 ) -> Brain:
     """Reads a surface (OBJ, STL, PLY, OFF or legacy VTK), merges what belongs together, and places it.
 
@@ -43,13 +46,14 @@ def load_brain(
         path: the file, coordinates in mm.
         craniotomy: point and direction in the file's axes.
         attachments: in the file's axes.
+        fill_holes: as of `read_brain`.
 
     Raises:
-        UserError: the file cannot be read, encloses no volume, or has no surface at the craniotomy.
+        UserError: the file cannot be read or closed, encloses no volume, or has no surface at the craniotomy.
     """
     assert craniotomy.point is not None  # with a mesh a job needs both
     assert craniotomy.direction is not None
-    vertices, faces = read_brain(path)
+    vertices, faces = read_brain(path, fill_holes)
     out = np.asarray(craniotomy.direction) / np.linalg.norm(craniotomy.direction)
     turn, origin = axes(out), np.asarray(craniotomy.point)
     placed = (vertices - origin) @ turn.T
@@ -74,18 +78,23 @@ def load_brain(
     return Brain(Shape(np.ascontiguousarray(placed), faces.astype(np.int32)), origin, held)
 
 
-def read_brain(path: Path) -> tuple[Floats, NDArray[np.int64]]:
+def read_brain(path: Path, fill_holes: bool = False) -> tuple[Floats, NDArray[np.int64]]:
     """A surface in the file's axes, merged: vertices (V, 3) mm and faces (F, 3).
 
+    `fill_holes`: every hole is closed by a fan of triangles, so that each edge has two faces.
+
     Raises:
-        UserError: the file cannot be read, or encloses no volume.
+        UserError: the file cannot be read, encloses no volume, or a hole can't be filled.
     """
     vertices, faces = _read(path)
     if not np.isfinite(vertices).all():
         raise UserError(f"anatomy.mesh: {path.name} holds coordinates that are no numbers")
+    if fill_holes:
+        faces = _filled(vertices, faces, path.name)
     span = np.ptp(vertices, axis=0) if len(vertices) else np.zeros(3)
     if len(faces) < 4 or span.min() < 1e-3 * span.max() or _volume(vertices, faces) < 1e-3 * span.prod():
-        raise UserError(f"anatomy.mesh: {path.name} encloses no volume")
+        hint = "" if fill_holes else "; if it is open, anatomy.fill_holes=true closes it"
+        raise UserError(f"anatomy.mesh: {path.name} encloses no volume{hint}")
     return vertices, faces
 
 
@@ -142,6 +151,18 @@ def _merged(vertices: Floats, faces: NDArray[np.int64]) -> tuple[Floats, NDArray
     faces = faces[np.sort(once)]
     used, faces = np.unique(faces, return_inverse=True)
     return vertices[first][used], faces.reshape(-1, 3)
+
+
+def _filled(vertices: Floats, faces: NDArray[np.int64], name: str) -> NDArray[np.int64]:
+    """The faces, and a fan over each hole."""
+    import trimesh
+
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
+    if not trimesh.repair.fill_holes(mesh, use_fan=True):
+        odd = len(trimesh.grouping.group_rows(mesh.edges_sorted, require_count=1))
+        why = f"{odd} edges stay open" if odd else "edges have more than two faces"
+        raise UserError(f"anatomy.fill_holes: {name} can't be closed ({why}); mend it in a mesh editor")
+    return np.asarray(mesh.faces, np.int64)
 
 
 def _volume(vertices: Floats, faces: NDArray[np.int64]) -> float:

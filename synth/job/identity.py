@@ -38,6 +38,8 @@ def identify_job(job: Job) -> str:
         del described["fem"]["crew"]  # so that jobs without one are what they were
     if not job.anatomy.craniotomy.also:
         del described["anatomy"]["craniotomy"]["also"]
+    if not job.anatomy.fill_holes:
+        del described["anatomy"]["fill_holes"]
     for (block, name), largest in FILES.items():
         described[block][name] = _digest(getattr(getattr(job, block), name), largest)
     return hashlib.blake2b(canonical(described), digest_size=16).hexdigest()

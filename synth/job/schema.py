@@ -64,6 +64,8 @@ class AnatomySection(Section):
 
     mesh: Path | None = None
     """Surface of a brain (OBJ, STL, PLY or VTK, mm); relative to the job file. Empty: a procedural block."""
+    fill_holes: bool = False
+    """Whether holes of the mesh are closed, each by a fan of triangles. What can't be closed is refused."""
     variety: Annotated[int, Field(ge=1)] | None = None
     """Number of distinct anatomies in the dataset. Empty: every sequence has its own."""
     dome_mm: Positive = 70.0

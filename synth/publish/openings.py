@@ -51,18 +51,21 @@ class Opening:
         return CraniotomySection(point=(x, y, z), direction=(u, v, w), radius_mm=radius_mm)
 
 
-def find_openings(mesh: Path, radius_mm: float, count: int) -> list[Opening]:
+def find_openings(mesh: Path, radius_mm: float, count: int, fill_holes: bool = False) -> list[Opening]:
     """At most `count` openings, the evenest first, apart from one another; each was tried as a job would.
+
+    `fill_holes`: as `anatomy.fill_holes`.
 
     Raises:
         UserError: the file cannot be used, or nowhere on it an opening of that radius works.
     """
     chosen: list[Opening] = []
     why = "the surface fills it nowhere"
-    for one in sorted(_judged(mesh, radius_mm), key=lambda one: (one.flat, one.relief_mm)):
+    for one in sorted(_judged(mesh, radius_mm, fill_holes), key=lambda one: (one.flat, one.relief_mm)):
         if any(np.linalg.norm(one.point - other.point) < _APART * radius_mm for other in chosen):
             continue
-        section = AnatomySection(mesh=mesh.resolve(), vertices=2500, craniotomy=one.craniotomy(radius_mm))
+        where = one.craniotomy(radius_mm)
+        section = AnatomySection(mesh=mesh.resolve(), fill_holes=fill_holes, vertices=2500, craniotomy=where)
         job = Job(anatomy=section, fem=FemSection(tets=400))  # whether it meshes, not how well
         try:
             mechanics.build(job, scenario.draw_scenario(job, 0))
@@ -77,19 +80,22 @@ def find_openings(mesh: Path, radius_mm: float, count: int) -> list[Opening]:
     return chosen
 
 
-def as_job(mesh: Path, chosen: Sequence[Opening], radius_mm: float) -> str:
+def as_job(mesh: Path, chosen: Sequence[Opening], radius_mm: float, fill_holes: bool = False) -> str:
     """Lines of a job with the first opening; the others are commented out under `also`."""
     first, *others = (one.craniotomy(radius_mm).model_dump(mode="json") for one in chosen)
-    lines = ["anatomy:", f"  mesh: {writer.scalar(mesh)}", "  craniotomy:", f"    radius_mm: {radius_mm:g}"]
+    lines = ["anatomy:", f"  mesh: {writer.scalar(mesh)}", *(["  fill_holes: true"] if fill_holes else [])]
+    lines += ["  craniotomy:", f"    radius_mm: {radius_mm:g}"]
     lines += [f"    point: {first['point']}", f"    direction: {first['direction']}"]
     lines += ["    # also:  # the next best; sequences take them in turn"] if others else []
     lines += [f"    #   - {{point: {one['point']}, direction: {one['direction']}}}" for one in others]
     return "\n".join(lines)
 
 
-def draw_openings(mesh: Path, chosen: Sequence[Opening], radius_mm: float) -> NDArray[np.uint8]:
+def draw_openings(
+    mesh: Path, chosen: Sequence[Opening], radius_mm: float, fill_holes: bool = False
+) -> NDArray[np.uint8]:
     """(H, W, 3): the brain from six sides, with each opening's ring and its number from 1."""
-    vertices, faces = read_brain(mesh)
+    vertices, faces = read_brain(mesh, fill_holes)
     corners, middle = vertices[faces], (vertices.max(axis=0) + vertices.min(axis=0)) / 2
     scale = 0.9 * _TILE_PX / np.ptp(vertices, axis=0).max()
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -119,11 +125,11 @@ def draw_openings(mesh: Path, chosen: Sequence[Opening], radius_mm: float) -> ND
     return np.vstack([np.hstack(tiles[:3]), np.hstack(tiles[3:])])
 
 
-def _judged(mesh: Path, radius_mm: float) -> Iterator[Opening]:
+def _judged(mesh: Path, radius_mm: float, fill_holes: bool) -> Iterator[Opening]:
     """Places under the skull, for which the convex hull stands, where a brain can be opened."""
     import trimesh  # here: most jobs have no mesh
 
-    surface = trimesh.Trimesh(*read_brain(mesh), process=False)
+    surface = trimesh.Trimesh(*read_brain(mesh, fill_holes), process=False)
     count = int(np.clip(_PER_MM2 * surface.area, 2_000, _MOST_SAMPLES))
     points = np.asarray(trimesh.sample.sample_surface(surface, count, seed=0)[0])  # in random order
     planes = np.unique(np.round(ConvexHull(points).equations, 9), axis=0)

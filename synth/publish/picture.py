@@ -125,7 +125,7 @@ def draw_sequence(sequence: Sequence_, frames: Sequence[int]) -> Rgb:
             f"flow, {most_px:.1f} px at most (arrows x{gain})": moved,
             f"traction, {total_mn:.1f} mN in all (yellow: {largest_kpa:.2g} kPa)": loaded,
         }
-        rows.append(np.hstack([_framed(panel, text) for text, panel in panels.items()]))
+        rows.append(np.hstack([framed(panel, text) for text, panel in panels.items()]))
     return np.vstack(rows)[:, _GAP_PX:]
 
 
@@ -139,7 +139,7 @@ def strongest(sequence: Sequence_) -> int:
     return int(np.linalg.norm(sequence["force"][...], axis=-1).argmax())
 
 
-def _framed(panel: Rgb, text: str) -> Rgb:
+def framed(panel: Rgb, text: str) -> Rgb:
     """A panel (H, W, 3) with white above and to its left, and a line of text on that."""
     canvas = cv2.copyMakeBorder(panel, _CAPTION_PX, 0, _GAP_PX, 0, cv2.BORDER_CONSTANT, value=(255,) * 3)
     cv2.putText(canvas, text, (_GAP_PX + 4, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.45, INK, 1, cv2.LINE_AA)

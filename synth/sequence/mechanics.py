@@ -49,9 +49,9 @@ def cortex(job: Job, case: Scenario) -> tuple[CortexSurface, Brain | None]:
 @lru_cache(maxsize=4)
 def _cortex(section: AnatomySection, relief: Relief, written: object) -> tuple[CortexSurface, Brain | None]:
     """As `cortex`; `written` tells a mesh from one that replaced it."""
-    brain = (
-        None if section.mesh is None else load_brain(section.mesh, section.craniotomy, section.attachments)
-    )
+    brain = None
+    if section.mesh is not None:
+        brain = load_brain(section.mesh, section.craniotomy, section.attachments, section.fill_holes)
     surface = anatomy.grow(relief, section, brain.shape if brain else None)
     for value in (*vars(surface).values(), *(brain.shape if brain else ())):
         if isinstance(value, np.ndarray):

@@ -57,9 +57,12 @@ def sound(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return Maker(tmp_path_factory.mktemp("sound"))(frames=8)
 
 
-def test_the_sound_one_has_nothing_bad(sound: Path) -> None:
-    states = {finding.state for finding in check.check_recording(sound)}
+def test_the_sound_one_has_nothing_bad(sound: Path, tmp_path: Path) -> None:
+    drawn = tmp_path / "tracked.png"
+    states = {finding.state for finding in check.check_recording(sound, picture=drawn)}
     assert states <= {"ok", "lack"}
+    rows, columns = np.array(cv2.imread(str(drawn)).shape[:2]) // (4 * 96, 4 * 128)
+    assert (rows, columns) == (2, 3)  # five frames and a legend, enlarged fourfold
 
 
 @pytest.mark.parametrize("name", CASES)

@@ -47,3 +47,20 @@ def test_what_is_no_closed_surface_at_the_craniotomy_is_refused(tmp_path: Path) 
     for path, opening in ((sheet, OPENING), (torn, OPENING), (bad, OPENING), (egg, beside)):
         with pytest.raises(UserError):
             brain_surface.load_brain(path, opening)
+
+
+def test_holes_are_filled_where_asked_and_what_stays_open_is_refused(tmp_path: Path) -> None:
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=30.0)
+    middle = ball.triangles_center
+    cut = (middle[:, 0] > -20) & (np.linalg.norm(middle - [0.0, 0.0, 30.0], axis=1) > 5)
+    holed = written(tmp_path / "holed.obj", ball.triangles[cut])
+    assert not trimesh.Trimesh(*brain_surface.read_brain(holed), process=False).is_watertight
+    closed = trimesh.Trimesh(*brain_surface.read_brain(holed, fill_holes=True), process=False)
+    assert closed.is_watertight
+    assert closed.is_winding_consistent
+    # The ball without the cap that the flat fan cuts off, 10 mm high at most.
+    cap = np.pi * 10**2 * (30 - 10 / 3)
+    assert 4 / 3 * np.pi * 30**3 - 1.15 * cap < closed.volume < ball.volume
+    fin = np.concatenate([ball.triangles, [[*ball.triangles[0, :2], (0.0, 0.0, 90.0)]]])
+    with pytest.raises(UserError, match=r"anatomy\.fill_holes"):
+        brain_surface.read_brain(written(tmp_path / "fin.stl", fin), fill_holes=True)
