@@ -193,7 +193,8 @@ def _contrast(rgb: Rgb) -> NDArray[np.uint8]:
     """(H, W) local contrast about 128: gain and offset of the light are taken out."""
     grey = cv2.GaussianBlur(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.float32), (0, 0), _SMOOTH_PX)
     detail = grey - cv2.blur(grey, _WINDOW)
-    spread = np.sqrt(cv2.blur(detail * detail, _WINDOW)) + _FLOOR
+    # A blur's running sums may end below 0 where a picture is blank.
+    spread = np.sqrt(np.maximum(cv2.blur(detail * detail, _WINDOW), 0)) + _FLOOR
     return np.asarray(np.clip(128 + _GREY * detail / spread, 0, 255), np.uint8)
 
 

@@ -9,7 +9,7 @@ import pytest
 from sources import ROOT, sources
 
 LINES = {
-    "synth": 23_659,
+    "synth": 23_660,
     "learn": 5_507,
     "bench": 6_610,
     "evidence": 8_402,
