@@ -149,11 +149,11 @@ def _against_sensor(
     forces = []
     if recording.meta.young_kpa is not None:
         every = [np.array(tracked.force_mn[n]) for n, one in methods.items() if not isinstance(one, FlowSize)]
-        seen = np.array([1.0, 1.0, 1.0 if recording.has_two_eyes else np.nan])
-        forces = [force[followed] * seen for force in every if np.nan_to_num(force).any()]
+        forces = [force[followed] for force in every if np.nan_to_num(force).any()]
     size = np.array(tracked.force_mn[moved])[followed, 0]
     time_s = np.array(tracked.time_s)[followed]
-    return judge_sensor(time_s, sensor.axes_mn[followed], size, forces, sensor.in_camera_axes)
+    axes = 3 if recording.has_two_eyes else 2  # one eye doesn't see along the view
+    return judge_sensor(time_s, sensor.axes_mn[followed], size, forces, axes if sensor.in_camera_axes else 0)
 
 
 def _speed(tracked: TrackedRecording, lost: Flags) -> Curve:
@@ -181,8 +181,10 @@ def _scored_frames(meta: Meta, time_s: Curve, notes: list[str]) -> Flags:
 
 
 def _repeated(tracked: TrackedRecording, sensor_mn: Curve | None, notes: list[str]) -> Flags:
-    """(T,) frames that show an earlier one again: surely, or while the sensor moved."""
-    surely, maybe = (np.isin(tracked.frame, list(frames)) for frames in tracked.repeats)
+    """(T,) frames that show what the one followed before them did: surely, or while the sensor moved."""
+    pairs = list(zip(tracked.frame, [-1, *tracked.frame[:-1]], strict=True))
+    # Of a doubled film whose every sixth frame is followed none is.
+    surely, maybe = (np.array([k in of and of[k] <= before for k, before in pairs]) for of in tracked.repeats)
     if sensor_mn is not None and maybe.any():
         peak = float(np.nanmax(np.abs(sensor_mn), initial=0.0))
         for run in np.split(np.arange(len(maybe)), np.flatnonzero(np.diff(maybe)) + 1):

@@ -17,6 +17,8 @@ Curve = NDArray[np.float64]
 
 _ODD_UNIT, _ANOTHER_UNIT = 12.0, 50.0  # factors that all methods are off by, to the same side
 _METHODS = 2  # fewer may be what is wrong themselves
+_PRESSED, _ALIKE = 0.3, 0.7  # share of a peak, correlation: what a unit is judged by
+_SIDEWAYS = 0.2  # of the force must lie in the axes that are seen
 _LITTLE, _MUCH, _APART = 0.2, 0.7, 0.5  # cosine of what doesn't agree, of what does, and between them
 _LATE_S, _DRIFTS = 1.5, (0.9, 0.92, 0.94, 0.96, 0.98, 1.0, 1.02, 1.04, 1.06, 1.08, 1.1)
 _COMMON = 0.6  # share of the frames that another clock must leave
@@ -25,7 +27,7 @@ _LEAST_FRAMES = 8
 
 
 def judge_sensor(
-    time_s: Curve, axes_mn: Curve, moved: Curve, forces: Sequence[Curve], in_camera_axes: bool
+    time_s: Curve, axes_mn: Curve, moved: Curve, forces: Sequence[Curve], seen_axes: int
 ) -> list[Finding]:
     """What is wrong with a sensor, seen from the film.
 
@@ -34,7 +36,7 @@ def judge_sensor(
         axes_mn: (T, 3) the sensor there; NaN where it has nothing.
         moved: (T,) mean motion of the tissue since the rest frame, any unit.
         forces: by each method, (T, 3) mN in the camera's axes, NaN: not known; none where E is unknown.
-        in_camera_axes: whether the sensor's are the same.
+        seen_axes: how many of them the film shows; 0: the sensor's are others.
     """
     known = np.isfinite(axes_mn).all(axis=1) & np.isfinite(moved)
     t, axes, moved = time_s[known], axes_mn[known], moved[known]
@@ -43,14 +45,23 @@ def judge_sensor(
         return []
     if not np.ptp(axes, axis=0).any():
         said = f"force.csv says {size[0]:.3g} mN all the time, while the tissue moves"
-        return [Finding("bad", "sensor", said)]
+        # Nothing is what a film without contact has.
+        return [Finding("bad" if size[0] else "odd", "sensor", said)]
     told = [np.nan_to_num(force[known]) for force in forces]
-    found = [*_unit(size, told), *(_axes(axes, told) if in_camera_axes else [])]
+    n = seen_axes or 3
+    sideways = np.linalg.norm(axes[:, :n]) > _SIDEWAYS * np.linalg.norm(axes)
+    found = _unit(axes[:, :n], [force[:, :n] for force in told]) if sideways else []
+    found += _axes(axes, told, n) if sideways and seen_axes else []
     return [*found, *_clock(t, size, moved), *_stands(t, axes, moved)]
 
 
-def _unit(size: Curve, forces: Sequence[Curve]) -> list[Finding]:
-    gains = [float(np.log(size.max() / max(np.linalg.norm(f, axis=1).max(), 1e-9))) for f in forces]
+def _unit(axes: Curve, forces: Sequence[Curve]) -> list[Finding]:
+    """By the median over the frames that are pressed on, of methods that follow the sensor."""
+    gains, size = [], np.linalg.norm(axes, axis=1)
+    for force in (np.linalg.norm(one, axis=1) for one in forces):
+        pressed = force > _PRESSED * float(np.quantile(force, 0.98))
+        if _correlation(size, force) > _ALIKE and pressed.any():
+            gains.append(float(np.log(max(np.median(size[pressed] / force[pressed]), 1e-9))))
     least = min(map(abs, gains), default=0.0)
     if len(gains) < _METHODS or least < np.log(_ODD_UNIT) or not (min(gains) > 0 or max(gains) < 0):
         return []
@@ -62,13 +73,11 @@ def _unit(size: Curve, forces: Sequence[Curve]) -> list[Finding]:
     return [Finding("odd" if least < np.log(_ANOTHER_UNIT) else "bad", "sensor", said)]
 
 
-def _axes(axes: Curve, forces: Sequence[Curve]) -> list[Finding]:
+def _axes(axes: Curve, forces: Sequence[Curve], n: int) -> list[Finding]:
     """The signed permutation of the axes at which the methods' force lies along the sensor's."""
     every = [force / max(float(np.linalg.norm(force)), 1e-12) for force in forces]
     if not every:
         return []
-    # One eye doesn't see along the view.
-    n = 3 if all(force[:, 2].any() for force in every) else 2
     one, other = np.sum(every, axis=0)[:, :n], axes[:, :n]
     both = one.T @ other / max(float(np.linalg.norm(one) * np.linalg.norm(other)), 1e-12)
     found = {
@@ -109,7 +118,8 @@ def _stands(time_s: Curve, axes: Curve, moved: Curve) -> list[Finding]:
     """Saturated or stuck: a component that keeps one value while the tissue goes on moving."""
     for k, values in enumerate(axes.T):
         for run in np.split(np.arange(len(values)), np.flatnonzero(np.diff(values)) + 1):
-            if len(run) > _STANDS_FRAMES and values[run[0]] and np.ptp(moved[run]) > _MOVES * np.ptp(moved):
+            stands = len(run) > _STANDS_FRAMES and values[run[0]] and np.ptp(values)
+            if stands and np.ptp(moved[run]) > _MOVES * np.ptp(moved):
                 span = f"{time_s[run[0]]:.3g} to {time_s[run[-1]]:.3g} s"
                 said = f"f{'xyz'[k]}_n stands at {values[run[0]]:.3g} mN from {span} while the tissue moves"
                 return [Finding("odd", "sensor", said + ": saturated, or stuck?")]

@@ -64,8 +64,8 @@ class TrackedRecording:
     """Whether the frame could be followed; the forces of one that couldn't are none."""
     summary: TrackingSummary = field(default_factory=TrackingSummary)
     """What was masked, lost and regained."""
-    repeats: tuple[set[int], set[int]] = field(default_factory=lambda: (set(), set()))
-    """Frames that show the one before again, as of `FilmFaults.repeats`."""
+    repeats: tuple[dict[int, int], dict[int, int]] = field(default_factory=lambda: ({}, {}))
+    """Frames that show an earlier one again, as of `FilmFaults.repeats`."""
     snapshots: list[Snapshot] = field(default_factory=list)
     rest: NDArray[np.uint8] | None = None
     tissue: NDArray[np.bool_] | None = None

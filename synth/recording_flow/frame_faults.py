@@ -119,13 +119,17 @@ class FilmFaults:
         green = rgb[:, ::2, 1].astype(np.float32)
         near, far = (cv2.blur((green[:-2] - green[k : len(green) - 2 + k]) ** 2, (8, 16)) for k in (1, 2))
         # The most torn blocks: elsewhere the picture may be at rest.
-        if np.percentile((near / (far + 1))[8::16, 4::8], 98) > _COMBED:
+        torn = (near / (far + 1))[8::16, 4::8]
+        if torn.size and np.percentile(torn, 98) > _COMBED:
             self._combed.append(time_s)
 
-    def repeats(self) -> tuple[set[int], set[int]]:
-        """Numbers of the frames that show the one before again: surely, and unless the tissue was still."""
+    def repeats(self) -> tuple[dict[int, int], dict[int, int]]:
+        """Frames that show an earlier one again, surely, and unless the tissue was still: number → of which.
+
+        The rest frame's number is -1.
+        """
         change, quiet = np.array(self._changes).reshape(-1, 2).T
-        surely, maybe = set[int](), set[int]()
+        surely, maybe = dict[int, int](), dict[int, int]()
         if not change.any():
             return surely, maybe
         usual = float(np.median(change[change > 0]))
@@ -133,7 +137,8 @@ class FilmFaults:
         same = np.concatenate([[False], change < _SAME * usual, [False]]).astype(int)
         for first, stop in zip(*(np.flatnonzero(np.diff(same) == k) for k in (1, -1)), strict=True):
             caught_up = stop < len(change) and change[stop] > _CAUGHT_UP * usual
-            (surely if noisy or caught_up else maybe).update(self._numbers[first:stop])
+            shown = self._numbers[first - 1] if first else -1
+            (surely if noisy or caught_up else maybe).update(dict.fromkeys(self._numbers[first:stop], shown))
         return surely, maybe
 
     def findings(self) -> list[Finding]:
@@ -146,9 +151,9 @@ class FilmFaults:
         for times, said in (
             (self._combed, "interlaced: rows are of two moments; deinterlace the film"),
             (self._blurred, "far less sharp than the rest frame: out of focus?"),
-            ([at[k] for k in sorted(again)], "the one before again: frozen or doubled, not scored"),
+            ([at[k] for k in sorted(again)], "the one before again: frozen or doubled"),
             (
-                [self._times[k] for k in leaps if not again & set(self._numbers[k - 1 : k + 2])],
+                [self._times[k] for k in leaps if not again.keys() & set(self._numbers[k - 1 : k + 2])],
                 "far from those beside: frames missing, a cut or a bump?",
             ),
         ):

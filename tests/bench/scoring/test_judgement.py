@@ -61,7 +61,11 @@ SENSORS = {
 @pytest.mark.parametrize("case", SENSORS)
 def test_a_sensor_that_the_film_contradicts_is_found(case: str) -> None:
     moved, methods = np.linalg.norm(PRESS, axis=1) ** 0.9, [0.6 * PRESS, 1.5 * PRESS]
-    assert judge_sensor(TIME, PRESS, moved, methods, True) == []
-    assert judge_sensor(TIME, PRESS, moved, [60 * PRESS], True) == [], "one method may be wrong itself"
+    assert judge_sensor(TIME, PRESS, moved, methods, 3) == []
+    assert judge_sensor(TIME, PRESS, moved, [60 * PRESS], 3) == [], "one method may be wrong itself"
+    spiked = PRESS + 400 * (np.arange(len(PRESS)) == 3)[:, None]
+    assert "bad" not in {one.state for one in judge_sensor(TIME, spiked, moved, methods, 3)}
+    noise = np.random.default_rng(1).normal(0, 0.3, PRESS.shape)
+    assert "bad" not in {one.state for one in judge_sensor(TIME, noise, moved, methods, 3)}
     wrong, state = SENSORS[case]
-    assert state in {one.state for one in judge_sensor(TIME, wrong, moved, methods, True)}
+    assert state in {one.state for one in judge_sensor(TIME, wrong, moved, methods, 3)}
