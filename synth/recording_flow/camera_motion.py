@@ -30,6 +30,7 @@ _OUTLIER = 4.0  # standard deviations from which on a corner counts nothing (Tuk
 _LEAST_SPREAD_PX = 0.03  # of followed corners
 _TOGETHER = 3.0  # neighbouring corners err alike: so many count as one
 _UNCERTAIN_PX = 0.15  # deviation over the tissue from which on corners show too little
+_UNLIKE = 0.1  # of the motion, by which surroundings near and far differ that deform
 _STILL_PX, _SURE = 0.05, 4.0  # motion of less, or of so few deviations, is a still camera's
 _SHARED, _LEFT_OVER = 0.6, 0.25  # of the corners have less than this of the motion left, if it is a camera's
 _LEAST_SHARED_PX, _NEAR_PX = (
@@ -82,6 +83,7 @@ class CameraTracker:
         self._tissue = np.column_stack([columns, rows])[some].astype(np.float64)
         self._last: Similarity | None = None
         self._unknown_s: list[float] = []
+        self._deforms = False
         # Time, where, and how far from where it was in the frame before.
         self._course: list[tuple[float, Similarity, float]] = []
 
@@ -93,9 +95,9 @@ class CameraTracker:
         now = _contrast(rgb)
         last = self._last
         before = last or Similarity(np.eye(2, 3))
-        found = self._fit(now, before, False) or self._fit(now, before, True)
+        found = self._find(now, before)
         if found is None and self._length((jump := self._jump(now)) - before.matrix) > _FAR_PX:
-            found = self._fit(now, Similarity(jump), False) or self._fit(now, Similarity(jump), True)
+            found = self._find(now, Similarity(jump))
         if found is None:
             self._unknown_s.append(time_s or 0.0)
             if last is not None:
@@ -138,6 +140,12 @@ class CameraTracker:
         shift, _ = cv2.phaseCorrelate(first, second, cv2.createHanningWindow(now.shape[::-1], cv2.CV_32F))
         return np.column_stack([np.eye(2), shift])
 
+    def _find(self, now: NDArray[np.uint8], near: Similarity) -> Similarity | None:
+        """A similarity near another: of the surroundings, else of all; None where the surroundings deform."""
+        self._deforms = False
+        found = self._fit(now, near, False)
+        return found if found or self._deforms else self._fit(now, near, True)
+
     def _fit(self, now: NDArray[np.uint8], near: Similarity, shared: bool) -> Similarity | None:
         """A similarity near another of the surroundings' corners; `shared`: of all, and most must have it."""
         points = self._points[shared]
@@ -171,6 +179,17 @@ class CameraTracker:
         linear = np.array([[1 + larger, -turned], [turned, 1 + larger]])
         matrix = np.column_stack([linear, self._centre - linear @ self._centre + (x, y)])
         length = self._length(matrix - np.eye(2, 3))
+        # What moves more beside the tissue than far from it is tissue that the mask leaves out.
+        away = np.linalg.norm(at - self._tissue.mean(axis=0), axis=1)
+        beside = away < np.median(away)
+        apart = [
+            (weight[:, None] * left)[half].sum(axis=0) / weight[half].sum() for half in (beside, ~beside)
+        ]
+        self._deforms = not shared and bool(
+            np.linalg.norm(apart[0] - apart[1]) > max(_UNLIKE * length, _STILL_PX)
+        )
+        if self._deforms:
+            return None
         most = float(np.quantile(np.linalg.norm(left, axis=1), _SHARED)) if shared else 0.0
         least, near_px = (_LEAST_SHARED_PX * shared, 0.0) if self._last is None else (0.0, _NEAR_PX)
         if variance > _UNCERTAIN_PX**2 or length < least or most > _LEFT_OVER * max(length, near_px):

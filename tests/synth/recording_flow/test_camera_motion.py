@@ -86,3 +86,11 @@ def test_confidence_stands_for_the_cameras_deviation_too() -> None:
     both = deviation(doubted(of_deviation(own), 0.4))
     assert both == pytest.approx(np.hypot(own, 0.4), rel=1e-4)
     assert not doubted(np.zeros((1, 1), np.float32), 0.4).any()
+
+
+def test_tissue_that_the_mask_leaves_out_is_no_camera() -> None:
+    pulled = 1.5 / (1 + np.hypot(X - 80, Y - 60) / 20)
+    frames = texture(X, Y), texture(X - pulled, Y - 0.3 * pulled)
+    part = np.hypot(X - 80, Y - 60) < 30
+    found = CameraTracker(frames[0], part, ~EVERYWHERE).find(frames[1], 1.0)
+    assert found is None or found.length_px < 0.3
