@@ -12,6 +12,7 @@ import typer
 from rich.console import Console
 
 from synth.errors import UserError
+from synth.job.types import MembraneState
 from synth.system.cli_errors import Commands
 from synth.system.terminal import counting
 
@@ -243,6 +244,9 @@ def predict_command(
     ),
     input: Input = None,
     young: Annotated[float | None, typer.Option(help="Young's modulus [kPa], instead of the data's.")] = None,
+    membrane: Annotated[
+        MembraneState, typer.Option(help="The tissue's membrane (pia), of a model that asks for it.")
+    ] = "unknown",
     scale: Annotated[
         str | None, typer.Option(help="A video's scale [mm a pixel], or unknown: forces up to a factor.")
     ] = None,
@@ -304,7 +308,7 @@ def predict_command(
         written = out / f"{motion.name}.npz"
         if written.exists() and written.samefile(source):
             raise UserError(f"{written}: is what is read, and would be overwritten; say another --out")
-        found = apply(predictor, motion, young)
+        found = apply(predictor, motion, young, membrane)
         write_prediction(found, out / motion.name)
         if overlay:
             one = source.is_file() or source.suffix == ".zarr" or is_film(source)

@@ -67,8 +67,8 @@ class Model:
         self, flow: Field, confidence: Field, moved: Moved | None, scene: MethodContext, picture: bool
     ) -> ForceEstimate:
         if self._reader is None or self._reader[0] is not scene:
-            reader = ForceReader(self.predictor, scene.tissue, scene.scale_mm_per_px, scene.young_kpa)
-            self._reader = scene, reader
+            about = scene.tissue, scene.scale_mm_per_px, scene.young_kpa, scene.membrane
+            self._reader = scene, ForceReader(self.predictor, *about)
         found = self._reader[1].read(FrameMotion(flow, confidence, motion=moved))
         answer = ForceEstimate(found.force_mn, found.map.to_image() if picture else None)
         if not found.bands:

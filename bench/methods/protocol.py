@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from synth.flow.stereo.track import Moved
+from synth.job.types import MembraneState
 
 Field = NDArray[np.float32]
 """(H, W, ...) on the pixels that flow is computed on."""
@@ -23,6 +24,8 @@ class MethodContext:
     """(H, W)."""
     scale_mm_per_px: float
     young_kpa: float | None
+    membrane: MembraneState = "unknown"
+    """What is known of the tissue's."""
 
     def __post_init__(self) -> None:
         """One method can't change what the others are told."""

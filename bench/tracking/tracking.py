@@ -15,6 +15,7 @@ from bench.recording import check
 from bench.recording.folder import Recording
 from bench.recording.second_eye import SecondEye, StereoQuality
 from synth.errors import UserError
+from synth.job.types import MembraneState
 from synth.recording_flow.finding import Finding, first_fault
 from synth.recording_flow.frame_motion import FrameMotion, TrackingSummary
 from synth.recording_flow.local_flow import LocalFlow
@@ -124,7 +125,9 @@ def track_recording(
         for frame in video.frames(progress):
             if frame.is_rest:
                 mm_per_px = scale_mm_per_px * video.shrink
-                forces.begin(frame.rgb, MethodContext(video.tissue, mm_per_px, about.young_kpa))
+                membrane: MembraneState = getattr(about, "membrane", "unknown")
+                scene = MethodContext(video.tissue, mm_per_px, about.young_kpa, membrane)
+                forces.begin(frame.rgb, scene)
             if frame.time_s is not None:
                 forces.add(frame, frame.time_s)
                 span = about.sensor.turn_s

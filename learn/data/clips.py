@@ -21,6 +21,7 @@ from synth.dataset.split import name_anatomy
 from synth.dataset.store import Dataset, Sequence
 from synth.errors import UserError, as_user_error, first_line
 from synth.job import identity
+from synth.job.types import MembraneState
 from synth.system import checked_file
 from synth.system.terminal import ProgressCallback
 
@@ -49,7 +50,7 @@ _CURE = {
 _ARRAYS = ("mask", "confidence", "density", "force")
 _SPATIAL = "motion_confidence"
 _FILE = "arrays.safetensors"
-_PLAIN = ("name", "content_hash", "group", "family", "gesture", "young_kpa", "opening")
+_PLAIN = ("name", "content_hash", "group", "family", "gesture", "young_kpa", "opening", "membrane")
 
 
 @dataclass(frozen=True)
@@ -80,6 +81,8 @@ class Clip:
     """(T, 2, N, N) 0..1 of the motion that two eyes recover, across and along the view; None without it."""
     opening: str = ""
     """Which place of a user's brain it shows; empty of procedural ones, and of older stores."""
+    membrane: MembraneState = "unknown"
+    """Whether its tissue has one; unknown of what was never simulated."""
 
     @property
     def frames(self) -> int:
@@ -183,7 +186,15 @@ def _plain(sequence: Sequence) -> dict[str, Any]:
         "gesture": (scenario.get("gesture") or {}).get("kind") or "",
         "young_kpa": float(sequence.attrs["young_kpa"]),
         "opening": sequence.attrs.get("opening_id") or "",
+        "membrane": _membrane(scenario.get("tissue")),
     }
+
+
+def _membrane(tissue: Any) -> MembraneState:
+    """Of a scenario's tissue, if there is one."""
+    if not tissue:
+        return "unknown"
+    return "intact" if tissue.get("membrane") else "stripped"
 
 
 def load_clips(

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass
+from typing import get_args
 
 import numpy as np
 import torch
@@ -16,7 +17,7 @@ from scipy import ndimage, sparse
 from torch import Tensor
 
 from synth.errors import UserError
-from synth.job.types import Positive
+from synth.job.types import MembraneState, Positive
 
 CHANNELS = ("dx", "dy", "magnitude", "mask", "divergence")
 SMOOTHING_MM = 0.5
@@ -274,10 +275,16 @@ def _smoother(size: int, sigma_px: float) -> Tensor:
     return weight / weight[size // 2].sum()
 
 
-def channel_names(confidence: bool, depth: bool) -> tuple[str, ...]:
-    """Of the network's input, with the confidence of the motion, with what a second eye adds."""
+def channel_names(confidence: bool, depth: bool, membrane: bool) -> tuple[str, ...]:
+    """Of the network's input, with the confidence of the motion, with what a second eye adds, with what is
+    known of the membrane."""
     along = ("dz", "confidence of dz") if confidence else ("dz",)
-    return (*CHANNELS, *["confidence"] * confidence, *along[: 2 * depth])
+    return (*CHANNELS, *["confidence"] * confidence, *along[: 2 * depth], *["membrane"] * membrane)
+
+
+def membrane_code(known: MembraneState) -> float:
+    """What the network is told of a membrane: -1 stripped, 0 unknown, 1 intact."""
+    return get_args(MembraneState).index(known) - 1.0
 
 
 def channels(
@@ -286,11 +293,13 @@ def channels(
     pitch_mm: float,
     scales: Scales,
     confidence: Tensor | None = None,
+    membrane: Tensor | None = None,
 ) -> Tensor:
     """The network's input, in the order of `channel_names`.
 
     `displacement`: (B, 2, N, N) mm in picture axes, or (B, 3, N, N) mm in camera axes; `mask`: (B, 1, N, N)
-    0/1; `confidence`: (B, 1, N, N) in 0..1, with depth (B, 2, N, N). Returns (B, 5 to 8, N, N) without unit.
+    0/1; `confidence`: (B, 1, N, N) in 0..1, with depth (B, 2, N, N); `membrane`: (B,) of `membrane_code`.
+    Returns (B, 5 to 9, N, N) without unit.
     Source: Heraoui et al., the five channels of D2FNet; here in mm and with one displacement scale.
     """
     moved = displacement * mask / scales.displacement_mm
@@ -302,6 +311,8 @@ def channels(
     parts.append(moved[:, 2:])
     if confidence is not None:
         parts.append(confidence[:, 1:] * mask)
+    if membrane is not None:
+        parts.append(membrane[:, None, None, None] * mask)
     return torch.cat(parts, dim=1)
 
 

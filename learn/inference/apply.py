@@ -15,20 +15,27 @@ from learn.inference.motion import Motion
 from learn.inference.predict import Predictor, force_size, net_force
 from learn.uncertainty.conformal import LEVELS
 from synth.errors import UserError
+from synth.job.types import MembraneState
 from synth.recording_flow.finding import first_fault, judge_young, worth_saying
 
 
-def apply(predictor: Predictor, motion: Motion, young_kpa: float | None = None) -> dict[str, Any]:
+def apply(
+    predictor: Predictor,
+    motion: Motion,
+    young_kpa: float | None = None,
+    membrane: MembraneState = "unknown",
+) -> dict[str, Any]:
     """Force of every frame of a film, ready for np.savez; what is done to it is `ForceReader`'s.
 
-    `young_kpa` overrides the film's own, but not where the scale is unknown. Returns fields of
+    `young_kpa` overrides the film's own, but not where the scale is unknown; `membrane` is what is known of
+    the tissue's. Returns fields of
     `prediction_file.FIELDS`, those that the film and the model have. Mask and centre are the last frame's;
     they change only where the tissue is wider than the grid.
     """
     young = young_kpa if young_kpa is not None else motion.young_kpa
     if not motion.scale_known:
         young = None
-    reader = ForceReader(predictor, motion.tissue, motion.scale_mm_per_px, young)
+    reader = ForceReader(predictor, motion.tissue, motion.scale_mm_per_px, young, membrane)
     numbers, times, followed, found = [], [], list[bool](), list[FrameForce]()
     for frame in motion.frames:
         numbers.append(frame.index)
@@ -37,7 +44,7 @@ def apply(predictor: Predictor, motion: Motion, young_kpa: float | None = None) 
         found.append(reader.read(frame))
     without_pulse = motion.again()
     if without_pulse is not None:
-        return apply(predictor, without_pulse, young_kpa)
+        return apply(predictor, without_pulse, young_kpa, membrane)
     findings = worth_saying([*judge_young(young), *motion.findings()])
     fault = first_fault(findings)
     trusted = np.array(followed) & (not fault)

@@ -2,9 +2,10 @@
 
 The file's input is displacement in mm on the grid, not the channels, so that nobody has to rebuild them:
 `displacement` (B, 2, N, N) mm and `mask` (B, 1, N, N) 0/1 (for some models `confidence` (B, 1, N, N) 0..1; of
-two eyes `displacement` (B, 3, N, N) and `confidence` (B, 2, N, N)). Its output is force density per unit
-stiffness (B, C, N, N) [mN/mm² at 1 kPa]. Times E in kPa it is mN/mm², times the cell's area and summed, mN.
-How a picture's flow comes onto the grid is written into the .json beside it.
+two eyes `displacement` (B, 3, N, N) and `confidence` (B, 2, N, N); `membrane` (B,), -1 stripped, 0 unknown,
+1 intact). Its output is force density per unit stiffness (B, C, N, N) [mN/mm² at 1 kPa]. Times E in kPa it is
+mN/mm², times the cell's area and summed, mN. How a picture's flow comes onto the grid is written into the
+.json beside it.
 """
 
 from __future__ import annotations
@@ -48,15 +49,17 @@ class Portable(nn.Module):
         super().__init__()
         self.model, self.card = model, card
 
-    def forward(self, displacement: Tensor, mask: Tensor, confidence: Tensor | None = None) -> Tensor:
-        x = channels(displacement, mask, self.card.settings.grid.pitch_mm, self.card.scales, confidence)
+    def forward(self, displacement: Tensor, mask: Tensor, *others: Tensor) -> Tensor:
+        known = dict(zip(input_names(self.card)[2:], others, strict=True))
+        x = channels(displacement, mask, self.card.settings.grid.pitch_mm, self.card.scales, **known)
         y: Tensor = self.model(x) * (self.card.scales.target * self.card.force_gain)
         return y
 
 
 def input_names(card: ModelCard) -> list[str]:
     """The file's inputs, in order."""
-    return ["displacement", "mask", *["confidence"] * card.settings.arch.confidence]
+    arch = card.settings.arch
+    return ["displacement", "mask", *["confidence"] * arch.confidence, *["membrane"] * arch.membrane]
 
 
 def examples(card: ModelCard, batch: int, seed: int = 0) -> list[Tensor]:
@@ -73,6 +76,7 @@ def examples(card: ModelCard, batch: int, seed: int = 0) -> list[Tensor]:
         "displacement": moved,
         "mask": mask,
         "confidence": rng.uniform(size=(batch, parts - 1, n, n)),
+        "membrane": rng.integers(-1, 2, batch),
     }
     return [torch.from_numpy(np.array(found[name], np.float32)) for name in input_names(card)]
 
@@ -156,6 +160,8 @@ def describe(card: ModelCard, kind: str, difference: float) -> dict[str, Any]:
             "confidence, across and along the view: means over tissue of 1 / (1 + (s / s0)^2), "
             f"s0 = {HALF_SURE_MM} mm, s the motion's standard deviation [mm] (of dx and dy the rms)"
         )
+    if arch.membrane:
+        inputs.append("membrane, one number a frame: -1 stripped, 0 unknown, 1 intact")
     return {
         "format": kind,
         "inputs": input_names(card),

@@ -18,6 +18,7 @@ from learn.uncertainty.intervals import Band, Prediction
 from learn.uncertainty.out_of_distribution import describe_unseen
 from synth.flow.confidence import DOUBTFUL
 from synth.flow.stereo.track import Moved
+from synth.job.types import MembraneState
 from synth.recording_flow.frame_motion import FrameMotion
 
 _MUCH_AT_BORDER = 0.1  # share of the force; what is spread evenly has a quarter there
@@ -30,6 +31,7 @@ def predict_force(
     scale_mm_per_px: float,
     young_kpa: float | None = None,
     confidence: Iterable[NDArray[np.float32]] | None = None,
+    membrane: MembraneState = "unknown",
 ) -> NDArray[np.float64]:
     """The force curve of one film: (T, 3) mN on the tissue, camera axes; what the rest frame says taken off.
 
@@ -42,11 +44,12 @@ def predict_force(
         scale_mm_per_px: of the picture.
         young_kpa: of the tissue; None: forces are those of tissue of 1 kPa.
         confidence: T times (H, W) in 0..1, for a model that reads it.
+        membrane: whether the tissue has its membrane (pia), for a model that asks.
 
     Raises:
         UserError: shapes that don't fit, values that aren't finite, or a model of two eyes.
     """
-    reader = ForceReader(model, np.asarray(tissue, bool), scale_mm_per_px, young_kpa)
+    reader = ForceReader(model, np.asarray(tissue, bool), scale_mm_per_px, young_kpa, membrane)
     sure = repeat(np.ones(np.shape(tissue), np.float32)) if confidence is None else confidence
     pairs = zip(flow, sure, strict=confidence is not None)
     return np.array([reader.read(FrameMotion(*pair)).force_mn for pair in pairs]).reshape(-1, 3)
@@ -79,10 +82,11 @@ class ForceReader:
         tissue: NDArray[np.bool_],
         scale_mm_per_px: float,
         young_kpa: float | None,
+        membrane: MembraneState = "unknown",
     ) -> None:
-        """`tissue`: (H, W) in the rest frame; `young_kpa`: of the tissue [kPa], None if unknown."""
+        """`tissue`: (H, W) in the rest frame; `young_kpa` [kPa], None if unknown, and `membrane`: of it."""
         self._predictor, self._tissue = predictor, tissue
-        self._scale, self._young_kpa = scale_mm_per_px, young_kpa
+        self._scale, self._young_kpa, self._membrane = scale_mm_per_px, young_kpa, membrane
         self._at_rest: dict[Point, ForceMap] = {}
         self.placing = Placing(tissue, scale_mm_per_px, predictor.grid)
         """Where the network's grid lies."""
@@ -136,7 +140,9 @@ class ForceReader:
     def _predict(self, frame: FrameMotion, place: Point) -> ForceMap:
         young = self._young_kpa
         found = self._predictor(
-            frame.flow, self._tissue, self._scale, young, frame.confidence, frame.motion, centre_px=place
+            *(frame.flow, self._tissue, self._scale, young, frame.confidence, frame.motion),
+            centre_px=place,
+            membrane=self._membrane,
         )
         if found.young_known:
             return found

@@ -15,13 +15,14 @@ from torch import nn
 from learn import checkpoint
 from learn.checkpoint import ModelCard
 from learn.data.clips import FIELDS, has_depth
-from learn.data.grid import Grid, GridView, certainty, channels
+from learn.data.grid import Grid, GridView, certainty, channels, membrane_code
 from learn.inference.shipped import find_model
 from learn.network.d2fnet import fused
 from learn.network.traced import Quick
 from learn.uncertainty.features import motion_features
 from synth.errors import UserError
 from synth.flow.stereo.track import Moved
+from synth.job.types import MembraneState
 
 
 def load_model(name: Path | str, device: torch.device | str = "cpu", *, quick: bool = False) -> Predictor:
@@ -76,6 +77,7 @@ class Predictor:
         moved: Moved | None = None,
         *,
         centre_px: tuple[float, float] | None = None,
+        membrane: MembraneState = "unknown",
     ) -> ForceMap:
         """Force map of one frame.
 
@@ -88,6 +90,7 @@ class Predictor:
             moved: motion in three dimensions and its deviation, which a model of two eyes reads instead of
                 flow and confidence.
             centre_px: as of `GridView`.
+            membrane: as of `density`.
 
         Raises:
             UserError: other shapes, values that aren't finite, or such a model without `moved`.
@@ -100,7 +103,7 @@ class Predictor:
         displacement, sure = self.on_grid(view, flow, confidence, moved)
         young = young_kpa or self.card.typical_young_kpa
         known = None if sure is None else sure[None]
-        density = self.density(displacement[None], view.mask, young, known)
+        density = self.density(displacement[None], view.mask, young, known, membrane)
         motion = None
         if self.card.intervals is not None:
             motion = motion_features(displacement[None], view.mask, known, self.grid.extent_mm)[0]
@@ -142,6 +145,7 @@ class Predictor:
         mask: NDArray[np.float32],
         young_kpa: float,
         confidence: NDArray[np.float32] | None = None,
+        membrane: MembraneState = "unknown",
     ) -> NDArray[np.float32]:
         """Force density of frames already on the grid, (T, C, N, N) mN/mm² at `young_kpa`.
 
@@ -150,6 +154,7 @@ class Predictor:
             mask: (N, N) 0/1.
             young_kpa: of the tissue.
             confidence: (T, 1, N, N), with depth (T, 2, N, N); None: 1.
+            membrane: what is known of the tissue's; a model without `arch.membrane` has no use for it.
 
         Raises:
             UserError: another grid or number of components, or values or a prediction that aren't finite.
@@ -173,7 +178,8 @@ class Predictor:
                 sure = torch.ones_like(m).expand(-1, parts - 1, -1, -1)
                 if confidence is not None:
                     sure = torch.from_numpy(np.array(confidence[frames])).to(self.device)
-            predicted = self._network(channels(u, m, self.grid.pitch_mm, scales, sure))
+            told = torch.full_like(u[:, 0, 0, 0], membrane_code(membrane)) if settings.arch.membrane else None
+            predicted = self._network(channels(u, m, self.grid.pitch_mm, scales, sure, told))
             maps.append(predicted.float().cpu().numpy())
         with np.errstate(over="ignore", invalid="ignore"):  # refused below
             density = np.concatenate(maps) * np.float32(scales.target * self.card.force_gain * young_kpa)

@@ -51,6 +51,8 @@ class Architecture(Section):
     depth: bool = False
     """Whether channels hold motion along the view too, from a second eye: `input` motion; with confidence its
     confidence as well."""
+    membrane: bool = False
+    """Whether a last channel says what is known of the tissue's membrane: stripped, nothing, intact."""
     relative: bool = False
     """Whether displacement comes in as a share of the frame's largest, and the map is multiplied by that:
     twice the motion is then twice the force, as in linear elasticity, and need not be learnt."""
@@ -58,7 +60,7 @@ class Architecture(Section):
     @property
     def channels(self) -> tuple[str, ...]:
         """Names of what comes in."""
-        return channel_names(self.confidence, self.depth)
+        return channel_names(self.confidence, self.depth, self.membrane)
 
     @property
     def displacements(self) -> int:
@@ -118,8 +120,8 @@ class D2FNet(nn.Module):
         return (peak + LEAST_MOTION**2).sqrt()[:, None, None, None]
 
     def per_motion(self, x: Tensor, largest: Tensor) -> Tensor:
-        """The channels over the largest motion, but for masks and confidences."""
-        plain = [name == "mask" or name.startswith("confidence") for name in self.arch.channels]
+        """The channels over the largest motion, but for those that are of no motion."""
+        plain = [name.startswith(("mask", "confidence", "membrane")) for name in self.arch.channels]
         return torch.where(x.new_tensor(plain)[None, :, None, None] > 0, x, x / largest)
 
 

@@ -10,9 +10,12 @@ import torch
 from torch import Tensor
 
 from learn.data.clips import Clip, amount, sources, target
-from learn.data.grid import Scales, channels, divergence
+from learn.data.grid import Scales, channels, divergence, membrane_code
 from learn.settings import TrainingSettings
 from synth.errors import UserError
+
+UNTOLD = 1 / 3
+"""Share of frames that a network with `arch.membrane` learns from without being told: a user may not know."""
 
 
 class Batch(NamedTuple):
@@ -26,6 +29,8 @@ class Batch(NamedTuple):
     """(B, 1, N, N) 0..1, with depth (B, 2, N, N)."""
     target: Tensor
     """(B, C, N, N) in the unit of `Scales.target`."""
+    membrane: Tensor
+    """(B,) what is told of each frame's membrane, as `membrane_code`."""
 
     def to(self, device: torch.device) -> Batch:
         return Batch(*(values.to(device, non_blocking=True) for values in self))
@@ -38,6 +43,7 @@ class Batch(NamedTuple):
             turned(self.mask, turn),
             planes.reshape(self.confidence.shape),
             turned(self.target, turn),
+            self.membrane,
         )
 
 
@@ -50,6 +56,8 @@ class FrameItem(NamedTuple):
     """Which displacement, as in `learn.data.clips.FIELDS`."""
     turn: int = 0
     """0-7, as of `turned`."""
+    told: bool = False
+    """Whether the network is told what is known of the membrane."""
 
 
 def swayed(batch: Batch, settings: TrainingSettings, generator: torch.Generator) -> Batch:
@@ -73,7 +81,8 @@ def swayed(batch: Batch, settings: TrainingSettings, generator: torch.Generator)
 def inputs(batch: Batch, settings: TrainingSettings, scales: Scales) -> Tensor:
     """The network's channels for a batch."""
     extra = batch.confidence if settings.arch.confidence else None
-    return channels(batch.displacement, batch.mask, settings.grid.pitch_mm, scales, extra)
+    told = batch.membrane if settings.arch.membrane else None
+    return channels(batch.displacement, batch.mask, settings.grid.pitch_mm, scales, extra, told)
 
 
 def turned(values: Tensor, turn: int) -> Tensor:
@@ -124,7 +133,10 @@ class FrameDataset:
             source = [self.sources[int(u < share_recovered)] for u in rng.random(len(items))]
         turn = rng.integers(0, 8, len(items))
         order = rng.permutation(len(items))
-        return [FrameItem._make((*items[i], source[i], int(turn[i]))) for i in order]
+        told = [False] * len(items)
+        if self.settings.arch.membrane:
+            told = [bool(one) for one in rng.random(len(items)) >= UNTOLD]
+        return [FrameItem._make((*items[i], source[i], int(turn[i]), told[i])) for i in order]
 
     def sequential(self, clip: int, source: str) -> Iterator[Batch]:
         """All frames of one clip, in order, as they are."""
@@ -136,11 +148,12 @@ class FrameDataset:
     def batch(self, items: Sequence[FrameItem]) -> Batch:
         """The frames named by `items`, as tensors."""
         frames = []
-        for c, t, source, turn in items:
+        for c, t, source, turn, told in items:
             clip = self.clips[c]
             truth = target(clip, t, self.settings.target, self.settings.arch.components)
             arrays = clip.displacement[source][t], clip.mask[None], clip.sure(source)[t], truth
-            one = Batch(*(torch.from_numpy(np.array(values))[None] for values in arrays))
+            known = np.float32(membrane_code(clip.membrane) if told else 0)
+            one = Batch(*(torch.from_numpy(np.array(values))[None] for values in (*arrays, known)))
             frames.append(one.turned(turn))
         return Batch(*map(torch.cat, zip(*frames, strict=True)))
 

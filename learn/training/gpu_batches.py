@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from learn.data.clips import Clip, sources, target
+from learn.data.grid import membrane_code
 from learn.settings import TrainingSettings
 from learn.training.batches import Batch, FrameDataset, FrameItem
 
@@ -53,7 +54,11 @@ class DeviceDataset(FrameDataset):
             clip = torch.tensor([one.clip for one in some], device=self._device)
             mask = self._mask[clip]
             sure = torch.ones_like(mask) if self._sure is None else self._sure[self.sources[k]][at]
-            parts.append(Batch(self._moved[self.sources[k]][at], mask, sure, self._true[at]).turned(turn))
+            told = torch.tensor(
+                [one.told * membrane_code(self.clips[one.clip].membrane) for one in some], device=self._device
+            )
+            moved = self._moved[self.sources[k]][at]
+            parts.append(Batch(moved, mask, sure, self._true[at], told).turned(turn))
         return Batch(*map(torch.cat, zip(*parts, strict=True)))
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, TypeVar, cast
+from typing import Annotated, Any, Literal, TypeVar, cast
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat
 from pydantic._internal._model_construction import ModelMetaclass
@@ -54,4 +54,6 @@ NonNegative = Annotated[FiniteFloat, Field(ge=0)]
 Share = Annotated[FiniteFloat, Field(ge=0, le=1)]
 Vector = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
 Direction = Annotated[Vector, AfterValidator(_long)]
+MembraneState = Literal["stripped", "unknown", "intact"]
+"""What is known of the tissue's membrane (pia): taken off, nothing, left on."""
 PlugInName = Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]+$", max_length=100)]

@@ -35,7 +35,7 @@ run = CliRunner().invoke
 
 @pytest.fixture(
     scope="module",
-    params=[(), pytest.param(("arch.confidence=true",), marks=pytest.mark.slow)],
+    params=[(), pytest.param(("arch.confidence=true", "arch.membrane=true"), marks=pytest.mark.slow)],
     ids=["plain", "confidence"],
 )
 def model(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequest) -> Path:
