@@ -70,7 +70,10 @@ def score(
     ] = "",
     json: Json = False,
 ) -> None:
-    """Force from a recording's video, scored against its sensor: score.json and report.html."""
+    """Force from a recording's video, scored against its sensor: score.json and report.html.
+
+    Exit code 2, and no table, where no number may be said of it.
+    """
     from bench.recording.folder import open_recording
     from synth.recording_flow.video_flow import RecordingFlowSettings
     from synth.video.mask_files import read_choice
@@ -279,16 +282,19 @@ def _score(
     )
     if json:
         print(json_.dumps(as_json(result), allow_nan=False))
-        return
+        raise typer.Exit(2 if result.refused else 0)
     console = Console()
     first = headline.headline(result)
     for line in filter(None, (first.refused, *first.warnings)):
         console.print(line, style="bold red", markup=False, highlight=False)
-    console.print(report.terminal_table(result))
+    if not result.refused:
+        console.print(report.terminal_table(result))
     for note in result.notes:
         console.print(f"note: {note}", style="yellow", markup=False, highlight=False)
     # A path is to be copied: never broken into lines.
     console.print(f"report: {folder / 'report.html'}", markup=False, highlight=False, soft_wrap=True)
+    if result.refused:
+        raise typer.Exit(2)
 
 
 @app.command(epilog="Example: bench live video.mp4 --model model --scale 0.05 --young 1.5")

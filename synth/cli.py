@@ -157,6 +157,13 @@ def render(
         print(f"{summary.already + summary.done} of {summary.total} sequences in {out}")
         for index, reason in summary.failed.items():
             print(f"  {index:06d} failed: {reason}", file=sys.stderr)
+    if not summary.already and read.card.authors == type(read.card)().authors:  # asked for once
+        licence = f"its licence is {read.card.licence}" if read.card.licence else "it has no licence"
+        print(
+            f"note: the card names no maker, and {licence}: say card.authors and card.licence in the job "
+            "and give the command again, which changes the card alone",
+            file=sys.stderr,
+        )
     if summary.failed:
         raise typer.Exit(1)
 

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import difflib
+import math
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from numbers import Real
+from pathlib import Path
 
 
 class UserError(Exception):
@@ -25,6 +28,22 @@ class NotFinite(UserError):
 
 class Caution(UserWarning):
     """Something that the user should know, though nothing is refused; command lines print it to stderr."""
+
+
+def as_path(what: str, value: object) -> Path:
+    """`value` as a path; UserError that names `what` for anything that can't be one."""
+    if not isinstance(value, (str, Path)):
+        raise UserError(f"{what}: expected a path, got {type(value).__name__}")
+    return Path(value)
+
+
+def as_positive(what: str, value: object, largest: float = math.inf) -> float:
+    """`value` as a finite number above 0 and at most `largest`; UserError that names `what` for another."""
+    number = float(value) if isinstance(value, Real) else math.nan
+    if not (0 < number <= largest and math.isfinite(number)):
+        most = f" and at most {largest:g}" if math.isfinite(largest) else ""
+        raise UserError(f"{what} {value!r}: must be a number above 0{most}")
+    return number
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:

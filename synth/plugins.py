@@ -18,9 +18,9 @@ STORED = object()
 def check_answer(
     label: str, what: str, found: Any, shape: tuple[int, ...], limits: tuple[float, float] = (-3e38, 3e38)
 ) -> NDArray[np.float32]:
-    """An array that a plug-in gave (`Registry.label`), (...) float32 of that shape and within finite limits.
+    """An array that a plug-in or a caller gave, (...) float32 of that shape and within finite limits.
 
-    UserError that names the plug-in and `what` of its answer for anything else.
+    UserError that names who (`Registry.label`) and `what` of its answer for anything else.
     """
     with as_user_error(f"{label}: {what}"):
         array = np.asarray(found, np.float32)

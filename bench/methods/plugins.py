@@ -16,6 +16,8 @@ from synth.plugins import Registry, check_answer
 METHODS = Registry("sulcus.method", "method", "method", {})
 """Methods of other packages: an entry point is a callable without arguments that gives a `Method`."""
 
+_MOST_MN = 1e12  # more is an error and no force
+
 
 class Plugged:
     """A method of somebody else's; what goes wrong in it is one line that names it."""
@@ -45,6 +47,9 @@ class Plugged:
             force = np.asarray(answer.force_mn, np.float64)
         if force.shape != (3,):
             raise UserError(f"{self._label}: gives force of shape {force.shape}, expected (3,)")
+        if (np.abs(force) > _MOST_MN).any() or answer.low_mn > answer.high_mn:
+            size_mn = f"force {force.tolist()} mN in [{answer.low_mn:g}, {answer.high_mn:g}]"
+            raise UserError(f"{self._label}: gives {size_mn}, which can't be")
         if answer.density is not None:
             density = check_answer(self._label, "density", answer.density, size)
         return replace(answer, force_mn=force, density=density)

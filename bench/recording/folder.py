@@ -304,16 +304,26 @@ def _rising(time: NDArray[np.float64]) -> NDArray[np.bool_]:
 def _force(path: Path, about: Meta, notes: list[str]) -> Force | None:
     if not os.path.lexists(path):
         return None
-    columns = csv_table.read_csv(path, ("t_s", "fx_n", "fy_n", "fz_n"), ("gx", "gy", "gz"))
+    forces = ("fx_n", "fy_n", "fz_n")
+    columns = csv_table.read_csv(path, ("t_s", *forces), ("gx", "gy", "gz"))
+    columns["row"] = np.arange(1.0, len(columns["t_s"]) + 1)
     for fault, check in (("without a time", np.isfinite), ("whose time stands still or runs back", _rising)):
         good = check(columns["t_s"])
         if not good.all():
             notes.append(f"{path.name}: {np.sum(~good)} rows {fault} left out")
         columns = {name: column[good] for name, column in columns.items()}
-    newtons = np.stack([columns[name] for name in ("fx_n", "fy_n", "fz_n")], axis=1)
-    usable = np.isfinite(newtons).all(axis=1)
+    newtons = np.stack([columns[name] for name in forces], axis=1)
+    lacking = ~np.isfinite(newtons)
+    usable = ~lacking.any(axis=1)
     if usable.sum() < 2:
-        raise UserError(f"{path}: fewer than two rows with a time and three forces")
+        few = f"{path}: fewer than two rows with a time and three forces"
+        for name, empty in zip(forces, lacking.T, strict=True):
+            if empty.any():
+                row = columns["row"][empty][0]
+                few += (
+                    f"; {name} is empty in {empty.sum()} of {len(empty)}, first in row {row:.0f} of the data"
+                )
+        raise UserError(few)
     if not usable.all():
         notes.append(
             f"{path.name}: {np.sum(~usable)} rows with a missing force; scores leave those times out"

@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from bench.recording import writer
 from synth.checks import optics, stereo
 from synth.dataset.store import Sequence
-from synth.errors import UserError
+from synth.errors import UserError, as_path
 
 _PAIR = "stereo.yaml"
 
 
-def export_recording(sequence: Sequence, folder: Path, frames: Literal["png", "mp4"] = "png") -> Path:
+def export_recording(sequence: Sequence, folder: str | Path, frames: Literal["png", "mp4"] = "png") -> Path:
     """Writes one recording: frames or video, times, force in camera axes, tool masks, tissue, meta.yaml.
 
     Of a stereo sequence the right eye and the pair's calibration too.
@@ -32,6 +32,7 @@ def export_recording(sequence: Sequence, folder: Path, frames: Literal["png", "m
     Raises:
         UserError: the folder exists.
     """
+    folder = as_path("recording", folder)
     with writer.write_whole_folder(folder) as part:
         _fill(sequence, part, frames)
     return folder

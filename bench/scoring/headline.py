@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from bench.bootstrap import Interval
 from bench.scoring.metrics import METRICS
-from bench.scoring.result import MOST_LOST, Result
+from bench.scoring.result import Result
 
 _NEWTONS = ("mae_mn", "mae_of_peak", "r", "ccc", "r2", "ghost_rate")
 _SHAPE = ("r", "shape_error", "lag_s")
@@ -43,13 +43,8 @@ def headline(result: Result) -> Headline:
     curve's shape follows: what no gain changes. Nothing of it where too many frames were lost.
     """
     odd = tuple(one.said for one in result.findings if one.state == "odd")
-    if result.fault:
-        return Headline(f"Nothing can be measured: {result.fault}", (), odd)
-    if result.lost.any() and result.lost_share > MOST_LOST:
-        share = f"{100 * result.lost_share:.0f}%"
-        return Headline(
-            f"{share} of the frames to be scored were lost: no number stands for this recording", (), odd
-        )
+    if result.refused:
+        return Headline(result.refused, (), odd)
     main = result.methods[result.main]
     if not main.scores:
         return Headline("No usable force sensor: these are predictions only, nothing is scored", (), odd)

@@ -26,6 +26,9 @@ _METHOD_KEYS = (
 MOST_LOST = 0.2
 """Share of lost frames above which no number stands for a recording: the rest are the easy ones."""
 
+LEAST_SCORED = 3
+"""Frames: of two every correlation is 1."""
+
 
 @dataclass(frozen=True)
 class Gain:
@@ -106,6 +109,20 @@ class Result:
     def fault(self) -> str:
         """Why no number stands; empty if one may."""
         return first_fault(self.findings)
+
+    @property
+    def refused(self) -> str:
+        """Why no number of it may be said; empty where numbers may. Without a sensor there is none either."""
+        if self.fault:
+            return f"Nothing can be measured: {self.fault}"
+        if self.lost.any() and self.lost_share > MOST_LOST:
+            share = f"{100 * self.lost_share:.0f}%"
+            return f"{share} of the frames to be scored were lost: no number stands for this recording"
+        if self.sensor_mn is None:
+            return ""
+        left = int((self.scored & ~self.lost & np.isfinite(self.sensor_mn)).sum())
+        why = f"{left} frames are left to be scored, {LEAST_SCORED} are needed (see the notes)"
+        return why if left < LEAST_SCORED else ""
 
     @property
     def aligned(self) -> bool:

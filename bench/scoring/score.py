@@ -6,6 +6,7 @@ import json
 from collections.abc import Mapping
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
+from types import NoneType
 from typing import Any
 
 from bench.methods import comparison, plugins
@@ -21,7 +22,7 @@ from bench.tracking import flow_process
 from bench.tracking.tracking import Progress
 from learn import Predictor
 from learn.inference.shipped import find_model, require_model
-from synth.errors import UserError
+from synth.errors import UserError, as_path
 from synth.recording_flow.local_flow import LocalFlow
 from synth.recording_flow.video_flow import RecordingFlowSettings
 from synth.system import checked_file
@@ -69,7 +70,13 @@ def score(
     """
     if train is not None and (isinstance(model, Predictor) or (model is None and methods)):
         raise UserError("score: train needs the model's folder, which says what it was fitted on")
-    opened = recording if isinstance(recording, Recording) else open_recording(Path(recording))
+    opened = (
+        recording if isinstance(recording, Recording) else open_recording(as_path("recording", recording))
+    )
+    if not isinstance(model, (str, Path, Predictor, NoneType)):
+        raise UserError(f"model: expected a folder or what `load_model` gives, got {type(model).__name__}")
+    if not isinstance(methods or {}, Mapping):
+        raise UserError(f"methods: expected them by name, got {type(methods).__name__}")
     if model is None and not methods:
         model = require_model(opened.has_two_eyes)
     elif isinstance(model, (str, Path)):

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy import ndimage, sparse
 from torch import Tensor
 
-from synth.errors import UserError
+from synth.errors import UserError, as_positive
 from synth.job.types import MembraneState, Positive
 
 CHANNELS = ("dx", "dy", "magnitude", "mask", "divergence")
@@ -71,9 +71,7 @@ def centre(tissue: NDArray[np.bool_]) -> tuple[float, float]:
 
 def check_scale(scale_mm_per_px: float) -> float:
     """The scale of a picture. UserError if it isn't positive, or above 100: what it costs grows with it."""
-    if not 0 < scale_mm_per_px <= 100:
-        raise UserError(f"scale {scale_mm_per_px} mm/px: must be positive and at most 100")
-    return float(scale_mm_per_px)
+    return as_positive("scale [mm/px]", scale_mm_per_px, largest=100)
 
 
 class Resampler:

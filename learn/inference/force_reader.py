@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from itertools import repeat
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,9 +17,11 @@ from learn.inference.predict import ForceMap, Predictor, force_size, net_force
 from learn.uncertainty.conformal import LEVELS
 from learn.uncertainty.intervals import Band, Prediction
 from learn.uncertainty.out_of_distribution import describe_unseen
+from synth.errors import UserError
 from synth.flow.confidence import DOUBTFUL
 from synth.flow.stereo.track import Moved
 from synth.job.types import MembraneState
+from synth.plugins import check_answer
 from synth.recording_flow.frame_motion import FrameMotion
 
 _MUCH_AT_BORDER = 0.1  # share of the force; what is spread evenly has a quarter there
@@ -49,10 +52,30 @@ def predict_force(
     Raises:
         UserError: shapes that don't fit, values that aren't finite, or a model of two eyes.
     """
-    reader = ForceReader(model, np.asarray(tissue, bool), scale_mm_per_px, young_kpa, membrane)
-    sure = repeat(np.ones(np.shape(tissue), np.float32)) if confidence is None else confidence
-    pairs = zip(flow, sure, strict=confidence is not None)
-    return np.array([reader.read(FrameMotion(*pair)).force_mn for pair in pairs]).reshape(-1, 3)
+    if not isinstance(model, Predictor):
+        raise UserError(f"model: expected what `load_model` gives, got {type(model).__name__}")
+    if len(size := np.shape(tissue)) != 2:
+        raise UserError(f"tissue: expected an array (H, W), got {size}")
+    inside = check_answer("predict_force", "tissue", tissue, size) != 0
+    reader = ForceReader(model, inside, scale_mm_per_px, young_kpa, membrane)
+    known: Iterator[NDArray[np.float32]] = repeat(np.ones(size, np.float32))
+    if confidence is not None:
+        known = _each("confidence", confidence, size, (0.0, 1.0))
+    found = list[NDArray[np.float64]]()
+    for moved in _each("flow", flow, (*size, 2)):
+        if (sure := next(known, None)) is None:
+            raise UserError(f"confidence: of {len(found)} frames, flow has more")
+        found.append(reader.read(FrameMotion(moved, sure)).force_mn)
+    if confidence is not None and next(known, None) is not None:
+        raise UserError(f"confidence: of more frames than flow's {len(found)}")
+    return np.array(found).reshape(-1, 3)
+
+
+def _each(what: str, frames: object, *about: Any) -> Iterator[NDArray[np.float32]]:
+    """Each of some arrays; UserError for one of another shape or range, as `check_answer`."""
+    if not isinstance(frames, Iterable):
+        raise UserError(f"{what}: expected an array a frame, got {type(frames).__name__}")
+    return (check_answer("predict_force", what, one, *about) for one in frames)
 
 
 @dataclass(frozen=True)

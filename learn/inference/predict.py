@@ -20,7 +20,7 @@ from learn.inference.shipped import find_model
 from learn.network.d2fnet import fused
 from learn.network.traced import Quick
 from learn.uncertainty.features import motion_features
-from synth.errors import UserError
+from synth.errors import UserError, as_path, as_positive, as_user_error
 from synth.flow.stereo.track import Moved
 from synth.job.types import MembraneState
 
@@ -36,7 +36,7 @@ def load_model(name: Path | str, device: torch.device | str = "cpu", *, quick: b
     Raises:
         UserError: the folder is missing, damaged or edited.
     """
-    network, card = checkpoint.read_model(find_model(name))
+    network, card = checkpoint.read_model(find_model(as_path("model", name)))
     return Predictor(network, card, device, quick)
 
 
@@ -48,7 +48,8 @@ class Predictor:
     ) -> None:
         """`quick`: as of `load_model`."""
         self.card, self.grid = card, card.settings.grid
-        self.device = torch.device(device)
+        with as_user_error(f"device {device}"):
+            self.device = torch.device(device)
         self.model = fused(network).to(self.device)
         self._network: Callable[..., Any] = self.model
         if quick and self.device.type == "cpu":
@@ -95,13 +96,11 @@ class Predictor:
         Raises:
             UserError: other shapes, values that aren't finite, or such a model without `moved`.
         """
-        if young_kpa is not None and not (np.isfinite(young_kpa) and young_kpa > 0):
-            raise UserError(f"young_kpa {young_kpa}: must be positive")
+        young = self.card.typical_young_kpa if young_kpa is None else as_positive("young_kpa", young_kpa)
         if self._view is None or not self._view.is_of(tissue, scale_mm_per_px, centre_px):
             self._view = GridView(tissue, scale_mm_per_px, self.grid, centre_px)
         view = self._view
         displacement, sure = self.on_grid(view, flow, confidence, moved)
-        young = young_kpa or self.card.typical_young_kpa
         known = None if sure is None else sure[None]
         density = self.density(displacement[None], view.mask, young, known, membrane)
         motion = None

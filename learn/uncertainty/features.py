@@ -48,7 +48,8 @@ def motion_features(
     """
     inside = mask > 0
     shift, weight = _coarse(displacement * inside, inside)
-    here = weight > 0.5
+    # Of a tissue smaller than a block, the blocks that hold most of it.
+    here = weight > (0.5 if (weight > 0.5).any() else 0.99 * weight.max())
     u = np.moveaxis(shift, 1, -1)[:, here].astype(np.float64)
     squared = np.square(u[..., :2]).sum(-1)
     motion = np.sqrt(squared.mean(1))

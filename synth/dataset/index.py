@@ -143,6 +143,12 @@ def write_index(folder: Folder) -> list[dict[str, Any]]:
     ordered = [rows[key] for key in sorted(rows)]
     stored = split.read_stored(folder.root)
     if not stored.sides:  # an older version stored them here alone
+        for row in known.values():
+            if row["split"] not in (None, *split.SIDES):
+                words = f"sequence {row['index']} is in {row['split'][:40]!r}, no side of a split"
+                raise UserError(
+                    f"{folder.root / NAME}: {words}: remove the file, `synth report` writes it anew"
+                )
         stored = _dealt(known.values(), [row["split"] for row in known.values()], stored)
     sides = split.assign_if_possible(ordered, stored)
     for row, side in zip(ordered, sides, strict=True):

@@ -132,11 +132,15 @@ def assign_sides(rows: Sequence[Mapping[str, Any]], chosen: DatasetSplit) -> lis
     fixed = {group: max(sides) for group, sides in on.items() if sides}
     needing = {k for k, share in enumerate(shares) if share > 0} - set(fixed.values())
     if len(on) - len(fixed) < len(needing) and not chosen.sides:
-        hint = "; `synth split --by opening`, or with --share-anatomy, splits within a brain"
-        if chosen.share_anatomy:
-            hint = "; craniotomy.also in the job lists further openings" if by == "opening" else ""
-        few = f"{len(on)} groups by {by}: too few"
-        raise UserError(f"{few} for {', '.join(SIDES[k] for k in sorted(needing))} to have one each{hint}")
+        hint = "render more sequences (`sequences` in the job)"
+        if chosen.share_anatomy and by == "opening":
+            hint = "craniotomy.also in the job lists further openings"
+        elif len(on) < len(done) and not chosen.share_anatomy:
+            hint += ", or split within a brain by `synth split --by opening` or --share-anatomy"
+        wanted = sorted(needing | set(fixed.values()))
+        each = ", ".join(SIDES[k] for k in wanted)
+        few = f"{len(done)} sequences are {len(on)} groups by {by}, {len(wanted)} are needed"
+        raise UserError(f"{few}, one each for {each}: {hint}")
     order = sorted(on, key=lambda name: hashlib.blake2b(name.encode(), digest_size=8).hexdigest())
     part = draw_groups(groups, shares, order, fixed)
     dealt = [SIDES[k] if len(on[group]) < 2 else None for group, k in zip(groups, part, strict=True)]

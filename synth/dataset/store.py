@@ -16,7 +16,7 @@ from zarr.codecs import BloscCodec, Crc32cCodec
 
 from synth.dataset import fast_read, location, provenance
 from synth.dataset.attributes import FORMAT, LARGEST_BYTES, check_attributes
-from synth.errors import NotFinite, UserError
+from synth.errors import InvalidValue, NotFinite, UserError, as_path, did_you_mean
 from synth.fields import FIELDS, FORMAT_VERSION, Field
 from synth.job import identity
 from synth.job.schema import Job
@@ -347,7 +347,7 @@ class Dataset:
     """A folder of sealed sequences, or an address of one: `len`, iteration, indexing, in order of names."""
 
     def __init__(self, root: Path | str) -> None:
-        self.root = Path(root)
+        self.root = as_path("dataset", root)
         self._addresses: list[str] | None = None
         if isinstance(root, str) and "://" in root:
             self._addresses = location.stores(root)
@@ -379,6 +379,7 @@ def open_sequence(path: Path | str, *, sealed: bool = True) -> Sequence:
     Raises:
         UserError: missing, unfinished, foreign, truncated or edited.
     """
+    as_path("sequence", path)
     if str(path).partition("::")[0].endswith(".part"):
         raise UserError(f"{path}: is an unfinished sequence")
     at = location.find_location(path)
@@ -418,7 +419,7 @@ def _hash(values: Mapping[str, Any]) -> str:
 
 def _field(name: str) -> Field:
     if name not in FIELDS:
-        raise ValueError(f"{name}: is not in the field table")
+        raise InvalidValue(f"{name}: is not in the field table{did_you_mean(str(name), FIELDS)}")
     return FIELDS[name]
 
 

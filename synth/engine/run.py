@@ -18,6 +18,7 @@ from synth.engine import machine
 from synth.engine.child import Attempt, Child, Setup, Slot
 from synth.engine.journal import Journal, Watcher
 from synth.errors import UserError
+from synth.job.reader import as_job
 from synth.job.schema import Job
 from synth.publish import card, croissant, film
 from synth.render.camera import camera as cameras
@@ -66,14 +67,16 @@ class Summary:
     """Hash of the content hashes of all finished sequences in order."""
 
 
-def render_job(job: Job, out: str | Path, *, progress: bool | Watcher = False, **options: Any) -> Summary:
+def render_job(
+    job: Job | str | Path, out: str | Path, *, progress: bool | Watcher = False, **options: Any
+) -> Summary:
     """Renders the dataset of a job into a folder; one that is there for the same job is continued.
 
     Sequences are computed in processes of their own, so this works from a notebook too. A sequence that fails
     doesn't end the run: `Summary.failed` has its reason.
 
     Args:
-        job: the job; `load_job` reads one.
+        job: the job, or what `load_job` knows it by.
         out: the folder.
         progress: True draws bars, in a terminal or a notebook; a `Watcher` is called with what happens.
         options: as the command's: `workers`, `engine`, `gpus`, `memory_gb`, `mix_versions`.
@@ -81,6 +84,7 @@ def render_job(job: Job, out: str | Path, *, progress: bool | Watcher = False, *
     Raises:
         UserError: the folder is not for this job, the disk is full, or the job cannot be carried out.
     """
+    job = as_job(job)
     if progress is True:
         from synth.engine.progress import RunBars
 
@@ -140,7 +144,7 @@ def run_job(job: Job, root: Path, options: Options, watcher: Watcher) -> Summary
 
 
 @contextmanager
-def open_dataset(root: str | Path, job: Job) -> Iterator[Path]:
+def open_dataset(root: str | Path, job: Job | str | Path) -> Iterator[Path]:
     """A folder for scenes of one's own, written by `write_scene`; index, preview and card follow at the end.
 
     Example:
@@ -150,7 +154,7 @@ def open_dataset(root: str | Path, job: Job) -> Iterator[Path]:
     Raises:
         UserError: the folder is not for this job.
     """
-    with claim(Path(root), job) as folder:
+    with claim(Path(root), as_job(job)) as folder:
         try:
             yield folder.root
         finally:

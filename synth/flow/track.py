@@ -182,6 +182,16 @@ def recover_flow(
     Raises:
         UserError: no such estimator, no frames, or shapes that don't fit.
     """
+    if not (
+        isinstance(frames, np.ndarray)
+        and frames.size
+        and frames.dtype == np.uint8
+        and np.shape(frames)[3:] == (3,)
+    ):
+        raise UserError("frames: expected a filled array (T, H, W, 3) of uint8")
+    for what, given, shape in (("tool", tool, frames.shape[:3]), ("tissue", tissue, frames.shape[1:3])):
+        if np.shape(given) != shape or np.asarray(given).dtype != bool:
+            raise UserError(f"{what}: expected an array {shape} of bool, got {np.shape(given)}")
     return track(backend, frames, mask_detection.hidden(frames, tool), tissue)
 
 

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from importlib import resources
 from pathlib import Path
 
-from synth.errors import UserError, did_you_mean
+from synth.errors import UserError, as_path, did_you_mean
 from synth.job import identity, retired
 from synth.job.schema import Job
 from synth.system import checked_file
@@ -20,7 +20,7 @@ def names() -> list[str]:
     return sorted(entry.name.removesuffix(".yaml") for entry in jobs if entry.name.endswith(".yaml"))
 
 
-def load_job(source: str, overrides: Sequence[str] = ()) -> Job:
+def load_job(source: str | Path, overrides: Sequence[str] = ()) -> Job:
     """The job in `source`, with overrides applied.
 
     Args:
@@ -31,8 +31,14 @@ def load_job(source: str, overrides: Sequence[str] = ()) -> Job:
     Raises:
         UserError: one line for every mistake, `job.yaml:12:3: render.sppp: unknown key; did you mean 'spp'?`
     """
-    text, label, folder = read_source(source)
+    as_path("job", source)
+    text, label, folder = read_source(str(source))
     return parse_job(text, label, folder, overrides)
+
+
+def as_job(job: Job | str | Path) -> Job:
+    """The job itself, or what `load_job` reads; errors as there."""
+    return job if isinstance(job, Job) else load_job(job)
 
 
 def read_source(source: str) -> tuple[str, str, Path]:

@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from synth.errors import UserError
+from synth.errors import UserError, as_positive
 from synth.flow import mask_detection
 from synth.flow.confidence import doubted
 from synth.flow.estimator import Flags, Map, Rgb
@@ -61,8 +61,8 @@ class RecordingFlowSettings:
 
     def __post_init__(self) -> None:
         """Raises UserError for a rate or a shrinking that can't be."""
-        if self.rate_hz is not None and not 0 < self.rate_hz < math.inf:
-            raise UserError(f"rate_hz {self.rate_hz}: above 0, or None for every frame")
+        if self.rate_hz is not None:
+            as_positive("rate_hz (None: every frame)", self.rate_hz)
         if self.shrink not in range(65):
             raise UserError(f"shrink {self.shrink}: a whole number from 0 to 64")
 

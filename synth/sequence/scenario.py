@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from synth.fem.pulse import Pulse
 from synth.fem.tool_gesture import Gesture, ToolContact
 from synth.job import schema
 from synth.job.mechanics import CLEAR_MM, InstrumentSection
+from synth.job.reader import as_job
 from synth.job.schema import Family, FemSection, Job, LightSection, RenderSection
 from synth.render.anatomy.surface import Relief
 from synth.render.appearance.family import FAMILIES, Colour
@@ -77,8 +79,9 @@ class Scenario:
         return described
 
 
-def draw_scenario(job: Job, index: int) -> Scenario:
+def draw_scenario(job: Job | str | Path, index: int) -> Scenario:
     """Draws sequence `index` of `job`; independent of how many others there are and of their order."""
+    job = as_job(job)
     anatomy = index % (job.anatomy.variety or job.sequences)
     family = job.appearance.families[index % len(job.appearance.families)]
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +16,7 @@ from synth.fem.tool_gesture import ToolMotion
 from synth.flow import track, tvl1
 from synth.flow.estimator import Estimator, create
 from synth.flow.track import Track
-from synth.job.reader import load_job
+from synth.job.reader import as_job
 from synth.job.schema import FlowSection, Job
 from synth.render.anatomy.surface import CortexSurface
 from synth.render.camera import camera, video_link
@@ -198,7 +199,7 @@ def at_rest(
 
 
 def simulate(
-    job: Job | str,
+    job: Job | str | Path,
     index: int = 0,
     report: StageCallback | None = None,
     watch: Stopwatch | None = None,
@@ -222,9 +223,8 @@ def simulate(
     Raises:
         UserError: no such sequence, or a job that cannot be carried out (surface, load, inverted element).
     """
-    if isinstance(job, str):
-        job = load_job(job)
-    if not 0 <= index < job.sequences:
+    job = as_job(job)
+    if index not in range(job.sequences):
         raise UserError(f"sequence {index}: the job has sequences 0 to {job.sequences - 1}")
     report, watch = report or (lambda stage, done, of: None), watch or Stopwatch()
     report("mesh", 0, 1)

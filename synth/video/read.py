@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
@@ -102,9 +103,19 @@ def read_film(path: Path, fps: float) -> Iterator[Picture]:
 
 
 def count_frames(path: Path) -> int | None:
-    """Number of frames that the container states; None if it doesn't. UserError if it is no video."""
+    """Number of frames that the container states, else of those in it; None: no video stream.
+
+    Raises UserError if it is no video.
+    """
     with _open_video(path) as container:
-        return int(container.streams.video[0].frames) or None if container.streams.video else None
+        if not (stream := next(iter(container.streams.video), None)):
+            return None
+        stated = stream.frames
+        with suppress(av.error.FFmpegError):  # those before a cut
+            if not stated:
+                for packet in container.demux(stream):
+                    stated += packet.size > 0
+        return stated or None
 
 
 def pixel_aspect(path: Path) -> float:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import importlib
 import json
+import math
 import re
 import subprocess
 import sys
@@ -61,6 +62,10 @@ def test_what_is_promised_is_there_and_types_say_the_same(name: str) -> None:
         assert (found.__doc__ or "").strip(), public
 
 
+GREY = np.full((2, 40, 40, 3), 90, np.uint8)
+FLOW, TISSUE = np.zeros((2, 40, 40, 2), np.float32), np.ones((40, 40), bool)
+
+
 @pytest.mark.parametrize(
     ("named", "call"),
     [
@@ -71,6 +76,18 @@ def test_what_is_promised_is_there_and_types_say_the_same(name: str) -> None:
         ("shrink", lambda: bench.Settings(shrink=-1)),
         ("scale", lambda: check_scale(0.0)),
         ("scale", lambda: check_scale(1e9)),
+        ("scale", lambda: check_scale("x")),  # type: ignore[arg-type]
+        ("job", lambda: synth.simulate(None)),  # type: ignore[arg-type]
+        ("flwo", lambda: synth.recover_flow(GREY, GREY[..., 0] > 0, GREY[0, ..., 0] < 0, "flwo")),
+        ("frames", lambda: synth.recover_flow(GREY / 255, GREY[..., 0] > 0, GREY[0, ..., 0] < 0)),  # type: ignore[arg-type]
+        ("tool", lambda: synth.recover_flow(GREY, GREY[0, ..., 0] > 0, GREY[0, ..., 0] < 0)),
+        ("model", lambda: learn.load_model(3)),  # type: ignore[arg-type]
+        ("model", lambda: learn.predict_force("mono", FLOW, TISSUE, 0.1)),  # type: ignore[arg-type]
+        ("young_kpa", lambda: learn.predict_force(learn.load_model("mono"), FLOW, TISSUE, 0.1, math.nan)),
+        ("flow", lambda: learn.predict_force(learn.load_model("mono"), FLOW * math.nan, TISSUE, 0.1)),
+        ("tissue", lambda: learn.predict_force(learn.load_model("mono"), FLOW, TISSUE[0], 0.1)),
+        ("confidence", lambda: learn.predict_force(learn.load_model("mono"), FLOW, TISSUE, 0.1, 1.0, FLOW)),
+        ("confidence", lambda: learn.predict_force(learn.load_model("mono"), FLOW, TISSUE, 0.1, 1.0, [])),
     ],
 )
 def test_what_cannot_be_is_refused_by_name(named: str, call: Callable[[], object]) -> None:

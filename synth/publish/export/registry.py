@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from synth.dataset.index import group_by_side
 from synth.dataset.store import Dataset
 from synth.errors import UserError
 from synth.publish import film
@@ -28,6 +29,8 @@ FORMATS: dict[str, Callable[..., None]] = {
 def export_dataset(root: Path, target: Path, to: str, **options: Any) -> int:
     """Writes the finished sequences of `root` into the new folder `target`; returns how many.
 
+    Beside what the format holds `split.csv` says on which side of the dataset's split each is.
+
     Args:
         root: the dataset.
         target: a folder that does not exist yet; it is there in full or not at all.
@@ -42,4 +45,7 @@ def export_dataset(root: Path, target: Path, to: str, **options: Any) -> int:
     dataset = Dataset(root)
     with checked_file.folder_of(target) as part:
         FORMATS[to](dataset, part, **options)
+        on = {dataset[k].index: side for side, those in group_by_side(dataset).items() for k in those}
+        lines = [f"{number:06d},{on[number]}\n" for number in sorted(on)]
+        (part / "split.csv").write_text("sequence,split\n" + "".join(lines), "utf-8")
     return len(dataset)

@@ -154,6 +154,18 @@ def test_pixels_of_a_video_are_made_square(tmp_path: Path) -> None:
     assert seen.any(0).sum() == pytest.approx(seen.any(1).sum(), abs=3)
 
 
+def test_a_video_whose_container_states_no_number_of_frames_has_those_in_it(tmp_path: Path) -> None:
+    folder = Maker(tmp_path)(frames=9, footage="mp4")
+    with av.open(str(folder / "video.mp4")) as read, av.open(str(folder / "video.mkv"), "w") as copy:
+        stream = copy.add_stream_from_template(read.streams.video[0])
+        for packet in read.demux(video=0):
+            if packet.size:
+                packet.stream = stream
+                copy.mux(packet)
+    (folder / "video.mp4").unlink()
+    assert list(open_recording(folder).numbers()) == list(range(9))
+
+
 def test_a_written_meta_is_read_as_what_it_stands_for(tmp_path: Path) -> None:
     (tmp_path / "meta.yaml").write_text(meta.commented())
     assert meta.read_meta(tmp_path / "meta.yaml") == meta.Meta(scale_mm_per_px="unknown")

@@ -46,6 +46,7 @@ CASES: dict[str, Spoil] = {
     "frame times run back": text("frames.csv", "frame,t_s\n0,0\n1,5\n2,3\n3,4\n4,6\n"),
     "force column missing": text("force.csv", "t_s,fx_n\n0,0\n"),
     "force all nan": text("force.csv", HEAD + "0,nan,nan,nan\n1,nan,nan,nan\n"),
+    "an axis is empty": text("force.csv", HEAD + "0,1,,2\n0.1,1,,2\n0.2,1,,2\n"),
     "force in millinewtons": rows(lambda lines: [f"{k / 100},{k * 90},0,0" for k in range(90)]),
     "sensor clock in ms": rows(lambda lines: [f"{k * 10},0.1,0,0" for k in range(90)]),
     "sensor clock elsewhere": rows(lambda lines: [f"{1e9 + k},0.1,0,0" for k in range(90)]),

@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from fake_recording import Maker, scored
+from typer.testing import CliRunner
 
+from bench.cli import app
 from bench.recording import check
 from bench.scoring.headline import headline
 from bench.scoring.result import as_json
@@ -32,6 +34,17 @@ def test_what_is_stated_in_another_unit_is_found_by_check_and_score_and_no_numbe
     assert np.isnan(result.methods["bump"].size_mn).all()
     assert headline(result).tiles == ()
     assert next(iter(as_json(result)["findings"]))["what"] == what
+
+
+@pytest.mark.parametrize(("frames", "young", "code"), [(8, 1.0, 0), (8, 1500.0, 2), (2, 1.0, 2)])
+def test_scoring_ends_in_a_refusal_where_no_number_may_be_said_and_writes_all_the_same(
+    make: Maker, frames: int, young: float, code: int
+) -> None:
+    folder = make(frames=frames, meta={"young_kpa": young})
+    done = CliRunner().invoke(app, ["score", str(folder), "-o", str(folder / "score"), "--flow", "dis"])
+    assert done.exit_code == code, done.output
+    assert ("D2FNet" in done.stdout) == (code == 0)  # the table
+    assert {"score.json", "report.html"} == {one.name for one in (folder / "score").iterdir()}
 
 
 @pytest.mark.parametrize(("rest", "free"), [(6, [[0.0, 0.05]]), (0, [[0.2, 0.8]])])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import hashlib
 import json
 import tarfile
@@ -23,11 +24,11 @@ from learn.settings import preset
 from learn.training.sides import divide
 from synth.cli import app as synth
 from synth.dataset import index, split
-from synth.dataset.folder import claim
+from synth.dataset.folder import Folder, claim
 from synth.dataset.split import DatasetSplit
 from synth.errors import UserError
 from synth.job.schema import Job
-from synth.publish.export.registry import export_dataset
+from synth.publish.export.registry import FORMATS, export_dataset
 
 run = CliRunner().invoke
 BASE = preset("tiny", size=32)
@@ -54,19 +55,22 @@ def divided(*datasets: Path) -> tuple[ModelCard, Split]:
 
 
 def exported(dataset: Path, target: Path) -> dict[str, dict[int, str]]:
-    """The side of every sequence by its index, in each export that has sides."""
-    for to in ("hf", "webdataset", "lerobot"):
+    """The side of every sequence by its index, as each export says it."""
+    formats = sorted(FORMATS.keys() - {"endonerf"})  # phantoms have no camera
+    for to in formats:
         export_dataset(dataset, target / to, to)
+    tables = [csv.reader((target / to / "split.csv").read_text().splitlines()[1:]) for to in formats]
     files = {one: one.name.split("-")[0] for one in (target / "hf/sequences").iterdir()}
     hf = {k: side for one, side in files.items() for k in pq.read_table(one)["index"].to_pylist()}
     shards = {}
-    for one in (target / "webdataset").iterdir():
+    for one in (target / "webdataset").glob("*.tar"):
         with tarfile.open(one) as archive:
             shards |= {int(name[:6]): one.name.split("-")[0] for name in archive.getnames()}
     ranges = json.loads((target / "lerobot/meta/info.json").read_text())["splits"]
     for side, (first, last) in ((side, text.split(":")) for side, text in ranges.items()):
         assert int(last) - int(first) == list(hf.values()).count(side)
-    return {"hf": hf, "webdataset": shards}
+    beside = {to: {int(k): side for k, side in rows} for to, rows in zip(formats, tables, strict=True)}
+    return {"beside " + to: sides for to, sides in beside.items()} | {"hf": hf, "webdataset": shards}
 
 
 @pytest.mark.slow
@@ -112,6 +116,18 @@ def test_no_sequence_is_on_two_sides_in_any_artefact(tmp_path: Path, draw: int) 
     used = find_sides(grouped, card, set(card.split["test"]), from_test=False)
     assert {clips[i].content_hash for i in used.test} == set(card.split["test"])
     assert not set(used.test) & {*used.fit, *used.select, *used.intervals}
+
+
+def test_a_side_that_is_none_in_an_older_index_is_refused(tmp_path: Path) -> None:
+    own = make(tmp_path / "own", [*range(6)])
+    (own / split.NAME).unlink()
+    rows = index.read_index(own).to_pylist()
+    index.save_rows(own, [{**row, "split": "trian"} for row in rows])
+    with pytest.raises(UserError, match="trian"):
+        index.write_index(Folder(own))
+    (own / index.NAME).unlink()
+    index.write_index(Folder(own))
+    assert {row["split"] for row in index.read_index(own).to_pylist()} == set(split.SIDES)
 
 
 def test_what_another_split_calls_test_is_not_scored_if_it_was_fitted_on(tmp_path: Path) -> None:

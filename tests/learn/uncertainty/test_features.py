@@ -57,6 +57,15 @@ def test_a_stretch_has_the_divergence_it_has(n: int) -> None:
     assert (found["confidence"], found["tissue share"]) == (0.25, 0.5)
 
 
+@pytest.mark.filterwarnings("error")
+def test_a_tissue_smaller_than_a_block_of_cells_has_features_too() -> None:
+    mask = np.zeros((256, 256), np.float32)
+    mask[100:102, 100:103] = 1
+    found = named(motion_features(field(256, "moved"), mask, None, EXTENT_MM))
+    assert np.isfinite([*found.values()]).all()
+    assert found["tissue share"] == pytest.approx(6 / 256**2)
+
+
 def cloud(rng: np.random.Generator, sequences: int, frames: int = 10) -> list[Floats]:
     """Moving frames of known middle and covariance."""
     mix = np.array([[1.0, 0.0, 0.0], [0.5, 0.7, 0.0], [-0.2, 0.1, 0.4]])

@@ -86,7 +86,7 @@ def test_what_cannot_be_split_is_said_so(rule: DatasetSplit) -> None:
 
 def test_a_dataset_of_one_brain_is_split_within_it_only_when_told() -> None:
     found = [{**row, "anatomy": "mesh-1"} for row in rows()]
-    with pytest.raises(UserError, match=r"1 groups by sequence: too few .*--share-anatomy"):
+    with pytest.raises(UserError, match=r"--share-anatomy"):
         split.assign_sides(found, DatasetSplit("sequence"))
     rule = DatasetSplit("sequence", share_anatomy=True)
     given = [{**row, "split": side} for row, side in zip(found, split.assign_sides(found, rule), strict=True)]
