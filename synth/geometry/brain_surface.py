@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from synth.errors import UserError
+from synth.errors import Caution, UserError
 from synth.geometry.triangles import Shape
 from synth.geometry.vtk import read_vtk
 from synth.job import identity
@@ -21,6 +22,9 @@ Floats = NDArray[np.float64]
 
 KINDS = ("obj", "stl", "ply", "off", "vtk")
 """Endings of the files that are read."""
+
+_OPEN = 0.25
+"""Share of a surface's area from which on what is missing is no hole: a hemisphere lacks a half."""
 
 
 @dataclass(frozen=True)
@@ -95,6 +99,13 @@ def read_brain(path: Path, fill_holes: bool = False) -> tuple[Floats, NDArray[np
     if len(faces) < 4 or span.min() < 1e-3 * span.max() or _volume(vertices, faces) < 1e-3 * span.prod():
         hint = "" if fill_holes else "; if it is open, anatomy.fill_holes=true closes it"
         raise UserError(f"anatomy.mesh: {path.name} encloses no volume{hint}")
+    if (open_share := _open_share(vertices, faces)) > _OPEN:
+        said = f"{path.name} is open: what would close it has {100 * open_share:.0f}% of its area"
+        warnings.warn(
+            f"anatomy.mesh: {said}; motion may be a third off: anatomy.fill_holes=true closes flat holes",
+            Caution,
+            stacklevel=1,  # said once
+        )
     return vertices, faces
 
 
@@ -163,6 +174,13 @@ def _filled(vertices: Floats, faces: NDArray[np.int64], name: str) -> NDArray[np
         why = f"{odd} edges stay open" if odd else "edges have more than two faces"
         raise UserError(f"anatomy.fill_holes: {name} can't be closed ({why}); mend it in a mesh editor")
     return np.asarray(mesh.faces, np.int64)
+
+
+def _open_share(vertices: Floats, faces: NDArray[np.int64]) -> float:
+    """Area of the flat lid that would close the surface, over the surface's own: 0 if closed, below 1."""
+    a, b, c = (vertices[faces[:, i]] for i in range(3))
+    areas = np.cross(b - a, c - a)  # twice; of a closed surface they cancel
+    return float(np.linalg.norm(areas.sum(axis=0)) / np.linalg.norm(areas, axis=1).sum())
 
 
 def _volume(vertices: Floats, faces: NDArray[np.int64]) -> float:

@@ -79,8 +79,10 @@ def legible(picture: Rgb) -> Rgb:
 def caption(picture: Rgb, text: str, row: int = 14) -> Rgb:
     """The picture (H, W, 3) with a line of text, readable on any ground, that stands on a row."""
     canvas = np.ascontiguousarray(picture)
-    for colour, thick in (((0, 0, 0), 3), ((255, 255, 255), 1)):
-        cv2.putText(canvas, text, (4, row), cv2.FONT_HERSHEY_SIMPLEX, 0.4, colour, thick, cv2.LINE_AA)
+    around = [(across, down, 0) for across in (-1, 0, 1) for down in (-1, 0, 1)]  # bold letters are wider
+    for across, down, level in (*around, (0, 0, 255)):
+        at = (4 + across, row + down)
+        cv2.putText(canvas, text, at, cv2.FONT_HERSHEY_SIMPLEX, 0.4, (level,) * 3, 1, cv2.LINE_AA)
     return canvas
 
 

@@ -142,3 +142,26 @@ def test_growth_moves_nobody_and_leaks_nothing(by: str) -> None:
             largest = max(sum(row["anatomy"] == one["anatomy"] for row in found) for one in found)
             for count, share in zip(counts, (0.7, 0.15, 0.15), strict=True):
                 assert abs(count - share * len(given)) <= max(2 * largest, 3)
+
+
+def test_openings_that_share_tissue_are_never_on_two_sides_however_they_come() -> None:
+    for draw in range(40):
+        rng = np.random.default_rng([36, draw])
+        at = rng.uniform(-60, 60, (int(rng.integers(8, 40)), 3)).round(2)
+        brain = rng.integers(0, 2, len(at)).tolist()
+        names = [f"mesh-{b} at {x}, {y}, {z}" for b, (x, y, z) in zip(brain, at.tolist(), strict=True)]
+        found = [
+            {**rows(1)[0], "index": k, "content_hash": str(k), "anatomy": f"mesh-{brain[k]}", "opening": name}
+            for k, name in enumerate(names)
+        ]
+        rule = split.parse_rule("opening", "0.6,0.2,0.2", [], apart_mm=24.0)
+        for part in (len(found) // 2, len(found)):
+            there = found[:part]
+            sides = split.assign_if_possible(there, rule)
+            on = {row["index"]: side for row, side in zip(there, sides, strict=True) if side}
+            rule = replace(
+                rule, sides={row["content_hash"]: on[row["index"]] for row in there if row["index"] in on}
+            )  # type: ignore[misc]
+            for a in on:
+                near = [b for b in on if brain[a] == brain[b] and np.linalg.norm(at[a] - at[b]) < 24.0]
+                assert {on[b] for b in near} == {on[a]}
