@@ -49,6 +49,8 @@ def headline(result: Result) -> Headline:
     if not main.scores:
         return Headline("No usable force sensor: these are predictions only, nothing is scored", (), odd)
     warnings = list(odd)
+    if result.left == 2:
+        warnings.append("Only two frames are scored: every curve correlates with two (see the notes)")
     if result.sync is not None and not result.aligned:
         warnings.append(
             f"The clocks could not be aligned ({result.sync.refused}): scored at the offset stated, "

@@ -26,9 +26,6 @@ _METHOD_KEYS = (
 MOST_LOST = 0.2
 """Share of lost frames above which no number stands for a recording: the rest are the easy ones."""
 
-LEAST_SCORED = 3
-"""Frames: of two every correlation is 1."""
-
 
 @dataclass(frozen=True)
 class Gain:
@@ -118,11 +115,15 @@ class Result:
         if self.lost.any() and self.lost_share > MOST_LOST:
             share = f"{100 * self.lost_share:.0f}%"
             return f"{share} of the frames to be scored were lost: no number stands for this recording"
-        if self.sensor_mn is None:
-            return ""
-        left = int((self.scored & ~self.lost & np.isfinite(self.sensor_mn)).sum())
-        why = f"{left} frames are left to be scored, {LEAST_SCORED} are needed (see the notes)"
-        return why if left < LEAST_SCORED else ""
+        left = self.left
+        return "" if left is None or left > 1 else f"{left} frames are left to be scored (see the notes)"
+
+    @property
+    def left(self) -> int | None:
+        """Frames that are scored; None without a sensor."""
+        return (
+            None if self.sensor_mn is None else int((self.scored & ~self.lost & (self.sensor_mn >= 0)).sum())
+        )
 
     @property
     def aligned(self) -> bool:
