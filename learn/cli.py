@@ -279,7 +279,10 @@ def predict_command(
     threads: Threads = None,
     json: Json = False,
 ) -> None:
-    """Write the force maps and force curves that a model sees in stores, videos or arrays of flow."""
+    """Write the force maps and force curves that a model sees in stores, videos or arrays of flow.
+
+    Exit code 2 if no frame has a force.
+    """
     from learn.inference.apply import apply
     from learn.inference.motion import VideoOptions, has_second_eye, motions
     from learn.inference.predict import load_model
@@ -318,12 +321,14 @@ def predict_command(
         said[motion.name] = found["notes"].tolist()
         if json:
             continue
-        what = "no force: no frame could be followed" if peak is None else f"peak force {peak:.3g} mN"
+        what = "no frame has a force" if peak is None else f"peak force {peak:.3g} mN"
         _console.print(f"{motion.name}: {len(found['trusted'])} frames, {what}")
         for note in found["notes"]:
             _console.print(f"note: {note}", style="yellow", markup=False, highlight=False)
     if json:
         print(json_.dumps({"out": str(out), "notes": said, "peak_force_mn": peaks}))
+    if all(peak is None for peak in peaks.values()):
+        raise typer.Exit(2)
 
 
 @app.command("calibrate", epilog="Example: learn calibrate model press.npz")

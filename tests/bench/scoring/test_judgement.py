@@ -12,6 +12,7 @@ from bench.recording import check
 from bench.scoring.headline import headline
 from bench.scoring.result import as_json
 from bench.sensor.plausibility import judge_sensor
+from learn.cli import app as learn
 
 STATED = {
     "E in Pa": ({"young_kpa": 1500.0}, "stiffness"),
@@ -45,6 +46,8 @@ def test_scoring_ends_in_a_refusal_where_no_number_may_be_said_and_writes_all_th
     assert done.exit_code == code, done.output
     assert ("D2FNet" in done.stdout) == (code == 0)  # the table
     assert {"score.json", "report.html"} == {one.name for one in (folder / "score").iterdir()}
+    words = ["mono", str(folder / "frames"), "--scale", "0.2", "--young", str(young), "-o", str(folder / "p")]
+    assert CliRunner().invoke(learn, ["predict", *words]).exit_code == (0 if young < 9 else 2)
 
 
 @pytest.mark.parametrize(("rest", "free"), [(6, [[0.0, 0.05]]), (0, [[0.2, 0.8]])])
