@@ -299,7 +299,10 @@ def _score(
 
 @app.command(epilog="Example: bench live video.mp4 --model model --scale 0.05 --young 1.5")
 def live(
-    video: Annotated[Path, typer.Argument(help="Video; its first frame is the rest frame.")],
+    video: Annotated[
+        Path,
+        typer.Argument(help="Video; its first frame is the rest frame, a tissue.png beside it its tissue."),
+    ],
     model: Annotated[
         Path | None, typer.Option("--model", "-m", help="Model folder, mono or stereo: forces too.")
     ] = None,
@@ -317,18 +320,22 @@ def live(
     json: Json = False,
 ) -> None:
     """Masks, flow and force of a video as it runs: latency percentiles and dropped frames."""
+    from functools import partial
+
     from threadpoolctl import threadpool_limits
 
     from bench.methods.network import Model
     from bench.tracking import flow_process, live
     from learn.inference.shipped import choose_model
     from learn.training.threads import set_threads
-    from synth.recording_flow.video_flow import Footage, RecordingFlowSettings
+    from synth.recording_flow.video_flow import Footage, RecordingFlowSettings, everywhere
     from synth.video.mask_files import read_choice
     from synth.video.pixel_scale import UNKNOWN_NOTE, read_scale
-    from synth.video.read import FPS, read_video
+    from synth.video.read import FPS, read_mask, read_video
 
     kind, files = read_choice(masks)
+    drawn = video.parent / "tissue.png"
+    tissue = partial(read_mask, drawn) if drawn.exists() else everywhere
     # Without a scale there is no force: flow alone is what is asked for.
     model = model or (choose_model(two_eyes=False) if scale else None)
     method = None if model is None else Model(model)
@@ -343,7 +350,7 @@ def live(
     threadpool_limits(set_threads(None))
     with flow_process.open_flow_process() as process:
         stream = live.stream_video(
-            Footage(read_video(video, FPS), str(video), tool=files.read if files else None),
+            Footage(read_video(video, FPS), str(video), tissue, files.read if files else None),
             RecordingFlowSettings(flow, shrink, rate_hz=None, pulse=False, masks=kind),
             method=method,
             scale_mm_per_px=read_scale(scale),
@@ -353,6 +360,8 @@ def live(
             flow=process,
         )
     summary = stream.summary()
+    for one in stream.findings:
+        typer.echo(f"{one.state}: {one.what}: {one.said}", err=True)
     if scale == "unknown":
         typer.echo(f"note: {UNKNOWN_NOTE}", err=True)
     if out is not None:

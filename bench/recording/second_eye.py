@@ -105,9 +105,8 @@ class SecondEye:
                 hidden = _mask_right(right, video.settings.masks, masked)
                 self._stereo = self._begun(self._rig(video), frame.rgb, right, masked, hidden, tissue)
                 self._pairing.add(frame.rgb, right, masked, frame.flow, tissue, 0.0)
-                # A breath moves all tissue to and from both eyes, across in this one: that is no camera's.
                 inside = self._stereo.right_tissue()
-                self._camera = CameraTracker(right, inside, inside | mask_detection.blocked(right))
+                self._camera = CameraTracker(right, inside, mask_detection.blocked(right))
                 return Moved.nothing(tissue.shape)
             # Both eyes' surroundings are brought back to rest: with them the rig, as far as the tissue shows.
             view = self._camera.find(right, frame.time_s) or frame.camera

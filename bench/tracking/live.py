@@ -16,6 +16,7 @@ import numpy as np
 
 from bench.methods.protocol import Method, MethodContext
 from synth.errors import UserError
+from synth.recording_flow.finding import Finding, worth_saying
 from synth.recording_flow.local_flow import LocalFlow
 from synth.recording_flow.video_flow import Footage, RecordingFlowSettings, VideoFlow
 from synth.system.checked_file import write_whole
@@ -48,6 +49,8 @@ class Stream:
     dropped: int = 0
     size: tuple[int, int] = (0, 0)
     """Height, width of what is worked on [px]."""
+    findings: tuple[Finding, ...] = ()
+    """What is odd or wrong about it, and whether its camera moved."""
 
     def summary(self) -> dict[str, float | int]:
         """Latency percentiles [ms], mean time of each stage [ms], dropped and flagged frames."""
@@ -116,7 +119,7 @@ def stream_video(
         )
         stream.frames.append(frame)
         report(frame)
-    stream.dropped = pace.dropped
+    stream.dropped, stream.findings = pace.dropped, worth_saying(video.findings)
     if not stream.frames:
         raise UserError(f"{footage.name}: fewer than two frames")
     return stream

@@ -3,8 +3,7 @@
 A microscope is bumped, sways, zooms and turns, and a method takes that for the tissue's motion. Corners (Shi
 & Tomasi, CVPR 1994) of the rest frame's surroundings, rim, drape and bone, are followed into each frame
 (Lucas & Kanade, IJCAI 1981, in Bouguet's pyramid), and a similarity is fitted to them, robustly. Where too
-little of the surroundings shows, the tissue's own corners are taken too: what most of them share is the
-camera's, for a contact's motion falls with distance.
+little of the surroundings shows, the tissue's own motion has to say it: `shared_motion`.
 """
 
 from __future__ import annotations
@@ -32,11 +31,6 @@ _TOGETHER = 3.0  # neighbouring corners err alike: so many count as one
 _UNCERTAIN_PX = 0.15  # deviation over the tissue from which on corners show too little
 _UNLIKE = 0.1  # of the motion, by which surroundings near and far differ that deform
 _STILL_PX, _SURE = 0.05, 4.0  # motion of less, or of so few deviations, is a still camera's
-_SHARED, _LEFT_OVER = 0.6, 0.25  # of the corners have less than this of the motion left, if it is a camera's
-_LEAST_SHARED_PX, _NEAR_PX = (
-    0.3,
-    0.5,
-)  # of the first such motion; what is nearer to rest is judged as if so far
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,26 +60,92 @@ class Similarity:
         x, y = np.arange(size[1]), np.arange(size[0])[:, None]
         return [(a * x + b * y + c).astype(np.float32) for a, b, c in self.matrix]
 
+    def steady(self, flow: NDArray[np.float32]) -> NDArray[np.float32]:
+        """A flow (H, W, 2) from the rest frame as a camera at rest would have had it."""
+        y, x = np.mgrid[: flow.shape[0], : flow.shape[1]].astype(np.float32)
+        back = cv2.invertAffineTransform(self.matrix).astype(np.float32)
+        at = flow + np.dstack([x, y])
+        return np.asarray(at @ back[:, :2].T + back[:, 2] - np.dstack([x, y]), np.float32)
+
+    def distance_px(self, other: Similarity | None, size: tuple[int, ...]) -> float:
+        """Root mean square over a picture (H, W) of what two shift differently; None: at rest."""
+        matrix = self.matrix - (np.eye(2, 3) if other is None else other.matrix)
+        y, x = np.mgrid[: size[0] : 8, : size[1] : 8]
+        shift = np.column_stack([x.ravel(), y.ravel()]) @ matrix[:, :2].T + matrix[:, 2]
+        return float(np.sqrt(np.square(shift).sum(axis=1).mean()))
+
+
+@dataclass(frozen=True, eq=False)
+class CameraPath:
+    """Where the camera was in the frames of a recording."""
+
+    time_s: Floats
+    """(T,), rising."""
+    found: tuple[Similarity | None, ...]
+    """By time; None: it had stood still since the rest frame."""
+
+    def at(self, time_s: float) -> Similarity | None:
+        """Where it was; between frames where it was in the one before."""
+        known = int(np.searchsorted(self.time_s, time_s, side="right"))
+        return self.found[known - 1] if known else None
+
+
+class SimilarityBasis:
+    """Small similarities about a picture's middle as four numbers: shift in x and y, scale and turn [px].
+
+    The last two are of what lies half a picture's width away.
+    """
+
+    def __init__(self, size: tuple[int, ...]) -> None:
+        """`size`: (H, W) of the picture."""
+        self._centre, self._unit = np.array(size[::-1]) / 2, size[1] / 2
+
+    def design(self, at: Floats) -> Floats:
+        """(2 N, 4) x and y of the shifts at places (N, 2) px by one px of each number."""
+        x, y = ((at - self._centre) / self._unit).T
+        one, nothing = np.ones_like(x), np.zeros_like(x)
+        return np.column_stack([one, nothing, x, -y, nothing, one, y, x]).reshape(-1, 4)
+
+    def matrix(self, answer: Floats) -> Floats:
+        """(2, 3): from the rest frame's pixels to the picture's."""
+        x, y, larger, turned = answer / np.array([1, 1, self._unit, self._unit])
+        linear = np.array([[1 + larger, -turned], [turned, 1 + larger]])
+        return np.column_stack([linear, self._centre - linear @ self._centre + (x, y)])
+
+
+Course = list[tuple[float, Similarity, float]]
+"""Time [s], where the camera was, and how far from where it was in the frame before [px]."""
+
+
+def describe_course(course: Course, shrink: int) -> str:
+    """How it moved, in pixels of a film that is `shrink` times larger than the pictures here."""
+    time_s, found, step = zip(*course, strict=True)
+    most, sudden = max(one.length_px for one in found), int(np.argmax(step))
+    sure = np.array([one.deviation_px for one in found])
+    said = f"the camera moved by up to {shrink * most:.2g} px, from {time_s[0]:.3g} s on, most at once at "
+    said += f"{time_s[sudden]:.3g} s, {shrink * step[sudden]:.2g} px: "
+    said += f"taken off to ± {shrink * np.median(sure):.1g} px"
+    return said + (f", ± {shrink * sure.max():.1g} px at worst" if sure.max() > 2 * np.median(sure) else "")
+
 
 class CameraTracker:
     """The camera's motion since the rest frame, frame by frame."""
 
     def __init__(self, rest: Rgb, tissue: Flags, blocked: Flags) -> None:
         """Starts at the rest frame (H, W, 3); `tissue`: (H, W) may deform; `blocked`: (H, W) tool, glare."""
-        self._centre, self._unit = np.array(tissue.shape[::-1]) / 2, tissue.shape[1] / 2
+        self._basis = SimilarityBasis(tissue.shape)
         self._rest = _contrast(rest)
         element = np.ones((2 * _RIM_PX + 1, 2 * _RIM_PX + 1), np.uint8)
         near, hidden = (cv2.dilate(one.astype(np.uint8), element) > 0 for one in (tissue, blocked))
-        outer, inner = (_corners(self._rest, where & ~hidden) for where in (~near, near))
-        self._points = {False: outer, True: np.concatenate([outer, inner])}  # by whether most must share it
+        self._points = _corners(self._rest, ~near & ~hidden)
+        self.is_blind = len(self._points) < _LEAST_POINTS
+        """Too little of the surroundings shows in the rest frame."""
         rows, columns = np.nonzero(tissue)
         some = slice(None, None, max(1, len(rows) // 100))
         self._tissue = np.column_stack([columns, rows])[some].astype(np.float64)
         self._last: Similarity | None = None
         self._unknown_s: list[float] = []
-        self._deforms = False
-        # Time, where, and how far from where it was in the frame before.
-        self._course: list[tuple[float, Similarity, float]] = []
+        self._course: Course = []
 
     def find(self, rgb: Rgb, time_s: float | None) -> Similarity | None:
         """Where the camera is in a frame (H, W, 3) uint8; None: it has stood still since the rest frame.
@@ -117,16 +177,8 @@ class CameraTracker:
         """How it moved, in pixels of a film that is `shrink` times larger than the pictures here."""
         if not self._course:
             return []
-        time_s, found, step = zip(*self._course, strict=True)
-        most, sudden = max(one.length_px for one in found), int(np.argmax(step))
-        sure = float(np.median([one.deviation_px for one in found]))
-        said = (
-            f"the camera moved by up to {shrink * most:.2g} px, from {time_s[0]:.3g} s on, most at once at "
-        )
-        said += (
-            f"{time_s[sudden]:.3g} s, {shrink * step[sudden]:.2g} px: taken off to ± {shrink * sure:.1g} px"
-        )
-        if unknown := [time for time in self._unknown_s if time > time_s[0]]:
+        time_s, said = self._course[0][0], describe_course(self._course, shrink)
+        if unknown := [time for time in self._unknown_s if time > time_s]:
             said += f"; in {len(unknown)} frames, from {unknown[0]:.3g} s on, nothing shows where it is"
         return [said]
 
@@ -141,15 +193,9 @@ class CameraTracker:
         return np.column_stack([np.eye(2), shift])
 
     def _find(self, now: NDArray[np.uint8], near: Similarity) -> Similarity | None:
-        """A similarity near another: of the surroundings, else of all; None where the surroundings deform."""
-        self._deforms = False
-        found = self._fit(now, near, False)
-        return found if found or self._deforms else self._fit(now, near, True)
-
-    def _fit(self, now: NDArray[np.uint8], near: Similarity, shared: bool) -> Similarity | None:
-        """A similarity near another of the surroundings' corners; `shared`: of all, and most must have it."""
-        points = self._points[shared]
-        if len(points) < _LEAST_POINTS:
+        """A similarity near another, of the surroundings; None where too few show it, or they deform."""
+        points = self._points
+        if self.is_blind:
             return None
         start = (points @ near.matrix[:, :2].T + near.matrix[:, 2]).astype(np.float32)
         how = None, None, _WINDOW, 3, _STOP, cv2.OPTFLOW_USE_INITIAL_FLOW
@@ -161,7 +207,7 @@ class CameraTracker:
         guess, _ = cv2.estimateAffinePartial2D(at, at + shift, ransacReprojThreshold=0.5)
         if guess is None:
             return None
-        design, answer = self._design(at), np.zeros(4)
+        design, answer = self._basis.design(at), np.zeros(4)
         left = at + shift - (at @ guess[:, :2].T + guess[:, 2])
         for _ in range(_ROUNDS):
             off = np.linalg.norm(left, axis=1)
@@ -173,11 +219,9 @@ class CameraTracker:
                 return None
             answer = np.linalg.solve(normal, weighed.T @ shift.ravel())
             left = shift - (design @ answer).reshape(-1, 2)
-        tissue = self._design(self._tissue)
+        tissue = self._basis.design(self._tissue)
         variance = _TOGETHER * spread**2 * 2 * ((tissue @ np.linalg.inv(normal)) * tissue).sum(axis=1).mean()
-        x, y, larger, turned = answer / np.array([1, 1, self._unit, self._unit])
-        linear = np.array([[1 + larger, -turned], [turned, 1 + larger]])
-        matrix = np.column_stack([linear, self._centre - linear @ self._centre + (x, y)])
+        matrix = self._basis.matrix(answer)
         length = self._length(matrix - np.eye(2, 3))
         # What moves more beside the tissue than far from it is tissue that the mask leaves out.
         away = np.linalg.norm(at - self._tissue.mean(axis=0), axis=1)
@@ -185,27 +229,14 @@ class CameraTracker:
         apart = [
             (weight[:, None] * left)[half].sum(axis=0) / weight[half].sum() for half in (beside, ~beside)
         ]
-        self._deforms = not shared and bool(
-            np.linalg.norm(apart[0] - apart[1]) > max(_UNLIKE * length, _STILL_PX)
-        )
-        if self._deforms:
+        deforms = np.linalg.norm(apart[0] - apart[1]) > max(_UNLIKE * length, _STILL_PX)
+        if deforms or variance > _UNCERTAIN_PX**2:
             return None
-        most = float(np.quantile(np.linalg.norm(left, axis=1), _SHARED)) if shared else 0.0
-        least, near_px = (_LEAST_SHARED_PX * shared, 0.0) if self._last is None else (0.0, _NEAR_PX)
-        if variance > _UNCERTAIN_PX**2 or length < least or most > _LEFT_OVER * max(length, near_px):
-            return None
-        # The half of what is left may be a contact's, and in it.
-        return Similarity(matrix, float(np.sqrt(variance + most**2 / 4)), length)
+        return Similarity(matrix, float(np.sqrt(variance)), length)
 
     def _length(self, matrix: Floats) -> float:
         """Root mean square over the tissue of a shift (2, 3) [px]."""
         return float(np.sqrt(np.square(self._tissue @ matrix[:, :2].T + matrix[:, 2]).sum(axis=1).mean()))
-
-    def _design(self, at: Floats) -> Floats:
-        """(2 N, 4) x and y of the shifts at places (N, 2) px by one px in x and y, of scale and of turn."""
-        x, y = ((at - self._centre) / self._unit).T
-        one, nothing = np.ones_like(x), np.zeros_like(x)
-        return np.column_stack([one, nothing, x, -y, nothing, one, y, x]).reshape(-1, 4)
 
 
 def _contrast(rgb: Rgb) -> NDArray[np.uint8]:

@@ -19,6 +19,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from synth.recording_flow.camera_motion import CameraPath
 from synth.recording_flow.harmonic_fit import Floats, Rhythm, Span, find_rhythms, fit, visible_rates
 
 Flags = NDArray[np.bool_]
@@ -49,17 +50,23 @@ class SurfaceMotion:
 
     def add(self, time_s: float, motion: NDArray[np.float32], confidence: NDArray[np.float32]) -> None:
         """One frame that could be followed: (h, w, C) and (h, w) in 0..1."""
-        height, width = self.tissue.shape
-        size = (COLUMNS, max(2, round(COLUMNS * height / width)))
-        weight = confidence * self.tissue
-        share = cv2.resize(weight, size, interpolation=cv2.INTER_AREA)
-        parts = [motion[..., k : k + 3] for k in range(0, motion.shape[2], 3)]  # cv2: 4 channels at most
-        total = np.dstack(
-            [cv2.resize(p * weight[..., None], size, interpolation=cv2.INTER_AREA) for p in parts]
-        )
+        mean, share = in_cells(motion, confidence * self.tissue)
         self.time_s.append(time_s)
-        self.motion.append(np.asarray(total / np.maximum(share, 1e-6)[..., None], np.float32))
-        self.visible.append(np.asarray(share, np.float32))
+        self.motion.append(mean)
+        self.visible.append(share)
+
+
+def in_cells(
+    motion: NDArray[np.float32], weight: NDArray[np.float32]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """(r, c, C) mean over each cell of a motion (h, w, C), weighed by (h, w), and (r, c) the weight's."""
+    height, width = weight.shape
+    size = (COLUMNS, max(2, round(COLUMNS * height / width)))
+    share = cv2.resize(weight, size, interpolation=cv2.INTER_AREA)
+    parts = [motion[..., k : k + 3] for k in range(0, motion.shape[2], 3)]  # cv2: 4 channels at most
+    total = np.dstack([cv2.resize(p * weight[..., None], size, interpolation=cv2.INTER_AREA) for p in parts])
+    mean = total / np.maximum(share, 1e-6)[..., None]
+    return np.asarray(mean, np.float32), np.asarray(share, np.float32)
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,6 +109,8 @@ class PulseSearch:
     """Between which rhythms were looked for; None: they weren't."""
     reason: str = ""
     """Why they weren't."""
+    camera: CameraPath | None = None
+    """The camera's motion in what the rhythms leave; None: there is none, or its surroundings show it."""
 
     def describe(self) -> str:
         """What heart or breath might have been missed, in words; empty if neither was."""

@@ -23,14 +23,15 @@ from synth.flow.confidence import doubted
 from synth.flow.estimator import Flags, Map, Rgb
 from synth.flow.mask_selection import Proposal
 from synth.flow.stereo.track import Moved
-from synth.recording_flow.camera_motion import CameraTracker, Similarity
+from synth.recording_flow.camera_motion import CameraTracker, Course, Similarity, describe_course
 from synth.recording_flow.finding import Finding, first_fault
 from synth.recording_flow.foreground import ForegroundSearch
 from synth.recording_flow.frame_faults import FilmFaults, find_bars, find_fault, is_inside_out
 from synth.recording_flow.frame_motion import FrameMotion, TrackingSummary
 from synth.recording_flow.harmonic_fit import Span
 from synth.recording_flow.local_flow import LocalFlow
-from synth.recording_flow.pulse import PulseSearch, SurfaceMotion, find_pulse
+from synth.recording_flow.pulse import PulseSearch, SurfaceMotion, find_pulse, in_cells
+from synth.recording_flow.shared_motion import SharedMotion, find_path
 from synth.system.stopwatch import Stopwatch
 from synth.video.mask_files import MASKS
 from synth.video.read import Picture
@@ -146,7 +147,7 @@ class VideoFlow:
             footage: what is followed.
             settings: how.
             flow: where flow is computed, closed by the caller; None: in this process.
-            pulse: what a first pass found; taken off the motion of every frame.
+            pulse: what a first pass found, and the camera's motion; taken off every frame.
             second: what shows motion in space, if there is something.
             pace: of a stream; None: every frame has its turn. Flow runs once before its start, for loading is
                 no latency.
@@ -175,6 +176,9 @@ class VideoFlow:
         """What its pictures suffer from; None before the rest frame."""
         self._flow, self._pace = flow or LocalFlow(), pace
         self._camera: CameraTracker | None = None  # from the rest frame on
+        self._path = None if pulse is None else pulse.camera
+        self._shared: SharedMotion | None = None  # of a stream whose tissue fills the picture
+        self._course: Course = []  # the camera's, found on the tissue
         self._foreground: ForegroundSearch | None = None  # not of a stream
         self._surface: SurfaceMotion | None = None  # only where a pulse is to be found
         self._depth_weights: list[float] = []
@@ -234,7 +238,9 @@ class VideoFlow:
             yield self._finish(*one)
 
     def find_pulse(self, free_s: Sequence[Span] = ()) -> PulseSearch | None:
-        """The tissue's own motion, once all frames are through; None where there is none, or it is off.
+        """The tissue's own motion, and the camera's where tissue fills the picture; all frames are through.
+
+        None where there is neither, or it is off.
 
         Args:
             free_s: spans without contact, if known [s].
@@ -248,7 +254,10 @@ class VideoFlow:
             rest_s = self._surface.time_s[0] if self._surface.time_s else 0.0
         with self.watch.stage("pulse"):
             self.pulse = find_pulse(self._surface, rest_s, free_s)
-        return None if self.pulse.pulse is None else self.pulse
+        if self._camera is not None and self._camera.is_blind:
+            with self.watch.stage("camera"):
+                self.pulse = replace(self.pulse, camera=find_path(self._surface, self.pulse.pulse))
+        return self.pulse if self.pulse.pulse or self.pulse.camera else None
 
     @property
     def findings(self) -> list[Finding]:
@@ -261,6 +270,10 @@ class VideoFlow:
         between = [] if self._foreground is None else self._foreground.findings
         moved = [] if self._camera is None else self._camera.describe(self.shrink)
         faults = [] if self.faults is None or fault else self.faults.findings()
+        course = self._course or ([] if self._shared is None else self._shared.course)
+        if course:
+            how = "found on tissue alone, of which a contact or a pulse may move all that shows"
+            moved.append(f"{describe_course(course, self.shrink)}; {how}")
         bad = [Finding("bad", "pictures", fault)] if fault else []
         return [*bad, *self.found, *between, *faults, *(Finding("odd", "camera", one) for one in moved)]
 
@@ -328,7 +341,13 @@ class VideoFlow:
             self.faults.look(picture.time_s, picture.rgb, rgb)
         if self._camera is not None:
             with self.watch.stage("camera"):
-                view = self._camera.find(rgb, picture.time_s)
+                if self._path is None:
+                    view = self._camera.find(rgb, picture.time_s)
+                elif (view := self._path.at(picture.time_s or 0.0)) is not None:
+                    last = self._course[-1][1] if self._course else None
+                    self._course.append(
+                        (picture.time_s or 0.0, view, view.distance_px(last, self.tissue.shape))
+                    )
                 rgb = rgb if view is None else view.undo(rgb)
         with self.watch.stage("mask"):
             proposal = self._mask(picture.index, rgb, view)
@@ -362,9 +381,10 @@ class VideoFlow:
         frame = FrameMotion.none(self.tissue.shape, trusted=not self._fault)
         if not self._fault:
             self._flow.begin(self.settings.backend, small.rgb, proposal, self.tissue)
-            # What all tissue shares may be its pulse, which is looked for in recordings, not in streams.
-            blocked = proposal.either | proposal.known | (self.tissue & (self._pace is None))
-            self._camera = CameraTracker(small.rgb, self.tissue, blocked)
+            self._camera = CameraTracker(small.rgb, self.tissue, proposal.either | proposal.known)
+            # What all tissue shares may be its pulse, which is looked for first.
+            if self._camera.is_blind and self._surface is None and self._path is None:
+                self._shared = SharedMotion(self.tissue)
             if self._pace is not None:
                 self._flow.submit(small.rgb, proposal).result()
             frame = replace(frame, confidence=(self.tissue & ~proposal.known).astype(np.float32))
@@ -383,8 +403,10 @@ class VideoFlow:
     def _finish(self, small: _Steadied, masking_s: float, flow: Future[FrameMotion]) -> FrameMotion:
         """The motion of a frame whose flow was submitted, in space too, and without the pulse."""
         frame = self._pictured(flow.result(), small, masking_s)
-        if small.camera is not None:
-            frame = replace(frame, confidence=doubted(frame.confidence, small.camera.deviation_px))
+        if self._shared is not None and frame.trusted and small.time_s is not None:
+            frame = self._without_camera(frame, small.time_s, self._shared)
+        if frame.camera is not None:
+            frame = replace(frame, confidence=doubted(frame.confidence, frame.camera.deviation_px))
         self._changes = self._changes or not np.array_equal(small.rgb, self._rest_rgb)
         if frame.trusted and find_fault(small.rgb, self.tissue):
             frame = replace(frame, trusted=False)
@@ -393,6 +415,18 @@ class VideoFlow:
         frame = self._in_space(frame)
         self.summary.add(frame, self.tissue)
         return self._without_pulse(self._looked_at(frame))
+
+    def _without_camera(self, frame: FrameMotion, time_s: float, shared: SharedMotion) -> FrameMotion:
+        """The same as a camera at rest had taken it, by what its tissue shares besides the pulse."""
+        began, moved = time.process_time(), frame.flow
+        if self.removed is not None:
+            moved = moved - self.removed.at(time_s)[..., :2]
+        view = shared.add(time_s, *in_cells(moved, frame.confidence * self.tissue))
+        if view is not None:
+            rgb = frame.rgb if self.second is None else view.undo(frame.rgb)
+            frame = replace(frame, flow=view.steady(frame.flow), rgb=rgb, camera=view)
+        self.watch.add("camera", time.process_time() - began, 0.0)
+        return frame
 
     def _pictured(self, frame: FrameMotion, small: _Steadied, masking_s: float) -> FrameMotion:
         frame = replace(frame, index=small.index, time_s=small.time_s, rgb=small.rgb)
