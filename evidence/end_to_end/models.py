@@ -104,10 +104,11 @@ def train_network(
     return load_model(folder)
 
 
-def read_force(predictor: Predictor, clip: Clip, source: str) -> Floats:
-    """Force (T, 3) mN that a network of vectors gives for a displacement: its map, summed."""
+def read_force(predictor: Predictor, clip: Clip, source: str, told: bool = False) -> Floats:
+    """Force (T, 3) mN that a network of vectors gives for a displacement (`told`: and membrane), summed."""
     moved = np.asarray(clip.displacement[source])
-    density = predictor.density(moved, clip.mask, clip.young_kpa, clip.sure(source))
+    membrane = clip.membrane if told else "unknown"
+    density = predictor.density(moved, clip.mask, clip.young_kpa, clip.sure(source), membrane)
     return np.asarray(density.astype(np.float64).sum(axis=(2, 3)) * predictor.grid.pitch_mm**2)
 
 

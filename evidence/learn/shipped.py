@@ -24,7 +24,6 @@ from learn.evaluation.evaluate import unseen as never_met
 from learn.inference import shipped
 from learn.inference.predict import Predictor, load_model
 from learn.training.threads import set_threads
-from synth.dataset.store import Dataset
 from synth.errors import UserError
 
 _LEVEL = 0.9
@@ -70,13 +69,12 @@ def _row(predictor: Predictor, root: Path, cache: Path | None) -> dict[str, Any]
     clips = never_met(every, predictor.card)
     if not clips:
         raise UserError(f"{root}: the model has met every sequence")
-    membrane = {
-        one.attrs["content_hash"]: bool((one.attrs.get("scenario") or {}).get("tissue", {}).get("membrane"))
-        for one in Dataset(root)
-    }
-    bare = [not membrane[clip.content_hash] for clip in clips]
-    row = {"asked": root.name, "sequences": len(clips)}
-    row |= figures(partial(models.read_force, predictor, source=source), clips, bare)
+    bare = [clip.membrane != "intact" for clip in clips]
+    row: dict[str, Any] = {"asked": root.name, "sequences": len(clips)}
+    answers = [partial(models.read_force, predictor, source=source, told=told) for told in (False, True)]
+    row |= figures(answers[0], clips, bare)
+    told = predictor.card.settings.arch.membrane
+    row["told"] = figures(answers[1], clips, bare)["whole"] if told else None
     row |= map_figures(predictor, clips, source)
     held = next(one for one in cover(predictor, clips, source) if one.level == _LEVEL).as_dict()
     for part in ("size", "x", "y", "z"):
@@ -89,8 +87,8 @@ def _told(own: Sequence[Mapping[str, Any]]) -> dict[str, str]:
     told = {}
     for row in own:
         where = f"{row['asked']}, {row['sequences']} sequences it never met"
-        parts = {"error of the force": "whole", "of its size": "force_size"}
-        said = [f"{words} {cell}" for words, key in parts.items() if (cell := percent(row[key]))]
+        parts = {"error of the force": "whole", "told of the membrane": "told", "of its size": "force_size"}
+        said = [f"{words} {percent(row[key])}" for words, key in parts.items() if row[key]]
         told[where] = "; ".join([*said, f"90% intervals hold for {percent(row['held_size'])} of frames"])
     return told
 
@@ -99,7 +97,7 @@ def page(found: Mapping[str, Any]) -> report.Page:
     """Errors, and what intervals hold, in every world."""
     errors = [
         {"model": row["model"], "asked": row["asked"], "sequences": row["sequences"]}
-        | {name: percent(row[key]) for name, key in _ERRORS.items()}
+        | {name: percent(row.get(key)) for name, key in _ERRORS.items()}
         | {"map R²": row["map_r2"], "ghosts": row["ghosts"], "gain": row["gain"], "slope": row["slope"]}
         for row in found["rows"]
     ]
@@ -129,10 +127,11 @@ def _chart(rows: Sequence[Mapping[str, Any]], title: str, key: str) -> report.Ch
 
 _CHARTS = (("Error of the force's size", "force_size"), ("Frames that a 90% interval holds", "held_size"))
 _WIDTHS = ("width_mn", "width_of_peak", "width_x_mn", "width_y_mn", "width_z_mn", "unseen", "distance")
-_ERRORS = {"whole": "whole", "across": "across", "along": "along", "size": "force_size", "bare": "bare"}
+_PARTS = ("whole", "told", "across", "along", "force_size", "bare")
+_ERRORS = {key.removeprefix("force_"): key for key in _PARTS}
 _ERRORS_ARE = (
     "Root mean square error of the force as a part of the force's own, mean over sequences with its 95% "
-    "interval; *bare*: the sequences without a membrane."
+    "interval; *told*: where the network is told whether there is a membrane; *bare*: sequences without one."
 )
 _HELD_IS = "Share of frames whose truth lies inside, mean over sequences; 90% was meant."
 
