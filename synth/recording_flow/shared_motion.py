@@ -26,8 +26,8 @@ _NOISE_PX, _CALM_PX = (
 )  # of a frame's similarity; by which a camera at rest moves from frame to frame
 _ROUNDS, _OUTLIER, _LEAST_SPREAD_PX, _MOST = 4, 4.0, 0.03, 0.7  # of a fit, as in `camera_motion`
 _MOST_SHAPES, _NEW, _NEW_PX = 4, 0.15, 0.12  # what shapes leave of a motion is another's, if so much
-_DOUBT = 0.8  # of the similarity of a shape of 1 px, as a half-space has it
-_LEFT = 2.0  # px of similarity that go with a px that no shape explains
+_DOUBT = 0.5  # of the similarity of a shape of 1 px, as a half-space has it
+_LEFT = 1.0  # px of similarity that go with a px that no shape explains
 _NODES, _POISSON, _NORMAL, _RIDGE = 8, 0.45, 0.3, 0.2  # the half-space's; insensitive, see the tests
 
 
