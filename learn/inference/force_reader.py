@@ -137,16 +137,20 @@ class ForceReader:
 
     @property
     def notes(self) -> list[str]:
-        """What its user should know of where the grid lay, once the frames are read."""
+        """What its user should know of the model and of where the grid lay, once the frames are read."""
+        deaf = self._membrane != "unknown" and not self._predictor.card.settings.arch.membrane
+        notes = (
+            ["this network takes no word of a membrane: it answers as if that were unknown"] if deaf else []
+        )
         if self.placing.fits:
-            return []
+            return notes
         wide = self._predictor.grid.extent_mm
         note = f"the tissue is wider than the network's {wide:g} mm: it looks at what moves most"
         note += f", and was moved there {self.placing.moves} times" if self.placing.moves else ""
         share = self._at_border / self._in_all if self._in_all > 0 else 0.0
         if share > _MUCH_AT_BORDER:
             note += f"; {100 * share:.0f}% of the force lies at the border of that, what is beyond is lost"
-        return [note]
+        return [*notes, note]
 
     @property
     def interval_notes(self) -> list[str]:

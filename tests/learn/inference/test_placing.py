@@ -58,6 +58,9 @@ def test_force_is_that_of_the_part_that_moves(tmp_path: Path) -> None:
     alone = ForceReader(predictor, _WIDE[cut], _MM_PER_PX, 1.0).read(part).force_mn
     assert force == pytest.approx(alone, rel=0.05, abs=0.02 * float(np.abs(alone).max()))
     middle = predictor(moved, _WIDE, _MM_PER_PX, 1.0).force_mn
+    deaf = ForceReader(predictor, _WIDE[cut], _MM_PER_PX, 1.0, "intact")
+    assert np.array_equal(deaf.read(part).force_mn, alone)
+    assert [len(one.notes) for one in (reader, deaf)] == [1, 1]
     assert middle is not None
     assert float(np.linalg.norm(middle - found.map.force_mn)) > 0.2 * float(np.linalg.norm(alone))
     assert any("wider than the network's" in note for note in reader.notes)
