@@ -18,7 +18,6 @@ _COPY = 0.03  # of the picture's own detail: two cameras' noise alone differs by
 _FROZEN = 3  # frames
 _LEAST_TOOL = 300  # px
 _BEHIND_PX = 1.0  # of disparity: what hides tissue is nearer than it
-_FOLLOWS = 0.7  # correlation of what is missing with the motion from frame to frame
 _NEAR = np.ones((25, 25), np.uint8)
 
 
@@ -26,32 +25,29 @@ class EyePairing:
     """Gathers, frame by frame, what tells."""
 
     def __init__(self) -> None:
-        self._last: tuple[Rgb, Rgb, Map] | None = None
+        self._last: tuple[Rgb, Rgb] | None = None
         self._copied, self._frozen, self._largest = True, 0, 0
         self._tool: tuple[Flags, Rgb, Rgb] | None = None
-        self._lags: list[tuple[float, float, float]] = []
+        self._lags: list[float] = []
 
     @property
     def lag(self) -> float:
         """Share of the motion that the right eye lacks, exceeded in a tenth of the frames that moved."""
-        return float(np.percentile(np.abs(self._lags), 90, axis=0)[0]) if self._lags else 0.0
+        return float(np.percentile(np.abs(self._lags), 90)) if self._lags else 0.0
 
     def add(self, left: Rgb, right: Rgb, masked: Flags, flow: Map, tissue: Flags, lag: float) -> None:
         """A frame's pictures (H, W, 3), its mask, and flow (H, W, 2) px since the rest frame, which is first.
 
         `lag`: of `StereoTracker`.
         """
-        down = flow[..., 1][tissue]
         # A flat surface may look alike to both eyes, but not in every frame.
         self._copied &= _change(left, right) < _COPY * _change(left[:, 1:], left[:, :-1])
         if self._last is not None:
-            before_left, before_right, before = self._last
+            before_left, before_right = self._last
             self._frozen += _change(right, before_right) < _SAME * _change(left, before_left)
-            if self._lags and np.isnan(self._lags[-1][2]):
-                self._lags[-1] = (*self._lags[-1][:2], _share(before, down))
             if np.percentile(np.abs(flow[tissue]), 98) > _MOVED_PX:
-                self._lags.append((lag, _share(down, before), np.nan))
-        self._last = left, right, down
+                self._lags.append(lag)
+        self._last = left, right
         tool = masked & ~mask_detection.glare(left, 3)
         if tool.sum() > max(_LEAST_TOOL, self._largest):
             self._largest, self._tool = int(tool.sum()), (tool, left, right)
@@ -64,11 +60,6 @@ class EyePairing:
             return f"stands still in {self._frozen} frames in which the left eye's picture changes"
         if self._behind_px(rectified) > _BEHIND_PX:
             return "sees the tool behind the tissue that it hides: the eyes are swapped"
-        share, *frames = np.nan_to_num(self._lags).reshape(-1, 3).T
-        if self.lag > LATE and len(share) > 3:
-            late, early = (np.corrcoef(share, np.clip(one, -2, 2))[0, 1] for one in frames)
-            if max(late, early) > _FOLLOWS:
-                return f"is about a frame {'late' if late > early else 'early'}"
         return ""
 
     def _behind_px(self, rectified: Rectified) -> float:
@@ -89,8 +80,3 @@ class EyePairing:
 def _change(one: Rgb, other: Rgb) -> float:
     """Mean difference of two pictures [grey levels]."""
     return float(cv2.absdiff(np.ascontiguousarray(one), np.ascontiguousarray(other)).mean())
-
-
-def _share(now: Map, other: Map) -> float:
-    """Share of a motion (N,) px that one of another moment lacks."""
-    return 1 - float(now @ other) / max(float(now @ now), 1e-9)

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 
 from bench.recording.eye_pairing import LATE, EyePairing
+from bench.recording.eye_timing import EyeTiming
 from bench.recording.folder import Recording
 from synth.errors import UserError
 from synth.flow import image, mask_detection
@@ -70,6 +71,7 @@ class SecondEye:
         self._shrink = 1
         self._noise: list[float] = []
         self._pairing = EyePairing()
+        self._timing: EyeTiming | None = None
         self._pair: tuple[Rgb, Rgb] | None = None  # of the frame last followed, or
         self._seen: Map | None = None  # its depth
 
@@ -85,6 +87,7 @@ class SecondEye:
         r, rest = self._stereo.rectified, self._stereo.rest
         scale = self._stereo.distance_mm / r.focal / self._shrink
         lag, fault = self._pairing.lag, self._pairing.fault(r)
+        fault = fault or ("" if self._timing is None else self._timing.fault())
         return StereoQuality(r.baseline_mm, rest.epipolar_px, scale, noise, lag, fault)
 
     def follow(self, frame: FrameMotion, video: VideoFlow) -> Moved | None:
@@ -105,6 +108,7 @@ class SecondEye:
                 hidden = _mask_right(right, video.settings.masks, masked)
                 self._stereo = self._begun(self._rig(video), frame.rgb, right, masked, hidden, tissue)
                 self._pairing.add(frame.rgb, right, masked, frame.flow, tissue, 0.0)
+                self._timing = EyeTiming(self._stereo, frame.rgb, right, tissue & ~masked)
                 inside = self._stereo.right_tissue()
                 self._camera = CameraTracker(right, inside, mask_detection.blocked(right))
                 return Moved.nothing(tissue.shape)
@@ -117,6 +121,8 @@ class SecondEye:
                 hidden |= view.outside(tissue.shape)
             moved = self._stereo.step(frame.rgb, right, masked, hidden, frame.flow, frame.confidence)
             self._pairing.add(frame.rgb, right, masked, frame.flow, tissue, self._stereo.lag)
+            if self._timing is not None:
+                self._timing.add(frame.rgb, right, frame.time_s or 0.0)
         else:
             if (depth := self._depths(frame, video)) is None:
                 return None

@@ -21,6 +21,8 @@ _PRESSED, _ALIKE = 0.3, 0.7  # share of a peak, correlation: what a unit is judg
 _SIDEWAYS = 0.2  # of the force must lie in the axes that are seen
 _LITTLE, _MUCH, _APART = 0.2, 0.7, 0.5  # cosine of what doesn't agree, of what does, and between them
 _LATE_S, _DRIFTS = 1.5, (0.9, 0.92, 0.94, 0.96, 0.98, 1.0, 1.02, 1.04, 1.06, 1.08, 1.1)
+_SURE, _LESS = 0.98, 0.3  # correlation; share of what it lacks that another clock must leave
+_LEAST_PART = 4  # frames before a gap, and after it
 _COMMON = 0.6  # share of the frames that another clock must leave
 _STANDS_FRAMES, _MOVES = 3, 0.25  # share of the largest motion
 _LEAST_FRAMES = 8
@@ -96,22 +98,34 @@ def _axes(axes: Curve, forces: Sequence[Curve], n: int) -> list[Finding]:
 
 
 def _clock(time_s: Curve, size: Curve, moved: Curve) -> list[Finding]:
-    """Whether force and motion agree much better at another clock, or backwards."""
-    start, now, frame = time_s[0], _correlation(size, moved), float(np.median(np.diff(time_s)))
-    found = {"the film runs backwards": _correlation(size, moved[::-1])}
-    for lag in np.arange(-_LATE_S, _LATE_S, frame / 2):
-        for drift in _DRIFTS:
-            at = start + (time_s - start) * drift - lag
-            inside = (at >= start) & (at <= time_s[-1])
-            if inside.sum() >= max(_COMMON * len(at), _LEAST_FRAMES):
-                said = f"the sensor's clock is moved by {lag:+.2f} s"
-                said += f" and runs {1 / drift:.2f} times as fast" if drift != 1 else ""
-                found[said] = _correlation(np.interp(at[inside], time_s, size), moved[inside])
-    best = max(found, key=lambda said: found[said])
-    if now > 1 - _LITTLE or found[best] < max(_MUCH + _LITTLE, now + _LITTLE):
-        return []
-    said = f"force and motion correlate by {now:.2f}, but by {found[best]:.2f} if {best}"
-    return [Finding("odd", "clocks", said)]
+    """Whether force and motion agree much better at another clock, from some frame on, or backwards."""
+    start, frame = time_s[0], float(np.median(np.diff(time_s)))
+    tried = [("the film runs backwards", start + time_s[-1] - time_s)]
+    most = round(2 * _LATE_S / frame)
+    lags = [k * frame / 2 for k in range(-most, most)]
+    for lag, drift in itertools.product(lags, _DRIFTS):
+        if drift == 1 and abs(lag) < frame:  # tissue that creeps is as late
+            continue
+        said = f"the sensor's clock is moved by {lag:+.2f} s"
+        said += f" and runs {1 / drift:.2f} times as fast" if drift != 1 else ""
+        tried.append((said, start + (time_s - start) * drift - lag))
+    gaps = [lag for lag in lags if abs(lag) >= frame]
+    for lag, k in itertools.product(gaps, range(_LEAST_PART, len(time_s) - _LEAST_PART)):
+        said = (
+            f"{abs(lag):.2f} s of the film are {'missing' if lag < 0 else 'shown twice'} at {time_s[k]:.2f} s"
+        )
+        tried.append((said, time_s - lag * (np.arange(len(time_s)) >= k)))
+    best, found = _LESS, ""
+    for said, at in tried:
+        inside = (at >= start) & (at <= time_s[-1])
+        if inside.sum() < max(_COMMON * len(at), _LEAST_FRAMES):
+            continue
+        now = _correlation(size[inside], moved[inside])
+        other = _correlation(np.interp(at[inside], time_s, size), moved[inside])
+        if now < _SURE and other > _MUCH + _LITTLE and (1 - other) / (1 - now) < best:
+            best = (1 - other) / (1 - now)
+            found = f"force and motion correlate by {now:.2f}, but by {other:.2f} if {said}"
+    return [Finding("odd", "clocks", found)] if found else []
 
 
 def _stands(time_s: Curve, axes: Curve, moved: Curve) -> list[Finding]:

@@ -9,12 +9,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from skimage import data
 
 from bench.methods.protocol import ForceEstimate, MethodContext
 from bench.recording import writer
 from bench.recording.check import judge_eyes
+from bench.recording.eye_timing import find_lag
 from bench.recording.folder import open_recording
 from bench.recording.second_eye import StereoQuality
 from bench.tracking.tracking import track_recording
@@ -204,3 +206,20 @@ def test_a_baseline_in_metres_is_named() -> None:
     assert found.state == "bad"
     assert "metres" in found.said
     assert "1000" in found.said
+
+
+@pytest.mark.parametrize(
+    ("order", "lag"),
+    [(lambda k: k, 0), (lambda k: np.maximum(k - 1, 0), 1), (lambda k: np.minimum(k + (k > 9), 23), -1)],
+)
+def test_a_right_eye_of_other_moments_is_found_by_its_motion(
+    order: Callable[[NDArray[np.intp]], NDArray[np.intp]], lag: int
+) -> None:
+    rng = np.random.default_rng(3)
+    level = np.sin(np.linspace(0, 2 * np.pi, 24))[:, None, None] ** 2
+    left = level * rng.normal(size=(1, 40, 2)) * 3 + rng.normal(0, 0.05, (24, 40, 2))
+    right = level[order(np.arange(24))] * left[6] + [0.1, 0] * level + rng.normal(0, 0.05, (24, 40, 2))
+    right[5:8, :9] = np.nan
+    found, since = find_lag(left, right)
+    assert found == lag
+    assert (since > 5) == (lag < 0)

@@ -71,6 +71,7 @@ SENSORS = {
     "saturated": (PRESS.clip(-9, 2.0), "odd"),
     "0.6 s late": (np.roll(PRESS, 6, axis=0), "odd"),
     "backwards": (PRESS[::-1], "odd"),
+    "0.5 s of the film missing": (np.concatenate([PRESS[:25], PRESS[20:55]]), "odd"),
 }
 
 

@@ -1,0 +1,120 @@
+"""Whether the right eye's pictures are of the left eye's moments: both see one motion, at the same time.
+
+Of rectified eyes the vertical motion is the same and the horizontal nearly: tissue that comes nearer by a
+millimetre changes the disparity by less than a tenth of what as much across moves either picture. So corners
+(Shi & Tomasi, CVPR 1994) are followed in each eye (Lucas & Kanade, IJCAI 1981, in Bouguet's pyramid), and
+the right eye's motion is held against the left eye's of other moments.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from synth.flow import image
+from synth.flow.estimator import Flags, Rgb
+from synth.flow.stereo.track import StereoTracker
+
+Motion = NDArray[np.float64]
+"""(T, P, 2) px of P points since the rest frame, the first; NaN: not followed."""
+Places = NDArray[np.float32]
+
+_CORNERS, _APART_PX, _LEAST_POINTS = 200, 5, 8
+_FLOOR, _GREY = 3.0, 32.0  # of local contrast
+_WINDOW = (13, 13)
+_STOP = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 20, 0.01)
+_BACK_PX = 0.5  # from where a corner was, once it is followed forth and back
+_MOST, _STEP, _LEAST = 3.0, 0.25, 0.5  # frames of lag
+_MOVING, _MOVED_PX = 0.4, 0.3  # share of the largest motion, of the corners that tell; less says nothing
+_BETTER = 0.75  # what another moment leaves of the difference; 0.98 and more of eyes of one moment
+_LEAST_FRAMES = 4  # before it ends
+
+
+class EyeTiming:
+    """Follows the tissue's corners in both eyes."""
+
+    def __init__(self, stereo: StereoTracker, left: Rgb, right: Rgb, usable: Flags) -> None:
+        """The rest pictures (H, W, 3); `usable`: (H, W) tissue, in the left eye."""
+        self._rectified = r = stereo.rectified
+        self._rest = [self._picture(rgb, eye) for eye, rgb in enumerate((left, right))]
+        mask = (r.flags(usable, 0) & stereo.rest.found).astype(np.uint8)
+        corners = cv2.goodFeaturesToTrack(
+            self._rest[0], _CORNERS, 0.01, _APART_PX, mask=mask, blockSize=_WINDOW[0] // 2
+        )
+        at = np.zeros((0, 2), np.float32) if corners is None else np.asarray(corners[:, 0], np.float32)
+        x, y = np.rint(at).astype(int).T
+        beside = at - np.column_stack([stereo.rest.disparity[y, x], np.zeros(len(at))])
+        self._at: list[Places] = [at, beside.astype(np.float32)]
+        self._last = list(self._at)
+        self._moved: list[list[Places]] = [[np.zeros_like(at)] for _ in range(2)]
+        self._time_s = [0.0]
+
+    def add(self, left: Rgb, right: Rgb, time_s: float) -> None:
+        """The next frame's pictures (H, W, 3)."""
+        if len(self._at[0]) < _LEAST_POINTS:
+            return
+        how = None, None, _WINDOW, 3, _STOP, cv2.OPTFLOW_USE_INITIAL_FLOW
+        for eye, rgb in enumerate((left, right)):
+            rest, now, at = self._rest[eye], self._picture(rgb, eye), self._at[eye]
+            there, good, _ = cv2.calcOpticalFlowPyrLK(rest, now, at, self._last[eye].copy(), *how)
+            back, _, _ = cv2.calcOpticalFlowPyrLK(now, rest, there, at.copy(), *how)
+            known = (np.linalg.norm(back - at, axis=1) < _BACK_PX) & (good[:, 0] > 0)
+            self._last[eye] = np.where(known[:, None], there, self._last[eye]).astype(np.float32)
+            self._moved[eye].append(np.where(known[:, None], there - at, np.nan))
+        self._time_s.append(time_s)
+
+    def fault(self) -> str:
+        """What is wrong; empty if nothing is."""
+        lag, since = find_lag(*(np.array(moved, np.float64) for moved in self._moved))
+        if not lag:
+            return ""
+        step_s = float(np.median(np.diff(self._time_s)))
+        after = f", from {self._time_s[since]:.3g} s on" if since > _LEAST_FRAMES else ""
+        return f"is about {abs(lag) * step_s:.2g} s {'late' if lag > 0 else 'early'}{after}"
+
+    def _picture(self, rgb: Rgb, eye: int) -> NDArray[np.uint8]:
+        """(H, W) local contrast, rectified."""
+        grey = cv2.GaussianBlur(self._rectified.picture(rgb @ image.GREY, eye), (0, 0), 1)
+        detail = grey - cv2.blur(grey, _WINDOW)
+        spread = np.sqrt(np.maximum(cv2.blur(detail * detail, _WINDOW), 0)) + _FLOOR
+        return np.asarray(np.clip(128 + _GREY * detail / spread, 0, 255), np.uint8)
+
+
+def find_lag(left: Motion, right: Motion) -> tuple[float, int]:
+    """By how many frames the right eye is late (below 0: early), and from which on; 0.0: not, or unknown."""
+    frames = np.arange(len(left))
+    known = np.isfinite(left + right).all(axis=2)
+    length = np.linalg.norm(np.where(np.isfinite(left + right), left, 0), axis=2)
+    length = np.where(known.mean(axis=0) > 0.5, np.percentile(length, 90, axis=0), 0)
+    if len(frames) < 2 * _LEAST_FRAMES or not len(length):
+        return 0.0, 0
+    tell = length > max(_MOVING * float(np.percentile(length, 90)), _MOVED_PX)
+    left, right = left[:, tell], right[:, tell]
+
+    def apart(lag: float) -> NDArray[np.float64]:
+        """(T,) median squared distance of the eyes' motions; NaN beyond the film."""
+        at = np.maximum(frames - lag, 0)
+        below = np.minimum(at.astype(int), len(frames) - 2)
+        share = (at - below)[:, None, None]
+        off = np.square(right - (1 - share) * left[below] - share * left[below + 1]).sum(axis=2)
+        found = np.isfinite(off).sum(axis=1) >= _LEAST_POINTS
+        return np.array(
+            [
+                np.nanmedian(one) if enough and inside else np.nan
+                for one, enough, inside in zip(off, found, at <= frames[-1], strict=True)
+            ]
+        )
+
+    best, answer, now = _BETTER, (0.0, 0), apart(0.0)
+    for lag in np.arange(-_MOST, _MOST + _STEP, _STEP):
+        other = apart(float(lag))
+        both = np.isfinite(now) & np.isfinite(other)
+        if abs(lag) < _LEAST or both.sum() < 2 * _LEAST_FRAMES or not now[both].any():
+            continue
+        for since in range(1, len(frames) - _LEAST_FRAMES):
+            mixed = np.where(frames < since, now, other)[both]
+            share = float(np.sqrt(mixed.mean() / now[both].mean()))
+            if share < best:
+                best, answer = share, (float(lag), since)
+    return answer

@@ -1,0 +1,571 @@
+"""Films spoilt in one way at a time: what becomes of the answer, and is the cause named?
+
+Silently wrong: the error, of the peak or over time, more than doubled and above a tenth of the peak, nothing
+new said, and the 90% interval misses. Also what is said of films that nothing is wrong with.
+
+Run: python -m evidence.scoring.stability films
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from fractions import Fraction
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import av
+import cv2
+import numpy as np
+import typer
+from numpy.typing import NDArray
+from ruamel.yaml import YAML
+
+from bench.methods.baselines import physical
+from bench.recording import writer
+from bench.recording.from_sequence import export_recording
+from bench.scoring.score import score
+from evidence import report
+from learn import load_model
+from learn.inference.shipped import require_model
+from synth.dataset.store import Dataset
+from synth.engine.run import render_job
+from synth.errors import UserError
+from synth.job import reader
+from synth.system.checked_file import read_picture
+
+Pictures = NDArray[np.uint8]
+_JOBS = {"opening": "mission", "edge to edge": str(Path(__file__).parents[1] / "curves/mission-bench.yaml")}
+_SCENES = (("opening", 1), ("edge to edge", 0))
+_CLEAN = 8  # films of either kind that nothing is wrong with
+_KEY = ("film", "scene")
+_SENSOR_HZ, _SENSOR_NOISE = 100.0, 0.005
+_DOUBLED, _LEAST, _COVERED = 2.0, 0.1, 0.8
+_NOTES = "unseen world|again, frozen"
+_PHYSICS = "Tikhonov near the contact"
+_PHYSICAL = {name: physical()[name] for name in (_PHYSICS, "one contact, FEM compliance")}
+
+
+@dataclass(frozen=True, eq=False)
+class Film:
+    """A recording in memory."""
+
+    rgb: Pictures
+    """(T, H, W, 3)."""
+    right: Any
+    """The same of the other eye; None: there is none."""
+    tool: NDArray[np.bool_]
+    tissue: NDArray[np.bool_]
+    time_s: NDArray[np.float64]
+    sensor: NDArray[np.float64]
+    """(N, 4) s and newtons."""
+    meta: dict[str, Any]
+    video: tuple[int, str, int] | None = None
+    """Quality (crf), format of the pixels, and their width in thirds of their height; None: PNG."""
+    white: int = 255
+    """Of masks."""
+
+
+def main(
+    work: Path,
+    out: Path = report.RESULTS / "scoring/stability",
+    seed: int = 35,
+    only: str = "",
+    foreign: Path | None = None,
+) -> None:
+    """Renders into `work`; `only`: a pattern of films; `foreign`: recordings of elsewhere, not spoilt."""
+    cv2.setNumThreads(1)
+    rows, kept = list[dict[str, Any]](), work / f"points-{report.commit()}.jsonl"
+    done = {tuple(one[k] for k in _KEY): one for one in map(json.loads, _lines(kept))}
+    for name, index in _SCENES:
+        clean = _read(_rendered(work, name, seed, 2)[index])
+        peak = 1000 * float(np.linalg.norm(clean.sensor[:, 1:], axis=1).max())
+        for eyes, film in ((1, replace(clean, right=None)), (2, clean)):
+            before: dict[str, Any] = {}
+            for what, (change, cause, needs) in FILMS.items():
+                row = done.get((what, f"{name} {index}"))
+                if row is None and eyes == needs and re.search(only, what):
+                    before = before or _scored(_written(film, work), peak)
+                    row = {"film": what, "scene": f"{name} {index}", "eyes": eyes}
+                    row |= _judged(_scored(_written(change(film), work), peak), before, cause)
+                    with kept.open("a") as file:
+                        print(json.dumps(row), file=file)
+                rows += [] if row is None or eyes != needs else [row]
+    found: dict[str, Any] = {"seed": seed, "films": _summary(rows), "undegraded": [], "points": rows}
+    if not only:
+        found["undegraded"] = list(_alarms(work, seed + 1000, foreign))
+    report.save(out, "stability.json", found, page(found))
+    report.show({key: found[key] for key in ("films", "undegraded")})
+
+
+def _lines(path: Path) -> list[str]:
+    """Of what was found before on the same commit; a run that ended is continued."""
+    return path.read_text("utf-8").splitlines() if path.exists() else []
+
+
+def _rendered(work: Path, name: str, seed: int, count: int) -> list[Path]:
+    """Recordings of both eyes, 24 frames in 3 s."""
+    data, folders = work / f"{name} {seed}", [work / f"{name} {seed} {k}" for k in range(count)]
+    if not folders[-1].is_dir():
+        changed = {"seed": seed, "sequences": count, "frames": 24, "fps": 8.0}
+        render_job(reader.load_job(_JOBS[name]).model_copy(update=changed), data, workers=1)
+        for sequence, folder in zip(Dataset(data), folders, strict=True):
+            export_recording(sequence, folder)
+    return folders
+
+
+def _read(folder: Path) -> Film:
+    """A recording of `export_recording`; its sensor is sampled more often, with noise, free at first."""
+
+    def pictures(name: str) -> Pictures:
+        return np.stack(
+            [read_picture(p, cv2.IMREAD_COLOR)[..., ::-1] for p in sorted((folder / name).glob("*.png"))]
+        )
+
+    rgb, meta = pictures("frames"), YAML(typ="safe").load((folder / "meta.yaml").read_text("utf-8"))
+    tool = np.zeros(rgb.shape[:3], bool)
+    for path in (folder / "masks").glob("*.png"):
+        tool[int(path.stem)] = np.asarray(read_picture(path, 0), np.uint8) > 127
+    time_s = np.loadtxt(folder / "frames.csv", delimiter=",", skiprows=1)[:, 1]
+    force = np.loadtxt(folder / "force.csv", delimiter=",", skiprows=1)
+    clock = np.arange(0, time_s[-1] + 0.5, 1 / _SENSOR_HZ)
+    values = np.stack([np.interp(clock, force[:, 0], f) for f in force[:, 1:].T], axis=1)
+    size = np.linalg.norm(force[:, 1:], axis=1)
+    values += _SENSOR_NOISE * size.max() * np.random.default_rng(0).normal(size=values.shape)
+    free = float(force[np.flatnonzero(size > 0)[0] - 1, 0])
+    meta["sensor"]["free_s"] = [[0.0, max(free, 0.1)]]
+    tissue, sensor = (
+        np.asarray(read_picture(folder / "tissue.png", 0), np.uint8) > 127,
+        np.column_stack([clock, values]),
+    )
+    meta["pair"] = (folder / "stereo.yaml").read_text("utf-8")
+    return Film(rgb, pictures("right"), tool, tissue, time_s, sensor, meta)
+
+
+def _written(film: Film, work: Path) -> Path:
+    """A film as a recording, in place of the one before."""
+    folder = work / "spoilt"
+    shutil.rmtree(folder, ignore_errors=True)
+    meta = {key: value for key, value in film.meta.items() if key != "pair"}
+    for name, eye in (("video", film.rgb), ("right", film.right)):
+        if eye is not None and film.video:
+            folder.mkdir(exist_ok=True)
+            _encode(folder / f"{name}.mp4", eye, film.time_s, *film.video)
+        elif eye is not None:
+            part = folder / {"video": "frames"}.get(name, name)
+            part.mkdir(parents=True)
+            for k, rgb in enumerate(eye):
+                cv2.imwrite(str(part / f"{k:06d}.png"), np.ascontiguousarray(rgb[..., ::-1]))
+    (folder / "masks").mkdir()
+    for k, tool in enumerate(film.tool):
+        if tool.any():
+            cv2.imwrite(str(folder / f"masks/{k:06d}.png"), tool.astype(np.uint8) * film.white)
+    cv2.imwrite(str(folder / "tissue.png"), film.tissue.astype(np.uint8) * 255)
+    writer.write_force(folder, film.sensor[:, 0], film.sensor[:, 1:])
+    writer.write_frames(folder, film.time_s)
+    if film.right is None:
+        meta.pop("stereo", None)
+    else:
+        (folder / "stereo.yaml").write_text(film.meta["pair"], "utf-8")
+    writer.write_meta(folder, meta)
+    return folder
+
+
+def _encode(
+    path: Path, film: Pictures, time_s: NDArray[np.float64], crf: int, pixels: str, wide: int
+) -> None:
+    """H.264; `wide`: of the pixels, in thirds of their height."""
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx264", rate=8, options={"crf": str(crf), "threads": "1"})
+        stream.height, stream.width, stream.pix_fmt = *film.shape[1:3], pixels
+        stream.codec_context.sample_aspect_ratio = Fraction(wide, 3)
+        for rgb in film:
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(np.ascontiguousarray(rgb), "rgb24")))
+        container.mux(stream.encode())
+
+
+@cache
+def _model(two_eyes: bool) -> Any:
+    return load_model(require_model(two_eyes), quick=True)
+
+
+def _scored(folder: Path, peak_mn: float) -> dict[str, Any]:
+    """Errors over the undegraded film's peak, how often the interval holds, and what is said."""
+    try:
+        result = score(folder, _model((folder / "stereo.yaml").exists()), methods=_PHYSICAL, baselines=False)
+    except UserError as error:
+        return {"error": None, "over_time": None, "physics": None, "held": None, "said": [str(error)]}
+    said = [f"{one.what}: {one.said}" for one in result.findings]
+    said += [note for note in result.notes if re.search(_NOTES, note)]
+    sensor, scored, row = np.asarray(result.sensor_mn), result.scored, dict[str, Any]()
+    for key, name in (("physics", _PHYSICS), ("error", result.main)):
+        found = result.methods[name].size_mn
+        known = scored & np.isfinite(found) & np.isfinite(sensor)
+        row[key] = row["over_time"] = None
+        if known.sum() > 1:
+            row[key] = abs(float(found[known].max() - sensor[known].max())) / peak_mn
+            row["over_time"] = float(np.abs(found - sensor)[known].mean()) / peak_mn
+    main = result.methods[result.main]
+    if main.low_mn is None or main.high_mn is None or row["error"] is None:
+        return {**row, "held": None, "said": said}
+    touched = known & (np.maximum(found, sensor) > _LEAST * peak_mn) & np.isfinite(main.low_mn)
+    inside = (sensor >= main.low_mn) & (sensor <= main.high_mn)
+    return {**row, "held": float(inside[touched].mean()) if touched.any() else None, "said": said}
+
+
+def _judged(after: dict[str, Any], before: dict[str, Any], cause: str) -> dict[str, Any]:
+    """A film against itself before it was spoilt; `cause`: a pattern of what names it, empty: need not be."""
+    known = {re.sub(r"[\d.,]+", "", one) for one in before["said"]}
+    new = [one for one in after["said"] if re.sub(r"[\d.,]+", "", one) not in known]
+    worse = any(
+        after[key] is not None and after[key] > max(_DOUBLED * (before[key] or 0.0), _LEAST)
+        for key in ("error", "over_time")
+    )
+    missed = after["held"] is None or after["held"] < _COVERED
+    row = {"before": before["error"], **after, "said": new, "worse": worse}
+    row["named"] = any(re.search(cause, one) for one in new) if cause else None
+    return {**row, "silently_wrong": worse and missed and not new}
+
+
+def _summary(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """A line for each way."""
+    lines = []
+    for film in dict.fromkeys(row["film"] for row in rows):
+        own = [row for row in rows if row["film"] == film]
+        named = [row["named"] for row in own if row["named"] is not None]
+        errors = {
+            key: [row[key] for row in own if row[key] is not None] for key in ("before", "error", "physics")
+        }
+        lines.append(
+            {"film": film, "eyes": own[0]["eyes"]}
+            | {key: f"{100 * np.median(e):.0f}%" if e else "none" for key, e in errors.items()}
+            | {
+                "worse": f"{sum(row['worse'] for row in own)} of {len(own)}",
+                "interval holds": f"{sum((row['held'] or 0) >= _COVERED for row in own)} of {len(own)}",
+                "named": f"{sum(named)} of {len(named)}" if named else None,
+                "silently wrong": sum(row["silently_wrong"] for row in own),
+                "said": max(
+                    (one for row in own for one in row["said"]),
+                    key=lambda s: bool(re.search(FILMS[film][1] or "$^", s)),
+                    default="",
+                )[:90],
+            }
+        )
+    return lines
+
+
+def _alarms(work: Path, seed: int, foreign: Path | None) -> Iterator[dict[str, Any]]:
+    """What is said of films as they are, which nothing here was tuned on."""
+    sets = {name: _rendered(work, name, seed, _CLEAN) for name in _JOBS}
+    if foreign:
+        sets["elsewhere"] = sorted(path.parent for path in foreign.glob("*/meta.yaml"))
+    for name, folders in sets.items():
+        said = Counter[str]()
+        for folder in folders:
+            where = _written(_read(folder), work) if name in _JOBS else folder
+            said.update({one.split(":")[0] for one in _scored(where, 1.0)["said"]} or {"nothing"})
+        yield {
+            "films": name,
+            "count": len(folders),
+            "said of": ", ".join(f"{k}: {n}" for k, n in said.items()),
+        }
+
+
+def page(found: dict[str, Any]) -> report.Page:
+    """Draws `stability.json`."""
+    words = [
+        "Four scenes, two with tissue from edge to edge. Errors are of the peak, in the median; physics is "
+        f"{_PHYSICS.lower()}. *Worse*: more than doubled and above a tenth of the peak, there or over time."
+    ]
+    sections = [
+        report.Section("Spoilt", found["films"]),
+        report.Section(
+            "Nothing wrong", found["undegraded"], ["Films of which something is said, by what of."]
+        ),
+    ]
+    return report.Page("Scoring: films that go wrong", found, (), sections, words)
+
+
+def _each(change: Callable[[Pictures, int], Pictures]) -> Callable[[Film], Film]:
+    """A change of each picture (H, W, 3) of the left eye, given its number."""
+    return lambda film: replace(film, rgb=np.stack([change(rgb, k) for k, rgb in enumerate(film.rgb)]))
+
+
+def _grey(change: Callable[[NDArray[np.float32], int], Any]) -> Callable[[Film], Film]:
+    """The same on floats, brought back to bytes."""
+    return _each(lambda rgb, k: np.clip(change(rgb.astype(np.float32), k), 0, 255).astype(np.uint8))
+
+
+def _moved(scale: float = 1.0, turn_deg: float = 0.0, shift: float = 0.0) -> Callable[[Film], Film]:
+    """The camera from the middle of the film on."""
+
+    def one(rgb: Pictures, k: int, count: int) -> Pictures:
+        matrix = cv2.getRotationMatrix2D((rgb.shape[1] / 2, rgb.shape[0] / 2), turn_deg, scale)
+        matrix[:, 2] += np.array([0.8, 0.6]) * shift
+        return rgb if k < count // 2 else _warped(rgb, matrix)
+
+    return lambda film: _each(lambda rgb, k: one(rgb, k, len(film.rgb)))(film)
+
+
+def _warped(rgb: Pictures, matrix: Any) -> Pictures:
+    how = {"flags": cv2.INTER_CUBIC, "borderMode": cv2.BORDER_REFLECT}
+    return np.asarray(cv2.warpAffine(rgb, matrix, rgb.shape[1::-1], **how), np.uint8)
+
+
+def _swayed(film: Film) -> Film:
+    """Nothing is touched."""
+    still = np.clip(film.rgb[:1] + np.random.default_rng(1).normal(0, 1.5, film.rgb.shape), 0, 255).astype(
+        np.uint8
+    )
+    sway = _each(
+        lambda rgb, k: _warped(rgb, np.array([[1, 0, 5 * np.sin(k / 3)], [0, 1, 2 * np.sin(k / 2)]]))
+    )
+    sensor = film.sensor.copy()
+    sensor[:, 1:] -= _smooth(sensor[:, 1:])
+    return sway(replace(film, rgb=still, sensor=sensor, tool=film.tool & False))
+
+
+def _smooth(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.asarray(cv2.GaussianBlur(values, (1, 15), 0), np.float64)
+
+
+def _rippled(rgb: Pictures, k: int) -> Pictures:
+    y, x = np.mgrid[: rgb.shape[0], : rgb.shape[1]].astype(np.float32)
+    wave = (k > 2) * np.sin(y / 6 - 1.3 * k)
+    return np.asarray(
+        cv2.remap(rgb, x + wave, y + wave, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT), np.uint8
+    )
+
+
+def _order(of: Callable[[NDArray[np.intp]], Any], right: bool = False) -> Callable[[Film], Film]:
+    """Other pictures in these places, those of one eye; the tool's masks go with the left."""
+
+    def change(film: Film) -> Film:
+        order = np.asarray(of(np.arange(len(film.rgb))))
+        if right:
+            assert film.right is not None
+            return replace(film, right=film.right[order])
+        n = len(order)
+        return replace(film, rgb=film.rgb[order], tool=film.tool[order], time_s=film.time_s[:n])
+
+    return change
+
+
+def _hand(film: Film) -> Film:
+    """A finger of a glove, from the right, from the middle of the film on."""
+    rng, (height, width) = np.random.default_rng(2), film.rgb.shape[1:3]
+    weave = cv2.GaussianBlur(rng.normal(0, 60, (height, width, 1)).astype(np.float32), (0, 0), 2)[..., None]
+
+    def one(rgb: NDArray[np.float32], k: int) -> Any:
+        into = min(max(k - len(film.rgb) // 3, 0) / 5, 1) * 0.45 * width
+        mask = np.zeros((height, width), np.uint8)
+        cv2.ellipse(
+            mask, (int(width * 1.1 - into), height // 2), (width // 5, height // 6), 0, 0, 360, 255, -1
+        )
+        return np.where(mask[..., None] > 0, np.array([222, 202, 180]) + weave, rgb)
+
+    return _grey(one)(film)
+
+
+def _still(
+    colour: tuple[int, int, int], points: list[tuple[float, float]], noise: float
+) -> Callable[[Film], Film]:
+    """Something of a colour that lies there in all frames."""
+
+    def one(rgb: NDArray[np.float32], k: int) -> Any:
+        mask = np.zeros(rgb.shape[:2], np.uint8)
+        cv2.fillPoly(mask, [np.int32(np.array(points) * rgb.shape[1::-1])], 255)
+        weave = np.random.default_rng(3).normal(0, noise, rgb.shape[:2])[..., None]
+        return np.where(mask[..., None] > 0, np.array(colour) + weave, rgb)
+
+    return _grey(one)
+
+
+def _text(rgb: Pictures, k: int) -> Pictures:
+    return np.asarray(cv2.putText(rgb.copy(), f"12:30:{k:02d}", (6, 16), 0, 0.5, (255, 255, 255)), np.uint8)
+
+
+def _jpeg(quality: int) -> Callable[[Film], Film]:
+    how = [cv2.IMWRITE_JPEG_QUALITY, quality]
+    return _each(lambda rgb, k: np.asarray(cv2.imdecode(cv2.imencode(".jpg", rgb, how)[1], 1), np.uint8))
+
+
+def _squeezed(film: Film, video: tuple[int, str, int] | None) -> Film:
+    """Fewer columns than square pixels would have; only a video says so."""
+    small = np.stack([cv2.resize(rgb, None, fx=0.75, fy=1, interpolation=cv2.INTER_AREA) for rgb in film.rgb])
+    if video:
+        return replace(film, rgb=small, video=video)
+    columns = np.linspace(0, film.tissue.shape[1] - 1, small.shape[2]).astype(int)
+    return replace(film, rgb=small, tissue=film.tissue[:, columns], tool=film.tool[..., columns])
+
+
+def _boxed(rgb: Pictures, k: int) -> Pictures:
+    bar = rgb.shape[0] // 8
+    inner = cv2.resize(rgb, (rgb.shape[1], rgb.shape[0] - 2 * bar), interpolation=cv2.INTER_AREA)
+    return np.asarray(
+        cv2.copyMakeBorder(inner, bar, bar, 0, 0, cv2.BORDER_CONSTANT, value=(16, 16, 16)), np.uint8
+    )
+
+
+def _combed(film: Film) -> Film:
+    rgb = film.rgb.copy()
+    rgb[:-1, 1::2] = film.rgb[1:, 1::2]
+    return replace(film, rgb=rgb)
+
+
+def _said(**changes: Any) -> Callable[[Film], Film]:
+    """Other things in meta.yaml; a float multiplies what is there."""
+
+    def change(film: Film) -> Film:
+        new = {k: film.meta[k] * v if isinstance(v, float) else v for k, v in changes.items()}
+        return replace(film, meta={**film.meta, **new})
+
+    return change
+
+
+def _sensor(of: Callable[[NDArray[np.float64], NDArray[np.float64]], Any]) -> Callable[[Film], Film]:
+    """Another sensor, made of its times (N,) and forces (N, 3)."""
+
+    def change(film: Film) -> Film:
+        time_s, force = film.sensor[:, 0], film.sensor[:, 1:]
+        made = of(time_s, force)
+        return replace(film, sensor=np.column_stack(made if isinstance(made, tuple) else (time_s, made)))
+
+    return change
+
+
+def _clipped(time_s: NDArray[np.float64], force: NDArray[np.float64]) -> Any:
+    most = 0.4 * np.abs(force).max()
+    return np.clip(force, -most, most)
+
+
+def _stuck(time_s: NDArray[np.float64], force: NDArray[np.float64]) -> Any:
+    peak = int(np.linalg.norm(force, axis=1).argmax())
+    return np.where((np.arange(len(force)) < peak)[:, None], force, force[peak])
+
+
+def _rest_at_peak(film: Film) -> Film:
+    at = film.sensor[np.linalg.norm(film.sensor[:, 1:], axis=1).argmax(), 0]
+    return replace(film, meta={**film.meta, "rest_frame": int(np.abs(film.time_s - at).argmin())})
+
+
+def _right(of: Callable[[Film], Any]) -> Callable[[Film], Film]:
+    return lambda film: replace(film, right=np.ascontiguousarray(of(film)))
+
+
+def _doubled(film: Film) -> Film:
+    twice = np.repeat(np.arange(len(film.rgb)), 2)
+    time_s = np.arange(len(twice)) * (film.time_s[1] - film.time_s[0]) / 2
+    return replace(film, rgb=film.rgb[twice], tool=film.tool[twice], time_s=time_s)
+
+
+_NOISE = np.random.default_rng(4)
+_UNSEEN, _AGAIN = "unseen world", "again"
+_MISSING = r"^pictures: .*missing|^clocks|^times"
+_LATE = "^second eye: .*(late|early|another moment)"
+# How it is made, what names its cause (a pattern; none: the answer is to hold), and eyes.
+FILMS: dict[str, tuple[Callable[[Film], Film], str, int]] = {
+    "camera bumped by 5 px": (_moved(shift=5.0), "^camera", 1),
+    "camera sways, nothing touched": (_swayed, "^camera", 1),
+    "zoom by 3%": (_moved(scale=1.03), "^camera", 1),
+    "rotation by 2 deg": (_moved(turn_deg=2.0), "^camera", 1),
+    "ripples of 1 px": (_each(_rippled), f"moves unlike|{_UNSEEN}", 1),
+    "rest frame at the peak": (_rest_at_peak, "^rest frame", 1),
+    "frozen for 5 frames": (_order(lambda k: np.where((k > 7) & (k < 13), 8, k)), _AGAIN, 1),
+    "4 frames dropped": (_order(lambda k: k[(k < 8) | (k > 11)]), _MISSING, 1),
+    "4 frames late": (_order(lambda k: np.maximum(k - 4, 0)), f"{_MISSING}|{_AGAIN}", 1),
+    "a hand comes into view": (_hand, "^foreground", 1),
+    "interlaced": (_combed, "interlaced", 1),
+    "pixels 4:3, said": (lambda film: _squeezed(film, (12, "yuv420p", 4)), "", 1),
+    "pixels 4:3, not said": (lambda film: _squeezed(film, None), "(?i)pixels", 1),
+    "letterbox": (_each(_boxed), "bars", 1),
+    "H.264 at crf 51": (
+        lambda film: replace(film, video=(51, "yuv420p", 3)),
+        "^pictures: .*(detail|compressed)",
+        1,
+    ),
+    "JPEG at quality 3": (_jpeg(3), "^pictures: .*(detail|compressed)", 1),
+    "noise of 30 levels": (_grey(lambda rgb, k: rgb + _NOISE.normal(0, 30, rgb.shape)), "noisy", 1),
+    "dark": (_grey(lambda rgb, k: 0.2 * rgb + _NOISE.normal(0, 1, rgb.shape)), "dim", 1),
+    "blur of 3 px": (_each(lambda rgb, k: cv2.GaussianBlur(rgb, (0, 0), 3)), "detail", 1),
+    "focus lost later": (
+        _each(lambda rgb, k: cv2.GaussianBlur(rgb, (0, 0), 3) if k > 8 else rgb),
+        "sharp",
+        1,
+    ),
+    "scale 1.5 times too large": (_said(scale_mm_per_px=1.5), "^scale", 1),
+    "scale in cm": (_said(scale_mm_per_px=0.1), "^scale", 1),
+    "scale in um": (_said(scale_mm_per_px=1000.0), "^scale", 1),
+    "scale in m": (_said(scale_mm_per_px=0.001), "^scale", 1),
+    "scale in px": (_said(scale_mm_per_px=1), "^scale", 1),
+    "E in Pa": (_said(young_kpa=1000.0), "^stiffness", 1),
+    "E in MPa": (_said(young_kpa=0.001), "^stiffness", 1),
+    "tissue.png inverted": (lambda film: replace(film, tissue=~film.tissue), "^tissue|marks no tissue", 1),
+    "sensor: grams": (_sensor(lambda t, f: f * 1000 / 9.81), "^sensor|in newtons|in mN", 1),
+    "sensor: mN": (_sensor(lambda t, f: f * 1000), "^sensor|in newtons|in mN", 1),
+    "sensor: sign": (_sensor(lambda t, f: -f), "^sensor", 1),
+    "sensor: axes": (_sensor(lambda t, f: f[:, [1, 2, 0]]), "^sensor", 1),
+    "sensor: saturated": (_sensor(_clipped), "^sensor", 1),
+    "sensor: stuck": (_sensor(_stuck), "^sensor", 1),
+    "sensor: clock 8% fast": (_sensor(lambda t, f: (t * 1.08, f)), "^clocks", 1),
+    "sensor: clock 0.6 s off": (_sensor(lambda t, f: (t - 0.6, f)), "^clocks", 1),
+    "film backwards": (_order(lambda k: k[::-1]), "^clocks", 1),
+    "every frame twice": (_doubled, _AGAIN, 1),
+    "masks of 0 and 1": (lambda film: replace(film, white=1), "", 1),
+    "exposure 0.4 to 1.6": (_grey(lambda rgb, k: rgb * (0.4 + 1.2 * k / 23)), "", 1),
+    "white balance": (_grey(lambda rgb, k: rgb * np.array([1.2, 1, 0.7])), "", 1),
+    "text burnt in": (_each(_text), "", 1),
+    "black tool at rest": (
+        _still((15, 15, 17), [(0, 0.75), (0, 0.83), (0.35, 0.66), (0.34, 0.61)], 3),
+        "",
+        1,
+    ),
+    "gauze at rest": (
+        _still((225, 220, 212), [(0.02, 0.1), (0.2, 0.05), (0.22, 0.3), (0.03, 0.32)], 15),
+        "",
+        1,
+    ),
+    "blood pool": (_still((95, 10, 14), [(0.7, 0.75), (0.85, 0.7), (0.92, 0.85), (0.75, 0.92)], 2), "", 1),
+    "mirrored": (lambda film: _turned(film, np.s_[..., ::-1]), "", 1),
+    "turned by 180 deg": (lambda film: _turned(film, np.s_[..., ::-1, ::-1]), "", 1),
+    "negative": (_each(lambda rgb, k: 255 - rgb), "", 1),
+    "grey": (_each(lambda rgb, k: rgb @ np.full((3, 3), 1 / 3)), "", 1),
+    "BGR": (_each(lambda rgb, k: rgb[..., ::-1]), "", 1),
+    "10 bits": (lambda film: replace(film, video=(12, "yuv420p10le", 3)), "", 1),
+    "JPEG at quality 10": (_jpeg(10), "", 1),
+    "flicker": (_grey(lambda rgb, k: rgb * (1 + 0.15 * (-1) ** k)), "", 1),
+    "right eye a frame late": (_order(lambda k: np.maximum(k - 1, 0), True), _LATE, 2),
+    "right eye lost a frame": (_order(lambda k: np.minimum(k + (k > 6), len(k) - 1), True), _LATE, 2),
+    "right eye frozen": (_order(lambda k: np.minimum(k, 6), True), "^second eye", 2),
+    "right eye mirrored": (_right(lambda film: film.right[:, :, ::-1]), "mirrored", 2),
+    "right eye 4 rows down": (_right(lambda film: np.roll(film.right, 4, axis=1)), "rows", 2),
+    "eyes swapped": (lambda film: replace(film, rgb=film.right, right=film.rgb), "swapped", 2),
+    "right eye a copy of the left": (_right(lambda film: film.rgb), "left eye's own", 2),
+    "baseline 2 times too long": (
+        _said(stereo={"calibration": "stereo.yaml", "mm_per_unit": 2}),
+        "^scale",
+        2,
+    ),
+    "scale 1.5 times too large, two eyes": (_said(scale_mm_per_px=1.5), "^scale", 2),
+    "bumped by 5 px, two eyes": (lambda film: _both(film, _moved(shift=5.0)), "^camera", 2),
+}
+
+
+def _turned(film: Film, how: Any) -> Film:
+    turn = np.s_[..., how[-1], :] if len(how) == 2 else np.s_[..., how[-2], how[-1], :]
+    return replace(film, rgb=film.rgb[turn], tool=film.tool[how], tissue=film.tissue[how])
+
+
+def _both(film: Film, change: Callable[[Film], Film]) -> Film:
+    """The same of either eye."""
+    assert film.right is not None
+    return replace(change(film), right=change(replace(film, rgb=film.right)).rgb)
+
+
+if __name__ == "__main__":
+    typer.run(main)
