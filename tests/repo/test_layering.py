@@ -58,6 +58,7 @@ ORDER = (
     "bench.sensor",
     "bench.methods",
     "bench.tracking",
+    "bench.adaptation",
     "bench.scoring",
     "bench.cli",
     "bench.__main__",
