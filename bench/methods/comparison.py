@@ -6,6 +6,7 @@ from pathlib import Path
 
 from bench.methods import baselines, plugins
 from bench.methods.baseline_cache import cached_rules
+from bench.methods.physics import Physics
 from bench.methods.protocol import Method
 from learn.checkpoint import read_card
 from learn.data.clips import read_clip
@@ -16,18 +17,26 @@ MAIN = "D2FNet"
 """Name under which the given model stands in every table."""
 
 
-def simpler_methods(train: Path | None, model: Path | None, two_eyes: bool = False) -> dict[str, Method]:
-    """Those that need no data, those of installed packages, and, given the training data, the fitted ones.
+PHYSICS = "physics"
 
-    These are fitted on the model's own fit sequences, once for a model; for a recording with a second eye on
+
+def untrained() -> dict[str, Method]:
+    """Those that need no training data."""
+    return {PHYSICS: Physics(), "zero": baselines.Baseline(baselines.nothing)}
+
+
+def simpler_methods(train: Path | None, model: Path | None, two_eyes: bool = False) -> dict[str, Method]:
+    """Those that need no data, those of installed packages, and, given the training data, ridge.
+
+    Ridge is fitted on the model's own fit sequences, once for a model; for a recording with a second eye on
     motion in three dimensions, if the data have it.
 
     Raises:
         UserError: none of the model's sequences is in `train`, or a plug-in takes a name of ours.
     """
-    methods = baselines.physical()
+    methods = untrained()
     others = plugins.installed()
-    if taken := {MAIN, *methods, *baselines.FITTED} & set(others):
+    if taken := {MAIN, *methods, baselines.RIDGE} & set(others):
         raise UserError(f"method {min(taken)}: a plug-in's name is taken by one of ours; rename it")
     methods |= others
     if train is None or model is None:

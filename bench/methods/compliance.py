@@ -1,24 +1,34 @@
-"""What unit loads on the surface do to what a camera sees: the linear map that the inverse baselines invert.
+"""What unit loads on the surface do to what a camera sees: the linear map that physics inverts.
 
 Built from `synth.fem` on a procedural block seen straight from above, with a mesh of its own. A recording
-doesn't tell the pose of the camera or the shape of the brain, so neither does the map know them.
+doesn't tell the pose of the camera or the shape of the brain, so neither does the map know them. What it may
+tell of the tissue (`TissueKind`) is a small grid of maps, kept on disk once they are built.
 """
 
 from __future__ import annotations
 
+import contextlib
+import hashlib
+import io
 from dataclasses import dataclass
 from functools import lru_cache
+from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import Delaunay
 
+from synth.dataset import provenance
 from synth.fem import surface_embedding
+from synth.fem.membrane import MembraneSheet
 from synth.fem.mesh import tetrahedra
 from synth.fem.mesh.tetrahedra import Tets
 from synth.fem.surface_embedding import Embedding
 from synth.fem.system import System, assemble
 from synth.job import schema
+from synth.system import cache
+from synth.system.checked_file import write_whole
 
 Floats = NDArray[np.float64]
 
@@ -27,7 +37,25 @@ TO_CAMERA = np.diag([1.0, -1.0, -1.0])
 
 # A recording doesn't tell the brain's shape: the default job's.
 _ANATOMY = schema.AnatomySection()
-_AT_ONCE = 32
+OPENING_MM = _ANATOMY.craniotomy.radius_mm
+_OPEN = schema.AnatomySection(craniotomy=schema.CraniotomySection(radius_mm=40.0))
+_AT_ONCE, _MOST = 32, 64
+_STRETCH = 1.02
+"""Of a membrane at rest, amid what jobs draw; a linear sheet doesn't feel it."""
+
+
+Edge = Literal["bonded", "slipping", "free"]
+
+
+@dataclass(frozen=True)
+class TissueKind:
+    """What the displacement under a load depends on, but for E."""
+
+    edge: Edge = "bonded"
+    """How the skull holds the tissue round the opening; `free`: there is none."""
+    membrane: float = 0.0
+    """Thickness times Young's modulus of the membrane over E of the tissue [mm]; 0: none."""
+    poisson: float = 0.4
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,10 +81,18 @@ class ElasticBlock:
     system: System
 
     @classmethod
-    def build(cls, tets: int) -> ElasticBlock:
-        """A linear block of about that many second-order tetrahedra, with Poisson's ratio 0.4."""
-        volume = tetrahedra.block(_ANATOMY, tets)
-        return cls(volume, assemble(volume, "linear", 0.4))
+    def build(cls, tets: int, tissue: TissueKind | None = None) -> ElasticBlock:
+        """A linear block of about that many second-order tetrahedra."""
+        tissue = tissue or TissueKind()
+        free = tissue.edge == "free"
+        volume = tetrahedra.block(
+            _OPEN if free else _ANATOMY,
+            tets,
+            [(0.0, 0.0, OPENING_MM)] if free else (),
+            slips=tissue.edge == "slipping",
+        )
+        sheet = MembraneSheet(tissue.membrane, _STRETCH) if tissue.membrane else None
+        return cls(volume, assemble(volume, "linear", tissue.poisson, sheet))
 
     def embed(self, xy: Floats) -> Embedding:
         """How surface points (P, 2), camera x, y [mm], ride on the volume."""
@@ -70,29 +106,57 @@ def picture(embedding: Embedding, moved: Floats, components: int = 2) -> Floats:
     return np.asarray(np.einsum("ab,pb...->pa...", TO_CAMERA[:components], embedding.move(moved)), np.float64)
 
 
-@lru_cache(maxsize=4)
-def build(point_mm: float = 1.0, node_mm: float = 1.2, tets: int = 3000, components: int = 2) -> Compliance:
-    """Solves one linear problem a node and axis, on one factorisation.
+def build(
+    point_mm: float = 1.0,
+    node_mm: float = 1.2,
+    tets: int = 3000,
+    components: int = 2,
+    tissue: TissueKind | None = None,
+) -> Compliance:
+    """Solves one linear problem a node and axis, on one factorisation (4 CPU-s), or reads what was solved.
 
     Args:
         point_mm: spacing of the points, which reach to the opening's edge.
         node_mm: spacing of the nodes, which stay as far inside it.
         tets: of the map's own mesh, second order.
         components: of the displacement that is seen: 2 by one eye, 3 by two.
+        tissue: of E = 1 kPa; None: bare, bonded to the skull, Poisson's ratio 0.4.
     """
-    block = ElasticBlock.build(tets)
-    radius_mm = _ANATOMY.craniotomy.radius_mm
-    points, nodes = _disc(point_mm, radius_mm), _disc(node_mm, radius_mm - node_mm)
+    points, nodes = _disc(point_mm, OPENING_MM), _disc(node_mm, OPENING_MM - node_mm)
+    matrix = _stored(tissue or TissueKind(), tets, point_mm, node_mm)[: components * len(points)]
+    flat = np.column_stack([nodes, np.zeros(len(nodes))])
+    area = surface_embedding.vertex_area(flat, Delaunay(nodes).simplices)
+    return Compliance(matrix.astype(np.float64), points, nodes, area)
+
+
+@lru_cache(maxsize=4)
+def _stored(tissue: TissueKind, tets: int, point_mm: float, node_mm: float) -> NDArray[np.float32]:
+    """(3 P, 3 K) from this user's cache, or solved and kept there."""
+    code = provenance.source("synth/fem", "synth/job").encode() + Path(__file__).read_bytes()
+    key = code + f"{tissue} {tets} {point_mm} {node_mm}".encode()
+    file = cache.folder("compliance") / f"{hashlib.sha256(key).hexdigest()[:32]}.npy"
+    with contextlib.suppress(OSError, ValueError, EOFError):
+        return np.asarray(np.load(file, allow_pickle=False), np.float32)
+    matrix = _solved(tissue, tets, point_mm, node_mm).astype(np.float32)
+    with contextlib.suppress(OSError):
+        np.save(held := io.BytesIO(), matrix)
+        write_whole(file, held.getvalue(), durable=False)
+        for old in sorted(file.parent.glob("*.npy"), key=lambda one: one.stat().st_mtime)[:-_MOST]:
+            old.unlink()
+    return matrix
+
+
+def _solved(tissue: TissueKind, tets: int, point_mm: float, node_mm: float) -> Floats:
+    block = ElasticBlock.build(tets, tissue)
+    points, nodes = _disc(point_mm, OPENING_MM), _disc(node_mm, OPENING_MM - node_mm)
     seen, held = block.embed(points), block.embed(nodes)
-    columns = np.empty((len(nodes), 3, components, len(points)))
+    columns = np.empty((len(nodes), 3, 3, len(points)))
     for some in np.array_split(np.arange(len(nodes)), max(1, len(nodes) // _AT_ONCE)):
         for axis in range(3):
             unit = np.einsum("kl,a->kal", np.eye(len(nodes))[:, some], TO_CAMERA[axis])
             u = block.system.solve(held.gather(unit))
-            columns[some, axis] = picture(seen, u, components).transpose(2, 1, 0)
-    matrix = columns.transpose(2, 3, 0, 1).reshape(components * len(points), 3 * len(nodes))
-    flat = np.column_stack([nodes, np.zeros(len(nodes))])
-    return Compliance(matrix, points, nodes, surface_embedding.vertex_area(flat, Delaunay(nodes).simplices))
+            columns[some, axis] = picture(seen, u, 3).transpose(2, 1, 0)
+    return columns.transpose(2, 3, 0, 1).reshape(3 * len(points), 3 * len(nodes))
 
 
 def _disc(spacing_mm: float, radius_mm: float) -> Floats:

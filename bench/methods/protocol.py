@@ -26,6 +26,10 @@ class MethodContext:
     young_kpa: float | None
     membrane: MembraneState = "unknown"
     """What is known of the tissue's."""
+    poisson: tuple[float, float] = (0.4, 0.49)
+    """Between which its Poisson's ratio lies."""
+    young_uncertainty: float = 0.0
+    """Relative standard uncertainty of `young_kpa`."""
 
     def __post_init__(self) -> None:
         """One method can't change what the others are told."""
@@ -74,4 +78,16 @@ class InSpace(Protocol):
         self, flow: Field, confidence: Field, moved: Moved, scene: MethodContext, picture: bool
     ) -> ForceEstimate:
         """As a `Method`; `moved`: motion [mm] in camera axes and its standard deviation, (H, W, 3) each."""
+        ...
+
+
+@runtime_checkable
+class Revising(Protocol):
+    """A method that, once a film is over, answers for all its frames anew."""
+
+    def revise(self, quiet: NDArray[np.bool_]) -> list[ForceEstimate]:
+        """As many answers as frames were asked about since the recording began; no `density` is needed.
+
+        `quiet`: (T,) whether nothing touches the tissue, as far as anybody says.
+        """
         ...

@@ -18,13 +18,14 @@ from pydantic import (
 )
 
 from synth.errors import UserError
-from synth.job.types import Positive
+from synth.job.types import MembraneState, Positive
 from synth.job.writer import section_lines
 from synth.system import checked_file
 from synth.system.config_file import ConfigFile
 
 Share = Annotated[FiniteFloat, Field(ge=0, lt=1)]
 Point = tuple[FiniteFloat, FiniteFloat]
+PoissonsRatio = Annotated[FiniteFloat, Field(ge=0, lt=0.5)]
 Corners = Annotated[int, Field(ge=2)]
 Row = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
 
@@ -32,6 +33,12 @@ Row = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
 def _must_run_forward(span: tuple[float, float]) -> tuple[float, float]:
     if span[0] >= span[1]:
         raise ValueError("a span must end after its beginning")
+    return span
+
+
+def _must_not_fall(span: tuple[float, float]) -> tuple[float, float]:
+    if span[0] > span[1]:
+        raise ValueError("the lower end comes first")
     return span
 
 
@@ -185,6 +192,10 @@ class Meta(_Section):
     """Young's modulus of the tissue [kPa], or `unknown`: then only relative force is known."""
     young_uncertainty: Share = 0.0
     """Relative standard uncertainty of `young_kpa`."""
+    membrane: MembraneState = "unknown"
+    """Whether the tissue still has its membrane (pia, arachnoid): `intact`, `stripped` or `unknown`."""
+    poisson: Annotated[tuple[PoissonsRatio, PoissonsRatio], AfterValidator(_must_not_fall)] = (0.4, 0.49)
+    """Between which the tissue's Poisson's ratio lies."""
     fps: Positive | None = None
     """Frames a second, for frames/*.png without frames.csv."""
     rest_frame: Annotated[int, Field(ge=0)] = 0

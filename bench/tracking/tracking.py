@@ -10,12 +10,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.methods.protocol import InSpace, Method, MethodContext
+from bench.methods.protocol import InSpace, Method, MethodContext, Revising
 from bench.recording import check
 from bench.recording.folder import Recording
+from bench.recording.meta import Meta
 from bench.recording.second_eye import SecondEye, StereoQuality
 from synth.errors import UserError
-from synth.job.types import MembraneState
 from synth.recording_flow.finding import Finding, first_fault
 from synth.recording_flow.frame_motion import FrameMotion, TrackingSummary
 from synth.recording_flow.local_flow import LocalFlow
@@ -125,9 +125,7 @@ def track_recording(
         for frame in video.frames(progress):
             if frame.is_rest:
                 mm_per_px = scale_mm_per_px * video.shrink
-                membrane: MembraneState = getattr(about, "membrane", "unknown")
-                scene = MethodContext(video.tissue, mm_per_px, about.young_kpa, membrane)
-                forces.begin(frame.rgb, scene)
+                forces.begin(frame.rgb, _context(about, video.tissue, mm_per_px))
             if frame.time_s is not None:
                 forces.add(frame, frame.time_s)
                 span = about.sensor.turn_s
@@ -135,6 +133,7 @@ def track_recording(
                     forces.out.turning = forces.out.turning or SurfaceMotion(video.tissue)
                     forces.out.turning.add(frame.time_s, frame.flow, frame.confidence)
         out = forces.out
+        forces.revise(about)
         if not out.time_s:
             if video.decoded <= about.rest_frame:
                 raise UserError(
@@ -188,6 +187,12 @@ def _describe(
         ]
 
 
+def _context(about: Meta, tissue: NDArray[np.bool_], mm_per_px: float) -> MethodContext:
+    return MethodContext(
+        tissue, mm_per_px, about.young_kpa, about.membrane, about.poisson, about.young_uncertainty
+    )
+
+
 class _Forces:
     """Every method applied to every frame."""
 
@@ -233,6 +238,21 @@ class _Forces:
         out.time_s.append(time_s)
         if wanted:
             self._snap(position, frame, density)
+
+    def revise(self, about: Meta) -> None:
+        """What methods say of all frames once the film is over; the times are what clocks and meta state."""
+        sensor_s = [(a + about.sync.offset_s, b + about.sync.offset_s) for a, b in about.sensor.free_s]
+        spans = [*about.pulse.free_s, *(sensor_s if about.sync.method != "correlate" else [])]
+        times = np.array(self.out.time_s)
+        quiet = np.array([(times >= a) & (times <= b) for a, b in spans]).any(axis=0) & np.array(
+            self.out.trusted
+        )
+        for name, method in self.methods.items():
+            if isinstance(method, Revising) and len(times):
+                with self.watch.stage(name):
+                    answers = method.revise(quiet if spans else np.zeros(len(times), bool))
+                self.out.force_mn[name] = [one.force_mn for one in answers]
+                self.out.bounds[name] = [(one.low_mn, one.high_mn) for one in answers]
 
     def _snap(self, position: int, frame: FrameMotion, density: NDArray[np.float32] | None) -> None:
         """Takes at most so many, evenly: when full, every other one goes and the stride doubles."""

@@ -15,32 +15,35 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from bench.methods import baselines
+from bench.methods import baselines, physics, posterior
+from bench.methods.compliance import TissueKind
+from bench.methods.protocol import Field
 from learn.data.clips import Clip
 from learn.data.split import Split
 from learn.inference.predict import Predictor, load_model
 from learn.settings import TrainingSettings
 from learn.training import batches
 from learn.training.train import train
+from synth.flow.confidence import deviation
 
 Floats = NDArray[np.float64]
 Answer = Callable[[Clip], Floats]
 """A clip with `recovered` displacement → force (T, 3) mN, camera axes."""
 
-RIDGE, NEAREST, PHYSICS = "ridge on flow", "k-NN on flow", "Tikhonov near the contact"
+RIDGE, NEAREST, PHYSICS = "ridge on flow", "k-NN on flow", "physics"
 _FOLDS = 4
+_MM_PER_PX = 0.12  # of the bench's scenes; flow's deviations are in pixels
 _STRENGTHS = np.geomspace(1e-8, 1e2, 21)
 
 
 def build(model: str, fit: Sequence[Clip]) -> Answer:
     """A model, fitted on sequences unless it is physics alone."""
     if model == PHYSICS:
-        rule = baselines.physical_rules()[model]
         return lambda clip: (
             clip.young_kpa
             * np.stack(
                 [
-                    rule(moved, clip.mask, sure)
+                    read_bare(moved, clip.mask, sure)
                     for moved, sure in zip(clip.displacement["recovered"], clip.confidence, strict=True)
                 ]
             )
@@ -50,6 +53,13 @@ def build(model: str, fit: Sequence[Clip]) -> Answer:
     x = x[:, live]
     regressor: Any = baselines.nearest(x, force) if model == NEAREST else fit_ridge(x, force, group)
     return lambda clip: clip.young_kpa * np.asarray(regressor.predict(rows(clip)[:, live]))
+
+
+def read_bare(moved: Field, mask: Field, sure: Field) -> Floats:
+    """Physics of one frame of still tissue without a membrane, a rule as the baselines are."""
+    spread = np.broadcast_to(_MM_PER_PX * deviation(sure), moved.shape)
+    seen = physics.observe(moved, spread, mask)
+    return posterior.infer(posterior.load_basis(len(moved), TissueKind()), seen, np.zeros(len(moved))).mean
 
 
 def fit_ridge(x: Floats, force: Floats, group: NDArray[np.intp]) -> Any:

@@ -15,7 +15,7 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
-from bench.methods import baselines
+from bench.methods.comparison import untrained
 from bench.methods.compliance import TO_CAMERA, ElasticBlock, picture
 from bench.methods.protocol import Method
 from bench.recording import pixel_scale, writer
@@ -53,7 +53,7 @@ def main(
             for name, beats, remove in (("still", 0, True), ("left in", 1, False), ("taken off", 1, True)):
                 folder = Path(scratch, name)
                 record(folder, contact, beats, size, remove, np.random.default_rng([seed, k, 1]))
-                runs[name] = score(folder, baselines.physical(), "tvl1")
+                runs[name] = score(folder, untrained(), "tvl1")
         for method in runs["still"].methods:
             row: dict[str, Any] = {"recording": k, "method": method}
             row |= {f"{name}_mn": run.methods[method].scores["mae_mn"] for name, run in runs.items()}

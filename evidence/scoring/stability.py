@@ -26,7 +26,7 @@ import typer
 from numpy.typing import NDArray
 from ruamel.yaml import YAML
 
-from bench.methods.baselines import physical
+from bench.methods.comparison import PHYSICS, untrained
 from bench.recording import writer
 from bench.recording.from_sequence import export_recording
 from bench.scoring.score import score
@@ -47,8 +47,7 @@ _KEY = ("film", "scene")
 _SENSOR_HZ, _SENSOR_NOISE = 100.0, 0.005
 _DOUBLED, _LEAST, _COVERED = 2.0, 0.1, 0.8
 _NOTES = "unseen world|again, frozen"
-_PHYSICS = "Tikhonov near the contact"
-_PHYSICAL = {name: physical()[name] for name in (_PHYSICS, "one contact, FEM compliance")}
+_PHYSICAL = {PHYSICS: untrained()[PHYSICS]}
 
 
 @dataclass(frozen=True, eq=False)
@@ -203,7 +202,7 @@ def _scored(folder: Path, peak_mn: float) -> dict[str, Any]:
     said = [f"{one.what}: {one.said}" for one in result.findings]
     said += [note for note in result.notes if re.search(_NOTES, note)]
     sensor, scored, row = np.asarray(result.sensor_mn), result.scored, dict[str, Any]()
-    for key, name in (("physics", _PHYSICS), ("error", result.main)):
+    for key, name in (("physics", PHYSICS), ("error", result.main)):
         found = result.methods[name].size_mn
         known = scored & np.isfinite(found) & np.isfinite(sensor)
         row[key] = row["over_time"] = None
@@ -280,7 +279,7 @@ def page(found: dict[str, Any]) -> report.Page:
     """Draws `stability.json`."""
     words = [
         "Four scenes, two with tissue from edge to edge. Errors are of the peak, in the median; physics is "
-        f"{_PHYSICS.lower()}. *Worse*: more than doubled and above a tenth of the peak, there or over time."
+        f"{PHYSICS.lower()}. *Worse*: more than doubled and above a tenth of the peak, there or over time."
     ]
     sections = [
         report.Section("Spoilt", found["films"]),

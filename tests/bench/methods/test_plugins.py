@@ -92,6 +92,6 @@ def test_a_method_cannot_change_what_the_others_see(recording: Path) -> None:
 
 
 def test_a_name_of_ours_is_not_taken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    installed(tmp_path, monkeypatch, mean="Push")
-    with pytest.raises(UserError, match="mean"):
+    installed(tmp_path, monkeypatch, physics="Push")
+    with pytest.raises(UserError, match="physics"):
         comparison.simpler_methods(None, None)

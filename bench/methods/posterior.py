@@ -1,0 +1,268 @@
+"""One Bayesian linear inverse: what loads a displacement tells of, and how surely.
+
+    d = C f / E + N a + e
+
+d: displacement seen at P points, C the compliance. Loads f are smooth ones spread over the opening, and a
+contact of unknown place and width on top; both sizes are by marginal likelihood, each frame. N a is what the
+tissue does by itself, six polynomials of second degree a component with sizes that somebody knows,
+marginalised. e has flow's stated deviations, multiplied as its errors go together, and a share of the
+displacement itself: what the compliance, of another shape than the tissue, cannot explain.
+
+All is Gaussian but place, width and the sizes, which are summed over a grid (Bishop, Pattern Recognition and
+Machine Learning, 2006, ch. 3; rank-3 updates of the evidence by the matrix determinant lemma).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve, eigh
+from scipy.special import logsumexp
+
+from bench.methods import compliance
+from bench.methods.compliance import OPENING_MM, TissueKind
+
+Floats = NDArray[np.float64]
+
+_RANK = 100
+_SMOOTH_MM, _AROUND_MM = 2.0, 1.5
+_RADII_MM = (2.4, 3.4, 4.8)
+_REACH_MM = 9.5
+"""Contacts stand so near to the opening's middle."""
+_SPREAD = (0.03, 0.15, 0.75)
+"""Deviations of the smooth loads' total a component, mN a kPa."""
+_CONTACT = (1.0, 5.0)
+"""The same of a contact's force: P = F/(E a^2) of 0.03 to 0.3."""
+_CORRELATED, _MISFIT, _UNMET = 3.0, 0.1, 2.0
+"""Variances count so much more as errors at neighbouring points go together; what of the displacement the
+compliance cannot explain; how much larger the tissue's own motion is than few quiet frames show."""
+LEAST_MM = 0.005
+"""Of flow's deviation, whatever is stated."""
+_DRAWN = 128
+
+
+@dataclass(frozen=True, eq=False)
+class LoadBasis:
+    """A compliance in the few directions of displacement that smooth loads can cause, E = 1 kPa."""
+
+    motion: Floats
+    """(C P, R + 6 C) mm: orthonormal directions, then the polynomials."""
+    size: Floats
+    """(R,) deviation along each for loads of unit size."""
+    force: Floats
+    """(3, R) total force of a coefficient [mN/mm]."""
+    unseen: Floats
+    """(3,) variance of the total force in the directions left out, loads of unit size."""
+    contacts: NDArray[np.float32]
+    """(R, H, 3) coefficients of contacts of 1 mN along each axis."""
+    loads: Floats
+    """(3 K, R) mN at the nodes of a coefficient."""
+    shares: Floats
+    """(K, H) what each node carries of a contact."""
+    around: Floats
+    """(P, P) means over neighbouring points."""
+    known: compliance.Compliance
+
+
+@dataclass(frozen=True, eq=False)
+class Observation:
+    """One frame's displacement at the compliance's points."""
+
+    moved: Floats
+    """(C, P) mm."""
+    deviation: Floats
+    """(C, P) mm, stated; infinite where nothing is seen."""
+
+    @property
+    def size_mm(self) -> float:
+        """Root mean square of what is seen."""
+        seen = np.isfinite(self.deviation)
+        return float(np.sqrt(np.mean(self.moved[seen] ** 2))) if seen.any() else 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Posterior:
+    """The force over E as a mixture of M Gaussians [mN/kPa]."""
+
+    evidence: float
+    """Logarithm of the marginal likelihood."""
+    weight: Floats
+    """(M,) that add up to 1."""
+    force: Floats
+    """(M, 3)."""
+    covariance: Floats
+    """(M, 3, 3)."""
+    load: Floats
+    """(K, 3) mean load at the nodes."""
+
+    @property
+    def mean(self) -> Floats:
+        return np.asarray(self.weight @ self.force, np.float64)
+
+
+@lru_cache(maxsize=32)
+def load_basis(components: int, tissue: TissueKind) -> LoadBasis:
+    """The reduced compliance of a tissue, seen in 2 or 3 components."""
+    known = compliance.build(components=components, tissue=tissue)
+    count = len(known.nodes)
+    apart = np.square(known.nodes[:, None] - known.nodes[None]).sum(axis=-1)
+    kernel = np.exp(-apart / (2 * _SMOOTH_MM**2)) * known.node_area[:, None] * known.node_area
+    root = np.linalg.cholesky(kernel + 1e-6 * np.trace(kernel) / count * np.eye(count))
+    root /= np.linalg.norm(root.sum(axis=0))
+    by_node = known.matrix.reshape(-1, count, 3)
+    smooth = np.tensordot(by_node, root, (1, 0)).transpose(0, 2, 1).reshape(len(by_node), -1)
+    values, vectors = eigh(smooth.T @ smooth)
+    vectors, seen = vectors[:, ::-1], np.sqrt(np.maximum(values[::-1], 1e-30))
+    motion = smooth @ (vectors[:, :_RANK] / seen[:_RANK])
+    loads = np.tensordot(root, vectors.reshape(count, 3, -1), (1, 0)).reshape(3 * count, -1)
+    total = loads.reshape(count, 3, -1).sum(axis=0)
+    shares = []
+    within = np.hypot(*known.nodes.T) <= _REACH_MM
+    for radius in _RADII_MM:
+        share = np.clip(1 - apart / radius**2, 0, None) ** 2 * known.node_area[:, None]
+        shares.append((share / share.sum(axis=0))[:, within])
+    shares_of = np.concatenate(shares, axis=1)
+    seen_by = (motion.T @ known.matrix).reshape(_RANK, count, 3)
+    contacts = np.einsum("rka,kh->rha", seen_by, shares_of, optimize=True)
+    near = np.square(known.points[:, None] - known.points[None]).sum(axis=-1)
+    near = np.exp(-near / (2 * _AROUND_MM**2))
+    own = np.kron(np.eye(components), polynomials(known.points))
+    return LoadBasis(
+        np.hstack([motion, own]),
+        seen[:_RANK],
+        total[:, :_RANK] / seen[:_RANK],
+        np.square(total[:, _RANK:]).sum(axis=1),
+        contacts.astype(np.float32),
+        loads[:, :_RANK] / seen[:_RANK],
+        shares_of,
+        near / near.sum(axis=1, keepdims=True),
+        known,
+    )
+
+
+def polynomials(points: Floats) -> Floats:
+    """(P, 6) of second degree at points (P, 2) mm, of size 1 at the opening's edge."""
+    x, y = points.T / OPENING_MM
+    return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
+
+
+def own_motion(basis: LoadBasis, quiet: list[Observation]) -> Floats:
+    """(C,) mm, sizes of what the tissue does by itself: of the polynomials' coefficients in quiet frames.
+
+    What flow's errors alone would make of them is taken off (a moment estimate); of no frames they are 0.
+    """
+    components = len(basis.motion) // len(basis.known.points)
+    found = np.zeros(components)
+    terms = polynomials(basis.known.points)
+    for axis in range(components if quiet else 0):
+        excess = []
+        for seen in quiet:
+            weight = 1 / (_CORRELATED * (seen.deviation[axis] ** 2 + LEAST_MM**2))
+            gram = terms.T @ (terms * weight[:, None])
+            if np.linalg.cond(gram) < 1e8:
+                inverse = np.linalg.inv(gram)
+                said = inverse @ (terms.T @ (weight * seen.moved[axis]))
+                excess.append(said**2 - np.diag(inverse))
+        found[axis] = _UNMET * np.sqrt(max(float(np.mean(excess)), 0.0)) if excess else 0.0
+    return found
+
+
+def infer(basis: LoadBasis, seen: Observation, own_mm: Floats) -> Posterior:
+    """Loads that a frame tells of.
+
+    Args:
+        basis: of the tissue.
+        seen: the frame's displacement.
+        own_mm: (C,) size of the tissue's own motion, a component.
+    """
+    rank = len(basis.size)
+    moved = seen.moved.ravel()
+    # Of neighbours: a point's own square would weigh down the points that err upwards.
+    local = basis.around @ np.square(seen.moved).mean(axis=0)
+    noise = _CORRELATED * (seen.deviation**2 + LEAST_MM**2 + _MISFIT**2 * local)
+    weight = 1 / noise.ravel()
+    own = np.repeat(np.square(own_mm), 6)
+    columns = np.append(np.arange(rank), rank + np.flatnonzero(own > 0))
+    motion = basis.motion[:, columns]
+    weighed = motion * weight[:, None]
+    gram, right = motion.T @ weighed, weighed.T @ moved
+    known = weight > 0
+    rest = float(moved @ (weight * moved) - np.log(weight[known]).sum() + known.sum() * np.log(2 * np.pi))
+    count = basis.contacts.shape[1]
+    flat = basis.contacts.reshape(rank, -1)
+    levels: list[_Level] = []
+    evidence: list[Floats] = []
+    for spread in _SPREAD:
+        prior = np.concatenate([np.square(spread * basis.size), own[own > 0]])
+        factor = cho_factor(gram + np.diag(1 / prior), lower=True)
+        mean = cho_solve(factor, right)
+        log_det = 2 * np.log(np.diag(factor[0])).sum() + np.log(prior).sum()
+        alone = -0.5 * (rest - right @ mean + log_det)
+        taken = cho_solve(factor, gram[:, :rank])
+        left = (gram[:rank, :rank] - gram[:, :rank].T @ taken).astype(np.float32)
+        beside = (left @ flat).reshape(rank, -1, 3)
+        # Entries (a, b) of each contact's 3 x 3 matrix, summed over directions.
+        square = np.empty((count, 3, 3))
+        for a in range(3):
+            square[:, a] = np.einsum("rh,rhb->hb", basis.contacts[..., a], beside)
+        pull = (right[:rank] - gram[:, :rank].T @ mean) @ flat.astype(np.float64)
+        padded = np.zeros((len(prior), 3))
+        padded[:rank] = basis.force.T
+        covariance = basis.force @ cho_solve(factor, padded)[:rank] + np.diag(basis.unseen) * spread**2
+        total = basis.force @ mean[:rank], covariance
+        level = _Level(mean[:rank], square, pull.reshape(-1, 3), taken[:rank], *total)
+        levels.append(level)
+        for size in _CONTACT:
+            scaled = square + np.eye(3) / size**2
+            force = np.linalg.solve(scaled, level.pull[..., None])[..., 0]
+            gain = 0.5 * (level.pull * force).sum(axis=1) - 0.5 * np.log(np.linalg.det(scaled))
+            evidence.append(alone + gain - 3 * np.log(size) - np.log(count))
+        evidence.append(np.array([alone]))
+    score = np.concatenate(evidence)
+    # Systematic draws: as many of each hypothesis as it is likely, none left out for being one of many.
+    likely = np.cumsum(np.exp(score - logsumexp(score)))
+    drawn = np.searchsorted(likely, (np.arange(_DRAWN) + 0.5) / _DRAWN * likely[-1])
+    best, times = np.unique(drawn, return_counts=True)
+    share = times / _DRAWN
+    force, covariance = np.empty((len(best), 3)), np.empty((len(best), 3, 3))
+    coefficients, carried = np.zeros(rank), np.zeros((len(basis.shares), 3))
+    for k, (hypothesis, part) in enumerate(zip(best, share, strict=True)):
+        level = levels[hypothesis // (len(_CONTACT) * count + 1)]
+        inside = hypothesis % (len(_CONTACT) * count + 1)
+        force[k], covariance[k] = level.force, level.covariance
+        mean = level.mean
+        if inside < len(_CONTACT) * count:
+            h = int(inside % count)
+            variance = np.linalg.inv(level.square[h] + np.eye(3) / _CONTACT[inside // count] ** 2)
+            contact = variance @ level.pull[h]
+            # What a contact adds to the total, less what the smooth loads then leave to it.
+            moves = level.taken @ basis.contacts[:, h]
+            gives = np.eye(3) - basis.force @ moves
+            force[k] += gives @ contact
+            covariance[k] += gives @ variance @ gives.T
+            mean = mean - moves @ contact
+            carried += part * basis.shares[:, h, None] * contact
+        coefficients += part * mean
+    load = (basis.loads @ coefficients).reshape(-1, 3) + carried
+    return Posterior(float(logsumexp(score)), share, force, covariance, load)
+
+
+@dataclass(frozen=True, eq=False)
+class _Level:
+    """Smooth loads of one size, and what contacts find beside them."""
+
+    mean: Floats
+    """(R,) of the smooth loads' coefficients."""
+    square: Floats
+    """(H, 3, 3) precision of each contact's force by what the smooth loads can't explain."""
+    pull: Floats
+    """(H, 3) that, times the force."""
+    taken: Floats
+    """(R, R) what smooth loads take up of a displacement."""
+    force: Floats
+    """(3,) total of the smooth loads."""
+    covariance: Floats
+    """(3, 3) of that."""

@@ -1,0 +1,141 @@
+"""The Bayesian inverse against loads of another mesh, theory of the half-space, and draws from itself."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from bench.methods import physics, posterior
+from bench.methods.compliance import ElasticBlock, TissueKind
+from bench.methods.posterior import LoadBasis, Observation
+from bench.methods.protocol import MethodContext
+
+Floats = NDArray[np.float64]
+BARE = TissueKind("bonded", 0.0, 0.45)
+STILL = np.zeros(3)
+
+
+def seen(moved: Floats, noise_mm: float = 0.0, seed: int = 0) -> Observation:
+    """(P, C) mm with white noise, whose deviation is stated."""
+    noise = noise_mm * np.random.default_rng(seed).normal(size=moved.shape)
+    return Observation((moved + noise).T, np.full(moved.T.shape, max(noise_mm, 0.01)))
+
+
+def pressed(basis: LoadBasis, tissue: TissueKind, force: list[float]) -> Floats:
+    """Displacement (P, 3) mm, camera axes, of a 3 mm contact at (2, 3) mm on another mesh; mN/kPa."""
+    block = ElasticBlock.build(2500, tissue)
+    steps = np.stack(np.meshgrid(np.linspace(-1, 1, 13), np.linspace(-1, 1, 13)), axis=-1).reshape(-1, 2)
+    disc = steps[np.hypot(*steps.T) < 1]
+    share = (1 - np.square(disc).sum(axis=1)) ** 2
+    load = np.outer(share / share.sum(), np.array(force) * [1, -1, -1])
+    u = block.system.solve(block.embed(np.array([2.0, 3.0]) + 3 * disc).gather(load))
+    return np.asarray(block.embed(basis.known.points).move(u) * [1, -1, -1], np.float64)
+
+
+@pytest.fixture(scope="module")
+def basis() -> LoadBasis:
+    return posterior.load_basis(3, BARE)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("force", [[3.0, 0.0, 0.0], [0.0, -1.0, 4.0]])
+def test_a_contacts_force_is_found_and_held(basis: LoadBasis, force: list[float]) -> None:
+    moved = pressed(basis, BARE, force)
+    for noise in (0.0, 0.03):
+        found = posterior.infer(basis, seen(moved, noise), STILL)
+        assert found.mean == pytest.approx(force, abs=0.1 * np.linalg.norm(force))
+        low, high = physics.size_interval(found, 0.08)
+        assert low < np.linalg.norm(force) < high
+        assert found.load.sum(axis=0) == pytest.approx(found.mean, abs=1e-6)
+    across = posterior.infer(posterior.load_basis(2, BARE), seen(moved[:, :2], 0.01), STILL[:2])
+    assert across.mean[:2] == pytest.approx(force[:2], abs=0.15 * np.linalg.norm(force))
+
+
+@pytest.mark.slow
+def test_no_motion_is_no_force(basis: LoadBasis) -> None:
+    for noise in (0.0, 0.03):
+        found = posterior.infer(basis, seen(np.zeros((len(basis.known.points), 3)), noise), STILL)
+        low, high = physics.size_interval(found, 0.08)
+        assert np.linalg.norm(found.mean) < 0.2
+        assert low == 0.0
+        assert 0 < high < 0.6
+
+
+@pytest.mark.slow
+def test_the_tissues_own_motion_is_learnt_where_nothing_touches(basis: LoadBasis) -> None:
+    rng = np.random.default_rng(1)
+    terms = posterior.polynomials(basis.known.points)
+    own = [terms @ (rng.normal(size=(6, 3)) * [0.0, 0.05, 0.25]) for _ in range(9)]
+    sizes = posterior.own_motion(basis, [seen(one, 0.005) for one in own[:8]])
+    assert sizes == pytest.approx([0.0, 0.1, 0.5], abs=0.2)
+    force = np.array([0.5, 0.0, 2.0])
+    both = seen(pressed(basis, BARE, force.tolist()) + own[8], 0.01)
+    told, untold = (posterior.infer(basis, both, size).mean for size in (sizes, STILL))
+    assert np.linalg.norm(told - force) < 0.25 * np.linalg.norm(force)
+    assert np.linalg.norm(told - force) < 0.5 * np.linalg.norm(untold - force)
+
+
+@pytest.mark.slow
+def test_ninety_of_a_hundred_draws_of_the_model_lie_in_its_interval(basis: LoadBasis) -> None:
+    rng, inside, count = np.random.default_rng(2), 0, 150
+    sizes = np.array([0.02, 0.02, 0.05])
+    for _ in range(count):
+        spread, size = rng.choice(posterior._SPREAD), rng.choice(posterior._CONTACT)
+        smooth = spread * basis.size * rng.normal(size=len(basis.size))
+        contact = size * rng.normal(size=3)
+        inward = basis.contacts[:, rng.integers(basis.contacts.shape[1])] @ contact
+        coefficients = np.append(smooth + inward, np.repeat(sizes, 6) * rng.normal(size=18))
+        spare = np.sqrt(basis.unseen) * spread * rng.normal(size=3)
+        force = basis.force @ smooth + spare + contact
+        moved = (basis.motion @ coefficients).reshape(3, -1)
+        # The model counts variances threefold; what it draws has them so.
+        local = basis.around @ np.square(moved).mean(axis=0)
+        noise = np.sqrt(
+            posterior._CORRELATED * (0.02**2 + posterior.LEAST_MM**2 + posterior._MISFIT**2 * local)
+        )
+        drawn = Observation(moved + noise * rng.normal(size=moved.shape), np.full(moved.shape, 0.02))
+        low, high = physics.size_interval(posterior.infer(basis, drawn, sizes), 0.0)
+        inside += low <= np.linalg.norm(force) <= high
+    assert abs(inside / count - 0.9) < 3 * np.sqrt(0.09 / count)
+
+
+@pytest.mark.slow
+def test_theory_of_the_half_space_is_read(basis: LoadBasis) -> None:
+    """Boussinesq's and Cerruti's point forces on a disc (Johnson, Contact Mechanics, 1985, ch. 3)."""
+    nu, force, radius = 0.45, np.array([1.0, 0.0, 3.0]), 3.0
+    steps = np.linspace(-1, 1, 30) * radius
+    disc = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
+    disc = disc[np.hypot(*disc.T) < radius]
+    share = 1 - np.square(disc).sum(axis=1) / radius**2
+    share /= share.sum()
+    apart = basis.known.points[:, None] - disc[None]
+    r = np.hypot(apart[..., 0], apart[..., 1]).clip(0.05)
+    x, y = apart[..., 0], apart[..., 1]
+    shear = 1 / (2 * (1 + nu))
+    p, q = force[2] / (4 * np.pi * shear), force[0] / (4 * np.pi * shear)
+    u = -p * (1 - 2 * nu) * x / r**2 + q * (2 * (1 - nu) / r + 2 * nu * x**2 / r**3)
+    v = -p * (1 - 2 * nu) * y / r**2 + q * 2 * nu * x * y / r**3
+    w = p * 2 * (1 - nu) / r + q * (1 - 2 * nu) * x / r**2
+    moved = np.stack([(part * share).sum(axis=1) for part in (u, v, w)], axis=1)
+    free = posterior.load_basis(3, TissueKind("free", 0.0, nu))
+    # The block's walls are fixed 50 mm away, where the half-space still sinks: that is let be.
+    found = posterior.infer(free, seen(moved, 0.01), np.full(3, 0.05))
+    assert found.mean == pytest.approx(force, abs=0.15 * 3.2)
+
+
+@pytest.mark.slow
+def test_a_film_tells_a_membrane_and_meta_narrows_it(basis: LoadBasis) -> None:
+    side = 80
+    scene = MethodContext(np.ones((side, side), bool), 12 * np.sqrt(np.pi) / side, 2.0)
+    stiff = []
+    for tissue in (BARE, TissueKind("bonded", 40.0, 0.45)):
+        film = [seen(pressed(basis, tissue, [1.0, 0.0, level]), 0.01) for level in (2.0, 4.0)]
+        found = physics.weigh_tissues(scene, film, STILL)
+        stiff.append(float(found.weight @ [one.membrane for one in found.tissues]))
+    assert "evidence for a membrane of about" in physics.describe(found, 2.0)
+    # Another mesh's bare tissue may look like a thin membrane, never like a thick one.
+    assert stiff[0] <= 5
+    assert 20 < stiff[1] <= 101
+    told = MethodContext(scene.tissue, scene.scale_mm_per_px, 2.0, "stripped", (0.48, 0.49))
+    assert {(one.membrane, one.poisson) for one in physics.grid_of(told)} == {(0.0, 0.49)}
