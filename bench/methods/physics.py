@@ -55,6 +55,8 @@ class Film:
     """Of each tissue; they add up to 1."""
     own_mm: Floats
     """(C,) size of the tissue's own motion."""
+    membrane: float
+    """How likely there is one, of all tissues that were asked about."""
 
 
 class Physics:
@@ -82,7 +84,7 @@ class Physics:
         components = len(self._seen[0].moved)
         basis = posterior.load_basis(components, grid_of(self._scene)[0])
         self._film = weigh_tissues(self._scene, self._seen, posterior.own_motion(basis, own))
-        self._quiet = len(own)
+        self._quiet = int(quiet.sum())
         return [self._answer(one, False) for one in self._seen]
 
     @property
@@ -102,7 +104,7 @@ class Physics:
             self._seen: list[Observation] = []
             self._quiet, self._weighed = 0, 0.0
             tissues = grid_of(scene)
-            self._film = Film(tissues, _prior(tissues, scene.membrane), np.zeros(moved.shape[2]))
+            self._film = Film(tissues, _prior(tissues, scene.membrane), np.zeros(moved.shape[2]), _INTACT)
         mean = self._view.resample.mean
         moved, spread = (mean(field.transpose(2, 0, 1), scene.tissue) for field in (moved, spread))
         seen = observe(moved, spread, self._view.mask)
@@ -181,7 +183,8 @@ def weigh_tissues(scene: MethodContext, seen: Sequence[Observation], own_mm: Flo
             score.append(score[best] + evidence(tissues[-1]) - evidence(tissues[best]))
     weight = softmax(score)
     kept = np.argsort(-weight)[: max(1, min(2, int((weight > _LEAST).sum())))]
-    return Film(tuple(tissues[k] for k in kept), weight[kept] / weight[kept].sum(), own_mm)
+    covered = float(weight @ [one.membrane > 0 for one in tissues])
+    return Film(tuple(tissues[k] for k in kept), weight[kept] / weight[kept].sum(), own_mm, covered)
 
 
 def infer(film: Film, seen: Observation) -> Posterior:
@@ -243,11 +246,10 @@ def observe(moved: Field, spread: Field, mask: Field) -> Observation:
 def describe(film: Film, young_kpa: float) -> str:
     """What the film says of the tissue, for a person."""
     stiff = np.array([one.membrane for one in film.tissues])
-    bare, covered = film.weight[stiff == 0].sum(), film.weight[stiff > 0].sum()
+    bare, covered = max(1 - film.membrane, 1e-3), max(film.membrane, 1e-3)
     edge, nu = film.tissues[0].edge, film.tissues[0].poisson
     said = f"its edge {edge}, Poisson's ratio {nu:g}"
     if covered > bare:
-        about = float(film.weight @ stiff / covered) * young_kpa
-        odds = covered / max(bare, 1e-2)
-        return f"evidence for a membrane of about {about:.2g} mN/mm, odds {odds:.3g} : 1; {said}"
-    return f"no evidence for a membrane, odds {bare / max(covered, 1e-2):.3g} : 1 against; {said}"
+        about = float(film.weight @ stiff / max(film.weight[stiff > 0].sum(), 1e-3)) * young_kpa
+        return f"evidence for a membrane of about {about:.2g} mN/mm, odds {covered / bare:.3g} : 1; {said}"
+    return f"no evidence for a membrane, odds {bare / covered:.3g} : 1 against; {said}"
