@@ -198,7 +198,13 @@ def _scored(folder: Path, peak_mn: float) -> dict[str, Any]:
     try:
         result = score(folder, _model((folder / "stereo.yaml").exists()), methods=_PHYSICAL, baselines=False)
     except UserError as error:
-        return {"error": None, "over_time": None, "physics": None, "held": None, "said": [str(error)]}
+        return {
+            "error": None,
+            "over_time": None,
+            "physics": None,
+            "held": None,
+            "said": [str(error).replace(f"{folder}: ", "")],
+        }
     said = [f"{one.what}: {one.said}" for one in result.findings]
     said += [note for note in result.notes if re.search(_NOTES, note)]
     sensor, scored, row = np.asarray(result.sensor_mn), result.scored, dict[str, Any]()
@@ -278,7 +284,7 @@ def _alarms(work: Path, seed: int, foreign: Path | None) -> Iterator[dict[str, A
 def page(found: dict[str, Any]) -> report.Page:
     """Draws `stability.json`."""
     words = [
-        "Four scenes, two with tissue from edge to edge. Errors are of the peak, in the median; physics is "
+        "Two scenes, one with tissue from edge to edge. Errors are of the peak, in the median; physics is "
         f"{PHYSICS.lower()}. *Worse*: more than doubled and above a tenth of the peak, there or over time."
     ]
     sections = [
