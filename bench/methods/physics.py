@@ -32,6 +32,8 @@ Floats = NDArray[np.float64]
 
 MEMBRANES = (0.0, 5.0, 15.0, 40.0, 100.0)
 """Stiffness over E [mm]."""
+_THIN = 5.0
+"""Up to here films of bare tissue look alike: the compliance's misfit is as large."""
 _INTACT = 0.33
 """How likely a membrane is that nobody speaks of."""
 _POISSON = (0.45, 0.4, 0.49)
@@ -56,7 +58,7 @@ class Film:
     own_mm: Floats
     """(C,) size of the tissue's own motion."""
     membrane: float
-    """How likely there is one, of all tissues that were asked about."""
+    """How likely there is one that is not thin, of all tissues that were asked about."""
 
 
 class Physics:
@@ -183,7 +185,7 @@ def weigh_tissues(scene: MethodContext, seen: Sequence[Observation], own_mm: Flo
             score.append(score[best] + evidence(tissues[-1]) - evidence(tissues[best]))
     weight = softmax(score)
     kept = np.argsort(-weight)[: max(1, min(2, int((weight > _LEAST).sum())))]
-    covered = float(weight @ [one.membrane > 0 for one in tissues])
+    covered = float(weight @ [one.membrane > _THIN for one in tissues])
     return Film(tuple(tissues[k] for k in kept), weight[kept] / weight[kept].sum(), own_mm, covered)
 
 
@@ -249,7 +251,9 @@ def describe(film: Film, young_kpa: float) -> str:
     bare, covered = max(1 - film.membrane, 1e-3), max(film.membrane, 1e-3)
     edge, nu = film.tissues[0].edge, film.tissues[0].poisson
     said = f"its edge {edge}, Poisson's ratio {nu:g}"
-    if covered > bare:
-        about = float(film.weight @ stiff / max(film.weight[stiff > 0].sum(), 1e-3)) * young_kpa
+    if covered > bare and (stiff > _THIN).any():
+        thick = stiff > _THIN
+        about = float(np.average(stiff[thick], weights=film.weight[thick])) * young_kpa
         return f"evidence for a membrane of about {about:.2g} mN/mm, odds {covered / bare:.3g} : 1; {said}"
-    return f"no evidence for a membrane, odds {bare / covered:.3g} : 1 against; {said}"
+    least = f"no evidence for a membrane above {_THIN * young_kpa:.2g} mN/mm"
+    return f"{least}, odds {bare / covered:.3g} : 1 against; {said}"
