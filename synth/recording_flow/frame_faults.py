@@ -81,7 +81,8 @@ class FilmFaults:
         self._fine = _detail(grey, 0, 1)[tissue].std()
         self._numbers: list[int] = []
         self._times: list[float] = []
-        self._changes: list[tuple[float, float]] = []  # mean, and of the quietest part, since the one before
+        # Since the one before: mean, of the quietest part, and of the middling one.
+        self._changes: list[tuple[float, float, float]] = []
         self._blurred: list[float] = []
         self._combed: list[float] = []
         level = float(np.percentile(grey[tissue], 95))
@@ -108,7 +109,7 @@ class FilmFaults:
             parts = cv2.resize(change, (8, 6), interpolation=cv2.INTER_AREA)
             self._numbers.append(index)
             self._times.append(time_s)
-            self._changes.append((float(change.mean()), float(parts.min())))
+            self._changes.append((float(change.mean()), float(parts.min()), float(np.median(parts))))
         self._last = one
 
     def look(self, time_s: float, rgb: NDArray[np.uint8], small: NDArray[np.uint8]) -> None:
@@ -128,7 +129,7 @@ class FilmFaults:
 
         The rest frame's number is -1.
         """
-        change, quiet = np.array(self._changes).reshape(-1, 2).T
+        change, quiet, _ = np.array(self._changes).reshape(-1, 3).T
         surely, maybe = dict[int, int](), dict[int, int]()
         if not change.any():
             return surely, maybe
@@ -143,7 +144,8 @@ class FilmFaults:
 
     def findings(self) -> list[Finding]:
         """What is odd, once the film is through."""
-        again, change = self.repeats()[0], [mean for mean, _ in self._changes]
+        # An instrument may come in at once; a cut or a bump changes most of the picture.
+        again, change = self.repeats()[0], [middling for *_, middling in self._changes]
         beside = [max(pair) for pair in zip(change[:-2], change[2:], strict=True)]
         leaps = [k for k, other in enumerate(beside, 1) if change[k] > _LEAPT * other]
         at = dict(zip(self._numbers, self._times, strict=True))

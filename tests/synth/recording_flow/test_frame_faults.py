@@ -45,6 +45,23 @@ def test_what_spoils_a_film_is_named(kind: str) -> None:
     assert faults.repeats() == ((dict.fromkeys((4, 5, 6), 3) if kind == "again" else {}), {})
 
 
+@pytest.mark.parametrize(("jumped", "named"), [("camera", True), ("instrument", False)])
+def test_a_bump_is_named_and_an_instrument_that_comes_in_at_once_is_not(jumped: str, named: bool) -> None:
+    rng, rest = np.random.default_rng(0), texture(96, 160).astype(np.float32)
+    faults = None
+    for k in range(10):
+        clean = rest[:, 8:136] if jumped == "camera" and k >= 5 else rest[:, :128].copy()
+        if jumped == "instrument" and k >= 5:
+            clean[20:80, 90:120] = 90  # 15% of the picture
+        picture = np.asarray(np.clip(clean + rng.normal(0, 2, clean.shape), 0, 255), np.uint8)
+        if faults is None:
+            faults = FilmFaults(picture, picture, np.ones((96, 128), bool))
+        else:
+            faults.see(k, k / 10, picture)
+    assert faults is not None
+    assert bool(faults.findings()) is named
+
+
 def test_black_bars_are_no_tissue_and_an_inverted_mask_is_asked_about() -> None:
     boxed = np.full((96, 128, 3), 16, np.uint8)
     boxed[12:-12] = _film()[0, 12:-12]
