@@ -27,5 +27,9 @@ def test_a_beating_recording_scores_as_a_still_one(tmp_path: Path) -> None:
     rates = [rhythm["rate_hz"] for rhythm in runs["off"].followed.pulse]
     assert rates == pytest.approx([1.2, 0.25], rel=0.03)
     errors = {what: run.methods[name].scores["mae_mn"] for what, run in runs.items()}
-    assert errors["off"] < 1.3 * errors["still"]
+    # Physics errs by 0.9% of the peak where nothing beats; the beat that is left adds another percent.
+    sensor = runs["still"].sensor_mn
+    assert sensor is not None
+    peak = float(np.nanmax(sensor))
+    assert errors["off"] < errors["still"] + 0.02 * peak
     assert errors["in"] > 1.5 * errors["still"], "a beat that harms nobody proves nothing"
