@@ -33,6 +33,7 @@ _EVEN = 0.05  # by which scale and distance vary between sequences, relative
 _EDGE_MM = 1.0  # of what hides tissue
 _RECORDED = 0.74  # linear light in a frame of a default job over the reflectance, in the mean
 _MEASURED = ("full_well", "read_noise", "vignette")
+_MEMBRANE = {"stripped": 0.0, "unknown": 0.3, "intact": 1.0}
 _FRAMES, _FPS = 8, 8.0  # of a sequence: as those that the networks have learnt from
 
 
@@ -109,9 +110,9 @@ def specimen_job(recording: Recording, sequences: int, texture: Path) -> Job:
             "anatomy": anatomy | {"vertices": 12_000},
             "appearance": {**sections["appearance"], "photo": texture, "cottonoid": 0.0},
             "fem": {
-                "poisson": [0.40, 0.49],
+                "poisson": list(recording.meta.poisson),
                 "skull": ["bonded", "slip"],
-                "membrane": {"probability": 0.3},
+                "membrane": {"probability": _MEMBRANE[recording.meta.membrane]},
                 "instruments": [1, 2],
                 "contact_region_radius_mm": region_mm,
             },

@@ -8,8 +8,9 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from bench.methods.protocol import Field, ForceEstimate, InSpace, Method, MethodContext
+from bench.methods.protocol import Field, ForceEstimate, InSpace, Method, MethodContext, Revising
 from synth.errors import UserError, as_user_error
 from synth.plugins import Registry, check_answer
 
@@ -27,6 +28,9 @@ class Plugged:
         if isinstance(method, InSpace):
             self.in_space = partial(self._asked, method.in_space)
             """See `InSpace`."""
+        if isinstance(method, Revising):
+            self.revise = self._revised
+            """See `Revising`."""
 
     @property
     def notes(self) -> list[str]:
@@ -38,10 +42,22 @@ class Plugged:
         """See `Method`."""
         return self._asked(self._method, flow, confidence, scene, picture)
 
+    def _revised(self, quiet: NDArray[np.bool_]) -> list[ForceEstimate]:
+        with as_user_error(self._label):
+            answers = list(self._method.revise(quiet.copy()))
+            if len(answers) != len(quiet):
+                raise TypeError(f"revises {len(answers)} frames of {len(quiet)}")
+        return [self._checked(one, None) for one in answers]
+
     def _asked(self, ask: Any, *told: Any) -> ForceEstimate:
-        size, density = told[0].shape[:2], None
         with as_user_error(self._label):
             answer = ask(*copy.deepcopy(told[:-2]), *told[-2:])  # the next method sees what it saw
+        return self._checked(answer, told[0].shape[:2])
+
+    def _checked(self, answer: Any, size: tuple[int, ...] | None) -> ForceEstimate:
+        """`size`: of the pictures that it may give a density on; None: of none."""
+        density = None
+        with as_user_error(self._label):
             if not isinstance(answer, ForceEstimate):
                 raise TypeError(f"answers {type(answer).__name__}, expected ForceEstimate")
             force = np.asarray(answer.force_mn, np.float64)
@@ -50,7 +66,7 @@ class Plugged:
         if (np.abs(force) > _MOST_MN).any() or answer.low_mn > answer.high_mn:
             size_mn = f"force {force.tolist()} mN in [{answer.low_mn:g}, {answer.high_mn:g}]"
             raise UserError(f"{self._label}: gives {size_mn}, which can't be")
-        if answer.density is not None:
+        if answer.density is not None and size is not None:
             density = check_answer(self._label, "density", answer.density, size)
         return replace(answer, force_mn=force, density=density)
 

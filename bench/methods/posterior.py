@@ -34,8 +34,11 @@ _REACH_MM = 9.5
 """Contacts stand so near to the opening's middle."""
 _SPREAD = (0.03, 0.15, 0.75)
 """Deviations of the smooth loads' total a component, mN a kPa."""
-_CONTACT = (1.0, 5.0)
-"""The same of a contact's force: P = F/(E a^2) of 0.03 to 0.3."""
+_CONTACTS = ((1.0, 1.0, 1.0), (5.0, 5.0, 5.0))
+"""The same of a contact's force along x, y, z: P = F/(E a^2) of 0.03 to 0.3."""
+_PRESSES = ((0.2, 0.2, 5.0), (0.05, 0.05, 5.0))
+"""Of one that presses along the view, for one eye: what it hardly sees would else count as not there, since
+forces across, which it sees, are not."""
 _CORRELATED, _MISFIT, _UNMET = 3.0, 0.1, 2.0
 """Variances count so much more as errors at neighbouring points go together; what of the displacement the
 compliance cannot explain; how much larger the tissue's own motion is than few quiet frames show."""
@@ -81,6 +84,13 @@ class Observation:
         """Root mean square of what is seen."""
         seen = np.isfinite(self.deviation)
         return float(np.sqrt(np.mean(self.moved[seen] ** 2))) if seen.any() else 0.0
+
+    @property
+    def signal_mm(self) -> float:
+        """The same without what the stated deviation alone would make."""
+        seen = np.isfinite(self.deviation)
+        excess = self.moved[seen] ** 2 - self.deviation[seen] ** 2
+        return float(np.sqrt(np.maximum(excess, 0).mean())) if seen.any() else 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,6 +202,7 @@ def infer(basis: LoadBasis, seen: Observation, own_mm: Floats) -> Posterior:
     known = weight > 0
     rest = float(moved @ (weight * moved) - np.log(weight[known]).sum() + known.sum() * np.log(2 * np.pi))
     count = basis.contacts.shape[1]
+    sizes = np.array(_CONTACTS if len(seen.moved) == 3 else (*_CONTACTS, *_PRESSES))
     flat = basis.contacts.reshape(rank, -1)
     levels: list[_Level] = []
     evidence: list[Floats] = []
@@ -215,11 +226,11 @@ def infer(basis: LoadBasis, seen: Observation, own_mm: Floats) -> Posterior:
         total = basis.force @ mean[:rank], covariance
         level = _Level(mean[:rank], square, pull.reshape(-1, 3), taken[:rank], *total)
         levels.append(level)
-        for size in _CONTACT:
-            scaled = square + np.eye(3) / size**2
+        for size in sizes:
+            scaled = square + np.diag(1 / size**2)
             force = np.linalg.solve(scaled, level.pull[..., None])[..., 0]
             gain = 0.5 * (level.pull * force).sum(axis=1) - 0.5 * np.log(np.linalg.det(scaled))
-            evidence.append(alone + gain - 3 * np.log(size) - np.log(count))
+            evidence.append(alone + gain - np.log(size).sum() - np.log(count))
         evidence.append(np.array([alone]))
     score = np.concatenate(evidence)
     # Systematic draws: as many of each hypothesis as it is likely, none left out for being one of many.
@@ -230,13 +241,13 @@ def infer(basis: LoadBasis, seen: Observation, own_mm: Floats) -> Posterior:
     force, covariance = np.empty((len(best), 3)), np.empty((len(best), 3, 3))
     coefficients, carried = np.zeros(rank), np.zeros((len(basis.shares), 3))
     for k, (hypothesis, part) in enumerate(zip(best, share, strict=True)):
-        level = levels[hypothesis // (len(_CONTACT) * count + 1)]
-        inside = hypothesis % (len(_CONTACT) * count + 1)
+        level = levels[hypothesis // (len(sizes) * count + 1)]
+        inside = hypothesis % (len(sizes) * count + 1)
         force[k], covariance[k] = level.force, level.covariance
         mean = level.mean
-        if inside < len(_CONTACT) * count:
+        if inside < len(sizes) * count:
             h = int(inside % count)
-            variance = np.linalg.inv(level.square[h] + np.eye(3) / _CONTACT[inside // count] ** 2)
+            variance = np.linalg.inv(level.square[h] + np.diag(1 / sizes[inside // count] ** 2))
             contact = variance @ level.pull[h]
             # What a contact adds to the total, less what the smooth loads then leave to it.
             moves = level.taken @ basis.contacts[:, h]

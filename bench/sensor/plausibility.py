@@ -6,7 +6,7 @@ No method is trusted for this; but what all of them contradict alike is the sens
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +22,7 @@ _SIDEWAYS = 0.2  # of the force must lie in the axes that are seen
 _LITTLE, _MUCH, _APART = 0.2, 0.7, 0.5  # cosine of what doesn't agree, of what does, and between them
 _LATE_S, _DRIFTS = 1.5, (0.9, 0.92, 0.94, 0.96, 0.98, 1.0, 1.02, 1.04, 1.06, 1.08, 1.1)
 _SURE, _LESS = 0.96, 0.3  # correlation; share of what it lacks that another clock must leave
+_TRIED = 100  # lags either way, and places of a gap, at most
 _LEAST_PART = 4  # frames before a gap, and after it
 _COMMON = 0.6  # share of the frames that another clock must leave
 _STANDS_FRAMES, _MOVES = 3, 0.25  # share of the largest motion
@@ -99,25 +100,11 @@ def _axes(axes: Curve, forces: Sequence[Curve], n: int) -> list[Finding]:
 
 def _clock(time_s: Curve, size: Curve, moved: Curve) -> list[Finding]:
     """Whether force and motion agree much better at another clock, from some frame on, or backwards."""
-    start, frame = time_s[0], float(np.median(np.diff(time_s)))
-    tried = [("the film runs backwards", start + time_s[-1] - time_s)]
-    most = round(2 * _LATE_S / frame)
-    lags = [k * frame / 2 for k in range(-most, most)]
-    for lag, drift in itertools.product(lags, _DRIFTS):
-        if drift == 1 and abs(lag) < frame:  # tissue that creeps is as late
-            continue
-        said = f"the sensor's clock is moved by {lag:+.2f} s"
-        said += f" and runs {1 / drift:.2f} times as fast" if drift != 1 else ""
-        tried.append((said, start + (time_s - start) * drift - lag))
-    gaps = [lag for lag in lags if abs(lag) >= frame]
-    for lag, k in itertools.product(gaps, range(_LEAST_PART, len(time_s) - _LEAST_PART)):
-        said = (
-            f"{abs(lag):.2f} s of the film are {'missing' if lag < 0 else 'shown twice'} at {time_s[k]:.2f} s"
-        )
-        tried.append((said, time_s - lag * (np.arange(len(time_s)) >= k)))
     best, found = _LESS, ""
-    for said, at in tried:
-        inside = (at >= start) & (at <= time_s[-1])
+    if _correlation(size, moved) >= _SURE:
+        return []
+    for said, at in _clocks(time_s):
+        inside = (at >= time_s[0]) & (at <= time_s[-1])
         if inside.sum() < max(_COMMON * len(at), _LEAST_FRAMES):
             continue
         now = _correlation(size[inside], moved[inside])
@@ -126,6 +113,26 @@ def _clock(time_s: Curve, size: Curve, moved: Curve) -> list[Finding]:
             best = (1 - other) / (1 - now)
             found = f"force and motion correlate by {now:.2f}, but by {other:.2f} if {said}"
     return [Finding("odd", "clocks", found)] if found else []
+
+
+def _clocks(time_s: Curve) -> Iterator[tuple[str, Curve]]:
+    """What may be wrong with a clock, and when its frames (T,) then were [s]."""
+    start, frame = time_s[0], float(np.median(np.diff(time_s)))
+    yield "the film runs backwards", start + time_s[-1] - time_s
+    most = round(2 * _LATE_S / frame)
+    lags = [k * frame / 2 for k in range(-most, most, max(1, most // _TRIED))]
+    for lag, drift in itertools.product(lags, _DRIFTS):
+        if drift == 1 and abs(lag) < frame:  # tissue that creeps is as late
+            continue
+        said = f"the sensor's clock is moved by {lag:+.2f} s"
+        said += f" and runs {1 / drift:.2f} times as fast" if drift != 1 else ""
+        yield said, start + (time_s - start) * drift - lag
+    gaps = [lag for lag in lags if abs(lag) >= frame]
+    starts = range(_LEAST_PART, len(time_s) - _LEAST_PART, max(1, len(time_s) // _TRIED))
+    for lag, k in itertools.product(gaps, starts):
+        what = "missing" if lag < 0 else "shown twice"
+        said = f"{abs(lag):.2f} s of the film are {what} at {time_s[k]:.2f} s"
+        yield said, time_s - lag * (np.arange(len(time_s)) >= k)
 
 
 def _stands(time_s: Curve, axes: Curve, moved: Curve) -> list[Finding]:

@@ -133,7 +133,6 @@ def track_recording(
                     forces.out.turning = forces.out.turning or SurfaceMotion(video.tissue)
                     forces.out.turning.add(frame.time_s, frame.flow, frame.confidence)
         out = forces.out
-        forces.revise(about)
         if not out.time_s:
             if video.decoded <= about.rest_frame:
                 raise UserError(
@@ -141,6 +140,8 @@ def track_recording(
                 )
             raise UserError(f"{recording.folder}: no frame has a time; give frames.csv, or fps in meta.yaml")
         found = video.find_pulse(about.pulse.free_s)
+        if pulse is not None or found is None:  # else all is read again
+            forces.revise(about)
         out.stereo = None if second is None else second.quality
         _describe(out, video, recording, methods, scale_mm_per_px * video.shrink)
         return out, found

@@ -91,6 +91,25 @@ def test_a_method_cannot_change_what_the_others_see(recording: Path) -> None:
     assert np.nanmax(both["b"].size_mn) > 0
 
 
+def test_a_method_may_answer_a_whole_film_anew(recording: Path) -> None:
+    class Later:
+        short = False
+
+        def __call__(self, flow: Any, confidence: Any, scene: Any, picture: bool) -> bench.ForceEstimate:
+            return bench.ForceEstimate(np.zeros(3))
+
+        def revise(self, quiet: Any) -> list[bench.ForceEstimate]:
+            count = len(quiet) - self.short
+            return [bench.ForceEstimate(np.array([1.0 + k, 0.0, 0.0])) for k in range(count)]
+
+    settings, later = bench.Settings(rate_hz=None, pulse=False), Later()
+    found = bench.score(recording, methods={"later": later}, settings=settings, baselines=False)
+    assert found.methods["later"].size_mn.tolist() == [1.0 + k for k in range(len(found.time_s))]
+    later.short = True
+    with pytest.raises(UserError):
+        bench.score(recording, methods={"later": later}, settings=settings, baselines=False)
+
+
 def test_a_name_of_ours_is_not_taken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     installed(tmp_path, monkeypatch, physics="Push")
     with pytest.raises(UserError, match="physics"):

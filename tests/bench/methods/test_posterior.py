@@ -53,6 +53,19 @@ def test_a_contacts_force_is_found_and_held(basis: LoadBasis, force: list[float]
 
 
 @pytest.mark.slow
+def test_one_eye_says_that_it_hardly_sees_a_press_along_the_view(basis: LoadBasis) -> None:
+    one_eye, inside, count = posterior.load_basis(2, BARE), 0, 0
+    for size in (1.0, 2.0, 3.0, 5.0):
+        moved = pressed(basis, BARE, [0.0, 0.0, size])[:, :2]
+        for noise in (0.04, 0.06):
+            for seed in range(5):
+                found = posterior.infer(one_eye, seen(moved, noise, seed), STILL[:2])
+                low, high = physics.size_interval(found, 0.08, eyes=1)
+                inside, count = inside + (low <= size <= high), count + 1
+    assert inside >= 0.85 * count
+
+
+@pytest.mark.slow
 def test_no_motion_is_no_force(basis: LoadBasis) -> None:
     for noise in (0.0, 0.03):
         found = posterior.infer(basis, seen(np.zeros((len(basis.known.points), 3)), noise), STILL)
@@ -68,7 +81,8 @@ def test_the_tissues_own_motion_is_learnt_where_nothing_touches(basis: LoadBasis
     terms = posterior.polynomials(basis.known.points)
     own = [terms @ (rng.normal(size=(6, 3)) * [0.0, 0.05, 0.25]) for _ in range(9)]
     sizes = posterior.own_motion(basis, [seen(one, 0.005) for one in own[:8]])
-    assert sizes == pytest.approx([0.0, 0.1, 0.5], abs=0.2)
+    assert sizes[0] < 0.03
+    assert sizes[1:] == pytest.approx([0.1, 0.5], rel=0.5)  # twice the drawn: few frames show less
     force = np.array([0.5, 0.0, 2.0])
     both = seen(pressed(basis, BARE, force.tolist()) + own[8], 0.01)
     told, untold = (posterior.infer(basis, both, size).mean for size in (sizes, STILL))
@@ -81,7 +95,7 @@ def test_ninety_of_a_hundred_draws_of_the_model_lie_in_its_interval(basis: LoadB
     rng, inside, count = np.random.default_rng(2), 0, 150
     sizes = np.array([0.02, 0.02, 0.05])
     for _ in range(count):
-        spread, size = rng.choice(posterior._SPREAD), rng.choice(posterior._CONTACT)
+        spread, size = rng.choice(posterior._SPREAD), np.array(rng.choice(posterior._CONTACTS))
         smooth = spread * basis.size * rng.normal(size=len(basis.size))
         contact = size * rng.normal(size=3)
         inward = basis.contacts[:, rng.integers(basis.contacts.shape[1])] @ contact
@@ -133,9 +147,13 @@ def test_a_film_tells_a_membrane_and_meta_narrows_it(basis: LoadBasis) -> None:
         film = [seen(pressed(basis, tissue, [1.0, 0.0, level]), 0.01) for level in (2.0, 4.0)]
         found = physics.weigh_tissues(scene, film, STILL)
         stiff.append(float(found.weight @ [one.membrane for one in found.tissues]))
-    assert "evidence for a membrane of about" in physics.describe(found, 2.0)
+    assert "evidence for a membrane of about" in physics.describe(found, scene)
     # Another mesh's bare tissue may look like a thin membrane, never like a thick one.
     assert stiff[0] <= 5
-    assert 20 < stiff[1] <= 101
+    assert stiff[1] > 20
     told = MethodContext(scene.tissue, scene.scale_mm_per_px, 2.0, "stripped", (0.48, 0.49))
     assert {(one.membrane, one.poisson) for one in physics.grid_of(told)} == {(0.0, 0.49)}
+    # What no frame speaks of is as likely as it was beforehand.
+    nothing = physics.weigh_tissues(scene, [], STILL)
+    thick = sum(one > 5 for one in physics.MEMBRANES) / sum(one > 0 for one in physics.MEMBRANES)
+    assert nothing.membrane == pytest.approx(0.33 * thick, abs=0.01)
