@@ -144,41 +144,6 @@ def check(
         raise typer.Exit(2)
 
 
-@app.command(epilog="Example: bench adapt recording --out adapted")
-def adapt(
-    recording: Annotated[Path, typer.Argument(help="Recording folder; a first one will do.")],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the model; OUT-data: its data.")],
-    model: Annotated[
-        Path | None, typer.Option("--model", "-m", help="Model to begin with; what comes along if not given.")
-    ] = None,
-    sequences: Annotated[int, typer.Option(min=40, help="Sequences to render.")] = 200,
-    json: Json = False,
-) -> None:
-    """Trains a network further for one specimen: on rendered sequences that wear the recording's rest frame.
-
-    Its force sensor is not read. The same command continues what was interrupted.
-    """
-    from dataclasses import asdict
-
-    from bench.adaptation.fine_tuning import adapt
-    from bench.recording.folder import open_recording
-    from learn.training.threads import set_threads
-    from synth.engine.progress import RunBars
-
-    set_threads(None)
-    with RunBars() as bars:
-        found = adapt(open_recording(recording), out, model, sequences=sequences, watcher=bars)
-    if json:
-        told = {key: value for key, value in asdict(found).items() if key != "card"}
-        print(json_.dumps({"model": str(out), "epoch": found.card.epoch, **told}))
-        return
-    print(
-        f"wrote {out}: on {found.tested} rendered sequences of this specimen that it never met, the force "
-        f"errs by {found.after:.1%} of its peak, before by {found.before:.1%}; now: bench score {recording} "
-        f"--model {out}"
-    )
-
-
 @app.command(
     "import", epilog="Example: bench import a.mcap --out recording --scale 0.05 --use force=/ft/wrench"
 )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
@@ -52,15 +52,11 @@ def train(
     settings: TrainingSettings,
     out: Path,
     *,
-    start: tuple[ModelCard, Mapping[str, torch.Tensor]] | None = None,
     report: ProgressCallback = lambda done, of: None,
     fabric: Fabric | None = None,
     log: Callable[[dict[str, float]], None] = lambda numbers: None,
 ) -> ModelCard:
     """Trains on `split.fit`, chooses the epoch on `split.select`, never looks at `split.test`.
-
-    `start`: card and weights of a model of the same architecture to go on from, with its scales; it is itself
-    among what is chosen from, and what it was fitted on counts as met. None: random weights.
 
     A folder that holds an unfinished run of the same settings and data is continued; the result is the same,
     bit for bit on one CPU, as that of an uninterrupted run. `report` is told after every batch, `log` gets
@@ -71,20 +67,14 @@ def train(
     fabric = fabric or make_fabric(accelerator="cpu", devices=1, precision=settings.precision)
     fabric.launch()
     fit, select = [clips[i] for i in split.fit], [clips[i] for i in split.select]
-    scales = measure_scales(fit, settings) if start is None else start[0].scales
+    scales = measure_scales(fit, settings)
     card = ModelCard(settings, scales, typical_young(fit), *_provenance(clips, split), [*split.hashes])
-    if start is not None:
-        card = _having_met(card, start[0])
     state = _open(out, card)
     try:
-        run = _start(card, state, None if start is None else start[1])
+        run = _start(card, state)
         net: Any = torch.compile(run.model) if settings.compile else run.model
         net, run.optimizer = fabric.setup(net, run.optimizer)
         frames, chooser = (place_frames(part, settings, fabric.device) for part in (fit, select))
-        if start is not None and state is None:
-            numbers = select_score(net, chooser, scales, fabric.device)
-            run.best = numbers["select_r2"]
-            _keep(fabric, out, card, run, numbers["select_gain"])
         with Log(out, run.epoch) if fabric.is_global_zero else nullcontext() as write:
             for epoch in range(run.epoch, settings.epochs):
                 numbers = _epoch(fabric, net, run.optimizer, frames, scales, epoch, report)
@@ -93,9 +83,10 @@ def train(
                 numbers |= {"epoch": epoch + 1.0, "lr": run.optimizer.param_groups[0]["lr"]}
                 if write is not None:
                     write(epoch, numbers)
-                if improved:
-                    _keep(fabric, out, card, run, numbers["select_gain"])
-                if write is not None:
+                    if improved:
+                        gain = numbers["select_gain"]
+                        best = dataclasses.replace(card, epoch=run.epoch, score=run.best, force_gain=gain)
+                        checkpoint.write_model(out, best, _cpu(run.model.state_dict()))
                     checkpoint.save_tensors(out / "last.pt", run.as_dict())
                 fabric.barrier()
                 log(numbers)
@@ -105,23 +96,6 @@ def train(
             shutil.rmtree(out)
         raise
     return checkpoint.read_card(out)
-
-
-def _keep(fabric: Fabric, out: Path, card: ModelCard, run: _Run, gain: float) -> None:
-    """Writes the model as it is now, the best so far."""
-    if fabric.is_global_zero:
-        best = dataclasses.replace(card, epoch=run.epoch, score=run.best, force_gain=gain)
-        checkpoint.write_model(out, best, _cpu(run.model.state_dict()))
-
-
-def _having_met(card: ModelCard, earlier: ModelCard) -> ModelCard:
-    """The card with what an earlier training met put to it."""
-
-    def joined(own: dict[str, list[str]], others: dict[str, list[str]]) -> dict[str, list[str]]:
-        return {part: [*others.get(part, []), *own.get(part, [])] for part in {**own, **others}}
-
-    split, brains = joined(card.split, earlier.split), joined(card.groups, earlier.groups)
-    return dataclasses.replace(card, split=split, groups=brains)
 
 
 @dataclasses.dataclass
@@ -152,15 +126,11 @@ class _Run:
         return plain | {"model": _cpu(self.model.state_dict())} | moving
 
 
-def _start(
-    card: ModelCard, state: dict[str, Any] | None, weights: Mapping[str, torch.Tensor] | None = None
-) -> _Run:
-    """A fresh run, of given weights or random ones, or one that goes on from what `_Run.as_dict` gave."""
+def _start(card: ModelCard, state: dict[str, Any] | None) -> _Run:
+    """A fresh run, or one that goes on from a state as `_Run.as_dict` gave it."""
     settings = card.settings
     torch.manual_seed(settings.seed)
     model = D2FNet(settings.arch)
-    if weights is not None:
-        model.load_state_dict(dict(weights))
     if settings.channels_last:
         model = model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     optimizer = torch.optim.AdamW(

@@ -41,7 +41,7 @@ def measure(rgb: Picture, usable: Mask, mm_per_px: float, reach: float = 1.0) ->
     """
     linear = decode(rgb)
     tissue = _between_vessels(linear, usable & ~mask_detection.glare(rgb, 2), mm_per_px)
-    red = smooth(linear, tissue, _TISSUE_MM / mm_per_px)[..., 0]
+    red = _smooth(linear, tissue, _TISSUE_MM / mm_per_px)[..., 0]
     grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.float32)
     noise = _noise(grey, tissue)
     colour = linear[tissue].mean(axis=0) if tissue.sum() > _LEAST else np.full(3, np.nan)
@@ -62,15 +62,15 @@ def decode(rgb: Picture) -> Map:
 
 
 def _between_vessels(linear: Map, clear: Mask, mm_per_px: float) -> Mask:
-    surround = smooth(linear, clear, _SURROUND_MM / mm_per_px)[..., 1]
+    surround = _smooth(linear, clear, _SURROUND_MM / mm_per_px)[..., 1]
     fine = cv2.GaussianBlur(linear[..., 1], (0, 0), 0.8)
     vessel = clear & (np.log(np.maximum(surround, 1e-3) / np.maximum(fine, 1e-3)) > _DARK)
     side = 2 * max(1, round(_GROWN_MM / mm_per_px)) + 1
     return np.asarray(clear & ~(cv2.dilate(vessel.astype(np.uint8), np.ones((side, side))) > 0))
 
 
-def smooth(linear: Map, where: Mask, sigma: float) -> Map:
-    """(H, W, C) Gaussian mean of those pixels of (H, W, C) that are in a mask (H, W); `sigma` [px]."""
+def _smooth(linear: Map, where: Mask, sigma: float) -> Map:
+    """Mean of the neighbourhood's pixels that are in a mask."""
     weight = cv2.GaussianBlur(where.astype(np.float32), (0, 0), sigma)
     total = cv2.GaussianBlur(linear * where[..., None], (0, 0), sigma)
     return np.asarray(total / np.maximum(weight, 1e-3)[..., None])

@@ -58,7 +58,6 @@ ORDER = (
     "bench.sensor",
     "bench.methods",
     "bench.tracking",
-    "bench.adaptation",
     "bench.scoring",
     "bench.cli",
     "bench.__main__",

@@ -190,18 +190,3 @@ def test_what_a_network_says_too_little_of_the_force_is_its_gain(
     assert found["select_gain"] == pytest.approx(np.clip(slope, *limits), rel=1e-6)
     if limits == (1.0, 1.5):
         assert 1.0 < slope < 1.5, "within the limits nothing else is tested"
-
-
-def test_training_goes_on_from_a_model_that_is_there(
-    clips: list[Clip], split: Split, model: Path, tmp_path: Path
-) -> None:
-    net, began = checkpoint.read_model(model)
-    others = [dataclasses.replace(clip, content_hash=f"other {clip.content_hash}") for clip in clips]
-    settings = replace(began.settings, learning_rate=1e-12, epochs=1)
-    card = train(others, split, settings, tmp_path / "model", start=(began, net.state_dict()))
-    assert card.scales == began.scales
-    assert card.score >= began.score - 1e-6  # what it began with is among what is chosen from
-    assert set(card.split["fit"]) == {*began.split["fit"], *(others[i].content_hash for i in split.fit)}
-    after = dict(checkpoint.read_model(tmp_path / "model")[0].named_parameters())
-    for name, value in net.named_parameters():
-        assert torch.allclose(after[name], value, atol=1e-6)
