@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import hashlib
 import pickle
 from collections.abc import Callable, Sequence
 
@@ -12,7 +10,6 @@ import sklearn
 from bench.methods.baselines import Rule
 from synth.dataset import provenance
 from synth.system import cache
-from synth.system.checked_file import write_whole
 
 _MOST = 8
 
@@ -27,15 +24,6 @@ def cached_rules(hashes: Sequence[str], source: str, fit: Callable[[], dict[str,
     """
     code = provenance.source("synth", "learn", "bench/methods")
     key = "\n".join([code, sklearn.__version__, source, *hashes]).encode()
-    folder = cache.folder("baselines")
-    file = folder / f"{hashlib.sha256(key).hexdigest()[:32]}.pickle"
     # Half a file, of a disk that was full, is no fit; nor is one of another Python.
-    with contextlib.suppress(OSError, EOFError, pickle.UnpicklingError, AttributeError, ImportError):
-        rules: dict[str, Rule] = pickle.loads(file.read_bytes())
-        return rules
-    rules = fit()
-    with contextlib.suppress(OSError):
-        write_whole(file, pickle.dumps(rules), durable=False)
-        for old in sorted(folder.glob("*.pickle"), key=lambda one: one.stat().st_mtime)[:-_MOST]:
-            old.unlink()
-    return rules
+    faults = EOFError, pickle.UnpicklingError, AttributeError, ImportError
+    return cache.kept("baselines/pickle", key, fit, pickle.dumps, pickle.loads, faults, _MOST)

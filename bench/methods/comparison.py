@@ -15,9 +15,8 @@ from synth.errors import UserError
 
 MAIN = "D2FNet"
 """Name under which the given model stands in every table."""
-
-
 PHYSICS = "physics"
+"""The same of the inverse."""
 
 
 def untrained() -> dict[str, Method]:

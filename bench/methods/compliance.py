@@ -7,8 +7,6 @@ tell of the tissue (`TissueKind`) is a small grid of maps, kept on disk once the
 
 from __future__ import annotations
 
-import contextlib
-import hashlib
 import io
 from dataclasses import dataclass
 from functools import lru_cache
@@ -28,7 +26,6 @@ from synth.fem.surface_embedding import Embedding
 from synth.fem.system import System, assemble
 from synth.job import schema
 from synth.system import cache
-from synth.system.checked_file import write_whole
 
 Floats = NDArray[np.float64]
 
@@ -134,16 +131,20 @@ def _stored(tissue: TissueKind, tets: int, point_mm: float, node_mm: float) -> N
     """(3 P, 3 K) from this user's cache, or solved and kept there."""
     code = provenance.source("synth/fem", "synth/job").encode() + Path(__file__).read_bytes()
     key = code + f"{tissue} {tets} {point_mm} {node_mm}".encode()
-    file = cache.folder("compliance") / f"{hashlib.sha256(key).hexdigest()[:32]}.npy"
-    with contextlib.suppress(OSError, ValueError, EOFError):
-        return np.asarray(np.load(file, allow_pickle=False), np.float32)
-    matrix = _solved(tissue, tets, point_mm, node_mm).astype(np.float32)
-    with contextlib.suppress(OSError):
-        np.save(held := io.BytesIO(), matrix)
-        write_whole(file, held.getvalue(), durable=False)
-        for old in sorted(file.parent.glob("*.npy"), key=lambda one: one.stat().st_mtime)[:-_MOST]:
-            old.unlink()
-    return matrix
+    return cache.kept(
+        "compliance/npy",
+        key,
+        lambda: _solved(tissue, tets, point_mm, node_mm).astype(np.float32),
+        _dumped,
+        lambda data: np.asarray(np.load(io.BytesIO(data), allow_pickle=False), np.float32),
+        (ValueError, EOFError),
+        _MOST,
+    )
+
+
+def _dumped(matrix: NDArray[np.float32]) -> bytes:
+    np.save(held := io.BytesIO(), matrix)
+    return held.getvalue()
 
 
 def _solved(tissue: TissueKind, tets: int, point_mm: float, node_mm: float) -> Floats:

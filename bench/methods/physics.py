@@ -99,8 +99,8 @@ class Physics:
         if not self._quiet:
             said = (
                 "no span without contact is known on the film's clock (sensor.free_s, or pulse.free_s where "
+                "clocks are found by correlation): what the tissue does by itself is taken for loads"
             )
-            said += "clocks are found by correlation): what the tissue does by itself is taken for loads"
         return [describe(self._film, self._scene), said]
 
     def _add(self, moved: Field, spread: Field, scene: MethodContext, picture: bool) -> ForceEstimate:

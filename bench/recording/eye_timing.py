@@ -21,7 +21,6 @@ Motion = NDArray[np.float64]
 Places = NDArray[np.float32]
 
 _CORNERS, _APART_PX, _LEAST_POINTS = 200, 5, 8
-_FLOOR, _GREY = 3.0, 32.0  # of local contrast
 _WINDOW = (13, 13)
 _STOP = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 20, 0.01)
 _BACK_PX = 0.5  # from where a corner was, once it is followed forth and back
@@ -76,9 +75,7 @@ class EyeTiming:
     def _picture(self, rgb: Rgb, eye: int) -> NDArray[np.uint8]:
         """(H, W) local contrast, rectified."""
         grey = cv2.GaussianBlur(self._rectified.picture(rgb @ image.GREY, eye), (0, 0), 1)
-        detail = grey - cv2.blur(grey, _WINDOW)
-        spread = np.sqrt(np.maximum(cv2.blur(detail * detail, _WINDOW), 0)) + _FLOOR
-        return np.asarray(np.clip(128 + _GREY * detail / spread, 0, 255), np.uint8)
+        return image.local_contrast(grey, _WINDOW)
 
 
 def find_lag(left: Motion, right: Motion) -> tuple[float, int]:

@@ -245,13 +245,12 @@ class _Forces:
         sensor_s = [(a + about.sync.offset_s, b + about.sync.offset_s) for a, b in about.sensor.free_s]
         spans = [*about.pulse.free_s, *(sensor_s if about.sync.method != "correlate" else [])]
         times = np.array(self.out.time_s)
-        quiet = np.array([(times >= a) & (times <= b) for a, b in spans]).any(axis=0) & np.array(
-            self.out.trusted
-        )
+        inside = np.any([(times >= a) & (times <= b) for a, b in spans], axis=0)  # False of none
+        quiet = np.array(self.out.trusted, bool) & inside
         for name, method in self.methods.items():
             if isinstance(method, Revising) and len(times):
                 with self.watch.stage(name):
-                    answers = method.revise(quiet if spans else np.zeros(len(times), bool))
+                    answers = method.revise(quiet)
                 self.out.force_mn[name] = [one.force_mn for one in answers]
                 self.out.bounds[name] = [(one.low_mn, one.high_mn) for one in answers]
 

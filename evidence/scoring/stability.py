@@ -26,7 +26,8 @@ import typer
 from numpy.typing import NDArray
 from ruamel.yaml import YAML
 
-from bench.methods.comparison import PHYSICS, untrained
+from bench.methods.comparison import PHYSICS
+from bench.methods.physics import Physics
 from bench.recording import writer
 from bench.recording.from_sequence import export_recording
 from bench.scoring.score import score
@@ -47,7 +48,7 @@ _KEY = ("film", "scene")
 _SENSOR_HZ, _SENSOR_NOISE = 100.0, 0.005
 _DOUBLED, _LEAST, _COVERED = 2.0, 0.1, 0.8
 _NOTES = "unseen world|again, frozen"
-_PHYSICAL = {PHYSICS: untrained()[PHYSICS]}
+_PHYSICAL = {PHYSICS: Physics()}
 
 
 @dataclass(frozen=True, eq=False)

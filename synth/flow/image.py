@@ -18,7 +18,17 @@ from synth.flow import fused
 
 GREY = np.array([0.2, 0.6, 0.2], np.float32)
 """Luminance from red, green, blue: vessels stand out in green, noise falls by averaging."""
+GREY_PER_DEVIATION = 32.0
+"""Normalised contrast of +-4 deviations spans 8 bits."""
 _FLOOR = 3.0  # grey levels: contrast below this is noise and isn't stretched to full contrast
+
+
+def local_contrast(grey: NDArray[np.float32], window: tuple[int, int]) -> NDArray[np.uint8]:
+    """(H, W) of a picture (H, W) in grey levels, about 128: gain and offset of the light are taken out."""
+    detail = grey - cv2.blur(grey, window)
+    # A blur's running sums may end below 0 where a picture is blank.
+    spread = np.sqrt(np.maximum(cv2.blur(detail * detail, window), 0)) + _FLOOR
+    return np.asarray(np.clip(128 + GREY_PER_DEVIATION * detail / spread, 0, 255), np.uint8)
 
 
 @dataclass(frozen=True)

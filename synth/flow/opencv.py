@@ -10,7 +10,6 @@ import numpy as np
 from synth.flow import image
 from synth.flow.estimator import Flags, Flow, Map, Rgb
 
-_GREY_PER_DEVIATION = 32.0  # normalised contrast of +-4 deviations spans 8 bits
 _RESIDUAL = 0.6  # in local deviations: where two aligned pictures differ by more they don't match
 _SMALLEST = 16  # OpenCV's estimators want some pixels to build a pyramid from
 _cv2: Any = cv2  # its type stubs leave out the contributed modules
@@ -79,7 +78,7 @@ def _prepare(picture: Rgb, usable: Flags) -> Rgb:
     known = image.flags(usable)
     contrast = image.normalise(image.tensor(picture), known)
     filled = image.fill(contrast, known)[0, 0].numpy()
-    return np.clip(np.round(128 + _GREY_PER_DEVIATION * filled), 0, 255).astype(np.uint8)
+    return np.clip(np.round(128 + image.GREY_PER_DEVIATION * filled), 0, 255).astype(np.uint8)
 
 
 def _confidence(flow: Flow, before: Rgb, after: Rgb, rest_usable: Flags, now_usable: Flags) -> Map:
@@ -89,7 +88,7 @@ def _confidence(flow: Flow, before: Rgb, after: Rgb, rest_usable: Flags, now_usa
     y = np.arange(height, dtype=np.float32)[:, None] + flow[..., 1]
     seen = cv2.remap(now_usable.astype(np.float32), x, y, cv2.INTER_LINEAR, borderValue=0) * rest_usable
     aligned = cv2.remap(after.astype(np.float32), x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    difference = cv2.GaussianBlur(((aligned - before) * seen / _GREY_PER_DEVIATION) ** 2, (0, 0), 2.0)
+    difference = cv2.GaussianBlur(((aligned - before) * seen / image.GREY_PER_DEVIATION) ** 2, (0, 0), 2.0)
     share = cv2.GaussianBlur(seen, (0, 0), 2.0)
     residual = difference / np.maximum(share, 1e-3)
     return np.asarray(seen * np.exp(-residual / _RESIDUAL**2), np.float32)

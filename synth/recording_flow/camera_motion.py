@@ -14,13 +14,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from synth.flow import image
 from synth.flow.estimator import Flags, Rgb
 
 Floats = NDArray[np.float64]
 
 _CORNERS, _APART_PX, _RIM_PX = 200, 5, 4  # the rim between tissue and surroundings may show either
 _SMOOTH_PX = 1.0  # bilinear sampling of sharper pictures is off by up to 0.03 px
-_FLOOR, _GREY = 3.0, 32.0  # of local contrast, as in `synth.flow.opencv`
 _WINDOW = (13, 13)
 _STOP = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 10, 0.01)
 _FAR_PX = 5.0  # of jumps beyond that many corners are lost
@@ -211,8 +211,7 @@ class CameraTracker:
         left = at + shift - (at @ guess[:, :2].T + guess[:, 2])
         for _ in range(_ROUNDS):
             off = np.linalg.norm(left, axis=1)
-            spread = max(float(np.median(off)) / 1.18, _LEAST_SPREAD_PX)  # Rayleigh's median
-            weight = np.maximum(1 - (off / (_OUTLIER * spread)) ** 2, 0) ** 2
+            weight, spread = weigh_outliers(off, off)
             weighed = np.repeat(weight, 2)[:, None] * design
             normal = weighed.T @ design
             if weight.sum() < _LEAST_POINTS / 2 or np.linalg.cond(normal) > _SINGULAR:
@@ -239,13 +238,16 @@ class CameraTracker:
         return float(np.sqrt(np.square(self._tissue @ matrix[:, :2].T + matrix[:, 2]).sum(axis=1).mean()))
 
 
+def weigh_outliers(off: Floats, typical: Floats) -> tuple[Floats, float]:
+    """(N,) Tukey's biweight of distances [px], and the deviation of a component that `typical` ones show."""
+    spread = max(float(np.median(typical)) / 1.18, _LEAST_SPREAD_PX)  # Rayleigh's median
+    return np.maximum(1 - (off / (_OUTLIER * spread)) ** 2, 0) ** 2, spread
+
+
 def _contrast(rgb: Rgb) -> NDArray[np.uint8]:
-    """(H, W) local contrast about 128: gain and offset of the light are taken out."""
+    """(H, W) local contrast."""
     grey = cv2.GaussianBlur(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.float32), (0, 0), _SMOOTH_PX)
-    detail = grey - cv2.blur(grey, _WINDOW)
-    # A blur's running sums may end below 0 where a picture is blank.
-    spread = np.sqrt(np.maximum(cv2.blur(detail * detail, _WINDOW), 0)) + _FLOOR
-    return np.asarray(np.clip(128 + _GREY * detail / spread, 0, 255), np.uint8)
+    return image.local_contrast(grey, _WINDOW)
 
 
 def _corners(picture: NDArray[np.uint8], where: Flags) -> NDArray[np.float32]:

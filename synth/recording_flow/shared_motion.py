@@ -14,17 +14,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from synth.flow.estimator import Flags
-from synth.recording_flow.camera_motion import CameraPath, Course, Floats, Similarity, SimilarityBasis
+from synth.recording_flow.camera_motion import (
+    CameraPath,
+    Course,
+    Floats,
+    Similarity,
+    SimilarityBasis,
+    weigh_outliers,
+)
 from synth.recording_flow.pulse import VISIBLE, PulseEstimate, SurfaceMotion, in_cells
 
 _LEAST_PX, _PURE = 0.3, 0.2  # of the first motion that is a camera's, and of it at most what is no similarity
 _JUMP = 5.0  # usual steps: what is sudden
 _USUAL = 8  # steps
-_NOISE_PX, _CALM_PX = (
-    0.02,
-    0.005,
-)  # of a frame's similarity; by which a camera at rest moves from frame to frame
-_ROUNDS, _OUTLIER, _LEAST_SPREAD_PX, _MOST = 4, 4.0, 0.03, 0.7  # of a fit, as in `camera_motion`
+_NOISE_PX = 0.02  # of a frame's similarity
+_CALM_PX = 0.005  # by which a camera at rest moves from frame to frame
+_ROUNDS, _MOST = 4, 0.7  # of a fit
 _MOST_SHAPES, _NEW, _NEW_PX = 4, 0.15, 0.12  # what shapes leave of a motion is another's, if so much
 _DOUBT = 0.5  # of the similarity of a shape of 1 px, as a half-space has it
 _LEFT = 1.0  # px of similarity that go with a px that no shape explains
@@ -139,8 +144,7 @@ class SharedMotion:
             answer = np.linalg.lstsq(weighed.T @ both, weighed.T @ motion, rcond=1e-9)[0]
             left = motion - both @ answer
             off = np.linalg.norm(left.reshape(-1, 2), axis=1)
-            spread = max(float(np.median(off[weight > 0])) / 1.18, _LEAST_SPREAD_PX)  # Rayleigh's median
-            sure = weight * np.maximum(1 - (off / (_OUTLIER * spread)) ** 2, 0) ** 2
+            sure = weight * weigh_outliers(off, off[weight > 0])[0]
         return np.asarray(answer[:4]), np.asarray(answer[4:]), left * np.repeat(weight > 0, 2)
 
     def _learn(self, shape: Floats) -> None:

@@ -1,12 +1,20 @@
-"""Where compiled code is kept between runs: a folder of our own, bounded, that can always be written."""
+"""What is kept between runs, compiled or computed: folders of our own, bounded, that can be written."""
 
 from __future__ import annotations
 
+import contextlib
 import functools
+import hashlib
 import os
 import stat
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
+from typing import TypeVar
+
+from synth.system.checked_file import write_whole
+
+T = TypeVar("T")
 
 LIMIT_BYTES = 512 * 1024**2
 """What the renderer's compiled kernels may take; the least recently used go first."""
@@ -42,3 +50,35 @@ def folder(name: str) -> Path:
         raise PermissionError(f"{mine}: is not this user's alone")
     (mine / name).mkdir(exist_ok=True)
     return mine / name
+
+
+def kept(
+    file: str,
+    key: bytes,
+    make: Callable[[], T],
+    dump: Callable[[T], bytes],
+    load: Callable[[bytes], T],
+    faults: tuple[type[Exception], ...],
+    most: int,
+) -> T:
+    """What `make` gives, from this user's cache if it was made before.
+
+    Args:
+        file: folder and ending, `compliance/npy`.
+        key: of all that it is made of.
+        make: computes it.
+        dump: to the bytes of a file.
+        load: of these.
+        faults: what `load` raises of half a file, of a disk that was full, or one that others wrote.
+        most: files that are kept, the newest.
+    """
+    name, ending = file.split("/")
+    place = folder(name) / f"{hashlib.sha256(key).hexdigest()[:32]}.{ending}"
+    with contextlib.suppress(OSError, *faults):
+        return load(place.read_bytes())
+    made = make()
+    with contextlib.suppress(OSError):
+        write_whole(place, dump(made), durable=False)
+        for old in sorted(place.parent.glob(f"*.{ending}"), key=lambda one: one.stat().st_mtime)[:-most]:
+            old.unlink()
+    return made
