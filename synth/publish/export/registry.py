@@ -10,7 +10,7 @@ from synth.dataset.index import group_by_side
 from synth.dataset.store import Dataset
 from synth.errors import UserError
 from synth.publish import film
-from synth.publish.export import d2fnet, endonerf, hugging_face, lerobot, plain, webdataset
+from synth.publish.export import d2fnet, endonerf, hugging_face, lerobot, plain, tapvid, webdataset
 from synth.system import checked_file
 
 FORMATS: dict[str, Callable[..., None]] = {
@@ -19,6 +19,7 @@ FORMATS: dict[str, Callable[..., None]] = {
     "webdataset": webdataset.write_shards,
     "lerobot": lerobot.write_episodes,
     "endonerf": endonerf.write_scenes,
+    "tapvid": tapvid.write_tracks,
     "hdf5": plain.write_hdf5,
     "d2fnet-npz": d2fnet.write_npz,
     "video": film.write_films,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import io
 import json
 import tarfile
 from pathlib import Path
@@ -183,7 +184,7 @@ def test_lerobots_files_are_as_its_format_says(root: Path, tmp_path: Path) -> No
 
 
 def moving(out: Path, job: Job) -> list[Camera]:
-    """A plane seen by a lens with distortion, off its middle, that shifts and turns."""
+    """A plane seen by a lens with distortion, off its middle, that shifts and turns; flow by OpenCV."""
     width, height = job.render.size
     K = np.array([[900.0, 0, 30.0], [0, 900.0, 19.0], [0, 0, 1]])
     bent = np.array([-0.2, 0.05, 0.001, -0.002, 0.0])
@@ -196,24 +197,36 @@ def moving(out: Path, job: Job) -> list[Camera]:
     rows, columns = np.mgrid[:height, :width]
     pixels = np.stack([columns, rows], axis=-1).reshape(-1, 2).astype(float)
     poses = np.tile(np.eye(4), (job.frames, 1, 1))
+    depths, points = [], np.zeros((0, 3))  # of the rest frame's pixels, world axes
     for t, camera in enumerate(cameras):
         start, way = camera.centre, rays(camera, pixels) @ camera.rotation
         hit = start - way * (start[2] / way[:, 2])[:, None]  # the plane z = 0
         local = hit @ camera.rotation.T + camera.translation
         poses[t, :3, :3], poses[t, :3, 3] = camera.rotation, camera.translation
+        points = points if t else hit
+        depths.append(local[:, 2])
+        moved = points @ camera.rotation.T + camera.translation
+        flow = cv2.projectPoints(moved, np.zeros(3), np.zeros(3), K, bent)[0].reshape(-1, 2) - pixels
+        motion = moved - (points @ cameras[0].rotation.T + cameras[0].translation)
         shade = np.clip(128 + 40 * np.sin(hit[:, 0]) + 40 * np.cos(1.3 * hit[:, 1]), 0, 255)
         still = np.zeros((height, width))
         values = {
             "rgb": np.repeat(shade.reshape(height, width, 1), 3, axis=-1).astype(np.uint8),
             "depth": local[:, 2].reshape(height, width).astype(np.float32),
-            "flow": np.zeros((height, width, 2), np.float32),
+            "flow": flow.reshape(height, width, 2).astype(np.float32),
+            "motion": motion.reshape(height, width, 3).astype(np.float32),
             "traction": np.zeros((height, width, 3), np.float32),
             "tool": columns < 5,
-            "visible": still == 0,
+            "visible": (rows + columns + t) % 3 > 0,
             "glare": still > 0,
         }
+        for name in ("rgb", "flow", "visible", "depth"):
+            values[f"{name}_right"] = values[name]  # of which nothing is read
         for name, value in values.items():
             writer.put_frame(name, t, value)
+    baseline, shifted = job.render.stereo_mm, K + np.array([[0, 0, 70.0], [0, 0, 0], [0, 0, 0]])
+    disparity = K[0, 0] * baseline / depths[0] - (shifted[0, 2] - K[0, 2])
+    writer.put("disparity", disparity.reshape(height, width).astype(np.float32))
     writer.put("camera", poses)
     writer.put("time", np.arange(job.frames) / job.fps)
     writer.put("force", np.zeros((job.frames, 3)))
@@ -222,6 +235,7 @@ def moving(out: Path, job: Job) -> list[Camera]:
     writer.seal(
         K=K.tolist(),
         distortion=bent.tolist(),
+        right={"K": shifted.tolist(), "baseline_mm": baseline},
         rotation=cameras[0].rotation.tolist(),
         translation=cameras[0].translation.tolist(),
         young_kpa=1.0,
@@ -269,6 +283,39 @@ def test_endonerfs_points_are_the_scenes(tmp_path: Path) -> None:
         assert np.abs(picture[:, 0] - drawn).mean() < 2.0
         where = project(camera, scene)
         assert (where[:, 0] > 4).all(), "the instrument is masked"
+
+
+def test_tapvids_tracks_are_the_scenes(tmp_path: Path) -> None:
+    """As both readers take them: in the picture, in space through the stated lens, and the store's mask."""
+    render = {"size": (64, 48), "stereo_mm": 24.0}
+    job = Job(sequences=1, frames=4, render=render, flow={"backend": "ideal"}, store={"extra": ["camera"]})
+    (tmp_path / "in").mkdir()
+    cameras = moving(tmp_path / "in", job)
+    export_dataset(tmp_path / "in", tmp_path / "to", "tapvid")
+    with np.load(tmp_path / "to/000000.npz", allow_pickle=False) as file:
+        told = dict(file)
+    sequence = Dataset(tmp_path / "in")[0]
+    size = np.array(told["video"].shape[2:0:-1])
+    places = told["points"] * size - 0.5
+    columns, rows = told["queries_xyt"][:, :2].astype(int).T
+    assert 500 < len(columns) <= 1024
+    assert places[:, 0] == pytest.approx(np.stack([columns, rows], axis=1), abs=1e-4)
+    fx, fy, cx, cy = told["fx_fy_cx_cy"]
+    K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    for t, camera in enumerate(cameras):
+        assert places[:, t] - places[:, 0] == pytest.approx(sequence["flow"][t][rows, columns], abs=1e-4)
+        local = told["tracks_XYZ"][t].astype(float)
+        seen = cv2.projectPoints(local, np.zeros(3), np.zeros(3), K, told["distortion"])[0].reshape(-1, 2)
+        assert seen - 0.5 == pytest.approx(places[:, t], abs=1e-3)
+        assert ((1000 * local - camera.translation) @ camera.rotation)[:, 2] == pytest.approx(0, abs=1e-3)
+        assert np.array_equal(told["visibility"][t], sequence["visible"][t][rows, columns])
+        assert np.array_equal(
+            np.asarray(Image.open(io.BytesIO(told["images_jpeg_bytes"][t]))), told["video"][t]
+        )
+    assert np.array_equal(told["occluded"], ~told["visibility"].T)
+    assert not told["occluded"][:, 0].any()
+    assert told["occluded"].any()
+    assert np.array_equal(told["video"], sequence["rgb"][:])
 
 
 def test_films_show_what_is_asked(root: Path, tmp_path: Path) -> None:

@@ -1,0 +1,88 @@
+"""The layout of TAP-Vid and TAPVid-3D (github.com/google-deepmind/tapnet): points followed through a film.
+
+Coordinates are theirs: (0, 0) is the corner of the top-left pixel, whose centre is at a half.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from synth.dataset.store import Dataset, Sequence
+from synth.errors import UserError
+from synth.publish.export.encoding import as_png
+from synth.render.camera.camera import undistort
+
+_POINTS = 1024
+
+Floats = NDArray[np.float64]
+
+
+def write_tracks(dataset: Dataset, target: Path) -> None:
+    """`NNNNNN.npz` a sequence, without pickles: points of tissue that frame 0 shows, asked for there.
+
+    TAP-Vid: `video` (T, H, W, 3) uint8, `points` (N, T, 2) float32 x and y over (W, H), `occluded` (N, T).
+    What its pickles hold is `{path.stem: dict(np.load(path)) for path in folder.glob("*.npz")}`.
+
+    TAPVid-3D, where a second eye had the motion in depth stored, as its evaluation loads it: `tracks_XYZ`
+    (T, N, 3) m in axes of each frame's camera, `visibility` (T, N), `queries_xyt` (N, 3) px and frame,
+    `fx_fy_cx_cy` (4,) px, `images_jpeg_bytes` (T,) PNGs. `distortion` (5,) is ours (k1, k2, p1, p2, k3): a
+    pinhole alone is off by it.
+
+    Tracks are the truth in the store: in space and picture they agree to 1e-3 px, or to the attribute
+    `summary.rounding_px` where flow is kept in half precision. STIR (github.com/athaddius/STIRLoader) knows
+    points of a film's first and last frame only: of these arrays, those two.
+
+    Raises:
+        UserError: a sequence shows no tissue in frame 0.
+    """
+    for sequence in dataset:
+        pixels = _choose(sequence)
+        columns, rows = pixels.T
+        frames = range(sequence.frames)
+        places = np.stack([pixels + 0.5 + sequence["flow"][t][rows, columns] for t in frames])
+        visible = np.stack([sequence["visible"][t][rows, columns] for t in frames])
+        video = sequence["rgb"][:]
+        arrays = {
+            "video": video,
+            "points": (places / sequence.size[::-1]).astype(np.float32).swapaxes(0, 1),
+            "occluded": ~visible.T,
+        }
+        if "motion" in sequence:
+            arrays |= _in_depth(sequence, pixels)
+            arrays["visibility"] = visible
+            arrays["queries_xyt"] = np.insert(pixels + 0.5, 2, 0, axis=1).astype(np.float32)
+            arrays["images_jpeg_bytes"] = np.array([as_png(picture) for picture in video])
+        np.savez_compressed(target / f"{sequence.index:06d}.npz", **arrays)
+
+
+def _choose(sequence: Sequence) -> NDArray[np.int64]:
+    """Pixels (N, 2) as x, y: a square grid of up to `_POINTS` on tissue that frame 0 shows."""
+    shown = sequence["tissue"][:] & sequence["visible"][0]
+    step = max(1, int(np.ceil(np.sqrt(shown.sum() / _POINTS))))
+    grid = np.zeros_like(shown)
+    grid[step // 2 :: step, step // 2 :: step] = True
+    pixels = np.argwhere(shown & grid)[:, ::-1]
+    if not len(pixels):
+        raise UserError(f"{sequence.path}: shows no tissue in frame 0")
+    return pixels
+
+
+def _in_depth(sequence: Sequence, pixels: NDArray[np.int64]) -> dict[str, NDArray[Any]]:
+    """Tracks of pixels (N, 2) of frame 0 in space, and the lens that projects them onto the picture."""
+    lens, right = sequence.attrs, sequence.attrs["right"]
+    (fx, _, cx), (_, fy, cy), _ = K = np.asarray(lens["K"], np.float64)
+    distortion = np.asarray(lens["distortion"], np.float64)
+    columns, rows = pixels.T
+    disparity = sequence["disparity"][:][rows, columns] + right["K"][0][2] - cx
+    flat = undistort((pixels - K[:2, 2]) / [fx, fy], distortion)
+    rest = np.insert(flat, 2, 1, axis=1) * (fx * right["baseline_mm"] / disparity)[:, None]
+    tracks = np.stack([rest + sequence["motion"][t][rows, columns] for t in range(sequence.frames)])
+    return {
+        "tracks_XYZ": (tracks / 1000).astype(np.float32),
+        "fx_fy_cx_cy": np.array([fx, fy, cx + 0.5, cy + 0.5]),
+        "distortion": distortion,
+    }
