@@ -70,11 +70,6 @@ class Baseline:
         return ForceEstimate(assumed_young(scene.young_kpa) * self._rule(*given))
 
 
-def nothing(moved: Field, mask: Field, sure: Field) -> Floats:
-    """The rule that no force acts."""
-    return np.array([0.0, np.nan, np.nan])
-
-
 def as_methods(rules: Mapping[str, Rule], source: str) -> dict[str, Method]:
     """Rules fitted on a displacement `source`, behind the bench's protocol."""
     return {name: Baseline(rule, has_depth(source)) for name, rule in rules.items()}

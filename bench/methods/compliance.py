@@ -37,9 +37,6 @@ _ANATOMY = schema.AnatomySection()
 OPENING_MM = _ANATOMY.craniotomy.radius_mm
 _OPEN = schema.AnatomySection(craniotomy=schema.CraniotomySection(radius_mm=40.0))
 _AT_ONCE, _MOST = 32, 64
-_STRETCH = 1.02
-"""Of a membrane at rest, amid what jobs draw; a linear sheet doesn't feel it."""
-
 
 Edge = Literal["bonded", "slipping", "free"]
 
@@ -53,6 +50,8 @@ class TissueKind:
     membrane: float = 0.0
     """Thickness times Young's modulus of the membrane over E of the tissue [mm]; 0: none."""
     poisson: float = 0.4
+    stretch: float = 1.0
+    """Of the membrane at rest: above 1 its tension resists being bent."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,8 +87,9 @@ class ElasticBlock:
             [(0.0, 0.0, OPENING_MM)] if free else (),
             slips=tissue.edge == "slipping",
         )
-        sheet = MembraneSheet(tissue.membrane, _STRETCH) if tissue.membrane else None
-        return cls(volume, assemble(volume, "linear", tissue.poisson, sheet))
+        sheet = MembraneSheet(tissue.membrane, tissue.stretch) if tissue.membrane else None
+        law = "neo-hookean" if tissue.stretch > 1 else "linear"  # a linear sheet knows no tension
+        return cls(volume, assemble(volume, law, tissue.poisson, sheet))
 
     def embed(self, xy: Floats) -> Embedding:
         """How surface points (P, 2), camera x, y [mm], ride on the volume."""

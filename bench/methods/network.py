@@ -5,6 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+from scipy.special import ndtri
+
+from bench.methods.force_mixture import ForceMixture
 from bench.methods.protocol import Field, ForceEstimate, MethodContext
 from learn import Predictor, load_model
 from learn.inference.force_reader import ForceReader
@@ -74,4 +78,8 @@ class Model:
         if not found.bands:
             return answer
         band = found.bands[LEVEL]
-        return replace(answer, low_mn=float(band.low[0]), high_mn=float(band.high[0]))
+        likely = None
+        if np.isfinite(found.force_mn).all():
+            deviation = (band.axes_high[0] - band.axes_low[0]) / (2 * ndtri(0.5 + LEVEL / 2))
+            likely = ForceMixture(np.ones(1), found.force_mn[None], np.diag(deviation**2)[None])
+        return replace(answer, low_mn=float(band.low[0]), high_mn=float(band.high[0]), likely=likely)

@@ -1,8 +1,8 @@
 """Physics behind the bench's protocol: `posterior` on every frame, the film saying what tissue it is.
 
-As frames come, each is answered with what the strongest before it said of the tissue. Once the film is over
-all are answered again: the span without contact has told how the tissue moves by itself, the strongest frames
-together its edge, membrane and Poisson's ratio.
+Frames are answered once the film is over: the span without contact has told how the tissue moves by itself,
+the strongest frames together its edge, membrane and Poisson's ratio. A picture that is wanted before rests on
+what the strongest frame until then said of the tissue.
 """
 
 from __future__ import annotations
@@ -15,11 +15,12 @@ from typing import get_args
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
-from scipy.special import ndtri, softmax
+from scipy.special import softmax
 
 from bench.methods import posterior
 from bench.methods.baselines import GRID
 from bench.methods.compliance import OPENING_MM, Edge, TissueKind
+from bench.methods.force_mixture import mix, size_interval
 from bench.methods.posterior import Observation, Posterior
 from bench.methods.protocol import Field, ForceEstimate, MethodContext
 from learn.data.clips import assumed_young
@@ -32,6 +33,8 @@ Floats = NDArray[np.float64]
 
 MEMBRANES = (0.0, 5.0, 15.0, 40.0, 100.0)
 """Stiffness over E [mm]."""
+STRETCHES = (1.0, 1.02)
+"""Of a membrane at rest: slack, or as a living head's may be."""
 _THIN = 5.0
 """Up to here films of bare tissue look alike: the compliance's misfit is as large."""
 _INTACT = 0.33
@@ -42,10 +45,9 @@ _WIDE = 1.2
 _TEMPER = 0.1
 """Frames of a film err alike, and alike at neighbouring points: so much of their evidence counts."""
 _STRONGEST, _ANEW, _LEAST = 8, 1.3, 0.05
-_GAIN = 0.25
-"""Relative deviation of the force by what no film tells: relief, pose, the law at large strain."""
-_DRAWS = 400
-_SURELY = 6.25  # chi-squared of three degrees of freedom: zero is within 90%
+_GAIN, _STIFFNESS = 0.25, 0.9
+"""Relative deviation of the force by what no film tells: relief, pose, the law at large strain; and, where
+there is a membrane, by its stiffness, which large strains and wrinkles hide."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +64,7 @@ class Film:
 
 
 class Physics:
-    """See the module."""
+    """See the module; `Revising`, and without a picture NaN until then."""
 
     def __init__(self) -> None:
         self._scene: MethodContext | None = None
@@ -108,12 +110,13 @@ class Physics:
             self._scene, self._view = scene, GridView(scene.tissue, scene.scale_mm_per_px, GRID)
             self._seen: list[Observation] = []
             self._quiet, self._weighed = 0, 0.0
-            tissues = grid_of(scene)
-            self._film = Film(tissues, _prior(tissues, scene.membrane), np.zeros(moved.shape[2]), _INTACT)
+            self._film = Film(grid_of(scene)[:1], np.ones(1), np.zeros(moved.shape[2]), _INTACT)
         mean = self._view.resample.mean
         moved, spread = (mean(field.transpose(2, 0, 1), scene.tissue) for field in (moved, spread))
         seen = observe(moved, spread, self._view.mask)
         self._seen.append(seen)
+        if not picture:
+            return ForceEstimate(np.full(3, np.nan))
         if seen.signal_mm > _ANEW * self._weighed and seen.signal_mm > posterior.LEAST_MM:
             self._weighed = seen.signal_mm
             self._film = weigh_tissues(scene, self._seen[-1:], self._film.own_mm)
@@ -123,12 +126,15 @@ class Physics:
         assert self._scene is not None
         young = assumed_young(self._scene.young_kpa)
         found = infer(self._film, seen)
+        covered = float(self._film.weight @ [one.membrane > 0 for one in self._film.tissues])
+        force = replace(found.force, common=_STIFFNESS * covered)
         gain, eyes = float(np.hypot(_GAIN, self._scene.young_uncertainty)), len(seen.moved) - 1
-        low, high = size_interval(found, gain, eyes)
+        low, high = size_interval(force, gain, eyes)
         density = None
         if picture:
             density = np.float32(young) * self._picture(found)
-        return ForceEstimate(young * found.mean, density, young * low, young * high)
+        likely = force.times(young).with_gain(_GAIN)
+        return ForceEstimate(young * force.mean, density, young * low, young * high, likely)
 
     def _picture(self, found: Posterior) -> Field:
         """(H, W) kPa a kPa of E, on the rest frame's pixels."""
@@ -155,7 +161,12 @@ def grid_of(scene: MethodContext) -> tuple[TissueKind, ...]:
     middle = next((nu for nu in _POISSON if low <= nu <= high), round((low + high) / 2, 3))
     stiff = {"stripped": MEMBRANES[:1], "intact": MEMBRANES[1:], "unknown": MEMBRANES}[scene.membrane]
     edges: tuple[Edge, ...] = ("free",) if radius > _WIDE * OPENING_MM else ("bonded", "slipping")
-    return tuple(TissueKind(edge, one, middle) for edge in edges for one in stiff)
+    return tuple(
+        TissueKind(edge, one, middle, stretch)
+        for edge in edges
+        for one in stiff
+        for stretch in (STRETCHES if one else STRETCHES[:1])
+    )
 
 
 def _prior(tissues: Sequence[TissueKind], known: MembraneState) -> Floats:
@@ -203,37 +214,9 @@ def infer(film: Film, seen: Observation) -> Posterior:
     ]
     return Posterior(
         float(film.weight @ [one.evidence for one in found]),
-        np.concatenate([share * one.weight for share, one in zip(film.weight, found, strict=True)]),
-        np.concatenate([one.force for one in found]),
-        np.concatenate([one.covariance for one in found]),
+        mix([one.force for one in found], film.weight),
         sum((share * one.load for share, one in zip(film.weight, found, strict=True)), np.zeros(())),
     )
-
-
-def size_interval(found: Posterior, gain: float, eyes: int = 2) -> tuple[float, float]:
-    """90% interval of the force's size, mN a kPa, by draws that are the same every time.
-
-    `gain`: relative deviation that multiplies all. From 0 on where 0 itself is within 90%; of one eye then up
-    to the 98th percentile, for a press along the view, hardly seen, is a small part of what is likely.
-    """
-    size = float(np.linalg.norm(found.mean))  # the length of a mean may be less than most lengths
-    weight = found.weight / found.weight.sum()
-    drawn = np.searchsorted(np.cumsum(weight), (np.arange(_DRAWS) + 0.5) / _DRAWS).clip(0, len(weight) - 1)
-    root = np.linalg.cholesky(found.covariance + 1e-12 * np.eye(3))
-    normal, factor = _normals()
-    forces = found.force[drawn] + np.einsum("nab,nb->na", root[drawn], normal)
-    sizes = np.linalg.norm(forces, axis=1) * np.exp(gain * factor)
-    spread = np.cov(forces.T) + 1e-12 * np.eye(3)
-    if found.mean @ np.linalg.solve(spread, found.mean) < _SURELY:
-        return 0.0, max(float(np.quantile(sizes, 0.9 if eyes == 2 else 0.98)), size)
-    low, high = np.quantile(sizes, (0.05, 0.95))
-    return min(float(low), size), max(float(high), size)
-
-
-@lru_cache(maxsize=1)
-def _normals() -> tuple[Floats, Floats]:
-    rng = np.random.default_rng(0)
-    return rng.normal(size=(_DRAWS, 3)), rng.permutation(ndtri((np.arange(_DRAWS) + 0.5) / _DRAWS))
 
 
 @lru_cache(maxsize=1)

@@ -24,6 +24,7 @@ from scipy.special import logsumexp
 
 from bench.methods import compliance
 from bench.methods.compliance import OPENING_MM, TissueKind
+from bench.methods.force_mixture import ForceMixture
 
 Floats = NDArray[np.float64]
 
@@ -95,22 +96,14 @@ class Observation:
 
 @dataclass(frozen=True, eq=False)
 class Posterior:
-    """The force over E as a mixture of M Gaussians [mN/kPa]."""
+    """What a frame tells of its loads."""
 
     evidence: float
     """Logarithm of the marginal likelihood."""
-    weight: Floats
-    """(M,) that add up to 1."""
-    force: Floats
-    """(M, 3)."""
-    covariance: Floats
-    """(M, 3, 3)."""
+    force: ForceMixture
+    """Over E [mN/kPa]."""
     load: Floats
     """(K, 3) mean load at the nodes."""
-
-    @property
-    def mean(self) -> Floats:
-        return np.asarray(self.weight @ self.force, np.float64)
 
 
 @lru_cache(maxsize=32)
@@ -258,7 +251,7 @@ def infer(basis: LoadBasis, seen: Observation, own_mm: Floats) -> Posterior:
             carried += part * basis.shares[:, h, None] * contact
         coefficients += part * mean
     load = (basis.loads @ coefficients).reshape(-1, 3) + carried
-    return Posterior(float(logsumexp(score)), share, force, covariance, load)
+    return Posterior(float(logsumexp(score)), ForceMixture(share, force, covariance), load)
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
+from bench.methods.force_mixture import ForceMixture
 from synth.flow.stereo.track import Moved
 from synth.job.types import MembraneState
 
@@ -49,6 +51,8 @@ class ForceEstimate:
     """Lower end of the 90% interval of the force's size; NaN of a method that knows none."""
     high_mn: float = math.nan
     """Upper end."""
+    likely: ForceMixture | None = None
+    """What else the force may be, for whoever weighs several methods; the error by E is not in it."""
 
     @property
     def size_mn(self) -> float:
@@ -90,4 +94,20 @@ class Revising(Protocol):
 
         `quiet`: (T,) whether nothing touches the tissue, as far as anybody says.
         """
+        ...
+
+
+@runtime_checkable
+class Combining(Protocol):
+    """A method that answers from what others of the table say."""
+
+    @property
+    def parts(self) -> tuple[str, ...]:
+        """Their names; the first's `density` is the picture."""
+        ...
+
+    def combine(
+        self, answers: Sequence[Mapping[str, ForceEstimate]], scene: MethodContext, eyes: int
+    ) -> list[ForceEstimate]:
+        """The force of each of a film's frames from what the others say of it; `eyes`: 1 or 2 that saw it."""
         ...

@@ -10,9 +10,10 @@ from types import NoneType
 from typing import Any
 
 from bench.methods import comparison, plugins
-from bench.methods.comparison import MAIN
+from bench.methods.comparison import MAIN, PHYSICS, TOGETHER
 from bench.methods.network import Model
 from bench.methods.protocol import Method
+from bench.methods.together import Together
 from bench.recording import pixel_scale
 from bench.recording.folder import Recording, open_recording
 from bench.scoring import report
@@ -101,11 +102,16 @@ def score(
         if baselines:
             simple = comparison.simpler_methods(Path(train) if train else None, folder, opened.has_two_eyes)
             chosen |= {name: one for name, one in simple.items() if name not in chosen}
+        if MAIN in chosen and PHYSICS in chosen:
+            chosen = {TOGETHER: Together(MAIN, PHYSICS), **chosen}
         described: dict[str, Any] = {} if network is None else {"model": network.described()}
         networks = {name: one for name, one in chosen.items() if isinstance(one, Model)}
         described["networks"] = {
             name: {"hash": one.identity, "origin": one.origin} for name, one in networks.items()
         }
+        if network is not None and TOGETHER in chosen:
+            about = {"hash": f"{network.identity} and physics", "origin": network.origin}
+            described["networks"][TOGETHER] = about
         if sources := {name: where for name, where in plugins.sources().items() if name in chosen}:
             described["plug_ins"] = sources
         scale = pixel_scale.find_scale(opened.meta, opened.folder)

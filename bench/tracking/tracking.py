@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.methods.protocol import InSpace, Method, MethodContext, Revising
+from bench.methods.protocol import Combining, ForceEstimate, InSpace, Method, MethodContext, Revising
 from bench.recording import check
 from bench.recording.folder import Recording
 from bench.recording.meta import Meta
@@ -141,7 +141,7 @@ def track_recording(
             raise UserError(f"{recording.folder}: no frame has a time; give frames.csv, or fps in meta.yaml")
         found = video.find_pulse(about.pulse.free_s)
         if pulse is not None or found is None:  # else all is read again
-            forces.revise(about)
+            forces.finish(about)
         out.stereo = None if second is None else second.quality
         _describe(out, video, recording, methods, scale_mm_per_px * video.shrink)
         return out, found
@@ -198,12 +198,13 @@ class _Forces:
     """Every method applied to every frame."""
 
     def __init__(self, methods: Mapping[str, Method], pictured: str | None, watch: Stopwatch) -> None:
-        self.methods, self.pictured, self.watch = methods, pictured, watch
-        self.out = TrackedRecording(
-            force_mn={name: [] for name in methods}, bounds={name: [] for name in methods}
-        )
+        shown = methods.get(pictured) if pictured is not None else None
+        self.pictured = shown.parts[0] if isinstance(shown, Combining) else pictured
+        self.methods, self.watch = methods, watch
+        self.out = TrackedRecording()
+        self.answers: list[dict[str, ForceEstimate]] = []
         self.last: NDArray[np.float32] | None = None
-        self.stride = 1
+        self.stride, self.eyes = 1, 1
 
     def begin(self, rest: NDArray[np.uint8], scene: MethodContext) -> None:
         """The rest frame's picture, (h, w, 3), and what stays the same over the recording."""
@@ -215,18 +216,22 @@ class _Forces:
         out, scene, inside, moved = self.out, self.scene, self.scene.tissue, frame.motion
         position = len(out.time_s)
         wanted = position % self.stride == 0
+        self.eyes = 1 if moved is None else 2
+        answers: dict[str, ForceEstimate] = {}
         density = None
         for name, method in self.methods.items():
+            if isinstance(method, Combining):
+                continue
             with self.watch.stage(name):
                 shown = wanted and name == self.pictured
                 if moved is not None and isinstance(method, InSpace):
                     answer = method.in_space(frame.flow, frame.confidence, moved, scene, shown)
                 else:
                     answer = method(frame.flow, frame.confidence, scene, shown)
-            out.force_mn[name].append(answer.force_mn)
-            out.bounds[name].append((answer.low_mn, answer.high_mn))
+            answers[name] = replace(answer, density=None)
             if name == self.pictured:
                 density = answer.density
+        self.answers.append(answers)
         speed = 0.0
         if self.last is not None and out.time_s:
             lengths = np.linalg.norm(frame.flow - self.last, axis=-1)[inside]
@@ -240,7 +245,7 @@ class _Forces:
         if wanted:
             self._snap(position, frame, density)
 
-    def revise(self, about: Meta) -> None:
+    def finish(self, about: Meta) -> None:
         """What methods say of all frames once the film is over; the times are what clocks and meta state."""
         sensor_s = [(a + about.sync.offset_s, b + about.sync.offset_s) for a, b in about.sensor.free_s]
         spans = [*about.pulse.free_s, *(sensor_s if about.sync.method != "correlate" else [])]
@@ -250,9 +255,17 @@ class _Forces:
         for name, method in self.methods.items():
             if isinstance(method, Revising) and len(times):
                 with self.watch.stage(name):
-                    answers = method.revise(quiet)
-                self.out.force_mn[name] = [one.force_mn for one in answers]
-                self.out.bounds[name] = [(one.low_mn, one.high_mn) for one in answers]
+                    for frame, answer in zip(self.answers, method.revise(quiet), strict=True):
+                        frame[name] = answer
+        for name, method in self.methods.items():
+            if isinstance(method, Combining):
+                with self.watch.stage(name):
+                    combined = method.combine(self.answers, self.scene, self.eyes)
+                for frame, answer in zip(self.answers, combined, strict=True):
+                    frame[name] = answer
+        for name in self.methods:
+            self.out.force_mn[name] = [frame[name].force_mn for frame in self.answers]
+            self.out.bounds[name] = [(frame[name].low_mn, frame[name].high_mn) for frame in self.answers]
 
     def _snap(self, position: int, frame: FrameMotion, density: NDArray[np.float32] | None) -> None:
         """Takes at most so many, evenly: when full, every other one goes and the stride doubles."""

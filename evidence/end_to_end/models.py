@@ -59,7 +59,9 @@ def read_bare(moved: Field, mask: Field, sure: Field) -> Floats:
     """Physics of one frame of still tissue without a membrane, a rule as the baselines are."""
     spread = np.broadcast_to(_MM_PER_PX * deviation(sure), moved.shape)
     seen = physics.observe(moved, spread, mask)
-    return posterior.infer(posterior.load_basis(len(moved), TissueKind()), seen, np.zeros(len(moved))).mean
+    return posterior.infer(
+        posterior.load_basis(len(moved), TissueKind()), seen, np.zeros(len(moved))
+    ).force.mean
 
 
 def fit_ridge(x: Floats, force: Floats, group: NDArray[np.intp]) -> Any:

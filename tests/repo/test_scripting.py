@@ -113,7 +113,7 @@ def test_a_model_reads_a_film_and_the_bench_scores_it(out: Path, tmp_path: Path)
     own = {"none": lambda flow, confidence, scene, picture: bench.ForceEstimate(np.zeros(3))}
     every = bench.Settings(rate_hz=None)
     result = bench.score(recording, model, methods=own, settings=every, baselines=False)
-    assert result.main == "D2FNet"
+    assert result.main == "D2FNet", "physics was not asked for"
     assert {"D2FNet", "none"} <= set(result.methods)
     assert result.methods["none"].scores["mae_mn"] == pytest.approx(np.abs(result.sensor_mn).mean(), rel=0.2)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["model", "recording"], "nothing is written"

@@ -44,12 +44,12 @@ def test_a_contacts_force_is_found_and_held(basis: LoadBasis, force: list[float]
     moved = pressed(basis, BARE, force)
     for noise in (0.0, 0.03):
         found = posterior.infer(basis, seen(moved, noise), STILL)
-        assert found.mean == pytest.approx(force, abs=0.1 * np.linalg.norm(force))
-        low, high = physics.size_interval(found, 0.08)
+        assert found.force.mean == pytest.approx(force, abs=0.1 * np.linalg.norm(force))
+        low, high = physics.size_interval(found.force, 0.08)
         assert low < np.linalg.norm(force) < high
-        assert found.load.sum(axis=0) == pytest.approx(found.mean, abs=1e-6)
+        assert found.load.sum(axis=0) == pytest.approx(found.force.mean, abs=1e-6)
     across = posterior.infer(posterior.load_basis(2, BARE), seen(moved[:, :2], 0.01), STILL[:2])
-    assert across.mean[:2] == pytest.approx(force[:2], abs=0.15 * np.linalg.norm(force))
+    assert across.force.mean[:2] == pytest.approx(force[:2], abs=0.15 * np.linalg.norm(force))
 
 
 @pytest.mark.slow
@@ -60,7 +60,7 @@ def test_one_eye_says_that_it_hardly_sees_a_press_along_the_view(basis: LoadBasi
         for noise in (0.04, 0.06):
             for seed in range(5):
                 found = posterior.infer(one_eye, seen(moved, noise, seed), STILL[:2])
-                low, high = physics.size_interval(found, 0.08, eyes=1)
+                low, high = physics.size_interval(found.force, 0.08, eyes=1)
                 inside, count = inside + (low <= size <= high), count + 1
     assert inside >= 0.85 * count
 
@@ -69,8 +69,8 @@ def test_one_eye_says_that_it_hardly_sees_a_press_along_the_view(basis: LoadBasi
 def test_no_motion_is_no_force(basis: LoadBasis) -> None:
     for noise in (0.0, 0.03):
         found = posterior.infer(basis, seen(np.zeros((len(basis.known.points), 3)), noise), STILL)
-        low, high = physics.size_interval(found, 0.08)
-        assert np.linalg.norm(found.mean) < 0.2
+        low, high = physics.size_interval(found.force, 0.08)
+        assert np.linalg.norm(found.force.mean) < 0.2
         assert low == 0.0
         assert 0 < high < 0.6
 
@@ -85,7 +85,7 @@ def test_the_tissues_own_motion_is_learnt_where_nothing_touches(basis: LoadBasis
     assert sizes[1:] == pytest.approx([0.1, 0.5], rel=0.5)  # twice the drawn: few frames show less
     force = np.array([0.5, 0.0, 2.0])
     both = seen(pressed(basis, BARE, force.tolist()) + own[8], 0.01)
-    told, untold = (posterior.infer(basis, both, size).mean for size in (sizes, STILL))
+    told, untold = (posterior.infer(basis, both, size).force.mean for size in (sizes, STILL))
     assert np.linalg.norm(told - force) < 0.25 * np.linalg.norm(force)
     assert np.linalg.norm(told - force) < 0.5 * np.linalg.norm(untold - force)
 
@@ -109,7 +109,7 @@ def test_ninety_of_a_hundred_draws_of_the_model_lie_in_its_interval(basis: LoadB
             posterior._CORRELATED * (0.02**2 + posterior.LEAST_MM**2 + posterior._MISFIT**2 * local)
         )
         drawn = Observation(moved + noise * rng.normal(size=moved.shape), np.full(moved.shape, 0.02))
-        low, high = physics.size_interval(posterior.infer(basis, drawn, sizes), 0.0)
+        low, high = physics.size_interval(posterior.infer(basis, drawn, sizes).force, 0.0)
         inside += low <= np.linalg.norm(force) <= high
     assert abs(inside / count - 0.9) < 3 * np.sqrt(0.09 / count)
 
@@ -135,7 +135,7 @@ def test_theory_of_the_half_space_is_read(basis: LoadBasis) -> None:
     free = posterior.load_basis(3, TissueKind("free", 0.0, nu))
     # The block's walls are fixed 50 mm away, where the half-space still sinks: that is let be.
     found = posterior.infer(free, seen(moved, 0.01), np.full(3, 0.05))
-    assert found.mean == pytest.approx(force, abs=0.15 * 3.2)
+    assert found.force.mean == pytest.approx(force, abs=0.15 * 3.2)
 
 
 @pytest.mark.slow
@@ -149,7 +149,7 @@ def test_a_film_tells_a_membrane_and_meta_narrows_it(basis: LoadBasis) -> None:
         stiff.append(float(found.weight @ [one.membrane for one in found.tissues]))
     assert "evidence for a membrane of about" in physics.describe(found, scene)
     # Another mesh's bare tissue may look like a thin membrane, never like a thick one.
-    assert stiff[0] <= 5
+    assert stiff[0] < 5.01
     assert stiff[1] > 20
     told = MethodContext(scene.tissue, scene.scale_mm_per_px, 2.0, "stripped", (0.48, 0.49))
     assert {(one.membrane, one.poisson) for one in physics.grid_of(told)} == {(0.0, 0.49)}

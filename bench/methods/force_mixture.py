@@ -1,0 +1,94 @@
+"""What is likely of a force: a mixture of Gaussians, what another answer adds to it, and an interval."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtri, softmax
+
+_DRAWS = 400
+_SURELY = 6.25  # chi-squared of three degrees of freedom: zero is within 90%
+
+
+@dataclass(frozen=True, eq=False)
+class ForceMixture:
+    """What a method holds likely of a force, as a mixture of M Gaussians."""
+
+    weight: NDArray[np.float64]
+    """(M,) that add up to 1."""
+    force: NDArray[np.float64]
+    """(M, 3), mN or, over E, mN/kPa."""
+    covariance: NDArray[np.float64]
+    """(M, 3, 3)."""
+    common: float = 0.0
+    """Relative deviation by which all may be off alike, which is not in `covariance`."""
+
+    @property
+    def mean(self) -> NDArray[np.float64]:
+        """(3,)."""
+        return np.asarray(self.weight @ self.force, np.float64)
+
+    def times(self, factor: float) -> ForceMixture:
+        """The same of forces so many times as large."""
+        return replace(self, force=factor * self.force, covariance=factor**2 * self.covariance)
+
+    def with_gain(self, gain: float) -> ForceMixture:
+        """The same where every force may be off by a factor of that relative deviation too."""
+        along = np.einsum("ma,mb->mab", self.force, self.force)
+        return replace(self, covariance=self.covariance + gain**2 * along)
+
+    def observe(self, force: NDArray[np.float64], covariance: NDArray[np.float64]) -> ForceMixture:
+        """What is likely once another says `force` (3,), which errs by `covariance` (3, 3) independently.
+
+        A product of Gaussians (Bishop, Pattern Recognition and Machine Learning, 2006, section 2.3).
+        """
+        both, off = self.covariance + covariance, force - self.force
+        pull = np.linalg.solve(both, off[..., None])[..., 0]
+        log = np.log(self.weight) - 0.5 * ((off * pull).sum(axis=1) + np.linalg.slogdet(both)[1])
+        return replace(
+            self,
+            weight=softmax(log),
+            force=self.force + np.einsum("mab,mb->ma", self.covariance, pull),
+            covariance=self.covariance - self.covariance @ np.linalg.solve(both, self.covariance),
+        )
+
+
+def mix(parts: Sequence[ForceMixture], weight: NDArray[np.float64]) -> ForceMixture:
+    """All of them, each as likely as its `weight`, which add up to 1."""
+    return ForceMixture(
+        np.concatenate([share * one.weight for share, one in zip(weight, parts, strict=True)]),
+        np.concatenate([one.force for one in parts]),
+        np.concatenate([one.covariance for one in parts]),
+    )
+
+
+def size_interval(found: ForceMixture, gain: float, eyes: int = 2) -> tuple[float, float]:
+    """90% interval of the force's size, in its unit, by draws that are the same every time.
+
+    `gain`: relative deviation that multiplies all, beside `found.common`. From 0 on where 0 itself is within
+    90%; of one eye then up to the 98th percentile, for a press along the view, hardly seen, is a small part
+    of what is likely.
+    """
+    gain = float(np.hypot(gain, found.common))
+    size = float(np.linalg.norm(found.mean))  # the length of a mean may be less than most lengths
+    weight = found.weight / found.weight.sum()
+    drawn = np.searchsorted(np.cumsum(weight), (np.arange(_DRAWS) + 0.5) / _DRAWS).clip(0, len(weight) - 1)
+    root = np.linalg.cholesky(found.covariance + 1e-12 * np.eye(3))
+    normal, factor = _normals()
+    forces = found.force[drawn] + np.einsum("nab,nb->na", root[drawn], normal)
+    sizes = np.linalg.norm(forces, axis=1) * np.exp(gain * factor)
+    spread = np.cov(forces.T) + 1e-12 * np.eye(3)
+    if found.mean @ np.linalg.solve(spread, found.mean) < _SURELY:
+        return 0.0, max(float(np.quantile(sizes, 0.9 if eyes == 2 else 0.98)), size)
+    low, high = np.quantile(sizes, (0.05, 0.95))
+    return min(float(low), size), max(float(high), size)
+
+
+@lru_cache(maxsize=1)
+def _normals() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    rng = np.random.default_rng(0)
+    return rng.normal(size=(_DRAWS, 3)), rng.permutation(ndtri((np.arange(_DRAWS) + 0.5) / _DRAWS))
