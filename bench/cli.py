@@ -158,7 +158,8 @@ def import_(
     use: Annotated[
         list[str] | None,
         typer.Option(
-            help="ROLE=NAME where one is to be named: frames, frame_time, force, force_time, tip, fps."
+            help="ROLE=NAME where one is to be named: frames, frame_time, force, force_time, tip, fps; "
+            "of a ROS bag right, depth, calibration, right_calibration too."
         ),
     ] = None,
     newtons: Annotated[

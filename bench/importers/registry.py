@@ -9,9 +9,10 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from functools import partial
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +26,8 @@ from synth.video.file_numbers import natural_order
 Floats = NDArray[np.float64]
 ROLES = ("frames", "frame_time", "force", "force_time", "tip")
 """What a source may hold; `--use ROLE=NAME` says under which name; `--use fps=RATE` times bare pictures."""
+BAG_ROLES = ("frames", "force", "tip", "right", "depth", "calibration", "right_calibration")
+"""What a ROS bag may: each a topic."""
 _STILLS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
 _PLAIN = "bench.importers.plain_files"
 _MAKERS = {
@@ -46,6 +49,21 @@ MOST_FRAMES = 10_000_000
 
 
 @dataclass(frozen=True)
+class SecondView:
+    """What a right eye or a depth camera saw of the frames, its pictures not yet decoded."""
+
+    kind: Literal["right", "depth"]
+    frame: NDArray[np.int64]
+    """(M,) number of the frame that each of its pictures is of; -1: of none."""
+    pictures: Callable[[], Iterator[NDArray[Any]]]
+    """Gives them in order: RGB (H, W, 3) uint8, or depth (H, W) mm, uint16 or float32; 0 or NaN: unknown."""
+    lens: Mapping[str, object] | None = None
+    """The section `depth` of meta.yaml; None: unknown, or of a right eye."""
+    pair: Mapping[str, Floats] | None = None
+    """K1, D1, K2, D2, R, T [mm] of both eyes, as OpenCV has them; None: unknown, or of depth."""
+
+
+@dataclass(frozen=True)
 class Intake:
     """What a source holds, its pictures not yet decoded."""
 
@@ -61,6 +79,7 @@ class Intake:
     tip: Floats = field(default_factory=lambda: np.zeros((0, 4)))
     """(M, 4) time [s] and the tool's tip [mm]."""
     notes: tuple[str, ...] = ()
+    second: SecondView | None = None
 
 
 def read_source(source: Path, use: Mapping[str, str] | None = None) -> Intake:
@@ -84,9 +103,9 @@ def read_source(source: Path, use: Mapping[str, str] | None = None) -> Intake:
         raise UserError(
             f"{source}: not a format that can be imported ({known}, a folder of pictures or of a ROS 2 bag)"
         )
-    unknown = sorted(set(use or {}) - {*ROLES, "fps"})
-    if unknown:
-        raise UserError(f"--use {unknown[0]}=...: one of {', '.join(ROLES)}")
+    roles = BAG_ROLES if maker.endswith("rosbag") else (*ROLES, "fps")
+    if unknown := sorted(set(use or {}) - set(roles)):
+        raise UserError(f"--use {unknown[0]}=...: of {source.name}, one of {', '.join(roles)}")
     with _damage_as_user_error(source):
         found: Intake = import_module(maker).read_source(source, dict(use or {}))
     _refuse_odd(source, found)
@@ -99,7 +118,12 @@ def read_source(source: Path, use: Mapping[str, str] | None = None) -> Intake:
                     raise UserError(f"{source}: frame {k} is of another size than those before it")
                 yield picture
 
-    return replace(found, pictures=pictures)
+    def beside(view: SecondView) -> Iterator[NDArray[Any]]:
+        with _damage_as_user_error(source):
+            yield from map(_as_rgb, view.pictures()) if view.kind == "right" else view.pictures()
+
+    second = found.second and replace(found.second, pictures=partial(beside, found.second))
+    return replace(found, pictures=pictures, second=second)
 
 
 @contextmanager
@@ -135,6 +159,8 @@ def write_recording(
 ) -> Path:
     """Writes a recording folder, whole or not at all: lossless video.mp4, frames.csv, force.csv, meta.yaml.
 
+    Of a second eye right/ and stereo.yaml too, of a depth camera depth/.
+
     Args:
         found: of `read_source`.
         out: must not exist.
@@ -155,7 +181,15 @@ def write_recording(
             writer.write_force(part, found.force_s, newtons * found.force)
         if len(found.tip):
             writer.write_tip(part, found.tip)
-        writer.write_meta(part, about)
+        more: dict[str, object] = {}
+        if (second := found.second) is not None:
+            writer.write_second(part / second.kind, second.frame.tolist(), second.pictures())
+            if second.pair is not None:
+                writer.write_storage(part / "stereo.yaml", second.pair)
+                more["stereo"] = {"calibration": "stereo.yaml"}
+            if second.lens is not None:
+                more["depth"] = dict(second.lens)
+        writer.write_meta(part, {**about, **more})
     return out
 
 

@@ -3,13 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
+from functools import partial
+from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.importers.registry import Intake, one_of
+from bench.importers import camera_info
+from bench.importers.camera_info import Lens, join_pair
+from bench.importers.registry import Floats, Intake, SecondView, one_of
 from synth.errors import UserError
 from synth.system import checked_file
 
@@ -21,17 +27,24 @@ _TIPS = (
     "geometry_msgs/msg/PointStamped",
     "geometry_msgs/msg/TransformStamped",
 )
+_LENSES = ("sensor_msgs/msg/CameraInfo",)
 _CHANNELS = {"mono8": 1, "8UC1": 1, "rgb8": 3, "bgr8": 3, "8UC3": 3, "rgba8": 4, "bgra8": 4}
+_DEPTHS = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
+_HEADER = 12  # bytes before the PNG of a compressed depth picture
+
+_Read = Callable[[Path, Any], NDArray[Any]]
+_Pictures = Callable[..., Iterator[NDArray[Any]]]
 
 
 def read_source(source: Path, use: dict[str, str]) -> Intake:
     """Opens a bag: the only topic of pictures, of forces and of poses, or those named by `use`.
 
     Times are the messages' own stamps; a topic whose stamps are all zero falls back on the bag's. Positions,
-    in metres by the ROS convention, become mm.
+    in metres by the ROS convention, become mm. With `right` or `depth` named, each picture there goes with
+    the frame that is nearest in time, by half a frame at most.
 
     Raises:
-        UserError: no pictures, several topics of a kind, an unknown encoding.
+        UserError: no pictures, several topics of a kind, an unknown encoding, or as `camera_info`.
     """
     from rosbags.highlevel import AnyReader
     from rosbags.typesys import Stores, get_typestore
@@ -42,9 +55,15 @@ def read_source(source: Path, use: dict[str, str]) -> Intake:
     def opened() -> Any:
         return AnyReader([source], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
 
+    def pictures(topic: str, read: _Read = _picture) -> Iterator[NDArray[Any]]:
+        with opened() as bag:
+            for _, message in _messages(bag, topic):
+                yield read(source, message)
+
     with opened() as bag:
+        beside = use.get("right") or use.get("depth")
         topics = {
-            role: _topic(bag, role, kinds, use)
+            role: _topic(bag, role, kinds, use, beside)
             for role, kinds in (("frames", _PICTURES), ("force", _FORCES), ("tip", _TIPS))
         }
         if topics["frames"] is None:
@@ -52,13 +71,84 @@ def read_source(source: Path, use: dict[str, str]) -> Intake:
         stamps = _table(bag, topics["frames"], lambda message: (), 0)[:, 0]
         force = _table(bag, topics["force"], _vector, 3)
         tip = _table(bag, topics["tip"], _place, 3) * [1.0, 1000.0, 1000.0, 1000.0]
+        found = Intake(stamps, partial(pictures, topics["frames"]), force[:, 0], force[:, 1:], tip)
+        if beside is not None:
+            return _add_second(bag, found, topics["frames"], use, pictures)
+        if lone := {"calibration", "right_calibration"} & use.keys():
+            raise UserError(f"--use {min(lone)}=...: goes with right=TOPIC or depth=TOPIC")
+        return found
 
-    def pictures() -> Iterator[NDArray[np.uint8]]:
-        with opened() as bag:
-            for _, message in _messages(bag, topics["frames"]):
-                yield _picture(source, message)
 
-    return Intake(stamps, pictures, force[:, 0], force[:, 1:], tip)
+def _add_second(bag: Any, found: Intake, frames: str, use: dict[str, str], pictures: _Pictures) -> Intake:
+    """With a right eye's pictures or depth; frames before the first of them and after the last are left out.
+
+    What the lenses are is said by the topics `calibration` and `right_calibration`, else by the `camera_info`
+    that lies beside the pictures.
+    """
+    kind: Literal["right", "depth"] = "right" if "right" in use else "depth"
+    if {"right", "depth"} <= use.keys():
+        raise UserError("--use right=... and depth=...: a recording has one of them")
+    topic = _topic(bag, kind, _PICTURES, use) or ""
+    frame = partners(_table(bag, topic, lambda message: (), 0)[:, 0], found.times_s)
+    if (frame < 0).all():
+        raise UserError(f"{topic}: none of its pictures is of the time of a frame of {frames}")
+    first, last = int(frame[frame >= 0].min()), int(frame.max())
+    times = found.times_s[first : last + 1]
+    notes = [f"{topic}: pictures of {(frame >= 0).sum()} of {len(found.times_s)} frames of {frames}"]
+    if len(times) < len(found.times_s):
+        notes.append(f"frames before {first} and after {last}, which have none, are left out")
+    left = _lens(bag, frames, use.get("calibration"), next(pictures(frames)))
+    view = SecondView(kind, np.where(frame < 0, -1, frame - first), partial(pictures, topic))
+    if kind == "right":
+        right = _lens(bag, topic, use.get("right_calibration"), next(pictures(topic)))
+        view = replace(view, pair=None if left is None or right is None else join_pair(left, right))
+    else:
+        view = replace(view, pictures=partial(pictures, topic, _depth))
+        if left is not None:
+            about = {"focal_px": float(left.K[0, 0]), "centre_px": left.K[:2, 2].tolist()}
+            view = replace(view, lens=about)
+            if left.distortion.any():
+                notes.append(f"{frames} has distortion, of which depth knows nothing")
+    if view.pair is None and view.lens is None:
+        section = {"right": "stereo", "depth": "depth"}[kind]
+        notes.append(f"calibrations are missing (camera_info): meta.yaml still needs {section}")
+    return replace(
+        found,
+        times_s=times,
+        pictures=lambda: islice(pictures(frames), first, last + 1),
+        notes=tuple(notes),
+        second=view,
+    )
+
+
+def partners(times_s: Floats, frames_s: Floats) -> NDArray[np.int64]:
+    """Which frame each picture of another camera is of, (M,): both are the other's nearest; -1: none.
+
+    Args:
+        times_s: (M,) of its pictures [s].
+        frames_s: (T,) of the frames [s].
+    """
+    frame, picture = _nearest(times_s, frames_s), _nearest(frames_s, times_s)
+    apart = np.abs(times_s - frames_s[frame])
+    step = float(np.median(np.diff(np.sort(frames_s)))) if len(frames_s) > 1 else np.inf
+    return np.where((picture[frame] == np.arange(len(times_s))) & (apart <= step / 2), frame, -1)
+
+
+def _nearest(times_s: Floats, among_s: Floats) -> NDArray[np.int64]:
+    """Which of `among_s` is nearest to each of (N,) times."""
+    order = np.argsort(among_s, kind="stable")
+    rising = among_s[order]
+    return order[np.searchsorted((rising[1:] + rising[:-1]) / 2, times_s)]
+
+
+def _lens(bag: Any, pictures: str, named: str | None, picture: NDArray[Any]) -> Lens | None:
+    names = sorted({c.topic for c in bag.connections if c.msgtype in _LENSES})
+    beside = camera_info.info_name(pictures)
+    topic = one_of("calibration", named or beside, names, "topic") if named or beside in names else None
+    if topic is None:
+        return None
+    _, info = next(_messages(bag, topic))
+    return camera_info.read_lens(topic, info, pictures, (picture.shape[1], picture.shape[0]))
 
 
 def _refuse_elsewhere(folder: Path) -> None:
@@ -75,8 +165,10 @@ def _refuse_elsewhere(folder: Path) -> None:
         checked_file.check_file(folder / name, _LARGEST_BYTES)
 
 
-def _topic(bag: Any, role: str, kinds: tuple[str, ...], use: dict[str, str]) -> str | None:
-    names = sorted({c.topic for c in bag.connections if c.msgtype in kinds})
+def _topic(
+    bag: Any, role: str, kinds: tuple[str, ...], use: dict[str, str], taken: str | None = None
+) -> str | None:
+    names = sorted({c.topic for c in bag.connections if c.msgtype in kinds} - {taken})
     return one_of(role, use.get(role), names, "topic")
 
 
@@ -128,3 +220,19 @@ def _picture(source: Path, message: Any) -> NDArray[np.uint8]:
     if message.encoding.startswith(("bgr", "8UC3")):
         picture = picture[..., [2, 1, 0]]  # opacity is of no use
     return picture
+
+
+def _depth(source: Path, message: Any) -> NDArray[Any]:
+    """(H, W) mm, uint16 or float32: 16-bit pictures are in mm and floats in metres, by ROS's REP 118."""
+    if hasattr(message, "format"):
+        data = bytes(message.data)[_HEADER * ("compressedDepth" in message.format) :]
+        found = checked_file.decode_picture(data, cv2.IMREAD_UNCHANGED)
+        if found.dtype != np.uint16 or found.ndim != 2:
+            raise UserError(f"{source}: depth in {message.format}, not in 16 bits")
+        return found
+    if message.encoding not in _DEPTHS:
+        raise UserError(f"{source}: depth in encoding {message.encoding}; {', '.join(_DEPTHS)} are read")
+    kind = np.dtype((">" if message.is_bigendian else "<") + _DEPTHS[message.encoding])
+    rows = np.frombuffer(bytes(message.data), np.uint8).reshape(message.height, message.step)
+    found = np.ascontiguousarray(rows[:, : message.width * kind.itemsize]).view(kind)
+    return 1000 * found.astype(np.float32) if kind.kind == "f" else found.astype(np.uint16)

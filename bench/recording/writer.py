@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import av
 import cv2
@@ -23,6 +23,8 @@ __all__ = [
     "write_frames",
     "write_meta",
     "write_pair",
+    "write_second",
+    "write_storage",
     "write_tip",
     "write_video",
     "write_whole_folder",
@@ -56,13 +58,37 @@ def write_meta(folder: Path, said: Mapping[str, object]) -> None:
 def write_pair(path: Path, left: Camera, right: Camera) -> None:
     """Writes the pair's calibration, K1, D1, K2, D2, R, T, as OpenCV's `stereoCalibrate` gives it."""
     turn = right.rotation @ left.rotation.T
+    lenses = {"K1": left.K, "D1": left.distortion, "K2": right.K, "D2": right.distortion}
+    write_storage(path, {**lenses, "R": turn, "T": (right.translation - turn @ left.translation)[:, None]})
+
+
+def write_storage(path: Path, matrices: Mapping[str, Floats]) -> None:
+    """Writes matrices, (N, M) or (M,), as an OpenCV FileStorage."""
     storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
-    for number, eye in (("1", left), ("2", right)):
-        storage.write(f"K{number}", eye.K)
-        storage.write(f"D{number}", np.atleast_2d(eye.distortion))
-    storage.write("R", turn)
-    storage.write("T", (right.translation - turn @ left.translation)[:, None])
+    for name, values in matrices.items():
+        storage.write(name, np.atleast_2d(values))
     storage.release()
+
+
+def write_second(folder: Path, frames: Iterable[int], pictures: Iterable[NDArray[Any]]) -> None:
+    """Writes FOLDER/NNNNNN.png a picture by the number of its frame; those of no frame (-1) are left out.
+
+    Args:
+        folder: `right` or `depth` of the recording; made.
+        frames: (M,).
+        pictures: M of (H, W, 3) uint8, or of depth (H, W): uint16, or float32 as .npy. An odd last row or
+            column is left out, as that of the film is.
+    """
+    folder.mkdir()
+    for frame, picture in zip(frames, pictures, strict=True):
+        if frame < 0:
+            continue
+        even = picture[: picture.shape[0] // 2 * 2, : picture.shape[1] // 2 * 2]
+        if even.dtype.kind == "f":
+            np.save(folder / f"{frame:06d}.npy", even)
+        else:
+            as_stored = np.ascontiguousarray(even[..., ::-1] if even.ndim == 3 else even)
+            (folder / f"{frame:06d}.png").write_bytes(cv2.imencode(".png", as_stored)[1].tobytes())
 
 
 def write_video(

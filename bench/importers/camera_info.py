@@ -1,0 +1,78 @@
+"""Calibrations as ROS has them (sensor_msgs/CameraInfo), turned into OpenCV's."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from bench.importers.registry import Floats
+from synth.errors import UserError
+
+_TERMS = {"plumb_bob": (4, 5), "rational_polynomial": (8,)}
+
+
+@dataclass(frozen=True)
+class Lens:
+    """A camera, and how it lies to the pair that it is of."""
+
+    K: Floats
+    """(3, 3) px."""
+    distortion: Floats
+    """(D,) in OpenCV's order."""
+    turn: Floats
+    """(3, 3) from its axes to the pair's, whose rows are epipolar lines."""
+    shift_mm: float
+    """x of the pair's left lens in the pair's axes, seen from this one."""
+
+
+def read_lens(topic: str, info: Any, pictures: str, size: tuple[int, int]) -> Lens:
+    """Of a topic's message.
+
+    Args:
+        topic: its name.
+        info: the message, of ROS 1 or 2.
+        pictures: the topic of its pictures; of one named `image_rect...` they are rectified already.
+        size: width, height of them [px].
+
+    Raises:
+        UserError: it is no calibration, or of pictures of another size.
+    """
+    K, D, R, P = (np.asarray(getattr(info, n, getattr(info, n.upper(), ())), np.float64) for n in "kdrp")
+    if (info.width, info.height) != size:
+        made = f"{info.width} x {info.height}"
+        raise UserError(f"{topic}: is of pictures of {made} px, {pictures} has {size[0]} x {size[1]}")
+    K, P = K.reshape(3, 3), P.reshape(3, 4)
+    if not (np.isfinite([*K.flat, *P.flat]).all() and min(K[0, 0], K[1, 1], P[0, 0], P[1, 1]) > 0):
+        raise UserError(f"{topic}: the camera isn't calibrated (K or P is 0)")
+    shift_mm = 1000 * float(P[0, 3] / P[0, 0])
+    if image_name(pictures).startswith("image_rect"):
+        return Lens(P[:, :3], np.zeros(5), np.eye(3), shift_mm)
+    if D.any() and len(D) not in _TERMS.get(info.distortion_model, ()):
+        raise UserError(f"{topic}: {len(D)} terms of distortion {info.distortion_model}, not one of OpenCV's")
+    return Lens(K, D if D.any() else np.zeros(5), R.reshape(3, 3), shift_mm)
+
+
+def image_name(topic: str) -> str:
+    """The last part of the name of a topic of pictures, without its transport."""
+    return [part for part in topic.split("/") if not part.startswith("compressed")][-1]
+
+
+def info_name(topic: str) -> str:
+    """Where ROS puts the calibration of a topic of pictures."""
+    return topic[: topic.rindex(image_name(topic))] + "camera_info"
+
+
+def join_pair(left: Lens, right: Lens) -> dict[str, Floats]:
+    """K1, D1, K2, D2, R, T [mm] as OpenCV's `stereoCalibrate` gives them: x_right = R x_left + T.
+
+    Raises:
+        UserError: they have no baseline.
+    """
+    across = right.shift_mm - left.shift_mm
+    if not across:
+        raise UserError("the calibrations have no baseline (P[0, 3] of the right eye's camera_info)")
+    rotation, translation = right.turn.T @ left.turn, right.turn.T @ [[across], [0.0], [0.0]]
+    lenses = {"K1": left.K, "D1": left.distortion, "K2": right.K, "D2": right.distortion}
+    return {**lenses, "R": rotation, "T": translation}
