@@ -250,7 +250,8 @@ def export(
         str,
         typer.Option(
             "--to",
-            help="folder, hf, webdataset, lerobot, endonerf, tapvid, hdf5, d2fnet-npz or video (MP4).",
+            help="folder, hf, webdataset, lerobot, lerobot-v2.1, endonerf, tapvid, hdf5, d2fnet-npz or video "
+            "(MP4 to look at).",
         ),
     ] = "folder",
     overlay: Annotated[
