@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import functools
 import hashlib
 import os
@@ -61,7 +62,7 @@ def kept(
     faults: tuple[type[Exception], ...],
     most: int,
 ) -> T:
-    """What `make` gives, from this user's cache if it was made before.
+    """What `make` gives, from this user's cache if it was made before; who wants what is being made waits.
 
     Args:
         file: folder and ending, `compliance/npy`.
@@ -73,12 +74,18 @@ def kept(
         most: files that are kept, the newest.
     """
     name, ending = file.split("/")
-    place = folder(name) / f"{hashlib.sha256(key).hexdigest()[:32]}.{ending}"
+    word = hashlib.sha256(key).hexdigest()[:32]
+    place = folder(name) / f"{word}.{ending}"
     with contextlib.suppress(OSError, *faults):
         return load(place.read_bytes())
-    made = make()
-    with contextlib.suppress(OSError):
-        write_whole(place, dump(made), durable=False)
-        for old in sorted(place.parent.glob(f"*.{ending}"), key=lambda one: one.stat().st_mtime)[:-most]:
-            old.unlink()
+    with contextlib.ExitStack() as held:
+        with contextlib.suppress(OSError):  # few locks, for they stay; two that share one only wait longer
+            fcntl.flock(held.enter_context((place.parent / f"{word[0]}.lock").open("w")), fcntl.LOCK_EX)
+        with contextlib.suppress(OSError, *faults):
+            return load(place.read_bytes())
+        made = make()
+        with contextlib.suppress(OSError):
+            write_whole(place, dump(made), durable=False)
+            for old in sorted(place.parent.glob(f"*.{ending}"), key=lambda one: one.stat().st_mtime)[:-most]:
+                old.unlink()
     return made

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -22,9 +24,14 @@ def seen(moved: Floats, noise_mm: float = 0.0, seed: int = 0) -> Observation:
     return Observation((moved + noise).T, np.full(moved.T.shape, max(noise_mm, 0.01)))
 
 
+@cache
+def other_mesh(tissue: TissueKind) -> ElasticBlock:
+    return ElasticBlock.build(2500, tissue)
+
+
 def pressed(basis: LoadBasis, tissue: TissueKind, force: list[float]) -> Floats:
     """Displacement (P, 3) mm, camera axes, of a 3 mm contact at (2, 3) mm on another mesh; mN/kPa."""
-    block = ElasticBlock.build(2500, tissue)
+    block = other_mesh(tissue)
     steps = np.stack(np.meshgrid(np.linspace(-1, 1, 13), np.linspace(-1, 1, 13)), axis=-1).reshape(-1, 2)
     disc = steps[np.hypot(*steps.T) < 1]
     share = (1 - np.square(disc).sum(axis=1)) ** 2

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -27,6 +29,21 @@ def test_the_cache_is_where_it_can_be_written(tmp_path: Path, monkeypatch: pytes
         assert found == at / "loops"
         assert found.is_dir()
     assert mine.stat().st_mode & 0o777 == 0o700
+
+
+def test_what_several_want_at_once_is_made_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cache, "folder", lambda name: tmp_path)
+    made = list[int]()
+
+    def make() -> bytes:
+        time.sleep(0.1)
+        made.append(1)
+        return b"7"
+
+    with ThreadPoolExecutor(4) as pool:
+        asked = [pool.submit(cache.kept, "made/bin", b"key", make, bytes, bytes, (), 2) for _ in range(4)]
+    assert [one.result() for one in asked] == [b"7"] * 4
+    assert len(made) == 1
 
 
 @pytest.mark.parametrize("foreign", ["open", "link", "file"])
