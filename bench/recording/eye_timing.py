@@ -109,9 +109,10 @@ def find_lag(left: Motion, right: Motion) -> tuple[float, int]:
         both = np.isfinite(now) & np.isfinite(other)
         if abs(lag) < _LEAST or both.sum() < 2 * _LEAST_FRAMES or not now[both].any():
             continue
-        for since in range(1, len(frames) - _LEAST_FRAMES):
-            mixed = np.where(frames < since, now, other)[both]
-            share = float(np.sqrt(mixed.mean() / now[both].mean()))
-            if share < best:
-                best, answer = share, (float(lag), since)
+        kept, late = np.where(both, now, 0.0), np.where(both, other, 0.0)
+        mixed = np.cumsum(kept) - kept + np.cumsum(late[::-1])[::-1]  # late from each frame on
+        since = 1 + int(np.argmin(mixed[1:-_LEAST_FRAMES]))
+        share = float(np.sqrt(mixed[since] / kept.sum()))
+        if share < best:
+            best, answer = share, (float(lag), since)
     return answer

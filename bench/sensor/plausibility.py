@@ -103,22 +103,44 @@ def _clock(time_s: Curve, size: Curve, moved: Curve) -> list[Finding]:
     best, found = _LESS, ""
     if _correlation(size, moved) >= _SURE:
         return []
-    for said, at in _clocks(time_s):
-        inside = (at >= time_s[0]) & (at <= time_s[-1])
-        if inside.sum() < max(_COMMON * len(at), _LEAST_FRAMES):
-            continue
-        now = _correlation(size[inside], moved[inside])
-        other = _correlation(np.interp(at[inside], time_s, size), moved[inside])
-        if now < _SURE and other > _MUCH + _LITTLE and (1 - other) / (1 - now) < best:
-            best = (1 - other) / (1 - now)
-            found = f"force and motion correlate by {now:.2f}, but by {other:.2f} if {said}"
+    for said, at, starts in _clocks(time_s):
+        now, other = _from_each_start(time_s, at, size, moved)[:, starts]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            left = np.where((now < _SURE) & (other > _MUCH + _LITTLE), (1 - other) / (1 - now), np.inf)
+        k = int(np.argmin(left))
+        if left[k] < best:
+            best = float(left[k])
+            found = f"force and motion correlate by {now[k]:.2f}, but by {other[k]:.2f} if {said}"
+            found += f" at {time_s[starts[k]]:.2f} s" if starts[0] else ""
     return [Finding("odd", "clocks", found)] if found else []
 
 
-def _clocks(time_s: Curve) -> Iterator[tuple[str, Curve]]:
-    """What may be wrong with a clock, and when its frames (T,) then were [s]."""
+def _from_each_start(time_s: Curve, at: Curve, size: Curve, moved: Curve) -> NDArray[np.float64]:
+    """(2, T) correlation of force and motion as they are, and if the frames from each one on were those of
+    `at` (T,) [s]; of the frames that then lie in the film, NaN if they are few.
+
+    By running sums, so that a film's length costs only once.
+    """
+    inside, every = ((at >= time_s[0]) & (at <= time_s[-1])).astype(np.float64), np.ones(len(at))
+    size, moved = size - size.mean(), moved - moved.mean()
+
+    def sums(force: Curve, of: Curve) -> NDArray[np.float64]:
+        return np.stack([of, of * force, of * moved, of * force**2, of * force * moved, of * moved**2])
+
+    before, found = sums(size, every), np.zeros((2, len(at)))
+    for row, force in zip(found, (size, np.interp(at, time_s, size)), strict=True):
+        after = np.cumsum(sums(force, inside)[:, ::-1], axis=1)[:, ::-1]
+        n, x, y, xx, xy, yy = np.cumsum(before, axis=1) - before + after
+        varies = np.sqrt(np.maximum(n * xx - x**2, 0) * np.maximum(n * yy - y**2, 0))
+        np.divide(n * xy - x * y, varies, out=row, where=varies > 1e-12 * (n * n).max() * yy.max())
+        row[n < max(_COMMON * len(at), _LEAST_FRAMES)] = np.nan
+    return found
+
+
+def _clocks(time_s: Curve) -> Iterator[tuple[str, Curve, range]]:
+    """What may be wrong with a clock, when its frames (T,) then were [s], and from which frames on."""
     start, frame = time_s[0], float(np.median(np.diff(time_s)))
-    yield "the film runs backwards", start + time_s[-1] - time_s
+    yield "the film runs backwards", start + time_s[-1] - time_s, range(1)
     most = round(2 * _LATE_S / frame)
     lags = [k * frame / 2 for k in range(-most, most, max(1, most // _TRIED))]
     for lag, drift in itertools.product(lags, _DRIFTS):
@@ -126,13 +148,12 @@ def _clocks(time_s: Curve) -> Iterator[tuple[str, Curve]]:
             continue
         said = f"the sensor's clock is moved by {lag:+.2f} s"
         said += f" and runs {1 / drift:.2f} times as fast" if drift != 1 else ""
-        yield said, start + (time_s - start) * drift - lag
+        yield said, start + (time_s - start) * drift - lag, range(1)
     gaps = [lag for lag in lags if abs(lag) >= frame]
     starts = range(_LEAST_PART, len(time_s) - _LEAST_PART, max(1, len(time_s) // _TRIED))
-    for lag, k in itertools.product(gaps, starts):
-        what = "missing" if lag < 0 else "shown twice"
-        said = f"{abs(lag):.2f} s of the film are {what} at {time_s[k]:.2f} s"
-        yield said, time_s - lag * (np.arange(len(time_s)) >= k)
+    for lag in gaps if starts else []:
+        said = f"{abs(lag):.2f} s of the film are {'missing' if lag < 0 else 'shown twice'}"
+        yield said, time_s - lag, starts
 
 
 def _stands(time_s: Curve, axes: Curve, moved: Curve) -> list[Finding]:

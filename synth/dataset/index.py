@@ -134,37 +134,41 @@ def write_index(folder: Folder) -> list[dict[str, Any]]:
     An index that can't be read is made anew: all that it says is in the stores. The split is stored beside
     it; sequences that came since get a side, and the others keep theirs.
     """
+    rows, stored = _rows(folder), split.read_stored(folder.root)
+    if not stored.sides:  # an older version stored them here alone
+        for row in rows:
+            if row.get("split") not in (None, *split.SIDES):
+                words = f"sequence {row['index']} is in {row['split'][:40]!r}, no side of a split"
+                raise UserError(
+                    f"{folder.root / NAME}: {words}: remove the file, `synth report` writes it anew"
+                )
+        stored = _dealt(rows, [row.get("split") for row in rows], stored)
+    sides = split.assign_if_possible(rows, stored)
+    for row, side in zip(rows, sides, strict=True):
+        row["split"] = side
+    if any(sides):
+        split.store(folder.root, _dealt(rows, sides, stored))
+    save_rows(folder.root, rows)
+    return rows
+
+
+def split_anew(folder: Folder, chosen: DatasetSplit) -> list[dict[str, Any]]:
+    """Splits a dataset by the rule of `chosen`, which has no sides yet, whatever its split was. Returns all
+    rows of the index. UserError as `assign_sides`."""
+    rows = _rows(folder)
+    split.store(folder.root, _dealt(rows, split.assign_sides(rows, chosen), chosen))
+    return write_index(folder)
+
+
+def _rows(folder: Folder) -> list[dict[str, Any]]:
+    """Of all sequences; what the index has of those that are done is not read from the stores again."""
     known: dict[int, dict[str, Any]] = {}
     with suppress(UserError):
         known = {row["index"]: row for row in read_index(folder.root).to_pylist() if row["status"] == "done"}
     failures = folder.failures().items()
     rows = {k: {"index": k, "status": "failed", "reason": failure["reason"]} for k, failure in failures}
     rows |= {key: known.get(key) or row_of(_open(folder, key)) for key in folder.sealed()}
-    ordered = [rows[key] for key in sorted(rows)]
-    stored = split.read_stored(folder.root)
-    if not stored.sides:  # an older version stored them here alone
-        for row in known.values():
-            if row["split"] not in (None, *split.SIDES):
-                words = f"sequence {row['index']} is in {row['split'][:40]!r}, no side of a split"
-                raise UserError(
-                    f"{folder.root / NAME}: {words}: remove the file, `synth report` writes it anew"
-                )
-        stored = _dealt(known.values(), [row["split"] for row in known.values()], stored)
-    sides = split.assign_if_possible(ordered, stored)
-    for row, side in zip(ordered, sides, strict=True):
-        row["split"] = side
-    if any(sides):
-        split.store(folder.root, _dealt(ordered, sides, stored))
-    save_rows(folder.root, ordered)
-    return ordered
-
-
-def split_anew(folder: Folder, chosen: DatasetSplit) -> list[dict[str, Any]]:
-    """Splits a dataset by the rule of `chosen`, which has no sides yet, whatever its split was. Returns all
-    rows of the index. UserError as `assign_sides`."""
-    rows = write_index(folder)
-    split.store(folder.root, _dealt(rows, split.assign_sides(rows, chosen), chosen))
-    return write_index(folder)
+    return [rows[key] for key in sorted(rows)]
 
 
 def _dealt(
