@@ -13,6 +13,7 @@ from typing import Any, Literal, TypeVar, cast, get_args
 
 import numpy as np
 from pydantic import FiniteFloat, TypeAdapter, ValidationError
+from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial.distance import cdist
 
@@ -227,20 +228,13 @@ def join_groups(*keys: Sequence[Hashable]) -> list[int]:
     `keys`: of everything that must not be on two sides, one value a sequence. The number is the place of the
     group's first sequence.
     """
-    root = list(range(len(keys[0])))
-
-    def find(i: int) -> int:
-        while root[i] != i:
-            root[i] = root[root[i]]
-            i = root[i]
-        return i
-
-    for values in keys:
-        first: dict[Hashable, int] = {}
-        for i, value in enumerate(values):
-            here, there = find(i), find(first.setdefault(value, i))
-            root[max(here, there)] = min(here, there)
-    return [find(i) for i in range(len(root))]
+    count, known, first = len(keys[0]), dict[Hashable, int](), dict[int, int]()
+    held = [(which, value) for which, values in enumerate(keys) for value in values]
+    by = [count + known.setdefault(one, len(known)) for one in held]
+    size = count + len(known)
+    joined = coo_array((np.ones(len(by)), (np.arange(len(by)) % max(count, 1), by)), shape=(size, size))
+    part = connected_components(joined, directed=False)[1][:count]
+    return [first.setdefault(group, i) for i, group in enumerate(part.tolist())]
 
 
 def name_anatomy(attrs: Mapping[str, Any]) -> str:

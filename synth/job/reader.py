@@ -78,9 +78,5 @@ def _find_files(config: ConfigFile, folder: Path) -> Iterator[Mistake]:
             config.values[at[0]][at[1]] = str(path)
         except UserError as error:
             yield Mistake(at, str(error))
-        except (
-            RuntimeError,
-            ValueError,
-            OSError,
-        ):  # no such home, a NUL, a circle of links, too long
+        except (RuntimeError, ValueError, OSError):  # no such home, a NUL, a circle of links, too long
             yield Mistake(at, f"{name[:80]!r} is no name of a file")

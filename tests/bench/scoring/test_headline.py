@@ -11,7 +11,7 @@ import pytest
 from fake_recording import GAIN_MN_PER_PX, Bump, Maker, force_curve, scored
 
 from bench.methods.flow_size import flow_sizes
-from bench.methods.protocol import Field, ForceEstimate, Method, MethodContext
+from bench.methods.protocol import ForceEstimate, Method, MethodContext
 from bench.scoring import charts
 from bench.scoring.headline import headline
 from bench.scoring.result import Result, as_json
@@ -91,19 +91,7 @@ def test_mean_and_peak_of_a_flow_by_hand() -> None:
 
 
 def test_a_shape_that_is_wrong_shows(make: Maker) -> None:
-    class Late:
-        """The bump, but square-rooted: another shape."""
-
-        def __call__(
-            self,
-            flow: Field,
-            confidence: Field,
-            scene: MethodContext,
-            picture: bool,
-        ) -> ForceEstimate:
-            return ForceEstimate(np.sqrt(Bump()(flow, confidence, scene, picture).force_mn))
-
-    result = run(make(), late=Late())
+    result = run(make(), late=lambda *given: ForceEstimate(np.sqrt(Bump()(*given).force_mn)))
     # min over g of mean |g sqrt(x) - x| / mean peak, x being the half-waves: by hand.
     x = force_curve(np.arange(30) / 10)
     g = float(x @ np.sqrt(x) / x.sum())

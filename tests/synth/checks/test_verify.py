@@ -8,6 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import fake_work
+import foreign
 import numpy as np
 import pytest
 import zarr
@@ -81,13 +82,6 @@ def test_a_faulty_pipeline_is_found_by_the_check_made_for_it(tmp_path: Path, fau
     assert not failing(tmp_path / "out") & {"checksum", "seal", "schema", "readable", "dataset", "finite"}
 
 
-def edit(store: Path, **changes: object) -> None:
-    path = store / "zarr.json"
-    metadata = json.loads(path.read_text())
-    metadata["attributes"].update(changes)
-    path.write_text(json.dumps(metadata))
-
-
 def no_number(root: Path) -> None:
     zarr.open_group(str(root / "000001.zarr"), mode="r+")["force"][2, 1] = np.nan
 
@@ -134,7 +128,10 @@ def broken_chunk(root: Path) -> None:
         (leaking_split, {"splits", "dataset"}),
         (edited_axes, {"schema"}),
         (unnamed_version, {"dataset"}),
-        (lambda root: edit(root / "000000.zarr", young_kpa=2.0), {"seal", "dataset"}),
+        (
+            lambda root: foreign.edit_attributes(root / "000000.zarr", reseal=False, young_kpa=2.0),
+            {"seal", "dataset"},
+        ),
         (swapped_sequences, {"seal", "dataset"}),
         (replaced_value, {"checksum"}),
         (broken_chunk, {"readable"}),
