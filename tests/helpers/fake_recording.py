@@ -66,7 +66,8 @@ class Maker:
             t = np.arange(0, time[-1] + 1e-9, 1 / SENSOR_HZ)
             writer.write_force(folder, t, np.outer(force_curve(t) / 1000, [1.0, 0.0, 0.0]))
         about = {"scale_mm_per_px": 0.2, "young_kpa": 1.0, "sensor": {"axes": "camera", "low_pass_hz": None}}
-        writer.write_meta(folder, {**about, **(meta or {})})
+        known = {"membrane": "stripped", "poisson": [0.45, 0.45]}  # two tissues to solve, not twelve
+        writer.write_meta(folder, {**about, **known, **(meta or {})})
         return folder
 
 
