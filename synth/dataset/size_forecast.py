@@ -89,9 +89,11 @@ def estimate(job: Job) -> float:
     """Bytes of one sequence of `job` on disk, before any is made."""
     width, height = job.render.size
     half = job.store.flow == "float16"
-    return _MARGIN * sum(
+    total = sum(
         field_bytes(FIELDS[name], job.frames, (height, width), half=half)[1] for name in job.stored_fields
     )
+    radiance = 6.0 * width * height * job.frames if job.render.exr else 0.0
+    return _MARGIN * (total + radiance)
 
 
 def estimate_memory(job: Job) -> float:

@@ -87,6 +87,8 @@ class RenderSection(Section):
     stereo_mm: NonNegative = 0.0
     """Distance of a second lens to the right [mm], for a stereo dataset: its pictures, and motion in three
     dimensions, true and recovered; 0: there is none."""
+    exr: bool = False
+    """Also write the linear radiance of every frame as EXR."""
     tool: bool = True
     """Show the instrument."""
     scenery: tuple[Literal["retractor", "cottonoid", "bone", "drape"], ...] = ()

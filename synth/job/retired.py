@@ -71,7 +71,6 @@ JOB: dict[str, Retired] = {
     "sensor.depth": Retired(8),
     "sensor.subframes": Retired(4),
     "render.off_centre": Retired([0.0, 0.0]),
-    "render.exr": Retired(False),
     "fem.crew": Retired([], renamed="instrument_list"),
     "fem.within_mm": Retired(None, renamed="contact_region_radius_mm"),
     "fem.cone_deg": Retired(65.0, renamed="max_tilt_deg"),

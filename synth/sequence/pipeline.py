@@ -131,6 +131,8 @@ def _render_frames(task: _Task) -> list[_Video]:
             for name in names:
                 writer.put_frame(name, t, made[name] if name in made else getattr(frame, name))
             writer.put_frame("traction", t, frame.traction)
+            if job.render.exr:
+                writer.put_exr(t, frame.radiance)
         for video, (rgb, tool) in zip(videos, lenses, strict=True):
             video.rgb[t], video.tools[t] = getattr(frame, rgb), getattr(frame, tool)
         poses[t] = frame.camera.pose
