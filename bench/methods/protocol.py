@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -57,6 +57,15 @@ class ForceEstimate:
     @property
     def size_mn(self) -> float:
         return float(np.sqrt(np.nansum(self.force_mn**2)))
+
+
+def allow_creep(answers: Sequence[ForceEstimate], share: float = 0.05) -> list[ForceEstimate]:
+    """A film's answers, intervals of those below a share of the largest reaching down to 0.
+
+    Tissue creeps: what a press leaves behind moves, and is no force.
+    """
+    largest = max((one.size_mn for one in answers), default=0.0)
+    return [replace(one, low_mn=0.0) if one.size_mn < share * largest else one for one in answers]
 
 
 class Method(Protocol):

@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from bench.methods.force_mixture import size_interval
-from bench.methods.protocol import Field, ForceEstimate, MethodContext
+from bench.methods.protocol import Field, ForceEstimate, MethodContext, allow_creep
 from synth.errors import UserError
 
 _COMMON, _CAUTION = 0.3, 1.5
@@ -49,7 +49,7 @@ class Together:
             off = network.force_mn - physics.force_mn
             pulled, apart = pulled + float((both.mean - physics.force_mn) @ off), apart + float(off @ off)
         self._share = pulled / apart if apart else 0.0
-        return found
+        return allow_creep(found)
 
     @property
     def notes(self) -> list[str]:

@@ -1,7 +1,8 @@
 """Network, physics and what both say together, on sequences of a world that the network has not met.
 
 Every sequence's stored motion is read as a recording's is, by one eye and by two, with the membrane unknown
-and stated. The constants of `bench.methods.together` rest on the half with even numbers; read the other.
+and stated. The constants of `bench.methods.together`, and what physics' interval grows by under a membrane,
+were set on the half with even numbers; read the other.
 
 Run: python -m evidence.scoring.together mission-unseen --work work
 """

@@ -59,3 +59,9 @@ def test_ninety_of_a_hundred_draws_lie_within() -> None:
         found, _ = together(estimate([said[0]], [1 / CAUTION], [1.0]), estimate([said[1]], [0.7], [1.0]))
         inside += found.low_mn <= np.linalg.norm(true) <= found.high_mn
     assert inside / count == pytest.approx(0.9, abs=0.05)
+
+
+def test_what_a_press_leaves_behind_may_be_no_force() -> None:
+    said = [estimate([np.array([size, 0.0, 0.0])], [0.01], [1.0]) for size in (10.0, 0.3, 1.0)]
+    found = Together("network", "physics").combine([{"network": o, "physics": o} for o in said], SCENE, 2)
+    assert [one.low_mn > 0 for one in found] == [True, False, True]
