@@ -105,6 +105,7 @@ def _add_second(bag: Any, found: Intake, frames: str, use: dict[str, str], pictu
     else:
         view = replace(view, pictures=partial(pictures, topic, _depth))
         if left is not None:
+            notes.append(f"{topic} is taken as registered to {frames}: pixel for pixel, seen by its lens")
             about = {"focal_px": float(left.K[0, 0]), "centre_px": left.K[:2, 2].tolist()}
             view = replace(view, lens=about)
             if left.distortion.any():
@@ -225,6 +226,10 @@ def _picture(source: Path, message: Any) -> NDArray[np.uint8]:
 def _depth(source: Path, message: Any) -> NDArray[Any]:
     """(H, W) mm, uint16 or float32: 16-bit pictures are in mm and floats in metres, by ROS's REP 118."""
     if hasattr(message, "format"):
+        if "compressedDepth" in message.format and message.format.startswith("32FC1"):
+            raise UserError(
+                f"{source}: {message.format} holds inverse depth, which isn't read; decompress it"
+            )
         data = bytes(message.data)[_HEADER * ("compressedDepth" in message.format) :]
         found = checked_file.decode_picture(data, cv2.IMREAD_UNCHANGED)
         if found.dtype != np.uint16 or found.ndim != 2:

@@ -7,6 +7,7 @@ observation of the same force: it draws each of them towards itself, and those t
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -26,7 +27,7 @@ class Together:
     def __init__(self, network: str, physics: str) -> None:
         """Names of the two."""
         self.parts = network, physics
-        self._share = 0.0
+        self._share, self._alone = 0.0, 0
 
     def __call__(self, flow: Field, confidence: Field, scene: MethodContext, picture: bool) -> ForceEstimate:
         """Raises UserError: it has nothing to say of a flow."""
@@ -41,18 +42,21 @@ class Together:
         for frame in answers:
             network, physics = (frame[name] for name in self.parts)
             if network.likely is None or physics.likely is None:
-                found.append(network)
+                found.append(replace(network, likely=None))
                 continue
             spread = _CAUTION**2 * network.likely.covariance[0]
             both = physics.likely.observe(network.likely.mean, spread)
-            found.append(ForceEstimate(both.mean, None, *size_interval(both, gain, eyes), both))
+            found.append(ForceEstimate(both.mean, None, *size_interval(both, gain, eyes)))
             off = network.force_mn - physics.force_mn
             pulled, apart = pulled + float((both.mean - physics.force_mn) @ off), apart + float(off @ off)
         self._share = pulled / apart if apart else 0.0
+        self._alone = sum(None in (frame[name].likely for name in self.parts) for frame in answers)
         return allow_creep(found)
 
     @property
     def notes(self) -> list[str]:
         """What each weighed over the film."""
         network, physics = self.parts
+        if self._alone:
+            return [f"{self._alone} frames are of {network} alone: one of the two states no error"]
         return [f"where they differ {network} weighs {self._share:.0%} and {physics} {1 - self._share:.0%}"]

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bench.methods.comparison import PHYSICS, TOGETHER
 from bench.scoring import metrics
 from bench.scoring.result import Curve, Result
 from bench.sensor.clock_sync import Offset
@@ -30,7 +31,9 @@ def draw_force(result: Result) -> str:
     """
     time_s, (sensor, curves, label) = result.time_s, scale_curves(result)
     main, method = curves[result.main], result.methods[result.main]
-    spread = 1.96 * result.relative_uncertainty
+    # What physics has a part in knows how unsure E is; scale is in no interval.
+    holds_young = method.low_mn is not None and result.main in (PHYSICS, TOGETHER)
+    spread = 1.96 * (2 * result.scale.uncertainty if holds_young else result.relative_uncertainty)
 
     def draw(figure: Figure) -> None:
         axes = figure.subplots()
@@ -38,7 +41,7 @@ def draw_force(result: Result) -> str:
             name = f"{method.interval['level']:.0%} interval"
             _band(axes, time_s, method.low_mn, method.high_mn, name, _INTERVAL)
         if spread > 0:
-            name = f"±{100 * spread:.0f}% scale, stiffness"
+            name = f"±{100 * spread:.0f}% scale" + ("" if holds_young else ", stiffness")
             _band(axes, time_s, main * (1 - min(spread, 1.0)), main * (1 + spread), name, _MAIN)
         if sensor is not None:
             axes.plot(time_s, sensor, color=_SENSOR, linewidth=1.8, label="sensor", zorder=4)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from bench import bootstrap
 from bench.methods.flow_size import FlowSize, flow_sizes
-from bench.methods.protocol import Method
+from bench.methods.protocol import Combining, Method
 from bench.recording.folder import Recording
 from bench.recording.meta import Meta, Span
 from bench.recording.pixel_scale import PixelScale
@@ -148,7 +148,9 @@ def _against_sensor(
         return []
     forces = []
     if recording.meta.young_kpa is not None:
-        every = [np.array(tracked.force_mn[n]) for n, one in methods.items() if not isinstance(one, FlowSize)]
+        # What combines others is no further witness.
+        alone = [n for n, one in methods.items() if not isinstance(one, (FlowSize, Combining))]
+        every = [np.array(tracked.force_mn[name]) for name in alone]
         forces = [force[followed] for force in every if np.nan_to_num(force).any()]
     size = np.array(tracked.force_mn[moved])[followed, 0]
     time_s = np.array(tracked.time_s)[followed]

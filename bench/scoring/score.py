@@ -12,6 +12,7 @@ from typing import Any
 from bench.methods import comparison, plugins
 from bench.methods.comparison import MAIN, PHYSICS, TOGETHER
 from bench.methods.network import Model
+from bench.methods.physics import Physics
 from bench.methods.protocol import Method
 from bench.methods.together import Together
 from bench.recording import pixel_scale
@@ -78,6 +79,8 @@ def score(
         raise UserError(f"model: expected a folder or what `load_model` gives, got {type(model).__name__}")
     if not isinstance(methods or {}, Mapping):
         raise UserError(f"methods: expected them by name, got {type(methods).__name__}")
+    if taken := {TOGETHER, *([MAIN] if model is not None or not methods else [])} & set(methods or {}):
+        raise UserError(f"methods: {min(taken)} is a name of ours; give yours another")
     if model is None and not methods:
         model = require_model(opened.has_two_eyes)
     elif isinstance(model, (str, Path)):
@@ -102,7 +105,7 @@ def score(
         if baselines:
             simple = comparison.simpler_methods(Path(train) if train else None, folder, opened.has_two_eyes)
             chosen |= {name: one for name, one in simple.items() if name not in chosen}
-        if MAIN in chosen and PHYSICS in chosen:
+        if network is not None and isinstance(chosen.get(PHYSICS), Physics):
             chosen = {TOGETHER: Together(MAIN, PHYSICS), **chosen}
         described: dict[str, Any] = {} if network is None else {"model": network.described()}
         networks = {name: one for name, one in chosen.items() if isinstance(one, Model)}

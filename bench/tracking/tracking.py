@@ -68,6 +68,8 @@ class TrackedRecording:
     repeats: tuple[dict[int, int], dict[int, int]] = field(default_factory=lambda: ({}, {}))
     """Frames that show an earlier one again, as of `FilmFaults.repeats`."""
     snapshots: list[Snapshot] = field(default_factory=list)
+    pictured: str = ""
+    """The method whose force map they have."""
     rest: NDArray[np.uint8] | None = None
     tissue: NDArray[np.bool_] | None = None
     """(h, w), shrunk as the snapshots are."""
@@ -201,7 +203,7 @@ class _Forces:
         shown = methods.get(pictured) if pictured is not None else None
         self.pictured = shown.parts[0] if isinstance(shown, Combining) else pictured
         self.methods, self.watch = methods, watch
-        self.out = TrackedRecording()
+        self.out = TrackedRecording(pictured=self.pictured or "")
         self.answers: list[dict[str, ForceEstimate]] = []
         self.last: NDArray[np.float32] | None = None
         self.stride, self.eyes = 1, 1
@@ -257,12 +259,15 @@ class _Forces:
                 with self.watch.stage(name):
                     for frame, answer in zip(self.answers, method.revise(quiet), strict=True):
                         frame[name] = answer
+        followed = [frame for frame, kept in zip(self.answers, self.out.trusted, strict=True) if kept]
         for name, method in self.methods.items():
             if isinstance(method, Combining):
                 with self.watch.stage(name):
-                    combined = method.combine(self.answers, self.scene, self.eyes)
-                for frame, answer in zip(self.answers, combined, strict=True):
+                    combined = method.combine(followed, self.scene, self.eyes)
+                for frame, answer in zip(followed, combined, strict=True):
                     frame[name] = answer
+                for frame in self.answers:
+                    frame.setdefault(name, frame[method.parts[0]])
         for name in self.methods:
             self.out.force_mn[name] = [frame[name].force_mn for frame in self.answers]
             self.out.bounds[name] = [(frame[name].low_mn, frame[name].high_mn) for frame in self.answers]

@@ -164,8 +164,7 @@ def page(tree: Mapping[str, Any]) -> report.Page:
         times = {"left in, times still": f"{left.max():.2f}", "taken off, times still": f"{off.max():.2f}"}
         rows.append({"method": name} | cells | times)
         worst = max(worst, float(off.max()))
-        if name != "zero":
-            bars.append(report.Row(name, float(np.median(off)), (float(off.min()), float(off.max()))))
+        bars.append(report.Row(name, float(np.median(off)), (float(off.min()), float(off.max()))))
     beats = [
         f"{one['amplitude_mm']:.2f} mm at {one['rate_hz']:.3f} Hz"
         for row in tree["rows"]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -15,7 +16,7 @@ from typer.testing import CliRunner
 
 from bench.cli import app
 from bench.importers import registry
-from bench.importers.rosbag import partners
+from bench.importers.rosbag import _depth, partners
 from bench.methods import comparison
 from bench.recording.folder import open_recording
 from evidence.scoring.cost import pushed
@@ -195,3 +196,10 @@ def test_a_bag_becomes_a_score(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     sensor, said = np.array(curve["sensor_mn"]), np.array(curve["predicted_mn"]["D2FNet"])
     assert sensor.max() == pytest.approx(50, rel=0.05)
     assert np.corrcoef(sensor, said)[0, 1] > 0.9
+
+
+def test_inverse_depth_is_refused() -> None:
+    """`32FC1; compressedDepth` holds A / depth + B: read as millimetres it would be silently wrong."""
+    message = SimpleNamespace(format="32FC1; compressedDepth png", data=b"")
+    with pytest.raises(UserError):
+        _depth(Path("bag"), message)

@@ -114,3 +114,9 @@ def test_a_name_of_ours_is_not_taken(tmp_path: Path, monkeypatch: pytest.MonkeyP
     installed(tmp_path, monkeypatch, physics="Push")
     with pytest.raises(UserError, match="physics"):
         comparison.simpler_methods(None, None)
+
+
+def test_the_answer_of_both_can_not_be_replaced(recording: Path) -> None:
+    own = {"network and physics": lambda *asked: bench.ForceEstimate(np.zeros(3))}
+    with pytest.raises(UserError):
+        bench.score(recording, methods=own)
