@@ -45,7 +45,7 @@ _WIDE = 1.2
 _TEMPER = 0.1
 """Frames of a film err alike, and alike at neighbouring points: so much of their evidence counts."""
 _STRONGEST, _ANEW, _LEAST = 8, 1.3, 0.05
-_GAIN, _STIFFNESS = 0.25, 0.9
+_GAIN, _STIFFNESS = 0.25, 0.5
 """Relative deviation of the force by what no film tells: relief, pose, the law at large strain; and, where
 there is a membrane, by its stiffness, which large strains and wrinkles hide."""
 
