@@ -12,6 +12,7 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
+from safetensors import SafetensorError
 from safetensors.numpy import save_file
 from safetensors.torch import load_file
 
@@ -255,7 +256,7 @@ def pack(clip: Clip, folder: Path) -> None:
             # One file: a mapping each, of which a process has some ten thousands, for thousands of clips.
             save_file({name: np.ascontiguousarray(values) for name, values in arrays.items()}, part / _FILE)
             (part / "clip.json").write_text(json.dumps(plain))
-    except (OSError, UserError) as error:
+    except (OSError, UserError, SafetensorError) as error:
         if not folder.is_dir():  # else another run was faster
             why = getattr(error, "strerror", error)
             raise UserError(f"{folder}: cannot be written ({why})") from None

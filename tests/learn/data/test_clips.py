@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import phantom
 import pytest
+from safetensors import SafetensorError
 
 from learn.data.clips import Clip, load_clips, pack, target, unpack
 from learn.data.grid import Grid
@@ -76,6 +77,18 @@ def test_two_runs_may_pack_the_same_at_once(
     pack(clips[0], tmp_path / "packed")
     assert [path.name for path in tmp_path.iterdir()] == ["packed"]
     np.testing.assert_array_equal(unpack(tmp_path / "packed").density, clips[0].density)
+
+
+def test_a_full_disk_is_one_line_and_leaves_nothing(
+    clips: list[Clip], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*about: object) -> None:
+        raise SafetensorError("Error while serializing: I/O error: No space left on device")
+
+    monkeypatch.setattr("learn.data.clips.save_file", full)
+    with pytest.raises(UserError):
+        pack(clips[0], tmp_path / "packed")
+    assert not any(tmp_path.iterdir())
 
 
 def test_a_packed_clip_holds_no_file_open_and_one_mapping(clips: list[Clip], tmp_path: Path) -> None:
