@@ -38,11 +38,12 @@ class Together:
     ) -> list[ForceEstimate]:
         """See `Combining`; where one knows nothing of its error the network answers alone."""
         gain = float(np.hypot(_COMMON, scene.young_uncertainty))
-        found, pulled, apart = list[ForceEstimate](), 0.0, 0.0
+        found, pulled, apart, self._alone = list[ForceEstimate](), 0.0, 0.0, 0
         for frame in answers:
             network, physics = (frame[name] for name in self.parts)
             if network.likely is None or physics.likely is None:
                 found.append(replace(network, likely=None))
+                self._alone += 1
                 continue
             spread = _CAUTION**2 * network.likely.covariance[0]
             both = physics.likely.observe(network.likely.mean, spread)
@@ -50,7 +51,6 @@ class Together:
             off = network.force_mn - physics.force_mn
             pulled, apart = pulled + float((both.mean - physics.force_mn) @ off), apart + float(off @ off)
         self._share = pulled / apart if apart else 0.0
-        self._alone = sum(None in (frame[name].likely for name in self.parts) for frame in answers)
         return allow_creep(found)
 
     @property

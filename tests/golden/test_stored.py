@@ -130,11 +130,23 @@ def test_predictions_are_read(stored: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "network_mn"), [("recording", 3.608), ("pair", 6.028)])
-def test_a_recording_is_scored_as_it_was(stored: Path, tmp_path: Path, name: str, network_mn: float) -> None:
+@pytest.mark.parametrize(
+    ("name", "network_mn", "sensor_mn"), [("recording", 3.608, 6.160), ("pair", 6.028, 6.160)]
+)
+def test_a_recording_is_scored_as_it_was(
+    stored: Path, tmp_path: Path, name: str, network_mn: float, sensor_mn: float
+) -> None:
     command("bench", ["score", stored / name, "-o", tmp_path / "score"])
-    methods = json.loads((tmp_path / "score" / "score.json").read_text())["methods"]
-    assert methods["D2FNet"]["scores"]["mae_mn"] == pytest.approx(network_mn, rel=0.01)
+    found = json.loads((tmp_path / "score" / "score.json").read_text())
+    assert found["methods"]["D2FNet"]["scores"]["mae_mn"] == pytest.approx(network_mn, rel=0.01)
+    read = [
+        force
+        for force, scored, lost in zip(
+            *(found["curve"][k] for k in ("sensor_mn", "scored", "lost")), strict=True
+        )
+        if scored and not lost
+    ]
+    assert np.mean(read) == pytest.approx(sensor_mn, rel=0.001)
 
 
 def test_a_retired_key_goes_unsaid_at_its_default_only() -> None:

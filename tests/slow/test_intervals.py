@@ -63,7 +63,9 @@ def test_unseen_brains_are_covered_and_another_mechanics_widens(
     card = read_card(model)
     assert card.intervals is not None
     assert card.intervals.units == len(card.groups["intervals"]) >= 9
-    assert not set(card.groups["intervals"]) & {*card.groups["fit"], *card.groups["select"]}
+    others = {*card.groups["fit"], *card.groups["select"], *card.groups["test"]}
+    assert not set(card.groups["intervals"]) & others
+    assert card.no_intervals == ""
     wide, _ = run("eval", str(model), str(dataset), "--json")["coverage"]
     assert wide["level"] == 0.9
     # 27 sequences: a share of 0.9 has a standard error of 0.06 if each held or failed as a whole.

@@ -1,9 +1,12 @@
-"""The real pipeline, small: its labels hold."""
+"""The real pipeline, small: its labels hold, and a killed run ends with the bytes of an undisturbed one."""
 
 from __future__ import annotations
 
+import os
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -22,14 +25,24 @@ render: {size: [96, 72], spp: 1}
 """
 
 
+def start(job: Path, out: Path) -> subprocess.Popen[bytes]:
+    command = [sys.executable, "-m", "synth", "render", str(job), "-o", str(out), "--workers", "1"]
+    return subprocess.Popen(
+        command, start_new_session=True, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE
+    )
+
+
+def finish(process: subprocess.Popen[bytes]) -> None:
+    _, errors = process.communicate(timeout=240)
+    assert process.returncode == 0, errors.decode()
+
+
 @pytest.fixture(scope="module")
 def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("pipeline")
     job, out = folder / "job.yaml", folder / "out"
     job.write_text(JOB)
-    command = [sys.executable, "-m", "synth", "render", str(job), "-o", str(out), "--workers", "1"]
-    done = subprocess.run(command, stderr=subprocess.PIPE, text=True)
-    assert done.returncode == 0, done.stderr
+    finish(start(job, out))
     return out
 
 
@@ -45,3 +58,23 @@ def test_pixels_carry_the_applied_force(undisturbed: Path) -> None:
         assert np.linalg.norm(force, axis=1).max() > 0
         # One pixel is 0.4 mm here, a tenth of the contact: quadrature costs more than the 1% of real sizes.
         assert np.abs(total - force).max() <= 0.03 * np.linalg.norm(force, axis=1).max()
+
+
+@pytest.mark.trial
+def test_killed_and_resumed_equals_undisturbed(undisturbed: Path, tmp_path: Path) -> None:
+    job, out = undisturbed.parent / "job.yaml", tmp_path / "out"
+    process = start(job, out)
+    limit = time.monotonic() + 120
+    # Killed with everything it started, in the middle of the second sequence.
+    while not list(out.glob("000001.zarr.part")):
+        assert process.poll() is None, "it ended before it could be killed"
+        assert time.monotonic() < limit
+        time.sleep(0.02)
+    os.killpg(process.pid, signal.SIGKILL)
+    process.communicate()
+    assert [path.name for path in Dataset(out).paths] == ["000000.zarr"]
+
+    finish(start(job, out))
+    hashes = [[s.attrs["content_hash"] for s in Dataset(folder)] for folder in (undisturbed, out)]
+    assert hashes[0] == hashes[1]
+    assert not list(out.glob("*.part"))

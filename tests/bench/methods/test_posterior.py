@@ -156,7 +156,7 @@ def test_a_film_tells_a_membrane_and_meta_narrows_it(basis: LoadBasis) -> None:
         stiff.append(float(found.weight @ [one.membrane for one in found.tissues]))
     assert "evidence for a membrane of about" in physics.describe(found, scene)
     # Another mesh's bare tissue may look like a thin membrane, never like a thick one.
-    assert stiff[0] < 5.01
+    assert stiff[0] <= 5 + 1e-9
     assert stiff[1] > 20
     told = MethodContext(scene.tissue, scene.scale_mm_per_px, 2.0, "stripped", (0.48, 0.49))
     assert {(one.membrane, one.poisson) for one in physics.grid_of(told)} == {(0.0, 0.49)}

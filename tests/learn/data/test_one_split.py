@@ -145,7 +145,7 @@ def test_what_another_split_calls_test_is_not_scored_if_it_was_fitted_on(tmp_pat
 
 
 def test_several_datasets_are_divided_as_each_says_and_no_brain_is_on_two_sides(tmp_path: Path) -> None:
-    for draw in range(3):
+    for draw in range(6):
         rng = np.random.default_rng([36, draw])
         both = [make(tmp_path / f"{draw}-{k}", rng.permutation(12)[:9].tolist(), 20 * k) for k in range(2)]
         card, _ = divided(*both)

@@ -32,10 +32,20 @@ def sides(found: list[dict[str, Any]], rule: DatasetSplit) -> dict[int, str | No
     return {row["index"]: side for row, side in zip(found, split.assign_sides(found, rule), strict=True)}
 
 
+def test_no_anatomy_is_on_two_sides_and_shares_are_kept() -> None:
+    found = rows()
+    given = sides(found, DatasetSplit())
+    assert given[7] is None
+    for anatomy in range(20):
+        assert len({given[k] for k in range(60) if k % 20 == anatomy and k != 7}) == 1
+    counts = split.count([{"split": side} for side in given.values()])
+    for side, share in zip(split.SIDES, (0.7, 0.15, 0.15), strict=True):
+        assert abs(counts[side] - 59 * share) <= 3, "an anatomy has three sequences"
+
+
 def test_order_does_not_matter() -> None:
     found = rows()
     assert sides(found, DatasetSplit()) == sides(found[::-1], DatasetSplit())
-    assert sides(found, DatasetSplit())[7] is None, "it failed"
 
 
 def test_a_held_out_family_is_only_for_testing() -> None:
