@@ -1,10 +1,12 @@
 """Everything that a GPU changes, checked and timed in one call, each step a process of its own.
 
-Run: python -m evidence.gpu; the last step trains the paper's network: 256², 20,000 frames, 50 epochs.
+Run: python -m evidence.gpu, or one step: --only training. What is done is not done again. The last two make
+labels and train the paper's network on them: 256², 20,000 frames, 50 epochs.
 """
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 import time
@@ -12,7 +14,7 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 import typer
@@ -30,6 +32,7 @@ from learn.training.train import train
 from synth.errors import UserError
 from synth.job import reader
 from synth.job.schema import Job
+from synth.system import gpu
 
 Steps = Sequence[tuple[str, Sequence[str]]]
 """Name of each step and the arguments after `python`."""
@@ -37,15 +40,22 @@ app = typer.Typer(add_completion=False)
 
 
 @app.callback(invoke_without_command=True)
-def main(context: typer.Context, out: Path = report.RESULTS / "gpu", limit_s: float = 900.0) -> None:
+def main(
+    context: typer.Context,
+    out: Path = report.RESULTS / "gpu",
+    only: Annotated[str | None, typer.Option(help="One step, by its name.")] = None,
+    limit_s: Annotated[float, typer.Option(help="A step that takes longer is stopped.")] = 580.0,
+) -> None:
     """Checks and times everything that an NVIDIA GPU changes. Exit code 1 if a step fails."""
-    from synth.render.mitsuba.adapter import cuda
-
     if context.invoked_subcommand:
         return
-    if not cuda():
+    if gpu.probe() is None:
         raise UserError("no NVIDIA GPU and driver were found; `synth doctor` says what is missing")
-    rows = run_steps(steps(out), out, limit_s)
+    named = {name: arguments for name, arguments in steps(out)}
+    if only is not None and only not in named:
+        raise UserError(f"--only {only}: the steps are {', '.join(named)}")
+    chosen = [(only, named[only])] if only else list(named.items())
+    rows = run_steps(chosen, out, limit_s)
     report.show({"steps": rows})
     raise typer.Exit(int(any(row["exit_code"] for row in rows)))
 
@@ -64,6 +74,7 @@ def steps(out: Path) -> Steps:
             "training",
             ("-m", "learn", "train", data, "-o", model, "--accelerator", "cuda", "--input", "mixed"),
         ),
+        ("labels", ("-m", "evidence.gpu", "labels", str(out / "labels"))),
         ("full size", ("-m", "evidence.gpu", "full-size", str(out / "labels"), str(out / "full"))),
     )
 
@@ -71,13 +82,20 @@ def steps(out: Path) -> Steps:
 def run_steps(steps: Steps, out: Path, limit_s: float) -> list[dict[str, Any]]:
     """Runs the steps one after another, each into `NAME.log`; one that fails does not stop the next.
 
+    A step that has passed before, by the same command, is not run again.
+
     Returns:
-        `name`, `command`, `exit_code` (-1: stopped at its time limit) and `wall_s` a step; `gpu.json` holds
-        them, rewritten after every step.
+        `name`, `command`, `exit_code` (-1: stopped at its time limit) and `wall_s` of every step that was
+        ever run into `out`; `gpu.json` holds them, rewritten after every step.
     """
     out.mkdir(parents=True, exist_ok=True)
-    rows: list[dict[str, Any]] = []
+    kept = out / "gpu.json"
+    rows: list[dict[str, Any]] = json.loads(kept.read_text("utf-8"))["steps"] if kept.is_file() else []
+    passed = {row["command"] for row in rows if row["exit_code"] == 0}
     for name, arguments in steps:
+        line = "python " + " ".join(arguments)
+        if line in passed:
+            continue
         begin = time.perf_counter()
         with (out / f"{name.replace(' ', '-')}.log").open("wb") as log:
             try:
@@ -86,11 +104,19 @@ def run_steps(steps: Steps, out: Path, limit_s: float) -> list[dict[str, Any]]:
             except subprocess.TimeoutExpired:
                 code = -1
         spent = time.perf_counter() - begin
-        line = "python " + " ".join(arguments)
+        rows = [row for row in rows if row["name"] != name]
         rows.append({"name": name, "command": line, "exit_code": code, "wall_s": round(spent, 1)})
         typer.echo(f"{name}: exit code {code}, {spent:.1f} s", err=True)
         report.save(out, "gpu.json", {"steps": rows})
     return rows
+
+
+@app.command()
+def labels(cache: Path, sequences: int = 500, frames: int = 52, size: int = 256, workers: int = 8) -> None:
+    """Makes the labels of the full size in parallel; those that are there already are kept."""
+    job, grid = _job(sequences, frames), preset("paper", size=size).grid
+    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+        list(pool.map(_make, [(job, index, grid, cache) for index in range(sequences)]))
 
 
 @app.command()
@@ -104,29 +130,24 @@ def full_size(
     epochs: int = 50,
     batch: int = 64,
     accelerator: str = "auto",
-    workers: int = 8,
 ) -> None:
-    """Makes labels in parallel, trains as the paper does, scores the fold that was kept; all of it timed."""
+    """Trains on these labels as the paper does, and scores the fold that was kept. Goes on if stopped."""
     set_threads(1)
-    job = reader.load_job(str(JOB)).model_copy(update={"sequences": sequences, "frames": frames})
-    base = preset("paper", size=size, epochs=epochs, batch=batch)
-    began = time.perf_counter()
-    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-        list(pool.map(_make, [(job, index, base.grid, cache) for index in range(sequences)]))
+    base, job = preset("paper", size=size, epochs=epochs, batch=batch), _job(sequences, frames)
     clips = [whole(job, index, base.grid, cache) for index in range(sequences)]
-    labelled = time.perf_counter() - began
-    gpu = accelerator != "cpu" and torch.cuda.is_available()
+    on_gpu = accelerator != "cpu" and torch.cuda.is_available()
     settings = replace(
         base,
         arch=replace(base.arch, width=width, output="magnitude"),
         learning_rate=2e-3,
         schedule="cosine",
-        precision="bf16-mixed" if gpu else "32-true",
+        precision="bf16-mixed" if on_gpu else "32-true",
         channels_last=True,
-        compile=gpu,
+        compile=on_gpu,
     )
     split = nested(clips, 10, 0, settings.seed)
     fabric = make_fabric(accelerator=accelerator, devices=1, precision=settings.precision)
+    whole_run = not (out / "model").exists()  # what goes on after a stop tells no rate
     began = time.perf_counter()
     train(clips, split, settings, out / "model", fabric=fabric)
     trained = time.perf_counter() - began
@@ -134,16 +155,19 @@ def full_size(
     found: Mapping[str, float] = evaluate(load_model(out / "model", fabric.device), tested, "ideal").summary()
     count = sum(clips[i].frames for i in split.fit)
     result = {
-        "device": torch.cuda.get_device_name() if gpu else "cpu",
+        "device": torch.cuda.get_device_name() if on_gpu else "cpu",
         "frames_fit": count,
-        "labels_s": labelled,
-        "training_s": trained,
-        "frames_per_s": count * epochs / trained,
+        "training_s": trained if whole_run else None,
+        "frames_per_s": count * epochs / trained if whole_run else None,
         "map_r2_pooled": found["map_r2_pooled"],
         "force_r2_pooled": found["force_r2_pooled"],
     }
     report.save(out, "full.json", result)
     report.show(result)
+
+
+def _job(sequences: int, frames: int) -> Job:
+    return reader.load_job(str(JOB)).model_copy(update={"sequences": sequences, "frames": frames})
 
 
 def _make(task: tuple[Job, int, Grid, Path]) -> None:

@@ -6,12 +6,11 @@ import ctypes
 import importlib.util
 import os
 import shutil
-import subprocess
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from synth.system import cache, llvm, packages
+from synth.system import cache, gpu, llvm, packages
 from synth.system.checked_file import folder_bytes
 from synth.system.text_lines import hang
 
@@ -32,7 +31,7 @@ class Diagnosis:
 
 def diagnose(folder: Path) -> list[Diagnosis]:
     """Everything that is looked at; `folder` is where datasets would go."""
-    machine, library, gpu = packages.machine(), llvm.find(), _cuda()
+    machine, library = packages.machine(), llvm.find()
     found = [
         Diagnosis("system", f"{machine['system']}, {machine['processor']}"),
         Diagnosis("cores", str(machine["cores"])),
@@ -49,7 +48,7 @@ def diagnose(folder: Path) -> list[Diagnosis]:
             library is not None,
             "install LLVM 17 or newer (Debian: apt-get install libllvm19), or set DRJIT_LIBLLVM_PATH",
         ),
-        Diagnosis("CUDA", f"{gpu}; render.variant=cuda_ad_rgb uses it" if gpu else "no GPU (not needed)"),
+        _cuda(),
         Diagnosis(
             "renderer",
             "llvm_ad_rgb" if library else "scalar_rgb",
@@ -108,10 +107,13 @@ def _disk(folder: Path) -> Diagnosis:
     return Diagnosis("disk", found, writable and free >= _LEAST_FREE_GB, "choose another folder with -o")
 
 
-def _cuda() -> str | None:
-    query = ["nvidia-smi", "--query-gpu=name,memory.total,driver_version", "--format=csv,noheader"]
-    try:
-        done = subprocess.run(query, capture_output=True, text=True, timeout=20, check=False)
-    except (FileNotFoundError, subprocess.TimeoutExpired):
-        return None
-    return done.stdout.strip() or None if done.returncode == 0 else None
+def _cuda() -> Diagnosis:
+    here = gpu.probe()
+    if here is None:
+        return Diagnosis("CUDA", "no GPU (not needed)")
+    capability = ".".join(map(str, here.capability))
+    found = f"{here.devices} GPU, driver {here.driver or 'unknown'}, compute capability {capability}"
+    why = gpu.obstacle(here)
+    return Diagnosis(
+        "CUDA", found if why else f"{found}; render.variant=cuda_ad_rgb uses it", why is None, why or ""
+    )

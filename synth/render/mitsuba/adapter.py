@@ -24,7 +24,7 @@ from synth.geometry.triangles import Shape, normals
 from synth.render.camera.camera import Camera
 from synth.render.mitsuba.glow import register_glow
 from synth.render.mitsuba.lens import Compiled, Scalar
-from synth.system import cache, llvm
+from synth.system import cache, gpu, llvm
 
 Floats = npt.NDArray[np.float64]
 Map = npt.NDArray[np.float32]
@@ -109,8 +109,8 @@ def pick(asked: str) -> str:
         os.environ.setdefault("DRJIT_CACHE_DIR", str(cache.folder("kernels")))
     os.environ.setdefault("DRJIT_CACHE_MAXSIZE", str(cache.LIMIT_BYTES))
     if asked == "cuda_ad_rgb":
-        if not cuda():
-            raise UserError("render.variant: cuda_ad_rgb needs an NVIDIA GPU and its driver; none was found")
+        if why := gpu.obstacle(gpu.probe()):
+            raise UserError(f"render.variant: cuda_ad_rgb: {why}")
         return asked
     found = llvm.find()
     if found is None:
@@ -119,17 +119,6 @@ def pick(asked: str) -> str:
         return "scalar_rgb"
     os.environ["DRJIT_LIBLLVM_PATH"] = found
     return "llvm_ad_rgb"
-
-
-@functools.cache
-def cuda() -> bool:
-    """Whether an NVIDIA driver with a device is there."""
-    try:
-        driver = ctypes.CDLL("libcuda.so.1")
-    except OSError:
-        return False
-    count = ctypes.c_int(0)
-    return driver.cuInit(0) == 0 and driver.cuDeviceGetCount(ctypes.byref(count)) == 0 and count.value > 0
 
 
 class Stage:
@@ -158,6 +147,8 @@ class Stage:
         scene: dict[str, Any] = {
             "type": "scene",
             "integrator": _integrator(integrator),
+            # A GPU may sort paths by what they hit: sums in another order, so other last bits.
+            "allow_thread_reordering": False,
         }
         for index, lamp in enumerate(lamps):
             scene[f"lamp{index}"] = _lamp(mi, lamp)
@@ -192,8 +183,8 @@ class Stage:
         lens = self._lens
         image = self._mi.render(self._scene, sensor=lens.sensor, spp=lens.spp, seed=seed)
         radiance = lens.develop(np.array(image, dtype=np.float32)[..., :3])
-        if self._jit:
-            # What one frame needs is not kept for the next: it costs nothing to ask for it again.
+        if self.variant.startswith("llvm"):
+            # What one frame needs is not kept for the next: asking again is free here, on a GPU it isn't.
             import drjit as dr
 
             dr.flush_malloc_cache()
@@ -361,4 +352,5 @@ def _bitmap(mi: Any, image: Map) -> dict[str, Any]:
         "raw": True,
         "filter_type": "bilinear",
         "wrap_mode": "clamp",
+        "accel": False,  # a GPU's texture units interpolate with 8 bits of fraction
     }

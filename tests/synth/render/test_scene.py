@@ -10,12 +10,12 @@ import pytest
 from synth.job.schema import AnatomySection, Job, RenderSection, StoreSection
 from synth.render.anatomy import surface as anatomy
 from synth.render.camera import camera
-from synth.render.mitsuba.adapter import cuda
 from synth.render.scene import Renderer, SceneState
 from synth.sequence import scenario
-from synth.system import llvm
+from synth.system import gpu, llvm
 
-VARIANTS = ["scalar_rgb", *(["llvm_ad_rgb"] if llvm.find() else []), *(["cuda_ad_rgb"] if cuda() else [])]
+VARIANTS = ["scalar_rgb"]
+VARIANTS += ["llvm_ad_rgb"] * bool(llvm.find()) + ["cuda_ad_rgb"] * (gpu.obstacle(gpu.probe()) is None)
 TIPS = np.array([[-1.0, 1.0, 0.2], [1.2, 1.4, 0.2]])
 SHAFTS = np.array([[0.6, 0.3, 0.74], [0.6, 0.3, 0.74]])
 

@@ -1,0 +1,75 @@
+"""NVIDIA GPUs, and what keeps the renderer from one: asked of the driver's own libraries."""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+_LEAST_DRIVER = 535
+_BROKEN_DRIVERS = range(565, 570)
+"""Releases whose OptiX compiler fails on Dr.Jit's kernels (Dr.Jit's notes on versions)."""
+_LEAST_CAPABILITY = (7, 5)
+_MAJOR, _MINOR = 75, 76  # CU_DEVICE_ATTRIBUTE_COMPUTE_CAPABILITY_*
+
+
+@dataclass(frozen=True)
+class Gpu:
+    """What the driver says of itself and of its first device."""
+
+    devices: int
+    driver: str
+    """Version; empty where the system does not say."""
+    capability: tuple[int, int]
+    optix: bool
+    """Whether `libnvoptix.so.1` is there: another library than CUDA's, and the one that traces rays."""
+
+
+@functools.cache
+def probe() -> Gpu | None:
+    """The GPU of this machine; None without a driver or a device."""
+    try:
+        cuda = ctypes.CDLL("libcuda.so.1")
+    except OSError:
+        return None
+    count, parts = ctypes.c_int(0), []
+    if cuda.cuInit(0) or cuda.cuDeviceGetCount(ctypes.byref(count)) or not count.value:
+        return None
+    for attribute in (_MAJOR, _MINOR):
+        value = ctypes.c_int(0)
+        cuda.cuDeviceGetAttribute(ctypes.byref(value), attribute, 0)
+        parts.append(value.value)
+    try:
+        ctypes.CDLL("libnvoptix.so.1")
+        optix = True
+    except OSError:
+        optix = False
+    return Gpu(count.value, _driver(), (parts[0], parts[1]), optix)
+
+
+def obstacle(gpu: Gpu | None) -> str | None:
+    """Why the renderer cannot run on a GPU, with the remedy; None where nothing stands in its way."""
+    if gpu is None:
+        return "no NVIDIA GPU with a driver was found"
+    if not gpu.optix:
+        return (
+            "the driver's OptiX (libnvoptix.so.1) is missing: install libnvidia-gl, or start the container "
+            "with NVIDIA_DRIVER_CAPABILITIES=compute,utility,graphics"
+        )
+    release = int(gpu.driver.split(".")[0]) if gpu.driver else None
+    if release is not None and (release < _LEAST_DRIVER or release in _BROKEN_DRIVERS):
+        return f"driver {gpu.driver}: {_LEAST_DRIVER} or newer is needed, other than 565 to 569"
+    if gpu.capability < _LEAST_CAPABILITY:
+        return f"compute capability {'.'.join(map(str, gpu.capability))}: 7.5 or more is needed"
+    return None
+
+
+def _driver() -> str:
+    try:
+        said = Path("/proc/driver/nvidia/version").read_text("utf-8")
+    except OSError:
+        return ""
+    found = re.search(r"\b\d{3}\.\d+(\.\d+)?\b", said)
+    return found[0] if found else ""
