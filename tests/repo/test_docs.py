@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import json
 import os
 import re
 import shlex
@@ -12,6 +13,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from html.parser import HTMLParser
 from pathlib import Path
+from typing import Any
 from urllib.parse import unquote
 
 import generate
@@ -69,6 +71,63 @@ def test_what_a_page_shows_can_be_used(page: Path) -> None:
             assert block.strip() in (ROOT / title).read_text("utf-8"), f"{page.name} and {title} differ"
     lost = [name for name in OURS.findall(text) if not (ROOT / name).exists()]
     assert not lost, f"{page.name} names {lost}"
+
+
+def _results(file: str, *keys: Any) -> Any:
+    """A value of docs/results; a mapping among the keys is what a row of a list holds."""
+    found = json.loads((DOCS / "results" / file).read_text("utf-8"))
+    for key in keys:
+        if isinstance(key, dict):
+            (found,) = (row for row in found if row.items() >= key.items())
+        else:
+            found = found[key]
+    return found
+
+
+_POOLED = ("scores", "mae_of_peak", "mean")
+_CURVE = {"model": "d2fnet-s", "size": 300, "asked": "mission-unseen"}
+_BOTH = {"told": False, "tissue": "all", "method": "network and physics"}
+_EYES = {1: "one-eye", 2: "two-eyes"}
+KEPT: dict[str, list[tuple[Any, ...]]] = {
+    "docs/results/learn/README.md": [
+        (".1%", f"learn/foreign/{_EYES[n]}/pool.json", "methods", "network and physics", *_POOLED)
+        for n in (2, 1)
+    ],
+    "docs/results/exvivo/README.md": [
+        (".1%", f"exvivo/{_EYES[n]}/pool.json", "methods", "D2FNet", *_POOLED) for n in (2, 1)
+    ],
+    "docs/results/learn/curves/README.md": [
+        (".0%", "learn/curves/curves.json", "rows", {**_CURVE, "eyes": n}, "along", 0) for n in (2, 1)
+    ],
+    "docs/results/scoring/together/README.md": [
+        (".0%", "scoring/together/together.json", "rows", {**_BOTH, "eyes": n}, "held", 0) for n in (2, 1)
+    ],
+    "docs/results/gap/README.md": [
+        (".0%", "gap/results.json", "flows", "tvl1", "closed", "force_mae", "R", "share")
+    ],
+    "docs/results/flow/README.md": [
+        (".2f", "flow/benchmark/results.json", "rows", {"what": "EPE mean, given masks"}, "measured")
+    ],
+    "docs/results/fem/README.md": [
+        (".1%", "fem/relief/relief.json", "summary", {"tets": 1600}, "peak_median")
+    ],
+}
+"""What the README's table says, by the page that its row names: how it is written, file and keys."""
+
+
+def test_figures_of_the_readme_are_those_of_kept_results() -> None:
+    """A row whose page has no data in JSON shows what that page says."""
+    rows = re.findall(
+        r"^\| .*? \| (.*\d.*) \| \[.*\]\((.*?)\) \|$", (ROOT / "README.md").read_text("utf-8"), re.M
+    )
+    assert {page for _, page in rows} >= KEPT.keys()
+    for answer, page in rows:
+        shown = re.findall(r"\d+(?:\.\d+)?%?", answer)
+        if page in KEPT:
+            assert shown == [format(_results(*at), form) for form, *at in KEPT[page]], page
+        else:
+            said = re.findall(r"\d+(?:\.\d+)?%?", (ROOT / page).read_text("utf-8"))
+            assert not set(shown) - set(said), page
 
 
 HOWTO = ("instruments", "export", "camera", "models", *PLUG_INS)
