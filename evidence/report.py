@@ -121,16 +121,17 @@ class Page:
     """Paragraphs at the top; may hold Markdown's `code` and *emphasis*."""
 
     def text(self) -> str:
-        """The page in Markdown."""
+        """The page in Markdown: what was found first, what made it last."""
         made = [f"{key} {self.found[key]}" for key in ("commit", "seed") if key in self.found]
         made += [f"{key} {value}" for key, value in self.found.get("machine", {}).items()]
-        parts = [f"# {self.title}", *([f"    {self.found['command']}"] if "command" in self.found else [])]
-        parts += [*([f"Made by {', '.join(made)}."] if made else []), *self.words]
+        parts = [f"# {self.title}", *self.words]
         pictures = _PICTURES[: len({type(one) for one in self.charts})]
         parts += [f"![{self.title}]({picture})" for picture in pictures]
         for section in self.sections:
             parts += [f"## {section.heading}"] if section.heading else []
             parts += [*section.words, *([markdown(section.rows)] if section.rows else [])]
+        parts += [f"Made by {', '.join(made)}:"] if made else []
+        parts += [f"    {self.found['command']}"] if "command" in self.found else []
         return "\n\n".join(parts) + "\n"
 
     def write(self, folder: Path) -> None:

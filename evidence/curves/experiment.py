@@ -23,11 +23,7 @@ from evidence.curves import readers
 from evidence.curves.readers import Reader, World
 from synth.errors import UserError
 
-_PARTS = {
-    "whole": "Error of the force",
-    "bare": "Error of the force, sequences without a membrane",
-    "along": "Its part along the line of sight",
-}
+_PARTS = {"whole": "Error of the force", "along": "Its part along the line of sight"}
 
 
 def main(
@@ -87,11 +83,11 @@ def page(found: Mapping[str, Any]) -> report.Page:
         "Learning curves",
         found,
         [_panel(rows, asked, eye) for asked in worlds for eye in eyes],
-        [report.Section(heading, _table(rows, part)) for part, heading in _PARTS.items()],
+        [report.Section(heading, _table(rows, part, [*worlds][-1])) for part, heading in _PARTS.items()],
         (
             " ".join(_verdict(rows, asked, eye) for asked in worlds for eye in eyes),
             "Root mean square error of the force as a part of the force's own, mean over sequences with its "
-            "95% interval. *exact*: fitted on true displacement and asked with it. Generation takes "
+            f"95% interval. The tables are of {[*worlds][-1]}. Generation takes "
             f"{found['generation_cpu_s']:.1f} CPU-s a sequence.",
         ),
     )
@@ -114,10 +110,10 @@ def _panel(rows: Sequence[Mapping[str, Any]], asked: str, eye: int) -> report.Pa
     return report.Panel(title, "fitted sequences", "error of the force", tuple(curves), log_x=True)
 
 
-def _table(rows: Sequence[Mapping[str, Any]], part: str) -> list[dict[str, Any]]:
+def _table(rows: Sequence[Mapping[str, Any]], part: str, asked: str) -> list[dict[str, Any]]:
     lines: dict[tuple[Any, ...], dict[str, Any]] = {}
-    for row in sorted(rows, key=lambda row: (row["asked"], row["eyes"])):
-        names = {"asked": row["asked"], "eyes": row["eyes"], "model": row["model"], "fitted on": row["input"]}
+    for row in sorted((row for row in rows if row["asked"] == asked), key=lambda row: int(row["eyes"])):
+        names = {"eyes": row["eyes"], "model": row["model"], "fitted on": row["input"]}
         line = lines.setdefault(tuple(names.values()), names)
         line[f"{row['size']} sequences"] = percent(row[part])
     return list(lines.values())

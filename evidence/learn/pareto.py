@@ -205,21 +205,18 @@ def page(found: Mapping[str, Any]) -> report.Page:
     panels = [panel for name in BESIDE if (panel := _panel(rows, name)) is not None]
     table = [
         {"network": f"w{one['width']} stem{one['stem']} depth{one['levels']} {one['size']}²"}
-        | {"preset": preset_of(one) or None, "parameters [M]": one["parameters"] / 1e6, "GFLOP": one["gflop"]}
-        | {"p50 [ms]": one["ms_p50"], "p95 [ms]": one["ms_p95"], "seeds": one.get("seeds")}
+        | {"preset": preset_of(one) or None, "parameters [M]": one["parameters"] / 1e6}
+        | {"p50 [ms]": one["ms_p50"]}
         | {"map RMSE [mN/mm²]": cell(one["map_rmse"]) if "map_rmse" in one else None}
         | {"more than the preset": cell(one["against"]) if "against" in one else None}
-        | {"total force MAE [mN]": cell(one["force_mae"]) if "force_mae" in one else None}
         for one in sorted(rows, key=lambda one: float(one["ms_p50"]))
     ]
     words = (
-        "From displacement on the grid to the force map, one frame at a time; CPU time of one thread on a "
-        "CPU, wall time on a GPU.",
-        "Errors are of fold 0, with the loss and dropout of the grid's preset, in equal steps on the same "
-        "batches, all answering with magnitudes: mean over tested sequences (and seeds) with BCa interval, "
-        "and the difference from the preset, paired by sequences, as a share of its error. A front is of one "
-        "grid: a coarser one averages over more of a contact's rim, so the same answer errs less on it. The "
-        "published network (32, no stem, 256²) can't be trained on a CPU.",
+        "From displacement to the force map, a frame at a time; CPU time of one thread (GPU: wall time).",
+        "In equal steps on the same batches; mean over tested sequences with BCa interval, and the "
+        "difference from the grid's preset as a share of its error. Compare within a grid only: a coarser "
+        "one averages over more of a contact's rim. The published network (32, no stem, 256²) can't be "
+        "trained on a CPU.",
     )
     sections = [report.Section(found["device"], table)]
     return report.Page("Networks: time and error", found, panels, sections, words)

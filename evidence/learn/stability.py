@@ -53,15 +53,17 @@ def page(found: Mapping[str, Any]) -> report.Page:
     lines = {f"{row['trained with']}, {row['shown']}": row["map R²"] for row in found["shown"]}
     known = {name: value for name, value in lines.items() if value is not None}
     chart = report.Chart("What a network is shown", "pooled R² of the map", report.bars(known))
-    sections = [report.Section(_TITLES[name], found[name]) for name in _TITLES]
-    words = ("Sequences of `../data/labels.yaml`, fold 0 of 3, 64² grid, one thread.",)
-    return report.Page("Networks: where they break", found, [chart], sections, words)
-
-
-_TITLES = {
-    "rates": "Learning rate by loss over seeds, two epochs, width 8",
-    "shown": "Disturbed input of a trained network",
-}
+    columns = ("trained with", "shown", "map R²", "force R²", "off contact [mN]")
+    table = [{name: row[name] for name in columns} for row in found["shown"]]
+    rates = found["rates"]
+    words = (
+        f"**{sum(row['diverged'] for row in rates)} of {sum(row['seeds'] for row in rates)} trainings "
+        f"diverged** ({len(RATES)} learning rates, {len(LOSSES)} losses). Sequences of "
+        "`../data/labels.yaml`, fold 0 of 3, 64² grid.",
+    )
+    return report.Page(
+        "Networks: where they break", found, [chart], [report.Section("Disturbed input", table)], words
+    )
 
 
 def rates(clips: Sequence[Clip], cache: Path, seeds: int) -> list[dict[str, Any]]:

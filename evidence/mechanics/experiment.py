@@ -19,14 +19,12 @@ from joblib import Parallel, delayed
 
 from evidence import report
 from evidence.end_to_end import models
-from evidence.end_to_end.models import PHYSICS, RIDGE, Answer
+from evidence.end_to_end.models import RIDGE, Answer
 from evidence.mechanics.worlds import MIXTURE, PLAIN, WORLDS, Scenes, coarse, rendered
 from learn.data.clips import Clip
 from learn.evaluation.statistics import Interval, interval, paired
 
-NOTHING = "no force at all"
-ON_PLAIN, ON_MIXTURE, UNFITTED = "plain", "mixture", "nothing"
-READERS = ((RIDGE, ON_PLAIN), (RIDGE, ON_MIXTURE), (PHYSICS, UNFITTED), (NOTHING, UNFITTED))
+ON_PLAIN, ON_MIXTURE = "plain", "mixture"
 PARTS = {"across": "the force across the line of sight", "whole": "the force"}
 Errors = list[float | None]
 """Of every sequence [%]; None: it was refused."""
@@ -68,29 +66,22 @@ def mixed(index: int) -> str:
 
 
 def ask(fitted: Scenes, asked: Scenes) -> list[dict[str, Any]]:
-    """A row a reader and world: errors by sequence, as a part of the force [%]."""
+    """A row a fit of ridge and world: errors by sequence, as a part of the force [%]."""
     tests = {name: [asked.clip(name, k) for k in range(asked.count)] for name in WORLDS}
     rows = []
-    for model, fit in READERS:
-        worlds = (
-            [] if fit == UNFITTED else [mixed(k) if fit == ON_MIXTURE else PLAIN for k in range(fitted.count)]
-        )
-        clips = [fitted.clip(name, k) for k, name in enumerate(worlds)]
-        answer = build(model, [clip for clip in clips if clip is not None])
+    for fit in (ON_PLAIN, ON_MIXTURE):
+        clips = [fitted.clip(mixed(k) if fit == ON_MIXTURE else PLAIN, k) for k in range(fitted.count)]
+        answer = build([clip for clip in clips if clip is not None])
         rows += [
-            {"model": model, "fit": fit, "world": name} | _errors(answer, some)
+            {"model": RIDGE, "fit": fit, "world": name} | _errors(answer, some)
             for name, some in tests.items()
         ]
     return rows
 
 
-def build(model: str, fit: Sequence[Clip]) -> Answer:
-    """A reader of clips; ridge reads cells of twice the size, enough for a linear rule."""
-    if model == NOTHING:
-        return lambda clip: np.zeros((clip.frames, 3))
-    if model == PHYSICS:
-        return models.build(model, fit)
-    ridge = models.build(model, [coarse(clip) for clip in fit])
+def build(fit: Sequence[Clip]) -> Answer:
+    """Ridge; it reads cells of twice the size, enough for a linear rule."""
+    ridge = models.build(RIDGE, [coarse(clip) for clip in fit])
     return lambda clip: ridge(coarse(clip))
 
 
@@ -111,15 +102,13 @@ def page(found: Mapping[str, Any]) -> report.Page:
     for part, what in PARTS.items():
         plain, table = rows[RIDGE, ON_PLAIN, PLAIN][part], []
         for world in WORLDS:
-            own, mixture, physics, none = (rows[model, on, world][part] for model, on in READERS)
+            own, mixture = (rows[RIDGE, on, world][part] for on in (ON_PLAIN, ON_MIXTURE))
             table.append(
                 {
                     "world": world,
                     "fitted on plain [%]": _cell(_mean(own)),
                     "more than in plain": None if world == PLAIN else _cell(_more(plain, own), "+"),
                     "mixture less plain": _cell(_more(own, mixture), "+"),
-                    f"{PHYSICS} [%]": _cell(_mean(physics)),
-                    f"{NOTHING} [%]": _cell(_mean(none)),
                 }
             )
             for group, values in enumerate((own, mixture) if part == "across" else ()):
@@ -133,9 +122,10 @@ def page(found: Mapping[str, Any]) -> report.Page:
         "Mechanics: which a force reader must have seen",
         found,
         [report.Chart("Error across the line of sight", "more than in plain [% of the force]", tuple(bars))],
-        [*sections, report.Section("Refused", words=refused or ["None."])],
+        [*sections, *([report.Section("Refused", words=refused)] if refused else [])],
         (
-            f"Fitted on plain tissue, more error across the line of sight with {'; '.join(hurt) or 'none'}.",
+            "**Fitted on plain tissue, a reader errs more across the line of sight with "
+            f"{'; '.join(hurt) or 'none'}.**",
             "A sequence of every world shows the same anatomy, contact, load and look as the plain one of "
             "its number, with other mechanics. Error of ridge on recovered flow: root mean square over "
             "frames as a part of the force's own, mean over sequences; differences are paired, intervals "
