@@ -97,16 +97,16 @@ def page(found: Mapping[str, Any]) -> report.Page:
     off = [[100 * r["across_rmse"] for r in ridge if (r["flow"] == flow) == own] for own in (True, False)]
     least, most = [min(some) for some in off], [max(some) for some in off]
     return report.Page(
-        "End to end: error of the force against cost, whole pipelines",
+        "Which part of a whole pipeline pays?",
         found,
         [_panel(found, part) for part in PARTS],
         [report.Section("", [_cells(row) for row in ridge])],
         (
             f"**Across the line of sight ridge errs by {least[0]:.0f} to {most[0]:.0f}% on flow by {flow}, "
             f"whatever law, mesh and paths, on other flow by {least[1]:.0f} to {most[1]:.0f}%.**",
-            "Other readers are in the data. Root mean square error over frames as a part of the force's "
-            "own, mean over sequences (each one's own ratio) with BCa intervals; *more*: paired with the "
-            f"defaults. No force at all errs by {100 * found['zero']:.0f}%, across the line of sight by "
+            "So only flow pays. Root mean square error over frames as a part of the force's own, mean over "
+            "sequences with BCa intervals; *more*: paired with the defaults. Other readers are in the data. "
+            f"No force at all errs by {100 * found['zero']:.0f}%, across the line of sight by "
             f"{100 * found['across_zero']:.0f}%. CPU time is that of a frame of data, its flow and an "
             "answer, the least that was measured.",
         ),

@@ -57,7 +57,7 @@ def page(found: Mapping[str, Any]) -> report.Page:
         "17.4 ms; of 100,000 sequences the status took 0.9 s, the report 1.3 s (22268e1).",
     )
     sections = [report.Section(name, [found[name]]) for name in ("overhead", "workers")]
-    return report.Page("Engine", found, (), sections, words)
+    return report.Page("What does the engine cost?", found, (), sections, words)
 
 
 def overhead(name: str, count: int) -> dict[str, float | int]:

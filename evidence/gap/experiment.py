@@ -166,14 +166,14 @@ def page(found: Mapping[str, Any]) -> report.Page:
         ]
         sections.append(report.Section(f"{flow}: {_UNIT}", rows))
     return report.Page(
-        "The sim-to-real gap",
+        "Does training on recovered flow close the sim-to-real gap?",
         found,
         [report.Chart(f"Unseen ({found['held_out']})", _UNIT, tuple(bars))],
         sections,
         (
             *(f"**Flow by {flow}**: {_verdict(one)}" for flow, one in found["flows"].items()),
             "I: trained on ideal flow, R: on recovered, N: on ideal with noise fitted to the recovered "
-            "flow's error, mixed: ideal first, recovered later. Errors of the map are in the data. "
+            "flow's error, mixed: ideal first, recovered later. Presets of two eyes train on mixed. "
             f"Sequences: {', '.join(f'{n} {name}' for name, n in found['sequences'].items())}; "
             f"{found['seeds']} networks a training, errors averaged over them; 95% BCa intervals.",
         ),

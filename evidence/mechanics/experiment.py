@@ -119,7 +119,7 @@ def page(found: Mapping[str, Any]) -> report.Page:
         sections.append(report.Section(f"Error of {what}", table))
     refused = [f"- {line}" for line in found["refused"]]
     return report.Page(
-        "Mechanics: which a force reader must have seen",
+        "Which mechanics must a force reader have seen?",
         found,
         [report.Chart("Error across the line of sight", "more than in plain [% of the force]", tuple(bars))],
         [*sections, *([report.Section("Refused", words=refused)] if refused else [])],
@@ -129,8 +129,8 @@ def page(found: Mapping[str, Any]) -> report.Page:
             "A sequence of every world shows the same anatomy, contact, load and look as the plain one of "
             "its number, with other mechanics. Error of ridge on recovered flow: root mean square over "
             "frames as a part of the force's own, mean over sequences; differences are paired, intervals "
-            "BCa over sequences. No anatomy that is asked about was fitted. *Taken off*: the tissue's own "
-            "motion is subtracted as it was, which no removal does better.",
+            "BCa over sequences. *Taken off*: the tissue's own motion is subtracted as it was, which no "
+            "removal does better. Default jobs are plain; `mission` mixes membrane, slip and ν.",
         ),
     )
 

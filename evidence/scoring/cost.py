@@ -104,7 +104,7 @@ def page(tree: Mapping[str, Any]) -> report.Page:
     bars = report.bars({name: spent["wall_s"] for name, spent in stages.items()})
     width, height = tree["size"]
     return report.Page(
-        "What scoring costs",
+        "What does scoring cost?",
         tree,
         [report.Chart("By stage, two processes side by side", "wall time [s]", bars)],
         (report.Section("", [{"stage": name} | dict(spent) for name, spent in stages.items()]),),

@@ -173,13 +173,13 @@ def page(tree: Mapping[str, Any]) -> report.Page:
     on_still = sum(len(row.get("found_on_still", ())) for row in tree["rows"])
     title = "Error on beating tissue over that on still tissue, the beat taken off"
     return report.Page(
-        "A cortex that beats",
+        "Can heart beat and breath be taken off?",
         tree,
         [report.Chart(title, "times the error on still tissue", tuple(bars))],
         (report.Section("", rows),),
         (
-            f"With the beat taken off no method errs by over {worst:.2f} times its error on still tissue "
-            f"({_ASKED:g} was asked). Found (median over the tissue): {', '.join(beats)}; on still tissue "
+            f"**With the beat taken off no method errs by over {worst:.2f} times its error on still tissue "
+            f"({_ASKED:g} was asked).** Found (median): {', '.join(beats)}; on still tissue "
             f"{on_still or 'nothing'}.",
             f"{tree['count']} recordings of {tree['seconds']:g} s, {tree['size']} px: FEM contacts of 15 to "
             f"40 mN on linear tissue. Heart {_HEART[0]:g} mm at {_HEART[1]:g} Hz, breath {_BREATH[0]:g} mm "

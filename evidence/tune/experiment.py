@@ -86,7 +86,7 @@ def page(found: Mapping[str, Any]) -> report.Page:
         panels.append(report.Panel(scene, "CPU s a frame", "error of the force [%]", tuple(curves)))
     sections = [report.Section("", table(found["rows"]))]
     words = [_verdict(found["rows"]), *found.get("notes", ()), *_WORDS]
-    title = "Tuning: budget and cost on fresh sequences"
+    title = "Does tuning keep its budget on fresh sequences?"
     return report.Page(title, found, panels, sections, words)
 
 
@@ -95,8 +95,8 @@ def _verdict(rows: list[dict[str, Any]]) -> str:
     costs = [row["fresh"][kind]["cpu_s_a_frame"] for row in rows for kind in ("after", "before")]
     ratios = [after / before for after, before in zip(costs[::2], costs[1::2], strict=True)]
     return (
-        f"The mean over fresh sequences is within the budget in {sum(kept)} of {len(kept)} cases, at "
-        f"{min(ratios):.2f} to {max(ratios):.2f} of the cost of the job as it was."
+        f"**The mean over fresh sequences is within the budget in {sum(kept)} of {len(kept)} cases, at "
+        f"{min(ratios):.2f} to {max(ratios):.2f} of the cost of the job as it was.**"
     )
 
 
