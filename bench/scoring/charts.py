@@ -23,8 +23,8 @@ _OTHERS = ("#8a6d00", "#2b7a4b", "#a04f9c", "#b8562b", "#5b6b7a", "#00798c", "#7
 _WIDE, _HALF, _HIGH = 1150, 560, 300  # points
 
 
-def draw_force(result: Result) -> str:
-    """Force over time: the sensor, the main method with its bands of uncertainty, the others thinner.
+def draw_force(result: Result, others: bool = False) -> str:
+    """Force over time: the sensor, the main method with its bands of uncertainty, thinner the `others`.
 
     Lost frames are gaps, shaded. Without a known E all curves are brought to one height. The axis holds the
     sensor, networks and lengths of flow, which are dotted; other curves may leave it.
@@ -46,14 +46,14 @@ def draw_force(result: Result) -> str:
         if sensor is not None:
             axes.plot(time_s, sensor, color=_SENSOR, linewidth=1.8, label="sensor", zorder=4)
         axes.plot(time_s, main, color=_MAIN, linewidth=1.8, label=result.main, zorder=5)
-        others = {name: curve for name, curve in curves.items() if name != result.main}
+        thin = {name: curve for name, curve in curves.items() if others and name != result.main}
         networks = result.settings.get("networks", {})
-        sizes = {name for name in others if result.methods[name].gain}
-        for k, (name, curve) in enumerate(others.items()):
+        sizes = {name for name in thin if result.methods[name].gain}
+        for k, (name, curve) in enumerate(thin.items()):
             # A length of flow has its gain from what is drawn here already.
             line, colour = ":" if name in sizes else "-", _OTHERS[k % len(_OTHERS)]
             axes.plot(time_s, curve, line, color=colour, linewidth=1.1, label=name)
-        held = [curve for name, curve in others.items() if name in sizes or name in networks]
+        held = [curve for name, curve in thin.items() if name in sizes or name in networks]
         shown = np.concatenate([main, *held, *([] if sensor is None else [sensor])])
         if np.isfinite(shown).any():
             low, high = min(np.nanmin(shown), 0.0), _largest(shown)

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from bench.bootstrap import Interval
 from bench.scoring.metrics import METRICS
 from bench.scoring.result import Result
+from learn.uncertainty.out_of_distribution import UNSEEN
 
 _NEWTONS = ("mae_mn", "mae_of_peak", "r", "ccc", "r2", "ghost_rate")
 _SHAPE = ("r", "shape_error", "lag_s")
@@ -34,6 +35,8 @@ class Headline:
     tiles: tuple[Tile, ...]
     warnings: tuple[str, ...] = ()
     """What the numbers must not be read without."""
+    trust: str = ""
+    """What was lost, what was unlike the training, what was assumed: one sentence."""
 
 
 def headline(result: Result) -> Headline:
@@ -47,7 +50,8 @@ def headline(result: Result) -> Headline:
         return Headline(result.refused, (), odd)
     main = result.methods[result.main]
     if not main.scores:
-        return Headline("No usable force sensor: these are predictions only, nothing is scored", (), odd)
+        why = "No usable force sensor: these are predictions only, nothing is scored"
+        return Headline(why, (), odd, _trust(result))
     warnings = list(odd)
     if result.left == 2:
         warnings.append("Only two frames are scored: every curve correlates with two (see the notes)")
@@ -66,4 +70,22 @@ def headline(result: Result) -> Headline:
     tiles += [
         Tile(METRICS[key].name, main.scores[key], METRICS[key].unit, main.intervals.get(key)) for key in keys
     ]
-    return Headline("", tuple(tiles), tuple(warnings))
+    return Headline("", tuple(tiles), tuple(warnings), _trust(result))
+
+
+def _trust(result: Result) -> str:
+    """Lost frames, motion unlike the network's training, and what of tissue and scale was taken as given."""
+    meta, frames, lost = result.settings["meta"], len(result.lost), int(result.lost.sum())
+    parts = [f"{lost} of {frames} frames were lost" if lost else f"None of {frames} frames was lost"]
+    if result.main in result.settings.get("networks", {}):
+        unlike = any(UNSEEN in note for note in result.notes)
+        parts.append(f"it moves {'unlike anything' if unlike else 'as what'} the network was trained on")
+    given = [f"{result.scale.mm_per_px:.3g} mm/px{_within(result.scale.uncertainty)}"]
+    if result.absolute:
+        given.insert(0, f"E = {meta['young_kpa']:.3g} kPa{_within(meta.get('young_uncertainty', 0.0))}")
+    given.append(f"membrane {meta.get('membrane', 'unknown')}")
+    return "; ".join([*parts, f"taken as given: {', '.join(given)}"]) + "."
+
+
+def _within(uncertainty: float) -> str:
+    return f" ± {uncertainty:.0%}" if uncertainty else ""

@@ -20,7 +20,7 @@ _SHAPE_ERROR = "MAE after the one gain that fits best, over the contacts' mean p
 
 METRICS = {
     "n": Metric("samples", "", "Samples where both are finite.", relative=True),
-    "mae_mn": Metric("MAE", "mN", "Mean absolute error.", "low", 2, column="MAE [mN]"),
+    "mae_mn": Metric("mean absolute error", "mN", "Mean absolute error.", "low", 2, column="MAE [mN]"),
     "mae_of_peak": Metric("MAE of event peak", "%", "Over the contacts' mean peak.", "low", column="of peak"),
     "rmse_mn": Metric("RMSE", "mN", "Root mean square error.", "low", 2, column="RMSE [mN]"),
     "bias_mn": Metric("bias", "mN", "Mean of predicted minus sensor.", "zero", 2, column="bias [mN]"),

@@ -55,7 +55,7 @@ def render_report(result: Result, title: str = "") -> str:
     )
     environment.filters["shown"] = shown
     main = result.methods[result.main]
-    figures = {"force": charts.draw_force(result)}
+    figures = {"force": charts.draw_force(result), "methods": charts.draw_force(result, others=True)}
     if np.isfinite(main.force_mn).any(axis=0).all():
         figures["components"] = charts.draw_components(result)
     if math.isfinite(main.scores.get("mae_mn", math.nan)):

@@ -17,6 +17,8 @@ Floats = NDArray[np.float64]
 
 USUAL = 0.99
 """Share of held-out frames that are no further than `OutOfDistribution.usual`."""
+UNSEEN = "unseen world"
+"""How `describe_unseen` begins."""
 _MOST, _FRAMES = 0.95, 0.9  # share of recordings that are no unseen world, and of the frames that say how far
 _LEAST_SPREAD = 0.05  # of a feature: logarithms and shares tell no worlds apart by less
 
@@ -120,7 +122,7 @@ def describe_unseen(world: OutOfDistribution, names: Sequence[str], motion: Floa
     most = order[: 1 + int(np.argmax(np.cumsum(parts[order]) >= parts.sum() / 2))]
     named = " and ".join(f"{names[k]} ({'high' if off[:, k].mean() > 0 else 'low'})" for k in most)
     return [
-        f"unseen world: it moves unlike anything that the network was trained on, most of all in {named}: "
+        f"{UNSEEN}: it moves unlike anything that the network was trained on, most of all in {named}: "
         f"{far / world.limit:.2g} times as far away as 95% of recordings are at most; intervals are widened, "
         "and may still be too narrow"
     ]

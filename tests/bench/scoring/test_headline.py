@@ -63,6 +63,7 @@ def test_lost_frames_are_out_of_the_scores_gaps_in_the_curves_and_counted(make: 
     assert tree["lost"] == {"frames": 3, "share": 0.1, "most": 0.2}
     assert tree["curve"]["predicted_mn"]["bump"][7] is None
     assert headline(some).refused == ""
+    assert "3 of 30" in headline(some).trust
 
 
 def test_force_goes_with_the_scales_square_so_its_error_counts_twice(make: Maker) -> None:
