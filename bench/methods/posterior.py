@@ -181,51 +181,9 @@ def infer(basis: LoadBasis, seen: Observation, own_mm: Floats) -> Posterior:
         seen: the frame's displacement.
         own_mm: (C,) size of the tissue's own motion, a component.
     """
-    rank = len(basis.size)
-    moved = seen.moved.ravel()
-    # Of neighbours: a point's own square would weigh down the points that err upwards.
-    local = basis.around @ np.square(seen.moved).mean(axis=0)
-    noise = _CORRELATED * (seen.deviation**2 + LEAST_MM**2 + _MISFIT**2 * local)
-    weight = 1 / noise.ravel()
-    own = np.repeat(np.square(own_mm), 6)
-    columns = np.append(np.arange(rank), rank + np.flatnonzero(own > 0))
-    motion = basis.motion[:, columns]
-    weighed = motion * weight[:, None]
-    gram, right = motion.T @ weighed, weighed.T @ moved
-    known = weight > 0
-    rest = float(moved @ (weight * moved) - np.log(weight[known]).sum() + known.sum() * np.log(2 * np.pi))
-    count = basis.contacts.shape[1]
+    rank, count = len(basis.size), basis.contacts.shape[1]
     sizes = np.array(_CONTACTS if len(seen.moved) == 3 else (*_CONTACTS, *_PRESSES))
-    flat = basis.contacts.reshape(rank, -1)
-    levels: list[_Level] = []
-    evidence: list[Floats] = []
-    for spread in _SPREAD:
-        prior = np.concatenate([np.square(spread * basis.size), own[own > 0]])
-        factor = cho_factor(gram + np.diag(1 / prior), lower=True)
-        mean = cho_solve(factor, right)
-        log_det = 2 * np.log(np.diag(factor[0])).sum() + np.log(prior).sum()
-        alone = -0.5 * (rest - right @ mean + log_det)
-        taken = cho_solve(factor, gram[:, :rank])
-        left = (gram[:rank, :rank] - gram[:, :rank].T @ taken).astype(np.float32)
-        beside = (left @ flat).reshape(rank, -1, 3)
-        # Entries (a, b) of each contact's 3 x 3 matrix, summed over directions.
-        square = np.empty((count, 3, 3))
-        for a in range(3):
-            square[:, a] = np.einsum("rh,rhb->hb", basis.contacts[..., a], beside)
-        pull = (right[:rank] - gram[:, :rank].T @ mean) @ flat.astype(np.float64)
-        padded = np.zeros((len(prior), 3))
-        padded[:rank] = basis.force.T
-        covariance = basis.force @ cho_solve(factor, padded)[:rank] + np.diag(basis.unseen) * spread**2
-        total = basis.force @ mean[:rank], covariance
-        level = _Level(mean[:rank], square, pull.reshape(-1, 3), taken[:rank], *total)
-        levels.append(level)
-        for size in sizes:
-            scaled = square + np.diag(1 / size**2)
-            force = np.linalg.solve(scaled, level.pull[..., None])[..., 0]
-            gain = 0.5 * (level.pull * force).sum(axis=1) - 0.5 * np.log(np.linalg.det(scaled))
-            evidence.append(alone + gain - np.log(size).sum() - np.log(count))
-        evidence.append(np.array([alone]))
-    score = np.concatenate(evidence)
+    levels, score = _weigh(basis, seen, own_mm, sizes)
     # Systematic draws: as many of each hypothesis as it is likely, none left out for being one of many.
     likely = np.cumsum(np.exp(score - logsumexp(score)))
     drawn = np.searchsorted(likely, (np.arange(_DRAWN) + 0.5) / _DRAWN * likely[-1])
@@ -252,6 +210,57 @@ def infer(basis: LoadBasis, seen: Observation, own_mm: Floats) -> Posterior:
         coefficients += part * mean
     load = (basis.loads @ coefficients).reshape(-1, 3) + carried
     return Posterior(float(logsumexp(score)), ForceMixture(share, force, covariance), load)
+
+
+def _weigh(basis: LoadBasis, seen: Observation, own_mm: Floats, sizes: Floats) -> tuple[list[_Level], Floats]:
+    """Every hypothesis: smooth loads of each size, and log evidence with each contact and without.
+
+    Evidence goes size of the smooth loads by size; within one by `sizes` (S, 3) of a contact and its place,
+    and last without any: (L (S H + 1),).
+    """
+    rank = len(basis.size)
+    moved = seen.moved.ravel()
+    # Of neighbours: a point's own square would weigh down the points that err upwards.
+    local = basis.around @ np.square(seen.moved).mean(axis=0)
+    noise = _CORRELATED * (seen.deviation**2 + LEAST_MM**2 + _MISFIT**2 * local)
+    weight = 1 / noise.ravel()
+    own = np.repeat(np.square(own_mm), 6)
+    columns = np.append(np.arange(rank), rank + np.flatnonzero(own > 0))
+    motion = basis.motion[:, columns]
+    weighed = motion * weight[:, None]
+    gram, right = motion.T @ weighed, weighed.T @ moved
+    known = weight > 0
+    rest = float(moved @ (weight * moved) - np.log(weight[known]).sum() + known.sum() * np.log(2 * np.pi))
+    count = basis.contacts.shape[1]
+    flat = basis.contacts.reshape(rank, -1)
+    levels, evidence = list[_Level](), list[Floats]()
+    for spread in _SPREAD:
+        prior = np.concatenate([np.square(spread * basis.size), own[own > 0]])
+        factor = cho_factor(gram + np.diag(1 / prior), lower=True)
+        mean = cho_solve(factor, right)
+        log_det = 2 * np.log(np.diag(factor[0])).sum() + np.log(prior).sum()
+        alone = -0.5 * (rest - right @ mean + log_det)
+        taken = cho_solve(factor, gram[:, :rank])
+        left = (gram[:rank, :rank] - gram[:, :rank].T @ taken).astype(np.float32)
+        beside = (left @ flat).reshape(rank, -1, 3)
+        # Entries (a, b) of each contact's 3 x 3 matrix, summed over directions.
+        square = np.empty((count, 3, 3))
+        for a in range(3):
+            square[:, a] = np.einsum("rh,rhb->hb", basis.contacts[..., a], beside)
+        pull = (right[:rank] - gram[:, :rank].T @ mean) @ flat.astype(np.float64)
+        padded = np.zeros((len(prior), 3))
+        padded[:rank] = basis.force.T
+        covariance = basis.force @ cho_solve(factor, padded)[:rank] + np.diag(basis.unseen) * spread**2
+        total = basis.force @ mean[:rank], covariance
+        level = _Level(mean[:rank], square, pull.reshape(-1, 3), taken[:rank], *total)
+        levels.append(level)
+        for size in sizes:
+            scaled = square + np.diag(1 / size**2)
+            force = np.linalg.solve(scaled, level.pull[..., None])[..., 0]
+            gain = 0.5 * (level.pull * force).sum(axis=1) - 0.5 * np.log(np.linalg.det(scaled))
+            evidence.append(alone + gain - np.log(size).sum() - np.log(count))
+        evidence.append(np.array([alone]))
+    return levels, np.concatenate(evidence)
 
 
 @dataclass(frozen=True, eq=False)

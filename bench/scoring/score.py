@@ -85,7 +85,6 @@ def score(
         model = require_model(opened.has_two_eyes)
     elif isinstance(model, (str, Path)):
         model = find_model(model)
-    folder = model if isinstance(model, Path) else None
     frames = len(opened.numbers()) or None
     flow: AbstractContextManager[LocalFlow | None] = nullcontext()
     if own_process and (frames or _LONG) >= _LONG:
@@ -98,25 +97,7 @@ def score(
         bar = counting(f"scoring {opened.name}", frames)
     # The process is started first, for it takes seconds to begin; the methods are fitted meanwhile.
     with written, flow as elsewhere:
-        network = None if model is None else Model(model)
-        chosen: dict[str, Method] = {MAIN: network} if network else {}
-        for name, own in (methods or {}).items():
-            chosen[name] = own if isinstance(own, Model) else plugins.Plugged(own, f"method {name}")
-        if baselines:
-            simple = comparison.simpler_methods(Path(train) if train else None, folder, opened.has_two_eyes)
-            chosen |= {name: one for name, one in simple.items() if name not in chosen}
-        if network is not None and isinstance(chosen.get(PHYSICS), Physics):
-            chosen = {TOGETHER: Together(MAIN, PHYSICS), **chosen}
-        described: dict[str, Any] = {} if network is None else {"model": network.described()}
-        networks = {name: one for name, one in chosen.items() if isinstance(one, Model)}
-        described["networks"] = {
-            name: {"hash": one.identity, "origin": one.origin} for name, one in networks.items()
-        }
-        if network is not None and TOGETHER in chosen:
-            about = {"hash": f"{network.identity} and physics", "origin": network.origin}
-            described["networks"][TOGETHER] = about
-        if sources := {name: where for name, where in plugins.sources().items() if name in chosen}:
-            described["plug_ins"] = sources
+        chosen = _choose_methods(model, methods or {}, opened.has_two_eyes, baselines, train)
         scale = pixel_scale.find_scale(opened.meta, opened.folder)
         with bar as told:
             result = evaluate_recording(
@@ -125,13 +106,47 @@ def score(
                 next(iter(chosen)),
                 scale,
                 settings or RecordingFlowSettings(),
-                described,
+                _describe(chosen),
                 told,
                 elsewhere,
             )
         if out is not None:
             write_result(result, Path(out), title)
     return result
+
+
+def _choose_methods(
+    model: Path | Predictor | None,
+    own: Mapping[str, Method],
+    two_eyes: bool,
+    baselines: bool,
+    train: str | Path | None,
+) -> dict[str, Method]:
+    """All methods by name, in the table's order; the first is what the result is about."""
+    chosen: dict[str, Method] = {} if model is None else {MAIN: Model(model)}
+    for name, one in own.items():
+        chosen[name] = one if isinstance(one, Model) else plugins.Plugged(one, f"method {name}")
+    if baselines:
+        folder = model if isinstance(model, Path) else None
+        simple = comparison.simpler_methods(Path(train) if train else None, folder, two_eyes)
+        chosen |= {name: one for name, one in simple.items() if name not in chosen}
+    if model is not None and isinstance(chosen.get(PHYSICS), Physics):
+        chosen = {TOGETHER: Together(MAIN, PHYSICS), **chosen}
+    return chosen
+
+
+def _describe(chosen: Mapping[str, Method]) -> dict[str, Any]:
+    """What networks and plug-ins among the methods are, for the report."""
+    networks = {name: one for name, one in chosen.items() if isinstance(one, Model)}
+    about = {name: {"hash": one.identity, "origin": one.origin} for name, one in networks.items()}
+    main = networks.get(MAIN)
+    if main is not None and TOGETHER in chosen:
+        about[TOGETHER] = {"hash": f"{main.identity} and physics", "origin": main.origin}
+    described: dict[str, Any] = {} if main is None else {"model": main.described()}
+    described["networks"] = about
+    if sources := {name: where for name, where in plugins.sources().items() if name in chosen}:
+        described["plug_ins"] = sources
+    return described
 
 
 def write_result(result: Result, folder: Path, title: str) -> None:
