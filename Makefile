@@ -5,6 +5,7 @@
 #   make trials  kills, clusters, containers, the wheel, the site: what has to pass as well before anything lands
 #   make quick   lint, types, and the tests that take no more than seconds
 #   make docs    the pages in site/; open site/index.html
+#   make evidence    every kept result anew, into runs/evidence and docs/results; PHOTO=cortex.jpg for the look
 #   make clean   removes what these made
 #
 # PYTHON=python3.12 chooses the interpreter (3.11 or newer).
@@ -15,7 +16,7 @@ BIN := .venv/bin
 DEMO := runs/demo
 PYTEST := $(BIN)/python -m pytest -n 2
 
-.PHONY: demo test trials quick docs setup lint types slurm clean
+.PHONY: demo test trials quick docs evidence setup lint types slurm clean
 .DELETE_ON_ERROR:
 
 setup: .venv/installed .venv/llvm
@@ -60,6 +61,10 @@ quick: setup lint types
 docs: setup
 	$(BIN)/python docs/generate.py
 	PYTHONPATH=docs $(BIN)/python -m zensical build --strict --clean
+
+evidence: setup
+	$(BIN)/python -m evidence.all runs/evidence $(if $(PHOTO),--photo $(PHOTO)) \
+	  $(if $(MECHANICS_PYTHON),--mechanics-python $(MECHANICS_PYTHON)) $(if $(PICTURES_PYTHON),--pictures-python $(PICTURES_PYTHON))
 
 lint: setup
 	$(BIN)/ruff check .

@@ -6,15 +6,12 @@ labels and train the paper's network on them: 256², 20,000 frames, 50 epochs.
 
 from __future__ import annotations
 
-import json
-import subprocess
-import sys
 import time
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import torch
 import typer
@@ -23,6 +20,7 @@ from evidence import report
 from evidence.folds import nested
 from evidence.learn.labels import whole
 from evidence.learn.runs import JOB
+from evidence.steps import Step, run_steps
 from learn.data.grid import Grid
 from learn.evaluation.evaluate import evaluate
 from learn.inference.predict import load_model
@@ -34,8 +32,6 @@ from synth.job import reader
 from synth.job.schema import Job
 from synth.system import gpu
 
-Steps = Sequence[tuple[str, Sequence[str]]]
-"""Name of each step and the arguments after `python`."""
 app = typer.Typer(add_completion=False)
 
 
@@ -55,12 +51,12 @@ def main(
     if only is not None and only not in named:
         raise UserError(f"--only {only}: the steps are {', '.join(named)}")
     chosen = [(only, named[only])] if only else list(named.items())
-    rows = run_steps(chosen, out, limit_s)
+    rows = run_steps(chosen, out / "gpu.json", out, limit_s)
     report.show({"steps": rows})
     raise typer.Exit(int(any(row["exit_code"] for row in rows)))
 
 
-def steps(out: Path) -> Steps:
+def steps(out: Path) -> Sequence[Step]:
     """What is run, in order: first whether it is right, then how fast it is."""
     data, model = str(out / "data"), str(out / "model")
     cuda = ("--device", "cuda")
@@ -77,38 +73,6 @@ def steps(out: Path) -> Steps:
         ("labels", ("-m", "evidence.gpu", "labels", str(out / "labels"))),
         ("full size", ("-m", "evidence.gpu", "full-size", str(out / "labels"), str(out / "full"))),
     )
-
-
-def run_steps(steps: Steps, out: Path, limit_s: float) -> list[dict[str, Any]]:
-    """Runs the steps one after another, each into `NAME.log`; one that fails does not stop the next.
-
-    A step that has passed before, by the same command, is not run again.
-
-    Returns:
-        `name`, `command`, `exit_code` (-1: stopped at its time limit) and `wall_s` of every step that was
-        ever run into `out`; `gpu.json` holds them, rewritten after every step.
-    """
-    out.mkdir(parents=True, exist_ok=True)
-    kept = out / "gpu.json"
-    rows: list[dict[str, Any]] = json.loads(kept.read_text("utf-8"))["steps"] if kept.is_file() else []
-    passed = {row["command"] for row in rows if row["exit_code"] == 0}
-    for name, arguments in steps:
-        line = "python " + " ".join(arguments)
-        if line in passed:
-            continue
-        begin = time.perf_counter()
-        with (out / f"{name.replace(' ', '-')}.log").open("wb") as log:
-            try:
-                words = [sys.executable, *arguments]
-                code = subprocess.run(words, stdout=log, stderr=log, timeout=limit_s).returncode
-            except subprocess.TimeoutExpired:
-                code = -1
-        spent = time.perf_counter() - begin
-        rows = [row for row in rows if row["name"] != name]
-        rows.append({"name": name, "command": line, "exit_code": code, "wall_s": round(spent, 1)})
-        typer.echo(f"{name}: exit code {code}, {spent:.1f} s", err=True)
-        report.save(out, "gpu.json", {"steps": rows})
-    return rows
 
 
 @app.command()

@@ -11,6 +11,7 @@ Run: python -m evidence.foreign.recordings OUT --mechanics-python A/bin/python -
 from __future__ import annotations
 
 import json
+import shutil
 import subprocess
 import tempfile
 from dataclasses import dataclass
@@ -49,6 +50,7 @@ def main(
     fps: float = 3.0,
     spp: Annotated[int, typer.Option(help="Light paths a pixel.")] = 24,
     seed: int = 500,
+    left: Annotated[Path | None, typer.Option(help="Also gets each of them with its left eye alone.")] = None,
 ) -> None:
     """Makes recordings by felupe and Blender: plain, with a membrane, with a pulse."""
     for kind in kinds.split(","):
@@ -59,6 +61,8 @@ def main(
                     rng = np.random.default_rng([seed, KINDS.index(kind), index])
                     pythons = mechanics_python, pictures_python
                     record(part, folder.name, kind, rng, (seconds, fps, spp), pythons)
+            if left is not None and not (left / folder.name).exists():
+                shutil.copytree(folder, left / folder.name, ignore=shutil.ignore_patterns("right.mp4"))
             print(folder)
 
 

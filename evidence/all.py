@@ -1,0 +1,156 @@
+"""Every kept result anew, of one commit, in an order that shares data.
+
+Run: make evidence PHOTO=CORTEX.jpg MECHANICS_PYTHON=A/bin/python PICTURES_PYTHON=B/bin/python
+
+What has passed at this commit is not run again. Without a photograph, or the two other Pythons, what needs
+them is left out and named. Weights that come along are not trained here: they are files of the commit.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from evidence import report
+from evidence.foreign.recordings import KINDS
+from evidence.steps import Step, run_steps
+
+_CURVES = report.CHECKOUT / "evidence/curves"
+_FOREIGN, _EXVIVO = 3, 6
+"""Recordings of each kind; recordings."""
+
+
+def main(
+    work: Annotated[Path, typer.Argument(help="Folder for data and logs, to go on from.")],
+    photo: Annotated[Path | None, typer.Option(help="A photograph of exposed cortex.")] = None,
+    mechanics_python: Annotated[Path | None, typer.Option(help="A Python with felupe, pypardiso.")] = None,
+    pictures_python: Annotated[Path | None, typer.Option(help="A Python with bpy.")] = None,
+    only: Annotated[str, typer.Option(help="Steps whose name has this.")] = "",
+) -> None:
+    """Makes all kept results anew. Exit code 1 if a step fails; its log is WORK/logs/STEP.log."""
+    steps = [*shared(work), *rooms(work)]
+    if photo is None:
+        typer.echo("no --photo: the look and pseudo ex vivo recordings are left out", err=True)
+    else:
+        steps += [*look(work, photo), *exvivo(work, photo)]
+    if mechanics_python is None or pictures_python is None:
+        typer.echo("no --mechanics-python and --pictures-python: foreign recordings are left out", err=True)
+    else:
+        steps += foreign(work, mechanics_python, pictures_python)
+    chosen = [step for step in steps if only in step[0]]
+    rows = run_steps(chosen, work / "steps.json", work / "logs")
+    report.show({"steps": rows, "CPU-hours": sum(row["cpu_s"] for row in rows) / 3600})
+    raise typer.Exit(int(any(row["exit_code"] for row in rows)))
+
+
+def shared(work: Path) -> list[Step]:
+    """Datasets that several experiments read."""
+    sizes = (("stereo-640", "[640, 480]"), ("stereo-320", "[320, 240]"))
+    return [
+        _render("mission", "mission", work, sequences=400),
+        _render("mission-bench", _CURVES / "mission-bench.yaml", work, sequences=60),
+        _render("mission-unseen", _CURVES / "mission-unseen.yaml", work, sequences=80),
+        *(
+            _render(name, "stereo", work, sequences=8, seed=77, **{"render.size": size})
+            for name, size in sizes
+        ),
+    ]
+
+
+def rooms(work: Path) -> list[Step]:
+    """What needs neither a photograph nor another Python."""
+    mission, unseen = str(work / "mission"), str(work / "mission-unseen")
+    labels, clips = str(work / "labels"), str(work / "clips")
+    networks = [word for name in ("mono", "stereo") for word in ("--model", f"{name}=learn/models/{name}")]
+    return [
+        _script("fem.half_space", "--tets", "1600,5000"),
+        _script("fem.pareto", "--refined", "8000", "--contacts", "2"),
+        _script("fem.relief", "--scenes", "40", "--tets", "1600,5000,20000"),
+        _script("render.pareto", "--width", "640,256"),
+        _script("render.stability"),
+        _script("render.gallery"),
+        _script("flow.experiment"),
+        _script("flow.pareto", "--count", "4"),
+        _script("flow.foreign", "--jobs", "1"),
+        _script("flow.stability", "--count", "1", "--size", "224"),
+        _script("flow.stereo", str(work / "stereo-640"), str(work / "stereo-320")),
+        _script("engine.speed"),
+        _script("learn.shipped", mission, *networks, "--unseen", unseen, "--cache", clips),
+        _script("learn.runs", labels),
+        _script("learn.pareto", "--cache", labels, "--repeats", "60"),
+        _script("learn.stability", labels),
+        _script(
+            *("curves.experiment", mission, "--unseen", unseen, "--sizes", "30,100,300", "--asked", "60"),
+            *("--choosing", "40", "--work", str(work / "curves")),
+        ),
+        _script("gap.experiment", mission, "--unseen", unseen, "--fit", "300", "--work", str(work / "gap")),
+        _script("scoring.together", unseen, "--work", str(work / "together")),
+        _script("scoring.pulse", "--seconds", "20", "--count", "2", "--size", "160"),
+        _script("scoring.cost", "learn/models/mono", "--train", mission),
+        _script("scoring.stability", str(work / "films")),
+        _script("mechanics.experiment", "--fit", "35", "--test", "12", "--work", str(work / "mechanics")),
+        _script("end_to_end.pareto", "--fit", "40", "--test", "24", "--work", str(work / "end-to-end")),
+        _script("tune.experiment"),
+    ]
+
+
+def look(work: Path, photo: Path) -> list[Step]:
+    """The look beside a photograph, as it comes and fitted."""
+    fitted = str(work / "look.yaml")
+    return [
+        _script("render.realism", str(photo), "--frames", "12", "--family", "healthy"),
+        ("fit", ("-m", "synth", "fit", str(photo), "--width-mm", "110", "-o", fitted)),
+        _script("look.classifier", str(photo), "--look", fitted, "--frames", "5", "--epochs", "8"),
+    ]
+
+
+def exvivo(work: Path, photo: Path) -> list[Step]:
+    """Pseudo ex vivo recordings of 30 s that differ from the training data in every family, scored."""
+    steps: list[Step] = []
+    for number, eyes, model in ((1, "one-eye", "mono"), (2, "two-eyes", "stereo")):
+        made = work / f"exvivo-{eyes}"
+        about = ("--count", str(_EXVIVO), "--seconds", "30", "--fps", "10", "--eyes", str(number))
+        steps.append(_script("scoring.exvivo", "--out", str(made), *about, "--photo", str(photo)))
+        folders = [made / f"{k:03d}" for k in range(_EXVIVO)]
+        steps += _scored(f"exvivo {eyes}", folders, model, report.RESULTS / "exvivo" / eyes)
+    return steps
+
+
+def foreign(work: Path, mechanics: Path, pictures: Path) -> list[Step]:
+    """Recordings by another mechanics code and another renderer, scored by two eyes and by the left one."""
+    made, left = work / "foreign", work / "foreign-left"
+    pythons = ("--mechanics-python", str(mechanics), "--pictures-python", str(pictures))
+    steps: list[Step] = [
+        _script("foreign.recordings", str(made), "--count", str(_FOREIGN), *pythons, "--left", str(left)),
+    ]
+    names = [f"{kind}-{k}" for kind in KINDS for k in range(_FOREIGN)]
+    for eyes, folder, model in (("two-eyes", made, "stereo"), ("one-eye", left, "mono")):
+        out = report.RESULTS / "learn/foreign" / eyes
+        steps += _scored(f"foreign {eyes}", [folder / name for name in names], model, out)
+    return steps
+
+
+def _scored(name: str, recordings: list[Path], model: str, out: Path) -> list[Step]:
+    """`bench score` of each and `bench pool` of all."""
+    scores = [folder.with_name(f"{folder.name}-score") for folder in recordings]
+    steps: list[Step] = [
+        (f"{name} {folder.name}", ("-m", "bench", "score", str(folder), "--model", model, "-o", str(score)))
+        for folder, score in zip(recordings, scores, strict=True)
+    ]
+    pooled = ("-m", "bench", "pool", *map(str, scores), "-o", str(out), "--by", "python -m evidence.all WORK")
+    return [*steps, (f"{name} pooled", pooled)]
+
+
+def _render(name: str, job: str | Path, work: Path, **changes: object) -> Step:
+    words = (f"{key}={value}" for key, value in changes.items())
+    return name, ("-m", "synth", "render", str(job), "-o", str(work / name), *words)
+
+
+def _script(module: str, *words: str) -> Step:
+    return module, ("-m", f"evidence.{module}", *words)
+
+
+if __name__ == "__main__":
+    typer.run(main)

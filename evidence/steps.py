@@ -1,0 +1,61 @@
+"""Steps of a long run: one after another, each a process of its own; what has passed is not run again."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import typer
+
+from evidence import report
+
+Step = tuple[str, Sequence[str]]
+"""Its name, and the arguments after `python`."""
+
+
+def run_steps(
+    steps: Sequence[Step], kept: Path, logs: Path, limit_s: float | None = None
+) -> list[dict[str, Any]]:
+    """Runs the steps, each into `NAME.log` of a folder; one that fails does not stop the next.
+
+    A step that has passed before, by the same command and commit, is not run again.
+
+    Args:
+        steps: in order.
+        kept: JSON of what was run, rewritten after every step.
+        logs: folder.
+        limit_s: a step that takes longer is stopped.
+
+    Returns:
+        `name`, `command`, `commit`, `exit_code` (-1: stopped at its time limit), `wall_s` and `cpu_s` of
+        every step that was ever run.
+    """
+    logs.mkdir(parents=True, exist_ok=True)
+    rows: list[dict[str, Any]] = json.loads(kept.read_text("utf-8"))["steps"] if kept.is_file() else []
+    commit = report.commit()
+    passed = {(row["command"], row.get("commit", "")) for row in rows if row["exit_code"] == 0}
+    for name, arguments in steps:
+        line = "python " + " ".join(arguments)
+        if (line, commit) in passed:
+            continue
+        begin, before = time.perf_counter(), os.times()
+        with (logs / f"{name.replace(' ', '-')}.log").open("wb") as log:
+            try:
+                words = [sys.executable, *arguments]
+                code = subprocess.run(words, stdout=log, stderr=log, timeout=limit_s).returncode
+            except subprocess.TimeoutExpired:
+                code = -1
+        spent, after = time.perf_counter() - begin, os.times()
+        cpu = after.children_user + after.children_system - before.children_user - before.children_system
+        rows = [row for row in rows if row["name"] != name]
+        about = {"exit_code": code, "wall_s": round(spent, 1), "cpu_s": round(cpu, 1)}
+        rows.append({"name": name, "command": line, "commit": commit, **about})
+        typer.echo(f"{name}: exit code {code}, {spent:.0f} s, {cpu:.0f} of the CPU", err=True)
+        report.save(kept.parent, kept.name, {"steps": rows})
+    return rows
