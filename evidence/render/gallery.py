@@ -43,7 +43,7 @@ _LIGHTS: dict[str, Settings] = {
 _CAMERAS: dict[str, Settings] = {
     "default": {},
     "noisy": {"sensor": {"full_well": 900.0, "read_noise": 25.0, "sharpening": 1.2}},
-    "one chip": {"sensor": {"bayer": True, "contrast": 1.0}},
+    "one chip": {"sensor": {"bayer": True}},
     "wide": {"render": {"field_mm": 46.0, "tilt_deg": 28.0, "distortion": (-0.25, 0, 0, 0, 0)}},
 }
 _SCENERY: dict[str, Kind] = {

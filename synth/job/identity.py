@@ -40,6 +40,9 @@ def identify_job(job: Job) -> str:
         del described["anatomy"]["craniotomy"]["also"]
     if not job.anatomy.fill_holes:
         del described["anatomy"]["fill_holes"]
+    for name in ("matrix", "curves"):
+        if getattr(job.sensor, name) is None:
+            del described["sensor"][name]
     for (block, name), largest in FILES.items():
         described[block][name] = _digest(getattr(getattr(job, block), name), largest)
     return hashlib.blake2b(canonical(described), digest_size=16).hexdigest()

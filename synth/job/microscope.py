@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, FiniteFloat
 
-from synth.job.types import NonNegative, Positive, Range, Section, Share
+from synth.job.types import Curve, NonNegative, Positive, Range, Section, Share, Vector
 
 
 class LightSection(Section):
@@ -38,8 +38,12 @@ class SensorSection(Section):
     """Share of light lost in the picture's corners."""
     blur_px: Annotated[FiniteFloat, Field(ge=0, le=8)] = 0.0
     """Blur of the optics beyond the aperture's: standard deviation of a Gaussian [px]."""
-    contrast: Range[Share] = (0.25, 0.55)
-    """Tone curve: weight of an S over plain sRGB."""
+    matrix: tuple[Vector, Vector, Vector] | None = None
+    """From the chip's colours to the picture's, in linear light: rows for red, green, blue, each summing
+    to 1 where white is to stay white. Empty: that of a camera drawn from a few."""
+    curves: tuple[Curve, Curve, Curve] | None = None
+    """Tone curves of red, green, blue: rising video levels, 1 is white, at 0.05, 0.2, 0.5, 1 and 2 times full
+    scale. Empty: those of the same camera."""
     sharpening: Range[NonNegative] = (0.15, 0.4)
     """Unsharp mask, as a share of the detail."""
     bayer: bool = False

@@ -68,6 +68,7 @@ JOB: dict[str, Retired] = {
     "anatomy.vessel_calibre": Retired(1.0),
     "light.power": Retired([0.95, 1.1]),
     "light.drift": Retired([0.0, 0.03]),
+    "sensor.contrast": Retired([0.25, 0.55]),
     "sensor.depth": Retired(8),
     "sensor.subframes": Retired(4),
     "render.off_centre": Retired([0.0, 0.0]),

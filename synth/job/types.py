@@ -41,6 +41,12 @@ def _ordered(value: tuple[float, float]) -> tuple[float, float]:
     return value
 
 
+def _rising(value: tuple[float, ...]) -> tuple[float, ...]:
+    if list(value) != sorted(value):
+        raise ValueError("levels of a tone curve have to rise")
+    return value
+
+
 def _long(value: tuple[float, float, float]) -> tuple[float, float, float]:
     if not any(value):
         raise ValueError("a direction of no length")
@@ -53,6 +59,9 @@ Positive = Annotated[FiniteFloat, Field(gt=0)]
 NonNegative = Annotated[FiniteFloat, Field(ge=0)]
 Share = Annotated[FiniteFloat, Field(ge=0, le=1)]
 Vector = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
+Curve = Annotated[
+    tuple[NonNegative, NonNegative, NonNegative, NonNegative, NonNegative], AfterValidator(_rising)
+]
 Direction = Annotated[Vector, AfterValidator(_long)]
 MembraneState = Literal["stripped", "unknown", "intact"]
 """What is known of the tissue's membrane (pia): taken off, nothing, left on."""

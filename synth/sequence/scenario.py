@@ -25,6 +25,7 @@ from synth.render.appearance.look import Look
 from synth.render.camera.camera import CameraView
 from synth.render.camera.camera_motion import CameraMotion
 from synth.render.camera.camera_sensor import CameraSensor
+from synth.render.camera.colour_processing import CAMERAS
 
 Floats = NDArray[np.float64]
 Random = np.random.Generator
@@ -365,20 +366,21 @@ def draw_light(light: LightSection, rng: Random) -> Lighting:
 
 
 def draw_sensor(section: schema.SensorSection, white: Colour, rng: Random) -> CameraSensor:
-    """A chip within the job's ranges, with that white balance."""
-    return CameraSensor(
+    """A chip within the job's ranges, with that white balance; colours as asked or as a camera has them."""
+    sensor = CameraSensor(
         exposure=_uniform(rng, section.exposure),
         white=white,
         full_well=_uniform(rng, section.full_well),
         read_noise=_uniform(rng, section.read_noise),
         vignette=section.vignette,
         blur=section.blur_px,
-        contrast=_uniform(rng, section.contrast),
         sharpening=_uniform(rng, section.sharpening),
         bayer=section.bayer,
         chroma=section.chroma,
         coded=section.bitrate_mbps is not None,
     )
+    camera = CAMERAS[int(rng.integers(len(CAMERAS)))]
+    return replace(sensor, matrix=section.matrix or camera.matrix, curves=section.curves or camera.curves)
 
 
 def _near(colour: Colour, rng: Random) -> Colour:

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import cv2
 import numpy as np
 import numpy.typing as npt
+from scipy.interpolate import PchipInterpolator
 
+from synth.render.camera.colour_processing import KNOTS, PLAIN, Curve, Curves, Matrix, encoded
 from synth.system.jit import vectorised
 
 Map = npt.NDArray[np.float32]
 
-_HEADROOM = 2.0  # times full scale that the sensor still measures, where a knee leaves room for it
-_STEPS = 4096  # of the tone curve, over full scale
+_HEADROOM = KNOTS[-1]  # times full scale that the sensor still measures
+_STEPS = 4096  # of the tone curves, over full scale
 
 
 @dataclass(frozen=True)
@@ -36,10 +39,10 @@ class CameraSensor:
     """Standard deviation of the optics' blur [px]."""
     bloom: float = 0.03
     """Share of light that the optics scatter around."""
-    knee: float = 0.8
-    """Share of full scale above which light is compressed, so that highlights keep some drawing; 1: none."""
-    contrast: float = 0.35
-    """Weight of the tone curve's S over a straight line."""
+    matrix: Matrix = PLAIN.matrix
+    """From balanced sensor colours to the picture's, in linear light; rows that sum to 1 keep white."""
+    curves: Curves = PLAIN.curves
+    """Tone curves of red, green, blue: video levels (1: white, more is cut off) at `KNOTS` of full scale."""
     sharpening: float = 0.3
     """Unsharp mask of the video processor, as a share of the detail."""
     bayer: bool = False
@@ -61,6 +64,17 @@ def record(radiance: Map, sensor: CameraSensor, rng: np.random.Generator) -> npt
     Returns:
         (H, W, 3) uint8.
     """
+    video = processed(balanced_light(radiance, sensor, rng), sensor.matrix, sensor.curves)
+    video = _sharpen(video, sensor.sharpening)
+    np.clip(video, 0, 1, out=video)
+    video = video if sensor.coded else _thinned(video, sensor.chroma)
+    np.clip(video, 0, 1, out=video)
+    video *= np.float32(255)
+    return np.rint(video, out=video).astype(np.uint8)
+
+
+def balanced_light(radiance: Map, sensor: CameraSensor, rng: np.random.Generator) -> Map:
+    """What the chip measures of radiance (H, W, 3), white-balanced, 1 at full scale, up to `_HEADROOM`."""
     white = np.asarray(sensor.white, np.float32)
     # Gains below 1 are taken off the exposure: what fills the sensor has to be white, not short of a colour.
     least = white.min()
@@ -70,18 +84,31 @@ def record(radiance: Map, sensor: CameraSensor, rng: np.random.Generator) -> npt
     light = _scatter(light, sensor.bloom)
     balanced = rng.standard_normal(light.shape, dtype=np.float32)
     well, read = np.float32(sensor.full_well), np.float32(sensor.read_noise**2)
-    most = np.float32(_HEADROOM if sensor.knee < 1 else 1)
+    most = np.float32(_HEADROOM)
     steps = np.float32(2**sensor.bits - 1) / most
     _convert(np.asarray(light, np.float32), well, read, steps, most, white / least, balanced)
-    if sensor.bayer:
-        balanced = _demosaiced(balanced)
-    video = _tone(balanced, sensor.contrast, sensor.knee)
-    video = _sharpen(video, sensor.sharpening)
-    np.clip(video, 0, 1, out=video)
-    video = video if sensor.coded else _thinned(video, sensor.chroma)
-    np.clip(video, 0, 1, out=video)
-    video *= np.float32(255)
-    return np.rint(video, out=video).astype(np.uint8)
+    return _demosaiced(balanced) if sensor.bayer else balanced
+
+
+def processed(linear: Map, matrix: Matrix, curves: Curves) -> Map:
+    """Video levels of balanced light (H, W, 3), `_HEADROOM` at most: a matrix, then a curve a channel.
+
+    Between knots a curve is monotone (F. N. Fritsch, R. E. Carlson, 1980) over sRGB-encoded light, of which
+    it makes plain sRGB where its levels are `encoded(KNOTS)`. Black is 0.
+    """
+    video = np.empty(linear.shape, np.float32)
+    red, green, blue = (_table(curve) for curve in curves)
+    light, mixed = np.ascontiguousarray(linear, np.float32), np.array(matrix, np.float32)
+    _look_up(light, mixed, red, green, blue, video)
+    return video
+
+
+@lru_cache(16)
+def _table(curve: Curve) -> Map:
+    """A tone curve in `_STEPS` a full scale."""
+    levels = encoded(np.linspace(0, _HEADROOM, int(_HEADROOM * _STEPS) + 1))
+    curve_of = PchipInterpolator(encoded(np.array([0.0, *KNOTS])), [0.0, *curve])
+    return np.asarray(curve_of(levels), np.float32)
 
 
 @vectorised
@@ -149,44 +176,18 @@ def _scatter(light: Map, share: float) -> Map:
     return np.asarray((1 - share) * light + share * halo, np.float32)
 
 
-def _tone(linear: Map, contrast: float, knee: float) -> Map:
-    """A knee, the sRGB transfer (IEC 61966-2-1), then an S-curve that keeps black, middle and white."""
-    levels = np.linspace(0, _HEADROOM, int(_HEADROOM * _STEPS) + 1, dtype=np.float32)
-    encoded = _encoded(_compressed(levels, knee))
-    curve = (encoded + contrast * (encoded * encoded * (3 - 2 * encoded) - encoded)).astype(np.float32)
-    video = np.empty(linear.shape, np.float32)
-    _look_up(np.ascontiguousarray(linear, np.float32), curve, video)
-    return video
-
-
-def _compressed(levels: Map, knee: float) -> Map:
-    """Linear light with what is above a knee bent towards full scale, which `_HEADROOM` reaches; smoothly."""
-    if knee >= 1:
-        return np.minimum(levels, 1)
-    room = 1 - knee
-    bent = -np.expm1(-np.maximum(levels - knee, 0) / room) / -np.expm1(-(_HEADROOM - knee) / room)
-    return np.asarray(np.minimum(levels, knee) + room * bent, np.float32)
-
-
-def _encoded(linear: Map) -> Map:
-    """The sRGB transfer (IEC 61966-2-1) of linear light."""
-    return np.asarray(
-        np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055), np.float32
-    )
-
-
 @vectorised
-def _look_up(linear: Map, curve: Map, video: Map) -> None:
-    """A curve of `_STEPS` a full scale, read at linear (H, W, 3) in double precision, into `video`."""
-    last = len(curve) - 2
+def _look_up(linear: Map, matrix: Map, red: Map, green: Map, blue: Map, video: Map) -> None:
+    """A matrix (3, 3) on linear (H, W, 3), and of it curves of `_STEPS` a full scale, into `video`."""
+    most, steps = np.float32(len(red) - 1.001), np.float32(_STEPS)
     for y in range(linear.shape[0]):
         for x in range(linear.shape[1]):
-            for k in range(3):
-                at = linear[y, x, k] * np.float32(_STEPS)
-                low = int(at)
-                if low > last:
-                    low = last
-                video[y, x, k] = curve[low] + (at - low) * (curve[low + 1] - curve[low])
+            r, g, b = linear[y, x, 0] * steps, linear[y, x, 1] * steps, linear[y, x, 2] * steps
+            for k, curve in enumerate((red, green, blue)):
+                at = matrix[k, 0] * r + matrix[k, 1] * g + matrix[k, 2] * b
+                at = min(max(at, np.float32(0)), most)
+                low = np.int32(at)
+                video[y, x, k] = curve[low] + (at - np.float32(low)) * (curve[low + 1] - curve[low])
 
 
 def _sharpen(video: Map, amount: float) -> Map:

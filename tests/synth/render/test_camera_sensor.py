@@ -5,9 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from synth.render.camera.camera_sensor import CameraSensor, record
+from synth.render.camera.camera_sensor import CameraSensor, processed, record
+from synth.render.camera.colour_processing import CAMERAS, KNOTS, encoded
+from synth.render.camera.colour_processing import PLAIN as ORDINARY
 
-PLAIN = CameraSensor(vignette=0.0, bloom=0.0, knee=1.0, contrast=0.0, sharpening=0.0)
+SRGB = (tuple(encoded(np.array(KNOTS)).tolist()),) * 3
+PLAIN = CameraSensor(vignette=0.0, bloom=0.0, curves=SRGB, sharpening=0.0)
+NOISELESS = replace(PLAIN, full_well=1e9, read_noise=0.0, bits=30)
 
 
 def flat(level: float, side: int = 200) -> np.ndarray:
@@ -36,8 +40,34 @@ def test_white_balance_multiplies_channels() -> None:
 
 def test_what_fills_the_sensor_is_white_under_any_lamp() -> None:
     sensor = replace(PLAIN, white=(0.79, 1.0, 1.26))
-    for knee in (1.0, 0.8):
-        assert (record(flat(5.0), replace(sensor, knee=knee), np.random.default_rng(0)) == 255).all()
+    for curves in (SRGB, ORDINARY.curves):
+        assert (record(flat(5.0), replace(sensor, curves=curves), np.random.default_rng(0)) == 255).all()
+
+
+def test_a_matrix_mixes_linear_light_and_keeps_white() -> None:
+    matrix = ((1.5, -0.4, -0.1), (-0.2, 1.4, -0.2), (0.0, -0.5, 1.5))
+    colour = flat(1.0) * np.array([0.5, 0.3, 0.2], np.float32)
+    seen = linear(record(colour, replace(NOISELESS, matrix=matrix), np.random.default_rng(0)).astype(float))
+    np.testing.assert_allclose(seen.mean(axis=(0, 1)), np.array(matrix) @ [0.5, 0.3, 0.2], rtol=0.02)
+    grey = linear(
+        record(flat(0.4), replace(NOISELESS, matrix=matrix), np.random.default_rng(0)).astype(float)
+    )
+    np.testing.assert_allclose(grey, 0.4, rtol=0.02)
+
+
+@pytest.mark.parametrize("camera", CAMERAS)
+def test_a_camera_keeps_its_knots_and_rises_between_them_not_steeply_in_the_dark(camera: tuple) -> None:
+    matrix, curves = camera
+    np.testing.assert_allclose(np.sum(matrix, axis=1), 1, atol=1e-3)
+    levels = np.linspace(0, KNOTS[-1], 4001)
+    grey = np.repeat(levels.astype(np.float32)[None, :, None], 3, axis=2)
+    video = processed(grey, ORDINARY.matrix, curves)[0]
+    assert (np.diff(video, axis=0) >= -1e-6).all()
+    for k in range(3):
+        np.testing.assert_allclose(np.interp(KNOTS, levels, video[:, k]), curves[k], atol=2e-3)
+    dark = levels < KNOTS[0]
+    slope = np.diff(video[dark], axis=0) / np.diff(encoded(levels[dark]))[:, None]
+    assert slope.max() < 1.3, "of plain sRGB: a steeper one multiplies the noise"
 
 
 def test_bloom_keeps_the_light() -> None:
