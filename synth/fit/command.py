@@ -8,25 +8,21 @@ from typing import Annotated
 
 import typer
 
+Photo = Annotated[Path, typer.Argument(help="A photograph of exposed cortex, of your own microscope.")]
+Out = Annotated[Path, typer.Option("--out", "-o", help="The YAML file to write, a job.")]
+Width = Annotated[float, typer.Option(min=5, max=400, help="What its width spans at the cortex [mm].")]
+Marked = Annotated[Path | None, typer.Option(help="A picture of its size, white on cortex; else found.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")]
+
 
 def fit(
-    photo: Annotated[Path, typer.Argument(help="A photograph of exposed cortex, of your own microscope.")],
-    out: Annotated[Path, typer.Option("--out", "-o", help="The YAML file to write, a job.")] = Path(
-        "look.yaml"
-    ),
-    width_mm: Annotated[
-        float,
-        typer.Option(
-            "--width-mm", min=5, max=400, help="What the photograph's width spans at the cortex [mm]."
-        ),
-    ] = 35.0,
-    mask: Annotated[
-        Path | None,
-        typer.Option(help="A picture of the same size, white where the cortex is; found if not given."),
-    ] = None,
-    json: Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")] = False,
+    photo: Photo,
+    out: Out = Path("look.yaml"),
+    width_mm: Width = 35.0,
+    mask: Marked = None,
+    json: AsJson = False,
 ) -> None:
-    """Measures the camera of one photograph (noise, blur, vignette, codec) and its nearest family."""
+    """Measures a photograph's camera (colours, noise, blur, vignette, codec) and its nearest family."""
     from synth.errors import UserError
     from synth.fit import fitting
     from synth.fit.photograph import read_photograph
@@ -43,7 +39,5 @@ def fit(
     for section, keys in found.items():
         lines += [f"{section}:", *(f"  {name}: {json_.dumps(value)}" for name, value in keys.items())]
     write_whole(out, "\n".join(lines) + "\n")
-    if json:
-        print(json_.dumps({"job": found, "cortex_mm2": given.cortex_mm2, "out": str(out)}))
-    else:
-        print("\n".join([*lines, f"wrote {out}; see it with: synth preview {out}"]))
+    said = json_.dumps({"job": found, "cortex_mm2": given.cortex_mm2, "out": str(out)})
+    print(said if json else "\n".join([*lines, f"wrote {out}; see it with: synth preview {out}"]))

@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
-from typing import Any
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 
+from synth.fit.colours import fit_colours
 from synth.fit.photograph import Photograph
 from synth.fit.statistics import Map, Mask, Picture, measure
 from synth.job.schema import Family, Job
 from synth.render.appearance.family import FAMILIES
 from synth.render.camera import camera_sensor
-from synth.render.camera.camera_sensor import CameraSensor
+from synth.render.camera.camera_sensor import CameraSensor, balanced_light
 from synth.render.scene import SceneState
 from synth.sequence.scene import at_rest
 
@@ -39,8 +40,7 @@ _TRIED: dict[str, tuple[tuple[float, ...], Callable[[float], dict[str, float]]]]
 """Of each figure: values that are tried, in the order in which it rises, and the sensor's keys for them."""
 
 
-@dataclass(frozen=True)
-class TissueFrame:
+class TissueFrame(NamedTuple):
     """A rendered frame before its sensor."""
 
     radiance: Map
@@ -48,12 +48,11 @@ class TissueFrame:
     usable: Mask
     """(H, W) tissue."""
     sensor: CameraSensor
-    """Of its sequence."""
+    """The usual one, exposed and white-balanced as the sequence's own is."""
 
-    def record(self, keys: Mapping[str, Any]) -> Picture:
-        """The picture (H, W, 3) sRGB of the usual sensor with these keys, white-balanced as its own is."""
-        usual = replace(_USUAL, white=self.sensor.white, exposure=self.sensor.exposure)
-        return camera_sensor.record(self.radiance, replace(usual, **keys), np.random.default_rng(0))
+    def record(self, keys: dict[str, Any]) -> Picture:
+        """The picture (H, W, 3) sRGB that the sensor with these keys takes."""
+        return camera_sensor.record(self.radiance, replace(self.sensor, **keys), np.random.default_rng(0))
 
 
 def fit_camera(given: Photograph) -> dict[str, Any]:
@@ -61,63 +60,55 @@ def fit_camera(given: Photograph) -> dict[str, Any]:
 
     Frames of a default job of that family are rendered as wide as the photograph, then recorded and packed
     with rising vignette, noise and blur: those are taken with which they measure what the photograph does.
+    Colours are fitted to the light that such a camera measures.
     """
-    theirs = measure(given.rgb, given.usable, given.mm_per_px)
-    family = nearest_family(theirs)
+    theirs = measure(given.rgb, given.usable)
+    family = nearest_family(theirs["green"], theirs["blue"])
     widest = min(given.rgb.shape[1], _LARGEST_MM / given.mm_per_px)
     width = int(np.clip(widest, _SMALLEST_PX, _LARGEST_PX)) // 4 * 4
     frames = [render(family, width, given.mm_per_px, index) for index in range(_ANATOMIES)]
     reach = width / given.rgb.shape[1]
-    keys: dict[str, float] = {}
+    keys: dict[str, Any] = {"vignette": _USUAL.vignette}
 
     def figure(name: str, tried: dict[str, float]) -> float:
-        camera_now = keys | tried
-        camera_now["vignette"] = camera_now.get("vignette", _USUAL.vignette) * reach**2
-        taken = [given.compression.apply(one.record(camera_now)) for one in frames]
-        scale = given.mm_per_px, reach
-        figures = [measure(rgb, one.usable, *scale) for rgb, one in zip(taken, frames, strict=True)]
-        return float(np.mean([one[name] for one in figures]))
+        now = keys | tried
+        now["vignette"] *= reach**2
+        taken = ((given.compression.apply(one.record(now)), one.usable) for one in frames)
+        return float(np.mean([measure(*one, reach)[name] for one in taken]))
 
     for name, (tried, as_keys) in _TRIED.items():
-        if np.isfinite(theirs[name]):
-            measured = np.maximum.accumulate([figure(name, as_keys(value)) for value in tried])
-            keys |= as_keys(float(np.interp(theirs[name], measured, tried)))
+        measured = np.maximum.accumulate([figure(name, as_keys(value)) for value in tried])
+        keys |= as_keys(float(np.interp(theirs[name], measured, tried)))
+    here, rng = keys | {"vignette": keys["vignette"] * reach**2}, np.random.default_rng(0)
+    light = [balanced_light(one.radiance, replace(one.sensor, **here), rng)[one.usable] for one in frames]
+    keys |= fit_colours(np.concatenate(light), given.rgb[given.usable] / 255)._asdict()
     rate = given.compression.bitrate_mbps(frames[0].record(keys))
-    sensor: dict[str, Any] = {
-        {"blur": "blur_px"}.get(name, name): float(f"{value:.3g}") for name, value in keys.items()
-    }
-    for name in {"full_well", "read_noise", "sharpening"} & set(sensor):
+    sensor = {name: np.round(value, 4).tolist() for name, value in keys.items()}
+    sensor["blur_px"] = sensor.pop("blur")
+    for name in ("full_well", "read_noise", "sharpening"):
         sensor[name] = [sensor[name]] * 2
-    sensor |= {"chroma": given.compression.chroma} | ({} if rate is None else {"bitrate_mbps": rate})
+    sensor |= {"chroma": given.compression.chroma, "bitrate_mbps": rate and round(rate, 2)}
     sections = {"appearance": {"families": [family]}, "sensor": sensor}
     Job.model_validate(sections)
     return sections
 
 
-def nearest_family(theirs: dict[str, float]) -> Family:
-    """The family whose tissue has most nearly the photograph's ratios of colours."""
-
-    def off(family: Family) -> float:
-        r, g, b = np.add(FAMILIES[family].crown, FAMILIES[family].flush)
-        green, blue = _GREEN * g / r / theirs["green"], _BLUE * b / r / theirs["blue"]
-        return float(np.hypot(np.log(green), np.log(blue)))
-
-    return min(FAMILIES, key=off)
+def nearest_family(green: float, blue: float) -> Family:
+    """The family whose tissue has most nearly these ratios to red, in linear light."""
+    both = {name: np.add(one.crown, one.flush) for name, one in FAMILIES.items()}
+    ratios = {name: (_GREEN * g / r / green, _BLUE * b / r / blue) for name, (r, g, b) in both.items()}
+    return min(FAMILIES, key=lambda name: float(np.hypot(*np.log(ratios[name]))))
 
 
 def render(family: Family, width: int, mm_per_px: float, index: int) -> TissueFrame:
     """A default frame without instruments: the anatomy, view and light of sequence `index`."""
     field = width * mm_per_px
-    job = Job.model_validate(
-        {
-            "anatomy": {"vertices": 8000, "craniotomy": {"radius_mm": 0.56 * field}},
-            "appearance": {"families": [family]},
-            "render": {"size": [width, width * 3 // 4], "field_mm": field, "tilt_deg": [0, 8], "tool": False},
-        }
-    )
+    look = {"anatomy": {"vertices": 8000, "craniotomy": {"radius_mm": 0.56 * field}}}
+    view = {"size": [width, width * 3 // 4], "field_mm": field, "tilt_deg": [0, 8], "tool": False}
+    job = Job.model_validate({**look, "appearance": {"families": [family]}, "render": view})
     scene = at_rest(job, index)
     nowhere = np.zeros((2, 3))
-    state = SceneState(scene.surface.vertices, nowhere, nowhere)
-    radiance = scene.renderer.render(state, seed=index).radiance
+    radiance = scene.renderer.render(SceneState(scene.surface.vertices, nowhere, nowhere), index).radiance
     usable = cv2.erode(scene.tissue.astype(np.uint8), np.ones((_INSET_PX, _INSET_PX), np.uint8)) > 0
-    return TissueFrame(radiance, usable, scene.scenario.look.sensor)
+    drawn = scene.scenario.look.sensor
+    return TissueFrame(radiance, usable, replace(_USUAL, white=drawn.white, exposure=drawn.exposure))

@@ -1,4 +1,4 @@
-"""Which pixels of a frame show no tissue: glare and tool, found in the picture itself."""
+"""Which pixels of a frame show no tissue, glare and tool, or cortex: found in the picture itself."""
 
 from __future__ import annotations
 
@@ -11,6 +11,11 @@ from synth.flow import toolnet
 _CLIPPED = 240.0  # grey levels: at least two channels this high have no texture left
 _ABOVE = 45.0  # grey levels above the local median
 _SOME = 0.1  # mean probability of a grey body that counts as an instrument
+_OUTLINE_PX = 240  # larger side of the small picture that the cortex is found in
+_MIDDLE = 0.6  # squared radius of the ellipse that is taken for cortex at first, half sides are 1
+_BLACK, _BLOODY = 60, 0.42  # grey levels; green over red (sRGB)
+_WIDE_PX = 9  # of the small picture: no vessel is wider, what is bloody over more is something else
+_INSET_PX = 5  # of it by which the outline is drawn in
 _SHRINK = 4  # the median is taken on a picture this much smaller: it is smooth
 
 
@@ -71,6 +76,30 @@ def both(rgb: NDArray[np.uint8], net: toolnet.ToolNet) -> NDArray[np.bool_]:
 def blocked(rgb: NDArray[np.uint8]) -> NDArray[np.bool_]:
     """Everything that is no tissue to follow: glare and tool, both found in the picture. (H, W) bool."""
     return np.asarray(glare(rgb) | tool(rgb), bool)
+
+
+def cortex(rgb: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    """(H, W): the exposed cortex of a picture (H, W, 3) sRGB, without instruments and dark border.
+
+    What is like the middle of the picture and not like its edge (C. Rother et al., "GrabCut", 2004), less
+    what is black, blue, soaked with blood or found to be an instrument.
+    """
+    scale = min(1.0, _OUTLINE_PX / max(rgb.shape))
+    small = cv2.medianBlur(cv2.resize(rgb, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), 5)
+    red, green, blue = np.moveaxis(small.astype(np.float32), 2, 0)
+    bloody = cv2.blur((green < _BLOODY * red).astype(np.float32), (_WIDE_PX, _WIDE_PX)) > 0.9
+    steel = cv2.resize(tool(rgb).astype(np.uint8), small.shape[1::-1]) > 0
+    y, x = np.meshgrid(*(np.linspace(-1, 1, n) for n in small.shape[:2]), indexing="ij")
+    label = np.where(x**2 + y**2 < _MIDDLE, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
+    label[(small.max(axis=2) < _BLACK) | (blue > 1.1 * red) | bloody | steel] = cv2.GC_BGD
+    if not (label == cv2.GC_PR_FGD).any():
+        return np.zeros(rgb.shape[:2], bool)
+    cv2.setRNGSeed(1)  # of the colour clusters' first guess
+    models = np.zeros((1, 65)), np.zeros((1, 65))
+    cv2.grabCut(np.ascontiguousarray(small[..., ::-1]), label, None, *models, 6, cv2.GC_INIT_WITH_MASK)
+    inside = (label == cv2.GC_PR_FGD).astype(np.uint8)
+    found = cv2.erode(inside, np.ones((_INSET_PX, _INSET_PX)), borderValue=1)
+    return np.asarray(cv2.resize(found, rgb.shape[1::-1]) > 0)
 
 
 def hidden(film: NDArray[np.uint8], tools: NDArray[np.bool_]) -> NDArray[np.bool_]:

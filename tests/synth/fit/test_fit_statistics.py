@@ -10,9 +10,11 @@ import pytest
 from PIL import Image
 
 from synth.fit import fitting
-from synth.fit.compression import Compression
-from synth.fit.photograph import Photograph
+from synth.fit.colours import fit_colours
+from synth.fit.photograph import Compression, Photograph
 from synth.fit.statistics import measure
+from synth.render.camera.camera_sensor import processed
+from synth.render.camera.colour_processing import CAMERAS
 
 MM = 0.0547
 SIZE = (360, 480)
@@ -44,13 +46,24 @@ def test_noise_of_known_size_is_found_and_blur_lowers_sharpness() -> None:
     picture = encoded(lines(8, 3)).astype(float)
     noise = 3 * np.random.default_rng(1).standard_normal(SIZE)[..., None]
     usable = np.ones(SIZE, bool)
-    assert measure(np.clip(picture + noise, 0, 255).astype(np.uint8), usable, MM)["noise"] == pytest.approx(
+    assert measure(np.clip(picture + noise, 0, 255).astype(np.uint8), usable)["noise"] == pytest.approx(
         3, rel=0.15
     )
-    sharp = measure(picture.astype(np.uint8), usable, MM)
-    soft = measure(cv2.GaussianBlur(picture, (0, 0), 1.5).astype(np.uint8), usable, MM)
+    sharp = measure(picture.astype(np.uint8), usable)
+    soft = measure(cv2.GaussianBlur(picture, (0, 0), 1.5).astype(np.uint8), usable)
     assert soft["sharpness"] < 0.7 * sharp["sharpness"]
     assert soft["noise"] < sharp["noise"]
+
+
+def test_colours_of_the_same_tissue_are_found_again() -> None:
+    rng = np.random.default_rng(2)
+    blood = rng.random((9000, 1)) ** 2
+    light = np.array([0.95, 0.8, 0.5]) * np.exp(-blood * [0.3, 1.9, 2.3]) * rng.uniform(0.5, 1.1, (9000, 1))
+    camera, light = CAMERAS[3], light.astype(np.float32)
+    video = np.clip(processed(light[None], *camera)[0], 0, 1)
+    found = np.clip(processed(light[None], *fit_colours(light, video))[0], 0, 1)
+    before = np.clip(processed(light[None], *CAMERAS[0])[0], 0, 1)
+    assert np.abs(found - video).mean() < 0.3 * np.abs(before - video).mean()
 
 
 @pytest.mark.slow

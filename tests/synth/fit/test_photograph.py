@@ -12,8 +12,8 @@ import pytest
 from PIL import Image
 
 from synth.errors import UserError
-from synth.fit.compression import Compression
-from synth.fit.photograph import find_cortex, read_photograph
+from synth.fit.photograph import Compression, read_photograph
+from synth.flow.mask_detection import cortex
 
 REFERENCE = Path(__file__).parents[4] / "shared" / "reference" / "cortex_photo.jpg"
 
@@ -45,14 +45,14 @@ def written(path: Path, rgb: np.ndarray, **how: object) -> Path:
 
 
 def test_the_opening_is_found_and_the_instrument_left_out() -> None:
-    with_tool, truth = find_cortex(scene(), 0.08), opening()
+    with_tool, truth = cortex(scene()), opening()
     rod = np.zeros(truth.shape, np.uint8)
     cv2.line(rod, (640, 480), (360, 270), 1, 20)
     rod = (rod > 0) & truth
     assert (with_tool & rod).sum() < 0.1 * rod.sum()
     assert (with_tool & ~truth).sum() < 0.03 * truth.sum()
     assert (with_tool & truth).sum() > 0.6 * (truth & ~rod).sum()
-    assert (find_cortex(scene(tool=False), 0.08) & truth).sum() > 0.8 * truth.sum()
+    assert (cortex(scene(tool=False)) & truth).sum() > 0.8 * truth.sum()
 
 
 def test_the_tables_of_a_jpeg_are_read_and_pack_alike() -> None:
