@@ -1,6 +1,6 @@
 """Can a small network tell crops of renderings from a photograph's? Held out by region and sequence.
 
-Run: python -m evidence.look.classifier cortex.jpg --look look.yaml
+Run: python -m evidence.look.classifier cortex.jpg --frames 5 --epochs 8 --seed 31
 """
 
 from __future__ import annotations
@@ -21,6 +21,9 @@ from torch import nn
 from evidence import report, status
 from evidence.look import crops
 from evidence.render.realism import OUTLINE
+from synth.fit.fitting import fit_camera
+from synth.fit.photograph import read_photograph
+from synth.job.schema import Job
 
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -28,6 +31,7 @@ Flags = npt.NDArray[np.bool_]
 Picture = npt.NDArray[np.uint8]
 
 _FOLDS = 5
+_UNSEEN = (3, 4), (0, 1)  # sectors that a look is not fitted on, and is asked on
 _BATCH, _RATE, _WIDTH = 32, 2e-3, 16
 _PATCHES = 40  # of the photograph, that the control gives one label each
 _BLURRED_PX = 3.0
@@ -36,7 +40,6 @@ _BLURRED_PX = 3.0
 def main(
     photo: Path,
     out: Path = report.RESULTS / "render/look",
-    look: Path | None = None,
     outline: str = OUTLINE,
     width_mm: float = 110.0,
     frames: int = 5,
@@ -45,8 +48,8 @@ def main(
 ) -> None:
     """AUC of a patch classifier, photograph against rendered crops; two controls have to be near 0.5.
 
-    `look`: also a job as `synth fit` writes it; `outline`, `width_mm`: of the cortex in the photograph, as in
-    realism; `frames`: one of each rendered sequence.
+    Fitted looks are asked on sectors that `synth fit` did not see. `outline`, `width_mm`: of the cortex in
+    the photograph, as in realism; `frames`: one of each rendered sequence.
     """
     torch.set_num_threads(1)
     (theirs, places), rng = crops.of_photograph(photo, outline, width_mm), np.random.default_rng(seed)
@@ -57,32 +60,43 @@ def main(
     rows = []
 
     def ask(name: str, pictures: Picture, label: Ints, fold: Ints, near: Flags) -> None:
-        rows.append({"crops": name, **held_out(pictures, label, fold, near, epochs, seed)})
+        scores = held_out(pictures, label, fold, near, epochs, seed)
+        rows.append({"crops": name, "count": len(label), **summary(list(scores.values()))})
 
-    for file in [None, look] if look else [None]:
-        ours, sequence = crops.of_job(crops.read_job(file, frames, seed, width_mm))
-        pictures, label = np.concatenate([theirs, ours]), np.repeat([0, 1], (len(theirs), len(ours)))
+    def against(job: Job) -> tuple[Picture, Ints, Ints, Flags]:
+        ours, sequence = crops.of_job(job)
+        label = np.repeat([0, 1], (len(theirs), len(ours)))
         fold, both = np.concatenate([region, sequence % _FOLDS]), np.pad(near, (0, len(ours)))
-        ask(file.stem if file else "default job", pictures, label, fold, both)
-        if file is None:
-            for k in (1, 2, 3):
-                ask(f"control: labels shuffled, {k}", pictures, shuffled(label, fold, rng), fold, both)
-        else:  # what gives a fitted look away
-            grey = np.stack([cv2.cvtColor(one, cv2.COLOR_RGB2GRAY) for one in pictures])
-            blurred = np.stack([cv2.GaussianBlur(one, (0, 0), _BLURRED_PX) for one in pictures])
-            ask(f"{file.stem}, grey levels", np.repeat(grey[..., None], 3, axis=3), label, fold, both)
-            ask(f"{file.stem}, colours, blurred", blurred, label, fold, both)
+        return np.concatenate([theirs, ours]), label, fold, both
+
+    pictures, label, fold, both = against(crops.read_job({}, frames, seed, width_mm))
+    ask("default job", pictures, label, fold, both)
+    for k in (1, 2, 3):
+        ask(f"control: labels shuffled, {k}", pictures, shuffled(label, fold, rng), fold, both)
+    found: dict[str, list[float]] = {}
+    looks = []
+    for pair in _UNSEEN:
+        seen = crops.without(read_photograph(photo, width_mm, None), places[np.isin(region, pair)])
+        looks.append(fit_camera(seen))
+        pictures, label, fold, both = against(crops.read_job(looks[-1], frames, seed, width_mm))
+        grey = np.stack([cv2.cvtColor(one, cv2.COLOR_RGB2GRAY) for one in pictures])
+        blurred = np.stack([cv2.GaussianBlur(one, (0, 0), _BLURRED_PX) for one in pictures])
+        shown = {"": pictures, ", grey levels": np.repeat(grey[..., None], 3, axis=3), ", blurred": blurred}
+        for name, of in shown.items():
+            scores = held_out(of, label, fold, both, epochs, seed, pair)
+            found.setdefault(f"fitted{name}", []).extend(scores.values())
+    rows += [{"crops": name, "count": len(theirs), **summary(scores)} for name, scores in found.items()]
     ask("control: photograph, itself", theirs, patch_labels(places, rng), region, near)
     means, ends = ({row["crops"]: row[key] for row in rows} for key in ("auc", "ends"))
-    found = {"data": status.data(*(file for file in (photo, look) if file)), "epochs": epochs, "rows": rows}
+    about = {"data": status.data(photo), "epochs": epochs, "looks": looks, "rows": rows}
     chart = report.Chart(
         "Told apart at 1, not at 0.5", "AUC, lowest to highest fold", report.bars(means, ends)
     )
     title = "Can a network tell crops from a photograph's?"
     report.save(
-        out, "classifier.json", found, report.Page(title, found, [chart], [report.Section("AUC", rows)])
+        out, "classifier.json", about, report.Page(title, about, [chart], [report.Section("AUC", rows)])
     )
-    report.show(found)
+    report.show(about)
 
 
 def shuffled(label: Ints, fold: Ints, rng: np.random.Generator) -> Ints:
@@ -99,21 +113,32 @@ def patch_labels(places: Floats, rng: np.random.Generator) -> Ints:
     return np.asarray(rng.permutation(np.arange(_PATCHES) % 2)[patch], np.int64)
 
 
+def summary(scores: list[float]) -> dict[str, Any]:
+    """Of the AUC of some folds."""
+    return {"auc": float(np.mean(scores)), "ends": (min(scores), max(scores))}
+
+
 def held_out(
-    pictures: Picture, label: Ints, fold: Ints, near: Flags, epochs: int, seed: int
-) -> dict[str, Any]:
-    """AUC of each fold on crops of it; none that shows some of them, their region or sequence was trained on.
+    pictures: Picture,
+    label: Ints,
+    fold: Ints,
+    near: Flags,
+    epochs: int,
+    seed: int,
+    asked: tuple[int, ...] = tuple(range(_FOLDS)),
+) -> dict[int, float]:
+    """AUC of each asked fold; no crop that shows some of its, their region or sequence was trained on.
 
     Args: pictures: (N, n, n, 3) sRGB; label: (N,) 0 or 1; fold: (N,); near: (N, N) show some of the same.
     """
-    found = []
-    for k in np.unique(fold):
+    found = {}
+    for k in asked:
         inside = fold == k
         taught = ~inside & ~near[inside].any(axis=0)
         if len(np.unique(label[inside])) == len(np.unique(label[taught])) == 2:
-            score = trained_scores(pictures[taught], label[taught], pictures[inside], epochs, seed + int(k))
-            found.append(float(roc_auc_score(label[inside], score)))
-    return {"count": len(label), "auc": float(np.mean(found)), "ends": (min(found), max(found))}
+            score = trained_scores(pictures[taught], label[taught], pictures[inside], epochs, seed + k)
+            found[k] = float(roc_auc_score(label[inside], score))
+    return found
 
 
 def trained_scores(pictures: Picture, label: Ints, asked: Picture, epochs: int, seed: int) -> Floats:

@@ -6,6 +6,7 @@ Both are at the same scale; both get the same noise and go through the same code
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -15,7 +16,7 @@ from evidence.render.case import case
 from evidence.render.picture_statistics import Picture, corners
 from evidence.render.realism import outlined, scaled_photograph
 from synth.errors import UserError
-from synth.job import reader
+from synth.fit.photograph import Photograph
 from synth.job.schema import Job
 
 Places = npt.NDArray[np.float64]
@@ -58,15 +59,24 @@ def of_job(job: Job, step: int = 64) -> tuple[Picture, Ints]:
     return np.concatenate(pictures), np.array(of)
 
 
-def read_job(look: Path | None, frames: int, seed: int, width_mm: float) -> Job:
-    """The job whose frames are compared: the default one, or what `synth fit` wrote.
+def without(given: Photograph, places: Places) -> Photograph:
+    """A photograph with nothing to be measured where crops of it are."""
+    usable, scale = given.usable.copy(), MM_PER_PX / given.mm_per_px
+    for x, y in places:
+        rows, columns = (slice(int(scale * at), int(scale * (at + SIDE_PX)) + 1) for at in (y, x))
+        usable[rows, columns] = False
+    return given._replace(usable=usable)
+
+
+def read_job(look: dict[str, Any], frames: int, seed: int, width_mm: float) -> Job:
+    """The job whose frames are compared: a default one with the sections that `synth fit` found.
 
     The fitted loss of light towards the corners is the photograph's, `width_mm` wide. These frames are like a
     piece of its middle, where there is less of it: by the square of the width.
     """
-    if look is None:
-        return Job.model_validate({"sequences": frames, "seed": seed})
-    job = reader.load_job(str(look), [f"sequences={frames}", f"seed={seed}"])
+    job = Job.model_validate({"sequences": frames, "seed": seed, **look})
+    if not look:
+        return job
     share = min(1.0, job.render.size[0] * MM_PER_PX / width_mm)
     sensor = job.sensor.model_copy(update={"vignette": job.sensor.vignette * share**2})
     return job.model_copy(update={"sensor": sensor})
