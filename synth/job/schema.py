@@ -72,8 +72,8 @@ class AnatomySection(Section):
     """Procedural block: radius of curvature of the brain surface [mm]."""
     gyrus_mm: Range[Positive] = (10.0, 15.0)
     """Procedural relief: spacing of the gyri [mm]."""
-    sulcus_mm: Range[NonNegative] = (0.6, 1.4)
-    """Procedural relief: depth of the sulci as seen from outside [mm]."""
+    sulcus_mm: Range[NonNegative] = (1.6, 2.8)
+    """Procedural relief: depth of the sulci below the crowns, as seen from outside [mm]."""
     vertices: Annotated[int, Field(ge=400, le=400_000)] = 40_000
     """Vertices of the fine surface that is loaded, moved and rendered. Not given: one for four pixels of the
     picture, at least 6000 and at most 40,000."""

@@ -115,9 +115,9 @@ class Renderer:
         self._coat = texture.cortex(
             surface,
             look,
-            texture.resolution(surface.extent_mm, camera.mm_per_px),
+            texture.resolution(surface.chart.extent_mm, camera.mm_per_px),
             job.appearance.photo,
-            rim.shade(self._rim, surface.extent_mm),
+            rim.shade(self._rim, surface),
         )
         hand = np.random.default_rng([look.rim_seed, 2])
         kinds = instrument.choose(gestures if job.render.tool else (), hand)
@@ -294,7 +294,7 @@ class Renderer:
 
     def _surroundings(self) -> reflection.Theatre:
         """What steel mirrors: the cortex with the rim around it, coarse, and the lamps."""
-        extent = self.surface.extent_mm
+        extent = self.surface.chart.extent_mm  # its plan to within the finish
         small = cv2.resize(self._coat.albedo, (_MIRRORED_PX, _MIRRORED_PX), interpolation=cv2.INTER_AREA)
         axis = noise.centres(_MIRRORED_PX, extent)
         inside = rim.inside(self._rim, *np.meshgrid(axis, axis))[..., None]

@@ -19,6 +19,7 @@ _SHAPING = (
     "zarr",
     "numba",
     "llvmlite",
+    "xatlas",
 )
 
 

@@ -255,10 +255,9 @@ def _threads(rim: Rim, angle: Map, away: Map) -> Map:
     return np.asarray(covered, np.float32)
 
 
-def shade(rim: Rim, extent_mm: float) -> Map:
-    """Share (512, 512) of light that reaches the surface's patch of that extent past the lip."""
-    axis = noise.centres(512, extent_mm)
-    x, y = np.meshgrid(axis, axis)
+def shade(rim: Rim, surface: CortexSurface) -> Map:
+    """Share (512, 512) of light that reaches the surface past the lip, over its chart."""
+    x, y = surface.chart.places(512).T.reshape(2, 512, 512)
     inside = np.maximum(_round(rim.edge, np.arctan2(y, x)) - _LIP_MM - np.hypot(x, y), 0)
     return np.asarray(1 - 0.35 * np.exp(-inside / 0.6) - 0.14 * np.exp(-inside / 2.0), np.float32)
 

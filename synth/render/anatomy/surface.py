@@ -6,7 +6,7 @@ what lies deeper is never seen.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -17,6 +17,7 @@ from synth.errors import UserError
 from synth.geometry.triangles import Shape, grid_faces
 from synth.job import schema
 from synth.render.anatomy import noise, tube, vessels
+from synth.render.anatomy.chart import Chart, unroll
 from synth.render.anatomy.tree import Tree
 from synth.render.anatomy.vessels import Vessels
 
@@ -29,6 +30,8 @@ LEAST_FILLED = 0.65
 """Share of the patch under which a user's brain must have surface."""
 _RELIEF_PX = 512
 _BULGE_PX = 1024
+_BED = 0.5  # of a sulcus's depth that a vein of 0.8 mm lies in wherever it runs
+_ROUND = 1.2  # 1: gyri are half waves; more: narrower clefts between flatter crowns
 
 
 @dataclass(frozen=True)
@@ -52,14 +55,17 @@ class CortexSurface:
     faces: npt.NDArray[np.int32]
     """(F, 3), counter-clockwise seen from outside."""
     uv: npt.NDArray[np.float32]
-    """(V, 2): world x, y over `extent_mm`, from 0 to 1."""
+    """(V, 2): place on the chart, from 0 to 1."""
     pia: Floats
     """(n, n) mm, height at the vertices without vessels; rows go with y, columns with x."""
     extent_mm: float
     """Side of the square patch."""
+    chart: Chart
+    """The square that sulci, vessels and every map lie on."""
     sulci: Map
     """(n, n) 0 on the crown of a gyrus to 1 in a sulcus."""
     vessels: Vessels
+    """Nodes in mm from the chart's middle."""
     seed: int
     """Seed of everything else that belongs to this anatomy."""
 
@@ -83,19 +89,32 @@ def grow(relief: Relief, anatomy: schema.AnatomySection, brain: Shape | None = N
     xy = np.stack([x.ravel(), y.ravel()], axis=1)
     if brain is None:
         sulci = _folds(relief, extent)
-        pia = _dome(xy, anatomy.dome_mm) - relief.sulcus_mm * noise.sample(sulci, xy, extent)
     else:
         outer, sulci = _under_opening(brain, relief, extent)
-        pia = noise.sample(outer, xy, extent).astype(np.float64)
     tree = vessels.grow_all(sulci, extent, np.random.default_rng([relief.seed, 1]))
-    z = pia + noise.sample(bulge(tree.veins, extent), xy, extent)
+    if brain is None:
+        sulci = np.maximum(sulci, _beds(tree.veins, extent))
+
+    def height(at: Floats) -> Floats:
+        if brain is not None:
+            return noise.sample(outer, at, extent).astype(np.float64)
+        return _dome(at, anatomy.dome_mm) - relief.sulcus_mm * noise.sample(sulci, at, extent)
+
+    pia = height(xy)
+    chart = unroll(height, extent, anatomy.craniotomy.radius_mm + MARGIN_MM / 2)
+    tree = vessels.Vessels(
+        **{name: replace(one, nodes=chart.at(one.nodes)) for name, one in vars(tree).items()}
+    )
+    laid = chart.at(xy)
+    z = pia + noise.sample(bulge(tree.veins, chart.extent_mm), laid, chart.extent_mm)
     return CortexSurface(
         vertices=np.concatenate([xy, z[:, None]], axis=1),
         faces=grid_faces(side, side).reshape(-1, 3),
         pia=pia.reshape(side, side),
-        uv=(xy / extent + 0.5).astype(np.float32),
+        uv=(laid / chart.extent_mm + 0.5).astype(np.float32),
         extent_mm=extent,
-        sulci=sulci,
+        chart=chart,
+        sulci=noise.sample(sulci, chart.places(_RELIEF_PX), extent).reshape(_RELIEF_PX, _RELIEF_PX),
         vessels=tree,
         seed=relief.seed,
     )
@@ -122,12 +141,20 @@ def _folds(relief: Relief, extent_mm: float) -> Map:
     # Zero lines of noise lie half a wavelength apart.
     waves = noise.band(rng, _RELIEF_PX, extent_mm, 2 * relief.gyrus_mm, 0.22)
     waves = waves + 0.12 * noise.band(rng, _RELIEF_PX, extent_mm, 0.7 * relief.gyrus_mm, 0.3)
-    pixel = extent_mm / _RELIEF_PX
-    slope = np.hypot(*np.gradient(waves, pixel))
-    away = np.abs(waves) / np.maximum(noise.blur(slope.astype(np.float32), 1.0, extent_mm), 1e-3)
-    valley = np.exp(-0.5 * (away / 0.9) ** 2) * 0.4 + np.exp(-0.5 * (away / 3.6) ** 2) * 0.6
-    fade = np.clip(0.5 + 0.45 * noise.band(rng, _RELIEF_PX, extent_mm, 1.6 * relief.gyrus_mm, 0.3), 0.25, 1.0)
-    return noise.blur((valley * fade).astype(np.float32), 0.25, extent_mm)
+    # Of a sine of that length these two have the same amplitude: |sin| is a row of cushions between clefts.
+    away = np.abs(waves)
+    slope = np.hypot(*np.gradient(waves, extent_mm / _RELIEF_PX)) * relief.gyrus_mm / np.pi
+    slope = noise.blur(slope.astype(np.float32), 0.5, extent_mm)
+    valley = (1 - away / np.maximum(np.hypot(away, slope), 1e-3)) ** _ROUND
+    fade = np.clip(0.85 + 0.2 * noise.band(rng, _RELIEF_PX, extent_mm, 1.6 * relief.gyrus_mm, 0.3), 0.5, 1.0)
+    return noise.blur((valley * fade).astype(np.float32), 0.4, extent_mm)
+
+
+def _beds(veins: Tree, extent_mm: float) -> Map:
+    """What wide veins press into a gyrus where they leave its clefts, (n, n) from 0 to 1 as the sulci."""
+    distance, radius = tube.raster(veins, _RELIEF_PX, extent_mm)
+    bed = _BED * np.clip(radius / 0.8, 0, 1) * np.exp(-((distance / 1.8) ** 2))
+    return noise.blur(bed.astype(np.float32), 0.3, extent_mm)
 
 
 def _under_opening(brain: Shape, relief: Relief, extent: float) -> tuple[Map, Map]:

@@ -23,7 +23,9 @@ Floats = npt.NDArray[np.float64]
 # Light lost in a millimetre of vessel, red, green, blue: blood seen through its wall, by eye on photographs.
 _ARTERIAL = np.array([0.4, 5.6, 7.6], np.float32)
 _TEXELS_A_PIXEL = 2.2
+_NARROW = 2  # power of the sulci's depth that is dark and wet: little is left a millimetre beside a cleft
 _BLEEDINGS = 3.5  # on a patch where the rim is soaked with blood
+_HAZE_MM = 0.8
 _CLIMB = 0.16  # of a vessel's radius, which the film climbs beside it
 _CLIMB_MM = 0.16  # over which that falls off
 
@@ -36,7 +38,7 @@ def resolution(extent_mm: float, mm_per_px: float) -> int:
 def cortex(
     surface: CortexSurface, look: Look, pixels: int, photo: Path | None, shade: Map | None = None
 ) -> Coat:
-    """Parenchyma, vessels and wet film over the surface's patch.
+    """Parenchyma, vessels and wet film over the surface's chart.
 
     Args:
         surface: the cortex.
@@ -48,13 +50,14 @@ def cortex(
     Raises:
         UserError: the photograph cannot be read.
     """
-    extent = surface.extent_mm
+    extent = surface.chart.extent_mm
     rng = np.random.default_rng([surface.seed, 2])
     tubes = {
         name: tube.raster(getattr(surface.vessels, name), pixels, extent)
         for name in ("veins", "arteries", "deep")
     }
-    sulci = cv2.resize(surface.sulci, (pixels, pixels), interpolation=cv2.INTER_LINEAR)
+    # Light and blood tell the clefts from the slopes above them.
+    sulci = cv2.resize(surface.sulci**_NARROW, (pixels, pixels), interpolation=cv2.INTER_LINEAR)
     albedo = _photograph(photo, pixels) if photo else _painted(rng, look, sulci, tubes, pixels, extent)
     if shade is not None:
         albedo = albedo * cv2.resize(shade, (pixels, pixels))[..., None] ** np.array(
@@ -134,17 +137,17 @@ def _blushed(look: Look, *maps: Map) -> Map:
     share, grain, sulci, beside, mottle, deep, strands, spots = maps
     albedo = np.asarray(look.crown, np.float32) * share + np.asarray(look.flush, np.float32) * (1 - share)
     albedo = albedo * (1 + look.grain * grain[..., None] * np.array([0.5, 1.0, 1.2], np.float32))
-    blush = look.blush * (0.04 + 0.3 * sulci) + (0.32 + 1.1 * sulci) * beside
+    blush = look.blush * (0.04 + 0.8 * sulci) + (0.32 + 1.1 * sulci) * beside
     blush = blush * np.clip(1 + 0.3 * mottle, 0.2, 2) + look.capillary * deep
     albedo = albedo * np.exp(-blush[..., None] * np.array([0.16, 1.0, 1.3], np.float32))
-    # Fluid stands in the clefts, and little light comes back out of them.
-    cleft = look.shade * (0.7 * sulci + 1.8 * np.clip(sulci - 0.5, 0, 1))
-    albedo = albedo * np.exp(-cleft[..., None] * np.array([0.5, 0.75, 0.62], np.float32))
-    # Over the deepest the fluid is grey, and the arachnoid a haze with whiter strands.
+    # Fluid stands in the clefts: over the deepest it is grey, and the arachnoid a haze with whiter strands.
     haze = np.clip(0.45 * np.clip((sulci - 0.45) / 0.4, 0, 1) + 0.35 * strands, 0, 0.7)[..., None]
     fluid = np.array(look.crown, np.float32) * np.array([0.50, 0.50, 0.72], np.float32)
     milk = fluid + strands[..., None] * (np.array([0.62, 0.52, 0.48], np.float32) - fluid)
     albedo = albedo + haze * look.shade * (milk - albedo)
+    # Little light comes back out of them.
+    cleft = look.shade * (2.4 * sulci + 1.8 * np.clip(sulci - 0.5, 0, 1))
+    albedo = albedo * np.exp(-cleft[..., None] * np.array([0.5, 0.75, 0.62], np.float32))
     return np.asarray(albedo * np.exp(-spots[..., None] * np.array([0.12, 1.5, 2.3], np.float32)))
 
 
@@ -194,8 +197,9 @@ def _vein_maps(rng: np.random.Generator, tube: tuple[Map, Map], extent: float) -
     thick = np.clip((radius - 0.12) / 0.3, 0, 1)
     along = cv2.resize(noise.band(rng, 256, extent, 9.0, 0.6), size)
     streak = cv2.resize(noise.fractal(rng, 1024, extent, 1.5, 1.0), size)
-    cover = noise.blur(np.clip((1 - across**2) * 2.2, 0, 1).astype(np.float32), 0.05, extent)
-    halo = noise.blur(((across < 1) * thick).astype(np.float32), 0.45, extent)
+    cover = noise.blur(np.clip((1 - across**2) * (2.2 - thick), 0, 1).astype(np.float32), 0.05, extent)
+    # The light that a vein takes is missed in the haze over its cleft, for about a millimetre.
+    halo = noise.blur(((across < 1) * thick).astype(np.float32), _HAZE_MM, extent)
     # Not every stretch lies on the surface: some shimmer through the arachnoid.
     depth = cv2.resize(noise.band(rng, 256, extent, 7.0, 0.6), size)
     return [across, thick, along, streak, cover, halo, depth]
@@ -212,7 +216,7 @@ def _veined(look: Look, albedo: Map, *maps: Map) -> Map:
     thin = np.array([0.50, 0.13, 0.15], np.float32) + 0.06 * along[..., None]
     wine = np.asarray(look.wine, np.float32) * thick[..., None] + thin * (1 - thick[..., None])
     wall = np.asarray(look.vein, np.float32) * slate + wine * (1 - slate)
-    soft = albedo * np.exp(-0.8 * halo[..., None] * np.array([0.45, 1.0, 0.75], np.float32))
+    soft = albedo * np.exp(-1.7 * halo[..., None] * np.array([0.45, 1.0, 0.75], np.float32))
     cover = cover[..., None] * np.clip(0.9 + 0.15 * depth, 0.5, 0.97)[..., None]
     return np.asarray(soft * (1 - cover) + wall * cover, np.float32)
 
@@ -241,13 +245,12 @@ def _film(
     blood = thickness(tubes["arteries"]) + thickness(tubes["veins"])
     beside = noise.blur(cv2.resize(blood, (coarse, coarse), interpolation=cv2.INTER_AREA), 0.25, extent)
     wet = 0.9 * cv2.resize(sulci, (coarse, coarse)) + 3.2 * np.minimum(beside, 0.25) + 1.6 * look.light.glare
-    dry = np.clip(1.5 + 0.5 * pools - wet, 0.05, 1.0)
+    dry = np.clip(2.1 + 0.8 * pools - wet, 0.05, 1.0)
     swell = fine(noise.band(rng, coarse, extent, 2.2, 0.5) * 0.004)
-    rough = fine(noise.band(rng, coarse, extent, 0.6, 0.5) * 0.0008)
     # The wall of a vein is taut and smooth: its crest mirrors the lamp in one line.
     distance, radius = tubes["veins"]
     on_vein = noise.blur((distance < radius).astype(np.float32), 0.1, extent)
-    height = relief + look.bump * (1 - 0.9 * on_vein) * (swell + fine(dry) * rough)
+    height = relief + look.bump * (1 - 0.9 * on_vein) * swell
     bare = dry * (1 - cv2.resize(on_vein, (coarse, coarse), interpolation=cv2.INTER_AREA))
     return np.asarray(height, np.float32), np.asarray(np.clip(bare, 0, 1), np.float32)
 

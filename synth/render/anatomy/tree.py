@@ -127,7 +127,7 @@ def taper(nodes: Floats, parent: Ints, length: float) -> Floats:
     for node in range(len(up) - 1, -1, -1):
         if up[node] >= 0:
             left[up[node]] = max(left[up[node]], left[node] + segment[node])
-    return np.asarray(0.4 + 0.6 * np.clip(np.asarray(left) / length, 0, 1))
+    return np.asarray(0.45 + 0.55 * np.clip(np.asarray(left) / length, 0, 1))
 
 
 def pruned(nodes: Floats, parent: Ints, fixed: int, shortest: int) -> tuple[Floats, Ints]:

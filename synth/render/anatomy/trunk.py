@@ -27,6 +27,7 @@ def trunks(
     *,
     smooth: int,
     wiggle: float,
+    settle: float = 0.0,
 ) -> tuple[tuple[Floats, Ints], Floats]:
     """Paths across the square along the sulci, as nodes with parents, and the trunk radius of each node.
 
@@ -40,9 +41,12 @@ def trunks(
         radius: between which a trunk's own radius is drawn [mm].
         smooth: rounds of smoothing; thick vessels bend in wider curves.
         wiggle: share of short bends in the path.
+        settle: mm by which a round of smoothing also draws the path into the cleft beside it.
     """
     side = 72
     depth = cv2.resize(sulci, (side, side), interpolation=cv2.INTER_AREA)
+    across, along = np.gradient(noise.blur(depth, 0.5, extent_mm), extent_mm / side)
+    downhill = np.dstack([along, across]).astype(np.float32)
     nodes, parents, radii = np.zeros((0, 2)), np.zeros(0, np.int64), np.zeros(0)
     taken = np.zeros((side, side), np.float32)
     for trunk in range(max(1, count)):
@@ -57,7 +61,9 @@ def trunks(
         pixel = np.rint((line / extent_mm + 0.5) * side - 0.5).astype(int)
         taken[pixel[:, 1], pixel[:, 0]] = 1.0
         taken = np.maximum(taken, cv2.GaussianBlur(taken, (0, 0), 1.5))
-        line = _resampled(_smoothed(line, smooth), 0.18)
+        for _ in range(smooth):
+            line = _smoothed(line + settle * noise.sample(downhill, line, extent_mm))
+        line = _resampled(line, 0.18)
         line = line + meander(rng, line, extent_mm, 0.55, wiggle)
         own = rng.uniform(*radius)
         if root >= 0:
@@ -132,10 +138,8 @@ def _cheapest(cost: Floats, start: tuple[int, int], end: tuple[int, int]) -> Flo
     return np.array([(p % side, p // side) for p in reversed(path)], dtype=np.float64)
 
 
-def _smoothed(line: Floats, rounds: int) -> Floats:
-    for _ in range(rounds):
-        line = np.concatenate([line[:1], 0.25 * line[:-2] + 0.5 * line[1:-1] + 0.25 * line[2:], line[-1:]])
-    return line
+def _smoothed(line: Floats) -> Floats:
+    return np.concatenate([line[:1], 0.25 * line[:-2] + 0.5 * line[1:-1] + 0.25 * line[2:], line[-1:]])
 
 
 def _resampled(line: Floats, spacing: float) -> Floats:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from synth.render.anatomy import noise, trunk
+from synth.render.anatomy import noise, trunk, tube
 from synth.render.anatomy.tree import Tree, grow, murray, pruned, relaxed, scattered, taper
 
 Floats = npt.NDArray[np.float64]
@@ -36,23 +36,26 @@ def grow_all(sulci: Map, extent_mm: float, rng: np.random.Generator) -> Vessels:
         rng: where the anatomy comes from.
     """
     many = extent_mm / 34.0
+    count = round(many * rng.integers(1, 4))
     trunks, radius = trunk.trunks(
-        sulci, extent_mm, rng, round(many * rng.integers(1, 4)), (0.55, 1.2), smooth=60, wiggle=0.0
+        sulci, extent_mm, rng, count, (0.55, 1.2), smooth=60, wiggle=0.0, settle=0.1
     )
     veins = _tree(extent_mm, rng, trunks, radius, spacings=(9.0, 5.5), leaf=0.1, wander=0.3)
     trunks, radius = trunk.trunks(
         sulci, extent_mm, rng, round(many * rng.integers(4, 7)), (0.2, 0.4), smooth=40, wiggle=0.12
     )
-    # No gyrus has as dense a web as the next.
+    # No gyrus has as dense a web as the next, and a wide vein has none.
     rich = 0.9 + 0.35 * noise.band(rng, 128, extent_mm, 9.0, 0.5)
-    rich = np.clip(rich, 0.3, 1.0).astype(np.float32)
+    distance, width = tube.raster(veins, 128, extent_mm)
+    rich = np.clip(rich, 0.3, 1.0) * ((distance > width + 0.3) | (width < 0.3))
+    rich = np.asarray(rich, np.float32)
     arteries = _tree(
         extent_mm,
         rng,
         trunks,
         radius,
         spacings=(5.2, 2.6, 1.3, 0.7, 0.46),
-        leaf=0.036,
+        leaf=0.042,
         wander=0.25,
         density=rich,
         winding=0.1,
@@ -97,9 +100,10 @@ def _tree(
         nodes, parent = pruned(nodes, parent, grown, shortest=int(0.55 * spacing / step))
     nodes = relaxed(nodes, parent, fixed, rounds=12)
     nodes = nodes + trunk.meander(rng, nodes, extent_mm, 0.3, 0.22)
-    radius = murray(parent, leaf) * taper(nodes, parent, 0.6)
+    radius = murray(parent, leaf) * taper(nodes, parent, 1.6)
     radius[:fixed] = np.maximum(np.minimum(radius[:fixed], 1.3 * own), own)
-    radius[fixed:] = np.minimum(radius[fixed:], 0.8 * own.max())
+    swell = 1 + 0.15 * noise.sample(noise.band(rng, 256, extent_mm, 2.0, 0.5), nodes[fixed:], extent_mm)
+    radius[fixed:] = np.minimum(radius[fixed:] * np.clip(swell, 0.6, 1.4), 0.8 * own.max())
     if winding:
         nodes = nodes + _wound(rng, nodes, radius, extent_mm, winding)
     return Tree(nodes, parent, radius)

@@ -1,0 +1,95 @@
+"""The square that maps are painted over: an opening's plan, or its surface unrolled where that is steep."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import xatlas
+from scipy.ndimage import distance_transform_edt
+
+from synth.geometry.triangles import grid_faces
+from synth.render.anatomy import noise
+
+Floats = npt.NDArray[np.float64]
+Map = npt.NDArray[np.float32]
+
+_COARSE = 48  # side of the grid that is unrolled, in a quarter of a CPU-second; 72 takes one
+_STEEP = 1.2  # stretch that a plan may have at 1% of the opening
+_TURNS = 24
+
+
+@dataclass(frozen=True, eq=False)
+class Chart:
+    """Where on the square each place of a patch lies; it is as large as the surface there."""
+
+    shift: Map
+    """(n, n, 2) mm from the plan's x, y; rows go with y, columns with x."""
+    plan_mm: float
+    """Side of the patch."""
+    extent_mm: float
+    """Side of the square."""
+
+    def at(self, xy: Floats) -> Floats:
+        """Where world x, y (N, 2) mm lie, mm from the square's middle."""
+        return np.asarray(xy + noise.sample(self.shift, xy, self.plan_mm))
+
+    def places(self, pixels: int) -> Floats:
+        """World x, y (pixels^2, 2) mm of a map's pixels, row by row."""
+        axis = noise.centres(pixels, self.extent_mm)
+        laid = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2).astype(np.float64)
+        xy = laid
+        for _ in range(_TURNS):  # a contraction, unless it stretches by more than 2.3
+            xy = xy + 0.6 * (laid - self.at(xy))
+        return xy
+
+
+def unroll(height: Callable[[Floats], Floats], plan_mm: float, radius_mm: float) -> Chart:
+    """A chart of the disc of a radius round the middle; beyond it goes on as at the disc's edge.
+
+    Where that disc's plan stretches by little it stays the chart. Else least-squares conformal coordinates
+    (B. Levy et al., Least squares conformal maps for automatic texture atlas generation, 2002) of xatlas.
+
+    Args:
+        height: (N,) mm of the surface at x, y (N, 2) mm.
+        plan_mm: side of the patch.
+        radius_mm: of the disc.
+    """
+    axis = noise.centres(_COARSE, plan_mm).astype(np.float64)
+    plan = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
+    vertices = np.column_stack([plan, height(plan)])
+    inside = np.hypot(*plan.T) < radius_mm
+    slope = np.hypot(*np.gradient(vertices[:, 2].reshape(_COARSE, _COARSE), plan_mm / _COARSE)).ravel()
+    shift = np.zeros((_COARSE, _COARSE, 2), np.float32)
+    if np.quantile(np.hypot(1, slope[inside]), 0.99) <= _STEEP:
+        return Chart(shift, plan_mm, plan_mm)
+    faces = grid_faces(_COARSE, _COARSE).reshape(-1, 3)
+    faces = faces[inside[faces].all(axis=1)]
+    atlas, options = xatlas.Atlas(), xatlas.ChartOptions()
+    options.max_cost, options.normal_deviation_weight = 1e9, 0.0  # one piece, however bent
+    atlas.add_mesh(vertices.astype(np.float32), faces.astype(np.uint32))
+    atlas.generate(chart_options=options)
+    which, corners, flat = atlas[0]
+    if atlas.chart_count != 1:
+        return Chart(shift, plan_mm, plan_mm)
+    # Turned and moved to where the plan is, and as large as the surface: complex numbers do both at once.
+    laid = flat.astype(np.float64) @ [atlas.width, 1j * atlas.height]
+    below = plan[which] @ [1, 1j]
+    turn = np.vdot(laid - laid.mean(), below - below.mean())
+    size = np.sqrt(_area(vertices[which][corners]) / _area(np.stack([laid.real, laid.imag], -1)[corners]))
+    moved = below.mean() + size * turn / np.abs(turn) * (laid - laid.mean()) - below
+    unknown = np.ones(len(vertices), bool)
+    unknown[which] = False
+    shift.reshape(-1, 2)[which] = np.stack([moved.real, moved.imag], axis=-1)
+    nearest = distance_transform_edt(
+        unknown.reshape(_COARSE, _COARSE), return_distances=False, return_indices=True
+    )
+    return Chart(shift[tuple(nearest)], plan_mm, plan_mm + 2 * float(np.abs(shift).max()))
+
+
+def _area(corners: Floats) -> float:
+    """Of triangles (F, 3, 2 or 3)."""
+    sides = corners[:, 1:] - corners[:, :1]
+    return float(np.sqrt(np.linalg.det(sides @ sides.swapaxes(1, 2))).sum() / 2)
