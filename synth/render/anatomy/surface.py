@@ -124,7 +124,7 @@ def bulge(tree: Tree, extent_mm: float) -> Map:
     """Height of vessels above the pia, (n, n) mm: half sunk round tubes with soft shoulders."""
     distance, radius = tube.raster(tree, _BULGE_PX, extent_mm)
     inside = np.sqrt(np.maximum(radius**2 - distance**2, 0)) * 0.75
-    return noise.blur(inside.astype(np.float32), 0.14, extent_mm)
+    return noise.blur(inside.astype(np.float32), 0.2, extent_mm)
 
 
 def _extent(anatomy: schema.AnatomySection) -> float:

@@ -245,7 +245,7 @@ def _film(
     blood = thickness(tubes["arteries"]) + thickness(tubes["veins"])
     beside = noise.blur(cv2.resize(blood, (coarse, coarse), interpolation=cv2.INTER_AREA), 0.25, extent)
     wet = 0.9 * cv2.resize(sulci, (coarse, coarse)) + 3.2 * np.minimum(beside, 0.25) + 1.6 * look.light.glare
-    dry = np.clip(2.1 + 0.8 * pools - wet, 0.05, 1.0)
+    dry = np.clip(3.8 + 1.5 * pools - 3 * wet, 0.05, 1.0)
     swell = fine(noise.band(rng, coarse, extent, 2.2, 0.5) * 0.004)
     # The wall of a vein is taut and smooth: its crest mirrors the lamp in one line.
     distance, radius = tubes["veins"]
