@@ -1,4 +1,4 @@
-"""Noise and recovered flow against cost, over light paths, sampler, integrator, vertices and size; what a
+"""Noise and recovered flow against cost, over light paths, integrator, vertices and size; what a
 whole frame takes.
 
 Run: python -m evidence.render.pareto
@@ -29,11 +29,10 @@ _LIFT = 1.5
 _STAGE = signature(Renderer.stage).parameters
 _DEFAULT = (
     RenderSection().spp,
-    _STAGE["sampler"].default,
     _STAGE["integrator"].default,
     RenderSection().size[0],
 )
-_SAMPLERS, _INTEGRATORS = ("multijitter", "ldsampler", "independent"), ("direct", "path3")
+_INTEGRATORS = ("direct", "path3")
 
 
 def main(
@@ -53,32 +52,31 @@ def main(
     for wide in (int(part) for part in width.split(",")):
         sections: dict[str, Any] = {"seed": seed, "render": {"size": (wide, wide * 3 // 4)}}
         ours = case(Job.model_validate(sections), 0)
-        settings = list(product((int(part) for part in spp.split(",")), _SAMPLERS[:1], _INTEGRATORS[:1]))
-        settings += [(_DEFAULT[0], sampler, _INTEGRATORS[0]) for sampler in _SAMPLERS[1:]]
-        settings += [(_DEFAULT[0], _SAMPLERS[0], kind) for kind in _INTEGRATORS[1:]]
-        for paths, sampler, kind in settings:
-            row = {"spp": paths, "sampler": sampler, "integrator": kind, "width": wide}
-            row["default"] = (paths, sampler, kind, wide) == _DEFAULT
-            rows.append(row | {"vertices": len(ours.vertices)} | measure(ours, paths, sampler, kind))
+        settings = list(product((int(part) for part in spp.split(",")), _INTEGRATORS[:1]))
+        settings += [(_DEFAULT[0], kind) for kind in _INTEGRATORS[1:]]
+        for paths, kind in settings:
+            row = {"spp": paths, "integrator": kind, "width": wide}
+            row["default"] = (paths, kind, wide) == _DEFAULT
+            rows.append(row | {"vertices": len(ours.vertices)} | measure(ours, paths, kind))
         for count in (int(part) for part in vertices.split(",")):
             other = case(Job.model_validate(sections | {"anatomy": {"vertices": count}}), 0)
-            row = dict(zip(("spp", "sampler", "integrator", "width"), (*_DEFAULT[:3], wide), strict=True))
+            row = dict(zip(("spp", "integrator", "width"), (*_DEFAULT[:2], wide), strict=True))
             row |= {"default": False, "vertices": len(other.vertices)}
-            rows.append(row | measure(other, *_DEFAULT[:3]))
+            rows.append(row | measure(other, *_DEFAULT[:2]))
     cost = frame_cost(case(Job(seed=seed), 0), frames)
     found = {"seed": seed, "lift_mm": _LIFT, "rows": rows, "frame": cost}
     report.save(out, "pareto.json", found, page(found))
     report.show(found)
 
 
-def measure(ours: Case, spp: int, sampler: str, kind: str) -> dict[str, float]:
+def measure(ours: Case, spp: int, kind: str) -> dict[str, float]:
     """Seconds of CPU a picture, its noise, and what DIS flow makes of a pull of 1.5 mm.
 
     Noise is that of two pictures over tissue (`noises`). Flow error is against the truth, over
     visible tissue away from the instrument.
     """
     renderer = ours.renderer
-    stage = renderer.stage(ours.state(), spp=spp, integrator=kind, sampler=sampler)
+    stage = renderer.stage(ours.state(), spp=spp, integrator=kind)
     stage.render(0)
     spent, pictures = [], []
     for seed, lift in ((1, 0.0), (2, 0.0), (3, _LIFT)):
@@ -126,7 +124,7 @@ def frame_cost(ours: Case, frames: int) -> dict[str, float]:
 
 
 def _curve_of(row: Mapping[str, Any]) -> tuple[Any, ...]:
-    return row["width"], row["sampler"], row["integrator"], row["vertices"]
+    return row["width"], row["integrator"], row["vertices"]
 
 
 def page(found: Mapping[str, Any]) -> report.Page:
@@ -142,7 +140,7 @@ def page(found: Mapping[str, Any]) -> report.Page:
             own = [r for r in found["rows"] if _curve_of(r) == kind]
             curves.append(
                 report.Curve(
-                    f"{kind[1]}, {kind[2]}, {kind[0]} px, {kind[3]} vertices",
+                    f"{kind[1]}, {kind[0]} px, {kind[2]} vertices",
                     tuple(float(r["cpu_s"]) for r in own),
                     tuple(float(r[key]) for r in own),
                     tuple(f"{r['spp']} spp" for r in own),

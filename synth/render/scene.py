@@ -206,15 +206,9 @@ class Renderer:
         """Traction (V, 3) kPa, world axes, at rest pixels: (H, W, 3) kPa, camera axes; 0 off tissue."""
         return truth.at_rest_pixels(self.rest, self.surface.faces, nodal @ self.camera.rotation.T)
 
-    def stage(
-        self,
-        state: SceneState,
-        spp: int,
-        integrator: str = "direct",
-        sampler: str = "multijitter",
-    ) -> Stage:
+    def stage(self, state: SceneState, spp: int, integrator: str = "direct") -> Stage:
         """A Mitsuba stage of a state, with bodies `cortex`, `rim` and `tool`."""
-        return Stage(self.variant, self.camera, self._bodies(state), self.lamps, spp, integrator, sampler)
+        return Stage(self.variant, self.camera, self._bodies(state), self.lamps, spp, integrator)
 
     def move(self, stage: Stage, state: SceneState) -> None:
         """Puts everything in a stage where it is in another state."""

@@ -1,6 +1,6 @@
 """A stage of meshes, lamps and a camera in Mitsuba; vertices are moved in place.
 
-With its lens (`mitsuba_lens`) the only file that knows Mitsuba. The variant is chosen on first use and its
+With its lens the only room that knows Mitsuba. The variant is chosen on first use and its
 LLVM found by `synth.system.llvm`: a wrong one ends the process.
 """
 
@@ -22,6 +22,8 @@ import numpy.typing as npt
 from synth.errors import UserError
 from synth.geometry.triangles import Shape, normals
 from synth.render.camera.camera import Camera
+from synth.render.mitsuba.direct_light import trace
+from synth.render.mitsuba.edge_filter import soften
 from synth.render.mitsuba.glow import register_glow
 from synth.render.mitsuba.lens import Compiled, Scalar
 from synth.system import cache, gpu, llvm
@@ -132,7 +134,6 @@ class Stage:
         lamps: list[Lamp],
         spp: int,
         integrator: str = "direct",
-        sampler: str = "multijitter",
     ) -> None:
         import mitsuba as mi
 
@@ -154,7 +155,12 @@ class Stage:
             scene[f"lamp{index}"] = _lamp(mi, lamp)
         for name, body in bodies.items():
             scene[name] = _mesh(mi, name, body)
-        self._lens = (Compiled if self._jit else Scalar)(camera, spp, sampler)
+        self._lens = (Compiled if self._jit else Scalar)(camera, spp)
+        self._layered, self._size = self._jit and integrator == "direct", camera.size
+        # Of each lamp where its axis ends, in green.
+        self._power = sum(
+            float(lamp.intensity[1] / ((lamp.position - lamp.target) ** 2).sum()) for lamp in lamps
+        )
         self._scene = mi.load_dict(scene)
         self._parameters = mi.traverse(self._scene)
 
@@ -181,8 +187,12 @@ class Stage:
         if camera is not None:
             self._lens.place(camera)
         lens = self._lens
-        image = self._mi.render(self._scene, sensor=lens.sensor, spp=lens.spp, seed=seed)
-        radiance = lens.develop(np.array(image, dtype=np.float32)[..., :3])
+        if self._layered:
+            light = trace(self._scene, lens.sensor, self._size, "tool", lens.spp, seed)
+            radiance = soften(light, self._power, lens.spp)
+        else:
+            image = self._mi.render(self._scene, sensor=lens.sensor, spp=lens.spp, seed=seed)
+            radiance = lens.develop(np.array(image, dtype=np.float32)[..., :3])
         if self.variant.startswith("llvm"):
             # What one frame needs is not kept for the next: asking again is free here, on a GPU it isn't.
             import drjit as dr
@@ -244,7 +254,7 @@ def _lamp(mi: Any, lamp: Lamp) -> dict[str, Any]:
         "light": {
             "type": "area",
             "radiance": {"type": "rgb", "value": radiance.tolist()},
-            # Each has half of a multijittered pixel's strata, and the choice makes no noise.
+            # Each has half of a pixel's strata, and the choice makes no noise.
             "sampling_weight": 1.0,
         },
     }

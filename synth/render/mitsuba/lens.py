@@ -23,7 +23,7 @@ Map = npt.NDArray[np.float32]
 class Compiled:
     """The exact lens, for variants that compile it."""
 
-    def __init__(self, camera: Camera, spp: int, sampler: str) -> None:
+    def __init__(self, camera: Camera, spp: int) -> None:
         import mitsuba as mi
 
         _register(mi.variant())
@@ -34,7 +34,7 @@ class Compiled:
             {
                 "type": "sulcus_lens",
                 "film": _film(*camera.size),
-                "sampler": {"type": sampler, "sample_count": spp},
+                "sampler": {"type": "multijitter", "sample_count": spp},
                 **{"aperture": camera.aperture_mm, "focus": camera.focus_mm, "fx": fx, "fy": fy},
                 **dict(zip(names, camera.distortion.tolist(), strict=True)),
             }
@@ -53,10 +53,9 @@ class Compiled:
 class Scalar:
     """Mitsuba's thin lens on a larger, finer film, and the warp to the recorded picture."""
 
-    def __init__(self, camera: Camera, spp: int, sampler: str) -> None:
+    def __init__(self, camera: Camera, spp: int) -> None:
         self._fine = 2 if spp >= 4 else 1
         self.spp = max(1, spp // self._fine**2)
-        self._sampler = sampler
         self._fit(camera)
         self.place(camera)
 
@@ -97,7 +96,7 @@ class Scalar:
                 "far_clip": 1e4,
                 "to_world": mi.ScalarTransform4f(to_world.tolist()),
                 "film": _film(self._width, self._height),
-                "sampler": {"type": self._sampler, "sample_count": self.spp},
+                "sampler": {"type": "multijitter", "sample_count": self.spp},
                 **(
                     {"aperture_radius": camera.aperture_mm, "focus_distance": camera.focus_mm}
                     if camera.aperture_mm > 0

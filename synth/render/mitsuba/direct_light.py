@@ -1,0 +1,111 @@
+"""Light that comes straight from lamps, kept apart by what makes grain: what is out of focus, and shadow.
+
+Lamps are small: what a surface scatters towards by itself hardly ever meets one, so a path asks for one lamp.
+Where paths pierce pixel, lens and lamps are (0, 2)-sequences in Morton order of the pixels, shuffled anew for
+every seed: not only a pixel's four, but the sixteen of four neighbours, are spread over the whole lens.
+A. G. M. Ahmed, P. Wonka, "Screen-space blue-noise diffusion of Monte Carlo sampling error via hierarchical
+ordering of pixels", 2020; B. Burley, "Practical hash-based Owen scrambling", 2020.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+Map = npt.NDArray[np.float32]
+
+_BLURRED_PX = 0.75  # circle of confusion (radius) from which on steel nearer than the focus is apart
+_AT_ONCE = 256  # paths a pixel: more would be more than 32 bits count
+_HALVES = ((16, 0x0000FFFF), (8, 0x00FF00FF), (4, 0x0F0F0F0F), (2, 0x33333333), (1, 0x55555555))
+
+
+class Light(NamedTuple):
+    """Means over each pixel's paths."""
+
+    radiance: Map
+    """(3, H, W)."""
+    near: Map
+    """(3, H, W) the part of it from steel that is nearer than the focus, and out of it."""
+    cover: Map
+    """(H, W) share of the paths that end there."""
+    blocked: Map
+    """(3, H, W) radiance that shadow took from the others."""
+    shade: Map
+    """(H, W) irradiance that it took from them."""
+
+
+def trace(scene: Any, lens: Any, size: tuple[int, int], steel: str, spp: int, seed: int) -> Light:
+    """Light of a compiled scene in a `sulcus_lens` over a picture of a size (width, height) px.
+
+    `steel`: id of the mesh, if it is there, that is apart where it is out of focus.
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    width, height = size
+    # Numbers as data: one that stands in the code would compile it anew.
+    seeds = [dr.opaque(mi.UInt32, int(word)) for word in np.random.SeedSequence(seed).generate_state(9)]
+    # A path's index in the sequences has its number within the pixel last; its bits, in reverse, first.
+    shift = dr.opaque(mi.UInt32, int(np.ceil(np.log2(spp))))
+    found = [mi.ShapePtr(shape) for shape in scene.shapes() if shape.id() == steel]
+    number = dr.opaque(mi.UInt32, int(np.array(dr.reinterpret_array(mi.UInt32, found[0]))[0]) if found else 0)
+    sums = [dr.zeros(mi.Float, width * height) for _ in range(11)]
+    for first in range(0, spp, _AT_ONCE):
+        _add_paths(scene, lens, size, (first, min(spp - first, _AT_ONCE)), (shift, seeds, number), sums)
+    means = np.stack([np.array(total) for total in sums]).reshape(-1, height, width) * np.float32(1 / spp)
+    return Light(means[:3], means[3:6], means[6], means[7:10], means[10])
+
+
+def _add_paths(
+    scene: Any, lens: Any, size: tuple[int, int], which: tuple[int, int], order: Any, sums: Any
+) -> None:
+    """Adds what `which` (first, how many) of each pixel's paths bring to sums over each pixel."""
+    import drjit as dr
+    import mitsuba as mi
+
+    width, height = size
+    first, paths = (dr.opaque(mi.UInt32, number) for number in which)
+    shift, seeds, steel = order
+    path = dr.arange(mi.UInt32, width * height * which[1])
+    pixel = path // paths
+    x, y = pixel % width, pixel // width
+    index = dr.brev(((_spread(x) | (_spread(y) << 1)) << shift) | (first + path - pixel * paths))
+    inside, aperture, window = (_pair(index, seeds[3 * n : 3 * n + 3]) for n in range(3))
+    place = mi.Point2f((x + inside.x) / width, (y + inside.y) / height)
+    ray, _ = lens.sample_ray_differential(0.0, 0.0, place, aperture)
+    si = scene.ray_intersect(ray, mi.RayFlags.All, True)
+    hit = si.is_valid()
+    lamp, weight = scene.sample_emitter_direction(si, window, False, hit)
+    scattered = weight * si.bsdf(ray).eval(mi.BSDFContext(), si, si.to_local(lamp.d), hit)
+    shadow = hit & scene.ray_test(si.spawn_ray_to(lamp.p), hit)
+    radiance = si.emitter(scene).eval(si) + dr.select(shadow, 0, scattered)
+    depth = dr.dot(si.p - lens.centre, lens.rows[2])
+    blur = lens.v["fx"] * lens.v["aperture"] * (dr.rcp(depth) - dr.rcp(lens.v["focus"]))
+    near = hit & (blur > _BLURRED_PX) & (dr.reinterpret_array(mi.UInt32, si.shape) == steel)
+    parts = [(hit, (*radiance,)), (near, (*radiance, mi.Float(1))), (shadow & ~near, (*scattered, weight.y))]
+    for total, (where, value) in zip(sums, [(w, v) for w, vs in parts for v in vs], strict=True):
+        dr.scatter_add(total, value, pixel, where)
+    dr.eval(sums)
+
+
+def _pair(index: Any, seeds: list[Any]) -> Any:
+    """Points of a (0, 2)-sequence in the unit square, of indices with their bits in reverse, shuffled."""
+    import mitsuba as mi
+
+    index = index + seeds[0]
+    for factor in (0x6C50B47C, 0xB82F1E52, 0xC7AFE638, 0x8D22F6E6):  # S. Laine, T. Karras, 2011
+        index = index ^ (index * factor)
+    second = index
+    for step, mask in _HALVES:  # Pascal's triangle modulo 2: Sobol's second dimension
+        second = second ^ ((second & mask) << step)
+    one, other = ((word ^ seed) >> 8 for word, seed in zip((index, second), seeds[1:], strict=True))
+    return mi.Point2f(mi.Float(one), mi.Float(other)) * 2.0**-24
+
+
+def _spread(x: Any) -> Any:
+    """The lower sixteen bits of a number, with a zero between any two."""
+    for step, mask in _HALVES[1:]:
+        x = (x | (x << step)) & mask
+    return x
