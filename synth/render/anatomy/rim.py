@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import cv2
 import numpy as np
@@ -28,7 +29,7 @@ _LIP_MM = 0.5  # how far the cut edge reaches over the brain
 _LAID_MM = (-3.0, -1.5, -1.2, -0.95, -0.7, -0.3)
 _PATTY_MM = 0.55  # thickness of a cotton patty
 _THREAD_MM = 0.075  # half width of a stitch's thread
-_BONE_MM = 2.0  # how far the bone's cut edge stands above the dura
+_GUTTER_MM, _STEPS_MM = 1.3, (1.5, 0.8)  # height of the wound's floor, and of each step of its wall
 
 
 @dataclass(frozen=True)
@@ -58,8 +59,11 @@ class Rim:
     """What the maps show of it; the patties over the opening's edge take theirs from one in the middle."""
     stitches: Floats
     """(n,) rad: where threads hold the dura."""
-    flap: Floats
-    """(A,) mm beyond the edge where bone begins; empty: there is none in view."""
+    dura: Floats
+    """(A,) mm beyond the edge where the folded dura ends, and the gutter behind it begins."""
+    wall: Floats
+    """(A,) mm beyond the edge where the wound's wall rises, to bone or muscle."""
+    bone: bool
     cloth: Floats
     """(A,) mm beyond the edge where drapes begin; empty: there are none in view."""
 
@@ -71,34 +75,38 @@ def build(surface: CortexSurface, radius_mm: float, look: Look, mm_per_px: float
     rings = round(_OUT * around / _AROUND)
     angle = np.linspace(0, 2 * np.pi, around, endpoint=False)
     edge = radius_mm * _outline(rng, angle)
-    out = _WIDTH_MM * np.linspace(0, 1, rings) ** 1.6
+    out = _WIDTH_MM * (0.4 * np.linspace(0, 1, rings) + 0.6 * np.linspace(0, 1, rings) ** 3)
     # The cut edge rises out of the brain's surface towards the lens, rounds, and goes on outwards.
     away = np.concatenate([-_LIP_MM * np.array([1.0, 0.96, 0.72, 0.44, 0.2, 0.04]), out + 0.12])
-    up = np.concatenate(
-        [[-1.8, -0.12, 0.10, 0.26, 0.38, 0.46], 0.5 + 1.5 * (1 - np.exp(-out / 3.5)) + 0.05 * out]
-    )
-    radius = edge[:, None] + away[None]
+    up = np.concatenate([[-1.8, -0.12, 0.10, 0.26, 0.38, 0.46], 0.5 + 0.05 * out])
+    away = np.broadcast_to(away, (around, len(away)))
+    radius = edge[:, None] + away
     xy = np.stack([radius * np.cos(angle)[:, None], radius * np.sin(angle)[:, None]], axis=-1)
     extent = 2 * (radius_mm * 1.25 + _WIDTH_MM)
-    folds = 0.28 * noise.band(rng, 256, extent, 6.5, 0.5) + 0.05 * noise.band(rng, 256, extent, 1.8, 0.5)
-    height = _under(surface, xy.reshape(-1, 2)).reshape(radius.shape)
-    lift = np.clip(away - 0.1, 0, 3.0) / 3.0
-    z = height + up[None] + lift * noise.sample(folds, xy.reshape(-1, 2), extent).reshape(radius.shape)
+    folds = 0.2 * noise.band(rng, 256, extent, 6.5, 0.5) + 0.05 * noise.band(rng, 256, extent, 1.8, 0.5)
+    flat = xy.reshape(-1, 2)
+    z = _under(surface, flat).reshape(radius.shape) + up
+    z += np.clip(away - 0.1, 0, 3.0) / 3.0 * noise.sample(folds, flat, extent).reshape(radius.shape)
     patty = _patty(rng, edge) if look.cottonoid else None
-    held = scenery.stitches(edge, rng)
-    if look.family == "calf":  # on the bench nobody sews
-        held = held[:0]
-    z = z + _folded(angle[:, None], away[None], edge, held, rng)
-    flap = _ragged(rng, angle, 2.9, 0.35) if "bone" in look.scenery else np.zeros(0)
-    cloth = _ragged(rng, angle, 7.2, 0.8) if "drape" in look.scenery else np.zeros(0)
-    z = z + _raised(away[None], flap, cloth, noise.band(rng, 128, extent, 7.0, 0.5), xy, extent)
+    held = scenery.stitches(edge, rng)[: 0 if look.family == "calf" else None]  # on the bench nobody sews
+    asides = [_aside(angle, stitch)[:, None] * float(edge.mean()) for stitch in held]
+    dura = _ragged(rng, angle, 3.1, 0.7) + sum(1.3 * np.exp(-((aside[:, 0] / 1.6) ** 2)) for aside in asides)
+    wall = dura + _ragged(rng, angle, 1.7, 0.6)
+    cloth = wall + _ragged(rng, angle, 3.0, 0.8) if "drape" in look.scenery else np.zeros(0)
+    z += _folded(away, dura[:, None], _ragged(rng, angle, 3.0, 1.2)[:, None], asides)
+    steps, bone = (wall + 0.4, wall + _ragged(rng, angle, 2.4, 0.7)), "bone" in look.scenery
+    risen = sum(high * _step((away - at[:, None]) / 0.7) for at, high in zip(steps, _STEPS_MM, strict=True))
+    lumps = noise.sample(noise.band(rng, 256, extent, 2.6, 0.6), flat, extent).reshape(radius.shape)
+    floor = _GUTTER_MM - 0.5 + risen + (0.12 if bone else 0.4) * np.minimum(risen, 1) * lumps
+    z += _step((away - dura[:, None]) / 0.35 - 0.4) * floor  # a gutter, and steps of bone or lumpy muscle
+    if len(cloth):
+        z += _step((away - cloth[:, None]) / 1.2 - 0.5) * (1.0 + 0.7 * lumps)
     if patty:
-        over = _step((0.3 - _outside(patty, *_along(patty, xy[..., 0], xy[..., 1]))) / 0.6)
-        # Cotton lies over folds rather than in them.
-        z = z + over * (_PATTY_MM + 0.3)
+        over = _step((0.3 - _placed(patty, xy[..., 0], xy[..., 1])[2]) / 0.6)
+        z += over * (_PATTY_MM + 0.3)  # cotton lies over folds rather than in them
     vertices = np.concatenate([xy, z[..., None]], axis=-1).reshape(-1, 3)
     # The cut edge is steep: on the maps it is laid flat inside the opening, or it had hardly a width there.
-    flat = edge[:, None] + np.concatenate([_LAID_MM, away[len(_LAID_MM) :]])[None]
+    flat = edge[:, None] + np.concatenate([_LAID_MM, away[0, len(_LAID_MM) :]])[None]
     laid = np.stack([flat * np.cos(angle)[:, None], flat * np.sin(angle)[:, None]], axis=-1).reshape(-1, 2)
     felt: tuple[Patty, ...] = () if patty is None else (patty,)
     parts = [(vertices, grid_faces(around, _INNER + rings, "rows").reshape(-1, 3), laid)]
@@ -108,19 +116,27 @@ def build(surface: CortexSurface, radius_mm: float, look: Look, mm_per_px: float
         parts += scenery.patties(edge, np.concatenate([surface.vertices, vertices]), rng)
     uv = (np.concatenate([place for *_, place in parts]) / extent + 0.5).astype(np.float32)
     mesh = joined(*(Shape(vertices, faces) for vertices, faces, _ in parts))
-    return Rim(mesh, uv, extent, edge, felt, held, flap, cloth)
+    return Rim(mesh, uv, extent, edge, felt, held, dura, wall, bone, cloth)
 
 
-def _folded(angle: Floats, away: Floats, edge: Floats, held: Floats, rng: np.random.Generator) -> Floats:
-    """Height (A, R) mm of the dura's turned-over edge, and of the tents and folds that stitches pull up."""
-    roll = 0.7 + 0.3 * np.cos(angle * int(rng.integers(3, 6)) + rng.uniform(0, 2 * np.pi))
-    raised = 0.38 * roll * np.exp(-(((away - 1.0) / 0.55) ** 2)) - 0.2 * np.exp(-(((away - 2.1) / 0.35) ** 2))
-    for stitch in held:
-        aside = (np.mod(angle - stitch + np.pi, 2 * np.pi) - np.pi) * float(edge.mean())
-        tent = np.exp(-((aside / 1.3) ** 2) - ((away - 0.9) / 1.4) ** 2)
-        tense = np.cos(aside * 4.2) * np.exp(-((aside / 2.6) ** 2)) * np.exp(-(((away - 2.2) / 2.0) ** 2))
-        raised = raised + np.where(away > 0, 0.5 * tent + 0.13 * tense, 0.0)
-    return np.asarray(raised)
+def _folded(away: Floats, dura: Floats, sway: Floats, asides: list[Floats]) -> Floats:
+    """Height (A, R) mm of the turned-over dura: rolled edge, pleats, the tents of stitches, a free end.
+
+    `away`: mm from the edge; `dura`: where it ends; `sway`: how pleats wander; `asides`: mm from each stitch.
+    """
+    raised = 0.11 * sway * np.exp(-(((away - 0.8) / 0.5) ** 2))
+    raised += 0.2 * np.sin(3.2 * away + 2 * sway) * np.clip(away - 0.8, 0, 1)
+    # It leans against the wall: its free end is the highest, and curls.
+    raised += 0.36 * np.clip(away, 0, None) + 0.35 * np.exp(-(((away - dura + 0.3) / 0.28) ** 2))
+    for aside in asides:
+        raised += 0.2 * np.cos(aside * 3.6) * np.exp(-((aside / 2.4) ** 2)) * np.clip(away / 1.5, 0, 1)
+        raised += 0.55 * np.exp(-((aside / 1.2) ** 2) - ((away - 1.0) / 1.3) ** 2)
+    return np.asarray(np.where(away > 0, raised, 0.0) * (1 - _step((away - dura) / 0.35 - 0.4)))
+
+
+def _aside(angle: npt.NDArray[Any], stitch: float) -> npt.NDArray[Any]:
+    """Angle (...) from a stitch, to the shorter side [rad]."""
+    return np.mod(angle - stitch + np.pi, 2 * np.pi) - np.pi
 
 
 def _ragged(rng: np.random.Generator, angle: Floats, mean: float, spread: float) -> Floats:
@@ -128,18 +144,7 @@ def _ragged(rng: np.random.Generator, angle: Floats, mean: float, spread: float)
     wave = np.full_like(angle, mean)
     for order in range(2, 14):
         wave += rng.normal(0, spread / order**0.7) * np.cos(order * angle + rng.uniform(0, 2 * np.pi))
-    return np.maximum(wave, 0.6 * mean)
-
-
-def _raised(away: Floats, flap: Floats, cloth: Floats, folds: Map, xy: Floats, extent: float) -> Floats:
-    """Height (A, R) mm that bone and drapes add."""
-    raised = np.zeros(xy.shape[:2])
-    if len(flap):
-        raised += _BONE_MM * _step((away - flap[:, None]) / 0.7 - 0.5)
-    if len(cloth):
-        wavy = noise.sample(folds, xy.reshape(-1, 2), extent).reshape(raised.shape)
-        raised += _step((away - cloth[:, None]) / 1.2 - 0.5) * (1.2 + 0.7 * wavy)
-    return raised
+    return np.maximum(wave, 0.35 * mean)
 
 
 def paint(rim: Rim, look: Look, pixels: int) -> Coat:
@@ -161,9 +166,8 @@ def paint(rim: Rim, look: Look, pixels: int) -> Coat:
         maps += [ragged, weave, noise.fractal(rng, pixels, 60.0, 4.0, 2.0)]
     colour, bumps, thin = noise.in_rows(partial(_paint_rows, rim, look, across), *maps)
     dry = cv2.resize(thin, (256, 256), interpolation=cv2.INTER_AREA)
-    return Coat(
-        colour, normals(noise.blur(bumps.astype(np.float32), 0.2, extent), extent), dry.astype(np.float32)
-    )
+    bent = normals(noise.blur(bumps.astype(np.float32), 0.2, extent), extent)
+    return Coat(colour, bent, dry.astype(np.float32))
 
 
 def _paint_rows(rim: Rim, look: Look, across: Map, *maps: Map) -> tuple[Map, Map, Map]:
@@ -179,30 +183,34 @@ def _paint_rows(rim: Rim, look: Look, across: Map, *maps: Map) -> tuple[Map, Map
     dura = dura * np.exp(-(4.5 * chord + flush)[..., None] * np.array([0.35, 1.0, 0.95], np.float32))
     beyond = np.asarray(look.beyond, np.float32) * (1 + 0.18 * mid + 0.04 * fine)[..., None]
     fat = np.array([0.72, 0.46, 0.22], np.float32) * (1 + 0.10 * fine)[..., None]
-    reach = 4.8 + 1.6 * wide
+    reach = _round(rim.dura, angle)
+    past = away - _round(rim.wall, angle)
     bumps = 0.035 * mid + 0.006 * swell
-    if len(rim.flap):
-        reach = _round(rim.flap, angle)
-        beyond = _bone(beyond, away - reach, mid, fine)
-        bumps = np.where(away > reach + 0.6, 0.4, 1.0).astype(np.float32) * bumps
-    outer = _step((away - reach) / 1.0 + 0.2 * mid) if not len(rim.flap) else _step((away - reach) / 0.3)
-    yellow = (0.7 * _step(wide * 1.5 - 1.4 + 0.4 * mid) * outer)[..., None] * (not len(rim.flap))
+    # What was cut shows its strands, and pale fascia at the edge of each step.
+    fascia = 0.45 * np.exp(-(((past - 1.0 - 0.3 * mid) / 0.3) ** 2))[..., None]
+    beyond = np.asarray(beyond * (1 - fascia) + np.asarray(look.dura) * fascia, np.float32)
+    if rim.bone:
+        beyond = _bone(beyond, past, mid, fine)
+        bumps *= np.where(past > 0.6, 0.4, 1.0).astype(np.float32)
+    outer = _step((away - reach) / 0.3 + 0.2 * mid)
+    yellow = (0.7 * _step(wide * 1.5 - 1.4 + 0.4 * mid) * _step(past))[..., None] * (not rim.bone)
     colour = dura * (1 - outer[..., None]) + beyond * outer[..., None]
     colour = colour * (1 - yellow) + fat * yellow
-    # Blood runs along the fibres and gathers: where the noise says so and in the fold behind the flap.
-    fold = np.exp(-(((away - reach) / 1.3) ** 2))
+    # Blood runs along the fibres and gathers: where the noise says so, and in the gutter.
+    gutter = outer * (1 - _step(past / 0.9 + 0.25 * mid))
     runs = 0.8 * wide + 0.25 * mid + 0.3 * fibres
-    gathered = 2.4 * look.blood - 1.9 + runs + (0.3 + 1.2 * look.blood) * fold
+    gathered = 2.4 * look.blood - 1.9 + runs + (0.3 + 2.6 * look.blood) * gutter
     blood = (0.02 + 0.4 * np.log1p(np.exp(2.0 * gathered))) * min(1.0, 8 * look.blood)
     colour = colour * np.exp(-blood[..., None] * np.array([0.26, 2.4, 2.8], np.float32))
     # The lip is thin and pale; under it the light is lost.
     lip = np.exp(-(((away + 0.1) / 0.35) ** 2))[..., None]
     under = np.clip(-away - 1.5, 0, 1)[..., None]
     colour = colour * (1 + 0.12 * lip) * np.exp(-under * np.array([0.35, 0.9, 1.0], np.float32))
-    # Behind the turned-over edge there is a crease, into which blood runs.
-    crease = np.exp(-(((away - 2.1 - 0.3 * wide) / 0.3) ** 2))[..., None]
-    colour = colour * np.exp(-(0.1 + 0.35 * look.blood) * crease * np.array([0.5, 1.5, 1.6], np.float32))
-    dry = np.clip(0.55 + 0.3 * wide - 0.8 * blood, 0.02, 1)
+    # Little light comes back out of the gutter, least from under the dura's free edge and at the wall's foot.
+    crevice = np.minimum(np.abs(away - reach - 0.25), np.abs(past) + 0.1)
+    lost = (0.7 * gutter + 0.8 * np.exp(-((crevice / 0.3) ** 2)))[..., None]
+    colour = colour * np.exp(-lost * np.array([0.8, 1.1, 1.1], np.float32))
+    dry = np.clip(0.55 + 0.3 * wide - 0.8 * blood - 0.5 * gutter, 0.02, 1)
     if len(rim.cloth):
         colour, bumps, dry = _draped(look, away - _round(rim.cloth, angle), mid, fine, colour, bumps, dry)
     threads = _threads(rim, angle, away)
@@ -234,20 +242,15 @@ def _draped(
     bled = np.clip(look.blood * (1.1 - past / 2.0) + 0.3 * mid, 0, 1.2)[..., None]
     cloth = cloth * (1 - 0.6 * np.minimum(bled, 1)) + np.array([0.22, 0.02, 0.02], np.float32) * 0.6 * bled
     cover = _step(past / 0.3 - 0.5)
-    blend = cover[..., None]
-    return (
-        np.asarray(colour * (1 - blend) + cloth * blend, np.float32),
-        np.asarray(bumps * (1 - cover) + 0.012 * fine * cover, np.float32),
-        np.asarray(np.maximum(dry, cover), np.float32),
-    )
+    colour = np.asarray(colour + (cloth - colour) * cover[..., None], np.float32)
+    return colour, np.asarray(bumps * (1 - cover) + 0.012 * fine * cover, np.float32), np.maximum(dry, cover)
 
 
 def _threads(rim: Rim, angle: Map, away: Map) -> Map:
     """Share covered by the stitches' threads: two strands from each, meeting far out."""
     covered = np.zeros_like(away)
-    mean = float(rim.edge.mean())
     for stitch in rim.stitches:
-        aside = (np.mod(angle - stitch + np.pi, 2 * np.pi) - np.pi) * (mean + away)
+        aside = _aside(angle, stitch) * (float(rim.edge.mean()) + away)
         # A loop that is round where it goes through, drawn together far out.
         apart = 0.42 * np.sqrt(np.clip((away - 0.9) / 0.7, 0, 1)) * np.clip(1 - (away - 1.0) / 12.0, 0, 1)
         line = np.where(away > 0.9, np.abs(np.abs(aside) - apart), 9.0)
@@ -270,8 +273,8 @@ def inside(rim: Rim, x: Map, y: Map) -> Map:
 def _round(values: Floats, angle: Map) -> Map:
     """Values (A,) at even angles, at other angles."""
     closed = np.append(values, values[0])
-    around = np.linspace(0, 2 * np.pi, len(closed))
-    return np.asarray(np.interp(angle % (2 * np.pi), around, closed), np.float32)
+    even = np.linspace(0, 2 * np.pi, len(closed))
+    return np.asarray(np.interp(angle % (2 * np.pi), even, closed), np.float32)
 
 
 def _streaks(across: Map, angle: Map, away: Map, radius: float) -> Map:
@@ -289,17 +292,13 @@ def _patty(rng: np.random.Generator, edge: Floats) -> Patty:
     return Patty((radius * float(np.cos(around)), radius * float(np.sin(around))), turn, half)
 
 
-def _along(patty: Patty, x: Floats | Map, y: Floats | Map) -> tuple[Floats, Floats]:
-    """Places x, y mm in a patty's own axes: along its length and across it [mm]."""
+def _placed(patty: Patty, x: Floats | Map, y: Floats | Map) -> tuple[Floats, Floats, Map]:
+    """Places x, y mm along a patty's length, across it, and from its outline, negative inside [mm]."""
     c, s = np.cos(patty.turn), np.sin(patty.turn)
     dx, dy = x - patty.middle[0], y - patty.middle[1]
-    return c * dx + s * dy, c * dy - s * dx
-
-
-def _outside(patty: Patty, along: Floats, across: Floats) -> Map:
-    """Distance to the patty's outline, negative inside [mm], of places in its axes."""
+    along, across = c * dx + s * dy, c * dy - s * dx
     far = np.maximum(np.abs(along) - patty.half[0], np.abs(across) - patty.half[1])
-    return np.asarray(far, np.float32)
+    return along, across, np.asarray(far, np.float32)
 
 
 def _cotton(
@@ -307,8 +306,8 @@ def _cotton(
 ) -> tuple[Map, Map]:
     """White felt with a blue thread, a little soaked at its edges."""
     ragged, weave, stains = drawn
-    along, across = _along(patty, x, y)
-    far = _outside(patty, along, across) + 0.12 * ragged
+    along, across, far = _placed(patty, x, y)
+    far = far + 0.12 * ragged
     cover = _step(0.5 - far / 0.25)[..., None]
     felt = np.array([0.86, 0.82, 0.76], np.float32) * (1 + 0.06 * weave)[..., None]
     soaked = blood * np.clip(1.2 + far / 1.2 + 0.5 * stains, 0, 1.5)

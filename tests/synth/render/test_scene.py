@@ -12,6 +12,7 @@ from synth.render.anatomy import surface as anatomy
 from synth.render.camera import camera
 from synth.render.scene import Renderer, SceneState
 from synth.sequence import scenario
+from synth.sequence.scene import at_rest
 from synth.system import gpu, llvm
 
 VARIANTS = ["scalar_rgb"]
@@ -82,6 +83,34 @@ def test_variants_agree_pixel_by_pixel(variant: str) -> None:
     assert abs(z.mean()) < 0.15
     assert z.std() < 1.3
     assert (np.abs(z) > 4.5).mean() < 0.01
+
+
+@pytest.mark.slow
+def test_few_paths_have_the_mean_of_many() -> None:
+    ours, vertices = made(VARIANTS[-1], spp=4)
+    many, _ = made(VARIANTS[-1], spp=256)
+    state = SceneState(vertices, TIPS, SHAFTS)
+    few = np.mean([ours.render(state, seed).radiance for seed in range(12)], axis=0)
+    apart = few - many.render(state, 1).radiance
+    assert abs(apart.mean()) < 0.002
+    assert np.median(np.abs(apart)) < 0.004
+
+
+@pytest.mark.slow
+def test_tissue_is_seen_through_the_opening_only() -> None:
+    """The wound's floor lies lower than the dura in front of it, and over the brain."""
+    for seed in range(3):
+        job = Job(seed=seed, anatomy=AnatomySection(vertices=6000))
+        scene = at_rest(job)
+        rest, edge = scene.renderer.rest, scene.renderer._rim.edge
+        points = scene.view.rotation.T @ (rest.points[rest.tissue.ravel()] - scene.view.translation).T
+        opening = np.interp(
+            np.arctan2(points[1], points[0]),
+            2 * np.pi * np.arange(len(edge)) / len(edge),
+            edge,
+            period=2 * np.pi,
+        )
+        assert (np.hypot(points[0], points[1]) < opening + 1.0).all()
 
 
 @pytest.mark.slow

@@ -1,0 +1,73 @@
+"""Few paths a pixel: where they go, and what is left of their grain at soft edges."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from synth.render.mitsuba.adapter import pick
+from synth.render.mitsuba.direct_light import Light, _pair
+from synth.render.mitsuba.edge_filter import soften
+
+if pick("auto") == "scalar_rgb":
+    pytest.skip("no LLVM here, so nothing is compiled", allow_module_level=True)
+
+
+def test_a_block_of_paths_is_spread_over_the_square() -> None:
+    """A block of 4 or 16 points has one in each of as many equal rectangles, whatever their shape."""
+    import drjit as dr
+    import mitsuba as mi
+
+    mi.set_variant("llvm_ad_rgb")
+    seeds = [mi.UInt32(word) for word in (12345, 678, 91011)]
+    points = np.array(_pair(dr.brev(dr.arange(mi.UInt32, 4096)), seeds)).T
+    assert ((points >= 0) & (points < 1)).all()
+    for size, shapes in ((4, ((2, 2), (4, 1), (1, 4))), (16, ((4, 4), (2, 8), (16, 1)))):
+        for block in points.reshape(-1, size, 2):
+            for shape in shapes:
+                cell = np.floor(block * shape).astype(int)
+                assert len({tuple(one) for one in cell}) == size
+
+
+def soft_edge(size: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Share (n, n) of a straight edge that is 6 px soft, and of it what four paths a pixel find."""
+    y, x = np.mgrid[:size, :size]
+    exact = np.clip((0.9 * x + 0.44 * y - 0.67 * size) / 6 + 0.5, 0, 1)
+    return exact, rng.binomial(4, exact) / 4
+
+
+def test_noise_along_a_soft_edge_falls_and_what_lies_behind_keeps_its_pixels() -> None:
+    rng = np.random.default_rng(3)
+    ground = np.where(np.mgrid[:64, :64][1] % 6 < 3, 0.8, 0.3).astype(np.float32)
+    before, after = [], []
+    for _ in range(8):
+        exact, cover = soft_edge(64, rng)
+        radiance = np.stack([0.1 * cover + ground * (1 - cover)] * 3).astype(np.float32)
+        near = np.stack([0.1 * cover] * 3).astype(np.float32)
+        blocked, none = np.zeros_like(radiance), np.zeros((64, 64), np.float32)
+        light = Light(radiance, near, cover.astype(np.float32), blocked, none)
+        truth = 0.1 * exact + ground * (1 - exact)
+        before.append(radiance[0] - truth)
+        after.append(soften(light, 1.0, 4)[..., 0] - truth)
+    band = np.zeros((64, 64), bool)
+    band[8:-8, 8:-8] = ((exact > 0.1) & (exact < 0.9))[8:-8, 8:-8]
+    assert np.std(after, axis=0)[band].mean() < 0.4 * np.std(before, axis=0)[band].mean()
+    assert abs(np.mean(after, axis=0)[band].mean()) < 0.005
+    beside = np.roll(exact, (-4, -4), (0, 1))[8:-8, 8:-8] == 0  # four pixels and more from the edge
+    assert np.abs(after)[:, 8:-8, 8:-8][:, beside].max() < 1e-5
+
+
+def test_noise_along_a_soft_shadow_falls() -> None:
+    rng = np.random.default_rng(3)
+    before, after = [], []
+    for _ in range(8):
+        exact, shade = soft_edge(64, rng)
+        blocked = np.stack([0.6 * shade] * 3).astype(np.float32)
+        none = np.zeros((64, 64), np.float32)
+        light = Light(0.6 - blocked, np.zeros_like(blocked), none, blocked, 2 * shade.astype(np.float32))
+        before.append(light.radiance[0] - 0.6 * (1 - exact))
+        after.append(soften(light, 2.0, 4)[..., 0] - 0.6 * (1 - exact))
+    band = np.zeros((64, 64), bool)
+    band[8:-8, 8:-8] = ((exact > 0.1) & (exact < 0.9))[8:-8, 8:-8]
+    assert np.std(after, axis=0)[band].mean() < 0.4 * np.std(before, axis=0)[band].mean()
+    assert abs(np.mean(after, axis=0)[band].mean()) < 0.005
