@@ -26,6 +26,7 @@ from scipy.interpolate import RectBivariateSpline
 from scipy.ndimage import gaussian_filter
 
 from bench.recording import writer
+from bench.recording.meta import read_meta
 from synth.errors import UserError
 from synth.system.checked_file import read_picture
 
@@ -62,8 +63,18 @@ def main(
                     pythons = mechanics_python, pictures_python
                     record(part, folder.name, kind, rng, (seconds, fps, spp), pythons)
             if left is not None and not (left / folder.name).exists():
-                shutil.copytree(folder, left / folder.name, ignore=shutil.ignore_patterns("right.mp4"))
+                with writer.write_whole_folder(left / folder.name) as part:
+                    copy_left_eye(folder, part)
             print(folder)
+
+
+def copy_left_eye(recording: Path, part: Path) -> None:
+    """What the left eye of a recording saw, into a folder."""
+    shutil.copytree(
+        recording, part, ignore=shutil.ignore_patterns("right.mp4", "pair.yaml"), dirs_exist_ok=True
+    )
+    meta = read_meta(recording / "meta.yaml")
+    writer.write_meta(part, meta.model_dump(mode="json", exclude_unset=True, exclude={"stereo"}))
 
 
 def record(

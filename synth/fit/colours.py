@@ -18,8 +18,8 @@ _OFF_DIAGONAL = -0.6, 0.2  # as published cameras have them
 _KNOWN, _NEUTRAL = 0.1, 0.3  # weights of plain colours, and of curves that are alike, against the distance
 
 
-def fit_colours(light: npt.NDArray[np.float32], video: Floats) -> ColourProcessing:
-    """The matrix, rows of sum 1, and rising curves with the least sliced Wasserstein distance.
+def fit_colours(light: npt.NDArray[np.float32], video: Floats) -> tuple[ColourProcessing, float]:
+    """The matrix, rows of sum 1, and rising curves with the least sliced Wasserstein distance, and that.
 
     Pixels are projected on random directions, sorted, and subtracted (J. Rabin et al., 2011). Directions in
     which the photograph varies little count more: hue would drown in lightness.
@@ -50,7 +50,8 @@ def fit_colours(light: npt.NDArray[np.float32], video: Floats) -> ColourProcessi
     steps = np.log(np.diff(plain, axis=1, prepend=0))
     start = np.append(np.ones(6), steps[:, :4] - steps[:, 4:])
     ends = [np.repeat([1 + end, 8 * np.sign(end)], (6, 12)) for end in _OFF_DIAGONAL]
-    return _colours(least_squares(residuals, start, bounds=ends, max_nfev=40, diff_step=3e-3).x)
+    found = least_squares(residuals, start, bounds=ends, max_nfev=40, diff_step=3e-3)
+    return _colours(found.x), float(found.cost)
 
 
 def _colours(free: Floats) -> ColourProcessing:

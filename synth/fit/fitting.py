@@ -22,8 +22,7 @@ from synth.sequence.scene import at_rest
 _LARGEST_MM, _SMALLEST_PX, _LARGEST_PX = 60.0, 160, 720
 _INSET_PX = 9  # from the opening's edge
 _ANATOMIES = 2
-# Green and blue over red in frames, against those of the reflectances they were rendered with.
-_GREEN, _BLUE = 0.825, 0.735
+_CHOOSING_PX = 320  # width of the frames by which the family is chosen
 _USUAL = CameraSensor()
 
 _TRIED: dict[str, tuple[tuple[float, ...], Callable[[float], dict[str, float]]]] = {
@@ -54,6 +53,11 @@ class TissueFrame(NamedTuple):
         """The picture (H, W, 3) sRGB that the sensor with these keys takes."""
         return camera_sensor.record(self.radiance, replace(self.sensor, **keys), np.random.default_rng(0))
 
+    def light(self, keys: dict[str, Any]) -> Map:
+        """(N, 3) that its chip measures of tissue, white-balanced, 1 at full scale."""
+        rng = np.random.default_rng(0)
+        return balanced_light(self.radiance, replace(self.sensor, **keys), rng)[self.usable]
+
 
 def fit_camera(given: Photograph) -> dict[str, Any]:
     """Sections of a job with the photograph's family and camera.
@@ -62,8 +66,7 @@ def fit_camera(given: Photograph) -> dict[str, Any]:
     with rising vignette, noise and blur: those are taken with which they measure what the photograph does.
     Colours are fitted to the light that such a camera measures.
     """
-    theirs = measure(given.rgb, given.usable)
-    family = nearest_family(theirs["green"], theirs["blue"])
+    theirs, family = measure(given.rgb, given.usable), nearest_family(given)
     widest = min(given.rgb.shape[1], _LARGEST_MM / given.mm_per_px)
     width = int(np.clip(widest, _SMALLEST_PX, _LARGEST_PX)) // 4 * 4
     frames = [render(family, width, given.mm_per_px, index) for index in range(_ANATOMIES)]
@@ -79,9 +82,9 @@ def fit_camera(given: Photograph) -> dict[str, Any]:
     for name, (tried, as_keys) in _TRIED.items():
         measured = np.maximum.accumulate([figure(name, as_keys(value)) for value in tried])
         keys |= as_keys(float(np.interp(theirs[name], measured, tried)))
-    here, rng = keys | {"vignette": keys["vignette"] * reach**2}, np.random.default_rng(0)
-    light = [balanced_light(one.radiance, replace(one.sensor, **here), rng)[one.usable] for one in frames]
-    keys |= fit_colours(np.concatenate(light), given.rgb[given.usable] / 255)._asdict()
+    here = keys | {"vignette": keys["vignette"] * reach**2}
+    light = np.concatenate([one.light(here) for one in frames])
+    keys |= fit_colours(light, given.rgb[given.usable] / 255)[0]._asdict()
     rate = given.compression.bitrate_mbps(frames[0].record(keys))
     sensor = {name: np.round(value, 4).tolist() for name, value in keys.items()}
     sensor["blur_px"] = sensor.pop("blur")
@@ -93,11 +96,11 @@ def fit_camera(given: Photograph) -> dict[str, Any]:
     return sections
 
 
-def nearest_family(green: float, blue: float) -> Family:
-    """The family whose tissue has most nearly these ratios to red, in linear light."""
-    both = {name: np.add(one.crown, one.flush) for name, one in FAMILIES.items()}
-    ratios = {name: (_GREEN * g / r / green, _BLUE * b / r / blue) for name, (r, g, b) in both.items()}
-    return min(FAMILIES, key=lambda name: float(np.hypot(*np.log(ratios[name]))))
+def nearest_family(given: Photograph) -> Family:
+    """The family whose tissue some camera's colours bring nearest to the photograph's."""
+    video, width = given.rgb[given.usable] / 255, min(_CHOOSING_PX, given.rgb.shape[1] // 4 * 4)
+    light = {name: render(name, width, given.mm_per_px, 0).light({}) for name in FAMILIES}
+    return min(FAMILIES, key=lambda name: fit_colours(light[name], video)[1])
 
 
 def render(family: Family, width: int, mm_per_px: float, index: int) -> TissueFrame:

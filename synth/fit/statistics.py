@@ -1,4 +1,4 @@
-"""What one photograph tells of its camera: vignette, noise, sharpness, and the colour of the tissue."""
+"""What one photograph tells of its camera: vignette, noise and sharpness."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def measure(rgb: Picture, usable: Mask, reach: float = 1.0) -> dict[str, float]:
 
     `vignette`: loss of light in the corners, a logarithm. `noise`: standard deviation in grey levels where
     tissue is smoothest (J. Immerkaer, 1996). `sharpness`: contrast of the finest octave against two octaves
-    on, both without the noise. `green`, `blue`: medians of tissue against its red, in linear light.
+    on, both without the noise.
 
     Args:
         rgb: (H, W, 3) sRGB.
@@ -42,14 +42,12 @@ def measure(rgb: Picture, usable: Mask, reach: float = 1.0) -> dict[str, float]:
         # White noise of unit variance leaves this much in a difference of Gaussians.
         left = (1 / fine**2 + 1 / coarse**2 - 4 / (fine**2 + coarse**2)) / (4 * np.pi)
         energy.append(max(float(band[clear].var()) - left * noise**2, 0.01))
-    red, green, blue = np.median(decoded[rgb[tissue]], axis=0)
+    red = decoded[rgb[..., 0]] / np.median(decoded[rgb[tissue, 0]])
     found = {
         "noise": noise,
         "sharpness": np.sqrt(energy[0] / energy[1]),
-        "green": green / red,
-        "blue": blue / red,
+        "vignette": _vignette(red, tissue, reach),
     }
-    found["vignette"] = _vignette(decoded[rgb[..., 0]] / red, tissue, reach)
     return {name: float(value) for name, value in found.items()}
 
 

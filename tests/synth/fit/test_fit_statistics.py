@@ -61,7 +61,7 @@ def test_colours_of_the_same_tissue_are_found_again() -> None:
     light = np.array([0.95, 0.8, 0.5]) * np.exp(-blood * [0.3, 1.9, 2.3]) * rng.uniform(0.5, 1.1, (9000, 1))
     camera, light = CAMERAS[3], light.astype(np.float32)
     video = np.clip(processed(light[None], *camera)[0], 0, 1)
-    found = np.clip(processed(light[None], *fit_colours(light, video))[0], 0, 1)
+    found = np.clip(processed(light[None], *fit_colours(light, video)[0])[0], 0, 1)
     before = np.clip(processed(light[None], *CAMERAS[0])[0], 0, 1)
     assert np.abs(found - video).mean() < 0.3 * np.abs(before - video).mean()
 
