@@ -27,7 +27,8 @@ def draw_force(result: Result, others: bool = False) -> str:
     """Force over time: the sensor, the main method with its bands of uncertainty, thinner the `others`.
 
     Lost frames are gaps, shaded. Without a known E all curves are brought to one height. The axis holds the
-    sensor, networks and lengths of flow, which are dotted; other curves may leave it.
+    sensor, networks and lengths of flow, which are dotted; other curves may leave it. Without the others it
+    holds the main method's interval, up to twice its largest force.
     """
     time_s, (sensor, curves, label) = result.time_s, scale_curves(result)
     main, method = curves[result.main], result.methods[result.main]
@@ -54,6 +55,8 @@ def draw_force(result: Result, others: bool = False) -> str:
             line, colour = ":" if name in sizes else "-", _OTHERS[k % len(_OTHERS)]
             axes.plot(time_s, curve, line, color=colour, linewidth=1.1, label=name)
         held = [curve for name, curve in thin.items() if name in sizes or name in networks]
+        if not others and result.absolute and method.high_mn is not None:
+            held.append(np.minimum(method.high_mn, 2 * _largest(main)))
         shown = np.concatenate([main, *held, *([] if sensor is None else [sensor])])
         if np.isfinite(shown).any():
             low, high = min(np.nanmin(shown), 0.0), _largest(shown)
