@@ -5,7 +5,7 @@
 #   make trials  kills, clusters, containers, the wheel, the site: what has to pass as well before anything lands
 #   make quick   lint, types, and the tests that take no more than seconds
 #   make docs    the pages in site/; open site/index.html
-#   make evidence    every kept result anew, into runs/evidence and docs/results; PHOTO=cortex.jpg for the look
+#   make evidence    kept results anew, into runs/evidence and docs/results; PHOTO=cortex.jpg for the look
 #   make clean   removes what these made
 #
 # PYTHON=python3.12 chooses the interpreter (3.11 or newer).

@@ -1,4 +1,4 @@
-"""Every kept result anew, of one commit, in an order that shares data.
+"""Kept results anew, of one commit, in an order that shares data; but for `learn/losses-1500`.
 
 Run: make evidence PHOTO=CORTEX.jpg MECHANICS_PYTHON=A/bin/python PICTURES_PYTHON=B/bin/python
 
@@ -29,18 +29,20 @@ def main(
     pictures_python: Annotated[Path | None, typer.Option(help="A Python with bpy.")] = None,
     only: Annotated[str, typer.Option(help="Steps whose name has this.")] = "",
 ) -> None:
-    """Makes all kept results anew. Exit code 1 if a step fails; its log is WORK/logs/STEP.log."""
+    """Makes kept results anew. Exit code 1 if a step fails; its log is WORK/COMMIT/logs/STEP.log."""
+    work = work / (report.commit() or "unknown")
     steps = [*shared(work), *rooms(work)]
     if photo is None:
         typer.echo("no --photo: the look and pseudo ex vivo recordings are left out", err=True)
     else:
-        steps += [*look(work, photo), *exvivo(work, photo)]
+        steps += [*look(photo), *exvivo(work, photo)]
     if mechanics_python is None or pictures_python is None:
         typer.echo("no --mechanics-python and --pictures-python: foreign recordings are left out", err=True)
     else:
         steps += foreign(work, mechanics_python, pictures_python)
     chosen = [step for step in steps if only in step[0]]
     rows = run_steps(chosen, work / "steps.json", work / "logs")
+    rows = [row for row in rows if row["name"] in {name for name, _ in chosen}]
     report.show({"steps": rows, "CPU-hours": sum(row["cpu_s"] for row in rows) / 3600})
     raise typer.Exit(int(any(row["exit_code"] for row in rows)))
 
@@ -50,7 +52,6 @@ def shared(work: Path) -> list[Step]:
     sizes = (("stereo-640", "[640, 480]"), ("stereo-320", "[320, 240]"))
     return [
         _render("mission", "mission", work, sequences=400),
-        _render("mission-bench", _CURVES / "mission-bench.yaml", work, sequences=60),
         _render("mission-unseen", _CURVES / "mission-unseen.yaml", work, sequences=80),
         *(
             _render(name, "stereo", work, sequences=8, seed=77, **{"render.size": size})
@@ -85,7 +86,18 @@ def rooms(work: Path) -> list[Step]:
             *("curves.experiment", mission, "--unseen", unseen, "--sizes", "30,100,300", "--asked", "60"),
             *("--choosing", "40", "--work", str(work / "curves")),
         ),
-        _script("gap.experiment", mission, "--unseen", unseen, "--fit", "300", "--work", str(work / "gap")),
+        _script(
+            "gap.experiment",
+            mission,
+            "--unseen",
+            unseen,
+            "--fit",
+            "300",
+            "--epochs",
+            "12",
+            "--work",
+            str(work / "gap"),
+        ),
         _script("scoring.together", unseen, "--work", str(work / "together")),
         _script("scoring.pulse", "--seconds", "20", "--count", "2", "--size", "160"),
         _script("scoring.cost", "learn/models/mono", "--train", mission),
@@ -96,13 +108,11 @@ def rooms(work: Path) -> list[Step]:
     ]
 
 
-def look(work: Path, photo: Path) -> list[Step]:
+def look(photo: Path) -> list[Step]:
     """The look beside a photograph, as it comes and fitted."""
-    fitted = str(work / "look.yaml")
     return [
         _script("render.realism", str(photo), "--frames", "12", "--family", "healthy"),
-        ("fit", ("-m", "synth", "fit", str(photo), "--width-mm", "110", "-o", fitted)),
-        _script("look.classifier", str(photo), "--look", fitted, "--frames", "5", "--epochs", "8"),
+        _script("look.classifier", str(photo), "--frames", "5", "--epochs", "8"),
     ]
 
 

@@ -34,15 +34,17 @@ def run_steps(
 
     Returns:
         `name`, `command`, `commit`, `exit_code` (-1: stopped at its time limit), `wall_s` and `cpu_s` of
-        every step that was ever run.
+        every step that was run at this commit.
     """
     logs.mkdir(parents=True, exist_ok=True)
     rows: list[dict[str, Any]] = json.loads(kept.read_text("utf-8"))["steps"] if kept.is_file() else []
     commit = report.commit()
-    passed = {(row["command"], row.get("commit", "")) for row in rows if row["exit_code"] == 0}
+    # What is not committed may have changed since.
+    rows = [row for row in rows if row.get("commit", "") == commit and not commit.endswith("+")]
+    passed = {row["command"] for row in rows if row["exit_code"] == 0}
     for name, arguments in steps:
         line = "python " + " ".join(arguments)
-        if (line, commit) in passed:
+        if line in passed:
             continue
         begin, before = time.perf_counter(), os.times()
         with (logs / f"{name.replace(' ', '-')}.log").open("wb") as log:

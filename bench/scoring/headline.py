@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 
 from bench.bootstrap import Interval
+from bench.methods.comparison import MAIN, TOGETHER
 from bench.scoring.metrics import METRICS
 from bench.scoring.result import Result
 from learn.uncertainty.out_of_distribution import UNSEEN
@@ -13,6 +14,8 @@ from learn.uncertainty.out_of_distribution import UNSEEN
 _NEWTONS = ("mae_mn", "mae_of_peak", "r", "ccc", "r2", "ghost_rate")
 _SHAPE = ("r", "shape_error", "lag_s")
 _PRESSED = ("mae_mn", "mae_of_peak", "r2")
+_GUESSED = 0.5
+"""Relative uncertainty from which a number was not stated by anybody."""
 
 
 @dataclass(frozen=True)
@@ -35,6 +38,8 @@ class Headline:
     tiles: tuple[Tile, ...]
     warnings: tuple[str, ...] = ()
     """What the numbers must not be read without."""
+    of_peak: float | None = None
+    """The first tile's error over the contacts' mean peak; None where it is no error."""
     trust: str = ""
     """What was lost, what was unlike the training, what was assumed: one sentence."""
 
@@ -51,7 +56,7 @@ def headline(result: Result) -> Headline:
     main = result.methods[result.main]
     if not main.scores:
         why = "No usable force sensor: these are predictions only, nothing is scored"
-        return Headline(why, (), odd, _trust(result))
+        return Headline(why, (), odd, trust=_trust(result))
     warnings = list(odd)
     if result.left == 2:
         warnings.append("Only two frames are scored: every curve correlates with two (see the notes)")
@@ -60,8 +65,9 @@ def headline(result: Result) -> Headline:
             f"The clocks could not be aligned ({result.sync.refused}): scored at the offset stated, "
             f"{result.settings['meta']['sync']['offset_s']:g} s"
         )
-    tiles: list[Tile] = []
+    tiles, of_peak = list[Tile](), main.scores["mae_of_peak"] if result.absolute else None
     if math.isfinite(main.calibrated.get("mae_mn", math.nan)):
+        of_peak = main.calibrated["mae_of_peak"]
         tiles += [
             Tile(f"{METRICS[key].name}, gain of the press", main.calibrated[key], METRICS[key].unit)
             for key in _PRESSED
@@ -70,22 +76,26 @@ def headline(result: Result) -> Headline:
     tiles += [
         Tile(METRICS[key].name, main.scores[key], METRICS[key].unit, main.intervals.get(key)) for key in keys
     ]
-    return Headline("", tuple(tiles), tuple(warnings), _trust(result))
+    return Headline("", tuple(tiles), tuple(warnings), of_peak, _trust(result))
 
 
 def _trust(result: Result) -> str:
     """Lost frames, motion unlike the network's training, and what of tissue and scale was taken as given."""
     meta, frames, lost = result.settings["meta"], len(result.lost), int(result.lost.sum())
     parts = [f"{lost} of {frames} frames were lost" if lost else f"None of {frames} frames was lost"]
-    if result.main in result.settings.get("networks", {}):
-        unlike = any(UNSEEN in note for note in result.notes)
+    network = MAIN if result.main == TOGETHER else result.main
+    asked = result.methods.get(network)  # without intervals nothing is known of what it was trained on
+    if network in result.settings.get("networks", {}) and asked is not None and asked.low_mn is not None:
+        unlike = any(note.startswith(f"{network}: {UNSEEN}") for note in result.notes)
         parts.append(f"it moves {'unlike anything' if unlike else 'as what'} the network was trained on")
-    given = [f"{result.scale.mm_per_px:.3g} mm/px{_within(result.scale.uncertainty)}"]
-    if result.absolute:
-        given.insert(0, f"E = {meta['young_kpa']:.3g} kPa{_within(meta.get('young_uncertainty', 0.0))}")
+    young = f"E = {meta['young_kpa']:.3g} kPa" if result.absolute else "E of 1 kPa, for none is known"
+    given = [young + _within(meta.get("young_uncertainty", 0.0))]
+    given.append(f"{result.scale.mm_per_px:.3g} mm/px{_within(result.scale.uncertainty)}")
     given.append(f"membrane {meta.get('membrane', 'unknown')}")
     return "; ".join([*parts, f"taken as given: {', '.join(given)}"]) + "."
 
 
 def _within(uncertainty: float) -> str:
+    if uncertainty > _GUESSED:
+        return " (a guess)"
     return f" ± {uncertainty:.0%}" if uncertainty else ""

@@ -61,8 +61,11 @@ def main(
     texture = photo.resolve() if photo else None
     plan = Plan(seed, seconds, fps, (width, width * 3 // 4), texture, eyes=eyes)
     for index in range(count):
-        with counting(f"recording {index}", int(seconds * fps)) as progress:
-            print(make(plan, index, out / f"{index:03d}", progress))
+        folder = out / f"{index:03d}"
+        if not folder.exists():
+            with counting(f"recording {index}", int(seconds * fps)) as progress:
+                make(plan, index, folder, progress)
+        print(folder)
 
 
 @dataclass(frozen=True)

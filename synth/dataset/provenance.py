@@ -13,7 +13,7 @@ from synth.system import packages
 HOME = Path(__file__).parents[2]
 _MAKING = tuple(f"synth/{room}" for room in ("job", "geometry", "fem", "render", "video", "flow", "sequence"))
 _OPENCV = "opencv-contrib-python-headless"
-_COMPUTING = ("mitsuba", "drjit", "numpy", "scipy", _OPENCV, "torch", "numba", "llvmlite")
+_COMPUTING = ("mitsuba", "drjit", "numpy", "scipy", _OPENCV, "torch", "numba", "llvmlite", "xatlas")
 
 
 @cache

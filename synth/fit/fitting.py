@@ -20,9 +20,8 @@ from synth.render.scene import SceneState
 from synth.sequence.scene import at_rest
 
 _LARGEST_MM, _SMALLEST_PX, _LARGEST_PX = 60.0, 160, 720
-_INSET_PX = 9  # from the opening's edge
+_INSET_PX, _CHOOSING_PX = 9, 320  # from the opening's edge; width of frames by which the family is chosen
 _ANATOMIES = 2
-_CHOOSING_PX = 320  # width of the frames by which the family is chosen
 _USUAL = CameraSensor()
 
 _TRIED: dict[str, tuple[tuple[float, ...], Callable[[float], dict[str, float]]]] = {

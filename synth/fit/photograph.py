@@ -95,7 +95,8 @@ def read_photograph(path: Path, width_mm: float, mask: Path | None) -> Photograp
         raise UserError(f"{path}: smaller than {_SMALLEST_PX} pixels")
     own, usual = width_mm / rgb.shape[1], RenderSection()
     finer = max(1.0, sum(usual.field_mm) / 2 / usual.size[0] / own)
-    usable = np.asarray(checked_file.read_picture(mask, 0)) > 127 if mask else mask_detection.cortex(rgb)
+    painted = None if mask is None else np.asarray(checked_file.read_picture(mask, 0)) > 127
+    usable = mask_detection.cortex(rgb, own) if painted is None else painted
     if usable.shape != rgb.shape[:2]:
         raise UserError(f"{mask}: is of another size than the photograph")
     small = {"dsize": None, "fx": 1 / finer, "fy": 1 / finer, "interpolation": cv2.INTER_AREA}

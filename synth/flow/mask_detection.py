@@ -14,7 +14,7 @@ _SOME = 0.1  # mean probability of a grey body that counts as an instrument
 _OUTLINE_PX = 240  # larger side of the small picture that the cortex is found in
 _MIDDLE = 0.6  # squared radius of the ellipse that is taken for cortex at first, half sides are 1
 _BLACK, _BLOODY = 60, 0.42  # grey levels; green over red (sRGB)
-_WIDE_PX = 9  # of the small picture: no vessel is wider, what is bloody over more is something else
+_VESSEL_MM = 3.0  # no vessel is wider: what is bloody over more is something else
 _INSET_PX = 5  # of it by which the outline is drawn in
 _SHRINK = 4  # the median is taken on a picture this much smaller: it is smooth
 
@@ -78,8 +78,8 @@ def blocked(rgb: NDArray[np.uint8]) -> NDArray[np.bool_]:
     return np.asarray(glare(rgb) | tool(rgb), bool)
 
 
-def cortex(rgb: NDArray[np.uint8]) -> NDArray[np.bool_]:
-    """(H, W): the exposed cortex of a picture (H, W, 3) sRGB, without instruments and dark border.
+def cortex(rgb: NDArray[np.uint8], mm_per_px: float) -> NDArray[np.bool_]:
+    """(H, W): the exposed cortex of a picture (H, W, 3) sRGB of a scale, without instruments and dark border.
 
     What is like the middle of the picture and not like its edge (C. Rother et al., "GrabCut", 2004), less
     what is black, blue, soaked with blood or found to be an instrument.
@@ -87,7 +87,8 @@ def cortex(rgb: NDArray[np.uint8]) -> NDArray[np.bool_]:
     scale = min(1.0, _OUTLINE_PX / max(rgb.shape))
     small = cv2.medianBlur(cv2.resize(rgb, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), 5)
     red, green, blue = np.moveaxis(small.astype(np.float32), 2, 0)
-    bloody = cv2.blur((green < _BLOODY * red).astype(np.float32), (_WIDE_PX, _WIDE_PX)) > 0.9
+    wide = (max(3, round(_VESSEL_MM / mm_per_px * scale)),) * 2
+    bloody = cv2.blur((green < _BLOODY * red).astype(np.float32), wide) > 0.9
     steel = cv2.resize(tool(rgb).astype(np.uint8), small.shape[1::-1]) > 0
     y, x = np.meshgrid(*(np.linspace(-1, 1, n) for n in small.shape[:2]), indexing="ij")
     label = np.where(x**2 + y**2 < _MIDDLE, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, FiniteFloat
 
-from synth.job.types import Curve, NonNegative, Positive, Range, Section, Share, Vector
+from synth.job.types import Curve, NonNegative, Positive, Range, Section, Share, Weights
 
 
 class LightSection(Section):
@@ -38,7 +38,7 @@ class SensorSection(Section):
     """Share of light lost in the picture's corners."""
     blur_px: Annotated[FiniteFloat, Field(ge=0, le=8)] = 0.0
     """Blur of the optics beyond the aperture's: standard deviation of a Gaussian [px]."""
-    matrix: tuple[Vector, Vector, Vector] | None = None
+    matrix: tuple[Weights, Weights, Weights] | None = None
     """From the chip's colours to the picture's, in linear light: rows for red, green, blue, each summing
     to 1 where white is to stay white. Empty: that of a camera drawn from a few."""
     curves: tuple[Curve, Curve, Curve] | None = None

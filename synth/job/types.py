@@ -42,7 +42,7 @@ def _ordered(value: tuple[float, float]) -> tuple[float, float]:
 
 
 def _rising(value: tuple[float, ...]) -> tuple[float, ...]:
-    if list(value) != sorted(value):
+    if list(value) != sorted(value) or value[0] == value[-1]:
         raise ValueError("levels of a tone curve have to rise")
     return value
 
@@ -59,6 +59,8 @@ Positive = Annotated[FiniteFloat, Field(gt=0)]
 NonNegative = Annotated[FiniteFloat, Field(ge=0)]
 Share = Annotated[FiniteFloat, Field(ge=0, le=1)]
 Vector = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
+_Weight = Annotated[FiniteFloat, Field(ge=-8, le=8)]
+Weights = tuple[_Weight, _Weight, _Weight]
 Curve = Annotated[
     tuple[NonNegative, NonNegative, NonNegative, NonNegative, NonNegative], AfterValidator(_rising)
 ]

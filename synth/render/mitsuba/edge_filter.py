@@ -57,13 +57,15 @@ def _along(share: Map) -> Map:
 
 @vectorised
 def _point(xx: Map, xy: Map, yy: Map, along: Map) -> None:
-    for y in range(xx.shape[0]):
-        for x in range(xx.shape[1]):
+    height, width = xx.shape
+    for y in range(height):
+        for x in range(width):
             whole = xx[y, x] + yy[y, x]
             if whole > _FLAT:
                 apart = np.sqrt((xx[y, x] - yy[y, x]) ** 2 + 4 * xy[y, x] ** 2)
                 turn = 0.5 * np.arctan2(2 * xy[y, x], xx[y, x] - yy[y, x])
-                reach = _REACH * apart / whole
+                # Beyond the picture's border nothing is known: the average ends there.
+                reach = min(_REACH, x, y, width - 1 - x, height - 1 - y) * apart / whole
                 along[0, y, x], along[1, y, x] = -np.sin(turn) * reach, np.cos(turn) * reach
 
 
@@ -119,6 +121,8 @@ def _cover(picture: Map, near: Map, behind: Map, cover: Map, along: Map) -> None
                             found[5 + k] += weight * behind[k, top + j, left + i]
             open_here = 1 - cover[y, x]
             open_around = 1 - found[1] / found[0]
+            if open_around < np.float32(1e-3):  # no edge, but a highlight on what covers all
+                continue
             for k in range(3):
                 back = behind[k, y, x] + np.float32(0.05) * found[5 + k] / found[0]
                 back /= open_here + np.float32(0.05) * open_around + np.float32(1e-6)

@@ -78,6 +78,14 @@ def test_over_a_fifth_lost_no_number_is_said_first(make: Maker) -> None:
     assert said.tiles == ()
 
 
+def test_the_first_number_and_its_share_of_the_peak_are_of_one_score(make: Maker) -> None:
+    for meta in ({}, {"press_s": [0.2, 1.2]}):
+        result = run(make("pressed" if meta else "free", meta=meta))
+        method = result.methods[result.main]
+        scores, said = method.calibrated if meta else method.scores, headline(result)
+        assert (said.tiles[0].value, said.of_peak) == (scores["mae_mn"], scores["mae_of_peak"])
+
+
 def test_mean_and_peak_of_a_flow_by_hand() -> None:
     flow = np.zeros((10, 20, 2), np.float32)
     flow[..., 0] = np.arange(200).reshape(10, 20)

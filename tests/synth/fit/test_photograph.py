@@ -45,14 +45,14 @@ def written(path: Path, rgb: np.ndarray, **how: object) -> Path:
 
 
 def test_the_opening_is_found_and_the_instrument_left_out() -> None:
-    with_tool, truth = cortex(scene()), opening()
+    with_tool, truth = cortex(scene(), 0.08), opening()
     rod = np.zeros(truth.shape, np.uint8)
     cv2.line(rod, (640, 480), (360, 270), 1, 20)
     rod = (rod > 0) & truth
     assert (with_tool & rod).sum() < 0.1 * rod.sum()
     assert (with_tool & ~truth).sum() < 0.03 * truth.sum()
     assert (with_tool & truth).sum() > 0.6 * (truth & ~rod).sum()
-    assert (cortex(scene(tool=False)) & truth).sum() > 0.8 * truth.sum()
+    assert (cortex(scene(tool=False), 0.08) & truth).sum() > 0.8 * truth.sum()
 
 
 def test_the_tables_of_a_jpeg_are_read_and_pack_alike() -> None:
