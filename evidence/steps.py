@@ -34,7 +34,7 @@ def run_steps(
 
     Returns:
         `name`, `command`, `commit`, `exit_code` (-1: stopped at its time limit), `wall_s` and `cpu_s` of
-        every step that was run at this commit.
+        these steps.
     """
     logs.mkdir(parents=True, exist_ok=True)
     rows: list[dict[str, Any]] = json.loads(kept.read_text("utf-8"))["steps"] if kept.is_file() else []
@@ -60,4 +60,5 @@ def run_steps(
         rows.append({"name": name, "command": line, "commit": commit, **about})
         typer.echo(f"{name}: exit code {code}, {spent:.0f} s, {cpu:.0f} of the CPU", err=True)
         report.save(kept.parent, kept.name, {"steps": rows})
-    return rows
+    asked = {name for name, _ in steps}
+    return [row for row in rows if row["name"] in asked]

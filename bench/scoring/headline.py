@@ -14,8 +14,6 @@ from learn.uncertainty.out_of_distribution import UNSEEN
 _NEWTONS = ("mae_mn", "mae_of_peak", "r", "ccc", "r2", "ghost_rate")
 _SHAPE = ("r", "shape_error", "lag_s")
 _PRESSED = ("mae_mn", "mae_of_peak", "r2")
-_GUESSED = 0.5
-"""Relative uncertainty from which a number was not stated by anybody."""
 
 
 @dataclass(frozen=True)
@@ -90,12 +88,12 @@ def _trust(result: Result) -> str:
         parts.append(f"it moves {'unlike anything' if unlike else 'as what'} the network was trained on")
     young = f"E = {meta['young_kpa']:.3g} kPa" if result.absolute else "E of 1 kPa, for none is known"
     given = [young + _within(meta.get("young_uncertainty", 0.0))]
-    given.append(f"{result.scale.mm_per_px:.3g} mm/px{_within(result.scale.uncertainty)}")
+    guessed = meta.get("scale_mm_per_px") == "unknown"
+    scale = " (a guess)" if guessed else _within(result.scale.uncertainty)
+    given.append(f"{result.scale.mm_per_px:.3g} mm/px{scale}")
     given.append(f"membrane {meta.get('membrane', 'unknown')}")
     return "; ".join([*parts, f"taken as given: {', '.join(given)}"]) + "."
 
 
 def _within(uncertainty: float) -> str:
-    if uncertainty > _GUESSED:
-        return " (a guess)"
     return f" ± {uncertainty:.0%}" if uncertainty else ""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
@@ -38,12 +39,18 @@ class Chart:
 
     def places(self, pixels: int) -> Floats:
         """World x, y (pixels^2, 2) mm of a map's pixels, row by row."""
-        axis = noise.centres(pixels, self.extent_mm)
-        laid = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2).astype(np.float64)
-        xy = laid
-        for _ in range(_TURNS):  # a contraction, unless it stretches by more than 2.3
-            xy = xy + 0.6 * (laid - self.at(xy))
-        return xy
+        return _places(self, pixels)
+
+
+@lru_cache(maxsize=1)
+def _places(chart: Chart, pixels: int) -> Floats:
+    """As `Chart.places`: sulci and the rim's shade ask one after the other."""
+    axis = noise.centres(pixels, chart.extent_mm)
+    laid = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2).astype(np.float64)
+    xy = laid
+    for _ in range(_TURNS if chart.shift.any() else 0):  # a contraction, below a stretch of 2.3
+        xy = xy + 0.6 * (laid - chart.at(xy))
+    return xy
 
 
 def unroll(height: Callable[[Floats], Floats], plan_mm: float, radius_mm: float) -> Chart:
