@@ -15,19 +15,27 @@ PYTHON ?= $(shell for p in python3.13 python3.12 python3.11 python3; do \
 BIN := .venv/bin
 DEMO := runs/demo
 PYTEST := $(BIN)/python -m pytest -n 2
+# Python compiles what is imported; compiling all that is installed takes as long as installing it.
+INSTALL := $(BIN)/python -m pip install -qq --disable-pip-version-check --no-compile -c constraints.txt
+UNREACHABLE := { echo "the packages could not be installed: is an index of Python packages within reach?" >&2; exit 2; }
 
 .PHONY: demo test trials quick docs evidence setup lint types slurm clean
 .DELETE_ON_ERROR:
 
-setup: .venv/installed .venv/llvm
+setup: .venv/developed .venv/llvm
 
+# `demo` takes what a user needs; everything else takes the tools of development as well, which are thrice as much.
 .venv/installed: pyproject.toml constraints.txt
 	@test -n "$(PYTHON)" || { echo "Python 3.11 or newer is needed: install it, or say make PYTHON=/path/to/python" >&2; exit 2; }
 	@test -x $(BIN)/python || $(PYTHON) -m venv .venv || \
 	  { echo "$(PYTHON) cannot make a virtual environment; on Debian: apt-get install python3-venv" >&2; exit 2; }
-	@echo "installing into .venv (once; some minutes) ..."
-	@$(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e '.[dev]' || \
-	  { echo "the packages could not be installed: is an index of Python packages within reach?" >&2; exit 2; }
+	@echo "installing into .venv (once; half a minute and the time of the download) ..."
+	@$(INSTALL) -e '.[bench]' || $(UNREACHABLE)
+	@touch $@
+
+.venv/developed: .venv/installed
+	@echo "installing what tests need (once; a minute) ..."
+	@$(INSTALL) -e '.[dev]' || $(UNREACHABLE)
 	@touch $@
 
 # The fast renderer needs an LLVM; without one the slow variant does the same work.
@@ -35,7 +43,7 @@ setup: .venv/installed .venv/llvm
 	@$(BIN)/python -m synth.system.llvm_setup
 	@touch $@
 
-demo: setup
+demo: .venv/installed .venv/llvm
 	@mkdir -p $(DEMO)
 	$(BIN)/synth render demo -o $(DEMO)/data
 	$(BIN)/synth verify $(DEMO)/data

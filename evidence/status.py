@@ -17,6 +17,7 @@ from evidence.report import CHECKOUT
 
 _OURS = re.compile(r"(synth|learn|bench|evidence)(\.\w+)+")
 _SCRIPT = re.compile(r"python -m (evidence(?:\.\w+)+)")
+_SCORED = re.compile(r"^\s*bench score", re.M)
 
 
 @dataclass(frozen=True)
@@ -93,7 +94,8 @@ def _status(file: Path, home: Path) -> Status:
     changed = None
     script = _SCRIPT.match(command)
     if script and _file(script[1], home) and _git(home, "cat-file", "-t", commit.rstrip("+")):
-        ours = {str(one.relative_to(home)) for one in closure(script[1], home)}
+        files = closure(script[1], home) | (closure("bench.cli", home) if _SCORED.search(command) else set())
+        ours = {str(one.relative_to(home)) for one in files}
         read = {path: word for path, word in found.get("data", {}).items() if (home / path).exists()}
         other = {path for path, word in read.items() if content(home / path) != word}
         changed = tuple(sorted(ours & _differing(home, commit.rstrip("+")) | other))
