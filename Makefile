@@ -45,12 +45,16 @@ setup: .venv/developed .venv/llvm
 
 demo: .venv/installed .venv/llvm
 	@mkdir -p $(DEMO)
+	@echo && echo "1 of 4: films of brain surfaces that are pushed and pulled, with the force and motion behind every pixel"
 	$(BIN)/synth render demo -o $(DEMO)/data
+	@echo && echo "2 of 4: does the truth agree with the pictures?"
 	$(BIN)/synth verify $(DEMO)/data
+	@echo && echo "3 of 4: a small network learns the force from the motion, then reads films that it has not seen"
 	$(BIN)/learn train $(DEMO)/data -o $(DEMO)/model --preset tiny --input mixed --epochs 30
 	$(BIN)/learn eval $(DEMO)/model $(DEMO)/data
+	@echo && echo "4 of 4: an unseen film as if a camera and a force sensor had recorded it, scored"
 	$(BIN)/bench demo $(DEMO)/data --model $(DEMO)/model -o $(DEMO)
-	@echo "done: open $(DEMO)/report.html"
+	@echo && echo "done: open $(DEMO)/report.html"
 
 test: setup lint types
 	$(PYTEST) -m "not trial"
