@@ -46,19 +46,18 @@ def main(
     chosen = [step for step in steps if only in step[0]]
     rows = run_steps(chosen, work / "steps.json", work / "logs")
     report.show({"steps": rows, "CPU-hours": sum(row["cpu_s"] for row in rows) / 3600})
-    raise typer.Exit(int(any(row["exit_code"] for row in rows)))
+    # A dataset may lack a scene whose load was too much; one that lacks many fails what reads it.
+    made = {name for name, _ in shared(work)}
+    raise typer.Exit(int(any(row["exit_code"] for row in rows if row["name"] not in made)))
 
 
 def shared(work: Path) -> list[Step]:
     """Datasets that several experiments read."""
-    sizes = (("stereo-640", "[640, 480]"), ("stereo-320", "[320, 240]"))
     return [
         _render("mission", "mission", work, sequences=400),
         _render("mission-unseen", _CURVES / "mission-unseen.yaml", work, sequences=80),
-        *(
-            _render(name, "stereo", work, sequences=8, seed=77, **{"render.size": size})
-            for name, size in sizes
-        ),
+        _render("stereo-640", "stereo", work, sequences=8, seed=77, **{"render.size": "[640, 480]"}),
+        _render("stereo-320", "stereo", work, sequences=8, seed=77, **{"render.size": "[320, 240]"}),
     ]
 
 
@@ -84,8 +83,8 @@ def rooms(work: Path) -> list[Step]:
         _script("learn.pareto", "--cache", labels, "--repeats", "60", "--seeds", "1"),
         _script("learn.stability", labels),
         _script(
-            *("curves.experiment", mission, "--unseen", unseen, "--sizes", "30,100,300", "--asked", "60"),
-            *("--choosing", "40", "--work", str(work / "curves")),
+            *("curves.experiment", mission, "--unseen", unseen, "--models", "ridge,d2fnet-s"),
+            *("--sizes", "30,100,300", "--asked", "56", "--choosing", "40", "--work", str(work / "curves")),
         ),
         _script(
             *("gap.experiment", mission, "--unseen", unseen, "--fit", "300", "--epochs", "12"),
