@@ -77,8 +77,8 @@ KEPT = """
 .1% learn/foreign/one-eye/pool.json methods/network and physics/scores/mae_of_peak/mean
 .1% exvivo/two-eyes/pool.json methods/D2FNet/scores/mae_of_peak/mean
 .1% exvivo/one-eye/pool.json methods/D2FNet/scores/mae_of_peak/mean
-.0% learn/curves/curves.json rows/11/along/0
-.0% learn/curves/curves.json rows/9/along/0
+.0% learn/curves/curves.json rows/23/along/0
+.0% learn/curves/curves.json rows/21/along/0
 .0% scoring/together/together.json rows/20/held/0
 .0% scoring/together/together.json rows/2/held/0
 .0% gap/results.json flows/tvl1/closed/force_mae/R/share
