@@ -88,7 +88,7 @@ def rooms(work: Path) -> list[Step]:
         ),
         _script(
             *("gap.experiment", mission, "--unseen", unseen, "--fit", "300", "--epochs", "12"),
-            *("--work", str(work / "gap")),
+            *("--flow", "tvl1", "--work", str(work / "gap")),
         ),
         _script("scoring.together", unseen, "--work", str(work / "together")),
         _script("scoring.pulse", "--seconds", "20", "--count", "2", "--size", "160"),

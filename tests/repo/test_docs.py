@@ -75,8 +75,8 @@ def test_what_a_page_shows_can_be_used(page: Path) -> None:
 KEPT = """
 .1% learn/foreign/two-eyes/pool.json methods/network and physics/scores/mae_of_peak/mean
 .1% learn/foreign/one-eye/pool.json methods/network and physics/scores/mae_of_peak/mean
-.1% exvivo/two-eyes/pool.json methods/D2FNet/scores/mae_of_peak/mean
-.1% exvivo/one-eye/pool.json methods/D2FNet/scores/mae_of_peak/mean
+.1% exvivo/two-eyes/pool.json methods/network and physics/scores/mae_of_peak/mean
+.1% exvivo/one-eye/pool.json methods/network and physics/scores/mae_of_peak/mean
 .0% learn/curves/curves.json rows/23/along/0
 .0% learn/curves/curves.json rows/21/along/0
 .0% scoring/together/together.json rows/20/held/0
