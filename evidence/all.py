@@ -87,8 +87,8 @@ def rooms(work: Path) -> list[Step]:
             *("--sizes", "30,100,300", "--asked", "56", "--choosing", "40", "--work", str(work / "curves")),
         ),
         _script(
-            *("gap.experiment", mission, "--unseen", unseen, "--fit", "300", "--epochs", "12"),
-            *("--flow", "tvl1", "--work", str(work / "gap")),
+            *("gap.experiment", mission, "--unseen", unseen, "--fit", "300", "--epochs", "24"),
+            *("--seeds", "1", "--flow", "tvl1", "--work", str(work / "gap")),
         ),
         _script("scoring.together", unseen, "--work", str(work / "together")),
         _script("scoring.pulse", "--seconds", "20", "--count", "2", "--size", "160"),
