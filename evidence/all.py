@@ -32,7 +32,8 @@ def main(
 ) -> None:
     """Makes kept results anew. Exit code 1 if a step fails; its log is WORK/COMMIT/logs/STEP.log."""
     work = work / (report.commit() or "unknown")
-    steps = [*shared(work), *rooms(work)]
+    data = shared(work)
+    steps = [*data, *rooms(work)]
     if photo is None:
         typer.echo("no --photo: the look and pseudo ex vivo recordings are left out", err=True)
     else:
@@ -47,7 +48,7 @@ def main(
     rows = run_steps(chosen, work / "steps.json", work / "logs")
     report.show({"steps": rows, "CPU-hours": sum(row["cpu_s"] for row in rows) / 3600})
     # A dataset may lack a scene whose load was too much; one that lacks many fails what reads it.
-    made = {name for name, _ in shared(work)}
+    made = {name for name, _ in data}
     raise typer.Exit(int(any(row["exit_code"] for row in rows if row["name"] not in made)))
 
 
