@@ -109,10 +109,12 @@ def page(tree: Mapping[str, Any]) -> report.Page:
         [report.Chart("By stage, two processes side by side", "wall time [s]", bars)],
         (report.Section("", [{"stage": name} | dict(spent) for name, spent in stages.items()]),),
         (
-            f"*{tree['wall_s']:.0f} s, {tree['wall_s'] / tree['seconds']:.1f} times the recording's length, "
-            f"and {memory / 1000:.1f} GB* in two processes: a recording of {tree['seconds']:g} s, "
+            f"**{tree['wall_s']:.0f} s, {tree['wall_s'] / tree['seconds']:.1f} times the recording's length, "
+            f"and {memory / 1000:.1f} GB** in two processes: a recording of {tree['seconds']:g} s, "
             f"{width} x {height} at {tree['fps']:g} a second, no masks; {tree['frames']} frames looked at, "
             "flow on pictures of at least 320 columns. At most twice the length and 2 GB were asked.",
+            "What it says: [network and physics together](together/README.md), [spoilt films]"
+            "(stability/README.md).",
         ),
     )
 

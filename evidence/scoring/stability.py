@@ -71,13 +71,9 @@ Change = Callable[[Film], Film]
 
 
 def main(
-    work: Path,
-    out: Path = report.RESULTS / "scoring/stability",
-    seed: int = 35,
-    only: str = "",
-    foreign: Path | None = None,
+    work: Path, out: Path = report.RESULTS / "scoring/stability", seed: int = 35, only: str = ""
 ) -> None:
-    """Renders into `work`; `only`: a pattern of films; `foreign`: recordings of elsewhere, not spoilt."""
+    """Renders into `work`; `only`: a pattern of films."""
     cv2.setNumThreads(1)
     rows = list[dict[str, Any]]()
     for name, index in _SCENES:
@@ -92,7 +88,7 @@ def main(
             rows.append(row | _judged(after, before, cause))
     found: dict[str, Any] = {"seed": seed, "films": _summary(rows), "undegraded": [], "points": rows}
     if not only:
-        found["undegraded"] = list(_alarms(work, seed + 1000, foreign))
+        found["undegraded"] = list(_alarms(work, seed + 1000))
     report.save(out, "stability.json", found, page(found))
     report.show({key: found[key] for key in ("films", "undegraded")})
 
@@ -242,15 +238,12 @@ def _summary(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     return lines
 
 
-def _alarms(work: Path, seed: int, foreign: Path | None) -> Iterator[dict[str, Any]]:
+def _alarms(work: Path, seed: int) -> Iterator[dict[str, Any]]:
     """What is said of films as they are, which nothing here was tuned on."""
-    sets = {name: _rendered(work, name, seed, _CLEAN) for name in _JOBS}
-    if foreign:
-        sets["elsewhere"] = sorted(path.parent for path in foreign.glob("*/meta.yaml"))
-    for name, folders in sets.items():
-        said = Counter[str]()
+    for name in _JOBS:
+        folders, said = _rendered(work, name, seed, _CLEAN), Counter[str]()
         for folder in folders:
-            where = _written(_read(folder), work) if name in _JOBS else folder
+            where = _written(_read(folder), work)
             said.update({one.split(":")[0] for one in _scored(where, 1.0)["said"]} or {"nothing"})
         line = ", ".join(f"{k}: {n}" for k, n in said.items())
         yield {"films": name, "count": len(folders), "said of": line}
@@ -266,7 +259,8 @@ def page(found: dict[str, Any]) -> report.Page:
         f"**{silent or 'None'} of {len(films)} ways to spoil a film moved the force out of its interval "
         f"unsaid.** {len(shown)} made the error worse or weren't always named (the rest: in the data).",
         "Two scenes each, one with tissue from edge to edge. Errors are of the peak, in the median. *Worse*: "
-        "more than doubled and above a tenth of the peak, there or over time. *Named*: a warning says why.",
+        "more than doubled and above a tenth of the peak, there or over time. *Named*: a warning says why. "
+        "*Unsaid*: without any warning that the film unspoilt doesn't have.",
     ]
     sections = [
         report.Section("Spoilt", [{key: row[key] for key in columns} for row in shown]),

@@ -150,9 +150,9 @@ def page(found: dict[str, Any]) -> report.Page:
         f"**Together they err by {two['whole'][0]:.0%} of the force with two eyes and by "
         f"{one['whole'][0]:.0%} with one. Their 90% intervals hold {two['held'][0]:.0%} and "
         f"{one['held'][0]:.0%} of frames.**",
-        f"{one['sequences']} sequences of looks that no network was fitted on and that chose no constant of "
-        "any method; the membrane isn't stated (where it is: in the data). *Force*: error as a vector, root "
-        "mean square over that of the force. *Bias*: of the peak. 95% intervals over sequences.",
+        f"{one['sequences']} sequences of a look that no network was fitted on; others of that look chose "
+        "the methods' constants; the membrane isn't stated (where it is: in the data). *Force*: error as a "
+        "vector, root mean square over that of the force. *Bias*: of the peak. 95% intervals over sequences.",
     )
     return report.Page("Network and physics together", found, [], [report.Section("", rows)], words)
 
