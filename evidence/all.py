@@ -96,7 +96,7 @@ def rooms(work: Path) -> list[Step]:
         ),
         _script("scoring.together", unseen, "--work", str(work / "together")),
         _script("scoring.pulse", "--seconds", "20", "--count", "2", "--size", "160"),
-        _script("scoring.cost", "learn/models/mono", "--train", mission),
+        _script("scoring.cost", "learn/models/mono"),
         _script("scoring.stability", str(work / "films")),
         _script("mechanics.experiment", "--fit", "35", "--test", "12", "--work", str(work / "mechanics")),
         _script("end_to_end.pareto", "--fit", "40", "--test", "24", "--work", str(work / "end-to-end")),

@@ -1,6 +1,6 @@
-"""What scoring costs: a minute of video made for it, every method asked, the command's time and memory.
+"""What scoring costs: a minute of video made for it, the command's time and memory.
 
-Run: python -m evidence.scoring.cost MODEL --train DATASET
+Run: python -m evidence.scoring.cost MODEL
 """
 
 from __future__ import annotations
@@ -31,15 +31,14 @@ _FPS, _SIZE = 30.0, (680, 480)
 
 def main(
     model: Annotated[Path, typer.Argument(help="Model folder of `learn train`.")],
-    train: Annotated[Path, typer.Option(help="Its training data: the simpler methods are asked too.")],
     out: Annotated[Path, typer.Option(help="Folder for the results.")] = report.RESULTS / "scoring",
     seconds: Annotated[float, typer.Option(min=2, help="Length of the recording.")] = 60.0,
 ) -> None:
-    """Time and memory of `bench score` on a recording of a moved texture, all methods in the table."""
+    """Time and memory of `bench score` on a recording of a moved texture."""
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch, "recording")
         record(folder, seconds)
-        words = ["score", str(folder), "--model", str(model), "--train", str(train), "-o", scratch]
+        words = ["score", str(folder), "--model", str(model), "-o", scratch]
         began = time.perf_counter()
         done = subprocess.run([sys.executable, "-m", "bench", *words], capture_output=True, text=True)
         wall = time.perf_counter() - began
@@ -47,7 +46,7 @@ def main(
             raise UserError(f"the scoring failed: {done.stderr.strip().splitlines()[-1]}")
         scored = json.loads(Path(scratch, "score.json").read_text())
     found = {
-        "data": status.data(model, train),
+        "data": status.data(model),
         "seconds": seconds,
         "fps": _FPS,
         "size": list(_SIZE),

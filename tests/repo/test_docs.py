@@ -77,10 +77,10 @@ KEPT = """
 .1% learn/foreign/one-eye/pool.json methods/network and physics/scores/mae_of_peak/mean
 .1% exvivo/two-eyes/pool.json methods/network and physics/scores/mae_of_peak/mean
 .1% exvivo/one-eye/pool.json methods/network and physics/scores/mae_of_peak/mean
-.0% learn/curves/curves.json rows/23/along/0
-.0% learn/curves/curves.json rows/21/along/0
 .0% scoring/together/together.json rows/20/held/0
 .0% scoring/together/together.json rows/2/held/0
+.0% learn/curves/curves.json rows/23/along/0
+.0% learn/curves/curves.json rows/21/along/0
 .0% gap/results.json flows/tvl1/closed/force_mae/R/share
 .2f flow/benchmark/results.json rows/0/measured
 .1% fem/relief/relief.json summary/0/peak_median
