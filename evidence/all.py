@@ -118,7 +118,8 @@ def exvivo(work: Path, photo: Path) -> list[Step]:
     for number, eyes, model in ((1, "one-eye", "mono"), (2, "two-eyes", "stereo")):
         made = work / f"exvivo-{eyes}"
         about = ("--count", str(_EXVIVO), "--seconds", "30", "--fps", "10", "--eyes", str(number))
-        films = _script("scoring.exvivo", "--out", str(made), *about, "--photo", str(photo))
+        _, words = _script("scoring.exvivo", "--out", str(made), *about, "--photo", str(photo))
+        films = f"exvivo {eyes}", words
         folders = [made / f"{k:03d}" for k in range(_EXVIVO)]
         steps += [films, *_scored(f"exvivo {eyes}", films, folders, model, report.RESULTS / "exvivo" / eyes)]
     return steps

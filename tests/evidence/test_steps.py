@@ -16,9 +16,9 @@ PYTHON = Path("python")
 
 def test_every_script_takes_what_its_step_gives_it(tmp_path: Path) -> None:
     steps = [*everything.rooms(tmp_path), *everything.look(PYTHON), *everything.exvivo(tmp_path, PYTHON)]
-    steps += everything.foreign(tmp_path, PYTHON, PYTHON)
+    steps += [*everything.foreign(tmp_path, PYTHON, PYTHON), *everything.shared(tmp_path)]
     scripts = [words[1:] for _, words in steps if words[1].startswith("evidence.")]
-    assert len(scripts) > 25
+    assert len({name for name, _ in steps}) == len(steps) > len(scripts) > 25  # its name finds a step's log
     for module, *words in scripts:
         app = typer.Typer()
         app.command()(import_module(module).main)
