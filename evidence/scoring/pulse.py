@@ -179,7 +179,7 @@ def page(tree: Mapping[str, Any]) -> report.Page:
         (report.Section("", rows),),
         (
             f"**With the beat taken off no method errs by over {worst:.2f} times its error on still tissue "
-            f"({_ASKED:g} was asked).** Found (median): {', '.join(dict.fromkeys(beats))}; on still tissue "
+            f"({_ASKED:g} was asked).** Found, by recording: {', '.join(beats)}; on still tissue "
             f"{on_still or 'nothing'}.",
             f"{tree['count']} recordings of {tree['seconds']:g} s, {tree['size']} px: FEM contacts of 15 to "
             f"40 mN on linear tissue. Heart {_HEART[0]:g} mm at {_HEART[1]:g} Hz, breath {_BREATH[0]:g} mm "
