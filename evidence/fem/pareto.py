@@ -49,7 +49,7 @@ def main(
     """Error against CPU time a frame by law and size, and costs.
 
     `load`: P = F/(E a^2) at which laws are compared; `refined`: tetrahedra of the references; `contacts`: how
-    many of four; `brain`: a surface in mm, its opening outwards along `direction`.
+    many of four.
     """
     on = fem_case.patch()
     found: Row = {

@@ -1,6 +1,6 @@
-"""Motion in three dimensions from two eyes: error, bias, z-scores and cost; rest disparity of a real pair.
+"""Motion in three dimensions from two eyes: error, bias, z-scores and cost.
 
-Run: python -m evidence.flow.stereo data-640 data-320 --pair motorcycle
+Run: python -m evidence.flow.stereo data-640 data-320
 """
 
 from __future__ import annotations
@@ -20,18 +20,15 @@ from evidence import report, status
 from synth.checks import optics, stereo
 from synth.dataset.store import Dataset, Sequence
 from synth.flow import mask_detection
-from synth.flow.stereo import rest
 from synth.flow.stereo.rig import Eye, StereoRig
 from synth.flow.stereo.track import StereoTracker, still_frames
 from synth.flow.track import track
-from synth.system.checked_file import read_picture
 
 Floats = NDArray[np.floating]
 Flags = NDArray[np.bool_]
 
 _EVERY = 7  # of the seen pixels one in so many is measured
 _CONTACT, _DEEP_MM = 0.05, 0.1  # pressed: load above this share of its peak, and moved so far in depth
-_OFF_PX = 2.0
 
 
 Sample = tuple[Floats, Floats, Floats, Flags]
@@ -40,13 +37,10 @@ Sample = tuple[Floats, Floats, Floats, Flags]
 
 def main(
     data: Annotated[list[Path], typer.Argument(help="Stereo datasets, of seeds that nothing was chosen on.")],
-    pair: Annotated[
-        Path | None, typer.Option(help="Folder of a real rectified pair: left.png, right.png, disp.npz.")
-    ] = None,
     count: Annotated[int, typer.Option(help="Sequences of each dataset.")] = 100,
     out: Path = report.RESULTS / "flow/stereo",
 ) -> None:
-    """Depth motion from two eyes by resolution, and the rest disparity of a real pair."""
+    """Depth motion from two eyes by resolution."""
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
     rows = []
@@ -60,7 +54,7 @@ def main(
             | figures([sample for one in measured for sample in one[0]])
             | {"cost_ratio": ratio, "epipolar_px": float(np.median([one[3] for one in measured]))}
         )
-    found = {"data": status.data(*data), "rows": rows, "pair": [] if pair is None else real_pair(pair)}
+    found = {"data": status.data(*data), "rows": rows}
     report.save(out, "stereo.json", found, page(found))
     report.show(found)
 
@@ -121,27 +115,6 @@ def _rig(sequence: Sequence) -> StereoRig:
     return StereoRig(*eyes, np.eye(3), right.translation - left.translation, left.size)
 
 
-def real_pair(folder: Path) -> list[dict[str, Any]]:
-    """Pixels off by more than 2 px on a real rectified pair whose disparity is known."""
-    left, right = (_grey(folder / f"{eye}.png") for eye in ("left", "right"))
-    archive = np.load(folder / "disp.npz")
-    truth = archive[archive.files[0]].astype(np.float32)
-    known = np.isfinite(truth) & (truth > 0)
-    every = np.ones(truth.shape, bool)
-    rows = []
-    for method, refine in (("OpenCV SGBM, holes count", False), ("ours", True)):
-        found = rest.match(left, right, every, every, (0, int(np.nanmax(truth[known])) + 8), refine=refine)
-        off = np.abs(found.disparity - truth)
-        bad = (off > _OFF_PX) | (~found.found & (not refine))
-        shares = {"off_by_2px": float(bad[known].mean()), "median_px": float(np.median(off[known]))}
-        rows.append({"method": method} | shares)
-    return rows
-
-
-def _grey(path: Path) -> NDArray[np.float32]:
-    return np.asarray(read_picture(path)[..., ::-1] @ np.array([0.2, 0.6, 0.2], np.float32), np.float32)
-
-
 _ASKED = (
     ("depth_rms_mm", "Depth motion, rms over seen tissue [mm]", {"640 x 480": 0.04, "320 x 240": 0.10}),
     ("pressed_bias", "Its bias under pressed contact (size)", {"640 x 480": 0.05}),
@@ -164,8 +137,6 @@ def page(found: Mapping[str, Any]) -> report.Page:
         report.Chart("Calibrated at 1", "quantile of |error| / deviation, over 1 and 2", report.bars(scores)),
     ]
     sections = [report.Section("By dataset", found["rows"])]
-    if found["pair"]:
-        sections.append(report.Section("Rest disparity of a real pair", found["pair"]))
     return report.Page("Two eyes: motion in three dimensions", found, charts, sections)
 
 
