@@ -24,22 +24,21 @@ from torch import Tensor
 
 from learn.data.grid import Scales
 from learn.network.d2fnet import Architecture, D2FNet
-from learn.settings import TrainingSettings, upgraded
+from learn.settings import TrainingSettings
 from learn.uncertainty.intervals import Intervals
 from synth.errors import UserError, as_user_error
-from synth.job import identity, retired
+from synth.formats import MODEL, check_format
+from synth.job import identity
 from synth.job.types import Positive
 from synth.system import checked_file
 from synth.system.checked_file import write_whole
-from synth.system.config_file import find_mistakes
+from synth.system.config_file import first_mistake
 
-_FORMAT, _VERSION = "sulcus-model", 1
+_FORMAT = "sulcus-model"
 _LARGEST_BYTES = 100_000_000
 """Of config.json, which names the sequences that were trained on: a million of them."""
 _LARGEST_WEIGHTS = 64 << 30
 _WEIGHTS, _NEXT, _SAFE = "weights.pt", "weights.next.pt", "weights.safetensors"
-_OF_MAP = ("map", "contact", "map_unit")
-"""Blocks of intervals that older cards hold of the map's cells: no more used."""
 _digest: Any = partial(hashlib.blake2b, digest_size=16)
 SEEN = ("fit", "select", "intervals")
 """Parts of `ModelCard.split` that no score of the model may be of."""
@@ -61,7 +60,7 @@ class ModelCard:
     groups: dict[str, list[str]]
     """The anatomies of each, so that a sequence of a seen anatomy is never taken for unseen."""
     dataset_splits: list[str] = field(default_factory=list)
-    """Hash of the split of each dataset that it was trained on; older cards have none."""
+    """Hash of the split of each dataset that it was trained on."""
     epoch: Annotated[int, Field(ge=0)] = 0
     score: FiniteFloat = 0.0
     """R² on the select sequences at the chosen epoch, of the network's own map, before `force_gain`."""
@@ -74,8 +73,6 @@ class ModelCard:
     """How far off its answers may be; None where nobody fitted that, or it could not be."""
     no_intervals: str = ""
     """Why it could not be; empty if it could, or nobody tried."""
-    retired: dict[str, Any] = field(default_factory=dict)
-    """Training settings that this version has no more, by dotted key: it can be used, not trained on."""
 
 
 _CARD = TypeAdapter(ModelCard)
@@ -84,7 +81,7 @@ _CARD = TypeAdapter(ModelCard)
 def write_card(folder: Path, card: ModelCard) -> None:
     """Writes config.json into a model's folder, whole or not at all."""
     folder.mkdir(parents=True, exist_ok=True)
-    tree = {"format": _FORMAT, "version": _VERSION, **_CARD.dump_python(card, mode="json")}
+    tree = {"format": _FORMAT, "format_version": MODEL, **_CARD.dump_python(card, mode="json")}
     tree["seal"] = _hash(identity.canonical(tree))
     _write(folder / "config.json", (json.dumps(tree, indent=1) + "\n").encode())
 
@@ -116,30 +113,14 @@ def read_card(folder: Path) -> ModelCard:
         tree = json.loads(data)
         if tree.pop("seal", None) != _hash(identity.canonical(tree)):
             raise UserError(f"{file}: is not as it was written: edited or damaged")
-        rest = {key: value for key, value in tree.items() if key not in ("format", "version")}
-        if (tree["format"], tree["version"]) != (_FORMAT, _VERSION):
-            raise UserError(f"{file}: not a model of this version")
-        return _CARD.validate_json(json.dumps(_upgraded(rest, file)), strict=True)
+        if tree.pop("format") != _FORMAT:
+            raise UserError(f"{file}: not a model of ours")
+        check_format(tree.pop("format_version", 1), MODEL, str(file))
+        return _CARD.validate_json(json.dumps(tree), strict=True)
     except ValidationError as error:
-        mistakes = list(find_mistakes(error))
-        unknown = next((one for one in mistakes if one.of_key), None)
-        what = "made by another version of this program" if unknown else "corrupt model configuration"
-        raise UserError(f"{file}: {what} ({unknown or mistakes[0]})") from None
+        raise UserError(f"{file}: corrupt model configuration ({first_mistake(error)})") from None
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise UserError(f"{file}: corrupt model configuration ({str(error)[:200]})") from None
-
-
-def _upgraded(tree: dict[str, Any], file: Path) -> dict[str, Any]:
-    """A card as this version writes it. Raises UserError for a network that it can't build."""
-    settings, gone = upgraded(tree["settings"])
-    lost = [str(one) for one in retired.mistakes(gone) if one.at[0] == "arch"]
-    if lost:
-        raise UserError(f"{file}: {'; '.join(lost)}")
-    intervals = tree.get("intervals")
-    if isinstance(intervals, dict):
-        intervals = {key: value for key, value in intervals.items() if key not in _OF_MAP}
-    gone = tree.get("retired", {}) | gone
-    return tree | {"settings": settings, "intervals": intervals, "retired": gone}
 
 
 def save_tensors(file: Path, tree: Mapping[str, Any]) -> None:

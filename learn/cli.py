@@ -76,12 +76,12 @@ def train_command(
     from learn.data.clips import sources
     from learn.evaluation.fit_intervals import add_intervals
     from learn.inference.predict import load_model
-    from learn.settings import override
     from learn.settings import preset as named
     from learn.training.sides import divide
     from learn.training.threads import make_fabric, set_threads
     from learn.training.train import train
     from synth.system.checked_file import made_folder
+    from synth.system.config_file import override
 
     set_threads(threads)
     dataset, given = _sorted_out(str(dataset), changes or [])

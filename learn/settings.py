@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import Field, model_validator
@@ -12,9 +12,7 @@ from learn.data.grid import Grid
 from learn.loss import Loss
 from learn.network.d2fnet import Architecture
 from synth.errors import UserError
-from synth.job import retired
 from synth.job.types import NonNegative, Positive, Section
-from synth.system import config_file
 
 Count = Annotated[int, Field(ge=0)]
 AtLeastOne = Annotated[int, Field(ge=1)]
@@ -137,7 +135,6 @@ PRESETS: dict[str, TrainingSettings] = {
 
 def preset(name: str, **changes: Any) -> TrainingSettings:
     """A preset with some settings replaced. Raises UserError for an unknown name."""
-    name = retired.PRESETS.get(name, name)
     if name not in PRESETS:
         raise UserError(f"unknown preset {name!r}: one of {', '.join(PRESETS)}")
     return replace(PRESETS[name], **changes)
@@ -163,46 +160,3 @@ def as_changes(words: Iterable[str]) -> tuple[dict[str, str], list[str]]:
     if "input" in changes:
         changes.setdefault("arch.depth", str(has_depth(changes["input"])))
     return changes, others
-
-
-def override(settings: TrainingSettings, changes: Iterable[str]) -> TrainingSettings:
-    """Settings with `key=value` or `arch.key=value` replaced, values in YAML.
-
-    Raises UserError: a line for each unknown key (with the nearest one) and each value that can't be.
-    """
-    changes = list(changes)
-    for key, _, value in (one.partition("=") for one in changes):
-        if key.strip() in _SPLIT:
-            raise UserError(f"{key}: is gone: a dataset has one split, and `synth split` makes another")
-        if key.strip() in retired.TRAINING:
-            raise UserError(str(*retired.mistakes({key.strip(): value})))
-    return config_file.override(settings, changes)
-
-
-_FRAMED = {"kind": "hinge", "r2_weight": 0.5, "r2_scope": "frame", "total_weight": 0.0}
-_OBJECTIVES: dict[str, dict[str, Any]] = {
-    "mse": {"kind": "mse", "total_weight": 0.0},
-    "mse-frame": {**_FRAMED, "stray_weight": 0.0},
-    "ghostless": {**_FRAMED, "stray_weight": 8.0, "stray_cap": 0.0, "ramp": [0.25, 0.75], "free": 0.01},
-    "antighost": {
-        **{"kind": "antighost", "r2_weight": 0.3, "r2_scope": "batch", "ghost_weight": 3.0},
-        **{"low": 0.05, "rule": "pixel", "total_weight": 0.0},
-    },
-}
-"""What of a block `objective`, as older cards have it, makes each loss."""
-_SPLIT = ("folds", "fold", "held_out_family", "share_anatomy")
-"""Settings that once decided who is fitted: a card's `split` says who was."""
-
-
-def upgraded(tree: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Settings as an older version wrote them: `(settings, others)`, as this one has them, and what it has no
-    more, by dotted key."""
-    settings, others = retired.drop(tree, retired.TRAINING)
-    for key in _SPLIT:
-        settings.pop(key, None)
-    objective = settings.pop("objective", None)
-    if objective is not None:
-        same = [k for k, v in _OBJECTIVES.items() if all(objective.get(key) == v[key] for key in v)]
-        settings["loss"] = same[0] if same else "mse"
-        others |= {} if same else {"objective": objective}
-    return settings, others

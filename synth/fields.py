@@ -6,9 +6,6 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal
 
-FORMAT_VERSION = 1
-"""Of the stores; raised when a reader of the older one would misread the newer."""
-
 TIME, ROW, COLUMN = "frame", "row", "column"
 
 

@@ -109,15 +109,11 @@ def pool(found: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 
 def _identity(tree: dict[str, Any], name: str) -> str:
-    """What tells a method from others: of a network its hash, of a plug-in its version too, else the name.
-
-    Scores of before networks had a hash are told apart by what they say of their network.
-    """
+    """What tells a method from others: of a network its hash, of a plug-in its version too, else the name."""
     about = tree["settings"]
     if network := about.get("networks", {}).get(name):
         return str(network["hash"])
-    old = about.get("model", "") if name == tree["main"] else ""
-    return f"{name} {about.get('plug_ins', {}).get(name, '')} {old}"
+    return f"{name} {about.get('plug_ins', {}).get(name, '')}"
 
 
 def _fault(tree: dict[str, Any]) -> str:

@@ -81,7 +81,7 @@ class Clip:
     motion_confidence: NDArray[np.float32] | None = None
     """(T, 2, N, N) 0..1 of the motion that two eyes recover, across and along the view; None without it."""
     opening: str = ""
-    """Which place of a user's brain it shows; empty of procedural ones, and of older stores."""
+    """Which place of a user's brain it shows; empty of procedural ones."""
     membrane: MembraneState = "unknown"
     """Whether its tissue has one; unknown of what was never simulated."""
 

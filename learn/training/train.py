@@ -31,7 +31,6 @@ from learn.training.log import Log
 from learn.training.threads import make_fabric
 from synth.dataset.split import find_crossings
 from synth.errors import UserError, as_user_error
-from synth.job import retired
 from synth.system.terminal import ProgressCallback
 
 CLIP = 1.0
@@ -285,9 +284,6 @@ def _open(out: Path, card: ModelCard) -> dict[str, Any] | None:
         checkpoint.write_card(out, card)
         return None
     there = checkpoint.read_card(out)
-    if there.retired:
-        gone = ", ".join(there.retired)
-        raise UserError(f"{out}: was trained with another {gone}; only commit {retired.LAST} goes on with it")
     if there.settings != replace(card.settings, epochs=there.settings.epochs):
         raise UserError(f"{out}: holds a model trained with other settings; choose another folder")
     if there.split != card.split or there.scales != card.scales:

@@ -48,8 +48,6 @@ def contact(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
     at_rest, tips = camera_of(sequence), np.asarray(instruments[0]["tip_mm"], np.float64)
     scenario, time = sequence.attrs["scenario"], sequence["time"][:]
     footprint = float(scenario["gesture"]["footprint_mm"])
-    # Over the relief a rigid tip's load may be anywhere under it.
-    spread = 1.0 if sequence.attrs["mechanics"].get("contact") == "rigid" else 0.1
     poses = _poses(sequence, at_rest, time)
     area, inside = sequence["area"][:], inner(sequence["tissue"][:], 2)
     rows, columns = np.indices(sequence.size)
@@ -66,7 +64,7 @@ def contact(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
         view = replace(at_rest, rotation=poses[t, :3, :3], translation=poses[t, :3, 3])
         tip = cameras.to_pixels(view, cameras.to_camera(view, tips[t].reshape(-1, 3))).mean(axis=0)
         off = float(np.hypot(x - tip[0], y - tip[1])) * view.mm_per_px
-        yield Measure(off, spread * footprint + view.mm_per_px, f"frame {t}", "mm")
+        yield Measure(off, 0.1 * footprint + view.mm_per_px, f"frame {t}", "mm")
 
 
 def _poses(sequence: Sequence, at_rest: cameras.Camera, time: Floats) -> Floats:

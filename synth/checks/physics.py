@@ -51,15 +51,13 @@ def compliance(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
 
     2 energy / |force|^2 is the loaded mean of the displacement along the force, per force. With a pulse, the
     tools' work on the motion that is theirs stands for the energy; the pulse's own work is known to a tenth
-    (a neo-Hookean law's answer to it is taken as linear). Left out are motion with inertia or relaxation,
-    where the past counts too, and rigid tips of older stores, which touch another relief as they slide.
+    (a neo-Hookean law's answer to it is taken as linear). Motion with inertia or relaxation, where the past
+    counts too, is left out.
     """
     mechanics = sequence.attrs.get("mechanics") or {}
     raised = mechanics.get("pulse_work_mn_mm")
-    # Sequences from before `elastic` was stored: among the named jobs only `paper` has inertia, and this law.
-    elastic = mechanics.get("elastic", mechanics.get("law") != "corotational")
     known = "tool_work_mn_mm" if raised is not None else "energy_mn_mm"
-    if not (elastic or raised is not None) or known not in mechanics or mechanics.get("contact") == "rigid":
+    if not (mechanics.get("elastic") or raised is not None) or known not in mechanics:
         return
     instruments = mechanics["instruments"]
     if raised is not None and len(instruments) > 1:

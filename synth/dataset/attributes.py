@@ -8,7 +8,7 @@ from typing import Annotated, Any
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from synth.errors import UserError
-from synth.fields import FORMAT_VERSION
+from synth.formats import STORE, check_format
 from synth.system.checked_file import LARGEST_PIXELS
 from synth.system.config_file import first_mistake
 
@@ -33,7 +33,6 @@ class _Scenario(BaseModel):
     family: str | None = None
     gesture: _Gesture | None = None
     further: list[_Gesture] | None = None
-    relief: dict[str, Any] | None = None
 
 
 class Attributes(BaseModel):
@@ -72,9 +71,7 @@ def check_attributes(attrs: Mapping[str, Any], where: str) -> None:
     """
     if attrs.get("format") != FORMAT:
         raise UserError(f"{where}: is a Zarr store, but not a sequence of ours")
-    if attrs.get("format_version") != FORMAT_VERSION:
-        found = str(attrs.get("format_version"))[:40]
-        raise UserError(f"{where}: has format version {found}; this program reads version {FORMAT_VERSION}")
+    check_format(attrs.get("format_version"), STORE, where)
     try:
         width, height = Attributes.model_validate(dict(attrs)).size
     except ValidationError as error:

@@ -18,7 +18,8 @@ from pydantic import BaseModel, ValidationError
 
 from synth.dataset import location, provenance
 from synth.errors import UserError
-from synth.job import identity, retired, writer
+from synth.formats import FOLDER, check_format
+from synth.job import identity, writer
 from synth.job.schema import Job
 from synth.plugins import STORED
 from synth.system import checked_file
@@ -33,9 +34,10 @@ _STATE = ".run"
 class _Described(BaseModel):
     """What `dataset.json` holds."""
 
+    format_version: int = 1
     identity: str
     job: dict[str, Any]
-    generators: list[dict[str, str]] = []
+    generators: list[dict[str, str]]
 
 
 class Folder:
@@ -51,23 +53,23 @@ class Folder:
         self.turn = 0
 
     def described(self) -> dict[str, Any]:
-        """`{"identity", "generators", "job"}` as first written. UserError if this is no dataset of ours."""
+        """What `dataset.json` holds. UserError if this is no dataset of ours, or its format is not read."""
         if not os.path.lexists(self.root / _NAME):
             raise UserError(f"{self.root}: holds no dataset ({_NAME} is missing)")
         found = checked_file.read_json(self.root / _NAME)
         try:
-            return _Described.model_validate(found).model_dump(exclude_unset=True)
+            described = _Described.model_validate(found)
         except ValidationError as error:
             raise UserError(f"{self.root / _NAME}: is damaged ({first_mistake(error)})") from None
+        check_format(described.format_version, FOLDER, str(self.root / _NAME))
+        return described.model_dump()
 
     def job(self) -> Job:
-        """The dataset's job, less retired keys: what is stored needs neither them nor plug-ins to be read."""
+        """The dataset's job; the plug-ins that it names need not be installed."""
         try:
-            values = retired.drop(self.described()["job"], retired.JOB)[0]
-            return Job.model_validate(values, context=STORED)
+            return Job.model_validate(self.described()["job"], context=STORED)
         except ValidationError as error:
-            why = first_mistake(error)
-            raise UserError(f"{self.root / _NAME}: is damaged or of another version ({why})") from None
+            raise UserError(f"{self.root / _NAME}: is damaged ({first_mistake(error)})") from None
 
     def sealed(self) -> list[int]:
         """Indices of the finished sequences, in order."""
@@ -162,8 +164,10 @@ def claim(root: Path, job: Job, *, mix_versions: bool = False) -> Iterator[Folde
             _refuse_foreign(folder, job, name)
             for own in (folder.state / "failed", folder.logs, folder.scratch):
                 own.mkdir(exist_ok=True)
-            described = {"identity": name, "generators": makers, "job": job.model_dump(mode="json")}
-            write_whole(root / _NAME, json.dumps(described, indent=1) + "\n")
+            described = _Described(
+                format_version=FOLDER, identity=name, job=job.model_dump(mode="json"), generators=makers
+            )
+            write_whole(root / _NAME, described.model_dump_json(indent=1) + "\n")
             head = "# The job of this dataset, every value said.\n"
             write_whole(root / "job.yaml", head + writer.dump_job(job))
             folder.pass_turn()
@@ -195,10 +199,7 @@ def _refuse_foreign(folder: Folder, job: Job, name: str) -> None:
         return
     described = folder.described()
     if described["identity"] != name:
-        before, gone = retired.drop(described["job"], retired.JOB)
-        if gone:
-            raise UserError(f"{root}: {'; '.join(map(str, retired.mistakes(gone)))}")
-        changes = _changes(before, job.model_dump(mode="json"))
+        changes = _changes(described["job"], job.model_dump(mode="json"))
         what = ", ".join(changes[:4]) or "another mesh or photograph"
         raise UserError(f"{root}: holds the dataset of another job ({what}), choose another folder")
     count = folder.job().sequences
@@ -219,7 +220,7 @@ def _makers(folder: Folder, mix: bool) -> list[dict[str, str]]:
     now, count = provenance.generator(), len(folder.sealed()) if folder.root.is_dir() else 0
     if not count:
         return [now]
-    before: list[dict[str, str]] = folder.described().get("generators", [])
+    before: list[dict[str, str]] = folder.described()["generators"]
     if now in before and (mix or len(before) == 1):
         return before
     if mix:

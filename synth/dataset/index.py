@@ -100,9 +100,7 @@ def read_index(root: Path) -> pa.Table:
 
 
 def read_split(root: Path, *, required: bool = True) -> DatasetSplit:
-    """The one split of the dataset in `root`, as stored; of an older one, the split that its index shows.
-
-    That is derived from what the sealed stores say, not from the index, which may be edited.
+    """The one split of the dataset in `root`, as stored, else as `write_index` will make it of its stores.
 
     Raises:
         UserError: `required`, and there are too few groups to split.
@@ -135,14 +133,6 @@ def write_index(folder: Folder) -> list[dict[str, Any]]:
     it; sequences that came since get a side, and the others keep theirs.
     """
     rows, stored = _rows(folder), split.read_stored(folder.root)
-    if not stored.sides:  # an older version stored them here alone
-        for row in rows:
-            if row.get("split") not in (None, *split.SIDES):
-                words = f"sequence {row['index']} is in {row['split'][:40]!r}, no side of a split"
-                raise UserError(
-                    f"{folder.root / NAME}: {words}: remove the file, `synth report` writes it anew"
-                )
-        stored = _dealt(rows, [row.get("split") for row in rows], stored)
     sides = split.assign_if_possible(rows, stored)
     for row, side in zip(rows, sides, strict=True):
         row["split"] = side

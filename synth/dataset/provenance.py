@@ -7,7 +7,7 @@ import json
 from functools import cache
 from pathlib import Path
 
-from synth.fields import FORMAT_VERSION
+from synth.formats import STORE
 from synth.system import packages
 
 HOME = Path(__file__).parents[2]
@@ -22,7 +22,7 @@ def generator() -> dict[str, str]:
 
     `code` is a hash of the files of the rooms that make a sequence, comments included.
     """
-    return {"format": str(FORMAT_VERSION), "code": code(*_MAKING), **_computing()}
+    return {"format": str(STORE), "code": code(*_MAKING), **_computing()}
 
 
 @cache

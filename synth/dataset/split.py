@@ -46,7 +46,7 @@ class DatasetSplit:
     apart_mm: FiniteFloat = 0.0
     """By opening: those of one brain that are nearer to each other show the same tissue, and are one."""
     sides: Mapping[str, Side] = field(default_factory=dict)
-    """By content hash. Older versions stored none: `synth.dataset.index.read_split` derives them."""
+    """By content hash."""
 
     @property
     def hash(self) -> str:
@@ -238,13 +238,9 @@ def join_groups(*keys: Sequence[Hashable]) -> list[int]:
 
 
 def name_anatomy(attrs: Mapping[str, Any]) -> str:
-    """What names a sequence's anatomy across datasets: `anatomy_id`, in older stores the seed of the relief;
-    a sequence with neither is alone. All sequences of one user's brain are one anatomy."""
-    named = attrs.get("anatomy_id")
-    if named is not None:
-        return str(named)
-    seed = ((attrs.get("scenario") or {}).get("relief") or {}).get("seed")
-    return str(attrs["content_hash"]) if seed is None else f"seed-{seed}"
+    """The name of a sequence's anatomy across datasets; a sequence that states none has one of its own. All
+    sequences of one user's brain are one anatomy."""
+    return str(attrs.get("anatomy_id") or attrs["content_hash"])
 
 
 def _groups(rows: Sequence[Mapping[str, Any]], chosen: DatasetSplit) -> list[str]:

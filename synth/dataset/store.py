@@ -17,7 +17,8 @@ from zarr.codecs import BloscCodec, Crc32cCodec
 from synth.dataset import fast_read, location, provenance
 from synth.dataset.attributes import FORMAT, LARGEST_BYTES, check_attributes
 from synth.errors import InvalidValue, NotFinite, UserError, as_path, did_you_mean
-from synth.fields import FIELDS, FORMAT_VERSION, Field
+from synth.fields import FIELDS, Field
+from synth.formats import STORE
 from synth.job import identity
 from synth.job.schema import Job
 from synth.system import packages
@@ -59,7 +60,7 @@ class Writer:
         self._exr_frames = 0
         self._own = {
             "format": FORMAT,
-            "format_version": FORMAT_VERSION,
+            "format_version": STORE,
             "index": index,
             "frames": frames,
             "size": [size[1], size[0]],

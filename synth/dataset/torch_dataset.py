@@ -23,7 +23,7 @@ class TorchDataset:
     Fields without a frame axis come whole; `index` and `frame` say where an item is from. Safe in workers
     that are forked or spawned: a process opens its own stores.
 
-        frames = TorchDataset("out", ["rgb", "flow", "traction"])  # from synth.store import TorchDataset
+        frames = TorchDataset("out", ["rgb", "flow", "traction"])
         loader = torch.utils.data.DataLoader(frames, batch_size=8, num_workers=2)
     """
 

@@ -7,7 +7,6 @@ import json
 from pathlib import Path
 from typing import Any
 
-from synth.job import retired
 from synth.job.schema import Job
 from synth.system import checked_file
 
@@ -30,19 +29,8 @@ def identify_job(job: Job) -> str:
     Files count by content and not by path, and what the card says does not count. Nor does the number of
     sequences: sequence 3 is the same in a dataset of 24 and of 48, so a dataset can be extended.
     """
-    described = retired.restore(job.model_dump(mode="json"), retired.JOB)
+    described = job.model_dump(mode="json")
     del described["sequences"], described["card"]
-    if not job.render.stereo_mm:
-        del described["flow"]["stereo"]  # says nothing of one eye's sequences
-    if not job.fem.instrument_list:
-        del described["fem"]["crew"]  # so that jobs without one are what they were
-    if not job.anatomy.craniotomy.also:
-        del described["anatomy"]["craniotomy"]["also"]
-    if not job.anatomy.fill_holes:
-        del described["anatomy"]["fill_holes"]
-    for name in ("matrix", "curves"):
-        if getattr(job.sensor, name) is None:
-            del described["sensor"][name]
     for (block, name), largest in FILES.items():
         described[block][name] = _digest(getattr(getattr(job, block), name), largest)
     return hashlib.blake2b(canonical(described), digest_size=16).hexdigest()

@@ -103,8 +103,8 @@ Skulls = Annotated[
 ]
 
 
-def _of_tissue(young_kpa: tuple[float, float], info: ValidationInfo) -> tuple[float, float]:
-    for value in young_kpa if info.context is not STORED else ():
+def _of_tissue(young_kpa: tuple[float, float]) -> tuple[float, float]:
+    for value in young_kpa:
         if not 0.01 <= value <= 300:
             unit, factor = ("Pa", 1e-3) if value > 1 else ("MPa", 1e3)
             raise ValueError(f"{value:g} kPa is no tissue's; was {unit} meant, {value * factor:g} kPa?")

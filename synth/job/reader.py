@@ -1,4 +1,4 @@
-"""Reading a job: its file, overrides, retired keys, files it names, schema; mistakes named at their place."""
+"""Reading a job: its file, overrides, files it names, schema; mistakes named at their place."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from importlib import resources
 from pathlib import Path
 
 from synth.errors import UserError, as_path, did_you_mean
-from synth.job import identity, retired
+from synth.job import identity
 from synth.job.schema import Job
 from synth.system import checked_file
 from synth.system.config_file import ConfigFile, Mistake
@@ -58,11 +58,7 @@ def parse_job(text: str, label: str, folder: Path, overrides: Sequence[str] = ()
     """The job in `text`; `label` names it in messages and its relative paths start at `folder`."""
     config = ConfigFile(text, label)
     config.change(overrides)
-    config.values, gone = retired.drop(config.values, retired.JOB)
-    found = [*retired.mistakes(gone), *_find_files(config, folder)]
-    if config.values.get("frames") == 2:  # that older datasets may have
-        found.append(Mistake(("frames",), "2 are at rest and released: no force; 3 or more are needed"))
-    return config.validate(Job, found)
+    return config.validate(Job, _find_files(config, folder))
 
 
 def _find_files(config: ConfigFile, folder: Path) -> Iterator[Mistake]:

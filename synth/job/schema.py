@@ -175,8 +175,8 @@ class Job(Section):
     """Root of every random draw. Same job, same bytes."""
     sequences: Annotated[int, Field(ge=1, le=1_000_000)] = 24
     """Number of sequences."""
-    frames: Annotated[int, Field(ge=2, le=10_000)] = 24
-    """Frames a sequence; frame 0 is the rest frame."""
+    frames: Annotated[int, Field(ge=3, le=10_000)] = 24
+    """Frames a sequence; the first is the rest frame, the last is released."""
     fps: Positive = 25.0
     """Frames a second of the recorded video."""
     anatomy: AnatomySection = AnatomySection()

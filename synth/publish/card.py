@@ -17,7 +17,6 @@ from synth.dataset.folder import Folder, write_whole
 from synth.dataset.store import open_sequence
 from synth.errors import UserError
 from synth.fields import FIELDS
-from synth.job import retired
 from synth.publish import picture, svg
 
 QUANTITIES = {
@@ -107,12 +106,10 @@ def facts(folder: Folder) -> dict[str, Any]:
 
 def limits(folder: Folder) -> list[str]:
     """What a reader must know before trusting the data, given how it was made."""
-    job, described = folder.job(), folder.described()
-    _, gone = retired.drop(described["job"], retired.JOB)
+    job = folder.job()
     text: str = template("limits.jinja").render(
         job=job,
-        gone=gone,
-        versions=len(described.get("generators", [])),
+        versions=len(folder.described()["generators"]),
         shared=split.read_stored(folder.root).share_anatomy,
     )
     return [line for line in text.splitlines() if line]

@@ -75,9 +75,7 @@ class Scenario:
         return (self.gesture, *self.further)
 
     def as_dict(self) -> dict[str, Any]:
-        described = asdict(self)
-        described["tissue"]["averaged"] = True  # as when elements could do without
-        return described
+        return asdict(self)
 
 
 def draw_scenario(job: Job | str | Path, index: int) -> Scenario:
@@ -296,14 +294,7 @@ def draw_view(render: RenderSection, rng: Random) -> CameraView:
         azimuth_deg=_uniform(rng, (0.0, 360.0)),
         roll_deg=_uniform(rng, (0.0, 360.0)),
         focus_mm=_uniform(rng, (-0.5, 0.5)),
-        off_centre=_draw_zero(rng),
     )
-
-
-def _draw_zero(rng: Random) -> tuple[float, float]:
-    """No offset; drawn as when a job could ask for one, so that its zeros keep their signs."""
-    length, angle = rng.uniform(0, 0), rng.uniform(0, 2 * np.pi)
-    return float(length * np.cos(angle)), float(length * np.sin(angle))
 
 
 def draw_sway(render: RenderSection, rng: Random) -> CameraMotion:

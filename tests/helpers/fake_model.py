@@ -10,7 +10,8 @@ from learn import checkpoint
 from learn.checkpoint import ModelCard
 from learn.data.grid import Scales
 from learn.network.d2fnet import D2FNet
-from learn.settings import override, preset
+from learn.settings import preset
+from synth.system.config_file import override
 
 
 def write_model(folder: Path, *changes: str) -> Path:

@@ -113,9 +113,10 @@ def write(
             writer.put_frame("motion_deviation", t, spread.astype(np.float32))
             writer.put_frame("rgb_right", t, np.roll(picture, t, axis=1))
     return writer.seal(
-        scenario={"relief": {"seed": anatomy_seed}, "family": family, "gesture": {"kind": "pull"}},
+        scenario={"family": family, "gesture": {"kind": "pull"}},
         scale_mm_per_px=SCALE_MM_PER_PX,
         young_kpa=young,
         poisson=POISSON,
-        **({} if opening is None else {"anatomy_id": opening.partition(" at ")[0], "opening_id": opening}),
+        anatomy_id=f"seed-{anatomy_seed}" if opening is None else opening.partition(" at ")[0],
+        **({} if opening is None else {"opening_id": opening}),
     )

@@ -35,7 +35,7 @@ class CameraView:
     """Turn of the picture about the optical axis."""
     focus_mm: float
     """Distance of the plane in focus beyond the craniotomy's centre."""
-    off_centre: tuple[float, float]
+    off_centre: tuple[float, float] = (0.0, 0.0)
     """Principal point from the middle of the picture, in its widths; x, y. Likewise."""
 
 
@@ -87,8 +87,7 @@ def place(view: CameraView, render: RenderSection) -> Camera:
     rotation = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ frame
     if render.calibration is None:
         focal = width * view.working_distance_mm / view.field_mm
-        x, y = (np.array([width, height]) - 1) / 2 + width * np.asarray(view.off_centre)
-        K = np.array([[focal, 0.0, x], [0.0, focal, y], [0.0, 0.0, 1.0]])
+        K = np.array([[focal, 0.0, (width - 1) / 2], [0.0, focal, (height - 1) / 2], [0.0, 0.0, 1.0]])
         distortion = np.asarray(render.distortion, np.float64)
     else:
         known = calibration.read(render.calibration)

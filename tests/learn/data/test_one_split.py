@@ -24,7 +24,7 @@ from learn.settings import preset
 from learn.training.sides import divide
 from synth.cli import app as synth
 from synth.dataset import index, split
-from synth.dataset.folder import Folder, claim
+from synth.dataset.folder import claim
 from synth.dataset.split import DatasetSplit
 from synth.errors import UserError
 from synth.job.schema import Job
@@ -116,18 +116,6 @@ def test_no_sequence_is_on_two_sides_in_any_artefact(tmp_path: Path, draw: int) 
     used = find_sides(grouped, card, set(card.split["test"]), from_test=False)
     assert {clips[i].content_hash for i in used.test} == set(card.split["test"])
     assert not set(used.test) & {*used.fit, *used.select, *used.intervals}
-
-
-def test_a_side_that_is_none_in_an_older_index_is_refused(tmp_path: Path) -> None:
-    own = make(tmp_path / "own", [*range(6)])
-    (own / split.NAME).unlink()
-    rows = index.read_index(own).to_pylist()
-    index.save_rows(own, [{**row, "split": "trian"} for row in rows])
-    with pytest.raises(UserError, match="trian"):
-        index.write_index(Folder(own))
-    for redo in (["split", str(own)], ["report", str(own)]):
-        assert run(synth, redo).exit_code == 0
-        assert {row["split"] for row in index.read_index(own).to_pylist()} == set(split.SIDES)
 
 
 def test_what_another_split_calls_test_is_not_scored_if_it_was_fitted_on(tmp_path: Path) -> None:

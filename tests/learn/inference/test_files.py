@@ -22,11 +22,12 @@ from learn.data.grid import Grid
 from learn.inference.apply import stiffness
 from learn.inference.export import CORRECTIONS, examples, export, export_correction
 from learn.inference.predict import load_model
-from learn.settings import override, preset
+from learn.settings import preset
 from learn.training.batches import measure_scales
 from synth.dataset.store import Dataset
 from synth.errors import UserError
 from synth.recording_flow.video_flow import Footage, RecordingFlowSettings, VideoFlow
+from synth.system.config_file import override
 from synth.video.pixel_scale import UNKNOWN_NOTE
 from synth.video.read import read_video
 

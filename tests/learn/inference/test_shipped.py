@@ -8,6 +8,7 @@ from pathlib import Path
 import fake_model
 import numpy as np
 import pytest
+import torch
 from typer.testing import CliRunner
 
 import learn
@@ -57,6 +58,17 @@ def test_damage_is_found(models: Path) -> None:
         weights.write_bytes(broken)
         with pytest.raises(UserError, match="weights"):
             learn.load_model("mono")
+
+
+@pytest.mark.parametrize(
+    ("name", "force"), [("mono", [196.83, 500.95, -1000.8]), ("stereo", [11.898, 24.684, -8.2516])]
+)
+def test_the_networks_answer_as_they_did(name: str, force: list[float]) -> None:
+    model, card = checkpoint.read_model(shipped.MODELS / name)
+    given = np.random.default_rng(0).random((1, len(card.settings.arch.channels), 128, 128), np.float32)
+    with torch.no_grad():
+        found = model(torch.from_numpy(given))[0].sum(dim=(1, 2))
+    np.testing.assert_allclose(found, force, rtol=1e-3)
 
 
 @pytest.mark.parametrize("name", shipped.NAMES)

@@ -23,6 +23,7 @@ from synth.dataset import index, split
 from synth.dataset.folder import Folder, claim
 from synth.dataset.store import open_sequence
 from synth.errors import UserError
+from synth.formats import FOLDER
 from synth.job.reader import parse_job
 from synth.job.schema import Job
 from synth.publish.export.registry import export_dataset
@@ -64,6 +65,7 @@ def bad(dataset: Path) -> set[str]:
         {"scenario": {"gesture": "pull"}},
         {"timings": {"render": None}},
         {"format_version": [1] * 999},
+        {"format_version": 1},
     ],
     ids=str,
 )
@@ -148,7 +150,8 @@ def test_no_run_follows_a_link(dataset: Path, tmp_path: Path, name: str) -> None
 
 def test_a_dataset_is_read_without_the_plug_ins_that_made_it(tmp_path: Path) -> None:
     job = {"flow": {"backend": "gone"}, "fem": {"law": "gone"}}
-    (tmp_path / "dataset.json").write_text(json.dumps({"identity": "", "job": job}))
+    described = {"format_version": FOLDER, "identity": "", "job": job, "generators": []}
+    (tmp_path / "dataset.json").write_text(json.dumps(described))
     read = Folder(tmp_path).job()
     assert (read.flow.backend, read.fem.law) == ("gone", "gone")
     with pytest.raises(UserError, match=r"flow\.backend"):

@@ -1,0 +1,28 @@
+"""Format versions: this one and the one before are read; what is older or newer is refused in one line."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from synth.dataset.folder import Folder
+from synth.errors import UserError
+from synth.formats import FIRST, FOLDER, check_format
+
+
+def test_a_reader_reads_its_format_and_the_one_before_but_none_of_before_the_first() -> None:
+    newest = FIRST + 2
+    for found in (newest, newest - 1):
+        check_format(found, newest, "x")
+    for found, current in ((newest - 2, newest), (newest + 1, newest), (FIRST - 1, FIRST), (None, FIRST)):
+        with pytest.raises(UserError, match=f"written by format {found}; this version reads {current}"):
+            check_format(found, current, "x")
+
+
+def test_a_dataset_of_before_formats_had_a_version_is_refused(tmp_path: Path) -> None:
+    before = {"identity": "", "job": {"fem": {"tip": "flat"}}, "generators": []}
+    (tmp_path / "dataset.json").write_text(json.dumps(before))
+    with pytest.raises(UserError, match=f"written by format 1; this version reads {FOLDER}"):
+        Folder(tmp_path).job()
