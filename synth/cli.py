@@ -250,8 +250,7 @@ def export(
         str,
         typer.Option(
             "--to",
-            help="folder, hf, webdataset, lerobot, lerobot-v2.1, endonerf, tapvid, hdf5, d2fnet-npz or video "
-            "(MP4 to look at).",
+            help="folder, hf, webdataset, lerobot, endonerf, tapvid, hdf5, d2fnet-npz or video.",
         ),
     ] = "folder",
     overlay: Annotated[

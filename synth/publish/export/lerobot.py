@@ -1,4 +1,4 @@
-"""LeRobot v3.0 and v2.1 (github.com/huggingface/lerobot): an episode a sequence, MP4, force by frame.
+"""LeRobot v3.0 (github.com/huggingface/lerobot): an episode a sequence, MP4, force by frame.
 
 The dense truth (flow, traction, depth) has no place in it; `--to hf` and `--to webdataset` hold that.
 """
@@ -20,15 +20,8 @@ from synth.video.write import encode_video
 
 _FILES = 1000  # in a folder
 _FILE = "chunk-{chunk_index:03d}/file-{file_index:03d}"
-_EPISODE = "episode_{episode_index:06d}"
-_PATHS = {
-    "v3.0": (f"data/{_FILE}.parquet", f"videos/{{video_key}}/{_FILE}.mp4"),
-    "v2.1": (
-        f"data/chunk-{{episode_chunk:03d}}/{_EPISODE}.parquet",
-        f"videos/chunk-{{episode_chunk:03d}}/{{video_key}}/{_EPISODE}.mp4",
-    ),
-}
-"""Of an episode's rows and of its videos."""
+_DATA_PATH = f"data/{_FILE}.parquet"
+_VIDEO_PATH = f"videos/{{video_key}}/{_FILE}.mp4"
 _QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
 _QUALITY, _GROUP = 18, 2  # any frame is decoded from at most one before it
 _PROBED = 100  # frames of an episode that the statistics of its pictures come from
@@ -37,23 +30,20 @@ _COUNTS = ("timestamp", "frame_index", "episode_index", "index", "task_index")
 Numbers = NDArray[Any]
 
 
-def write_episodes(dataset: Dataset, target: Path, version: str = "v3.0") -> None:
+def write_episodes(dataset: Dataset, target: Path) -> None:
     """`meta/`, `data/chunk-000/file-NNN.parquet` and `videos/KEY/chunk-000/file-NNN.mp4`, one an episode.
 
-    As v2.1 `data/chunk-000/episode_NNNNNN.parquet`, `videos/chunk-000/KEY/episode_NNNNNN.mp4`, JSON lines in
-    `meta/`.
-
-    Features: `observation.images.left` (and `.right`: the second lens) as video, `force` (3,) mN in camera
-    axes, `young_kpa` and `scale_mm_per_px` (1,). There is no action: nobody steered a robot. The task says
-    gesture and look. Sides of the split are the ranges under `splits`.
+    Features: `observation.images.left` (and `.right`) as video, `force` (3,) mN in camera
+    axes, `young_kpa` and `scale_mm_per_px` (1,). There is no action: nobody steered a robot. The task is
+    gesture and appearance. Sides of the split are the ranges under `splits`.
     """
     tasks, episodes, ranges = list[str](), list[dict[str, Any]](), dict[str, str]()
     for side, positions in group_by_side(dataset).items():
         ranges[side] = f"{len(episodes)}:{len(episodes) + len(positions)}"
         for sequence in map(dataset.__getitem__, positions):
             before = episodes[-1]["dataset_to_index"] if episodes else 0
-            episodes.append(_write_episode(sequence, len(episodes), before, tasks, target, _PATHS[version]))
-    _write_meta(dataset[0], episodes, tasks, ranges, target, version)
+            episodes.append(_write_episode(sequence, len(episodes), before, tasks, target))
+    _write_meta(dataset[0], episodes, tasks, ranges, target)
 
 
 def _cameras(sequence: Sequence) -> dict[str, str]:
@@ -63,7 +53,7 @@ def _cameras(sequence: Sequence) -> dict[str, str]:
 
 
 def _write_episode(
-    sequence: Sequence, number: int, before: int, tasks: list[str], target: Path, paths: tuple[str, str]
+    sequence: Sequence, number: int, before: int, tasks: list[str], target: Path
 ) -> dict[str, Any]:
     """Frames and videos of an episode with `before` rows before it; its row in `meta/episodes`."""
     about = row_of(sequence)
@@ -83,13 +73,12 @@ def _write_episode(
     }
     stats = {name: _statistics(values.reshape(frames, -1), ()) for name, values in columns.items()}
     place = {"chunk_index": number // _FILES, "file_index": number % _FILES}
-    named = {**place, "episode_chunk": number // _FILES, "episode_index": number}
     vector = pa.list_(pa.float32(), 3)
     arrays = {
         name: pa.array(list(values), vector) if values.ndim == 2 else pa.array(values)
         for name, values in columns.items()
     }
-    _write_table(pa.table(arrays), target / paths[0].format(**named))
+    _write_table(pa.table(arrays), target / _DATA_PATH.format(**place))
     row: dict[str, Any] = {
         "episode_index": number,
         "tasks": [task],
@@ -102,7 +91,7 @@ def _write_episode(
     }
     probed = np.unique(np.linspace(0, frames - 1, _PROBED).round().astype(int)).tolist()
     for key, name in _cameras(sequence).items():
-        video = target / paths[1].format(video_key=key, **named)
+        video = target / _VIDEO_PATH.format(video_key=key, **place)
         video.parent.mkdir(parents=True, exist_ok=True)
         encode_video(video, sequence[name][:], fps, quality=_QUALITY, group=_GROUP)
         row |= {f"videos/{key}/{what}": value for what, value in place.items()}
@@ -144,9 +133,8 @@ def _write_meta(
     tasks: list[str],
     ranges: dict[str, str],
     target: Path,
-    version: str,
 ) -> None:
-    """`meta/info.json`, `stats.json`, `tasks.parquet` and the table of episodes; those of v2.1 as lines."""
+    """Writes `meta/info.json`, `stats.json`, `tasks.parquet` and the table of episodes."""
     height, width = (side // 2 * 2 for side in first.size)
     fps = float(first.attrs["fps"])
     features: dict[str, Any] = {}
@@ -167,48 +155,28 @@ def _write_meta(
     for name in ("young_kpa", "scale_mm_per_px", *_COUNTS):
         kind = "int64" if name in _COUNTS[1:] else "float32"
         features[name] = {"dtype": kind, "shape": [1], "names": None}
-    data_path, video_path = _PATHS[version]
-    own = {"data_files_size_in_mb": 100, "video_files_size_in_mb": 200}
-    if version == "v2.1":
-        videos = len(about) * len(_cameras(first))
-        own = {"total_videos": videos, "total_chunks": (len(about) - 1) // _FILES + 1}
     info = {
-        "codebase_version": version,
+        "codebase_version": "v3.0",
         "robot_type": None,
         "total_episodes": len(about),
         "total_frames": sum(row["length"] for row in about),
         "total_tasks": len(tasks),
         "chunks_size": _FILES,
-        **own,
+        "data_files_size_in_mb": 100,
+        "video_files_size_in_mb": 200,
         "fps": int(fps) if fps.is_integer() else fps,
         "splits": ranges,
-        "data_path": data_path,
-        "video_path": video_path,
+        "data_path": _DATA_PATH,
+        "video_path": _VIDEO_PATH,
         "features": features,
     }
     meta = target / "meta"
     meta.mkdir()
     (meta / "info.json").write_text(json.dumps(info, indent=4), "utf-8")
-    if version == "v2.1":
-        _write_lines(about, tasks, list(features), meta)
-        return
     _write_table(pa.Table.from_pylist(about), meta / "episodes" / "chunk-000" / "file-000.parquet")
     stats = {key: _pooled(about, key) for key in features}
     (meta / "stats.json").write_text(json.dumps(stats, indent=4), "utf-8")
     _write_table(_indexed(tasks), meta / "tasks.parquet")
-
-
-def _write_lines(about: list[dict[str, Any]], tasks: list[str], features: list[str], meta: Path) -> None:
-    """`episodes.jsonl`, `episodes_stats.jsonl` and `tasks.jsonl` of v2.1."""
-    names = ("min", "max", "mean", "std", "count")
-    stats = [{key: {one: row[f"stats/{key}/{one}"] for one in names} for key in features} for row in about]
-    tables = {
-        "episodes": [{key: row[key] for key in ("episode_index", "tasks", "length")} for row in about],
-        "episodes_stats": [{"episode_index": k, "stats": one} for k, one in enumerate(stats)],
-        "tasks": [{"task_index": k, "task": task} for k, task in enumerate(tasks)],
-    }
-    for name, rows in tables.items():
-        (meta / f"{name}.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows), "utf-8")
 
 
 def _indexed(tasks: list[str]) -> pa.Table:

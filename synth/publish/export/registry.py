@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,6 @@ FORMATS: dict[str, Callable[..., None]] = {
     "hf": hugging_face.write_parquet,
     "webdataset": webdataset.write_shards,
     "lerobot": lerobot.write_episodes,
-    "lerobot-v2.1": partial(lerobot.write_episodes, version="v2.1"),
     "endonerf": endonerf.write_scenes,
     "tapvid": tapvid.write_tracks,
     "hdf5": plain.write_hdf5,

@@ -183,27 +183,6 @@ def test_lerobots_files_are_as_its_format_says(root: Path, tmp_path: Path) -> No
             assert list(frames[0][1].shape) == info["features"][key]["shape"]
 
 
-def test_lerobots_older_files_are_as_their_format_says(root: Path, tmp_path: Path) -> None:
-    export_dataset(root, tmp_path / "to", "lerobot-v2.1")
-    meta = tmp_path / "to/meta"
-    info = json.loads((meta / "info.json").read_text())
-    assert (info["codebase_version"], info["total_chunks"], info["total_videos"]) == ("v2.1", 1, 12)
-    told = {
-        name: [json.loads(line) for line in (meta / f"{name}.jsonl").read_text().splitlines()]
-        for name in ("episodes", "episodes_stats", "tasks")
-    }
-    tasks = {row["task_index"]: row["task"] for row in told["tasks"]}
-    for episode, stats in zip(told["episodes"], told["episodes_stats"], strict=True):
-        place = {"episode_chunk": 0, "episode_index": episode["episode_index"]}
-        rows = pq.read_table(tmp_path / "to" / info["data_path"].format(**place)).to_pylist()
-        assert len(rows) == episode["length"] == 3
-        assert [tasks[row["task_index"]] for row in rows] == 3 * episode["tasks"]
-        assert stats["stats"].keys() == info["features"].keys()
-        assert stats["stats"]["force"]["mean"] == pytest.approx(np.mean([r["force"] for r in rows], axis=0))
-        video = info["video_path"].format(video_key="observation.images.right", **place)
-        assert list(decoded(tmp_path / "to" / video)[0][1].shape) == [36, 48, 3]
-
-
 def moving(out: Path, job: Job) -> list[Camera]:
     """A plane seen by a lens with distortion, off its middle, that shifts and turns; flow by OpenCV."""
     width, height = job.render.size
