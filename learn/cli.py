@@ -385,22 +385,16 @@ def calibrate_command(
         Console().print(f"{name}: E = {kpa:.3g} kPa; give it to `learn predict` as --young {kpa:.3g}")
 
 
-@app.command("export", epilog="Example: learn export model d2fnet.onnx --format onnx")
+@app.command("export", epilog="Example: learn export model d2fnet.onnx")
 def export_command(
-    model: Annotated[
-        Path, typer.Argument(help="Model; flow-correction, depth-correction: of the motion it reads.")
-    ],
-    file: Annotated[Path, typer.Argument(help="File to write; NAME.json beside it says how to use it.")],
-    format: Annotated[str, typer.Option(help="torchscript or onnx.")] = "torchscript",
+    model: Annotated[Path, typer.Argument(help="Model's folder, or the name of a pretrained one.")],
+    file: Annotated[Path, typer.Argument(help="ONNX file; NAME.json next to it says how to use it.")],
 ) -> None:
-    """Write a model for other programs, checked against PyTorch to 1e-4."""
-    from learn.inference.export import CORRECTIONS, export, export_correction
+    """Write a model as ONNX for other programs, checked against PyTorch to 1e-4."""
+    from learn.inference.export import export
     from learn.inference.predict import load_model
 
-    if str(model) in CORRECTIONS:
-        worst = export_correction(str(model), file, format)
-    else:
-        worst = export(load_model(model), file, format)
+    worst = export(load_model(model), file)
     _console.print(f"{file}: differs from PyTorch by at most {worst:.1e} of full scale")
 
 

@@ -1,11 +1,11 @@
-"""A trained model as one file for other programs: TorchScript or ONNX, channels and scales inside.
+"""A trained model as one ONNX file for other programs, channels and scales inside.
 
 The file's input is displacement in mm on the grid, not the channels, so that nobody has to rebuild them:
-`displacement` (B, 2, N, N) mm and `mask` (B, 1, N, N) 0/1 (for some models `confidence` (B, 1, N, N) 0..1; of
-two eyes `displacement` (B, 3, N, N) and `confidence` (B, 2, N, N); `membrane` (B,), -1 stripped, 0 unknown,
-1 intact). Its output is force density per unit stiffness (B, C, N, N) [mN/mm² at 1 kPa]. Times E in kPa it is
-mN/mm², times the cell's area and summed, mN. How a picture's flow comes onto the grid is written into the
-.json beside it.
+`displacement` (B, 2, N, N) mm and `mask` (B, 1, N, N) 0/1; for some models `confidence` (B, 1, N, N) 0..1.
+For stereo: `displacement` (B, 3, N, N) and `confidence` (B, 2, N, N). For some models `membrane` (B,): -1
+stripped, 0 unknown, 1 intact. Its output is force density per unit stiffness (B, C, N, N) [mN/mm² at 1 kPa].
+Times E in kPa it is mN/mm², times the cell's area and summed, mN. How a picture's flow comes onto the grid is
+written into the .json next to it.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from __future__ import annotations
 import importlib
 import json
 import warnings
-from dataclasses import dataclass
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -25,19 +25,7 @@ from learn.checkpoint import ModelCard
 from learn.data.grid import HALF_SURE_MM, SMOOTHING_MM, channels
 from learn.inference.predict import Predictor
 from synth.errors import UserError
-from synth.flow import correction
-from synth.flow.stereo import depth_correction
 
-CORRECTIONS = {
-    "flow-correction": (correction.WEIGHTS, correction.CHANNELS, 2, "see synth.flow.correction.describe"),
-    "depth-correction": (
-        depth_correction.WEIGHTS,
-        depth_correction.CHANNELS,
-        1,
-        "see synth.flow.stereo.depth_correction.describe",
-    ),
-}
-"""Networks that correct motion before it is read: weights, channels, parts, input."""
 TOLERANCE = 1e-4
 """Largest difference from PyTorch allowed, in units of the training data's 99.9th percentile."""
 
@@ -82,79 +70,38 @@ def examples(card: ModelCard, batch: int, seed: int = 0) -> list[Tensor]:
 
 
 @torch.no_grad()
-def export(predictor: Predictor, file: Path, kind: str) -> float:
-    """Writes `file` and a description `file`.json, reads it back, and compares it with PyTorch.
+def export(predictor: Predictor, file: Path) -> float:
+    """Writes `file` as ONNX and a description `file`.json, reads it back, and compares it with PyTorch.
 
-    Returns the largest difference in units of the 99.9th percentile, or of the largest answer where that is
-    more. Raises UserError if it is above 1e-4 (the file is removed), or if ONNX is asked for and its packages
-    are not installed.
+    Returns the largest difference in units of the 99.9th percentile, or of the largest output where that is
+    more. Raises UserError if it is above 1e-4 (the file is removed), or if ONNX's packages are not installed.
     """
     card = predictor.card
     module = Portable(predictor.model.cpu(), card).eval()
-    cases = [examples(card, batch, seed=batch) for batch in (1, 3)]
-    worst = _export(module, cases, Axes(input_names(card), {0: "batch"}), file, kind, card.scales.target)
-    _describe(file, describe(card, kind, worst))
-    return worst
-
-
-@torch.no_grad()
-def export_correction(name: str, file: Path, kind: str) -> float:
-    """As `export`, of the network that corrects recovered motion (`CORRECTIONS`); any size of picture."""
-    weights, channels, parts, sees = CORRECTIONS[name]
-    net = correction.load(weights, channels, parts)
-    cases = [torch.randn(1, channels, *size) for size in ((32, 40), (48, 64))]
-    axes = Axes(["features"], {2: "height", 3: "width"}, "correction")
-    worst = _export(net, [[one * net.deviation + net.mean] for one in cases], axes, file, kind, 1.0)
-    said = "what is to be added, then the logarithm of its variance, a channel for each part"
-    sizes = "height and width are multiples of 8 cells"
-    _describe(file, {"format": kind, "input": f"{sees}; {sizes}", "output": said, "parts": parts})
-    return worst
-
-
-@dataclass(frozen=True)
-class Axes:
-    """What a file's inputs and output are called, and which of their axes may have any length."""
-
-    inputs: list[str]
-    free: dict[int, str]
-    output: str = "density"
-
-
-def _describe(file: Path, said: dict[str, Any]) -> None:
-    file.with_suffix(file.suffix + ".json").write_text(json.dumps(said, indent=1))
-
-
-def _export(
-    module: nn.Module, cases: list[list[Tensor]], axes: Axes, file: Path, kind: str, least: float
-) -> float:
-    """Writes `file` and compares; differences in units of the largest answer, at least `least`."""
     file.parent.mkdir(parents=True, exist_ok=True)
-    write = {"torchscript": _torchscript, "onnx": _onnx}.get(kind)
-    if write is None:
-        raise UserError(f"unknown format {kind!r}: torchscript or onnx")
-    run = write(module, cases[-1], axes, file)
+    cases = [examples(card, batch, seed=batch) for batch in (1, 3)]
+    run = _write(module, cases[-1], input_names(card), file)
     worst = 0.0
     for inputs in cases:
         expected = module(*inputs)
-        largest = max(least, float(expected.abs().max()))
+        largest = max(card.scales.target, float(expected.abs().max()))
         worst = max(worst, float((run(inputs) - expected).abs().max()) / largest)
     if not worst <= TOLERANCE:
         file.unlink()
         raise UserError(f"{file}: differs from PyTorch by {worst:.1e} of full scale, at most {TOLERANCE:g}")
+    file.with_suffix(file.suffix + ".json").write_text(json.dumps(describe(card, worst), indent=1))
     return worst
 
 
-def describe(card: ModelCard, kind: str, difference: float) -> dict[str, Any]:
-    """What a program must know to use the file."""
+def describe(card: ModelCard, difference: float) -> dict[str, Any]:
+    """Everything that a program needs to use the file."""
     grid, arch = card.settings.grid, card.settings.arch
     output = f"{card.settings.target} per unit stiffness, one component"
     if arch.components == 3:
         output = "force density per unit stiffness [mN/mm2 at E = 1 kPa]; components x, y, z in camera axes"
     inputs = ["flow [px] times the picture's scale [mm/px] is displacement [mm]; x right, y down"]
     if arch.depth:
-        inputs = [
-            "displacement [mm] is motion in camera axes, x right, y down, z away, as a second eye gives it"
-        ]
+        inputs = ["displacement [mm] is motion in camera axes, x right, y down, z away, as stereo gives it"]
     if arch.depth and arch.confidence:
         inputs.append(
             "confidence, across and along the view: means over tissue of 1 / (1 + (s / s0)^2), "
@@ -163,7 +110,7 @@ def describe(card: ModelCard, kind: str, difference: float) -> dict[str, Any]:
     if arch.membrane:
         inputs.append("membrane, one number a frame: -1 stripped, 0 unknown, 1 intact")
     return {
-        "format": kind,
+        "format": "onnx",
         "inputs": input_names(card),
         "outputs": ["density"],
         "output": output,
@@ -182,17 +129,10 @@ def describe(card: ModelCard, kind: str, difference: float) -> dict[str, Any]:
     }
 
 
-def _torchscript(module: nn.Module, inputs: list[Tensor], axes: Axes, file: Path) -> Any:
-    with warnings.catch_warnings():
-        # Tracing warns that shapes are taken as constants: the grid's size is one.
-        warnings.simplefilter("ignore")
-        jit: Any = torch.jit
-        jit.trace(module, tuple(inputs), check_trace=False).save(str(file))
-        loaded = jit.load(str(file))
-    return lambda inputs: loaded(*inputs)
-
-
-def _onnx(module: nn.Module, inputs: list[Tensor], axes: Axes, file: Path) -> Any:
+def _write(
+    module: nn.Module, inputs: list[Tensor], names: list[str], file: Path
+) -> Callable[[list[Tensor]], Tensor]:
+    """Writes `file`, for batches of any size; what runs it."""
     try:
         importlib.import_module("onnx")
         runtime: Any = importlib.import_module("onnxruntime")
@@ -204,16 +144,16 @@ def _onnx(module: nn.Module, inputs: list[Tensor], axes: Axes, file: Path) -> An
             module,
             tuple(inputs),
             str(file),
-            input_names=axes.inputs,
-            output_names=[axes.output],
-            dynamic_axes={name: axes.free for name in [*axes.inputs, axes.output]},
+            input_names=names,
+            output_names=["density"],
+            dynamic_axes={name: {0: "batch"} for name in [*names, "density"]},
             dynamo=False,
             opset_version=17,
         )
     session = runtime.InferenceSession(str(file), providers=["CPUExecutionProvider"])
 
     def run(inputs: list[Tensor]) -> Tensor:
-        named = {name: value.numpy() for name, value in zip(axes.inputs, inputs, strict=True)}
+        named = {name: value.numpy() for name, value in zip(names, inputs, strict=True)}
         return torch.from_numpy(session.run(None, named)[0])
 
     return run

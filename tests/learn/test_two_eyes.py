@@ -141,6 +141,6 @@ def test_predict_eval_and_export(model: Path, data: Path, tmp_path: Path) -> Non
     assert scored.exit_code == 0, scored.output
     assert json.loads(scored.stdout)["input"] == "motion"
     assert run(app, ["eval", str(model), str(data), "--all", "--input", "recovered"]).exit_code != 0
-    assert export(load_model(model), tmp_path / "net.pt", "torchscript") < 1e-4
-    about = json.loads((tmp_path / "net.pt.json").read_text())
-    assert "second eye" in about["preprocessing"][0]
+    assert export(load_model(model), tmp_path / "net.onnx") < 1e-4
+    about = json.loads((tmp_path / "net.onnx.json").read_text())
+    assert "stereo" in about["preprocessing"][0]

@@ -20,7 +20,7 @@ from learn.cli import app
 from learn.data.clips import Clip
 from learn.data.grid import Grid
 from learn.inference.apply import stiffness
-from learn.inference.export import CORRECTIONS, examples, export, export_correction
+from learn.inference.export import examples, export
 from learn.inference.predict import load_model
 from learn.settings import preset
 from learn.training.batches import measure_scales
@@ -43,11 +43,10 @@ def model(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureReque
     return write_model(tmp_path_factory.mktemp("model"), *request.param)
 
 
-@pytest.mark.parametrize("kind", ["torchscript", "onnx"])
-def test_an_exported_model_says_the_same(model: Path, tmp_path: Path, kind: str) -> None:
+def test_an_exported_model_says_the_same(model: Path, tmp_path: Path) -> None:
     predictor = load_model(model)
     file = tmp_path / "net"
-    worst = export(predictor, file, kind)
+    worst = export(predictor, file)
     said = predictor.density(
         examples(predictor.card, 1)[0].numpy(), examples(predictor.card, 1)[1][0, 0].numpy(), 1.0
     )
@@ -56,17 +55,6 @@ def test_an_exported_model_says_the_same(model: Path, tmp_path: Path, kind: str)
     note = json.loads((tmp_path / "net.json").read_text())
     assert note["inputs"][:2] == ["displacement", "mask"]
     assert note["grid"]["pitch_mm"] == 36 / 32
-
-
-@pytest.mark.parametrize("name", sorted(CORRECTIONS))
-def test_an_exported_correction_takes_any_size(name: str, tmp_path: Path) -> None:
-    file = tmp_path / "net.onnx"
-    assert export_correction(name, file, "onnx") <= 1e-4
-    channels = CORRECTIONS[name][1]
-    found = onnxruntime.InferenceSession(str(file)).run(
-        None, {"features": np.zeros((1, channels, 16, 24), "f4")}
-    )
-    assert found[0].shape[2:] == (16, 24)
 
 
 def test_the_gain_is_in_every_map(model: Path, tmp_path: Path) -> None:
@@ -78,7 +66,7 @@ def test_the_gain_is_in_every_map(model: Path, tmp_path: Path) -> None:
     before, after = (one.density(told[0].numpy(), told[1][0, 0].numpy(), 1.0) for one in (plain, gained))
     np.testing.assert_allclose(after, 1.25 * before, rtol=1e-5)
     if len(told) == 2:  # the other is told more than `density` here
-        export(gained, tmp_path / "net", "onnx")
+        export(gained, tmp_path / "net")
         session = onnxruntime.InferenceSession(str(tmp_path / "net"))
         named = {asked.name: one.numpy() for asked, one in zip(session.get_inputs(), told, strict=True)}
         np.testing.assert_allclose(session.run(None, named)[0], after, rtol=1e-3, atol=1e-6)
@@ -89,10 +77,8 @@ def test_an_unfaithful_export_is_refused_and_removed(
 ) -> None:
     monkeypatch.setattr("learn.inference.export.TOLERANCE", -1.0)
     with pytest.raises(UserError):
-        export(load_model(model), tmp_path / "net", "torchscript")
+        export(load_model(model), tmp_path / "net")
     assert not list(tmp_path.iterdir())
-    with pytest.raises(UserError, match="tflite"):
-        export(load_model(model), tmp_path / "net", "tflite")
 
 
 def test_predict_on_stores_and_on_arrays_agree(model: Path, dataset: Path, tmp_path: Path) -> None:
