@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from synth.errors import UserError
-from synth.flow import fused
+from synth.flow import kernels
 from synth.flow.estimator import Flags, Flow, Map, Rgb
 from synth.flow.image import GREY
 from synth.system.jit import vectorised
@@ -174,7 +174,7 @@ def _steps(products: NDArray[np.float32], side: int) -> NDArray[np.float32]:
     Of products (20, h, w), those of `sum_cells`; (2, 3, h, w), by greys and by colours.
     """
     around = np.empty_like(products)
-    fused.box_into(products, (0,) * side, around)
+    kernels.box_into(products, (0,) * side, around)
     around = around.reshape(2, 10, *products.shape[1:]).swapaxes(0, 1)
     inside = cv2.boxFilter(np.ones_like(products[0]), -1, (side, side), borderType=cv2.BORDER_CONSTANT)
     # Windows that see less than a pixel a cell say less.

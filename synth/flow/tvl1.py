@@ -1,4 +1,4 @@
-"""Masked TV-L1 optical flow: one solver for CPU and CUDA.
+"""Masked TV-L1 optical flow, each step of its solver one compiled pass over the pixels.
 
 Minimises over the flow w = (u, v), with I_0 the rest frame and I_1 the frame now, both contrast-normalised,
 
@@ -7,12 +7,12 @@ Minimises over the flow w = (u, v), with I_0 the rest frame and I_1 the frame no
 
 psi(s^2) = sqrt(s^2 + epsilon^2) being the robust data term on brightness and gradient (Brox et al., High
 accuracy optical flow estimation based on a theory for warping, ECCV 2004, eq. 5), |.|_h the Huber norm
-(Werlberger et al., Anisotropic Huber-L1 optical flow, BMVC 2009, eq. 6), and m the mask: seen in the rest
-frame, and seen now at x + w. Where m is 0 the regulariser alone carries the flow on, there as a membrane (a
-larger h). lambda is that of a picture of little noise: it falls with the square of the residual's median, as
-a measurement's weight does with its noise, and rises where the first guess is steep. Coarse to fine, re-
-warped (Brox), each warp solved by the primal-dual steps of Chambolle and Pock (J. Math. Imaging Vis. 40,
-2011, algorithm 1) on lagged weights.
+(Werlberger et al., Anisotropic Huber-L1 optical flow, BMVC 2009, eq. 6), and m the mask: visible in the
+rest frame, and visible now at x + w. Where m is 0 the regulariser alone carries the flow on, there as a
+membrane (a larger h). lambda is that of a picture of little noise: it falls with the square of the residual's
+median, as a measurement's weight does with its noise, and rises where the first guess is steep. Coarse to
+fine, re-warped (Brox), each warp solved by the primal-dual steps of Chambolle and Pock (J. Math. Imaging Vis.
+40, 2011, algorithm 1) on lagged weights.
 """
 
 from __future__ import annotations
@@ -27,13 +27,16 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from synth.flow import confidence, correction, fused, image
+from synth.flow import confidence, correction, image, kernels
 from synth.flow.estimator import Flags, Flow, Map, Rgb
 from synth.flow.image import Level
+from synth.system.jit import vectorised
 
 _BETTER = 1.025  # the guess for large motion must fit this much better than the one for small motion
 _AGREED = 0.6  # agreement below which the network is believed less, and noise not at all
 _WEIGHT_LIMITS = 0.45, 1.5  # pictures of much noise, or none, would be smoothed to nothing or not at all
+_LANES = 16  # floats of the widest vectors
+_ZERO, _HALF, _ONE, _TWO, _EIGHT = (np.float32(number) for number in (0, 0.5, 1, 2, 8))
 
 
 @dataclass(frozen=True)
@@ -95,23 +98,15 @@ class Tvl1:
     Both with as many warps: half of them smooth less, and the error of warm frames was 1.12 times as large.
     """
 
-    def __init__(
-        self,
-        settings: TVL1Settings | None = None,
-        device: str | None = None,
-        *,
-        corrected: bool = True,
-    ) -> None:
+    def __init__(self, settings: TVL1Settings | None = None, *, corrected: bool = True) -> None:
         """Sets up.
 
         Args:
             settings: the energy and the effort; None: the default, a measured point.
-            device: torch device; None: CUDA where there is one.
             corrected: add what a network says is missing, and take its deviation for the confidence, which is
                 the pictures' agreement otherwise; see `synth.flow.correction`.
         """
         self.settings = settings or TVL1Settings()
-        self.device = device or ("cuda" if torch.cuda.is_available() else "cpu")
         self.correction = correction.load() if corrected else None
         self._rest: tuple[Tensor, Tensor, list[tuple[Tensor, Tensor]]] | None = None
         """The last rest frame, where it was usable, and its pyramid: a video has one."""
@@ -125,18 +120,18 @@ class Tvl1:
             if initial is not None:
                 # Planes, not interleaved: sums over neighbours took five times as long on the latter.
                 planes = np.ascontiguousarray(np.moveaxis(initial, -1, 0))
-                start = torch.from_numpy(planes)[None].to(self.device)
+                start = torch.from_numpy(planes)[None]
             found, agreed, aligned = self.tensors(
-                image.tensor(rest, self.device),
-                image.tensor(now, self.device),
-                image.flags(rest_usable, self.device),
-                image.flags(now_usable, self.device),
+                image.tensor(rest),
+                image.tensor(now),
+                image.flags(rest_usable),
+                image.flags(now_usable),
                 start,
             )
-            flow, sure = found[0].movedim(0, -1).cpu().numpy(), agreed[0, 0].cpu().numpy()
+            flow, sure = found[0].movedim(0, -1).numpy(), agreed[0, 0].numpy()
             if self.correction is None:
                 return flow, sure
-            *greys, seen = (plane[0, 0].cpu().numpy() for plane in aligned)
+            *greys, seen = (plane[0, 0].numpy() for plane in aligned)
             described = correction.describe(rest, now, rest_usable, (greys[0], greys[1]), seen, flow, sure)
             flow, deviation = correction.correct(self.correction, described, flow)
             # Where pictures hardly agree, as under a tool that no mask knows, the network has learnt nothing.
@@ -150,7 +145,7 @@ class Tvl1:
         now_usable: Tensor,
         initial: Tensor | None = None,
     ) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor, Tensor]]:
-        """As `flow`, uncorrected, on the device: greys, masks, agreement (1, 1, H, W), flow (1, 2, H, W).
+        """As `flow`, uncorrected, on tensors: greys, masks, agreement (1, 1, H, W), flow (1, 2, H, W).
 
         The last are the rest frame, the one warped back, both contrast-normalised, and what is seen of it.
         """
@@ -225,17 +220,12 @@ def solve(levels: list[Level], initial: Tensor | None, s: TVL1Settings) -> Tenso
         here = weight
         if weight.shape[-1] > 1:
             here = F.interpolate(weight, size=flow.shape[-2:], mode="bilinear", align_corners=False)
-        if flow.device.type == "cpu":
-            flow = _solve_level(level, flow, here, s)
-            continue
-        dual = flow.new_zeros(2, *flow.shape)
-        for _ in range(s.warps):
-            flow, dual = step(level, flow, dual, here, s)
+        flow = _solve_level(level, flow, here, s)
     return flow
 
 
 def _solve_level(level: Level, flow: Tensor, weight: Tensor, s: TVL1Settings) -> Tensor:
-    """All warps of a level on the CPU, in compiled loops that compute what `step` does."""
+    """All warps of a level: linearise r about the flow, weigh it, minimise."""
     rest, now, rest_usable, now_usable = (
         np.ascontiguousarray(field[0, 0].numpy())
         for field in (level.rest, level.now, level.rest_usable, level.now_usable)
@@ -245,25 +235,25 @@ def _solve_level(level: Level, flow: Tensor, weight: Tensor, s: TVL1Settings) ->
     before, after = np.empty((2, 6, *rest.shape), np.float32)
     mask, spare = np.empty((2, *rest.shape), np.float32)
     lambda_ = here = np.ascontiguousarray(np.broadcast_to(weight[0, 0].numpy(), rest.shape))
-    state = fused.new_state(*rest.shape)
+    state = new_state(*rest.shape)
 
     def differentiate(planes: Map) -> None:
         """d_x, d_y, d_xx, d_xy, d_yy of the first plane into the others."""
-        fused.differentiate(planes[0], planes[1], planes[2])
-        fused.differentiate(planes[1], planes[3], planes[4])
-        fused.differentiate(planes[2], spare, planes[5])
+        kernels.differentiate(planes[0], planes[1], planes[2])
+        kernels.differentiate(planes[1], planes[3], planes[4])
+        kernels.differentiate(planes[2], spare, planes[5])
 
     before[0] = rest
     differentiate(before)
     for _ in range(s.warps):
-        fused.warp_into(now, now_usable, found, after[0], mask)
+        kernels.warp_into(now, now_usable, found, after[0], mask)
         mask *= rest_usable
         differentiate(after)
         if s.noise > 0:
-            share = fused.noise_weight(before, after, mask, s.gradient, s.noise)
+            share = noise_weight(before, after, mask, s.gradient, s.noise)
             here = lambda_ * np.float32(np.clip(share, *_WEIGHT_LIMITS))
-        fused.linearise(before, after, mask, here, found, numbers, state)
-        fused.primal_dual(found, state, np.float32(s.tau), s.steps)
+        linearise(before, after, mask, here, found, numbers, state)
+        primal_dual(found, state, np.float32(s.tau), s.steps)
         if s.median:
             found = np.stack([cv2.medianBlur(plane, 3) for plane in found])
     return torch.from_numpy(found)[None]
@@ -283,43 +273,6 @@ def finer(flow: Tensor, level: Level) -> Tensor:
     return 2 * image.doubled(flow, level.now)
 
 
-def step(level: Level, flow: Tensor, dual: Tensor, weight: Tensor, s: TVL1Settings) -> tuple[Tensor, Tensor]:
-    """One warp: linearise r about `flow`, weigh it, minimise. dual: (2, B, 2, H, W), its x and y parts."""
-    warped, seen = image.warp(level.now, level.now_usable, flow)
-    mask = level.rest_usable * seen
-    # The gradient of the *warped* picture is what the rest frame's must equal: it turns and stretches with w.
-    before = torch.cat([level.rest, s.gradient * image.derivative(level.rest)], 1)
-    after = torch.cat([warped, s.gradient * image.derivative(warped)], 1)
-    residual = after - before  # (B, 3, H, W)
-    slope = image.derivative(0.5 * (after + before))  # (B, 6, H, W): x of the 3, then y of the 3
-    rows, columns = slope[:, :3], slope[:, 3:]
-    if s.noise > 0:
-        weight = weight * noise_weight(residual, mask, s.noise)
-    c = s.tau * weight * mask / torch.sqrt((residual * residual).sum(1, keepdim=True) + s.epsilon**2)
-    # (1 + c J^T J) w = v - c J^T (r - J w_0), 2x2 by Cramer.
-    xx = 1 + c * (rows * rows).sum(1, keepdim=True)
-    xy = c * (rows * columns).sum(1, keepdim=True)
-    yy = 1 + c * (columns * columns).sum(1, keepdim=True)
-    offset = residual - rows * flow[:, :1] - columns * flow[:, 1:]
-    gx, gy = c * (rows * offset).sum(1, keepdim=True), c * (columns * offset).sum(1, keepdim=True)
-    scale = 1 / (xx * yy - xy * xy)
-    straight = torch.cat([yy, xx], 1) * scale
-    cross = -xy * scale
-    shift = straight * torch.cat([gx, gy], 1) + cross * torch.cat([gy, gx], 1)
-    flow, dual = primal_dual(flow, dual, straight, cross, shift, s.huber + s.hidden_huber * (1 - mask), s)
-    if s.median:
-        flow = image.median3(flow)
-    return flow, dual
-
-
-def noise_weight(residual: Tensor, mask: Tensor, noise: float) -> Tensor:
-    """(noise / median of |r| in the mask) squared, within limits; 1 if nothing is seen. (B, 1, 1, 1)."""
-    some = residual[..., ::2, ::2]
-    square = torch.where(mask[..., ::2, ::2] > 0, (some * some).sum(1, keepdim=True), torch.nan)
-    found = torch.nan_to_num(square.flatten(1).nanmedian(dim=1).values, nan=noise**2)
-    return (noise**2 / found.clamp_min(1e-12)).clamp(*_WEIGHT_LIMITS).view(-1, 1, 1, 1)
-
-
 def steepness(flow: Tensor) -> Tensor:
     """|grad w|^2 of w averaged over 16 x 16 px, (B, 1, H, W): what of the slope isn't noise."""
     coarse = F.avg_pool2d(flow, 16, ceil_mode=True, count_include_pad=False)
@@ -329,32 +282,119 @@ def steepness(flow: Tensor) -> Tensor:
     return F.interpolate(slope, size=flow.shape[-2:], mode="bilinear", align_corners=False)
 
 
-def primal_dual(
-    flow: Tensor, dual: Tensor, straight: Tensor, cross: Tensor, shift: Tensor, huber: Tensor, s: TVL1Settings
-) -> tuple[Tensor, Tensor]:
-    """`steps` of: dual ascent on grad w with the Huber prox, primal descent with the data term's 2x2 prox.
+@vectorised
+def linearise(before: Map, after: Map, mask: Map, weight: Map, flow: Map, numbers: Map, state: Map) -> None:
+    """The data term's prox as an affine map of (v_x, v_y), and the dual's factor 1 / (1 + sigma h).
 
     Args:
-        flow: (B, 2, H, W) px.
-        dual: (2, B, 2, H, W), its x and y parts.
-        straight, cross, shift: (B, 2, H, W), (B, 1, H, W), (B, 2, H, W): the prox as an affine map.
-        huber: (B, 1, H, W) or a number, h [px/px].
-        s: settings.
+        before, after: (6, H, W), the rest frame and the warped one: I, d_x, d_y, d_xx, d_xy, d_yy of it.
+        mask, weight: (H, W).
+        flow: (2, H, W) px, what is linearised about.
+        numbers: tau, gamma, epsilon, h where something is seen, and what is added to it where nothing is.
+        state: see `new_state`; its last six planes are written.
     """
-    sigma = 1 / (8 * s.tau)
-    dual, ahead = dual.clone(), flow
-    px, py = dual[0], dual[1]
-    shrink = 1 / (1 + sigma * huber)
-    for _ in range(s.steps):
-        px[..., :-1].add_(ahead[..., 1:] - ahead[..., :-1], alpha=sigma)
-        py[..., :-1, :].add_(ahead[..., 1:, :] - ahead[..., :-1, :], alpha=sigma)
-        dual.mul_(shrink)
-        dual.mul_((px * px).addcmul_(py, py).clamp_min_(1).rsqrt_())  # p / max(1, |p|)
-        v = torch.add(flow, px, alpha=s.tau).add_(py, alpha=s.tau)  # v = w + tau div p
-        v[..., 1:].sub_(px[..., :-1], alpha=s.tau)
-        v[..., 1:, :].sub_(py[..., :-1, :], alpha=s.tau)
-        new = (straight * v).sub_(shift)
-        new[:, :1].addcmul_(cross, v[:, 1:])
-        new[:, 1:].addcmul_(cross, v[:, :1])
-        flow, ahead = new, torch.lerp(flow, new, 2.0)  # 2 new - old
-    return flow, dual
+    height, width = mask.shape
+    tau, gamma, epsilon, huber, hidden_huber = numbers
+    for y in range(height):
+        for x in range(width):
+            u, v = flow[0, y, x], flow[1, y, x]
+            # Residual r; slopes a by x and b by y of the mean of both pictures, b1 being a2.
+            r0 = after[0, y, x] - before[0, y, x]
+            r1 = gamma * (after[1, y, x] - before[1, y, x])
+            r2 = gamma * (after[2, y, x] - before[2, y, x])
+            a0 = _HALF * (after[1, y, x] + before[1, y, x])
+            b0 = _HALF * (after[2, y, x] + before[2, y, x])
+            a1 = _HALF * gamma * (after[3, y, x] + before[3, y, x])
+            b1 = _HALF * gamma * (after[4, y, x] + before[4, y, x])
+            b2 = _HALF * gamma * (after[5, y, x] + before[5, y, x])
+            norm = np.sqrt(r0 * r0 + r1 * r1 + r2 * r2 + epsilon * epsilon)
+            c = tau * weight[y, x] * mask[y, x] / norm
+            # (1 + c J^T J) w = v - c J^T (r - J w_0), 2x2 by Cramer.
+            xx, xy, yy = a0 * a0 + a1 * a1 + b1 * b1, a0 * b0 + a1 * b1 + b1 * b2, b0 * b0 + b1 * b1 + b2 * b2
+            gx = c * (a0 * r0 + a1 * r1 + b1 * r2 - xx * u - xy * v)
+            gy = c * (b0 * r0 + b1 * r1 + b2 * r2 - xy * u - yy * v)
+            xx, xy, yy = _ONE + c * xx, c * xy, _ONE + c * yy
+            scale = _ONE / (xx * yy - xy * xy)
+            state[8, y, x], state[9, y, x], state[10, y, x] = yy * scale, xx * scale, -xy * scale
+            state[11, y, x], state[12, y, x] = (yy * gx - xy * gy) * scale, (xx * gy - xy * gx) * scale
+            state[13, y, x] = _ONE / (_ONE + (huber + hidden_huber * (_ONE - mask[y, x])) / (_EIGHT * tau))
+
+
+def new_state(height: int, width: int) -> Map:
+    """Planes of `primal_dual`: w (2), its extrapolation (2), the dual of grad w by x (2) and by y (2), at 0,
+    the prox: straight (2), cross (1), shift (2), and 1 / (1 + sigma h).
+
+    Wider than the picture and aligned, so that loops of whole vectors have no rest: without, they took 1.6
+    times as long. The dual stands a row lower, that by x `_LANES` further right: 0 comes before it.
+    """
+    shape = 14, height + 1, -(-width // _LANES) * _LANES + _LANES
+    flat = np.empty(int(np.prod(shape)) + _LANES, np.float32)
+    state: Map = flat[-(flat.ctypes.data // 4) % _LANES :][: int(np.prod(shape))].reshape(shape)
+    state[4:8] = state[..., width:] = 0
+    return state
+
+
+@vectorised
+def primal_dual(flow: Map, state: Map, tau: np.float32, steps: int) -> None:
+    """`steps` of Chambolle and Pock's algorithm 1, in place.
+
+    A row of step k needs this row and the next of step k - 1, no more: all steps go down the picture
+    together, each one row behind the one before it, so that what they share stays in the cache.
+
+    Args:
+        flow: (2, H, W) px.
+        state: see `new_state`.
+        tau: primal step; the dual step sigma is 1 / (8 tau).
+        steps: how many.
+    """
+    height, width = flow.shape[1:]
+    wide = state.shape[2] - _LANES
+    sigma = _ONE / (_EIGHT * tau)
+    sigma_x = np.full(wide, sigma)  # no gradient leaves the picture: the last column's dual stays 0
+    sigma_x[width - 1 :] = _ZERO
+    now, ahead, px, py, prox, shrink = state[:2], state[2:4], state[4:6], state[6:8], state[8:13], state[13]
+    now[:, :height, :width] = flow
+    ahead[:, :height, :width] = flow
+    for sweep in range(height + steps - 1):
+        for k in range(max(0, sweep - height + 1), min(steps, sweep + 1)):
+            y = sweep - k
+            below = min(y + 1, height - 1)
+            for c in range(2):
+                for x in range(wide):
+                    here = ahead[c, y, x]
+                    p = px[c, y + 1, x + _LANES] + sigma_x[x] * (ahead[c, y, x + 1] - here)
+                    q = py[c, y + 1, x] + sigma * (ahead[c, below, x] - here)
+                    p, q = p * shrink[y, x], q * shrink[y, x]
+                    norm = _ONE / np.sqrt(max(_ONE, p * p + q * q))
+                    px[c, y + 1, x + _LANES], py[c, y + 1, x] = p * norm, q * norm
+            for x in range(wide):
+                u, v = now[0, y, x], now[1, y, x]
+                a = px[0, y + 1, x + _LANES] - px[0, y + 1, x + _LANES - 1] + py[0, y + 1, x] - py[0, y, x]
+                b = px[1, y + 1, x + _LANES] - px[1, y + 1, x + _LANES - 1] + py[1, y + 1, x] - py[1, y, x]
+                a, b = u + tau * a, v + tau * b
+                new_u = prox[0, y, x] * a + prox[2, y, x] * b - prox[3, y, x]
+                new_v = prox[1, y, x] * b + prox[2, y, x] * a - prox[4, y, x]
+                now[0, y, x], now[1, y, x] = new_u, new_v
+                ahead[0, y, x], ahead[1, y, x] = _TWO * new_u - u, _TWO * new_v - v
+    flow[:] = now[:, :height, :width]
+
+
+def noise_weight(before: Map, after: Map, mask: Map, gamma: float, noise: float) -> float:
+    """(noise / median of |r| where `mask` is)^2, 1 if nothing is seen; before, after as in `linearise`."""
+    square = _squares(before, after, mask, np.float32(gamma))
+    middle = (len(square) - 1) // 2
+    return noise**2 / max(float(np.partition(square, middle)[middle]), 1e-12) if len(square) else 1.0
+
+
+@vectorised
+def _squares(before: Map, after: Map, mask: Map, gamma: np.float32) -> Map:
+    """|r|^2 of every other pixel of every other row, where the mask is."""
+    height, width = mask.shape
+    square, count = np.empty(mask.size, np.float32), 0
+    for y in range(0, height, 2):
+        for x in range(0, width, 2):
+            r0 = after[0, y, x] - before[0, y, x]
+            r1, r2 = after[1, y, x] - before[1, y, x], after[2, y, x] - before[2, y, x]
+            square[count] = r0 * r0 + gamma * gamma * (r1 * r1 + r2 * r2)
+            count += mask[y, x] > _ZERO
+    return square[:count]

@@ -31,7 +31,7 @@ import scipy.sparse as sparse
 from numpy.typing import NDArray
 from scipy.sparse.linalg import splu
 
-from synth.flow import fused
+from synth.flow import kernels
 from synth.system.jit import vectorised
 
 Map = NDArray[np.float32]
@@ -135,7 +135,7 @@ class Solver:
         """
         s = self.settings
         warped, seen = np.empty_like(disparity), np.empty_like(disparity)
-        fused.warp_into(pictures.left, pictures.left_usable, flow, warped, seen)
+        kernels.warp_into(pictures.left, pictures.left_usable, flow, warped, seen)
         left_now, left_rest = self._stacked(warped), self._stacked(pictures.left_rest)
         right_rest = self._stacked(pictures.right_rest)
         lefts, less = left_now + left_rest, left_now - left_rest + right_rest
@@ -148,7 +148,7 @@ class Solver:
         here[1] = flow[1]
         for _ in range(s.cold if initial is None else s.warm):
             here[0] = flow[0] - disparity - change
-            fused.warp_into(pictures.right, pictures.right_usable, here, warped, seen)
+            kernels.warp_into(pictures.right, pictures.right_usable, here, warped, seen)
             both = mask * seen
             right_now = self._stacked(warped)
             noise = _noise(right_now - less, both)
@@ -206,7 +206,7 @@ class Solver:
         """(3, H, W): the picture and its derivatives by x and y."""
         found = np.empty((3, *picture.shape), np.float32)
         found[0] = picture
-        fused.differentiate(picture, found[1], found[2])
+        kernels.differentiate(picture, found[1], found[2])
         return found
 
     def steepness(self, flow: Map) -> Map:

@@ -105,7 +105,7 @@ def _refined(left: Map, right: Map, left_usable: Flags, right_usable: Flags, sta
 
     initial = torch.from_numpy(np.stack([-start, np.zeros_like(start)]))[None]
     with torch.inference_mode(), one_thread():
-        flow, trust, _ = Tvl1(device="cpu", corrected=False).tensors(
+        flow, trust, _ = Tvl1(corrected=False).tensors(
             wide(left), wide(right), wide(left_usable), wide(right_usable), initial
         )
     return flow[0].numpy(), trust[0, 0].numpy()

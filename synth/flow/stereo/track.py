@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 
 from synth.errors import UserError
-from synth.flow import fused, image
+from synth.flow import image, kernels
 from synth.flow.confidence import deviation
 from synth.flow.estimator import Flags, Flow, Map, Rgb
 from synth.flow.stereo import depth_correction, rest
@@ -95,7 +95,7 @@ class StereoTracker:
         right, known = self._normalised(rights[0], usable[1], 1)
         self._right, self._usable = np.empty_like(right), np.empty_like(right)
         aside = np.stack([-self.rest.disparity, np.zeros_like(right)])
-        fused.warp_into(right, known, aside, self._right, self._usable)
+        kernels.warp_into(right, known, aside, self._right, self._usable)
         self._usable *= usable[0]
         self.distance_mm = float(np.median(r.depth(self.rest.disparity)[usable[0]]))
         """Median of the tissue's, at rest."""

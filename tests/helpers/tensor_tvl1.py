@@ -1,0 +1,129 @@
+"""Masked TV-L1 by whole tensors: the oracle of `synth.flow.tvl1`, whose equations and symbols these are."""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from synth.flow.image import Level
+from synth.flow.tvl1 import TVL1Settings
+
+_WEIGHT_LIMITS = 0.45, 1.5
+
+
+def solve_level(level: Level, flow: Tensor, weight: Tensor, s: TVL1Settings) -> Tensor:
+    """All warps of a level; flow (B, 2, H, W) px, weight (B, 1, H, W)."""
+    dual = flow.new_zeros(2, *flow.shape)
+    for _ in range(s.warps):
+        flow, dual = step(level, flow, dual, weight, s)
+    return flow
+
+
+def step(level: Level, flow: Tensor, dual: Tensor, weight: Tensor, s: TVL1Settings) -> tuple[Tensor, Tensor]:
+    """One warp: linearise r about `flow`, weigh it, minimise. dual: (2, B, 2, H, W), its x and y parts."""
+    warped, seen = warp(level.now, level.now_usable, flow)
+    mask = level.rest_usable * seen
+    # The gradient of the *warped* picture is what the rest frame's must equal: it turns and stretches with w.
+    before = torch.cat([level.rest, s.gradient * derivative(level.rest)], 1)
+    after = torch.cat([warped, s.gradient * derivative(warped)], 1)
+    residual = after - before  # (B, 3, H, W)
+    slope = derivative(0.5 * (after + before))  # (B, 6, H, W): x of the 3, then y of the 3
+    rows, columns = slope[:, :3], slope[:, 3:]
+    if s.noise > 0:
+        weight = weight * noise_weight(residual, mask, s.noise)
+    c = s.tau * weight * mask / torch.sqrt((residual * residual).sum(1, keepdim=True) + s.epsilon**2)
+    # (1 + c J^T J) w = v - c J^T (r - J w_0), 2x2 by Cramer.
+    xx = 1 + c * (rows * rows).sum(1, keepdim=True)
+    xy = c * (rows * columns).sum(1, keepdim=True)
+    yy = 1 + c * (columns * columns).sum(1, keepdim=True)
+    offset = residual - rows * flow[:, :1] - columns * flow[:, 1:]
+    gx, gy = c * (rows * offset).sum(1, keepdim=True), c * (columns * offset).sum(1, keepdim=True)
+    scale = 1 / (xx * yy - xy * xy)
+    straight = torch.cat([yy, xx], 1) * scale
+    cross = -xy * scale
+    shift = straight * torch.cat([gx, gy], 1) + cross * torch.cat([gy, gx], 1)
+    flow, dual = primal_dual(flow, dual, straight, cross, shift, s.huber + s.hidden_huber * (1 - mask), s)
+    if s.median:
+        flow = median3(flow)
+    return flow, dual
+
+
+def noise_weight(residual: Tensor, mask: Tensor, noise: float) -> Tensor:
+    """(noise / median of |r| in the mask) squared, within limits; 1 if nothing is seen. (B, 1, 1, 1)."""
+    some = residual[..., ::2, ::2]
+    square = torch.where(mask[..., ::2, ::2] > 0, (some * some).sum(1, keepdim=True), torch.nan)
+    found = torch.nan_to_num(square.flatten(1).nanmedian(dim=1).values, nan=noise**2)
+    return (noise**2 / found.clamp_min(1e-12)).clamp(*_WEIGHT_LIMITS).view(-1, 1, 1, 1)
+
+
+def primal_dual(
+    flow: Tensor, dual: Tensor, straight: Tensor, cross: Tensor, shift: Tensor, huber: Tensor, s: TVL1Settings
+) -> tuple[Tensor, Tensor]:
+    """`steps` of: dual ascent on grad w with the Huber prox, primal descent with the data term's 2x2 prox.
+
+    Args:
+        flow: (B, 2, H, W) px.
+        dual: (2, B, 2, H, W), its x and y parts.
+        straight, cross, shift: (B, 2, H, W), (B, 1, H, W), (B, 2, H, W): the prox as an affine map.
+        huber: (B, 1, H, W) or a number, h [px/px].
+        s: settings.
+    """
+    sigma = 1 / (8 * s.tau)
+    dual, ahead = dual.clone(), flow
+    px, py = dual[0], dual[1]
+    shrink = 1 / (1 + sigma * huber)
+    for _ in range(s.steps):
+        px[..., :-1].add_(ahead[..., 1:] - ahead[..., :-1], alpha=sigma)
+        py[..., :-1, :].add_(ahead[..., 1:, :] - ahead[..., :-1, :], alpha=sigma)
+        dual.mul_(shrink)
+        dual.mul_((px * px).addcmul_(py, py).clamp_min_(1).rsqrt_())  # p / max(1, |p|)
+        v = torch.add(flow, px, alpha=s.tau).add_(py, alpha=s.tau)  # v = w + tau div p
+        v[..., 1:].sub_(px[..., :-1], alpha=s.tau)
+        v[..., 1:, :].sub_(py[..., :-1, :], alpha=s.tau)
+        new = (straight * v).sub_(shift)
+        new[:, :1].addcmul_(cross, v[:, 1:])
+        new[:, 1:].addcmul_(cross, v[:, :1])
+        flow, ahead = new, torch.lerp(flow, new, 2.0)  # 2 new - old
+    return flow, dual
+
+
+def warp(now: Tensor, usable: Tensor, flow: Tensor) -> tuple[Tensor, Tensor]:
+    """As `image.warp`, (B, C, H, W)."""
+    height, width = now.shape[-2:]
+    x = torch.arange(width, dtype=now.dtype)
+    y = torch.arange(height, dtype=now.dtype)[:, None]
+    at = torch.stack([(2 * (x + flow[:, 0]) + 1) / width - 1, (2 * (y + flow[:, 1]) + 1) / height - 1], -1)
+    picture = F.grid_sample(now, at, mode="bicubic", padding_mode="border", align_corners=False)
+    seen = F.grid_sample(usable, at, mode="bilinear", padding_mode="zeros", align_corners=False)
+    return picture, (seen > 0.9).to(now.dtype)
+
+
+def derivative(field: Tensor) -> Tensor:
+    """d/dx of every channel, then d/dy of every channel: (B, 2C, H, W); fourth-order central differences."""
+    wide = F.pad(field, (2, 2, 2, 2), "replicate")
+    x, y = wide[..., 2:-2, :], wide[..., 2:-2]
+    dx = (8 * (x[..., 3:-1] - x[..., 1:-3]) - (x[..., 4:] - x[..., :-4])) / 12
+    dy = (8 * (y[..., 3:-1, :] - y[..., 1:-3, :]) - (y[..., 4:, :] - y[..., :-4, :])) / 12
+    return torch.cat([dx, dy], 1)
+
+
+def median3(field: Tensor) -> Tensor:
+    """3x3 median of every channel, (B, C, H, W).
+
+    Sorts the columns; the median is that of the largest low, the middle mid and the smallest high.
+    """
+    wide = F.pad(field, (1, 1, 1, 1), "replicate")
+    a, b, c = wide[..., :-2, :], wide[..., 1:-1, :], wide[..., 2:, :]
+    low, high = torch.minimum(a, b), torch.maximum(a, b)
+    middle, high = torch.minimum(high, c), torch.maximum(high, c)
+    low, middle = torch.minimum(low, middle), torch.maximum(low, middle)
+
+    def sides(f: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        return f[..., :-2], f[..., 1:-1], f[..., 2:]
+
+    lows, (m0, m1, m2), highs = sides(low), sides(middle), sides(high)
+    top = torch.maximum(torch.maximum(lows[0], lows[1]), lows[2])
+    bottom = torch.minimum(torch.minimum(highs[0], highs[1]), highs[2])
+    mid = torch.maximum(torch.minimum(m0, m1), torch.minimum(torch.maximum(m0, m1), m2))
+    return torch.maximum(torch.minimum(top, mid), torch.minimum(torch.maximum(top, mid), bottom))
