@@ -21,7 +21,7 @@ _HISTORY, _ITERATIONS, _ARMIJO = 8, 200, 1e-4
 _DIRECTIONS = 3  # of loads, up to which states are foretold from all that are known
 
 
-_Step = tuple[Floats, Floats, float, Floats | None]
+_Step = tuple[Floats, Floats, float, Floats]
 """Step s (N, 3) mm, the gradient's change y (N, 3) mN over it, s'y, and the inverse rest stiffness on y."""
 
 
@@ -68,15 +68,6 @@ def solve_path(system: System, loads: Floats, load_parameter: Floats) -> LoadPat
     return follow_loads(system, loads, load_parameter, _QuasiStatic(system, loads))
 
 
-def solve_mixed_path(system: System, loads: Floats, load_parameter: Floats) -> LoadPath:
-    """As `solve_path`, for loads that mix a few directions and for membranes.
-
-    One solve an iteration rather than two, and starts from all states found: the same answer within the
-    tolerance but not to the last bit, so that scenes without a need for it keep theirs.
-    """
-    return follow_loads(system, loads, load_parameter, _QuasiStatic(system, loads, mixed=True))
-
-
 def follow_loads(
     system: System,
     loads: Floats,
@@ -118,37 +109,21 @@ def follow_loads(
 class _QuasiStatic:
     """Equilibrium under a load: one solve of a linear law; else L-BFGS from a prediction by states found."""
 
-    def __init__(self, system: System, loads: Floats, *, mixed: bool = False) -> None:
-        self._system, self._loads, self._mixed = system, loads, mixed
-        self._linear = _LinearResponse(system)
-        self._peak = loads[np.abs(loads).max(axis=(1, 2)).argmax()]
-        self._at_peak = self._linear(self._peak)
-        self._peak_squared = float(np.vdot(self._peak, self._peak)) or 1.0
-        self._scale = float(np.sqrt(np.vdot(self._peak, self._at_peak))) or 1.0
-        self._known = [(0.0, np.zeros_like(self._peak))]
+    def __init__(self, system: System, loads: Floats) -> None:
+        self._system, self._linear = system, _LinearResponse(system)
+        peak = loads[np.abs(loads).max(axis=(1, 2)).argmax()]
+        self._peak = float(np.sqrt(np.vdot(peak, peak))) or 1.0
+        self._scale = float(np.sqrt(np.vdot(peak, self._linear(peak)))) or 1.0
         self._bends = _Bends(self._linear)
 
     def __call__(self, number: int, load: Floats, last: Floats) -> tuple[Floats, State, float]:
-        system, peak = self._system, self._peak
+        system = self._system
         if system.law == "linear":
             u = self._linear(load)
             state = system.state(u)
-            out = np.linalg.norm(on_free(system, load - state.force)) / np.sqrt(self._peak_squared)
-            return u, state, float(out)
-        factor = float(np.vdot(load, peak)) / self._peak_squared
-        proportional = float(np.abs(load - factor * peak).max()) <= 1e-9 * float(np.abs(peak).max())
-        if proportional:
-            start = interpolate_states(self._known, factor, self._at_peak)
-        elif self._mixed:
-            start = self._bends.guess(load)
-        else:
-            start = last + self._linear(load - self._loads[number - 1])
-        tolerance = TOLERANCE * self._scale
-        u, state, norm = minimise_energy(system, load, start, tolerance, last, keep_solved=self._mixed)
-        if self._mixed:
-            self._bends.learn(load, u)
-        if proportional and all(abs(factor - k) > 1e-3 for k, _ in self._known):
-            self._known.append((factor, u))
+            return u, state, float(np.linalg.norm(on_free(system, load - state.force)) / self._peak)
+        u, state, norm = minimise_energy(system, load, self._bends.guess(load), TOLERANCE * self._scale, last)
+        self._bends.learn(load, u)
         return u, state, norm / self._scale
 
 
@@ -240,7 +215,7 @@ def check_state(system: System, u: Floats, state: State, frame: int, load: float
 
 
 def minimise_energy(
-    system: System, load: Floats, start: Floats, tolerance: float, safe: Floats, *, keep_solved: bool = False
+    system: System, load: Floats, start: Floats, tolerance: float, safe: Floats
 ) -> tuple[Floats, State, float]:
     """Minimises stored energy less the load's work by L-BFGS on the factored rest stiffness.
 
@@ -253,7 +228,6 @@ def minimise_energy(
         start: (N, 3) mm.
         safe: (N, 3) mm, a state of finite energy, for when the guess `start` has none.
         tolerance: on the residual's norm sqrt(r' K^-1 r), in sqrt(mN mm).
-        keep_solved: keep the rest stiffness's inverse on changes of the gradient, rather than solve anew.
 
     Returns:
         Displacement, its state and the residual's norm; the caller judges it.
@@ -269,7 +243,7 @@ def minimise_energy(
         norm = max(float(np.vdot(gradient, preconditioned)), 0.0) ** 0.5
         if norm <= tolerance:
             break
-        direction = -_two_loop_recursion(gradient, preconditioned, history, system)
+        direction = -_two_loop_recursion(gradient, preconditioned, history)
         derivative = float(np.vdot(gradient, direction))
         if derivative >= 0:
             history.clear()
@@ -292,52 +266,29 @@ def minimise_energy(
         curvature = float(np.vdot(s, y))
         then, preconditioned = preconditioned, system.solve(trial_gradient)
         if curvature > 1e-12 * float(np.sqrt(np.vdot(s, s) * np.vdot(y, y))):
-            history.append((s, y, curvature, preconditioned - then if keep_solved else None))
+            history.append((s, y, curvature, preconditioned - then))
             del history[:-_HISTORY]
         u, state, gradient = trial, trial_state, trial_gradient
     return u, state, norm
 
 
-def _two_loop_recursion(
-    gradient: Floats, preconditioned: Floats, history: list[_Step], system: System
-) -> Floats:
+def _two_loop_recursion(gradient: Floats, preconditioned: Floats, history: list[_Step]) -> Floats:
     """The inverse Hessian on the gradient (Nocedal & Wright, algorithm 7.4), the rest stiffness as its seed.
 
     Args:
         gradient: (N, 3) mN.
         preconditioned: (N, 3) mm, the inverse rest stiffness on it.
         history: the latest steps.
-        system: the equations.
     """
-    if not history:
-        return preconditioned
     q, r, alphas = gradient.copy(), preconditioned.copy(), []
     for s, y, curvature, solved in reversed(history):
         alpha = float(np.vdot(s, q)) / curvature
         q -= alpha * y
-        if solved is not None:
-            r -= alpha * solved
+        r -= alpha * solved
         alphas.append(alpha)
-    if history[0][3] is None:
-        r = system.solve(q)
     for (s, y, curvature, _), alpha in zip(history, reversed(alphas), strict=True):
         r += s * (alpha - float(np.vdot(y, r)) / curvature)
     return r
-
-
-def interpolate_states(known: list[tuple[float, Floats]], factor: float, at_peak: Floats) -> Floats:
-    """The state (N, 3) mm at a load factor, through the three nearest known: it depends on no more."""
-    nearest = sorted(known, key=lambda k: abs(k[0] - factor))[:3]
-    if len(nearest) == 1:
-        return factor * at_peak
-    value = np.zeros_like(at_peak)
-    for i, (at, u) in enumerate(nearest):
-        lagrange = 1.0
-        for j, (other, _) in enumerate(nearest):
-            if j != i:
-                lagrange *= (factor - other) / (at - other)
-        value += lagrange * u
-    return value
 
 
 def on_free(system: System, force: Floats) -> Floats:

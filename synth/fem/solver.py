@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from synth.fem import surface_embedding, tool_gesture
-from synth.fem.equilibrium import InvertedElement, LoadPath, solve_mixed_path, solve_path
+from synth.fem.equilibrium import InvertedElement, LoadPath, solve_path
 from synth.fem.material import Tissue
 from synth.fem.mesh.tetrahedra import Tets
 from synth.fem.motion import Clock, march_in_time, volume
@@ -126,8 +126,7 @@ def deform(
     if fem.time == "dynamic" or fem.relaxation:
         path = march_in_time(tets, tissue, loads, load_parameter, clock(fem, fps, tets))
     else:
-        mixed = pulse is not None or tissue.sheet is not None
-        path = (solve_mixed_path if mixed else solve_path)(system, loads, load_parameter)
+        path = solve_path(system, loads, load_parameter)
     return _on_surface(path, tissue, tools, traction, area, embedding, surface, time, pulse_work)
 
 
