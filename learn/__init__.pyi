@@ -1,4 +1,4 @@
-from learn.inference.force_reader import predict_force as predict_force
-from learn.inference.predict import ForceMap as ForceMap
-from learn.inference.predict import Predictor as Predictor
-from learn.inference.predict import load_model as load_model
+from .inference.force_reader import predict_force as predict_force
+from .inference.predict import ForceMap as ForceMap
+from .inference.predict import Predictor as Predictor
+from .inference.predict import load_model as load_model

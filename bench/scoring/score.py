@@ -30,6 +30,8 @@ from synth.recording_flow.video_flow import RecordingFlowSettings
 from synth.system import checked_file
 from synth.system.terminal import counting
 
+Settings = RecordingFlowSettings
+"""What scripts call them."""
 _ROOM_BYTES = 32 << 20  # score.json and report.html, with the charts' program in it
 _LONG = 100
 """Frames from which a second process is worth the seconds that it takes to start."""
@@ -42,7 +44,7 @@ def score(
     methods: Mapping[str, Method] | None = None,
     baselines: bool = True,
     train: str | Path | None = None,
-    settings: RecordingFlowSettings | None = None,
+    settings: Settings | None = None,
     out: str | Path | None = None,
     title: str = "",
     progress: bool = False,
@@ -105,7 +107,7 @@ def score(
                 chosen,
                 next(iter(chosen)),
                 scale,
-                settings or RecordingFlowSettings(),
+                settings or Settings(),
                 _describe(chosen),
                 told,
                 elsewhere,
