@@ -11,6 +11,7 @@ Curve = NDArray[np.float64]
 Interval = tuple[float, float]
 
 RESAMPLES = 1000
+LEAST_SAMPLES = 8
 LEVEL = 0.95
 LEAST_GROUPS = 5
 """Of fewer, a 95% interval is little more than the two that are furthest apart."""
@@ -28,7 +29,7 @@ def block_length(x: Curve) -> float:
     n = len(x)
     centred = x - x.mean()
     variance = float(centred @ centred) / n
-    if n < 8 or variance == 0:
+    if n < LEAST_SAMPLES or variance == 0:
         return 1.0
     most = min(n - 1, int(np.ceil(np.sqrt(n))) + max(5, int(np.log10(n))))
     autocov = np.array([float(centred[: n - k] @ centred[k:]) / n for k in range(2 * most + 1) if k < n])
@@ -66,35 +67,6 @@ def counts(n: int, mean_block: float, resamples: int, rng: np.random.Generator) 
     return np.bincount(flat, minlength=resamples * n).reshape(resamples, n).astype(np.float64)
 
 
-def agreement(sensor: Curve, predicted: Curve, rng: np.random.Generator) -> dict[str, Interval]:
-    """Intervals of mae_mn, rmse_mn, bias_mn, r, ccc and r2, samples being resampled in blocks.
-
-    The block is the longest that the sensor, the prediction or their difference ask for.
-
-    Args:
-        sensor: (T,) mN.
-        predicted: (T,) mN; samples where either is NaN are left out.
-        rng: source of the resamples.
-    """
-    good = np.isfinite(sensor) & np.isfinite(predicted)
-    x, y = sensor[good], predicted[good]
-    if len(x) < 8:
-        return {}
-    block = max(block_length(x), block_length(y), block_length(y - x))
-    values = _scores(counts(len(x), block, RESAMPLES, rng), x, y)
-    return {name: _interval(value) for name, value in values.items()}
-
-
-def difference(sensor: Curve, first: Curve, second: Curve, rng: np.random.Generator) -> Interval:
-    """Interval of MAE(first) − MAE(second), paired: both are resampled alike."""
-    good = np.isfinite(sensor) & np.isfinite(first) & np.isfinite(second)
-    gap = np.abs(first - sensor)[good] - np.abs(second - sensor)[good]
-    if len(gap) < 8:
-        return (float("nan"), float("nan"))
-    weights = counts(len(gap), block_length(gap), RESAMPLES, rng)
-    return _interval(weights @ gap / len(gap))
-
-
 def over_groups(values: Sequence[float], groups: Sequence[str], rng: np.random.Generator) -> Interval:
     """Interval of the mean over recordings, whole groups (specimens) being resampled.
 
@@ -115,28 +87,11 @@ def over_groups(values: Sequence[float], groups: Sequence[str], rng: np.random.G
     sums = np.array([float(np.sum(v)) for v in by.values()])
     sizes = np.array([float(len(v)) for v in by.values()])
     picks = rng.integers(0, len(sums), (RESAMPLES, len(sums)))
-    return _interval(sums[picks].sum(axis=1) / sizes[picks].sum(axis=1))
+    return interval(sums[picks].sum(axis=1) / sizes[picks].sum(axis=1))
 
 
-def _scores(weights: NDArray[np.float64], x: Curve, y: Curve) -> dict[str, Curve]:
-    n = weights.sum(axis=1)
-    mean_x, mean_y = weights @ x / n, weights @ y / n
-    var_x = np.maximum(weights @ x**2 / n - mean_x**2, 0)
-    var_y = np.maximum(weights @ y**2 / n - mean_y**2, 0)
-    cov = weights @ (x * y) / n - mean_x * mean_y
-    mse = weights @ (y - x) ** 2 / n
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return {
-            "mae_mn": weights @ np.abs(y - x) / n,
-            "rmse_mn": np.sqrt(mse),
-            "bias_mn": mean_y - mean_x,
-            "r": cov / np.sqrt(var_x * var_y),
-            "ccc": 2 * cov / (var_x + var_y + (mean_x - mean_y) ** 2),
-            "r2": 1 - mse / var_x,
-        }
-
-
-def _interval(values: Curve) -> Interval:
+def interval(values: Curve) -> Interval:
+    """The middle 95% of resampled values (R,); those that are not finite are left out."""
     values = values[np.isfinite(values)]
     if len(values) == 0:
         return (float("nan"), float("nan"))

@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bench import bootstrap
 from bench.methods.flow_size import FlowSize, flow_sizes
 from bench.methods.protocol import Combining, Method
 from bench.recording.folder import Recording
@@ -226,8 +225,8 @@ def _score(force: Curve, first: Scored | None, against: _Reference) -> Scored:
     if against.sensor.in_camera_axes and np.isfinite(force).any(axis=0).all():
         components = {axis: metrics.agreement(axes[kept, k], force[kept, k]) for k, axis in enumerate("xyz")}
     rng = np.random.default_rng(_SEED)
-    intervals = bootstrap.agreement(x, y, rng)
-    worse = None if first is None else bootstrap.difference(x, first.size_mn[kept], y, rng)
+    intervals = metrics.agreement_intervals(x, y, rng)
+    worse = None if first is None else metrics.difference_interval(x, first.size_mn[kept], y, rng)
     if not against.absolute:
         scores, events = metrics.without_newtons(scores), metrics.without_prediction(events)
         components = {axis: metrics.without_newtons(values) for axis, values in components.items()}

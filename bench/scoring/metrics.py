@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import math
+from dataclasses import asdict
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import linregress
-from sklearn.metrics import f1_score, mean_absolute_error, r2_score, root_mean_squared_error
+from sklearn.metrics import f1_score
 
+from bench import bootstrap
+from bench.bootstrap import Interval
+from learn.evaluation import metrics
 from learn.evaluation.metrics import Metric
 
 Curve = NDArray[np.float64]
@@ -47,38 +50,47 @@ RELATIVE = tuple(key for key, metric in METRICS.items() if metric.relative)
 """Scores that a prediction of unknown stiffness has."""
 
 
+_AGREEMENT = {"mae": "mae_mn", "rmse": "rmse_mn", "bias": "bias_mn", "r": "r", "ccc": "ccc", "r2": "r2"}
+"""Fields of `learn.evaluation.metrics.Agreement`, and their keys here."""
+
+
 def agreement(sensor: Curve, predicted: Curve) -> dict[str, float]:
-    """Scores over all samples where both are finite.
-
-    `r2` is 1 − SSE/SST about the sensor's mean, so bias and gain errors count; `ccc` is Lin's concordance
-    ("A concordance correlation coefficient to evaluate reproducibility", Biometrics 1989).
-
-    Args:
-        sensor: (T,) mN.
-        predicted: (T,) mN.
+    """Scores of predicted against sensor, each (T,) mN, over all samples where both are finite.
 
     Returns:
         n, mae_mn, rmse_mn, bias_mn, r, ccc, r2, gain (least-squares slope of predicted on sensor).
     """
     both = np.isfinite(sensor) & np.isfinite(predicted)
     x, y = sensor[both], predicted[both]
-    if len(x) == 0:
-        return {"n": 0.0} | dict.fromkeys(
-            ("mae_mn", "rmse_mn", "bias_mn", "r", "ccc", "r2", "gain"), math.nan
-        )
-    bias, moving = float((y - x).mean()), np.ptp(x) > 0
-    fit = linregress(x, y) if moving else None
-    covariance = float(np.cov(x, y, ddof=0)[0, 1]) if moving else 0.0
-    return {
-        "n": float(len(x)),
-        "mae_mn": float(mean_absolute_error(x, y)),
-        "rmse_mn": float(root_mean_squared_error(x, y)),
-        "bias_mn": bias,
-        "r": float(fit.rvalue) if fit and np.ptp(y) > 0 else math.nan,
-        "ccc": ratio(2 * covariance, float(x.var() + y.var() + bias**2)),
-        "r2": float(r2_score(x, y)) if moving else math.nan,
-        "gain": float(fit.slope) if fit else math.nan,
-    }
+    found = asdict(metrics.agreement(metrics.moments(x, y)))
+    scores = {key: found[name] for name, key in _AGREEMENT.items()}
+    return {"n": float(len(x)), **scores, "gain": metrics.line(x, y)[0]}
+
+
+def agreement_intervals(sensor: Curve, predicted: Curve, rng: np.random.Generator) -> dict[str, Interval]:
+    """Intervals of mae_mn, rmse_mn, bias_mn, r, ccc and r2, samples being resampled in blocks.
+
+    The block is the longest that the sensor, the prediction or their difference ask for. Arguments as of
+    `agreement`; none of fewer than eight samples.
+    """
+    good = np.isfinite(sensor) & np.isfinite(predicted)
+    x, y = sensor[good], predicted[good]
+    if len(x) < bootstrap.LEAST_SAMPLES:
+        return {}
+    block = max(bootstrap.block_length(one) for one in (x, y, y - x))
+    pairs = np.column_stack([np.ones_like(x), x, y, x**2, y**2, x * y, np.abs(y - x)])
+    drawn = metrics.agreements(bootstrap.counts(len(x), block, bootstrap.RESAMPLES, rng) @ pairs)
+    return {key: bootstrap.interval(drawn[name]) for name, key in _AGREEMENT.items()}
+
+
+def difference_interval(sensor: Curve, first: Curve, second: Curve, rng: np.random.Generator) -> Interval:
+    """Interval of MAE(first) − MAE(second), paired: both are resampled alike."""
+    gap = np.abs(first - sensor) - np.abs(second - sensor)
+    gap = gap[np.isfinite(gap)]
+    if len(gap) < bootstrap.LEAST_SAMPLES:
+        return (math.nan, math.nan)
+    weights = bootstrap.counts(len(gap), bootstrap.block_length(gap), bootstrap.RESAMPLES, rng)
+    return bootstrap.interval(weights @ gap / len(gap))
 
 
 def gain(sensor: Curve, predicted: Curve, where: NDArray[np.bool_]) -> float:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, astuple, dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -16,7 +16,7 @@ from learn.checkpoint import SEEN, ModelCard
 from learn.data.clips import Clip, amount, target
 from learn.data.grid import Grid
 from learn.data.split import find_unit, regroup
-from learn.evaluation.metrics import Moments, agreement, contact_mm, false_positive_share, line
+from learn.evaluation.metrics import agreement, contact_mm, false_positive_share, line, moments, rescale
 from learn.evaluation.statistics import Interval, Paired, interval, paired, pooled_r2
 from learn.inference.predict import Predictor, force_size, length, total_force
 from synth.errors import UserError
@@ -42,8 +42,8 @@ class ClipScore:
 
     name: str
     young_kpa: float
-    map: Moments
-    """Over tissue cells of all frames, of the density's length."""
+    map: NDArray[np.floating]
+    """(7,) `moments` over tissue cells of all frames, of the density's length."""
     true_mn: NDArray[np.float64]
     """(T,) size of the total force; for a map of lengths the sum of lengths (`learn.data.clips.amount`)."""
     predicted_mn: NDArray[np.float64]
@@ -52,7 +52,7 @@ class ClipScore:
 
     def as_row(self) -> dict[str, float]:
         """All scores by key of `METRICS`."""
-        force = agreement(Moments.of(self.true_mn, self.predicted_mn))
+        force = agreement(moments(self.true_mn, self.predicted_mn))
         row = {f"map_{name}": value for name, value in asdict(agreement(self.map)).items()}
         return row | {f"force_{name}": value for name, value in asdict(force).items()} | self.others
 
@@ -79,7 +79,7 @@ def score(clip: Clip, predicted: NDArray[np.float32], card: ModelCard) -> ClipSc
     others = {}
     if parts == 3:
         components = np.broadcast_to(inside[:, None], predicted.shape)
-        others["vector_r2"] = agreement(Moments.of(true[components], predicted[components])).r2
+        others["vector_r2"] = agreement(moments(true[components], predicted[components])).r2
         others["vector_error_mn"] = float(np.linalg.norm(total - clip.force, axis=1).mean())
     others |= {
         "peak_error_share": abs(float(predicted_mn.max()) - peak) / peak if peak > 0 else math.nan,
@@ -90,7 +90,7 @@ def score(clip: Clip, predicted: NDArray[np.float32], card: ModelCard) -> ClipSc
         "localisation_mm": float(np.median(off)) if off else math.nan,
         "low_over_mn": float(np.maximum(predicted_mn - true_mn, 0)[low].mean()) if low.any() else math.nan,
     }
-    agreed = Moments.of(true_size[inside], size[inside])
+    agreed = moments(true_size[inside], size[inside])
     return ClipScore(clip.name, young, agreed, true_mn, predicted_mn, others)
 
 
@@ -124,11 +124,12 @@ class EvaluationReport:
         """Mean over sequences of every per-sequence number, and pooled R² (`*_pooled`), in one E column."""
         rows, clips = self.per_clip(young), self.columns[young]
         out = {k: _mean([r[k] for r in rows]) for k in rows[0]}
-        out["map_r2_pooled"] = agreement(sum((c.map for c in clips), Moments())).r2
-        out["unit_map_r2_pooled"] = agreement(sum((c.map.over(c.young_kpa) for c in clips), Moments())).r2
+        out["map_r2_pooled"] = agreement(np.sum([c.map for c in clips], axis=0)).r2
+        unit_maps = [rescale(c.map, c.young_kpa) for c in clips]
+        out["unit_map_r2_pooled"] = agreement(np.sum(unit_maps, axis=0)).r2
         true = np.concatenate([c.true_mn for c in clips])
         predicted = np.concatenate([c.predicted_mn for c in clips])
-        out["force_r2_pooled"] = agreement(Moments.of(true, predicted)).r2
+        out["force_r2_pooled"] = agreement(moments(true, predicted)).r2
         out["calibration_slope"], out["calibration_offset_mn"] = line(predicted, true)
         return out
 
@@ -136,9 +137,9 @@ class EvaluationReport:
         """Mean and BCa interval over sequences of every per-sequence number, and of the pooled R²."""
         rows, rng = self.per_clip(), np.random.default_rng(0)
         out = {k: interval(np.array([r[k] for r in rows]), rng) for k in rows[0]}
-        forces = [Moments.of(c.true_mn, c.predicted_mn) for c in self.clips]
+        forces = [moments(c.true_mn, c.predicted_mn) for c in self.clips]
         for name, parts in (("map_r2_pooled", [c.map for c in self.clips]), ("force_r2_pooled", forces)):
-            out[name] = pooled_r2(np.array([astuple(m)[:6] for m in parts]), rng)
+            out[name] = pooled_r2(np.array(parts), rng)
         return out
 
     def bands(self) -> list[dict[str, float]]:
@@ -161,7 +162,7 @@ class EvaluationReport:
             "sequences": [
                 {"name": c.name, "young_kpa": c.young_kpa}
                 | _plain(c.as_row())
-                | {"map_moments": list(astuple(c.map))}
+                | {"map_moments": c.map.tolist()}
                 for c in self.clips
             ],
             "columns": {young: _plain(self.summary(young)) for young in self.columns},

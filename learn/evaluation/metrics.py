@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -90,38 +90,29 @@ METRICS = {
 """By key of `learn eval --json`: the only place that says what a score is."""
 
 
-@dataclass(frozen=True)
-class Moments:
-    """Sums over pairs (true, predicted), from which every agreement metric follows; those of parts add up."""
+_DEGREES = np.array([0, 1, 1, 2, 2, 2, 1])
+"""Powers of the unit in each of `moments`."""
 
-    n: float = 0.0
-    t: float = 0.0
-    p: float = 0.0
-    tt: float = 0.0
-    pp: float = 0.0
-    tp: float = 0.0
-    absolute: float = 0.0
 
-    @staticmethod
-    def of(true: Floats, predicted: Floats) -> Moments:
-        t, p = (np.asarray(values, np.float64).ravel() for values in (true, predicted))
-        sums = t.size, t.sum(), p.sum(), t @ t, p @ p, t @ p, np.abs(p - t).sum()
-        return Moments(*map(float, sums))
+def moments(true: Floats, predicted: Floats) -> Floats:
+    """Sums over pairs (true, predicted), from which every agreement metric follows; those of parts add up.
 
-    def __add__(self, other: Moments) -> Moments:
-        return Moments(*(getattr(self, f.name) + getattr(other, f.name) for f in fields(self)))
+    Returns: (7,) count and sums of t, p, t², p², tp and |p − t|.
+    """
+    t, p = (np.asarray(values, np.float64).ravel() for values in (true, predicted))
+    return np.array([t.size, t.sum(), p.sum(), t @ t, p @ p, t @ p, np.abs(p - t).sum()])
 
-    def over(self, unit: float) -> Moments:
-        """Of the same pairs, both divided by `unit`."""
-        u, u2 = 1 / unit, 1 / unit**2
-        return Moments(
-            self.n, self.t * u, self.p * u, self.tt * u2, self.pp * u2, self.tp * u2, self.absolute * u
-        )
+
+def rescale(moments: Floats, unit: float) -> Floats:
+    """Moments of the same pairs, both divided by `unit`."""
+    return np.asarray(moments * (1 / unit**_DEGREES))
 
 
 @dataclass(frozen=True)
 class Agreement:
-    """R² = 1 − SSE/SST; errors in the unit of the data; r (Pearson); CCC (Lin 1989)."""
+    """R² = 1 − SSE/SST about the truth's mean, so bias and gain errors count; errors in the unit of the data;
+    r (Pearson); CCC (Lin, "A concordance correlation coefficient to evaluate reproducibility", Biometrics
+    1989)."""
 
     r2: float
     mae: float
@@ -131,25 +122,28 @@ class Agreement:
     ccc: float
 
 
-def agreement(m: Moments) -> Agreement:
-    """Agreement from moments. R², r and CCC are NaN where the truth (or the answer, for r) is constant."""
-    if m.n == 0:
-        return Agreement(*[float("nan")] * 6)
-    mean_t, mean_p = m.t / m.n, m.p / m.n
-    var_t = max(m.tt / m.n - mean_t**2, 0.0)
-    var_p = max(m.pp / m.n - mean_p**2, 0.0)
-    cov = m.tp / m.n - mean_t * mean_p
-    mse = max((m.pp - 2 * m.tp + m.tt) / m.n, 0.0)
-    tiny = 1e-12 * max(m.tt / m.n, 1e-300)
-    nan = float("nan")
-    return Agreement(
-        r2=1 - mse / var_t if var_t > tiny else nan,
-        mae=m.absolute / m.n,
-        rmse=mse**0.5,
-        bias=mean_p - mean_t,
-        r=cov / (var_t * var_p) ** 0.5 if var_t > tiny and var_p > 0 else nan,
-        ccc=2 * cov / (var_t + var_p + (mean_t - mean_p) ** 2) if var_t > tiny else nan,
-    )
+def agreement(moments: Floats) -> Agreement:
+    """Agreement from moments (7,). R², r and CCC are NaN where the truth (for r the answer) is constant."""
+    return Agreement(**{name: float(value) for name, value in agreements(moments).items()})
+
+
+def agreements(moments: Floats) -> dict[str, NDArray[np.float64]]:
+    """Fields of `Agreement`, each (...), from many moments (..., 7) at once."""
+    n, t, p, tt, pp, tp, absolute = np.moveaxis(np.asarray(moments, np.float64), -1, 0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        mean_t, mean_p = t / n, p / n
+        var_t, var_p = np.maximum(tt / n - mean_t**2, 0), np.maximum(pp / n - mean_p**2, 0)
+        cov = tp / n - mean_t * mean_p
+        mse = np.maximum((pp - 2 * tp + tt) / n, 0)
+        varies = var_t > 1e-12 * np.maximum(tt / n, 1e-300)
+        return {
+            "r2": np.where(varies, 1 - mse / var_t, np.nan),
+            "mae": absolute / n,
+            "rmse": np.sqrt(mse),
+            "bias": mean_p - mean_t,
+            "r": np.where(varies & (var_p > 0), cov / np.sqrt(var_t * var_p), np.nan),
+            "ccc": np.where(varies, 2 * cov / (var_t + var_p + (mean_t - mean_p) ** 2), np.nan),
+        }
 
 
 def false_positive_share(predicted: Floats, free: NDArray[np.bool_], threshold: float) -> float:
@@ -174,11 +168,10 @@ def contact_mm(map_: Floats, pitch_mm: float) -> NDArray[np.float64]:
     return centre * pitch_mm
 
 
-def line(predicted: Floats, true: Floats) -> tuple[float, float]:
-    """Calibration: slope and intercept of truth on prediction by least squares; (1, 0) is calibrated."""
-    x, y = np.asarray(predicted, np.float64), np.asarray(true, np.float64)
-    spread = float(np.var(x))
-    if spread == 0:
+def line(x: Floats, y: Floats) -> tuple[float, float]:
+    """Slope and intercept of `y` on `x` by least squares; of truth on prediction (1, 0) is calibrated."""
+    x, y = np.asarray(x, np.float64), np.asarray(y, np.float64)
+    if len(x) == 0 or np.ptp(x) == 0:
         return float("nan"), float("nan")
-    slope = float(np.mean((x - x.mean()) * (y - y.mean())) / spread)
+    slope = float(np.mean((x - x.mean()) * (y - y.mean())) / np.var(x))
     return slope, float(y.mean() - slope * x.mean())

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
+from learn.evaluation.metrics import agreement, agreements
 from synth.errors import UserError
 
 Floats = NDArray[np.float64]
@@ -50,22 +51,15 @@ def interval(values: Floats, rng: np.random.Generator, draws: int = _DRAWS) -> I
 def pooled_r2(moments: Floats, rng: np.random.Generator, draws: int = _DRAWS) -> Interval:
     """R² over everything that the sequences hold together, and its BCa interval over sequences.
 
-    `moments`: (n, 6), the first six of each sequence's `learn.evaluation.metrics.Moments`: count, sums of
-    t, p, tt, pp and tp. With fewer than three sequences there is no interval (NaN).
+    `moments`: (n, 7), `learn.evaluation.metrics.moments` of each sequence. With fewer than three sequences
+    there is no interval (NaN).
     """
     m = np.asarray(moments, np.float64)
     total, count = m.sum(axis=0), len(m)
     if count < 3:
-        return Interval(float(_r2(total)), float("nan"), float("nan"), count)
+        return Interval(agreement(total).r2, float("nan"), float("nan"), count)
     times = rng.multinomial(count, np.full(count, 1 / count), draws)
-    return _bca(float(_r2(total)), _r2(times @ m), _r2(total - m))
-
-
-def _r2(moments: Floats) -> Floats:
-    n, t, _, tt, pp, tp = np.moveaxis(moments, -1, 0)
-    spread = tt - t**2 / n
-    varies = spread > 1e-12 * np.maximum(tt, 1e-300)  # else there is none, as in `agreement`
-    return np.where(varies, 1 - (pp - 2 * tp + tt) / np.where(varies, spread, 1), np.nan)
+    return _bca(agreement(total).r2, agreements(times @ m)["r2"], agreements(total - m)["r2"])
 
 
 def _bca(value: float, boot: Floats, left_out: Floats) -> Interval:

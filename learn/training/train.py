@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import torch
 from lightning_fabric import Fabric
+from numpy.typing import NDArray
 from torch.optim.lr_scheduler import ReduceLROnPlateau
 from torchmetrics.aggregation import MeanMetric
 
@@ -21,7 +22,7 @@ from learn.checkpoint import ModelCard
 from learn.data.clips import Clip, sources, typical_young
 from learn.data.grid import Scales
 from learn.data.split import Split, groups
-from learn.evaluation.metrics import Moments, agreement
+from learn.evaluation.metrics import agreement
 from learn.loss import SHARES, full, gradient_shares, loss
 from learn.network.d2fnet import D2FNet
 from learn.settings import TrainingSettings, replace
@@ -226,7 +227,7 @@ def select_score(net: Any, frames: FrameDataset, scales: Scales, device: torch.d
     network to say less than there is.
     """
     net.eval()
-    sums, forces = Moments(), Moments()
+    sums, forces = np.zeros(7), np.zeros(7)
     for c in range(len(frames.clips)):
         for batch in frames.sequential(c, frames.sources[-1]):
             here = batch.to(device)
@@ -250,18 +251,19 @@ def _amount(maps: torch.Tensor, settings: TrainingSettings) -> torch.Tensor:
     return (flat.amax(2) if settings.target == "intensity" else flat.sum(2)).flatten()
 
 
-def _gain(forces: Moments, anatomies: int) -> float:
+def _gain(forces: NDArray[np.float64], anatomies: int) -> float:
     """Slope through the origin of true on predicted force, within `_GAINS`; 1 if too few anatomies tell."""
-    if anatomies < _TELLING or not forces.tp > 0:
+    pp, tp = forces[4:6]
+    if anatomies < _TELLING or not tp > 0:
         return 1.0
-    return min(max(forces.tp / forces.pp, _GAINS[0]), _GAINS[1])
+    return min(max(float(tp / pp), _GAINS[0]), _GAINS[1])
 
 
-def moments(true: torch.Tensor, predicted: torch.Tensor) -> Moments:
-    """`Moments.of`, summed on the tensors' own device: six numbers come back."""
+def moments(true: torch.Tensor, predicted: torch.Tensor) -> NDArray[np.float64]:
+    """`metrics.moments`, summed on the tensors' own device: six numbers come back."""
     t, p = true.double(), predicted.double()
     sums = torch.stack([t.sum(), p.sum(), t @ t, p @ p, t @ p, (p - t).abs().sum()])
-    return Moments(float(t.numel()), *sums.tolist())
+    return np.array([t.numel(), *sums.tolist()])
 
 
 def _provenance(clips: Sequence[Clip], split: Split) -> tuple[dict[str, list[str]], dict[str, list[str]]]:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from bench import bootstrap
+from bench.scoring import metrics
 
 
 def autoregressive(n: int, phi: float, rng: np.random.Generator) -> np.ndarray:
@@ -43,7 +44,7 @@ def test_coverage_of_the_bias_of_dependent_errors() -> None:
     for _ in range(trials):
         truth = 50 + 30 * np.sin(np.arange(400) / 15)
         said = truth + 2 + autoregressive(400, 0.8, rng)
-        low, high = bootstrap.agreement(truth, said, rng)["bias_mn"]
+        low, high = metrics.agreement_intervals(truth, said, rng)["bias_mn"]
         hits += low <= 2 <= high
         error = said - truth
         half = 1.96 * error.std() / np.sqrt(len(error))
@@ -67,6 +68,6 @@ def test_paired_difference_sees_what_unpaired_cannot() -> None:
     rng = np.random.default_rng(1)
     truth = np.zeros(300)
     common = 20 * np.abs(autoregressive(300, 0.5, rng))
-    low, high = bootstrap.difference(truth, common + 1, common, rng)
+    low, high = metrics.difference_interval(truth, common + 1, common, rng)
     assert low == pytest.approx(1, abs=1e-9)
     assert high == pytest.approx(1, abs=1e-9)

@@ -12,7 +12,7 @@ import torchmetrics
 from learn.checkpoint import ModelCard
 from learn.data.clips import Clip
 from learn.evaluation.evaluate import EvaluationReport, score
-from learn.evaluation.metrics import Moments, agreement, contact_mm
+from learn.evaluation.metrics import agreement, contact_mm, moments
 from learn.network.d2fnet import Architecture
 from learn.settings import TrainingSettings
 from learn.training.batches import measure_scales
@@ -27,7 +27,7 @@ def pairs() -> tuple[np.ndarray, np.ndarray]:
 
 def test_against_torchmetrics(pairs: tuple[np.ndarray, np.ndarray]) -> None:
     true, said = pairs
-    got = agreement(Moments.of(true[:200], said[:200]) + Moments.of(true[200:], said[200:]))
+    got = agreement(moments(true[:200], said[:200]) + moments(true[200:], said[200:]))
     t, p = torch.tensor(true), torch.tensor(said)
     for name, metric in {
         "r2": torchmetrics.R2Score(),
